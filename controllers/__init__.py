@@ -1,0 +1,1 @@
+"""Lateral controllers and the closed-loop drive."""

@@ -1,0 +1,1 @@
+"""The dataset generator: a scripted AI driver records labelled rounds to MCAP."""

@@ -1,0 +1,1 @@
+"""The perception service: one driver-view image in, track features out."""

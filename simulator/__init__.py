@@ -1,0 +1,1 @@
+"""VTORCS: tracks, physics, traffic, sensors, camera and the Gymnasium environments."""

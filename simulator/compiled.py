@@ -1,0 +1,18 @@
+"""The one way this project compiles numeric code: numba, cached on disk, without fast-math.
+
+Fast-math would let the compiler reorder sums, and two builds of the same kernel could then differ
+in the last bit; every recording and replay relies on them being equal.
+"""
+
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import numba
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+
+def compiled(function: Function) -> Function:
+    """Compile `function` with numba in no-python mode, keeping its type for the type checker."""
+    kernel: Function = numba.njit(cache=True, fastmath=False, error_model="numpy")(function)
+    return kernel
