@@ -1,0 +1,79 @@
+"""Between features in metres and radians and the six values a network is trained on.
+
+`y = 0.1 + 0.8 (x - lo) / (hi - lo)`, clipped to [0, 1]; the columns are those of `TARGETS`. An
+absent distance is NaN in metres, and the outer end of its range when coded.
+"""
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from trackfeatures.definitions import MARKINGS, RANGES, TARGETS, Heading
+from trackfeatures.features import TrackFeatures
+
+OFFSET, SPAN = 0.1, 0.8
+IN_LANE_WIDTH_LIMIT_M = 5.5
+"""The in-lane pair is present when its markings are nearer to each other than this."""
+ON_MARKING_LIMIT_M = 2.75
+NEIGHBOUR_LIMIT_M = 6.75
+
+_LO = np.array([RANGES[name].lo for name in TARGETS])
+_WIDTH = np.array([RANGES[name].hi - RANGES[name].lo for name in TARGETS])
+_INACTIVE = np.array([RANGES[name].inactive for name in MARKINGS], dtype=np.float64)
+_ML, _MR, _L, _M, _R, _ANGLE = range(len(TARGETS))
+
+
+def encode(distances: ArrayLike, angle: ArrayLike) -> NDArray[np.float32]:
+    """Coded targets (N, 6) of `distances` (N, 5) in m, NaN where absent, and `angle` (N,) in rad."""
+    metres = np.atleast_2d(np.asarray(distances, dtype=np.float64))
+    present = np.where(np.isnan(metres), _INACTIVE, metres)
+    values = np.column_stack([present, np.atleast_1d(np.asarray(angle, dtype=np.float64))])
+    return np.clip(OFFSET + SPAN * (values - _LO) / _WIDTH, 0.0, 1.0).astype(np.float32)
+
+
+def decode_values(coded: ArrayLike) -> NDArray[np.float64]:
+    """The values (N, 6) in m and rad that `coded` (N, 6) says, absent or not."""
+    y = np.atleast_2d(np.asarray(coded, dtype=np.float64))
+    values: NDArray[np.float64] = _LO + (y - OFFSET) / SPAN * _WIDTH
+    return values
+
+
+def decode(coded: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Distances (N, 5) in m, NaN where absent, and angles (N,) in rad of `coded` (N, 6)."""
+    values = decode_values(coded)
+    distances = values[:, :_ANGLE].copy()
+    in_lane = values[:, _MR] - values[:, _ML] < IN_LANE_WIDTH_LIMIT_M
+    on_marking = values[:, _M] < ON_MARKING_LIMIT_M
+    distances[~in_lane, _ML : _MR + 1] = np.nan
+    distances[~on_marking, _M] = np.nan
+    distances[~(on_marking & (values[:, _L] > -NEIGHBOUR_LIMIT_M)), _L] = np.nan
+    distances[~(on_marking & (values[:, _R] < NEIGHBOUR_LIMIT_M)), _R] = np.nan
+    return distances, values[:, _ANGLE]
+
+
+def encode_features(features: TrackFeatures) -> NDArray[np.float32]:
+    """Coded targets (6,) of one moment."""
+    distances = [np.nan if d is None else d for d in features.distances.values()]
+    return encode([distances], [features.angle])[0]
+
+
+def decode_features(coded: ArrayLike, heading: Heading) -> TrackFeatures:
+    """The features that coded values (6,) and a class say."""
+    distances, angle = decode(coded)
+    ml, mr, l, m, r = (None if np.isnan(d) else float(d) for d in distances[0])  # noqa: E741
+    return TrackFeatures(ml, mr, l, m, r, float(angle[0]), heading)
+
+
+def mirror_coded(coded: ArrayLike) -> NDArray[np.float32]:
+    """The coded targets (N, 6) of the left-right mirrored scenes."""
+    y = np.atleast_2d(np.asarray(coded, dtype=np.float64))
+    swapped = 1.0 - y[:, [_MR, _ML, _R, _M, _L, _ANGLE]]
+    # The range of `m` is not symmetric about 0, and its inactive end stays where it is.
+    m = decode_values(y)[:, _M]
+    mirrored_m = np.where(m < ON_MARKING_LIMIT_M, -m, m)
+    swapped[:, _M] = OFFSET + SPAN * (mirrored_m - _LO[_M]) / _WIDTH[_M]
+    return np.clip(swapped, 0.0, 1.0).astype(np.float32)
+
+
+def mirror_heading(heading: ArrayLike) -> NDArray[np.int64]:
+    """The classes (N,) of the mirrored scenes: left and right change places."""
+    return Heading.RIGHT - np.asarray(heading, dtype=np.int64)
