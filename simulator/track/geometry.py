@@ -1,0 +1,199 @@
+"""A track: a closed centre line of constant-curvature pieces, with both edges' heights.
+
+World frame: x, y in the plane, z up. s in metres along the centre line in driving direction,
+y and to_middle in metres, left positive; headings in radians, counter-clockwise.
+"""
+
+import hashlib
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from simulator.track import kernel
+from simulator.track.markings import MarkingStyle
+from simulator.track.pieces import Placed
+
+FloatArray = NDArray[np.float64]
+Source = Literal["own", "torcs", "csv"]
+Surface = Literal["asphalt", "gravel", "concrete"]
+
+
+@dataclass(frozen=True)
+class TrackPose:
+    """Points of the road plane; arrays of one shape, heading in (-pi, pi]."""
+
+    x: FloatArray
+    y: FloatArray
+    z: FloatArray
+    heading: FloatArray
+    curvature: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """One track. Arrays are (P,), one entry a piece, in driving order; the last piece ends where
+    the first begins (an imported track may miss it by up to 0.15 m)."""
+
+    name: str
+    source: Source
+    width: float
+    """The track's own full width, m; a road laid on it may be wider (see `road.Road`)."""
+    surface: Surface
+    look: str
+    """Scenery style: highway, mountain, circuit, oval, town, forest, coast, gravel, countryside."""
+    markings: MarkingStyle
+    s0: FloatArray
+    length: FloatArray
+    x0: FloatArray
+    y0: FloatArray
+    heading0: FloatArray
+    curvature0: FloatArray
+    z_left0: FloatArray
+    z_right0: FloatArray
+    z_left1: FloatArray
+    z_right1: FloatArray
+
+    @classmethod
+    def from_placed(
+        cls,
+        placed: Placed,
+        *,
+        name: str,
+        source: Source,
+        width: float,
+        surface: Surface,
+        look: str,
+        markings: MarkingStyle,
+    ) -> Self:
+        """Build a track from pieces put end to end."""
+        return cls(
+            name,
+            source,
+            width,
+            surface,
+            look,
+            markings,
+            placed.s0,
+            placed.length,
+            placed.x0,
+            placed.y0,
+            placed.heading0,
+            placed.curvature,
+            placed.z_left0,
+            placed.z_right0,
+            placed.z_left1,
+            placed.z_right1,
+        )
+
+    @property
+    def length_m(self) -> float:
+        """Length of a lap along the centre line, m."""
+        return float(self.s0[-1] + self.length[-1])
+
+    @property
+    def min_radius_m(self) -> float:
+        """Smallest centre-line radius of a piece, m; infinite without a bend."""
+        sharpest = float(np.max(np.abs(self.curvature0)))
+        return 1.0 / sharpest if sharpest > 0.0 else float("inf")
+
+    @property
+    def z_range_m(self) -> float:
+        """Highest minus lowest centre-line height, m."""
+        heights = np.concatenate((self.z_left0 + self.z_right0, self.z_left1 + self.z_right1)) / 2
+        return float(np.ptp(heights))
+
+    @property
+    def grade_range(self) -> tuple[float, float]:
+        """Steepest fall and rise of the centre line in driving direction (min, max), as dz/ds."""
+        rise = (self.z_left1 + self.z_right1 - self.z_left0 - self.z_right0) / 2
+        grade = rise / self.length
+        return float(grade.min()), float(grade.max())
+
+    @cached_property
+    def content_hash(self) -> str:
+        """SHA-256 (hex) of the geometry: the same for the same road, whatever its name."""
+        return hashlib.sha256(self.arrays().astype("<f8").tobytes()).hexdigest()
+
+    @cached_property
+    def _table(self) -> FloatArray:
+        table = np.empty((len(self.s0), kernel.COLUMNS), dtype=np.float64)
+        table[:, kernel.S0] = self.s0
+        table[:, kernel.LENGTH] = self.length
+        table[:, kernel.X0] = self.x0
+        table[:, kernel.Y0] = self.y0
+        table[:, kernel.HEADING0] = self.heading0
+        table[:, kernel.CURVATURE] = self.curvature0
+        table[:, kernel.Z_LEFT0] = self.z_left0
+        table[:, kernel.Z_RIGHT0] = self.z_right0
+        table[:, kernel.Z_LEFT1] = self.z_left1
+        table[:, kernel.Z_RIGHT1] = self.z_right1
+        table[:, kernel.HALF_WIDTH] = self.width / 2
+        table[:, kernel.TRACK_LENGTH] = self.length_m
+        return table
+
+    def arrays(self) -> FloatArray:
+        """The C-contiguous (P, 12) table that the kernels of `track.kernel` take."""
+        return self._table
+
+    def at(self, s: ArrayLike, y: ArrayLike = 0.0) -> TrackPose:
+        """Points of the road plane at (s, y); both broadcast, s wraps round the lap."""
+        distance, offset = np.broadcast_arrays(
+            np.asarray(s, dtype=np.float64), np.asarray(y, dtype=np.float64)
+        )
+        index, along = self._pieces_at(distance)
+        k = self.curvature0[index]
+        turn = k * along
+        chord = along * np.sinc(turn / (2.0 * np.pi))
+        direction = self.heading0[index] + turn / 2.0
+        heading = self.heading0[index] + turn
+        share = along / self.length[index]
+        left = self.z_left0[index] + (self.z_left1 - self.z_left0)[index] * share
+        right = self.z_right0[index] + (self.z_right1 - self.z_right0)[index] * share
+        return TrackPose(
+            x=self.x0[index] + chord * np.cos(direction) - offset * np.sin(heading),
+            y=self.y0[index] + chord * np.sin(direction) + offset * np.cos(heading),
+            z=(left + right) / 2.0 + (left - right) * offset / self.width,
+            heading=wrap_angle(heading),
+            curvature=k,
+        )
+
+    def project(self, x: float, y: float, hint_s: float | None = None) -> tuple[float, float]:
+        """Track coordinates (s, to_middle) of a world point.
+
+        Without `hint_s` the nearest point of the whole centre line counts; with it, the part of
+        the track near that s, which tells a bridge from the road below.
+        """
+        table = self.arrays()
+        hint = -1 if hint_s is None else kernel.index_at(table, float(hint_s))
+        _, s, to_middle = kernel.locate(table, float(x), float(y), hint)
+        return float(s), float(to_middle)
+
+    def heading(self, s: float) -> float:
+        """Tangent direction at s, rad in (-pi, pi]."""
+        _, _, _, heading, _ = kernel.pose_at(self.arrays(), float(s))
+        return float(wrap_angle(np.float64(heading)))
+
+    def curvature(self, s: float) -> float:
+        """Signed curvature at s (left positive), 1/m; s wraps. `at` is the vectorised one."""
+        return float(self.curvature0[kernel.index_at(self.arrays(), float(s))])
+
+    def slope(self, s: float) -> float:
+        """Rise of the centre line per metre of s at s (dz/ds, uphill positive)."""
+        i = kernel.index_at(self.arrays(), float(s))
+        rise = self.z_left1[i] + self.z_right1[i] - self.z_left0[i] - self.z_right0[i]
+        return float(rise / 2.0 / self.length[i])
+
+    def _pieces_at(self, s: FloatArray) -> tuple[NDArray[np.intp], FloatArray]:
+        wrapped = np.mod(s, self.length_m)
+        # np.mod of a tiny negative number may round up to the modulus itself.
+        wrapped = np.where(wrapped >= self.length_m, 0.0, wrapped)
+        index = np.searchsorted(self.s0, wrapped, side="right") - 1
+        return index, wrapped - self.s0[index]
+
+
+def wrap_angle(angle: FloatArray | np.float64) -> FloatArray:
+    """Angles brought into (-pi, pi]."""
+    return np.asarray(np.pi - np.mod(np.pi - angle, 2.0 * np.pi), dtype=np.float64)

@@ -1,0 +1,171 @@
+"""The track as compiled code sees it: one (P, 12) table of constant-curvature pieces.
+
+A piece is a straight or an arc of the centre line with edge heights linear in its arc length.
+World frame (x, y plane, z up); s along the centre line, to_middle left positive; metres, radians.
+"""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from simulator.compiled import compiled
+
+Table = NDArray[np.float64]
+
+S0, LENGTH, X0, Y0, HEADING0, CURVATURE = 0, 1, 2, 3, 4, 5
+Z_LEFT0, Z_RIGHT0, Z_LEFT1, Z_RIGHT1 = 6, 7, 8, 9
+HALF_WIDTH, TRACK_LENGTH = 10, 11
+COLUMNS = 12
+
+MAX_WALK = 64
+"""Pieces a hint may be wrong by before all pieces are searched."""
+HINT_REACH_M = 40.0
+"""A foot point farther off than this is not trusted to be on the hinted part of the track."""
+
+
+@compiled
+def foot(table: Table, index: int, x: float, y: float) -> tuple[float, float]:
+    """Foot point of (x, y) on piece `index`, extended beyond both ends: (local s, to_middle).
+
+    Exact on arcs and free of cancellation as the curvature goes to zero. A piece turns at most
+    a quarter circle (see `pieces.assemble`), so the angle never wraps near it.
+    """
+    dx = x - table[index, X0]
+    dy = y - table[index, Y0]
+    cos_h = math.cos(table[index, HEADING0])
+    sin_h = math.sin(table[index, HEADING0])
+    u = dx * cos_h + dy * sin_h
+    v = -dx * sin_h + dy * cos_h
+    k = table[index, CURVATURE]
+    if k == 0.0:
+        return u, v
+    q = math.sqrt((k * u) ** 2 + (1.0 - k * v) ** 2)
+    return math.atan2(k * u, 1.0 - k * v) / k, (2.0 * v - k * (u * u + v * v)) / (1.0 + q)
+
+
+@compiled
+def centre_point(table: Table, index: int, along: float) -> tuple[float, float]:
+    """Point (x, y) of the centre line `along` metres into piece `index`."""
+    half_turn = 0.5 * along * table[index, CURVATURE]
+    chord = along
+    if half_turn != 0.0:
+        chord = along * math.sin(half_turn) / half_turn
+    direction = table[index, HEADING0] + half_turn
+    return (
+        table[index, X0] + chord * math.cos(direction),
+        table[index, Y0] + chord * math.sin(direction),
+    )
+
+
+@compiled
+def index_at(table: Table, s: float) -> int:
+    """Index of the piece that holds `s`; s wraps round the lap."""
+    wrapped = wrap(table, s)
+    index = int(np.searchsorted(table[:, S0], wrapped, side="right")) - 1
+    return max(index, 0)
+
+
+@compiled
+def wrap(table: Table, s: float) -> float:
+    """`s` brought into [0, track length)."""
+    total = table[0, TRACK_LENGTH]
+    wrapped = s - total * math.floor(s / total)
+    return wrapped if wrapped < total else 0.0
+
+
+@compiled
+def locate_everywhere(table: Table, x: float, y: float) -> tuple[int, float, float]:
+    """Nearest point of the whole centre line, as `locate`; the first of equally near ones."""
+    best, best_s, best_d, best_squared = 0, 0.0, 0.0, math.inf
+    for index in range(table.shape[0]):
+        reach = table[index, LENGTH]
+        dx = x - table[index, X0]
+        dy = y - table[index, Y0]
+        # No point of a piece is farther from its start than its length.
+        if best_squared < math.inf:
+            start_distance = math.sqrt(dx * dx + dy * dy)
+            if start_distance > reach + math.sqrt(best_squared):
+                continue
+        along, d = foot(table, index, x, y)
+        along = min(max(along, 0.0), reach)
+        px, py = centre_point(table, index, along)
+        squared = (x - px) ** 2 + (y - py) ** 2
+        if squared < best_squared:
+            best, best_s, best_d, best_squared = index, along, d, squared
+    # In the wedge outside a kink of the centre line (the closing joint of a TORCS track) no
+    # perpendicular foot exists; the offset from the extended piece is then as near as any.
+    return best, wrap(table, table[best, S0] + best_s), best_d
+
+
+@compiled
+def locate(table: Table, x: float, y: float, hint_index: int) -> tuple[int, float, float]:
+    """Track coordinates of a world point: (piece index, s, to_middle).
+
+    With `hint_index` >= 0 the search walks from that piece to its neighbours, so that a car
+    under a bridge stays on its own road; -1, a hint too far off, or a point beyond the centre
+    of a bend, searches the whole track. s is in [0, track length).
+    """
+    count = table.shape[0]
+    if hint_index < 0 or hint_index >= count:
+        return locate_everywhere(table, x, y)
+    index, last_move = hint_index, 0
+    for _ in range(min(MAX_WALK, count)):
+        along, d = foot(table, index, x, y)
+        length = table[index, LENGTH]
+        move = 0
+        if along < 0.0:
+            move = -1
+        elif along > length:
+            move = 1
+        # Turning back means the point lies in the joint between two pieces.
+        if move == 0 or move == -last_move:
+            along = min(max(along, 0.0), length)
+            if abs(d) > HINT_REACH_M or d * table[index, CURVATURE] >= 1.0:
+                return locate_everywhere(table, x, y)
+            return index, wrap(table, table[index, S0] + along), d
+        last_move = move
+        index = (index + move) % count
+    return locate_everywhere(table, x, y)
+
+
+@compiled
+def surface(
+    table: Table, index: int, s: float, to_middle: float
+) -> tuple[float, float, float, float]:
+    """Height and unit normal (z, nx, ny, nz) of the road plane at (s, to_middle) on a piece.
+
+    Beyond the track's width the banking plane goes on.
+    """
+    length = table[index, LENGTH]
+    along = min(max(s - table[index, S0], 0.0), length)
+    left_slope = (table[index, Z_LEFT1] - table[index, Z_LEFT0]) / length
+    right_slope = (table[index, Z_RIGHT1] - table[index, Z_RIGHT0]) / length
+    left = table[index, Z_LEFT0] + left_slope * along
+    right = table[index, Z_RIGHT0] + right_slope * along
+    width = 2.0 * table[index, HALF_WIDTH]
+    across = (left - right) / width
+    share = to_middle / width
+    k = table[index, CURVATURE]
+    # A metre of s is (1 - k y) metres on the ground at offset y.
+    stretch = max(1.0 - k * to_middle, 0.05)
+    slope = (0.5 * (left_slope + right_slope) + share * (left_slope - right_slope)) / stretch
+    heading = table[index, HEADING0] + k * along
+    cos_h, sin_h = math.cos(heading), math.sin(heading)
+    gx = slope * cos_h - across * sin_h
+    gy = slope * sin_h + across * cos_h
+    norm = math.sqrt(1.0 + gx * gx + gy * gy)
+    z = 0.5 * (left + right) + across * to_middle
+    return z, -gx / norm, -gy / norm, 1.0 / norm
+
+
+@compiled
+def pose_at(table: Table, s: float) -> tuple[float, float, float, float, float]:
+    """Centre-line pose (x, y, z, heading, curvature) at `s`; s wraps, heading is unwrapped."""
+    index = index_at(table, s)
+    wrapped = wrap(table, s)
+    along = wrapped - table[index, S0]
+    x, y = centre_point(table, index, along)
+    z, _, _, _ = surface(table, index, wrapped, 0.0)
+    k = table[index, CURVATURE]
+    return x, y, z, table[index, HEADING0] + k * along, k

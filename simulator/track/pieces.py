@@ -1,0 +1,97 @@
+"""From lengths, curvatures and edge heights to placed constant-curvature pieces.
+
+Lengths in metres, curvature in 1/m (left positive), headings in radians counter-clockwise.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+
+MAX_TURN = math.pi / 2
+"""No piece turns farther, so that a foot point on an arc is unique near it."""
+
+
+@dataclass(frozen=True)
+class Piece:
+    """One step of a centre line, with the heights of both edges at its ends."""
+
+    length: float
+    curvature: float
+    z_left0: float
+    z_right0: float
+    z_left1: float
+    z_right1: float
+
+
+@dataclass(frozen=True)
+class Placed:
+    """Pieces put end to end in the plane, all arrays (P,), and where the last one ends."""
+
+    s0: FloatArray
+    length: FloatArray
+    x0: FloatArray
+    y0: FloatArray
+    heading0: FloatArray
+    curvature: FloatArray
+    z_left0: FloatArray
+    z_right0: FloatArray
+    z_left1: FloatArray
+    z_right1: FloatArray
+    end: tuple[float, float, float]
+    """x, y, heading (unwrapped) at the end of the last piece."""
+
+
+def split_turns(pieces: list[Piece]) -> list[Piece]:
+    """Cut every piece that turns more than `MAX_TURN` into equal ones; heights stay linear."""
+    cut: list[Piece] = []
+    for piece in pieces:
+        parts = max(1, math.ceil(abs(piece.curvature) * piece.length / MAX_TURN - 1e-9))
+        for i in range(parts):
+            a, b = i / parts, (i + 1) / parts
+            cut.append(
+                Piece(
+                    piece.length / parts,
+                    piece.curvature,
+                    _between(piece.z_left0, piece.z_left1, a),
+                    _between(piece.z_right0, piece.z_right1, a),
+                    _between(piece.z_left0, piece.z_left1, b),
+                    _between(piece.z_right0, piece.z_right1, b),
+                )
+            )
+    return cut
+
+
+def _between(start: float, end: float, share: float) -> float:
+    return end if share == 1.0 else start + (end - start) * share
+
+
+def assemble(pieces: list[Piece], x: float = 0.0, y: float = 0.0, heading: float = 0.0) -> Placed:
+    """Place pieces end to end, tangent to tangent, from the pose (x, y, heading)."""
+    cut = split_turns(pieces)
+    length = np.array([piece.length for piece in cut], dtype=np.float64)
+    curvature = np.array([piece.curvature for piece in cut], dtype=np.float64)
+    turn = curvature * length
+    headings = heading + np.concatenate(([0.0], np.cumsum(turn)))
+    # np.sinc(t) = sin(pi t)/(pi t): the chord of an arc that turns by `turn`.
+    chord = length * np.sinc(turn / (2.0 * np.pi))
+    middle = headings[:-1] + turn / 2.0
+    xs = x + np.concatenate(([0.0], np.cumsum(chord * np.cos(middle))))
+    ys = y + np.concatenate(([0.0], np.cumsum(chord * np.sin(middle))))
+    heights = np.array([[p.z_left0, p.z_right0, p.z_left1, p.z_right1] for p in cut])
+    return Placed(
+        s0=np.concatenate(([0.0], np.cumsum(length)[:-1])),
+        length=length,
+        x0=xs[:-1],
+        y0=ys[:-1],
+        heading0=headings[:-1],
+        curvature=curvature,
+        z_left0=heights[:, 0].copy(),
+        z_right0=heights[:, 1].copy(),
+        z_left1=heights[:, 2].copy(),
+        z_right1=heights[:, 3].copy(),
+        end=(float(xs[-1]), float(ys[-1]), float(headings[-1])),
+    )
