@@ -5,7 +5,7 @@ in the last bit; every recording and replay relies on them being equal.
 """
 
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import numba
 
@@ -14,5 +14,4 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 def compiled(function: Function) -> Function:
     """Compile `function` with numba in no-python mode, keeping its type for the type checker."""
-    kernel: Function = numba.njit(cache=True, fastmath=False, error_model="numpy")(function)
-    return kernel
+    return cast(Function, numba.njit(cache=True, fastmath=False, error_model="numpy")(function))

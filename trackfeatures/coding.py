@@ -23,11 +23,11 @@ _ML, _MR, _L, _M, _R, _ANGLE = range(len(TARGETS))
 
 
 def encode(distances: ArrayLike, angle: ArrayLike) -> NDArray[np.float32]:
-    """Coded targets (N, 6) of `distances` (N, 5) in m, NaN where absent, and `angle` (N,) in rad."""
+    """Coded targets (N, 6) of distances (N, 5) in m, NaN where absent, and angles (N,) in rad."""
     metres = np.atleast_2d(np.asarray(distances, dtype=np.float64))
     present = np.where(np.isnan(metres), _INACTIVE, metres)
     values = np.column_stack([present, np.atleast_1d(np.asarray(angle, dtype=np.float64))])
-    return np.clip(OFFSET + SPAN * (values - _LO) / _WIDTH, 0.0, 1.0).astype(np.float32)
+    return _clip(OFFSET + SPAN * (values - _LO) / _WIDTH)
 
 
 def decode_values(coded: ArrayLike) -> NDArray[np.float64]:
@@ -53,13 +53,14 @@ def decode(coded: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 def encode_features(features: TrackFeatures) -> NDArray[np.float32]:
     """Coded targets (6,) of one moment."""
     distances = [np.nan if d is None else d for d in features.distances.values()]
-    return encode([distances], [features.angle])[0]
+    coded: NDArray[np.float32] = encode([distances], [features.angle])[0]
+    return coded
 
 
 def decode_features(coded: ArrayLike, heading: Heading) -> TrackFeatures:
     """The features that coded values (6,) and a class say."""
     distances, angle = decode(coded)
-    ml, mr, l, m, r = (None if np.isnan(d) else float(d) for d in distances[0])  # noqa: E741
+    ml, mr, l, m, r = (None if np.isnan(d) else float(d) for d in distances[0])
     return TrackFeatures(ml, mr, l, m, r, float(angle[0]), heading)
 
 
@@ -71,9 +72,14 @@ def mirror_coded(coded: ArrayLike) -> NDArray[np.float32]:
     m = decode_values(y)[:, _M]
     mirrored_m = np.where(m < ON_MARKING_LIMIT_M, -m, m)
     swapped[:, _M] = OFFSET + SPAN * (mirrored_m - _LO[_M]) / _WIDTH[_M]
-    return np.clip(swapped, 0.0, 1.0).astype(np.float32)
+    return _clip(swapped)
 
 
 def mirror_heading(heading: ArrayLike) -> NDArray[np.int64]:
     """The classes (N,) of the mirrored scenes: left and right change places."""
     return Heading.RIGHT - np.asarray(heading, dtype=np.int64)
+
+
+def _clip(coded: NDArray[np.float64]) -> NDArray[np.float32]:
+    clipped: NDArray[np.float32] = np.clip(coded, 0.0, 1.0).astype(np.float32)
+    return clipped

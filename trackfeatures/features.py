@@ -12,7 +12,7 @@ class TrackFeatures:
 
     ml: float | None
     mr: float | None
-    l: float | None  # noqa: E741  # the paper's name
+    l: float | None
     m: float | None
     r: float | None
     angle: float
@@ -30,7 +30,7 @@ class TrackFeatures:
             return (self.ml + self.mr) / 2
         if self.m is None:
             return None
-        # The lane lies to the right of a marking that is on the car's left, and the other way round.
+        # A marking on the car's left has the car's lane on its right, and the other way round.
         first, second = (self.r, self.l) if self.m <= 0 else (self.l, self.r)
         neighbour = first if first is not None else second
         return None if neighbour is None else (self.m + neighbour) / 2

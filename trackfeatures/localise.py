@@ -11,10 +11,11 @@ def localise(distances: ArrayLike) -> NDArray[np.float64]:
     outside the road it is the only lane next to that marking. The same rule for one moment is
     `TrackFeatures.to_lane_centre`.
     """
-    ml, mr, l, m, r = np.atleast_2d(np.asarray(distances, dtype=np.float64)).T  # noqa: E741
+    ml, mr, l, m, r = np.atleast_2d(np.asarray(distances, dtype=np.float64)).T
     in_lane = (ml + mr) / 2
     right_lane, left_lane = (m + r) / 2, (l + m) / 2
     first = np.where(m <= 0, right_lane, left_lane)
     second = np.where(m <= 0, left_lane, right_lane)
     on_marking = np.where(np.isnan(first), second, first)
-    return np.where(np.isnan(in_lane), on_marking, in_lane)
+    nearest: NDArray[np.float64] = np.where(np.isnan(in_lane), on_marking, in_lane)
+    return nearest

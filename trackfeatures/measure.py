@@ -80,7 +80,7 @@ def measure(
 ) -> TrackFeatures:
     """The features of a car `to_middle` m left of the centre of a road, heading `angle` (rad)."""
     ml, mr = _in_lane(to_middle, lanes, lane_width_m)
-    l, m, r = _on_marking(to_middle, lanes, lane_width_m)  # noqa: E741  # the paper's name
+    l, m, r = _on_marking(to_middle, lanes, lane_width_m)
     heading = classify_heading(curvature, curvature_ahead)
     return TrackFeatures(ml, mr, l, m, r, angle, heading)
 
