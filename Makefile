@@ -1,0 +1,66 @@
+# driverview: `make demo` shows the whole pipeline, `make test` checks it. `make help` lists the rest.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+READY := $(VENV)/.ready
+PACKAGES := trackfeatures simulator datagen mtlnet serve controllers
+export PATH := $(CURDIR)/$(BIN):$(PATH)
+
+.PHONY: help setup system demo test check quick e2e bench format lock clean
+
+help: ## list the targets
+	@grep -hE '^[a-z0-9]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 10
+
+setup: $(READY) ## make .venv with everything in it (about 6 GB, minutes)
+
+# The lock pins every version; torch and torchvision come together, from one index.
+$(READY): pyproject.toml requirements.lock
+	@$(MAKE) --no-print-directory system
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+	  { echo "error: $$($(PYTHON) --version) found, Python 3.11 or newer is needed: make PYTHON=python3.11 setup" >&2; exit 1; }
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --requirement requirements.lock
+	$(BIN)/python -m pip install --quiet --no-deps --editable .
+	@touch $@
+
+# The camera renders through EGL; with no GPU, Mesa's llvmpipe does the work.
+EGL_PACKAGES := libegl1 libgl1-mesa-dri
+system:
+	@if ldconfig -p 2>/dev/null | grep -q 'libEGL\.so\.1' && \
+	  { ldconfig -p | grep -q 'libEGL_nvidia' || find /usr/lib* -name 'swrast_dri.so' -o -name 'libgallium*' 2>/dev/null | grep -q .; }; then :; \
+	elif ! command -v apt-get >/dev/null; then \
+	  echo "error: EGL and Mesa are missing; install your system's packages for them ($(EGL_PACKAGES) on Debian)" >&2; exit 1; \
+	elif [ "$$(id -u)" = 0 ]; then apt-get update -qq && DEBIAN_FRONTEND=noninteractive apt-get install -y -qq $(EGL_PACKAGES); \
+	elif sudo -n true 2>/dev/null; then sudo apt-get update -qq && sudo apt-get install -y -qq $(EGL_PACKAGES); \
+	else echo "error: EGL and Mesa are missing; type: sudo apt-get install $(EGL_PACKAGES)" >&2; exit 1; fi
+
+demo: $(READY) ## collect, train, evaluate, serve, ask, report: in 15 minutes on two cores
+	$(BIN)/controllers demo --out demo
+
+test: check $(READY) ## all checks and tests
+	$(BIN)/pytest
+
+check: $(READY) ## format, lint, types, imports
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/mypy $(PACKAGES) tests
+	$(BIN)/lint-imports
+
+quick: $(READY) ## the tests that take seconds
+	$(BIN)/pytest -m "not slow"
+
+e2e: $(READY) ## one round from the simulator to a steered car
+	$(BIN)/pytest tests/e2e
+
+bench: $(READY) ## every benchmark, side by side with what it claims to beat
+	for script in benchmarks/*.py; do $(BIN)/python $$script || exit 1; done
+
+format: $(READY) ## put the code in order
+	$(BIN)/ruff format .
+	$(BIN)/ruff check --fix .
+
+lock: ## pin what is installed now, after a change of pyproject.toml
+	$(BIN)/python -m pip freeze --exclude-editable | grep -vE '^(pip|setuptools)==' > requirements.lock
+
+clean: ## remove what was built and collected here, the environment too
+	rm -rf $(VENV) demo build dist *.egg-info
