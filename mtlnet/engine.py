@@ -1,0 +1,133 @@
+"""Running a trained model on images: OpenVINO by default, torch in float32 as the oracle.
+
+Free of torch until the torch engine is asked for: the serving image has none. An engine takes one
+image as it came from the camera, uint8 RGB; its normalisation is part of the exported graph.
+"""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mtlnet.answer import OUTPUTS
+from mtlnet.card import (
+    GRAPH,
+    GRAPH_WEIGHTS,
+    WEIGHTS,
+    ModelCard,
+    ModelError,
+    check_files,
+    read_card,
+)
+
+if TYPE_CHECKING:
+    from mtlnet.network import Network
+
+Precision = Literal["bf16", "f32"]
+
+
+class Engine(Protocol):
+    """A model ready to run; not to be shared between threads."""
+
+    @property
+    def card(self) -> ModelCard:
+        """What the model is."""
+
+    def __call__(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
+        """Image (H, W, 3) RGB of `card.camera`'s size -> (9,) outputs, see `mtlnet.answer`."""
+
+
+def load_engine(
+    run: Path,
+    kind: Literal["openvino", "torch"] = "openvino",
+    precision: Precision | None = None,
+    threads: int = 1,
+) -> Engine:
+    """The model of folder `run` (see `mtlnet.card.resolve_run`), ready to run.
+
+    `precision` None: bf16 where the CPU computes in it, float32 elsewhere. The torch engine knows
+    float32 only. Raises ModelError when the model is missing, unfinished or damaged.
+    """
+    card = read_card(run)
+    if kind == "torch":
+        if precision == "bf16":
+            raise ModelError("the torch engine is the float32 oracle; ask for precision f32")
+        return TorchEngine(run, card, threads)
+    return OpenVinoEngine(run, card, precision, threads)
+
+
+class OpenVinoEngine:
+    """The exported graph, compiled for this CPU. `precision` is what it really computes in."""
+
+    def __init__(
+        self, run: Path, card: ModelCard, precision: Precision | None = None, threads: int = 1
+    ) -> None:
+        import openvino
+
+        check_files(run, card, (GRAPH, GRAPH_WEIGHTS))
+        core = openvino.Core()
+        self.card = card
+        self.precision: Precision = precision or best_precision(core)
+        options = {
+            "INFERENCE_PRECISION_HINT": self.precision,
+            "INFERENCE_NUM_THREADS": threads,
+            "NUM_STREAMS": 1,
+            # Two workers told to pin would choose the same core.
+            "ENABLE_CPU_PINNING": False,
+        }
+        try:
+            model = core.read_model(str(run / GRAPH))
+            compiled = core.compile_model(model, "CPU", options)
+        except RuntimeError as error:
+            reason = str(error).strip().splitlines()[-1]
+            raise ModelError(f"OpenVINO cannot load {run / GRAPH}: {reason}") from error
+        self._request = compiled.create_infer_request()
+        self._shape = tuple(compiled.input(0).shape)
+        self._input: NDArray[np.uint8] = np.empty(self._shape, np.uint8)
+        self._request.set_input_tensor(0, openvino.Tensor(self._input, shared_memory=True))
+        self._output: NDArray[np.float32] = self._request.get_output_tensor(0).data
+
+    def __call__(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
+        check_image(image, self._shape[1:])
+        self._input[0] = image
+        self._request.infer()
+        outputs: NDArray[np.float32] = self._output.reshape(OUTPUTS).copy()
+        return outputs
+
+
+class TorchEngine:
+    """The same network in torch, float32: the oracle the exported graph is held against."""
+
+    def __init__(self, run: Path, card: ModelCard, threads: int = 1) -> None:
+        import torch
+
+        from mtlnet.network import load_network
+
+        check_files(run, card, (WEIGHTS,))
+        torch.set_num_threads(threads)
+        self.card = card
+        self.precision: Precision = "f32"
+        self._network: Network = load_network(run / WEIGHTS)
+        self._shape = (card.camera.height, card.camera.width, 3)
+
+    def __call__(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
+        from mtlnet.network import answer_images
+
+        check_image(image, self._shape)
+        outputs: NDArray[np.float32] = answer_images(self._network, image[None])[0]
+        return outputs
+
+
+def best_precision(core: Any) -> Precision:
+    """bf16 where this CPU computes in it natively (AVX512-BF16 or AMX), float32 elsewhere."""
+    return "bf16" if "BF16" in core.get_property("CPU", "OPTIMIZATION_CAPABILITIES") else "f32"
+
+
+def check_image(image: NDArray[np.uint8], shape: tuple[int, ...]) -> None:
+    """Raise ModelError unless `image` is uint8 of `shape` (height, width, 3)."""
+    if image.shape != tuple(shape) or image.dtype != np.uint8:
+        raise ModelError(
+            f"the image is {image.dtype} of shape {image.shape}; this model takes uint8 RGB of "
+            f"shape {tuple(shape)} (height, width, 3): scale it first"
+        )

@@ -1,0 +1,80 @@
+"""The multi-task loss (paper, equations 6 to 9): three tasks weighted by alpha.
+
+Distances: squared error, summed over the five coded distances, mean over the batch. Angle: squared
+error of the coded angle, mean over the batch. Type: cross-entropy of the class, mean over the
+batch. The L2 term is the optimiser's: a weight decay of 2 lambda is the gradient of lambda |w|^2.
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn.functional import cross_entropy
+
+from trackfeatures.errors import UserError
+
+TASKS = ("distance", "angle", "type")
+Alpha = tuple[float, float, float]
+
+
+class AlphaError(UserError):
+    """Task weights that are no task weights."""
+
+
+@dataclass(frozen=True)
+class Losses:
+    """The unweighted loss of each task, as reported, and the weighted sum that is minimised."""
+
+    distance: Tensor
+    angle: Tensor
+    type: Tensor
+    total: Tensor
+
+
+def parse_alpha(text: str) -> Alpha:
+    """Three weights "distance,angle,type", non-negative, of any sum; 0 leaves a task out.
+
+    Raises AlphaError naming what was seen.
+    """
+    parts = [part.strip() for part in text.split(",")]
+    how = "give three weights for distance, angle and type, such as --alpha 0.3,0.2,0.5"
+    if len(parts) != len(TASKS):
+        raise AlphaError(f"alpha has {len(parts)} weight(s) ({text!r}); {how}")
+    try:
+        distance, angle, kind = (float(part) for part in parts)
+    except ValueError:
+        raise AlphaError(
+            f"alpha {text!r} has a weight that is missing or no number; {how}"
+        ) from None
+    for task, weight in zip(TASKS, (distance, angle, kind), strict=True):
+        if not math.isfinite(weight) or weight < 0:
+            raise AlphaError(
+                f"alpha's weight for {task} is {weight:g}; it must be 0 or more; {how}"
+            )
+    if distance == angle == kind == 0:
+        raise AlphaError(f"alpha {text!r} leaves nothing to learn; give at least one task a weight")
+    return distance, angle, kind
+
+
+def multi_task_loss(
+    outputs: Tensor, coded: Tensor, heading: Tensor, alpha: Alpha, scale: Tensor | None = None
+) -> Losses:
+    """Losses of outputs (B, 9) for targets coded (B, 6) and heading (B,) int64.
+
+    `scale` (6,): variances of the coded targets. With it, the sum that is minimised (never the
+    reported losses) counts squared errors in units of them, distances as their mean: a task
+    answered by its mean then costs about 1, whatever its range.
+    """
+    squared = (outputs[:, :6].float() - coded) ** 2
+    distance = squared[:, :5].sum(1).mean()
+    angle = squared[:, 5].mean()
+    kind = cross_entropy(outputs[:, 6:].float(), heading)
+    if scale is None:
+        terms = (distance, angle, kind)
+    else:
+        scaled = squared / scale
+        terms = (scaled[:, :5].mean(), scaled[:, 5].mean(), kind)
+    # A weight of 0 takes the task out of the graph: a true single-task network.
+    weighted = [weight * term for weight, term in zip(alpha, terms, strict=True) if weight > 0]
+    return Losses(distance.detach(), angle.detach(), kind.detach(), torch.stack(weighted).sum())

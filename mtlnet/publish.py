@@ -1,0 +1,111 @@
+"""The end of a training run: the paper's network, its OpenVINO graph and its card, checked.
+
+Nothing is said to be finished before the exported graph has answered real frames as torch does.
+"""
+
+import platform
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from safetensors.torch import save
+
+import trackfeatures as tf
+from mtlnet.card import (
+    GRAPH,
+    GRAPH_WEIGHTS,
+    MODEL_FILES,
+    WEIGHTS,
+    Camera,
+    ModelCard,
+    ModelError,
+    file_hash,
+)
+from mtlnet.export import TOLERANCE, write_graph
+from mtlnet.network import Network, answer_images, fold
+
+PACKAGES = ("driverview", "torch", "openvino", "numpy")
+
+
+def publish(
+    network: Network,
+    run: Path,
+    images: NDArray[np.uint8],
+    *,
+    camera: Camera | None = None,
+    alpha: tuple[float, float, float] = (0.3, 0.2, 0.5),
+    recipe: str = "fast",
+    iterations: int = 0,
+    batch: int = 32,
+    seed: int = 0,
+    data: dict[str, Any] | None = None,
+) -> ModelCard:
+    """Fold `network`, write all of `mtlnet.card.MODEL_FILES` and the card into folder `run`.
+
+    `images` (N, 210, 280, 3): frames on which the graph is held against torch. Raises ModelError
+    when it differs by more than `mtlnet.export.TOLERANCE`; the run then has no card.
+    """
+    run.mkdir(parents=True, exist_ok=True)
+    folded = fold(network)
+    partial = run / (WEIGHTS + ".partial")
+    partial.write_bytes(save({name: t.contiguous() for name, t in folded.state_dict().items()}))
+    partial.replace(run / WEIGHTS)
+    # OpenVINO names the weights after the graph, so both are written under another stem first.
+    staged = run / "staged.xml"
+    write_graph(folded, staged)
+    staged.with_suffix(".bin").replace(run / GRAPH_WEIGHTS)
+    staged.replace(run / GRAPH)
+    check = compare(folded, run, images)
+    if check["openvino_f32_max"] > TOLERANCE:
+        raise ModelError(
+            f"the exported graph {run / GRAPH} differs from torch by "
+            f"{check['openvino_f32_max']:.2g}, at most {TOLERANCE:g} is expected: the model is "
+            "not published; report this as a fault"
+        )
+    card = ModelCard(
+        name=run.resolve().name,
+        definitions_version=tf.VERSION,
+        program_version=package_versions()["driverview"],
+        camera=camera or Camera(),
+        alpha=alpha,
+        recipe=recipe,
+        iterations=iterations,
+        batch=batch,
+        seed=seed,
+        data=data or {},
+        versions=package_versions(),
+        files={name: file_hash(run / name) for name in MODEL_FILES},
+        export_check=check,
+    )
+    card.write(run)
+    return card
+
+
+def compare(network: Network, run: Path, images: NDArray[np.uint8]) -> dict[str, float]:
+    """Largest difference of any output between torch in float32 and the graph, per precision."""
+    import openvino
+
+    from mtlnet.engine import best_precision
+
+    expected = answer_images(network, images)
+    core = openvino.Core()
+    differences = {"frames": float(len(images))}
+    for precision in dict.fromkeys(("f32", best_precision(core))):
+        options = {"INFERENCE_PRECISION_HINT": precision, "NUM_STREAMS": 1}
+        request = core.compile_model(str(run / GRAPH), "CPU", options).create_infer_request()
+        answers = np.concatenate([request.infer([image[None]])[0].copy() for image in images])
+        differences[f"openvino_{precision}_max"] = float(np.abs(answers - expected).max())
+    return differences
+
+
+def package_versions() -> dict[str, str]:
+    """Versions of what made the model."""
+    versions = {"python": platform.python_version()}
+    for package in PACKAGES:
+        try:
+            versions[package] = version(package)
+        except PackageNotFoundError:
+            versions[package] = "unknown"
+    return versions
