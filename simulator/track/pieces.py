@@ -5,14 +5,20 @@ Lengths in metres, curvature in 1/m (left positive), headings in radians counter
 
 import math
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from simulator.track.errors import TrackError
+
 FloatArray = NDArray[np.float64]
 
-MAX_TURN = math.pi / 2
+MAX_TURN: Final = math.pi / 2
 """No piece turns farther, so that a foot point on an arc is unique near it."""
+MAX_GAP_M: Final = 0.16
+"""TORCS tracks close within 0.15 m, to the centimetre; forza, the widest gap, has 0.152."""
+MAX_HEADING_GAP: Final = math.radians(0.5)
 
 
 @dataclass(frozen=True)
@@ -95,3 +101,24 @@ def assemble(pieces: list[Piece], x: float = 0.0, y: float = 0.0, heading: float
         z_right1=heights[:, 3].copy(),
         end=(float(xs[-1]), float(ys[-1]), float(headings[-1])),
     )
+
+
+def check_closes(placed: Placed, what: str, max_gap_m: float = MAX_GAP_M) -> None:
+    """Raise TrackError unless the end of the last piece meets the start of the first."""
+    x, y, heading = placed.end
+    gap = math.hypot(x - placed.x0[0], y - placed.y0[0])
+    height = max(
+        abs(placed.z_left1[-1] - placed.z_left0[0]), abs(placed.z_right1[-1] - placed.z_right0[0])
+    )
+    turn = heading - float(placed.heading0[0])
+    advice = "a track must be one closed loop, so correct its last segments"
+    # Written so that NaN fails as well.
+    if not gap <= max_gap_m:
+        raise TrackError(f"{what}: the segments end {gap:.2f} m from their start; {advice}")
+    if not abs(math.remainder(turn, 2.0 * math.pi)) <= MAX_HEADING_GAP:
+        degrees = math.degrees(turn)
+        raise TrackError(f"{what}: the segments turn by {degrees:.2f} deg in all; {advice}")
+    if not height <= max_gap_m:
+        raise TrackError(
+            f"{what}: the segments end {height:.2f} m off their first height; {advice}"
+        )
