@@ -1,0 +1,54 @@
+"""Images to bytes and back: JPEG quality 95 4:2:0, or PNG where nothing may be lost."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+CODECS = ("jpeg", "png")
+JPEG_QUALITY = 95
+JPEG_MAGIC = b"\xff\xd8"
+PNG_MAGIC = b"\x89PNG"
+
+Buffer = bytes | memoryview
+
+
+def encode(image: NDArray[np.uint8], codec: str) -> bytes:
+    """`image` (H, W, 3) RGB."""
+    if codec == "jpeg":
+        import simplejpeg
+
+        contiguous = np.ascontiguousarray(image)
+        return bytes(simplejpeg.encode_jpeg(contiguous, JPEG_QUALITY, "RGB", "420"))
+    import cv2
+
+    done, data = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
+    if not done:
+        raise ValueError(f"cannot write an image of shape {image.shape} as PNG")
+    return data.tobytes()
+
+
+def decode_into(data: Buffer, out: NDArray[np.uint8]) -> None:
+    """Decode into `out` (H, W, 3) RGB; ValueError when it is damaged or of another size."""
+    if data[:2] == JPEG_MAGIC:
+        import simplejpeg
+
+        # Given too small a buffer the decoder complains; a smaller image would pass unseen.
+        height, width = simplejpeg.decode_jpeg_header(data)[:2]
+        _require_shape((height, width), out)
+        simplejpeg.decode_jpeg(data, "RGB", buffer=out)
+    elif bytes(data[:4]) == PNG_MAGIC:
+        import cv2
+
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+        if image is None:
+            raise ValueError("the PNG cannot be decoded")
+        _require_shape(image.shape[:2], out)
+        cv2.cvtColor(image, cv2.COLOR_BGR2RGB, dst=out)
+    else:
+        raise ValueError(f"neither JPEG nor PNG: it starts with {bytes(data[:4])!r}")
+
+
+def _require_shape(found: tuple[int, ...], out: NDArray[np.uint8]) -> None:
+    if tuple(found) != out.shape[:2]:
+        raise ValueError(
+            f"it is {found[1]}x{found[0]} px where {out.shape[1]}x{out.shape[0]} were expected"
+        )

@@ -1,0 +1,101 @@
+"""The labels of many frames as arrays, in the frame and units of `trackfeatures`."""
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .errors import DatasetError
+from .index import RoundIndex
+from .proto.driverview_pb2 import TrackFeatures, VehicleState
+from .topics import CAMERA, EGO_STATE, LABELS
+
+NAN = float("nan")
+
+
+@dataclass(frozen=True)
+class Labels:
+    """One row a frame; `distances` are ml, mr, l, m, r in m, NaN where not active."""
+
+    distances: NDArray[np.float32]  # (N, 5)
+    angle: NDArray[np.float32]  # (N,) rad, as all below
+    heading: NDArray[np.int64]  # 0 left, 1 straight, 2 right
+    lanes: NDArray[np.int64]
+    lane_index: NDArray[np.int64]
+    curvature: NDArray[np.float32]  # 1/m
+    to_lane_centre: NDArray[np.float32]  # m, NaN where absent
+    to_middle: NDArray[np.float32]  # m
+    s: NDArray[np.float32]  # m
+    speed: NDArray[np.float32]  # m/s along the body
+    shadow_fraction: NDArray[np.float32]
+    round: NDArray[np.int64]  # index into the rounds of these frames
+
+    def __len__(self) -> int:
+        return len(self.angle)
+
+    def take(self, indices: NDArray[np.int64]) -> "Labels":
+        return Labels(**{f.name: getattr(self, f.name)[indices] for f in fields(self)})
+
+
+def read_labels(index: RoundIndex, round_number: int) -> Labels:
+    """Labels of all frames of a round; DatasetError unless each image has its label and state."""
+    camera, labels, states = (index.messages[t] for t in (CAMERA, LABELS, EGO_STATE))
+    count = len(camera.log_time)
+    for name, other in (("labels", labels), ("ego states", states)):
+        if not np.array_equal(camera.log_time, other.log_time):
+            raise DatasetError(
+                f"{index.path.name}: {count} images do not pair with its {len(other.log_time)} "
+                f"{name}; run `datagen verify` on the dataset and record the round again"
+            )
+    rows = np.array([_row(labels.payload(i)) for i in range(count)], dtype=np.float64)
+    rows = rows.reshape(count, 13)
+    motion = np.array([_motion(states.payload(i)) for i in range(count)], dtype=np.float64)
+    motion = motion.reshape(count, 2)
+    return Labels(
+        distances=rows[:, :5].astype(np.float32),
+        to_lane_centre=rows[:, 5].astype(np.float32),
+        angle=rows[:, 6].astype(np.float32),
+        heading=rows[:, 7].astype(np.int64),
+        lanes=rows[:, 8].astype(np.int64),
+        lane_index=rows[:, 9].astype(np.int64),
+        curvature=rows[:, 10].astype(np.float32),
+        to_middle=rows[:, 11].astype(np.float32),
+        s=rows[:, 12].astype(np.float32),
+        speed=motion[:, 0].astype(np.float32),
+        shadow_fraction=motion[:, 1].astype(np.float32),
+        round=np.full(count, round_number, dtype=np.int64),
+    )
+
+
+def concatenate(parts: list[Labels]) -> Labels:
+    return Labels(
+        **{
+            f.name: np.concatenate([getattr(part, f.name) for part in parts])
+            for f in fields(Labels)
+        }
+    )
+
+
+def _row(payload: memoryview) -> tuple[float, ...]:
+    m = TrackFeatures.FromString(bytes(payload))
+    has = m.HasField
+    return (
+        m.to_marking_ml if has("to_marking_ml") else NAN,
+        m.to_marking_mr if has("to_marking_mr") else NAN,
+        m.to_marking_l if has("to_marking_l") else NAN,
+        m.to_marking_m if has("to_marking_m") else NAN,
+        m.to_marking_r if has("to_marking_r") else NAN,
+        m.to_lane_centre if has("to_lane_centre") else NAN,
+        m.angle,
+        m.heading,
+        m.lanes,
+        m.lane_index,
+        m.curvature,
+        m.to_middle,
+        m.s,
+    )
+
+
+def _motion(payload: memoryview) -> tuple[float, float]:
+    state = VehicleState.FromString(bytes(payload))
+    return state.vx, state.shadow_fraction
