@@ -1,0 +1,136 @@
+"""The car as one frozen record of parameters (SI units; body frame x forward, y left, z up).
+
+The figures are the paper's (mass, axles, yaw inertia, cornering stiffness) and those of TORCS's
+car1-trb1 (size, gears, torque, aerodynamics), on which the paper drives.
+"""
+
+from dataclasses import astuple, dataclass, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trackfeatures.errors import UserError
+
+GRAVITY = 9.81  # m/s2
+RPM = 60.0 / (2.0 * np.pi)  # rev/min per rad/s
+WHEELS = ("front_left", "front_right", "rear_left", "rear_right")
+TORQUE_RPM_STEP = 1000.0  # the torque table is given at 0, 1000, 2000, ... rev/min
+LOWEST_GEAR, HIGHEST_GEAR = -1, 6  # -1 reverse, 0 neutral
+
+
+@dataclass(frozen=True)
+class CarParameters:
+    """All that makes one car differ from another; the defaults are the paper's car."""
+
+    mass: float = 1150.0
+    """kg, without fuel."""
+    fuel: float = 80.0
+    """kg; it rides at the centre of gravity and is not used up."""
+    inertia: tuple[float, float, float] = (420.0, 1900.0, 2000.0)
+    """kg m2 about x (roll), y (pitch) and z (yaw)."""
+    front_axle: float = 1.27
+    """m from the centre of gravity to the front axle, lf."""
+    rear_axle: float = 1.37
+    """m from the centre of gravity to the rear axle, lr."""
+    front_track: float = 1.68
+    rear_track: float = 1.60
+    cg_height: float = 0.25
+    """m above the road, at rest."""
+    length: float = 4.52
+    width: float = 1.94
+    height: float = 1.10
+
+    spring_front: float = 90_000.0
+    """N/m at the wheel."""
+    spring_rear: float = 90_000.0
+    damper_front: float = 7_000.0
+    """N s/m at the wheel."""
+    damper_rear: float = 7_000.0
+    anti_roll_front: float = 20_000.0
+    """N for each metre by which one wheel of the axle is pushed in further than the other."""
+    anti_roll_rear: float = 10_000.0
+    bump_travel: float = 0.08
+    """m of compression from rest to the bump stop."""
+    bump_spring: float = 600_000.0
+    """N/m added beyond the bump stop."""
+
+    wheel_radius: float = 0.3276
+    wheel_inertia: float = 1.2
+    """kg m2, one wheel."""
+    cornering_stiffness: float = 80_000.0
+    """N/rad, one tyre at its static load; grows in proportion to the load."""
+    friction: float = 1.6
+    """Largest tyre force over its load, on asphalt."""
+    tyre_shape: float = 1.5
+    """C of the magic formula (Pacejka, Tyre and Vehicle Dynamics, 4.3.1)."""
+    rolling_resistance: float = 0.012
+
+    steering_lock: float = 0.36652
+    """rad of the front wheels at steer = 1 (21 deg)."""
+    steering_rate: float = 6.2832
+    """rad/s of the front wheels (360 deg/s)."""
+
+    air_density: float = 1.23
+    drag_coefficient: float = 0.35
+    frontal_area: float = 1.92
+    lift_front: float = 0.35
+    """m2: downforce coefficient times area, at the front axle."""
+    lift_rear: float = 0.75
+
+    gears: tuple[float, float, float, float, float, float] = (3.0, 1.9, 1.4, 1.1, 0.9, 0.77)
+    reverse_gear: float = -4.0
+    final_drive: float = 4.5
+    driveline_efficiency: float = 0.95
+    engine_inertia: float = 0.2423
+    """kg m2, at the crankshaft."""
+    idle_rpm: float = 900.0
+    limiter_rpm: float = 9152.0
+    torque: tuple[float, ...] = (
+        100.0, 160.0, 190.0, 280.0, 350.0, 405.0, 443.0, 465.0, 483.0, 415.0, 360.0,
+    )  # fmt: skip
+    """N m at full throttle at 0, 1000, ... 10000 rev/min."""
+    engine_brake: float = 60.0
+    """N m at closed throttle and at the limiter, falling linearly to none at idle."""
+    differential_viscosity: float = 30.0
+    """N m s/rad between the rear wheels."""
+
+    brake_torque: float = 9_000.0
+    """N m at full brake, four wheels together; enough to lock them."""
+    brake_front_share: float = 0.58
+
+    def __post_init__(self) -> None:
+        for name in ("mass", "front_axle", "rear_axle", "cg_height", "wheel_radius", "friction"):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value > 0):
+                raise UserError(f"car parameter {name} is {value}; give a number above 0")
+        if len(self.torque) != 11:
+            raise UserError(
+                f"the torque table has {len(self.torque)} values; give 11, at 0, 1000 ... 10000 rpm"
+            )
+
+    @property
+    def total_mass(self) -> float:
+        return self.mass + self.fuel
+
+    @property
+    def wheelbase(self) -> float:
+        return self.front_axle + self.rear_axle
+
+    @property
+    def static_loads(self) -> tuple[float, float]:
+        """N on one front and on one rear tyre, at rest on a level road."""
+        half_weight = 0.5 * self.total_mass * GRAVITY
+        return (
+            half_weight * self.rear_axle / self.wheelbase,
+            half_weight * self.front_axle / self.wheelbase,
+        )
+
+    def packed(self) -> NDArray[Any]:
+        """The parameters as a structured array of shape (1,), one field a parameter, for numba."""
+        layout = [
+            (field.name, "f8", (len(value),) if isinstance(value, tuple) else ())
+            for field, value in zip(fields(self), astuple(self), strict=True)
+        ]
+        layout += [(name, "f8", ()) for name in ("total_mass", "load_front", "load_rear")]
+        return np.array([(*astuple(self), self.total_mass, *self.static_loads)], dtype=layout)

@@ -1,0 +1,68 @@
+"""What a driver commands and what the car then does. SI units; angles counter-clockwise, rad."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """The four controls of the paper."""
+
+    steer: float = 0.0
+    """[-1, 1], left positive; times the steering lock is the front-wheel angle."""
+    throttle: float = 0.0
+    """[0, 1]"""
+    brake: float = 0.0
+    """[0, 1]"""
+    gear: int = 1
+    """-1 reverse, 0 neutral, 1 to 6."""
+
+
+@dataclass(frozen=True, slots=True)
+class CarState:
+    """The car at one moment; x, y, z is its centre of gravity."""
+
+    time_s: float
+    x: float
+    y: float
+    z: float
+    yaw: float
+    pitch: float
+    """rad about the body's y axis (left): positive nose down."""
+    roll: float
+    vx: float
+    """m/s along the body, forward positive."""
+    vy: float
+    """m/s to the body's left."""
+    yaw_rate: float
+    s: float
+    """m along the centre line, in [0, length)."""
+    to_middle: float
+    """m left of the centre line."""
+    angle: float
+    """rad, track tangent minus yaw, in (-pi, pi]."""
+    curvature: float
+    """1/m of the centre line, left positive."""
+    rpm: float
+    gear: int
+    wheel_spin: tuple[float, float, float, float]
+    """rad/s: front left, front right, rear left, rear right."""
+    steer: float
+    """Where the front wheels stand, as a share of the lock: lags the command."""
+    lap: int
+    odometer_m: float
+    lap_time_s: float
+    collision: Literal["traffic", "wall"] | None
+    """What the body touched during the last control step."""
+    off_track: bool
+    backwards: bool
+
+    @property
+    def speed(self) -> float:
+        """m/s in the road plane; negative when the car rolls back."""
+        planar = (self.vx * self.vx + self.vy * self.vy) ** 0.5
+        return planar if self.vx >= 0.0 else -planar
+
+    @property
+    def speed_kmh(self) -> float:
+        return 3.6 * self.speed
