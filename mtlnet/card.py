@@ -54,6 +54,7 @@ class ModelCard:
     versions: dict[str, str]
     files: dict[str, str]
     export_check: dict[str, float]
+    golden: tuple[float, ...]  # what torch in float32 answers to `mtlnet.golden.golden_image`, (9,)
 
     @property
     def model_hash(self) -> str:
@@ -92,6 +93,7 @@ def read_card(run: Path) -> ModelCard:
         values = {field.name: content[field.name] for field in fields(ModelCard)}
         values["camera"] = Camera(**values["camera"])
         values["alpha"] = tuple(values["alpha"])
+        values["golden"] = tuple(values["golden"])
         card = ModelCard(**values)
     except (ValueError, KeyError, TypeError) as error:
         raise ModelError(f"{path} is damaged ({error!r}); train the model anew") from error

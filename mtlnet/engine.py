@@ -34,6 +34,14 @@ class Engine(Protocol):
     def card(self) -> ModelCard:
         """What the model is."""
 
+    @property
+    def kind(self) -> str:
+        """The program that runs it: "openvino" or "torch"."""
+
+    @property
+    def precision(self) -> str:
+        """What it computes in: "f32" or "bf16"."""
+
     def __call__(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
         """Image (H, W, 3) RGB of `card.camera`'s size -> (9,) outputs, see `mtlnet.answer`."""
 
@@ -59,6 +67,8 @@ def load_engine(
 
 class OpenVinoEngine:
     """The exported graph, compiled for this CPU. `precision` is what it really computes in."""
+
+    kind = "openvino"
 
     def __init__(
         self, run: Path, card: ModelCard, precision: Precision | None = None, threads: int = 1
@@ -98,6 +108,8 @@ class OpenVinoEngine:
 
 class TorchEngine:
     """The same network in torch, float32: the oracle the exported graph is held against."""
+
+    kind = "torch"
 
     def __init__(self, run: Path, card: ModelCard, threads: int = 1) -> None:
         import torch

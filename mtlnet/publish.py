@@ -24,7 +24,8 @@ from mtlnet.card import (
     file_hash,
 )
 from mtlnet.export import TOLERANCE, write_graph
-from mtlnet.network import Network, answer_images, fold
+from mtlnet.golden import golden_image
+from mtlnet.network import HEIGHT, WIDTH, Network, answer_images, fold
 
 PACKAGES = ("driverview", "torch", "openvino", "numpy")
 
@@ -64,6 +65,7 @@ def publish(
             f"{check['openvino_f32_max']:.2g}, at most {TOLERANCE:g} is expected: the model is "
             "not published; report this as a fault"
         )
+    golden = golden_image(WIDTH, HEIGHT)
     card = ModelCard(
         name=run.resolve().name,
         definitions_version=tf.VERSION,
@@ -78,6 +80,7 @@ def publish(
         versions=package_versions(),
         files={name: file_hash(run / name) for name in MODEL_FILES},
         export_check=check,
+        golden=tuple(float(v) for v in answer_images(folded, golden[None])[0]),
     )
     card.write(run)
     return card
