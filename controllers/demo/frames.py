@@ -1,0 +1,72 @@
+"""Held-out frames for the demo: spread over the test rounds, then asked of the service."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from datagen.recording import Frames
+from serve.client import Client
+from trackfeatures import MARKINGS, Heading, localise
+
+
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """One held-out frame, the truth about it, and what the service answered."""
+
+    index: int
+    round_id: str
+    track: str
+    lanes: int
+    distances: dict[str, float | None]
+    to_lane_centre: float | None
+    angle: float
+    heading: str
+    answer: dict[str, Any]
+
+    @property
+    def answered_heading(self) -> str:
+        classes: dict[str, float] = self.answer["heading"]
+        return max(classes, key=lambda name: classes[name])
+
+
+def spread(frames: Frames, count: int, rng: np.random.Generator) -> list[int]:
+    """`count` frame numbers, the same share of every round, drawn without repetition."""
+    rounds = frames.labels.round
+    shares = np.array_split(np.arange(count), len(np.unique(rounds)))
+    chosen: list[int] = []
+    for number, share in zip(np.unique(rounds), shares, strict=True):
+        here = np.flatnonzero(rounds == number)
+        chosen += rng.choice(here, size=min(len(share), len(here)), replace=False).tolist()
+    return sorted(chosen)
+
+
+def ask(frames: Frames, indices: list[int], client: Client) -> list[Asked]:
+    """Post the recorded JPEG files and set the answers beside the labels."""
+    return [_ask_one(frames, index, client) for index in indices]
+
+
+def _ask_one(frames: Frames, index: int, client: Client) -> Asked:
+    labels = frames.labels
+    answer = client.features(bytes(frames.jpeg(index)))
+    values = labels.distances[index]
+    about = frames.rounds[int(labels.round[index])]
+    return Asked(
+        index=index,
+        round_id=about.id,
+        track=about.track,
+        lanes=about.lanes,
+        distances={
+            name: None if np.isnan(value) else float(value)
+            for name, value in zip(MARKINGS, values, strict=True)
+        },
+        to_lane_centre=_localised(values),
+        angle=float(labels.angle[index]),
+        heading=Heading(int(labels.heading[index])).name.lower(),
+        answer=answer,
+    )
+
+
+def _localised(values: Any) -> float | None:
+    centre = float(localise(values)[0])
+    return None if np.isnan(centre) else centre

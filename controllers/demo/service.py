@@ -1,0 +1,68 @@
+"""A perception service as a process of its own: started, waited for, stopped cleanly."""
+
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from serve.client import Client
+from trackfeatures import UserError
+
+START_LIMIT_S = 60.0
+STOP_LIMIT_S = 10.0
+
+
+def free_port() -> int:
+    """A port of the loopback interface that nobody listens on now."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port: int = probe.getsockname()[1]
+        return port
+
+
+@contextmanager
+def running_service(model: Path, log: Path) -> Iterator[str]:
+    """Serve the run folder `model`; gives the service's address while the block runs.
+
+    Raises UserError with the end of the log if the service does not become ready or does not stop
+    when asked to.
+    """
+    port = free_port()
+    url = f"http://127.0.0.1:{port}"
+    command = [sys.executable, "-m", "serve", "--model", str(model), "--port", str(port)]
+    with (
+        log.open("wb") as output,
+        subprocess.Popen(command, stdout=output, stderr=output) as server,
+    ):
+        try:
+            _wait_until_ready(server, url, log)
+            yield url
+        finally:
+            stopped = _stop(server)
+    if not stopped:
+        raise UserError(f"the service did not stop within {STOP_LIMIT_S:.0f} s; see {log}")
+
+
+def _wait_until_ready(server: subprocess.Popen[bytes], url: str, log: Path) -> None:
+    try:
+        with Client(url) as client:
+            client.wait_until_ready(START_LIMIT_S)
+    except UserError as error:
+        said = log.read_text(errors="replace").strip().splitlines()[-3:]
+        state = "still running" if server.poll() is None else f"ended with {server.returncode}"
+        raise UserError(
+            f"the service is not ready ({state}): {error}; {' | '.join(said)}"
+        ) from None
+
+
+def _stop(server: subprocess.Popen[bytes]) -> bool:
+    server.send_signal(signal.SIGTERM)
+    try:
+        server.wait(STOP_LIMIT_S)
+    except subprocess.TimeoutExpired:
+        server.kill()
+        return False
+    return True
