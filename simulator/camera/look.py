@@ -1,0 +1,196 @@
+"""What the land beside each kind of track is like: palettes, hills, what stands there.
+
+Colours are linear RGB albedos; densities are per 100 m of track.
+"""
+
+from dataclasses import dataclass
+
+Colour = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Look:
+    """One scenery style; what is drawn from the scene's seed varies around it."""
+
+    asphalt: Colour
+    verge: Colour
+    """Between asphalt and the track's edge."""
+    grass: Colour
+    dry: Colour
+    soil: Colour
+    barriers: tuple[str, ...]
+    """Which of rail, wall, hedge, fence, stones, tyres line the road, by section."""
+    trees: tuple[str, ...]
+    tree_density: float
+    tree_reach_m: float = 45.0
+    hills_m: float = 8.0
+    houses: float = 0.0
+    stands: float = 0.0
+    signs: float = 0.8
+    posts: bool = False
+    lamps: bool = False
+    ridge_deg: float = 3.0
+    """How high distant hills stand above the horizon."""
+    worn: float = 0.4
+    """How patched and cracked the surface is, 0 to 1."""
+
+
+_GREEN, _DRY, _SOIL = (0.085, 0.15, 0.032), (0.21, 0.19, 0.075), (0.20, 0.145, 0.09)
+
+LOOKS: dict[str, Look] = {
+    "highway": Look(
+        (0.125, 0.125, 0.13),
+        (0.16, 0.155, 0.145),
+        _GREEN,
+        _DRY,
+        _SOIL,
+        ("rail", "rail", "wall"),
+        ("oak", "pine", "bush"),
+        9.0,
+        60.0,
+        hills_m=10.0,
+        signs=1.2,
+        lamps=True,
+        ridge_deg=2.5,
+        worn=0.3,
+    ),
+    "mountain": Look(
+        (0.12, 0.118, 0.118),
+        (0.21, 0.20, 0.18),
+        (0.10, 0.135, 0.05),
+        (0.23, 0.21, 0.13),
+        (0.26, 0.25, 0.23),
+        ("rail", "stones", "rail"),
+        ("pine", "fir", "pine"),
+        11.0,
+        50.0,
+        hills_m=55.0,
+        houses=0.15,
+        signs=0.7,
+        posts=True,
+        ridge_deg=11.0,
+        worn=0.6,
+    ),
+    "circuit": Look(
+        (0.10, 0.10, 0.105),
+        (0.10, 0.17, 0.04),
+        (0.08, 0.16, 0.03),
+        (0.15, 0.17, 0.05),
+        _SOIL,
+        ("rail", "tyres", "wall"),
+        ("oak", "poplar", "bush"),
+        5.0,
+        70.0,
+        hills_m=6.0,
+        stands=0.35,
+        signs=1.8,
+        ridge_deg=2.0,
+        worn=0.2,
+    ),
+    "oval": Look(
+        (0.115, 0.112, 0.112),
+        (0.145, 0.14, 0.135),
+        (0.085, 0.155, 0.035),
+        _DRY,
+        _SOIL,
+        ("wall",),
+        ("oak", "poplar"),
+        2.5,
+        80.0,
+        hills_m=2.5,
+        stands=0.7,
+        signs=1.5,
+        lamps=True,
+        ridge_deg=1.2,
+        worn=0.3,
+    ),
+    "town": Look(
+        (0.13, 0.13, 0.132),
+        (0.30, 0.285, 0.27),
+        (0.09, 0.14, 0.04),
+        _DRY,
+        _SOIL,
+        ("fence", "hedge", "wall"),
+        ("oak", "poplar", "bush"),
+        4.0,
+        35.0,
+        hills_m=3.0,
+        houses=4.5,
+        signs=2.2,
+        lamps=True,
+        ridge_deg=1.5,
+        worn=0.8,
+    ),
+    "forest": Look(
+        (0.115, 0.115, 0.112),
+        (0.15, 0.13, 0.085),
+        (0.07, 0.115, 0.03),
+        (0.16, 0.12, 0.06),
+        (0.15, 0.11, 0.07),
+        ("fence", "rail"),
+        ("fir", "oak", "pine", "fir"),
+        26.0,
+        55.0,
+        hills_m=12.0,
+        signs=0.5,
+        posts=True,
+        ridge_deg=3.5,
+        worn=0.6,
+    ),
+    "coast": Look(
+        (0.15, 0.148, 0.142),
+        (0.30, 0.26, 0.19),
+        (0.13, 0.16, 0.055),
+        (0.32, 0.27, 0.16),
+        (0.38, 0.32, 0.22),
+        ("wall", "stones", "rail"),
+        ("palm", "bush", "palm"),
+        6.0,
+        45.0,
+        hills_m=12.0,
+        houses=0.8,
+        signs=0.8,
+        ridge_deg=2.0,
+        worn=0.5,
+    ),
+    "gravel": Look(
+        (0.24, 0.20, 0.15),
+        (0.22, 0.17, 0.11),
+        (0.11, 0.14, 0.045),
+        (0.27, 0.22, 0.11),
+        (0.27, 0.21, 0.14),
+        ("fence", "stones"),
+        ("bush", "pine", "oak"),
+        8.0,
+        60.0,
+        hills_m=18.0,
+        houses=0.2,
+        signs=0.3,
+        ridge_deg=5.0,
+        worn=1.0,
+    ),
+    "countryside": Look(
+        (0.13, 0.128, 0.125),
+        (0.14, 0.15, 0.06),
+        (0.095, 0.17, 0.035),
+        (0.27, 0.23, 0.085),
+        _SOIL,
+        ("fence", "hedge", "stones"),
+        ("oak", "poplar", "bush"),
+        7.0,
+        70.0,
+        hills_m=14.0,
+        houses=0.5,
+        signs=0.6,
+        posts=True,
+        ridge_deg=3.0,
+        worn=0.7,
+    ),
+}
+
+PLAIN = "countryside"
+
+
+def look_of(name: str) -> Look:
+    """The look called `name`; a track with a look of its own invention gets the countryside."""
+    return LOOKS.get(name, LOOKS[PLAIN])

@@ -1,0 +1,51 @@
+// Shared by all shaders. Colours are linear until finish(); places are eye-relative world metres.
+layout(std140) uniform Frame {
+    mat4 clip;        // eye-relative world to clip space
+    vec4 eye;         // place of the eye
+    vec4 ray_corner;  // sky: world direction of the image centre
+    vec4 ray_x;       // sky: world direction of half the width
+    vec4 ray_y;       // sky: world direction of half the height, downwards
+    vec4 sun;         // unit vector to the sun; w: light left in a hard shadow
+    vec4 sunlight;    // light of the sun on a surface facing it; w: exposure
+    vec4 skylight;    // light from above; w: extinction of the air, 1/m
+    vec4 zenith;      // sky colours; w: share of cloud
+    vec4 horizon;
+    vec4 haze;
+};
+layout(std140) uniform Scene {
+    vec4 asphalt;     // w: how worn the surface is
+    vec4 verge;       // w: how much of the verge is grass
+    vec4 grass;
+    vec4 dry;
+    vec4 soil;
+    vec4 left_line;   // colour of the leftmost line; w: half of a line's width
+    vec4 line;        // colour of the other lines; w: wear of the paint
+    vec4 lanes;       // number, lane width, half the asphalt, edge
+    vec4 dashes;      // length, period, share of missing paint, length of the track
+    vec4 mask;        // shadow mask: metres a texel along s and y, texels of a band, bands
+};
+uniform sampler2D noise; // r: grain, g: patches of some centimetres, b: broad patches, a: cracks
+
+vec3 lit(vec3 albedo, vec3 normal, float sun_share) {
+    float direct = max(dot(normal, sun.xyz), 0.0) * sun_share;
+    return albedo * (sunlight.rgb * direct + skylight.rgb * (0.62 + 0.38 * normal.z));
+}
+
+// Through the air to the eye, then to display values; 1/2.0 is near enough sRGB and cheap.
+vec4 finish(vec3 light, vec3 place) {
+    float distance = length(place);
+    float toward = max(dot(place, sun.xyz) / distance, 0.0);
+    vec3 air = haze.rgb * (1.0 + 0.35 * sunlight.rgb * toward * toward * toward * toward);
+    vec3 colour = mix(air, light, exp2(-skylight.w * distance)) * sunlight.w;
+    return vec4(sqrt(colour), 1.0);
+}
+
+vec3 meadow(vec2 world, vec3 normal, float near) {
+    vec4 broad = texture(noise, world * 0.0083);
+    vec4 fine = texture(noise, world * 0.137);
+    float tuft = mix(0.5, fine.r * 0.5 + fine.g * 0.5, near);
+    vec3 colour = mix(grass.rgb, dry.rgb, smoothstep(0.42, 0.72, broad.g * 0.6 + broad.b * 0.4));
+    float bare = smoothstep(0.86, 0.70, normal.z) + smoothstep(0.70, 0.80, fine.g * 0.4 + broad.r * 0.0 + broad.b * 0.6);
+    colour = mix(colour, soil.rgb, clamp(bare, 0.0, 1.0));
+    return colour * (0.62 + 0.76 * tuft);
+}
