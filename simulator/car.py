@@ -55,7 +55,7 @@ class CarParameters:
     bump_spring: float = 600_000.0
     """N/m added beyond the bump stop."""
 
-    wheel_radius: float = 0.3276
+    wheel_radius: float = 0.3273
     wheel_inertia: float = 1.2
     """kg m2, one wheel."""
     cornering_stiffness: float = 80_000.0
@@ -64,7 +64,7 @@ class CarParameters:
     """Largest tyre force over its load, on asphalt."""
     tyre_shape: float = 1.5
     """C of the magic formula (Pacejka, Tyre and Vehicle Dynamics, 4.3.1)."""
-    rolling_resistance: float = 0.012
+    rolling_resistance: float = 0.001
 
     steering_lock: float = 0.36652
     """rad of the front wheels at steer = 1 (21 deg)."""
@@ -74,6 +74,8 @@ class CarParameters:
     air_density: float = 1.23
     drag_coefficient: float = 0.35
     frontal_area: float = 1.92
+    wing_drag: float = 0.47
+    """m2: drag coefficient times area of the wings."""
     lift_front: float = 0.35
     """m2: downforce coefficient times area, at the front axle."""
     lift_rear: float = 0.75
@@ -81,17 +83,19 @@ class CarParameters:
     gears: tuple[float, float, float, float, float, float] = (3.0, 1.9, 1.4, 1.1, 0.9, 0.77)
     reverse_gear: float = -4.0
     final_drive: float = 4.5
-    driveline_efficiency: float = 0.95
-    engine_inertia: float = 0.2423
-    """kg m2, at the crankshaft."""
+    driveline_efficiency: float = 0.984
+    engine_inertia: float = 0.02
+    """kg m2, at the crankshaft; fitted: in gear 1 TORCS's car is 6.3 % heavier than at rest."""
     idle_rpm: float = 900.0
     limiter_rpm: float = 9152.0
+    top_rpm: float = 10_000.0
+    """End of the torque table."""
     torque: tuple[float, ...] = (
         100.0, 160.0, 190.0, 280.0, 350.0, 405.0, 443.0, 465.0, 483.0, 415.0, 360.0,
     )  # fmt: skip
     """N m at full throttle at 0, 1000, ... 10000 rev/min."""
-    engine_brake: float = 60.0
-    """N m at closed throttle and at the limiter, falling linearly to none at idle."""
+    engine_braking: float = 0.33
+    """Share of the full-load torque that a closed throttle takes at `top_rpm`; none at idle."""
     differential_viscosity: float = 30.0
     """N m s/rad between the rear wheels."""
 

@@ -34,7 +34,7 @@ BELLY_SPRING, BELLY_DAMPER = 500_000.0, 20_000.0
 @compiled
 def dot(a: Vector, b: Vector) -> float:
     """Scalar product of two 3-vectors, summed in a fixed order."""
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+    return float(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
 
 
 @compiled
@@ -60,7 +60,7 @@ def move_steering(p: Any, angle: float, command: float, dt: float) -> float:
     """Front wheel angle (rad) after `dt` of turning towards `command` in [-1, 1]."""
     step = p.steering_rate * dt
     wanted = command * p.steering_lock
-    return angle + min(max(wanted - angle, -step), step)
+    return float(angle + min(max(wanted - angle, -step), step))
 
 
 @compiled
@@ -211,7 +211,8 @@ def add_air(p: Any, motion: Vector, axes: Vector, wrench: Vector) -> None:
     forward = axes[0]
     speed = forward[0] * motion[7] + forward[1] * motion[8] + forward[2] * motion[9]
     pressure = 0.5 * p.air_density * speed * abs(speed)
-    add_force(wrench, -pressure * p.drag_coefficient * p.frontal_area * forward, 0.0 * forward)
+    area = p.drag_coefficient * p.frontal_area + p.wing_drag
+    add_force(wrench, -pressure * area * forward, 0.0 * forward)
     press = 0.5 * p.air_density * speed * speed
     add_force(wrench, -press * p.lift_front * axes[2], p.front_axle * forward)
     add_force(wrench, -press * p.lift_rear * axes[2], -p.rear_axle * forward)

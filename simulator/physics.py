@@ -10,7 +10,7 @@ import pybullet
 from numpy.typing import NDArray
 
 from simulator.car import CarParameters
-from simulator.dynamics import MOTION, PHYSICS_HZ
+from simulator.dynamics import PHYSICS_HZ
 from simulator.walls import Mesh
 from trackfeatures.errors import UserError
 

@@ -1,5 +1,6 @@
 """What a driver commands and what the car then does. SI units; angles counter-clockwise, rad."""
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -60,7 +61,7 @@ class CarState:
     @property
     def speed(self) -> float:
         """m/s in the road plane; negative when the car rolls back."""
-        planar = (self.vx * self.vx + self.vy * self.vy) ** 0.5
+        planar = math.hypot(self.vx, self.vy)
         return planar if self.vx >= 0.0 else -planar
 
     @property

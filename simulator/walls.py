@@ -31,7 +31,8 @@ def wall_mesh(road: Road) -> Mesh:
         pose = road.track.at(stations, side * road.wall_offset)
         foot = np.column_stack((pose.x, pose.y, pose.z))
         clear = ~_on_another_road(road, stations, foot)
-        posts = np.stack((foot - [0, 0, BELOW_M], foot + [0, 0, ABOVE_M]), axis=1).reshape(-1, 3)
+        up = np.array([0.0, 0.0, 1.0])
+        posts = np.stack((foot - BELOW_M * up, foot + ABOVE_M * up), axis=1).reshape(-1, 3)
         first = np.flatnonzero(clear & np.roll(clear, -1))
         second = (first + 1) % len(stations)
         panels = np.column_stack(
