@@ -39,7 +39,7 @@ _ENCODING = re.compile(rb"<\?xml[^>]*?encoding\s*=\s*[\"']([A-Za-z0-9._-]+)[\"']
 
 @dataclass(frozen=True)
 class Section:
-    """One section of a parameter file; attributes nobody asks for (or misspelt ones) are ignored."""
+    """One section of a parameter file; attributes that nobody asks for are ignored."""
 
     element: Element
     file: Path

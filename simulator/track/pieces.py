@@ -120,5 +120,5 @@ def check_closes(placed: Placed, what: str, max_gap_m: float = MAX_GAP_M) -> Non
         raise TrackError(f"{what}: the segments turn by {degrees:.2f} deg in all; {advice}")
     if not height <= max_gap_m:
         raise TrackError(
-            f"{what}: the segments end {height:.2f} m off their first height; {advice}"
+            f"{what}: the segments end {height:.2f} m above or below their start; {advice}"
         )

@@ -14,6 +14,7 @@ from simulator.track.parameter_file import Section
 from simulator.track.pieces import Piece
 
 MAX_LENGTH_M: Final = 100_000.0
+MAX_ARC: Final = 4.0 * math.pi
 MAX_STEPS: Final = 100_000
 
 
@@ -86,6 +87,11 @@ def _plan(segment: Section) -> tuple[int, float, float, float]:
     arc = segment.number("arc") or 0.0
     for name, value in (("radius", radius), ("end radius", radius_end), ("arc", arc)):
         _check_length(segment, name, value)
+    if arc > MAX_ARC:
+        raise TrackError(
+            f"{segment.file}: segment {segment.name!r} turns by {math.degrees(arc):g} deg, "
+            f"expected at most {math.degrees(MAX_ARC):g}"
+        )
     length = (radius + radius_end) / 2.0 * arc
     _check_length(segment, "length", length)
     return (1 if kind == "lft" else -1), radius, radius_end, length
@@ -112,7 +118,9 @@ def _end_heights(
         _or(segment.number("z end right"), profile.end.right),
     )
     z_start, z_end = segment.number("z start"), segment.number("z end")
-    profile.grade = _or(segment.number("grade"), profile.grade)
+    grade = segment.number("grade")
+    if grade is not None:
+        profile.grade = grade
     if z_start is not None:
         start = Edges(z_start, z_start)
     middle_end = end.mean

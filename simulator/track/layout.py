@@ -1,0 +1,194 @@
+"""From straights and bends to pieces: spirals, banking, a smooth height profile, exact closing.
+
+Metres and radians; a bend's angle is left positive; grades are dz/ds.
+"""
+
+import math
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from simulator.track.errors import TrackError
+from simulator.track.pieces import FloatArray, Piece, Placed, assemble
+
+MAX_STEP_M: Final = 5.0
+SPIRAL_STEP_M: Final = 2.0
+
+
+@dataclass(frozen=True)
+class Straight:
+    length: float
+    grade: float
+
+
+@dataclass(frozen=True)
+class Bend:
+    """A clothoid of length `spiral`, an arc, and the same clothoid back to straight."""
+
+    radius: float
+    angle: float
+    """Turn of the whole bend, spirals included."""
+    spiral: float
+    banking: float
+    """Outer edge up; grows along the spiral as the curvature does."""
+    grade: float
+
+
+Segment = Straight | Bend
+
+
+@dataclass(frozen=True)
+class Steps:
+    """Cut segments, (n,) arrays: length, curvature, and banking (left edge up) at each end."""
+
+    length: FloatArray
+    curvature: FloatArray
+    banking_end: FloatArray
+    segment: NDArray[np.int64]
+    """Index of the segment each step was cut from."""
+
+
+def cut(segments: list[Segment]) -> Steps:
+    """Cut segments into steps of at most 5 m, spirals into steps of about 2 m."""
+    rows: list[tuple[float, float, float, int]] = []
+    for number, segment in enumerate(segments):
+        if isinstance(segment, Straight):
+            rows += _even(segment.length, 0.0, 0.0, number)
+            continue
+        sign = math.copysign(1.0, segment.angle)
+        k = sign / segment.radius
+        arc = abs(segment.angle) * segment.radius - segment.spiral
+        ramp = _spiral(segment, sign, number)
+        rows += ramp
+        if arc > 0.0:
+            rows += _even(arc, k, -sign * segment.banking, number)
+        # The way out is the way in, backwards: each step ends with the banking it began with.
+        starts = [0.0] + [banking for _, _, banking, _ in ramp[:-1]]
+        rows += [
+            (length, curvature, start, number)
+            for (length, curvature, _, _), start in zip(ramp[::-1], starts[::-1], strict=bool(ramp))
+        ]
+    length, curvature, banking, number_of = zip(*rows, strict=True)
+    return Steps(
+        np.array(length), np.array(curvature), np.array(banking), np.array(number_of, dtype=int)
+    )
+
+
+def _even(
+    length: float, k: float, banking: float, number: int
+) -> list[tuple[float, float, float, int]]:
+    count = max(1, math.ceil(length / MAX_STEP_M - 1e-9))
+    return [(length / count, k, banking, number)] * count
+
+
+def _spiral(bend: Bend, sign: float, number: int) -> list[tuple[float, float, float, int]]:
+    count = math.ceil(bend.spiral / SPIRAL_STEP_M - 1e-9)
+    # Curvature at the middle of a step: the sum of the turns is then exactly the clothoid's.
+    return [
+        (
+            bend.spiral / count,
+            sign / bend.radius * (i + 0.5) / count,
+            -sign * bend.banking * (i + 1) / count,
+            number,
+        )
+        for i in range(count)
+    ]
+
+
+def place(steps: Steps) -> Placed:
+    """The steps in the plane, without heights."""
+    flat = [
+        Piece(length, k, 0.0, 0.0, 0.0, 0.0)
+        for length, k in zip(steps.length, steps.curvature, strict=True)
+    ]
+    return assemble(flat)
+
+
+def close(segments: list[Segment]) -> tuple[list[Segment], float]:
+    """Change the straights' lengths, as little as possible, so that the loop closes in the plane.
+
+    The end point is linear in the lengths of straights, so one minimum-norm step is exact.
+    Returns the segments and the largest change made (m). Raises TrackError when no change of the
+    straights can close the loop.
+    """
+    placed = place(cut(segments))
+    bounds = np.concatenate(([0.0], np.cumsum([segment_length(s) for s in segments])))
+    straights = [i for i, s in enumerate(segments) if isinstance(s, Straight)]
+    at = np.searchsorted(placed.s0, bounds[straights] + 1e-6, side="right") - 1
+    directions = np.stack((np.cos(placed.heading0[at]), np.sin(placed.heading0[at])))
+    gram = directions @ directions.T
+    determinant = float(gram[0, 0] * gram[1, 1] - gram[0, 1] ** 2)
+    if determinant < 1e-6:
+        raise TrackError("straights in two directions are needed to close the loop; add one")
+    gx, gy = placed.end[0], placed.end[1]
+    wx = (gram[1, 1] * gx - gram[0, 1] * gy) / determinant
+    wy = (gram[0, 0] * gy - gram[0, 1] * gx) / determinant
+    closed = list(segments)
+    largest = 0.0
+    for i, (cos_h, sin_h) in zip(straights, directions.T, strict=True):
+        change = -float(cos_h * wx + sin_h * wy)
+        straight = segments[i]
+        assert isinstance(straight, Straight)
+        closed[i] = replace(straight, length=straight.length + change)
+        largest = max(largest, abs(change))
+    return closed, largest
+
+
+def segment_length(segment: Segment) -> float:
+    """Length of a segment along the centre line: a bend's spirals add one spiral length."""
+    if isinstance(segment, Straight):
+        return segment.length
+    return abs(segment.angle) * segment.radius + segment.spiral
+
+
+def heights(segments: list[Segment], s: FloatArray, vertical_curve: float) -> FloatArray:
+    """Centre-line heights (n,) at `s` in [0, L], zero at the start of the lap.
+
+    Grades are shifted by their mean, so that the lap ends where it began, and averaged over
+    `vertical_curve` metres: parabolic crests and dips, as on a real road.
+    """
+    lengths = np.array([segment_length(segment) for segment in segments])
+    grades = np.array([segment.grade for segment in segments])
+    total = float(lengths.sum())
+    grades = grades - float(np.sum(grades * lengths)) / total
+    # Three laps end to end, so that the average near the start sees the end of the lap before.
+    grades3, lengths3 = np.tile(grades, 3), np.tile(lengths, 3)
+    node = np.concatenate(([0.0], np.cumsum(lengths3))) - total
+    z = np.concatenate(([0.0], np.cumsum(grades3 * lengths3)))
+    area = np.concatenate(([0.0], np.cumsum((z[:-1] + z[1:]) / 2.0 * lengths3)))
+
+    def integral(t: FloatArray) -> FloatArray:
+        i = np.clip(np.searchsorted(node, t, side="right") - 1, 0, len(lengths3) - 1)
+        x = t - node[i]
+        result: FloatArray = area[i] + z[i] * x + grades3[i] * x * x / 2.0
+        return result
+
+    half = vertical_curve / 2.0
+    smooth = (integral(s + half) - integral(s - half)) / vertical_curve
+    # Equal but for rounding; the last must be the first.
+    if abs(s[-1] - total) < 1e-6:
+        smooth[-1] = smooth[0]
+    result: FloatArray = smooth - smooth[0]
+    return result
+
+
+def lay(segments: list[Segment], width: float, vertical_curve: float) -> list[Piece]:
+    """The pieces of a closed list of segments (see `close`)."""
+    steps = cut(segments)
+    s = np.concatenate(([0.0], np.cumsum(steps.length)))
+    z = heights(segments, s, vertical_curve)
+    lift = np.tan(np.concatenate((steps.banking_end[-1:], steps.banking_end))) * width / 2.0
+    left, right = z + lift, z - lift
+    return [
+        Piece(
+            float(steps.length[i]),
+            float(steps.curvature[i]),
+            float(left[i]),
+            float(right[i]),
+            float(left[i + 1]),
+            float(right[i + 1]),
+        )
+        for i in range(len(steps.length))
+    ]

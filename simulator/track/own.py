@@ -1,0 +1,162 @@
+"""Reads the project's own track format: a TOML list of straights and bends.
+
+    name, look, surface, width (m), vertical_curve (m)
+    [markings]   the fields of `MarkingStyle`
+    [[segment]]  type = "straight", length (m)
+    [[segment]]  type = "bend", radius (m), angle (deg, left positive, spirals included),
+                 spiral (m, each end), banking (deg, outer edge up)
+    grade (%, uphill positive) on a segment holds until another one is given.
+
+The bends must turn by +-360 degrees in all. Straights are adjusted by up to a metre so that the
+loop closes exactly, and the mean grade is taken out so that the heights close too.
+"""
+
+import math
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any, Final, get_args
+
+from simulator.track.errors import TrackError
+from simulator.track.geometry import Surface, Track
+from simulator.track.layout import Bend, Segment, Straight, close, lay
+from simulator.track.markings import LineColour, MarkingStyle
+from simulator.track.pieces import assemble, check_closes
+
+MAX_BYTES: Final = 2**20
+MAX_CORRECTION_M: Final = 1.0
+"""A straight that had to change by more would not be the one its author wrote."""
+MAX_GAP_M: Final = 1e-3
+LOOKS: Final = (
+    "highway",
+    "mountain",
+    "circuit",
+    "oval",
+    "town",
+    "forest",
+    "coast",
+    "gravel",
+    "countryside",
+)
+
+
+@dataclass(frozen=True)
+class Table:
+    """A TOML table that says where it stands when something in it is wrong."""
+
+    values: Mapping[str, Any]
+    where: str
+
+    def number(self, key: str, lo: float, hi: float, default: float | None = None) -> float:
+        value = self.values.get(key, default)
+        if isinstance(value, bool) or not isinstance(value, int | float) or not lo <= value <= hi:
+            raise TrackError(
+                f"{self.where}: {key} is {value!r}, expected a number from {lo:g} to {hi:g}"
+            )
+        return float(value)
+
+    def choice(self, key: str, choices: tuple[str, ...], default: str | None = None) -> str:
+        value = self.values.get(key, default)
+        if value not in choices:
+            raise TrackError(f"{self.where}: {key} is {value!r}, expected one of {choices}")
+        return str(value)
+
+    def only(self, *keys: str) -> None:
+        """Refuse keys that mean nothing: a misspelt one would silently have no effect."""
+        for key in self.values:
+            if key not in keys:
+                raise TrackError(f"{self.where}: unknown key {key!r}, expected {', '.join(keys)}")
+
+
+def read_own(path: Path) -> Track:
+    """The track of one TOML file, named after the file. Raises TrackError when it is not one."""
+    table = Table(_load(path), str(path))
+    table.only("look", "surface", "width", "vertical_curve", "markings", "segment")
+    width = table.number("width", 6.0, 40.0)
+    segments, correction = close(read_segments(table))
+    if correction > MAX_CORRECTION_M:
+        raise TrackError(
+            f"{path}: to close the loop a straight would have to change by {correction:.2f} m, "
+            f"allowed are {MAX_CORRECTION_M:g} m; correct the lengths or angles"
+        )
+    placed = assemble(lay(segments, width, table.number("vertical_curve", 1.0, 200.0, 50.0)))
+    check_closes(placed, str(path), MAX_GAP_M)
+    return Track.from_placed(
+        placed,
+        name=path.stem,
+        source="own",
+        width=width,
+        surface=_surface(table.choice("surface", get_args(Surface), "asphalt")),
+        look=table.choice("look", LOOKS),
+        markings=_markings(Table(table.values.get("markings", {}), f"{path}: [markings]")),
+    )
+
+
+def read_segments(table: Table) -> list[Segment]:
+    """The segments as written, before the loop is closed; grades carried on."""
+    rows = table.values.get("segment")
+    if not isinstance(rows, list) or not 3 <= len(rows) <= 1000:
+        raise TrackError(f"{table.where}: expected 3 to 1000 [[segment]] tables")
+    segments: list[Segment] = []
+    grade = 0.0
+    for number, row in enumerate(rows, start=1):
+        if not isinstance(row, Mapping):
+            raise TrackError(f"{table.where}: segment {number} is no table")
+        entry = Table(row, f"{table.where}: segment {number}")
+        grade = entry.number("grade", -30.0, 30.0, grade)
+        if entry.choice("type", ("straight", "bend")) == "straight":
+            entry.only("type", "length", "grade")
+            segments.append(Straight(entry.number("length", 0.1, 10_000.0), grade / 100.0))
+        else:
+            segments.append(_bend(entry, grade / 100.0))
+    return segments
+
+
+def _bend(entry: Table, grade: float) -> Bend:
+    entry.only("type", "radius", "angle", "spiral", "banking", "grade")
+    radius = entry.number("radius", 8.0, 10_000.0)
+    angle = math.radians(entry.number("angle", -360.0, 360.0))
+    spiral = entry.number("spiral", 0.0, 500.0, 0.0)
+    banking = math.radians(entry.number("banking", -5.0, 30.0, 0.0))
+    if angle == 0.0 or abs(angle) * radius < spiral:
+        raise TrackError(
+            f"{entry.where}: spirals of {spiral:g} m do not fit into a bend of "
+            f"{math.degrees(angle):g} deg with radius {radius:g} m; shorten them"
+        )
+    if banking != 0.0 and spiral == 0.0:
+        raise TrackError(f"{entry.where}: a banked bend needs a spiral to lean into; give one")
+    return Bend(radius, angle, spiral, banking, grade)
+
+
+def _load(path: Path) -> Mapping[str, Any]:
+    size = path.stat().st_size
+    if size > MAX_BYTES:
+        raise TrackError(f"{path}: {size} bytes; a track file has at most {MAX_BYTES}")
+    try:
+        return tomllib.loads(path.read_bytes().decode("utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise TrackError(f"{path}: not a readable TOML file ({error})") from None
+
+
+def _surface(name: str) -> Surface:
+    return "gravel" if name == "gravel" else "concrete" if name == "concrete" else "asphalt"
+
+
+def _markings(table: Table) -> MarkingStyle:
+    if not isinstance(table.values, Mapping):
+        raise TrackError(f"{table.where}: expected a table")
+    table.only(*(field.name for field in fields(MarkingStyle)))
+    plain = MarkingStyle()
+    kerbs = table.values.get("kerbs", plain.kerbs)
+    if not isinstance(kerbs, bool):
+        raise TrackError(f"{table.where}: kerbs is {kerbs!r}, expected true or false")
+    colour = table.choice("left_colour", get_args(LineColour), plain.left_colour)
+    return MarkingStyle(
+        line_width=table.number("line_width", 0.11, 0.15, plain.line_width),
+        dash_length=table.number("dash_length", 1.0, 20.0, plain.dash_length),
+        dash_gap=table.number("dash_gap", 1.0, 20.0, plain.dash_gap),
+        left_colour="yellow" if colour == "yellow" else "white",
+        kerbs=kerbs,
+        wear=table.number("wear", 0.0, 1.0, plain.wear),
+    )
