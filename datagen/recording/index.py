@@ -30,6 +30,8 @@ RECORD_HEAD = 9  # opcode and length
 MESSAGE_HEAD = 22  # channel, sequence, log time, publish time
 CHUNK_HEAD = RECORD_HEAD + 40  # of an uncompressed chunk, up to its records
 INDEX_HEAD = RECORD_HEAD + 6  # channel and byte count, before the entries
+# What the official reader and our own raise on bytes that are no MCAP file.
+DAMAGE = (McapError, ValueError, KeyError, TypeError, IndexError, OverflowError, struct.error)
 READ_TOPICS = (topics.CAMERA, topics.LABELS, topics.EGO_STATE)
 
 
@@ -89,7 +91,7 @@ def load_round(path: Path) -> RoundIndex:
 def _guarded(path: Path, read: Callable[[], RoundIndex]) -> RoundIndex:
     try:
         return read()
-    except (McapError, ValueError, KeyError, TypeError, IndexError, struct.error) as error:
+    except DAMAGE as error:
         raise DatasetError(f"{path.name} is damaged or not a recorded round: {error}") from error
 
 

@@ -3,6 +3,7 @@
 from dataclasses import dataclass, fields
 
 import numpy as np
+from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
 from .errors import DatasetError
@@ -47,10 +48,11 @@ def read_labels(index: RoundIndex, round_number: int) -> Labels:
                 f"{index.path.name}: {count} images do not pair with its {len(other.log_time)} "
                 f"{name}; run `datagen verify` on the dataset and record the round again"
             )
-    rows = np.array([_row(labels.payload(i)) for i in range(count)], dtype=np.float64)
-    rows = rows.reshape(count, 13)
-    motion = np.array([_motion(states.payload(i)) for i in range(count)], dtype=np.float64)
-    motion = motion.reshape(count, 2)
+    try:
+        rows = np.array([_row(labels.payload(i)) for i in range(count)], dtype=np.float64)
+        motion = np.array([_motion(states.payload(i)) for i in range(count)], dtype=np.float64)
+    except DecodeError as error:
+        raise DatasetError(f"{index.path.name}: a label is damaged ({error})") from error
     return Labels(
         distances=rows[:, :5].astype(np.float32),
         to_lane_centre=rows[:, 5].astype(np.float32),

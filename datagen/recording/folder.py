@@ -1,0 +1,128 @@
+"""A dataset folder on disk: how a round gets into it whole or not at all.
+
+A round is written under `.partial/`, read back, checked, hashed, synced and renamed into `rounds/`;
+`state/ID.json` then holds its hashes. Everything else in the folder is derived and can be rebuilt.
+"""
+
+import hashlib
+import json
+import os
+import shutil
+from dataclasses import asdict, dataclass
+from importlib.resources import files
+from pathlib import Path
+
+from .errors import DatasetError
+
+PARTIAL = ".partial"
+SUBFOLDERS = ("rounds", "state", "splits", "layouts", "proto")
+READ_BYTES = 1 << 20
+
+
+@dataclass(frozen=True, slots=True)
+class RoundState:
+    """What is known of a finished file: enough to see that it is still the same."""
+
+    id: str
+    file: str
+    bytes: int
+    sha256: str
+    frames: int
+    content_hash: str
+    definitions: str
+
+    @staticmethod
+    def read(path: Path) -> "RoundState":
+        try:
+            return RoundState(**json.loads(path.read_text()))
+        except (ValueError, TypeError) as error:
+            raise DatasetError(f"{path} is no round state: {error}") from error
+
+
+def prepare(folder: Path) -> None:
+    """Make the folder's parts and publish what explains its messages."""
+    for name in SUBFOLDERS:
+        (folder / name).mkdir(parents=True, exist_ok=True)
+    package = files("datagen.recording")
+    for name in ("proto/driverview.proto", "layouts/foxglove.json"):
+        write_synced(folder / name, package.joinpath(name).read_text())
+
+
+def round_path(folder: Path, round_id: str) -> Path:
+    return folder / "rounds" / f"{round_id}.mcap"
+
+
+def state_path(folder: Path, round_id: str) -> Path:
+    return folder / "state" / f"{round_id}.json"
+
+
+def partial_path(folder: Path, round_id: str) -> Path:
+    """Where to write a round that is not finished; its own folder, made empty."""
+    home = folder / PARTIAL / round_id
+    shutil.rmtree(home, ignore_errors=True)
+    home.mkdir(parents=True)
+    return home / "round.mcap"
+
+
+def publish(folder: Path, partial: Path, state: RoundState) -> None:
+    """Move a checked round to its place: after a power cut it is there whole or not at all."""
+    _sync(partial)
+    partial.replace(round_path(folder, state.id))
+    _sync(folder / "rounds")
+    write_synced(state_path(folder, state.id), json.dumps(asdict(state), indent=1) + "\n")
+    discard_partial(folder, state.id)
+
+
+def discard_partial(folder: Path, round_id: str) -> None:
+    shutil.rmtree(folder / PARTIAL / round_id, ignore_errors=True)
+    _remove_empty(folder / PARTIAL)
+
+
+def discard_partials(folder: Path) -> None:
+    """What a crash or an interruption has left."""
+    shutil.rmtree(folder / PARTIAL, ignore_errors=True)
+
+
+def read_states(folder: Path) -> dict[str, RoundState]:
+    """States of the rounds that are finished: the file is there and has its length."""
+    states = {}
+    for path in sorted((folder / "state").glob("*.json")):
+        state = RoundState.read(path)
+        file = folder / state.file
+        if file.is_file() and file.stat().st_size == state.bytes:
+            states[state.id] = state
+    return states
+
+
+def file_sha256(path: Path) -> str:
+    digest = hashlib.sha256()
+    with path.open("rb") as stream:
+        while block := stream.read(READ_BYTES):
+            digest.update(block)
+    return digest.hexdigest()
+
+
+def write_synced(path: Path, text: str) -> None:
+    """Replace a small file in one step."""
+    beside = path.with_name(f".{path.name}.new")
+    try:
+        beside.write_text(text)
+        _sync(beside)
+        beside.replace(path)
+    except OSError:
+        beside.unlink(missing_ok=True)
+        raise
+    _sync(path.parent)
+
+
+def _sync(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _remove_empty(path: Path) -> None:
+    if path.is_dir() and not any(path.iterdir()):
+        path.rmdir()

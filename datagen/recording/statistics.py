@@ -1,0 +1,74 @@
+"""What is in a dataset, counted: the figures a model's errors are to be judged against."""
+
+from collections import Counter
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+import trackfeatures as tf
+
+from .dataset import Dataset
+from .labels import Labels
+
+
+def describe(dataset: Dataset) -> dict[str, Any]:
+    """Counts and label statistics of all frames and of either side of the split."""
+    frames = dataset.select("all")
+    labels, rounds = frames.labels, frames.rounds
+    side = np.array([info.split for info in rounds])[labels.round]
+    return {
+        "definitions": tf.VERSION,
+        "content_hash": dataset.content_hash,
+        "rounds": len(rounds),
+        "frames": len(labels),
+        "camera": dataset.camera.as_dict(),
+        "seeds": sorted({info.seed for info in rounds}),
+        "by_track": _frames_by(rounds, "track"),
+        "by_lanes": _frames_by(rounds, "lanes"),
+        "by_light": _frames_by(rounds, "light"),
+        "by_traffic": _frames_by(rounds, "traffic"),
+        "by_trajectory": _frames_by(rounds, "trajectory"),
+        "all": describe_labels(labels),
+        "train": describe_labels(labels.take(np.flatnonzero(side == "train"))),
+        "test": describe_labels(labels.take(np.flatnonzero(side == "test"))),
+    }
+
+
+def describe_labels(labels: Labels) -> dict[str, Any]:
+    """`mean_deviation` is the mean error of always answering the mean: what is no learning."""
+    if not len(labels):
+        return {"frames": 0}
+    columns = dict(zip(tf.MARKINGS, labels.distances.T, strict=True))
+    columns["to_lane_centre"] = labels.to_lane_centre
+    columns["angle"] = labels.angle
+    counts = np.bincount(labels.heading, minlength=len(tf.Heading)) / len(labels)
+    return {
+        "frames": len(labels),
+        "heading": {kind.name.lower(): round(float(counts[kind]), 4) for kind in tf.Heading},
+        "active": {n: round(float(np.mean(~np.isnan(c))), 4) for n, c in columns.items()},
+        "mean": {n: _mean(c) for n, c in columns.items()},
+        "mean_deviation": {n: _mean(np.abs(c - _mean(c))) for n, c in columns.items()},
+        "angle_std": round(float(labels.angle.std()), 5),
+        "to_middle_m": _range(labels.to_middle),
+        "speed_kmh": _range(labels.speed * 3.6),
+        "shadow_fraction": _mean(labels.shadow_fraction),
+    }
+
+
+def _mean(values: NDArray[np.float32]) -> float:
+    present = values[~np.isnan(values)]
+    return round(float(present.mean()), 5) if present.size else 0.0
+
+
+def _range(values: NDArray[np.float32]) -> dict[str, float]:
+    low, middle, high = np.percentile(values, [0, 50, 100])
+    return {"min": round(low, 3), "median": round(middle, 3), "max": round(high, 3)}
+
+
+def _frames_by(rounds: Iterable[Any], name: str) -> dict[str, int]:
+    counts: Counter[str] = Counter()
+    for info in rounds:
+        counts[str(getattr(info, name))] += info.frames
+    return dict(sorted(counts.items()))
