@@ -24,6 +24,7 @@ from mtlnet.card import (
 if TYPE_CHECKING:
     from mtlnet.network import Network
 
+Kind = Literal["openvino", "torch"]
 Precision = Literal["bf16", "f32"]
 
 
@@ -48,7 +49,7 @@ class Engine(Protocol):
 
 def load_engine(
     run: Path,
-    kind: Literal["openvino", "torch"] = "openvino",
+    kind: Kind = "openvino",
     precision: Precision | None = None,
     threads: int = 1,
 ) -> Engine:
@@ -129,6 +130,24 @@ class TorchEngine:
         check_image(image, self._shape)
         outputs: NDArray[np.float32] = answer_images(self._network, image[None])[0]
         return outputs
+
+
+def parse_kind(text: str) -> Kind:
+    """The engine called `text`; ModelError when there is none."""
+    kinds: dict[str, Kind] = {"openvino": "openvino", "torch": "torch"}
+    if text in kinds:
+        return kinds[text]
+    raise ModelError(f"there is no engine {text!r}; choose openvino or torch")
+
+
+def parse_precision(text: str | None) -> Precision | None:
+    """The precision called `text`, None for the CPU's best; ModelError when there is none."""
+    precisions: dict[str, Precision] = {"bf16": "bf16", "f32": "f32"}
+    if text is None:
+        return None
+    if text in precisions:
+        return precisions[text]
+    raise ModelError(f"there is no precision {text!r}; choose bf16 or f32")
 
 
 def best_precision(core: Any) -> Precision:

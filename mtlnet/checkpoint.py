@@ -1,0 +1,86 @@
+"""Checkpoints of a run in training: one safetensors file each, written whole or not at all.
+
+Tensors: `network.*`, `optimiser.INDEX.NAME`, `rng` (torch's generator, for dropout). Metadata:
+the step and the seconds trained so far.
+"""
+
+import os
+from pathlib import Path
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+from torch import Tensor
+
+from mtlnet.card import ModelError
+from mtlnet.trainer import Trainer
+
+FOLDER = "checkpoints"
+KEPT = 2
+
+
+def save_checkpoint(run: Path, trainer: Trainer, elapsed_s: float) -> Path:
+    """Write the state of `trainer` to `run`; the latest `KEPT` checkpoints stay."""
+    folder = run / FOLDER
+    folder.mkdir(exist_ok=True)
+    path = folder / f"step-{trainer.step_number:08d}.safetensors"
+    metadata = {"step": str(trainer.step_number), "elapsed_s": repr(elapsed_s)}
+    partial = path.with_suffix(".partial")
+    with partial.open("wb") as file:
+        file.write(save(_tensors(trainer), metadata))
+        file.flush()
+        os.fsync(file.fileno())
+    partial.replace(path)
+    for old in list_checkpoints(run)[:-KEPT]:
+        old.unlink()
+    return path
+
+
+def load_checkpoint(path: Path, trainer: Trainer) -> float:
+    """Put the state in `path` into `trainer`; the seconds trained so far.
+
+    Raises ModelError when the file is damaged or of another network.
+    """
+    try:
+        with safe_open(path, framework="pt") as file:
+            metadata = file.metadata()
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 no dict
+        _restore(trainer, tensors)
+        trainer.step_number = int(metadata["step"])
+        return float(metadata["elapsed_s"])
+    except (SafetensorError, RuntimeError, KeyError, ValueError, TypeError) as error:
+        reason = str(error).splitlines()[0]
+        raise ModelError(
+            f"the checkpoint {path} cannot be read ({reason}); delete it to resume from the one "
+            "before, or start a new run"
+        ) from error
+
+
+def list_checkpoints(run: Path) -> list[Path]:
+    """Checkpoints of a run, oldest first."""
+    return sorted((run / FOLDER).glob("step-*.safetensors"))
+
+
+def _tensors(trainer: Trainer) -> dict[str, Tensor]:
+    tensors = {f"network.{name}": t for name, t in trainer.network.state_dict().items()}
+    for index, state in trainer.optimiser.state_dict()["state"].items():
+        for name, value in state.items():
+            if isinstance(value, Tensor):
+                tensors[f"optimiser.{index}.{name}"] = value
+    tensors["rng"] = torch.get_rng_state()
+    return {name: t.detach().cpu().contiguous() for name, t in tensors.items()}
+
+
+def _restore(trainer: Trainer, tensors: dict[str, Tensor]) -> None:
+    prefix = "network."
+    trainer.network.load_state_dict(
+        {name.removeprefix(prefix): t for name, t in tensors.items() if name.startswith(prefix)}
+    )
+    state: dict[int, dict[str, Tensor]] = {}
+    for key, tensor in tensors.items():
+        if key.startswith("optimiser."):
+            _, index, name = key.split(".", 2)
+            state.setdefault(int(index), {})[name] = tensor
+    groups = trainer.optimiser.state_dict()["param_groups"]
+    trainer.optimiser.load_state_dict({"state": state, "param_groups": groups})
+    torch.set_rng_state(tensors["rng"])

@@ -1,0 +1,155 @@
+"""The `mtlnet` command: train, evaluate and ask the perception network."""
+
+import json
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from trackfeatures.command import main as run_command
+
+if TYPE_CHECKING:
+    from mtlnet.engine import Engine
+
+app = typer.Typer(
+    help="Train, evaluate and ask the multi-task perception network.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    add_completion=False,
+)
+MODEL_HELP = 'Run folder, name in runs/, "latest", or "default" (the weights shipped).'
+Model = Annotated[str, typer.Option(help=MODEL_HELP)]
+Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
+Data = Annotated[Path, typer.Option(help="Dataset folder.")]
+EngineKind = Annotated[str, typer.Option("--engine", help="openvino or torch (float32 oracle).")]
+PrecisionOption = Annotated[
+    str | None, typer.Option(help="bf16 or f32; by default bf16 where the CPU computes in it.")
+]
+
+
+@app.command("train")
+def train_command(
+    data: Annotated[
+        Path | None, typer.Option(help="Dataset folder.  [default: datasets/default]")
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="New run folder.  [default: runs/DATE-RECIPE]")
+    ] = None,
+    alpha: Annotated[
+        str | None,
+        typer.Option(help="Weights of distance, angle and type loss.  [default: 0.3,0.2,0.5]"),
+    ] = None,
+    recipe: Annotated[
+        str | None, typer.Option(help="fast (minutes) or paper (days).  [default: fast]")
+    ] = None,
+    iterations: Annotated[
+        int | None, typer.Option(help="Steps.  [default: the recipe's, unless --minutes]")
+    ] = None,
+    minutes: Annotated[
+        float | None, typer.Option(help="Train for this long; the schedule follows the clock.")
+    ] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of it all.  [default: 0]")] = None,
+    batch: Annotated[int | None, typer.Option(help="Images a step.  [default: 32]")] = None,
+    device: Annotated[str | None, typer.Option(help="auto, cpu or cuda.  [default: auto]")] = None,
+    threads: Annotated[int | None, typer.Option(help="CPU threads.  [default: one a core]")] = None,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on with the stopped run in --out (or the newest).")
+    ] = False,
+    as_json: Json = False,
+) -> None:
+    """Train the network on the train rounds of a dataset; ends with a model `serve` can load."""
+    given = {
+        "data": data,
+        "recipe": recipe,
+        "iterations": iterations,
+        "minutes": minutes,
+        "seed": seed,
+        "batch": batch,
+        "device": device,
+        "threads": threads,
+    }
+    options: dict[str, Any] = {k: v for k, v in given.items() if v is not None}
+    from mtlnet.start import start_training
+
+    result = start_training(options, alpha, out, resume=resume)
+    if as_json:
+        typer.echo(json.dumps(result))
+
+
+@app.command("evaluate")
+def evaluate_command(
+    model: Model = "default",
+    data: Data = Path("datasets/default"),
+    split: Annotated[str, typer.Option(help="train, test or all.")] = "test",
+    engine: EngineKind = "openvino",
+    precision: PrecisionOption = None,
+    as_json: Json = False,
+) -> None:
+    """Errors in metres and radians on a dataset, beside always answering the training mean."""
+    import os
+
+    from rich.console import Console
+    from rich.progress import Progress
+
+    from mtlnet.evaluate import evaluate
+    from mtlnet.tables import evaluation_table, group_table
+
+    ready = _load(model, engine, precision, threads=os.cpu_count() or 1)
+    with Progress(console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task("evaluating")
+        result = evaluate(
+            ready, data, split, lambda done, total: bar.update(task, completed=done, total=total)
+        )
+    if as_json:
+        typer.echo(json.dumps(result))
+        return
+    console = Console()
+    console.print(evaluation_table(result))
+    console.print(group_table(result))
+
+
+@app.command("predict")
+def predict_command(
+    images: Annotated[list[Path], typer.Argument(help="JPEG or PNG files.")],
+    model: Model = "default",
+    engine: EngineKind = "openvino",
+    precision: PrecisionOption = None,
+    as_json: Json = False,
+) -> None:
+    """Track features of images from the model's camera."""
+    from rich.console import Console
+
+    from mtlnet.answer import interpret
+    from mtlnet.images import read_image
+    from mtlnet.tables import answer_table
+
+    ready = _load(model, engine, precision, threads=1)
+    answers = []
+    for path in images:
+        image = read_image(path, ready.card.camera)
+        begin = time.perf_counter()
+        answer = interpret(ready(image)).as_json()
+        latency_ms = round(1e3 * (time.perf_counter() - begin), 3)
+        answers.append(
+            {"image": str(path), **answer, "model": ready.card.name, "latency_ms": latency_ms}
+        )
+    if as_json:
+        typer.echo(json.dumps(answers))
+    else:
+        Console().print(answer_table(answers))
+
+
+def _load(model: str, kind: str, precision: str | None, threads: int) -> "Engine":
+    """The engine of a model; says on stderr which one was really taken."""
+    from mtlnet.card import resolve_run
+    from mtlnet.engine import load_engine, parse_kind, parse_precision
+
+    run = resolve_run(model)
+    typer.echo(f"model: {run}", err=True)
+    return load_engine(run, parse_kind(kind), parse_precision(precision), threads)
+
+
+def main() -> None:
+    """Entry point."""
+    run_command(app)

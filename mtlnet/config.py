@@ -1,0 +1,91 @@
+"""What a training run was asked to do: kept in its `config.json`, and obeyed on `--resume`."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import trackfeatures as tf
+from mtlnet.card import ModelError
+from mtlnet.loss import Alpha
+from mtlnet.recipe import Recipe
+from trackfeatures.errors import UserError
+
+CONFIG = "config.json"
+# What may change when a run goes on; all else would make it another run.
+FLEXIBLE = ("iterations", "minutes", "device", "threads", "data")
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """One training run."""
+
+    data: Path
+    out: Path
+    alpha: Alpha = (0.3, 0.2, 0.5)
+    recipe: str = "fast"
+    iterations: int | None = None
+    """Steps; None: the recipe's, or as many as fit into `minutes`."""
+    minutes: float | None = None
+    """Time for the training itself; the schedule follows the clock."""
+    seed: int = 0
+    batch: int = 32
+    device: str = "auto"
+    threads: int = 0
+    """CPU threads; 0: one a core."""
+
+    def __post_init__(self) -> None:
+        if self.iterations is not None and self.iterations < 1:
+            raise UserError(f"--iterations is {self.iterations}; give at least 1")
+        if self.minutes is not None and not self.minutes > 0:
+            raise UserError(f"--minutes is {self.minutes}; give more than 0")
+        if self.batch < 2:
+            raise UserError(f"--batch is {self.batch}; batch normalisation needs at least 2")
+        if self.seed < 0:
+            raise UserError(f"--seed is {self.seed}; give 0 or more")
+
+
+def write_config(config: TrainConfig, recipe: Recipe, data: Mapping[str, Any]) -> None:
+    """Write `config.json` of a new run."""
+    content = {
+        "definitions": tf.VERSION,
+        "config": {**asdict(config), "data": str(config.data), "out": str(config.out)},
+        "recipe": asdict(recipe),
+        "data": dict(data),
+    }
+    text = json.dumps(content, indent=1) + "\n"
+    partial = config.out / (CONFIG + ".partial")
+    partial.write_text(text, encoding="utf-8")
+    partial.replace(config.out / CONFIG)
+
+
+def read_config(run: Path) -> tuple[TrainConfig, dict[str, Any]]:
+    """The configuration of a run, and the description of its data."""
+    path = run / CONFIG
+    if not path.is_file():
+        raise ModelError(f"{run} is no training run ({CONFIG} is missing); nothing to resume")
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        tf.require_version(content["definitions"], f"the run in {run}")
+        values = content["config"]
+        values.update(data=Path(values["data"]), out=run, alpha=tuple(values["alpha"]))
+        return TrainConfig(**values), content["data"]
+    except (ValueError, KeyError, TypeError) as error:
+        raise ModelError(f"{path} is damaged ({error!r}); start a new run") from error
+
+
+def resume_config(run: Path, given: Mapping[str, Any]) -> tuple[TrainConfig, dict[str, Any]]:
+    """The stored configuration with what was `given` on the command line to go on with.
+
+    Raises UserError when something is given that would make it another run.
+    """
+    stored, data = read_config(run)
+    for name, value in given.items():
+        kept = getattr(stored, name)
+        if name not in FLEXIBLE and value != kept:
+            raise UserError(
+                f"{run} was started with {name} {kept}, now {value} is asked for; leave it out to "
+                "resume, or start a new run with another --out"
+            )
+    return replace(stored, **{k: v for k, v in given.items() if k in FLEXIBLE}), data

@@ -1,0 +1,133 @@
+"""Batches for training, decoded and mirrored on threads while the network computes.
+
+A batch is a pure function of (seed, step): a resumed run sees what an unbroken one would have.
+"""
+
+from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+import trackfeatures as tf
+
+AHEAD = 3  # batches in the making
+BRIGHTNESS, CONTRAST, TINT = 0.25, 0.25, 0.06
+
+
+class LabelArrays(Protocol):
+    """The labels training needs; see `datagen.recording.Labels`."""
+
+    @property
+    def distances(self) -> NDArray[np.float32]:
+        """(N, 5) m, NaN where absent."""
+
+    @property
+    def angle(self) -> NDArray[np.float32]:
+        """(N,) rad."""
+
+    @property
+    def heading(self) -> NDArray[np.int64]:
+        """(N,) classes."""
+
+
+class Images(Protocol):
+    """Labelled images; `datagen.recording.Frames` is one."""
+
+    def __len__(self) -> int: ...
+
+    @property
+    def labels(self) -> LabelArrays: ...
+
+    def read_batch(
+        self, indices: NDArray[np.int64], out: NDArray[np.uint8]
+    ) -> NDArray[np.uint8]: ...
+
+
+@dataclass(frozen=True)
+class Batch:
+    """`images` (B, H, W, 3) uint8, `coded` (B, 6), `heading` (B,), `gain` and `shift` (B, 1, 1, 3).
+
+    The network is to see `normalised image * gain + shift`.
+    """
+
+    images: NDArray[np.uint8]
+    coded: NDArray[np.float32]
+    heading: NDArray[np.int64]
+    gain: NDArray[np.float32]
+    shift: NDArray[np.float32]
+
+
+class Loader:
+    """Endless batches from `frames`, each epoch in its own order."""
+
+    def __init__(
+        self, frames: Images, size: tuple[int, int], batch: int, seed: int, *, augment: bool
+    ) -> None:
+        self.frames = frames
+        self.batch = batch
+        self.seed = seed
+        self.augment = augment
+        self._size = size
+        labels = frames.labels
+        self.coded = tf.encode(labels.distances, labels.angle)
+        self.heading = np.asarray(labels.heading, dtype=np.int64)
+        self._permutation = lru_cache(maxsize=2)(self._shuffle)
+
+    def _shuffle(self, epoch: int) -> NDArray[np.int64]:
+        return np.random.default_rng([self.seed, 1, epoch]).permutation(len(self.heading))
+
+    def indices(self, step: int) -> NDArray[np.int64]:
+        """The frames of batch `step`; every frame once an epoch."""
+        places = np.arange(step * self.batch, (step + 1) * self.batch)
+        epochs, rows = np.divmod(places, len(self.heading))
+        return np.array(
+            [self._permutation(int(e))[r] for e, r in zip(epochs, rows, strict=True)], np.int64
+        )
+
+    def make(self, step: int) -> Batch:
+        """Batch number `step`."""
+        chosen = self.indices(step)
+        images = np.empty((self.batch, *self._size, 3), np.uint8)
+        self.frames.read_batch(chosen, images)
+        coded, heading = self.coded[chosen], self.heading[chosen]
+        gain = np.ones((self.batch, 1, 1, 3), np.float32)
+        shift = np.zeros_like(gain)
+        if self.augment:
+            rng = np.random.default_rng([self.seed, 2, step])
+            coded, heading = mirror(images, coded, heading, rng.random(self.batch) < 0.5)
+            contrast = np.exp(rng.uniform(-CONTRAST, CONTRAST, (self.batch, 1, 1, 1)))
+            gain *= contrast * np.exp(rng.uniform(-TINT, TINT, gain.shape))
+            shift += rng.uniform(-BRIGHTNESS, BRIGHTNESS, (self.batch, 1, 1, 1))
+        return Batch(images, coded, heading, gain.astype(np.float32), shift.astype(np.float32))
+
+    def batches(self, first: int) -> Iterator[Batch]:
+        """Batches `first`, `first` + 1, ... without end, made ahead on a thread."""
+        with ThreadPoolExecutor(1, thread_name_prefix="loader") as pool:
+            waiting: list[Future[Batch]] = [pool.submit(self.make, first + i) for i in range(AHEAD)]
+            step = first + AHEAD
+            try:
+                while True:
+                    batch = waiting.pop(0).result()
+                    waiting.append(pool.submit(self.make, step))
+                    step += 1
+                    yield batch
+            finally:
+                for future in waiting:
+                    future.cancel()
+
+
+def mirror(
+    images: NDArray[np.uint8],
+    coded: NDArray[np.float32],
+    heading: NDArray[np.int64],
+    chosen: NDArray[np.bool_],
+) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+    """Mirror the `chosen` (B,) images in place; the targets of the batch, theirs mirrored."""
+    for row in np.flatnonzero(chosen):
+        images[row] = images[row, :, ::-1]
+    mirrored = np.where(chosen[:, None], tf.mirror_coded(coded), coded).astype(np.float32)
+    return mirrored, np.where(chosen, tf.mirror_heading(heading), heading)

@@ -1,0 +1,204 @@
+"""Training a model from a dataset: `mtlnet train --data DIR --out RUN --alpha 0.3,0.2,0.5`.
+
+Ends with the finished model in the run's folder (see `mtlnet.publish`); stopped by Ctrl-C it
+leaves a checkpoint to go on from with `--resume`.
+"""
+
+import os
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from datagen.recording import Dataset, Frames
+from mtlnet.card import RUNS, Camera, ModelCard, ModelError
+from mtlnet.checkpoint import list_checkpoints, load_checkpoint, save_checkpoint
+from mtlnet.config import TrainConfig, write_config
+from mtlnet.curves import Curves
+from mtlnet.interrupt import StopRequest
+from mtlnet.loader import Loader
+from mtlnet.network import HEIGHT, WIDTH
+from mtlnet.publish import publish
+from mtlnet.recipe import find_recipe
+from mtlnet.report import describe_data
+from mtlnet.trainer import Trainer, keep_freed_memory
+from trackfeatures.errors import UserError
+
+LOG_EVERY = 10
+CHECKPOINT_SECONDS = 60.0
+CHECK_FRAMES = 16
+"""Frames on which the exported graph is held against torch."""
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Where a run is: `fraction` in [0, 1]; losses as logged (distance, angle, type, total)."""
+
+    step: int
+    fraction: float
+    elapsed_s: float
+    images_per_second: float
+    losses: NDArray[np.float64]
+
+
+class Stopped(KeyboardInterrupt):
+    """The user stopped the run; its state is in the checkpoint named."""
+
+
+Report = Callable[[Progress], None]
+
+
+def train(
+    config: TrainConfig, resumed: dict[str, Any] | None, report: Report = lambda _: None
+) -> ModelCard:
+    """Train by `config` and publish the model in `config.out`.
+
+    `resumed`: the description of the data as the run was started with, to go on with it; None
+    starts a new run. Raises UserError (data, an existing folder), Stopped after Ctrl-C.
+    """
+    recipe = find_recipe(config.recipe)
+    frames, dataset = open_training_data(config.data)
+    data = describe_data(dataset, frames)
+    if resumed is None:
+        create_run(config.out)
+        write_config(config, recipe, data)
+    else:
+        require_same_data(config, resumed, data)
+    torch.set_num_threads(config.threads or os.cpu_count() or 1)
+    keep_freed_memory()
+    trainer = Trainer(recipe, config.alpha, config.seed, choose_device(config.device))
+    loader = Loader(frames, (HEIGHT, WIDTH), config.batch, config.seed, augment=recipe.augment)
+    trainer.standardise(loader)
+    elapsed_s = 0.0
+    checkpoints = list_checkpoints(config.out) if resumed is not None else []
+    if checkpoints:
+        elapsed_s = load_checkpoint(checkpoints[-1], trainer)
+    learn(config, trainer, loader, elapsed_s, report)
+    chosen = np.linspace(0, len(frames) - 1, min(CHECK_FRAMES, len(frames))).astype(np.int64)
+    images = frames.read_batch(chosen, np.empty((len(chosen), HEIGHT, WIDTH, 3), np.uint8))
+    card = publish(
+        trainer.network,
+        config.out,
+        images,
+        camera=Camera(**dataset.camera.as_dict()),  # type: ignore[arg-type]  # sizes are int
+        alpha=config.alpha,
+        recipe=config.recipe,
+        iterations=trainer.step_number,
+        batch=config.batch,
+        seed=config.seed,
+        data=data,
+    )
+    link_latest(config.out)
+    return card
+
+
+def learn(
+    config: TrainConfig, trainer: Trainer, loader: Loader, elapsed_s: float, report: Report
+) -> None:
+    """Take steps until the iterations or the minutes are used up; checkpoints on the way."""
+    begin = time.perf_counter() - elapsed_s
+    saved = logged = time.perf_counter()
+    window: list[torch.Tensor] = []
+    with Curves(config.out, trainer.step_number) as curves, StopRequest() as stop:
+        batches = loader.batches(trainer.step_number)
+        while (done := fraction(config, trainer, time.perf_counter() - begin)) < 1.0:
+            losses = trainer.step(next(batches), done)
+            window.append(
+                torch.stack([losses.distance, losses.angle, losses.type, losses.total.detach()])
+            )
+            if trainer.step_number % LOG_EVERY == 0:
+                now = time.perf_counter()
+                means = torch.stack(window).double().mean(0).cpu().numpy()
+                require_finite(means, trainer.step_number)
+                speed = len(window) * config.batch / (now - logged)
+                window, logged = [], now
+                point = Progress(trainer.step_number, done, now - begin, speed, means)
+                rate = trainer.optimiser.param_groups[0]["lr"]
+                curves.write(dict(zip(curves.columns, as_row(point, rate), strict=True)))
+                report(point)
+            if stop.requested or time.perf_counter() - saved > CHECKPOINT_SECONDS:
+                path = save_checkpoint(config.out, trainer, time.perf_counter() - begin)
+                saved = time.perf_counter()
+                if stop.requested:
+                    raise Stopped(str(path))
+        save_checkpoint(config.out, trainer, time.perf_counter() - begin)
+
+
+def fraction(config: TrainConfig, trainer: Trainer, elapsed_s: float) -> float:
+    """How much of the run is done, by steps or by the clock, whichever is further."""
+    recipe_steps = None if config.minutes is not None else trainer.recipe.iterations
+    steps = config.iterations or recipe_steps
+    by_steps = trainer.step_number / steps if steps else 0.0
+    by_clock = elapsed_s / (60 * config.minutes) if config.minutes is not None else 0.0
+    return max(by_steps, by_clock)
+
+
+def as_row(point: Progress, rate: float) -> tuple[float, ...]:
+    """A point of the curves, in the order of their columns."""
+    return (point.step, point.elapsed_s, rate, point.images_per_second, *point.losses.tolist())
+
+
+def require_finite(losses: NDArray[np.float64], step: int) -> None:
+    """Raise UserError when training has diverged."""
+    if not np.isfinite(losses).all():
+        raise UserError(
+            f"the loss is no longer a finite number at step {step} (distance, angle, type, total: "
+            f"{losses.tolist()}); resume from the last checkpoint with other data or smaller alpha"
+        )
+
+
+def open_training_data(path: Path) -> tuple[Frames, Dataset]:
+    """The train rounds of a dataset; UserError when it does not fit this network."""
+    dataset = Dataset.open(path)
+    camera = dataset.camera
+    if (camera.width, camera.height) != (WIDTH, HEIGHT):
+        raise UserError(
+            f"the images of {path} are {camera.width} x {camera.height}, the network takes "
+            f"{WIDTH} x {HEIGHT}; collect with the default camera size"
+        )
+    return dataset.select("train"), dataset
+
+
+def create_run(out: Path) -> None:
+    """Make the folder of a new run; UserError when there is something already."""
+    if out.exists():
+        raise UserError(
+            f"{out} already exists; continue that run with --resume, or choose another --out"
+        )
+    out.mkdir(parents=True)
+
+
+def require_same_data(config: TrainConfig, resumed: dict[str, Any], data: dict[str, Any]) -> None:
+    """Raise ModelError unless the run goes on with what it began with."""
+    for name in ("content_hash", "split"):
+        if resumed.get(name) != data[name]:
+            raise ModelError(
+                f"the {name.replace('_', ' ')} of {config.data} is not the one {config.out} was "
+                "started with; give that dataset with --data, or start a new run"
+            )
+
+
+def choose_device(name: str) -> torch.device:
+    """The device called `name`; "auto": a GPU where there is one."""
+    if name == "auto":
+        name = "cuda" if torch.cuda.is_available() else "cpu"
+    if name.startswith("cuda") and not torch.cuda.is_available():
+        raise UserError(f"--device {name}: torch finds no GPU here; use --device cpu")
+    if name.split(":")[0] not in ("cpu", "cuda"):
+        raise UserError(f"--device {name!r} is not known; use auto, cpu or cuda")
+    return torch.device(name)
+
+
+def link_latest(run: Path) -> None:
+    """Point `runs/latest` to `run` when it lies in `runs/`."""
+    if run.resolve().parent != RUNS.resolve():
+        return
+    link = RUNS / "latest.partial"
+    link.unlink(missing_ok=True)
+    link.symlink_to(run.resolve().name)
+    link.replace(RUNS / "latest")
