@@ -37,6 +37,8 @@ class Bend:
 
 
 Segment = Straight | Bend
+Row = tuple[float, float, float, int]
+"""Length, curvature, banking at the end (left edge up), number of the segment."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +54,7 @@ class Steps:
 
 def cut(segments: list[Segment]) -> Steps:
     """Cut segments into steps of at most 5 m, spirals into steps of about 2 m."""
-    rows: list[tuple[float, float, float, int]] = []
+    rows: list[Row] = []
     for number, segment in enumerate(segments):
         if isinstance(segment, Straight):
             rows += _even(segment.length, 0.0, 0.0, number)
@@ -76,14 +78,12 @@ def cut(segments: list[Segment]) -> Steps:
     )
 
 
-def _even(
-    length: float, k: float, banking: float, number: int
-) -> list[tuple[float, float, float, int]]:
+def _even(length: float, k: float, banking: float, number: int) -> list[Row]:
     count = max(1, math.ceil(length / MAX_STEP_M - 1e-9))
     return [(length / count, k, banking, number)] * count
 
 
-def _spiral(bend: Bend, sign: float, number: int) -> list[tuple[float, float, float, int]]:
+def _spiral(bend: Bend, sign: float, number: int) -> list[Row]:
     count = math.ceil(bend.spiral / SPIRAL_STEP_M - 1e-9)
     # Curvature at the middle of a step: the sum of the turns is then exactly the clothoid's.
     return [

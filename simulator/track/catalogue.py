@@ -1,0 +1,118 @@
+"""Finds tracks by name: the project's own, then TORCS and CSV tracks in the folders we look in.
+
+Looked in, in this order: `simulator/tracks`, the folder given (`--tracks-dir`), `$TORCS_TRACKS`,
+`/usr/share/games/torcs/tracks`. The first track of a name wins.
+"""
+
+import difflib
+import os
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Final
+
+from simulator.track.errors import UnknownTrack
+from simulator.track.geometry import Track
+from trackfeatures.errors import UserError
+
+OWN_TRACKS: Final = Path(__file__).parent.parent / "tracks"
+SYSTEM_TRACKS: Final = Path("/usr/share/games/torcs/tracks")
+VARIABLE: Final = "TORCS_TRACKS"
+SUFFIXES: Final = (".xml", ".toml", ".csv")
+
+
+def find_track(name: str, tracks_dir: Path | None = None) -> Track:
+    """The track of that name, or of that file (.xml, .toml or .csv).
+
+    Raises UnknownTrack with names close to it, TrackError when its file is bad.
+    """
+    path = Path(name)
+    if path.suffix.lower() in SUFFIXES:
+        if not path.is_file():
+            raise UnknownTrack(f"there is no track file {name}; check the path")
+        return read_track(path)
+    files = track_files(tracks_dir)
+    if name not in files:
+        raise UnknownTrack(_unknown(name, list(files)))
+    return read_track(files[name])
+
+
+def list_tracks(tracks_dir: Path | None = None) -> list[Track]:
+    """All tracks that can be found; a bad file is skipped with a warning on stderr."""
+    tracks: list[Track] = []
+    for path in track_files(tracks_dir).values():
+        try:
+            tracks.append(read_track(path))
+        except (UserError, OSError) as error:
+            _warn(f"skipped a track: {error}")
+    return tracks
+
+
+def read_track(path: Path) -> Track:
+    """The track in one file; its kind is told by the suffix."""
+    return _reader(path.suffix.lower())(path)
+
+
+def _reader(suffix: str) -> Callable[[Path], Track]:
+    # One import each: a collector of own tracks needs neither XML nor scipy.
+    if suffix == ".xml":
+        from simulator.track.torcs import read_torcs
+
+        return read_torcs
+    if suffix == ".csv":
+        from simulator.track.centre_line_csv import read_centre_line
+
+        return read_centre_line
+    from simulator.track.own import read_own
+
+    return read_own
+
+
+def track_files(tracks_dir: Path | None = None) -> dict[str, Path]:
+    """File of every track by name, in the order we look."""
+    files: dict[str, Path] = {}
+    for folder in _folders(tracks_dir):
+        for path in _files_in(folder):
+            files.setdefault(path.stem, path)
+    return files
+
+
+def _folders(tracks_dir: Path | None) -> Iterator[Path]:
+    yield OWN_TRACKS
+    if tracks_dir is not None:
+        if not tracks_dir.is_dir():
+            raise UserError(f"there is no folder {tracks_dir}; name one that holds track files")
+        yield _tracks_below(tracks_dir)
+    if from_variable := os.environ.get(VARIABLE):
+        if Path(from_variable).is_dir():
+            yield _tracks_below(Path(from_variable))
+        else:
+            _warn(f"${VARIABLE} is {from_variable}, which is no folder; unset or correct it")
+    if SYSTEM_TRACKS.is_dir():
+        yield SYSTEM_TRACKS
+
+
+def _tracks_below(folder: Path) -> Path:
+    """TORCS keeps its tracks in `tracks`; both it and the folder above may be named."""
+    return folder / "tracks" if (folder / "tracks").is_dir() else folder
+
+
+def _files_in(folder: Path) -> list[Path]:
+    """Track files: NAME.* in the folder itself, and NAME/NAME.xml one and two levels down."""
+    here = [path for path in folder.glob("*") if path.suffix.lower() in SUFFIXES]
+    below = [*folder.glob("*/*.xml"), *folder.glob("*/*/*.xml")]
+    named = [path for path in below if path.stem == path.parent.name]
+    return sorted(here) + sorted(named)
+
+
+def _unknown(name: str, known: list[str]) -> str:
+    close = difflib.get_close_matches(name, known, n=3, cutoff=0.5)
+    hint = f"did you mean {' or '.join(close)}? " if close else ""
+    return (
+        f"there is no track {name!r}; {hint}`simulator tracks` lists the {len(known)} known ones, "
+        f"--tracks-dir or ${VARIABLE} adds a folder of TORCS tracks"
+    )
+
+
+def _warn(message: str) -> None:
+    sys.stderr.write(f"warning: {message}\n")

@@ -1,0 +1,171 @@
+"""Centre lines as CSV files, read and written.
+
+Read: the format of the TUM racetrack database, `x_m,y_m,w_tr_right_m,w_tr_left_m` (metres, one
+point a row, closed, no heights). Written: `s,x,y,z,ang,curv` (m, rad, 1/m) of any track.
+"""
+
+import math
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from scipy.interpolate import splev, splprep
+
+from simulator.track.errors import TrackError
+from simulator.track.geometry import Track
+from simulator.track.markings import imported_style
+from simulator.track.pieces import FloatArray, Piece, assemble, check_closes
+from trackfeatures.errors import UserError
+
+MAX_BYTES: Final = 16 * 2**20
+POINTS: Final = (8, 100_000)
+LENGTH_M: Final = (50.0, 100_000.0)
+WIDTH_M: Final = (2.0, 60.0)
+STEP_LIMITS_M: Final = (0.01, 1000.0)
+
+PIECE_M: Final = 4.0
+"""About the length of a piece."""
+NOISE_M: Final = 0.05
+"""Root mean square of the survey's noise, which is smoothed away."""
+MIN_RADIUS_M: Final = 5.0
+"""A sharper line is a mistake of the survey, not a road."""
+MAX_GAP_M: Final = 1e-3
+HEADER: Final = "s,x,y,z,ang,curv\n"
+ROW: Final = "%.6f,%.6f,%.6f,%.6f,%.9f,%.9f\n"
+
+
+def read_centre_line(path: Path) -> Track:
+    """A flat track along the points of a CSV file, as wide as their median width.
+
+    Raises TrackError for a file that is not of this format, or whose points are no closed road.
+    """
+    points, width = _read_points(path)
+    placed = assemble(_pieces(points, path))
+    check_closes(placed, str(path), MAX_GAP_M)
+    radius = 1.0 / float(np.max(np.abs(placed.curvature)))
+    if radius < MIN_RADIUS_M:
+        raise TrackError(
+            f"{path}: the line bends with a radius of {radius:.1f} m, expected at least "
+            f"{MIN_RADIUS_M:g} m; are the points in order and in metres?"
+        )
+    return Track.from_placed(
+        placed,
+        name=path.stem,
+        source="csv",
+        width=width,
+        surface="asphalt",
+        look="circuit",
+        markings=imported_style(path.stem, kerbs=True),
+    )
+
+
+def _read_points(path: Path) -> tuple[FloatArray, float]:
+    """Points (N, 2) of the closed line, each once, and the track's width."""
+    rows = _read_rows(path)
+    widths = rows[:, 2] + rows[:, 3]
+    if not (rows[:, 2:] > 0.0).all() or not WIDTH_M[0] <= float(np.median(widths)) <= WIDTH_M[1]:
+        raise TrackError(
+            f"{path}: widths from {widths.min():g} to {widths.max():g} m, "
+            f"expected {WIDTH_M[0]:g} to {WIDTH_M[1]:g} m"
+        )
+    points = rows[:, :2]
+    apart = np.hypot(*(np.roll(points, -1, axis=0) - points).T)
+    # The first point is often given again as the last one.
+    points, apart = points[apart > 1e-6], apart[apart > 1e-6]
+    if not LENGTH_M[0] <= float(apart.sum()) <= LENGTH_M[1] or len(points) < POINTS[0]:
+        raise TrackError(
+            f"{path}: {len(points)} different points round {apart.sum():.1f} m, expected at least "
+            f"{POINTS[0]} points and {LENGTH_M[0]:g} to {LENGTH_M[1]:g} m"
+        )
+    if apart[-1] > 10.0 * float(np.median(apart)):
+        raise TrackError(
+            f"{path}: the last point is {apart[-1]:.1f} m from the first; "
+            "a track must be one closed loop"
+        )
+    return points, float(np.median(widths))
+
+
+def _read_rows(path: Path) -> FloatArray:
+    size = path.stat().st_size
+    if size > MAX_BYTES:
+        raise TrackError(f"{path}: {size} bytes; a centre-line file has at most {MAX_BYTES}")
+    try:
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+    except UnicodeDecodeError as error:
+        raise TrackError(f"{path}: not a text file ({error})") from None
+    rows: list[list[float]] = []
+    for number, line in enumerate(lines, start=1):
+        text = line.strip()
+        if not text or text.startswith("#") or (number == 1 and text.startswith("x_m")):
+            continue
+        try:
+            row = [float(cell) for cell in text.replace(";", ",").split(",")]
+        except ValueError:
+            row = []
+        if len(row) != 4 or not all(math.isfinite(value) for value in row):
+            raise TrackError(
+                f"{path}: line {number} is {text[:60]!r}, expected four finite numbers: "
+                "x_m,y_m,w_tr_right_m,w_tr_left_m"
+            )
+        rows.append(row)
+    if not POINTS[0] <= len(rows) <= POINTS[1]:
+        raise TrackError(f"{path}: {len(rows)} points, expected {POINTS[0]} to {POINTS[1]}")
+    return np.array(rows, dtype=np.float64)
+
+
+def _pieces(points: FloatArray, path: Path) -> list[Piece]:
+    """Arcs along a periodic smoothing spline through the points."""
+    closed = np.vstack((points, points[:1]))
+    tck, _ = splprep(closed.T, s=len(points) * NOISE_M**2, per=1)
+    fine = np.linspace(0.0, 1.0, max(20 * len(points), 2000) + 1)
+    x, y = splev(fine, tck)
+    dx, dy = splev(fine, tck, der=1)
+    s = np.concatenate(([0.0], np.cumsum(np.hypot(np.diff(x), np.diff(y)))))
+    heading = np.unwrap(np.arctan2(dy, dx))
+    count = max(8, round(float(s[-1]) / PIECE_M))
+    nodes = np.linspace(0.0, float(s[-1]), count + 1)
+    turn = np.diff(np.interp(nodes, s, heading))
+    if abs(math.remainder(float(turn.sum()), 2.0 * math.pi)) > 1e-6:
+        raise TrackError(f"{path}: the points do not run round a closed loop")
+    length = _closing_lengths(np.full(count, s[-1] / count), turn, float(heading[0]))
+    return [
+        Piece(float(ds), float(dh / ds), 0.0, 0.0, 0.0, 0.0)
+        for ds, dh in zip(length, turn, strict=True)
+    ]
+
+
+def _closing_lengths(length: FloatArray, turn: FloatArray, heading: float) -> FloatArray:
+    """Lengths changed as little as possible, turns kept, so that the last arc meets the first."""
+    middle = heading + np.concatenate(([0.0], np.cumsum(turn)[:-1])) + turn / 2.0
+    chord = np.sinc(turn / (2.0 * np.pi)) * np.stack((np.cos(middle), np.sin(middle)))
+    gap = chord @ length
+    closed: FloatArray = length - chord.T @ np.linalg.solve(chord @ chord.T, gap)
+    return closed
+
+
+def write_centre_line(track: Track, step: float, path: Path) -> int:
+    """Write `s,x,y,z,ang,curv`, a row every `step` metres of a lap; returns the number of rows.
+
+    An older file stays as it is until the new one is complete.
+    """
+    if not STEP_LIMITS_M[0] <= step <= STEP_LIMITS_M[1]:
+        raise UserError(f"step {step:g} m asked for; it must be {STEP_LIMITS_M[0]:g} to 1000 m")
+    s = np.arange(0.0, track.length_m, step)
+    pose = track.at(s)
+    rows = np.column_stack((s, pose.x, pose.y, pose.z, pose.heading, pose.curvature))
+    write_whole(path, HEADER + "".join(ROW % tuple(row) for row in rows))
+    return len(s)
+
+
+def write_whole(path: Path, text: str) -> None:
+    """Write a text file in one go: an older one stays as it is until the new one is complete."""
+    if path.exists() and not path.is_file():
+        # A pipe or /dev/stdout cannot be replaced, and must not be.
+        path.write_text(text)
+        return
+    partial = path.with_name(path.name + ".partial")
+    try:
+        partial.write_text(text)
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)
