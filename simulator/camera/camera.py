@@ -64,7 +64,8 @@ class Camera:
         self._graphics.begin(target)
         scene.draw(eye.place, optics.frustum(eye, matrix))
         self._graphics.sky.render()
-        self._graphics.context.copy_framebuffer(target.resolved, target.drawn)
+        if target.resolved is not target.drawn:
+            self._graphics.context.copy_framebuffer(target.resolved, target.drawn)
         target.resolved.read_into(self._buffer, components=3, alignment=1)
         picture = np.frombuffer(self._buffer, dtype=np.uint8)
         return picture.reshape(self.height, self.width, 3).copy()

@@ -56,5 +56,5 @@ def _grid(
     centre = np.array(centres)
     centre[:, 0] = x0 + centre[:, 0] * cell
     centre[:, 1] = y0 + centre[:, 1] * cell
-    chunks = Chunks(centre, np.array(radii), np.array(first), np.array(count))
+    chunks = Chunks(centre, np.array(radii), np.array([first]), np.array([count]))
     return vertices.reshape(-1, 6), np.concatenate(indices).astype(np.uint32), chunks

@@ -17,27 +17,39 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Chunks:
-    """Spheres round runs of indices: centres (N, 3), radii, first index and number of indices."""
+    """Spheres round runs of indices: centres (N, 3), radii (N,), and one row of first index and
+    number of indices a level of detail, (levels, N), the finest first."""
 
     centres: FloatArray
     radii: FloatArray
     first: NDArray[np.int64]
     count: NDArray[np.int64]
 
-    def seen(self, eye: FloatArray, planes: FloatArray, reach: float) -> list[tuple[int, int]]:
-        """(first, count) runs that meet the frustum within `reach` m; neighbours are joined."""
+    def seen(
+        self, eye: FloatArray, planes: FloatArray, reaches: Sequence[float]
+    ) -> list[tuple[int, int]]:
+        """(first, count) runs that meet the frustum; level k is drawn up to reaches[k] m."""
         relative = self.centres - eye
-        inside = relative @ planes.T > -self.radii[:, None]
-        near = np.einsum("ij,ij->i", relative, relative) < (reach + self.radii) ** 2
-        chosen = np.flatnonzero(inside.all(axis=1) & near)
-        if len(chosen) == 0:
-            return []
-        breaks = np.flatnonzero(np.diff(chosen) > 1) + 1
-        starts = chosen[np.concatenate(([0], breaks))]
-        ends = chosen[np.concatenate((breaks - 1, [len(chosen) - 1]))]
-        first = self.first[starts]
-        count = self.first[ends] + self.count[ends] - first
-        return list(zip(first.tolist(), count.tolist(), strict=True))
+        inside = (relative @ planes.T > -self.radii[:, None]).all(axis=1)
+        distance = np.sqrt(np.einsum("ij,ij->i", relative, relative)) - self.radii
+        level = np.searchsorted(np.asarray(reaches), distance)
+        runs: list[tuple[int, int]] = []
+        for k in range(len(reaches)):
+            runs += _joined(np.flatnonzero(inside & (level == k)), self.first[k], self.count[k])
+        return runs
+
+
+def _joined(
+    chosen: NDArray[np.intp], first: NDArray[np.int64], count: NDArray[np.int64]
+) -> list[tuple[int, int]]:
+    """Runs of indices of the chosen chunks, neighbours in one run."""
+    if len(chosen) == 0:
+        return []
+    breaks = np.flatnonzero(np.diff(chosen) > 1)
+    starts = chosen[np.concatenate(([0], breaks + 1))]
+    ends = chosen[np.concatenate((breaks, [len(chosen) - 1]))]
+    sizes = first[ends] + count[ends] - first[starts]
+    return list(zip(first[starts].tolist(), sizes.tolist(), strict=True))
 
 
 class Mesh:
@@ -63,13 +75,10 @@ class Mesh:
         )
         self._chunks = chunks
 
-    def draw(self, eye: FloatArray, planes: FloatArray, reach: float) -> int:
-        """Draw what is seen within `reach` m; returns the number of indices drawn."""
-        drawn = 0
-        for first, count in self._chunks.seen(eye, planes, reach):
+    def draw(self, eye: FloatArray, planes: FloatArray, *reaches: float) -> None:
+        """Draw the chunks that are seen, each level of detail up to its reach (m)."""
+        for first, count in self._chunks.seen(eye, planes, reaches):
             self._array.render(vertices=count, first=first)
-            drawn += count
-        return drawn
 
     def release(self) -> None:
         """Free the graphics memory."""

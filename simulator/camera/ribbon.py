@@ -17,11 +17,13 @@ from simulator.track.road import Road
 FloatArray = NDArray[np.float64]
 
 SAGITTA_M = 0.0025
-LONGEST_ROW_M = 5.0
+LONGEST_ROW_M = 4.0
+TWIST_M = 0.004
+"""Two triangles miss the twisted road plane between two rows by no more."""
 SKIRT_M = 10.0
 """How far the ribbon reaches into the land beyond the wall."""
 KERB_CURVATURE = 1.0 / 220.0
-CHUNK_ROWS = 12
+CHUNK_ROWS, COARSE_ROWS = 16, 4
 
 
 @dataclass(frozen=True)
@@ -59,7 +61,11 @@ def rows_of(road: Road) -> FloatArray:
     """Places s of the rows, from 0 to the track's length, both included."""
     track = road.track
     radius = 1.0 / np.maximum(np.abs(track.curvature0), 1e-9)
-    step = np.clip(np.sqrt(8.0 * radius * SAGITTA_M), 0.3, LONGEST_ROW_M)
+    step = np.sqrt(8.0 * radius * SAGITTA_M)
+    twist = np.abs(track.z_left1 - track.z_right1 - track.z_left0 + track.z_right0)
+    twist *= road.wall_offset / track.width / track.length
+    step = np.minimum(step, 4.0 * TWIST_M / np.maximum(twist, 1e-9))
+    step = np.clip(step, 0.3, LONGEST_ROW_M)
     parts = np.maximum(1, np.ceil(track.length / step)).astype(np.intp)
     start = np.repeat(track.s0, parts)
     size = np.repeat(track.length / parts, parts)
@@ -71,11 +77,10 @@ def build(road: Road, line: CentreLine, terrain: Terrain) -> Ribbon:
     """Lay the ribbon and let its skirts run out into the land."""
     s = rows_of(road)
     pose = road.track.at(s)
-    inner = np.linspace(road.half_asphalt, -road.half_asphalt, 5)
     wall = road.wall_offset
     left = _skirt(road, line, s, pose.curvature, 1.0)
     right = _skirt(road, line, s, pose.curvature, -1.0)
-    middle = np.concatenate([[wall, road.edge], inner, [-road.edge, -wall]])
+    middle = np.array([wall, 0.0, -wall])
     y = np.empty((len(s), len(middle) + 4))
     y[:, 2:-2] = middle
     y[:, 0], y[:, 1] = wall + left, wall + 0.35 * left
@@ -140,25 +145,43 @@ def _kerb(ribbon: Ribbon, road: Road) -> FloatArray:
 
 
 def strip(vertices: NDArray[np.float32], points: FloatArray) -> Strip:
-    """Triangles between the rows of a vertex grid (R, C, F), cut into chunks for culling."""
+    """Triangles between the rows of a vertex grid (R, C, F), in two levels of detail: all rows,
+    and one row in COARSE_ROWS; cut into chunks for culling."""
     rows, columns = vertices.shape[:2]
-    cell = np.arange(columns - 1)
-    quad = np.stack([cell, cell + columns, cell + 1, cell + 1, cell + columns, cell + columns + 1])
-    quad = quad.T.reshape(-1)
-    indices = (columns * np.arange(rows - 1)[:, None] + quad).astype(np.uint32)
     starts = np.arange(0, rows - 1, CHUNK_ROWS)
     ends = np.minimum(starts + CHUNK_ROWS, rows - 1)
+    every = np.arange(rows)
+    some = np.unique(np.concatenate([every[::COARSE_ROWS], [rows - 1]]))
+    indices = [_between(every, columns), _between(some, columns)]
+    a_quad = (columns - 1) * 6
+    first = [starts * a_quad, len(indices[0]) + np.searchsorted(some, starts) * a_quad]
+    count = [(ends - starts), np.searchsorted(some, ends) - np.searchsorted(some, starts)]
     low = np.minimum.reduceat(points.min(axis=1), starts, axis=0)
     high = np.maximum.reduceat(points.max(axis=1), starts, axis=0)
-    last_low, last_high = points[ends].min(axis=1), points[ends].max(axis=1)
-    low, high = np.minimum(low, last_low), np.maximum(high, last_high)
+    low = np.minimum(low, points[ends].min(axis=1))
+    high = np.maximum(high, points[ends].max(axis=1))
     return Strip(
         np.ascontiguousarray(vertices.reshape(rows * columns, -1)),
-        indices.reshape(-1),
+        np.concatenate(indices),
         Chunks(
             (low + high) / 2.0,
             np.linalg.norm(high - low, axis=1) / 2.0,
-            starts.astype(np.int64) * len(quad),
-            (ends - starts).astype(np.int64) * len(quad),
+            np.stack(first).astype(np.int64),
+            np.stack(count).astype(np.int64) * a_quad,
         ),
     )
+
+
+def _between(rows: NDArray[np.intp], columns: int) -> NDArray[np.uint32]:
+    """Indices of two triangles for each cell between consecutive `rows` of a grid."""
+    near, far = columns * rows[:-1, None], columns * rows[1:, None]
+    cell = np.arange(columns - 1)
+    corners = [
+        near + cell,
+        far + cell,
+        near + cell + 1,
+        near + cell + 1,
+        far + cell,
+        far + cell + 1,
+    ]
+    return np.stack(corners, axis=-1).reshape(-1).astype(np.uint32)

@@ -15,7 +15,8 @@ from simulator.track.road import Road
 
 FloatArray = NDArray[np.float64]
 
-FINE_LAND_M, COARSE_LAND_M, ROAD_M = 260.0, 2500.0, 650.0
+FINE_LAND_M, COARSE_LAND_M = 260.0, 2500.0
+FINE_ROAD_M, COARSE_ROAD_M = 90.0, 650.0
 _LINE = {"white": (0.78, 0.78, 0.75), "yellow": (0.75, 0.50, 0.06)}
 
 
@@ -52,7 +53,7 @@ class Scene:
         """Paint everything but the sky; nearest first, so that hidden pixels cost little."""
         self._block.bind_to_uniform_block(SCENE_BINDING)
         self._shade.use(1)
-        self._road.draw(eye, planes, ROAD_M)
+        self._road.draw(eye, planes, FINE_ROAD_M, COARSE_ROAD_M)
         self._land.draw(eye, planes, FINE_LAND_M)
         self._far_land.draw(eye, planes, COARSE_LAND_M)
 
