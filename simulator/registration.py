@@ -1,0 +1,18 @@
+"""Makes Gymnasium know the environments; Gymnasium calls it through the `gymnasium.envs` entry
+point, so `gymnasium.make("driverview/LateralControl-v0")` needs no import of ours."""
+
+ENVIRONMENTS = {
+    "driverview/LateralControl-v0": "simulator.env:LateralControl",
+    "driverview/DriverView-v0": "simulator.env:DriverView",
+}
+MAX_STEPS = 6500
+"""The paper's longest episode, in control steps."""
+
+
+def register_environments() -> None:
+    """Register both environments; those already registered stay as they are."""
+    import gymnasium
+
+    for name, entry_point in ENVIRONMENTS.items():
+        if name not in gymnasium.registry:
+            gymnasium.register(id=name, entry_point=entry_point, max_episode_steps=MAX_STEPS)

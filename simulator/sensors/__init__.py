@@ -1,0 +1,1 @@
+"""The sensors of the paper's table, and how to declare more."""
