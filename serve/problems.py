@@ -122,4 +122,7 @@ def _on_validation_error(_request: Request, error: Exception) -> Response:
 
 def _on_failure(_request: Request, _error: Exception) -> Response:
     # The server logs the error itself; a client gets nothing of our insides.
-    return respond(INTERNAL, "the request could not be answered; the service's log says why")
+    detail = "the request could not be answered; the service's log says why"
+    return respond(
+        INTERNAL, detail, {"Connection": "close"}
+    )  # the server closes it after a failure

@@ -88,7 +88,7 @@ def _run_here(app: FastAPI, listener: socket.socket) -> None:
     # uvicorn raises the signal that ended it once more when all is closed: it has done its work.
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, _ignore)
-    server = uvicorn.Server(_settings(app))
+    server = uvicorn.Server(settings(app))
     server.run(sockets=[listener])
     if not server.started:
         raise UserError("the service could not start; the lines above say why")
@@ -96,13 +96,14 @@ def _run_here(app: FastAPI, listener: socket.socket) -> None:
 
 def _run_workers(folder: Path, workers: int, listener: socket.socket) -> None:
     os.environ[RUN_VARIABLE] = str(folder.resolve())
-    settings = _settings("serve.server:worker_app", factory=True, workers=workers)
-    Multiprocess(settings, sockets=[listener]).run()
+    config = settings("serve.server:worker_app", factory=True, workers=workers)
+    Multiprocess(config, sockets=[listener]).run()
 
 
-def _settings(
+def settings(
     app: FastAPI | str, *, factory: bool = False, workers: int | None = None
 ) -> uvicorn.Config:
+    """How uvicorn runs the application, or the factory named by an import string."""
     return uvicorn.Config(
         app,
         factory=factory,

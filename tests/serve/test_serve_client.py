@@ -1,0 +1,133 @@
+"""The client against the service, and against listeners that behave badly."""
+
+import socket
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+import pytest
+
+from serve.client import Client, ServiceError
+from serve.server import bind
+from tests.serve.conftest import CARD, FakeEngine, Served, jpeg, outputs, picture, png, serving
+
+JPEG, PNG = jpeg(picture()), png(picture())
+
+
+@contextmanager
+def listener(behave: Callable[[socket.socket, int], None]) -> Iterator[str]:
+    """A server that hands each connection and its number to `behave`; gives its URL."""
+    server = bind("127.0.0.1", 0)
+    server.listen()
+
+    def run() -> None:
+        number = 0
+        while True:
+            try:
+                connection, _ = server.accept()
+            except OSError:
+                return
+            with connection:
+                behave(connection, number)
+            number += 1
+
+    thread = threading.Thread(target=run, daemon=True)
+    thread.start()
+    try:
+        yield f"http://127.0.0.1:{server.getsockname()[1]}"
+    finally:
+        server.shutdown(socket.SHUT_RDWR)
+        server.close()
+        thread.join(5)
+
+
+def reply(content: bytes, status: str = "200 OK") -> bytes:
+    return b"HTTP/1.1 %s\r\nContent-Length: %d\r\n\r\n%s" % (status.encode(), len(content), content)
+
+
+def test_answers_come_as_the_service_gave_them(service: Served) -> None:
+    with Client(service.url + "/") as client:
+        assert client.ready()
+        client.wait_until_ready(1)
+        answer = client.features(JPEG, frame_id="17")
+        assert answer["distances_m"]["ml"] == pytest.approx(-2.0, abs=1e-5)
+        assert answer["frame_id"] == "17"
+        assert client.features(PNG)["model"] == CARD.model_hash
+        assert client.model()["camera"]["width"] == 280
+    assert Client(f"127.0.0.1:{service.port}").ready()
+
+
+def test_a_refusal_carries_the_problem(service: Served) -> None:
+    with Client(service.url) as client:
+        with pytest.raises(ServiceError, match="4 bytes that begin with b'text'") as caught:
+            client.features(b"text")
+        assert caught.value.status == 422
+        assert caught.value.problem == "/problems/not-an-image"
+        assert client.features(JPEG)
+
+
+def test_waiting_ends_with_the_services_reason() -> None:
+    gate = threading.Event()
+    engine = FakeEngine(lambda _image: outputs())
+    with serving(engine, lambda _engine: gate.wait(20) and None) as served:
+        client = Client(served.url)
+        assert not client.ready()
+        with pytest.raises(ServiceError, match=r"not ready within 0\.3 s.*warming up"):
+            client.wait_until_ready(0.3)
+        threading.Timer(0.2, gate.set).start()
+        client.wait_until_ready(10)
+        assert client.ready()
+
+
+def test_a_dropped_idle_connection_is_opened_again() -> None:
+    def one_answer_each(connection: socket.socket, number: int) -> None:
+        connection.recv(65536)
+        connection.sendall(reply(b'{"number": %d}' % number))
+
+    with listener(one_answer_each) as url, Client(url) as client:
+        assert [client.model()["number"] for _ in range(3)] == [0, 1, 2]
+
+
+def test_a_service_that_always_hangs_up_is_an_error() -> None:
+    with listener(lambda connection, _number: connection.recv(65536) and None) as url:
+        client = Client(url)
+        with pytest.raises(ServiceError, match="closed the connection"):
+            client.model()
+
+
+def test_a_silent_service_and_none_at_all() -> None:
+    quiet = threading.Event()
+    with listener(lambda _connection, _number: quiet.wait(5) and None) as url:
+        with pytest.raises(ServiceError, match=r"no answer within 0\.2 s"):
+            Client(url, timeout_s=0.2).features(JPEG)
+        quiet.set()
+    free = bind("127.0.0.1", 0)
+    url = f"http://127.0.0.1:{free.getsockname()[1]}"
+    free.close()
+    with pytest.raises(ServiceError, match="start one with `serve`"):
+        Client(url).features(JPEG)
+
+
+@pytest.mark.parametrize(
+    ("sent", "message"),
+    [
+        (reply(b"<html>"), "something else than JSON"),
+        (reply(b"[1]"), "something else than JSON"),
+        (reply(b"{}", "500 Oops"), "answered 500: no reason given"),
+        (b"SSH-2.0-OpenSSH\r\n", "does not answer as HTTP"),
+        (b"HTTP/1.1 200 OK\r\nContent-Length: 99\r\n\r\n{}", "does not answer as HTTP"),
+    ],
+)
+def test_something_else_at_the_address(sent: bytes, message: str) -> None:
+    def behave(connection: socket.socket, _number: int) -> None:
+        connection.recv(65536)
+        connection.sendall(sent)
+
+    with listener(behave) as url, pytest.raises(ServiceError, match=message):
+        Client(url).model()
+
+
+@pytest.mark.parametrize("url", ["", "ftp://x:1", "http://", "http://x:port", "http://x:99999"])
+def test_what_is_no_address(url: str) -> None:
+    with pytest.raises(ServiceError, match="no address of a service"):
+        Client(url)

@@ -1,0 +1,159 @@
+"""The command `serve`: a published model on a real port, its first line, its ends, its errors."""
+
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mtlnet.answer import interpret
+from mtlnet.card import read_card
+from mtlnet.engine import load_engine
+from mtlnet.golden import golden_image
+from serve.client import Client
+from serve.server import bind
+from tests.serve.conftest import png
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture(scope="session")
+def published(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An untrained network, published as `mtlnet train` does, in a folder RUNS/latest links to."""
+    import torch
+
+    from mtlnet.network import Network
+    from mtlnet.publish import publish
+
+    runs = tmp_path_factory.mktemp("serve") / "runs"
+    torch.manual_seed(3)
+    publish(Network(), runs / "fresh", golden_image(280, 210)[None])
+    (runs / "latest").symlink_to("fresh")
+    return runs / "fresh"
+
+
+def command(*arguments: str) -> list[str]:
+    return [sys.executable, "-m", "serve", *arguments]
+
+
+@contextmanager
+def started(*arguments: str, folder: Path = ROOT) -> Iterator[tuple[subprocess.Popen[str], str]]:
+    """The running command and its first line; killed at the end if it still runs."""
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    with subprocess.Popen(
+        command(*arguments), stderr=subprocess.PIPE, text=True, cwd=folder, env=environment
+    ) as process:
+        try:
+            assert process.stderr is not None
+            yield process, process.stderr.readline()
+        finally:
+            process.kill()
+
+
+def address(line: str) -> str:
+    found = re.search(r"http://\S+?:\d+", line)
+    assert found, line
+    return found[0]
+
+
+def refused(*arguments: str, folder: Path = ROOT) -> str:
+    """The one line with which the command ends with exit code 1."""
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(
+        command(*arguments), capture_output=True, text=True, cwd=folder, env=environment, timeout=60
+    )
+    assert done.returncode == 1, done.stderr
+    assert done.stderr.startswith("error: ")
+    assert done.stderr.count("\n") == 1, done.stderr
+    return done.stderr
+
+
+def test_a_published_model_is_served_and_stops_when_told(published: Path) -> None:
+    engine = load_engine(published)
+    image = golden_image(280, 210)
+    with started("--model", str(published), "--port", "0") as (process, line):
+        card = read_card(published)
+        assert str(published) in line
+        assert card.model_hash[:12] in line
+        assert f"openvino {engine.precision}" in line
+        with Client(address(line)) as client:
+            client.wait_until_ready(30)
+            answer = client.features(png(image[:, :, ::-1]))
+        expected = interpret(engine(image)).as_json()
+        assert {key: answer[key] for key in expected} == expected
+        assert answer["model"] == card.model_hash
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(10) == 0
+        assert process.stderr is not None
+        assert process.stderr.read() == ""
+
+
+def test_bare_serve_takes_the_latest_run_and_ctrl_c_ends_it(published: Path) -> None:
+    if (ROOT / "mtlnet" / "weights" / "default").exists():
+        pytest.skip("weights are shipped: bare `serve` takes those")
+    with started("--port", "0", folder=published.parents[1]) as (process, line):
+        assert line.startswith("serving default")
+        assert "runs/fresh" in line
+        Client(address(line)).wait_until_ready(30)
+        process.send_signal(signal.SIGINT)
+        assert process.wait(10) == 0
+
+
+def test_two_workers_give_the_same_answers(published: Path) -> None:
+    body = png(golden_image(280, 210))
+    with started("--model", str(published), "--port", "0", "--workers", "2") as (process, line):
+        assert "2 workers" in line
+        answers = set()
+        for _ in range(12):  # each connection may meet another worker
+            with Client(address(line), timeout_s=30) as client:
+                client.wait_until_ready(30)
+                answer = client.features(body)
+            answers.add(json.dumps({k: answer[k] for k in ("distances_m", "heading", "model")}))
+        assert len(answers) == 1
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(15) == 0
+
+
+def test_a_damaged_model_is_one_line(published: Path, tmp_path: Path) -> None:
+    assert "no run" in refused("--model", str(tmp_path / "none"))
+    assert "train" in refused("--model", "latest", folder=tmp_path)
+    other = tmp_path / "other"
+    shutil.copytree(published, other)
+    card = json.loads((other / "card.json").read_text())
+    (other / "card.json").write_text(json.dumps({**card, "definitions_version": "0"}))
+    assert "version" in refused("--model", str(other))
+    shutil.copy(published / "card.json", other)
+    with (other / "model.bin").open("r+b") as file:
+        file.seek(1000)
+        file.write(b"x" * 100)
+    assert "damaged" in refused("--model", str(other))
+
+
+def test_a_taken_port_and_an_unknown_host_are_one_line(published: Path) -> None:
+    taken = bind("127.0.0.1", 0)
+    taken.listen()
+    port = str(taken.getsockname()[1])
+    message = refused("--model", str(published), "--port", port)
+    assert f"port {port}" in message
+    assert "in use" in message
+    taken.close()
+    assert "no.such.host" in refused("--model", str(published), "--host", "no.such.host")
+
+
+def test_help_is_quick() -> None:
+    times = []
+    for _ in range(3):
+        start = time.perf_counter()
+        done = subprocess.run(command("--help"), capture_output=True, text=True, check=True)
+        times.append(time.perf_counter() - start)
+    assert "--workers" in done.stdout
+    assert np.min(times) < 0.5
