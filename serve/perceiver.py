@@ -5,6 +5,7 @@ controller: what does not fit into the queue is refused at once.
 """
 
 import asyncio
+import logging
 import threading
 import time
 from collections.abc import Callable
@@ -19,6 +20,7 @@ from serve.problems import NOT_READY, OVERLOADED, Problem
 
 QUEUE = 4  # frames that may wait while one is answered
 T = TypeVar("T")
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,6 +45,7 @@ class Perceiver:
     def start(self) -> None:
         """Warm the engine up behind the caller's back; `check_ready` says when that is done."""
         self._warm = self._thread.submit(self._warm_up, self.engine)
+        self._warm.add_done_callback(_report)
 
     def check_ready(self) -> None:
         """Raise Problem until the engine is warm and has given its golden answer."""
@@ -80,3 +83,10 @@ class Perceiver:
     def close(self) -> None:
         """Finish what was begun, drop what waits, end the thread."""
         self._thread.shutdown(wait=True, cancel_futures=True)
+
+
+def _report(warm: Future[None]) -> None:
+    """Say on the console, too, that this process will never be ready."""
+    fault = None if warm.cancelled() else warm.exception()
+    if fault is not None:
+        logger.error("the model failed its check and answers nothing: %s", fault)

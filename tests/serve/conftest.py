@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 import trackfeatures as tf
 from mtlnet.card import WEIGHTS, Camera, ModelCard
+from mtlnet.engine import Engine
 from serve.app import create_app
 from serve.server import bind, settings
 
@@ -121,14 +122,18 @@ class Served:
 
 @contextmanager
 def serving(
-    engine: FakeEngine, check: Callable[[Any], None] = lambda _engine: None
+    engine: FakeEngine, check: Callable[[Any], object] = lambda _engine: None
 ) -> Iterator[Served]:
     """The service around `engine` on a free port, as `serve` runs it, in a thread of this process.
 
     Ready when entered, unless `check` takes its time.
     """
+
+    def checked(engine: Engine) -> None:
+        check(engine)
+
     listener = bind("127.0.0.1", 0)
-    server = uvicorn.Server(settings(create_app(engine, check)))
+    server = uvicorn.Server(settings(create_app(engine, checked)))
     thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
     thread.start()
     try:

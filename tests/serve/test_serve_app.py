@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 import trackfeatures as tf
 from mtlnet.card import ModelError
@@ -164,7 +165,7 @@ def test_mutated_images_never_break_it(service: Served) -> None:
 def test_not_ready_until_warm_but_alive() -> None:
     gate = threading.Event()
     engine = FakeEngine(lambda _image: outputs())
-    with serving(engine, lambda _engine: gate.wait(20) and None) as service:
+    with serving(engine, lambda _engine: gate.wait(20)) as service:
         assert service.ask("GET", "/healthz").content == {"status": "alive"}
         reply = service.ask("GET", "/readyz")
         assert_problem(reply, 503, "not-ready")
@@ -177,16 +178,19 @@ def test_not_ready_until_warm_but_alive() -> None:
         assert service.post(JPEG).status == 200
 
 
+def always(answer: NDArray[np.float32]) -> FakeEngine:
+    return FakeEngine(lambda _image: answer)
+
+
 def test_never_ready_with_another_answer_than_the_published() -> None:
     right = np.array(CARD.golden, np.float32)
-    engine = FakeEngine(lambda _image: right)
+    engine = always(right)
     warm_up(engine)
     assert np.array_equal(engine.images[0], golden_image(280, 210))
     for wrong in (right + np.float32(0.01), right * np.float32(np.nan), right[:8]):
-        engine.respond = lambda _image, wrong=wrong: wrong
         with pytest.raises(ModelError):
-            warm_up(engine)
-    with serving(engine, warm_up) as service:
+            warm_up(always(wrong))
+    with serving(always(right + np.float32(0.01)), warm_up) as service:
         time.sleep(0.1)
         reply = service.ask("GET", "/readyz")
         assert_problem(reply, 503, "not-ready")

@@ -15,7 +15,7 @@ JPEG, PNG = jpeg(picture()), png(picture())
 
 
 @contextmanager
-def listener(behave: Callable[[socket.socket, int], None]) -> Iterator[str]:
+def listener(behave: Callable[[socket.socket, int], object]) -> Iterator[str]:
     """A server that hands each connection and its number to `behave`; gives its URL."""
     server = bind("127.0.0.1", 0)
     server.listen()
@@ -69,7 +69,7 @@ def test_a_refusal_carries_the_problem(service: Served) -> None:
 def test_waiting_ends_with_the_services_reason() -> None:
     gate = threading.Event()
     engine = FakeEngine(lambda _image: outputs())
-    with serving(engine, lambda _engine: gate.wait(20) and None) as served:
+    with serving(engine, lambda _engine: gate.wait(20)) as served:
         client = Client(served.url)
         assert not client.ready()
         with pytest.raises(ServiceError, match=r"not ready within 0\.3 s.*warming up"):
@@ -89,7 +89,7 @@ def test_a_dropped_idle_connection_is_opened_again() -> None:
 
 
 def test_a_service_that_always_hangs_up_is_an_error() -> None:
-    with listener(lambda connection, _number: connection.recv(65536) and None) as url:
+    with listener(lambda connection, _number: connection.recv(65536)) as url:
         client = Client(url)
         with pytest.raises(ServiceError, match="closed the connection"):
             client.model()
@@ -97,7 +97,7 @@ def test_a_service_that_always_hangs_up_is_an_error() -> None:
 
 def test_a_silent_service_and_none_at_all() -> None:
     quiet = threading.Event()
-    with listener(lambda _connection, _number: quiet.wait(5) and None) as url:
+    with listener(lambda _connection, _number: quiet.wait(5)) as url:
         with pytest.raises(ServiceError, match=r"no answer within 0\.2 s"):
             Client(url, timeout_s=0.2).features(JPEG)
         quiet.set()

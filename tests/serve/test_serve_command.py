@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from mtlnet.answer import interpret
-from mtlnet.card import read_card
+from mtlnet.card import CARD, SHIPPED, read_card
 from mtlnet.engine import load_engine
 from mtlnet.golden import golden_image
 from serve.client import Client
@@ -97,12 +97,11 @@ def test_a_published_model_is_served_and_stops_when_told(published: Path) -> Non
         assert process.stderr.read() == ""
 
 
-def test_bare_serve_takes_the_latest_run_and_ctrl_c_ends_it(published: Path) -> None:
-    if (ROOT / "mtlnet" / "weights" / "default").exists():
-        pytest.skip("weights are shipped: bare `serve` takes those")
+def test_bare_serve_takes_the_shipped_or_latest_model_and_ctrl_c_ends_it(published: Path) -> None:
+    taken = str(SHIPPED) if (SHIPPED / CARD).is_file() else "runs/fresh"
     with started("--port", "0", folder=published.parents[1]) as (process, line):
         assert line.startswith("serving default")
-        assert "runs/fresh" in line
+        assert taken in line
         Client(address(line)).wait_until_ready(30)
         process.send_signal(signal.SIGINT)
         assert process.wait(10) == 0

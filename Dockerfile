@@ -1,0 +1,51 @@
+# Three images from one source: `docker build --target serve|train|collect -t driverview-TARGET .`
+#
+#   docker run -p 8000:8000 -v "$PWD/runs:/work/runs:ro" driverview-serve
+#   docker run -v "$PWD/datasets:/work/datasets" driverview-collect datagen collect --rounds 60
+#   docker run --gpus all -v "$PWD/datasets:/work/datasets:ro" -v "$PWD/runs:/work/runs" \
+#     driverview-train mtlnet train --alpha 0.3,0.2,0.5
+#
+# The processes run as user 10001: folders they write to must let it (`chown 10001 runs datasets`).
+
+FROM python:3.11-slim AS wheel
+WORKDIR /src
+COPY pyproject.toml README.md LICENSE ./
+COPY trackfeatures trackfeatures
+COPY simulator simulator
+COPY datagen datagen
+COPY mtlnet mtlnet
+COPY serve serve
+COPY controllers controllers
+RUN pip wheel --no-cache-dir --no-deps --wheel-dir /wheels .
+
+FROM python:3.11-slim AS base
+ENV PYTHONUNBUFFERED=1 PIP_NO_CACHE_DIR=1 PIP_DISABLE_PIP_VERSION_CHECK=1
+RUN useradd --create-home --uid 10001 driverview && install -d -o driverview /work
+# The lock pins the versions; which of them an image gets is for its extras to say.
+COPY requirements.lock /wheels/
+COPY --from=wheel /wheels /wheels
+WORKDIR /work
+
+# Physics and rendering; with no GPU, Mesa renders.
+FROM base AS collect
+RUN apt-get update \
+    && apt-get install -y --no-install-recommends libegl1 libgl1-mesa-dri \
+    && rm -rf /var/lib/apt/lists/*
+RUN pip install --constraint /wheels/requirements.lock "$(ls /wheels/*.whl)[simulation]"
+USER driverview
+CMD ["datagen", "collect", "--help"]
+
+# torch, no physics.
+FROM base AS train
+RUN pip install --constraint /wheels/requirements.lock "$(ls /wheels/*.whl)[training]"
+USER driverview
+CMD ["mtlnet", "train", "--help"]
+
+# Neither torch nor physics. Last, so that a plain `docker build .` makes it.
+FROM base AS serve
+RUN pip install --constraint /wheels/requirements.lock "$(ls /wheels/*.whl)"
+USER driverview
+EXPOSE 8000
+HEALTHCHECK --interval=10s --timeout=5s --start-period=10s \
+    CMD ["python", "-c", "import sys; from serve.client import Client; sys.exit(not Client().ready())"]
+CMD ["serve", "--host", "0.0.0.0", "--port", "8000"]
