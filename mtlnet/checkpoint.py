@@ -83,4 +83,9 @@ def _restore(trainer: Trainer, tensors: dict[str, Tensor]) -> None:
             state.setdefault(int(index), {})[name] = tensor
     groups = trainer.optimiser.state_dict()["param_groups"]
     trainer.optimiser.load_state_dict({"state": state, "param_groups": groups})
+    # Fused optimisers walk a parameter and its state in memory order: channels-last, both.
+    for parameter, values in trainer.optimiser.state.items():
+        for name, value in values.items():
+            if isinstance(value, Tensor) and value.shape == parameter.shape:
+                values[name] = torch.empty_like(parameter).copy_(value)
     torch.set_rng_state(tensors["rng"])

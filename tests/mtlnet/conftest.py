@@ -1,0 +1,84 @@
+"""A small dataset of drawn roads, and a published model, shared by the tests of `mtlnet`."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import trackfeatures as tf
+from datagen.recording.frame import DriverCommand, EgoState, Frame, RoadPlace
+from datagen.recording.header import RoundHeader
+from datagen.recording.splits import Split, split_path, write_split
+from datagen.recording.writer import RoundWriter
+from mtlnet.network import HEIGHT, WIDTH, Network, initialise
+from mtlnet.publish import publish
+
+FRAMES = 24
+TRAIN, TEST = ("r000", "r001", "r002"), ("r003",)
+
+
+def draw_road(to_middle: float, angle: float) -> NDArray[np.uint8]:
+    """A flat one-lane road, 4 m wide, seen from 1.2 m: enough to learn from."""
+    focal = HEIGHT / 2 / np.tan(np.radians(67.5 / 2))
+    rows, columns = np.mgrid[:HEIGHT, :WIDTH]
+    below = np.maximum((rows + 0.5 - HEIGHT / 2) / focal, 1e-3)
+    ahead = 1.2 / below
+    left = -(columns + 0.5 - WIDTH / 2) / focal * ahead
+    across = to_middle - ahead * np.sin(angle) + left * np.cos(angle)
+    image = np.full((HEIGHT, WIDTH, 3), (150, 190, 230), np.uint8)
+    ground = rows > HEIGHT / 2
+    image[ground] = (60, 110, 60)
+    image[ground & (np.abs(across) < 3)] = (100, 100, 104)
+    image[ground & (np.abs(np.abs(across) - 2) < 0.1)] = (230, 230, 230)
+    return image
+
+
+def drawn_frame(rng: np.random.Generator) -> Frame:
+    to_middle, angle = rng.uniform(-1.5, 1.5), rng.normal(0.0, 0.05)
+    curvature = float(rng.choice([-0.02, 0.0, 0.02]))
+    return Frame(
+        image=draw_road(to_middle, angle),
+        features=tf.measure(to_middle, angle, curvature, curvature, 1, 4.0),
+        place=RoadPlace(1, 0, curvature, to_middle, 7.0),
+        ego=EgoState(1.0, 2.0, 0.3, angle, 0.0, 0.0, 15.0, 0.0, 0.0),
+        command=DriverCommand(0.0, 0.2, 0.0, 1),
+    )
+
+
+@pytest.fixture(scope="session")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three train rounds and a test round of `FRAMES` frames each."""
+    folder = tmp_path_factory.mktemp("data")
+    (folder / "rounds").mkdir()
+    for number, name in enumerate(TRAIN + TEST):
+        rng = np.random.default_rng(number)
+        about = RoundHeader(
+            id=name,
+            seed=number,
+            track="alpha" if number % 2 else "beta",
+            track_hash="0" * 64,
+            lanes=1,
+            lane_width_m=4.0,
+            traffic=0,
+            trajectory="weave",
+            light="clear",
+            speed_kmh=60.0,
+        )
+        with RoundWriter(folder / "rounds" / f"{name}.mcap", about, {}) as writer:
+            for _ in range(FRAMES):
+                writer.add(drawn_frame(rng))
+            writer.finish()
+    (folder / "splits").mkdir()
+    write_split(split_path(folder), Split(TRAIN, TEST))
+    return folder
+
+
+@pytest.fixture(scope="session")
+def published(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run folder with an untrained, published network."""
+    network = Network()
+    initialise(network, 5)
+    run = tmp_path_factory.mktemp("runs") / "untrained"
+    publish(network, run, np.stack([draw_road(d, 0.0) for d in (-1.0, 0.5)]))
+    return run

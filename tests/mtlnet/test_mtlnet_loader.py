@@ -1,0 +1,75 @@
+"""Batches: every frame once an epoch, a function of seed and step, mirrored with their labels."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+import trackfeatures as tf
+from mtlnet.loader import Loader, mirror
+
+
+@dataclass(frozen=True)
+class FakeLabels:
+    distances: NDArray[np.float32]
+    angle: NDArray[np.float32]
+    heading: NDArray[np.int64]
+
+
+class FakeFrames:
+    """Images of one colour: their frame number."""
+
+    def __init__(self, count: int) -> None:
+        angle = np.linspace(-0.4, 0.4, count).astype(np.float32)
+        distances = np.tile(np.float32([-2, 2, np.nan, np.nan, np.nan]), (count, 1))
+        self.labels = FakeLabels(distances, angle, np.arange(count) % 3)
+
+    def __len__(self) -> int:
+        return len(self.labels.angle)
+
+    def read_batch(self, indices: NDArray[np.int64], out: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        out[:] = np.asarray(indices, np.uint8)[:, None, None, None]
+        return out
+
+
+def loader(seed: int = 0, *, augment: bool = False) -> Loader:
+    return Loader(FakeFrames(20), (2, 3), 8, seed, augment=augment)
+
+
+def test_every_frame_once_an_epoch_across_batches() -> None:
+    order = np.concatenate([loader().indices(step) for step in range(5)])
+    assert sorted(order[:20]) == sorted(order[20:]) == list(range(20))
+    assert order[:20].tolist() != order[20:].tolist()
+
+
+def test_batches_carry_the_labels_of_their_frames() -> None:
+    made = loader()
+    batches = made.batches(3)
+    batch = next(batches)
+    assert batch.images[:, 0, 0, 0].tolist() == made.indices(3).tolist()
+    np.testing.assert_array_equal(batch.coded, made.coded[made.indices(3)])
+    assert next(batches).images[:, 0, 0, 0].tolist() == made.indices(4).tolist()
+    batches.close()
+
+
+def test_same_seed_and_step_same_batch() -> None:
+    one, two = loader(augment=True).make(4), loader(augment=True).make(4)
+    other = loader(seed=1, augment=True).make(4)
+    np.testing.assert_array_equal(one.gain, two.gain)
+    np.testing.assert_array_equal(one.coded, two.coded)
+    assert one.gain.tolist() != other.gain.tolist()
+
+
+def test_mirrored_images_have_mirrored_labels() -> None:
+    images = np.arange(2 * 2 * 3 * 3, dtype=np.uint8).reshape(2, 2, 3, 3)
+    before = images.copy()
+    near_left = tf.encode([[-0.9, 3.1, np.nan, -0.9, 3.1]], [0.1])
+    coded = np.repeat(near_left, 2, 0)
+    mirrored, heading = mirror(images, coded, np.array([0, 0]), np.array([False, True]))
+    np.testing.assert_array_equal(images[0], before[0])
+    np.testing.assert_array_equal(images[1], before[1, :, ::-1])
+    np.testing.assert_array_equal(mirrored[0], coded[0])
+    distances, angle = tf.decode(mirrored[1:])
+    np.testing.assert_allclose(distances[0], [-3.1, 0.9, -3.1, 0.9, np.nan], atol=1e-6)
+    assert abs(angle[0] + 0.1) < 1e-6
+    assert heading.tolist() == [0, 2]

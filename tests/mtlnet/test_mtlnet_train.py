@@ -1,0 +1,163 @@
+"""Training learns, and a run that was stopped goes on to the same bits."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from safetensors.numpy import load_file
+
+import mtlnet.train
+from datagen.recording import Dataset
+from mtlnet.card import GRAPH, WEIGHTS, ModelError, read_card
+from mtlnet.checkpoint import list_checkpoints
+from mtlnet.config import TrainConfig, resume_config
+from mtlnet.curves import read_curves
+from mtlnet.loader import Loader
+from mtlnet.recipe import RECIPES, learning_rate
+from mtlnet.train import Stopped, train
+from mtlnet.trainer import Trainer
+from trackfeatures.errors import UserError
+
+CPU = torch.device("cpu")
+
+
+def config(dataset: Path, out: Path, **changes: Any) -> TrainConfig:
+    values = {"iterations": 4, "batch": 4, "seed": 7, "device": "cpu", "threads": 2, **changes}
+    return TrainConfig(dataset, out, **values)
+
+
+class StopAt:
+    """Ctrl-C after so many steps: `requested` is asked once a step until it is true."""
+
+    def __init__(self, steps: int) -> None:
+        self.steps = steps
+
+    @property
+    def requested(self) -> bool:
+        self.steps -= 1
+        return self.steps <= 0
+
+    def __enter__(self) -> "StopAt":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        return
+
+
+def test_one_batch_is_overfitted(dataset: Path) -> None:
+    frames = Dataset.open(dataset).select("train")
+    loader = Loader(frames, (210, 280), 8, 0, augment=False)
+    recipe = replace(RECIPES["fast"], augment=False, batch=8)
+    trainer = Trainer(recipe, (0.3, 0.2, 0.5), 0, CPU)
+    trainer.standardise(loader)
+    batch = loader.make(0)
+    first = trainer.step(batch, 0.05)
+    for _ in range(30):
+        last = trainer.step(batch, 0.05)
+    # In units of the targets' variances the answer of the mean costs about 0.3 + 0.2 + 0.5 ln 3.
+    assert first.total.item() > 0.6
+    assert last.total.item() < 0.05
+    assert float(last.angle) < 0.1 * float(np.var(batch.coded[:, 5]))
+
+
+@pytest.mark.parametrize("recipe", ["fast", "paper"])
+def test_stopped_and_resumed_is_the_unbroken_run(
+    dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, recipe: str
+) -> None:
+    train(config(dataset, tmp_path / "whole", recipe=recipe), None)
+    broken = config(dataset, tmp_path / "broken", recipe=recipe)
+    with monkeypatch.context() as patch:
+        patch.setattr(mtlnet.train, "StopRequest", lambda: StopAt(2))
+        with pytest.raises(Stopped, match="step-00000002"):
+            train(broken, None)
+    with pytest.raises(ModelError, match="no finished model"):
+        read_card(broken.out)
+    resumed, data = resume_config(broken.out, {})
+    assert resumed == broken
+    train(resumed, data)
+    whole, again = (load_file(tmp_path / run / WEIGHTS) for run in ("whole", "broken"))
+    assert [name for name in whole if not np.array_equal(whole[name], again[name])] == []
+
+
+def test_a_run_keeps_what_it_was(dataset: Path, tmp_path: Path) -> None:
+    points = []
+    done = train(config(dataset, tmp_path / "run", iterations=10), None, points.append)
+    run = tmp_path / "run"
+    assert read_card(run) == done
+    assert done.iterations == 10
+    assert done.export_check["openvino_f32_max"] < 2e-4
+    assert set(done.files) == {WEIGHTS, GRAPH, "model.bin"}
+    assert done.data["content_hash"] == Dataset.open(dataset).content_hash
+    assert done.data["split"]["test"] == ["r003"]
+    labels = Dataset.open(dataset).select("train").labels
+    assert done.data["mean"]["angle_rad"] == pytest.approx(labels.angle.mean(), abs=1e-6)
+    stored = json.loads((run / "config.json").read_text())
+    assert stored["config"]["seed"] == 7
+    assert stored["recipe"]["name"] == "fast"
+    curve = read_curves(run / "curves.csv")
+    assert [point["step"] for point in curve] == [10]
+    assert curve[0]["total_loss"] == pytest.approx(points[0].losses[3], rel=1e-4)
+    assert list((run / "tensorboard").glob("events.out.*"))
+    assert [path.suffix for path in list_checkpoints(run)] == [".safetensors"]
+
+
+def test_a_timed_run_ends_by_the_clock(dataset: Path, tmp_path: Path) -> None:
+    run = config(dataset, tmp_path / "timed", iterations=None, minutes=1 / 60)
+    card = train(run, None)
+    assert 1 <= card.iterations < 60
+
+
+def test_refused_before_anything_is_written(dataset: Path, tmp_path: Path) -> None:
+    (tmp_path / "kept").mkdir()
+    (tmp_path / "kept" / "mine").write_text("precious")
+    with pytest.raises(UserError, match=r"kept already exists.*--resume"):
+        train(config(dataset, tmp_path / "kept"), None)
+    assert (tmp_path / "kept" / "mine").read_text() == "precious"
+    with pytest.raises(UserError, match="no recorded rounds"):
+        train(config(tmp_path / "kept", tmp_path / "new"), None)
+    with pytest.raises(UserError, match="no recipe 'slow'"):
+        train(config(dataset, tmp_path / "new", recipe="slow"), None)
+    assert not (tmp_path / "new").exists()
+
+
+def test_another_run_is_not_resumed(dataset: Path, tmp_path: Path) -> None:
+    run = config(dataset, tmp_path / "run", iterations=1)
+    train(run, None)
+    with pytest.raises(UserError, match="started with seed 7, now 8"):
+        resume_config(run.out, {"seed": 8})
+    resumed, data = resume_config(run.out, {"iterations": 2, "seed": 7})
+    assert resumed.iterations == 2
+    with pytest.raises(ModelError, match=r"content hash .* is not the one"):
+        train(resumed, {**data, "content_hash": "other"})
+    list_checkpoints(run.out)[-1].write_bytes(b"rubbish")
+    with pytest.raises(ModelError, match="cannot be read"):
+        train(resumed, data)
+
+
+def test_learning_rates() -> None:
+    paper, fast = RECIPES["paper"], RECIPES["fast"]
+    assert learning_rate(paper, 9_999, 0.1) == 1e-3
+    assert learning_rate(paper, 30_000, 0.2) == pytest.approx(1e-3 * 0.9**3)
+    assert (paper.batch, paper.iterations) == (32, 150_000)
+    peak = fast.learning_rate
+    assert learning_rate(fast, 0, 0.05) == pytest.approx(peak)
+    assert learning_rate(fast, 0, 0.525) == pytest.approx(peak / 2)
+    assert learning_rate(fast, 0, 1.0) == pytest.approx(0, abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("changes", "seen"),
+    [
+        ({"iterations": 0}, "--iterations is 0"),
+        ({"minutes": 0.0}, "--minutes is 0"),
+        ({"batch": 1}, "--batch is 1"),
+        ({"seed": -1}, "--seed is -1"),
+    ],
+)
+def test_numbers_out_of_range(changes: dict[str, Any], seen: str) -> None:
+    with pytest.raises(UserError, match=seen):
+        config(Path("data"), Path("out"), **changes)
