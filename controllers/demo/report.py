@@ -140,7 +140,7 @@ def _data_uri(image: NDArray[np.uint8]) -> str:
 def _curves(path: Path) -> str:
     """The training curves as SVG lines, each scaled to its own first value."""
     table = np.genfromtxt(path, delimiter=",", names=True)
-    names = [name for name in table.dtype.names if name.startswith("loss")]
+    names = [name for name in table.dtype.names if name.endswith("_loss")]
     colours = ("#2b6", "#e82", "#36c", "#888", "#c3a")
     lines, legend = [], []
     step = table["step"]
