@@ -2,7 +2,7 @@
 
 Input: uint8 RGB images (B, 210, 280, 3). Output (B, 9): five coded distances and the coded angle
 (linear), and the scores of the classes left, straight, right (before softmax). Recipe `fast`
-trains a rescaled form of it, with batch normalisation after every convolution and shared layer and
+trains a rescaled form of it, with batch normalisation after every convolution, and
 heads that answer in standard deviations; `fold` turns that into the paper's network, exactly.
 """
 
@@ -109,9 +109,8 @@ class Network(nn.Module):
         self.shared = nn.Sequential()
         size = channels * height * width
         for number, units in enumerate(SHARED):
-            linear = nn.Linear(size, units, bias=not batch_norm)
-            norm_1d = nn.BatchNorm1d(units, eps=NORM_EPS) if batch_norm else None
-            self.shared.add_module(f"fc{number}", block(linear, norm_1d, dropout))
+            # Not normalised: what neighbours in a batch add to an image is noise to a distance.
+            self.shared.add_module(f"fc{number}", block(nn.Linear(size, units), None, dropout))
             size = units
         self.heads = nn.ModuleDict({name: nn.Linear(size, units) for name, units in HEADS})
         # Heads answer in these units; (0, 1), the paper's, unless recipe `fast` sets others.
