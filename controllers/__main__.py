@@ -1,0 +1,5 @@
+"""`python -m controllers` is the `controllers` command."""
+
+from controllers.cli import main
+
+main()

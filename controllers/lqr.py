@@ -1,0 +1,126 @@
+"""Linear quadratic regulator: the paper's first controller.
+
+Minimises sum(x'Qx + rho delta^2) for the linear lateral model; the gains follow the speed.
+
+Deviations from the paper:
+- discretised at the control rate (zero-order hold), then the discrete Riccati equation: the
+  continuous gains are bang-bang at 20 Hz and leave the road on alpine-2;
+- gains for every speed (a grid, linear in between) in place of one design speed;
+- two sets of weights for all tracks, where the paper tunes five numbers a track: one of the
+  paper's for the exact state, and a softer one for a perceived state. With the errors of a young
+  model (0.25 m, 0.025 rad) the paper's weights swing up to 4 m on alpine-2, the softer ones 0.6 m;
+- feed-forward of the road's curvature, with the slip angle a bend needs as the set point, when
+  somebody tells the curvature. On perception it is estimated from the yaw rate (a slow filter,
+  held to the side the heading class names), which takes the standing offset out of bends.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import solve_discrete_are
+
+from controllers.feedback import steer_for
+from controllers.lateral_model import LateralModel
+from controllers.observation import Observation
+from trackfeatures import Heading
+
+Matrix = NDArray[np.float64]
+
+SLOWEST_M_S = 3.0
+"""The model divides by the speed; below this its gains are held."""
+FASTEST_M_S = 45.0
+GRID_M_S = 1.0
+
+
+@dataclass(frozen=True)
+class LqrWeights:
+    """Q = diag(offset, offset_rate, heading, heading_rate) and R = rho."""
+
+    offset: float
+    offset_rate: float
+    heading: float
+    heading_rate: float
+    rho: float
+
+
+EXACT = LqrWeights(2.0, 0.2, 2.0, 0.1, 0.01)
+"""The paper's for forza and g-track-3."""
+PERCEIVED = LqrWeights(1.0, 1.0, 5.0, 1.0, 10.0)
+
+
+def dlqr(A: Matrix, B: Matrix, Q: Matrix, R: Matrix) -> Matrix:
+    """Gain K (inputs, states) of u = -K x for x' = A x + B u, cost sum(x'Qx + u'Ru)."""
+    P = solve_discrete_are(A, B, Q, R)
+    gain: Matrix = np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)
+    return gain
+
+
+def gain_at(model: LateralModel, weights: LqrWeights, speed: float, dt: float) -> Matrix:
+    """K (4,) rad per unit of (e1, e1', e2, e2') at one speed (m/s) and control step (s)."""
+    A, B = model.discretise(speed, dt)
+    Q = np.diag([weights.offset, weights.offset_rate, weights.heading, weights.heading_rate])
+    gain: Matrix = dlqr(A, B, Q, np.array([[weights.rho]]))[0]
+    return gain
+
+
+class Lqr:
+    """Speed-scheduled LQR at a control step of `dt` s; all gains are solved when it is made."""
+
+    def __init__(
+        self,
+        dt: float = 0.05,
+        weights: LqrWeights = EXACT,
+        model: LateralModel | None = None,
+        *,
+        curvature_filter_s: float = 0.4,
+    ) -> None:
+        self.dt = dt
+        self.weights = weights
+        self.model = model or LateralModel()
+        self._speeds = np.arange(SLOWEST_M_S, FASTEST_M_S + GRID_M_S, GRID_M_S)
+        self._gains = np.array([gain_at(self.model, self.weights, v, dt) for v in self._speeds])
+        self._bends = np.array([self.model.cornering(v) for v in self._speeds])
+        self._blend = dt / (dt + curvature_filter_s)
+        self._curvature = 0.0
+
+    def gain(self, speed: float) -> Matrix:
+        """K (4,) at `speed` m/s."""
+        return self._at(speed, self._gains)
+
+    def update(self, observation: Observation) -> float:
+        speed = max(observation.vx, SLOWEST_M_S)
+        curvature = self._road(observation)
+        theta = -observation.angle
+        wheel_per_bend, theta_per_bend = self._at(speed, self._bends)
+        error = np.array(
+            [
+                observation.to_lane_centre,
+                observation.vy + observation.vx * math.sin(theta),
+                theta - theta_per_bend * curvature,
+                observation.yaw_rate - observation.vx * curvature,
+            ]
+        )
+        wheel_angle = wheel_per_bend * curvature - float(self.gain(speed) @ error)
+        return steer_for(wheel_angle)
+
+    def _road(self, observation: Observation) -> float:
+        """The curvature told, or else one estimated from how the car has been turning."""
+        if observation.curvature is not None:
+            return observation.curvature
+        turning = observation.yaw_rate / max(observation.vx, SLOWEST_M_S)
+        self._curvature += self._blend * (turning - self._curvature)
+        if observation.heading is Heading.LEFT:
+            self._curvature = max(self._curvature, 0.0)
+        elif observation.heading is Heading.RIGHT:
+            self._curvature = min(self._curvature, 0.0)
+        return self._curvature
+
+    def _at(self, speed: float, table: Matrix) -> Matrix:
+        """Linear interpolation of the rows of `table` at `speed`, held beyond the grid."""
+        place = (min(max(speed, SLOWEST_M_S), FASTEST_M_S) - SLOWEST_M_S) / GRID_M_S
+        low = min(int(place), len(table) - 2)
+        share = place - low
+        row: Matrix = (1.0 - share) * table[low] + share * table[low + 1]
+        return row

@@ -1,0 +1,33 @@
+"""What a controller is told and what it must answer. SI units, track frame, left positive."""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+from trackfeatures import Heading
+
+
+@dataclass(frozen=True, slots=True)
+class Observation:
+    """One control step as the car knows it: what is perceived, and the car's own sensors."""
+
+    to_lane_centre: float
+    """m from the middle of the lane to follow; the paper's e1."""
+    angle: float
+    """rad, track tangent minus yaw: positive when the car points to the right (minus e2)."""
+    heading: Heading
+    vx: float
+    """m/s, forward in the body frame."""
+    vy: float
+    """m/s, to the left in the body frame."""
+    yaw_rate: float
+    """rad/s, counter-clockwise."""
+    curvature: float | None = None
+    """1/m, left positive, of the road just ahead; None where nobody tells, as in perception."""
+
+
+class Controller(Protocol):
+    """A lateral controller. A new one is a new file and one line in `registry`."""
+
+    def update(self, observation: Observation) -> float:
+        """The steering action in [-1, 1], left positive; called once a control step."""
+        ...
