@@ -62,8 +62,11 @@ class Camera:
         target = self._graphics.target(self.width, self.height)
         self._set_frame(eye, matrix)
         self._graphics.begin(target)
-        scene.draw(eye.place, optics.frustum(eye, matrix))
+        planes = optics.frustum(eye, matrix)
+        scene.draw(eye.place, planes)
         self._graphics.sky.render()
+        self._graphics.blend()
+        scene.draw_blended(eye.place, planes)
         if target.resolved is not target.drawn:
             self._graphics.context.copy_framebuffer(target.resolved, target.drawn)
         target.resolved.read_into(self._buffer, components=3, alignment=1)

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from simulator.camera import land, ribbon
+from simulator.camera import land, ribbon, scenery
 from simulator.camera.context import SCENE_BINDING, Graphics
 from simulator.camera.light import Light
 from simulator.camera.look import Colour, Look, look_of
@@ -11,6 +11,7 @@ from simulator.camera.mesh import Mesh
 from simulator.camera.shade import ShadeMask
 from simulator.camera.terrain import CentreLine
 from simulator.camera.terrain import build as build_terrain
+from simulator.camera.woods import Woods
 from simulator.track.road import Road
 
 FloatArray = NDArray[np.float64]
@@ -42,6 +43,8 @@ class Scene:
         layout = ("3f 3f", "at", "facing")
         self._land = Mesh(graphics, "land", *_ordered(land.fine(terrain), layout))
         self._far_land = Mesh(graphics, "land", *_ordered(land.coarse(terrain), layout))
+        trees = scenery.plant(road, line, strips, terrain, look, np.random.default_rng([seed, 3]))
+        self._woods = Woods(graphics, trees)
         palette = scene_block(road, look, np.random.default_rng([seed, 2]), self.mask)
         self._block = graphics.context.buffer(palette.tobytes())
         self._shade = graphics.context.texture(
@@ -57,9 +60,20 @@ class Scene:
         self._land.draw(eye, planes, FINE_LAND_M)
         self._far_land.draw(eye, planes, COARSE_LAND_M)
 
+    def draw_blended(self, eye: FloatArray, planes: FloatArray) -> None:
+        """Paint what lets light through, after all else."""
+        self._woods.draw(eye, planes)
+
     def release(self) -> None:
         """Free the graphics memory."""
-        for thing in (self._road, self._land, self._far_land, self._block, self._shade):
+        for thing in (
+            self._road,
+            self._land,
+            self._far_land,
+            self._woods,
+            self._block,
+            self._shade,
+        ):
             thing.release()
 
 
