@@ -1,5 +1,4 @@
-"""Makes Gymnasium know the environments; Gymnasium calls it through the `gymnasium.envs` entry
-point, so `gymnasium.make("driverview/LateralControl-v0")` needs no import of ours."""
+"""Makes Gymnasium know the environments (see the package's own page for when this happens)."""
 
 ENVIRONMENTS = {
     "driverview/LateralControl-v0": "simulator.env:LateralControl",

@@ -1,4 +1,4 @@
-"""The physical sensors of the paper's table, in its units; v_x and v_y signed, in the body frame."""
+"""The physical sensors of the paper's table, in its units; v_x and v_y signed, body frame."""
 
 from collections.abc import Callable
 from typing import Any
