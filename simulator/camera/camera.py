@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from simulator.camera import optics
+from simulator.camera.cars import cars_of
 from simulator.camera.context import FRAME_BINDING, Graphics, graphics
 from simulator.camera.light import Light
 from simulator.camera.optics import Mount
@@ -18,6 +19,9 @@ FloatArray = NDArray[np.float64]
 Picture = NDArray[np.uint8]
 
 MAX_SIZE = 4096
+_OWN_PAINT = 0
+_CG_HEIGHT_M = 0.25
+"""Height of the centre of gravity over the road at rest."""
 
 
 class Camera:
@@ -45,7 +49,11 @@ class Camera:
         self.road, self.light, self.mount = road, light, mount
         self.width, self.height = width, height
         self._graphics: Graphics = graphics()
+        self._cars = cars_of(self._graphics)
         self._scene: Scene | None = Scene(self._graphics, road, seed, light)
+        # Cars of different rounds differ in colour; from the second on, so as to spare our own.
+        self._first_paint = 1 + seed % 5
+        self._last_s: float | None = None
         self._buffer = bytearray(width * height * 3)
 
     def render(
@@ -63,9 +71,13 @@ class Camera:
         self._set_frame(eye, matrix)
         self._graphics.begin(target)
         planes = optics.frustum(eye, matrix)
+        cars, paints = self._cars_in_view(body_pose, others, view)
+        chosen = self._cars.seen(cars, eye.place, planes)
+        self._cars.draw(cars[chosen], [paints[k] for k in chosen], eye.place)
         scene.draw(eye.place, planes)
         self._graphics.sky.render()
         self._graphics.blend()
+        self._cars.draw_shadows(cars[chosen], eye.place, self.light)
         scene.draw_blended(eye.place, planes)
         if target.resolved is not target.drawn:
             self._graphics.context.copy_framebuffer(target.resolved, target.drawn)
@@ -100,6 +112,25 @@ class Camera:
         trace: TracebackType | None,
     ) -> None:
         self.close()
+
+    def shadow_fraction(self, body_pose: ArrayLike) -> float:
+        """Share (0 to 1) of the road within 30 m ahead of the car that lies in hard shadow."""
+        pose = np.asarray(body_pose, dtype=np.float64)
+        s, _ = self.road.track.project(float(pose[0]), float(pose[1]), self._last_s)
+        self._last_s = s
+        return self._open_scene().mask.fraction(s, self.road.half_asphalt)
+
+    def _cars_in_view(
+        self, body_pose: ArrayLike, others: ArrayLike | None, view: str
+    ) -> tuple[FloatArray, list[int]]:
+        """Poses (n, 6) on the ground of the cars to draw, and the number of each one's paint."""
+        poses = np.asarray(() if others is None else others, dtype=np.float64).reshape(-1, 6)
+        paints = [self._first_paint + k for k in range(len(poses))]
+        if view in ("chase", "top"):
+            own = np.asarray(body_pose, dtype=np.float64).copy()
+            own[:3] -= optics.rotation(*own[3:])[:, 2] * _CG_HEIGHT_M
+            poses, paints = np.vstack([poses, own]), [*paints, _OWN_PAINT]
+        return poses, paints
 
     def _open_scene(self) -> Scene:
         if self._scene is None:
