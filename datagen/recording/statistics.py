@@ -63,8 +63,8 @@ def _mean(values: NDArray[np.float32]) -> float:
 
 
 def _range(values: NDArray[np.float32]) -> dict[str, float]:
-    low, middle, high = np.percentile(values, [0, 50, 100])
-    return {"min": round(low, 3), "median": round(middle, 3), "max": round(high, 3)}
+    low, middle, high = (round(float(v), 3) for v in np.percentile(values, [0, 50, 100]))
+    return {"min": low, "median": middle, "max": high}
 
 
 def _frames_by(rounds: Iterable[Any], name: str) -> dict[str, int]:

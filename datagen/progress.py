@@ -1,0 +1,47 @@
+"""The progress bar of a collection, on stderr."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    Progress,
+    ProgressColumn,
+    Task,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+from rich.text import Text
+
+from datagen import collect
+
+
+class FramesPerSecond(ProgressColumn):
+    def render(self, task: Task) -> Text:
+        speed = task.finished_speed or task.speed
+        return Text(f"{speed:.0f} frames/s" if speed else "starting")
+
+
+@contextmanager
+def shown(rounds: int, frames: int) -> Iterator[collect.Progress]:
+    """A function that takes the counts and shows them until the block ends."""
+    bar = Progress(
+        TextColumn("[bold]{task.description}"),
+        BarColumn(),
+        TextColumn("{task.completed:.0f}/{task.total:.0f} frames"),
+        FramesPerSecond(),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+        console=Console(stderr=True),
+        speed_estimate_period=20.0,
+    )
+    task = bar.add_task(f"0/{rounds} rounds", total=frames)
+
+    def update(done_frames: int, done_rounds: int) -> None:
+        bar.update(task, completed=done_frames, description=f"{done_rounds}/{rounds} rounds")
+
+    with bar:
+        yield update

@@ -1,0 +1,216 @@
+"""Recording one round: drive, look, measure, write. A pure function of the round's plan entry."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from simulator.camera.overlay import marking_polylines
+
+import trackfeatures as tf
+from datagen.driver import ScriptedDriver
+from datagen.plan import RoundPlan
+from datagen.recording.frame import DriverCommand, EgoState, Frame, RoadPlace, SensorReadings
+from datagen.recording.header import RoundHeader
+from datagen.recording.writer import RoundWriter
+from datagen.trajectory import make_course
+from simulator.camera import Camera, Light, Mount
+from simulator.sensors.sensor import SensorSuite
+from simulator.sensors.standard import STANDARD
+from simulator.state import CarState, Command
+from simulator.track.catalogue import find_track
+from simulator.track.road import Road
+from simulator.world import World
+
+ANNOTATED_M = 60.0
+SCENE_STEP_M = 4.0
+WHEELS = ("front_left", "front_right", "rear_left", "rear_right")
+NOT_RECORDED = ("range_traffic",)
+MOST_RESETS = 20
+
+
+class RoundFailed(RuntimeError):
+    """The driver cannot drive this round."""
+
+
+@dataclass
+class Drive:
+    """The state of a round while it is driven."""
+
+    plan: RoundPlan
+    world: World
+    driver: ScriptedDriver
+    driven_m: float = 0.0
+    laps: int = 0
+    resets: int = 0
+    state: CarState = field(init=False)
+
+    def __post_init__(self) -> None:
+        start = self.plan.start * self.world.road.track.length_m
+        self._start(start, self.driver.offset_at(0.0))
+
+    def command(self) -> Command:
+        return self.driver.command(self.state, self.world.traffic, self.driven_m)
+
+    def step(self, command: Command) -> None:
+        """One control step; a car that hits something or leaves the road is put back on it."""
+        lap = self.state.lap
+        self.state = self.world.step(command)
+        self.driven_m += max(self.state.speed, 0.0) / self.plan.frequency_hz
+        self.laps += self.state.lap - lap
+        if self.state.collision or self.state.off_track or self.state.backwards:
+            self.resets += 1
+            if self.resets > MOST_RESETS:
+                raise RoundFailed(f"{self.plan.id}: the car left the road {self.resets} times")
+            self._start(self.state.s, 0.0)
+            self.driver.restart()
+
+    def _start(self, s: float, to_middle: float) -> None:
+        self.state = self.world.reset(
+            seed=self.plan.seed + self.resets,
+            s=s,
+            to_middle=to_middle,
+            speed=self.driver.speed_at(s),
+        )
+
+
+def record_round(
+    plan: RoundPlan,
+    plan_hash: str,
+    path: Path,
+    tracks_dir: Path | None,
+    progress: Callable[[int], None] = lambda frames: None,
+) -> None:
+    """Drive the round and write it to `path`; `progress` hears how many frames are done."""
+    with _scene(plan, tracks_dir) as (drive, camera):
+        suite = SensorSuite([s for s in STANDARD if s.name not in NOT_RECORDED])
+        header = _header(plan, plan_hash, drive.world.road)
+        speed = 0.0
+        with RoundWriter(path, header, scene_lines(drive.world.road)) as writer:
+            for number in range(plan.frames):
+                command = drive.command()
+                writer.add(_frame(drive, camera, suite, command))
+                speed += max(drive.state.speed, 0.0)
+                drive.step(command)
+                progress(number + 1)
+            writer.finish(
+                laps=drive.laps,
+                resets=drive.resets,
+                distance_m=round(drive.driven_m, 3),
+                mean_speed_kmh=round(3.6 * speed / plan.frames, 3),
+            )
+
+
+@contextmanager
+def _scene(plan: RoundPlan, tracks_dir: Path | None) -> Iterator[tuple[Drive, Camera]]:
+    track = find_track(plan.track, tracks_dir)
+    if track.content_hash != plan.track_hash:
+        raise tf.UserError(
+            f"track {plan.track} is not the one this dataset was planned with (its geometry has "
+            "changed); collect into another folder"
+        )
+    road = Road(track, plan.lanes, plan.lane_width_m)
+    rng = np.random.default_rng([plan.seed, 2])
+    speed = plan.speed_kmh / 3.6
+    longest = plan.frames / plan.frequency_hz * speed * 1.1 + 50.0
+    course = make_course(plan.trajectory, road, longest, np.random.default_rng([plan.seed, 3]))
+    about = plan.camera
+    mount = Mount(about.x, about.y, about.z, about.pitch_deg, about.fov_y_deg)
+    with (
+        World(road, traffic=plan.traffic, frequency_hz=plan.frequency_hz) as world,
+        Camera(
+            road,
+            seed=plan.seed,
+            light=Light.named(plan.light, rng),
+            mount=mount,
+            width=about.width,
+            height=about.height,
+        ) as camera,
+    ):
+        driver = ScriptedDriver(road, course, speed, plan.frequency_hz)
+        yield Drive(plan, world, driver), camera
+
+
+def _header(plan: RoundPlan, plan_hash: str, road: Road) -> RoundHeader:
+    return RoundHeader(
+        id=plan.id,
+        seed=plan.seed,
+        track=road.track.name,
+        track_hash=plan.track_hash,
+        lanes=plan.lanes,
+        lane_width_m=plan.lane_width_m,
+        traffic=plan.traffic,
+        trajectory=plan.trajectory,
+        light=plan.light,
+        speed_kmh=plan.speed_kmh,
+        frequency_hz=plan.frequency_hz,
+        codec=plan.codec,
+        plan_hash=plan_hash,
+        program=f"driverview {version('driverview')}",
+        camera=plan.camera,
+    )
+
+
+def _frame(drive: Drive, camera: Camera, suite: SensorSuite, command: Command) -> Frame:
+    """Everything true at this moment, and the command that is about to be given."""
+    world, now = drive.world, drive.state
+    pose, others = world.body_pose(), world.traffic.poses()
+    road = world.road
+    return Frame(
+        image=camera.render(pose, others),
+        features=world.features(),
+        place=RoadPlace(
+            lanes=road.lanes,
+            lane_index=tf.lane_index(now.to_middle, road.lanes, road.lane_width),
+            curvature=now.curvature,
+            to_middle=now.to_middle,
+            s=now.s,
+        ),
+        ego=EgoState(
+            x=now.x,
+            y=now.y,
+            z=now.z,
+            yaw=now.yaw,
+            pitch=now.pitch,
+            roll=now.roll,
+            vx=now.vx,
+            vy=now.vy,
+            yaw_rate=now.yaw_rate,
+            shadow_fraction=camera.shadow_fraction(pose),
+        ),
+        command=DriverCommand(command.steer, command.throttle, command.brake, command.gear),
+        sensors=_readings(suite.read(world)),
+        traffic=others,
+        markings=tuple(marking_polylines(camera, road, (now.s, pose), ANNOTATED_M)),
+    )
+
+
+def _readings(read: dict[str, Any]) -> SensorReadings:
+    return SensorReadings(
+        range=tuple(read["range"].tolist()),
+        angle=read["angle"],
+        speed=read["speed"],
+        speed_x=read["v_x"],
+        speed_y=read["v_y"],
+        engine_rotation=read["engine"],
+        odometer=read["odometer"],
+        lap_time=read["lap_timer"],
+        wheel_spin=tuple(read[f"wheel_spin_{wheel}"] for wheel in WHEELS),
+    )
+
+
+def scene_lines(road: Road) -> dict[str, NDArray[np.float64]]:
+    """The markings and both edges of the asphalt all the way round, (N, 3) m each."""
+    count = int(np.ceil(road.track.length_m / SCENE_STEP_M))
+    s = np.linspace(0.0, road.track.length_m, count + 1)
+    places = {f"marking {i}": y for i, y in enumerate(road.markings_y.tolist())}
+    places |= {"left edge": road.half_asphalt, "right edge": -road.half_asphalt}
+    lines = {}
+    for name, y in places.items():
+        pose = road.track.at(s, y)
+        lines[name] = np.stack([pose.x, pose.y, pose.z], axis=1)
+    return lines
