@@ -1,5 +1,7 @@
 """Pictures of trees, painted once a process: one atlas of cells, sqrt-coded colour and alpha."""
 
+from functools import cache
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +21,7 @@ _BARK = np.array([70.0, 55.0, 42.0])
 Canvas = NDArray[np.float32]
 
 
+@cache
 def atlas() -> NDArray[np.uint8]:
     """The atlas (ROWS * CELL, COLUMNS * CELL, 4); row 0 is the top of the first cells."""
     rng = np.random.default_rng(77)
@@ -34,6 +37,12 @@ def atlas() -> NDArray[np.uint8]:
         top, left = row * CELL, column * CELL
         sheet[top : top + CELL, left : left + CELL] = _finished(canvas)
     return sheet
+
+
+def silhouettes() -> NDArray[np.uint8]:
+    """Outlines (kinds, CELL, CELL) of the trees, 255 where no light passes."""
+    alpha = atlas()[..., 3].reshape(ROWS, CELL, COLUMNS, CELL).transpose(0, 2, 1, 3)
+    return np.ascontiguousarray(alpha.reshape(-1, CELL, CELL))
 
 
 def _finished(canvas: Canvas) -> NDArray[np.uint8]:
@@ -99,10 +108,10 @@ def _leaves(
 
 
 def _oak(canvas: Canvas, rng: np.random.Generator) -> None:
-    _trunk(canvas, 0.45, 0.035)
+    _trunk(canvas, 0.45, 0.028)
     clusters = [(0.5, 0.62, 0.36, 0.26), (0.3, 0.5, 0.22, 0.16), (0.7, 0.5, 0.22, 0.17)]
     clusters += [(0.42, 0.8, 0.24, 0.14), (0.6, 0.78, 0.22, 0.15)]
-    _leaves(canvas, rng, clusters, 150, 0.022, (96, 128, 58))
+    _leaves(canvas, rng, clusters, 210, 0.022, (96, 128, 58))
 
 
 def _poplar(canvas: Canvas, rng: np.random.Generator) -> None:
@@ -123,25 +132,25 @@ def _pine(canvas: Canvas, rng: np.random.Generator) -> None:
 
 def _fir(canvas: Canvas, rng: np.random.Generator) -> None:
     _trunk(canvas, 0.2, 0.035)
-    for y in np.linspace(0.12, 0.95, 13):
+    for y in np.linspace(0.12, 0.95, 16):
         half = 0.44 * (1.0 - (y - 0.1) / 0.9) + 0.03
-        for _ in range(46):
+        for _ in range(130):
             u = rng.uniform(-1, 1)
             light = 0.55 + 0.35 * y + 0.2 * rng.standard_normal() - 0.12 * abs(u)
             colour = np.array([58.0, 88.0, 55.0]) * np.clip(light, 0.3, 1.2)
             drop = 0.075 * abs(u) + rng.uniform(-0.02, 0.02)
-            _disc(canvas, 0.5 + half * u, y - drop, 0.017, colour)
+            _disc(canvas, 0.5 + half * u, y - drop, 0.02, colour)
 
 
 def _palm(canvas: Canvas, rng: np.random.Generator) -> None:
-    _trunk(canvas, 0.74, 0.024, np.array([118.0, 98.0, 74.0]))
+    _trunk(canvas, 0.74, 0.019, np.array([118.0, 98.0, 74.0]))
     for angle in np.linspace(-0.5, np.pi + 0.5, 15):
         reach = rng.uniform(0.3, 0.44)
         bright = np.clip(0.8 + 0.25 * np.sin(angle) + 0.1 * rng.standard_normal(), 0.5, 1.2)
-        for share in np.linspace(0.0, 1.0, 22):
+        for share in np.linspace(0.0, 1.0, 30):
             x = 0.5 + reach * share * np.cos(angle)
             y = 0.74 + reach * share * np.sin(angle) * 0.7 - 0.3 * share * share * reach / 0.4
-            _disc(canvas, x, y, 0.03 * (1.1 - share), np.array([92.0, 122.0, 58.0]) * bright)
+            _disc(canvas, x, y, 0.036 * (1.15 - share), np.array([92.0, 122.0, 58.0]) * bright)
 
 
 def _bush(canvas: Canvas, rng: np.random.Generator) -> None:
@@ -151,7 +160,7 @@ def _bush(canvas: Canvas, rng: np.random.Generator) -> None:
 
 
 def _crown(canvas: Canvas, rng: np.random.Generator) -> None:
-    clusters = [(0.5, 0.5, 0.36, 0.36)]
+    clusters = [(0.5, 0.5, 0.36, 0.36), (0.5, 0.5, 0.2, 0.2)]
     clusters += [
         (0.5 + 0.28 * np.cos(a), 0.5 + 0.28 * np.sin(a), 0.15, 0.15) for a in np.arange(7) * 0.9
     ]
@@ -159,6 +168,6 @@ def _crown(canvas: Canvas, rng: np.random.Generator) -> None:
 
 
 def _birch(canvas: Canvas, rng: np.random.Generator) -> None:
-    _trunk(canvas, 0.7, 0.022, np.array([178.0, 174.0, 164.0]))
+    _trunk(canvas, 0.8, 0.018, np.array([178.0, 174.0, 164.0]))
     clusters = [(0.5 + rng.uniform(-0.2, 0.2), y, 0.2, 0.09) for y in np.linspace(0.38, 0.88, 9)]
-    _leaves(canvas, rng, clusters, 60, 0.018, (116, 142, 66))
+    _leaves(canvas, rng, clusters, 90, 0.02, (116, 142, 66))

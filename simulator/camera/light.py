@@ -144,7 +144,7 @@ def _heavy_shadow(rng: np.random.Generator) -> Light:
         kind="heavy-shadow",
         sun_elevation=math.radians(rng.uniform(42.0, 62.0)),
         sun=(2.25, 2.15, 1.9),
-        sky=_tinted((0.26, 0.29, 0.35), rng, 0.05),
+        sky=_tinted((0.20, 0.225, 0.275), rng, 0.05),
         clouds=rng.uniform(0.0, 0.3),
         tree_shadows=1.0,
     )

@@ -3,12 +3,11 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from simulator.camera import land, ribbon, scenery
+from simulator.camera import land, ribbon, scenery, shade
 from simulator.camera.context import SCENE_BINDING, Graphics
 from simulator.camera.light import Light
 from simulator.camera.look import Colour, Look, look_of
 from simulator.camera.mesh import Mesh
-from simulator.camera.shade import ShadeMask
 from simulator.camera.terrain import CentreLine
 from simulator.camera.terrain import build as build_terrain
 from simulator.camera.woods import Woods
@@ -29,7 +28,6 @@ class Scene:
         line = CentreLine.of(road)
         terrain = build_terrain(road, line, look, np.random.default_rng([seed, 1]))
         strips = ribbon.build(road, line, terrain)
-        self.mask = ShadeMask.empty(road)
         self._graphics = graphics
         surface = ribbon.surface(strips, road)
         self._road = Mesh(
@@ -44,6 +42,7 @@ class Scene:
         self._land = Mesh(graphics, "land", *_ordered(land.fine(terrain), layout))
         self._far_land = Mesh(graphics, "land", *_ordered(land.coarse(terrain), layout))
         trees = scenery.plant(road, line, strips, terrain, look, np.random.default_rng([seed, 3]))
+        self.mask = shade.build(road, line, trees, light, np.random.default_rng([seed, 4]))
         self._woods = Woods(graphics, trees)
         palette = scene_block(road, look, np.random.default_rng([seed, 2]), self.mask)
         self._block = graphics.context.buffer(palette.tobytes())
@@ -83,7 +82,7 @@ def _ordered(grid, layout):  # type: ignore
 
 
 def scene_block(
-    road: Road, look: Look, rng: np.random.Generator, mask: ShadeMask
+    road: Road, look: Look, rng: np.random.Generator, mask: shade.ShadeMask
 ) -> NDArray[np.float32]:
     """The uniform block `Scene` of frame.glsl, (10, 4) float32."""
     marks = road.track.markings
@@ -102,7 +101,7 @@ def scene_block(
         (*_varied(_LINE["white"], rng, 0.03, fade), marks.wear),
         (float(road.lanes), road.lane_width, road.half_asphalt, road.edge),
         (marks.dash_length, marks.dash_length + marks.dash_gap, missing, road.track.length_m),
-        (mask.along_m, mask.across_m, float(mask.band_texels), float(mask.bands)),
+        (mask.along_m, shade.TEXEL_M, float(shade.BAND_TEXELS), float(mask.bands)),
     ]
     return np.array(rows, dtype=np.float32)
 

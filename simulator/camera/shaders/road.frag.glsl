@@ -26,7 +26,7 @@ float sunshine(vec2 at) {
     vec2 texel = vec2(column - band * mask.z + 8.0, (at.y / mask.y + 64.0) + band * 128.0);
     vec2 size = vec2(textureSize(shade, 0));
     if (abs(at.y) > 62.0 * mask.y) return 1.0;
-    return 1.0 - texture(shade, texel / size, -1.0).r;
+    return 1.0 - smoothstep(0.30, 0.70, texture(shade, texel / size, -1.2).r);
 }
 
 void main() {
