@@ -163,6 +163,8 @@ def write_whole(path: Path, text: str) -> None:
         # A pipe or /dev/stdout cannot be replaced, and must not be.
         path.write_text(text)
         return
+    if not path.parent.is_dir():
+        raise UserError(f"there is no folder {path.parent} to write {path.name} to; make it first")
     partial = path.with_name(path.name + ".partial")
     try:
         partial.write_text(text)
