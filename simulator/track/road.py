@@ -10,8 +10,9 @@ from simulator.track.geometry import Track
 
 SHOULDER_M = 1.0
 """Asphalt beyond the outermost marking."""
-WALL_MARGIN_M = 0.5
-"""Rails and walls stand this far outside the edge."""
+WALL_MARGIN_M = 1.5
+"""Rails and walls stand this far outside the edge: more than half a car's width (0.97 m), or no
+car could ever leave the track before it hits them."""
 
 
 @dataclass(frozen=True)
