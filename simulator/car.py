@@ -18,6 +18,10 @@ WHEELS = ("front_left", "front_right", "rear_left", "rear_right")
 TORQUE_RPM_STEP = 1000.0  # the torque table is given at 0, 1000, 2000, ... rev/min
 LOWEST_GEAR, HIGHEST_GEAR = -1, 6  # -1 reverse, 0 neutral
 
+GRIP = {"asphalt": 1.2, "concrete": 1.1, "gravel": 0.9}
+"""Friction of a surface, by which the tyre's own is multiplied (TORCS's surfaces.xml: asphalt,
+concrete4 and dirt). Without it no car follows TORCS through the kinks of g-track-3."""
+
 
 @dataclass(frozen=True)
 class CarParameters:
@@ -41,9 +45,9 @@ class CarParameters:
     width: float = 1.94
     height: float = 1.10
 
-    spring_front: float = 90_000.0
+    spring_front: float = 150_000.0
     """N/m at the wheel."""
-    spring_rear: float = 90_000.0
+    spring_rear: float = 150_000.0
     damper_front: float = 7_000.0
     """N s/m at the wheel."""
     damper_rear: float = 7_000.0
@@ -61,7 +65,7 @@ class CarParameters:
     cornering_stiffness: float = 80_000.0
     """N/rad, one tyre at its static load; grows in proportion to the load."""
     friction: float = 1.6
-    """Largest tyre force over its load, on asphalt."""
+    """Largest tyre force over its load, on a surface of grip 1 (see GRIP)."""
     tyre_shape: float = 1.5
     """C of the magic formula (Pacejka, Tyre and Vehicle Dynamics, 4.3.1)."""
     rolling_resistance: float = 0.001

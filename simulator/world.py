@@ -4,13 +4,14 @@ World frame: x, y in the plane, z up, yaw counter-clockwise; s and to_middle in 
 """
 
 import math
+from dataclasses import replace
 from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 import trackfeatures as tf
-from simulator.car import HIGHEST_GEAR, LOWEST_GEAR, RPM, CarParameters
+from simulator.car import GRIP, HIGHEST_GEAR, LOWEST_GEAR, RPM, CarParameters
 from simulator.dynamics import (
     ENGINE,
     MEMORY,
@@ -64,7 +65,8 @@ class World:
         self.car = car or CarParameters()
         self._count = traffic
         self.traffic = Traffic(road, traffic, np.random.default_rng(0))
-        self._params = self.car.packed()
+        on_surface = replace(self.car, friction=self.car.friction * GRIP[road.track.surface])
+        self._params = on_surface.packed()
         self._table = road.track.arrays()
         self._scene = Scene(self.car, wall_mesh(road))
         self._motion = np.zeros(MOTION)
