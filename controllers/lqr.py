@@ -31,7 +31,7 @@ Matrix = NDArray[np.float64]
 SLOWEST_M_S = 3.0
 """The model divides by the speed; below this its gains are held."""
 FASTEST_M_S = 45.0
-GRID_M_S = 1.0
+GRID_M_S = 2.0
 
 
 @dataclass(frozen=True)
@@ -103,7 +103,7 @@ class Lqr:
             ]
         )
         wheel_angle = wheel_per_bend * curvature - float(self.gain(speed) @ error)
-        return steer_for(wheel_angle)
+        return steer_for(float(wheel_angle))
 
     def _road(self, observation: Observation) -> float:
         """The curvature told, or else one estimated from how the car has been turning."""

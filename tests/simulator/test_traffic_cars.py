@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -43,7 +44,8 @@ def corners(poses: NDArray[np.float64], size: tuple[float, ...]) -> NDArray[np.f
     local = half * np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]])
     cos, sin = np.cos(poses[:, 5]), np.sin(poses[:, 5])
     turn = np.stack([np.stack([cos, -sin], -1), np.stack([sin, cos], -1)], -2)
-    return poses[:, None, :2] + np.einsum("nij,kj->nki", turn, local)
+    placed: NDArray[np.float64] = poses[:, None, :2] + np.einsum("nij,kj->nki", turn, local)
+    return placed
 
 
 def apart(a: NDArray[np.float64], b: NDArray[np.float64]) -> bool:
@@ -55,7 +57,7 @@ def apart(a: NDArray[np.float64], b: NDArray[np.float64]) -> bool:
     return bool(gap.any())
 
 
-def run(lanes: int, seed: int, steps: int, ego_speed: float = 14.0) -> tuple[Traffic, list]:
+def run(lanes: int, seed: int, steps: int, ego_speed: float = 14.0) -> tuple[Traffic, list[Any]]:
     """Traffic round an ego car that drives in the rightmost lane; samples of all places."""
     road = Road(stadium(), lanes=lanes, lane_width=3.2)
     traffic = Traffic(road, 12, np.random.default_rng(seed), clear_s=500.0)
@@ -181,7 +183,8 @@ def test_leader_is_the_nearest_car_in_the_same_lane() -> None:
         found = traffic.leader(0.0, lane_y)
         assert found is not None
         gap = traffic.s[first] - 0.5 * (SIZE[0] + EGO_SIZE[0])
-        assert found == (pytest.approx(gap), pytest.approx(traffic.speed[first]))
+        assert found[0] == pytest.approx(gap)
+        assert found[1] == pytest.approx(traffic.speed[first])
         beside = traffic.leader(0.0, lane_y, exclude=int(first))
         assert beside is not None
         assert beside[0] > gap

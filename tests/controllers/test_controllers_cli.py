@@ -1,0 +1,64 @@
+"""The `controllers` command: JSON on stdout, one clear line on stderr when something is wrong."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from controllers.demo.service import free_port
+
+
+def run(*arguments: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "controllers", *arguments]
+    return subprocess.run(command, capture_output=True, text=True, timeout=120)
+
+
+def test_drive_prints_json_and_writes_the_log(tmp_path: Path) -> None:
+    log = tmp_path / "drive.csv"
+    done = run("drive", "--track", "oval", "--steps", "60", "--log", str(log), "--json")
+    assert done.returncode == 0, done.stderr
+    result = json.loads(done.stdout)
+    assert (result["steps"], result["ended"]) == (60, None)
+    assert result["score_per_step"] == pytest.approx(result["score"] / 60)
+    assert len(log.read_text().splitlines()) == 61
+
+
+def test_drive_prints_a_table_for_people() -> None:
+    done = run("drive", "--track", "oval", "--steps", "20", "--controller", "torcs")
+    assert done.returncode == 0, done.stderr
+    assert "torcs on oval" in done.stdout
+    assert "score_per_step" in done.stdout
+
+
+def test_a_service_that_is_down() -> None:
+    url = f"http://127.0.0.1:{free_port()}"
+    done = run("drive", "--steps", "20", "--perception", url)
+    assert done.returncode == 1
+    errors = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
+    assert len(errors) == 1
+    assert url in errors[0]
+    assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("--controller", "mpc"), "not there yet; use one of"),
+        (("--lanes", "7"), "7"),
+        (("--throttle", "2"), "throttle 2.0"),
+        (("--steps", "0"), "0 steps"),
+        (("--traffic", "99"), "99 traffic cars"),
+        (("--perception", "model", "--model", "no-such-run"), "no-such-run"),
+        (("--log", "/no-such-folder/drive.csv"), "/no-such-folder/drive.csv"),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, tuple) else None,
+)
+def test_mistakes_get_one_line(arguments: tuple[str, ...], said: str) -> None:
+    done = run("drive", "--steps", "20", *arguments)
+    assert done.returncode == 1, done.stdout
+    assert "Traceback" not in done.stderr
+    errors = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
+    assert len(errors) == 1, done.stderr
+    assert said in errors[0]
