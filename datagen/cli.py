@@ -61,8 +61,12 @@ def collect(
         codec=codec,
     )
     plan = make_plan(wanted)
-    with shown(rounds, rounds * frames) as progress:
-        result = run(plan, out, workers or os.cpu_count() or 1, tracks_dir, progress)
+    try:
+        with shown(rounds, rounds * frames) as progress:
+            result = run(plan, out, workers or os.cpu_count() or 1, tracks_dir, progress)
+    except KeyboardInterrupt:
+        sys.stderr.write("interrupted: finished rounds are kept; the same command goes on\n")
+        raise typer.Exit(command.INTERRUPTED) from None
     line = (
         f"{result.out}: {result.rounds} rounds, {result.frames} frames; recorded "
         f"{result.recorded_frames} in {result.seconds:.1f} s, "

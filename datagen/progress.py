@@ -41,7 +41,10 @@ def shown(rounds: int, frames: int) -> Iterator[collect.Progress]:
     task = bar.add_task(f"0/{rounds} rounds", total=frames)
 
     def update(done_frames: int, done_rounds: int) -> None:
+        bar.start()  # only now: what is refused before it begins shows no bar
         bar.update(task, completed=done_frames, description=f"{done_rounds}/{rounds} rounds")
 
-    with bar:
+    try:
         yield update
+    finally:
+        bar.stop()

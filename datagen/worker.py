@@ -3,6 +3,7 @@
 It lives across rounds because compiled code and the graphics context cost seconds to set up.
 """
 
+import os
 import signal
 import traceback
 from dataclasses import dataclass
@@ -65,6 +66,8 @@ Message = FramesDone | RoundDone | RoundBroken | Hopeless
 def work(connection: Connection) -> None:
     """Main function of the process."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the parent, which decides
+    # PyBullet greets on stdout, which belongs to the result.
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
     while True:
         try:
             job: Job | None = connection.recv()
