@@ -4,6 +4,9 @@ Car frame: x ahead, y left, z up, origin on the ground under the middle. A verte
 normal and a colour; a colour of (-1, -1, -1) takes the car's own paint.
 """
 
+from collections.abc import Sequence
+from itertools import pairwise
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -38,8 +41,12 @@ def car_mesh() -> NDArray[np.float32]:
 
 
 def _quad(a: Point, b: Point, c: Point, d: Point, colour: Point) -> FloatArray:
-    """Two triangles; the normal points to where a, b, c, d run counter-clockwise."""
-    corners = np.array([a, b, c, d])
+    return _face([a, b, c, d], colour)
+
+
+def _face(points: Sequence[Point], colour: Point) -> FloatArray:
+    """Two triangles; the normal points to where the four corners run counter-clockwise."""
+    corners = np.array(points)
     normal = np.cross(corners[1] - corners[0], corners[2] - corners[0])
     size = np.linalg.norm(normal)
     if size < 1e-9:
@@ -55,14 +62,14 @@ def _quad(a: Point, b: Point, c: Point, d: Point, colour: Point) -> FloatArray:
 def _hull(outline: tuple[Point, ...], floor: float, top: Point, flank: Point) -> list[FloatArray]:
     """A prism over an outline (x, z, half width), from rear to front, down to `floor`."""
     parts = []
-    for (x0, z0, w0), (x1, z1, w1) in zip(outline[:-1], outline[1:], strict=True):
+    for (x0, z0, w0), (x1, z1, w1) in pairwise(outline):
         parts.append(_quad((x0, w0, z0), (x0, -w0, z0), (x1, -w1, z1), (x1, w1, z1), top))
         for side in (1.0, -1.0):
             corners = [
                 (x0, side * w0, floor), (x0, side * w0, z0), (x1, side * w1, z1),
                 (x1, side * w1, floor),
             ]  # fmt: skip
-            parts.append(_quad(*(corners if side > 0 else corners[::-1]), flank))
+            parts.append(_face(corners if side > 0 else corners[::-1], flank))
     x, z, w = outline[0]
     parts.append(_quad((x, w, floor), (x, -w, floor), (x, -w, z), (x, w, z), top))
     x, z, w = outline[-1]
@@ -73,7 +80,7 @@ def _hull(outline: tuple[Point, ...], floor: float, top: Point, flank: Point) ->
 def _cabin() -> list[FloatArray]:
     """Glass all round under a painted roof."""
     parts = []
-    for k, (back, front) in enumerate(zip(_CABIN[:-1], _CABIN[1:], strict=True)):
+    for k, (back, front) in enumerate(pairwise(_CABIN)):
         (x0, z0, w0), (x1, z1, w1) = back, front
         colour = _OWN if k == 1 else _GLASS
         parts.append(_quad((x0, w0, z0), (x0, -w0, z0), (x1, -w1, z1), (x1, w1, z1), colour))
@@ -86,7 +93,7 @@ def _cabin() -> list[FloatArray]:
             [foot1, roof1, roof0, foot0],
             [front, front, roof1, foot1],
         ):
-            parts.append(_quad(*(corners if side < 0 else corners[::-1]), _GLASS))
+            parts.append(_face(corners if side < 0 else corners[::-1], _GLASS))
     return parts
 
 
@@ -95,7 +102,7 @@ def _wheel(x: float, side: float) -> list[FloatArray]:
     parts = []
     outer, inner = side * 0.91, side * 0.68
     angles = np.linspace(0.0, 2.0 * np.pi, 11)
-    for a, b in zip(angles[:-1], angles[1:], strict=True):
+    for a, b in pairwise(angles):
         ring = [
             (x + r * np.cos(t), r * np.sin(t) + _WHEEL_RADIUS)
             for r in (_WHEEL_RADIUS, 0.2)
@@ -113,7 +120,7 @@ def _wheel(x: float, side: float) -> list[FloatArray]:
             (x, outer, _WHEEL_RADIUS),
         ]
         for corners, colour in ((face, _RUBBER), (hub, _RIM)):
-            parts.append(_quad(*(corners if side < 0 else corners[::-1]), colour))
+            parts.append(_face(corners if side < 0 else corners[::-1], colour))
     return parts
 
 

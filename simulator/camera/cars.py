@@ -24,16 +24,16 @@ class Cars:
 
     def __init__(self, graphics: Graphics) -> None:
         context = graphics.context
-        self._body = graphics.programs["car"]
-        self._spot = graphics.programs["spot"]
+        self._body = {name: graphics.uniform("car", name) for name in ("stand", "paint")}
+        self._spot = {name: graphics.uniform("spot", name) for name in ("stand", "reach", "middle")}
         self._context = context
         mesh = context.buffer(car_mesh().tobytes())
         self._mesh = context.vertex_array(
-            self._body, [(mesh, "3f 3f 3f", "at", "facing", "colour")]
+            graphics.programs["car"], [(mesh, "3f 3f 3f", "at", "facing", "colour")]
         )
         corners = np.array([-1, -1, 1, -1, -1, 1, 1, 1], dtype=np.float32)
         patch = context.buffer(corners.tobytes())
-        self._patch = context.vertex_array(self._spot, [(patch, "2f", "corner")])
+        self._patch = context.vertex_array(graphics.programs["spot"], [(patch, "2f", "corner")])
 
     def seen(self, poses: FloatArray, eye: FloatArray, planes: FloatArray) -> NDArray[np.intp]:
         """Which cars of `poses` (n, 6) may show, nearest first."""

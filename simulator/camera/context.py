@@ -7,7 +7,7 @@ the drawing threads: 0 draws in the calling thread, which suits one worker proce
 import os
 from dataclasses import dataclass
 from importlib import resources
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -22,6 +22,7 @@ GPU_SAMPLES = 4
 paint are filtered in the shader anyway."""
 PROGRAMS = ("sky", "land", "road", "tree", "car", "spot")
 FRAME_BINDING, SCENE_BINDING = 0, 1
+BLOCKS = {"Frame": FRAME_BINDING, "Scene": SCENE_BINDING}
 FRAME_FLOATS = 56
 UNITS = {"noise": 0, "shade": 1, "atlas": 2}
 """Texture units, by the name of the sampler."""
@@ -83,12 +84,7 @@ class Graphics:
     def blend(self) -> None:
         """From here on lay pictures with alpha over what is drawn, and leave the depth alone."""
         self.context.enable(self.context.BLEND)
-        self.context.blend_func = (
-            self.context.SRC_ALPHA,
-            self.context.ONE_MINUS_SRC_ALPHA,
-            self.context.ZERO,
-            self.context.ONE,
-        )
+        self.context.blend_func = (self.context.SRC_ALPHA, self.context.ONE_MINUS_SRC_ALPHA)
 
     def _make_target(self, width: int, height: int) -> Target:
         import moderngl
@@ -116,18 +112,29 @@ class Graphics:
                 framebuffer.depth_attachment.release()
             framebuffer.release()
 
+    def uniform(self, program: str, name: str) -> "moderngl.Uniform":
+        """A plain uniform of one of the programs."""
+        import moderngl
+
+        member = self.programs[program][name]
+        if not isinstance(member, moderngl.Uniform):
+            raise TypeError(f"{name} of program {program} is no uniform")
+        return member
+
     def _program(self, name: str) -> "moderngl.Program":
+        import moderngl
+
         head = "#version 330 core\n" + _source("frame.glsl")
         program = self.context.program(
             vertex_shader=head + _source(f"{name}.vert.glsl"),
             fragment_shader=head + _source(f"{name}.frag.glsl"),
         )
-        for block, binding in (("Frame", FRAME_BINDING), ("Scene", SCENE_BINDING)):
-            if block in program:
-                program[block].binding = binding
-        for sampler, unit in UNITS.items():
-            if sampler in program:
-                program[sampler].value = unit
+        for key in program:
+            member = program[key]
+            if isinstance(member, moderngl.UniformBlock):
+                member.binding = BLOCKS[key]
+            elif isinstance(member, moderngl.Uniform) and key in UNITS:
+                member.value = UNITS[key]
         return program
 
     def mipmapped(self, texture: "moderngl.Texture") -> None:
@@ -156,8 +163,9 @@ def _source(name: str) -> str:
 def _create_context() -> "moderngl.Context":
     import moderngl
 
+    settings: dict[str, Any] = {"backend": "egl"}
     try:
-        return moderngl.create_context(standalone=True, backend="egl", require=330)
+        return moderngl.create_context(require=330, standalone=True, **settings)
     except Exception as error:  # moderngl and glcontext raise bare Exception, ImportError, ...
         raise NoRendererError(
             f"no OpenGL 3.3 through EGL on this machine ({error}); "

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from simulator.camera.mesh import Chunks
+from simulator.camera.mesh import Chunks, Surface
 from simulator.camera.terrain import COARSE, Terrain
 
 FloatArray = NDArray[np.float64]
@@ -13,24 +13,20 @@ BLOCK = 8
 COARSE_SINK_M = 4.0
 
 
-def fine(terrain: Terrain) -> tuple[NDArray[np.float32], NDArray[np.uint32], Chunks]:
-    """Vertices (x, y, z, normal), indices and chunks of the full grid."""
+def fine(terrain: Terrain) -> Surface:
+    """The full grid; a vertex is x, y, z, normal."""
     return _grid(terrain.x0, terrain.y0, terrain.cell, terrain.z, terrain.normals())
 
 
-def coarse(terrain: Terrain) -> tuple[NDArray[np.float32], NDArray[np.uint32], Chunks]:
-    """The same from every COARSE-th point, sunk a little so that the fine grid covers it, with a
-    rim that runs level to the far horizon."""
+def coarse(terrain: Terrain) -> Surface:
+    """The same from every COARSE-th point, sunk so that the fine grid covers it."""
     z = terrain.z[::COARSE, ::COARSE] - COARSE_SINK_M
     step = terrain.cell * COARSE
     normals = terrain.normals()[::COARSE, ::COARSE]
-    vertices, indices, chunks = _grid(terrain.x0, terrain.y0, step, z, normals)
-    return vertices, indices, chunks
+    return _grid(terrain.x0, terrain.y0, step, z, normals)
 
 
-def _grid(
-    x0: float, y0: float, cell: float, z: FloatArray, normals: FloatArray
-) -> tuple[NDArray[np.float32], NDArray[np.uint32], Chunks]:
+def _grid(x0: float, y0: float, cell: float, z: FloatArray, normals: FloatArray) -> Surface:
     rows, columns = z.shape
     vertices = np.empty((rows, columns, 6), dtype=np.float32)
     vertices[..., 0] = x0 + cell * np.arange(columns)
@@ -57,4 +53,4 @@ def _grid(
     centre[:, 0] = x0 + centre[:, 0] * cell
     centre[:, 1] = y0 + centre[:, 1] * cell
     chunks = Chunks(centre, np.array(radii), np.array([first]), np.array([count]))
-    return vertices.reshape(-1, 6), np.concatenate(indices).astype(np.uint32), chunks
+    return Surface(vertices.reshape(-1, 6), np.concatenate(indices).astype(np.uint32), chunks)

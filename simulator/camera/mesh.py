@@ -16,6 +16,15 @@ FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
+class Surface:
+    """Triangles ready to draw: `vertices` (N, F) float32, `indices` uint32, chunks to cull by."""
+
+    vertices: NDArray[np.float32]
+    indices: NDArray[np.uint32]
+    chunks: "Chunks"
+
+
+@dataclass(frozen=True)
 class Chunks:
     """Spheres round runs of indices: centres (N, 3), radii (N,), and one row of first index and
     number of indices a level of detail, (levels, N), the finest first."""
@@ -59,21 +68,19 @@ class Mesh:
         self,
         graphics: Graphics,
         program: str,
-        vertices: NDArray[np.float32],
-        indices: NDArray[np.uint32],
+        surface: Surface,
         layout: Sequence[str],
-        chunks: Chunks,
     ) -> None:
         context = graphics.context
-        self._vertices = context.buffer(np.ascontiguousarray(vertices).tobytes())
-        self._indices = context.buffer(np.ascontiguousarray(indices, dtype=np.uint32).tobytes())
+        self._vertices = context.buffer(np.ascontiguousarray(surface.vertices).tobytes())
+        self._indices = context.buffer(np.ascontiguousarray(surface.indices).tobytes())
         self._array: moderngl.VertexArray = context.vertex_array(
             graphics.programs[program],
             [(self._vertices, *layout)],
             index_buffer=self._indices,
             index_element_size=4,
         )
-        self._chunks = chunks
+        self._chunks = surface.chunks
 
     def draw(self, eye: FloatArray, planes: FloatArray, *reaches: float) -> None:
         """Draw the chunks that are seen, each level of detail up to its reach (m)."""

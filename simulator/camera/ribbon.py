@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from simulator.camera.mesh import Chunks
+from simulator.camera.mesh import Chunks, Surface
 from simulator.camera.terrain import CentreLine, Terrain
 from simulator.track.road import Road
 
@@ -24,16 +24,6 @@ SKIRT_M = 10.0
 """How far the ribbon reaches into the land beyond the wall."""
 KERB_CURVATURE = 1.0 / 220.0
 CHUNK_ROWS, COARSE_ROWS = 16, 4
-
-
-@dataclass(frozen=True)
-class Strip:
-    """A grid of vertices drawn row by row: `vertices` (rows * columns, F) float32 and triangle
-    `indices` uint32, with the chunks of rows to cull by."""
-
-    vertices: NDArray[np.float32]
-    indices: NDArray[np.uint32]
-    chunks: Chunks
 
 
 @dataclass(frozen=True)
@@ -54,7 +44,7 @@ class Ribbon:
         pick = np.arange(len(row))
         y0, y1 = y[pick, column - 1], y[pick, column]
         share = np.clip((offset - y0) / np.minimum(y1 - y0, -1e-6), 0.0, 1.0)
-        return z[pick, column - 1] + share * (z[pick, column] - z[pick, column - 1])
+        return np.asarray(z[pick, column - 1] + share * (z[pick, column] - z[pick, column - 1]))
 
 
 def rows_of(road: Road) -> FloatArray:
@@ -113,7 +103,7 @@ def _skirt(
     return width
 
 
-def surface(ribbon: Ribbon, road: Road) -> Strip:
+def surface(ribbon: Ribbon, road: Road) -> Surface:
     """The ribbon's triangles; a vertex is x, y, z, s, y, normal (3), kerb."""
     rows, columns = ribbon.y.shape
     vertices = np.empty((rows, columns, 9), dtype=np.float32)
@@ -144,7 +134,7 @@ def _kerb(ribbon: Ribbon, road: Road) -> FloatArray:
     return kerb
 
 
-def strip(vertices: NDArray[np.float32], points: FloatArray) -> Strip:
+def strip(vertices: NDArray[np.float32], points: FloatArray) -> Surface:
     """Triangles between the rows of a vertex grid (R, C, F), in two levels of detail: all rows,
     and one row in COARSE_ROWS; cut into chunks for culling."""
     rows, columns = vertices.shape[:2]
@@ -160,7 +150,7 @@ def strip(vertices: NDArray[np.float32], points: FloatArray) -> Strip:
     high = np.maximum.reduceat(points.max(axis=1), starts, axis=0)
     low = np.minimum(low, points[ends].min(axis=1))
     high = np.maximum(high, points[ends].max(axis=1))
-    return Strip(
+    return Surface(
         np.ascontiguousarray(vertices.reshape(rows * columns, -1)),
         np.concatenate(indices),
         Chunks(

@@ -29,18 +29,15 @@ class Scene:
         terrain = build_terrain(road, line, look, np.random.default_rng([seed, 1]))
         strips = ribbon.build(road, line, terrain)
         self._graphics = graphics
-        surface = ribbon.surface(strips, road)
         self._road = Mesh(
             graphics,
             "road",
-            surface.vertices,
-            surface.indices,
+            ribbon.surface(strips, road),
             ("3f 2f 3f 1f", "at", "road", "facing", "kerbed"),
-            surface.chunks,
         )
         layout = ("3f 3f", "at", "facing")
-        self._land = Mesh(graphics, "land", *_ordered(land.fine(terrain), layout))
-        self._far_land = Mesh(graphics, "land", *_ordered(land.coarse(terrain), layout))
+        self._land = Mesh(graphics, "land", land.fine(terrain), layout)
+        self._far_land = Mesh(graphics, "land", land.coarse(terrain), layout)
         trees = scenery.plant(road, line, strips, terrain, look, np.random.default_rng([seed, 3]))
         self.mask = shade.build(road, line, trees, light, np.random.default_rng([seed, 4]))
         self._woods = Woods(graphics, trees)
@@ -74,11 +71,6 @@ class Scene:
             self._shade,
         ):
             thing.release()
-
-
-def _ordered(grid, layout):  # type: ignore
-    vertices, indices, chunks = grid
-    return vertices, indices, layout, chunks
 
 
 def scene_block(

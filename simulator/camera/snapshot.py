@@ -1,0 +1,133 @@
+"""A contact sheet of a road: driver views all round it, the true markings drawn over them.
+
+simulator snapshot TRACK --out sheet.png
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from simulator.camera import overlay
+from simulator.camera.camera import Camera
+from simulator.camera.light import KINDS, Light
+from simulator.track.road import Road
+from trackfeatures.errors import UserError
+
+FloatArray = NDArray[np.float64]
+Picture = NDArray[np.uint8]
+
+WIDTH, HEIGHT, COLUMNS = 480, 360, 4
+DRIVER_VIEWS = 14
+CG_HEIGHT_M = 0.25
+CAR_GAP_M = (12.0, 60.0)
+
+
+@dataclass(frozen=True)
+class Shot:
+    """One picture of the sheet: where the car is (m, rad), what looks, in which light."""
+
+    s: float
+    to_middle: float
+    angle: float
+    view: str
+    light: str
+
+
+def write_contact_sheet(road: Road, out: Path, *, seed: int, traffic: int) -> None:
+    """Write a PNG of driver views at places all round `road`, one chase and one top view.
+
+    The right half of each picture has the true markings drawn thinly over the painted ones.
+    Raises UserError if the file cannot be written as PNG, OSError if it cannot be written.
+    """
+    if out.suffix.lower() != ".png":
+        raise UserError(f"{out}: the contact sheet is a PNG file; give a name that ends in .png")
+    shots = _shots(road, np.random.default_rng([seed, 10]))
+    pictures: list[Picture | None] = [None] * len(shots)
+    for kind in dict.fromkeys(shot.light for shot in shots):
+        light = Light.named(kind, np.random.default_rng([seed, 11]))
+        with Camera(road, seed=seed, light=light, width=WIDTH, height=HEIGHT) as camera:
+            for k, shot in enumerate(shots):
+                if shot.light == kind:
+                    rng = np.random.default_rng([seed, 12, k])
+                    pictures[k] = take(camera, road, shot, traffic, rng)
+    made = [picture for picture in pictures if picture is not None]
+    rows = [np.hstack(made[k : k + COLUMNS]) for k in range(0, len(made), COLUMNS)]
+    done, png = cv2.imencode(".png", cv2.cvtColor(np.vstack(rows), cv2.COLOR_RGB2BGR))
+    if not done:
+        raise UserError(f"{out}: the contact sheet could not be coded as PNG")
+    out.write_bytes(png.tobytes())
+
+
+def take(camera: Camera, road: Road, shot: Shot, traffic: int, rng: np.random.Generator) -> Picture:
+    """The picture of `shot` with the true markings over its right half and a caption."""
+    pose = standing_pose(road, shot.s, shot.to_middle, shot.angle)
+    cars = _cars_ahead(road, shot, traffic, rng)
+    plain = camera.render(pose, cars, shot.view)
+    lines = overlay.marking_polylines(camera, road, (shot.s, pose), view=shot.view)
+    picture = overlay.draw(plain, lines)
+    half = camera.width // 2
+    picture[:, :half] = plain[:, :half]
+    caption = (
+        f"{road.track.name}  s {shot.s:.0f} m  {shot.view}  {shot.light}  "
+        f"d {shot.to_middle:+.1f} m  {np.degrees(shot.angle):+.0f} deg"
+    )
+    for colour, thick in (((0, 0, 0), 3), ((255, 255, 255), 1)):
+        place = (8, camera.height - 10)
+        cv2.putText(
+            picture, caption, place, cv2.FONT_HERSHEY_SIMPLEX, 0.42, colour, thick, cv2.LINE_AA
+        )
+    return picture
+
+
+def standing_pose(
+    road: Road, s: float, to_middle: float, angle: float = 0.0, height: float = CG_HEIGHT_M
+) -> FloatArray:
+    """Pose (6,) of a car that stands on the road plane, `height` m above it along its normal."""
+    track = road.track
+    place = track.at(s, to_middle)
+    here = np.array([place.x, place.y, place.z], dtype=np.float64)
+    ahead, behind = track.at(s + 0.05, to_middle), track.at(s - 0.05, to_middle)
+    left, right = track.at(s, to_middle + 0.5), track.at(s, to_middle - 0.5)
+    along = np.array([ahead.x - behind.x, ahead.y - behind.y, ahead.z - behind.z])
+    across = np.array([left.x - right.x, left.y - right.y, left.z - right.z])
+    normal = np.cross(along, across)
+    normal /= np.linalg.norm(normal)
+    yaw = float(place.heading) - angle
+    # Euler angles (Rz Ry Rx) of the body whose x axis lies in the road plane at this yaw.
+    flat = np.array([np.cos(yaw), np.sin(yaw), 0.0])
+    x_axis = np.array([flat[0], flat[1], -(flat @ normal) / normal[2]])
+    x_axis /= np.linalg.norm(x_axis)
+    y_axis = np.cross(normal, x_axis)
+    pitch = -float(np.arcsin(np.clip(x_axis[2], -1.0, 1.0)))
+    roll = float(np.arctan2(y_axis[2], normal[2]))
+    return np.array([*(here + normal * height), roll, pitch, yaw])
+
+
+def _shots(road: Road, rng: np.random.Generator) -> list[Shot]:
+    length = road.track.length_m
+    places = (np.arange(DRIVER_VIEWS + 2) + rng.uniform(0.0, 1.0)) * length / (DRIVER_VIEWS + 2)
+    reach = road.lanes * road.lane_width / 2 - 1.0
+    shots = []
+    for k, s in enumerate(places):
+        view = "chase" if k == DRIVER_VIEWS else "top" if k == DRIVER_VIEWS + 1 else "front"
+        offset = float(rng.uniform(-reach, reach))
+        angle = float(rng.normal(0.0, 0.06)) if view == "front" else 0.0
+        # Every other picture in clear light, the others in each of the rest in turn.
+        light = "clear" if k % 2 == 0 else KINDS[1 + (k // 2) % (len(KINDS) - 1)]
+        shots.append(Shot(float(s), offset, angle, view, light))
+    return shots
+
+
+def _cars_ahead(road: Road, shot: Shot, count: int, rng: np.random.Generator) -> FloatArray:
+    """Poses (count, 6) of cars standing in lanes ahead, none within 12 m of another."""
+    ahead = np.cumsum(rng.uniform(*CAR_GAP_M, count))
+    lanes = rng.integers(0, road.lanes, count)
+    first = (road.lanes - 1) * road.lane_width / 2
+    poses = [
+        standing_pose(road, shot.s + gap, first - lane * road.lane_width, height=0.0)
+        for gap, lane in zip(ahead, lanes, strict=True)
+    ]
+    return np.array(poses).reshape(-1, 6)
