@@ -14,7 +14,7 @@ from scipy.interpolate import splev, splprep
 from simulator.track.errors import TrackError
 from simulator.track.geometry import Track
 from simulator.track.markings import imported_style
-from simulator.track.pieces import FloatArray, Piece, assemble, check_closes
+from simulator.track.pieces import FloatArray, Piece, Placed, assemble, check_closes
 from trackfeatures.errors import UserError
 
 MAX_BYTES: Final = 16 * 2**20
@@ -40,7 +40,7 @@ def read_centre_line(path: Path) -> Track:
     Raises TrackError for a file that is not of this format, or whose points are no closed road.
     """
     points, width = _read_points(path)
-    placed = assemble(_pieces(points, path))
+    placed = _arcs(points, path)
     check_closes(placed, str(path), MAX_GAP_M)
     radius = 1.0 / float(np.max(np.abs(placed.curvature)))
     if radius < MIN_RADIUS_M:
@@ -113,8 +113,8 @@ def _read_rows(path: Path) -> FloatArray:
     return np.array(rows, dtype=np.float64)
 
 
-def _pieces(points: FloatArray, path: Path) -> list[Piece]:
-    """Arcs along a periodic smoothing spline through the points."""
+def _arcs(points: FloatArray, path: Path) -> Placed:
+    """Arcs along a periodic smoothing spline through the points, where the points are."""
     closed = np.vstack((points, points[:1]))
     tck, _ = splprep(closed.T, s=len(points) * NOISE_M**2, per=1)
     fine = np.linspace(0.0, 1.0, max(20 * len(points), 2000) + 1)
@@ -128,10 +128,11 @@ def _pieces(points: FloatArray, path: Path) -> list[Piece]:
     if abs(math.remainder(float(turn.sum()), 2.0 * math.pi)) > 1e-6:
         raise TrackError(f"{path}: the points do not run round a closed loop")
     length = _closing_lengths(np.full(count, s[-1] / count), turn, float(heading[0]))
-    return [
+    pieces = [
         Piece(float(ds), float(dh / ds), 0.0, 0.0, 0.0, 0.0)
         for ds, dh in zip(length, turn, strict=True)
     ]
+    return assemble(pieces, float(x[0]), float(y[0]), float(heading[0]))
 
 
 def _closing_lengths(length: FloatArray, turn: FloatArray, heading: float) -> FloatArray:

@@ -1,0 +1,138 @@
+"""The project's own tracks: they close, keep clear of themselves, and turn both ways."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import trackfeatures as tf
+from simulator.track.catalogue import OWN_TRACKS, find_track, read_track
+from simulator.track.errors import TrackError
+from simulator.track.geometry import Track
+from simulator.track.layout import Bend, close
+from simulator.track.own import LOOKS, Table, read_own, read_segments
+
+NAMES = sorted(path.stem for path in OWN_TRACKS.glob("*.toml"))
+TRACKS = {name: find_track(name) for name in NAMES}
+OVAL = (OWN_TRACKS / "oval.toml").read_text()
+
+
+def classes(track: Track) -> np.ndarray:
+    """Share of a lap whose heading class is left, straight, right."""
+    s = np.arange(0.0, track.length_m, 1.0)
+    here, ahead = track.at(s).curvature, track.at(s + tf.LOOK_AHEAD_M).curvature
+    found = [tf.classify_heading(float(a), float(b)) for a, b in zip(here, ahead, strict=True)]
+    return np.bincount(found, minlength=3) / len(found)
+
+
+def test_there_are_ten_of_eight_looks() -> None:
+    assert len(NAMES) >= 10
+    assert {track.look for track in TRACKS.values()} <= set(LOOKS)
+    assert len({track.look for track in TRACKS.values()}) >= 8
+    assert len({track.content_hash for track in TRACKS.values()}) == len(NAMES)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_closes_to_the_millimetre(name: str) -> None:
+    track = TRACKS[name]
+    before, start = track.at(track.length_m - 1e-6, [5.0, 0.0, -5.0]), track.at(0.0, [5.0, 0.0, -5])
+    for axis in ("x", "y", "z"):
+        assert np.abs(getattr(before, axis) - getattr(start, axis)).max() < 1e-3
+    assert abs(math.remainder(float(before.heading[1] - start.heading[1]), 2 * math.pi)) < 1e-6
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_what_is_written_is_what_is_driven(name: str) -> None:
+    """Closing may change a straight by a rounding of the file, no more; nor the grades."""
+    import tomllib
+
+    path = OWN_TRACKS / f"{name}.toml"
+    segments = read_segments(Table(tomllib.loads(path.read_text()), name))
+    _, correction = close(segments)
+    assert correction < 0.005
+    turn = sum(segment.angle for segment in segments if isinstance(segment, Bend))
+    assert abs(turn) == pytest.approx(2 * math.pi)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_is_a_road_one_can_drive(name: str) -> None:
+    track = TRACKS[name]
+    assert 1200.0 <= track.length_m <= 4000.0
+    assert track.min_radius_m >= 25.0
+    assert max(map(abs, track.grade_range)) <= 0.125
+    s = np.arange(0.0, track.length_m, 2.0)
+    edges = track.at(s, track.width / 2).z - track.at(s, -track.width / 2).z
+    banking = np.degrees(np.arctan(edges / track.width))
+    assert np.abs(banking).max() <= 10.0
+    # The outer edge is the higher one: right in a left bend.
+    assert (banking * track.at(s).curvature <= 1e-12).all()
+    # No kinks: heights bend by at most 4 % of grade over 10 m.
+    slopes = np.diff(track.at(s).z) / 2.0
+    assert np.abs(slopes[5:] - slopes[:-5]).max() < 0.04
+    # A car starts 25 m before the line, on a straight.
+    assert (track.at(np.arange(-25.0, 10.0)).curvature == 0.0).all()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_three_lanes_keep_clear_of_each_other(name: str) -> None:
+    """Parts of the road farther than 100 m along it are at least 45 m apart in the plane."""
+    track = TRACKS[name]
+    s = np.arange(0.0, track.length_m, 3.0)
+    pose = track.at(s)
+    apart = np.hypot(pose.x[:, None] - pose.x, pose.y[:, None] - pose.y)
+    along = np.abs(s[:, None] - s)
+    along = np.minimum(along, track.length_m - along)
+    assert apart[along > 100.0].min() >= 45.0
+
+
+def test_classes_are_balanced_over_the_set() -> None:
+    shares = np.mean([classes(track) for track in TRACKS.values()], axis=0)
+    assert shares.min() >= 0.15
+    assert shares.max() <= 0.60
+    turns = [math.copysign(1.0, float(np.sum(t.curvature0 * t.length))) for t in TRACKS.values()]
+    assert {-1.0, 1.0} == set(turns)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("radius = 130.0", "radius = 230.0", "to close the loop"),
+        ("radius = 130.0", "radius = 2", "expected a number from 8"),
+        ("radius = 130.0", 'radius = "wide"', "'wide'"),
+        ("radius = 130.0", "radius = nan", "nan"),
+        ("radius = 130.0", "raduis = 130.0", "'raduis'"),
+        ("spiral = 60.0", "spiral = 400.0", "do not fit"),
+        ('look = "oval"', 'look = "moon"', "'moon'"),
+        ('type = "straight"', 'type = "loop"', "'loop'"),
+        ("line_width = 0.15", "line_width = 1.5", "0.15"),
+        ("[[segment]]", "[[segment", "TOML"),
+        ("[[segment]]", "[[stretch]]", "'stretch'"),
+        ("width = 14.0", "width = true", "True"),
+    ],
+)
+def test_mistakes_are_named(tmp_path: Path, old: str, new: str, said: str) -> None:
+    assert old in OVAL
+    path = tmp_path / "bad.toml"
+    path.write_text(OVAL.replace(old, new, 1) if old != "[[segment]]" else OVAL.replace(old, new))
+    with pytest.raises(TrackError, match=r"bad\.toml") as caught:
+        read_track(path)
+    assert said in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_square_with_known_figures(tmp_path: Path) -> None:
+    bend = '[[segment]]\ntype = "bend"\nradius = 40\nangle = 90\nspiral = 20\nbanking = 4\n'
+    straight = '[[segment]]\ntype = "straight"\nlength = 100\n'
+    path = tmp_path / "square.toml"
+    path.write_text('look = "town"\nwidth = 8.0\n' + (straight + bend) * 4)
+    track = read_own(path)
+    assert track.length_m == pytest.approx(4 * (100.0 + 20.0 * math.pi + 20.0))
+    assert track.min_radius_m == pytest.approx(40.0)
+    middle = 100.0 + (20.0 * math.pi + 20.0) / 2
+    right, left = track.at(middle, [-4.0, 4.0]).z
+    assert right - left == pytest.approx(8.0 * math.tan(math.radians(4.0)))
+    # Half-way along the spiral the curvature and the banking are half of the bend's.
+    assert float(track.at(110.0 + 1e-6).curvature) == pytest.approx(1 / 80.0, rel=0.11)
+    half = track.at(110.0, [-4.0, 4.0]).z
+    assert half[0] - half[1] == pytest.approx(4.0 * math.tan(math.radians(4.0)), rel=0.01)
