@@ -101,5 +101,6 @@ def test_version_3_feet_and_latin_1() -> None:
     assert track.length_m == pytest.approx(2 * straight + 200.0 * math.pi)
     assert track.length[:7] == pytest.approx([straight / 7] * 7)
     assert len(track.s0) == 28
-    assert (track.width, track.min_radius_m) == (20.0, pytest.approx(100.0))
+    assert track.width == 20.0
+    assert track.min_radius_m == pytest.approx(100.0)
     assert (track.name, track.source, track.look) == ("version-3", "torcs", "oval")
