@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from simulator.camera import land, ribbon, scenery, shade
+from simulator.camera import barriers, land, ribbon, scenery, shade
 from simulator.camera.context import SCENE_BINDING, Graphics
 from simulator.camera.light import Light
 from simulator.camera.look import Colour, Look, look_of
@@ -16,6 +16,7 @@ from simulator.track.road import Road
 FloatArray = NDArray[np.float64]
 
 FINE_LAND_M, COARSE_LAND_M = 260.0, 2500.0
+BARRIER_M = (60.0, 300.0)
 FINE_ROAD_M, COARSE_ROAD_M = 90.0, 650.0
 _LINE = {"white": (0.78, 0.78, 0.75), "yellow": (0.75, 0.50, 0.06)}
 
@@ -38,6 +39,12 @@ class Scene:
         layout = ("3f 3f", "at", "facing")
         self._land = Mesh(graphics, "land", land.fine(terrain), layout)
         self._far_land = Mesh(graphics, "land", land.coarse(terrain), layout)
+        self._barriers = Mesh(
+            graphics,
+            "barrier",
+            barriers.build(road, strips, look, np.random.default_rng([seed, 5])),
+            ("3f 2f 1f 3f", "at", "along", "kind", "facing"),
+        )
         trees = scenery.plant(road, line, strips, terrain, look, np.random.default_rng([seed, 3]))
         self.mask = shade.build(road, line, trees, light, np.random.default_rng([seed, 4]))
         self._woods = Woods(graphics, trees)
@@ -58,6 +65,7 @@ class Scene:
 
     def draw_blended(self, eye: FloatArray, planes: FloatArray) -> None:
         """Paint what lets light through, after all else."""
+        self._barriers.draw(eye, planes, *BARRIER_M)
         self._woods.draw(eye, planes)
 
     def release(self) -> None:
