@@ -55,7 +55,6 @@ def test_help_comes_in_half_a_second(command: tuple[str, ...]) -> None:
     [
         (("simulator", "centreline", "no-such-track", "--out", "x.csv"), "no-such-track"),
         (("simulator", "snapshot", "no-such-track", "--out", "x.png"), "no-such-track"),
-        (("datagen", "verify", "no-such-folder"), "no-such-folder"),
         (("datagen", "info", "no-such-folder"), "no-such-folder"),
         (("datagen", "collect", "--tracks", "no-such-track", "--out", "OUT"), "no-such-track"),
         (("mtlnet", "train", "--alpha", "0.3,0.2", "--data", "x", "--out", "OUT"), "0.3,0.2"),
