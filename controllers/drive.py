@@ -62,6 +62,7 @@ def run_lap(
     memory = OffsetMemory(round(HOLD_S * world.frequency_hz))
     score, ended = 0.0, None
     offsets, speeds = [], []
+    start_m = world.state.odometer_m
     for _ in range(steps):
         now = world.state
         steer = controller.update(_observe(now, perceive(world), memory))
@@ -71,14 +72,14 @@ def run_lap(
         after = world.step(Command(steer=steer, throttle=pedal, brake=brake, gear=GEAR))
         offsets.append(abs(after.to_middle - lane_centre))
         speeds.append(after.speed_kmh)
+        ended = _ending(after)
         score += step_reward(
             after.angle,
             after.to_middle,
             world.road.half_width,
-            after.off_track,
-            after.backwards or after.collision is not None,
+            off_track=ended is not None,
+            backwards=False,
         )
-        ended = _ending(after)
         if ended is not None:
             break
     run_up = round(RUN_UP_S * world.frequency_hz)
@@ -88,6 +89,7 @@ def run_lap(
         score=score,
         score_per_step=score / steps,
         laps=max(world.state.lap - 1, 0),
+        distance_m=world.state.odometer_m - start_m,
         mean_abs_d_m=float(np.mean(offsets)),
         max_abs_d_m=max(offsets),
         speed_kmh=(min(speeds), max(speeds)),
@@ -141,8 +143,10 @@ def _observe(now: CarState, seen: Perceived, memory: OffsetMemory) -> Observatio
 
 
 def _ending(state: CarState) -> str | None:
-    if state.off_track:
+    # Rails stand half a metre beyond the edge: a body that touches one has left the track, though
+    # the centre of gravity, by which the edge is judged, cannot get there any more.
+    if state.off_track or state.collision == "wall":
         return "off_track"
     if state.backwards:
         return "backwards"
-    return "collision" if state.collision is not None else None
+    return "collision" if state.collision == "traffic" else None

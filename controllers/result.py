@@ -17,6 +17,8 @@ class DriveResult:
     """`score` over `steps_asked`."""
     laps: int
     """Whole laps, from crossing the line to crossing it again."""
+    distance_m: float
+    """Way made by the car."""
     mean_abs_d_m: float
     """Mean distance from the centre of the lane to follow."""
     max_abs_d_m: float
@@ -29,7 +31,7 @@ class DriveResult:
     noisy: bool
     """Whether noise was added to the state."""
     ended: str | None
-    """Why the drive ended early: off_track, backwards or collision."""
+    """Why it ended early: off_track (the rails count), backwards, or collision (with a car)."""
 
     def as_json(self) -> dict[str, Any]:
         values = asdict(self)

@@ -86,6 +86,7 @@ def test_the_score_is_the_sum_of_the_rewards_after_each_step() -> None:
     ("change", "ended"),
     [
         ({"off_track": True}, "off_track"),
+        ({"collision": "wall"}, "off_track"),
         ({"backwards": True}, "backwards"),
         ({"collision": "traffic"}, "collision"),
     ],
