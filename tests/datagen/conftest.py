@@ -1,0 +1,109 @@
+"""Rounds made without a simulator, and datasets of them: what the tests of recording share."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import trackfeatures as tf
+from datagen.recording.camera import CameraInfo
+from datagen.recording.derived import rebuild
+from datagen.recording.folder import RoundState, file_sha256, partial_path, prepare, publish
+from datagen.recording.frame import DriverCommand, EgoState, Frame, RoadPlace, SensorReadings
+from datagen.recording.header import RoundHeader, RoundResult
+from datagen.recording.splits import Split
+from datagen.recording.writer import RoundWriter
+
+LANES = 2
+CAMERA = CameraInfo(width=56, height=42)
+
+
+FRAMES = 45
+
+
+class Samples:
+    """Makes headers, frames, rounds and dataset folders."""
+
+    camera = CAMERA
+    frames_a_round = FRAMES
+
+    def header(self, round_id: str = "r000", **changes: Any) -> RoundHeader:
+        header = RoundHeader(
+            id=round_id,
+            seed=int(round_id[1:]),
+            track="a-track",
+            track_hash="0" * 64,
+            lanes=LANES,
+            lane_width_m=4.0,
+            traffic=2,
+            trajectory="weave",
+            light="clear",
+            speed_kmh=60.0,
+            camera=CAMERA,
+        )
+        return replace(header, **changes)
+
+    def frames(self, count: int, seed: int) -> list[Frame]:
+        rng = np.random.default_rng(seed)
+        return [_frame(rng) for _ in range(count)]
+
+    def write(self, path: Path, header: RoundHeader, frames: list[Frame]) -> RoundResult:
+        scene = {"left": np.arange(30.0).reshape(10, 3)}
+        with RoundWriter(path, header, scene) as writer:
+            for frame in frames:
+                writer.add(frame)
+            return writer.finish(laps=1, distance_m=12.5, mean_speed_kmh=60.0)
+
+    def add_round(self, folder: Path, header: RoundHeader, content_seed: int | None = None) -> None:
+        """A round as `datagen collect` leaves it; its frames follow from its seed."""
+        partial = partial_path(folder, header.id)
+        seed = header.seed if content_seed is None else content_seed
+        result = self.write(partial, header, self.frames(FRAMES, seed))
+        state = RoundState(
+            id=header.id,
+            file=f"rounds/{header.id}.mcap",
+            bytes=partial.stat().st_size,
+            sha256=file_sha256(partial),
+            frames=result.frames,
+            content_hash=result.content_hash,
+            definitions=header.definitions,
+        )
+        publish(folder, partial, state)
+
+    def dataset(self, folder: Path) -> Path:
+        """Two rounds to train, one to test."""
+        prepare(folder)
+        for number in range(3):
+            self.add_round(folder, self.header(f"r{number:03d}"))
+        rebuild(folder, Split(train=("r000", "r001"), test=("r002",)))
+        return folder
+
+
+@pytest.fixture(scope="session")
+def samples() -> Samples:
+    return Samples()
+
+
+@pytest.fixture
+def dataset(samples: Samples, tmp_path: Path) -> Path:
+    return samples.dataset(tmp_path / "data")
+
+
+def _frame(rng: np.random.Generator) -> Frame:
+    to_middle, angle = rng.uniform(-7.0, 7.0), rng.normal(0.0, 0.05)
+    curvature, ahead = rng.normal(0.0, 0.01, 2)
+    rows, columns = np.mgrid[: CAMERA.height, : CAMERA.width]
+    ramp = (rows * rng.uniform(1, 3) + columns * rng.uniform(1, 2)) % 256
+    image = np.stack([ramp, ramp // 2, 255 - ramp], axis=-1).astype(np.uint8)
+    return Frame(
+        image=image,
+        features=tf.measure(to_middle, angle, curvature, ahead, LANES, 4.0),
+        place=RoadPlace(LANES, tf.lane_index(to_middle, LANES, 4.0), curvature, to_middle, 7.0),
+        ego=EgoState(1.0, 2.0, 0.3, angle, 0.01, -0.02, 15.0, 0.1, 0.05, 0.25),
+        command=DriverCommand(0.1, 0.2, 0.0, 3),
+        sensors=SensorReadings(range=tuple(rng.uniform(0, 200, 19)), wheel_spin=(1, 2, 3, 4)),
+        traffic=rng.uniform(-5, 5, (2, 6)),
+        markings=(rng.uniform(0, 40, (12, 2)), rng.uniform(0, 40, (8, 2))),
+    )

@@ -1,0 +1,106 @@
+"""What verification finds, level by level; whatever it is given, it reports and never raises."""
+
+import json
+
+import numpy as np
+import pytest
+
+from datagen.recording import Dataset
+from datagen.recording.folder import round_path, state_path
+from datagen.recording.splits import Split, split_path, write_split
+from datagen.recording.verify import verify
+
+
+@pytest.mark.parametrize("level", ["quick", "full", "deep"])
+def test_a_good_dataset_is_in_order_at_every_level(dataset, level):
+    report = verify(dataset, level)
+    assert (report.ok, report.rounds, report.frames, report.problems) == (True, 3, 135, ())
+
+
+def test_a_flipped_byte_in_an_image_is_found_by_full(dataset):
+    frames = Dataset.open(dataset).select("all")
+    path = round_path(dataset, "r001")
+    image = bytes(frames.jpeg(45 + 20))
+    data = bytearray(path.read_bytes())
+    data[data.index(image) + len(image) // 2] ^= 0x10
+    path.write_bytes(data)
+    assert verify(dataset, "quick").ok
+    problems = verify(dataset, "full").problems
+    assert all(problem.startswith("r001.mcap: ") for problem in problems)
+    for expected in ("sha256 differs", "CRC", "content hash differs"):
+        assert any(expected in problem for problem in problems)
+
+
+def test_a_truncated_file_is_found_by_quick(dataset):
+    path = round_path(dataset, "r002")
+    path.write_bytes(path.read_bytes()[:-1000])
+    report = verify(dataset, "quick")
+    assert not report.ok
+    assert len(report.problems) == 1
+    assert "its end is missing" in report.problems[0]
+
+
+@pytest.mark.parametrize("content", [b"", b"not an mcap file at all" * 9, b"\x89MCAP0\r\n" * 9])
+def test_a_foreign_file_is_reported(dataset, content):
+    (dataset / "rounds" / "zz.mcap").write_bytes(content)
+    for level in ("quick", "full", "deep"):
+        report = verify(dataset, level)
+        assert [p.split()[0] for p in report.problems] == ["zz.mcap"]
+        assert report.frames == 135
+
+
+def test_missing_rounds_states_and_folders_are_reported(dataset, tmp_path):
+    round_path(dataset, "r000").unlink()
+    state_path(dataset, "r001").unlink()
+    state_path(dataset, "r002").write_text("{}")
+    problems = " / ".join(verify(dataset, "quick").problems)
+    assert "r000.mcap is missing" in problems
+    assert "r001.mcap: no state file" in problems
+    assert "r002.json is no round state" in problems
+    assert "holds no recorded rounds" in verify(tmp_path / "nothing", "quick").problems[0]
+
+
+def test_labels_that_do_not_follow_from_the_offset_are_found_by_deep(samples, dataset):
+    from dataclasses import replace
+
+    frames = samples.frames(20, seed=9)
+    shifted = [
+        replace(f, place=replace(f.place, to_middle=f.place.to_middle + 0.1)) for f in frames
+    ]
+    samples.write(round_path(dataset, "r000"), samples.header("r000"), shifted)
+    assert any("do not follow from the offset" in p for p in verify(dataset, "deep").problems)
+
+
+def test_images_of_another_size_are_found_by_deep(samples, dataset):
+    from dataclasses import replace
+
+    frames = [replace(f, image=f.image[:20, :20]) for f in samples.frames(3, seed=9)]
+    samples.write(round_path(dataset, "r000"), samples.header("r000"), frames)
+    problems = verify(dataset, "deep").problems
+    assert sum("20x20 px where 56x42" in p for p in problems) == 3
+
+
+def test_a_leaking_split_and_one_of_other_definitions_are_reported(dataset):
+    write_split(split_path(dataset), Split(("r000", "r001"), ("r001",)))
+    path = split_path(dataset, "old")
+    path.write_text(json.dumps({"definitions": "0-old", "train": [], "test": []}))
+    problems = verify(dataset, "quick").problems
+    assert len(problems) == 2
+    assert "round r001 on both sides" in problems[0]
+    assert "0-old" in problems[1]
+
+
+def test_random_damage_never_raises_and_is_always_found(dataset):
+    rng = np.random.default_rng(0)
+    path = round_path(dataset, "r000")
+    good = path.read_bytes()
+    for trial in range(60):
+        bad = bytearray(good)
+        # Half of the trials aim at the index at the end, where a wrong number leads far.
+        low = 0 if trial % 2 else len(good) - 4000
+        for at in rng.integers(low, len(good), 4):
+            bad[at] ^= int(rng.integers(1, 256))
+        if trial % 5 == 0:
+            del bad[int(rng.integers(len(bad))) :]
+        path.write_bytes(bad)
+        assert not verify(dataset, "deep").ok
