@@ -161,8 +161,9 @@ class World:
         z, *normal = surface(self._table, piece, wrapped, to_middle)
         up = np.array(normal)
         yaw = float(pose.heading) - angle
-        level = np.array([math.cos(yaw), math.sin(yaw), 0.0])
-        forward = level - up * (level @ up)
+        # In the road plane, and seen from above exactly in the direction of yaw.
+        rise = -(up[0] * math.cos(yaw) + up[1] * math.sin(yaw)) / up[2]
+        forward = np.array([math.cos(yaw), math.sin(yaw), rise])
         forward /= np.linalg.norm(forward)
         position = np.array([float(pose.x), float(pose.y), z]) + up * self.car.cg_height
         self._motion[:] = 0.0

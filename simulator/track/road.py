@@ -10,9 +10,9 @@ from simulator.track.geometry import Track
 
 SHOULDER_M = 1.0
 """Asphalt beyond the outermost marking."""
-WALL_MARGIN_M = 1.5
-"""Rails and walls stand this far outside the edge: more than half a car's width (0.97 m), or no
-car could ever leave the track before it hits them."""
+WALL_MARGIN_M = 2.5
+"""Rails and walls stand this far outside the edge: half a car's diagonal (2.46 m), so that a car
+has left the track before any part of it meets a wall."""
 
 
 @dataclass(frozen=True)

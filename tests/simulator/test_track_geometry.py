@@ -148,7 +148,7 @@ def test_content_hash_is_of_the_geometry() -> None:
 def test_road_lays_lanes_on_a_track() -> None:
     narrow, wide = Road(STADIUM), Road(STADIUM, lanes=3)
     assert (narrow.half_width, narrow.half_asphalt, narrow.edge) == (5.0, 3.0, 5.0)
-    assert (wide.half_width, wide.half_asphalt, wide.edge, wide.wall_offset) == (5.0, 7.0, 7.0, 8.5)
+    assert (wide.half_width, wide.half_asphalt, wide.edge, wide.wall_offset) == (5.0, 7.0, 7.0, 9.5)
     assert wide.markings_y == pytest.approx([6.0, 2.0, -2.0, -6.0])
     features = narrow.measure(85.0, 0.5, 0.1)
     assert (features.ml, features.mr) == pytest.approx((-1.5, 2.5))

@@ -131,13 +131,15 @@ def test_a_wall_stops_the_car_and_is_recorded() -> None:
         assert abs(state.roll) < 0.3
 
 
-def test_the_car_can_leave_the_track_before_it_meets_the_wall() -> None:
+def test_a_car_has_left_the_track_before_it_meets_the_wall() -> None:
     with World(stadium()) as world:
-        state = world.reset(seed=0, s=100.0, to_middle=4.0, angle=-0.1, speed=15.0)
-        seen = [state := world.step(Command(gear=0)) for _ in range(40)]
-        first = next(state for state in seen if state.off_track)
-        assert first.collision is None
-        assert world.road.edge < first.to_middle < world.road.edge + 1.0
+        for angle in (-0.1, -0.7, -1.4):
+            world.reset(seed=0, s=100.0, to_middle=2.0, angle=angle, speed=15.0)
+            seen = [world.step(Command(gear=0)) for _ in range(120)]
+            off = next(i for i, state in enumerate(seen) if state.off_track)
+            hits = [i for i, state in enumerate(seen) if state.collision]
+            assert not hits or off <= hits[0]  # both may fall into one control step
+            assert world.road.edge < seen[off].to_middle < world.road.edge + 0.8
 
 
 def test_running_into_traffic_is_recorded_and_slows_the_car() -> None:

@@ -1,0 +1,198 @@
+"""The Gymnasium environments: the checker, spaces, reward, endings, seeds, vectors, bad input."""
+
+import math
+import subprocess
+import sys
+import warnings
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+import simulator.env  # registers the names
+from simulator.reward import step_reward
+from trackfeatures.errors import UserError
+
+STATE_ID = "driverview/LateralControl-v0"
+IMAGE_ID = "driverview/DriverView-v0"
+
+
+def make(**options: Any) -> gym.Env[Any, Any]:
+    return gym.make(STATE_ID, **{"track": "circuit", **options})
+
+
+def steer(value: float) -> np.ndarray[Any, Any]:
+    return np.array([value], np.float32)
+
+
+@pytest.mark.parametrize("controls", ["steer", "full"])
+def test_gymnasiums_checker_passes(controls: str) -> None:
+    env = make(controls=controls, traffic=2, lanes=2)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # unbounded observations and the gear's range are meant
+        check_env(env.unwrapped, skip_render_check=True)
+    env.close()
+
+
+def test_the_observation_is_the_papers_state() -> None:
+    env = make()
+    observation, _ = env.reset(
+        seed=0, options={"s": 100.0, "to_middle": 1.2, "angle": -0.3, "speed": 10.0}
+    )
+    world = env.unwrapped.world  # type: ignore[attr-defined]
+    half_width = world.road.half_width
+    heading = np.eye(3)[int(world.features().heading)]
+    expected = [1.2 / half_width, -0.3 / math.pi, 36.0 / 75.0, 0.0, *heading]
+    np.testing.assert_allclose(observation, expected, atol=1e-6)
+    assert observation.dtype == np.float32
+    env.close()
+
+
+def test_throttle_and_gear_are_held_and_the_score_is_the_sum_of_rewards() -> None:
+    env = make()
+    env.reset(seed=1)
+    total, info = 0.0, {}
+    for _ in range(120):
+        state = env.unwrapped.world.state  # type: ignore[attr-defined]
+        wheel = -(state.to_middle - 2.0 * state.angle)
+        _, reward, ended, cut, info = env.step(steer(min(max(wheel, -1.0), 1.0)))
+        total += float(reward)
+        assert not ended
+        assert not cut
+    state = env.unwrapped.world.state  # type: ignore[attr-defined]
+    assert state.gear == 1
+    assert info["score"] == pytest.approx(total)
+    assert (info["steps"], info["ended"]) == (120, "")
+    assert 15.0 < info["speed_kmh"] < 30.0
+    env.close()
+
+
+def test_the_reward_by_hand() -> None:
+    assert step_reward(0.0, 0.0, 5.0, False, False) == 1.0
+    expected = math.cos(0.2) - math.sin(0.2) - 0.3
+    assert step_reward(-0.2, 1.5, 5.0, False, False) == pytest.approx(expected)
+    assert step_reward(0.2, 1.5, 5.0, False, False, 0.5) == pytest.approx(
+        math.cos(0.2) - 0.5 * math.sin(0.2) - 0.3
+    )
+    assert step_reward(1.6, 0.0, 5.0, False, False) == -2.0
+    assert step_reward(0.0, 0.0, 5.0, True, False) == -2.0
+    assert step_reward(0.0, 0.0, 5.0, False, True) == -2.0
+
+
+def test_leaving_the_track_ends_the_episode_with_minus_two() -> None:
+    env = make()
+    env.reset(seed=0, options={"s": 60.0, "speed": 15.0})
+    for _ in range(200):
+        _, reward, ended, _, info = env.step(steer(0.3))
+        if ended:
+            break
+    assert ended
+    assert reward == -2.0
+    assert info["ended"] == "off_track"
+    env.close()
+
+
+def test_an_episode_is_cut_after_6500_steps() -> None:
+    spec = gym.spec(STATE_ID)
+    assert spec.max_episode_steps == 6500
+
+
+def test_noise_is_the_papers_and_seeded() -> None:
+    quiet, noisy = make(), make(noise=True)
+    base, _ = quiet.reset(seed=3)
+    states = [noisy.reset(seed=seed)[0] for seed in range(200)]
+    assert np.std(np.array(states) - base) == pytest.approx(0.05, rel=0.1)
+    np.testing.assert_array_equal(noisy.reset(seed=3)[0], states[3])
+    quiet.close()
+    noisy.close()
+
+
+def test_full_controls_shift_and_brake() -> None:
+    env = make(controls="full")
+    env.reset(seed=0, options={"s": 30.0, "speed": 15.0})
+    for _ in range(20):
+        _, _, _, _, info = env.step(np.array([0.0, 0.0, 1.0, 2.4], np.float32))
+    assert info["speed_kmh"] < 10.0
+    assert env.unwrapped.world.state.gear == 2  # type: ignore[attr-defined]
+    env.close()
+
+
+def test_two_environments_beside_each_other_are_like_one_alone() -> None:
+    vector = gym.make_vec(STATE_ID, num_envs=2, vectorization_mode="async", track="circuit")
+    observations, _ = vector.reset(seed=[4, 5])
+    for _ in range(30):
+        observations, *_ = vector.step(np.array([[0.02], [-0.02]], np.float32))
+    vector.close()
+    for row, action in ((0, 0.02), (1, -0.02)):
+        env = make()
+        alone, _ = env.reset(seed=4 + row)
+        for _ in range(30):
+            alone, *_ = env.step(steer(action))
+        np.testing.assert_array_equal(observations[row], alone)
+        env.close()
+
+
+@pytest.mark.parametrize(
+    ("action", "message"),
+    [([math.nan], "finite"), ([1.5], "steer = 1.5"), ([0.0, 0.0], "shape"), ([-1.01], "steer")],
+)
+def test_bad_actions_are_refused(action: list[float], message: str) -> None:
+    env = make(disable_env_checker=True)
+    env.reset(seed=0)
+    with pytest.raises(UserError, match=message):
+        env.unwrapped.step(np.array(action, np.float32))
+    env.close()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"track": "no-such-track"}, "no-such-track"),
+        ({"frequency_hz": 30}, "30 Hz"),
+        ({"noise": -1.0}, "noise"),
+        ({"controls": "feet"}, "controls"),
+        ({"colour": "red"}, "colour"),
+        ({"lambda_": math.nan}, "lambda_"),
+        ({"traffic": 50}, "50 traffic cars"),
+    ],
+)
+def test_bad_options_are_refused(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(UserError, match=message):
+        make(**options)
+
+
+def test_unknown_reset_options_are_refused() -> None:
+    env = make()
+    with pytest.raises(UserError, match="velocity"):
+        env.reset(seed=0, options={"velocity": 3.0})
+    env.close()
+
+
+def test_a_step_before_reset_is_refused() -> None:
+    env = simulator.env.LateralControl("circuit")
+    with pytest.raises(UserError, match="call reset"):
+        env.step(steer(0.0))
+    env.close()
+
+
+def test_importing_the_package_after_gymnasium_registers_the_names() -> None:
+    code = "import gymnasium, simulator; print(gymnasium.spec('driverview/DriverView-v0').id)"
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
+    assert result.stdout.strip() == IMAGE_ID
+
+
+def test_the_driver_view_gives_image_and_state() -> None:
+    env = gym.make(IMAGE_ID, track="circuit", lanes=2, width=140, height=105)
+    try:
+        observation, _ = env.reset(seed=0)
+        assert env.observation_space.contains(observation)
+        assert observation["image"].shape == (105, 140, 3)
+        assert observation["image"].std() > 10.0  # a picture, not a blank
+        moved, *_ = env.step(steer(0.0))
+        assert moved["state"].shape == (7,)
+    finally:
+        env.close()
