@@ -3,6 +3,7 @@
 One DIRECT client a scene. Positions in m, world frame, z up; quaternions (x, y, z, w).
 """
 
+import weakref
 from typing import Literal
 
 import numpy as np
@@ -30,7 +31,9 @@ class Scene:
         self._client = pybullet.connect(pybullet.DIRECT)
         if self._client < 0:
             raise UserError("PyBullet has no free client; close worlds that are no longer needed")
-        self._car, self._walls = car, walls
+        # A world that is dropped without close() still gives its client back.
+        self._release = weakref.finalize(self, pybullet.disconnect, self._client)
+        self._car = car
         self._vertices = walls.vertices.tolist()
         self._indices = walls.triangles.ravel().tolist()
         self._body, self._wall = -1, -1
@@ -39,6 +42,8 @@ class Scene:
     def rebuild(self, others: int, size: Box) -> None:
         """Start afresh with `others` traffic boxes: nothing of an earlier episode, such as cached
         contacts, can then reach into the next."""
+        if not self._release.alive:
+            raise UserError("this world is closed; make a new one")
         client = self._client
         pybullet.resetSimulation(physicsClientId=client)
         pybullet.setPhysicsEngineParameter(
@@ -103,9 +108,7 @@ class Scene:
         return "wall" if self._wall in touched else None
 
     def close(self) -> None:
-        if self._client >= 0:
-            pybullet.disconnect(physicsClientId=self._client)
-            self._client = -1
+        self._release()
 
     def _add_walls(self) -> int:
         if not self._indices:

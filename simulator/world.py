@@ -35,6 +35,8 @@ from trackfeatures.errors import UserError
 
 __all__ = ["CarState", "Command", "World"]
 
+Poses = NDArray[np.float64]
+
 START_BEFORE_LINE_M = 25.0
 """A drive starts this far before the line."""
 ROLLING_BACK_M_S = -0.5
@@ -121,15 +123,21 @@ class World:
         """Hold `command` for one control step; raises UserError for a value out of its range."""
         before = self.state
         controls = _checked(command)
-        self._move_traffic(before)
+        path = self._advance_traffic(before)
         watch = self._near_anything()
         hit: Collision | None = None
-        for _ in range(PHYSICS_HZ // self.frequency_hz):
+        substeps = PHYSICS_HZ // self.frequency_hz
+        for substep in range(1, substeps + 1):
+            if watch and path is not None:
+                # In one jump a box could land deep inside the car, and be thrown out of it.
+                self._scene.move_others(path[0] + path[1] * (substep / substeps), SIZE[2])
             wrench = advance(self._params, self._table, self._motion, self._memory, controls)
             self._scene.push(wrench, self._motion)
             self._scene.read(self._motion)
             if watch:
                 hit = hit or self._scene.collision()
+        if path is not None and not watch:
+            self._scene.move_others(path[0] + path[1], SIZE[2])
         self._steps += 1
         self._state = self._measure(command.gear, hit)
         return self._state
@@ -145,7 +153,9 @@ class World:
         return np.array([now.x, now.y, now.z, now.roll, now.pitch, now.yaw])
 
     def close(self) -> None:
+        """Give the physics client back; a closed world refuses to reset and to step."""
         self._scene.close()
+        self._state = None
 
     def __enter__(self) -> Self:
         return self
@@ -176,15 +186,17 @@ class World:
         turning = abs(speed) / self.car.wheel_radius * gear_ratio(self._params[0], 1)
         self._memory[ENGINE] = max(turning, self.car.idle_rpm / RPM)
 
-    def _move_traffic(self, before: CarState) -> None:
+    def _advance_traffic(self, before: CarState) -> tuple[Poses, Poses] | None:
+        """Let the traffic drive one control step; returns where it was and how far it moves."""
         if not self.traffic.count:
-            return
+            return None
         dt = 1.0 / self.frequency_hz
         old = self.traffic.poses()
         self.traffic.step(dt, before.s, before.to_middle, before.speed)
-        new = self.traffic.poses()
-        self._scene.move_others(new, SIZE[2])
-        self._scene.set_others_velocity((new[:, :3] - old[:, :3]) / dt)
+        move = self.traffic.poses() - old
+        move[:, 3:] = (move[:, 3:] + math.pi) % (2.0 * math.pi) - math.pi
+        self._scene.set_others_velocity(move[:, :3] / dt)
+        return old, move
 
     def _near_anything(self) -> bool:
         """Whether the car may touch something within this step."""

@@ -197,6 +197,17 @@ def test_bad_input_is_refused() -> None:
             world.reset(seed=0, s=math.nan)
 
 
+def test_a_closed_world_says_so() -> None:
+    world = World(stadium())
+    world.reset(seed=0)
+    world.close()
+    world.close()  # twice is no mistake
+    with pytest.raises(UserError, match="closed"):
+        world.reset(seed=0)
+    with pytest.raises(UserError, match="call reset"):
+        world.step(Command())
+
+
 def test_any_rate_that_divides_200_gives_the_same_drive() -> None:
     ends = []
     for frequency in (20, 40, 200):
