@@ -66,6 +66,11 @@ class ScriptedDriver:
         """m/s that the driver wants at `s`."""
         return self._profile.at(s)
 
+    @property
+    def place(self) -> float:
+        """Lateral place (m) that the last command steered for."""
+        return self._place or 0.0
+
     def command(self, state: CarState, traffic: Traffic, driven_m: float) -> Command:
         """`driven_m` counts the whole round, over its resets too."""
         if traffic.count:

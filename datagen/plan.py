@@ -15,6 +15,7 @@ import numpy as np
 
 import trackfeatures as tf
 from datagen.recording.camera import CameraInfo
+from datagen.recording.encoding import CODECS
 
 TRAJECTORIES = ("lane", "offsets", "weave", "lane-changes", "recoveries")
 LIGHTS = ("clear", "overcast", "dusk", "fog", "heavy-shadow")
@@ -60,6 +61,12 @@ class Wanted:
             tf.check_lanes(lanes, tf.LANE_WIDTH_M)
         if not (self.lanes and self.tracks and self.lights):
             raise tf.UserError("no tracks, lanes or lights given; name at least one of each")
+        for name, found, known in (
+            ("light", self.lights, LIGHTS),
+            ("codec", (self.codec,), CODECS),
+        ):
+            if unknown := set(found) - set(known):
+                raise tf.UserError(f"unknown {name} {min(unknown)!r}; choose {', '.join(known)}")
         if not 0.0 <= self.test_share < 1.0:
             raise tf.UserError(f"a test share of {self.test_share}; give 0 to below 1, e.g. 0.25")
 

@@ -106,9 +106,10 @@ def _walk(index: RoundIndex, decode: bool) -> Iterator[str]:
     """Every chunk by the official reader: CRCs and counts; with `decode`, every message parsed."""
     counts = dict.fromkeys(topics.MESSAGE_TYPES, 0)
     names: dict[int, str] = {}
+    size = index.path.stat().st_size
     try:
         with index.path.open("rb") as stream:
-            for record in StreamReader(stream, emit_chunks=True).records:
+            for record in StreamReader(stream, emit_chunks=True, record_size_limit=size).records:
                 if not isinstance(record, Chunk):
                     continue
                 if not record.compression and zlib.crc32(record.data) != record.uncompressed_crc:

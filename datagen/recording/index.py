@@ -4,6 +4,7 @@ An uncompressed, indexed MCAP file is memory-mapped and its message indexes are 
 any other goes through the official reader, message by message. Both give the same `RoundIndex`.
 """
 
+import errno
 import io
 import mmap
 import struct
@@ -30,8 +31,12 @@ RECORD_HEAD = 9  # opcode and length
 MESSAGE_HEAD = 22  # channel, sequence, log time, publish time
 CHUNK_HEAD = RECORD_HEAD + 40  # of an uncompressed chunk, up to its records
 INDEX_HEAD = RECORD_HEAD + 6  # channel and byte count, before the entries
-# What the official reader and our own raise on bytes that are no MCAP file.
-DAMAGE = (McapError, ValueError, KeyError, TypeError, IndexError, OverflowError, struct.error)
+# What the official reader and our own raise on bytes that are no MCAP file; the last one when a
+# damaged length asks for more than there is.
+DAMAGE = (
+    McapError, ValueError, KeyError, TypeError, IndexError, OverflowError, struct.error,
+    MemoryError,
+)  # fmt: skip
 READ_TOPICS = (topics.CAMERA, topics.LABELS, topics.EGO_STATE)
 
 
@@ -91,7 +96,10 @@ def load_round(path: Path) -> RoundIndex:
 def _guarded(path: Path, read: Callable[[], RoundIndex]) -> RoundIndex:
     try:
         return read()
-    except DAMAGE as error:
+    except (*DAMAGE, OSError) as error:
+        # A damaged offset is an invalid argument to the system; other errors are not the file's.
+        if isinstance(error, OSError) and error.errno != errno.EINVAL:
+            raise
         raise DatasetError(f"{path.name} is damaged or not a recorded round: {error}") from error
 
 

@@ -54,17 +54,17 @@ def read_labels(index: RoundIndex, round_number: int) -> Labels:
     except DecodeError as error:
         raise DatasetError(f"{index.path.name}: a label is damaged ({error})") from error
     return Labels(
-        distances=rows[:, :5].astype(np.float32),
-        to_lane_centre=rows[:, 5].astype(np.float32),
-        angle=rows[:, 6].astype(np.float32),
+        distances=_narrow(rows[:, :5]),
+        to_lane_centre=_narrow(rows[:, 5]),
+        angle=_narrow(rows[:, 6]),
         heading=rows[:, 7].astype(np.int64),
         lanes=rows[:, 8].astype(np.int64),
         lane_index=rows[:, 9].astype(np.int64),
-        curvature=rows[:, 10].astype(np.float32),
-        to_middle=rows[:, 11].astype(np.float32),
-        s=rows[:, 12].astype(np.float32),
-        speed=motion[:, 0].astype(np.float32),
-        shadow_fraction=motion[:, 1].astype(np.float32),
+        curvature=_narrow(rows[:, 10]),
+        to_middle=_narrow(rows[:, 11]),
+        s=_narrow(rows[:, 12]),
+        speed=_narrow(motion[:, 0]),
+        shadow_fraction=_narrow(motion[:, 1]),
         round=np.full(count, round_number, dtype=np.int64),
     )
 
@@ -76,6 +76,11 @@ def concatenate(parts: list[Labels]) -> Labels:
             for f in fields(Labels)
         }
     )
+
+
+def _narrow(values: NDArray[np.float64]) -> NDArray[np.float32]:
+    with np.errstate(over="ignore"):  # only a damaged label is out of float32's range
+        return values.astype(np.float32)
 
 
 def _row(payload: memoryview) -> tuple[float, ...]:

@@ -1,0 +1,89 @@
+"""The plan: pure, evenly dealt, and split without leaks."""
+
+from collections import Counter
+from dataclasses import replace
+from itertools import pairwise
+
+import pytest
+
+import trackfeatures as tf
+from datagen.plan import LIGHTS, TRAJECTORIES, TrackChoice, Wanted, make_plan
+from datagen.tracks import TORCS_TRACKS, choose_tracks
+
+NINE = tuple(TrackChoice(f"track-{i}", f"{i}" * 64) for i in range(9))
+
+
+def wanted(**changes):
+    return replace(Wanted(rounds=60, frames=2000, seed=0, tracks=NINE), **changes)
+
+
+def test_the_same_wishes_give_the_same_plan_and_others_another():
+    plan = make_plan(wanted())
+    assert plan == make_plan(wanted())
+    others = [
+        wanted(seed=1), wanted(rounds=61), wanted(frames=100), wanted(lanes=(1, 2)),
+        wanted(codec="png"), wanted(tracks=(*NINE[:-1], TrackChoice("track-8", "f" * 64))),
+    ]  # fmt: skip
+    hashes = {plan.hash, *(make_plan(other).hash for other in others)}
+    assert len(hashes) == 7
+
+
+def test_sixty_rounds_cover_everything_evenly():
+    rounds = make_plan(wanted()).rounds
+    tracks = Counter(entry.track for entry in rounds)
+    assert set(tracks.values()) == {6, 7}
+    assert set(Counter(e.lanes for e in rounds).values()) <= {19, 20, 21}
+    pairs = Counter((e.track, e.lanes) for e in rounds)
+    assert len(pairs) == 27
+    assert set(pairs.values()) <= {2, 3}
+    assert set(Counter(e.traffic for e in rounds)) == set(range(9))
+    assert set(Counter(e.trajectory for e in rounds).values()) == {60 // len(TRAJECTORIES)}
+    assert set(Counter(e.light for e in rounds).values()) == {60 // len(LIGHTS)}
+    assert 40 <= min(e.speed_kmh for e in rounds) < 41
+    assert 74 < max(e.speed_kmh for e in rounds) <= 75
+    for track in tracks:
+        starts = sorted(e.start for e in rounds if e.track == track)
+        assert max(b - a for a, b in pairwise(starts)) < 0.35
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_quarter_is_for_testing_and_every_track_and_lane_count_is_on_both_sides(seed):
+    rounds = make_plan(wanted(seed=seed)).rounds
+    sides = {side: [e for e in rounds if e.split == side] for side in ("train", "test")}
+    assert len(sides["test"]) == 15
+    for side in sides.values():
+        assert {e.track for e in side} == {choice.name for choice in NINE}
+        assert {e.lanes for e in side} == {1, 2, 3}
+    assert len({e.seed for e in rounds}) == 60
+    assert not {e.seed for e in rounds} & {e.seed for e in make_plan(wanted(seed=seed + 1)).rounds}
+
+
+def test_small_plans_keep_a_round_of_each_track_for_training():
+    twelve = make_plan(wanted(rounds=12, tracks=NINE[:4])).rounds
+    train = [e for e in twelve if e.split == "train"]
+    assert {e.track for e in train} == {e.track for e in twelve}
+    assert {e.track for e in twelve if e.split == "test"} == {e.track for e in twelve}
+    assert [e.split for e in make_plan(wanted(rounds=1)).rounds] == ["train"]
+    assert sorted(e.split for e in make_plan(wanted(rounds=2)).rounds) == ["test", "train"]
+    assert {e.split for e in make_plan(wanted(test_share=0.0)).rounds} == {"train"}
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{"rounds": 0}, {"frames": 0}, {"seed": -1}, {"lanes": (4,)}, {"lanes": ()}, {"tracks": ()},
+     {"test_share": 1.0}, {"lights": ("disco",)}, {"codec": "gif"}],
+)  # fmt: skip
+def test_wishes_that_cannot_be_met_are_refused(changes):
+    with pytest.raises(tf.UserError):
+        wanted(**changes)
+
+
+def test_without_torcs_the_projects_own_tracks_are_driven(monkeypatch, tmp_path):
+    monkeypatch.delenv("TORCS_TRACKS", raising=False)
+    monkeypatch.setattr("simulator.track.catalogue.SYSTEM_TRACKS", tmp_path / "none")
+    names = [choice.name for choice in choose_tracks((), None)]
+    assert len(names) >= 4
+    assert not set(names) & set(TORCS_TRACKS)
+    (one,) = choose_tracks((names[0],), None)
+    assert one.name == names[0]
+    assert len(one.content_hash) == 64
