@@ -15,6 +15,7 @@ from controllers.demo.frames import Asked
 from controllers.demo.picture import draw_answer
 from controllers.demo.run import DemoConfig, DemoResult
 from datagen.recording import Dataset
+from mtlnet.curves import read_curves
 from simulator.car import CarParameters
 from trackfeatures import MARKINGS
 
@@ -138,27 +139,20 @@ def _data_uri(image: NDArray[np.uint8]) -> str:
 
 
 def _curves(path: Path) -> str:
-    """The training curves as SVG lines, each scaled to its own first value."""
-    table = np.genfromtxt(path, delimiter=",", names=True)
-    names = [name for name in table.dtype.names if name.endswith("_loss")]
-    colours = ("#2b6", "#e82", "#36c", "#888", "#c3a")
+    """The training losses as SVG lines, each scaled to its own first value."""
+    rows = read_curves(path)
+    steps = [row["step"] for row in rows]
     lines, legend = [], []
-    step = table["step"]
-    for name, colour in zip(names, colours, strict=False):
-        share = np.clip(table[name] / table[name][0], 0, 1)
+    for task, colour in (("distance", "#2b6"), ("angle", "#e82"), ("type", "#36c")):
+        loss = [row[f"{task}_loss"] for row in rows]
         points = " ".join(
-            f"{600 * x:.1f},{180 - 170 * y:.1f}"
-            for x, y in zip(step / step[-1], share, strict=True)
+            f"{600 * step / steps[-1]:.1f},{180 - 170 * min(value / loss[0], 1.0):.1f}"
+            for step, value in zip(steps, loss, strict=True)
         )
-        lines.append(
-            f'<polyline fill="none" stroke="{colour}" stroke-width="2" points="{points}"/>'
-        )
-        first, last = table[name][0], table[name][-1]
-        legend.append(f'<span style="color:{colour}">{name}: {first:.3f} to {last:.3f}</span>')
-    svg = (
-        f'<svg viewBox="0 0 600 185" role="img" aria-label="training curves">{"".join(lines)}</svg>'
-    )
-    return svg + f"<p>{int(step[-1])} steps. {', '.join(legend)}</p>"
+        lines.append(f'<polyline stroke="{colour}" points="{points}"/>')
+        legend.append(f'<b style="color:{colour}">{task}</b> {loss[0]:.3g} to {loss[-1]:.3g}')
+    svg = f'<svg viewBox="0 0 600 185" role="img" aria-label="losses">{"".join(lines)}</svg>'
+    return f"{svg}<p>Losses over {steps[-1]:.0f} steps: {', '.join(legend)}.</p>"
 
 
 def _drive(drive: dict[str, Any]) -> str:
