@@ -47,4 +47,5 @@ def shown(rounds: int, frames: int) -> Iterator[collect.Progress]:
     try:
         yield update
     finally:
-        bar.stop()
+        if bar.live.is_started:
+            bar.stop()

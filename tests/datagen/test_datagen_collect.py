@@ -1,0 +1,230 @@
+"""Collecting for real: same bytes twice, resuming, interruptions, crashes, a full disk."""
+
+import errno
+import json
+import os
+import resource
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import trackfeatures as tf
+from datagen.crew import Crew
+from datagen.plan import Wanted, make_plan
+from datagen.recording import Dataset
+from datagen.recording.folder import prepare, read_states
+from datagen.recording.verify import verify
+from datagen.tracks import choose_tracks
+from datagen.worker import FramesDone, Hopeless, Job, RoundDone, _attempt
+
+SHORT = ["--rounds", "2", "--frames", "30", "--tracks", "circuit", "--lanes", "1,2"]
+
+
+def datagen(*args: object, **options: object) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "datagen", *map(str, args)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=120, **options)
+
+
+@pytest.fixture(scope="module")
+def collected(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("collect") / "data"
+    done = datagen("collect", *SHORT, "--out", folder, "--workers", "2", "--json")
+    assert done.returncode == 0, done.stderr
+    result = json.loads(done.stdout)
+    assert (result["rounds"], result["frames"], result["resets"]) == (2, 60, 0)
+    assert result["frames_per_second"] == pytest.approx(60 / result["seconds"], rel=0.01)
+    return folder
+
+
+def _jobs(folder: Path, rounds: int, frames: int) -> list[Job]:
+    wanted = Wanted(rounds, frames, seed=1, tracks=choose_tracks(("oval",), None))
+    plan = make_plan(wanted)
+    prepare(folder)
+    return [Job(entry, plan.hash, folder, None) for entry in plan.rounds]
+
+
+def test_what_is_collected_verifies_and_reads(collected):
+    report = verify(collected, "deep")
+    assert report.ok, report.problems
+    dataset = Dataset.open(collected)
+    assert {info.split for info in dataset.rounds} == {"train", "test"}
+    frames = dataset.select("all")
+    images = frames.read_batch(range(60), np.empty((60, 210, 280, 3), np.uint8))
+    # A road is in the picture: neither black nor of one colour, the sky above it lighter.
+    assert images.std(axis=(1, 2, 3)).min() > 10.0
+    labels = frames.labels
+    place = labels.to_middle[labels.round == 0]
+    assert 0.0 < np.abs(np.diff(place)).max() < 0.3
+    assert labels.speed.min() > 5.0
+
+
+def test_verify_and_info_as_commands(collected, tmp_path):
+    done = datagen("verify", collected, "--level", "full", "--json")
+    report = json.loads(done.stdout)
+    assert done.returncode == 0
+    assert report == {"ok": True, "rounds": 2, "frames": 60, "problems": []}
+    info = json.loads(datagen("info", collected, "--json").stdout)
+    assert (info["rounds"], info["by_lanes"]) == (2, {"1": 30, "2": 30})
+    assert "mean misses by" in datagen("info", collected).stdout
+    nothing = datagen("verify", tmp_path / "nothing", "--json")
+    assert nothing.returncode == 1
+    assert not json.loads(nothing.stdout)["ok"]
+    unknown = datagen("verify", collected, "--level", "slow")
+    assert unknown.returncode == 1
+    assert unknown.stderr.count("\n") == 1
+
+
+def test_the_same_plan_gives_the_same_bytes_with_another_number_of_workers(collected, tmp_path):
+    done = datagen("collect", *SHORT, "--out", tmp_path / "again", "--workers", "1")
+    assert done.returncode == 0, done.stderr
+    for path in sorted((collected / "rounds").iterdir()):
+        assert path.read_bytes() == (tmp_path / "again" / "rounds" / path.name).read_bytes()
+
+
+def test_a_finished_dataset_is_left_alone_and_a_lost_round_made_again(collected):
+    lost = collected / "rounds" / "round-001.mcap"
+    kept = collected / "rounds" / "round-000.mcap"
+    before, written = lost.read_bytes(), kept.stat().st_mtime_ns
+    lost.unlink()
+    done = datagen("collect", *SHORT, "--out", collected, "--json")
+    assert json.loads(done.stdout)["recorded_frames"] == 30
+    assert lost.read_bytes() == before
+    assert kept.stat().st_mtime_ns == written
+    done = datagen("collect", *SHORT, "--out", collected, "--json")
+    assert (done.returncode, json.loads(done.stdout)["recorded_frames"]) == (0, 0)
+
+
+@pytest.mark.parametrize(
+    ("args", "message"),
+    [
+        (["--seed", "9"], "seed: 0 there, 9 asked for"),
+        (["--tracks", "no-such-track"], "no track 'no-such-track'"),
+        (["--lanes", "1,5"], "5 lanes asked for"),
+        (["--lanes", "one"], "--lanes is 'one'"),
+        (["--workers", "-1"], "-1 workers"),
+        (["--tracks-dir", "/no/such/folder"], "no folder /no/such/folder"),
+    ],
+)
+def test_what_cannot_be_is_refused_in_one_line(collected, args, message):
+    before = {path: path.stat().st_mtime_ns for path in collected.rglob("*")}
+    done = datagen("collect", *SHORT, "--out", collected, *args)
+    assert (done.returncode, done.stdout) == (1, "")
+    assert message in done.stderr
+    assert done.stderr.count("\n") == 1
+    assert {path: path.stat().st_mtime_ns for path in collected.rglob("*")} == before
+
+
+def test_a_folder_of_something_else_is_not_touched(tmp_path):
+    (tmp_path / "thesis.tex").write_text("years of work")
+    done = datagen("collect", *SHORT, "--out", tmp_path)
+    assert done.returncode == 1
+    assert "is not a dataset" in done.stderr
+    assert [p.name for p in tmp_path.iterdir()] == ["thesis.tex"]
+    file = datagen("collect", *SHORT, "--out", tmp_path / "thesis.tex")
+    assert "is a file" in file.stderr
+
+
+def test_a_dataset_of_other_definitions_is_refused(tmp_path):
+    from datagen.collect import collect
+
+    plan = make_plan(Wanted(1, 10, seed=1, tracks=choose_tracks(("oval",), None)))
+    (tmp_path / "plan.json").write_text(json.dumps({**plan.as_json(), "definitions": "0-old"}))
+    with pytest.raises(tf.DefinitionsMismatch, match="0-old"):
+        collect(plan, tmp_path, workers=1)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interruption_leaves_whole_rounds_only_and_is_resumed(tmp_path, number):
+    folder = tmp_path / "data"
+    args = ["collect", "--rounds", "3", "--frames", "60", "--tracks", "oval", "--workers", "1"]
+    command = [sys.executable, "-m", "datagen", *args, "--out", str(folder)]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+        _wait_for(lambda: list(folder.glob("state/*.json")), process)
+        _wait_for(lambda: list(folder.glob(".partial/*/*.mcap")), process)
+        process.send_signal(number)
+        _, stderr = process.communicate(timeout=20)
+    assert process.returncode == 130
+    assert "Traceback" not in stderr
+    kept = read_states(folder)
+    assert 1 <= len(kept) < 3
+    assert not (folder / ".partial").exists()
+    assert len(list(folder.glob("rounds/*"))) == len(kept)
+    assert verify(folder, "full").ok
+    if number == signal.SIGINT:
+        done = datagen(*args, "--out", folder, "--json")
+        assert json.loads(done.stdout)["recorded_frames"] == 60 * (3 - len(kept))
+        assert verify(folder, "full").ok
+
+
+def test_a_worker_that_dies_costs_its_round_only_and_the_round_is_tried_again(tmp_path):
+    jobs = _jobs(tmp_path, rounds=2, frames=30)
+    killed, done = [], []
+
+    def hear(message: FramesDone | RoundDone) -> None:
+        if isinstance(message, RoundDone):
+            done.append(message.state.id)
+        elif not killed:
+            killed.append(message.round_id)
+            crew._workers[0].process.kill()
+
+    crew = Crew(1, hear)
+    assert crew.run(jobs) == []
+    assert killed == ["round-000"]
+    assert sorted(done) == ["round-000", "round-001"] == sorted(read_states(tmp_path))
+
+
+@pytest.mark.parametrize("reason", [errno.ENOSPC, errno.EACCES])
+def test_a_full_disk_ends_a_round_without_a_trace(tmp_path, monkeypatch, reason):
+    def full(*args: object) -> None:
+        raise OSError(reason, os.strerror(reason))
+
+    (job,) = _jobs(tmp_path, rounds=1, frames=10)
+    monkeypatch.setattr("datagen.record.RoundWriter.add", full)
+    message = _attempt(job, None)
+    assert isinstance(message, Hopeless)
+    assert isinstance(message.error, OSError)
+    assert message.error.errno == reason
+    assert not (tmp_path / ".partial").exists()
+    assert not list(tmp_path.glob("rounds/*"))
+
+
+def test_a_disk_that_fills_up_gives_one_line_and_keeps_the_rounds(collected):
+    """A limit on the size of files stands in for the full disk: the same write fails."""
+    lost = collected / "rounds" / "round-001.mcap"
+    before = lost.read_bytes()
+    lost.unlink()
+    limit = 400_000
+    done = datagen(
+        "collect", *SHORT, "--out", collected,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit)),
+    )  # fmt: skip
+    assert done.returncode == 1
+    errors = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
+    assert errors == [f"error: {os.strerror(errno.EFBIG)}"]
+    assert "Traceback" not in done.stderr
+    assert list(read_states(collected)) == ["round-000"]
+    assert not (collected / ".partial").exists()
+    assert datagen("collect", *SHORT, "--out", collected).returncode == 0
+    assert lost.read_bytes() == before
+
+
+def test_help_is_quick():
+    code = "import sys, datagen.cli; print(*sorted({m.split('.')[0] for m in sys.modules}))"
+    loaded = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
+    heavy = {"numba", "pybullet", "moderngl", "cv2", "mcap", "simulator"}
+    assert not heavy & set(loaded.stdout.split())
+
+
+def _wait_for(found, process):
+    deadline = time.monotonic() + 60.0
+    while not found():
+        assert process.poll() is None, process.stderr.read()
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
