@@ -41,6 +41,7 @@ SPEED_SCALE = 75.0 / 3.6  # m/s
 NOISE = 0.05
 """Standard deviation of the paper's state noise."""
 STATE_SIZE = 7
+RENDERING = {"render_modes": ["rgb_array"], "render_fps": 20}
 START_OPTIONS = ("s", "to_middle", "angle", "speed")
 
 
@@ -65,7 +66,8 @@ class LateralControl(gym.Env[Any, Any]):
     the reward. Raises UserError for options or actions out of their ranges.
     """
 
-    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 20}  # noqa: RUF012
+    # Gymnasium types it as an instance's, but reads it off the class.
+    metadata: dict[str, Any] = RENDERING
 
     def __init__(
         self,

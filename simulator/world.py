@@ -25,6 +25,7 @@ from simulator.dynamics import (
     rotation,
 )
 from simulator.engine import gear_ratio
+from simulator.orientation import quaternion
 from simulator.physics import Collision, Scene
 from simulator.state import CarState, Command
 from simulator.track.kernel import index_at, locate, surface
@@ -178,7 +179,7 @@ class World:
         position = np.array([float(pose.x), float(pose.y), z]) + up * self.car.cg_height
         self._motion[:] = 0.0
         self._motion[0:3] = position
-        self._motion[3:7] = _quaternion(forward, np.cross(up, forward), up)
+        self._motion[3:7] = quaternion(forward, np.cross(up, forward), up)
         self._motion[7:10] = speed * forward
         self._memory[:] = 0.0
         self._memory[PIECE] = piece
@@ -286,27 +287,3 @@ def _tangent(table: NDArray[np.float64], piece: int, s: float) -> tuple[float, f
 def _wrapped(angle: float) -> float:
     """The angle in (-pi, pi]."""
     return math.pi - (math.pi - angle) % (2.0 * math.pi)
-
-
-def _quaternion(
-    forward: NDArray[np.float64], left: NDArray[np.float64], up: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Unit quaternion (x, y, z, w) of the frame with these axes.
-
-    Of the four equivalent formulas the one with the largest divisor is used (Shepperd, 1978).
-    """
-    trace = forward[0] + left[1] + up[2]
-    w = 1.0 + trace
-    x = 1.0 + 2.0 * forward[0] - trace
-    y = 1.0 + 2.0 * left[1] - trace
-    z = 1.0 + 2.0 * up[2] - trace
-    cross = (left[2] - up[1], up[0] - forward[2], forward[1] - left[0])
-    mixed = (forward[1] + left[0], forward[2] + up[0], left[2] + up[1])
-    rows = [
-        (w, [cross[0], cross[1], cross[2], w]),
-        (x, [x, mixed[0], mixed[1], cross[0]]),
-        (y, [mixed[0], y, mixed[2], cross[1]]),
-        (z, [mixed[1], mixed[2], z, cross[2]]),
-    ]
-    best = np.array(max(rows, key=lambda row: row[0])[1])
-    return np.asarray(best / np.linalg.norm(best))
