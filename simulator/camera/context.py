@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 GPU_SAMPLES = 4
 """Samples a pixel on a GPU. On llvmpipe one: four took 24 ms a frame instead of 6, and road and
 paint are filtered in the shader anyway."""
-PROGRAMS = ("sky", "land", "road", "barrier", "tree", "car", "spot")
+PROGRAMS = ("sky", "land", "road", "barrier", "prop", "tree", "car", "spot")
 FRAME_BINDING, SCENE_BINDING = 0, 1
 BLOCKS = {"Frame": FRAME_BINDING, "Scene": SCENE_BINDING}
 FRAME_FLOATS = 56

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from simulator.camera import barriers, land, ribbon, scenery, shade
+from simulator.camera import barriers, land, props, ribbon, scenery, shade
 from simulator.camera.context import SCENE_BINDING, Graphics
 from simulator.camera.light import Light
 from simulator.camera.look import Colour, Look, look_of
@@ -16,6 +16,7 @@ from simulator.track.road import Road
 FloatArray = NDArray[np.float64]
 
 FINE_LAND_M, COARSE_LAND_M = 260.0, 2500.0
+PROPS_M = 350.0
 BARRIER_M = (60.0, 300.0)
 FINE_ROAD_M, COARSE_ROAD_M = 90.0, 650.0
 _LINE = {"white": (0.78, 0.78, 0.75), "yellow": (0.75, 0.50, 0.06)}
@@ -45,6 +46,12 @@ class Scene:
             barriers.build(road, strips, look, np.random.default_rng([seed, 5])),
             ("3f 2f 1f 3f", "at", "along", "kind", "facing"),
         )
+        self._props = Mesh(
+            graphics,
+            "prop",
+            props.build(road, line, strips, terrain, look, np.random.default_rng([seed, 6])),
+            ("3f 3f 3f 3f", "at", "facing", "colour", "surface"),
+        )
         trees = scenery.plant(road, line, strips, terrain, look, np.random.default_rng([seed, 3]))
         self.mask = shade.build(road, line, trees, light, np.random.default_rng([seed, 4]))
         self._woods = Woods(graphics, trees)
@@ -60,6 +67,7 @@ class Scene:
         self._block.bind_to_uniform_block(SCENE_BINDING)
         self._shade.use(1)
         self._road.draw(eye, planes, FINE_ROAD_M, COARSE_ROAD_M)
+        self._props.draw(eye, planes, PROPS_M)
         self._land.draw(eye, planes, FINE_LAND_M)
         self._far_land.draw(eye, planes, COARSE_LAND_M)
 
@@ -74,6 +82,8 @@ class Scene:
             self._road,
             self._land,
             self._far_land,
+            self._barriers,
+            self._props,
             self._woods,
             self._block,
             self._shade,

@@ -188,7 +188,7 @@ def test_cameras_leave_nothing_in_memory(road: Road) -> None:
     before = resident_mb()
     for seed in range(20):
         draw_once(seed)
-    assert resident_mb() - before < 25.0
+    assert resident_mb() - before < 8.0
 
 
 def test_impossible_pictures_are_refused(road: Road) -> None:
