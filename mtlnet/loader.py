@@ -13,9 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 import trackfeatures as tf
+from mtlnet.augment import colours, cover, mirror, turn, turned_labels
+from mtlnet.card import Camera
 
 AHEAD = 3  # batches in the making
-BRIGHTNESS, CONTRAST, TINT = 0.25, 0.25, 0.06
 
 
 class LabelArrays(Protocol):
@@ -65,13 +66,13 @@ class Loader:
     """Endless batches from `frames`, each epoch in its own order."""
 
     def __init__(
-        self, frames: Images, size: tuple[int, int], batch: int, seed: int, *, augment: bool
+        self, frames: Images, camera: Camera, batch: int, seed: int, *, augment: bool
     ) -> None:
         self.frames = frames
         self.batch = batch
         self.seed = seed
         self.augment = augment
-        self._size = size
+        self.camera = camera
         labels = frames.labels
         self.coded = tf.encode(labels.distances, labels.angle)
         self.heading = np.asarray(labels.heading, dtype=np.int64)
@@ -91,18 +92,19 @@ class Loader:
     def make(self, step: int) -> Batch:
         """Batch number `step`."""
         chosen = self.indices(step)
-        images = np.empty((self.batch, *self._size, 3), np.uint8)
+        images = np.empty((self.batch, self.camera.height, self.camera.width, 3), np.uint8)
         self.frames.read_batch(chosen, images)
-        coded, heading = self.coded[chosen], self.heading[chosen]
-        gain = np.ones((self.batch, 1, 1, 3), np.float32)
-        shift = np.zeros_like(gain)
-        if self.augment:
-            rng = np.random.default_rng([self.seed, 2, step])
-            coded, heading = mirror(images, coded, heading, rng.random(self.batch) < 0.5)
-            contrast = np.exp(rng.uniform(-CONTRAST, CONTRAST, (self.batch, 1, 1, 1)))
-            gain *= contrast * np.exp(rng.uniform(-TINT, TINT, gain.shape))
-            shift += rng.uniform(-BRIGHTNESS, BRIGHTNESS, (self.batch, 1, 1, 1))
-        return Batch(images, coded, heading, gain.astype(np.float32), shift.astype(np.float32))
+        heading = self.heading[chosen]
+        if not self.augment:
+            ones = np.ones((self.batch, 1, 1, 3), np.float32)
+            return Batch(images, self.coded[chosen], heading, ones, np.zeros_like(ones))
+        rng = np.random.default_rng([self.seed, 2, step])
+        labels = self.frames.labels
+        yaw = turn(images, self.camera, rng)
+        coded = turned_labels(labels.distances[chosen], labels.angle[chosen], yaw, self.camera)
+        coded, heading = mirror(images, coded, heading, rng.random(self.batch) < 0.5)
+        cover(images, rng)
+        return Batch(images, coded, heading, *colours(self.batch, rng))
 
     def batches(self, first: int) -> Iterator[Batch]:
         """Batches `first`, `first` + 1, ... without end, made ahead on a thread."""
@@ -118,16 +120,3 @@ class Loader:
             finally:
                 for future in waiting:
                     future.cancel()
-
-
-def mirror(
-    images: NDArray[np.uint8],
-    coded: NDArray[np.float32],
-    heading: NDArray[np.int64],
-    chosen: NDArray[np.bool_],
-) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-    """Mirror the `chosen` (B,) images in place; the targets of the batch, theirs mirrored."""
-    for row in np.flatnonzero(chosen):
-        images[row] = images[row, :, ::-1]
-    mirrored = np.where(chosen[:, None], tf.mirror_coded(coded), coded).astype(np.float32)
-    return mirrored, np.where(chosen, tf.mirror_heading(heading), heading)

@@ -64,6 +64,7 @@ def train(
     recipe = find_recipe(config.recipe)
     frames, dataset = open_training_data(config.data)
     data = describe_data(dataset, frames)
+    camera = Camera(**dataset.camera.as_dict())  # type: ignore[arg-type]  # sizes are int
     if resumed is None:
         create_run(config.out)
         write_config(config, recipe, data)
@@ -72,7 +73,7 @@ def train(
     torch.set_num_threads(config.threads or os.cpu_count() or 1)
     keep_freed_memory()
     trainer = Trainer(recipe, config.alpha, config.seed, choose_device(config.device))
-    loader = Loader(frames, (HEIGHT, WIDTH), config.batch, config.seed, augment=recipe.augment)
+    loader = Loader(frames, camera, config.batch, config.seed, augment=recipe.augment)
     trainer.standardise(loader)
     elapsed_s = 0.0
     checkpoints = list_checkpoints(config.out) if resumed is not None else []
@@ -85,7 +86,7 @@ def train(
         trainer.network,
         config.out,
         images,
-        camera=Camera(**dataset.camera.as_dict()),  # type: ignore[arg-type]  # sizes are int
+        camera=camera,
         alpha=config.alpha,
         recipe=config.recipe,
         iterations=trainer.step_number,

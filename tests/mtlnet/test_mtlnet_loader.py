@@ -1,12 +1,12 @@
-"""Batches: every frame once an epoch, a function of seed and step, mirrored with their labels."""
+"""Batches: every frame once an epoch, a function of seed and step."""
 
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-import trackfeatures as tf
-from mtlnet.loader import Loader, mirror
+from mtlnet.card import Camera
+from mtlnet.loader import Loader
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class FakeFrames:
 
 
 def loader(seed: int = 0, *, augment: bool = False) -> Loader:
-    return Loader(FakeFrames(20), (2, 3), 8, seed, augment=augment)
+    return Loader(FakeFrames(20), Camera(width=3, height=2), 8, seed, augment=augment)
 
 
 def test_every_frame_once_an_epoch_across_batches() -> None:
@@ -58,18 +58,3 @@ def test_same_seed_and_step_same_batch() -> None:
     np.testing.assert_array_equal(one.gain, two.gain)
     np.testing.assert_array_equal(one.coded, two.coded)
     assert one.gain.tolist() != other.gain.tolist()
-
-
-def test_mirrored_images_have_mirrored_labels() -> None:
-    images = np.arange(2 * 2 * 3 * 3, dtype=np.uint8).reshape(2, 2, 3, 3)
-    before = images.copy()
-    near_left = tf.encode([[-0.9, 3.1, np.nan, -0.9, 3.1]], [0.1])
-    coded = np.repeat(near_left, 2, 0)
-    mirrored, heading = mirror(images, coded, np.array([0, 0]), np.array([False, True]))
-    np.testing.assert_array_equal(images[0], before[0])
-    np.testing.assert_array_equal(images[1], before[1, :, ::-1])
-    np.testing.assert_array_equal(mirrored[0], coded[0])
-    distances, angle = tf.decode(mirrored[1:])
-    np.testing.assert_allclose(distances[0], [-3.1, 0.9, -3.1, 0.9, np.nan], atol=1e-6)
-    assert abs(angle[0] + 0.1) < 1e-6
-    assert heading.tolist() == [0, 2]

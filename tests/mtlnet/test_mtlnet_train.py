@@ -12,7 +12,7 @@ from safetensors.numpy import load_file
 
 import mtlnet.train
 from datagen.recording import Dataset
-from mtlnet.card import GRAPH, WEIGHTS, ModelError, read_card
+from mtlnet.card import GRAPH, WEIGHTS, Camera, ModelError, read_card
 from mtlnet.checkpoint import list_checkpoints
 from mtlnet.config import TrainConfig, resume_config
 from mtlnet.curves import read_curves
@@ -50,7 +50,7 @@ class StopAt:
 
 def test_one_batch_is_overfitted(dataset: Path) -> None:
     frames = Dataset.open(dataset).select("train")
-    loader = Loader(frames, (210, 280), 8, 0, augment=False)
+    loader = Loader(frames, Camera(), 8, 0, augment=False)
     recipe = replace(RECIPES["fast"], augment=False, batch=8)
     trainer = Trainer(recipe, (0.3, 0.2, 0.5), 0, CPU)
     trainer.standardise(loader)
