@@ -38,7 +38,7 @@ def _cache_folder() -> Path:
     return Path(tempfile.mkdtemp(prefix=name))
 
 
-numba.config.CACHE_DIR = str(_cache_folder())
+vars(numba.config)["CACHE_DIR"] = str(_cache_folder())
 
 
 def compiled(function: Function) -> Function:
