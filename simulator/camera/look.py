@@ -29,8 +29,6 @@ class Look:
     signs: float = 0.8
     posts: bool = False
     lamps: bool = False
-    ridge_deg: float = 3.0
-    """How high distant hills stand above the horizon."""
     worn: float = 0.4
     """How patched and cracked the surface is, 0 to 1."""
 
@@ -51,7 +49,6 @@ LOOKS: dict[str, Look] = {
         hills_m=10.0,
         signs=1.2,
         lamps=True,
-        ridge_deg=2.5,
         worn=0.3,
     ),
     "mountain": Look(
@@ -64,11 +61,10 @@ LOOKS: dict[str, Look] = {
         ("pine", "fir", "pine"),
         11.0,
         50.0,
-        hills_m=55.0,
+        hills_m=85.0,
         houses=0.15,
         signs=0.7,
         posts=True,
-        ridge_deg=11.0,
         worn=0.6,
     ),
     "circuit": Look(
@@ -84,7 +80,6 @@ LOOKS: dict[str, Look] = {
         hills_m=6.0,
         stands=0.35,
         signs=1.8,
-        ridge_deg=2.0,
         worn=0.2,
     ),
     "oval": Look(
@@ -101,7 +96,6 @@ LOOKS: dict[str, Look] = {
         stands=0.7,
         signs=1.5,
         lamps=True,
-        ridge_deg=1.2,
         worn=0.3,
     ),
     "town": Look(
@@ -118,7 +112,6 @@ LOOKS: dict[str, Look] = {
         houses=4.5,
         signs=2.2,
         lamps=True,
-        ridge_deg=1.5,
         worn=0.8,
     ),
     "forest": Look(
@@ -134,7 +127,6 @@ LOOKS: dict[str, Look] = {
         hills_m=12.0,
         signs=0.5,
         posts=True,
-        ridge_deg=3.5,
         worn=0.6,
     ),
     "coast": Look(
@@ -150,7 +142,6 @@ LOOKS: dict[str, Look] = {
         hills_m=12.0,
         houses=0.8,
         signs=0.8,
-        ridge_deg=2.0,
         worn=0.5,
     ),
     "gravel": Look(
@@ -166,7 +157,6 @@ LOOKS: dict[str, Look] = {
         hills_m=18.0,
         houses=0.2,
         signs=0.3,
-        ridge_deg=5.0,
         worn=1.0,
     ),
     "countryside": Look(
@@ -183,7 +173,6 @@ LOOKS: dict[str, Look] = {
         houses=0.5,
         signs=0.6,
         posts=True,
-        ridge_deg=3.0,
         worn=0.7,
     ),
 }

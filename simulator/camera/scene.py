@@ -106,7 +106,7 @@ def scene_block(
         (*_varied(look.verge, rng, 0.1, rng.uniform(0.85, 1.15)), grassy),
         (*_varied(look.grass, rng, 0.2, rng.uniform(0.75, 1.25)), 0.0),
         (*_varied(look.dry, rng, 0.15, rng.uniform(0.75, 1.2)), 0.0),
-        (*_varied(look.soil, rng, 0.12, 1.0), 0.0),
+        (*_varied(look.soil, rng, 0.12, 1.0), 0.0 if road.track.surface == "gravel" else worn),
         (*_varied(_LINE[marks.left_colour], rng, 0.03, fade), marks.line_width / 2),
         (*_varied(_LINE["white"], rng, 0.03, fade), marks.wear),
         (float(road.lanes), road.lane_width, road.half_asphalt, road.edge),

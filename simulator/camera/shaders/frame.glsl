@@ -17,7 +17,7 @@ layout(std140) uniform Scene {
     vec4 verge;       // w: how much of the verge is grass
     vec4 grass;
     vec4 dry;
-    vec4 soil;
+    vec4 soil;        // w: how cracked the asphalt is
     vec4 left_line;   // colour of the leftmost line; w: half of a line's width
     vec4 line;        // colour of the other lines; w: wear of the paint
     vec4 lanes;       // number, lane width, half the asphalt, edge
@@ -45,7 +45,7 @@ vec3 meadow(vec2 world, vec3 normal, float near) {
     vec4 fine = texture(noise, world * 0.137);
     float tuft = mix(0.5, fine.r * 0.5 + fine.g * 0.5, near);
     vec3 colour = mix(grass.rgb, dry.rgb, smoothstep(0.42, 0.72, broad.g * 0.6 + broad.b * 0.4));
-    float bare = smoothstep(0.86, 0.70, normal.z) + smoothstep(0.70, 0.80, fine.g * 0.4 + broad.r * 0.0 + broad.b * 0.6);
+    float bare = smoothstep(0.86, 0.70, normal.z) + smoothstep(0.70, 0.80, fine.g * 0.4 + broad.b * 0.6);
     colour = mix(colour, soil.rgb, clamp(bare, 0.0, 1.0));
     return colour * (0.62 + 0.76 * tuft);
 }

@@ -45,7 +45,9 @@ void main() {
     float worn = asphalt.w;
     float tone = 0.86 + 0.34 * (fine.r - 0.5) + (0.25 + 0.5 * worn) * (broad.g - 0.5) + 0.2 * (fine.g - 0.5);
     tone *= 1.0 - 0.14 * exp2(-8.0 * track_off * track_off) * step(away, lane_left);
-    tone *= 1.0 - 0.5 * worn * smoothstep(0.80, 0.90, fine.a) * smoothstep(0.45, 0.65, broad.b) * exp2(-6.0 * wy);
+    // Cracks from two layers of ridges of unlike scale, so that no tile repeats; thin, and few.
+    float crack = smoothstep(0.90, 0.97, max(fine.a, broad.a - 0.02)) * smoothstep(0.50, 0.75, broad.b);
+    tone *= 1.0 - 0.45 * soil.w * crack;
     vec3 colour = asphalt.rgb * max(tone, 0.2);
     float repair = smoothstep(0.66, 0.67 + 0.02 * ws, broad.b + 0.03 * fine.g) * worn;
     colour *= 1.0 - 0.28 * repair;
