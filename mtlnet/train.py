@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -71,6 +72,7 @@ def train(
     else:
         require_same_data(config, resumed, data)
     torch.set_num_threads(config.threads or os.cpu_count() or 1)
+    cv2.setNumThreads(1)  # the loader's images are small: a second pool would only fight torch's
     keep_freed_memory()
     trainer = Trainer(recipe, config.alpha, config.seed, choose_device(config.device))
     loader = Loader(frames, camera, config.batch, config.seed, augment=recipe.augment)
