@@ -87,12 +87,15 @@ def verify(
     as_json: AsJson = False,
 ) -> None:
     """Check that a dataset is what was recorded; exit 1 when it is not."""
+    from rich.console import Console
+
     from datagen.recording.check import LEVELS
     from datagen.recording.verify import verify as run
 
     if level not in LEVELS:
         raise UserError(f"there is no level {level!r}; choose {', '.join(LEVELS)}")
-    report = run(folder, level)
+    with Console(stderr=True).status(f"checking {folder}") as status:
+        report = run(folder, level, lambda name: status.update(f"checked {name}"))
     lines = [f"{folder}: {report.rounds} rounds, {report.frames} frames, level {level}: "]
     lines[0] += "in order" if report.ok else f"{len(report.problems)} problems"
     _print(report.as_json(), as_json, "\n".join([*lines, *report.problems]))

@@ -7,6 +7,7 @@ of its entry.
 
 import hashlib
 import json
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any, TypeVar
@@ -124,7 +125,7 @@ def make_plan(wanted: Wanted) -> Plan:
     lights = _dealt(wanted.lights, count, rng)
     speeds = _spread(count, rng) * (SPEED_KMH[1] - SPEED_KMH[0]) + SPEED_KMH[0]
     starts = _starts(tracks, rng)
-    test = _test_rounds(wanted, tracks, lanes, rng)
+    test = _test_rounds(wanted, tracks, (lanes, trajectories, lights), rng)
     digits = max(3, len(str(count - 1)))
     return Plan(
         wanted,
@@ -194,44 +195,36 @@ def _starts(tracks: Sequence[TrackChoice], rng: np.random.Generator) -> list[flo
 def _test_rounds(
     wanted: Wanted,
     tracks: Sequence[TrackChoice],
-    lanes: Sequence[int],
+    others: Sequence[Sequence[Any]],
     rng: np.random.Generator,
 ) -> set[int]:
-    """A share of all rounds, as evenly over tracks and lane counts as it goes.
+    """A share of all rounds: evenly over the tracks first, then over what `others` lists of each
+    round (lanes, trajectory, light).
 
     Every track that has three rounds or more stands on both sides, even if that takes a few more
-    test rounds than the share; no track gives its last round away.
+    test rounds than the share; no track gives its last round away while another has two.
     """
-    rounds_of: dict[str, list[int]] = {}
-    for number, choice in enumerate(tracks):
-        rounds_of.setdefault(choice.name, []).append(number)
     if wanted.test_share == 0.0 or wanted.rounds < 2:
         return set()
+    names = [choice.name for choice in tracks]
+    counts = Counter(names)
     total = max(round(wanted.rounds * wanted.test_share), 1)
-    total = max(total, sum(len(mine) >= 3 for mine in rounds_of.values()))
-    test: set[int] = set()
+    total = max(total, sum(count >= 3 for count in counts.values()))
+    total = min(total, wanted.rounds - 1)
     draw = rng.uniform(size=wanted.rounds)
+    test: set[int] = set()
+
+    def crowding(number: int) -> tuple[bool, float, float, float]:
+        mine = _share(test, names, number)
+        last = counts[names[number]] - round(mine * counts[names[number]]) == 1
+        return last, mine, sum(_share(test, kind, number) for kind in others), draw[number]
+
     while len(test) < total:
-        # A track may give all its rounds but the last; if that is not enough, any but one.
-        free = [
-            number
-            for mine in rounds_of.values()
-            for number in mine
-            if number not in test and len(test.intersection(mine)) < len(mine) - 1
-        ] or sorted(set(range(1, wanted.rounds)) - test)
-        if not free:
-            break
-        crowding = {
-            number: (
-                _share(test, rounds_of[tracks[number].name]),
-                _share(test, [n for n in range(wanted.rounds) if lanes[n] == lanes[number]]),
-                draw[number],
-            )
-            for number in free
-        }
-        test.add(min(free, key=crowding.__getitem__))
+        test.add(min(set(range(wanted.rounds)) - test, key=crowding))
     return test
 
 
-def _share(test: set[int], numbers: Sequence[int]) -> float:
-    return len(test.intersection(numbers)) / len(numbers)
+def _share(test: set[int], kinds: Sequence[Any], number: int) -> float:
+    """Share of the rounds of the same kind as `number` that are for testing already."""
+    alike = [n for n, kind in enumerate(kinds) if kind == kinds[number]]
+    return len(test.intersection(alike)) / len(alike)

@@ -54,6 +54,8 @@ def test_a_quarter_is_for_testing_and_every_track_and_lane_count_is_on_both_side
     for side in sides.values():
         assert {e.track for e in side} == {choice.name for choice in NINE}
         assert {e.lanes for e in side} == {1, 2, 3}
+        assert {e.light for e in side} == set(LIGHTS)
+        assert {e.trajectory for e in side} == set(TRAJECTORIES)
     assert len({e.seed for e in rounds}) == 60
     assert not {e.seed for e in rounds} & {e.seed for e in make_plan(wanted(seed=seed + 1)).rounds}
 
