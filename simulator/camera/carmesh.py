@@ -131,7 +131,7 @@ def _fittings() -> list[FloatArray]:
         parts.append(_rear_panel(y0, y1, 0.66, 0.84, _TAIL))
         parts.append(_front_panel(y0, y1, 0.5, 0.62, _HEAD))
     parts.append(_rear_panel(0.26, -0.26, 0.62, 0.73, _PLATE))
-    parts.append(_rear_panel(0.76, -0.76, 0.24, 0.42, _DARK))
+    parts.append(_rear_panel(0.78, -0.78, 0.19, 0.42, _DARK))
     parts.append(_front_panel(0.6, -0.6, 0.3, 0.44, _DARK))
     return parts
 

@@ -74,11 +74,9 @@ def take(camera: Camera, road: Road, shot: Shot, traffic: int, rng: np.random.Ge
         f"{road.track.name}  s {shot.s:.0f} m  {shot.view}  {shot.light}  "
         f"d {shot.to_middle:+.1f} m  {np.degrees(shot.angle):+.0f} deg"
     )
-    for colour, thick in (((0, 0, 0), 3), ((255, 255, 255), 1)):
-        place = (8, camera.height - 10)
-        cv2.putText(
-            picture, caption, place, cv2.FONT_HERSHEY_SIMPLEX, 0.42, colour, thick, cv2.LINE_AA
-        )
+    for colour, shift in (((0, 0, 0), 1), ((255, 255, 255), 0)):
+        place = (8 + shift, camera.height - 10 + shift)
+        cv2.putText(picture, caption, place, cv2.FONT_HERSHEY_SIMPLEX, 0.42, colour, 1, cv2.LINE_AA)
     return picture
 
 

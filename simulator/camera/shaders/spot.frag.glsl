@@ -12,10 +12,10 @@ float box(vec2 at, vec2 half_size, float soft) {
 void main() {
     float blur = 0.06 + 0.002 * dot(place, place) / 20.0;
     float contact = box(car, vec2(2.1, 0.85), 0.9);
-    // Sun shadow: the body swept along the ray, in a few slices of height.
+    // Sun shadow: the body swept along the ray, in slices of height.
     float thrown = 0.0;
-    for (int k = 0; k < 4; ++k) {
-        float height = 0.25 + 0.23 * float(k);
+    for (int k = 0; k < 10; ++k) {
+        float height = 0.22 + 0.08 * float(k);
         thrown = max(thrown, box(car - reach.xy * height, vec2(2.15, 0.85), blur));
     }
     thrown = max(thrown, box(car - reach.xy * 1.15 + vec2(0.4, 0.0), vec2(1.25, 0.7), blur));
