@@ -10,7 +10,7 @@ from simulator.camera import optics
 from simulator.camera.cars import cars_of
 from simulator.camera.context import FRAME_BINDING, Graphics, graphics
 from simulator.camera.light import Light
-from simulator.camera.optics import Mount
+from simulator.camera.optics import DRIVER_SEAT, Mount
 from simulator.camera.scene import Scene
 from simulator.track.road import Road
 from trackfeatures.errors import UserError
@@ -38,7 +38,7 @@ class Camera:
         *,
         seed: int,
         light: Light,
-        mount: Mount = Mount(),  # noqa: B008
+        mount: Mount = DRIVER_SEAT,
         width: int = 280,
         height: int = 210,
     ) -> None:

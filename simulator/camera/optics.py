@@ -44,6 +44,9 @@ class Mount:
             )
 
 
+DRIVER_SEAT = Mount()
+
+
 @dataclass(frozen=True)
 class Eye:
     """One eye in the world: `place` (3,) m and `axes` (3, 3), rows right, up and ahead."""
