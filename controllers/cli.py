@@ -91,8 +91,8 @@ def drive(
 @app.command()
 def demo(
     out: Annotated[Path, typer.Option(help="Folder for all that comes of it.")] = Path("demo"),
-    rounds: Annotated[int, typer.Option(help="Rounds to collect.", min=12)] = 16,
-    frames: Annotated[int, typer.Option(help="Frames a round.", min=1)] = 800,
+    rounds: Annotated[int, typer.Option(help="Rounds to collect.", min=12)] = 20,
+    frames: Annotated[int, typer.Option(help="Frames a round.", min=1)] = 640,
     minutes: Annotated[float, typer.Option(help="Training time.")] = 7.0,
     seed: Annotated[int, typer.Option(help="Of the collection and the training.", min=0)] = 1,
 ) -> None:

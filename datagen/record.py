@@ -71,7 +71,7 @@ class Drive:
 
     def _start(self, s: float, to_middle: float) -> None:
         self.state = self.world.reset(
-            seed=self.plan.seed + self.resets,
+            seed=self.plan.seed,  # never a neighbour's: it may stand on the split's other side
             s=s,
             to_middle=to_middle,
             speed=self.driver.speed_at(s),

@@ -27,8 +27,9 @@ class DemoConfig:
     """What the demo collects and how long it learns; the defaults fit 15 minutes on two cores."""
 
     out: Path
-    rounds: int = 16
-    frames: int = 800
+    tracks: str = "circuit,countryside,forest,highway,mountain-pass"
+    rounds: int = 20
+    frames: int = 640
     seed: int = 1
     minutes: float = 7.0
     """of training"""
@@ -62,7 +63,7 @@ def run_demo(config: DemoConfig) -> DemoResult:
     data, run = str(config.out / "data"), str(config.out / "run")
     collect = ["datagen", "collect", "--out", data, "--json"]
     collect += ["--rounds", str(config.rounds), "--frames", str(config.frames)]
-    collect += ["--seed", str(config.seed)]
+    collect += ["--tracks", config.tracks, "--seed", str(config.seed)]
     train = ["mtlnet", "train", "--data", data, "--out", run, "--alpha", config.alpha]
     train += ["--recipe", "fast", "--minutes", f"{config.minutes:g}", "--seed", str(config.seed)]
     if (config.out / "run").exists():
