@@ -91,20 +91,19 @@ def drive(
 @app.command()
 def demo(
     out: Annotated[Path, typer.Option(help="Folder for all that comes of it.")] = Path("demo"),
-    rounds: Annotated[int, typer.Option(help="Rounds to collect.", min=12)] = 20,
-    frames: Annotated[int, typer.Option(help="Frames a round.", min=1)] = 640,
-    minutes: Annotated[float, typer.Option(help="Training time.")] = 7.0,
+    rounds: Annotated[int, typer.Option(help="Rounds to collect.", min=12)] = 40,
+    frames: Annotated[int, typer.Option(help="Frames a round.", min=1)] = 500,
+    minutes: Annotated[float, typer.Option(help="Training time.")] = 9.5,
     seed: Annotated[int, typer.Option(help="Of the collection and the training.", min=0)] = 1,
 ) -> None:
     """The whole pipeline: collect, train, evaluate, serve, ask, drive, and an HTML report."""
-    from rich.console import Console
-
-    from controllers.demo.report import write_report
-    from controllers.demo.run import DemoConfig, answers_table, run_demo
+    from controllers.demo.report import verdicts, write_report
+    from controllers.demo.run import DemoConfig, run_demo
+    from controllers.demo.tables import print_tables
 
     config = DemoConfig(out=out, rounds=rounds, frames=frames, seed=seed, minutes=minutes)
     result = run_demo(config)
-    Console().print(answers_table(result.asked))
+    print_tables(verdicts(result.evaluation), result.asked)
     typer.echo(f"report: {write_report(config, result)}")
 
 

@@ -22,6 +22,7 @@ class Asked:
     to_lane_centre: float | None
     angle: float
     heading: str
+    curvature: float
     answer: dict[str, Any]
 
     @property
@@ -63,6 +64,7 @@ def _ask_one(frames: Frames, index: int, client: Client) -> Asked:
         to_lane_centre=_localised(values),
         angle=float(labels.angle[index]),
         heading=Heading(int(labels.heading[index])).name.lower(),
+        curvature=float(labels.curvature[index]),
         answer=answer,
     )
 

@@ -22,11 +22,13 @@ SCALE = 2
 PLAN_WIDTH, PLAN_METRES = 160, 16.0
 
 
-def marking_line(distance: float, angle: float) -> NDArray[np.float64]:
-    """Points (N, 2) of a straight marking `distance` m to the right, on a track at `angle`."""
+def marking_line(distance: float, angle: float, curvature: float) -> NDArray[np.float64]:
+    """Points (N, 2) of a marking `distance` m to the right, on a track at `angle` (rad) that bends
+    by `curvature` (1/m, left positive)."""
     along = np.linspace(NEAR_M, FAR_M, 24)
+    left = curvature * along**2 / 2 - distance
     cos, sin = math.cos(angle), math.sin(angle)
-    return np.column_stack([along * cos + distance * sin, along * sin - distance * cos])
+    return np.column_stack([along * cos - left * sin, along * sin + left * cos])
 
 
 def to_pixels(
@@ -47,10 +49,14 @@ def draw_answer(
     frame: Image,
     camera: CameraInfo,
     height_m: float,
+    curvature: float,
     truth: tuple[Distances, float],
     answer: tuple[Distances, float],
 ) -> Image:
-    """The frame (H, W, 3) RGB, doubled, with a plan view beside it: truth green, answer orange."""
+    """The frame (H, W, 3) RGB, doubled, with a plan view beside it: truth green, answer orange.
+
+    Both are drawn along the road's true bend, which no answer tells.
+    """
     size = (frame.shape[1] * SCALE, frame.shape[0] * SCALE)
     canvas = cv2.resize(frame, size, interpolation=cv2.INTER_CUBIC)
     plan = np.full((canvas.shape[0], PLAN_WIDTH, 3), 48, np.uint8)
@@ -59,7 +65,7 @@ def draw_answer(
         for distance in distances.values():
             if distance is None:
                 continue
-            line = marking_line(distance, angle)
+            line = marking_line(distance, angle, curvature)
             pixels = to_pixels(line, camera, height_m)
             cv2.polylines(canvas, [pixels], False, colour, thickness, cv2.LINE_AA)
             cv2.polylines(plan, [_on_plan(line, plan)], False, colour, thickness, cv2.LINE_AA)

@@ -3,6 +3,7 @@
 import base64
 import html
 from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
 from string import Template
 from typing import Any
@@ -43,8 +44,19 @@ def write_report(config: DemoConfig, result: DemoResult) -> Path:
     return path
 
 
-def verdicts(evaluation: dict[str, Any]) -> list[tuple[str, float, float, float, bool]]:
-    """Rows (what, error, limit, error of answering the mean, reached) of an evaluation."""
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """One figure of the evaluation beside its limit and that of always answering the mean."""
+
+    what: str
+    figure: float
+    limit: float
+    mean: float
+    reached: bool
+
+
+def verdicts(evaluation: dict[str, Any]) -> list[Verdict]:
+    """What the model reached, feature by feature."""
     baseline = evaluation["baseline"]
     rows = []
     for name in MARKINGS:
@@ -55,15 +67,13 @@ def verdicts(evaluation: dict[str, Any]) -> list[tuple[str, float, float, float,
     angle, mean_angle = evaluation["angle_mae_rad"], baseline["angle_mae_rad"]
     rows.append(_verdict("angle (rad)", angle, LIMITS["angle"], mean_angle))
     right, most_frequent = evaluation["heading_accuracy"], baseline["heading_accuracy"]
-    reached = right >= LIMITS["heading"]
-    rows.append(("heading class (share right)", right, LIMITS["heading"], most_frequent, reached))
+    limit = LIMITS["heading"]
+    rows.append(Verdict("heading (share right)", right, limit, most_frequent, right >= limit))
     return rows
 
 
-def _verdict(
-    what: str, error: float, limit: float, mean: float
-) -> tuple[str, float, float, float, bool]:
-    return what, error, limit, mean, error <= limit and error <= LEARNED_RATIO * mean
+def _verdict(what: str, error: float, limit: float, mean: float) -> Verdict:
+    return Verdict(what, error, limit, mean, error <= limit and error <= LEARNED_RATIO * mean)
 
 
 def _summary(config: DemoConfig, result: DemoResult) -> str:
@@ -80,14 +90,14 @@ def _summary(config: DemoConfig, result: DemoResult) -> str:
 def _accuracy(evaluation: dict[str, Any]) -> str:
     rows = [
         (
-            what,
-            f"{error:.4f}",
-            "" if np.isinf(limit) else f"{limit:g}",
-            f"{mean:.4f}",
-            f"{error / mean:.2f}",
-            "yes" if reached else "NO",
+            one.what,
+            f"{one.figure:.4f}",
+            "" if np.isinf(one.limit) else f"{one.limit:g}",
+            f"{one.mean:.4f}",
+            f"{one.figure / one.mean:.2f}",
+            "yes" if one.reached else "NO",
         )
-        for what, error, limit, mean, reached in verdicts(evaluation)
+        for one in verdicts(evaluation)
     ]
     head = ("feature", "mean error", "limit", "always the mean", "ratio", "reached")
     return _table(head, rows)
@@ -127,8 +137,12 @@ def _pictures(config: DemoConfig, asked: list[Asked]) -> str:
     figures = []
     for one, image in zip(asked, images, strict=True):
         answer = (one.answer["distances_m"], one.answer["angle_rad"])
-        drawn = draw_answer(image, camera, height_m, (one.distances, one.angle), answer)
-        caption = html.escape(f"{one.track}, {one.lanes} lanes, {one.round_id}")
+        drawn = draw_answer(
+            image, camera, height_m, one.curvature, (one.distances, one.angle), answer
+        )
+        caption = html.escape(
+            f"{one.track}, {one.lanes} lane{'s'[: one.lanes > 1]}, {one.round_id}"
+        )
         figures.append(f'<figure><img src="{_data_uri(drawn)}"><figcaption>{caption}</figure>')
     return "".join(figures)
 

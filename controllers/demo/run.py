@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 from rich.console import Console
-from rich.table import Table
 
 from controllers.demo.frames import Asked, ask, spread
 from controllers.demo.service import running_service
@@ -28,10 +27,10 @@ class DemoConfig:
 
     out: Path
     tracks: str = "circuit,countryside,forest,highway,mountain-pass"
-    rounds: int = 20
-    frames: int = 640
+    rounds: int = 40
+    frames: int = 500
     seed: int = 1
-    minutes: float = 7.0
+    minutes: float = 9.5
     """of training"""
     alpha: str = "0.3,0.2,0.5"
     asked: int = 12
@@ -120,28 +119,3 @@ def _check_folder(out: Path) -> None:
         raise UserError(f"{out} holds other files; name an empty or new folder with --out")
     out.mkdir(parents=True, exist_ok=True)
     marker.touch()
-
-
-def answers_table(asked: list[Asked]) -> Table:
-    """Predicted beside true values, a row a held-out frame."""
-    table = Table(title="Held-out frames: true -> answered")
-    for column in ("round", "track", "lanes", "to lane centre (m)", "ml", "mr", "m", "angle (rad)"):
-        table.add_column(column)
-    table.add_column("heading")
-    for one in asked:
-        found = one.answer["distances_m"]
-        cells = [_pair(one.distances[name], found[name]) for name in ("ml", "mr", "m")]
-        table.add_row(
-            one.round_id,
-            one.track,
-            str(one.lanes),
-            _pair(one.to_lane_centre, one.answer["to_lane_centre_m"]),
-            *cells,
-            f"{one.angle:+.3f} -> {one.answer['angle_rad']:+.3f}",
-            f"{one.heading} -> {one.answered_heading}",
-        )
-    return table
-
-
-def _pair(true: float | None, answered: float | None) -> str:
-    return " -> ".join("-" if value is None else f"{value:+.2f}" for value in (true, answered))

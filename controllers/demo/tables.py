@@ -1,0 +1,54 @@
+"""The demo's tables for the terminal: the verdict, and predicted beside true values."""
+
+import math
+
+from rich.console import Console
+from rich.table import Table
+
+from controllers.demo.frames import Asked
+from controllers.demo.report import LEARNED_RATIO, Verdict
+
+WIDTH = 118
+"""Columns the tables need; a narrower terminal wraps whole lines, which reads better."""
+
+
+def print_tables(verdicts: list[Verdict], asked: list[Asked]) -> None:
+    """Both tables on standard output."""
+    console = Console()
+    console = Console(width=max(console.width, WIDTH))
+    console.print(_verdict_table(verdicts))
+    console.print(_answers_table(asked))
+
+
+def _verdict_table(verdicts: list[Verdict]) -> Table:
+    table = Table(title=f"Rounds of unseen seeds (learned: at most {LEARNED_RATIO} of the mean's)")
+    for column in ("feature", "error", "limit", "always the mean", "ratio", "reached"):
+        table.add_column(column, justify="left" if column == "feature" else "right")
+    for one in verdicts:
+        limit = "" if math.isinf(one.limit) else f"{one.limit:g}"
+        ratio = f"{one.figure / one.mean:.2f}"
+        reached = "yes" if one.reached else "NO"
+        table.add_row(one.what, f"{one.figure:.4f}", limit, f"{one.mean:.4f}", ratio, reached)
+    return table
+
+
+def _answers_table(asked: list[Asked]) -> Table:
+    table = Table(title="Held-out frames: true, answered")
+    columns = ("track", "lanes", "to lane centre (m)", "ml (m)", "mr (m)", "m (m)", "angle (rad)")
+    for column in (*columns, "heading"):
+        table.add_column(column, no_wrap=True, justify="right")
+    for one in asked:
+        found = one.answer["distances_m"]
+        table.add_row(
+            one.track,
+            str(one.lanes),
+            _pair(one.to_lane_centre, one.answer["to_lane_centre_m"]),
+            *(_pair(one.distances[name], found[name]) for name in ("ml", "mr", "m")),
+            f"{one.angle:+.3f} {one.answer['angle_rad']:+.3f}",
+            f"{one.heading} {one.answered_heading}",
+        )
+    return table
+
+
+def _pair(true: float | None, answered: float | None) -> str:
+    return " ".join("  -  " if value is None else f"{value:+.2f}" for value in (true, answered))
