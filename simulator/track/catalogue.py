@@ -102,7 +102,8 @@ def _files_in(folder: Path) -> list[Path]:
     here = [path for path in folder.glob("*") if path.suffix.lower() in SUFFIXES]
     below = [*folder.glob("*/*.xml"), *folder.glob("*/*/*.xml")]
     named = [path for path in below if path.stem == path.parent.name]
-    return sorted(here) + sorted(named)
+    # A pipe of such a name would be waited for without end.
+    return [path for path in sorted(here) + sorted(named) if path.is_file()]
 
 
 def _unknown(name: str, known: list[str]) -> str:

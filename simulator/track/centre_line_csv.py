@@ -21,6 +21,8 @@ MAX_BYTES: Final = 16 * 2**20
 POINTS: Final = (8, 100_000)
 LENGTH_M: Final = (50.0, 100_000.0)
 WIDTH_M: Final = (2.0, 60.0)
+FARTHEST_M: Final = 1e7
+"""No map has coordinates beyond it: the northing of UTM ends there."""
 STEP_LIMITS_M: Final = (0.01, 1000.0)
 
 PIECE_M: Final = 4.0
@@ -106,6 +108,11 @@ def _read_rows(path: Path) -> FloatArray:
             raise TrackError(
                 f"{path}: line {number} is {text[:60]!r}, expected four finite numbers: "
                 "x_m,y_m,w_tr_right_m,w_tr_left_m"
+            )
+        if max(abs(row[0]), abs(row[1])) > FARTHEST_M:
+            raise TrackError(
+                f"{path}: line {number} is {text[:60]!r}, a point more than {FARTHEST_M:g} m "
+                "from the origin; coordinates are metres"
             )
         rows.append(row)
     if not POINTS[0] <= len(rows) <= POINTS[1]:

@@ -74,12 +74,7 @@ def read_own(path: Path) -> Track:
     table = Table(_load(path), str(path))
     table.only("look", "surface", "width", "vertical_curve", "markings", "segment")
     width = table.number("width", 6.0, 40.0)
-    segments, correction = close(read_segments(table))
-    if correction > MAX_CORRECTION_M:
-        raise TrackError(
-            f"{path}: to close the loop a straight would have to change by {correction:.2f} m, "
-            f"allowed are {MAX_CORRECTION_M:g} m; correct the lengths or angles"
-        )
+    segments = _closed(read_segments(table), path)
     placed = assemble(lay(segments, width, table.number("vertical_curve", 1.0, 200.0, 50.0)))
     check_closes(placed, str(path), MAX_GAP_M)
     return Track.from_placed(
@@ -91,6 +86,22 @@ def read_own(path: Path) -> Track:
         look=table.choice("look", LOOKS),
         markings=_markings(Table(table.values.get("markings", {}), f"{path}: [markings]")),
     )
+
+
+def _closed(written: list[Segment], path: Path) -> list[Segment]:
+    """The segments of a closed loop; TrackError where closing changes a straight too much."""
+    try:
+        segments, correction = close(written)
+    except TrackError as error:
+        raise TrackError(f"{path}: {error}") from None
+    if correction > MAX_CORRECTION_M:
+        raise TrackError(
+            f"{path}: to close the loop a straight would have to change by {correction:.2f} m, "
+            f"allowed are {MAX_CORRECTION_M:g} m; correct the lengths or angles"
+        )
+    if any(isinstance(s, Straight) and s.length <= 0.0 for s in segments):
+        raise TrackError(f"{path}: closing the loop leaves a straight no length; lengthen it")
+    return segments
 
 
 def read_segments(table: Table) -> list[Segment]:
@@ -135,7 +146,8 @@ def _load(path: Path) -> Mapping[str, Any]:
         raise TrackError(f"{path}: {size} bytes; a track file has at most {MAX_BYTES}")
     try:
         return tomllib.loads(path.read_bytes().decode("utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
+    except (ValueError, RecursionError) as error:
+        # Not only TOMLDecodeError: Python itself refuses an integer of thousands of digits.
         raise TrackError(f"{path}: not a readable TOML file ({error})") from None
 
 

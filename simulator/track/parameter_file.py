@@ -128,5 +128,5 @@ def _decode(data: bytes, path: Path) -> str:
         encoding = "utf-8-sig" if name.lower() in ("utf-8", "utf8") else name
     try:
         return data.decode(encoding)
-    except (UnicodeDecodeError, LookupError) as error:
+    except (UnicodeError, LookupError) as error:
         raise TrackError(f"{path}: cannot be read as text ({error}); is it an XML file?") from None

@@ -1,11 +1,12 @@
 """Track files that are hostile or broken: one clear line each, and nothing opened on their word."""
 
 import math
+import os
 from pathlib import Path
 
 import pytest
 
-from simulator.track.catalogue import list_tracks, read_track
+from simulator.track.catalogue import list_tracks, read_track, track_files
 from simulator.track.errors import TrackError
 from simulator.track.torcs import read_torcs
 
@@ -135,3 +136,17 @@ def test_a_bad_file_in_a_folder_is_skipped_with_a_warning(
     warnings = capsys.readouterr().err
     assert warnings.count("warning: ") == 1
     assert "bad.xml" in warnings
+
+
+@pytest.mark.parametrize("encoding", ["undefined", "punycode", "no-such-code"])
+def test_an_encoding_that_is_none(tmp_path: Path, encoding: str) -> None:
+    path = tmp_path / "odd.xml"
+    path.write_text(f'<?xml version="1.0" encoding="{encoding}"?>\n<params name="\u00e9"/>')
+    assert "cannot be read as text" in refused(path)
+
+
+def test_pipes_are_not_waited_for(tmp_path: Path) -> None:
+    (tmp_path / "deep").mkdir()
+    for name in ("flat.csv", "deep/deep.xml"):
+        os.mkfifo(tmp_path / name)
+    assert not {"flat", "deep"} & set(track_files(tmp_path))

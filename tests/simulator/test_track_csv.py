@@ -75,6 +75,7 @@ def test_written_centre_line(tmp_path: Path) -> None:
         ([*circle(), "1,2,3"], "line 102"),
         ([*circle(), "1,2,nan,4"], "line 102"),
         ([*circle(), "a,b,c,d"], "line 102"),
+        (["1e200,0,5,5", *circle()], "line 2 is '1e200,0,5,5', a point more than 1e+07 m"),
         (["3,4,5,5"] * 50, "different points"),
         (circle()[:50], "from the first"),
         (circle(radius=2.0), "12.6 m"),

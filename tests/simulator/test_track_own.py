@@ -136,3 +136,33 @@ def test_a_square_with_known_figures(tmp_path: Path) -> None:
     assert float(track.at(110.0 + 1e-6).curvature) == pytest.approx(1 / 80.0, rel=0.11)
     half = track.at(110.0, [-4.0, 4.0]).z
     assert half[0] - half[1] == pytest.approx(4.0 * math.tan(math.radians(4.0)), rel=0.01)
+
+
+@pytest.mark.parametrize("text", ["width = " + "9" * 5000, "width = " + "[" * 5000])
+def test_what_python_will_not_read_is_named(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "deep.toml"
+    path.write_text(text)
+    with pytest.raises(TrackError, match=r"deep\.toml: not a readable TOML file"):
+        read_track(path)
+
+
+def test_closing_must_leave_every_straight_a_length(tmp_path: Path) -> None:
+    bend = '[[segment]]\ntype = "bend"\nradius = 40\nangle = 90\n'
+
+    def straight(length: float) -> str:
+        return f'[[segment]]\ntype = "straight"\nlength = {length}\n'
+
+    # 1.2 m too long one way, shared by three straights: 0.4 m off one of 0.1 m.
+    sides = straight(0.1) + straight(50.0) + bend, straight(30.0) + bend, straight(48.9) + bend
+    path = tmp_path / "short.toml"
+    path.write_text('look = "town"\nwidth = 8.0\n' + "".join(sides) + straight(30.0) + bend)
+    with pytest.raises(TrackError, match=r"short\.toml: closing the loop leaves a straight no"):
+        read_own(path)
+
+
+def test_a_track_without_straights_names_its_file(tmp_path: Path) -> None:
+    bend = '[[segment]]\ntype = "bend"\nradius = 40\nangle = 120\n'
+    path = tmp_path / "round.toml"
+    path.write_text('look = "town"\nwidth = 8.0\n' + bend * 3)
+    with pytest.raises(TrackError, match=r"round\.toml: straights in two directions"):
+        read_own(path)
