@@ -92,19 +92,36 @@ def drive(
 def demo(
     out: Annotated[Path, typer.Option(help="Folder for all that comes of it.")] = Path("demo"),
     rounds: Annotated[int, typer.Option(help="Rounds to collect.", min=12)] = 40,
-    frames: Annotated[int, typer.Option(help="Frames a round.", min=1)] = 500,
-    minutes: Annotated[float, typer.Option(help="Training time.")] = 9.5,
+    frames: Annotated[int, typer.Option(help="Frames a round.", min=20)] = 500,
+    minutes: Annotated[float, typer.Option(help="Training time.", min=0.1)] = 9.5,
     seed: Annotated[int, typer.Option(help="Of the collection and the training.", min=0)] = 1,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
 ) -> None:
-    """The whole pipeline: collect, train, evaluate, serve, ask, drive, and an HTML report."""
+    """The whole pipeline: collect, train, evaluate, serve, ask, drive, and an HTML report.
+
+    The same command again goes on where it was stopped. Exit 1 when the model misses a limit.
+    """
+    from controllers.demo.process import stop_on_sigterm
     from controllers.demo.report import verdicts, write_report
     from controllers.demo.run import DemoConfig, run_demo
     from controllers.demo.tables import print_tables
 
+    stop_on_sigterm()
     config = DemoConfig(out=out, rounds=rounds, frames=frames, seed=seed, minutes=minutes)
     result = run_demo(config)
-    print_tables(verdicts(result.evaluation), result.asked)
-    typer.echo(f"report: {write_report(config, result)}")
+    found = verdicts(result.evaluation)
+    report = write_report(config, result)
+    if as_json:
+        typer.echo(json.dumps(result.as_json()))
+    else:
+        print_tables(found, result.asked)
+        typer.echo(f"report: {report}")
+    missed = [one.what for one in found if not one.reached]
+    if missed:
+        command.fail(
+            f"the model misses the limit for {', '.join(missed)}; a slower machine needs more "
+            "--minutes (with another --out)"
+        )
 
 
 def _stderr() -> "Console":

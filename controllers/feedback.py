@@ -10,9 +10,9 @@ import math
 from dataclasses import dataclass
 
 from controllers.observation import Observation
+from simulator.car import CarParameters
 
-STEERING_LOCK = 0.36652
-"""rad of the front wheels at steer = 1 (21 deg)."""
+STEERING_LOCK = CarParameters.steering_lock  # rad of the front wheels at steer = 1
 
 
 def steer_for(wheel_angle: float, lock: float = STEERING_LOCK) -> float:

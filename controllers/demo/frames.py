@@ -12,9 +12,9 @@ from trackfeatures import MARKINGS, Heading, localise
 
 @dataclass(frozen=True, slots=True)
 class Asked:
-    """One held-out frame, the truth about it, and what the service answered."""
+    """One held-out frame (JPEG), the truth about it, and what the service answered."""
 
-    index: int
+    jpeg: bytes
     round_id: str
     track: str
     lanes: int
@@ -49,11 +49,12 @@ def ask(frames: Frames, indices: list[int], client: Client) -> list[Asked]:
 
 def _ask_one(frames: Frames, index: int, client: Client) -> Asked:
     labels = frames.labels
-    answer = client.features(bytes(frames.jpeg(index)))
+    jpeg = bytes(frames.jpeg(index))
+    answer = client.features(jpeg)
     values = labels.distances[index]
     about = frames.rounds[int(labels.round[index])]
     return Asked(
-        index=index,
+        jpeg=jpeg,
         round_id=about.id,
         track=about.track,
         lanes=about.lanes,

@@ -10,18 +10,20 @@ from typing import Any
 
 import cv2
 import numpy as np
+import simplejpeg
 from numpy.typing import NDArray
 
 from controllers.demo.frames import Asked
 from controllers.demo.picture import draw_answer
 from controllers.demo.run import DemoConfig, DemoResult
-from datagen.recording import Dataset
+from datagen.recording import CameraInfo, Dataset
 from mtlnet.curves import read_curves
 from simulator.car import CarParameters
 from trackfeatures import MARKINGS
 
 LIMITS = {"ml": 0.35, "mr": 0.35, "angle": 0.03, "heading": 0.85}
 """What the demo must reach: mean error in m and rad, and the share of right classes."""
+VERDICT_COLUMNS = ("feature", "mean error", "limit", "always the mean", "ratio", "reached")
 LEARNED_RATIO = 0.65
 """Learned, not guessed: at most this share of the error of always answering the training mean."""
 
@@ -35,7 +37,7 @@ def write_report(config: DemoConfig, result: DemoResult) -> Path:
             summary=_summary(config, result),
             accuracy=_accuracy(result.evaluation),
             curves=_curves(config.out / "run" / "curves.csv"),
-            pictures=_pictures(config, result.asked),
+            pictures=_pictures(Dataset.open(config.out / "data").camera, result.asked),
             answers=_answers(result.asked),
             drive=_drive(result.drive),
             commands=html.escape("\n".join(result.commands)),
@@ -50,9 +52,16 @@ class Verdict:
 
     what: str
     figure: float
-    limit: float
     mean: float
-    reached: bool
+    limit: float | None = None
+    """None: the demo sets none for it."""
+    reached: bool = True
+
+    @property
+    def word(self) -> str:
+        if self.limit is None:
+            return ""
+        return "yes" if self.reached else "NO"
 
 
 def verdicts(evaluation: dict[str, Any]) -> list[Verdict]:
@@ -61,19 +70,19 @@ def verdicts(evaluation: dict[str, Any]) -> list[Verdict]:
     rows = []
     for name in MARKINGS:
         error, mean = evaluation["mae_m"][name], baseline["mae_m"][name]
-        if error is None or mean is None:  # a marking no test frame shows, as on one-lane roads
-            continue
-        rows.append(_verdict(f"{name} (m)", error, LIMITS.get(name, np.inf), mean))
+        if error is not None and mean is not None:  # on one lane, no test frame may show an `l`
+            rows.append(_error_verdict(f"{name} (m)", error, mean, LIMITS.get(name)))
     angle, mean_angle = evaluation["angle_mae_rad"], baseline["angle_mae_rad"]
-    rows.append(_verdict("angle (rad)", angle, LIMITS["angle"], mean_angle))
+    rows.append(_error_verdict("angle (rad)", angle, mean_angle, LIMITS["angle"]))
     right, most_frequent = evaluation["heading_accuracy"], baseline["heading_accuracy"]
-    limit = LIMITS["heading"]
-    rows.append(Verdict("heading (share right)", right, limit, most_frequent, right >= limit))
+    least = LIMITS["heading"]
+    rows.append(Verdict("heading (share right)", right, most_frequent, least, right >= least))
     return rows
 
 
-def _verdict(what: str, error: float, limit: float, mean: float) -> Verdict:
-    return Verdict(what, error, limit, mean, error <= limit and error <= LEARNED_RATIO * mean)
+def _error_verdict(what: str, error: float, mean: float, limit: float | None) -> Verdict:
+    reached = limit is None or (error <= limit and error <= LEARNED_RATIO * mean)
+    return Verdict(what, error, mean, limit, reached)
 
 
 def _summary(config: DemoConfig, result: DemoResult) -> str:
@@ -88,19 +97,15 @@ def _summary(config: DemoConfig, result: DemoResult) -> str:
 
 
 def _accuracy(evaluation: dict[str, Any]) -> str:
-    rows = [
-        (
-            one.what,
-            f"{one.figure:.4f}",
-            "" if np.isinf(one.limit) else f"{one.limit:g}",
-            f"{one.mean:.4f}",
-            f"{one.figure / one.mean:.2f}",
-            "yes" if one.reached else "NO",
-        )
-        for one in verdicts(evaluation)
-    ]
-    head = ("feature", "mean error", "limit", "always the mean", "ratio", "reached")
-    return _table(head, rows)
+    rows = [verdict_cells(one) for one in verdicts(evaluation)]
+    return _table(VERDICT_COLUMNS, rows)
+
+
+def verdict_cells(one: Verdict) -> tuple[str, ...]:
+    """A verdict as the cells of `VERDICT_COLUMNS`."""
+    limit = "" if one.limit is None else f"{one.limit:g}"
+    ratio = f"{one.figure / one.mean:.2f}"
+    return one.what, f"{one.figure:.4f}", limit, f"{one.mean:.4f}", ratio, one.word
 
 
 def _answers(asked: list[Asked]) -> str:
@@ -128,18 +133,14 @@ def _pair(true: float | None, answered: float | None, digits: int) -> str:
     return " / ".join("absent" if v is None else f"{v:+.{digits}f}" for v in (true, answered))
 
 
-def _pictures(config: DemoConfig, asked: list[Asked]) -> str:
-    dataset = Dataset.open(config.out / "data")
-    frames, camera = dataset.select("test"), dataset.camera
-    images = np.empty((len(asked), camera.height, camera.width, 3), np.uint8)
-    frames.read_batch(np.array([one.index for one in asked]), images)
+def _pictures(camera: CameraInfo, asked: list[Asked]) -> str:
     height_m = camera.z + CarParameters().cg_height
     figures = []
-    for one, image in zip(asked, images, strict=True):
+    for one in asked:
+        frame = simplejpeg.decode_jpeg(one.jpeg)
         answer = (one.answer["distances_m"], one.answer["angle_rad"])
-        drawn = draw_answer(
-            image, camera, height_m, one.curvature, (one.distances, one.angle), answer
-        )
+        truth = (one.distances, one.angle)
+        drawn = draw_answer(frame, camera, height_m, one.curvature, truth, answer)
         caption = html.escape(
             f"{one.track}, {one.lanes} lane{'s'[: one.lanes > 1]}, {one.round_id}"
         )
@@ -155,6 +156,8 @@ def _data_uri(image: NDArray[np.uint8]) -> str:
 def _curves(path: Path) -> str:
     """The training losses as SVG lines, each scaled to its own first value."""
     rows = read_curves(path)
+    if not rows:
+        return "<p>The training was too short for a curve.</p>"
     steps = [row["step"] for row in rows]
     lines, legend = [], []
     for task, colour in (("distance", "#2b6"), ("angle", "#e82"), ("type", "#36c")):

@@ -2,7 +2,6 @@
 
 import json
 import shlex
-import subprocess
 import sys
 import time
 from dataclasses import asdict, dataclass, field
@@ -13,12 +12,14 @@ import numpy as np
 from rich.console import Console
 
 from controllers.demo.frames import Asked, ask, spread
-from controllers.demo.service import running_service
+from controllers.demo.process import run_module, running_service
 from datagen.recording import Dataset
 from serve.client import Client
 from trackfeatures import UserError
 
 LOG = Console(stderr=True, highlight=False)
+DRIVE_STEPS = 800
+"""of 50 ms: 40 s from a standing start"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,6 +36,7 @@ class DemoConfig:
     alpha: str = "0.3,0.2,0.5"
     asked: int = 12
     """held-out frames that are posted to the service"""
+    drive_track: str = "highway"
 
 
 @dataclass(slots=True)
@@ -48,8 +50,12 @@ class DemoResult:
     commands: list[str] = field(default_factory=list)
     seconds: dict[str, float] = field(default_factory=dict)
 
-    def write(self, path: Path) -> None:
-        path.write_text(json.dumps(asdict(self), indent=1) + "\n")
+    def as_json(self) -> dict[str, Any]:
+        """All of it but the pictures."""
+        content = asdict(self)
+        for one in content["asked"]:
+            del one["jpeg"]
+        return content
 
 
 def run_demo(config: DemoConfig) -> DemoResult:
@@ -65,7 +71,7 @@ def run_demo(config: DemoConfig) -> DemoResult:
     collect += ["--tracks", config.tracks, "--seed", str(config.seed)]
     train = ["mtlnet", "train", "--data", data, "--out", run, "--alpha", config.alpha]
     train += ["--recipe", "fast", "--minutes", f"{config.minutes:g}", "--seed", str(config.seed)]
-    if (config.out / "run").exists():
+    if (config.out / "run" / "config.json").exists():
         train.append("--resume")
     evaluate = ["mtlnet", "evaluate", "--model", run, "--data", data, "--split", "test", "--json"]
 
@@ -74,15 +80,15 @@ def run_demo(config: DemoConfig) -> DemoResult:
     _step(result, "train", train)
     result.evaluation = json.loads(_step(result, "evaluate", evaluate))
     _use_service(config, result)
-    result.write(config.out / "result.json")
+    text = json.dumps(result.as_json(), indent=1)
+    (config.out / "result.json").write_text(text + "\n")
     return result
 
 
 def _use_service(config: DemoConfig, result: DemoResult) -> None:
     """Post held-out frames and let the answers steer a car, on one service."""
     started = time.monotonic()
-    result.commands.append(f"serve --model {config.out / 'run'}")
-    LOG.print(f"[bold]$ {result.commands[-1]}[/bold]")
+    _show(result, f"serve --model {config.out / 'run'}")
     frames = Dataset.open(config.out / "data").select("test")
     chosen = spread(frames, config.asked, np.random.default_rng([config.seed, 1]))
     with (
@@ -91,9 +97,8 @@ def _use_service(config: DemoConfig, result: DemoResult) -> None:
     ):
         result.asked = ask(frames, chosen, client)
         result.seconds["serve"] = time.monotonic() - started
-        track = result.asked[0].track
-        drive = ["controllers", "drive", "--controller", "lqr", "--track", track, "--lanes", "1"]
-        drive += ["--perception", url, "--steps", "400", "--json"]
+        drive = ["controllers", "drive", "--controller", "lqr", "--track", config.drive_track]
+        drive += ["--lanes", "1", "--perception", url, "--steps", str(DRIVE_STEPS), "--json"]
         drive += ["--log", str(config.out / "drive.csv")]
         result.drive = json.loads(_step(result, "drive", drive))
 
@@ -101,16 +106,19 @@ def _use_service(config: DemoConfig, result: DemoResult) -> None:
 def _step(result: DemoResult, name: str, command: list[str]) -> str:
     """Run one of the project's commands; its standard output comes back, the rest is shown."""
     shown = shlex.join(command)
-    result.commands.append(shown)
-    LOG.print(f"[bold]$ {shown}[/bold]")
+    _show(result, shown)
     started = time.monotonic()
-    # The same interpreter's modules, whatever else the PATH holds.
-    done = subprocess.run([sys.executable, "-m", *command], stdout=subprocess.PIPE, text=True)
+    code, said = run_module(command)
     result.seconds[name] = time.monotonic() - started
-    if done.returncode:
-        sys.stderr.write(done.stdout)
-        raise UserError(f"`{shown}` ended with exit code {done.returncode}; its message is above")
-    return done.stdout
+    if code:
+        sys.stderr.write(said)
+        raise UserError(f"`{shown}` ended with exit code {code}; its message is above")
+    return said
+
+
+def _show(result: DemoResult, command: str) -> None:
+    result.commands.append(command)
+    LOG.print(f"$ {command}", style="bold", markup=False)
 
 
 def _check_folder(out: Path) -> None:

@@ -1,12 +1,10 @@
 """The demo's tables for the terminal: the verdict, and predicted beside true values."""
 
-import math
-
 from rich.console import Console
 from rich.table import Table
 
 from controllers.demo.frames import Asked
-from controllers.demo.report import LEARNED_RATIO, Verdict
+from controllers.demo.report import LEARNED_RATIO, VERDICT_COLUMNS, Verdict, verdict_cells
 
 WIDTH = 118
 """Columns the tables need; a narrower terminal wraps whole lines, which reads better."""
@@ -22,13 +20,10 @@ def print_tables(verdicts: list[Verdict], asked: list[Asked]) -> None:
 
 def _verdict_table(verdicts: list[Verdict]) -> Table:
     table = Table(title=f"Rounds of unseen seeds (learned: at most {LEARNED_RATIO} of the mean's)")
-    for column in ("feature", "error", "limit", "always the mean", "ratio", "reached"):
+    for column in VERDICT_COLUMNS:
         table.add_column(column, justify="left" if column == "feature" else "right")
     for one in verdicts:
-        limit = "" if math.isinf(one.limit) else f"{one.limit:g}"
-        ratio = f"{one.figure / one.mean:.2f}"
-        reached = "yes" if one.reached else "NO"
-        table.add_row(one.what, f"{one.figure:.4f}", limit, f"{one.mean:.4f}", ratio, reached)
+        table.add_row(*verdict_cells(one))
     return table
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from controllers.demo.service import free_port
+from controllers.demo.process import free_port
 
 
 def run(*arguments: str) -> subprocess.CompletedProcess[str]:

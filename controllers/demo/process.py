@@ -1,4 +1,7 @@
-"""A perception service as a process of its own: started, waited for, stopped cleanly."""
+"""The project's commands as processes of their own: run to their end, or served and stopped.
+
+Whatever ends the demo, Ctrl-C or SIGTERM, its processes get the time to leave nothing half done.
+"""
 
 import signal
 import socket
@@ -13,6 +16,34 @@ from trackfeatures import UserError
 
 START_LIMIT_S = 60.0
 STOP_LIMIT_S = 10.0
+
+
+class Terminated(KeyboardInterrupt):
+    """SIGTERM: unlike the terminal's Ctrl-C, it has not reached the child processes."""
+
+
+def stop_on_sigterm() -> None:
+    """Make SIGTERM end this process as Ctrl-C does."""
+
+    def stop(number: int, frame: object) -> None:
+        raise Terminated
+
+    signal.signal(signal.SIGTERM, stop)
+
+
+def run_module(command: list[str]) -> tuple[int, str]:
+    """Run `python -m command...` with this interpreter; its exit code and standard output."""
+    with subprocess.Popen(
+        [sys.executable, "-m", *command], stdout=subprocess.PIPE, text=True
+    ) as child:
+        try:
+            said, _ = child.communicate()
+        except KeyboardInterrupt as reason:
+            if isinstance(reason, Terminated):
+                child.terminate()
+            _wait(child)
+            raise
+    return child.returncode, said
 
 
 def free_port() -> int:
@@ -59,10 +90,15 @@ def _wait_until_ready(server: subprocess.Popen[bytes], url: str, log: Path) -> N
 
 
 def _stop(server: subprocess.Popen[bytes]) -> bool:
-    server.send_signal(signal.SIGTERM)
+    server.terminate()
+    return _wait(server)
+
+
+def _wait(child: "subprocess.Popen[bytes] | subprocess.Popen[str]") -> bool:
+    """Give the process its time to stop by itself; False when it had to be killed."""
     try:
-        server.wait(STOP_LIMIT_S)
+        child.wait(STOP_LIMIT_S)
     except subprocess.TimeoutExpired:
-        server.kill()
+        child.kill()
         return False
     return True
