@@ -21,6 +21,7 @@ from datagen.plan import Plan
 from datagen.recording.derived import rebuild
 from datagen.recording.errors import DatasetError
 from datagen.recording.folder import (
+    barely_begun,
     discard_partials,
     prepare,
     read_states,
@@ -138,7 +139,7 @@ def _require_fitting(folder: Path, plan: Plan) -> None:
         raise DatasetError(f"{folder} is a file; choose a folder with --out")
     path = folder / PLAN
     if not path.is_file():
-        if any(folder.iterdir()):
+        if not barely_begun(folder, PLAN):
             raise DatasetError(
                 f"{folder} exists and is not a dataset of `datagen collect` (it has no {PLAN}); "
                 "nothing was changed; choose another folder with --out"
@@ -177,8 +178,9 @@ def _short(value: Any) -> str:
 
 def _open_folder(folder: Path, plan: Plan) -> None:
     discard_partials(folder)
-    prepare(folder)
+    # First of all: by its plan the same command knows the folder again, whatever fails next.
     write_synced(folder / PLAN, json.dumps(plan.as_json(), indent=1) + "\n")
+    prepare(folder)
     # Whatever happens from here on, the rounds that are finished can be read.
     write_split(split_path(folder), _split(plan, {entry.id for entry in plan.rounds}))
 

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from simulator.camera.overlay import marking_polylines
 
 import trackfeatures as tf
 from datagen.driver import ScriptedDriver
@@ -19,6 +18,7 @@ from datagen.recording.header import RoundHeader
 from datagen.recording.writer import RoundWriter
 from datagen.trajectory import make_course
 from simulator.camera import Camera, Light, Mount
+from simulator.camera.overlay import marking_polylines
 from simulator.sensors.sensor import SensorSuite
 from simulator.sensors.standard import STANDARD
 from simulator.state import CarState, Command

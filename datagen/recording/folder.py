@@ -16,6 +16,7 @@ from .errors import DatasetError
 
 PARTIAL = ".partial"
 SUBFOLDERS = ("rounds", "state", "splits", "layouts", "proto")
+UNFINISHED = ".{name}.new"  # a small file before it takes its place
 READ_BYTES = 1 << 20
 
 
@@ -46,6 +47,16 @@ def prepare(folder: Path) -> None:
     package = files("datagen.recording")
     for name in ("proto/driverview.proto", "layouts/foxglove.json"):
         write_synced(folder / name, package.joinpath(name).read_text())
+
+
+def barely_begun(folder: Path, first: str) -> bool:
+    """Whether nothing is in the folder but empty parts of a dataset and the beginning of `first`,
+    the file that is written before all others: what a disk full at the start may leave."""
+    return all(
+        path.name == UNFINISHED.format(name=first)
+        or (path.name in (*SUBFOLDERS, PARTIAL) and path.is_dir() and not any(path.iterdir()))
+        for path in folder.iterdir()
+    )
 
 
 def round_path(folder: Path, round_id: str) -> Path:
@@ -103,10 +114,12 @@ def file_sha256(path: Path) -> str:
 
 
 def write_synced(path: Path, text: str) -> None:
-    """Replace a small file in one step."""
-    beside = path.with_name(f".{path.name}.new")
+    """Replace a small file in one step; one that holds this text already is left alone."""
+    if path.is_file() and path.read_bytes() == text.encode():
+        return
+    beside = path.with_name(UNFINISHED.format(name=path.name))
     try:
-        beside.write_text(text)
+        beside.write_text(text, encoding="utf-8")
         _sync(beside)
         beside.replace(path)
     except OSError:

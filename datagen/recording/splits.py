@@ -11,6 +11,7 @@ from pathlib import Path
 import trackfeatures as tf
 
 from .errors import DatasetError
+from .folder import write_synced
 
 SIDES = ("train", "test")
 DEFAULT_SPLIT = "default"
@@ -62,7 +63,7 @@ def write_split(path: Path, split: Split) -> None:
         "train": list(split.train),
         "test": list(split.test),
     }
-    path.write_text(json.dumps(content, indent=1) + "\n")
+    write_synced(path, json.dumps(content, indent=1) + "\n")
 
 
 def require_disjoint(split: Split, rounds: Iterable[RoundKey]) -> None:

@@ -15,9 +15,11 @@ import pytest
 
 import trackfeatures as tf
 from datagen.cli import main as datagen_main
+from datagen.collect import _open_folder, _require_fitting, collect
 from datagen.crew import Crew
 from datagen.plan import Wanted, make_plan
 from datagen.recording import Dataset
+from datagen.recording.errors import DatasetError
 from datagen.recording.folder import prepare, read_states
 from datagen.recording.verify import verify
 from datagen.tracks import choose_tracks
@@ -138,9 +140,41 @@ def test_a_folder_of_something_else_is_not_touched(tmp_path, refused):
     assert "is a file" in refused("collect", *SHORT, "--out", tmp_path / "thesis.tex")
 
 
-def test_a_dataset_of_other_definitions_is_refused(tmp_path):
-    from datagen.collect import collect
+@pytest.mark.parametrize("failing", range(5))
+def test_a_disk_full_from_the_start_leaves_a_folder_that_can_be_gone_on_with(
+    tmp_path, monkeypatch, failing
+):
+    """Each of the writes before the first round fails once; the same command then works."""
+    folder = tmp_path / "data"
+    plan = make_plan(Wanted(1, 10, seed=1, tracks=choose_tracks(("oval",), None)))
+    synced = []
 
+    def full(path: Path) -> None:
+        synced.append(path)
+        if len(synced) > failing:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with monkeypatch.context() as patch:
+        patch.setattr("datagen.recording.folder._sync", full)
+        with pytest.raises(OSError, match="No space left"):
+            collect(plan, folder, workers=1)
+    _require_fitting(folder, plan)
+    _open_folder(folder, plan)
+    assert json.loads((folder / "plan.json").read_text())["hash"] == plan.hash
+
+
+def test_empty_parts_of_a_dataset_are_no_foreign_folder(tmp_path):
+    plan = make_plan(Wanted(1, 10, seed=1, tracks=choose_tracks(("oval",), None)))
+    (tmp_path / "rounds").mkdir()
+    (tmp_path / "state").mkdir()
+    (tmp_path / ".plan.json.new").write_text('{"rou')
+    _require_fitting(tmp_path, plan)
+    (tmp_path / "rounds" / "somebody.mcap").write_text("else's")
+    with pytest.raises(DatasetError, match="is not a dataset"):
+        collect(plan, tmp_path, workers=1)
+
+
+def test_a_dataset_of_other_definitions_is_refused(tmp_path):
     plan = make_plan(Wanted(1, 10, seed=1, tracks=choose_tracks(("oval",), None)))
     (tmp_path / "plan.json").write_text(json.dumps({**plan.as_json(), "definitions": "0-old"}))
     with pytest.raises(tf.DefinitionsMismatch, match="0-old"):

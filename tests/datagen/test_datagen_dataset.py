@@ -11,7 +11,7 @@ from datagen.recording.derived import rebuild
 from datagen.recording.encoding import decode_into
 from datagen.recording.folder import prepare, write_synced
 from datagen.recording.header import RoundHeader, RoundResult
-from datagen.recording.splits import Split, split_path, write_split
+from datagen.recording.splits import Split, read_split, split_path, write_split
 
 
 def test_rounds_sides_and_labels(samples, dataset):
@@ -146,6 +146,21 @@ def test_the_derived_files_are_rebuilt_from_the_rounds_alone(dataset):
     manifest = json.loads(before["manifest.json"])
     assert [entry["split"] for entry in manifest["rounds"]] == ["train", "train", "test"]
     assert (dataset / "proto" / "driverview.proto").read_text().count("\nmessage ") == 4
+
+
+def test_a_split_is_replaced_whole_and_an_identical_one_not_touched(dataset, monkeypatch):
+    path = split_path(dataset)
+    before = path.stat()
+    write_split(path, Split(("r000", "r001"), ("r002",)))
+    assert (path.stat().st_ino, path.stat().st_mtime_ns) == (before.st_ino, before.st_mtime_ns)
+
+    def full(*args: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("datagen.recording.folder._sync", full)
+    with pytest.raises(OSError, match="No space left"):
+        write_split(path, Split(("r000",), ("r002",)))
+    assert read_split(path) == Split(("r000", "r001"), ("r002",))
 
 
 def test_a_file_is_replaced_whole_or_left_alone(tmp_path, monkeypatch):
