@@ -11,9 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from simulator import traffic_kernel as kernel
+from simulator.car import CarParameters
 from simulator.idm import COMFORTABLE_BRAKING, STANDSTILL_GAP_M, TIME_HEADWAY_S, idm_acceleration
 from simulator.track.geometry import Track
-from simulator.track.road import Road
+from simulator.track.road import START_BEFORE_LINE_M, Road
 from trackfeatures.errors import UserError
 
 __all__ = ["EGO_SIZE", "MOST_CARS", "SIZE", "Traffic", "idm_acceleration"]
@@ -22,14 +23,13 @@ FloatArray = NDArray[np.float64]
 
 SIZE = (4.4, 1.8, 1.4)
 """Length, width, height of a traffic car, m."""
-EGO_SIZE = (4.52, 1.94, 1.10)
+EGO_SIZE = (CarParameters.length, CarParameters.width, CarParameters.height)
 MOST_CARS = 12
 DESIRED_KMH = (40.0, 62.0)
 CLEAR_M = 25.0
 """No car starts nearer to the ego car (bumper to bumper)."""
 SPREAD_M = 600.0
 """Cars start within this way ahead of the ego car, where it meets them; farther if crowded."""
-START_LINE_GAP_M = 25.0
 SIDE_ACCELERATION = 3.0
 """m/s2: cars take bends no faster than this."""
 
@@ -54,7 +54,7 @@ class Traffic:
         self._table = road.track.arrays()
         markings = road.markings_y
         self._lane_y = 0.5 * (markings[:-1] + markings[1:])
-        start = self._length - START_LINE_GAP_M if clear_s is None else clear_s
+        start = self._length - START_BEFORE_LINE_M if clear_s is None else clear_s
         self._curvature, self._limit = _bends(road.track, float(np.max(self._lane_y)))
         self._cars = self._start(count, rng, start % self._length)
         self._bodies = np.zeros((count + 1, kernel.BODY_COLUMNS))

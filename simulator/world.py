@@ -28,8 +28,9 @@ from simulator.engine import gear_ratio
 from simulator.orientation import quaternion
 from simulator.physics import Collision, Scene
 from simulator.state import CarState, Command
+from simulator.track.geometry import wrap_angle
 from simulator.track.kernel import index_at, locate, surface
-from simulator.track.road import Road
+from simulator.track.road import START_BEFORE_LINE_M, Road
 from simulator.traffic import SIZE, Traffic
 from simulator.walls import wall_mesh
 from trackfeatures.errors import UserError
@@ -38,8 +39,6 @@ __all__ = ["CarState", "Command", "World"]
 
 Poses = NDArray[np.float64]
 
-START_BEFORE_LINE_M = 25.0
-"""A drive starts this far before the line."""
 ROLLING_BACK_M_S = -0.5
 """Slower than this along the track is driving backwards."""
 NEAR_WALL_M = 3.5
@@ -218,7 +217,7 @@ class World:
         axes = rotation(motion[3:7])
         forward, left, up = axes.tolist()
         yaw = math.atan2(forward[1], forward[0])
-        angle = _wrapped(tangent - yaw)
+        angle = float(wrap_angle(np.float64(tangent - yaw)))
         velocity = motion[7:10]
         along = math.cos(tangent) * velocity[0] + math.sin(tangent) * velocity[1]
         time_s = self._steps / self.frequency_hz
@@ -282,8 +281,3 @@ def _tangent(table: NDArray[np.float64], piece: int, s: float) -> tuple[float, f
     start, heading, curvature = table[piece, 0], table[piece, 4], table[piece, 5]
     along = min(max(s - start, 0.0), table[piece, 1])
     return float(heading + curvature * along), float(curvature)
-
-
-def _wrapped(angle: float) -> float:
-    """The angle in (-pi, pi]."""
-    return math.pi - (math.pi - angle) % (2.0 * math.pi)

@@ -12,6 +12,7 @@ from simulator.camera.context import FRAME_BINDING, Graphics, graphics
 from simulator.camera.light import Light
 from simulator.camera.optics import DRIVER_SEAT, Mount
 from simulator.camera.scene import Scene
+from simulator.car import CarParameters
 from simulator.track.road import Road
 from trackfeatures.errors import UserError
 
@@ -20,8 +21,6 @@ Picture = NDArray[np.uint8]
 
 MAX_SIZE = 4096
 _OWN_PAINT = 0
-_CG_HEIGHT_M = 0.25
-"""Height of the centre of gravity over the road at rest."""
 
 
 class Camera:
@@ -128,7 +127,7 @@ class Camera:
         paints = [self._first_paint + k for k in range(len(poses))]
         if view in ("chase", "top"):
             own = np.asarray(body_pose, dtype=np.float64).copy()
-            own[:3] -= optics.rotation(*own[3:])[:, 2] * _CG_HEIGHT_M
+            own[:3] -= optics.rotation(*own[3:])[:, 2] * CarParameters.cg_height
             poses, paints = np.vstack([poses, own]), [*paints, _OWN_PAINT]
         return poses, paints
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from simulator.camera import overlay
 from simulator.camera.camera import Camera
 from simulator.camera.light import KINDS, Light
+from simulator.car import CarParameters
 from simulator.track.road import Road
 from trackfeatures.errors import UserError
 
@@ -21,7 +22,6 @@ Picture = NDArray[np.uint8]
 
 WIDTH, HEIGHT, COLUMNS = 480, 360, 4
 DRIVER_VIEWS = 14
-CG_HEIGHT_M = 0.25
 CAR_GAP_M = (12.0, 60.0)
 
 
@@ -81,7 +81,11 @@ def take(camera: Camera, road: Road, shot: Shot, traffic: int, rng: np.random.Ge
 
 
 def standing_pose(
-    road: Road, s: float, to_middle: float, angle: float = 0.0, height: float = CG_HEIGHT_M
+    road: Road,
+    s: float,
+    to_middle: float,
+    angle: float = 0.0,
+    height: float = CarParameters.cg_height,
 ) -> FloatArray:
     """Pose (6,) of a car that stands on the road plane, `height` m above it along its normal."""
     track = road.track

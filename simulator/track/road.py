@@ -8,6 +8,8 @@ from numpy.typing import NDArray
 import trackfeatures as tf
 from simulator.track.geometry import Track
 
+START_BEFORE_LINE_M = 25.0
+"""A drive starts this far before the line."""
 SHOULDER_M = 1.0
 """Asphalt beyond the outermost marking."""
 WALL_MARGIN_M = 2.5
@@ -31,7 +33,7 @@ class Road:
 
     @property
     def half_width(self) -> float:
-        """`w`: half of the track's own width; scales reward and state, nothing else."""
+        """`w`: half of the track's own width; scales reward and state, and is the least `edge`."""
         return self.track.width / 2
 
     @property
