@@ -17,16 +17,17 @@ from mcap.stream_reader import StreamReader, breakup_chunk
 import trackfeatures as tf
 
 from . import topics
+from .agreement import disagreements
+from .checksums import wrong_checksums
 from .dataset import IMAGE_DATA
 from .encoding import decode_into
 from .errors import DatasetError
 from .folder import RoundState, file_sha256
 from .index import DAMAGE, RoundIndex, open_round
-from .labels import Labels, read_labels
+from .labels import read_labels
 from .wire import bytes_field
 
 LEVELS = ("quick", "full", "deep")
-TOLERANCE_M = 1e-4  # labels are read as float32
 
 
 def check_round(path: Path, level: str, state: RoundState | None) -> tuple[int, list[str]]:
@@ -73,6 +74,7 @@ def _quick(index: RoundIndex, state: RoundState | None) -> Iterator[str]:
 def _full(index: RoundIndex, state: RoundState | None) -> Iterator[str]:
     if state is not None and file_sha256(index.path) != state.sha256:
         yield "its bytes are not those that were written (sha256 differs)"
+    yield from wrong_checksums(index.path)
     yield from _walk(index, decode=False)
     for topic, messages in index.messages.items():
         if (np.diff(messages.log_time) <= 0).any():
@@ -99,7 +101,7 @@ def _deep(index: RoundIndex) -> Iterator[str]:
         labels = read_labels(index, 0)
     except DatasetError:
         return  # already told
-    yield from _labels_against_definitions(index, labels)
+    yield from disagreements(labels, index.header.lanes, index.header.lane_width_m)
 
 
 def _walk(index: RoundIndex, decode: bool) -> Iterator[str]:
@@ -132,18 +134,3 @@ def _walk(index: RoundIndex, decode: bool) -> Iterator[str]:
 
 def _seconds(log_time: int) -> str:
     return f"{(log_time - topics.EPOCH_NS) / topics.NANOSECONDS:.2f} s"
-
-
-def _labels_against_definitions(index: RoundIndex, labels: Labels) -> Iterator[str]:
-    """The distances that follow from the recorded offset are those that were recorded."""
-    width = index.header.lane_width_m
-    wrong = 0
-    for i in range(len(labels)):
-        found = tf.measure(
-            float(labels.to_middle[i]), 0.0, 0.0, 0.0, int(labels.lanes[i]), width
-        ).distances.values()
-        expected = np.array([np.nan if d is None else d for d in found])
-        both = ~(np.isnan(expected) | np.isnan(labels.distances[i]))
-        wrong += bool((np.abs(expected - labels.distances[i])[both] > TOLERANCE_M).any())
-    if wrong:
-        yield f"{wrong} labels do not follow from the offset recorded beside them"
