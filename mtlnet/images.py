@@ -1,49 +1,160 @@
-"""Images from files, made to fit a model's camera."""
+"""Everything between an image's bytes and pixels the model may see: limits, header, strict decode.
 
+Free of torch; `mtlnet predict` and `serve` see the same pixels. The size of an image is read from
+its header before anything is decoded: a PNG of 31 KB can ask for 1.5 GB. Rotation marks (EXIF) are
+ignored, alpha is dropped, grey becomes RGB, 16 bits become 8.
+"""
+
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol
 
 import cv2
 import numpy as np
+import simplejpeg
 from numpy.typing import NDArray
 
-from mtlnet.card import Camera
+from mtlnet import png
+from mtlnet.image_error import Fault, ImageError
 from trackfeatures.errors import UserError
 
-MAX_BYTES = 32 << 20
+MAX_FILE_BYTES = 32 << 20
+MIN_SIDE_PX, MAX_SIDE_PX, MAX_PIXELS = 16, 4096, 8_400_000
+MAX_SCANS = 100  # a progressive JPEG has about ten; each more costs a pass over all pixels
 ASPECT_TOLERANCE = 0.01
-SIGNATURES = {b"\xff\xd8\xff": "JPEG", b"\x89PNG\r\n\x1a\n": "PNG"}
+JPEG_SIGNATURE = b"\xff\xd8\xff"
+JPEG_SCAN = b"\xff\xda"
 
 
-class ImageError(UserError):
-    """A file that is no image this model can read."""
+class View(Protocol):
+    """The size of the image a model takes, px."""
+
+    @property
+    def width(self) -> int: ...
+
+    @property
+    def height(self) -> int: ...
 
 
-def read_image(path: Path, camera: Camera) -> NDArray[np.uint8]:
-    """The JPEG or PNG at `path` as RGB (height, width, 3) of `camera`'s size.
+@dataclass(frozen=True, slots=True)
+class ImageHeader:
+    """What an image says of itself; `png_header` is set for a PNG."""
 
-    Another size is scaled; another shape is refused, for its angles would be wrong.
-    Raises ImageError.
+    width: int
+    height: int
+    png_header: png.PngHeader | None = None
+
+
+def read_image(path: Path, view: View) -> NDArray[np.uint8]:
+    """The JPEG or PNG at `path` as uint8 RGB (view.height, view.width, 3).
+
+    Another size is scaled; another shape is refused, for its angles would be wrong. Raises
+    ImageError, or UserError where there is no file to read.
     """
     if not path.is_file():
-        raise ImageError(f"there is no image file {path}")
-    if path.stat().st_size > MAX_BYTES:
-        raise ImageError(f"{path} has {path.stat().st_size} bytes, at most {MAX_BYTES} are read")
-    content = path.read_bytes()
-    if not any(content.startswith(signature) for signature in SIGNATURES):
-        raise ImageError(
-            f"{path} is no JPEG or PNG image (it begins with {content[:8]!r}); convert it first"
+        raise UserError(f"there is no image file {path}")
+    if path.stat().st_size > MAX_FILE_BYTES:
+        raise UserError(
+            f"{path} has {path.stat().st_size} bytes, at most {MAX_FILE_BYTES} are read; save a "
+            "smaller image"
         )
-    decoded = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR_RGB)
-    if decoded is None:
-        raise ImageError(f"{path} is damaged: it cannot be decoded")
-    height, width = decoded.shape[:2]
-    if abs(width / height * camera.height / camera.width - 1) > ASPECT_TOLERANCE:
+    body = path.read_bytes()
+    try:
+        return decode(body, inspect(body, view), view)
+    except ImageError as error:
+        raise ImageError(error.fault, f"{path}: {error}") from error
+
+
+def inspect(body: bytes, view: View) -> ImageHeader:
+    """The header of an image that may be decoded for a model of this view. Raises ImageError."""
+    if body.startswith(png.SIGNATURE):
+        found = png.read_header(body)
+        header = ImageHeader(found.width, found.height, found)
+    elif body.startswith(JPEG_SIGNATURE):
+        header = _inspect_jpeg(body)
+    else:
+        seen = f"{len(body)} bytes that begin with {body[:8]!r}" if body else "nothing at all"
+        raise ImageError(Fault.NOT_AN_IMAGE, f"no JPEG or PNG file, but {seen}")
+    _check_size(header)
+    _check_aspect(header, view)
+    return header
+
+
+def _inspect_jpeg(body: bytes) -> ImageHeader:
+    try:
+        # The decoder's own reading of the header: it cannot differ from what it decodes later.
+        height, width, colours, _ = simplejpeg.decode_jpeg_header(body)
+    except ValueError as error:
+        raise _damaged_jpeg(error) from error
+    if colours not in ("Gray", "YCbCr", "RGB"):
+        raise ImageError(Fault.UNSUPPORTED, f"the JPEG's colours are {colours}; save it in RGB")
+    scans = body.count(JPEG_SCAN)
+    if scans > MAX_SCANS:
+        raise ImageError(Fault.UNSUPPORTED, f"the JPEG has {scans} scans; save it as baseline JPEG")
+    return ImageHeader(width, height)
+
+
+def _check_size(header: ImageHeader) -> None:
+    width, height = header.width, header.height
+    sides = min(width, height) >= MIN_SIDE_PX and max(width, height) <= MAX_SIDE_PX
+    if not sides or width * height > MAX_PIXELS:
         raise ImageError(
-            f"{path} is {width} x {height}; the model sees {camera.width} x {camera.height} and "
-            "takes other sizes of the same shape only: crop it to that shape"
+            Fault.SIZE,
+            f"the image is {width} x {height} px; {MIN_SIDE_PX} to {MAX_SIDE_PX} px a side and at "
+            f"most {MAX_PIXELS / 1e6:.1f} million px are taken: scale it to the model's camera",
         )
-    image: NDArray[np.uint8] = np.asarray(decoded, np.uint8)
-    if (width, height) != (camera.width, camera.height):
-        size = (camera.width, camera.height)
-        image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
-    return np.ascontiguousarray(image)
+
+
+def _check_aspect(header: ImageHeader, view: View) -> None:
+    """A stretched or cropped view would give wrong metres without a sign of it: refused."""
+    stretch = header.width * view.height / (header.height * view.width)
+    if abs(stretch - 1.0) > ASPECT_TOLERANCE:
+        raise ImageError(
+            Fault.ASPECT,
+            f"the image is {header.width} x {header.height} px (width / height "
+            f"{header.width / header.height:.3f}), the model's camera gives {view.width} x "
+            f"{view.height} ({view.width / view.height:.3f}); give the whole view of such a "
+            "camera, at any size of that shape",
+        )
+
+
+def decode(body: bytes, header: ImageHeader, view: View) -> NDArray[np.uint8]:
+    """The image as uint8 RGB (view.height, view.width, 3), area-averaged to it.
+
+    Raises ImageError.
+    """
+    image = (
+        _decode_jpeg(body) if header.png_header is None else _decode_png(body, header.png_header)
+    )
+    if image.shape != (header.height, header.width, 3):
+        raise ImageError(
+            Fault.DAMAGED,
+            f"the image decodes to {image.shape[1]} x {image.shape[0]} px, its header says "
+            f"{header.width} x {header.height}; save it anew",
+        )
+    if (header.width, header.height) == (view.width, view.height):
+        return image
+    shrinks = header.width > view.width
+    method = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
+    scaled = cv2.resize(image, (view.width, view.height), interpolation=method)
+    return scaled.astype(np.uint8, copy=False)
+
+
+def _decode_jpeg(body: bytes) -> NDArray[np.uint8]:
+    try:
+        image: NDArray[np.uint8] = simplejpeg.decode_jpeg(body, colorspace="RGB", strict=True)
+    except ValueError as error:
+        raise _damaged_jpeg(error) from error
+    return image
+
+
+def _decode_png(body: bytes, header: png.PngHeader) -> NDArray[np.uint8]:
+    checked = png.critical_chunks(body, header)
+    image = cv2.imdecode(np.frombuffer(checked, np.uint8), cv2.IMREAD_COLOR)
+    if image is None:
+        raise ImageError(Fault.DAMAGED, "the PNG cannot be decoded; save it anew")
+    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB).astype(np.uint8, copy=False)
+
+
+def _damaged_jpeg(error: ValueError) -> ImageError:
+    return ImageError(Fault.DAMAGED, f"the JPEG cannot be decoded ({error}); give the whole file")

@@ -14,8 +14,9 @@ from fastapi.responses import HTMLResponse, JSONResponse, Response
 
 import trackfeatures as tf
 from mtlnet.engine import Engine
+from mtlnet.images import inspect
 from serve import contract, problems
-from serve.gate import check_headers, inspect, read_body
+from serve.gate import check_headers, read_body
 from serve.perceiver import Perceived, Perceiver
 from serve.problems import Problem
 from serve.readiness import warm_up

@@ -9,6 +9,7 @@ Not to be shared between threads: each makes its own.
 
 import http.client
 import json
+import re
 import time
 from types import TracebackType
 from typing import Any
@@ -17,6 +18,7 @@ from urllib.parse import SplitResult, urlsplit
 from trackfeatures.errors import UserError
 
 POLL_S = 0.1
+UNSENDABLE = re.compile("[^!-~]")  # what the path of an HTTP request cannot hold
 PNG_SIGNATURE = b"\x89PNG"
 # How a connection dies that the service closed while it was idle.
 DROPPED = (http.client.RemoteDisconnected, ConnectionResetError, BrokenPipeError)
@@ -159,10 +161,14 @@ def _plain_connection(host: str, port: int | None, *, timeout: float) -> http.cl
 
 
 def _parse(url: str) -> SplitResult:
-    parts = urlsplit(url if "://" in url else f"http://{url}")
     try:
-        usable = parts.scheme in ("http", "https") and parts.hostname and parts.port != 0
-    except ValueError:  # the port is no number
+        parts = urlsplit(url if "://" in url else f"http://{url}")
+        host = parts.hostname or ""
+        host.encode("idna")  # as looking it up will do
+        usable = host and parts.scheme in ("http", "https") and parts.port != 0
+        usable = usable and host.isprintable() and " " not in host
+        usable = usable and not UNSENDABLE.search(parts.path)
+    except ValueError:  # an open bracket, a port that is no number, a label too long (UnicodeError)
         usable = False
     if not usable:
         raise ServiceError(

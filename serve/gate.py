@@ -1,56 +1,11 @@
-"""Everything between a request's body and pixels the model may see: limits, header, strict decode.
-
-The size of an image is read from its header before anything is decoded: a PNG of 31 KB can ask for
-1.5 GB. Rotation marks (EXIF) are ignored, alpha is dropped, grey becomes RGB, 16 bits become 8.
-"""
+"""What a request must be before its body is looked at as an image: `mtlnet.images` does that."""
 
 from collections.abc import AsyncIterator, Mapping
-from dataclasses import dataclass
-from typing import Protocol
 
-import cv2
-import numpy as np
-import simplejpeg
-from numpy.typing import NDArray
-
-from serve import png
-from serve.problems import (
-    BODY_TOO_LARGE,
-    DAMAGED_IMAGE,
-    IMAGE_ASPECT,
-    IMAGE_SIZE,
-    NOT_AN_IMAGE,
-    UNSUPPORTED_IMAGE,
-    UNSUPPORTED_TYPE,
-    Problem,
-)
+from serve.problems import BODY_TOO_LARGE, UNSUPPORTED_TYPE, Problem
 
 MAX_BODY_BYTES = 4 * 1024 * 1024
-MIN_SIDE_PX, MAX_SIDE_PX, MAX_PIXELS = 16, 4096, 8_400_000
-MAX_SCANS = 100  # a progressive JPEG has about ten; each more costs a pass over all pixels
-ASPECT_TOLERANCE = 0.01
 MEDIA_TYPES = ("image/jpeg", "image/png")
-JPEG_SIGNATURE = b"\xff\xd8\xff"
-JPEG_SCAN = b"\xff\xda"
-
-
-class View(Protocol):
-    """The size of the image a model takes, px."""
-
-    @property
-    def width(self) -> int: ...
-
-    @property
-    def height(self) -> int: ...
-
-
-@dataclass(frozen=True, slots=True)
-class ImageHeader:
-    """What an image says of itself; `png_header` is set for a PNG."""
-
-    width: int
-    height: int
-    png_header: png.PngHeader | None = None
 
 
 def check_headers(headers: Mapping[str, str]) -> None:
@@ -89,96 +44,3 @@ def _too_large(seen: str) -> Problem:
         f"the body has {seen}, at most {MAX_BODY_BYTES} are taken; send a smaller image or "
         "compress it more",
     )
-
-
-def inspect(body: bytes, view: View) -> ImageHeader:
-    """The header of an image that may be decoded for a model of this view. Raises Problem."""
-    if body.startswith(png.SIGNATURE):
-        found = png.read_header(body)
-        header = ImageHeader(found.width, found.height, found)
-    elif body.startswith(JPEG_SIGNATURE):
-        header = _inspect_jpeg(body)
-    else:
-        seen = f"{len(body)} bytes that begin with {body[:8]!r}" if body else "nothing at all"
-        raise Problem(NOT_AN_IMAGE, f"the body holds {seen}; post the bytes of a JPEG or PNG file")
-    _check_size(header)
-    _check_aspect(header, view)
-    return header
-
-
-def _inspect_jpeg(body: bytes) -> ImageHeader:
-    try:
-        # The decoder's own reading of the header: it cannot differ from what it decodes later.
-        height, width, colours, _ = simplejpeg.decode_jpeg_header(body)
-    except ValueError as error:
-        raise _damaged_jpeg(error) from error
-    if colours not in ("Gray", "YCbCr", "RGB"):
-        raise Problem(UNSUPPORTED_IMAGE, f"the JPEG's colours are {colours}; save it in RGB")
-    scans = body.count(JPEG_SCAN)
-    if scans > MAX_SCANS:
-        raise Problem(UNSUPPORTED_IMAGE, f"the JPEG has {scans} scans; save it as baseline JPEG")
-    return ImageHeader(width, height)
-
-
-def _check_size(header: ImageHeader) -> None:
-    width, height = header.width, header.height
-    sides = min(width, height) >= MIN_SIDE_PX and max(width, height) <= MAX_SIDE_PX
-    if not sides or width * height > MAX_PIXELS:
-        raise Problem(
-            IMAGE_SIZE,
-            f"the image is {width} x {height} px; {MIN_SIDE_PX} to {MAX_SIDE_PX} px a side and at "
-            f"most {MAX_PIXELS / 1e6:.1f} million px are taken: scale it to the model's camera "
-            "(GET /model)",
-        )
-
-
-def _check_aspect(header: ImageHeader, view: View) -> None:
-    """A stretched or cropped view would give wrong metres without a sign of it: refused."""
-    stretch = header.width * view.height / (header.height * view.width)
-    if abs(stretch - 1.0) > ASPECT_TOLERANCE:
-        raise Problem(
-            IMAGE_ASPECT,
-            f"the image is {header.width} x {header.height} px (width / height "
-            f"{header.width / header.height:.3f}), the model's camera gives {view.width} x "
-            f"{view.height} ({view.width / view.height:.3f}); send the whole view of a camera "
-            "mounted as GET /model says, at any size of that shape",
-        )
-
-
-def decode(body: bytes, header: ImageHeader, view: View) -> NDArray[np.uint8]:
-    """The image as uint8 RGB (view.height, view.width, 3), area-averaged to it. Raises Problem."""
-    image = (
-        _decode_jpeg(body) if header.png_header is None else _decode_png(body, header.png_header)
-    )
-    if image.shape != (header.height, header.width, 3):
-        raise Problem(
-            DAMAGED_IMAGE,
-            f"the image decodes to {image.shape[1]} x {image.shape[0]} px, its header says "
-            f"{header.width} x {header.height}; send it anew",
-        )
-    if (header.width, header.height) == (view.width, view.height):
-        return image
-    shrinks = header.width > view.width
-    method = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
-    scaled = cv2.resize(image, (view.width, view.height), interpolation=method)
-    return scaled.astype(np.uint8, copy=False)
-
-
-def _decode_jpeg(body: bytes) -> NDArray[np.uint8]:
-    try:
-        image: NDArray[np.uint8] = simplejpeg.decode_jpeg(body, colorspace="RGB", strict=True)
-    except ValueError as error:
-        raise _damaged_jpeg(error) from error
-    return image
-
-
-def _decode_png(body: bytes, header: png.PngHeader) -> NDArray[np.uint8]:
-    checked = png.critical_chunks(body, header)
-    image = cv2.imdecode(np.frombuffer(checked, np.uint8), cv2.IMREAD_COLOR)
-    if image is None:
-        raise Problem(DAMAGED_IMAGE, "the PNG cannot be decoded; save it anew")
-    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB).astype(np.uint8, copy=False)
-
-
-def _damaged_jpeg(error: ValueError) -> Problem:
-    return Problem(DAMAGED_IMAGE, f"the JPEG cannot be decoded ({error}); send the whole file anew")

@@ -15,7 +15,7 @@ from typing import TypeVar
 
 from mtlnet.answer import Answer, interpret
 from mtlnet.engine import Engine
-from serve.gate import ImageHeader, decode
+from mtlnet.images import ImageHeader, decode
 from serve.problems import NOT_READY, OVERLOADED, Problem
 
 QUEUE = 4  # frames that may wait while one is answered
@@ -56,7 +56,10 @@ class Perceiver:
             raise Problem(NOT_READY, f"the model failed its check and answers nothing: {fault}")
 
     async def perceive(self, body: bytes, header: ImageHeader) -> Perceived:
-        """What the model sees in an image that passed `serve.gate.inspect`. Raises Problem."""
+        """What the model sees in an image that passed `mtlnet.images.inspect`.
+
+        Raises Problem, ImageError.
+        """
         self.check_ready()
         return await self._in_thread(lambda: self._perceive(body, header))
 

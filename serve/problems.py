@@ -11,8 +11,10 @@ from typing import Any
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from starlette.exceptions import HTTPException
+from starlette.requests import ClientDisconnect
 from starlette.responses import Response
 
+from mtlnet.image_error import Fault, ImageError
 from trackfeatures.errors import UserError
 
 MEDIA_TYPE = "application/problem+json"
@@ -61,6 +63,19 @@ KINDS = (
     METHOD_NOT_ALLOWED,
     INTERNAL,
 )
+IMAGE_KINDS = {
+    Fault.NOT_AN_IMAGE: NOT_AN_IMAGE,
+    Fault.DAMAGED: DAMAGED_IMAGE,
+    Fault.UNSUPPORTED: UNSUPPORTED_IMAGE,
+    Fault.SIZE: IMAGE_SIZE,
+    Fault.ASPECT: IMAGE_ASPECT,
+}
+# What a client of this service can do about it, beside what the image's reader says.
+HINTS = {
+    NOT_AN_IMAGE: "; post the bytes of the file itself",
+    IMAGE_SIZE: " (GET /model)",
+    IMAGE_ASPECT: " (GET /model says how it is mounted)",
+}
 RETRY_AFTER = {"Retry-After": "1"}  # whole seconds, the header's unit
 
 
@@ -71,6 +86,12 @@ class Problem(UserError):
         super().__init__(detail)
         self.kind = kind
         self.detail = detail
+
+
+def image_problem(error: ImageError) -> Problem:
+    """The problem that an unreadable image is here."""
+    kind = IMAGE_KINDS[error.fault]
+    return Problem(kind, f"{error}{HINTS.get(kind, '')}")
 
 
 def respond(kind: Kind, detail: str, headers: dict[str, str] | None = None) -> Response:
@@ -88,6 +109,8 @@ def _response(
 def install(app: FastAPI) -> None:
     """Make every error that leaves `app` a problem, those of the framework included."""
     app.add_exception_handler(Problem, _on_problem)
+    app.add_exception_handler(ImageError, _on_image_error)
+    app.add_exception_handler(ClientDisconnect, _on_departure)
     app.add_exception_handler(HTTPException, _on_http_exception)
     app.add_exception_handler(RequestValidationError, _on_validation_error)
     app.add_exception_handler(Exception, _on_failure)
@@ -97,6 +120,16 @@ def _on_problem(_request: Request, error: Exception) -> Response:
     assert isinstance(error, Problem)
     headers = RETRY_AFTER if error.kind.status == 503 else None
     return respond(error.kind, error.detail, headers)
+
+
+def _on_image_error(request: Request, error: Exception) -> Response:
+    assert isinstance(error, ImageError)
+    return _on_problem(request, image_problem(error))
+
+
+def _on_departure(_request: Request, _error: Exception) -> Response:
+    """A client that left in mid-upload is no failure of the service; nobody reads this answer."""
+    return respond(INVALID_REQUEST, "the client left before its image was whole")
 
 
 def _on_http_exception(request: Request, error: Exception) -> Response:

@@ -12,8 +12,10 @@ from mtlnet.golden import golden_image
 
 WARM_UP_RUNS = 3  # the first runs allocate and choose kernels
 # Largest difference of any output (coded, or a probability) from the published answer: about
-# what rounding in that precision makes of it, far below what damaged weights do.
-TOLERANCE = {"f32": 2e-3, "bf16": 0.1}
+# what rounding in that precision makes of it, far below what damaged weights do. Measured with
+# bf16 against f32 on a model trained for ten minutes: 0.0002 on the golden image; on 1500 test
+# frames 0.0003 in the median, 0.018 at most (a probability between two headings).
+TOLERANCE = {"f32": 2e-3, "bf16": 0.03}
 
 
 def warm_up(engine: Engine) -> None:

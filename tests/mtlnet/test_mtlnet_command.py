@@ -90,9 +90,9 @@ def test_what_is_no_image(published: Path, tmp_path: Path) -> None:
     wide.write_bytes(simplejpeg.encode_jpeg(np.zeros((100, 280, 3), np.uint8)))
     for path, seen in [
         (tmp_path / "none.jpg", "there is no image file"),
-        (text, "is no JPEG or PNG image"),
-        (cut, "is damaged"),
-        (wide, "is 280 x 100; the model sees 280 x 210"),
+        (text, "a.jpg: no JPEG or PNG file, but 19 bytes"),
+        (cut, "b.jpg: the JPEG cannot be decoded"),
+        (wide, "c.jpg: the image is 280 x 100 px"),
     ]:
         assert seen in refused("predict", "--model", published, path)
 

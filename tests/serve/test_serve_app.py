@@ -1,6 +1,7 @@
 """The service over HTTP: its answers, its problems, its readiness, and how it bears a crowd."""
 
 import json
+import socket
 import subprocess
 import sys
 import threading
@@ -141,6 +142,19 @@ def test_a_failing_engine_is_a_problem_without_our_insides(
     assert service.post(JPEG).status == 200
 
 
+def test_a_client_that_leaves_in_mid_upload_is_no_failure(
+    service: Served, caplog: pytest.LogCaptureFixture
+) -> None:
+    for _ in range(3):
+        with socket.create_connection(("127.0.0.1", service.port)) as connection:
+            head = "POST /features HTTP/1.1\r\nHost: x\r\nContent-Type: image/jpeg\r\n"
+            connection.sendall(f"{head}Content-Length: {len(JPEG)}\r\n\r\n".encode() + JPEG[:99])
+            time.sleep(0.05)
+    time.sleep(0.2)
+    assert service.post(JPEG).status == 200
+    assert [record for record in caplog.records if record.levelname == "ERROR"] == []
+
+
 def test_mutated_images_never_break_it(service: Served) -> None:
     rng = np.random.default_rng(20)
     statuses = set()
@@ -190,6 +204,12 @@ def test_never_ready_with_another_answer_than_the_published() -> None:
     for wrong in (right + np.float32(0.01), right * np.float32(np.nan), right[:8]):
         with pytest.raises(ModelError):
             warm_up(always(wrong))
+    rounded = always(right + np.float32(0.02))
+    rounded.precision = "bf16"
+    warm_up(rounded)
+    rounded.respond = lambda _image: right + np.float32(0.04)
+    with pytest.raises(ModelError, match=r"at most 0\.03 is expected in bf16"):
+        warm_up(rounded)
     with serving(always(right + np.float32(0.01)), warm_up) as service:
         time.sleep(0.1)
         reply = service.ask("GET", "/readyz")

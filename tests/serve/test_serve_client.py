@@ -127,7 +127,23 @@ def test_something_else_at_the_address(sent: bytes, message: str) -> None:
         Client(url).model()
 
 
-@pytest.mark.parametrize("url", ["", "ftp://x:1", "http://", "http://x:port", "http://x:99999"])
+@pytest.mark.parametrize(
+    "url",
+    [
+        "",
+        "ftp://x:1",
+        "http://",
+        "http://x:port",
+        "http://x:99999",
+        "http://[::1",
+        "http://exa..mple:8000",
+        f"http://{'x' * 64}.org",
+        "http://host/\xe4",
+        "http://host/a b",
+        "http://a b",
+        "http://a\0b",
+    ],
+)
 def test_what_is_no_address(url: str) -> None:
     with pytest.raises(ServiceError, match="no address of a service"):
         Client(url)

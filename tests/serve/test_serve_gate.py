@@ -1,4 +1,4 @@
-"""What the gate lets pass, with which pixels, and what it refuses, with which problem."""
+"""Which images pass, with which pixels, and which are refused, with which problem."""
 
 import struct
 import zlib
@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 import simplejpeg
 
+from mtlnet import images
 from mtlnet.card import Camera
-from serve import gate
+from mtlnet.image_error import ImageError
 from serve.problems import (
     DAMAGED_IMAGE,
     IMAGE_ASPECT,
@@ -18,6 +19,7 @@ from serve.problems import (
     UNSUPPORTED_IMAGE,
     Kind,
     Problem,
+    image_problem,
 )
 from tests.serve.conftest import jpeg, picture, png
 
@@ -25,13 +27,13 @@ VIEW = Camera()
 
 
 def pixels(body: bytes) -> np.ndarray:
-    return gate.decode(body, gate.inspect(body, VIEW), VIEW)
+    return images.decode(body, images.inspect(body, VIEW), VIEW)
 
 
 def refusal(body: bytes) -> Problem:
-    with pytest.raises(Problem) as caught:
+    with pytest.raises(ImageError) as caught:
         pixels(body)
-    return caught.value
+    return image_problem(caught.value)
 
 
 def chunk(kind: bytes, data: bytes) -> bytes:
@@ -144,7 +146,7 @@ JPEG, PNG = jpeg(picture()), png(picture())
         (handmade_png(extra=chunk(b"abCd", b"") * 10_000), UNSUPPORTED_IMAGE),
         (handmade_png(depth=3), UNSUPPORTED_IMAGE),
         (handmade_png(interlace=2), UNSUPPORTED_IMAGE),
-        (JPEG[:-2] + gate.JPEG_SCAN * 101, UNSUPPORTED_IMAGE),
+        (JPEG[:-2] + images.JPEG_SCAN * 101, UNSUPPORTED_IMAGE),
         (bytes(simplejpeg.encode_jpeg(picture(channels=4), 95, "CMYK")), UNSUPPORTED_IMAGE),
         (jpeg(picture(12, 9)), IMAGE_SIZE),
         (jpeg(picture(4104, 3078)), IMAGE_SIZE),

@@ -9,7 +9,7 @@ import struct
 import zlib
 from dataclasses import dataclass
 
-from serve.problems import DAMAGED_IMAGE, UNSUPPORTED_IMAGE, Problem
+from mtlnet.image_error import Fault, ImageError
 
 SIGNATURE = b"\x89PNG\r\n\x1a\n"
 MAX_CHUNKS = 10_000  # 4 MiB in the 8 KiB chunks that encoders write are 512
@@ -51,16 +51,16 @@ class PngHeader:
 
 
 def read_header(body: bytes) -> PngHeader:
-    """The header of a PNG that starts with SIGNATURE. Raises Problem."""
+    """The header of a PNG that starts with SIGNATURE. Raises ImageError."""
     start = len(SIGNATURE)
     if len(body) < start + 25 or body[start : start + 8] != b"\x00\x00\x00\x0dIHDR":
-        raise Problem(DAMAGED_IMAGE, "the PNG does not begin with its header (IHDR); send it anew")
+        raise ImageError(Fault.DAMAGED, "the PNG does not begin with IHDR; save it anew")
     width, height, depth, colour, compression, filtering, interlace = struct.unpack_from(
         ">IIBBBBB", body, start + 8
     )
     if depth not in DEPTHS.get(colour, ()) or compression or filtering or interlace > 1:
-        raise Problem(
-            UNSUPPORTED_IMAGE,
+        raise ImageError(
+            Fault.UNSUPPORTED,
             f"the PNG's header asks for colour type {colour} with {depth} bits, compression "
             f"{compression}, filter {filtering}, interlace {interlace}, which PNG does not know",
         )
@@ -68,7 +68,10 @@ def read_header(body: bytes) -> PngHeader:
 
 
 def critical_chunks(body: bytes, header: PngHeader) -> bytes:
-    """The same image with nothing but header, palette and pixels, all checked. Raises Problem."""
+    """The same image with nothing but header, palette and pixels, all checked.
+
+    Raises ImageError.
+    """
     kept: list[bytes | memoryview] = [SIGNATURE]
     pixels: list[memoryview] = []
     view = memoryview(body)
@@ -80,14 +83,14 @@ def critical_chunks(body: bytes, header: PngHeader) -> bytes:
             if kind == b"IDAT":
                 pixels.append(view[at + 8 : end - 4])
         elif not kind[0] & 0x20:  # bit 5 clear: a decoder that does not know it must stop
-            raise Problem(
-                UNSUPPORTED_IMAGE, f"the PNG needs the unknown chunk {kind!r}; save it as plain PNG"
+            raise ImageError(
+                Fault.UNSUPPORTED, f"the PNG needs the unknown chunk {kind!r}; save it as plain PNG"
             )
         if kind == b"IEND":
             break
         at = end
     else:
-        raise Problem(UNSUPPORTED_IMAGE, f"the PNG has more than {MAX_CHUNKS} chunks; save it anew")
+        raise ImageError(Fault.UNSUPPORTED, f"the PNG has over {MAX_CHUNKS} chunks; save it anew")
     _check_pixels(b"".join(pixels), header)
     return b"".join(kept)
 
@@ -95,19 +98,19 @@ def critical_chunks(body: bytes, header: PngHeader) -> bytes:
 def _check_chunk(view: memoryview, at: int) -> tuple[int, bytes]:
     """(end, type) of the chunk that begins at byte `at`."""
     if at + 12 > len(view):
-        raise Problem(
-            DAMAGED_IMAGE,
-            f"the PNG ends after {len(view)} bytes, before its end mark; send the whole file",
+        raise ImageError(
+            Fault.DAMAGED,
+            f"the PNG ends after {len(view)} bytes, before its end mark; give the whole file",
         )
     length = int.from_bytes(view[at : at + 4], "big")
     end = at + 12 + length
     if end > len(view):
-        raise Problem(
-            DAMAGED_IMAGE,
-            f"the PNG has {len(view)} bytes, a chunk of it reaches to {end}; send the whole file",
+        raise ImageError(
+            Fault.DAMAGED,
+            f"the PNG has {len(view)} bytes, a chunk of it reaches to {end}; give the whole file",
         )
     if zlib.crc32(view[at + 4 : end - 4]) != int.from_bytes(view[end - 4 : end], "big"):
-        raise Problem(DAMAGED_IMAGE, f"the PNG's checksum at byte {at} is wrong; send it anew")
+        raise ImageError(Fault.DAMAGED, f"the PNG's checksum at byte {at} is wrong; save it anew")
     return end, bytes(view[at + 4 : at + 8])
 
 
@@ -118,15 +121,15 @@ def _check_pixels(compressed: bytes, header: PngHeader) -> None:
         # Never more than the header promised: the limit on dimensions is then one on memory.
         raw = inflater.decompress(compressed, expected + 1)
     except zlib.error as error:
-        raise Problem(
-            DAMAGED_IMAGE, f"the PNG's pixels do not inflate ({error}); send it anew"
+        raise ImageError(
+            Fault.DAMAGED, f"the PNG's pixels do not inflate ({error}); save it anew"
         ) from error
     if len(raw) != expected or not inflater.eof:
         seen = f"more than {expected}" if len(raw) > expected else f"{len(raw)} of {expected}"
-        raise Problem(DAMAGED_IMAGE, f"the PNG holds {seen} bytes of pixels; send it anew")
+        raise ImageError(Fault.DAMAGED, f"the PNG holds {seen} bytes of pixels; save it anew")
     at = 0
     for rows, row_bytes in header.passes():
         size = rows * (1 + row_bytes)
         if max(raw[at : at + size : 1 + row_bytes]) >= FILTERS:
-            raise Problem(DAMAGED_IMAGE, "the PNG has a row of an unknown filter; send it anew")
+            raise ImageError(Fault.DAMAGED, "the PNG has a row of an unknown filter; save it anew")
         at += size
