@@ -65,8 +65,8 @@ def snapshot(
     out: Annotated[Path, typer.Option(help="PNG file to write.")],
     lanes: Annotated[int, typer.Option(help="Number of lanes, 1 to 3.")] = 2,
     lane_width: Annotated[float, typer.Option(help="Metres, 3.0 to 4.5.")] = LANE_WIDTH_M,
-    seed: Annotated[int, typer.Option(help="Fixes scenery, light and places.")] = 0,
-    traffic: Annotated[int, typer.Option(help="Number of other cars, 0 to 12.")] = 3,
+    seed: Annotated[int, typer.Option(help="Fixes scenery, light and places.", min=0)] = 0,
+    traffic: Annotated[int, typer.Option(help="Number of other cars.", min=0, max=12)] = 3,
     tracks_dir: TracksDir = None,
 ) -> None:
     """Write a contact sheet of views, the true markings drawn over them."""

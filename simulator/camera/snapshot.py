@@ -14,6 +14,7 @@ from simulator.camera import overlay
 from simulator.camera.camera import Camera
 from simulator.camera.light import KINDS, Light
 from simulator.car import CarParameters
+from simulator.files import check_folder, write_whole
 from simulator.track.road import Road
 from trackfeatures.errors import UserError
 
@@ -40,10 +41,12 @@ def write_contact_sheet(road: Road, out: Path, *, seed: int, traffic: int) -> No
     """Write a PNG of driver views at places all round `road`, one chase and one top view.
 
     The right half of each picture has the true markings drawn thinly over the painted ones.
-    Raises UserError if the file cannot be written as PNG, OSError if it cannot be written.
+    An older file stays as it is until the new one is complete. Raises UserError if the file cannot
+    be written as PNG or has no folder, OSError if it cannot be written.
     """
     if out.suffix.lower() != ".png":
         raise UserError(f"{out}: the contact sheet is a PNG file; give a name that ends in .png")
+    check_folder(out)  # before the pictures, which take a while
     shots = _shots(road, np.random.default_rng([seed, 10]))
     pictures: list[Picture | None] = [None] * len(shots)
     for kind in dict.fromkeys(shot.light for shot in shots):
@@ -58,7 +61,7 @@ def write_contact_sheet(road: Road, out: Path, *, seed: int, traffic: int) -> No
     done, png = cv2.imencode(".png", cv2.cvtColor(np.vstack(rows), cv2.COLOR_RGB2BGR))
     if not done:
         raise UserError(f"{out}: the contact sheet could not be coded as PNG")
-    out.write_bytes(png.tobytes())
+    write_whole(out, png.tobytes())
 
 
 def take(camera: Camera, road: Road, shot: Shot, traffic: int, rng: np.random.Generator) -> Picture:

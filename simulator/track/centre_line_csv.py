@@ -11,6 +11,7 @@ from typing import Final
 import numpy as np
 from scipy.interpolate import splev, splprep
 
+from simulator.files import write_whole
 from simulator.track.errors import TrackError
 from simulator.track.geometry import Track
 from simulator.track.markings import imported_style
@@ -163,19 +164,3 @@ def write_centre_line(track: Track, step: float, path: Path) -> int:
     rows = np.column_stack((s, pose.x, pose.y, pose.z, pose.heading, pose.curvature))
     write_whole(path, HEADER + "".join(ROW % tuple(row) for row in rows))
     return len(s)
-
-
-def write_whole(path: Path, text: str) -> None:
-    """Write a text file in one go: an older one stays as it is until the new one is complete."""
-    if path.exists() and not path.is_file():
-        # A pipe or /dev/stdout cannot be replaced, and must not be.
-        path.write_text(text)
-        return
-    if not path.parent.is_dir():
-        raise UserError(f"there is no folder {path.parent} to write {path.name} to; make it first")
-    partial = path.with_name(path.name + ".partial")
-    try:
-        partial.write_text(text)
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)

@@ -226,6 +226,7 @@ def test_contact_sheet(road: Road, tmp_path: Path) -> None:
     assert sheet.shape == (4 * 360, 4 * 480, 3)
     with pytest.raises(UserError, match=r"ends in \.png"):
         write_contact_sheet(road, tmp_path / "sheet.gif", seed=0, traffic=0)
+    assert list(tmp_path.iterdir()) == [out]
 
 
 def test_a_track_of_unknown_look_gets_a_countryside(road: Road) -> None:

@@ -52,6 +52,11 @@ def test_centre_line_of_a_file(tmp_path: Path) -> None:
         (("centreline", "oval", "--out", "/no/such/folder/x.csv"), "/no/such/folder"),
         (("centreline", "oval", "--step", "0", "--out", "x.csv"), "step 0"),
         (("centreline", "oval", "--out", "/dev/full"), "the disk is full"),
+        (("centreline", "oval", "--out", "/tmp"), "/tmp is a folder"),
+        (
+            ("snapshot", "oval", "--out", "/no/such/folder/x.png"),
+            "there is no folder /no/such/folder",
+        ),
         (("tracks", "--tracks-dir", "/no/such/folder"), "/no/such/folder"),
     ],
 )
@@ -62,6 +67,16 @@ def test_mistakes_end_in_one_line(arguments: tuple[str, ...], said: str) -> None
     assert len(done.stderr.splitlines()) == 1
     assert said in done.stderr
     assert done.stdout == ""
+
+
+@pytest.mark.parametrize("option", [("--seed", "-1"), ("--traffic", "-1"), ("--traffic", "500")])
+def test_a_snapshot_out_of_range(tmp_path: Path, option: tuple[str, str]) -> None:
+    done = simulator("snapshot", "oval", "--out", str(tmp_path / "x.png"), *option)
+    assert done.returncode == 2
+    assert "Traceback" not in done.stderr
+    assert option[0] in done.stderr
+    assert "or equal to" in done.stderr
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_torcs_variable_may_name_either_folder(
