@@ -30,7 +30,15 @@ class Sensor:
     noise: float = 0.0
     """Standard deviation of the added normal noise, in `unit`; 0 is a perfect sensor."""
 
+    limits: tuple[float, float] | None = None
+    """Least and largest valid reading. Noise stays within them, and leaves a reading outside them,
+    such as the range meter's -1 off the track, as it is."""
+
     def __post_init__(self) -> None:
+        if self.limits is not None and not self.limits[0] < self.limits[1]:
+            raise UserError(
+                f"sensor {self.name!r} has the limits {self.limits}; give the least reading first"
+            )
         if not (np.isfinite(self.noise) and self.noise >= 0.0):
             raise UserError(
                 f"sensor {self.name!r} has noise {self.noise}; give a standard deviation of 0 "
@@ -83,6 +91,10 @@ def _noisy(sensor: Sensor, world: World, rng: np.random.Generator) -> Reading:
     reading = sensor.read(world)
     if sensor.noise == 0.0:
         return reading
-    if isinstance(reading, float):
-        return reading + float(rng.normal(0.0, sensor.noise))
-    return reading + rng.normal(0.0, sensor.noise, size=np.shape(reading))
+    exact = np.asarray(reading)
+    noisy = exact + rng.normal(0.0, sensor.noise, size=exact.shape)
+    if sensor.limits is not None:
+        low, high = sensor.limits
+        valid = (low <= exact) & (exact <= high)
+        noisy = np.where(valid, np.clip(noisy, low, high), exact)
+    return noisy if isinstance(reading, np.ndarray) else float(noisy)

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from simulator.sensors.beams import BEAM_ANGLES, shorten_at_boxes, track_beams
+from simulator.sensors.beams import BEAM_ANGLES, RANGE_M, shorten_at_boxes, track_beams
 from simulator.sensors.sensor import Sensor
 from simulator.track.kernel import index_at
 from simulator.traffic import SIZE
@@ -37,8 +37,8 @@ def wheel(index: int) -> Callable[[World], float]:
 
 
 STANDARD: tuple[Sensor, ...] = (
-    Sensor("range", "m", read_track_range),
-    Sensor("range_traffic", "m", read_range),
+    Sensor("range", "m", read_track_range, limits=(0.0, RANGE_M)),
+    Sensor("range_traffic", "m", read_range, limits=(0.0, RANGE_M)),
     Sensor("angle", "rad", lambda world: world.state.angle),
     Sensor("speed", "km/h", lambda world: KMH * world.state.speed),
     Sensor("v_x", "km/h", lambda world: KMH * world.state.vx),

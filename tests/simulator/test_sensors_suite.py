@@ -134,7 +134,20 @@ def test_noise_is_off_by_default_seeded_and_of_the_size_asked_for() -> None:
     assert np.std(ranges) == pytest.approx(0.5, rel=0.05)
 
 
+def test_noise_keeps_to_the_range_meters_limits_and_to_its_sign_of_no_track() -> None:
+    with World(Road(find_track("oval"))) as world:
+        world.reset(seed=0, s=_straight(world.road))
+        suite = SensorSuite(STANDARD, seed=7, noise={"range": 300.0})
+        seen = np.array([suite.read(world)["range"] for _ in range(50)])
+        assert (seen.min(), seen.max()) == (0.0, 200.0)
+        while not world.step(Command(steer=1.0, throttle=1.0)).off_track:
+            pass
+        np.testing.assert_array_equal(suite.read(world)["range"], np.full(19, -1.0))
+
+
 def test_bad_sensors_are_refused() -> None:
+    with pytest.raises(UserError, match=r"limits \(1\.0, 0\.0\)"):
+        Sensor("x", "m", lambda _: 0.0, limits=(1.0, 0.0))
     with pytest.raises(UserError, match="share a name"):
         SensorSuite([*STANDARD, STANDARD[0]])
     with pytest.raises(UserError, match="no_such"):
