@@ -36,7 +36,7 @@ def drive(
         int | None, typer.Option(help="Control steps of 50 ms [default: about one lap]")
     ] = None,
     log: Annotated[Path | None, typer.Option(help="Write the drive to this CSV file.")] = None,
-    model: Annotated[str, typer.Option(help="Run for perception model.")] = "latest",
+    model: Annotated[str, typer.Option(help="Run for perception model.")] = "default",
     start_d: Annotated[
         float | None, typer.Option(help="Start this far left of the track's centre, m.")
     ] = None,
@@ -55,6 +55,7 @@ def drive(
     Gear 1 and the throttle are held, but for slower traffic ahead. The score is a sum over the
     steps asked for; leaving the track, turning round or a collision ends the drive.
     """
+    from rich.markup import escape
     from rich.progress import MofNCompleteColumn, Progress
 
     from controllers.trip import DriveConfig
@@ -78,7 +79,7 @@ def drive(
     )
     columns = (*Progress.get_default_columns(), MofNCompleteColumn())
     with Progress(*columns, console=_stderr(), transient=True) as bar:
-        task = bar.add_task(f"{controller} on {track}", total=None)
+        task = bar.add_task(escape(f"{controller} on {track}"), total=None)
         result = drive_trip(
             config, lambda done, total: bar.update(task, completed=done, total=total)
         )
@@ -132,13 +133,15 @@ def _stderr() -> "Console":
 
 def _show(config: "DriveConfig", result: "DriveResult") -> None:
     from rich.console import Console
+    from rich.markup import escape
     from rich.table import Table
 
-    table = Table(title=f"{config.controller} on {config.track}, perception {config.perception}")
+    title = f"{config.controller} on {config.track}, perception {config.perception}"
+    table = Table(title=escape(title))
     table.add_column("figure")
     table.add_column("value", justify="right")
     for name, value in result.as_json().items():
-        table.add_row(name, _shown(value))
+        table.add_row(name, escape(_shown(value)))
     Console().print(table)
     if config.log is not None:
         typer.echo(f"log: {config.log}")

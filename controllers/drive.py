@@ -13,7 +13,7 @@ from controllers.observation import Controller, Observation
 from controllers.perception import Perceived
 from controllers.result import DriveResult
 from simulator.idm import idm_acceleration
-from simulator.reward import step_reward
+from simulator.reward import ending, step_reward
 from simulator.state import CarState, Command
 from simulator.track.road import Road
 from simulator.traffic import Traffic
@@ -72,13 +72,12 @@ def run_lap(
         after = world.step(Command(steer=steer, throttle=pedal, brake=brake, gear=GEAR))
         offsets.append(abs(after.to_middle - lane_centre))
         speeds.append(after.speed_kmh)
-        ended = _ending(after)
+        ended = ending(after)
         score += step_reward(
             after.angle,
             after.to_middle,
             world.road.half_width,
-            off_track=ended is not None,
-            backwards=False,
+            ended=ended is not None,
         )
         if ended is not None:
             break
@@ -140,13 +139,3 @@ def _observe(now: CarState, seen: Perceived, memory: OffsetMemory) -> Observatio
         yaw_rate=now.yaw_rate,
         curvature=seen.curvature,
     )
-
-
-def _ending(state: CarState) -> str | None:
-    # Rails stand half a metre beyond the edge: a body that touches one has left the track, though
-    # the centre of gravity, by which the edge is judged, cannot get there any more.
-    if state.off_track or state.collision == "wall":
-        return "off_track"
-    if state.backwards:
-        return "backwards"
-    return "collision" if state.collision == "traffic" else None

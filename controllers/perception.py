@@ -3,6 +3,7 @@
 Each is a function of the world as it stands; a fake in a test is a lambda.
 """
 
+import math
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -135,12 +136,19 @@ def read_answer(answer: dict[str, Any]) -> Perceived:
         classes = answer["heading"]
         likeliest = max(Heading, key=lambda heading: float(classes[heading.name.lower()]))
         to_lane_centre = None if offset is None else float(offset)
+        _finite(angle, to_lane_centre or 0.0, *(float(classes[h.name.lower()]) for h in Heading))
     except (KeyError, TypeError, ValueError) as error:
         raise UserError(
-            f"the service's answer lacks to_lane_centre_m, angle_rad or heading ({error!r}); "
-            "is it a perception service of this version?"
+            "the service's answer lacks to_lane_centre_m, angle_rad or heading in finite numbers "
+            f"({error!r}); is it a perception service of this version?"
         ) from error
     return Perceived(to_lane_centre, angle, likeliest)
+
+
+def _finite(*values: float) -> None:
+    # A NaN passes every comparison that would stop it, and would steer to full lock.
+    if not all(map(math.isfinite, values)):
+        raise ValueError(f"{values} are not all finite")
 
 
 class Eyes:

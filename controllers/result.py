@@ -31,7 +31,7 @@ class DriveResult:
     noisy: bool
     """Whether noise was added to the state."""
     ended: str | None
-    """Why it ended early: off_track (the rails count), backwards, or collision (with a car)."""
+    """Why it ended early: off_track (touching a wall too), backwards, or collision (with a car)."""
 
     def as_json(self) -> dict[str, Any]:
         values = asdict(self)

@@ -16,6 +16,7 @@ from controllers.log import DriveLog
 from controllers.perception import open_eyes
 from controllers.registry import Setting, make_controller
 from controllers.result import DriveResult
+from simulator.camera import check_light
 from simulator.state import CarState
 from simulator.track.catalogue import find_track
 from simulator.track.road import Road
@@ -40,8 +41,8 @@ class DriveConfig:
     steps: int | None = None
     """Control steps of 50 ms; None: the track's scored number, else about one lap."""
     log: Path | None = None
-    model: str = "latest"
-    """The run that perception `model` drives with."""
+    model: str = "default"
+    """The run that perception `model` drives with; default: the shipped one, else the latest."""
     start_d: float | None = None
     """m left of the track's centre; None: the middle of the target lane, or 0 without one."""
     target_lane: int | None = None
@@ -67,6 +68,7 @@ def drive(config: DriveConfig, progress: Callable[[int, int], None] | None = Non
     The log is written row by row, so what was driven is kept whatever happens. Raises UserError
     for what cannot be: an unknown name, a lane or place that is not there, a service that is down.
     """
+    check_light(config.light)  # the truth needs none, but a misspelt one is a mistake all the same
     track = find_track(config.track, config.tracks_dir)
     road = Road(track, lanes=config.lanes)
     lane = choose_lane(config, road)

@@ -7,7 +7,8 @@
     gymnasium.make("driverview/DriverView-v0", track="forza", controls="full")
 
 An episode starts 25 m before the line, at rest, unless `reset(options={"s", "to_middle", "angle",
-"speed"})` says otherwise; it ends off the track or backwards, and is cut after 6500 steps.
+"speed"})` says otherwise; it ends off the track, backwards or in a collision, and is cut after
+6500 steps.
 """
 
 import math
@@ -23,7 +24,7 @@ from numpy.typing import NDArray
 import trackfeatures as tf
 from simulator.car import HIGHEST_GEAR, LOWEST_GEAR
 from simulator.registration import register_environments
-from simulator.reward import step_reward
+from simulator.reward import ending, step_reward
 from simulator.state import CarState, Command
 from simulator.track.catalogue import find_track
 from simulator.track.road import Road
@@ -98,6 +99,7 @@ class LateralControl(gym.Env[Any, Any]):
         )
         self.world = World(road, traffic=traffic, frequency_hz=frequency_hz)
         self.render_mode = render_mode
+        self.metadata = {**RENDERING, "render_fps": frequency_hz}
         self._weight, self._full = float(lambda_), controls == "full"
         self._picture = _camera_options(camera)
         self._camera: Camera | None = None
@@ -122,17 +124,16 @@ class LateralControl(gym.Env[Any, Any]):
         self, action: NDArray[np.float32]
     ) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         state = self.world.step(self._command(action))
+        ended = ending(state) is not None
         reward = step_reward(
             state.angle,
             state.to_middle,
             self.world.road.half_width,
-            state.off_track,
-            state.backwards,
+            ended,
             self._weight,
         )
         self._score += reward
         self._steps += 1
-        ended = state.off_track or state.backwards
         return self._observe(state), reward, ended, False, self._info(state)
 
     def render(self) -> NDArray[np.uint8] | None:
@@ -188,7 +189,7 @@ class LateralControl(gym.Env[Any, Any]):
             "speed_kmh": state.speed_kmh,
             "rpm": state.rpm,
             "collision": state.collision or "",
-            "ended": _reason(state),
+            "ended": ending(state) or "",
         }
 
     def _image(self) -> NDArray[np.uint8]:
@@ -223,7 +224,11 @@ def _camera_options(options: Mapping[str, Any]) -> CameraOptions:
     unknown = sorted(set(options) - set(known))
     if unknown:
         raise UserError(f"the environment has no option {', '.join(unknown)}; cameras take {known}")
-    return CameraOptions(**options)
+    from simulator.camera import check_light
+
+    picture = CameraOptions(**options)
+    check_light(picture.light)
+    return picture
 
 
 def _make_camera(road: Road, options: CameraOptions) -> "Camera":
@@ -245,13 +250,6 @@ def _action_space(full: bool) -> gym.Space[Any]:
         return gym.spaces.Box(-1.0, 1.0, (1,), np.float32)
     low = np.array([-1.0, 0.0, 0.0, LOWEST_GEAR], np.float32)
     return gym.spaces.Box(low, np.array([1.0, 1.0, 1.0, HIGHEST_GEAR], np.float32))
-
-
-def _reason(state: CarState) -> str:
-    """Why the episode ended, or the empty string while it goes on."""
-    if state.off_track:
-        return "off_track"
-    return "backwards" if state.backwards else ""
 
 
 register_environments()

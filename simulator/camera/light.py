@@ -41,8 +41,7 @@ class Light:
     @staticmethod
     def named(kind: str, rng: np.random.Generator) -> "Light":
         """A light of `kind` with what varies in it drawn from `rng`."""
-        if kind not in _MAKERS:
-            raise UserError(f"unknown light '{kind}'; the lights are {', '.join(KINDS)}")
+        check_light(kind)
         light = _MAKERS[kind](rng)
         return replace(light, exposure=float(np.exp(rng.uniform(-0.16, 0.16))))
 
@@ -55,6 +54,12 @@ class Light:
             level * math.sin(self.sun_azimuth),
             math.sin(self.sun_elevation),
         )
+
+
+def check_light(kind: str) -> None:
+    """Raises UserError unless `kind` is one of KINDS."""
+    if kind not in KINDS:
+        raise UserError(f"unknown light '{kind}'; the lights are {', '.join(KINDS)}")
 
 
 def _tinted(colour: Colour, rng: np.random.Generator, amount: float) -> Colour:

@@ -5,14 +5,17 @@ asphalt; the ribbon's skirts (see `ribbon`) cover the join.
 """
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from simulator.camera.look import Look
 from simulator.track.road import Road
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
 
 FloatArray = NDArray[np.float64]
 
@@ -35,7 +38,7 @@ class CentreLine:
     x: FloatArray
     y: FloatArray
     heading: FloatArray
-    tree: cKDTree
+    tree: "cKDTree"
 
     @classmethod
     def of(cls, road: Road) -> "CentreLine":
@@ -43,6 +46,8 @@ class CentreLine:
         length = road.track.length_m
         s = np.arange(0.0, length, length / max(8, round(length / SAMPLE_M)))
         pose = road.track.at(s)
+        from scipy.spatial import cKDTree  # costs 0.2 s, which a check of a light need not pay
+
         tree = cKDTree(np.stack([pose.x, pose.y], axis=1))
         return cls(s, pose.x, pose.y, pose.heading, tree)
 

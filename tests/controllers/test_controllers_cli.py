@@ -50,6 +50,8 @@ def test_a_service_that_is_down() -> None:
         (("--throttle", "2"), "throttle 2.0"),
         (("--steps", "0"), "0 steps"),
         (("--traffic", "99"), "99 traffic cars"),
+        (("--light", "bogus"), "unknown light 'bogus'"),
+        (("--track", "[/x]"), "there is no track '[/x]'"),
         (("--perception", "model", "--model", "no-such-run"), "no-such-run"),
         (("--log", "/no-such-folder/drive.csv"), "/no-such-folder/drive.csv"),
     ],

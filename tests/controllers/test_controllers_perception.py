@@ -64,6 +64,10 @@ def test_an_answer_is_read() -> None:
         {**ANSWER, "angle_rad": "north"},
         {**ANSWER, "heading": None},
         {**ANSWER, "to_lane_centre_m": "x"},
+        {**ANSWER, "to_lane_centre_m": float("nan")},
+        {**ANSWER, "angle_rad": float("nan")},
+        {**ANSWER, "angle_rad": float("-inf")},
+        {**ANSWER, "heading": {**ANSWER["heading"], "left": float("nan")}},
     ],
 )
 def test_what_is_no_answer_is_refused(answer: dict[str, Any]) -> None:

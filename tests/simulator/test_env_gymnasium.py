@@ -70,15 +70,14 @@ def test_throttle_and_gear_are_held_and_the_score_is_the_sum_of_rewards() -> Non
 
 
 def test_the_reward_by_hand() -> None:
-    assert step_reward(0.0, 0.0, 5.0, False, False) == 1.0
+    assert step_reward(0.0, 0.0, 5.0, ended=False) == 1.0
     expected = math.cos(0.2) - math.sin(0.2) - 0.3
-    assert step_reward(-0.2, 1.5, 5.0, False, False) == pytest.approx(expected)
-    assert step_reward(0.2, 1.5, 5.0, False, False, 0.5) == pytest.approx(
+    assert step_reward(-0.2, 1.5, 5.0, ended=False) == pytest.approx(expected)
+    assert step_reward(0.2, 1.5, 5.0, False, 0.5) == pytest.approx(
         math.cos(0.2) - 0.5 * math.sin(0.2) - 0.3
     )
-    assert step_reward(1.6, 0.0, 5.0, False, False) == -2.0
-    assert step_reward(0.0, 0.0, 5.0, True, False) == -2.0
-    assert step_reward(0.0, 0.0, 5.0, False, True) == -2.0
+    assert step_reward(1.6, 0.0, 5.0, ended=False) == -2.0
+    assert step_reward(0.0, 0.0, 5.0, ended=True) == -2.0
 
 
 def test_leaving_the_track_ends_the_episode_with_minus_two() -> None:
@@ -92,6 +91,28 @@ def test_leaving_the_track_ends_the_episode_with_minus_two() -> None:
     assert reward == -2.0
     assert info["ended"] == "off_track"
     env.close()
+
+
+def test_a_collision_ends_the_episode_with_minus_two() -> None:
+    env = make(track="oval", traffic=1, controls="full")
+    _, info = env.reset(seed=0, options={"speed": 20.0})
+    for _ in range(1500):
+        wheel = info["angle"] - 0.1 * info["to_middle"]
+        action = np.clip([wheel, 0.3, 0.0, 2.0], -1.0, 2.0).astype(np.float32)
+        _, reward, ended, _, info = env.step(action)
+        if ended:
+            break
+    assert ended
+    assert (reward, info["ended"], info["collision"]) == (-2.0, "collision", "traffic")
+    env.close()
+
+
+@pytest.mark.parametrize("frequency_hz", [10, 50])
+def test_recordings_play_at_the_speed_of_life(frequency_hz: int) -> None:
+    env = make(frequency_hz=frequency_hz)
+    assert env.metadata["render_fps"] == frequency_hz
+    env.close()
+    assert simulator.env.LateralControl.metadata["render_fps"] == 20
 
 
 def test_an_episode_is_cut_after_6500_steps() -> None:
@@ -156,6 +177,7 @@ def test_bad_actions_are_refused(action: list[float], message: str) -> None:
         ({"colour": "red"}, "colour"),
         ({"lambda_": math.nan}, "lambda_"),
         ({"traffic": 50}, "50 traffic cars"),
+        ({"light": "bogus"}, "unknown light 'bogus'"),
     ],
 )
 def test_bad_options_are_refused(options: dict[str, Any], message: str) -> None:
