@@ -68,7 +68,8 @@ def collect(
         sys.stderr.write("interrupted: finished rounds are kept; the same command goes on\n")
         raise typer.Exit(command.INTERRUPTED) from None
     line = (
-        f"{result.out}: {result.rounds} rounds, {result.frames} frames; recorded "
+        f"{result.out}: {_counted(result.rounds, 'round')}, "
+        f"{_counted(result.frames, 'frame')}; recorded "
         f"{result.recorded_frames} in {result.seconds:.1f} s, "
         f"{result.frames_per_second:.0f} a second"
     )
@@ -96,9 +97,10 @@ def verify(
         raise UserError(f"there is no level {level!r}; choose {', '.join(LEVELS)}")
     with Console(stderr=True).status(f"checking {folder}") as status:
         report = run(folder, level, lambda name: status.update(f"checked {name}"))
-    lines = [f"{folder}: {report.rounds} rounds, {report.frames} frames, level {level}: "]
-    lines[0] += "in order" if report.ok else f"{len(report.problems)} problems"
-    _print(report.as_json(), as_json, "\n".join([*lines, *report.problems]))
+    verdict = "in order" if report.ok else _counted(len(report.problems), "problem")
+    found = f"{_counted(report.rounds, 'round')}, {_counted(report.frames, 'frame')}"
+    line = f"{folder}: {found}, level {level}: {verdict}"
+    _print(report.as_json(), as_json, "\n".join([line, *report.problems]))
     if not report.ok:
         raise typer.Exit(1)
 
@@ -125,6 +127,10 @@ def _numbers(text: str) -> tuple[int, ...]:
         raise UserError(
             f"--lanes is {text!r}; give numbers with commas between, as 1,2,3"
         ) from error
+
+
+def _counted(count: int, noun: str) -> str:
+    return f"{count} {noun}{'' if count == 1 else 's'}"
 
 
 def _print(content: dict[str, Any], as_json: bool, line: str) -> None:

@@ -8,7 +8,7 @@ import json
 import os
 import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -16,7 +16,7 @@ from types import FrameType
 from typing import Any, Protocol
 
 import trackfeatures as tf
-from datagen.crew import Crew
+from datagen.crew import Crew, Failure
 from datagen.plan import Plan
 from datagen.recording.derived import rebuild
 from datagen.recording.errors import DatasetError
@@ -86,12 +86,20 @@ def collect(
         if tally.finished:
             rebuild(folder, _split(plan, set(tally.finished)))
     if failures:
-        names = ", ".join(failure.round_id for failure in failures)
-        raise DatasetError(
-            f"{len(failures)} of {len(plan.rounds)} rounds failed ({names}; {failures[0].reason}); "
-            "the others are finished; run the same command again to try these once more"
-        )
+        raise DatasetError(_told(failures, len(plan.rounds)))
     return tally.result(folder, time.perf_counter() - started)
+
+
+def _told(failures: Sequence[Failure], planned: int) -> str:
+    names = ", ".join(failure.round_id for failure in failures)
+    if all(failure.final for failure in failures):
+        advice = "other --tracks or another --seed, with another --out, may avoid this"
+    else:
+        advice = "run the same command again to try what failed once more"
+    return (
+        f"{len(failures)} of {planned} rounds failed ({names}: {failures[0].reason}); "
+        f"what was finished can be used; {advice}"
+    )
 
 
 class _Tally:

@@ -14,6 +14,7 @@ from datagen.worker import FramesDone, Hopeless, Job, Message, RoundBroken, Roun
 
 ATTEMPTS = 3
 STOP_S = 5.0
+CONTEXT = multiprocessing.get_context("spawn")  # a forked graphics context does not work
 
 
 @dataclass
@@ -27,6 +28,7 @@ class Worker:
 class Failure:
     round_id: str
     reason: str
+    final: bool  # the same round will fail again
 
 
 class Crew:
@@ -35,14 +37,13 @@ class Crew:
     def __init__(self, size: int, hear: Callable[[FramesDone | RoundDone], None]) -> None:
         self._size = size
         self._hear = hear
-        self._context = multiprocessing.get_context("spawn")
         self._workers: list[Worker] = []
         self._attempts: dict[str, int] = {}
         self._jobs: deque[Job] = deque()
         self.failures: list[Failure] = []
 
     def run(self, jobs: Iterable[Job]) -> list[Failure]:
-        """Record all rounds; those that failed ATTEMPTS times are returned.
+        """Record all rounds; those that failed for good, or ATTEMPTS times, are returned.
 
         Raises what no round can get round (disk full, unknown track): UserError or OSError. Leaves
         no process behind, however it ends.
@@ -58,8 +59,8 @@ class Crew:
         return self.failures
 
     def _hire(self) -> Worker:
-        mine, theirs = self._context.Pipe()
-        process = self._context.Process(target=work, args=(theirs,), daemon=True)
+        mine, theirs = CONTEXT.Pipe()
+        process = CONTEXT.Process(target=work, args=(theirs,), daemon=True)
         # A new process keeps ignoring what is ignored here: Ctrl-C is for this one to handle.
         before = signal.signal(signal.SIGINT, signal.SIG_IGN)
         try:
@@ -96,7 +97,7 @@ class Crew:
         if isinstance(message, Hopeless):
             raise message.error
         if isinstance(message, RoundBroken):
-            self._retry(worker, message.reason)
+            self._retry(worker, message.reason, message.final)
         else:
             if isinstance(message, RoundDone):
                 worker.job = None
@@ -111,16 +112,16 @@ class Crew:
         if dead.job is not None:
             self._retry(dead, f"its process ended with code {dead.process.exitcode}")
 
-    def _retry(self, worker: Worker, reason: str) -> None:
+    def _retry(self, worker: Worker, reason: str, final: bool = False) -> None:
         job, worker.job = worker.job, None
         if job is None:
             return
         tried = self._attempts[job.plan.id] = self._attempts.get(job.plan.id, 0) + 1
         self._hear(FramesDone(job.plan.id, 0))
-        if tried < ATTEMPTS:
+        if tried < ATTEMPTS and not final:
             self._jobs.append(job)
         else:
-            self.failures.append(Failure(job.plan.id, reason))
+            self.failures.append(Failure(job.plan.id, reason, final))
 
     def _dismiss(self) -> None:
         """Idle workers are asked to go, busy ones are stopped."""

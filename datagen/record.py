@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 import trackfeatures as tf
 from datagen.driver import ScriptedDriver
+from datagen.errors import RoundFailed
 from datagen.plan import RoundPlan
 from datagen.recording.frame import DriverCommand, EgoState, Frame, RoadPlace, SensorReadings
 from datagen.recording.header import RoundHeader
@@ -31,10 +32,6 @@ SCENE_STEP_M = 4.0
 WHEELS = ("front_left", "front_right", "rear_left", "rear_right")
 NOT_RECORDED = ("range_traffic",)
 MOST_RESETS = 20
-
-
-class RoundFailed(RuntimeError):
-    """The driver cannot drive this round."""
 
 
 @dataclass
@@ -65,7 +62,10 @@ class Drive:
         if self.state.collision or self.state.off_track or self.state.backwards:
             self.resets += 1
             if self.resets > MOST_RESETS:
-                raise RoundFailed(f"{self.plan.id}: the car left the road {self.resets} times")
+                raise RoundFailed(
+                    f"the car hit something or left the road {self.resets} times on "
+                    f"{self.plan.track}, {self.plan.lanes} lanes, {self.plan.speed_kmh:.0f} km/h"
+                )
             self._start(self.state.s, 0.0)
             self.driver.restart()
 

@@ -6,10 +6,14 @@ It lives across rounds because compiled code and the graphics context cost secon
 import os
 import signal
 import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
+from importlib import import_module
 from multiprocessing.connection import Connection
 from pathlib import Path
 
+from datagen.errors import RoundFailed
 from datagen.plan import RoundPlan
 from datagen.recording.check import check_round
 from datagen.recording.folder import (
@@ -47,10 +51,11 @@ class RoundDone:
 
 @dataclass(frozen=True, slots=True)
 class RoundBroken:
-    """This round failed; another try or another round may do better."""
+    """This round failed; the others may do better, and so may another try, unless `final`."""
 
     round_id: str
     reason: str
+    final: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,8 +71,9 @@ Message = FramesDone | RoundDone | RoundBroken | Hopeless
 def work(connection: Connection) -> None:
     """Main function of the process."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the parent, which decides
-    # PyBullet greets on stdout, which belongs to the result.
-    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # stdout belongs to the result
+    with _silence():
+        import_module("simulator.physics")
     while True:
         try:
             job: Job | None = connection.recv()
@@ -84,7 +90,7 @@ def work(connection: Connection) -> None:
 
 def record_and_publish(job: Job, report: Connection | None = None) -> RoundDone:
     """Record one round into its dataset folder: afterwards it is there, checked, or not at all."""
-    # Only here: a process that waits for its first round needs none of the simulator.
+    # Only here: the parent loads this module too, and needs neither physics nor graphics.
     from datagen.record import record_round
 
     def progress(frames: int) -> None:
@@ -122,11 +128,25 @@ def _attempt(job: Job, connection: Connection) -> Message:
         return record_and_publish(job, connection)
     except BrokenPipeError:
         raise
+    except RoundFailed as error:
+        return RoundBroken(job.plan.id, str(error), final=True)
     except (UserError, OSError) as error:
         return Hopeless(_portable(error))
     except Exception as error:  # noqa: BLE001  # whatever it is costs this round, not the others
         traceback.print_exc()
         return RoundBroken(job.plan.id, f"{type(error).__name__}: {error}")
+
+
+@contextmanager
+def _silence() -> Iterator[None]:
+    """PyBullet greets on stderr when it is loaded: the user has no use for that."""
+    kept = os.dup(2)
+    os.dup2(1, 2)
+    try:
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
 
 
 def _portable(error: UserError | OSError) -> UserError | OSError:

@@ -36,15 +36,25 @@ def check_round(path: Path, level: str, state: RoundState | None) -> tuple[int, 
         raise DatasetError(f"there is no level {level!r}; choose {', '.join(LEVELS)}")
     try:
         index = open_round(path)
-    except (DatasetError, OSError) as error:
+    except DatasetError as error:
         return 0, [str(error)]
+    except OSError as error:
+        return 0, [unreadable(path, error)]
     frames = len(index.messages[topics.CAMERA].log_time)
-    problems = list(_quick(index, state))
-    if level != "quick":
-        problems += _full(index, state)
-    if level == "deep":
-        problems += _deep(index)
+    problems: list[str] = []
+    try:
+        problems += _quick(index, state)
+        if level != "quick":
+            problems += _full(index, state)
+        if level == "deep":
+            problems += _deep(index)
+    except OSError as error:
+        problems.append(f"cannot be read ({error.strerror})")
     return frames, [f"{path.name}: {problem}" for problem in problems]
+
+
+def unreadable(path: Path, error: OSError) -> str:
+    return f"{path} cannot be read ({error.strerror})"
 
 
 def content_hash(index: RoundIndex) -> str:

@@ -100,7 +100,10 @@ def _guarded(path: Path, read: Callable[[], RoundIndex]) -> RoundIndex:
         # A damaged offset is an invalid argument to the system; other errors are not the file's.
         if isinstance(error, OSError) and error.errno != errno.EINVAL:
             raise
-        raise DatasetError(f"{path.name} is damaged or not a recorded round: {error}") from error
+        raise DatasetError(
+            f"{path} is damaged or not a recorded round ({error}); delete it and run the same "
+            "`datagen collect` again"
+        ) from error
 
 
 def _map_round(path: Path) -> RoundIndex | None:

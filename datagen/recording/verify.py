@@ -6,7 +6,7 @@ from pathlib import Path
 
 import trackfeatures as tf
 
-from .check import check_round
+from .check import check_round, unreadable
 from .dataset import round_files
 from .errors import DatasetError
 from .folder import RoundState, round_path, state_path
@@ -40,6 +40,9 @@ def verify(folder: Path, level: str, seen: Callable[[str], None] = lambda name: 
         except DatasetError as error:
             state = None
             problems.append(str(error))
+        except OSError as error:
+            state = None
+            problems.append(unreadable(state_path(folder, file.stem), error))
         count, found = check_round(file, level, state)
         frames += count
         problems += found
@@ -69,7 +72,7 @@ def _splits(folder: Path, files: list[Path]) -> list[str]:
     for file in files:
         try:
             index = open_round(file)
-        except DatasetError:
+        except (DatasetError, OSError):
             continue  # already told
         keys.append(RoundKey(index.header.id, index.header.seed, index.result.content_hash))
     problems = []
@@ -79,4 +82,6 @@ def _splits(folder: Path, files: list[Path]) -> list[str]:
             require_disjoint(read_split(path), keys)
         except (DatasetError, tf.DefinitionsMismatch) as error:
             problems.append(str(error))
+        except OSError as error:
+            problems.append(unreadable(path, error))
     return problems or ([] if paths else [f"there are no splits in {folder / 'splits'}"])

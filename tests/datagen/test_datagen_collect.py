@@ -1,13 +1,16 @@
 """Collecting for real: same bytes twice, resuming, interruptions, crashes, a full disk."""
 
+import ctypes
 import errno
 import json
+import multiprocessing
 import os
 import resource
 import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,14 +20,18 @@ import trackfeatures as tf
 from datagen.cli import main as datagen_main
 from datagen.collect import _open_folder, _require_fitting, collect
 from datagen.crew import Crew
-from datagen.plan import Wanted, make_plan
+from datagen.errors import RoundFailed
+from datagen.plan import RoundPlan, Wanted, make_plan
 from datagen.recording import Dataset
+from datagen.recording.camera import CameraInfo
 from datagen.recording.errors import DatasetError
 from datagen.recording.folder import prepare, read_states
 from datagen.recording.verify import verify
 from datagen.tracks import choose_tracks
-from datagen.worker import FramesDone, Hopeless, Job, RoundDone, _attempt
+from datagen.worker import FramesDone, Hopeless, Job, RoundBroken, RoundDone, _attempt
+from simulator.state import Command
 
+PR_CAPBSET_DROP, CAP_DAC_OVERRIDE = 24, 1  # <linux/prctl.h>, <linux/capability.h>
 SHORT = ["--rounds", "2", "--frames", "30", "--tracks", "circuit", "--lanes", "1,2"]
 
 
@@ -54,6 +61,7 @@ def collected(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("collect") / "data"
     done = datagen("collect", *SHORT, "--out", folder, "--workers", "2", "--json")
     assert done.returncode == 0, done.stderr
+    assert "pybullet" not in done.stderr
     result = json.loads(done.stdout)
     assert (result["rounds"], result["frames"], result["resets"]) == (2, 60, 0)
     assert result["frames_per_second"] == pytest.approx(60 / result["seconds"], rel=0.01)
@@ -163,6 +171,23 @@ def test_a_disk_full_from_the_start_leaves_a_folder_that_can_be_gone_on_with(
     assert json.loads((folder / "plan.json").read_text())["hash"] == plan.hash
 
 
+def test_a_folder_without_permission_is_told_in_one_line(tmp_path):
+    """Without the capability to pass over modes, for where the tests run as root."""
+
+    def humble() -> None:
+        ctypes.CDLL(None).prctl(PR_CAPBSET_DROP, CAP_DAC_OVERRIDE, 0, 0, 0)
+
+    tmp_path.chmod(0o555)
+    (plain := tmp_path.with_name("plain")).mkdir()
+    plain.chmod(0o555)
+    for folder in (tmp_path / "new", plain):
+        done = datagen("collect", *SHORT, "--out", folder, preexec_fn=humble)
+        assert (done.returncode, done.stdout, done.stderr.count("\n")) == (1, "", 1)
+        assert done.stderr.startswith("error: no permission to write or read: ")
+        assert str(folder) in done.stderr
+    assert not list(plain.iterdir())
+
+
 def test_empty_parts_of_a_dataset_are_no_foreign_folder(tmp_path):
     plan = make_plan(Wanted(1, 10, seed=1, tracks=choose_tracks(("oval",), None)))
     (tmp_path / "rounds").mkdir()
@@ -219,6 +244,45 @@ def test_a_worker_that_dies_costs_its_round_only_and_the_round_is_tried_again(tm
     assert crew.run(jobs) == []
     assert killed == ["round-000"]
     assert sorted(done) == ["round-000", "round-001"] == sorted(read_states(tmp_path))
+
+
+def test_a_round_that_cannot_be_driven_is_tried_once_and_told_in_one_line(
+    tmp_path, monkeypatch, capfd, samples
+):
+    """Forked workers take the stand-in for recording with them."""
+
+    def record(plan: RoundPlan, plan_hash: str, path: Path, *rest: object) -> None:
+        with (tmp_path / "attempts").open("a") as stream:
+            stream.write(f"{plan.id}\n")
+        if plan.id == "round-000":
+            raise RoundFailed("the car left the road 21 times")
+        header = replace(samples.header("r001"), id=plan.id, seed=plan.seed)
+        samples.write(path, header, samples.frames(3, seed=1))
+
+    monkeypatch.setattr("datagen.record.record_round", record)
+    monkeypatch.setattr("datagen.crew.CONTEXT", multiprocessing.get_context("fork"))
+    plan = make_plan(Wanted(2, 3, seed=1, tracks=choose_tracks(("oval",), None)))
+    capfd.readouterr()  # what libraries said when they were loaded
+    expected = r"1 of 2 rounds failed \(round-000: the car left the road 21 times\); what was"
+    with pytest.raises(DatasetError, match=expected) as told:
+        collect(plan, tmp_path / "data", workers=1)
+    assert "another --seed" in str(told.value)
+    assert (tmp_path / "attempts").read_text().split() == ["round-000", "round-001"]
+    assert capfd.readouterr().err == ""
+    assert list(read_states(tmp_path / "data")) == ["round-001"]
+    assert verify(tmp_path / "data", "full").ok
+
+
+def test_a_car_that_is_reset_too_often_ends_its_round(tmp_path, monkeypatch):
+    monkeypatch.setattr("datagen.record.MOST_RESETS", 0)
+    monkeypatch.setattr("datagen.record.ScriptedDriver.command", lambda *args: Command(1.0, 1.0))
+    (job,) = _jobs(tmp_path, rounds=1, frames=200)
+    job = replace(job, plan=replace(job.plan, camera=CameraInfo(width=56, height=42)))
+    message = _attempt(job, None)
+    assert isinstance(message, RoundBroken)
+    assert message.final
+    assert "left the road 1 times on oval, " in message.reason
+    assert not list(tmp_path.glob("rounds/*"))
 
 
 @pytest.mark.parametrize("reason", [errno.ENOSPC, errno.EACCES])

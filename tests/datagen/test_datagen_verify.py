@@ -47,8 +47,36 @@ def test_a_foreign_file_is_reported(dataset, content):
     (dataset / "rounds" / "zz.mcap").write_bytes(content)
     for level in ("quick", "full", "deep"):
         report = verify(dataset, level)
-        assert [p.split()[0] for p in report.problems] == ["zz.mcap"]
+        (problem,) = report.problems
+        assert problem.startswith(f"{dataset}/rounds/zz.mcap is damaged or not a recorded round (")
+        assert problem.endswith("delete it and run the same `datagen collect` again")
         assert report.frames == 135
+
+
+@pytest.mark.parametrize("level", ["quick", "full", "deep"])
+def test_what_is_no_readable_file_is_reported(dataset, level):
+    (dataset / "rounds" / "folder.mcap").mkdir()
+    (dataset / "rounds" / "nowhere.mcap").symlink_to("/no/such/file")
+    (dataset / "splits" / "folder.json").mkdir()
+    report = verify(dataset, level)
+    assert (report.rounds, report.frames) == (5, 135)
+    assert [p.removeprefix(f"{dataset}/").split()[0] for p in report.problems] == [
+        "rounds/folder.mcap",
+        "rounds/nowhere.mcap",
+        "splits/folder.json",
+    ]
+    assert "cannot be read (No such file" in report.problems[1]
+    assert "cannot be read (Is a directory" in report.problems[2]
+
+
+def test_a_disk_that_fails_while_it_is_read_is_reported(dataset, monkeypatch):
+    def broken(*args: object) -> None:
+        raise OSError(5, "Input/output error")
+
+    monkeypatch.setattr("datagen.recording.check.file_sha256", broken)
+    assert verify(dataset, "full").problems[0] == "r000.mcap: cannot be read (Input/output error)"
+    monkeypatch.setattr("datagen.recording.folder.RoundState.read", broken)
+    assert "state/r000.json cannot be read" in verify(dataset, "quick").problems[0]
 
 
 def test_missing_rounds_states_and_folders_are_reported(dataset, tmp_path):
