@@ -11,6 +11,7 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
+from mtlnet.whole import write_whole
 from trackfeatures.errors import UserError, require_version
 
 RUNS = Path("runs")
@@ -66,9 +67,7 @@ class ModelCard:
         text = json.dumps(
             {"format": FORMAT, "model_hash": self.model_hash, **asdict(self)}, indent=1
         )
-        partial = run / (CARD + ".partial")
-        partial.write_text(text + "\n", encoding="utf-8")
-        partial.replace(run / CARD)
+        write_whole(run / CARD, f"{text}\n".encode())
 
 
 def read_card(run: Path) -> ModelCard:

@@ -4,7 +4,6 @@ Tensors: `network.*`, `optimiser.INDEX.NAME`, `rng` (torch's generator, for drop
 the step and the seconds trained so far.
 """
 
-import os
 from pathlib import Path
 
 import torch
@@ -14,6 +13,7 @@ from torch import Tensor
 
 from mtlnet.card import ModelError
 from mtlnet.trainer import Trainer
+from mtlnet.whole import write_whole
 
 FOLDER = "checkpoints"
 KEPT = 2
@@ -25,12 +25,7 @@ def save_checkpoint(run: Path, trainer: Trainer, elapsed_s: float) -> Path:
     folder.mkdir(exist_ok=True)
     path = folder / f"step-{trainer.step_number:08d}.safetensors"
     metadata = {"step": str(trainer.step_number), "elapsed_s": repr(elapsed_s)}
-    partial = path.with_suffix(".partial")
-    with partial.open("wb") as file:
-        file.write(save(_tensors(trainer), metadata))
-        file.flush()
-        os.fsync(file.fileno())
-    partial.replace(path)
+    write_whole(path, save(_tensors(trainer), metadata))
     for old in list_checkpoints(run)[:-KEPT]:
         old.unlink()
     return path

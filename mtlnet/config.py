@@ -10,9 +10,11 @@ import trackfeatures as tf
 from mtlnet.card import ModelError
 from mtlnet.loss import Alpha
 from mtlnet.recipe import Recipe
+from mtlnet.whole import write_whole
 from trackfeatures.errors import UserError
 
 CONFIG = "config.json"
+MAX_THREADS = 1024
 # What may change when a run goes on; all else would make it another run.
 FLEXIBLE = ("iterations", "minutes", "device", "threads", "data")
 
@@ -44,6 +46,10 @@ class TrainConfig:
             raise UserError(f"--batch is {self.batch}; batch normalisation needs at least 2")
         if self.seed < 0:
             raise UserError(f"--seed is {self.seed}; give 0 or more")
+        if not 0 <= self.threads <= MAX_THREADS:
+            raise UserError(
+                f"--threads is {self.threads}; give 0 (one a core) or at most {MAX_THREADS}"
+            )
 
 
 def write_config(config: TrainConfig, recipe: Recipe, data: Mapping[str, Any]) -> None:
@@ -55,9 +61,7 @@ def write_config(config: TrainConfig, recipe: Recipe, data: Mapping[str, Any]) -
         "data": dict(data),
     }
     text = json.dumps(content, indent=1) + "\n"
-    partial = config.out / (CONFIG + ".partial")
-    partial.write_text(text, encoding="utf-8")
-    partial.replace(config.out / CONFIG)
+    write_whole(config.out / CONFIG, text.encode())
 
 
 def read_config(run: Path) -> tuple[TrainConfig, dict[str, Any]]:

@@ -4,6 +4,8 @@ The graph is built operation by operation from the weights, not traced: it uses 
 padding and so is an independent check of the network's. No converter, hence no telemetry.
 """
 
+import errno
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -62,8 +64,23 @@ def _precise_linear(ops: Any, x: Any, weights: dict[str, NDArray[np.float32]], n
     return ops.add(ops.reduce_sum(products, np.array([2])), weights[f"{name}.bias"][None])
 
 
-def write_graph(network: Network, path: Path) -> None:
-    """Write the graph to `path` (.xml) and the .bin beside it, weights in float32."""
+def write_graph(network: Network, graph: Path, weights: Path) -> None:
+    """Write the graph to `graph` (.xml) and its weights, in float32, to `weights` (.bin).
+
+    Raises OSError when the disk takes neither; both are then as they were.
+    """
     import openvino
 
-    openvino.save_model(build_graph(network), str(path), compress_to_fp16=False)
+    # OpenVINO names the weights after the graph, so both are written under another stem first.
+    staged = graph.with_name("staged.xml")
+    try:
+        openvino.save_model(build_graph(network), str(staged), compress_to_fp16=False)
+        staged.with_suffix(".bin").replace(weights)
+        staged.replace(graph)
+    except RuntimeError as error:  # how OpenVINO says that a write failed, without the reason
+        free_mb = shutil.disk_usage(graph.parent).free / 1e6
+        reason = f"OpenVINO could not write the model's graph, {free_mb:.0f} MB are free"
+        raise OSError(errno.EIO, reason, str(graph)) from error
+    finally:
+        staged.unlink(missing_ok=True)
+        staged.with_suffix(".bin").unlink(missing_ok=True)

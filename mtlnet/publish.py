@@ -26,6 +26,7 @@ from mtlnet.card import (
 from mtlnet.export import TOLERANCE, write_graph
 from mtlnet.golden import golden_image
 from mtlnet.network import HEIGHT, WIDTH, Network, answer_images, fold
+from mtlnet.whole import write_whole
 
 PACKAGES = ("driverview", "torch", "openvino", "numpy")
 
@@ -50,14 +51,9 @@ def publish(
     """
     run.mkdir(parents=True, exist_ok=True)
     folded = fold(network)
-    partial = run / (WEIGHTS + ".partial")
-    partial.write_bytes(save({name: t.contiguous() for name, t in folded.state_dict().items()}))
-    partial.replace(run / WEIGHTS)
-    # OpenVINO names the weights after the graph, so both are written under another stem first.
-    staged = run / "staged.xml"
-    write_graph(folded, staged)
-    staged.with_suffix(".bin").replace(run / GRAPH_WEIGHTS)
-    staged.replace(run / GRAPH)
+    weights = {name: t.contiguous() for name, t in folded.state_dict().items()}
+    write_whole(run / WEIGHTS, save(weights))
+    write_graph(folded, run / GRAPH, run / GRAPH_WEIGHTS)
     check = compare(folded, run, images)
     if check["openvino_f32_max"] > TOLERANCE:
         raise ModelError(
@@ -97,7 +93,14 @@ def compare(network: Network, run: Path, images: NDArray[np.uint8]) -> dict[str,
     differences = {"frames": float(len(images))}
     for precision in dict.fromkeys(("f32", best_precision(core))):
         options = {"INFERENCE_PRECISION_HINT": precision, "NUM_STREAMS": 1}
-        request = core.compile_model(str(run / GRAPH), "CPU", options).create_infer_request()
+        try:
+            request = core.compile_model(str(run / GRAPH), "CPU", options).create_infer_request()
+        except RuntimeError as error:
+            reason = str(error).strip().splitlines()[-1]
+            raise ModelError(
+                f"OpenVINO cannot load {run / GRAPH}, just written ({reason}): the model is not "
+                "published; is the disk full?"
+            ) from error
         answers = np.concatenate([request.infer([image[None]])[0].copy() for image in images])
         differences[f"openvino_{precision}_max"] = float(np.abs(answers - expected).max())
     return differences

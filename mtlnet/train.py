@@ -5,6 +5,8 @@ leaves a checkpoint to go on from with `--resume`.
 """
 
 import os
+import re
+import shutil
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -25,7 +27,7 @@ from mtlnet.interrupt import StopRequest
 from mtlnet.loader import Loader
 from mtlnet.network import HEIGHT, WIDTH
 from mtlnet.publish import publish
-from mtlnet.recipe import find_recipe
+from mtlnet.recipe import Recipe, find_recipe
 from mtlnet.report import describe_data
 from mtlnet.trainer import Trainer, keep_freed_memory
 from trackfeatures.errors import UserError
@@ -63,25 +65,39 @@ def train(
     starts a new run. Raises UserError (data, an existing folder), Stopped after Ctrl-C.
     """
     recipe = find_recipe(config.recipe)
+    device = choose_device(config.device)
     frames, dataset = open_training_data(config.data)
     data = describe_data(dataset, frames)
     camera = Camera(**dataset.camera.as_dict())  # type: ignore[arg-type]  # sizes are int
     if resumed is None:
-        create_run(config.out)
-        write_config(config, recipe, data)
+        create_run(config, recipe, data)
     else:
         require_same_data(config, resumed, data)
     torch.set_num_threads(config.threads or os.cpu_count() or 1)
     cv2.setNumThreads(1)  # the loader's images are small: a second pool would only fight torch's
     keep_freed_memory()
-    trainer = Trainer(recipe, config.alpha, config.seed, choose_device(config.device))
+    trainer = Trainer(recipe, config.alpha, config.seed, device)
     loader = Loader(frames, camera, config.batch, config.seed, augment=recipe.augment)
     trainer.standardise(loader)
     elapsed_s = 0.0
     checkpoints = list_checkpoints(config.out) if resumed is not None else []
     if checkpoints:
         elapsed_s = load_checkpoint(checkpoints[-1], trainer)
-    learn(config, trainer, loader, elapsed_s, report)
+    try:
+        learn(config, trainer, loader, elapsed_s, report)
+        return finish(config, trainer, frames, camera, data)
+    except OSError as error:
+        where = f" ({error.filename})" if error.filename else ""
+        raise UserError(
+            f"the run in {config.out} broke off: {error.strerror or error}{where}; mend that, then "
+            f"go on from its last checkpoint with `mtlnet train --out {config.out} --resume`"
+        ) from error
+
+
+def finish(
+    config: TrainConfig, trainer: Trainer, frames: Frames, camera: Camera, data: dict[str, Any]
+) -> ModelCard:
+    """Publish the trained network in the run's folder."""
     chosen = np.linspace(0, len(frames) - 1, min(CHECK_FRAMES, len(frames))).astype(np.int64)
     images = frames.read_batch(chosen, np.empty((len(chosen), HEIGHT, WIDTH, 3), np.uint8))
     card = publish(
@@ -167,13 +183,19 @@ def open_training_data(path: Path) -> tuple[Frames, Dataset]:
     return dataset.select("train"), dataset
 
 
-def create_run(out: Path) -> None:
+def create_run(config: TrainConfig, recipe: Recipe, data: dict[str, Any]) -> None:
     """Make the folder of a new run; UserError when there is something already."""
+    out = config.out
     if out.exists():
         raise UserError(
             f"{out} already exists; continue that run with --resume, or choose another --out"
         )
     out.mkdir(parents=True)
+    try:
+        write_config(config, recipe, data)
+    except OSError:
+        shutil.rmtree(out)  # so that the same command works when the disk does
+        raise
 
 
 def require_same_data(config: TrainConfig, resumed: dict[str, Any], data: dict[str, Any]) -> None:
@@ -190,11 +212,14 @@ def choose_device(name: str) -> torch.device:
     """The device called `name`; "auto": a GPU where there is one."""
     if name == "auto":
         name = "cuda" if torch.cuda.is_available() else "cpu"
-    if name.startswith("cuda") and not torch.cuda.is_available():
+    if not re.fullmatch(r"cpu|cuda(:\d{1,3})?", name):
+        raise UserError(f"--device {name!r} is not known; use auto, cpu, cuda or cuda:NUMBER")
+    device = torch.device(name)
+    if device.type == "cuda" and not torch.cuda.is_available():
         raise UserError(f"--device {name}: torch finds no GPU here; use --device cpu")
-    if name.split(":")[0] not in ("cpu", "cuda"):
-        raise UserError(f"--device {name!r} is not known; use auto, cpu or cuda")
-    return torch.device(name)
+    if device.type == "cuda" and (device.index or 0) >= torch.cuda.device_count():
+        raise UserError(f"--device {name}: torch finds {torch.cuda.device_count()} GPU(s) here")
+    return device
 
 
 def link_latest(run: Path) -> None:

@@ -121,6 +121,9 @@ def test_refused_before_anything_is_written(dataset: Path, tmp_path: Path) -> No
         train(config(tmp_path / "kept", tmp_path / "new"), None)
     with pytest.raises(UserError, match="no recipe 'slow'"):
         train(config(dataset, tmp_path / "new", recipe="slow"), None)
+    for device in ("gpu", "cpu:x", "cuda:x", "cuda:99", ""):
+        with pytest.raises(UserError, match="--device"):
+            train(config(dataset, tmp_path / "new", device=device), None)
     assert not (tmp_path / "new").exists()
 
 
@@ -156,6 +159,8 @@ def test_learning_rates() -> None:
         ({"minutes": 0.0}, "--minutes is 0"),
         ({"batch": 1}, "--batch is 1"),
         ({"seed": -1}, "--seed is -1"),
+        ({"threads": -1}, "--threads is -1"),
+        ({"threads": 2**31}, "--threads is 2147483648"),
     ],
 )
 def test_numbers_out_of_range(changes: dict[str, Any], seen: str) -> None:
