@@ -93,13 +93,16 @@ def describe(track: "Track") -> dict[str, str | float]:
 
 def _print_table(found: list[dict[str, str | float]]) -> None:
     from rich.console import Console
+    from rich.markup import escape
     from rich.table import Table
 
     table = Table()
     for column in ("track", "source", "length m", "width m", "least radius m", "height range m"):
         table.add_column(column, justify="left" if column in ("track", "source") else "right")
     for row in found:
-        table.add_row(*(f"{v:.1f}" if isinstance(v, float) else str(v) for v in row.values()))
+        table.add_row(
+            *(f"{v:.1f}" if isinstance(v, float) else escape(str(v)) for v in row.values())
+        )
     Console().print(table)
 
 

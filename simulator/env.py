@@ -94,6 +94,7 @@ class LateralControl(gym.Env[Any, Any]):
             raise UserError(f"lambda_ is {lambda_}; give a finite weight")
         if render_mode not in (None, "rgb_array"):
             raise UserError(f'render_mode is {render_mode!r}; choose "rgb_array" or leave it out')
+        self._picture = _camera_options(camera)
         road = Road(
             find_track(track, None if tracks_dir is None else Path(tracks_dir)), lanes, lane_width
         )
@@ -101,7 +102,6 @@ class LateralControl(gym.Env[Any, Any]):
         self.render_mode = render_mode
         self.metadata = {**RENDERING, "render_fps": frequency_hz}
         self._weight, self._full = float(lambda_), controls == "full"
-        self._picture = _camera_options(camera)
         self._camera: Camera | None = None
         self._score, self._steps = 0.0, 0
         self.action_space: gym.Space[Any] = _action_space(self._full)

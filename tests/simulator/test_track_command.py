@@ -69,6 +69,15 @@ def test_mistakes_end_in_one_line(arguments: tuple[str, ...], said: str) -> None
     assert done.stdout == ""
 
 
+def test_a_name_with_brackets_is_listed_as_it_is(tmp_path: Path) -> None:
+    folder = tmp_path / "[b]"
+    folder.mkdir()
+    (folder / "x[red].toml").write_bytes((OWN_TRACKS / "oval.toml").read_bytes())
+    done = simulator("tracks", "--tracks-dir", str(folder))
+    assert done.returncode == 0, done.stderr
+    assert "x[red]" in done.stdout
+
+
 @pytest.mark.parametrize("option", [("--seed", "-1"), ("--traffic", "-1"), ("--traffic", "500")])
 def test_a_snapshot_out_of_range(tmp_path: Path, option: tuple[str, str]) -> None:
     done = simulator("snapshot", "oval", "--out", str(tmp_path / "x.png"), *option)
