@@ -5,6 +5,7 @@ torch's SummaryWriter writes them from a thread: on a full disk that prints a tr
 
 import socket
 import time
+from contextlib import suppress
 from pathlib import Path
 
 from tensorboard.compat.proto.event_pb2 import Event, SessionLog
@@ -32,8 +33,14 @@ class Board:
 
     def _add(self, event: Event) -> None:
         event.wall_time = time.time()
-        self._records.write(event.SerializeToString())
-        self._file.flush()
+        try:
+            self._records.write(event.SerializeToString())
+            self._file.flush()
+        except OSError as error:
+            error.filename = self._file.name
+            with suppress(OSError):  # what is left in the buffer fails once more
+                self._file.close()
+            raise
 
     def close(self) -> None:
         """Close the file."""

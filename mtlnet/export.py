@@ -5,7 +5,6 @@ padding and so is an independent check of the network's. No converter, hence no 
 """
 
 import errno
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -78,8 +77,7 @@ def write_graph(network: Network, graph: Path, weights: Path) -> None:
         staged.with_suffix(".bin").replace(weights)
         staged.replace(graph)
     except RuntimeError as error:  # how OpenVINO says that a write failed, without the reason
-        free_mb = shutil.disk_usage(graph.parent).free / 1e6
-        reason = f"OpenVINO could not write the model's graph, {free_mb:.0f} MB are free"
+        reason = "OpenVINO could not write the model's graph; is the disk full?"
         raise OSError(errno.EIO, reason, str(graph)) from error
     finally:
         staged.unlink(missing_ok=True)

@@ -90,7 +90,7 @@ def train(
         where = f" ({error.filename})" if error.filename else ""
         raise UserError(
             f"the run in {config.out} broke off: {error.strerror or error}{where}; mend that, then "
-            f"go on from its last checkpoint with `mtlnet train --out {config.out} --resume`"
+            f"go on with `mtlnet train --out {config.out} --resume`"
         ) from error
 
 

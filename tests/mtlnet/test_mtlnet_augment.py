@@ -31,7 +31,8 @@ def pixel_of(
     seen = point - (np.array([0.0, to_middle]) + camera.x * ahead)
     focal = camera.height / 2 / np.tan(np.radians(camera.fov_y_deg) / 2)
     centre = np.array([(camera.width - 1) / 2, (camera.height - 1) / 2])
-    return centre + focal * np.array([-(seen @ left), camera.z + 0.25]) / (seen @ ahead)
+    across, along = float(seen @ left), float(seen @ ahead)
+    return centre + focal * np.array([-across, camera.z + 0.25]) / along
 
 
 @pytest.mark.parametrize("turned", [-0.08, 0.03])
@@ -47,7 +48,10 @@ def test_a_turned_image_is_that_of_the_turned_car(turned: float) -> None:
         np.testing.assert_allclose(moved[:2] / moved[2], goal, atol=1e-9)
     lane = np.array([-2.0, 2.0, np.nan, np.nan, np.nan])
     coded = turned_labels(
-        np.float32([lane + to_middle]), np.float32([-yaw]), np.array([turned]), camera
+        np.array([lane + to_middle], np.float32),
+        np.array([-yaw], np.float32),
+        np.array([turned]),
+        camera,
     )
     distances, angle = tf.decode(coded)
     assert angle[0] == pytest.approx(-yaw - turned, abs=1e-6)

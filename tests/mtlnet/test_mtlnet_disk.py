@@ -8,8 +8,10 @@ from typing import Any
 import openvino
 import pytest
 from tensorboard.backend.event_processing.event_file_loader import EventFileLoader
+from tensorboard.summary.writer.record_writer import RecordWriter
 
 import mtlnet.whole
+from mtlnet.board import Board
 from mtlnet.card import read_card
 from mtlnet.checkpoint import list_checkpoints
 from mtlnet.config import TrainConfig, resume_config
@@ -20,7 +22,7 @@ from trackfeatures.errors import UserError
 
 
 def config(dataset: Path, out: Path, **changes: Any) -> TrainConfig:
-    values = {"iterations": 20, "batch": 2, "device": "cpu", "threads": 2, **changes}
+    values = {"iterations": 2, "batch": 2, "device": "cpu", "threads": 2, **changes}
     return TrainConfig(dataset, out, **values)
 
 
@@ -74,7 +76,7 @@ def when_full(monkeypatch: pytest.MonkeyPatch, what: str) -> None:
         written: Callable[[Path, bytes], None] = mtlnet.whole.write_whole
 
         def write(path: Path, content: bytes) -> None:
-            if path.suffix == ".safetensors" and path.name != "step-00000010.safetensors":
+            if path.suffix == ".safetensors" and path.name != "step-00000001.safetensors":
                 full()
             written(path, content)
 
@@ -85,14 +87,15 @@ def when_full(monkeypatch: pytest.MonkeyPatch, what: str) -> None:
 def test_a_run_goes_on_after_the_disk_was_full(
     dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, what: str
 ) -> None:
+    monkeypatch.setattr("mtlnet.train.LOG_EVERY", 1)
     new = config(dataset, tmp_path / "run")
-    first = config(dataset, tmp_path / "run", iterations=10)
+    first = config(dataset, tmp_path / "run", iterations=1)
     with monkeypatch.context() as patch:
         patch.setattr("mtlnet.train.finish", lambda *_: None)
         train(first, None)
     kept = [path.name for path in list_checkpoints(new.out)]
-    assert kept == ["step-00000010.safetensors"]
-    resumed, data = resume_config(new.out, {"iterations": 20})
+    assert kept == ["step-00000001.safetensors"]
+    resumed, data = resume_config(new.out, {"iterations": 2})
     with monkeypatch.context() as patch:
         when_full(patch, what)
         with pytest.raises(UserError, match=rf"{new.out} broke off: .*--resume") as caught:
@@ -101,8 +104,8 @@ def test_a_run_goes_on_after_the_disk_was_full(
     assert left_over(new.out) == []
     assert kept[0] in [path.name for path in list_checkpoints(new.out)]
     train(resumed, data)
-    assert read_card(new.out).iterations == 20
-    assert [row["step"] for row in read_curves(new.out / "curves.csv")] == [10, 20]
+    assert read_card(new.out).iterations == 2
+    assert [row["step"] for row in read_curves(new.out / "curves.csv")] == [1, 2]
 
 
 def test_half_written_rows_are_left_out(tmp_path: Path) -> None:
@@ -131,6 +134,17 @@ def test_a_failing_rewrite_keeps_the_curves(
     with pytest.raises(OSError, match="No space"):
         Curves(tmp_path, 10)
     assert [row["step"] for row in read_curves(tmp_path / "curves.csv")] == [10]
+
+
+def test_a_board_on_a_full_disk_says_which_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    board = Board(tmp_path)
+    monkeypatch.setattr(RecordWriter, "write", full)
+    with pytest.raises(OSError, match="No space") as caught:
+        board.add(1, {"loss": 0.5})
+    assert caught.value.filename == str(next(tmp_path.iterdir()))
+    board.close()
 
 
 def test_tensorboard_reads_the_points(tmp_path: Path) -> None:

@@ -3,9 +3,11 @@
 import json
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 import trackfeatures as tf
 from mtlnet import card as cards
@@ -43,7 +45,8 @@ def test_answers_are_not_overwritten_by_the_next(published: Path) -> None:
 def test_images_of_another_kind_are_refused(published: Path) -> None:
     for kind in ("openvino", "torch"):
         engine = load_engine(published, kind)
-        for image in (IMAGE[:100], IMAGE[..., 0], IMAGE.astype(np.float32)):
+        others: list[NDArray[Any]] = [IMAGE[:100], IMAGE[..., 0], IMAGE.astype(np.float32)]
+        for image in others:
             with pytest.raises(ModelError, match=r"takes uint8 RGB of shape \(210, 280, 3\)"):
                 engine(image)
 

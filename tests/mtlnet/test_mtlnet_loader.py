@@ -1,5 +1,6 @@
 """Batches: every frame once an epoch, a function of seed and step."""
 
+from collections.abc import Generator
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,7 +22,7 @@ class FakeFrames:
 
     def __init__(self, count: int) -> None:
         angle = np.linspace(-0.4, 0.4, count).astype(np.float32)
-        distances = np.tile(np.float32([-2, 2, np.nan, np.nan, np.nan]), (count, 1))
+        distances = np.tile(np.array([-2, 2, np.nan, np.nan, np.nan], np.float32), (count, 1))
         self.labels = FakeLabels(distances, angle, np.arange(count) % 3)
 
     def __len__(self) -> int:
@@ -45,6 +46,7 @@ def test_every_frame_once_an_epoch_across_batches() -> None:
 def test_batches_carry_the_labels_of_their_frames() -> None:
     made = loader()
     batches = made.batches(3)
+    assert isinstance(batches, Generator)
     batch = next(batches)
     assert batch.images[:, 0, 0, 0].tolist() == made.indices(3).tolist()
     np.testing.assert_array_equal(batch.coded, made.coded[made.indices(3)])

@@ -87,10 +87,10 @@ def test_first_layer_against_a_sum_by_hand() -> None:
     network = Network()
     initialise(network, 1)
     pixels = images(1)
-    out = torch.nn.Sequential(network.features.pad0, network.features.conv0)(
-        normalise(pixels).permute(0, 3, 1, 2)
-    )
-    weight = network.features.conv0.layer.weight.detach().numpy().astype(np.float64)
+    features = network.features
+    first = (features.get_submodule("pad0"), features.get_submodule("conv0"))
+    out = torch.nn.Sequential(*first)(normalise(pixels).permute(0, 3, 1, 2))
+    weight = features.get_parameter("conv0.layer.weight").detach().numpy().astype(np.float64)
     padded = np.zeros((219, 287, 3))
     padded[4:214, 3:283] = pixels[0].numpy() / 127.5 - 1
     for row, column in [(0, 0), (20, 31), (52, 69)]:

@@ -18,7 +18,7 @@ from mtlnet.config import TrainConfig, resume_config
 from mtlnet.curves import read_curves
 from mtlnet.loader import Loader
 from mtlnet.recipe import RECIPES, learning_rate
-from mtlnet.train import Stopped, train
+from mtlnet.train import Progress, Stopped, train
 from mtlnet.trainer import Trainer
 from trackfeatures.errors import UserError
 
@@ -84,7 +84,7 @@ def test_stopped_and_resumed_is_the_unbroken_run(
 
 
 def test_a_run_keeps_what_it_was(dataset: Path, tmp_path: Path) -> None:
-    points = []
+    points: list[Progress] = []
     done = train(config(dataset, tmp_path / "run", iterations=10), None, points.append)
     run = tmp_path / "run"
     assert read_card(run) == done
