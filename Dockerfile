@@ -1,8 +1,8 @@
 # Three images from one source: `docker build --target serve|train|collect -t driverview-TARGET .`
 #
-#   docker run -p 8000:8000 -v "$PWD/runs:/work/runs:ro" driverview-serve
-#   docker run -v "$PWD/datasets:/work/datasets" driverview-collect datagen collect --rounds 60
-#   docker run --gpus all -v "$PWD/datasets:/work/datasets:ro" -v "$PWD/runs:/work/runs" \
+#   docker run -p 8000:8000 -v "$PWD/runs:/driverview/runs:ro" driverview-serve
+#   docker run -v "$PWD/datasets:/driverview/datasets" driverview-collect datagen collect --rounds 60
+#   docker run --gpus all -v "$PWD/datasets:/driverview/datasets:ro" -v "$PWD/runs:/driverview/runs" \
 #     driverview-train mtlnet train --alpha 0.3,0.2,0.5
 #
 # The processes run as user 10001: folders they write to must let it (`chown 10001 runs datasets`).
@@ -20,11 +20,11 @@ RUN pip wheel --no-cache-dir --no-deps --wheel-dir /wheels .
 
 FROM python:3.11-slim AS base
 ENV PYTHONUNBUFFERED=1 PIP_NO_CACHE_DIR=1 PIP_DISABLE_PIP_VERSION_CHECK=1
-RUN useradd --create-home --uid 10001 driverview && install -d -o driverview /work
+RUN useradd --create-home --uid 10001 driverview && install -d -o driverview /driverview
 # The lock pins the versions; which of them an image gets is for its extras to say.
 COPY requirements.lock /wheels/
 COPY --from=wheel /wheels /wheels
-WORKDIR /work
+WORKDIR /driverview
 
 # Physics and rendering; with no GPU, Mesa renders.
 FROM base AS collect
