@@ -12,7 +12,7 @@ from simulator.track.road import Road
 from simulator.world import World
 from trackfeatures import VERSION, DefinitionsMismatch, Heading, UserError
 
-ANSWER = {
+ANSWER: dict[str, Any] = {
     "distances_m": {"ml": -1.5, "mr": 2.5, "l": None, "m": None, "r": None},
     "to_lane_centre_m": 0.5,
     "angle_rad": -0.03,

@@ -36,7 +36,9 @@ def _labels(places: np.ndarray, lanes: int, width: float = WIDTH) -> Labels:
 
 @pytest.mark.parametrize("lanes", tf.LANES)
 @pytest.mark.parametrize("width", [3.0, 3.7, 4.5])
-def test_true_labels_agree_everywhere_and_on_either_side_of_every_border(lanes, width):
+def test_true_labels_agree_everywhere_and_on_either_side_of_every_border(
+    lanes: int, width: float
+) -> None:
     markings = tf.marking_offsets(lanes, width)
     reaches = [0.0, 0.5, 1.2, 2.0, width / 2]
     borders = np.array([m + side * r for m in markings for r in reaches for side in (-1, 1)])
@@ -58,7 +60,9 @@ def test_true_labels_agree_everywhere_and_on_either_side_of_every_border(lanes, 
         ("lanes", 3, "1 of 4 labels do not have the 2 lanes of the round"),
     ],
 )
-def test_what_is_dropped_invented_or_wrong_is_found(column, value, expected):
+def test_what_is_dropped_invented_or_wrong_is_found(
+    column: str, value: float, expected: str
+) -> None:
     """All cars stand 0.3 m right of the centre of the right lane of two: ml -2.3, mr 1.7."""
     labels = _labels(np.full(4, -2.3), lanes=2)
     name = "distances" if column in tf.MARKINGS else column
@@ -72,6 +76,6 @@ def test_what_is_dropped_invented_or_wrong_is_found(column, value, expected):
     assert any(expected in line for line in found), found
 
 
-def test_a_road_that_cannot_be_is_found():
+def test_a_road_that_cannot_be_is_found() -> None:
     labels = _labels(np.zeros(3), lanes=1)
     assert "an impossible road: 7 lanes" in next(disagreements(labels, 7, WIDTH))

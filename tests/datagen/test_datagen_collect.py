@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -28,20 +29,27 @@ from datagen.recording.errors import DatasetError
 from datagen.recording.folder import prepare, read_states
 from datagen.recording.verify import verify
 from datagen.tracks import choose_tracks
-from datagen.worker import FramesDone, Hopeless, Job, RoundBroken, RoundDone, _attempt
+from datagen.worker import FramesDone, Hopeless, Job, Message, RoundBroken, RoundDone, _attempt
 from simulator.state import Command
+from tests.datagen.conftest import Samples
 
 PR_CAPBSET_DROP, CAP_DAC_OVERRIDE = 24, 1  # <linux/prctl.h>, <linux/capability.h>
 SHORT = ["--rounds", "2", "--frames", "30", "--tracks", "circuit", "--lanes", "1,2"]
 
 
-def datagen(*args: object, **options: object) -> subprocess.CompletedProcess[str]:
+def datagen(
+    *args: object, preexec_fn: Callable[[], object] | None = None
+) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-m", "datagen", *map(str, args)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=120, **options)
+    return subprocess.run(
+        command, capture_output=True, text=True, timeout=120, preexec_fn=preexec_fn
+    )
 
 
 @pytest.fixture
-def refused(monkeypatch, capsys):
+def refused(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> Callable[..., str]:
     """Runs the command in this process; returns the one line that it was refused with."""
 
     def run(*args: object) -> str:
@@ -51,7 +59,7 @@ def refused(monkeypatch, capsys):
             datagen_main()
         stdout, stderr = capsys.readouterr()
         assert (end.value.code, stdout, stderr.count("\n")) == (1, "", 1)
-        return str(stderr)
+        return stderr
 
     return run
 
@@ -75,7 +83,7 @@ def _jobs(folder: Path, rounds: int, frames: int) -> list[Job]:
     return [Job(entry, plan.hash, folder, None) for entry in plan.rounds]
 
 
-def test_what_is_collected_verifies_and_reads(collected):
+def test_what_is_collected_verifies_and_reads(collected: Path) -> None:
     report = verify(collected, "deep")
     assert report.ok, report.problems
     dataset = Dataset.open(collected)
@@ -90,7 +98,9 @@ def test_what_is_collected_verifies_and_reads(collected):
     assert labels.speed.min() > 5.0
 
 
-def test_verify_and_info_as_commands(collected, tmp_path, refused):
+def test_verify_and_info_as_commands(
+    collected: Path, tmp_path: Path, refused: Callable[..., str]
+) -> None:
     done = datagen("verify", collected, "--level", "full", "--json")
     report = json.loads(done.stdout)
     assert done.returncode == 0
@@ -104,14 +114,16 @@ def test_verify_and_info_as_commands(collected, tmp_path, refused):
     assert "no level 'slow'" in refused("verify", collected, "--level", "slow")
 
 
-def test_the_same_plan_gives_the_same_bytes_with_another_number_of_workers(collected, tmp_path):
+def test_the_same_plan_gives_the_same_bytes_with_another_number_of_workers(
+    collected: Path, tmp_path: Path
+) -> None:
     done = datagen("collect", *SHORT, "--out", tmp_path / "again", "--workers", "1")
     assert done.returncode == 0, done.stderr
     for path in sorted((collected / "rounds").iterdir()):
         assert path.read_bytes() == (tmp_path / "again" / "rounds" / path.name).read_bytes()
 
 
-def test_a_finished_dataset_is_left_alone_and_a_lost_round_made_again(collected):
+def test_a_finished_dataset_is_left_alone_and_a_lost_round_made_again(collected: Path) -> None:
     lost = collected / "rounds" / "round-001.mcap"
     kept = collected / "rounds" / "round-000.mcap"
     before, written = lost.read_bytes(), kept.stat().st_mtime_ns
@@ -135,13 +147,17 @@ def test_a_finished_dataset_is_left_alone_and_a_lost_round_made_again(collected)
         (["--tracks-dir", "/no/such/folder"], "no folder /no/such/folder"),
     ],
 )
-def test_what_cannot_be_is_refused_in_one_line(collected, refused, args, message):
+def test_what_cannot_be_is_refused_in_one_line(
+    collected: Path, refused: Callable[..., str], args: list[str], message: str
+) -> None:
     before = {path: path.stat().st_mtime_ns for path in collected.rglob("*")}
     assert message in refused("collect", *SHORT, "--out", collected, *args)
     assert {path: path.stat().st_mtime_ns for path in collected.rglob("*")} == before
 
 
-def test_a_folder_of_something_else_is_not_touched(tmp_path, refused):
+def test_a_folder_of_something_else_is_not_touched(
+    tmp_path: Path, refused: Callable[..., str]
+) -> None:
     (tmp_path / "thesis.tex").write_text("years of work")
     assert "is not a dataset" in refused("collect", *SHORT, "--out", tmp_path)
     assert [p.name for p in tmp_path.iterdir()] == ["thesis.tex"]
@@ -150,12 +166,12 @@ def test_a_folder_of_something_else_is_not_touched(tmp_path, refused):
 
 @pytest.mark.parametrize("failing", range(5))
 def test_a_disk_full_from_the_start_leaves_a_folder_that_can_be_gone_on_with(
-    tmp_path, monkeypatch, failing
-):
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, failing: int
+) -> None:
     """Each of the writes before the first round fails once; the same command then works."""
     folder = tmp_path / "data"
     plan = make_plan(Wanted(1, 10, seed=1, tracks=choose_tracks(("oval",), None)))
-    synced = []
+    synced: list[Path] = []
 
     def full(path: Path) -> None:
         synced.append(path)
@@ -171,7 +187,7 @@ def test_a_disk_full_from_the_start_leaves_a_folder_that_can_be_gone_on_with(
     assert json.loads((folder / "plan.json").read_text())["hash"] == plan.hash
 
 
-def test_a_folder_without_permission_is_told_in_one_line(tmp_path):
+def test_a_folder_without_permission_is_told_in_one_line(tmp_path: Path) -> None:
     """Without the capability to pass over modes, for where the tests run as root."""
 
     def humble() -> None:
@@ -188,7 +204,7 @@ def test_a_folder_without_permission_is_told_in_one_line(tmp_path):
     assert not list(plain.iterdir())
 
 
-def test_empty_parts_of_a_dataset_are_no_foreign_folder(tmp_path):
+def test_empty_parts_of_a_dataset_are_no_foreign_folder(tmp_path: Path) -> None:
     plan = make_plan(Wanted(1, 10, seed=1, tracks=choose_tracks(("oval",), None)))
     (tmp_path / "rounds").mkdir()
     (tmp_path / "state").mkdir()
@@ -199,7 +215,7 @@ def test_empty_parts_of_a_dataset_are_no_foreign_folder(tmp_path):
         collect(plan, tmp_path, workers=1)
 
 
-def test_a_dataset_of_other_definitions_is_refused(tmp_path):
+def test_a_dataset_of_other_definitions_is_refused(tmp_path: Path) -> None:
     plan = make_plan(Wanted(1, 10, seed=1, tracks=choose_tracks(("oval",), None)))
     (tmp_path / "plan.json").write_text(json.dumps({**plan.as_json(), "definitions": "0-old"}))
     with pytest.raises(tf.DefinitionsMismatch, match="0-old"):
@@ -207,7 +223,9 @@ def test_a_dataset_of_other_definitions_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_an_interruption_leaves_whole_rounds_only_and_is_resumed(tmp_path, number):
+def test_an_interruption_leaves_whole_rounds_only_and_is_resumed(
+    tmp_path: Path, number: signal.Signals
+) -> None:
     folder = tmp_path / "data"
     args = ["collect", "--rounds", "3", "--frames", "60", "--tracks", "oval", "--workers", "1"]
     command = [sys.executable, "-m", "datagen", *args, "--out", str(folder)]
@@ -229,9 +247,12 @@ def test_an_interruption_leaves_whole_rounds_only_and_is_resumed(tmp_path, numbe
         assert verify(folder, "full").ok
 
 
-def test_a_worker_that_dies_costs_its_round_only_and_the_round_is_tried_again(tmp_path):
+def test_a_worker_that_dies_costs_its_round_only_and_the_round_is_tried_again(
+    tmp_path: Path,
+) -> None:
     jobs = _jobs(tmp_path, rounds=2, frames=30)
-    killed, done = [], []
+    killed: list[str] = []
+    done: list[str] = []
 
     def hear(message: FramesDone | RoundDone) -> None:
         if isinstance(message, RoundDone):
@@ -247,8 +268,11 @@ def test_a_worker_that_dies_costs_its_round_only_and_the_round_is_tried_again(tm
 
 
 def test_a_round_that_cannot_be_driven_is_tried_once_and_told_in_one_line(
-    tmp_path, monkeypatch, capfd, samples
-):
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+    samples: Samples,
+) -> None:
     """Forked workers take the stand-in for recording with them."""
 
     def record(plan: RoundPlan, plan_hash: str, path: Path, *rest: object) -> None:
@@ -273,12 +297,14 @@ def test_a_round_that_cannot_be_driven_is_tried_once_and_told_in_one_line(
     assert verify(tmp_path / "data", "full").ok
 
 
-def test_a_car_that_is_reset_too_often_ends_its_round(tmp_path, monkeypatch):
+def test_a_car_that_is_reset_too_often_ends_its_round(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("datagen.record.MOST_RESETS", 0)
     monkeypatch.setattr("datagen.record.ScriptedDriver.command", lambda *args: Command(1.0, 1.0))
     (job,) = _jobs(tmp_path, rounds=1, frames=200)
     job = replace(job, plan=replace(job.plan, camera=CameraInfo(width=56, height=42)))
-    message = _attempt(job, None)
+    message = _attempted(job)
     assert isinstance(message, RoundBroken)
     assert message.final
     assert "left the road 1 times on oval, " in message.reason
@@ -286,13 +312,15 @@ def test_a_car_that_is_reset_too_often_ends_its_round(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("reason", [errno.ENOSPC, errno.EACCES])
-def test_a_full_disk_ends_a_round_without_a_trace(tmp_path, monkeypatch, reason):
+def test_a_full_disk_ends_a_round_without_a_trace(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, reason: int
+) -> None:
     def full(*args: object) -> None:
         raise OSError(reason, os.strerror(reason))
 
     (job,) = _jobs(tmp_path, rounds=1, frames=10)
     monkeypatch.setattr("datagen.record.RoundWriter.add", full)
-    message = _attempt(job, None)
+    message = _attempted(job)
     assert isinstance(message, Hopeless)
     assert isinstance(message.error, OSError)
     assert message.error.errno == reason
@@ -300,7 +328,7 @@ def test_a_full_disk_ends_a_round_without_a_trace(tmp_path, monkeypatch, reason)
     assert not list(tmp_path.glob("rounds/*"))
 
 
-def test_a_disk_that_fills_up_gives_one_line_and_keeps_the_rounds(collected):
+def test_a_disk_that_fills_up_gives_one_line_and_keeps_the_rounds(collected: Path) -> None:
     """A limit on the size of files stands in for the full disk: the same write fails."""
     lost = collected / "rounds" / "round-001.mcap"
     before = lost.read_bytes()
@@ -320,7 +348,7 @@ def test_a_disk_that_fills_up_gives_one_line_and_keeps_the_rounds(collected):
     assert lost.read_bytes() == before
 
 
-def test_help_is_quick():
+def test_help_is_quick() -> None:
     code = "import sys, datagen.cli; print(*sorted({m.split('.')[0] for m in sys.modules}))"
     loaded = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True
@@ -329,9 +357,17 @@ def test_help_is_quick():
     assert not heavy & set(loaded.stdout.split())
 
 
-def _wait_for(found, process):
+def _attempted(job: Job) -> Message:
+    ours, the_workers = multiprocessing.Pipe()
+    with ours, the_workers:
+        return _attempt(job, the_workers)
+
+
+def _wait_for(found: Callable[[], object], process: subprocess.Popen[str]) -> None:
+    stderr = process.stderr
+    assert stderr is not None
     deadline = time.monotonic() + 60.0
     while not found():
-        assert process.poll() is None, process.stderr.read()
+        assert process.poll() is None, stderr.read()
         assert time.monotonic() < deadline
         time.sleep(0.02)

@@ -1,6 +1,8 @@
 """Opening a dataset: arrays, batches, and what is refused."""
 
 import json
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,9 +14,10 @@ from datagen.recording.encoding import decode_into
 from datagen.recording.folder import prepare, write_synced
 from datagen.recording.header import RoundHeader, RoundResult
 from datagen.recording.splits import Split, read_split, split_path, write_split
+from tests.datagen.conftest import Samples
 
 
-def test_rounds_sides_and_labels(samples, dataset):
+def test_rounds_sides_and_labels(samples: Samples, dataset: Path) -> None:
     opened = Dataset.open(dataset)
     assert [(info.id, info.split, info.frames) for info in opened.rounds] == [
         ("r000", "train", 45),
@@ -28,7 +31,7 @@ def test_rounds_sides_and_labels(samples, dataset):
     labels = train.labels
     for i, frame in enumerate(expected):
         wanted = [np.nan if d is None else d for d in frame.features.distances.values()]
-        assert np.array_equal(labels.distances[i], np.float32(wanted), equal_nan=True)
+        assert np.array_equal(labels.distances[i], np.array(wanted, np.float32), equal_nan=True)
         centre = frame.features.to_lane_centre
         assert np.isnan(labels.to_lane_centre[i]) == (centre is None)
         assert labels.angle[i] == np.float32(frame.features.angle)
@@ -40,7 +43,7 @@ def test_rounds_sides_and_labels(samples, dataset):
     assert labels.round.tolist() == [0] * 45 + [1] * 45
 
 
-def test_batches_are_the_decoded_images_in_the_order_asked_for(dataset):
+def test_batches_are_the_decoded_images_in_the_order_asked_for(dataset: Path) -> None:
     frames = Dataset.open(dataset).select("all")
     wanted = [134, 0, 77, 44, 45, 77]
     batch = frames.read_batch(wanted, np.empty((6, 42, 56, 3), np.uint8))
@@ -51,7 +54,7 @@ def test_batches_are_the_decoded_images_in_the_order_asked_for(dataset):
     assert not np.array_equal(batch[0], batch[1])
 
 
-def test_a_batch_of_another_shape_is_refused(dataset):
+def test_a_batch_of_another_shape_is_refused(dataset: Path) -> None:
     frames = Dataset.open(dataset).select("all")
     with pytest.raises(ValueError, match=r"expected uint8 \(2, 42, 56, 3\)"):
         frames.read_batch([0, 1], np.empty((2, 56, 42, 3), np.uint8))
@@ -59,7 +62,7 @@ def test_a_batch_of_another_shape_is_refused(dataset):
         frames.jpeg(135)
 
 
-def test_header_and_result_survive_their_metadata(samples):
+def test_header_and_result_survive_their_metadata(samples: Samples) -> None:
     header = samples.header(program='with "quotes" and = signs')
     assert RoundHeader.from_metadata(header.to_metadata()) == header
     result = RoundResult(7, "ab", laps=2, resets=1, distance_m=0.1, mean_speed_kmh=51.25)
@@ -72,34 +75,34 @@ def test_header_and_result_survive_their_metadata(samples):
     ids=["same-seed", "same-content"],
 )
 def test_a_split_with_a_seed_or_content_on_both_sides_is_refused(
-    samples, dataset, changes, content, what
-):
+    samples: Samples, dataset: Path, changes: dict[str, Any], content: int, what: str
+) -> None:
     samples.add_round(dataset, samples.header("r003", **changes), content_seed=content)
     write_split(split_path(dataset), Split(("r000", "r001"), ("r002", "r003")))
     with pytest.raises(DatasetError, match=f"{what}.* on both sides"):
         Dataset.open(dataset)
 
 
-def test_a_split_with_a_round_on_both_sides_is_refused(dataset):
+def test_a_split_with_a_round_on_both_sides_is_refused(dataset: Path) -> None:
     write_split(split_path(dataset), Split(("r000", "r001"), ("r001", "r002")))
     with pytest.raises(DatasetError, match="round r001 on both sides"):
         Dataset.open(dataset)
 
 
-def test_other_definitions_are_refused(samples, dataset):
+def test_other_definitions_are_refused(samples: Samples, dataset: Path) -> None:
     samples.add_round(dataset, samples.header("r003", definitions="0-old"))
     with pytest.raises(tf.DefinitionsMismatch, match="0-old"):
         Dataset.open(dataset)
 
 
-def test_other_definitions_of_a_split_are_refused(dataset):
+def test_other_definitions_of_a_split_are_refused(dataset: Path) -> None:
     path = split_path(dataset)
     path.write_text(json.dumps({**json.loads(path.read_text()), "definitions": "0-old"}))
     with pytest.raises(tf.DefinitionsMismatch, match="0-old"):
         Dataset.open(dataset)
 
 
-def test_two_cameras_in_one_dataset_are_refused(samples, dataset):
+def test_two_cameras_in_one_dataset_are_refused(samples: Samples, dataset: Path) -> None:
     from dataclasses import replace
 
     tilted = replace(samples.camera, pitch_deg=5.0)
@@ -108,7 +111,9 @@ def test_two_cameras_in_one_dataset_are_refused(samples, dataset):
         Dataset.open(dataset)
 
 
-def test_a_folder_without_rounds_and_a_side_without_rounds_are_named(samples, tmp_path):
+def test_a_folder_without_rounds_and_a_side_without_rounds_are_named(
+    samples: Samples, tmp_path: Path
+) -> None:
     with pytest.raises(DatasetError, match="holds no recorded rounds"):
         Dataset.open(tmp_path)
     prepare(tmp_path)
@@ -120,7 +125,9 @@ def test_a_folder_without_rounds_and_a_side_without_rounds_are_named(samples, tm
         Dataset.open(tmp_path).select("dev")
 
 
-def test_the_content_hash_does_not_depend_on_the_rounds_names(samples, tmp_path):
+def test_the_content_hash_does_not_depend_on_the_rounds_names(
+    samples: Samples, tmp_path: Path
+) -> None:
     hashes = []
     for name, ids in (("a", ("r001", "r002")), ("b", ("r008", "r007"))):
         prepare(tmp_path / name)
@@ -131,7 +138,7 @@ def test_the_content_hash_does_not_depend_on_the_rounds_names(samples, tmp_path)
     assert hashes[0] == hashes[1]
 
 
-def test_the_derived_files_are_rebuilt_from_the_rounds_alone(dataset):
+def test_the_derived_files_are_rebuilt_from_the_rounds_alone(dataset: Path) -> None:
     names = ("manifest.json", "stats.json", "README.md")
     before = {name: (dataset / name).read_bytes() for name in names}
     for name in names:
@@ -148,7 +155,9 @@ def test_the_derived_files_are_rebuilt_from_the_rounds_alone(dataset):
     assert (dataset / "proto" / "driverview.proto").read_text().count("\nmessage ") == 4
 
 
-def test_a_split_is_replaced_whole_and_an_identical_one_not_touched(dataset, monkeypatch):
+def test_a_split_is_replaced_whole_and_an_identical_one_not_touched(
+    dataset: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     path = split_path(dataset)
     before = path.stat()
     write_split(path, Split(("r000", "r001"), ("r002",)))
@@ -163,7 +172,9 @@ def test_a_split_is_replaced_whole_and_an_identical_one_not_touched(dataset, mon
     assert read_split(path) == Split(("r000", "r001"), ("r002",))
 
 
-def test_a_file_is_replaced_whole_or_left_alone(tmp_path, monkeypatch):
+def test_a_file_is_replaced_whole_or_left_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     path = tmp_path / "a.json"
     write_synced(path, "old")
 

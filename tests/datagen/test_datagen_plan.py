@@ -3,6 +3,8 @@
 from collections import Counter
 from dataclasses import replace
 from itertools import pairwise
+from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -13,11 +15,11 @@ from datagen.tracks import TORCS_TRACKS, choose_tracks
 NINE = tuple(TrackChoice(f"track-{i}", f"{i}" * 64) for i in range(9))
 
 
-def wanted(**changes):
+def wanted(**changes: Any) -> Wanted:
     return replace(Wanted(rounds=60, frames=2000, seed=0, tracks=NINE), **changes)
 
 
-def test_the_same_wishes_give_the_same_plan_and_others_another():
+def test_the_same_wishes_give_the_same_plan_and_others_another() -> None:
     plan = make_plan(wanted())
     assert plan == make_plan(wanted())
     others = [
@@ -28,7 +30,7 @@ def test_the_same_wishes_give_the_same_plan_and_others_another():
     assert len(hashes) == 7
 
 
-def test_sixty_rounds_cover_everything_evenly():
+def test_sixty_rounds_cover_everything_evenly() -> None:
     rounds = make_plan(wanted()).rounds
     tracks = Counter(entry.track for entry in rounds)
     assert set(tracks.values()) == {6, 7}
@@ -47,7 +49,9 @@ def test_sixty_rounds_cover_everything_evenly():
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_a_quarter_is_for_testing_and_every_track_and_lane_count_is_on_both_sides(seed):
+def test_a_quarter_is_for_testing_and_every_track_and_lane_count_is_on_both_sides(
+    seed: int,
+) -> None:
     rounds = make_plan(wanted(seed=seed)).rounds
     sides = {side: [e for e in rounds if e.split == side] for side in ("train", "test")}
     assert len(sides["test"]) == 15
@@ -60,7 +64,7 @@ def test_a_quarter_is_for_testing_and_every_track_and_lane_count_is_on_both_side
     assert not {e.seed for e in rounds} & {e.seed for e in make_plan(wanted(seed=seed + 1)).rounds}
 
 
-def test_small_plans_keep_a_round_of_each_track_for_training():
+def test_small_plans_keep_a_round_of_each_track_for_training() -> None:
     twelve = make_plan(wanted(rounds=12, tracks=NINE[:4])).rounds
     train = [e for e in twelve if e.split == "train"]
     assert {e.track for e in train} == {e.track for e in twelve}
@@ -75,12 +79,14 @@ def test_small_plans_keep_a_round_of_each_track_for_training():
     [{"rounds": 0}, {"frames": 0}, {"seed": -1}, {"lanes": (4,)}, {"lanes": ()}, {"tracks": ()},
      {"test_share": 1.0}, {"lights": ("disco",)}, {"codec": "gif"}],
 )  # fmt: skip
-def test_wishes_that_cannot_be_met_are_refused(changes):
+def test_wishes_that_cannot_be_met_are_refused(changes: dict[str, Any]) -> None:
     with pytest.raises(tf.UserError):
         wanted(**changes)
 
 
-def test_without_torcs_the_projects_own_tracks_are_driven(monkeypatch, tmp_path):
+def test_without_torcs_the_projects_own_tracks_are_driven(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     monkeypatch.delenv("TORCS_TRACKS", raising=False)
     monkeypatch.setattr("simulator.track.catalogue.SYSTEM_TRACKS", tmp_path / "none")
     names = [choice.name for choice in choose_tracks((), None)]

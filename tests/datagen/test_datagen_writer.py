@@ -3,6 +3,7 @@
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import mcap.writer
 import numpy as np
@@ -14,8 +15,9 @@ from mcap_protobuf.decoder import DecoderFactory
 import trackfeatures as tf
 from datagen.recording import topics
 from datagen.recording.encoding import decode_into, encode
-from datagen.recording.index import MappedMessages, load_round, open_round
+from datagen.recording.index import MappedMessages, RoundIndex, load_round, open_round
 from datagen.recording.labels import read_labels
+from tests.datagen.conftest import Samples
 
 SCHEMAS = {
     "/camera/front": "foxglove.CompressedImage",
@@ -31,14 +33,17 @@ SCHEMAS = {
 }
 
 
-def test_every_topic_is_there_at_its_rate_and_decodes_with_the_official_reader(samples, tmp_path):
+def test_every_topic_is_there_at_its_rate_and_decodes_with_the_official_reader(
+    samples: Samples, tmp_path: Path
+) -> None:
     path = tmp_path / "r.mcap"
     frames = samples.frames(45, seed=3)
     samples.write(path, samples.header(), frames)
-    seen: dict[str, list[object]] = {topic: [] for topic in SCHEMAS}
+    seen: dict[str, list[Any]] = {topic: [] for topic in SCHEMAS}
     with path.open("rb") as stream:
         reader = make_reader(stream, validate_crcs=True, decoder_factories=[DecoderFactory()])
         for schema, channel, message, decoded in reader.iter_decoded_messages():
+            assert schema is not None
             assert schema.name == SCHEMAS[channel.topic]
             assert (message.log_time - topics.EPOCH_NS) % (topics.NANOSECONDS // 20) == 0
             seen[channel.topic].append(decoded)
@@ -47,6 +52,7 @@ def test_every_topic_is_there_at_its_rate_and_decodes_with_the_official_reader(s
     assert counts == {
         **dict.fromkeys(SCHEMAS, 45), "/camera/front/calibration": 3, "/track/scene": 1,
     }  # fmt: skip
+    assert summary is not None
     assert all(chunk.compression == "" for chunk in summary.chunk_indexes)
     image = simplejpeg.decode_jpeg(seen["/camera/front"][7].data, "RGB")
     assert np.abs(image.astype(int) - frames[7].image).mean() < 6.0
@@ -57,7 +63,7 @@ def test_every_topic_is_there_at_its_rate_and_decodes_with_the_official_reader(s
     assert np.allclose([(p.x, p.y) for p in line.points], frames[2].markings[0])
 
 
-def test_labels_keep_every_digit_and_absence_is_unset(samples, tmp_path):
+def test_labels_keep_every_digit_and_absence_is_unset(samples: Samples, tmp_path: Path) -> None:
     path = tmp_path / "r.mcap"
     frames = samples.frames(200, seed=4)
     samples.write(path, samples.header(), frames)
@@ -78,7 +84,7 @@ def test_labels_keep_every_digit_and_absence_is_unset(samples, tmp_path):
     assert absent > 100  # the samples do have absent distances
 
 
-def test_our_reader_and_the_official_one_find_the_same(samples, tmp_path):
+def test_our_reader_and_the_official_one_find_the_same(samples: Samples, tmp_path: Path) -> None:
     path = tmp_path / "r.mcap"
     samples.write(path, samples.header(), samples.frames(60, seed=5))
     fast, official = open_round(path), load_round(path)
@@ -89,7 +95,9 @@ def test_our_reader_and_the_official_one_find_the_same(samples, tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["zstd", "unindexed"])
-def test_compressed_and_unindexed_files_go_through_the_official_reader(samples, tmp_path, kind):
+def test_compressed_and_unindexed_files_go_through_the_official_reader(
+    samples: Samples, tmp_path: Path, kind: str
+) -> None:
     path, other = tmp_path / "r.mcap", tmp_path / "other.mcap"
     samples.write(path, samples.header(), samples.frames(30, seed=6))
     _rewrite(path, other, kind)
@@ -98,7 +106,9 @@ def test_compressed_and_unindexed_files_go_through_the_official_reader(samples, 
     _assert_same(index, open_round(path))
 
 
-def test_the_same_round_gives_the_same_bytes_in_two_processes(samples, tmp_path):
+def test_the_same_round_gives_the_same_bytes_in_two_processes(
+    samples: Samples, tmp_path: Path
+) -> None:
     code = (
         "import importlib.util, pathlib, sys\n"
         f"spec = importlib.util.spec_from_file_location('c', {str(Path(__file__).parent)!r} + "
@@ -115,7 +125,9 @@ def test_the_same_round_gives_the_same_bytes_in_two_processes(samples, tmp_path)
     assert mine.read_bytes() == paths[0].read_bytes()
 
 
-def test_the_content_hash_knows_images_and_labels_but_not_names(samples, tmp_path):
+def test_the_content_hash_knows_images_and_labels_but_not_names(
+    samples: Samples, tmp_path: Path
+) -> None:
     frames = samples.frames(10, seed=8)
     first = samples.write(tmp_path / "a.mcap", samples.header("r001"), frames)
     renamed = samples.write(tmp_path / "b.mcap", samples.header("r002"), frames)
@@ -123,7 +135,7 @@ def test_the_content_hash_knows_images_and_labels_but_not_names(samples, tmp_pat
     assert first.content_hash == renamed.content_hash != shorter.content_hash
 
 
-def test_png_loses_nothing_and_jpeg_little():
+def test_png_loses_nothing_and_jpeg_little() -> None:
     rng = np.random.default_rng(0)
     image = rng.integers(0, 256, (42, 56, 3), dtype=np.uint8)
     out = np.empty_like(image)
@@ -134,13 +146,13 @@ def test_png_loses_nothing_and_jpeg_little():
     assert np.abs(out.astype(int) - smooth).max() <= 4
 
 
-def test_an_image_of_another_size_is_refused():
+def test_an_image_of_another_size_is_refused() -> None:
     small = encode(np.zeros((20, 20, 3), np.uint8), "jpeg")
     with pytest.raises(ValueError, match="20x20 px where 56x42"):
         decode_into(small, np.empty((42, 56, 3), np.uint8))
 
 
-def _assert_same(one, other):
+def _assert_same(one: RoundIndex, other: RoundIndex) -> None:
     for topic in (topics.CAMERA, topics.LABELS, topics.EGO_STATE):
         a, b = one.messages[topic], other.messages[topic]
         assert np.array_equal(a.log_time, b.log_time)
@@ -152,25 +164,26 @@ def _assert_same(one, other):
     assert set(np.unique(mine.heading)) <= set(tf.Heading)
 
 
-def _rewrite(source, target, kind):
+def _rewrite(source: Path, target: Path, kind: str) -> None:
     """The same messages in another kind of MCAP file."""
-    settings = {
+    kinds: dict[str, dict[str, Any]] = {
         "zstd": {"compression": mcap.writer.CompressionType.ZSTD},
         "unindexed": {
             "compression": mcap.writer.CompressionType.NONE,
             "index_types": mcap.writer.IndexType.METADATA,
             "use_chunking": False,
         },
-    }[kind]
+    }
     with source.open("rb") as stream, target.open("wb") as out:
         reader = make_reader(stream)
-        writer = mcap.writer.Writer(out, **settings)
+        writer = mcap.writer.Writer(out, **kinds[kind])
         writer.start()
         for record in reader.iter_metadata():
             writer.add_metadata(record.name, record.metadata)
-        channels = {}
+        channels: dict[int, int] = {}
         for schema, channel, message in reader.iter_messages(log_time_order=False):
             if channel.id not in channels:
+                assert schema is not None
                 number = writer.register_schema(schema.name, schema.encoding, schema.data)
                 channels[channel.id] = writer.register_channel(
                     channel.topic, channel.message_encoding, number
@@ -178,4 +191,4 @@ def _rewrite(source, target, kind):
             writer.add_message(
                 channels[channel.id], message.log_time, message.data, message.publish_time
             )
-        writer.finish()
+        writer.finish()  # type: ignore[no-untyped-call]  # mcap leaves it untyped

@@ -31,8 +31,8 @@ def pixel_of(
     seen = point - (np.array([0.0, to_middle]) + camera.x * ahead)
     focal = camera.height / 2 / np.tan(np.radians(camera.fov_y_deg) / 2)
     centre = np.array([(camera.width - 1) / 2, (camera.height - 1) / 2])
-    across, along = float(seen @ left), float(seen @ ahead)
-    return centre + focal * np.array([-across, camera.z + 0.25]) / along
+    below: NDArray[np.float64] = focal * np.array([-(seen @ left), camera.z + 0.25])
+    return centre + below / float(seen @ ahead)
 
 
 @pytest.mark.parametrize("turned", [-0.08, 0.03])

@@ -223,6 +223,7 @@ def test_contact_sheet(road: Road, tmp_path: Path) -> None:
     out = tmp_path / "sheet.png"
     write_contact_sheet(road, out, seed=0, traffic=2)
     sheet = cv2.imread(str(out))
+    assert sheet is not None
     assert sheet.shape == (4 * 360, 4 * 480, 3)
     with pytest.raises(UserError, match=r"ends in \.png"):
         write_contact_sheet(road, tmp_path / "sheet.gif", seed=0, traffic=0)

@@ -53,7 +53,8 @@ def test_the_observation_is_the_papers_state() -> None:
 def test_throttle_and_gear_are_held_and_the_score_is_the_sum_of_rewards() -> None:
     env = make()
     env.reset(seed=1)
-    total, info = 0.0, {}
+    total = 0.0
+    info: dict[str, Any] = {}
     for _ in range(120):
         state = env.unwrapped.world.state  # type: ignore[attr-defined]
         wheel = -(state.to_middle - 2.0 * state.angle)
@@ -142,6 +143,7 @@ def test_full_controls_shift_and_brake() -> None:
 
 def test_two_environments_beside_each_other_are_like_one_alone() -> None:
     vector = gym.make_vec(STATE_ID, num_envs=2, vectorization_mode="async", track="circuit")
+    assert isinstance(vector, gym.vector.AsyncVectorEnv)
     observations, _ = vector.reset(seed=[4, 5])
     for _ in range(30):
         observations, *_ = vector.step(np.array([[0.02], [-0.02]], np.float32))
