@@ -6,7 +6,7 @@ from rich.table import Table
 from controllers.demo.frames import Asked
 from controllers.demo.report import LEARNED_RATIO, VERDICT_COLUMNS, Verdict, verdict_cells
 
-WIDTH = 118
+WIDTH = 120
 """Columns the tables need; a narrower terminal wraps whole lines, which reads better."""
 
 
@@ -28,8 +28,10 @@ def _verdict_table(verdicts: list[Verdict]) -> Table:
 
 
 def _answers_table(asked: list[Asked]) -> Table:
-    table = Table(title="Held-out frames: true, answered")
-    columns = ("track", "lanes", "to lane centre (m)", "ml (m)", "mr (m)", "m (m)", "angle (rad)")
+    table = Table(
+        title="Held-out frames: true, answered (centre: offset from the centre of the lane)"
+    )
+    columns = ("track", "lanes", "centre (m)", "ml (m)", "mr (m)", "m (m)", "angle (rad)")
     for column in (*columns, "heading"):
         table.add_column(column, no_wrap=True, justify="right")
     for one in asked:
