@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from simulator.camera import foliage, textures
+from simulator.camera.llvm import load_triton_first
 from trackfeatures.errors import UserError
 
 if TYPE_CHECKING:
@@ -166,6 +167,7 @@ def _create_context() -> "moderngl.Context":
     import moderngl
 
     settings: dict[str, Any] = {"backend": "egl"}
+    load_triton_first()
     try:
         return moderngl.create_context(require=330, standalone=True, **settings)
     except Exception as error:  # moderngl and glcontext raise bare Exception, ImportError, ...

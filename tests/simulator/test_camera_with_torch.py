@@ -1,0 +1,28 @@
+"""A process that draws may learn too: Mesa's and triton's LLVM must not meet."""
+
+import subprocess
+import sys
+
+DRAW_THEN_LEARN = """
+from simulator.camera import Camera, Light
+from simulator.track.catalogue import find_track
+from simulator.track.road import Road
+import numpy as np
+light = Light.named("clear", np.random.default_rng(0))
+with Camera(Road(find_track("oval")), seed=0, light=light, width=64, height=48) as camera:
+    picture = camera.render(np.array([0.0, 0.0, 0.3, 0.0, 0.0, 0.0]))
+import torch
+weight = torch.nn.Parameter(torch.ones(3))
+optimiser = torch.optim.AdamW([weight])  # the first optimiser imports torch's compiler and triton
+weight.sum().backward()
+optimiser.step()
+print(picture.shape, bool((weight < 1).all()))
+"""
+
+
+def test_torch_learns_in_a_process_that_has_drawn() -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", DRAW_THEN_LEARN], capture_output=True, text=True, timeout=120
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert done.stdout.split("\n")[-2] == "(48, 64, 3) True"
