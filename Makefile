@@ -44,7 +44,7 @@ test: check $(READY) ## all checks and tests
 check: $(READY) ## format, lint, types, imports
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
-	$(BIN)/mypy $(PACKAGES) tests
+	$(BIN)/mypy $(PACKAGES) tests benchmarks
 	$(BIN)/lint-imports
 
 quick: $(READY) ## the tests that take seconds
