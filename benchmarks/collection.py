@@ -1,12 +1,16 @@
 """Collection against the bare render loop of the same scenes, all cores, in one run.
 
-Run: `python benchmarks/collection.py [--rounds 6] [--frames 500]`. Claim: at least 120 frames a
-second at 280 x 210 on two cores, physics, rendering, labels, JPEG, MCAP and checks included.
+Run: `python benchmarks/collection.py [--rounds 6] [--frames 2000] [--json FILE]`. Claim (on two
+cores with Mesa, 280 x 210): at least 250 frames a second, physics, rendering, labels, JPEG, MCAP
+and checks included, and at least 0.75 of what drawing alone reaches. The bare loop draws the same
+frames, traffic and all, and does nothing else; its scenes are built before the clock starts. Ratios
+are of wall time, which decides, and of processor time, which neighbours spoil less.
 """
 
 import argparse
 import json
 import os
+import resource
 import subprocess
 import sys
 import tempfile
@@ -14,74 +18,74 @@ import time
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
+from typing import Any
 
-CLAIM_FRAMES_PER_SECOND = 120.0
+CLAIM_FRAMES_PER_SECOND = 250.0
+CLAIM_RATIO = 0.75
 FRAMES_OF_WARM_UP = 20
 
 
-def collect(out: Path, rounds: int, frames: int, seed: int) -> dict[str, float]:
-    """`datagen collect --json` on the project's own tracks; what it says."""
+def collect(out: Path, rounds: int, frames: int, seed: int) -> dict[str, Any]:
+    """`datagen collect --json`; what it says, and the processor time of all its processes."""
     command = [sys.executable, "-m", "datagen", "collect", "--json", "--out", str(out)]
     command += ["--rounds", str(rounds), "--frames", str(frames), "--seed", str(seed)]
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
     done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
-    result: dict[str, float] = json.loads(done.stdout)
-    return result
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    cpu_s = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    return {**json.loads(done.stdout), "cpu_s": cpu_s}
 
 
-def render_round(path: Path) -> tuple[int, float]:
-    """Render every frame of a recorded round again, nothing else; frames and seconds."""
+def draw_round(entry: dict[str, Any]) -> tuple[int, float, float]:
+    """Drive a round of the plan, then draw all its frames: how many, wall and processor seconds."""
     # Mesa and numpy are to use one thread a process, as the collector's workers do.
-    os.environ.update(LP_NUM_THREADS="1", OMP_NUM_THREADS="1")
-    import numpy as np
-    from mcap.reader import make_reader
-    from mcap_protobuf.decoder import DecoderFactory
+    os.environ.update(LP_NUM_THREADS="0", OMP_NUM_THREADS="1")
+    from datagen.plan import RoundPlan
+    from datagen.record import moments_of, scene_of
 
-    from simulator.camera import Camera, Light
-    from simulator.track.catalogue import find_track
-    from simulator.track.road import Road
-
-    with path.open("rb") as stream:
-        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
-        about = next(m for m in reader.iter_metadata() if m.name == "driverview.round").metadata
-        poses = [
-            (m.x, m.y, m.z, m.roll, m.pitch, m.yaw)
-            for _, _, _, m in reader.iter_decoded_messages(topics=["/ego/state"])
-        ]
-    seed = int(about["seed"])
-    road = Road(find_track(json.loads(about["track"])), int(about["lanes"]))
-    light = Light.named(json.loads(about["light"]), np.random.default_rng([seed, 2]))
-    with Camera(road, seed=seed, light=light) as camera:
-        camera.render(np.array(poses[0]), np.zeros((0, 6)))
-        started = time.perf_counter()
-        for pose in poses:
-            camera.render(np.array(pose), np.zeros((0, 6)))
-        return len(poses), time.perf_counter() - started
+    with scene_of(RoundPlan.from_json(entry), None) as (drive, camera):
+        moments = [moment for part in moments_of(drive, camera) for moment in part]
+        camera.render(moments[0].pose, moments[0].traffic)
+        started, cpu = time.perf_counter(), time.process_time()
+        for moment in moments:
+            camera.render(moment.pose, moment.traffic)
+        return len(moments), time.perf_counter() - started, time.process_time() - cpu
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--rounds", type=int, default=6)
-    parser.add_argument("--frames", type=int, default=500)
+    parser.add_argument("--frames", type=int, default=2000)
+    parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
-    cores = os.cpu_count() or 1
+    cores = len(os.sched_getaffinity(0))
     with tempfile.TemporaryDirectory() as folder:
         collect(Path(folder) / "warm-up", cores, FRAMES_OF_WARM_UP, seed=1)
         data = Path(folder) / "data"
         collected = collect(data, arguments.rounds, arguments.frames, seed=2)
-        rounds = sorted((data / "rounds").glob("*.mcap"))
+        plan = json.loads((data / "plan.json").read_text())
         with ProcessPoolExecutor(cores, mp_context=get_context("spawn")) as pool:
-            rendered = list(pool.map(render_round, rounds))
-    bare = cores * sum(n for n, _ in rendered) / sum(seconds for _, seconds in rendered)
-    speed = collected["frames_per_second"]
+            drawn = list(pool.map(draw_round, plan["rounds"]))
+    frames = sum(count for count, _, _ in drawn)
+    bare = cores * frames / sum(wall for _, wall, _ in drawn)
+    speed = float(collected["frames_per_second"])
     result = {
         "cores": cores,
+        "frames": frames,
         "collect_frames_per_second": round(speed, 1),
-        "bare_render_frames_per_second": round(bare, 1),
+        "bare_frames_per_second": round(bare, 1),
         "ratio": round(speed / bare, 3),
-        "claim_frames_per_second": CLAIM_FRAMES_PER_SECOND,
-        "reached": speed >= CLAIM_FRAMES_PER_SECOND,
+        "collect_cpu_ms_per_frame": round(1000.0 * collected["cpu_s"] / frames, 3),
+        "bare_cpu_ms_per_frame": round(1000.0 * sum(cpu for _, _, cpu in drawn) / frames, 3),
+        "cpu_ratio": round(sum(cpu for _, _, cpu in drawn) / collected["cpu_s"], 3),
+        "claims": {"frames_per_second": CLAIM_FRAMES_PER_SECOND, "ratio": CLAIM_RATIO},
     }
-    print(json.dumps(result))
+    result["reached"] = speed >= CLAIM_FRAMES_PER_SECOND and speed / bare >= CLAIM_RATIO
+    text = json.dumps(result, indent=1)
+    print(text)
+    if arguments.json:
+        arguments.json.write_text(text + "\n")
+    sys.exit(0 if result["reached"] else 1)
 
 
 if __name__ == "__main__":

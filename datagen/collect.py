@@ -3,57 +3,47 @@
 datagen collect --rounds 60 --out datasets/default
 """
 
-import fcntl
-import json
-import os
 import signal
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType
 from typing import Any, Protocol
 
 import trackfeatures as tf
-from datagen.crew import Crew, Failure
-from datagen.plan import Plan
+from datagen.crew import Crew, Hear
+from datagen.lock import held, setting_up
+from datagen.opening import open_folder, require_fitting, split_of
+from datagen.plan import Plan, RoundPlan
 from datagen.recording.derived import rebuild
 from datagen.recording.errors import DatasetError
-from datagen.recording.folder import (
-    barely_begun,
-    discard_partials,
-    prepare,
-    read_states,
-    round_path,
-    write_synced,
-)
-from datagen.recording.splits import Split, split_path, write_split
-from datagen.worker import FramesDone, Job, RoundDone
+from datagen.recording.folder import discard_partials, read_states, round_path
+from datagen.round import Job
+from datagen.shard import Shard
+from datagen.tally import Collected, Progress, Tally
+from datagen.tries import Failure
 
-PLAN = "plan.json"
+EXECUTORS = ("local", "ray")
 
 
-class Progress(Protocol):
-    """Hears how the collection goes."""
+class Executor(Protocol):
+    """Records rounds; see `crew.Crew.run`."""
 
-    def __call__(self, done_frames: int, done_rounds: int) -> None: ...
+    def run(self, jobs: Iterable[Job]) -> list[Failure]: ...
 
 
-@dataclass(frozen=True, slots=True)
-class Collected:
-    """`rounds` and `frames` are in the folder; `recorded_frames` of them came in this run."""
+def make_crew(executor: str, workers: int, hear: Hear) -> Executor:
+    """Processes of this machine, or of a Ray cluster. Raises UserError for anything else."""
+    if workers < 0:
+        raise tf.UserError(f"{workers} workers asked for; give 1 or more, or 0 for one a core")
+    if executor not in EXECUTORS:
+        raise tf.UserError(f"there is no executor {executor!r}; choose {', '.join(EXECUTORS)}")
+    if executor == "ray":
+        from datagen.ray_crew import RayCrew
 
-    rounds: int
-    frames: int
-    seconds: float
-    frames_per_second: float
-    recorded_frames: int
-    resets: int
-    out: str
-
-    def as_json(self) -> dict[str, Any]:
-        return asdict(self)
+        return RayCrew(workers, hear)
+    return Crew(workers, hear)
 
 
 def collect(
@@ -62,32 +52,51 @@ def collect(
     workers: int,
     tracks_dir: Path | None = None,
     progress: Progress = lambda done_frames, done_rounds: None,
+    *,
+    executor: str = "local",
+    shard: Shard | None = None,
 ) -> Collected:
-    """Record what is missing of the plan into `folder`.
+    """Record what is missing of the plan, or of its part `shard`, into `folder`.
 
     Raises DatasetError when the folder holds something else or rounds failed; UserError and
     OSError as they come. Finished rounds stay in every case, unfinished ones leave no trace.
     """
-    if workers < 1:
-        raise tf.UserError(f"{workers} workers asked for; at least one is needed")
     started = time.perf_counter()
-    _require_fitting(folder, plan)
+    mine = plan.rounds if shard is None else shard.of(plan.rounds)
+    make_crew(executor, workers, lambda message: None)  # what cannot be is refused first
+    require_fitting(folder, plan)
     folder.mkdir(parents=True, exist_ok=True)
-    with _alone(folder):
-        _open_folder(folder, plan)
-        tally = _Tally(plan, read_states(folder).keys(), progress)
-        missing = [entry for entry in plan.rounds if entry.id not in tally.finished]
-        crew = Crew(workers, tally.hear)
-        with _terminable():
-            try:
-                failures = crew.run(Job(e, plan.hash, folder, tracks_dir) for e in missing)
-            finally:
-                _sweep(folder, plan)
-        if tally.finished:
-            rebuild(folder, _split(plan, set(tally.finished)))
+    with _terminable(), held(folder, shard):
+        with setting_up(folder):
+            open_folder(folder, plan)
+        _sweep(folder, mine)
+        tally = Tally(mine, read_states(folder).keys(), progress)
+        missing = [entry for entry in mine if entry.id not in tally.finished]
+        crew = make_crew(executor, workers, tally.hear)
+        try:
+            failures = crew.run(Job(e, plan.hash, folder, tracks_dir) for e in missing)
+        except BaseException:
+            with suppress(OSError, tf.UserError):  # what went wrong first is what is told
+                _sweep(folder, mine)
+                _derive(folder, plan, shard)
+            raise
+        _sweep(folder, mine)
+        content_hash = _derive(folder, plan, shard)
     if failures:
-        raise DatasetError(_told(failures, len(plan.rounds)))
-    return tally.result(folder, time.perf_counter() - started)
+        raise DatasetError(_told(failures, len(mine)))
+    return tally.result(folder, time.perf_counter() - started, content_hash)
+
+
+def _derive(folder: Path, plan: Plan, shard: Shard | None) -> str | None:
+    """Manifest, split, statistics and card of what is there; the dataset's hash.
+
+    The last shard of a folder to end finds all rounds there; the others leave it to that one.
+    """
+    with setting_up(folder):
+        finished = read_states(folder).keys() & {entry.id for entry in plan.rounds}
+        if not finished or (shard is not None and len(finished) < len(plan.rounds)):
+            return None
+        return str(rebuild(folder, split_of(plan, set(finished)))["content_hash"])
 
 
 def _told(failures: Sequence[Failure], planned: int) -> str:
@@ -102,129 +111,13 @@ def _told(failures: Sequence[Failure], planned: int) -> str:
     )
 
 
-class _Tally:
-    """Counts what the crew reports."""
-
-    def __init__(self, plan: Plan, finished: Any, progress: Progress) -> None:
-        self._frames_of = {entry.id: entry.frames for entry in plan.rounds}
-        self.finished = [round_id for round_id in self._frames_of if round_id in finished]
-        self._before = sum(self._frames_of[round_id] for round_id in self.finished)
-        self._running: dict[str, int] = {}
-        self._resets = 0
-        self._progress = progress
-        progress(self._before, len(self.finished))
-
-    def hear(self, message: FramesDone | RoundDone) -> None:
-        if isinstance(message, FramesDone):
-            self._running[message.round_id] = message.frames
-        else:
-            self._running.pop(message.state.id, None)
-            self.finished.append(message.state.id)
-            self._resets += message.resets
-        self._progress(self._done() + sum(self._running.values()), len(self.finished))
-
-    def result(self, folder: Path, seconds: float) -> Collected:
-        recorded = self._done() - self._before
-        return Collected(
-            rounds=len(self.finished),
-            frames=self._done(),
-            seconds=round(seconds, 3),
-            frames_per_second=round(recorded / seconds, 2),
-            recorded_frames=recorded,
-            resets=self._resets,
-            out=str(folder),
-        )
-
-    def _done(self) -> int:
-        return sum(self._frames_of[round_id] for round_id in self.finished)
-
-
-def _require_fitting(folder: Path, plan: Plan) -> None:
-    """The folder is new, empty, or holds the beginning of this very plan."""
-    if not folder.exists():
-        return
-    if not folder.is_dir():
-        raise DatasetError(f"{folder} is a file; choose a folder with --out")
-    path = folder / PLAN
-    if not path.is_file():
-        if not barely_begun(folder, PLAN):
-            raise DatasetError(
-                f"{folder} exists and is not a dataset of `datagen collect` (it has no {PLAN}); "
-                "nothing was changed; choose another folder with --out"
-            )
-        return
-    try:
-        found = json.loads(path.read_text())
-        found_hash, definitions, wanted = found["hash"], found["definitions"], found["wanted"]
-    except (ValueError, KeyError, TypeError) as error:
-        raise DatasetError(
-            f"{path} cannot be read ({error!r}); choose another folder with --out"
-        ) from error
-    tf.require_version(str(definitions), str(folder))
-    if found_hash != plan.hash:
-        raise DatasetError(
-            f"{folder} was begun with another plan ({_differences(wanted, plan)}); give the same "
-            "options to finish it, or choose another folder with --out"
-        )
-
-
-def _differences(found: dict[str, Any], plan: Plan) -> str:
-    wanted = json.loads(json.dumps(asdict(plan.wanted)))
-    named = [
-        f"{name}: {_short(found.get(name))} there, {_short(value)} asked for"
-        for name, value in wanted.items()
-        if found.get(name) != value
-    ]
-    return "; ".join(named) or "made by another version of this program"
-
-
-def _short(value: Any) -> str:
-    if isinstance(value, list):
-        return ",".join(str(v["name"] if isinstance(v, dict) else v) for v in value)
-    return str(value)
-
-
-def _open_folder(folder: Path, plan: Plan) -> None:
-    discard_partials(folder)
-    # First of all: by its plan the same command knows the folder again, whatever fails next.
-    write_synced(folder / PLAN, json.dumps(plan.as_json(), indent=1) + "\n")
-    prepare(folder)
-    # Whatever happens from here on, the rounds that are finished can be read.
-    write_split(split_path(folder), _split(plan, {entry.id for entry in plan.rounds}))
-
-
-def _split(plan: Plan, finished: set[str]) -> Split:
-    sides = {
-        side: tuple(e.id for e in plan.rounds if e.split == side and e.id in finished)
-        for side in ("train", "test")
-    }
-    return Split(train=sides["train"], test=sides["test"])
-
-
-def _sweep(folder: Path, plan: Plan) -> None:
-    """Take away what an interrupted round left."""
-    discard_partials(folder)
+def _sweep(folder: Path, rounds: Sequence[RoundPlan]) -> None:
+    """Take away what interruptions left of these rounds."""
+    discard_partials(folder, (entry.id for entry in rounds))
     states = read_states(folder)
-    for entry in plan.rounds:
+    for entry in rounds:
         if entry.id not in states:
             round_path(folder, entry.id).unlink(missing_ok=True)
-
-
-@contextmanager
-def _alone(folder: Path) -> Iterator[None]:
-    """Hold the folder against a second collection."""
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError as error:
-        os.close(descriptor)
-        raise DatasetError(
-            f"another `datagen collect` is writing to {folder}; wait for it or choose another --out"
-        ) from error
-    try:
-        yield
-    finally:
-        os.close(descriptor)
 
 
 @contextmanager

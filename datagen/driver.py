@@ -10,9 +10,10 @@ from math import atan, inf
 import numpy as np
 
 import trackfeatures as tf
-from datagen.speed import BRAKING, Pedals, speed_profile, wanted_acceleration
 from datagen.trajectory import Course, reach
 from simulator.car import CarParameters
+from simulator.ground import SURFACES
+from simulator.speed import BRAKING, Pedals, speed_profile, wanted_acceleration
 from simulator.state import CarState, Command
 from simulator.track.road import Road
 from simulator.traffic import EGO_SIZE, SIZE, Traffic, idm_acceleration
@@ -45,6 +46,8 @@ class ScriptedDriver:
         self._road = road
         self._course = course
         self._car = car or CarParameters()
+        grip = SURFACES[road.track.surface].grip
+        self._rear_stiffness = self._car.cornering_stiffness(False, grip)
         self._pedals = Pedals(self._car)
         self._dt = 1.0 / frequency_hz
         self._reach = reach(road)
@@ -90,7 +93,7 @@ class ScriptedDriver:
         kappa = kappa / max(1.0 - kappa * state.to_middle, 0.3) + (bend if free else 0.0)
         # At speed the body stands askew in a bend: the slip of the centre of gravity.
         pressed = car.total_mass * car.front_axle * v * v / car.wheelbase
-        slip = kappa * (car.rear_axle - pressed / (2.0 * car.cornering_stiffness))
+        slip = kappa * (car.rear_axle - pressed / (2.0 * self._rear_stiffness))
         off_course = state.to_middle - wanted
         off_heading = -state.angle - atan(slope) + slip
         gain = NATURAL_FREQUENCY**2 * car.wheelbase / (v * v)

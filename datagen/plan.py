@@ -1,31 +1,31 @@
-"""What is to be recorded: one entry a round, all of it drawn from one seed before the first frame.
+"""What is to be recorded: one entry a round, all of it known before the first frame.
 
-Tracks, lane counts, traffic, trajectories, lights and speeds are spread evenly (each list is dealt
-out like shuffled cards), so that a short plan covers as much as it can. A round is a pure function
-of its entry.
+A round is a pure function of its entry. `datagen.deal` makes the entries.
 """
 
 import hashlib
 import json
-from collections import Counter
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
-from typing import Any, TypeVar
-
-import numpy as np
+from importlib.metadata import version
+from typing import Any
 
 import trackfeatures as tf
 from datagen.recording.camera import CameraInfo
 from datagen.recording.encoding import CODECS
+from datagen.recording.splits import UNSEEN
+from datagen.trajectory import KINDS as TRAJECTORIES
+from simulator.camera import KINDS as LIGHTS
 
-TRAJECTORIES = ("lane", "offsets", "weave", "lane-changes", "recoveries")
-LIGHTS = ("clear", "overcast", "dusk", "fog", "heavy-shadow")
-MOST_TRAFFIC = 8
-SPEED_KMH = (40.0, 75.0)
 TEST_SHARE = 0.25
-SEEDS_A_PLAN = 1_000_000  # rounds a plan may have before its seeds meet those of the next seed
+SEEDS_A_PLAN = 1_000_000
+MOST_ROUNDS = SEEDS_A_PLAN // 2  # before its seeds meet those of another plan
 
-Card = TypeVar("Card")
+__all__ = ["LIGHTS", "TRAJECTORIES", "Plan", "RoundPlan", "TrackChoice", "Wanted"]
+
+
+def program() -> str:
+    """What records: another version of it may draw or drive the same round otherwise."""
+    return f"driverview {version('driverview')}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,11 +50,16 @@ class Wanted:
     codec: str = "jpeg"
     frequency_hz: int = 20
     camera: CameraInfo = field(default_factory=CameraInfo)
+    jitter_camera: bool = False
+    """Each round looks from a place, pitch and lens a little different from `camera`."""
+    split: str = ""
+    """"unseen": all rounds are for testing what was never trained on. Else: train and test."""
 
     def __post_init__(self) -> None:
-        if not 1 <= self.rounds < SEEDS_A_PLAN or self.frames < 1:
+        if not 1 <= self.rounds <= MOST_ROUNDS or self.frames < 1:
             raise tf.UserError(
-                f"{self.rounds} rounds of {self.frames} frames asked for; ask for at least one each"
+                f"{self.rounds} rounds of {self.frames} frames asked for; ask for at least one "
+                f"each, and for {MOST_ROUNDS} rounds at most"
             )
         if self.seed < 0:
             raise tf.UserError(f"the seed is {self.seed}; give a whole number from 0 up")
@@ -68,6 +73,8 @@ class Wanted:
         ):
             if unknown := set(found) - set(known):
                 raise tf.UserError(f"unknown {name} {min(unknown)!r}; choose {', '.join(known)}")
+        if self.split not in ("", UNSEEN):
+            raise tf.UserError(f"there is no split {self.split!r} to collect; the one is {UNSEEN}")
         if not 0.0 <= self.test_share < 1.0:
             raise tf.UserError(f"a test share of {self.test_share}; give 0 to below 1, e.g. 0.25")
 
@@ -92,7 +99,15 @@ class RoundPlan:
     frequency_hz: int
     codec: str
     camera: CameraInfo
+    nominal_camera: CameraInfo
+    """The dataset's camera, of which `camera` may be a jittered copy."""
     lane_width_m: float = tf.LANE_WIDTH_M
+
+    @staticmethod
+    def from_json(entry: dict[str, Any]) -> "RoundPlan":
+        """Raises KeyError or TypeError where the entry is not one of this program."""
+        cameras = {key: CameraInfo(**entry[key]) for key in ("camera", "nominal_camera")}
+        return RoundPlan(**{**entry, **cameras})
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,129 +117,15 @@ class Plan:
 
     @property
     def hash(self) -> str:
-        """SHA-256 (hex) of all entries and of the definitions they are measured by."""
-        content = [tf.VERSION, [asdict(entry) for entry in self.rounds]]
+        """SHA-256 (hex) of all entries, the program and the definitions they are measured by."""
+        content = [tf.VERSION, program(), [asdict(entry) for entry in self.rounds]]
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
     def as_json(self) -> dict[str, Any]:
         return {
             "hash": self.hash,
             "definitions": tf.VERSION,
+            "program": program(),
             "wanted": asdict(self.wanted),
             "rounds": [asdict(entry) for entry in self.rounds],
         }
-
-
-def make_plan(wanted: Wanted) -> Plan:
-    """The plan that belongs to these wishes, always the same one."""
-    rng = np.random.default_rng([wanted.seed, 0])
-    count = wanted.rounds
-    tracks, lanes = _tracks_and_lanes(wanted, rng)
-    traffic = _dealt(range(MOST_TRAFFIC + 1), count, rng)
-    trajectories = _dealt(TRAJECTORIES, count, rng)
-    lights = _dealt(wanted.lights, count, rng)
-    speeds = _spread(count, rng) * (SPEED_KMH[1] - SPEED_KMH[0]) + SPEED_KMH[0]
-    starts = _starts(tracks, rng)
-    test = _test_rounds(wanted, tracks, (lanes, trajectories, lights), rng)
-    digits = max(3, len(str(count - 1)))
-    return Plan(
-        wanted,
-        tuple(
-            RoundPlan(
-                id=f"round-{number:0{digits}d}",
-                seed=wanted.seed * SEEDS_A_PLAN + number,
-                split="test" if number in test else "train",
-                track=tracks[number].name,
-                track_hash=tracks[number].content_hash,
-                lanes=lanes[number],
-                traffic=traffic[number],
-                trajectory=trajectories[number],
-                light=lights[number],
-                speed_kmh=round(float(speeds[number]), 2),
-                start=round(starts[number], 5),
-                frames=wanted.frames,
-                frequency_hz=wanted.frequency_hz,
-                codec=wanted.codec,
-                camera=wanted.camera,
-            )
-            for number in range(count)
-        ),
-    )
-
-
-def _tracks_and_lanes(
-    wanted: Wanted, rng: np.random.Generator
-) -> tuple[list[TrackChoice], list[int]]:
-    """Every track in turn, and for each track every lane count in turn."""
-    order = rng.permutation(len(wanted.tracks))
-    first = rng.permutation(len(wanted.tracks))
-    tracks, lanes = [], []
-    for number in range(wanted.rounds):
-        turn, place = divmod(number, len(order))
-        tracks.append(wanted.tracks[order[place]])
-        lanes.append(wanted.lanes[(turn + int(first[place])) % len(wanted.lanes)])
-    return tracks, lanes
-
-
-def _dealt(cards: Sequence[Card], count: int, rng: np.random.Generator) -> list[Card]:
-    """`count` cards from packs that are shuffled one after the other."""
-    dealt: list[Card] = []
-    while len(dealt) < count:
-        dealt += [cards[i] for i in rng.permutation(len(cards))]
-    return dealt[:count]
-
-
-def _spread(count: int, rng: np.random.Generator) -> np.ndarray[Any, np.dtype[np.float64]]:
-    """One number in each of `count` equal parts of [0, 1), shuffled."""
-    return (rng.permutation(count) + rng.uniform(size=count)) / count
-
-
-def _starts(tracks: Sequence[TrackChoice], rng: np.random.Generator) -> list[float]:
-    """The rounds of a track start evenly around its lap."""
-    golden = 0.6180339887498949
-    first = {choice.name: rng.uniform() for choice in dict.fromkeys(tracks)}
-    seen: dict[str, int] = {}
-    starts = []
-    for choice in tracks:
-        turn = seen.get(choice.name, 0)
-        seen[choice.name] = turn + 1
-        starts.append(float((first[choice.name] + turn * golden) % 1.0))
-    return starts
-
-
-def _test_rounds(
-    wanted: Wanted,
-    tracks: Sequence[TrackChoice],
-    others: Sequence[Sequence[Any]],
-    rng: np.random.Generator,
-) -> set[int]:
-    """A share of all rounds: evenly over the tracks first, then over what `others` lists of each
-    round (lanes, trajectory, light).
-
-    Every track that has three rounds or more stands on both sides, even if that takes a few more
-    test rounds than the share; no track gives its last round away while another has two.
-    """
-    if wanted.test_share == 0.0 or wanted.rounds < 2:
-        return set()
-    names = [choice.name for choice in tracks]
-    counts = Counter(names)
-    total = max(round(wanted.rounds * wanted.test_share), 1)
-    total = max(total, sum(count >= 3 for count in counts.values()))
-    total = min(total, wanted.rounds - 1)
-    draw = rng.uniform(size=wanted.rounds)
-    test: set[int] = set()
-
-    def crowding(number: int) -> tuple[bool, float, float, float]:
-        mine = _share(test, names, number)
-        last = counts[names[number]] - round(mine * counts[names[number]]) == 1
-        return last, mine, sum(_share(test, kind, number) for kind in others), draw[number]
-
-    while len(test) < total:
-        test.add(min(set(range(wanted.rounds)) - test, key=crowding))
-    return test
-
-
-def _share(test: set[int], kinds: Sequence[Any], number: int) -> float:
-    """Share of the rounds of the same kind as `number` that are for testing already."""
-    alike = [n for n, kind in enumerate(kinds) if kind == kinds[number]]
-    return len(test.intersection(alike)) / len(alike)

@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from rich.console import Console
+from rich.console import Console, RenderableType
 from rich.progress import (
     BarColumn,
     Progress,
@@ -15,7 +15,7 @@ from rich.progress import (
 )
 from rich.text import Text
 
-from datagen import collect
+from datagen import tally
 
 
 class FramesPerSecond(ProgressColumn):
@@ -25,8 +25,8 @@ class FramesPerSecond(ProgressColumn):
 
 
 @contextmanager
-def shown(rounds: int, frames: int) -> Iterator[collect.Progress]:
-    """A function that takes the counts and shows them until the block ends."""
+def shown(rounds: int, frames: int, heading: RenderableType = "") -> Iterator[tally.Progress]:
+    """A function that takes the counts and shows them, below `heading`, until the block ends."""
     bar = Progress(
         TextColumn("[bold]{task.description}"),
         BarColumn(),
@@ -41,7 +41,9 @@ def shown(rounds: int, frames: int) -> Iterator[collect.Progress]:
     task = bar.add_task(f"0/{rounds} rounds", total=frames)
 
     def update(done_frames: int, done_rounds: int) -> None:
-        bar.start()  # only now: what is refused before it begins shows no bar
+        if not bar.live.is_started:  # only now: what is refused before it begins shows nothing
+            bar.console.print(heading)
+            bar.start()
         bar.update(task, completed=done_frames, description=f"{done_rounds}/{rounds} rounds")
 
     try:

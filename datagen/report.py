@@ -3,6 +3,7 @@
 from typing import Any
 
 import trackfeatures as tf
+from datagen.recording.splits import SIDES, UNSEEN
 
 
 def text(statistics: dict[str, Any]) -> str:
@@ -11,14 +12,14 @@ def text(statistics: dict[str, Any]) -> str:
     for name in ("track", "lanes", "light", "traffic", "trajectory"):
         counts = statistics[f"by_{name}"]
         lines.append(f"{name + ':':<12}" + ", ".join(f"{key} {n}" for key, n in counts.items()))
-    for side in ("train", "test"):
+    for side in SIDES:
         lines += _side(side, statistics[side])
     return "\n".join(lines)
 
 
 def _side(name: str, side: dict[str, Any]) -> list[str]:
     if not side["frames"]:
-        return [f"{name}: no frames"]
+        return [] if name == UNSEEN else [f"{name}: no frames"]
     classes = ", ".join(f"{kind} {share:.1%}" for kind, share in side["heading"].items())
     lines = [f"{name}: {side['frames']} frames; {classes}"]
     lines.append("  always answering the mean misses by (where active):")

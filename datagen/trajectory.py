@@ -15,7 +15,7 @@ from simulator.track.road import Road
 
 FloatArray = NDArray[np.float64]
 
-KINDS = ("lane", "offsets", "weave", "lane-changes", "recoveries")
+KINDS = ("lane", "offsets", "weave", "lane-changes", "yaw-recoveries", "offset-recoveries")
 OUTSIDE_M = 1.0
 """Farthest from an outer marking, outwards, that a course leads."""
 BODY_HALF_WIDTH_M = 0.97
@@ -123,8 +123,8 @@ def _lane_changes(road: Road, count: int, rng: np.random.Generator) -> tuple[Flo
     return _steps(count, (50.0, 130.0), change, rng), 16.0
 
 
-def _recoveries(road: Road, count: int, rng: np.random.Generator) -> tuple[FloatArray, float]:
-    """A lane, from which the car is thrown off every 40 to 90 m and steers back."""
+def _yaw_recoveries(road: Road, count: int, rng: np.random.Generator) -> tuple[FloatArray, float]:
+    """A lane, from which the car is turned away every 40 to 90 m and steers back."""
     base, _ = _lane(road, count, rng)
     metres = np.arange(count, dtype=np.float64)
     at = rng.uniform(20.0, 60.0)
@@ -138,13 +138,31 @@ def _recoveries(road: Road, count: int, rng: np.random.Generator) -> tuple[Float
     return base, 2.0
 
 
+def _offset_recoveries(
+    road: Road, count: int, rng: np.random.Generator
+) -> tuple[FloatArray, float]:
+    """A lane, from which the car is pushed 1 to 2.4 m aside every 60 to 110 m: it finds itself
+    there, straight on, for some metres, and comes back."""
+    base, _ = _lane(road, count, rng)
+    at = rng.uniform(20.0, 60.0)
+    while at < count:
+        aside = rng.choice([-1.0, 1.0]) * rng.uniform(1.0, 2.4)
+        there, back = at + rng.uniform(6.0, 18.0), rng.uniform(8.0, 16.0)
+        base[int(at) : int(there)] += aside
+        past = np.arange(int(there), count) - int(there)
+        base[int(there) :] += aside * np.exp(-0.5 * (past / back) ** 2)
+        at += rng.uniform(60.0, 110.0)
+    return base, 4.0
+
+
 Maker = Callable[[Road, int, np.random.Generator], tuple[FloatArray, float]]
 _MAKERS: dict[str, Maker] = {
     "lane": _lane,
     "offsets": _offsets,
     "weave": _weave,
     "lane-changes": _lane_changes,
-    "recoveries": _recoveries,
+    "yaw-recoveries": _yaw_recoveries,
+    "offset-recoveries": _offset_recoveries,
 }
 
 

@@ -3,77 +3,26 @@
 It lives across rounds because compiled code and the graphics context cost seconds to set up.
 """
 
+import ctypes
 import os
 import signal
-import traceback
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from importlib import import_module
 from multiprocessing.connection import Connection
-from pathlib import Path
 
-from datagen.errors import RoundFailed
-from datagen.plan import RoundPlan
-from datagen.recording.check import check_round
-from datagen.recording.folder import (
-    RoundState,
-    discard_partial,
-    file_sha256,
-    partial_path,
-    publish,
-)
-from datagen.recording.index import open_round
-from trackfeatures.errors import UserError
+from datagen.round import Job, attempt
 
-REPORT_EVERY = 10  # frames
+PR_SET_PDEATHSIG = 1  # <linux/prctl.h>
 
 
-@dataclass(frozen=True, slots=True)
-class Job:
-    plan: RoundPlan
-    plan_hash: str
-    folder: Path
-    tracks_dir: Path | None
-
-
-@dataclass(frozen=True, slots=True)
-class FramesDone:
-    round_id: str
-    frames: int
-
-
-@dataclass(frozen=True, slots=True)
-class RoundDone:
-    state: RoundState
-    resets: int
-
-
-@dataclass(frozen=True, slots=True)
-class RoundBroken:
-    """This round failed; the others may do better, and so may another try, unless `final`."""
-
-    round_id: str
-    reason: str
-    final: bool = False
-
-
-@dataclass(frozen=True, slots=True)
-class Hopeless:
-    """The user's or the machine's mistake, which every round would meet: `error` is raised."""
-
-    error: UserError | OSError
-
-
-Message = FramesDone | RoundDone | RoundBroken | Hopeless
-
-
-def work(connection: Connection) -> None:
-    """Main function of the process."""
+def work(connection: Connection, parent: int) -> None:
+    """Main function of the process; `parent` is the process that it works for."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the parent, which decides
+    die_with(parent)
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # stdout belongs to the result
-    with _silence():
-        import_module("simulator.physics")
+    warm_up()
     while True:
         try:
             job: Job | None = connection.recv()
@@ -82,75 +31,34 @@ def work(connection: Connection) -> None:
         if job is None:
             return
         try:
-            message: Message = _attempt(job, connection)
+            connection.send(attempt(job, connection.send))
         except BrokenPipeError:
             return
-        connection.send(message)
 
 
-def record_and_publish(job: Job, report: Connection | None = None) -> RoundDone:
-    """Record one round into its dataset folder: afterwards it is there, checked, or not at all."""
-    # Only here: the parent loads this module too, and needs neither physics nor graphics.
-    from datagen.record import record_round
-
-    def progress(frames: int) -> None:
-        if report is not None and frames % REPORT_EVERY == 0:
-            report.send(FramesDone(job.plan.id, frames))
-
-    partial = partial_path(job.folder, job.plan.id)
-    try:
-        record_round(job.plan, job.plan_hash, partial, job.tracks_dir, progress)
-        result = open_round(partial).result
-        state = RoundState(
-            id=job.plan.id,
-            file=f"rounds/{job.plan.id}.mcap",
-            bytes=partial.stat().st_size,
-            sha256=file_sha256(partial),
-            frames=result.frames,
-            content_hash=result.content_hash,
-            definitions=_definitions(partial),
-        )
-        _, problems = check_round(partial, "full", state)
-        if problems:
-            raise RuntimeError(f"read back, it is not what was written: {problems[0]}")
-        publish(job.folder, partial, state)
-    finally:
-        discard_partial(job.folder, job.plan.id)
-    return RoundDone(state, result.resets)
+def die_with(parent: int) -> None:
+    """No round goes on when its collector was killed: the next one may be recording it already."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
+    if os.getppid() != parent:
+        sys.exit(1)
 
 
-def _definitions(path: Path) -> str:
-    return open_round(path).header.definitions
-
-
-def _attempt(job: Job, connection: Connection) -> Message:
-    try:
-        return record_and_publish(job, connection)
-    except BrokenPipeError:
-        raise
-    except RoundFailed as error:
-        return RoundBroken(job.plan.id, str(error), final=True)
-    except (UserError, OSError) as error:
-        return Hopeless(_portable(error))
-    except Exception as error:  # noqa: BLE001  # whatever it is costs this round, not the others
-        traceback.print_exc()
-        return RoundBroken(job.plan.id, f"{type(error).__name__}: {error}")
+def warm_up() -> None:
+    """Load what takes long to load."""
+    with _silence():
+        import_module("simulator.physics")
 
 
 @contextmanager
 def _silence() -> Iterator[None]:
     """PyBullet greets on stderr when it is loaded: the user has no use for that."""
     kept = os.dup(2)
-    os.dup2(1, 2)
+    nothing = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nothing, 2)
     try:
         yield
     finally:
         os.dup2(kept, 2)
         os.close(kept)
-
-
-def _portable(error: UserError | OSError) -> UserError | OSError:
-    """The same error, sure to survive the way to another process."""
-    if isinstance(error, OSError):
-        return OSError(error.errno or 0, error.strerror or str(error), error.filename)
-    return UserError(str(error))
+        os.close(nothing)

@@ -81,7 +81,7 @@ def train_command(
 def evaluate_command(
     model: Model = "default",
     data: Data = Path("datasets/default"),
-    split: Annotated[str, typer.Option(help="train, test or all.")] = "test",
+    split: Annotated[str, typer.Option(help="train, test, unseen or all.")] = "test",
     engine: EngineKind = "openvino",
     precision: PrecisionOption = None,
     as_json: Json = False,

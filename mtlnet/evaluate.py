@@ -55,7 +55,7 @@ def answer_frames(
 
 
 def require_fit(card: ModelCard, frames: Frames, split: str) -> None:
-    """Raise ModelError when the camera differs, or when test rounds were trained on."""
+    """Raise ModelError when the camera differs, or when what is to judge it was trained on."""
     found, expected = frames.camera.as_dict(), vars(card.camera)
     if found != expected:
         differing = ", ".join(
@@ -69,11 +69,17 @@ def require_fit(card: ModelCard, frames: Frames, split: str) -> None:
         )
     if "mean" not in card.data:
         raise ModelError(f"model {card.name} does not say what it was trained on; train it anew")
-    if split != "test":
+    if split not in ("test", "unseen"):
         return
     seen = {info.seed for info in frames.rounds} & set(card.data["seeds"])
     if seen:
         raise ModelError(
-            f"model {card.name} was trained on the round of seed {min(seen)}, a test round of this "
-            "data: the result would say nothing; use --split all, or other rounds"
+            f"model {card.name} was trained on the round of seed {min(seen)}, a {split} round of "
+            "this data: the result would say nothing; use --split all, or other rounds"
+        )
+    known = {info.track for info in frames.rounds} & set(card.data.get("tracks", ()))
+    if split == "unseen" and known:
+        raise ModelError(
+            f"model {card.name} was trained on track {min(known)}, which is not unseen to it; "
+            "collect another with `datagen collect --split unseen --tracks NAME`"
         )

@@ -17,6 +17,7 @@ from mtlnet.augment import colours, cover, mirror, turn, turned_labels
 from mtlnet.card import Camera
 
 AHEAD = 3  # batches in the making
+MAKERS = 2  # at a time: while one batch waits for its last image, the next is begun
 
 
 class LabelArrays(Protocol):
@@ -85,9 +86,8 @@ class Loader:
         """The frames of batch `step`; every frame once an epoch."""
         places = np.arange(step * self.batch, (step + 1) * self.batch)
         epochs, rows = np.divmod(places, len(self.heading))
-        return np.array(
-            [self._permutation(int(e))[r] for e, r in zip(epochs, rows, strict=True)], np.int64
-        )
+        parts = [self._permutation(e)[rows[epochs == e]] for e in np.unique(epochs).tolist()]
+        return np.concatenate(parts)
 
     def make(self, step: int) -> Batch:
         """Batch number `step`."""
@@ -107,8 +107,8 @@ class Loader:
         return Batch(images, coded, heading, *colours(self.batch, rng))
 
     def batches(self, first: int) -> Iterator[Batch]:
-        """Batches `first`, `first` + 1, ... without end, made ahead on a thread."""
-        with ThreadPoolExecutor(1, thread_name_prefix="loader") as pool:
+        """Batches `first`, `first` + 1, ... without end, made ahead on threads."""
+        with ThreadPoolExecutor(MAKERS, thread_name_prefix="loader") as pool:
             waiting: list[Future[Batch]] = [pool.submit(self.make, first + i) for i in range(AHEAD)]
             step = first + AHEAD
             try:

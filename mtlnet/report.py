@@ -32,6 +32,7 @@ def describe_data(dataset: Dataset, frames: Frames) -> dict[str, Any]:
         "frames": len(frames),
         "split": sides,
         "seeds": [info.seed for info in frames.rounds],
+        "tracks": sorted({info.track for info in frames.rounds}),
         "mean": {
             "distances_m": [float(s / n) if n else None for s, n in zip(sums, counts, strict=True)],
             "to_lane_centre_m": float(np.nanmean(tf.localise(distances))),

@@ -20,6 +20,7 @@ from mtlnet.card import resolve_run
 from mtlnet.engine import load_engine
 from serve.app import create_app
 from trackfeatures.errors import UserError
+from trackfeatures.listening import address, bind
 
 RUN_VARIABLE = "DRIVERVIEW_SERVE_RUN"  # how the parent tells its workers which model to load
 BACKLOG = 2048
@@ -48,7 +49,7 @@ def run(config: ServiceConfig) -> None:
     engine = load_engine(folder)
     sys.stderr.write(
         f"serving {_named(config.model, folder)}, model {engine.card.model_hash[:12]}, with "
-        f"{engine.kind} {engine.precision} at {_address(listener, config.host)}"
+        f"{engine.kind} {engine.precision} at {address(listener, config.host)}"
         f"{f', {config.workers} workers' if config.workers > 1 else ''}\n"
     )
     sys.stderr.flush()
@@ -58,25 +59,6 @@ def run(config: ServiceConfig) -> None:
     else:
         del engine
         _run_workers(folder, config.workers, listener)
-
-
-def bind(host: str, port: int) -> socket.socket:
-    """A socket bound to the address. Raises UserError when that is taken, unknown or forbidden."""
-    try:
-        family, kind, protocol, _, address = socket.getaddrinfo(
-            host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
-        )[0]
-        listener = socket.socket(family, kind, protocol)
-        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        listener.bind(address)
-    except (OSError, UnicodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else str(error)
-        raise UserError(
-            f"cannot listen on {host} port {port}: {reason}; choose another with --host or --port "
-            "(--port 0 takes any free one)"
-        ) from error
-    listener.set_inheritable(True)
-    return listener
 
 
 def worker_app() -> FastAPI:
@@ -126,8 +108,3 @@ def _ignore(_number: int, _frame: FrameType | None) -> None:
 
 def _named(model: str, folder: Path) -> str:
     return model if model == str(folder) else f"{model} ({folder})"
-
-
-def _address(listener: socket.socket, host: str) -> str:
-    shown = f"[{host}]" if ":" in host else host
-    return f"http://{shown}:{listener.getsockname()[1]}"

@@ -1,7 +1,9 @@
 """The car as one frozen record of parameters (SI units; body frame x forward, y left, z up).
 
-The figures are the paper's (mass, axles, yaw inertia, cornering stiffness) and those of TORCS's
-car1-trb1 (size, gears, torque, aerodynamics), on which the paper drives.
+The figures are those of TORCS's car1-trb1, on which the paper drives. The paper's yaw inertia
+(2000 kg m2) and cornering stiffness (80 kN/rad a tyre) are not that car's: its recorded laps show
+1120 kg m2 and 125 kN/rad, and with the paper's it leaves the line by twice as much in the kink of
+g-track-3. The paper's stay where they are its controllers' model (`controllers.lateral_model`).
 """
 
 from dataclasses import astuple, dataclass, fields
@@ -18,10 +20,6 @@ WHEELS = ("front_left", "front_right", "rear_left", "rear_right")
 TORQUE_RPM_STEP = 1000.0  # the torque table is given at 0, 1000, 2000, ... rev/min
 LOWEST_GEAR, HIGHEST_GEAR = -1, 6  # -1 reverse, 0 neutral
 
-GRIP = {"asphalt": 1.2, "concrete": 1.1, "gravel": 0.9}
-"""Friction of a surface, by which the tyre's own is multiplied (TORCS's surfaces.xml: asphalt,
-concrete4 and dirt). Without it no car follows TORCS through the kinks of g-track-3."""
-
 
 @dataclass(frozen=True)
 class CarParameters:
@@ -31,8 +29,9 @@ class CarParameters:
     """kg, without fuel."""
     fuel: float = 80.0
     """kg; it rides at the centre of gravity and is not used up."""
-    inertia: tuple[float, float, float] = (420.0, 1900.0, 2000.0)
-    """kg m2 about x (roll), y (pitch) and z (yaw)."""
+    inertia: tuple[float, float, float] = (477.0, 868.0, 1113.0)
+    """kg m2 about x (roll), y (pitch) and z (yaw): of a box of the car's size, its length counted
+    with TORCS's mass repartition of 0.62."""
     front_axle: float = 1.27
     """m from the centre of gravity to the front axle, lf."""
     rear_axle: float = 1.37
@@ -62,13 +61,26 @@ class CarParameters:
     wheel_radius: float = 0.3273
     wheel_inertia: float = 1.2
     """kg m2, one wheel."""
-    cornering_stiffness: float = 80_000.0
-    """N/rad, one tyre at its static load; grows in proportion to the load."""
     friction: float = 1.6
-    """Largest tyre force over its load, on a surface of grip 1 (see GRIP)."""
-    tyre_shape: float = 1.5
+    """Largest tyre force over its load at `working_load`, on ground of grip 1."""
+    tyre_stiffness: float = 20.0
+    """1/rad: slope of the tyre force at no slip, over its largest (Pacejka's B C)."""
+    tyre_shape: float = 1.41
     """C of the magic formula (Pacejka, Tyre and Vehicle Dynamics, 4.3.1)."""
+    tyre_curvature: float = 0.7
+    """E of the magic formula."""
+    camber_gain_front: float = 1.048
+    """What the wheels' camber adds to the friction: 1 + 0.05 sin(18 camber), 4 deg."""
+    camber_gain_rear: float = 1.040
+    """3 deg."""
+    working_load: float = 1.2
+    """Load at which the tyre has its nominal friction, over the static one without fuel."""
+    friction_unloaded: float = 1.6
+    """Share of the nominal friction left (or gained) at no load ..."""
+    friction_overloaded: float = 0.8
+    """... and at any load; between them it falls exponentially."""
     rolling_resistance: float = 0.001
+    """Over the load, on asphalt."""
 
     steering_lock: float = 0.36652
     """rad of the front wheels at steer = 1 (21 deg)."""
@@ -80,9 +92,9 @@ class CarParameters:
     frontal_area: float = 1.92
     wing_drag: float = 0.47
     """m2: drag coefficient times area of the wings."""
-    lift_front: float = 0.35
-    """m2: downforce coefficient times area, at the front axle."""
-    lift_rear: float = 0.75
+    lift_front: float = 1.79
+    """m2: downforce coefficient times area, at the front axle; wing and ground effect."""
+    lift_rear: float = 2.96
 
     gears: tuple[float, float, float, float, float, float] = (3.0, 1.9, 1.4, 1.1, 0.9, 0.77)
     reverse_gear: float = -4.0
@@ -134,6 +146,16 @@ class CarParameters:
             half_weight * self.front_axle / self.wheelbase,
         )
 
+    def cornering_stiffness(self, front: bool, grip: float) -> float:
+        """N/rad of one tyre at its static load, on ground of this grip."""
+        load = self.static_loads[0 if front else 1]
+        share = load / (self.working_load * load * self.mass / self.total_mass)
+        spread = self.friction_unloaded - self.friction_overloaded
+        rate = np.log((1.0 - self.friction_overloaded) / spread)
+        nominal = self.friction_overloaded + spread * np.exp(rate * share)
+        gain = self.camber_gain_front if front else self.camber_gain_rear
+        return float(self.tyre_stiffness * self.friction * nominal * gain * grip * load)
+
     def packed(self) -> NDArray[Any]:
         """The parameters as a structured array of shape (1,), one field a parameter, for numba."""
         layout = [
@@ -141,4 +163,8 @@ class CarParameters:
             for field, value in zip(fields(self), astuple(self), strict=True)
         ]
         layout += [(name, "f8", ()) for name in ("total_mass", "load_front", "load_rear")]
-        return np.array([(*astuple(self), self.total_mass, *self.static_loads)], dtype=layout)
+        layout += [(name, "f8", ()) for name in ("working_front", "working_rear")]
+        front, rear = self.static_loads
+        nominal = self.working_load * self.mass / self.total_mass
+        derived = (self.total_mass, front, rear, nominal * front, nominal * rear)
+        return np.array([(*astuple(self), *derived)], dtype=layout)

@@ -1,7 +1,9 @@
-"""Orientation of a body as a quaternion, from its axes in the world frame."""
+"""Orientation of a body: a quaternion from its axes in the world frame, and back."""
 
 import numpy as np
 from numpy.typing import NDArray
+
+from simulator.compiled import compiled
 
 
 def quaternion(
@@ -26,3 +28,21 @@ def quaternion(
     ]
     best = np.array(max(rows, key=lambda row: row[0])[1])
     return np.asarray(best / np.linalg.norm(best))
+
+
+@compiled
+def rotation(quaternion: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Body axes (forward, left, up) as the rows of a (3, 3) matrix, from a unit quaternion
+    (x, y, z, w)."""
+    x, y, z, w = quaternion
+    axes = np.empty((3, 3))
+    axes[0, 0] = 1.0 - 2.0 * (y * y + z * z)
+    axes[0, 1] = 2.0 * (x * y + w * z)
+    axes[0, 2] = 2.0 * (x * z - w * y)
+    axes[1, 0] = 2.0 * (x * y - w * z)
+    axes[1, 1] = 1.0 - 2.0 * (x * x + z * z)
+    axes[1, 2] = 2.0 * (y * z + w * x)
+    axes[2, 0] = 2.0 * (x * z + w * y)
+    axes[2, 1] = 2.0 * (y * z - w * x)
+    axes[2, 2] = 1.0 - 2.0 * (x * x + y * y)
+    return axes

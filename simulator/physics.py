@@ -1,10 +1,12 @@
-"""The PyBullet side of a world: the car's body, walls and traffic, as rigid bodies that collide.
+"""The PyBullet side of a world: cars and pieces of wall as rigid bodies.
 
-One DIRECT client a scene. Positions in m, world frame, z up; quaternions (x, y, z, w).
+One DIRECT client a scene. Positions in m, world frame, z up; quaternions (x, y, z, w). A body's
+frame is its centre of gravity.
 """
 
+import math
 import weakref
-from typing import Literal
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 import pybullet
@@ -12,36 +14,37 @@ from numpy.typing import NDArray
 
 from simulator.car import CarParameters
 from simulator.dynamics import PHYSICS_HZ
-from simulator.walls import Mesh
+from simulator.walls import PANEL, Panel
 from trackfeatures.errors import UserError
 
-Collision = Literal["traffic", "wall"]
-Box = tuple[float, float, float]
-
-GROUND_CLEARANCE = 0.12  # m from the road to the underside of the car's box
+GROUND_CLEARANCE = 0.12  # m from the road to the underside of a car's box
 CONTACT_FRICTION = 0.3  # bodywork on rails and bodywork
 RESTITUTION = 0.1
 SOLVER_ITERATIONS = 20
+ASIDE_M = 1_000.0  # below the road, where a box waits that nothing can meet
+
+Motion = NDArray[np.float64]
 
 
 class Scene:
-    """The bodies of one world. Only this class talks to PyBullet."""
+    """The bodies of one world. Only this class talks to PyBullet.
 
-    def __init__(self, car: CarParameters, walls: Mesh) -> None:
+    `cars` are PyBullet's numbers of the cars, the driver's own first; each has a panel of wall of
+    its own in `walls`, which is there for it alone.
+    """
+
+    def __init__(self) -> None:
         self._client = pybullet.connect(pybullet.DIRECT)
         if self._client < 0:
             raise UserError("PyBullet has no free client; close worlds that are no longer needed")
         # A world that is dropped without close() still gives its client back.
         self._release = weakref.finalize(self, pybullet.disconnect, self._client)
-        self._car = car
-        self._vertices = walls.vertices.tolist()
-        self._indices = walls.triangles.ravel().tolist()
-        self._body, self._wall = -1, -1
-        self._others: list[int] = []
+        self.cars: list[int] = []
+        self.walls: list[int] = []
 
-    def rebuild(self, others: int, size: Box) -> None:
-        """Start afresh with `others` traffic boxes: nothing of an earlier episode, such as cached
-        contacts, can then reach into the next."""
+    def rebuild(self, cars: Sequence[CarParameters]) -> None:
+        """Start afresh with these cars: nothing of an earlier episode, such as cached contacts, can
+        then reach into the next."""
         if not self._release.alive:
             raise UserError("this world is closed; make a new one")
         client = self._client
@@ -55,75 +58,70 @@ class Scene:
             physicsClientId=client,
         )
         pybullet.setGravity(0.0, 0.0, 0.0, physicsClientId=client)  # in the wrench already
-        self._wall = self._add_walls()
-        self._body = self._add_car()
-        self._others = [self._add_box(size) for _ in range(others)]
+        self.cars = [self._add_car(car) for car in cars]
+        self.walls = [self._add_panel() for _ in cars]
+        everybody = (1 << len(cars)) - 1
+        for index, (car, wall) in enumerate(zip(self.cars, self.walls, strict=True)):
+            mine, its = 1 << index, 1 << (index + 16)
+            pybullet.setCollisionFilterGroupMask(car, -1, mine, everybody | its, client)
+            pybullet.setCollisionFilterGroupMask(wall, -1, its, mine, client)
+        for body in (*self.cars, *self.walls):
+            self.put_aside(body)
+        self.step()  # PyBullet takes a new inertia over at the end of a step only
 
-    def place(self, motion: NDArray[np.float64]) -> None:
-        """Put the car's body into a motion (13,): position, quaternion, velocity, turning."""
-        m = motion.tolist()
+    def put(self, body: int, motion: Motion) -> None:
+        """Give a body a motion (13,): position, quaternion, velocity, turning."""
+        m, client = motion.tolist(), self._client
+        pybullet.resetBasePositionAndOrientation(body, m[:3], m[3:7], physicsClientId=client)
+        pybullet.resetBaseVelocity(body, m[7:10], m[10:], physicsClientId=client)
+
+    def put_wall(self, body: int, panel: Panel) -> None:
+        """Stand a panel of wall up."""
+        turn = [0.0, 0.0, math.sin(0.5 * panel.yaw), math.cos(0.5 * panel.yaw)]
+        place = [panel.x, panel.y, panel.z]
+        pybullet.resetBasePositionAndOrientation(body, place, turn, physicsClientId=self._client)
+
+    def put_aside(self, body: int) -> None:
+        """Take a body out of everybody's way, each to a place of its own."""
+        place, still = [20.0 * body, 0.0, -ASIDE_M], [0.0, 0.0, 0.0]
         client = self._client
-        pybullet.resetBasePositionAndOrientation(self._body, m[:3], m[3:7], physicsClientId=client)
-        pybullet.resetBaseVelocity(self._body, m[7:10], m[10:], physicsClientId=client)
+        pybullet.resetBasePositionAndOrientation(body, place, [0, 0, 0, 1], physicsClientId=client)
+        pybullet.resetBaseVelocity(body, still, still, physicsClientId=client)
 
-    def read(self, motion: NDArray[np.float64]) -> None:
-        """Write the body's motion into `motion` (13,)."""
-        place, turn = pybullet.getBasePositionAndOrientation(
-            self._body, physicsClientId=self._client
-        )
-        velocity, spin = pybullet.getBaseVelocity(self._body, physicsClientId=self._client)
+    def push(self, body: int, wrench: NDArray[np.float64], motion: Motion) -> None:
+        """Let (force, torque) (6,) act at the body's centre of gravity in the next step."""
+        force, client, world = wrench.tolist(), self._client, pybullet.WORLD_FRAME
+        at = motion[:3].tolist()
+        pybullet.applyExternalForce(body, -1, force[:3], at, world, physicsClientId=client)
+        pybullet.applyExternalTorque(body, -1, force[3:], world, physicsClientId=client)
+
+    def step(self) -> None:
+        """Advance all bodies by 1/200 s."""
+        pybullet.stepSimulation(physicsClientId=self._client)
+
+    def read(self, body: int, motion: Motion) -> None:
+        """Write a body's motion into `motion` (13,)."""
+        place, turn = pybullet.getBasePositionAndOrientation(body, physicsClientId=self._client)
+        velocity, spin = pybullet.getBaseVelocity(body, physicsClientId=self._client)
         motion[:] = (*place, *turn, *velocity, *spin)
 
-    def push(self, wrench: NDArray[np.float64], motion: NDArray[np.float64]) -> None:
-        """Apply (force, torque) (6,) at the centre of gravity and advance 1/200 s."""
-        force, client = wrench.tolist(), self._client
-        at = motion[:3].tolist()
-        world = pybullet.WORLD_FRAME
-        pybullet.applyExternalForce(self._body, -1, force[:3], at, world, physicsClientId=client)
-        pybullet.applyExternalTorque(self._body, -1, force[3:], world, physicsClientId=client)
-        pybullet.stepSimulation(physicsClientId=client)
-
-    def move_others(self, poses: NDArray[np.float64], height: float) -> None:
-        """Put the traffic boxes on their ground poses (n, 6): x, y, z, roll, pitch, yaw."""
-        for body, pose in zip(self._others, poses.tolist(), strict=True):
-            turn = pybullet.getQuaternionFromEuler(pose[3:])
-            centre = [pose[0], pose[1], pose[2] + 0.5 * height]
-            pybullet.resetBasePositionAndOrientation(
-                body, centre, turn, physicsClientId=self._client
-            )
-
-    def set_others_velocity(self, velocities: NDArray[np.float64]) -> None:
-        """Tell the solver how fast the boxes move (n, 3), so that a hit pushes as it should."""
-        for body, velocity in zip(self._others, velocities.tolist(), strict=True):
-            pybullet.resetBaseVelocity(
-                body, velocity, [0.0, 0.0, 0.0], physicsClientId=self._client
-            )
-
-    def collision(self) -> Collision | None:
-        """What the car's body touched in the last 1/200 s."""
-        contacts = pybullet.getContactPoints(bodyA=self._body, physicsClientId=self._client)
-        touched = {contact[2] for contact in contacts if contact[8] <= 0.0}
-        if touched & set(self._others):
-            return "traffic"
-        return "wall" if self._wall in touched else None
+    def contacts(self) -> Iterator[tuple[int, int]]:
+        """Pairs of bodies that touched in the last step, some more than once."""
+        for contact in pybullet.getContactPoints(physicsClientId=self._client):
+            if contact[8] <= 0.0:
+                yield contact[1], contact[2]
 
     def close(self) -> None:
         self._release()
 
-    def _add_walls(self) -> int:
-        if not self._indices:
-            return -1
+    def _add_panel(self) -> int:
         shape = pybullet.createCollisionShape(
-            pybullet.GEOM_MESH,
-            vertices=self._vertices,
-            indices=self._indices,
-            flags=pybullet.GEOM_FORCE_CONCAVE_TRIMESH,
-            physicsClientId=self._client,
+            pybullet.GEOM_BOX, halfExtents=[0.5 * v for v in PANEL], physicsClientId=self._client
         )
         return self._surface(pybullet.createMultiBody(0, shape, physicsClientId=self._client))
 
-    def _add_car(self) -> int:
-        car, client = self._car, self._client
+    def _add_car(self, car: CarParameters) -> int:
+        client = self._client
         tall = car.height - GROUND_CLEARANCE
         shape = pybullet.createCollisionShape(
             pybullet.GEOM_BOX,
@@ -146,16 +144,6 @@ class Scene:
             physicsClientId=client,
         )
         return self._surface(body)
-
-    def _add_box(self, size: Box) -> int:
-        shape = pybullet.createCollisionShape(
-            pybullet.GEOM_BOX, halfExtents=[0.5 * v for v in size], physicsClientId=self._client
-        )
-        return self._surface(
-            pybullet.createMultiBody(
-                0, shape, useMaximalCoordinates=1, physicsClientId=self._client
-            )
-        )
 
     def _surface(self, body: int) -> int:
         pybullet.changeDynamics(

@@ -4,6 +4,8 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
+Collision = Literal["traffic", "wall"]
+
 
 @dataclass(frozen=True, slots=True)
 class Command:
@@ -53,7 +55,7 @@ class CarState:
     lap: int
     odometer_m: float
     lap_time_s: float
-    collision: Literal["traffic", "wall"] | None
+    collision: Collision | None
     """What the body touched during the last control step."""
     off_track: bool
     backwards: bool

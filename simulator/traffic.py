@@ -15,13 +15,14 @@ from simulator.car import CarParameters
 from simulator.idm import COMFORTABLE_BRAKING, STANDSTILL_GAP_M, TIME_HEADWAY_S, idm_acceleration
 from simulator.track.geometry import Track
 from simulator.track.road import START_BEFORE_LINE_M, Road
+from simulator.wreck import TRAFFIC_CAR
 from trackfeatures.errors import UserError
 
 __all__ = ["EGO_SIZE", "MOST_CARS", "SIZE", "Traffic", "idm_acceleration"]
 
 FloatArray = NDArray[np.float64]
 
-SIZE = (4.4, 1.8, 1.4)
+SIZE = (TRAFFIC_CAR.length, TRAFFIC_CAR.width, TRAFFIC_CAR.height)
 """Length, width, height of a traffic car, m."""
 EGO_SIZE = (CarParameters.length, CarParameters.width, CarParameters.height)
 MOST_CARS = 12
@@ -55,7 +56,7 @@ class Traffic:
         markings = road.markings_y
         self._lane_y = 0.5 * (markings[:-1] + markings[1:])
         start = self._length - START_BEFORE_LINE_M if clear_s is None else clear_s
-        self._curvature, self._limit = _bends(road.track, float(np.max(self._lane_y)))
+        self._limit = _bends(road.track, float(np.max(self._lane_y)))
         self._cars = self._start(count, rng, start % self._length)
         self._bodies = np.zeros((count + 1, kernel.BODY_COLUMNS))
         self._poses = np.zeros((count, 6))
@@ -97,11 +98,35 @@ class Traffic:
             dt,
             self._length,
             self._lane_y,
-            self._curvature,
+            self._table,
             self._limit,
+            0.5 * SIZE[0],
             0.5 * SIZE[1],
         )
         kernel.place(self._cars, self._table, self._poses)
+
+    @property
+    def struck(self) -> NDArray[np.bool_]:
+        """(n,) which cars were hit: they are out of the lanes' order and only in the way."""
+        return self._cars[:, kernel.STRUCK] > 0.0
+
+    def strike(self, row: int) -> None:
+        """Take car `row` out of the lanes' order: from now on `displace` says where it is."""
+        self._cars[row, kernel.STRUCK] = 1.0
+        self._cars[row, kernel.DONE] = 1.0
+
+    def displace(self, row: int, pose: FloatArray, place: FloatArray) -> None:
+        """Put a struck car on its ground `pose` (6,); `place`: (s, to_middle, angle, speed along
+        the track). The others see the whole of its breadth and length as it lies."""
+        s, to_middle, angle, speed = place
+        cos, sin = abs(math.cos(angle)), abs(math.sin(angle))
+        half_length = 0.5 * (SIZE[0] * cos + SIZE[1] * sin)
+        half_width = 0.5 * (SIZE[0] * sin + SIZE[1] * cos)
+        self._poses[row] = pose
+        self._cars[row, [kernel.S, kernel.Y, kernel.SPEED]] = s, to_middle, speed
+        left, right = to_middle + half_width, to_middle - half_width
+        seen = max(speed, 0.0)
+        self._bodies[row] = (s, right, left, seen, half_length, max(seen, 1.0))
 
     def leader(
         self, s: float, to_middle: float, exclude: int | None = None
@@ -166,6 +191,8 @@ class Traffic:
         nearest = CLEAR_M + 0.5 * (SIZE[0] + EGO_SIZE[0])
         room = self._length - 2 * nearest
         lanes = len(self._lane_y)
+        if not isinstance(count, int | np.integer) or isinstance(count, bool):
+            raise UserError(f"the number of traffic cars is {count!r}; give a whole number")
         fits = min(lanes * max(int(room / _LEAST_SPACING_M), 0), MOST_CARS)
         if not 0 <= count <= fits:
             raise UserError(
@@ -205,8 +232,8 @@ def _spread(count: int, reach: float, rng: np.random.Generator) -> FloatArray:
     return part * np.arange(count) + rng.uniform(0.0, max(part - _LEAST_SPACING_M, 0.0), count)
 
 
-def _bends(track: Track, outermost_y: float) -> tuple[FloatArray, FloatArray]:
-    """Centre-line curvature (1/m) and speed limit (m/s) of cells of about 1 m around the loop.
+def _bends(track: Track, outermost_y: float) -> FloatArray:
+    """Speed limit (m/s) of cells of about 1 m around the loop.
 
     The limit is that of the innermost lane and falls before a bend at a comfortable braking.
     """
@@ -216,7 +243,6 @@ def _bends(track: Track, outermost_y: float) -> tuple[FloatArray, FloatArray]:
     sharpness = np.abs(curvature)
     innermost = sharpness / np.maximum(1.0 - sharpness * outermost_y, 0.1)
     squared = SIDE_ACCELERATION / np.maximum(innermost, 1e-6)
-    for cell in range(2 * cells - 1, -1, -1):  # twice round: the end brakes for the beginning
-        ahead = squared[(cell + 1) % cells] + 2 * COMFORTABLE_BRAKING * step
-        squared[cell % cells] = min(squared[cell % cells], ahead)
-    return curvature, np.sqrt(squared)
+    kernel.brake_ahead(squared, 2 * COMFORTABLE_BRAKING * step)
+    limit: FloatArray = np.sqrt(squared)
+    return limit

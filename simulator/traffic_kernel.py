@@ -14,8 +14,9 @@ from simulator.idm import COMFORTABLE_BRAKING, STANDSTILL_GAP_M, idm_acceleratio
 from simulator.track import kernel
 
 # Columns of a car's row.
-S, Y, SPEED, DESIRED, Y_FROM, Y_TO, DONE, CHANGE_M, REST_S = range(9)
-CAR_COLUMNS = 9
+S, Y, SPEED, DESIRED, Y_FROM, Y_TO, DONE, CHANGE_M, REST_S, STRUCK = range(10)
+CAR_COLUMNS = 10
+# A car that was hit (STRUCK is 1) is moved by others: here it only stands in the way.
 # Columns of a body's row: what others see of a car, or of the ego car (the last row).
 B_S, B_RIGHT, B_LEFT, B_SPEED, B_HALF_LENGTH, B_DESIRED = range(6)
 BODY_COLUMNS = 6
@@ -26,6 +27,7 @@ SHORTEST_CHANGE_M = 25.0
 REST_BETWEEN_CHANGES_S = 3.0
 SAFE_BRAKING = COMFORTABLE_BRAKING  # a lane change asks no more than this of anyone
 WORTH_CHANGING = 0.2  # m/s2 to be gained
+LEAST_STRETCH = 0.05  # of a metre of s, near the middle of a bend
 POLITENESS = 0.2  # MOBIL: how much the loss of the new follower counts
 
 Table = NDArray[np.float64]
@@ -134,6 +136,8 @@ def room_in(
 def show(cars: Table, bodies: Table, half_length: float, half_width: float) -> None:
     """Writes what others see of the cars into the first rows of `bodies`."""
     for i in range(cars.shape[0]):
+        if cars[i, STRUCK] > 0.0:
+            continue
         bodies[i, B_S] = cars[i, S]
         bodies[i, B_RIGHT] = min(cars[i, Y], cars[i, Y_TO]) - half_width
         bodies[i, B_LEFT] = max(cars[i, Y], cars[i, Y_TO]) + half_width
@@ -170,6 +174,24 @@ def choose_lane(
 
 
 @compiled
+def along_centre(table: Table, s: float, y: float, way: float) -> float:
+    """How far s grows while a car goes `way` m at the offset `y`: a lane inside a bend is shorter
+    than the centre line. Exact across the joints of a track, where the bend may change at once."""
+    gained, index = 0.0, kernel.index_at(table, s)
+    at = kernel.wrap(table, s)
+    for _ in range(table.shape[0] + 1):
+        stretch = max(1.0 - table[index, kernel.CURVATURE] * y, LEAST_STRETCH)
+        left = max(table[index, kernel.S0] + table[index, kernel.LENGTH] - at, 0.0)
+        if way <= left * stretch:
+            return float(gained + way / stretch)
+        gained += left
+        way -= left * stretch
+        index = (index + 1) % table.shape[0]
+        at = table[index, kernel.S0]
+    return gained
+
+
+@compiled
 def move(cars: Table, i: int, advance_m: float, dt: float, length: float) -> None:
     """Moves car `i` along its lane; sideways by the way made, so a car at rest stays in place."""
     cars[i, S] = (cars[i, S] + advance_m) % length
@@ -189,24 +211,27 @@ def advance(
     dt: float,
     length: float,
     lane_y: Table,
-    curvature: Table,
+    table: Table,
     speed_limit: Table,
+    half_length: float,
     half_width: float,
 ) -> None:
-    """One step of `dt` s. `curvature` and `speed_limit` hold one value a cell around the loop.
+    """One step of `dt` s. `speed_limit` holds one value a cell around the loop.
 
     Lane changes are decided one car after the other, each seeing the decisions before it; all
     accelerations come from the state before the step.
     """
     count = cars.shape[0]
-    half_length = bodies[0, B_HALF_LENGTH]
     if lane_y.shape[0] > 1:
         for i in range(count):
-            if cars[i, DONE] >= 1.0 and cars[i, REST_S] <= 0.0:
+            idle = cars[i, DONE] >= 1.0 and cars[i, REST_S] <= 0.0
+            if idle and cars[i, STRUCK] == 0.0:
                 choose_lane(cars, bodies, i, lane_y, half_width, length)
                 show(cars, bodies, half_length, half_width)
-    cells = curvature.shape[0]
+    cells = speed_limit.shape[0]
     for i in range(count):
+        if cars[i, STRUCK] > 0.0:
+            continue
         cell = int(cars[i, S] / length * cells) % cells
         next_cell = (int((cars[i, S] + cars[i, SPEED] * dt) / length * cells) + 1) % cells
         limit = min(speed_limit[cell], speed_limit[next_cell])
@@ -216,9 +241,8 @@ def advance(
         wish = follow(bodies, i, cars[i, S], speed, desired, right, left, half_length, length)
         # The limits fall no faster than one brakes in comfort, so they can be kept to exactly.
         cars[i, SPEED] = min(max(speed + wish * dt, 0.0), limit)
-        # A lane inside a bend is shorter than the centre line.
-        stretch = 1.0 - curvature[cell] * cars[i, Y]
-        move(cars, i, 0.5 * (speed + cars[i, SPEED]) * dt / stretch, dt, length)
+        way = 0.5 * (speed + cars[i, SPEED]) * dt
+        move(cars, i, along_centre(table, cars[i, S], cars[i, Y], way), dt, length)
     show(cars, bodies, half_length, half_width)
 
 
@@ -227,9 +251,11 @@ def place(cars: Table, table: Table, poses: Table) -> None:
     """Fills `poses` (n, 6): x, y, z, roll, pitch, yaw of the ground point under each car.
 
     Angles are those of pybullet (R = Rz(yaw) Ry(pitch) Rx(roll), pitch positive nose down); the
-    car stands square on the road plane.
+    car stands square on the road plane. Leaves the poses of struck cars alone.
     """
     for i in range(cars.shape[0]):
+        if cars[i, STRUCK] > 0.0:
+            continue
         s, y = cars[i, S], cars[i, Y]
         index = kernel.index_at(table, s)
         x0, y0, _, heading, _ = kernel.pose_at(table, s)
@@ -247,3 +273,13 @@ def place(cars: Table, table: Table, poses: Table) -> None:
         poses[i, 3] = math.asin(nx * math.sin(yaw) - ny * math.cos(yaw))
         poses[i, 4] = math.atan2(forward, nz)
         poses[i, 5] = math.atan2(math.sin(yaw), math.cos(yaw))
+
+
+@compiled
+def brake_ahead(squared: Table, gain: float) -> None:
+    """Lower the squared speed limits (n,) of cells around a loop where the next one's is lower by
+    more than the `gain` that can be braked off within a cell."""
+    cells = squared.shape[0]
+    for cell in range(2 * cells - 1, -1, -1):  # twice round: the end brakes for the beginning
+        ahead = squared[(cell + 1) % cells] + gain
+        squared[cell % cells] = min(squared[cell % cells], ahead)

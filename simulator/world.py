@@ -4,46 +4,47 @@ World frame: x, y in the plane, z up, yaw counter-clockwise; s and to_middle in 
 """
 
 import math
-from dataclasses import replace
 from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 import trackfeatures as tf
-from simulator.car import GRIP, HIGHEST_GEAR, LOWEST_GEAR, RPM, CarParameters
-from simulator.dynamics import (
-    ENGINE,
-    MEMORY,
-    MOTION,
-    ODOMETER,
-    PHYSICS_HZ,
-    PIECE,
-    SPIN,
-    STEER,
-    advance,
-    rotation,
-)
+from simulator.car import HIGHEST_GEAR, LOWEST_GEAR, RPM, CarParameters
+from simulator.dynamics import ENGINE, MEMORY, MOTION, ODOMETER, PHYSICS_HZ, PIECE, SPIN, STEER
 from simulator.engine import gear_ratio
+from simulator.flight import fly
+from simulator.ground import ground
+from simulator.impacts import Impacts
 from simulator.orientation import quaternion
-from simulator.physics import Collision, Scene
-from simulator.state import CarState, Command
-from simulator.track.geometry import wrap_angle
-from simulator.track.kernel import index_at, locate, surface
+from simulator.readout import (
+    ALONG,
+    ANGLE,
+    BEND,
+    OFFSET,
+    PITCH,
+    PLACE,
+    READINGS,
+    ROLL,
+    VX,
+    VY,
+    YAW,
+    YAW_RATE,
+    read_out,
+)
+from simulator.state import CarState, Collision, Command
+from simulator.track.kernel import index_at, surface
 from simulator.track.road import START_BEFORE_LINE_M, Road
-from simulator.traffic import SIZE, Traffic
-from simulator.walls import wall_mesh
+from simulator.traffic import Traffic
 from trackfeatures.errors import UserError
 
 __all__ = ["CarState", "Command", "World"]
 
-Poses = NDArray[np.float64]
-
 ROLLING_BACK_M_S = -0.5
 """Slower than this along the track is driving backwards."""
-NEAR_WALL_M = 3.5
-"""No part of the car is farther than this from its centre of gravity, with a margin."""
-NEAR_TRAFFIC_M = 8.0
+FASTEST_START_M_S = 150.0
+FloatArray = NDArray[np.float64]
+NO_TRAFFIC = np.zeros((0, 6))
 
 
 class World:
@@ -57,22 +58,20 @@ class World:
         frequency_hz: int = 20,
         car: CarParameters | None = None,
     ) -> None:
-        if not 0 < frequency_hz <= PHYSICS_HZ or PHYSICS_HZ % frequency_hz:
-            raise UserError(
-                f"a control frequency of {frequency_hz} Hz does not divide the physics' "
-                f"{PHYSICS_HZ} Hz; choose for example 10, 20, 40 or 50"
-            )
+        check_frequency(frequency_hz)
         self.road = road
-        self.frequency_hz = frequency_hz
+        self.frequency_hz = int(frequency_hz)
         self.car = car or CarParameters()
         self._count = traffic
         self.traffic = Traffic(road, traffic, np.random.default_rng(0))
-        on_surface = replace(self.car, friction=self.car.friction * GRIP[road.track.surface])
-        self._params = on_surface.packed()
+        self._params = self.car.packed()
         self._table = road.track.arrays()
-        self._scene = Scene(self.car, wall_mesh(road))
+        self._ground = ground(road)
         self._motion = np.zeros(MOTION)
         self._memory = np.zeros(MEMORY)
+        self._readings = np.zeros(READINGS)
+        self._controls = np.zeros(4)
+        self._impacts = Impacts(road, self.car)
         self._state: CarState | None = None
 
     @property
@@ -97,10 +96,11 @@ class World:
         The episode is a function of the arguments alone, whatever this world did before.
         """
         start = -START_BEFORE_LINE_M if s is None else float(s)
+        check_seed(seed)
         for name, value in (("s", start), ("to_middle", to_middle), ("angle", angle)):
             if not math.isfinite(value):
                 raise UserError(f"reset got {name} = {value}; give a finite number")
-        if not math.isfinite(speed) or abs(speed) > 150.0:
+        if not abs(speed) <= FASTEST_START_M_S:  # true for NaN, too
             raise UserError(f"reset got speed = {speed}; give m/s between -150 and 150")
         if abs(to_middle) > self.road.edge:
             raise UserError(
@@ -110,10 +110,8 @@ class World:
         self.traffic = Traffic(
             self.road, self._count, np.random.default_rng([seed, 1]), clear_s=start
         )
-        self._scene.rebuild(self.traffic.count, SIZE)
+        self._impacts.start(self.traffic)
         self._place(start, to_middle, angle, speed)
-        self._scene.place(self._motion)
-        self._scene.move_others(self.traffic.poses(), SIZE[2])
         self._lap, self._steps, self._lap_start = 0, 0, 0
         self._s = float(start % self.road.track.length_m)
         self._state = self._measure(1, None)
@@ -122,22 +120,8 @@ class World:
     def step(self, command: Command) -> CarState:
         """Hold `command` for one control step; raises UserError for a value out of its range."""
         before = self.state
-        controls = _checked(command)
-        path = self._advance_traffic(before)
-        watch = self._near_anything()
-        hit: Collision | None = None
-        substeps = PHYSICS_HZ // self.frequency_hz
-        for substep in range(1, substeps + 1):
-            if watch and path is not None:
-                # In one jump a box could land deep inside the car, and be thrown out of it.
-                self._scene.move_others(path[0] + path[1] * (substep / substeps), SIZE[2])
-            wrench = advance(self._params, self._table, self._motion, self._memory, controls)
-            self._scene.push(wrench, self._motion)
-            self._scene.read(self._motion)
-            if watch:
-                hit = hit or self._scene.collision()
-        if path is not None and not watch:
-            self._scene.move_others(path[0] + path[1], SIZE[2])
+        _check(command, self._controls)
+        hit = self._move(*self._advance_traffic(before))
         self._steps += 1
         self._state = self._measure(command.gear, hit)
         return self._state
@@ -154,7 +138,7 @@ class World:
 
     def close(self) -> None:
         """Give the physics client back; a closed world refuses to reset and to step."""
-        self._scene.close()
+        self._impacts.close()
         self._state = None
 
     def __enter__(self) -> Self:
@@ -186,68 +170,79 @@ class World:
         turning = abs(speed) / self.car.wheel_radius * gear_ratio(self._params[0], 1)
         self._memory[ENGINE] = max(turning, self.car.idle_rpm / RPM)
 
-    def _advance_traffic(self, before: CarState) -> tuple[Poses, Poses] | None:
+    def _advance_traffic(self, before: CarState) -> tuple[FloatArray, FloatArray]:
         """Let the traffic drive one control step; returns where it was and how far it moves."""
         if not self.traffic.count:
-            return None
-        dt = 1.0 / self.frequency_hz
+            return NO_TRAFFIC, NO_TRAFFIC
         old = self.traffic.poses()
-        self.traffic.step(dt, before.s, before.to_middle, before.speed)
+        self.traffic.step(1.0 / self.frequency_hz, before.s, before.to_middle, before.speed)
         move = self.traffic.poses() - old
         move[:, 3:] = (move[:, 3:] + math.pi) % (2.0 * math.pi) - math.pi
-        self._scene.set_others_velocity(move[:, :3] / dt)
         return old, move
 
-    def _near_anything(self) -> bool:
-        """Whether the car may touch something within this step."""
-        now = self.state
-        if abs(now.to_middle) > self.road.wall_offset - NEAR_WALL_M:
-            return True
-        if not self.traffic.count:
-            return False
-        apart = self.traffic.poses()[:, :2] - (now.x, now.y)
-        return bool(np.any(np.hypot(apart[:, 0], apart[:, 1]) < NEAR_TRAFFIC_M))
+    def _move(self, others: FloatArray, move: FloatArray) -> Collision | None:
+        """Drive one control step while the traffic goes from `others` on by `move` (n, 6 each);
+        returns what the car first touched."""
+        steps, done = PHYSICS_HZ // self.frequency_hz, 0
+        hit: Collision | None = None
+        while done < steps:
+            if not self._impacts.going_on:
+                done = self._fly(others, move, done, steps)
+            if done < steps:
+                share, dt = done / steps, 1.0 / self.frequency_hz
+                met = self._impacts.step(
+                    self._motion, self._memory, self._controls, others, move, share, dt
+                )
+                hit, done = hit or met, done + 1
+        return hit
+
+    def _fly(self, others: FloatArray, move: FloatArray, done: int, steps: int) -> int:
+        """Drive on from physics step `done` until something is near; returns how far it came."""
+        return fly(
+            self._params,
+            self._table,
+            self._ground,
+            self._motion,
+            self._memory,
+            self._controls,
+            self.road.wall_offset,
+            others,
+            move,
+            done,
+            steps,
+        )
 
     def _measure(self, gear: int, hit: Collision | None) -> CarState:
-        """Read the state off the body. The one place where angle = tangent - yaw is formed."""
-        motion, memory, table = self._motion, self._memory, self._table
-        piece, s, to_middle = locate(table, motion[0], motion[1], int(memory[PIECE]))
-        memory[PIECE] = piece
-        tangent, curvature = _tangent(table, piece, s)
-        axes = rotation(motion[3:7])
-        forward, left, up = axes.tolist()
-        yaw = math.atan2(forward[1], forward[0])
-        angle = float(wrap_angle(np.float64(tangent - yaw)))
-        velocity = motion[7:10]
-        along = math.cos(tangent) * velocity[0] + math.sin(tangent) * velocity[1]
-        time_s = self._steps / self.frequency_hz
-        self._count_laps(float(s))
-        vx, vy = axes[0] @ velocity, axes[1] @ velocity
+        """Read the state off the body."""
+        read_out(self._table, self._motion, self._memory, self._readings)
+        motion, memory = self._motion.tolist(), self._memory.tolist()
+        readings = self._readings.tolist()
+        self._count_laps(readings[PLACE])
         return CarState(
-            time_s=time_s,
-            x=float(motion[0]),
-            y=float(motion[1]),
-            z=float(motion[2]),
-            yaw=yaw,
-            pitch=math.asin(max(-1.0, min(1.0, -forward[2]))),
-            roll=math.atan2(left[2], up[2]),
-            vx=float(vx),
-            vy=float(vy),
-            yaw_rate=float(axes[2] @ motion[10:13]),
-            s=float(s),
-            to_middle=float(to_middle),
-            angle=angle,
-            curvature=curvature,
-            rpm=float(memory[ENGINE]) * RPM,
+            time_s=self._steps / self.frequency_hz,
+            x=motion[0],
+            y=motion[1],
+            z=motion[2],
+            yaw=readings[YAW],
+            pitch=readings[PITCH],
+            roll=readings[ROLL],
+            vx=readings[VX],
+            vy=readings[VY],
+            yaw_rate=readings[YAW_RATE],
+            s=readings[PLACE],
+            to_middle=readings[OFFSET],
+            angle=readings[ANGLE],
+            curvature=readings[BEND],
+            rpm=memory[ENGINE] * RPM,
             gear=gear,
-            wheel_spin=tuple(memory[SPIN : SPIN + 4].tolist()),
-            steer=float(memory[STEER]) / self.car.steering_lock,
+            wheel_spin=(memory[SPIN], memory[SPIN + 1], memory[SPIN + 2], memory[SPIN + 3]),
+            steer=memory[STEER] / self.car.steering_lock,
             lap=self._lap,
-            odometer_m=float(memory[ODOMETER]),
+            odometer_m=memory[ODOMETER],
             lap_time_s=(self._steps - self._lap_start) / self.frequency_hz,
             collision=hit,
-            off_track=bool(abs(to_middle) > self.road.edge),
-            backwards=bool(abs(angle) > 0.5 * math.pi or along < ROLLING_BACK_M_S),
+            off_track=abs(readings[OFFSET]) > self.road.edge,
+            backwards=abs(readings[ANGLE]) > 0.5 * math.pi or readings[ALONG] < ROLLING_BACK_M_S,
         )
 
     def _count_laps(self, s: float) -> None:
@@ -262,22 +257,30 @@ class World:
         self._s = s
 
 
-def _checked(command: Command) -> NDArray[np.float64]:
-    """The command as (steer, throttle, brake, gear) for the kernel."""
-    for name, value, low in (
-        ("steer", command.steer, -1.0),
-        ("throttle", command.throttle, 0.0),
-        ("brake", command.brake, 0.0),
-    ):
-        if not low <= value <= 1.0:  # false for NaN too
-            raise UserError(f"the command has {name} = {value}; it goes from {low:g} to 1")
-    if command.gear != int(command.gear) or not LOWEST_GEAR <= command.gear <= HIGHEST_GEAR:
-        raise UserError(f"the command has gear = {command.gear}; gears are -1, 0 and 1 to 6")
-    return np.array([command.steer, command.throttle, command.brake, float(command.gear)])
+def check_frequency(frequency_hz: int) -> None:
+    """Raises UserError for a control rate that the physics cannot keep."""
+    if not 1 <= frequency_hz <= PHYSICS_HZ or PHYSICS_HZ % frequency_hz:  # true for NaN, too
+        raise UserError(
+            f"a control frequency of {frequency_hz} Hz does not divide the physics' "
+            f"{PHYSICS_HZ} Hz; choose for example 10, 20, 40 or 50"
+        )
 
 
-def _tangent(table: NDArray[np.float64], piece: int, s: float) -> tuple[float, float]:
-    """Heading (rad) and curvature (1/m) of the centre line at `s` on `piece`."""
-    start, heading, curvature = table[piece, 0], table[piece, 4], table[piece, 5]
-    along = min(max(s - start, 0.0), table[piece, 1])
-    return float(heading + curvature * along), float(curvature)
+def check_seed(seed: int) -> None:
+    """Raises UserError for what numpy's generator would not take."""
+    if not isinstance(seed, int | np.integer) or seed < 0:
+        raise UserError(f"reset got seed = {seed!r}; give a whole number of 0 or more")
+
+
+def _check(command: Command, controls: FloatArray) -> None:
+    """Fill `controls` with (steer, throttle, brake, gear) for the kernel."""
+    steer, throttle, brake, gear = command.steer, command.throttle, command.brake, command.gear
+    # Comparisons with NaN are false, so these hold for it as well.
+    if not (-1.0 <= steer <= 1.0 and 0.0 <= throttle <= 1.0 and 0.0 <= brake <= 1.0):
+        raise UserError(
+            f"the command has steer = {steer}, throttle = {throttle}, brake = {brake}; "
+            "steer goes from -1 to 1, the others go from 0 to 1"
+        )
+    if not LOWEST_GEAR <= gear <= HIGHEST_GEAR or gear != int(gear):
+        raise UserError(f"the command has gear = {gear}; gears are -1, 0 and 1 to 6")
+    controls[:] = steer, throttle, brake, gear

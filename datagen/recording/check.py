@@ -5,29 +5,29 @@ labels. deep: every image and message decoded, labels against the definitions.
 """
 
 import hashlib
-import zlib
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from google.protobuf.message import DecodeError
-from mcap.records import Channel, Chunk, Message
-from mcap.stream_reader import StreamReader, breakup_chunk
 
 import trackfeatures as tf
 
 from . import topics
 from .agreement import disagreements
-from .checksums import wrong_checksums
 from .dataset import IMAGE_DATA
 from .encoding import decode_into
 from .errors import DatasetError
-from .folder import RoundState, file_sha256
-from .index import DAMAGE, RoundIndex, open_round
+from .folder import RoundState
+from .index import RoundIndex, open_round
 from .labels import read_labels
+from .scan import Scan, scan
 from .wire import bytes_field
 
 LEVELS = ("quick", "full", "deep")
+TOLD = 5  # problems of one kind in one round; more of them say no more
 
 
 def check_round(path: Path, level: str, state: RoundState | None) -> tuple[int, list[str]]:
@@ -40,107 +40,125 @@ def check_round(path: Path, level: str, state: RoundState | None) -> tuple[int, 
         return 0, [str(error)]
     except OSError as error:
         return 0, [unreadable(path, error)]
-    frames = len(index.messages[topics.CAMERA].log_time)
     problems: list[str] = []
     try:
         problems += _quick(index, state)
         if level != "quick":
-            problems += _full(index, state)
+            problems += _full(index, state, _Listener(index, deep=level == "deep"))
         if level == "deep":
-            problems += _deep(index)
+            problems += _labels(index)
     except OSError as error:
         problems.append(f"cannot be read ({error.strerror})")
-    return frames, [f"{path.name}: {problem}" for problem in problems]
+    return len(index.messages[topics.CAMERA]), [f"{path.name}: {p}" for p in problems]
 
 
 def unreadable(path: Path, error: OSError) -> str:
     return f"{path} cannot be read ({error.strerror})"
 
 
-def content_hash(index: RoundIndex) -> str:
-    """The hash over images and labels that the writer took."""
-    digest = hashlib.sha256()
-    images, labels = index.messages[topics.CAMERA], index.messages[topics.LABELS]
-    for i in range(len(images.log_time)):
-        digest.update(bytes_field(images.payload(i), IMAGE_DATA))
-        digest.update(labels.payload(i))
-    return digest.hexdigest()
-
-
 def _quick(index: RoundIndex, state: RoundState | None) -> Iterator[str]:
+    header, result = index.header, index.result
     for topic, messages in index.messages.items():
-        if len(messages.log_time) != index.result.frames:
-            yield f"{len(messages.log_time)} messages on {topic}, {index.result.frames} recorded"
-    if index.header.definitions != tf.VERSION:
+        if len(messages) != result.frames:
+            yield f"{len(messages)} messages on {topic}, {result.frames} recorded"
+    if header.definitions != tf.VERSION:
         yield (
-            f"recorded under definitions {index.header.definitions}, this program has {tf.VERSION}"
+            f"recorded under definitions {header.definitions}, this program has {tf.VERSION}; "
+            "record it again with this program"
         )
     if state is None:
         yield "no state file holds its hashes"
-    elif index.path.stat().st_size != state.bytes:
-        yield f"{index.path.stat().st_size} bytes, {state.bytes} were written"
+        return
+    expected = {
+        "id": header.id,
+        "bytes": index.path.stat().st_size,
+        "frames": result.frames,
+        "content_hash": result.content_hash,
+        "definitions": header.definitions,
+    }
+    for name, value in expected.items():
+        if (noted := getattr(state, name)) != value:
+            yield f"its {name} is {value}, its state file says {noted}"
 
 
-def _full(index: RoundIndex, state: RoundState | None) -> Iterator[str]:
-    if state is not None and file_sha256(index.path) != state.sha256:
+def _full(index: RoundIndex, state: RoundState | None, listener: "_Listener") -> Iterator[str]:
+    found = scan(index.path, listener.hear)
+    if state is not None and found.sha256 != state.sha256:
         yield "its bytes are not those that were written (sha256 differs)"
-    yield from wrong_checksums(index.path)
-    yield from _walk(index, decode=False)
-    for topic, messages in index.messages.items():
-        if (np.diff(messages.log_time) <= 0).any():
+    yield from found.problems
+    if index.summary is not None and found.chunks != index.summary.chunks:
+        yield "its index is not that of its chunks"
+    yield from _times(index, found)
+    yield from listener.problems()
+    if listener.content.hexdigest() != index.result.content_hash:
+        yield "its images and labels are not those that were recorded (content hash differs)"
+
+
+def _times(index: RoundIndex, found: Scan) -> Iterator[str]:
+    """Every topic of the control steps once a step, on the clock of the round."""
+    frames, hertz = index.result.frames, index.header.frequency_hz
+    clock = [topics.log_time_ns(step, hertz) for step in range(frames)]
+    if index.recovery is not None:  # frames are missing: only the others' times can be right
+        clock = found.times.get(topics.CAMERA, [])
+    for topic in topics.EVERY_STEP:
+        times = found.times.get(topic, [])
+        if len(times) != frames:
+            yield f"{len(times)} messages on {topic}, expected {frames}"
+        elif times != clock:
+            step = next(i for i, (a, b) in enumerate(zip(times, clock, strict=True)) if a != b)
+            yield (
+                f"frame {step} on {topic} is at {topics.seconds(times[step]):.3f} s, "
+                f"expected at {topics.seconds(clock[step]):.3f} s"
+            )
+    for topic, times in found.times.items():
+        if any(b <= a for a, b in pairwise(times)):
             yield f"time does not increase on {topic}"
-    try:
-        read_labels(index, 0)
-        if content_hash(index) != index.result.content_hash:
-            yield "its images and labels are not those that were recorded (content hash differs)"
-    except (DatasetError, ValueError, IndexError) as error:
-        yield str(error)
 
 
-def _deep(index: RoundIndex) -> Iterator[str]:
-    yield from _walk(index, decode=True)
-    camera = index.header.camera
-    image = np.empty((camera.height, camera.width, 3), np.uint8)
-    messages = index.messages[topics.CAMERA]
-    for i in range(len(messages.log_time)):
-        try:
-            decode_into(bytes_field(messages.payload(i), IMAGE_DATA), image)
-        except ValueError as error:
-            yield f"image {i} cannot be decoded: {error}"
+def _labels(index: RoundIndex) -> Iterator[str]:
     try:
         labels = read_labels(index, 0)
-    except DatasetError:
-        return  # already told
+    except DatasetError as error:
+        yield str(error)
+        return
     yield from disagreements(labels, index.header.lanes, index.header.lane_width_m)
 
 
-def _walk(index: RoundIndex, decode: bool) -> Iterator[str]:
-    """Every chunk by the official reader: CRCs and counts; with `decode`, every message parsed."""
-    counts = dict.fromkeys(topics.MESSAGE_TYPES, 0)
-    names: dict[int, str] = {}
-    size = index.path.stat().st_size
-    try:
-        with index.path.open("rb") as stream:
-            for record in StreamReader(stream, emit_chunks=True, record_size_limit=size).records:
-                if not isinstance(record, Chunk):
-                    continue
-                if not record.compression and zlib.crc32(record.data) != record.uncompressed_crc:
-                    yield f"damaged near {_seconds(record.message_start_time)} (a chunk's CRC)"
-                for part in breakup_chunk(record):
-                    if isinstance(part, Channel):
-                        names[part.id] = part.topic
-                    elif isinstance(part, Message):
-                        topic = names[part.channel_id]
-                        counts[topic] = counts.get(topic, 0) + 1
-                        if decode and topic in topics.MESSAGE_TYPES:
-                            topics.MESSAGE_TYPES[topic].FromString(part.data)
-    except (*DAMAGE, DecodeError) as error:
-        yield f"cannot be read to its end: {error or type(error).__name__}"
-        return
-    for topic in topics.EVERY_STEP:
-        if counts[topic] != index.result.frames:
-            yield f"{counts[topic]} messages on {topic}, expected {index.result.frames}"
+class _Listener:
+    """Hears every message of a round: hashes images and labels; `deep`: decodes all of them."""
 
+    def __init__(self, index: RoundIndex, *, deep: bool) -> None:
+        self.content = hashlib.sha256()
+        self._deep = deep
+        self._wrong: dict[str, list[str]] = {}
+        camera = index.header.camera
+        self._image = np.empty((camera.height, camera.width, 3), np.uint8)
 
-def _seconds(log_time: int) -> str:
-    return f"{(log_time - topics.EPOCH_NS) / topics.NANOSECONDS:.2f} s"
+    def hear(self, topic: str, log_time: int, payload: memoryview) -> None:
+        try:
+            if topic == topics.LABELS:
+                self.content.update(payload)
+            elif topic == topics.CAMERA:
+                self._hear_image(log_time, payload)
+            if self._deep and topic in topics.MESSAGE_TYPES:
+                self._decode(topic, log_time, payload)
+        except (ValueError, DecodeError) as error:
+            at = f"{topics.seconds(log_time):.2f} s"
+            self._wrong.setdefault(topic, []).append(f"{topic} at {at}: {error}")
+
+    def problems(self) -> Iterator[str]:
+        for found in self._wrong.values():
+            yield from found[:TOLD]
+            if len(found) > TOLD:
+                yield f"... and {len(found) - TOLD} more of this topic"
+
+    def _hear_image(self, log_time: int, payload: memoryview) -> None:
+        data = bytes_field(payload, IMAGE_DATA)
+        self.content.update(data)
+        if self._deep:
+            decode_into(data, self._image)
+
+    def _decode(self, topic: str, log_time: int, payload: memoryview) -> None:
+        message: Any = topics.MESSAGE_TYPES[topic].FromString(bytes(payload))
+        if topic == topics.CAMERA and message.timestamp.ToNanoseconds() != log_time:
+            raise ValueError("the image carries another time than its message")

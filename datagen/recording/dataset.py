@@ -1,15 +1,17 @@
 """Reading a dataset folder: its rounds, their labels as arrays, their images as uint8 batches.
 
 frames = Dataset.open("datasets/default").select("train")
-batch = frames.read_batch(indices, np.empty((len(indices), 210, 280, 3), np.uint8))
+batch = frames.read_batch([3, 1, 2])
 """
 
 import hashlib
-from collections.abc import Sequence
+import os
+from bisect import bisect_right
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
-from os import cpu_count
+from itertools import accumulate
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +25,16 @@ from .errors import DatasetError
 from .header import RoundInfo
 from .index import RoundIndex, open_round
 from .labels import Labels, concatenate, read_labels
-from .splits import DEFAULT_SPLIT, SIDES, RoundKey, Split, read_split, require_disjoint, split_path
+from .splits import (
+    DEFAULT_SPLIT,
+    SIDES,
+    RoundKey,
+    Split,
+    read_split,
+    require_disjoint,
+    require_known_recovered,
+    split_path,
+)
 from .topics import CAMERA
 from .wire import bytes_field
 
@@ -40,11 +51,11 @@ class Frames:
         self.camera = camera
         self._images = [index.messages[CAMERA] for index in indexes]
         self._indexes = list(indexes)
-        counts = [len(images.log_time) for images in self._images]
-        self._first = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+        # The number of the first frame of each round, and of the one after the last.
+        self._first = list(accumulate((len(images) for images in self._images), initial=0))
 
     def __len__(self) -> int:
-        return int(self._first[-1])
+        return self._first[-1]
 
     @cached_property
     def labels(self) -> Labels:
@@ -58,34 +69,43 @@ class Frames:
         except ValueError as error:
             raise self._unreadable(i, error) from error
 
+    def image(self, i: int) -> NDArray[np.uint8]:
+        """The image of frame `i`, (H, W, 3) uint8 RGB; DatasetError when it cannot be decoded."""
+        image: NDArray[np.uint8] = self.read_batch([i])[0]
+        return image
+
     def read_batch(
-        self, indices: Sequence[int] | NDArray[np.int64], out: NDArray[np.uint8]
+        self, indices: Sequence[int] | NDArray[np.int64], out: NDArray[np.uint8] | None = None
     ) -> NDArray[np.uint8]:
-        """Decode the images of `indices` into `out` (B, H, W, 3) uint8 RGB, on threads."""
+        """Decode the images of `indices` into `out` (B, H, W, 3) uint8 RGB, on all cores.
+
+        Returns `out`, a new array where none is given. IndexError for a frame that is not there,
+        DatasetError for an image that cannot be decoded.
+        """
         numbers = np.asarray(indices, dtype=np.int64)
         shape = (len(numbers), self.camera.height, self.camera.width, 3)
+        out = np.empty(shape, np.uint8) if out is None else out
         if out.shape != shape or out.dtype != np.uint8:
             raise ValueError(f"`out` is {out.dtype} {out.shape}, expected uint8 {shape}")
-        parts = np.array_split(np.arange(len(numbers)), self._threads)
-        work = [self._pool.submit(self._decode, numbers, part, out) for part in parts]
+        # One iterator for all threads: each takes the next image when it is done with its last.
+        rows = iter(enumerate(numbers.tolist()))
+        work = [self._pool.submit(self._decode, rows, out) for _ in range(self._threads)]
         for part_done in work:
             part_done.result()
         return out
 
-    def _decode(
-        self, numbers: NDArray[np.int64], rows: NDArray[np.int64], out: NDArray[np.uint8]
-    ) -> None:
-        for row in rows.tolist():
+    def _decode(self, rows: Iterator[tuple[int, int]], out: NDArray[np.uint8]) -> None:
+        for row, i in rows:
             try:
-                decode_into(self.jpeg(int(numbers[row])), out[row])
+                decode_into(self.jpeg(i), out[row])
             except ValueError as error:
-                raise self._unreadable(int(numbers[row]), error) from error
+                raise self._unreadable(i, error) from error
 
     def _locate(self, i: int) -> tuple[int, int]:
         if not 0 <= i < len(self):
             raise IndexError(f"frame {i} of {len(self)}")
-        number = int(np.searchsorted(self._first, i, side="right")) - 1
-        return number, i - int(self._first[number])
+        number = bisect_right(self._first, i) - 1
+        return number, i - self._first[number]
 
     def _unreadable(self, i: int, error: Exception) -> DatasetError:
         number, frame = self._locate(i)
@@ -94,9 +114,9 @@ class Frames:
             "`datagen verify --level deep` on the dataset and record the round again"
         )
 
-    @property
+    @cached_property
     def _threads(self) -> int:
-        return cpu_count() or 1
+        return len(os.sched_getaffinity(0))
 
     @cached_property
     def _pool(self) -> ThreadPoolExecutor:
@@ -129,17 +149,21 @@ class Dataset:
         rounds = [
             RoundInfo.of(ix.path, ix.header, ix.result, chosen.side(ix.header.id)) for ix in indexes
         ]
-        return Dataset(folder, rounds, _one_camera(indexes), _content_hash(rounds), indexes)
+        content_hash = dataset_hash(info.content_hash for info in rounds)
+        return Dataset(folder, rounds, _one_camera(indexes), content_hash, indexes)
 
     def select(self, side: str = "all") -> Frames:
-        """The frames of the train rounds, the test rounds, or all."""
+        """The frames of the train, the test or the unseen rounds, or of all."""
         if side not in (*SIDES, "all"):
-            raise DatasetError(f"there is no side {side!r} of a split; choose train, test or all")
+            raise DatasetError(
+                f"there is no side {side!r} of a split; choose {', '.join(SIDES)} or all"
+            )
         chosen = [i for i, info in enumerate(self.rounds) if side in (info.split, "all")]
         if not chosen:
             raise DatasetError(
                 f"{self.path} has {len(self.rounds)} rounds but none for {side}; collect more "
-                "rounds (every fourth becomes a test round) or choose another split"
+                "rounds (every fourth becomes a test round; `datagen collect --split unseen` makes "
+                "unseen ones) or choose another split"
             )
         return Frames(
             [self.rounds[i] for i in chosen], [self.indexes[i] for i in chosen], self.camera
@@ -158,25 +182,27 @@ def round_files(folder: Path) -> list[Path]:
 
 
 def _require_sound_split(split: Split, indexes: Sequence[RoundIndex]) -> None:
+    require_known_recovered(split, indexes)
     require_disjoint(
         split, [RoundKey(ix.header.id, ix.header.seed, ix.result.content_hash) for ix in indexes]
     )
 
 
 def _one_camera(indexes: Sequence[RoundIndex]) -> CameraInfo:
-    camera = indexes[0].header.camera
+    """The camera all rounds are of; in a dataset with jitter each round's differs a little."""
+    camera = indexes[0].header.dataset_camera
     for index in indexes:
-        if index.header.camera != camera:
+        if index.header.dataset_camera != camera:
             raise DatasetError(
                 f"the rounds were recorded with different cameras: {indexes[0].path.name} with "
-                f"{camera}, {index.path.name} with {index.header.camera}; keep them apart"
+                f"{camera}, {index.path.name} with {index.header.dataset_camera}; keep them apart"
             )
     return camera
 
 
-def _content_hash(rounds: Sequence[RoundInfo]) -> str:
-    """One hash over all rounds, whatever their order."""
+def dataset_hash(content_hashes: Iterable[str]) -> str:
+    """One hash over the images and labels of all rounds, whatever their order and names."""
     digest = hashlib.sha256(tf.VERSION.encode())
-    for content in sorted(info.content_hash for info in rounds):
+    for content in sorted(content_hashes):
         digest.update(content.encode())
     return digest.hexdigest()

@@ -8,14 +8,19 @@ import hashlib
 import json
 import os
 import shutil
+from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from importlib.resources import files
 from pathlib import Path
 
 from .errors import DatasetError
+from .schema import SCHEMA, schema_text
 
 PARTIAL = ".partial"
-SUBFOLDERS = ("rounds", "state", "splits", "layouts", "proto")
+LOCKS = ".locks"
+SUBFOLDERS = ("rounds", "state", "splits", "layouts", "proto", "schemas")
+PUBLISHED = ("proto/driverview.proto", "layouts/foxglove.json", SCHEMA)
 UNFINISHED = ".{name}.new"  # a small file before it takes its place
 READ_BYTES = 1 << 20
 
@@ -45,15 +50,16 @@ def prepare(folder: Path) -> None:
     for name in SUBFOLDERS:
         (folder / name).mkdir(parents=True, exist_ok=True)
     package = files("datagen.recording")
-    for name in ("proto/driverview.proto", "layouts/foxglove.json"):
-        write_synced(folder / name, package.joinpath(name).read_text())
+    for name in PUBLISHED:
+        text = schema_text() if name == SCHEMA else package.joinpath(name).read_text()
+        write_synced(folder / name, text)
 
 
 def barely_begun(folder: Path, first: str) -> bool:
     """Whether nothing is in the folder but empty parts of a dataset and the beginning of `first`,
     the file that is written before all others: what a disk full at the start may leave."""
     return all(
-        path.name == UNFINISHED.format(name=first)
+        path.name in (UNFINISHED.format(name=first), LOCKS)
         or (path.name in (*SUBFOLDERS, PARTIAL) and path.is_dir() and not any(path.iterdir()))
         for path in folder.iterdir()
     )
@@ -77,21 +83,22 @@ def partial_path(folder: Path, round_id: str) -> Path:
 
 def publish(folder: Path, partial: Path, state: RoundState) -> None:
     """Move a checked round to its place: after a power cut it is there whole or not at all."""
-    _sync(partial)
-    partial.replace(round_path(folder, state.id))
-    _sync(folder / "rounds")
+    move_synced(partial, round_path(folder, state.id))
     write_synced(state_path(folder, state.id), json.dumps(asdict(state), indent=1) + "\n")
     discard_partial(folder, state.id)
 
 
 def discard_partial(folder: Path, round_id: str) -> None:
+    """What an attempt has left. Its parent stays: another round may be about to begin in it."""
     shutil.rmtree(folder / PARTIAL / round_id, ignore_errors=True)
-    _remove_empty(folder / PARTIAL)
 
 
-def discard_partials(folder: Path) -> None:
-    """What a crash or an interruption has left."""
-    shutil.rmtree(folder / PARTIAL, ignore_errors=True)
+def discard_partials(folder: Path, round_ids: Iterable[str]) -> None:
+    """What a crash or an interruption has left of these rounds."""
+    for round_id in round_ids:
+        discard_partial(folder, round_id)
+    with suppress(OSError):  # it is not there, or other rounds are being written in it
+        (folder / PARTIAL).rmdir()
 
 
 def read_states(folder: Path) -> dict[str, RoundState]:
@@ -111,6 +118,15 @@ def file_sha256(path: Path) -> str:
         while block := stream.read(READ_BYTES):
             digest.update(block)
     return digest.hexdigest()
+
+
+def move_synced(source: Path, target: Path) -> None:
+    """Put a finished file, or a folder of files, in its place: after a power cut it is there whole
+    or not at all."""
+    for path in (*source.rglob("*"), source):
+        _sync(path)
+    source.replace(target)
+    _sync(target.parent)
 
 
 def write_synced(path: Path, text: str) -> None:
@@ -134,8 +150,3 @@ def _sync(path: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
-
-
-def _remove_empty(path: Path) -> None:
-    if path.is_dir() and not any(path.iterdir()):
-        path.rmdir()

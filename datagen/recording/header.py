@@ -15,6 +15,8 @@ from .camera import CameraInfo
 
 ROUND_METADATA = "driverview.round"
 RESULT_METADATA = "driverview.result"
+RECOVERY_METADATA = "driverview.recovered"
+MOST_PIXELS = 65_500  # of a side: what JPEG holds
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,6 +39,22 @@ class RoundHeader:
     definitions: str = tf.VERSION
     program: str = ""
     camera: CameraInfo = field(default_factory=CameraInfo)
+    """What the images were taken with; varies from round to round where it was jittered..."""
+    nominal_camera: CameraInfo | None = None
+    """...about this one, the dataset's; absent where it was not."""
+
+    @property
+    def dataset_camera(self) -> CameraInfo:
+        return self.nominal_camera or self.camera
+
+    def require_sane(self) -> None:
+        """Raise ValueError where a value cannot be: damage reaches no computation."""
+        camera = self.camera
+        if type(self.frequency_hz) is not int or self.frequency_hz < 1:
+            raise ValueError(f"its header tells of {self.frequency_hz!r} frames a second")
+        for size in (camera.width, camera.height):
+            if type(size) is not int or not 0 < size <= MOST_PIXELS:
+                raise ValueError(f"its header tells of an image of {camera.width}x{camera.height}")
 
     def to_metadata(self) -> dict[str, str]:
         return {name: json.dumps(value) for name, value in asdict(self).items()}
@@ -45,7 +63,9 @@ class RoundHeader:
     def from_metadata(metadata: Mapping[str, str]) -> "RoundHeader":
         """Raises KeyError, TypeError or ValueError where the metadata is not of our kind."""
         values: dict[str, Any] = {name: json.loads(text) for name, text in metadata.items()}
-        values["camera"] = CameraInfo(**values["camera"])
+        for name in ("camera", "nominal_camera"):
+            if values[name] is not None:
+                values[name] = CameraInfo(**values[name])
         values["definitions"] = str(values["definitions"])
         return RoundHeader(**values)
 
@@ -67,6 +87,30 @@ class RoundResult:
     @staticmethod
     def from_metadata(metadata: Mapping[str, str]) -> "RoundResult":
         return RoundResult(**{name: json.loads(text) for name, text in metadata.items()})
+
+
+@dataclass(frozen=True, slots=True)
+class Recovery:
+    """What `datagen recover` notes in a round: not what was recorded, but what was whole of it.
+
+    `lost` frames are missing; when the file did not say how many it had, `at_least` so many.
+    """
+
+    source: str
+    saved: int
+    lost: int
+    at_least: bool
+
+    def to_metadata(self) -> dict[str, str]:
+        return {name: json.dumps(value) for name, value in asdict(self).items()}
+
+    @staticmethod
+    def from_metadata(metadata: Mapping[str, str]) -> "Recovery":
+        return Recovery(**{name: json.loads(text) for name, text in metadata.items()})
+
+    def __str__(self) -> str:
+        least = "at least " if self.at_least else ""
+        return f"{self.saved} frames saved from {self.source}, {least}{self.lost} lost"
 
 
 @dataclass(frozen=True, slots=True)

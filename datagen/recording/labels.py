@@ -41,18 +41,20 @@ class Labels:
 def read_labels(index: RoundIndex, round_number: int) -> Labels:
     """Labels of all frames of a round; DatasetError unless each image has its label and state."""
     camera, labels, states = (index.messages[t] for t in (CAMERA, LABELS, EGO_STATE))
-    count = len(camera.log_time)
-    for name, other in (("labels", labels), ("ego states", states)):
-        if not np.array_equal(camera.log_time, other.log_time):
-            raise DatasetError(
-                f"{index.path.name}: {count} images do not pair with its {len(other.log_time)} "
-                f"{name}; run `datagen verify` on the dataset and record the round again"
-            )
+    count = len(camera)
     try:
+        for name, other in (("labels", labels), ("ego states", states)):
+            if not np.array_equal(camera.log_time, other.log_time):
+                raise DatasetError(
+                    f"{index.path.name}: {count} images do not pair with its {len(other)} {name}; "
+                    "run `datagen verify` on the dataset and record the round again"
+                )
         rows = np.array([_row(labels.payload(i)) for i in range(count)], dtype=np.float64)
         motion = np.array([_motion(states.payload(i)) for i in range(count)], dtype=np.float64)
-    except DecodeError as error:
+    except (DecodeError, ValueError) as error:
         raise DatasetError(f"{index.path.name}: a label is damaged ({error})") from error
+    if not count:
+        raise DatasetError(f"{index.path.name} has no frames; record the round again")
     return Labels(
         distances=_narrow(rows[:, :5]),
         to_lane_centre=_narrow(rows[:, 5]),

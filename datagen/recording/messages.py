@@ -22,6 +22,7 @@ from .camera import CameraInfo
 from .frame import DriverCommand, EgoState, Frame, SensorReadings
 from .proto.driverview_pb2 import Command, Sensors, TrackFeatures, VehicleState
 from .topics import NANOSECONDS
+from .wire import points_field
 
 WORLD, EGO, CAMERA_FRAME = "world", "ego", "camera_front"
 EGO_SIZE = (4.52, 1.94, 1.10)
@@ -71,8 +72,7 @@ def annotations(frame: Frame, time: Timestamp) -> bytes:
         line.type = PointsAnnotation.LINE_STRIP
         line.thickness = 1.0
         line.outline_color.CopyFrom(GREEN)
-        for x, y in np.asarray(polyline, dtype=np.float64).tolist():
-            line.points.add(x=x, y=y)
+        line.MergeFromString(points_field(PointsAnnotation.POINTS_FIELD_NUMBER, polyline))
     text = message.texts.add()
     text.timestamp.CopyFrom(time)
     text.position.x, text.position.y = 4.0, 12.0

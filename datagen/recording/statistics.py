@@ -11,6 +11,7 @@ import trackfeatures as tf
 
 from .dataset import Dataset
 from .labels import Labels
+from .splits import SIDES
 
 
 def describe(dataset: Dataset) -> dict[str, Any]:
@@ -31,8 +32,7 @@ def describe(dataset: Dataset) -> dict[str, Any]:
         "by_traffic": _frames_by(rounds, "traffic"),
         "by_trajectory": _frames_by(rounds, "trajectory"),
         "all": describe_labels(labels),
-        "train": describe_labels(labels.take(np.flatnonzero(side == "train"))),
-        "test": describe_labels(labels.take(np.flatnonzero(side == "test"))),
+        **{name: describe_labels(labels.take(np.flatnonzero(side == name))) for name in SIDES},
     }
 
 

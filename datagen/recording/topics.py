@@ -47,6 +47,11 @@ def log_time_ns(step: int, frequency_hz: int) -> int:
     return EPOCH_NS + step * NANOSECONDS // frequency_hz
 
 
+def seconds(log_time: int) -> float:
+    """Simulated time since the start of the round, s."""
+    return (log_time - EPOCH_NS) / NANOSECONDS
+
+
 def schema_data(message_type: Any) -> bytes:
     """The serialised FileDescriptorSet that MCAP stores for a protobuf schema."""
     files: dict[str, FileDescriptor] = {}

@@ -1,87 +1,155 @@
 """Whether a dataset folder is what was recorded; a bad file is reported, never raised."""
 
-from collections.abc import Callable
+import os
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import trackfeatures as tf
 
-from .check import check_round, unreadable
-from .dataset import round_files
+from .check import LEVELS, check_round, unreadable
+from .dataset import dataset_hash, round_files
 from .errors import DatasetError
 from .folder import RoundState, round_path, state_path
-from .index import open_round
-from .splits import RoundKey, read_split, require_disjoint
+from .index import RoundIndex, open_round
+from .manifest import manifest_problems
+from .splits import SIDES, RoundKey, read_split, require_disjoint, require_known_recovered
 
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """The result of `datagen verify`."""
+    """The result of `datagen verify`.
+
+    `content_hash` is the dataset's (see `Dataset`), absent when a round cannot be read.
+    """
 
     ok: bool
     rounds: int
     frames: int
     problems: tuple[str, ...]
+    content_hash: str | None = None
+    recovered: tuple[str, ...] = ()
+    """Rounds that `datagen recover` saved, one line each: known, and no problem by themselves."""
 
     def as_json(self) -> dict[str, object]:
-        return {**asdict(self), "problems": list(self.problems)}
+        return asdict(self)
 
 
 def verify(folder: Path, level: str, seen: Callable[[str], None] = lambda name: None) -> Report:
-    """Check every round at `level` (quick, full or deep) and the splits; `seen` hears of each."""
+    """Check every round at `level` (quick, full or deep) and what belongs to them, on all cores.
+
+    `seen` hears of each round that is done, on any thread. DatasetError for another level.
+    """
+    if level not in LEVELS:
+        raise DatasetError(f"there is no level {level!r}; choose {', '.join(LEVELS)}")
     try:
         files = round_files(folder)
     except DatasetError as error:
         return Report(False, 0, 0, (str(error),))
-    frames, problems = 0, []
-    for file in files:
-        try:
-            state = _state_of(folder, file)
-        except DatasetError as error:
-            state = None
-            problems.append(str(error))
-        except OSError as error:
-            state = None
-            problems.append(unreadable(state_path(folder, file.stem), error))
-        count, found = check_round(file, level, state)
-        frames += count
-        problems += found
+
+    def check(file: Path) -> tuple[int, list[str]]:
+        done = _check(folder, file, level)
         seen(file.stem)
-    problems += _missing(folder)
-    problems += _splits(folder, files)
-    return Report(not problems, len(files), frames, tuple(problems))
+        return done
+
+    # Threads: hashing, CRCs and decoding, nearly all of the time, leave Python to the others.
+    with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
+        checked = list(pool.map(check, files))
+    problems = [problem for _, found in checked for problem in found]
+    rounds = list(_opened(files))
+    problems += [*_missing(folder), *_foreign(folder), *_doubles(rounds), *_splits(folder, rounds)]
+    if level != "quick" and not problems:
+        problems += _derived(folder)
+    return Report(
+        not problems,
+        len(files),
+        sum(frames for frames, _ in checked),
+        tuple(problems),
+        dataset_hash(r.result.content_hash for r in rounds) if len(rounds) == len(files) else None,
+        tuple(f"{r.header.id}: {r.recovery}" for r in rounds if r.recovery),
+    )
 
 
-def _state_of(folder: Path, file: Path) -> RoundState | None:
+def _check(folder: Path, file: Path, level: str) -> tuple[int, list[str]]:
     path = state_path(folder, file.stem)
-    return RoundState.read(path) if path.is_file() else None
+    state, problems = None, []
+    try:
+        state = RoundState.read(path) if path.is_file() else None
+    except DatasetError as error:
+        problems.append(str(error))
+    except OSError as error:
+        problems.append(unreadable(path, error))
+    if state is not None and state.file != f"rounds/{file.name}":
+        problems.append(f"{path} is of {state.file}")
+    frames, found = check_round(file, level, state)
+    return frames, problems + found
 
 
-def _missing(folder: Path) -> list[str]:
-    """Rounds that were finished once and whose file is gone."""
-    names = [path.stem for path in sorted((folder / "state").glob("*.json"))]
-    return [
-        f"{name}.mcap is missing: state/{name}.json says that it was recorded"
-        for name in names
-        if not round_path(folder, name).is_file()
-    ]
-
-
-def _splits(folder: Path, files: list[Path]) -> list[str]:
-    keys = []
+def _opened(files: list[Path]) -> Iterator[RoundIndex]:
     for file in files:
         try:
-            index = open_round(file)
+            yield open_round(file)
         except (DatasetError, OSError):
             continue  # already told
-        keys.append(RoundKey(index.header.id, index.header.seed, index.result.content_hash))
-    problems = []
+
+
+def _derived(folder: Path) -> Iterator[str]:
+    try:
+        yield from manifest_problems(folder)
+    except tf.UserError as error:
+        yield str(error)
+    except OSError as error:
+        yield unreadable(Path(error.filename or folder), error)
+
+
+def _missing(folder: Path) -> Iterator[str]:
+    """Rounds that were finished once and whose file is gone."""
+    for path in sorted((folder / "state").glob("*.json")):
+        if not round_path(folder, path.stem).is_file():
+            yield f"{path.stem}.mcap is missing: state/{path.name} says that it was recorded"
+
+
+def _foreign(folder: Path) -> Iterator[str]:
+    """What stands among the rounds and is none."""
+    for path in sorted((folder / "rounds").iterdir()):
+        if path.suffix != ".mcap":
+            yield f"{path} is no round (expected *.mcap); move it elsewhere"
+
+
+def _doubles(rounds: list[RoundIndex]) -> Iterator[str]:
+    """Files under another's name, and rounds that are there twice."""
+    contents: dict[str, str] = {}
+    for index in rounds:
+        name, header = index.path.name, index.header
+        if header.id != index.path.stem:
+            yield (
+                f"{name} holds round {header.id}: files were swapped, copied or renamed; give each "
+                "the name of its round"
+            )
+        first = contents.setdefault(index.result.content_hash, name)
+        if first != name:
+            yield f"{name} has the same images and labels as {first}; keep one of them"
+
+
+def _splits(folder: Path, rounds: list[RoundIndex]) -> Iterator[str]:
+    keys = [RoundKey(r.header.id, r.header.seed, r.result.content_hash) for r in rounds]
     paths = sorted((folder / "splits").glob("*.json"))
+    if not paths:
+        yield f"there are no splits in {folder / 'splits'}"
     for path in paths:
         try:
-            require_disjoint(read_split(path), keys)
+            split = read_split(path)
+            require_disjoint(split, keys)
+            require_known_recovered(split, rounds)
         except (DatasetError, tf.DefinitionsMismatch) as error:
-            problems.append(str(error))
+            yield str(error)
         except OSError as error:
-            problems.append(unreadable(path, error))
-    return problems or ([] if paths else [f"there are no splits in {folder / 'splits'}"])
+            yield unreadable(path, error)
+        else:
+            named = [round_id for side in SIDES for round_id in getattr(split, side)]
+            for round_id in sorted(set(named)):
+                if named.count(round_id) > 1:
+                    yield f"{path} names round {round_id} twice"
+                if not round_path(folder, round_id).is_file():
+                    yield f"{path} names round {round_id}, which is not there"

@@ -6,18 +6,13 @@ from pathlib import Path
 from types import TracebackType
 
 import numpy as np
-from mcap.well_known import MessageEncoding, SchemaEncoding
-from mcap.writer import CompressionType, Writer
 from numpy.typing import NDArray
 
 from . import messages, topics
 from .encoding import encode
 from .frame import Frame
-from .header import RESULT_METADATA, ROUND_METADATA, RoundHeader, RoundResult
-
-# Bytes a pixel that the codecs need on our images, and what the other topics need a step.
-BYTES_PER_PIXEL = {"jpeg": 0.5, "png": 1.8}
-OTHER_BYTES = 6_000
+from .header import RESULT_METADATA, RoundHeader, RoundResult
+from .round_file import RoundFile
 
 
 class RoundWriter:
@@ -33,16 +28,7 @@ class RoundWriter:
         self.header = header
         self.frames = 0
         self._content = hashlib.sha256()
-        self._stream = path.open("wb")
-        self._mcap = Writer(
-            self._stream,
-            chunk_size=_chunk_bytes(header),
-            compression=CompressionType.NONE,
-            enable_data_crcs=True,
-        )
-        self._mcap.start(profile="", library="driverview")
-        self._channels = self._register()
-        self._mcap.add_metadata(ROUND_METADATA, header.to_metadata())
+        self._file = RoundFile(path, header)
         start = topics.log_time_ns(0, header.frequency_hz)
         track = messages.track_scene(scene, messages.timestamp(start))
         self._add(topics.TRACK_SCENE, start, track)
@@ -84,9 +70,8 @@ class RoundWriter:
             distance_m=distance_m,
             mean_speed_kmh=mean_speed_kmh,
         )
-        self._mcap.add_metadata(RESULT_METADATA, result.to_metadata())
-        self._mcap.finish()  # type: ignore[no-untyped-call]  # mcap leaves it untyped
-        self._stream.close()
+        self._file.add_metadata(RESULT_METADATA, result.to_metadata())
+        self._file.finish()
         return result
 
     def __enter__(self) -> "RoundWriter":
@@ -98,30 +83,7 @@ class RoundWriter:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        self._stream.close()
-
-    def _register(self) -> dict[str, int]:
-        schemas: dict[str, int] = {}
-        channels: dict[str, int] = {}
-        for topic, message_type in topics.MESSAGE_TYPES.items():
-            name = message_type.DESCRIPTOR.full_name
-            if name not in schemas:
-                schemas[name] = self._mcap.register_schema(
-                    name, SchemaEncoding.Protobuf, topics.schema_data(message_type)
-                )
-            channels[topic] = self._mcap.register_channel(
-                topic, MessageEncoding.Protobuf, schemas[name]
-            )
-        return channels
+        self._file.__exit__(kind, error, trace)
 
     def _add(self, topic: str, time: int, data: bytes) -> None:
-        self._mcap.add_message(
-            self._channels[topic], time, data, publish_time=time, sequence=self.frames
-        )
-
-
-def _chunk_bytes(header: RoundHeader) -> int:
-    """About one second of messages."""
-    pixels = header.camera.width * header.camera.height
-    step = pixels * BYTES_PER_PIXEL[header.codec] + OTHER_BYTES
-    return int(step * header.frequency_hz)
+        self._file.add(topic, time, self.frames, data)

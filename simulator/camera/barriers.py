@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 
 from simulator.camera.look import Look
 from simulator.camera.mesh import Surface
-from simulator.camera.ribbon import Ribbon, strip
+from simulator.camera.ribbon import Ribbon
+from simulator.camera.strips import Level, strip
 from simulator.track.road import Road
 
 FloatArray = NDArray[np.float64]
@@ -18,23 +19,33 @@ KINDS: tuple[str, ...] = ("rail", "wall", "hedge", "fence", "stones", "tyres")
 HEIGHT_M = np.array([0.8, 0.9, 1.25, 1.05, 0.75, 0.95])
 THICK_M = np.array([0.06, 0.25, 0.9, 0.06, 0.5, 0.7])
 SECTION_M = (90.0, 420.0)
+LEVELS = (Level(35.0, 0.005, 16.0), Level(120.0, 0.03, 32.0), Level(300.0, 0.1, 64.0))
 
 
 def build(road: Road, ribbon: Ribbon, look: Look, rng: np.random.Generator) -> Surface:
     """Both sides' barriers; a vertex is x, y, z, s, height, kind, normal (3)."""
-    grids, points = [], []
+    grids, profiles = [], []
     for side, column in zip((1.0, -1.0), ribbon.wall, strict=True):
         kind = _sections(ribbon.s, road.track.length_m, look, rng)
         grid = _one_side(ribbon, road, side, column, kind)
         grids.append(grid)
-        points.append(grid[..., :3].astype(np.float64))
+        # A row at which the kind changes says so loudly enough to stay.
+        profiles.append(np.column_stack([ribbon.points[:, column], 100.0 * kind]))
     # One strip, the right side after the left; the quads that would join them have no area.
     left, right = grids
     bridge = np.stack([left[-1], right[0]])
     bridge[:, :, :3] = right[0, 0, :3]
     vertices = np.concatenate([left, bridge, right])
-    corners = np.concatenate([points[0], bridge[..., :3].astype(np.float64), points[1]])
-    return strip(vertices, corners)
+    ends = np.stack([profiles[0][-1], profiles[1][0]]) + 1e6
+    length = ribbon.s[-1]
+    return strip(
+        vertices,
+        vertices[..., :3].astype(np.float64),
+        np.concatenate([ribbon.s, [length + 1.0, length + 2.0], length + 3.0 + ribbon.s]),
+        np.concatenate([profiles[0], ends, profiles[1]]),
+        [((0, 1), (1, 2))] * len(LEVELS),
+        LEVELS,
+    )
 
 
 def _sections(

@@ -1,7 +1,10 @@
 """The camera: pictures of a road and the cars on it, from a pose. World frame, metres, radians."""
 
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -9,18 +12,39 @@ from numpy.typing import ArrayLike, NDArray
 from simulator.camera import optics
 from simulator.camera.cars import cars_of
 from simulator.camera.context import FRAME_BINDING, Graphics, graphics
+from simulator.camera.fall import Fall
+from simulator.camera.kinds import CLASS, COLOUR, DEPTH, Wanted
 from simulator.camera.light import Light
 from simulator.camera.optics import DRIVER_SEAT, Mount
-from simulator.camera.scene import Scene
+from simulator.camera.scene import Scene, Seen
+from simulator.camera.sky import Sky
 from simulator.car import CarParameters
 from simulator.track.road import Road
 from trackfeatures.errors import UserError
 
 FloatArray = NDArray[np.float64]
-Picture = NDArray[np.uint8]
+Picture = NDArray[Any]
 
 MAX_SIZE = 4096
 _OWN_PAINT = 0
+
+
+def check_size(width: int, height: int) -> None:
+    """Raises UserError unless pictures of this size can be drawn."""
+    if not (8 <= width <= MAX_SIZE and 8 <= height <= MAX_SIZE):
+        raise UserError(
+            f"picture size {width} x {height}; each side must be 8 to {MAX_SIZE} pixels"
+        )
+
+
+@dataclass(frozen=True)
+class _Shot:
+    """One aimed view: the eye, what of the scene it may see, and the cars, nearest first."""
+
+    eye: optics.Eye
+    seen: Seen
+    cars: FloatArray
+    paints: list[int]
 
 
 class Camera:
@@ -41,19 +65,19 @@ class Camera:
         width: int = 280,
         height: int = 210,
     ) -> None:
-        if not (8 <= width <= MAX_SIZE and 8 <= height <= MAX_SIZE):
-            raise UserError(
-                f"picture size {width} x {height}; each side must be 8 to {MAX_SIZE} pixels"
-            )
+        check_size(width, height)
         self.road, self.light, self.mount = road, light, mount
         self.width, self.height = width, height
         self._graphics: Graphics = graphics()
         self._cars = cars_of(self._graphics)
+        self._fall = Fall(self._graphics, light, seed) if light.falling > 0.0 else None
         self._scene: Scene | None = Scene(self._graphics, road, seed, light)
+        self._frame = np.concatenate([np.zeros(24), *_light_rows(light)]).astype(np.float32)
+        self._set_frame(optics.eye_of(mount, np.zeros(6), "front"), self.intrinsics)
+        self._sky = Sky(self._graphics, light.weather, float(self.intrinsics[0, 0]))
         # Cars of different rounds differ in colour; from the second on, so as to spare our own.
         self._first_paint = 1 + seed % 5
         self._last_s: float | None = None
-        self._buffer = bytearray(width * height * 3)
 
     def render(
         self, body_pose: ArrayLike, others: ArrayLike | None = None, view: str = "front"
@@ -63,31 +87,86 @@ class Camera:
         `body_pose` (6,) is x, y, z, roll, pitch, yaw of the centre of gravity; `others` (n, 6)
         the same of other cars, z at the ground they stand on.
         """
+        return self._views(body_pose, others, {view: Wanted(view)})[view]
+
+    def render_views(
+        self,
+        body_pose: ArrayLike,
+        others: ArrayLike | None = None,
+        views: Sequence[str] = ("front",),
+    ) -> dict[str, Picture]:
+        """Pictures of several views from one pose, by the names in `views`.
+
+        "front" (any of VIEWS) is the colour picture (height, width, 3) uint8; "front:depth" the
+        distance along the optical axis (height, width) float32 in metres, inf in the sky;
+        "front:class" the number in CLASSES (height, width) uint8. Depth and class are those of
+        what the middle of the pixel shows, of leaves and hedges where they are more than half
+        opaque. Kinds of one view share its work. Raises UserError for an unknown view or kind.
+        """
+        return self._views(body_pose, others, {name: Wanted.of(name) for name in views})
+
+    def _views(
+        self, body_pose: ArrayLike, others: ArrayLike | None, wanted: dict[str, Wanted]
+    ) -> dict[str, Picture]:
+        taken: dict[Wanted, Picture] = {}
+        for view in dict.fromkeys(each.view for each in wanted.values()):
+            kinds = {each.kind for each in wanted.values() if each.view == view}
+            shot = self._aim(body_pose, others, view)
+            if COLOUR in kinds:
+                taken[Wanted(view)] = self._draw_colours(shot)
+            if kinds - {COLOUR}:
+                labels = self._draw_labels(shot)
+                taken[Wanted(view, DEPTH)] = np.ascontiguousarray(labels[..., 0])
+                taken[Wanted(view, CLASS)] = labels[..., 1].astype(np.uint8)
+        return {name: taken[each] for name, each in wanted.items()}
+
+    def _aim(self, body_pose: ArrayLike, others: ArrayLike | None, view: str) -> _Shot:
+        """Point at a view and find what it may show."""
         scene = self._open_scene()
         eye = optics.eye_of(self.mount, body_pose, view)
         matrix = self.intrinsics
-        target = self._graphics.target(self.width, self.height)
         self._set_frame(eye, matrix)
-        self._graphics.begin(target)
         planes = optics.frustum(eye, matrix)
         cars, paints = self._cars_in_view(body_pose, others, view)
         chosen = self._cars.seen(cars, eye.place, planes)
-        self._cars.draw(cars[chosen], [paints[k] for k in chosen], eye.place)
-        scene.draw(eye.place, planes)
-        self._graphics.sky.render()
+        return _Shot(eye, scene.seen(eye, planes), cars[chosen], [paints[k] for k in chosen])
+
+    def _draw_colours(self, shot: _Shot) -> NDArray[np.uint8]:
+        scene, place = self._open_scene(), shot.eye.place
+        target = self._graphics.targets.of(self.width, self.height, labels=False)
+        self._graphics.begin(target)
+        self._cars.draw(shot.cars, shot.paints, place, labels=False)
+        scene.draw(shot.seen, labels=False)
+        self._sky.draw()
         self._graphics.blend()
-        self._cars.draw_shadows(cars[chosen], eye.place, self.light)
-        scene.draw_blended(eye.place, planes)
-        if target.resolved is not target.drawn:
-            self._graphics.context.copy_framebuffer(target.resolved, target.drawn)
-        target.resolved.read_into(self._buffer, components=3, alignment=1)
-        picture = np.frombuffer(self._buffer, dtype=np.uint8)
-        return picture.reshape(self.height, self.width, 3).copy()
+        self._cars.draw_shadows(shot.cars, place, self.light)
+        scene.draw_blended(shot.seen)
+        if self._fall is not None:
+            self._fall.draw(shot.eye, self.intrinsics[0, 0])
+        return target.colours()
+
+    def _draw_labels(self, shot: _Shot) -> NDArray[np.float32]:
+        """Depth and class (height, width, 2) of what `_draw_colours` draws, rain and snow apart."""
+        scene = self._open_scene()
+        target = self._graphics.targets.of(self.width, self.height, labels=True)
+        self._graphics.begin(target, labels=True)
+        self._cars.draw(shot.cars, shot.paints, shot.eye.place, labels=True)
+        scene.draw(shot.seen, labels=True)
+        return target.labels()
 
     @property
     def intrinsics(self) -> FloatArray:
         """Pinhole matrix (3, 3) in pixels; square pixels, principal point in the middle."""
         return optics.intrinsics(self.mount, self.width, self.height)
+
+    def extrinsics(self, view: str = "front", body_pose: ArrayLike = (0.0,) * 6) -> FloatArray:
+        """Body frame to camera frame (4, 4): x right, y down, z ahead (the optical axis), metres.
+
+        Fixed for views of the car's mounts; `chase` and `top` keep level, so theirs depend on the
+        roll and pitch of `body_pose`. With `intrinsics` K, K @ (E @ point)[:3] is (u, v, 1) times
+        the depth. Raises UserError for an unknown view.
+        """
+        return optics.extrinsics(self.mount, body_pose, view)
 
     def project(
         self, points: ArrayLike, body_pose: ArrayLike, view: str = "front"
@@ -100,6 +179,9 @@ class Camera:
         if self._scene is not None:
             self._scene.release()
             self._scene = None
+            self._sky.release()
+            if self._fall is not None:
+                self._fall.release()
 
     def __enter__(self) -> Self:
         return self
@@ -138,22 +220,21 @@ class Camera:
 
     def _set_frame(self, eye: optics.Eye, matrix: FloatArray) -> None:
         """Fill the uniform block `Frame` of frame.glsl."""
-        right, up, ahead = eye.axes
-        light = self.light
-        block = np.zeros(56, dtype=np.float32)
         clip = optics.clip_matrix(eye, matrix, self.width, self.height)
+        block = self._frame
         block[:16] = clip.T.reshape(-1)
-        rows = block[16:].reshape(10, 4)
-        rows[0, :3] = eye.place
-        rows[1, :3] = ahead
-        rows[2, :3] = right * matrix[0, 2] / matrix[0, 0]
-        # The picture is drawn upside down: image rows run downwards in the world.
-        rows[3, :3] = -up * matrix[1, 2] / matrix[1, 1]
-        rows[4] = (*light.sun_direction, light.shade)
-        rows[5] = (*light.sun, light.exposure)
-        rows[6] = (*light.sky, light.haze_per_km / 1000.0 / np.log(2.0))
-        rows[7] = (*light.zenith, light.clouds)
-        rows[8, :3] = light.horizon
-        rows[9, :3] = light.haze
+        block[16:19], block[20:23] = eye.place, eye.axes[2]
         self._graphics.frame.write(block.tobytes())
         self._graphics.frame.bind_to_uniform_block(FRAME_BINDING)
+
+
+def _light_rows(light: Light) -> list[tuple[float, ...]]:
+    """The rows of the uniform block `Frame` that tell of light and air."""
+    return [
+        (*light.sun_direction, light.shade),
+        (*light.sun, light.exposure),
+        (*light.sky, light.haze_per_km / 1000.0 / math.log(2.0)),
+        (*light.zenith, light.clouds),
+        (*light.horizon, light.cover),
+        (*light.haze, 0.0),
+    ]

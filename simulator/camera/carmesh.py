@@ -5,6 +5,7 @@ normal and a colour; a colour of (-1, -1, -1) takes the car's own paint.
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -30,14 +31,26 @@ _CABIN = ((-1.75, 0.95, 0.78), (-1.05, 1.38, 0.62), (0.05, 1.4, 0.62), (0.95, 0.
 _WHEELS_X, _WHEEL_RADIUS = (-1.35, 1.32), 0.33
 
 
-def car_mesh() -> NDArray[np.float32]:
-    """Triangles of one car, (3 T, 9) float32: place, normal, colour."""
-    parts = [*_hull(_BODY, 0.22, _OWN, _OWN), *_cabin()]
-    for x in _WHEELS_X:
-        for side in (-1.0, 1.0):
-            parts += _wheel(x, side)
-    parts += _fittings()
-    return np.concatenate(parts).astype(np.float32)
+@dataclass(frozen=True)
+class CarMesh:
+    """Triangles of a car, (3 T, 9) float32: place, normal, colour. From near the first `near`
+    vertices are drawn, from afar those from `far` on, with fewer corners to the wheels."""
+
+    vertices: NDArray[np.float32]
+    near: int
+    far: int
+
+
+def car_mesh() -> CarMesh:
+    """The car's triangles in both levels of detail."""
+    wheels, far_wheels = (
+        [part for x in _WHEELS_X for side in (-1.0, 1.0) for part in wheel(x, side)]
+        for wheel in (_wheel, _far_wheel)
+    )
+    body = [*_hull(_BODY, 0.22, _OWN, _OWN), *_cabin(), *_fittings()]
+    near = sum(map(len, wheels)) + sum(map(len, body))
+    vertices = np.concatenate([*wheels, *body, *far_wheels]).astype(np.float32)
+    return CarMesh(vertices, near, sum(map(len, wheels)))
 
 
 def _quad(a: Point, b: Point, c: Point, d: Point, colour: Point) -> FloatArray:
@@ -122,6 +135,17 @@ def _wheel(x: float, side: float) -> list[FloatArray]:
         for corners, colour in ((face, _RUBBER), (hub, _RIM)):
             parts.append(_face(corners if side < 0 else corners[::-1], colour))
     return parts
+
+
+def _far_wheel(x: float, side: float) -> list[FloatArray]:
+    """A tyre as one dark face of six corners."""
+    y = side * 0.91
+    ring = [
+        (x + _WHEEL_RADIUS * np.cos(t), y, _WHEEL_RADIUS * (1.0 + np.sin(t)))
+        for t in np.linspace(0.0, 2.0 * np.pi, 7)
+    ]
+    halves = ([ring[k] for k in (0, 1, 2, 3)], [ring[k] for k in (3, 4, 5, 0)])
+    return [_face(half if side < 0 else half[::-1], _RUBBER) for half in halves]
 
 
 def _fittings() -> list[FloatArray]:

@@ -8,11 +8,12 @@ from numpy.typing import NDArray
 from simulator.camera.carmesh import PAINTS, car_mesh
 from simulator.camera.context import Graphics
 from simulator.camera.light import Light
+from simulator.camera.mesh import both_ways
 from simulator.camera.optics import rotation
 
 FloatArray = NDArray[np.float64]
 
-REACH_M = 350.0
+REACH_M, NEAR_M = 350.0, 40.0
 SHADOW_REACH_M = 120.0
 _RADIUS_M = 3.0
 _LONGEST_SHADOW = 4.0
@@ -24,12 +25,17 @@ class Cars:
 
     def __init__(self, graphics: Graphics) -> None:
         context = graphics.context
-        self._body = {name: graphics.uniform("car", name) for name in ("stand", "paint")}
+        self._stands = [
+            graphics.uniform(name, "stand") for name in ("car", graphics.labelling("car"))
+        ]
+        self._paint = graphics.uniform("car", "paint")
         self._spot = {name: graphics.uniform("spot", name) for name in ("stand", "reach", "middle")}
         self._context = context
-        mesh = context.buffer(car_mesh().tobytes())
-        self._mesh = context.vertex_array(
-            graphics.programs["car"], [(mesh, "3f 3f 3f", "at", "facing", "colour")]
+        mesh = car_mesh()
+        triangles = context.buffer(mesh.vertices.tobytes())
+        self._near, self._far = (0, mesh.near), (mesh.far, len(mesh.vertices) - mesh.far)
+        self._meshes = both_ways(
+            graphics, "car", triangles, None, ("3f 3f 3f", "at", "facing", "colour")
         )
         corners = np.array([-1, -1, 1, -1, -1, 1, 1, 1], dtype=np.float32)
         patch = context.buffer(corners.tobytes())
@@ -44,12 +50,14 @@ class Cars:
         inside = (relative @ planes.T > -2.0 * _RADIUS_M).all(axis=1) & (distance < REACH_M)
         return np.flatnonzero(inside)[np.argsort(distance[inside], kind="stable")]
 
-    def draw(self, poses: FloatArray, paints: list[int], eye: FloatArray) -> None:
+    def draw(self, poses: FloatArray, paints: list[int], eye: FloatArray, labels: bool) -> None:
         """The bodies at `poses` (n, 6), in the paints of these numbers."""
         for pose, paint in zip(poses, paints, strict=True):
-            self._body["stand"].write(_stand(pose, eye).tobytes())
-            self._body["paint"].value = PAINTS[paint % len(PAINTS)]
-            self._mesh.render()
+            self._stands[labels].write(_stand(pose, eye).tobytes())
+            self._paint.value = PAINTS[paint % len(PAINTS)]
+            near = np.linalg.norm(pose[:3] - eye) < NEAR_M
+            first, count = self._near if near else self._far
+            self._meshes[labels].render(vertices=count, first=first)
 
     def draw_shadows(self, poses: FloatArray, eye: FloatArray, light: Light) -> None:
         """The shadows on the ground; blending must be on."""

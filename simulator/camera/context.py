@@ -5,41 +5,47 @@ the drawing threads: 0 draws in the calling thread, which suits one worker proce
 """
 
 import os
-from dataclasses import dataclass
 from importlib import resources
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from simulator.camera import foliage, textures
+from simulator.camera.kinds import CLASSES
 from simulator.camera.llvm import load_triton_first
+from simulator.camera.targets import GPU_SAMPLES, Target, Targets
 from trackfeatures.errors import UserError
 
 if TYPE_CHECKING:
     import moderngl
 
-GPU_SAMPLES = 4
-"""Samples a pixel on a GPU. On llvmpipe one: four took 24 ms a frame instead of 6, and road and
-paint are filtered in the shader anyway."""
-PROGRAMS = ("sky", "land", "road", "barrier", "prop", "tree", "car", "spot")
+PROGRAMS = (
+    "sky",
+    "dome",
+    "land",
+    "paved",
+    "verge",
+    "barrier",
+    "prop",
+    "tree",
+    "car",
+    "spot",
+    "fall",
+)
 FRAME_BINDING, SCENE_BINDING = 0, 1
+VERTEX_SHADERS = {"paved": "road", "verge": "road"}
+"""Where a program takes another's."""
+LIBRARIES = ("output.glsl", "weather.glsl", "road.glsl", "sea.glsl")
+"""Functions for fragment shaders."""
 BLOCKS = {"Frame": FRAME_BINDING, "Scene": SCENE_BINDING}
-FRAME_FLOATS = 56
-UNITS = {"noise": 0, "shade": 1, "atlas": 2}
+WEATHERED = ("sky", "land", "paved", "verge", "barrier", "prop", "tree")
+"""Programs that rain and snow change; each weather gets its own, so that dry ones cost no more."""
+FRAME_FLOATS = 48
+NOISE_UNIT, SHADE_UNIT, ATLAS_UNIT, SKY_UNIT = range(4)
+UNITS = {"noise": NOISE_UNIT, "shade": SHADE_UNIT, "atlas": ATLAS_UNIT, "panorama": SKY_UNIT}
 """Texture units, by the name of the sampler."""
-_KEPT_TARGETS = 8
 
 
 class NoRendererError(UserError):
     """OpenGL through EGL is not to be had on this machine."""
-
-
-@dataclass(frozen=True)
-class Target:
-    """Where a picture is drawn (multisampled) and where it is resolved for reading."""
-
-    drawn: "moderngl.Framebuffer"
-    resolved: "moderngl.Framebuffer"
 
 
 class Graphics:
@@ -56,64 +62,32 @@ class Graphics:
         sheet = foliage.atlas()
         self.atlas = self.context.texture(sheet.shape[1::-1], 4, sheet.tobytes())
         self.mipmapped(self.atlas)
+        self.atlas.filter = self.noise.filter
         self.atlas.repeat_x = self.atlas.repeat_y = False
-        corners = np.array([-1.0, -1.0, 3.0, -1.0, -1.0, 3.0], dtype=np.float32)
-        buffer = self.context.buffer(corners.tobytes())
-        self.sky = self.context.vertex_array(self.programs["sky"], [(buffer, "2f", "corner")])
         self.frame = self.context.buffer(reserve=FRAME_FLOATS * 4, dynamic=True)
-        self._targets: dict[tuple[int, int], Target] = {}
+        samples = 0 if "llvmpipe" in self.renderer else min(GPU_SAMPLES, self.context.max_samples)
+        self.targets = Targets(self.context, samples)
 
     @property
     def renderer(self) -> str:
         """Name of what draws, such as "llvmpipe (LLVM 15.0.6, 256 bits)"."""
         return str(self.context.info["GL_RENDERER"])
 
-    def target(self, width: int, height: int) -> Target:
-        """The target of this size, made on first use; the few latest sizes are kept."""
-        if (width, height) not in self._targets:
-            if len(self._targets) >= _KEPT_TARGETS:
-                self._release_oldest_target()
-            self._targets[width, height] = self._make_target(width, height)
-        return self._targets[width, height]
-
-    def begin(self, target: Target) -> None:
+    def begin(self, target: Target, labels: bool = False) -> None:
         """Clear `target` and make it the one that is drawn to."""
-        target.drawn.use()
-        target.drawn.clear()
+        target.clear(labels)
         self.context.enable_only(self.context.DEPTH_TEST)
-        self.noise.use(UNITS["noise"])
-        self.atlas.use(UNITS["atlas"])
+        self.use_textures()
+
+    def use_textures(self) -> None:
+        """Bind the textures that all scenes share."""
+        self.noise.use(NOISE_UNIT)
+        self.atlas.use(ATLAS_UNIT)
 
     def blend(self) -> None:
         """From here on lay pictures with alpha over what is drawn, and leave the depth alone."""
         self.context.enable(self.context.BLEND)
         self.context.blend_func = (self.context.SRC_ALPHA, self.context.ONE_MINUS_SRC_ALPHA)
-
-    def _make_target(self, width: int, height: int) -> Target:
-        import moderngl
-
-        size = (width, height)
-        samples = 0 if "llvmpipe" in self.renderer else min(GPU_SAMPLES, self.context.max_samples)
-        try:
-            drawn = self.context.framebuffer(
-                [self.context.renderbuffer(size, 4, samples=samples)],
-                self.context.depth_renderbuffer(size, samples=samples),
-            )
-            resolved = drawn
-            if samples:
-                resolved = self.context.framebuffer([self.context.renderbuffer(size, 4)])
-        except moderngl.Error as error:
-            raise UserError(f"cannot draw pictures of {width} x {height}: {error}") from error
-        return Target(drawn, resolved)
-
-    def _release_oldest_target(self) -> None:
-        oldest = self._targets.pop(next(iter(self._targets)))
-        for framebuffer in (oldest.drawn, oldest.resolved):
-            for attachment in framebuffer.color_attachments:
-                attachment.release()
-            if framebuffer.depth_attachment is not None:
-                framebuffer.depth_attachment.release()
-            framebuffer.release()
 
     def uniform(self, program: str, name: str) -> "moderngl.Uniform":
         """A plain uniform of one of the programs."""
@@ -124,13 +98,34 @@ class Graphics:
             raise TypeError(f"{name} of program {program} is no uniform")
         return member
 
-    def _program(self, name: str) -> "moderngl.Program":
+    def weathered(self, name: str, weather: str, *features: str) -> str:
+        """Name in `programs` of program `name` as it is in `weather` ("" when dry), with what the
+        shaders know as `features` ("sea": the land has a shore)."""
+        defines = [*features, *([weather] if weather and name in WEATHERED else [])]
+        key = " ".join([name, *defines])
+        if key not in self.programs:
+            self.programs[key] = self._program(name, *defines)
+        return key
+
+    def labelling(self, name: str) -> str:
+        """Name in `programs` of the program that draws what `name` draws as depth and class."""
+        key = f"{name.split()[0]} labels"
+        if key not in self.programs:
+            self.programs[key] = self._program(name.split()[0], "labels")
+        return key
+
+    def _program(self, name: str, *defines: str) -> "moderngl.Program":
         import moderngl
 
-        head = "#version 330 core\n" + _source("frame.glsl")
+        head = "#version 330 core\n"
+        for define in defines:
+            head += f"#define {define.upper()}\n"
+        head += _source("frame.glsl")
+        classes = "".join(f"#define {name.upper()} {k}\n" for k, name in enumerate(CLASSES))
+        libraries = "".join(_source(library) for library in LIBRARIES)
         program = self.context.program(
-            vertex_shader=head + _source(f"{name}.vert.glsl"),
-            fragment_shader=head + _source(f"{name}.frag.glsl"),
+            vertex_shader=head + _source(f"{VERTEX_SHADERS.get(name, name)}.vert.glsl"),
+            fragment_shader=head + classes + libraries + _source(f"{name}.frag.glsl"),
         )
         for key in program:
             member = program[key]

@@ -6,6 +6,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from simulator.camera.outline import outline
+
 CELL = 128
 COLUMNS, ROWS = 4, 2
 KINDS: tuple[str, ...] = ("oak", "poplar", "pine", "fir", "palm", "bush", "crown", "birch")
@@ -43,6 +45,12 @@ def silhouettes() -> NDArray[np.uint8]:
     """Outlines (kinds, CELL, CELL) of the trees, 255 where no light passes."""
     alpha = atlas()[..., 3].reshape(ROWS, CELL, COLUMNS, CELL).transpose(0, 2, 1, 3)
     return np.ascontiguousarray(alpha.reshape(-1, CELL, CELL))
+
+
+@cache
+def outlines() -> NDArray[np.float64]:
+    """Polygons (kinds, CORNERS, 2) round the pictures of the trees; see `outline`."""
+    return np.stack([outline(shape) for shape in silhouettes()])
 
 
 def _finished(canvas: Canvas) -> NDArray[np.uint8]:

@@ -12,7 +12,9 @@ from trackfeatures.errors import UserError
 
 Colour = tuple[float, float, float]
 
-KINDS: tuple[str, ...] = ("clear", "overcast", "dusk", "fog", "heavy-shadow")
+KINDS: tuple[str, ...] = ("clear", "overcast", "dusk", "fog", "heavy-shadow", "rain", "snow")
+WEATHERS: tuple[str, ...] = ("rain", "snow")
+"""The kinds in which something falls; the others are dry."""
 
 
 @dataclass(frozen=True)
@@ -34,9 +36,18 @@ class Light:
     clouds: float
     """Share of the sky that is cloud, 0 to 1."""
     shade: float
-    tree_shadows: float
-    """Extra tree shadows on the road, 0 none to 1 the hard case."""
+    canopy: bool = False
+    """The hard case: trees meet over the road and dapple it."""
     exposure: float = 1.0
+    cover: float = 0.0
+    """Rain: how wet the road is; snow: how much of it is white; 0 to 1."""
+    falling: float = 0.0
+    """How thick rain or snow falls, 0 to 1."""
+
+    @property
+    def weather(self) -> str:
+        """One of WEATHERS, or "" when it is dry."""
+        return self.kind if self.kind in WEATHERS else ""
 
     @staticmethod
     def named(kind: str, rng: np.random.Generator) -> "Light":
@@ -83,7 +94,6 @@ def _clear(rng: np.random.Generator) -> Light:
         haze_per_km=rng.uniform(0.25, 1.1),
         clouds=rng.uniform(0.0, 0.55),
         shade=0.0,
-        tree_shadows=rng.uniform(0.0, 0.3),
     )
 
 
@@ -101,7 +111,6 @@ def _overcast(rng: np.random.Generator) -> Light:
         haze_per_km=rng.uniform(0.8, 2.5),
         clouds=1.0,
         shade=0.85,
-        tree_shadows=0.0,
     )
 
 
@@ -119,7 +128,6 @@ def _dusk(rng: np.random.Generator) -> Light:
         haze_per_km=rng.uniform(0.8, 2.0),
         clouds=rng.uniform(0.2, 0.7),
         shade=0.3,
-        tree_shadows=rng.uniform(0.0, 0.2),
     )
 
 
@@ -138,7 +146,6 @@ def _fog(rng: np.random.Generator) -> Light:
         haze_per_km=rng.uniform(7.0, 16.0),
         clouds=0.0,
         shade=0.9,
-        tree_shadows=0.0,
     )
 
 
@@ -151,7 +158,49 @@ def _heavy_shadow(rng: np.random.Generator) -> Light:
         sun=(2.25, 2.15, 1.9),
         sky=_tinted((0.20, 0.225, 0.275), rng, 0.05),
         clouds=rng.uniform(0.0, 0.3),
-        tree_shadows=1.0,
+        canopy=True,
+    )
+
+
+def _rain(rng: np.random.Generator) -> Light:
+    grey = rng.uniform(0.52, 0.85)
+    heavy = rng.uniform(0.0, 1.0)
+    air = _tinted((0.50 * grey, 0.525 * grey, 0.56 * grey), rng, 0.04)
+    return Light(
+        "rain",
+        sun_azimuth=rng.uniform(-math.pi, math.pi),
+        sun_elevation=math.radians(rng.uniform(35.0, 60.0)),
+        sun=(0.05 * grey, 0.05 * grey, 0.05 * grey),
+        sky=_tinted((1.05 * grey, 1.10 * grey, 1.18 * grey), rng, 0.04),
+        zenith=_tinted((0.34 * grey, 0.37 * grey, 0.42 * grey), rng, 0.06),
+        horizon=_tinted((0.56 * grey, 0.58 * grey, 0.61 * grey), rng, 0.05),
+        haze=air,
+        haze_per_km=2.0 + 6.0 * heavy,
+        clouds=1.0,
+        shade=0.95,
+        cover=rng.uniform(0.55, 1.0),
+        falling=0.35 + 0.65 * heavy,
+    )
+
+
+def _snow(rng: np.random.Generator) -> Light:
+    grey = rng.uniform(0.72, 1.0)
+    heavy = rng.uniform(0.0, 1.0)
+    air = _tinted((0.60 * grey, 0.62 * grey, 0.65 * grey), rng, 0.03)
+    return Light(
+        "snow",
+        sun_azimuth=rng.uniform(-math.pi, math.pi),
+        sun_elevation=math.radians(rng.uniform(25.0, 50.0)),
+        sun=(0.10 * grey, 0.10 * grey, 0.095 * grey),
+        sky=_tinted((0.80 * grey, 0.83 * grey, 0.88 * grey), rng, 0.03),
+        zenith=_tinted((0.50 * grey, 0.52 * grey, 0.56 * grey), rng, 0.04),
+        horizon=air,
+        haze=air,
+        haze_per_km=2.5 + 7.0 * heavy,
+        clouds=rng.uniform(0.6, 1.0),
+        shade=0.9,
+        cover=rng.uniform(0.2, 0.75),
+        falling=0.3 + 0.7 * heavy,
     )
 
 
@@ -161,4 +210,6 @@ _MAKERS = {
     "dusk": _dusk,
     "fog": _fog,
     "heavy-shadow": _heavy_shadow,
+    "rain": _rain,
+    "snow": _snow,
 }

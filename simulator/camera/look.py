@@ -23,12 +23,25 @@ class Look:
     trees: tuple[str, ...]
     tree_density: float
     tree_reach_m: float = 45.0
+    clearings: float = 0.3
+    """How much the trees thin out here and there, 0 to 0.35."""
     hills_m: float = 8.0
     houses: float = 0.0
     stands: float = 0.0
     signs: float = 0.8
     posts: bool = False
     lamps: bool = False
+    poles: bool = False
+    """Telegraph poles along one side."""
+    blocks: float = 0.0
+    """Tall flat-roofed buildings."""
+    grassy: float = 0.35
+    """Share of the verge that is grown over."""
+    sea: bool = False
+    """Outside the loop the land falls to the sea."""
+    bridges: tuple[str, ...] = ()
+    """Styles (see `bridge_styles`) of the bridges over the road."""
+    bridge_every_m: float = 450.0
     worn: float = 0.4
     """How patched and cracked the surface is, 0 to 1."""
 
@@ -49,7 +62,27 @@ LOOKS: dict[str, Look] = {
         hills_m=10.0,
         signs=1.2,
         lamps=True,
+        bridges=("overpass", "gantry", "overpass", "footbridge"),
         worn=0.3,
+    ),
+    "ring-road": Look(
+        (0.115, 0.115, 0.12),
+        (0.22, 0.215, 0.205),
+        (0.09, 0.14, 0.045),
+        (0.19, 0.18, 0.09),
+        _SOIL,
+        ("wall", "wall", "rail"),
+        ("birch", "poplar", "bush"),
+        6.0,
+        45.0,
+        hills_m=4.0,
+        signs=1.6,
+        lamps=True,
+        blocks=1.8,
+        grassy=0.1,
+        bridges=("gantry", "overpass", "gantry", "railway"),
+        bridge_every_m=350.0,
+        worn=0.35,
     ),
     "mountain": Look(
         (0.12, 0.118, 0.118),
@@ -65,6 +98,7 @@ LOOKS: dict[str, Look] = {
         houses=0.15,
         signs=0.7,
         posts=True,
+        bridges=("arch", "railway"),
         worn=0.6,
     ),
     "circuit": Look(
@@ -80,6 +114,7 @@ LOOKS: dict[str, Look] = {
         hills_m=6.0,
         stands=0.35,
         signs=1.8,
+        bridges=("adverts", "footbridge", "gantry"),
         worn=0.2,
     ),
     "oval": Look(
@@ -96,6 +131,7 @@ LOOKS: dict[str, Look] = {
         stands=0.7,
         signs=1.5,
         lamps=True,
+        bridges=("adverts",),
         worn=0.3,
     ),
     "town": Look(
@@ -109,9 +145,12 @@ LOOKS: dict[str, Look] = {
         4.0,
         35.0,
         hills_m=3.0,
-        houses=4.5,
+        houses=5.5,
         signs=2.2,
         lamps=True,
+        blocks=1.4,
+        grassy=0.0,
+        bridges=("railway", "footbridge", "arch"),
         worn=0.8,
     ),
     "forest": Look(
@@ -121,12 +160,15 @@ LOOKS: dict[str, Look] = {
         (0.16, 0.12, 0.06),
         (0.15, 0.11, 0.07),
         ("fence", "rail"),
-        ("fir", "oak", "pine", "fir"),
-        26.0,
-        55.0,
+        ("fir", "oak", "birch", "fir", "bush"),
+        30.0,
+        34.0,
+        clearings=0.12,
         hills_m=12.0,
+        grassy=0.6,
         signs=0.5,
         posts=True,
+        bridges=("wooden", "arch"),
         worn=0.6,
     ),
     "coast": Look(
@@ -135,13 +177,15 @@ LOOKS: dict[str, Look] = {
         (0.13, 0.16, 0.055),
         (0.32, 0.27, 0.16),
         (0.38, 0.32, 0.22),
-        ("wall", "stones", "rail"),
+        ("rail", "stones", "rail", "wall"),
         ("palm", "bush", "palm"),
-        6.0,
-        45.0,
+        9.0,
+        30.0,
         hills_m=12.0,
+        sea=True,
         houses=0.8,
         signs=0.8,
+        bridges=("arch", "footbridge"),
         worn=0.5,
     ),
     "gravel": Look(
@@ -151,12 +195,14 @@ LOOKS: dict[str, Look] = {
         (0.27, 0.22, 0.11),
         (0.27, 0.21, 0.14),
         ("fence", "stones"),
-        ("bush", "pine", "oak"),
-        8.0,
-        60.0,
-        hills_m=18.0,
+        ("bush", "pine", "bush", "birch"),
+        9.0,
+        50.0,
+        hills_m=30.0,
+        poles=True,
         houses=0.2,
         signs=0.3,
+        bridges=("wooden",),
         worn=1.0,
     ),
     "countryside": Look(
@@ -173,6 +219,9 @@ LOOKS: dict[str, Look] = {
         houses=0.5,
         signs=0.6,
         posts=True,
+        poles=True,
+        grassy=0.7,
+        bridges=("railway", "arch", "overpass"),
         worn=0.7,
     ),
 }

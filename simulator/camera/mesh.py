@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from simulator.camera.context import Graphics
+from simulator.camera.cull import runs_seen
 
 if TYPE_CHECKING:
     import moderngl
@@ -27,38 +28,15 @@ class Surface:
 @dataclass(frozen=True)
 class Chunks:
     """Spheres round runs of indices: centres (N, 3), radii (N,), and one row of first index and
-    number of indices a level of detail, (levels, N), the finest first."""
+    number of indices a level of detail, (levels, N), the finest first; each up to `reaches` m."""
 
     centres: FloatArray
     radii: FloatArray
     first: NDArray[np.int64]
     count: NDArray[np.int64]
-
-    def seen(
-        self, eye: FloatArray, planes: FloatArray, reaches: Sequence[float]
-    ) -> list[tuple[int, int]]:
-        """(first, count) runs that meet the frustum; level k is drawn up to reaches[k] m."""
-        relative = self.centres - eye
-        inside = (relative @ planes.T > -self.radii[:, None]).all(axis=1)
-        distance = np.sqrt(np.einsum("ij,ij->i", relative, relative)) - self.radii
-        level = np.searchsorted(np.asarray(reaches), distance)
-        runs: list[tuple[int, int]] = []
-        for k in range(len(reaches)):
-            runs += _joined(np.flatnonzero(inside & (level == k)), self.first[k], self.count[k])
-        return runs
-
-
-def _joined(
-    chosen: NDArray[np.intp], first: NDArray[np.int64], count: NDArray[np.int64]
-) -> list[tuple[int, int]]:
-    """Runs of indices of the chosen chunks, neighbours in one run."""
-    if len(chosen) == 0:
-        return []
-    breaks = np.flatnonzero(np.diff(chosen) > 1)
-    starts = chosen[np.concatenate(([0], breaks + 1))]
-    ends = chosen[np.concatenate((breaks, [len(chosen) - 1]))]
-    sizes = first[ends] + count[ends] - first[starts]
-    return list(zip(first[starts].tolist(), sizes.tolist(), strict=True))
+    reaches: tuple[float, ...]
+    nearest: float = 0.0
+    """Chunks that lie wholly nearer than this are left to a finer mesh."""
 
 
 class Mesh:
@@ -74,21 +52,49 @@ class Mesh:
         context = graphics.context
         self._vertices = context.buffer(np.ascontiguousarray(surface.vertices).tobytes())
         self._indices = context.buffer(np.ascontiguousarray(surface.indices).tobytes())
-        self._array: moderngl.VertexArray = context.vertex_array(
-            graphics.programs[program],
-            [(self._vertices, *layout)],
-            index_buffer=self._indices,
-            index_element_size=4,
-        )
-        self._chunks = surface.chunks
+        self._arrays = both_ways(graphics, program, self._vertices, self._indices, layout)
+        chunks = surface.chunks
+        self._spheres = np.column_stack([chunks.centres, chunks.radii])
+        self._levels = chunks.first, chunks.count, np.array(chunks.reaches), chunks.nearest
+        self._runs = np.empty((len(self._spheres), 2), dtype=np.int64)
 
-    def draw(self, eye: FloatArray, planes: FloatArray, *reaches: float) -> None:
-        """Draw the chunks that are seen, each level of detail up to its reach (m)."""
-        for first, count in self._chunks.seen(eye, planes, reaches):
-            self._array.render(vertices=count, first=first)
+    def seen(self, eye: FloatArray, planes: FloatArray) -> list[list[int]]:
+        """What to draw for an eye: (first, count) runs of indices."""
+        found = runs_seen(self._spheres, *self._levels, eye, planes, self._runs)
+        runs: list[list[int]] = self._runs[:found].tolist()
+        return runs
+
+    def draw(self, runs: list[list[int]], labels: bool) -> None:
+        """Draw the runs that are seen, as depth and class or in their colours."""
+        array = self._arrays[labels]
+        for first, count in runs:
+            array.render(vertices=count, first=first)
 
     def release(self) -> None:
         """Free the graphics memory."""
-        self._array.release()
+        for array in self._arrays:
+            array.release()
         self._indices.release()
         self._vertices.release()
+
+
+def both_ways(
+    graphics: Graphics,
+    program: str,
+    vertices: "moderngl.Buffer",
+    indices: "moderngl.Buffer | None",
+    layout: Sequence[str],
+) -> "tuple[moderngl.VertexArray, moderngl.VertexArray]":
+    """Vertex arrays of the same vertices: one draws them in their colours, one as depth and class
+    (whose program does not use all of a vertex)."""
+    drawn, labelled = (
+        graphics.context.vertex_array(
+            graphics.programs[name],
+            [(vertices, *layout)],
+            index_buffer=indices,
+            index_element_size=4,
+            skip_errors=name != program,
+        )
+        for name in (program, graphics.labelling(program))
+    )
+    return drawn, labelled

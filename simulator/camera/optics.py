@@ -88,14 +88,27 @@ def eye_of(mount: Mount, body_pose: ArrayLike, view: str) -> Eye:
 
 
 def _eye(place: FloatArray, turn: FloatArray) -> Eye:
-    ahead, left, up = turn.T
-    return Eye(place, np.stack([-left, up, ahead]))
+    axes = np.empty((3, 3))
+    axes[0], axes[1], axes[2] = -turn[:, 1], turn[:, 2], turn[:, 0]
+    return Eye(place, axes)
 
 
 def intrinsics(mount: Mount, width: int, height: int) -> FloatArray:
     """Pinhole matrix (3, 3) in pixels."""
     focal = height / 2 / math.tan(math.radians(mount.fov_y_deg) / 2)
     return np.array([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
+
+
+def extrinsics(mount: Mount, body_pose: ArrayLike, view: str) -> FloatArray:
+    """Body frame to camera frame (x right, y down, z ahead) of `view`, (4, 4)."""
+    pose = np.asarray(body_pose, dtype=np.float64)
+    eye = eye_of(mount, pose, view)
+    right, up, ahead = eye.axes
+    turn = np.stack([right, -up, ahead])
+    matrix = np.eye(4)
+    matrix[:3, :3] = turn @ rotation(*pose[3:])
+    matrix[:3, 3] = turn @ (pose[:3] - eye.place)
+    return matrix
 
 
 def project(eye: Eye, matrix: FloatArray, points: ArrayLike) -> tuple[FloatArray, FloatArray]:
@@ -126,10 +139,15 @@ def clip_matrix(eye: Eye, matrix: FloatArray, width: int, height: int) -> FloatA
 
 def frustum(eye: Eye, matrix: FloatArray) -> FloatArray:
     """Inward unit normals (4, 3) of the side planes through the eye."""
-    right, up, ahead = eye.axes
     half_x = matrix[0, 2] / matrix[0, 0]
     half_y = matrix[1, 2] / matrix[1, 1]
-    planes = np.stack(
-        [ahead * half_x - right, ahead * half_x + right, ahead * half_y - up, ahead * half_y + up]
+    long_x, long_y = math.hypot(half_x, 1.0), math.hypot(half_y, 1.0)
+    sides = np.array(
+        [
+            [-1.0 / long_x, 0.0, half_x / long_x],
+            [1.0 / long_x, 0.0, half_x / long_x],
+            [0.0, -1.0 / long_y, half_y / long_y],
+            [0.0, 1.0 / long_y, half_y / long_y],
+        ]
     )
-    return np.asarray(planes / np.linalg.norm(planes, axis=1, keepdims=True))
+    return np.asarray(sides @ eye.axes)

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from simulator.camera.optics import NEAR_M
+from simulator.track.kernel import road_points
 from simulator.track.road import Road
 
 if TYPE_CHECKING:
@@ -50,13 +51,10 @@ def marking_polylines(
     if view in ("top", "left", "right"):
         start = -ahead_m
     distances = s + np.arange(start, end + STEP_M / 2, STEP_M)
-    lines = []
-    for y in road.markings_y:
-        place = road.track.at(distances, y)
-        points = np.stack([place.x, place.y, place.z], axis=1)
-        pixels, depth = camera.project(points, body_pose, view)
-        lines += _inside(camera, pixels, depth)
-    return lines
+    points = road_points(road.track.arrays(), distances, road.markings_y)
+    pixels, depth = camera.project(points.reshape(-1, 3), body_pose, view)
+    good = _near_picture(camera, pixels, depth).reshape(points.shape[:2])
+    return _runs(pixels.reshape(*points.shape[:2], 2), good)
 
 
 def pose_of_state(state: "CarState") -> FloatArray:
@@ -77,14 +75,27 @@ def draw(
     return drawn
 
 
-def _inside(camera: Seen, pixels: FloatArray, depth: FloatArray) -> list[FloatArray]:
-    """Runs of at least two points that lie before the eye and near the picture."""
+def _near_picture(camera: Seen, pixels: FloatArray, depth: FloatArray) -> NDArray[np.bool_]:
+    """Which points lie before the eye and not far outside the picture."""
     margin = 0.5 * max(camera.width, camera.height)
     u, v = pixels[:, 0], pixels[:, 1]
-    near = (
-        (u > -margin) & (u < camera.width + margin) & (v > -margin) & (v < camera.height + margin)
+    return np.asarray(
+        (depth > 2.0 * NEAR_M)
+        & (np.abs(u - 0.5 * camera.width) < 0.5 * camera.width + margin)
+        & (np.abs(v - 0.5 * camera.height) < 0.5 * camera.height + margin)
     )
-    good = (depth > 2.0 * NEAR_M) & near
-    breaks = np.flatnonzero(np.diff(good.astype(np.int8)) != 0) + 1
-    runs = np.split(np.arange(len(good)), breaks)
-    return [pixels[run] for run in runs if good[run[0]] and len(run) >= 2]
+
+
+def _runs(lines: FloatArray, good: NDArray[np.bool_]) -> list[FloatArray]:
+    """The parts (n, 2) of `lines` (L, N, 2) of at least two `good` (L, N) points in a row."""
+    # A column of False on either side keeps the lines apart and gives every run both its ends.
+    padded = np.zeros((good.shape[0], good.shape[1] + 2), dtype=np.bool_)
+    padded[:, 1:-1] = good
+    flat = padded.ravel()
+    edges = np.flatnonzero(flat[1:] != flat[:-1]).tolist()
+    runs = []
+    for start, end in zip(edges[::2], edges[1::2], strict=True):
+        line, first = divmod(start, padded.shape[1])
+        if end - start >= 2:
+            runs.append(lines[line, first : first + end - start])
+    return runs

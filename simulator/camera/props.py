@@ -9,20 +9,24 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from simulator.camera.bridges import KEEP_FREE_M, Bridge, free_of
 from simulator.camera.look import Look
 from simulator.camera.mesh import Chunks, Surface
 from simulator.camera.ribbon import Ribbon
-from simulator.camera.scenery import ground_height, place_beside
+from simulator.camera.roadside import ground_height, place_beside
+from simulator.camera.scenery import DRY_M
+from simulator.camera.solids import BOARD, CROWD, FACADE, PLAIN, STRIPED, TILES, Point, box, face
 from simulator.camera.terrain import CentreLine, Terrain
 from simulator.track.road import Road
 
 FloatArray = NDArray[np.float64]
-Point = tuple[float, float, float]
 
-PLAIN, FACADE, CROWD, BOARD, STRIPED, TILES = (float(k) for k in range(6))
-"""Materials, as prop.frag.glsl numbers them."""
-CHUNK_M = 50.0
-POST_STEP_M, LAMP_STEP_M = 50.0, 42.0
+CHUNK_M, REACH_M = 50.0, 350.0
+SMALL_M2, SMALL_REACH_M = 14.0, 130.0
+"""Posts, lamps and signs, of less area than this, are nothing but a flicker from farther away."""
+BUILDING_M = 3.9
+"""What reaches farther from its middle is a building."""
+POST_STEP_M, LAMP_STEP_M, POLE_STEP_M = 50.0, 42.0, 40.0
 _WALLS: tuple[Point, ...] = (
     (0.62, 0.58, 0.50), (0.66, 0.64, 0.60), (0.42, 0.22, 0.15), (0.58, 0.47, 0.30),
     (0.45, 0.46, 0.48), (0.52, 0.34, 0.25),
@@ -32,43 +36,6 @@ _BOARDS: tuple[Point, ...] = (
     (0.02, 0.09, 0.36), (0.03, 0.22, 0.09), (0.62, 0.46, 0.03), (0.60, 0.60, 0.58),
     (0.48, 0.03, 0.03), (0.50, 0.18, 0.02),
 )  # fmt: skip
-
-
-def box(size: Point, at: Point, colour: Point, material: float = PLAIN) -> FloatArray:
-    """A box without a floor, (30, 12): place, normal, colour, (u, v) in metres, material."""
-    half_x, half_y, height = size[0] / 2, size[1] / 2, size[2]
-    faces = []
-    for nx, ny, reach, half in ((1, 0, half_x, half_y), (-1, 0, half_x, half_y),
-                                (0, 1, half_y, half_x), (0, -1, half_y, half_x)):  # fmt: skip
-        along = np.array([-ny, nx, 0.0]) * half
-        middle = np.array([nx, ny, 0.0]) * reach
-        up = np.array([0.0, 0.0, height])
-        corners = [middle - along, middle + along, middle + along + up, middle - along + up]
-        uv = [(0.0, 0.0), (2 * half, 0.0), (2 * half, height), (0.0, height)]
-        faces.append(_face(corners, uv, colour, material))
-    top = [
-        np.array([x * half_x, y * half_y, height]) for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))
-    ]
-    faces.append(
-        _face(top, [(0, 0), (size[0], 0), (size[0], size[1]), (0, size[1])], colour, PLAIN)
-    )
-    whole = np.concatenate(faces)
-    whole[:, :3] += np.array(at)
-    return whole
-
-
-def _face(
-    corners: Sequence[FloatArray], uv: Sequence[tuple[float, float]], colour: Point, material: float
-) -> FloatArray:
-    rows = np.empty((6, 12))
-    order = [0, 1, 2, 0, 2, 3]
-    rows[:, :3] = np.array(corners)[order]
-    normal = np.cross(corners[1] - corners[0], corners[2] - corners[0])
-    rows[:, 3:6] = normal / max(float(np.linalg.norm(normal)), 1e-9)
-    rows[:, 6:9] = colour
-    rows[:, 9:11] = np.array(uv)[order]
-    rows[:, 11] = material
-    return rows
 
 
 def house(rng: np.random.Generator) -> FloatArray:
@@ -84,14 +51,14 @@ def house(rng: np.random.Generator) -> FloatArray:
         low = [np.array([side * x, side * y, eaves]), np.array([-side * x, side * y, eaves])]
         high_edge = [ridge[0], ridge[1]] if side > 0 else [ridge[1], ridge[0]]
         slope = [(0.0, 0.0), (wide, 0.0), (wide, 5.0), (0.0, 5.0)]
-        parts.append(_face([*low, *high_edge], slope, roof, TILES))
+        parts.append(face([*low, *high_edge], slope, roof, TILES))
         gable = [
             np.array([side * wide / 2, -side * deep / 2, high]),
             np.array([side * wide / 2, side * deep / 2, high]),
             np.array([side * wide / 2, 0.0, top - 0.1]),
             np.array([side * wide / 2, 0.0, top - 0.1]),
         ]
-        parts.append(_face(gable, [(0.0, 0.0)] * 4, wall, PLAIN))
+        parts.append(face(gable, [(0.0, 0.0)] * 4, wall, PLAIN))
     return np.concatenate(parts)
 
 
@@ -103,7 +70,7 @@ def stand(rng: np.random.Generator) -> FloatArray:
     low, back = np.array([0.0, -4.5, 1.6]), np.array([0.0, 5.0, 7.0])
     right = np.array([wide / 2, 0.0, 0.0])
     tiers = [low - right, low + right, back + right, back - right]
-    parts.append(_face(tiers, [(0, 0), (wide, 0), (wide, 11.0), (0, 11.0)], (0.3, 0.3, 0.3), CROWD))
+    parts.append(face(tiers, [(0, 0), (wide, 0), (wide, 11.0), (0, 11.0)], (0.3, 0.3, 0.3), CROWD))
     parts.append(box((wide, 0.4, 10.0), (0.0, 5.2, -1.0), (0.4, 0.4, 0.41)))
     parts.append(box((wide, 9.0, 0.35), (0.0, 1.0, 10.0), colour))
     return np.concatenate(parts)
@@ -129,6 +96,27 @@ def marker_post() -> FloatArray:
     return box((0.09, 0.12, 1.3), (0.0, 0.0, -0.3), (0.72, 0.72, 0.70), STRIPED)
 
 
+def block(rng: np.random.Generator) -> FloatArray:
+    """A building of four to nine floors under a flat roof."""
+    wide, deep = float(rng.uniform(12.0, 26.0)), float(rng.uniform(9.0, 13.0))
+    high = float(2.9 * rng.integers(4, 10) + 0.4)
+    wall = _WALLS[rng.integers(len(_WALLS))]
+    return np.concatenate(
+        [
+            box((wide, deep, high + 1.0), (0.0, 0.0, -1.0), wall, FACADE),
+            box((wide + 0.3, deep + 0.3, 0.5), (0.0, 0.0, high), (0.30, 0.30, 0.30)),
+            box((3.0, 3.0, 2.2), (wide * 0.2, 0.0, high + 0.5), (0.35, 0.35, 0.34)),
+        ]
+    )
+
+
+def pole() -> FloatArray:
+    """A telegraph pole of wood with two cross-arms."""
+    wood, mast = (0.13, 0.09, 0.06), (0.22, 0.22, 9.0)
+    arms = [box((0.12, 2.0, 0.12), (0.0, 0.0, z), wood) for z in (6.9, 7.6)]
+    return np.concatenate([box(mast, (0.0, 0.0, -0.9), wood), *arms])
+
+
 def lamp() -> FloatArray:
     """A lamp on a tall mast, its arm over the road (-y)."""
     grey = (0.24, 0.25, 0.25)
@@ -144,17 +132,36 @@ def lamp() -> FloatArray:
 class _Site:
     """Puts templates down beside the road and gathers their triangles."""
 
-    def __init__(self, road: Road, line: CentreLine, ribbon: Ribbon, terrain: Terrain) -> None:
+    def __init__(
+        self,
+        road: Road,
+        line: CentreLine,
+        ribbon: Ribbon,
+        terrain: Terrain,
+        bridges: Sequence[Bridge],
+    ) -> None:
         self.road, self.line, self.ribbon, self.terrain = road, line, ribbon, terrain
+        self.bridges = bridges
+        self.taken: list[tuple[float, float, float]] = []
         self.s: list[float] = []
         self.parts: list[FloatArray] = []
 
     def put(self, template: FloatArray, s: float, offset: float, clear_m: float) -> None:
-        """Stand `template` at (s, offset), unless it comes within `clear_m` of a wall line."""
+        """Stand `template` at (s, offset), unless it comes within `clear_m` of a wall line, under a
+        bridge or into another building."""
         free, x, y = place_beside(self.road, self.line, np.array([s]), np.array([offset]), clear_m)
-        if not free[0]:
+        if not (free & free_of(self.bridges, x, y, clear_m + KEEP_FREE_M))[0]:
+            return
+        reach = float(np.abs(template[:, :2]).max())
+        if reach > BUILDING_M and any(
+            np.hypot(x[0] - u, y[0] - v) < 0.9 * (reach + other) for u, v, other in self.taken
+        ):
             return
         z = ground_height(self.ribbon, self.terrain, np.array([s]), np.array([offset]), x, y)[0]
+        if z < self.terrain.sea + DRY_M:
+            return
+        if reach > BUILDING_M:
+            self.taken.append((float(x[0]), float(y[0]), reach))
         heading = float(self.road.track.at(s).heading)
         # On the right side the template is turned round, so that its -y still faces the road; its
         # x axis then points against the traffic.
@@ -165,8 +172,12 @@ class _Site:
         placed[:, :2] = template[:, :2] @ rotate + np.array([x[0], y[0]])
         placed[:, 2] += z
         placed[:, 3:5] = template[:, 3:5] @ rotate
+        self.add(s, placed)
+
+    def add(self, s: float, triangles: FloatArray) -> None:
+        """Triangles (n, 12) that are in place already, near `s`."""
         self.s.append(s)
-        self.parts.append(placed)
+        self.parts.append(triangles)
 
 
 def build(
@@ -175,13 +186,17 @@ def build(
     ribbon: Ribbon,
     terrain: Terrain,
     look: Look,
+    bridges: Sequence[Bridge],
     rng: np.random.Generator,
 ) -> Surface:
-    """All props of a scene; a vertex is place, normal, colour, (u, v), material."""
-    site = _Site(road, line, ribbon, terrain)
+    """All props of a scene, its bridges among them; a vertex is as `solids` has it."""
+    site = _Site(road, line, ribbon, terrain, bridges)
+    for bridge in bridges:
+        site.add(bridge.s, bridge.triangles)
     length, wall = road.track.length_m, road.wall_offset
     for make, density, near, far, clear in (
         (house, look.houses, 9.0, 24.0, 7.5),
+        (block, look.blocks, 13.0, 34.0, 11.0),
         (stand, look.stands, 9.0, 14.0, 6.5),
         (sign, look.signs, 0.9, 2.2, 0.4),
     ):
@@ -193,6 +208,10 @@ def build(
         for s in np.arange(0.0, length, POST_STEP_M):
             for side in (-1.0, 1.0):
                 site.put(marker_post(), float(s), side * (wall + 0.35), 0.1)
+    if look.poles:
+        side = rng.choice([-1.0, 1.0])
+        for s in np.arange(0.0, length, POLE_STEP_M):
+            site.put(pole(), float(s), side * (wall + 3.0), 1.0)
     if look.lamps:
         side = rng.choice([-1.0, 1.0])
         for s in np.arange(0.0, length, LAMP_STEP_M):
@@ -201,24 +220,34 @@ def build(
 
 
 def _gathered(site: _Site) -> Surface:
-    """The triangles of all props, in order of s, with a chunk every CHUNK_M."""
+    """The triangles of all props, in order of s, with a chunk every CHUNK_M; in each chunk the
+    small ones last, which the second level of detail leaves out."""
     if not site.parts:
         site.parts, site.s = [np.zeros((3, 12))], [0.0]
-    order = np.argsort(site.s, kind="stable")
-    parts = [site.parts[k] for k in order]
-    vertices = np.concatenate(parts)
-    sizes = np.array([len(part) for part in parts])
-    cell = (np.asarray(site.s)[order] / CHUNK_M).astype(np.int64)
-    starts = np.flatnonzero(np.diff(cell, prepend=-1))
+    cell = (np.asarray(site.s) / CHUNK_M).astype(np.int64)
+    small = np.array([_area(part) < SMALL_M2 for part in site.parts])
+    order = np.lexsort((np.asarray(site.s), small, cell))
+    sizes = np.array([len(part) for part in site.parts])[order]
+    vertices = np.concatenate([site.parts[k] for k in order])
+    starts = np.flatnonzero(np.diff(cell[order], prepend=-1))
     first = (np.cumsum(sizes) - sizes)[starts]
-    count = np.diff(np.append(first, len(vertices)))
+    count = np.stack(
+        [np.add.reduceat(sizes, starts), np.add.reduceat(np.where(small[order], 0, sizes), starts)]
+    )
     low = np.minimum.reduceat(vertices[:, :3], first, axis=0)
     high = np.maximum.reduceat(vertices[:, :3], first, axis=0)
     chunks = Chunks(
         (low + high) / 2.0,
         np.linalg.norm(high - low, axis=1) / 2.0,
-        first[None].astype(np.int64),
-        count[None].astype(np.int64),
+        np.stack([first, first]).astype(np.int64),
+        count.astype(np.int64),
+        (SMALL_REACH_M, REACH_M),
     )
     indices = np.arange(len(vertices), dtype=np.uint32)
     return Surface(vertices.astype(np.float32), indices, chunks)
+
+
+def _area(triangles: FloatArray) -> float:
+    """Area (m2) of triangles (3 T, ...) that begin with places."""
+    a, b, c = (triangles[k::3, :3] for k in range(3))
+    return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2.0)

@@ -10,7 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from simulator.camera.mesh import Chunks, Surface
+from simulator.camera.mesh import Surface
+from simulator.camera.strips import LEVELS, Level, strip
 from simulator.camera.terrain import CentreLine, Terrain
 from simulator.track.road import Road
 
@@ -23,7 +24,16 @@ TWIST_M = 0.004
 SKIRT_M = 10.0
 """How far the ribbon reaches into the land beyond the wall."""
 KERB_CURVATURE = 1.0 / 220.0
-CHUNK_ROWS, COARSE_ROWS = 16, 4
+SKIRT_WEIGHT, KERB_WEIGHT = 0.05, 0.3
+"""What an error there counts beside one of the road."""
+_ASPHALT = ((3, 4),)
+_LEFT, _RIGHT = ((0, 1), (1, 2), (2, 3)), ((4, 5), (5, 6), (6, 7))
+_FAR = ((0, 2), (2, 3), (4, 5), (5, 7))
+VERGE = (Level(30.0, 0.04, 12.0), Level(90.0, 0.1, 24.0), Level(300.0, 0.3, 48.0))
+"""Beside the asphalt nobody looks so closely."""
+LAP_M, LAP_DOWN_M, RISE_WEIGHT = 0.3, 0.06, 4.0
+"""How far the verge reaches in under the asphalt, how far below it, and what an error in height
+counts beside it, so that it never comes out on top."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +63,8 @@ def rows_of(road: Road) -> FloatArray:
     radius = 1.0 / np.maximum(np.abs(track.curvature0), 1e-9)
     step = np.sqrt(8.0 * radius * SAGITTA_M)
     twist = np.abs(track.z_left1 - track.z_right1 - track.z_left0 + track.z_right0)
-    twist *= road.wall_offset / track.width / track.length
+    widest = max(2.0 * road.half_asphalt, road.wall_offset - road.half_asphalt)
+    twist *= widest / track.width / track.length
     step = np.minimum(step, 4.0 * TWIST_M / np.maximum(twist, 1e-9))
     step = np.clip(step, 0.3, LONGEST_ROW_M)
     parts = np.maximum(1, np.ceil(track.length / step)).astype(np.intp)
@@ -70,7 +81,7 @@ def build(road: Road, line: CentreLine, terrain: Terrain) -> Ribbon:
     wall = road.wall_offset
     left = _skirt(road, line, s, pose.curvature, 1.0)
     right = _skirt(road, line, s, pose.curvature, -1.0)
-    middle = np.array([wall, 0.0, -wall])
+    middle = np.array([wall, road.half_asphalt, -road.half_asphalt, -wall])
     y = np.empty((len(s), len(middle) + 4))
     y[:, 2:-2] = middle
     y[:, 0], y[:, 1] = wall + left, wall + 0.35 * left
@@ -103,8 +114,18 @@ def _skirt(
     return width
 
 
-def surface(ribbon: Ribbon, road: Road) -> Surface:
-    """The ribbon's triangles; a vertex is x, y, z, s, y, normal (3), kerb."""
+def covers(
+    ribbon: Ribbon, line: CentreLine, x: FloatArray, y: FloatArray, margin_m: float
+) -> NDArray[np.bool_]:
+    """Which places lie under the ribbon, `margin_m` within its edges."""
+    near, sample = line.tree.query(np.stack([x, y], axis=-1))
+    row = np.clip(np.searchsorted(ribbon.s, line.s[sample]), 1, len(ribbon.s) - 1)
+    reach = np.minimum(ribbon.y[:, 0], -ribbon.y[:, -1])
+    return np.asarray(near < np.minimum(reach[row - 1], reach[row]) - margin_m)
+
+
+def surfaces(ribbon: Ribbon, road: Road) -> tuple[Surface, Surface]:
+    """The asphalt's triangles and those beside it; a vertex is x, y, z, s, y, normal (3), kerb."""
     rows, columns = ribbon.y.shape
     vertices = np.empty((rows, columns, 9), dtype=np.float32)
     vertices[..., 0:3] = ribbon.points
@@ -112,7 +133,28 @@ def surface(ribbon: Ribbon, road: Road) -> Surface:
     vertices[..., 4] = ribbon.y
     vertices[..., 5:8] = _normals(ribbon)
     vertices[..., 8] = _kerb(ribbon, road)[:, None]
-    return strip(vertices, ribbon.points)
+    kerb = vertices[:, 0, 8]
+    profile = np.column_stack([ribbon.points[:, 2:-2].reshape(rows, -1), KERB_WEIGHT * kerb])
+    asphalt = strip(vertices, ribbon.points, ribbon.s, profile, [_ASPHALT] * len(LEVELS))
+    weight = np.tile([1.0, 1.0, RISE_WEIGHT], (columns, 1))
+    weight[[0, 1, -2, -1]] = SKIRT_WEIGHT
+    places = (ribbon.points * weight).reshape(rows, -1)
+    profile = np.column_stack([places, KERB_WEIGHT * kerb])
+    cells = [(*_LEFT, *_RIGHT), _FAR, _FAR]
+    beside = strip(_lapped(vertices), ribbon.points, ribbon.s, profile, cells, VERGE)
+    return asphalt, beside
+
+
+def _lapped(vertices: NDArray[np.float32]) -> NDArray[np.float32]:
+    """The same, the verge's inner edges moved in under the asphalt: no gap opens between rows of
+    unlike detail."""
+    vertices = vertices.copy()
+    for inner, outer in ((3, 2), (4, 5)):
+        step = np.sign(vertices[:, inner, 4] - vertices[:, outer, 4])[:, None] * LAP_M
+        across = vertices[:, inner, :5] - vertices[:, outer, :5]
+        vertices[:, inner, :5] += across / across[:, 4:] * step
+        vertices[:, inner, 2] -= LAP_DOWN_M
+    return vertices
 
 
 def _normals(ribbon: Ribbon) -> FloatArray:
@@ -132,46 +174,3 @@ def _kerb(ribbon: Ribbon, road: Road) -> FloatArray:
     for _ in range(2):
         kerb = np.maximum(kerb, 0.5 * (np.roll(kerb, 1) + np.roll(kerb, -1)))
     return kerb
-
-
-def strip(vertices: NDArray[np.float32], points: FloatArray) -> Surface:
-    """Triangles between the rows of a vertex grid (R, C, F), in two levels of detail: all rows,
-    and one row in COARSE_ROWS; cut into chunks for culling."""
-    rows, columns = vertices.shape[:2]
-    starts = np.arange(0, rows - 1, CHUNK_ROWS)
-    ends = np.minimum(starts + CHUNK_ROWS, rows - 1)
-    every = np.arange(rows)
-    some = np.unique(np.concatenate([every[::COARSE_ROWS], [rows - 1]]))
-    indices = [_between(every, columns), _between(some, columns)]
-    a_quad = (columns - 1) * 6
-    first = [starts * a_quad, len(indices[0]) + np.searchsorted(some, starts) * a_quad]
-    count = [(ends - starts), np.searchsorted(some, ends) - np.searchsorted(some, starts)]
-    low = np.minimum.reduceat(points.min(axis=1), starts, axis=0)
-    high = np.maximum.reduceat(points.max(axis=1), starts, axis=0)
-    low = np.minimum(low, points[ends].min(axis=1))
-    high = np.maximum(high, points[ends].max(axis=1))
-    return Surface(
-        np.ascontiguousarray(vertices.reshape(rows * columns, -1)),
-        np.concatenate(indices),
-        Chunks(
-            (low + high) / 2.0,
-            np.linalg.norm(high - low, axis=1) / 2.0,
-            np.stack(first).astype(np.int64),
-            np.stack(count).astype(np.int64) * a_quad,
-        ),
-    )
-
-
-def _between(rows: NDArray[np.intp], columns: int) -> NDArray[np.uint32]:
-    """Indices of two triangles for each cell between consecutive `rows` of a grid."""
-    near, far = columns * rows[:-1, None], columns * rows[1:, None]
-    cell = np.arange(columns - 1)
-    corners = [
-        near + cell,
-        far + cell,
-        near + cell + 1,
-        near + cell + 1,
-        far + cell,
-        far + cell + 1,
-    ]
-    return np.stack(corners, axis=-1).reshape(-1).astype(np.uint32)

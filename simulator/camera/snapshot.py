@@ -1,9 +1,9 @@
 """A contact sheet of a road: driver views all round it, the true markings drawn over them.
 
-simulator snapshot TRACK --out sheet.png
+simulator snapshot TRACK --out sheet.png --view chase --kind class --light rain
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -12,7 +12,14 @@ from numpy.typing import NDArray
 
 from simulator.camera import overlay
 from simulator.camera.camera import Camera
-from simulator.camera.light import KINDS, Light
+from simulator.camera.false_colours import (
+    CLASS_COLOURS,
+    FARTHEST_M,
+    NEAREST_M,
+    in_false_colours,
+)
+from simulator.camera.kinds import CLASS, CLASSES, COLOUR, DEPTH, Wanted
+from simulator.camera.light import KINDS, Light, check_light
 from simulator.car import CarParameters
 from simulator.files import check_folder, write_whole
 from simulator.track.road import Road
@@ -23,6 +30,8 @@ Picture = NDArray[np.uint8]
 
 WIDTH, HEIGHT, COLUMNS = 480, 360, 4
 DRIVER_VIEWS = 14
+_FONT, _FONT_SIZE, _WHITE = cv2.FONT_HERSHEY_SIMPLEX, 0.42, (255, 255, 255)
+Colour = tuple[int, int, int]
 CAR_GAP_M = (12.0, 60.0)
 
 
@@ -35,23 +44,42 @@ class Shot:
     angle: float
     view: str
     light: str
+    kind: str = COLOUR
 
 
-def write_contact_sheet(road: Road, out: Path, *, seed: int, traffic: int) -> None:
-    """Write a PNG of driver views at places all round `road`, one chase and one top view.
+def write_contact_sheet(
+    road: Road,
+    out: Path,
+    *,
+    seed: int,
+    traffic: int,
+    light: str | None = None,
+    view: str | None = None,
+    kind: str = COLOUR,
+) -> None:
+    """Write a PNG of views at places all round `road`.
 
-    The right half of each picture has the true markings drawn thinly over the painted ones.
-    An older file stays as it is until the new one is complete. Raises UserError if the file cannot
-    be written as PNG or has no folder, OSError if it cannot be written.
+    All pictures are of `view`, or without it driver views, one chase and one top view; in the light
+    of kind `light`, or without it in each kind by turns, every other one clear. Of `kind` "colour"
+    the right half has the true markings drawn thinly over the painted ones; "depth" and "class" are
+    in false colours. An older file stays as it is until the new one is complete. Raises UserError
+    if the file cannot be written as PNG or has no folder, or light, view or kind is unknown;
+    OSError if it cannot be written.
     """
     if out.suffix.lower() != ".png":
         raise UserError(f"{out}: the contact sheet is a PNG file; give a name that ends in .png")
     check_folder(out)  # before the pictures, which take a while
-    shots = _shots(road, np.random.default_rng([seed, 10]))
+    if light is not None:
+        check_light(light)
+    Wanted.of(f"{view or 'front'}:{kind}")
+    shots = [
+        replace(shot, kind=kind, view=view or shot.view)
+        for shot in _shots(road, light, np.random.default_rng([seed, 10]))
+    ]
     pictures: list[Picture | None] = [None] * len(shots)
     for kind in dict.fromkeys(shot.light for shot in shots):
-        light = Light.named(kind, np.random.default_rng([seed, 11]))
-        with Camera(road, seed=seed, light=light, width=WIDTH, height=HEIGHT) as camera:
+        drawn = Light.named(kind, np.random.default_rng([seed, 11]))
+        with Camera(road, seed=seed, light=drawn, width=WIDTH, height=HEIGHT) as camera:
             for k, shot in enumerate(shots):
                 if shot.light == kind:
                     rng = np.random.default_rng([seed, 12, k])
@@ -65,22 +93,38 @@ def write_contact_sheet(road: Road, out: Path, *, seed: int, traffic: int) -> No
 
 
 def take(camera: Camera, road: Road, shot: Shot, traffic: int, rng: np.random.Generator) -> Picture:
-    """The picture of `shot` with the true markings over its right half and a caption."""
+    """The picture of `shot` with a caption; in colour with the true markings on its right half."""
     pose = standing_pose(road, shot.s, shot.to_middle, shot.angle)
     cars = _cars_ahead(road, shot, traffic, rng)
-    plain = camera.render(pose, cars, shot.view)
-    lines = overlay.marking_polylines(camera, road, (shot.s, pose), view=shot.view)
-    picture = overlay.draw(plain, lines)
-    half = camera.width // 2
-    picture[:, :half] = plain[:, :half]
+    name = f"{shot.view}:{shot.kind}"
+    picture = in_false_colours(camera.render_views(pose, cars, [name])[name], shot.kind)
+    if shot.kind == COLOUR:
+        lines = overlay.marking_polylines(camera, road, (shot.s, pose), view=shot.view)
+        half = camera.width // 2
+        picture[:, half:] = overlay.draw(picture, lines)[:, half:]
     caption = (
         f"{road.track.name}  s {shot.s:.0f} m  {shot.view}  {shot.light}  "
         f"d {shot.to_middle:+.1f} m  {np.degrees(shot.angle):+.0f} deg"
     )
-    for colour, shift in (((0, 0, 0), 1), ((255, 255, 255), 0)):
-        place = (8 + shift, camera.height - 10 + shift)
-        cv2.putText(picture, caption, place, cv2.FONT_HERSHEY_SIMPLEX, 0.42, colour, 1, cv2.LINE_AA)
+    _write(picture, caption, (8, camera.height - 10), _WHITE)
+    _write_legend(picture, shot.kind)
     return picture
+
+
+def _write_legend(picture: Picture, kind: str) -> None:
+    if kind == DEPTH:
+        _write(picture, f"red {NEAREST_M:.0f} m ... blue {FARTHEST_M:.0f} m", (8, 18), _WHITE)
+    x = 8
+    for name in CLASSES if kind == CLASS else ():
+        x += _write(picture, name, (x, 18), CLASS_COLOURS[name]) + 10
+
+
+def _write(picture: Picture, text: str, place: tuple[int, int], colour: Colour) -> int:
+    """Write `text` with a shadow; how many pixels wide it is."""
+    for shade, shift in (((0, 0, 0), 1), (colour, 0)):
+        at = (place[0] + shift, place[1] + shift)
+        cv2.putText(picture, text, at, _FONT, _FONT_SIZE, shade, 1, cv2.LINE_AA)
+    return int(cv2.getTextSize(text, _FONT, _FONT_SIZE, 1)[0][0])
 
 
 def standing_pose(
@@ -111,7 +155,7 @@ def standing_pose(
     return np.array([*(here + normal * height), roll, pitch, yaw])
 
 
-def _shots(road: Road, rng: np.random.Generator) -> list[Shot]:
+def _shots(road: Road, light: str | None, rng: np.random.Generator) -> list[Shot]:
     length = road.track.length_m
     places = (np.arange(DRIVER_VIEWS + 2) + rng.uniform(0.0, 1.0)) * length / (DRIVER_VIEWS + 2)
     reach = road.lanes * road.lane_width / 2 - 1.0
@@ -121,8 +165,8 @@ def _shots(road: Road, rng: np.random.Generator) -> list[Shot]:
         offset = float(rng.uniform(-reach, reach))
         angle = float(rng.normal(0.0, 0.06)) if view == "front" else 0.0
         # Every other picture in clear light, the others in each of the rest in turn.
-        light = "clear" if k % 2 == 0 else KINDS[1 + (k // 2) % (len(KINDS) - 1)]
-        shots.append(Shot(float(s), offset, angle, view, light))
+        turn = "clear" if k % 2 == 0 else KINDS[1 + (k // 2) % (len(KINDS) - 1)]
+        shots.append(Shot(float(s), offset, angle, view, light or turn))
     return shots
 
 

@@ -20,12 +20,16 @@ if TYPE_CHECKING:
 FloatArray = NDArray[np.float64]
 
 CELL_M = 8.0
-COARSE = 5
-"""Cells of the far grid are this many times as wide."""
+COARSEST = 8
+"""The grid is whole in cells so many times as wide."""
 MARGIN_M = 400.0
 MAX_CELLS = 1200
 SAMPLE_M = 2.0
 SINK_M = 0.9
+SEA_BELOW_M = 3.0
+"""The sea lies so far below the lowest place of the road."""
+SHORE_M = (14.0, 75.0)
+"""From the wall line outwards the land falls to the sea between these."""
 BANK_SLOPE = 0.55
 """No land rises from the roadside more steeply than this."""
 
@@ -65,20 +69,20 @@ class Terrain:
     y0: float
     cell: float
     z: FloatArray
+    sea: float = -np.inf
+    """Level of the sea, where there is one."""
 
     def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """Height at points, on the triangles that are drawn."""
+        return between(self.z, (x - self.x0) / self.cell, (y - self.y0) / self.cell)
+
+    def grid(self) -> tuple[FloatArray, FloatArray]:
+        """x and y of all points, each (rows, columns)."""
         rows, columns = self.z.shape
-        u = np.clip((x - self.x0) / self.cell, 0.0, columns - 1.001)
-        v = np.clip((y - self.y0) / self.cell, 0.0, rows - 1.001)
-        i, j = u.astype(np.intp), v.astype(np.intp)
-        fu, fv = u - i, v - j
-        z00, z10 = self.z[j, i], self.z[j, i + 1]
-        z01, z11 = self.z[j + 1, i], self.z[j + 1, i + 1]
-        # The cell's diagonal runs from (1, 0) to (0, 1).
-        low = z00 + (z10 - z00) * fu + (z01 - z00) * fv
-        high = z11 + (z01 - z11) * (1.0 - fu) + (z10 - z11) * (1.0 - fv)
-        return np.where(fu + fv <= 1.0, low, high)
+        x, y = np.meshgrid(
+            self.x0 + self.cell * np.arange(columns), self.y0 + self.cell * np.arange(rows)
+        )
+        return x, y
 
     def normals(self) -> FloatArray:
         """Unit normals (rows, columns, 3)."""
@@ -87,20 +91,42 @@ class Terrain:
         return np.asarray(normal / np.linalg.norm(normal, axis=-1, keepdims=True))
 
 
+def between(z: FloatArray, u: FloatArray, v: FloatArray) -> FloatArray:
+    """Height at column `u` and row `v` of the grid `z`, on the triangles that are drawn."""
+    rows, columns = z.shape
+    u, v = np.clip(u, 0.0, columns - 1.001), np.clip(v, 0.0, rows - 1.001)
+    i, j = u.astype(np.intp), v.astype(np.intp)
+    fu, fv = u - i, v - j
+    z00, z10 = z[j, i], z[j, i + 1]
+    z01, z11 = z[j + 1, i], z[j + 1, i + 1]
+    # The cell's diagonal runs from (1, 0) to (0, 1).
+    low = z00 + (z10 - z00) * fu + (z01 - z00) * fv
+    high = z11 + (z01 - z11) * (1.0 - fu) + (z10 - z11) * (1.0 - fv)
+    return np.where(fu + fv <= 1.0, low, high)
+
+
 def build(road: Road, line: CentreLine, look: Look, rng: np.random.Generator) -> Terrain:
     """The land round `road` in the style of `look`."""
     span = max(np.ptp(line.x), np.ptp(line.y)) + 2 * MARGIN_M
     cell = max(CELL_M, span / MAX_CELLS)
     x0, y0 = line.x.min() - MARGIN_M, line.y.min() - MARGIN_M
-    columns = COARSE * int(np.ceil((np.ptp(line.x) + 2 * MARGIN_M) / cell / COARSE)) + 1
-    rows = COARSE * int(np.ceil((np.ptp(line.y) + 2 * MARGIN_M) / cell / COARSE)) + 1
+    columns = COARSEST * int(np.ceil((np.ptp(line.x) + 2 * MARGIN_M) / cell / COARSEST)) + 1
+    rows = COARSEST * int(np.ceil((np.ptp(line.y) + 2 * MARGIN_M) / cell / COARSEST)) + 1
     shape = (rows, columns)
     cap = _road_cap(road, line, x0, y0, cell, shape)
     base, near = _spread(road, line, x0, y0, cell, shape)
     rolling = _rolling(shape, cell, rng) * look.hills_m
     away = np.clip((near - road.wall_offset - 5.0) / 110.0, 0.0, 1.0)
     natural = base + rolling * away * away * (3.0 - 2.0 * away)
-    return Terrain(float(x0), float(y0), float(cell), np.minimum(natural, cap))
+    if not look.sea:
+        return Terrain(float(x0), float(y0), float(cell), np.minimum(natural, cap))
+    sea = float(road.track.at(line.s).z.min()) - SEA_BELOW_M
+    fall = np.clip((near - road.wall_offset - SHORE_M[0]) / (SHORE_M[1] - SHORE_M[0]), 0.0, 1.0)
+    fall *= fall * (3.0 - 2.0 * fall) * _outside(line, x0, y0, cell, shape)
+    natural += (sea - 4.0 - natural) * fall
+    return Terrain(
+        float(x0), float(y0), float(cell), np.maximum(np.minimum(natural, cap), sea), sea
+    )
 
 
 def _road_cap(
@@ -141,6 +167,16 @@ def _spread(
     narrow = cv2.GaussianBlur(nearest, (0, 0), 10.0 / cell)
     far = np.clip((near - 25.0) / 60.0, 0.0, 1.0)
     return narrow + (wide - narrow) * far, near
+
+
+def _outside(
+    line: CentreLine, x0: float, y0: float, cell: float, shape: tuple[int, int]
+) -> FloatArray:
+    """1 outside the loop that the road makes, 0 inside, with a soft step."""
+    loop = np.stack([(line.x - x0) / cell, (line.y - y0) / cell], axis=1)
+    inside = np.zeros(shape, dtype=np.float32)
+    cv2.fillPoly(inside, [np.rint(loop).astype(np.int32)], 1.0)
+    return np.asarray(1.0 - cv2.GaussianBlur(inside, (0, 0), 12.0 / cell), dtype=np.float64)
 
 
 def _rolling(shape: tuple[int, int], cell: float, rng: np.random.Generator) -> FloatArray:

@@ -1,6 +1,6 @@
 """The sensors of the paper's table, and how to declare more."""
 
 from simulator.sensors.sensor import Reading, Sensor, SensorSuite
-from simulator.sensors.standard import STANDARD, camera_sensor
+from simulator.sensors.standard import STANDARD, camera_sensor, sensors_of
 
-__all__ = ["STANDARD", "Reading", "Sensor", "SensorSuite", "camera_sensor"]
+__all__ = ["STANDARD", "Reading", "Sensor", "SensorSuite", "camera_sensor", "sensors_of"]

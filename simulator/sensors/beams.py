@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from simulator.compiled import compiled
-from simulator.track.kernel import Table, locate
+from simulator.track.kernel import CURVATURE, HEADING0, LENGTH, X0, Y0, Table, locate
 
 FloatArray = NDArray[np.float64]
 
@@ -15,17 +15,31 @@ OFF_TRACK = -1.0
 BEAM_ANGLES: FloatArray = np.radians(np.arange(90.0, -91.0, -10.0))
 """(19,) from the left (+90 deg) to the right of the car's heading."""
 
-LEAST_STEP_M = 0.5
-"""Marching never goes slower: a bulge of the road crossed in less than this is not seen."""
-ROOT_STEPS = 60
-ROOT_TOLERANCE_M = 1e-9
+MOST_PIECES = 4096
+"""Pieces a beam may cross; 200 m of the finest spiral are some hundred."""
 
 
 @compiled
-def beyond_edge(table: Table, piece: int, x: float, y: float, edge: float) -> tuple[float, int]:
-    """(metres outside the edge, negative on the road; piece index there)."""
+def track_beams(
+    table: Table,
+    piece: int,
+    x: float,
+    y: float,
+    yaw: float,
+    angles: FloatArray,
+    edge: float,
+    distances: FloatArray,
+) -> None:
+    """Fill `distances` (n,) m to the track's edge along `angles` from the heading; -1 off it.
+
+    `piece` is where to look for (x, y) first, -1 anywhere.
+    """
     at, _, d = locate(table, x, y, piece)
-    return abs(d) - edge, at
+    for i in range(angles.shape[0]):
+        if abs(d) > edge:
+            distances[i] = OFF_TRACK
+        else:
+            distances[i] = edge_distance(table, at, x, y, yaw + angles[i], edge)
 
 
 @compiled
@@ -34,62 +48,85 @@ def edge_distance(
 ) -> float:
     """Distance (m) from a point on the road to where the ray leaves it; at most RANGE_M.
 
-    The road's edge is nowhere nearer than `edge - |to_middle|`, so the ray marches by that much;
-    the crossing itself is found with the Illinois method.
+    The ray is followed from piece to piece; in each, both edges are lines or circles, which it
+    meets at the root of a quadratic equation.
     """
     cos_d, sin_d = math.cos(direction), math.sin(direction)
-    inside, at = beyond_edge(table, piece, x, y, edge)
-    near = 0.0
-    while near < RANGE_M:
-        far = min(near + max(-inside, LEAST_STEP_M), RANGE_M)
-        outside, ahead = beyond_edge(table, at, x + far * cos_d, y + far * sin_d, edge)
-        if outside > 0.0:
-            return crossing(table, at, x, y, direction, edge, near, inside, far, outside)
-        near, inside, at = far, outside, ahead
+    passed, last_move = 0.0, 0
+    for _ in range(MOST_PIECES):
+        cos_h, sin_h = math.cos(table[piece, HEADING0]), math.sin(table[piece, HEADING0])
+        k = table[piece, CURVATURE]
+        # The ray (u, v) + t (cu, cv) in the frame of the piece's start.
+        dx, dy = x - table[piece, X0], y - table[piece, Y0]
+        u, v = dx * cos_h + dy * sin_h, dy * cos_h - dx * sin_h
+        cu, cv = cos_d * cos_h + sin_d * sin_h, sin_d * cos_h - cos_d * sin_h
+        exit_t = leaves_edges(k, u, v, cu, cv, edge, passed)
+        # A straight line turns one way only about the bend's centre: it goes through the piece
+        # forwards or backwards, and can leave at one of its ends.
+        ahead = cu * (1.0 - k * v) + cv * k * u > 0.0
+        move = 1 if ahead else -1
+        # Going back and forth means that the ray lies in a kink between two pieces.
+        if move == -last_move:
+            return min(exit_t, RANGE_M)
+        end_t = crosses_end(table[piece, LENGTH] if ahead else 0.0, k, u, v, cu, cv, move)
+        if exit_t <= end_t or end_t >= RANGE_M:
+            return min(exit_t, RANGE_M)
+        passed, last_move = max(passed, end_t), move
+        piece = (piece + move) % table.shape[0]
     return RANGE_M
 
 
 @compiled
-def crossing(
-    table: Table,
-    piece: int,
-    x: float,
-    y: float,
-    direction: float,
-    edge: float,
-    near: float,
-    inside: float,
-    far: float,
-    outside: float,
+def leaves_edges(
+    k: float, u: float, v: float, cu: float, cv: float, edge: float, passed: float
 ) -> float:
-    """Root of the edge function between `near` (inside <= 0) and `far` (outside > 0)."""
-    cos_d, sin_d = math.cos(direction), math.sin(direction)
-    for _ in range(ROOT_STEPS):
-        guess = (near * outside - far * inside) / (outside - inside)
-        value, _ = beyond_edge(table, piece, x + guess * cos_d, y + guess * sin_d, edge)
-        if abs(value) < ROOT_TOLERANCE_M:
-            return guess
-        if value > 0.0:
-            far, outside = guess, value
-            inside *= 0.5
-        else:
-            near, inside = guess, value
-            outside *= 0.5
-    return 0.5 * (near + far)
+    """Where, from `passed` on, the ray leaves the road of an endless piece of curvature `k`.
+
+    The offset d of (u, v) is the root of k d^2 - 2 d = k (u^2 + v^2) - 2 v, so that the ray's
+    distance from an edge has the sign of a t^2 + 2 b t + c, free of cancellation as k goes to 0.
+    """
+    b = k * (u * cu + v * cv) - cv
+    here = k * (u * u + v * v) - 2.0 * v
+    nearest = math.inf
+    for side in (1.0, -1.0):
+        # Positive on the road, for both edges; beyond the bend's centre there is no edge.
+        if k * side * edge >= 1.0:
+            continue
+        a, half_b, c = side * k, side * b, side * here + 2.0 * edge - side * k * edge * edge
+        if c + passed * (2.0 * half_b + passed * a) <= 0.0:
+            return passed
+        nearest = min(nearest, falling_root(a, half_b, c, passed))
+    return nearest
 
 
 @compiled
-def track_beams(
-    table: Table, piece: int, x: float, y: float, yaw: float, angles: FloatArray, edge: float
-) -> FloatArray:
-    """Distances (n,) to the track's edge along `angles` from the car's heading; -1 off it."""
-    distances = np.full(angles.shape[0], OFF_TRACK)
-    here, at = beyond_edge(table, piece, x, y, edge)
-    if here > 0.0:
-        return distances
-    for i in range(angles.shape[0]):
-        distances[i] = edge_distance(table, at, x, y, yaw + angles[i], edge)
-    return distances
+def falling_root(a: float, half_b: float, c: float, passed: float) -> float:
+    """Where a t^2 + 2 half_b t + c, positive at `passed`, next falls to 0; infinite if nowhere."""
+    square = half_b * half_b - a * c
+    if square < 0.0:
+        return math.inf
+    root = math.sqrt(square)
+    # Of the two forms of the root, the one that adds numbers of one sign.
+    top, bottom = (half_b + root, -a) if half_b > 0.0 else (c, root - half_b)
+    if bottom == 0.0:
+        return math.inf
+    t = top / bottom
+    return t if t >= passed else math.inf
+
+
+@compiled
+def crosses_end(
+    along: float, k: float, u: float, v: float, cu: float, cv: float, move: int
+) -> float:
+    """Where the ray crosses the normal of the centre line `along` m from the piece's start."""
+    half_turn = 0.5 * along * k
+    sin_half, cos_half = math.sin(half_turn), math.cos(half_turn)
+    chord = along if half_turn == 0.0 else along * sin_half / half_turn
+    tangent_u, tangent_v = 1.0 - 2.0 * sin_half * sin_half, 2.0 * sin_half * cos_half
+    rate = cu * tangent_u + cv * tangent_v
+    if rate * move <= 0.0:
+        return math.inf
+    return ((chord * cos_half - u) * tangent_u + (chord * sin_half - v) * tangent_v) / rate
 
 
 @compiled

@@ -1,12 +1,15 @@
-"""What a sensor is: a name, a unit, how to read it off the world, and its noise.
+"""What a sensor is: a name, a unit, a scale, how to read it off the world, and its noise.
 
 A sensor of your own is one line, and reads along with the others:
 
     slip = Sensor("side_slip", "rad", lambda world: atan2(world.state.vy, world.state.vx))
     suite = SensorSuite([*STANDARD, slip], seed=1)
-    readings = suite.read(world)        # {"angle": 0.01, ..., "side_slip": 0.002}
+    readings = suite.read(world)        # {"range": array([...]), ..., "side_slip": 0.002}
+
+or, in an environment, `gymnasium.make(..., sensors=("range", "v_x", slip))`.
 """
 
+import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
@@ -22,7 +25,10 @@ Reading = float | NDArray[Any]
 
 @dataclass(frozen=True)
 class Sensor:
-    """One declared sensor; `read` returns a number or an array in `unit`."""
+    """One declared sensor; `read` returns a number or an array of `shape` in `unit`.
+
+    Like an instrument it stops at the end of its scale: a reading beyond `limits` is the limit.
+    """
 
     name: str
     unit: str
@@ -30,20 +36,62 @@ class Sensor:
     noise: float = 0.0
     """Standard deviation of the added normal noise, in `unit`; 0 is a perfect sensor."""
 
-    limits: tuple[float, float] | None = None
-    """Least and largest valid reading. Noise stays within them, and leaves a reading outside them,
-    such as the range meter's -1 off the track, as it is."""
+    limits: tuple[float, float] = (-math.inf, math.inf)
+    """Least and largest reading; noise stays within them."""
+
+    invalid: float | None = None
+    """A reading outside `limits` that says there is none, such as the range meter's -1 off the
+    track; neither limits nor noise touch it."""
+
+    shape: tuple[int, ...] = ()
+    """Of a reading; () is a number."""
+
+    dtype: str = "float32"
+    """Of the reading in an environment's observation."""
 
     def __post_init__(self) -> None:
-        if self.limits is not None and not self.limits[0] < self.limits[1]:
+        if not self.limits[0] < self.limits[1]:
             raise UserError(
                 f"sensor {self.name!r} has the limits {self.limits}; give the least reading first"
             )
-        if not (np.isfinite(self.noise) and self.noise >= 0.0):
+        if self.invalid is not None and self.limits[0] <= self.invalid <= self.limits[1]:
+            raise UserError(
+                f"sensor {self.name!r} has the invalid reading {self.invalid}, which lies within "
+                f"its limits {self.limits}; give one outside them"
+            )
+        if not (math.isfinite(self.noise) and self.noise >= 0.0):
             raise UserError(
                 f"sensor {self.name!r} has noise {self.noise}; give a standard deviation of 0 "
                 f"{self.unit} or more"
             )
+
+    def measure(self, world: World, rng: np.random.Generator | None = None) -> Reading:
+        """The reading now, on the sensor's scale; noisy if `rng` is given.
+
+        Raises UserError for a reading that is not of the declared shape.
+        """
+        exact = self.read(world)
+        if np.shape(exact) != self.shape:
+            raise UserError(
+                f"sensor {self.name!r} read something of shape {np.shape(exact)}, but declares "
+                f"shape {self.shape}; set Sensor(..., shape={np.shape(exact)})"
+            )
+        if isinstance(exact, np.ndarray):
+            return self._measured_array(exact, rng)
+        value = float(exact)
+        if value == self.invalid:
+            return value
+        if rng is not None:
+            value += rng.normal(0.0, self.noise)
+        return min(max(value, self.limits[0]), self.limits[1])
+
+    def _measured_array(self, exact: NDArray[Any], rng: np.random.Generator | None) -> NDArray[Any]:
+        noisy = exact if rng is None else exact + rng.normal(0.0, self.noise, size=exact.shape)
+        if exact.dtype.kind in "iu":
+            noisy = np.rint(noisy)
+        low, high = self.limits
+        within = np.minimum(np.maximum(noisy, low), high).astype(exact.dtype, copy=False)
+        return within if self.invalid is None else np.where(exact == self.invalid, exact, within)
 
 
 class SensorSuite:
@@ -72,29 +120,19 @@ class SensorSuite:
         self._seed = seed
         self.restart()
 
-    def restart(self) -> None:
-        """Begin the noise anew, as at construction; call at the start of an episode."""
+    def restart(self, seed: int | None = None) -> None:
+        """Begin the noise anew, as at construction or with another seed; call at the start of an
+        episode."""
+        self._seed = self._seed if seed is None else seed
         # One stream a sensor: adding a sensor leaves the noise of the others as it was.
         self._rngs = [
-            np.random.default_rng([self._seed, *sensor.name.encode()]) for sensor in self.sensors
+            np.random.default_rng([self._seed, *sensor.name.encode()]) if sensor.noise else None
+            for sensor in self.sensors
         ]
 
     def read(self, world: World) -> dict[str, Reading]:
         """All readings of the present moment, by name."""
         return {
-            sensor.name: _noisy(sensor, world, rng)
+            sensor.name: sensor.measure(world, rng)
             for sensor, rng in zip(self.sensors, self._rngs, strict=True)
         }
-
-
-def _noisy(sensor: Sensor, world: World, rng: np.random.Generator) -> Reading:
-    reading = sensor.read(world)
-    if sensor.noise == 0.0:
-        return reading
-    exact = np.asarray(reading)
-    noisy = exact + rng.normal(0.0, sensor.noise, size=exact.shape)
-    if sensor.limits is not None:
-        low, high = sensor.limits
-        valid = (low <= exact) & (exact <= high)
-        noisy = np.where(valid, np.clip(noisy, low, high), exact)
-    return noisy if isinstance(reading, np.ndarray) else float(noisy)

@@ -1,25 +1,41 @@
-"""The physical sensors of the paper's table, in its units; v_x and v_y signed, body frame."""
+"""The sensors of the paper's table, with its ranges and in its units.
 
-from collections.abc import Callable
+v_x and v_y are signed and in the body frame, so their scales are too; speed and wheel spin are
+magnitudes, as the table has them.
+"""
+
+import math
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from simulator.sensors.beams import BEAM_ANGLES, RANGE_M, shorten_at_boxes, track_beams
+from simulator.sensors.beams import (
+    BEAM_ANGLES,
+    OFF_TRACK,
+    RANGE_M,
+    shorten_at_boxes,
+    track_beams,
+)
 from simulator.sensors.sensor import Sensor
 from simulator.track.kernel import index_at
 from simulator.traffic import SIZE
 from simulator.world import World
+from trackfeatures.errors import UserError
 
 KMH = 3.6  # km/h in a m/s
+CAMERA = "camera"
+"""Name of the one sensor of the table that needs a `simulator.camera.Camera`."""
 
 
 def read_track_range(world: World) -> NDArray[np.float64]:
     """Distances (19,) m to the track's edge from +90 to -90 deg, in [0, 200]; -1 off the track."""
     now, table = world.state, world.road.track.arrays()
+    distances = np.empty(len(BEAM_ANGLES))
     piece = index_at(table, now.s)
-    return track_beams(table, piece, now.x, now.y, now.yaw, BEAM_ANGLES, world.road.edge)
+    track_beams(table, piece, now.x, now.y, now.yaw, BEAM_ANGLES, world.road.edge, distances)
+    return distances
 
 
 def read_range(world: World) -> NDArray[np.float64]:
@@ -32,31 +48,66 @@ def read_range(world: World) -> NDArray[np.float64]:
     return distances
 
 
-def wheel(index: int) -> Callable[[World], float]:
-    return lambda world: world.state.wheel_spin[index]
+def range_meter(name: str, read: Callable[[World], NDArray[np.float64]]) -> Sensor:
+    limits, shape = (0.0, RANGE_M), BEAM_ANGLES.shape
+    return Sensor(name, "m", read, limits=limits, invalid=OFF_TRACK, shape=shape)
+
+
+def wheel_meter(name: str, index: int) -> Sensor:
+    def read(world: World) -> float:
+        return abs(world.state.wheel_spin[index])
+
+    return Sensor(name, "rad/s", read, limits=(0.0, math.inf))
 
 
 STANDARD: tuple[Sensor, ...] = (
-    Sensor("range", "m", read_track_range, limits=(0.0, RANGE_M)),
-    Sensor("range_traffic", "m", read_range, limits=(0.0, RANGE_M)),
-    Sensor("angle", "rad", lambda world: world.state.angle),
-    Sensor("speed", "km/h", lambda world: KMH * world.state.speed),
-    Sensor("v_x", "km/h", lambda world: KMH * world.state.vx),
-    Sensor("v_y", "km/h", lambda world: KMH * world.state.vy),
-    Sensor("engine", "rpm", lambda world: world.state.rpm),
-    Sensor("odometer", "m", lambda world: world.state.odometer_m),
-    Sensor("lap_timer", "s", lambda world: world.state.lap_time_s),
-    Sensor("wheel_spin_front_left", "rad/s", wheel(0)),
-    Sensor("wheel_spin_front_right", "rad/s", wheel(1)),
-    Sensor("wheel_spin_rear_left", "rad/s", wheel(2)),
-    Sensor("wheel_spin_rear_right", "rad/s", wheel(3)),
+    range_meter("range", read_track_range),
+    range_meter("range_traffic", read_range),
+    Sensor("angle", "rad", lambda world: world.state.angle, limits=(-math.pi, math.pi)),
+    Sensor("speed", "km/h", lambda world: abs(KMH * world.state.speed), limits=(0.0, 200.0)),
+    Sensor("v_x", "km/h", lambda world: KMH * world.state.vx, limits=(-200.0, 200.0)),
+    Sensor("v_y", "km/h", lambda world: KMH * world.state.vy, limits=(-50.0, 50.0)),
+    Sensor("engine", "rpm", lambda world: world.state.rpm, limits=(0.0, 10_000.0)),
+    Sensor("odometer", "m", lambda world: world.state.odometer_m, limits=(0.0, math.inf)),
+    Sensor("lap_timer", "s", lambda world: world.state.lap_time_s, limits=(0.0, math.inf)),
+    wheel_meter("wheel_spin_front_left", 0),
+    wheel_meter("wheel_spin_front_right", 1),
+    wheel_meter("wheel_spin_rear_left", 2),
+    wheel_meter("wheel_spin_rear_right", 3),
 )
+"""All of the paper's table but the camera, for which see `camera_sensor`."""
 
 
 def camera_sensor(camera: Any, view: str = "front") -> Sensor:
-    """The image (H, W, 3) uint8 of a `simulator.camera.Camera` as a sensor named after its view."""
-    return Sensor(
-        f"camera_{view}",
-        "RGB",
-        lambda world: np.asarray(camera.render(world.body_pose(), world.traffic.poses(), view)),
+    """The image (H, W, 3) uint8 of a `simulator.camera.Camera`, the table's last line.
+
+    Its name is `camera`, for another view than the driver's `camera_VIEW`.
+    """
+
+    def read(world: World) -> NDArray[np.uint8]:
+        return np.asarray(camera.render(world.body_pose(), world.traffic.poses(), view))
+
+    name = CAMERA if view == "front" else f"{CAMERA}_{view}"
+    return picture_sensor(name, read, (camera.height, camera.width, 3))
+
+
+def picture_sensor(
+    name: str, read: Callable[[World], NDArray[np.uint8]], shape: tuple[int, int, int]
+) -> Sensor:
+    """A sensor of pictures of `shape` with grey levels 0 to 255."""
+    return Sensor(name, "-", read, limits=(0.0, 255.0), shape=shape, dtype="uint8")
+
+
+def sensors_of(chosen: Iterable[str | Sensor]) -> tuple[Sensor, ...]:
+    """Sensors given by their name in STANDARD, or as they are. Raises UserError for others."""
+    return tuple(sensor if isinstance(sensor, Sensor) else _named(sensor) for sensor in chosen)
+
+
+def _named(name: object) -> Sensor:
+    for sensor in STANDARD:
+        if sensor.name == name:
+            return sensor
+    raise UserError(
+        f"unknown sensor {name!r}; the sensors are {', '.join(s.name for s in STANDARD)} and "
+        f"{CAMERA}, or give a Sensor of your own"
     )

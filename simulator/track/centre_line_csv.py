@@ -28,8 +28,10 @@ STEP_LIMITS_M: Final = (0.01, 1000.0)
 
 PIECE_M: Final = 4.0
 """About the length of a piece."""
-NOISE_M: Final = 0.05
-"""Root mean square of the survey's noise, which is smoothed away."""
+NOISE_M: Final = (0.05, 1.0)
+"""Least and most noise (m, root mean square) that is smoothed away; a survey's own is estimated."""
+SMOOTHER: Final = 1.2
+"""Of the noise's variance: a little too smooth keeps a road, a little too rough wiggles."""
 MIN_RADIUS_M: Final = 5.0
 """A sharper line is a mistake of the survey, not a road."""
 MAX_GAP_M: Final = 1e-3
@@ -124,7 +126,8 @@ def _read_rows(path: Path) -> FloatArray:
 def _arcs(points: FloatArray, path: Path) -> Placed:
     """Arcs along a periodic smoothing spline through the points, where the points are."""
     closed = np.vstack((points, points[:1]))
-    tck, _ = splprep(closed.T, s=len(points) * NOISE_M**2, per=1)
+    noise = min(max(survey_noise(points), NOISE_M[0]), NOISE_M[1])
+    tck, _ = splprep(closed.T, s=SMOOTHER * len(points) * noise**2, per=1)
     fine = np.linspace(0.0, 1.0, max(20 * len(points), 2000) + 1)
     x, y = splev(fine, tck)
     dx, dy = splev(fine, tck, der=1)
@@ -141,6 +144,34 @@ def _arcs(points: FloatArray, path: Path) -> Placed:
         for ds, dh in zip(length, turn, strict=True)
     ]
     return assemble(pieces, float(x[0]), float(y[0]), float(heading[0]))
+
+
+def survey_noise(points: FloatArray) -> float:
+    """Standard deviation (m) of the noise sideways of points (N, 2) round a smooth closed line.
+
+    Each point is held against the cubic through the two before and the two after it, by the length
+    along the chords. The median is blind to the few joints where a bend begins at once.
+    """
+    before2, before, after, after2 = (np.roll(points, k, axis=0) for k in (2, 1, -1, -2))
+    chord = np.hypot(*(after - points).T)
+    t = np.stack(
+        (
+            -np.roll(chord, 1) - np.roll(chord, 2),
+            -np.roll(chord, 1),
+            chord,
+            chord + np.roll(chord, -1),
+        )
+    )
+    weights = np.stack(
+        [np.prod([t[j] / (t[j] - t[i]) for j in range(4) if j != i], axis=0) for i in range(4)]
+    )
+    neighbours = np.stack((before2, before, after, after2))
+    error = points - np.einsum("in,inj->nj", weights, neighbours)
+    along = after - before
+    sideways = (along[:, 0] * error[:, 1] - along[:, 1] * error[:, 0]) / np.hypot(*along.T)
+    # The error of a point adds to those of the four that it is held against.
+    sideways /= np.sqrt(1.0 + np.sum(weights**2, axis=0))
+    return float(np.median(np.abs(sideways)) / 0.6745)
 
 
 def _closing_lengths(length: FloatArray, turn: FloatArray, heading: float) -> FloatArray:

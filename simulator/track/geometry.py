@@ -35,7 +35,7 @@ class TrackPose:
 @dataclass(frozen=True, eq=False)
 class Track:
     """One track. Arrays are (P,), one entry a piece, in driving order; the last piece ends where
-    the first begins (an imported track may miss it by up to 0.15 m)."""
+    the first begins (an imported track may miss it by up to 0.28 m)."""
 
     name: str
     source: Source

@@ -169,3 +169,26 @@ def pose_at(table: Table, s: float) -> tuple[float, float, float, float, float]:
     z, _, _, _ = surface(table, index, wrapped, 0.0)
     k = table[index, CURVATURE]
     return x, y, z, table[index, HEADING0] + k * along, k
+
+
+@compiled
+def road_points(
+    table: Table, distances: NDArray[np.float64], offsets: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Points (offsets, distances, 3) of the road plane; `distances` along s wrap round the lap."""
+    points = np.empty((offsets.shape[0], distances.shape[0], 3))
+    for i in range(distances.shape[0]):
+        index = index_at(table, distances[i])
+        along = wrap(table, distances[i]) - table[index, S0]
+        x, y = centre_point(table, index, along)
+        heading = table[index, HEADING0] + table[index, CURVATURE] * along
+        sin_h, cos_h = math.sin(heading), math.cos(heading)
+        share = along / table[index, LENGTH]
+        left = table[index, Z_LEFT0] + (table[index, Z_LEFT1] - table[index, Z_LEFT0]) * share
+        right = table[index, Z_RIGHT0] + (table[index, Z_RIGHT1] - table[index, Z_RIGHT0]) * share
+        across = (left - right) / (2.0 * table[index, HALF_WIDTH])
+        for k in range(offsets.shape[0]):
+            points[k, i, 0] = x - offsets[k] * sin_h
+            points[k, i, 1] = y + offsets[k] * cos_h
+            points[k, i, 2] = 0.5 * (left + right) + across * offsets[k]
+    return points

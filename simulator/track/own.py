@@ -30,6 +30,7 @@ MAX_CORRECTION_M: Final = 1.0
 MAX_GAP_M: Final = 1e-3
 LOOKS: Final = (
     "highway",
+    "ring-road",
     "mountain",
     "circuit",
     "oval",

@@ -85,9 +85,8 @@ class Section:
         return None if attribute is None else attribute.get("val", "")
 
     def _attribute(self, kind: str, name: str) -> Element | None:
-        # The last one wins where a name is given twice.
-        found = [child for child in self.element.findall(kind) if child.get("name") == name]
-        return found[-1] if found else None
+        # The first one wins where a name is given twice: so the program has ruudskogen's heights.
+        return next((c for c in self.element.findall(kind) if c.get("name") == name), None)
 
 
 def read_parameter_file(path: Path) -> Section:

@@ -4,25 +4,24 @@ from pathlib import Path
 from typing import Final
 
 from simulator.track.errors import TrackError
-from simulator.track.geometry import Surface, Track
+from simulator.track.geometry import Track
 from simulator.track.markings import imported_style
 from simulator.track.parameter_file import Section, read_parameter_file
-from simulator.track.pieces import Piece, Placed, assemble, check_closes
+from simulator.track.pieces import Piece, assemble, check_closes
+from simulator.track.torcs_look import has_kerbs, surface_and_look
 from simulator.track.torcs_segments import read_pieces
 
 DEFAULT_WIDTH_M: Final = 15.0
 SEGMENT_LISTS: Final = {3: "segments", 4: "Track Segments"}
 """Name of the list of segments in each version of the format that we read."""
 MAX_PIECES: Final = 200_000
-MOUNTAIN_HEIGHT_M: Final = 55.0
-"""A track that climbs more than this gets mountain scenery."""
 
 
 def read_torcs(path: Path) -> Track:
     """The track of one TORCS XML file, named after the file.
 
     Raises TrackError for a file that is unreadable or hostile (see `parameter_file`), for lengths
-    that are not positive, and for segments that do not close within 0.15 m.
+    that are not positive, and for segments that do not close (see `pieces.MAX_GAP_M`).
     """
     root = read_parameter_file(path)
     main = _required(root, "Main Track")
@@ -43,7 +42,7 @@ def read_torcs(path: Path) -> Track:
         raise TrackError(f"{path}: no segments, so the track has no length")
     placed = assemble(pieces, y=width / 2.0)
     check_closes(placed, str(path))
-    surface, look = _surface_and_look(root, main, placed)
+    surface, look = surface_and_look(path.stem, root, main, placed)
     return Track.from_placed(
         placed,
         name=path.stem,
@@ -51,34 +50,7 @@ def read_torcs(path: Path) -> Track:
         width=width,
         surface=surface,
         look=look,
-        markings=imported_style(path.stem, kerbs=_has_kerbs(main)),
-    )
-
-
-def _surface_and_look(root: Section, main: Section, placed: Placed) -> tuple[Surface, str]:
-    name = (main.text("surface") or "").lower()
-    header = root.section("Header")
-    category = (header.text("category") if header else None) or "road"
-    surface: Surface = "asphalt"
-    if category == "dirt" or "dirt" in name or "gravel" in name or "sand" in name:
-        surface = "gravel"
-    elif "conc" in name:
-        surface = "concrete"
-    if surface == "gravel":
-        return surface, "gravel"
-    if category == "oval":
-        return surface, "oval"
-    middle = (placed.z_left0 + placed.z_right0) / 2.0
-    if float(middle.max() - middle.min()) > MOUNTAIN_HEIGHT_M:
-        return surface, "mountain"
-    return surface, "circuit" if _has_kerbs(main) else "countryside"
-
-
-def _has_kerbs(main: Section) -> bool:
-    return any(
-        "curb" in (attribute.get("val") or "").lower()
-        for attribute in main.element.iter("attstr")
-        if attribute.get("name") in ("surface", "style")
+        markings=imported_style(path.stem, kerbs=has_kerbs(main)),
     )
 
 

@@ -1,5 +1,8 @@
 """Rounds made without a simulator, and datasets of them: what the tests of recording share."""
 
+import json
+import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -8,6 +11,7 @@ import numpy as np
 import pytest
 
 import trackfeatures as tf
+from datagen.cli import main as datagen_main
 from datagen.recording.camera import CameraInfo
 from datagen.recording.derived import rebuild
 from datagen.recording.folder import RoundState, file_sha256, partial_path, prepare, publish
@@ -15,6 +19,7 @@ from datagen.recording.frame import DriverCommand, EgoState, Frame, RoadPlace, S
 from datagen.recording.header import RoundHeader, RoundResult
 from datagen.recording.splits import Split
 from datagen.recording.writer import RoundWriter
+from tests.datagen.commands import SHORT, datagen
 
 LANES = 2
 CAMERA = CameraInfo(width=56, height=42)
@@ -79,6 +84,37 @@ class Samples:
             self.add_round(folder, self.header(f"r{number:03d}"))
         rebuild(folder, Split(train=("r000", "r001"), test=("r002",)))
         return folder
+
+
+@pytest.fixture
+def refused(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> Callable[..., str]:
+    """Runs the command in this process; returns the one line that it was refused with."""
+
+    def run(*args: object) -> str:
+        monkeypatch.setattr(sys, "argv", ["datagen", *map(str, args)])
+        capsys.readouterr()
+        with pytest.raises(SystemExit) as end:
+            datagen_main()
+        stdout, stderr = capsys.readouterr()
+        assert (end.value.code, stdout, stderr.count("\n")) == (1, "", 1)
+        return stderr
+
+    return run
+
+
+@pytest.fixture(scope="session")
+def collected(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two short rounds; a test that changes them puts them back."""
+    folder = tmp_path_factory.mktemp("collect") / "data"
+    done = datagen("collect", *SHORT, "--out", folder, "--workers", "2", "--json")
+    assert done.returncode == 0, done.stderr
+    assert "pybullet" not in done.stderr
+    result = json.loads(done.stdout)
+    assert (result["rounds"], result["frames"], result["resets"]) == (2, 60, 0)
+    assert result["frames_per_second"] == pytest.approx(60 / result["seconds"], rel=0.01)
+    return folder
 
 
 @pytest.fixture(scope="session")

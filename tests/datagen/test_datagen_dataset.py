@@ -1,6 +1,7 @@
 """Opening a dataset: arrays, batches, and what is refused."""
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -52,6 +53,20 @@ def test_batches_are_the_decoded_images_in_the_order_asked_for(dataset: Path) ->
         decode_into(frames.jpeg(i), one)
         assert np.array_equal(batch[row], one)
     assert not np.array_equal(batch[0], batch[1])
+
+
+def test_the_snippet_of_the_readme_runs_on_a_dataset(
+    dataset: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = (Path(__file__).parents[2] / "README.md").read_text()
+    (snippet,) = re.findall(r"```python\n(from datagen\.recording.*?)```", text, flags=re.DOTALL)
+    assert snippet.count("\n") <= 6
+    names: dict[str, Any] = {}
+    exec(snippet.replace("datasets/default", str(dataset)).replace("500, 1000", "50, 80"), names)
+    assert names["images"].shape == (3, 42, 56, 3)
+    assert capsys.readouterr().out.startswith("90 [")
+    frames = Dataset.open(dataset).select("train")
+    assert np.array_equal(names["images"][1], frames.image(50))
 
 
 def test_a_batch_of_another_shape_is_refused(dataset: Path) -> None:

@@ -3,13 +3,13 @@
 from collections import Counter
 from dataclasses import replace
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 import pytest
 
 import trackfeatures as tf
-from datagen.plan import LIGHTS, TRAJECTORIES, TrackChoice, Wanted, make_plan
+from datagen.deal import JITTER, make_plan
+from datagen.plan import LIGHTS, TRAJECTORIES, TrackChoice, Wanted
 from datagen.tracks import TORCS_TRACKS, choose_tracks
 
 NINE = tuple(TrackChoice(f"track-{i}", f"{i}" * 64) for i in range(9))
@@ -39,8 +39,10 @@ def test_sixty_rounds_cover_everything_evenly() -> None:
     assert len(pairs) == 27
     assert set(pairs.values()) <= {2, 3}
     assert set(Counter(e.traffic for e in rounds)) == set(range(9))
-    assert set(Counter(e.trajectory for e in rounds).values()) == {60 // len(TRAJECTORIES)}
-    assert set(Counter(e.light for e in rounds).values()) == {60 // len(LIGHTS)}
+    for dealt, kinds in (("trajectory", TRAJECTORIES), ("light", LIGHTS)):
+        counts = Counter(getattr(e, dealt) for e in rounds)
+        assert set(counts) == set(kinds)
+        assert max(counts.values()) - min(counts.values()) <= 1
     assert 40 <= min(e.speed_kmh for e in rounds) < 41
     assert 74 < max(e.speed_kmh for e in rounds) <= 75
     for track in tracks:
@@ -77,21 +79,56 @@ def test_small_plans_keep_a_round_of_each_track_for_training() -> None:
 @pytest.mark.parametrize(
     "changes",
     [{"rounds": 0}, {"frames": 0}, {"seed": -1}, {"lanes": (4,)}, {"lanes": ()}, {"tracks": ()},
-     {"test_share": 1.0}, {"lights": ("disco",)}, {"codec": "gif"}],
+     {"test_share": 1.0}, {"lights": ("disco",)}, {"codec": "gif"}, {"split": "seen"},
+     {"rounds": 600_000}],
 )  # fmt: skip
 def test_wishes_that_cannot_be_met_are_refused(changes: dict[str, Any]) -> None:
     with pytest.raises(tf.UserError):
         wanted(**changes)
 
 
-def test_without_torcs_the_projects_own_tracks_are_driven(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    monkeypatch.delenv("TORCS_TRACKS", raising=False)
-    monkeypatch.setattr("simulator.track.catalogue.SYSTEM_TRACKS", tmp_path / "none")
+@pytest.mark.usefixtures("no_torcs_install")
+def test_without_torcs_the_projects_own_tracks_are_driven() -> None:
     names = [choice.name for choice in choose_tracks((), None)]
     assert len(names) >= 4
     assert not set(names) & set(TORCS_TRACKS)
     (one,) = choose_tracks((names[0],), None)
     assert one.name == names[0]
     assert len(one.content_hash) == 64
+
+
+def test_jittered_cameras_differ_and_stay_near_the_datasets_own() -> None:
+    plan = make_plan(wanted(jitter_camera=True))
+    about = wanted().camera
+    for name, half in JITTER.items():
+        values = [getattr(entry.camera, name) - getattr(about, name) for entry in plan.rounds]
+        assert len({*values}) == 60
+        assert max(map(abs, values)) <= half + 1e-4
+        assert max(values) > 0.9 * half
+        assert min(values) < -0.9 * half
+    assert {entry.nominal_camera for entry in plan.rounds} == {about}
+    assert {(e.camera.width, e.camera.x, e.camera.y) for e in plan.rounds} == {(280, 0.75, 0.0)}
+    assert {entry.camera for entry in make_plan(wanted()).rounds} == {about}
+
+
+def test_rounds_of_an_unseen_track_share_no_seed_with_those_to_train_on() -> None:
+    plan = make_plan(wanted(split="unseen"))
+    assert {entry.split for entry in plan.rounds} == {"unseen"}
+    usual = {entry.seed for seed in range(3) for entry in make_plan(wanted(seed=seed)).rounds}
+    assert not usual & {entry.seed for entry in plan.rounds}
+
+
+def test_the_unseen_track_is_in_no_usual_plan() -> None:
+    (unseen,) = choose_tracks((), None, unseen=True)
+    usual = [choice.name for choice in choose_tracks((), None)]
+    assert unseen.name not in usual
+    with pytest.raises(tf.UserError, match="one of those to train on"):
+        choose_tracks((usual[0],), None, unseen=True)
+    assert [c.name for c in choose_tracks((unseen.name,), None, unseen=True)] == [unseen.name]
+
+
+def test_another_version_of_the_program_has_another_plan(monkeypatch: pytest.MonkeyPatch) -> None:
+    plan = make_plan(wanted())
+    before = plan.hash
+    monkeypatch.setattr("datagen.plan.program", lambda: "driverview 99")
+    assert plan.hash != before

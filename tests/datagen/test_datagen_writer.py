@@ -9,6 +9,7 @@ import mcap.writer
 import numpy as np
 import pytest
 import simplejpeg
+from foxglove_schemas_protobuf.PointsAnnotation_pb2 import PointsAnnotation
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
@@ -17,6 +18,7 @@ from datagen.recording import topics
 from datagen.recording.encoding import decode_into, encode
 from datagen.recording.index import MappedMessages, RoundIndex, load_round, open_round
 from datagen.recording.labels import read_labels
+from datagen.recording.wire import points_field
 from tests.datagen.conftest import Samples
 
 SCHEMAS = {
@@ -192,3 +194,15 @@ def _rewrite(source: Path, target: Path, kind: str) -> None:
                 channels[channel.id], message.log_time, message.data, message.publish_time
             )
         writer.finish()  # type: ignore[no-untyped-call]  # mcap leaves it untyped
+
+
+def test_points_are_written_as_protobuf_writes_them() -> None:
+    points = np.array([[1.5, -2.25], [0.0, 1e9], [3.0, 0.0]])
+    plain = PointsAnnotation(thickness=2.0)
+    for x, y in points.tolist():
+        plain.points.add(x=x, y=y)
+    packed = PointsAnnotation(thickness=2.0)
+    packed.MergeFromString(points_field(PointsAnnotation.POINTS_FIELD_NUMBER, points))
+    assert packed == plain
+    assert packed.SerializeToString() == plain.SerializeToString()
+    assert points_field(3, np.zeros((0, 2))) == b""

@@ -1,6 +1,7 @@
 """The `mtlnet` command from outside: what it prints, and one clear line for what it refuses."""
 
 import json
+import shutil
 import signal
 import subprocess
 import sys
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 import simplejpeg
 
+from datagen.recording.splits import Split, split_path, write_split
 from mtlnet.curves import read_curves
 
 
@@ -70,6 +72,16 @@ def test_train_evaluate_and_predict(dataset: Path, tmp_path: Path) -> None:
     assert report["baseline"]["angle_mae_rad"] == pytest.approx(0.04, abs=0.02)
     table = mtlnet("evaluate", "--model", run, "--data", dataset)
     assert "offset from the lane centre" in table.stdout
+
+    unseen = shutil.copytree(dataset, tmp_path / "unseen")
+    write_split(split_path(unseen), Split(train=(), test=(), unseen=("r003",)))
+    known = refused("evaluate", "--model", run, "--data", unseen, "--split", "unseen")
+    assert "was trained on track alpha, which is not unseen to it" in known
+    card = json.loads((run / "card.json").read_text())
+    card["data"]["tracks"] = ["beta"]
+    (run / "card.json").write_text(json.dumps(card))
+    judged = mtlnet("evaluate", "--model", run, "--data", unseen, "--split", "unseen", "--json")
+    assert json.loads(judged.stdout)["frames"] == 24
 
     image = tmp_path / "frame.jpg"
     pixels = np.full((420, 560, 3), 90, np.uint8)  # twice the size: scaled down

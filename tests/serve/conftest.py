@@ -20,7 +20,8 @@ import trackfeatures as tf
 from mtlnet.card import WEIGHTS, Camera, ModelCard
 from mtlnet.engine import Engine
 from serve.app import create_app
-from serve.server import bind, settings
+from serve.server import settings
+from trackfeatures.listening import bind
 
 CARD = ModelCard(
     name="fake",

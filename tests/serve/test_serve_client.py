@@ -8,8 +8,8 @@ from contextlib import contextmanager
 import pytest
 
 from serve.client import Client, ServiceError
-from serve.server import bind
 from tests.serve.conftest import CARD, FakeEngine, Served, jpeg, outputs, picture, png, serving
+from trackfeatures.listening import bind
 
 JPEG, PNG = jpeg(picture()), png(picture())
 

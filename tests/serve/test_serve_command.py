@@ -20,8 +20,8 @@ from mtlnet.card import CARD, SHIPPED, read_card
 from mtlnet.engine import load_engine
 from mtlnet.golden import golden_image
 from serve.client import Client
-from serve.server import bind
 from tests.serve.conftest import png
+from trackfeatures.listening import bind
 
 ROOT = Path(__file__).parents[2]
 

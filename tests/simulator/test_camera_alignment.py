@@ -62,12 +62,22 @@ def _errors(camera: Camera, bare: Camera, pose: FloatArray, s: float) -> FloatAr
     return np.array(found)
 
 
-@pytest.mark.parametrize("name", ["mountain-pass", "oval", "circuit", "town"])
-def test_paint_lies_on_the_projected_markings(name: str) -> None:
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [
+        ("mountain-pass", "overcast"),
+        ("oval", "overcast"),
+        ("circuit", "overcast"),
+        ("town", "overcast"),
+        ("mountain-pass", "rain"),
+        ("town", "rain"),
+    ],
+)
+def test_paint_lies_on_the_projected_markings(name: str, kind: str) -> None:
     painted = replace(find_track(name), markings=MarkingStyle())
     unpainted = replace(painted, markings=MarkingStyle(line_width=1e-6))
     rng = np.random.default_rng(5)
-    light = Light.named("overcast", rng)
+    light = Light.named(kind, rng)
     errors = []
     for lanes in (1, 2):
         road = Road(painted, lanes)

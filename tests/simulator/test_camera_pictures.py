@@ -227,7 +227,23 @@ def test_contact_sheet(road: Road, tmp_path: Path) -> None:
     assert sheet.shape == (4 * 360, 4 * 480, 3)
     with pytest.raises(UserError, match=r"ends in \.png"):
         write_contact_sheet(road, tmp_path / "sheet.gif", seed=0, traffic=0)
+    with pytest.raises(UserError, match="unknown light 'noon'"):
+        write_contact_sheet(road, tmp_path / "noon.png", seed=0, traffic=0, light="noon")
     assert list(tmp_path.iterdir()) == [out]
+
+
+def test_a_contact_sheet_in_one_light(road: Road, tmp_path: Path) -> None:
+    import cv2
+
+    write_contact_sheet(road, tmp_path / "snow.png", seed=0, traffic=0, light="snow")
+    sheet = cv2.imread(str(tmp_path / "snow.png"))
+    assert sheet is not None
+    blue = 0
+    for k in range(14):  # the driver views; in half of those of a mixed sheet the sky is blue
+        row, column = divmod(k, 4)
+        sky = sheet[360 * row : 360 * row + 100, 480 * column : 480 * column + 480].astype(int)
+        blue += int((sky[..., 0] - sky[..., 2]).mean() > 15.0)
+    assert blue <= 1  # a bridge of blue steel may hang over the car
 
 
 def test_a_track_of_unknown_look_gets_a_countryside(road: Road) -> None:

@@ -7,13 +7,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from simulator.car import GRAVITY, GRIP, CarParameters
+from simulator.car import GRAVITY, CarParameters
 from simulator.dynamics import DT, MEMORY, MOTION, PIECE, advance
+from simulator.ground import SURFACES, VERGE, ground
 from simulator.state import CarState, Command
 from simulator.track.geometry import Track
 from simulator.track.markings import MarkingStyle
 from simulator.track.pieces import Piece, assemble
 from simulator.track.road import Road
+from simulator.tyre import peak_force
+from simulator.wheels import wheel_angle
 from simulator.world import World
 from trackfeatures.errors import UserError
 
@@ -21,6 +24,7 @@ CAR = CarParameters()
 # Nothing slows this one down: no air, no rolling resistance.
 FREE = replace(CAR, rolling_resistance=0.0, drag_coefficient=0.0, wing_drag=0.0)
 NEUTRAL = Command(gear=0)
+ASPHALT = SURFACES["asphalt"].grip
 
 
 def plain(grade: float = 0.0, width: float = 600.0) -> Road:
@@ -88,8 +92,9 @@ def test_static_loads_carry_the_weight_and_balance_it() -> None:
     motion, memory = np.zeros(MOTION), np.zeros(MEMORY)
     motion[0], motion[2], motion[6] = 300.0, CAR.cg_height, 1.0
     memory[PIECE] = -1
-    table = plain().track.arrays()
-    wrench = advance(CAR.packed(), table, motion, memory, np.array([0.0, 0.0, 0.0, 0.0]))
+    road, wrench = plain(), np.ones(6)
+    table, command = road.track.arrays(), np.zeros(4)
+    advance(CAR.packed(), table, ground(road), motion, memory, command, wrench)
     np.testing.assert_allclose(wrench, 0.0, atol=1e-6)
 
 
@@ -109,17 +114,19 @@ def test_steady_cornering_follows_the_bicycle_model(speed: float) -> None:
         throttle = min(max(0.1 + 0.5 * (speed - state.vx), 0.0), 1.0)
         return Command(steer=delta / CAR.steering_lock, throttle=throttle, gear=2)
 
-    states = drive(replace(FREE, lift_front=0.0, lift_rear=0.0), 6.0, hold, speed=speed)
-    turn = float(np.mean([state.yaw_rate for state in states[-20:]]))
-    v = float(np.mean([state.vx for state in states[-20:]]))
-    axles = CAR.rear_axle - CAR.front_axle
-    gradient = CAR.total_mass * axles / (2 * CAR.cornering_stiffness * CAR.wheelbase)
+    # Steady long before the car reaches the verge.
+    states = drive(replace(FREE, lift_front=0.0, lift_rear=0.0), 1.5, hold, speed=speed)
+    turn = float(np.mean([state.yaw_rate for state in states[-10:]]))
+    v = float(np.mean([state.vx for state in states[-10:]]))
+    front, rear = CAR.cornering_stiffness(True, ASPHALT), CAR.cornering_stiffness(False, ASPHALT)
+    gradient = CAR.rear_axle / (2 * front) - CAR.front_axle / (2 * rear)
+    gradient *= CAR.total_mass / CAR.wheelbase
     assert turn == pytest.approx(v * delta / (CAR.wheelbase + gradient * v * v), rel=0.03)
     assert states[-1].angle < 0.0  # it turned left, so it points to the left of the track
     # Slip angle at the centre of gravity: the rear axle's share of the bicycle model.
     rear_slip = CAR.total_mass * v * turn * CAR.front_axle / CAR.wheelbase
-    rear_slip /= 2 * CAR.cornering_stiffness
-    side_slip = float(np.mean([state.vy / state.vx for state in states[-20:]]))
+    rear_slip /= 2 * rear
+    side_slip = float(np.mean([state.vy / state.vx for state in states[-10:]]))
     assert side_slip == pytest.approx(CAR.rear_axle * turn / v - rear_slip, abs=0.0015)
 
 
@@ -134,7 +141,7 @@ def test_cornering_loads_the_outer_wheels() -> None:
 def test_braking_is_limited_by_friction() -> None:
     states = drive(CAR, 1.0, lambda _: Command(brake=1.0, gear=0), speed=30.0)
     slowest = (30.0 - states[-1].speed) / 1.0
-    limit = CAR.friction * GRIP["asphalt"] * GRAVITY
+    limit = CAR.friction * ASPHALT * GRAVITY
     # Drag and wings add a little to what the tyres alone can do; locked tyres give some away.
     assert 0.6 * limit < slowest < 1.15 * limit
     assert states[-1].pitch > 0.002  # the nose dips
@@ -176,3 +183,54 @@ def test_a_car_that_cannot_be_is_refused() -> None:
 
 def test_physics_step_is_five_milliseconds() -> None:
     assert DT == 0.005
+
+
+def test_the_tyres_stiffness_is_that_of_the_recorded_laps() -> None:
+    # Fitted to yaw rate and side slip of TORCS's laps: 120 to 130 kN/rad, front and rear alike.
+    for front in (True, False):
+        assert 115e3 < CAR.cornering_stiffness(front, ASPHALT) < 135e3
+
+
+def test_a_harder_pressed_tyre_has_more_grip_but_less_for_its_load() -> None:
+    p = CAR.packed()[0]
+    light, heavy = peak_force(p, True, 2000.0, ASPHALT), peak_force(p, True, 6000.0, ASPHALT)
+    assert light < heavy < 3.0 * light
+    nominal = peak_force(p, True, float(p["working_front"]), 1.0)
+    assert nominal == pytest.approx(CAR.friction * CAR.camber_gain_front * p["working_front"])
+
+
+def test_the_inner_front_wheel_turns_further() -> None:
+    p = CAR.packed()[0]
+    for sign in (1.0, -1.0):
+        left, right = wheel_angle(p, 0, 0.3 * sign), wheel_angle(p, 1, 0.3 * sign)
+        inner, outer = (left, right) if sign > 0 else (right, left)
+        assert inner == pytest.approx(0.3 * sign)
+        # Both are square to circles about one centre, on the line of the rear axle.
+        radius = CAR.wheelbase / math.tan(0.3)
+        track = 0.5 * (CAR.front_track + CAR.rear_track)
+        assert outer == pytest.approx(sign * math.atan2(CAR.wheelbase, radius + track))
+    assert wheel_angle(p, 2, 0.3) == 0.0
+
+
+def test_the_verge_brakes_worse_and_rolls_harder() -> None:
+    """One lane on a track 16 m wide: asphalt to 3 m, then verge."""
+    road = plain(width=16.0)
+    slowed = {}
+    for name, to_middle in (("road", 0.0), ("half", 3.0), ("verge", 5.5)):
+        with World(road) as world:
+            world.reset(seed=0, s=300.0, to_middle=to_middle, speed=20.0)
+            braked = [world.step(Command(brake=1.0, gear=0)) for _ in range(16)]
+            slowed[name] = 20.0 - braked[-1].speed
+            slowed[name + " yaw"] = abs(braked[4].yaw_rate)
+    assert slowed["verge"] / slowed["road"] == pytest.approx(VERGE.grip / ASPHALT, abs=0.05)
+    assert slowed["verge"] < slowed["half"] < slowed["road"]
+    # With the left wheels on the verge the right ones pull the car round.
+    assert slowed["half yaw"] > 0.2
+    assert slowed["road yaw"] == pytest.approx(0.0, abs=1e-6)
+    rolled = {}
+    for to_middle in (0.0, 5.5):
+        with World(road) as world:
+            world.reset(seed=0, s=300.0, to_middle=to_middle, speed=5.0)
+            rolled[to_middle] = 5.0 - [world.step(NEUTRAL) for _ in range(40)][-1].speed
+    more = CAR.rolling_resistance * (VERGE.rolling - 1.0) * GRAVITY * 2.0
+    assert rolled[5.5] - rolled[0.0] == pytest.approx(more, rel=0.15)

@@ -1,6 +1,7 @@
 """The Gymnasium environments: the checker, spaces, reward, endings, seeds, vectors, bad input."""
 
 import math
+import re
 import subprocess
 import sys
 import warnings
@@ -13,10 +14,12 @@ from gymnasium.utils.env_checker import check_env
 
 import simulator.env  # registers the names
 from simulator.reward import step_reward
+from simulator.sensors import Sensor
 from trackfeatures.errors import UserError
 
 STATE_ID = "driverview/LateralControl-v0"
 IMAGE_ID = "driverview/DriverView-v0"
+SMALL = {"width": 64, "height": 48}
 
 
 def make(**options: Any) -> gym.Env[Any, Any]:
@@ -27,12 +30,29 @@ def steer(value: float) -> np.ndarray[Any, Any]:
     return np.array([value], np.float32)
 
 
-@pytest.mark.parametrize("controls", ["steer", "full"])
-def test_gymnasiums_checker_passes(controls: str) -> None:
-    env = make(controls=controls, traffic=2, lanes=2)
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [
+        (STATE_ID, {"traffic": 2, "lanes": 2, "noise": True}),
+        (STATE_ID, {"sensors": ("range", "v_x"), "sensor_noise": {"range": 0.1}}),
+        (IMAGE_ID, {"views": ("front", "rear:depth", "front:class"), **SMALL}),
+        (IMAGE_ID, {"observation": "image", "render_mode": "rgb_array", **SMALL}),
+    ],
+)
+def test_gymnasiums_checker_passes_without_a_warning(name: str, options: dict[str, Any]) -> None:
+    env = gym.make(name, track="circuit", **options)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # unbounded observations and the gear's range are meant
-        check_env(env.unwrapped, skip_render_check=True)
+        warnings.simplefilter("error")
+        check_env(env.unwrapped)
+    env.close()
+
+
+def test_gymnasiums_checker_only_minds_the_range_of_the_gear() -> None:
+    env = make(controls="full")
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        check_env(env.unwrapped)
+    assert ["normalized space" in str(warning.message) for warning in told] == [True]
     env.close()
 
 
@@ -116,9 +136,13 @@ def test_recordings_play_at_the_speed_of_life(frequency_hz: int) -> None:
     assert simulator.env.LateralControl.metadata["render_fps"] == 20
 
 
-def test_an_episode_is_cut_after_6500_steps() -> None:
+def test_an_episode_is_cut_after_6500_steps_or_as_many_as_asked_for() -> None:
     spec = gym.spec(STATE_ID)
     assert spec.max_episode_steps == 6500
+    env = make(max_episode_steps=3)
+    env.reset(seed=0)
+    assert [env.step(steer(0.0))[2:4] for _ in range(3)] == [(False, c) for c in (0, 0, 1)]
+    env.close()
 
 
 def test_noise_is_the_papers_and_seeded() -> None:
@@ -159,10 +183,19 @@ def test_two_environments_beside_each_other_are_like_one_alone() -> None:
 
 @pytest.mark.parametrize(
     ("action", "message"),
-    [([math.nan], "finite"), ([1.5], "steer = 1.5"), ([0.0, 0.0], "shape"), ([-1.01], "steer")],
+    [
+        ([math.nan], "steer = nan; give a finite number"),
+        ([1.5], "steer = 1.5"),
+        ([-math.inf], "steer = -inf"),
+        ([-1.01], "steer"),
+        ([0.0, 0.0], "shape"),
+        ([0.0, 1.1, 0.0, 1.0], "throttle = 1.1"),
+        ([0.0, 0.0, -0.5, 1.0], "brake = -0.5"),
+        ([0.0, 0.0, 0.0, 7.0], "gear = 7"),
+    ],
 )
 def test_bad_actions_are_refused(action: list[float], message: str) -> None:
-    env = make(disable_env_checker=True)
+    env = make(disable_env_checker=True, controls="full" if len(action) == 4 else "steer")
     env.reset(seed=0)
     with pytest.raises(UserError, match=message):
         env.unwrapped.step(np.array(action, np.float32))
@@ -173,18 +206,44 @@ def test_bad_actions_are_refused(action: list[float], message: str) -> None:
     ("options", "message"),
     [
         ({"track": "no-such-track"}, "no-such-track"),
+        ({"lanes": 4}, "4 lanes"),
         ({"frequency_hz": 30}, "30 Hz"),
         ({"noise": -1.0}, "noise"),
+        ({"noise": math.nan}, "noise"),
         ({"controls": "feet"}, "controls"),
         ({"colour": "red"}, "colour"),
+        ({"trafic": 3}, "did you mean 'traffic'"),
         ({"lambda_": math.nan}, "lambda_"),
+        ({"reward": 3.0}, "reward is 3.0"),
+        ({"reward": lambda state, road, ending: 0.0, "lambda_": 2.0}, "lambda_"),
+        ({"ends": ("off_track", "boredom")}, "boredom"),
+        ({"ends": "off_track"}, "give a list"),
         ({"traffic": 50}, "50 traffic cars"),
         ({"light": "bogus"}, "unknown light 'bogus'"),
+        ({"width": 4}, "picture size 4"),
+        ({"render_view": "inside"}, "render_view is 'inside'"),
+        ({"observation": "smell"}, "observation is 'smell'"),
+        ({"observation": "image", "views": ()}, "one picture"),
+        ({"observation": "state", "views": ("front",)}, "views are part"),
+        ({"observation": "image", "sensors": ("v_x",)}, "sensors are part"),
+        ({"views": ("below",)}, "unknown camera view 'below'"),
+        ({"views": ("front:heat",)}, "unknown kind of picture 'heat'"),
+        ({"views": "front"}, "give a list"),
+        ({"views": ("front", "front")}, "once"),
+        ({"sensors": ("lidar",)}, "unknown sensor 'lidar'"),
+        ({"sensors": ("v_x", "v_x")}, "share a name"),
+        ({"sensors": ("v_x",), "sensor_noise": {"v_y": 1.0}}, "noise is set for"),
+        ({"sensors": (Sensor("state", "", lambda world: 0.0),)}, "named like"),
     ],
 )
 def test_bad_options_are_refused(options: dict[str, Any], message: str) -> None:
-    with pytest.raises(UserError, match=message):
+    with pytest.raises(UserError, match=re.escape(message)):
         make(**options)
+
+
+def test_an_unknown_render_mode_is_refused() -> None:
+    with pytest.raises(UserError, match="render_mode is 'ansi'"):
+        simulator.env.LateralControl(render_mode="ansi")
 
 
 def test_unknown_reset_options_are_refused() -> None:
@@ -194,19 +253,40 @@ def test_unknown_reset_options_are_refused() -> None:
     env.close()
 
 
-def test_a_step_before_reset_is_refused() -> None:
+def test_a_step_without_an_episode_is_refused() -> None:
     env = simulator.env.LateralControl("circuit")
     with pytest.raises(UserError, match="call reset"):
         env.step(steer(0.0))
+    env.reset(seed=0, options={"s": 60.0, "speed": 15.0})
+    while not env.step(steer(0.5))[2]:
+        pass
+    # What Gymnasium's own wrapper raises too, so that callers catch one error.
+    with pytest.raises(gym.error.ResetNeeded, match="after an end"):
+        env.step(steer(0.0))
+    env.reset(seed=0)
+    env.step(steer(0.0))
     env.close()
+    with pytest.raises(UserError, match="call reset"):
+        env.step(steer(0.0))
+    with pytest.raises(UserError, match="closed"):
+        env.reset(seed=0)
 
 
-def test_importing_the_package_after_gymnasium_registers_the_names() -> None:
-    code = "import gymnasium, simulator; print(gymnasium.spec('driverview/DriverView-v0').id)"
+@pytest.mark.parametrize(
+    "code",
+    [
+        "import gymnasium, simulator; print(gymnasium.spec('driverview/DriverView-v0').id)",
+        "import gymnasium as g; e = g.make('simulator.env:driverview/DriverView-v0', width=64);"
+        "print(e.spec.id)",
+        "import gymnasium as g; e = g.make_vec('simulator.env:driverview/DriverView-v0', 2,"
+        "vectorization_mode='sync'); print(e.spec.id)",
+    ],
+)
+def test_the_names_are_known_after_an_import_or_by_the_modules_name(code: str) -> None:
     result = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True
     )
-    assert result.stdout.strip() == IMAGE_ID
+    assert result.stdout.splitlines()[-1] == IMAGE_ID
 
 
 def test_the_driver_view_gives_image_and_state() -> None:

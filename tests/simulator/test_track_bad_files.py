@@ -59,9 +59,9 @@ def test_wrong_values_are_named(tmp_path: Path, old: str, new: str, said: str) -
 
 def test_a_gap_of_more_than_the_tolerance(tmp_path: Path) -> None:
     path = tmp_path / "gap.xml"
-    first = STADIUM.replace('name="lg" val="100"', 'name="lg" val="100.1"', 1)
+    first = STADIUM.replace('name="lg" val="100"', 'name="lg" val="100.25"', 1)
     path.write_text(first)
-    assert read_torcs(path).length_m == pytest.approx(200.1 + 100.0 * math.pi)
+    assert read_torcs(path).length_m == pytest.approx(200.25 + 100.0 * math.pi)
     path.write_text(STADIUM.replace('name="lg" val="100"', 'name="lg" val="100.3"', 1))
     assert "0.30 m from their start" in refused(path)
 
@@ -125,6 +125,7 @@ def test_too_large(tmp_path: Path) -> None:
     assert "bytes" in refused(path)
 
 
+@pytest.mark.usefixtures("no_torcs_install")
 def test_a_bad_file_in_a_folder_is_skipped_with_a_warning(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

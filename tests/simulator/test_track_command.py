@@ -57,6 +57,9 @@ def test_centre_line_of_a_file(tmp_path: Path) -> None:
             ("snapshot", "oval", "--out", "/no/such/folder/x.png"),
             "there is no folder /no/such/folder",
         ),
+        (("snapshot", "oval", "--out", "x.png", "--light", "noon"), "unknown light 'noon'"),
+        (("snapshot", "oval", "--out", "x.png", "--view", "up"), "unknown camera view 'up'"),
+        (("snapshot", "oval", "--out", "x.png", "--kind", "depths"), "unknown kind of picture"),
         (("tracks", "--tracks-dir", "/no/such/folder"), "/no/such/folder"),
     ],
 )
@@ -88,6 +91,7 @@ def test_a_snapshot_out_of_range(tmp_path: Path, option: tuple[str, str]) -> Non
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.usefixtures("no_torcs_install")
 def test_torcs_variable_may_name_either_folder(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -105,8 +109,8 @@ def test_torcs_variable_may_name_either_folder(
     assert "TORCS_TRACKS" in capsys.readouterr().err
 
 
-def test_unknown_names_and_folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv("TORCS_TRACKS", raising=False)
+@pytest.mark.usefixtures("no_torcs_install")
+def test_unknown_names_and_folders(tmp_path: Path) -> None:
     with pytest.raises(UnknownTrack, match=r"no track 'g-track-3'.*--tracks-dir"):
         find_track("g-track-3", tmp_path)
     with pytest.raises(UserError, match="no folder"):

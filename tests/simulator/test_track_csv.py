@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from simulator.track.catalogue import find_track, read_track
-from simulator.track.centre_line_csv import write_centre_line
+from simulator.track.centre_line_csv import survey_noise, write_centre_line
 from simulator.track.errors import TrackError
 
 HEADER = "# x_m,y_m,w_tr_right_m,w_tr_left_m\n"
@@ -48,6 +48,31 @@ def test_there_and_back(tmp_path: Path, name: str) -> None:
     assert np.abs(offsets).max() < 0.25
     end = survey.at(survey.length_m - 1e-6)
     assert math.hypot(float(end.x - survey.x0[0]), float(end.y - survey.y0[0])) < 1e-3
+
+
+@pytest.mark.parametrize("noise", [0.1, 0.2])
+@pytest.mark.parametrize("spacing", [2.0, 5.0])
+def test_a_noisy_survey_is_smoothed_by_its_own_noise(
+    tmp_path: Path, noise: float, spacing: float
+) -> None:
+    """Unevenly spaced points, each off by 0.1 or 0.2 m, widths too: still the road it was."""
+    track = find_track("coast")
+    count = int(track.length_m / spacing)
+    rng = np.random.default_rng([7, int(10 * noise), int(spacing)])
+    s = (np.arange(count) + rng.uniform(-0.3, 0.3, count)) * track.length_m / count
+    pose = track.at(s)
+    points = np.column_stack((pose.x, pose.y)) + rng.normal(0.0, noise, (count, 2))
+    assert survey_noise(points) == pytest.approx(noise, rel=0.15)
+    rows = np.column_stack((points, 5.0 + rng.normal(0.0, 0.1, (count, 2))))
+    path = tmp_path / "survey.csv"
+    np.savetxt(path, rows, "%.6f", ",", header="x_m,y_m,w_tr_right_m,w_tr_left_m")
+    survey = read_track(path)
+    assert survey.length_m == pytest.approx(track.length_m, rel=5e-4)
+    assert survey.width == pytest.approx(10.0, abs=0.05)
+    assert survey.min_radius_m > 0.75 * track.min_radius_m
+    every = track.at(np.arange(0.0, track.length_m, 5.0))
+    offsets = [survey.project(float(a), float(b))[1] for a, b in zip(every.x, every.y, strict=True)]
+    assert np.abs(offsets).max() < 3.0 * noise
 
 
 def test_written_centre_line(tmp_path: Path) -> None:

@@ -4,8 +4,7 @@ import numpy as np
 import pybullet
 import pytest
 
-from simulator.dynamics import rotation
-from simulator.orientation import quaternion
+from simulator.orientation import quaternion, rotation
 
 
 @pytest.mark.parametrize(

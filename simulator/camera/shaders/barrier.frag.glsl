@@ -2,17 +2,6 @@ in vec3 place;
 in vec2 face;
 in vec3 normal;
 flat in float sort;
-out vec4 pixel;
-
-float covered(float x, float w, float low, float high) {
-    return clamp((min(x + 0.5 * w, high) - max(x - 0.5 * w, low)) / w, 0.0, 1.0);
-}
-
-float repeated(float x, float w, float a, float p) {
-    float low = (x - 0.5 * w) / p, high = (x + 0.5 * w) / p;
-    float share = a / p;
-    return (((floor(high) - floor(low)) * share) + min(fract(high), share) - min(fract(low), share)) * p / w;
-}
 
 void main() {
     float s = face.x, h = face.y;
@@ -54,6 +43,10 @@ void main() {
         colour = mix(vec3(0.025), mix(vec3(0.5, 0.03, 0.03), vec3(0.62), paint), covered(h, wh, 0.32, 0.66));
         colour *= mix(0.55, 1.0, bump * exp2(-2.0 * ws) + 0.6 * (1.0 - exp2(-2.0 * ws)));
     }
-    if (solid < 0.12) discard;
-    pixel = vec4(finish(lit(colour, facing, 0.9), place).rgb, solid);
+#ifdef SNOW
+    float top = sort < 0.5 ? 0.79 : sort < 1.5 ? 0.9 : sort < 2.5 ? 1.1 : sort < 3.5 ? 1.0 : sort < 4.5 ? 0.72 : 0.93;
+    colour = snowed(colour, smoothstep(top - 0.03, top + 0.02, h + 0.12 * (fine.g - 0.5)) + smoothstep(0.12, -0.08, h + 0.15 * (fine.g - 0.5)));
+#endif
+    if (solid < max(0.12, LEAST_ALPHA)) discard;
+    SHOW(vec4(finish(lit(colour, facing, 0.9), place).rgb, solid), OBJECT);
 }

@@ -1,7 +1,6 @@
 in vec3 place;
 in vec3 normal;
 in vec3 albedo;
-out vec4 pixel;
 void main() {
     // Both sides are drawn: turn the normal to the eye.
     vec3 facing = normalize(normal);
@@ -11,5 +10,5 @@ void main() {
     float sheen = 0.04 + 0.30 * pow(1.0 - abs(dot(facing, normalize(place))), 4.0);
     vec3 light = lit(albedo, facing, 1.0) + reflection * sheen;
     light += sunlight.rgb * 0.5 * pow(max(dot(mirrored, sun.xyz), 0.0), 60.0);
-    pixel = finish(light, place);
+    SHOW(finish(light, place), CAR);
 }

@@ -2,28 +2,29 @@
 layout(std140) uniform Frame {
     mat4 clip;        // eye-relative world to clip space
     vec4 eye;         // place of the eye
-    vec4 ray_corner;  // sky: world direction of the image centre
-    vec4 ray_x;       // sky: world direction of half the width
-    vec4 ray_y;       // sky: world direction of half the height, downwards
+    vec4 ahead;       // the optical axis
     vec4 sun;         // unit vector to the sun; w: light left in a hard shadow
     vec4 sunlight;    // light of the sun on a surface facing it; w: exposure
     vec4 skylight;    // light from above; w: extinction of the air, 1/m
     vec4 zenith;      // sky colours; w: share of cloud
-    vec4 horizon;
+    vec4 horizon;     // w: how wet or white the ground is
     vec4 haze;
 };
 layout(std140) uniform Scene {
     vec4 asphalt;     // w: how worn the surface is
     vec4 verge;       // w: how much of the verge is grass
-    vec4 grass;
+    vec4 grass;       // w: level of the sea
     vec4 dry;
     vec4 soil;        // w: how cracked the asphalt is
     vec4 left_line;   // colour of the leftmost line; w: half of a line's width
     vec4 line;        // colour of the other lines; w: wear of the paint
     vec4 lanes;       // number, lane width, half the asphalt, edge
     vec4 dashes;      // length, period, share of missing paint, length of the track
-    vec4 mask;        // shadow mask: metres a texel along s and y, texels of a band, bands
+    vec4 mask;        // shadow mask: metres a texel along s and y, texels and rows of a band
 };
+#ifdef SNOW
+const vec3 WHITE = vec3(0.80, 0.82, 0.85);
+#endif
 uniform sampler2D noise; // r: grain, g: patches of some centimetres, b: broad patches, a: cracks
 
 vec3 lit(vec3 albedo, vec3 normal, float sun_share) {
@@ -40,12 +41,35 @@ vec4 finish(vec3 light, vec3 place) {
     return vec4(sqrt(colour), 1.0);
 }
 
-vec3 meadow(vec2 world, vec3 normal, float near) {
-    vec4 broad = texture(noise, world * 0.0083);
-    vec4 fine = texture(noise, world * 0.137);
+// The same for smooth ground, worked out at its vertices: the shares of the sun's and the sky's
+// light on it that reach the eye, and the light of the air before it.
+void see(vec3 place, vec3 normal, float sun_share, out vec2 reach, out vec3 mist) {
+    float distance = length(place);
+    float left = exp2(-skylight.w * distance) * sunlight.w;
+    float toward = max(dot(place, sun.xyz) / distance, 0.0);
+    toward *= toward;
+    reach = vec2(max(dot(normal, sun.xyz), 0.0) * sun_share, 0.62 + 0.38 * normal.z) * left;
+    mist = haze.rgb * (1.0 + 0.35 * sunlight.rgb * toward * toward) * (sunlight.w - left);
+}
+
+// Light of smooth ground at the eye, and its display values; `sunny`: share of the sun in shadow.
+vec3 reaching(vec3 albedo, vec2 reach, float sunny) {
+    return albedo * (sunlight.rgb * (reach.x * sunny) + skylight.rgb * reach.y);
+}
+
+vec4 shown(vec3 light, vec3 mist) {
+    return vec4(sqrt(light + mist), 1.0);
+}
+
+// How much of the meadow's tufts is seen from here.
+float nearness(vec3 place) {
+    return exp2(-0.0002 * dot(place, place));
+}
+
+vec3 meadow(vec4 broad, vec4 fine, float level, float near) {
     float tuft = mix(0.5, fine.r * 0.5 + fine.g * 0.5, near);
     vec3 colour = mix(grass.rgb, dry.rgb, smoothstep(0.42, 0.72, broad.g * 0.6 + broad.b * 0.4));
-    float bare = smoothstep(0.86, 0.70, normal.z) + smoothstep(0.70, 0.80, fine.g * 0.4 + broad.b * 0.6);
+    float bare = smoothstep(0.86, 0.70, level) + smoothstep(0.70, 0.80, fine.g * 0.4 + broad.b * 0.6);
     colour = mix(colour, soil.rgb, clamp(bare, 0.0, 1.0));
     return colour * (0.62 + 0.76 * tuft);
 }

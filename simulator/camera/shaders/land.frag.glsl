@@ -1,9 +1,21 @@
-in vec3 place;
-in vec3 normal;
 in vec2 world;
-out vec4 pixel;
+in vec2 lie;
+in vec2 reach;
+in vec3 mist;
+#ifdef SEA
+in vec3 place;
+#endif
 void main() {
-    float near = exp2(-0.012 * dot(place, place) / 60.0);
-    vec3 facing = normalize(normal);
-    pixel = finish(lit(meadow(world, facing, near), facing, 0.9), place);
+    vec4 broad = texture(noise, world * 0.0083);
+    vec4 fine = texture(noise, world * 0.137);
+    vec3 colour = ground(world, broad, fine, lie.x, lie.y);
+#ifdef SEA
+    float above = place.z + eye.z - grass.w;
+    if (above < 0.02) {
+        SHOW(finish(water(world, place), place), GROUND);
+        return;
+    }
+    colour = shore(colour, above, broad.g);
+#endif
+    SHOW(shown(reaching(colour, reach, 1.0), mist), GROUND);
 }

@@ -3,13 +3,6 @@ in vec3 normal;
 in vec3 albedo;
 in vec2 face;
 flat in float material;
-out vec4 pixel;
-
-float repeated(float x, float w, float a, float p) {
-    float low = (x - 0.5 * w) / p, high = (x + 0.5 * w) / p;
-    float share = a / p;
-    return (((floor(high) - floor(low)) * share) + min(fract(high), share) - min(fract(low), share)) * p / w;
-}
 
 void main() {
     vec2 w = fwidth(face) + 1e-4;
@@ -34,8 +27,17 @@ void main() {
         colour = mix(albedo, ink, max(frame, text));
     } else if (material < 4.5 && material > 3.5) {  // marker post
         colour = mix(albedo, vec3(0.03), step(1.0, face.y) * step(face.y, 1.2));
+    } else if (material > 6.5) {                    // earth: what lies round it
+        vec2 world = place.xy + eye.xy;
+        colour = ground(world, texture(noise, world * 0.0083), texture(noise, world * 0.137), 0.5 + 0.5 * facing.z, 1.0);
+    } else if (material > 5.5) {                    // concrete, masonry
+        vec4 stain = texture(noise, face * vec2(0.031, 0.017) + albedo.gb * 5.0);
+        colour *= 0.62 + 0.38 * rough.g + 0.34 * stain.b;
     } else if (material > 4.5) {                    // tiles
         colour = albedo * (0.7 + 0.45 * rough.g) * (0.8 + 0.2 * repeated(face.y, w.y, 0.22, 0.34));
     }
-    pixel = finish(lit(colour, facing, 1.0), place);
+#ifdef SNOW
+    if (material < 1.5 || material > 2.5) colour = snowed(colour, smoothstep(0.35, 0.6, normalize(normal).z + 0.1 * (rough.g - 0.5)));
+#endif
+    SHOW(finish(lit(colour, facing, 1.0), place), OBJECT);
 }

@@ -1,5 +1,4 @@
 in vec3 ray;
-out vec4 pixel;
 void main() {
     vec3 direction = normalize(ray);
     float up = direction.z;
@@ -17,6 +16,11 @@ void main() {
         float cover = smoothstep(edge, edge + 0.16, density) * smoothstep(0.015, 0.09, up);
         vec3 white = skylight.rgb * 0.75 + sunlight.rgb * 0.33;
         vec3 grey = skylight.rgb * 0.55 + sunlight.rgb * 0.08;
+#if defined(RAIN) || defined(SNOW)
+        // Low cloud: a grey ceiling without an edge, a little darker here and there.
+        white = colour * 1.08;
+        grey = colour * 0.80;
+#endif
         colour = mix(colour, mix(white, grey, smoothstep(edge + 0.05, edge + 0.4, density)), cover * 0.9);
     }
     float glow = toward * toward;

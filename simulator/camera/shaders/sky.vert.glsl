@@ -1,6 +1,7 @@
-in vec2 corner;
+in vec3 direction;
+in vec2 place;   // in the panorama
 out vec3 ray;
 void main() {
-    ray = ray_corner.xyz + corner.x * ray_x.xyz + corner.y * ray_y.xyz;
-    gl_Position = vec4(corner, 0.999999, 1.0);
+    ray = direction;
+    gl_Position = vec4(place * 2.0 - 1.0, 0.0, 1.0);
 }

@@ -1,6 +1,5 @@
 in vec3 place;
 in vec2 car;
-out vec4 pixel;
 uniform vec4 reach;
 
 float box(vec2 at, vec2 half_size, float soft) {

@@ -6,13 +6,14 @@ in vec2 corner;  // (-0.5 .. 0.5, 0 .. 1)
 out vec2 picture;
 out vec3 light;
 out vec4 air;    // what the air adds, and what it leaves
+invariant gl_Position;  // so that a tree's fringe does not fight with its core
 void main() {
     vec3 foot = at - eye.xyz;
     vec3 place;
     float cell = shape.z;
     vec2 away = normalize(foot.xy + vec2(1e-4, 0.0));
     vec2 right = vec2(away.y, -away.x);
-    if (ray_corner.z < -0.9) {
+    if (ahead.z < -0.9) {
         cell = 6.0;
         place = foot + vec3(corner.x, corner.y - 0.5, 0.0) * shape.x + vec3(0.0, 0.0, 0.7 * shape.y);
     } else {

@@ -32,16 +32,21 @@ class SpeedProfile:
 
 def speed_profile(track: Track, desired: float, innermost_y: float) -> SpeedProfile:
     """`desired` m/s where the road allows it; `innermost_y` (m) is how far inside a bend cuts."""
+    bends = bend_profile(track, innermost_y)
+    return SpeedProfile(np.minimum(bends.limit, desired), bends.cell_m)
+
+
+def bend_profile(track: Track, innermost_y: float) -> SpeedProfile:
+    """What the bends alone allow, m/s, for a driver whose wish is no limit."""
     cells = int(np.ceil(track.length_m / CELL_M))
     cell = track.length_m / cells
     bend = np.abs(track.at((np.arange(cells) + 0.5) * cell).curvature)
     bend = bend / np.maximum(1.0 - bend * innermost_y, 0.3)
-    squared = np.minimum(desired**2, SIDE_ACCELERATION / np.maximum(bend, 1e-6))
-    for at in range(2 * cells - 1, -1, -1):  # twice round: the end brakes for the beginning
-        squared[at % cells] = min(
-            squared[at % cells], squared[(at + 1) % cells] + 2.0 * BRAKING * cell
-        )
-    return SpeedProfile(np.sqrt(squared), cell)
+    squared = np.tile(SIDE_ACCELERATION / np.maximum(bend, 1e-6), 2)
+    # The bend that is hardest to brake for counts; twice round: the end brakes for the beginning.
+    fall = 2.0 * BRAKING * cell * np.arange(2 * cells)
+    hardest = np.minimum.accumulate((squared + fall)[::-1])[::-1] - fall
+    return SpeedProfile(np.sqrt(hardest[:cells]), cell)
 
 
 class Pedals:
@@ -68,7 +73,10 @@ class Pedals:
         gear = self._choose_gear(speed)
         if force < 0.0:
             return 0.0, min(-force * car.wheel_radius / car.brake_torque, 1.0), gear
-        return min(force / self._pull(speed, gear), MOST_THROTTLE), 0.0, gear
+        # The engine's own braking takes its share first (see `engine.engine_torque`).
+        braking = self._engine_braking(speed, gear)
+        wanted = (force / self._pull(speed, gear) + braking) / (1.0 + braking)
+        return min(wanted, MOST_THROTTLE), 0.0, gear
 
     def _choose_gear(self, speed: float) -> int:
         if self._rpm(speed, self._gear) > SHIFT_UP_RPM and self._gear < TOP_GEAR:
@@ -82,6 +90,12 @@ class Pedals:
 
     def _ratio(self, gear: int) -> float:
         return self._car.gears[gear - 1] * self._car.final_drive
+
+    def _engine_braking(self, speed: float, gear: int) -> float:
+        """Share of the full-load torque that a closed throttle takes."""
+        car = self._car
+        above = max(self._rpm(speed, gear) - car.idle_rpm, 0.0)
+        return car.engine_braking * above / (car.top_rpm - car.idle_rpm)
 
     def _pull(self, speed: float, gear: int) -> float:
         """Force (N) of full throttle."""

@@ -1,0 +1,214 @@
+"""Random episodes, run again elsewhere: is every bit of them the same?
+
+Run: `python benchmarks/replay.py [--episodes 100] [--json FILE]`, some five minutes on two
+cores. Claim: 100 episodes of random track, lanes, traffic, start, rate, controls, noise, sensors
+and, for every fifth, pictures in random light, give bit-equal observations, rewards, states, true
+features and info (a) in a process, (b) in another one that runs them in the opposite order and
+(c) beside each other in Gymnasium's `AsyncVectorEnv`. Each step is added to a SHA-256 as it is
+made.
+"""
+
+import argparse
+import hashlib
+import json
+import os
+import struct
+import sys
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import astuple, dataclass
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("LP_NUM_THREADS", "1")
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.vector import AsyncVectorEnv
+
+import simulator.env  # noqa: F401  (registers the names)
+from simulator.camera.light import KINDS
+from simulator.track.catalogue import OWN_TRACKS
+
+STEPS = 200
+SEED = 20
+PICTURES_EVERY = 5
+BESIDE_EACH_OTHER = 4
+SENSORS = ("range", "range_traffic", "v_x", "engine", "wheel_spin_rear_left")
+
+Step = tuple[Any, float, bool, bool, dict[str, Any]]
+
+
+@dataclass(frozen=True)
+class Episode:
+    """One episode: the environment's options, the seed of its reset and of its actions."""
+
+    number: int
+    seed: int
+    kind: str
+    options: dict[str, Any]
+    start: dict[str, float]
+
+
+def plan(count: int) -> list[Episode]:
+    """`count` random episodes, the same every time."""
+    return [random_episode(number) for number in range(count)]
+
+
+def random_episode(number: int) -> Episode:
+    rng = np.random.default_rng([SEED, number])
+    options: dict[str, Any] = {
+        "track": str(rng.choice(sorted(path.stem for path in OWN_TRACKS.glob("*.toml")))),
+        "lanes": int(rng.integers(1, 4)),
+        "traffic": int(rng.integers(0, 13)),
+        "frequency_hz": int(rng.choice([10, 20, 40, 50])),
+        "controls": str(rng.choice(["steer", "full"])),
+        "noise": bool(rng.random() < 0.5),
+        "sensors": SENSORS,
+        "sensor_noise": {"v_x": 0.3, "range": 0.2} if rng.random() < 0.5 else {},
+    }
+    kind = "state"
+    if number % PICTURES_EVERY == PICTURES_EVERY - 1:
+        kind = "pictures"
+        options |= {"views": ("front", "rear:class", "chase"), "width": 140, "height": 105}
+        options |= {"light": str(rng.choice(KINDS)), "light_seed": int(rng.integers(1000))}
+    start = {
+        "s": float(rng.uniform(0.0, 2000.0)),
+        "to_middle": float(rng.uniform(-1.0, 1.0)),
+        "angle": float(rng.normal(0.0, 0.1)),
+        "speed": float(rng.uniform(0.0, 25.0)),
+    }
+    seed, kind = int(rng.integers(2**31)), f"{kind}, {options['controls']}"
+    return Episode(number, seed, kind, options, start)
+
+
+class Fingerprint(gym.Wrapper[Any, Any, Any, Any]):
+    """Chooses the actions of an episode itself, hashes all that comes of them, and tells in
+    `info["digest"]`; an episode that ended stays as it was."""
+
+    def __init__(self, env: gym.Env[Any, Any], episode: Episode) -> None:
+        super().__init__(env)
+        self._episode = episode
+        self._end: Step | None = None
+
+    def reset(self, **_: Any) -> tuple[Any, dict[str, Any]]:
+        self._hash = hashlib.sha256()
+        self._rng = np.random.default_rng([self._episode.seed, 1])
+        self._end = None
+        observation, self._info = self._told(
+            *self.env.reset(seed=self._episode.seed, options=self._episode.start)
+        )
+        return observation, self._info
+
+    def step(self, action: Any) -> Step:
+        if self._end is not None:
+            return self._end
+        observation, reward, over, _, info = self.env.step(self._action(self._info))
+        self._hash.update(struct.pack("<d?", reward, over))
+        observation, self._info = self._told(observation, info)
+        # The vector is to go on till all episodes are over: an end is told in the digest only.
+        taken = observation, float(reward), False, False, self._info
+        self._end = taken if over else None
+        return taken
+
+    def _action(self, info: dict[str, Any]) -> np.ndarray[Any, Any]:
+        wheel = 2.0 * info["angle"] - 0.2 * info["to_middle"] + self._rng.normal(0.0, 0.2)
+        others = self._rng.random(3) * (0.5, 0.1, 3.0) + (0.0, 0.0, 0.6)
+        action = np.array([np.clip(wheel, -1.0, 1.0), *others], np.float32)
+        return action if self.action_space.shape == (4,) else action[:1]
+
+    def _told(self, observation: Any, info: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
+        world = self.unwrapped.world  # type: ignore[attr-defined]
+        for part in parts(observation):
+            self._hash.update(part)
+        # repr of a float is exact: two that differ in one bit differ in it.
+        self._hash.update(repr((astuple(world.state), world.traffic.poses().tolist())).encode())
+        self._hash.update(repr((world.features(), info)).encode())
+        return observation, info | {"digest": self._hash.hexdigest()}
+
+
+def parts(observation: Any) -> Iterator[bytes]:
+    """The bytes of an observation's arrays, by name."""
+    for name in sorted(observation):
+        yield name.encode() + observation[name].tobytes()
+
+
+def maker(episode: Episode) -> Callable[[], gym.Env[Any, Any]]:
+    def make() -> gym.Env[Any, Any]:
+        env = gym.make("driverview/LateralControl-v0", **episode.options)
+        return Fingerprint(env, episode)
+
+    return make
+
+
+def run_alone(episodes: list[Episode]) -> dict[int, str]:
+    """Steps and digest of each episode, run one after the other."""
+    digests = {}
+    for episode in episodes:
+        env = maker(episode)()
+        env.reset()
+        for _ in range(STEPS):
+            info = env.step(None)[4]
+        env.close()
+        digests[episode.number] = f"{info['steps']} {info['digest']}"
+    return digests
+
+
+def run_beside(episodes: list[Episode]) -> dict[int, str]:
+    """As `run_alone`, but each episode beside others of its kind in an AsyncVectorEnv."""
+    digests: dict[int, str] = {}
+    for kind in sorted({episode.kind for episode in episodes}):
+        alike = [episode for episode in episodes if episode.kind == kind]
+        for first in range(0, len(alike), BESIDE_EACH_OTHER):
+            group = alike[first : first + BESIDE_EACH_OTHER]
+            # Their spaces differ in their limits, which the noise is part of.
+            vector = AsyncVectorEnv(
+                [maker(episode) for episode in group], observation_mode="different"
+            )
+            vector.reset()
+            nothing = vector.action_space.sample()  # the episodes choose for themselves
+            for _ in range(STEPS):
+                *_, infos = vector.step(nothing)
+            vector.close()
+            for episode, *told in zip(group, infos["steps"], infos["digest"], strict=True):
+                digests[episode.number] = " ".join(map(str, told))
+            print(f"{len(digests)} of {len(episodes)} episodes in vectors", file=sys.stderr)
+    return digests
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--episodes", type=int, default=100)
+    parser.add_argument("--json", type=Path, help="write the result to this file as well")
+    arguments = parser.parse_args()
+    episodes, started = plan(arguments.episodes), time.perf_counter()
+    # Vectors first: they fork, and this process has no picture's context yet.
+    beside = run_beside(episodes)
+    with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
+        forwards = pool.submit(run_alone, episodes)
+        backwards = pool.submit(run_alone, episodes[::-1])
+        alone, again = forwards.result(), backwards.result()
+    different = {
+        "another_process": [n for n in alone if alone[n] != again[n]],
+        "async_vector": [n for n in alone if alone[n] != beside[n]],
+    }
+    result = {
+        "episodes": len(episodes),
+        "with_pictures": sum(episode.kind.startswith("pictures") for episode in episodes),
+        "distinct": len(set(alone.values())),
+        "ended_early": sum(int(told.split()[0]) < STEPS for told in alone.values()),
+        "steps": sum(int(told.split()[0]) for told in alone.values()),
+        "seconds": round(time.perf_counter() - started, 1),
+        "different": different,
+        "reached": len(set(alone.values())) == len(episodes) and not any(different.values()),
+    }
+    print(json.dumps(result))
+    if arguments.json is not None:
+        arguments.json.write_text(json.dumps(result, indent=1) + "\n")
+    sys.exit(0 if result["reached"] else 1)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,56 @@
+"""Twelve cars for ten minutes on one, two and three lanes of every track, the own car among them.
+
+Run: `python benchmarks/traffic.py [--minutes 10] [--tracks town,highway] [--json FILE]`. Claim: no
+two cars ever overlap, whether the own car drives along or is parked in the rightmost lane; on two
+and three lanes cars do change lanes. Exits 1 otherwise.
+"""
+
+import argparse
+import json
+import sys
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+from simulator.rush_hour import Disorder, watch
+from simulator.track.catalogue import find_track, track_files
+from simulator.track.road import Road
+
+
+def one(case: tuple[str, int, bool], seconds: float) -> dict[str, Any]:
+    """Watch one road; what was seen, or what went wrong."""
+    name, lanes, parked = case
+    about = {"track": name, "lanes": lanes, "own_car": "parked" if parked else "drives"}
+    try:
+        return about | asdict(watch(Road(find_track(name), lanes), seconds, parked=parked))
+    except Disorder as wrong:
+        return about | {"disorder": str(wrong)}
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--minutes", type=float, default=10.0)
+    parser.add_argument("--tracks", help="names, comma-separated; all that are found without it")
+    parser.add_argument("--json", type=Path, help="write the figures to this file")
+    arguments = parser.parse_args()
+    names = arguments.tracks.split(",") if arguments.tracks else list(track_files())
+    cases = list(product(names, (1, 2, 3), (False, True)))
+    with ProcessPoolExecutor() as pool:
+        results = list(pool.map(one, cases, [60.0 * arguments.minutes] * len(cases)))
+    for result in results:
+        print(json.dumps(result))
+    wrong = [result for result in results if "disorder" in result]
+    changes = {
+        lanes: sum(r.get("lane_changes", 0) for r in results if r["lanes"] == lanes)
+        for lanes in (1, 2, 3)
+    }
+    print(f"{len(results)} roads, {len(wrong)} in disorder; lane changes by lanes: {changes}")
+    if arguments.json:
+        arguments.json.write_text(json.dumps(results, indent=2) + "\n")
+    return 0 if not wrong and changes[1] == 0 and changes[2] > 0 and changes[3] > 0 else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,111 @@
+"""What a LeRobot export holds of each frame, and how it stands in its parquet files.
+
+Source: LeRobotDataset v3.0, github.com/huggingface/lerobot. Vectors are float32; an absent distance
+is NaN, as lists of its tensors hold no nulls. Units and signs are those of the recording.
+"""
+
+import json
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+import trackfeatures as tf
+from datagen.export.webdataset import SUFFIX
+from datagen.recording.camera import CameraInfo
+from datagen.steps import Step, values
+
+IMAGE = "observation.images.front"
+STATE = ("vx", "vy", "yaw_rate")
+POSE = ("x", "y", "z", "yaw", "pitch", "roll")
+ACTION = ("steer", "throttle", "brake", "gear")
+LABELS = (
+    *(f"to_marking_{name}" for name in tf.MARKINGS),
+    "to_lane_centre", "angle", "heading", "lanes", "lane_index", "curvature", "to_middle", "s",
+)  # fmt: skip
+VECTORS = {
+    "observation.state": STATE,
+    "action": ACTION,
+    "labels": LABELS,
+    "pose": POSE,
+    "shadow_fraction": ("shadow_fraction",),
+}
+COUNTERS = ("frame_index", "episode_index", "index", "task_index")
+
+Columns = dict[str, NDArray[Any]]
+
+
+def features(camera: CameraInfo) -> dict[str, Any]:
+    """`features` of meta/info.json."""
+    image = {
+        "dtype": "image",
+        "shape": [camera.height, camera.width, 3],
+        "names": ["height", "width", "channels"],
+    }
+    vectors = {
+        name: {"dtype": "float32", "shape": [len(parts)], "names": list(parts)}
+        for name, parts in VECTORS.items()
+    }
+    scalar = {"shape": [1], "names": None}
+    time = {"timestamp": {"dtype": "float32", **scalar}}
+    counters = {name: {"dtype": "int64", **scalar} for name in COUNTERS}
+    return {IMAGE: image, **vectors, **time, **counters}
+
+
+def columns(steps: Sequence[Step], fps: int, episode: int, first: int, task: int) -> Columns:
+    """The numbers of an episode, one row a frame; `first` is the number of its first frame."""
+    rows = [_row(step) for step in steps]
+    found: Columns = {
+        name: np.array([[row[part] for part in parts] for row in rows], np.float32)
+        for name, parts in VECTORS.items()
+    }
+    frame = np.arange(len(steps), dtype=np.int64)
+    found["timestamp"] = (frame / fps).astype(np.float32)
+    found["frame_index"], found["index"] = frame, frame + first
+    found["episode_index"] = np.full_like(frame, episode)
+    found["task_index"] = np.full_like(frame, task)
+    return found
+
+
+def _row(step: Step) -> dict[str, Any]:
+    """Every number of a frame by name; absent ones None, which becomes NaN."""
+    row = values(step.labels) | values(step.ego) | values(step.command)
+    return row | {"heading": step.labels.heading}
+
+
+def table(steps: Sequence[Step], numbers: Columns, codec: str) -> pa.Table:
+    """An episode as it stands in data/."""
+    images = pa.StructArray.from_arrays(
+        [
+            pa.array([bytes(step.image) for step in steps], pa.binary()),
+            pa.array([f"frame-{step.number:06d}.{SUFFIX[codec]}" for step in steps], pa.string()),
+        ],
+        names=["bytes", "path"],
+    )
+    arrays = {IMAGE: images} | {name: _array(column) for name, column in numbers.items()}
+    return pa.table(arrays).replace_schema_metadata({"huggingface": _hugging_face()})
+
+
+def _array(column: NDArray[Any]) -> pa.Array:
+    if column.ndim == 1:
+        return pa.array(column)
+    if column.shape[1] == 1:  # a vector of one is a plain number there
+        return pa.array(column[:, 0])
+    return pa.FixedSizeListArray.from_arrays(pa.array(column.ravel()), column.shape[1])
+
+
+def _hugging_face() -> str:
+    """What tells the library `datasets` that the images are images."""
+    types: dict[str, Any] = {IMAGE: {"_type": "Image"}}
+    for name, parts in VECTORS.items():
+        number = {"dtype": "float32", "_type": "Value"}
+        types[name] = (
+            number
+            if len(parts) == 1
+            else {"feature": number, "length": len(parts), "_type": "Sequence"}
+        )
+    types["timestamp"] = {"dtype": "float32", "_type": "Value"}
+    types |= {name: {"dtype": "int64", "_type": "Value"} for name in COUNTERS}
+    return json.dumps({"info": {"features": types}})

@@ -1,0 +1,92 @@
+"""One export: chosen rounds of a dataset, in one format, into a folder that was not there."""
+
+from dataclasses import asdict, dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from datagen.export import webdataset
+from datagen.export.card import card
+from datagen.export.sides import Progress, Side, sides
+from datagen.export.target import new_folder, require_free
+from datagen.recording.dataset import Dataset
+from trackfeatures.errors import UserError
+
+FORMATS = ("webdataset", "lerobot")
+
+
+@dataclass(frozen=True, slots=True)
+class Wanted:
+    """What to export, and how."""
+
+    format: str
+    split: str = "all"
+    """train, test, unseen or all."""
+    shard_size: int = 1000
+    """Frames of a WebDataset shard."""
+    shuffle: bool = False
+    """Put WebDataset's frames in random order, the same each time."""
+
+    def require_sane(self) -> None:
+        """Raise UserError where it cannot be done, before anything is read."""
+        if self.format not in FORMATS:
+            raise UserError(f"there is no format {self.format!r}; choose {' or '.join(FORMATS)}")
+        if self.shard_size < 1:
+            raise UserError(f"a shard of {self.shard_size} frames holds none; give at least 1")
+        if self.format == "lerobot" and self.shuffle:
+            raise UserError("LeRobot's episodes are in order of time; leave --shuffle away")
+        if self.format == "lerobot" and find_spec("pyarrow") is None:
+            raise UserError(
+                "LeRobot's format needs pyarrow, which is not installed; "
+                "run `pip install 'driverview[export]'`"
+            )
+
+
+@dataclass(frozen=True, slots=True)
+class Exported:
+    """`content_hash` is that of the dataset it was made from."""
+
+    format: str
+    out: str
+    rounds: int
+    frames: int
+    files: int
+    bytes: int
+    content_hash: str
+
+    def as_json(self) -> dict[str, Any]:
+        return asdict(self)
+
+
+def export(folder: Path, out: Path, wanted: Wanted, progress: Progress) -> Exported:
+    """Write the export. Raises UserError (DatasetError) or OSError; `out` is then not there."""
+    wanted.require_sane()
+    require_free(out)
+    dataset = Dataset.open(folder)
+    parts = sides(dataset, wanted.split)
+    with new_folder(out) as partial:
+        _write(partial, dataset, parts, wanted, progress)
+        about = card(dataset, parts, wanted.format, wanted.shard_size)
+        (partial / "README.md").write_text(about, encoding="utf-8")
+        files = [path for path in partial.rglob("*") if path.is_file()]
+        size = sum(path.stat().st_size for path in files)
+    return Exported(
+        format=wanted.format,
+        out=str(out),
+        rounds=sum(len(side.rounds) for side in parts),
+        frames=sum(side.frames for side in parts),
+        files=len(files),
+        bytes=size,
+        content_hash=dataset.content_hash,
+    )
+
+
+def _write(
+    partial: Path, dataset: Dataset, parts: list[Side], wanted: Wanted, progress: Progress
+) -> None:
+    if wanted.format == "webdataset":
+        webdataset.write(partial, parts, wanted.shard_size, wanted.shuffle, progress)
+        return
+    from datagen.export import lerobot
+
+    lerobot.write(partial, parts, dataset.camera, progress)

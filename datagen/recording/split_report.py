@@ -1,0 +1,119 @@
+"""Checking or making the split of a dataset, and what it has in common across its sides."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .dataset import Dataset, round_files
+from .divide import divide
+from .errors import DatasetError
+from .header import RoundInfo
+from .index import open_round
+from .neighbours import Neighbours, Tolerances, find_neighbours
+from .splits import SIDES, RoundKey, read_split, require_disjoint, split_path, write_split
+
+TRAIN = SIDES[0]
+TOLD = 3  # of the nearest pairs, to people
+
+
+@dataclass(frozen=True, slots=True)
+class Wanted:
+    """How to make a split."""
+
+    by: str = "round"
+    test_share: float = 0.25
+    seed: int = 0
+    with_recovered: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class SplitReport:
+    """A sound split: its size, and by side the frames that nearly stand among those of train."""
+
+    path: Path
+    made: bool
+    rounds: dict[str, int]
+    frames: dict[str, int]
+    near: dict[str, Neighbours]
+
+    def as_json(self) -> dict[str, Any]:
+        return {
+            "path": str(self.path),
+            "made": self.made,
+            "rounds": self.rounds,
+            "frames": self.frames,
+            "near_duplicates": {side: found.as_json() for side, found in self.near.items()},
+        }
+
+
+def make_split(folder: Path, name: str, wanted: Wanted) -> Path:
+    """Write a new split; what is unseen in the dataset's own split stays so.
+
+    DatasetError when there is one of that name, rounds are too few, or it would leak.
+    """
+    path = split_path(folder, name)
+    if path.exists():
+        raise DatasetError(f"{path} exists and stays as it is; choose another --name")
+    indexes = [open_round(file) for file in round_files(folder)]
+    usable = [ix for ix in indexes if wanted.with_recovered or ix.recovery is None]
+    own = split_path(folder)
+    unseen = set(read_split(own).unseen) if own.exists() else set()
+    infos = [
+        RoundInfo.of(ix.path, ix.header, ix.result, "")
+        for ix in usable
+        if ix.header.id not in unseen
+    ]
+    split = replace(
+        divide(infos, wanted.by, wanted.test_share, wanted.seed),
+        unseen=tuple(ix.header.id for ix in usable if ix.header.id in unseen),
+        recovered=tuple(ix.header.id for ix in usable if ix.recovery is not None),
+    )
+    require_disjoint(
+        split, [RoundKey(ix.header.id, ix.header.seed, ix.result.content_hash) for ix in usable]
+    )
+    path.parent.mkdir(exist_ok=True)
+    write_split(path, split)
+    return path
+
+
+def check_split(folder: Path, name: str, tolerances: Tolerances, *, made: bool) -> SplitReport:
+    """The report of a split; DatasetError when a round, seed or content is on both sides."""
+    dataset = Dataset.open(folder, name)
+    frames = dataset.select("all")
+    sides = np.array([info.split for info in frames.rounds])
+    of_frame = sides[frames.labels.round]
+    here = [side for side in SIDES if (sides == side).any()]
+    return SplitReport(
+        path=split_path(folder, name),
+        made=made,
+        rounds={side: int((sides == side).sum()) for side in here},
+        frames={side: int((of_frame == side).sum()) for side in here},
+        near={
+            side: find_neighbours(
+                frames.labels, frames.rounds, of_frame == side, of_frame == TRAIN, tolerances
+            )
+            for side in here
+            if side != TRAIN
+        },
+    )
+
+
+def as_text(report: SplitReport) -> str:
+    """The report for people: a line a side, the nearest pairs below it."""
+    lines = [f"{report.path}{' (made)' if report.made else ''}: nothing stands on two sides"]
+    for side, rounds in report.rounds.items():
+        line = f"  {side:<6} {rounds} rounds, {report.frames[side]} frames"
+        found = report.near.get(side)
+        if found is None:
+            lines.append(line)
+            continue
+        share = found.near / max(found.frames, 1)
+        lines.append(f"{line}; {found.near} ({share:.1%}) nearly as one in {TRAIN}")
+        lines += [
+            f"    {p.round} frame {p.frame} and {p.other_round} frame {p.other_frame}: "
+            f"{p.track}, {p.s_m:.1f} m, {p.distance:.2f} of the tolerances apart"
+            for p in found.worst[:TOLD]
+        ]
+    return "\n".join(lines)

@@ -1,0 +1,159 @@
+"""What a viewer shows of a round: images, markings, poses, boxes, and named series over time.
+
+Frames and units are those of the recording; absent values of a series are None.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+import trackfeatures as tf
+from datagen.recording.errors import DatasetError
+from datagen.recording.header import RoundHeader
+from datagen.recording.messages import EGO, WORLD
+from datagen.recording.topics import (
+    ANNOTATIONS,
+    MESSAGE_TYPES,
+    TRACK_SCENE,
+    TRAFFIC,
+    TRANSFORMS,
+)
+from datagen.steps import Step, Steps, values
+
+KMH = 3.6
+Numbers = list[float | None]
+Points = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Plot:
+    """Series of one unit in one picture, on a scale of `limits` or of what there is.
+
+    `dots`: values may be absent, so that a line between neighbours would tell of what is not there.
+    """
+
+    title: str
+    unit: str
+    series: dict[str, Numbers]
+    dots: bool = False
+    limits: tuple[float, float] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Pose:
+    """`place` (3,) m and `turn` (4,) x, y, z, w, of a frame in its parent."""
+
+    place: Points
+    turn: Points
+
+
+@dataclass(frozen=True, slots=True)
+class Box:
+    """`size` (3,) m, with its middle at `pose`."""
+
+    pose: Pose
+    size: Points
+
+
+@dataclass(frozen=True)
+class Contents:
+    """A round with all its topics; what is asked for is parsed then."""
+
+    steps: Steps
+
+    @staticmethod
+    def open(path: Path) -> "Contents":
+        """Raises DatasetError where there is no whole round."""
+        if path.is_dir():
+            example = next(iter(sorted(path.glob("rounds/*.mcap"))), path / "rounds/ID.mcap")
+            raise DatasetError(f"{path} is a folder; name one of its rounds, such as {example}")
+        return Contents(Steps.open(path, tuple(MESSAGE_TYPES)))
+
+    @property
+    def header(self) -> RoundHeader:
+        return self.steps.index.header
+
+    @property
+    def about(self) -> str:
+        """The round in a line."""
+        h, frames = self.header, len(self.steps)
+        lanes = f"{h.lanes} lane{'' if h.lanes == 1 else 's'}"
+        cars = f"{h.traffic} other car{'' if h.traffic == 1 else 's'}"
+        return (
+            f"{h.id}: {h.track}, {lanes}, {cars}, {h.light}, {h.trajectory}, {h.speed_kmh:g} km/h; "
+            f"{frames} frames, {frames / h.frequency_hz:g} s"
+        )
+
+    @cached_property
+    def plots(self) -> list[Plot]:
+        return _plots(list(self.steps))
+
+    def markings(self, number: int) -> list[Points]:
+        """True markings over the image, (k, 2) px each."""
+        lines = self.steps.message(ANNOTATIONS, number).points
+        return [np.array([(p.x, p.y) for p in line.points]).reshape(-1, 2) for line in lines]
+
+    def caption(self, number: int) -> str:
+        return " ".join(t.text for t in self.steps.message(ANNOTATIONS, number).texts)
+
+    def pose(self, number: int, child: str = EGO) -> Pose:
+        """Of the car in the world, or of another frame in its parent."""
+        for found in self.steps.message(TRANSFORMS, number).transforms:
+            if found.child_frame_id == child:
+                return Pose(_vector(found.translation), _quaternion(found.rotation))
+        raise DatasetError(f"{self.steps.index.path}: no transform of {child} in step {number}")
+
+    def boxes(self, number: int, frame: str = WORLD) -> list[Box]:
+        """The other cars in the world, or in frame `EGO` the car itself."""
+        entities = self.steps.message(TRAFFIC, number).entities
+        return [
+            Box(Pose(_vector(c.pose.position), _quaternion(c.pose.orientation)), _vector(c.size))
+            for entity in entities
+            if entity.frame_id == frame
+            for c in entity.cubes
+        ]
+
+    @cached_property
+    def scene(self) -> dict[str, Points]:
+        """The track's lines in the world by name, (N, 3) m each."""
+        return {
+            entity.id: np.array([(p.x, p.y, p.z) for line in entity.lines for p in line.points])
+            for entity in self.steps.message(TRACK_SCENE, 0).entities
+        }
+
+
+def _plots(steps: list[Step]) -> list[Plot]:
+    labels = [values(step.labels) for step in steps]
+    command = [values(step.command) for step in steps]
+    markings = {name: _column(labels, f"to_marking_{name}") for name in tf.MARKINGS}
+    offsets = {name: _column(labels, name) for name in ("to_lane_centre", "to_middle")}
+    speed: Numbers = [step.ego.vx * KMH for step in steps]
+    heading: Numbers = [float(step.labels.heading) for step in steps]
+    shadow: Numbers = [step.ego.shadow_fraction for step in steps]
+    pedals = {name: _column(command, name) for name in ("steer", "throttle", "brake")}
+    return [
+        Plot("Distances to markings", "m", markings, dots=True),
+        Plot("Offset, left positive", "m", offsets, dots=True),
+        Plot("Angle, positive to the right", "rad", {"angle": _column(labels, "angle")}),
+        Plot("Heading", "0 left, 1 straight, 2 right", {"heading": heading}, limits=(-0.2, 2.2)),
+        Plot("Command, steer left positive", "share", pedals, limits=(-1.1, 1.1)),
+        Plot("Speed", "km/h", {"speed": speed}),
+        Plot("Road in shadow within 30 m", "share", {"shadow": shadow}, limits=(-0.1, 1.1)),
+    ]
+
+
+def _column(rows: Iterable[dict[str, Any]], name: str) -> Numbers:
+    return [row[name] for row in rows]
+
+
+def _vector(message: Any) -> Points:
+    return np.array([message.x, message.y, message.z])
+
+
+def _quaternion(message: Any) -> Points:
+    return np.array([message.x, message.y, message.z, message.w])

@@ -1,0 +1,82 @@
+// Asphalt and the paint on it from (s, y); every edge is filtered over the pixel's footprint.
+in vec2 track;
+in vec2 world;
+in vec2 reach;
+in vec3 mist;
+in vec3 plain_verge;
+#ifdef RAIN
+in vec3 place;
+in vec3 normal;
+#endif
+void main() {
+    float s = track.x, y = track.y;
+    float ws = fwidth(s) + 1e-5, wy = fwidth(y) + 1e-5;
+    vec4 fine = texture(noise, world * 0.31);
+    vec4 broad = texture(noise, track * vec2(0.0113, 0.041));
+    float away = abs(y);
+
+    // Asphalt: grain, stains, long patches, two tyre tracks a lane, cracks.
+    float lane_left = lanes.x * 0.5 * lanes.y;
+    float in_lane = mod(lane_left - y, lanes.y) - 0.5 * lanes.y;
+    float track_off = abs(abs(in_lane) - 0.8);
+    float worn = asphalt.w;
+    float tone = 0.86 + 0.34 * (fine.r - 0.5) + (0.25 + 0.5 * worn) * (broad.g - 0.5) + 0.2 * (fine.g - 0.5);
+    tone *= 1.0 - 0.14 * exp2(-8.0 * track_off * track_off) * step(away, lane_left);
+    // Cracks from two layers of ridges of unlike scale, so that no tile repeats; thin, and few.
+    float crack = smoothstep(0.90, 0.97, max(fine.a, broad.a - 0.02)) * smoothstep(0.50, 0.75, broad.b);
+    tone *= 1.0 - 0.45 * soil.w * crack;
+    vec3 colour = asphalt.rgb * max(tone, 0.2);
+    float repair = smoothstep(0.66, 0.67 + 0.02 * ws, broad.b + 0.03 * fine.g) * worn;
+    colour *= 1.0 - 0.28 * repair;
+
+    // Paint: the nearest of the lines, its coverage, and what wear has left of it.
+    float number = clamp(floor((lane_left - y) / lanes.y + 0.5), 0.0, lanes.x);
+    float line_y = lane_left - number * lanes.y;
+    float paint = covered(y, wy, line_y - left_line.w, line_y + left_line.w);
+    bool divider = number > 0.5 && number < lanes.x - 0.5;
+    if (divider) paint *= repeated(s, ws, dashes.x, dashes.y);
+    float grit = fine.g * 0.55 + broad.g * 0.45;
+    float left_over = 1.0 - line.w * (0.35 + 0.65 * smoothstep(0.40, 0.62, grit));
+    // Where the asphalt was mended most, nobody has painted it again.
+    float gap = smoothstep(1.0 - dashes.z - 0.03, 1.0 - dashes.z + 0.03, broad.b);
+    gap *= step(0.001, dashes.z);
+    paint *= left_over * (1.0 - 0.92 * gap);
+    vec3 paint_colour = number < 0.5 ? left_line.rgb : line.rgb;
+    colour = mix(colour, paint_colour * (0.88 + 0.24 * fine.r), paint);
+
+#ifdef RAIN
+    // Water darkens the porous asphalt more than the paint on it, and stands in tracks and hollows.
+    colour *= mix(0.58, 0.92, paint) + 0.25 * (1.0 - horizon.w);
+    float film = horizon.w * (0.45 + 0.55 * smoothstep(0.45, 0.75, broad.g * 0.6 + broad.b * 0.4 + 0.25 * exp2(-10.0 * track_off * track_off)));
+#endif
+#ifdef SNOW
+    // Wheels keep two tracks a lane clear; between them lies slush, deeper towards the side.
+    float rut = smoothstep(0.16, 0.50, track_off + 0.30 * (broad.g - 0.5) + 0.10 * (fine.g - 0.5));
+    float side_m = max(away - lane_left + 0.3, 0.0);
+    float depth = 0.55 * fine.g + 0.45 * broad.b + 0.8 * horizon.w - 0.62 + 0.5 * smoothstep(0.0, 1.1, side_m);
+    depth = smoothstep(0.0, 0.38, depth) * mix(rut, 1.0, smoothstep(0.2, 0.9, side_m));
+    depth = max(depth, 0.10 * rut * horizon.w);
+    depth *= 1.0 - 0.45 * paint;
+    vec3 slush = mix(vec3(0.27, 0.275, 0.29), WHITE, smoothstep(0.45, 1.0, depth));
+    colour = mix(colour * mix(0.78, 0.95, paint), slush * (0.9 + 0.2 * fine.r), min(depth * 1.15, 1.0));
+#endif
+
+#ifdef LABELS
+    // What the middle of the pixel shows; there is no half a class.
+    bool painted = abs(y - line_y) < left_line.w && gap < 0.5;
+    if (divider && fract(s / dashes.y) * dashes.y > dashes.x) painted = false;
+    SHOW(pixel, painted ? MARKING : ROAD);
+#else
+    float inside = covered(y, wy, -lanes.z, lanes.z);
+    colour = mix(plain_verge, colour, inside);
+#ifdef RAIN
+    vec3 ripple = vec3((fine.rg - 0.5) * 0.05, 0.0);
+    vec3 light = reaching(colour, reach, 1.0);
+    pixel = shown(light + mirrored(normalize(normal + ripple), place, film * inside, fine.g) * reach.y, mist);
+#elif defined(SNOW)
+    pixel = shown(reaching(colour, reach, 1.0), mist);
+#else
+    pixel = shown(reaching(colour, reach, sunshine(track)), mist);
+#endif
+#endif
+}

@@ -1,0 +1,69 @@
+"""Boxes and faces of which props and bridges are put together, as triangles.
+
+A vertex is place, normal, colour, (u, v) in metres and the number of its material; the frame is
+the maker's own, z up, metres.
+"""
+
+from collections.abc import Sequence
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+Point = tuple[float, float, float]
+
+PLAIN, FACADE, CROWD, BOARD, STRIPED, TILES, MASONRY, EARTH = (float(k) for k in range(8))
+"""Materials, as prop.frag.glsl numbers them."""
+
+
+def box(
+    size: Point, at: Point, colour: Point, material: float = PLAIN, *, floor: bool = False
+) -> FloatArray:
+    """A box that stands on `at`, the middle of its floor, (30, 12) or with the floor (36, 12).
+
+    Its sides are of `material`; above and below, a facade's box is plain.
+    """
+    rows = _unit_box()[: 36 if floor else 30].copy()
+    rows[:, :3] = rows[:, :3] * size + at
+    # Sides are as long as the box in y (the first two) or x, and as high; the others lie flat.
+    x, y, z = size
+    rows[:12, 9:11] *= (y, z)
+    rows[12:24, 9:11] *= (x, z)
+    rows[24:, 9:11] *= (x, y)
+    rows[:, 6:9] = colour
+    rows[:24, 11] = material
+    rows[24:, 11] = PLAIN if material == FACADE else material
+    return rows
+
+
+@cache
+def _unit_box() -> FloatArray:
+    """Six faces of a box of 1 m: the sides +x, -x, +y, -y, the top and the floor."""
+    up, uv = np.array([0.0, 0.0, 1.0]), ((0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0))
+    black = (0.0, 0.0, 0.0)
+    faces = []
+    for x, y in ((1, 0), (-1, 0), (0, 1), (0, -1)):
+        middle, along = np.array([x, y, 0.0]) / 2, np.array([-y, x, 0.0]) / 2
+        corners = [middle - along, middle + along, middle + along + up, middle - along + up]
+        faces.append(face(corners, uv, black, PLAIN))
+    ring = [np.array([x, y, 0.0]) / 2 for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
+    faces.append(face([corner + up for corner in ring], uv, black, PLAIN))
+    faces.append(face([ring[k] for k in (0, 3, 2, 1)], uv, black, PLAIN))
+    return np.concatenate(faces)
+
+
+def face(
+    corners: Sequence[FloatArray], uv: Sequence[tuple[float, float]], colour: Point, material: float
+) -> FloatArray:
+    """A face of four corners, counter-clockwise from outside, as two triangles (6, 12)."""
+    rows = np.empty((6, 12))
+    order = [0, 1, 2, 0, 2, 3]
+    rows[:, :3] = np.array(corners)[order]
+    (ax, ay, az), (bx, by, bz) = (corners[1] - corners[0]), (corners[2] - corners[0])
+    normal = np.array([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
+    rows[:, 3:6] = normal / max(float(np.sqrt(normal @ normal)), 1e-9)
+    rows[:, 6:9] = colour
+    rows[:, 9:11] = np.array(uv)[order]
+    rows[:, 11] = material
+    return rows

@@ -1,0 +1,204 @@
+"""A client of the link in Python.
+
+    from simulator.link.client import Link
+    from simulator.state import Command
+
+    with Link("/driverview", wait_s=30.0) as link:
+        message = link.reset(seed=1)
+        while message.ended is None:
+            message = link.step(Command(steer=-0.5 * message.state.to_middle, throttle=0.2))
+
+Give one Link to one thread of one process.
+"""
+
+import math
+import os
+import time
+from types import TracebackType
+from typing import Self
+
+from simulator.link import futex
+from simulator.link.channel import Receiver, Sender, state_image_bytes
+from simulator.link.errors import (
+    DamagedMessage,
+    EngineDied,
+    LinkError,
+    LinkTimeout,
+    NoEngine,
+    Refused,
+)
+from simulator.link.handshake import EngineInfo, phase, read_header
+from simulator.link.layout import COMMAND, STATE, Phase, Request
+from simulator.link.message import Message, read_message, write_command
+from simulator.link.segment import Segment, attach
+from simulator.state import Command
+
+DEFAULT_NAME = "/driverview"
+SLICE_S = 0.05
+"""Between two looks at whether the engine lives."""
+RETRY_S = 0.02
+
+
+class Link:
+    """One client of one engine. `wait_s`: how long to wait for an engine that is not there yet;
+    `timeout_s`: for an answer of one that lives.
+
+    Every call raises EngineDied within a moment of the engine's end, LinkTimeout, or Refused when
+    the engine will not do what was asked. The constructor raises NoEngine, NameInUse,
+    LayoutMismatch.
+    """
+
+    def __init__(
+        self, name: str = DEFAULT_NAME, *, timeout_s: float = 2.0, wait_s: float = 0.0
+    ) -> None:
+        futex.check_system()
+        self._segment, self.info = _attach(name, wait_s)
+        self._outbox = Sender(self._segment, COMMAND)
+        self._inbox = Receiver(self._segment, STATE, state_image_bytes(self._segment))
+        before = Receiver(self._segment, COMMAND)
+        before.poll()
+        self._timeout_s = timeout_s
+        self._number = 0
+        self._outbox.record["session"] = before.record["session"] + 1
+        self._outbox.record["client_pid"] = os.getpid()
+        self._closed = False
+
+    def reset(
+        self,
+        *,
+        seed: int | None = None,
+        s: float | None = None,
+        to_middle: float = 0.0,
+        angle: float = 0.0,
+        speed: float = 0.0,
+    ) -> Message:
+        """Start an episode, as `World.reset`; without `seed` the engine chooses one."""
+        record = self._outbox.record
+        record["request"] = Request.RESET
+        record["seed"] = -1 if seed is None else seed
+        record["start_s"] = math.nan if s is None else s
+        record["start_to_middle"], record["start_angle"] = to_middle, angle
+        record["start_speed"] = speed
+        return self._ask()
+
+    def step(self, command: Command) -> Message:
+        """Hold `command` for a control step. In real time: from the next step on."""
+        write_command(self._outbox.record, command)
+        return self._ask()
+
+    def latest(self) -> Message:
+        """The newest message, without asking for anything: to look on in real time."""
+        self._check_open()
+        self._receive()
+        return self._message()
+
+    def quit(self) -> None:
+        """End the engine, and this link."""
+        self._outbox.record["request"] = Request.QUIT
+        self._exchange()
+        self._closed = True
+        self._segment.close()
+
+    def close(self) -> None:
+        """Take our leave; the engine waits for its next client."""
+        if self._closed:
+            return
+        try:
+            self._outbox.record["request"] = Request.LEAVE
+            self._exchange()
+        except LinkError:
+            pass  # it is gone or does not listen: all the same now
+        self._closed = True
+        self._segment.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def _ask(self) -> Message:
+        self._exchange()
+        record = self._inbox.record
+        if record["error"]:
+            text = record["error_text"].decode(errors="ignore")
+            raise Refused(int(record["error"]), text)
+        return self._message()
+
+    def _exchange(self) -> None:
+        """Send the command and wait for the message that answers it."""
+        self._check_open()
+        self._number += 1
+        record = self._outbox.record
+        record["number"], record["seen"] = self._number, self._inbox.record["number"]
+        self._outbox.send()
+        until = time.monotonic() + self._timeout_s
+        while not (self._receive(SLICE_S) and self._answered()):
+            if time.monotonic() > until:
+                raise LinkTimeout(
+                    f"{self._engine} lives, but has not answered within {self._timeout_s:g} s; "
+                    "is it stopped, or too busy? A longer timeout_s waits longer"
+                )
+
+    def _receive(self, seconds: float = 0.0) -> bool:
+        """Whether a new message came within `seconds`. Raises EngineDied, DamagedMessage."""
+        came = self._inbox.wait(seconds) if seconds else self._inbox.poll()
+        if not came and not self._segment.other_end_lives():
+            came = self._inbox.poll()  # its last word may have come meanwhile
+            if not came:
+                self._give_up()
+        if came and self._inbox.damaged:
+            raise DamagedMessage(f"a message of {self._engine} is damaged: its checksum is wrong")
+        return came
+
+    def _answered(self) -> bool:
+        mine, theirs = self._outbox.record, self._inbox.record
+        return bool(theirs["session"] == mine["session"] and theirs["answers"] == mine["number"])
+
+    def _give_up(self) -> None:
+        ended = phase(self._segment) == Phase.CLOSED
+        self._closed = True
+        self._segment.close()
+        raise EngineDied(
+            f"{self._engine} has {'ended' if ended else 'died'} (the last message was of step "
+            f"{int(self._inbox.record['step'])}); start it again"
+        )
+
+    def _message(self) -> Message:
+        record, image = self._inbox.record, None
+        if not record["number"]:
+            raise LinkError(f"{self._engine} has sent nothing yet; ask for a reset first")
+        height, width = self.info.image_height, self.info.image_width
+        if width:
+            image = self._inbox.image[: height * width * 3].reshape(height, width, 3)
+        return read_message(record, image)
+
+    def _check_open(self) -> None:
+        if self._closed or self._segment.descriptor < 0:
+            raise LinkError(f"the link to {self._engine} is closed; make a new one")
+
+    @property
+    def _engine(self) -> str:
+        return f"the engine of {self._segment.name} (process {self.info.engine_pid})"
+
+
+def _attach(name: str, wait_s: float) -> tuple[Segment, EngineInfo]:
+    """Attach to a ready engine, trying again for `wait_s`."""
+    until = time.monotonic() + wait_s
+    while True:
+        try:
+            segment = attach(name)
+            try:
+                return segment, read_header(segment)
+            except BaseException:
+                segment.close()
+                raise
+        except NoEngine:
+            if time.monotonic() >= until:
+                raise
+        time.sleep(RETRY_S)

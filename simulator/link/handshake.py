@@ -1,0 +1,115 @@
+"""The header: what the engine says of itself, and how a client makes sure it understands it."""
+
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from simulator.link import layout
+from simulator.link.errors import LayoutMismatch
+from simulator.link.layout import HEADER, IDENTITY, MAGIC, Mode, Phase
+from simulator.link.segment import Segment
+from simulator.link.seqlock import get_word, set_word
+
+
+@dataclass(frozen=True)
+class EngineInfo:
+    """What holds as long as the engine runs; the layout's HEADER gives the units."""
+
+    track: str
+    lanes: int
+    lane_width: float
+    track_length: float
+    half_width: float
+    edge: float
+    steering_lock: float
+    traffic: int
+    frequency_hz: int
+    mode: Mode
+    image_width: int
+    image_height: int
+    engine_pid: int
+    beam_angles: tuple[float, ...]
+
+
+def write_header(segment: Segment, info: EngineInfo) -> None:
+    """Describe the engine, in a segment not yet published."""
+    record = _record(segment)
+    record["magic"] = MAGIC
+    record["byte_order"] = layout.BYTE_ORDER
+    record["version"] = layout.VERSION
+    record["layout_hash"] = layout.layout_hash()
+    record["segment_size"] = len(segment.memory)
+    record["image_bytes"] = layout.image_bytes(info.image_width, info.image_height)
+    record["phase"] = Phase.OPEN
+    for field in fields(EngineInfo):
+        value = getattr(info, field.name)
+        record[field.name] = _cut(value) if isinstance(value, str) else value
+
+
+def read_header(segment: Segment) -> EngineInfo:
+    """What the engine says of itself. Raises LayoutMismatch."""
+    check_identity(segment)
+    record = _record(segment)
+    values = {field.name: record[field.name].item() for field in fields(EngineInfo)[1:-1]}
+    values["mode"] = Mode(values["mode"])
+    return EngineInfo(
+        track=record["track"].decode(),
+        beam_angles=tuple(record["beam_angles"].tolist()),
+        **values,
+    )
+
+
+def check_identity(segment: Segment) -> None:
+    """Raises LayoutMismatch unless the engine writes the layout that this program reads."""
+    name, size = segment.name, len(segment.memory)
+    if size < IDENTITY.itemsize:
+        raise LayoutMismatch(f"the segment {name} has {size} bytes, too few for a link's header")
+    found: Any = np.frombuffer(segment.memory, IDENTITY, count=1)[0]
+    swapped = int.from_bytes(layout.BYTE_ORDER.to_bytes(4, "big"), "little")
+    if found["byte_order"] == swapped:
+        raise LayoutMismatch(
+            f"the engine of {name} writes the other byte order; run both sides on one machine"
+        )
+    theirs = int(found["version"]), int(found["layout_hash"])
+    ours = layout.VERSION, layout.layout_hash()
+    if theirs != ours:
+        raise LayoutMismatch(
+            f"the engine of {name} writes layout {theirs[0]} ({theirs[1]:016x}), this client reads "
+            f"layout {ours[0]} ({ours[1]:016x}); use the same version of driverview on both sides"
+        )
+    stated = int(found["segment_size"])
+    if size < HEADER.end or not size == stated == layout.STATE.end + _image_bytes(segment):
+        raise LayoutMismatch(
+            f"the segment {name} has {size} bytes and its header says {stated}; it is damaged: "
+            "start the engine again"
+        )
+
+
+def _image_bytes(segment: Segment) -> int:
+    return int(_record(segment)["image_bytes"])
+
+
+def phase(segment: Segment) -> Phase:
+    return Phase(int(get_word(_phase_word(segment))))
+
+
+def set_phase(segment: Segment, value: Phase) -> None:
+    """Everything written before is seen by whoever sees the phase."""
+    set_word(_phase_word(segment), int(value))
+
+
+def _record(segment: Segment) -> Any:
+    """The header in the memory itself, by field names."""
+    return np.frombuffer(segment.memory, HEADER.dtype, count=1)[0]
+
+
+def _phase_word(segment: Segment) -> NDArray[np.uint32]:
+    place, size = HEADER.places["phase"]
+    return segment.bytes()[place : place + size].view(np.uint32)
+
+
+def _cut(text: str) -> bytes:
+    """UTF-8 that fits its field with the 0 behind it."""
+    return text.encode()[:63].decode(errors="ignore").encode()

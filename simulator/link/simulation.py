@@ -1,0 +1,150 @@
+"""What the engine does with a request: it drives the world and writes the answer into a record.
+
+Knows nothing of shared memory. A mistake of the client becomes an error code and a sentence in the
+answer; the car then stands where it stood.
+"""
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from simulator.link.layout import ERROR_BYTES, Refusal, Request
+from simulator.link.message import read_command, write_ending, write_features, write_state
+from simulator.reward import ending, step_reward
+from simulator.sensors.standard import read_range, read_track_range
+from simulator.state import CarState, Command
+from simulator.world import World
+from trackfeatures.errors import UserError
+
+if TYPE_CHECKING:
+    from simulator.camera import Camera
+
+
+class Simulation:
+    """One world behind a link. `record` is a row of the layout's STATE, `image` its picture.
+
+    `seed` chooses the episodes of resets that name none: episode n then has seed + n.
+    """
+
+    def __init__(
+        self,
+        world: World,
+        record: Any,
+        image: NDArray[np.uint8],
+        *,
+        seed: int = 0,
+        camera: "Camera | None" = None,
+    ) -> None:
+        self._world, self._record, self._image = world, record, image
+        self._seed, self._camera = seed, camera
+        self._open = False
+        self._held = Command()
+        self.steps, self.refused = 0, 0
+
+    @property
+    def episodes(self) -> int:
+        return int(self._record["episode"])
+
+    @property
+    def place(self) -> str:
+        """Where in the drive we are, for messages."""
+        return f"at step {int(self._record['step'])} of episode {self.episodes}"
+
+    @property
+    def running(self) -> bool:
+        """Whether there is an episode that has not ended."""
+        return self._open and not self._record["ended"]
+
+    def drop(self) -> None:
+        """End the episode: its client is gone."""
+        self._open = False
+
+    def answer(self, request: Any) -> None:
+        """Do what `request`, a row of the layout's COMMAND, asks for."""
+        record = self._record
+        record["error"], record["error_text"] = Refusal.NONE, b""
+        asked = int(request["request"])
+        if asked == Request.RESET:
+            self._reset(request)
+        elif asked == Request.STEP:
+            self._step(read_command(request))
+        elif asked not in (Request.LEAVE, Request.QUIT):
+            known = ", ".join(f"{kind.value} {kind.name}" for kind in Request)
+            self._refuse(Refusal.UNKNOWN_REQUEST, f"the request is {asked}; there are {known}")
+
+    def reject(self, text: str) -> None:
+        """Answer to a command that came damaged."""
+        self._refuse(Refusal.BAD_CHECKSUM, text)
+
+    def advance(self) -> None:
+        """One more step under the command held, without being asked."""
+        self._measure(self._world.step(self._held), stepped=True)
+
+    def _reset(self, request: Any) -> None:
+        episode = self.episodes + 1
+        seed, s = int(request["seed"]), float(request["start_s"])
+        chosen = seed if seed >= 0 else self._seed + episode
+        try:
+            state = self._world.reset(
+                seed=chosen,
+                s=None if math.isnan(s) else s,
+                to_middle=float(request["start_to_middle"]),
+                angle=float(request["start_angle"]),
+                speed=float(request["start_speed"]),
+            )
+        except UserError as error:
+            self._refuse(Refusal.BAD_RESET, str(error))
+            return
+        self._open, self._held = True, Command()
+        for name in ("step", "late_steps", "score"):
+            self._record[name] = 0
+        self._record["episode"], self._record["seed"] = episode, chosen
+        self._measure(state, stepped=False)
+
+    def _step(self, command: Command) -> None:
+        if not self._open:
+            self._refuse(Refusal.NO_EPISODE, "there is no episode yet; ask for a reset first")
+        elif self._record["ended"]:
+            why = ending(self._world.state)
+            self._refuse(
+                Refusal.EPISODE_ENDED,
+                f"the episode has ended ({why}) at step {int(self._record['step'])}; ask for a "
+                "reset",
+            )
+        else:
+            try:
+                state = self._world.step(command)
+            except UserError as error:
+                self._refuse(Refusal.BAD_COMMAND, str(error))
+                return
+            self._held = command
+            self._measure(state, stepped=True)
+
+    def _measure(self, state: CarState, *, stepped: bool) -> None:
+        """Write down the moment; a reset earns nothing."""
+        record, world = self._record, self._world
+        ended = ending(state)
+        reward = 0.0
+        if stepped:
+            half_width = world.road.half_width
+            reward = step_reward(state.angle, state.to_middle, half_width, ended is not None)
+            record["step"] += 1
+            self.steps += 1
+        record["reward"] = reward
+        record["score"] += reward
+        write_state(record, state)
+        write_ending(record, ended)
+        write_features(record, world.features())
+        record["ranges"] = read_track_range(world)
+        # Without traffic both are the same, and the beams are what costs.
+        record["ranges_traffic"] = read_range(world) if world.traffic.count else record["ranges"]
+        if self._camera is not None:
+            picture = self._camera.render(world.body_pose(), world.traffic.poses())
+            self._image[: picture.size] = picture.ravel()
+
+    def _refuse(self, code: Refusal, text: str) -> None:
+        self.refused += 1
+        self._record["error"] = code
+        self._record["error_text"] = text.encode()[: ERROR_BYTES - 1]

@@ -1,0 +1,86 @@
+"""`simulator tracks`: what tracks there are, and what one looks like.
+
+simulator tracks --tracks-dir FOLDER --json
+simulator tracks plot forza --out forza.png --lanes 2
+"""
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from simulator.track.geometry import Track
+
+TrackName = Annotated[str, typer.Argument(help="Name of a track, or a .xml, .toml or .csv file.")]
+TracksDir = Annotated[
+    Path | None, typer.Option(help="Folder of TORCS (or .toml, .csv) tracks to look in as well.")
+]
+
+tracks = typer.Typer(rich_markup_mode="rich")
+
+
+@tracks.callback(invoke_without_command=True)
+def list_all(
+    context: typer.Context,
+    tracks_dir: TracksDir = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+) -> None:
+    """List all tracks that can be driven, or plot one."""
+    if context.invoked_subcommand is not None:
+        context.obj = tracks_dir
+        return
+    from simulator.track.catalogue import list_tracks
+
+    found = [describe(track) for track in list_tracks(tracks_dir)]
+    if as_json:
+        typer.echo(json.dumps(found, indent=2))
+    else:
+        _print_table(found)
+
+
+@tracks.command()
+def plot(
+    context: typer.Context,
+    track: TrackName,
+    out: Annotated[Path | None, typer.Option(help="PNG file; NAME.png here if not given.")] = None,
+    lanes: Annotated[int, typer.Option(help="Number of lanes, 1 to 3.")] = 1,
+    tracks_dir: TracksDir = None,
+) -> None:
+    """Draw a track: plan, and height, curvature and heading class along the lap, as PNG."""
+    from simulator.track.catalogue import find_track
+    from simulator.track.plot import write_plot
+    from simulator.track.road import Road
+
+    road = Road(find_track(track, tracks_dir or context.obj), lanes)
+    out = out or Path(f"{road.track.name}.png")
+    write_plot(road, out)
+    typer.echo(str(out), err=True)
+
+
+def describe(track: "Track") -> dict[str, str | float]:
+    """What `tracks --json` says of one track; metres."""
+    return {
+        "name": track.name,
+        "source": track.source,
+        "length_m": round(track.length_m, 4),
+        "width_m": track.width,
+        "min_radius_m": round(track.min_radius_m, 4),
+        "z_range_m": round(track.z_range_m, 4),
+    }
+
+
+def _print_table(found: list[dict[str, str | float]]) -> None:
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
+    table = Table()
+    for column in ("track", "source", "length m", "width m", "least radius m", "height range m"):
+        table.add_column(column, justify="left" if column in ("track", "source") else "right")
+    for row in found:
+        table.add_row(
+            *(f"{v:.1f}" if isinstance(v, float) else escape(str(v)) for v in row.values())
+        )
+    Console().print(table)

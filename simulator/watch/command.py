@@ -1,0 +1,92 @@
+"""`simulator watch`: checks what it is asked to do, then drives and serves until Ctrl-C.
+
+simulator watch --track coast --lanes 2 --traffic 6 --port 8765
+"""
+
+import signal
+import socket
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType
+from typing import Final
+
+from simulator.camera import check_light
+from simulator.camera.context import graphics
+from simulator.track.catalogue import find_track
+from simulator.track.road import Road
+from simulator.watch.pace import check_speed
+from trackfeatures.listening import address, bind
+
+FREQUENCY_HZ: Final = 20
+
+
+@dataclass(frozen=True)
+class WatchConfig:
+    """What `simulator watch` is asked to do."""
+
+    track: str = "circuit"
+    lanes: int = 1
+    traffic: int = 0
+    light: str = "clear"
+    host: str = "127.0.0.1"
+    port: int = 8765
+    """0: any free one; the first line says which."""
+    speed: float = 1.0
+    """Simulated seconds a second of the clock."""
+    seed: int = 0
+    tracks_dir: Path | None = None
+
+
+def watch(config: WatchConfig) -> None:
+    """Drive and serve until Ctrl-C. Raises UserError when it cannot begin."""
+    road = Road(find_track(config.track, config.tracks_dir), config.lanes)
+    check_light(config.light)
+    check_speed(config.speed)
+    with bind(config.host, config.port) as listener:
+        listener.listen()
+        graphics()
+        _drive(road, config, listener)
+
+
+def _drive(road: Road, config: WatchConfig, listener: socket.socket) -> None:
+    from simulator.watch.drive import Drive
+    from simulator.watch.hub import Hub
+    from simulator.watch.server import Server
+    from simulator.world import World
+
+    hub = Hub()
+    with World(road, traffic=config.traffic, frequency_hz=FREQUENCY_HZ) as world:
+        drive = Drive(world, hub, light=config.light, seed=config.seed, speed=config.speed)
+        server = Server(hub, listener)
+        try:
+            server.start()
+            url = address(listener, config.host)
+            sys.stderr.write(f"watch {road.track.name} at {url} (Ctrl-C ends it)\n")
+            sys.stderr.flush()
+            with _interrupts() as interrupted:
+                while not interrupted():
+                    drive.advance()
+        finally:
+            server.stop()
+            drive.close()
+    raise KeyboardInterrupt
+
+
+@contextmanager
+def _interrupts() -> Iterator[Callable[[], bool]]:
+    """Whether Ctrl-C was pressed. Raised where it strikes, KeyboardInterrupt can be lost: in a
+    callback or a finaliser Python only reports it. A second one is raised all the same."""
+    seen: list[int] = []
+
+    def note(number: int, _frame: FrameType | None) -> None:
+        seen.append(number)
+        signal.signal(number, signal.default_int_handler)
+
+    before = signal.signal(signal.SIGINT, note)
+    try:
+        yield lambda: bool(seen)
+    finally:
+        signal.signal(signal.SIGINT, before)

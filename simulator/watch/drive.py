@@ -1,0 +1,163 @@
+"""The drive that `simulator watch` shows: a built-in driver, or whoever holds the keys."""
+
+import time
+from typing import Final
+
+import trackfeatures as tf
+from simulator.cruise import Cruise
+from simulator.state import CarState, Command
+from simulator.watch.hub import Browser, Hub
+from simulator.watch.keyboard import Keyboard
+from simulator.watch.messages import scene_message, state_message
+from simulator.watch.orders import Order
+from simulator.watch.pace import Pacer, Rate
+from simulator.watch.pictures import Pictures
+from simulator.watch.score import Score
+from simulator.watch.server import FIRST_VIEW
+from simulator.world import World
+
+SHOW_S: Final = 1.0 / 26.0
+"""A browser is shown something new at most this often (s of the clock)."""
+STALEST_S: Final = 0.25
+"""Pictures are left out when the drive is late, but no longer than this."""
+ENDED_S: Final = 2.0
+"""How long the end of an episode is shown before the next begins."""
+
+
+class Drive:
+    """One endless drive in `world`; what browsers ask of it comes through `hub`.
+
+    Raises NoRendererError at once where nothing can draw.
+    """
+
+    def __init__(
+        self, world: World, hub: Hub, *, light: str = "clear", seed: int = 0, speed: float = 1.0
+    ) -> None:
+        self.world, self.hub = world, hub
+        self.paused = False
+        self.driver = "built-in"
+        self._pacer = Pacer(1.0 / world.frequency_hz, speed)
+        self._speed = speed
+        self._cruise = Cruise(world.road, frequency_hz=world.frequency_hz)
+        self._keyboard = Keyboard(world.road, world.frequency_hz)
+        self._holder: Browser | None = None
+        self._score = Score()
+        self._rate, self._shown = Rate(), Rate()
+        self._pictures = Pictures(world.road, light, seed)
+        self._seed, self._number = seed, 0
+        self._ended_at: float | None = None
+        self._last_show = self._last_picture = 0.0
+        self._taken: set[str] = set()
+        """Views of which there is a picture of the present state."""
+        self._scene = scene_message(world.road, controls=True)
+        self._warm_up()
+        self._start()
+
+    def advance(self) -> None:
+        """One control step, what browsers want to see of it, and the wait until it is due."""
+        self._obey()
+        if self._ended_at is not None:
+            if time.monotonic() - self._ended_at > ENDED_S:
+                self._start()
+        elif not self.paused:
+            self._step()
+        self._show()
+        self._pacer.wait()
+
+    def close(self) -> None:
+        self._pictures.close()
+
+    def _warm_up(self) -> None:
+        """Compile and build what is used first, before anybody waits for it: seconds, more where
+        nothing is cached. Leaves no trace in the drive."""
+        self.world.reset(seed=self._seed)
+        for command in (
+            self._cruise.command(self.world.state, self.world.traffic),
+            self._keyboard.command(self.world.state),
+        ):
+            self.world.step(command)
+        state_message(self.world)
+        self._pictures.take(self.world, [FIRST_VIEW])
+
+    def _start(self) -> None:
+        """The next episode: another seed, so other traffic."""
+        road = self.world.road
+        lane = tf.lane_centre(road.lanes - 1, road.lanes, road.lane_width)
+        self.world.reset(seed=self._seed, to_middle=lane)
+        self._seed += 1
+        self._ended_at = None
+        self._cruise.take_over()
+        self._keyboard.release()
+        self._score.count(self.world)
+        self._taken.clear()
+
+    def _step(self) -> None:
+        self.world.step(self._command(self.world.state))
+        self._rate.add(self._score.count(self.world))
+        self._taken.clear()
+        if self._score.ended is not None:
+            self._ended_at = time.monotonic()
+
+    def _command(self, state: CarState) -> Command:
+        if self.driver == "keyboard":
+            return self._keyboard.command(state)
+        return self._cruise.command(state, self.world.traffic)
+
+    def _obey(self) -> None:
+        orders, left = self.hub.take_orders()
+        for browser, order in orders:
+            self._follow(browser, order)
+        if self._holder in left:
+            self._give_back()
+
+    def _follow(self, browser: Browser, order: Order) -> None:
+        if order.kind == "keys" and isinstance(order.value, frozenset):
+            if order.value:
+                self.driver, self._holder = "keyboard", browser
+            if browser is self._holder:
+                self._keyboard.hold(order.value)
+        elif order.kind == "driver":
+            if order.value == "keyboard":
+                self.driver, self._holder = "keyboard", browser
+            else:
+                self._give_back()
+        elif order.kind == "pause":
+            self.paused = bool(order.value)
+        elif order.kind == "reset":
+            self._start()
+        elif order.kind == "light":
+            self._pictures.set_light(str(order.value))
+            self._taken.clear()
+
+    def _give_back(self) -> None:
+        """The built-in driver goes on, in the lane where the car is."""
+        self.driver, self._holder = "built-in", None
+        self._keyboard.release()
+        self._cruise.take_over()
+
+    def _show(self) -> None:
+        now = time.monotonic()
+        views = [view for view in self.hub.wanted_views() if view not in self._taken]
+        if now - self._last_show < SHOW_S and not (self.paused and views):
+            return
+        self._last_show = now
+        pictures: dict[str, bytes] = {}
+        if views and (not self._pacer.late or now - self._last_picture > STALEST_S):
+            pictures = self._pictures.take(self.world, views)
+            self._taken.update(views)
+            self._last_picture = now
+            self._shown.add(1.0)
+        self._number += 1
+        state = state_message(
+            self.world,
+            number=self._number,
+            **self._score.as_dict(),
+            paused=self.paused,
+            driver=self.driver,
+            light=self._pictures.light,
+            rate=0.0 if self.paused else round(self._rate.value, 2),
+            asked_rate=self._speed,
+            pictures_per_s=round(self._shown.value, 1),
+            watching=self.hub.watching,
+        )
+        self.hub.publish(self._number, self._scene, state, pictures)

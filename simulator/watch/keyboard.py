@@ -1,0 +1,66 @@
+"""Driving with four keys: left and right steer, up accelerates, down brakes."""
+
+import time
+from collections.abc import Callable
+from typing import Final
+
+from simulator.car import CarParameters
+from simulator.speed import Pedals
+from simulator.state import CarState, Command
+from simulator.track.road import Road
+
+HELD_S: Final = 0.7
+"""A browser repeats the keys that are held; from a silent one none is."""
+SIDE_ACCELERATION: Final = 6.0  # m/s2 that a held key asks for
+MOST_STEER: Final = 0.7
+STEER_RATE: Final = 2.0  # 1/s
+FASTEST: Final = 45.0  # m/s
+FORWARD, BACK, COAST = 3.0, -7.0, -0.6  # m/s2
+
+
+class Keyboard:
+    """Turns the keys held down into commands, smoothly, at any speed."""
+
+    def __init__(
+        self, road: Road, frequency_hz: int, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        self._road = road
+        self._dt = 1.0 / frequency_hz
+        self._car = CarParameters()
+        self._pedals = Pedals(self._car)
+        self._clock = clock
+        self.release()
+
+    def release(self) -> None:
+        """No key is held, and the wheel stands straight."""
+        self._keys: frozenset[str] = frozenset()
+        self._until = 0.0
+        self._steer = 0.0
+        self._pedals.reset()
+
+    def hold(self, keys: frozenset[str]) -> None:
+        """These keys are down now."""
+        self._keys, self._until = keys, self._clock() + HELD_S
+
+    def command(self, state: CarState) -> Command:
+        """The command for one control step."""
+        keys = self._keys if self._clock() < self._until else frozenset()
+        wanted = self._reach(state.speed) * (("left" in keys) - ("right" in keys))
+        most = STEER_RATE * self._dt
+        self._steer += min(max(wanted - self._steer, -most), most)
+        speed = max(state.speed, 0.0)
+        if "down" in keys:
+            acceleration = BACK if speed > 0.5 else -1.0
+        elif "up" in keys and speed < FASTEST:
+            acceleration = FORWARD
+        else:
+            acceleration = COAST if speed > 0.5 else -1.0
+        slope = self._road.track.slope(state.s)
+        throttle, brake, gear = self._pedals.press(acceleration, speed, 0.0, slope, self._dt)
+        return Command(self._steer, throttle, brake, gear)
+
+    def _reach(self, speed: float) -> float:
+        """How far a held key steers: less at speed, by the sideways acceleration it brings."""
+        car = self._car
+        wheel = SIDE_ACCELERATION * car.wheelbase / max(speed * speed, 1.0)
+        return min(wheel / car.steering_lock, MOST_STEER)

@@ -1,0 +1,57 @@
+"""Pictures of a watched world as JPEG, in any light; the scene is built when first wanted."""
+
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+import simplejpeg
+
+from simulator.camera import Camera, Light, check_light
+from simulator.track.road import Road
+from simulator.world import World
+
+SIZE: Final = (560, 420)
+"""Width, height: twice the driver view's pixels each way."""
+QUALITY: Final = 82
+
+
+class Pictures:
+    """Takes pictures of worlds on one road; call from one thread."""
+
+    def __init__(self, road: Road, light: str, seed: int = 0) -> None:
+        check_light(light)
+        self.road, self.light = road, light
+        self._seed = seed
+        self._camera: Camera | None = None
+
+    def set_light(self, light: str) -> None:
+        """From the next picture on."""
+        check_light(light)
+        if light != self.light:
+            self.light = light
+            self.close()
+
+    def open(self) -> Camera:
+        """The camera, made on first use. Raises NoRendererError where nothing can draw."""
+        if self._camera is None:
+            light = Light.named(self.light, np.random.default_rng([self._seed, 2]))
+            width, height = SIZE
+            self._camera = Camera(
+                self.road, seed=self._seed, light=light, width=width, height=height
+            )
+        return self._camera
+
+    def take(self, world: World, views: Sequence[str]) -> dict[str, bytes]:
+        """JPEGs of `world` now, by view."""
+        if not views:
+            return {}
+        images = self.open().render_views(world.body_pose(), world.traffic.poses(), views)
+        return {
+            view: bytes(simplejpeg.encode_jpeg(image, QUALITY, "RGB", "420"))
+            for view, image in images.items()
+        }
+
+    def close(self) -> None:
+        if self._camera is not None:
+            self._camera.close()
+            self._camera = None

@@ -1,0 +1,133 @@
+"""Watch any drive of your own in the browser, such as an agent in training."""
+
+import sys
+import time
+from types import TracebackType
+from typing import Any, Final, Self
+
+from simulator.track.road import Road
+from simulator.watch.hub import Hub
+from simulator.watch.messages import scene_message, state_message
+from simulator.watch.pace import Pacer, Rate
+from simulator.watch.pictures import Pictures
+from simulator.watch.score import Score
+from simulator.watch.server import Server
+from simulator.world import World
+from trackfeatures.errors import UserError
+from trackfeatures.listening import address, bind
+
+SHOW_S: Final = 1.0 / 20.0
+"""Browsers are shown something new at most this often (s of the clock)."""
+
+
+class Watcher:
+    """Shows the world of whatever is passed to `update`; `url` is where.
+
+    While no browser looks, an update costs microseconds; while one does, a picture is taken at most
+    20 times a second. `speed` holds the drive to so many times real time, None lets it run. Use it
+    from the thread that steps the environment. Raises UserError when the port is in use.
+    """
+
+    def __init__(
+        self,
+        *,
+        host: str = "127.0.0.1",
+        port: int = 8765,
+        light: str = "clear",
+        speed: float | None = None,
+    ) -> None:
+        listener = bind(host, port)
+        listener.listen()
+        self.url = address(listener, host)
+        self._hub = Hub()
+        self._light, self._speed = light, speed
+        self._score, self._rate, self._shown = Score(), Rate(), Rate()
+        self._road: Road | None = None
+        self._pictures: Pictures | None = None
+        self._pacer: Pacer | None = None
+        self._number, self._last_show, self._scene = 0, 0.0, ""
+        self._server = Server(self._hub, listener)
+        self._server.start()
+        sys.stderr.write(f"watch at {self.url}\n")
+
+    def update(self, drive: Any) -> None:
+        """Show `drive` as it is now: a World, or an environment of this package, wrapped or not.
+
+        Call it after every reset and step. Raises UserError for something else, NoRendererError
+        where nothing can draw.
+        """
+        world = _world_of(drive)
+        if world.road is not self._road:
+            self._change_road(world)
+        passed = self._score.count(world)
+        self._rate.add(passed)
+        self._obey()
+        now = time.monotonic()
+        if self._hub.watching and now - self._last_show >= SHOW_S:
+            self._last_show = now
+            self._show(world)
+        if self._pacer is not None and passed > 0.0:
+            self._pacer.wait()
+
+    def close(self) -> None:
+        """End the server; browsers say that the drive is over."""
+        self._server.stop()
+        if self._pictures is not None:
+            self._pictures.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def _change_road(self, world: World) -> None:
+        if self._pictures is not None:
+            self._pictures.close()
+        self._road = world.road
+        self._pictures = Pictures(world.road, self._light)
+        self._scene = scene_message(world.road, controls=False)
+        if self._speed is not None:
+            self._pacer = Pacer(1.0 / world.frequency_hz, self._speed)
+
+    def _obey(self) -> None:
+        """Of what a browser may ask, only the light is ours to change; the drive is not."""
+        orders, _ = self._hub.take_orders()
+        for _, order in orders:
+            if order.kind == "light" and self._pictures is not None:
+                self._light = str(order.value)
+                self._pictures.set_light(self._light)
+
+    def _show(self, world: World) -> None:
+        assert self._pictures is not None
+        pictures = self._pictures.take(world, self._hub.wanted_views())
+        self._shown.add(1.0)
+        self._number += 1
+        state = state_message(
+            world,
+            number=self._number,
+            **self._score.as_dict(),
+            paused=False,
+            driver="program",
+            light=self._light,
+            rate=round(self._rate.value, 2),
+            asked_rate=self._speed,
+            pictures_per_s=round(self._shown.value, 1),
+            watching=self._hub.watching,
+        )
+        self._hub.publish(self._number, self._scene, state, pictures)
+
+
+def _world_of(drive: Any) -> World:
+    world = getattr(getattr(drive, "unwrapped", drive), "world", drive)
+    if not isinstance(world, World):
+        raise UserError(
+            f"a Watcher cannot show {type(drive).__name__}: pass a World or an environment of "
+            "simulator.env (of a vector environment, one of its environments)"
+        )
+    return world

@@ -1,0 +1,39 @@
+"""Running the command and making jobs: what the tests of collection share."""
+
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+from datagen.deal import make_plan
+from datagen.plan import Plan, Wanted
+from datagen.recording.folder import prepare
+from datagen.round import Ending, Job, attempt
+from datagen.tracks import choose_tracks
+
+SHORT = ["--rounds", "2", "--frames", "30", "--tracks", "circuit", "--lanes", "1,2"]
+
+
+def datagen(
+    *args: object,
+    preexec_fn: Callable[[], object] | None = None,
+    env: dict[str, str] | None = None,
+) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "datagen", *map(str, args)]
+    return subprocess.run(
+        command, capture_output=True, text=True, timeout=120, preexec_fn=preexec_fn, env=env
+    )
+
+
+def make_small_plan(rounds: int, frames: int) -> Plan:
+    return make_plan(Wanted(rounds, frames, seed=1, tracks=choose_tracks(("oval",), None)))
+
+
+def make_jobs(folder: Path, rounds: int, frames: int) -> list[Job]:
+    plan = make_small_plan(rounds, frames)
+    prepare(folder)
+    return [Job(entry, plan.hash, folder, None) for entry in plan.rounds]
+
+
+def attempted(job: Job) -> Ending:
+    return attempt(job, lambda message: None)

@@ -1,0 +1,93 @@
+"""Engines as processes of their own, and the C client compiled."""
+
+import contextlib
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import uuid
+from collections.abc import Callable, Iterator
+from importlib.resources import files
+from pathlib import Path
+
+import pytest
+
+START_S = 180.0
+SHM = Path("/dev/shm")
+
+Start = Callable[..., "subprocess.Popen[str]"]
+
+
+def start_engine(name: str, *options: str) -> "subprocess.Popen[str]":
+    command = [sys.executable, "-m", "simulator", "link", "--name", name, *options]
+    return subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=os.environ
+    )
+
+
+def fresh_name() -> str:
+    return f"/drvlink-test-{uuid.uuid4().hex[:12]}"
+
+
+@pytest.fixture
+def name() -> Iterator[str]:
+    """A link's name of this test alone; nothing of it may be left."""
+    name = fresh_name()
+    yield name
+    left = SHM / name[1:]
+    leaked = left.exists()
+    left.unlink(missing_ok=True)
+    assert not leaked, f"the segment {name} was left behind"
+
+
+@pytest.fixture
+def engine(name: str) -> Iterator[Start]:
+    """Starts engines of `name`; those still running are stopped at the end, as a user would."""
+    with contextlib.ExitStack() as stack:
+
+        def start(*options: str) -> "subprocess.Popen[str]":
+            process = start_engine(name, *options)
+            stack.callback(stop, process)
+            return process
+
+        yield start
+
+
+@pytest.fixture(scope="session")
+def oval() -> Iterator[str]:
+    """The name of an engine in lock step on the oval, with two lanes, for many clients."""
+    name = fresh_name()
+    process = start_engine(name, "--track", "oval", "--lanes", "2", "--seed", "7")
+    yield name
+    stop(process)
+    assert process.returncode == 0
+    assert not (SHM / name[1:]).exists()
+
+
+@pytest.fixture(scope="session")
+def lap_program(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """simulator/link/c/lap.c, compiled without a warning."""
+    out = tmp_path_factory.mktemp("lap") / "lap"
+    compile_c(Path(str(files("simulator.link").joinpath("c/lap.c"))), out)
+    return out
+
+
+def compile_c(source: Path, out: Path, *options: str) -> None:
+    if shutil.which("gcc") is None:
+        pytest.skip("no gcc on this machine")
+    strict = ["-std=c11", "-Wall", "-Wextra", "-Wpedantic", "-Werror", "-O2", "-D_GNU_SOURCE"]
+    include = f"-I{files('simulator.link').joinpath('c')}"
+    command = ["gcc", *strict, include, *options, "-o", str(out), str(source), "-lm"]
+    subprocess.run(command, check=True, capture_output=True, text=True)
+
+
+def stop(process: "subprocess.Popen[str]") -> tuple[str, str]:
+    """Stop an engine with SIGTERM if it still runs; what it said on stdout and stderr."""
+    if process.poll() is None:
+        process.send_signal(signal.SIGTERM)
+    try:
+        return process.communicate(timeout=START_S)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        raise

@@ -1,0 +1,176 @@
+"""Names, the two ends' locks, what is left by the dead, what belongs to others."""
+
+import os
+import resource
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from simulator.link.errors import LinkError, NameInUse, NoEngine
+from simulator.link.layout import MAGIC
+from simulator.link.segment import Segment, attach, check_name, clear, create
+
+SIZE = 4096
+SHM = Path("/dev/shm")
+
+
+def engine_end(name: str) -> Segment:
+    """A published segment with nothing but the mark in it."""
+    segment = create(name, SIZE)
+    segment.memory[: len(MAGIC)] = MAGIC
+    segment.publish()
+    return segment
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("driverview", "begins with a slash"),
+        ("", "begins with a slash"),
+        ("/", "begins with a slash"),
+        ("/a/b", "one slash and then a plain name"),
+        ("/..", "one slash and then a plain name"),
+        ("/a\0b", "one slash and then a plain name"),
+        ("/" + "x" * 250, "has 251 bytes"),
+        ("/" + "\u00e4" * 125, "has 251 bytes"),
+    ],
+)
+def test_bad_names_are_refused(name: str, said: str) -> None:
+    with pytest.raises(LinkError, match=said):
+        create(name, SIZE)
+    with pytest.raises(LinkError, match=said):
+        attach(name)
+
+
+def test_the_longest_name_works() -> None:
+    assert check_name("/" + "x" * 249)
+
+
+def test_each_end_is_held_once_and_sees_the_other(name: str) -> None:
+    ours = engine_end(name)
+    assert not ours.other_end_lives()
+    with pytest.raises(NameInUse, match="is running"):
+        engine_end(name)
+    client = attach(name)
+    assert ours.other_end_lives()
+    assert client.other_end_lives()
+    with pytest.raises(NameInUse, match="has a client already"):
+        attach(name)
+    client.close()
+    assert not ours.other_end_lives()
+    again = attach(name)
+    ours.close()
+    assert not again.other_end_lives()
+    assert not (SHM / name[1:]).exists()
+    again.close()
+
+
+def test_without_an_engine_there_is_nothing_to_attach_to(name: str) -> None:
+    with pytest.raises(NoEngine, match=f"there is no engine of the link {name}"):
+        attach(name)
+
+
+def killed_owner(name: str) -> None:
+    """Let a process make the segment, and kill it."""
+    code = (
+        "import time; from simulator.link.segment import create;"
+        f"held = create({name!r}, {SIZE}); held.memory[:8] = {MAGIC!r}; held.publish();"
+        "print('ready', flush=True); time.sleep(60)"
+    )
+    process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    assert process.stdout.readline() == "ready\n"
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    process.stdout.close()
+
+
+def test_a_new_engine_takes_over_from_a_killed_one(name: str) -> None:
+    killed_owner(name)
+    old = (SHM / name[1:]).stat().st_ino
+    ours = engine_end(name)
+    assert (SHM / name[1:]).stat().st_ino != old
+    assert not ours.bytes()[8:].any()
+    ours.close()
+
+
+def test_a_client_that_finds_a_killed_engine_cleans_up(name: str) -> None:
+    killed_owner(name)
+    with pytest.raises(NoEngine, match="has died"):
+        attach(name)
+    assert not (SHM / name[1:]).exists()
+
+
+def test_nobody_sees_a_segment_before_it_is_published(name: str) -> None:
+    ours = create(name, SIZE)
+    with pytest.raises(NoEngine):
+        attach(name)
+    ours.close()
+
+
+def test_clearing_leaves_a_living_engine_alone(name: str) -> None:
+    clear(name)
+    killed_owner(name)
+    clear(name)
+    assert not (SHM / name[1:]).exists()
+    ours = engine_end(name)
+    with pytest.raises(NameInUse, match="is running"):
+        clear(name)
+    assert (SHM / name[1:]).exists()
+    ours.close()
+
+
+def test_a_client_of_a_killed_engine_does_not_remove_its_successors_segment(name: str) -> None:
+    first = engine_end(name)
+    client = attach(name)
+    os.close(first.descriptor)  # as the kernel does at its death
+    first.descriptor = -1
+    second = engine_end(name)
+    client.close()
+    assert (SHM / name[1:]).exists()
+    second.close()
+
+
+def test_the_memory_of_another_program_is_left_alone(name: str) -> None:
+    path = SHM / name[1:]
+    path.write_bytes(b"somebody else's")
+    for action in (lambda: engine_end(name), lambda: attach(name), lambda: clear(name)):
+        with pytest.raises(LinkError, match="is no link of this program"):
+            action()
+    assert path.read_bytes() == b"somebody else's"
+    path.unlink()
+
+
+def test_no_room_is_an_error_and_leaves_nothing(name: str) -> None:
+    code = (
+        "import resource; from simulator.link.segment import create;"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (65536, resource.RLIM_INFINITY));"
+        f"create({name!r}, 1 << 20)"
+    )
+    assert resource.getrlimit(resource.RLIMIT_FSIZE)[1] == resource.RLIM_INFINITY
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert "no room for 1048576 bytes of shared memory" in done.stderr
+    assert not (SHM / name[1:]).exists()
+
+
+def test_a_forked_child_does_not_keep_our_end_alive(name: str) -> None:
+    ours = engine_end(name)
+    client = attach(name)
+    child = os.fork()
+    if child == 0:
+        time.sleep(30.0)
+        os._exit(0)
+    try:
+        deadline = time.monotonic() + 5.0  # the child closes its copy first of all
+        client.close()
+        while ours.other_end_lives() and time.monotonic() < deadline:
+            time.sleep(0.01)
+        assert not ours.other_end_lives()
+    finally:
+        os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)
+        ours.close()

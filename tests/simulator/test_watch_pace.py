@@ -1,0 +1,68 @@
+"""Real time is kept by a clock of our own: no waiting in these tests."""
+
+import pytest
+
+from simulator.watch.pace import FORGIVEN_S, Pacer, Rate
+from trackfeatures.errors import UserError
+
+
+class Clock:
+    def __init__(self) -> None:
+        self.now = 100.0
+        self.slept: list[float] = []
+
+    def __call__(self) -> float:
+        return self.now
+
+    def sleep(self, seconds: float) -> None:
+        assert seconds > 0.0
+        self.slept.append(seconds)
+        self.now += seconds
+
+
+@pytest.mark.parametrize("speed", [0.5, 1.0, 4.0])
+def test_steps_pass_at_the_speed_asked_for(speed: float) -> None:
+    clock = Clock()
+    pacer = Pacer(0.05, speed, clock=clock, sleep=clock.sleep)
+    for _ in range(100):
+        clock.now += 0.004  # the work of a step
+        pacer.wait()
+    assert clock.now - 100.0 == pytest.approx(100 * 0.05 / speed)
+
+
+def test_a_slow_step_is_caught_up_with_but_a_long_halt_is_not() -> None:
+    clock = Clock()
+    pacer = Pacer(0.05, clock=clock, sleep=clock.sleep)
+    clock.now += 0.17
+    assert pacer.late
+    for _ in range(10):
+        pacer.wait()
+    assert clock.now == pytest.approx(100.5)
+    clock.now += 20.0
+    pacer.wait()
+    for _ in range(10):
+        pacer.wait()
+    assert clock.now == pytest.approx(120.5 + 10 * 0.05, abs=FORGIVEN_S)
+    assert not pacer.late
+
+
+@pytest.mark.parametrize("speed", [0.0, -1.0, 1e9, float("nan")])
+def test_a_speed_that_is_none(speed: float) -> None:
+    with pytest.raises(UserError, match=r"must be 0\.05 to 100"):
+        Pacer(0.05, speed)
+
+
+def test_a_rate_is_what_was_reached_lately() -> None:
+    clock = Clock()
+    rate = Rate(clock)
+    assert rate.value == 0.0
+    for _ in range(60):
+        clock.now += 0.1
+        rate.add(0.05)
+    assert rate.value == pytest.approx(0.5, rel=0.02)
+    for _ in range(60):
+        clock.now += 0.05
+        rate.add(0.05)
+    assert rate.value == pytest.approx(1.0, rel=0.02)
+    clock.now += 60.0
+    assert rate.value == 0.0

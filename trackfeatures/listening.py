@@ -1,0 +1,31 @@
+"""The socket of every command that serves: bound before anything else, so that a port in use is
+one clear line."""
+
+import socket
+
+from trackfeatures.errors import UserError
+
+
+def bind(host: str, port: int) -> socket.socket:
+    """A socket bound to the address. Raises UserError when that is taken, unknown or forbidden."""
+    try:
+        family, kind, protocol, _, address = socket.getaddrinfo(
+            host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
+        )[0]
+        listener = socket.socket(family, kind, protocol)
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listener.bind(address)
+    except (OSError, UnicodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else str(error)
+        raise UserError(
+            f"cannot listen on {host} port {port}: {reason}; choose another with --host or --port "
+            "(--port 0 takes any free one)"
+        ) from error
+    listener.set_inheritable(True)
+    return listener
+
+
+def address(listener: socket.socket, host: str) -> str:
+    """The URL of a bound socket, with the port that it really has."""
+    shown = f"[{host}]" if ":" in host else host
+    return f"http://{shown}:{listener.getsockname()[1]}"
