@@ -1,14 +1,11 @@
-"""The shared language of all parts: what a track feature is, its unit, sign, range and coding."""
+"""The shared language of all parts: what a track feature is, its unit, sign, range and coding.
 
-from trackfeatures.coding import (
-    decode,
-    decode_features,
-    decode_values,
-    encode,
-    encode_features,
-    mirror_coded,
-    mirror_heading,
-)
+What computes on arrays is imported when it is first used: a command's help needs no numpy.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING
+
 from trackfeatures.definitions import (
     LANE_WIDTH_M,
     LANES,
@@ -22,18 +19,29 @@ from trackfeatures.definitions import (
 )
 from trackfeatures.errors import DefinitionsMismatch, UserError, require_version
 from trackfeatures.features import TrackFeatures
-from trackfeatures.localise import localise
-from trackfeatures.measure import (
-    CentreLine,
-    check_lanes,
-    classify_heading,
-    lane_centre,
-    lane_index,
-    marking_offsets,
-    measure,
-    measure_pose,
-    wrap_angle,
-)
+
+if TYPE_CHECKING:
+    from trackfeatures.coding import (
+        decode,
+        decode_features,
+        decode_values,
+        encode,
+        encode_features,
+        mirror_coded,
+        mirror_heading,
+    )
+    from trackfeatures.localising import localise
+    from trackfeatures.measuring import (
+        CentreLine,
+        check_lanes,
+        classify_heading,
+        lane_centre,
+        lane_index,
+        marking_offsets,
+        measure,
+        measure_pose,
+        wrap_angle,
+    )
 
 __all__ = [
     "LANES",
@@ -67,3 +75,15 @@ __all__ = [
     "require_version",
     "wrap_angle",
 ]
+
+_ON_ARRAYS = ("coding", "localising", "measuring")
+
+
+def __getattr__(name: str) -> object:
+    if name in __all__:
+        for module in _ON_ARRAYS:
+            found = getattr(import_module(f"trackfeatures.{module}"), name, None)
+            if found is not None:
+                globals()[name] = found
+                return found
+    raise AttributeError(f"module 'trackfeatures' has no attribute {name!r}")
