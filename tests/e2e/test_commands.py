@@ -1,62 +1,129 @@
 """What every command owes its user: quick help, and one clear line when something is wrong."""
 
+import json
+import os
 import re
 import subprocess
 import sys
-import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cache
+from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 import pytest
+import typer
 
 ROOT = Path(__file__).parents[2]
 BIN = Path(sys.executable).parent
-COMMANDS = [
-    ("simulator",),
-    ("simulator", "tracks"),
-    ("simulator", "tracks", "plot"),
-    ("simulator", "centreline"),
-    ("simulator", "snapshot"),
-    ("simulator", "link"),
-    ("simulator", "watch"),
-    ("datagen",),
-    ("datagen", "collect"),
-    ("datagen", "verify"),
-    ("datagen", "split"),
-    ("datagen", "recover"),
-    ("datagen", "info"),
-    ("datagen", "export"),
-    ("datagen", "view"),
-    ("datagen", "stats"),
-    ("datagen", "merge"),
-    ("mtlnet",),
-    ("mtlnet", "train"),
-    ("mtlnet", "evaluate"),
-    ("mtlnet", "predict"),
-    ("serve",),
-    ("controllers",),
-    ("controllers", "drive"),
-    ("controllers", "demo"),
-]
+PROGRAMS = ("simulator", "datagen", "mtlnet", "serve", "controllers")
 HELP_LIMIT_S = 0.5
+TRIES = 5
+# What takes long to import, or needs a machine to be set up; a help text needs none of it.
+HEAVY = {
+    "cv2", "fastapi", "google", "gymnasium", "matplotlib", "mcap", "moderngl", "numba", "numpy",
+    "openvino", "pyarrow", "pybullet", "ray", "scipy", "simplejpeg", "torch", "uvicorn",
+}  # fmt: skip
+# Typer's own help of one command with one option: what no command of ours can undercut.
+BARE = """
+import typer
+app = typer.Typer()
+app.command()(lambda: None)
+@app.command()
+def work(amount: int = 1) -> None: "Work."
+app()
+"""
+HELP_OF_ALL = """
+import contextlib, importlib, io, json, sys
+heavy, commands = set(json.loads(sys.argv[1])), json.loads(sys.argv[2])
+for command in commands:
+    sys.argv = [*command, "--help"]
+    with contextlib.redirect_stdout(io.StringIO()) as shown, contextlib.suppress(SystemExit):
+        importlib.import_module(f"{command[0]}.cli").main()
+    assert "Usage" in shown.getvalue(), command
+    found = heavy & {name.split(".")[0] for name in sys.modules}
+    assert not found, f"{' '.join(command)} --help imports {', '.join(sorted(found))}"
+"""
+
+
+def below(command: Any, words: tuple[str, ...]) -> Iterator[tuple[str, ...]]:
+    yield words
+    for name, subcommand in getattr(command, "commands", {}).items():
+        yield from below(subcommand, (*words, name))
+
+
+def all_commands() -> list[tuple[str, ...]]:
+    """Every command and subcommand that a user can type."""
+    apps = {name: import_module(f"{name}.cli").app for name in PROGRAMS}
+    return [words for name in apps for words in below(typer.main.get_command(apps[name]), (name,))]
+
+
+COMMANDS = all_commands()
+
+
+@dataclass(frozen=True)
+class Help:
+    """What `--help` shows, and the processor time (s, user and system) it takes."""
+
+    shown: str
+    cost_s: float
+
+
+def measured(*command: str) -> Help:
+    """Runs `command` until it costs less than the limit, `TRIES` times at most; its best.
+
+    Processor time, not the clock's: a machine that is busy with other work makes a command wait,
+    and that is not the command's fault. Memory and cores shared with that work make it dearer
+    too, therefore the best of a few tries.
+    """
+    best = float("inf")
+    for _ in range(TRIES):
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+        assert process.stdout is not None
+        assert process.stderr is not None
+        shown, said = process.stdout.read().decode(), process.stderr.read().decode()
+        _, status, usage = os.wait4(process.pid, 0)
+        process.returncode = os.waitstatus_to_exitcode(status)
+        assert process.returncode == 0, said
+        best = min(best, usage.ru_utime + usage.ru_stime)
+        if best < HELP_LIMIT_S:
+            break
+    return Help(shown, best)
+
+
+@cache
+def help_of(*command: str) -> Help:
+    return measured(str(BIN / command[0]), *command[1:], "--help")
+
+
+@cache
+def cost_of_typer_s() -> float:
+    return measured(sys.executable, "-c", BARE, "work", "--help").cost_s
 
 
 def run(*arguments: str) -> subprocess.CompletedProcess[str]:
     program = str(BIN / arguments[0])
-    return subprocess.run([program, *arguments[1:]], capture_output=True, text=True, timeout=120)
+    return subprocess.run([program, *arguments[1:]], capture_output=True, text=True, timeout=300)
 
 
+@pytest.mark.alone
 @pytest.mark.parametrize("command", COMMANDS, ids=" ".join)
-def test_help_comes_in_half_a_second(command: tuple[str, ...]) -> None:
-    seconds = []
-    for _ in range(5):  # the best of a few: other work on the machine is not the command's fault
-        started = time.perf_counter()
-        done = run(*command, "--help")
-        seconds.append(time.perf_counter() - started)
-        assert done.returncode == 0, done.stderr
-        assert "Usage" in done.stdout
-        if seconds[-1] < HELP_LIMIT_S:
-            break
-    assert min(seconds) < HELP_LIMIT_S
+def test_help_costs_half_a_second_at_most(command: tuple[str, ...]) -> None:
+    found = help_of(*command)
+    assert "Usage" in found.shown
+    if found.cost_s >= HELP_LIMIT_S:  # only a machine on which typer alone takes half of it may
+        assert found.cost_s < 2 * cost_of_typer_s()
+
+
+@pytest.mark.parametrize("program", PROGRAMS)
+def test_help_imports_nothing_heavy(program: str) -> None:
+    commands = [words for words in COMMANDS if words[0] == program]
+    arguments = [json.dumps(sorted(HEAVY)), json.dumps(commands)]
+    done = subprocess.run(
+        [sys.executable, "-c", HELP_OF_ALL, *arguments], capture_output=True, text=True, timeout=300
+    )
+    assert done.returncode == 0, done.stderr
 
 
 @pytest.mark.parametrize(
@@ -96,8 +163,7 @@ def readme_commands() -> list[list[str]]:
     """The project's own commands that the README tells a user to type."""
     blocks = re.findall(r"```sh\n(.*?)```", (ROOT / "README.md").read_text(), flags=re.DOTALL)
     lines = [line.split("#")[0].split() for block in blocks for line in block.splitlines()]
-    programs = {command[0] for command in COMMANDS}
-    return [words for words in lines if words and words[0] in programs]
+    return [words for words in lines if words and words[0] in PROGRAMS]
 
 
 def test_the_readme_uses_only_options_that_exist() -> None:
@@ -105,7 +171,7 @@ def test_the_readme_uses_only_options_that_exist() -> None:
     assert len(commands) >= 8
     for words in commands:
         subcommands = [w for w in words[1:2] if (words[0], w) in COMMANDS]
-        shown = re.sub(r"\s+", " ", run(words[0], *subcommands, "--help").stdout)
+        shown = re.sub(r"\s+", " ", help_of(words[0], *subcommands).shown)
         for option in (word for word in words if word.startswith("--")):
             assert re.search(rf"{option}\b", shown), f"{' '.join(words)}: no {option}"
 
