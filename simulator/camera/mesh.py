@@ -85,15 +85,15 @@ def both_ways(
     indices: "moderngl.Buffer | None",
     layout: Sequence[str],
 ) -> "tuple[moderngl.VertexArray, moderngl.VertexArray]":
-    """Vertex arrays of the same vertices: one draws them in their colours, one as depth and class
-    (whose program does not use all of a vertex)."""
+    """Vertex arrays of the same vertices: one draws them in their colours, one as depth and class.
+    A program may leave out a part of a vertex that it has no use for."""
     drawn, labelled = (
         graphics.context.vertex_array(
             graphics.programs[name],
             [(vertices, *layout)],
             index_buffer=indices,
             index_element_size=4,
-            skip_errors=name != program,
+            skip_errors=True,
         )
         for name in (program, graphics.labelling(program))
     )

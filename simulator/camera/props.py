@@ -15,7 +15,18 @@ from simulator.camera.mesh import Chunks, Surface
 from simulator.camera.ribbon import Ribbon
 from simulator.camera.roadside import ground_height, place_beside
 from simulator.camera.scenery import DRY_M
-from simulator.camera.solids import BOARD, CROWD, FACADE, PLAIN, STRIPED, TILES, Point, box, face
+from simulator.camera.solids import (
+    BOARD,
+    CROWD,
+    FACADE,
+    MATERIALS,
+    PLAIN,
+    STRIPED,
+    TILES,
+    Point,
+    box,
+    face,
+)
 from simulator.camera.terrain import CentreLine, Terrain
 from simulator.track.road import Road
 
@@ -188,8 +199,9 @@ def build(
     look: Look,
     bridges: Sequence[Bridge],
     rng: np.random.Generator,
-) -> Surface:
-    """All props of a scene, its bridges among them; a vertex is as `solids` has it."""
+) -> dict[str, Surface]:
+    """All props of a scene, its bridges among them, by material; a vertex is as `solids` has it,
+    without the material."""
     site = _Site(road, line, ribbon, terrain, bridges)
     for bridge in bridges:
         site.add(bridge.s, bridge.triangles)
@@ -219,16 +231,29 @@ def build(
     return _gathered(site)
 
 
-def _gathered(site: _Site) -> Surface:
-    """The triangles of all props, in order of s, with a chunk every CHUNK_M; in each chunk the
-    small ones last, which the second level of detail leaves out."""
-    if not site.parts:
-        site.parts, site.s = [np.zeros((3, 12))], [0.0]
-    cell = (np.asarray(site.s) / CHUNK_M).astype(np.int64)
-    small = np.array([_area(part) < SMALL_M2 for part in site.parts])
-    order = np.lexsort((np.asarray(site.s), small, cell))
-    sizes = np.array([len(part) for part in site.parts])[order]
-    vertices = np.concatenate([site.parts[k] for k in order])
+def _gathered(site: _Site) -> dict[str, Surface]:
+    """The triangles of all props by the name of their material."""
+    small = [_area(part) < SMALL_M2 for part in site.parts]
+    surfaces = {}
+    for number, material in enumerate(MATERIALS):
+        parts = [part[part[:, 11] == number, :11] for part in site.parts]
+        used = [k for k, part in enumerate(parts) if len(part)]
+        if used:
+            surfaces[material] = _surface(
+                [parts[k] for k in used],
+                np.array([site.s[k] for k in used]),
+                np.array([small[k] for k in used]),
+            )
+    return surfaces
+
+
+def _surface(parts: list[FloatArray], s: FloatArray, small: NDArray[np.bool_]) -> Surface:
+    """Triangles of one material in order of s, with a chunk every CHUNK_M; in each chunk those of
+    small props last, which the second level of detail leaves out."""
+    cell = (s / CHUNK_M).astype(np.int64)
+    order = np.lexsort((s, small, cell))
+    sizes = np.array([len(part) for part in parts])[order]
+    vertices = np.concatenate([parts[k] for k in order])
     starts = np.flatnonzero(np.diff(cell[order], prepend=-1))
     first = (np.cumsum(sizes) - sizes)[starts]
     count = np.stack(

@@ -83,17 +83,23 @@ class Scene:
             barriers.build(road, strips, look, np.random.default_rng([seed, 5])),
             ("3f 2f 1f 3f", "at", "along", "kind", "facing"),
         )
-        things = Mesh(
-            graphics,
-            named("prop"),
-            props.build(road, line, strips, terrain, look, over, np.random.default_rng([seed, 6])),
-            ("3f 3f 3f 3f", "at", "facing", "colour", "surface"),
+        built = props.build(
+            road, line, strips, terrain, look, over, np.random.default_rng([seed, 6])
         )
+        things = [
+            Mesh(
+                graphics,
+                graphics.weathered("prop", light.weather, material),
+                surface,
+                ("3f 3f 3f 2f", "at", "facing", "colour", "face"),
+            )
+            for material, surface in built.items()
+        ]
         self.mask = shade.build(
             road, trees, over, shadiness, light, np.random.default_rng([seed, 4])
         )
         self._woods = Woods(graphics, trees, light.weather)
-        self._solid = (paved, verge, things, *fields)
+        self._solid = (paved, verge, *things, *fields)
         palette = scene_block(road, look, np.random.default_rng([seed, 2]), self.mask, terrain.sea)
         self._block = graphics.context.buffer(palette.tobytes())
         self._shade = graphics.context.texture(

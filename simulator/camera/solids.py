@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 FloatArray = NDArray[np.float64]
 Point = tuple[float, float, float]
 
-PLAIN, FACADE, CROWD, BOARD, STRIPED, TILES, MASONRY, EARTH = (float(k) for k in range(8))
-"""Materials, as prop.frag.glsl numbers them."""
+MATERIALS = ("plain", "facade", "crowd", "board", "striped", "tiles", "masonry", "earth")
+"""By number; prop.frag.glsl knows them by name."""
+PLAIN, FACADE, CROWD, BOARD, STRIPED, TILES, MASONRY, EARTH = map(float, range(len(MATERIALS)))
 
 
 def box(
