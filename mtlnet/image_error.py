@@ -13,6 +13,8 @@ class Fault(StrEnum):
     UNSUPPORTED = "unsupported-image"
     SIZE = "image-size"
     ASPECT = "image-aspect"
+    FIELD_OF_VIEW = "field-of-view"
+    TRAILING = "trailing-bytes"
 
 
 class ImageError(UserError):

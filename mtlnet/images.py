@@ -1,39 +1,27 @@
 """Everything between an image's bytes and pixels the model may see: limits, header, strict decode.
 
 Free of torch; `mtlnet predict` and `serve` see the same pixels. The size of an image is read from
-its header before anything is decoded: a PNG of 31 KB can ask for 1.5 GB. Rotation marks (EXIF) are
-ignored, alpha is dropped, grey becomes RGB, 16 bits become 8.
+its header before anything is decoded: a PNG of 31 KB can ask for 1.5 GB. A wider picture is cropped
+to the model's view (`mtlnet.view`). Rotation marks (EXIF) are ignored, alpha is dropped, grey
+becomes RGB, 16 bits become 8.
 """
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
 
 import cv2
 import numpy as np
 import simplejpeg
 from numpy.typing import NDArray
 
-from mtlnet import png
+from mtlnet import jpeg, png
 from mtlnet.image_error import Fault, ImageError
+from mtlnet.view import View, visible
 from trackfeatures.errors import UserError
 
 MAX_FILE_BYTES = 32 << 20
 MIN_SIDE_PX, MAX_SIDE_PX, MAX_PIXELS = 16, 4096, 8_400_000
-MAX_SCANS = 100  # a progressive JPEG has about ten; each more costs a pass over all pixels
-ASPECT_TOLERANCE = 0.01
-JPEG_SIGNATURE = b"\xff\xd8\xff"
-JPEG_SCAN = b"\xff\xda"
-
-
-class View(Protocol):
-    """The size of the image a model takes, px."""
-
-    @property
-    def width(self) -> int: ...
-
-    @property
-    def height(self) -> int: ...
+MAX_TRAILING_BYTES = 64  # what some cameras pad with; more is another file behind the picture
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,8 +36,8 @@ class ImageHeader:
 def read_image(path: Path, view: View) -> NDArray[np.uint8]:
     """The JPEG or PNG at `path` as uint8 RGB (view.height, view.width, 3).
 
-    Another size is scaled; another shape is refused, for its angles would be wrong. Raises
-    ImageError, or UserError where there is no file to read.
+    Another size is scaled, a wider picture cropped; a narrower one is refused, for it does not
+    show all of the view. Raises ImageError, or UserError where there is no file to read.
     """
     if not path.is_file():
         raise UserError(f"there is no image file {path}")
@@ -65,18 +53,21 @@ def read_image(path: Path, view: View) -> NDArray[np.uint8]:
         raise ImageError(error.fault, f"{path}: {error}") from error
 
 
-def inspect(body: bytes, view: View) -> ImageHeader:
-    """The header of an image that may be decoded for a model of this view. Raises ImageError."""
+def inspect(body: bytes, view: View, fov_y_deg: float | None = None) -> ImageHeader:
+    """The header of an image that may be decoded for a model of this view.
+
+    `fov_y_deg`: the image's own vertical field of view, None: the view's. Raises ImageError.
+    """
     if body.startswith(png.SIGNATURE):
         found = png.read_header(body)
         header = ImageHeader(found.width, found.height, found)
-    elif body.startswith(JPEG_SIGNATURE):
+    elif body.startswith(jpeg.SIGNATURE):
         header = _inspect_jpeg(body)
     else:
         seen = f"{len(body)} bytes that begin with {body[:8]!r}" if body else "nothing at all"
         raise ImageError(Fault.NOT_AN_IMAGE, f"no JPEG or PNG file, but {seen}")
     _check_size(header)
-    _check_aspect(header, view)
+    visible(header.width, header.height, view, fov_y_deg)
     return header
 
 
@@ -88,10 +79,18 @@ def _inspect_jpeg(body: bytes) -> ImageHeader:
         raise _damaged_jpeg(error) from error
     if colours not in ("Gray", "YCbCr", "RGB"):
         raise ImageError(Fault.UNSUPPORTED, f"the JPEG's colours are {colours}; save it in RGB")
-    scans = body.count(JPEG_SCAN)
-    if scans > MAX_SCANS:
-        raise ImageError(Fault.UNSUPPORTED, f"the JPEG has {scans} scans; save it as baseline JPEG")
+    check_trailing(len(body) - jpeg.end(body))
     return ImageHeader(width, height)
+
+
+def check_trailing(count: int) -> None:
+    """Raise ImageError when `count` bytes behind the end of a picture are too many."""
+    if count > MAX_TRAILING_BYTES:
+        raise ImageError(
+            Fault.TRAILING,
+            f"{count} bytes follow the end of the picture, at most {MAX_TRAILING_BYTES} are "
+            "taken; send the picture alone",
+        )
 
 
 def _check_size(header: ImageHeader) -> None:
@@ -105,23 +104,12 @@ def _check_size(header: ImageHeader) -> None:
         )
 
 
-def _check_aspect(header: ImageHeader, view: View) -> None:
-    """A stretched or cropped view would give wrong metres without a sign of it: refused."""
-    stretch = header.width * view.height / (header.height * view.width)
-    if abs(stretch - 1.0) > ASPECT_TOLERANCE:
-        raise ImageError(
-            Fault.ASPECT,
-            f"the image is {header.width} x {header.height} px (width / height "
-            f"{header.width / header.height:.3f}), the model's camera gives {view.width} x "
-            f"{view.height} ({view.width / view.height:.3f}); give the whole view of such a "
-            "camera, at any size of that shape",
-        )
+def decode(
+    body: bytes, header: ImageHeader, view: View, fov_y_deg: float | None = None
+) -> NDArray[np.uint8]:
+    """The image as uint8 RGB (view.height, view.width, 3), cropped and area-averaged to it.
 
-
-def decode(body: bytes, header: ImageHeader, view: View) -> NDArray[np.uint8]:
-    """The image as uint8 RGB (view.height, view.width, 3), area-averaged to it.
-
-    Raises ImageError.
+    `header` and `fov_y_deg` as in `inspect`. Raises ImageError.
     """
     image = (
         _decode_jpeg(body) if header.png_header is None else _decode_png(body, header.png_header)
@@ -132,10 +120,17 @@ def decode(body: bytes, header: ImageHeader, view: View) -> NDArray[np.uint8]:
             f"the image decodes to {image.shape[1]} x {image.shape[0]} px, its header says "
             f"{header.width} x {header.height}; save it anew",
         )
-    if (header.width, header.height) == (view.width, view.height):
-        return image
-    shrinks = header.width > view.width
-    method = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
+    return fit(image, view, fov_y_deg)
+
+
+def fit(image: NDArray[np.uint8], view: View, fov_y_deg: float | None = None) -> NDArray[np.uint8]:
+    """An image (H, W, 3) cropped and scaled to (view.height, view.width, 3). Raises ImageError."""
+    box = visible(image.shape[1], image.shape[0], view, fov_y_deg)
+    if box is not None:
+        image = image[box.top : box.top + box.height, box.left : box.left + box.width]
+    if image.shape[:2] == (view.height, view.width):
+        return np.ascontiguousarray(image)
+    method = cv2.INTER_AREA if image.shape[1] > view.width else cv2.INTER_LINEAR
     scaled = cv2.resize(image, (view.width, view.height), interpolation=method)
     return scaled.astype(np.uint8, copy=False)
 
@@ -149,7 +144,8 @@ def _decode_jpeg(body: bytes) -> NDArray[np.uint8]:
 
 
 def _decode_png(body: bytes, header: png.PngHeader) -> NDArray[np.uint8]:
-    checked = png.critical_chunks(body, header)
+    checked, end = png.critical_chunks(body, header)
+    check_trailing(len(body) - end)
     image = cv2.imdecode(np.frombuffer(checked, np.uint8), cv2.IMREAD_COLOR)
     if image is None:
         raise ImageError(Fault.DAMAGED, "the PNG cannot be decoded; save it anew")

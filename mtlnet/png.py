@@ -67,8 +67,8 @@ def read_header(body: bytes) -> PngHeader:
     return PngHeader(width, height, colour, depth * CHANNELS[colour], bool(interlace))
 
 
-def critical_chunks(body: bytes, header: PngHeader) -> bytes:
-    """The same image with nothing but header, palette and pixels, all checked.
+def critical_chunks(body: bytes, header: PngHeader) -> tuple[bytes, int]:
+    """(the same image with nothing but header, palette and pixels, all checked; where it ends).
 
     Raises ImageError.
     """
@@ -92,7 +92,7 @@ def critical_chunks(body: bytes, header: PngHeader) -> bytes:
     else:
         raise ImageError(Fault.UNSUPPORTED, f"the PNG has over {MAX_CHUNKS} chunks; save it anew")
     _check_pixels(b"".join(pixels), header)
-    return b"".join(kept)
+    return b"".join(kept), end
 
 
 def _check_chunk(view: memoryview, at: int) -> tuple[int, bytes]:

@@ -1,7 +1,5 @@
-"""The HTTP application: POST /features with an image, and what tells how the service is."""
+"""The service as one application: the hot path as plain ASGI, all else by FastAPI."""
 
-import json
-import time
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from dataclasses import asdict
@@ -9,48 +7,69 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from fastapi import FastAPI, Request
+from fastapi import FastAPI
 from fastapi.responses import HTMLResponse, JSONResponse, Response
+from starlette.routing import Route
 
-import trackfeatures as tf
 from mtlnet.engine import Engine
-from mtlnet.images import inspect
 from serve import contract, problems
-from serve.gate import check_headers, read_body
-from serve.perceiver import Perceived, Perceiver
-from serve.problems import Problem
+from serve.features import Features
+from serve.gate import Receive, Scope, Send
+from serve.limits import Limits
+from serve.perceiver import Perceiver
 from serve.readiness import warm_up
+from serve.shared import Shared, create
+from serve.streams import Streams
 
 PAGE = Path(__file__).parent / "index.html"
 DESCRIPTION = "One driver-view image in, track features out. Angles in rad, distances in m."
-REFUSALS = (
-    problems.BODY_TOO_LARGE,
-    problems.UNSUPPORTED_TYPE,
-    problems.NOT_AN_IMAGE,
-    problems.DAMAGED_IMAGE,
-    problems.UNSUPPORTED_IMAGE,
-    problems.IMAGE_SIZE,
-    problems.IMAGE_ASPECT,
-    problems.INVALID_REQUEST,
-    problems.INTERNAL,
-    problems.NOT_READY,
-    problems.OVERLOADED,
-)
 
 
-def create_app(engine: Engine, check: Callable[[Engine], None] = warm_up) -> FastAPI:
-    """The service around `engine`; `check` warms it up and raises when its answers are wrong.
+class Service:
+    """The ASGI application around one engine."""
 
-    The check runs when the application starts (its lifespan): until it is through, /readyz and
-    /features answer 503.
-    """
-    perceiver = Perceiver(engine, check)
+    def __init__(
+        self,
+        engine: Engine,
+        check: Callable[[Engine], None] = warm_up,
+        limits: Limits | None = None,
+        shared: Shared | None = None,
+    ) -> None:
+        """`check` warms an engine up and raises when its answers are wrong.
 
+        It runs when the application starts (its lifespan): until it is through, /readyz and
+        /features answer 503. `shared` None: this is the only worker.
+        """
+        self.limits = limits or Limits()
+        self.shared = shared or create(slots=1)
+        streams = Streams(self.shared.streams())
+        self.perceiver = Perceiver(engine, check, streams, self.limits.queue)
+        self.features = Features(self.perceiver)
+        self.framework = _framework(self)
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] == "http" and scope["path"] == "/features" and scope["method"] == "POST":
+            await self.features(scope, receive, send)
+        else:
+            await self.framework(scope, receive, send)
+
+
+def create_app(
+    engine: Engine,
+    check: Callable[[Engine], None] = warm_up,
+    limits: Limits | None = None,
+    shared: Shared | None = None,
+) -> Service:
+    """The service around `engine`, see `Service`."""
+    return Service(engine, check, limits, shared)
+
+
+def _framework(service: Service) -> FastAPI:
     @asynccontextmanager
     async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
-        perceiver.start()
+        service.perceiver.start()
         yield
-        perceiver.close()
+        service.perceiver.close()
 
     app = FastAPI(
         title="driverview",
@@ -61,49 +80,13 @@ def create_app(engine: Engine, check: Callable[[Engine], None] = warm_up) -> Fas
     )
     problems.install(app)
     contract.install_openapi(app)
-    _add_features(app, perceiver)
-    _add_status(app, perceiver)
+    # Reached only with another method than POST: who sends one is told which there is.
+    app.router.routes.append(Route("/features", service.features, methods=["POST"]))
+    _add_status(app, service.perceiver)
     return app
 
 
-def _add_features(app: FastAPI, perceiver: Perceiver) -> None:
-    engine = perceiver.engine
-    origin = {
-        "model": engine.card.model_hash,
-        "definitions_version": tf.VERSION,
-        "engine": engine.kind,
-        "precision": engine.precision,
-    }
-
-    @app.post(
-        "/features",
-        summary="Track features of one driver-view image",
-        response_model=contract.Features,
-        responses=contract.problem_responses(*REFUSALS),
-        openapi_extra=contract.IMAGE_REQUEST,
-    )
-    async def features(request: Request) -> Response:
-        start = time.perf_counter()
-        frame_id = _frame_id(request)
-        check_headers(request.headers)
-        body = await read_body(request.stream())
-        header = inspect(body, engine.card.camera)
-        perceived = await perceiver.perceive(body, header)
-        total_ms = 1e3 * (time.perf_counter() - start)
-        # Not through the response model: it was validated by the tests, once for all requests.
-        content = {
-            **perceived.answer.as_json(),
-            **origin,
-            "timing_ms": _timing(perceived, total_ms),
-            "frame_id": frame_id,
-        }
-        return Response(json.dumps(content), media_type="application/json")
-
-
 def _add_status(app: FastAPI, perceiver: Perceiver) -> None:
-    engine = perceiver.engine
-    card = engine.card
-
     @app.get("/healthz", summary="Is the process alive?", response_model=contract.Status)
     async def healthz() -> Response:
         return JSONResponse({"status": "alive"})
@@ -116,38 +99,13 @@ def _add_status(app: FastAPI, perceiver: Perceiver) -> None:
     )
     async def readyz() -> Response:
         perceiver.check_ready()
-        return JSONResponse({"status": "ready", "model": card.model_hash})
+        return JSONResponse({"status": "ready", "model": perceiver.loaded.origin["model"]})
 
     @app.get("/model", summary="What the model was made from, and for which camera")
     async def model() -> dict[str, Any]:
-        return {
-            "model": card.model_hash,
-            "engine": engine.kind,
-            "precision": engine.precision,
-            **asdict(card),
-        }
+        loaded = perceiver.loaded
+        return {**loaded.origin, **asdict(loaded.engine.card)}
 
     @app.get("/", include_in_schema=False)
     async def page() -> HTMLResponse:
         return HTMLResponse(PAGE.read_text(encoding="utf-8"))
-
-
-def _frame_id(request: Request) -> str | None:
-    sent = request.headers.get(contract.FRAME_ID)
-    if sent is None:
-        return None
-    if len(sent) > contract.MAX_FRAME_ID or not (sent.isascii() and sent.isprintable()):
-        raise Problem(
-            problems.INVALID_REQUEST,
-            f"{contract.FRAME_ID} has {len(sent)} characters; at most {contract.MAX_FRAME_ID} of "
-            "printable ASCII are taken",
-        )
-    return sent
-
-
-def _timing(perceived: Perceived, total_ms: float) -> dict[str, float]:
-    return {
-        "decode": round(perceived.decode_ms, 3),
-        "forward": round(perceived.forward_ms, 3),
-        "total": round(total_ms, 3),
-    }

@@ -6,11 +6,21 @@ from fastapi import FastAPI
 from fastapi.openapi.utils import get_openapi
 from pydantic import BaseModel, Field, JsonValue
 
-from serve.gate import MEDIA_TYPES
+from serve import problems
+from serve.ask import (
+    DEADLINE,
+    FIELD_OF_VIEW,
+    FRAME_ID,
+    MAX_FOV_DEG,
+    MEDIA_TYPES,
+    MIN_FOV_DEG,
+    REQUEST_ID,
+    STREAM_ID,
+)
+from serve.limits import MAX_DEADLINE_MS, MAX_NAME
 from serve.problems import KINDS, MEDIA_TYPE, Kind
+from serve.wire import FORMATS
 
-FRAME_ID = "X-Frame-Id"
-MAX_FRAME_ID = 128
 PROBLEM_TYPES: list[JsonValue] = [*(kind.type for kind in KINDS), "about:blank"]
 
 
@@ -33,8 +43,9 @@ class HeadingProbabilities(BaseModel):
 
 
 class Timing(BaseModel):
-    """Where the service spent its time, ms. `total` includes receiving the body and waiting."""
+    """Where the service spent its time, ms. `queue` and `total` include receiving the body."""
 
+    queue: float = Field(description="from the first of the request to its turn")
     decode: float
     forward: float
     total: float
@@ -56,6 +67,11 @@ class Features(BaseModel):
     definitions_version: str = Field(description="version of what the features mean")
     engine: str
     precision: str
+    crop_px: list[int] | None = Field(
+        description="left, top, width, height of what the model saw of the image, px; null: all",
+        min_length=4,
+        max_length=4,
+    )
     timing_ms: Timing
     frame_id: str | None = Field(description=f"the request's {FRAME_ID}, null without one")
 
@@ -77,28 +93,83 @@ class ProblemDetails(BaseModel):
     title: str
     status: int
     detail: str = Field(description="what was seen and what to do")
+    retry_after_ms: int | None = Field(
+        default=None, description="when to ask again, ms; only where that may help"
+    )
 
 
-IMAGE_REQUEST: dict[str, Any] = {
-    "requestBody": {
-        "required": True,
-        "description": "The bytes of one JPEG or PNG file: no form, no base64. At most 4 MiB, 16 "
-        "to 4096 px a side, 8.4 million px; the shape (width / height) of the model's camera.",
-        "content": {
-            name: {"schema": {"type": "string", "format": "binary", "contentMediaType": name}}
-            for name in MEDIA_TYPES
-        },
-    },
-    "parameters": [
-        {
-            "name": FRAME_ID,
-            "in": "header",
-            "required": False,
-            "description": "Comes back as `frame_id`. Printable ASCII.",
-            "schema": {"type": "string", "maxLength": MAX_FRAME_ID, "pattern": "^[ -~]*$"},
-        }
-    ],
+REFUSALS = (
+    problems.UNAUTHORIZED,
+    problems.NOT_ACCEPTABLE,
+    problems.TOO_SLOW,
+    problems.BODY_TOO_LARGE,
+    problems.UNSUPPORTED_TYPE,
+    problems.INVALID_REQUEST,
+    problems.NOT_AN_IMAGE,
+    problems.DAMAGED_IMAGE,
+    problems.UNSUPPORTED_IMAGE,
+    problems.TRAILING_BYTES,
+    problems.IMAGE_SIZE,
+    problems.IMAGE_ASPECT,
+    problems.FIELD_OF_VIEW,
+    problems.RATE_LIMITED,
+    problems.INTERNAL,
+    problems.NOT_READY,
+    problems.OVERLOADED,
+    problems.SUPERSEDED,
+    problems.DEADLINE_PASSED,
+)
+NAME: dict[str, Any] = {"type": "string", "maxLength": MAX_NAME, "pattern": "^[ -~]*$"}
+HEADERS: dict[str, tuple[str, dict[str, Any]]] = {
+    FRAME_ID: ("Comes back as `frame_id`. Printable ASCII.", NAME),
+    STREAM_ID: (
+        "Names a stream of frames of this client, one camera's for instance: a newer frame takes "
+        "the place of one that waits, which is answered 503, `superseded`.",
+        NAME,
+    ),
+    DEADLINE: (
+        "A frame whose turn comes later than so many ms after its request began is not decoded, "
+        "but answered 503, `deadline-passed`.",
+        {"type": "number", "minimum": 0, "maximum": MAX_DEADLINE_MS},
+    ),
+    FIELD_OF_VIEW: (
+        "The image's vertical field of view, degrees; without it, the model's. The model's view is "
+        "cut out of a larger one.",
+        {"type": "number", "minimum": MIN_FOV_DEG, "maximum": MAX_FOV_DEG},
+    ),
+    REQUEST_ID: ("Comes back in a header of the same name, and stands in the log.", NAME),
 }
+
+
+def features_operation() -> dict[str, Any]:
+    """POST /features as OpenAPI has it: that path bypasses the framework."""
+    schema = {"$ref": "#/components/schemas/Features"}
+    return {
+        "summary": "Track features of one driver-view image",
+        "operationId": "features",
+        "parameters": [
+            {"name": name, "in": "header", "required": False, "description": text, "schema": kind}
+            for name, (text, kind) in HEADERS.items()
+        ],
+        "requestBody": {
+            "required": True,
+            "description": "The bytes of one JPEG or PNG file: no form, no base64. At most 4 MiB, "
+            "16 to 4096 px a side, 8.4 million px. The model's view is cut out of a wider image; "
+            "one that does not hold it is refused.",
+            "content": {
+                name: {"schema": {"type": "string", "format": "binary", "contentMediaType": name}}
+                for name in MEDIA_TYPES
+            },
+        },
+        "responses": {
+            "200": {
+                "description": "What the model sees, in the type that `Accept` prefers",
+                "content": {form.media_type: {"schema": schema} for form in FORMATS},
+                "headers": {REQUEST_ID: {"schema": NAME}},
+            },
+            **{str(k): v for k, v in problem_responses(*REFUSALS).items()},
+        },
+    }
 
 
 def problem_responses(*kinds: Kind) -> dict[int | str, dict[str, Any]]:
@@ -115,7 +186,7 @@ def problem_responses(*kinds: Kind) -> dict[int | str, dict[str, Any]]:
 
 
 def install_openapi(app: FastAPI) -> None:
-    """Give `app` an OpenAPI document in which the problem schema can be found."""
+    """Give `app` an OpenAPI document with the paths and schemas that it does not know of."""
 
     def document() -> dict[str, Any]:
         if app.openapi_schema is None:
@@ -126,7 +197,11 @@ def install_openapi(app: FastAPI) -> None:
                 routes=app.routes,
             )
             schemas = schema.setdefault("components", {}).setdefault("schemas", {})
-            schemas["ProblemDetails"] = ProblemDetails.model_json_schema()
+            for model in (ProblemDetails, Features):
+                found = model.model_json_schema(ref_template="#/components/schemas/{model}")
+                schemas.update(found.pop("$defs", {}))
+                schemas[model.__name__] = found
+            schema["paths"] = {"/features": {"post": features_operation()}, **schema["paths"]}
             app.openapi_schema = schema
         return app.openapi_schema
 

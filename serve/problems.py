@@ -6,12 +6,12 @@ A problem's `type` names its kind and never changes; `detail` says what was seen
 import http
 import json
 from dataclasses import dataclass
+from math import ceil
 from typing import Any
 
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from starlette.exceptions import HTTPException
-from starlette.requests import ClientDisconnect
 from starlette.responses import Response
 
 from mtlnet.image_error import Fault, ImageError
@@ -34,34 +34,58 @@ class Kind:
         return f"/problems/{self.name}"
 
 
-INVALID_REQUEST = Kind("invalid-request", 422, "The request is not understood")
+MALFORMED = Kind("malformed-request", 400, "This is no HTTP request")
+UNAUTHORIZED = Kind("unauthorized", 401, "The token is missing or wrong")
+FORBIDDEN_ORIGIN = Kind("forbidden-origin", 403, "Another site's page may not use this service")
+NOT_FOUND = Kind("not-found", 404, "There is nothing at this path")
+METHOD_NOT_ALLOWED = Kind("method-not-allowed", 405, "This path does not take this method")
+NOT_ACCEPTABLE = Kind("not-acceptable", 406, "The answer cannot be had in the accepted types")
+TOO_SLOW = Kind("request-timeout", 408, "The request came too slowly")
 BODY_TOO_LARGE = Kind("body-too-large", 413, "The body is too large")
 UNSUPPORTED_TYPE = Kind("unsupported-media-type", 415, "The body has another type than an image")
+INVALID_REQUEST = Kind("invalid-request", 422, "The request is not understood")
 NOT_AN_IMAGE = Kind("not-an-image", 422, "The body is no JPEG or PNG image")
 DAMAGED_IMAGE = Kind("damaged-image", 422, "The image is damaged or incomplete")
 UNSUPPORTED_IMAGE = Kind("unsupported-image", 422, "The image has a coding that is not supported")
+TRAILING_BYTES = Kind("trailing-bytes", 422, "More than the image is in the body")
 IMAGE_SIZE = Kind("image-size", 422, "The image is too small or too large")
 IMAGE_ASPECT = Kind("image-aspect", 422, "The image has another shape than the model's camera")
+FIELD_OF_VIEW = Kind("field-of-view", 422, "The image shows less than the model's camera does")
+RATE_LIMITED = Kind("rate-limited", 429, "This client asks too often")
+HEAD_TOO_LARGE = Kind("headers-too-large", 431, "The headers are too large")
+INTERNAL = Kind("internal", 500, "The service failed")
 NOT_READY = Kind("not-ready", 503, "The service is not ready")
 OVERLOADED = Kind("overloaded", 503, "The service has too much to do")
-NOT_FOUND = Kind("not-found", 404, "There is nothing at this path")
-METHOD_NOT_ALLOWED = Kind("method-not-allowed", 405, "This path does not take this method")
-INTERNAL = Kind("internal", 500, "The service failed")
+TOO_MANY_CONNECTIONS = Kind("too-many-connections", 503, "The service has too many connections")
+SUPERSEDED = Kind("superseded", 503, "A newer frame of the stream took this one's place")
+DEADLINE_PASSED = Kind("deadline-passed", 503, "The frame's deadline passed before its turn came")
 
 KINDS = (
-    INVALID_REQUEST,
+    MALFORMED,
+    UNAUTHORIZED,
+    FORBIDDEN_ORIGIN,
+    NOT_FOUND,
+    METHOD_NOT_ALLOWED,
+    NOT_ACCEPTABLE,
+    TOO_SLOW,
     BODY_TOO_LARGE,
     UNSUPPORTED_TYPE,
+    INVALID_REQUEST,
     NOT_AN_IMAGE,
     DAMAGED_IMAGE,
     UNSUPPORTED_IMAGE,
+    TRAILING_BYTES,
     IMAGE_SIZE,
     IMAGE_ASPECT,
+    FIELD_OF_VIEW,
+    RATE_LIMITED,
+    HEAD_TOO_LARGE,
+    INTERNAL,
     NOT_READY,
     OVERLOADED,
-    NOT_FOUND,
-    METHOD_NOT_ALLOWED,
-    INTERNAL,
+    TOO_MANY_CONNECTIONS,
+    SUPERSEDED,
+    DEADLINE_PASSED,
 )
 IMAGE_KINDS = {
     Fault.NOT_AN_IMAGE: NOT_AN_IMAGE,
@@ -69,23 +93,45 @@ IMAGE_KINDS = {
     Fault.UNSUPPORTED: UNSUPPORTED_IMAGE,
     Fault.SIZE: IMAGE_SIZE,
     Fault.ASPECT: IMAGE_ASPECT,
+    Fault.FIELD_OF_VIEW: FIELD_OF_VIEW,
+    Fault.TRAILING: TRAILING_BYTES,
 }
 # What a client of this service can do about it, beside what the image's reader says.
 HINTS = {
     NOT_AN_IMAGE: "; post the bytes of the file itself",
     IMAGE_SIZE: " (GET /model)",
     IMAGE_ASPECT: " (GET /model says how it is mounted)",
+    FIELD_OF_VIEW: " (GET /model says how the model's is mounted)",
 }
-RETRY_AFTER = {"Retry-After": "1"}  # whole seconds, the header's unit
+RETRY_AFTER_MS = 1000  # where nothing better is known
 
 
 class Problem(UserError):
-    """A request that gets no answer, and why."""
+    """A request that gets no answer, and why; `retry_after_ms` says when to ask again."""
 
-    def __init__(self, kind: Kind, detail: str) -> None:
+    def __init__(self, kind: Kind, detail: str, retry_after_ms: float | None = None) -> None:
         super().__init__(detail)
         self.kind = kind
         self.detail = detail
+        if retry_after_ms is None and kind.status in (429, 503):
+            retry_after_ms = RETRY_AFTER_MS
+        self.retry_after_ms = retry_after_ms
+
+    @property
+    def content(self) -> dict[str, Any]:
+        """The problem's members, `retry_after_ms` in milliseconds among them where it is known."""
+        content = _members(self.kind.type, self.kind.title, self.kind.status, self.detail)
+        if self.retry_after_ms is not None:
+            content["retry_after_ms"] = max(1, round(self.retry_after_ms))
+        return content
+
+    @property
+    def headers(self) -> dict[str, str]:
+        """The headers that go with it."""
+        headers = {"WWW-Authenticate": "Bearer"} if self.kind is UNAUTHORIZED else {}
+        if self.retry_after_ms is not None:  # whole seconds, the header's unit
+            headers["Retry-After"] = str(max(1, ceil(self.retry_after_ms / 1e3)))
+        return headers
 
 
 def image_problem(error: ImageError) -> Problem:
@@ -94,23 +140,28 @@ def image_problem(error: ImageError) -> Problem:
     return Problem(kind, f"{error}{HINTS.get(kind, '')}")
 
 
-def respond(kind: Kind, detail: str, headers: dict[str, str] | None = None) -> Response:
+def failure() -> Problem:
+    """The problem that a fault of ours is to a client, who gets nothing of our insides."""
+    return Problem(INTERNAL, "the request could not be answered; the service's log says why")
+
+
+def respond(problem: Problem, headers: dict[str, str] | None = None) -> Response:
     """The problem as a response."""
-    return _response(kind.type, kind.status, kind.title, detail, headers)
+    return _response(problem.content, {**problem.headers, **(headers or {})})
 
 
-def _response(
-    type_uri: str, status: int, title: str, detail: str, headers: dict[str, str] | None
-) -> Response:
-    content: dict[str, Any] = {"type": type_uri, "title": title, "status": status, "detail": detail}
-    return Response(json.dumps(content), status, headers, MEDIA_TYPE)
+def _members(type_uri: str, title: str, status: int, detail: str) -> dict[str, Any]:
+    return {"type": type_uri, "title": title, "status": status, "detail": detail}
+
+
+def _response(content: dict[str, Any], headers: dict[str, str] | None) -> Response:
+    return Response(json.dumps(content), content["status"], headers, MEDIA_TYPE)
 
 
 def install(app: FastAPI) -> None:
     """Make every error that leaves `app` a problem, those of the framework included."""
     app.add_exception_handler(Problem, _on_problem)
     app.add_exception_handler(ImageError, _on_image_error)
-    app.add_exception_handler(ClientDisconnect, _on_departure)
     app.add_exception_handler(HTTPException, _on_http_exception)
     app.add_exception_handler(RequestValidationError, _on_validation_error)
     app.add_exception_handler(Exception, _on_failure)
@@ -118,18 +169,12 @@ def install(app: FastAPI) -> None:
 
 def _on_problem(_request: Request, error: Exception) -> Response:
     assert isinstance(error, Problem)
-    headers = RETRY_AFTER if error.kind.status == 503 else None
-    return respond(error.kind, error.detail, headers)
+    return respond(error)
 
 
-def _on_image_error(request: Request, error: Exception) -> Response:
+def _on_image_error(_request: Request, error: Exception) -> Response:
     assert isinstance(error, ImageError)
-    return _on_problem(request, image_problem(error))
-
-
-def _on_departure(_request: Request, _error: Exception) -> Response:
-    """A client that left in mid-upload is no failure of the service; nobody reads this answer."""
-    return respond(INVALID_REQUEST, "the client left before its image was whole")
+    return respond(image_problem(error))
 
 
 def _on_http_exception(request: Request, error: Exception) -> Response:
@@ -138,24 +183,21 @@ def _on_http_exception(request: Request, error: Exception) -> Response:
     path = request.url.path
     if error.status_code == 404:
         detail = f"there is nothing at {path}; images go to POST /features, the docs are at /docs"
-        return respond(NOT_FOUND, detail, headers)
+        return respond(Problem(NOT_FOUND, detail), headers)
     if error.status_code == 405:
         allowed = headers.get("allow") or headers.get("Allow") or "another method"
         detail = f"{path} takes {allowed}, not {request.method}; the docs are at /docs"
-        return respond(METHOD_NOT_ALLOWED, detail, headers)
+        return respond(Problem(METHOD_NOT_ALLOWED, detail), headers)
     title = http.HTTPStatus(error.status_code).phrase
-    return _response("about:blank", error.status_code, title, str(error.detail), headers)
+    return _response(_members("about:blank", title, error.status_code, str(error.detail)), headers)
 
 
 def _on_validation_error(_request: Request, error: Exception) -> Response:
     assert isinstance(error, RequestValidationError)
     seen = "; ".join(f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors())
-    return respond(INVALID_REQUEST, f"{seen}; the docs are at /docs")
+    return respond(Problem(INVALID_REQUEST, f"{seen}; the docs are at /docs"))
 
 
 def _on_failure(_request: Request, _error: Exception) -> Response:
-    # The server logs the error itself; a client gets nothing of our insides.
-    detail = "the request could not be answered; the service's log says why"
-    return respond(
-        INTERNAL, detail, {"Connection": "close"}
-    )  # the server closes it after a failure
+    # The server logs the error itself, and closes the connection after a failure.
+    return respond(failure(), {"Connection": "close"})

@@ -13,12 +13,11 @@ from pathlib import Path
 from types import FrameType
 
 import uvicorn
-from fastapi import FastAPI
 from uvicorn.supervisors import Multiprocess
 
 from mtlnet.card import resolve_run
 from mtlnet.engine import load_engine
-from serve.app import create_app
+from serve.app import Service, create_app
 from trackfeatures.errors import UserError
 from trackfeatures.listening import address, bind
 
@@ -61,12 +60,12 @@ def run(config: ServiceConfig) -> None:
         _run_workers(folder, config.workers, listener)
 
 
-def worker_app() -> FastAPI:
+def worker_app() -> Service:
     """The application of one worker process: uvicorn calls this there."""
     return create_app(load_engine(Path(os.environ[RUN_VARIABLE])))
 
 
-def _run_here(app: FastAPI, listener: socket.socket) -> None:
+def _run_here(app: Service, listener: socket.socket) -> None:
     # uvicorn raises the signal that ended it once more when all is closed: it has done its work.
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, _ignore)
@@ -83,7 +82,7 @@ def _run_workers(folder: Path, workers: int, listener: socket.socket) -> None:
 
 
 def settings(
-    app: FastAPI | str, *, factory: bool = False, workers: int | None = None
+    app: Service | str, *, factory: bool = False, workers: int | None = None
 ) -> uvicorn.Config:
     """How uvicorn runs the application, or the factory named by an import string."""
     return uvicorn.Config(

@@ -7,12 +7,10 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from mtlnet.answer import interpret
@@ -148,11 +146,14 @@ def test_a_taken_port_and_an_unknown_host_are_one_line(published: Path) -> None:
     assert "no.such.host" in refused("--model", str(published), "--host", "no.such.host")
 
 
-def test_help_is_quick() -> None:
-    times = []
-    for _ in range(3):
-        start = time.perf_counter()
-        done = subprocess.run(command("--help"), capture_output=True, text=True, check=True)
-        times.append(time.perf_counter() - start)
+def test_help_loads_nothing_heavy() -> None:
+    """Seconds would measure the machine; what is loaded says the same on all of them."""
+    code = (
+        "import sys; from serve.cli import app; sys.argv[1:] = ['--help']\n"
+        "try: app()\n"
+        "finally: print({'cv2', 'openvino', 'fastapi', 'torch'} & set(sys.modules))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
     assert "--workers" in done.stdout
-    assert np.min(times) < 0.5
+    assert done.stdout.splitlines()[-1] == "set()"

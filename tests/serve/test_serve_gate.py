@@ -11,11 +11,15 @@ import simplejpeg
 from mtlnet import images
 from mtlnet.card import Camera
 from mtlnet.image_error import ImageError
+from mtlnet.jpeg import end as jpeg_end
+from mtlnet.view import Box, visible
 from serve.problems import (
     DAMAGED_IMAGE,
+    FIELD_OF_VIEW,
     IMAGE_ASPECT,
     IMAGE_SIZE,
     NOT_AN_IMAGE,
+    TRAILING_BYTES,
     UNSUPPORTED_IMAGE,
     Kind,
     Problem,
@@ -115,12 +119,44 @@ def test_side_chunks_change_nothing() -> None:
     assert np.array_equal(pixels(marked), pixels(handmade_png()))
 
 
-def test_one_percent_of_another_aspect_passes_and_more_does_not() -> None:
-    assert pixels(jpeg(picture(282, 210))).shape == (210, 280, 3)
-    problem = refusal(jpeg(picture(284, 210)))
+def test_one_percent_of_another_aspect_passes_and_more_is_cropped_or_refused() -> None:
+    assert pixels(jpeg(picture(278, 210))).shape == (210, 280, 3)
+    problem = refusal(jpeg(picture(276, 210)))
     assert problem.kind is IMAGE_ASPECT
-    assert "284 x 210" in problem.detail
+    assert "276 x 210" in problem.detail
     assert "280 x 210" in problem.detail
+    wide = picture(480, 210)
+    assert np.array_equal(pixels(png(wide[:, :, ::-1])), wide[:, 100:380])
+
+
+def test_a_wider_lens_is_cropped_and_a_narrower_one_refused() -> None:
+    """tan(67.5 / 2 deg) = 0.66818 of tan(45 deg): 210 rows seen with 67.5 are 314.3 with 90."""
+    large = picture(420, 314)
+    body = png(large[:, :, ::-1])
+    header = images.inspect(body, VIEW, 90.0)
+    assert np.array_equal(images.decode(body, header, VIEW, 90.0), large[52:262, 70:350])
+    assert visible(420, 314, VIEW, 90.0) == Box(70, 52, 280, 210)
+    with pytest.raises(ImageError, match="50 degrees") as caught:
+        images.inspect(body, VIEW, 50.0)
+    assert image_problem(caught.value).kind is FIELD_OF_VIEW
+
+
+def test_up_to_64_bytes_may_follow_the_picture() -> None:
+    for body in (JPEG, PNG):
+        assert np.array_equal(pixels(body + bytes(64)), pixels(body))
+        problem = refusal(body + JPEG)
+        assert problem.kind is TRAILING_BYTES
+        assert f"{len(JPEG)} bytes" in problem.detail
+        assert refusal(body + bytes(65)).kind is TRAILING_BYTES
+
+
+def test_a_progressive_jpeg_and_filling_bytes_are_read() -> None:
+    image = picture()
+    options = [cv2.IMWRITE_JPEG_PROGRESSIVE, 1, cv2.IMWRITE_JPEG_RST_INTERVAL, 2]
+    body = cv2.imencode(".jpg", image, options)[1].tobytes()
+    assert jpeg_end(body) == len(body)
+    filled = body[:2] + b"\xff" * 5 + body[2:]
+    assert np.array_equal(pixels(filled), pixels(body))
 
 
 JPEG, PNG = jpeg(picture()), png(picture())
@@ -146,7 +182,7 @@ JPEG, PNG = jpeg(picture()), png(picture())
         (handmade_png(extra=chunk(b"abCd", b"") * 10_000), UNSUPPORTED_IMAGE),
         (handmade_png(depth=3), UNSUPPORTED_IMAGE),
         (handmade_png(interlace=2), UNSUPPORTED_IMAGE),
-        (JPEG[:-2] + images.JPEG_SCAN * 101, UNSUPPORTED_IMAGE),
+        (JPEG[:-2] + b"\xff\xda\0\x02" * 101, UNSUPPORTED_IMAGE),
         (bytes(simplejpeg.encode_jpeg(picture(channels=4), 95, "CMYK")), UNSUPPORTED_IMAGE),
         (jpeg(picture(12, 9)), IMAGE_SIZE),
         (jpeg(picture(4104, 3078)), IMAGE_SIZE),
