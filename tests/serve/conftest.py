@@ -19,8 +19,10 @@ from numpy.typing import NDArray
 import trackfeatures as tf
 from mtlnet.card import WEIGHTS, Camera, ModelCard
 from mtlnet.engine import Engine
-from serve.app import create_app
+from serve.app import Service, create_app
+from serve.limits import Limits
 from serve.server import settings
+from serve.shared import Shared
 from trackfeatures.listening import bind
 
 CARD = ModelCard(
@@ -84,6 +86,27 @@ def png(image: NDArray[Any], *options: int) -> bytes:
     return data.tobytes()
 
 
+class Gate:
+    """An engine that answers only when `open`; `busy` once it has begun on a frame."""
+
+    def __init__(self) -> None:
+        self.open, self.busy = threading.Event(), threading.Event()
+        self.engine = FakeEngine(self._respond)
+
+    def _respond(self, _image: NDArray[np.uint8]) -> NDArray[np.float32]:
+        self.busy.set()
+        assert self.open.wait(20)
+        return outputs()
+
+
+def until(condition: Callable[[], bool]) -> None:
+    """Return once `condition` holds; fail after 20 s."""
+    end = time.monotonic() + 20
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.002)
+
+
 @pytest.fixture
 def engine() -> FakeEngine:
     return FakeEngine(lambda _image: outputs())
@@ -101,10 +124,17 @@ class Reply:
 class Served:
     """A running service, and one connection to it."""
 
-    def __init__(self, port: int) -> None:
+    def __init__(self, port: int, app: Service | None = None) -> None:
         self.port = port
+        self._app = app
         self.url = f"http://127.0.0.1:{port}"
         self._connection = http.client.HTTPConnection("127.0.0.1", port, timeout=20)
+
+    @property
+    def app(self) -> Service:
+        """What runs behind the port, in a thread of this process."""
+        assert self._app is not None
+        return self._app
 
     def ask(
         self, method: str, path: str, body: Any = None, headers: dict[str, str] | None = None
@@ -123,7 +153,10 @@ class Served:
 
 @contextmanager
 def serving(
-    engine: FakeEngine, check: Callable[[Any], object] = lambda _engine: None
+    engine: FakeEngine,
+    check: Callable[[Any], object] = lambda _engine: None,
+    limits: Limits | None = None,
+    shared: Shared | None = None,
 ) -> Iterator[Served]:
     """The service around `engine` on a free port, as `serve` runs it, in a thread of this process.
 
@@ -134,14 +167,15 @@ def serving(
         check(engine)
 
     listener = bind("127.0.0.1", 0)
-    server = uvicorn.Server(settings(create_app(engine, checked)))
+    app = create_app(engine, checked, limits, shared)
+    server = uvicorn.Server(settings(app))
     thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
     thread.start()
     try:
         while not server.started:
             assert thread.is_alive()
             time.sleep(0.005)
-        yield Served(listener.getsockname()[1])
+        yield Served(listener.getsockname()[1], app)
     finally:
         server.should_exit = True
         thread.join()
