@@ -1,7 +1,7 @@
 """The card of a trained model: what it was made from and for, and where its folder is.
 
 Free of torch: the service reads cards. A run's folder holds `card.json`, `config.json`,
-`model.safetensors` (the weights of the paper's network), `model.xml` and `model.bin` (the same for
+`model.safetensors` (the folded weights of the network), `model.xml` and `model.bin` (the same for
 OpenVINO), `curves.csv`, `checkpoints/` and `tensorboard/`.
 """
 
@@ -18,7 +18,7 @@ RUNS = Path("runs")
 SHIPPED = Path(__file__).parent / "weights" / "default"
 CARD, WEIGHTS, GRAPH, GRAPH_WEIGHTS = "card.json", "model.safetensors", "model.xml", "model.bin"
 MODEL_FILES = (WEIGHTS, GRAPH, GRAPH_WEIGHTS)
-FORMAT = 1
+FORMAT = 2  # 2: `network`
 
 
 class ModelError(UserError):
@@ -43,6 +43,7 @@ class ModelCard:
     """What a model is. `files` are SHA-256 in hex; `data` describes the dataset it learned from."""
 
     name: str
+    network: str  # of `mtlnet.plan.PLANS`
     definitions_version: str
     program_version: str
     camera: Camera

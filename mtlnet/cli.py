@@ -40,6 +40,10 @@ def train_command(
         str | None,
         typer.Option(help="Weights of distance, angle and type loss.  [default: 0.3,0.2,0.5]"),
     ] = None,
+    network: Annotated[
+        str | None,
+        typer.Option(help="mtl, deepdriving, mobilenet_v3_small, regnet_y_400mf.  [default: mtl]"),
+    ] = None,
     recipe: Annotated[
         str | None, typer.Option(help="fast (minutes) or paper (days).  [default: fast]")
     ] = None,
@@ -61,6 +65,7 @@ def train_command(
     """Train the network on the train rounds of a dataset; ends with a model `serve` can load."""
     given = {
         "data": data,
+        "network": network,
         "recipe": recipe,
         "iterations": iterations,
         "minutes": minutes,

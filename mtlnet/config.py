@@ -9,6 +9,7 @@ from typing import Any
 import trackfeatures as tf
 from mtlnet.card import ModelError
 from mtlnet.loss import Alpha
+from mtlnet.plan import find_plan, require_learnable
 from mtlnet.recipe import Recipe
 from mtlnet.whole import write_whole
 from trackfeatures.errors import UserError
@@ -25,6 +26,8 @@ class TrainConfig:
 
     data: Path
     out: Path
+    network: str = "mtl"
+    """A name of `mtlnet.plan.PLANS`."""
     alpha: Alpha = (0.3, 0.2, 0.5)
     recipe: str = "fast"
     iterations: int | None = None
@@ -38,6 +41,7 @@ class TrainConfig:
     """CPU threads; 0: one a core."""
 
     def __post_init__(self) -> None:
+        require_learnable(find_plan(self.network), self.alpha)
         if self.iterations is not None and self.iterations < 1:
             raise UserError(f"--iterations is {self.iterations}; give at least 1")
         if self.minutes is not None and not self.minutes > 0:

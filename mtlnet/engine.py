@@ -121,7 +121,7 @@ class TorchEngine:
         torch.set_num_threads(threads)
         self.card = card
         self.precision: Precision = "f32"
-        self._network: Network = load_network(run / WEIGHTS)
+        self._network: Network = load_network(run / WEIGHTS, card.network)
         self._shape = (card.camera.height, card.camera.width, 3)
 
     def __call__(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:

@@ -1,7 +1,7 @@
 """Writing the trained network as OpenVINO IR: what `serve` loads, without torch.
 
 The graph is built operation by operation from the weights, not traced: it uses OpenVINO's own SAME
-padding and so is an independent check of the network's. No converter, hence no telemetry.
+padding (`mtlnet.graph_layers`) and so is an independent check. No converter, hence no telemetry.
 """
 
 import errno
@@ -11,7 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mtlnet.network import FEATURES, HEADS, HEIGHT, SHARED, WIDTH, Network, Pool
+from mtlnet.graph_layers import features_graph
+from mtlnet.network import Network
+from mtlnet.plan import HEADS, HEIGHT, WIDTH
 
 # Largest difference of any output (coded, or a probability) from torch in float32.
 TOLERANCE = 2e-4
@@ -27,21 +29,8 @@ def build_graph(network: Network) -> Any:
     x = ops.convert(images, np.float32)
     x = ops.subtract(ops.multiply(x, np.float32(1 / 127.5)), np.float32(1))
     x = ops.transpose(x, np.array([0, 3, 1, 2]))
-    zeros = [0, 0]
-    for number, spec in enumerate(FEATURES):
-        strides = [spec.stride] * 2
-        if isinstance(spec, Pool):
-            kernel = [spec.kernel] * 2
-            x = ops.max_pool(
-                x, strides, [1, 1], zeros, zeros, kernel, auto_pad="same_upper"
-            ).output(0)
-            continue
-        weight = weights[f"features.conv{number}.layer.weight"]
-        bias = weights[f"features.conv{number}.layer.bias"]
-        x = ops.convolution(x, weight, strides, zeros, zeros, [1, 1], auto_pad="same_upper")
-        x = ops.relu(ops.add(x, bias.reshape(1, -1, 1, 1)))
-    x = ops.reshape(x, np.array([1, -1]), special_zero=False)
-    for number in range(len(SHARED)):
+    x = features_graph(ops, x, network)
+    for number in range(len(network.plan.shared)):
         x = ops.relu(_linear(ops, x, weights, f"shared.fc{number}.layer"))
     distance, angle, kind = (_precise_linear(ops, x, weights, f"heads.{name}") for name, _ in HEADS)
     outputs = ops.concat([distance, angle, ops.softmax(kind, 1)], 1)

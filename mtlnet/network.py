@@ -1,4 +1,4 @@
-"""The multi-task network of the paper (section IV-C), with TensorFlow's SAME padding.
+"""The multi-task network of the paper (section IV-C), and others in its place: `mtlnet.plan`.
 
 Input: uint8 RGB images (B, 210, 280, 3). Output (B, 9): five coded distances and the coded angle
 (linear), and the scores of the classes left, straight, right (before softmax). Recipe `fast`
@@ -6,7 +6,7 @@ trains a rescaled form of it, with batch normalisation after every convolution, 
 heads that answer in standard deviations; `fold` turns that into the paper's network, exactly.
 """
 
-from dataclasses import dataclass
+import copy
 from pathlib import Path
 
 import numpy as np
@@ -15,74 +15,10 @@ from numpy.typing import NDArray
 from safetensors.torch import load_file
 from torch import Tensor, nn
 
-HEIGHT, WIDTH = 210, 280
-NORM_EPS = 1e-5
+from mtlnet.layers import block, build_features, fold_norms
+from mtlnet.plan import HEADS, HEIGHT, MTL, WIDTH, Plan, find_plan
 
-
-@dataclass(frozen=True)
-class Conv:
-    """Conv(n, k, s) of the paper: n filters of k x k with stride s, ReLU."""
-
-    filters: int
-    kernel: int
-    stride: int
-
-
-@dataclass(frozen=True)
-class Pool:
-    """MaxPool(k, s) of the paper."""
-
-    kernel: int = 3
-    stride: int = 2
-
-
-FEATURES: tuple[Conv | Pool, ...] = (
-    Conv(96, 11, 4),
-    Pool(),
-    Conv(256, 5, 2),
-    Pool(),
-    Conv(384, 3, 2),
-    Conv(384, 3, 2),
-    Conv(256, 3, 2),
-    Pool(),
-)
-SHARED = (4096, 1024, 256)
-HEADS = (("distance", 5), ("angle", 1), ("heading", 3))
-
-
-def same_padding(size: int, kernel: int, stride: int) -> tuple[int, int, int]:
-    """TensorFlow's SAME: output size, zeros before, zeros after; the odd one goes after."""
-    out = -(-size // stride)
-    total = max((out - 1) * stride + kernel - size, 0)
-    return out, total // 2, total - total // 2
-
-
-class SamePad(nn.Module):
-    """Zeros around an image, as SAME padding of the next layer asks."""
-
-    def __init__(self, height: int, width: int, layer: Conv | Pool) -> None:
-        super().__init__()
-        self.out_height, top, bottom = same_padding(height, layer.kernel, layer.stride)
-        self.out_width, left, right = same_padding(width, layer.kernel, layer.stride)
-        self.pads = (left, right, top, bottom)
-
-    def forward(self, x: Tensor) -> Tensor:
-        # A maximum of values after ReLU is not changed by zeros, so pools are padded with them too.
-        return nn.functional.pad(x, self.pads) if any(self.pads) else x
-
-
-def block(layer: nn.Module, norm: nn.Module | None, dropout: float = 0.0) -> nn.Sequential:
-    """layer - [batch normalisation] - ReLU - [dropout]."""
-    parts: list[tuple[str, nn.Module]] = [("layer", layer)]
-    if norm is not None:
-        parts.append(("norm", norm))
-    parts.append(("relu", nn.ReLU()))
-    if dropout:
-        parts.append(("dropout", nn.Dropout(dropout)))
-    sequence = nn.Sequential()
-    for name, part in parts:
-        sequence.add_module(name, part)
-    return sequence
+__all__ = ["HEIGHT", "WIDTH", "Network", "answer_images", "fold", "initialise", "load_network"]
 
 
 class Network(nn.Module):
@@ -91,24 +27,12 @@ class Network(nn.Module):
     target_mean: Tensor
     target_std: Tensor
 
-    def __init__(self, *, batch_norm: bool = False, dropout: float = 0.0) -> None:
+    def __init__(self, *, batch_norm: bool = False, dropout: float = 0.0, plan: Plan = MTL) -> None:
         super().__init__()
-        self.features = nn.Sequential()
-        channels, height, width = 3, HEIGHT, WIDTH
-        for number, spec in enumerate(FEATURES):
-            pad = SamePad(height, width, spec)
-            height, width = pad.out_height, pad.out_width
-            self.features.add_module(f"pad{number}", pad)
-            if isinstance(spec, Pool):
-                self.features.add_module(f"pool{number}", nn.MaxPool2d(spec.kernel, spec.stride))
-                continue
-            conv = nn.Conv2d(channels, spec.filters, spec.kernel, spec.stride, bias=not batch_norm)
-            norm = nn.BatchNorm2d(spec.filters, eps=NORM_EPS) if batch_norm else None
-            channels = spec.filters
-            self.features.add_module(f"conv{number}", block(conv, norm))
+        self.plan = plan
+        self.features, size = build_features(plan, batch_norm=batch_norm)
         self.shared = nn.Sequential()
-        size = channels * height * width
-        for number, units in enumerate(SHARED):
+        for number, units in enumerate(plan.shared):
             # Not normalised: what neighbours in a batch add to an image is noise to a distance.
             self.shared.add_module(f"fc{number}", block(nn.Linear(size, units), None, dropout))
             size = units
@@ -119,8 +43,16 @@ class Network(nn.Module):
 
     def forward(self, images: Tensor) -> Tensor:
         """Images (B, 210, 280, 3), uint8 or already normalised float -> (B, 9) float32."""
+        return self.answer(self.describe(images))
+
+    def describe(self, images: Tensor) -> Tensor:
+        """The last shared features (B, 256) of images, from which the heads answer."""
         x = (normalise(images) if images.dtype == torch.uint8 else images).permute(0, 3, 1, 2)
-        x = self.shared(self.features(x).flatten(1))
+        described: Tensor = self.shared(self.features(x).flatten(1))
+        return described
+
+    def answer(self, x: Tensor) -> Tensor:
+        """The outputs (B, 9) for last shared features (B, 256)."""
         # The heads are small: in float32 also under autocast, for coded values near each other.
         with torch.autocast(x.device.type, enabled=False):
             x = x.float()
@@ -141,6 +73,8 @@ def initialise(network: Network, seed: int) -> None:
     for name, module in network.named_modules():
         if isinstance(module, nn.Conv2d | nn.Linear):
             gain = 0.01 if name.startswith("heads") else 2.0
+            if name == "heads.heading" and "type" not in network.plan.tasks:
+                gain = 0.0  # never trained: the same probability for each class
             fan_in = module.weight[0].numel()
             with torch.no_grad():
                 module.weight.normal_(0.0, (gain / fan_in) ** 0.5, generator=generator)
@@ -149,41 +83,27 @@ def initialise(network: Network, seed: int) -> None:
 
 
 def fold(network: Network) -> Network:
-    """The paper's network that computes what `network` computes in evaluation mode."""
-    folded = Network()
-    state = network.state_dict()
-    result = folded.state_dict()
-    for name in result:
-        prefix, _, kind = name.rpartition(".")
-        weight = state[f"{prefix}.weight"].double()
-        block_name = prefix.removesuffix(".layer")
-        if f"{block_name}.norm.weight" in state:
-            norm = {
-                key: state[f"{block_name}.norm.{key}"].double()
-                for key in ("weight", "bias", "running_mean", "running_var")
-            }
-            gain = norm["weight"] / torch.sqrt(norm["running_var"] + NORM_EPS)
-            bias = norm["bias"] - norm["running_mean"] * gain
-        else:
-            gain, bias = _head_scale(network, prefix, state)
-        scaled = weight * gain.reshape(-1, *[1] * (weight.ndim - 1))
-        result[name] = (scaled if kind == "weight" else bias).float().cpu().contiguous()
-    folded.load_state_dict(result)
+    """The plain network that computes what `network` computes in evaluation mode.
+
+    For `mtl` that is the paper's. Folded in double precision.
+    """
+    double = copy.deepcopy(network).cpu().double()
+    fold_norms(double)
+    for name, rows in (("distance", slice(0, 5)), ("angle", slice(5, 6))):
+        std = double.target_std[rows]
+        with torch.no_grad():
+            double.get_parameter(f"heads.{name}.weight").mul_(std[:, None])
+            bias = double.get_parameter(f"heads.{name}.bias")
+            bias.mul_(std).add_(double.target_mean[rows])
+    folded = Network(plan=network.plan)
+    state = double.state_dict()
+    folded.load_state_dict({name: state[name].float() for name in folded.state_dict()})
     return folded.eval()
 
 
-def _head_scale(network: Network, prefix: str, state: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
-    bias = state[f"{prefix}.bias"].double()
-    rows = {"heads.distance": slice(0, 5), "heads.angle": slice(5, 6)}.get(prefix)
-    if rows is None:
-        return torch.ones_like(bias), bias
-    std, mean = network.target_std[rows].double(), network.target_mean[rows].double()
-    return std, bias * std + mean
-
-
-def load_network(path: Path) -> Network:
-    """The paper's network with the weights of a `model.safetensors`."""
-    network = Network()
+def load_network(path: Path, name: str = MTL.name) -> Network:
+    """The network called `name` with the weights of a `model.safetensors`."""
+    network = Network(plan=find_plan(name))
     network.load_state_dict(load_file(path))
     return network.eval()
 

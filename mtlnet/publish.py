@@ -64,6 +64,7 @@ def publish(
     golden = golden_image(WIDTH, HEIGHT)
     card = ModelCard(
         name=run.resolve().name,
+        network=folded.plan.name,
         definitions_version=tf.VERSION,
         program_version=package_versions()["driverview"],
         camera=camera or Camera(),

@@ -10,6 +10,7 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn
 from mtlnet.card import RUNS, ModelError
 from mtlnet.config import CONFIG, TrainConfig, resume_config
 from mtlnet.loss import parse_alpha
+from mtlnet.plan import find_plan
 from mtlnet.recipe import find_recipe
 from mtlnet.train import Progress as Point
 from mtlnet.train import Stopped, train
@@ -29,9 +30,12 @@ def start_training(
     else:
         recipe = find_recipe(options.get("recipe", "fast")).name
         folder = out or RUNS / f"{time.strftime('%Y%m%d-%H%M%S')}-{recipe}"
-        config = TrainConfig(**{"data": DATASET, "out": folder, **options})
+        usual = {"alpha": find_plan(options.get("network", "mtl")).default_alpha}
+        config = TrainConfig(**{"data": DATASET, "out": folder, **usual, **options})
     console = Console(stderr=True)
-    console.print(f"training {config.out} on {config.data}, recipe {config.recipe}")
+    console.print(
+        f"training {config.network} in {config.out} on {config.data}, recipe {config.recipe}"
+    )
     began = time.perf_counter()
     with _bar(console) as bar:
         task = bar.add_task("", total=1.0, text="reading labels", left="")

@@ -26,6 +26,7 @@ from mtlnet.curves import Curves
 from mtlnet.interrupt import StopRequest
 from mtlnet.loader import Loader
 from mtlnet.network import HEIGHT, WIDTH
+from mtlnet.plan import find_plan
 from mtlnet.publish import publish
 from mtlnet.recipe import Recipe, find_recipe
 from mtlnet.report import describe_data
@@ -76,7 +77,7 @@ def train(
     torch.set_num_threads(config.threads or os.cpu_count() or 1)
     cv2.setNumThreads(1)  # the loader's images are small: a second pool would only fight torch's
     keep_freed_memory()
-    trainer = Trainer(recipe, config.alpha, config.seed, device)
+    trainer = Trainer(recipe, config.alpha, config.seed, device, find_plan(config.network))
     loader = Loader(frames, camera, config.batch, config.seed, augment=recipe.augment)
     trainer.standardise(loader)
     elapsed_s = 0.0

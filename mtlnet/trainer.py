@@ -11,6 +11,7 @@ from torch import Tensor
 from mtlnet.loader import Batch, Loader
 from mtlnet.loss import Alpha, Losses, multi_task_loss
 from mtlnet.network import Network, initialise, normalise
+from mtlnet.plan import MTL, Plan
 from mtlnet.recipe import MOMENTUM, Recipe, learning_rate
 
 MIN_TARGET_STD = 0.01
@@ -19,12 +20,16 @@ MIN_TARGET_STD = 0.01
 class Trainer:
     """Trains a network; `step_number` counts the steps taken."""
 
-    def __init__(self, recipe: Recipe, alpha: Alpha, seed: int, device: torch.device) -> None:
+    def __init__(
+        self, recipe: Recipe, alpha: Alpha, seed: int, device: torch.device, plan: Plan = MTL
+    ) -> None:
         self.recipe = recipe
         self.alpha = alpha
         self.device = device
         self.step_number = 0
-        network = Network(batch_norm=recipe.batch_norm, dropout=recipe.dropout)
+        network = Network(
+            batch_norm=recipe.batch_norm or plan.backbone, dropout=recipe.dropout, plan=plan
+        )
         initialise(network, seed)
         self.network = network.to(device).to(memory_format=torch.channels_last)
         self.optimiser = make_optimiser(self.network, recipe)

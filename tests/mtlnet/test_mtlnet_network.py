@@ -4,17 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from mtlnet.network import (
-    FEATURES,
-    SHARED,
-    Conv,
-    Network,
-    answer_images,
-    fold,
-    initialise,
-    normalise,
-    same_padding,
-)
+from mtlnet.network import Network, answer_images, fold, initialise, normalise
+from mtlnet.plan import FEATURES, SHARED, Conv, same_padding
 
 # Paper, section IV-C, and the sizes SAME padding gives for 280 x 210: layer, (rows, columns).
 LAYERS = [
@@ -47,7 +38,7 @@ def test_layers_are_those_of_the_paper() -> None:
 
 def test_sizes_of_the_layers() -> None:
     network, sizes = Network(), []
-    for module in network.features:
+    for module in network.features.children():
         if type(module).__name__ != "SamePad":
             module.register_forward_hook(lambda _m, _i, out: sizes.append(tuple(out.shape[2:])))
     network(images(1))
