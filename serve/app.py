@@ -4,15 +4,15 @@ from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from dataclasses import asdict
 from importlib.metadata import version
-from pathlib import Path
 from typing import Any
 
 from fastapi import FastAPI
-from fastapi.responses import HTMLResponse, JSONResponse, Response
+from fastapi.responses import JSONResponse, Response
 from starlette.routing import Route
 
 from mtlnet.engine import Engine
 from serve import contract, problems
+from serve.console import add_console
 from serve.features import Features
 from serve.gate import Receive, Scope, Send
 from serve.limits import Limits
@@ -21,7 +21,6 @@ from serve.readiness import warm_up
 from serve.shared import Shared, create
 from serve.streams import Streams
 
-PAGE = Path(__file__).parent / "index.html"
 DESCRIPTION = "One driver-view image in, track features out. Angles in rad, distances in m."
 
 
@@ -83,6 +82,7 @@ def _framework(service: Service) -> FastAPI:
     # Reached only with another method than POST: who sends one is told which there is.
     app.router.routes.append(Route("/features", service.features, methods=["POST"]))
     _add_status(app, service.perceiver)
+    add_console(app)
     return app
 
 
@@ -105,7 +105,3 @@ def _add_status(app: FastAPI, perceiver: Perceiver) -> None:
     async def model() -> dict[str, Any]:
         loaded = perceiver.loaded
         return {**loaded.origin, **asdict(loaded.engine.card)}
-
-    @app.get("/", include_in_schema=False)
-    async def page() -> HTMLResponse:
-        return HTMLResponse(PAGE.read_text(encoding="utf-8"))

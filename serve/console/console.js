@@ -1,0 +1,148 @@
+// The console: ask the service about one image after the other, and show what it says.
+
+import { IN_LANE, ON_MARKING } from "./geometry.js";
+import { drawAbove, drawLatency, drawPicture } from "./drawing.js";
+
+const KEPT = 120, EVERY_MS = 100;
+const $ = (id) => document.getElementById(id);
+const model = await (await fetch("model")).json();
+const latencies = [];
+let current = null; // {body, image, truth}
+let asking = false;
+
+$("model").textContent =
+  `model ${model.model.slice(0, 12)}, ${model.engine} ${model.precision}, ` +
+  `camera ${model.camera.width} × ${model.camera.height}, ${model.camera.fov_y_deg}° upright`;
+$("base").textContent = location.origin;
+
+async function ask() {
+  if (!current || asking) return;
+  asking = true;
+  const { body, image, truth } = current;
+  const started = performance.now();
+  try {
+    const reply = await fetch("features", { method: "POST", headers: { "Content-Type": body.type }, body });
+    const said = await reply.json();
+    if (!reply.ok) return refuse(`${said.title ?? reply.statusText}: ${said.detail ?? ""}`, image);
+    latencies.push({ trip: performance.now() - started, total: said.timing_ms.total, ...said.timing_ms });
+    latencies.splice(0, latencies.length - KEPT);
+    show(image, said, truth);
+  } catch (error) {
+    refuse(`no answer: ${error.message}`, image);
+  } finally {
+    asking = false;
+  }
+}
+
+function refuse(text, image) {
+  $("said").textContent = text;
+  $("said").className = "bad";
+  $("picture").getContext("2d").drawImage(image, 0, 0, $("picture").width, $("picture").height);
+}
+
+function show(image, said, truth) {
+  drawPicture($("picture"), image, said, truth, model.camera);
+  drawAbove($("above"), said, truth);
+  drawLatency($("latency"), latencies, KEPT);
+  const offset = said.to_lane_centre_m;
+  $("said").className = "";
+  $("said").textContent = offset == null
+    ? "No lane is near."
+    : `${Math.abs(offset).toFixed(2)} m ${offset >= 0 ? "left" : "right"} of the lane's centre, ` +
+      `pointing ${Math.abs(said.angle_rad * 180 / Math.PI).toFixed(1)}° to the ${said.angle_rad >= 0 ? "right" : "left"}.`;
+  fillTable(said, truth);
+  fillHeading(said.heading);
+  $("foreign").hidden = !said.out_of_distribution;
+  const sorted = latencies.map((row) => row.trip).sort((a, b) => a - b);
+  const at = (share) => sorted[Math.min(sorted.length - 1, Math.floor(share * sorted.length))].toFixed(1);
+  const last = latencies.at(-1);
+  $("times").textContent =
+    `service ${last.total.toFixed(1)} ms (decode ${last.decode.toFixed(1)}, forward ${last.forward.toFixed(1)}); ` +
+    `with the way there and back p50 ${at(0.5)}, p99 ${at(0.99)} ms over ${sorted.length}`;
+}
+
+function fillTable(said, truth) {
+  const rows = [...IN_LANE, ...ON_MARKING].map((name) =>
+    [name, said.distances_m[name], said.std?.[name], truth?.distances_m[name], "m", 2]);
+  rows.push(["to lane centre", said.to_lane_centre_m, said.std?.to_lane_centre, truth?.to_lane_centre_m, "m", 2]);
+  rows.push(["angle", said.angle_rad, said.std?.angle, truth?.angle_rad, "rad", 4]);
+  const text = (value, digits) => (value == null ? "–" : value.toFixed(digits));
+  $("features").replaceChildren(...rows.map(([name, read, std, true_, unit, digits]) => {
+    const row = document.createElement("tr");
+    for (const [content, kind] of [[name], [text(read, digits)], [text(std, digits), "doubt"], [text(true_, digits), "truth"]]) {
+      const cell = document.createElement("td");
+      cell.textContent = content;
+      if (kind) cell.className = kind;
+      row.append(cell);
+    }
+    const small = document.createElement("small");
+    small.textContent = ` ${unit}`;
+    row.children[1].append(small);
+    return row;
+  }));
+  const table = $("features").parentElement;
+  table.classList.toggle("no-doubt", !said.std);
+  table.classList.toggle("no-truth", !truth);
+}
+
+function fillHeading(heading) {
+  $("heading").replaceChildren(...Object.entries(heading).flatMap(([name, share]) => {
+    const [word, bar, figure] = ["span", "span", "span"].map((tag) => document.createElement(tag));
+    word.textContent = name;
+    bar.className = "bar";
+    const fill = document.createElement("i");
+    fill.style.width = `${100 * share}%`;
+    bar.append(fill);
+    figure.textContent = `${(100 * share).toFixed(0)} %`;
+    return [word, bar, figure];
+  }));
+}
+
+async function take(body, truth = null) {
+  try {
+    const image = await createImageBitmap(body);
+    current = { body, image, truth };
+    await ask();
+  } catch {
+    $("said").textContent = "The browser cannot read this file as an image.";
+    $("said").className = "bad";
+  }
+}
+
+function press(button) {
+  for (const other of $("samples").children) other.setAttribute("aria-pressed", other === button);
+}
+
+function takeFile(file) {
+  if (!file) return;
+  press(null);
+  take(file);
+}
+
+$("file").addEventListener("change", (event) => takeFile(event.target.files[0]));
+const stage = document.querySelector(".picture");
+for (const kind of ["dragover", "dragleave", "drop"]) {
+  stage.addEventListener(kind, (event) => {
+    event.preventDefault();
+    stage.classList.toggle("over", kind === "dragover");
+    if (kind === "drop") takeFile(event.dataTransfer.files[0]);
+  });
+}
+setInterval(() => $("repeat").checked && ask(), EVERY_MS);
+
+const samples = await (await fetch("console/samples.json")).json();
+for (const { file, about, truth } of samples) {
+  const button = document.createElement("button");
+  const picture = document.createElement("img");
+  picture.src = `console/${file}`;
+  picture.alt = about;
+  button.title = about;
+  button.append(picture);
+  button.addEventListener("click", async () => {
+    press(button);
+    take(await (await fetch(picture.src)).blob(), truth);
+  });
+  $("samples").append(button);
+}
+document.documentElement.dataset.ready = "yes";
+$("samples").firstElementChild?.click();
