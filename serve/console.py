@@ -1,4 +1,5 @@
-"""The web console: one page at `/` that asks the service about images. All it loads comes from here.
+"""The web console: one page at `/` that asks the service about images; it loads nothing from
+elsewhere.
 
 Its scripts use what any other client does: GET /model and POST /features.
 """
