@@ -31,6 +31,7 @@ CARD = ModelCard(
     program_version="0",
     camera=Camera(),
     alpha=(0.3, 0.2, 0.5),
+    network="mtl",
     recipe="fast",
     iterations=1,
     batch=1,
