@@ -1,6 +1,6 @@
 # Three images from one source: `docker build --target serve|train|collect -t driverview-TARGET .`
 #
-#   docker run -p 8000:8000 -v "$PWD/runs:/driverview/runs:ro" driverview-serve
+#   docker run -p 8000:8000 -e DRIVERVIEW_TOKEN -v "$PWD/runs:/driverview/runs:ro" driverview-serve
 #   docker run -v "$PWD/datasets:/driverview/datasets" driverview-collect datagen collect --rounds 60
 #   docker run --gpus all -v "$PWD/datasets:/driverview/datasets:ro" -v "$PWD/runs:/driverview/runs" \
 #     driverview-train mtlnet train --alpha 0.3,0.2,0.5

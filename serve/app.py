@@ -12,15 +12,19 @@ from starlette.routing import Route
 
 from mtlnet.engine import Engine
 from serve import contract, problems
+from serve.ask import check_token
 from serve.console import add_console
-from serve.features import Features
-from serve.gate import Receive, Scope, Send
+from serve.features import Features, client_of
+from serve.gate import Receive, Scope, Send, refuse
 from serve.limits import Limits
 from serve.perceiver import Perceiver
+from serve.problems import Problem
+from serve.rate import Rate
 from serve.readiness import warm_up
 from serve.shared import Shared, create
 from serve.streams import Streams
 
+PROBES = {"/healthz", "/readyz"}  # what a balancer asks, often and without a token
 DESCRIPTION = "One driver-view image in, track features out. Angles in rad, distances in m."
 
 
@@ -44,10 +48,22 @@ class Service:
         streams = Streams(self.shared.streams())
         self.perceiver = Perceiver(engine, check, streams, self.limits.queue)
         self.features = Features(self.perceiver)
+        self._rate = Rate(self.shared.clients(), self.limits.rate)
+        self._token = self.limits.token
         self.framework = _framework(self)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] == "http" and scope["path"] == "/features" and scope["method"] == "POST":
+        if scope["type"] == "lifespan":
+            await self.framework(scope, receive, send)
+            return
+        try:
+            if scope["path"] not in PROBES:
+                self._rate.check(client_of(scope))
+                check_token(dict(scope["headers"]), self._token)
+        except Problem as problem:
+            await refuse(send, problem, [])
+            return
+        if scope["path"] == "/features" and scope["method"] == "POST":
             await self.features(scope, receive, send)
         else:
             await self.framework(scope, receive, send)

@@ -3,12 +3,14 @@
 import itertools
 import os
 from dataclasses import dataclass
+from hmac import compare_digest
 from math import isfinite
 
 from serve.limits import MAX_BODY_BYTES, MAX_DEADLINE_MS, MAX_NAME
 from serve.problems import (
     BODY_TOO_LARGE,
     INVALID_REQUEST,
+    UNAUTHORIZED,
     UNSUPPORTED_TYPE,
     Problem,
 )
@@ -107,6 +109,17 @@ def _number(sent: bytes | str, header: str, low: float, high: float) -> float:
             f"{header} is {text[:40]!r}; a number from {low:g} to {high:g} is taken",
         )
     return value
+
+
+def check_token(headers: Headers, token: str | None) -> None:
+    """Refuse whoever does not know the service's token. Raises Problem."""
+    if token is None:
+        return
+    scheme, _, sent = headers.get(b"authorization", b"").partition(b" ")
+    if scheme.lower() != b"bearer" or not compare_digest(sent.strip(), token.encode()):
+        raise Problem(
+            UNAUTHORIZED, "send the service's token with the header Authorization: Bearer TOKEN"
+        )
 
 
 def check_headers(headers: Headers) -> None:

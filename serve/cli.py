@@ -1,5 +1,8 @@
-"""The perception service. Run: `serve`, or `serve --model runs/NAME --port 8000 --workers 2`."""
+"""The perception service. Run: `serve`, or `serve --model runs/NAME --port 8000 --workers 2`;
+`serve reload` and `serve restart` while it runs.
+"""
 
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -9,8 +12,12 @@ from trackfeatures import command
 app = typer.Typer(add_completion=False, rich_markup_mode="rich")
 
 
-@app.command()
+Port = Annotated[int, typer.Option(help="The running service's port.", min=1, max=65535)]
+
+
+@app.callback(invoke_without_command=True)
 def serve(
+    context: typer.Context,
     model: Annotated[
         str,
         typer.Option(help="A run's folder or its name in runs/; 'latest'; 'default': the shipped."),
@@ -22,16 +29,60 @@ def serve(
     workers: Annotated[
         int, typer.Option(help="Processes, each with one engine: one a core.", min=1, max=256)
     ] = 1,
+    token_file: Annotated[
+        Path | None,
+        typer.Option(help="What clients must know: Authorization: Bearer. Or $DRIVERVIEW_TOKEN."),
+    ] = None,
+    insecure: Annotated[
+        bool, typer.Option("--insecure", help="Listen on an open --host without a token.")
+    ] = False,
+    rate: Annotated[
+        float, typer.Option(help="Requests a second of one other machine; 0: any.", min=0)
+    ] = 200.0,
+    connections: Annotated[
+        int, typer.Option(help="Open connections at most.", min=1, max=65536)
+    ] = 256,
 ) -> None:
     """Answer driver-view images over HTTP with track features.
 
     The first line on stderr says which model answers, and where. Post an image with
     [bold]curl -H "Content-Type: image/jpeg" --data-binary @frame.jpg URL/features[/bold];
-    the docs are at URL/docs. SIGTERM or Ctrl-C stops it.
+    the docs are at URL/docs. SIGTERM or Ctrl-C stops it, SIGHUP loads the model anew.
     """
-    from serve.server import ServiceConfig, run
+    if context.invoked_subcommand is not None:
+        return
+    from serve.limits import Limits
+    from serve.server import ServiceConfig, read_token, run
 
-    run(ServiceConfig(model, host, port, workers))
+    limits = Limits(connections=connections, rate=rate, token=read_token(token_file))
+    run(ServiceConfig(model, host, port, workers, insecure, limits))
+
+
+@app.command()
+def reload(
+    port: Port = 8000,
+    model: Annotated[
+        str | None, typer.Option(help="Another model than the one served; as for `serve`.")
+    ] = None,
+) -> None:
+    """Load the model anew in the service that runs here, without losing a request.
+
+    The new weights are loaded and checked beside the old. If they are bad, the old ones go on
+    answering, and this command says why.
+    """
+    from serve.manage import ask
+
+    # Its own working folder may be another: a path is told whole.
+    named = str(Path(model).resolve()) if model is not None and Path(model).is_dir() else model
+    typer.echo(ask(port, "reload", named))
+
+
+@app.command()
+def restart(port: Port = 8000) -> None:
+    """Replace the workers of the service that runs here one by one, without losing a request."""
+    from serve.manage import ask
+
+    typer.echo(ask(port, "restart"))
 
 
 def main() -> None:

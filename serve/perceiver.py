@@ -134,6 +134,14 @@ class Perceiver:
         """Answer with `engine`, warm and checked, from the first frame on for which `chosen`."""
         self._staged = load(engine), chosen
 
+    def drop(self) -> None:
+        """Forget what was staged."""
+        self._staged = None
+
+    def when_warm(self, do: Callable[[], None]) -> None:
+        """Call `do`, in another thread, once the engine is warm and right."""
+        self._warm.add_done_callback(lambda warm: None if warm.exception() else do())
+
     def perceive(self, frame: Frame) -> "asyncio.Future[Perceived]":
         """What the model sees in a frame; the future may raise Problem, ImageError.
 

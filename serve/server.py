@@ -1,30 +1,27 @@
-"""Running the service: the socket, the worker processes, the first line, a clean end.
+"""Running the service: what it may listen on, the socket, the first line, a clean end.
 
-One process is one engine with one thread (two in one process lose throughput to each other); with
-several workers the processes share the socket, and the kernel deals the connections out.
+One process is one engine with one thread (two in one process lose throughput to each other); the
+workers share the socket. `serve.supervisor` watches over them.
 """
 
+import asyncio
+import logging
 import os
-import signal
 import socket
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from types import FrameType
-
-import uvicorn
-from uvicorn.supervisors import Multiprocess
 
 from mtlnet.card import resolve_run
-from mtlnet.engine import load_engine
-from serve.app import Service, create_app
+from serve.limits import Limits, is_loopback
+from serve.manage import listen, socket_path
+from serve.supervisor import Plan, Supervisor
 from trackfeatures.errors import UserError
 from trackfeatures.listening import address, bind
 
-RUN_VARIABLE = "DRIVERVIEW_SERVE_RUN"  # how the parent tells its workers which model to load
 BACKLOG = 2048
-KEEP_ALIVE_S = 30
-GRACE_S = 5  # for requests in progress when the service is told to stop
+TOKEN_VARIABLE = "DRIVERVIEW_TOKEN"
+MIN_TOKEN = 16
 
 
 @dataclass(frozen=True)
@@ -37,72 +34,77 @@ class ServiceConfig:
     port: int = 8000
     """0: any free one; the first line says which."""
     workers: int = 1
+    insecure: bool = False
+    """Listen on other addresses than this machine's own without a token."""
+    limits: Limits = field(default_factory=Limits)
+
+
+def read_token(path: Path | None) -> str | None:
+    """The token in a file, else in the environment, else None. Raises UserError."""
+    if path is None:
+        token = os.environ.get(TOKEN_VARIABLE, "").strip()
+        where = f"${TOKEN_VARIABLE}"
+    elif path.is_file():
+        token, where = path.read_text(encoding="utf-8").strip(), str(path)
+    else:
+        raise UserError(
+            f"there is no token file {path}; write one, `openssl rand -hex 32` gives one"
+        )
+    if not token:
+        if path is not None:
+            raise UserError(f"{where} is empty; `openssl rand -hex 32` gives a token")
+        return None
+    if len(token) < MIN_TOKEN or not (token.isascii() and token.isprintable() and " " not in token):
+        raise UserError(
+            f"the token in {where} must be {MIN_TOKEN} or more printable ASCII characters without "
+            "a space; `openssl rand -hex 32` gives one"
+        )
+    return token
 
 
 def run(config: ServiceConfig) -> None:
     """Serve until SIGTERM or Ctrl-C. Raises UserError when it cannot begin."""
-    folder = resolve_run(config.model)
+    logging.basicConfig(format="%(levelname)s: %(message)s", level=logging.WARNING)
+    _check_exposure(config)
+    resolve_run(config.model)  # a model that is not there is told before any process is started
     listener = bind(config.host, config.port)
-    # Loaded here even when only the workers use it: a model that cannot be loaded is then one
-    # clear line and not one traceback a worker.
-    engine = load_engine(folder)
+    asyncio.run(_serve(config, listener))
+
+
+def _check_exposure(config: ServiceConfig) -> None:
+    if is_loopback(config.host) or config.limits.token is not None or config.insecure:
+        return
+    raise UserError(
+        f"--host {config.host} is open to others than this machine: set a token (--token-file, or "
+        f"{TOKEN_VARIABLE} in the environment), or say --insecure where a proxy guards the service"
+    )
+
+
+async def _serve(config: ServiceConfig, listener: socket.socket) -> None:
+    plan = Plan(config.model, resolve_run, config.workers, config.limits)
+    supervisor = Supervisor(plan, listener)
+    listener.listen(BACKLOG)
+    first = await supervisor.start()
     sys.stderr.write(
-        f"serving {_named(config.model, folder)}, model {engine.card.model_hash[:12]}, with "
-        f"{engine.kind} {engine.precision} at {address(listener, config.host)}"
+        f"serving {_named(config.model, supervisor.folder)}, model {first['model'][:12]}, with "
+        f"{first['engine']} {first['precision']} at {address(listener, config.host)}"
         f"{f', {config.workers} workers' if config.workers > 1 else ''}\n"
     )
     sys.stderr.flush()
-    listener.listen(BACKLOG)
-    if config.workers == 1:
-        _run_here(create_app(engine), listener)
-    else:
-        del engine
-        _run_workers(folder, config.workers, listener)
 
+    async def reload(model: str | None) -> str:
+        return f"now serving model {(await supervisor.reload(model))[:12]}"
 
-def worker_app() -> Service:
-    """The application of one worker process: uvicorn calls this there."""
-    return create_app(load_engine(Path(os.environ[RUN_VARIABLE])))
+    async def restart(_model: str | None) -> str:
+        await supervisor.restart()
+        return "all workers were replaced"
 
-
-def _run_here(app: Service, listener: socket.socket) -> None:
-    # uvicorn raises the signal that ended it once more when all is closed: it has done its work.
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, _ignore)
-    server = uvicorn.Server(settings(app))
-    server.run(sockets=[listener])
-    if not server.started:
-        raise UserError("the service could not start; the lines above say why")
-
-
-def _run_workers(folder: Path, workers: int, listener: socket.socket) -> None:
-    os.environ[RUN_VARIABLE] = str(folder.resolve())
-    config = settings("serve.server:worker_app", factory=True, workers=workers)
-    Multiprocess(config, sockets=[listener]).run()
-
-
-def settings(
-    app: Service | str, *, factory: bool = False, workers: int | None = None
-) -> uvicorn.Config:
-    """How uvicorn runs the application, or the factory named by an import string."""
-    return uvicorn.Config(
-        app,
-        factory=factory,
-        workers=workers,
-        loop="uvloop",
-        http="httptools",
-        ws="none",
-        lifespan="on",
-        log_level="warning",
-        access_log=False,
-        server_header=False,
-        timeout_keep_alive=KEEP_ALIVE_S,
-        timeout_graceful_shutdown=GRACE_S,
-    )
-
-
-def _ignore(_number: int, _frame: FrameType | None) -> None:
-    pass
+    port = listener.getsockname()[1]
+    commands = await listen(port, {"reload": reload, "restart": restart})
+    await supervisor.run()
+    if commands is not None:
+        commands.close()
+        socket_path(port).unlink(missing_ok=True)
 
 
 def _named(model: str, folder: Path) -> str:

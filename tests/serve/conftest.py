@@ -7,21 +7,22 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 import simplejpeg
-import uvicorn
 from numpy.typing import NDArray
 
 import trackfeatures as tf
 from mtlnet.card import WEIGHTS, Camera, ModelCard
 from mtlnet.engine import Engine
+from mtlnet.golden import golden_image
 from serve.app import Service, create_app
 from serve.limits import Limits
-from serve.server import settings
+from serve.listener import WorkerServer
 from serve.shared import Shared
 from trackfeatures.listening import bind
 
@@ -168,8 +169,9 @@ def serving(
         check(engine)
 
     listener = bind("127.0.0.1", 0)
+    listener.listen(2048)
     app = create_app(engine, checked, limits, shared)
-    server = uvicorn.Server(settings(app))
+    server = WorkerServer(app, limits or Limits())
     thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
     thread.start()
     try:
@@ -188,3 +190,23 @@ def service(engine: FakeEngine) -> Iterator[Served]:
     """The service around `engine`, ready."""
     with serving(engine) as served:
         yield served
+
+
+@pytest.fixture(scope="session")
+def published(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An untrained network, published as `mtlnet train` does, in a folder RUNS/latest links to."""
+    runs = tmp_path_factory.mktemp("serve") / "runs"
+    publish_untrained(runs / "fresh", seed=3)
+    (runs / "latest").symlink_to("fresh")
+    return runs / "fresh"
+
+
+def publish_untrained(run: Path, seed: int) -> None:
+    """A whole model in folder `run`; its weights are those of `seed`."""
+    import torch
+
+    from mtlnet.network import Network
+    from mtlnet.publish import publish
+
+    torch.manual_seed(seed)
+    publish(Network(), run, golden_image(280, 210)[None])

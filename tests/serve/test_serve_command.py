@@ -11,8 +11,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-import pytest
-
 from mtlnet.answer import interpret
 from mtlnet.card import CARD, SHIPPED, read_card
 from mtlnet.engine import load_engine
@@ -22,21 +20,6 @@ from tests.serve.conftest import png
 from trackfeatures.listening import bind
 
 ROOT = Path(__file__).parents[2]
-
-
-@pytest.fixture(scope="session")
-def published(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An untrained network, published as `mtlnet train` does, in a folder RUNS/latest links to."""
-    import torch
-
-    from mtlnet.network import Network
-    from mtlnet.publish import publish
-
-    runs = tmp_path_factory.mktemp("serve") / "runs"
-    torch.manual_seed(3)
-    publish(Network(), runs / "fresh", golden_image(280, 210)[None])
-    (runs / "latest").symlink_to("fresh")
-    return runs / "fresh"
 
 
 def command(*arguments: str) -> list[str]:

@@ -1,0 +1,167 @@
+"""The server of one worker: it takes connections in turn with the others, and drains at its end.
+
+All workers listen on one socket and all are woken by a connection; the one with the fewest takes
+it. (Left to the kernel, one of two workers may get six of eight cars, and keep them for hours.)
+"""
+
+import asyncio
+import errno
+import logging
+import signal
+import socket
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
+from typing import Any, Protocol
+
+import uvicorn
+
+from serve.limits import Limits
+from serve.protocol import Guard, GuardedProtocol, sweep
+
+GRACE_S = 5  # for requests in progress when the service is told to stop
+DRAIN_S = 1.0  # for clients at work to send one more request and be told to connect anew
+TURN_S = 0.002  # for which a worker leaves a connection to one that has fewer
+REST_S = 0.1  # after the system has no more descriptors
+
+logger = logging.getLogger(__name__)
+
+
+class Peers(Protocol):
+    """What a worker knows of the others, and tells them (`serve.workers`)."""
+
+    def tell(self, connections: int) -> None: ...
+
+    def leave(self) -> None: ...
+
+    def others(self) -> list[int]:
+        """The connections of each of the other workers that are alive."""
+
+
+class Alone:
+    """The peers of a single worker."""
+
+    def tell(self, connections: int) -> None:
+        """There is nobody to tell."""
+
+    def leave(self) -> None:
+        """Nor to leave."""
+
+    def others(self) -> list[int]:
+        return []
+
+
+class WorkerServer(uvicorn.Server):
+    """uvicorn with our own accepting, deadlines and draining."""
+
+    def __init__(self, app: Any, limits: Limits, peers: Peers | None = None) -> None:
+        self.guard = Guard(limits, others=lambda: sum(self._peers.others()))
+        super().__init__(_settings(app, limits))
+        self._peers = peers or Alone()
+        self._waited = False
+
+    @contextmanager
+    def capture_signals(self) -> Iterator[None]:
+        """SIGTERM ends the worker; Ctrl-C, which all of the group get, is the supervisor's."""
+        if threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGTERM, self.handle_exit)
+            for number in (signal.SIGINT, signal.SIGHUP, signal.SIGUSR2):
+                signal.signal(number, signal.SIG_IGN)
+        yield
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        """Start the application, then take connections from the one listening socket."""
+        assert sockets is not None
+        await self.lifespan.startup()
+        if self.lifespan.should_exit:
+            raise SystemExit(1)
+        self.servers = []
+        self._listener = sockets[0]
+        self._listener.setblocking(False)
+        self._loop = asyncio.get_running_loop()
+        self._make = partial(
+            GuardedProtocol,
+            guard=self.guard,
+            config=self.config,
+            server_state=self.server_state,
+            app_state=self.lifespan.state,
+            _loop=self._loop,
+        )
+        self._listen()
+        self.started = True
+
+    async def on_tick(self, counter: int) -> bool:
+        """Ten times a second."""
+        sweep(self.server_state.connections, self._loop.time())
+        self._peers.tell(len(self.server_state.connections))
+        return await super().on_tick(counter)
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        """Take no more connections, tell the clients at work, finish what was begun."""
+        self._loop.remove_reader(self._listener.fileno())
+        self.guard.draining = True
+        self._peers.leave()
+        end = self._loop.time() + DRAIN_S
+        while self._at_work() and self._loop.time() < end and not self.force_exit:
+            await asyncio.sleep(0.02)
+        await super().shutdown(sockets)
+
+    def _at_work(self) -> bool:
+        """Whether a connection is open that may soon ask once more."""
+        return any(
+            isinstance(found, GuardedProtocol) and found.active
+            for found in self.server_state.connections
+        )
+
+    def _listen(self) -> None:
+        self._loop.add_reader(self._listener.fileno(), self._accept)
+
+    def _rest(self, seconds: float) -> None:
+        self._loop.remove_reader(self._listener.fileno())
+        self._loop.call_later(seconds, self._resume)
+
+    def _resume(self) -> None:
+        if not self.guard.draining:
+            self._listen()
+
+    def _accept(self) -> None:
+        mine, others = len(self.server_state.connections), self._peers.others()
+        if others and mine > min(others) and not self._waited:
+            self._waited = True  # once: the other may hang
+            self._rest(TURN_S)
+            return
+        self._waited = False
+        try:
+            connection, _ = self._listener.accept()
+        except (BlockingIOError, InterruptedError, ConnectionAbortedError):
+            return
+        except OSError as error:
+            if error.errno not in (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM):
+                raise
+            logger.error("cannot take a connection: %s", error.strerror)
+            self._rest(REST_S)
+            return
+        connection.setblocking(False)
+        task = self._loop.create_task(self._serve_connection(connection))
+        self.server_state.tasks.add(task)
+        task.add_done_callback(self.server_state.tasks.discard)
+
+    async def _serve_connection(self, connection: socket.socket) -> None:
+        await self._loop.connect_accepted_socket(self._make, connection)
+        self._peers.tell(len(self.server_state.connections))
+
+
+def _settings(app: Any, limits: Limits) -> uvicorn.Config:
+    return uvicorn.Config(
+        app,
+        loop="uvloop",
+        http="httptools",
+        ws="none",
+        lifespan="on",
+        log_config=None,
+        access_log=False,
+        server_header=False,
+        timeout_keep_alive=limits.idle_s,  # type: ignore[arg-type]  # a delay in s
+        timeout_graceful_shutdown=GRACE_S,
+    )
