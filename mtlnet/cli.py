@@ -82,6 +82,37 @@ def train_command(
         typer.echo(json.dumps(result))
 
 
+@app.command("ablate")
+def ablate_command(
+    out: Annotated[Path, typer.Option(help="Folder of the ablation; the same one goes on.")],
+    iterations: Annotated[int, typer.Option(help="Steps of every run.")],
+    data: Data = Path("datasets/default"),
+    seeds: Annotated[str, typer.Option(help="Every row is trained with each.")] = "1,2,3",
+    recipe: Annotated[str, typer.Option(help="fast or paper.")] = "fast",
+    backbone: Annotated[
+        str, typer.Option(help="The yardstick: mobilenet_v3_small or regnet_y_400mf.")
+    ] = "mobilenet_v3_small",
+    batch: Annotated[int, typer.Option(help="Images a step.")] = 32,
+    split: Annotated[str, typer.Option(help="What to judge on: test or unseen.")] = "test",
+    device: Annotated[str, typer.Option(help="auto, cpu or cuda.")] = "auto",
+    threads: Annotated[int, typer.Option(help="CPU threads; 0: one a core.")] = 0,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Say the plan and how long it takes.")
+    ] = False,
+    as_json: Json = False,
+) -> None:
+    """The paper's table made anew: each task alone, MTL 1 to 4, and two other networks."""
+    from mtlnet.ablate import ablate
+    from mtlnet.ablation import AblationConfig, parse_seeds, rows_of
+
+    config = AblationConfig(
+        data, out, iterations, parse_seeds(seeds), recipe, batch, split, device, threads
+    )
+    result = ablate(config, rows_of(backbone), dry_run=dry_run)
+    if as_json:
+        typer.echo(json.dumps(result))
+
+
 @app.command("evaluate")
 def evaluate_command(
     model: Model = "default",
