@@ -11,8 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 import trackfeatures as tf
+from mtlnet.doubt import COLUMNS, FEATURES
 
 OUTPUTS = 9  # five coded distances, the coded angle, three class probabilities
+WITH_DOUBT = OUTPUTS + COLUMNS  # and the columns of `mtlnet.doubt`
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,13 +22,18 @@ class Answer:
     """Track features read from one image.
 
     Distances in m, None where the marking is absent; `to_lane_centre_m` in m, left positive, None
-    where no marking is near; the angle in rad; `heading` the probability of each class.
+    where no marking is near; the angle in rad; `heading` the probability of each class. `std`: the
+    standard deviation of the error of each of `mtlnet.doubt.FEATURES` in m and rad, None for what
+    is absent. `out_of_distribution`: the image is unlike those the model learned from. Both are
+    None where the model was published without frames to learn them from.
     """
 
     distances_m: dict[str, float | None]
     to_lane_centre_m: float | None
     angle_rad: float
     heading: dict[str, float]
+    std: dict[str, float | None] | None = None
+    out_of_distribution: bool | None = None
 
     def as_json(self) -> dict[str, Any]:
         """The answer as the service gives it (DESIGN §9)."""
@@ -35,23 +42,34 @@ class Answer:
             "to_lane_centre_m": self.to_lane_centre_m,
             "angle_rad": self.angle_rad,
             "heading": dict(self.heading),
+            "std": None if self.std is None else dict(self.std),
+            "out_of_distribution": self.out_of_distribution,
         }
 
 
 def interpret(outputs: NDArray[np.float32]) -> Answer:
-    """The answer in the network's outputs (9,): see `OUTPUTS` for their order."""
-    if outputs.shape != (OUTPUTS,):
-        raise ValueError(f"the network gives {OUTPUTS} numbers an image, not shape {outputs.shape}")
-    distances, angle = tf.decode(outputs[None, :6])
-    offset = float(tf.localise(distances)[0])
+    """The answer in a model's outputs: `OUTPUTS` of them, or `WITH_DOUBT`."""
+    if outputs.shape not in ((OUTPUTS,), (WITH_DOUBT,)):
+        raise ValueError(
+            f"a model gives {OUTPUTS} or {WITH_DOUBT} numbers an image, not shape {outputs.shape}"
+        )
+    coded, probabilities, doubt = outputs[:6], outputs[6:OUTPUTS], outputs[OUTPUTS:]
+    distances, angle = tf.decode(coded[None])
+    found = [*distances[0], tf.localise(distances)[0]]
+    values = [None if np.isnan(value) else float(value) for value in found]
+    std = None
+    if len(doubt):
+        here = [value is not None for value in values] + [True]  # the angle is never absent
+        said = zip(FEATURES, doubt[:-1].tolist(), here, strict=True)
+        std = {name: value if present else None for name, value, present in said}
     return Answer(
-        distances_m={
-            name: None if np.isnan(value) else float(value)
-            for name, value in zip(tf.MARKINGS, distances[0], strict=True)
-        },
-        to_lane_centre_m=None if np.isnan(offset) else offset,
+        distances_m=dict(zip(tf.MARKINGS, values[:5], strict=True)),
+        to_lane_centre_m=values[5],
         angle_rad=float(angle[0]),
         heading={
-            name.name.lower(): float(p) for name, p in zip(tf.Heading, outputs[6:], strict=True)
+            name.name.lower(): float(p) for name, p in zip(tf.Heading, probabilities, strict=True)
         },
+        std=std,
+        # Written so that a NaN is strange too.
+        out_of_distribution=not doubt[-1] <= 1.0 if len(doubt) else None,
     )

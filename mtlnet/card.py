@@ -1,8 +1,9 @@
 """The card of a trained model: what it was made from and for, and where its folder is.
 
 Free of torch: the service reads cards. A run's folder holds `card.json`, `config.json`,
-`model.safetensors` (the folded weights of the network), `model.xml` and `model.bin` (the same for
-OpenVINO), `curves.csv`, `checkpoints/` and `tensorboard/`.
+`model.safetensors` (the folded weights of the network), `doubt.safetensors` (the second head that
+says how sure an answer is), `model.xml` and `model.bin` (both for OpenVINO), `curves.csv`,
+`checkpoints/` and `tensorboard/`.
 """
 
 import hashlib
@@ -17,8 +18,9 @@ from trackfeatures.errors import UserError, require_version
 RUNS = Path("runs")
 SHIPPED = Path(__file__).parent / "weights" / "default"
 CARD, WEIGHTS, GRAPH, GRAPH_WEIGHTS = "card.json", "model.safetensors", "model.xml", "model.bin"
+DOUBT = "doubt.safetensors"
 MODEL_FILES = (WEIGHTS, GRAPH, GRAPH_WEIGHTS)
-FORMAT = 2  # 2: `network`
+FORMAT = 3  # 2: `network`; 3: `doubt`
 
 
 class ModelError(UserError):
@@ -57,6 +59,7 @@ class ModelCard:
     files: dict[str, str]
     export_check: dict[str, float]
     golden: tuple[float, ...]  # what torch in float32 answers to `mtlnet.golden.golden_image`, (9,)
+    doubt: dict[str, Any] | None  # how its standard deviations were fitted; None: it gives none
 
     @property
     def model_hash(self) -> str:

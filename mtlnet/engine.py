@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any, Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from mtlnet.answer import OUTPUTS
 from mtlnet.card import (
+    DOUBT,
     GRAPH,
     GRAPH_WEIGHTS,
     WEIGHTS,
@@ -20,6 +20,7 @@ from mtlnet.card import (
     check_files,
     read_card,
 )
+from mtlnet.doubt import read_doubt
 
 if TYPE_CHECKING:
     from mtlnet.network import Network
@@ -44,7 +45,7 @@ class Engine(Protocol):
         """What it computes in: "f32" or "bf16"."""
 
     def __call__(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """Image (H, W, 3) RGB of `card.camera`'s size -> (9,) outputs, see `mtlnet.answer`."""
+        """Image (H, W, 3) RGB of `card.camera`'s size -> outputs (9,) or (17,), see `answer`."""
 
 
 def load_engine(
@@ -103,7 +104,7 @@ class OpenVinoEngine:
         check_image(image, self._shape[1:])
         self._input[0] = image
         self._request.infer()
-        outputs: NDArray[np.float32] = self._output.reshape(OUTPUTS).copy()
+        outputs: NDArray[np.float32] = self._output[0].copy()
         return outputs
 
 
@@ -117,19 +118,21 @@ class TorchEngine:
 
         from mtlnet.network import load_network
 
-        check_files(run, card, (WEIGHTS,))
+        names = (WEIGHTS,) if card.doubt is None else (WEIGHTS, DOUBT)
+        check_files(run, card, names)
         torch.set_num_threads(threads)
         self.card = card
         self.precision: Precision = "f32"
         self._network: Network = load_network(run / WEIGHTS, card.network)
+        self._doubt = None if card.doubt is None else read_doubt(run)
         self._shape = (card.camera.height, card.camera.width, 3)
 
     def __call__(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
-        from mtlnet.network import answer_images
+        from mtlnet.network import describe_images
 
         check_image(image, self._shape)
-        outputs: NDArray[np.float32] = answer_images(self._network, image[None])[0]
-        return outputs
+        x, outputs = describe_images(self._network, image[None])
+        return outputs[0] if self._doubt is None else np.append(outputs, self._doubt.assess(x))
 
 
 def parse_kind(text: str) -> Kind:

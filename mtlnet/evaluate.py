@@ -1,6 +1,8 @@
 """Judging a model on the rounds of a dataset: `mtlnet evaluate --model RUN --data DIR --json`."""
 
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -8,25 +10,30 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datagen.recording import Dataset, Frames
-from mtlnet.answer import OUTPUTS
 from mtlnet.card import ModelCard, ModelError
 from mtlnet.engine import Engine
+from mtlnet.loader import Images
 from mtlnet.report import judge, judge_groups
 
-CHUNK = 64
+CHUNK = 32
 
 
 def evaluate(
-    engine: Engine, data: Path, split: str, report: Callable[[int, int], None] = lambda *_: None
+    engines: Sequence[Engine],
+    data: Path,
+    split: str,
+    report: Callable[[int, int], None] = lambda *_: None,
 ) -> dict[str, Any]:
     """The report of `mtlnet.report.judge` on one side of a dataset, whole and by groups.
 
-    `report(done, all)` is told how far it is. Raises UserError when data and model do not fit.
+    `engines`: the same model, once for each thread. `report(done, all)` is told how far it is.
+    Raises UserError when data and model do not fit.
     """
+    engine = engines[0]
     dataset = Dataset.open(data)
     frames = dataset.select(split)
     require_fit(engine.card, frames, split)
-    outputs = answer_frames(engine, frames, report)
+    outputs = answer_frames(engines, frames, report)
     mean = engine.card.data["mean"]
     return {
         "model": engine.card.name,
@@ -40,18 +47,33 @@ def evaluate(
 
 
 def answer_frames(
-    engine: Engine, frames: Frames, report: Callable[[int, int], None] = lambda *_: None
+    engines: Sequence[Engine],
+    frames: Images,
+    report: Callable[[int, int], None] = lambda *_: None,
 ) -> NDArray[np.float32]:
-    """The outputs (N, 9) of the engine for all frames, one by one as in service."""
-    camera = engine.card.camera
-    outputs = np.empty((len(frames), OUTPUTS), np.float32)
-    images = np.empty((CHUNK, camera.height, camera.width, 3), np.uint8)
-    for first in range(0, len(frames), CHUNK):
-        rows = np.arange(first, min(first + CHUNK, len(frames)))
-        for row, image in zip(rows, frames.read_batch(rows, images[: len(rows)]), strict=True):
-            outputs[row] = engine(image)
-        report(int(rows[-1]) + 1, len(frames))
-    return outputs
+    """The outputs (N, 9 or 17) for all frames, one by one as in service, on a thread an engine."""
+    chunks = iter(range(0, len(frames), CHUNK))
+    taking = threading.Lock()
+    parts: dict[int, list[NDArray[np.float32]]] = {}
+
+    def work(engine: Engine) -> None:
+        camera = engine.card.camera
+        images = np.empty((CHUNK, camera.height, camera.width, 3), np.uint8)
+        while True:
+            with taking:
+                first = next(chunks, None)
+            if first is None:
+                return
+            rows = np.arange(first, min(first + CHUNK, len(frames)))
+            batch = frames.read_batch(rows, images[: len(rows)])
+            parts[first] = [engine(image) for image in batch]
+            with taking:
+                report(min(len(parts) * CHUNK, len(frames)), len(frames))
+
+    with ThreadPoolExecutor(len(engines), thread_name_prefix="engine") as pool:
+        for done in [pool.submit(work, engine) for engine in engines]:
+            done.result()
+    return np.stack([outputs for first in sorted(parts) for outputs in parts[first]])
 
 
 def require_fit(card: ModelCard, frames: Frames, split: str) -> None:

@@ -11,16 +11,23 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mtlnet.doubt import Doubt
 from mtlnet.graph_layers import features_graph
 from mtlnet.network import Network
 from mtlnet.plan import HEADS, HEIGHT, WIDTH
+from mtlnet.precise import doubt_outputs, precise_linear
 
 # Largest difference of any output (coded, or a probability) from torch in float32.
 TOLERANCE = 2e-4
+DOUBT_TOLERANCE = 5e-3
+"""The same of a standard deviation or the novelty, as a share of it."""
 
 
-def build_graph(network: Network) -> Any:
-    """The OpenVINO model of a folded network: uint8 (1, 210, 280, 3) -> float32 (1, 9)."""
+def build_graph(network: Network, doubt: Doubt | None = None) -> Any:
+    """The OpenVINO model of a folded network: uint8 (1, 210, 280, 3) -> float32 (1, 9).
+
+    With `doubt` (1, 17): see `mtlnet.answer`.
+    """
     import openvino
     from openvino import opset13 as ops
 
@@ -32,8 +39,12 @@ def build_graph(network: Network) -> Any:
     x = features_graph(ops, x, network)
     for number in range(len(network.plan.shared)):
         x = ops.relu(_linear(ops, x, weights, f"shared.fc{number}.layer"))
-    distance, angle, kind = (_precise_linear(ops, x, weights, f"heads.{name}") for name, _ in HEADS)
-    outputs = ops.concat([distance, angle, ops.softmax(kind, 1)], 1)
+    distance, angle, kind = (
+        precise_linear(ops, x, weights[f"heads.{name}.weight"], weights[f"heads.{name}.bias"])
+        for name, _ in HEADS
+    )
+    second = [] if doubt is None else doubt_outputs(ops, x, doubt)
+    outputs = ops.concat([distance, angle, ops.softmax(kind, 1), *second], 1)
     return openvino.Model([ops.result(outputs)], [images], "mtlnet")
 
 
@@ -42,17 +53,7 @@ def _linear(ops: Any, x: Any, weights: dict[str, NDArray[np.float32]], name: str
     return ops.add(product, weights[f"{name}.bias"][None])
 
 
-def _precise_linear(ops: Any, x: Any, weights: dict[str, NDArray[np.float32]], name: str) -> Any:
-    """A linear layer that stays in float32 where the rest is computed in bf16.
-
-    OpenVINO rounds what a MatMul gives to bf16, in steps of 0.004 near 1: 0.025 m and 0.005 rad.
-    It leaves the element-wise operations that end a graph alone.
-    """
-    products = ops.multiply(ops.unsqueeze(x, np.array([1])), weights[f"{name}.weight"][None])
-    return ops.add(ops.reduce_sum(products, np.array([2])), weights[f"{name}.bias"][None])
-
-
-def write_graph(network: Network, graph: Path, weights: Path) -> None:
+def write_graph(network: Network, graph: Path, weights: Path, doubt: Doubt | None = None) -> None:
     """Write the graph to `graph` (.xml) and its weights, in float32, to `weights` (.bin).
 
     Raises OSError when the disk takes neither; both are then as they were.
@@ -62,7 +63,7 @@ def write_graph(network: Network, graph: Path, weights: Path) -> None:
     # OpenVINO names the weights after the graph, so both are written under another stem first.
     staged = graph.with_name("staged.xml")
     try:
-        openvino.save_model(build_graph(network), str(staged), compress_to_fp16=False)
+        openvino.save_model(build_graph(network, doubt), str(staged), compress_to_fp16=False)
         staged.with_suffix(".bin").replace(weights)
         staged.replace(graph)
     except RuntimeError as error:  # how OpenVINO says that a write failed, without the reason

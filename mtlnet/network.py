@@ -18,7 +18,16 @@ from torch import Tensor, nn
 from mtlnet.layers import block, build_features, fold_norms
 from mtlnet.plan import HEADS, HEIGHT, MTL, WIDTH, Plan, find_plan
 
-__all__ = ["HEIGHT", "WIDTH", "Network", "answer_images", "fold", "initialise", "load_network"]
+__all__ = [
+    "HEIGHT",
+    "WIDTH",
+    "Network",
+    "answer_images",
+    "describe_images",
+    "fold",
+    "initialise",
+    "load_network",
+]
 
 
 class Network(nn.Module):
@@ -110,10 +119,17 @@ def load_network(path: Path, name: str = MTL.name) -> Network:
 
 def answer_images(network: Network, images: NDArray[np.uint8]) -> NDArray[np.float32]:
     """Images (B, 210, 280, 3) -> (B, 9): coded distances and angle, class probabilities."""
+    return describe_images(network, images)[1]
+
+
+def describe_images(
+    network: Network, images: NDArray[np.uint8]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """The last shared features (B, 256) of images (B, 210, 280, 3), and the answers (B, 9)."""
     device = next(network.parameters()).device
     network.eval()
     with torch.inference_mode():
-        outputs = network(torch.from_numpy(images).to(device))
+        x = network.describe(torch.from_numpy(images).to(device)).float()
+        outputs = network.answer(x)
         outputs[:, 6:] = torch.softmax(outputs[:, 6:], 1)
-    answers: NDArray[np.float32] = outputs.cpu().numpy()
-    return answers
+    return x.cpu().numpy(), outputs.cpu().numpy()

@@ -13,7 +13,9 @@ from numpy.typing import NDArray
 from safetensors.torch import save
 
 import trackfeatures as tf
+from mtlnet.answer import OUTPUTS
 from mtlnet.card import (
+    DOUBT,
     GRAPH,
     GRAPH_WEIGHTS,
     MODEL_FILES,
@@ -23,9 +25,10 @@ from mtlnet.card import (
     ModelError,
     file_hash,
 )
-from mtlnet.export import TOLERANCE, write_graph
+from mtlnet.doubt import Doubt, FittedDoubt, write_doubt
+from mtlnet.export import DOUBT_TOLERANCE, TOLERANCE, write_graph
 from mtlnet.golden import golden_image
-from mtlnet.network import HEIGHT, WIDTH, Network, answer_images, fold
+from mtlnet.network import HEIGHT, WIDTH, Network, answer_images, describe_images, fold
 from mtlnet.whole import write_whole
 
 PACKAGES = ("driverview", "torch", "openvino", "numpy")
@@ -43,25 +46,27 @@ def publish(
     batch: int = 32,
     seed: int = 0,
     data: dict[str, Any] | None = None,
+    doubt: FittedDoubt | None = None,
 ) -> ModelCard:
     """Fold `network`, write all of `mtlnet.card.MODEL_FILES` and the card into folder `run`.
 
-    `images` (N, 210, 280, 3): frames on which the graph is held against torch. Raises ModelError
-    when it differs by more than `mtlnet.export.TOLERANCE`; the run then has no card.
+    `images` (N, 210, 280, 3): frames on which the graph is held against torch. `doubt`: its second
+    head (`mtlnet.doubt_fit`); without one the model gives no standard deviations. Raises
+    ModelError when the graph differs by more than `mtlnet.export.TOLERANCE`; the run then has no
+    card.
     """
     run.mkdir(parents=True, exist_ok=True)
     folded = fold(network)
     weights = {name: t.contiguous() for name, t in folded.state_dict().items()}
     write_whole(run / WEIGHTS, save(weights))
-    write_graph(folded, run / GRAPH, run / GRAPH_WEIGHTS)
-    check = compare(folded, run, images)
-    if check["openvino_f32_max"] > TOLERANCE:
-        raise ModelError(
-            f"the exported graph {run / GRAPH} differs from torch by "
-            f"{check['openvino_f32_max']:.2g}, at most {TOLERANCE:g} is expected: the model is "
-            "not published; report this as a fault"
-        )
+    head = None if doubt is None else doubt.head
+    if head is not None:
+        write_doubt(run, head)
+    write_graph(folded, run / GRAPH, run / GRAPH_WEIGHTS, head)
+    check = compare(folded, run, images, head)
+    _require_equal(run, check)
     golden = golden_image(WIDTH, HEIGHT)
+    names = MODEL_FILES if doubt is None else (*MODEL_FILES, DOUBT)
     card = ModelCard(
         name=run.resolve().name,
         network=folded.plan.name,
@@ -75,21 +80,39 @@ def publish(
         seed=seed,
         data=data or {},
         versions=package_versions(),
-        files={name: file_hash(run / name) for name in MODEL_FILES},
+        files={name: file_hash(run / name) for name in names},
         export_check=check,
         golden=tuple(float(v) for v in answer_images(folded, golden[None])[0]),
+        doubt=None if doubt is None else doubt.about,
     )
     card.write(run)
     return card
 
 
-def compare(network: Network, run: Path, images: NDArray[np.uint8]) -> dict[str, float]:
-    """Largest difference of any output between torch in float32 and the graph, per precision."""
+def _require_equal(run: Path, check: dict[str, float]) -> None:
+    limits = {"openvino_f32_max": TOLERANCE, "openvino_f32_doubt": DOUBT_TOLERANCE}
+    for name, limit in limits.items():
+        if not check.get(name, 0.0) <= limit:  # written so that NaN is a failure too
+            raise ModelError(
+                f"the exported graph {run / GRAPH} differs from torch by {check[name]:.2g} "
+                f"({name}), at most {limit:g} is expected: the model is not published; report this "
+                "as a fault"
+            )
+
+
+def compare(
+    network: Network, run: Path, images: NDArray[np.uint8], doubt: Doubt | None = None
+) -> dict[str, float]:
+    """Largest difference between torch in float32 and the graph, per precision.
+
+    Of any of the nine outputs; and, as a share of its value, of any of the second head's.
+    """
     import openvino
 
     from mtlnet.engine import best_precision
 
-    expected = answer_images(network, images)
+    x, expected = describe_images(network, images)
+    second = None if doubt is None else doubt.assess(x)
     core = openvino.Core()
     differences = {"frames": float(len(images))}
     for precision in dict.fromkeys(("f32", best_precision(core))):
@@ -103,7 +126,11 @@ def compare(network: Network, run: Path, images: NDArray[np.uint8]) -> dict[str,
                 "published; is the disk full?"
             ) from error
         answers = np.concatenate([request.infer([image[None]])[0].copy() for image in images])
-        differences[f"openvino_{precision}_max"] = float(np.abs(answers - expected).max())
+        nine = answers[:, :OUTPUTS]
+        differences[f"openvino_{precision}_max"] = float(np.abs(nine - expected).max())
+        if second is not None:
+            share = np.abs(answers[:, OUTPUTS:] / second - 1)
+            differences[f"openvino_{precision}_doubt"] = float(share.max())
     return differences
 
 

@@ -15,8 +15,14 @@ from datagen.recording import Dataset, Frames, Labels
 Numbers = NDArray[np.float64]
 
 
-def describe_data(dataset: Dataset, frames: Frames) -> dict[str, Any]:
-    """What a model was trained on, and the mean of its labels: the answer of one who guesses."""
+def describe_data(
+    dataset: Dataset, frames: Frames, held_out: Frames | None = None
+) -> dict[str, Any]:
+    """What a model was trained on, and the mean of its labels: the answer of one who guesses.
+
+    `held_out`: rounds on which only its doubt was fitted; it has seen them all the same.
+    """
+    rounds = [*frames.rounds, *(held_out.rounds if held_out is not None else [])]
     labels = frames.labels
     distances = labels.distances.astype(np.float64)
     counts = (~np.isnan(distances)).sum(0)
@@ -31,8 +37,9 @@ def describe_data(dataset: Dataset, frames: Frames) -> dict[str, Any]:
         "content_hash": dataset.content_hash,
         "frames": len(frames),
         "split": sides,
-        "seeds": [info.seed for info in frames.rounds],
-        "tracks": sorted({info.track for info in frames.rounds}),
+        "held_out": [info.id for info in held_out.rounds] if held_out is not None else [],
+        "seeds": [info.seed for info in rounds],
+        "tracks": sorted({info.track for info in rounds}),
         "mean": {
             "distances_m": [float(s / n) if n else None for s, n in zip(sums, counts, strict=True)],
             "to_lane_centre_m": float(np.nanmean(tf.localise(distances))),
@@ -123,7 +130,7 @@ def judge_groups(
 
 def _values(outputs: NDArray[np.float32]) -> tuple[Numbers, Numbers, NDArray[np.int64]]:
     distances, _ = tf.decode(outputs[:, :6])
-    return tf.decode_values(outputs[:, :6]), tf.localise(distances), outputs[:, 6:].argmax(1)
+    return tf.decode_values(outputs[:, :6]), tf.localise(distances), outputs[:, 6:9].argmax(1)
 
 
 def _constant(mean: dict[str, Any], count: int) -> tuple[Numbers, Numbers, NDArray[np.int64]]:

@@ -23,9 +23,10 @@ from mtlnet.card import RUNS, Camera, ModelCard, ModelError
 from mtlnet.checkpoint import list_checkpoints, load_checkpoint, save_checkpoint
 from mtlnet.config import TrainConfig, write_config
 from mtlnet.curves import Curves
+from mtlnet.doubt_fit import fit_doubt, hold_out
 from mtlnet.interrupt import StopRequest
 from mtlnet.loader import Loader
-from mtlnet.network import HEIGHT, WIDTH
+from mtlnet.network import HEIGHT, WIDTH, fold
 from mtlnet.plan import find_plan
 from mtlnet.publish import publish
 from mtlnet.recipe import Recipe, find_recipe
@@ -67,8 +68,9 @@ def train(
     """
     recipe = find_recipe(config.recipe)
     device = choose_device(config.device)
-    frames, dataset = open_training_data(config.data)
-    data = describe_data(dataset, frames)
+    dataset = open_training_data(config.data)
+    frames, held_out = hold_out(dataset)
+    data = describe_data(dataset, frames, held_out)
     camera = Camera(**dataset.camera.as_dict())  # type: ignore[arg-type]  # sizes are int
     if resumed is None:
         create_run(config, recipe, data)
@@ -86,7 +88,7 @@ def train(
         elapsed_s = load_checkpoint(checkpoints[-1], trainer)
     try:
         learn(config, trainer, loader, elapsed_s, report)
-        return finish(config, trainer, frames, camera, data)
+        return finish(config, trainer, frames, held_out, camera, data)
     except OSError as error:
         where = f" ({error.filename})" if error.filename else ""
         raise UserError(
@@ -96,7 +98,12 @@ def train(
 
 
 def finish(
-    config: TrainConfig, trainer: Trainer, frames: Frames, camera: Camera, data: dict[str, Any]
+    config: TrainConfig,
+    trainer: Trainer,
+    frames: Frames,
+    held_out: Frames | None,
+    camera: Camera,
+    data: dict[str, Any],
 ) -> ModelCard:
     """Publish the trained network in the run's folder."""
     chosen = np.linspace(0, len(frames) - 1, min(CHECK_FRAMES, len(frames))).astype(np.int64)
@@ -112,6 +119,7 @@ def finish(
         batch=config.batch,
         seed=config.seed,
         data=data,
+        doubt=fit_doubt(fold(trainer.network), frames, held_out, config.seed),
     )
     link_latest(config.out)
     return card
@@ -172,8 +180,8 @@ def require_finite(losses: NDArray[np.float64], step: int) -> None:
         )
 
 
-def open_training_data(path: Path) -> tuple[Frames, Dataset]:
-    """The train rounds of a dataset; UserError when it does not fit this network."""
+def open_training_data(path: Path) -> Dataset:
+    """The dataset in folder `path`; UserError when it does not fit this network."""
     dataset = Dataset.open(path)
     camera = dataset.camera
     if (camera.width, camera.height) != (WIDTH, HEIGHT):
@@ -181,7 +189,8 @@ def open_training_data(path: Path) -> tuple[Frames, Dataset]:
             f"the images of {path} are {camera.width} x {camera.height}, the network takes "
             f"{WIDTH} x {HEIGHT}; collect with the default camera size"
         )
-    return dataset.select("train"), dataset
+    dataset.select("train")  # raises where there are none
+    return dataset
 
 
 def create_run(config: TrainConfig, recipe: Recipe, data: dict[str, Any]) -> None:

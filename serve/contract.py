@@ -42,6 +42,13 @@ class HeadingProbabilities(BaseModel):
     right: float
 
 
+class Deviations(Distances):
+    """Standard deviation of the error of each feature, m and rad; null for what is absent."""
+
+    to_lane_centre: float | None = Field(description="of to_lane_centre_m, m")
+    angle: float = Field(description="of angle_rad, rad")
+
+
 class Timing(BaseModel):
     """Where the service spent its time, ms. `queue` and `total` include receiving the body."""
 
@@ -63,6 +70,12 @@ class Features(BaseModel):
         description="track heading minus the car's, rad: positive when the car points to the right"
     )
     heading: HeadingProbabilities
+    std: Deviations | None = Field(
+        description="null where the model was published without frames to learn them from"
+    )
+    out_of_distribution: bool | None = Field(
+        description="the image is unlike those the model learned from: do not drive by it"
+    )
     model: str = Field(description="hash of the weights that answered")
     definitions_version: str = Field(description="version of what the features mean")
     engine: str

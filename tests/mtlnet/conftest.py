@@ -7,10 +7,12 @@ import pytest
 from numpy.typing import NDArray
 
 import trackfeatures as tf
+from datagen.recording import Dataset
 from datagen.recording.frame import DriverCommand, EgoState, Frame, RoadPlace
 from datagen.recording.header import RoundHeader
 from datagen.recording.splits import Split, split_path, write_split
 from datagen.recording.writer import RoundWriter
+from mtlnet.doubt_fit import fit_doubt
 from mtlnet.network import HEIGHT, WIDTH, Network, initialise
 from mtlnet.publish import publish
 
@@ -75,10 +77,12 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def published(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run folder with an untrained, published network."""
+def published(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run folder with an untrained, published network; its doubt was fitted."""
     network = Network()
     initialise(network, 5)
     run = tmp_path_factory.mktemp("runs") / "untrained"
-    publish(network, run, np.stack([draw_road(d, 0.0) for d in (-1.0, 0.5)]))
+    doubt = fit_doubt(network, Dataset.open(dataset).select("train"), None, 0)
+    images = np.stack([draw_road(d, 0.0) for d in (-1.0, 0.5)])
+    publish(network, run, images, doubt=doubt)
     return run

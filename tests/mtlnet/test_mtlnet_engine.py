@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 import trackfeatures as tf
 from mtlnet import card as cards
-from mtlnet.answer import interpret
+from mtlnet.answer import OUTPUTS, interpret
 from mtlnet.card import ModelError, read_card, resolve_run
 from mtlnet.engine import load_engine
 
@@ -26,9 +26,10 @@ def copy(published: Path, tmp_path: Path) -> Path:
 def test_openvino_answers_as_torch(published: Path) -> None:
     oracle = load_engine(published, "torch")(IMAGE)
     single = load_engine(published, precision="f32")(IMAGE)
-    np.testing.assert_allclose(single, oracle, atol=2e-5)
+    np.testing.assert_allclose(single[:OUTPUTS], oracle[:OUTPUTS], atol=2e-5)
+    np.testing.assert_allclose(single[OUTPUTS:], oracle[OUTPUTS:], rtol=5e-3)
     fast = load_engine(published)
-    np.testing.assert_allclose(fast(IMAGE), oracle, atol=0.05)
+    np.testing.assert_allclose(fast(IMAGE)[:OUTPUTS], oracle[:OUTPUTS], atol=0.05)
     assert fast(IMAGE).tolist() == fast(IMAGE).tolist()
     other = fast(255 - IMAGE)
     assert other.tolist() != fast(IMAGE).tolist()
@@ -107,6 +108,38 @@ def test_interpreting_outputs() -> None:
     assert answer.to_lane_centre_m == pytest.approx(1.0, abs=1e-5)
     assert answer.angle_rad == pytest.approx(0.05, abs=1e-6)
     assert answer.heading == pytest.approx({"left": 0.7, "straight": 0.2, "right": 0.1})
-    assert list(answer.as_json()) == ["distances_m", "to_lane_centre_m", "angle_rad", "heading"]
-    with pytest.raises(ValueError, match="9 numbers"):
+    assert list(answer.as_json()) == [
+        "distances_m", "to_lane_centre_m", "angle_rad", "heading", "std", "out_of_distribution",
+    ]  # fmt: skip
+    assert answer.std is None
+    assert answer.out_of_distribution is None
+    with pytest.raises(ValueError, match="9 or 17 numbers"):
         interpret(coded)
+
+
+def test_interpreting_doubt() -> None:
+    coded = tf.encode([[-1.0, 3.0, np.nan, -1.0, 3.0]], [0.05])[0]
+    std = [0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.01]
+    for novelty, strange in ((0.99, False), (1.01, True), (np.nan, True)):
+        outputs = np.concatenate([coded, [0.7, 0.2, 0.1], std, [novelty]]).astype(np.float32)
+        answer = interpret(outputs)
+        assert answer.out_of_distribution is strange
+        assert answer.std == {
+            "ml": pytest.approx(0.1), "mr": pytest.approx(0.2), "l": None, "m": pytest.approx(0.4),
+            "r": pytest.approx(0.5), "to_lane_centre": pytest.approx(0.6),
+            "angle": pytest.approx(0.01),
+        }  # fmt: skip
+
+
+def test_a_model_of_the_format_before_is_refused(copy: Path) -> None:
+    content = json.loads((copy / "card.json").read_text())
+    content["format"] = 1
+    (copy / "card.json").write_text(json.dumps(content))
+    with pytest.raises(ModelError, match="has format 1, this program reads 3"):
+        load_engine(copy)
+
+
+def test_a_damaged_second_head_is_seen(copy: Path) -> None:
+    (copy / "doubt.safetensors").write_bytes(b"rubbish")
+    with pytest.raises(ModelError, match=r"doubt\.safetensors is damaged"):
+        load_engine(copy, "torch")

@@ -12,7 +12,7 @@ from safetensors.numpy import load_file
 
 import mtlnet.train
 from datagen.recording import Dataset
-from mtlnet.card import GRAPH, WEIGHTS, Camera, ModelError, read_card
+from mtlnet.card import DOUBT, GRAPH, WEIGHTS, Camera, ModelError, read_card
 from mtlnet.checkpoint import list_checkpoints
 from mtlnet.config import TrainConfig, resume_config
 from mtlnet.curves import read_curves
@@ -90,7 +90,7 @@ def test_a_run_keeps_what_it_was(dataset: Path, tmp_path: Path) -> None:
     assert read_card(run) == done
     assert done.iterations == 10
     assert done.export_check["openvino_f32_max"] < 2e-4
-    assert set(done.files) == {WEIGHTS, GRAPH, "model.bin"}
+    assert set(done.files) == {WEIGHTS, DOUBT, GRAPH, "model.bin"}
     assert done.data["content_hash"] == Dataset.open(dataset).content_hash
     assert done.data["split"]["test"] == ["r003"]
     labels = Dataset.open(dataset).select("train").labels

@@ -1,0 +1,34 @@
+"""Layers of an OpenVINO graph that are computed in float32 where the rest is in bf16.
+
+OpenVINO rounds what a MatMul gives to bf16, in steps of 0.004 near 1: 0.025 m and 0.005 rad.
+It leaves the element-wise operations that end a graph alone.
+"""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mtlnet.doubt import Doubt
+
+
+def precise_product(ops: Any, x: Any, weight: NDArray[np.float32]) -> Any:
+    """x (1, F) times weight (N, F), transposed: (1, N)."""
+    products = ops.multiply(ops.unsqueeze(x, np.array([1])), weight[None])
+    return ops.reduce_sum(products, np.array([2]))
+
+
+def precise_linear(ops: Any, x: Any, weight: NDArray[np.float32], bias: NDArray[np.float32]) -> Any:
+    """The linear layer of these weights (N, F) and (N,) on x (1, F): (1, N)."""
+    return ops.add(precise_product(ops, x, weight), bias[None])
+
+
+def doubt_outputs(ops: Any, x: Any, doubt: Doubt) -> list[Any]:
+    """`Doubt.assess` of the last shared features x (1, F): standard deviations, novelty."""
+    z = ops.multiply(ops.subtract(x, doubt.centre[None]), doubt.scale[None])
+    hidden = ops.relu(precise_linear(ops, z, doubt.hidden_weight, doubt.hidden_bias))
+    logarithm = precise_linear(ops, hidden, doubt.weight, doubt.bias)
+    limited = ops.minimum(ops.maximum(logarithm, doubt.low[None]), doubt.high[None])
+    along = precise_product(ops, z, doubt.directions)
+    novelty = ops.reduce_sum(ops.multiply(along, along), np.array([1]), keep_dims=True)
+    return [ops.exp(limited), novelty]
