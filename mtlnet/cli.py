@@ -118,6 +118,9 @@ def evaluate_command(
     model: Model = "default",
     data: Data = Path("datasets/default"),
     split: Annotated[str, typer.Option(help="train, test, unseen or all.")] = "test",
+    page: Annotated[
+        Path | None, typer.Option("--report", help="HTML page to write: a file, or a folder.")
+    ] = None,
     engine: EngineKind = "openvino",
     precision: PrecisionOption = None,
     as_json: Json = False,
@@ -129,7 +132,7 @@ def evaluate_command(
     from rich.progress import Progress
 
     from mtlnet.evaluate import evaluate
-    from mtlnet.tables import evaluation_table, group_table
+    from mtlnet.tables import doubt_table, evaluation_table, group_table
 
     # The frames are shared out to engines of one thread each: that answers more of them a second
     # than one engine on all cores.
@@ -138,14 +141,22 @@ def evaluate_command(
     with Progress(console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task("evaluating")
         result = evaluate(
-            ready, data, split, lambda done, total: bar.update(task, completed=done, total=total)
+            ready,
+            data,
+            split,
+            lambda done, total: bar.update(task, completed=done, total=total),
+            page,
         )
+    if page is not None:
+        typer.echo(f"report: {result['page']}", err=True)
     if as_json:
         typer.echo(json.dumps(result))
         return
     console = Console()
     console.print(evaluation_table(result))
     console.print(group_table(result))
+    if "doubt" in result:
+        console.print(doubt_table(result))
 
 
 @app.command("predict")

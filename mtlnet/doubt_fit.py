@@ -7,7 +7,6 @@ temperatures and the limit of novelty come from there too.
 
 import hashlib
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
@@ -17,6 +16,7 @@ from torch import Tensor, nn
 import trackfeatures as tf
 from datagen.recording import Dataset, Frames
 from mtlnet.doubt import FEATURES, Doubt, FittedDoubt
+from mtlnet.errors import coverage, signed_errors
 from mtlnet.loader import Images
 from mtlnet.network import HEIGHT, WIDTH, Network, describe_images
 
@@ -110,15 +110,8 @@ def look(network: Network, frames: Images, most: int) -> Seen:
         parts.append(describe_images(network, frames.read_batch(rows, images[: len(rows)])))
     x, outputs = (np.concatenate(column) for column in zip(*parts, strict=True))
     labels = frames.labels
-    return Seen(x, errors(outputs, labels.distances[chosen], labels.angle[chosen]))
-
-
-def errors(outputs: Numbers, distances: Numbers, angle: Numbers) -> Numbers:
-    """Signed errors (N, D) of outputs (N, 9 or more) in m and rad, NaN where there is no label."""
-    said, values = tf.decode(outputs[:, :6])[0], tf.decode_values(outputs[:, :6])
-    offset = tf.localise(said) - tf.localise(distances)
-    columns = [values[:, :5] - distances, offset[:, None], (values[:, 5] - angle)[:, None]]
-    return np.concatenate(columns, 1).astype(np.float32)
+    error = signed_errors(outputs, labels.distances[chosen], labels.angle[chosen])
+    return Seen(x, error.astype(np.float32))
 
 
 def novelty_directions(known: Numbers, held_out: Numbers) -> Numbers:
@@ -210,14 +203,3 @@ class _Head(nn.Module):
     def forward(self, z: Tensor) -> Tensor:
         logarithm: Tensor = self.second(self.first(z).relu())
         return logarithm
-
-
-def coverage(std: Numbers, error: Numbers) -> dict[str, list[float | None]]:
-    """By feature: shares of errors within one and within two standard deviations."""
-    ratio = np.abs(error) / std
-    return {name: [_share(ratio[:, i], k) for k in (1, 2)] for i, name in enumerate(FEATURES)}
-
-
-def _share(ratio: NDArray[Any], limit: float) -> float | None:
-    present = ratio[~np.isnan(ratio)]
-    return float((present <= limit).mean()) if len(present) else None

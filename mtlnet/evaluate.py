@@ -13,7 +13,8 @@ from datagen.recording import Dataset, Frames
 from mtlnet.card import ModelCard, ModelError
 from mtlnet.engine import Engine
 from mtlnet.loader import Images
-from mtlnet.report import judge, judge_groups
+from mtlnet.report import judge_all
+from mtlnet.report_page import write_page
 
 CHUNK = 32
 
@@ -23,9 +24,11 @@ def evaluate(
     data: Path,
     split: str,
     report: Callable[[int, int], None] = lambda *_: None,
+    page: Path | None = None,
 ) -> dict[str, Any]:
     """The report of `mtlnet.report.judge` on one side of a dataset, whole and by groups.
 
+    `page`: where to write it as HTML as well, a file or a folder.
     `engines`: the same model, once for each thread. `report(done, all)` is told how far it is.
     Raises UserError when data and model do not fit.
     """
@@ -35,15 +38,19 @@ def evaluate(
     require_fit(engine.card, frames, split)
     outputs = answer_frames(engines, frames, report)
     mean = engine.card.data["mean"]
-    return {
+    found = {
         "model": engine.card.name,
         "model_hash": engine.card.model_hash,
+        "engine": engine.kind,
+        "precision": engine.precision,
         "data": str(data),
         "split": split,
         "rounds": len(frames.rounds),
-        **judge(outputs, frames.labels, mean),
-        **judge_groups(outputs, frames, mean),
+        **judge_all(outputs, frames, mean),
     }
+    if page is not None:
+        found["page"] = str(write_page(page, found, frames, outputs))
+    return found
 
 
 def answer_frames(

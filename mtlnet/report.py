@@ -1,7 +1,7 @@
 """How good a model's answers are, in metres and radians, beside always answering the mean.
 
-Errors are taken on active labels only, on the value the network gives whether or not it decodes to
-"absent"; how often presence itself is wrong stands beside them.
+Errors are taken on active labels only (`mtlnet.errors`); how often presence itself is wrong stands
+beside them.
 """
 
 from typing import Any
@@ -11,8 +11,10 @@ from numpy.typing import NDArray
 
 import trackfeatures as tf
 from datagen.recording import Dataset, Frames, Labels
-
-Numbers = NDArray[np.float64]
+from mtlnet.answer import OUTPUTS
+from mtlnet.doubt import FEATURES
+from mtlnet.errors import Numbers, calibration, confusion, coverage, signed_errors, spread
+from mtlnet.groups import groups
 
 
 def describe_data(
@@ -51,96 +53,104 @@ def describe_data(
 
 
 def judge(outputs: NDArray[np.float32], labels: Labels, mean: dict[str, Any]) -> dict[str, Any]:
-    """The report (DESIGN §9) on `outputs` (N, 9) for `labels`, `mean` as `describe_data` has it."""
-    model = errors(*_values(outputs), labels)
-    guess = errors(*_constant(mean, len(labels)), labels)
-    ratio = {
-        "mae_m": {m: _ratio(model["mae_m"][m], guess["mae_m"][m]) for m in tf.MARKINGS},
-        "to_lane_centre_mae_m": _ratio(
-            model["to_lane_centre_mae_m"], guess["to_lane_centre_mae_m"]
-        ),
-        "angle_mae_rad": _ratio(model["angle_mae_rad"], guess["angle_mae_rad"]),
-    }
-    return {
+    """The report (DESIGN §9) on `outputs` (N, 9 or 17) for `labels`, `mean` as of `describe_data`.
+
+    `doubt` is there where the model gives standard deviations.
+    """
+    errors = signed_errors(outputs, labels.distances, labels.angle)
+    said = outputs[:, 6:OUTPUTS].argmax(1)
+    model = _means(errors, said == labels.heading)
+    guess = _means(_constant_errors(mean, labels), labels.heading == mean["heading"])
+    report = {
         "frames": len(labels),
         **model,
+        "errors": spread(errors),
+        "confusion": confusion(labels.heading, said),
         "coded": coded_losses(outputs, labels),
         "presence": presence(outputs, labels),
         "baseline": guess,
-        "ratio": ratio,
+        "ratio": _ratios(model, guess),
+    }
+    if outputs.shape[1] > OUTPUTS:
+        std, novelty = outputs[:, OUTPUTS:-1], outputs[:, -1]
+        strange = float((~(novelty <= 1)).mean())
+        report["doubt"] = {"coverage": coverage(std, errors), "out_of_distribution": strange}
+    return report
+
+
+def judge_all(outputs: NDArray[np.float32], frames: Frames, mean: dict[str, Any]) -> dict[str, Any]:
+    """The report on all frames, and the same by each of `mtlnet.groups.groups`: `by_track`, ..."""
+    labels = frames.labels
+    report = judge(outputs, labels, mean)
+    if outputs.shape[1] > OUTPUTS:
+        errors = signed_errors(outputs, labels.distances, labels.angle)
+        report["doubt"]["calibration"] = calibration(outputs[:, OUTPUTS:-1], errors)
+    for name, parts in groups(frames):
+        report[name] = {
+            key: judge(outputs[rows], labels.take(rows), mean) for key, rows in parts.items()
+        }
+    return report
+
+
+def _means(errors: Numbers, right: NDArray[np.bool_]) -> dict[str, Any]:
+    """Mean absolute errors, and the share of right classes, under the names of DESIGN §9."""
+    sizes = [_mean(np.abs(column)) for column in errors.T]
+    by_name = dict(zip(FEATURES, sizes, strict=True))
+    return {
+        "mae_m": {m: by_name[m] for m in tf.MARKINGS},
+        "to_lane_centre_mae_m": by_name["to_lane_centre"],
+        "angle_mae_rad": by_name["angle"],
+        "heading_accuracy": _mean(right.astype(np.float64)),
     }
 
 
-def errors(
-    values: Numbers, offset: Numbers, heading: NDArray[np.int64], labels: Labels
-) -> dict[str, Any]:
-    """Mean absolute errors of values (N, 6) in m and rad, of the offset (N,), and the accuracy.
-
-    The offset counts where both the label and the answer have one.
-    """
-    distance = np.abs(values[:, :5] - labels.distances)
+def _ratios(model: dict[str, Any], guess: dict[str, Any]) -> dict[str, Any]:
     return {
-        "mae_m": {m: _mean(distance[:, i]) for i, m in enumerate(tf.MARKINGS)},
-        "to_lane_centre_mae_m": _mean(np.abs(offset - tf.localise(labels.distances))),
-        "angle_mae_rad": _mean(np.abs(values[:, 5] - labels.angle)),
-        "heading_accuracy": _mean((heading == labels.heading).astype(np.float64)),
+        "mae_m": {m: _ratio(model["mae_m"][m], guess["mae_m"][m]) for m in tf.MARKINGS},
+        **{k: _ratio(model[k], guess[k]) for k in ("to_lane_centre_mae_m", "angle_mae_rad")},
     }
 
 
 def coded_losses(outputs: NDArray[np.float32], labels: Labels) -> dict[str, float]:
-    """The three losses of the paper, as they are trained (see `mtlnet.loss`)."""
+    """The losses of the paper's table on coded values, inactive ones included.
+
+    `distance`, `angle`: mean over the frames of the squared error, of the five distances summed, as
+    trained; `distance_absolute`, `angle_absolute`: of the absolute error; `type`: cross-entropy.
+    """
     target = tf.encode(labels.distances, labels.angle).astype(np.float64)
-    squared = (outputs[:, :6] - target) ** 2
+    difference = outputs[:, :6] - target
+    squared, absolute = difference**2, np.abs(difference)
     chosen = outputs[np.arange(len(labels)), 6 + labels.heading].astype(np.float64)
     return {
         "distance": float(squared[:, :5].sum(1).mean()),
         "angle": float(squared[:, 5].mean()),
         "type": float(-np.log(np.maximum(chosen, 1e-12)).mean()),
+        "distance_absolute": float(absolute[:, :5].sum(1).mean()),
+        "angle_absolute": float(absolute[:, 5].mean()),
     }
 
 
 def presence(outputs: NDArray[np.float32], labels: Labels) -> dict[str, dict[str, float | None]]:
-    """Per marking: share of active labels answered as absent, and of absent ones as active."""
+    """Per distance: share of active labels answered as absent, and of absent ones as active."""
     distances, _ = tf.decode(outputs[:, :6])
-    absent, truly_absent = np.isnan(distances), np.isnan(labels.distances)
+    truth = labels.distances
+    absent = np.isnan(np.column_stack([distances, tf.localise(distances)]))
+    truly_absent = np.isnan(np.column_stack([truth, tf.localise(truth)]))
     return {
-        marking: {
-            "missed": _mean(absent[~truly_absent[:, i], i].astype(np.float64)),
-            "invented": _mean(1.0 - absent[truly_absent[:, i], i]),
+        name: {
+            "false_inactive": _mean(absent[~truly_absent[:, i], i].astype(np.float64)),
+            "false_active": _mean(1.0 - absent[truly_absent[:, i], i]),
         }
-        for i, marking in enumerate(tf.MARKINGS)
+        for i, name in enumerate(FEATURES[:-1])
     }
 
 
-def judge_groups(
-    outputs: NDArray[np.float32], frames: Frames, mean: dict[str, Any]
-) -> dict[str, dict[str, Any]]:
-    """The report by track and by lane count: {"by_track": {...}, "by_lanes": {...}}."""
-    labels = frames.labels
-    tracks = np.array([info.track for info in frames.rounds])[labels.round]
-    groups = {"by_track": tracks, "by_lanes": labels.lanes.astype(str)}
-    report: dict[str, dict[str, Any]] = {}
-    for group, keys in groups.items():
-        report[group] = {}
-        for key in np.unique(keys).tolist():
-            rows = np.flatnonzero(keys == key)
-            report[group][key] = judge(outputs[rows], labels.take(rows), mean)
-    return report
-
-
-def _values(outputs: NDArray[np.float32]) -> tuple[Numbers, Numbers, NDArray[np.int64]]:
-    distances, _ = tf.decode(outputs[:, :6])
-    return tf.decode_values(outputs[:, :6]), tf.localise(distances), outputs[:, 6:9].argmax(1)
-
-
-def _constant(mean: dict[str, Any], count: int) -> tuple[Numbers, Numbers, NDArray[np.int64]]:
+def _constant_errors(mean: dict[str, Any], labels: Labels) -> Numbers:
+    """Errors (N, 7) of always answering the training mean."""
     distances = [np.nan if d is None else d for d in mean["distances_m"]]
-    values = np.tile([*distances, mean["angle_rad"]], (count, 1))
-    return (
-        values,
-        np.full(count, mean["to_lane_centre_m"]),
-        np.full(count, mean["heading"], dtype=np.int64),
-    )
+    offset = mean["to_lane_centre_m"] - tf.localise(labels.distances)
+    angle = mean["angle_rad"] - labels.angle
+    return np.column_stack([np.array(distances) - labels.distances, offset, angle])
 
 
 def _mean(values: Numbers) -> float | None:

@@ -5,43 +5,65 @@ from typing import Any
 from rich.table import Table
 
 import trackfeatures as tf
+from mtlnet.doubt import FEATURES
+from mtlnet.groups import GROUPS
+
+ROWS = {
+    **{m: (f"distance to {m}", "m", 3) for m in tf.MARKINGS},
+    "to_lane_centre": ("offset from the lane centre", "m", 3),
+    "angle": ("angle", "rad", 4),
+}
 
 
 def evaluation_table(result: dict[str, Any]) -> Table:
-    """Errors of a model beside those of always answering the training mean."""
+    """Errors of a model on active labels, beside those of always answering the training mean."""
     title = f"{result['model']} on {result['frames']} {result['split']} frames of {result['data']}"
     table = Table(title=title)
-    for column in ("", "error", "of the mean's answer", "ratio"):
+    for column in ("", "mean", "median", "95 %", "99 %", "of the mean's answer", "ratio"):
         table.add_column(column, justify="left" if not column else "right")
-    base, ratio = result["baseline"], result["ratio"]
-    for m in tf.MARKINGS:
-        values = (result["mae_m"][m], base["mae_m"][m], ratio["mae_m"][m])
-        table.add_row(f"distance to {m}", *_cells(values, "m", 3))
-    for name, label, unit, digits in (
-        ("to_lane_centre_mae_m", "offset from the lane centre", "m", 3),
-        ("angle_mae_rad", "angle", "rad", 4),
-    ):
-        values = (result[name], base[name], ratio[name])
-        table.add_row(label, *_cells(values, unit, digits))
-    accuracy = (result["heading_accuracy"], base["heading_accuracy"])
-    table.add_row("class accuracy", *(f"{100 * a:.1f} %" for a in accuracy), "")
+    for name, (label, unit, digits) in ROWS.items():
+        base, ratio = (_of(result[part], name) for part in ("baseline", "ratio"))
+        sizes = [*(result["errors"][name][k] for k in ("mean", "median", "p95", "p99")), base]
+        cells = [f"{_number(v, digits)} {unit}" if v is not None else "-" for v in sizes]
+        table.add_row(label, *cells, _number(ratio, 2))
+    accuracy, base = (result["heading_accuracy"], result["baseline"]["heading_accuracy"])
+    table.add_row("class right", f"{100 * accuracy:.1f} %", "", "", "", f"{100 * base:.1f} %", "")
     return table
 
 
+def _of(part: dict[str, Any], name: str) -> float | None:
+    """The figure of a feature under the names of DESIGN §9."""
+    names = {"to_lane_centre": "to_lane_centre_mae_m", "angle": "angle_mae_rad"}
+    found: float | None = part[names[name]] if name in names else part["mae_m"][name]
+    return found
+
+
 def group_table(result: dict[str, Any]) -> Table:
-    """The same by track and by lane count, shorter."""
-    table = Table(title="by track and by lanes")
-    for column in ("", "frames", "ml (m)", "mr (m)", "angle (rad)", "class"):
+    """Mean absolute errors by track, lane count, light, shadow, bend and speed."""
+    table = Table(title="by groups (m, rad)")
+    for column in ("", "frames", *FEATURES, "class"):
         table.add_column(column, justify="left" if not column else "right")
-    for group, suffix in (("by_track", ""), ("by_lanes", " lane(s)")):
+    for group, label in GROUPS.items():
+        table.add_section()
         for key, part in result[group].items():
             table.add_row(
-                f"{key}{suffix}",
+                f"{label} {key}",
                 str(part["frames"]),
-                *(_number(part["mae_m"][m], 3) for m in ("ml", "mr")),
-                _number(part["angle_mae_rad"], 4),
+                *(_number(part["errors"][f]["mean"], 4 if f == "angle" else 3) for f in FEATURES),
                 f"{100 * part['heading_accuracy']:.1f} %",
             )
+    return table
+
+
+def doubt_table(result: dict[str, Any]) -> Table:
+    """How many errors were as small as the model said, and how many frames it called strange."""
+    doubt = result["doubt"]
+    strange = f"{doubt['out_of_distribution']:.1%} of the frames called out of distribution"
+    table = Table(title=f"standard deviations; {strange}")
+    for column in ("", "within 1 (68.3 %)", "within 2 (95.4 %)"):
+        table.add_column(column, justify="left" if not column else "right")
+    for name, shares in doubt["coverage"].items():
+        table.add_row(name, *("-" if s is None else f"{100 * s:.1f} %" for s in shares))
     return table
 
 
@@ -63,12 +85,6 @@ def answer_table(answers: list[dict[str, Any]]) -> Table:
             f"{best} {100 * answer['heading'][best]:.0f} %",
         )
     return table
-
-
-def _cells(values: tuple[float | None, ...], unit: str, digits: int) -> tuple[str, str, str]:
-    error, base, ratio = values
-    with_unit = [f"{_number(v, digits)} {unit}" if v is not None else "-" for v in (error, base)]
-    return with_unit[0], with_unit[1], _number(ratio, 2)
 
 
 def _number(value: float | None, digits: int) -> str:

@@ -24,9 +24,7 @@ def warm_up(engine: Engine) -> None:
     card = engine.card
     image = golden_image(card.camera.width, card.camera.height)
     for _ in range(WARM_UP_RUNS):
-        outputs = engine(image)[
-            :OUTPUTS
-        ]  # what follows them is doubt: no image of a road, no limit
+        outputs = engine(image)[:OUTPUTS]
     expected = np.asarray(card.golden, np.float32)
     if outputs.shape != expected.shape:
         raise ModelError(

@@ -14,7 +14,7 @@ import simplejpeg
 from numpy.typing import NDArray
 
 from controllers.demo.frames import Asked
-from controllers.demo.picture import draw_answer
+from mtlnet.picture import draw_answer
 from controllers.demo.run import DemoConfig, DemoResult
 from datagen.recording import CameraInfo, Dataset
 from mtlnet.curves import read_curves

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from controllers.demo.frames import Asked, spread
-from controllers.demo.picture import SCALE, draw_answer, marking_line, to_pixels
+from mtlnet.picture import SCALE, draw_answer, marking_line, to_pixels
 from controllers.demo.process import run_module
 from controllers.demo.report import verdicts
 from controllers.demo.run import DemoConfig, run_demo

@@ -94,11 +94,11 @@ def test_coded_losses_are_those_of_training() -> None:
 
 def test_presence_counts_missed_and_invented() -> None:
     counted = presence(OUTPUTS, labels())
-    assert counted["m"] == {"missed": 0.0, "invented": 0.5}
-    assert counted["ml"] == {"missed": 0.0, "invented": 0.0}
+    assert counted["m"] == {"false_inactive": 0.0, "false_active": 0.5}
+    assert counted["ml"] == {"false_inactive": 0.0, "false_active": 0.0}
     without_m = OUTPUTS.copy()
     without_m[2, 3] = 0.9  # decodes to the inactive end
-    assert presence(without_m, labels())["m"]["missed"] == 0.5
+    assert presence(without_m, labels())["m"]["false_inactive"] == 0.5
     # The error is still taken, on the value given: 3.5 m instead of 0.2 m.
     error = judge(without_m, labels(), MEAN)["mae_m"]["m"]
     assert error == pytest.approx((3.3 + 0.2) / 2, abs=1e-4)

@@ -28,6 +28,7 @@ from trackfeatures.listening import bind
 
 CARD = ModelCard(
     name="fake",
+    network="mtl",
     definitions_version=tf.VERSION,
     program_version="0",
     camera=Camera(),

@@ -1,0 +1,215 @@
+"""The evaluation as one HTML page that needs nothing beside it: `mtlnet evaluate --report FILE`."""
+
+from collections.abc import Iterable, Iterator
+from html import escape
+from importlib.resources import files
+from pathlib import Path
+from string import Template
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+import trackfeatures as tf
+from datagen.recording import Frames
+from mtlnet.answer import OUTPUTS
+from mtlnet.charts import MOST_POINTS, Line, Plot, plot, reliability
+from mtlnet.doubt import FEATURES
+from mtlnet.errors import Numbers, signed_errors
+from mtlnet.groups import GROUPS
+from mtlnet.whole import write_whole
+from mtlnet.worst import figures, worst_frames
+
+PAGE = "report.html"
+MOST_DRIVES = 8
+HEAVY_SHADOW = 0.3
+"""Share of the road in shadow from which a stretch is shaded in the figures."""
+
+
+def write_page(path: Path, report: dict[str, Any], frames: Frames, outputs: Any) -> Path:
+    """Write the page of `mtlnet.evaluate`'s report to `path`, or into the folder `path`."""
+    if path.is_dir():
+        path = path / PAGE
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_whole(path, page(report, frames, outputs).encode())
+    return path
+
+
+def page(report: dict[str, Any], frames: Frames, outputs: NDArray[np.float32]) -> str:
+    """HTML of `report` on `outputs` (N, 9 or 17) for `frames`."""
+    errors = signed_errors(outputs, frames.labels.distances, frames.labels.angle)
+    template = Template(files("mtlnet").joinpath("report.html").read_text(encoding="utf-8"))
+    worst = worst_frames(errors, frames.labels.round)
+    return template.substitute(
+        model=escape(report["model"]),
+        about=escape(
+            f"{report['frames']:,} {report['split']} frames in {report['rounds']} rounds of "
+            f"{report['data']}; engine {report['engine']}, {report['precision']}"
+        ),
+        hash=report["model_hash"][:16],
+        summary=_summary(report),
+        classes=_classes(report),
+        presence=_presence(report),
+        coded=_coded(report["coded"]),
+        drives="".join(_drives(frames, outputs)),
+        doubt=_doubt(report),
+        worst="".join(figures(frames, outputs, worst)),
+        groups="".join(_groups(report)),
+    )
+
+
+def _summary(report: dict[str, Any]) -> str:
+    rows = []
+    for name in FEATURES:
+        unit, digits = ("rad", 4) if name == "angle" else ("m", 3)
+        found, guess = report["errors"][name], _mean_error(report["baseline"], name)
+        ratio = None if found["mean"] is None or not guess else found["mean"] / guess
+        cells = [_number(found[k], digits) for k in ("mean", "median", "p95", "p99")]
+        cells += [_number(guess, digits), _number(ratio, 2), f"{found['frames']:,}"]
+        rows.append([f"{name} ({unit})", *cells])
+    head = ("", "mean", "median", "95 %", "99 %", "mean's answer", "ratio", "frames")
+    return _table(head, rows)
+
+
+def _mean_error(part: dict[str, Any], name: str) -> float | None:
+    found: float | None = part["mae_m"].get(name) if name in tf.MARKINGS else None
+    if name not in tf.MARKINGS:
+        found = part["angle_mae_rad" if name == "angle" else "to_lane_centre_mae_m"]
+    return found
+
+
+def _classes(report: dict[str, Any]) -> str:
+    counts = report["confusion"]
+    rows = []
+    for name, row in counts.items():
+        total = sum(row.values())
+        shares = [f"{n:,} ({n / total:.1%})" if total else "-" for n in row.values()]
+        rows.append([f"truly {name}", *shares])
+    right, guess = report["heading_accuracy"], report["baseline"]["heading_accuracy"]
+    told = f"<p>{right:.2%} right; always the most frequent class of training: {guess:.1%}.</p>"
+    return told + _table(("", *(f"said {name}" for name in counts)), rows)
+
+
+def _presence(report: dict[str, Any]) -> str:
+    rows = [
+        [name, _share(rates["false_active"]), _share(rates["false_inactive"])]
+        for name, rates in report["presence"].items()
+    ]
+    return _table(("", "false active", "false inactive"), rows)
+
+
+def _coded(coded: dict[str, float]) -> str:
+    rows = [
+        ["distance (five summed)", f"{coded['distance']:.5f}", f"{coded['distance_absolute']:.5f}"],
+        ["angle", f"{coded['angle']:.6f}", f"{coded['angle_absolute']:.5f}"],
+        ["type (cross-entropy)", f"{coded['type']:.4f}", ""],
+    ]
+    return _table(("", "mean squared", "mean absolute"), rows)
+
+
+def _drives(frames: Frames, outputs: NDArray[np.float32]) -> Iterator[str]:
+    """The paper's perception figure: a round of each track, offset and angle against the truth."""
+    shown: set[str] = set()
+    for number, info in enumerate(frames.rounds):
+        if info.track in shown or len(shown) == MOST_DRIVES:
+            continue
+        shown.add(info.track)
+        rows = np.flatnonzero(frames.labels.round == number)
+        about = f"{info.track}, {info.lanes} lane(s), {info.light} ({info.id})"
+        yield f"<h3>{escape(about)}</h3>{_drive(frames, rows, outputs[rows])}"
+
+
+def _drive(frames: Frames, rows: NDArray[np.int64], outputs: NDArray[np.float32]) -> str:
+    labels = frames.labels.take(rows)
+    metres = _driven(labels.s.astype(np.float64))
+    said = tf.localise(tf.decode(outputs[:, :6])[0])
+    angle = tf.decode_values(outputs[:, :6])[:, 5]
+    thin = slice(None, None, -(-len(rows) // MOST_POINTS))
+    shaded = _spans(metres, labels.shadow_fraction >= HEAVY_SHADOW)
+    drawn = []
+    for title, unit, true, value, column in (
+        ("offset from the lane centre", "m", tf.localise(labels.distances), said, -3),
+        ("angle", "rad", labels.angle.astype(np.float64), angle, -2),
+    ):
+        band = None
+        if outputs.shape[1] > OUTPUTS:
+            wide = 2 * outputs[:, column].astype(np.float64)
+            band = (value - wide)[thin], (value + wide)[thin]
+        lines = [Line("truth", true[thin]), Line("said", value[thin])]
+        drawn.append(plot(Plot(title, unit, metres[thin], lines, "m driven", band, shaded)))
+    return "".join(drawn)
+
+
+def _driven(s: Numbers) -> Numbers:
+    """Metres since the first frame; crossing the start line is no jump back."""
+    steps = np.diff(s)
+    steps[steps < 0] = 0.0
+    return np.concatenate([[0.0], np.cumsum(steps)])
+
+
+def _spans(x: Numbers, chosen: NDArray[np.bool_]) -> list[tuple[float, float]]:
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], chosen, [False]]).astype(int)))
+    last = len(x) - 1
+    return [
+        (float(x[a]), float(x[min(b, last)])) for a, b in zip(edges[::2], edges[1::2], strict=True)
+    ]
+
+
+def _doubt(report: dict[str, Any]) -> str:
+    doubt = report.get("doubt")
+    if doubt is None:
+        return "<p>This model gives no standard deviations.</p>"
+    rows = [[name, *map(_share, shares)] for name, shares in doubt["coverage"].items()]
+    table = _table(("", "within 1 &sigma; (68.3 %)", "within 2 &sigma; (95.4 %)"), rows)
+    charts = "".join(
+        reliability(
+            name,
+            "rad" if name == "angle" else "m",
+            np.array([part["said"] for part in bins]),
+            np.array([part["found"] for part in bins]),
+        )
+        for name, bins in doubt["calibration"].items()
+        if bins
+    )
+    strange = (
+        f"<p>{doubt['out_of_distribution']:.1%} of these frames are called out of distribution."
+    )
+    return f'{table}<div class="grid small">{charts}</div>{strange}</p>'
+
+
+def _groups(report: dict[str, Any]) -> Iterator[str]:
+    features = [f"{name} ({'rad' if name == 'angle' else 'm'})" for name in FEATURES]
+    head = ["frames", *features, "class"]
+    for way, label in GROUPS.items():
+        rows = []
+        for key, part in report[way].items():
+            cells = [
+                _number(part["errors"][name]["mean"], 4 if name == "angle" else 3)
+                for name in FEATURES
+            ]
+            right = f"{part['heading_accuracy']:.1%}"
+            rows.append([escape(key), f"{part['frames']:,}", *cells, right])
+        columns = [label, *head]
+        if "doubt" in report:
+            columns.append("strange")
+            for row, part in zip(rows, report[way].values(), strict=True):
+                row.append(_share(part["doubt"]["out_of_distribution"]))
+        yield _table(columns, rows)
+
+
+def _table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
+    """A table; cells are HTML already. The first column names the row."""
+    top = "".join(f"<th>{cell}" for cell in head)
+    body = "".join(
+        "<tr>" + "".join(f"<{'td' if i else 'th'}>{cell}" for i, cell in enumerate(row))
+        for row in rows
+    )
+    return f"<div class=scroll><table><thead><tr>{top}<tbody>{body}</table></div>"
+
+
+def _number(value: float | None, digits: int) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"
+
+
+def _share(value: float | None) -> str:
+    return "-" if value is None else f"{value:.1%}"
