@@ -14,10 +14,10 @@ import simplejpeg
 from numpy.typing import NDArray
 
 from controllers.demo.frames import Asked
-from mtlnet.picture import draw_answer
 from controllers.demo.run import DemoConfig, DemoResult
 from datagen.recording import CameraInfo, Dataset
 from mtlnet.curves import read_curves
+from mtlnet.picture import draw_answer
 from simulator.car import CarParameters
 from trackfeatures import MARKINGS
 

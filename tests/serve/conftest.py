@@ -28,7 +28,6 @@ from trackfeatures.listening import bind
 
 CARD = ModelCard(
     name="fake",
-    network="mtl",
     definitions_version=tf.VERSION,
     program_version="0",
     camera=Camera(),
