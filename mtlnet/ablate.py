@@ -96,7 +96,8 @@ def _trainer(console: Console) -> Any:
 
 def _judge(run: Path, data: Path, split: str) -> dict[str, Any]:
     """The evaluation of a finished run, in float32."""
-    return evaluate(load_engine(run, "openvino", "f32", os.cpu_count() or 1), data, split)
+    engines = [load_engine(run, "openvino", "f32") for _ in range(os.cpu_count() or 1)]
+    return evaluate(engines, data, split)
 
 
 def _tell_plan(
