@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import trackfeatures as tf
-from mtlnet.augment import colours, cover, mirror, turn, turned_labels
+from mtlnet.augment import change_images, changed_labels, draw_changes
 from mtlnet.card import Camera
 
 AHEAD = 3  # batches in the making
@@ -51,29 +51,36 @@ class Images(Protocol):
 
 @dataclass(frozen=True)
 class Batch:
-    """`images` (B, H, W, 3) uint8, `coded` (B, 6), `heading` (B,), `gain` and `shift` (B, 1, 1, 3).
-
-    The network is to see `normalised image * gain + shift`.
-    """
+    """`images` (B, H, W, 3) uint8, `coded` (B, 6), `heading` (B,)."""
 
     images: NDArray[np.uint8]
     coded: NDArray[np.float32]
     heading: NDArray[np.int64]
-    gain: NDArray[np.float32]
-    shift: NDArray[np.float32]
 
 
 class Loader:
-    """Endless batches from `frames`, each epoch in its own order."""
+    """Endless batches from `frames`, each epoch in its own order.
+
+    `part` (which, of how many): makes that part of each batch of `batch` images, as whole.
+    """
 
     def __init__(
-        self, frames: Images, camera: Camera, batch: int, seed: int, *, augment: bool
+        self,
+        frames: Images,
+        camera: Camera,
+        batch: int,
+        seed: int,
+        *,
+        augment: bool,
+        part: tuple[int, int] = (0, 1),
     ) -> None:
         self.frames = frames
         self.batch = batch
         self.seed = seed
         self.augment = augment
         self.camera = camera
+        which, parts = part
+        self.rows = slice(which * batch // parts, (which + 1) * batch // parts)
         labels = frames.labels
         self.coded = tf.encode(labels.distances, labels.angle)
         self.heading = np.asarray(labels.heading, dtype=np.int64)
@@ -83,28 +90,29 @@ class Loader:
         return np.random.default_rng([self.seed, 1, epoch]).permutation(len(self.heading))
 
     def indices(self, step: int) -> NDArray[np.int64]:
-        """The frames of batch `step`; every frame once an epoch."""
+        """The frames of the whole batch `step`; every frame once an epoch."""
         places = np.arange(step * self.batch, (step + 1) * self.batch)
         epochs, rows = np.divmod(places, len(self.heading))
         parts = [self._permutation(e)[rows[epochs == e]] for e in np.unique(epochs).tolist()]
         return np.concatenate(parts)
 
     def make(self, step: int) -> Batch:
-        """Batch number `step`."""
-        chosen = self.indices(step)
-        images = np.empty((self.batch, self.camera.height, self.camera.width, 3), np.uint8)
+        """This part of batch number `step`."""
+        chosen = self.indices(step)[self.rows]
+        size = (self.camera.height, self.camera.width)
+        images = np.empty((len(chosen), *size, 3), np.uint8)
         self.frames.read_batch(chosen, images)
         heading = self.heading[chosen]
         if not self.augment:
-            ones = np.ones((self.batch, 1, 1, 3), np.float32)
-            return Batch(images, self.coded[chosen], heading, ones, np.zeros_like(ones))
+            return Batch(images, self.coded[chosen], heading)
         rng = np.random.default_rng([self.seed, 2, step])
+        changes = draw_changes(self.batch, *size, rng).take(self.rows)
+        change_images(images, changes, self.camera)
         labels = self.frames.labels
-        yaw = turn(images, self.camera, rng)
-        coded = turned_labels(labels.distances[chosen], labels.angle[chosen], yaw, self.camera)
-        coded, heading = mirror(images, coded, heading, rng.random(self.batch) < 0.5)
-        cover(images, rng)
-        return Batch(images, coded, heading, *colours(self.batch, rng))
+        coded, heading = changed_labels(
+            labels.distances[chosen], labels.angle[chosen], heading, changes, self.camera
+        )
+        return Batch(images, coded, heading)
 
     def batches(self, first: int) -> Iterator[Batch]:
         """Batches `first`, `first` + 1, ... without end, made ahead on threads."""

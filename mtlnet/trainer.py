@@ -2,17 +2,20 @@
 
 import ctypes
 import sys
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Sequence
+from functools import cache
 from pathlib import Path
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from mtlnet.loader import Batch, Loader
 from mtlnet.loss import Alpha, Losses, multi_task_loss
-from mtlnet.network import Network, initialise, normalise
+from mtlnet.network import Network, initialise
 from mtlnet.plan import MTL, Plan
 from mtlnet.recipe import MOMENTUM, Recipe, learning_rate
+from mtlnet.swift import training_outputs
 
 MIN_TARGET_STD = 0.01
 
@@ -25,6 +28,7 @@ class Trainer:
     ) -> None:
         self.recipe = recipe
         self.alpha = alpha
+        self.seed = seed
         self.device = device
         self.step_number = 0
         network = Network(
@@ -57,18 +61,45 @@ class Trainer:
         coded = torch.from_numpy(batch.coded).to(self.device, non_blocking=True)
         heading = torch.from_numpy(batch.heading).to(self.device, non_blocking=True)
         images = torch.from_numpy(batch.images).to(self.device, non_blocking=True)
-        x = normalise(images)
-        if self.recipe.augment:
-            gain = torch.from_numpy(batch.gain).to(self.device)
-            x = torch.addcmul(torch.from_numpy(batch.shift).to(self.device), x, gain)
-        with autocast(self.device):
-            outputs = self.network(x)
+        outputs = self.outputs(images)
         losses = multi_task_loss(outputs, coded, heading, self.alpha, self.scale)
         self.optimiser.zero_grad(set_to_none=True)
         losses.total.backward()  # type: ignore[no-untyped-call]  # torch leaves it untyped
         self.optimiser.step()
         self.step_number += 1
         return losses
+
+    def outputs(self, images: Tensor) -> Tensor:
+        """What the network in training answers, (B, 9), to images (B, 210, 280, 3) uint8."""
+        on_cpu = self.device.type == "cpu"
+        dtype = torch.bfloat16 if not on_cpu or cpu_has_bf16() else torch.float32
+        if on_cpu and self.network.plan is MTL:
+            seed = [self.seed, 3, self.step_number]
+            masks = dropout_masks(self.recipe.dropout, MTL.shared, len(images), seed)
+            return training_outputs(self.network, images, dtype, masks)
+        with torch.autocast(self.device.type, dtype, enabled=dtype != torch.float32):
+            answers: Tensor = self.network(images)
+        return answers
+
+
+def dropout_masks(
+    share: float,
+    layers: Sequence[int],
+    count: int,
+    seed: list[int],
+    part: tuple[int, int] = (0, 1),
+) -> list[Tensor]:
+    """What is left of `layers` of so many units, scaled up; the same for one process or many.
+
+    A mask is a function of the seed, so that a run can be resumed from its weights alone.
+    """
+    if not share:
+        return []
+    which, parts = part
+    rng = np.random.default_rng(seed)
+    rows = slice(which * count, (which + 1) * count)
+    drawn = [rng.random((parts * count, units), np.float32)[rows] for units in layers]
+    return [torch.from_numpy((d >= share) / np.float32(1 - share)) for d in drawn]
 
 
 def make_optimiser(network: Network, recipe: Recipe) -> torch.optim.Optimizer:
@@ -91,13 +122,7 @@ def make_optimiser(network: Network, recipe: Recipe) -> torch.optim.Optimizer:
     return torch.optim.AdamW(groups, recipe.learning_rate, betas=(0.9, 0.99), fused=True)
 
 
-def autocast(device: torch.device) -> AbstractContextManager[object]:
-    """bf16 on a GPU, and on a CPU that computes in it; float32 elsewhere."""
-    if device.type == "cpu" and not cpu_has_bf16():
-        return nullcontext()
-    return torch.autocast(device.type, torch.bfloat16)
-
-
+@cache
 def cpu_has_bf16() -> bool:
     """Whether the CPU multiplies bf16 natively (AVX512-BF16 or AMX); elsewhere it is slower."""
     info = Path("/proc/cpuinfo")

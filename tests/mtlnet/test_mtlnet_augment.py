@@ -1,22 +1,60 @@
-"""Changed images carry the labels of the changed scene."""
+"""Changed images carry the labels of the changed scene; the changes are torchvision's."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 from numpy.typing import NDArray
+from torchvision.transforms.v2 import functional as vision
 
 import trackfeatures as tf
 from mtlnet.augment import (
+    JPEG_SHARE,
+    LUMA,
     PATCH_SIDE,
     PATCHES,
     TURN_LIMIT_RAD,
-    colours,
-    cover,
+    TURN_RAD,
+    TURN_SHARE,
+    TURNS,
+    Changes,
+    add_noise,
+    blur,
+    change_images,
+    changed_labels,
+    compress,
+    draw_changes,
     homography,
-    mirror,
     turn,
     turned_labels,
+    turns,
 )
 from mtlnet.card import Camera
+
+SMALL = Camera(width=70, height=52)
+
+
+def none(count: int) -> Changes:
+    """No change at all."""
+    drawn = draw_changes(count, SMALL.height, SMALL.width, np.random.default_rng(0))
+    zeros = {name: np.zeros_like(value) for name, value in vars(drawn).items()}
+    same = np.tile(np.eye(3, 4, dtype=np.float32), (count, 1, 1))
+    return Changes(**{**zeros, "colour": same})
+
+
+def picture(seed: int = 0) -> NDArray[np.uint8]:
+    """Smooth, as pictures are, and with an edge."""
+    rng = np.random.default_rng(seed)
+    rows, columns = np.mgrid[:210, :280]
+    waves = [np.sin(rows / a + b) * np.cos(columns / c) for a, b, c in rng.uniform(8, 30, (3, 3))]
+    image = 110 + 70 * np.stack(waves, 2)
+    image[150:160] += 60
+    return image.clip(0, 255).astype(np.uint8)
+
+
+def as_tensor(image: NDArray[np.uint8]) -> torch.Tensor:
+    return torch.from_numpy(image.copy()).permute(2, 0, 1)
 
 
 def pixel_of(
@@ -58,44 +96,118 @@ def test_a_turned_image_is_that_of_the_turned_car(turned: float) -> None:
     np.testing.assert_allclose(distances[0], lane + swung[1], atol=5e-3)
 
 
-def test_turns_move_the_picture_and_stay_in_bounds() -> None:
-    camera, rng = Camera(), np.random.default_rng(0)
-    images = np.zeros((64, 210, 280, 3), np.uint8)
-    images[:, :, 138:142] = 255  # a pole straight ahead
-    yaw = turn(images, camera, rng)
+def test_turns_are_normal_and_move_the_picture() -> None:
+    camera, deck = Camera(), turns()
+    assert deck[0].tolist() == [0.0, 0.0]
+    yaw = deck[1:, 0]
     assert np.abs(yaw).max() <= TURN_LIMIT_RAD
-    assert 0.3 < (yaw == 0).mean() < 0.7
+    assert yaw.mean() == pytest.approx(0.0, abs=1e-9)
+    assert yaw.std() == pytest.approx(TURN_RAD, rel=0.1)
     focal = 105 / np.tan(np.radians(33.75))
-    columns = (images[:, 105, :, 0] * np.arange(280.0)).sum(1) / images[:, 105, :, 0].sum(1)
-    np.testing.assert_allclose(columns, 139.5 + focal * np.tan(yaw), atol=0.3)
+    for which in (1, 20, 50, TURNS - 1):
+        image = np.zeros((210, 280, 3), np.uint8)
+        image[:, 138:142] = 255  # a pole straight ahead
+        turn(image, camera, which)
+        column = (image[105, :, 0] * np.arange(280.0)).sum() / image[105, :, 0].sum()
+        assert column == pytest.approx(139.5 + focal * np.tan(deck[which, 0]), abs=0.3)
 
 
 def test_mirrored_images_have_mirrored_labels() -> None:
-    images = np.arange(2 * 2 * 3 * 3, dtype=np.uint8).reshape(2, 2, 3, 3)
+    images = np.stack([picture()[:52, :70], picture(1)[:52, :70]])
     before = images.copy()
-    near_left = tf.encode([[-0.9, 3.1, np.nan, -0.9, 3.1]], [0.1])
-    coded = np.repeat(near_left, 2, 0)
-    mirrored, heading = mirror(images, coded, np.array([0, 0]), np.array([False, True]))
+    changes = replace(none(2), mirrored=np.array([False, True]))
+    change_images(images, changes, SMALL)
     np.testing.assert_array_equal(images[0], before[0])
     np.testing.assert_array_equal(images[1], before[1, :, ::-1])
-    np.testing.assert_array_equal(mirrored[0], coded[0])
-    distances, angle = tf.decode(mirrored[1:])
-    np.testing.assert_allclose(distances[0], [-3.1, 0.9, -3.1, 0.9, np.nan], atol=1e-6)
-    assert abs(angle[0] + 0.1) < 1e-6
+    distances = np.tile(np.array([-0.9, 3.1, np.nan, -0.9, 3.1], np.float32), (2, 1))
+    angle = np.array([0.1, 0.1], np.float32)
+    coded, heading = changed_labels(distances, angle, np.array([0, 0]), changes, SMALL)
+    np.testing.assert_array_equal(coded[0], tf.encode(distances[:1], angle[:1])[0])
+    mirrored, turned = tf.decode(coded[1:])
+    np.testing.assert_allclose(mirrored[0], [-3.1, 0.9, -3.1, 0.9, np.nan], atol=1e-6)
+    assert abs(turned[0] + 0.1) < 1e-6
     assert heading.tolist() == [0, 2]
 
 
+def test_labels_follow_a_turn_and_then_the_mirror() -> None:
+    changes = replace(none(1), turn=np.array([9]), mirrored=np.array([True]))
+    yaw = turns()[9, 0]
+    lane = np.array([[-2.0, 2.0, np.nan, np.nan, np.nan]], np.float32)
+    coded, _ = changed_labels(lane, np.zeros(1, np.float32), np.array([1]), changes, Camera())
+    distances, angle = tf.decode(coded)
+    assert angle[0] == pytest.approx(yaw, abs=1e-6)  # turned: -yaw; mirrored: yaw
+    aside = Camera().x * np.sin(yaw)
+    np.testing.assert_allclose(distances[0, :2], [-2 + aside, 2 + aside], atol=1e-6)
+
+
 def test_covered_patches_are_few_and_small() -> None:
+    drawn = draw_changes(64, 100, 140, np.random.default_rng(0))
     images = np.zeros((64, 100, 140, 3), np.uint8)
-    cover(images, np.random.default_rng(0))
+    change_images(images, replace(none(64), patches=drawn.patches), SMALL)
     share = (images.max(3) > 0).mean((1, 2))
     assert share.max() <= PATCHES * (PATCH_SIDE + 0.02) ** 2
     assert 0.1 < (share == 0).mean() < 0.5
     assert share.mean() > 0.01
 
 
-def test_colours_are_one_an_image_and_channel() -> None:
-    gain, shift = colours(1000, np.random.default_rng(0))
-    assert gain.shape == shift.shape == (1000, 1, 1, 3)
-    assert abs(np.log(gain).mean()) < 0.02
-    assert abs(shift.mean()) < 0.02
+def colour(contrast: float = 1.0, brightness: float = 0.0, saturation: float = 1.0) -> Changes:
+    """The change of one image that `draw_colours` makes of these."""
+    mixed = saturation * np.eye(3) + (1 - saturation) * np.array(LUMA)
+    shift = np.full((3, 1), 127.5 * (brightness + 1 - contrast))
+    table = np.concatenate([contrast * mixed, shift], 1)[None].astype(np.float32)
+    return replace(none(1), colour=table)
+
+
+def test_colours_are_torchvisions() -> None:
+    before = picture()
+    saturated, scaled = before[None].copy(), before[None].copy()
+    change_images(saturated, colour(saturation=0.5), Camera())
+    # torchvision rounds its luma (0.2989, 0.587, 0.114) to a whole level first.
+    expected = vision.adjust_saturation(as_tensor(before), 0.5)
+    assert int((as_tensor(saturated[0]).int() - expected.int()).abs().max()) <= 1
+    change_images(scaled, colour(contrast=1.3, brightness=0.3), Camera())
+    brighter = vision.adjust_brightness(as_tensor(before), 1.3)
+    assert int((as_tensor(scaled[0]).int() - brighter.int()).abs().max()) <= 1
+
+
+def test_drawn_colours_leave_the_middle_grey_on_average() -> None:
+    table = draw_changes(2000, 52, 70, np.random.default_rng(0)).colour
+    grey = table @ np.array([127.5, 127.5, 127.5, 1.0], np.float32)
+    assert grey.mean() == pytest.approx(127.5, abs=2.0)
+    assert grey.std() == pytest.approx(127.5 * np.sqrt((0.25**2 + 0.08**2) / 3), rel=0.1)
+
+
+def test_blur_noise_and_compression_are_torchvisions() -> None:
+    before = picture()
+    blurred, noisy, packed = before.copy(), before.copy(), before.copy()
+    blur(blurred, 1.2)
+    expected = vision.gaussian_blur(as_tensor(before), [5, 5], [1.2, 1.2])
+    inside = (as_tensor(blurred).int() - expected.int())[:, 3:-3, 3:-3]
+    assert int(inside.abs().max()) <= 1
+    add_noise(noisy, 6.0, 1234)
+    added = noisy.astype(np.float64) - before
+    free = (before > 40) & (before < 215)
+    assert added[free].mean() == pytest.approx(0.0, abs=0.1)
+    assert added[free].std() == pytest.approx(6.0, rel=0.03)
+    compress(packed, 40)
+    theirs = vision.jpeg(as_tensor(before), 40)
+    difference = (as_tensor(packed).float() - theirs.float()).abs()
+    lost = (theirs.float() - as_tensor(before).float()).abs()
+    assert float(difference.mean()) < 0.2 * float(lost.mean())
+    assert float(lost.mean()) > 0.5
+
+
+def test_shares_of_what_is_drawn() -> None:
+    drawn = draw_changes(4000, 210, 280, np.random.default_rng(1))
+    assert (drawn.turn > 0).mean() == pytest.approx(TURN_SHARE, abs=0.03)
+    assert (drawn.quality > 0).mean() == pytest.approx(JPEG_SHARE, abs=0.015)
+    assert set(np.unique(drawn.turn)) == set(range(TURNS))
+
+
+def test_a_part_is_changed_as_the_whole() -> None:
+    images = np.stack([picture(seed)[:52, :70] for seed in range(6)])
+    part = images[2:4].copy()
+    changes = draw_changes(6, 52, 70, np.random.default_rng(3))
+    change_images(images, changes, SMALL)
+    change_images(part, changes.take(slice(2, 4)), SMALL)
+    np.testing.assert_array_equal(part, images[2:4])

@@ -22,7 +22,7 @@ from trackfeatures.errors import UserError
 
 
 def config(dataset: Path, out: Path, **changes: Any) -> TrainConfig:
-    values = {"iterations": 2, "batch": 2, "device": "cpu", "threads": 2, **changes}
+    values = {"iterations": 2, "batch": 2, "device": "cpu", "threads": 1, **changes}
     return TrainConfig(dataset, out, **values)
 
 

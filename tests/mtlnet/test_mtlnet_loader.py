@@ -33,8 +33,9 @@ class FakeFrames:
         return out
 
 
-def loader(seed: int = 0, *, augment: bool = False) -> Loader:
-    return Loader(FakeFrames(20), Camera(width=3, height=2), 8, seed, augment=augment)
+def loader(seed: int = 0, *, augment: bool = False, part: tuple[int, int] = (0, 1)) -> Loader:
+    camera = Camera(width=24, height=16)
+    return Loader(FakeFrames(20), camera, 8, seed, augment=augment, part=part)
 
 
 def test_every_frame_once_an_epoch_across_batches() -> None:
@@ -57,6 +58,14 @@ def test_batches_carry_the_labels_of_their_frames() -> None:
 def test_same_seed_and_step_same_batch() -> None:
     one, two = loader(augment=True).make(4), loader(augment=True).make(4)
     other = loader(seed=1, augment=True).make(4)
-    np.testing.assert_array_equal(one.gain, two.gain)
+    np.testing.assert_array_equal(one.images, two.images)
     np.testing.assert_array_equal(one.coded, two.coded)
-    assert one.gain.tolist() != other.gain.tolist()
+    assert one.images.tolist() != other.images.tolist()
+
+
+def test_parts_of_a_batch_are_the_batch() -> None:
+    whole = loader(augment=True).make(5)
+    parts = [loader(augment=True, part=(which, 4)).make(5) for which in range(4)]
+    for name in ("images", "coded", "heading"):
+        together = np.concatenate([getattr(part, name) for part in parts])
+        np.testing.assert_array_equal(together, getattr(whole, name))

@@ -26,7 +26,7 @@ CPU = torch.device("cpu")
 
 
 def config(dataset: Path, out: Path, **changes: Any) -> TrainConfig:
-    values = {"iterations": 4, "batch": 4, "seed": 7, "device": "cpu", "threads": 2, **changes}
+    values = {"iterations": 4, "batch": 4, "seed": 7, "device": "cpu", "threads": 1, **changes}
     return TrainConfig(dataset, out, **values)
 
 
