@@ -17,6 +17,7 @@ COLOURS = ("#3b6fd4", "#e07a2e", "#2a9d5c", "#c23b6b")
 SINGLE = "#6a3fb5"  # the paper's purple line
 END = 0.05  # the share of a run over which its final loss is averaged
 Column = tuple[str, str, str, int, int]
+PAPER_DIGITS = {"distance_absolute": 5, "angle_absolute": 5, "accuracy": 2}
 NONE = '<td class="none">&ndash;'
 
 
@@ -57,7 +58,8 @@ def _table(entries: Sequence[dict[str, Any]], columns: Sequence[Column]) -> str:
             if name in PAPER_COLUMNS:
                 value = entry["row"]["paper"][PAPER_COLUMNS.index(name)]
                 cells.append(
-                    '<td class="paper">' + ("" if value is None else f"{value * scale:.{digits}f}")
+                    '<td class="paper">'
+                    + ("" if value is None else f"{value * scale:.{PAPER_DIGITS[name]}f}")
                 )
         part = ' class="part"' if entry["row"]["name"] in ("mtl-1", "deepdriving") else ""
         body.append(f"<tr{part}>{_title(entry)}{''.join(cells)}")

@@ -64,7 +64,12 @@ class Bench:
         return {
             "model_hash": read_card(run).model_hash,
             "frames": 24,
-            "coded": {"distance": 0.01 * seed, "angle": 0.02, "type": 0.1},
+            "coded": {
+                "distance": 0.01 * seed,
+                "angle": 0.02,
+                "distance_absolute": 0.1 * seed,
+                "angle_absolute": 0.05,
+            },
             "mae_m": {**marking, "r": None},
             "to_lane_centre_mae_m": 0.3,
             "angle_mae_rad": 0.004,
@@ -186,9 +191,16 @@ def test_the_page_shows_the_table_beside_the_papers(tmp_path: Path, card: ModelC
     assert json.loads((config.out / "ablation.json").read_text()) == json.loads(json.dumps(result))
     text = (config.out / "ablation.html").read_text()
     found = Page(text)
-    assert found.rows[1][:4] == ["Distance alone", "1, 0, 0", "0.02000± 0.01414", "0.06771"]
-    assert found.rows[6][2:8:2] == ["0.02000± 0.01414", "0.02000± 0.00000", "80.00± 0.00"]
-    assert found.rows[6][3:8:2] == ["0.02253", "0.01150", "98.78"]
+    assert found.rows[1][:5] == [
+        "Distance alone",
+        "1, 0, 0",
+        "0.02000± 0.01414",
+        "0.2000± 0.1414",
+        "0.06771",
+    ]
+    ours = ["0.02000± 0.01414", "0.2000± 0.1414", "0.02000± 0.00000", "0.05000± 0.00000"]
+    assert [found.rows[6][i] for i in (2, 3, 5, 6, 8)] == [*ours, "80.00± 0.00"]
+    assert [found.rows[6][i] for i in (4, 7, 9)] == ["0.02253", "0.01150", "98.78"]
     # Four alphas and the line of the single task in each of three charts.
     assert found.curves == 15
     assert not re.search(r'(src|href)="', text)
