@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 import trackfeatures as tf
 from mtlnet.augment import change_images, changed_labels, draw_changes
 from mtlnet.card import Camera
+from mtlnet.recycled import Recycled
 
 AHEAD = 3  # batches in the making
 MAKERS = 2  # at a time: while one batch waits for its last image, the next is begun
@@ -81,6 +82,8 @@ class Loader:
         self.camera = camera
         which, parts = part
         self.rows = slice(which * batch // parts, (which + 1) * batch // parts)
+        shape = (self.rows.stop - self.rows.start, camera.height, camera.width, 3)
+        self._memory = Recycled(shape)
         labels = frames.labels
         self.coded = tf.encode(labels.distances, labels.angle)
         self.heading = np.asarray(labels.heading, dtype=np.int64)
@@ -99,13 +102,13 @@ class Loader:
     def make(self, step: int) -> Batch:
         """This part of batch number `step`."""
         chosen = self.indices(step)[self.rows]
-        size = (self.camera.height, self.camera.width)
-        images = np.empty((len(chosen), *size, 3), np.uint8)
+        images = self._memory.take()
         self.frames.read_batch(chosen, images)
         heading = self.heading[chosen]
         if not self.augment:
             return Batch(images, self.coded[chosen], heading)
         rng = np.random.default_rng([self.seed, 2, step])
+        size = (self.camera.height, self.camera.width)
         changes = draw_changes(self.batch, *size, rng).take(self.rows)
         change_images(images, changes, self.camera)
         labels = self.frames.labels

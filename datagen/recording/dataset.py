@@ -7,12 +7,13 @@ batch = frames.read_batch([3, 1, 2])
 import hashlib
 import os
 from bisect import bisect_right
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import accumulate
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +21,7 @@ from numpy.typing import NDArray
 import trackfeatures as tf
 
 from .camera import CameraInfo
-from .encoding import decode_into
+from .encoding import Buffer, decode_into
 from .errors import DatasetError
 from .header import RoundInfo
 from .index import RoundIndex, open_round
@@ -38,7 +39,12 @@ from .splits import (
 from .topics import CAMERA
 from .wire import bytes_field
 
+if TYPE_CHECKING:
+    from .bulk import BulkDecoder
+
+DecodeInto = Callable[[Buffer, NDArray[np.uint8]], None]
 IMAGE_DATA = 2  # number of the field `data` of foxglove.CompressedImage
+BULK = 8  # images: for fewer, compiled code is not worth loading
 
 
 class Frames:
@@ -80,7 +86,8 @@ class Frames:
         """Decode the images of `indices` into `out` (B, H, W, 3) uint8 RGB, on all cores.
 
         Returns `out`, a new array where none is given. IndexError for a frame that is not there,
-        DatasetError for an image that cannot be decoded.
+        DatasetError for an image that cannot be decoded. The first batch of a process takes 0.7 s
+        longer, the first on a machine some seconds: the decoder is compiled, and kept.
         """
         numbers = np.asarray(indices, dtype=np.int64)
         shape = (len(numbers), self.camera.height, self.camera.width, 3)
@@ -89,15 +96,18 @@ class Frames:
             raise ValueError(f"`out` is {out.dtype} {out.shape}, expected uint8 {shape}")
         # One iterator for all threads: each takes the next image when it is done with its last.
         rows = iter(enumerate(numbers.tolist()))
-        work = [self._pool.submit(self._decode, rows, out) for _ in range(self._threads)]
+        into = decode_into if len(numbers) < BULK else self._bulk.decode_into
+        work = [self._pool.submit(self._decode, rows, out, into) for _ in range(self._threads)]
         for part_done in work:
             part_done.result()
         return out
 
-    def _decode(self, rows: Iterator[tuple[int, int]], out: NDArray[np.uint8]) -> None:
+    def _decode(
+        self, rows: Iterator[tuple[int, int]], out: NDArray[np.uint8], into: DecodeInto
+    ) -> None:
         for row, i in rows:
             try:
-                decode_into(self.jpeg(i), out[row])
+                into(self.jpeg(i), out[row])
             except ValueError as error:
                 raise self._unreadable(i, error) from error
 
@@ -117,6 +127,12 @@ class Frames:
     @cached_property
     def _threads(self) -> int:
         return len(os.sched_getaffinity(0))
+
+    @cached_property
+    def _bulk(self) -> "BulkDecoder":
+        from .bulk import BulkDecoder  # numba takes long to load
+
+        return BulkDecoder()
 
     @cached_property
     def _pool(self) -> ThreadPoolExecutor:
