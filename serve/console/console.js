@@ -21,8 +21,11 @@ async function ask() {
   const { body, image, truth } = current;
   const started = performance.now();
   try {
-    const reply = await fetch("features", { method: "POST", headers: { "Content-Type": body.type }, body });
+    const headers = { "Content-Type": body.type };
+    if ($("token").value) headers.Authorization = `Bearer ${$("token").value}`;
+    const reply = await fetch("features", { method: "POST", headers, body });
     const said = await reply.json();
+    if (reply.status === 401) $("locked").hidden = false;
     if (!reply.ok) return refuse(`${said.title ?? reply.statusText}: ${said.detail ?? ""}`, image);
     latencies.push({ trip: performance.now() - started, total: said.timing_ms.total, ...said.timing_ms });
     latencies.splice(0, latencies.length - KEPT);
@@ -128,6 +131,7 @@ for (const kind of ["dragover", "dragleave", "drop"]) {
     if (kind === "drop") takeFile(event.dataTransfer.files[0]);
   });
 }
+$("token").addEventListener("change", ask);
 setInterval(() => $("repeat").checked && ask(), EVERY_MS);
 
 const samples = await (await fetch("console/samples.json")).json();

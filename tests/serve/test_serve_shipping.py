@@ -1,0 +1,105 @@
+"""What ships the service says the same as the service: ports, paths, users, options."""
+
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from typer.testing import CliRunner
+
+from serve.cli import app
+from tests.serve.conftest import Served
+
+ROOT = Path(__file__).parents[2]
+DEPLOY = ROOT / "deploy"
+DOCKERFILE = (ROOT / "Dockerfile").read_text()
+
+
+def manifest(name: str) -> dict[str, Any]:
+    content = yaml.safe_load((DEPLOY / "kubernetes" / name).read_text())
+    assert isinstance(content, dict)
+    return content
+
+
+@pytest.fixture(scope="module")
+def pod() -> dict[str, Any]:
+    spec = manifest("deployment.yaml")["spec"]["template"]["spec"]
+    assert isinstance(spec, dict)
+    return spec
+
+
+@pytest.fixture(scope="module")
+def container(pod: dict[str, Any]) -> dict[str, Any]:
+    (container,) = pod["containers"]
+    assert isinstance(container, dict)
+    return container
+
+
+def test_probes_ask_paths_that_the_service_answers(
+    service: Served, container: dict[str, Any]
+) -> None:
+    for probe in ("startupProbe", "readinessProbe", "livenessProbe"):
+        assert service.ask("GET", container[probe]["httpGet"]["path"]).status == 200
+        assert container[probe]["httpGet"]["port"] == container["ports"][0]["name"]
+
+
+def test_the_pod_is_as_careful_as_the_image(pod: dict[str, Any], container: dict[str, Any]) -> None:
+    users = re.findall(r"--uid (\d+)", DOCKERFILE)
+    assert pod["securityContext"]["runAsUser"] == int(users[0])
+    assert pod["securityContext"]["runAsNonRoot"]
+    security = container["securityContext"]
+    assert security["readOnlyRootFilesystem"]
+    assert not security["allowPrivilegeEscalation"]
+    assert security["capabilities"]["drop"] == ["ALL"]
+    assert container["resources"]["limits"]["cpu"] == "1"
+    assert "token" not in str(container.get("args"))
+
+
+def test_ports_agree() -> None:
+    exposed = re.findall(r"^EXPOSE (\d+)$", DOCKERFILE, flags=re.MULTILINE)
+    assert exposed == ["8000"]
+    (container,) = manifest("deployment.yaml")["spec"]["template"]["spec"]["containers"]
+    assert container["ports"][0]["containerPort"] == 8000
+    assert manifest("service.yaml")["spec"]["ports"][0]["targetPort"] == "http"
+    compose = yaml.safe_load((DEPLOY / "compose.yaml").read_text())
+    assert compose["services"]["serve"]["ports"] == ["127.0.0.1:8000:8000"]
+    scraped = yaml.safe_load((DEPLOY / "prometheus.yml").read_text())["scrape_configs"][0]
+    assert scraped["static_configs"][0]["targets"] == ["serve:8000"]
+
+
+def test_every_option_that_is_passed_exists(container: dict[str, Any]) -> None:
+    shown = CliRunner().invoke(app, ["--help"], env={"COLUMNS": "200"}).output
+    compose = yaml.safe_load((DEPLOY / "compose.yaml").read_text())["services"]
+    image = re.findall(r'^CMD (\["serve".*\])$', DOCKERFILE, flags=re.MULTILINE)
+    commands = [container["args"], compose["serve"]["command"], *map(yaml.safe_load, image)]
+    assert len(commands) == 3
+    for command in commands:
+        assert command[0] == "serve"
+        for option in (word for word in command if word.startswith("--")):
+            assert re.search(rf"{option}\b", shown), option
+
+
+def test_the_manifests_name_each_other() -> None:
+    files = manifest("kustomization.yaml")["resources"]
+    assert {path.name for path in (DEPLOY / "kubernetes").iterdir()} == {
+        *files,
+        "kustomization.yaml",
+    }
+    deployment = manifest("deployment.yaml")
+    labels = deployment["spec"]["template"]["metadata"]["labels"]
+    assert manifest("service.yaml")["spec"]["selector"].items() <= labels.items()
+    assert manifest("disruption.yaml")["spec"]["selector"]["matchLabels"] == labels
+    scaled = manifest("autoscaler.yaml")["spec"]["scaleTargetRef"]
+    assert (scaled["kind"], scaled["name"]) == ("Deployment", deployment["metadata"]["name"])
+    named = manifest("kustomization.yaml")["images"][0]["name"]
+    assert deployment["spec"]["template"]["spec"]["containers"][0]["image"] == named
+
+
+def test_the_stage_that_serves_has_neither_torch_nor_physics() -> None:
+    stage = DOCKERFILE.split("FROM base AS serve")[1]
+    assert "[" not in stage.split("pip install")[1].split("\n")[0].replace(
+        "$(ls /wheels/*.whl)", ""
+    )
+    assert "USER driverview" in stage
+    assert "HEALTHCHECK" in stage
