@@ -7,7 +7,7 @@ PACKAGES := trackfeatures simulator datagen mtlnet serve controllers
 # Debian keeps ldconfig in /sbin, which is not on every user's PATH.
 export PATH := $(CURDIR)/$(BIN):$(PATH):/usr/sbin:/sbin
 
-.PHONY: help setup system demo test check quick e2e bench format lock clean
+.PHONY: help setup system demo test check compiled quick e2e bench format lock clean
 
 help: ## list the targets
 	@grep -hE '^[a-z0-9]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 10
@@ -38,8 +38,20 @@ system:
 demo: $(READY) ## collect, train, evaluate, serve, ask, report: in 15 minutes on two cores
 	$(BIN)/controllers demo --out demo
 
-test: check $(READY) ## all checks and tests
-	$(BIN)/pytest
+# One process a core, four at most: each takes about 1 GB. A file's tests stay in one process, for
+# they share what is costly to make. What measures time comes after them, when the cores are free.
+PARALLEL := --numprocesses logical --maxprocesses 4 --dist loadfile
+
+test: $(READY) ## all checks and tests
+	@$(MAKE) --no-print-directory --jobs 2 check compiled
+	$(BIN)/pytest $(PARALLEL) -m "not alone"
+	$(BIN)/pytest -m alone
+
+# The simulator compiles its numeric code when it first runs; once, before many processes need it.
+compiled: $(READY)
+	@folder=$$(mktemp -d); \
+	$(BIN)/datagen collect --rounds 1 --frames 3 --tracks oval --workers 1 --out $$folder/data \
+	  >/dev/null 2>$$folder/said || { cat $$folder/said >&2; exit 1; }; rm -rf $$folder
 
 check: $(READY) ## format, lint, types, imports
 	$(BIN)/ruff format --check .
@@ -48,7 +60,7 @@ check: $(READY) ## format, lint, types, imports
 	$(BIN)/lint-imports
 
 quick: $(READY) ## the tests that take seconds
-	$(BIN)/pytest -m "not slow"
+	$(BIN)/pytest $(PARALLEL) -m "not slow and not alone"
 
 e2e: $(READY) ## one round from the simulator to a steered car
 	$(BIN)/pytest tests/e2e

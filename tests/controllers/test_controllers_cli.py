@@ -2,17 +2,16 @@
 
 import json
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
 from controllers.demo.process import free_port
+from tests.typed import typed
 
 
 def run(*arguments: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "controllers", *arguments]
-    return subprocess.run(command, capture_output=True, text=True, timeout=120)
+    return typed("controllers", *arguments)
 
 
 def test_drive_prints_json_and_writes_the_log(tmp_path: Path) -> None:

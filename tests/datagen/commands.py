@@ -10,6 +10,7 @@ from datagen.plan import Plan, Wanted
 from datagen.recording.folder import prepare
 from datagen.round import Ending, Job, attempt
 from datagen.tracks import choose_tracks
+from tests.typed import typed
 
 SHORT = ["--rounds", "2", "--frames", "30", "--tracks", "circuit", "--lanes", "1,2"]
 
@@ -19,10 +20,16 @@ def datagen(
     preexec_fn: Callable[[], object] | None = None,
     env: dict[str, str] | None = None,
 ) -> subprocess.CompletedProcess[str]:
+    """The command in a process of its own."""
     command = [sys.executable, "-m", "datagen", *map(str, args)]
     return subprocess.run(
-        command, capture_output=True, text=True, timeout=120, preexec_fn=preexec_fn, env=env
+        command, capture_output=True, text=True, timeout=600, preexec_fn=preexec_fn, env=env
     )
+
+
+def datagen_here(*args: object) -> subprocess.CompletedProcess[str]:
+    """The command in this process; only those that record start others."""
+    return typed("datagen", *args)
 
 
 def make_small_plan(rounds: int, frames: int) -> Plan:

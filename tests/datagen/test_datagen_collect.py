@@ -21,7 +21,14 @@ from datagen.recording.errors import DatasetError
 from datagen.recording.folder import read_states
 from datagen.recording.verify import verify
 from datagen.round import RoundDone
-from tests.datagen.commands import SHORT, attempted, datagen, make_jobs, make_small_plan
+from tests.datagen.commands import (
+    SHORT,
+    attempted,
+    datagen,
+    datagen_here,
+    make_jobs,
+    make_small_plan,
+)
 
 
 def test_what_is_collected_verifies_and_reads(collected: Path) -> None:
@@ -42,16 +49,16 @@ def test_what_is_collected_verifies_and_reads(collected: Path) -> None:
 def test_verify_and_info_as_commands(
     collected: Path, tmp_path: Path, refused: Callable[..., str]
 ) -> None:
-    done = datagen("verify", collected, "--level", "full", "--json")
+    done = datagen_here("verify", collected, "--level", "full", "--json")
     report = json.loads(done.stdout)
     assert done.returncode == 0
-    info = json.loads(datagen("info", collected, "--json").stdout)
+    info = json.loads(datagen_here("info", collected, "--json").stdout)
     assert (report["ok"], report["rounds"], report["frames"]) == (True, 2, 60)
     assert report["problems"] == []
     assert report["content_hash"] == info["content_hash"]
     assert (info["rounds"], info["by_lanes"]) == (2, {"1": 30, "2": 30})
-    assert "mean misses by" in datagen("info", collected).stdout
-    nothing = datagen("verify", tmp_path / "nothing", "--json")
+    assert "mean misses by" in datagen_here("info", collected).stdout
+    nothing = datagen_here("verify", tmp_path / "nothing", "--json")
     assert nothing.returncode == 1
     assert not json.loads(nothing.stdout)["ok"]
     assert "no level 'slow'" in refused("verify", collected, "--level", "slow")
@@ -60,7 +67,7 @@ def test_verify_and_info_as_commands(
 def test_the_same_plan_gives_the_same_bytes_with_another_number_of_workers(
     collected: Path, tmp_path: Path
 ) -> None:
-    done = datagen("collect", *SHORT, "--out", tmp_path / "again", "--workers", "1")
+    done = datagen_here("collect", *SHORT, "--out", tmp_path / "again", "--workers", "1")
     assert done.returncode == 0, done.stderr
     for path in sorted((collected / "rounds").iterdir()):
         assert path.read_bytes() == (tmp_path / "again" / "rounds" / path.name).read_bytes()
@@ -71,11 +78,11 @@ def test_a_finished_dataset_is_left_alone_and_a_lost_round_made_again(collected:
     kept = collected / "rounds" / "round-000.mcap"
     before, written = lost.read_bytes(), kept.stat().st_mtime_ns
     lost.unlink()
-    done = datagen("collect", *SHORT, "--out", collected, "--json")
+    done = datagen_here("collect", *SHORT, "--out", collected, "--json")
     assert json.loads(done.stdout)["recorded_frames"] == 30
     assert lost.read_bytes() == before
     assert kept.stat().st_mtime_ns == written
-    done = datagen("collect", *SHORT, "--out", collected, "--json")
+    done = datagen_here("collect", *SHORT, "--out", collected, "--json")
     assert (done.returncode, json.loads(done.stdout)["recorded_frames"]) == (0, 0)
 
 
@@ -181,18 +188,18 @@ def test_a_dry_run_prints_the_plan_and_touches_nothing(tmp_path: Path) -> None:
     folder = tmp_path / "data"
     args = ["collect", "--rounds", "6", "--frames", "500", "--tracks", "circuit,town"]
     args += ["--seed", "3", "--out", str(folder), "--dry-run"]
-    text = datagen(*args).stdout
+    text = datagen_here(*args).stdout
     assert [f"round-00{n}" in text for n in range(7)] == [True] * 6 + [False]
     assert "road ahead" in text
     assert "6 rounds of 500 frames" in text
-    plan = json.loads(datagen(*args, "--json").stdout)
+    plan = json.loads(datagen_here(*args, "--json").stdout)
     assert [entry["id"] for entry in plan["rounds"]] == [f"round-00{n}" for n in range(6)]
     assert len(plan["hash"]) == 64
     for shares in plan["expected_classes"].values():
         assert sum(shares.values()) == pytest.approx(1.0, abs=1e-3)
     assert min(plan["expected_classes"]["all"].values()) >= 0.15
     assert list(tmp_path.iterdir()) == []
-    oval = datagen("collect", "--tracks", "oval", "--dry-run").stdout
+    oval = datagen_here("collect", "--tracks", "oval", "--dry-run").stdout
     assert "note: right will be 0% of all frames" in oval
 
 
@@ -202,7 +209,7 @@ def test_rounds_of_an_unseen_track_with_jittered_cameras_are_a_dataset_of_their_
     folder = tmp_path / "data"
     args = ["--rounds", "2", "--frames", "10", "--split", "unseen", "--jitter-camera"]
     args += ["--lights", "clear,fog", "--tracks", "coast", "--workers", "1"]
-    done = datagen("collect", *args, "--out", folder)
+    done = datagen_here("collect", *args, "--out", folder)
     assert done.returncode == 0, done.stderr
     dataset = Dataset.open(folder)
     assert {(info.split, info.track) for info in dataset.rounds} == {("unseen", "coast")}
@@ -212,7 +219,7 @@ def test_rounds_of_an_unseen_track_with_jittered_cameras_are_a_dataset_of_their_
     cameras = [index.header.camera for index in dataset.indexes]
     assert cameras[0] != cameras[1] != dataset.camera == CameraInfo()
     assert verify(folder, "deep").ok
-    info = datagen("info", folder).stdout
+    info = datagen_here("info", folder).stdout
     assert "unseen: 20 frames" in info
 
 

@@ -24,7 +24,7 @@ from datagen.recording.verify import verify
 from datagen.round import FramesDone, RoundBroken, RoundDone
 from datagen.tries import ATTEMPTS, DEATHS_IN_A_ROW, Limits, Tries
 from simulator.state import Command
-from tests.datagen.commands import attempted, datagen, make_jobs, make_small_plan
+from tests.datagen.commands import attempted, datagen_here, make_jobs, make_small_plan
 from tests.datagen.conftest import Samples
 
 
@@ -39,7 +39,7 @@ def test_an_interruption_leaves_whole_rounds_only_and_is_resumed(
         wait_for(lambda: list(folder.glob("state/*.json")), process)
         wait_for(lambda: list(folder.glob(".partial/*/*.mcap")), process)
         process.send_signal(number)
-        _, stderr = process.communicate(timeout=20)
+        _, stderr = process.communicate(timeout=120)
     assert process.returncode == 130
     assert "Traceback" not in stderr
     kept = read_states(folder)
@@ -48,7 +48,7 @@ def test_an_interruption_leaves_whole_rounds_only_and_is_resumed(
     assert len(list(folder.glob("rounds/*"))) == len(kept)
     assert verify(folder, "full").ok
     if number == signal.SIGINT:
-        done = datagen(*args, "--out", folder, "--json")
+        done = datagen_here(*args, "--out", folder, "--json")
         assert json.loads(done.stdout)["recorded_frames"] == 60 * (3 - len(kept))
         assert verify(folder, "full").ok
 
@@ -120,28 +120,31 @@ def test_a_car_that_is_reset_too_often_ends_its_round(
 def wait_for(found: Callable[[], object], process: subprocess.Popen[str]) -> None:
     stderr = process.stderr
     assert stderr is not None
-    deadline = time.monotonic() + 60.0
+    deadline = time.monotonic() + 300.0
     while not found():
         assert process.poll() is None, stderr.read()
         assert time.monotonic() < deadline
         time.sleep(0.02)
 
 
-@pytest.mark.slow
-def test_a_process_that_gives_no_sign_of_life_is_replaced(collected: Path, tmp_path: Path) -> None:
+def test_a_process_that_gives_no_sign_of_life_is_replaced(tmp_path: Path) -> None:
     """A stopped one: it is alive and says nothing."""
-    assert collected  # by now all is compiled: compiling is silent too
     stopped: list[int] = []
     done: list[str] = []
 
     def hear(message: FramesDone | RoundDone) -> None:
         if isinstance(message, RoundDone):
             done.append(message.state.id)
-        elif not stopped and message.frames:
-            stopped.append(crew._workers[0].process.pid or 0)
-            os.kill(stopped[0], signal.SIGSTOP)
+        elif message.frames:
+            worker = crew._workers[0]
+            if not stopped:
+                stopped.append(worker.process.pid or 0)
+                os.kill(stopped[0], signal.SIGSTOP)
+            if worker.process.pid == stopped[0]:
+                worker.heard -= limits.silence_s - 1.0  # one second is left of its time
 
-    crew = Crew(1, hear, Limits(silence_s=20.0, delay_s=0.1))
+    limits = Limits(delay_s=0.1)
+    crew = Crew(1, hear, limits)
     assert crew.run(make_jobs(tmp_path, rounds=1, frames=60)) == []
     assert done == ["round-000"]
     with pytest.raises(ProcessLookupError):
@@ -200,9 +203,9 @@ def test_no_worker_outlives_a_collector_that_was_killed(tmp_path: Path) -> None:
         wait_for(lambda: list(tmp_path.glob("data/.partial/*/*.mcap")), process)
         children = _children(process.pid)
         process.kill()
-        process.communicate(timeout=20)
+        process.communicate(timeout=120)
     assert children
-    deadline = time.monotonic() + 10.0
+    deadline = time.monotonic() + 120.0
     while any(Path(f"/proc/{child}/cmdline").exists() for child in children):
         assert time.monotonic() < deadline
         time.sleep(0.02)
@@ -217,9 +220,9 @@ def _children(process: int) -> list[int]:
 def test_kills_of_the_whole_tree_at_random_moments_lose_nothing() -> None:
     """The benchmark in small."""
     script = Path(__file__).parents[2] / "benchmarks" / "killed.py"
-    small = ["--kills", "5", "--rounds", "4", "--frames", "10", "--seed", "2"]
+    small = ["--kills", "3", "--rounds", "3", "--frames", "10", "--seed", "2"]
     done = subprocess.run(
         [sys.executable, str(script), *small], capture_output=True, text=True, timeout=500
     )
     assert done.returncode == 0, done.stdout + done.stderr
-    assert json.loads(done.stdout)["kills"] == 5
+    assert json.loads(done.stdout)["kills"] == 3

@@ -11,7 +11,7 @@ from datagen.recording.folder import read_states
 from datagen.recording.verify import verify
 from datagen.round import FramesDone, RoundDone
 from datagen.tries import Limits
-from tests.datagen.commands import SHORT, datagen, make_jobs
+from tests.datagen.commands import SHORT, datagen, datagen_here, make_jobs
 from trackfeatures.errors import UserError
 
 pytestmark = pytest.mark.slow
@@ -24,7 +24,7 @@ def test_two_ray_workers_give_the_same_dataset(collected: Path, tmp_path: Path) 
         "collect", *SHORT, "--out", folder, "--executor", "ray", "--workers", "2", "--json"
     )
     assert done.returncode == 0, done.stderr
-    info = json.loads(datagen("info", collected, "--json").stdout)
+    info = json.loads(datagen_here("info", collected, "--json").stdout)
     assert json.loads(done.stdout)["content_hash"] == info["content_hash"]
     for path in sorted((collected / "rounds").iterdir()):
         assert path.read_bytes() == (folder / "rounds" / path.name).read_bytes()

@@ -18,7 +18,7 @@ from datagen.recording.recover import recover
 from datagen.recording.splits import Split
 from datagen.recording.summary import read_summary
 from datagen.recording.verify import verify
-from tests.datagen.commands import datagen
+from tests.datagen.commands import datagen_here
 from tests.datagen.conftest import Samples
 
 FRAMES = 60
@@ -165,18 +165,18 @@ def test_verify_tells_of_a_recovered_round_and_no_split_takes_it_unasked(
 def test_the_command_saves_a_round_of_a_dataset_aside(dataset: Path) -> None:
     path = round_path(dataset, "r001")
     path.write_bytes(path.read_bytes()[:-30_000])
-    done = datagen("recover", str(path), "--json")
+    done = datagen_here("recover", str(path), "--json")
     assert done.returncode == 0, done.stderr
     told = json.loads(done.stdout)
     assert told["out"] == str(dataset / "recovered" / "r001.mcap")
     assert told["saved"] + told["lost"] == 45  # as the state file beside it says
     assert told["at_least"] is False
     assert 0 < told["saved"] == len(saved_frames(Path(told["out"])))
-    again = datagen("recover", str(path))
+    again = datagen_here("recover", str(path))
     assert (again.returncode, again.stdout) == (1, "")
     assert again.stderr.endswith("exists; nothing was changed; choose another --out\n")
     aside = dataset.parent / "mine.mcap"
-    done = datagen("recover", str(path), "--out", str(aside))
+    done = datagen_here("recover", str(path), "--out", str(aside))
     assert done.stdout == f"{aside}: {told['saved']} frames saved, {told['lost']} lost\n"
 
 
@@ -209,7 +209,7 @@ def test_a_round_of_a_dataset_keeps_its_name(good: bytes, dataset: Path) -> None
 
 
 def test_a_missing_file_is_one_line() -> None:
-    done = datagen("recover", "/no/such/r.mcap")
+    done = datagen_here("recover", "/no/such/r.mcap")
     assert done.returncode == 1
     assert done.stderr.count("\n") == 1
     assert "/no/such/r.mcap" in done.stderr

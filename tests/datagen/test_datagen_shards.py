@@ -18,7 +18,7 @@ from datagen.recording.errors import DatasetError
 from datagen.recording.folder import read_states
 from datagen.recording.verify import verify
 from datagen.shard import Shard
-from tests.datagen.commands import datagen, make_small_plan
+from tests.datagen.commands import datagen_here, make_small_plan
 
 ROUNDS = ["--rounds", "3", "--frames", "20", "--tracks", "oval", "--workers", "1"]
 
@@ -30,7 +30,7 @@ def files(folder: Path) -> dict[str, bytes]:
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("shards") / "whole"
-    assert datagen("collect", *ROUNDS, "--out", folder).returncode == 0
+    assert datagen_here("collect", *ROUNDS, "--out", folder).returncode == 0
     return folder
 
 
@@ -58,7 +58,7 @@ def test_shards_at_the_same_time_make_what_one_collector_makes(whole: Path, tmp_
         )
         for number in (1, 2)
     ]
-    ended = [process.communicate(timeout=100) for process in running]
+    ended = [process.communicate(timeout=600) for process in running]
     assert [process.returncode for process in running] == [0, 0], ended
     results = [json.loads(stdout) for stdout, _ in ended]
     assert [result["rounds"] for result in results] == [2, 1]
@@ -78,7 +78,7 @@ def test_folders_of_shards_are_merged(
     out = tmp_path / "out"
     merged = merge([parts[0]], out)
     assert (merged.rounds, merged.planned, merged.added) == (2, 3, 2)
-    done = datagen("merge", *parts, "--out", out, "--json")
+    done = datagen_here("merge", *parts, "--out", out, "--json")
     both = json.loads(done.stdout)
     assert (both["rounds"], both["added"], both["frames"]) == (3, 1, 60)
     assert both["content_hash"] == Dataset.open(whole).content_hash
@@ -142,7 +142,7 @@ def test_a_collector_refuses_a_folder_that_another_process_holds(
 ) -> None:
     hold = (
         "import sys, time; from pathlib import Path; from datagen.lock import held\n"
-        "with held(Path(sys.argv[1]), None): print('held', flush=True); time.sleep(60)"
+        "with held(Path(sys.argv[1]), None): print('held', flush=True); time.sleep(300)"
     )
     with subprocess.Popen(
         [sys.executable, "-c", hold, str(whole)], stdout=subprocess.PIPE, text=True
@@ -151,6 +151,6 @@ def test_a_collector_refuses_a_folder_that_another_process_holds(
         assert other.stdout.readline() == "held\n"
         assert "another `datagen collect`" in refused("collect", *ROUNDS, "--out", whole)
         other.kill()
-    deadline = time.monotonic() + 10.0
-    while datagen("collect", *ROUNDS, "--out", whole).returncode:  # the lock ended with it
+    deadline = time.monotonic() + 120.0
+    while datagen_here("collect", *ROUNDS, "--out", whole).returncode:  # the lock ended with it
         assert time.monotonic() < deadline

@@ -19,7 +19,7 @@ from datagen.recording.recover import recover
 from datagen.recording.split_report import Wanted, check_split, make_split
 from datagen.recording.splits import Split, read_split, split_path, write_split
 from datagen.trust_commands import split as split_command
-from tests.datagen.commands import datagen
+from tests.datagen.commands import datagen_here
 from tests.datagen.conftest import Samples
 from trackfeatures.errors import UserError
 
@@ -158,7 +158,7 @@ def test_the_command_checks_the_split_and_finds_the_same_frames_on_both_sides(
     samples.add_round(folder, samples.header("r000"))
     samples.write(round_path(folder, "r001"), samples.header("r001"), samples.frames(40, 0)[:30])
     rebuild(folder, Split(("r000",), ("r001",)))
-    done = datagen("split", str(folder), "--json")
+    done = datagen_here("split", str(folder), "--json")
     assert done.returncode == 0, done.stderr
     report = json.loads(done.stdout)
     assert report["made"] is False
@@ -166,13 +166,13 @@ def test_the_command_checks_the_split_and_finds_the_same_frames_on_both_sides(
     found = report["near_duplicates"]["test"]
     assert (found["frames"], found["near"], found["share"]) == (30, 30, 1.0)
     assert {pair["distance"] for pair in found["worst"]} == {0.0}
-    text = datagen("split", str(folder)).stdout
+    text = datagen_here("split", str(folder)).stdout
     assert "test   1 rounds, 30 frames; 30 (100.0%) nearly as one in train" in text
     assert "r001 frame 0 and r000 frame 0: a-track, 7.0 m, 0.00 of the tolerances apart" in text
 
 
 def test_the_command_makes_a_split_once(dataset: Path) -> None:
-    made = datagen(
+    made = datagen_here(
         "split", str(dataset), "--name", "mine", "--by", "round", "--test-share", "0.4",
         "--seed", "2", "--near", "1,1,5", "--json",
     )  # fmt: skip
@@ -181,7 +181,7 @@ def test_the_command_makes_a_split_once(dataset: Path) -> None:
     assert (report["made"], report["rounds"]) == (True, {"train": 2, "test": 1})
     split = read_split(split_path(dataset, "mine"))
     assert len(Dataset.open(dataset, "mine").select("test")) == 45 * len(split.test)
-    again = datagen("split", str(dataset), "--name", "mine", "--by", "round")
+    again = datagen_here("split", str(dataset), "--name", "mine", "--by", "round")
     assert (again.returncode, again.stdout) == (1, "")
     assert "mine.json exists and stays as it is; choose another --name" in again.stderr
     assert read_split(split_path(dataset, "mine")) == split
@@ -209,9 +209,9 @@ def test_a_made_split_takes_recovered_rounds_only_when_asked(dataset: Path) -> N
     damaged.write_bytes(damaged.read_bytes()[:-20_000])
     recover(damaged, path)
     arguments = ("split", str(dataset), "--by", "round", "--test-share", "0.5", "--name")
-    assert datagen(*arguments, "without").returncode == 0
+    assert datagen_here(*arguments, "without").returncode == 0
     assert read_split(split_path(dataset, "without")).side("r001") == ""
-    assert datagen(*arguments, "with", "--with-recovered").returncode == 0
+    assert datagen_here(*arguments, "with", "--with-recovered").returncode == 0
     split = read_split(split_path(dataset, "with"))
     assert split.side("r001") in ("train", "test")
     assert split.recovered == ("r001",)
@@ -219,7 +219,7 @@ def test_a_made_split_takes_recovered_rounds_only_when_asked(dataset: Path) -> N
 
 def test_the_command_refuses_a_leak_in_one_line(dataset: Path) -> None:
     write_split(split_path(dataset, "leak"), Split(("r000", "r001"), ("r001", "r002")))
-    done = datagen("split", str(dataset), "--name", "leak")
+    done = datagen_here("split", str(dataset), "--name", "leak")
     assert (done.returncode, done.stdout) == (1, "")
     assert done.stderr.count("\n") == 1
     assert "round r001 on both sides" in done.stderr

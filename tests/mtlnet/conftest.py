@@ -1,5 +1,6 @@
 """A small dataset of drawn roads, and a published model, shared by the tests of `mtlnet`."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,8 @@ from datagen.recording.header import RoundHeader
 from datagen.recording.splits import Split, split_path, write_split
 from datagen.recording.writer import RoundWriter
 from mtlnet.doubt_fit import fit_doubt
-from mtlnet.network import HEIGHT, WIDTH, Network, initialise
+from mtlnet.network import Network, initialise
+from mtlnet.plan import FEATURES, HEIGHT, MTL, PLANS, WIDTH, Conv
 from mtlnet.publish import publish
 
 FRAMES = 24
@@ -86,3 +88,10 @@ def published(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     images = np.stack([draw_road(d, 0.0) for d in (-1.0, 0.5)])
     publish(network, run, images, doubt=doubt)
     return run
+
+
+@pytest.fixture
+def small_network(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The network has few filters and units: for tests of what happens around its training."""
+    few = tuple(replace(spec, filters=8) if isinstance(spec, Conv) else spec for spec in FEATURES)
+    monkeypatch.setitem(PLANS, MTL.name, replace(MTL, features=few, shared=(32, 16, 16)))

@@ -14,15 +14,11 @@ import simplejpeg
 
 from datagen.recording.splits import Split, split_path, write_split
 from mtlnet.curves import read_curves
+from tests.typed import typed
 
 
 def mtlnet(*arguments: object, folder: Path | None = None) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "mtlnet", *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        cwd=folder,
-    )
+    return typed("mtlnet", *arguments, folder=folder)
 
 
 def refused(*arguments: object, folder: Path | None = None) -> str:
@@ -56,6 +52,7 @@ def test_the_service_needs_no_torch(published: Path) -> None:
     assert done.stdout.strip() == "[]", done.stderr
 
 
+@pytest.mark.usefixtures("small_network")
 def test_train_evaluate_and_predict(dataset: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
     base = ["train", "--data", dataset, "--out", run, "--batch", 4, "--iterations", 2]
@@ -126,11 +123,11 @@ def test_ctrl_c_leaves_a_checkpoint_to_resume_from(dataset: Path, tmp_path: Path
     process = subprocess.Popen(
         [sys.executable, "-m", "mtlnet", *map(str, command)], stderr=subprocess.PIPE, text=True
     )
-    limit = time.monotonic() + 60
+    limit = time.monotonic() + 300
     while not read_curves(run / "curves.csv") and time.monotonic() < limit:
         time.sleep(0.2)
     process.send_signal(signal.SIGINT)
-    _, said = process.communicate(timeout=60)
+    _, said = process.communicate(timeout=300)
     assert process.returncode == 130, said
     assert "--resume" in said
     (checkpoint,) = (run / "checkpoints").iterdir()

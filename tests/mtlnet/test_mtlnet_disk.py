@@ -20,6 +20,8 @@ from mtlnet.train import train
 from mtlnet.whole import write_whole
 from trackfeatures.errors import UserError
 
+pytestmark = pytest.mark.usefixtures("small_network")
+
 
 def config(dataset: Path, out: Path, **changes: Any) -> TrainConfig:
     values = {"iterations": 2, "batch": 2, "device": "cpu", "threads": 1, **changes}

@@ -105,12 +105,14 @@ def test_a_run_keeps_what_it_was(dataset: Path, tmp_path: Path) -> None:
     assert [path.suffix for path in list_checkpoints(run)] == [".safetensors"]
 
 
+@pytest.mark.usefixtures("small_network")
 def test_a_timed_run_ends_by_the_clock(dataset: Path, tmp_path: Path) -> None:
     run = config(dataset, tmp_path / "timed", iterations=None, minutes=1 / 60)
     card = train(run, None)
     assert 1 <= card.iterations < 60
 
 
+@pytest.mark.usefixtures("small_network")
 def test_refused_before_anything_is_written(dataset: Path, tmp_path: Path) -> None:
     (tmp_path / "kept").mkdir()
     (tmp_path / "kept" / "mine").write_text("precious")
@@ -127,6 +129,7 @@ def test_refused_before_anything_is_written(dataset: Path, tmp_path: Path) -> No
     assert not (tmp_path / "new").exists()
 
 
+@pytest.mark.usefixtures("small_network")
 def test_another_run_is_not_resumed(dataset: Path, tmp_path: Path) -> None:
     run = config(dataset, tmp_path / "run", iterations=1)
     train(run, None)

@@ -131,7 +131,7 @@ class Served:
         self.port = port
         self._app = app
         self.url = f"http://127.0.0.1:{port}"
-        self._connection = http.client.HTTPConnection("127.0.0.1", port, timeout=20)
+        self._connection = http.client.HTTPConnection("127.0.0.1", port, timeout=120)
 
     @property
     def app(self) -> Service:

@@ -17,6 +17,7 @@ from mtlnet.engine import load_engine
 from mtlnet.golden import golden_image
 from serve.client import Client
 from tests.serve.conftest import png
+from tests.typed import typed
 from trackfeatures.listening import bind
 
 ROOT = Path(__file__).parents[2]
@@ -48,10 +49,7 @@ def address(line: str) -> str:
 
 def refused(*arguments: str, folder: Path = ROOT) -> str:
     """The one line with which the command ends with exit code 1."""
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    done = subprocess.run(
-        command(*arguments), capture_output=True, text=True, cwd=folder, env=environment, timeout=60
-    )
+    done = typed("serve", *arguments, folder=folder)
     assert done.returncode == 1, done.stderr
     assert done.stderr.startswith("error: ")
     assert done.stderr.count("\n") == 1, done.stderr
@@ -67,13 +65,13 @@ def test_a_published_model_is_served_and_stops_when_told(published: Path) -> Non
         assert card.model_hash[:12] in line
         assert f"openvino {engine.precision}" in line
         with Client(address(line)) as client:
-            client.wait_until_ready(30)
+            client.wait_until_ready(120)
             answer = client.features(png(image[:, :, ::-1]))
         expected = interpret(engine(image)).as_json()
         assert {key: answer[key] for key in expected} == expected
         assert answer["model"] == card.model_hash
         process.send_signal(signal.SIGTERM)
-        assert process.wait(10) == 0
+        assert process.wait(120) == 0
         assert process.stderr is not None
         assert process.stderr.read() == ""
 
@@ -83,9 +81,9 @@ def test_bare_serve_takes_the_shipped_or_latest_model_and_ctrl_c_ends_it(publish
     with started("--port", "0", folder=published.parents[1]) as (process, line):
         assert line.startswith("serving default")
         assert taken in line
-        Client(address(line)).wait_until_ready(30)
+        Client(address(line)).wait_until_ready(120)
         process.send_signal(signal.SIGINT)
-        assert process.wait(10) == 0
+        assert process.wait(120) == 0
 
 
 def test_two_workers_give_the_same_answers(published: Path) -> None:
@@ -94,13 +92,13 @@ def test_two_workers_give_the_same_answers(published: Path) -> None:
         assert "2 workers" in line
         answers = set()
         for _ in range(12):  # each connection may meet another worker
-            with Client(address(line), timeout_s=30) as client:
-                client.wait_until_ready(30)
+            with Client(address(line), timeout_s=120) as client:
+                client.wait_until_ready(120)
                 answer = client.features(body)
             answers.add(json.dumps({k: answer[k] for k in ("distances_m", "heading", "model")}))
         assert len(answers) == 1
         process.send_signal(signal.SIGTERM)
-        assert process.wait(15) == 0
+        assert process.wait(120) == 0
 
 
 def test_a_damaged_model_is_one_line(published: Path, tmp_path: Path) -> None:

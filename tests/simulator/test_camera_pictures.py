@@ -173,7 +173,7 @@ def test_a_closed_camera_draws_no_more(road: Road) -> None:
 
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="needs Linux's /proc")
 def test_cameras_leave_nothing_in_memory(road: Road) -> None:
-    """A scene holds several megabytes; twenty of them must not stay (llvmpipe's are in ours)."""
+    """A scene holds several megabytes; ten of them must not stay (llvmpipe's are in ours)."""
 
     def resident_mb() -> float:
         return int(Path("/proc/self/statm").read_text().split()[1]) * 4096 / 1e6
@@ -185,7 +185,7 @@ def test_cameras_leave_nothing_in_memory(road: Road) -> None:
     for seed in range(4):
         draw_once(seed)
     before = resident_mb()
-    for seed in range(20):
+    for seed in range(10):
         draw_once(seed)
     assert resident_mb() - before < 8.0
 

@@ -2,7 +2,6 @@
 
 import json
 import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -10,14 +9,14 @@ import pytest
 
 from simulator.track.catalogue import OWN_TRACKS, find_track, list_tracks
 from simulator.track.errors import UnknownTrack
+from tests.typed import typed
 from trackfeatures.errors import UserError
 
 FIXTURES = Path(__file__).parent / "tracks"
 
 
 def simulator(*arguments: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "simulator", *arguments]
-    return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    return typed("simulator", *arguments)
 
 
 def test_tracks_as_json() -> None:

@@ -12,16 +12,14 @@ import trackfeatures as tf
 from simulator.track.catalogue import OWN_TRACKS, find_track
 from simulator.track.plot import COLOURS, MOST_TICKS, draw, runs, sample, tick_step, write_plot
 from simulator.track.road import Road
+from tests.typed import typed
 from trackfeatures.errors import UserError
 
 COAST = Road(find_track("coast"), 2)
 
 
 def simulator(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "simulator", "tracks", *arguments]
-    return subprocess.run(
-        command, capture_output=True, text=True, timeout=120, check=False, cwd=folder
-    )
+    return typed("simulator", "tracks", *arguments, folder=folder)
 
 
 def test_the_lap_is_classed_by_the_shared_rule() -> None:

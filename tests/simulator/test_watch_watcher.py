@@ -30,7 +30,7 @@ def read(
     """Step and read till a state is `good`: it, the pictures and the scenes on the way."""
     pictures: list[bytes] = []
     scenes: list[dict[str, Any]] = []
-    end = time.monotonic() + 40.0
+    end = time.monotonic() + 240.0
     while time.monotonic() < end:
         step()
         try:
@@ -94,6 +94,7 @@ def test_another_road_is_another_scene() -> None:
                 assert [scene["track"] for scene in scenes] == [road.track.name]
 
 
+@pytest.mark.alone
 def test_nobody_looking_it_costs_microseconds() -> None:
     with Watcher(port=0) as watcher, World(Road(find_track("oval"))) as world:
         world.reset(seed=1, speed=15.0)
@@ -107,6 +108,7 @@ def test_nobody_looking_it_costs_microseconds() -> None:
     assert spent / 400 < 200e-6
 
 
+@pytest.mark.alone
 def test_held_to_a_speed() -> None:
     with Watcher(port=0, speed=10.0) as watcher, World(Road(find_track("oval"))) as world:
         world.reset(seed=1)
@@ -115,7 +117,7 @@ def test_held_to_a_speed() -> None:
         for _ in range(100):  # 5 s
             world.step(Command(throttle=0.2))
             watcher.update(world)
-        assert 0.4 < time.monotonic() - began < 3.0
+        assert 0.4 < time.monotonic() - began < 4.0
 
 
 def test_what_it_cannot_show() -> None:

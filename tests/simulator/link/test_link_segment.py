@@ -79,7 +79,7 @@ def killed_owner(name: str) -> None:
     code = (
         "import time; from simulator.link.segment import create;"
         f"held = create({name!r}, {SIZE}); held.memory[:8] = {MAGIC!r}; held.publish();"
-        "print('ready', flush=True); time.sleep(60)"
+        "print('ready', flush=True); time.sleep(300)"
     )
     process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
@@ -162,10 +162,10 @@ def test_a_forked_child_does_not_keep_our_end_alive(name: str) -> None:
     client = attach(name)
     child = os.fork()
     if child == 0:
-        time.sleep(30.0)
+        time.sleep(120.0)
         os._exit(0)
     try:
-        deadline = time.monotonic() + 5.0  # the child closes its copy first of all
+        deadline = time.monotonic() + 60.0  # the child closes its copy first of all
         client.close()
         while ours.other_end_lives() and time.monotonic() < deadline:
             time.sleep(0.01)

@@ -89,11 +89,12 @@ def test_the_checksum_is_fnv_1a() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.alone
 def test_no_torn_message_no_hang_and_nothing_leaked() -> None:
-    """The benchmark, small: 50,000 messages each way while there is time, ten kills."""
+    """The benchmark, small: 20,000 messages each way while there is time, each kind of kill."""
     if shutil.which("gcc") is None:
         pytest.skip("no gcc on this machine")
-    counts = ("--messages", "50000", "--patience", "10", "--kills", "10", "--steps", "0")
+    counts = ("--messages", "20000", "--patience", "5", "--kills", "4", "--steps", "0")
     command = [sys.executable, str(BENCHMARK), *counts]
     done = subprocess.run(command, capture_output=True, text=True, timeout=300)
     assert done.stdout, done.stderr
@@ -102,5 +103,5 @@ def test_no_torn_message_no_hang_and_nothing_leaked() -> None:
         assert (result[way]["torn"], result[way]["damaged"]) == (0, 0)
         assert result[way]["messages"] > 100
     killed = result["killed"]
-    assert (killed["kills"], killed["leaked_segments"]) == (10, [])
+    assert (killed["kills"], killed["leaked_segments"]) == (4, [])
     assert max(killed["longest_s"].values()) < BOUND_S
