@@ -28,7 +28,7 @@ def datagen(
 
 
 def datagen_here(*args: object) -> subprocess.CompletedProcess[str]:
-    """The command in this process; only those that record start others."""
+    """The command in this process: for those that start no others."""
     return typed("datagen", *args)
 
 

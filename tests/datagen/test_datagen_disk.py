@@ -17,14 +17,7 @@ from datagen.opening import open_folder, require_fitting
 from datagen.recording.folder import read_states
 from datagen.recording.verify import verify
 from datagen.round import Hopeless
-from tests.datagen.commands import (
-    SHORT,
-    attempted,
-    datagen,
-    datagen_here,
-    make_jobs,
-    make_small_plan,
-)
+from tests.datagen.commands import SHORT, attempted, datagen, make_jobs, make_small_plan
 
 PR_CAPBSET_DROP, CAP_DAC_OVERRIDE = 24, 1  # <linux/prctl.h>, <linux/capability.h>
 
@@ -102,7 +95,7 @@ def test_a_disk_that_fills_up_gives_one_line_and_keeps_the_rounds(collected: Pat
     assert "Traceback" not in done.stderr
     assert list(read_states(collected)) == ["round-000"]
     assert not (collected / ".partial").exists()
-    assert datagen_here("collect", *SHORT, "--out", collected).returncode == 0
+    assert datagen("collect", *SHORT, "--out", collected).returncode == 0
     assert lost.read_bytes() == before
 
 
@@ -131,7 +124,7 @@ def test_a_real_disk_that_is_full_in_the_middle_keeps_what_is_finished(small_dis
     before = (folder / "rounds" / f"{kept}.mcap").stat().st_mtime_ns
     assert not (folder / ".partial").exists()
     subprocess.run(["mount", "-o", "remount,size=20m", small_disk], check=True)
-    again = datagen_here("collect", *args, "--out", folder, "--json")
+    again = datagen("collect", *args, "--out", folder, "--json")
     assert json.loads(again.stdout)["recorded_frames"] == 80
     assert (folder / "rounds" / f"{kept}.mcap").stat().st_mtime_ns == before
     assert verify(folder, "full").ok
