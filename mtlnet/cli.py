@@ -24,7 +24,11 @@ Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 Data = Annotated[Path, typer.Option(help="Dataset folder.")]
 EngineKind = Annotated[str, typer.Option("--engine", help="openvino or torch (float32 oracle).")]
 PrecisionOption = Annotated[
-    str | None, typer.Option(help="bf16 or f32; by default bf16 where the CPU computes in it.")
+    str | None,
+    typer.Option(
+        help="int8 (after `mtlnet export`), bf16 or f32.  [default: int8 once it passed its gate, "
+        "else bf16 where the CPU computes in it]"
+    ),
 ]
 
 
@@ -111,6 +115,36 @@ def ablate_command(
     result = ablate(config, rows_of(backbone), dry_run=dry_run)
     if as_json:
         typer.echo(json.dumps(result))
+
+
+@app.command("export")
+def export_command(
+    model: Model = "default",
+    form: Annotated[str, typer.Option("--format", help="onnx or openvino.")] = "openvino",
+    precision: Annotated[
+        str, typer.Option(help="f32, bf16 (weights in half the bytes) or int8 (openvino).")
+    ] = "f32",
+    data: Annotated[
+        Path | None, typer.Option(help="Frames to check it on.  [default: what it learned from]")
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder.  [default: RUN/export/FORMAT-PRECISION]")
+    ] = None,
+    frames: Annotated[int, typer.Option(help="How many frames to check it on.")] = 64,
+    as_json: Json = False,
+) -> None:
+    """Write a model as ONNX or OpenVINO, checked against torch; int8 has to pass a gate."""
+    from rich.console import Console
+
+    from mtlnet.card import resolve_run
+    from mtlnet.convert import export_model
+    from mtlnet.tables import export_lines
+
+    result = export_model(resolve_run(model), form, precision, data, out, frames)
+    if as_json:
+        typer.echo(json.dumps(result))
+    else:
+        Console().print(export_lines(result))
 
 
 @app.command("evaluate")

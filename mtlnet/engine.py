@@ -21,12 +21,13 @@ from mtlnet.card import (
     read_card,
 )
 from mtlnet.doubt import read_doubt
+from mtlnet.exported import int8_graph, passed_gate
 
 if TYPE_CHECKING:
     from mtlnet.network import Network
 
 Kind = Literal["openvino", "torch"]
-Precision = Literal["bf16", "f32"]
+Precision = Literal["bf16", "f32", "int8"]
 
 
 class Engine(Protocol):
@@ -42,7 +43,7 @@ class Engine(Protocol):
 
     @property
     def precision(self) -> str:
-        """What it computes in: "f32" or "bf16"."""
+        """What it computes in: "f32", "bf16" or "int8"."""
 
     def __call__(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
         """Image (H, W, 3) RGB of `card.camera`'s size -> outputs (9,) or (17,), see `answer`."""
@@ -56,12 +57,13 @@ def load_engine(
 ) -> Engine:
     """The model of folder `run` (see `mtlnet.card.resolve_run`), ready to run.
 
-    `precision` None: bf16 where the CPU computes in it, float32 elsewhere. The torch engine knows
+    `precision` None: int8 where the model has a graph of it that passed its gate, else bf16 where
+    the CPU computes in it, float32 elsewhere. The torch engine knows
     float32 only. Raises ModelError when the model is missing, unfinished or damaged.
     """
     card = read_card(run)
     if kind == "torch":
-        if precision == "bf16":
+        if precision not in (None, "f32"):
             raise ModelError("the torch engine is the float32 oracle; ask for precision f32")
         return TorchEngine(run, card, threads)
     return OpenVinoEngine(run, card, precision, threads)
@@ -80,20 +82,23 @@ class OpenVinoEngine:
         check_files(run, card, (GRAPH, GRAPH_WEIGHTS))
         core = openvino.Core()
         self.card = card
-        self.precision: Precision = precision or best_precision(core)
+        best = best_precision(core)
+        self.precision: Precision = precision or ("int8" if passed_gate(run, card) else best)
+        eight = self.precision == "int8"
+        graph = int8_graph(run, card) if eight else run / GRAPH
         options = {
-            "INFERENCE_PRECISION_HINT": self.precision,
+            "INFERENCE_PRECISION_HINT": best if eight else self.precision,
             "INFERENCE_NUM_THREADS": threads,
             "NUM_STREAMS": 1,
             # Two workers told to pin would choose the same core.
             "ENABLE_CPU_PINNING": False,
         }
         try:
-            model = core.read_model(str(run / GRAPH))
+            model = core.read_model(str(graph))
             compiled = core.compile_model(model, "CPU", options)
         except RuntimeError as error:
             reason = str(error).strip().splitlines()[-1]
-            raise ModelError(f"OpenVINO cannot load {run / GRAPH}: {reason}") from error
+            raise ModelError(f"OpenVINO cannot load {graph}: {reason}") from error
         self._request = compiled.create_infer_request()
         self._shape = tuple(compiled.input(0).shape)
         self._input: NDArray[np.uint8] = np.empty(self._shape, np.uint8)
@@ -145,12 +150,12 @@ def parse_kind(text: str) -> Kind:
 
 def parse_precision(text: str | None) -> Precision | None:
     """The precision called `text`, None for the CPU's best; ModelError when there is none."""
-    precisions: dict[str, Precision] = {"bf16": "bf16", "f32": "f32"}
+    precisions: dict[str, Precision] = {"bf16": "bf16", "f32": "f32", "int8": "int8"}
     if text is None:
         return None
     if text in precisions:
         return precisions[text]
-    raise ModelError(f"there is no precision {text!r}; choose bf16 or f32")
+    raise ModelError(f"there is no precision {text!r}; choose int8, bf16 or f32")
 
 
 def best_precision(core: Any) -> Precision:

@@ -89,3 +89,21 @@ def answer_table(answers: list[dict[str, Any]]) -> Table:
 
 def _number(value: float | None, digits: int) -> str:
     return "-" if value is None else f"{value:.{digits}f}"
+
+
+def export_lines(result: dict[str, Any]) -> str:
+    """What came of an export: where it is, how far from torch, and its gate."""
+    check, gate = result["check"], result.get("gate")
+    lines = [
+        f"{result['out']}: {', '.join(result['files'])}",
+        f"largest difference from torch on {check['frames']} frames: {check['coded']:.2g} (coded), "
+        f"{check['probability']:.2g} (probability), computed in {check['computed_in']}",
+    ]
+    if gate is not None:
+        worse = ", ".join(f"{name} {by:+.5f}" for name, by in gate["worse"].items())
+        lines.append(f"error against float32 on {gate['frames']} test frames: {worse}")
+        verdict = "passed: engines take int8 by default"
+        if not gate["passed"]:
+            verdict = f"FAILED by {', '.join(gate['failed'])}: engines do not take int8 by default"
+        lines.append(f"accuracy gate {verdict}")
+    return "\n".join(lines)

@@ -16,7 +16,8 @@ WARM_UP_RUNS = 3  # the first runs allocate and choose kernels
 # what rounding in that precision makes of it, far below what damaged weights do. Measured with
 # bf16 against f32 on a model trained for ten minutes: 0.0002 on the golden image; on 1500 test
 # frames 0.0003 in the median, 0.018 at most (a probability between two headings).
-TOLERANCE = {"f32": 2e-3, "bf16": 0.03}
+# int8 rounds more, and the golden image is unlike those it was calibrated on.
+TOLERANCE = {"f32": 2e-3, "bf16": 0.03, "int8": 0.1}
 
 
 def warm_up(engine: Engine) -> None:
