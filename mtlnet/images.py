@@ -66,7 +66,7 @@ def inspect(body: bytes, view: View, fov_y_deg: float | None = None) -> ImageHea
     else:
         seen = f"{len(body)} bytes that begin with {body[:8]!r}" if body else "nothing at all"
         raise ImageError(Fault.NOT_AN_IMAGE, f"no JPEG or PNG file, but {seen}")
-    _check_size(header)
+    check_size(header.width, header.height)
     visible(header.width, header.height, view, fov_y_deg)
     return header
 
@@ -93,8 +93,8 @@ def check_trailing(count: int) -> None:
         )
 
 
-def _check_size(header: ImageHeader) -> None:
-    width, height = header.width, header.height
+def check_size(width: int, height: int) -> None:
+    """Raise ImageError unless a picture of so many px is taken."""
     sides = min(width, height) >= MIN_SIDE_PX and max(width, height) <= MAX_SIDE_PX
     if not sides or width * height > MAX_PIXELS:
         raise ImageError(

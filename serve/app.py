@@ -1,5 +1,6 @@
 """The service as one application: the hot path as plain ASGI, all else by FastAPI."""
 
+import time
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from dataclasses import asdict
@@ -7,24 +8,30 @@ from importlib.metadata import version
 from typing import Any
 
 from fastapi import FastAPI
-from fastapi.responses import JSONResponse, Response
+from fastapi.responses import JSONResponse, PlainTextResponse, Response
 from starlette.routing import Route
 
 from mtlnet.engine import Engine
-from serve import contract, problems
+from serve import contract, inference, problems
 from serve.ask import check_token
 from serve.console import add_console
-from serve.features import Features, client_of
+from serve.features import Features, Sight, client_of
 from serve.gate import Receive, Scope, Send, refuse
 from serve.limits import Limits
+from serve.metrics import MEDIA_TYPE, Metrics
 from serve.perceiver import Perceiver
 from serve.problems import Problem
 from serve.rate import Rate
 from serve.readiness import warm_up
 from serve.shared import Shared, create
+from serve.stream import Stream
 from serve.streams import Streams
 
-PROBES = {"/healthz", "/readyz"}  # what a balancer asks, often and without a token
+PROBES = {
+    "/healthz",
+    "/readyz",
+    *inference.PROBES,
+}  # what a balancer asks, often and without a token
 DESCRIPTION = "One driver-view image in, track features out. Angles in rad, distances in m."
 
 
@@ -37,46 +44,49 @@ class Service:
         check: Callable[[Engine], None] = warm_up,
         limits: Limits | None = None,
         shared: Shared | None = None,
+        slot: int = 0,
     ) -> None:
         """`check` warms an engine up and raises when its answers are wrong.
 
         It runs when the application starts (its lifespan): until it is through, /readyz and
-        /features answer 503. `shared` None: this is the only worker.
+        /features answer 503. `shared` None: this is the only worker; else `slot` is its block.
         """
         self.limits = limits or Limits()
         self.shared = shared or create(slots=1)
         streams = Streams(self.shared.streams())
         self.perceiver = Perceiver(engine, check, streams, self.limits.queue)
-        self.features = Features(self.perceiver)
-        self._rate = Rate(self.shared.clients(), self.limits.rate)
+        self.metrics = Metrics(self.shared, slot)
+        self.sight = Sight(self.perceiver, self.metrics, self.limits.log_answers)
+        self.features = Features(self.sight)
+        self.rate = Rate(self.shared.clients(), self.limits.rate)
         self._token = self.limits.token
+        self._stream = Stream(self.sight, self.rate)
         self.framework = _framework(self)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] == "lifespan":
             await self.framework(scope, receive, send)
             return
+        way = "http" if scope["type"] == "http" else "websocket.http"
         try:
-            if scope["path"] not in PROBES:
-                self._rate.check(client_of(scope))
+            if not _is_public(scope["path"]):
+                self.rate.check(client_of(scope))
                 check_token(dict(scope["headers"]), self._token)
         except Problem as problem:
-            await refuse(send, problem, [])
+            self.metrics.refused(problem.kind, self.perceiver.waiting)
+            await refuse(send, problem, [], way)
             return
-        if scope["path"] == "/features" and scope["method"] == "POST":
+        if scope["type"] == "websocket":
+            await self._stream(scope, receive, send)
+        elif scope["path"] == "/features" and scope["method"] == "POST":
             await self.features(scope, receive, send)
         else:
             await self.framework(scope, receive, send)
 
 
-def create_app(
-    engine: Engine,
-    check: Callable[[Engine], None] = warm_up,
-    limits: Limits | None = None,
-    shared: Shared | None = None,
-) -> Service:
-    """The service around `engine`, see `Service`."""
-    return Service(engine, check, limits, shared)
+def _is_public(path: str) -> bool:
+    """Whether a path needs no token: probes, and the console's own files, which ask for one."""
+    return path in PROBES or path == "/" or path.startswith("/console/")
 
 
 def _framework(service: Service) -> FastAPI:
@@ -98,6 +108,8 @@ def _framework(service: Service) -> FastAPI:
     # Reached only with another method than POST: who sends one is told which there is.
     app.router.routes.append(Route("/features", service.features, methods=["POST"]))
     _add_status(app, service.perceiver)
+    _add_metrics(app, service)
+    inference.install(app, service.sight)
     add_console(app)
     return app
 
@@ -121,3 +133,14 @@ def _add_status(app: FastAPI, perceiver: Perceiver) -> None:
     async def model() -> dict[str, Any]:
         loaded = perceiver.loaded
         return {**loaded.origin, **asdict(loaded.engine.card)}
+
+
+def _add_metrics(app: FastAPI, service: Service) -> None:
+    @app.get(
+        "/metrics",
+        summary="Counts and times of all workers, for Prometheus",
+        response_class=PlainTextResponse,
+    )
+    async def metrics() -> Response:
+        origin = service.perceiver.loaded.origin
+        return Response(service.metrics.page(time.monotonic(), origin), media_type=MEDIA_TYPE)

@@ -33,6 +33,7 @@ class Ask:
     """What one frame asks for. `stamp_ns` is when it arrived; `deadline_ns` None: none."""
 
     stamp_ns: int
+    request_id: str = ""
     frame_id: str | None = None
     stream: str | None = None
     deadline_ns: int | None = None
@@ -40,10 +41,11 @@ class Ask:
     format: Format = JSON
 
 
-def read_ask(headers: Headers, stamp_ns: int) -> Ask:
-    """What the headers ask for. Raises Problem."""
+def read_ask(headers: Headers, stamp_ns: int, name: str) -> Ask:
+    """What the headers of the request called `name` ask for. Raises Problem."""
     return Ask(
         stamp_ns,
+        name,
         read_name(headers.get(b"x-frame-id"), FRAME_ID),
         read_name(headers.get(b"x-stream-id"), STREAM_ID),
         read_deadline(headers.get(b"x-deadline-ms"), stamp_ns),

@@ -42,6 +42,9 @@ def serve(
     connections: Annotated[
         int, typer.Option(help="Open connections at most.", min=1, max=65536)
     ] = 256,
+    log_answers: Annotated[
+        bool, typer.Option("--log-answers", help="Log answered requests too, not only refused.")
+    ] = False,
 ) -> None:
     """Answer driver-view images over HTTP with track features.
 
@@ -54,7 +57,8 @@ def serve(
     from serve.limits import Limits
     from serve.server import ServiceConfig, read_token, run
 
-    limits = Limits(connections=connections, rate=rate, token=read_token(token_file))
+    token = read_token(token_file)
+    limits = Limits(connections=connections, rate=rate, token=token, log_answers=log_answers)
     run(ServiceConfig(model, host, port, workers, insecure, limits))
 
 

@@ -9,6 +9,8 @@ from mtlnet.images import decode, inspect
 from mtlnet.view import View, visible
 from serve.ask import Ask, Headers, check_headers, read_ask, request_id
 from serve.gate import Departed, Header, Receive, Scope, Send, as_problem, read_body, refuse, reply
+from serve.logs import Refusals, tell_answer
+from serve.metrics import Metrics
 from serve.perceiver import Frame, Perceived, Perceiver, Reader
 from serve.problems import Problem, failure
 from serve.streams import stream_key
@@ -16,11 +18,48 @@ from serve.streams import stream_key
 logger = logging.getLogger(__name__)
 
 
+class Sight:
+    """What every way into the service does with a frame: see it, count it, tell of it."""
+
+    def __init__(self, perceiver: Perceiver, metrics: Metrics, log_answers: bool) -> None:
+        self.perceiver = perceiver
+        self._metrics = metrics
+        self._refusals = Refusals()
+        self._log_answers = log_answers
+
+    async def look(self, ask: Ask, body: bytes, client: str) -> dict[str, Any]:
+        """What `serve.contract.Features` says of an image's bytes. Raises Problem, ImageError."""
+        self.perceiver.check_ready()
+        camera = self.perceiver.loaded.engine.card.camera
+        header = inspect(body, camera, ask.fov_y_deg)
+        fov = ask.fov_y_deg
+        perceived = await self.see(ask, client, lambda view: decode(body, header, view, fov))
+        return content_of(ask, perceived, crop_of(header.width, header.height, camera, fov))
+
+    async def see(self, ask: Ask, client: str, read: Reader) -> Perceived:
+        """What the model sees in the pixels that `read` gives. Raises Problem, ImageError."""
+        stream = stream_key(client, ask.stream) if ask.stream else 0
+        frame = Frame(read, ask.stamp_ns, stream, ask.deadline_ns)
+        perceived = await self.perceiver.perceive(frame)
+        total_s = (time.monotonic_ns() - ask.stamp_ns) / 1e9
+        self._metrics.answered(perceived, total_s, self.perceiver.waiting)
+        if self._log_answers:
+            tell_answer(ask.request_id, client, 1e3 * total_s)
+        return perceived
+
+    def refused(self, error: Problem | ImageError, request: str, client: str) -> Problem:
+        """The problem that an error is to a client; counted, and told to the log."""
+        problem = as_problem(error)
+        self._refusals.tell(request, client, problem)
+        self._metrics.refused(problem.kind, self.perceiver.waiting)
+        return problem
+
+
 class Features:
     """The endpoint, as an ASGI application."""
 
-    def __init__(self, perceiver: Perceiver) -> None:
-        self._perceiver = perceiver
+    def __init__(self, sight: Sight) -> None:
+        self._sight = sight
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         stamp = time.monotonic_ns()
@@ -28,35 +67,20 @@ class Features:
         name = request_id(headers)
         sent: list[Header] = [(b"x-request-id", name.encode())]
         try:
-            ask = read_ask(headers, stamp)
+            ask = read_ask(headers, stamp, name)
             check_headers(headers)
             body = await read_body(receive)
-            content = await self.answer(ask, body, client_of(scope))
+            content = await self._sight.look(ask, body, client_of(scope))
         except Departed:
             return
         except (Problem, ImageError) as error:
-            await refuse(send, as_problem(error), sent)
+            await refuse(send, self._sight.refused(error, name, client_of(scope)), sent)
         except Exception:
             logger.exception("request %s failed", name)
-            await refuse(send, failure(), sent)
+            await refuse(send, self._sight.refused(failure(), name, client_of(scope)), sent)
         else:
             sent.append(ask.format.header)
             await reply(send, 200, sent, ask.format.encode(content))
-
-    async def answer(self, ask: Ask, body: bytes, client: str) -> dict[str, Any]:
-        """What `serve.contract.Features` says of an image's bytes. Raises Problem, ImageError."""
-        self._perceiver.check_ready()
-        camera = self._perceiver.loaded.engine.card.camera
-        header = inspect(body, camera, ask.fov_y_deg)
-        fov = ask.fov_y_deg
-        perceived = await self.see(ask, client, lambda view: decode(body, header, view, fov))
-        crop = crop_of(header.width, header.height, camera, fov)
-        return content_of(ask, perceived, crop)
-
-    async def see(self, ask: Ask, client: str, read: Reader) -> Perceived:
-        """What the model sees in the pixels that `read` gives. Raises Problem, ImageError."""
-        stream = stream_key(client, ask.stream) if ask.stream else 0
-        return await self._perceiver.perceive(Frame(read, ask.stamp_ns, stream, ask.deadline_ns))
 
 
 def client_of(scope: Scope) -> str:

@@ -51,18 +51,20 @@ def _check_size(size: int) -> None:
         raise too_large(f"more than {MAX_BODY_BYTES} bytes")
 
 
-async def reply(send: Send, status: int, headers: list[Header], body: bytes) -> None:
-    """Send a whole answer."""
+async def reply(
+    send: Send, status: int, headers: list[Header], body: bytes, way: str = "http"
+) -> None:
+    """Send a whole answer; `way` "websocket.http": to the handshake of a WebSocket."""
     headers.append((b"content-length", b"%d" % len(body)))
-    await send({"type": "http.response.start", "status": status, "headers": headers})
-    await send({"type": "http.response.body", "body": body})
+    await send({"type": f"{way}.response.start", "status": status, "headers": headers})
+    await send({"type": f"{way}.response.body", "body": body})
 
 
-async def refuse(send: Send, problem: Problem, headers: list[Header]) -> None:
-    """Send a problem."""
+async def refuse(send: Send, problem: Problem, headers: list[Header], way: str = "http") -> None:
+    """Send a problem; `way` as in `reply`."""
     added = [(k.lower().encode(), v.encode()) for k, v in problem.headers.items()]
     content = encode_problem(problem.content)
-    await reply(send, problem.kind.status, [PROBLEM_HEADER, *added, *headers], content)
+    await reply(send, problem.kind.status, [PROBLEM_HEADER, *added, *headers], content, way)
 
 
 def as_problem(error: Problem | ImageError) -> Problem:

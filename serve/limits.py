@@ -25,6 +25,8 @@ class Limits:
     """For which a connection may stay open with no request in it."""
     rate: float = 200.0
     """Requests a second of one client address, in bursts of as many; 0: any number."""
+    log_answers: bool = False
+    """Whether answered requests stand in the log, not only refused ones."""
     token: str | None = None
     """What `Authorization: Bearer` must hold; None: nothing is asked."""
 

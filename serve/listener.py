@@ -13,12 +13,14 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
-from typing import Any, Protocol
+from typing import Any
 
 import uvicorn
 
-from serve.limits import Limits
+from serve.app import Service
+from serve.limits import MAX_BODY_BYTES, Limits
 from serve.protocol import Guard, GuardedProtocol, sweep
+from serve.workers import BlockPeers
 
 GRACE_S = 5  # for requests in progress when the service is told to stop
 DRAIN_S = 1.0  # for clients at work to send one more request and be told to connect anew
@@ -28,37 +30,15 @@ REST_S = 0.1  # after the system has no more descriptors
 logger = logging.getLogger(__name__)
 
 
-class Peers(Protocol):
-    """What a worker knows of the others, and tells them (`serve.workers`)."""
-
-    def tell(self, connections: int) -> None: ...
-
-    def leave(self) -> None: ...
-
-    def others(self) -> list[int]:
-        """The connections of each of the other workers that are alive."""
-
-
-class Alone:
-    """The peers of a single worker."""
-
-    def tell(self, connections: int) -> None:
-        """There is nobody to tell."""
-
-    def leave(self) -> None:
-        """Nor to leave."""
-
-    def others(self) -> list[int]:
-        return []
-
-
 class WorkerServer(uvicorn.Server):
     """uvicorn with our own accepting, deadlines and draining."""
 
-    def __init__(self, app: Any, limits: Limits, peers: Peers | None = None) -> None:
-        self.guard = Guard(limits, others=lambda: sum(self._peers.others()))
+    def __init__(self, app: Service, limits: Limits, peers: BlockPeers | None = None) -> None:
+        self.guard = Guard(
+            limits, others=lambda: sum(self._peers.others()), dismissed=app.metrics.dismissed
+        )
         super().__init__(_settings(app, limits))
-        self._peers = peers or Alone()
+        self._peers = peers or BlockPeers(app.shared, 0)
         self._waited = False
 
     @contextmanager
@@ -157,7 +137,9 @@ def _settings(app: Any, limits: Limits) -> uvicorn.Config:
         app,
         loop="uvloop",
         http="httptools",
-        ws="none",
+        ws="websockets-sansio",
+        ws_max_size=MAX_BODY_BYTES,
+        ws_per_message_deflate=False,  # images do not shrink
         lifespan="on",
         log_config=None,
         access_log=False,

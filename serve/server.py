@@ -5,7 +5,6 @@ workers share the socket. `serve.supervisor` watches over them.
 """
 
 import asyncio
-import logging
 import os
 import socket
 import sys
@@ -13,6 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from mtlnet.card import resolve_run
+from serve import logs
 from serve.limits import Limits, is_loopback
 from serve.manage import listen, socket_path
 from serve.supervisor import Plan, Supervisor
@@ -64,7 +64,7 @@ def read_token(path: Path | None) -> str | None:
 
 def run(config: ServiceConfig) -> None:
     """Serve until SIGTERM or Ctrl-C. Raises UserError when it cannot begin."""
-    logging.basicConfig(format="%(levelname)s: %(message)s", level=logging.WARNING)
+    logs.set_up()
     _check_exposure(config)
     resolve_run(config.model)  # a model that is not there is told before any process is started
     listener = bind(config.host, config.port)

@@ -123,7 +123,7 @@ class Supervisor:
             # From this instant on every worker answers with the new weights.
             self._head[COMMITTED] = generation
             self._folder, self._model, self._hash = folder, name, found
-            logger.warning("now serving %s, model %s", folder, found[:12])
+            logger.info("now serving %s, model %s", folder, found[:12])
             return found
 
     def _on_hangup(self, reload: Callable[[], None]) -> None:

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from mtlnet.engine import Engine, load_engine
+from serve import logs
 from serve.app import Service
 from serve.listener import WorkerServer
 from serve.readiness import warm_up
@@ -62,7 +63,7 @@ class Control:
 
 def main() -> None:
     """Run one worker until its supervisor or SIGTERM ends it."""
-    logging.basicConfig(format="%(levelname)s: %(message)s", level=logging.WARNING)
+    logs.set_up()
     control = Control(int(sys.argv[1]))
     lines = control.lines()
     line = next(lines, None)
@@ -76,7 +77,7 @@ def main() -> None:
         return
     control.say_loaded(task.generation, engine)
     shared = attach(task.memory, task.slots)
-    app = Service(engine, warm_up, task.limits, shared)
+    app = Service(engine, warm_up, task.limits, shared, task.slot)
     app.perceiver.when_warm(lambda: control.say(ready=True))
     peers = BlockPeers(shared, task.slot)
     server = WorkerServer(app, task.limits, peers)

@@ -20,10 +20,11 @@ import trackfeatures as tf
 from mtlnet.card import WEIGHTS, Camera, ModelCard
 from mtlnet.engine import Engine
 from mtlnet.golden import golden_image
-from serve.app import Service, create_app
+from serve.app import Service
 from serve.limits import Limits
 from serve.listener import WorkerServer
 from serve.shared import Shared
+from serve.workers import BlockPeers
 from trackfeatures.listening import bind
 
 CARD = ModelCard(
@@ -160,6 +161,7 @@ def serving(
     check: Callable[[Any], object] = lambda _engine: None,
     limits: Limits | None = None,
     shared: Shared | None = None,
+    slot: int = 0,
 ) -> Iterator[Served]:
     """The service around `engine` on a free port, as `serve` runs it, in a thread of this process.
 
@@ -171,8 +173,8 @@ def serving(
 
     listener = bind("127.0.0.1", 0)
     listener.listen(2048)
-    app = create_app(engine, checked, limits, shared)
-    server = WorkerServer(app, limits or Limits())
+    app = Service(engine, checked, limits, shared, slot)
+    server = WorkerServer(app, limits or Limits(), BlockPeers(app.shared, slot))
     thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
     thread.start()
     try:

@@ -358,7 +358,19 @@ def test_the_openapi_document_says_what_the_service_does(service: Served) -> Non
         for key in reference.removeprefix("#/").split("/"):
             node = node[key]
         assert node
-    assert set(document["paths"]) == {"/features", "/healthz", "/readyz", "/model"}
+    assert set(document["paths"]) == {
+        "/features",
+        "/healthz",
+        "/readyz",
+        "/model",
+        "/metrics",
+        "/v2",
+        "/v2/health/live",
+        "/v2/health/ready",
+        "/v2/models/track",
+        "/v2/models/track/ready",
+        "/v2/models/track/infer",
+    }
     post = document["paths"]["/features"]["post"]
     assert post["requestBody"]["required"]
     assert set(post["requestBody"]["content"]) == {"image/jpeg", "image/png"}

@@ -151,6 +151,7 @@ def test_only_who_knows_the_token_is_answered() -> None:
                 assert reply.headers["www-authenticate"] == "Bearer"
         assert service.post(JPEG, Authorization=f"Bearer {token}").status == 200
         assert service.ask("GET", "/readyz").status == 200  # a balancer knows no token
+        assert service.ask("GET", "/").status == 200  # the console asks for it
 
 
 def test_a_client_that_asks_too_often_is_told_when_to_come_back() -> None:

@@ -82,7 +82,7 @@ def test_a_newer_frame_at_another_worker_supersedes_too() -> None:
     with busy(gate, memory) as crowd:
         old = crowd.queue(1, X_Stream_Id="front")
         kept = crowd.queue(2, X_Stream_Id="rear")
-        with serving(FakeEngine(lambda _image: outputs()), shared=memory) as second:
+        with serving(FakeEngine(lambda _image: outputs()), shared=memory, slot=1) as second:
             assert second.post(JPEG, X_Stream_Id="front").status == 200
         gate.open.set()
         assert_problem(old.result(), 503, "superseded")

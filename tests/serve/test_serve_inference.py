@@ -1,0 +1,163 @@
+"""The Open Inference Protocol v2, by requests built from its specification."""
+
+import base64
+import json
+import struct
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.serve.conftest import FakeEngine, Reply, Served, jpeg, outputs, picture, serving
+
+JPEG = jpeg(picture())
+INFER = "/v2/models/track/infer"
+
+
+def infer(
+    service: Served, content: Any, binary: bytes | None = None, path: str = INFER, **headers: str
+) -> Reply:
+    head = json.dumps(content).encode()
+    if binary is None:
+        return service.ask("POST", path, head, headers)
+    length = {"Inference-Header-Content-Length": str(len(head))}
+    return service.ask("POST", path, head + binary, {**length, **headers})
+
+
+def image(**more: Any) -> dict[str, Any]:
+    return {"name": "image", "shape": [1, 1], "datatype": "BYTES", **more}
+
+
+RAW = struct.pack("<I", len(JPEG)) + JPEG
+BINARY = {"inputs": [image(parameters={"binary_data_size": len(RAW)})]}
+BASE64 = image(data=[base64.b64encode(JPEG).decode()])
+
+
+def test_health_and_metadata(service: Served) -> None:
+    for path in ("/v2/health/live", "/v2/health/ready", "/v2/models/track/ready"):
+        assert service.ask("GET", path).status == 200
+    assert "binary_tensor_data" in service.ask("GET", "/v2").content["extensions"]
+    model = service.ask("GET", "/v2/models/track").content
+    assert model == service.ask("GET", "/v2/models/track/versions/1").content
+    assert {tensor["name"] for tensor in model["inputs"]} == {"image", "pixels"}
+    assert service.ask("GET", "/v2/models/other").status == 404
+
+
+def test_not_ready_before_the_model_is_warm() -> None:
+    def fail(_engine: Any) -> None:
+        raise RuntimeError
+
+    with serving(FakeEngine(lambda _image: outputs()), fail) as service:
+        assert service.ask("GET", "/v2/health/live").status == 200
+        for path in ("/v2/health/ready", "/v2/models/track/ready"):
+            assert service.ask("GET", path).status == 503
+
+
+def test_json_in_and_out_is_what_features_says(service: Served) -> None:
+    expected = service.post(JPEG).content
+    answer = infer(service, {"id": "7", "inputs": [BASE64]}).content
+    assert (answer["id"], answer["model_name"], answer["model_version"]) == ("7", "track", "1")
+    assert answer["parameters"]["model"] == expected["model"]
+    found = {output["name"]: output for output in answer["outputs"]}
+    assert all(output["datatype"] == "FP32" for output in answer["outputs"])
+    assert found["distances_m"]["shape"] == [1, 5]
+    assert found["distances_m"]["data"] == pytest.approx(
+        list(expected["distances_m"].values()), abs=1e-6
+    )
+    assert found["distances_m"]["data"][2:] == [None] * 3
+    assert found["heading"]["data"] == pytest.approx(list(expected["heading"].values()))
+    assert found["angle_rad"]["data"] == pytest.approx([expected["angle_rad"]])
+    assert found["to_lane_centre_m"]["data"] == pytest.approx([expected["to_lane_centre_m"]])
+
+
+def test_raw_binary_in_and_out(service: Served, engine: FakeEngine) -> None:
+    wanted = [
+        {"name": "angle_rad", "parameters": {"binary_data": True}},
+        {"name": "heading"},
+        {"name": "distances_m", "parameters": {"binary_data": True}},
+    ]
+    reply = infer(service, {**BINARY, "outputs": wanted})
+    assert reply.status == 422  # the binary part is missing
+    reply = infer(service, {**BINARY, "outputs": wanted}, RAW)
+    length = int(reply.headers["inference-header-content-length"])
+    head = json.loads(reply.content[:length])
+    assert [output["name"] for output in head["outputs"]] == ["angle_rad", "heading", "distances_m"]
+    values = np.frombuffer(reply.content[length:], "<f4")
+    assert values == pytest.approx([0.1, -2, 2, np.nan, np.nan, np.nan], abs=1e-5, nan_ok=True)
+    everything = infer(service, {**BINARY, "parameters": {"binary_data_output": True}}, RAW)
+    length = int(everything.headers["inference-header-content-length"])
+    assert len(everything.content) - length == 4 * 18
+
+    pixels = picture()
+    tensor = {"name": "pixels", "shape": [1, 210, 280, 3], "datatype": "UINT8"}
+    raw = {"inputs": [{**tensor, "parameters": {"binary_data_size": pixels.size}}]}
+    assert infer(service, raw, pixels.tobytes()).status == 200
+    assert np.array_equal(engine.images[-1], pixels)
+    plain = {"inputs": [{**tensor, "data": pixels.tolist()}]}
+    assert infer(service, plain, path="/v2/models/track/versions/1/infer").status == 200
+    assert np.array_equal(engine.images[-1], pixels)
+
+
+@pytest.mark.parametrize(
+    ("content", "binary", "name"),
+    [
+        ([], None, "invalid-request"),
+        ({"inputs": []}, None, "invalid-request"),
+        ({"inputs": [BASE64, BASE64]}, None, "invalid-request"),
+        ({"inputs": [image(data=["%%%"])]}, None, "invalid-request"),
+        ({"inputs": [image(data=[1])]}, None, "invalid-request"),
+        ({"inputs": [{**BASE64, "shape": [2]}]}, None, "invalid-request"),
+        ({"inputs": [{**BASE64, "name": "other"}]}, None, "invalid-request"),
+        ({"inputs": [BASE64], "outputs": [{"name": "other"}]}, None, "invalid-request"),
+        ({"inputs": [BASE64]}, b"more", "invalid-request"),
+        (BINARY, RAW[:-1], "invalid-request"),
+        (BINARY, b"\xff" * len(RAW), "invalid-request"),
+        ({"inputs": [image(data=["aGVsbG8="])]}, None, "not-an-image"),
+        (
+            {"inputs": [{"name": "pixels", "shape": [2, 2, 3], "datatype": "UINT8", "data": [0]}]},
+            None,
+            "invalid-request",
+        ),
+        (
+            {"inputs": [{"name": "pixels", "shape": [0, 2, 3], "datatype": "UINT8", "data": []}]},
+            None,
+            "invalid-request",
+        ),
+        (
+            {
+                "inputs": [
+                    {"name": "pixels", "shape": [1, 1, 3], "datatype": "UINT8", "data": [256]}
+                ]
+            },
+            None,
+            "invalid-request",
+        ),
+        (
+            {
+                "inputs": [
+                    {"name": "pixels", "shape": [2, 2, 3], "datatype": "UINT8", "data": [[0] * 12]}
+                ]
+            },
+            None,
+            "image-size",
+        ),
+    ],
+)
+def test_what_breaks_the_protocol_is_a_problem_with_its_error(
+    service: Served, content: Any, binary: bytes | None, name: str
+) -> None:
+    reply = infer(service, content, binary)
+    assert reply.status == 422
+    assert reply.content["type"] == f"/problems/{name}"
+    assert reply.content["error"] == reply.content["detail"]
+    assert infer(service, {"inputs": [BASE64]}).status == 200
+
+
+def test_a_lie_about_the_header_and_deep_nesting_are_problems(service: Served) -> None:
+    for length in ("99999999", "-1", "x", "1" * 5000):
+        headers = {"Inference-Header-Content-Length": length}
+        assert service.ask("POST", INFER, b"{}", headers).status == 422
+    deep = b"[" * 900 + b"]" * 900
+    head = b'{"inputs": [{"name": "pixels", "shape": [1, 1, 3], "datatype": "UINT8", "data": '
+    assert service.ask("POST", INFER, head + deep + b"}]}").status == 422
+    assert service.ask("POST", INFER, head + b"[" * 100_000).status == 422
