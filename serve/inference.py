@@ -2,7 +2,8 @@
 
 Inputs: `image` (BYTES [1, 1], the bytes of a JPEG or PNG file) or `pixels` (UINT8 [1, height,
 width, 3], RGB). Outputs, float32: `distances_m` (1, 5) in the order ml, mr, l, m, r, NaN where
-absent; `std` in the order of `mtlnet.doubt`; `out_of_distribution` 0 or 1; the others are named and mean as in POST /features, whose request headers hold here too.
+absent; `std` in the order of `mtlnet.doubt`; `out_of_distribution` 0 or 1; the others are named and
+mean as in POST /features, whose request headers hold here too.
 """
 
 import logging
