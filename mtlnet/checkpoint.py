@@ -1,7 +1,7 @@
 """Checkpoints of a run in training: one safetensors file each, written whole or not at all.
 
-Tensors: `network.*`, `optimiser.INDEX.NAME`, `rng` (torch's generator, for dropout). Metadata:
-the step and the seconds trained so far.
+Tensors: `network.*`, `optimiser.INDEX.NAME`, `balance.NAME`, `rng` (torch's generator, for
+dropout). Metadata: the step and the seconds trained so far.
 """
 
 from pathlib import Path
@@ -62,6 +62,8 @@ def _tensors(trainer: Trainer) -> dict[str, Tensor]:
         for name, value in state.items():
             if isinstance(value, Tensor):
                 tensors[f"optimiser.{index}.{name}"] = value
+    for name, tensor in trainer.balance.state().items():
+        tensors[f"balance.{name}"] = tensor
     tensors["rng"] = torch.get_rng_state()
     return {name: t.detach().cpu().contiguous() for name, t in tensors.items()}
 
@@ -83,4 +85,6 @@ def _restore(trainer: Trainer, tensors: dict[str, Tensor]) -> None:
         for name, value in values.items():
             if isinstance(value, Tensor) and value.shape == parameter.shape:
                 values[name] = torch.empty_like(parameter).copy_(value)
+    kept = {n.removeprefix("balance."): t for n, t in tensors.items() if n.startswith("balance.")}
+    trainer.balance.restore(kept)
     torch.set_rng_state(tensors["rng"])

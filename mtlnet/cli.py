@@ -48,6 +48,12 @@ def train_command(
         str | None,
         typer.Option(help="mtl, deepdriving, mobilenet_v3_small, regnet_y_400mf.  [default: mtl]"),
     ] = None,
+    balance: Annotated[
+        str | None,
+        typer.Option(
+            help="fixed (alpha), or weights found by uncertainty or dwa.  [default: fixed]"
+        ),
+    ] = None,
     recipe: Annotated[
         str | None, typer.Option(help="fast (minutes) or paper (days).  [default: fast]")
     ] = None,
@@ -70,6 +76,7 @@ def train_command(
     given = {
         "data": data,
         "network": network,
+        "balance": balance,
         "recipe": recipe,
         "iterations": iterations,
         "minutes": minutes,
@@ -82,7 +89,7 @@ def train_command(
     from mtlnet.start import start_training
 
     result = start_training(options, alpha, out, resume=resume)
-    if as_json:
+    if as_json and result:
         typer.echo(json.dumps(result))
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import trackfeatures as tf
+from mtlnet.balance import find_balance
 from mtlnet.card import ModelError
 from mtlnet.loss import Alpha
 from mtlnet.plan import find_plan, require_learnable
@@ -29,6 +30,8 @@ class TrainConfig:
     network: str = "mtl"
     """A name of `mtlnet.plan.PLANS`."""
     alpha: Alpha = (0.3, 0.2, 0.5)
+    balance: str = "fixed"
+    """A name of `mtlnet.balance.BALANCES`; unless fixed, alpha only says what is learned."""
     recipe: str = "fast"
     iterations: int | None = None
     """Steps; None: the recipe's, or as many as fit into `minutes`."""
@@ -42,6 +45,7 @@ class TrainConfig:
 
     def __post_init__(self) -> None:
         require_learnable(find_plan(self.network), self.alpha)
+        find_balance(self.balance)
         if self.iterations is not None and self.iterations < 1:
             raise UserError(f"--iterations is {self.iterations}; give at least 1")
         if self.minutes is not None and not self.minutes > 0:

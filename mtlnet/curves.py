@@ -18,6 +18,9 @@ COLUMNS = (
     "angle_loss",
     "type_loss",
     "total_loss",
+    "distance_weight",
+    "angle_weight",
+    "type_weight",
 )
 CURVES = "curves.csv"
 

@@ -6,6 +6,7 @@ batch. The L2 term is the optimiser's: a weight decay of 2 lambda is the gradien
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -24,12 +25,20 @@ class AlphaError(UserError):
 
 @dataclass(frozen=True)
 class Losses:
-    """The unweighted loss of each task, as reported, and the weighted sum that is minimised."""
+    """The unweighted loss of each task, as reported, and the sum that is minimised.
+
+    `terms` (3,): what that sum weighs, of each task.
+    """
 
     distance: Tensor
     angle: Tensor
     type: Tensor
     total: Tensor
+    terms: Tensor
+
+    def row(self) -> Tensor:
+        """Distance, angle, type, total (4,), without the graph."""
+        return torch.stack([self.distance, self.angle, self.type, self.total.detach()])
 
 
 def parse_alpha(text: str) -> Alpha:
@@ -58,9 +67,15 @@ def parse_alpha(text: str) -> Alpha:
 
 
 def multi_task_loss(
-    outputs: Tensor, coded: Tensor, heading: Tensor, alpha: Alpha, scale: Tensor | None = None
+    outputs: Tensor,
+    coded: Tensor,
+    heading: Tensor,
+    combine: Alpha | Callable[[Tensor], Tensor],
+    scale: Tensor | None = None,
 ) -> Losses:
     """Losses of outputs (B, 9) for targets coded (B, 6) and heading (B,) int64.
+
+    `combine`: the tasks' weights, or what makes the sum to minimise out of their terms (3,).
 
     `scale` (6,): variances of the coded targets. With it, the sum that is minimised (never the
     reported losses) counts squared errors in units of them, distances as their mean: a task
@@ -75,6 +90,11 @@ def multi_task_loss(
     else:
         scaled = squared / scale
         terms = (scaled[:, :5].mean(), scaled[:, 5].mean(), kind)
-    # A weight of 0 takes the task out of the graph: a true single-task network.
-    weighted = [weight * term for weight, term in zip(alpha, terms, strict=True) if weight > 0]
-    return Losses(distance.detach(), angle.detach(), kind.detach(), torch.stack(weighted).sum())
+    if callable(combine):
+        total = combine(torch.stack(terms))
+    else:
+        # A weight of 0 takes the task out of the graph: a true single-task network.
+        weighted = [weight * term for weight, term in zip(combine, terms, strict=True) if weight]
+        total = torch.stack(weighted).sum()
+    kept = torch.stack(terms).detach()
+    return Losses(distance.detach(), angle.detach(), kind.detach(), total, kept)

@@ -12,8 +12,10 @@ from mtlnet.config import CONFIG, TrainConfig, resume_config
 from mtlnet.loss import parse_alpha
 from mtlnet.plan import find_plan
 from mtlnet.recipe import find_recipe
+from mtlnet.together import find_part
 from mtlnet.train import Progress as Point
 from mtlnet.train import Stopped, train
+from trackfeatures.errors import UserError
 
 DATASET = Path("datasets/default")
 
@@ -28,11 +30,13 @@ def start_training(
     if resume:
         config, resumed = resume_config(out or newest_run(), options)
     else:
+        if out is None and find_part().world > 1:
+            raise UserError("give --out: several processes must agree on the run's folder")
         recipe = find_recipe(options.get("recipe", "fast")).name
         folder = out or RUNS / f"{time.strftime('%Y%m%d-%H%M%S')}-{recipe}"
         usual = {"alpha": find_plan(options.get("network", "mtl")).default_alpha}
         config = TrainConfig(**{"data": DATASET, "out": folder, **usual, **options})
-    console = Console(stderr=True)
+    console = Console(stderr=True, quiet=not find_part().first)
     console.print(
         f"training {config.network} in {config.out} on {config.data}, recipe {config.recipe}"
     )
@@ -48,6 +52,8 @@ def start_training(
                 f"`mtlnet train --out {config.out} --resume`"
             )
             raise
+    if not find_part().first:
+        return {}  # the first process says it
     differences = {k: v for k, v in card.export_check.items() if k != "frames"}
     console.print(
         f"exported and checked against torch on {card.export_check['frames']:.0f} frames, largest "

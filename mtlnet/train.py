@@ -8,7 +8,8 @@ import os
 import re
 import shutil
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,7 @@ import torch
 from numpy.typing import NDArray
 
 from datagen.recording import Dataset, Frames
-from mtlnet.card import RUNS, Camera, ModelCard, ModelError
+from mtlnet.card import RUNS, Camera, ModelCard, ModelError, read_card
 from mtlnet.checkpoint import list_checkpoints, load_checkpoint, save_checkpoint
 from mtlnet.config import TrainConfig, write_config
 from mtlnet.curves import Curves
@@ -31,11 +32,16 @@ from mtlnet.plan import find_plan
 from mtlnet.publish import publish
 from mtlnet.recipe import Recipe, find_recipe
 from mtlnet.report import describe_data
+from mtlnet.together import ALONE, Part, agree, find_part, joined, wait
 from mtlnet.trainer import Trainer, keep_freed_memory
 from trackfeatures.errors import UserError
 
 LOG_EVERY = 10
 CHECKPOINT_SECONDS = 60.0
+DIVERGED = (
+    "training stops, the last good checkpoint stays; start anew with smaller --alpha or another "
+    "--seed, or look at the data with `datagen verify`"
+)
 CHECK_FRAMES = 16
 """Frames on which the exported graph is held against torch."""
 
@@ -67,28 +73,61 @@ def train(
     starts a new run. Raises UserError (data, an existing folder), Stopped after Ctrl-C.
     """
     recipe = find_recipe(config.recipe)
-    device = choose_device(config.device)
+    part = find_part()
+    device = choose_device(config.device, part)
+    try:
+        with joined(part, device, config.batch):
+            return _train(config, resumed, report, recipe, device, part)
+    except torch.OutOfMemoryError as error:
+        raise UserError(
+            f"the memory of {device} is used up; give a smaller --batch than {config.batch}, or "
+            "train with --device cpu"
+        ) from error
+
+
+def _train(
+    config: TrainConfig,
+    resumed: dict[str, Any] | None,
+    report: Report,
+    recipe: Recipe,
+    device: torch.device,
+    part: Part,
+) -> ModelCard:
     dataset = open_training_data(config.data)
     frames, held_out = hold_out(dataset)
     data = describe_data(dataset, frames, held_out)
     camera = Camera(**dataset.camera.as_dict())  # type: ignore[arg-type]  # sizes are int
-    if resumed is None:
+    if resumed is None and part.first:
         create_run(config, recipe, data)
-    else:
+    if resumed is not None:
         require_same_data(config, resumed, data)
-    torch.set_num_threads(config.threads or os.cpu_count() or 1)
+    torch.set_num_threads(config.threads or max((os.cpu_count() or 1) // part.local, 1))
     cv2.setNumThreads(1)  # the loader's images are small: a second pool would only fight torch's
     keep_freed_memory()
-    trainer = Trainer(recipe, config.alpha, config.seed, device, find_plan(config.network))
-    loader = Loader(frames, camera, config.batch, config.seed, augment=recipe.augment)
+    mine = (part.rank, part.world)
+    trainer = Trainer(
+        recipe,
+        config.alpha,
+        config.seed,
+        device,
+        find_plan(config.network),
+        balance=config.balance,
+        epoch=len(frames) // config.batch,
+        part=mine,
+    )
+    loader = Loader(frames, camera, config.batch, config.seed, augment=recipe.augment, part=mine)
     trainer.standardise(loader)
     elapsed_s = 0.0
     checkpoints = list_checkpoints(config.out) if resumed is not None else []
     if checkpoints:
         elapsed_s = load_checkpoint(checkpoints[-1], trainer)
+    wait()  # until all have read it, the first one writes nothing
     try:
-        learn(config, trainer, loader, elapsed_s, report)
-        return finish(config, trainer, frames, held_out, camera, data)
+        learn(config, trainer, loader, elapsed_s, report, part)
+        if part.first:
+            finish(config, trainer, frames, held_out, camera, data)
+        wait()
+        return read_card(config.out)
     except OSError as error:
         where = f" ({error.filename})" if error.filename else ""
         raise UserError(
@@ -126,35 +165,60 @@ def finish(
 
 
 def learn(
-    config: TrainConfig, trainer: Trainer, loader: Loader, elapsed_s: float, report: Report
+    config: TrainConfig,
+    trainer: Trainer,
+    loader: Loader,
+    elapsed_s: float,
+    report: Report,
+    part: Part,
 ) -> None:
     """Take steps until the iterations or the minutes are used up; checkpoints on the way."""
+    written = Curves(config.out, trainer.step_number) if part.first else None
     begin = time.perf_counter() - elapsed_s
     saved = logged = time.perf_counter()
     window: list[torch.Tensor] = []
-    with Curves(config.out, trainer.step_number) as curves, StopRequest() as stop:
+    with written or nullcontext() as curves, StopRequest() as stop:
         batches = loader.batches(trainer.step_number)
-        while (done := fraction(config, trainer, time.perf_counter() - begin)) < 1.0:
+        while True:
+            now = time.perf_counter()
+            here = [fraction(config, trainer, now - begin), stop.requested, now - saved]
+            done, stopping, unsaved_s = agree(here, trainer.device)
+            if stopping or unsaved_s > CHECKPOINT_SECONDS:
+                require_finite(window, trainer.step_number)
+                path = keep(config, trainer, now - begin, part)
+                saved = now
+                if stopping:
+                    raise Stopped(str(path))
+            if done >= 1.0:
+                break
             losses = trainer.step(next(batches), done)
-            window.append(
-                torch.stack([losses.distance, losses.angle, losses.type, losses.total.detach()])
-            )
+            window.append(losses.row())
+            if trainer.device.type == "cpu":  # on a GPU, asking would wait for it
+                require_finite(window[-1:], trainer.step_number)
             if trainer.step_number % LOG_EVERY == 0:
                 now = time.perf_counter()
+                require_finite(window, trainer.step_number)
                 means = torch.stack(window).double().mean(0).cpu().numpy()
-                require_finite(means, trainer.step_number)
                 speed = len(window) * config.batch / (now - logged)
                 window, logged = [], now
                 point = Progress(trainer.step_number, done, now - begin, speed, means)
-                rate = trainer.optimiser.param_groups[0]["lr"]
-                curves.write(dict(zip(curves.columns, as_row(point, rate), strict=True)))
-                report(point)
-            if stop.requested or time.perf_counter() - saved > CHECKPOINT_SECONDS:
-                path = save_checkpoint(config.out, trainer, time.perf_counter() - begin)
-                saved = time.perf_counter()
-                if stop.requested:
-                    raise Stopped(str(path))
-        save_checkpoint(config.out, trainer, time.perf_counter() - begin)
+                if curves is not None:
+                    row = as_row(point, trainer)
+                    curves.write(dict(zip(curves.columns, row, strict=True)))
+                    report(point)
+        require_finite(window, trainer.step_number)
+        keep(config, trainer, time.perf_counter() - begin, part)
+
+
+def keep(config: TrainConfig, trainer: Trainer, elapsed_s: float, part: Part) -> Path:
+    """Save a checkpoint, in the first process."""
+    if not part.first:
+        return config.out
+    if not all(bool(p.isfinite().all()) for p in trainer.network.parameters()):
+        raise UserError(
+            f"a weight is no finite number after batch {trainer.step_number}; {DIVERGED}"
+        )
+    return save_checkpoint(config.out, trainer, elapsed_s)
 
 
 def fraction(config: TrainConfig, trainer: Trainer, elapsed_s: float) -> float:
@@ -166,18 +230,21 @@ def fraction(config: TrainConfig, trainer: Trainer, elapsed_s: float) -> float:
     return max(by_steps, by_clock)
 
 
-def as_row(point: Progress, rate: float) -> tuple[float, ...]:
+def as_row(point: Progress, trainer: Trainer) -> tuple[float, ...]:
     """A point of the curves, in the order of their columns."""
-    return (point.step, point.elapsed_s, rate, point.images_per_second, *point.losses.tolist())
+    rate = trainer.optimiser.param_groups[0]["lr"]
+    head = (point.step, point.elapsed_s, rate, point.images_per_second)
+    return (*head, *point.losses.tolist(), *trainer.balance.weights())
 
 
-def require_finite(losses: NDArray[np.float64], step: int) -> None:
-    """Raise UserError when training has diverged."""
-    if not np.isfinite(losses).all():
-        raise UserError(
-            f"the loss is no longer a finite number at step {step} (distance, angle, type, total: "
-            f"{losses.tolist()}); resume from the last checkpoint with other data or smaller alpha"
-        )
+def require_finite(window: Sequence[torch.Tensor], step: int) -> None:
+    """Raise UserError when training has diverged in the last steps: losses (4,) each."""
+    for before, losses in enumerate(reversed(window)):
+        if not bool(losses.isfinite().all()):
+            raise UserError(
+                f"the loss of batch {step - before} is no finite number (distance, angle, type, "
+                f"total: {losses.tolist()}); {DIVERGED}"
+            )
 
 
 def open_training_data(path: Path) -> Dataset:
@@ -218,10 +285,12 @@ def require_same_data(config: TrainConfig, resumed: dict[str, Any], data: dict[s
             )
 
 
-def choose_device(name: str) -> torch.device:
+def choose_device(name: str, part: Part = ALONE) -> torch.device:
     """The device called `name`; "auto": a GPU where there is one."""
     if name == "auto":
         name = "cuda" if torch.cuda.is_available() else "cpu"
+    if name == "cuda" and part.local > 1:
+        name = f"cuda:{part.local_rank}"
     if not re.fullmatch(r"cpu|cuda(:\d{1,3})?", name):
         raise UserError(f"--device {name!r} is not known; use auto, cpu, cuda or cuda:NUMBER")
     device = torch.device(name)

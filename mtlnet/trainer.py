@@ -2,20 +2,22 @@
 
 import ctypes
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
+from mtlnet.balance import STRETCH, Balance
 from mtlnet.loader import Batch, Loader
 from mtlnet.loss import Alpha, Losses, multi_task_loss
 from mtlnet.network import Network, initialise
 from mtlnet.plan import MTL, Plan
 from mtlnet.recipe import MOMENTUM, Recipe, learning_rate
 from mtlnet.swift import training_outputs
+from mtlnet.together import average
 
 MIN_TARGET_STD = 0.01
 
@@ -24,19 +26,30 @@ class Trainer:
     """Trains a network; `step_number` counts the steps taken."""
 
     def __init__(
-        self, recipe: Recipe, alpha: Alpha, seed: int, device: torch.device, plan: Plan = MTL
+        self,
+        recipe: Recipe,
+        alpha: Alpha,
+        seed: int,
+        device: torch.device,
+        plan: Plan = MTL,
+        *,
+        balance: str = "fixed",
+        epoch: int = STRETCH,
+        part: tuple[int, int] = (0, 1),
     ) -> None:
         self.recipe = recipe
         self.alpha = alpha
         self.seed = seed
         self.device = device
+        self.part = part
+        self.balance = Balance(balance, alpha, device, epoch)
         self.step_number = 0
         network = Network(
             batch_norm=recipe.batch_norm or plan.backbone, dropout=recipe.dropout, plan=plan
         )
         initialise(network, seed)
         self.network = network.to(device).to(memory_format=torch.channels_last)
-        self.optimiser = make_optimiser(self.network, recipe)
+        self.optimiser = make_optimiser(self.network, recipe, self.balance.parameters)
         self.scale: Tensor | None = None
         if recipe.dropout:
             # Dropout takes no generator of its own: this is torch's only place for a seed.
@@ -62,12 +75,22 @@ class Trainer:
         heading = torch.from_numpy(batch.heading).to(self.device, non_blocking=True)
         images = torch.from_numpy(batch.images).to(self.device, non_blocking=True)
         outputs = self.outputs(images)
-        losses = multi_task_loss(outputs, coded, heading, self.alpha, self.scale)
+        losses = multi_task_loss(outputs, coded, heading, self._combine(), self.scale)
         self.optimiser.zero_grad(set_to_none=True)
         losses.total.backward()  # type: ignore[no-untyped-call]  # torch leaves it untyped
+        seen = [losses.distance, losses.angle, losses.type, losses.total.detach(), losses.terms]
+        average([*seen, *self._gradients()])
+        self.balance.note(losses.terms)
         self.optimiser.step()
         self.step_number += 1
         return losses
+
+    def _combine(self) -> Alpha | Callable[[Tensor], Tensor]:
+        return self.alpha if self.balance.kind == "fixed" else self.balance.total
+
+    def _gradients(self) -> list[Tensor]:
+        groups = self.optimiser.param_groups
+        return [p.grad for group in groups for p in group["params"] if p.grad is not None]
 
     def outputs(self, images: Tensor) -> Tensor:
         """What the network in training answers, (B, 9), to images (B, 210, 280, 3) uint8."""
@@ -75,7 +98,7 @@ class Trainer:
         dtype = torch.bfloat16 if not on_cpu or cpu_has_bf16() else torch.float32
         if on_cpu and self.network.plan is MTL:
             seed = [self.seed, 3, self.step_number]
-            masks = dropout_masks(self.recipe.dropout, MTL.shared, len(images), seed)
+            masks = dropout_masks(self.recipe.dropout, MTL.shared, len(images), seed, self.part)
             return training_outputs(self.network, images, dtype, masks)
         with torch.autocast(self.device.type, dtype, enabled=dtype != torch.float32):
             answers: Tensor = self.network(images)
@@ -102,19 +125,21 @@ def dropout_masks(
     return [torch.from_numpy((d >= share) / np.float32(1 - share)) for d in drawn]
 
 
-def make_optimiser(network: Network, recipe: Recipe) -> torch.optim.Optimizer:
-    """SGD or AdamW, fused: one pass over the nine million parameters."""
+def make_optimiser(
+    network: Network, recipe: Recipe, beside: Sequence[nn.Parameter] = ()
+) -> torch.optim.Optimizer:
+    """SGD or AdamW, fused: one pass over the nine million parameters; none of `beside` decays."""
     if recipe.optimiser == "sgd":
         # The gradient of l2 * |w|^2 is 2 * l2 * w.
+        groups = [
+            {"params": list(network.parameters()), "weight_decay": 2 * recipe.l2},
+            {"params": list(beside), "weight_decay": 0.0},
+        ]
         return torch.optim.SGD(
-            network.parameters(),
-            recipe.learning_rate,
-            MOMENTUM,
-            weight_decay=2 * recipe.l2,
-            fused=True,
+            groups[: 1 + bool(beside)], recipe.learning_rate, MOMENTUM, fused=True
         )
     weights = [p for p in network.parameters() if p.ndim > 1]
-    others = [p for p in network.parameters() if p.ndim <= 1]
+    others = [p for p in network.parameters() if p.ndim <= 1] + list(beside)
     groups = [
         {"params": weights, "weight_decay": recipe.l2},
         {"params": others, "weight_decay": 0.0},

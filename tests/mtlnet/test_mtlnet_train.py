@@ -1,6 +1,9 @@
 """Training learns, and a run that was stopped goes on to the same bits."""
 
 import json
+import signal
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,6 +21,7 @@ from mtlnet.config import TrainConfig, resume_config
 from mtlnet.curves import read_curves
 from mtlnet.loader import Loader
 from mtlnet.recipe import RECIPES, learning_rate
+from mtlnet.swift import training_outputs
 from mtlnet.train import Progress, Stopped, train
 from mtlnet.trainer import Trainer
 from trackfeatures.errors import UserError
@@ -31,7 +35,7 @@ def config(dataset: Path, out: Path, **changes: Any) -> TrainConfig:
 
 
 class StopAt:
-    """Ctrl-C after so many steps: `requested` is asked once a step until it is true."""
+    """Ctrl-C after so many steps: `requested` is asked once before each until it is true."""
 
     def __init__(self, steps: int) -> None:
         self.steps = steps
@@ -39,7 +43,7 @@ class StopAt:
     @property
     def requested(self) -> bool:
         self.steps -= 1
-        return self.steps <= 0
+        return self.steps < 0
 
     def __enter__(self) -> "StopAt":
         return self
@@ -64,12 +68,14 @@ def test_one_batch_is_overfitted(dataset: Path) -> None:
     assert float(last.angle) < 0.1 * float(np.var(batch.coded[:, 5]))
 
 
-@pytest.mark.parametrize("recipe", ["fast", "paper"])
+@pytest.mark.parametrize(("recipe", "balance"), [("fast", "dwa"), ("paper", "uncertainty")])
 def test_stopped_and_resumed_is_the_unbroken_run(
-    dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, recipe: str
+    dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, recipe: str, balance: str
 ) -> None:
-    train(config(dataset, tmp_path / "whole", recipe=recipe), None)
-    broken = config(dataset, tmp_path / "broken", recipe=recipe)
+    monkeypatch.setattr("mtlnet.balance.STRETCH", 1)
+    monkeypatch.setattr("mtlnet.train.LOG_EVERY", 1)
+    train(config(dataset, tmp_path / "whole", recipe=recipe, balance=balance), None)
+    broken = config(dataset, tmp_path / "broken", recipe=recipe, balance=balance)
     with monkeypatch.context() as patch:
         patch.setattr(mtlnet.train, "StopRequest", lambda: StopAt(2))
         with pytest.raises(Stopped, match="step-00000002"):
@@ -79,8 +85,84 @@ def test_stopped_and_resumed_is_the_unbroken_run(
     resumed, data = resume_config(broken.out, {})
     assert resumed == broken
     train(resumed, data)
-    whole, again = (load_file(tmp_path / run / WEIGHTS) for run in ("whole", "broken"))
-    assert [name for name in whole if not np.array_equal(whole[name], again[name])] == []
+    assert differences(tmp_path / "whole", broken.out) == []
+    weights = [weights_in(tmp_path / run) for run in ("whole", "broken")]
+    assert weights[0] == weights[1]
+    assert len({tuple(row) for row in weights[0]}) > 1  # they move
+
+
+def differences(one: Path, other: Path) -> list[str]:
+    """Names of the weights that are not bit-equal in two runs."""
+    a, b = load_file(one / WEIGHTS), load_file(other / WEIGHTS)
+    return [name for name in a if not np.array_equal(a[name], b[name])]
+
+
+def weights_in(run: Path) -> list[list[float]]:
+    """The tasks' weights along a run."""
+    names = ("distance_weight", "angle_weight", "type_weight")
+    return [[point[name] for name in names] for point in read_curves(run / "curves.csv")]
+
+
+def test_a_full_gpu_is_one_line(
+    dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> None:
+        raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 MiB.\n...")
+
+    monkeypatch.setattr("mtlnet.train.learn", full)
+    with pytest.raises(UserError, match="memory of cpu is used up; give a smaller --batch than 4"):
+        train(config(dataset, tmp_path / "run"), None)
+
+
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+import mtlnet.train, mtlnet.whole
+from mtlnet.config import TrainConfig
+sync, seen = os.fsync, []
+def die(file):
+    if os.readlink(f"/proc/self/fd/{file}").endswith("00000004.safetensors.partial"):
+        os.kill(os.getpid(), signal.SIGKILL)
+    sync(file)
+mtlnet.whole.os.fsync = die
+mtlnet.train.CHECKPOINT_SECONDS = 0.0
+data, out = map(Path, sys.argv[1:])
+given = {"iterations": 6, "batch": 4, "seed": 7, "device": "cpu", "threads": 1}
+mtlnet.train.train(TrainConfig(data, out, **given), None)
+"""
+
+
+def test_killed_while_it_saves_it_goes_on_from_the_checkpoint_before(
+    dataset: Path, tmp_path: Path
+) -> None:
+    killed = tmp_path / "killed"
+    done = subprocess.run([sys.executable, "-c", KILLED, dataset, killed], capture_output=True)
+    assert done.returncode == -signal.SIGKILL, done.stderr
+    assert [path.name for path in list_checkpoints(killed)][-1] == "step-00000003.safetensors"
+    resumed, data = resume_config(killed, {})
+    train(resumed, data)
+    train(config(dataset, tmp_path / "whole", iterations=6), None)
+    assert differences(tmp_path / "whole", killed) == []
+
+
+def test_a_loss_that_is_no_number_stops_the_run_at_its_batch(
+    dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("mtlnet.train.CHECKPOINT_SECONDS", 0.0)
+    sound = training_outputs
+    calls: list[int] = []
+
+    def outputs(*given: Any) -> torch.Tensor:
+        calls.append(1)
+        return sound(*given) * (float("nan") if len(calls) == 3 else 1.0)
+
+    monkeypatch.setattr("mtlnet.trainer.training_outputs", outputs)
+    with pytest.raises(UserError, match="the loss of batch 3 is no finite number") as caught:
+        train(config(dataset, tmp_path / "run"), None)
+    assert "\n" not in str(caught.value)
+    (*_, last) = list_checkpoints(tmp_path / "run")
+    assert last.name == "step-00000002.safetensors"
+    assert all(np.isfinite(value).all() for value in load_file(last).values())
 
 
 def test_a_run_keeps_what_it_was(dataset: Path, tmp_path: Path) -> None:
