@@ -62,11 +62,14 @@ check: $(READY) ## format, lint, types, imports
 quick: $(READY) ## the tests that take seconds
 	$(BIN)/pytest $(PARALLEL) -m "not slow and not alone"
 
+fuzz: $(READY) ## a million damaged images through the service's gate, in process
+	$(BIN)/python benchmarks/service_fuzz.py
+
 e2e: $(READY) ## one round from the simulator to a steered car
 	$(BIN)/pytest tests/e2e
 
 bench: $(READY) ## every benchmark, side by side with what it claims to beat
-	for script in benchmarks/*.py; do $(BIN)/python $$script || exit 1; done
+	for script in $(filter-out %_fuzz.py,$(wildcard benchmarks/*.py)); do $(BIN)/python $$script || exit 1; done
 
 format: $(READY) ## put the code in order
 	$(BIN)/ruff format .

@@ -208,10 +208,11 @@ def test_a_client_that_leaves_in_mid_upload_is_no_failure(
     assert [record for record in caplog.records if record.levelname == "ERROR"] == []
 
 
+@pytest.mark.slow
 def test_mutated_images_never_break_it(service: Served) -> None:
     rng = np.random.default_rng(20)
     statuses = set()
-    for number in range(1000):
+    for number in range(3000):
         whole = bytearray((JPEG, PNG)[number % 2])
         for place in rng.integers(0, len(whole), rng.integers(1, 20)):
             whole[place] = rng.integers(256)

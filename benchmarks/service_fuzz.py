@@ -1,0 +1,110 @@
+"""A million damaged images through all that reads them in the service, in process.
+
+Each is a JPEG or PNG with flipped bits, overwritten, cut or repeated parts, lies in its header, or
+another file behind it. It must give pixels or one of our own errors: anything else is a fault,
+whose seed and number make it again. Memory is read after a tenth of the images and at the end.
+
+    python benchmarks/service_fuzz.py [--count 1000000] [--seed 0] [--workers N]
+"""
+
+import argparse
+import os
+import sys
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+
+import cv2
+import numpy as np
+import simplejpeg
+
+from mtlnet.card import Camera
+from mtlnet.image_error import ImageError
+from mtlnet.images import decode, inspect
+
+MAX_GROWTH = 0.01
+VIEW = Camera()
+
+
+def seeds() -> list[bytes]:
+    """Small whole images of each kind: a mutation then hits what matters, and costs little."""
+    rng = np.random.default_rng(0)
+    image = rng.integers(0, 256, (21, 28, 3), np.uint8)
+    progressive = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_PROGRESSIVE, 1])[1].tobytes()
+    restarts = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_RST_INTERVAL, 1])[1].tobytes()
+    pngs = [cv2.imencode(".png", found)[1].tobytes() for found in (image, image[:, :, 0])]
+    return [simplejpeg.encode_jpeg(image, 90), progressive, restarts, *pngs]
+
+
+def mutate(rng: np.random.Generator, whole: list[bytes]) -> bytes:
+    """One damaged image."""
+    body = bytearray(whole[rng.integers(len(whole))])
+    for _ in range(rng.integers(1, 5)):
+        at, size = int(rng.integers(len(body))), int(rng.integers(1, 40))
+        match rng.integers(7):
+            case 0:
+                body[at] ^= 1 << int(rng.integers(8))
+            case 1:  # headers lie in the first hundred bytes
+                body[min(at, int(rng.integers(100)), len(body) - 1)] = int(rng.integers(256))
+            case 2:
+                body[at : at + size] = rng.bytes(size)
+            case 3:
+                body[at : at + size] = body[at : at + size] * 2
+            case 4:
+                del body[at + 1 :]
+            case 5:
+                body += whole[rng.integers(len(whole))]
+            case 6:  # numbers at their ends, where a size may stand
+                body[at : at + 2] = (b"\xff\xff", b"\x00\x00", b"\x7f\xff")[rng.integers(3)]
+    return bytes(body)
+
+
+def memory_mb() -> float:
+    """What this process holds of the machine's memory."""
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
+
+
+def run(seed: int, part: int, count: int) -> tuple[int, int, float, list[str]]:
+    """(images that gave pixels, refused, growth of memory, faults) of one part."""
+    whole, accepted, refused, faults = seeds(), 0, 0, []
+    early = 0.0
+    for number in range(count):
+        rng = np.random.default_rng([seed, part, number])
+        body = mutate(rng, whole)
+        try:
+            image = decode(body, inspect(body, VIEW), VIEW)
+            accepted += 1
+            if image.shape != (210, 280, 3):
+                faults.append(f"part {part}, number {number}: shape {image.shape}")
+        except ImageError:
+            refused += 1
+        except Exception as error:  # noqa: BLE001  # just what is looked for
+            faults.append(f"part {part}, number {number}: {error!r}")
+        if number == count // 10:
+            early = memory_mb()
+    return accepted, refused, memory_mb() / early - 1.0, faults
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--count", type=int, default=1_000_000)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
+    options = parser.parse_args()
+    share = options.count // options.workers
+    with ProcessPoolExecutor(options.workers) as pool:  # a crash breaks the pool, and is told
+        parts = range(options.workers)
+        results = list(
+            pool.map(run, [options.seed] * len(parts), parts, [share] * len(parts), chunksize=1)
+        )
+    accepted, refused = sum(r[0] for r in results), sum(r[1] for r in results)
+    growth = max(result[2] for result in results)
+    faults = [fault for result in results for fault in result[3]]
+    print(f"{accepted} gave pixels, {refused} were refused, {len(faults)} faults")
+    print(f"memory grew by {100 * growth:.2f} %, claim: under {100 * MAX_GROWTH:g} %")
+    print("\n".join(faults[:20]))
+    sys.exit(bool(faults) or growth >= MAX_GROWTH)
+
+
+if __name__ == "__main__":
+    main()
