@@ -20,7 +20,7 @@ from mtlnet.card import (
     check_files,
     read_card,
 )
-from mtlnet.doubt import read_doubt
+from mtlnet.doubt import read_doubt, texture
 from mtlnet.exported import int8_graph, passed_gate
 
 if TYPE_CHECKING:
@@ -137,7 +137,9 @@ class TorchEngine:
 
         check_image(image, self._shape)
         x, outputs = describe_images(self._network, image[None])
-        return outputs[0] if self._doubt is None else np.append(outputs, self._doubt.assess(x))
+        if self._doubt is None:
+            return outputs[0]
+        return np.append(outputs, self._doubt.assess(x, texture(image)[None]))
 
 
 def parse_kind(text: str) -> Kind:

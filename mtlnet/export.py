@@ -31,21 +31,37 @@ def build_graph(network: Network, doubt: Doubt | None = None) -> Any:
     import openvino
     from openvino import opset13 as ops
 
+    images, pixels, x, nine = _network_graph(ops, network)
+    second = [] if doubt is None else doubt_outputs(ops, x, pixels, doubt)
+    outputs = ops.concat([nine, *second], 1)
+    return openvino.Model([ops.result(outputs)], [images], "mtlnet")
+
+
+def describing_graph(network: Network) -> Any:
+    """The same with two results: the nine outputs, and the last shared features (1, F)."""
+    import openvino
+    from openvino import opset13 as ops
+
+    images, _, x, nine = _network_graph(ops, network)
+    return openvino.Model([ops.result(nine), ops.result(x)], [images], "mtlnet")
+
+
+def _network_graph(ops: Any, network: Network) -> tuple[Any, Any, Any, Any]:
+    """As nodes: the images, their pixels (1, 3, H, W) in [-1, 1], the last shared features, the
+    nine outputs."""
     weights = {name: t.detach().cpu().numpy() for name, t in network.state_dict().items()}
     images = ops.parameter([1, HEIGHT, WIDTH, 3], np.uint8, name="images")
     x = ops.convert(images, np.float32)
     x = ops.subtract(ops.multiply(x, np.float32(1 / 127.5)), np.float32(1))
-    x = ops.transpose(x, np.array([0, 3, 1, 2]))
-    x = features_graph(ops, x, network)
+    pixels = ops.transpose(x, np.array([0, 3, 1, 2]))
+    x = features_graph(ops, pixels, network)
     for number in range(len(network.plan.shared)):
         x = ops.relu(_linear(ops, x, weights, f"shared.fc{number}.layer"))
     distance, angle, kind = (
         precise_linear(ops, x, weights[f"heads.{name}.weight"], weights[f"heads.{name}.bias"])
         for name, _ in HEADS
     )
-    second = [] if doubt is None else doubt_outputs(ops, x, doubt)
-    outputs = ops.concat([distance, angle, ops.softmax(kind, 1), *second], 1)
-    return openvino.Model([ops.result(outputs)], [images], "mtlnet")
+    return images, pixels, x, ops.concat([distance, angle, ops.softmax(kind, 1)], 1)
 
 
 def _linear(ops: Any, x: Any, weights: dict[str, NDArray[np.float32]], name: str) -> Any:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mtlnet.doubt import Doubt
+from mtlnet.doubt import COLUMNS_OF_CELLS, ROWS_OF_CELLS, SMALLEST, Doubt
 
 
 def precise_product(ops: Any, x: Any, weight: NDArray[np.float32]) -> Any:
@@ -23,12 +23,30 @@ def precise_linear(ops: Any, x: Any, weight: NDArray[np.float32], bias: NDArray[
     return ops.add(precise_product(ops, x, weight), bias[None])
 
 
-def doubt_outputs(ops: Any, x: Any, doubt: Doubt) -> list[Any]:
-    """`Doubt.assess` of the last shared features x (1, F): standard deviations, novelty."""
+def doubt_outputs(ops: Any, x: Any, pixels: Any, doubt: Doubt) -> list[Any]:
+    """`Doubt.assess` of the last shared features x (1, F) and pixels (1, 3, H, W) in [-1, 1]."""
     z = ops.multiply(ops.subtract(x, doubt.centre[None]), doubt.scale[None])
     hidden = ops.relu(precise_linear(ops, z, doubt.hidden_weight, doubt.hidden_bias))
     logarithm = precise_linear(ops, hidden, doubt.weight, doubt.bias)
     limited = ops.minimum(ops.maximum(logarithm, doubt.low[None]), doubt.high[None])
-    along = precise_product(ops, z, doubt.directions)
+    strange = ops.subtract(texture_graph(ops, pixels), doubt.usual[None])
+    along = precise_product(ops, strange, doubt.directions)
     novelty = ops.reduce_sum(ops.multiply(along, along), np.array([1]), keep_dims=True)
     return [ops.exp(limited), novelty]
+
+
+def texture_graph(ops: Any, pixels: Any) -> Any:
+    """`mtlnet.doubt.texture` of pixels (1, 3, H, W): (1, T)."""
+    _, _, height, width = pixels.shape
+    grey = ops.reduce_mean(pixels, np.array([1]), keep_dims=True)
+    planes = [pixels]
+    for axis, size in ((3, width), (2, height)):
+        ends = np.array([0] * axis + [1] + [0] * (3 - axis))
+        longer = ops.pad(grey, np.zeros(4, int), ends, "edge")
+        one, all_, by = np.array([1]), np.array([size + 1]), np.array([1])
+        later = ops.slice(longer, one, all_, by, np.array([axis]))
+        planes.append(ops.abs(ops.subtract(later, grey)))
+    cell = [height // ROWS_OF_CELLS, width // COLUMNS_OF_CELLS]
+    means = [ops.avg_pool(plane, cell, [0, 0], [0, 0], cell, False) for plane in planes]
+    means[1:] = [ops.sqrt(ops.add(mean, np.float32(SMALLEST))) for mean in means[1:]]
+    return ops.reshape(ops.concat(means, 1), np.array([1, -1]), special_zero=False)

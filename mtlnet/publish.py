@@ -25,7 +25,7 @@ from mtlnet.card import (
     ModelError,
     file_hash,
 )
-from mtlnet.doubt import Doubt, FittedDoubt, write_doubt
+from mtlnet.doubt import Doubt, FittedDoubt, texture, write_doubt
 from mtlnet.export import DOUBT_TOLERANCE, TOLERANCE, write_graph
 from mtlnet.golden import golden_image
 from mtlnet.network import HEIGHT, WIDTH, Network, answer_images, describe_images, fold
@@ -112,7 +112,8 @@ def compare(
     from mtlnet.engine import best_precision
 
     x, expected = describe_images(network, images)
-    second = None if doubt is None else doubt.assess(x)
+    textures = np.stack([texture(image) for image in images])
+    second = None if doubt is None else doubt.assess(x, textures)
     core = openvino.Core()
     differences = {"frames": float(len(images))}
     for precision in dict.fromkeys(("f32", best_precision(core))):
