@@ -18,6 +18,9 @@ from urllib.parse import SplitResult, urlsplit
 from trackfeatures.errors import UserError
 
 POLL_S = 0.1
+MAX_DEADLINE_MS = 60_000  # the longest that the service takes
+# Refusals of a frame that stay true when it is sent again.
+FINAL = ("/problems/superseded", "/problems/deadline-passed")
 UNSENDABLE = re.compile("[^!-~]")  # what the path of an HTTP request cannot hold
 PNG_SIGNATURE = b"\x89PNG"
 # How a connection dies that the service closed while it was idle.
@@ -27,13 +30,30 @@ DROPPED = (http.client.RemoteDisconnected, ConnectionResetError, BrokenPipeError
 class ServiceError(UserError):
     """The service cannot be reached or gave no answer.
 
-    `status` is the HTTP status and `problem` the problem's type, None where nothing came back.
+    `status` is the HTTP status and `problem` the problem's type, None where nothing came back;
+    `retry_after_s` is when the service says to ask again.
     """
 
-    def __init__(self, message: str, status: int | None = None, problem: str | None = None) -> None:
+    def __init__(
+        self,
+        message: str,
+        status: int | None = None,
+        problem: str | None = None,
+        retry_after_s: float | None = None,
+    ) -> None:
         super().__init__(message)
         self.status = status
         self.problem = problem
+        self.retry_after_s = retry_after_s
+
+
+def retry_pause_s(error: ServiceError) -> float | None:
+    """How long to wait before the same is asked again, s; None where that would not help."""
+    if error.status is None:  # nobody answered: it may be starting
+        return POLL_S
+    if error.status not in (429, 503) or error.problem in FINAL:
+        return None
+    return POLL_S if error.retry_after_s is None else min(error.retry_after_s, POLL_S)
 
 
 class Client:
@@ -50,18 +70,52 @@ class Client:
         self._timeout_s = timeout_s
 
     def features(
-        self, image: bytes, content_type: str | None = None, frame_id: str | None = None
+        self,
+        image: bytes,
+        content_type: str | None = None,
+        frame_id: str | None = None,
+        *,
+        stream: str | None = None,
+        deadline_s: float | None = None,
     ) -> dict[str, Any]:
         """The service's answer to a JPEG or PNG file's bytes, as DESIGN §9 gives it.
 
-        `content_type` None: by the image's first bytes. Raises ServiceError.
+        `content_type` None: by the image's first bytes. `stream`: a newer frame of it supersedes
+        this one. With `deadline_s` the service drops the frame when it is late, and where asking
+        again may help (it is full, not ready, or restarts), that is done until then. Raises
+        ServiceError.
         """
         if content_type is None:
             content_type = "image/png" if image.startswith(PNG_SIGNATURE) else "image/jpeg"
         headers = {"Content-Type": content_type}
         if frame_id is not None:
             headers["X-Frame-Id"] = frame_id
-        return self._ask("POST", "/features", image, headers)
+        if stream is not None:
+            headers["X-Stream-Id"] = stream
+        if deadline_s is None:
+            return self._ask("POST", "/features", image, headers)
+        return self._ask_until(time.monotonic() + deadline_s, image, headers)
+
+    def _ask_until(self, end: float, image: bytes, headers: dict[str, str]) -> dict[str, Any]:
+        """Ask, and ask again as long as that may help, until `end` (s, monotonic)."""
+        while True:
+            left_s = max(0.0, end - time.monotonic())
+            headers["X-Deadline-Ms"] = f"{min(1e3 * left_s, MAX_DEADLINE_MS):.1f}"
+            self._wait_at_most(max(left_s, 0.001))
+            try:
+                return self._ask("POST", "/features", image, headers)
+            except ServiceError as error:
+                pause_s = retry_pause_s(error)
+                if pause_s is None or time.monotonic() + pause_s >= end:
+                    raise
+            finally:
+                self._wait_at_most(self._timeout_s)
+            time.sleep(pause_s)
+
+    def _wait_at_most(self, seconds: float) -> None:
+        self._connection.timeout = seconds
+        if self._connection.sock is not None:
+            self._connection.sock.settimeout(seconds)
 
     def model(self) -> dict[str, Any]:
         """The card of the model that answers. Raises ServiceError."""
@@ -188,5 +242,9 @@ def _read(status: int, content: bytes, asked: str) -> dict[str, Any]:
         )
     if status != 200:
         detail = answer.get("detail", "no reason given")
-        raise ServiceError(f"{asked} answered {status}: {detail}", status, answer.get("type"))
+        after_ms = answer.get("retry_after_ms")
+        after_s = after_ms / 1e3 if isinstance(after_ms, int | float) else None
+        raise ServiceError(
+            f"{asked} answered {status}: {detail}", status, answer.get("type"), after_s
+        )
     return answer

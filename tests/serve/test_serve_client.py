@@ -1,7 +1,9 @@
 """The client against the service, and against listeners that behave badly."""
 
+import re
 import socket
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
@@ -86,6 +88,47 @@ def test_a_dropped_idle_connection_is_opened_again() -> None:
 
     with listener(one_answer_each) as url, Client(url) as client:
         assert [client.model()["number"] for _ in range(3)] == [0, 1, 2]
+
+
+def test_with_a_deadline_it_asks_again_where_that_helps_and_no_longer() -> None:
+    full = b'{"type": "/problems/overloaded", "retry_after_ms": 5}'
+    gone = b'{"type": "/problems/superseded", "retry_after_ms": 5}'
+    asked: list[bytes] = []
+
+    def full_twice(connection: socket.socket, number: int) -> None:
+        asked.append(connection.recv(65536))
+        busy = reply(full, "503 Service Unavailable")
+        connection.sendall(busy if number < 2 else reply(b'{"number": %d}' % number))
+
+    with listener(full_twice) as url:
+        assert Client(url).features(b"image", deadline_s=20, stream="front") == {"number": 2}
+        sent = [float(re.findall(rb"X-Deadline-Ms: (\S+)", found)[0]) for found in asked]
+        assert 20_000 >= sent[0] > sent[1] > sent[2] > 0
+        assert b"X-Stream-Id: front" in asked[0]
+
+    def always(content: bytes) -> Callable[[socket.socket, int], None]:
+        def behave(connection: socket.socket, _number: int) -> None:
+            asked.append(connection.recv(65536))
+            connection.sendall(reply(content, "503 Service Unavailable"))
+
+        return behave
+
+    for content, deadline_s, most in ((gone, 20.0, 1), (full, 0.1, 50)):
+        asked.clear()
+        with listener(always(content)) as url, pytest.raises(ServiceError, match="503") as caught:
+            Client(url).features(b"image", deadline_s=deadline_s)
+        assert caught.value.retry_after_s == 0.005
+        assert 1 <= len(asked) <= most
+
+
+def test_a_silent_service_is_left_at_the_deadline() -> None:
+    quiet = threading.Event()
+    with listener(lambda _connection, _number: quiet.wait(20)) as url:
+        begin = time.monotonic()
+        with pytest.raises(ServiceError, match="gave no answer"):
+            Client(url, timeout_s=15).features(JPEG, deadline_s=0.2)
+        assert time.monotonic() - begin < 10
+        quiet.set()
 
 
 def test_a_service_that_always_hangs_up_is_an_error() -> None:
