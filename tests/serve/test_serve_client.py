@@ -1,14 +1,17 @@
 """The client against the service, and against listeners that behave badly."""
 
+import asyncio
 import re
 import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import pytest
 
+from serve.async_client import AsyncClient
 from serve.client import Client, ServiceError
 from tests.serve.conftest import CARD, FakeEngine, Served, jpeg, outputs, picture, png, serving
 from trackfeatures.listening import bind
@@ -57,6 +60,22 @@ def test_answers_come_as_the_service_gave_them(service: Served) -> None:
         assert client.features(PNG)["model"] == CARD.model_hash
         assert client.model()["camera"]["width"] == 280
     assert Client(f"127.0.0.1:{service.port}").ready()
+
+
+def test_asyncio_clients_ask_at_once(service: Served) -> None:
+    async def ask(number: int) -> dict[str, Any]:
+        async with AsyncClient(service.url) as client:
+            assert await client.ready()
+            assert (await client.model())["model"] == CARD.model_hash
+            with pytest.raises(ServiceError, match="4 bytes"):
+                await client.features(b"text")
+            return await client.features(JPEG, frame_id=str(number), deadline_s=20)
+
+    async def crowd() -> list[dict[str, Any]]:
+        return await asyncio.gather(*(ask(number) for number in range(4)))
+
+    answers = asyncio.run(crowd())
+    assert [answer["frame_id"] for answer in answers] == ["0", "1", "2", "3"]
 
 
 def test_a_refusal_carries_the_problem(service: Served) -> None:
