@@ -54,6 +54,10 @@ def train_command(
             help="fixed (alpha), or weights found by uncertainty or dwa.  [default: fixed]"
         ),
     ] = None,
+    init: Annotated[
+        str | None,
+        typer.Option(help="Run to fine-tune, or default; --data may be images with a labels.csv."),
+    ] = None,
     recipe: Annotated[
         str | None, typer.Option(help="fast (minutes) or paper (days).  [default: fast]")
     ] = None,
@@ -77,6 +81,7 @@ def train_command(
         "data": data,
         "network": network,
         "balance": balance,
+        "init": init,
         "recipe": recipe,
         "iterations": iterations,
         "minutes": minutes,

@@ -11,7 +11,7 @@ from mtlnet.balance import find_balance
 from mtlnet.card import ModelError
 from mtlnet.loss import Alpha
 from mtlnet.plan import find_plan, require_learnable
-from mtlnet.recipe import Recipe
+from mtlnet.recipe import Recipe, find_recipe
 from mtlnet.whole import write_whole
 from trackfeatures.errors import UserError
 
@@ -37,6 +37,8 @@ class TrainConfig:
     """Steps; None: the recipe's, or as many as fit into `minutes`."""
     minutes: float | None = None
     """Time for the training itself; the schedule follows the clock."""
+    init: str | None = None
+    """The run whose model training starts from."""
     seed: int = 0
     batch: int = 32
     device: str = "auto"
@@ -46,6 +48,8 @@ class TrainConfig:
     def __post_init__(self) -> None:
         require_learnable(find_plan(self.network), self.alpha)
         find_balance(self.balance)
+        if self.init is not None and find_recipe(self.recipe).batch_norm:
+            raise UserError(f"recipe {self.recipe} starts anew; with --init give --recipe tune")
         if self.iterations is not None and self.iterations < 1:
             raise UserError(f"--iterations is {self.iterations}; give at least 1")
         if self.minutes is not None and not self.minutes > 0:

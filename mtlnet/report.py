@@ -13,7 +13,7 @@ import trackfeatures as tf
 from datagen.recording import Dataset, Frames, Labels
 from mtlnet.answer import OUTPUTS
 from mtlnet.doubt import FEATURES
-from mtlnet.errors import Numbers, calibration, confusion, coverage, signed_errors, spread
+from mtlnet.errors import Numbers, Truth, calibration, confusion, coverage, signed_errors, spread
 from mtlnet.groups import groups
 
 
@@ -25,11 +25,6 @@ def describe_data(
     `held_out`: rounds on which only its doubt was fitted; it has seen them all the same.
     """
     rounds = [*frames.rounds, *(held_out.rounds if held_out is not None else [])]
-    labels = frames.labels
-    distances = labels.distances.astype(np.float64)
-    counts = (~np.isnan(distances)).sum(0)
-    sums = np.nansum(distances, axis=0)
-    classes = np.bincount(labels.heading, minlength=len(tf.Heading))
     sides = {
         side: [info.id for info in dataset.rounds if info.split == side]
         for side in ("train", "test")
@@ -42,13 +37,23 @@ def describe_data(
         "held_out": [info.id for info in held_out.rounds] if held_out is not None else [],
         "seeds": [info.seed for info in rounds],
         "tracks": sorted({info.track for info in rounds}),
-        "mean": {
-            "distances_m": [float(s / n) if n else None for s, n in zip(sums, counts, strict=True)],
-            "to_lane_centre_m": float(np.nanmean(tf.localise(distances))),
-            "angle_rad": float(labels.angle.astype(np.float64).mean()),
-            "heading": int(classes.argmax()),
-            "heading_share": [float(share) for share in classes / classes.sum()],
-        },
+        "mean": mean_answer(frames.labels),
+    }
+
+
+def mean_answer(labels: Truth) -> dict[str, Any]:
+    """The mean of labels: the answer of one who guesses. None where nothing is labelled."""
+    distances = labels.distances.astype(np.float64)
+    counts = (~np.isnan(distances)).sum(0)
+    sums = np.nansum(distances, axis=0)
+    offset = tf.localise(distances)
+    classes = np.bincount(labels.heading, minlength=len(tf.Heading))
+    return {
+        "distances_m": [float(s / n) if n else None for s, n in zip(sums, counts, strict=True)],
+        "to_lane_centre_m": float(np.nanmean(offset)) if not np.isnan(offset).all() else 0.0,
+        "angle_rad": float(labels.angle.astype(np.float64).mean()),
+        "heading": int(classes.argmax()),
+        "heading_share": [float(share) for share in classes / classes.sum()],
     }
 
 

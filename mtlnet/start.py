@@ -9,6 +9,7 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn
 
 from mtlnet.card import RUNS, ModelError
 from mtlnet.config import CONFIG, TrainConfig, resume_config
+from mtlnet.fine_tune import open_init
 from mtlnet.loss import parse_alpha
 from mtlnet.plan import find_plan
 from mtlnet.recipe import find_recipe
@@ -32,9 +33,15 @@ def start_training(
     else:
         if out is None and find_part().world > 1:
             raise UserError("give --out: several processes must agree on the run's folder")
-        recipe = find_recipe(options.get("recipe", "fast")).name
+        usual: dict[str, Any] = {"recipe": "fast"}
+        if "init" in options:
+            run, card = open_init(options["init"])
+            same = {"network": card.network, "alpha": card.alpha, "recipe": "tune"}
+            usual, options["init"] = same, str(run)
+        else:
+            usual["alpha"] = find_plan(options.get("network", "mtl")).default_alpha
+        recipe = find_recipe(options.get("recipe", usual["recipe"])).name
         folder = out or RUNS / f"{time.strftime('%Y%m%d-%H%M%S')}-{recipe}"
-        usual = {"alpha": find_plan(options.get("network", "mtl")).default_alpha}
         config = TrainConfig(**{"data": DATASET, "out": folder, **usual, **options})
     console = Console(stderr=True, quiet=not find_part().first)
     console.print(

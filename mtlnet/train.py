@@ -24,14 +24,23 @@ from mtlnet.card import RUNS, Camera, ModelCard, ModelError, read_card
 from mtlnet.checkpoint import list_checkpoints, load_checkpoint, save_checkpoint
 from mtlnet.config import TrainConfig, write_config
 from mtlnet.curves import Curves
-from mtlnet.doubt_fit import fit_doubt, hold_out
+from mtlnet.doubt_fit import fit_doubt
+from mtlnet.fine_tune import (
+    TUNED_LEAST,
+    Material,
+    continued,
+    open_init,
+    own_material,
+    round_material,
+    take_weights,
+)
 from mtlnet.interrupt import StopRequest
 from mtlnet.loader import Loader
 from mtlnet.network import HEIGHT, WIDTH, fold
+from mtlnet.own_images import OwnImages, is_own
 from mtlnet.plan import find_plan
 from mtlnet.publish import publish
 from mtlnet.recipe import Recipe, find_recipe
-from mtlnet.report import describe_data
 from mtlnet.together import ALONE, Part, agree, find_part, joined, wait
 from mtlnet.trainer import Trainer, keep_freed_memory
 from trackfeatures.errors import UserError
@@ -93,10 +102,9 @@ def _train(
     device: torch.device,
     part: Part,
 ) -> ModelCard:
-    dataset = open_training_data(config.data)
-    frames, held_out = hold_out(dataset)
-    data = describe_data(dataset, frames, held_out)
-    camera = Camera(**dataset.camera.as_dict())  # type: ignore[arg-type]  # sizes are int
+    init = None if config.init is None else open_init(config.init)
+    material = open_material(config, init[1] if init else None)
+    frames, camera, data = material.frames, material.camera, material.about
     if resumed is None and part.first:
         create_run(config, recipe, data)
     if resumed is not None:
@@ -112,11 +120,16 @@ def _train(
         device,
         find_plan(config.network),
         balance=config.balance,
-        epoch=len(frames) // config.batch,
+        epoch=max(len(frames) // config.batch, 1),
         part=mine,
+        folded=init is not None,
     )
     loader = Loader(frames, camera, config.batch, config.seed, augment=recipe.augment, part=mine)
-    trainer.standardise(loader)
+    if init is None:
+        trainer.standardise(loader)
+    else:
+        trainer.standardise(loader, TUNED_LEAST)
+        take_weights(trainer.network, init[0])
     elapsed_s = 0.0
     checkpoints = list_checkpoints(config.out) if resumed is not None else []
     if checkpoints:
@@ -125,7 +138,7 @@ def _train(
     try:
         learn(config, trainer, loader, elapsed_s, report, part)
         if part.first:
-            finish(config, trainer, frames, held_out, camera, data)
+            finish(config, trainer, frames, material.held_out, camera, data)
         wait()
         return read_card(config.out)
     except OSError as error:
@@ -139,7 +152,7 @@ def _train(
 def finish(
     config: TrainConfig,
     trainer: Trainer,
-    frames: Frames,
+    frames: Frames | OwnImages,
     held_out: Frames | None,
     camera: Camera,
     data: dict[str, Any],
@@ -247,6 +260,17 @@ def require_finite(window: Sequence[torch.Tensor], step: int) -> None:
             )
 
 
+def open_material(config: TrainConfig, init: ModelCard | None) -> Material:
+    """What `config.data` holds, recorded rounds or a user's own images; UserError: it cannot be."""
+    if init is not None and init.network != config.network:
+        raise UserError(f"--init is a {init.network}, not a {config.network}; leave out --network")
+    if is_own(config.data):
+        material = own_material(config.data, init)
+    else:
+        material = round_material(open_training_data(config.data))
+    return material if init is None else continued(material, init)
+
+
 def open_training_data(path: Path) -> Dataset:
     """The dataset in folder `path`; UserError when it does not fit this network."""
     dataset = Dataset.open(path)
@@ -277,8 +301,8 @@ def create_run(config: TrainConfig, recipe: Recipe, data: dict[str, Any]) -> Non
 
 def require_same_data(config: TrainConfig, resumed: dict[str, Any], data: dict[str, Any]) -> None:
     """Raise ModelError unless the run goes on with what it began with."""
-    for name in ("content_hash", "split"):
-        if resumed.get(name) != data[name]:
+    for name in ("content_hash", "split", "init"):
+        if resumed.get(name) != data.get(name):
             raise ModelError(
                 f"the {name.replace('_', ' ')} of {config.data} is not the one {config.out} was "
                 "started with; give that dataset with --data, or start a new run"

@@ -36,6 +36,7 @@ class Trainer:
         balance: str = "fixed",
         epoch: int = STRETCH,
         part: tuple[int, int] = (0, 1),
+        folded: bool = False,
     ) -> None:
         self.recipe = recipe
         self.alpha = alpha
@@ -45,7 +46,10 @@ class Trainer:
         self.balance = Balance(balance, alpha, device, epoch)
         self.step_number = 0
         network = Network(
-            batch_norm=recipe.batch_norm or plan.backbone, dropout=recipe.dropout, plan=plan
+            # A backbone has its own, unless it goes on from a finished model.
+            batch_norm=recipe.batch_norm or (plan.backbone and not folded),
+            dropout=recipe.dropout,
+            plan=plan,
         )
         initialise(network, seed)
         self.network = network.to(device).to(memory_format=torch.channels_last)
@@ -55,12 +59,16 @@ class Trainer:
             # Dropout takes no generator of its own: this is torch's only place for a seed.
             torch.manual_seed(seed)
 
-    def standardise(self, loader: Loader) -> None:
-        """Set the heads' units to the mean and standard deviation of the training targets."""
+    def standardise(self, loader: Loader, least: Sequence[float] = (MIN_TARGET_STD,) * 6) -> None:
+        """Set the heads' units to the mean and standard deviation of the training targets.
+
+        `least` (6,): no unit is smaller.
+        """
         if not self.recipe.standardise:
             return
         coded = torch.from_numpy(loader.coded).double()
-        mean, std = coded.mean(0), coded.std(0, correction=0).clamp_min(MIN_TARGET_STD)
+        mean, std = coded.mean(0), coded.std(0, correction=0)
+        std = std.clamp_min(torch.tensor(least, dtype=std.dtype))
         self.network.target_mean.copy_(mean)
         self.network.target_std.copy_(std)
         self.scale = (std**2).float().to(self.device)
