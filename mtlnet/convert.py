@@ -29,8 +29,9 @@ ONNX_FILE = "model.onnx"
 OPSET = 18
 CALIBRATION_FRAMES = 300
 LARGE = 256  # numbers; smaller constants are not worth half their bytes
-# Element-wise products are the heads' (`mtlnet.precise`): left in float32.
-EXACT = ("Multiply", "ReduceSum", "Subtract", "Power")
+# Element-wise products are the heads', means of cells the texture's (`mtlnet.precise`): left in
+# float32.
+EXACT = ("Multiply", "ReduceSum", "Subtract", "Power", "AvgPool", "ReduceMean")
 
 
 def export_model(

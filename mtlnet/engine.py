@@ -139,7 +139,8 @@ class TorchEngine:
         x, outputs = describe_images(self._network, image[None])
         if self._doubt is None:
             return outputs[0]
-        return np.append(outputs, self._doubt.assess(x, texture(image)[None]))
+        second = self._doubt.assess(x, texture(image)[None])
+        return np.concatenate([outputs[0], second[0]])
 
 
 def parse_kind(text: str) -> Kind:

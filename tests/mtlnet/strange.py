@@ -52,7 +52,8 @@ def stripes(rng: np.random.Generator) -> Image:
     if rng.random() < 0.5:
         waves = waves * np.sin(rows / rng.uniform(3, 25))
     first, second = rng.integers(0, 256, (2, 3))
-    return np.where(waves[..., None] > 0, first, second).astype(np.uint8)
+    image: Image = np.where(waves[..., None] > 0, first, second).astype(np.uint8)
+    return image
 
 
 def shapes(rng: np.random.Generator) -> Image:
@@ -109,4 +110,5 @@ def _intrinsics(camera: Camera, fov_y_deg: float) -> NDArray[np.float64]:
 
 def _full_range(values: NDArray[np.float64]) -> Image:
     low, high = values.min(), values.max()
-    return ((values - low) / max(high - low, 1e-9) * 255).astype(np.uint8)
+    image: Image = ((values - low) / max(high - low, 1e-9) * 255).astype(np.uint8)
+    return image

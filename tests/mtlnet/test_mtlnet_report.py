@@ -1,13 +1,15 @@
 """The figures of `mtlnet evaluate` on four frames, worked out by hand."""
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import trackfeatures as tf
 from datagen.recording import Labels
-from mtlnet.report import judge, presence
+from mtlnet.groups import GROUPS
+from mtlnet.report import judge, judge_all, presence
 
 NAN = float("nan")
 TRUE = [
@@ -109,3 +111,88 @@ def test_nothing_active_is_none_not_nan() -> None:
     report = judge(OUTPUTS[:1], only, MEAN)
     assert report["mae_m"]["l"] is None
     assert report["ratio"]["mae_m"]["l"] is None
+
+
+def many(count: int) -> tuple[np.ndarray, Labels]:
+    """Outputs (N, 17) that are off by known errors, and labels of every group."""
+    rng = np.random.default_rng(4)
+    column = rng.uniform(-1.4, 1.4, (count, 1)).astype(np.float32)
+    absent = np.full((count, 3), np.nan, np.float32)
+    distances = np.concatenate([column - 2, column + 2, absent], 1)
+    angle = rng.uniform(-0.1, 0.1, count).astype(np.float32)
+    error = rng.normal(0.0, 0.05, (count, 2))
+    said = distances.astype(np.float64)
+    said[:, :2] += error
+    coded = tf.encode(said, angle + 0.01)
+    doubt = np.tile([0.05] * 5 + [0.05 / 2**0.5, 0.02, 0.5], (count, 1))
+    outputs = np.concatenate([coded, np.tile([0.2, 0.5, 0.3], (count, 1)), doubt], 1)
+    lanes, zeros = rng.integers(1, 4, count), np.zeros(count, np.float32)
+    found = Labels(
+        distances=distances,
+        angle=angle,
+        heading=rng.integers(0, 3, count),
+        lanes=lanes,
+        lane_index=lanes * 0,
+        curvature=rng.uniform(-0.04, 0.04, count).astype(np.float32),
+        to_lane_centre=column[:, 0],
+        to_middle=zeros,
+        s=zeros,
+        speed=rng.uniform(5, 25, count).astype(np.float32),
+        shadow_fraction=rng.uniform(0, 1, count).astype(np.float32),
+        round=rng.integers(0, 2, count),
+    )
+    return outputs.astype(np.float32), found
+
+
+class Drives:
+    """Frames of two rounds, as far as a judge asks of them."""
+
+    def __init__(self, labels: Labels) -> None:
+        self.labels = labels
+        self.rounds = [
+            SimpleNamespace(track=track, light=light)
+            for track, light in (("oval", "fog"), ("town", "rain"))
+        ]
+
+
+def test_percentiles_are_numpys() -> None:
+    outputs, found = many(500)
+    spread = judge(outputs, found, MEAN)["errors"]
+    error = np.abs(tf.decode_values(outputs[:, :6])[:, 0] - found.distances[:, 0])
+    for name, share in (("median", 50), ("p95", 95), ("p99", 99)):
+        assert spread["ml"][name] == pytest.approx(np.percentile(error, share))
+    assert spread["ml"]["mean"] == judge(outputs, found, MEAN)["mae_m"]["ml"]
+    assert spread["angle"]["p99"] == pytest.approx(0.01, abs=1e-5)
+    assert spread["m"] == {"mean": None, "median": None, "p95": None, "p99": None, "frames": 0}
+
+
+def test_groups_sum_to_the_whole() -> None:
+    outputs, found = many(600)
+    report = judge_all(outputs, Drives(found), MEAN)  # type: ignore[arg-type]
+    for way in GROUPS:
+        parts = report[way].values()
+        assert sum(part["frames"] for part in parts) == 600
+        assert len(parts) > 1
+        mean = sum(part["errors"]["mr"]["mean"] * part["frames"] for part in parts) / 600
+        assert mean == pytest.approx(report["mae_m"]["mr"])
+        for true, row in report["confusion"].items():
+            for said, count in row.items():
+                assert sum(part["confusion"][true][said] for part in parts) == count
+    assert list(report["by_speed"]) == [
+        "under 30 km/h", "30 to 45 km/h", "45 to 60 km/h", "over 60 km/h",
+    ]  # fmt: skip
+    slow = (found.speed * 3.6 < 30).sum()
+    assert report["by_speed"]["under 30 km/h"]["frames"] == slow
+
+
+def test_what_is_said_of_doubt() -> None:
+    outputs, found = many(2000)
+    doubt = judge_all(outputs, Drives(found), MEAN)["doubt"]  # type: ignore[arg-type]
+    assert doubt["coverage"]["ml"][0] == pytest.approx(0.683, abs=0.03)
+    assert doubt["coverage"]["to_lane_centre"][1] == pytest.approx(0.954, abs=0.02)
+    assert doubt["coverage"]["angle"] == [1.0, 1.0]
+    assert doubt["coverage"]["l"] == [None, None]
+    assert doubt["out_of_distribution"] == 0.0
+    assert sum(part["frames"] for part in doubt["calibration"]["ml"]) == 2000
+    outputs[:500, -1] = 1.5
+    assert judge(outputs, found, MEAN)["doubt"]["out_of_distribution"] == 0.25
