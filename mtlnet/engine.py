@@ -137,10 +137,10 @@ class TorchEngine:
 
         check_image(image, self._shape)
         x, outputs = describe_images(self._network, image[None])
-        if self._doubt is None:
-            return outputs[0]
-        second = self._doubt.assess(x, texture(image)[None])
-        return np.concatenate([outputs[0], second[0]])
+        if self._doubt is not None:
+            outputs = np.concatenate([outputs, self._doubt.assess(x, texture(image)[None])], 1)
+        answer: NDArray[np.float32] = outputs[0]
+        return answer
 
 
 def parse_kind(text: str) -> Kind:
