@@ -52,7 +52,9 @@ class Bench:
         if len(self.trained) == self.stop_at:
             raise Stopped("here")
         points = [
-            ",".join(str(v) for v in (s, s / 10, 1e-3, 50.0, 10 / s * config.seed, 1 / s, 2, 3))
+            ",".join(
+                str(v) for v in (s, s / 10, 1e-3, 50.0, 10 / s * config.seed, 1 / s, 2, 3, 1, 1, 1)
+            )
             for s in range(10, 410, 10)
         ]
         (config.out / "curves.csv").write_text("\n".join([",".join(CURVE_COLUMNS), *points, ""]))
