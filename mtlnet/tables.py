@@ -9,9 +9,9 @@ from mtlnet.doubt import FEATURES
 from mtlnet.groups import GROUPS
 
 ROWS = {
-    **{m: (f"distance to {m}", "m", 3) for m in tf.MARKINGS},
-    "to_lane_centre": ("offset from the lane centre", "m", 3),
-    "angle": ("angle", "rad", 4),
+    **{m: (f"to {m} (m)", 3) for m in tf.MARKINGS},
+    "to_lane_centre": ("to lane centre (m)", 3),
+    "angle": ("angle (rad)", 4),
 }
 
 
@@ -19,12 +19,12 @@ def evaluation_table(result: dict[str, Any]) -> Table:
     """Errors of a model on active labels, beside those of always answering the training mean."""
     title = f"{result['model']} on {result['frames']} {result['split']} frames of {result['data']}"
     table = Table(title=title)
-    for column in ("", "mean", "median", "95 %", "99 %", "of the mean's answer", "ratio"):
-        table.add_column(column, justify="left" if not column else "right")
-    for name, (label, unit, digits) in ROWS.items():
+    for column in ("", "mean", "median", "95 %", "99 %", "mean's answer", "ratio"):
+        table.add_column(column, justify="left" if not column else "right", no_wrap=not column)
+    for name, (label, digits) in ROWS.items():
         base, ratio = (_of(result[part], name) for part in ("baseline", "ratio"))
         sizes = [*(result["errors"][name][k] for k in ("mean", "median", "p95", "p99")), base]
-        cells = [f"{_number(v, digits)} {unit}" if v is not None else "-" for v in sizes]
+        cells = [_number(v, digits) for v in sizes]
         table.add_row(label, *cells, _number(ratio, 2))
     accuracy, base = (result["heading_accuracy"], result["baseline"]["heading_accuracy"])
     table.add_row("class right", f"{100 * accuracy:.1f} %", "", "", "", f"{100 * base:.1f} %", "")
@@ -40,17 +40,19 @@ def _of(part: dict[str, Any], name: str) -> float | None:
 
 def group_table(result: dict[str, Any]) -> Table:
     """Mean absolute errors by track, lane count, light, shadow, bend and speed."""
-    table = Table(title="by groups (m, rad)")
-    for column in ("", "frames", *FEATURES, "class"):
-        table.add_column(column, justify="left" if not column else "right")
+    table = Table(title="by groups (m, rad)", box=None, padding=(0, 0, 0, 1))
+    short = ("centre" if name == "to_lane_centre" else name for name in FEATURES)
+    for column in ("", "frames", *short, "class"):
+        table.add_column(column, justify="left" if not column else "right", no_wrap=True)
     for group, label in GROUPS.items():
         table.add_section()
+        table.add_row(f"[bold]{label}")
         for key, part in result[group].items():
             table.add_row(
-                f"{label} {key}",
+                key,
                 str(part["frames"]),
                 *(_number(part["errors"][f]["mean"], 4 if f == "angle" else 3) for f in FEATURES),
-                f"{100 * part['heading_accuracy']:.1f} %",
+                f"{100 * part['heading_accuracy']:.1f}%",
             )
     return table
 
