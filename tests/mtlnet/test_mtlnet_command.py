@@ -93,15 +93,15 @@ def test_train_evaluate_and_predict(dataset: Path, tmp_path: Path) -> None:
 
 
 def test_what_is_no_image(published: Path, tmp_path: Path) -> None:
-    text, cut, wide = (tmp_path / name for name in ("a.jpg", "b.jpg", "c.jpg"))
+    text, cut, narrow = (tmp_path / name for name in ("a.jpg", "b.jpg", "c.jpg"))
     text.write_text("not an image at all")
     cut.write_bytes(simplejpeg.encode_jpeg(np.zeros((210, 280, 3), np.uint8))[:20])
-    wide.write_bytes(simplejpeg.encode_jpeg(np.zeros((100, 280, 3), np.uint8)))
+    narrow.write_bytes(simplejpeg.encode_jpeg(np.zeros((210, 100, 3), np.uint8)))
     for path, seen in [
         (tmp_path / "none.jpg", "there is no image file"),
         (text, "a.jpg: no JPEG or PNG file, but 19 bytes"),
         (cut, "b.jpg: the JPEG cannot be decoded"),
-        (wide, "c.jpg: the image is 280 x 100 px"),
+        (narrow, "c.jpg: the image is 100 x 210 px"),
     ]:
         assert seen in refused("predict", "--model", published, path)
 

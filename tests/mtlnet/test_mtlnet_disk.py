@@ -12,7 +12,7 @@ from tensorboard.summary.writer.record_writer import RecordWriter
 
 import mtlnet.whole
 from mtlnet.board import Board
-from mtlnet.card import read_card
+from mtlnet.card import ModelError, read_card
 from mtlnet.checkpoint import list_checkpoints
 from mtlnet.config import TrainConfig, resume_config
 from mtlnet.curves import COLUMNS, Curves, read_curves
@@ -94,7 +94,8 @@ def test_a_run_goes_on_after_the_disk_was_full(
     first = config(dataset, tmp_path / "run", iterations=1)
     with monkeypatch.context() as patch:
         patch.setattr("mtlnet.train.finish", lambda *_: None)
-        train(first, None)
+        with pytest.raises(ModelError, match="no finished model"):
+            train(first, None)
     kept = [path.name for path in list_checkpoints(new.out)]
     assert kept == ["step-00000001.safetensors"]
     resumed, data = resume_config(new.out, {"iterations": 2})
