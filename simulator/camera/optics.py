@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from simulator.compiled import compiled
 from trackfeatures.errors import UserError
 
 FloatArray = NDArray[np.float64]
@@ -55,6 +56,7 @@ class Eye:
     axes: FloatArray
 
 
+@compiled
 def rotation(roll: float, pitch: float, yaw: float) -> FloatArray:
     """Body-to-world rotation (3, 3), as PyBullet's getMatrixFromQuaternion gives it."""
     cr, sr = math.cos(roll), math.sin(roll)
@@ -113,12 +115,28 @@ def extrinsics(mount: Mount, body_pose: ArrayLike, view: str) -> FloatArray:
 
 def project(eye: Eye, matrix: FloatArray, points: ArrayLike) -> tuple[FloatArray, FloatArray]:
     """Pixels (N, 2) and depth (N,) m along the optical axis; behind the eye pixels are NaN."""
-    seen = (np.asarray(points, dtype=np.float64).reshape(-1, 3) - eye.place) @ eye.axes.T
-    depth = seen[:, 2]
-    ahead = np.where(depth > 1e-6, depth, np.nan)
-    u = matrix[0, 2] + matrix[0, 0] * seen[:, 0] / ahead
-    v = matrix[1, 2] - matrix[1, 1] * seen[:, 1] / ahead
-    return np.stack([u, v], axis=1), depth
+    places = np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 3)
+    return _pixels(places, eye.place, eye.axes, matrix)
+
+
+@compiled
+def _pixels(
+    points: FloatArray, eye: FloatArray, axes: FloatArray, matrix: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """`project` point by point: called for every frame's markings, where numpy's calls add up."""
+    pixels, depth = np.empty((len(points), 2)), np.empty(len(points))
+    for k in range(len(points)):
+        x, y, z = points[k, 0] - eye[0], points[k, 1] - eye[1], points[k, 2] - eye[2]
+        right = x * axes[0, 0] + y * axes[0, 1] + z * axes[0, 2]
+        up = x * axes[1, 0] + y * axes[1, 1] + z * axes[1, 2]
+        ahead = x * axes[2, 0] + y * axes[2, 1] + z * axes[2, 2]
+        depth[k] = ahead
+        if ahead > 1e-6:
+            pixels[k, 0] = matrix[0, 2] + matrix[0, 0] * right / ahead
+            pixels[k, 1] = matrix[1, 2] - matrix[1, 1] * up / ahead
+        else:
+            pixels[k] = np.nan
+    return pixels, depth
 
 
 def clip_matrix(eye: Eye, matrix: FloatArray, width: int, height: int) -> FloatArray:

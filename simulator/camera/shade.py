@@ -19,6 +19,7 @@ from simulator.camera.land import Shadiness
 from simulator.camera.light import Light
 from simulator.camera.ribbon import SKIRT_M
 from simulator.camera.scenery import Trees
+from simulator.compiled import compiled
 from simulator.track.road import Road
 
 FloatArray = NDArray[np.float64]
@@ -44,13 +45,20 @@ class ShadeMask:
 
     def fraction(self, s: float, half_width: float) -> float:
         """Share in shadow of the road within `half_width` of its centre, LOOK_M ahead of s."""
-        columns = self.strip.shape[1]
-        first = int(s / self.along_m)
-        ahead = np.arange(first, first + int(LOOK_M / self.along_m)) % columns
         middle = self.strip.shape[0] // 2
         reach = min(int(half_width / TEXEL_M), middle)
-        part = self.strip[middle - reach : middle + reach, ahead]
-        return float(np.mean(part >= 128))
+        rows = self.strip[middle - reach : middle + reach]
+        return float(_dark_share(rows, int(s / self.along_m), int(LOOK_M / self.along_m)))
+
+
+@compiled
+def _dark_share(rows: Strip, first: int, count: int) -> float:
+    """Share of dark texels in `count` columns from `first` on, round the end of the strip."""
+    dark, columns = 0, rows.shape[1]
+    for row in rows:
+        for k in range(first, first + count):
+            dark += row[k % columns] >= 128
+    return float(dark / (rows.shape[0] * count))
 
 
 def build(
