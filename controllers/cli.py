@@ -92,9 +92,9 @@ def drive(
 @app.command()
 def demo(
     out: Annotated[Path, typer.Option(help="Folder for all that comes of it.")] = Path("demo"),
-    rounds: Annotated[int, typer.Option(help="Rounds to collect.", min=12)] = 40,
-    frames: Annotated[int, typer.Option(help="Frames a round.", min=20)] = 500,
-    minutes: Annotated[float, typer.Option(help="Training time.", min=0.1)] = 9.5,
+    rounds: Annotated[int, typer.Option(help="Rounds to collect.", min=12)] = 100,
+    frames: Annotated[int, typer.Option(help="Frames a round.", min=20)] = 200,
+    minutes: Annotated[float, typer.Option(help="Training time.", min=0.1)] = 8.5,
     seed: Annotated[int, typer.Option(help="Of the collection and the training.", min=0)] = 1,
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
 ) -> None:

@@ -28,10 +28,10 @@ class DemoConfig:
 
     out: Path
     tracks: str = "circuit,countryside,forest,highway,mountain-pass"
-    rounds: int = 40
-    frames: int = 500
+    rounds: int = 100
+    frames: int = 200
     seed: int = 1
-    minutes: float = 9.5
+    minutes: float = 8.5
     """of training"""
     alpha: str = "0.3,0.2,0.5"
     asked: int = 12
