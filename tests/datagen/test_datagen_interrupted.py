@@ -145,7 +145,7 @@ def test_a_process_that_gives_no_sign_of_life_is_replaced(tmp_path: Path) -> Non
 
     limits = Limits(delay_s=0.1)
     crew = Crew(1, hear, limits)
-    assert crew.run(make_jobs(tmp_path, rounds=1, frames=60)) == []
+    assert crew.run(make_jobs(tmp_path, rounds=1, frames=400)) == []
     assert done == ["round-000"]
     with pytest.raises(ProcessLookupError):
         os.kill(stopped[0], 0)

@@ -45,7 +45,7 @@ def test_an_actor_that_dies_costs_its_round_only(tmp_path: Path) -> None:
             ray.kill(crew._seats[0].actor)
 
     crew = RayCrew(1, hear, Limits(delay_s=0.1))
-    assert crew.run(make_jobs(tmp_path, rounds=1, frames=150)) == []
+    assert crew.run(make_jobs(tmp_path, rounds=1, frames=600)) == []
     assert killed == done == ["round-000"] == list(read_states(tmp_path))
     assert not ray.is_initialized()
 

@@ -198,7 +198,8 @@ def test_pictures_of_the_view_that_is_chosen(watched: Watched) -> None:
 def test_another_light(watched: Watched) -> None:
     """Pictures under way are still of the light before: wait for the sky of the one asked for."""
     with watched.browser() as page:
-        page.ask(view="front", light="dusk")
+        page.ask(view="front")
+        page.ask(light="dusk")
         page.until(lambda state: state["light"] == "dusk")
         dusk = page.picture_until(lambda picture: picture[:20, :, 2].mean() < 185.0)
         page.ask(light="clear")
