@@ -1,14 +1,16 @@
 """Collection against the bare render loop of the same scenes, all cores, in one run.
 
-Run: `python benchmarks/collection.py [--rounds 20] [--frames 2000] [--json FILE]`. Claim (on two
-cores with Mesa, 280 x 210): at least 250 frames a second, physics, rendering, labels, JPEG, MCAP
-and checks included, and at least 0.75 of what drawing alone reaches. The bare loop draws the same
-frames, traffic and all, and does nothing else; its scenes are built before the clock starts. Ratios
-are of wall time, which decides, and of processor time, which neighbours spoil less. Twenty rounds,
-so that start and end, when a core idles, weigh little more than in the default plan's sixty.
+Run: `python benchmarks/collection.py [--rounds 60] [--frames 2000] [--out FOLDER] [--json FILE]`.
+The dataset stays in `FOLDER/data` where a folder is given. Claim (on two cores with Mesa, 280 x
+210): at least 250 frames a second, physics, rendering, labels, JPEG, MCAP and checks included, and
+at least 0.75 of what drawing alone reaches. The bare loop draws the same frames, traffic and all,
+and does nothing else; its scenes are built before the clock starts. Ratios are of wall time, which
+decides, and of processor time, which neighbours spoil less. Sixty rounds are the default plan's:
+with fewer, start-up and the end, when a core idles, weigh more than in real use.
 """
 
 import argparse
+import contextlib
 import json
 import os
 import resource
@@ -55,12 +57,14 @@ def draw_round(entry: dict[str, Any]) -> tuple[int, float, float]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--rounds", type=int, default=20)
+    parser.add_argument("--rounds", type=int, default=60)
     parser.add_argument("--frames", type=int, default=2000)
+    parser.add_argument("--out", type=Path)
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
     cores = len(os.sched_getaffinity(0))
-    with tempfile.TemporaryDirectory() as folder:
+    with contextlib.ExitStack() as held:
+        folder = arguments.out or held.enter_context(tempfile.TemporaryDirectory())
         collect(Path(folder) / "warm-up", cores, FRAMES_OF_WARM_UP, seed=1)
         data = Path(folder) / "data"
         collected = collect(data, arguments.rounds, arguments.frames, seed=2)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
-from torch.nn.functional import cross_entropy
+from torch.nn.functional import cross_entropy, smooth_l1_loss
 
 from trackfeatures.errors import UserError
 
@@ -72,6 +72,7 @@ def multi_task_loss(
     heading: Tensor,
     combine: Alpha | Callable[[Tensor], Tensor],
     scale: Tensor | None = None,
+    bend: float = 0.0,
 ) -> Losses:
     """Losses of outputs (B, 9) for targets coded (B, 6) and heading (B,) int64.
 
@@ -79,7 +80,9 @@ def multi_task_loss(
 
     `scale` (6,): variances of the coded targets. With it, the sum that is minimised (never the
     reported losses) counts squared errors in units of them, distances as their mean: a task
-    answered by its mean then costs about 1, whatever its range.
+    answered by its mean then costs about 1, whatever its range. `bend`: from so many standard
+    deviations on an error costs what it is, not its square (Huber 1964), 0: never. Between two
+    possible answers the best is then the likelier, where a squared error asks for one in between.
     """
     squared = (outputs[:, :6].float() - coded) ** 2
     distance = squared[:, :5].sum(1).mean()
@@ -88,7 +91,7 @@ def multi_task_loss(
     if scale is None:
         terms = (distance, angle, kind)
     else:
-        scaled = squared / scale
+        scaled = squared / scale if not bend else _bent(outputs[:, :6].float() - coded, scale, bend)
         terms = (scaled[:, :5].mean(), scaled[:, 5].mean(), kind)
     if callable(combine):
         total = combine(torch.stack(terms))
@@ -98,3 +101,8 @@ def multi_task_loss(
         total = torch.stack(weighted).sum()
     kept = torch.stack(terms).detach()
     return Losses(distance.detach(), angle.detach(), kind.detach(), total, kept)
+
+
+def _bent(errors: Tensor, scale: Tensor, bend: float) -> Tensor:
+    units = errors * scale.rsqrt()
+    return smooth_l1_loss(units, torch.zeros_like(units), reduction="none", beta=bend)

@@ -83,7 +83,9 @@ class Trainer:
         heading = torch.from_numpy(batch.heading).to(self.device, non_blocking=True)
         images = torch.from_numpy(batch.images).to(self.device, non_blocking=True)
         outputs = self.outputs(images)
-        losses = multi_task_loss(outputs, coded, heading, self._combine(), self.scale)
+        losses = multi_task_loss(
+            outputs, coded, heading, self._combine(), self.scale, self.recipe.bend
+        )
         self.optimiser.zero_grad(set_to_none=True)
         losses.total.backward()  # type: ignore[no-untyped-call]  # torch leaves it untyped
         seen = [losses.distance, losses.angle, losses.type, losses.total.detach(), losses.terms]

@@ -36,6 +36,42 @@ def test_scaled_losses_count_in_variances() -> None:
     assert float(losses.distance) == pytest.approx(DISTANCE)
 
 
+def test_bent_losses_grow_as_errors_do() -> None:
+    scale = torch.tensor([0.01, 0.01, 0.01, 0.04, 0.01, 0.09])
+    # In standard deviations two distances err by 1 and the angle of one image of two by 1.
+    bent = multi_task_loss(OUTPUTS, TARGETS, HEADING, (1.0, 2.0, 0.0), scale, 0.5)
+    assert float(bent.total) == pytest.approx(2 / 10 * (1 - 0.25) + 2 / 2 * (1 - 0.25))
+    # Below the bend: the square, by twice the bend.
+    small = multi_task_loss(OUTPUTS, TARGETS, HEADING, (1.0, 2.0, 0.0), scale, 2.0)
+    assert float(small.total) == pytest.approx((2 / 10 + 2 / 2) / 4)
+    assert float(bent.distance) == pytest.approx(DISTANCE)
+
+
+def test_between_two_answers_the_likelier_is_cheapest_when_bent() -> None:
+    # 60 images in 100 have 0.2 as their first distance, the others 0.8, and nothing tells which.
+    targets = torch.full((100, 6), 0.5)
+    targets[:, 0] = torch.where(torch.arange(100) < 60, 0.2, 0.8)
+    answers = [
+        torch.full((100, 9), 0.5).index_fill(1, torch.tensor([0]), value / 100)
+        for value in range(101)
+    ]
+    for bend, best in ((0.0, 0.6 * 0.2 + 0.4 * 0.8), (0.05, 0.2)):
+        costs = [
+            float(
+                multi_task_loss(
+                    a,
+                    targets,
+                    HEADING[:1].expand(100),
+                    (1.0, 0.0, 0.0),
+                    torch.full((6,), 0.09),
+                    bend,
+                ).total
+            )
+            for a in answers
+        ]
+        assert costs.index(min(costs)) / 100 == pytest.approx(best, abs=0.011)
+
+
 def test_a_task_of_weight_zero_sends_no_gradient() -> None:
     outputs = OUTPUTS.clone().requires_grad_()
     torch.autograd.backward(multi_task_loss(outputs, TARGETS, HEADING, (0.0, 1.0, 0.0)).total)
