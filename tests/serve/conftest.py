@@ -157,7 +157,7 @@ class Served:
 
 @contextmanager
 def serving(
-    engine: FakeEngine,
+    engine: Engine,
     check: Callable[[Any], object] = lambda _engine: None,
     limits: Limits | None = None,
     shared: Shared | None = None,
