@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 import trackfeatures as tf
 
 from .camera import CameraInfo
-from .encoding import Buffer, decode_into
+from .encoding import decode_into
 from .errors import DatasetError
 from .header import RoundInfo
 from .index import RoundIndex, open_round
@@ -42,7 +42,6 @@ from .wire import bytes_field
 if TYPE_CHECKING:
     from .bulk import BulkDecoder
 
-DecodeInto = Callable[[Buffer, NDArray[np.uint8]], None]
 IMAGE_DATA = 2  # number of the field `data` of foxglove.CompressedImage
 BULK = 8  # images: for fewer, compiled code is not worth loading
 
@@ -94,22 +93,37 @@ class Frames:
         out = np.empty(shape, np.uint8) if out is None else out
         if out.shape != shape or out.dtype != np.uint8:
             raise ValueError(f"`out` is {out.dtype} {out.shape}, expected uint8 {shape}")
-        # One iterator for all threads: each takes the next image when it is done with its last.
-        rows = iter(enumerate(numbers.tolist()))
-        into = decode_into if len(numbers) < BULK else self._bulk.decode_into
-        work = [self._pool.submit(self._decode, rows, out, into) for _ in range(self._threads)]
-        for part_done in work:
-            part_done.result()
+        left = np.arange(len(numbers))
+        if len(numbers) >= BULK and out.flags.c_contiguous:
+            left = np.flatnonzero(~self._decode_together(numbers, out))
+        if len(left):
+            # One iterator for all threads: each takes the next image when it is done with its last.
+            rows = zip(left.tolist(), numbers[left].tolist(), strict=True)
+            self._on_all_threads(lambda: self._decode(rows, out))
         return out
 
-    def _decode(
-        self, rows: Iterator[tuple[int, int]], out: NDArray[np.uint8], into: DecodeInto
-    ) -> None:
+    def _decode_together(
+        self, numbers: NDArray[np.int64], out: NDArray[np.uint8]
+    ) -> NDArray[np.bool_]:
+        """Which images our own decoder has decoded, (B,)."""
+        from .bulk import lots
+
+        found = lots([self.jpeg(i) for i in numbers.tolist()])
+        done = np.zeros(len(numbers), np.bool_)
+        self._on_all_threads(lambda: self._bulk.decode(found, out, done))
+        return done
+
+    def _decode(self, rows: Iterator[tuple[int, int]], out: NDArray[np.uint8]) -> None:
         for row, i in rows:
             try:
-                into(self.jpeg(i), out[row])
+                decode_into(self.jpeg(i), out[row])
             except ValueError as error:
                 raise self._unreadable(i, error) from error
+
+    def _on_all_threads(self, work: Callable[[], None]) -> None:
+        parts = [self._pool.submit(work) for _ in range(self._threads)]
+        for part_done in parts:
+            part_done.result()
 
     def _locate(self, i: int) -> tuple[int, int]:
         if not 0 <= i < len(self):

@@ -55,6 +55,30 @@ def test_batches_are_the_decoded_images_in_the_order_asked_for(dataset: Path) ->
     assert not np.array_equal(batch[0], batch[1])
 
 
+def test_large_batches_are_those_of_the_general_decoder(dataset: Path) -> None:
+    frames = Dataset.open(dataset).select("all")
+    wanted = np.random.default_rng(0).permutation(135)[:100]
+    expected = np.empty((100, 42, 56, 3), np.uint8)
+    for row, i in enumerate(wanted.tolist()):
+        decode_into(frames.jpeg(i), expected[row])
+    assert np.array_equal(frames.read_batch(wanted), expected)
+    apart = np.zeros((200, 42, 56, 3), np.uint8)  # with gaps
+    assert np.array_equal(frames.read_batch(wanted, apart[::2]), expected)
+    assert not apart[1::2].any()
+
+
+def test_a_damaged_image_of_a_large_batch_is_named(dataset: Path) -> None:
+    image = bytes(Dataset.open(dataset).select("all").jpeg(50))
+    path = dataset / "rounds" / "r001.mcap"
+    path.write_bytes(path.read_bytes().replace(image, b"\0\0" + image[2:]))
+    frames = Dataset.open(dataset).select("all")
+    with pytest.raises(DatasetError, match=r"image 5 of .*r001\.mcap cannot be read: neither JPEG"):
+        frames.read_batch(np.arange(40, 72))
+    assert frames.read_batch(np.arange(51, 83)).any()
+    with pytest.raises(IndexError, match="frame 135 of 135"):
+        frames.read_batch(np.arange(120, 152))
+
+
 def test_the_snippet_of_the_readme_runs_on_a_dataset(
     dataset: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

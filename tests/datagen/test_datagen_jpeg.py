@@ -1,14 +1,18 @@
 """Our decoder of recorded pictures against libjpeg-turbo's, bit by bit, and on damage."""
 
+from concurrent.futures import ThreadPoolExecutor
+
+import numba
 import numpy as np
 import pytest
 import simplejpeg
 from numpy.typing import NDArray
 
-from datagen.recording.bulk import BulkDecoder
-from datagen.recording.encoding import decode_into
+from datagen.recording.bulk import MOST_HEADS, BulkDecoder, lots
 from datagen.recording.jpeg.decoder import Decoder
+from datagen.recording.jpeg.lot import Lot
 from datagen.recording.jpeg.tables import OtherKindError, head_length, read_head
+from datagen.recording.jpeg.vectors import take_next
 
 Image = NDArray[np.uint8]
 
@@ -29,6 +33,25 @@ def encoded(image: Image, quality: int = 95, sampling: str = "420") -> bytes:
 
 def decoder_of(data: bytes) -> Decoder:
     return Decoder(data[: head_length(data)])
+
+
+def in_bulk(images: list[bytes], threads: int = 1) -> tuple[Image, NDArray[np.bool_]]:
+    """Pictures of 96 x 64, and which of them were decoded."""
+    found, decoder = lots(images), BulkDecoder()
+    out, done = np.zeros((len(images), 64, 96, 3), np.uint8), np.zeros(len(images), np.bool_)
+    with ThreadPoolExecutor(threads) as pool:
+        list(pool.map(lambda _: decoder.decode(found, out, done), range(threads)))
+    return out, done
+
+
+@numba.njit(nogil=True)
+def all_taken(counter):  # type: ignore[no-untyped-def]
+    found = [np.int64(0) for _ in range(0)]
+    number = take_next(counter)
+    while number < 1000:
+        found.append(number)
+        number = take_next(counter)
+    return found
 
 
 def turbo(data: bytes) -> Image:
@@ -114,9 +137,8 @@ def test_other_kinds_are_left_to_the_general_decoder() -> None:
         data = encoded(image, 90, sampling)
         with pytest.raises(OtherKindError):
             decoder_of(data)
-        out = np.empty_like(image)
-        BulkDecoder().decode_into(data, out)
-        np.testing.assert_array_equal(out, turbo(data))
+        _, done = in_bulk([data])
+        assert not done[0]
     odd = encoded(scene(64, 97, 2, 5.0))
     with pytest.raises(OtherKindError, match="97x64"):
         decoder_of(odd)
@@ -130,19 +152,38 @@ def test_a_damaged_head_is_refused(cut: int) -> None:
         read_head(head[:cut])
 
 
-def test_bulk_answers_and_complains_as_the_general_decoder() -> None:
-    bulk = BulkDecoder()
-    images = [
-        encoded(scene(64, 96, s, 5.0), quality) for s in range(3) for quality in range(88, 100)
-    ]
-    out, expected = np.empty((64, 96, 3), np.uint8), np.empty((64, 96, 3), np.uint8)
-    for data in images:  # more heads than it keeps decoders
-        bulk.decode_into(memoryview(data), out)
-        decode_into(data, expected)
-        np.testing.assert_array_equal(out, expected)
-    with pytest.raises(ValueError, match=r"."):
-        bulk.decode_into(images[0][:-400], out)
-    with pytest.raises(ValueError, match="96x64 px where 32x32"):
-        bulk.decode_into(images[0], np.empty((32, 32, 3), np.uint8))
-    with pytest.raises(ValueError, match="neither JPEG nor PNG"):
-        bulk.decode_into(b"", out)
+def test_a_lot_is_shared_by_threads_and_damage_in_it_hurts_no_neighbour() -> None:
+    """Two qualities, so two lots; cut, foreign and empty pictures are left to the general one."""
+    images = [encoded(scene(64, 96, s, 9.0), 90 + 5 * (s % 2)) for s in range(64)]
+    strange = {5: images[5][:-400], 6: b"", 7: encoded(scene(64, 96, 7, 9.0), 95, "444"), 40: b"?"}
+    for row, data in strange.items():
+        images[row] = data
+    for threads in (1, 2, 5):
+        out, done = in_bulk(images, threads)
+        assert np.flatnonzero(~done).tolist() == sorted(strange)
+        for row in np.flatnonzero(done).tolist():
+            np.testing.assert_array_equal(out[row], turbo(images[row]))
+
+
+def test_no_picture_of_a_lot_is_decoded_twice() -> None:
+    lot = Lot.of(b"", range(1000), [b"x"] * 1000)
+    taken: list[int] = []
+    with ThreadPoolExecutor(4) as pool:
+        list(pool.map(lambda _: taken.extend(all_taken(lot.taken)), range(4)))
+    assert sorted(taken) == list(range(1000))
+
+
+def test_decoders_are_kept_for_few_heads_only() -> None:
+    images = [encoded(scene(64, 96, 1, 5.0), quality) for quality in range(90, 90 + MOST_HEADS)]
+    images += [encoded(scene(64, 96, 1, 5.0), quality) for quality in range(40, 50)]
+    _, done = in_bulk(images)
+    assert done.tolist() == [True] * MOST_HEADS + [False] * (len(images) - MOST_HEADS)
+
+
+def test_pictures_of_another_size_than_the_batch_are_left_alone() -> None:
+    decoder = BulkDecoder()
+    found, out = lots([encoded(scene(64, 96, 1, 5.0))]), np.zeros((1, 32, 32, 3), np.uint8)
+    done = np.zeros(1, np.bool_)
+    decoder.decode(found, out, done)
+    assert not done[0]
+    assert not out.any()

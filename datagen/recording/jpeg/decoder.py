@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from . import tables
 from .entropy import BLOCKS, SPARE
-from .picture import decoded
+from .lot import Lot, decoded_lot
 from .tables import Head, OtherKindError
 from .transform import LANES, STEP
 
@@ -27,7 +27,8 @@ class Decoder:
         if width < STEP or width % 2 or not height:
             raise OtherKindError(f"{width}x{height} px are not read here")
         self._bytes = head
-        self._tables, self._codes = _tables(head)
+        self._tables, self._codes, self._factors = _tables(head)
+        self._places = tables.places(LANES)
         across = (width + 15) // 16  # units
         self._units, starts = _layout(across)
         luma, chroma = _padded(2 * across) * 8, _padded(across) * 8 + AROUND
@@ -38,8 +39,9 @@ class Decoder:
         self._planes = np.array(list(zip(begins.tolist(), strides, strict=True)), np.int64)
         self._groups = np.array(
             [
-                (begins[p] + y * strides[p] + x, (16, 8, 8)[p] * strides[p], strides[p])
+                (begins[p] + y * strides[p] + x, (16, 8, 8)[p] * strides[p], strides[p], by)
                 for p, y, x in starts
+                for by in (GROUP if p else 0,)
             ],
             np.int64,
         )
@@ -52,20 +54,27 @@ class Decoder:
 
         `data` starts with this decoder's head. Then `out` may hold anything.
         """
+        done = np.zeros(1, np.bool_)
+        self.decode_lot(Lot.of(self._bytes, [0], [data]), out[np.newaxis], done)
+        return bool(done[0])
+
+    def decode_lot(self, lot: Lot, out: NDArray[np.uint8], done: NDArray[np.bool_]) -> None:
+        """Pictures of `lot` that no other thread takes, to its rows of `out` (B, H, W, 3).
+
+        `done` (B,) becomes true for those that were decoded; other rows may hold anything.
+        """
         head = self.head
-        if out.shape != (head.height, head.width, 3) or not out.flags.c_contiguous:
-            return False
-        source = np.frombuffer(data, np.uint8)
-        if len(self._coded) < len(source) + SPARE:
-            self._coded = np.zeros(2 * (len(source) + SPARE), np.uint8)
-        done: bool = decoded(
-            source, head.length, head.width, head.height, self._tables, self._codes, self._units,
-            self._groups, self._planes, self._coefficients, self._samples, self._coded,
-            out.reshape(-1),
+        if out.shape[1:] != (head.height, head.width, 3) or not out.flags.c_contiguous:
+            return
+        longest = int(lot.lengths.max(initial=0)) + SPARE
+        if len(self._coded) < longest:
+            self._coded = np.zeros(2 * longest, np.uint8)
+        decoded_lot(
+            lot.rows, lot.addresses, lot.lengths, lot.taken, head.length, head.width, head.height,
+            self._tables, self._codes, self._places, self._factors, self._units, self._groups,
+            self._planes, self._coefficients, self._samples, self._coded,
+            out.reshape(len(out), -1), done,
         )  # fmt: skip
-        if not done:
-            self._coefficients[:] = 0
-        return done
 
 
 @lru_cache(maxsize=8)
@@ -74,14 +83,14 @@ def _read(head: bytes) -> Head:
 
 
 @lru_cache(maxsize=8)
-def _tables(head: bytes) -> tuple[NDArray[np.int64], NDArray[np.uint16]]:
-    """DC, AC and quantisers, luma's before chroma's; codes of DC and AC likewise."""
+def _tables(head: bytes) -> tuple[NDArray[np.int64], NDArray[np.uint16], NDArray[np.int16]]:
+    """DC and AC, luma's before chroma's; codes of DC and AC likewise; factors likewise."""
     found = _read(head)
     codes = [tables.code_table(*found.codes[number]) for number in (0, 1, 16, 17)]
     parts = [tables.dc_table(codes[0]), tables.dc_table(codes[1])]
     parts += [tables.ac_table(codes[2]), tables.ac_table(codes[3])]
-    parts += [tables.places(found.quantisers[number], LANES) for number in found.chosen]
-    return np.concatenate(parts), np.concatenate(codes)
+    factors = [tables.factors(found.quantisers[number], LANES) for number in found.chosen]
+    return np.concatenate(parts), np.concatenate(codes), np.concatenate(factors)
 
 
 def _padded(blocks: int) -> int:

@@ -8,7 +8,7 @@ cannot be is noticed at the end of each block.
 import numpy as np
 
 from .compiled import compiled
-from .tables import AC_BITS, COEFFICIENTS, DC_BITS, ENDS, LONG
+from .tables import AC_BITS, DC_BITS, ENDS, LONG
 from .transform import LANES
 from .vectors import at, big_endian, copy_eight, put
 
@@ -63,7 +63,7 @@ def valued(bits, size):  # type: ignore[no-untyped-def]
 
 @compiled
 def row_of_units(  # type: ignore[no-untyped-def]
-    coded, end, place, bits, have, last_dc, units, dc, ac, codes, quantised, coefficients, deepest
+    coded, end, place, bits, have, last_dc, units, dc, ac, codes, places, coefficients, deepest
 ):
     """Read a row of `units`: where it ends in `coded`, or `BAD`, and the bits left over.
 
@@ -75,7 +75,7 @@ def row_of_units(  # type: ignore[no-untyped-def]
         chroma = 0 if block < 4 else 1
         component = 0 if block < 4 else block - 3
         home = at(units, number)
-        ac_at, first = chroma << AC_BITS, chroma * COEFFICIENTS
+        ac_at = chroma << AC_BITS
 
         place, bits, have = more(coded, place, bits, have)
         entry = at(dc, (chroma << DC_BITS) + np.int64(bits >> DC_SHIFT))
@@ -93,8 +93,7 @@ def row_of_units(  # type: ignore[no-untyped-def]
                 last_dc[component] += valued(bits, size)
                 bits <<= u64(size)
             have -= (code >> 8) + size
-        target = at(quantised, first)
-        put(coefficients, home, last_dc[component] * (target & 0xFFFF))
+        put(coefficients, home, last_dc[component])
 
         k = 0
         while True:
@@ -105,10 +104,8 @@ def row_of_units(  # type: ignore[no-untyped-def]
                 entry = at(ac, ac_at + np.int64(bits >> AC_SHIFT))
                 bits <<= u64(entry & 63)
                 have -= entry & 63
-                target = at(quantised, first + k + ((entry >> 8) & 255))
-                put(coefficients, home + (target >> 16), ((entry << 16) >> 52) * (target & 0xFFFF))
-                target = at(quantised, first + k + ((entry >> 16) & 255))
-                put(coefficients, home + (target >> 16), (entry >> 48) * (target & 0xFFFF))
+                put(coefficients, home + at(places, k + ((entry >> 8) & 255)), entry >> 32)
+                put(coefficients, home + at(places, k + ((entry >> 16) & 255)), entry >> 48)
                 k += (entry >> 24) & 255
                 if k >= 63:
                     break
@@ -120,13 +117,12 @@ def row_of_units(  # type: ignore[no-untyped-def]
                     # The first was the block's last, what follows is not of it: take that back.
                     if k - step + ((entry >> 8) & 255) != 63:
                         return BAD, bits, have
-                    used = (entry >> 32) & 15
+                    code = np.int64(at(codes, ((2 + chroma) << 16) + np.int64(before >> u64(48))))
+                    used = (code >> 8) + (code & 15)
                     bits = before << u64(used)
                     have += (entry & 63) - used
                     k = 63
-                    target = at(quantised, first + k)
-                    value = ((entry << 16) >> 52) * (target & 0xFFFF)
-                    put(coefficients, home + (target >> 16), value)
+                    put(coefficients, home + at(places, k), entry >> 32)
                 break
             k -= LONG
             place, bits, have = more(coded, place, bits, have)
@@ -141,8 +137,7 @@ def row_of_units(  # type: ignore[no-untyped-def]
             k += int(symbol >> 4) + 1
             size = symbol & 15
             if size:
-                target = at(quantised, first + k)
-                put(coefficients, home + (target >> 16), valued(bits, size) * (target & 0xFFFF))
+                put(coefficients, home + at(places, k), valued(bits, size))
                 bits <<= u64(size)
                 have -= size
             if k >= 63:

@@ -4,7 +4,7 @@ import numpy as np
 
 from .compiled import compiled
 from .entropy import BAD, row_of_units, unstuffed
-from .tables import AC_BITS, COEFFICIENTS, DC_BITS
+from .tables import DC_BITS
 from .transform import LANES, STEP, colour, inverse_four, inverse_full, inverse_two
 
 u64 = np.uint64
@@ -14,23 +14,23 @@ IN_TWO, IN_FOUR = 2, 9
 
 
 @compiled
-def transformed(row, groups, coefficients, deepest, samples):  # type: ignore[no-untyped-def]
+def transformed(row, groups, coefficients, factors, deepest, samples):  # type: ignore[no-untyped-def]
     """The coefficients of a row of units into samples; all of them are zero afterwards.
 
-    `groups` (n, 3): where a group of blocks starts in the first row of samples, how much further
-    for each row of units, and how far apart its rows are.
+    `groups` (n, 4): where a group of blocks starts in the first row of samples, how much further
+    for each row of units, how far apart its rows are, and where its `factors` start.
     """
     for number in range(len(groups)):
         first = number * 64 * LANES
         to, stride = groups[number, 0] + row * groups[number, 1], groups[number, 2]
-        depth = deepest[number]
+        depth, by = deepest[number], groups[number, 3]
         deepest[number] = 0
         if depth > IN_FOUR:
-            inverse_full(coefficients, first, samples, to, stride)
+            inverse_full(coefficients, first, factors, by, samples, to, stride)
         elif depth > IN_TWO:
-            inverse_four(coefficients, first, samples, to, stride)
+            inverse_four(coefficients, first, factors, by, samples, to, stride)
         else:
-            inverse_two(coefficients, first, samples, to, stride)
+            inverse_two(coefficients, first, factors, by, samples, to, stride)
 
 
 @compiled
@@ -64,17 +64,15 @@ def coloured(samples, planes, first, last, width, height, out):  # type: ignore[
 
 @compiled
 def decoded(  # type: ignore[no-untyped-def]
-    source, start, width, height, tables, codes, units, groups, planes, coefficients, samples,
-    coded, out,
+    source, start, width, height, tables, codes, places, factors, units, groups, planes,
+    coefficients, samples, coded, out,
 ):  # fmt: skip
     """The picture of `source`, whose coded part begins at `start`, to `out` (H * W * 3 bytes).
 
     False where it is damaged: then `out` and what was to be zero in `coefficients` are anything.
     """
     ac_at = 2 << DC_BITS
-    quantised_at = ac_at + (2 << AC_BITS)
-    dc, ac = tables[:ac_at], tables[ac_at:quantised_at]
-    quantised = tables[quantised_at : quantised_at + 2 * COEFFICIENTS]
+    dc, ac = tables[:ac_at], tables[ac_at:]
     end, marker = unstuffed(source, start, coded)
     if marker + 1 >= len(source) or source[marker + 1] != END_OF_IMAGE:
         return False
@@ -83,12 +81,12 @@ def decoded(  # type: ignore[no-untyped-def]
     rows = (height + 15) // 16
     for row in range(rows):
         place, bits, have = row_of_units(
-            coded, end, place, bits, have, last_dc, units, dc, ac, codes, quantised, coefficients,
+            coded, end, place, bits, have, last_dc, units, dc, ac, codes, places, coefficients,
             deepest,
         )  # fmt: skip
         if place == BAD:
             return False
-        transformed(row, groups, coefficients, deepest, samples)
+        transformed(row, groups, coefficients, factors, deepest, samples)
         for plane in (1, 2):
             begin, stride = planes[plane]
             widened(samples, 8 * row, 8 * row + 8, begin, stride, (width + 1) // 2)

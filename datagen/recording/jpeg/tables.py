@@ -145,27 +145,26 @@ def ac_table(codes: NDArray[np.uint16]) -> NDArray[np.int64]:
 
     Bits 0 to 5: bits used; from 8, 16 and 24, 8 bits each: what to add to the place of the last
     coefficient for that of the first, of the second (the first again where there is one) and of
-    the last, `ENDS` more when the block ends; 32 to 35: bits of the first; 36 to 47 and 48 to 63:
-    first and second value.
+    the last, `ENDS` more when the block ends; 32 to 47 and 48 to 63: first and second value.
     """
     table = np.zeros(1 << AC_BITS, np.int64)
     for bits in range(len(table)):
         first = _symbol(codes, bits, AC_BITS)
         if first is None:
-            table[bits] = _entry(0, NOWHERE, NOWHERE, LONG, 0, 0, 0)
+            table[bits] = _entry(0, NOWHERE, NOWHERE, LONG, 0, 0)
             continue
         used, step, value = first
         second = _symbol(codes, (bits << used) & ((1 << AC_BITS) - 1), AC_BITS - used)
         if not step:
-            table[bits] = _entry(used, NOWHERE, NOWHERE, ENDS, 0, 0, 0)
+            table[bits] = _entry(used, NOWHERE, NOWHERE, ENDS, 0, 0)
         elif second is None:
-            table[bits] = _entry(used, step, step, step, used, value, value)
+            table[bits] = _entry(used, step, step, step, value, value)
         elif not second[1]:
             both = used + second[0]
-            table[bits] = _entry(both, step, step, step + ENDS, used, value, value)
+            table[bits] = _entry(both, step, step, step + ENDS, value, value)
         else:
             both, last = used + second[0], step + second[1]
-            table[bits] = _entry(both, step, last, last, used, value, second[2])
+            table[bits] = _entry(both, step, last, last, value, second[2])
     return table
 
 
@@ -181,13 +180,18 @@ def _symbol(codes: NDArray[np.uint16], bits: int, known: int) -> tuple[int, int,
     return length + size, step, _value((bits >> rest) & ((1 << size) - 1), size)
 
 
-def _entry(used: int, first: int, second: int, last: int, of_first: int, v: int, w: int) -> int:
-    low = used | first << 8 | second << 16 | last << 24 | of_first << 32 | (v & 0xFFF) << 36
-    return low | w << 48
+def _entry(used: int, first: int, second: int, last: int, v: int, w: int) -> int:
+    return used | first << 8 | second << 16 | last << 24 | (v & 0xFFFF) << 32 | w << 48
 
 
-def places(quantiser: bytes, lanes: int) -> NDArray[np.int64]:
-    """(COEFFICIENTS,) by place in the file: place in memory << 16 | quantiser, 0 beyond 64."""
+def places(lanes: int) -> NDArray[np.uint16]:
+    """(COEFFICIENTS,) place in memory by place in the file; the last one's beyond 64."""
     beyond = COEFFICIENTS - len(ZIGZAG)
-    order = np.array(ZIGZAG + (ZIGZAG[-1],) * beyond, np.int64)
-    return (order * lanes) << 16 | np.array(list(quantiser) + [0] * beyond, np.int64)
+    return np.array(ZIGZAG + (ZIGZAG[-1],) * beyond, np.uint16) * np.uint16(lanes)
+
+
+def factors(quantiser: bytes, lanes: int) -> NDArray[np.int16]:
+    """(64 * lanes,) what coefficients are multiplied with, as they lie in memory."""
+    found = np.zeros(len(ZIGZAG), np.int16)
+    found[list(ZIGZAG)] = list(quantiser)
+    return found.repeat(lanes)

@@ -55,39 +55,46 @@ def _inverse(size: int) -> Intrinsic:
     """For blocks with nothing but zeros beyond their first `size` rows and columns: what those
     would be multiplied with is then never written."""
 
-    def typed(tc: Any, coefficients: Any, first: Any, samples: Any, to: Any, stride: Any) -> Any:
+    def typed(  # type: ignore[no-untyped-def]
+        tc, coefficients, first, factors, by, samples, to, stride
+    ) -> Any:
         def build(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
             place = place_in(context, builder, signature.args[0], *arguments[:2])
+            factor = place_in(context, builder, signature.args[2], *arguments[2:4])
             zero = zeros(builder, I16, LANES)
             between = [zero] * 64
             for x in range(size):
-                places = [beyond(builder, place, (8 * y + x) * LANES) for y in range(size)]
-                column = [load(builder, at, I16, LANES) for at in places]
-                for at in places:
+                column = []
+                for number in range(x, 8 * size, 8):
+                    at, times = (beyond(builder, p, number * LANES) for p in (place, factor))
+                    column.append(load(builder, at, I16, LANES) * load(builder, times, I16, LANES))
                     store(at, zero)  # for the next blocks
                 for y, vector in enumerate(_eight(column + [zero] * (8 - size), FIRST_BITS)):
                     between[8 * y + x] = vector.to(I16)
-            row = place_in(context, builder, signature.args[2], *arguments[2:4])
+            row = place_in(context, builder, signature.args[4], *arguments[4:6])
             for y in range(8):
-                found = [(v + 128).byte() for v in _eight(between[8 * y : 8 * y + 8], SECOND_BITS)]
+                found = _eight(between[8 * y : 8 * y + 8], SECOND_BITS)
                 left, right = (_four_bytes(found[i : i + 4]) for i in (0, 4))
                 pairs = [lane for i in range(LANES) for lane in (i, LANES + i)]
                 store(row, shuffled(left, right, pairs))
-                row = builder.gep(row, [arguments[4]])
+                row = builder.gep(row, [arguments[6]])
             return context.get_dummy_value()
 
-        return types.void(coefficients, types.intp, samples, types.intp, types.intp), build
+        arrays = coefficients, types.intp, factors, types.intp, samples
+        return types.void(*arrays, types.intp, types.intp), build
 
     return make_intrinsic(typed)
 
 
 def _four_bytes(a: list[Vector]) -> Vector:
-    return a[0] | (a[1] << 8) | (a[2] << 16) | (a[3] << 24)
+    """Four samples of 16 bits around 0, each in 32, as bytes; two of them are limited at once."""
+    even, odd = ((v & 0xFFFF | w << 16).seen_as(I16) for v, w in ((a[0], a[2]), (a[1], a[3])))
+    return ((even + 128).byte() | (odd + 128).byte() << 8).seen_as(I32)
 
 
-# (coefficients, first, samples, to, stride): `LANES` blocks, lane after lane of each of 64
-# coefficients from `first`, become 8 rows of 8 * `LANES` bytes from `to`, `stride` bytes apart.
-# The coefficients are zero afterwards.
+# (coefficients, first, factors, by, samples, to, stride): `LANES` blocks, lane after lane of each
+# of 64 coefficients from `first`, times those of `factors` from `by`, become 8 rows of
+# 8 * `LANES` bytes from `to`, `stride` bytes apart. The coefficients are zero afterwards.
 inverse_full, inverse_four, inverse_two = _inverse(8), _inverse(4), _inverse(2)
 
 

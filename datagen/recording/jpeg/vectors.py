@@ -158,3 +158,25 @@ def copy_eight(typing_context: Any, source: Any, start: Any, target: Any, to: An
         return context.get_dummy_value()
 
     return types.void(source, types.intp, target, types.intp), build
+
+
+@make_intrinsic
+def take_next(typing_context: Any, counter: Any) -> Any:
+    """`counter[0]`, which is one more afterwards; no two threads get the same."""
+
+    def build(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        place = place_in(context, builder, signature.args[0], arguments[0], ir.Constant(I64, 0))
+        return builder.atomic_rmw("add", place, ir.Constant(I64, 1), "monotonic")
+
+    return types.int64(counter), build
+
+
+@make_intrinsic
+def bytes_from(typing_context: Any, address: Any) -> Any:
+    """Pointer to the bytes from `address` of memory; somebody else keeps them there."""
+
+    def build(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return builder.inttoptr(arguments[0], I8.as_pointer())
+
+    pointer: Any = types.CPointer
+    return pointer(types.uint8)(types.int64), build
