@@ -1,4 +1,4 @@
-"""The service as one application: the hot path as plain ASGI, all else by FastAPI."""
+"""The service as one application: frames by hand, all else by FastAPI."""
 
 import time
 from collections.abc import AsyncIterator, Callable
@@ -13,10 +13,10 @@ from starlette.routing import Route
 
 from mtlnet.engine import Engine
 from serve import contract, inference, problems
-from serve.ask import check_token
+from serve.ask import Headers, check_token
 from serve.console import add_console
-from serve.features import Features, Sight, client_of
-from serve.gate import Receive, Scope, Send, refuse
+from serve.features import Exchange, Features, Sight, client_of
+from serve.gate import Receive, Reply, Scope, Send, refusal, reply
 from serve.limits import Limits
 from serve.metrics import MEDIA_TYPE, Metrics
 from serve.perceiver import Perceiver
@@ -68,20 +68,36 @@ class Service:
             await self.framework(scope, receive, send)
             return
         way = "http" if scope["type"] == "http" else "websocket.http"
-        try:
-            if not _is_public(scope["path"]):
-                self.rate.check(client_of(scope))
-                check_token(dict(scope["headers"]), self._token)
-        except Problem as problem:
-            self.metrics.refused(problem.kind, self.perceiver.waiting)
-            await refuse(send, problem, [], way)
-            return
+        if not _is_public(scope["path"]):
+            stopped = self._at_the_door(dict(scope["headers"]), client_of(scope))
+            if stopped is not None:
+                await reply(send, stopped, way)
+                return
         if scope["type"] == "websocket":
             await self._stream(scope, receive, send)
         elif scope["path"] == "/features" and scope["method"] == "POST":
             await self.features(scope, receive, send)
         else:
             await self.framework(scope, receive, send)
+
+    def open(self, headers: Headers, client: str, send: Callable[[Reply], None]) -> Exchange | None:
+        """A POST /features whose body is wanted; None: it was replied to."""
+        stopped = self._at_the_door(headers, client)
+        if stopped is not None:
+            send(stopped)
+            return None
+        exchange = Exchange(self.sight, client, send)
+        return exchange if exchange.open(headers) else None
+
+    def _at_the_door(self, headers: Headers, client: str) -> Reply | None:
+        """The reply to a client who may not come in."""
+        try:
+            self.rate.check(client)
+            check_token(headers, self._token)
+        except Problem as problem:
+            self.metrics.refused(problem.kind, self.perceiver.waiting)
+            return refusal(problem)
+        return None
 
 
 def _is_public(path: str) -> bool:

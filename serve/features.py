@@ -1,19 +1,38 @@
-"""POST /features: the hot path, as plain ASGI. What it takes and gives is in `serve.contract`."""
+"""POST /features, whatever carries it. What it takes and gives is in `serve.contract`.
 
+The service's own connections (`serve.direct`) open an `Exchange` for each request; `Features` is
+the same as an ASGI application, for other servers.
+"""
+
+import asyncio
 import logging
 import time
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from mtlnet.image_error import ImageError
 from mtlnet.images import decode, inspect
 from mtlnet.view import View, visible
 from serve.ask import Ask, Headers, check_headers, read_ask, request_id
-from serve.gate import Departed, Header, Receive, Scope, Send, as_problem, read_body, refuse, reply
+from serve.gate import (
+    Departed,
+    Receive,
+    Reply,
+    Scope,
+    Send,
+    as_problem,
+    read_body,
+    refusal,
+    reply,
+)
 from serve.logs import Refusals, tell_answer
 from serve.metrics import Metrics
-from serve.perceiver import Frame, Perceived, Perceiver, Reader
+from serve.perceiver import Done, Frame, Perceived, Perceiver, Reader
 from serve.problems import Problem, failure
 from serve.streams import stream_key
+
+SMALL_PIXELS = 640 * 480  # decoded in a millisecond or two
 
 logger = logging.getLogger(__name__)
 
@@ -27,25 +46,43 @@ class Sight:
         self._refusals = Refusals()
         self._log_answers = log_answers
 
+    def admit(self, ask: Ask, body: bytes, client: str, done: Done) -> list[int] | None:
+        """Have `done` called with what the model sees in an image's bytes, or with an error.
+
+        The part of the image that it sees, as in `crop_of`. Raises Problem, ImageError.
+        """
+        self.perceiver.check_ready()
+        if ask.stream is None:
+            self.perceiver.check_room()  # who has too much to do reads no headers of images
+        camera, fov = self.perceiver.loaded.engine.card.camera, ask.fov_y_deg
+        header = inspect(body, camera, fov)
+        small = header.width * header.height <= SMALL_PIXELS
+        frame = _frame(ask, client, lambda view: decode(body, header, view, fov), small)
+        self.perceiver.admit(frame, done)
+        return crop_of(header.width, header.height, camera, fov)
+
     async def look(self, ask: Ask, body: bytes, client: str) -> dict[str, Any]:
         """What `serve.contract.Features` says of an image's bytes. Raises Problem, ImageError."""
-        self.perceiver.check_ready()
-        camera = self.perceiver.loaded.engine.card.camera
-        header = inspect(body, camera, ask.fov_y_deg)
-        fov = ask.fov_y_deg
-        perceived = await self.see(ask, client, lambda view: decode(body, header, view, fov))
-        return content_of(ask, perceived, crop_of(header.width, header.height, camera, fov))
+        future: asyncio.Future[Perceived] = asyncio.get_running_loop().create_future()
+        crop = self.admit(ask, body, client, partial(settle, future))
+        perceived = await future
+        self.answered(ask, client, perceived)
+        return content_of(ask, perceived, crop)
 
     async def see(self, ask: Ask, client: str, read: Reader) -> Perceived:
         """What the model sees in the pixels that `read` gives. Raises Problem, ImageError."""
-        stream = stream_key(client, ask.stream) if ask.stream else 0
-        frame = Frame(read, ask.stamp_ns, stream, ask.deadline_ns)
-        perceived = await self.perceiver.perceive(frame)
+        future: asyncio.Future[Perceived] = asyncio.get_running_loop().create_future()
+        self.perceiver.admit(_frame(ask, client, read, False), partial(settle, future))
+        perceived = await future
+        self.answered(ask, client, perceived)
+        return perceived
+
+    def answered(self, ask: Ask, client: str, perceived: Perceived) -> None:
+        """Count an answer; told to the log where that is wanted."""
         total_s = (time.monotonic_ns() - ask.stamp_ns) / 1e9
         self._metrics.answered(perceived, total_s, self.perceiver.waiting)
         if self._log_answers:
             tell_answer(ask.request_id, client, 1e3 * total_s)
-        return perceived
 
     def refused(self, error: Problem | ImageError, request: str, client: str) -> Problem:
         """The problem that an error is to a client; counted, and told to the log."""
@@ -55,6 +92,66 @@ class Sight:
         return problem
 
 
+class Exchange:
+    """One request, from its headers to its reply: `open`, then `take` its body.
+
+    `send` is called once, unless the client departs before its body is whole.
+    """
+
+    __slots__ = ("_ask", "_client", "_crop", "_name", "_send", "_sight")
+
+    def __init__(self, sight: Sight, client: str, send: Callable[[Reply], None]) -> None:
+        self._sight = sight
+        self._client = client
+        self._send = send
+
+    def open(self, headers: Headers) -> bool:
+        """Whether the body is wanted; if not, it was refused."""
+        stamp = time.monotonic_ns()
+        self._name = request_id(headers)
+        try:
+            self._ask = read_ask(headers, stamp, self._name)
+            check_headers(headers)
+        except Problem as problem:
+            self.refuse(problem)
+            return False
+        return True
+
+    def take(self, body: bytes) -> None:
+        """Have the whole body answered."""
+        try:
+            self._crop = self._sight.admit(self._ask, body, self._client, self._answer)
+        except (Problem, ImageError) as error:
+            self.refuse(error)
+        except Exception:
+            logger.exception("request %s failed", self._name)
+            self.refuse(failure())
+
+    def refuse(self, error: Problem | ImageError) -> None:
+        """Reply with the problem that an error is."""
+        problem = self._sight.refused(error, self._name, self._client)
+        self._send(refusal(problem, (b"x-request-id", self._name.encode())))
+
+    def _answer(self, result: Perceived | Exception) -> None:
+        try:
+            if isinstance(result, Exception):
+                raise result
+            reply = self._reply(result)
+        except (Problem, ImageError) as error:
+            self.refuse(error)
+        except Exception:
+            logger.exception("request %s failed", self._name)
+            self.refuse(failure())
+        else:
+            self._send(reply)
+
+    def _reply(self, perceived: Perceived) -> Reply:
+        ask = self._ask
+        self._sight.answered(ask, self._client, perceived)
+        headers = [(b"x-request-id", self._name.encode()), ask.format.header]
+        return Reply(200, headers, ask.format.encode(content_of(ask, perceived, self._crop)))
+
+
 class Features:
     """The endpoint, as an ASGI application."""
 
@@ -62,25 +159,31 @@ class Features:
         self._sight = sight
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        stamp = time.monotonic_ns()
-        headers: Headers = dict(scope["headers"])
-        name = request_id(headers)
-        sent: list[Header] = [(b"x-request-id", name.encode())]
-        try:
-            ask = read_ask(headers, stamp, name)
-            check_headers(headers)
-            body = await read_body(receive)
-            content = await self._sight.look(ask, body, client_of(scope))
-        except Departed:
-            return
-        except (Problem, ImageError) as error:
-            await refuse(send, self._sight.refused(error, name, client_of(scope)), sent)
-        except Exception:
-            logger.exception("request %s failed", name)
-            await refuse(send, self._sight.refused(failure(), name, client_of(scope)), sent)
-        else:
-            sent.append(ask.format.header)
-            await reply(send, 200, sent, ask.format.encode(content))
+        found: asyncio.Future[Reply] = asyncio.get_running_loop().create_future()
+        exchange = Exchange(self._sight, client_of(scope), partial(settle, found))
+        if exchange.open(dict(scope["headers"])):
+            try:
+                exchange.take(await read_body(receive))
+            except Departed:
+                return
+            except Problem as problem:
+                exchange.refuse(problem)
+        await reply(send, await found)
+
+
+def settle(future: "asyncio.Future[Any]", result: Any) -> None:
+    """Give a future its result, or the exception that it is; none is due to who was cancelled."""
+    if future.done():
+        return
+    if isinstance(result, Exception):
+        future.set_exception(result)
+    else:
+        future.set_result(result)
+
+
+def _frame(ask: Ask, client: str, read: Reader, small: bool) -> Frame:
+    stream = stream_key(client, ask.stream) if ask.stream else 0
+    return Frame(read, ask.stamp_ns, stream, ask.deadline_ns, small)
 
 
 def client_of(scope: Scope) -> str:

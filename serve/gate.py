@@ -1,10 +1,8 @@
-"""A request on its way in and out: its whole body within the limit, its answer in one go.
-
-Plain ASGI, for the paths on which every microsecond counts.
-"""
+"""A request on its way in and out: its whole body within the limit, its answer in one go."""
 
 from collections.abc import Awaitable, Callable, MutableMapping
-from typing import Any
+from http import HTTPStatus
+from typing import Any, NamedTuple
 
 import msgspec
 
@@ -19,8 +17,19 @@ Receive = Callable[[], Awaitable[Message]]
 Send = Callable[[Message], Awaitable[None]]
 Header = tuple[bytes, bytes]
 
+STATUS_LINES: dict[int, bytes] = {
+    status: f"HTTP/1.1 {status} {status.phrase}\r\n".encode() for status in HTTPStatus
+}
 PROBLEM_HEADER: Header = (b"content-type", MEDIA_TYPE.encode())
 encode_problem = msgspec.json.Encoder().encode
+
+
+class Reply(NamedTuple):
+    """A whole answer to a request; its length stands not in the headers."""
+
+    status: int
+    headers: list[Header]
+    body: bytes
 
 
 class Departed(Exception):
@@ -34,7 +43,7 @@ async def read_body(receive: Receive) -> bytes:
         raise Departed
     body: bytes = message.get("body", b"")
     if not message.get("more_body", False):
-        _check_size(len(body))
+        check_size(len(body))
         return body
     parts = bytearray(body)
     while message.get("more_body", False):
@@ -42,29 +51,39 @@ async def read_body(receive: Receive) -> bytes:
         if message["type"] == "http.disconnect":
             raise Departed
         parts += message.get("body", b"")
-        _check_size(len(parts))
+        check_size(len(parts))
     return bytes(parts)
 
 
-def _check_size(size: int) -> None:
+def check_size(size: int) -> None:
+    """Raise Problem when a body of so many bytes is too large."""
     if size > MAX_BODY_BYTES:
         raise too_large(f"more than {MAX_BODY_BYTES} bytes")
 
 
-async def reply(
-    send: Send, status: int, headers: list[Header], body: bytes, way: str = "http"
-) -> None:
-    """Send a whole answer; `way` "websocket.http": to the handshake of a WebSocket."""
-    headers.append((b"content-length", b"%d" % len(body)))
-    await send({"type": f"{way}.response.start", "status": status, "headers": headers})
-    await send({"type": f"{way}.response.body", "body": body})
+async def reply(send: Send, whole: Reply, way: str = "http") -> None:
+    """Send a reply; `way` "websocket.http": to the handshake of a WebSocket."""
+    headers = [*whole.headers, (b"content-length", b"%d" % len(whole.body))]
+    await send({"type": f"{way}.response.start", "status": whole.status, "headers": headers})
+    await send({"type": f"{way}.response.body", "body": whole.body})
 
 
-async def refuse(send: Send, problem: Problem, headers: list[Header], way: str = "http") -> None:
-    """Send a problem; `way` as in `reply`."""
+def refusal(problem: Problem, *headers: Header) -> Reply:
+    """The reply that tells a client of a problem."""
     added = [(k.lower().encode(), v.encode()) for k, v in problem.headers.items()]
     content = encode_problem(problem.content)
-    await reply(send, problem.kind.status, [PROBLEM_HEADER, *added, *headers], content, way)
+    return Reply(problem.kind.status, [PROBLEM_HEADER, *added, *headers], content)
+
+
+def head_of(whole: Reply, *more: Header) -> bytes:
+    """The bytes of a reply before its body, as HTTP/1.1 has them."""
+    lines = [
+        STATUS_LINES[whole.status],
+        *[b"%b: %b\r\n" % header for header in more],
+        *[b"%b: %b\r\n" % header for header in whole.headers],
+        b"content-length: %d\r\n\r\n" % len(whole.body),
+    ]
+    return b"".join(lines)
 
 
 def as_problem(error: Problem | ImageError) -> Problem:

@@ -18,6 +18,7 @@ from typing import Any
 import uvicorn
 
 from serve.app import Service
+from serve.direct import DirectProtocol
 from serve.limits import MAX_BODY_BYTES, Limits
 from serve.protocol import Guard, GuardedProtocol, sweep
 from serve.workers import BlockPeers
@@ -38,6 +39,7 @@ class WorkerServer(uvicorn.Server):
             limits, others=lambda: sum(self._peers.others()), dismissed=app.metrics.dismissed
         )
         super().__init__(_settings(app, limits))
+        self._app = app
         self._peers = peers or BlockPeers(app.shared, 0)
         self._waited = False
 
@@ -61,7 +63,8 @@ class WorkerServer(uvicorn.Server):
         self._listener.setblocking(False)
         self._loop = asyncio.get_running_loop()
         self._make = partial(
-            GuardedProtocol,
+            DirectProtocol,
+            service=self._app,
             guard=self.guard,
             config=self.config,
             server_state=self.server_state,
@@ -144,6 +147,5 @@ def _settings(app: Any, limits: Limits) -> uvicorn.Config:
         log_config=None,
         access_log=False,
         server_header=False,
-        timeout_keep_alive=limits.idle_s,  # type: ignore[arg-type]  # a delay in s
         timeout_graceful_shutdown=GRACE_S,
     )

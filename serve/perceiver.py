@@ -1,8 +1,12 @@
-"""One engine in one thread of its own, with a short queue before it: the event loop stays free.
+"""One engine with a short queue before it, and a thread of its own: the event loop stays free.
 
 An engine is neither re-entrant nor thread-safe, and waiting longer than a few frames helps no
 controller: what does not fit into the queue is refused at once. In a stream a newer frame takes a
 queued one's place; a frame whose deadline has passed is dropped before it is decoded.
+
+A frame that comes alone to a quick engine is answered by the event loop itself: the way to another
+thread and back costs more than all else that is not the model. Whoever comes meanwhile would have
+waited for that frame anyway. As soon as two frames wait, the thread takes them.
 """
 
 import asyncio
@@ -14,7 +18,6 @@ from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import dataclass
 from queue import SimpleQueue
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,9 +30,12 @@ from serve.problems import DEADLINE_PASSED, NOT_READY, OVERLOADED, SUPERSEDED, P
 from serve.streams import Streams
 
 SMOOTHING = 0.1  # weight of the latest frame in the mean time a frame takes
+QUICK_MS = 10.0  # for so long the event loop may be kept from everything else
+QUICK_RUN = 8  # frames in a row that took no longer, before it is trusted with one
 logger = logging.getLogger(__name__)
 
 Reader = Callable[[Camera], NDArray[np.uint8]]
+Done = Callable[["Perceived | Exception"], None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,27 +72,31 @@ class Perceived:
 class Frame:
     """An image that waits: how to read its pixels, and what `serve.ask` says of its turn.
 
-    `stream` 0: of no stream.
+    `stream` 0: of no stream. `small`: read in less time than the engine takes.
     """
 
     read: Reader
     stamp_ns: int
     stream: int = 0
     deadline_ns: int | None = None
+    small: bool = False
 
 
 class Turn:
-    """A place in the queue, and the frame that has it now."""
+    """A place in the queue, the frame that has it now, and who is told of its answer."""
 
-    __slots__ = ("frame", "future")
+    __slots__ = ("done", "frame")
 
-    def __init__(self, frame: Frame, future: asyncio.Future[Perceived]) -> None:
+    def __init__(self, frame: Frame, done: Done) -> None:
         self.frame = frame
-        self.future = future
+        self.done = done
 
 
 class Perceiver:
-    """Answers images with one engine, one at a time. Start it in a running event loop."""
+    """Answers images with one engine, one at a time. Start it in a running event loop.
+
+    All but what the thread does is for that loop's thread alone.
+    """
 
     def __init__(
         self, engine: Engine, warm_up: Callable[[Engine], None], streams: Streams, queue: int
@@ -95,13 +105,16 @@ class Perceiver:
         self._staged: tuple[Loaded, Callable[[], bool]] | None = None
         self._warm_up = warm_up
         self._warm: Future[None] = Future()
+        self._ready = False
         self._streams = streams
         self._limit = queue
         self._waiting: deque[Turn] = deque()
-        self._busy = False
+        self._busy = False  # the thread has a frame in work
+        self._awake = False  # somebody is about to look at the queue
         self._lock = threading.Lock()
-        self._calls: SimpleQueue[bool] = SimpleQueue()  # one True a turn; False: the end
+        self._calls: SimpleQueue[bool] = SimpleQueue()  # True: to the queue; False: the end
         self._frame_ms = 5.0
+        self._quick = 0  # frames in a row of this engine that took no longer than QUICK_MS
         self._thread = threading.Thread(target=self._run, name="forward", daemon=True)
 
     @property
@@ -109,7 +122,7 @@ class Perceiver:
         """The engine that answers the next frame."""
         staged = self._staged
         if staged is not None and staged[1]():
-            self._loaded, self._staged = staged[0], None
+            self._loaded, self._staged, self._quick = staged[0], None, 0
         return self._loaded
 
     @property
@@ -124,6 +137,8 @@ class Perceiver:
 
     def check_ready(self) -> None:
         """Raise Problem until the engine is warm and has given its golden answer."""
+        if self._ready:
+            return
         if not self._warm.done():
             raise Problem(NOT_READY, "the model is warming up; ask again in a second")
         fault = self._warm.exception()
@@ -142,38 +157,54 @@ class Perceiver:
         """Call `do`, in another thread, once the engine is warm and right."""
         self._warm.add_done_callback(lambda warm: None if warm.exception() else do())
 
-    def perceive(self, frame: Frame) -> "asyncio.Future[Perceived]":
-        """What the model sees in a frame; the future may raise Problem, ImageError.
+    def check_room(self) -> None:
+        """Raise Problem when a frame that takes no other's place would be refused."""
+        if len(self._waiting) + self._busy > self._limit:
+            raise self._overloaded()
+
+    def admit(self, frame: Frame, done: Done) -> None:
+        """Have `done` called with what the model sees in a frame, or with the error it got.
 
         Raises Problem at once where there is no room or no engine yet.
         """
         self.check_ready()
-        future: asyncio.Future[Perceived] = self._loop.create_future()
-        turn = Turn(frame, future)
+        lost = None
         with self._lock:
-            replaced = self._replace(turn) if frame.stream else None
-            if replaced is None:
-                if len(self._waiting) + self._busy > self._limit:
-                    raise self._overloaded()
-                self._waiting.append(turn)
-                self._calls.put(True)
-        if replaced is not None:
-            _fail(replaced, Problem(SUPERSEDED, "a newer frame of this stream came meanwhile"))
+            if frame.stream:
+                lost = self._replace(frame, done)
+            if lost is None:
+                self.check_room()
+                self._waiting.append(Turn(frame, done))
+                if not self._awake:
+                    self._awake = True
+                    # Not at once: first all is read that came in the meantime.
+                    self._loop.call_soon(self._begin)
+        if lost is not None:
+            lost(Problem(SUPERSEDED, "a newer frame of this stream came meanwhile"))
         if frame.stream:
             self._streams.announce(frame.stream, frame.stamp_ns)
-        return future
 
-    def _replace(self, turn: Turn) -> "asyncio.Future[Perceived] | None":
-        """Put a frame in the place of its stream's queued one; whose future has lost its turn."""
+    def _replace(self, frame: Frame, done: Done) -> Done | None:
+        """Put a frame in the place of its stream's queued one; whoever has lost their turn."""
         for queued in self._waiting:
-            if queued.frame.stream != turn.frame.stream:
+            if queued.frame.stream != frame.stream:
                 continue
-            if queued.frame.stamp_ns > turn.frame.stamp_ns:
-                return turn.future
-            lost = queued.future
-            queued.frame, queued.future = turn.frame, turn.future
+            if queued.frame.stamp_ns > frame.stamp_ns:
+                return done
+            lost = queued.done
+            queued.frame, queued.done = frame, done
             return lost
         return None
+
+    def _begin(self) -> None:
+        """Answer a lone small frame here; leave all else to the thread."""
+        if self._quick < QUICK_RUN or len(self._waiting) > 1 or not self._waiting[0].frame.small:
+            self._calls.put(True)
+            return
+        turn = self._waiting.popleft()
+        result = self._attempt(turn.frame)
+        self._awake = False
+        turn.done(result)
 
     def _overloaded(self) -> Problem:
         waiting = len(self._waiting)
@@ -195,14 +226,18 @@ class Perceiver:
             logger.exception("the model failed its check and answers nothing")
             self._warm.set_exception(error)
             return
+        self._ready = True
         self._warm.set_result(None)
         while self._calls.get():
-            with self._lock:
-                turn = self._waiting.popleft()
-                self._busy = True
-            result = self._attempt(turn.frame)
-            self._busy = False
-            self._loop.call_soon_threadsafe(_settle, turn.future, result)
+            while (turn := self._next()) is not None:
+                result = self._attempt(turn.frame)
+                self._loop.call_soon_threadsafe(turn.done, result)
+
+    def _next(self) -> Turn | None:
+        """The thread's next turn; None: it may rest."""
+        with self._lock:
+            self._busy = self._awake = bool(self._waiting)
+            return self._waiting.popleft() if self._waiting else None
 
     def _attempt(self, frame: Frame) -> "Perceived | Exception":
         try:
@@ -225,7 +260,9 @@ class Perceiver:
         decoded = time.monotonic_ns()
         answer = interpret(loaded.engine(image))
         end = time.monotonic_ns()
-        self._frame_ms += SMOOTHING * ((end - start) / 1e6 - self._frame_ms)
+        frame_ms = (end - start) / 1e6
+        self._frame_ms += SMOOTHING * (frame_ms - self._frame_ms)
+        self._quick = self._quick + 1 if frame_ms <= QUICK_MS else 0
         return Perceived(
             answer,
             loaded.origin,
@@ -236,19 +273,6 @@ class Perceiver:
 
     def close(self) -> None:
         """Finish what was begun and what waits, end the thread."""
-        self._calls.put(False)
+        for last in (True, False):
+            self._calls.put(last)
         self._thread.join()
-
-
-def _settle(future: "asyncio.Future[Perceived]", result: Perceived | Exception) -> None:
-    if future.done():  # whoever asked was cancelled
-        return
-    if isinstance(result, Exception):
-        future.set_exception(result)
-    else:
-        future.set_result(result)
-
-
-def _fail(future: "asyncio.Future[Any]", problem: Problem) -> None:
-    if not future.done():
-        future.set_exception(problem)

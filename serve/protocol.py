@@ -8,13 +8,12 @@ import asyncio
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from enum import Enum, auto
-from http import HTTPStatus
 from math import inf
 from typing import Any
 
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
-from serve.gate import PROBLEM_HEADER, encode_problem
+from serve.gate import head_of, refusal
 from serve.limits import MAX_HEAD_BYTES, Limits
 from serve.problems import HEAD_TOO_LARGE, MALFORMED, TOO_MANY_CONNECTIONS, TOO_SLOW, Kind, Problem
 
@@ -52,8 +51,11 @@ class GuardedProtocol(HttpToolsProtocol):
         self._due = inf
         self._since = 0.0
         self._served = False
-        self._head_bytes = 0  # of whole headers
-        self._unread_bytes = 0  # of all that came since the last whole request
+        self._head_bytes = 0  # of headers that are too large
+        self._part_bytes = 0  # of what came last
+        self._unread_bytes = (
+            0  # of all that came since the last whole request, and what came with it
+        )
 
     @property
     def active(self) -> bool:
@@ -73,52 +75,60 @@ class GuardedProtocol(HttpToolsProtocol):
         if self._phase is Phase.DISMISSED:
             return
         if self._phase is Phase.IDLE:
-            self._phase, self._head_bytes, self._unread_bytes = Phase.HEAD, 0, 0
+            self._phase, self._unread_bytes = Phase.HEAD, 0
             self._due = self.loop.time() + self._guard.limits.head_s
+        self._part_bytes = len(data)
+        self._unread_bytes += self._part_bytes
         super().data_received(data)
-        if self._phase is Phase.HEAD:
-            # A header that has no end yet is counted as it comes.
-            self._unread_bytes += len(data)
-            if self._unread_bytes > MAX_HEAD_BYTES:
-                self._dismiss(_head_too_large())
+        # A header that has no end yet is counted as it comes.
+        if self._phase is Phase.HEAD and self._unread_bytes > MAX_HEAD_BYTES:
+            self._dismiss(_head_too_large())
 
-    def on_url(self, url: bytes) -> None:
-        self._head_bytes += len(url)
-        super().on_url(url)
-
-    def on_header(self, name: bytes, value: bytes) -> None:
-        self._head_bytes += len(name) + len(value)
-        super().on_header(name, value)
+    def check_head(self) -> None:
+        """Go on to the body when the headers are not too large; else an error for the parser."""
+        if self._unread_bytes > MAX_HEAD_BYTES:
+            self._head_bytes = len(self.url) + sum(len(k) + len(v) for k, v in self.headers)
+            if self._head_bytes > MAX_HEAD_BYTES:
+                raise ValueError("headers too large")  # ends in `send_400_response`
+        self._phase = Phase.BODY
+        self._due = self.loop.time() + self._guard.limits.body_s
 
     def on_headers_complete(self) -> None:
-        if self._head_bytes > MAX_HEAD_BYTES:
-            raise ValueError("headers too large")  # ends in `send_400_response`
-        self._phase, self._head_bytes = Phase.BODY, 0
-        self._due = self.loop.time() + self._guard.limits.body_s
+        self.check_head()
         super().on_headers_complete()
         if self._guard.draining and self.cycle is not None:
             self.cycle.keep_alive = False
 
+    def body_is_whole(self) -> None:
+        """Wait for the answer, unless it was given."""
+        self._unread_bytes = self._part_bytes
+        if self.cycle is None or self.cycle.response_complete:
+            self._rest()
+        else:
+            self._phase, self._due = Phase.WORK, inf
+
     def on_message_complete(self) -> None:
-        self._due = inf
-        done = self.cycle is None or self.cycle.response_complete
-        self._phase = Phase.IDLE if done else Phase.WORK
+        self.body_is_whole()
         super().on_message_complete()
 
     def on_response_complete(self) -> None:
         self._served = True
+        if self.pipeline:
+            super().on_response_complete()
+            return
+        self.server_state.total_requests += 1
+        self.flow.resume_reading()
         if self._phase is Phase.WORK:
-            self._phase = Phase.IDLE
-        super().on_response_complete()
+            self._rest()
+
+    def _rest(self) -> None:
+        """Wait for the next request."""
+        self._phase = Phase.IDLE
+        self._due = self.loop.time() + self._guard.limits.idle_s
 
     def handle_websocket_upgrade(self) -> None:
         self._due = inf
         super().handle_websocket_upgrade()
-
-    def timeout_keep_alive_handler(self) -> None:
-        if self.transport.get_write_buffer_size():
-            self.transport.abort()  # it asked, and never read the answer
-        super().timeout_keep_alive_handler()
 
     def send_400_response(self, msg: str) -> None:
         if self._head_bytes > MAX_HEAD_BYTES:
@@ -134,6 +144,12 @@ class GuardedProtocol(HttpToolsProtocol):
     def expire(self, now: float) -> None:
         """Dismiss the client when its deadline has passed."""
         if now < self._due:
+            return
+        if self._phase is Phase.IDLE:
+            self._due = inf
+            # Closed in peace, unless it asked and never read the answer.
+            unread = self.transport.get_write_buffer_size()
+            (self.transport.abort if unread else self.transport.close)()
             return
         what, within = "headers", self._guard.limits.head_s
         if self._phase is Phase.BODY:
@@ -173,7 +189,8 @@ class GuardedProtocol(HttpToolsProtocol):
         self._unset_keepalive_if_required()
         if self.transport.is_closing():
             return
-        self.transport.write(_whole_response(problem))
+        whole = refusal(problem, (b"connection", b"close"))
+        self.transport.write(head_of(whole) + whole.body)
         # Cut at once, the answer would be lost to whoever is still sending.
         if self.transport.can_write_eof():
             self.transport.write_eof()
@@ -189,13 +206,3 @@ def sweep(connections: Iterable[object], now: float) -> None:
 
 def _head_too_large() -> Problem:
     return Problem(HEAD_TOO_LARGE, f"the headers have over {MAX_HEAD_BYTES} bytes; send fewer")
-
-
-def _whole_response(problem: Problem) -> bytes:
-    status = problem.kind.status
-    body = encode_problem(problem.content)
-    headers = [PROBLEM_HEADER, (b"connection", b"close"), (b"content-length", b"%d" % len(body))]
-    headers += [(name.encode(), value.encode()) for name, value in problem.headers.items()]
-    lines = [b"HTTP/1.1 %d %s" % (status, HTTPStatus(status).phrase.encode())]
-    lines += [b"%s: %s" % header for header in headers]
-    return b"\r\n".join(lines) + b"\r\n\r\n" + body

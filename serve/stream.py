@@ -20,7 +20,7 @@ import msgspec
 from mtlnet.image_error import ImageError
 from serve.ask import Ask, Headers, is_name, read_ask, read_deadline, read_fov, request_id
 from serve.features import Sight, client_of
-from serve.gate import Receive, Scope, Send, refuse
+from serve.gate import Receive, Scope, Send, refusal, reply
 from serve.problems import FORBIDDEN_ORIGIN, INVALID_REQUEST, NOT_FOUND, Problem, failure
 from serve.rate import Rate
 from serve.wire import JSON, MSGPACK
@@ -56,7 +56,7 @@ class Stream:
             terms = _agree(scope, name)
         except Problem as problem:
             found = self._sight.refused(problem, name, client_of(scope))
-            await refuse(send, found, [], "websocket.http")
+            await reply(send, refusal(found), "websocket.http")
             return
         headers = [(b"x-request-id", name.encode())]
         await send({"type": "websocket.accept", "subprotocol": terms.protocol, "headers": headers})
