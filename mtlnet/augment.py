@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 import trackfeatures as tf
 from mtlnet.card import Camera
 
-PATCHES = 3  # at most so many are covered, each at most this share of the image's sides
+PATCHES = 1  # at most so many are covered, each at most this share of the image's sides
 PATCH_SIDE = 0.3
-TURN_SHARE = 0.4  # of the images
+TURN_SHARE = 0.25  # of the images
 TURN_RAD, NOD_RAD = 0.035, 0.006  # standard deviations
 TURN_LIMIT_RAD = 0.09
 TURNS = 64  # turns to choose from: where pixels go is then worked out once

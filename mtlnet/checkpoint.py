@@ -1,6 +1,6 @@
 """Checkpoints of a run in training: one safetensors file each, written whole or not at all.
 
-Tensors: `network.*`, `optimiser.INDEX.NAME`, `balance.NAME`, `rng` (torch's generator, for
+Tensors: `network.*`, `optimiser.WHICH.INDEX.NAME`, `balance.NAME`, `rng` (torch's generator, for
 dropout). Metadata: the step and the seconds trained so far.
 """
 
@@ -10,6 +10,7 @@ import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
+from torch.optim import Optimizer
 
 from mtlnet.card import ModelError
 from mtlnet.trainer import Trainer
@@ -58,10 +59,11 @@ def list_checkpoints(run: Path) -> list[Path]:
 
 def _tensors(trainer: Trainer) -> dict[str, Tensor]:
     tensors = {f"network.{name}": t for name, t in trainer.network.state_dict().items()}
-    for index, state in trainer.optimiser.state_dict()["state"].items():
-        for name, value in state.items():
-            if isinstance(value, Tensor):
-                tensors[f"optimiser.{index}.{name}"] = value
+    for which, optimiser in enumerate(trainer.optimisers.parts):
+        for index, state in optimiser.state_dict()["state"].items():
+            for name, value in state.items():
+                if isinstance(value, Tensor):
+                    tensors[f"optimiser.{which}.{index}.{name}"] = value
     for name, tensor in trainer.balance.state().items():
         tensors[f"balance.{name}"] = tensor
     tensors["rng"] = torch.get_rng_state()
@@ -73,18 +75,24 @@ def _restore(trainer: Trainer, tensors: dict[str, Tensor]) -> None:
     trainer.network.load_state_dict(
         {name.removeprefix(prefix): t for name, t in tensors.items() if name.startswith(prefix)}
     )
-    state: dict[int, dict[str, Tensor]] = {}
-    for key, tensor in tensors.items():
-        if key.startswith("optimiser."):
-            _, index, name = key.split(".", 2)
-            state.setdefault(int(index), {})[name] = tensor
-    groups = trainer.optimiser.state_dict()["param_groups"]
-    trainer.optimiser.load_state_dict({"state": state, "param_groups": groups})
-    # Fused optimisers walk a parameter and its state in memory order: channels-last, both.
-    for parameter, values in trainer.optimiser.state.items():
-        for name, value in values.items():
-            if isinstance(value, Tensor) and value.shape == parameter.shape:
-                values[name] = torch.empty_like(parameter).copy_(value)
+    for which, optimiser in enumerate(trainer.optimisers.parts):
+        prefix = f"optimiser.{which}."
+        kept = {n.removeprefix(prefix): t for n, t in tensors.items() if n.startswith(prefix)}
+        _restore_optimiser(optimiser, kept)
     kept = {n.removeprefix("balance."): t for n, t in tensors.items() if n.startswith("balance.")}
     trainer.balance.restore(kept)
     torch.set_rng_state(tensors["rng"])
+
+
+def _restore_optimiser(optimiser: Optimizer, tensors: dict[str, Tensor]) -> None:
+    state: dict[int, dict[str, Tensor]] = {}
+    for key, tensor in tensors.items():
+        index, name = key.split(".", 1)
+        state.setdefault(int(index), {})[name] = tensor
+    groups = optimiser.state_dict()["param_groups"]
+    optimiser.load_state_dict({"state": state, "param_groups": groups})
+    # Fused optimisers walk a parameter and its state in memory order: channels-last, both.
+    for parameter, values in optimiser.state.items():
+        for name, value in values.items():
+            if isinstance(value, Tensor) and value.shape == parameter.shape:
+                values[name] = torch.empty_like(parameter).copy_(value)

@@ -68,7 +68,9 @@ def train_command(
         float | None, typer.Option(help="Train for this long; the schedule follows the clock.")
     ] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of it all.  [default: 0]")] = None,
-    batch: Annotated[int | None, typer.Option(help="Images a step.  [default: 32]")] = None,
+    batch: Annotated[
+        int | None, typer.Option(help="Images a step.  [default: the recipe's]")
+    ] = None,
     device: Annotated[str | None, typer.Option(help="auto, cpu or cuda.  [default: auto]")] = None,
     threads: Annotated[int | None, typer.Option(help="CPU threads.  [default: one a core]")] = None,
     resume: Annotated[

@@ -40,7 +40,8 @@ class TrainConfig:
     init: str | None = None
     """The run whose model training starts from."""
     seed: int = 0
-    batch: int = 32
+    batch: int = 0
+    """Images a step; 0: the recipe's."""
     device: str = "auto"
     threads: int = 0
     """CPU threads; 0: one a core."""
@@ -48,6 +49,8 @@ class TrainConfig:
     def __post_init__(self) -> None:
         require_learnable(find_plan(self.network), self.alpha)
         find_balance(self.balance)
+        if self.batch == 0:
+            object.__setattr__(self, "batch", find_recipe(self.recipe).batch)
         if self.init is not None and find_recipe(self.recipe).batch_norm:
             raise UserError(f"recipe {self.recipe} starts anew; with --init give --recipe tune")
         if self.iterations is not None and self.iterations < 1:

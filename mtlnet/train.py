@@ -245,7 +245,7 @@ def fraction(config: TrainConfig, trainer: Trainer, elapsed_s: float) -> float:
 
 def as_row(point: Progress, trainer: Trainer) -> tuple[float, ...]:
     """A point of the curves, in the order of their columns."""
-    rate = trainer.optimiser.param_groups[0]["lr"]
+    rate = trainer.optimisers.rate
     head = (point.step, point.elapsed_s, rate, point.images_per_second)
     return (*head, *point.losses.tolist(), *trainer.balance.weights())
 

@@ -8,14 +8,15 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from mtlnet.balance import STRETCH, Balance
 from mtlnet.loader import Batch, Loader
 from mtlnet.loss import Alpha, Losses, multi_task_loss
 from mtlnet.network import Network, initialise
+from mtlnet.optimiser import Optimisers
 from mtlnet.plan import MTL, Plan
-from mtlnet.recipe import MOMENTUM, Recipe, learning_rate
+from mtlnet.recipe import Recipe, learning_rate
 from mtlnet.swift import training_outputs
 from mtlnet.together import average
 
@@ -53,7 +54,7 @@ class Trainer:
         )
         initialise(network, seed)
         self.network = network.to(device).to(memory_format=torch.channels_last)
-        self.optimiser = make_optimiser(self.network, recipe, self.balance.parameters)
+        self.optimisers = Optimisers(self.network, recipe, self.balance.parameters)
         self.scale: Tensor | None = None
         if recipe.dropout:
             # Dropout takes no generator of its own: this is torch's only place for a seed.
@@ -76,9 +77,7 @@ class Trainer:
     def step(self, batch: Batch, progress: float) -> Losses:
         """Learn from one batch; its losses, before the step."""
         self.network.train()
-        rate = learning_rate(self.recipe, self.step_number, progress)
-        for group in self.optimiser.param_groups:
-            group["lr"] = rate
+        self.optimisers.set_rate(learning_rate(self.recipe, self.step_number, progress))
         coded = torch.from_numpy(batch.coded).to(self.device, non_blocking=True)
         heading = torch.from_numpy(batch.heading).to(self.device, non_blocking=True)
         images = torch.from_numpy(batch.images).to(self.device, non_blocking=True)
@@ -86,21 +85,17 @@ class Trainer:
         losses = multi_task_loss(
             outputs, coded, heading, self._combine(), self.scale, self.recipe.bend
         )
-        self.optimiser.zero_grad(set_to_none=True)
+        self.optimisers.zero_grad()
         losses.total.backward()  # type: ignore[no-untyped-call]  # torch leaves it untyped
         seen = [losses.distance, losses.angle, losses.type, losses.total.detach(), losses.terms]
-        average([*seen, *self._gradients()])
+        average([*seen, *self.optimisers.gradients()])
         self.balance.note(losses.terms)
-        self.optimiser.step()
+        self.optimisers.step()
         self.step_number += 1
         return losses
 
     def _combine(self) -> Alpha | Callable[[Tensor], Tensor]:
         return self.alpha if self.balance.kind == "fixed" else self.balance.total
-
-    def _gradients(self) -> list[Tensor]:
-        groups = self.optimiser.param_groups
-        return [p.grad for group in groups for p in group["params"] if p.grad is not None]
 
     def outputs(self, images: Tensor) -> Tensor:
         """What the network in training answers, (B, 9), to images (B, 210, 280, 3) uint8."""
@@ -133,28 +128,6 @@ def dropout_masks(
     rows = slice(which * count, (which + 1) * count)
     drawn = [rng.random((parts * count, units), np.float32)[rows] for units in layers]
     return [torch.from_numpy((d >= share) / np.float32(1 - share)) for d in drawn]
-
-
-def make_optimiser(
-    network: Network, recipe: Recipe, beside: Sequence[nn.Parameter] = ()
-) -> torch.optim.Optimizer:
-    """SGD or AdamW, fused: one pass over the nine million parameters; none of `beside` decays."""
-    if recipe.optimiser == "sgd":
-        # The gradient of l2 * |w|^2 is 2 * l2 * w.
-        groups = [
-            {"params": list(network.parameters()), "weight_decay": 2 * recipe.l2},
-            {"params": list(beside), "weight_decay": 0.0},
-        ]
-        return torch.optim.SGD(
-            groups[: 1 + bool(beside)], recipe.learning_rate, MOMENTUM, fused=True
-        )
-    weights = [p for p in network.parameters() if p.ndim > 1]
-    others = [p for p in network.parameters() if p.ndim <= 1] + list(beside)
-    groups = [
-        {"params": weights, "weight_decay": recipe.l2},
-        {"params": others, "weight_decay": 0.0},
-    ]
-    return torch.optim.AdamW(groups, recipe.learning_rate, betas=(0.9, 0.99), fused=True)
 
 
 @cache

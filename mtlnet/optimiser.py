@@ -1,0 +1,95 @@
+"""What changes the weights in training: SGD, AdamW, or Muon for the large layers beside AdamW.
+
+Muon (Jordan et al. 2024) steps along the gradient with all its singular values made equal, in as
+many directions as a layer has; `fast` then needs half the images. For the layers whose matrix that
+is cheap: the convolutions and the first shared layer. What is small, and the wide second shared
+layer, stays with AdamW.
+"""
+
+from collections.abc import Sequence
+
+from torch import Tensor, nn
+from torch.optim import SGD, AdamW, Muon, Optimizer
+
+from mtlnet.network import Network
+from mtlnet.recipe import MOMENTUM, Recipe
+
+MUON_LAYERS = ("features.", "shared.fc0.")
+LEAST_COLUMNS = 32  # a depthwise filter has nine weights, and no directions to make equal
+MUON_RATE = 2.0
+"""Times the recipe's rate: with updates scaled to AdamW's size, Muon bears longer steps."""
+
+
+class Optimisers:
+    """The optimisers of a network, stepped together; `beside`: parameters that never decay."""
+
+    def __init__(self, network: Network, recipe: Recipe, beside: Sequence[nn.Parameter]) -> None:
+        self.parts: list[Optimizer] = []
+        self.parameters = [*network.parameters(), *beside]
+        self._rows: list[tuple[nn.Parameter, nn.Parameter]] = []
+        if recipe.optimiser == "sgd":
+            # The gradient of l2 * |w|^2 is 2 * l2 * w.
+            groups = _groups(list(network.parameters()), 2 * recipe.l2, beside)
+            self.parts.append(SGD(groups, recipe.learning_rate, MOMENTUM, fused=True))
+            return
+        weights = {name: p for name, p in network.named_parameters() if p.ndim > 1}
+        others = [p for p in network.parameters() if p.ndim <= 1]
+        if recipe.optimiser == "muon":
+            large = [name for name, weight in weights.items() if _is_large(name, weight)]
+            self._rows = [(p, nn.Parameter(as_rows(p.detach()))) for p in map(weights.pop, large)]
+            rows = [{"params": [row for _, row in self._rows], "times": MUON_RATE}]
+            rate = recipe.learning_rate * MUON_RATE
+            self.parts.append(
+                Muon(rows, rate, weight_decay=recipe.l2, adjust_lr_fn="match_rms_adamw")
+            )
+        groups = _groups(list(weights.values()), recipe.l2, [*others, *beside])
+        self.parts.append(AdamW(groups, recipe.learning_rate, betas=(0.9, 0.99), fused=True))
+
+    def gradients(self) -> list[Tensor]:
+        """Those there are, to be averaged over processes."""
+        return [p.grad for p in self.parameters if p.grad is not None]
+
+    def zero_grad(self) -> None:
+        """Forget the gradients."""
+        for parameter in self.parameters:
+            parameter.grad = None
+
+    def set_rate(self, rate: float) -> None:
+        """The learning rate from now on."""
+        for part in self.parts:
+            for group in part.param_groups:
+                group["lr"] = rate * group.get("times", 1.0)
+
+    @property
+    def rate(self) -> float:
+        """The learning rate."""
+        group = self.parts[-1].param_groups[0]
+        return float(group["lr"])
+
+    def step(self) -> None:
+        """Change the weights by their gradients."""
+        for parameter, row in self._rows:
+            row.grad = None if parameter.grad is None else as_rows(parameter.grad)
+        for part in self.parts:
+            part.step()
+
+
+def as_rows(weight: Tensor) -> Tensor:
+    """A layer's weights (F, C, H, W) or (F, C) as a matrix (F, all else), of the same memory.
+
+    The order of its columns, here of channels-last memory, means nothing to Muon.
+    """
+    return weight if weight.ndim == 2 else weight.permute(0, 2, 3, 1).flatten(1)
+
+
+def _is_large(name: str, weight: Tensor) -> bool:
+    return name.startswith(MUON_LAYERS) and weight[0].numel() >= LEAST_COLUMNS
+
+
+def _groups(
+    decaying: list[nn.Parameter], decay: float, others: Sequence[nn.Parameter]
+) -> list[dict[str, object]]:
+    groups: list[dict[str, object]] = [{"params": decaying, "weight_decay": decay}]
+    if others:
+        groups.append({"params": list(others), "weight_decay": 0.0})
+    return groups
