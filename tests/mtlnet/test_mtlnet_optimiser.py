@@ -1,0 +1,66 @@
+"""Every weight is changed by one optimiser; Muon makes the directions of a step equal."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from mtlnet.network import Network, initialise
+from mtlnet.optimiser import Optimisers, as_rows
+from mtlnet.recipe import RECIPES, Recipe
+
+
+def made(recipe: Recipe) -> tuple[Network, Optimisers]:
+    network = Network(batch_norm=recipe.batch_norm, dropout=recipe.dropout)
+    initialise(network, 1)
+    network.to(memory_format=torch.channels_last)
+    return network, Optimisers(network, recipe, [])
+
+
+@pytest.mark.parametrize("name", RECIPES)
+def test_each_weight_belongs_to_one_optimiser(name: str) -> None:
+    network, optimisers = made(RECIPES[name])
+    addresses = [
+        parameter.data_ptr()
+        for part in optimisers.parts
+        for group in part.param_groups
+        for parameter in group["params"]
+    ]
+    assert sorted(addresses) == sorted(p.data_ptr() for p in network.parameters())
+
+
+def test_muon_has_the_convolutions_and_the_first_shared_layer() -> None:
+    network, optimisers = made(RECIPES["fast"])
+    names = {p.data_ptr(): name for name, p in network.named_parameters()}
+    muon = {names[p.data_ptr()] for p in optimisers.parts[0].param_groups[0]["params"]}
+    convolutions = {f"features.conv{number}.layer.weight" for number in (0, 2, 4, 5, 6)}
+    assert muon == convolutions | {"shared.fc0.layer.weight"}
+
+
+def test_a_step_goes_equally_far_in_all_directions() -> None:
+    network, optimisers = made(replace(RECIPES["fast"], l2=0.0))
+    weight = network.get_parameter("features.conv5.layer.weight")
+    generator = torch.Generator().manual_seed(0)
+    left, _ = torch.linalg.qr(torch.randn(384, 384, generator=generator))
+    right, _ = torch.linalg.qr(torch.randn(3456, 384, generator=generator))
+    gradient = (left * torch.logspace(0, -2, 384)) @ right.T
+    weight.grad = gradient.view(384, 3, 3, 384).permute(0, 3, 1, 2)
+    before = as_rows(weight.detach()).clone()
+    optimisers.set_rate(1e-3)
+    optimisers.step()
+    change = before - as_rows(weight.detach())
+    lengths = torch.linalg.svdvals(change)
+    # Newton and Schulz's five steps leave singular values between 0.5 and 1.5 (Jordan et al.).
+    size = 2e-3 * 0.2 * 3456**0.5
+    assert size * 0.4 < float(lengths.min())
+    assert float(lengths.max()) < size * 1.6
+    # Down the gradient in every one of its directions.
+    assert bool(((left.T @ change @ right).diagonal() > 0).all())
+
+
+def test_the_rate_is_the_recipes_for_adamw_and_twice_that_for_muon() -> None:
+    _, optimisers = made(RECIPES["fast"])
+    optimisers.set_rate(4e-4)
+    rates = [group["lr"] for part in optimisers.parts for group in part.param_groups]
+    assert rates == [8e-4, 4e-4, 4e-4]
+    assert optimisers.rate == 4e-4
