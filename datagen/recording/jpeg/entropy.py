@@ -99,11 +99,11 @@ def row_of_units(  # type: ignore[no-untyped-def]
         while True:
             place, bits, have = more(coded, place, bits, have)
             before, entry = bits, 0
-            for _ in range(4):  # so many at `AC_BITS` are there
+            for _ in range(5):  # so many at `AC_BITS` are there, of 56
                 before = bits
                 entry = at(ac, ac_at + np.int64(bits >> AC_SHIFT))
                 bits <<= u64(entry & 63)
-                have -= entry & 63
+                have -= entry & 255  # the same, off the chain that the next one waits for
                 put(coefficients, home + at(places, k + ((entry >> 8) & 255)), entry >> 32)
                 put(coefficients, home + at(places, k + ((entry >> 16) & 255)), entry >> 48)
                 k += (entry >> 24) & 255

@@ -143,7 +143,7 @@ def dc_table(codes: NDArray[np.uint16]) -> NDArray[np.int64]:
 def ac_table(codes: NDArray[np.uint16]) -> NDArray[np.int64]:
     """By the next `AC_BITS` bits: one coefficient, or two.
 
-    Bits 0 to 5: bits used; from 8, 16 and 24, 8 bits each: what to add to the place of the last
+    Bits 0 to 7: bits used; from 8, 16 and 24, 8 bits each: what to add to the place of the last
     coefficient for that of the first, of the second (the first again where there is one) and of
     the last, `ENDS` more when the block ends; 32 to 47 and 48 to 63: first and second value.
     """
