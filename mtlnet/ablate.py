@@ -28,12 +28,16 @@ from mtlnet.ablation_table import table
 from mtlnet.card import Camera
 from mtlnet.config import TrainConfig
 from mtlnet.curves import CURVES, read_curves
+from mtlnet.device import choose_device
 from mtlnet.engine import load_engine
 from mtlnet.evaluate import evaluate
+from mtlnet.learn import Progress
 from mtlnet.loader import Loader
+from mtlnet.material import open_training_data
 from mtlnet.plan import find_plan
+from mtlnet.readable import require_all_decodable
 from mtlnet.recipe import find_recipe
-from mtlnet.train import Progress, choose_device, train
+from mtlnet.train import train
 from mtlnet.trainer import Trainer
 from mtlnet.whole import write_whole
 from trackfeatures.errors import UserError
@@ -48,11 +52,12 @@ def ablate(config: AblationConfig, rows: Sequence[Row], *, dry_run: bool = False
     Raises UserError when the folder was made with other settings, or a run fails.
     """
     console = Console(stderr=True)
-    dataset = Dataset.open(config.data)
+    dataset = open_training_data(config.data)
     dataset.select(config.split)  # raises where there are no such rounds
     runs = plan_runs(config, rows)
     if dry_run:
         return _tell_plan(config, runs, dataset, console)
+    require_all_decodable(dataset, ("train", config.split))  # once for all runs
     require_same_settings(config, dataset.content_hash)
     for number, run in enumerate(carry_out(config, runs, _trainer(console), _judge), 1):
         console.print(f"{number} of {len(runs)}: {run.folder} is finished")
@@ -87,7 +92,7 @@ def _trainer(console: Console) -> Any:
                 )
 
         try:
-            train(config, resumed, report)
+            train(config, resumed, report, checked=True)
         except UserError as error:
             raise UserError(f"the run in {config.out} failed: {error}") from error
 

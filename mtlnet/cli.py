@@ -73,6 +73,9 @@ def train_command(
     ] = None,
     device: Annotated[str | None, typer.Option(help="auto, cpu or cuda.  [default: auto]")] = None,
     threads: Annotated[int | None, typer.Option(help="CPU threads.  [default: one a core]")] = None,
+    skip_undecodable: Annotated[
+        bool, typer.Option("--skip-undecodable", help="Leave out images that cannot be decoded.")
+    ] = False,
     resume: Annotated[
         bool, typer.Option("--resume", help="Go on with the stopped run in --out (or the newest).")
     ] = False,
@@ -91,6 +94,7 @@ def train_command(
         "batch": batch,
         "device": device,
         "threads": threads,
+        "skip_undecodable": skip_undecodable or None,
     }
     options: dict[str, Any] = {k: v for k, v in given.items() if v is not None}
     from mtlnet.start import start_training

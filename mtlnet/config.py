@@ -45,6 +45,8 @@ class TrainConfig:
     device: str = "auto"
     threads: int = 0
     """CPU threads; 0: one a core."""
+    skip_undecodable: bool = False
+    """Leave out the frames whose image cannot be decoded; they are named in the model's card."""
 
     def __post_init__(self) -> None:
         require_learnable(find_plan(self.network), self.alpha)

@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from datagen.recording import Dataset, Frames
+from datagen.recording import Dataset, Frames, UndecodableImage
 from mtlnet.card import ModelCard, ModelError
 from mtlnet.engine import Engine
 from mtlnet.loader import Images
+from mtlnet.readable import require_decodable
 from mtlnet.report import judge_all
 from mtlnet.report_page import write_page
 
@@ -36,7 +37,11 @@ def evaluate(
     dataset = Dataset.open(data)
     frames = dataset.select(split)
     require_fit(engine.card, frames, split)
-    outputs = answer_frames(engines, frames, report)
+    try:
+        outputs = answer_frames(engines, frames, report)
+    except UndecodableImage:
+        require_decodable(frames, data)  # to name and count all of them
+        raise
     mean = engine.card.data["mean"]
     found = {
         "model": engine.card.name,

@@ -10,12 +10,13 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn
 from mtlnet.card import RUNS, ModelError
 from mtlnet.config import CONFIG, TrainConfig, resume_config
 from mtlnet.fine_tune import open_init
+from mtlnet.learn import Progress as Point
+from mtlnet.learn import Stopped
 from mtlnet.loss import parse_alpha
 from mtlnet.plan import find_plan
 from mtlnet.recipe import find_recipe
 from mtlnet.together import find_part
-from mtlnet.train import Progress as Point
-from mtlnet.train import Stopped, train
+from mtlnet.train import train
 from trackfeatures.errors import UserError
 
 DATASET = Path("datasets/default")

@@ -14,7 +14,7 @@ is opened with `open_round`; `verify` and `recover` look after folders and files
 
 from .camera import CameraInfo
 from .dataset import Dataset, Frames
-from .errors import DatasetError
+from .errors import DatasetError, UndecodableImage
 from .header import Recovery, RoundHeader, RoundInfo, RoundResult
 from .index import RoundIndex, open_round
 from .labels import Labels
@@ -32,5 +32,6 @@ __all__ = [
     "RoundInfo",
     "RoundResult",
     "Split",
+    "UndecodableImage",
     "open_round",
 ]

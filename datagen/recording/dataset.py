@@ -22,7 +22,7 @@ import trackfeatures as tf
 
 from .camera import CameraInfo
 from .encoding import decode_into
-from .errors import DatasetError
+from .errors import DatasetError, UndecodableImage
 from .header import RoundInfo
 from .index import RoundIndex, open_round
 from .labels import Labels, concatenate, read_labels
@@ -50,21 +50,33 @@ class Frames:
     """The frames of some rounds, in round order; labels are parsed once, images on demand."""
 
     def __init__(
-        self, rounds: Sequence[RoundInfo], indexes: Sequence[RoundIndex], camera: CameraInfo
+        self,
+        rounds: Sequence[RoundInfo],
+        indexes: Sequence[RoundIndex],
+        camera: CameraInfo,
+        rows: NDArray[np.int64] | None = None,
     ) -> None:
+        """`rows`: the frames of these rounds that are meant, ascending; None: all."""
         self.rounds = list(rounds)
         self.camera = camera
         self._images = [index.messages[CAMERA] for index in indexes]
         self._indexes = list(indexes)
         # The number of the first frame of each round, and of the one after the last.
         self._first = list(accumulate((len(images) for images in self._images), initial=0))
+        self._rows = np.arange(self._first[-1]) if rows is None else rows
 
     def __len__(self) -> int:
-        return self._first[-1]
+        return len(self._rows)
 
     @cached_property
     def labels(self) -> Labels:
-        return concatenate([read_labels(ix, number) for number, ix in enumerate(self._indexes)])
+        each = concatenate([read_labels(ix, number) for number, ix in enumerate(self._indexes)])
+        return each if len(self) == self._first[-1] else each.take(self._rows)
+
+    def without(self, left_out: Iterable[int]) -> "Frames":
+        """These frames but those numbered `left_out`."""
+        kept = np.delete(self._rows, list(left_out))
+        return Frames(self.rounds, self._indexes, self.camera, kept)
 
     def jpeg(self, i: int) -> memoryview:
         """The encoded image of frame `i` (a PNG in rounds recorded with that codec), not copied."""
@@ -128,15 +140,13 @@ class Frames:
     def _locate(self, i: int) -> tuple[int, int]:
         if not 0 <= i < len(self):
             raise IndexError(f"frame {i} of {len(self)}")
-        number = bisect_right(self._first, i) - 1
-        return number, i - self._first[number]
+        row = int(self._rows[i])
+        number = bisect_right(self._first, row) - 1
+        return number, row - self._first[number]
 
-    def _unreadable(self, i: int, error: Exception) -> DatasetError:
+    def _unreadable(self, i: int, error: Exception) -> UndecodableImage:
         number, frame = self._locate(i)
-        return DatasetError(
-            f"image {frame} of {self.rounds[number].path} cannot be read: {error}; run "
-            "`datagen verify --level deep` on the dataset and record the round again"
-        )
+        return UndecodableImage(self.rounds[number].id, frame, str(error))
 
     @cached_property
     def _threads(self) -> int:

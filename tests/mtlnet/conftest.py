@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from mtlnet.doubt_fit import fit_doubt
 from mtlnet.network import Network, initialise
 from mtlnet.plan import FEATURES, HEIGHT, MTL, PLANS, WIDTH, Conv
 from mtlnet.publish import publish
+from mtlnet.report import describe_data
 
 FRAMES = 24
 TRAIN, TEST = ("r000", "r001", "r002"), ("r003",)
@@ -50,29 +52,35 @@ def drawn_frame(rng: np.random.Generator) -> Frame:
     )
 
 
+def write_round(folder: Path, name: str, number: int, **changes: Any) -> None:
+    """A round of `FRAMES` drawn frames in a dataset folder; `changes`: of its header."""
+    rng = np.random.default_rng(number)
+    values: dict[str, Any] = {
+        "id": name,
+        "seed": number,
+        "track": "alpha" if number % 2 else "beta",
+        "track_hash": "0" * 64,
+        "lanes": 1,
+        "lane_width_m": 4.0,
+        "traffic": 0,
+        "trajectory": "weave",
+        "light": "clear",
+        "speed_kmh": 60.0,
+        **changes,
+    }
+    with RoundWriter(folder / "rounds" / f"{name}.mcap", RoundHeader(**values), {}) as writer:
+        for _ in range(FRAMES):
+            writer.add(drawn_frame(rng))
+        writer.finish()
+
+
 @pytest.fixture(scope="session")
 def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Three train rounds and a test round of `FRAMES` frames each."""
     folder = tmp_path_factory.mktemp("data")
     (folder / "rounds").mkdir()
     for number, name in enumerate(TRAIN + TEST):
-        rng = np.random.default_rng(number)
-        about = RoundHeader(
-            id=name,
-            seed=number,
-            track="alpha" if number % 2 else "beta",
-            track_hash="0" * 64,
-            lanes=1,
-            lane_width_m=4.0,
-            traffic=0,
-            trajectory="weave",
-            light="clear",
-            speed_kmh=60.0,
-        )
-        with RoundWriter(folder / "rounds" / f"{name}.mcap", about, {}) as writer:
-            for _ in range(FRAMES):
-                writer.add(drawn_frame(rng))
-            writer.finish()
+        write_round(folder, name, number)
     (folder / "splits").mkdir()
     write_split(split_path(folder), Split(TRAIN, TEST))
     return folder
@@ -84,9 +92,11 @@ def published(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     network = Network()
     initialise(network, 5)
     run = tmp_path_factory.mktemp("runs") / "untrained"
-    doubt = fit_doubt(network, Dataset.open(dataset).select("train"), None, 0)
+    data = Dataset.open(dataset)
+    frames = data.select("train")
+    doubt = fit_doubt(network, frames, None, 0)
     images = np.stack([draw_road(d, 0.0) for d in (-1.0, 0.5)])
-    publish(network, run, images, doubt=doubt)
+    publish(network, run, images, doubt=doubt, data=describe_data(data, frames))
     return run
 
 

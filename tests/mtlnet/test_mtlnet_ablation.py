@@ -26,8 +26,8 @@ from mtlnet.ablation_table import best, table, training_curve
 from mtlnet.card import CARD, ModelCard, read_card
 from mtlnet.config import TrainConfig
 from mtlnet.curves import COLUMNS as CURVE_COLUMNS
+from mtlnet.learn import Stopped
 from mtlnet.lines import ticks
-from mtlnet.train import Stopped
 from trackfeatures.errors import UserError
 
 ALPHAS = {row.name: row.alpha for row in PAPER_ROWS}

@@ -89,7 +89,7 @@ def when_full(monkeypatch: pytest.MonkeyPatch, what: str) -> None:
 def test_a_run_goes_on_after_the_disk_was_full(
     dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, what: str
 ) -> None:
-    monkeypatch.setattr("mtlnet.train.LOG_EVERY", 1)
+    monkeypatch.setattr("mtlnet.learn.LOG_EVERY", 1)
     new = config(dataset, tmp_path / "run")
     first = config(dataset, tmp_path / "run", iterations=1)
     with monkeypatch.context() as patch:

@@ -11,7 +11,8 @@ import torch
 from datagen.recording import Dataset
 from mtlnet.card import WEIGHTS, read_card
 from mtlnet.config import TrainConfig
-from mtlnet.fine_tune import continued, open_init, own_material, take_weights
+from mtlnet.fine_tune import open_init, take_weights
+from mtlnet.material import continued, own_material
 from mtlnet.network import Network, answer_images, load_network
 from mtlnet.start import start_training
 from trackfeatures.errors import UserError

@@ -14,16 +14,17 @@ import pytest
 import torch
 from safetensors.numpy import load_file
 
-import mtlnet.train
+import mtlnet.learn
 from datagen.recording import Dataset
 from mtlnet.card import DOUBT, GRAPH, WEIGHTS, Camera, ModelError, read_card
 from mtlnet.checkpoint import list_checkpoints
 from mtlnet.config import TrainConfig, resume_config
 from mtlnet.curves import read_curves
+from mtlnet.learn import Progress, Stopped
 from mtlnet.loader import Loader
 from mtlnet.recipe import RECIPES, learning_rate
 from mtlnet.swift import training_outputs
-from mtlnet.train import Progress, Stopped, train
+from mtlnet.train import train
 from mtlnet.trainer import Trainer
 from trackfeatures.errors import UserError
 
@@ -74,11 +75,11 @@ def test_stopped_and_resumed_is_the_unbroken_run(
     dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, recipe: str, balance: str
 ) -> None:
     monkeypatch.setattr("mtlnet.balance.STRETCH", 1)
-    monkeypatch.setattr("mtlnet.train.LOG_EVERY", 1)
+    monkeypatch.setattr("mtlnet.learn.LOG_EVERY", 1)
     train(config(dataset, tmp_path / "whole", recipe=recipe, balance=balance), None)
     broken = config(dataset, tmp_path / "broken", recipe=recipe, balance=balance)
     with monkeypatch.context() as patch:
-        patch.setattr(mtlnet.train, "StopRequest", lambda: StopAt(2))
+        patch.setattr(mtlnet.learn, "StopRequest", lambda: StopAt(2))
         with pytest.raises(Stopped, match="step-00000002"):
             train(broken, None)
     with pytest.raises(ModelError, match="no finished model"):
@@ -118,7 +119,7 @@ def test_a_full_gpu_is_one_line(
 KILLED = """
 import os, signal, sys
 from pathlib import Path
-import mtlnet.train, mtlnet.whole
+import mtlnet.learn, mtlnet.train, mtlnet.whole
 from mtlnet.config import TrainConfig
 sync, seen = os.fsync, []
 def die(file):
@@ -126,7 +127,7 @@ def die(file):
         os.kill(os.getpid(), signal.SIGKILL)
     sync(file)
 mtlnet.whole.os.fsync = die
-mtlnet.train.CHECKPOINT_SECONDS = 0.0
+mtlnet.learn.CHECKPOINT_SECONDS = 0.0
 data, out = map(Path, sys.argv[1:])
 given = {"iterations": 6, "batch": 4, "seed": 7, "device": "cpu", "threads": 1}
 mtlnet.train.train(TrainConfig(data, out, **given), None)
@@ -149,7 +150,7 @@ def test_killed_while_it_saves_it_goes_on_from_the_checkpoint_before(
 def test_a_loss_that_is_no_number_stops_the_run_at_its_batch(
     dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("mtlnet.train.CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr("mtlnet.learn.CHECKPOINT_SECONDS", 0.0)
     sound = training_outputs
     calls: list[int] = []
 
