@@ -10,7 +10,8 @@ import numpy as np
 
 from mtlnet.ablation import AblationConfig, Row, Run
 from mtlnet.ablation_table import ERRORS, LOSSES, PAPER_COLUMNS, best, training_curve
-from mtlnet.lines import Level, Line, line_chart
+from mtlnet.axes import Numbers
+from mtlnet.charts import Line, Plot, plot, style
 from mtlnet.loss import TASKS
 
 COLOURS = ("#3b6fd4", "#e07a2e", "#2a9d5c", "#c23b6b")
@@ -29,6 +30,7 @@ def page(
     frames = next((entry["frames"] for entry in entries if entry["frames"]), 0)
     template = Template(files("mtlnet").joinpath("ablation.html").read_text(encoding="utf-8"))
     return template.substitute(
+        chart_style=style(),
         summary=f"{finished} of {len(runs)} runs of {config.iterations:,} iterations each, judged "
         f"on {frames:,} {escape(config.split)} frames.",
         settings=f"Data <code>{escape(str(config.data))}</code>, recipe {escape(config.recipe)}, "
@@ -85,17 +87,25 @@ def _chart(task: int, rows: Sequence[Row], runs: Sequence[Run]) -> str:
     """The training loss of one task: MTL 1 to 4, and where the task ends when learned alone."""
     name = TASKS[task]
     together = [row for row in rows if row.network == "mtl" and sum(a > 0 for a in row.alpha) > 1]
-    lines, levels = [], []
+    lines, last = [], 1.0
     for colour, row in zip(COLOURS, together, strict=False):
         curve = training_curve(runs, row, name)
         if curve is not None:
             steps, losses = curve
+            last = max(last, float(steps[-1]))
             alpha = ", ".join(f"{weight:g}" for weight in row.alpha)
-            label, shown = f"{row.title} ({alpha})", np.maximum(losses, 1e-9)
-            lines.append(Line(label, colour, steps, shown.mean(0), shown.min(0), shown.max(0)))
+            label = f"{row.title} ({alpha})"
+            band = losses.min(0), losses.max(0)
+            lines.append(Line("curve", steps, losses.mean(0), label, colour, band))
     alone = next((row for row in rows if row.name == name), None)
     curve = training_curve(runs, alone, name) if alone is not None else None
     if curve is not None:
-        last = max(1, round(END * curve[1].shape[1]))
-        levels.append(Level(f"{name} alone, at the end", SINGLE, float(curve[1][:, -last:].mean())))
-    return line_chart(f"({'abc'[task]}) {name}", "iterations", lines, levels)
+        lines.append(_level(curve[1], last, f"{name} alone, at the end"))
+    return plot(Plot(f"({'abc'[task]}) {name}", lines, "iterations", log=True))
+
+
+def _level(losses: Numbers, last: float, label: str) -> Line:
+    """The mean over the end of losses (seeds, P), as a line up to x = `last`."""
+    end = max(1, round(END * losses.shape[1]))
+    level = np.full(2, losses[:, -end:].mean())
+    return Line("level", np.array([0.0, last]), level, label, SINGLE)

@@ -1,146 +1,154 @@
-"""Charts of the evaluation report: SVG stretched over its box, with labels in HTML beside it.
+"""Charts of HTML pages: SVG stretched over its box, with labels in HTML beside it.
 
-The lines stretch with the page and the text does not, so that both are readable on a phone.
+The lines stretch with the page and the text does not, so that both are readable on a phone. A page
+with charts has `style` in its own.
 """
 
-import math
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from html import escape
+from importlib.resources import files
+from itertools import groupby
 
 import numpy as np
-from numpy.typing import NDArray
+
+from mtlnet.axes import LEAST, SIDE, Axis, Numbers, span
 
 MOST_POINTS = 800
-SIDE = 1000.0  # of the SVG's own coordinates, both ways
-
-Numbers = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Line:
-    """A line: `kind` is its class in the page's style. NaN breaks it."""
+    """A line through y (N,) at x (N,), NaN breaks it; `band` (low, high) lies behind it.
+
+    `kind`: its class in the page's style. With a `label` it is named in the legend, and has its
+    own `colour`.
+    """
 
     kind: str
+    x: Numbers
     y: Numbers
+    label: str = ""
+    colour: str = ""
+    band: tuple[Numbers, Numbers] | None = None
 
 
 @dataclass(frozen=True)
 class Plot:
-    """Lines over one x, a band (low, high) behind them, shaded spans (from, to) of x."""
+    """Lines, and shaded spans (from, to) of x behind them; `log`: up, logarithms."""
 
     title: str
-    unit: str
-    x: Numbers
     lines: Sequence[Line]
     x_unit: str = ""
-    band: tuple[Numbers, Numbers] | None = None
-    shaded: Sequence[tuple[float, float]] = field(default_factory=tuple)
+    shaded: Sequence[tuple[float, float]] = ()
+    log: bool = False
+
+
+def style() -> str:
+    """What the style of a page with charts must hold."""
+    return files("mtlnet").joinpath("charts.css").read_text(encoding="utf-8")
 
 
 def plot(what: Plot) -> str:
-    """The figure."""
-    low, high = _range([line.y for line in what.lines])
-    left, right = float(what.x.min()), float(what.x.max())
-    across, up = _Axis(left, right), _Axis(high, low)  # SVG's y points down
+    """The figure; a note in its place where there is nothing to draw."""
+    if not what.lines:
+        return f"<figure><figcaption>{escape(what.title)}</figcaption><p>not yet</p></figure>"
+    # The bands of charts with names belong to them; others may be cut off, the line may not.
+    fitted = [line.y for line in what.lines]
+    fitted += [edge for line in what.lines if line.label for edge in line.band or ()]
+    low, high = span(fitted, log=what.log)
+    xs = np.concatenate([line.x for line in what.lines])
+    across, up = Axis(float(xs.min()), float(xs.max())), Axis(high, low, what.log)  # y points down
     drawn = [
-        f'<rect class=shade x="{across(a):.1f}" width="{across(b) - across(a):.1f}" height="1000"/>'
+        f'<rect class=shade x="{across(a):.1f}" y="0" width="{across(b) - across(a):.1f}" '
+        f'height="{SIDE:.0f}"/>'
         for a, b in what.shaded
     ]
-    ticks = list(_ticks(low, high))
-    drawn += [f'<path class=grid d="M0,{up(t):.1f}H1000"/>' for t in ticks]
-    if what.band is not None:
-        drawn.append(_band(across, up, what.x, *(edge.clip(low, high) for edge in what.band)))
-    for line in what.lines:
-        drawn.append(f'<path class="{line.kind}" d="{_path(across, up, what.x, line.y)}"/>')
-    labels = [f'<span class=y style="top:{up(t) / 10:.1f}%">{t:g}</span>' for t in ticks]
-    labels += [
-        f'<span class=x style="left:{across(t) / 10:.1f}%">{t:g}</span>'
-        for t in _ticks(left, right)
+    drawn += [f'<path class=grid d="M0,{up(t):.1f}H{SIDE:.0f}"/>' for t in up.ticks]
+    drawn += [_band(across, up, line) for line in what.lines if line.band is not None]
+    drawn += [
+        f'<path class="{line.kind}"{_colour("stroke", line)} d="{_path(across, up, line)}"/>'
+        for line in what.lines
     ]
-    return _figure(f"{what.title} ({what.unit})", drawn, labels, what.x_unit)
+    labels = [_label("y", up(t), t) for t in up.ticks]
+    labels += [_label("x", across(t), t) for t in across.ticks]
+    return _figure(what.title, drawn, labels, what.x_unit, legend=_legend(what.lines))
 
 
-def reliability(title: str, unit: str, said: Numbers, found: Numbers) -> str:
+def reliability(title: str, said: Numbers, found: Numbers) -> str:
     """Errors found against standard deviations said, both axes logarithmic, the diagonal drawn."""
-    both = np.log10(np.maximum(np.concatenate([said, found]), 1e-9))
-    low, high = float(both.min()) - 0.1, float(both.max()) + 0.1
-    across, up = _Axis(low, high), _Axis(high, low)
+    both = np.maximum(np.concatenate([said, found]), LEAST)
+    low, high = float(both.min()) * 0.8, float(both.max()) * 1.25
+    across, up = Axis(low, high, log=True), Axis(high, low, log=True)
     dots = [
-        f'<path class=dot d="M{across(math.log10(max(s, 1e-9))):.1f},'
-        f'{up(math.log10(max(f, 1e-9))):.1f}h0"/>'
+        f'<path class=dot d="M{across(s):.1f},{up(f):.1f}h0"/>'
         for s, f in zip(said.tolist(), found.tolist(), strict=True)
     ]
-    ends = [10**low, 10**high]
     labels = [
-        f'<span class=y style="top:97%">{ends[0]:.2g}</span>',
-        f'<span class=y style="top:3%">{ends[1]:.2g}</span>',
-        f'<span class=x style="left:0%">{ends[0]:.2g}</span>',
-        f'<span class=x style="left:100%">{ends[1]:.2g}</span>',
+        f'<span class=y style="top:97%">{low:.2g}</span>',
+        f'<span class=y style="top:3%">{high:.2g}</span>',
+        f'<span class=x style="left:0%">{low:.2g}</span>',
+        f'<span class=x style="left:100%">{high:.2g}</span>',
     ]
-    diagonal = '<path class=grid d="M0,1000L1000,0"/>'
-    return _figure(f"{title} ({unit})", [diagonal, *dots], labels, "said", "square")
+    diagonal = f'<path class=grid d="M0,{SIDE:.0f}L{SIDE:.0f},0"/>'
+    return _figure(title, [diagonal, *dots], labels, "said", "square")
 
 
-class _Axis:
-    """Values -> [0, 1000], from `first` to `last`."""
-
-    def __init__(self, first: float, last: float) -> None:
-        self._first, self._scale = first, SIDE / ((last - first) or 1.0)
-
-    def __call__(self, value: float) -> float:
-        return (value - self._first) * self._scale
-
-
-def _range(columns: Iterable[Numbers]) -> tuple[float, float]:
-    values = np.concatenate([column[np.isfinite(column)] for column in columns])
-    if not len(values):
-        return -1.0, 1.0
-    low, high = float(values.min()), float(values.max())
-    margin = 0.06 * (high - low) or 0.5
-    return low - margin, high + margin
-
-
-def _ticks(low: float, high: float) -> Iterator[float]:
-    """Round numbers within, three to six of them; none within nothing."""
-    if not high > low:
-        return
-    step = 10 ** math.floor(math.log10((high - low) / 3))
-    step *= next(m for m in (5, 2, 1) if (high - low) / (m * step) >= 3 or m == 1)
-    first = math.ceil(low / step)
-    for number in range(first, math.floor(high / step) + 1):
-        yield round(number * step, 10)
-
-
-def _path(across: _Axis, up: _Axis, x: Numbers, y: Numbers) -> str:
+def _path(across: Axis, up: Axis, line: Line) -> str:
     parts, drawing = [], False
-    for a, b in zip(x.tolist(), y.tolist(), strict=True):
-        if not math.isfinite(b):
-            drawing = False
-            continue
-        parts.append(f"{'L' if drawing else 'M'}{across(a):.1f},{up(b):.1f}")
-        drawing = True
+    for x, y in zip(line.x.tolist(), line.y.tolist(), strict=True):
+        present = bool(np.isfinite(y))
+        if present:
+            parts.append(f"{'L' if drawing else 'M'}{across(x):.1f},{up(y):.1f}")
+        drawing = present
     return "".join(parts)
 
 
-def _band(across: _Axis, up: _Axis, x: Numbers, low: Numbers, high: Numbers) -> str:
-    drawn = []
+def _band(across: Axis, up: Axis, line: Line) -> str:
+    assert line.band is not None
+    first, last = sorted((up.first, up.last))
+    low, high = (edge.clip(first, last) for edge in line.band)
     present = np.isfinite(low) & np.isfinite(high)
-    for rows in np.split(np.arange(len(x)), np.flatnonzero(np.diff(present)) + 1):
-        if len(rows) and present[rows[0]]:
-            ring = [*zip(x[rows], high[rows], strict=True)]
-            ring += zip(x[rows][::-1], low[rows][::-1], strict=True)
-            drawn.append("M" + "L".join(f"{across(a):.1f},{up(b):.1f}" for a, b in ring) + "Z")
-    return f'<path class=band d="{"".join(drawn)}"/>'
+    rings = []
+    for here, rows in groupby(range(len(line.x)), key=lambda row: bool(present[row])):
+        if here:
+            there = list(rows)
+            ring = [(line.x[i], high[i]) for i in there]
+            ring += [(line.x[i], low[i]) for i in reversed(there)]
+            rings.append("M" + "L".join(f"{across(x):.1f},{up(y):.1f}" for x, y in ring) + "Z")
+    return f'<path class=band{_colour("fill", line)} d="{"".join(rings)}"/>'
+
+
+def _colour(what: str, line: Line) -> str:
+    return f' style="{what}:{line.colour}"' if line.colour else ""
+
+
+def _label(side: str, place: float, value: float) -> str:
+    edge = "top" if side == "y" else "left"
+    return f'<span class={side} style="{edge}:{100 * place / SIDE:.1f}%">{value:g}</span>'
+
+
+def _legend(lines: Iterable[Line]) -> str:
+    named = [
+        f'<span><i style="background:{line.colour}"></i>{escape(line.label)}</span>'
+        for line in lines
+        if line.label
+    ]
+    return f"<p class=legend>{''.join(named)}</p>" if named else ""
 
 
 def _figure(
-    title: str, drawn: Iterable[str], labels: Iterable[str], x_unit: str, kind: str = "wide"
+    title: str,
+    drawn: Iterable[str],
+    labels: Iterable[str],
+    x_unit: str,
+    kind: str = "wide",
+    legend: str = "",
 ) -> str:
     name = escape(title)
     return (
         f'<figure class="chart {kind}"><figcaption>{name}</figcaption><div class=plot>'
-        f'<svg viewBox="0 0 1000 1000" preserveAspectRatio=none role=img aria-label="{name}">'
-        f"{''.join(drawn)}</svg>{''.join(labels)}<span class=unit>{escape(x_unit)}</span></div>"
-        "</figure>"
+        f'<svg viewBox="0 0 {SIDE:.0f} {SIDE:.0f}" preserveAspectRatio=none role=img '
+        f'aria-label="{name}">{"".join(drawn)}</svg>{"".join(labels)}'
+        f"<span class=unit>{escape(x_unit)}</span></div>{legend}</figure>"
     )

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 import trackfeatures as tf
 from datagen.recording import Frames
 from mtlnet.answer import OUTPUTS
-from mtlnet.charts import MOST_POINTS, Line, Plot, plot, reliability
+from mtlnet.charts import MOST_POINTS, Line, Plot, plot, reliability, style
 from mtlnet.doubt import FEATURES
 from mtlnet.errors import Numbers, signed_errors
 from mtlnet.groups import GROUPS
@@ -41,6 +41,7 @@ def page(report: dict[str, Any], frames: Frames, outputs: NDArray[np.float32]) -
     template = Template(files("mtlnet").joinpath("report.html").read_text(encoding="utf-8"))
     worst = worst_frames(errors, frames.labels.round)
     return template.substitute(
+        chart_style=style(),
         model=escape(report["model"]),
         about=escape(
             f"{report['frames']:,} {report['split']} frames in {report['rounds']} rounds of "
@@ -135,8 +136,9 @@ def _drive(frames: Frames, rows: NDArray[np.int64], outputs: NDArray[np.float32]
         if outputs.shape[1] > OUTPUTS:
             wide = 2 * outputs[:, column].astype(np.float64)
             band = (value - wide)[thin], (value + wide)[thin]
-        lines = [Line("truth", true[thin]), Line("said", value[thin])]
-        drawn.append(plot(Plot(title, unit, metres[thin], lines, "m driven", band, shaded)))
+        along = metres[thin]
+        lines = [Line("truth", along, true[thin]), Line("said", along, value[thin], band=band)]
+        drawn.append(plot(Plot(f"{title} ({unit})", lines, "m driven", shaded)))
     return "".join(drawn)
 
 
@@ -163,8 +165,7 @@ def _doubt(report: dict[str, Any]) -> str:
     table = _table(("", "within 1 &sigma; (68.3 %)", "within 2 &sigma; (95.4 %)"), rows)
     charts = "".join(
         reliability(
-            name,
-            "rad" if name == "angle" else "m",
+            f"{name} ({'rad' if name == 'angle' else 'm'})",
             np.array([part["said"] for part in bins]),
             np.array([part["found"] for part in bins]),
         )

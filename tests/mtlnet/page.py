@@ -1,0 +1,98 @@
+"""Reading HTML pages that the project writes: their elements, and whether they are well-formed."""
+
+import re
+from dataclasses import dataclass, field
+from html.parser import HTMLParser
+
+VOID = {"meta", "img", "br", "link", "input", "hr"}
+UNCLOSED = {"html", "head", "body", "p", "tr", "td", "th", "thead", "tbody", "li"}
+"""Elements whose end tag HTML lets one leave out..."""
+CELLS = ("td", "th")
+ENDS = {
+    "td": CELLS,
+    "th": CELLS,
+    "tr": (*CELLS, "tr"),
+    "tbody": (*CELLS, "tr", "thead"),
+    "p": ("p",),
+    "table": ("p",),
+}
+"""...and what the beginning of another one ends."""
+
+
+@dataclass
+class Element:
+    tag: str
+    attributes: dict[str, str]
+    text: str = ""
+    inside: list[str] = field(default_factory=list)  # tags around it, from the outermost
+
+    def has_class(self, name: str) -> bool:
+        return name in self.attributes.get("class", "").split()
+
+
+class Page(HTMLParser):
+    """The elements of a page in their order; AssertionError where one is not closed as it must."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.source = text
+        self.elements: list[Element] = []
+        self._open: list[Element] = []
+        self.feed(text)
+        self.close()
+        left = [one.tag for one in self._open if one.tag not in UNCLOSED]
+        assert not left, f"never closed: {left}"
+
+    def all(self, tag: str, kind: str | None = None) -> list[Element]:
+        """Elements called `tag`, of class `kind`."""
+        return [e for e in self.elements if e.tag == tag and (kind is None or e.has_class(kind))]
+
+    def rows(self, table: int) -> list[list[str]]:
+        """The cells of a table's rows."""
+        return self._tables[table]
+
+    def require_alone(self) -> None:
+        """AssertionError unless the page needs nothing beside it: no network, no other file."""
+        for element in self.elements:
+            assert element.tag not in ("script", "link", "iframe", "object"), element
+            for name in ("src", "href", "srcset", "action", "data"):
+                value = element.attributes.get(name, "data:")
+                assert value.startswith(("data:", "#")), (element.tag, name, value)
+        assert not re.search(r"url\(|@import|https?:", self.source)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        while self._open and self._open[-1].tag in ENDS.get(tag, ()):
+            self._open.pop()
+        around = [one.tag for one in self._open]
+        element = Element(tag, {name: value or "" for name, value in attrs}, inside=around)
+        self.elements.append(element)
+        if tag not in VOID:
+            self._open.append(element)
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.handle_starttag(tag, attrs)
+        if tag not in VOID:
+            self._open.pop()
+
+    def handle_endtag(self, tag: str) -> None:
+        while self._open and self._open[-1].tag != tag:
+            assert self._open[-1].tag in UNCLOSED, f"<{self._open[-1].tag}> closed by </{tag}>"
+            self._open.pop()
+        assert self._open, f"</{tag}> closes nothing"
+        self._open.pop()
+
+    def handle_data(self, data: str) -> None:
+        for element in self._open:
+            element.text += data
+
+    @property
+    def _tables(self) -> list[list[list[str]]]:
+        tables: list[list[list[str]]] = []
+        for element in self.elements:
+            if element.tag == "table":
+                tables.append([])
+            elif element.tag == "tr":
+                tables[-1].append([])
+            elif element.tag in ("td", "th"):
+                tables[-1][-1].append(element.text.strip())
+        return tables
