@@ -1,7 +1,7 @@
 """The steps of a run, until its iterations or its minutes are used up; checkpoints on the way."""
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +14,8 @@ from mtlnet.checkpoint import save_checkpoint
 from mtlnet.config import TrainConfig
 from mtlnet.curves import Curves
 from mtlnet.interrupt import StopRequest
-from mtlnet.loader import Loader
+from mtlnet.loader import Batch, Loader
+from mtlnet.resident import DeviceBatch, Resident
 from mtlnet.together import Part, agree
 from mtlnet.trainer import Trainer
 from trackfeatures.errors import UserError
@@ -48,7 +49,7 @@ Report = Callable[[Progress], None]
 def learn(
     config: TrainConfig,
     trainer: Trainer,
-    loader: Loader,
+    loader: Loader | Resident,
     elapsed_s: float,
     report: Report,
     part: Part,
@@ -59,7 +60,7 @@ def learn(
     saved = logged = time.perf_counter()
     window: list[torch.Tensor] = []
     with written or nullcontext() as curves, StopRequest() as stop:
-        batches = loader.batches(trainer.step_number)
+        batches: Iterator[Batch | DeviceBatch] = loader.batches(trainer.step_number)
         while True:
             now = time.perf_counter()
             here = [fraction(config, trainer, now - begin), stop.requested, now - saved]

@@ -23,6 +23,7 @@ from mtlnet.loader import Loader
 from mtlnet.material import Material, open_material, require_same_data
 from mtlnet.plan import find_plan
 from mtlnet.recipe import Recipe, find_recipe
+from mtlnet.resident import resident_or_not
 from mtlnet.together import Part, find_part, joined, wait
 from mtlnet.trainer import Trainer, keep_freed_memory
 from trackfeatures.errors import UserError
@@ -77,7 +78,8 @@ def _train(
     elapsed_s = load_checkpoint(checkpoints[-1], trainer) if checkpoints else 0.0
     wait()  # until all have read it, the first one writes nothing
     try:
-        learn(config, trainer, loader, elapsed_s, report, part)
+        batches = resident_or_not(loader, device)
+        learn(config, trainer, batches, elapsed_s, report, part)
         if part.first:
             finish(config, trainer, material)
         wait()

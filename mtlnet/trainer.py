@@ -11,12 +11,14 @@ import torch
 from torch import Tensor
 
 from mtlnet.balance import STRETCH, Balance
+from mtlnet.captured import Captured, CudaRecorder
 from mtlnet.loader import Batch, Loader
 from mtlnet.loss import Alpha, Losses, multi_task_loss
 from mtlnet.network import Network, initialise
 from mtlnet.optimiser import Optimisers
 from mtlnet.plan import MTL, Plan
 from mtlnet.recipe import Recipe, learning_rate
+from mtlnet.resident import DeviceBatch, on_device
 from mtlnet.swift import training_outputs
 from mtlnet.together import average
 
@@ -56,6 +58,10 @@ class Trainer:
         self.network = network.to(device).to(memory_format=torch.channels_last)
         self.optimisers = Optimisers(self.network, recipe, self.balance.parameters)
         self.scale: Tensor | None = None
+        # Of the others, the rate changes at every step, or the weights of the tasks.
+        lasting = recipe.optimiser == "sgd" and balance == "fixed" and part[1] == 1
+        on_gpu = device.type == "cuda"
+        self.captured = Captured(self.learn, CudaRecorder(device)) if lasting and on_gpu else None
         if recipe.dropout:
             # Dropout takes no generator of its own: this is torch's only place for a seed.
             torch.manual_seed(seed)
@@ -74,24 +80,27 @@ class Trainer:
         self.network.target_std.copy_(std)
         self.scale = (std**2).float().to(self.device)
 
-    def step(self, batch: Batch, progress: float) -> Losses:
+    def step(self, batch: Batch | DeviceBatch, progress: float) -> Losses:
         """Learn from one batch; its losses, before the step."""
         self.network.train()
-        self.optimisers.set_rate(learning_rate(self.recipe, self.step_number, progress))
-        coded = torch.from_numpy(batch.coded).to(self.device, non_blocking=True)
-        heading = torch.from_numpy(batch.heading).to(self.device, non_blocking=True)
-        images = torch.from_numpy(batch.images).to(self.device, non_blocking=True)
-        outputs = self.outputs(images)
-        losses = multi_task_loss(
-            outputs, coded, heading, self._combine(), self.scale, self.recipe.bend
-        )
+        rate = learning_rate(self.recipe, self.step_number, progress)
+        self.optimisers.set_rate(rate)
+        given = on_device(batch, self.device)
+        losses = self.learn(given) if self.captured is None else self.captured(given, rate)
+        self.balance.note(losses.terms)
+        self.step_number += 1
+        return losses
+
+    def learn(self, batch: DeviceBatch) -> Losses:
+        """Change the weights by one batch, at the rate that is set."""
+        outputs = self.outputs(batch.images)
+        combine, bend = self._combine(), self.recipe.bend
+        losses = multi_task_loss(outputs, batch.coded, batch.heading, combine, self.scale, bend)
         self.optimisers.zero_grad()
         losses.total.backward()  # type: ignore[no-untyped-call]  # torch leaves it untyped
         seen = [losses.distance, losses.angle, losses.type, losses.total.detach(), losses.terms]
         average([*seen, *self.optimisers.gradients()])
-        self.balance.note(losses.terms)
         self.optimisers.step()
-        self.step_number += 1
         return losses
 
     def _combine(self) -> Alpha | Callable[[Tensor], Tensor]:
