@@ -146,7 +146,8 @@ class Frames:
 
     def _unreadable(self, i: int, error: Exception) -> UndecodableImage:
         number, frame = self._locate(i)
-        return UndecodableImage(self.rounds[number].id, frame, str(error))
+        info = self.rounds[number]
+        return UndecodableImage(info.id, info.path, frame, str(error))
 
     @cached_property
     def _threads(self) -> int:
