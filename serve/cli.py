@@ -13,29 +13,32 @@ app = typer.Typer(add_completion=False, rich_markup_mode="rich")
 
 
 Port = Annotated[int, typer.Option(help="The running service's port.", min=1, max=65535)]
+Model = Annotated[
+    str, typer.Option(help="A run's folder or its name in runs/; 'latest'; 'default': the shipped.")
+]
+Host = Annotated[str, typer.Option(help="Address to listen on.")]
+TokenFile = Annotated[
+    Path | None,
+    typer.Option(help="What clients must know: Authorization: Bearer. Or $DRIVERVIEW_TOKEN."),
+]
+Insecure = Annotated[
+    bool, typer.Option("--insecure", help="Listen on an open --host without a token.")
+]
 
 
 @app.callback(invoke_without_command=True)
 def serve(
     context: typer.Context,
-    model: Annotated[
-        str,
-        typer.Option(help="A run's folder or its name in runs/; 'latest'; 'default': the shipped."),
-    ] = "default",
-    host: Annotated[str, typer.Option(help="Address to listen on.")] = "127.0.0.1",
+    model: Model = "default",
+    host: Host = "127.0.0.1",
     port: Annotated[
         int, typer.Option(help="Port to listen on; 0: any free one.", min=0, max=65535)
     ] = 8000,
     workers: Annotated[
         int, typer.Option(help="Processes, each with one engine: one a core.", min=1, max=256)
     ] = 1,
-    token_file: Annotated[
-        Path | None,
-        typer.Option(help="What clients must know: Authorization: Bearer. Or $DRIVERVIEW_TOKEN."),
-    ] = None,
-    insecure: Annotated[
-        bool, typer.Option("--insecure", help="Listen on an open --host without a token.")
-    ] = False,
+    token_file: TokenFile = None,
+    insecure: Insecure = False,
     rate: Annotated[
         float, typer.Option(help="Requests a second of one other machine; 0: any.", min=0)
     ] = 200.0,
@@ -87,6 +90,37 @@ def restart(port: Port = 8000) -> None:
     from serve.manage import ask
 
     typer.echo(ask(port, "restart"))
+
+
+@app.command()
+def ray(
+    model: Model = "default",
+    host: Host = "127.0.0.1",
+    port: Annotated[int, typer.Option(help="Port of Ray's proxy.", min=1, max=65535)] = 8000,
+    replicas: Annotated[
+        int, typer.Option(help="Engines, each with a core of the cluster.", min=1)
+    ] = 1,
+    token_file: TokenFile = None,
+    insecure: Insecure = False,
+) -> None:
+    """Serve on Ray, on one machine or many: on the cluster of $RAY_ADDRESS, or on one of its own.
+
+    Needs [bold]pip install 'driverview\\[rayserve]'[/bold]. The model's folder must be there on
+    all machines.
+    """
+    from serve.limits import Limits
+    from serve.server import check_exposure, read_token
+    from trackfeatures.errors import UserError
+
+    token = read_token(token_file)
+    check_exposure(host, token, insecure)
+    try:
+        from serve.on_ray import RayConfig, run
+    except ImportError as error:
+        raise UserError(
+            f"Ray Serve is not installed ({error}): pip install 'driverview[rayserve]'"
+        ) from error
+    run(RayConfig(model, host, port, replicas, Limits(token=token)))
 
 
 def main() -> None:
