@@ -7,7 +7,7 @@ PACKAGES := trackfeatures simulator datagen mtlnet serve controllers
 # Debian keeps ldconfig in /sbin, which is not on every user's PATH.
 export PATH := $(CURDIR)/$(BIN):$(PATH):/usr/sbin:/sbin
 
-.PHONY: help setup system demo test check compiled quick e2e bench format lock clean
+.PHONY: help setup system demo test check compiled quick fuzz api e2e bench format lock clean
 
 help: ## list the targets
 	@grep -hE '^[a-z0-9]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 10
@@ -64,6 +64,9 @@ quick: $(READY) ## the tests that take seconds
 
 fuzz: $(READY) ## a million damaged images through the service's gate, in process
 	$(BIN)/python benchmarks/service_fuzz.py
+
+api: $(READY) ## a thousand requests an operation, made from the OpenAPI document
+	DRIVERVIEW_API_EXAMPLES=1000 $(BIN)/pytest tests/serve/test_serve_openapi.py
 
 e2e: $(READY) ## one round from the simulator to a steered car
 	$(BIN)/pytest tests/e2e

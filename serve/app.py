@@ -1,11 +1,12 @@
 """The service as one application: frames by hand, all else by FastAPI."""
 
 import time
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
 from dataclasses import asdict
+from functools import partial
 from importlib.metadata import version
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from fastapi import FastAPI
 from fastapi.responses import JSONResponse, PlainTextResponse, Response
@@ -15,6 +16,8 @@ from mtlnet.engine import Engine
 from serve import contract, inference, problems
 from serve.ask import Headers, check_token
 from serve.console import add_console
+from serve.docs import PATH as DOCS
+from serve.docs import add_docs
 from serve.features import Exchange, Features, Sight, client_of
 from serve.gate import Receive, Reply, Scope, Send, refusal, reply
 from serve.limits import Limits
@@ -26,6 +29,12 @@ from serve.readiness import warm_up
 from serve.shared import Shared, create
 from serve.stream import Stream
 from serve.streams import Streams
+
+if TYPE_CHECKING:
+    from opentelemetry.trace import Tracer
+
+App = Callable[[Scope, Receive, Send], Awaitable[None]]
+Begin = Callable[[Sight, str, Callable[[Reply], None]], Exchange]
 
 PROBES = {
     "/healthz",
@@ -45,11 +54,13 @@ class Service:
         limits: Limits | None = None,
         shared: Shared | None = None,
         slot: int = 0,
+        tracer: "Tracer | None" = None,
     ) -> None:
         """`check` warms an engine up and raises when its answers are wrong.
 
         It runs when the application starts (its lifespan): until it is through, /readyz and
         /features answer 503. `shared` None: this is the only worker; else `slot` is its block.
+        `tracer` None: nothing is traced.
         """
         self.limits = limits or Limits()
         self.shared = shared or create(slots=1)
@@ -57,11 +68,17 @@ class Service:
         self.perceiver = Perceiver(engine, check, streams, self.limits.queue)
         self.metrics = Metrics(self.shared, slot)
         self.sight = Sight(self.perceiver, self.metrics, self.limits.log_answers)
-        self.features = Features(self.sight)
+        self._begin: Begin = Exchange
+        if tracer is not None:
+            self.sight, self._begin = _traced(self, tracer)
+        self.features = Features(self.sight, self._begin)
         self.rate = Rate(self.shared.clients(), self.limits.rate)
         self._token = self.limits.token
-        self._stream = Stream(self.sight, self.rate)
+        self._stream: App = Stream(self.sight, self.rate)
         self.framework = _framework(self)
+        self._other: App = self.framework
+        if tracer is not None:
+            self._stream, self._other = _traced_apps(tracer, self._stream, self._other)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] == "lifespan":
@@ -78,7 +95,7 @@ class Service:
         elif scope["path"] == "/features" and scope["method"] == "POST":
             await self.features(scope, receive, send)
         else:
-            await self.framework(scope, receive, send)
+            await self._other(scope, receive, send)
 
     def open(self, headers: Headers, client: str, send: Callable[[Reply], None]) -> Exchange | None:
         """A POST /features whose body is wanted; None: it was replied to."""
@@ -86,7 +103,7 @@ class Service:
         if stopped is not None:
             send(stopped)
             return None
-        exchange = Exchange(self.sight, client, send)
+        exchange = self._begin(self.sight, client, send)
         return exchange if exchange.open(headers) else None
 
     def _at_the_door(self, headers: Headers, client: str) -> Reply | None:
@@ -100,9 +117,22 @@ class Service:
         return None
 
 
+def _traced(service: Service, tracer: "Tracer") -> tuple[Sight, Begin]:
+    from serve.tracing import TracedExchange, TracedSight
+
+    about = (service.perceiver, service.metrics, service.limits.log_answers)
+    return TracedSight(tracer, *about), partial(TracedExchange, tracer)
+
+
+def _traced_apps(tracer: "Tracer", *apps: App) -> list[App]:
+    from serve.tracing import Traced
+
+    return [Traced(tracer, app) for app in apps]
+
+
 def _is_public(path: str) -> bool:
-    """Whether a path needs no token: probes, and the console's own files, which ask for one."""
-    return path in PROBES or path == "/" or path.startswith("/console/")
+    """Whether a path needs no token: probes, the console's own files, which ask for one, docs."""
+    return path in PROBES or path in ("/", DOCS) or path.startswith("/console/")
 
 
 def _framework(service: Service) -> FastAPI:
@@ -118,15 +148,18 @@ def _framework(service: Service) -> FastAPI:
         description=DESCRIPTION,
         lifespan=lifespan,
         redirect_slashes=False,
+        docs_url=None,  # the framework's own pages load their scripts from elsewhere
+        redoc_url=None,
     )
     problems.install(app)
-    contract.install_openapi(app)
+    contract.install_openapi(app, PROBES)
     # Reached only with another method than POST: who sends one is told which there is.
     app.router.routes.append(Route("/features", service.features, methods=["POST"]))
     _add_status(app, service.perceiver)
     _add_metrics(app, service)
     inference.install(app, service.sight)
     add_console(app)
+    add_docs(app)
     return app
 
 

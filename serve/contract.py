@@ -1,5 +1,6 @@
 """The service's answers as schemas, and the parts of its OpenAPI document FastAPI cannot derive."""
 
+from collections.abc import Collection
 from typing import Any
 
 from fastapi import FastAPI
@@ -111,10 +112,16 @@ class ProblemDetails(BaseModel):
     )
 
 
-REFUSALS = (
-    problems.UNAUTHORIZED,
-    problems.NOT_ACCEPTABLE,
+# What any request may meet before its path matters; a probe needs no token and has no rate.
+DOOR = (
+    problems.MALFORMED,
     problems.TOO_SLOW,
+    problems.HEAD_TOO_LARGE,
+    problems.TOO_MANY_CONNECTIONS,
+)
+GUARD = (problems.UNAUTHORIZED, problems.RATE_LIMITED)
+REFUSALS = (
+    problems.NOT_ACCEPTABLE,
     problems.BODY_TOO_LARGE,
     problems.UNSUPPORTED_TYPE,
     problems.INVALID_REQUEST,
@@ -125,7 +132,6 @@ REFUSALS = (
     problems.IMAGE_SIZE,
     problems.IMAGE_ASPECT,
     problems.FIELD_OF_VIEW,
-    problems.RATE_LIMITED,
     problems.INTERNAL,
     problems.NOT_READY,
     problems.OVERLOADED,
@@ -150,8 +156,20 @@ HEADERS: dict[str, tuple[str, dict[str, Any]]] = {
         "cut out of a larger one.",
         {"type": "number", "minimum": MIN_FOV_DEG, "maximum": MAX_FOV_DEG},
     ),
-    REQUEST_ID: ("Comes back in a header of the same name, and stands in the log.", NAME),
+    REQUEST_ID: (
+        "Comes back in a header of the same name, and stands in the log. One that is not printable "
+        f"ASCII of at most {MAX_NAME} characters is replaced by a new one.",
+        {"type": "string"},
+    ),
 }
+
+
+def header_parameters() -> list[dict[str, Any]]:
+    """The headers that speak of an image, as OpenAPI has them."""
+    return [
+        {"name": name, "in": "header", "required": False, "description": text, "schema": kind}
+        for name, (text, kind) in HEADERS.items()
+    ]
 
 
 def features_operation() -> dict[str, Any]:
@@ -160,10 +178,7 @@ def features_operation() -> dict[str, Any]:
     return {
         "summary": "Track features of one driver-view image",
         "operationId": "features",
-        "parameters": [
-            {"name": name, "in": "header", "required": False, "description": text, "schema": kind}
-            for name, (text, kind) in HEADERS.items()
-        ],
+        "parameters": header_parameters(),
         "requestBody": {
             "required": True,
             "description": "The bytes of one JPEG or PNG file: no form, no base64. At most 4 MiB, "
@@ -198,8 +213,22 @@ def problem_responses(*kinds: Kind) -> dict[int | str, dict[str, Any]]:
     }
 
 
-def install_openapi(app: FastAPI) -> None:
-    """Give `app` an OpenAPI document with the paths and schemas that it does not know of."""
+def add_door(operation: dict[str, Any], guarded: bool) -> None:
+    """Add what the door refuses to an operation's responses, beside what it refuses itself."""
+    kinds = (*DOOR, *GUARD) if guarded else DOOR
+    responses = operation["responses"]
+    for status, response in problem_responses(*kinds).items():
+        own = responses.get(str(status))
+        if own is not None:
+            response["description"] = f"{own['description']}; {response['description']}"
+        responses[str(status)] = response
+
+
+def install_openapi(app: FastAPI, public: Collection[str]) -> None:
+    """Give `app` an OpenAPI document with the paths and schemas that it does not know of.
+
+    `public`: the paths that need no token.
+    """
 
     def document() -> dict[str, Any]:
         if app.openapi_schema is None:
@@ -215,6 +244,9 @@ def install_openapi(app: FastAPI) -> None:
                 schemas.update(found.pop("$defs", {}))
                 schemas[model.__name__] = found
             schema["paths"] = {"/features": {"post": features_operation()}, **schema["paths"]}
+            for path, item in schema["paths"].items():
+                for operation in item.values():
+                    add_door(operation, path not in public)
             app.openapi_schema = schema
         return app.openapi_schema
 

@@ -155,12 +155,17 @@ class Exchange:
 class Features:
     """The endpoint, as an ASGI application."""
 
-    def __init__(self, sight: Sight) -> None:
+    def __init__(
+        self,
+        sight: Sight,
+        begin: Callable[[Sight, str, Callable[[Reply], None]], Exchange] = Exchange,
+    ) -> None:
         self._sight = sight
+        self._begin = begin
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         found: asyncio.Future[Reply] = asyncio.get_running_loop().create_future()
-        exchange = Exchange(self._sight, client_of(scope), partial(settle, found))
+        exchange = self._begin(self._sight, client_of(scope), partial(settle, found))
         if exchange.open(dict(scope["headers"])):
             try:
                 exchange.take(await read_body(receive))

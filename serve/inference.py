@@ -22,9 +22,10 @@ from mtlnet.doubt import FEATURES
 from mtlnet.image_error import ImageError
 from mtlnet.images import check_size, decode, fit, inspect
 from serve.ask import Headers, check_body_headers, read_ask, request_id
-from serve.contract import REFUSALS, problem_responses
+from serve.contract import REFUSALS, header_parameters, problem_responses
 from serve.features import Sight, client_of
 from serve.gate import Departed, read_body
+from serve.limits import MAX_BODY_BYTES
 from serve.perceiver import Reader
 from serve.problems import MEDIA_TYPE, NOT_READY, Problem, failure
 from serve.tensors import InferRequest, invalid, parse, read_image_bytes, read_pixels, write
@@ -46,18 +47,70 @@ OUTPUTS = {
     "std": len(FEATURES),
     "out_of_distribution": 1,
 }
+PARAMETERS: dict[str, Any] = {"type": "object"}
+TENSOR: dict[str, Any] = {
+    "type": "object",
+    "required": ["name", "shape", "datatype"],
+    "properties": {
+        "name": {"enum": [tensor["name"] for tensor in INPUTS]},
+        "shape": {"type": "array", "items": {"type": "integer"}},
+        "datatype": {"enum": [tensor["datatype"] for tensor in INPUTS]},
+        "parameters": {
+            **PARAMETERS,
+            "description": "`binary_data_size`: the bytes of this tensor follow the JSON part",
+        },
+        "data": {"description": "a file in base64, or values from 0 to 255, row by row"},
+    },
+}
+REQUEST: dict[str, Any] = {
+    "type": "object",
+    "required": ["inputs"],
+    "properties": {
+        "id": {"type": ["string", "null"], "description": "comes back in the answer"},
+        "inputs": {"type": "array", "minItems": 1, "maxItems": 1, "items": TENSOR},
+        "outputs": {
+            "type": "array",
+            "description": "which outputs are wanted; without it, all",
+            "items": {
+                "type": "object",
+                "required": ["name"],
+                "properties": {"name": {"enum": [*OUTPUTS]}, "parameters": PARAMETERS},
+            },
+        },
+        "parameters": {
+            **PARAMETERS,
+            "description": "`binary_data_output`: outputs are wanted as bytes behind the JSON part",
+        },
+    },
+}
 INFER_BODY: dict[str, Any] = {
     "parameters": [
-        {"name": HEADER, "in": "header", "required": False, "schema": {"type": "integer"}}
+        {
+            "name": HEADER,
+            "in": "header",
+            "required": False,
+            "description": "Bytes of the body's JSON part, where binary tensors follow it",
+            "schema": {"type": "integer", "minimum": 0, "maximum": MAX_BODY_BYTES},
+        },
+        *header_parameters(),
     ],
     "requestBody": {
         "required": True,
         "description": "An inference request in JSON; with its header's length also binary tensors",
         "content": {
-            "application/json": {"schema": {"type": "object"}},
+            "application/json": {"schema": REQUEST},
             "application/octet-stream": {"schema": {"type": "string", "format": "binary"}},
         },
     },
+}
+BINARY_ANSWER: dict[int | str, dict[str, Any]] = {
+    200: {
+        "description": "The outputs, in JSON, or with binary ones behind it",
+        "content": {
+            "application/json": {"schema": {"type": "object"}},
+            "application/octet-stream": {"schema": {"type": "string", "format": "binary"}},
+        },
+    }
 }
 
 logger = logging.getLogger(__name__)
@@ -89,7 +142,7 @@ def install(app: FastAPI, sight: Sight) -> None:
         app.post(
             f"{model}/infer",
             summary="Track features of one image, as tensors",
-            responses=problem_responses(*REFUSALS),
+            responses={**BINARY_ANSWER, **problem_responses(*REFUSALS)},
             openapi_extra=INFER_BODY,
             **add,
         )(_infer(sight))

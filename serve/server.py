@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from mtlnet.card import resolve_run
-from serve import logs
+from serve import logs, telemetry
 from serve.limits import Limits, is_loopback
 from serve.manage import listen, socket_path
 from serve.supervisor import Plan, Supervisor
@@ -65,17 +65,20 @@ def read_token(path: Path | None) -> str | None:
 def run(config: ServiceConfig) -> None:
     """Serve until SIGTERM or Ctrl-C. Raises UserError when it cannot begin."""
     logs.set_up()
-    _check_exposure(config)
-    resolve_run(config.model)  # a model that is not there is told before any process is started
+    check_exposure(config.host, config.limits.token, config.insecure)
+    # What is not there is told before any process is started.
+    telemetry.exporter_name()
+    resolve_run(config.model)
     listener = bind(config.host, config.port)
     asyncio.run(_serve(config, listener))
 
 
-def _check_exposure(config: ServiceConfig) -> None:
-    if is_loopback(config.host) or config.limits.token is not None or config.insecure:
+def check_exposure(host: str, token: str | None, insecure: bool) -> None:
+    """Raise UserError where others than this machine could use the service unasked."""
+    if is_loopback(host) or token is not None or insecure:
         return
     raise UserError(
-        f"--host {config.host} is open to others than this machine: set a token (--token-file, or "
+        f"--host {host} is open to others than this machine: set a token (--token-file, or "
         f"{TOKEN_VARIABLE} in the environment), or say --insecure where a proxy guards the service"
     )
 

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from mtlnet.engine import Engine, load_engine
-from serve import logs
+from serve import logs, telemetry
 from serve.app import Service
 from serve.listener import WorkerServer
 from serve.readiness import warm_up
@@ -77,7 +77,7 @@ def main() -> None:
         return
     control.say_loaded(task.generation, engine)
     shared = attach(task.memory, task.slots)
-    app = Service(engine, warm_up, task.limits, shared, task.slot)
+    app = Service(engine, warm_up, task.limits, shared, task.slot, telemetry.tracer())
     app.perceiver.when_warm(lambda: control.say(ready=True))
     peers = BlockPeers(shared, task.slot)
     server = WorkerServer(app, task.limits, peers)

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -26,6 +26,9 @@ from serve.listener import WorkerServer
 from serve.shared import Shared
 from serve.workers import BlockPeers
 from trackfeatures.listening import bind
+
+if TYPE_CHECKING:
+    from opentelemetry.trace import Tracer
 
 CARD = ModelCard(
     name="fake",
@@ -162,6 +165,7 @@ def serving(
     limits: Limits | None = None,
     shared: Shared | None = None,
     slot: int = 0,
+    tracer: "Tracer | None" = None,
 ) -> Iterator[Served]:
     """The service around `engine` on a free port, as `serve` runs it, in a thread of this process.
 
@@ -173,7 +177,7 @@ def serving(
 
     listener = bind("127.0.0.1", 0)
     listener.listen(2048)
-    app = Service(engine, checked, limits, shared, slot)
+    app = Service(engine, checked, limits, shared, slot, tracer)
     server = WorkerServer(app, limits or Limits(), BlockPeers(app.shared, slot))
     thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
     thread.start()
