@@ -13,7 +13,7 @@ from fastapi.responses import JSONResponse, PlainTextResponse, Response
 from starlette.routing import Route
 
 from mtlnet.engine import Engine
-from serve import contract, inference, problems
+from serve import contract, failures, inference, problems
 from serve.ask import Headers, check_token
 from serve.console import add_console
 from serve.docs import PATH as DOCS
@@ -151,7 +151,7 @@ def _framework(service: Service) -> FastAPI:
         docs_url=None,  # the framework's own pages load their scripts from elsewhere
         redoc_url=None,
     )
-    problems.install(app)
+    failures.install(app)
     contract.install_openapi(app, PROBES)
     # Reached only with another method than POST: who sends one is told which there is.
     app.router.routes.append(Route("/features", service.features, methods=["POST"]))

@@ -3,16 +3,9 @@
 A problem's `type` names its kind and never changes; `detail` says what was seen and what to do.
 """
 
-import http
-import json
 from dataclasses import dataclass
 from math import ceil
 from typing import Any
-
-from fastapi import FastAPI, Request
-from fastapi.exceptions import RequestValidationError
-from starlette.exceptions import HTTPException
-from starlette.responses import Response
 
 from mtlnet.image_error import Fault, ImageError
 from trackfeatures.errors import UserError
@@ -120,7 +113,7 @@ class Problem(UserError):
     @property
     def content(self) -> dict[str, Any]:
         """The problem's members, `retry_after_ms` in milliseconds among them where it is known."""
-        content = _members(self.kind.type, self.kind.title, self.kind.status, self.detail)
+        content = members(self.kind.type, self.kind.title, self.kind.status, self.detail)
         if self.retry_after_ms is not None:
             content["retry_after_ms"] = max(1, round(self.retry_after_ms))
         return content
@@ -145,59 +138,6 @@ def failure() -> Problem:
     return Problem(INTERNAL, "the request could not be answered; the service's log says why")
 
 
-def respond(problem: Problem, headers: dict[str, str] | None = None) -> Response:
-    """The problem as a response."""
-    return _response(problem.content, {**problem.headers, **(headers or {})})
-
-
-def _members(type_uri: str, title: str, status: int, detail: str) -> dict[str, Any]:
+def members(type_uri: str, title: str, status: int, detail: str) -> dict[str, Any]:
+    """The members that every problem has."""
     return {"type": type_uri, "title": title, "status": status, "detail": detail}
-
-
-def _response(content: dict[str, Any], headers: dict[str, str] | None) -> Response:
-    return Response(json.dumps(content), content["status"], headers, MEDIA_TYPE)
-
-
-def install(app: FastAPI) -> None:
-    """Make every error that leaves `app` a problem, those of the framework included."""
-    app.add_exception_handler(Problem, _on_problem)
-    app.add_exception_handler(ImageError, _on_image_error)
-    app.add_exception_handler(HTTPException, _on_http_exception)
-    app.add_exception_handler(RequestValidationError, _on_validation_error)
-    app.add_exception_handler(Exception, _on_failure)
-
-
-def _on_problem(_request: Request, error: Exception) -> Response:
-    assert isinstance(error, Problem)
-    return respond(error)
-
-
-def _on_image_error(_request: Request, error: Exception) -> Response:
-    assert isinstance(error, ImageError)
-    return respond(image_problem(error))
-
-
-def _on_http_exception(request: Request, error: Exception) -> Response:
-    assert isinstance(error, HTTPException)
-    headers = dict(error.headers or {})
-    path = request.url.path
-    if error.status_code == 404:
-        detail = f"there is nothing at {path}; images go to POST /features, the docs are at /docs"
-        return respond(Problem(NOT_FOUND, detail), headers)
-    if error.status_code == 405:
-        allowed = headers.get("allow") or headers.get("Allow") or "another method"
-        detail = f"{path} takes {allowed}, not {request.method}; the docs are at /docs"
-        return respond(Problem(METHOD_NOT_ALLOWED, detail), headers)
-    title = http.HTTPStatus(error.status_code).phrase
-    return _response(_members("about:blank", title, error.status_code, str(error.detail)), headers)
-
-
-def _on_validation_error(_request: Request, error: Exception) -> Response:
-    assert isinstance(error, RequestValidationError)
-    seen = "; ".join(f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors())
-    return respond(Problem(INVALID_REQUEST, f"{seen}; the docs are at /docs"))
-
-
-def _on_failure(_request: Request, _error: Exception) -> Response:
-    # The server logs the error itself, and closes the connection after a failure.
-    return respond(failure(), {"Connection": "close"})

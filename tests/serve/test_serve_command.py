@@ -138,3 +138,10 @@ def test_help_loads_nothing_heavy() -> None:
     assert done.returncode == 0, done.stderr
     assert "--workers" in done.stdout
     assert done.stdout.splitlines()[-1] == "set()"
+
+
+def test_the_supervisor_loads_neither_framework_nor_engine() -> None:
+    """It answers no request, and every worker waits for its start."""
+    code = "import sys, serve.server; print({'fastapi', 'cv2', 'openvino'} & set(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.stdout == "set()\n", done.stderr
