@@ -10,6 +10,10 @@ last features: a network that has learned to see a road answers anything else wi
 their mean. Measured on a model of 230 steps, at 1 % false alarms: 1 % of noise and text found by
 the last features, all of it by the texture.
 
+A camera that looks up or down shows the same textures a little higher or lower. From the middle of
+the picture two layers tell how far (`mtlnet.aim_fit`), in units of what counts as known too; the
+greater of both squares is the novelty.
+
 In numpy; the exported graph computes the same.
 """
 
@@ -28,7 +32,12 @@ FEATURES = (*tf.MARKINGS, "to_lane_centre", "angle")
 """What has a standard deviation: m, and rad for the angle."""
 COLUMNS = len(FEATURES) + 1
 ROWS_OF_CELLS, COLUMNS_OF_CELLS = 14, 8
-TEXTURE = 5 * ROWS_OF_CELLS * COLUMNS_OF_CELLS
+BANDS = 3  # in the height of a cell: aims are read from them, in the middle of the picture
+MIDDLE_BANDS, MIDDLE_COLUMNS = slice(9, 33), slice(2, 6)
+PLANES = 5
+CELLS = PLANES * ROWS_OF_CELLS * COLUMNS_OF_CELLS
+MIDDLE = PLANES * 24 * 4
+TEXTURE = CELLS + MIDDLE
 SMALLEST = 1e-6
 """Of a mean difference before its root: a flat cell has none."""
 
@@ -47,31 +56,55 @@ class Doubt:
     bias: Numbers  # (D,) log(standard deviation) of m and rad
     low: Numbers  # (D,) limits of that logarithm: an image unlike any before says nothing...
     high: Numbers  # (D,) ...of use beyond them
-    usual: Numbers  # (T,) the mean texture
-    directions: Numbers  # (K, T) novelty = |directions (texture - usual)|^2; above 1: strange
+    usual: Numbers  # (C,) the mean of the textures' cells
+    directions: Numbers  # (K, C) novelty = |directions (cells - usual)|^2; above 1: strange
+    aim_centre: Numbers  # (M,) of the middle
+    aim_scale: Numbers  # (M,)
+    aim_hidden_weight: Numbers  # (H, M)
+    aim_hidden_bias: Numbers  # (H,)
+    aim_weight: Numbers  # (1, H) how far down the camera looks, so that...
+    aim_bias: Numbers  # (1,) ...novelty = aim^2
 
     def assess(self, x: Numbers, textures: Numbers) -> Numbers:
         """Last shared features (N, F), textures (N, T) -> (N, D + 1): deviations, novelty."""
         z = (x - self.centre) * self.scale
         hidden = np.maximum(z @ self.hidden_weight.T + self.hidden_bias, 0)
         logarithm = (hidden @ self.weight.T + self.bias).clip(self.low, self.high)
-        along = (textures - self.usual) @ self.directions.T
-        novelty = (along**2).sum(1, keepdims=True)
+        cells, middle = np.split(textures, [len(self.usual)], 1)
+        along = (cells - self.usual) @ self.directions.T
+        aim = self.aim(middle)
+        novelty = np.maximum((along**2).sum(1, keepdims=True), aim**2)
         return np.concatenate([np.exp(logarithm), novelty], 1).astype(np.float32)
+
+    def aim(self, middle: Numbers) -> Numbers:
+        """How far down, beyond their own, cameras of these middles (N, M) look: (N, 1)."""
+        z = (middle - self.aim_centre) * self.aim_scale
+        hidden = np.maximum(z @ self.aim_hidden_weight.T + self.aim_hidden_bias, 0)
+        off: Numbers = hidden @ self.aim_weight.T + self.aim_bias
+        return off
 
 
 def texture(image: NDArray[np.uint8]) -> Numbers:
-    """What an image (H, W, 3) is made of, cell by cell (T,): colours, and the roots of the mean
-    differences of brightness between neighbours, across and down. H, W: multiples of the cells."""
+    """What an image (H, W, 3) is made of (T,): cell by cell, then band by band in its middle.
+
+    Colours, and the roots of the mean differences of brightness between neighbours, across and
+    down. H, W: multiples of the bands and cells.
+    """
     pixels = image.astype(np.float32) * np.float32(1 / 127.5) - 1
     grey = pixels.mean(2, keepdims=True)
     across = np.abs(np.diff(grey, axis=1, append=grey[:, -1:]))
     down = np.abs(np.diff(grey, axis=0, append=grey[-1:]))
-    height, width = image.shape[0] // ROWS_OF_CELLS, image.shape[1] // COLUMNS_OF_CELLS
+    bands, columns = ROWS_OF_CELLS * BANDS, COLUMNS_OF_CELLS
+    height, width = image.shape[0] // bands, image.shape[1] // columns
     planes = np.concatenate([pixels, across, down], 2)
-    cells = planes.reshape(ROWS_OF_CELLS, height, COLUMNS_OF_CELLS, width, 5).mean((1, 3))
-    cells[..., 3:] = np.sqrt(cells[..., 3:] + SMALLEST)
-    return np.ascontiguousarray(cells.transpose(2, 0, 1)).reshape(-1).astype(np.float32)
+    narrow = planes.reshape(bands, height, columns, width, PLANES).mean((1, 3))
+    cells = narrow.reshape(ROWS_OF_CELLS, BANDS, columns, PLANES).mean(1)
+    parts = [cells, narrow[MIDDLE_BANDS, MIDDLE_COLUMNS].copy()]
+    for part in parts:
+        part[..., 3:] = np.sqrt(part[..., 3:] + SMALLEST)
+    return np.concatenate([part.transpose(2, 0, 1).reshape(-1) for part in parts]).astype(
+        np.float32
+    )
 
 
 @dataclass(frozen=True)

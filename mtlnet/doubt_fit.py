@@ -17,8 +17,10 @@ from torch import Tensor, nn
 
 import trackfeatures as tf
 from datagen.recording import Dataset, Frames
+from mtlnet.aim_fit import fit_aim, turn_frames
 from mtlnet.answer import OUTPUTS
-from mtlnet.doubt import FEATURES, TEXTURE, Doubt, FittedDoubt, texture
+from mtlnet.card import Camera
+from mtlnet.doubt import CELLS, FEATURES, TEXTURE, Doubt, FittedDoubt, texture
 from mtlnet.engine import best_precision
 from mtlnet.errors import coverage, signed_errors
 from mtlnet.export import describing_graph
@@ -29,7 +31,7 @@ HELD_OUT_SHARE = 1 / 12
 LEAST_ROUNDS = 8
 """With fewer train rounds none can be spared: doubt is then fitted to what was learned from."""
 FALSE_ALARMS = 0.01
-"""Share of known frames that are called out of distribution."""
+"""Share of known frames that are called out of distribution, half of them for their texture."""
 LEARNED_FRAMES, HELD_OUT_FRAMES = 3_000, 4_000  # at most so many are looked at
 HIDDEN = 32
 STEPS, BATCH, RATE, DECAY = 250, 256, 1e-2, 3e-2
@@ -85,7 +87,13 @@ class Seen:
     texture: Numbers
 
 
-def fit_doubt(network: Network, learned: Images, held_out: Images | None, seed: int) -> FittedDoubt:
+def fit_doubt(
+    network: Network,
+    learned: Images,
+    held_out: Images | None,
+    seed: int,
+    camera: Camera | None = None,
+) -> FittedDoubt:
     """The second head of `network` (folded), fitted on frames held out of its training.
 
     Without any, on those learned from: it then trusts the network too much, and the card says so.
@@ -97,9 +105,15 @@ def fit_doubt(network: Network, learned: Images, held_out: Images | None, seed: 
     torch.set_num_threads(1)  # the head is small: threads would only wait for each other
     standard = None if judged is None else replace(judged, x=(judged.x - centre) * scale)
     head = fit_head((known.x - centre) * scale, known.error, seed, standard)
+    seen, limits = known.texture, None if judged is None else judged.texture
+    if limits is None:  # without any, every second one of the known
+        seen, limits = seen[::2], seen[1::2]
+    turned = turn_frames(learned, camera or Camera(), seed)
+    aim = fit_aim(seen[:, CELLS:], turned, limits[:, CELLS:], FALSE_ALARMS / 2, seed)
     torch.set_num_threads(threads)
-    usual, directions = novelty(known.texture, None if judged is None else judged.texture)
-    doubt = Doubt(centre, scale.astype(np.float32), **head, usual=usual, directions=directions)
+    usual, directions = novelty(seen[:, :CELLS], limits[:, :CELLS], FALSE_ALARMS / 2)
+    strange = {"usual": usual, "directions": directions, **aim}
+    doubt = Doubt(centre, scale.astype(np.float32), **head, **strange)
     judged = judged or known
     about = {
         "features": list(FEATURES),
@@ -154,18 +168,16 @@ def _requests(network: Network) -> Any:
     return openvino.AsyncInferQueue(core.compile_model(describing_graph(network), "CPU", options))
 
 
-def novelty(known: Numbers, held_out: Numbers | None) -> tuple[Numbers, Numbers]:
-    """The mean texture (T,), and directions (T, T) so long that `FALSE_ALARMS` reach 1.
-
-    The limit is that of the textures held out; without any, of every second one of the known.
-    """
-    if held_out is None:
-        known, held_out = known[::2], known[1::2]
+def novelty(
+    known: Numbers, held_out: Numbers, false_alarms: float = FALSE_ALARMS
+) -> tuple[Numbers, Numbers]:
+    """The mean texture (C,), and directions (C, C) so long that `false_alarms` of the textures
+    held out reach 1."""
     usual, spread = known.mean(0), np.maximum(known.std(0), LEAST_SPREAD)
     variance, axes = np.linalg.eigh(np.cov((known - usual) / spread, rowvar=False))
     directions = (axes / np.sqrt(np.maximum(variance, 0) + RIDGE)).T / spread
     sizes = (((held_out - usual) @ directions.T) ** 2).sum(1)
-    limit = max(float(np.quantile(sizes, 1 - FALSE_ALARMS)), 1e-6)
+    limit = max(float(np.quantile(sizes, 1 - false_alarms)), 1e-6)
     return usual, np.asarray(directions / np.sqrt(limit), np.float32)
 
 

@@ -32,7 +32,9 @@ def finish(config: TrainConfig, trainer: Trainer, material: Material) -> ModelCa
         batch=config.batch,
         seed=config.seed,
         data=material.about,
-        doubt=fit_doubt(fold(trainer.network), frames, material.held_out, config.seed),
+        doubt=fit_doubt(
+            fold(trainer.network), frames, material.held_out, config.seed, material.camera
+        ),
     )
     link_latest(config.out)
     return card

@@ -3,19 +3,28 @@
 from collections import Counter
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
 from datagen.recording import Dataset
+from mtlnet.aim_fit import aimed, draw_aim
 from mtlnet.answer import OUTPUTS, interpret
 from mtlnet.card import Camera
-from mtlnet.doubt import FEATURES, Doubt, read_doubt, texture
+from mtlnet.doubt import CELLS, FEATURES, Doubt, read_doubt, texture
 from mtlnet.doubt_fit import fit_head, novelty
 from mtlnet.engine import load_engine
 from mtlnet.errors import calibration, coverage
 from tests.mtlnet.strange import no_road, seen_by
 
 NO_ROAD = 1000
+
+
+def no_aim() -> dict[str, np.ndarray]:
+    """Layers that tell nothing of any picture."""
+    shapes: dict[str, tuple[int, ...]] = {"centre": (0,), "scale": (0,)}
+    shapes |= {"hidden_weight": (1, 0), "hidden_bias": (1,), "weight": (1, 1), "bias": (1,)}
+    return {f"aim_{name}": np.zeros(shape, np.float32) for name, shape in shapes.items()}
 
 
 def fitted(seed: int, count: int, of: int) -> tuple[Doubt, np.ndarray, np.ndarray, np.ndarray]:
@@ -29,7 +38,7 @@ def fitted(seed: int, count: int, of: int) -> tuple[Doubt, np.ndarray, np.ndarra
     nothing = np.zeros(1, np.float32)
     doubt = Doubt(
         np.zeros(6, np.float32), np.ones(6, np.float32), **head,
-        usual=nothing, directions=nothing[None],
+        usual=nothing, directions=nothing[None], **no_aim(),
     )  # fmt: skip
     return doubt, x[count:], true[count:], error[count:]
 
@@ -72,12 +81,20 @@ def test_novelty_keeps_to_its_rate_of_false_alarms() -> None:
 def test_a_texture_by_hand() -> None:
     image = np.zeros((210, 280, 3), np.uint8)
     image[:, 70:] = 255  # the third of eight columns of cells begins there
-    cells = texture(image).reshape(5, 14, 8)
+    whole = texture(image)
+    cells, middle = whole[:CELLS].reshape(5, 14, 8), whole[CELLS:].reshape(5, 24, 4)
     assert cells[:3, :, :2] == pytest.approx(-1)
     assert cells[:3, :, 2:] == pytest.approx(1)
     assert cells[3, :, 1] == pytest.approx((2 / 35) ** 0.5, rel=1e-3)  # one step of 2 in 35 pixels
     assert np.delete(cells[3], 1, 1) == pytest.approx(1e-3)
     assert cells[4] == pytest.approx(1e-3)
+    assert middle[:3] == pytest.approx(1)
+    image[:50] = 0  # the second of the bands of 5 rows in the middle begins there, at row 45
+    middle = texture(image)[CELLS:].reshape(5, 24, 4)
+    assert middle[0, 0] == pytest.approx(-1)
+    assert middle[0, 1:] == pytest.approx(1)
+    assert middle[4, 0] == pytest.approx((2 / 5) ** 0.5, rel=1e-3)
+    assert middle[4, 1:] == pytest.approx(1e-3)
 
 
 def test_a_thousand_pictures_of_no_road_are_strange(published: Path) -> None:
@@ -103,6 +120,46 @@ def test_roads_are_known_and_foreign_cameras_are_not(published: Path, dataset: P
     ]
     views += [np.ascontiguousarray(image[::-1]) for image in images[:6]]
     assert all(interpret(engine(view)).out_of_distribution for view in views)
+
+
+@pytest.mark.parametrize(("pitch_deg", "fov_y_deg"), [(6, 67.5), (-6, 67.5), (7, 80), (-7, 58)])
+def test_a_camera_that_looks_elsewhere(
+    published: Path, dataset: Path, pitch_deg: float, fov_y_deg: float
+) -> None:
+    frames = Dataset.open(dataset).select("test")
+    images = frames.read_batch(np.arange(len(frames)))
+    views = np.stack([texture(seen_by(i, Camera(), fov_y_deg, pitch_deg)) for i in images])
+    doubt = read_doubt(published)
+    aim = doubt.aim(views[:, CELLS:])[:, 0]
+    assert (aim**2 > 1).mean() > 0.9
+    assert (np.sign(aim) == np.sign(pitch_deg)).mean() > 0.9  # and it knows which way
+    known = np.stack([texture(image) for image in images])
+    assert (np.abs(doubt.aim(known[:, CELLS:])) > 1).sum() <= 1
+
+
+def test_no_border_is_ever_seen() -> None:
+    camera, rng = Camera(), np.random.default_rng(8)
+    shape = (camera.height, camera.width)
+    steepest = 0.0
+    for _ in range(200):
+        pitch, wider = draw_aim(camera, rng)
+        steepest = max(steepest, abs(pitch))
+        full = np.full((*shape, 3), 200, np.uint8)
+        seen = cv2.warpPerspective(full, aimed(camera, pitch, wider), shape[::-1])
+        assert (seen[45:166, 70:211] == 200).all()
+    assert steepest > np.radians(12)
+
+
+def test_an_aim_is_seen_as_by_that_camera(dataset: Path) -> None:
+    camera = Camera()
+    image = Dataset.open(dataset).select("test").image(0)
+    expected = seen_by(image, camera, 80.0, 5.0)
+    wider = np.log(np.tan(np.radians(40.0)) / np.tan(np.radians(camera.fov_y_deg / 2)))
+    moved = aimed(camera, np.radians(5.0), wider)
+    found = cv2.warpPerspective(image, moved, (camera.width, camera.height))
+    middle = np.s_[50:160, 75:205]
+    # The oracle's picture is half a pixel aside.
+    assert np.abs(found[middle].astype(int) - expected[middle]).mean() < 6
 
 
 def test_answers_carry_their_doubt(published: Path) -> None:
