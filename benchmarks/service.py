@@ -95,12 +95,40 @@ class Asked:
         }
 
 
+def connect(address: tuple[str, int]) -> socket.socket:
+    """A connection that waits for nothing."""
+    connection = socket.create_connection(address)
+    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    return connection
+
+
+def exchange(connection: socket.socket, request: bytes) -> bytes:
+    """The body of the answer; as little work of its own as a client can have."""
+    connection.sendall(request)
+    received = b""
+    while b"\r\n\r\n" not in received:
+        received += _receive(connection)
+    head, _, content = received.partition(b"\r\n\r\n")
+    fields = dict(line.lower().split(b": ", 1) for line in head.split(b"\r\n")[1:])
+    while len(content) < int(fields[b"content-length"]):
+        content += _receive(connection)
+    if not head.startswith(b"HTTP/1.1 200"):
+        raise RuntimeError(content.decode())
+    return content
+
+
+def _receive(connection: socket.socket) -> bytes:
+    part = connection.recv(65536)
+    if not part:
+        raise ConnectionError("the server ended the connection")
+    return part
+
+
 class Asker:
-    """One connection; as little work of its own as a client can have."""
+    """One connection, and the times of requests over it."""
 
     def __init__(self, address: tuple[str, int], body: bytes) -> None:
-        self._socket = socket.create_connection(address)
-        self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._socket = connect(address)
         head = (
             "POST /features HTTP/1.1\r\nHost: x\r\nContent-Type: image/jpeg\r\n"
             f"Content-Length: {len(body)}\r\n\r\n"
@@ -110,17 +138,8 @@ class Asker:
     def ask(self) -> tuple[float, float]:
         """(time of the request, the work in it), ms."""
         start = time.perf_counter()
-        self._socket.sendall(self._request)
-        received = b""
-        while b"\r\n\r\n" not in received:
-            received += self._socket.recv(65536)
-        head, _, content = received.partition(b"\r\n\r\n")
-        fields = dict(line.lower().split(b": ", 1) for line in head.split(b"\r\n")[1:])
-        while len(content) < int(fields[b"content-length"]):
-            content += self._socket.recv(65536)
+        content = exchange(self._socket, self._request)
         total_ms = 1e3 * (time.perf_counter() - start)
-        if not head.startswith(b"HTTP/1.1 200"):
-            raise RuntimeError(content.decode())
         timing = json.loads(content)["timing_ms"]
         return total_ms, timing["decode"] + timing["forward"]
 

@@ -18,7 +18,7 @@ from serve.limits import MAX_HEAD_BYTES, Limits
 from serve.problems import HEAD_TOO_LARGE, MALFORMED, TOO_MANY_CONNECTIONS, TOO_SLOW, Kind, Problem
 
 LINGER_S = 0.5  # for a client to read why it was dismissed, before the connection is cut
-EVICTABLE_S = 0.5  # a connection that asked for nothing for so long makes room for another
+EVICTABLE_S = 0.5  # headers or a body that take longer make room for another connection
 
 
 class Phase(Enum):
@@ -49,7 +49,7 @@ class GuardedProtocol(HttpToolsProtocol):
         self._guard = guard
         self._phase = Phase.HEAD
         self._due = inf
-        self._since = 0.0
+        self._since = 0.0  # when these headers, or this body, began
         self._served = False
         self._head_bytes = 0  # of headers that are too large
         self._part_bytes = 0  # of what came last
@@ -76,7 +76,8 @@ class GuardedProtocol(HttpToolsProtocol):
             return
         if self._phase is Phase.IDLE:
             self._phase, self._unread_bytes = Phase.HEAD, 0
-            self._due = self.loop.time() + self._guard.limits.head_s
+            self._since = self.loop.time()
+            self._due = self._since + self._guard.limits.head_s
         self._part_bytes = len(data)
         self._unread_bytes += self._part_bytes
         super().data_received(data)
@@ -91,7 +92,8 @@ class GuardedProtocol(HttpToolsProtocol):
             if self._head_bytes > MAX_HEAD_BYTES:
                 raise ValueError("headers too large")  # ends in `send_400_response`
         self._phase = Phase.BODY
-        self._due = self.loop.time() + self._guard.limits.body_s
+        self._since = self.loop.time()
+        self._due = self._since + self._guard.limits.body_s
 
     def on_headers_complete(self) -> None:
         self.check_head()
@@ -161,19 +163,18 @@ class GuardedProtocol(HttpToolsProtocol):
         self._dismiss(Problem(TOO_SLOW, f"the {what} did not come within {within:g} s"))
 
     def _make_room(self) -> bool:
-        """Cut the connection that has asked for nothing for longest; False where there is none."""
+        """Cut the connection that has sent too little for longest; False where there is none."""
         now = self.loop.time()
-        idle = [
+        slow = [
             found
             for found in self.connections
             if isinstance(found, GuardedProtocol)
-            and found._phase is Phase.HEAD
-            and not found._served
+            and found._phase in (Phase.HEAD, Phase.BODY)
             and now - found._since > EVICTABLE_S
         ]
-        if not idle:
+        if not slow:
             return False
-        oldest = min(idle, key=lambda found: found._since)
+        oldest = min(slow, key=lambda found: found._since)
         oldest._phase, oldest._due = Phase.DISMISSED, inf
         oldest.transport.abort()
         self._guard.dismissed(TOO_MANY_CONNECTIONS)

@@ -112,6 +112,31 @@ def test_connections_that_ask_for_nothing_make_room() -> None:
         assert ends(idle[0])
 
 
+def test_slow_headers_and_bodies_make_room_but_not_who_is_served() -> None:
+    with limited(Limits(connections=4)) as service:
+        steady = dial(service)
+        whole = HEAD + b"Content-Length: %d\r\n\r\n" % len(JPEG) + JPEG
+        steady.sendall(whole)
+        assert steady.recv(65536).startswith(b"HTTP/1.1 200")
+        slow = [dial(service) for _ in range(3)]
+        slow[0].sendall(HEAD + b"Content-Length: 1000\r\n\r\n" + JPEG[:10])
+        for connection in slow[1:]:
+            connection.sendall(HEAD)
+        time.sleep(0.6)
+        assert service.post(JPEG).status == 200
+        assert [c for c in slow if _is_cut(c)] != []
+        steady.sendall(whole)
+        assert steady.recv(65536).startswith(b"HTTP/1.1 200")
+
+
+def _is_cut(connection: socket.socket) -> bool:
+    connection.settimeout(0.2)
+    try:
+        return ends(connection)
+    except TimeoutError:
+        return False
+
+
 @pytest.mark.parametrize(
     "sent",
     [

@@ -1,0 +1,110 @@
+"""What a forward pass takes: the engine in bf16 and in int8 against torch in float32.
+
+One image, one thread each; torch runs the published network channels-last, as fast as it gets
+without another precision. They are asked in turns, so that a busy machine disturbs all alike. The
+int8 graph is quantised here, on noise: its speed is that of any other, its answers are of no use.
+
+    python benchmarks/forward.py [--model RUN] [--rounds 200] [--out FILE]
+    claims: bf16 at most 0.40 of torch's time, int8 at most 0.20
+"""
+
+import argparse
+import json
+import os
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from statistics import median
+from time import perf_counter
+from typing import Any
+
+# Before numpy and torch are loaded: their own threads would be two engines in one process.
+os.environ["OMP_NUM_THREADS"] = "1"
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from benchmarks.material.servers import model
+from mtlnet.card import GRAPH, WEIGHTS, read_card
+from mtlnet.convert import quantise
+from mtlnet.engine import best_precision
+from mtlnet.network import load_network
+
+CLAIMS = {"bf16": 0.40, "int8": 0.20}
+WARM_UP = 20
+Forward = Callable[[NDArray[np.uint8]], Any]
+
+
+def in_torch(run: Path) -> Forward:
+    """The network in float32, channels-last, on one thread."""
+    torch.set_num_threads(1)
+    network = load_network(run / WEIGHTS, read_card(run).network)
+    network.to(memory_format=torch.channels_last)
+
+    def forward(image: NDArray[np.uint8]) -> Any:
+        with torch.inference_mode():
+            return network.answer(network.describe(torch.from_numpy(image[None])))
+
+    return forward
+
+
+def in_openvino(run: Path, images: NDArray[np.uint8] | None) -> Forward:
+    """The exported graph in bf16; with `images` to calibrate on in int8."""
+    import openvino
+
+    core = openvino.Core()
+    graph = core.read_model(str(run / GRAPH))
+    if images is not None:
+        graph = quantise(graph, images)
+    options = {
+        "INFERENCE_PRECISION_HINT": best_precision(core),
+        "INFERENCE_NUM_THREADS": 1,
+        "NUM_STREAMS": 1,
+        "ENABLE_CPU_PINNING": False,
+    }
+    request = core.compile_model(graph, "CPU", options).create_infer_request()
+    return lambda image: request.infer([image[None]])
+
+
+def measure(run: Path, rounds: int) -> dict[str, Any]:
+    """Median times, ms, and their ratios to torch's."""
+    rng = np.random.default_rng(0)
+    camera = read_card(run).camera
+    images = rng.integers(0, 256, (16, camera.height, camera.width, 3), np.uint8)
+    ways = {
+        "torch f32": in_torch(run),
+        "bf16": in_openvino(run, None),
+        "int8": in_openvino(run, images),
+    }
+    times: dict[str, list[float]] = {name: [] for name in ways}
+    for number in range(WARM_UP + rounds):
+        for name, forward in ways.items():
+            start = perf_counter()
+            forward(images[number % len(images)])
+            times[name].append(1e3 * (perf_counter() - start))
+    medians = {name: median(found[WARM_UP:]) for name, found in times.items()}
+    ratios = {name: medians[name] / medians["torch f32"] for name in CLAIMS}
+    held = all(ratios[name] <= claim for name, claim in CLAIMS.items())
+    return {"median_ms": medians, "ratios": ratios, "claims": CLAIMS, "held": held}
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--model", type=Path, help="a run's folder; without it untrained weights")
+    parser.add_argument("--rounds", type=int, default=200)
+    parser.add_argument("--out", type=Path, help="write the figures here, too")
+    options = parser.parse_args()
+    with model(options.model) as run:
+        result = measure(run, options.rounds)
+    text = json.dumps(result, indent=1)
+    print(text)
+    if options.out:
+        options.out.write_text(f"{text}\n")
+    return 0 if result["held"] else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,33 @@
+"""What each peer does with a JPEG: it has the engine, the precision and the answer of ours."""
+
+import os
+from pathlib import Path
+from typing import Any
+
+import simplejpeg
+
+from mtlnet.answer import interpret
+from mtlnet.engine import load_engine
+
+MODEL, WORKERS, PORT = "DRIVERVIEW_MODEL", "DRIVERVIEW_WORKERS", "DRIVERVIEW_PORT"
+
+
+class Work:
+    """The model of the environment's run, on one thread."""
+
+    def __init__(self) -> None:
+        self._engine = load_engine(Path(os.environ[MODEL]))
+
+    def __call__(self, body: bytes) -> dict[str, Any]:
+        image = simplejpeg.decode_jpeg(body, colorspace="RGB")
+        return interpret(self._engine(image)).as_json()
+
+
+def workers() -> int:
+    """How many processes are to run the model."""
+    return int(os.environ[WORKERS])
+
+
+def port() -> int:
+    """Where to listen, on this machine alone."""
+    return int(os.environ[PORT])

@@ -1,0 +1,126 @@
+"""What the service does with five times the frames it can answer, and with 1,000 slow connections.
+
+One worker on one core, a compiled load generator on the other. First one client alone, then as many
+as keep the engine busy (the peak), then frames that come at five times that rate whatever becomes
+of them; last four clients at a fifth of the peak, without and with 1,000 others that never end what
+they send. With a peer's interpreter its figures on the same script stand beside ours.
+
+    python benchmarks/overload.py [--litserve PYTHON] [--bentoml PYTHON] [--mosec PYTHON]
+        [--model RUN] [--seconds 30] [--out FILE]
+    claims, for ours: admitted p99 at most twice the p99 of one client alone plus the time of a full
+    queue; answers at least 0.95 of the peak; p99 of refusals at most 5 ms; with slow connections
+    the others' p99 at most doubles, and none of them is refused or cut
+"""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from benchmarks.material.servers import HERE, OURS, PEERS, Loader, model, own_python, running
+from serve.limits import Limits
+
+OVER, GOODPUT, REFUSED_MS, SLOWER = 5.0, 0.95, 5.0, 2.0
+BUSY = 4  # clients that keep one worker busy, and whom its queue holds
+CONNECTIONS = 64  # over which the frames come that are too many
+SLOW = 1000
+SETTLE_S = 3.0
+SERVER, CLIENTS = {0}, {1}  # cores
+
+
+def overload(loader: Loader, port: int, seconds: float) -> dict[str, Any]:
+    """One client, the peak, five times the peak."""
+    loader.run(port, 1, 1.0)
+    alone = loader.run(port, 1, seconds)
+    peak = loader.run(port, BUSY, seconds).per_second()
+    over = loader.run(port, CONNECTIONS, seconds, OVER * peak)
+    return {
+        "alone_p99_ms": alone.percentile(99),
+        "peak_per_second": peak,
+        "offered_per_second": OVER * peak,
+        "answered_per_second": over.per_second(),
+        "refused_per_second": over.per_second(503),
+        "broken_per_second": over.per_second(0),
+        "admitted_p50_ms": over.percentile(50),
+        "admitted_p99_ms": over.percentile(99),
+        "refused_p50_ms": over.percentile(50, 503),
+        "refused_p99_ms": over.percentile(99, 503),
+    }
+
+
+def beside_slow_ones(loader: Loader, port: int, seconds: float, rate: float) -> dict[str, Any]:
+    """Four clients at `rate`, without and with a crowd of slow connections."""
+    before = loader.run(port, BUSY, seconds, rate)
+    with crowd(port):
+        beside = loader.run(port, BUSY, seconds, rate)
+    return {
+        "p99_ms": before.percentile(99),
+        "p99_ms_beside_slow": beside.percentile(99),
+        "not_answered_beside_slow": int((beside.status != 200).sum()),
+    }
+
+
+@contextmanager
+def crowd(port: int) -> Iterator[None]:
+    """1,000 slow connections."""
+    process = subprocess.Popen(
+        [sys.executable, str(HERE / "slow.py"), str(port), str(SLOW)],
+        preexec_fn=lambda: os.sched_setaffinity(0, CLIENTS),
+    )
+    try:
+        time.sleep(SETTLE_S)
+        yield
+    finally:
+        process.kill()
+        process.wait()
+
+
+def judge(found: dict[str, Any]) -> dict[str, bool]:
+    """Which claims hold for these figures."""
+    queue_ms = Limits().queue * 1e3 / found["peak_per_second"]
+    return {
+        "admitted": found["admitted_p99_ms"] <= 2 * found["alone_p99_ms"] + queue_ms,
+        "goodput": found["answered_per_second"] >= GOODPUT * found["peak_per_second"],
+        "refusals": found["refused_p99_ms"] <= REFUSED_MS,
+        "slow": found["p99_ms_beside_slow"] <= SLOWER * found["p99_ms"]
+        and found["not_answered_beside_slow"] == 0,
+    }
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__)
+    for name in PEERS:
+        parser.add_argument(f"--{name}", type=Path, help=f"the interpreter that has {name}")
+    parser.add_argument("--model", type=Path, help="a run's folder; without it untrained weights")
+    parser.add_argument("--seconds", type=float, default=30.0, help="of each of the five loads")
+    parser.add_argument("--out", type=Path, help="write the figures here, too")
+    options = parser.parse_args()
+    pythons = {OURS: own_python(), **{n: p for n in PEERS if (p := getattr(options, n))}}
+    result: dict[str, Any] = {}
+    with model(options.model) as run, tempfile.TemporaryDirectory() as folder:
+        loader = Loader(Path(folder), CLIENTS)
+        for name, python in pythons.items():
+            with running(name, python, run, 1, SERVER) as port:
+                found = overload(loader, port, options.seconds)
+                rate = found["peak_per_second"] / 5
+                found |= beside_slow_ones(loader, port, options.seconds, rate)
+            result[name] = found
+    result[OURS]["held"] = judge(result[OURS])
+    text = json.dumps(result, indent=1)
+    print(text)
+    if options.out:
+        options.out.write_text(f"{text}\n")
+    return 0 if all(result[OURS]["held"].values()) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,120 @@
+"""The service against LitServe, BentoML and mosec, on one model: time of a request, throughput.
+
+Each answers the same JPEG by POST with the same JSON, from the same weights on OpenVINO in the same
+precision, an engine of one thread a worker; each as its own manual advises, `material/peer_*.py`.
+First all run at once with one worker and are asked in turns over one connection; then, one after
+another, in turns again, each with two workers by eight clients that ask as soon as they have their
+answer. A peer is an environment of its own with it, openvino, numpy and simplejpeg; one that is not
+given is skipped.
+
+    python benchmarks/peers.py --litserve PYTHON --bentoml PYTHON --mosec PYTHON
+        [--model RUN] [--requests 2000] [--seconds 10] [--turns 3] [--out FILE]
+    claims: see CLAIMS
+"""
+
+import argparse
+import json
+import sys
+import tempfile
+from contextlib import ExitStack
+from pathlib import Path
+from statistics import median
+from time import perf_counter
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from benchmarks.material.servers import OURS, PEERS, Loader, model, own_python, request, running
+from benchmarks.service import TURN, connect, exchange
+
+CLAIMS = {"litserve": (0.75, 1.5), "bentoml": (0.65, 1.8), "mosec": (1.0, 1.0)}
+"""Our p50 at most so many times theirs, our throughput at least so many times theirs."""
+CLIENTS, WORKERS = 8, 2
+
+
+def latency(pythons: dict[str, Path], run: Path, requests: int) -> dict[str, list[float]]:
+    """Times of requests to each server, ms."""
+    found: dict[str, list[float]] = {name: [] for name in pythons}
+    with ExitStack() as stack:
+        ports = {
+            name: stack.enter_context(running(name, python, run, 1))
+            for name, python in pythons.items()
+        }
+        for _ in range(max(1, requests // TURN)):
+            for name, port in ports.items():
+                found[name] += ask(port, TURN)
+    return found
+
+
+def ask(port: int, count: int) -> list[float]:
+    """Times of `count` requests over a new connection, ms, after one that is not counted."""
+    sent, times = request(), []
+    with connect(("127.0.0.1", port)) as connection:
+        exchange(connection, sent)
+        for _ in range(count):
+            start = perf_counter()
+            exchange(connection, sent)
+            times.append(1e3 * (perf_counter() - start))
+    return times
+
+
+def throughput(pythons: dict[str, Path], run: Path, seconds: float, turns: int) -> dict[str, Any]:
+    """Answers a second and the p99 of their times, ms, of each server: medians over the turns."""
+    found: dict[str, list[tuple[float, float]]] = {name: [] for name in pythons}
+    with tempfile.TemporaryDirectory() as folder:
+        loader = Loader(Path(folder))
+        for _ in range(turns):
+            for name, python in pythons.items():
+                with running(name, python, run, WORKERS) as port:
+                    loader.run(port, CLIENTS, 1.0)
+                    load = loader.run(port, CLIENTS, seconds)
+                found[name].append((load.per_second(), load.percentile(99)))
+    return {
+        name: {"per_second": median(a for a, _ in rows), "p99_ms": median(b for _, b in rows)}
+        for name, rows in found.items()
+    }
+
+
+def measure(options: argparse.Namespace) -> dict[str, Any]:
+    """All figures, and which claims hold."""
+    given = {name: getattr(options, name) for name in PEERS}
+    pythons = {OURS: own_python(), **{k: v for k, v in given.items() if v is not None}}
+    with model(options.model) as run:
+        times = latency(pythons, run, options.requests)
+        rates = throughput(pythons, run, options.seconds, options.turns)
+    figures = {name: {"p50_ms": median(times[name]), **rates[name]} for name in pythons}
+    for name in figures.keys() - {OURS}:
+        figures[name] |= compare(name, figures[OURS], figures[name])
+    return {"servers": figures, "skipped": [name for name in PEERS if name not in pythons]}
+
+
+def compare(name: str, ours: dict[str, Any], theirs: dict[str, Any]) -> dict[str, Any]:
+    """Our figures over a peer's, and whether the claims hold."""
+    p50, rate = ours["p50_ms"] / theirs["p50_ms"], ours["per_second"] / theirs["per_second"]
+    slowest, fewest = CLAIMS[name]
+    held = p50 <= slowest and rate >= fewest
+    return {"our_ratios": [p50, rate], "claims": [slowest, fewest], "held": held}
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__)
+    for name in PEERS:
+        parser.add_argument(f"--{name}", type=Path, help=f"the interpreter that has {name}")
+    parser.add_argument("--model", type=Path, help="a run's folder; without it untrained weights")
+    parser.add_argument("--requests", type=int, default=2_000, help="to each, one after another")
+    parser.add_argument("--seconds", type=float, default=10.0, help="of a turn with many clients")
+    parser.add_argument("--turns", type=int, default=3)
+    parser.add_argument("--out", type=Path, help="write the figures here, too")
+    options = parser.parse_args()
+    result = measure(options)
+    text = json.dumps(result, indent=1)
+    print(text)
+    if options.out:
+        options.out.write_text(f"{text}\n")
+    for name in result["skipped"]:
+        print(f"skipped {name}: give --{name} PYTHON")
+    return 0 if all(each.get("held", True) for each in result["servers"].values()) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
