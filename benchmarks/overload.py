@@ -6,7 +6,7 @@ of them; last four clients at a fifth of the peak, without and with 1,000 others
 they send. With a peer's interpreter its figures on the same script stand beside ours.
 
     python benchmarks/overload.py [--litserve PYTHON] [--bentoml PYTHON] [--mosec PYTHON]
-        [--model RUN] [--seconds 30] [--out FILE]
+        [--model RUN] [--int8] [--seconds 30] [--out FILE]
     claims, for ours: admitted p99 at most twice the p99 of one client alone plus the time of a full
     queue; answers at least 0.95 of the peak; p99 of refusals at most 5 ms; with slow connections
     the others' p99 at most doubles, and none of them is refused or cut
@@ -26,7 +26,7 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from benchmarks.material.servers import HERE, OURS, PEERS, Loader, model, own_python, running
+from benchmarks.material.servers import HERE, OURS, Loader, add_options, model, pythons, running
 from serve.limits import Limits
 
 OVER, GOODPUT, REFUSED_MS, SLOWER = 5.0, 0.95, 5.0, 2.0
@@ -98,17 +98,13 @@ def judge(found: dict[str, Any]) -> dict[str, bool]:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
-    for name in PEERS:
-        parser.add_argument(f"--{name}", type=Path, help=f"the interpreter that has {name}")
-    parser.add_argument("--model", type=Path, help="a run's folder; without it untrained weights")
+    add_options(parser)
     parser.add_argument("--seconds", type=float, default=30.0, help="of each of the five loads")
-    parser.add_argument("--out", type=Path, help="write the figures here, too")
     options = parser.parse_args()
-    pythons = {OURS: own_python(), **{n: p for n in PEERS if (p := getattr(options, n))}}
     result: dict[str, Any] = {}
-    with model(options.model) as run, tempfile.TemporaryDirectory() as folder:
+    with model(options.model, options.int8) as run, tempfile.TemporaryDirectory() as folder:
         loader = Loader(Path(folder), CLIENTS)
-        for name, python in pythons.items():
+        for name, python in pythons(options).items():
             with running(name, python, run, 1, SERVER) as port:
                 found = overload(loader, port, options.seconds)
                 rate = found["peak_per_second"] / 5

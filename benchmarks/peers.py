@@ -8,7 +8,7 @@ answer. A peer is an environment of its own with it, openvino, numpy and simplej
 given is skipped.
 
     python benchmarks/peers.py --litserve PYTHON --bentoml PYTHON --mosec PYTHON
-        [--model RUN] [--requests 2000] [--seconds 10] [--turns 3] [--out FILE]
+        [--model RUN] [--int8] [--requests 2000] [--seconds 10] [--turns 3] [--out FILE]
     claims: see CLAIMS
 """
 
@@ -24,7 +24,16 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from benchmarks.material.servers import OURS, PEERS, Loader, model, own_python, request, running
+from benchmarks.material.servers import (
+    OURS,
+    PEERS,
+    Loader,
+    add_options,
+    model,
+    pythons,
+    request,
+    running,
+)
 from benchmarks.service import TURN, connect, exchange
 
 CLAIMS = {"litserve": (0.75, 1.5), "bentoml": (0.65, 1.8), "mosec": (1.0, 1.0)}
@@ -32,13 +41,13 @@ CLAIMS = {"litserve": (0.75, 1.5), "bentoml": (0.65, 1.8), "mosec": (1.0, 1.0)}
 CLIENTS, WORKERS = 8, 2
 
 
-def latency(pythons: dict[str, Path], run: Path, requests: int) -> dict[str, list[float]]:
+def latency(servers: dict[str, Path], run: Path, requests: int) -> dict[str, list[float]]:
     """Times of requests to each server, ms."""
-    found: dict[str, list[float]] = {name: [] for name in pythons}
+    found: dict[str, list[float]] = {name: [] for name in servers}
     with ExitStack() as stack:
         ports = {
             name: stack.enter_context(running(name, python, run, 1))
-            for name, python in pythons.items()
+            for name, python in servers.items()
         }
         for _ in range(max(1, requests // TURN)):
             for name, port in ports.items():
@@ -58,13 +67,13 @@ def ask(port: int, count: int) -> list[float]:
     return times
 
 
-def throughput(pythons: dict[str, Path], run: Path, seconds: float, turns: int) -> dict[str, Any]:
+def throughput(servers: dict[str, Path], run: Path, seconds: float, turns: int) -> dict[str, Any]:
     """Answers a second and the p99 of their times, ms, of each server: medians over the turns."""
-    found: dict[str, list[tuple[float, float]]] = {name: [] for name in pythons}
+    found: dict[str, list[tuple[float, float]]] = {name: [] for name in servers}
     with tempfile.TemporaryDirectory() as folder:
         loader = Loader(Path(folder))
         for _ in range(turns):
-            for name, python in pythons.items():
+            for name, python in servers.items():
                 with running(name, python, run, WORKERS) as port:
                     loader.run(port, CLIENTS, 1.0)
                     load = loader.run(port, CLIENTS, seconds)
@@ -77,15 +86,14 @@ def throughput(pythons: dict[str, Path], run: Path, seconds: float, turns: int) 
 
 def measure(options: argparse.Namespace) -> dict[str, Any]:
     """All figures, and which claims hold."""
-    given = {name: getattr(options, name) for name in PEERS}
-    pythons = {OURS: own_python(), **{k: v for k, v in given.items() if v is not None}}
-    with model(options.model) as run:
-        times = latency(pythons, run, options.requests)
-        rates = throughput(pythons, run, options.seconds, options.turns)
-    figures = {name: {"p50_ms": median(times[name]), **rates[name]} for name in pythons}
+    found = pythons(options)
+    with model(options.model, options.int8) as run:
+        times = latency(found, run, options.requests)
+        rates = throughput(found, run, options.seconds, options.turns)
+    figures = {name: {"p50_ms": median(times[name]), **rates[name]} for name in found}
     for name in figures.keys() - {OURS}:
         figures[name] |= compare(name, figures[OURS], figures[name])
-    return {"servers": figures, "skipped": [name for name in PEERS if name not in pythons]}
+    return {"servers": figures, "skipped": [name for name in PEERS if name not in found]}
 
 
 def compare(name: str, ours: dict[str, Any], theirs: dict[str, Any]) -> dict[str, Any]:
@@ -98,13 +106,10 @@ def compare(name: str, ours: dict[str, Any], theirs: dict[str, Any]) -> dict[str
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
-    for name in PEERS:
-        parser.add_argument(f"--{name}", type=Path, help=f"the interpreter that has {name}")
-    parser.add_argument("--model", type=Path, help="a run's folder; without it untrained weights")
+    add_options(parser)
     parser.add_argument("--requests", type=int, default=2_000, help="to each, one after another")
     parser.add_argument("--seconds", type=float, default=10.0, help="of a turn with many clients")
     parser.add_argument("--turns", type=int, default=3)
-    parser.add_argument("--out", type=Path, help="write the figures here, too")
     options = parser.parse_args()
     result = measure(options)
     text = json.dumps(result, indent=1)

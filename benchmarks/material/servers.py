@@ -3,6 +3,7 @@
 A peer runs in an environment of its own, which has it, openvino, numpy and simplejpeg.
 """
 
+import argparse
 import http.client
 import os
 import shutil
@@ -13,7 +14,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -27,7 +28,7 @@ HERE = Path(__file__).parent
 ROOT = HERE.parents[1]
 OURS = "driverview"
 PEERS = ("litserve", "bentoml", "mosec")
-START_S = 120.0
+START_S, END_S = 120.0, 10.0
 BODY = jpeg(picture())
 
 
@@ -37,15 +38,32 @@ def request(path: str = "/features") -> bytes:
     return f"{head}Content-Length: {len(BODY)}\r\n\r\n".encode() + BODY
 
 
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """The options that say which servers, and which model."""
+    for name in PEERS:
+        parser.add_argument(f"--{name}", type=Path, help=f"the interpreter that has {name}")
+    parser.add_argument("--model", type=Path, help="a run's folder; without it untrained weights")
+    parser.add_argument(
+        "--int8", action="store_true", help="keep the run's int8 graph, for all of them"
+    )
+    parser.add_argument("--out", type=Path, help="write the figures here, too")
+
+
+def pythons(options: argparse.Namespace) -> dict[str, Path]:
+    """The interpreter of each server: ours, and of the peers that are given."""
+    given = {name: getattr(options, name) for name in PEERS}
+    return {OURS: Path(sys.executable), **{name: path for name, path in given.items() if path}}
+
+
 @contextmanager
-def model(run: Path | None) -> Iterator[Path]:
-    """A copy of `run` without its int8 graph, which the peers have not; None: untrained weights."""
+def model(run: Path | None, int8: bool = False) -> Iterator[Path]:
+    """A copy of `run`, without its int8 graph unless that is wanted; None: untrained weights."""
     with tempfile.TemporaryDirectory() as folder:
         found = Path(folder) / "run"
         if run is None:
             publish_untrained(found, seed=3)
         else:
-            shutil.copytree(run, found, ignore=shutil.ignore_patterns("export"))
+            shutil.copytree(run, found, ignore=None if int8 else shutil.ignore_patterns("export"))
         yield found
 
 
@@ -90,8 +108,28 @@ def running(
                 raise RuntimeError(f"{name} does not answer:\n{said.read().decode()[-2000:]}")
             yield port
         finally:
-            os.killpg(process.pid, signal.SIGKILL)
-            process.wait()
+            _end(process)
+
+
+def _end(process: "subprocess.Popen[bytes]") -> None:
+    """End a server in peace, by force where it does not, and whoever it leaves behind."""
+    family = _descendants(process.pid)
+    process.terminate()
+    with suppress(subprocess.TimeoutExpired):
+        process.wait(END_S)
+    for pid in (process.pid, *family):
+        with suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGKILL)
+    process.wait()
+
+
+def _descendants(pid: int) -> list[int]:
+    """All processes below one. (Linux: the children of its first thread.)"""
+    try:
+        children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+    except OSError:  # it has ended
+        return []
+    return [found for child in map(int, children) for found in (child, *_descendants(child))]
 
 
 def _answers(port: int, process: "subprocess.Popen[bytes]") -> bool:
@@ -157,8 +195,3 @@ class Loader:
     def _pin(self) -> None:
         assert self._cores is not None
         os.sched_setaffinity(0, self._cores)
-
-
-def own_python() -> Path:
-    """The interpreter of this environment."""
-    return Path(sys.executable)
