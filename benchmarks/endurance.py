@@ -1,0 +1,206 @@
+"""Controllers for an hour, while the service is restarted and given other models under them.
+
+    python benchmarks/endurance.py [--minutes 60] [--out FILE]
+
+Eight clients ask at 20 Hz each; a rolling restart every five minutes and a reload every minute, of
+two models by turns. Claims: no admitted request is lost (every request is answered or refused, and
+the clients have all answers that the service counts), and no answer is of the wrong model: each is
+bit-equal to what the model that it names says of that image, and that model was, while the request
+was under way, the one to answer.
+"""
+
+import argparse
+import json
+import re
+import sys
+import tempfile
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from statistics import median, quantiles
+from typing import Any
+from urllib.request import urlopen
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from benchmarks.material.servers import OURS, running
+from mtlnet.answer import interpret
+from mtlnet.card import read_card
+from mtlnet.engine import load_engine
+from mtlnet.images import decode, inspect
+from serve.client import Client, ServiceError
+from serve.manage import ask
+from tests.serve.conftest import jpeg, picture, publish_untrained
+
+CLIENTS, HERTZ, WORKERS = 8, 20.0, 2
+RELOAD_S, RESTART_S = 60.0, 300.0
+IMAGES = 16
+COUNTED = re.compile(r'^driverview_frames_total\{.*outcome="answered".*\} ([0-9.e+]+)$', re.M)
+
+Known = dict[str, list[dict[str, Any]]]  # model hash -> its answers to the images
+
+
+@dataclass
+class Reign:
+    """Which models may have answered when: `begun` and `ended` are those of each reload."""
+
+    first: str
+    changes: list[tuple[float, float, str]] = field(default_factory=list)
+
+    def allowed(self, sent: float, answered: float) -> set[str]:
+        """The models that may answer a request under way from `sent` to `answered`."""
+        now, models = self.first, set()
+        since = -1.0
+        for begun, ended, model in [*self.changes, (float("inf"), float("inf"), "")]:
+            if sent < ended and answered > since:
+                models.add(now)
+            now, since = model, begun
+        return models
+
+
+@dataclass
+class Told:
+    """What one client was told."""
+
+    answers: list[tuple[float, float, int, dict[str, Any]]] = field(default_factory=list)
+    refused: Counter[str] = field(default_factory=Counter)
+    lost: list[str] = field(default_factory=list)
+    late: int = 0
+
+
+def drive(port: int, number: int, images: list[bytes], end: float, told: Told) -> None:
+    """Ask at 20 Hz until `end`; clients begin spread over a period."""
+    begin = time.monotonic() + number / CLIENTS / HERTZ
+    with Client(f"127.0.0.1:{port}", timeout_s=10.0) as client:
+        turn = 0
+        while (due := begin + turn / HERTZ) < end:
+            pause = due - time.monotonic()
+            time.sleep(max(pause, 0.0))
+            told.late += pause < -1 / HERTZ
+            which = (turn + number) % len(images)
+            sent = time.monotonic()
+            try:
+                answer = client.features(images[which])
+                told.answers.append((sent, time.monotonic(), which, answer))
+            except ServiceError as error:
+                if error.status is None:
+                    told.lost.append(str(error))
+                else:
+                    told.refused[str(error.problem)] += 1
+            turn += 1
+
+
+def disturb(port: int, runs: list[Path], reign: Reign, end: float) -> Counter[str]:
+    """Reload and restart on time until `end`; how often."""
+    done: Counter[str] = Counter()
+    begin = time.monotonic()
+    plans: dict[str, tuple[float, Callable[[], object]]] = {
+        "reload": (RELOAD_S, lambda: _reload(port, runs[(done["reload"] + 1) % 2], reign)),
+        "restart": (RESTART_S, lambda: ask(port, "restart")),
+    }
+    while True:
+        due, name = min((begin + (done[n] + 1) * every, n) for n, (every, _) in plans.items())
+        if due >= end:
+            return done
+        time.sleep(max(due - time.monotonic(), 0.0))
+        plans[name][1]()
+        done[name] += 1
+
+
+def _reload(port: int, run: Path, reign: Reign) -> None:
+    begun = time.monotonic()
+    ask(port, "reload", str(run))
+    reign.changes.append((begun, time.monotonic(), read_card(run).model_hash))
+
+
+def answers_of(run: Path, images: list[bytes]) -> list[dict[str, Any]]:
+    """What the model of `run` says of the images, asked without a service."""
+    engine = load_engine(run)
+    camera = engine.card.camera
+    return [
+        interpret(engine(decode(image, inspect(image, camera), camera))).as_json()
+        for image in images
+    ]
+
+
+def wrong(told: Told, known: Known, reign: Reign) -> list[str]:
+    """The answers that are not what they ought to be."""
+    found = []
+    for sent, answered, which, answer in told.answers:
+        model = answer["model"]
+        if model not in reign.allowed(sent, answered):
+            found.append(f"model {model[:12]} answered at {sent:.3f} s out of its time")
+        right = known[model][which]
+        if {key: answer[key] for key in right} != right:
+            found.append(f"model {model[:12]} answered image {which} otherwise than by itself")
+    return found
+
+
+def measure(minutes: float, folder: Path) -> dict[str, Any]:
+    """The figures of a run."""
+    images = [jpeg(np.roll(picture(), 17 * number, axis=1)) for number in range(IMAGES)]
+    runs = [folder / "one", folder / "other"]
+    for seed, run in enumerate(runs):
+        publish_untrained(run, seed=seed + 3)
+    known = {read_card(run).model_hash: answers_of(run, images) for run in runs}
+    reign = Reign(read_card(runs[0]).model_hash)
+    told = [Told() for _ in range(CLIENTS)]
+    with running(OURS, Path(sys.executable), runs[0], WORKERS) as port:
+        before = counted(port)
+        end = time.monotonic() + 60 * minutes
+        clients = [
+            threading.Thread(target=drive, args=(port, number, images, end, told[number]))
+            for number in range(CLIENTS)
+        ]
+        for client in clients:
+            client.start()
+        done = disturb(port, runs, reign, end)
+        for client in clients:
+            client.join()
+        after = counted(port)
+    answers = sum(len(one.answers) for one in told)
+    times_ms = [1e3 * (b - a) for one in told for a, b, _, _ in one.answers]
+    faults = [fault for one in told for fault in [*one.lost, *wrong(one, known, reign)]]
+    return {
+        "minutes": minutes,
+        **done,
+        "answers": answers,
+        "answers_counted_by_the_service": after - before,
+        "refused": dict(sum((one.refused for one in told), Counter())),
+        "models": dict(Counter(answer["model"] for one in told for *_, answer in one.answers)),
+        "asked_late": sum(one.late for one in told),
+        "p50_ms": round(median(times_ms), 2),
+        "p99_ms": round(quantiles(times_ms, n=100)[98], 2),
+        "faults": faults[:10],
+        "reached": not faults and answers == after - before,
+    }
+
+
+def counted(port: int) -> int:
+    """The frames that the service says it answered, in all workers."""
+    with urlopen(f"http://127.0.0.1:{port}/metrics") as page:
+        found = COUNTED.findall(page.read().decode())
+    return round(sum(map(float, found)))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--minutes", type=float, default=60.0)
+    parser.add_argument("--out", type=Path, help="write the figures here, too")
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        result = measure(options.minutes, Path(folder))
+    text = json.dumps(result, indent=1)
+    print(text)
+    if options.out:
+        options.out.write_text(f"{text}\n")
+    sys.exit(0 if result["reached"] else 1)
+
+
+if __name__ == "__main__":
+    main()
