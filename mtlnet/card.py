@@ -20,7 +20,7 @@ SHIPPED = Path(__file__).parent / "weights" / "default"
 CARD, WEIGHTS, GRAPH, GRAPH_WEIGHTS = "card.json", "model.safetensors", "model.xml", "model.bin"
 DOUBT = "doubt.safetensors"
 MODEL_FILES = (WEIGHTS, GRAPH, GRAPH_WEIGHTS)
-FORMAT = 3  # 2: `network`; 3: `doubt`
+FORMAT = 4  # 2: `network`; 3: `doubt`; 4: how the camera is aimed
 
 
 class ModelError(UserError):
