@@ -6,7 +6,7 @@ place by OpenCV. Colour, blur, noise, erasing and JPEG artefacts are torchvision
 (tests/mtlnet/test_mtlnet_augment.py holds them to it); its own take 3 to 30 times as long.
 """
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 from statistics import NormalDist
 
@@ -16,11 +16,13 @@ import simplejpeg
 from numpy.typing import NDArray
 
 import trackfeatures as tf
+from mtlnet.aside import metres_aside, move_aside
 from mtlnet.card import Camera
+from mtlnet.shade import SHADES, shade
 
 PATCHES = 1  # at most so many are covered, each at most this share of the image's sides
 PATCH_SIDE = 0.3
-TURN_SHARE = 0.25  # of the images
+ASIDE_SHARE, TURN_SHARE, SHADE_SHARE = 0.5, 0.6, 0.3  # of the images
 TURN_RAD, NOD_RAD = 0.035, 0.006  # standard deviations
 TURN_LIMIT_RAD = 0.09
 TURNS = 64  # turns to choose from: where pixels go is then worked out once
@@ -36,8 +38,10 @@ NOISE_UNIT = 32.0  # standard deviation of the stored noise, about 128
 class Changes:
     """What is to happen to each of B images; 0 leaves it as it is."""
 
+    aside: NDArray[np.float64]  # (B,) m to the left; as drawn: the share of the room there is
     turn: NDArray[np.int64]  # (B,) one of `TURNS`; 0 is none
     mirrored: NDArray[np.bool_]  # (B,)
+    shade: NDArray[np.int64]  # (B,) one of `SHADES`; 0 is none
     patches: NDArray[np.int64]  # (B, PATCHES, 7): top, left, rows, columns, colour
     colour: NDArray[np.float32]  # (B, 3, 4): an affine function of the levels of a pixel
     blur: NDArray[np.float64]  # (B,) px, standard deviation
@@ -51,10 +55,12 @@ class Changes:
 
 
 def draw_changes(count: int, height: int, width: int, rng: np.random.Generator) -> Changes:
-    """The changes of a batch."""
+    """The changes of a batch; `fit_to` the labels of its frames before they are made."""
     return Changes(
+        aside=rng.uniform(-1.0, 1.0, count) * (rng.random(count) < ASIDE_SHARE),
         turn=rng.integers(1, TURNS, count) * (rng.random(count) < TURN_SHARE),
         mirrored=rng.random(count) < 0.5,
+        shade=rng.integers(1, SHADES, count) * (rng.random(count) < SHADE_SHARE),
         patches=_draw_patches(count, height, width, rng),
         colour=draw_colours(count, rng),
         blur=rng.uniform(*BLUR_PX, count) * (rng.random(count) < BLUR_SHARE),
@@ -78,13 +84,22 @@ def _draw_patches(
     return np.concatenate([corner, rows[..., None], columns[..., None], colour], 2)
 
 
+def fit_to(changes: Changes, distances: NDArray[np.float32]) -> Changes:
+    """The changes with how far to move aside in m, for frames of these distances (B, 5)."""
+    return replace(changes, aside=metres_aside(changes.aside, distances))
+
+
 def change_images(images: NDArray[np.uint8], changes: Changes, camera: Camera) -> None:
     """Change images (B, H, W, 3) as a camera's picture comes about: scene, light, lens, file."""
     for row, image in enumerate(images):
+        if changes.aside[row]:
+            move_aside(image, camera, float(changes.aside[row]))
         if changes.turn[row]:
             turn(image, camera, int(changes.turn[row]))
         if changes.mirrored[row]:
             cv2.flip(image, 1, dst=image)
+        if changes.shade[row]:
+            shade(image, camera, int(changes.shade[row]))
         for top, left, rows, columns, *colour in changes.patches[row].tolist():
             image[top : top + rows, left : left + columns] = colour
         cv2.transform(image, changes.colour[row], dst=image)
@@ -163,7 +178,8 @@ def changed_labels(
     camera: Camera,
 ) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
     """Coded targets (B, 6) and classes (B,) after the changes."""
-    coded = turned_labels(distances, angle, turns()[changes.turn, 0], camera)
+    aside = (changes.aside * np.cos(angle)).astype(np.float32)
+    coded = turned_labels(distances + aside[:, None], angle, turns()[changes.turn, 0], camera)
     chosen = changes.mirrored
     mirrored = np.where(chosen[:, None], tf.mirror_coded(coded), coded).astype(np.float32)
     return mirrored, np.where(chosen, tf.mirror_heading(heading), heading)

@@ -23,6 +23,10 @@ MODEL_FILES = (WEIGHTS, GRAPH, GRAPH_WEIGHTS)
 FORMAT = 4  # 2: `network`; 3: `doubt`; 4: how the camera is aimed
 
 
+CENTRE_HEIGHT_M = 0.25
+"""Of the car's centre of gravity over the road; the camera's place is told from there."""
+
+
 class ModelError(UserError):
     """A model that is missing, unfinished, damaged or not for this image."""
 

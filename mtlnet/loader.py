@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import trackfeatures as tf
-from mtlnet.augment import change_images, changed_labels, draw_changes
+from mtlnet.augment import change_images, changed_labels, draw_changes, fit_to
 from mtlnet.card import Camera
 from mtlnet.recycled import Recycled
 
@@ -109,12 +109,11 @@ class Loader:
             return Batch(images, self.coded[chosen], heading)
         rng = np.random.default_rng([self.seed, 2, step])
         size = (self.camera.height, self.camera.width)
-        changes = draw_changes(self.batch, *size, rng).take(self.rows)
-        change_images(images, changes, self.camera)
         labels = self.frames.labels
-        coded, heading = changed_labels(
-            labels.distances[chosen], labels.angle[chosen], heading, changes, self.camera
-        )
+        distances, angle = labels.distances[chosen], labels.angle[chosen]
+        changes = fit_to(draw_changes(self.batch, *size, rng).take(self.rows), distances)
+        change_images(images, changes, self.camera)
+        coded, heading = changed_labels(distances, angle, heading, changes, self.camera)
         return Batch(images, coded, heading)
 
     def batches(self, first: int) -> Iterator[Batch]:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 import trackfeatures as tf
 from datagen.recording import Frames
 from mtlnet.answer import Answer, interpret
+from mtlnet.card import CENTRE_HEIGHT_M
 from mtlnet.doubt import FEATURES
 from mtlnet.errors import Numbers
 from mtlnet.picture import draw_answer
@@ -20,8 +21,6 @@ EACH = 2
 """Frames of each feature..."""
 APART = 40
 """...which in the same round lie at least so many frames apart: one bad place is shown once."""
-CENTRE_HEIGHT_M = 0.25
-"""Of the car's centre of gravity over the road; the camera's height is told from there."""
 QUALITY = 80
 
 

@@ -7,10 +7,12 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 from trackfeatures.definitions import (
+    IN_LANE_MARGIN_M,
     LANE_WIDTH_M,
     LANES,
     LOOK_AHEAD_M,
     MARKINGS,
+    ON_MARKING_REACH_M,
     RANGES,
     TARGETS,
     VERSION,
@@ -44,10 +46,12 @@ if TYPE_CHECKING:
     )
 
 __all__ = [
+    "IN_LANE_MARGIN_M",
     "LANES",
     "LANE_WIDTH_M",
     "LOOK_AHEAD_M",
     "MARKINGS",
+    "ON_MARKING_REACH_M",
     "RANGES",
     "TARGETS",
     "VERSION",

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from torchvision.transforms.v2 import functional as vision
 
 import trackfeatures as tf
+from mtlnet.aside import metres_aside, move_aside
 from mtlnet.augment import (
     JPEG_SHARE,
     LUMA,
@@ -31,6 +32,7 @@ from mtlnet.augment import (
     turns,
 )
 from mtlnet.card import Camera
+from mtlnet.shade import SHADES, road_places, shade
 
 SMALL = Camera(width=70, height=52)
 
@@ -94,6 +96,65 @@ def test_a_turned_image_is_that_of_the_turned_car(turned: float) -> None:
     distances, angle = tf.decode(coded)
     assert angle[0] == pytest.approx(-yaw - turned, abs=1e-6)
     np.testing.assert_allclose(distances[0], lane + swung[1], atol=5e-3)
+
+
+@pytest.mark.parametrize("metres", [-0.5, 0.3])
+@pytest.mark.parametrize("pitch_deg", [0.0, 4.0])
+def test_a_shifted_image_is_that_of_a_car_aside(metres: float, pitch_deg: float) -> None:
+    camera = Camera(pitch_deg=pitch_deg)
+    image = np.zeros((210, 280, 3), np.uint8)
+    focal, tilt = 105 / np.tan(np.radians(33.75)), np.radians(pitch_deg)
+
+    def column(row: int, left: float) -> float:
+        """Where a line `left` of the camera is in a row: a ray's meeting with the road."""
+        down = (row - 104.5) / focal * np.cos(tilt) + np.sin(tilt)
+        return float(139.5 - focal * left * down / 1.2)
+
+    rows = range(130, 180)
+    for row in rows:
+        weights = (2.0 - np.abs(np.arange(280) - column(row, 0.2))).clip(0.0) * 100
+        image[row] = weights[:, None].astype(np.uint8)
+    move_aside(image, camera, metres)
+    for row in rows:
+        seen = image[row, :, 0].astype(float)
+        place = (seen * np.arange(280)).sum() / seen.sum()
+        assert place == pytest.approx(column(row, 0.2 - metres), abs=0.3)
+
+
+def test_labels_of_a_car_aside_are_those_measured_there() -> None:
+    moved = 0
+    for lanes in (1, 2, 3):
+        places = np.arange(-2.0 * lanes - 1.5, 2.0 * lanes + 1.5, 0.07)
+
+        def measured(at: float, lanes: int = lanes) -> list[float]:
+            found = tf.measure(at, 0.0, 0.0, 0.0, lanes, 4.0).distances.values()
+            return [np.nan if d is None else d for d in found]
+
+        before = np.array([measured(at) for at in places], np.float32)
+        for share in (-0.98, 0.5, 0.98):
+            metres = metres_aside(np.full(len(places), share), before)
+            moved += int((np.abs(metres) > 0.25).sum())
+            after = np.array([measured(at) for at in places + metres])
+            np.testing.assert_allclose(before + metres[:, None], after, atol=1e-5)
+    assert moved > 400  # of about 600: most have room
+
+
+def test_shadows_darken_the_road_alone() -> None:
+    camera = Camera()
+    white = np.full((210, 280, 3), 255, np.uint8)
+    covered = []
+    for which in (1, 20, SHADES - 1):
+        image = white.copy()
+        shade(image, camera, which)
+        assert len(np.unique(image[:100])) <= 3  # an even light above the horizon
+        assert image.min() >= 255 * 0.25 - 1
+        road = image[120:, :, 0]
+        covered.append(float((road < 0.5 * road.min() + 127).mean()))
+    assert all(0.01 < share < 0.99 for share in covered)
+    ahead, aside = road_places(camera)
+    x, y = float(ahead[150, 30]), float(aside[150, 30])
+    seen = pixel_of(camera, 0.0, 0.0, np.array([x + camera.x, y]))
+    np.testing.assert_allclose(seen, [30.0, 150.0], atol=1e-9)
 
 
 def test_turns_are_normal_and_move_the_picture() -> None:
