@@ -3,7 +3,7 @@
 Muon (Jordan et al. 2024) steps along the gradient with all its singular values made equal, in as
 many directions as a layer has; `fast` then needs half the images. For the layers whose matrix that
 is cheap: the convolutions and the first shared layer. What is small, and the wide second shared
-layer, stays with AdamW.
+layer, stays with AdamW; so do torchvision's backbones, whose thin layers have few directions.
 """
 
 from collections.abc import Sequence
@@ -15,7 +15,6 @@ from mtlnet.network import Network
 from mtlnet.recipe import MOMENTUM, Recipe
 
 MUON_LAYERS = ("features.", "shared.fc0.")
-LEAST_COLUMNS = 32  # a depthwise filter has nine weights, and no directions to make equal
 MUON_RATE = 2.0
 """Times the recipe's rate: with updates scaled to AdamW's size, Muon bears longer steps."""
 
@@ -34,8 +33,8 @@ class Optimisers:
             return
         weights = {name: p for name, p in network.named_parameters() if p.ndim > 1}
         others = [p for p in network.parameters() if p.ndim <= 1]
-        if recipe.optimiser == "muon":
-            large = [name for name, weight in weights.items() if _is_large(name, weight)]
+        if recipe.optimiser == "muon" and not network.plan.backbone:
+            large = [name for name in weights if name.startswith(MUON_LAYERS)]
             self._rows = [(p, nn.Parameter(as_rows(p.detach()))) for p in map(weights.pop, large)]
             rows = [{"params": [row for _, row in self._rows], "times": MUON_RATE}]
             rate = recipe.learning_rate * MUON_RATE
@@ -80,10 +79,6 @@ def as_rows(weight: Tensor) -> Tensor:
     The order of its columns, here of channels-last memory, means nothing to Muon.
     """
     return weight if weight.ndim == 2 else weight.permute(0, 2, 3, 1).flatten(1)
-
-
-def _is_large(name: str, weight: Tensor) -> bool:
-    return name.startswith(MUON_LAYERS) and weight[0].numel() >= LEAST_COLUMNS
 
 
 def _groups(

@@ -170,13 +170,18 @@ def test_only_who_knows_the_token_is_answered() -> None:
     token = "a-token-of-some-length"
     with limited(Limits(token=token)) as service:
         for sent in ({}, {"Authorization": "Bearer wrong"}, {"Authorization": f"Basic {token}"}):
-            for method, path in (("POST", "/features"), ("GET", "/model"), ("GET", "/docs")):
+            for method, path in (
+                ("POST", "/features"),
+                ("GET", "/model"),
+                ("GET", "/openapi.json"),
+            ):
                 reply = service.ask(method, path, JPEG, {"Content-Type": "image/jpeg", **sent})
                 assert_problem(reply, 401, "unauthorized")
                 assert reply.headers["www-authenticate"] == "Bearer"
         assert service.post(JPEG, Authorization=f"Bearer {token}").status == 200
         assert service.ask("GET", "/readyz").status == 200  # a balancer knows no token
         assert service.ask("GET", "/").status == 200  # the console asks for it
+        assert service.ask("GET", "/docs").status == 200  # a browser can send none
 
 
 def test_a_client_that_asks_too_often_is_told_when_to_come_back() -> None:
