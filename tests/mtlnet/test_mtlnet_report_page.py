@@ -12,12 +12,13 @@ from numpy.typing import NDArray
 
 import trackfeatures as tf
 from datagen.recording import Dataset, Frames
+from mtlnet.card import CENTRE_HEIGHT_M
 from mtlnet.doubt import FEATURES
 from mtlnet.errors import signed_errors
 from mtlnet.picture import ANSWER_COLOUR, TRUTH_COLOUR, marking_line, to_pixels
 from mtlnet.report import judge_all, mean_answer
 from mtlnet.report_page import MOST_DRIVES, page
-from mtlnet.worst import APART, CENTRE_HEIGHT_M, EACH, Worst, figures, worst_frames
+from mtlnet.worst import APART, EACH, Worst, figures, worst_frames
 from tests.mtlnet.page import Page
 
 ORDER = ("to_lane_centre", "angle", "ml", "mr", "m", "l", "r")
