@@ -1,7 +1,7 @@
 """What changes the weights in training: SGD, AdamW, or Muon for the large layers beside AdamW.
 
 Muon (Jordan et al. 2024) steps along the gradient with all its singular values made equal, in as
-many directions as a layer has; `fast` then needs half the images. For the layers whose matrix that
+many directions as a layer has; in short trials `fast` needed half the images. For the layers whose matrix that
 is cheap: the convolutions and the first shared layer. What is small, and the wide second shared
 layer, stays with AdamW; so do torchvision's backbones, whose thin layers have few directions.
 """
