@@ -1,9 +1,10 @@
 """What changes the weights in training: SGD, AdamW, or Muon for the large layers beside AdamW.
 
 Muon (Jordan et al. 2024) steps along the gradient with all its singular values made equal, in as
-many directions as a layer has; in short trials `fast` needed half the images. For the layers whose matrix that
-is cheap: the convolutions and the first shared layer. What is small, and the wide second shared
-layer, stays with AdamW; so do torchvision's backbones, whose thin layers have few directions.
+many directions as a layer has; in short trials `fast` needed half the images. It has the layers
+whose matrix is cheap: the convolutions and the first shared layer. What is small, and the wide
+second shared layer, stays with AdamW; so do torchvision's backbones, whose thin layers have few
+directions.
 """
 
 from collections.abc import Sequence
