@@ -84,14 +84,15 @@ def multi_task_loss(
     deviations on an error costs what it is, not its square (Huber 1964), 0: never. Between two
     possible answers the best is then the likelier, where a squared error asks for one in between.
     """
-    squared = (outputs[:, :6].float() - coded) ** 2
+    errors = outputs[:, :6].float() - coded
+    squared = errors**2
     distance = squared[:, :5].sum(1).mean()
     angle = squared[:, 5].mean()
     kind = cross_entropy(outputs[:, 6:].float(), heading)
     if scale is None:
         terms = (distance, angle, kind)
     else:
-        scaled = squared / scale if not bend else _bent(outputs[:, :6].float() - coded, scale, bend)
+        scaled = _bent(errors, scale, bend) if bend else squared / scale
         terms = (scaled[:, :5].mean(), scaled[:, 5].mean(), kind)
     if callable(combine):
         total = combine(torch.stack(terms))
