@@ -40,19 +40,23 @@ def collect(out: Path, rounds: int, frames: int, seed: int) -> dict[str, Any]:
 
 
 def draw_round(entry: dict[str, Any]) -> tuple[int, float, float]:
-    """Drive a round of the plan, then draw all its frames: how many, wall and processor seconds."""
+    """Drive a round of the plan; of drawing its frames: how many, wall and processor seconds."""
     # Mesa and numpy are to use one thread a process, as the collector's workers do.
     os.environ.update(LP_NUM_THREADS="0", OMP_NUM_THREADS="1")
     from datagen.plan import RoundPlan
     from datagen.record import moments_of, scene_of
 
     with scene_of(RoundPlan.from_json(entry), None) as (drive, camera):
-        moments = [moment for part in moments_of(drive, camera) for moment in part]
-        camera.render(moments[0].pose, moments[0].traffic)
-        started, cpu = time.perf_counter(), time.process_time()
-        for moment in moments:
-            camera.render(moment.pose, moment.traffic)
-        return len(moments), time.perf_counter() - started, time.process_time() - cpu
+        drawn, wall_s, cpu_s = 0, 0.0, 0.0
+        for moments in moments_of(drive, camera):
+            camera.render(moments[0].pose, moments[0].traffic)
+            started, cpu = time.perf_counter(), time.process_time()
+            for moment in moments:
+                camera.render(moment.pose, moment.traffic)
+            wall_s += time.perf_counter() - started
+            cpu_s += time.process_time() - cpu
+            drawn += len(moments)
+        return drawn, wall_s, cpu_s
 
 
 def main() -> None:

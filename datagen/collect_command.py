@@ -12,6 +12,7 @@ from trackfeatures.errors import UserError
 
 DEFAULT_FOLDER = Path("datasets/default")
 UNSEEN_FOLDER = Path("datasets/unseen")
+STRETCH = 200  # frames: 10 s, some 160 m
 
 
 def collect(
@@ -29,6 +30,9 @@ def collect(
     tracks: Annotated[str, typer.Option(help="Names or files, by commas; empty: a choice.")] = "",
     lanes: Annotated[str, typer.Option(help="Lane counts, by commas.")] = "1,2,3",
     lights: Annotated[str, typer.Option(help="Lights, by commas; empty: all.")] = "",
+    stretch: Annotated[
+        int, typer.Option(help="Frames until scenery and light change; 0: never in a round.")
+    ] = STRETCH,
     tracks_dir: Annotated[Path | None, typer.Option(help="Folder of TORCS tracks.")] = None,
     split_test_share: Annotated[float, typer.Option(help="Share of rounds for testing.")] = 0.25,
     split: Annotated[
@@ -70,6 +74,7 @@ def collect(
         tracks=choose_tracks(_names(tracks), tracks_dir, unseen=split == UNSEEN),
         lanes=_numbers(lanes),
         lights=_names(lights) or LIGHTS,
+        stretch=stretch,
         test_share=split_test_share,
         codec=codec,
         jitter_camera=jitter_camera,

@@ -42,7 +42,7 @@ def make_plan(wanted: Wanted, forecast: Forecast | None = None) -> Plan:
     tracks, lanes = _tracks_and_lanes(wanted, rng)
     traffic = _dealt(range(MOST_TRAFFIC + 1), count, rng)
     trajectories = _dealt(TRAJECTORIES, count, rng)
-    lights = _dealt(wanted.lights, count, rng)
+    lights = _lights(wanted, rng)
     speeds = _spread(count, rng) * (SPEED_KMH[1] - SPEED_KMH[0]) + SPEED_KMH[0]
     starts = _starts(tracks, rng)
     sides = _sides(wanted, tracks, (lanes, trajectories, lights), rng)
@@ -58,7 +58,8 @@ def make_plan(wanted: Wanted, forecast: Forecast | None = None) -> Plan:
             lanes=lanes[number],
             traffic=traffic[number],
             trajectory=trajectories[number],
-            light=lights[number],
+            lights=lights[number],
+            stretch=wanted.stretch,
             speed_kmh=round(float(speeds[number]), 2),
             start=round(starts[number], 5),
             frames=wanted.frames,
@@ -114,6 +115,13 @@ def _dealt(cards: Sequence[Card], count: int, rng: np.random.Generator) -> list[
     while len(dealt) < count:
         dealt += [cards[i] for i in rng.permutation(len(cards))]
     return dealt[:count]
+
+
+def _lights(wanted: Wanted, rng: np.random.Generator) -> list[tuple[str, ...]]:
+    """The light of each stretch of each round: every light before one comes again."""
+    each = -(-wanted.frames // wanted.stretch) if wanted.stretch else 1
+    dealt = _dealt(wanted.lights, wanted.rounds * each, rng)
+    return [tuple(dealt[each * number : each * (number + 1)]) for number in range(wanted.rounds)]
 
 
 def _spread(count: int, rng: np.random.Generator) -> np.ndarray[Any, np.dtype[np.float64]]:

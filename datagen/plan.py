@@ -50,6 +50,8 @@ class Wanted:
     codec: str = "jpeg"
     frequency_hz: int = 20
     camera: CameraInfo = field(default_factory=CameraInfo)
+    stretch: int = 0
+    """After so many frames the scenery and the light are others; 0: never in a round."""
     jitter_camera: bool = False
     """Each round looks from a place, pitch and lens a little different from `camera`."""
     split: str = ""
@@ -60,6 +62,11 @@ class Wanted:
             raise tf.UserError(
                 f"{self.rounds} rounds of {self.frames} frames asked for; ask for at least one "
                 f"each, and for {MOST_ROUNDS} rounds at most"
+            )
+        if self.stretch < 0:
+            raise tf.UserError(
+                f"a stretch of {self.stretch} frames; give how many frames the scenery lasts, or 0 "
+                "for the whole round"
             )
         if self.seed < 0:
             raise tf.UserError(f"the seed is {self.seed}; give a whole number from 0 up")
@@ -91,7 +98,10 @@ class RoundPlan:
     lanes: int
     traffic: int
     trajectory: str
-    light: str
+    lights: tuple[str, ...]
+    """Of each stretch; every stretch has scenery of its own, too."""
+    stretch: int
+    """Frames; 0: the round is one stretch."""
     speed_kmh: float
     start: float
     """Where on the lap it starts, as a share of its length."""
@@ -107,7 +117,7 @@ class RoundPlan:
     def from_json(entry: dict[str, Any]) -> "RoundPlan":
         """Raises KeyError or TypeError where the entry is not one of this program."""
         cameras = {key: CameraInfo(**entry[key]) for key in ("camera", "nominal_camera")}
-        return RoundPlan(**{**entry, **cameras})
+        return RoundPlan(**{**entry, **cameras, "lights": tuple(entry["lights"])})
 
 
 @dataclass(frozen=True, slots=True)

@@ -37,6 +37,7 @@ MOST_RESETS = 20
 # Steps are simulated, then drawn, then written, so many at a time: the driver needs no picture, and
 # code that is run again at once is twice as fast as code that waits for a picture in between.
 BATCH = 20
+SCENERIES_APART = 2**40  # between the seeds of a round's sceneries: beyond the seed of any round
 
 
 @dataclass
@@ -137,11 +138,25 @@ def record_round(
 
 
 def moments_of(drive: Drive, camera: Camera) -> Iterator[list[Moment]]:
-    """All moments of a round from its beginning, some at a time; `camera` is not asked to draw."""
+    """All moments of a round from its beginning, some at a time, all of one stretch.
+
+    `camera` is not asked to draw, but shows the scene of the moments that were given last.
+    """
     suite = SensorSuite([s for s in STANDARD if s.name not in NOT_RECORDED])
-    for first in range(0, drive.plan.frames, BATCH):
-        steps = min(BATCH, drive.plan.frames - first)
-        yield [_next_moment(drive, camera, suite) for _ in range(steps)]
+    plan = drive.plan
+    length = plan.stretch or plan.frames
+    for first in range(0, plan.frames, length):
+        if first:
+            camera.change_scene(*scenery(plan, first // length))
+        for start in range(first, min(first + length, plan.frames), BATCH):
+            end = min(start + BATCH, first + length, plan.frames)
+            yield [_next_moment(drive, camera, suite) for _ in range(start, end)]
+
+
+def scenery(plan: RoundPlan, stretch: int) -> tuple[int, Light]:
+    """Seed and light of a stretch, number 0 the first: no other round's."""
+    rng = np.random.default_rng([plan.seed, 2, stretch])
+    return plan.seed + stretch * SCENERIES_APART, Light.named(plan.lights[stretch], rng)
 
 
 @lru_cache(maxsize=16)
@@ -163,18 +178,18 @@ def scene_of(plan: RoundPlan, tracks_dir: Path | None) -> Iterator[tuple[Drive, 
             "changed); collect into another folder"
         )
     road = Road(track, plan.lanes, plan.lane_width_m)
-    rng = np.random.default_rng([plan.seed, 2])
     speed = plan.speed_kmh / 3.6
     longest = plan.frames / plan.frequency_hz * speed * 1.1 + 50.0
     course = make_course(plan.trajectory, road, longest, np.random.default_rng([plan.seed, 3]))
     about = plan.camera
+    seed, light = scenery(plan, 0)
     mount = Mount(about.x, about.y, about.z, about.pitch_deg, about.fov_y_deg)
     with (
         World(road, traffic=plan.traffic, frequency_hz=plan.frequency_hz) as world,
         Camera(
             road,
-            seed=plan.seed,
-            light=Light.named(plan.light, rng),
+            seed=seed,
+            light=light,
             mount=mount,
             width=about.width,
             height=about.height,
@@ -194,7 +209,8 @@ def _header(plan: RoundPlan, plan_hash: str, road: Road) -> RoundHeader:
         lane_width_m=plan.lane_width_m,
         traffic=plan.traffic,
         trajectory=plan.trajectory,
-        light=plan.light,
+        lights=plan.lights,
+        stretch=plan.stretch,
         speed_kmh=plan.speed_kmh,
         frequency_hz=plan.frequency_hz,
         codec=plan.codec,

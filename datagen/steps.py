@@ -11,6 +11,7 @@ import numpy as np
 from datagen.recording.dataset import IMAGE_DATA
 from datagen.recording.errors import DatasetError
 from datagen.recording.index import DAMAGE, RoundIndex, open_round
+from datagen.recording.labels import lights_of
 from datagen.recording.proto.driverview_pb2 import Command, TrackFeatures, VehicleState
 from datagen.recording.topics import CAMERA, COMMAND, EGO_STATE, LABELS, MESSAGE_TYPES, seconds
 from datagen.recording.wire import bytes_field
@@ -30,6 +31,7 @@ class Step:
     labels: TrackFeatures
     ego: VehicleState
     command: Command
+    light: str
 
 
 @dataclass(frozen=True)
@@ -62,6 +64,7 @@ class Steps:
             self.message(LABELS, number),
             self.message(EGO_STATE, number),
             self.message(COMMAND, number),
+            self.lights[number],
         )
 
     def __iter__(self) -> Iterator[Step]:
@@ -79,6 +82,12 @@ class Steps:
             return self.index.messages[topic].payload(number)
         except DAMAGE as error:
             raise self._damaged(topic, number, error) from error
+
+    @cached_property
+    def lights(self) -> list[str]:
+        """The light at each step."""
+        lights: list[str] = lights_of(self.index).tolist()
+        return lights
 
     @cached_property
     def times_s(self) -> list[float]:

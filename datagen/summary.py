@@ -11,6 +11,7 @@ import trackfeatures as tf
 from datagen.balance import LEAST_SHARE, expected_shares
 from datagen.forecast import Forecast
 from datagen.plan import Plan, RoundPlan
+from datagen.recording.header import the_light
 from datagen.recording.splits import SIDES
 
 
@@ -34,8 +35,10 @@ def overview(plan: Plan, classes: dict[str, dict[str, float]]) -> RenderableType
     for side in sides:
         table.add_column(side)
     table.add_row("rounds", *(str(len(rounds)) for rounds in sides.values()))
-    for name in ("track", "lanes", "light", "trajectory", "traffic"):
-        table.add_row(name, *(_counts(rounds, name) for rounds in sides.values()))
+    for name in ("track", "lanes", "trajectory", "traffic"):
+        table.add_row(name, *(_counts([getattr(e, name) for e in part]) for part in sides.values()))
+    lights = ([light for e in part for light in e.lights] for part in sides.values())
+    table.add_row("light", *(_counts(each) for each in lights))
     shares = (", ".join(f"{k} {v:.0%}" for k, v in classes[side].items()) for side in sides)
     table.add_row("road ahead", *shares)
     return Group(table, *_rare(classes))
@@ -48,7 +51,7 @@ def listing(plan: Plan) -> RenderableType:
     for name in names:
         table.add_column(name, justify="right" if name in ("km/h", "start") else "left")
     for e in plan.rounds:
-        cells = (e.id, e.split, e.track, e.lanes, e.traffic, e.trajectory, e.light)
+        cells = (e.id, e.split, e.track, e.lanes, e.traffic, e.trajectory, the_light(e.lights))
         table.add_row(*map(str, cells), f"{e.speed_kmh:.1f}", f"{e.start:.3f}")
     return table
 
@@ -67,6 +70,6 @@ def _sides(plan: Plan) -> dict[str, list[RoundPlan]]:
     return {side: rounds for side, rounds in of.items() if rounds}
 
 
-def _counts(rounds: Sequence[Any], name: str) -> str:
-    counts = Counter(getattr(entry, name) for entry in rounds)
+def _counts(values: Sequence[Any]) -> str:
+    counts = Counter(values)
     return ", ".join(f"{value} {count}" for value, count in sorted(counts.items()))

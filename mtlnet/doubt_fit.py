@@ -54,7 +54,8 @@ def hold_out(dataset: Dataset) -> tuple[Frames, Frames | None]:
     The same for the same rounds, whatever their order; one of a track and light that several have
     is kept before one of its own kind.
     """
-    ids = {info.id: (info.track, info.light) for info in dataset.rounds if info.split == "train"}
+    rounds = [info for info in dataset.rounds if info.split == "train"]
+    ids = {info.id: {info.track, *info.lights} for info in rounds}
     if len(ids) < LEAST_ROUNDS:
         return dataset.select("train"), None
     kept: list[str] = []

@@ -34,7 +34,7 @@ def groups(frames: "Frames") -> Iterator[tuple[str, dict[str, NDArray[np.int64]]
     of_round = labels.round
     yield "by_track", _parts(np.array([info.track for info in frames.rounds])[of_round])
     yield "by_lanes", _parts(labels.lanes.astype(str))
-    yield "by_light", _parts(np.array([info.light for info in frames.rounds])[of_round])
+    yield "by_light", _parts(labels.light)
     yield "by_shadow", _ranges(labels.shadow_fraction, SHADOW, "")
     radius = 1 / np.maximum(np.abs(labels.curvature), 1e-9)
     yield "by_radius", _ranges(radius, RADIUS_M, " m")

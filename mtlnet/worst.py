@@ -78,7 +78,7 @@ def _caption(frames: Frames, one: Worst, answer: Answer) -> str:
     doubt = "" if said is None else f", said to be known to {said:.2g} {unit}"
     strange = ", called out of distribution" if answer.out_of_distribution else ""
     place = f"{info.id}, {info.track}, s = {labels.s[one.row]:.0f} m"
-    about = f"{info.lanes} lane(s), {info.light}, {labels.speed[one.row] * 3.6:.0f} km/h"
+    about = f"{info.lanes} lane(s), {labels.light[one.row]}, {labels.speed[one.row] * 3.6:.0f} km/h"
     return (
         f"<b>{one.feature} {one.error:+.2g} {unit}</b>{doubt}{strange}"
         f"<br><small>{escape(place)}; {escape(about)}</small>"

@@ -141,7 +141,7 @@ class _Episodes:
                 "meta/episodes/file_index": 0,
                 "round": info.id,
                 "track": info.track,
-                "light": info.light,
+                "light": ", ".join(info.lights),
                 **{
                     f"stats/{f}/{kind}": v
                     for f, kinds in stats.items()

@@ -71,7 +71,7 @@ def sample(info: RoundInfo, step: Step) -> dict[str, Any]:
         "time_s": step.time_s,
         "split": info.split,
         "track": info.track,
-        "light": info.light,
+        "light": step.light,
         "labels": values(step.labels),
         "ego": values(step.ego),
         "command": values(step.command),

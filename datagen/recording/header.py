@@ -19,6 +19,11 @@ RECOVERY_METADATA = "driverview.recovered"
 MOST_PIXELS = 65_500  # of a side: what JPEG holds
 
 
+def the_light(lights: tuple[str, ...]) -> str:
+    """One light by its name, several as "changing"."""
+    return lights[0] if len(set(lights)) == 1 else "changing"
+
+
 @dataclass(frozen=True, slots=True)
 class RoundHeader:
     """All that is known of a round before its first frame."""
@@ -31,8 +36,11 @@ class RoundHeader:
     lane_width_m: float
     traffic: int
     trajectory: str
-    light: str
+    lights: tuple[str, ...]
+    """Of each stretch of the round, in turn; each has scenery of its own."""
     speed_kmh: float
+    stretch: int = 0
+    """Frames; 0: the round is one stretch."""
     frequency_hz: int = 20
     codec: str = "jpeg"
     plan_hash: str = ""
@@ -52,6 +60,8 @@ class RoundHeader:
         camera = self.camera
         if type(self.frequency_hz) is not int or self.frequency_hz < 1:
             raise ValueError(f"its header tells of {self.frequency_hz!r} frames a second")
+        if type(self.stretch) is not int or self.stretch < 0 or not self.lights:
+            raise ValueError(f"its header tells of {self.lights!r} by {self.stretch!r} frames")
         for size in (camera.width, camera.height):
             if type(size) is not int or not 0 < size <= MOST_PIXELS:
                 raise ValueError(f"its header tells of an image of {camera.width}x{camera.height}")
@@ -66,6 +76,7 @@ class RoundHeader:
         for name in ("camera", "nominal_camera"):
             if values[name] is not None:
                 values[name] = CameraInfo(**values[name])
+        values["lights"] = tuple(values["lights"])
         values["definitions"] = str(values["definitions"])
         return RoundHeader(**values)
 
@@ -122,7 +133,7 @@ class RoundInfo:
     track: str
     lanes: int
     split: str
-    light: str
+    lights: tuple[str, ...]
     traffic: int
     trajectory: str
     frames: int
@@ -130,6 +141,15 @@ class RoundInfo:
     lane_width_m: float
     content_hash: str
     path: Path
+
+    @property
+    def light(self) -> str:
+        """The round's light in a word."""
+        return the_light(self.lights)
+
+    def kinds(self, name: str) -> tuple[str, ...]:
+        """What the round has of `name`: one track, but perhaps several lights."""
+        return self.lights if name == "light" else (str(getattr(self, name)),)
 
     @staticmethod
     def of(path: Path, header: RoundHeader, result: RoundResult, split: str) -> "RoundInfo":
@@ -139,7 +159,7 @@ class RoundInfo:
             track=header.track,
             lanes=header.lanes,
             split=split,
-            light=header.light,
+            lights=header.lights,
             traffic=header.traffic,
             trajectory=header.trajectory,
             frames=result.frames,

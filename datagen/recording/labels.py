@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from .errors import DatasetError
 from .index import RoundIndex
 from .proto.driverview_pb2 import TrackFeatures, VehicleState
-from .topics import CAMERA, EGO_STATE, LABELS
+from .topics import CAMERA, EGO_STATE, LABELS, frames_of
 
 NAN = float("nan")
 
@@ -29,6 +29,7 @@ class Labels:
     s: NDArray[np.float32]  # m
     speed: NDArray[np.float32]  # m/s along the body
     shadow_fraction: NDArray[np.float32]
+    light: NDArray[np.str_]
     round: NDArray[np.int64]  # index into the rounds of these frames
 
     def __len__(self) -> int:
@@ -67,8 +68,18 @@ def read_labels(index: RoundIndex, round_number: int) -> Labels:
         s=_narrow(rows[:, 12]),
         speed=_narrow(motion[:, 0]),
         shadow_fraction=_narrow(motion[:, 1]),
+        light=lights_of(index),
         round=np.full(count, round_number, dtype=np.int64),
     )
+
+
+def lights_of(index: RoundIndex) -> NDArray[np.str_]:
+    """The light (N,) of each frame of a round: by its time, for frames may be missing."""
+    header = index.header
+    frames = frames_of(index.messages[CAMERA].log_time, header.frequency_hz)
+    stretch = header.stretch or int(frames.max(initial=0)) + 1
+    lights: NDArray[np.str_] = np.array(header.lights)[frames // stretch % len(header.lights)]
+    return lights
 
 
 def concatenate(parts: list[Labels]) -> Labels:

@@ -97,9 +97,10 @@ def _places(labels: Labels, tolerances: Tolerances) -> NDArray[np.float64]:
 
 def _scenes(labels: Labels, rounds: Sequence[RoundInfo]) -> NDArray[np.int64]:
     """(N,) a number for the road and light of each frame."""
-    numbers: dict[tuple[str, int, str], int] = {}
-    of_round = [numbers.setdefault((r.track, r.lanes, r.light), len(numbers)) for r in rounds]
-    return np.array(of_round, np.int64)[labels.round]
+    numbers: dict[tuple[str, int], int] = {}
+    of_round = [numbers.setdefault((r.track, r.lanes), len(numbers)) for r in rounds]
+    kinds, light = np.unique(labels.light, return_inverse=True)
+    return np.array(of_round, np.int64)[labels.round] * len(kinds) + light
 
 
 def _cells(

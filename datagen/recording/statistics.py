@@ -28,7 +28,7 @@ def describe(dataset: Dataset) -> dict[str, Any]:
         "seeds": sorted({info.seed for info in rounds}),
         "by_track": _frames_by(rounds, "track"),
         "by_lanes": _frames_by(rounds, "lanes"),
-        "by_light": _frames_by(rounds, "light"),
+        "by_light": dict(sorted(Counter(labels.light.tolist()).items())),
         "by_traffic": _frames_by(rounds, "traffic"),
         "by_trajectory": _frames_by(rounds, "trajectory"),
         "all": describe_labels(labels),

@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import numpy as np
 from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
@@ -9,6 +10,7 @@ from foxglove_schemas_protobuf.ImageAnnotations_pb2 import ImageAnnotations
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from google.protobuf.descriptor import FileDescriptor
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
+from numpy.typing import NDArray
 
 from .proto.driverview_pb2 import Command, Sensors, TrackFeatures, VehicleState
 
@@ -45,6 +47,12 @@ NANOSECONDS = 1_000_000_000
 
 def log_time_ns(step: int, frequency_hz: int) -> int:
     return EPOCH_NS + step * NANOSECONDS // frequency_hz
+
+
+def frames_of(log_times: NDArray[np.int64], frequency_hz: int) -> NDArray[np.int64]:
+    """The steps (N,) that have these log times."""
+    steps: NDArray[np.int64] = -(-(log_times - EPOCH_NS) * frequency_hz // NANOSECONDS)
+    return steps
 
 
 def seconds(log_time: int) -> float:

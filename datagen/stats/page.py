@@ -19,7 +19,7 @@ from datagen.stats.charts import Numbers, bars, histogram
 from datagen.stats.concerns import NEEDED, concerns
 from datagen.stats.sheet import Card, contact_sheet
 
-KINDS = ("track", "lanes", "light", "trajectory", "traffic")
+KINDS = ("track", "lanes", "trajectory", "traffic")
 SHEET_QUALITY = 80
 
 
@@ -71,6 +71,8 @@ def _balance(dataset: Dataset, parts: dict[str, Labels]) -> Iterator[str]:
             if info.split in sides:
                 row[sides.index(info.split)] += info.frames
         yield bars(kind, dict(sorted(frames.items(), key=_in_order)))
+    lights = sorted({light for part in parts.values() for light in part.light.tolist()})
+    yield bars("light", {k: [int((parts[s].light == k).sum()) for s in parts] for k in lights})
 
 
 def _in_order(item: tuple[str, Any]) -> tuple[int, str]:

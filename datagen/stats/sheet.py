@@ -17,6 +17,7 @@ from datagen.recording.dataset import Dataset
 from datagen.recording.encoding import decode_into
 from datagen.recording.header import RoundInfo
 from datagen.recording.index import RoundIndex
+from datagen.recording.labels import lights_of
 from datagen.recording.topics import ANNOTATIONS, CAMERA
 from datagen.recording.wire import bytes_field
 
@@ -75,7 +76,8 @@ def _card(info: RoundInfo, index: RoundIndex, frame: int, size: tuple[int, int])
         points = np.array([(p.x, p.y) for p in line.points]) * SCALE
         cv2.polylines(big, [np.round(points).astype(np.int32)], False, _GREEN, 1, cv2.LINE_AA)
     lanes = f"{info.lanes} lane{'s' if info.lanes > 1 else ''}"
-    about = f"{info.id} #{frame} ({info.split or 'no side'}): {info.track}, {lanes}, {info.light}"
+    light = lights_of(index)[frame]
+    about = f"{info.id} #{frame} ({info.split or 'no side'}): {info.track}, {lanes}, {light}"
     return Card(np.asarray(big, np.uint8), about, notes.texts[0].text if notes.texts else "")
 
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 import trackfeatures as tf
 from datagen.recording.errors import DatasetError
-from datagen.recording.header import RoundHeader
+from datagen.recording.header import RoundHeader, the_light
 from datagen.recording.messages import EGO, WORLD
 from datagen.recording.topics import (
     ANNOTATIONS,
@@ -85,8 +85,8 @@ class Contents:
         lanes = f"{h.lanes} lane{'' if h.lanes == 1 else 's'}"
         cars = f"{h.traffic} other car{'' if h.traffic == 1 else 's'}"
         return (
-            f"{h.id}: {h.track}, {lanes}, {cars}, {h.light}, {h.trajectory}, {h.speed_kmh:g} km/h; "
-            f"{frames} frames, {frames / h.frequency_hz:g} s"
+            f"{h.id}: {h.track}, {lanes}, {cars}, {the_light(h.lights)}, {h.trajectory}, "
+            f"{h.speed_kmh:g} km/h; {frames} frames, {frames / h.frequency_hz:g} s"
         )
 
     @cached_property

@@ -66,18 +66,25 @@ class Camera:
         height: int = 210,
     ) -> None:
         check_size(width, height)
-        self.road, self.light, self.mount = road, light, mount
+        self.road, self.mount = road, mount
         self.width, self.height = width, height
         self._graphics: Graphics = graphics()
         self._cars = cars_of(self._graphics)
+        self._scene: Scene | None = None
+        self._last_s: float | None = None
+        self.change_scene(seed, light)
+
+    def change_scene(self, seed: int, light: Light) -> None:
+        """Go on with the scenery of another `seed` under another `light`, on the same road."""
+        self.close()
+        self.light = light
         self._fall = Fall(self._graphics, light, seed) if light.falling > 0.0 else None
-        self._scene: Scene | None = Scene(self._graphics, road, seed, light)
+        self._scene = Scene(self._graphics, self.road, seed, light)
         self._frame = np.concatenate([np.zeros(24), *_light_rows(light)]).astype(np.float32)
-        self._set_frame(optics.eye_of(mount, np.zeros(6), "front"), self.intrinsics)
+        self._set_frame(optics.eye_of(self.mount, np.zeros(6), "front"), self.intrinsics)
         self._sky = Sky(self._graphics, light.weather, float(self.intrinsics[0, 0]))
         # Cars of different rounds differ in colour; from the second on, so as to spare our own.
         self._first_paint = 1 + seed % 5
-        self._last_s: float | None = None
 
     def render(
         self, body_pose: ArrayLike, others: ArrayLike | None = None, view: str = "front"

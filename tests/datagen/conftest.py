@@ -44,7 +44,7 @@ class Samples:
             lane_width_m=4.0,
             traffic=2,
             trajectory="weave",
-            light="clear",
+            lights=("clear",),
             speed_kmh=60.0,
             camera=CAMERA,
         )

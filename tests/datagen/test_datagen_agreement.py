@@ -30,6 +30,7 @@ def _labels(places: np.ndarray, lanes: int, width: float = WIDTH) -> Labels:
         s=zeros,
         speed=zeros,
         shadow_fraction=zeros,
+        light=np.full(len(places), "clear"),
         round=np.zeros(len(places), dtype=np.int64),
     )
 

@@ -39,7 +39,7 @@ def test_sixty_rounds_cover_everything_evenly() -> None:
     assert len(pairs) == 27
     assert set(pairs.values()) <= {2, 3}
     assert set(Counter(e.traffic for e in rounds)) == set(range(9))
-    for dealt, kinds in (("trajectory", TRAJECTORIES), ("light", LIGHTS)):
+    for dealt, kinds in (("trajectory", TRAJECTORIES), ("lights", [(kind,) for kind in LIGHTS])):
         counts = Counter(getattr(e, dealt) for e in rounds)
         assert set(counts) == set(kinds)
         assert max(counts.values()) - min(counts.values()) <= 1
@@ -60,7 +60,7 @@ def test_a_quarter_is_for_testing_and_every_track_and_lane_count_is_on_both_side
     for side in sides.values():
         assert {e.track for e in side} == {choice.name for choice in NINE}
         assert {e.lanes for e in side} == {1, 2, 3}
-        assert {e.light for e in side} == set(LIGHTS)
+        assert {light for e in side for light in e.lights} == set(LIGHTS)
         assert {e.trajectory for e in side} == set(TRAJECTORIES)
     assert len({e.seed for e in rounds}) == 60
     assert not {e.seed for e in rounds} & {e.seed for e in make_plan(wanted(seed=seed + 1)).rounds}

@@ -31,7 +31,7 @@ def make_info(number: int, track: str, **changes: object) -> RoundInfo:
         track=track,
         lanes=2,
         split="",
-        light="clear",
+        lights=("clear",),
         traffic=0,
         trajectory="weave",
         frames=10,
@@ -62,6 +62,7 @@ def make_labels(rng: np.random.Generator, count: int, rounds: int) -> Labels:
         s=rng.uniform(0.0, 100.0, count).astype(np.float32),
         speed=nothing,
         shadow_fraction=nothing,
+        light=rng.choice(["clear", "fog"], count),
         round=np.sort(rng.integers(0, rounds, count)),
     )
 
@@ -121,12 +122,12 @@ def test_near_frames_are_those_of_comparing_all_with_all(
 ) -> None:
     monkeypatch.setattr(grid, "PAIRS_AT_ONCE", at_once)
     rng = np.random.default_rng(0)
-    lights = ("clear", "fog")
-    rounds = [make_info(n, f"track-{n % 2}", light=lights[n // 3]) for n in range(6)]
+    rounds = [make_info(n, f"track-{n % 2}") for n in range(6)]
     labels = make_labels(rng, 1500, 6)
     test = labels.round % 3 == 0
     found = find_neighbours(labels, rounds, test, ~test, tolerances)
-    scene = np.array([f"{info.track} {info.light}" for info in rounds])[labels.round]
+    tracks = np.array([info.track for info in rounds])[labels.round]
+    scene = np.strings.add(tracks, labels.light)
     scale = (tolerances.s_m, tolerances.to_middle_m, np.radians(tolerances.angle_deg))
     place = np.stack([labels.s, labels.to_middle, labels.angle], axis=1) / np.array(scale)
     apart = np.abs(place[test][:, None] - place[~test][None]).max(axis=-1)

@@ -62,10 +62,10 @@ def test_a_rare_class_an_empty_side_and_a_one_sided_track_are_concerns(dataset: 
 
 def test_the_sheet_shows_other_tracks_and_lights_first(dataset: Path) -> None:
     opened = Dataset.open(dataset)
-    opened.rounds[2] = replace(opened.rounds[2], track="hill", light="fog")
+    opened.rounds[2] = replace(opened.rounds[2], track="hill")
     cards = list(contact_sheet(opened, most=2))
     assert [card.about.split(" ")[0] for card in cards] == ["r000", "r002"]
-    assert "hill, 2 lanes, fog" in cards[1].about
+    assert "hill, 2 lanes, clear" in cards[1].about
     assert cards[0].image.shape == (84, 112, 3)
     assert re.search(r"rad \| (left|straight|right)", cards[0].caption)
     green = (cards[0].image[..., 1] > 200) & (cards[0].image[..., 0] < 120)

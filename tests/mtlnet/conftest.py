@@ -64,7 +64,7 @@ def write_round(folder: Path, name: str, number: int, **changes: Any) -> None:
         "lane_width_m": 4.0,
         "traffic": 0,
         "trajectory": "weave",
-        "light": "clear",
+        "lights": ("clear",),
         "speed_kmh": 60.0,
         **changes,
     }

@@ -139,6 +139,7 @@ def many(count: int) -> tuple[np.ndarray, Labels]:
         s=zeros,
         speed=rng.uniform(5, 25, count).astype(np.float32),
         shadow_fraction=rng.uniform(0, 1, count).astype(np.float32),
+        light=rng.choice(["fog", "rain"], count),
         round=rng.integers(0, 2, count),
     )
     return outputs.astype(np.float32), found
@@ -149,10 +150,7 @@ class Drives:
 
     def __init__(self, labels: Labels) -> None:
         self.labels = labels
-        self.rounds = [
-            SimpleNamespace(track=track, light=light)
-            for track, light in (("oval", "fog"), ("town", "rain"))
-        ]
+        self.rounds = [SimpleNamespace(track=track) for track in ("oval", "town")]
 
 
 def test_percentiles_are_numpys() -> None:

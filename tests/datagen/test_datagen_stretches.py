@@ -1,0 +1,58 @@
+"""Stretches of a round: each has scenery and light of its own, and every frame says which light."""
+
+from pathlib import Path
+
+import numpy as np
+
+from datagen.deal import make_plan
+from datagen.plan import LIGHTS, TrackChoice, Wanted
+from datagen.record import scenery
+from datagen.recording import Dataset
+from datagen.replay import replay
+from datagen.steps import Steps
+from tests.datagen.commands import datagen
+
+TRACKS = (TrackChoice("oval", "0"),)
+
+
+def test_every_light_comes_before_one_comes_again() -> None:
+    plan = make_plan(Wanted(rounds=6, frames=500, seed=3, tracks=TRACKS, stretch=60))
+    lights = [light for entry in plan.rounds for light in entry.lights]
+    assert [len(entry.lights) for entry in plan.rounds] == [9] * 6
+    for first in range(0, len(lights) - len(LIGHTS), len(LIGHTS)):
+        assert set(lights[first : first + len(LIGHTS)]) == set(LIGHTS)
+
+
+def test_without_stretches_a_round_has_one_light() -> None:
+    plan = make_plan(Wanted(rounds=8, frames=500, seed=3, tracks=TRACKS))
+    assert [len(entry.lights) for entry in plan.rounds] == [1] * 8
+
+
+def test_no_two_stretches_have_the_same_scenery() -> None:
+    plan = make_plan(Wanted(rounds=40, frames=100, seed=3, tracks=TRACKS, stretch=10))
+    seen = [scenery(entry, k) for entry in plan.rounds for k in range(10)]
+    assert len({seed for seed, _ in seen}) == 400
+    assert len({(light.exposure, light.haze_per_km) for _, light in seen}) == 400
+
+
+def test_scenery_and_light_change_where_a_stretch_ends(tmp_path: Path) -> None:
+    folder = tmp_path / "data"
+    options = ("--rounds", "1", "--frames", "70", "--tracks", "oval", "--workers", "1")
+    done = datagen("collect", "--out", folder, *options, "--stretch", "25", "--lights", "clear,fog")
+    assert done.returncode == 0, done.stderr
+    frames = Dataset.open(folder).select("all")
+    assert set(frames.rounds[0].lights) == {"clear", "fog"}
+    light = frames.labels.light.tolist()
+    assert light == [frames.rounds[0].lights[k // 25] for k in range(70)]
+    images = frames.read_batch(range(70)).astype(np.int16)
+    change = np.abs(np.diff(images, axis=0)).mean((1, 2, 3))
+    assert set(np.argsort(change)[-2:].tolist()) == {24, 49}
+    path = frames.rounds[0].path
+    assert [step.light for step in Steps.open(path)] == light
+    assert replay(folder, 1)[1] == []
+
+
+def test_a_negative_stretch_is_refused() -> None:
+    done = datagen("collect", "--stretch", "-1", "--dry-run")
+    assert done.returncode != 0
+    assert "a stretch of -1 frames" in done.stderr
