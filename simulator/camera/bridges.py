@@ -52,7 +52,7 @@ class Bridge:
         """World directions (..., 3) in the bridge's own frame."""
         return np.asarray(direction @ _turn(self.heading))
 
-    def near(self, x: FloatArray, y: FloatArray, margin_m: float) -> NDArray[np.bool_]:
+    def near(self, x: FloatArray, y: FloatArray, margin_m: float | FloatArray) -> NDArray[np.bool_]:
         """Which places lie on its ground, or within `margin_m` of it."""
         own = self.inside(np.stack([x, y, np.zeros_like(x)], axis=-1))
         along, across = np.abs(own[..., 0]), np.abs(own[..., 1])
@@ -66,7 +66,10 @@ def _turn(heading: float) -> FloatArray:
 
 
 def free_of(
-    bridges: Sequence[Bridge], x: FloatArray, y: FloatArray, margin_m: float = KEEP_FREE_M
+    bridges: Sequence[Bridge],
+    x: FloatArray,
+    y: FloatArray,
+    margin_m: float | FloatArray = KEEP_FREE_M,
 ) -> NDArray[np.bool_]:
     """Which places are clear of every bridge."""
     free = np.ones(np.shape(x), dtype=np.bool_)

@@ -18,6 +18,7 @@ from simulator.camera.light import Light
 from simulator.camera.optics import DRIVER_SEAT, Mount
 from simulator.camera.scene import Scene, Seen
 from simulator.camera.sky import Sky
+from simulator.camera.terrain import Survey
 from simulator.car import CarParameters
 from simulator.track.road import Road
 from trackfeatures.errors import UserError
@@ -70,6 +71,7 @@ class Camera:
         self.width, self.height = width, height
         self._graphics: Graphics = graphics()
         self._cars = cars_of(self._graphics)
+        self._survey = Survey.of(road)
         self._scene: Scene | None = None
         self._last_s: float | None = None
         self.change_scene(seed, light)
@@ -79,7 +81,7 @@ class Camera:
         self.close()
         self.light = light
         self._fall = Fall(self._graphics, light, seed) if light.falling > 0.0 else None
-        self._scene = Scene(self._graphics, self.road, seed, light)
+        self._scene = Scene(self._graphics, self.road, self._survey, seed, light)
         self._frame = np.concatenate([np.zeros(24), *_light_rows(light)]).astype(np.float32)
         self._set_frame(optics.eye_of(self.mount, np.zeros(6), "front"), self.intrinsics)
         self._sky = Sky(self._graphics, light.weather, float(self.intrinsics[0, 0]))

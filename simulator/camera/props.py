@@ -153,37 +153,45 @@ class _Site:
     ) -> None:
         self.road, self.line, self.ribbon, self.terrain = road, line, ribbon, terrain
         self.bridges = bridges
-        self.taken: list[tuple[float, float, float]] = []
+        self.wanted: list[tuple[FloatArray, float, float, float]] = []
         self.s: list[float] = []
         self.parts: list[FloatArray] = []
 
-    def put(self, template: FloatArray, s: float, offset: float, clear_m: float) -> None:
-        """Stand `template` at (s, offset), unless it comes within `clear_m` of a wall line, under a
-        bridge or into another building."""
-        free, x, y = place_beside(self.road, self.line, np.array([s]), np.array([offset]), clear_m)
-        if not (free & free_of(self.bridges, x, y, clear_m + KEEP_FREE_M))[0]:
+    def want(self, template: FloatArray, s: float, offset: float, clear_m: float) -> None:
+        """Stand `template` at (s, offset), if nothing is in its way: see `stand`."""
+        self.wanted.append((template, s, offset, clear_m))
+
+    def stand(self) -> None:
+        """Put down what was wanted, in that order, but for what would come within its `clear_m` of
+        a wall line, under a bridge, into the sea or into another building."""
+        if not self.wanted:
             return
-        reach = float(np.abs(template[:, :2]).max())
-        if reach > BUILDING_M and any(
-            np.hypot(x[0] - u, y[0] - v) < 0.9 * (reach + other) for u, v, other in self.taken
-        ):
-            return
-        z = ground_height(self.ribbon, self.terrain, np.array([s]), np.array([offset]), x, y)[0]
-        if z < self.terrain.sea + DRY_M:
-            return
-        if reach > BUILDING_M:
-            self.taken.append((float(x[0]), float(y[0]), reach))
-        heading = float(self.road.track.at(s).heading)
+        templates, *numbers = zip(*self.wanted, strict=True)
+        s, offset, clear_m = (np.array(column) for column in numbers)
+        free, x, y = place_beside(self.road, self.line, s, offset, clear_m)
+        free &= free_of(self.bridges, x, y, clear_m + KEEP_FREE_M)
+        z = ground_height(self.ribbon, self.terrain, s, offset, x, y)
+        free &= z >= self.terrain.sea + DRY_M
         # On the right side the template is turned round, so that its -y still faces the road; its
         # x axis then points against the traffic.
-        turn = heading if offset > 0 else heading + np.pi
+        turn = self.road.track.at(s).heading + np.where(offset > 0, 0.0, np.pi)
         cos, sin = np.cos(turn), np.sin(turn)
-        placed = template.copy()
-        rotate = np.array([[cos, sin], [-sin, cos]])
-        placed[:, :2] = template[:, :2] @ rotate + np.array([x[0], y[0]])
-        placed[:, 2] += z
-        placed[:, 3:5] = template[:, 3:5] @ rotate
-        self.add(s, placed)
+        taken: list[tuple[float, float, float]] = []
+        for k in np.flatnonzero(free).tolist():
+            template = templates[k]
+            reach = float(np.abs(template[:, :2]).max())
+            if reach > BUILDING_M:
+                if any(
+                    np.hypot(x[k] - u, y[k] - v) < 0.9 * (reach + other) for u, v, other in taken
+                ):
+                    continue
+                taken.append((x[k], y[k], reach))
+            placed = template.copy()
+            rotate = np.array([[cos[k], sin[k]], [-sin[k], cos[k]]])
+            placed[:, :2] = template[:, :2] @ rotate + np.array([x[k], y[k]])
+            placed[:, 2] += z[k]
+            placed[:, 3:5] = template[:, 3:5] @ rotate
+            self.add(s[k], placed)
 
     def add(self, s: float, triangles: FloatArray) -> None:
         """Triangles (n, 12) that are in place already, near `s`."""
@@ -215,19 +223,20 @@ def build(
         for s in rng.uniform(0.0, length, rng.poisson(density * length / 100.0)):
             side = rng.choice([-1.0, 1.0])
             offset = side * (wall + rng.uniform(near, far))
-            site.put(make(rng), float(s), float(offset), clear)
+            site.want(make(rng), float(s), float(offset), clear)
     if look.posts:
         for s in np.arange(0.0, length, POST_STEP_M):
             for side in (-1.0, 1.0):
-                site.put(marker_post(), float(s), side * (wall + 0.35), 0.1)
+                site.want(marker_post(), float(s), side * (wall + 0.35), 0.1)
     if look.poles:
         side = rng.choice([-1.0, 1.0])
         for s in np.arange(0.0, length, POLE_STEP_M):
-            site.put(pole(), float(s), side * (wall + 3.0), 1.0)
+            site.want(pole(), float(s), side * (wall + 3.0), 1.0)
     if look.lamps:
         side = rng.choice([-1.0, 1.0])
         for s in np.arange(0.0, length, LAMP_STEP_M):
-            site.put(lamp(), float(s), side * (wall + 1.0), 0.6)
+            site.want(lamp(), float(s), side * (wall + 1.0), 0.6)
+    site.stand()
     return _gathered(site)
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from simulator.camera.mesh import Surface
 from simulator.camera.strips import LEVELS, Level, strip
-from simulator.camera.terrain import CentreLine, Terrain
+from simulator.camera.terrain import CentreLine, Survey, Terrain
 from simulator.track.road import Road
 
 FloatArray = NDArray[np.float64]
@@ -114,14 +114,11 @@ def _skirt(
     return width
 
 
-def covers(
-    ribbon: Ribbon, line: CentreLine, x: FloatArray, y: FloatArray, margin_m: float
-) -> NDArray[np.bool_]:
-    """Which places lie under the ribbon, `margin_m` within its edges."""
-    near, sample = line.tree.query(np.stack([x, y], axis=-1))
-    row = np.clip(np.searchsorted(ribbon.s, line.s[sample]), 1, len(ribbon.s) - 1)
+def covers(ribbon: Ribbon, survey: Survey, margin_m: float) -> NDArray[np.bool_]:
+    """Which points (rows, columns) of the grid lie under the ribbon, `margin_m` within its edges."""
+    row = np.clip(np.searchsorted(ribbon.s, survey.line.s), 1, len(ribbon.s) - 1)[survey.sample]
     reach = np.minimum(ribbon.y[:, 0], -ribbon.y[:, -1])
-    return np.asarray(near < np.minimum(reach[row - 1], reach[row]) - margin_m)
+    return np.asarray(survey.near < np.minimum(reach[row - 1], reach[row]) - margin_m)
 
 
 def surfaces(ribbon: Ribbon, road: Road) -> tuple[Surface, Surface]:

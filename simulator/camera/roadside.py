@@ -12,7 +12,7 @@ FloatArray = NDArray[np.float64]
 
 
 def place_beside(
-    road: Road, line: CentreLine, s: FloatArray, offset: FloatArray, clear_m: float
+    road: Road, line: CentreLine, s: FloatArray, offset: FloatArray, clear_m: float | FloatArray
 ) -> tuple[NDArray[np.bool_], FloatArray, FloatArray]:
     """Which of the places (s, offset) are `clear_m` outside every wall line, and their x, y."""
     pose = road.track.at(s, offset)

@@ -11,7 +11,7 @@ from simulator.camera.light import Light
 from simulator.camera.look import Colour, Look, look_of
 from simulator.camera.mesh import Mesh
 from simulator.camera.optics import Eye
-from simulator.camera.terrain import COARSEST, CentreLine
+from simulator.camera.terrain import COARSEST, Survey
 from simulator.camera.terrain import build as build_terrain
 from simulator.camera.woods import Corners, Woods
 from simulator.track.road import Road
@@ -40,10 +40,11 @@ class Seen:
 class Scene:
     """The still world of one road and seed; `draw` paints it with the frame that is set."""
 
-    def __init__(self, graphics: Graphics, road: Road, seed: int, light: Light) -> None:
-        look = look_of(road.track.look)
-        line = CentreLine.of(road)
-        terrain = build_terrain(road, line, look, np.random.default_rng([seed, 1]))
+    def __init__(
+        self, graphics: Graphics, road: Road, survey: Survey, seed: int, light: Light
+    ) -> None:
+        look, line = look_of(road.track.look), survey.line
+        terrain = build_terrain(road, survey, look, np.random.default_rng([seed, 1]))
         strips = ribbon.build(road, line, terrain)
         self._graphics = graphics
 
@@ -67,7 +68,7 @@ class Scene:
         paved = Mesh(graphics, named("paved"), asphalt, layout)
         verge = Mesh(graphics, named("verge"), beside, layout)
         shore = graphics.weathered("land", light.weather, *(["sea"] if look.sea else []))
-        hidden = ribbon.covers(strips, line, *terrain.grid(), margin_m=2.0)
+        hidden = ribbon.covers(strips, survey, margin_m=2.0)
         fields = [
             Mesh(
                 graphics,

@@ -62,6 +62,39 @@ class CentreLine:
 
 
 @dataclass(frozen=True)
+class Survey:
+    """What the road alone says of the land round it: the same in every scenery.
+
+    The grid (rows y, columns x) from (x0, y0), and of each of its points: the greatest height that
+    keeps the road clear, the road's height spread out to it, the distance to the road and the
+    nearest sample of its centre line.
+    """
+
+    line: CentreLine
+    x0: float
+    y0: float
+    cell: float
+    cap: FloatArray
+    base: FloatArray
+    near: FloatArray
+    sample: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, road: Road) -> "Survey":
+        """Survey the land round `road`."""
+        line = CentreLine.of(road)
+        span = max(np.ptp(line.x), np.ptp(line.y)) + 2 * MARGIN_M
+        cell = max(CELL_M, span / MAX_CELLS)
+        x0, y0 = line.x.min() - MARGIN_M, line.y.min() - MARGIN_M
+        columns = COARSEST * int(np.ceil((np.ptp(line.x) + 2 * MARGIN_M) / cell / COARSEST)) + 1
+        rows = COARSEST * int(np.ceil((np.ptp(line.y) + 2 * MARGIN_M) / cell / COARSEST)) + 1
+        shape = (rows, columns)
+        cap = _road_cap(road, line, x0, y0, cell, shape)
+        spread = _spread(road, line, x0, y0, cell, shape)
+        return cls(line, float(x0), float(y0), float(cell), cap, *spread)
+
+
+@dataclass(frozen=True)
 class Terrain:
     """Heights `z` (rows y, columns x) on a square grid from (x0, y0)."""
 
@@ -75,14 +108,6 @@ class Terrain:
     def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """Height at points, on the triangles that are drawn."""
         return between(self.z, (x - self.x0) / self.cell, (y - self.y0) / self.cell)
-
-    def grid(self) -> tuple[FloatArray, FloatArray]:
-        """x and y of all points, each (rows, columns)."""
-        rows, columns = self.z.shape
-        x, y = np.meshgrid(
-            self.x0 + self.cell * np.arange(columns), self.y0 + self.cell * np.arange(rows)
-        )
-        return x, y
 
     def normals(self) -> FloatArray:
         """Unit normals (rows, columns, 3)."""
@@ -105,28 +130,20 @@ def between(z: FloatArray, u: FloatArray, v: FloatArray) -> FloatArray:
     return np.where(fu + fv <= 1.0, low, high)
 
 
-def build(road: Road, line: CentreLine, look: Look, rng: np.random.Generator) -> Terrain:
+def build(road: Road, survey: Survey, look: Look, rng: np.random.Generator) -> Terrain:
     """The land round `road` in the style of `look`."""
-    span = max(np.ptp(line.x), np.ptp(line.y)) + 2 * MARGIN_M
-    cell = max(CELL_M, span / MAX_CELLS)
-    x0, y0 = line.x.min() - MARGIN_M, line.y.min() - MARGIN_M
-    columns = COARSEST * int(np.ceil((np.ptp(line.x) + 2 * MARGIN_M) / cell / COARSEST)) + 1
-    rows = COARSEST * int(np.ceil((np.ptp(line.y) + 2 * MARGIN_M) / cell / COARSEST)) + 1
-    shape = (rows, columns)
-    cap = _road_cap(road, line, x0, y0, cell, shape)
-    base, near = _spread(road, line, x0, y0, cell, shape)
+    line, near, base = survey.line, survey.near, survey.base
+    x0, y0, cell, shape = survey.x0, survey.y0, survey.cell, survey.near.shape
     rolling = _rolling(shape, cell, rng) * look.hills_m
     away = np.clip((near - road.wall_offset - 5.0) / 110.0, 0.0, 1.0)
     natural = base + rolling * away * away * (3.0 - 2.0 * away)
     if not look.sea:
-        return Terrain(float(x0), float(y0), float(cell), np.minimum(natural, cap))
+        return Terrain(x0, y0, cell, np.minimum(natural, survey.cap))
     sea = float(road.track.at(line.s).z.min()) - SEA_BELOW_M
     fall = np.clip((near - road.wall_offset - SHORE_M[0]) / (SHORE_M[1] - SHORE_M[0]), 0.0, 1.0)
     fall *= fall * (3.0 - 2.0 * fall) * _outside(line, x0, y0, cell, shape)
     natural += (sea - 4.0 - natural) * fall
-    return Terrain(
-        float(x0), float(y0), float(cell), np.maximum(np.minimum(natural, cap), sea), sea
-    )
+    return Terrain(x0, y0, cell, np.maximum(np.minimum(natural, survey.cap), sea), sea)
 
 
 def _road_cap(
@@ -152,8 +169,9 @@ def _road_cap(
 
 def _spread(
     road: Road, line: CentreLine, x0: float, y0: float, cell: float, shape: tuple[int, int]
-) -> tuple[FloatArray, FloatArray]:
-    """Road heights spread smoothly over the grid, and each point's distance to the road."""
+) -> tuple[FloatArray, FloatArray, NDArray[np.int64]]:
+    """Road heights spread smoothly over the grid; each point's distance to the road and the nearest
+    sample of its centre line."""
     x = x0 + cell * np.arange(shape[1])
     y = y0 + cell * np.arange(shape[0])
     points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
@@ -166,7 +184,7 @@ def _spread(
     wide = cv2.GaussianBlur(nearest, (0, 0), 60.0 / cell)
     narrow = cv2.GaussianBlur(nearest, (0, 0), 10.0 / cell)
     far = np.clip((near - 25.0) / 60.0, 0.0, 1.0)
-    return narrow + (wide - narrow) * far, near
+    return narrow + (wide - narrow) * far, near, index.reshape(shape)
 
 
 def _outside(

@@ -10,7 +10,7 @@ from simulator.camera.bridges import CLEARANCE_M, Bridge
 from simulator.camera.look import LOOKS, look_of
 from simulator.camera.ribbon import build as build_ribbon
 from simulator.camera.snapshot import standing_pose
-from simulator.camera.terrain import CentreLine
+from simulator.camera.terrain import CentreLine, Survey
 from simulator.camera.terrain import build as build_terrain
 from simulator.track.catalogue import OWN_TRACKS, find_track
 from simulator.track.own import LOOKS as TRACK_LOOKS
@@ -27,8 +27,9 @@ def light(kind: str, seed: int) -> Light:
 
 def bridges_of(road: Road, seed: int) -> tuple[Bridge, ...]:
     """The bridges that a scene of this seed has."""
-    look, line = look_of(road.track.look), CentreLine.of(road)
-    terrain = build_terrain(road, line, look, np.random.default_rng([seed, 1]))
+    look, survey = look_of(road.track.look), Survey.of(road)
+    line = survey.line
+    terrain = build_terrain(road, survey, look, np.random.default_rng([seed, 1]))
     strips = build_ribbon(road, line, terrain)
     return bridges.build(road, line, strips, terrain, look, np.random.default_rng([seed, 8]))
 
