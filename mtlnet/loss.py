@@ -17,6 +17,7 @@ from trackfeatures.errors import UserError
 
 TASKS = ("distance", "angle", "type")
 Alpha = tuple[float, float, float]
+ANGLE_BEND, ANGLE_GAIN = 1.0, 4.0
 
 
 class AlphaError(UserError):
@@ -81,8 +82,11 @@ def multi_task_loss(
     `scale` (6,): variances of the coded targets. With it, the sum that is minimised (never the
     reported losses) counts squared errors in units of them, distances as their mean: a task
     answered by its mean then costs about 1, whatever its range. `bend`: from so many standard
-    deviations on an error costs what it is, not its square (Huber 1964), 0: never. Between two
-    possible answers the best is then the likelier, where a squared error asks for one in between.
+    deviations on a distance's error costs what it is, not its square (Huber 1964), 0: never.
+    Between two possible answers the best is then the likelier, where a squared error asks for one
+    in between. The angle never jumps: with `bend` its errors count squared up to `ANGLE_BEND`, and
+    `ANGLE_GAIN` times, or large angles come out too small beside distances whose every error pulls
+    alike.
     """
     errors = outputs[:, :6].float() - coded
     squared = errors**2
@@ -106,4 +110,7 @@ def multi_task_loss(
 
 def _bent(errors: Tensor, scale: Tensor, bend: float) -> Tensor:
     units = errors * scale.rsqrt()
-    return smooth_l1_loss(units, torch.zeros_like(units), reduction="none", beta=bend)
+    none = torch.zeros_like(units)
+    distances = smooth_l1_loss(units[:, :5], none[:, :5], reduction="none", beta=bend)
+    angle = smooth_l1_loss(units[:, 5:], none[:, 5:], reduction="none", beta=ANGLE_BEND)
+    return torch.cat([distances, ANGLE_GAIN * angle], 1)
