@@ -99,10 +99,10 @@ def _trainer(console: Console) -> Any:
     return work
 
 
-def _judge(run: Path, data: Path, split: str) -> dict[str, Any]:
+def _judge(run: Path, config: AblationConfig) -> dict[str, Any]:
     """The evaluation of a finished run, in float32."""
     engines = [load_engine(run, "openvino", "f32") for _ in range(os.cpu_count() or 1)]
-    return evaluate(engines, data, split)
+    return evaluate(engines, config.data, config.split, every=config.every)
 
 
 def _tell_plan(

@@ -72,6 +72,8 @@ class AblationConfig:
     recipe: str = "fast"
     batch: int = 32
     split: str = "test"
+    every: int = 5
+    """Each so many-th frame is judged."""
     device: str = "auto"
     threads: int = 0
 
@@ -82,7 +84,7 @@ class AblationConfig:
 
     def fixed(self) -> dict[str, Any]:
         """What makes two runs comparable."""
-        same = ("iterations", "recipe", "batch", "split")
+        same = ("iterations", "recipe", "batch", "split", "every")
         return {"definitions": tf.VERSION, **{name: getattr(self, name) for name in same}}
 
 
@@ -103,7 +105,7 @@ class Run:
 
 
 Train = Callable[[TrainConfig, dict[str, Any] | None], Any]
-Judge = Callable[[Path, Path, str], dict[str, Any]]
+Judge = Callable[[Path, AblationConfig], dict[str, Any]]
 
 
 def parse_seeds(text: str) -> tuple[int, ...]:
@@ -177,7 +179,7 @@ def _finish(config: AblationConfig, run: Run, train: Train, judge: Judge) -> Non
             # A folder without a configuration: killed while it was made.
             shutil.rmtree(run.folder, ignore_errors=True)
             train(wanted, None)
-    result = judge(run.folder, config.data, config.split)
+    result = judge(run.folder, config)
     write_whole(run.folder / EVALUATION, (json.dumps(result) + "\n").encode())
     # Twice 100 MB and more a run, of no use once it is finished.
     shutil.rmtree(run.folder / CHECKPOINTS, ignore_errors=True)

@@ -116,6 +116,7 @@ def ablate_command(
     ] = "mobilenet_v3_small",
     batch: Annotated[int, typer.Option(help="Images a step.")] = 32,
     split: Annotated[str, typer.Option(help="What to judge on: test or unseen.")] = "test",
+    every: Annotated[int, typer.Option(help="Judge each so many-th frame.", min=1)] = 5,
     device: Annotated[str, typer.Option(help="auto, cpu or cuda.")] = "auto",
     threads: Annotated[int, typer.Option(help="CPU threads; 0: one a core.")] = 0,
     dry_run: Annotated[
@@ -128,7 +129,7 @@ def ablate_command(
     from mtlnet.ablation import AblationConfig, parse_seeds, rows_of
 
     config = AblationConfig(
-        data, out, iterations, parse_seeds(seeds), recipe, batch, split, device, threads
+        data, out, iterations, parse_seeds(seeds), recipe, batch, split, every, device, threads
     )
     result = ablate(config, rows_of(backbone), dry_run=dry_run)
     if as_json:
@@ -173,6 +174,7 @@ def evaluate_command(
     page: Annotated[
         Path | None, typer.Option("--report", help="HTML page to write: a file, or a folder.")
     ] = None,
+    every: Annotated[int, typer.Option(help="Judge each so many-th frame only.")] = 1,
     engine: EngineKind = "openvino",
     precision: PrecisionOption = None,
     as_json: Json = False,
@@ -198,6 +200,7 @@ def evaluate_command(
             split,
             lambda done, total: bar.update(task, completed=done, total=total),
             page,
+            every,
         )
     if page is not None:
         typer.echo(f"report: {result['page']}", err=True)

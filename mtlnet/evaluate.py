@@ -16,6 +16,7 @@ from mtlnet.loader import Images
 from mtlnet.readable import require_decodable
 from mtlnet.report import judge_all
 from mtlnet.report_page import write_page
+from trackfeatures.errors import UserError
 
 CHUNK = 32
 
@@ -26,16 +27,20 @@ def evaluate(
     split: str,
     report: Callable[[int, int], None] = lambda *_: None,
     page: Path | None = None,
+    every: int = 1,
 ) -> dict[str, Any]:
     """The report of `mtlnet.report.judge` on one side of a dataset, whole and by groups.
 
-    `page`: where to write it as HTML as well, a file or a folder.
+    `page`: where to write it as HTML as well, a file or a folder. `every`: judge each so many-th
+    frame only; its neighbours show much the same.
     `engines`: the same model, once for each thread. `report(done, all)` is told how far it is.
     Raises UserError when data and model do not fit.
     """
+    if every < 1:
+        raise UserError(f"--every is {every}; give 1 for all frames, 5 for each fifth")
     engine = engines[0]
     dataset = Dataset.open(data)
-    frames = dataset.select(split)
+    frames = dataset.select(split).every(every)
     require_fit(engine.card, frames, split)
     try:
         outputs = answer_frames(engines, frames, report)
@@ -50,6 +55,7 @@ def evaluate(
         "precision": engine.precision,
         "data": str(data),
         "split": split,
+        "every": every,
         "rounds": len(frames.rounds),
         **judge_all(outputs, frames, mean),
     }

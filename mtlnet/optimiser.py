@@ -16,7 +16,7 @@ from mtlnet.network import Network
 from mtlnet.recipe import MOMENTUM, Recipe
 
 MUON_LAYERS = ("features.", "shared.fc0.")
-MUON_RATE = 2.0
+MUON_RATE = 8.0
 """Times the recipe's rate: with updates scaled to AdamW's size, Muon bears longer steps."""
 
 

@@ -73,6 +73,10 @@ class Frames:
         each = concatenate([read_labels(ix, number) for number, ix in enumerate(self._indexes)])
         return each if len(self) == self._first[-1] else each.take(self._rows)
 
+    def every(self, step: int) -> "Frames":
+        """Each `step`-th of these frames, from the first on."""
+        return Frames(self.rounds, self._indexes, self.camera, self._rows[::step])
+
     def without(self, left_out: Iterable[int]) -> "Frames":
         """These frames but those numbered `left_out`."""
         kept = np.delete(self._rows, list(left_out))

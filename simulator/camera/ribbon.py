@@ -115,7 +115,7 @@ def _skirt(
 
 
 def covers(ribbon: Ribbon, survey: Survey, margin_m: float) -> NDArray[np.bool_]:
-    """Which points (rows, columns) of the grid lie under the ribbon, `margin_m` within its edges."""
+    """Which points of the grid (rows, columns) the ribbon covers, `margin_m` within its edges."""
     row = np.clip(np.searchsorted(ribbon.s, survey.line.s), 1, len(ribbon.s) - 1)[survey.sample]
     reach = np.minimum(ribbon.y[:, 0], -ribbon.y[:, -1])
     return np.asarray(survey.near < np.minimum(reach[row - 1], reach[row]) - margin_m)

@@ -55,6 +55,14 @@ def test_batches_are_the_decoded_images_in_the_order_asked_for(dataset: Path) ->
     assert not np.array_equal(batch[0], batch[1])
 
 
+def test_every_third_frame_is_itself_with_its_label(dataset: Path) -> None:
+    frames = Dataset.open(dataset).select("all")
+    third = frames.every(3)
+    assert len(third) == len(third.labels) == 45
+    assert np.array_equal(third.labels.angle, frames.labels.angle[::3])
+    assert np.array_equal(third.read_batch([44, 7]), frames.read_batch([132, 21]))
+
+
 def test_large_batches_are_those_of_the_general_decoder(dataset: Path) -> None:
     frames = Dataset.open(dataset).select("all")
     wanted = np.random.default_rng(0).permutation(135)[:100]

@@ -58,7 +58,7 @@ class Bench:
         (config.out / "curves.csv").write_text("\n".join([",".join(CURVE_COLUMNS), *points, ""]))
         replace(self.card, name=config.out.name, alpha=config.alpha).write(config.out)
 
-    def judge(self, run: Path, data: Path, split: str) -> dict[str, Any]:
+    def judge(self, run: Path, config: AblationConfig) -> dict[str, Any]:
         seed = int(run.name[-1])
         marking = dict.fromkeys(("ml", "mr", "l", "m"), 0.1 * seed)
         return {
