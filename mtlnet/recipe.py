@@ -11,11 +11,12 @@ steps. Dropout 0.5 and L2 5e-4 are ours: the paper gives neither.
 - Muon for the large layers (`mtlnet.optimiser`): in short trials half as many images for the same
   errors. The rate rises, then falls to nothing as a cosine over the run. Batches of 64, since its
   own work is two fifths of a step of 32.
-- An error counts as it is, not squared, from a twentieth of a standard deviation on: `l`, `m` and
-  `r` jump where they become inactive, and a squared error answers in between.
+- A distance's error counts as it is, not squared, from a twentieth of a standard deviation on: `l`,
+  `m` and `r` jump where they become inactive, and a squared error answers in between. The angle's
+  counts squared, and more (`mtlnet.loss`).
 - No dropout: it adds noise to what must come out as a number to a few per cent.
 - Images mirrored, turned and covered in places, with labels that follow (`mtlnet.augment`); other
-  brightness, contrast and tint. Ten rounds are few: without it their scenery is learned by heart.
+  brightness, contrast and tint. Rounds are few: without it their scenery is learned by heart.
 
 `tune`: `fast` from a finished model (`--init`): AdamW with a tenth of the rate, 500 steps, no
 normalisation.

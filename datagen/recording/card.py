@@ -96,7 +96,7 @@ Absent means unset, not zero. Definitions of the labels: version {definitions}.
 By `datagen collect` of {program}: a simulated car (rigid body, tyres, suspension at 200 Hz) is
 driven by a scripted driver along a trajectory of its round, at a speed of its round, among cars
 that keep their distance; the labels are computed from the road's geometry. One seed fixes all.
-Camera: {camera}{jitter}. Images: {codecs}.
+{stretches}Camera: {camera}{jitter}. Images: {codecs}.
 
 Frames by...
 
@@ -153,6 +153,7 @@ def card(dataset: Dataset, statistics: dict[str, Any]) -> str:
         ),
         fields="\n\n".join(_fields(message) for message in FIELDS),
         program=_listed({header.program or "driverview" for header in headers}),
+        stretches=_stretches({header.stretch for header in headers} - {0}),
         camera=_camera(dataset.camera),
         jitter=", each round's a little off (in its metadata)" if jittered else "",
         one_camera=", nearly" if jittered else "",
@@ -164,6 +165,16 @@ def card(dataset: Dataset, statistics: dict[str, Any]) -> str:
             name: _counts(statistics[name])
             for name in ("by_track", "by_lanes", "by_traffic", "by_light", "by_trajectory")
         },
+    )
+
+
+def _stretches(frames: set[int]) -> str:
+    if not frames:
+        return ""
+    every = _listed({str(count) for count in frames})
+    return (
+        f"Every {every} frames the scenery, the weather and the light are others, while the drive "
+        "goes on: pictures\njump there, labels and states do not. "
     )
 
 
