@@ -22,9 +22,14 @@ T = TypeVar("T")
 class AsyncClient:
     """A connection to the service at `url`; see `serve.client.Client` for what its methods do."""
 
-    def __init__(self, url: str = "http://127.0.0.1:8000", timeout_s: float = 5.0) -> None:
+    def __init__(
+        self,
+        url: str = "http://127.0.0.1:8000",
+        timeout_s: float = 5.0,
+        token: str | None = None,
+    ) -> None:
         """Raises ServiceError when `url` is none. Nothing is sent before the first request."""
-        self._client = Client(url, timeout_s)
+        self._client = Client(url, timeout_s, token)
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="driverview-client")
 
     async def features(

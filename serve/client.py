@@ -9,16 +9,17 @@ Not to be shared between threads: each makes its own.
 
 import http.client
 import json
+import os
 import re
 import time
 from types import TracebackType
 from typing import Any
 from urllib.parse import SplitResult, urlsplit
 
+from serve.limits import MAX_DEADLINE_MS, TOKEN_VARIABLE
 from trackfeatures.errors import UserError
 
 POLL_S = 0.1
-MAX_DEADLINE_MS = 60_000  # the longest that the service takes
 # Refusals of a frame that stay true when it is sent again.
 FINAL = ("/problems/superseded", "/problems/deadline-passed")
 UNSENDABLE = re.compile("[^!-~]")  # what the path of an HTTP request cannot hold
@@ -57,9 +58,17 @@ def retry_pause_s(error: ServiceError) -> float | None:
 
 
 class Client:
-    """A connection to the service at `url` ("http://HOST:PORT" or "HOST:PORT")."""
+    """A connection to the service at `url` ("http://HOST:PORT" or "HOST:PORT").
 
-    def __init__(self, url: str = "http://127.0.0.1:8000", timeout_s: float = 5.0) -> None:
+    `token`: what the service asks of its clients; None: $DRIVERVIEW_TOKEN, or nothing.
+    """
+
+    def __init__(
+        self,
+        url: str = "http://127.0.0.1:8000",
+        timeout_s: float = 5.0,
+        token: str | None = None,
+    ) -> None:
         """Raises ServiceError when `url` is none. Nothing is sent before the first request."""
         parts = _parse(url)
         self.url = parts.geturl().rstrip("/")
@@ -68,6 +77,8 @@ class Client:
         assert parts.hostname is not None
         self._connection = kind(parts.hostname, parts.port, timeout=timeout_s)
         self._timeout_s = timeout_s
+        token = os.environ.get(TOKEN_VARIABLE, "").strip() if token is None else token
+        self._known = {"Authorization": f"Bearer {token}"} if token else {}
 
     def features(
         self,
@@ -188,7 +199,8 @@ class Client:
         self, method: str, path: str, body: bytes | None, headers: dict[str, str]
     ) -> tuple[int, bytes]:
         try:
-            self._connection.request(method, self._path + path, body, headers)
+            everything = {**self._known, **headers}
+            self._connection.request(method, self._path + path, body, everything)
             response = self._connection.getresponse()
             return response.status, response.read()
         except DROPPED:

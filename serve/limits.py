@@ -6,7 +6,8 @@ from ipaddress import ip_address
 MAX_BODY_BYTES = 4 << 20
 MAX_HEAD_BYTES = 32 << 10
 MAX_NAME = 128  # characters of a frame's, a request's or a stream's name
-MAX_DEADLINE_MS = 60_000
+MAX_DEADLINE_MS = 60_000  # the longest a client may give
+TOKEN_VARIABLE = "DRIVERVIEW_TOKEN"
 
 
 @dataclass(frozen=True)

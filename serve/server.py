@@ -13,14 +13,13 @@ from pathlib import Path
 
 from mtlnet.card import resolve_run
 from serve import logs, telemetry
-from serve.limits import Limits, is_loopback
+from serve.limits import TOKEN_VARIABLE, Limits, is_loopback
 from serve.manage import listen, socket_path
 from serve.supervisor import Plan, Supervisor
 from trackfeatures.errors import UserError
 from trackfeatures.listening import address, bind
 
 BACKLOG = 2048
-TOKEN_VARIABLE = "DRIVERVIEW_TOKEN"
 MIN_TOKEN = 16
 
 

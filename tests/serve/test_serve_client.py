@@ -13,6 +13,7 @@ import pytest
 
 from serve.async_client import AsyncClient
 from serve.client import Client, ServiceError
+from serve.limits import Limits
 from tests.serve.conftest import CARD, FakeEngine, Served, jpeg, outputs, picture, png, serving
 from trackfeatures.listening import bind
 
@@ -48,6 +49,26 @@ def listener(behave: Callable[[socket.socket, int], object]) -> Iterator[str]:
 
 def reply(content: bytes, status: str = "200 OK") -> bytes:
     return b"HTTP/1.1 %s\r\nContent-Length: %d\r\n\r\n%s" % (status.encode(), len(content), content)
+
+
+def test_a_token_is_sent_as_given_or_as_the_environment_has_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    token = "a-token-of-some-length"
+    engine = FakeEngine(lambda _image: outputs())
+    with serving(engine, limits=Limits(token=token)) as service:
+        with Client(service.url) as unknown, pytest.raises(ServiceError, match="token") as refused:
+            unknown.features(JPEG)
+        assert refused.value.status == 401
+        with Client(service.url, token=token) as known:
+            assert known.features(JPEG)["model"] == CARD.model_hash
+        monkeypatch.setenv("DRIVERVIEW_TOKEN", token)
+
+        async def ask() -> str:
+            async with AsyncClient(service.url) as client:
+                return str((await client.features(JPEG))["model"])
+
+        assert asyncio.run(ask()) == CARD.model_hash
 
 
 def test_answers_come_as_the_service_gave_them(service: Served) -> None:
