@@ -29,8 +29,8 @@ from numpy.typing import NDArray
 
 from benchmarks.material.servers import model
 from mtlnet.card import GRAPH, WEIGHTS, read_card
-from mtlnet.convert import quantise
 from mtlnet.engine import best_precision
+from mtlnet.int8 import quantise
 from mtlnet.network import load_network
 
 CLAIMS = {"bf16": 0.40, "int8": 0.20}

@@ -1,12 +1,10 @@
 """`mtlnet export --model RUN --format onnx|openvino --precision f32|bf16|int8`: checked on frames.
 
 float32: as trained. bf16: weights stored in half the bytes, widened as they are read. int8
-(OpenVINO): weights and activations quantised by NNCF, calibrated on training frames, the heads left
-in float32; its accuracy gate is judged on test rounds.
+(OpenVINO): see `mtlnet.int8`; it is used by default once it has passed its gate on test rounds.
 """
 
 import logging
-import os
 from pathlib import Path
 from typing import Any
 
@@ -17,21 +15,17 @@ from numpy.typing import NDArray
 from datagen.recording import Dataset
 from mtlnet.answer import OUTPUTS
 from mtlnet.card import GRAPH, GRAPH_WEIGHTS, WEIGHTS, ModelError, check_files, read_card
-from mtlnet.engine import load_engine
-from mtlnet.evaluate import evaluate, require_fit
+from mtlnet.evaluate import require_fit
 from mtlnet.export import TOLERANCE
-from mtlnet.exported import ABOUT, gate, write_about
+from mtlnet.exported import ABOUT, write_about
+from mtlnet.int8 import MOST_LEFT, Gate, calibration_images, quantise
 from mtlnet.network import HEIGHT, WIDTH, Network, answer_images, load_network
 from trackfeatures.errors import UserError
 
 FORMATS, PRECISIONS = ("onnx", "openvino"), ("f32", "bf16", "int8")
 ONNX_FILE = "model.onnx"
 OPSET = 18
-CALIBRATION_FRAMES = 300
 LARGE = 256  # numbers; smaller constants are not worth half their bytes
-# Element-wise products are the heads', means of cells the texture's (`mtlnet.precise`): left in
-# float32.
-EXACT = ("Multiply", "ReduceSum", "Subtract", "Power", "AvgPool", "ReduceMean")
 
 
 def export_model(
@@ -68,25 +62,33 @@ def export_model(
     folder.mkdir(parents=True, exist_ok=True)
     (folder / ABOUT).unlink(missing_ok=True)  # killed from here on, there is no export at all
     network = load_network(run / WEIGHTS, card.network)
-    try:
-        if kind == "onnx":
-            names = write_onnx(network, folder, half=precision == "bf16")
-        else:
-            names = write_openvino(run, folder, precision, dataset)
-    except RuntimeError as error:  # how OpenVINO says that a write failed, without the reason
-        reason = str(error).strip().splitlines()[-1]
-        raise UserError(f"{folder} could not be written ({reason}); is the disk full?") from error
-    check = check_on(network, folder / names[0], precision, shown.read_batch(chosen))
-    about: dict[str, Any] = {"format": kind, "precision": precision, "check": check}
-    write_about(folder, card, names, **about)
+    images = shown.read_batch(chosen)
+    judged = Gate(run, dataset.path)
+    for left in range(1, MOST_LEFT + 1):
+        try:
+            if kind == "onnx":
+                names = write_onnx(network, folder, half=precision == "bf16")
+            else:
+                names = write_openvino(run, folder, precision, dataset, left)
+        except RuntimeError as error:  # how OpenVINO says that a write failed, without the reason
+            reason = str(error).strip().splitlines()[-1]
+            raise UserError(
+                f"{folder} could not be written ({reason}); is the disk full?"
+            ) from error
+        check = check_on(network, folder / names[0], precision, images)
+        about: dict[str, Any] = {"format": kind, "precision": precision, "check": check}
+        write_about(folder, card, names, **about)
+        if precision != "int8":
+            break
+        about |= {"layers_left": left, "gate": judged.judge()}
+        write_about(folder, card, names, **about)
+        if about["gate"]["passed"]:
+            break
     if precision == "f32" and not check["largest"] <= TOLERANCE:
         raise ModelError(
             f"{folder / names[0]} differs from torch by {check['largest']:.2g}, at most "
             f"{TOLERANCE:g} is expected; report this as a fault"
         )
-    if precision == "int8":
-        about["gate"] = judge_int8(run, dataset.path)
-        write_about(folder, card, names, **about)
     return {"model": card.name, "out": str(folder), "files": list(names), **about}
 
 
@@ -152,18 +154,20 @@ def halve_onnx(model: Any) -> None:
     model.graph.node.extend(nodes)
 
 
-def write_openvino(run: Path, folder: Path, precision: str, dataset: Dataset) -> tuple[str, ...]:
-    """Write `model.xml` and `model.bin`, made from the graph the run was published with."""
+def write_openvino(
+    run: Path, folder: Path, precision: str, dataset: Dataset, left: int
+) -> tuple[str, ...]:
+    """Write `model.xml` and `model.bin`, made from the graph the run was published with.
+
+    In int8 its last `left` shared layers are left as they are.
+    """
     import openvino
 
     model = openvino.Core().read_model(str(run / GRAPH))
     if precision == "bf16":
         halve_openvino(model)
     if precision == "int8":
-        train = dataset.select("train")
-        count = min(CALIBRATION_FRAMES, len(train))
-        rows = np.linspace(0, len(train) - 1, count).astype(np.int64)
-        model = quantise(model, train.read_batch(rows))
+        model = quantise(model, calibration_images(dataset.select("train")), left)
     openvino.save_model(model, str(folder / GRAPH), compress_to_fp16=False)
     return (GRAPH, GRAPH_WEIGHTS)
 
@@ -184,22 +188,6 @@ def halve_openvino(model: Any) -> None:
         widened.get_rt_info()["decompression_0"] = ""
         for reader in readers:
             reader.replace_source_output(widened.output(0))
-
-
-def quantise(model: Any, images: NDArray[np.uint8]) -> Any:
-    """The int8 form of a graph, calibrated on images (N, H, W, 3)."""
-    # NNCF tells its makers of every use unless it is said to run in a test.
-    os.environ["NNCF_CI"] = "1"
-    import nncf
-
-    nncf.set_log_level(logging.ERROR)
-    return nncf.quantize(
-        model,
-        nncf.Dataset([image[None] for image in images]),
-        subset_size=len(images),
-        preset=nncf.QuantizationPreset.MIXED,
-        ignored_scope=nncf.IgnoredScope(types=list(EXACT), validate=False),
-    )
 
 
 def check_on(
@@ -223,14 +211,3 @@ def check_on(
         "coded": float(difference[:, :6].max()),
         "probability": float(difference[:, 6:].max()),
     }
-
-
-def judge_int8(run: Path, data: Path) -> dict[str, Any]:
-    """The accuracy gate of the int8 graph of `run`, on the test rounds of `data`."""
-    results = [
-        evaluate(
-            [load_engine(run, "openvino", p) for _ in range(os.cpu_count() or 1)], data, "test"
-        )
-        for p in ("f32", "int8")
-    ]
-    return gate(*results)
