@@ -50,6 +50,7 @@ def labels() -> Labels:
         s=zeros,
         speed=zeros,
         shadow_fraction=zeros,
+        light=np.full(4, "clear"),
         round=count * 0,
     )
 
