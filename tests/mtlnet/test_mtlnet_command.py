@@ -68,7 +68,7 @@ def test_train_evaluate_and_predict(dataset: Path, tmp_path: Path) -> None:
     assert report["by_lanes"]["1"]["mae_m"] == report["mae_m"]
     assert report["baseline"]["angle_mae_rad"] == pytest.approx(0.04, abs=0.02)
     table = mtlnet("evaluate", "--model", run, "--data", dataset, "--every", "5")
-    assert "5 frames" in table.stdout
+    assert "on 5 test frames" in table.stdout
     assert "to lane centre (m)" in table.stdout
 
     unseen = shutil.copytree(dataset, tmp_path / "unseen")

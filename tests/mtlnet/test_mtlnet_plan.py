@@ -109,7 +109,7 @@ def test_another_network_learns(dataset: Path, name: str) -> None:
     trainer = Trainer(recipe, plan.default_alpha, 0, torch.device("cpu"), plan)
     trainer.standardise(loader)
     batch = loader.make(0)
-    totals = [float(trainer.step(batch, 0.05).total.detach()) for _ in range(8)]
+    totals = [float(trainer.step(batch, 0.05).total.detach()) for _ in range(12)]
     assert totals[-1] < 0.5 * totals[0]
 
 
