@@ -65,16 +65,7 @@ def export_model(
     images = shown.read_batch(chosen)
     judged = Gate(run, dataset.path)
     for left in range(1, MOST_LEFT + 1):
-        try:
-            if kind == "onnx":
-                names = write_onnx(network, folder, half=precision == "bf16")
-            else:
-                names = write_openvino(run, folder, precision, dataset, left)
-        except RuntimeError as error:  # how OpenVINO says that a write failed, without the reason
-            reason = str(error).strip().splitlines()[-1]
-            raise UserError(
-                f"{folder} could not be written ({reason}); is the disk full?"
-            ) from error
+        names = _write(run, network, folder, (kind, precision), dataset, left)
         check = check_on(network, folder / names[0], precision, images)
         about: dict[str, Any] = {"format": kind, "precision": precision, "check": check}
         write_about(folder, card, names, **about)
@@ -90,6 +81,20 @@ def export_model(
             f"{TOLERANCE:g} is expected; report this as a fault"
         )
     return {"model": card.name, "out": str(folder), "files": list(names), **about}
+
+
+def _write(
+    run: Path, network: Network, folder: Path, form: tuple[str, str], dataset: Dataset, left: int
+) -> tuple[str, ...]:
+    """Write the files of an export of this format and precision; their names."""
+    kind, precision = form
+    try:
+        if kind == "onnx":
+            return write_onnx(network, folder, half=precision == "bf16")
+        return write_openvino(run, folder, precision, dataset, left)
+    except RuntimeError as error:  # how OpenVINO says that a write failed, without the reason
+        reason = str(error).strip().splitlines()[-1]
+        raise UserError(f"{folder} could not be written ({reason}); is the disk full?") from error
 
 
 class Answering(torch.nn.Module):
