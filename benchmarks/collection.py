@@ -49,10 +49,10 @@ def draw_round(entry: dict[str, Any]) -> tuple[int, float, float]:
     with scene_of(RoundPlan.from_json(entry), None) as (drive, camera):
         drawn, wall_s, cpu_s = 0, 0.0, 0.0
         for moments in moments_of(drive, camera):
-            camera.render(moments[0].pose, moments[0].traffic)
+            moments[0].picture(camera)
             started, cpu = time.perf_counter(), time.process_time()
             for moment in moments:
-                camera.render(moment.pose, moment.traffic)
+                moment.picture(camera)
             wall_s += time.perf_counter() - started
             cpu_s += time.process_time() - cpu
             drawn += len(moments)

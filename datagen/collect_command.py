@@ -12,12 +12,15 @@ from trackfeatures.errors import UserError
 
 DEFAULT_FOLDER = Path("datasets/default")
 UNSEEN_FOLDER = Path("datasets/unseen")
-STRETCH = 200  # frames: 10 s, some 160 m
+FREQUENCY_HZ, STRETCH, SCENES = 20, 200, 0
 
 
 def collect(
     rounds: Annotated[int, typer.Option(help="How many rounds.")] = 60,
-    frames: Annotated[int, typer.Option(help="Frames a round, 20 a second.")] = 2000,
+    frames: Annotated[int, typer.Option(help="Frames a round.")] = 2000,
+    frequency: Annotated[
+        int, typer.Option(help="Frames a second; the car is steered 20 times a second or more.")
+    ] = FREQUENCY_HZ,
     out: Annotated[
         Path | None,
         typer.Option(
@@ -33,6 +36,10 @@ def collect(
     stretch: Annotated[
         int, typer.Option(help="Frames until scenery and light change; 0: never in a round.")
     ] = STRETCH,
+    scenes: Annotated[
+        int,
+        typer.Option(help="Sceneries a round, shown in turn; 0: another for every stretch."),
+    ] = SCENES,
     tracks_dir: Annotated[Path | None, typer.Option(help="Folder of TORCS tracks.")] = None,
     split_test_share: Annotated[float, typer.Option(help="Share of rounds for testing.")] = 0.25,
     split: Annotated[
@@ -71,10 +78,12 @@ def collect(
         rounds=rounds,
         frames=frames,
         seed=seed,
+        frequency_hz=frequency,
         tracks=choose_tracks(_names(tracks), tracks_dir, unseen=split == UNSEEN),
         lanes=_numbers(lanes),
         lights=_names(lights) or LIGHTS,
         stretch=stretch,
+        scenes=scenes,
         test_share=split_test_share,
         codec=codec,
         jitter_camera=jitter_camera,

@@ -118,8 +118,9 @@ def _dealt(cards: Sequence[Card], count: int, rng: np.random.Generator) -> list[
 
 
 def _lights(wanted: Wanted, rng: np.random.Generator) -> list[tuple[str, ...]]:
-    """The light of each stretch of each round: every light before one comes again."""
+    """The light of each scene of each round: every light before one comes again."""
     each = -(-wanted.frames // wanted.stretch) if wanted.stretch else 1
+    each = min(each, wanted.scenes or each)
     dealt = _dealt(wanted.lights, wanted.rounds * each, rng)
     return [tuple(dealt[each * number : each * (number + 1)]) for number in range(wanted.rounds)]
 

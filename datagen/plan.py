@@ -15,8 +15,11 @@ from datagen.recording.encoding import CODECS
 from datagen.recording.splits import UNSEEN
 from datagen.trajectory import KINDS as TRAJECTORIES
 from simulator.camera import KINDS as LIGHTS
+from simulator.dynamics import PHYSICS_HZ
+from simulator.world import check_frequency
 
 TEST_SHARE = 0.25
+CONTROL_HZ = 20
 SEEDS_A_PLAN = 1_000_000
 MOST_ROUNDS = SEEDS_A_PLAN // 2  # before its seeds meet those of another plan
 
@@ -49,9 +52,12 @@ class Wanted:
     test_share: float = TEST_SHARE
     codec: str = "jpeg"
     frequency_hz: int = 20
+    """Of the frames; the car is steered at `CONTROL_HZ` or more."""
     camera: CameraInfo = field(default_factory=CameraInfo)
     stretch: int = 0
     """After so many frames the scenery and the light are others; 0: never in a round."""
+    scenes: int = 0
+    """A round has at most so many, which come again in turn; 0: every stretch has its own."""
     jitter_camera: bool = False
     """Each round looks from a place, pitch and lens a little different from `camera`."""
     split: str = ""
@@ -68,8 +74,14 @@ class Wanted:
                 f"a stretch of {self.stretch} frames; give how many frames the scenery lasts, or 0 "
                 "for the whole round"
             )
+        if self.scenes < 0:
+            raise tf.UserError(
+                f"{self.scenes} scenes a round; give at least 1, or 0 for one of its own for every "
+                "stretch"
+            )
         if self.seed < 0:
             raise tf.UserError(f"the seed is {self.seed}; give a whole number from 0 up")
+        check_frequency(self.frequency_hz)
         for lanes in self.lanes:
             tf.check_lanes(lanes, tf.LANE_WIDTH_M)
         if not (self.lanes and self.tracks and self.lights):
@@ -99,7 +111,7 @@ class RoundPlan:
     traffic: int
     trajectory: str
     lights: tuple[str, ...]
-    """Of each stretch; every stretch has scenery of its own, too."""
+    """Of each scene; its stretches show them in turn, again and again where they are more."""
     stretch: int
     """Frames; 0: the round is one stretch."""
     speed_kmh: float
@@ -112,6 +124,14 @@ class RoundPlan:
     nominal_camera: CameraInfo
     """The dataset's camera, of which `camera` may be a jittered copy."""
     lane_width_m: float = tf.LANE_WIDTH_M
+
+    @property
+    def steps_a_frame(self) -> int:
+        """Control steps from one frame to the next: the car is steered at least 20 times a second,
+        at a rate that the physics' divides by."""
+        least = -(-CONTROL_HZ // self.frequency_hz)
+        whole = PHYSICS_HZ // self.frequency_hz
+        return next(steps for steps in range(least, whole + 1) if whole % steps == 0)
 
     @staticmethod
     def from_json(entry: dict[str, Any]) -> "RoundPlan":

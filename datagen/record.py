@@ -37,6 +37,7 @@ MOST_RESETS = 20
 # Steps are simulated, then drawn, then written, so many at a time: the driver needs no picture, and
 # code that is run again at once is twice as fast as code that waits for a picture in between.
 BATCH = 20
+MOST_SCENES = BATCH  # kept ready by the camera, so that none is built twice for one batch
 SCENERIES_APART = 2**40  # between the seeds of a round's sceneries: beyond the seed of any round
 
 
@@ -50,22 +51,32 @@ class Drive:
     driven_m: float = 0.0
     laps: int = 0
     resets: int = 0
+    steps: int = 0
     speed_sum: float = 0.0
     state: CarState = field(init=False)
+    sceneries: list[tuple[int, Light]] = field(init=False)
 
     def __post_init__(self) -> None:
+        self.sceneries = [scenery(self.plan, k) for k in range(len(self.plan.lights))]
         start = self.plan.start * self.world.road.track.length_m
         self._start(start, self.driver.offset_at(0.0))
+
+    def scenery_at(self, frame: int) -> tuple[int, Light]:
+        """Seed and light of what stands round the car at a frame."""
+        return self.sceneries[
+            frame // (self.plan.stretch or self.plan.frames) % len(self.sceneries)
+        ]
 
     def command(self) -> Command:
         return self.driver.command(self.state, self.world.traffic, self.driven_m)
 
     def step(self, command: Command) -> None:
         """One control step; a car that hits something or leaves the road is put back on it."""
+        self.steps += 1
         self.speed_sum += max(self.state.speed, 0.0)
         lap = self.state.lap
         self.state = self.world.step(command)
-        self.driven_m += max(self.state.speed, 0.0) / self.plan.frequency_hz
+        self.driven_m += max(self.state.speed, 0.0) / self.world.frequency_hz
         self.laps += self.state.lap - lap
         if self.state.collision or self.state.off_track or self.state.backwards:
             self.resets += 1
@@ -90,6 +101,7 @@ class Drive:
 class Moment:
     """A frame whose picture has not been taken yet."""
 
+    scenery: tuple[int, Light]
     pose: NDArray[np.float64]
     traffic: NDArray[np.float64]
     features: tf.TrackFeatures
@@ -98,6 +110,11 @@ class Moment:
     command: DriverCommand
     sensors: SensorReadings
     markings: tuple[NDArray[np.float64], ...]
+
+    def picture(self, camera: Camera) -> NDArray[np.uint8]:
+        """What the camera sees, (height, width, 3)."""
+        camera.change_scene(*self.scenery)
+        return camera.render(self.pose, self.traffic)
 
     def seen(self, image: NDArray[np.uint8]) -> Frame:
         return Frame(
@@ -125,7 +142,7 @@ def record_round(
         with RoundWriter(path, header, scene_lines(drive.world.road)) as writer:
             done = count(1)
             for moments in moments_of(drive, camera):
-                images = [camera.render(moment.pose, moment.traffic) for moment in moments]
+                images = [moment.picture(camera) for moment in moments]
                 for moment, image in zip(moments, images, strict=True):
                     writer.add(moment.seen(image))
                     progress(next(done))
@@ -133,30 +150,23 @@ def record_round(
                 laps=drive.laps,
                 resets=drive.resets,
                 distance_m=round(drive.driven_m, 3),
-                mean_speed_kmh=round(3.6 * drive.speed_sum / plan.frames, 3),
+                mean_speed_kmh=round(3.6 * drive.speed_sum / drive.steps, 3),
             )
 
 
 def moments_of(drive: Drive, camera: Camera) -> Iterator[list[Moment]]:
-    """All moments of a round from its beginning, some at a time, all of one stretch.
-
-    `camera` is not asked to draw, but shows the scene of the moments that were given last.
-    """
+    """All moments of a round from its beginning, some at a time."""
     suite = SensorSuite([s for s in STANDARD if s.name not in NOT_RECORDED])
-    plan = drive.plan
-    length = plan.stretch or plan.frames
-    for first in range(0, plan.frames, length):
-        if first:
-            camera.change_scene(*scenery(plan, first // length))
-        for start in range(first, min(first + length, plan.frames), BATCH):
-            end = min(start + BATCH, first + length, plan.frames)
-            yield [_next_moment(drive, camera, suite) for _ in range(start, end)]
+    frames = drive.plan.frames
+    for start in range(0, frames, BATCH):
+        batch = range(start, min(start + BATCH, frames))
+        yield [_next_moment(drive, camera, suite, drive.scenery_at(frame)) for frame in batch]
 
 
-def scenery(plan: RoundPlan, stretch: int) -> tuple[int, Light]:
-    """Seed and light of a stretch, number 0 the first: no other round's."""
-    rng = np.random.default_rng([plan.seed, 2, stretch])
-    return plan.seed + stretch * SCENERIES_APART, Light.named(plan.lights[stretch], rng)
+def scenery(plan: RoundPlan, number: int) -> tuple[int, Light]:
+    """Seed and light of a round's scene, number 0 the first: no other round's."""
+    rng = np.random.default_rng([plan.seed, 2, number])
+    return plan.seed + number * SCENERIES_APART, Light.named(plan.lights[number], rng)
 
 
 @lru_cache(maxsize=16)
@@ -181,11 +191,12 @@ def scene_of(plan: RoundPlan, tracks_dir: Path | None) -> Iterator[tuple[Drive, 
     speed = plan.speed_kmh / 3.6
     longest = plan.frames / plan.frequency_hz * speed * 1.1 + 50.0
     course = make_course(plan.trajectory, road, longest, np.random.default_rng([plan.seed, 3]))
+    control_hz = plan.frequency_hz * plan.steps_a_frame
     about = plan.camera
     seed, light = scenery(plan, 0)
     mount = Mount(about.x, about.y, about.z, about.pitch_deg, about.fov_y_deg)
     with (
-        World(road, traffic=plan.traffic, frequency_hz=plan.frequency_hz) as world,
+        World(road, traffic=plan.traffic, frequency_hz=control_hz) as world,
         Camera(
             road,
             seed=seed,
@@ -193,9 +204,10 @@ def scene_of(plan: RoundPlan, tracks_dir: Path | None) -> Iterator[tuple[Drive, 
             mount=mount,
             width=about.width,
             height=about.height,
+            scenes=MOST_SCENES,
         ) as camera,
     ):
-        driver = ScriptedDriver(road, course, speed, plan.frequency_hz)
+        driver = ScriptedDriver(road, course, speed, control_hz)
         yield Drive(plan, world, driver), camera
 
 
@@ -221,11 +233,15 @@ def _header(plan: RoundPlan, plan_hash: str, road: Road) -> RoundHeader:
     )
 
 
-def _next_moment(drive: Drive, camera: Camera, suite: SensorSuite) -> Moment:
-    """Everything true now and the command that is given, which is then carried out."""
+def _next_moment(
+    drive: Drive, camera: Camera, suite: SensorSuite, scene: tuple[int, Light]
+) -> Moment:
+    """Everything true now and the command that is given; then the car goes on to the next."""
+    camera.change_scene(*scene)
     world, now = drive.world, drive.state
     road, pose, command = world.road, world.body_pose(), drive.command()
     moment = Moment(
+        scenery=scene,
         pose=pose,
         traffic=world.traffic.poses(),
         features=world.features(),
@@ -253,6 +269,8 @@ def _next_moment(drive: Drive, camera: Camera, suite: SensorSuite) -> Moment:
         markings=tuple(marking_polylines(camera, road, (now.s, pose), ANNOTATED_M)),
     )
     drive.step(command)
+    for _ in range(drive.plan.steps_a_frame - 1):
+        drive.step(drive.command())
     return moment
 
 

@@ -70,7 +70,7 @@ def differences(
                     if number >= len(here.log_time) or here.payload(number) != data:
                         first.setdefault(topic, number)
                 if pixels and not _same_image(
-                    index, number, encode(camera.render(moment.pose, moment.traffic), entry.codec)
+                    index, number, encode(moment.picture(camera), entry.codec)
                 ):
                     first.setdefault(topics.CAMERA, number)
                 number += 1

@@ -37,7 +37,7 @@ class RoundHeader:
     traffic: int
     trajectory: str
     lights: tuple[str, ...]
-    """Of each stretch of the round, in turn; each has scenery of its own."""
+    """Of each scene of the round: its stretches show them in turn, and again."""
     speed_kmh: float
     stretch: int = 0
     """Frames; 0: the round is one stretch."""

@@ -39,6 +39,24 @@ def check_size(width: int, height: int) -> None:
 
 
 @dataclass(frozen=True)
+class _Setting:
+    """One scenery under one light, in the graphics memory; `frame` is its block of uniforms."""
+
+    light: Light
+    scene: Scene
+    sky: Sky
+    fall: Fall | None
+    frame: NDArray[np.float32]
+    first_paint: int
+
+    def release(self) -> None:
+        """Free the graphics memory."""
+        for part in (self.scene, self.sky, self.fall):
+            if part is not None:
+                part.release()
+
+
+@dataclass(frozen=True)
 class _Shot:
     """One aimed view: the eye, what of the scene it may see, and the cars, nearest first."""
 
@@ -51,8 +69,9 @@ class _Shot:
 class Camera:
     """Draws one scene: `road` with the scenery of `seed` under `light`.
 
-    Cameras of a process share one OpenGL context (see `context`); use them from one thread. The
-    same road, seed, light, pose and cars give the same bytes on the same renderer.
+    It keeps the last `scenes` it showed ready. Cameras of a process share one OpenGL context (see
+    `context`); use them from one thread. The same road, seed, light, pose and cars give the same
+    bytes on the same renderer.
     Raises UserError for a picture size out of range, NoRendererError without EGL.
     """
 
@@ -65,6 +84,7 @@ class Camera:
         mount: Mount = DRIVER_SEAT,
         width: int = 280,
         height: int = 210,
+        scenes: int = 1,
     ) -> None:
         check_size(width, height)
         self.road, self.mount = road, mount
@@ -72,21 +92,42 @@ class Camera:
         self._graphics: Graphics = graphics()
         self._cars = cars_of(self._graphics)
         self._survey = Survey.of(road)
-        self._scene: Scene | None = None
+        self._keeps = scenes
+        self._settings: dict[tuple[int, Light], _Setting] = {}
+        self._shown: _Setting | None = None
         self._last_s: float | None = None
         self.change_scene(seed, light)
 
+    @property
+    def light(self) -> Light:
+        """The light it draws under."""
+        return self._setting.light
+
     def change_scene(self, seed: int, light: Light) -> None:
         """Go on with the scenery of another `seed` under another `light`, on the same road."""
-        self.close()
-        self.light = light
-        self._fall = Fall(self._graphics, light, seed) if light.falling > 0.0 else None
-        self._scene = Scene(self._graphics, self.road, self._survey, seed, light)
-        self._frame = np.concatenate([np.zeros(24), *_light_rows(light)]).astype(np.float32)
-        self._set_frame(optics.eye_of(self.mount, np.zeros(6), "front"), self.intrinsics)
-        self._sky = Sky(self._graphics, light.weather, float(self.intrinsics[0, 0]))
-        # Cars of different rounds differ in colour; from the second on, so as to spare our own.
-        self._first_paint = 1 + seed % 5
+        self._shown = None
+        found = self._settings.pop((seed, light), None)
+        if found is None:
+            while len(self._settings) >= self._keeps:
+                self._settings.pop(next(iter(self._settings))).release()
+            found = self._set_up(seed, light)
+        # Shown last comes last: the first is the one to go.
+        self._settings[seed, light] = self._shown = found
+
+    def _set_up(self, seed: int, light: Light) -> _Setting:
+        graphics = self._graphics
+        frame = np.concatenate([np.zeros(24), *_light_rows(light)]).astype(np.float32)
+        self._set_frame(frame, optics.eye_of(self.mount, np.zeros(6), "front"))
+        return _Setting(
+            light,
+            Scene(graphics, self.road, self._survey, seed, light),
+            # Painted under the light of the frame that is set.
+            Sky(graphics, light.weather, float(self.intrinsics[0, 0])),
+            Fall(graphics, light, seed) if light.falling > 0.0 else None,
+            frame,
+            # Cars of different rounds differ in colour; from the second on, so as to spare our own.
+            first_paint=1 + seed % 5,
+        )
 
     def render(
         self, body_pose: ArrayLike, others: ArrayLike | None = None, view: str = "front"
@@ -131,36 +172,36 @@ class Camera:
 
     def _aim(self, body_pose: ArrayLike, others: ArrayLike | None, view: str) -> _Shot:
         """Point at a view and find what it may show."""
-        scene = self._open_scene()
+        setting = self._setting
         eye = optics.eye_of(self.mount, body_pose, view)
-        matrix = self.intrinsics
-        self._set_frame(eye, matrix)
-        planes = optics.frustum(eye, matrix)
+        self._set_frame(setting.frame, eye)
+        planes = optics.frustum(eye, self.intrinsics)
         cars, paints = self._cars_in_view(body_pose, others, view)
         chosen = self._cars.seen(cars, eye.place, planes)
-        return _Shot(eye, scene.seen(eye, planes), cars[chosen], [paints[k] for k in chosen])
+        return _Shot(
+            eye, setting.scene.seen(eye, planes), cars[chosen], [paints[k] for k in chosen]
+        )
 
     def _draw_colours(self, shot: _Shot) -> NDArray[np.uint8]:
-        scene, place = self._open_scene(), shot.eye.place
+        setting, place = self._setting, shot.eye.place
         target = self._graphics.targets.of(self.width, self.height, labels=False)
         self._graphics.begin(target)
         self._cars.draw(shot.cars, shot.paints, place, labels=False)
-        scene.draw(shot.seen, labels=False)
-        self._sky.draw()
+        setting.scene.draw(shot.seen, labels=False)
+        setting.sky.draw()
         self._graphics.blend()
-        self._cars.draw_shadows(shot.cars, place, self.light)
-        scene.draw_blended(shot.seen)
-        if self._fall is not None:
-            self._fall.draw(shot.eye, self.intrinsics[0, 0])
+        self._cars.draw_shadows(shot.cars, place, setting.light)
+        setting.scene.draw_blended(shot.seen)
+        if setting.fall is not None:
+            setting.fall.draw(shot.eye, self.intrinsics[0, 0])
         return target.colours()
 
     def _draw_labels(self, shot: _Shot) -> NDArray[np.float32]:
         """Depth and class (height, width, 2) of what `_draw_colours` draws, rain and snow apart."""
-        scene = self._open_scene()
         target = self._graphics.targets.of(self.width, self.height, labels=True)
         self._graphics.begin(target, labels=True)
         self._cars.draw(shot.cars, shot.paints, shot.eye.place, labels=True)
-        scene.draw(shot.seen, labels=True)
+        self._setting.scene.draw(shot.seen, labels=True)
         return target.labels()
 
     @property
@@ -184,13 +225,10 @@ class Camera:
         return optics.project(optics.eye_of(self.mount, body_pose, view), self.intrinsics, points)
 
     def close(self) -> None:
-        """Free the scene's graphics memory; the camera draws no more."""
-        if self._scene is not None:
-            self._scene.release()
-            self._scene = None
-            self._sky.release()
-            if self._fall is not None:
-                self._fall.release()
+        """Free the scenes' graphics memory; the camera draws no more."""
+        for setting in self._settings.values():
+            setting.release()
+        self._settings, self._shown = {}, None
 
     def __enter__(self) -> Self:
         return self
@@ -208,29 +246,30 @@ class Camera:
         pose = np.asarray(body_pose, dtype=np.float64)
         s, _ = self.road.track.project(float(pose[0]), float(pose[1]), self._last_s)
         self._last_s = s
-        return self._open_scene().mask.fraction(s, self.road.half_asphalt)
+        return self._setting.scene.mask.fraction(s, self.road.half_asphalt)
 
     def _cars_in_view(
         self, body_pose: ArrayLike, others: ArrayLike | None, view: str
     ) -> tuple[FloatArray, list[int]]:
         """Poses (n, 6) on the ground of the cars to draw, and the number of each one's paint."""
         poses = np.asarray(() if others is None else others, dtype=np.float64).reshape(-1, 6)
-        paints = [self._first_paint + k for k in range(len(poses))]
+        first = self._setting.first_paint
+        paints = [first + k for k in range(len(poses))]
         if view in ("chase", "top"):
             own = np.asarray(body_pose, dtype=np.float64).copy()
             own[:3] -= optics.rotation(*own[3:])[:, 2] * CarParameters.cg_height
             poses, paints = np.vstack([poses, own]), [*paints, _OWN_PAINT]
         return poses, paints
 
-    def _open_scene(self) -> Scene:
-        if self._scene is None:
+    @property
+    def _setting(self) -> _Setting:
+        if self._shown is None:
             raise RuntimeError("this camera is closed; make a new one")
-        return self._scene
+        return self._shown
 
-    def _set_frame(self, eye: optics.Eye, matrix: FloatArray) -> None:
-        """Fill the uniform block `Frame` of frame.glsl."""
-        clip = optics.clip_matrix(eye, matrix, self.width, self.height)
-        block = self._frame
+    def _set_frame(self, block: NDArray[np.float32], eye: optics.Eye) -> None:
+        """Fill the uniform block `Frame` of frame.glsl, which `block` keeps."""
+        clip = optics.clip_matrix(eye, self.intrinsics, self.width, self.height)
         block[:16] = clip.T.reshape(-1)
         block[16:19], block[20:23] = eye.place, eye.axes[2]
         self._graphics.frame.write(block.tobytes())

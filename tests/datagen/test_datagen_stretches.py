@@ -52,6 +52,36 @@ def test_scenery_and_light_change_where_a_stretch_ends(tmp_path: Path) -> None:
     assert replay(folder, 1)[1] == []
 
 
+def test_scenes_come_again_in_turn(tmp_path: Path) -> None:
+    folder = tmp_path / "data"
+    options = ("--rounds", "1", "--frames", "24", "--tracks", "oval", "--lights", "clear,fog")
+    done = datagen("collect", "--out", folder, *options, "--stretch", "2", "--scenes", "3")
+    assert done.returncode == 0, done.stderr
+    frames = Dataset.open(folder).select("all")
+    lights = frames.rounds[0].lights
+    assert len(lights) == 3
+    assert frames.labels.light.tolist() == [lights[k // 2 % 3] for k in range(24)]
+    # A frame looks more like that of its scene, 6 before it, than like those of the others.
+    images = frames.read_batch(range(24)).astype(np.int16)
+    for now in range(6, 24):
+        apart = [np.abs(images[now] - images[now - back]).mean() for back in (2, 4, 6)]
+        assert apart[2] < min(apart[:2])
+    assert replay(folder, 1, pixels=True)[1] == []
+
+
+def test_fewer_scenes_than_stretches_are_dealt() -> None:
+    plan = make_plan(Wanted(rounds=5, frames=500, seed=3, tracks=TRACKS, stretch=20, scenes=7))
+    assert [len(entry.lights) for entry in plan.rounds] == [7] * 5
+    plan = make_plan(Wanted(rounds=5, frames=500, seed=3, tracks=TRACKS, stretch=200, scenes=7))
+    assert [len(entry.lights) for entry in plan.rounds] == [3] * 5
+
+
+def test_scenes_below_nought_are_refused() -> None:
+    done = datagen("collect", "--scenes", "-1", "--dry-run")
+    assert done.returncode != 0
+    assert "-1 scenes a round" in done.stderr
+
+
 def test_a_negative_stretch_is_refused() -> None:
     done = datagen("collect", "--stretch", "-1", "--dry-run")
     assert done.returncode != 0

@@ -47,7 +47,7 @@ def test_heavy_shadow_covers_30_to_80_percent_of_every_road(name: str) -> None:
         with Camera(
             road, seed=seed, light=light("heavy-shadow", seed), width=8, height=8
         ) as camera:
-            mask = camera._open_scene().mask
+            mask = camera._setting.scene.mask
         places = np.arange(0.0, road.track.length_m, 3.0)
         shares = [mask.fraction(float(s), road.half_asphalt) for s in places]
         assert min(shares) >= 0.3, (lanes, seed)
@@ -58,7 +58,7 @@ def test_heavy_shadow_covers_30_to_80_percent_of_every_road(name: str) -> None:
 def lit_and_dark(camera: Camera, s: float) -> tuple[FloatArray, FloatArray]:
     """Light (not display values) of road pixels 3 to 15 m ahead that the mask has in the sun, and
     in the shade, away from the lines and the shadows' edges."""
-    road, mask = camera.road, camera._open_scene().mask
+    road, mask = camera.road, camera._setting.scene.mask
     pose = standing_pose(road, s, 0.0)
     grey = np.square(camera.render(pose) / 255.0).mean(axis=2)
     at_s, at_y = np.meshgrid(s + np.arange(3.0, 15.0, 0.1), np.arange(-3.4, -0.6, 0.1))
@@ -93,7 +93,7 @@ def test_shadows_are_hard_edged() -> None:
     """Few texels of the mask lie between light and shade: an edge is about a texel wide."""
     road = Road(find_track("forest"), 2)
     with Camera(road, seed=3, light=light("heavy-shadow", 3)) as camera:
-        strip = camera._open_scene().mask.strip
+        strip = camera._setting.scene.mask.strip
     half = round(road.half_asphalt / shade.TEXEL_M)
     middle = strip.shape[0] // 2
     asphalt = strip[middle - half : middle + half]
@@ -107,7 +107,7 @@ def test_no_shadow_ends_in_a_line_beside_the_road(kind: str) -> None:
     """The rows at the mask's rim hold the land's even shade, and there is no step towards them."""
     road = Road(find_track("forest"), 2)
     with Camera(road, seed=3, light=light(kind, 3)) as camera:
-        strip = camera._open_scene().mask.strip.astype(np.float64)
+        strip = camera._setting.scene.mask.strip.astype(np.float64)
     assert strip.shape[0] * shade.TEXEL_M > 2 * (road.wall_offset + 10.0)
     for rows in (strip, strip[::-1]):
         assert rows[:4].std(axis=0).max() < 1.0
