@@ -12,7 +12,8 @@ from trackfeatures.errors import UserError
 
 DEFAULT_FOLDER = Path("datasets/default")
 UNSEEN_FOLDER = Path("datasets/unseen")
-FREQUENCY_HZ, STRETCH, SCENES = 20, 200, 0
+FREQUENCY_HZ = 20
+STRETCH = 1  # frames: neighbours that look alike are one picture to a network
 
 
 def collect(
@@ -34,12 +35,11 @@ def collect(
     lanes: Annotated[str, typer.Option(help="Lane counts, by commas.")] = "1,2,3",
     lights: Annotated[str, typer.Option(help="Lights, by commas; empty: all.")] = "",
     stretch: Annotated[
-        int, typer.Option(help="Frames until scenery and light change; 0: never in a round.")
+        int, typer.Option(help="Frames until another scenery's turn; 0: a round shows one.")
     ] = STRETCH,
     scenes: Annotated[
-        int,
-        typer.Option(help="Sceneries a round, shown in turn; 0: another for every stretch."),
-    ] = SCENES,
+        int, typer.Option(help="Sceneries a round, shown in turn; 0: one for every 200 frames.")
+    ] = 0,
     tracks_dir: Annotated[Path | None, typer.Option(help="Folder of TORCS tracks.")] = None,
     split_test_share: Annotated[float, typer.Option(help="Share of rounds for testing.")] = 0.25,
     split: Annotated[

@@ -14,6 +14,7 @@ import numpy as np
 from datagen.balance import balanced
 from datagen.forecast import Forecast
 from datagen.plan import (
+    FRAMES_A_SCENE,
     SEEDS_A_PLAN,
     TRAJECTORIES,
     Plan,
@@ -119,8 +120,8 @@ def _dealt(cards: Sequence[Card], count: int, rng: np.random.Generator) -> list[
 
 def _lights(wanted: Wanted, rng: np.random.Generator) -> list[tuple[str, ...]]:
     """The light of each scene of each round: every light before one comes again."""
-    each = -(-wanted.frames // wanted.stretch) if wanted.stretch else 1
-    each = min(each, wanted.scenes or each)
+    stretches = -(-wanted.frames // wanted.stretch) if wanted.stretch else 1
+    each = min(stretches, wanted.scenes or max(1, wanted.frames // FRAMES_A_SCENE))
     dealt = _dealt(wanted.lights, wanted.rounds * each, rng)
     return [tuple(dealt[each * number : each * (number + 1)]) for number in range(wanted.rounds)]
 

@@ -20,6 +20,7 @@ from simulator.world import check_frequency
 
 TEST_SHARE = 0.25
 CONTROL_HZ = 20
+FRAMES_A_SCENE = 200  # to build one takes as long as some thirty pictures
 SEEDS_A_PLAN = 1_000_000
 MOST_ROUNDS = SEEDS_A_PLAN // 2  # before its seeds meet those of another plan
 
@@ -57,7 +58,7 @@ class Wanted:
     stretch: int = 0
     """After so many frames the scenery and the light are others; 0: never in a round."""
     scenes: int = 0
-    """A round has at most so many, which come again in turn; 0: every stretch has its own."""
+    """A round shows so many in turn, again and again; 0: one for every `FRAMES_A_SCENE`."""
     jitter_camera: bool = False
     """Each round looks from a place, pitch and lens a little different from `camera`."""
     split: str = ""
@@ -76,8 +77,8 @@ class Wanted:
             )
         if self.scenes < 0:
             raise tf.UserError(
-                f"{self.scenes} scenes a round; give at least 1, or 0 for one of its own for every "
-                "stretch"
+                f"{self.scenes} scenes a round; give at least 1, or 0 for one for every "
+                f"{FRAMES_A_SCENE} frames"
             )
         if self.seed < 0:
             raise tf.UserError(f"the seed is {self.seed}; give a whole number from 0 up")

@@ -18,7 +18,7 @@ from serve.limits import MAX_HEAD_BYTES, Limits
 from serve.problems import HEAD_TOO_LARGE, MALFORMED, TOO_MANY_CONNECTIONS, TOO_SLOW, Kind, Problem
 
 LINGER_S = 0.5  # for a client to read why it was dismissed, before the connection is cut
-EVICTABLE_S = 0.5  # headers or a body that take longer make room for another connection
+EVICTABLE_S = 0.1  # headers or a body that take longer make room for another connection
 
 
 class Phase(Enum):
@@ -39,6 +39,8 @@ class Guard:
     others: Callable[[], int] = lambda: 0
     dismissed: Callable[[Kind], None] = lambda _kind: None
     draining: bool = field(default=False)
+    unfinished: dict["GuardedProtocol", None] = field(default_factory=dict)
+    """Those in the middle of headers or a body, the one that has been for longest first."""
 
 
 class GuardedProtocol(HttpToolsProtocol):
@@ -64,8 +66,7 @@ class GuardedProtocol(HttpToolsProtocol):
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         super().connection_made(transport)
-        self._since = self.loop.time()
-        self._due = self._since + self._guard.limits.head_s
+        self._await(Phase.HEAD)
         limit = self._guard.limits.connections
         if len(self.connections) + self._guard.others() > limit and not self._make_room():
             detail = f"{limit} connections are open already; keep one open for all requests"
@@ -75,9 +76,8 @@ class GuardedProtocol(HttpToolsProtocol):
         if self._phase is Phase.DISMISSED:
             return
         if self._phase is Phase.IDLE:
-            self._phase, self._unread_bytes = Phase.HEAD, 0
-            self._since = self.loop.time()
-            self._due = self._since + self._guard.limits.head_s
+            self._unread_bytes = 0
+            self._await(Phase.HEAD)
         self._part_bytes = len(data)
         self._unread_bytes += self._part_bytes
         super().data_received(data)
@@ -91,9 +91,7 @@ class GuardedProtocol(HttpToolsProtocol):
             self._head_bytes = len(self.url) + sum(len(k) + len(v) for k, v in self.headers)
             if self._head_bytes > MAX_HEAD_BYTES:
                 raise ValueError("headers too large")  # ends in `send_400_response`
-        self._phase = Phase.BODY
-        self._since = self.loop.time()
-        self._due = self._since + self._guard.limits.body_s
+        self._await(Phase.BODY)
 
     def on_headers_complete(self) -> None:
         self.check_head()
@@ -107,7 +105,7 @@ class GuardedProtocol(HttpToolsProtocol):
         if self.cycle is None or self.cycle.response_complete:
             self._rest()
         else:
-            self._phase, self._due = Phase.WORK, inf
+            self._leave(Phase.WORK)
 
     def on_message_complete(self) -> None:
         self.body_is_whole()
@@ -123,13 +121,30 @@ class GuardedProtocol(HttpToolsProtocol):
         if self._phase is Phase.WORK:
             self._rest()
 
+    def connection_lost(self, exc: Exception | None) -> None:
+        self._leave(Phase.DISMISSED)
+        super().connection_lost(exc)
+
     def _rest(self) -> None:
         """Wait for the next request."""
-        self._phase = Phase.IDLE
+        self._leave(Phase.IDLE)
         self._due = self.loop.time() + self._guard.limits.idle_s
 
+    def _await(self, phase: Phase) -> None:
+        """Wait for headers or a body that began now."""
+        limits, unfinished = self._guard.limits, self._guard.unfinished
+        self._phase, self._since = phase, self.loop.time()
+        self._due = self._since + (limits.head_s if phase is Phase.HEAD else limits.body_s)
+        unfinished.pop(self, None)
+        unfinished[self] = None
+
+    def _leave(self, phase: Phase) -> None:
+        """Wait no more for headers or a body."""
+        self._phase, self._due = phase, inf
+        self._guard.unfinished.pop(self, None)
+
     def handle_websocket_upgrade(self) -> None:
-        self._due = inf
+        self._leave(Phase.WORK)
         super().handle_websocket_upgrade()
 
     def send_400_response(self, msg: str) -> None:
@@ -157,32 +172,24 @@ class GuardedProtocol(HttpToolsProtocol):
         if self._phase is Phase.BODY:
             what, within = "body", self._guard.limits.body_s
         if self._phase is Phase.HEAD and not self._unread_bytes:
-            self._phase, self._due = Phase.DISMISSED, inf
+            self._leave(Phase.DISMISSED)
             self.transport.abort()  # it never asked for anything
             return
         self._dismiss(Problem(TOO_SLOW, f"the {what} did not come within {within:g} s"))
 
     def _make_room(self) -> bool:
         """Cut the connection that has sent too little for longest; False where there is none."""
-        now = self.loop.time()
-        slow = [
-            found
-            for found in self.connections
-            if isinstance(found, GuardedProtocol)
-            and found._phase in (Phase.HEAD, Phase.BODY)
-            and now - found._since > EVICTABLE_S
-        ]
-        if not slow:
+        oldest = next(iter(self._guard.unfinished))  # at the latest this one itself
+        if self.loop.time() - oldest._since <= EVICTABLE_S:
             return False
-        oldest = min(slow, key=lambda found: found._since)
-        oldest._phase, oldest._due = Phase.DISMISSED, inf
+        oldest._leave(Phase.DISMISSED)
         oldest.transport.abort()
         self._guard.dismissed(TOO_MANY_CONNECTIONS)
         return True
 
     def _dismiss(self, problem: Problem) -> None:
         """Say why, and cut the connection."""
-        self._phase, self._due = Phase.DISMISSED, inf
+        self._leave(Phase.DISMISSED)
         self._guard.dismissed(problem.kind)
         if self.cycle is not None and not self.cycle.response_complete:
             self.cycle.disconnected = True

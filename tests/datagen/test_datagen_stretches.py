@@ -16,7 +16,7 @@ TRACKS = (TrackChoice("oval", "0"),)
 
 
 def test_every_light_comes_before_one_comes_again() -> None:
-    plan = make_plan(Wanted(rounds=6, frames=500, seed=3, tracks=TRACKS, stretch=60))
+    plan = make_plan(Wanted(rounds=6, frames=500, seed=3, tracks=TRACKS, stretch=60, scenes=9))
     lights = [light for entry in plan.rounds for light in entry.lights]
     assert [len(entry.lights) for entry in plan.rounds] == [9] * 6
     for first in range(0, len(lights) - len(LIGHTS), len(LIGHTS)):
@@ -29,7 +29,7 @@ def test_without_stretches_a_round_has_one_light() -> None:
 
 
 def test_no_two_stretches_have_the_same_scenery() -> None:
-    plan = make_plan(Wanted(rounds=40, frames=100, seed=3, tracks=TRACKS, stretch=10))
+    plan = make_plan(Wanted(rounds=40, frames=100, seed=3, tracks=TRACKS, stretch=10, scenes=10))
     seen = [scenery(entry, k) for entry in plan.rounds for k in range(10)]
     assert len({seed for seed, _ in seen}) == 400
     assert len({(light.exposure, light.haze_per_km) for _, light in seen}) == 400
@@ -37,8 +37,8 @@ def test_no_two_stretches_have_the_same_scenery() -> None:
 
 def test_scenery_and_light_change_where_a_stretch_ends(tmp_path: Path) -> None:
     folder = tmp_path / "data"
-    options = ("--rounds", "1", "--frames", "70", "--tracks", "oval", "--workers", "1")
-    done = datagen("collect", "--out", folder, *options, "--stretch", "25", "--lights", "clear,fog")
+    options = ("--rounds", "1", "--frames", "70", "--tracks", "oval", "--lights", "clear,fog")
+    done = datagen("collect", "--out", folder, *options, "--stretch", "25", "--scenes", "3")
     assert done.returncode == 0, done.stderr
     frames = Dataset.open(folder).select("all")
     assert set(frames.rounds[0].lights) == {"clear", "fog"}

@@ -107,7 +107,7 @@ def test_one_connection_too_many_is_told_so_and_room_is_made_again() -> None:
 def test_connections_that_ask_for_nothing_make_room() -> None:
     with limited(Limits(connections=4)) as service:
         idle = [dial(service) for _ in range(4)]
-        time.sleep(0.6)  # for so long they could still have begun
+        time.sleep(0.2)  # for half of that they could still have begun
         assert service.post(JPEG).status == 200
         assert ends(idle[0])
 
@@ -122,7 +122,7 @@ def test_slow_headers_and_bodies_make_room_but_not_who_is_served() -> None:
         slow[0].sendall(HEAD + b"Content-Length: 1000\r\n\r\n" + JPEG[:10])
         for connection in slow[1:]:
             connection.sendall(HEAD)
-        time.sleep(0.6)
+        time.sleep(0.2)
         assert service.post(JPEG).status == 200
         assert [c for c in slow if _is_cut(c)] != []
         steady.sendall(whole)
