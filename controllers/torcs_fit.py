@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from controllers.drive import GEAR, THROTTLE
 from controllers.feedback import Feedback
 from controllers.observation import Observation
-from simulator.dynamics import PHYSICS_HZ
+from simulator.rate import PHYSICS_HZ
 from simulator.state import CarState, Command
 from simulator.track.catalogue import find_track
 from simulator.track.road import Road

@@ -15,8 +15,7 @@ from datagen.recording.encoding import CODECS
 from datagen.recording.splits import UNSEEN
 from datagen.trajectory import KINDS as TRAJECTORIES
 from simulator.camera import KINDS as LIGHTS
-from simulator.dynamics import PHYSICS_HZ
-from simulator.world import check_frequency
+from simulator.rate import PHYSICS_HZ, check_frequency
 
 TEST_SHARE = 0.25
 CONTROL_HZ = 20

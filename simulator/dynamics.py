@@ -15,12 +15,12 @@ from simulator.compiled import compiled
 from simulator.engine import clutch, free_engine_speed, gear_ratio
 from simulator.ground import Ground
 from simulator.orientation import rotation
+from simulator.rate import PHYSICS_HZ
 from simulator.track.kernel import Table, locate, surface
 from simulator.wheels import ALONG, WHEEL, add_tyres, feel, stand, tyre_grips
 
 Vector = NDArray[np.float64]
 
-PHYSICS_HZ = 200
 DT = 1.0 / PHYSICS_HZ
 
 # What the car remembers between steps beside its body's motion: `memory`, shape (MEMORY,).

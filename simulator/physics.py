@@ -13,7 +13,7 @@ import pybullet
 from numpy.typing import NDArray
 
 from simulator.car import CarParameters
-from simulator.dynamics import PHYSICS_HZ
+from simulator.rate import PHYSICS_HZ
 from simulator.walls import PANEL, Panel
 from trackfeatures.errors import UserError
 

@@ -11,12 +11,13 @@ from numpy.typing import NDArray
 
 import trackfeatures as tf
 from simulator.car import HIGHEST_GEAR, LOWEST_GEAR, RPM, CarParameters
-from simulator.dynamics import ENGINE, MEMORY, MOTION, ODOMETER, PHYSICS_HZ, PIECE, SPIN, STEER
+from simulator.dynamics import ENGINE, MEMORY, MOTION, ODOMETER, PIECE, SPIN, STEER
 from simulator.engine import gear_ratio
 from simulator.flight import fly
 from simulator.ground import ground
 from simulator.impacts import Impacts
 from simulator.orientation import quaternion
+from simulator.rate import PHYSICS_HZ, check_frequency
 from simulator.readout import (
     ALONG,
     ANGLE,
@@ -255,15 +256,6 @@ class World:
         elif moved > 0.5 * length:
             self._lap -= 1
         self._s = s
-
-
-def check_frequency(frequency_hz: int) -> None:
-    """Raises UserError for a control rate that the physics cannot keep."""
-    if not 1 <= frequency_hz <= PHYSICS_HZ or PHYSICS_HZ % frequency_hz:  # true for NaN, too
-        raise UserError(
-            f"a control frequency of {frequency_hz} Hz does not divide the physics' "
-            f"{PHYSICS_HZ} Hz; choose for example 10, 20, 40 or 50"
-        )
 
 
 def check_seed(seed: int) -> None:

@@ -68,6 +68,7 @@ def run_demo(config: DemoConfig) -> DemoResult:
     data, run = str(config.out / "data"), str(config.out / "run")
     collect = ["datagen", "collect", "--out", data, "--json"]
     collect += ["--rounds", str(config.rounds), "--frames", str(config.frames)]
+    collect += ["--scenes", "4"]  # rounds so short would show one each
     collect += ["--tracks", config.tracks, "--seed", str(config.seed)]
     train = ["mtlnet", "train", "--data", data, "--out", run, "--alpha", config.alpha]
     train += ["--recipe", "fast", "--minutes", f"{config.minutes:g}", "--seed", str(config.seed)]

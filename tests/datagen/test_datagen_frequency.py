@@ -10,7 +10,7 @@ from datagen.deal import make_plan
 from datagen.plan import CONTROL_HZ, TrackChoice, Wanted
 from datagen.recording import Dataset
 from datagen.steps import Steps
-from simulator.dynamics import PHYSICS_HZ
+from simulator.rate import PHYSICS_HZ
 from tests.datagen.commands import datagen
 
 OPTIONS = ("--rounds", "1", "--tracks", "oval", "--lights", "clear", "--stretch", "0")
