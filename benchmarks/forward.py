@@ -2,8 +2,7 @@
 
 One image, one thread each; torch runs the published network channels-last, as fast as it gets
 without another precision. They are asked in turns, so that a busy machine disturbs all alike. The
-int8 graph is quantised here, on noise, with the last shared layer left exact: its answers are of no
-use, and a model whose gate asks for more layers left exact is slower.
+int8 graph is quantised here, on noise: its answers are of no use, its time is that of any other.
 
     python benchmarks/forward.py [--model RUN] [--rounds 200] [--out FILE]
     claims: bf16 at most 0.40 of torch's time, int8 at most 0.20

@@ -18,7 +18,7 @@ from mtlnet.card import GRAPH, GRAPH_WEIGHTS, WEIGHTS, ModelError, check_files, 
 from mtlnet.evaluate import require_fit
 from mtlnet.export import TOLERANCE
 from mtlnet.exported import ABOUT, write_about
-from mtlnet.int8 import MOST_LEFT, Gate, calibration_images, quantise
+from mtlnet.int8 import calibration_images, judge, quantise
 from mtlnet.network import HEIGHT, WIDTH, Network, answer_images, load_network
 from trackfeatures.errors import UserError
 
@@ -63,18 +63,13 @@ def export_model(
     (folder / ABOUT).unlink(missing_ok=True)  # killed from here on, there is no export at all
     network = load_network(run / WEIGHTS, card.network)
     images = shown.read_batch(chosen)
-    judged = Gate(run, dataset.path)
-    for left in range(1, MOST_LEFT + 1):
-        names = _write(run, network, folder, (kind, precision), dataset, left)
-        check = check_on(network, folder / names[0], precision, images)
-        about: dict[str, Any] = {"format": kind, "precision": precision, "check": check}
+    names = _write(run, network, folder, (kind, precision), dataset)
+    check = check_on(network, folder / names[0], precision, images)
+    about: dict[str, Any] = {"format": kind, "precision": precision, "check": check}
+    write_about(folder, card, names, **about)
+    if precision == "int8":
+        about["gate"] = judge(run, dataset.path)
         write_about(folder, card, names, **about)
-        if precision != "int8":
-            break
-        about |= {"layers_left": left, "gate": judged.judge()}
-        write_about(folder, card, names, **about)
-        if about["gate"]["passed"]:
-            break
     if precision == "f32" and not check["largest"] <= TOLERANCE:
         raise ModelError(
             f"{folder / names[0]} differs from torch by {check['largest']:.2g}, at most "
@@ -84,14 +79,14 @@ def export_model(
 
 
 def _write(
-    run: Path, network: Network, folder: Path, form: tuple[str, str], dataset: Dataset, left: int
+    run: Path, network: Network, folder: Path, form: tuple[str, str], dataset: Dataset
 ) -> tuple[str, ...]:
     """Write the files of an export of this format and precision; their names."""
     kind, precision = form
     try:
         if kind == "onnx":
             return write_onnx(network, folder, half=precision == "bf16")
-        return write_openvino(run, folder, precision, dataset, left)
+        return write_openvino(run, folder, precision, dataset)
     except RuntimeError as error:  # how OpenVINO says that a write failed, without the reason
         reason = str(error).strip().splitlines()[-1]
         raise UserError(f"{folder} could not be written ({reason}); is the disk full?") from error
@@ -159,20 +154,15 @@ def halve_onnx(model: Any) -> None:
     model.graph.node.extend(nodes)
 
 
-def write_openvino(
-    run: Path, folder: Path, precision: str, dataset: Dataset, left: int
-) -> tuple[str, ...]:
-    """Write `model.xml` and `model.bin`, made from the graph the run was published with.
-
-    In int8 its last `left` shared layers are left as they are.
-    """
+def write_openvino(run: Path, folder: Path, precision: str, dataset: Dataset) -> tuple[str, ...]:
+    """Write `model.xml` and `model.bin`, made from the graph the run was published with."""
     import openvino
 
     model = openvino.Core().read_model(str(run / GRAPH))
     if precision == "bf16":
         halve_openvino(model)
     if precision == "int8":
-        model = quantise(model, calibration_images(dataset.select("train")), left)
+        model = quantise(model, calibration_images(dataset.select("train")))
     openvino.save_model(model, str(folder / GRAPH), compress_to_fp16=False)
     return (GRAPH, GRAPH_WEIGHTS)
 

@@ -1,8 +1,8 @@
 """The int8 form of a graph, and the gate it has to pass (DESIGN §7).
 
-Weights and activations are quantised by NNCF, calibrated on training frames. What the heads read is
-left exact: rounded, it costs as much accuracy as all other layers together. Where that is not
-enough, more of the last layers are, for a little time each.
+The convolutions are quantised by NNCF, weights and activations, calibrated on training frames. Of
+the shared layers the weights alone are int8: what the heads read costs as much accuracy, rounded,
+as all the rest, and the time of those layers is that of reading their weights.
 """
 
 import logging
@@ -24,8 +24,6 @@ CALIBRATION_FRAMES = 300
 # Element-wise products are the heads', means of cells the texture's (`mtlnet.precise`): left in
 # float32.
 EXACT = ("Multiply", "ReduceSum", "Subtract", "Power", "AvgPool", "ReduceMean")
-MOST_LEFT = 3
-"""Of the last shared layers: so many at most are left as they are."""
 
 
 def calibration_images(train: Frames) -> NDArray[np.uint8]:
@@ -34,43 +32,29 @@ def calibration_images(train: Frames) -> NDArray[np.uint8]:
     return train.read_batch(np.linspace(0, len(train) - 1, count).astype(np.int64))
 
 
-def quantise(model: Any, images: NDArray[np.uint8], left: int = 1) -> Any:
-    """The int8 form of a graph but for its last `left` shared layers, calibrated on `images`."""
+def quantise(model: Any, images: NDArray[np.uint8]) -> Any:
+    """The int8 form of a graph, calibrated on `images` (N, H, W, 3)."""
     # NNCF tells its makers of every use unless it is said to run in a test.
     os.environ["NNCF_CI"] = "1"
     import nncf
 
     nncf.set_log_level(logging.ERROR)
-    shared = [n.get_friendly_name() for n in model.get_ordered_ops() if _is_shared(n)]
     with redirect_stdout(sys.stderr):  # its progress bars are no result
-        return nncf.quantize(
+        quantised = nncf.quantize(
             model,
             nncf.Dataset([image[None] for image in images]),
             subset_size=len(images),
             preset=nncf.QuantizationPreset.MIXED,
-            ignored_scope=nncf.IgnoredScope(
-                names=shared[len(shared) - left :], types=list(EXACT), validate=False
-            ),
+            ignored_scope=nncf.IgnoredScope(types=["MatMul", *EXACT], validate=False),
         )
+        return nncf.compress_weights(quantised, mode=nncf.CompressWeightsMode.INT8_SYM)
 
 
-def _is_shared(node: Any) -> bool:
-    return bool(node.get_type_name() == "MatMul")
+def judge(run: Path, data: Path) -> dict[str, Any]:
+    """The gate's result for a run's int8 graph on the test rounds of a dataset, against float32."""
 
+    def evaluated(precision: Literal["f32", "int8"]) -> dict[str, Any]:
+        engines = [load_engine(run, "openvino", precision) for _ in range(os.cpu_count() or 1)]
+        return evaluate(engines, data, "test")
 
-class Gate:
-    """Judges int8 graphs of a run on the test rounds of a dataset, against float32."""
-
-    def __init__(self, run: Path, data: Path) -> None:
-        self.run, self.data = run, data
-        self._exact: dict[str, Any] | None = None
-
-    def judge(self) -> dict[str, Any]:
-        """The gate's result for the int8 graph that the run has now."""
-        if self._exact is None:
-            self._exact = self._evaluate("f32")
-        return gate(self._exact, self._evaluate("int8"))
-
-    def _evaluate(self, precision: Literal["f32", "int8"]) -> dict[str, Any]:
-        engines = [load_engine(self.run, "openvino", precision) for _ in range(os.cpu_count() or 1)]
-        return evaluate(engines, self.data, "test")
+    return gate(evaluated("f32"), evaluated("int8"))

@@ -22,8 +22,9 @@ from mtlnet.doubt import (
 
 def precise_product(ops: Any, x: Any, weight: NDArray[np.float32]) -> Any:
     """x (1, F) times weight (N, F), transposed: (1, N)."""
-    products = ops.multiply(ops.unsqueeze(x, np.array([1])), weight[None])
-    return ops.reduce_sum(products, np.array([2]))
+    # In two dimensions: three are laid out as an image's channels, and back for the sum.
+    sums = ops.reduce_sum(ops.multiply(x, weight), np.array([1]))
+    return ops.unsqueeze(sums, np.array([0]))
 
 
 def precise_linear(ops: Any, x: Any, weight: NDArray[np.float32], bias: NDArray[np.float32]) -> Any:
