@@ -10,8 +10,9 @@ directions.
 from collections.abc import Sequence
 
 from torch import Tensor, nn
-from torch.optim import SGD, AdamW, Muon, Optimizer
+from torch.optim import SGD, AdamW, Optimizer
 
+from mtlnet.muon import GramMuon
 from mtlnet.network import Network
 from mtlnet.recipe import MOMENTUM, Recipe
 
@@ -39,9 +40,7 @@ class Optimisers:
             self._rows = [(p, nn.Parameter(as_rows(p.detach()))) for p in map(weights.pop, large)]
             rows = [{"params": [row for _, row in self._rows], "times": MUON_RATE}]
             rate = recipe.learning_rate * MUON_RATE
-            self.parts.append(
-                Muon(rows, rate, weight_decay=recipe.l2, adjust_lr_fn="match_rms_adamw")
-            )
+            self.parts.append(GramMuon(rows, rate, recipe.l2))
         groups = _groups(list(weights.values()), recipe.l2, [*others, *beside])
         self.parts.append(AdamW(groups, recipe.learning_rate, betas=(0.9, 0.99), fused=True))
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from mtlnet.muon import GramMuon
 from mtlnet.network import Network, initialise
 from mtlnet.optimiser import MUON_RATE, Optimisers, as_rows
 from mtlnet.recipe import RECIPES, Recipe
@@ -56,6 +57,34 @@ def test_a_step_goes_equally_far_in_all_directions() -> None:
     assert float(lengths.max()) < size * 1.6
     # Down the gradient in every one of its directions.
     assert bool(((left.T @ change @ right).diagonal() > 0).all())
+
+
+@pytest.mark.parametrize("shape", [(96, 363), (384, 3456), (512, 64)])
+def test_steps_are_those_of_torchs_muon(shape: tuple[int, int]) -> None:
+    """Which rounds to bf16, to 8 bits, in each of its ten products."""
+    generator = torch.Generator().manual_seed(0)
+    start = torch.randn(shape, generator=generator)
+    ours, theirs = (torch.nn.Parameter(start.clone()) for _ in range(2))
+    optimisers = (
+        GramMuon([ours], 0.02, 0.1),
+        torch.optim.Muon([theirs], 0.02, 0.1, adjust_lr_fn="match_rms_adamw"),
+    )
+    for _ in range(3):
+        gradient = torch.randn(shape, generator=generator)
+        for weight, optimiser in zip((ours, theirs), optimisers, strict=True):
+            weight.grad = gradient.clone()
+            optimiser.step()  # type: ignore[no-untyped-call]  # torch leaves it untyped
+    change, expected = ours.detach() - start, theirs.detach() - start
+    assert float((change - expected).norm() / expected.norm()) < 0.02
+    for name, state in optimisers[1].state[theirs].items():
+        torch.testing.assert_close(optimisers[0].state[ours][name], state)
+
+
+def test_nothing_to_learn_changes_nothing() -> None:
+    weight = torch.nn.Parameter(torch.ones(4, 8))
+    weight.grad = torch.zeros(4, 8)
+    GramMuon([weight], 0.02, 0.0).step()
+    torch.testing.assert_close(weight.detach(), torch.ones(4, 8))
 
 
 def test_the_rate_is_the_recipes_for_adamw_and_times_muons_for_muon() -> None:
