@@ -10,7 +10,7 @@ steps. Dropout 0.5 and L2 5e-4 are ours: the paper gives neither.
   varies by 0.03 where a coded distance varies by 0.2, and would hardly be learned beside it.
 - Muon for the large layers (`mtlnet.optimiser`): in short trials half as many images for the same
   errors. The rate rises, then falls to nothing as a cosine over the run. Batches of 64, since its
-  own work is two fifths of a step of 32.
+  own work does not grow with the batch.
 - A distance's error counts as it is, not squared, from a twentieth of a standard deviation on: `l`,
   `m` and `r` jump where they become inactive, and a squared error answers in between. The angle's
   counts squared, and more (`mtlnet.loss`).
