@@ -33,7 +33,7 @@ ANNOTATED_M = 60.0
 SCENE_STEP_M = 4.0
 WHEELS = ("front_left", "front_right", "rear_left", "rear_right")
 NOT_RECORDED = ("range_traffic",)
-MOST_RESETS = 20
+MOST_RESETS = 20  # a control step of each frame: rounds of fewer frames a second drive for longer
 # Steps are simulated, then drawn, then written, so many at a time: the driver needs no picture, and
 # code that is run again at once is twice as fast as code that waits for a picture in between.
 BATCH = 20
@@ -80,7 +80,7 @@ class Drive:
         self.laps += self.state.lap - lap
         if self.state.collision or self.state.off_track or self.state.backwards:
             self.resets += 1
-            if self.resets > MOST_RESETS:
+            if self.resets > MOST_RESETS * self.plan.steps_a_frame:
                 raise RoundFailed(
                     f"the car hit something or left the road {self.resets} times on "
                     f"{self.plan.track}, {self.plan.lanes} lanes, {self.plan.speed_kmh:.0f} km/h"
