@@ -19,7 +19,7 @@ from simulator.rate import PHYSICS_HZ, check_frequency
 
 TEST_SHARE = 0.25
 CONTROL_HZ = 20
-FRAMES_A_SCENE = 200  # to build one takes as long as some thirty pictures
+FRAMES_A_SCENE = 200  # to build one takes as long as some fifteen frames
 SEEDS_A_PLAN = 1_000_000
 MOST_ROUNDS = SEEDS_A_PLAN // 2  # before its seeds meet those of another plan
 
