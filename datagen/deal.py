@@ -166,11 +166,13 @@ def _test_rounds(
     round (lanes, trajectory, light).
 
     Every track that has three rounds or more stands on both sides, even if that takes a few more
-    test rounds than the share; no track gives its last round away while another has two.
+    test rounds than the share; no track gives its last round away while another has two, nor its
+    last one of so many lanes: a road that was never trained on is what `unseen` rounds are for.
     """
     if wanted.test_share == 0.0 or wanted.rounds < 2:
         return set()
     names = [choice.name for choice in tracks]
+    roads = list(zip(names, others[0], strict=True))
     counts = Counter(names)
     total = max(round(wanted.rounds * wanted.test_share), 1)
     total = max(total, sum(count >= 3 for count in counts.values()))
@@ -178,10 +180,12 @@ def _test_rounds(
     draw = rng.uniform(size=wanted.rounds)
     test: set[int] = set()
 
-    def crowding(number: int) -> tuple[bool, float, float, float]:
+    def crowding(number: int) -> tuple[bool, bool, float, float, float]:
         mine = _share(test, names, number)
         last = counts[names[number]] - round(mine * counts[names[number]]) == 1
-        return last, mine, sum(_share(test, kind, number) for kind in others), draw[number]
+        left = sum(road == roads[number] for n, road in enumerate(roads) if n not in test)
+        beside = sum(_share(test, kind, number) for kind in others)
+        return last, left == 1, mine, beside, draw[number]
 
     while len(test) < total:
         test.add(min(set(range(wanted.rounds)) - test, key=crowding))

@@ -62,6 +62,8 @@ def test_a_quarter_is_for_testing_and_every_track_and_lane_count_is_on_both_side
         assert {e.lanes for e in side} == {1, 2, 3}
         assert {light for e in side for light in e.lights} == set(LIGHTS)
         assert {e.trajectory for e in side} == set(TRAJECTORIES)
+    roads = {side: {(e.track, e.lanes) for e in sides[side]} for side in sides}
+    assert roads["test"] <= roads["train"]  # of 27 roads each has two rounds or three
     assert len({e.seed for e in rounds}) == 60
     assert not {e.seed for e in rounds} & {e.seed for e in make_plan(wanted(seed=seed + 1)).rounds}
 
