@@ -104,8 +104,10 @@ def _unpool(gradient: Tensor, x: Tensor, pool: dict[str, Any], places: Tensor) -
 def norm_pool_relu(x: Tensor, sign: Tensor, norm: nn.BatchNorm2d, pool: Pool | None) -> Tensor:
     """Normalise x (B, C, H, W) = `sign` (C,) times the layer's sums; pool, ReLU.
 
-    Moves the running statistics of `norm` as torch does.
+    Moves the running statistics of `norm` as torch does, or takes them when it is in evaluation.
     """
+    if not norm.training:
+        return _settled(x, sign, norm, pool)
     with torch.no_grad():
         mean, variance, count = statistics(x)
         momentum = norm.momentum or 0.0
@@ -119,3 +121,10 @@ def norm_pool_relu(x: Tensor, sign: Tensor, norm: nn.BatchNorm2d, pool: Pool | N
         x, norm.weight * sign, norm.bias, (mean, variance, count), norm.eps, pool
     )
     return out
+
+
+def _settled(x: Tensor, sign: Tensor, norm: nn.BatchNorm2d, pool: Pool | None) -> Tensor:
+    assert norm.running_mean is not None
+    pooled = x if pool is None else max_pool2d(x, **pool_arguments(x.shape[2], x.shape[3], pool))
+    mean, gain = norm.running_mean * sign, norm.weight * sign
+    return relu(batch_norm(pooled, mean, norm.running_var, gain, norm.bias, False, 0.0, norm.eps))

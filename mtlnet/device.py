@@ -1,6 +1,8 @@
 """Where a run computes."""
 
 import re
+from functools import cache
+from pathlib import Path
 
 import torch
 
@@ -22,3 +24,13 @@ def choose_device(name: str, part: Part = ALONE) -> torch.device:
     if device.type == "cuda" and (device.index or 0) >= torch.cuda.device_count():
         raise UserError(f"--device {name}: torch finds {torch.cuda.device_count()} GPU(s) here")
     return device
+
+
+@cache
+def cpu_has_bf16() -> bool:
+    """Whether the CPU multiplies bf16 natively (AVX512-BF16 or AMX); elsewhere it is slower."""
+    info = Path("/proc/cpuinfo")
+    if not info.is_file():
+        return False
+    text = info.read_text()
+    return "avx512_bf16" in text or "amx_bf16" in text

@@ -3,15 +3,14 @@
 import ctypes
 import sys
 from collections.abc import Callable, Sequence
-from functools import cache
-from pathlib import Path
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from mtlnet.balance import STRETCH, Balance
 from mtlnet.captured import Captured, CudaRecorder
+from mtlnet.device import cpu_has_bf16
 from mtlnet.loader import Batch, Loader
 from mtlnet.loss import Alpha, Losses, multi_task_loss
 from mtlnet.network import Network, initialise
@@ -23,6 +22,8 @@ from mtlnet.swift import training_outputs
 from mtlnet.together import average
 
 MIN_TARGET_STD = 0.01
+SETTLING_STEPS = 100
+"""After so many the running statistics of batch normalisation know nothing of the first weights."""
 
 
 class Trainer:
@@ -83,6 +84,8 @@ class Trainer:
     def step(self, batch: Batch | DeviceBatch, progress: float) -> Losses:
         """Learn from one batch; its losses, before the step."""
         self.network.train()
+        if progress >= self.recipe.settled and self.step_number >= SETTLING_STEPS:
+            settle_norms(self.network)
         rate = learning_rate(self.recipe, self.step_number, progress)
         self.optimisers.set_rate(rate)
         given = on_device(batch, self.device)
@@ -119,6 +122,13 @@ class Trainer:
         return answers
 
 
+def settle_norms(network: Network) -> None:
+    """Let batch normalisation keep its statistics, until the next `network.train()`."""
+    for module in network.modules():
+        if isinstance(module, nn.BatchNorm2d):
+            module.eval()
+
+
 def dropout_masks(
     share: float,
     layers: Sequence[int],
@@ -137,16 +147,6 @@ def dropout_masks(
     rows = slice(which * count, (which + 1) * count)
     drawn = [rng.random((parts * count, units), np.float32)[rows] for units in layers]
     return [torch.from_numpy((d >= share) / np.float32(1 - share)) for d in drawn]
-
-
-@cache
-def cpu_has_bf16() -> bool:
-    """Whether the CPU multiplies bf16 natively (AVX512-BF16 or AMX); elsewhere it is slower."""
-    info = Path("/proc/cpuinfo")
-    if not info.is_file():
-        return False
-    text = info.read_text()
-    return "avx512_bf16" in text or "amx_bf16" in text
 
 
 def keep_freed_memory() -> None:

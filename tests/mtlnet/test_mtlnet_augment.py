@@ -11,10 +11,12 @@ from torchvision.transforms.v2 import functional as vision
 import trackfeatures as tf
 from mtlnet.aside import metres_aside, move_aside
 from mtlnet.augment import (
+    BRIGHTNESS,
+    CAST,
     JPEG_SHARE,
     LUMA,
+    PATCH_SHARE,
     PATCH_SIDE,
-    PATCHES,
     TURN_LIMIT_RAD,
     TURN_RAD,
     TURN_SHARE,
@@ -202,13 +204,13 @@ def test_labels_follow_a_turn_and_then_the_mirror() -> None:
 
 
 def test_covered_patches_are_few_and_small() -> None:
-    drawn = draw_changes(64, 100, 140, np.random.default_rng(0))
-    images = np.zeros((64, 100, 140, 3), np.uint8)
-    change_images(images, replace(none(64), patches=drawn.patches), SMALL)
+    drawn = draw_changes(256, 100, 140, np.random.default_rng(0))
+    images = np.zeros((256, 100, 140, 3), np.uint8)
+    change_images(images, replace(none(256), patch=drawn.patch), SMALL)
     share = (images.max(3) > 0).mean((1, 2))
-    assert share.max() <= PATCHES * (PATCH_SIDE + 0.02) ** 2
-    assert 0.1 < (share == 0).mean() < 0.5
-    assert share.mean() > 0.01
+    assert share.max() <= (PATCH_SIDE + 0.02) ** 2
+    assert (share > 0).mean() == pytest.approx(PATCH_SHARE, abs=0.06)
+    assert share[share > 0].mean() > 0.01
 
 
 def colour(contrast: float = 1.0, brightness: float = 0.0, saturation: float = 1.0) -> Changes:
@@ -235,7 +237,7 @@ def test_drawn_colours_leave_the_middle_grey_on_average() -> None:
     table = draw_changes(2000, 52, 70, np.random.default_rng(0)).colour
     grey = table @ np.array([127.5, 127.5, 127.5, 1.0], np.float32)
     assert grey.mean() == pytest.approx(127.5, abs=2.0)
-    assert grey.std() == pytest.approx(127.5 * np.sqrt((0.25**2 + 0.08**2) / 3), rel=0.1)
+    assert grey.std() == pytest.approx(127.5 * np.hypot(BRIGHTNESS, CAST) / np.sqrt(3), rel=0.1)
 
 
 def test_blur_noise_and_compression_are_torchvisions() -> None:

@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -68,6 +69,23 @@ def test_one_batch_is_overfitted(dataset: Path) -> None:
     assert first.total.item() > 0.6
     assert last.total.item() < 0.05
     assert float(last.angle) < 0.1 * float(np.var(batch.coded[:, 5]))
+
+
+def test_late_in_a_run_statistics_of_batches_stay(dataset: Path) -> None:
+    frames = Dataset.open(dataset).select("train")
+    recipe = replace(RECIPES["fast"], batch=4)
+    trainer = Trainer(recipe, (0.3, 0.2, 0.5), 0, CPU)
+    batch = Loader(frames, Camera(), 4, 0, augment=False).make(0)
+    mean = trainer.network.get_buffer("features.conv0.norm.running_mean")
+    seen = [mean.clone()]
+    late = recipe.settled
+    for steps, progress in ((200, late - 0.1), (200, late), (200, 0.99), (5, 0.99)):
+        trainer.step_number = steps
+        trainer.step(batch, progress)
+        seen.append(mean.clone())
+    moved = [not torch.equal(a, b) for a, b in pairwise(seen)]
+    # A run of a few steps has not seen enough for statistics that could stay.
+    assert moved == [True, False, False, True]
 
 
 @pytest.mark.parametrize(("recipe", "balance"), [("fast", "dwa"), ("paper", "uncertainty")])
