@@ -6,12 +6,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import openvino
 import pytest
 import torch
+from safetensors.numpy import load_file
 
 import mtlnet.int8
 from datagen.recording import Dataset
-from mtlnet.card import DOUBT, GRAPH_WEIGHTS, WEIGHTS, ModelError, read_card
+from mtlnet.card import DOUBT, GRAPH, GRAPH_WEIGHTS, WEIGHTS, ModelError, read_card
 from mtlnet.config import TrainConfig
 from mtlnet.convert import export_model
 from mtlnet.engine import load_engine
@@ -86,6 +88,11 @@ def test_onnx_in_halves(trained: Path, dataset: Path, tmp_path: Path) -> None:
     assert sizes[1] / sizes[0] == pytest.approx(0.5, abs=0.01)
 
 
+def read_by(operation: Any) -> Any:
+    """The inputs that an operation's output goes to."""
+    return operation.output(0).get_target_inputs()
+
+
 @pytest.mark.slow
 def test_int8_is_taken_once_its_gate_is_passed(
     trained: Path, dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -100,8 +107,14 @@ def test_int8_is_taken_once_its_gate_is_passed(
     assert found["gate"]["split"] == "test"
     assert found["gate"]["frames"] == 24
     weights = [(path / GRAPH_WEIGHTS).stat().st_size for path in (run, run / INT8)]
-    second = (run / DOUBT).stat().st_size  # this head stays exact
-    assert weights[1] == pytest.approx((weights[0] - second) / 4 + second, rel=0.01)
+    last = load_file(run / WEIGHTS)["shared.fc2.layer.weight"].nbytes
+    kept = last + (run / DOUBT).stat().st_size  # and the second head
+    assert weights[1] == pytest.approx((weights[0] - kept) / 4 + kept, rel=0.01)
+    rounded_to = openvino.Core().read_model(run / INT8 / GRAPH).get_ordered_ops()
+    rounding = [op for op in rounded_to if op.get_type_name() == "FakeQuantize"]
+    readers = {i.get_node().get_type_name() for op in rounding for i in read_by(op)}
+    assert len(rounding) == 3
+    assert readers <= {"Convolution", "MaxPool"}  # nothing of the heads
     exact = load_engine(run, precision="f32")(frame)
     rounded = load_engine(run, precision="int8")(frame)
     assert 0 < np.abs(exact - rounded)[:9].max() <= found["check"]["largest"] + 0.1
