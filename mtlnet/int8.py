@@ -1,8 +1,8 @@
 """The int8 form of a graph, and the gate it has to pass (DESIGN §7).
 
 By NNCF. Three convolutions are quantised, weights and activations, calibrated on training frames;
-of the first and the third the weights alone are int8, for rounded activations cost there more accuracy
-than in all others (in the first that of distances, in the third that of the angle) and save little.
+of the first and the third the weights alone are int8, for rounded activations cost there more
+accuracy than in all others (in the first of distances, in the third of the angle) and save little.
 So are the weights of the shared layers, whose time is that of reading them, but the last: it is
 small, and costs as much accuracy as both others.
 """
