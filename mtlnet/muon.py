@@ -1,4 +1,4 @@
-"""Muon with its iteration on the Gram matrix, which is kept in float32.
+"""Muon with its iteration on the Gram matrix, in float32.
 
 A step goes along the gradient with its singular values made (nearly) equal, by five steps of Newton
 and Schulz. torch's Muon takes them on the whole matrix in bf16, which suits a GPU; a CPU without
@@ -13,8 +13,6 @@ from typing import Any
 import torch
 from torch import Tensor
 from torch.optim import Muon
-
-from mtlnet.device import cpu_has_bf16
 
 RMS_OF_ADAMW = 0.2
 """Steps have the size of AdamW's: this times the root of the matrix's longer side."""
@@ -56,11 +54,8 @@ def evened(
     """`matrix` (F, C) with its singular values brought near 1; `least`: the smallest norm."""
     wide = matrix if matrix.shape[0] <= matrix.shape[1] else matrix.T
     wide = wide / wide.norm().clamp(min=least)
-    if wide.device.type == "cpu" and cpu_has_bf16():
-        # Only the two large products: in the polynomial's, rounding would grow from step to step.
-        wide = wide.bfloat16()
     first, second, third = coefficients
-    gram, product = (wide @ wide.T).float(), None
+    gram, product = wide @ wide.T, None
     for left in reversed(range(steps)):
         factor = torch.addmm(gram, gram, gram, beta=second, alpha=third)
         factor.diagonal().add_(first)
@@ -69,5 +64,5 @@ def evened(
         if left:
             gram = factor @ gram @ factor
     assert product is not None
-    even: Tensor = (product.to(wide) @ wide).to(matrix)
+    even: Tensor = product @ wide
     return even if matrix.shape[0] <= matrix.shape[1] else even.T
