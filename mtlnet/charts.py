@@ -130,7 +130,8 @@ def _label(side: str, place: float, value: float) -> str:
 
 def _legend(lines: Iterable[Line]) -> str:
     named = [
-        f'<span><i style="background:{line.colour}"></i>{escape(line.label)}</span>'
+        f'<span><i class={line.kind} style="border-color:{line.colour}"></i>'
+        f"{escape(line.label)}</span>"
         for line in lines
         if line.label
     ]

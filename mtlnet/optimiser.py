@@ -17,6 +17,9 @@ from mtlnet.network import Network
 from mtlnet.recipe import MOMENTUM, Recipe
 
 MUON_LAYERS = ("features.", "shared.fc0.")
+MUON_SIDE = 1024
+"""Directions of a layer at most. The work grows with their square: the 4096 of network
+`deepdriving` cost two cores twenty seconds a step."""
 MUON_RATE = 8.0
 """Times the recipe's rate: with updates scaled to AdamW's size, Muon bears longer steps."""
 
@@ -36,7 +39,7 @@ class Optimisers:
         weights = {name: p for name, p in network.named_parameters() if p.ndim > 1}
         others = [p for p in network.parameters() if p.ndim <= 1]
         if recipe.optimiser == "muon" and not network.plan.backbone:
-            large = [name for name in weights if name.startswith(MUON_LAYERS)]
+            large = [name for name, weight in weights.items() if has_muon(name, weight)]
             self._rows = [(p, nn.Parameter(as_rows(p.detach()))) for p in map(weights.pop, large)]
             rows = [{"params": [row for _, row in self._rows], "times": MUON_RATE}]
             rate = recipe.learning_rate * MUON_RATE
@@ -71,6 +74,11 @@ class Optimisers:
             row.grad = None if parameter.grad is None else as_rows(parameter.grad)
         for part in self.parts:
             part.step()
+
+
+def has_muon(name: str, weight: Tensor) -> bool:
+    """Whether a layer is Muon's."""
+    return name.startswith(MUON_LAYERS) and min(as_rows(weight).shape) <= MUON_SIDE
 
 
 def as_rows(weight: Tensor) -> Tensor:

@@ -123,6 +123,7 @@ class DirectProtocol(GuardedProtocol):
 
     def _reply(self, direct: Direct, whole: Reply) -> None:
         direct.response_complete = True
+        direct.exchange = None  # which holds it in turn, by its way to reply
         if direct.disconnected or self.transport.is_closing() or self._phase is Phase.DISMISSED:
             return
         more = self.server_state.default_headers

@@ -110,6 +110,8 @@ class Exchange:
         stamp = time.monotonic_ns()
         self._name = request_id(headers)
         try:
+            if b"x-stream-id" not in headers:
+                self._sight.perceiver.check_room()  # who has too much to do reads no more
             self._ask = read_ask(headers, stamp, self._name)
             check_headers(headers)
         except Problem as problem:

@@ -1,6 +1,7 @@
 """A request on its way in and out: its whole body within the limit, its answer in one go."""
 
 from collections.abc import Awaitable, Callable, MutableMapping
+from functools import lru_cache
 from http import HTTPStatus
 from typing import Any, NamedTuple
 
@@ -9,7 +10,7 @@ import msgspec
 from mtlnet.image_error import ImageError
 from serve.ask import too_large
 from serve.limits import MAX_BODY_BYTES
-from serve.problems import MEDIA_TYPE, Problem, image_problem
+from serve.problems import MEDIA_TYPE, Kind, Problem, image_problem
 
 Scope = MutableMapping[str, Any]
 Message = MutableMapping[str, Any]
@@ -21,6 +22,7 @@ STATUS_LINES: dict[int, bytes] = {
     status: f"HTTP/1.1 {status} {status.phrase}\r\n".encode() for status in HTTPStatus
 }
 PROBLEM_HEADER: Header = (b"content-type", MEDIA_TYPE.encode())
+KNOWN_PROBLEMS = 128  # whose replies are kept, ready to be sent again
 encode_problem = msgspec.json.Encoder().encode
 
 
@@ -70,9 +72,16 @@ async def reply(send: Send, whole: Reply, way: str = "http") -> None:
 
 def refusal(problem: Problem, *headers: Header) -> Reply:
     """The reply that tells a client of a problem."""
+    added, content = _told(problem.kind, problem.detail, problem.retry_after_ms)
+    return Reply(problem.kind.status, [*added, *headers], content)
+
+
+@lru_cache(KNOWN_PROBLEMS)
+def _told(kind: Kind, detail: str, retry_after_ms: int | None) -> tuple[list[Header], bytes]:
+    """The headers and the body that tell of a problem; an overloaded service says few things."""
+    problem = Problem(kind, detail, retry_after_ms)
     added = [(k.lower().encode(), v.encode()) for k, v in problem.headers.items()]
-    content = encode_problem(problem.content)
-    return Reply(problem.kind.status, [PROBLEM_HEADER, *added, *headers], content)
+    return [PROBLEM_HEADER, *added], encode_problem(problem.content)
 
 
 def head_of(whole: Reply, *more: Header) -> bytes:

@@ -2,6 +2,7 @@
 
 All workers listen on one socket and all are woken by a connection; the one with the fewest takes
 it. (Left to the kernel, one of two workers may get six of eight cars, and keep them for hours.)
+One that is still warming up leaves them to those that can answer.
 """
 
 import asyncio
@@ -21,6 +22,7 @@ from serve.app import Service
 from serve.direct import DirectProtocol
 from serve.limits import MAX_BODY_BYTES, Limits
 from serve.protocol import Guard, GuardedProtocol, sweep
+from serve.websocket import GuardedWebSocket
 from serve.workers import BlockPeers
 
 GRACE_S = 5  # for requests in progress when the service is told to stop
@@ -77,7 +79,7 @@ class WorkerServer(uvicorn.Server):
     async def on_tick(self, counter: int) -> bool:
         """Ten times a second."""
         sweep(self.server_state.connections, self._loop.time())
-        self._peers.tell(len(self.server_state.connections))
+        self._tell()
         return await super().on_tick(counter)
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
@@ -109,6 +111,9 @@ class WorkerServer(uvicorn.Server):
             self._listen()
 
     def _accept(self) -> None:
+        if not self._app.perceiver.ready and self._peers.other_is_ready():
+            self._rest(TURN_S)
+            return
         mine, others = len(self.server_state.connections), self._peers.others()
         if others and mine > min(others) and not self._waited:
             self._waited = True  # once: the other may hang
@@ -132,7 +137,10 @@ class WorkerServer(uvicorn.Server):
 
     async def _serve_connection(self, connection: socket.socket) -> None:
         await self._loop.connect_accepted_socket(self._make, connection)
-        self._peers.tell(len(self.server_state.connections))
+        self._tell()
+
+    def _tell(self) -> None:
+        self._peers.tell(len(self.server_state.connections), self._app.perceiver.ready)
 
 
 def _settings(app: Any, limits: Limits) -> uvicorn.Config:
@@ -140,7 +148,7 @@ def _settings(app: Any, limits: Limits) -> uvicorn.Config:
         app,
         loop="uvloop",
         http="httptools",
-        ws="websockets-sansio",
+        ws=GuardedWebSocket,
         ws_max_size=MAX_BODY_BYTES,
         ws_per_message_deflate=False,  # images do not shrink
         lifespan="on",

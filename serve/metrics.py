@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from serve.perceiver import Perceived
 from serve.problems import KINDS, Kind
 from serve.shared import WORKER_WORDS, Shared
-from serve.workers import BEAT, CONNECTIONS, COUNTS, SILENT_S, WAITING
+from serve.workers import BEAT, CONNECTIONS, COUNTS, READY, SILENT_S, WAITING
 
 MEDIA_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 BOUNDS_S = (0.0005, 0.001, 0.002, 0.003, 0.005, 0.0075, 0.01, 0.02, 0.03, 0.05, 0.1, 0.25, 1.0)
@@ -66,6 +66,7 @@ class Metrics:
         for name, cell, text in (
             ("connections", CONNECTIONS, "Open connections."),
             ("waiting_frames", WAITING, "Frames in the queues, when a frame last left one."),
+            ("workers_ready", READY, "Workers that are warm and have given their golden answer."),
         ):
             yield from _head(name, "gauge", text)
             yield f"driverview_{name} {sum(block[cell] for block in alive):g}"

@@ -31,6 +31,7 @@ from serve.streams import Streams
 
 SMOOTHING = 0.1  # weight of the latest frame in the mean time a frame takes
 QUICK_MS = 10.0  # for so long the event loop may be kept from everything else
+FULL_PAUSE_S = 0.002  # between two looks at who has come, while all of them are refused
 QUICK_RUN = 8  # frames in a row that took no longer, before it is trusted with one
 logger = logging.getLogger(__name__)
 
@@ -112,6 +113,9 @@ class Perceiver:
         self._busy = False  # the thread has a frame in work
         self._awake = False  # somebody is about to look at the queue
         self._lock = threading.Lock()
+        self._pausing = False  # the loop is about to
+        self._answered = threading.Lock()  # open from when the thread answers until a pause
+        self._answered.acquire()
         self._calls: SimpleQueue[bool] = SimpleQueue()  # True: to the queue; False: the end
         self._frame_ms = 5.0
         self._quick = 0  # frames in a row of this engine that took no longer than QUICK_MS
@@ -124,6 +128,11 @@ class Perceiver:
         if staged is not None and staged[1]():
             self._loaded, self._staged, self._quick = staged[0], None, 0
         return self._loaded
+
+    @property
+    def ready(self) -> bool:
+        """Whether the engine is warm and has given its golden answer."""
+        return self._ready
 
     @property
     def waiting(self) -> int:
@@ -159,8 +168,24 @@ class Perceiver:
 
     def check_room(self) -> None:
         """Raise Problem when a frame that takes no other's place would be refused."""
-        if len(self._waiting) + self._busy > self._limit:
+        if self._full():
+            if not self._pausing:
+                self._pausing = True
+                self._loop.call_soon(self._pause)
             raise self._overloaded()
+
+    def _full(self) -> bool:
+        return len(self._waiting) + self._busy > self._limit
+
+    def _pause(self) -> None:
+        """Keep the loop from its clients until some have come, or a frame is answered.
+
+        To refuse several at once takes less of the core than to be woken by each, and the engine
+        needs that core.
+        """
+        self._pausing = False
+        if self._full():
+            self._answered.acquire(timeout=FULL_PAUSE_S)
 
     def admit(self, frame: Frame, done: Done) -> None:
         """Have `done` called with what the model sees in a frame, or with the error it got.
@@ -232,6 +257,8 @@ class Perceiver:
             while (turn := self._next()) is not None:
                 result = self._attempt(turn.frame)
                 self._loop.call_soon_threadsafe(turn.done, result)
+                if self._answered.locked():
+                    self._answered.release()
 
     def _next(self) -> Turn | None:
         """The thread's next turn; None: it may rest."""

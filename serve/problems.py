@@ -108,14 +108,14 @@ class Problem(UserError):
         self.detail = detail
         if retry_after_ms is None and kind.status in (429, 503):
             retry_after_ms = RETRY_AFTER_MS
-        self.retry_after_ms = retry_after_ms
+        self.retry_after_ms = None if retry_after_ms is None else max(1, round(retry_after_ms))
 
     @property
     def content(self) -> dict[str, Any]:
         """The problem's members, `retry_after_ms` in milliseconds among them where it is known."""
         content = members(self.kind.type, self.kind.title, self.kind.status, self.detail)
         if self.retry_after_ms is not None:
-            content["retry_after_ms"] = max(1, round(self.retry_after_ms))
+            content["retry_after_ms"] = self.retry_after_ms
         return content
 
     @property

@@ -17,7 +17,7 @@ from serve.gate import head_of, refusal
 from serve.limits import MAX_HEAD_BYTES, Limits
 from serve.problems import HEAD_TOO_LARGE, MALFORMED, TOO_MANY_CONNECTIONS, TOO_SLOW, Kind, Problem
 
-LINGER_S = 0.5  # for a client to read why it was dismissed, before the connection is cut
+LINGER_S = 0.5  # for a client to read why it is dismissed, before the connection is cut
 EVICTABLE_S = 0.1  # headers or a body that take longer make room for another connection
 
 

@@ -6,6 +6,7 @@ From the supervisor: the Task, then {"load": folder, "generation": n}, {"drop": 
 {"ready": true}. The end of that socket is the end of the worker.
 """
 
+import gc
 import json
 import logging
 import socket
@@ -78,7 +79,7 @@ def main() -> None:
     control.say_loaded(task.generation, engine)
     shared = attach(task.memory, task.slots)
     app = Service(engine, warm_up, task.limits, shared, task.slot, telemetry.tracer())
-    app.perceiver.when_warm(lambda: control.say(ready=True))
+    app.perceiver.when_warm(lambda: say_ready(control))
     peers = BlockPeers(shared, task.slot)
     server = WorkerServer(app, task.limits, peers)
     threading.Thread(target=follow, args=(control, lines, server, app), daemon=True).start()
@@ -96,6 +97,14 @@ def load(folder: Path, expected: str | None) -> Engine:
             "`serve reload` takes the new one"
         )
     return engine
+
+
+def say_ready(control: Control) -> None:
+    """Tell that images are answered from now on."""
+    # What is here now stays. To look through it for garbage held up every client for 50 to 80 ms,
+    # several times a minute; what requests leave behind is looked through in 3.
+    gc.freeze()
+    control.say(ready=True)
 
 
 def follow(control: Control, lines: Iterator[str], server: WorkerServer, app: Service) -> None:

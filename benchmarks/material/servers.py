@@ -82,7 +82,11 @@ def _command(name: str, python: Path, port: int, workers: int, run: Path) -> lis
 def running(
     name: str, python: Path, run: Path, workers: int, cores: set[int] | None = None
 ) -> Iterator[int]:
-    """The port of a server that answers; `cores`: all that it may use."""
+    """The port of a server that answers; `cores`: all that it may use.
+
+    SIGTERM ends this process in order from now on, and the server with it.
+    """
+    signal.signal(signal.SIGTERM, lambda number, _frame: sys.exit(128 + number))
     with socket.create_server(("127.0.0.1", 0)) as probe:
         port = probe.getsockname()[1]
     settings = {MODEL: str(run), WORKERS: str(workers), PORT: str(port)}

@@ -2,6 +2,7 @@
 
 import http.client
 import json
+import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -131,9 +132,12 @@ class Reply:
 class Served:
     """A running service, and one connection to it."""
 
-    def __init__(self, port: int, app: Service | None = None) -> None:
+    def __init__(
+        self, port: int, app: Service | None = None, listener: socket.socket | None = None
+    ) -> None:
         self.port = port
         self._app = app
+        self._listener = listener
         self.url = f"http://127.0.0.1:{port}"
         self._connection = http.client.HTTPConnection("127.0.0.1", port, timeout=120)
 
@@ -142,6 +146,12 @@ class Served:
         """What runs behind the port, in a thread of this process."""
         assert self._app is not None
         return self._app
+
+    @property
+    def listener(self) -> socket.socket:
+        """The socket on which this process takes its connections."""
+        assert self._listener is not None
+        return self._listener
 
     def ask(
         self, method: str, path: str, body: Any = None, headers: dict[str, str] | None = None
@@ -166,16 +176,17 @@ def serving(
     shared: Shared | None = None,
     slot: int = 0,
     tracer: "Tracer | None" = None,
+    beside: Served | None = None,
 ) -> Iterator[Served]:
     """The service around `engine` on a free port, as `serve` runs it, in a thread of this process.
 
-    Ready when entered, unless `check` takes its time.
+    Ready when entered, unless `check` takes its time. `beside`: on its port, as another worker.
     """
 
     def checked(engine: Engine) -> None:
         check(engine)
 
-    listener = bind("127.0.0.1", 0)
+    listener = beside.listener.dup() if beside is not None else bind("127.0.0.1", 0)
     listener.listen(2048)
     app = Service(engine, checked, limits, shared, slot, tracer)
     server = WorkerServer(app, limits or Limits(), BlockPeers(app.shared, slot))
@@ -185,7 +196,7 @@ def serving(
         while not server.started:
             assert thread.is_alive()
             time.sleep(0.005)
-        yield Served(listener.getsockname()[1], app)
+        yield Served(listener.getsockname()[1], app, listener)
     finally:
         server.should_exit = True
         thread.join()

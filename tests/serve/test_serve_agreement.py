@@ -25,7 +25,7 @@ from mtlnet.golden import golden_image
 from mtlnet.images import decode, inspect
 from serve.client import Client
 from serve.readiness import TOLERANCE
-from tests.serve.conftest import jpeg, picture, serving
+from tests.serve.conftest import jpeg, picture, serving, until
 from tests.serve.test_serve_command import address, started
 
 JPEG = jpeg(picture())
@@ -127,6 +127,7 @@ def test_workers_types_and_endpoints_say_the_same(published: Path) -> None:
     with started("--model", str(published), *options) as (process, line), ExitStack() as stack:
         port = int(address(line).rpartition(":")[2])
         Client(address(line), timeout_s=120).wait_until_ready(120)
+        until(lambda: b"driverview_workers_ready 2" in page(port))
         plain, tensors = [], []
         for number in range(CONNECTIONS):  # all stay open, so that the workers share them
             name = f"c{number}"
@@ -145,6 +146,13 @@ def test_workers_types_and_endpoints_say_the_same(published: Path) -> None:
     assert len(ways) == 2  # both workers had a part in it, by every way over HTTP
     assert all(found >= {"json", "msgpack", "v2", "raw"} for found in ways.values())
     assert set().union(*ways.values()) == {"json", "msgpack", "v2", "raw", "stream"}
+
+
+def page(port: int) -> bytes:
+    """The metrics of all workers."""
+    with closing(Connection("127.0.0.1", port, timeout=120)) as connection:
+        connection.request("GET", "/metrics")
+        return connection.getresponse().read()
 
 
 def ways_by_worker(lines: Iterator[str]) -> dict[int, set[str]]:

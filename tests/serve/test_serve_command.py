@@ -1,10 +1,12 @@
 """The command `serve`: a published model on a real port, its first line, its ends, its errors."""
 
+import gc
 import json
 import os
 import re
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -16,6 +18,7 @@ from mtlnet.card import CARD, SHIPPED, read_card
 from mtlnet.engine import load_engine
 from mtlnet.golden import golden_image
 from serve.client import Client
+from serve.worker import Control, say_ready
 from tests.serve.conftest import png
 from tests.typed import typed
 from trackfeatures.listening import bind
@@ -145,3 +148,15 @@ def test_the_supervisor_loads_neither_framework_nor_engine() -> None:
     code = "import sys, serve.server; print({'fastapi', 'cv2', 'openvino'} & set(sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.stdout == "set()\n", done.stderr
+
+
+def test_a_ready_worker_keeps_what_it_loaded_from_the_garbage_collector() -> None:
+    """To look through all of it takes so long that every client notices."""
+    ours, other = socket.socketpair()
+    with other:
+        say_ready(Control(ours.detach()))
+        try:
+            assert json.loads(other.recv(1024)) == {"ready": True}
+            assert gc.get_freeze_count() > 10_000
+        finally:
+            gc.unfreeze()

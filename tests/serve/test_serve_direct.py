@@ -1,5 +1,6 @@
 """Requests that go straight from the parser to the engine: who answers, and in which order."""
 
+import gc
 import json
 import socket
 import threading
@@ -191,3 +192,23 @@ def test_a_body_without_end_is_refused_once(service: Served) -> None:
         connection.sendall(piece)
     connection.sendall(b"0\r\n\r\n" + WHOLE)
     assert [status for status, _ in read(connection, 2)] == [413, 200]
+
+
+def test_requests_leave_nothing_for_the_garbage_collector(engine: FakeEngine) -> None:
+    """It holds up all clients while it looks for cycles."""
+    with serving(engine, limits=Limits(queue=1)) as served:
+        served.post(JPEG)
+        gc.collect()
+        gc.disable()
+        gc.set_debug(gc.DEBUG_SAVEALL)
+        try:
+            statuses = [served.post(body).status for body in (JPEG, b"text", JPEG)]
+            statuses.append(served.post(JPEG, X_Deadline_Ms="x").status)
+            gc.collect()
+            left = [type(found) for found in gc.garbage]
+        finally:
+            gc.set_debug(0)
+            gc.garbage.clear()
+            gc.enable()
+    assert statuses == [200, 422, 200, 422]
+    assert not [kind for kind in left if kind.__module__.partition(".")[0] in ("serve", "mtlnet")]

@@ -4,15 +4,16 @@ import json
 import socket
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, contextmanager
 
 import pytest
 
-from serve import shared
+from serve import perceiver, shared
 from serve.limits import Limits, is_loopback
 from serve.problems import Problem
 from serve.rate import Rate
-from tests.serve.conftest import FakeEngine, Served, jpeg, outputs, picture, serving, until
+from tests.serve.conftest import FakeEngine, Gate, Served, jpeg, outputs, picture, serving, until
 from tests.serve.test_serve_app import assert_problem
 
 JPEG = jpeg(picture())
@@ -208,3 +209,19 @@ def test_which_addresses_are_this_machine() -> None:
     assert not any(
         map(is_loopback, ["0.0.0.0", "::", "10.0.0.1", "example.org", "", "::ffff:1.2.3.4"])
     )
+
+
+def test_a_full_service_pauses_until_a_frame_is_answered(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Refusals are given several at a time; an answer never waits for that."""
+    monkeypatch.setattr(perceiver, "FULL_PAUSE_S", 15.0)
+    gate = Gate()
+    with serving(gate.engine, limits=Limits(queue=1)) as service, ThreadPoolExecutor(2) as pool:
+        admitted = [pool.submit(Served(service.port).post, JPEG)]
+        until(gate.busy.is_set)
+        admitted.append(pool.submit(Served(service.port).post, JPEG))
+        until(lambda: service.app.perceiver.waiting == 1)
+        begin = time.monotonic()
+        assert service.post(JPEG).status == 503
+        gate.open.set()
+        assert [asked.result().status for asked in admitted] == [200, 200]
+        assert time.monotonic() - begin < 10.0

@@ -64,7 +64,7 @@ def test_each_worker_tells_of_all() -> None:
     for page in pages:
         assert page['driverview_frames_total{outcome="answered"}'] == 2
         assert page['driverview_frames_total{outcome="not-an-image"}'] == 1
-        assert page["driverview_workers"] == 2
+        assert page["driverview_workers"] == page["driverview_workers_ready"] == 2
 
 
 @pytest.fixture

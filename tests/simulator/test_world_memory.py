@@ -23,10 +23,14 @@ def test_a_closed_world_gives_its_memory_back() -> None:
             with World(road, traffic=2) as world:
                 world.reset(seed=0)
 
-    make()
-    gc.collect()
-    before = resident_mib()
+    def growth_mib() -> float:
+        before = resident_mib()
+        make()
+        gc.collect()
+        return resident_mib() - before
+
     make()
     gc.collect()
     # PyBullet 3.2.7 never gives back a mesh's lists: with walls as meshes it was 1 MiB a world.
-    assert resident_mib() - before < 0.15 * MAKES
+    # A leak shows every time; what other tests left in this process may move the heap once.
+    assert min(growth_mib() for _ in range(3)) < 0.15 * MAKES
