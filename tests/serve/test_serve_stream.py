@@ -1,6 +1,7 @@
 """Frames over a WebSocket: the answers, the problems and the rules of POST /features."""
 
 import json
+import socket
 import time
 from typing import Any
 
@@ -114,3 +115,20 @@ def test_a_giant_message_ends_the_websocket_and_nothing_else(service: Served) ->
         assert caught.value.rcvd is not None
         assert caught.value.rcvd.code == 1009
     assert service.post(JPEG).status == 200
+
+
+def test_whoever_is_still_sending_learns_why_the_websocket_ends(service: Served) -> None:
+    with socket.create_connection(("127.0.0.1", service.port), 20) as connection:
+        connection.sendall(
+            b"GET /stream HTTP/1.1\r\nhost: x\r\nupgrade: websocket\r\nconnection: upgrade\r\n"
+            b"sec-websocket-version: 13\r\nsec-websocket-key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n"
+        )
+        assert connection.recv(65536).startswith(b"HTTP/1.1 101")
+        mask = bytes(4)
+        connection.sendall(b"\x82\xff" + (MAX_BODY_BYTES + 1).to_bytes(8, "big") + mask)
+        for _ in range(4):  # a part of it, and more after the service has found it too long
+            connection.sendall(bytes(1 << 18))
+            time.sleep(0.05)
+        said = b"".join(iter(lambda: connection.recv(65536), b""))
+    assert said[:1] == b"\x88"
+    assert int.from_bytes(said[2:4], "big") == 1009
