@@ -67,6 +67,12 @@ class Plan:
         """The paper's MTL 3, or one plain squared error over all numbers for a single task."""
         return (0.3, 0.2, 0.5) if "type" in self.tasks else (1.0, 1.0, 0.0)
 
+    @property
+    def convolutions(self) -> tuple[str, ...]:
+        """Names of the convolutions, the first of all first; none where a backbone stands."""
+        each = enumerate(self.features)
+        return tuple(f"conv{number}" for number, spec in each if isinstance(spec, Conv))
+
 
 FEATURES: tuple[Conv | Pool, ...] = (
     Conv(96, 11, 4),

@@ -16,7 +16,7 @@ from mtlnet.loss import Alpha, Losses, multi_task_loss
 from mtlnet.network import Network, initialise
 from mtlnet.optimiser import Optimisers
 from mtlnet.plan import MTL, Plan
-from mtlnet.recipe import Recipe, learning_rate
+from mtlnet.recipe import Recipe, learning_rate, resting
 from mtlnet.resident import DeviceBatch, on_device
 from mtlnet.swift import training_outputs
 from mtlnet.together import average
@@ -86,6 +86,7 @@ class Trainer:
         self.network.train()
         if progress >= self.recipe.settled and self.step_number >= SETTLING_STEPS:
             settle_norms(self.network)
+        rest(self.network, resting(self.recipe, progress))
         rate = learning_rate(self.recipe, self.step_number, progress)
         self.optimisers.set_rate(rate)
         given = on_device(batch, self.device)
@@ -127,6 +128,13 @@ def settle_norms(network: Network) -> None:
     for module in network.modules():
         if isinstance(module, nn.BatchNorm2d):
             module.eval()
+
+
+def rest(network: Network, count: int) -> None:
+    """Let the first `count` convolutions keep their weights; no work goes into their gradients."""
+    for number, name in enumerate(network.plan.convolutions):
+        for parameter in network.features.get_submodule(name).parameters():
+            parameter.requires_grad_(number >= count)
 
 
 def dropout_masks(

@@ -5,7 +5,14 @@ import math
 import pytest
 import torch
 
-from mtlnet.loss import ANGLE_BEND, ANGLE_GAIN, AlphaError, multi_task_loss, parse_alpha
+from mtlnet.loss import (
+    ANGLE_BEND,
+    ANGLE_GAIN,
+    DISTANCE_GAIN,
+    AlphaError,
+    multi_task_loss,
+    parse_alpha,
+)
 
 OUTPUTS = torch.tensor(
     [
@@ -41,10 +48,10 @@ def test_bent_losses_grow_as_errors_do() -> None:
     # In standard deviations two distances err by 1 and the angle of one image of two by 1.
     bent = multi_task_loss(OUTPUTS, TARGETS, HEADING, (1.0, 2.0, 0.0), scale, 0.5)
     angle = ANGLE_GAIN * (1 - ANGLE_BEND / 2) / 2
-    assert float(bent.total) == pytest.approx(2 / 10 * (1 - 0.25) + 2 * angle)
+    assert float(bent.total) == pytest.approx(DISTANCE_GAIN * 2 / 10 * (1 - 0.25) + 2 * angle)
     # Below the bend: the square, by twice the bend.
     small = multi_task_loss(OUTPUTS, TARGETS, HEADING, (1.0, 2.0, 0.0), scale, 2.0)
-    assert float(small.total) == pytest.approx(2 / 10 / 4 + 2 * angle)
+    assert float(small.total) == pytest.approx(DISTANCE_GAIN * 2 / 10 / 4 + 2 * angle)
     assert float(bent.distance) == pytest.approx(DISTANCE)
 
 

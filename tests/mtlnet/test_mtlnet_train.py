@@ -88,6 +88,22 @@ def test_late_in_a_run_statistics_of_batches_stay(dataset: Path) -> None:
     assert moved == [True, False, False, True]
 
 
+def test_the_first_convolutions_learn_for_a_part_of_the_run(dataset: Path) -> None:
+    frames = Dataset.open(dataset).select("train")
+    recipe = replace(RECIPES["fast"], batch=4)
+    trainer = Trainer(recipe, (0.3, 0.2, 0.5), 0, CPU)
+    batch = Loader(frames, Camera(), 4, 0, augment=False).make(0)
+    network = trainer.network
+    assert [share for share, _ in recipe.rests] == sorted(share for share, _ in recipe.rests)
+    for progress, count in [(0.1, 0), *recipe.rests, (0.99, recipe.rests[-1][1])]:
+        before = {name: weight.detach().clone() for name, weight in network.named_parameters()}
+        trainer.step(batch, progress)
+        still = {
+            n.split(".")[1] for n, w in network.named_parameters() if torch.equal(w, before[n])
+        }
+        assert still == set(network.plan.convolutions[:count])
+
+
 @pytest.mark.parametrize(("recipe", "balance"), [("fast", "dwa"), ("paper", "uncertainty")])
 def test_stopped_and_resumed_is_the_unbroken_run(
     dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, recipe: str, balance: str
