@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
-PACKAGES := trackfeatures simulator datagen mtlnet serve controllers
+PACKAGES := trackfeatures runtime simulator datagen mtlnet serve controllers
 # Debian keeps ldconfig in /sbin, which is not on every user's PATH.
 export PATH := $(CURDIR)/$(BIN):$(PATH):/usr/sbin:/sbin
 
@@ -66,7 +66,7 @@ fuzz: $(READY) ## a million damaged images through the service's gate, in proces
 	$(BIN)/python benchmarks/service_fuzz.py
 
 api: $(READY) ## a thousand requests an operation, made from the OpenAPI document
-	DRIVERVIEW_API_EXAMPLES=1000 $(BIN)/pytest tests/serve/test_serve_openapi.py
+	DRIVERVIEW_API_EXAMPLES=1000 $(BIN)/pytest tests/serve/api/test_openapi.py
 
 e2e: $(READY) ## one round from the simulator to a steered car
 	$(BIN)/pytest tests/e2e

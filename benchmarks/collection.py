@@ -43,8 +43,8 @@ def draw_round(entry: dict[str, Any]) -> tuple[int, float, float]:
     """Drive a round of the plan; of drawing its frames: how many, wall and processor seconds."""
     # Mesa and numpy are to use one thread a process, as the collector's workers do.
     os.environ.update(LP_NUM_THREADS="0", OMP_NUM_THREADS="1")
-    from datagen.plan import RoundPlan
-    from datagen.record import moments_of, scene_of
+    from datagen.planning.plan import RoundPlan
+    from datagen.recorder.record import moments_of, scene_of
 
     with scene_of(RoundPlan.from_json(entry), None) as (drive, camera):
         drawn, wall_s, cpu_s = 0, 0.0, 0.0

@@ -29,12 +29,12 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from benchmarks.material.servers import OURS, running
-from mtlnet.answer import interpret
-from mtlnet.card import read_card
-from mtlnet.engine import load_engine
-from mtlnet.images import decode, inspect
+from mtlnet.inference.engine import load_engine
+from mtlnet.inference.image_decoding.decode import decode, inspect
+from mtlnet.inference.model_card import read_card
+from mtlnet.inference.prediction import decode_outputs
 from serve.client import Client, ServiceError
-from serve.manage import ask
+from serve.workers.control_socket import ask
 from tests.serve.conftest import jpeg, picture, publish_untrained
 
 CLIENTS, HERTZ, WORKERS = 8, 20.0, 2
@@ -124,7 +124,7 @@ def answers_of(run: Path, images: list[bytes]) -> list[dict[str, Any]]:
     engine = load_engine(run)
     camera = engine.card.camera
     return [
-        interpret(engine(decode(image, inspect(image, camera), camera))).as_json()
+        decode_outputs(engine(decode(image, inspect(image, camera), camera))).as_json()
         for image in images
     ]
 

@@ -29,7 +29,7 @@ def flip(path: Path, at: int, bit: int) -> None:
 
 
 def run(data: Path, flips: int, seed: int) -> dict[str, object]:
-    from datagen.recording.verify import verify
+    from datagen.recording.integrity.verify import verify
 
     rng = np.random.default_rng(seed)
     rounds = sorted((data / "rounds").glob("*.mcap"))

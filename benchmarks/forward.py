@@ -5,8 +5,8 @@ without another precision. They are asked in turns, so that a busy machine distu
 int8 graph is quantised here, on noise: its answers are of no use, its time is that of any other.
 
 Both sides compute the network's nine outputs. What an engine adds to them in the same pass,
-deviations and novelty (`mtlnet.doubt`), torch does not compute here: with a model that has them
-the passes `with doubt` are told, too, and judged by nothing.
+deviations and novelty (`mtlnet.inference.uncertainty`), torch does not compute here: with a model
+that has them the passes `with doubt` are told, too, and judged by nothing.
 
     python benchmarks/forward.py [--model RUN] [--rounds 200] [--out FILE]
     claims: bf16 at most 0.40 of torch's time, int8 at most 0.20
@@ -32,11 +32,11 @@ import torch
 from numpy.typing import NDArray
 
 from benchmarks.material.servers import model
-from mtlnet.card import GRAPH, WEIGHTS, read_card
-from mtlnet.engine import best_precision
-from mtlnet.export import build_graph
-from mtlnet.int8 import quantise
-from mtlnet.network import load_network
+from mtlnet.export.int8 import quantise
+from mtlnet.export.openvino_graph import build_graph
+from mtlnet.inference.engine import best_precision
+from mtlnet.inference.model_card import GRAPH, WEIGHTS, read_card
+from mtlnet.model.network import load_network
 
 CLAIMS = {"bf16": 0.40, "int8": 0.20}
 WARM_UP = 20

@@ -24,19 +24,19 @@ from typing import Any
 
 import numpy as np
 
-from simulator.compiled import compiled
+from runtime.jit import compiled
 from simulator.link.channel import Receiver, Sender, state_image_bytes
 from simulator.link.client import Link
-from simulator.link.engine import Engine
 from simulator.link.errors import EngineDied, LinkError
 from simulator.link.handshake import EngineInfo, write_header
 from simulator.link.layout import COMMAND, STATE, Mode, segment_size
 from simulator.link.segment import SHM, Segment, create
-from simulator.link.seqlock import DAMAGED, READ, publish, spin, take
-from simulator.state import Command
+from simulator.link.server import Engine
+from simulator.link.sync.seqlock import DAMAGED, READ, publish, spin, take
 from simulator.track.catalogue import find_track
 from simulator.track.road import Road
-from simulator.world import World
+from simulator.vehicle.state import Command
+from simulator.world.world import World
 
 BOUND_S = 2.0
 START_S = 180.0
@@ -323,7 +323,7 @@ def steps_in_c(hammer: str, name: str, steps: int) -> list[float]:
 
 
 def steps_here(world: World, steps: int) -> list[float]:
-    from simulator.reward import ending
+    from simulator.env.reward import ending
     from simulator.sensors.standard import read_track_range
 
     world.reset(seed=1)

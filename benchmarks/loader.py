@@ -56,8 +56,8 @@ def decoder(frames: Frames, order: NDArray[np.int64]) -> Read:
 
 
 def ours(frames: Frames, batches: int) -> Read:
-    from mtlnet.card import Camera
-    from mtlnet.loader import Loader
+    from mtlnet.data.loader import Loader
+    from mtlnet.inference.model_card import Camera
 
     camera = Camera(width=frames.camera.width, height=frames.camera.height)
     endless = Loader(frames, camera, BATCH, 0, augment=False).batches(0)
@@ -100,7 +100,7 @@ def mcap_reader(frames: Frames, order: NDArray[np.int64], count: int) -> Read:
     from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
     from mcap.reader import make_reader
 
-    from datagen.recording import topics
+    from datagen.recording.schema import topics
 
     ends = np.cumsum([info.frames for info in frames.rounds])
     readers = {info.path: make_reader(info.path.open("rb")) for info in frames.rounds}

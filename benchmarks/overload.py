@@ -27,7 +27,7 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from benchmarks.material.servers import HERE, OURS, Loader, add_options, model, pythons, running
-from serve.limits import Limits
+from serve.config import Limits
 
 OVER, GOODPUT, REFUSED_MS, SLOWER = 5.0, 0.95, 5.0, 2.0
 BUSY = 4  # clients that keep one worker busy, and whom its queue holds

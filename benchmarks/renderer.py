@@ -27,7 +27,7 @@ import numpy as np
 
 import simulator.env  # noqa: F401  (registers the names)
 from simulator.camera import Camera, Light
-from simulator.camera.context import graphics
+from simulator.camera.core.context import graphics
 from simulator.camera.snapshot import standing_pose
 from simulator.track.catalogue import find_track
 from simulator.track.road import Road

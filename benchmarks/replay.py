@@ -29,7 +29,7 @@ import numpy as np
 from gymnasium.vector import AsyncVectorEnv
 
 import simulator.env  # noqa: F401  (registers the names)
-from simulator.camera.light import KINDS
+from simulator.camera.scene.light import KINDS
 from simulator.track.catalogue import OWN_TRACKS
 
 STEPS = 200

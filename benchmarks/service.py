@@ -33,8 +33,8 @@ def plain(engine: FakeEngine) -> Any:
     """The handler that one writes first."""
     from fastapi import FastAPI, Request
 
-    from mtlnet.answer import interpret
-    from mtlnet.images import decode, inspect
+    from mtlnet.inference.image_decoding.decode import decode, inspect
+    from mtlnet.inference.prediction import decode_outputs
 
     app = FastAPI()
     camera = engine.card.camera
@@ -44,7 +44,7 @@ def plain(engine: FakeEngine) -> Any:
         body = await request.body()
         header = inspect(body, camera)  # ours does this before its clock starts, too
         start = time.perf_counter()
-        answer = interpret(engine(decode(body, header, camera)))
+        answer = decode_outputs(engine(decode(body, header, camera)))
         work_ms = 1e3 * (time.perf_counter() - start)
         timing = {"decode": work_ms, "forward": 0.0}
         return {**answer.as_json(), "model": engine.card.model_hash, "timing_ms": timing}
@@ -66,8 +66,8 @@ def serve(which: str, fd: int) -> None:
         uvicorn.Server(config).run(sockets=[listener])
     else:
         from serve.app import Service
-        from serve.limits import Limits
-        from serve.listener import WorkerServer
+        from serve.config import Limits
+        from serve.server.worker_server import WorkerServer
 
         WorkerServer(Service(engine, lambda _engine: None), Limits()).run(sockets=[listener])
 

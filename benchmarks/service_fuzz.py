@@ -17,9 +17,9 @@ import cv2
 import numpy as np
 import simplejpeg
 
-from mtlnet.card import Camera
-from mtlnet.image_error import ImageError
-from mtlnet.images import decode, inspect
+from mtlnet.inference.image_decoding.decode import decode, inspect
+from mtlnet.inference.image_decoding.errors import ImageError
+from mtlnet.inference.model_card import Camera
 
 MAX_GROWTH = 0.01
 VIEW = Camera()

@@ -20,7 +20,7 @@ from statistics import median
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from trackfeatures.listening import bind
+from runtime.sockets import bind
 
 ROOT = Path(__file__).parents[1]
 CLAIM_S = 1.0

@@ -26,7 +26,7 @@ import numpy as np
 
 import simulator.env
 from simulator.sensors.beams import BEAM_ANGLES
-from simulator.sensors.brute_force import BruteForce
+from tests.simulator.oracles import BruteForce
 
 CLAIMS = {"steps_per_second": 4000.0, "times_car_racing": 20.0, "times_racetrack": 40.0}
 BEAMS_WITHIN_M = 0.02

@@ -12,7 +12,7 @@ import sys
 from dataclasses import asdict
 from pathlib import Path
 
-from controllers.torcs_fit import LIMITS, TRACKS, Fit, compare
+from benchmarks.material.torcs_laps import LIMITS, TRACKS, Fit, compare
 
 
 def line(fit: Fit, sampling: str) -> str:

@@ -14,9 +14,9 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-from simulator.rush_hour import Disorder, watch
 from simulator.track.catalogue import find_track, track_files
 from simulator.track.road import Road
+from tests.simulator.traffic_audit import Disorder, watch
 
 
 def one(case: tuple[str, int, bool], seconds: float) -> dict[str, Any]:

@@ -29,12 +29,12 @@ from torch import Tensor
 
 import trackfeatures as tf
 from datagen.recording import Dataset, Frames
-from mtlnet.card import Camera
-from mtlnet.loader import Loader
-from mtlnet.loss import multi_task_loss
-from mtlnet.network import Network, initialise
-from mtlnet.recipe import RECIPES, WARM_UP
-from mtlnet.trainer import SETTLING_STEPS, Trainer, keep_freed_memory
+from mtlnet.data.loader import Loader
+from mtlnet.inference.model_card import Camera
+from mtlnet.model.network import Network, initialise
+from mtlnet.training.loss import multi_task_loss
+from mtlnet.training.recipes import RECIPES, WARM_UP
+from mtlnet.training.trainer import SETTLING_STEPS, Trainer, keep_freed_memory
 
 MOST_OVER_MEMORY = 1.05
 LEAST_OVER_PLAIN = 2.0

@@ -34,7 +34,7 @@ def hash_alone(folder: Path) -> None:
 
 
 def measure(folder: Path) -> dict[str, object]:
-    from datagen.recording.verify import verify
+    from datagen.recording.integrity.verify import verify
 
     verify_s: dict[str, list[float]] = {"quick": [], "full": []}
     hash_s: list[float] = []

@@ -16,7 +16,7 @@ os.environ.setdefault("LP_NUM_THREADS", "0")  # before Mesa reads it: draw in th
 import numpy as np
 
 from simulator.camera import KINDS, Camera, Light
-from simulator.camera.light import WEATHERS
+from simulator.camera.scene.light import WEATHERS
 from simulator.camera.snapshot import standing_pose
 from simulator.track.catalogue import find_track
 from simulator.track.road import Road

@@ -6,13 +6,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from trackfeatures import command
+from runtime import cli as command
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from controllers.result import DriveResult
-    from controllers.trip import DriveConfig
+    from controllers.closed_loop import DriveResult
+    from controllers.drive import DriveConfig
 
 app = typer.Typer(add_completion=False, rich_markup_mode="rich", no_args_is_help=True)
 
@@ -58,8 +58,8 @@ def drive(
     from rich.markup import escape
     from rich.progress import MofNCompleteColumn, Progress
 
-    from controllers.trip import DriveConfig
-    from controllers.trip import drive as drive_trip
+    from controllers.drive import DriveConfig
+    from controllers.drive import drive as drive_trip
 
     config = DriveConfig(
         controller=controller,

@@ -1,141 +1,152 @@
-"""Closed-loop driving: perceive, steer, step, score. Throttle is held open loop, as in the paper.
+"""One drive from its configuration: road, world, eyes, controller, log.
 
-A run of `run_lap` is a function of the world's reset, the controller and the perception alone.
+controllers drive --controller lqr --track oval --perception truth --log drive.csv
 """
 
+import itertools
 import math
 from collections.abc import Callable
-from typing import Protocol, TypeVar
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
 
-import numpy as np
-
-from controllers.observation import Controller, Observation
-from controllers.perception import Perceived
-from controllers.result import DriveResult
-from simulator.idm import idm_acceleration
-from simulator.reward import ending, step_reward
-from simulator.state import CarState, Command
+import trackfeatures as tf
+from controllers.closed_loop import THROTTLE, DriveLog, DriveResult, run_lap
+from controllers.perception import open_eyes
+from controllers.registry import Setting, make_controller
+from simulator.camera import check_light
+from simulator.track.catalogue import find_track
 from simulator.track.road import Road
-from simulator.traffic import Traffic
+from simulator.vehicle.state import CarState
+from simulator.world.world import World
+from trackfeatures import UserError
 
-GEAR = 1
-THROTTLE = 0.2
-HOLD_S = 0.5
-"""A lost offset is held this long; then the car is steered along the road until one is seen."""
-RUN_UP_S = 15.0
-EASE_OFF = 1.0  # m/s2 of wanted braking at which the throttle is closed
-FULL_BRAKING = 15.0  # m/s2 at full brake on asphalt
-
-
-class Drivable(Protocol):
-    """What a drive needs of `simulator.world.World`."""
-
-    road: Road
-    frequency_hz: int
-    traffic: Traffic
-
-    @property
-    def state(self) -> CarState: ...
-
-    def step(self, command: Command) -> CarState: ...
+FREQUENCY_HZ = 20
+SCORED_STEPS = {"forza": 6500, "alpine-2": 4500, "eroad": 3700, "g-track-3": 3300}
+"""The fixed numbers of steps that scores are compared over."""
+USUAL_SPEED = 15.0  # m/s, a little less than gear 1 and the default throttle give on a flat road
 
 
-World = TypeVar("World", bound=Drivable)
+@dataclass(frozen=True)
+class DriveConfig:
+    """One closed-loop drive. The same configuration gives the same drive."""
+
+    controller: str = "lqr"
+    track: str = "oval"
+    lanes: int = 1
+    perception: str = "truth"
+    """truth, model, or the address of a service."""
+    steps: int | None = None
+    """Control steps of 50 ms; None: the track's scored number, else about one lap."""
+    log: Path | None = None
+    model: str = "default"
+    """The run that perception `model` drives with; default: the shipped one, else the latest."""
+    start_d: float | None = None
+    """m left of the track's centre; None: the middle of the target lane, or 0 without one."""
+    target_lane: int | None = None
+    """0 is the leftmost; None: the lane nearest to the start."""
+    throttle: float = THROTTLE
+    traffic: int = 0
+    light: str = "clear"
+    seed: int = 0
+    tracks_dir: Path | None = None
 
 
-def run_lap(
-    world: World,
-    controller: Controller,
-    perceive: Callable[[World], Perceived],
-    steps: int,
-    *,
-    throttle: float = THROTTLE,
-    lane_centre: float = 0.0,
-    record: Callable[[CarState, float], None] | None = None,
-) -> DriveResult:
-    """Drives `steps` control steps from where the world stands, or until the episode ends.
+@dataclass(frozen=True)
+class Lane:
+    """Where a drive starts and the line it follows, m left of the track's centre."""
 
-    `lane_centre` (m, left positive) is the line that `mean_abs_d_m` is measured from. `record` is
-    given each step's state and the steering chosen in it. The reward is that of the state after
-    each step.
+    start_d: float
+    centre: float
+
+
+def drive(config: DriveConfig, progress: Callable[[int, int], None] | None = None) -> DriveResult:
+    """Drives `config`; each step calls `progress` with the steps done and those to do.
+
+    The log is written row by row, so what was driven is kept whatever happens. Raises UserError
+    for what cannot be: an unknown name, a lane or place that is not there, a service that is down.
     """
-    memory = OffsetMemory(round(HOLD_S * world.frequency_hz))
-    score, ended = 0.0, None
-    offsets, speeds = [], []
-    start_m = world.state.odometer_m
-    for _ in range(steps):
-        now = world.state
-        steer = controller.update(_observe(now, perceive(world), memory))
-        if record is not None:
-            record(now, steer)
-        pedal, brake = pedals(world.traffic, now, throttle)
-        after = world.step(Command(steer=steer, throttle=pedal, brake=brake, gear=GEAR))
-        offsets.append(abs(after.to_middle - lane_centre))
-        speeds.append(after.speed_kmh)
-        ended = ending(after)
-        score += step_reward(
-            after.angle,
-            after.to_middle,
-            world.road.half_width,
-            ended=ended is not None,
+    check_light(config.light)  # the truth needs none, but a misspelt one is a mistake all the same
+    track = find_track(config.track, config.tracks_dir)
+    road = Road(track, lanes=config.lanes)
+    lane = choose_lane(config, road)
+    steps = steps_for(config.steps, track.name, track.length_m)
+    setting = Setting(1.0 / FREQUENCY_HZ, perceived=config.perception != "truth")
+    controller = make_controller(config.controller, setting)
+    if not 0.0 <= config.throttle <= 1.0:
+        raise UserError(f"throttle {config.throttle} is out of range; give one from 0 to 1")
+    with ExitStack() as stack:
+        world = stack.enter_context(World(road, traffic=config.traffic, frequency_hz=FREQUENCY_HZ))
+        world.reset(seed=config.seed, to_middle=lane.start_d)
+        eyes = stack.enter_context(
+            open_eyes(
+                config.perception,
+                world,
+                model=config.model,
+                lane_centre=lane.centre,
+                light=config.light,
+                seed=config.seed,
+            )
         )
-        if ended is not None:
-            break
-    run_up = round(RUN_UP_S * world.frequency_hz)
-    return DriveResult(
-        steps=len(offsets),
-        steps_asked=steps,
-        score=score,
-        score_per_step=score / steps,
-        laps=max(world.state.lap - 1, 0),
-        distance_m=world.state.odometer_m - start_m,
-        mean_abs_d_m=float(np.mean(offsets)),
-        max_abs_d_m=max(offsets),
-        speed_kmh=(min(speeds), max(speeds)),
-        cruising_kmh=(min(speeds[run_up:]), max(speeds)) if len(speeds) > run_up else None,
-        blind_steps=memory.blind_steps,
-        noisy=False,
-        ended=ended,
-    )
+        log = None
+        if config.log is not None:
+            log = DriveLog(stack.enter_context(config.log.open("w", encoding="utf-8")))
+        done = itertools.count()
+
+        def record(state: CarState, steer: float) -> None:
+            if log is not None:
+                log.write(state, steer)
+            if progress is not None:
+                progress(next(done), steps)
+
+        return run_lap(
+            world,
+            controller,
+            eyes.perceive,
+            steps,
+            throttle=config.throttle,
+            lane_centre=lane.centre,
+            record=record,
+        )
 
 
-class OffsetMemory:
-    """Bridges the steps in which no marking is perceived."""
+def choose_lane(config: DriveConfig, road: Road) -> Lane:
+    """The lane to follow and where to start.
 
-    def __init__(self, hold_steps: int) -> None:
-        self.blind_steps = 0
-        self._hold_steps = hold_steps
-        self._age = 0
-        self._last = 0.0
+    Raises UserError for a lane that is not there, and on perception for a target other than the
+    lane the drive starts in: an image tells only the offset from the lane the car is in.
+    """
+    target = config.target_lane
+    if target is not None and not 0 <= target < road.lanes:
+        raise UserError(
+            f"target lane {target} is not there; the {road.lanes} lane(s) are numbered from 0, "
+            "the leftmost"
+        )
+    if config.start_d is not None:
+        start = config.start_d
+    elif target is not None:
+        start = tf.lane_centre(target, road.lanes, road.lane_width)
+    else:
+        start = 0.0
+    if not (math.isfinite(start) and abs(start) <= road.edge):
+        raise UserError(
+            f"start-d {start:g} m is off the road, which ends {road.edge:.2f} m from its centre"
+        )
+    nearest = tf.lane_index(start, road.lanes, road.lane_width)
+    if target is not None and target != nearest and config.perception != "truth":
+        raise UserError(
+            f"the start is in lane {nearest}, the target is lane {target}: perception tells only "
+            "the lane the car is in; leave --start-d out, or drive on the truth"
+        )
+    chosen = nearest if target is None else target
+    return Lane(start, tf.lane_centre(chosen, road.lanes, road.lane_width))
 
-    def fill(self, offset: float | None) -> float:
-        """The offset, the last one for `hold_steps` steps, after that 0: along the road."""
-        if offset is not None:
-            self._age, self._last = 0, offset
-            return offset
-        self.blind_steps += 1
-        self._age += 1
-        return self._last if self._age <= self._hold_steps else 0.0
 
-
-def pedals(traffic: Traffic, now: CarState, throttle: float) -> tuple[float, float]:
-    """(throttle, brake): `throttle` on a free road, less or the brake behind a slower car."""
-    leader = traffic.leader(now.s, now.to_middle) if traffic.count else None
-    if leader is None:
-        return throttle, 0.0
-    gap, lead_speed = leader
-    wish = idm_acceleration(gap, max(now.vx, 0.0), lead_speed, math.inf)
-    open_share = min(max(1.0 + wish / EASE_OFF, 0.0), 1.0)
-    return throttle * open_share, min(max(-wish - EASE_OFF, 0.0) / FULL_BRAKING, 1.0)
-
-
-def _observe(now: CarState, seen: Perceived, memory: OffsetMemory) -> Observation:
-    return Observation(
-        to_lane_centre=memory.fill(seen.to_lane_centre),
-        angle=seen.angle,
-        heading=seen.heading,
-        vx=now.vx,
-        vy=now.vy,
-        yaw_rate=now.yaw_rate,
-        curvature=seen.curvature,
-    )
+def steps_for(asked: int | None, track: str, length_m: float) -> int:
+    """The steps asked for; else the track's scored number; else about one lap, in hundreds."""
+    if asked is not None:
+        if asked < 1:
+            raise UserError(f"{asked} steps asked for; give 1 or more")
+        return asked
+    about = length_m / USUAL_SPEED * FREQUENCY_HZ
+    return SCORED_STEPS.get(track, 100 * math.ceil(about / 100))

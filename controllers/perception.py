@@ -17,7 +17,7 @@ from trackfeatures import Heading, UserError
 
 if TYPE_CHECKING:
     from simulator.camera import Camera
-    from simulator.world import World
+    from simulator.world.world import World
 
 Image = NDArray[np.uint8]
 JPEG_QUALITY = 95  # that of the recorded training images
@@ -43,8 +43,8 @@ class Perceive(Protocol):
     def __call__(self, world: "World") -> Perceived: ...
 
 
-class Vision(Protocol):
-    """What `Sight` asks of a network: its camera, and its answer to an image."""
+class FeatureModel(Protocol):
+    """What `CameraPerception` asks of a network: its camera, and its answer to an image."""
 
     camera: dict[str, Any]
 
@@ -77,12 +77,12 @@ class LocalModel:
     def __init__(self, run: str) -> None:
         from dataclasses import asdict
 
-        from mtlnet.answer import interpret
-        from mtlnet.card import resolve_run
-        from mtlnet.engine import load_engine
+        from mtlnet.inference.engine import load_engine
+        from mtlnet.inference.model_card import resolve_run
+        from mtlnet.inference.prediction import decode_outputs
 
         self._engine = load_engine(resolve_run(run))
-        self._interpret = interpret
+        self._interpret = decode_outputs
         self.camera: dict[str, Any] = asdict(self._engine.card.camera)
 
     def look(self, image: Image) -> dict[str, Any]:
@@ -117,10 +117,10 @@ class Service:
         self._client.close()
 
 
-class Sight:
+class CameraPerception:
     """Perception by a camera on the car and a network that reads its images."""
 
-    def __init__(self, camera: "Camera", vision: Vision) -> None:
+    def __init__(self, camera: "Camera", vision: FeatureModel) -> None:
         self._camera = camera
         self._vision = vision
 
@@ -151,7 +151,7 @@ def _finite(*values: float) -> None:
         raise ValueError(f"{values} are not all finite")
 
 
-class Eyes:
+class PerceptionSource:
     """A `Perceive` chosen by name, with what it holds open. A context manager."""
 
     def __init__(self, perceive: Perceive, *closing: Callable[[], None]) -> None:
@@ -169,15 +169,15 @@ class Eyes:
 
 def open_eyes(
     perception: str, world: "World", *, model: str, lane_centre: float, light: str, seed: int
-) -> Eyes:
+) -> PerceptionSource:
     """The perception named "truth", "model" or a service's address.
 
     Raises UserError for any other word, a missing model, or a service that is not there.
     """
     if perception == "truth":
-        return Eyes(truth(lane_centre))
+        return PerceptionSource(truth(lane_centre))
     if perception == "model":
-        vision: Vision = LocalModel(model)
+        vision: FeatureModel = LocalModel(model)
     elif ":" in perception:
         vision = Service(perception)
     else:
@@ -186,7 +186,7 @@ def open_eyes(
             "service such as http://127.0.0.1:8000"
         )
     camera = _camera(vision.camera, world, light, seed)
-    return Eyes(Sight(camera, vision), vision.close, camera.close)
+    return PerceptionSource(CameraPerception(camera, vision), vision.close, camera.close)
 
 
 def _camera(wanted: dict[str, Any], world: "World", light: str, seed: int) -> "Camera":

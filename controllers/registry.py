@@ -3,9 +3,9 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from controllers.feedback import Feedback
+from controllers.interface import Controller
 from controllers.lqr import EXACT, PERCEIVED, Lqr
-from controllers.observation import Controller
+from controllers.torcs_feedback import Feedback
 from trackfeatures.errors import UserError
 
 

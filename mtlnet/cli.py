@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from trackfeatures.command import main as run_command
+from runtime.cli import main as run_command
 
 if TYPE_CHECKING:
-    from mtlnet.engine import Engine
+    from mtlnet.inference.engine import Engine
 
 app = typer.Typer(
     help="Train, evaluate and ask the multi-task perception network.",
@@ -97,7 +97,7 @@ def train_command(
         "skip_undecodable": skip_undecodable or None,
     }
     options: dict[str, Any] = {k: v for k, v in given.items() if v is not None}
-    from mtlnet.start import start_training
+    from mtlnet.training.start import start_training
 
     result = start_training(options, alpha, out, resume=resume)
     if as_json and result:
@@ -125,8 +125,8 @@ def ablate_command(
     as_json: Json = False,
 ) -> None:
     """The paper's table made anew: each task alone, MTL 1 to 4, and two other networks."""
-    from mtlnet.ablate import ablate
-    from mtlnet.ablation import AblationConfig, parse_seeds, rows_of
+    from mtlnet.evaluation.ablation import AblationConfig, parse_seeds, rows_of
+    from mtlnet.evaluation.ablation_run import ablate
 
     config = AblationConfig(
         data, out, iterations, parse_seeds(seeds), recipe, batch, split, every, device, threads
@@ -155,9 +155,9 @@ def export_command(
     """Write a model as ONNX or OpenVINO, checked against torch; int8 has to pass a gate."""
     from rich.console import Console
 
-    from mtlnet.card import resolve_run
-    from mtlnet.convert import export_model
-    from mtlnet.tables import export_lines
+    from mtlnet.evaluation.tables import export_lines
+    from mtlnet.export.convert import export_model
+    from mtlnet.inference.model_card import resolve_run
 
     result = export_model(resolve_run(model), form, precision, data, out, frames)
     if as_json:
@@ -185,8 +185,8 @@ def evaluate_command(
     from rich.console import Console
     from rich.progress import Progress
 
-    from mtlnet.evaluate import evaluate
-    from mtlnet.tables import doubt_table, evaluation_table, group_table
+    from mtlnet.evaluation.evaluate import evaluate
+    from mtlnet.evaluation.tables import doubt_table, evaluation_table, group_table
 
     # The frames are shared out to engines of one thread each: that answers more of them a second
     # than one engine on all cores.
@@ -225,9 +225,9 @@ def predict_command(
     """Track features of images from the model's camera."""
     from rich.console import Console
 
-    from mtlnet.answer import interpret
-    from mtlnet.images import read_image
-    from mtlnet.tables import answer_table
+    from mtlnet.evaluation.tables import answer_table
+    from mtlnet.inference.image_decoding.decode import read_image
+    from mtlnet.inference.prediction import decode_outputs
 
     _say_which(model)
     ready = _load(model, engine, precision)
@@ -235,7 +235,7 @@ def predict_command(
     for path in images:
         image = read_image(path, ready.card.camera)
         begin = time.perf_counter()
-        answer = interpret(ready(image)).as_json()
+        answer = decode_outputs(ready(image)).as_json()
         latency_ms = round(1e3 * (time.perf_counter() - begin), 3)
         answers.append(
             {"image": str(path), **answer, "model": ready.card.name, "latency_ms": latency_ms}
@@ -248,15 +248,15 @@ def predict_command(
 
 def _say_which(model: str) -> None:
     """Tell on stderr which run a name stands for."""
-    from mtlnet.card import resolve_run
+    from mtlnet.inference.model_card import resolve_run
 
     typer.echo(f"model: {resolve_run(model)}", err=True)
 
 
 def _load(model: str, kind: str, precision: str | None) -> "Engine":
     """The engine of a model, on one thread."""
-    from mtlnet.card import resolve_run
-    from mtlnet.engine import load_engine, parse_kind, parse_precision
+    from mtlnet.inference.engine import load_engine, parse_kind, parse_precision
+    from mtlnet.inference.model_card import resolve_run
 
     return load_engine(resolve_run(model), parse_kind(kind), parse_precision(precision), threads=1)
 

@@ -12,29 +12,31 @@ from fastapi import FastAPI
 from fastapi.responses import JSONResponse, PlainTextResponse, Response
 from starlette.routing import Route
 
-from mtlnet.engine import Engine
-from serve import contract, failures, inference, problems
-from serve.ask import Headers, check_token
-from serve.console import add_console
-from serve.docs import PATH as DOCS
-from serve.docs import add_docs
-from serve.features import Exchange, Features, Sight, client_of
-from serve.gate import Receive, Reply, Scope, Send, refusal, reply
-from serve.limits import Limits
-from serve.metrics import MEDIA_TYPE, Metrics
-from serve.perceiver import Perceiver
-from serve.problems import Problem
-from serve.rate import Rate
-from serve.readiness import warm_up
-from serve.shared import Shared, create
-from serve.stream import Stream
-from serve.streams import Streams
+from mtlnet.inference.engine import Engine
+from serve.api import failures, problems
+from serve.api import kserve as inference
+from serve.api import schemas as contract
+from serve.api.console import add_console
+from serve.api.docs import PATH as DOCS
+from serve.api.docs import add_docs
+from serve.api.features import FeaturesEndpoint, FeaturesRequest, FrameHandler, client_of
+from serve.api.http_io import Receive, Reply, Scope, Send, refusal, reply
+from serve.api.problems import Problem
+from serve.api.request_options import Headers, check_token
+from serve.api.stream import Stream
+from serve.config import Limits
+from serve.observability.metrics import MEDIA_TYPE, Metrics
+from serve.scheduling.frame_queue import FrameQueue
+from serve.scheduling.rate_limit import Rate
+from serve.scheduling.streams import Streams
+from serve.scheduling.warmup import warm_up
+from serve.workers.shared_memory import Shared, create
 
 if TYPE_CHECKING:
     from opentelemetry.trace import Tracer
 
 App = Callable[[Scope, Receive, Send], Awaitable[None]]
-Begin = Callable[[Sight, str, Callable[[Reply], None]], Exchange]
+Begin = Callable[[FrameHandler, str, Callable[[Reply], None]], FeaturesRequest]
 
 PROBES = {
     "/healthz",
@@ -65,13 +67,13 @@ class Service:
         self.limits = limits or Limits()
         self.shared = shared or create(slots=1)
         streams = Streams(self.shared.streams())
-        self.perceiver = Perceiver(engine, check, streams, self.limits.queue)
+        self.perceiver = FrameQueue(engine, check, streams, self.limits.queue)
         self.metrics = Metrics(self.shared, slot)
-        self.sight = Sight(self.perceiver, self.metrics, self.limits.log_answers)
-        self._begin: Begin = Exchange
+        self.sight = FrameHandler(self.perceiver, self.metrics, self.limits.log_answers)
+        self._begin: Begin = FeaturesRequest
         if tracer is not None:
             self.sight, self._begin = _traced(self, tracer)
-        self.features = Features(self.sight, self._begin)
+        self.features = FeaturesEndpoint(self.sight, self._begin)
         self.rate = Rate(self.shared.clients(), self.limits.rate)
         self._token = self.limits.token
         self._stream: App = Stream(self.sight, self.rate)
@@ -97,7 +99,9 @@ class Service:
         else:
             await self._other(scope, receive, send)
 
-    def open(self, headers: Headers, client: str, send: Callable[[Reply], None]) -> Exchange | None:
+    def open(
+        self, headers: Headers, client: str, send: Callable[[Reply], None]
+    ) -> FeaturesRequest | None:
         """A POST /features whose body is wanted; None: it was replied to."""
         stopped = self._at_the_door(headers, client)
         if stopped is not None:
@@ -117,15 +121,15 @@ class Service:
         return None
 
 
-def _traced(service: Service, tracer: "Tracer") -> tuple[Sight, Begin]:
-    from serve.tracing import TracedExchange, TracedSight
+def _traced(service: Service, tracer: "Tracer") -> tuple[FrameHandler, Begin]:
+    from serve.observability.tracing import TracedExchange, TracedSight
 
     about = (service.perceiver, service.metrics, service.limits.log_answers)
     return TracedSight(tracer, *about), partial(TracedExchange, tracer)
 
 
 def _traced_apps(tracer: "Tracer", *apps: App) -> list[App]:
-    from serve.tracing import Traced
+    from serve.observability.tracing import Traced
 
     return [Traced(tracer, app) for app in apps]
 
@@ -163,7 +167,7 @@ def _framework(service: Service) -> FastAPI:
     return app
 
 
-def _add_status(app: FastAPI, perceiver: Perceiver) -> None:
+def _add_status(app: FastAPI, perceiver: FrameQueue) -> None:
     @app.get("/healthz", summary="Is the process alive?", response_model=contract.Status)
     async def healthz() -> Response:
         return JSONResponse({"status": "alive"})

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from trackfeatures import command
+from runtime import cli as command
 
 app = typer.Typer(add_completion=False, rich_markup_mode="rich")
 
@@ -57,8 +57,8 @@ def serve(
     """
     if context.invoked_subcommand is not None:
         return
-    from serve.limits import Limits
-    from serve.server import ServiceConfig, read_token, run
+    from serve.config import Limits
+    from serve.launch import ServiceConfig, read_token, run
 
     token = read_token(token_file)
     limits = Limits(connections=connections, rate=rate, token=token, log_answers=log_answers)
@@ -77,7 +77,7 @@ def reload(
     The new weights are loaded and checked beside the old. If they are bad, the old ones go on
     answering, and this command says why.
     """
-    from serve.manage import ask
+    from serve.workers.control_socket import ask
 
     # Its own working folder may be another: a path is told whole.
     named = str(Path(model).resolve()) if model is not None and Path(model).is_dir() else model
@@ -87,7 +87,7 @@ def reload(
 @app.command()
 def restart(port: Port = 8000) -> None:
     """Replace the workers of the service that runs here one by one, without losing a request."""
-    from serve.manage import ask
+    from serve.workers.control_socket import ask
 
     typer.echo(ask(port, "restart"))
 
@@ -108,8 +108,8 @@ def ray(
     Needs [bold]pip install 'driverview\\[rayserve]'[/bold]. The model's folder must be there on
     all machines.
     """
-    from serve.limits import Limits
-    from serve.server import check_exposure, read_token
+    from serve.config import Limits
+    from serve.launch import check_exposure, read_token
     from trackfeatures.errors import UserError
 
     token = read_token(token_file)

@@ -19,12 +19,12 @@ from typing import Any
 
 from ray import serve as ray_serve  # ours is the package `serve`, Ray's is `ray.serve`
 
-from mtlnet.card import resolve_run
-from mtlnet.engine import load_engine
-from serve import telemetry
+from mtlnet.inference.engine import load_engine
+from mtlnet.inference.model_card import resolve_run
 from serve.app import Service
-from serve.limits import Limits
-from serve.readiness import warm_up
+from serve.config import Limits
+from serve.observability import telemetry
+from serve.scheduling.warmup import warm_up
 from trackfeatures.errors import UserError
 
 NAME = "driverview"

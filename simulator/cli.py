@@ -13,10 +13,11 @@ from typing import Annotated
 
 import typer
 
+from runtime import cli as command
 from simulator.link.command import link
 from simulator.track.cli import TrackName, TracksDir, tracks
 from simulator.watch.cli import watch
-from trackfeatures import LANE_WIDTH_M, command
+from trackfeatures import LANE_WIDTH_M
 
 app = typer.Typer(
     help="VTORCS: tracks, physics, traffic, sensors and camera.",

@@ -18,9 +18,9 @@ from trackfeatures.definitions import (
     VERSION,
     Heading,
     Range,
+    TrackFeatures,
 )
 from trackfeatures.errors import DefinitionsMismatch, UserError, require_version
-from trackfeatures.features import TrackFeatures
 
 if TYPE_CHECKING:
     from trackfeatures.coding import (
@@ -32,13 +32,13 @@ if TYPE_CHECKING:
         mirror_coded,
         mirror_heading,
     )
-    from trackfeatures.localising import localise
-    from trackfeatures.measuring import (
+    from trackfeatures.measurement import (
         CentreLine,
         check_lanes,
         classify_heading,
         lane_centre,
         lane_index,
+        localise,
         marking_offsets,
         measure,
         measure_pose,
@@ -80,7 +80,7 @@ __all__ = [
     "wrap_angle",
 ]
 
-_ON_ARRAYS = ("coding", "localising", "measuring")
+_ON_ARRAYS = ("coding", "measurement")
 
 
 def __getattr__(name: str) -> object:

@@ -7,8 +7,7 @@ absent distance is NaN in metres, and the outer end of its range when coded.
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from trackfeatures.definitions import MARKINGS, RANGES, TARGETS, Heading
-from trackfeatures.features import TrackFeatures
+from trackfeatures.definitions import MARKINGS, RANGES, TARGETS, Heading, TrackFeatures
 
 OFFSET, SPAN = 0.1, 0.8
 IN_LANE_WIDTH_LIMIT_M = 5.5

@@ -6,8 +6,8 @@ from typing import Any
 
 import simplejpeg
 
-from mtlnet.answer import interpret
-from mtlnet.engine import load_engine
+from mtlnet.inference.engine import load_engine
+from mtlnet.inference.prediction import decode_outputs
 
 MODEL, WORKERS, PORT = "DRIVERVIEW_MODEL", "DRIVERVIEW_WORKERS", "DRIVERVIEW_PORT"
 
@@ -20,7 +20,7 @@ class Work:
 
     def __call__(self, body: bytes) -> dict[str, Any]:
         image = simplejpeg.decode_jpeg(body, colorspace="RGB")
-        return interpret(self._engine(image)).as_json()
+        return decode_outputs(self._engine(image)).as_json()
 
 
 def workers() -> int:

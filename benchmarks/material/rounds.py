@@ -15,14 +15,14 @@ from pathlib import Path
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from mcap.reader import make_reader
 
-from datagen.recording import topics
 from datagen.recording.dataset import round_files
-from datagen.recording.derived import rebuild
 from datagen.recording.folder import RoundState, file_sha256, partial_path, prepare, publish
-from datagen.recording.header import RESULT_METADATA, RoundHeader, RoundResult
-from datagen.recording.index import open_round
-from datagen.recording.messages import timestamp
-from datagen.recording.round_file import RoundFile
+from datagen.recording.manifest import rebuild
+from datagen.recording.mcap.index import open_round
+from datagen.recording.mcap.writer import RoundFile
+from datagen.recording.round_metadata import RESULT_METADATA, RoundHeader, RoundResult
+from datagen.recording.schema import topics
+from datagen.recording.schema.messages import timestamp
 from datagen.recording.splits import Split
 
 Steps = list[dict[str, bytes]]

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from controllers.demo.frames import Asked
 from controllers.demo.run import DemoConfig, DemoResult
 from datagen.recording import CameraInfo, Dataset
-from mtlnet.curves import read_curves
-from mtlnet.picture import draw_answer
-from simulator.car import CarParameters
+from mtlnet.inference.overlay import draw_answer
+from mtlnet.training.logging import read_curves
+from simulator.vehicle.car import CarParameters
 from trackfeatures import MARKINGS
 
 LIMITS = {"ml": 0.35, "mr": 0.35, "angle": 0.03, "heading": 0.85}

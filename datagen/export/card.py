@@ -2,7 +2,7 @@
 
 from datagen.export.sides import Side
 from datagen.recording.dataset import Dataset
-from datagen.say import counted
+from runtime.cli import counted
 
 WEBDATASET = """---
 license: mit

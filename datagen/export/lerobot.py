@@ -19,8 +19,8 @@ from datagen.export.lerobot_stats import Histogram, Stats, of_numbers
 from datagen.export.sides import Progress, Side
 from datagen.recording.camera import CameraInfo
 from datagen.recording.errors import DatasetError
-from datagen.recording.header import RoundInfo
-from datagen.steps import Step, Steps
+from datagen.recording.round_metadata import RoundInfo
+from datagen.view.steps import Step, Steps
 
 VERSION = "v3.0"
 CHUNK_FILES = 1000

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 import trackfeatures as tf
 from datagen.export.webdataset import SUFFIX
 from datagen.recording.camera import CameraInfo
-from datagen.steps import Step, values
+from datagen.view.steps import Step, values
 
 IMAGE = "observation.images.front"
 STATE = ("vx", "vy", "yaw_rate")

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datagen.recording.camera import CameraInfo
-from datagen.recording.encoding import decode_into
-from datagen.steps import Step
+from datagen.recording.images import decode_into
+from datagen.view.steps import Step
 
 QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
 LEVELS = 256

@@ -16,7 +16,7 @@ FORMATS = ("webdataset", "lerobot")
 
 
 @dataclass(frozen=True, slots=True)
-class Wanted:
+class ExportConfig:
     """What to export, and how."""
 
     format: str
@@ -58,7 +58,7 @@ class Exported:
         return asdict(self)
 
 
-def export(folder: Path, out: Path, wanted: Wanted, progress: Progress) -> Exported:
+def export(folder: Path, out: Path, wanted: ExportConfig, progress: Progress) -> Exported:
     """Write the export. Raises UserError (DatasetError) or OSError; `out` is then not there."""
     wanted.require_sane()
     require_free(out)
@@ -82,7 +82,7 @@ def export(folder: Path, out: Path, wanted: Wanted, progress: Progress) -> Expor
 
 
 def _write(
-    partial: Path, dataset: Dataset, parts: list[Side], wanted: Wanted, progress: Progress
+    partial: Path, dataset: Dataset, parts: list[Side], wanted: ExportConfig, progress: Progress
 ) -> None:
     if wanted.format == "webdataset":
         webdataset.write(partial, parts, wanted.shard_size, wanted.shuffle, progress)

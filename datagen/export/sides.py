@@ -4,9 +4,9 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 from datagen.recording.dataset import Dataset
-from datagen.recording.header import RoundInfo
+from datagen.recording.round_metadata import RoundInfo
 from datagen.recording.splits import SIDES
-from datagen.steps import Steps
+from datagen.view.steps import Steps
 
 Progress = Callable[[int], None]
 """Hears how many frames are written."""

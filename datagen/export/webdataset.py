@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 
 from datagen.export.sides import Progress, Side
-from datagen.recording.header import RoundInfo
-from datagen.recording.schema import json_schema
-from datagen.steps import Step, values
+from datagen.recording.round_metadata import RoundInfo
+from datagen.recording.schema.json_schema import json_schema
+from datagen.view.steps import Step, values
 
 SUFFIX = {"jpeg": "jpg", "png": "png"}
 SCHEMA_FILE = "sample.schema.json"

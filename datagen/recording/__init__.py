@@ -12,13 +12,13 @@ What is listed here is stable: it changes with a new version of the program only
 is opened with `open_round`; `verify` and `recover` look after folders and files.
 """
 
-from .camera import CameraInfo
-from .dataset import Dataset, Frames
-from .errors import DatasetError, UndecodableImage
-from .header import Recovery, RoundHeader, RoundInfo, RoundResult
-from .index import RoundIndex, open_round
-from .labels import Labels
-from .splits import Split
+from datagen.recording.camera import CameraInfo
+from datagen.recording.dataset import Dataset, Frames
+from datagen.recording.errors import DatasetError, UndecodableImage
+from datagen.recording.labels import Labels
+from datagen.recording.mcap.index import RoundIndex, open_round
+from datagen.recording.round_metadata import Recovery, RoundHeader, RoundInfo, RoundResult
+from datagen.recording.splits import Split
 
 __all__ = [
     "CameraInfo",

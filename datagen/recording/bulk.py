@@ -11,10 +11,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from .encoding import JPEG_MAGIC, Buffer
-from .jpeg.decoder import Decoder
-from .jpeg.lot import Lot
-from .jpeg.tables import OtherKindError, head_length
+from datagen.recording.images import JPEG_MAGIC, Buffer
+from datagen.recording.jpeg.decoder import Decoder
+from datagen.recording.jpeg.lot import Lot
+from datagen.recording.jpeg.tables import OtherKindError, head_length
 
 MOST_HEADS = 8
 """Rounds have one; with a new one for each picture, making tables would take longer than reading.

@@ -7,14 +7,13 @@ from collections.abc import Iterator
 from typing import Any
 
 import trackfeatures as tf
-
-from .camera import CameraInfo
-from .dataset import Dataset
-from .encoding import JPEG_QUALITY
-from .fields import FIELDS, Field
-from .schema import SCHEMA
-from .splits import SIDES
-from .topics import MESSAGE_TYPES
+from datagen.recording.camera import CameraInfo
+from datagen.recording.dataset import Dataset
+from datagen.recording.images import JPEG_QUALITY
+from datagen.recording.schema.fields import FIELDS, Field
+from datagen.recording.schema.json_schema import SCHEMA
+from datagen.recording.schema.topics import MESSAGE_TYPES
+from datagen.recording.splits import SIDES
 
 SIZES = ((1_000, "n<1K"), (10_000, "1K<n<10K"), (100_000, "10K<n<100K"), (1_000_000, "100K<n<1M"))
 LARGEST = "1M<n<10M"

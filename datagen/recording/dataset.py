@@ -19,14 +19,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 import trackfeatures as tf
-
-from .camera import CameraInfo
-from .encoding import decode_into
-from .errors import DatasetError, UndecodableImage
-from .header import RoundInfo
-from .index import RoundIndex, open_round
-from .labels import Labels, concatenate, read_labels
-from .splits import (
+from datagen.recording.camera import CameraInfo
+from datagen.recording.errors import DatasetError, UndecodableImage
+from datagen.recording.images import decode_into
+from datagen.recording.labels import Labels, concatenate, read_labels
+from datagen.recording.mcap.index import RoundIndex, open_round
+from datagen.recording.mcap.protobuf_wire import bytes_field
+from datagen.recording.round_metadata import RoundInfo
+from datagen.recording.schema.topics import CAMERA
+from datagen.recording.splits import (
     DEFAULT_SPLIT,
     SIDES,
     RoundKey,
@@ -36,11 +37,9 @@ from .splits import (
     require_known_recovered,
     split_path,
 )
-from .topics import CAMERA
-from .wire import bytes_field
 
 if TYPE_CHECKING:
-    from .bulk import BulkDecoder
+    from datagen.recording.bulk import BulkDecoder
 
 IMAGE_DATA = 2  # number of the field `data` of foxglove.CompressedImage
 BULK = 8  # images: for fewer, compiled code is not worth loading
@@ -122,7 +121,7 @@ class Frames:
         self, numbers: NDArray[np.int64], out: NDArray[np.uint8]
     ) -> NDArray[np.bool_]:
         """Which images our own decoder has decoded, (B,)."""
-        from .bulk import lots
+        from datagen.recording.bulk import lots
 
         found = lots([self.jpeg(i) for i in numbers.tolist()])
         done = np.zeros(len(numbers), np.bool_)
@@ -159,7 +158,7 @@ class Frames:
 
     @cached_property
     def _bulk(self) -> "BulkDecoder":
-        from .bulk import BulkDecoder  # numba takes long to load
+        from datagen.recording.bulk import BulkDecoder  # numba takes long to load
 
         return BulkDecoder()
 

@@ -14,8 +14,8 @@ from dataclasses import asdict, dataclass
 from importlib.resources import files
 from pathlib import Path
 
-from .errors import DatasetError
-from .schema import SCHEMA, schema_text
+from datagen.recording.errors import DatasetError
+from datagen.recording.schema.json_schema import SCHEMA, schema_text
 
 PARTIAL = ".partial"
 LOCKS = ".locks"
@@ -49,7 +49,7 @@ def prepare(folder: Path) -> None:
     """Make the folder's parts and publish what explains its messages."""
     for name in SUBFOLDERS:
         (folder / name).mkdir(parents=True, exist_ok=True)
-    package = files("datagen.recording")
+    package = files("datagen.recording.schema")
     for name in PUBLISHED:
         text = schema_text() if name == SCHEMA else package.joinpath(name).read_text()
         write_synced(folder / name, text)

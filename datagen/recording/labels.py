@@ -6,10 +6,10 @@ import numpy as np
 from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
-from .errors import DatasetError
-from .index import RoundIndex
-from .proto.driverview_pb2 import TrackFeatures, VehicleState
-from .topics import CAMERA, EGO_STATE, LABELS, frames_of
+from datagen.recording.errors import DatasetError
+from datagen.recording.mcap.index import RoundIndex
+from datagen.recording.schema.proto.driverview_pb2 import TrackFeatures, VehicleState
+from datagen.recording.schema.topics import CAMERA, EGO_STATE, LABELS, frames_of
 
 NAN = float("nan")
 

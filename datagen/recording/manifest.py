@@ -10,9 +10,11 @@ from pathlib import Path
 from typing import Any
 
 import trackfeatures as tf
-
-from .dataset import Dataset
-from .folder import PUBLISHED, file_sha256, read_states
+from datagen.recording.card import card
+from datagen.recording.dataset import Dataset
+from datagen.recording.folder import PUBLISHED, file_sha256, read_states, write_synced
+from datagen.recording.splits import Split, split_path, write_split
+from datagen.recording.statistics import describe
 
 MANIFEST = "manifest.json"
 # The dataset card is not among them: people write into it.
@@ -70,3 +72,17 @@ def manifest_problems(folder: Path) -> Iterator[str]:
         yield f"{', '.join(sorted(changed))} in {folder}: not what {MANIFEST} was written for"
     else:
         yield f"{path} does not describe the rounds that are there; {mend}"
+
+
+# The derived parts of a dataset folder: manifest, split, statistics and the dataset card.
+
+
+def rebuild(folder: Path, split: Split) -> dict[str, Any]:
+    """Write manifest, split, statistics and card from the rounds; returns the statistics."""
+    write_split(split_path(folder), split)
+    dataset = Dataset.open(folder)
+    statistics = describe(dataset)
+    write_synced(folder / "stats.json", as_text(statistics))
+    write_synced(folder / "README.md", card(dataset, statistics))
+    write_synced(folder / MANIFEST, as_text(describe_folder(dataset)))
+    return statistics

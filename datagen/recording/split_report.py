@@ -6,20 +6,27 @@ from typing import Any
 
 import numpy as np
 
-from .dataset import Dataset, round_files
-from .divide import divide
-from .errors import DatasetError
-from .header import RoundInfo
-from .index import open_round
-from .neighbours import Neighbours, Tolerances, find_neighbours
-from .splits import SIDES, RoundKey, read_split, require_disjoint, split_path, write_split
+from datagen.recording.dataset import Dataset, round_files
+from datagen.recording.errors import DatasetError
+from datagen.recording.mcap.index import open_round
+from datagen.recording.near_duplicates import Neighbours, Tolerances, find_neighbours
+from datagen.recording.round_metadata import RoundInfo
+from datagen.recording.splits import (
+    SIDES,
+    RoundKey,
+    divide,
+    read_split,
+    require_disjoint,
+    split_path,
+    write_split,
+)
 
 TRAIN = SIDES[0]
 TOLD = 3  # of the nearest pairs, to people
 
 
 @dataclass(frozen=True, slots=True)
-class Wanted:
+class SplitReportConfig:
     """How to make a split."""
 
     by: str = "round"
@@ -48,7 +55,7 @@ class SplitReport:
         }
 
 
-def make_split(folder: Path, name: str, wanted: Wanted) -> Path:
+def make_split(folder: Path, name: str, wanted: SplitReportConfig) -> Path:
     """Write a new split; what is unseen in the dataset's own split stays so.
 
     DatasetError when there is one of that name, rounds are too few, or it would leak.

@@ -8,10 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 import trackfeatures as tf
-
-from .dataset import Dataset
-from .labels import Labels
-from .splits import SIDES
+from datagen.recording.dataset import Dataset
+from datagen.recording.labels import Labels
+from datagen.recording.splits import SIDES
 
 
 def describe(dataset: Dataset) -> dict[str, Any]:

@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Iterator
 from typing import Any
 
-from datagen.recording.header import RoundInfo
+from datagen.recording.round_metadata import RoundInfo
 
 LEAST_CLASS_SHARE = 0.15
 LEAST_ACTIVE_SHARE = 0.02

@@ -17,7 +17,7 @@ from datagen.recording.splits import SIDES
 from datagen.recording.statistics import describe
 from datagen.stats.charts import Numbers, bars, histogram
 from datagen.stats.concerns import NEEDED, concerns
-from datagen.stats.sheet import Card, contact_sheet
+from datagen.stats.contact_sheet import Card, contact_sheet
 
 KINDS = ("track", "lanes", "trajectory", "traffic")
 SHEET_QUALITY = 80

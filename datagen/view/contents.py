@@ -14,16 +14,16 @@ from numpy.typing import NDArray
 
 import trackfeatures as tf
 from datagen.recording.errors import DatasetError
-from datagen.recording.header import RoundHeader, the_light
-from datagen.recording.messages import EGO, WORLD
-from datagen.recording.topics import (
+from datagen.recording.round_metadata import RoundHeader, the_light
+from datagen.recording.schema.messages import EGO, WORLD
+from datagen.recording.schema.topics import (
     ANNOTATIONS,
     MESSAGE_TYPES,
     TRACK_SCENE,
     TRAFFIC,
     TRANSFORMS,
 )
-from datagen.steps import Step, Steps, values
+from datagen.view.steps import Step, Steps, values
 
 KMH = 3.6
 Numbers = list[float | None]

@@ -11,7 +11,7 @@ from pathlib import Path
 from urllib.parse import quote
 
 from datagen.view.contents import Contents
-from simulator.files import check_folder, write_whole
+from runtime.files import atomic_write, check_folder
 from trackfeatures.errors import UserError
 
 Told = Callable[[str], None]
@@ -48,9 +48,9 @@ class Ways:
 def show(contents: Contents, ways: Ways, told: Told) -> None:
     """Show a round. Raises UserError, OSError, or KeyboardInterrupt when a server is ended."""
     if ways.html is not None:
-        from datagen.view.page import page
+        from datagen.view.html_page import page
 
-        write_whole(ways.html, page(contents))
+        atomic_write(ways.html, page(contents))
         told(str(ways.html))
     elif ways.save is not None:
         save(contents, ways.save)
@@ -66,7 +66,7 @@ def save(contents: Contents, path: Path) -> None:
     """Write a .rrd file for Rerun, whole or not at all."""
     import rerun as rr
 
-    from datagen.view.rerun_log import APPLICATION, log
+    from datagen.view.rerun import APPLICATION, log
 
     partial = path.with_name(path.name + ".partial")
     try:
@@ -90,7 +90,7 @@ def _require_whole(path: Path, frames: int) -> None:
     """Raise ValueError unless all images have arrived: Rerun writes in the background."""
     from rerun.chunk import RrdReader
 
-    from datagen.view.rerun_log import IMAGE
+    from datagen.view.rerun import IMAGE
 
     chunks = [chunk for chunk in RrdReader(path).stream() if chunk.entity_path == f"/{IMAGE}"]
     if (written := sum(chunk.num_rows for chunk in chunks)) != frames:
@@ -101,7 +101,7 @@ def _open_window(contents: Contents) -> None:
     """The window stays when this process ends."""
     import rerun as rr
 
-    from datagen.view.rerun_log import APPLICATION, log
+    from datagen.view.rerun import APPLICATION, log
 
     recording = rr.RecordingStream(APPLICATION)
     recording.spawn()
@@ -112,7 +112,7 @@ def _open_window(contents: Contents) -> None:
 def _serve(contents: Contents, port: int, told: Told) -> None:
     import rerun as rr
 
-    from datagen.view.rerun_log import APPLICATION, log
+    from datagen.view.rerun import APPLICATION, log
 
     recording = rr.RecordingStream(APPLICATION)
     data = recording.serve_grpc(grpc_port=port + 1)

@@ -1,9 +1,9 @@
 """Pictures of the simulated road: the camera, its light and its mounts."""
 
-from simulator.camera.camera import Camera, check_size
-from simulator.camera.kinds import CLASSES, PICTURE_KINDS
-from simulator.camera.light import KINDS, Light, check_light
-from simulator.camera.optics import VIEWS, Mount, intrinsics
+from simulator.camera.core.camera import Camera, check_size
+from simulator.camera.core.optics import VIEWS, Mount, intrinsics
+from simulator.camera.core.render_modes import CLASSES, PICTURE_KINDS
+from simulator.camera.scene.light import KINDS, Light, check_light
 
 __all__ = [
     "CLASSES",

@@ -6,12 +6,12 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from simulator.camera.optics import NEAR_M
+from simulator.camera.core.optics import NEAR_M
 from simulator.track.kernel import road_points
 from simulator.track.road import Road
 
 if TYPE_CHECKING:
-    from simulator.state import CarState
+    from simulator.vehicle.state import CarState
 
 FloatArray = NDArray[np.float64]
 

@@ -10,19 +10,19 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from runtime.files import atomic_write, check_folder
 from simulator.camera import overlay
-from simulator.camera.camera import Camera
-from simulator.camera.false_colours import (
+from simulator.camera.colourise import (
     CLASS_COLOURS,
     FARTHEST_M,
     NEAREST_M,
     in_false_colours,
 )
-from simulator.camera.kinds import CLASS, CLASSES, COLOUR, DEPTH, Wanted
-from simulator.camera.light import KINDS, Light, check_light
-from simulator.car import CarParameters
-from simulator.files import check_folder, write_whole
+from simulator.camera.core.camera import Camera
+from simulator.camera.core.render_modes import CLASS, CLASSES, COLOUR, DEPTH, ViewRequest
+from simulator.camera.scene.light import KINDS, Light, check_light
 from simulator.track.road import Road
+from simulator.vehicle.car import CarParameters
 from trackfeatures.errors import UserError
 
 FloatArray = NDArray[np.float64]
@@ -71,7 +71,7 @@ def write_contact_sheet(
     check_folder(out)  # before the pictures, which take a while
     if light is not None:
         check_light(light)
-    Wanted.of(f"{view or 'front'}:{kind}")
+    ViewRequest.of(f"{view or 'front'}:{kind}")
     shots = [
         replace(shot, kind=kind, view=view or shot.view)
         for shot in _shots(road, light, np.random.default_rng([seed, 10]))
@@ -89,7 +89,7 @@ def write_contact_sheet(
     done, png = cv2.imencode(".png", cv2.cvtColor(np.vstack(rows), cv2.COLOR_RGB2BGR))
     if not done:
         raise UserError(f"{out}: the contact sheet could not be coded as PNG")
-    write_whole(out, png.tobytes())
+    atomic_write(out, png.tobytes())
 
 
 def take(camera: Camera, road: Road, shot: Shot, traffic: int, rng: np.random.Generator) -> Picture:

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from simulator.link import futex
 from simulator.link.layout import IMAGE_OFFSET, MESSAGE_ALIGNMENT, STATE, Block
 from simulator.link.segment import Segment
-from simulator.link.seqlock import DAMAGED, NOTHING, publish, spin, take
+from simulator.link.sync import futex
+from simulator.link.sync.seqlock import DAMAGED, NOTHING, publish, spin, take
 
 SPINS = 30_000
 """Looks before sleeping: about 20 us, what it takes to be woken from a sleep."""

@@ -1,7 +1,7 @@
 """A client of the link in Python.
 
     from simulator.link.client import Link
-    from simulator.state import Command
+    from simulator.vehicle.state import Command
 
     with Link("/driverview", wait_s=30.0) as link:
         message = link.reset(seed=1)
@@ -17,7 +17,6 @@ import time
 from types import TracebackType
 from typing import Self
 
-from simulator.link import futex
 from simulator.link.channel import Receiver, Sender, state_image_bytes
 from simulator.link.errors import (
     DamagedMessage,
@@ -31,7 +30,8 @@ from simulator.link.handshake import EngineInfo, phase, read_header
 from simulator.link.layout import COMMAND, STATE, Phase, Request
 from simulator.link.message import Message, read_message, write_command
 from simulator.link.segment import Segment, attach
-from simulator.state import Command
+from simulator.link.sync import futex
+from simulator.vehicle.state import Command
 
 DEFAULT_NAME = "/driverview"
 SLICE_S = 0.05

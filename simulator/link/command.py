@@ -52,12 +52,12 @@ def link(
     Ctrl-C, SIGTERM or the client's request to quit ends it.
     """
     if header is not None:
-        from simulator.files import write_whole
+        from runtime.files import atomic_write
         from simulator.link.header import c_header
 
-        write_whole(header, c_header())
+        atomic_write(header, c_header())
         return
-    from simulator.link.run import LinkConfig, run
+    from simulator.link.process import LinkConfig, run
 
     signal.signal(signal.SIGTERM, _interrupt)
     config = LinkConfig(

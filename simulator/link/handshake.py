@@ -10,7 +10,7 @@ from simulator.link import layout
 from simulator.link.errors import LayoutMismatch
 from simulator.link.layout import HEADER, IDENTITY, MAGIC, Mode, Phase
 from simulator.link.segment import Segment
-from simulator.link.seqlock import get_word, set_word
+from simulator.link.sync.seqlock import get_word, set_word
 
 
 @dataclass(frozen=True)

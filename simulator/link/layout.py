@@ -14,7 +14,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from simulator.car import WHEELS
+from simulator.vehicle.car import WHEELS
 
 MAGIC: Final = b"DRVLINK\0"
 VERSION: Final = 1
@@ -63,7 +63,7 @@ class Refusal(IntEnum):
 
 
 class Ended(IntEnum):
-    """Why the episode has ended (STATE.ended); names are those of `simulator.reward.Ending`."""
+    """Why the episode has ended (STATE.ended); names are those of `simulator.env.reward.Ending`."""
 
     NOT = 0
     OFF_TRACK = 1

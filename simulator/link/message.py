@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 import trackfeatures as tf
+from simulator.env.reward import Ending
 from simulator.link.layout import Collision, Ended, Request
-from simulator.reward import Ending
-from simulator.state import CarState, Command
+from simulator.vehicle.state import CarState, Command
 
 _CODED: Final = ("collision", "off_track", "backwards")
 _COUNTED: Final = ("number", "episode", "step", "late_steps", "seed", "reward", "score")

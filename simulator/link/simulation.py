@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from simulator.env.reward import ending, step_reward
 from simulator.link.layout import ERROR_BYTES, Refusal, Request
 from simulator.link.message import read_command, write_ending, write_features, write_state
-from simulator.reward import ending, step_reward
 from simulator.sensors.standard import read_range, read_track_range
-from simulator.state import CarState, Command
-from simulator.world import World
+from simulator.vehicle.state import CarState, Command
+from simulator.world.world import World
 from trackfeatures.errors import UserError
 
 if TYPE_CHECKING:

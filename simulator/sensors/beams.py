@@ -5,7 +5,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from simulator.compiled import compiled
+from runtime.jit import compiled
 from simulator.track.kernel import CURVATURE, HEADING0, LENGTH, X0, Y0, Table, locate
 
 FloatArray = NDArray[np.float64]

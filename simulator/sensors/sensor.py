@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from simulator.world import World
+from simulator.world.world import World
 from trackfeatures.errors import UserError
 
 Reading = float | NDArray[Any]

@@ -20,8 +20,8 @@ from simulator.sensors.beams import (
 )
 from simulator.sensors.sensor import Sensor
 from simulator.track.kernel import index_at
-from simulator.traffic import SIZE
-from simulator.world import World
+from simulator.traffic.traffic import SIZE
+from simulator.world.world import World
 from trackfeatures.errors import UserError
 
 KMH = 3.6  # km/h in a m/s

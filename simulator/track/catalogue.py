@@ -56,7 +56,7 @@ def read_track(path: Path) -> Track:
 def _reader(suffix: str) -> Callable[[Path], Track]:
     # One import each: a collector of own tracks needs neither XML nor scipy.
     if suffix == ".xml":
-        from simulator.track.torcs import read_torcs
+        from simulator.track.torcs.torcs import read_torcs
 
         return read_torcs
     if suffix == ".csv":

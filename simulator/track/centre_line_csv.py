@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 from scipy.interpolate import splev, splprep
 
-from simulator.files import write_whole
+from runtime.files import atomic_write
 from simulator.track.errors import TrackError
 from simulator.track.geometry import Track
 from simulator.track.markings import imported_style
@@ -193,5 +193,5 @@ def write_centre_line(track: Track, step: float, path: Path) -> int:
     s = np.arange(0.0, track.length_m, step)
     pose = track.at(s)
     rows = np.column_stack((s, pose.x, pose.y, pose.z, pose.heading, pose.curvature))
-    write_whole(path, HEADER + "".join(ROW % tuple(row) for row in rows))
+    atomic_write(path, HEADER + "".join(ROW % tuple(row) for row in rows))
     return len(s)

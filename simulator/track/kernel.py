@@ -9,7 +9,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from simulator.compiled import compiled
+from runtime.jit import compiled
 
 Table = NDArray[np.float64]
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import trackfeatures as tf
-from simulator.files import check_folder, write_whole
+from runtime.files import atomic_write, check_folder
 from simulator.track.geometry import Track, TrackPose
 from simulator.track.road import Road
 from trackfeatures.definitions import BEND_CURVATURE
@@ -85,7 +85,7 @@ def write_plot(road: Road, out: Path) -> None:
     check_folder(out)
     buffer = io.BytesIO()
     draw(sample(road)).savefig(buffer, format="png", dpi=DPI, facecolor=PAPER)
-    write_whole(out, buffer.getvalue())
+    atomic_write(out, buffer.getvalue())
 
 
 def draw(lap: Lap) -> "Figure":

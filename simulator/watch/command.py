@@ -13,12 +13,12 @@ from pathlib import Path
 from types import FrameType
 from typing import Final
 
+from runtime.sockets import address, bind
 from simulator.camera import check_light
-from simulator.camera.context import graphics
+from simulator.camera.core.context import graphics
 from simulator.track.catalogue import find_track
 from simulator.track.road import Road
 from simulator.watch.pace import check_speed
-from trackfeatures.listening import address, bind
 
 FREQUENCY_HZ: Final = 20
 
@@ -55,7 +55,7 @@ def _drive(road: Road, config: WatchConfig, listener: socket.socket) -> None:
     from simulator.watch.drive import Drive
     from simulator.watch.hub import Hub
     from simulator.watch.server import Server
-    from simulator.world import World
+    from simulator.world.world import World
 
     hub = Hub()
     with World(road, traffic=config.traffic, frequency_hz=FREQUENCY_HZ) as world:

@@ -4,17 +4,17 @@ import time
 from typing import Final
 
 import trackfeatures as tf
-from simulator.cruise import Cruise
-from simulator.state import CarState, Command
+from simulator.driving.cruise import Cruise
+from simulator.vehicle.state import CarState, Command
 from simulator.watch.hub import Browser, Hub
 from simulator.watch.keyboard import Keyboard
 from simulator.watch.messages import scene_message, state_message
-from simulator.watch.orders import Order
 from simulator.watch.pace import Pacer, Rate
 from simulator.watch.pictures import Pictures
+from simulator.watch.requests import Order
 from simulator.watch.score import Score
 from simulator.watch.server import FIRST_VIEW
-from simulator.world import World
+from simulator.world.world import World
 
 SHOW_S: Final = 1.0 / 26.0
 """A browser is shown something new at most this often (s of the clock)."""

@@ -8,7 +8,7 @@ import asyncio
 import threading
 from dataclasses import dataclass, field
 
-from simulator.watch.orders import Order
+from simulator.watch.requests import Order
 
 MOST_BROWSERS = 16
 MOST_ORDERS = 256

@@ -4,10 +4,10 @@ import time
 from collections.abc import Callable
 from typing import Final
 
-from simulator.car import CarParameters
-from simulator.speed import Pedals
-from simulator.state import CarState, Command
+from simulator.driving.speed import Pedals
 from simulator.track.road import Road
+from simulator.vehicle.car import CarParameters
+from simulator.vehicle.state import CarState, Command
 
 HELD_S: Final = 0.7
 """A browser repeats the keys that are held; from a silent one none is."""

@@ -10,10 +10,10 @@ import numpy as np
 from simulator.camera import KINDS, VIEWS
 from simulator.sensors.beams import BEAM_ANGLES, RANGE_M
 from simulator.sensors.standard import read_range
-from simulator.state import CarState
 from simulator.track.road import Road
-from simulator.traffic import EGO_SIZE, SIZE
-from simulator.world import World
+from simulator.traffic.traffic import EGO_SIZE, SIZE
+from simulator.vehicle.state import CarState
+from simulator.world.world import World
 
 STATION_M: Final = 3.0
 MOST_STATIONS: Final = 6000

@@ -8,7 +8,7 @@ import simplejpeg
 
 from simulator.camera import Camera, Light, check_light
 from simulator.track.road import Road
-from simulator.world import World
+from simulator.world.world import World
 
 SIZE: Final = (560, 420)
 """Width, height: twice the driver view's pixels each way."""

@@ -1,7 +1,7 @@
 """The paper's score of a watched drive, summed up step by step."""
 
-from simulator.reward import Ending, ending, step_reward
-from simulator.world import World
+from simulator.env.reward import Ending, ending, step_reward
+from simulator.world.world import World
 
 
 class Score:

@@ -17,7 +17,7 @@ from fastapi import FastAPI, WebSocket, WebSocketDisconnect
 from fastapi.responses import HTMLResponse, Response
 
 from simulator.watch.hub import IN_FLIGHT, Browser, Hub
-from simulator.watch.orders import BadOrder, parse
+from simulator.watch.requests import BadOrder, parse
 from trackfeatures.errors import UserError
 
 PAGE: Final = Path(__file__).parent / "page.html"

@@ -5,6 +5,7 @@ import time
 from types import TracebackType
 from typing import Any, Final, Self
 
+from runtime.sockets import address, bind
 from simulator.track.road import Road
 from simulator.watch.hub import Hub
 from simulator.watch.messages import scene_message, state_message
@@ -12,9 +13,8 @@ from simulator.watch.pace import Pacer, Rate
 from simulator.watch.pictures import Pictures
 from simulator.watch.score import Score
 from simulator.watch.server import Server
-from simulator.world import World
+from simulator.world.world import World
 from trackfeatures.errors import UserError
-from trackfeatures.listening import address, bind
 
 SHOW_S: Final = 1.0 / 20.0
 """Browsers are shown something new at most this often (s of the clock)."""

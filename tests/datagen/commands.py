@@ -5,11 +5,11 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-from datagen.deal import make_plan
-from datagen.plan import Plan, Wanted
+from datagen.planning.plan import CollectConfig, Plan
+from datagen.planning.planner import make_plan
+from datagen.planning.tracks import choose_tracks
+from datagen.recorder.job import Ending, Job, attempt
 from datagen.recording.folder import prepare
-from datagen.round import Ending, Job, attempt
-from datagen.tracks import choose_tracks
 from tests.typed import typed
 
 SHORT = ["--rounds", "2", "--frames", "30", "--tracks", "circuit", "--lanes", "1,2"]
@@ -33,7 +33,7 @@ def datagen_here(*args: object) -> subprocess.CompletedProcess[str]:
 
 
 def make_small_plan(rounds: int, frames: int) -> Plan:
-    return make_plan(Wanted(rounds, frames, seed=1, tracks=choose_tracks(("oval",), None)))
+    return make_plan(CollectConfig(rounds, frames, seed=1, tracks=choose_tracks(("oval",), None)))
 
 
 def make_jobs(folder: Path, rounds: int, frames: int) -> list[Job]:

@@ -13,12 +13,12 @@ import pytest
 import trackfeatures as tf
 from datagen.cli import main as datagen_main
 from datagen.recording.camera import CameraInfo
-from datagen.recording.derived import rebuild
 from datagen.recording.folder import RoundState, file_sha256, partial_path, prepare, publish
 from datagen.recording.frame import DriverCommand, EgoState, Frame, RoadPlace, SensorReadings
-from datagen.recording.header import RoundHeader, RoundResult
+from datagen.recording.manifest import rebuild
+from datagen.recording.mcap.writer import RoundWriter
+from datagen.recording.round_metadata import RoundHeader, RoundResult
 from datagen.recording.splits import Split
-from datagen.recording.writer import RoundWriter
 from tests.datagen.commands import SHORT, datagen
 
 LANES = 2

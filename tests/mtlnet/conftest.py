@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 import trackfeatures as tf
 from datagen.recording import Dataset
 from datagen.recording.frame import DriverCommand, EgoState, Frame, RoadPlace
-from datagen.recording.header import RoundHeader
+from datagen.recording.mcap.writer import RoundWriter
+from datagen.recording.round_metadata import RoundHeader
 from datagen.recording.splits import Split, split_path, write_split
-from datagen.recording.writer import RoundWriter
-from mtlnet.doubt_fit import fit_doubt
-from mtlnet.network import Network, initialise
-from mtlnet.plan import FEATURES, HEIGHT, MTL, PLANS, WIDTH, Conv
-from mtlnet.publish import publish
-from mtlnet.report import describe_data
+from mtlnet.evaluation.metrics import describe_data
+from mtlnet.export.publish import publish
+from mtlnet.model.architecture import FEATURES, HEIGHT, MTL, PLANS, WIDTH, Conv
+from mtlnet.model.network import Network, initialise
+from mtlnet.uncertainty_fit.head import fit_doubt
 
 FRAMES = 24
 TRAIN, TEST = ("r000", "r001", "r002"), ("r003",)

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mtlnet.card import Camera
+from mtlnet.inference.model_card import Camera
 
 WIDTH, HEIGHT = 280, 210
 Image = NDArray[np.uint8]

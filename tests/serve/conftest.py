@@ -18,15 +18,13 @@ import simplejpeg
 from numpy.typing import NDArray
 
 import trackfeatures as tf
-from mtlnet.card import WEIGHTS, Camera, ModelCard
-from mtlnet.engine import Engine
-from mtlnet.golden import golden_image
+from mtlnet.inference.engine import Engine
+from mtlnet.inference.model_card import WEIGHTS, Camera, ModelCard, golden_image
+from runtime.sockets import bind
 from serve.app import Service
-from serve.limits import Limits
-from serve.listener import WorkerServer
-from serve.shared import Shared
-from serve.workers import BlockPeers
-from trackfeatures.listening import bind
+from serve.config import Limits
+from serve.server.worker_server import WorkerServer
+from serve.workers.shared_memory import BlockPeers, Shared
 
 if TYPE_CHECKING:
     from opentelemetry.trace import Tracer
@@ -223,8 +221,8 @@ def publish_untrained(run: Path, seed: int) -> None:
     """A whole model in folder `run`; its weights are those of `seed`."""
     import torch
 
-    from mtlnet.network import Network
-    from mtlnet.publish import publish
+    from mtlnet.export.publish import publish
+    from mtlnet.model.network import Network
 
     torch.manual_seed(seed)
     publish(Network(), run, golden_image(280, 210)[None])

@@ -14,7 +14,7 @@ import simplejpeg
 
 import trackfeatures as tf
 from datagen.recording import Dataset
-from serve.console import FOLDER
+from serve.api.console import FOLDER
 
 FRAMES = {
     390: "avenue in hard shadow, two lanes",

@@ -7,7 +7,7 @@ from typing import Any
 
 import numba
 
-from trackfeatures.machine_code import code_folder
+from runtime.jit import code_folder
 
 
 def compiled(function: Callable[..., Any]) -> Callable[..., Any]:

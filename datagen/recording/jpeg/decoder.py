@@ -5,11 +5,11 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from . import tables
-from .entropy import BLOCKS, SPARE
-from .lot import Lot, decoded_lot
-from .tables import Head, OtherKindError
-from .transform import LANES, STEP
+from datagen.recording.jpeg import tables
+from datagen.recording.jpeg.entropy import BLOCKS, SPARE
+from datagen.recording.jpeg.lot import Lot, decoded_lot
+from datagen.recording.jpeg.tables import Head, OtherKindError
+from datagen.recording.jpeg.transform import LANES, STEP
 
 GROUP = 64 * LANES  # coefficients
 AROUND = 64  # bytes beyond a row of samples that may be read, and written at its sides

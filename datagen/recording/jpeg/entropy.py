@@ -7,10 +7,10 @@ cannot be is noticed at the end of each block.
 
 import numpy as np
 
-from .compiled import compiled
-from .tables import AC_BITS, DC_BITS, ENDS, LONG
-from .transform import LANES
-from .vectors import at, big_endian, copy_eight, put
+from datagen.recording.jpeg.compiled import compiled
+from datagen.recording.jpeg.tables import AC_BITS, DC_BITS, ENDS, LONG
+from datagen.recording.jpeg.transform import LANES
+from datagen.recording.jpeg.vectors import at, big_endian, copy_eight, put
 
 u64 = np.uint64
 BLOCKS = 6  # of a unit of 16 x 16 pixels: four of luma, two of chroma

@@ -7,9 +7,9 @@ import numpy as np
 from numba.np.numpy_support import carray
 from numpy.typing import NDArray
 
-from .compiled import compiled
-from .picture import decoded
-from .vectors import bytes_from, take_next
+from datagen.recording.jpeg.compiled import compiled
+from datagen.recording.jpeg.picture import decoded
+from datagen.recording.jpeg.vectors import bytes_from, take_next
 
 
 @dataclass(frozen=True)

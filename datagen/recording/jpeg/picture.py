@@ -2,10 +2,17 @@
 
 import numpy as np
 
-from .compiled import compiled
-from .entropy import BAD, row_of_units, unstuffed
-from .tables import DC_BITS
-from .transform import LANES, STEP, colour, inverse_four, inverse_full, inverse_two
+from datagen.recording.jpeg.compiled import compiled
+from datagen.recording.jpeg.entropy import BAD, row_of_units, unstuffed
+from datagen.recording.jpeg.tables import DC_BITS
+from datagen.recording.jpeg.transform import (
+    LANES,
+    STEP,
+    colour,
+    inverse_four,
+    inverse_full,
+    inverse_two,
+)
 
 u64 = np.uint64
 END_OF_IMAGE = 0xD9

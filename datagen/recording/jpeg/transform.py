@@ -8,7 +8,7 @@ from typing import Any
 
 from numba import types
 
-from .vectors import (
+from datagen.recording.jpeg.vectors import (
     I8,
     I16,
     I32,

@@ -1,0 +1,139 @@
+"""The simulated car beside the real TORCS: one law, one track, the flying lap of each.
+
+A recording is a CSV of `drives/`: laps of the real program under the law of `feedback`. The same
+law drives here, from the same start and at the same moments: the program ticks at 20 to 22 ms,
+so that its control steps take 40 to 66 ms, and a law as stiff as this one feels that.
+"""
+
+import itertools
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from controllers.closed_loop import GEAR, THROTTLE
+from controllers.interface import Observation
+from controllers.torcs_feedback import Feedback
+from simulator.track.catalogue import find_track
+from simulator.track.road import Road
+from simulator.vehicle.state import CarState, Command
+from simulator.world.physics import PHYSICS_HZ
+from simulator.world.world import World
+from trackfeatures import Heading, UserError
+
+TRACKS = ("forza", "g-track-3")
+FLYING_LAP = 2
+LIMITS = {"steps": 0.01, "score_per_step": 0.004, "mean_abs_d_m": 0.02, "max_abs_d_m": 0.15}
+"""How far the two laps may be apart: of the steps a share, of the others the figure itself."""
+EVEN_STEPS = PHYSICS_HZ // 20
+
+Rows = NDArray[Any]
+
+
+@dataclass(frozen=True)
+class Lap:
+    """The figures of one flying lap."""
+
+    steps: int
+    score_per_step: float
+    mean_abs_d_m: float
+    max_abs_d_m: float
+    least_speed_kmh: float
+    most_speed_kmh: float
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A flying lap here and the program's."""
+
+    track: str
+    here: Lap
+    torcs: Lap
+
+    @property
+    def difference(self) -> dict[str, float]:
+        """Here minus TORCS for each of LIMITS."""
+        apart = {name: getattr(self.here, name) - getattr(self.torcs, name) for name in LIMITS}
+        return apart | {"steps": apart["steps"] / self.torcs.steps}
+
+    @property
+    def within(self) -> dict[str, bool]:
+        """Which of LIMITS are kept."""
+        return {name: abs(apart) <= LIMITS[name] for name, apart in self.difference.items()}
+
+
+def read_recording(path: Path) -> Rows:
+    """The rows of a drive of TORCS, as a structured array named by its columns."""
+    try:
+        return np.genfromtxt(path, delimiter=",", names=True, skip_header=1)
+    except OSError as error:
+        raise UserError(f"no recorded laps at {path}: {error}") from error
+
+
+def compare(name: str, drives: Path, *, as_recorded: bool = True) -> Fit:
+    """Drive the laps of `drives`/NAME-lqr.csv again and compare the flying ones.
+
+    With `as_recorded=False` the law acts every 50 ms instead of at the recording's moments.
+    """
+    recording = read_recording(drives / f"{name}-lqr.csv")
+    road = Road(find_track(name))
+    moments = np.round(recording["t"] * PHYSICS_HZ).astype(int)
+    holds = np.diff(moments).tolist() if as_recorded else [EVEN_STEPS]
+    states = drive_laps(road, float(recording["d"][0]), holds)
+    here = np.array(
+        [(now.to_middle, -now.angle, now.speed) for now in states],
+        dtype=[("d", "f8"), ("th", "f8"), ("v", "f8")],
+    )
+    torcs = recording[recording["lap"] == FLYING_LAP]
+    return Fit(name, figures(here, road.half_width), figures(torcs, road.half_width))
+
+
+def drive_laps(road: Road, start_d: float, holds: list[int]) -> list[CarState]:
+    """The states that the law saw in its flying lap.
+
+    `holds`: physics steps from one control step to the next, again and again.
+    """
+    law, seen = Feedback(), []
+    with World(road, frequency_hz=PHYSICS_HZ) as world:
+        now = world.reset(seed=0, to_middle=start_d)
+        for hold in itertools.cycle(holds):
+            if now.lap == FLYING_LAP:
+                seen.append(now)
+            command = Command(
+                law.update(_observed(now, world.features().heading)), THROTTLE, gear=GEAR
+            )
+            for _ in range(hold):
+                now = world.step(command)
+            if now.lap > FLYING_LAP:
+                return seen
+            if now.off_track or now.backwards:
+                raise UserError(f"the law left {road.track.name!r} at s = {now.s:.0f} m")
+    raise AssertionError("a cycle does not end")
+
+
+def figures(lap: Rows, half_width: float) -> Lap:
+    """Of rows with d (m), th (rad, yaw minus tangent) and v (m/s), one a control step."""
+    offset, speed = np.abs(lap["d"]), 3.6 * lap["v"]
+    score = np.cos(lap["th"]) - np.abs(np.sin(lap["th"])) - offset / half_width
+    return Lap(
+        len(lap),
+        float(score.mean()),
+        float(offset.mean()),
+        float(offset.max()),
+        float(speed.min()),
+        float(speed.max()),
+    )
+
+
+def _observed(now: CarState, heading: Heading) -> Observation:
+    return Observation(
+        to_lane_centre=now.to_middle,
+        angle=now.angle,
+        heading=heading,
+        vx=now.vx,
+        vy=now.vy,
+        yaw_rate=now.yaw_rate,
+        curvature=now.curvature,
+    )

@@ -1,0 +1,132 @@
+"""What a collection has done so far, counted from what its crew reports."""
+
+from collections.abc import Collection, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+from rich.console import Console, RenderableType
+from rich.progress import (
+    BarColumn,
+    Progress,
+    ProgressColumn,
+    Task,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+from rich.text import Text
+
+from datagen.planning.plan import RoundPlan
+from datagen.recorder.job import FramesDone, RoundDone
+
+
+class ProgressCallback(Protocol):
+    """Hears how the collection goes."""
+
+    def __call__(self, done_frames: int, done_rounds: int) -> None: ...
+
+
+@dataclass(frozen=True, slots=True)
+class Collected:
+    """`rounds` and `frames` are in the folder; `recorded_frames` of them came in this run.
+
+    `content_hash` is the dataset's (see `datagen.recording.dataset`), absent while a shard's part
+    is all there is.
+    """
+
+    rounds: int
+    frames: int
+    seconds: float
+    frames_per_second: float
+    recorded_frames: int
+    resets: int
+    out: str
+    content_hash: str | None = None
+
+    def as_json(self) -> dict[str, Any]:
+        return asdict(self)
+
+
+class Tally:
+    """Counts `rounds`, of which those in `finished` are there before it begins."""
+
+    def __init__(
+        self, rounds: Sequence[RoundPlan], finished: Collection[str], progress: ProgressCallback
+    ) -> None:
+        self._frames_of = {entry.id: entry.frames for entry in rounds}
+        self.finished = [round_id for round_id in self._frames_of if round_id in finished]
+        self._before = self._done()
+        self._running: dict[str, int] = {}
+        self._resets = 0
+        self._progress = progress
+        progress(self._before, len(self.finished))
+
+    def hear(self, message: FramesDone | RoundDone) -> None:
+        if isinstance(message, FramesDone):
+            self._running[message.round_id] = message.frames
+        else:
+            self._running.pop(message.state.id, None)
+            self.finished.append(message.state.id)
+            self._resets += message.resets
+        self._progress(self._done() + sum(self._running.values()), len(self.finished))
+
+    def result(self, folder: Path, seconds: float, content_hash: str | None) -> Collected:
+        recorded = self._done() - self._before
+        return Collected(
+            rounds=len(self.finished),
+            frames=self._done(),
+            seconds=round(seconds, 3),
+            frames_per_second=round(recorded / seconds, 2),
+            recorded_frames=recorded,
+            resets=self._resets,
+            out=str(folder),
+            content_hash=content_hash,
+        )
+
+    def _done(self) -> int:
+        return sum(self._frames_of[round_id] for round_id in self.finished)
+
+
+# The progress bar of a collection, on stderr.
+
+
+class FramesPerSecond(ProgressColumn):
+    """Of the last seconds; at the end of all. Frames there were before (`begun`) do not count."""
+
+    def render(self, task: Task) -> Text:
+        speed = task.speed
+        if task.finished_time:
+            speed = (task.completed - task.fields["begun"]) / task.finished_time
+        return Text(f"{speed:.0f} frames/s" if speed else "starting")
+
+
+@contextmanager
+def shown(rounds: int, frames: int, heading: RenderableType = "") -> Iterator[ProgressCallback]:
+    """A function that takes the counts and shows them, below `heading`, until the block ends."""
+    bar = Progress(
+        TextColumn("[bold]{task.description}"),
+        BarColumn(),
+        TextColumn("{task.completed:.0f}/{task.total:.0f} frames"),
+        FramesPerSecond(),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+        console=Console(stderr=True),
+        speed_estimate_period=20.0,
+    )
+    task = bar.add_task(f"0/{rounds} rounds", total=frames, begun=0)
+
+    def update(done_frames: int, done_rounds: int) -> None:
+        if not bar.live.is_started:  # only now: what is refused before it begins shows nothing
+            bar.console.print(heading)
+            bar.start()
+            bar.update(task, begun=done_frames)
+        bar.update(task, completed=done_frames, description=f"{done_rounds}/{rounds} rounds")
+
+    try:
+        yield update
+    finally:
+        if bar.live.is_started:
+            bar.stop()

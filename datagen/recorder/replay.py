@@ -1,0 +1,107 @@
+"""Simulating recorded rounds again: what is recorded must come out of the plan once more.
+
+datagen verify datasets/default --replay 3
+"""
+
+import json
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+import trackfeatures as tf
+from datagen.execution.collect import PLAN
+from datagen.planning.plan import RoundPlan, program
+from datagen.recorder.record import moments_of, scene_of
+from datagen.recording.dataset import IMAGE_DATA
+from datagen.recording.errors import DatasetError
+from datagen.recording.folder import read_states, round_path
+from datagen.recording.images import encode
+from datagen.recording.mcap.index import RoundIndex, open_round
+from datagen.recording.mcap.protobuf_wire import bytes_field
+from datagen.recording.schema import messages, topics
+
+NO_IMAGE: NDArray[np.uint8] = np.zeros((0, 0, 3), np.uint8)
+
+Seen = Callable[[str], None]
+
+
+def replay(
+    folder: Path,
+    count: int,
+    tracks_dir: Path | None = None,
+    pixels: bool = False,
+    seen: Seen = lambda name: None,
+) -> tuple[list[str], list[str]]:
+    """Simulate up to `count` rounds, spread over the plan; their names, and what is not the same.
+
+    Labels and states are held to the bytes that were recorded; with `pixels` images too, which are
+    the same on the same renderer only. Raises UserError when a round cannot be simulated here.
+    """
+    if count < 1:
+        raise tf.UserError(f"--replay is {count}; give how many rounds to simulate again")
+    entries = _spread(_recorded(folder), count)
+    problems: list[str] = []
+    for entry in entries:
+        problems += differences(entry, round_path(folder, entry.id), tracks_dir, pixels)
+        seen(entry.id)
+    return [entry.id for entry in entries], problems
+
+
+def differences(
+    entry: RoundPlan, path: Path, tracks_dir: Path | None, pixels: bool
+) -> Iterator[str]:
+    """What a recorded round and the simulation of its entry differ in, one line a topic."""
+    index = open_round(path)
+    recorded = {topic: index.messages[topic] for topic in (topics.LABELS, topics.EGO_STATE)}
+    first: dict[str, int] = {}
+    number = 0
+    with scene_of(entry, tracks_dir) as (drive, camera):
+        for moments in moments_of(drive, camera):
+            for moment in moments:
+                frame = moment.seen(NO_IMAGE)
+                again = {
+                    topics.LABELS: messages.labels(frame),
+                    topics.EGO_STATE: messages.ego_state(frame.ego),
+                }
+                for topic, data in again.items():
+                    here = recorded[topic]
+                    if number >= len(here.log_time) or here.payload(number) != data:
+                        first.setdefault(topic, number)
+                if pixels and not _same_image(
+                    index, number, encode(moment.picture(camera), entry.codec)
+                ):
+                    first.setdefault(topics.CAMERA, number)
+                number += 1
+    for topic, at in sorted(first.items()):
+        yield (
+            f"{path.name}: simulated again, {topic} differs from frame {at} on (recorded by "
+            f"{index.header.program}, this is {program()})"
+        )
+
+
+def _same_image(index: RoundIndex, number: int, image: bytes) -> bool:
+    images = index.messages[topics.CAMERA]
+    if number >= len(images.log_time):
+        return False
+    return bytes_field(images.payload(number), IMAGE_DATA) == image
+
+
+def _recorded(folder: Path) -> list[RoundPlan]:
+    """The plan's entries of the rounds that are there."""
+    path = folder / PLAN
+    states = read_states(folder)
+    try:
+        entries = json.loads(path.read_text())["rounds"]
+        return [RoundPlan.from_json(entry) for entry in entries if entry["id"] in states]
+    except FileNotFoundError as error:
+        raise DatasetError(f"there is no {path}: only what has a plan can be replayed") from error
+    except (ValueError, KeyError, TypeError) as error:
+        raise DatasetError(f"{path} is no plan of this program ({error!r})") from error
+
+
+def _spread(entries: Sequence[RoundPlan], count: int) -> list[RoundPlan]:
+    if len(entries) <= count:
+        return list(entries)
+    return [entries[int(i)] for i in np.linspace(0, len(entries) - 1, count)]

@@ -1,0 +1,163 @@
+"""What can be wrong with one recorded round, found level by level.
+
+quick: its end, its index and its counts. full: every byte by CRC and hash, time, images paired with
+labels. deep: every image and message decoded, labels against the definitions.
+"""
+
+import hashlib
+from collections.abc import Iterator
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from google.protobuf.message import DecodeError
+
+import trackfeatures as tf
+from datagen.recording.dataset import IMAGE_DATA
+from datagen.recording.errors import DatasetError
+from datagen.recording.folder import RoundState
+from datagen.recording.images import decode_into
+from datagen.recording.integrity.label_consistency import disagreements
+from datagen.recording.labels import read_labels
+from datagen.recording.mcap.index import RoundIndex, open_round
+from datagen.recording.mcap.protobuf_wire import bytes_field
+from datagen.recording.mcap.scan import Scan, scan
+from datagen.recording.schema import topics
+
+LEVELS = ("quick", "full", "deep")
+TOLD = 5  # problems of one kind in one round; more of them say no more
+
+
+def check_round(path: Path, level: str, state: RoundState | None) -> tuple[int, list[str]]:
+    """Frames found, and the problems, one line each; never raises for a bad file."""
+    if level not in LEVELS:
+        raise DatasetError(f"there is no level {level!r}; choose {', '.join(LEVELS)}")
+    try:
+        index = open_round(path)
+    except DatasetError as error:
+        return 0, [str(error)]
+    except OSError as error:
+        return 0, [unreadable(path, error)]
+    problems: list[str] = []
+    try:
+        problems += _quick(index, state)
+        if level != "quick":
+            problems += _full(index, state, _Listener(index, deep=level == "deep"))
+        if level == "deep":
+            problems += _labels(index)
+    except OSError as error:
+        problems.append(f"cannot be read ({error.strerror})")
+    return len(index.messages[topics.CAMERA]), [f"{path.name}: {p}" for p in problems]
+
+
+def unreadable(path: Path, error: OSError) -> str:
+    return f"{path} cannot be read ({error.strerror})"
+
+
+def _quick(index: RoundIndex, state: RoundState | None) -> Iterator[str]:
+    header, result = index.header, index.result
+    for topic, messages in index.messages.items():
+        if len(messages) != result.frames:
+            yield f"{len(messages)} messages on {topic}, {result.frames} recorded"
+    if header.definitions != tf.VERSION:
+        yield (
+            f"recorded under definitions {header.definitions}, this program has {tf.VERSION}; "
+            "record it again with this program"
+        )
+    if state is None:
+        yield "no state file holds its hashes"
+        return
+    expected = {
+        "id": header.id,
+        "bytes": index.path.stat().st_size,
+        "frames": result.frames,
+        "content_hash": result.content_hash,
+        "definitions": header.definitions,
+    }
+    for name, value in expected.items():
+        if (noted := getattr(state, name)) != value:
+            yield f"its {name} is {value}, its state file says {noted}"
+
+
+def _full(index: RoundIndex, state: RoundState | None, listener: "_Listener") -> Iterator[str]:
+    found = scan(index.path, listener.hear)
+    if state is not None and found.sha256 != state.sha256:
+        yield "its bytes are not those that were written (sha256 differs)"
+    yield from found.problems
+    if index.summary is not None and found.chunks != index.summary.chunks:
+        yield "its index is not that of its chunks"
+    yield from _times(index, found)
+    yield from listener.problems()
+    if listener.content.hexdigest() != index.result.content_hash:
+        yield "its images and labels are not those that were recorded (content hash differs)"
+
+
+def _times(index: RoundIndex, found: Scan) -> Iterator[str]:
+    """Every topic of the control steps once a step, on the clock of the round."""
+    frames, hertz = index.result.frames, index.header.frequency_hz
+    clock = [topics.log_time_ns(step, hertz) for step in range(frames)]
+    if index.recovery is not None:  # frames are missing: only the others' times can be right
+        clock = found.times.get(topics.CAMERA, [])
+    for topic in topics.EVERY_STEP:
+        times = found.times.get(topic, [])
+        if len(times) != frames:
+            yield f"{len(times)} messages on {topic}, expected {frames}"
+        elif times != clock:
+            step = next(i for i, (a, b) in enumerate(zip(times, clock, strict=True)) if a != b)
+            yield (
+                f"frame {step} on {topic} is at {topics.seconds(times[step]):.3f} s, "
+                f"expected at {topics.seconds(clock[step]):.3f} s"
+            )
+    for topic, times in found.times.items():
+        if any(b <= a for a, b in pairwise(times)):
+            yield f"time does not increase on {topic}"
+
+
+def _labels(index: RoundIndex) -> Iterator[str]:
+    try:
+        labels = read_labels(index, 0)
+    except DatasetError as error:
+        yield str(error)
+        return
+    yield from disagreements(labels, index.header.lanes, index.header.lane_width_m)
+
+
+class _Listener:
+    """Hears every message of a round: hashes images and labels; `deep`: decodes all of them."""
+
+    def __init__(self, index: RoundIndex, *, deep: bool) -> None:
+        self.content = hashlib.sha256()
+        self._deep = deep
+        self._wrong: dict[str, list[str]] = {}
+        camera = index.header.camera
+        self._image = np.empty((camera.height, camera.width, 3), np.uint8)
+
+    def hear(self, topic: str, log_time: int, payload: memoryview) -> None:
+        try:
+            if topic == topics.LABELS:
+                self.content.update(payload)
+            elif topic == topics.CAMERA:
+                self._hear_image(log_time, payload)
+            if self._deep and topic in topics.MESSAGE_TYPES:
+                self._decode(topic, log_time, payload)
+        except (ValueError, DecodeError) as error:
+            at = f"{topics.seconds(log_time):.2f} s"
+            self._wrong.setdefault(topic, []).append(f"{topic} at {at}: {error}")
+
+    def problems(self) -> Iterator[str]:
+        for found in self._wrong.values():
+            yield from found[:TOLD]
+            if len(found) > TOLD:
+                yield f"... and {len(found) - TOLD} more of this topic"
+
+    def _hear_image(self, log_time: int, payload: memoryview) -> None:
+        data = bytes_field(payload, IMAGE_DATA)
+        self.content.update(data)
+        if self._deep:
+            decode_into(data, self._image)
+
+    def _decode(self, topic: str, log_time: int, payload: memoryview) -> None:
+        message: Any = topics.MESSAGE_TYPES[topic].FromString(bytes(payload))
+        if topic == topics.CAMERA and message.timestamp.ToNanoseconds() != log_time:
+            raise ValueError("the image carries another time than its message")

@@ -1,0 +1,160 @@
+"""Whether a dataset folder is what was recorded; a bad file is reported, never raised."""
+
+import os
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import trackfeatures as tf
+from datagen.recording.dataset import dataset_hash, round_files
+from datagen.recording.errors import DatasetError
+from datagen.recording.folder import RoundState, round_path, state_path
+from datagen.recording.integrity.round_checks import LEVELS, check_round, unreadable
+from datagen.recording.manifest import manifest_problems
+from datagen.recording.mcap.index import RoundIndex, open_round
+from datagen.recording.splits import (
+    SIDES,
+    RoundKey,
+    read_split,
+    require_disjoint,
+    require_known_recovered,
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Report:
+    """The result of `datagen verify`.
+
+    `content_hash` is the dataset's (see `Dataset`), absent when a round cannot be read.
+    """
+
+    ok: bool
+    rounds: int
+    frames: int
+    problems: tuple[str, ...]
+    content_hash: str | None = None
+    recovered: tuple[str, ...] = ()
+    """Rounds that `datagen recover` saved, one line each: known, and no problem by themselves."""
+
+    def as_json(self) -> dict[str, object]:
+        return asdict(self)
+
+
+def verify(folder: Path, level: str, seen: Callable[[str], None] = lambda name: None) -> Report:
+    """Check every round at `level` (quick, full or deep) and what belongs to them, on all cores.
+
+    `seen` hears of each round that is done, on any thread. DatasetError for another level.
+    """
+    if level not in LEVELS:
+        raise DatasetError(f"there is no level {level!r}; choose {', '.join(LEVELS)}")
+    try:
+        files = round_files(folder)
+    except DatasetError as error:
+        return Report(False, 0, 0, (str(error),))
+
+    def check(file: Path) -> tuple[int, list[str]]:
+        done = _check(folder, file, level)
+        seen(file.stem)
+        return done
+
+    # Threads: hashing, CRCs and decoding, nearly all of the time, leave Python to the others.
+    with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
+        checked = list(pool.map(check, files))
+    problems = [problem for _, found in checked for problem in found]
+    rounds = list(_opened(files))
+    problems += [*_missing(folder), *_foreign(folder), *_doubles(rounds), *_splits(folder, rounds)]
+    if level != "quick" and not problems:
+        problems += _derived(folder)
+    return Report(
+        not problems,
+        len(files),
+        sum(frames for frames, _ in checked),
+        tuple(problems),
+        dataset_hash(r.result.content_hash for r in rounds) if len(rounds) == len(files) else None,
+        tuple(f"{r.header.id}: {r.recovery}" for r in rounds if r.recovery),
+    )
+
+
+def _check(folder: Path, file: Path, level: str) -> tuple[int, list[str]]:
+    path = state_path(folder, file.stem)
+    state, problems = None, []
+    try:
+        state = RoundState.read(path) if path.is_file() else None
+    except DatasetError as error:
+        problems.append(str(error))
+    except OSError as error:
+        problems.append(unreadable(path, error))
+    if state is not None and state.file != f"rounds/{file.name}":
+        problems.append(f"{path} is of {state.file}")
+    frames, found = check_round(file, level, state)
+    return frames, problems + found
+
+
+def _opened(files: list[Path]) -> Iterator[RoundIndex]:
+    for file in files:
+        try:
+            yield open_round(file)
+        except (DatasetError, OSError):
+            continue  # already told
+
+
+def _derived(folder: Path) -> Iterator[str]:
+    try:
+        yield from manifest_problems(folder)
+    except tf.UserError as error:
+        yield str(error)
+    except OSError as error:
+        yield unreadable(Path(error.filename or folder), error)
+
+
+def _missing(folder: Path) -> Iterator[str]:
+    """Rounds that were finished once and whose file is gone."""
+    for path in sorted((folder / "state").glob("*.json")):
+        if not round_path(folder, path.stem).is_file():
+            yield f"{path.stem}.mcap is missing: state/{path.name} says that it was recorded"
+
+
+def _foreign(folder: Path) -> Iterator[str]:
+    """What stands among the rounds and is none."""
+    for path in sorted((folder / "rounds").iterdir()):
+        if path.suffix != ".mcap":
+            yield f"{path} is no round (expected *.mcap); move it elsewhere"
+
+
+def _doubles(rounds: list[RoundIndex]) -> Iterator[str]:
+    """Files under another's name, and rounds that are there twice."""
+    contents: dict[str, str] = {}
+    for index in rounds:
+        name, header = index.path.name, index.header
+        if header.id != index.path.stem:
+            yield (
+                f"{name} holds round {header.id}: files were swapped, copied or renamed; give each "
+                "the name of its round"
+            )
+        first = contents.setdefault(index.result.content_hash, name)
+        if first != name:
+            yield f"{name} has the same images and labels as {first}; keep one of them"
+
+
+def _splits(folder: Path, rounds: list[RoundIndex]) -> Iterator[str]:
+    keys = [RoundKey(r.header.id, r.header.seed, r.result.content_hash) for r in rounds]
+    paths = sorted((folder / "splits").glob("*.json"))
+    if not paths:
+        yield f"there are no splits in {folder / 'splits'}"
+    for path in paths:
+        try:
+            split = read_split(path)
+            require_disjoint(split, keys)
+            require_known_recovered(split, rounds)
+        except (DatasetError, tf.DefinitionsMismatch) as error:
+            yield str(error)
+        except OSError as error:
+            yield unreadable(path, error)
+        else:
+            named = [round_id for side in SIDES for round_id in getattr(split, side)]
+            for round_id in sorted(set(named)):
+                if named.count(round_id) > 1:
+                    yield f"{path} names round {round_id} twice"
+                if not round_path(folder, round_id).is_file():
+                    yield f"{path} names round {round_id}, which is not there"

@@ -1,0 +1,108 @@
+"""What the end of an MCAP file says about the rest: channels, chunks, metadata, counts.
+
+The official reader builds an object for each of thousands of entries; opening many rounds would
+take seconds. Both are held equal by a test.
+"""
+
+import zlib
+from dataclasses import dataclass, field
+
+from mcap.opcode import Opcode
+
+from datagen.recording.mcap.records import (
+    CHANNEL_COUNT,
+    CHUNK_INDEX,
+    CRC_BYTES,
+    DATA_END,
+    FOOTER,
+    INDEX_OFFSET,
+    LENGTH,
+    LONG_LENGTH,
+    MAGIC,
+    STATISTICS,
+    records,
+    text,
+    text_map,
+)
+
+
+@dataclass(frozen=True, slots=True)
+class ChunkPlace:
+    """Where a chunk starts in the file, and the message index of each of its channels."""
+
+    start: int
+    compression: str
+    indexes: dict[int, int]
+
+
+@dataclass(frozen=True, slots=True)
+class Summary:
+    """`channels` by topic, `metadata` as (start, end) by name, `counts` of messages by channel."""
+
+    channels: dict[str, int] = field(default_factory=dict)
+    chunks: list[ChunkPlace] = field(default_factory=list)
+    metadata: dict[str, tuple[int, int]] = field(default_factory=dict)
+    counts: dict[int, int] = field(default_factory=dict)
+
+
+def read_summary(view: memoryview) -> Summary:
+    """Empty when the file has none; ValueError when it is no whole MCAP file or is damaged there.
+
+    Its CRC is checked: what it says can be relied on.
+    """
+    found = Summary()
+    start, end = _bounds(view)
+    if not start:
+        return found
+    for opcode, at, _ in records(view, start, end):
+        if opcode == Opcode.CHANNEL:
+            topic, _ = text(view, at + 4)
+            found.channels[topic] = int.from_bytes(view[at : at + 2], "little")
+        elif opcode == Opcode.CHUNK_INDEX:
+            found.chunks.append(_chunk(view, at))
+        elif opcode == Opcode.METADATA_INDEX:
+            offset, length = (LONG_LENGTH.unpack_from(view, at + i)[0] for i in (0, 8))
+            found.metadata[text(view, at + 16)[0]] = (offset, offset + length)
+        elif opcode == Opcode.STATISTICS:
+            after = at + STATISTICS.size
+            size = STATISTICS.unpack_from(view, at)[-1]
+            found.counts.update(CHANNEL_COUNT.iter_unpack(view[after : after + size]))
+    return found
+
+
+def read_metadata(view: memoryview, place: tuple[int, int]) -> dict[str, str]:
+    """The metadata record at `place` of a summary; ValueError when it is not there."""
+    for opcode, at, _ in records(view, *place):
+        if opcode == Opcode.METADATA:
+            _, after = text(view, at)
+            return text_map(view, after)
+    raise ValueError("there is no metadata where the index places it")
+
+
+def _bounds(view: memoryview) -> tuple[int, int]:
+    """Start and end of the summary records; start 0 when there are none."""
+    footer_at = len(view) - len(MAGIC) - FOOTER.size
+    if footer_at < len(MAGIC) + DATA_END.size:
+        raise ValueError(f"{len(view)} bytes are too few for an MCAP file")
+    if view[: len(MAGIC)] != MAGIC:
+        raise ValueError("it does not start with the MCAP magic")
+    if view[-len(MAGIC) :] != MAGIC:
+        raise ValueError("its end is missing (it does not end with the MCAP magic)")
+    opcode, length, start, _, crc = FOOTER.unpack_from(view, footer_at)
+    if (opcode, length) != (Opcode.FOOTER, FOOTER.size - 9):
+        raise ValueError("its footer is not where it belongs")
+    if start and not len(MAGIC) + DATA_END.size <= start <= footer_at:
+        raise ValueError("its footer does not say where the index is")
+    covered = footer_at + FOOTER.size - CRC_BYTES
+    if start and crc and zlib.crc32(view[start:covered]) != crc:
+        raise ValueError("its index is damaged (the summary's CRC)")
+    return start, footer_at
+
+
+def _chunk(view: memoryview, at: int) -> ChunkPlace:
+    _, _, start, _, size = CHUNK_INDEX.unpack_from(view, at)
+    at += CHUNK_INDEX.size
+    indexes = dict(INDEX_OFFSET.iter_unpack(view[at : at + size]))
+    at += size + LONG_LENGTH.size  # the indexes' total length
+    (length,) = LENGTH.unpack_from(view, at)
+    return ChunkPlace(start, text(view, at)[0] if length else "", indexes)

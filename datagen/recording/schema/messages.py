@@ -1,0 +1,241 @@
+"""Frames as protobuf messages, one function a topic; each returns the serialised message."""
+
+from collections.abc import Mapping
+from math import cos, sin
+from typing import Any
+
+import numpy as np
+from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
+from foxglove_schemas_protobuf.Color_pb2 import Color
+from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
+from foxglove_schemas_protobuf.ImageAnnotations_pb2 import ImageAnnotations
+from foxglove_schemas_protobuf.LinePrimitive_pb2 import LinePrimitive
+from foxglove_schemas_protobuf.PointsAnnotation_pb2 import PointsAnnotation
+from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
+from google.protobuf.timestamp_pb2 import Timestamp
+from numpy.typing import NDArray
+
+import trackfeatures as tf
+from datagen.recording.camera import CameraInfo
+from datagen.recording.frame import DriverCommand, EgoState, Frame, SensorReadings
+from datagen.recording.mcap.protobuf_wire import points_field
+from datagen.recording.schema.proto.driverview_pb2 import (
+    Command,
+    Sensors,
+    TrackFeatures,
+    VehicleState,
+)
+from datagen.recording.schema.topics import NANOSECONDS
+
+WORLD, EGO, CAMERA_FRAME = "world", "ego", "camera_front"
+EGO_SIZE = (4.52, 1.94, 1.10)
+TRAFFIC_SIZE = (4.4, 1.8, 1.4)
+EGO_HEIGHT = 0.30  # of the body's middle above its centre of gravity
+GREEN = Color(r=0.1, g=1.0, b=0.3, a=1.0)
+WHITE = Color(r=1.0, g=1.0, b=1.0, a=1.0)
+SHADE = Color(r=0.0, g=0.0, b=0.0, a=0.5)
+BLUE = Color(r=0.2, g=0.4, b=1.0, a=1.0)
+GREY = Color(r=0.7, g=0.7, b=0.7, a=1.0)
+
+Quaternion = tuple[float, float, float, float]
+
+
+def timestamp(log_time_ns: int) -> Timestamp:
+    return Timestamp(seconds=log_time_ns // NANOSECONDS, nanos=log_time_ns % NANOSECONDS)
+
+
+def compressed_image(data: bytes, codec: str, time: Timestamp) -> bytes:
+    return _bytes(CompressedImage(timestamp=time, frame_id=CAMERA_FRAME, data=data, format=codec))
+
+
+def calibration(camera: CameraInfo, time: Timestamp) -> bytes:
+    k = camera.intrinsics
+    projection = np.hstack([k, np.zeros((3, 1))])
+    return _bytes(
+        CameraCalibration(
+            timestamp=time,
+            frame_id=CAMERA_FRAME,
+            width=camera.width,
+            height=camera.height,
+            distortion_model="plumb_bob",
+            D=[0.0] * 5,
+            K=k.ravel().tolist(),
+            R=np.eye(3).ravel().tolist(),
+            P=projection.ravel().tolist(),
+        )
+    )
+
+
+def annotations(frame: Frame, time: Timestamp) -> bytes:
+    """The true markings and a line of figures over the image."""
+    message = ImageAnnotations(timestamp=time)
+    for polyline in frame.markings:
+        line = message.points.add()
+        line.timestamp.CopyFrom(time)
+        line.type = PointsAnnotation.LINE_STRIP
+        line.thickness = 1.0
+        line.outline_color.CopyFrom(GREEN)
+        line.MergeFromString(points_field(PointsAnnotation.POINTS_FIELD_NUMBER, polyline))
+    text = message.texts.add()
+    text.timestamp.CopyFrom(time)
+    text.position.x, text.position.y = 4.0, 12.0
+    text.font_size = 9.0
+    text.text = caption(frame.features)
+    text.text_color.CopyFrom(WHITE)
+    text.background_color.CopyFrom(SHADE)
+    return _bytes(message)
+
+
+def caption(features: tf.TrackFeatures) -> str:
+    distances = " ".join(
+        f"{name} {value:.2f}" for name, value in features.distances.items() if value is not None
+    )
+    return f"{distances} | {features.angle:+.3f} rad | {features.heading.name.lower()}"
+
+
+def labels(frame: Frame) -> bytes:
+    features, place = frame.features, frame.place
+    return _bytes(
+        TrackFeatures(
+            to_marking_ml=features.ml,
+            to_marking_mr=features.mr,
+            to_marking_l=features.l,
+            to_marking_m=features.m,
+            to_marking_r=features.r,
+            to_lane_centre=features.to_lane_centre,
+            angle=features.angle,
+            heading=features.heading.name,
+            lanes=place.lanes,
+            lane_index=place.lane_index,
+            curvature=place.curvature,
+            to_middle=place.to_middle,
+            s=place.s,
+        )
+    )
+
+
+def ego_state(ego: EgoState) -> bytes:
+    return _bytes(
+        VehicleState(
+            x=ego.x,
+            y=ego.y,
+            z=ego.z,
+            yaw=ego.yaw,
+            pitch=ego.pitch,
+            roll=ego.roll,
+            vx=ego.vx,
+            vy=ego.vy,
+            yaw_rate=ego.yaw_rate,
+            shadow_fraction=ego.shadow_fraction,
+        )
+    )
+
+
+def sensors(readings: SensorReadings) -> bytes:
+    return _bytes(
+        Sensors(
+            range=readings.range,
+            angle=readings.angle,
+            speed=readings.speed,
+            speed_x=readings.speed_x,
+            speed_y=readings.speed_y,
+            engine_rotation=readings.engine_rotation,
+            odometer=readings.odometer,
+            lap_time=readings.lap_time,
+            wheel_spin=readings.wheel_spin,
+        )
+    )
+
+
+def command(given: DriverCommand) -> bytes:
+    return _bytes(
+        Command(steer=given.steer, throttle=given.throttle, brake=given.brake, gear=given.gear)
+    )
+
+
+def traffic(frame: Frame, time: Timestamp) -> bytes:
+    """The cars as boxes in the world, the ego car in its own frame among them."""
+    message = SceneUpdate()
+    _add_box(message, "ego", EGO, (0.0, 0.0, EGO_HEIGHT, 0.0, 0.0, 0.0), EGO_SIZE, BLUE, time)
+    for number, (x, y, z, roll, pitch, yaw) in enumerate(frame.traffic.tolist()):
+        middle = (x, y, z + TRAFFIC_SIZE[2] / 2.0, roll, pitch, yaw)
+        _add_box(message, f"car {number}", WORLD, middle, TRAFFIC_SIZE, GREY, time)
+    return _bytes(message)
+
+
+def track_scene(lines: Mapping[str, NDArray[np.float64]], time: Timestamp) -> bytes:
+    """Named world polylines, (N, 3) m each."""
+    message = SceneUpdate()
+    for name, points in lines.items():
+        entity = message.entities.add(id=name, frame_id=WORLD)
+        entity.timestamp.CopyFrom(time)
+        line = entity.lines.add(type=LinePrimitive.LINE_STRIP, thickness=0.12)
+        line.pose.orientation.w = 1.0
+        line.color.CopyFrom(WHITE)
+        for x, y, z in points.tolist():
+            line.points.add(x=x, y=y, z=z)
+    return _bytes(message)
+
+
+def transforms(ego: EgoState, camera: CameraInfo, time: Timestamp) -> bytes:
+    message = FrameTransforms()
+    _add_transform(
+        message, WORLD, EGO, (ego.x, ego.y, ego.z), quaternion(ego.roll, ego.pitch, ego.yaw), time
+    )
+    # The optical frame looks along its z axis, with x to the right and y down.
+    level = quaternion(-np.pi / 2.0 - np.radians(camera.pitch_deg), 0.0, -np.pi / 2.0)
+    _add_transform(message, EGO, CAMERA_FRAME, (camera.x, camera.y, camera.z), level, time)
+    return _bytes(message)
+
+
+def quaternion(roll: float, pitch: float, yaw: float) -> Quaternion:
+    """x, y, z, w of the rotation Rz(yaw) Ry(pitch) Rx(roll)."""
+    cr, sr = cos(roll / 2.0), sin(roll / 2.0)
+    cp, sp = cos(pitch / 2.0), sin(pitch / 2.0)
+    cy, sy = cos(yaw / 2.0), sin(yaw / 2.0)
+    return (
+        sr * cp * cy - cr * sp * sy,
+        cr * sp * cy + sr * cp * sy,
+        cr * cp * sy - sr * sp * cy,
+        cr * cp * cy + sr * sp * sy,
+    )
+
+
+def _add_box(
+    message: Any,
+    name: str,
+    frame_id: str,
+    pose: tuple[float, float, float, float, float, float],
+    size: tuple[float, float, float],
+    color: Any,
+    time: Timestamp,
+) -> None:
+    x, y, z, roll, pitch, yaw = pose
+    entity = message.entities.add(id=name, frame_id=frame_id, frame_locked=frame_id != WORLD)
+    entity.timestamp.CopyFrom(time)
+    cube = entity.cubes.add()
+    place, turn = cube.pose.position, cube.pose.orientation
+    place.x, place.y, place.z = x, y, z
+    turn.x, turn.y, turn.z, turn.w = quaternion(roll, pitch, yaw)
+    cube.size.x, cube.size.y, cube.size.z = size
+    cube.color.CopyFrom(color)
+
+
+def _add_transform(
+    message: Any,
+    parent: str,
+    child: str,
+    place: tuple[float, float, float],
+    turn: Quaternion,
+    time: Timestamp,
+) -> None:
+    transform = message.transforms.add(parent_frame_id=parent, child_frame_id=child)
+    transform.timestamp.CopyFrom(time)
+    shift, rotation = transform.translation, transform.rotation
+    shift.x, shift.y, shift.z = place
+    rotation.x, rotation.y, rotation.z, rotation.w = turn
+
+
+def _bytes(message: Any) -> bytes:
+    return bytes(message.SerializeToString())

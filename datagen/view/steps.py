@@ -1,0 +1,126 @@
+"""A round's control steps with their messages parsed: what `datagen export` and `view` read."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from datagen.recording.dataset import IMAGE_DATA
+from datagen.recording.errors import DatasetError
+from datagen.recording.labels import lights_of
+from datagen.recording.mcap.index import DAMAGE, RoundIndex, open_round
+from datagen.recording.mcap.protobuf_wire import bytes_field
+from datagen.recording.schema.proto.driverview_pb2 import Command, TrackFeatures, VehicleState
+from datagen.recording.schema.topics import (
+    CAMERA,
+    COMMAND,
+    EGO_STATE,
+    LABELS,
+    MESSAGE_TYPES,
+    seconds,
+)
+
+TOPICS = (CAMERA, LABELS, EGO_STATE, COMMAND)
+
+Value = float | int | str | list[float] | None
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """What is true at one moment; `image` is encoded, and not copied."""
+
+    number: int
+    time_s: float
+    image: memoryview
+    labels: TrackFeatures
+    ego: VehicleState
+    command: Command
+    light: str
+
+
+@dataclass(frozen=True)
+class Steps:
+    """The steps of a round, in order: `steps[0]`, `len(steps)`, `for step in steps`."""
+
+    index: RoundIndex
+
+    @staticmethod
+    def open(path: Path, topics: tuple[str, ...] = TOPICS) -> "Steps":
+        """Raises DatasetError unless every image has its label, state and command."""
+        steps = Steps(open_round(path, topics))
+        times = steps.index.messages[CAMERA].log_time
+        for topic in TOPICS[1:]:
+            if not np.array_equal(steps.index.messages[topic].log_time, times):
+                raise DatasetError(
+                    f"{path}: its images do not pair with what is on {topic}; run "
+                    "`datagen verify` on the dataset and record the round again"
+                )
+        return steps
+
+    def __len__(self) -> int:
+        return len(self.times_s)
+
+    def __getitem__(self, number: int) -> Step:
+        return Step(
+            number,
+            self.times_s[number],
+            bytes_field(self.payload(CAMERA, number), IMAGE_DATA),
+            self.message(LABELS, number),
+            self.message(EGO_STATE, number),
+            self.message(COMMAND, number),
+            self.lights[number],
+        )
+
+    def __iter__(self) -> Iterator[Step]:
+        return (self[number] for number in range(len(self)))
+
+    def message(self, topic: str, number: int) -> Any:
+        """Message `number` of a topic the round was opened for, parsed; DatasetError if damaged."""
+        try:
+            return MESSAGE_TYPES[topic].FromString(bytes(self.payload(topic, number)))
+        except DAMAGE as error:
+            raise self._damaged(topic, number, error) from error
+
+    def payload(self, topic: str, number: int) -> memoryview:
+        try:
+            return self.index.messages[topic].payload(number)
+        except DAMAGE as error:
+            raise self._damaged(topic, number, error) from error
+
+    @cached_property
+    def lights(self) -> list[str]:
+        """The light at each step."""
+        lights: list[str] = lights_of(self.index).tolist()
+        return lights
+
+    @cached_property
+    def times_s(self) -> list[float]:
+        """Simulated time of each step since the start of the round, s."""
+        times = self.index.messages[CAMERA].log_time.tolist()
+        if not times:
+            raise DatasetError(f"{self.index.path} has no frames; record the round again")
+        return [seconds(time) for time in times]
+
+    def _damaged(self, topic: str, number: int, error: Exception) -> DatasetError:
+        return DatasetError(
+            f"{self.index.path}: message {number} on {topic} cannot be read ({error}); run "
+            "`datagen verify` on the dataset and record the round again"
+        )
+
+
+def values(message: Any) -> dict[str, Value]:
+    """The fields of one of our messages: None where absent, classes by name in lower case."""
+    return {f.name: _value(message, f) for f in message.DESCRIPTOR.fields}
+
+
+def _value(message: Any, field: Any) -> Value:
+    value = getattr(message, field.name)
+    if field.has_presence and not message.HasField(field.name):
+        return None
+    if field.enum_type is not None:
+        return str(field.enum_type.values_by_number[value].name).lower()
+    found: Value = list(value) if field.is_repeated else value
+    return found

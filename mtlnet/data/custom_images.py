@@ -1,0 +1,192 @@
+"""A user's own images with a `labels.csv`, to fine-tune a model with: `mtlnet train --init RUN`.
+
+Columns (a header names them, in any order): `file`, a path within the folder; `ml`, `mr`, `l`, `m`,
+`r`, m, left negative, empty where there is no such marking; `angle`, rad, positive when the car
+points to the right of the track; `heading`, left, straight or right. The images are of the camera
+of the model that is fine-tuned, at any size of its shape.
+"""
+
+import csv
+import hashlib
+import math
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+import trackfeatures as tf
+from mtlnet.inference.image_decoding.decode import inspect, read_image
+from mtlnet.inference.model_card import Camera
+from trackfeatures.errors import UserError
+
+LABELS = "labels.csv"
+COLUMNS = ("file", *tf.MARKINGS, "angle", "heading")
+MARKING_LIMITS_M = {
+    "ml": (-5.5, -0.5),
+    "mr": (0.5, 5.5),
+    "l": (-7.0, -1.5),
+    "m": (-2.0, 2.75),
+    "r": (1.5, 7.0),
+}
+"""What the network's coding can say (DESIGN section 2); beyond it a label would be cut off."""
+ANGLE_LIMIT_RAD = 0.5
+ASPECT_TOLERANCE = 0.01
+
+
+@dataclass(frozen=True)
+class OwnLabels:
+    """`distances` (N, 5) m, NaN where absent; `angle` (N,) rad; `heading` (N,) classes."""
+
+    distances: NDArray[np.float32]
+    angle: NDArray[np.float32]
+    heading: NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class OwnImages:
+    """Labelled images in memory, (N, H, W, 3) uint8 of the camera's size (0.18 MB each)."""
+
+    path: Path
+    labels: OwnLabels
+    images: NDArray[np.uint8]
+    content_hash: str
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+    def read_batch(
+        self, indices: NDArray[np.int64], out: NDArray[np.uint8] | None = None
+    ) -> NDArray[np.uint8]:
+        """The images of `indices`, (B, H, W, 3), in `out` where one is given."""
+        return np.take(self.images, indices, axis=0, out=out)
+
+
+def is_own(folder: Path) -> bool:
+    """Whether a folder holds a user's own images rather than recorded rounds."""
+    return (folder / LABELS).is_file()
+
+
+def open_own_images(folder: Path, camera: Camera) -> OwnImages:
+    """Read, check and decode all of a folder, scaled to the camera's size.
+
+    Raises UserError that names the line of `labels.csv` that is wrong, ImageError (a UserError)
+    for an image that is damaged or of another shape than the camera's.
+    """
+    files, labels = read_labels(folder / LABELS)
+    images = np.empty((len(files), camera.height, camera.width, 3), np.uint8)
+
+    def decode(number: int) -> bytes:
+        path = folder / files[number][1]
+        try:
+            images[number] = _read_whole_view(path, camera)
+        except UserError as error:
+            error.args = (f"{folder / LABELS}, line {files[number][0]}: {error}",)
+            raise
+        return hashlib.sha256(path.read_bytes()).digest()
+
+    digest = hashlib.sha256((folder / LABELS).read_bytes())
+    with ThreadPoolExecutor() as pool:
+        for part in pool.map(decode, range(len(files))):
+            digest.update(part)
+    return OwnImages(folder, labels, images, digest.hexdigest())
+
+
+def _read_whole_view(path: Path, camera: Camera) -> NDArray[np.uint8]:
+    """An image of the camera's shape, at its size: not cropped, as one that is asked about may be.
+
+    A label would not know what was cut away.
+    """
+    image = read_image(path, camera)
+    header = inspect(path.read_bytes(), camera)
+    stretch = header.width * camera.height / (header.height * camera.width)
+    if abs(stretch - 1) > ASPECT_TOLERANCE:
+        raise UserError(
+            f"{path} is {header.width} x {header.height} px, the camera of the model gives "
+            f"{camera.width} x {camera.height}: give images of that shape (within 1 percent), of "
+            "any size"
+        )
+    return image
+
+
+def read_labels(path: Path) -> tuple[list[tuple[int, str]], OwnLabels]:
+    """The lines and files of a `labels.csv`, and the labels; UserError that names a wrong line."""
+    files: list[tuple[int, str]] = []
+    rows: list[tuple[list[float], float, int]] = []
+    with path.open(newline="", encoding="utf-8-sig") as file:
+        reader = csv.DictReader(file, strict=True)
+        try:
+            names = [name.strip() for name in reader.fieldnames or ()]
+            reader.fieldnames = names
+            if sorted(names) != sorted(COLUMNS):
+                raise UserError(
+                    f"{path} has the columns {', '.join(names) or 'none'}; its first line must "
+                    f"name {', '.join(COLUMNS)}"
+                )
+            for row in reader:
+                try:
+                    name, *values = _parse(row)
+                except ValueError as error:
+                    raise UserError(f"{path}, line {reader.line_num}: {error}") from None
+                files.append((reader.line_num, name))
+                rows.append(values)  # type: ignore[arg-type]  # as `_parse` gives them
+        except (csv.Error, UnicodeDecodeError) as error:
+            raise UserError(f"{path}, after line {reader.line_num}: {error}") from error
+    if not files:
+        raise UserError(f"{path} names no images")
+    seen: dict[str, int] = {}
+    for line, name in files:
+        if name in seen:
+            raise UserError(f"{path}, line {line}: {name} stands in line {seen[name]} already")
+        seen[name] = line
+    labels = OwnLabels(
+        np.array([row[0] for row in rows], np.float32),
+        np.array([row[1] for row in rows], np.float32),
+        np.array([row[2] for row in rows], np.int64),
+    )
+    return files, labels
+
+
+def _parse(row: dict[str, str | None]) -> tuple[str, list[float], float, int]:
+    """One row: file, distances in m (NaN absent), angle in rad, class; ValueError: its fault."""
+    if None in row or None in row.values():
+        raise ValueError(f"it has not {len(COLUMNS)} values")
+    cells = {name: (text or "").strip() for name, text in row.items()}
+    name = cells["file"]
+    if not name or Path(name).is_absolute() or ".." in Path(name).parts:
+        raise ValueError(f"the file {name!r} is no path within the folder")
+    found = {marking: _distance(marking, cells[marking]) for marking in tf.MARKINGS}
+    if math.isnan(found["ml"]) != math.isnan(found["mr"]):
+        raise ValueError("ml and mr are the two sides of one lane: give both or none")
+    if math.isnan(found["m"]) and not (math.isnan(found["l"]) and math.isnan(found["r"])):
+        raise ValueError("l and r stand beside m: without m they must be empty")
+    angle = _number("angle", cells["angle"])
+    if not abs(angle) <= ANGLE_LIMIT_RAD:
+        raise ValueError(
+            f"angle is {angle:g}; it must be within {ANGLE_LIMIT_RAD} rad (radians, not degrees)"
+        )
+    headings = {kind.name.lower(): int(kind) for kind in tf.Heading}
+    if cells["heading"] not in headings:
+        raise ValueError(f"heading is {cells['heading']!r}; give {', '.join(headings)}")
+    return name, [found[m] for m in tf.MARKINGS], angle, headings[cells["heading"]]
+
+
+def _distance(marking: str, text: str) -> float:
+    if not text:
+        return math.nan
+    value = _number(marking, text)
+    low, high = MARKING_LIMITS_M[marking]
+    if not low <= value <= high:
+        raise ValueError(
+            f"{marking} is {value:g} m; it must be from {low:g} to {high:g} (left negative), or "
+            "empty where there is none"
+        )
+    return value
+
+
+def _number(name: str, text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise ValueError(f"{name} is {text!r}, not a number") from None

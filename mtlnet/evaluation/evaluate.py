@@ -1,0 +1,126 @@
+"""Judging a model on the rounds of a dataset: `mtlnet evaluate --model RUN --data DIR --json`."""
+
+import threading
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from datagen.recording import Dataset, Frames, UndecodableImage
+from mtlnet.data.loader import Images
+from mtlnet.data.sources import require_decodable
+from mtlnet.evaluation.html_report import write_page
+from mtlnet.evaluation.metrics import judge_all
+from mtlnet.inference.engine import Engine
+from mtlnet.inference.model_card import ModelCard, ModelError
+from trackfeatures.errors import UserError
+
+CHUNK = 32
+
+
+def evaluate(
+    engines: Sequence[Engine],
+    data: Path,
+    split: str,
+    report: Callable[[int, int], None] = lambda *_: None,
+    page: Path | None = None,
+    every: int = 1,
+) -> dict[str, Any]:
+    """The report of `mtlnet.evaluation.metrics.judge` on one side of a dataset, whole and by
+    groups.
+
+    `page`: where to write it as HTML as well, a file or a folder. `every`: judge each so many-th
+    frame only; its neighbours show much the same.
+    `engines`: the same model, once for each thread. `report(done, all)` is told how far it is.
+    Raises UserError when data and model do not fit.
+    """
+    if every < 1:
+        raise UserError(f"--every is {every}; give 1 for all frames, 5 for each fifth")
+    engine = engines[0]
+    dataset = Dataset.open(data)
+    frames = dataset.select(split).every(every)
+    require_fit(engine.card, frames, split)
+    try:
+        outputs = answer_frames(engines, frames, report)
+    except UndecodableImage:
+        require_decodable(frames, data)  # to name and count all of them
+        raise
+    mean = engine.card.data["mean"]
+    found = {
+        "model": engine.card.name,
+        "model_hash": engine.card.model_hash,
+        "engine": engine.kind,
+        "precision": engine.precision,
+        "data": str(data),
+        "split": split,
+        "every": every,
+        "rounds": len(frames.rounds),
+        **judge_all(outputs, frames, mean),
+    }
+    if page is not None:
+        found["page"] = str(write_page(page, found, frames, outputs))
+    return found
+
+
+def answer_frames(
+    engines: Sequence[Engine],
+    frames: Images,
+    report: Callable[[int, int], None] = lambda *_: None,
+) -> NDArray[np.float32]:
+    """The outputs (N, 9 or 17) for all frames, one by one as in service, on a thread an engine."""
+    chunks = iter(range(0, len(frames), CHUNK))
+    taking = threading.Lock()
+    parts: dict[int, list[NDArray[np.float32]]] = {}
+
+    def work(engine: Engine) -> None:
+        camera = engine.card.camera
+        images = np.empty((CHUNK, camera.height, camera.width, 3), np.uint8)
+        while True:
+            with taking:
+                first = next(chunks, None)
+            if first is None:
+                return
+            rows = np.arange(first, min(first + CHUNK, len(frames)))
+            batch = frames.read_batch(rows, images[: len(rows)])
+            parts[first] = [engine(image) for image in batch]
+            with taking:
+                report(min(len(parts) * CHUNK, len(frames)), len(frames))
+
+    with ThreadPoolExecutor(len(engines), thread_name_prefix="engine") as pool:
+        for done in [pool.submit(work, engine) for engine in engines]:
+            done.result()
+    return np.stack([outputs for first in sorted(parts) for outputs in parts[first]])
+
+
+def require_fit(card: ModelCard, frames: Frames, split: str) -> None:
+    """Raise ModelError when the camera differs, or when what is to judge it was trained on."""
+    found, expected = frames.camera.as_dict(), vars(card.camera)
+    if found != expected:
+        differing = ", ".join(
+            f"{k} {found[k]:g} instead of {expected[k]:g}"
+            for k in expected
+            if found[k] != expected[k]
+        )
+        raise ModelError(
+            f"the camera of the data is not that of model {card.name}: {differing}; collect with "
+            "the model's camera, or train a model for this one"
+        )
+    if "mean" not in card.data:
+        raise ModelError(f"model {card.name} does not say what it was trained on; train it anew")
+    if split not in ("test", "unseen"):
+        return
+    seen = {info.seed for info in frames.rounds} & set(card.data["seeds"])
+    if seen:
+        raise ModelError(
+            f"model {card.name} was trained on the round of seed {min(seen)}, a {split} round of "
+            "this data: the result would say nothing; use --split all, or other rounds"
+        )
+    known = {info.track for info in frames.rounds} & set(card.data.get("tracks", ()))
+    if split == "unseen" and known:
+        raise ModelError(
+            f"model {card.name} was trained on track {min(known)}, which is not unseen to it; "
+            "collect another with `datagen collect --split unseen --tracks NAME`"
+        )

@@ -1,0 +1,263 @@
+"""Errors of a model's outputs on labelled frames, in m and rad, feature by feature.
+
+A feature is one of `mtlnet.inference.uncertainty.FEATURES`: the five markings, `to_lane_centre`,
+`angle`. Errors are signed (answer minus truth), and NaN where the label has none: what is not
+active is not judged.
+"""
+
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+import trackfeatures as tf
+from datagen.recording import Dataset, Frames, Labels
+from mtlnet.evaluation.slices import groups
+from mtlnet.inference.prediction import OUTPUTS
+from mtlnet.inference.uncertainty import FEATURES
+
+Numbers = NDArray[np.float64]
+PERCENTILES = {"median": 50, "p95": 95, "p99": 99}
+CALIBRATION_BINS = 10
+
+
+class Truth(Protocol):
+    """The labels that errors need; see `datagen.recording.Labels`."""
+
+    @property
+    def distances(self) -> NDArray[np.float32]: ...
+    @property
+    def angle(self) -> NDArray[np.float32]: ...
+    @property
+    def heading(self) -> NDArray[np.int64]: ...
+
+
+def signed_errors(outputs: NDArray[np.float32], distances: Any, angle: Any) -> Numbers:
+    """Errors (N, 7) of outputs (N, 9 or more).
+
+    A marking's is that of the value the network gives, whether or not it decodes to "absent"; that
+    of `to_lane_centre` counts where both the label and the answer have one.
+    """
+    values = tf.decode_values(outputs[:, :6])
+    offset = tf.localise(tf.decode(outputs[:, :6])[0]) - tf.localise(distances)
+    columns = [values[:, :5] - distances, offset[:, None], (values[:, 5] - angle)[:, None]]
+    return np.concatenate(columns, axis=1)
+
+
+def spread(errors: Numbers) -> dict[str, dict[str, float | None]]:
+    """By feature: mean, median, 95th and 99th percentile of the absolute error, how many frames."""
+    return {name: _spread(np.abs(errors[:, i])) for i, name in enumerate(FEATURES)}
+
+
+def _spread(sizes: Numbers) -> dict[str, float | None]:
+    present = sizes[~np.isnan(sizes)]
+    if not len(present):
+        return {"mean": None, **dict.fromkeys(PERCENTILES), "frames": 0}
+    found = np.percentile(present, list(PERCENTILES.values())).tolist()
+    percentiles = dict(zip(PERCENTILES, found, strict=True))
+    return {"mean": float(present.mean()), **percentiles, "frames": len(present)}
+
+
+def confusion(heading: NDArray[np.int64], said: NDArray[np.int64]) -> dict[str, dict[str, int]]:
+    """Frames by true class, then by the class that was said."""
+    names = [kind.name.lower() for kind in tf.Heading]
+    counts = np.zeros((len(names), len(names)), np.int64)
+    np.add.at(counts, (heading, said), 1)
+    return {
+        name: dict(zip(names, row, strict=True))
+        for name, row in zip(names, counts.tolist(), strict=True)
+    }
+
+
+def coverage(std: NDArray[Any], errors: NDArray[Any]) -> dict[str, list[float | None]]:
+    """By feature: shares of errors within one and two standard deviations (N, 7).
+
+    Of a normal distribution 0.683 and 0.954.
+    """
+    ratio = np.abs(errors) / std
+    return {name: [_within(ratio[:, i], k) for k in (1, 2)] for i, name in enumerate(FEATURES)}
+
+
+def _within(ratio: NDArray[Any], limit: float) -> float | None:
+    present = ratio[~np.isnan(ratio)]
+    return float((present <= limit).mean()) if len(present) else None
+
+
+def calibration(std: NDArray[Any], errors: Numbers) -> dict[str, list[dict[str, float]]]:
+    """By feature: the errors found where a standard deviation was said, in bins of equal count.
+
+    Each bin: root mean square of the said deviations, that of the errors, frames.
+    """
+    return {name: _bins(std[:, i], errors[:, i]) for i, name in enumerate(FEATURES)}
+
+
+def _bins(std: NDArray[Any], errors: Numbers) -> list[dict[str, float]]:
+    present = np.flatnonzero(~np.isnan(errors))
+    order = present[np.argsort(std[present], kind="stable")]
+    parts = np.array_split(order, min(CALIBRATION_BINS, max(len(order), 1)))
+    return [
+        {"said": _rms(std[part]), "found": _rms(errors[part]), "frames": len(part)}
+        for part in parts
+        if len(part)
+    ]
+
+
+def _rms(values: NDArray[Any]) -> float:
+    return float(np.sqrt((values.astype(np.float64) ** 2).mean()))
+
+
+# How good a model's answers are, in metres and radians, beside always answering the mean. Errors
+# are taken on active labels only (`mtlnet.evaluation.metrics`); how often presence itself is wrong
+# stands beside them.
+
+
+def describe_data(
+    dataset: Dataset, frames: Frames, held_out: Frames | None = None
+) -> dict[str, Any]:
+    """What a model was trained on, and the mean of its labels: the answer of one who guesses.
+
+    `held_out`: rounds on which only its doubt was fitted; it has seen them all the same.
+    """
+    rounds = [*frames.rounds, *(held_out.rounds if held_out is not None else [])]
+    sides = {
+        side: [info.id for info in dataset.rounds if info.split == side]
+        for side in ("train", "test")
+    }
+    return {
+        "path": str(dataset.path),
+        "content_hash": dataset.content_hash,
+        "frames": len(frames),
+        "split": sides,
+        "held_out": [info.id for info in held_out.rounds] if held_out is not None else [],
+        "seeds": [info.seed for info in rounds],
+        "tracks": sorted({info.track for info in rounds}),
+        "mean": mean_answer(frames.labels),
+    }
+
+
+def mean_answer(labels: Truth) -> dict[str, Any]:
+    """The mean of labels: the answer of one who guesses. None where nothing is labelled."""
+    distances = labels.distances.astype(np.float64)
+    counts = (~np.isnan(distances)).sum(0)
+    sums = np.nansum(distances, axis=0)
+    offset = tf.localise(distances)
+    classes = np.bincount(labels.heading, minlength=len(tf.Heading))
+    return {
+        "distances_m": [float(s / n) if n else None for s, n in zip(sums, counts, strict=True)],
+        "to_lane_centre_m": float(np.nanmean(offset)) if not np.isnan(offset).all() else 0.0,
+        "angle_rad": float(labels.angle.astype(np.float64).mean()),
+        "heading": int(classes.argmax()),
+        "heading_share": [float(share) for share in classes / classes.sum()],
+    }
+
+
+def judge(outputs: NDArray[np.float32], labels: Labels, mean: dict[str, Any]) -> dict[str, Any]:
+    """The report (DESIGN §9) on `outputs` (N, 9 or 17) for `labels`, `mean` as of `describe_data`.
+
+    `doubt` is there where the model gives standard deviations.
+    """
+    errors = signed_errors(outputs, labels.distances, labels.angle)
+    said = outputs[:, 6:OUTPUTS].argmax(1)
+    model = _means(errors, said == labels.heading)
+    guess = _means(_constant_errors(mean, labels), labels.heading == mean["heading"])
+    report = {
+        "frames": len(labels),
+        **model,
+        "errors": spread(errors),
+        "confusion": confusion(labels.heading, said),
+        "coded": coded_losses(outputs, labels),
+        "presence": presence(outputs, labels),
+        "baseline": guess,
+        "ratio": _ratios(model, guess),
+    }
+    if outputs.shape[1] > OUTPUTS:
+        std, novelty = outputs[:, OUTPUTS:-1], outputs[:, -1]
+        strange = float((~(novelty <= 1)).mean())
+        report["doubt"] = {"coverage": coverage(std, errors), "out_of_distribution": strange}
+    return report
+
+
+def judge_all(outputs: NDArray[np.float32], frames: Frames, mean: dict[str, Any]) -> dict[str, Any]:
+    """The report on all frames, and the same by each of `mtlnet.evaluation.slices.groups`:
+    `by_track`, ..."""
+    labels = frames.labels
+    report = judge(outputs, labels, mean)
+    if outputs.shape[1] > OUTPUTS:
+        errors = signed_errors(outputs, labels.distances, labels.angle)
+        report["doubt"]["calibration"] = calibration(outputs[:, OUTPUTS:-1], errors)
+    for name, parts in groups(frames):
+        report[name] = {
+            key: judge(outputs[rows], labels.take(rows), mean) for key, rows in parts.items()
+        }
+    return report
+
+
+def _means(errors: Numbers, right: NDArray[np.bool_]) -> dict[str, Any]:
+    """Mean absolute errors, and the share of right classes, under the names of DESIGN §9."""
+    sizes = [_mean(np.abs(column)) for column in errors.T]
+    by_name = dict(zip(FEATURES, sizes, strict=True))
+    return {
+        "mae_m": {m: by_name[m] for m in tf.MARKINGS},
+        "to_lane_centre_mae_m": by_name["to_lane_centre"],
+        "angle_mae_rad": by_name["angle"],
+        "heading_accuracy": _mean(right.astype(np.float64)),
+    }
+
+
+def _ratios(model: dict[str, Any], guess: dict[str, Any]) -> dict[str, Any]:
+    return {
+        "mae_m": {m: _ratio(model["mae_m"][m], guess["mae_m"][m]) for m in tf.MARKINGS},
+        **{k: _ratio(model[k], guess[k]) for k in ("to_lane_centre_mae_m", "angle_mae_rad")},
+    }
+
+
+def coded_losses(outputs: NDArray[np.float32], labels: Labels) -> dict[str, float]:
+    """The losses of the paper's table on coded values, inactive ones included.
+
+    `distance`, `angle`: mean over the frames of the squared error, of the five distances summed, as
+    trained; `distance_absolute`, `angle_absolute`: of the absolute error; `type`: cross-entropy.
+    """
+    target = tf.encode(labels.distances, labels.angle).astype(np.float64)
+    difference = outputs[:, :6] - target
+    squared, absolute = difference**2, np.abs(difference)
+    chosen = outputs[np.arange(len(labels)), 6 + labels.heading].astype(np.float64)
+    return {
+        "distance": float(squared[:, :5].sum(1).mean()),
+        "angle": float(squared[:, 5].mean()),
+        "type": float(-np.log(np.maximum(chosen, 1e-12)).mean()),
+        "distance_absolute": float(absolute[:, :5].sum(1).mean()),
+        "angle_absolute": float(absolute[:, 5].mean()),
+    }
+
+
+def presence(outputs: NDArray[np.float32], labels: Labels) -> dict[str, dict[str, float | None]]:
+    """Per distance: share of active labels answered as absent, and of absent ones as active."""
+    distances, _ = tf.decode(outputs[:, :6])
+    truth = labels.distances
+    absent = np.isnan(np.column_stack([distances, tf.localise(distances)]))
+    truly_absent = np.isnan(np.column_stack([truth, tf.localise(truth)]))
+    return {
+        name: {
+            "false_inactive": _mean(absent[~truly_absent[:, i], i].astype(np.float64)),
+            "false_active": _mean(1.0 - absent[truly_absent[:, i], i]),
+        }
+        for i, name in enumerate(FEATURES[:-1])
+    }
+
+
+def _constant_errors(mean: dict[str, Any], labels: Labels) -> Numbers:
+    """Errors (N, 7) of always answering the training mean."""
+    distances = [np.nan if d is None else d for d in mean["distances_m"]]
+    offset = mean["to_lane_centre_m"] - tf.localise(labels.distances)
+    angle = mean["angle_rad"] - labels.angle
+    return np.column_stack([np.array(distances) - labels.distances, offset, angle])
+
+
+def _mean(values: Numbers) -> float | None:
+    """The mean of what is there; None where nothing is."""
+    present = values[~np.isnan(values)]
+    return float(present.mean()) if len(present) else None
+
+
+def _ratio(value: float | None, reference: float | None) -> float | None:
+    return value / reference if value is not None and reference else None

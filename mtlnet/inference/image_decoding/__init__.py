@@ -1,0 +1,1 @@
+"""Reading an image of unknown origin: structure first, then limits, then pixels."""

@@ -1,0 +1,76 @@
+"""Which part of a picture shows what the model's camera shows: pinhole geometry, centred.
+
+The model learned metres and radians from one view. A picture that is stretched, or seen through
+another lens, gives wrong ones without a sign of it; so the model's view is cut out of a larger
+one, and a picture that does not hold it is refused.
+"""
+
+from dataclasses import dataclass
+from math import radians, tan
+from typing import Protocol
+
+from mtlnet.inference.image_decoding.errors import Fault, ImageError
+
+TOLERANCE = 0.01  # of width and height: rounding to whole pixels, and small errors of calibration
+
+
+class View(Protocol):
+    """What a model's camera shows: its picture's size, px, and vertical field of view, degrees."""
+
+    @property
+    def width(self) -> int: ...
+
+    @property
+    def height(self) -> int: ...
+
+    @property
+    def fov_y_deg(self) -> float: ...
+
+
+@dataclass(frozen=True, slots=True)
+class Box:
+    """A part of a picture, px."""
+
+    left: int
+    top: int
+    width: int
+    height: int
+
+
+def visible(width: int, height: int, view: View, fov_y_deg: float | None = None) -> Box | None:
+    """The part of a width x height picture that shows `view`; None: all of it does.
+
+    `fov_y_deg` is the vertical field of view of the picture, None: the view's own. A pinhole camera
+    with focal length f px shows 2 f tan(fov/2) px. Raises ImageError where the picture shows less
+    than the view.
+    """
+    ratio = 1.0
+    if fov_y_deg is not None:
+        ratio = tan(radians(view.fov_y_deg) / 2) / tan(radians(fov_y_deg) / 2)
+    rows = height * ratio
+    columns = rows * view.width / view.height
+    if rows > height * (1 + TOLERANCE) or columns > width * (1 + TOLERANCE):
+        raise _too_narrow(width, height, view, fov_y_deg)
+    if rows >= height * (1 - TOLERANCE) and columns >= width * (1 - TOLERANCE):
+        return None
+    kept_columns, kept_rows = min(round(columns), width), min(round(rows), height)
+    if min(kept_columns, kept_rows) < 1:
+        raise _too_narrow(width, height, view, fov_y_deg)
+    return Box((width - kept_columns) // 2, (height - kept_rows) // 2, kept_columns, kept_rows)
+
+
+def _too_narrow(width: int, height: int, view: View, fov_y_deg: float | None) -> ImageError:
+    shape = f"{view.width} x {view.height} ({view.width / view.height:.3f})"
+    if fov_y_deg is None:
+        return ImageError(
+            Fault.ASPECT,
+            f"the image is {width} x {height} px (width / height {width / height:.3f}), the "
+            f"model's camera gives {shape}; a wider image is cropped to it, a narrower one cannot "
+            "be: give the whole view of such a camera, at any size",
+        )
+    return ImageError(
+        Fault.FIELD_OF_VIEW,
+        f"the image is {width} x {height} px with a vertical field of view of {fov_y_deg:g} "
+        f"degrees, the model's camera gives {shape} with {view.fov_y_deg:g}: such an image does "
+        "not hold all that the model must see; use a wider lens",
+    )

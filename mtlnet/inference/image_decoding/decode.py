@@ -1,0 +1,157 @@
+"""Everything between an image's bytes and pixels the model may see: limits, header, strict decode.
+
+Free of torch; `mtlnet predict` and `serve` see the same pixels. The size of an image is read from
+its header before anything is decoded: a PNG of 31 KB can ask for 1.5 GB. A wider picture is cropped
+to the model's view (`mtlnet.inference.image_decoding.crop`). Rotation marks (EXIF) are ignored,
+alpha is dropped, grey becomes RGB, 16 bits become 8.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import simplejpeg
+from numpy.typing import NDArray
+
+from mtlnet.inference.image_decoding import jpeg_structure as jpeg
+from mtlnet.inference.image_decoding import png_structure as png
+from mtlnet.inference.image_decoding.crop import View, visible
+from mtlnet.inference.image_decoding.errors import Fault, ImageError
+from trackfeatures.errors import UserError
+
+MAX_FILE_BYTES = 32 << 20
+MIN_SIDE_PX, MAX_SIDE_PX, MAX_PIXELS = 16, 4096, 8_400_000
+MAX_TRAILING_BYTES = 64  # what some cameras pad with; more is another file behind the picture
+
+
+@dataclass(frozen=True, slots=True)
+class ImageHeader:
+    """What an image says of itself; `png_header` is set for a PNG."""
+
+    width: int
+    height: int
+    png_header: png.PngHeader | None = None
+
+
+def read_image(path: Path, view: View) -> NDArray[np.uint8]:
+    """The JPEG or PNG at `path` as uint8 RGB (view.height, view.width, 3).
+
+    Another size is scaled, a wider picture cropped; a narrower one is refused, for it does not
+    show all of the view. Raises ImageError, or UserError where there is no file to read.
+    """
+    if not path.is_file():
+        raise UserError(f"there is no image file {path}")
+    if path.stat().st_size > MAX_FILE_BYTES:
+        raise UserError(
+            f"{path} has {path.stat().st_size} bytes, at most {MAX_FILE_BYTES} are read; save a "
+            "smaller image"
+        )
+    body = path.read_bytes()
+    try:
+        return decode(body, inspect(body, view), view)
+    except ImageError as error:
+        raise ImageError(error.fault, f"{path}: {error}") from error
+
+
+def inspect(body: bytes, view: View, fov_y_deg: float | None = None) -> ImageHeader:
+    """The header of an image that may be decoded for a model of this view.
+
+    `fov_y_deg`: the image's own vertical field of view, None: the view's. Raises ImageError.
+    """
+    if body.startswith(png.SIGNATURE):
+        found = png.read_header(body)
+        header = ImageHeader(found.width, found.height, found)
+    elif body.startswith(jpeg.SIGNATURE):
+        header = _inspect_jpeg(body)
+    else:
+        seen = f"{len(body)} bytes that begin with {body[:8]!r}" if body else "nothing at all"
+        raise ImageError(Fault.NOT_AN_IMAGE, f"no JPEG or PNG file, but {seen}")
+    check_size(header.width, header.height)
+    visible(header.width, header.height, view, fov_y_deg)
+    return header
+
+
+def _inspect_jpeg(body: bytes) -> ImageHeader:
+    try:
+        # The decoder's own reading of the header: it cannot differ from what it decodes later.
+        height, width, colours, _ = simplejpeg.decode_jpeg_header(body)
+    except ValueError as error:
+        raise _damaged_jpeg(error) from error
+    if colours not in ("Gray", "YCbCr", "RGB"):
+        raise ImageError(Fault.UNSUPPORTED, f"the JPEG's colours are {colours}; save it in RGB")
+    check_trailing(len(body) - jpeg.end(body))
+    return ImageHeader(width, height)
+
+
+def check_trailing(count: int) -> None:
+    """Raise ImageError when `count` bytes behind the end of a picture are too many."""
+    if count > MAX_TRAILING_BYTES:
+        raise ImageError(
+            Fault.TRAILING,
+            f"{count} bytes follow the end of the picture, at most {MAX_TRAILING_BYTES} are "
+            "taken; send the picture alone",
+        )
+
+
+def check_size(width: int, height: int) -> None:
+    """Raise ImageError unless a picture of so many px is taken."""
+    sides = min(width, height) >= MIN_SIDE_PX and max(width, height) <= MAX_SIDE_PX
+    if not sides or width * height > MAX_PIXELS:
+        raise ImageError(
+            Fault.SIZE,
+            f"the image is {width} x {height} px; {MIN_SIDE_PX} to {MAX_SIDE_PX} px a side and at "
+            f"most {MAX_PIXELS / 1e6:.1f} million px are taken: scale it to the model's camera",
+        )
+
+
+def decode(
+    body: bytes, header: ImageHeader, view: View, fov_y_deg: float | None = None
+) -> NDArray[np.uint8]:
+    """The image as uint8 RGB (view.height, view.width, 3), cropped and area-averaged to it.
+
+    `header` and `fov_y_deg` as in `inspect`. Raises ImageError.
+    """
+    image = (
+        _decode_jpeg(body) if header.png_header is None else _decode_png(body, header.png_header)
+    )
+    if image.shape != (header.height, header.width, 3):
+        raise ImageError(
+            Fault.DAMAGED,
+            f"the image decodes to {image.shape[1]} x {image.shape[0]} px, its header says "
+            f"{header.width} x {header.height}; save it anew",
+        )
+    return fit(image, view, fov_y_deg)
+
+
+def fit(image: NDArray[np.uint8], view: View, fov_y_deg: float | None = None) -> NDArray[np.uint8]:
+    """An image (H, W, 3) cropped and scaled to (view.height, view.width, 3). Raises ImageError."""
+    box = visible(image.shape[1], image.shape[0], view, fov_y_deg)
+    if box is not None:
+        image = image[box.top : box.top + box.height, box.left : box.left + box.width]
+    if image.shape[:2] == (view.height, view.width):
+        return np.ascontiguousarray(image)
+    method = cv2.INTER_AREA if image.shape[1] > view.width else cv2.INTER_LINEAR
+    scaled = cv2.resize(image, (view.width, view.height), interpolation=method)
+    return scaled.astype(np.uint8, copy=False)
+
+
+def _decode_jpeg(body: bytes) -> NDArray[np.uint8]:
+    try:
+        image: NDArray[np.uint8] = simplejpeg.decode_jpeg(body, colorspace="RGB", strict=True)
+    except ValueError as error:
+        raise _damaged_jpeg(error) from error
+    return image
+
+
+def _decode_png(body: bytes, header: png.PngHeader) -> NDArray[np.uint8]:
+    checked, end = png.critical_chunks(body, header)
+    check_trailing(len(body) - end)
+    image = cv2.imdecode(np.frombuffer(checked, np.uint8), cv2.IMREAD_COLOR)
+    if image is None:
+        raise ImageError(Fault.DAMAGED, "the PNG cannot be decoded; save it anew")
+    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB).astype(np.uint8, copy=False)
+
+
+def _damaged_jpeg(error: ValueError) -> ImageError:
+    return ImageError(Fault.DAMAGED, f"the JPEG cannot be decoded ({error}); give the whole file")

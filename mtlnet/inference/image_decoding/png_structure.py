@@ -1,0 +1,135 @@
+"""Reading a PNG's structure before anything is decoded: header, checksums, amount of pixel data.
+
+Source: PNG specification, third edition (W3C). Decoders differ in what damage they let pass and in
+what they make of side chunks (rotation, animation, colour profiles); `critical_chunks` takes both
+away from them.
+"""
+
+import struct
+import zlib
+from dataclasses import dataclass
+
+from mtlnet.inference.image_decoding.errors import Fault, ImageError
+
+SIGNATURE = b"\x89PNG\r\n\x1a\n"
+MAX_CHUNKS = 10_000  # 4 MiB in the 8 KiB chunks that encoders write are 512
+CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}  # by colour type
+DEPTHS = {0: (1, 2, 4, 8, 16), 2: (8, 16), 3: (1, 2, 4, 8), 4: (8, 16), 6: (8, 16)}
+# First column and row, then steps, of the seven passes of Adam7.
+PASSES = (
+    (0, 0, 8, 8),
+    (4, 0, 8, 8),
+    (0, 4, 4, 8),
+    (2, 0, 4, 4),
+    (0, 2, 2, 4),
+    (1, 0, 2, 2),
+    (0, 1, 1, 2),
+)
+FILTERS = 5
+
+
+@dataclass(frozen=True, slots=True)
+class PngHeader:
+    """IHDR: the size in px, bits a sample, bits a pixel, and whether it is interlaced."""
+
+    width: int
+    height: int
+    colour_type: int
+    pixel_bits: int
+    interlaced: bool
+
+    def passes(self) -> list[tuple[int, int]]:
+        """(rows, bytes a row without the filter byte) of each pass over the image."""
+        steps = PASSES if self.interlaced else ((0, 0, 1, 1),)
+        sizes = []
+        for column, row, across, down in steps:
+            columns = -(-(self.width - column) // across)
+            rows = -(-(self.height - row) // down)
+            if columns > 0 and rows > 0:
+                sizes.append((rows, -(-columns * self.pixel_bits // 8)))
+        return sizes
+
+
+def read_header(body: bytes) -> PngHeader:
+    """The header of a PNG that starts with SIGNATURE. Raises ImageError."""
+    start = len(SIGNATURE)
+    if len(body) < start + 25 or body[start : start + 8] != b"\x00\x00\x00\x0dIHDR":
+        raise ImageError(Fault.DAMAGED, "the PNG does not begin with IHDR; save it anew")
+    width, height, depth, colour, compression, filtering, interlace = struct.unpack_from(
+        ">IIBBBBB", body, start + 8
+    )
+    if depth not in DEPTHS.get(colour, ()) or compression or filtering or interlace > 1:
+        raise ImageError(
+            Fault.UNSUPPORTED,
+            f"the PNG's header asks for colour type {colour} with {depth} bits, compression "
+            f"{compression}, filter {filtering}, interlace {interlace}, which PNG does not know",
+        )
+    return PngHeader(width, height, colour, depth * CHANNELS[colour], bool(interlace))
+
+
+def critical_chunks(body: bytes, header: PngHeader) -> tuple[bytes, int]:
+    """(the same image with nothing but header, palette and pixels, all checked; where it ends).
+
+    Raises ImageError.
+    """
+    kept: list[bytes | memoryview] = [SIGNATURE]
+    pixels: list[memoryview] = []
+    view = memoryview(body)
+    at = len(SIGNATURE)
+    for _ in range(MAX_CHUNKS):
+        end, kind = _check_chunk(view, at)
+        if kind in (b"IHDR", b"PLTE", b"IDAT", b"IEND"):
+            kept.append(view[at:end])
+            if kind == b"IDAT":
+                pixels.append(view[at + 8 : end - 4])
+        elif not kind[0] & 0x20:  # bit 5 clear: a decoder that does not know it must stop
+            raise ImageError(
+                Fault.UNSUPPORTED, f"the PNG needs the unknown chunk {kind!r}; save it as plain PNG"
+            )
+        if kind == b"IEND":
+            break
+        at = end
+    else:
+        raise ImageError(Fault.UNSUPPORTED, f"the PNG has over {MAX_CHUNKS} chunks; save it anew")
+    _check_pixels(b"".join(pixels), header)
+    return b"".join(kept), end
+
+
+def _check_chunk(view: memoryview, at: int) -> tuple[int, bytes]:
+    """(end, type) of the chunk that begins at byte `at`."""
+    if at + 12 > len(view):
+        raise ImageError(
+            Fault.DAMAGED,
+            f"the PNG ends after {len(view)} bytes, before its end mark; give the whole file",
+        )
+    length = int.from_bytes(view[at : at + 4], "big")
+    end = at + 12 + length
+    if end > len(view):
+        raise ImageError(
+            Fault.DAMAGED,
+            f"the PNG has {len(view)} bytes, a chunk of it reaches to {end}; give the whole file",
+        )
+    if zlib.crc32(view[at + 4 : end - 4]) != int.from_bytes(view[end - 4 : end], "big"):
+        raise ImageError(Fault.DAMAGED, f"the PNG's checksum at byte {at} is wrong; save it anew")
+    return end, bytes(view[at + 4 : at + 8])
+
+
+def _check_pixels(compressed: bytes, header: PngHeader) -> None:
+    expected = sum(rows * (1 + row_bytes) for rows, row_bytes in header.passes())
+    inflater = zlib.decompressobj()
+    try:
+        # Never more than the header promised: the limit on dimensions is then one on memory.
+        raw = inflater.decompress(compressed, expected + 1)
+    except zlib.error as error:
+        raise ImageError(
+            Fault.DAMAGED, f"the PNG's pixels do not inflate ({error}); save it anew"
+        ) from error
+    if len(raw) != expected or not inflater.eof:
+        seen = f"more than {expected}" if len(raw) > expected else f"{len(raw)} of {expected}"
+        raise ImageError(Fault.DAMAGED, f"the PNG holds {seen} bytes of pixels; save it anew")
+    at = 0
+    for rows, row_bytes in header.passes():
+        size = rows * (1 + row_bytes)
+        if max(raw[at : at + size : 1 + row_bytes]) >= FILTERS:
+            raise ImageError(Fault.DAMAGED, "the PNG has a row of an unknown filter; save it anew")
+        at += size

@@ -1,0 +1,144 @@
+"""What each network is made of, layer by layer. Free of torch: commands name networks by it.
+
+`mtl`: the paper's network (section IV-C), with TensorFlow's SAME padding.
+
+`deepdriving`: the network of Chen et al. (DeepDriving, ICCV 2015), which the paper compares with:
+AlexNet with a fourth fully connected layer, trained on one task, the regression of coded numbers.
+Layers, padding and places of the local normalisation are those of the authors' Caffe model.
+Deviations: outputs are our six coded numbers, not their fourteen, and linear, not a sigmoid's; no
+mean image is subtracted; it is trained by our recipes. It knows no class: one third for each.
+
+`mobilenet_v3_small`, `regnet_y_400mf`: small modern backbones of torchvision, from random
+weights, as a yardstick: their pooled features, one layer of 256, the same nine outputs.
+"""
+
+from dataclasses import dataclass
+
+from trackfeatures.errors import UserError
+
+HEIGHT, WIDTH = 210, 280
+
+
+@dataclass(frozen=True)
+class Conv:
+    """Conv(n, k, s) of the paper: n filters of k x k with stride s, ReLU; `pad` None is SAME."""
+
+    filters: int
+    kernel: int
+    stride: int
+    pad: int | None = None
+    groups: int = 1
+
+
+@dataclass(frozen=True)
+class Pool:
+    """MaxPool(k, s): SAME padding as in the paper, or Caffe's, which rounds sizes up."""
+
+    kernel: int = 3
+    stride: int = 2
+    same: bool = True
+
+
+@dataclass(frozen=True)
+class LocalNorm:
+    """AlexNet's local response normalisation over neighbouring channels (Krizhevsky 2012)."""
+
+    size: int = 5
+    alpha: float = 1e-4
+    beta: float = 0.75
+
+
+Layer = Conv | Pool | LocalNorm
+
+
+@dataclass(frozen=True)
+class Architecture:
+    """One network: layers or a torchvision backbone, then shared fully connected layers."""
+
+    name: str
+    features: tuple[Layer, ...]
+    shared: tuple[int, ...]
+    tasks: tuple[str, ...] = ("distance", "angle", "type")
+    backbone: bool = False
+    """The features are those of the torchvision model called `name`."""
+
+    @property
+    def default_alpha(self) -> tuple[float, float, float]:
+        """The paper's MTL 3, or one plain squared error over all numbers for a single task."""
+        return (0.3, 0.2, 0.5) if "type" in self.tasks else (1.0, 1.0, 0.0)
+
+    @property
+    def convolutions(self) -> tuple[str, ...]:
+        """Names of the convolutions, the first of all first; none where a backbone stands."""
+        each = enumerate(self.features)
+        return tuple(f"conv{number}" for number, spec in each if isinstance(spec, Conv))
+
+
+FEATURES: tuple[Conv | Pool, ...] = (
+    Conv(96, 11, 4),
+    Pool(),
+    Conv(256, 5, 2),
+    Pool(),
+    Conv(384, 3, 2),
+    Conv(384, 3, 2),
+    Conv(256, 3, 2),
+    Pool(),
+)
+SHARED = (4096, 1024, 256)
+HEADS = (("distance", 5), ("angle", 1), ("heading", 3))
+ALEXNET: tuple[Layer, ...] = (
+    Conv(96, 11, 4, pad=0),
+    Pool(same=False),
+    LocalNorm(),
+    Conv(256, 5, 1, pad=2, groups=2),
+    Pool(same=False),
+    LocalNorm(),
+    Conv(384, 3, 1, pad=1),
+    Conv(384, 3, 1, pad=1, groups=2),
+    Conv(256, 3, 1, pad=1, groups=2),
+    Pool(same=False),
+)
+MTL = Architecture("mtl", FEATURES, SHARED)
+PLANS = {
+    plan.name: plan
+    for plan in (
+        MTL,
+        Architecture("deepdriving", ALEXNET, (4096, 4096, 256), tasks=("distance", "angle")),
+        Architecture("mobilenet_v3_small", (), (256,), backbone=True),
+        Architecture("regnet_y_400mf", (), (256,), backbone=True),
+    )
+}
+
+
+def find_plan(name: str) -> Architecture:
+    """The network of that name; UserError when there is none."""
+    if name not in PLANS:
+        raise UserError(f"there is no network {name!r}; choose one of {', '.join(PLANS)}")
+    return PLANS[name]
+
+
+def require_learnable(plan: Architecture, alpha: tuple[float, float, float]) -> None:
+    """Raise UserError when `alpha` weighs a task that the network does not have."""
+    if alpha[2] > 0 and "type" not in plan.tasks:
+        raise UserError(
+            f"network {plan.name} has no class, so alpha's third weight must be 0, not "
+            f"{alpha[2]:g}; give for example --alpha 1,1,0"
+        )
+
+
+def same_padding(size: int, kernel: int, stride: int) -> tuple[int, int, int]:
+    """TensorFlow's SAME: output size, zeros before, zeros after; the odd one goes after."""
+    out = -(-size // stride)
+    total = max((out - 1) * stride + kernel - size, 0)
+    return out, total // 2, total - total // 2
+
+
+def output_size(size: int, layer: Layer) -> int:
+    """How many rows (or columns) a layer makes of `size` of them."""
+    if isinstance(layer, LocalNorm):
+        return size
+    if isinstance(layer, Conv) and layer.pad is not None:
+        return (size + 2 * layer.pad - layer.kernel) // layer.stride + 1
+    if isinstance(layer, Pool) and not layer.same:
+        return -(-(size - layer.kernel) // layer.stride) + 1
+    return same_padding(size, layer.kernel, layer.stride)[0]

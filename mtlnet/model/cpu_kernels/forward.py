@@ -1,0 +1,81 @@
+"""The network's forward pass in training on a CPU: the same sums as `Network.forward`, faster.
+
+Three layouts make the difference: `mtlnet.model.cpu_kernels.space_to_depth`,
+`mtlnet.model.cpu_kernels.im2col` and `mtlnet.model.cpu_kernels.norm_pool_relu`. In evaluation, and
+on a GPU, the network computes as written.
+"""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import conv2d, linear, max_pool2d, relu
+
+from mtlnet.model.architecture import FEATURES, SHARED, Conv, Pool, same_padding
+from mtlnet.model.cpu_kernels.im2col import column_convolution
+from mtlnet.model.cpu_kernels.norm_pool_relu import norm_pool_relu, pool_arguments
+from mtlnet.model.cpu_kernels.space_to_depth import block_convolution, to_blocks
+from mtlnet.model.network import Network
+
+MOST_COLUMN_PLACES = 64
+"""Images of at most so many places are convolved by `column_convolution`."""
+
+
+def training_outputs(
+    network: Network, images: Tensor, dtype: torch.dtype, masks: Sequence[Tensor] = ()
+) -> Tensor:
+    """Images (B, 210, 280, 3) uint8 -> (B, 9) float32, computed in `dtype`; see `describe`."""
+    return network.answer(describe(network, images, dtype, masks))
+
+
+def describe(
+    network: Network, images: Tensor, dtype: torch.dtype, masks: Sequence[Tensor] = ()
+) -> Tensor:
+    """The last shared features (B, 256) of images (B, 210, 280, 3) uint8, in `dtype`.
+
+    `masks`: what dropout leaves of each shared layer (B, units), already scaled up; none: all.
+    """
+    x = to_blocks(images, dtype)
+    for number, spec in enumerate(FEATURES):
+        if isinstance(spec, Conv):
+            after = FEATURES[number + 1] if number + 1 < len(FEATURES) else None
+            pool = after if isinstance(after, Pool) else None
+            x = _layer(x, number, spec, pool, network.features.get_submodule(f"conv{number}"))
+    x = x.flatten(1)
+    for number in range(len(SHARED)):
+        layer = network.shared.get_submodule(f"fc{number}.layer")
+        assert isinstance(layer, nn.Linear)
+        x = relu(linear(x, layer.weight.to(dtype), layer.bias.to(dtype)))
+        if masks:
+            x = x * masks[number].to(dtype)
+    return x
+
+
+def _layer(x: Tensor, number: int, spec: Conv, pool: Pool | None, block: nn.Module) -> Tensor:
+    layer, norm = block.get_submodule("layer"), dict(block.named_children()).get("norm")
+    assert isinstance(layer, nn.Conv2d)
+    if norm is None:
+        y = _convolve(x, number, spec, layer.weight, layer.bias)
+        pooled = (
+            y if pool is None else max_pool2d(y, **pool_arguments(y.shape[2], y.shape[3], pool))
+        )
+        return relu(pooled)
+    assert isinstance(norm, nn.BatchNorm2d)
+    sign = torch.where(norm.weight.detach() < 0, -1.0, 1.0)
+    y = _convolve(x, number, spec, layer.weight * sign[:, None, None, None], None)
+    return norm_pool_relu(y, sign, norm, pool)
+
+
+def _convolve(x: Tensor, number: int, spec: Conv, weight: Tensor, bias: Tensor | None) -> Tensor:
+    if number == 0:
+        return block_convolution(x, weight, bias, x.dtype)
+    weight = weight.to(x.dtype)
+    height, width = x.shape[2:]
+    if height * width <= MOST_COLUMN_PLACES:
+        y = column_convolution(x, weight, spec.stride)
+        return y if bias is None else y + bias.to(x.dtype)[:, None, None]
+    (_, top, bottom), (_, left, right) = (
+        same_padding(size, spec.kernel, spec.stride) for size in (height, width)
+    )
+    assert (top, left) == (bottom, right)
+    return conv2d(x, weight, None if bias is None else bias.to(x.dtype), spec.stride, (top, left))

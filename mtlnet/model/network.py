@@ -1,0 +1,252 @@
+"""The multi-task network of the paper (section IV-C), and others in its place:
+`mtlnet.model.architecture`.
+
+Input: uint8 RGB images (B, 210, 280, 3). Output (B, 9): five coded distances and the coded angle
+(linear), and the scores of the classes left, straight, right (before softmax). Recipe `fast`
+trains a rescaled form of it, with batch normalisation after every convolution, and
+heads that answer in standard deviations; `fold` turns that into the paper's network, exactly.
+"""
+
+import copy
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from safetensors.torch import load_file
+from torch import Tensor, nn
+from torch.nn.utils.fusion import fuse_conv_bn_eval
+
+from mtlnet.model.architecture import (
+    HEADS,
+    HEIGHT,
+    MTL,
+    WIDTH,
+    Architecture,
+    Conv,
+    LocalNorm,
+    Pool,
+    find_plan,
+    output_size,
+    same_padding,
+)
+
+__all__ = [
+    "HEIGHT",
+    "WIDTH",
+    "Network",
+    "answer_images",
+    "describe_images",
+    "fold",
+    "initialise",
+    "load_network",
+]
+
+
+class Network(nn.Module):
+    """The network; with `batch_norm` and other `target_*`, the form that recipe `fast` trains."""
+
+    target_mean: Tensor
+    target_std: Tensor
+
+    def __init__(
+        self, *, batch_norm: bool = False, dropout: float = 0.0, plan: Architecture = MTL
+    ) -> None:
+        super().__init__()
+        self.plan = plan
+        self.features, size = build_features(plan, batch_norm=batch_norm)
+        self.shared = nn.Sequential()
+        for number, units in enumerate(plan.shared):
+            # Not normalised: what neighbours in a batch add to an image is noise to a distance.
+            self.shared.add_module(f"fc{number}", block(nn.Linear(size, units), None, dropout))
+            size = units
+        self.heads = nn.ModuleDict({name: nn.Linear(size, units) for name, units in HEADS})
+        # Heads answer in these units; (0, 1), the paper's, unless recipe `fast` sets others.
+        self.register_buffer("target_mean", torch.zeros(6), persistent=batch_norm)
+        self.register_buffer("target_std", torch.ones(6), persistent=batch_norm)
+
+    def forward(self, images: Tensor) -> Tensor:
+        """Images (B, 210, 280, 3), uint8 or already normalised float -> (B, 9) float32."""
+        return self.answer(self.describe(images))
+
+    def describe(self, images: Tensor) -> Tensor:
+        """The last shared features (B, 256) of images, from which the heads answer."""
+        x = (normalise(images) if images.dtype == torch.uint8 else images).permute(0, 3, 1, 2)
+        described: Tensor = self.shared(self.features(x).flatten(1))
+        return described
+
+    def answer(self, x: Tensor) -> Tensor:
+        """The outputs (B, 9) for last shared features (B, 256)."""
+        # The heads are small: in float32 also under autocast, for coded values near each other.
+        with torch.autocast(x.device.type, enabled=False):
+            x = x.float()
+            coded = torch.cat([self.heads["distance"](x), self.heads["angle"](x)], 1)
+            return torch.cat(
+                [coded * self.target_std + self.target_mean, self.heads["heading"](x)], 1
+            )
+
+
+def normalise(images: Tensor) -> Tensor:
+    """uint8 colours -> float32 in [-1, 1]; the exported graph does the same."""
+    return images.float() * (1 / 127.5) - 1.0
+
+
+def initialise(network: Network, seed: int) -> None:
+    """He's normal initialisation for layers before a ReLU, small heads; same seed, same weights."""
+    generator = torch.Generator().manual_seed(seed)
+    for name, module in network.named_modules():
+        if isinstance(module, nn.Conv2d | nn.Linear):
+            gain = 0.01 if name.startswith("heads") else 2.0
+            if name == "heads.heading" and "type" not in network.plan.tasks:
+                gain = 0.0  # never trained: the same probability for each class
+            fan_in = module.weight[0].numel()
+            with torch.no_grad():
+                module.weight.normal_(0.0, (gain / fan_in) ** 0.5, generator=generator)
+                if module.bias is not None:
+                    module.bias.zero_()
+
+
+def fold(network: Network) -> Network:
+    """The plain network that computes what `network` computes in evaluation mode.
+
+    For `mtl` that is the paper's. Folded in double precision.
+    """
+    double = copy.deepcopy(network).cpu().double()
+    fold_norms(double)
+    for name, rows in (("distance", slice(0, 5)), ("angle", slice(5, 6))):
+        std = double.target_std[rows]
+        with torch.no_grad():
+            double.get_parameter(f"heads.{name}.weight").mul_(std[:, None])
+            bias = double.get_parameter(f"heads.{name}.bias")
+            bias.mul_(std).add_(double.target_mean[rows])
+    folded = Network(plan=network.plan)
+    state = double.state_dict()
+    folded.load_state_dict({name: state[name].float() for name in folded.state_dict()})
+    return folded.eval()
+
+
+def load_network(path: Path, name: str = MTL.name) -> Network:
+    """The network called `name` with the weights of a `model.safetensors`."""
+    network = Network(plan=find_plan(name))
+    network.load_state_dict(load_file(path))
+    return network.eval()
+
+
+def answer_images(network: Network, images: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """Images (B, 210, 280, 3) -> (B, 9): coded distances and angle, class probabilities."""
+    return describe_images(network, images)[1]
+
+
+def describe_images(
+    network: Network, images: NDArray[np.uint8]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """The last shared features (B, 256) of images (B, 210, 280, 3), and the answers (B, 9)."""
+    device = next(network.parameters()).device
+    network.eval()
+    with torch.inference_mode():
+        x = network.describe(torch.from_numpy(images).to(device)).float()
+        outputs = network.answer(x)
+        outputs[:, 6:] = torch.softmax(outputs[:, 6:], 1)
+    return x.cpu().numpy(), outputs.cpu().numpy()
+
+
+# The layers of a plan as torch modules, and batch normalisation folded into convolutions.
+
+
+NORM_EPS = 1e-5
+NORM_MOMENTUM = 0.1
+
+
+class SamePad(nn.Module):
+    """Zeros around an image, as SAME padding of the next layer asks."""
+
+    def __init__(self, height: int, width: int, layer: Conv | Pool) -> None:
+        super().__init__()
+        self.out_height, top, bottom = same_padding(height, layer.kernel, layer.stride)
+        self.out_width, left, right = same_padding(width, layer.kernel, layer.stride)
+        self.pads = (left, right, top, bottom)
+
+    def forward(self, x: Tensor) -> Tensor:
+        # A maximum of values after ReLU is not changed by zeros, so pools are padded with them too.
+        return nn.functional.pad(x, self.pads) if any(self.pads) else x
+
+
+def block(layer: nn.Module, norm: nn.Module | None, dropout: float = 0.0) -> nn.Sequential:
+    """layer - [batch normalisation] - ReLU - [dropout]."""
+    parts: list[tuple[str, nn.Module]] = [("layer", layer)]
+    if norm is not None:
+        parts.append(("norm", norm))
+    parts.append(("relu", nn.ReLU()))
+    if dropout:
+        parts.append(("dropout", nn.Dropout(dropout)))
+    sequence = nn.Sequential()
+    for name, part in parts:
+        sequence.add_module(name, part)
+    return sequence
+
+
+def build_features(plan: Architecture, *, batch_norm: bool) -> tuple[nn.Module, int]:
+    """The part before the fully connected layers, (B, 3, H, W) -> (B, ...), and its size."""
+    if plan.backbone:
+        return build_backbone(plan.name, batch_norm=batch_norm)
+    features = nn.Sequential()
+    channels, height, width = 3, HEIGHT, WIDTH
+    for number, spec in enumerate(plan.features):
+        if isinstance(spec, LocalNorm):
+            norm = nn.LocalResponseNorm(spec.size, spec.alpha, spec.beta)
+            features.add_module(f"norm{number}", norm)
+            continue
+        if spec.same if isinstance(spec, Pool) else spec.pad is None:
+            features.add_module(f"pad{number}", SamePad(height, width, spec))
+        height, width = output_size(height, spec), output_size(width, spec)
+        if isinstance(spec, Pool):
+            pool = nn.MaxPool2d(spec.kernel, spec.stride, ceil_mode=not spec.same)
+            features.add_module(f"pool{number}", pool)
+            continue
+        features.add_module(f"conv{number}", _convolution(channels, spec, batch_norm))
+        channels = spec.filters
+    return features, channels * height * width
+
+
+def _convolution(channels: int, spec: Conv, batch_norm: bool) -> nn.Sequential:
+    conv = nn.Conv2d(
+        channels,
+        spec.filters,
+        spec.kernel,
+        spec.stride,
+        padding=spec.pad or 0,
+        groups=spec.groups,
+        bias=not batch_norm,
+    )
+    return block(conv, nn.BatchNorm2d(spec.filters, eps=NORM_EPS) if batch_norm else None)
+
+
+def build_backbone(name: str, *, batch_norm: bool) -> tuple[nn.Module, int]:
+    """A torchvision model up to its pooled features, random weights, and their number.
+
+    Without `batch_norm`: the form it takes once its normalisation is folded away.
+    """
+    from torchvision.models import get_model
+
+    model: nn.Module = get_model(name, weights=None)
+    last = "fc" if hasattr(model, "fc") else "classifier"
+    classifier = next(m for m in getattr(model, last).modules() if isinstance(m, nn.Linear))
+    setattr(model, last, nn.Identity())
+    for module in model.modules():
+        if isinstance(module, nn.BatchNorm2d):
+            # torchvision's 0.01 is for runs of 100,000 steps: after 500 the means would be stale.
+            module.momentum = NORM_MOMENTUM
+    if not batch_norm:
+        fold_norms(model)
+    return model, int(classifier.in_features)
+
+
+def fold_norms(network: nn.Module) -> None:
+    """Fold every batch normalisation into the convolution before it, in evaluation mode."""
+    network.eval()
+    for sequence in [m for m in network.modules() if isinstance(m, nn.Sequential)]:
+        for (first, conv), (second, norm) in pairwise(list(sequence.named_children())):
+            if isinstance(conv, nn.Conv2d) and isinstance(norm, nn.BatchNorm2d):
+                setattr(sequence, first, fuse_conv_bn_eval(conv, norm))
+                setattr(sequence, second, nn.Identity())

@@ -1,0 +1,113 @@
+"""What a training run was asked to do: kept in its `config.json`, and obeyed on `--resume`."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import trackfeatures as tf
+from mtlnet.inference.model_card import ModelError
+from mtlnet.model.architecture import find_plan, require_learnable
+from mtlnet.training.loss import Alpha
+from mtlnet.training.recipes import Recipe, find_recipe
+from mtlnet.training.task_weighting import find_balance
+from runtime.files import atomic_write
+from trackfeatures.errors import UserError
+
+CONFIG = "config.json"
+MAX_THREADS = 1024
+# What may change when a run goes on; all else would make it another run.
+FLEXIBLE = ("iterations", "minutes", "device", "threads", "data")
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """One training run."""
+
+    data: Path
+    out: Path
+    network: str = "mtl"
+    """A name of `mtlnet.model.architecture.PLANS`."""
+    alpha: Alpha = (0.3, 0.2, 0.5)
+    balance: str = "fixed"
+    """A name of `mtlnet.training.task_weighting.BALANCES`; unless fixed, alpha only says what is
+    learned."""
+    recipe: str = "fast"
+    iterations: int | None = None
+    """Steps; None: the recipe's, or as many as fit into `minutes`."""
+    minutes: float | None = None
+    """Time for the training itself; the schedule follows the clock."""
+    init: str | None = None
+    """The run whose model training starts from."""
+    seed: int = 0
+    batch: int = 0
+    """Images a step; 0: the recipe's."""
+    device: str = "auto"
+    threads: int = 0
+    """CPU threads; 0: one a core."""
+    skip_undecodable: bool = False
+    """Leave out the frames whose image cannot be decoded; they are named in the model's card."""
+
+    def __post_init__(self) -> None:
+        require_learnable(find_plan(self.network), self.alpha)
+        find_balance(self.balance)
+        if self.batch == 0:
+            object.__setattr__(self, "batch", find_recipe(self.recipe).batch)
+        if self.init is not None and find_recipe(self.recipe).batch_norm:
+            raise UserError(f"recipe {self.recipe} starts anew; with --init give --recipe tune")
+        if self.iterations is not None and self.iterations < 1:
+            raise UserError(f"--iterations is {self.iterations}; give at least 1")
+        if self.minutes is not None and not self.minutes > 0:
+            raise UserError(f"--minutes is {self.minutes}; give more than 0")
+        if self.batch < 2:
+            raise UserError(f"--batch is {self.batch}; batch normalisation needs at least 2")
+        if self.seed < 0:
+            raise UserError(f"--seed is {self.seed}; give 0 or more")
+        if not 0 <= self.threads <= MAX_THREADS:
+            raise UserError(
+                f"--threads is {self.threads}; give 0 (one a core) or at most {MAX_THREADS}"
+            )
+
+
+def write_config(config: TrainConfig, recipe: Recipe, data: Mapping[str, Any]) -> None:
+    """Write `config.json` of a new run."""
+    content = {
+        "definitions": tf.VERSION,
+        "config": {**asdict(config), "data": str(config.data), "out": str(config.out)},
+        "recipe": asdict(recipe),
+        "data": dict(data),
+    }
+    text = json.dumps(content, indent=1) + "\n"
+    atomic_write(config.out / CONFIG, text.encode(), fsync=True)
+
+
+def read_config(run: Path) -> tuple[TrainConfig, dict[str, Any]]:
+    """The configuration of a run, and the description of its data."""
+    path = run / CONFIG
+    if not path.is_file():
+        raise ModelError(f"{run} is no training run ({CONFIG} is missing); nothing to resume")
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        tf.require_version(content["definitions"], f"the run in {run}")
+        values = content["config"]
+        values.update(data=Path(values["data"]), out=run, alpha=tuple(values["alpha"]))
+        return TrainConfig(**values), content["data"]
+    except (ValueError, KeyError, TypeError) as error:
+        raise ModelError(f"{path} is damaged ({error!r}); start a new run") from error
+
+
+def resume_config(run: Path, given: Mapping[str, Any]) -> tuple[TrainConfig, dict[str, Any]]:
+    """The stored configuration with what was `given` on the command line to go on with.
+
+    Raises UserError when something is given that would make it another run.
+    """
+    stored, data = read_config(run)
+    for name, value in given.items():
+        kept = getattr(stored, name)
+        if name not in FLEXIBLE and value != kept:
+            raise UserError(
+                f"{run} was started with {name} {kept}, now {value} is asked for; leave it out to "
+                "resume, or start a new run with another --out"
+            )
+    return replace(stored, **{k: v for k, v in given.items() if k in FLEXIBLE}), data

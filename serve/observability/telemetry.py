@@ -1,0 +1,71 @@
+"""Traces by OpenTelemetry (the extra `telemetry`), switched on by its own environment variables.
+
+On where $OTEL_TRACES_EXPORTER (`otlp`, `console`; `none`: off) or $OTEL_EXPORTER_OTLP_ENDPOINT, or
+the latter's variant for traces, is set and $OTEL_SDK_DISABLED is not `true`. Service name,
+resource, sampler, propagators and batches follow their standard variables. What is traced is in
+`serve.observability.tracing`; while this is off neither that nor an exporter is loaded.
+"""
+
+import os
+from collections.abc import Mapping
+from importlib.metadata import entry_points, version
+from typing import TYPE_CHECKING, Any
+
+from trackfeatures.errors import UserError
+
+if TYPE_CHECKING:
+    from opentelemetry.trace import Tracer
+
+EXPORTER = "OTEL_TRACES_EXPORTER"
+ENDPOINTS = ("OTEL_EXPORTER_OTLP_ENDPOINT", "OTEL_EXPORTER_OTLP_TRACES_ENDPOINT")
+PROTOCOLS = ("OTEL_EXPORTER_OTLP_TRACES_PROTOCOL", "OTEL_EXPORTER_OTLP_PROTOCOL")
+GROUP = "opentelemetry_traces_exporter"  # where packages of OpenTelemetry name their exporters
+BY_PROTOCOL = {"http/protobuf": "otlp_proto_http", "grpc": "otlp_proto_grpc"}
+INSTALL = "pip install 'driverview[telemetry]'"
+
+
+def exporter_name(environment: Mapping[str, str] = os.environ) -> str | None:
+    """The exporter that the environment asks for, as its entry point is called; None: no traces.
+
+    Raises UserError when the packages that it needs are not installed.
+    """
+    found = environment.get(EXPORTER, "").strip().lower()
+    asked = found or any(environment.get(name) for name in ENDPOINTS)
+    if not asked or found == "none" or environment.get("OTEL_SDK_DISABLED", "").lower() == "true":
+        return None
+    if found in ("", "otlp"):
+        protocol = next((environment[name] for name in PROTOCOLS if environment.get(name)), None)
+        found = BY_PROTOCOL.get(protocol or "http/protobuf", str(protocol))
+    known = sorted(entry.name for entry in entry_points(group=GROUP))
+    if found not in known:
+        raise UserError(
+            f"there is no exporter of traces {found!r}, but {', '.join(known) or 'none'}: "
+            f"{INSTALL}, or set {EXPORTER} to another or to none"
+        )
+    return found
+
+
+def tracer() -> "Tracer | None":
+    """What makes the spans of this process, exported as the environment says; None: off."""
+    name = exporter_name()
+    if name is None:
+        return None
+    from opentelemetry.sdk.resources import Resource
+    from opentelemetry.sdk.trace import TracerProvider
+    from opentelemetry.sdk.trace.export import BatchSpanProcessor
+
+    (entry,) = entry_points(group=GROUP, name=name)
+    provider = TracerProvider(resource=Resource.create(_about()))
+    provider.add_span_processor(BatchSpanProcessor(entry.load()()))
+    return provider.get_tracer("serve", version("driverview"))  # it ends with the process
+
+
+def _about() -> dict[str, Any]:
+    about: dict[str, Any] = {
+        "service.version": version("driverview"),
+        "service.instance.id": str(os.getpid()),
+    }
+    named = "service.name=" in os.environ.get("OTEL_RESOURCE_ATTRIBUTES", "")
+    if not named and not os.environ.get("OTEL_SERVICE_NAME"):
+        about["service.name"] = "driverview"
+    return about

@@ -1,0 +1,294 @@
+"""How bridges are built: decks, piers, railings, arches and gantries, in the bridge's own frame.
+
+x along the road, y to the left, z up from the road's centre, metres. Each style is told where the
+wall line is, the height that must stay free, and how deep the ground lies.
+"""
+
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from simulator.camera.scene.solids import BOARD, EARTH, MASONRY, PLAIN, Point, box, face
+
+FloatArray = NDArray[np.float64]
+
+CONCRETE: tuple[Point, ...] = ((0.36, 0.35, 0.33), (0.42, 0.41, 0.38), (0.30, 0.30, 0.30))
+STEEL: tuple[Point, ...] = (
+    (0.06, 0.13, 0.10), (0.20, 0.09, 0.06), (0.11, 0.16, 0.22), (0.26, 0.27, 0.28),
+    (0.42, 0.41, 0.38),
+)  # fmt: skip
+STONE: tuple[Point, ...] = ((0.27, 0.24, 0.20), (0.30, 0.29, 0.27), (0.24, 0.11, 0.07))
+WOOD: Point = (0.17, 0.11, 0.06)
+ADVERTS: tuple[Point, ...] = (
+    (0.48, 0.03, 0.03), (0.02, 0.09, 0.36), (0.62, 0.46, 0.03), (0.60, 0.60, 0.58),
+    (0.02, 0.02, 0.02),
+)  # fmt: skip
+ROAD_SIGNS: tuple[Point, ...] = ((0.02, 0.10, 0.34), (0.02, 0.17, 0.08))
+NO_COLOUR: Point = (0.0, 0.0, 0.0)
+SPAN_BEYOND_M = {"overpass": 13.0, "railway": 5.0, "footbridge": 3.0, "wooden": 3.0,
+                 "adverts": 3.0, "arch": 5.0, "gantry": 1.4}  # fmt: skip
+"""How far a bridge of each style reaches beyond the wall line."""
+
+
+class Works:
+    """Gathers the triangles of a bridge, and the boxes that throw its shadow."""
+
+    def __init__(self) -> None:
+        self._parts: list[FloatArray] = []
+        self._boxes: list[FloatArray] = []
+
+    def box(self, size: Point, at: Point, colour: Point, material: float = PLAIN) -> None:
+        """A closed box of `size` that stands on `at`, the middle of its floor, and its shadow."""
+        self.thin(size, at, colour, material)
+        self.shadow(size, at)
+
+    def thin(self, size: Point, at: Point, colour: Point, material: float = PLAIN) -> None:
+        """The same of something too thin to throw a shadow that would be seen."""
+        self._parts.append(box(size, at, colour, material, floor=True))
+
+    def shadow(self, size: Point, at: Point) -> None:
+        """Let a box throw a shadow without drawing it."""
+        half = np.array([size[0] / 2, size[1] / 2, 0.0])
+        self._boxes.append(np.array([at - half, at + half + np.array([0.0, 0.0, size[2]])]))
+
+    def face(self, corners: list[FloatArray], colour: Point, material: float) -> None:
+        """A face of four corners, counter-clockwise from outside; textured by its own size."""
+        right = corners[1] - corners[0]
+        along = right / max(float(np.linalg.norm(right)), 1e-9)
+        uv = []
+        for corner in corners:
+            off = corner - corners[0]
+            u = float(off @ along)
+            uv.append((u, float(np.linalg.norm(off - u * along))))
+        self._parts.append(face(corners, uv, colour, material))
+
+    def board(self, size: tuple[float, float], at: Point, colour: Point, facing: float) -> None:
+        """A lettered board (width, height) across the road, its lower edge at `at`; `facing` 1 for
+        traffic that drives along +x, -1 for the other way."""
+        wide, high = size
+        left, up = np.array([0.0, facing * wide / 2, 0.0]), np.array([0.0, 0.0, high])
+        front = np.array(at) - np.array([0.045 * facing, 0.0, 0.0])
+        corners = [front + left, front - left, front - left + up, front + left + up]
+        self.thin((0.08, wide, high), at, (0.2, 0.2, 0.2))
+        self.shadow((0.25, wide, high), at)
+        letters = [(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)]
+        self._parts.append(face(corners, letters, colour, BOARD))
+
+    def triangles(self) -> FloatArray:
+        """All triangles, (n, 12)."""
+        return np.concatenate(self._parts)
+
+    def boxes(self) -> FloatArray:
+        """Least and greatest corners of what throws a shadow, (m, 2, 3)."""
+        return np.array(self._boxes).reshape(-1, 2, 3)
+
+
+class Style(Protocol):
+    """Builds one bridge into `works`."""
+
+    def __call__(
+        self, works: Works, rng: np.random.Generator, *, wall: float, under: float, ground: float
+    ) -> None:
+        """`wall` is the wall line's offset, `under` the least height of the deck's underside,
+        `ground` the lowest land at its ends, all from the road's centre."""
+
+
+def half_span(style: str, wall: float) -> float:
+    """Half of a bridge's length across the road, without its earthworks."""
+    return wall + SPAN_BEYOND_M[style]
+
+
+def _pick(rng: np.random.Generator, colours: tuple[Point, ...]) -> Point:
+    return colours[int(rng.integers(len(colours)))]
+
+
+def _railing(works: Works, x: float, reach: float, foot: float, colour: Point, step: float) -> None:
+    """Posts and two bars across the road at `x`."""
+    for height in (0.5, 1.02):
+        works.thin((0.06, 2 * reach, 0.06), (x, 0.0, foot + height), colour)
+    for y in np.arange(-reach, reach + 0.01, step):
+        works.thin((0.06, 0.06, 1.05), (x, float(y), foot), colour)
+
+
+def _mounds(works: Works, width: float, reach: float, top: float, ground: float) -> None:
+    """Banks of earth that carry the way up to both ends of a deck."""
+    low, spread = ground - 1.0, 1.4 * (top - ground)
+    for side in (-1.0, 1.0):
+        crest = _ring(width / 2 + 0.3, side * (reach - 0.6), side * (reach + 5.0), top)
+        foot = _ring(
+            width / 2 + spread,
+            side * (reach - 0.6 - 0.25 * spread),
+            side * (reach + 5 + spread),
+            low,
+        )
+        for k in range(4):
+            pair = [foot[k], foot[(k + 1) % 4], crest[(k + 1) % 4], crest[k]]
+            works.face(pair if side > 0 else pair[::-1], NO_COLOUR, EARTH)
+        works.face(crest if side > 0 else crest[::-1], NO_COLOUR, EARTH)
+
+
+def _ring(x: float, y0: float, y1: float, z: float) -> list[FloatArray]:
+    return [np.array([u, v, z]) for u, v in ((-x, y0), (x, y0), (x, y1), (-x, y1))]
+
+
+def overpass(
+    works: Works, rng: np.random.Generator, *, wall: float, under: float, ground: float
+) -> None:
+    """A road of concrete on rows of columns."""
+    width, depth = float(rng.uniform(7.0, 9.0)), 1.1
+    reach, colour = half_span("overpass", wall), _pick(rng, CONCRETE)
+    works.box((width, 2 * reach, depth), (0.0, 0.0, under), colour, MASONRY)
+    for x in (-width / 2, width / 2):
+        works.box((0.3, 2 * reach, 0.75), (x, 0.0, under + depth - 0.2), colour, MASONRY)
+        _railing(works, x, reach, under + depth + 0.1, (0.3, 0.3, 0.3), 2.5)
+    for y in (-wall - 1.0, wall + 1.0):
+        works.box((width * 0.86, 0.9, 0.7), (0.0, y, under - 0.7), colour, MASONRY)
+        for x in np.linspace(-0.34, 0.34, 3) * width:
+            works.box(
+                (0.7, 0.7, under - ground + 0.6), (float(x), y, ground - 1.0), colour, MASONRY
+            )
+    _mounds(works, width, reach, under + depth, ground)
+
+
+def railway(
+    works: Works, rng: np.random.Generator, *, wall: float, under: float, ground: float
+) -> None:
+    """Steel plate girders on abutments of masonry."""
+    width, reach = 5.0, half_span("railway", wall)
+    steel, stone = _pick(rng, STEEL), _pick(rng, STONE)
+    works.box((width, 2 * reach, 0.5), (0.0, 0.0, under), steel)
+    for x in (-width / 2, width / 2):
+        works.box((0.25, 2 * reach, 1.7), (x, 0.0, under), steel)
+        for y in np.arange(-reach, reach, 1.8):
+            works.thin((0.5, 0.12, 1.7), (x, float(y), under), steel)
+    for side in (-1.0, 1.0):
+        height = under - ground + 2.0
+        at = (0.0, side * (wall + 3.0), ground - 1.0)
+        works.box((width + 1.6, 4.0, height), (at[0], at[1], at[2]), stone, MASONRY)
+    _mounds(works, width, reach, under + 0.9, ground)
+
+
+def footbridge(
+    works: Works, rng: np.random.Generator, *, wall: float, under: float, ground: float
+) -> None:
+    """A narrow steel deck with stairs down both sides."""
+    _walkway(works, "footbridge", _pick(rng, STEEL), wall, under, ground)
+
+
+def wooden(
+    works: Works, rng: np.random.Generator, *, wall: float, under: float, ground: float
+) -> None:
+    """The same of timber."""
+    _walkway(works, "wooden", WOOD, wall, under, ground)
+
+
+def adverts(
+    works: Works, rng: np.random.Generator, *, wall: float, under: float, ground: float
+) -> None:
+    """A footbridge behind a board along its whole length, as race tracks have."""
+    _walkway(works, "adverts", (0.30, 0.30, 0.31), wall, under, ground)
+    reach, colour = half_span("adverts", wall), _pick(rng, ADVERTS)
+    for x, facing in ((-1.42, 1.0), (1.42, -1.0)):
+        count = max(2, round(2 * reach / 6.0))
+        for k in range(count):
+            y = (k + 0.5) * 2 * reach / count - reach
+            works.board((2 * reach / count, 1.7), (x, y, under - 0.05), colour, facing)
+
+
+def _walkway(
+    works: Works, style: str, colour: Point, wall: float, under: float, ground: float
+) -> None:
+    width, reach = 2.6, half_span(style, wall)
+    works.box((width, 2 * reach, 0.38), (0.0, 0.0, under), colour)
+    for x in (-width / 2, width / 2):
+        works.box((0.12, 2 * reach, 0.6), (x, 0.0, under - 0.1), colour)
+        _railing(works, x, reach, under + 0.38, colour, 2.0)
+    for side in (-1.0, 1.0):
+        for x in (-0.9, 0.9):
+            at = (x, side * (wall + 1.0), ground - 1.0)
+            works.box((0.34, 0.34, under - ground + 1.0), at, colour)
+        _stairs(works, side * (reach - 1.0), under + 0.38, ground, colour)
+
+
+def _stairs(works: Works, y: float, top: float, ground: float, colour: Point) -> None:
+    """A flight down along the road, from the deck's edge."""
+    steps = max(4, round((top - ground) / 0.5))
+    for k in range(steps):
+        z = top - (k + 1) * (top - ground) / steps
+        works.thin((0.72, 1.7, 0.2), (1.6 + 0.7 * k, y, z), colour)
+    run = 1.3 + 0.7 * steps
+    for edge in (y - 0.85, y + 0.85):
+        corners = [
+            np.array([1.2, edge, top - 0.5]), np.array([1.2 + run, edge, ground - 0.5]),
+            np.array([1.2 + run, edge, ground + 0.9]), np.array([1.2, edge, top + 0.9]),
+        ]  # fmt: skip
+        works.face(corners, colour, PLAIN)
+
+
+def gantry(
+    works: Works, rng: np.random.Generator, *, wall: float, under: float, ground: float
+) -> None:
+    """Two posts and a beam with direction signs over the lanes."""
+    steel, reach = (0.34, 0.35, 0.36), wall + 0.8
+    for y in (-reach, reach):
+        works.box((0.35, 0.35, under - ground + 2.6), (0.0, y, ground - 1.0), steel)
+    for z in (under + 0.35, under + 1.35):
+        works.box((0.22, 2 * reach, 0.22), (0.0, 0.0, z), steel)
+    for y in np.arange(-reach, reach, 1.5):
+        works.thin((0.1, 0.1, 1.0), (0.0, float(y), under + 0.4), steel)
+    colour, count = _pick(rng, ROAD_SIGNS), int(rng.integers(2, 4))
+    for k in range(count):
+        y = (k + 0.5) * 1.3 * wall / count - 0.65 * wall
+        works.board((1.05 * wall / count, 2.2), (-0.25, y, under), colour, 1.0)
+
+
+def arch(
+    works: Works, rng: np.random.Generator, *, wall: float, under: float, ground: float
+) -> None:
+    """A segmental arch of masonry under a level parapet."""
+    width, reach, parts = float(rng.uniform(4.0, 6.0)), half_span("arch", wall), 20
+    colour = _pick(rng, STONE)
+    spring = wall + 0.6
+    y = np.linspace(-spring, spring, parts + 1)
+    rise = min(0.45 * under, 2.6)
+    crown = under + rise * 0.45
+    z = crown - rise * (y / spring) ** 2
+    top = crown + 1.6
+    for a, b, za, zb in zip(y[:-1], y[1:], z[:-1], z[1:], strict=True):
+        _arch_part(works, width, (a, b), (za, zb), top, colour)
+    for side in (-1.0, 1.0):
+        height = top - ground + 1.0
+        at = (0.0, side * (spring + (reach - spring) / 2), ground - 1.0)
+        works.box((width, reach - spring, height), at, colour, MASONRY)
+    coping = (0.8 * colour[0], 0.8 * colour[1], 0.8 * colour[2])
+    works.box((width + 0.35, 2 * reach, 0.25), (0.0, 0.0, top), coping, MASONRY)
+    _mounds(works, width, reach, top - 0.9, ground)
+
+
+def _arch_part(
+    works: Works,
+    width: float,
+    y: tuple[float, float],
+    z: tuple[float, float],
+    top: float,
+    colour: Point,
+) -> None:
+    for x, turn in ((-width / 2, -1), (width / 2, 1)):
+        near, far = (y[0], z[0]), (y[1], z[1])
+        if turn < 0:
+            near, far = far, near
+        corners = [np.array([x, *near]), np.array([x, *far])]
+        corners += [np.array([x, far[0], top]), np.array([x, near[0], top])]
+        works.face(corners, colour, MASONRY)
+    x = width / 2
+    vault = [(-x, y[0], z[0]), (-x, y[1], z[1]), (x, y[1], z[1]), (x, y[0], z[0])]
+    works.face([np.array(corner) for corner in vault], colour, MASONRY)
+    low = min(z)
+    works.shadow((width, y[1] - y[0], top - low), (0.0, (y[0] + y[1]) / 2, low))
+
+
+STYLES: dict[str, Style] = {
+    "overpass": overpass, "railway": railway, "footbridge": footbridge, "wooden": wooden,
+    "adverts": adverts, "gantry": gantry, "arch": arch,
+}  # fmt: skip

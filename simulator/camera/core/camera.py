@@ -1,0 +1,288 @@
+"""The camera: pictures of a road and the cars on it, from a pose. World frame, metres, radians."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from simulator.camera.core import optics
+from simulator.camera.core.context import FRAME_BINDING, Graphics, graphics
+from simulator.camera.core.optics import DRIVER_SEAT, Mount
+from simulator.camera.core.render_modes import CLASS, COLOUR, DEPTH, ViewRequest
+from simulator.camera.scene.cars import cars_of
+from simulator.camera.scene.light import Light
+from simulator.camera.scene.precipitation import Fall
+from simulator.camera.scene.scene import Scene, Seen
+from simulator.camera.scene.sky import Sky
+from simulator.camera.scene.terrain import Survey
+from simulator.track.road import Road
+from simulator.vehicle.car import CarParameters
+from trackfeatures.errors import UserError
+
+FloatArray = NDArray[np.float64]
+Picture = NDArray[Any]
+
+MAX_SIZE = 4096
+_OWN_PAINT = 0
+
+
+def check_size(width: int, height: int) -> None:
+    """Raises UserError unless pictures of this size can be drawn."""
+    if not (8 <= width <= MAX_SIZE and 8 <= height <= MAX_SIZE):
+        raise UserError(
+            f"picture size {width} x {height}; each side must be 8 to {MAX_SIZE} pixels"
+        )
+
+
+@dataclass(frozen=True)
+class _Setting:
+    """One scenery under one light, in the graphics memory; `frame` is its block of uniforms."""
+
+    light: Light
+    scene: Scene
+    sky: Sky
+    fall: Fall | None
+    frame: NDArray[np.float32]
+    first_paint: int
+
+    def release(self) -> None:
+        """Free the graphics memory."""
+        for part in (self.scene, self.sky, self.fall):
+            if part is not None:
+                part.release()
+
+
+@dataclass(frozen=True)
+class _Shot:
+    """One aimed view: the eye, what of the scene it may see, and the cars, nearest first."""
+
+    eye: optics.Eye
+    seen: Seen
+    cars: FloatArray
+    paints: list[int]
+
+
+class Camera:
+    """Draws one scene: `road` with the scenery of `seed` under `light`.
+
+    It keeps the last `scenes` it showed ready. Cameras of a process share one OpenGL context (see
+    `context`); use them from one thread. The same road, seed, light, pose and cars give the same
+    bytes on the same renderer.
+    Raises UserError for a picture size out of range, NoRendererError without EGL.
+    """
+
+    def __init__(
+        self,
+        road: Road,
+        *,
+        seed: int,
+        light: Light,
+        mount: Mount = DRIVER_SEAT,
+        width: int = 280,
+        height: int = 210,
+        scenes: int = 1,
+    ) -> None:
+        check_size(width, height)
+        self.road, self.mount = road, mount
+        self.width, self.height = width, height
+        self._graphics: Graphics = graphics()
+        self._cars = cars_of(self._graphics)
+        self._survey = Survey.of(road)
+        self._keeps = scenes
+        self._settings: dict[tuple[int, Light], _Setting] = {}
+        self._shown: _Setting | None = None
+        self._last_s: float | None = None
+        self.change_scene(seed, light)
+
+    @property
+    def light(self) -> Light:
+        """The light it draws under."""
+        return self._setting.light
+
+    def change_scene(self, seed: int, light: Light) -> None:
+        """Go on with the scenery of another `seed` under another `light`, on the same road."""
+        self._shown = None
+        found = self._settings.pop((seed, light), None)
+        if found is None:
+            while len(self._settings) >= self._keeps:
+                self._settings.pop(next(iter(self._settings))).release()
+            found = self._set_up(seed, light)
+        # Shown last comes last: the first is the one to go.
+        self._settings[seed, light] = self._shown = found
+
+    def _set_up(self, seed: int, light: Light) -> _Setting:
+        graphics = self._graphics
+        frame = np.concatenate([np.zeros(24), *_light_rows(light)]).astype(np.float32)
+        self._set_frame(frame, optics.eye_of(self.mount, np.zeros(6), "front"))
+        return _Setting(
+            light,
+            Scene(graphics, self.road, self._survey, seed, light),
+            # Painted under the light of the frame that is set.
+            Sky(graphics, light.weather, float(self.intrinsics[0, 0])),
+            Fall(graphics, light, seed) if light.falling > 0.0 else None,
+            frame,
+            # Cars of different rounds differ in colour; from the second on, so as to spare our own.
+            first_paint=1 + seed % 5,
+        )
+
+    def render(
+        self, body_pose: ArrayLike, others: ArrayLike | None = None, view: str = "front"
+    ) -> Picture:
+        """The picture (height, width, 3) uint8 RGB of `view` from a car at `body_pose`.
+
+        `body_pose` (6,) is x, y, z, roll, pitch, yaw of the centre of gravity; `others` (n, 6)
+        the same of other cars, z at the ground they stand on.
+        """
+        return self._views(body_pose, others, {view: ViewRequest(view)})[view]
+
+    def render_views(
+        self,
+        body_pose: ArrayLike,
+        others: ArrayLike | None = None,
+        views: Sequence[str] = ("front",),
+    ) -> dict[str, Picture]:
+        """Pictures of several views from one pose, by the names in `views`.
+
+        "front" (any of VIEWS) is the colour picture (height, width, 3) uint8; "front:depth" the
+        distance along the optical axis (height, width) float32 in metres, inf in the sky;
+        "front:class" the number in CLASSES (height, width) uint8. Depth and class are those of
+        what the middle of the pixel shows, of leaves and hedges where they are more than half
+        opaque. Kinds of one view share its work. Raises UserError for an unknown view or kind.
+        """
+        return self._views(body_pose, others, {name: ViewRequest.of(name) for name in views})
+
+    def _views(
+        self, body_pose: ArrayLike, others: ArrayLike | None, wanted: dict[str, ViewRequest]
+    ) -> dict[str, Picture]:
+        taken: dict[ViewRequest, Picture] = {}
+        for view in dict.fromkeys(each.view for each in wanted.values()):
+            kinds = {each.kind for each in wanted.values() if each.view == view}
+            shot = self._aim(body_pose, others, view)
+            if COLOUR in kinds:
+                taken[ViewRequest(view)] = self._draw_colours(shot)
+            if kinds - {COLOUR}:
+                labels = self._draw_labels(shot)
+                taken[ViewRequest(view, DEPTH)] = np.ascontiguousarray(labels[..., 0])
+                taken[ViewRequest(view, CLASS)] = labels[..., 1].astype(np.uint8)
+        return {name: taken[each] for name, each in wanted.items()}
+
+    def _aim(self, body_pose: ArrayLike, others: ArrayLike | None, view: str) -> _Shot:
+        """Point at a view and find what it may show."""
+        setting = self._setting
+        eye = optics.eye_of(self.mount, body_pose, view)
+        self._set_frame(setting.frame, eye)
+        planes = optics.frustum(eye, self.intrinsics)
+        cars, paints = self._cars_in_view(body_pose, others, view)
+        chosen = self._cars.seen(cars, eye.place, planes)
+        return _Shot(
+            eye, setting.scene.seen(eye, planes), cars[chosen], [paints[k] for k in chosen]
+        )
+
+    def _draw_colours(self, shot: _Shot) -> NDArray[np.uint8]:
+        setting, place = self._setting, shot.eye.place
+        target = self._graphics.targets.of(self.width, self.height, labels=False)
+        self._graphics.begin(target)
+        self._cars.draw(shot.cars, shot.paints, place, labels=False)
+        setting.scene.draw(shot.seen, labels=False)
+        setting.sky.draw()
+        self._graphics.blend()
+        self._cars.draw_shadows(shot.cars, place, setting.light)
+        setting.scene.draw_blended(shot.seen)
+        if setting.fall is not None:
+            setting.fall.draw(shot.eye, self.intrinsics[0, 0])
+        return target.colours()
+
+    def _draw_labels(self, shot: _Shot) -> NDArray[np.float32]:
+        """Depth and class (height, width, 2) of what `_draw_colours` draws, rain and snow apart."""
+        target = self._graphics.targets.of(self.width, self.height, labels=True)
+        self._graphics.begin(target, labels=True)
+        self._cars.draw(shot.cars, shot.paints, shot.eye.place, labels=True)
+        self._setting.scene.draw(shot.seen, labels=True)
+        return target.labels()
+
+    @property
+    def intrinsics(self) -> FloatArray:
+        """Pinhole matrix (3, 3) in pixels; square pixels, principal point in the middle."""
+        return optics.intrinsics(self.mount, self.width, self.height)
+
+    def extrinsics(self, view: str = "front", body_pose: ArrayLike = (0.0,) * 6) -> FloatArray:
+        """Body frame to camera frame (4, 4): x right, y down, z ahead (the optical axis), metres.
+
+        Fixed for views of the car's mounts; `chase` and `top` keep level, so theirs depend on the
+        roll and pitch of `body_pose`. With `intrinsics` K, K @ (E @ point)[:3] is (u, v, 1) times
+        the depth. Raises UserError for an unknown view.
+        """
+        return optics.extrinsics(self.mount, body_pose, view)
+
+    def project(
+        self, points: ArrayLike, body_pose: ArrayLike, view: str = "front"
+    ) -> tuple[FloatArray, FloatArray]:
+        """Pixels (N, 2) (u right, v down; NaN behind the eye) and depth (N,) m of world points."""
+        return optics.project(optics.eye_of(self.mount, body_pose, view), self.intrinsics, points)
+
+    def close(self) -> None:
+        """Free the scenes' graphics memory; the camera draws no more."""
+        for setting in self._settings.values():
+            setting.release()
+        self._settings, self._shown = {}, None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def shadow_fraction(self, body_pose: ArrayLike) -> float:
+        """Share (0 to 1) of the road within 30 m ahead of the car that lies in hard shadow."""
+        pose = np.asarray(body_pose, dtype=np.float64)
+        s, _ = self.road.track.project(float(pose[0]), float(pose[1]), self._last_s)
+        self._last_s = s
+        return self._setting.scene.mask.fraction(s, self.road.half_asphalt)
+
+    def _cars_in_view(
+        self, body_pose: ArrayLike, others: ArrayLike | None, view: str
+    ) -> tuple[FloatArray, list[int]]:
+        """Poses (n, 6) on the ground of the cars to draw, and the number of each one's paint."""
+        poses = np.asarray(() if others is None else others, dtype=np.float64).reshape(-1, 6)
+        first = self._setting.first_paint
+        paints = [first + k for k in range(len(poses))]
+        if view in ("chase", "top"):
+            own = np.asarray(body_pose, dtype=np.float64).copy()
+            own[:3] -= optics.rotation(*own[3:])[:, 2] * CarParameters.cg_height
+            poses, paints = np.vstack([poses, own]), [*paints, _OWN_PAINT]
+        return poses, paints
+
+    @property
+    def _setting(self) -> _Setting:
+        if self._shown is None:
+            raise RuntimeError("this camera is closed; make a new one")
+        return self._shown
+
+    def _set_frame(self, block: NDArray[np.float32], eye: optics.Eye) -> None:
+        """Fill the uniform block `Frame` of frame.glsl, which `block` keeps."""
+        clip = optics.clip_matrix(eye, self.intrinsics, self.width, self.height)
+        block[:16] = clip.T.reshape(-1)
+        block[16:19], block[20:23] = eye.place, eye.axes[2]
+        self._graphics.frame.write(block.tobytes())
+        self._graphics.frame.bind_to_uniform_block(FRAME_BINDING)
+
+
+def _light_rows(light: Light) -> list[tuple[float, ...]]:
+    """The rows of the uniform block `Frame` that tell of light and air."""
+    return [
+        (*light.sun_direction, light.shade),
+        (*light.sun, light.exposure),
+        (*light.sky, light.haze_per_km / 1000.0 / math.log(2.0)),
+        (*light.zenith, light.clouds),
+        (*light.horizon, light.cover),
+        (*light.haze, 0.0),
+    ]

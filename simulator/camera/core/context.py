@@ -1,0 +1,173 @@
+"""The one OpenGL context of a process: EGL without a window, on a GPU or on Mesa's llvmpipe.
+
+On llvmpipe the environment variable LP_NUM_THREADS, read by Mesa when the context is made, sets
+the drawing threads: 0 draws in the calling thread, which suits one worker process a core.
+"""
+
+import os
+from importlib import resources
+from typing import TYPE_CHECKING, Any
+
+from simulator.camera.core import textures
+from simulator.camera.core.llvm_isolation import load_triton_first
+from simulator.camera.core.render_modes import CLASSES
+from simulator.camera.core.targets import GPU_SAMPLES, Target, Targets
+from simulator.camera.vegetation import foliage
+from trackfeatures.errors import UserError
+
+if TYPE_CHECKING:
+    import moderngl
+
+PROGRAMS = (
+    "sky",
+    "dome",
+    "land",
+    "paved",
+    "verge",
+    "barrier",
+    "prop",
+    "tree",
+    "car",
+    "spot",
+    "fall",
+)
+FRAME_BINDING, SCENE_BINDING = 0, 1
+VERTEX_SHADERS = {"paved": "road", "verge": "road"}
+"""Where a program takes another's."""
+LIBRARIES = ("output.glsl", "weather.glsl", "road.glsl", "sea.glsl")
+"""Functions for fragment shaders."""
+BLOCKS = {"Frame": FRAME_BINDING, "Scene": SCENE_BINDING}
+WEATHERED = ("sky", "land", "paved", "verge", "barrier", "prop", "tree")
+"""Programs that rain and snow change; each weather gets its own, so that dry ones cost no more."""
+FRAME_FLOATS = 48
+NOISE_UNIT, SHADE_UNIT, ATLAS_UNIT, SKY_UNIT = range(4)
+UNITS = {"noise": NOISE_UNIT, "shade": SHADE_UNIT, "atlas": ATLAS_UNIT, "panorama": SKY_UNIT}
+"""Texture units, by the name of the sampler."""
+
+
+class NoRendererError(UserError):
+    """OpenGL through EGL is not to be had on this machine."""
+
+
+class Graphics:
+    """Context, programs and textures that every camera of the process shares."""
+
+    def __init__(self) -> None:
+        self.context = _create_context()
+        self.programs = {name: self._program(name) for name in PROGRAMS}
+        size = (textures.NOISE_SIZE, textures.NOISE_SIZE)
+        self.noise = self.context.texture(size, 4, textures.noise_tile().tobytes())
+        self.mipmapped(self.noise)
+        # The nearest mipmap alone: noise shows no step, and a frame is drawn 1 ms sooner.
+        self.noise.filter = (self.context.LINEAR_MIPMAP_NEAREST, self.context.LINEAR)
+        sheet = foliage.atlas()
+        self.atlas = self.context.texture(sheet.shape[1::-1], 4, sheet.tobytes())
+        self.mipmapped(self.atlas)
+        self.atlas.filter = self.noise.filter
+        self.atlas.repeat_x = self.atlas.repeat_y = False
+        self.frame = self.context.buffer(reserve=FRAME_FLOATS * 4, dynamic=True)
+        samples = 0 if "llvmpipe" in self.renderer else min(GPU_SAMPLES, self.context.max_samples)
+        self.targets = Targets(self.context, samples)
+
+    @property
+    def renderer(self) -> str:
+        """Name of what draws, such as "llvmpipe (LLVM 15.0.6, 256 bits)"."""
+        return str(self.context.info["GL_RENDERER"])
+
+    def begin(self, target: Target, labels: bool = False) -> None:
+        """Clear `target` and make it the one that is drawn to."""
+        target.clear(labels)
+        self.context.enable_only(self.context.DEPTH_TEST)
+        self.use_textures()
+
+    def use_textures(self) -> None:
+        """Bind the textures that all scenes share."""
+        self.noise.use(NOISE_UNIT)
+        self.atlas.use(ATLAS_UNIT)
+
+    def blend(self) -> None:
+        """From here on lay pictures with alpha over what is drawn, and leave the depth alone."""
+        self.context.enable(self.context.BLEND)
+        self.context.blend_func = (self.context.SRC_ALPHA, self.context.ONE_MINUS_SRC_ALPHA)
+
+    def uniform(self, program: str, name: str) -> "moderngl.Uniform":
+        """A plain uniform of one of the programs."""
+        import moderngl
+
+        member = self.programs[program][name]
+        if not isinstance(member, moderngl.Uniform):
+            raise TypeError(f"{name} of program {program} is no uniform")
+        return member
+
+    def weathered(self, name: str, weather: str, *features: str) -> str:
+        """Name in `programs` of program `name` as it is in `weather` ("" when dry), with what the
+        shaders know as `features` ("sea": the land has a shore)."""
+        defines = [*features, *([weather] if weather and name in WEATHERED else [])]
+        key = " ".join([name, *defines])
+        if key not in self.programs:
+            self.programs[key] = self._program(name, *defines)
+        return key
+
+    def labelling(self, name: str) -> str:
+        """Name in `programs` of the program that draws what `name` draws as depth and class."""
+        key = f"{name.split()[0]} labels"
+        if key not in self.programs:
+            self.programs[key] = self._program(name.split()[0], "labels")
+        return key
+
+    def _program(self, name: str, *defines: str) -> "moderngl.Program":
+        import moderngl
+
+        head = "#version 330 core\n"
+        for define in defines:
+            head += f"#define {define.upper()}\n"
+        head += _source("frame.glsl")
+        classes = "".join(f"#define {name.upper()} {k}\n" for k, name in enumerate(CLASSES))
+        libraries = "".join(_source(library) for library in LIBRARIES)
+        program = self.context.program(
+            vertex_shader=head + _source(f"{VERTEX_SHADERS.get(name, name)}.vert.glsl"),
+            fragment_shader=head + classes + libraries + _source(f"{name}.frag.glsl"),
+        )
+        for key in program:
+            member = program[key]
+            if isinstance(member, moderngl.UniformBlock):
+                member.binding = BLOCKS[key]
+            elif isinstance(member, moderngl.Uniform) and key in UNITS:
+                member.value = UNITS[key]
+        return program
+
+    def mipmapped(self, texture: "moderngl.Texture") -> None:
+        """Build the texture's mipmaps and let it be filtered through them."""
+        texture.build_mipmaps()
+        texture.filter = (self.context.LINEAR_MIPMAP_LINEAR, self.context.LINEAR)
+
+
+_shared: dict[int, Graphics] = {}
+
+
+def graphics() -> Graphics:
+    """This process's graphics, made on first use. Raises NoRendererError without EGL."""
+    # A forked child must not use its parent's context, hence the process id.
+    process = os.getpid()
+    if process not in _shared:
+        _shared.clear()
+        _shared[process] = Graphics()
+    return _shared[process]
+
+
+def _source(name: str) -> str:
+    return (resources.files("simulator.camera") / "shaders" / name).read_text()
+
+
+def _create_context() -> "moderngl.Context":
+    import moderngl
+
+    settings: dict[str, Any] = {"backend": "egl"}
+    load_triton_first()
+    try:
+        return moderngl.create_context(require=330, standalone=True, **settings)
+    except Exception as error:  # moderngl and glcontext raise bare Exception, ImportError, ...
+        raise NoRendererError(
+            f"no OpenGL 3.3 through EGL on this machine ({error}); "
+            "install it with: apt-get install libegl1 libgl1-mesa-dri"
+        ) from error

@@ -1,0 +1,100 @@
+"""What an eye may see: spheres against the side planes of its picture, in compiled code."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from runtime.jit import compiled
+
+FloatArray = NDArray[np.float64]
+Fan = NDArray[np.int64]
+
+
+@compiled
+def runs_seen(
+    spheres: FloatArray,
+    first: NDArray[np.int64],
+    count: NDArray[np.int64],
+    reaches: FloatArray,
+    nearest: float,
+    eye: FloatArray,
+    planes: FloatArray,
+    runs: NDArray[np.int64],
+) -> int:
+    """Fill `runs` (at least N, 2) with first index and number of indices to draw; how many runs.
+
+    Chunk k lies in the sphere `spheres[k]` (centre, radius); of its levels of detail, (levels, N)
+    in `first` and `count`, the one is drawn whose reach is the first beyond the sphere's near end.
+    Chunks that end before `nearest` are left out; what lies together makes one run.
+    """
+    found, end = 0, -1
+    for k in range(len(spheres)):
+        x, y, z = spheres[k, 0] - eye[0], spheres[k, 1] - eye[1], spheres[k, 2] - eye[2]
+        radius = spheres[k, 3]
+        start = np.sqrt(x * x + y * y + z * z) - radius
+        level = 0
+        while level < len(reaches) and start > reaches[level]:
+            level += 1
+        if level == len(reaches) or start + 2.0 * radius <= nearest:
+            continue
+        if not _meets(x, y, z, radius, planes):
+            continue
+        if count[level, k] == 0:
+            continue
+        if first[level, k] == end:
+            runs[found - 1, 1] += count[level, k]
+        else:
+            runs[found, 0], runs[found, 1] = first[level, k], count[level, k]
+            found += 1
+        end = first[level, k] + count[level, k]
+    return found
+
+
+@compiled
+def balls_seen(
+    centres: FloatArray,
+    radii: FloatArray,
+    reach: float,
+    most: int,
+    eye: FloatArray,
+    planes: FloatArray,
+) -> NDArray[np.int64]:
+    """The balls (numbers, the nearest first) that meet the frustum within `reach`, `most` of them
+    at most."""
+    chosen = np.empty(len(centres), dtype=np.int64)
+    distance = np.empty(len(centres))
+    found = 0
+    for k in range(len(centres)):
+        x, y, z = centres[k, 0] - eye[0], centres[k, 1] - eye[1], centres[k, 2] - eye[2]
+        squared = x * x + y * y + z * z
+        if squared < reach * reach and _meets(x, y, z, radii[k], planes):
+            chosen[found], distance[found] = k, squared
+            found += 1
+    order = np.argsort(distance[:found], kind="mergesort")
+    return chosen[order[:most]]
+
+
+@compiled
+def fans(
+    trees: NDArray[np.int64], near: int, corners: int, near_fan: Fan, far_fan: Fan
+) -> NDArray[np.uint32]:
+    """Indices (triangles, 3) of the `trees`, each of `corners` vertices: of the first `near` by
+    `near_fan`, of the others by `far_fan`, both (triangles, 3) of a tree's own vertices."""
+    near_count, far_count = len(near_fan), len(far_fan)
+    far = len(trees) - near
+    indices = np.empty((near * near_count + far * far_count, 3), dtype=np.uint32)
+    row = 0
+    for k in range(len(trees)):
+        fan = near_fan if k < near else far_fan
+        for triangle in fan:
+            for corner in range(3):
+                indices[row, corner] = trees[k] * corners + triangle[corner]
+            row += 1
+    return indices
+
+
+@compiled
+def _meets(x: float, y: float, z: float, radius: float, planes: FloatArray) -> bool:
+    inside = True
+    for plane in planes:
+        inside &= x * plane[0] + y * plane[1] + z * plane[2] > -radius
+    return inside

@@ -1,0 +1,100 @@
+"""Meshes on the graphics card, drawn chunk by chunk where the eye can see them."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from simulator.camera.core.context import Graphics
+from simulator.camera.core.frustum_culling import runs_seen
+
+if TYPE_CHECKING:
+    import moderngl
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Surface:
+    """Triangles ready to draw: `vertices` (N, F) float32, `indices` uint32, chunks to cull by."""
+
+    vertices: NDArray[np.float32]
+    indices: NDArray[np.uint32]
+    chunks: "Chunks"
+
+
+@dataclass(frozen=True)
+class Chunks:
+    """Spheres round runs of indices: centres (N, 3), radii (N,), and one row of first index and
+    number of indices a level of detail, (levels, N), the finest first; each up to `reaches` m."""
+
+    centres: FloatArray
+    radii: FloatArray
+    first: NDArray[np.int64]
+    count: NDArray[np.int64]
+    reaches: tuple[float, ...]
+    nearest: float = 0.0
+    """Chunks that lie wholly nearer than this are left to a finer mesh."""
+
+
+class Mesh:
+    """One indexed vertex array with its chunks. `layout` is moderngl's format and names."""
+
+    def __init__(
+        self,
+        graphics: Graphics,
+        program: str,
+        surface: Surface,
+        layout: Sequence[str],
+    ) -> None:
+        context = graphics.context
+        self._vertices = context.buffer(np.ascontiguousarray(surface.vertices).tobytes())
+        self._indices = context.buffer(np.ascontiguousarray(surface.indices).tobytes())
+        self._arrays = both_ways(graphics, program, self._vertices, self._indices, layout)
+        chunks = surface.chunks
+        self._spheres = np.column_stack([chunks.centres, chunks.radii])
+        self._levels = chunks.first, chunks.count, np.array(chunks.reaches), chunks.nearest
+        self._runs = np.empty((len(self._spheres), 2), dtype=np.int64)
+
+    def seen(self, eye: FloatArray, planes: FloatArray) -> list[list[int]]:
+        """What to draw for an eye: (first, count) runs of indices."""
+        found = runs_seen(self._spheres, *self._levels, eye, planes, self._runs)
+        runs: list[list[int]] = self._runs[:found].tolist()
+        return runs
+
+    def draw(self, runs: list[list[int]], labels: bool) -> None:
+        """Draw the runs that are seen, as depth and class or in their colours."""
+        array = self._arrays[labels]
+        for first, count in runs:
+            array.render(vertices=count, first=first)
+
+    def release(self) -> None:
+        """Free the graphics memory."""
+        for array in self._arrays:
+            array.release()
+        self._indices.release()
+        self._vertices.release()
+
+
+def both_ways(
+    graphics: Graphics,
+    program: str,
+    vertices: "moderngl.Buffer",
+    indices: "moderngl.Buffer | None",
+    layout: Sequence[str],
+) -> "tuple[moderngl.VertexArray, moderngl.VertexArray]":
+    """Vertex arrays of the same vertices: one draws them in their colours, one as depth and class.
+    A program may leave out a part of a vertex that it has no use for."""
+    drawn, labelled = (
+        graphics.context.vertex_array(
+            graphics.programs[name],
+            [(vertices, *layout)],
+            index_buffer=indices,
+            index_element_size=4,
+            skip_errors=True,
+        )
+        for name in (program, graphics.labelling(program))
+    )
+    return drawn, labelled

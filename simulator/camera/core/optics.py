@@ -1,0 +1,171 @@
+"""Where the eye is and how it sees: mounts, views, pinhole projection.
+
+Body frame: x ahead, y to the left, z up, origin at the centre of gravity; a body pose is
+(x, y, z, roll, pitch, yaw) as PyBullet's Euler angles (R = Rz Ry Rx, pitch positive nose down).
+Image frame: pixels, origin at the top left corner, u to the right, v down; a pixel's centre is at
+half-integers. Square pixels, principal point in the middle.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from runtime.jit import compiled
+from trackfeatures.errors import UserError
+
+FloatArray = NDArray[np.float64]
+
+VIEWS: tuple[str, ...] = ("front", "left", "right", "rear", "chase", "top")
+"""`front` is the driver view; `chase` looks from behind and above, `top` straight down."""
+
+NEAR_M = 0.12
+FAR_M = 6000.0
+
+_YAW_DEG = {"front": 0.0, "left": 90.0, "right": -90.0, "rear": 180.0}
+_CHASE_BACK_M, _CHASE_UP_M, _CHASE_PITCH_DEG = 7.5, 2.9, 12.0
+_TOP_UP_M = 24.0
+
+
+@dataclass(frozen=True)
+class Mount:
+    """Place of the driver camera in the body frame (m), its pitch (deg, nose down) and lens."""
+
+    x: float = 0.75
+    y: float = 0.0
+    z: float = 0.95
+    pitch_deg: float = 0.0
+    fov_y_deg: float = 67.5
+
+    def __post_init__(self) -> None:
+        if not 1.0 <= self.fov_y_deg <= 150.0:
+            raise UserError(
+                f"vertical field of view {self.fov_y_deg} deg; give one between 1 and 150 deg"
+            )
+
+
+DRIVER_SEAT = Mount()
+
+
+@dataclass(frozen=True)
+class Eye:
+    """One eye in the world: `place` (3,) m and `axes` (3, 3), rows right, up and ahead."""
+
+    place: FloatArray
+    axes: FloatArray
+
+
+@compiled
+def rotation(roll: float, pitch: float, yaw: float) -> FloatArray:
+    """Body-to-world rotation (3, 3), as PyBullet's getMatrixFromQuaternion gives it."""
+    cr, sr = math.cos(roll), math.sin(roll)
+    cp, sp = math.cos(pitch), math.sin(pitch)
+    cy, sy = math.cos(yaw), math.sin(yaw)
+    return np.array(
+        [
+            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+            [-sp, cp * sr, cp * cr],
+        ]
+    )
+
+
+def eye_of(mount: Mount, body_pose: ArrayLike, view: str) -> Eye:
+    """The eye of `view` on a car at `body_pose`. Raises UserError for an unknown view."""
+    pose = np.asarray(body_pose, dtype=np.float64)
+    yaw = float(pose[5])
+    if view == "chase":
+        # Behind the car but level with the horizon, as a following camera is.
+        turn = rotation(0.0, math.radians(_CHASE_PITCH_DEG), yaw)
+        back = rotation(0.0, float(pose[4]), yaw) @ np.array([-_CHASE_BACK_M, 0.0, 0.0])
+        return _eye(pose[:3] + back + np.array([0.0, 0.0, _CHASE_UP_M]), turn)
+    if view == "top":
+        return _eye(pose[:3] + np.array([0.0, 0.0, _TOP_UP_M]), rotation(0.0, math.pi / 2, yaw))
+    if view not in _YAW_DEG:
+        raise UserError(f"unknown camera view '{view}'; the views are {', '.join(VIEWS)}")
+    body = rotation(float(pose[3]), float(pose[4]), yaw)
+    turn = rotation(0.0, math.radians(mount.pitch_deg), math.radians(_YAW_DEG[view]))
+    return _eye(pose[:3] + body @ np.array([mount.x, mount.y, mount.z]), body @ turn)
+
+
+def _eye(place: FloatArray, turn: FloatArray) -> Eye:
+    axes = np.empty((3, 3))
+    axes[0], axes[1], axes[2] = -turn[:, 1], turn[:, 2], turn[:, 0]
+    return Eye(place, axes)
+
+
+def intrinsics(mount: Mount, width: int, height: int) -> FloatArray:
+    """Pinhole matrix (3, 3) in pixels."""
+    focal = height / 2 / math.tan(math.radians(mount.fov_y_deg) / 2)
+    return np.array([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
+
+
+def extrinsics(mount: Mount, body_pose: ArrayLike, view: str) -> FloatArray:
+    """Body frame to camera frame (x right, y down, z ahead) of `view`, (4, 4)."""
+    pose = np.asarray(body_pose, dtype=np.float64)
+    eye = eye_of(mount, pose, view)
+    right, up, ahead = eye.axes
+    turn = np.stack([right, -up, ahead])
+    matrix = np.eye(4)
+    matrix[:3, :3] = turn @ rotation(*pose[3:])
+    matrix[:3, 3] = turn @ (pose[:3] - eye.place)
+    return matrix
+
+
+def project(eye: Eye, matrix: FloatArray, points: ArrayLike) -> tuple[FloatArray, FloatArray]:
+    """Pixels (N, 2) and depth (N,) m along the optical axis; behind the eye pixels are NaN."""
+    places = np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 3)
+    return _pixels(places, eye.place, eye.axes, matrix)
+
+
+@compiled
+def _pixels(
+    points: FloatArray, eye: FloatArray, axes: FloatArray, matrix: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """`project` point by point: called for every frame's markings, where numpy's calls add up."""
+    pixels, depth = np.empty((len(points), 2)), np.empty(len(points))
+    for k in range(len(points)):
+        x, y, z = points[k, 0] - eye[0], points[k, 1] - eye[1], points[k, 2] - eye[2]
+        right = x * axes[0, 0] + y * axes[0, 1] + z * axes[0, 2]
+        up = x * axes[1, 0] + y * axes[1, 1] + z * axes[1, 2]
+        ahead = x * axes[2, 0] + y * axes[2, 1] + z * axes[2, 2]
+        depth[k] = ahead
+        if ahead > 1e-6:
+            pixels[k, 0] = matrix[0, 2] + matrix[0, 0] * right / ahead
+            pixels[k, 1] = matrix[1, 2] - matrix[1, 1] * up / ahead
+        else:
+            pixels[k] = np.nan
+    return pixels, depth
+
+
+def clip_matrix(eye: Eye, matrix: FloatArray, width: int, height: int) -> FloatArray:
+    """From eye-relative world coordinates to clip space (4, 4), row vectors last.
+
+    The picture comes out upside down in GL's sense: its first row in memory is the top one.
+    """
+    x_scale = 2.0 * matrix[0, 0] / width
+    y_scale = 2.0 * matrix[1, 1] / height
+    clip = np.zeros((4, 4))
+    clip[0, :3] = eye.axes[0] * x_scale
+    clip[1, :3] = -eye.axes[1] * y_scale
+    clip[2, :3] = eye.axes[2] * (FAR_M + NEAR_M) / (FAR_M - NEAR_M)
+    clip[2, 3] = -2.0 * FAR_M * NEAR_M / (FAR_M - NEAR_M)
+    clip[3, :3] = eye.axes[2]
+    return clip
+
+
+def frustum(eye: Eye, matrix: FloatArray) -> FloatArray:
+    """Inward unit normals (4, 3) of the side planes through the eye."""
+    half_x = matrix[0, 2] / matrix[0, 0]
+    half_y = matrix[1, 2] / matrix[1, 1]
+    long_x, long_y = math.hypot(half_x, 1.0), math.hypot(half_y, 1.0)
+    sides = np.array(
+        [
+            [-1.0 / long_x, 0.0, half_x / long_x],
+            [1.0 / long_x, 0.0, half_x / long_x],
+            [0.0, -1.0 / long_y, half_y / long_y],
+            [0.0, 1.0 / long_y, half_y / long_y],
+        ]
+    )
+    return np.asarray(sides @ eye.axes)

@@ -1,0 +1,36 @@
+"""What a picture can hold of a view: its colours, the depth or the class of each pixel."""
+
+from dataclasses import dataclass
+from typing import Self
+
+from simulator.camera.core.optics import VIEWS
+from trackfeatures.errors import UserError
+
+CLASSES: tuple[str, ...] = ("road", "marking", "car", "ground", "sky", "object")
+"""Classes of a pixel by their number. `object` is what else stands beside the road: trees, rails,
+houses, signs; kerb, verge and land are `ground`; paint that is worn off is `road`."""
+
+COLOUR, DEPTH, CLASS = PICTURE_KINDS = ("colour", "depth", "class")
+
+
+@dataclass(frozen=True)
+class ViewRequest:
+    """One picture of several: a view, and what of it."""
+
+    view: str
+    kind: str = COLOUR
+
+    @classmethod
+    def of(cls, name: str) -> Self:
+        """Read "front", "front:depth" or "front:class"; UserError for an unknown view or kind."""
+        view, _, kind = name.partition(":")
+        if view not in VIEWS:
+            raise UserError(
+                f"unknown camera view '{view}' in '{name}'; the views are {', '.join(VIEWS)}"
+            )
+        if (kind or COLOUR) not in PICTURE_KINDS or name.endswith(":"):
+            raise UserError(
+                f"unknown kind of picture '{kind}' in '{name}'; "
+                f"the kinds are {', '.join(PICTURE_KINDS)}"
+            )
+        return cls(view, kind or COLOUR)

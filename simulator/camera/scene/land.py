@@ -1,0 +1,126 @@
+"""The terrain grid as triangles: fine cells near the eye, coarse ones to the horizon; and how much
+of it lies in the shade of trees."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from simulator.camera.core.mesh import Chunks, Surface
+from simulator.camera.scene.light import Light
+from simulator.camera.scene.terrain import CentreLine, Terrain, between
+from simulator.camera.vegetation.scenery import Trees
+
+FloatArray = NDArray[np.float64]
+
+BLOCK = 4
+"""A chunk is BLOCK x BLOCK cells."""
+SMOOTH_M = 9.0
+MOST_SHADE = 0.8
+CANOPY, CANOPY_M = 0.55, 30.0
+"""In the heavy-shadow light trees stand so thick beside the road, to so far from its middle."""
+
+
+@dataclass(frozen=True)
+class Shadiness:
+    """Share of the sun that trees keep from the land, on the terrain's grid `shade` (rows y,
+    columns x), 0 to MOST_SHADE: smooth, where single shadows would be lost."""
+
+    terrain: Terrain
+    shade: FloatArray
+
+    @classmethod
+    def of(cls, terrain: Terrain, line: CentreLine, trees: Trees, light: Light) -> "Shadiness":
+        """The shade of `trees` under the sun of `light`, none where that casts no hard shadow."""
+        shade: FloatArray = np.zeros(terrain.z.shape)
+        if light.shade >= 0.5:
+            return cls(terrain, shade)
+        sx, sy, sz = light.sun_direction
+        run = np.minimum(trees.height * np.hypot(sx, sy) / max(sz, 0.1), 40.0)
+        area = 0.6 * trees.width * np.maximum(run, trees.width)
+        i = np.rint((trees.feet[:, 0] - 0.5 * run * sx - terrain.x0) / terrain.cell).astype(np.intp)
+        j = np.rint((trees.feet[:, 1] - 0.5 * run * sy - terrain.y0) / terrain.cell).astype(np.intp)
+        inside = (i >= 0) & (j >= 0) & (i < shade.shape[1]) & (j < shade.shape[0])
+        np.add.at(shade, (j[inside], i[inside]), area[inside] / terrain.cell**2)
+        shade = np.asarray(cv2.GaussianBlur(shade, (0, 0), SMOOTH_M / terrain.cell), np.float64)
+        if light.canopy:
+            x = terrain.x0 + terrain.cell * np.arange(shade.shape[1])
+            y = terrain.y0 + terrain.cell * np.arange(shade.shape[0])
+            near = line.distance(*np.meshgrid(x, y))
+            shade = np.maximum(shade, CANOPY * np.clip(1.5 - near / CANOPY_M, 0.0, 1.0))
+        return cls(terrain, MOST_SHADE * (1.0 - np.exp(-shade / MOST_SHADE)))
+
+    def at(self, x: FloatArray, y: FloatArray) -> FloatArray:
+        """The shade at places, from the nearest grid point."""
+        i = np.rint((x - self.terrain.x0) / self.terrain.cell).astype(np.intp)
+        j = np.rint((y - self.terrain.y0) / self.terrain.cell).astype(np.intp)
+        rows, columns = self.shade.shape
+        return np.asarray(self.shade[np.clip(j, 0, rows - 1), np.clip(i, 0, columns - 1)])
+
+
+@dataclass(frozen=True)
+class Span:
+    """Where one grid of the land is drawn: cells of `step` x `step` of the finest, in chunks from
+    `start_m` to `reach_m`; where the road's ribbon lies on it too (`bare`), or not."""
+
+    step: int
+    start_m: float
+    reach_m: float
+    bare: bool
+
+
+def surface(land: Shadiness, hidden: NDArray[np.bool_], span: Span) -> Surface:
+    """The land by one grid, nowhere above the finest; a vertex is x, y, z, normal, share of the sun
+    that reaches it. `hidden` says which points (rows, columns) of the finest the ribbon covers."""
+    terrain, every = land.terrain, (slice(None, None, span.step),) * 2
+    z, normals = lowered(terrain.z, span.step), terrain.normals()[every]
+    rows, columns = z.shape
+    vertices = np.empty((rows, columns, 7), dtype=np.float32)
+    vertices[..., 0] = terrain.x0 + terrain.cell * span.step * np.arange(columns)
+    vertices[..., 1] = (terrain.y0 + terrain.cell * span.step * np.arange(rows))[:, None]
+    vertices[..., 2] = z
+    vertices[..., 3:6] = normals
+    vertices[..., 6] = 0.9 * (1.0 - land.shade[every])
+    shown = np.ones((rows - 1, columns - 1), dtype=np.bool_)
+    if not span.bare:
+        window = np.ones((span.step + 1,) * 2, np.uint8)
+        covered = cv2.erode(hidden.astype(np.uint8), window, anchor=(0, 0))
+        shown = covered[every][:-1, :-1] == 0
+    return _in_chunks(vertices, shown, span)
+
+
+def lowered(z: FloatArray, step: int) -> FloatArray:
+    """Every `step`-th height of `z`, each as much lower as the triangles between them would rise
+    over any height beside it."""
+    kept = z[::step, ::step]
+    if step == 1:
+        return kept
+    share = np.arange(z.shape[0]) / step, np.arange(z.shape[1]) / step
+    over = np.maximum(between(kept, share[1][None, :], share[0][:, None]) - z, 0.0)
+    reach = np.ones((2 * step - 1, 2 * step - 1), np.uint8)
+    return np.asarray(kept - cv2.dilate(over, reach)[::step, ::step], dtype=np.float64)
+
+
+def _in_chunks(vertices: NDArray[np.float32], shown: NDArray[np.bool_], span: Span) -> Surface:
+    """Two triangles for each cell that is `shown`, in blocks of BLOCK x BLOCK cells."""
+    columns = vertices.shape[1]
+    j, i = np.nonzero(shown)
+    block = (j // BLOCK) * (columns // BLOCK + 1) + i // BLOCK
+    order = np.argsort(block, kind="stable")
+    corner = (j * columns + i)[order]
+    _, first, cells = np.unique(block[order], return_index=True, return_counts=True)
+    base = np.array([0, 1, columns, 1, columns + 1, columns])
+    indices = (corner[:, None] + base).astype(np.uint32)
+    places = vertices.reshape(-1, 7)[:, :3].astype(np.float64)[indices]
+    low = np.minimum.reduceat(places.min(axis=1), first, axis=0)
+    high = np.maximum.reduceat(places.max(axis=1), first, axis=0)
+    chunks = Chunks(
+        (low + high) / 2.0,
+        np.linalg.norm(high - low, axis=1) / 2.0,
+        6 * first[None].astype(np.int64),
+        6 * cells[None].astype(np.int64),
+        (span.reach_m,),
+        span.start_m,
+    )
+    return Surface(vertices.reshape(-1, 7), indices.reshape(-1), chunks)

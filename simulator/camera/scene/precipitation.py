@@ -1,0 +1,84 @@
+"""What falls: rain and snow between the eye and the road, as short streaks in the air.
+
+The drops stand still in a box of air that repeats through the world, so that they pass by as the
+eye moves; how far they have fallen is drawn from the eye's place. So a picture needs no clock: the
+same pose gives the same drops. Metres, world frame.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from simulator.camera.core.context import Graphics
+from simulator.camera.core.optics import Eye
+from simulator.camera.scene.light import Light
+
+CAR_SPEED = 15.0
+"""m/s; the speed at which drops are taken to come towards the car."""
+
+
+@dataclass(frozen=True)
+class Drops:
+    """One thing that falls: the box of air (m) that holds `most` of it at its thickest, how fast
+    it falls (m/s), how long the shutter is open (s), how wide it is (m), and how opaque."""
+
+    box_m: float
+    most: int
+    speed: float
+    shutter_s: float
+    width_m: float
+    alpha: float
+
+
+RAIN = Drops(box_m=9.0, most=2200, speed=8.0, shutter_s=1 / 50, width_m=0.007, alpha=0.5)
+SNOW = Drops(box_m=14.0, most=4500, speed=1.3, shutter_s=1 / 200, width_m=0.045, alpha=0.95)
+_CORNERS = np.array([[-1, 0], [1, 0], [-1, 1], [-1, 1], [1, 0], [1, 1]], dtype=np.float32)
+
+
+class Fall:
+    """The drops of one scene, drawn over all else."""
+
+    def __init__(self, graphics: Graphics, light: Light, seed: int) -> None:
+        self._drops = SNOW if light.weather == "snow" else RAIN
+        rng = np.random.default_rng([seed, 7])
+        count = round(self._drops.most * light.falling)
+        vertices = np.empty((count, 6, 6), dtype=np.float32)
+        vertices[:, :, :4] = rng.uniform(0.0, 1.0, (count, 1, 4))
+        vertices[:, :, 4:] = _CORNERS
+        self._count = count * 6
+        wind = rng.normal(0.0, 1.2, 2)
+        self._velocity = np.array([wind[0], wind[1], -self._drops.speed])
+        self._buffer = graphics.context.buffer(vertices.tobytes())
+        program = graphics.programs["fall"]
+        self._array = graphics.context.vertex_array(
+            program, [(self._buffer, "4f 2f", "at", "corner")]
+        )
+        self._uniforms = {
+            name: graphics.uniform("fall", name) for name in ("shift", "streak", "shape")
+        }
+
+    def draw(self, eye: Eye, focal_px: float) -> None:
+        """Draw what falls before `eye`; blending must be on."""
+        drops = self._drops
+        shift = np.append(-eye.place, 0.0) / drops.box_m
+        shift[2] += _fallen(eye.place)
+        ahead = eye.axes[2] * CAR_SPEED
+        streak = (self._velocity - ahead) * drops.shutter_s
+        self._uniforms["shift"].value = tuple((shift % 1.0).tolist())
+        self._uniforms["streak"].value = (*streak.tolist(), drops.box_m)
+        self._uniforms["shape"].value = (drops.width_m, 0.8 / focal_px, drops.alpha)
+        self._array.render(vertices=self._count)
+
+    def release(self) -> None:
+        """Free the graphics memory."""
+        self._array.release()
+        self._buffer.release()
+
+
+def _fallen(place: NDArray[np.float64]) -> float:
+    """A share of the box drawn from the eye's place to the millimetre."""
+    x, y, z = (round(float(v) * 1000.0) for v in place)
+    mixed = (x * 73_856_093) ^ (y * 19_349_663) ^ (z * 83_492_791)
+    return math.fmod((mixed % 1_000_003) * 0.6180339887498949, 1.0)

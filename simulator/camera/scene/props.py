@@ -1,0 +1,287 @@
+"""Things that stand beside the road: houses, stands, signs, marker posts, lamps.
+
+Each is a template in its own frame (x along the road, y away from it, z up, metres), put down many
+times. World frame, metres.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from simulator.camera.bridges.bridges import KEEP_FREE_M, Bridge, free_of
+from simulator.camera.core.mesh import Chunks, Surface
+from simulator.camera.scene.road_mesh import Ribbon
+from simulator.camera.scene.roadside import ground_height, place_beside
+from simulator.camera.scene.solids import (
+    BOARD,
+    CROWD,
+    FACADE,
+    MATERIALS,
+    PLAIN,
+    STRIPED,
+    TILES,
+    Point,
+    box,
+    face,
+)
+from simulator.camera.scene.terrain import CentreLine, Terrain
+from simulator.camera.scene.themes import Look
+from simulator.camera.vegetation.scenery import DRY_M
+from simulator.track.road import Road
+
+FloatArray = NDArray[np.float64]
+
+CHUNK_M, REACH_M = 50.0, 350.0
+SMALL_M2, SMALL_REACH_M = 14.0, 130.0
+"""Posts, lamps and signs, of less area than this, are nothing but a flicker from farther away."""
+BUILDING_M = 3.9
+"""What reaches farther from its middle is a building."""
+POST_STEP_M, LAMP_STEP_M, POLE_STEP_M = 50.0, 42.0, 40.0
+_WALLS: tuple[Point, ...] = (
+    (0.62, 0.58, 0.50), (0.66, 0.64, 0.60), (0.42, 0.22, 0.15), (0.58, 0.47, 0.30),
+    (0.45, 0.46, 0.48), (0.52, 0.34, 0.25),
+)  # fmt: skip
+_ROOFS: tuple[Point, ...] = ((0.26, 0.10, 0.06), (0.13, 0.12, 0.125), (0.20, 0.13, 0.09))
+_BOARDS: tuple[Point, ...] = (
+    (0.02, 0.09, 0.36), (0.03, 0.22, 0.09), (0.62, 0.46, 0.03), (0.60, 0.60, 0.58),
+    (0.48, 0.03, 0.03), (0.50, 0.18, 0.02),
+)  # fmt: skip
+
+
+def house(rng: np.random.Generator) -> FloatArray:
+    """A house of one to three floors under a gabled roof."""
+    wide, deep = rng.uniform(8.0, 15.0), rng.uniform(7.0, 10.0)
+    high = 2.9 * rng.integers(1, 4) + 0.4
+    wall, roof = _WALLS[rng.integers(len(_WALLS))], _ROOFS[rng.integers(len(_ROOFS))]
+    x, y, top = wide / 2 + 0.4, deep / 2 + 0.4, high + deep * rng.uniform(0.28, 0.45)
+    ridge = [np.array([-x, 0.0, top]), np.array([x, 0.0, top])]
+    eaves = high - 0.15
+    parts = [box((wide, deep, high + 1.0), (0.0, 0.0, -1.0), wall, FACADE)]
+    for side in (-1.0, 1.0):
+        low = [np.array([side * x, side * y, eaves]), np.array([-side * x, side * y, eaves])]
+        high_edge = [ridge[0], ridge[1]] if side > 0 else [ridge[1], ridge[0]]
+        slope = [(0.0, 0.0), (wide, 0.0), (wide, 5.0), (0.0, 5.0)]
+        parts.append(face([*low, *high_edge], slope, roof, TILES))
+        gable = [
+            np.array([side * wide / 2, -side * deep / 2, high]),
+            np.array([side * wide / 2, side * deep / 2, high]),
+            np.array([side * wide / 2, 0.0, top - 0.1]),
+            np.array([side * wide / 2, 0.0, top - 0.1]),
+        ]
+        parts.append(face(gable, [(0.0, 0.0)] * 4, wall, PLAIN))
+    return np.concatenate(parts)
+
+
+def stand(rng: np.random.Generator) -> FloatArray:
+    """A grandstand: rising tiers full of people under a roof."""
+    wide = float(rng.uniform(25.0, 45.0))
+    colour = _BOARDS[rng.integers(len(_BOARDS))]
+    parts = [box((wide, 1.0, 2.6), (0.0, -5.0, -1.0), colour)]
+    low, back = np.array([0.0, -4.5, 1.6]), np.array([0.0, 5.0, 7.0])
+    right = np.array([wide / 2, 0.0, 0.0])
+    tiers = [low - right, low + right, back + right, back - right]
+    parts.append(face(tiers, [(0, 0), (wide, 0), (wide, 11.0), (0, 11.0)], (0.3, 0.3, 0.3), CROWD))
+    parts.append(box((wide, 0.4, 10.0), (0.0, 5.2, -1.0), (0.4, 0.4, 0.41)))
+    parts.append(box((wide, 9.0, 0.35), (0.0, 1.0, 10.0), colour))
+    return np.concatenate(parts)
+
+
+def sign(rng: np.random.Generator) -> FloatArray:
+    """A board on two legs, facing traffic that drives along +x."""
+    wide, high = float(rng.uniform(0.8, 3.4)), float(rng.uniform(0.7, 1.5))
+    foot = float(rng.uniform(1.3, 2.0))
+    board = box((0.06, wide, high), (0.0, 0.0, foot), _BOARDS[rng.integers(len(_BOARDS))], BOARD)
+    # Boards are lettered in shares of their size.
+    board[:, 9] /= wide
+    board[:, 10] /= high
+    legs = [
+        box((0.08, 0.08, foot + 1.0), (0.05, y * wide * 0.35, -0.9), (0.3, 0.3, 0.3))
+        for y in (-1, 1)
+    ]
+    return np.concatenate([board, *legs])
+
+
+def marker_post() -> FloatArray:
+    """A white marker post with a dark band."""
+    return box((0.09, 0.12, 1.3), (0.0, 0.0, -0.3), (0.72, 0.72, 0.70), STRIPED)
+
+
+def block(rng: np.random.Generator) -> FloatArray:
+    """A building of four to nine floors under a flat roof."""
+    wide, deep = float(rng.uniform(12.0, 26.0)), float(rng.uniform(9.0, 13.0))
+    high = float(2.9 * rng.integers(4, 10) + 0.4)
+    wall = _WALLS[rng.integers(len(_WALLS))]
+    return np.concatenate(
+        [
+            box((wide, deep, high + 1.0), (0.0, 0.0, -1.0), wall, FACADE),
+            box((wide + 0.3, deep + 0.3, 0.5), (0.0, 0.0, high), (0.30, 0.30, 0.30)),
+            box((3.0, 3.0, 2.2), (wide * 0.2, 0.0, high + 0.5), (0.35, 0.35, 0.34)),
+        ]
+    )
+
+
+def pole() -> FloatArray:
+    """A telegraph pole of wood with two cross-arms."""
+    wood, mast = (0.13, 0.09, 0.06), (0.22, 0.22, 9.0)
+    arms = [box((0.12, 2.0, 0.12), (0.0, 0.0, z), wood) for z in (6.9, 7.6)]
+    return np.concatenate([box(mast, (0.0, 0.0, -0.9), wood), *arms])
+
+
+def lamp() -> FloatArray:
+    """A lamp on a tall mast, its arm over the road (-y)."""
+    grey = (0.24, 0.25, 0.25)
+    return np.concatenate(
+        [
+            box((0.16, 0.16, 9.0), (0.0, 0.0, -0.8), grey),
+            box((0.1, 2.2, 0.1), (0.0, -1.0, 8.1), grey),
+            box((0.25, 0.8, 0.14), (0.0, -2.2, 8.0), (0.45, 0.45, 0.43)),
+        ]
+    )
+
+
+class _Site:
+    """Puts templates down beside the road and gathers their triangles."""
+
+    def __init__(
+        self,
+        road: Road,
+        line: CentreLine,
+        ribbon: Ribbon,
+        terrain: Terrain,
+        bridges: Sequence[Bridge],
+    ) -> None:
+        self.road, self.line, self.ribbon, self.terrain = road, line, ribbon, terrain
+        self.bridges = bridges
+        self.wanted: list[tuple[FloatArray, float, float, float]] = []
+        self.s: list[float] = []
+        self.parts: list[FloatArray] = []
+
+    def want(self, template: FloatArray, s: float, offset: float, clear_m: float) -> None:
+        """Stand `template` at (s, offset), if nothing is in its way: see `stand`."""
+        self.wanted.append((template, s, offset, clear_m))
+
+    def stand(self) -> None:
+        """Put down what was wanted, in that order, but for what would come within its `clear_m` of
+        a wall line, under a bridge, into the sea or into another building."""
+        if not self.wanted:
+            return
+        templates, *numbers = zip(*self.wanted, strict=True)
+        s, offset, clear_m = (np.array(column) for column in numbers)
+        free, x, y = place_beside(self.road, self.line, s, offset, clear_m)
+        free &= free_of(self.bridges, x, y, clear_m + KEEP_FREE_M)
+        z = ground_height(self.ribbon, self.terrain, s, offset, x, y)
+        free &= z >= self.terrain.sea + DRY_M
+        # On the right side the template is turned round, so that its -y still faces the road; its
+        # x axis then points against the traffic.
+        turn = self.road.track.at(s).heading + np.where(offset > 0, 0.0, np.pi)
+        cos, sin = np.cos(turn), np.sin(turn)
+        taken: list[tuple[float, float, float]] = []
+        for k in np.flatnonzero(free).tolist():
+            template = templates[k]
+            reach = float(np.abs(template[:, :2]).max())
+            if reach > BUILDING_M:
+                if any(
+                    np.hypot(x[k] - u, y[k] - v) < 0.9 * (reach + other) for u, v, other in taken
+                ):
+                    continue
+                taken.append((x[k], y[k], reach))
+            placed = template.copy()
+            rotate = np.array([[cos[k], sin[k]], [-sin[k], cos[k]]])
+            placed[:, :2] = template[:, :2] @ rotate + np.array([x[k], y[k]])
+            placed[:, 2] += z[k]
+            placed[:, 3:5] = template[:, 3:5] @ rotate
+            self.add(s[k], placed)
+
+    def add(self, s: float, triangles: FloatArray) -> None:
+        """Triangles (n, 12) that are in place already, near `s`."""
+        self.s.append(s)
+        self.parts.append(triangles)
+
+
+def build(
+    road: Road,
+    line: CentreLine,
+    ribbon: Ribbon,
+    terrain: Terrain,
+    look: Look,
+    bridges: Sequence[Bridge],
+    rng: np.random.Generator,
+) -> dict[str, Surface]:
+    """All props of a scene, its bridges among them, by material; a vertex is as `solids` has it,
+    without the material."""
+    site = _Site(road, line, ribbon, terrain, bridges)
+    for bridge in bridges:
+        site.add(bridge.s, bridge.triangles)
+    length, wall = road.track.length_m, road.wall_offset
+    for make, density, near, far, clear in (
+        (house, look.houses, 9.0, 24.0, 7.5),
+        (block, look.blocks, 13.0, 34.0, 11.0),
+        (stand, look.stands, 9.0, 14.0, 6.5),
+        (sign, look.signs, 0.9, 2.2, 0.4),
+    ):
+        for s in rng.uniform(0.0, length, rng.poisson(density * length / 100.0)):
+            side = rng.choice([-1.0, 1.0])
+            offset = side * (wall + rng.uniform(near, far))
+            site.want(make(rng), float(s), float(offset), clear)
+    if look.posts:
+        for s in np.arange(0.0, length, POST_STEP_M):
+            for side in (-1.0, 1.0):
+                site.want(marker_post(), float(s), side * (wall + 0.35), 0.1)
+    if look.poles:
+        side = rng.choice([-1.0, 1.0])
+        for s in np.arange(0.0, length, POLE_STEP_M):
+            site.want(pole(), float(s), side * (wall + 3.0), 1.0)
+    if look.lamps:
+        side = rng.choice([-1.0, 1.0])
+        for s in np.arange(0.0, length, LAMP_STEP_M):
+            site.want(lamp(), float(s), side * (wall + 1.0), 0.6)
+    site.stand()
+    return _gathered(site)
+
+
+def _gathered(site: _Site) -> dict[str, Surface]:
+    """The triangles of all props by the name of their material."""
+    small = [_area(part) < SMALL_M2 for part in site.parts]
+    surfaces = {}
+    for number, material in enumerate(MATERIALS):
+        parts = [part[part[:, 11] == number, :11] for part in site.parts]
+        used = [k for k, part in enumerate(parts) if len(part)]
+        if used:
+            surfaces[material] = _surface(
+                [parts[k] for k in used],
+                np.array([site.s[k] for k in used]),
+                np.array([small[k] for k in used]),
+            )
+    return surfaces
+
+
+def _surface(parts: list[FloatArray], s: FloatArray, small: NDArray[np.bool_]) -> Surface:
+    """Triangles of one material in order of s, with a chunk every CHUNK_M; in each chunk those of
+    small props last, which the second level of detail leaves out."""
+    cell = (s / CHUNK_M).astype(np.int64)
+    order = np.lexsort((s, small, cell))
+    sizes = np.array([len(part) for part in parts])[order]
+    vertices = np.concatenate([parts[k] for k in order])
+    starts = np.flatnonzero(np.diff(cell[order], prepend=-1))
+    first = (np.cumsum(sizes) - sizes)[starts]
+    count = np.stack(
+        [np.add.reduceat(sizes, starts), np.add.reduceat(np.where(small[order], 0, sizes), starts)]
+    )
+    low = np.minimum.reduceat(vertices[:, :3], first, axis=0)
+    high = np.maximum.reduceat(vertices[:, :3], first, axis=0)
+    chunks = Chunks(
+        (low + high) / 2.0,
+        np.linalg.norm(high - low, axis=1) / 2.0,
+        np.stack([first, first]).astype(np.int64),
+        count.astype(np.int64),
+        (SMALL_REACH_M, REACH_M),
+    )
+    indices = np.arange(len(vertices), dtype=np.uint32)
+    return Surface(vertices.astype(np.float32), indices, chunks)
+
+
+def _area(triangles: FloatArray) -> float:
+    """Area (m2) of triangles (3 T, ...) that begin with places."""
+    a, b, c = (triangles[k::3, :3] for k in range(3))
+    return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2.0)

@@ -1,0 +1,173 @@
+"""The road as triangles: a ribbon of rows across the track, with (s, y) carried to every pixel.
+
+World frame, metres; s along the centre line, y left positive. Rows lie close enough that the chord
+between two of them leaves the true arc by less than `SAGITTA_M`, so what the shader paints at
+(s, y) stands where the geometry says.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from simulator.camera.core.mesh import Surface
+from simulator.camera.scene.strips import LEVELS, Level, strip
+from simulator.camera.scene.terrain import CentreLine, Survey, Terrain
+from simulator.track.road import Road
+
+FloatArray = NDArray[np.float64]
+
+SAGITTA_M = 0.0025
+LONGEST_ROW_M = 4.0
+TWIST_M = 0.004
+"""Two triangles miss the twisted road plane between two rows by no more."""
+SKIRT_M = 10.0
+"""How far the ribbon reaches into the land beyond the wall."""
+KERB_CURVATURE = 1.0 / 220.0
+SKIRT_WEIGHT, KERB_WEIGHT = 0.05, 0.3
+"""What an error there counts beside one of the road."""
+_ASPHALT = ((3, 4),)
+_LEFT, _RIGHT = ((0, 1), (1, 2), (2, 3)), ((4, 5), (5, 6), (6, 7))
+_FAR = ((0, 2), (2, 3), (4, 5), (5, 7))
+VERGE = (Level(30.0, 0.04, 12.0), Level(90.0, 0.1, 24.0), Level(300.0, 0.3, 48.0))
+"""Beside the asphalt nobody looks so closely."""
+LAP_M, LAP_DOWN_M, RISE_WEIGHT = 0.3, 0.06, 4.0
+"""How far the verge reaches in under the asphalt, how far below it, and what an error in height
+counts beside it, so that it never comes out on top."""
+
+
+@dataclass(frozen=True)
+class Ribbon:
+    """Places of the road: rows `s` (R,), lateral columns `y` (R, C) and points (R, C, 3)."""
+
+    s: FloatArray
+    y: FloatArray
+    points: FloatArray
+    curvature: FloatArray
+    wall: tuple[int, int]
+    """Columns of the left and the right wall line."""
+
+    def ground(self, row: NDArray[np.intp], offset: FloatArray) -> FloatArray:
+        """Height of the ribbon's surface at lateral `offset` of a row, by the nearest columns."""
+        y, z = self.y[row], self.points[row, :, 2]
+        column = np.clip(np.sum(y > offset[:, None], axis=1), 1, y.shape[1] - 1)
+        pick = np.arange(len(row))
+        y0, y1 = y[pick, column - 1], y[pick, column]
+        share = np.clip((offset - y0) / np.minimum(y1 - y0, -1e-6), 0.0, 1.0)
+        return np.asarray(z[pick, column - 1] + share * (z[pick, column] - z[pick, column - 1]))
+
+
+def rows_of(road: Road) -> FloatArray:
+    """Places s of the rows, from 0 to the track's length, both included."""
+    track = road.track
+    radius = 1.0 / np.maximum(np.abs(track.curvature0), 1e-9)
+    step = np.sqrt(8.0 * radius * SAGITTA_M)
+    twist = np.abs(track.z_left1 - track.z_right1 - track.z_left0 + track.z_right0)
+    widest = max(2.0 * road.half_asphalt, road.wall_offset - road.half_asphalt)
+    twist *= widest / track.width / track.length
+    step = np.minimum(step, 4.0 * TWIST_M / np.maximum(twist, 1e-9))
+    step = np.clip(step, 0.3, LONGEST_ROW_M)
+    parts = np.maximum(1, np.ceil(track.length / step)).astype(np.intp)
+    start = np.repeat(track.s0, parts)
+    size = np.repeat(track.length / parts, parts)
+    number = np.arange(len(start)) - np.repeat(np.cumsum(parts) - parts, parts)
+    return np.append(start + size * number, track.length_m)
+
+
+def build(road: Road, line: CentreLine, terrain: Terrain) -> Ribbon:
+    """Lay the ribbon and let its skirts run out into the land."""
+    s = rows_of(road)
+    pose = road.track.at(s)
+    wall = road.wall_offset
+    left = _skirt(road, line, s, pose.curvature, 1.0)
+    right = _skirt(road, line, s, pose.curvature, -1.0)
+    middle = np.array([wall, road.half_asphalt, -road.half_asphalt, -wall])
+    y = np.empty((len(s), len(middle) + 4))
+    y[:, 2:-2] = middle
+    y[:, 0], y[:, 1] = wall + left, wall + 0.35 * left
+    y[:, -1], y[:, -2] = -wall - right, -wall - 0.35 * right
+    flat = road.track.at(s[:, None], y)
+    points = np.stack([flat.x, flat.y, flat.z], axis=-1)
+    for outer, between, edge in ((0, 1, 2), (-1, -2, -3)):
+        land = terrain.height(points[:, outer, 0], points[:, outer, 1]) - 0.6
+        points[:, outer, 2] = np.minimum(land, points[:, edge, 2] + 4.0)
+        rise = points[:, outer, 2] - points[:, edge, 2]
+        points[:, between, 2] = points[:, edge, 2] + 0.12 * rise - 0.05
+    return Ribbon(s, y, points, pose.curvature, (2, y.shape[1] - 3))
+
+
+def _skirt(
+    road: Road, line: CentreLine, s: FloatArray, curvature: FloatArray, side: float
+) -> FloatArray:
+    """Width of the skirt on one side (+1 left): never over another part of the road."""
+    width = np.full(len(s), 0.4)
+    for share in (0.25, 0.5, 0.75, 1.0):
+        offset = road.wall_offset + SKIRT_M * share
+        pose = road.track.at(s, side * offset)
+        clear = line.distance(pose.x, pose.y) > offset - 1.0
+        # Beyond the centre of a bend the ribbon would fold over.
+        clear &= curvature * side * offset < 0.85
+        width = np.where(clear & (width >= SKIRT_M * (share - 0.25) - 0.1), SKIRT_M * share, width)
+    # A width that jumps would tear the skirt's edge; the narrowest neighbour counts.
+    for _ in range(2):
+        width = np.minimum(width, np.minimum(np.roll(width, 1), np.roll(width, -1)))
+    return width
+
+
+def covers(ribbon: Ribbon, survey: Survey, margin_m: float) -> NDArray[np.bool_]:
+    """Which points of the grid (rows, columns) the ribbon covers, `margin_m` within its edges."""
+    row = np.clip(np.searchsorted(ribbon.s, survey.line.s), 1, len(ribbon.s) - 1)[survey.sample]
+    reach = np.minimum(ribbon.y[:, 0], -ribbon.y[:, -1])
+    return np.asarray(survey.near < np.minimum(reach[row - 1], reach[row]) - margin_m)
+
+
+def surfaces(ribbon: Ribbon, road: Road) -> tuple[Surface, Surface]:
+    """The asphalt's triangles and those beside it; a vertex is x, y, z, s, y, normal (3), kerb."""
+    rows, columns = ribbon.y.shape
+    vertices = np.empty((rows, columns, 9), dtype=np.float32)
+    vertices[..., 0:3] = ribbon.points
+    vertices[..., 3] = ribbon.s[:, None]
+    vertices[..., 4] = ribbon.y
+    vertices[..., 5:8] = _normals(ribbon)
+    vertices[..., 8] = _kerb(ribbon, road)[:, None]
+    kerb = vertices[:, 0, 8]
+    profile = np.column_stack([ribbon.points[:, 2:-2].reshape(rows, -1), KERB_WEIGHT * kerb])
+    asphalt = strip(vertices, ribbon.points, ribbon.s, profile, [_ASPHALT] * len(LEVELS))
+    weight = np.tile([1.0, 1.0, RISE_WEIGHT], (columns, 1))
+    weight[[0, 1, -2, -1]] = SKIRT_WEIGHT
+    places = (ribbon.points * weight).reshape(rows, -1)
+    profile = np.column_stack([places, KERB_WEIGHT * kerb])
+    cells = [(*_LEFT, *_RIGHT), _FAR, _FAR]
+    beside = strip(_lapped(vertices), ribbon.points, ribbon.s, profile, cells, VERGE)
+    return asphalt, beside
+
+
+def _lapped(vertices: NDArray[np.float32]) -> NDArray[np.float32]:
+    """The same, the verge's inner edges moved in under the asphalt: no gap opens between rows of
+    unlike detail."""
+    vertices = vertices.copy()
+    for inner, outer in ((3, 2), (4, 5)):
+        step = np.sign(vertices[:, inner, 4] - vertices[:, outer, 4])[:, None] * LAP_M
+        across = vertices[:, inner, :5] - vertices[:, outer, :5]
+        vertices[:, inner, :5] += across / across[:, 4:] * step
+        vertices[:, inner, 2] -= LAP_DOWN_M
+    return vertices
+
+
+def _normals(ribbon: Ribbon) -> FloatArray:
+    along = np.gradient(ribbon.points, axis=0)
+    left, right = ribbon.points[:, 2:3], ribbon.points[:, -3:-2]
+    across = np.broadcast_to(left - right, ribbon.points.shape).copy()
+    across[:, :2] = ribbon.points[:, :1] - ribbon.points[:, 2:3]
+    across[:, -2:] = ribbon.points[:, -3:-2] - ribbon.points[:, -1:]
+    normal = np.cross(along, across)
+    return np.asarray(normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-9))
+
+
+def _kerb(ribbon: Ribbon, road: Road) -> FloatArray:
+    """1 where kerbs stand beside the asphalt, 0 elsewhere, with short ramps between."""
+    bend = np.abs(ribbon.curvature) > KERB_CURVATURE
+    kerb = bend.astype(np.float64) * float(road.track.markings.kerbs)
+    for _ in range(2):
+        kerb = np.maximum(kerb, 0.5 * (np.roll(kerb, 1) + np.roll(kerb, -1)))
+    return kerb

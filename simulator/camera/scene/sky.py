@@ -1,0 +1,79 @@
+"""The sky: worked out once a scene on a panorama, which each picture shows on a dome round the eye.
+
+A sky depends on the direction alone, so clouds and glow need not be worked out at every pixel of
+every frame. Panorama and dome have the same triangles, so a direction finds exactly its texel.
+"""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from simulator.camera.core.context import SKY_UNIT, Graphics
+
+SECTORS = 12
+_ROWS = ((-90, 0.0), (-8, 0.02), (12, 0.32), (45, 0.70), (90, 1.0))
+"""Elevation (deg) and height in the panorama of the dome's rows: finest over the horizon."""
+_SHARPNESS = 0.9
+"""Texels a pixel in the middle of the picture, about."""
+_WIDTHS = (1024, 4096)
+
+
+class Sky:
+    """The sky of one light, sharp enough for pictures of focal length `focal_px`. The uniform block
+    of the frame must hold the light."""
+
+    def __init__(self, graphics: Graphics, weather: str, focal_px: float) -> None:
+        context = graphics.context
+        self._texture = context.texture(_panorama_size(focal_px), 4)
+        self._texture.filter = (context.LINEAR, context.LINEAR)
+        self._texture.repeat_y = False
+        self._buffer = context.buffer(_dome().tobytes())
+        layout = (self._buffer, "3f 2f", "direction", "place")
+        self._array = context.vertex_array(graphics.programs["dome"], [layout])
+        program = graphics.programs[graphics.weathered("sky", weather)]
+        panorama = context.framebuffer([self._texture])
+        painter = context.vertex_array(program, [layout])
+        panorama.use()
+        context.enable_only(context.NOTHING)
+        graphics.use_textures()
+        painter.render()
+        painter.release()
+        panorama.release()
+
+    def draw(self) -> None:
+        """Paint the sky where nothing stands before it."""
+        self._texture.use(SKY_UNIT)
+        self._array.render()
+
+    def release(self) -> None:
+        """Free the graphics memory."""
+        for thing in (self._array, self._buffer, self._texture):
+            thing.release()
+
+
+def _panorama_size(focal_px: float) -> tuple[int, int]:
+    wanted = 2.0 * math.pi * focal_px * _SHARPNESS
+    width = int(np.clip(2 ** math.ceil(math.log2(wanted)), *_WIDTHS))
+    return width, width // 4
+
+
+def _dome() -> NDArray[np.float32]:
+    """Triangles round the eye (n, 5): direction, place in the panorama (0 to 1)."""
+    azimuth = np.linspace(-np.pi, np.pi, SECTORS + 1)
+    elevation, height = np.radians([row[0] for row in _ROWS]), [row[1] for row in _ROWS]
+    grid = np.empty((len(_ROWS), SECTORS + 1, 5), dtype=np.float32)
+    grid[..., 0] = np.cos(elevation)[:, None] * np.cos(azimuth)
+    grid[..., 1] = np.cos(elevation)[:, None] * np.sin(azimuth)
+    grid[..., 2] = np.sin(elevation)[:, None]
+    grid[..., 3] = np.arange(SECTORS + 1) / SECTORS
+    grid[..., 4] = np.array(height)[:, None]
+    corners = [
+        grid[:-1, :-1],
+        grid[:-1, 1:],
+        grid[1:, :-1],
+        grid[1:, :-1],
+        grid[:-1, 1:],
+        grid[1:, 1:],
+    ]
+    return np.ascontiguousarray(np.stack(corners, axis=2).reshape(-1, 5))

@@ -1,0 +1,111 @@
+"""Strips along the road as triangles: grids of rows across it, in levels of detail, in chunks.
+
+What a software renderer pays for is triangles that cover less than a block of 4 x 4 pixels, so
+rows are left out where the ones kept still say the same.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from simulator.camera.core.mesh import Chunks, Surface
+
+FloatArray = NDArray[np.float64]
+
+CHUNK_ROWS = 16
+_STEPS = (16, 8, 4, 2, 1)
+
+
+@dataclass(frozen=True)
+class Level:
+    """A level of detail, up to `reach_m` from the eye: rows are left out as long as that changes
+    no place by more than `error_m` and makes no triangle longer than `longest_m`."""
+
+    reach_m: float
+    error_m: float
+    longest_m: float
+
+
+LEVELS = (
+    Level(35.0, 0.003, 8.0),
+    Level(100.0, 0.02, 16.0),
+    Level(300.0, 0.08, 32.0),
+    Level(650.0, 0.3, 64.0),
+)
+"""A quarter of a pixel of the driver's view, about; and light and air change evenly over a row."""
+
+
+def strip(
+    vertices: NDArray[np.float32],
+    points: FloatArray,
+    s: FloatArray,
+    profile: FloatArray,
+    cells: Sequence[Sequence[tuple[int, int]]],
+    levels: Sequence[Level] = LEVELS,
+) -> Surface:
+    """Triangles between the rows of a vertex grid (R, C, F) at `points` (R, C, 3) and places `s`.
+
+    `profile` (R, K) is what rows must tell, in metres; level k joins the pairs of columns
+    `cells[k]`. Rows that bound a chunk stay, so neighbours of unlike levels meet.
+    """
+    rows, columns = vertices.shape[:2]
+    starts = np.arange(0, rows - 1, CHUNK_ROWS)
+    ends = np.minimum(starts + CHUNK_ROWS, rows - 1)
+    steps = _steps(s, profile, starts, ends, levels)
+    row = np.arange(rows)
+    chunk = np.minimum(row // CHUNK_ROWS, len(starts) - 1)
+    indices = []
+    first, count = np.empty((2, len(levels), len(starts)), dtype=np.int64)
+    for k, pairs in enumerate(cells):
+        kept = row[((row - starts[chunk]) % steps[k, chunk] == 0) | (row == rows - 1)]
+        indices.append(_between(kept, columns, np.array(pairs)))
+        begin, end = np.searchsorted(kept, starts), np.searchsorted(kept, ends)
+        first[k] = sum(len(part) for part in indices[:-1]) + begin * len(pairs) * 6
+        count[k] = (end - begin) * len(pairs) * 6
+    low = np.minimum(np.minimum.reduceat(points.min(axis=1), starts), points[ends].min(axis=1))
+    high = np.maximum(np.maximum.reduceat(points.max(axis=1), starts), points[ends].max(axis=1))
+    return Surface(
+        np.ascontiguousarray(vertices.reshape(rows * columns, -1)),
+        np.concatenate(indices),
+        Chunks(
+            (low + high) / 2.0,
+            np.linalg.norm(high - low, axis=1) / 2.0,
+            first,
+            count,
+            tuple(level.reach_m for level in levels),
+        ),
+    )
+
+
+def _steps(
+    s: FloatArray,
+    profile: FloatArray,
+    starts: NDArray[np.intp],
+    ends: NDArray[np.intp],
+    levels: Sequence[Level],
+) -> NDArray[np.intp]:
+    """How many rows on the next kept row lies, (levels, chunks)."""
+    steps = np.ones((len(levels), len(starts)), dtype=np.intp)
+    row = np.arange(len(s) - 1)
+    chunk = row // CHUNK_ROWS
+    for step in reversed(_STEPS[:-1]):
+        before = starts[chunk] + (row - starts[chunk]) // step * step
+        after = np.minimum(before + step, ends[chunk])
+        length = s[after] - s[before]
+        share = ((s[row] - s[before]) / np.maximum(length, 1e-9))[:, None]
+        between = profile[before] + share * (profile[after] - profile[before])
+        error = np.maximum.reduceat(np.abs(between - profile[row]).max(axis=1), starts)
+        longest = np.maximum.reduceat(length, starts)
+        for k, level in enumerate(levels):
+            steps[k, (error <= level.error_m) & (longest <= level.longest_m)] = step
+    return steps
+
+
+def _between(rows: NDArray[np.intp], columns: int, sides: NDArray[np.intp]) -> NDArray[np.uint32]:
+    """Indices of two triangles for each pair of columns (n, 2) between consecutive `rows`; the
+    last corner, which says what is the same all over a triangle, is of the row before."""
+    near, far = columns * rows[:-1, None, None] + sides, columns * rows[1:, None, None] + sides
+    corners = [near[..., 0], far[..., 0], near[..., 1], far[..., 0], far[..., 1], near[..., 1]]
+    return np.stack(corners, axis=-1).reshape(-1).astype(np.uint32)

@@ -1,0 +1,209 @@
+"""The land round a track: a height grid that meets the road and rolls away from it.
+
+World frame, metres. Under the road the grid is sunk, so that no corner of it comes up through the
+asphalt; the ribbon's skirts (see `ribbon`) cover the join.
+"""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from simulator.camera.scene.themes import Look
+from simulator.track.road import Road
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
+
+FloatArray = NDArray[np.float64]
+
+CELL_M = 8.0
+COARSEST = 8
+"""The grid is whole in cells so many times as wide."""
+MARGIN_M = 400.0
+MAX_CELLS = 1200
+SAMPLE_M = 2.0
+SINK_M = 0.9
+SEA_BELOW_M = 3.0
+"""The sea lies so far below the lowest place of the road."""
+SHORE_M = (14.0, 75.0)
+"""From the wall line outwards the land falls to the sea between these."""
+BANK_SLOPE = 0.55
+"""No land rises from the roadside more steeply than this."""
+
+
+@dataclass(frozen=True)
+class CentreLine:
+    """Samples of a road's centre line, every `SAMPLE_M`, with a tree to search them."""
+
+    s: FloatArray
+    x: FloatArray
+    y: FloatArray
+    heading: FloatArray
+    tree: "cKDTree"
+
+    @classmethod
+    def of(cls, road: Road) -> "CentreLine":
+        """Sample `road`."""
+        length = road.track.length_m
+        s = np.arange(0.0, length, length / max(8, round(length / SAMPLE_M)))
+        pose = road.track.at(s)
+        from scipy.spatial import cKDTree  # costs 0.2 s, which a check of a light need not pay
+
+        tree = cKDTree(np.stack([pose.x, pose.y], axis=1))
+        return cls(s, pose.x, pose.y, pose.heading, tree)
+
+    def distance(self, x: FloatArray, y: FloatArray) -> FloatArray:
+        """Distance (m) from points to the nearest centre-line sample."""
+        near, _ = self.tree.query(np.stack([x, y], axis=-1))
+        return np.asarray(near, dtype=np.float64)
+
+
+@dataclass(frozen=True)
+class Survey:
+    """What the road alone says of the land round it: the same in every scenery.
+
+    The grid (rows y, columns x) from (x0, y0), and of each of its points: the greatest height that
+    keeps the road clear, the road's height spread out to it, the distance to the road and the
+    nearest sample of its centre line.
+    """
+
+    line: CentreLine
+    x0: float
+    y0: float
+    cell: float
+    cap: FloatArray
+    base: FloatArray
+    near: FloatArray
+    sample: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, road: Road) -> "Survey":
+        """Survey the land round `road`."""
+        line = CentreLine.of(road)
+        span = max(np.ptp(line.x), np.ptp(line.y)) + 2 * MARGIN_M
+        cell = max(CELL_M, span / MAX_CELLS)
+        x0, y0 = line.x.min() - MARGIN_M, line.y.min() - MARGIN_M
+        columns = COARSEST * int(np.ceil((np.ptp(line.x) + 2 * MARGIN_M) / cell / COARSEST)) + 1
+        rows = COARSEST * int(np.ceil((np.ptp(line.y) + 2 * MARGIN_M) / cell / COARSEST)) + 1
+        shape = (rows, columns)
+        cap = _road_cap(road, line, x0, y0, cell, shape)
+        spread = _spread(road, line, x0, y0, cell, shape)
+        return cls(line, float(x0), float(y0), float(cell), cap, *spread)
+
+
+@dataclass(frozen=True)
+class Terrain:
+    """Heights `z` (rows y, columns x) on a square grid from (x0, y0)."""
+
+    x0: float
+    y0: float
+    cell: float
+    z: FloatArray
+    sea: float = -np.inf
+    """Level of the sea, where there is one."""
+
+    def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
+        """Height at points, on the triangles that are drawn."""
+        return between(self.z, (x - self.x0) / self.cell, (y - self.y0) / self.cell)
+
+    def normals(self) -> FloatArray:
+        """Unit normals (rows, columns, 3)."""
+        slope_y, slope_x = np.gradient(self.z, self.cell)
+        normal = np.stack([-slope_x, -slope_y, np.ones_like(self.z)], axis=-1)
+        return np.asarray(normal / np.linalg.norm(normal, axis=-1, keepdims=True))
+
+
+def between(z: FloatArray, u: FloatArray, v: FloatArray) -> FloatArray:
+    """Height at column `u` and row `v` of the grid `z`, on the triangles that are drawn."""
+    rows, columns = z.shape
+    u, v = np.clip(u, 0.0, columns - 1.001), np.clip(v, 0.0, rows - 1.001)
+    i, j = u.astype(np.intp), v.astype(np.intp)
+    fu, fv = u - i, v - j
+    z00, z10 = z[j, i], z[j, i + 1]
+    z01, z11 = z[j + 1, i], z[j + 1, i + 1]
+    # The cell's diagonal runs from (1, 0) to (0, 1).
+    low = z00 + (z10 - z00) * fu + (z01 - z00) * fv
+    high = z11 + (z01 - z11) * (1.0 - fu) + (z10 - z11) * (1.0 - fv)
+    return np.where(fu + fv <= 1.0, low, high)
+
+
+def build(road: Road, survey: Survey, look: Look, rng: np.random.Generator) -> Terrain:
+    """The land round `road` in the style of `look`."""
+    line, near, base = survey.line, survey.near, survey.base
+    x0, y0, cell, shape = survey.x0, survey.y0, survey.cell, survey.near.shape
+    rolling = _rolling(shape, cell, rng) * look.hills_m
+    away = np.clip((near - road.wall_offset - 5.0) / 110.0, 0.0, 1.0)
+    natural = base + rolling * away * away * (3.0 - 2.0 * away)
+    if not look.sea:
+        return Terrain(x0, y0, cell, np.minimum(natural, survey.cap))
+    sea = float(road.track.at(line.s).z.min()) - SEA_BELOW_M
+    fall = np.clip((near - road.wall_offset - SHORE_M[0]) / (SHORE_M[1] - SHORE_M[0]), 0.0, 1.0)
+    fall *= fall * (3.0 - 2.0 * fall) * _outside(line, x0, y0, cell, shape)
+    natural += (sea - 4.0 - natural) * fall
+    return Terrain(x0, y0, cell, np.maximum(np.minimum(natural, survey.cap), sea), sea)
+
+
+def _road_cap(
+    road: Road, line: CentreLine, x0: float, y0: float, cell: float, shape: tuple[int, int]
+) -> FloatArray:
+    """The greatest height each grid point may have, so that every road stays clear."""
+    reach = road.wall_offset + 5.0 + 50.0
+    offsets = np.arange(-reach, reach + 0.5 * cell, 0.6 * cell)
+    s = line.s[:: max(1, round(0.6 * cell / SAMPLE_M))]
+    side = np.clip(offsets, -road.wall_offset, road.wall_offset)
+    pose = road.track.at(s[:, None], offsets[None, :])
+    plane = road.track.at(s[:, None], side[None, :]).z
+    limit = plane - SINK_M + BANK_SLOPE * np.maximum(np.abs(offsets) - road.wall_offset - 4.0, 0.0)
+    cap = np.full(shape, np.inf)
+    i = np.rint((pose.x - x0) / cell).astype(np.intp)
+    j = np.rint((pose.y - y0) / cell).astype(np.intp)
+    inside = (i >= 0) & (i < shape[1]) & (j >= 0) & (j < shape[0])
+    np.minimum.at(cap, (j[inside], i[inside]), limit[inside])
+    # A sample speaks for its neighbours too: erosion is the minimum over 3 x 3.
+    finite = np.where(np.isfinite(cap), cap, 1e9).astype(np.float32)
+    return np.asarray(cv2.erode(finite, np.ones((3, 3), np.uint8)), dtype=np.float64)
+
+
+def _spread(
+    road: Road, line: CentreLine, x0: float, y0: float, cell: float, shape: tuple[int, int]
+) -> tuple[FloatArray, FloatArray, NDArray[np.int64]]:
+    """Road heights spread smoothly over the grid; each point's distance to the road and the nearest
+    sample of its centre line."""
+    x = x0 + cell * np.arange(shape[1])
+    y = y0 + cell * np.arange(shape[0])
+    points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    near, index = line.tree.query(points)
+    height = road.track.at(line.s).z
+    nearest = height[index].reshape(shape).astype(np.float32)
+    near = near.reshape(shape)
+    # The nearest road's height jumps midway between two roads; blurring removes the step,
+    # a wide blur far out and a narrow one beside the road.
+    wide = cv2.GaussianBlur(nearest, (0, 0), 60.0 / cell)
+    narrow = cv2.GaussianBlur(nearest, (0, 0), 10.0 / cell)
+    far = np.clip((near - 25.0) / 60.0, 0.0, 1.0)
+    return narrow + (wide - narrow) * far, near, index.reshape(shape)
+
+
+def _outside(
+    line: CentreLine, x0: float, y0: float, cell: float, shape: tuple[int, int]
+) -> FloatArray:
+    """1 outside the loop that the road makes, 0 inside, with a soft step."""
+    loop = np.stack([(line.x - x0) / cell, (line.y - y0) / cell], axis=1)
+    inside = np.zeros(shape, dtype=np.float32)
+    cv2.fillPoly(inside, [np.rint(loop).astype(np.int32)], 1.0)
+    return np.asarray(1.0 - cv2.GaussianBlur(inside, (0, 0), 12.0 / cell), dtype=np.float64)
+
+
+def _rolling(shape: tuple[int, int], cell: float, rng: np.random.Generator) -> FloatArray:
+    """Smooth hills of standard deviation about a half, both signs."""
+    hills = np.zeros(shape)
+    for wavelength, weight in ((420.0, 0.45), (160.0, 0.2), (60.0, 0.06)):
+        knots = (int(shape[0] * cell / wavelength) + 3, int(shape[1] * cell / wavelength) + 3)
+        coarse = rng.standard_normal(knots).astype(np.float32)
+        size = (round(knots[1] * wavelength / cell), round(knots[0] * wavelength / cell))
+        fine = cv2.resize(coarse, size, interpolation=cv2.INTER_CUBIC)
+        hills += weight * fine[: shape[0], : shape[1]]
+    return hills

@@ -1,0 +1,181 @@
+"""Pictures of trees, painted once a process: one atlas of cells, sqrt-coded colour and alpha."""
+
+from functools import cache
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from simulator.camera.vegetation.outline import outline
+
+CELL = 128
+COLUMNS, ROWS = 4, 2
+KINDS: tuple[str, ...] = ("oak", "poplar", "pine", "fir", "palm", "bush", "crown", "birch")
+"""Cell of each kind, row by row; `crown` is any tree from above."""
+ASPECT = {
+    "oak": 0.95, "poplar": 0.36, "pine": 0.62, "fir": 0.5, "palm": 0.8, "bush": 1.5, "birch": 0.6,
+}  # fmt: skip
+"""Width over height of a tree of each kind."""
+
+_FINE = 2
+"""Cells are painted this many times as large, then averaged, for soft edges."""
+_BARK = np.array([70.0, 55.0, 42.0])
+Canvas = NDArray[np.float32]
+
+
+@cache
+def atlas() -> NDArray[np.uint8]:
+    """The atlas (ROWS * CELL, COLUMNS * CELL, 4); row 0 is the top of the first cells."""
+    rng = np.random.default_rng(77)
+    painters = {
+        "oak": _oak, "poplar": _poplar, "pine": _pine, "fir": _fir,
+        "palm": _palm, "bush": _bush, "crown": _crown, "birch": _birch,
+    }  # fmt: skip
+    sheet = np.zeros((ROWS * CELL, COLUMNS * CELL, 4), dtype=np.uint8)
+    for number, kind in enumerate(KINDS):
+        canvas = np.zeros((CELL * _FINE, CELL * _FINE, 4), dtype=np.float32)
+        painters[kind](canvas, rng)
+        row, column = divmod(number, COLUMNS)
+        top, left = row * CELL, column * CELL
+        sheet[top : top + CELL, left : left + CELL] = _finished(canvas)
+    return sheet
+
+
+def silhouettes() -> NDArray[np.uint8]:
+    """Outlines (kinds, CELL, CELL) of the trees, 255 where no light passes."""
+    alpha = atlas()[..., 3].reshape(ROWS, CELL, COLUMNS, CELL).transpose(0, 2, 1, 3)
+    return np.ascontiguousarray(alpha.reshape(-1, CELL, CELL))
+
+
+@cache
+def outlines() -> NDArray[np.float64]:
+    """Polygons (kinds, CORNERS, 2) round the pictures of the trees; see `outline`."""
+    return np.stack([outline(shape) for shape in silhouettes()])
+
+
+def _finished(canvas: Canvas) -> NDArray[np.uint8]:
+    """Averaged to cell size, with the leaf colour run out under the transparent rim."""
+    alpha = canvas[..., 3:]
+    premultiplied = np.concatenate([canvas[..., :3] * alpha, alpha], axis=-1)
+    small = cv2.resize(premultiplied, (CELL, CELL), interpolation=cv2.INTER_AREA)
+    spread = cv2.GaussianBlur(small, (0, 0), 6.0)
+    mean = premultiplied.sum(axis=(0, 1))
+    fallback = mean[:3] / mean[3]
+    colour = np.where(
+        small[..., 3:] > 0.02,
+        small[..., :3] / np.maximum(small[..., 3:], 0.02),
+        np.where(
+            spread[..., 3:] > 1e-3, spread[..., :3] / np.maximum(spread[..., 3:], 1e-3), fallback
+        ),
+    )
+    small_alpha = small[..., 3:] * 255.0
+    # A clear rim keeps neighbours from bleeding in through the mipmaps.
+    small_alpha[[0, 1, -1], :] = 0.0
+    small_alpha[:, [0, 1, -2, -1]] = 0.0
+    return np.concatenate([np.clip(colour, 0, 255), small_alpha], axis=-1).astype(np.uint8)
+
+
+def _disc(canvas: Canvas, x: float, y: float, radius: float, colour: NDArray[np.float64]) -> None:
+    """An opaque disc; x, y from the lower left in cell units 0 to 1."""
+    size = canvas.shape[0]
+    centre = (round(x * size), round((1.0 - y) * size))
+    cv2.circle(canvas, centre, max(1, round(radius * size)), (*colour.tolist(), 1.0), -1)
+
+
+def _trunk(canvas: Canvas, top: float, width: float, bark: NDArray[np.float64] = _BARK) -> None:
+    size = canvas.shape[0]
+    for k in range(24):
+        share = k / 23
+        thick = width * (1.0 - 0.5 * share)
+        left, right = round((0.5 - thick) * size), round((0.5 + thick) * size)
+        low = round((1.0 - top * share) * size)
+        cv2.line(canvas, (left, low), (right, low), (*bark.tolist(), 1.0), round(size * top / 18))
+
+
+def _leaves(
+    canvas: Canvas,
+    rng: np.random.Generator,
+    clusters: list[tuple[float, float, float, float]],
+    count: int,
+    leaf: float,
+    colour: tuple[float, float, float],
+) -> None:
+    """Discs in elliptic clusters (x, y, rx, ry): dark ones first, light ones above and last."""
+    base = np.array(colour)
+    spots = []
+    for x, y, rx, ry in clusters:
+        angle = rng.uniform(0, 2 * np.pi, count)
+        reach = np.sqrt(rng.uniform(0, 1, count))
+        u, v = reach * np.cos(angle), reach * np.sin(angle)
+        light = 0.62 + 0.30 * v + 0.12 * rng.standard_normal(count)
+        spots += list(zip(x + rx * u, y + ry * v, light, strict=True))
+    spots.sort(key=lambda spot: spot[2])
+    for x, y, light in spots:
+        shade = float(np.clip(light, 0.25, 1.15))
+        _disc(canvas, x, y, leaf * rng.uniform(0.6, 1.3), np.clip(base * shade, 0, 255))
+
+
+def _oak(canvas: Canvas, rng: np.random.Generator) -> None:
+    _trunk(canvas, 0.45, 0.028)
+    clusters = [(0.5, 0.62, 0.36, 0.26), (0.3, 0.5, 0.22, 0.16), (0.7, 0.5, 0.22, 0.17)]
+    clusters += [(0.42, 0.8, 0.24, 0.14), (0.6, 0.78, 0.22, 0.15)]
+    _leaves(canvas, rng, clusters, 210, 0.022, (96, 128, 58))
+
+
+def _poplar(canvas: Canvas, rng: np.random.Generator) -> None:
+    _trunk(canvas, 0.3, 0.05)
+    clusters = [(0.5, y, rx, 0.13) for y, rx in ((0.25, 0.28), (0.42, 0.38), (0.6, 0.36))]
+    clusters += [(0.5, 0.76, 0.26, 0.12), (0.5, 0.89, 0.13, 0.08)]
+    _leaves(canvas, rng, clusters, 150, 0.024, (88, 124, 56))
+
+
+def _pine(canvas: Canvas, rng: np.random.Generator) -> None:
+    _trunk(canvas, 0.85, 0.028, np.array([105.0, 72.0, 50.0]))
+    clusters = [
+        (0.5 + rng.uniform(-0.16, 0.16), y, 0.2 + 0.14 * (1 - abs(y - 0.62) * 3), 0.065)
+        for y in np.linspace(0.42, 0.92, 8)
+    ]
+    _leaves(canvas, rng, clusters, 90, 0.02, (66, 98, 58))
+
+
+def _fir(canvas: Canvas, rng: np.random.Generator) -> None:
+    _trunk(canvas, 0.2, 0.035)
+    for y in np.linspace(0.12, 0.95, 16):
+        half = 0.44 * (1.0 - (y - 0.1) / 0.9) + 0.03
+        for _ in range(130):
+            u = rng.uniform(-1, 1)
+            light = 0.55 + 0.35 * y + 0.2 * rng.standard_normal() - 0.12 * abs(u)
+            colour = np.array([58.0, 88.0, 55.0]) * np.clip(light, 0.3, 1.2)
+            drop = 0.075 * abs(u) + rng.uniform(-0.02, 0.02)
+            _disc(canvas, 0.5 + half * u, y - drop, 0.02, colour)
+
+
+def _palm(canvas: Canvas, rng: np.random.Generator) -> None:
+    _trunk(canvas, 0.74, 0.019, np.array([118.0, 98.0, 74.0]))
+    for angle in np.linspace(-0.5, np.pi + 0.5, 15):
+        reach = rng.uniform(0.3, 0.44)
+        bright = np.clip(0.8 + 0.25 * np.sin(angle) + 0.1 * rng.standard_normal(), 0.5, 1.2)
+        for share in np.linspace(0.0, 1.0, 30):
+            x = 0.5 + reach * share * np.cos(angle)
+            y = 0.74 + reach * share * np.sin(angle) * 0.7 - 0.3 * share * share * reach / 0.4
+            _disc(canvas, x, y, 0.036 * (1.15 - share), np.array([92.0, 122.0, 58.0]) * bright)
+
+
+def _bush(canvas: Canvas, rng: np.random.Generator) -> None:
+    clusters = [(x, 0.28, 0.2, 0.28) for x in (0.22, 0.4, 0.6, 0.78)]
+    clusters += [(0.5, 0.5, 0.26, 0.26), (0.34, 0.42, 0.2, 0.22)]
+    _leaves(canvas, rng, clusters, 110, 0.028, (92, 122, 60))
+
+
+def _crown(canvas: Canvas, rng: np.random.Generator) -> None:
+    clusters = [(0.5, 0.5, 0.36, 0.36), (0.5, 0.5, 0.2, 0.2)]
+    clusters += [
+        (0.5 + 0.28 * np.cos(a), 0.5 + 0.28 * np.sin(a), 0.15, 0.15) for a in np.arange(7) * 0.9
+    ]
+    _leaves(canvas, rng, clusters, 110, 0.026, (90, 124, 58))
+
+
+def _birch(canvas: Canvas, rng: np.random.Generator) -> None:
+    _trunk(canvas, 0.8, 0.018, np.array([178.0, 174.0, 164.0]))
+    clusters = [(0.5 + rng.uniform(-0.2, 0.2), y, 0.2, 0.09) for y in np.linspace(0.38, 0.88, 9)]
+    _leaves(canvas, rng, clusters, 90, 0.02, (116, 142, 66))

@@ -1,0 +1,129 @@
+"""Where trees stand: seeded, beside the road, never on any part of it. World frame, metres."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from simulator.camera.bridges.bridges import Bridge, free_of
+from simulator.camera.scene.road_mesh import Ribbon
+from simulator.camera.scene.roadside import ground_height, place_beside
+from simulator.camera.scene.terrain import CentreLine, Terrain
+from simulator.camera.scene.themes import Look
+from simulator.camera.vegetation import foliage
+from simulator.track.road import Road
+
+FloatArray = NDArray[np.float64]
+
+CLEAR_M = 1.6
+"""No trunk stands nearer to a wall line than this."""
+DRY_M = 1.5
+"""Nor lower above the sea."""
+HEIGHT_M = {
+    "oak": (6.0, 12.0), "poplar": (9.0, 17.0), "pine": (8.0, 16.0), "fir": (7.0, 18.0),
+    "palm": (6.0, 10.0), "bush": (1.2, 3.0), "birch": (7.0, 13.0),
+}  # fmt: skip
+
+LEAF_SHEDDING = ("oak", "poplar", "birch", "bush")
+"""Trees that turn yellow and red in autumn."""
+SHADY = ("oak", "birch", "pine", "fir")
+AVENUE_STEP_M, OVERHANG_M = 18.0, 2.5
+
+
+@dataclass(frozen=True)
+class Trees:
+    """N trees: feet (N, 3), width and height (N,), cell of the atlas, colour tint (N, 3) and
+    their place (s, offset) beside the road."""
+
+    feet: FloatArray
+    width: FloatArray
+    height: FloatArray
+    cell: NDArray[np.int64]
+    tint: FloatArray
+    s: FloatArray
+    offset: FloatArray
+
+
+def plant(
+    road: Road,
+    line: CentreLine,
+    ribbon: Ribbon,
+    terrain: Terrain,
+    look: Look,
+    bridges: Sequence[Bridge],
+    rng: np.random.Generator,
+    *,
+    avenue: bool,
+) -> Trees:
+    """The trees of a scene; they stand in groves, denser near the road.
+
+    `avenue` plants one more close behind each wall line, tall enough to meet over the road.
+    """
+    sites = [_groves(road, look, rng)]
+    if avenue:
+        sites.append(_avenue(road, look, np.random.default_rng(rng.integers(2**32))))
+    s, offset, kinds, size, overhang = (
+        np.concatenate(column) for column in zip(*sites, strict=True)
+    )
+    low, high = np.array([HEIGHT_M[kind] for kind in kinds]).reshape(-1, 2).T
+    height = low + (high - low) * size
+    width = height * np.array([foliage.ASPECT[kind] for kind in kinds])
+    width *= rng.uniform(0.85, 1.15, len(s))
+    free, x, y = place_beside(road, line, s, offset, CLEAR_M - 0.1)
+    # Branches may reach over the rail; over the lanes only where they are high enough.
+    near = np.abs(offset) - width / 2.0
+    keep = free & (near > road.half_asphalt - 0.5 - overhang) & free_of(bridges, x, y)
+    z = ground_height(ribbon, terrain, s, offset, x, y) - 0.12
+    keep &= z > terrain.sea + DRY_M
+    cell = np.array([foliage.KINDS.index(kind) for kind in kinds], dtype=np.int64)
+    season = rng.choice([0.0, 0.0, 0.0, 0.35, 1.0])
+    tint = _tints(rng, np.isin(kinds, LEAF_SHEDDING), float(season))
+    feet = np.stack([x, y, z], axis=1)
+    return Trees(
+        feet[keep], width[keep], height[keep], cell[keep], tint[keep], s[keep], offset[keep]
+    )
+
+
+Sites = tuple[FloatArray, FloatArray, NDArray[np.str_], FloatArray, FloatArray]
+"""Of N trees: s, offset, kind, size (0 to 1 of its kind's heights), and how far their crowns may
+reach over the asphalt."""
+
+
+def _groves(road: Road, look: Look, rng: np.random.Generator) -> Sites:
+    length = road.track.length_m
+    density = look.tree_density * rng.uniform(0.6, 1.3)
+    count = int(density * length / 100.0 * 2.0)
+    s = rng.uniform(0.0, length, count)
+    side = rng.choice([-1.0, 1.0], count)
+    reach = look.tree_reach_m * rng.beta(1.1, 2.0, count)
+    # Groves and clearings: waves along s thin the trees out.
+    phase = rng.uniform(0.0, 2 * np.pi, (3, 1))
+    waves = np.sin(phase + 2 * np.pi * s / np.array([[310.0], [137.0], [71.0]]) + side)
+    stay = rng.uniform(0.0, 1.0, count) < 1.0 + look.clearings * (waves.sum(axis=0) - 1.5)
+    kinds = rng.choice(np.array(look.trees), count)
+    offset = side * (road.wall_offset + CLEAR_M + reach)
+    size = rng.beta(2.0, 2.0, count)
+    return s[stay], offset[stay], kinds[stay], size[stay], np.zeros(int(stay.sum()))
+
+
+def _avenue(road: Road, look: Look, rng: np.random.Generator) -> Sites:
+    """Tall trees along both wall lines; the kinds that grow here and give shade, else pines."""
+    shady = [kind for kind in look.trees if kind in SHADY] or ["pine"]
+    step = road.track.length_m / max(1, round(road.track.length_m / AVENUE_STEP_M))
+    s = np.tile(np.arange(0.0, road.track.length_m - 0.5 * step, step), 2)
+    side = np.repeat([1.0, -1.0], len(s) // 2)
+    s = s + step * (rng.uniform(-0.35, 0.35, len(s)) + 0.25 * side)
+    offset = side * (road.wall_offset + CLEAR_M + rng.uniform(0.0, 2.5, len(s)))
+    size = rng.uniform(0.65, 1.0, len(s))
+    return s, offset, rng.choice(np.array(shady), len(s)), size, np.full(len(s), OVERHANG_M)
+
+
+def _tints(rng: np.random.Generator, sheds: NDArray[np.bool_], autumn: float) -> FloatArray:
+    """Colour factors (N, 3): each tree a little different, some that shed turned in autumn."""
+    count = len(sheds)
+    tone = rng.uniform(0.7, 1.25, (count, 1))
+    tint = tone * (1.0 + rng.uniform(-0.12, 0.12, (count, 3)))
+    turned = sheds & (rng.uniform(0.0, 1.0, count) < 0.6 * autumn)
+    tint[turned] *= np.array([2.0, 1.05, 0.5]) * rng.uniform(0.8, 1.1, (int(turned.sum()), 1))
+    return tint

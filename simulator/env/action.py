@@ -1,0 +1,58 @@
+"""Actions of the environments: the steering alone, or the paper's four commands."""
+
+from typing import Any, Literal
+
+import gymnasium as gym
+import numpy as np
+
+from simulator.vehicle.car import HIGHEST_GEAR, LOWEST_GEAR
+from simulator.vehicle.state import Command
+from trackfeatures.errors import UserError
+
+Controls = Literal["steer", "full"]
+
+THROTTLE, GEAR = 0.2, 1
+"""The paper holds both while it steers."""
+
+LIMITS = {
+    "steer": (-1.0, 1.0),
+    "throttle": (0.0, 1.0),
+    "brake": (0.0, 1.0),
+    "gear": (float(LOWEST_GEAR), float(HIGHEST_GEAR)),
+}
+NAMES: dict[str, tuple[str, ...]] = {"steer": ("steer",), "full": tuple(LIMITS)}
+
+
+def check_controls(controls: str) -> None:
+    """Raises UserError unless `controls` is one of NAMES."""
+    if controls not in NAMES:
+        raise UserError(f'controls is {controls!r}; choose "steer" or "full"')
+
+
+def action_space(controls: Controls) -> gym.spaces.Box:
+    """(1,) steering, or (4,) steering, throttle, brake and gear; float32."""
+    low, high = zip(*(LIMITS[name] for name in NAMES[controls]), strict=True)
+    return gym.spaces.Box(np.array(low, np.float32), np.array(high, np.float32))
+
+
+def to_command(action: Any, controls: Controls) -> Command:
+    """What `action` commands; the gear is rounded. Raises UserError for one out of the space."""
+    values = np.asarray(action, dtype=np.float64)
+    names = NAMES[controls]
+    if values.shape != (len(names),):
+        raise UserError(
+            f"the action is {action!r}; give {len(names)} number(s), shape ({len(names)},): "
+            f"{', '.join(names)}"
+        )
+    numbers = values.tolist()
+    for name, value in zip(names, numbers, strict=True):
+        low, high = LIMITS[name]
+        if not low <= value <= high:  # false for NaN too
+            raise UserError(
+                f"the action has {name} = {value:g}; give a finite number from {low:g} to "
+                f"{high:g} (gymnasium.wrappers.ClipAction clips for you)"
+            )
+    if controls == "steer":
+        return Command(steer=numbers[0], throttle=THROTTLE, gear=GEAR)
+    steer, throttle, brake, gear = numbers
+    return Command(steer=steer, throttle=throttle, brake=brake, gear=round(gear))

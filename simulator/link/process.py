@@ -1,0 +1,125 @@
+"""An engine from its options: makes the world, warms it up, serves until it is told to end."""
+
+import os
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from simulator.link.handshake import EngineInfo
+from simulator.link.layout import COMMAND, STATE, Mode, Request, image_bytes
+from simulator.link.segment import clear
+from simulator.link.server import Engine, Summary
+from simulator.link.simulation import Simulation
+from simulator.link.sync import futex
+from simulator.sensors.beams import BEAM_ANGLES
+from simulator.track.catalogue import find_track
+from simulator.track.road import Road
+from simulator.world.world import World
+from trackfeatures import LANE_WIDTH_M
+from trackfeatures.errors import UserError
+
+if TYPE_CHECKING:
+    from simulator.camera import Camera
+
+
+@dataclass(frozen=True)
+class LinkConfig:
+    """All that makes one engine."""
+
+    track: str = "circuit"
+    name: str = "/driverview"
+    lanes: int = 1
+    lane_width: float = LANE_WIDTH_M
+    traffic: int = 0
+    frequency_hz: int = 20
+    seed: int = 0
+    picture: tuple[int, int] = (0, 0)
+    """Width and height, (0, 0) for none."""
+    light: str = "clear"
+    tracks_dir: Path | None = None
+    realtime: bool = False
+    once: bool = False
+    patience_s: float = 600.0
+
+
+def run(config: LinkConfig, report: Callable[[str], None]) -> Summary:
+    """Serve until a client's request to quit or a KeyboardInterrupt; `report` is told what happens.
+
+    Raises UserError for what cannot be; ClientLost, see `Engine.serve`.
+    """
+    futex.check_system()
+    if not config.patience_s >= 0.0:  # NaN too
+        raise UserError(f"--patience is {config.patience_s}; give seconds, or 0 for any number")
+    clear(config.name)  # a name in use is told before the world is made
+    with ExitStack() as stack:
+        road = Road(find_track(config.track, config.tracks_dir), config.lanes, config.lane_width)
+        world = stack.enter_context(
+            World(road, traffic=config.traffic, frequency_hz=config.frequency_hz)
+        )
+        camera = stack.enter_context(_camera(road, config)) if config.picture[0] else None
+
+        def simulation(record: Any, image: NDArray[np.uint8]) -> Simulation:
+            return Simulation(world, record, image, seed=config.seed, camera=camera)
+
+        _warm_up(simulation, config)
+        engine = stack.enter_context(
+            Engine(
+                config.name,
+                describe(world, config),
+                simulation,
+                once=config.once,
+                patience_s=config.patience_s,
+                report=report,
+            )
+        )
+        report(f"{config.name}: {road.track.name} is ready for a client")
+        try:
+            engine.serve()
+        except KeyboardInterrupt:
+            report(f"{config.name}: stopped")
+        return engine.summary
+
+
+def describe(world: World, config: LinkConfig) -> EngineInfo:
+    """What the engine's clients are told of it."""
+    road = world.road
+    return EngineInfo(
+        track=road.track.name,
+        lanes=road.lanes,
+        lane_width=road.lane_width,
+        track_length=road.track.length_m,
+        half_width=road.half_width,
+        edge=road.edge,
+        steering_lock=world.car.steering_lock,
+        traffic=config.traffic,
+        frequency_hz=world.frequency_hz,
+        mode=Mode.REALTIME if config.realtime else Mode.LOCK_STEP,
+        image_width=config.picture[0],
+        image_height=config.picture[1],
+        engine_pid=os.getpid(),
+        beam_angles=tuple(BEAM_ANGLES.tolist()),
+    )
+
+
+def _warm_up(
+    simulation: Callable[[Any, NDArray[np.uint8]], Simulation], config: LinkConfig
+) -> None:
+    """Compile, and draw a first picture, before a client waits for it."""
+    state, command = np.zeros(1, STATE.dtype)[0], np.zeros(1, COMMAND.dtype)[0]
+    trial = simulation(state, np.zeros(image_bytes(*config.picture), np.uint8))
+    for request in (Request.RESET, Request.STEP):
+        command["request"], command["start_s"] = request, np.nan
+        trial.answer(command)
+
+
+def _camera(road: Road, config: LinkConfig) -> "Camera":
+    from simulator.camera import Camera, Light  # the renderer only where pictures are
+
+    light = Light.named(config.light, np.random.default_rng([config.seed, 2]))
+    width, height = config.picture
+    return Camera(road, seed=config.seed, light=light, width=width, height=height)

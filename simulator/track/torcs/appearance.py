@@ -1,0 +1,68 @@
+"""What an imported TORCS track looks like: told by its category, its surface, its name, its height.
+
+TORCS keeps scenery in 3D models, which are not read; a name that says nothing draws one of the
+looks that suit a track with, or without, kerbs.
+"""
+
+import hashlib
+from typing import Final
+
+from simulator.track.geometry import Surface
+from simulator.track.pieces import Placed
+from simulator.track.torcs.torcs_xml import Section
+
+MOUNTAIN_HEIGHT_M: Final = 55.0
+"""A track that climbs more than this gets mountain scenery."""
+NAMED: Final = (
+    ("mountain", ("alpine", "mountain", "pass", "hill")),
+    ("town", ("street", "city", "town")),
+    ("oval", ("speedway", "oval", "michigan")),
+    ("forest", ("forest", "wood", "skog", "aalborg")),
+    ("coast", ("coast", "beach", "corkscrew")),
+    ("highway", ("eroad", "highway", "motorway")),
+    ("countryside", ("ole-road", "spring")),
+    ("circuit", ("forza", "wheel", "brondehach")),
+)
+"""Looks by words in a track's name."""
+WITH_KERBS: Final = ("circuit", "forest", "circuit", "countryside")
+WITHOUT_KERBS: Final = ("countryside", "forest", "ring-road", "highway")
+
+
+def surface_and_look(
+    name: str, root: Section, main: Section, placed: Placed
+) -> tuple[Surface, str]:
+    """Surface and look of the track called `name`."""
+    surface = _surface(root, main)
+    if surface == "gravel":
+        return surface, "gravel"
+    if _category(root) == "oval":
+        return surface, "oval"
+    for look, words in NAMED:
+        if any(word in name.lower() for word in words):
+            return surface, look
+    middle = (placed.z_left0 + placed.z_right0) / 2.0
+    if float(middle.max() - middle.min()) > MOUNTAIN_HEIGHT_M:
+        return surface, "mountain"
+    looks = WITH_KERBS if has_kerbs(main) else WITHOUT_KERBS
+    return surface, looks[hashlib.sha256(name.encode()).digest()[4] % len(looks)]
+
+
+def has_kerbs(main: Section) -> bool:
+    """Whether any segment of the track has a kerb beside it."""
+    return any(
+        "curb" in (attribute.get("val") or "").lower()
+        for attribute in main.element.iter("attstr")
+        if attribute.get("name") in ("surface", "style")
+    )
+
+
+def _category(root: Section) -> str:
+    header = root.section("Header")
+    return (header.text("category") if header else None) or "road"
+
+
+def _surface(root: Section, main: Section) -> Surface:
+    name = (main.text("surface") or "").lower()
+    if _category(root) == "dirt" or "dirt" in name or "gravel" in name or "sand" in name:
+        return "gravel"
+    return "concrete" if "conc" in name else "asphalt"

@@ -1,0 +1,216 @@
+"""TORCS segments to pieces: profile steps, spirals, heights, banking, as TORCS 1.3.7 has them.
+
+Everything is in SI units and at the centre line; the program's own words are kept where it has
+one (`profil`). Attributes that TORCS does not know (misspelt ones, too) have no effect.
+"""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Final
+
+from simulator.track.errors import TrackError
+from simulator.track.pieces import Piece
+from simulator.track.torcs.torcs_xml import Section
+
+MAX_LENGTH_M: Final = 100_000.0
+MAX_ARC: Final = 4.0 * math.pi
+MAX_STEPS: Final = 100_000
+
+
+@dataclass(frozen=True)
+class Edges:
+    """A value for each edge of the road: a height (m) or a slope (dz/ds)."""
+
+    left: float
+    right: float
+
+    @property
+    def mean(self) -> float:
+        return (self.left + self.right) / 2.0
+
+
+@dataclass
+class Profile:
+    """What one segment hands on to the next: end heights, end slopes and the sticky grade."""
+
+    end: Edges
+    tangent: Edges
+    grade: float | None = None
+
+
+def read_pieces(segments: Section, main: Section, width: float) -> Iterator[Piece]:
+    """The pieces of all segments in order, each segment cut into its profile steps."""
+    global_step = main.number("profil steps length") or 0.0
+    profile = Profile(end=Edges(0.0, 0.0), tangent=Edges(0.0, 0.0))
+    for segment in segments.sections():
+        if segment.text("type") is not None:
+            yield from _segment_pieces(segment, profile, width, global_step)
+
+
+def _segment_pieces(
+    segment: Section, profile: Profile, width: float, global_step: float
+) -> Iterator[Piece]:
+    sign, radius, radius_end, length = _plan(segment)
+    start, end = _end_heights(segment, profile, width, length)
+    spline = (segment.text("profil") or "spline") == "spline"
+    steps = _step_count(segment, length, global_step) if spline else 1
+    tangents = _tangents(segment, profile, start, end, length, spline)
+    arc = 0.0 if sign == 0 else length / ((radius + radius_end) / 2.0)
+    lengths, radii = _steps(steps, length, radius, radius_end, arc)
+    z0 = start
+    for i in range(steps):
+        t = (i + 1) / steps
+        z1 = _hermite(start, end, tangents, length, t)
+        yield Piece(
+            lengths[i], sign / radii[i] if sign else 0.0, z0.left, z0.right, z1.left, z1.right
+        )
+        z0 = z1
+    profile.end, profile.tangent = end, tangents[1]
+
+
+def _plan(segment: Section) -> tuple[int, float, float, float]:
+    """Turning sign (1 left, 0 straight, -1 right), start and end radius, centre-line length."""
+    kind = segment.text("type")
+    if kind == "str":
+        length = segment.number("lg") or 0.0
+        _check_length(segment, "lg", length)
+        return 0, math.inf, math.inf, length
+    if kind not in ("lft", "rgt"):
+        raise TrackError(
+            f"{segment.file}: segment {segment.name!r} has the type {kind!r}, "
+            "expected str, lft or rgt"
+        )
+    radius = segment.number("radius") or 0.0
+    radius_end = segment.number("end radius")
+    radius_end = radius if radius_end is None else radius_end
+    arc = segment.number("arc") or 0.0
+    for name, value in (("radius", radius), ("end radius", radius_end), ("arc", arc)):
+        _check_length(segment, name, value)
+    if arc > MAX_ARC:
+        raise TrackError(
+            f"{segment.file}: segment {segment.name!r} turns by {math.degrees(arc):g} deg, "
+            f"expected at most {math.degrees(MAX_ARC):g}"
+        )
+    length = (radius + radius_end) / 2.0 * arc
+    _check_length(segment, "length", length)
+    return (1 if kind == "lft" else -1), radius, radius_end, length
+
+
+def _check_length(segment: Section, name: str, value: float) -> None:
+    if not 0.0 < value <= MAX_LENGTH_M:
+        raise TrackError(
+            f"{segment.file}: segment {segment.name!r} has the {name} {value:g}, "
+            f"expected more than 0 and at most {MAX_LENGTH_M:g}"
+        )
+
+
+def _end_heights(
+    segment: Section, profile: Profile, width: float, length: float
+) -> tuple[Edges, Edges]:
+    """Heights of both edges at the start and at the end of a segment."""
+    start = Edges(
+        _or(segment.number("z start left"), profile.end.left),
+        _or(segment.number("z start right"), profile.end.right),
+    )
+    end = Edges(
+        _or(segment.number("z end left"), profile.end.left),
+        _or(segment.number("z end right"), profile.end.right),
+    )
+    z_start, z_end = segment.number("z start"), segment.number("z end")
+    grade = segment.number("grade")
+    if grade is not None:
+        profile.grade = grade
+    if z_start is not None:
+        start = Edges(z_start, z_start)
+    middle_end = end.mean
+    if z_end is not None:
+        end = Edges(z_end, z_end)
+        middle_end = z_end
+    elif profile.grade is not None:
+        middle_end = start.mean + length * profile.grade
+    banking_start = segment.number("banking start")
+    banking_end = segment.number("banking end")
+    return (
+        _banked(start.mean, start, banking_start, width),
+        _banked(middle_end, end, banking_end, width),
+    )
+
+
+def _banked(middle: float, edges: Edges, banking: float | None, width: float) -> Edges:
+    # Without an angle of its own a segment keeps the height difference of its edges.
+    half = (edges.left - edges.right) / 2.0 if banking is None else math.tan(banking) * width / 2.0
+    return Edges(middle + half, middle - half)
+
+
+def _step_count(segment: Section, length: float, global_step: float) -> int:
+    steps = int(_or(segment.number("profil steps"), 1.0))
+    if steps == 1:
+        step_length = _or(segment.number("profil steps length"), global_step)
+        if step_length > 0.0:
+            steps = int(min(length / step_length, MAX_STEPS)) + 1
+    if not 1 <= steps <= MAX_STEPS:
+        raise TrackError(
+            f"{segment.file}: segment {segment.name!r} has {steps} profile steps, "
+            f"expected 1 to {MAX_STEPS}"
+        )
+    return steps
+
+
+def _tangents(
+    segment: Section, profile: Profile, start: Edges, end: Edges, length: float, spline: bool
+) -> tuple[Edges, Edges]:
+    """Slopes of both edges at the start and at the end of the profile."""
+    if not spline:
+        chord = Edges((end.left - start.left) / length, (end.right - start.right) / length)
+        return chord, chord
+    previous = profile.tangent
+    return (
+        _edge_slopes(segment, "profil start tangent", previous),
+        _edge_slopes(segment, "profil end tangent", previous),
+    )
+
+
+def _edge_slopes(segment: Section, name: str, default: Edges) -> Edges:
+    both = segment.number(name)
+    if both is not None:
+        return Edges(both, both)
+    return Edges(
+        _or(segment.number(f"{name} left"), default.left),
+        _or(segment.number(f"{name} right"), default.right),
+    )
+
+
+def _steps(
+    steps: int, length: float, radius: float, radius_end: float, arc: float
+) -> tuple[list[float], list[float]]:
+    """Length and radius of every step; a spiral's steps are scaled to turn by `arc` in all."""
+    step = length / steps
+    if radius == radius_end or steps == 1:
+        # One step knows the start radius only, so its length follows from the arc.
+        only = step if radius == radius_end else radius * arc
+        return [only] * steps, [radius] * steps
+    change = (radius_end - radius) / (steps - 1)
+    radii = [radius + i * change for i in range(steps)]
+    step *= arc / sum(step / r for r in radii)
+    return [step] * steps, radii
+
+
+def _hermite(
+    start: Edges, end: Edges, tangents: tuple[Edges, Edges], length: float, t: float
+) -> Edges:
+    """Cubic through both ends with the given slopes, at the share t of the segment."""
+    if t == 1.0:
+        return end
+    h_end = t * t * (3.0 - 2.0 * t)
+    h_t0 = t * (1.0 - t) ** 2 * length
+    h_t1 = t * t * (t - 1.0) * length
+    first, last = tangents
+    return Edges(
+        start.left + (end.left - start.left) * h_end + first.left * h_t0 + last.left * h_t1,
+        start.right + (end.right - start.right) * h_end + first.right * h_t0 + last.right * h_t1,
+    )
+
+
+def _or(value: float | None, default: float) -> float:
+    return default if value is None else value

@@ -1,0 +1,170 @@
+"""The car as one frozen record of parameters (SI units; body frame x forward, y left, z up).
+
+The figures are those of TORCS's car1-trb1, on which the paper drives. The paper's yaw inertia
+(2000 kg m2) and cornering stiffness (80 kN/rad a tyre) are not that car's: its recorded laps show
+1120 kg m2 and 125 kN/rad, and with the paper's it leaves the line by twice as much in the kink of
+g-track-3. The paper's stay where they are its controllers' model (`controllers.lqr`).
+"""
+
+from dataclasses import astuple, dataclass, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trackfeatures.errors import UserError
+
+GRAVITY = 9.81  # m/s2
+RPM = 60.0 / (2.0 * np.pi)  # rev/min per rad/s
+WHEELS = ("front_left", "front_right", "rear_left", "rear_right")
+TORQUE_RPM_STEP = 1000.0  # the torque table is given at 0, 1000, 2000, ... rev/min
+LOWEST_GEAR, HIGHEST_GEAR = -1, 6  # -1 reverse, 0 neutral
+
+
+@dataclass(frozen=True)
+class CarParameters:
+    """All that makes one car differ from another; the defaults are the paper's car."""
+
+    mass: float = 1150.0
+    """kg, without fuel."""
+    fuel: float = 80.0
+    """kg; it rides at the centre of gravity and is not used up."""
+    inertia: tuple[float, float, float] = (477.0, 868.0, 1113.0)
+    """kg m2 about x (roll), y (pitch) and z (yaw): of a box of the car's size, its length counted
+    with TORCS's mass repartition of 0.62."""
+    front_axle: float = 1.27
+    """m from the centre of gravity to the front axle, lf."""
+    rear_axle: float = 1.37
+    """m from the centre of gravity to the rear axle, lr."""
+    front_track: float = 1.68
+    rear_track: float = 1.60
+    cg_height: float = 0.25
+    """m above the road, at rest."""
+    length: float = 4.52
+    width: float = 1.94
+    height: float = 1.10
+
+    spring_front: float = 150_000.0
+    """N/m at the wheel."""
+    spring_rear: float = 150_000.0
+    damper_front: float = 7_000.0
+    """N s/m at the wheel."""
+    damper_rear: float = 7_000.0
+    anti_roll_front: float = 20_000.0
+    """N for each metre by which one wheel of the axle is pushed in further than the other."""
+    anti_roll_rear: float = 10_000.0
+    bump_travel: float = 0.08
+    """m of compression from rest to the bump stop."""
+    bump_spring: float = 600_000.0
+    """N/m added beyond the bump stop."""
+
+    wheel_radius: float = 0.3273
+    wheel_inertia: float = 1.2
+    """kg m2, one wheel."""
+    friction: float = 1.6
+    """Largest tyre force over its load at `working_load`, on ground of grip 1."""
+    tyre_stiffness: float = 20.0
+    """1/rad: slope of the tyre force at no slip, over its largest (Pacejka's B C)."""
+    tyre_shape: float = 1.41
+    """C of the magic formula (Pacejka, Tyre and Vehicle Dynamics, 4.3.1)."""
+    tyre_curvature: float = 0.7
+    """E of the magic formula."""
+    camber_gain_front: float = 1.048
+    """What the wheels' camber adds to the friction: 1 + 0.05 sin(18 camber), 4 deg."""
+    camber_gain_rear: float = 1.040
+    """3 deg."""
+    working_load: float = 1.2
+    """Load at which the tyre has its nominal friction, over the static one without fuel."""
+    friction_unloaded: float = 1.6
+    """Share of the nominal friction left (or gained) at no load ..."""
+    friction_overloaded: float = 0.8
+    """... and at any load; between them it falls exponentially."""
+    rolling_resistance: float = 0.001
+    """Over the load, on asphalt."""
+
+    steering_lock: float = 0.36652
+    """rad of the front wheels at steer = 1 (21 deg)."""
+    steering_rate: float = 6.2832
+    """rad/s of the front wheels (360 deg/s)."""
+
+    air_density: float = 1.23
+    drag_coefficient: float = 0.35
+    frontal_area: float = 1.92
+    wing_drag: float = 0.47
+    """m2: drag coefficient times area of the wings."""
+    lift_front: float = 1.79
+    """m2: downforce coefficient times area, at the front axle; wing and ground effect."""
+    lift_rear: float = 2.96
+
+    gears: tuple[float, float, float, float, float, float] = (3.0, 1.9, 1.4, 1.1, 0.9, 0.77)
+    reverse_gear: float = -4.0
+    final_drive: float = 4.5
+    driveline_efficiency: float = 0.984
+    engine_inertia: float = 0.02
+    """kg m2, at the crankshaft; fitted: in gear 1 TORCS's car is 6.3 % heavier than at rest."""
+    idle_rpm: float = 900.0
+    limiter_rpm: float = 9152.0
+    top_rpm: float = 10_000.0
+    """End of the torque table."""
+    torque: tuple[float, ...] = (
+        100.0, 160.0, 190.0, 280.0, 350.0, 405.0, 443.0, 465.0, 483.0, 415.0, 360.0,
+    )  # fmt: skip
+    """N m at full throttle at 0, 1000, ... 10000 rev/min."""
+    engine_braking: float = 0.33
+    """Share of the full-load torque that a closed throttle takes at `top_rpm`; none at idle."""
+    differential_viscosity: float = 30.0
+    """N m s/rad between the rear wheels."""
+
+    brake_torque: float = 9_000.0
+    """N m at full brake, four wheels together; enough to lock them."""
+    brake_front_share: float = 0.58
+
+    def __post_init__(self) -> None:
+        for name in ("mass", "front_axle", "rear_axle", "cg_height", "wheel_radius", "friction"):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value > 0):
+                raise UserError(f"car parameter {name} is {value}; give a number above 0")
+        if len(self.torque) != 11:
+            raise UserError(
+                f"the torque table has {len(self.torque)} values; give 11, at 0, 1000 ... 10000 rpm"
+            )
+
+    @property
+    def total_mass(self) -> float:
+        return self.mass + self.fuel
+
+    @property
+    def wheelbase(self) -> float:
+        return self.front_axle + self.rear_axle
+
+    @property
+    def static_loads(self) -> tuple[float, float]:
+        """N on one front and on one rear tyre, at rest on a level road."""
+        half_weight = 0.5 * self.total_mass * GRAVITY
+        return (
+            half_weight * self.rear_axle / self.wheelbase,
+            half_weight * self.front_axle / self.wheelbase,
+        )
+
+    def cornering_stiffness(self, front: bool, grip: float) -> float:
+        """N/rad of one tyre at its static load, on ground of this grip."""
+        load = self.static_loads[0 if front else 1]
+        share = load / (self.working_load * load * self.mass / self.total_mass)
+        spread = self.friction_unloaded - self.friction_overloaded
+        rate = np.log((1.0 - self.friction_overloaded) / spread)
+        nominal = self.friction_overloaded + spread * np.exp(rate * share)
+        gain = self.camber_gain_front if front else self.camber_gain_rear
+        return float(self.tyre_stiffness * self.friction * nominal * gain * grip * load)
+
+    def packed(self) -> NDArray[Any]:
+        """The parameters as a structured array of shape (1,), one field a parameter, for numba."""
+        layout = [
+            (field.name, "f8", (len(value),) if isinstance(value, tuple) else ())
+            for field, value in zip(fields(self), astuple(self), strict=True)
+        ]
+        layout += [(name, "f8", ()) for name in ("total_mass", "load_front", "load_rear")]
+        layout += [(name, "f8", ()) for name in ("working_front", "working_rear")]
+        front, rear = self.static_loads
+        nominal = self.working_load * self.mass / self.total_mass
+        derived = (self.total_mass, front, rear, nominal * front, nominal * rear)
+        return np.array([(*astuple(self), *derived)], dtype=layout)

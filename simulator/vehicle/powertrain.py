@@ -1,0 +1,51 @@
+"""Engine, gearbox and clutch: torque from speed and throttle. rad/s and N m."""
+
+from typing import Any
+
+from runtime.jit import compiled
+from simulator.vehicle.car import RPM, TORQUE_RPM_STEP
+
+
+@compiled
+def gear_ratio(p: Any, gear: int) -> float:
+    """Engine turns for one turn of the rear wheels; negative in reverse, 0 in neutral."""
+    if gear > 0:
+        return float(p.gears[gear - 1] * p.final_drive)
+    if gear < 0:
+        return float(p.reverse_gear * p.final_drive)
+    return 0.0
+
+
+@compiled
+def engine_torque(p: Any, speed: float, throttle: float) -> float:
+    """Torque (N m) at the crankshaft at `speed` rad/s.
+
+    As TORCS has it: the full-load curve times (throttle (1 + b) - b), where the engine braking b
+    grows linearly from 0 at idle. It fits the accelerations in TORCS's drives to 0.003 m/s2.
+    """
+    rpm = speed * RPM
+    place = min(max(rpm / TORQUE_RPM_STEP, 0.0), 9.999)
+    below = int(place)
+    full = p.torque[below] + (p.torque[below + 1] - p.torque[below]) * (place - below)
+    opened = 0.0 if rpm > p.limiter_rpm else throttle
+    braking = p.engine_braking * max(rpm - p.idle_rpm, 0.0) / (p.top_rpm - p.idle_rpm)
+    return float(full * (opened * (1.0 + braking) - braking))
+
+
+@compiled
+def free_engine_speed(p: Any, speed: float, throttle: float, dt: float) -> float:
+    """Speed (rad/s) after `dt` of an engine out of gear."""
+    faster = speed + dt * engine_torque(p, speed, throttle) / p.engine_inertia
+    return float(min(max(faster, p.idle_rpm / RPM), p.top_rpm / RPM))
+
+
+@compiled
+def clutch(p: Any, shaft_speed: float, throttle: float) -> tuple[float, float, float]:
+    """What the gearbox input shaft feels at `shaft_speed` rad/s: (engine speed, torque, inertia).
+
+    Below idle the clutch slips: the engine keeps idling, sends its torque, but not its inertia.
+    """
+    idle = p.idle_rpm / RPM
+    if shaft_speed < idle:
+        return idle, engine_torque(p, idle, throttle), 0.0
+    return shaft_speed, engine_torque(p, shaft_speed, throttle), p.engine_inertia

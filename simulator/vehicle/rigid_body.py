@@ -1,0 +1,151 @@
+"""The car's body where nothing can touch it: whole control steps in one compiled call.
+
+The scheme is PyBullet's own (semi-implicit Euler, exact rotation), so that it makes no difference
+who moves the body; the tests hold the two together. World frame, SI units.
+"""
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from runtime.jit import compiled
+from simulator.track.kernel import Table, locate
+from simulator.traffic.wreck import TRAFFIC_CAR
+from simulator.vehicle.dynamics import DT, PIECE, accelerate, advance
+from simulator.vehicle.orientation import rotation
+from simulator.vehicle.surface import Ground
+from simulator.world.boxes import overlap
+
+Vector = NDArray[np.float64]
+
+NEAR_WALL_M = 3.5
+"""No part of the car is farther than this from its centre of gravity, with a margin for the way of
+one physics step."""
+NEAR_CAR_M = 6.5
+"""Nor is any car farther than this from one that it may touch."""
+FASTEST_TRAFFIC_M_S = 20.0
+LEAST_APART_M = 0.3
+OTHER_LENGTH, OTHER_WIDTH = TRAFFIC_CAR.length, TRAFFIC_CAR.width
+
+
+@compiled
+def tumble(p: Any, axes: Vector, motion: Vector) -> tuple[float, float, float]:
+    """How a step without torque changes the angular velocity (body frame, rad/s): Euler's
+    equations, one Newton step of the implicit rule, as in PyBullet (Catto, GDC 2015)."""
+    wx = axes[0, 0] * motion[10] + axes[0, 1] * motion[11] + axes[0, 2] * motion[12]
+    wy = axes[1, 0] * motion[10] + axes[1, 1] * motion[11] + axes[1, 2] * motion[12]
+    wz = axes[2, 0] * motion[10] + axes[2, 1] * motion[11] + axes[2, 2] * motion[12]
+    ix, iy, iz = p.inertia[0], p.inertia[1], p.inertia[2]
+    # f = dt w x (I w), and its Jacobian I + dt (skew(w) I - skew(I w)).
+    fx, fy, fz = DT * (iz - iy) * wy * wz, DT * (ix - iz) * wz * wx, DT * (iy - ix) * wx * wy
+    yz, zy = DT * (iz - iy) * wz, DT * (iz - iy) * wy
+    zx, xz = DT * (ix - iz) * wx, DT * (ix - iz) * wz
+    xy, yx = DT * (iy - ix) * wy, DT * (iy - ix) * wx
+    # Rows of the Jacobian: (ix, yz, zy), (xz, iy, zx), (xy, yx, iz); solved by Cramer's rule.
+    determinant = ix * (iy * iz - zx * yx) - yz * (xz * iz - zx * xy) + zy * (xz * yx - iy * xy)
+    gx = fx * (iy * iz - zx * yx) - yz * (fy * iz - zx * fz) + zy * (fy * yx - iy * fz)
+    gy = ix * (fy * iz - zx * fz) - fx * (xz * iz - zx * xy) + zy * (xz * fz - fy * xy)
+    gz = ix * (iy * fz - fy * yx) - yz * (xz * fz - fy * xy) + fx * (xz * yx - iy * xy)
+    return -gx / determinant, -gy / determinant, -gz / determinant
+
+
+@compiled
+def turn(quaternion: Vector, wx: float, wy: float, wz: float, dt: float) -> None:
+    """Rotate a unit quaternion (x, y, z, w) by the angular velocity (world frame) over `dt`."""
+    rate = math.sqrt(wx * wx + wy * wy + wz * wz)
+    half = 0.5 * rate * dt
+    # sin(half) / rate without cancellation at rest.
+    scale = 0.5 * dt - dt**3 * rate * rate / 48.0 if rate < 1e-3 else math.sin(half) / rate
+    ax, ay, az, aw = wx * scale, wy * scale, wz * scale, math.cos(half)
+    x, y, z, w = quaternion
+    quaternion[0] = aw * x + ax * w + ay * z - az * y
+    quaternion[1] = aw * y + ay * w + az * x - ax * z
+    quaternion[2] = aw * z + az * w + ax * y - ay * x
+    quaternion[3] = aw * w - ax * x - ay * y - az * z
+    quaternion /= math.sqrt(np.sum(quaternion * quaternion))
+
+
+@compiled
+def fall(p: Any, motion: Vector, wrench: Vector) -> None:
+    """Move a free body by one physics step under (force, torque)."""
+    axes = rotation(motion[3:7])
+    tx, ty, tz = tumble(p, axes, motion)
+    accelerate(p, axes, wrench, DT, motion[7:13])
+    for i in range(3):
+        motion[10 + i] += tx * axes[0, i] + ty * axes[1, i] + tz * axes[2, i]
+        motion[i] += DT * motion[7 + i]
+    turn(motion[3:7], motion[10], motion[11], motion[12], DT)
+
+
+@compiled
+def may_touch(p: Any, motion: Vector, dx: float, dy: float, yaw: float) -> bool:
+    """Whether the box of a traffic car (dx, dy) m off may meet the car's within a physics step."""
+    forward = rotation(motion[3:7])[0]
+    mine, other = np.zeros(5), np.zeros(5)
+    speed = math.sqrt(motion[7] ** 2 + motion[8] ** 2) + FASTEST_TRAFFIC_M_S
+    grown = 2.0 * (speed * DT + LEAST_APART_M)
+    mine[2] = math.atan2(forward[1], forward[0])
+    mine[3], mine[4] = p.length + grown, p.width + grown
+    other[0], other[1], other[2] = dx, dy, yaw
+    other[3], other[4] = OTHER_LENGTH, OTHER_WIDTH
+    return overlap(mine, other)
+
+
+@compiled
+def near_anything(
+    p: Any,
+    table: Table,
+    motion: Vector,
+    piece: int,
+    reach: float,
+    others: Vector,
+    move: Vector,
+    share: float,
+) -> bool:
+    """Whether the car may touch something within a physics step.
+
+    reach: distance (m) of the walls from the track's centre; others (n, 6): ground poses of the
+    traffic at the start of the control step, move: how far they go in it, share of it done.
+    """
+    _, _, d = locate(table, motion[0], motion[1], piece)
+    if abs(d) > reach - NEAR_WALL_M:
+        return True
+    for i in range(others.shape[0]):
+        dx = others[i, 0] + share * move[i, 0] - motion[0]
+        dy = others[i, 1] + share * move[i, 1] - motion[1]
+        if dx * dx + dy * dy < NEAR_CAR_M * NEAR_CAR_M:
+            yaw = others[i, 5] + share * move[i, 5]
+            if may_touch(p, motion, dx, dy, yaw):
+                return True
+    return False
+
+
+@compiled
+def fly(
+    params: NDArray[Any],
+    table: Table,
+    ground: Ground,
+    motion: Vector,
+    memory: Vector,
+    command: Vector,
+    reach: float,
+    others: Vector,
+    move: Vector,
+    done: int,
+    steps: int,
+) -> int:
+    """Advance the car from physics step `done` of `steps` until it may touch something.
+
+    Returns how many steps are then done.
+    """
+    wrench = np.empty(6)
+    while done < steps:
+        share = done / steps
+        if near_anything(params[0], table, motion, int(memory[PIECE]), reach, others, move, share):
+            return done
+        advance(params, table, ground, motion, memory, command, wrench)
+        fall(params[0], motion, wrench)
+        done += 1
+    return done

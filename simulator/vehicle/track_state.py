@@ -1,0 +1,45 @@
+"""What the track and the road say of a body's motion: its place, its angles, its speeds.
+
+The one place where angle = tangent - yaw is formed. SI units, angles in rad.
+"""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from runtime.jit import compiled
+from simulator.track.kernel import CURVATURE, HEADING0, LENGTH, S0, Table, locate
+from simulator.vehicle.dynamics import PIECE
+from simulator.vehicle.orientation import rotation
+
+Vector = NDArray[np.float64]
+
+# Places in `out` (READINGS,); ALONG is the speed in the track's direction, TILT the height of the
+# body's up axis: 1 on a level road, below 0 on its roof.
+YAW, PITCH, ROLL, VX, VY, YAW_RATE = 0, 1, 2, 3, 4, 5
+PLACE, OFFSET, ANGLE, BEND, ALONG, TILT, READINGS = 6, 7, 8, 9, 10, 11, 12
+
+
+@compiled
+def read_out(table: Table, motion: Vector, memory: Vector, out: Vector) -> None:
+    """Fill `out` (READINGS,) with the readings of one car; moves its PIECE in `memory`."""
+    piece, s, to_middle = locate(table, motion[0], motion[1], int(memory[PIECE]))
+    memory[PIECE] = piece
+    curvature = table[piece, CURVATURE]
+    along = min(max(s - table[piece, S0], 0.0), table[piece, LENGTH])
+    tangent = table[piece, HEADING0] + curvature * along
+    axes = rotation(motion[3:7])
+    ahead, left, up = axes[0], axes[1], axes[2]
+    yaw = math.atan2(ahead[1], ahead[0])
+    angle = tangent - yaw
+    angle -= 2.0 * math.pi * math.ceil((angle - math.pi) / (2.0 * math.pi))  # in (-pi, pi]
+    out[YAW], out[ANGLE] = yaw, angle
+    out[PITCH] = math.asin(max(-1.0, min(1.0, -ahead[2])))
+    out[ROLL] = math.atan2(left[2], up[2])
+    out[VX] = ahead[0] * motion[7] + ahead[1] * motion[8] + ahead[2] * motion[9]
+    out[VY] = left[0] * motion[7] + left[1] * motion[8] + left[2] * motion[9]
+    out[YAW_RATE] = up[0] * motion[10] + up[1] * motion[11] + up[2] * motion[12]
+    out[PLACE], out[OFFSET], out[BEND] = s, to_middle, curvature
+    out[ALONG] = math.cos(tangent) * motion[7] + math.sin(tangent) * motion[8]
+    out[TILT] = up[2]

@@ -1,0 +1,278 @@
+"""VTORCS's world: one car on one road with walls and traffic, advanced by PyBullet at 200 Hz.
+
+World frame: x, y in the plane, z up, yaw counter-clockwise; s and to_middle in the track frame.
+"""
+
+import math
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+import trackfeatures as tf
+from simulator.track.kernel import index_at, surface
+from simulator.track.road import START_BEFORE_LINE_M, Road
+from simulator.traffic.traffic import Traffic
+from simulator.vehicle.car import HIGHEST_GEAR, LOWEST_GEAR, RPM, CarParameters
+from simulator.vehicle.dynamics import ENGINE, MEMORY, MOTION, ODOMETER, PIECE, SPIN, STEER
+from simulator.vehicle.orientation import quaternion
+from simulator.vehicle.powertrain import gear_ratio
+from simulator.vehicle.rigid_body import fly
+from simulator.vehicle.state import CarState, Collision, Command
+from simulator.vehicle.surface import ground
+from simulator.vehicle.track_state import (
+    ALONG,
+    ANGLE,
+    BEND,
+    OFFSET,
+    PITCH,
+    PLACE,
+    READINGS,
+    ROLL,
+    VX,
+    VY,
+    YAW,
+    YAW_RATE,
+    read_out,
+)
+from simulator.world.collisions import Impacts
+from simulator.world.physics import PHYSICS_HZ, check_frequency
+from trackfeatures.errors import UserError
+
+__all__ = ["CarState", "Command", "World"]
+
+ROLLING_BACK_M_S = -0.5
+"""Slower than this along the track is driving backwards."""
+FASTEST_START_M_S = 150.0
+FloatArray = NDArray[np.float64]
+NO_TRAFFIC = np.zeros((0, 6))
+
+
+class World:
+    """One episode at a time; `reset` starts one, `step` holds a command for 1/frequency_hz s."""
+
+    def __init__(
+        self,
+        road: Road,
+        *,
+        traffic: int = 0,
+        frequency_hz: int = 20,
+        car: CarParameters | None = None,
+    ) -> None:
+        check_frequency(frequency_hz)
+        self.road = road
+        self.frequency_hz = int(frequency_hz)
+        self.car = car or CarParameters()
+        self._count = traffic
+        self.traffic = Traffic(road, traffic, np.random.default_rng(0))
+        self._params = self.car.packed()
+        self._table = road.track.arrays()
+        self._ground = ground(road)
+        self._motion = np.zeros(MOTION)
+        self._memory = np.zeros(MEMORY)
+        self._readings = np.zeros(READINGS)
+        self._controls = np.zeros(4)
+        self._impacts = Impacts(road, self.car)
+        self._state: CarState | None = None
+
+    @property
+    def state(self) -> CarState:
+        """The car now. Raises UserError before the first reset."""
+        if self._state is None:
+            raise UserError("the world has no episode yet; call reset(seed=...) first")
+        return self._state
+
+    def reset(
+        self,
+        *,
+        seed: int,
+        s: float | None = None,
+        to_middle: float = 0.0,
+        angle: float = 0.0,
+        speed: float = 0.0,
+    ) -> CarState:
+        """Start an episode. `s` defaults to 25 m before the line; angle as in DESIGN (positive:
+        the car points to the right of the track), rad; speed in m/s along the body.
+
+        The episode is a function of the arguments alone, whatever this world did before.
+        """
+        start = -START_BEFORE_LINE_M if s is None else float(s)
+        check_seed(seed)
+        for name, value in (("s", start), ("to_middle", to_middle), ("angle", angle)):
+            if not math.isfinite(value):
+                raise UserError(f"reset got {name} = {value}; give a finite number")
+        if not abs(speed) <= FASTEST_START_M_S:  # true for NaN, too
+            raise UserError(f"reset got speed = {speed}; give m/s between -150 and 150")
+        if abs(to_middle) > self.road.edge:
+            raise UserError(
+                f"reset got to_middle = {to_middle} m; the road ends {self.road.edge:.2f} m from "
+                "its centre, so give less"
+            )
+        self.traffic = Traffic(
+            self.road, self._count, np.random.default_rng([seed, 1]), clear_s=start
+        )
+        self._impacts.start(self.traffic)
+        self._place(start, to_middle, angle, speed)
+        self._lap, self._steps, self._lap_start = 0, 0, 0
+        self._s = float(start % self.road.track.length_m)
+        self._state = self._measure(1, None)
+        return self._state
+
+    def step(self, command: Command) -> CarState:
+        """Hold `command` for one control step; raises UserError for a value out of its range."""
+        before = self.state
+        _check(command, self._controls)
+        hit = self._move(*self._advance_traffic(before))
+        self._steps += 1
+        self._state = self._measure(command.gear, hit)
+        return self._state
+
+    def features(self) -> tf.TrackFeatures:
+        """The true track features of the present moment."""
+        now = self.state
+        return self.road.measure(now.s, now.to_middle, now.angle)
+
+    def body_pose(self) -> NDArray[np.float64]:
+        """x, y, z, roll, pitch, yaw of the centre of gravity (6,), as PyBullet's Euler angles."""
+        now = self.state
+        return np.array([now.x, now.y, now.z, now.roll, now.pitch, now.yaw])
+
+    def close(self) -> None:
+        """Give the physics client back; a closed world refuses to reset and to step."""
+        self._impacts.close()
+        self._state = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _place(self, s: float, to_middle: float, angle: float, speed: float) -> None:
+        """Stand the car on its wheels at a place of the road, rolling at `speed`."""
+        piece = index_at(self._table, s)
+        wrapped = s % self.road.track.length_m
+        pose = self.road.track.at(s, to_middle)
+        z, *normal = surface(self._table, piece, wrapped, to_middle)
+        up = np.array(normal)
+        yaw = float(pose.heading) - angle
+        # In the road plane, and seen from above exactly in the direction of yaw.
+        rise = -(up[0] * math.cos(yaw) + up[1] * math.sin(yaw)) / up[2]
+        forward = np.array([math.cos(yaw), math.sin(yaw), rise])
+        forward /= np.linalg.norm(forward)
+        position = np.array([float(pose.x), float(pose.y), z]) + up * self.car.cg_height
+        self._motion[:] = 0.0
+        self._motion[0:3] = position
+        self._motion[3:7] = quaternion(forward, np.cross(up, forward), up)
+        self._motion[7:10] = speed * forward
+        self._memory[:] = 0.0
+        self._memory[PIECE] = piece
+        self._memory[SPIN : SPIN + 4] = speed / self.car.wheel_radius
+        turning = abs(speed) / self.car.wheel_radius * gear_ratio(self._params[0], 1)
+        self._memory[ENGINE] = max(turning, self.car.idle_rpm / RPM)
+
+    def _advance_traffic(self, before: CarState) -> tuple[FloatArray, FloatArray]:
+        """Let the traffic drive one control step; returns where it was and how far it moves."""
+        if not self.traffic.count:
+            return NO_TRAFFIC, NO_TRAFFIC
+        old = self.traffic.poses()
+        self.traffic.step(1.0 / self.frequency_hz, before.s, before.to_middle, before.speed)
+        move = self.traffic.poses() - old
+        move[:, 3:] = (move[:, 3:] + math.pi) % (2.0 * math.pi) - math.pi
+        return old, move
+
+    def _move(self, others: FloatArray, move: FloatArray) -> Collision | None:
+        """Drive one control step while the traffic goes from `others` on by `move` (n, 6 each);
+        returns what the car first touched."""
+        steps, done = PHYSICS_HZ // self.frequency_hz, 0
+        hit: Collision | None = None
+        while done < steps:
+            if not self._impacts.going_on:
+                done = self._fly(others, move, done, steps)
+            if done < steps:
+                share, dt = done / steps, 1.0 / self.frequency_hz
+                met = self._impacts.step(
+                    self._motion, self._memory, self._controls, others, move, share, dt
+                )
+                hit, done = hit or met, done + 1
+        return hit
+
+    def _fly(self, others: FloatArray, move: FloatArray, done: int, steps: int) -> int:
+        """Drive on from physics step `done` until something is near; returns how far it came."""
+        return fly(
+            self._params,
+            self._table,
+            self._ground,
+            self._motion,
+            self._memory,
+            self._controls,
+            self.road.wall_offset,
+            others,
+            move,
+            done,
+            steps,
+        )
+
+    def _measure(self, gear: int, hit: Collision | None) -> CarState:
+        """Read the state off the body."""
+        read_out(self._table, self._motion, self._memory, self._readings)
+        motion, memory = self._motion.tolist(), self._memory.tolist()
+        readings = self._readings.tolist()
+        self._count_laps(readings[PLACE])
+        return CarState(
+            time_s=self._steps / self.frequency_hz,
+            x=motion[0],
+            y=motion[1],
+            z=motion[2],
+            yaw=readings[YAW],
+            pitch=readings[PITCH],
+            roll=readings[ROLL],
+            vx=readings[VX],
+            vy=readings[VY],
+            yaw_rate=readings[YAW_RATE],
+            s=readings[PLACE],
+            to_middle=readings[OFFSET],
+            angle=readings[ANGLE],
+            curvature=readings[BEND],
+            rpm=memory[ENGINE] * RPM,
+            gear=gear,
+            wheel_spin=(memory[SPIN], memory[SPIN + 1], memory[SPIN + 2], memory[SPIN + 3]),
+            steer=memory[STEER] / self.car.steering_lock,
+            lap=self._lap,
+            odometer_m=memory[ODOMETER],
+            lap_time_s=(self._steps - self._lap_start) / self.frequency_hz,
+            collision=hit,
+            off_track=abs(readings[OFFSET]) > self.road.edge,
+            backwards=abs(readings[ANGLE]) > 0.5 * math.pi or readings[ALONG] < ROLLING_BACK_M_S,
+        )
+
+    def _count_laps(self, s: float) -> None:
+        """Crossing the line adds a lap (crossing it backwards takes one away again)."""
+        length = self.road.track.length_m
+        moved = s - self._s
+        if moved < -0.5 * length:
+            self._lap += 1
+            self._lap_start = self._steps
+        elif moved > 0.5 * length:
+            self._lap -= 1
+        self._s = s
+
+
+def check_seed(seed: int) -> None:
+    """Raises UserError for what numpy's generator would not take."""
+    if not isinstance(seed, int | np.integer) or seed < 0:
+        raise UserError(f"reset got seed = {seed!r}; give a whole number of 0 or more")
+
+
+def _check(command: Command, controls: FloatArray) -> None:
+    """Fill `controls` with (steer, throttle, brake, gear) for the kernel."""
+    steer, throttle, brake, gear = command.steer, command.throttle, command.brake, command.gear
+    # Comparisons with NaN are false, so these hold for it as well.
+    if not (-1.0 <= steer <= 1.0 and 0.0 <= throttle <= 1.0 and 0.0 <= brake <= 1.0):
+        raise UserError(
+            f"the command has steer = {steer}, throttle = {throttle}, brake = {brake}; "
+            "steer goes from -1 to 1, the others go from 0 to 1"
+        )
+    if not LOWEST_GEAR <= gear <= HIGHEST_GEAR or gear != int(gear):
+        raise UserError(f"the command has gear = {gear}; gears are -1, 0 and 1 to 6")
+    controls[:] = steer, throttle, brake, gear

@@ -1,0 +1,157 @@
+"""The demo's own parts: pictures by hand-computed pixels, choice of frames, verdicts, stopping."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from controllers.demo.frames import Asked, spread
+from controllers.demo.process import run_module
+from controllers.demo.report import verdicts
+from controllers.demo.run import DemoConfig, run_demo
+from controllers.demo.tables import print_tables
+from datagen.recording import CameraInfo
+from mtlnet.inference.overlay import SCALE, draw_answer, marking_line, to_pixels
+from trackfeatures import UserError
+
+CAMERA = CameraInfo(width=200, height=100, fov_y_deg=90.0, x=0.0, y=0.0, z=1.0, pitch_deg=0.0)
+NOTHING = dict.fromkeys(("ml", "mr", "l", "m", "r"))
+
+
+def test_a_road_point_is_seen_where_the_pinhole_says() -> None:
+    # 90 degrees over 100 px: focal length 50 px. 10 m ahead, 2 m left, 1 m below the camera.
+    pixels = to_pixels(np.array([[10.0, 2.0]]), CAMERA, height_m=1.0)
+    assert pixels.tolist() == [[(100 - 50 * 2 / 10) * SCALE, (50 + 50 * 1 / 10) * SCALE]]
+
+
+def test_a_positive_distance_is_drawn_to_the_right() -> None:
+    line = marking_line(2.0, angle=0.0, curvature=0.0)
+    assert (line[:, 1] == -2.0).all()
+    assert (to_pixels(line, CAMERA, 1.0)[:, 0] > 100 * SCALE).all()
+
+
+def test_a_car_pointing_right_sees_the_road_go_left() -> None:
+    line = marking_line(0.0, angle=0.1, curvature=0.0)
+    assert line[-1] == pytest.approx([14 * np.cos(0.1), 14 * np.sin(0.1)])
+
+
+def test_a_left_bend_bends_left() -> None:
+    assert marking_line(0.0, 0.0, curvature=0.01)[-1, 1] == pytest.approx(0.01 * 14**2 / 2)
+
+
+def test_absent_distances_are_not_drawn() -> None:
+    frame = np.zeros((100, 200, 3), np.uint8)
+    empty = draw_answer(frame, CAMERA, 1.0, 0.0, (NOTHING, 0.0), (NOTHING, 0.0))
+    drawn = draw_answer(frame, CAMERA, 1.0, 0.0, (NOTHING, 0.0), ({**NOTHING, "mr": 2.0}, 0.0))
+    changed = (drawn != empty).any(axis=2)
+    assert changed[:, : 200 * SCALE // 2].sum() == 0, "nothing on the left half of the frame"
+    red, _, blue = drawn[changed].astype(int).T
+    assert changed.any()
+    assert (red >= blue).all(), "in the answer's orange, antialiased"
+
+
+class FakeFrames:
+    """Only what `spread` asks for: the round of each frame."""
+
+    class labels:  # noqa: N801  # stands for an attribute
+        round = np.repeat([3, 4, 9], [50, 5, 50])
+
+
+def test_frames_are_asked_from_every_round() -> None:
+    chosen = spread(FakeFrames, 12, np.random.default_rng(1))  # type: ignore[arg-type]  # a fake
+    assert len(set(chosen)) == 12
+    assert np.bincount(FakeFrames.labels.round[chosen]).tolist() == [0, 0, 0, 4, 4, 0, 0, 0, 0, 4]
+
+
+def evaluation(angle: float = 0.02, ml: float = 0.2, heading: float = 0.9) -> dict[str, Any]:
+    mae = {"ml": ml, "mr": 0.2, "l": None, "m": 0.9, "r": 0.9}
+    mean = {"ml": 0.5, "mr": 0.5, "l": None, "m": 0.5, "r": 0.5}
+    baseline = {"mae_m": mean, "angle_mae_rad": 0.04, "heading_accuracy": 0.5}
+    return {
+        "mae_m": mae,
+        "angle_mae_rad": angle,
+        "heading_accuracy": heading,
+        "baseline": baseline,
+    }
+
+
+@pytest.mark.parametrize(
+    ("change", "missed"),
+    [
+        ({}, []),
+        ({"ml": 0.36}, ["ml (m)"]),
+        ({"ml": 0.33}, ["ml (m)"]),  # under 0.35 m, but not under 0.65 of the mean's 0.5 m
+        ({"angle": 0.027}, ["angle (rad)"]),
+        ({"heading": 0.84}, ["heading (share right)"]),
+    ],
+)
+def test_a_limit_is_reached_only_when_learned(change: dict[str, float], missed: list[str]) -> None:
+    found = verdicts(evaluation(**change))
+    assert [one.what for one in found] == [
+        *("ml (m)", "mr (m)", "m (m)", "r (m)", "angle (rad)", "heading (share right)")
+    ]
+    assert [one.what for one in found if not one.reached] == missed
+
+
+def test_tables_show_true_and_answered_values(capsys: pytest.CaptureFixture[str]) -> None:
+    answer = {
+        "distances_m": {**NOTHING, "ml": -1.5, "mr": 2.5},
+        "to_lane_centre_m": 0.5,
+        "angle_rad": 0.012,
+        "heading": {"left": 0.1, "straight": 0.2, "right": 0.7},
+    }
+    distances = {**NOTHING, "ml": -1.6, "mr": 2.4}
+    asked = Asked(b"", "r1", "oval", 2, distances, 0.4, 0.01, "straight", 0.0, answer)
+    print_tables(verdicts(evaluation(angle=0.05)), [asked])
+    said = capsys.readouterr().out
+    for cell in ("-1.60 -1.50", "+0.40 +0.50", "+0.010 +0.012", "straight right", "1.25 ", "NO"):
+        assert cell in said
+
+
+def test_a_folder_of_other_files_is_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "thesis.tex").touch()
+    with pytest.raises(UserError, match="holds other files"):
+        run_demo(DemoConfig(out=tmp_path))
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
+
+
+def test_a_command_gives_its_output_and_exit_code() -> None:
+    assert run_module(["json.tool", "--help"])[0] == 0
+    code, said = run_module(["json.tool", "no-such-file"])
+    assert code != 0
+    assert said == ""
+
+
+def test_sigterm_ends_the_child_too(tmp_path: Path) -> None:
+    """The child has time to leave: here, to write that it was told to."""
+    (tmp_path / "child.py").write_text(
+        "import pathlib, signal, sys, time\n"
+        "def stop(*_):\n    pathlib.Path('stopped').touch()\n    sys.exit(0)\n"
+        "signal.signal(signal.SIGTERM, stop)\n"
+        "pathlib.Path('started').touch()\n"
+        "time.sleep(300)\n"
+    )
+    parent = (
+        "from controllers.demo.process import run_module, stop_on_sigterm\n"
+        "stop_on_sigterm()\nrun_module(['child'])\n"
+    )
+    root = Path(__file__).parents[3]
+    with subprocess.Popen(
+        [sys.executable, "-c", parent],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": f"{tmp_path}:{root}"},
+        stderr=subprocess.DEVNULL,
+    ) as process:
+        for _ in range(1200):
+            if (tmp_path / "started").exists():
+                break
+            time.sleep(0.1)
+        process.send_signal(signal.SIGTERM)
+        process.wait(120)
+    assert (tmp_path / "stopped").exists()

@@ -1,0 +1,207 @@
+"""The LQR against textbook cases, the stability of its loop, its signs, its step response."""
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.linalg import solve_discrete_are
+
+from controllers.interface import Controller, Observation
+from controllers.lqr import (
+    EXACT,
+    FASTEST_M_S,
+    PERCEIVED,
+    SLOWEST_M_S,
+    LateralModel,
+    Lqr,
+    LqrWeights,
+    Matrix,
+    dlqr,
+)
+from controllers.registry import Setting, make_controller
+from controllers.torcs_feedback import STEERING_LOCK, Feedback
+from trackfeatures import Heading, UserError
+
+STRAIGHT_AT_20 = Observation(
+    to_lane_centre=0.0,
+    angle=0.0,
+    heading=Heading.STRAIGHT,
+    vx=20.0,
+    vy=0.0,
+    yaw_rate=0.0,
+    curvature=0.0,
+)
+
+
+def test_scalar_regulator_has_its_closed_form() -> None:
+    """x' = x + u, cost x^2 + u^2: P is the golden ratio, K = P / (1 + P)."""
+    gain = dlqr(np.eye(1), np.eye(1), np.eye(1), np.eye(1))
+    golden = (1 + math.sqrt(5)) / 2
+    assert gain[0, 0] == pytest.approx(golden / (1 + golden))
+
+
+def test_gain_is_that_of_the_discrete_riccati_equation() -> None:
+    """Double integrator at 0.1 s: u = -(R + B'PB)^-1 B'PA x, and P solves the equation."""
+    A, B = np.array([[1.0, 0.1], [0.0, 1.0]]), np.array([[0.005], [0.1]])
+    Q, R = np.diag([1.0, 0.5]), np.array([[0.2]])
+    P = solve_discrete_are(A, B, Q, R)
+    gain = dlqr(A, B, Q, R)
+    np.testing.assert_allclose(gain, np.linalg.inv(R + B.T @ P @ B) @ B.T @ P @ A, rtol=1e-9)
+    np.testing.assert_allclose(Q + A.T @ P @ (A - B @ gain), P, rtol=1e-9)
+
+
+def test_model_is_rajamanis() -> None:
+    """The entries of the paper's A and B, typed from it, at 20 m/s."""
+    A, B, turn = LateralModel().matrices(20.0)
+    c, m, inertia, lf, lr, v = 80_000.0, 1150.0, 2000.0, 1.27, 1.37, 20.0
+    moment = -2 * c * lf + 2 * c * lr
+    spin = -2 * c * lf**2 - 2 * c * lr**2
+    expected: Matrix = np.array(
+        [
+            [0, 1, 0, 0],
+            [0, -4 * c / (m * v), 4 * c / m, moment / (m * v)],
+            [0, 0, 0, 1],
+            [0, moment / (inertia * v), -moment / inertia, spin / (inertia * v)],
+        ]
+    )
+    np.testing.assert_allclose(A, expected)
+    np.testing.assert_allclose(B[:, 0], [0, 2 * c / m, 0, 2 * c * lf / inertia])
+    assert turn[1, 0] == pytest.approx(moment / (m * v) - v)
+
+
+def test_discretisation_equals_small_steps() -> None:
+    model, speed, dt = LateralModel(), 20.0, 0.05
+    A, B, _ = model.matrices(speed)
+    state, wheel = np.array([0.5, -0.2, 0.05, 0.1]), 0.03
+    exact = model.discretise(speed, dt)
+    small, parts = state.copy(), 20_000
+    for _ in range(parts):
+        small = small + (A @ small + B[:, 0] * wheel) * dt / parts
+    np.testing.assert_allclose(exact[0] @ state + exact[1][:, 0] * wheel, small, atol=2e-5)
+
+
+@pytest.mark.parametrize("weights", [EXACT, PERCEIVED])
+@pytest.mark.parametrize("dt", [0.02, 0.05, 0.1])
+def test_the_closed_loop_is_stable_at_every_speed(weights: LqrWeights, dt: float) -> None:
+    lqr = Lqr(dt, weights)
+    for speed in np.arange(5.0, 35.5, 0.5):  # between the points of the grid, too
+        A, B = lqr.model.discretise(float(speed), dt)
+        loop = A - B @ lqr.gain(float(speed))[None, :]
+        assert np.abs(np.linalg.eigvals(loop)).max() < 0.999
+
+
+def test_gains_are_held_beyond_the_grid() -> None:
+    lqr = Lqr()
+    np.testing.assert_array_equal(lqr.gain(0.0), lqr.gain(SLOWEST_M_S))
+    np.testing.assert_allclose(lqr.gain(90.0), lqr.gain(FASTEST_M_S))
+    assert np.all(np.isfinite(lqr.gain(-2.0)))
+
+
+@pytest.mark.parametrize("name", ["lqr", "torcs"])
+@pytest.mark.parametrize("perceived", [False, True])
+def test_signs(name: str, perceived: bool) -> None:
+    def steer(**changes: Any) -> float:
+        controller = make_controller(name, Setting(0.05, perceived))
+        return controller.update(replace(STRAIGHT_AT_20, **changes))
+
+    assert steer() == 0.0
+    assert steer(to_lane_centre=0.05) < 0  # left of the centre: steer right
+    assert steer(to_lane_centre=-0.05) > 0
+    assert steer(angle=0.01) > 0  # nose to the right of the track: steer left
+    assert steer(angle=-0.01) < 0
+    assert steer(yaw_rate=0.05) < 0  # turning left on a straight: steer right
+    assert steer(to_lane_centre=9.0) == -1.0
+    assert steer(to_lane_centre=-9.0) == 1.0
+
+
+def test_feed_forward_steers_into_the_bend() -> None:
+    """In a steady bend with no error the wheel angle is L k + K_us v^2 k (Rajamani 3.3)."""
+    model, speed, curvature = LateralModel(), 15.0, 1 / 60
+    wheel, heading = model.cornering(speed)
+    load = model.mass / (2 * 80_000.0 * 2.64)
+    understeer = load * (model.rear_axle - model.front_axle)
+    assert wheel == pytest.approx(2.64 + understeer * speed**2)
+    assert heading == pytest.approx(-model.rear_axle + load * model.front_axle * speed**2)
+    steady = Observation(
+        to_lane_centre=0.0,
+        angle=-heading * curvature,
+        heading=Heading.LEFT,
+        vx=speed,
+        vy=-speed * math.sin(heading * curvature),
+        yaw_rate=speed * curvature,
+        curvature=curvature,
+    )
+    assert Lqr().update(steady) * STEERING_LOCK == pytest.approx(wheel * curvature, rel=1e-3)
+
+
+def response(controller: Controller, speed: float, curvature: float = 0.0) -> Matrix:
+    """Offsets (m) of the linear model, 1 m off at the start, over 10 s at 20 Hz."""
+    model, dt, parts = LateralModel(), 0.05, 20
+    A, B, turn = model.matrices(speed)
+    state, offsets = np.array([1.0, 0.0, 0.0, 0.0]), []
+    heading = Heading.STRAIGHT if curvature == 0 else Heading.LEFT
+    for _ in range(200):
+        e1, e1_rate, e2, e2_rate = state
+        told = Observation(
+            to_lane_centre=e1,
+            angle=-e2,
+            heading=heading,
+            vx=speed,
+            vy=e1_rate - speed * math.sin(e2),
+            yaw_rate=e2_rate + speed * curvature,
+            curvature=None,
+        )
+        wheel = controller.update(told) * STEERING_LOCK
+        for _ in range(parts):
+            push = B[:, 0] * wheel + turn[:, 0] * speed * curvature
+            state = state + (A @ state + push) * dt / parts
+        offsets.append(state[0])
+    return np.array(offsets)
+
+
+@pytest.mark.parametrize("speed", [8.0, 15.0, 22.0])
+@pytest.mark.parametrize("weights", [EXACT, PERCEIVED])
+def test_step_response(speed: float, weights: LqrWeights) -> None:
+    offsets = response(Lqr(0.05, weights), speed)
+    assert offsets.min() > -0.15  # overshoots by less than 15 %
+    assert np.abs(offsets[100:]).max() < 0.02  # there within 5 s
+    assert np.abs(response(Feedback(), speed)[100:]).max() < 0.05
+
+
+def test_no_standing_offset_in_a_bend_that_nobody_tells() -> None:
+    for weights in (EXACT, PERCEIVED):
+        assert abs(response(Lqr(0.05, weights), 15.0, 1 / 80)[-1]) < 0.02
+
+
+def test_the_class_bounds_the_estimated_curvature() -> None:
+    """Turning left where the road is said to turn right is an error, not a bend."""
+    told = replace(STRAIGHT_AT_20, yaw_rate=0.4, curvature=None)
+    corrected = Lqr().update(replace(told, heading=Heading.RIGHT))
+    believed = Lqr().update(replace(told, heading=Heading.LEFT))
+    assert corrected < believed
+
+
+@pytest.mark.parametrize(
+    ("d", "th", "vx", "vy", "yr", "steer"),
+    [
+        (0.0557, 0.00603, 20.0047, -0.0827, -0.27573, -0.12010),
+        (0.1692, 0.01342, 19.7329, -0.0663, -0.80748, -0.36879),
+    ],
+)
+def test_reference_law(d: float, th: float, vx: float, vy: float, yr: float, steer: float) -> None:
+    """Two rows of a lap of the real program (forza), state and the steering that it got."""
+    seen = Observation(d, -th, Heading.RIGHT, vx, vy, yr)
+    assert Feedback().update(seen) == pytest.approx(steer, abs=2e-4)
+
+
+@pytest.mark.parametrize("name", ["mpc", "rl"])
+def test_planned_controllers_say_so(name: str) -> None:
+    with pytest.raises(UserError, match="not there yet; use one of: lqr"):
+        make_controller(name, Setting(0.05))
+
+
+def test_an_unknown_controller_is_named() -> None:
+    with pytest.raises(UserError, match="'pid'"):
+        make_controller("pid", Setting(0.05))

@@ -1,0 +1,232 @@
+"""Interruptions, crashes, hanging processes, rounds that cannot be driven."""
+
+import json
+import multiprocessing
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from datagen.errors import RoundFailed
+from datagen.execution.collect import collect
+from datagen.execution.process_pool import ProcessPool
+from datagen.execution.retry import ATTEMPTS, DEATHS_IN_A_ROW, Limits, Tries
+from datagen.planning.plan import RoundPlan
+from datagen.recorder.job import FramesDone, RoundBroken, RoundDone
+from datagen.recording.camera import CameraInfo
+from datagen.recording.errors import DatasetError
+from datagen.recording.folder import read_states
+from datagen.recording.integrity.verify import verify
+from simulator.vehicle.state import Command
+from tests.datagen.commands import attempted, datagen, make_jobs, make_small_plan
+from tests.datagen.conftest import Samples
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interruption_leaves_whole_rounds_only_and_is_resumed(
+    tmp_path: Path, number: signal.Signals
+) -> None:
+    folder = tmp_path / "data"
+    args = ["collect", "--rounds", "3", "--frames", "60", "--tracks", "oval", "--workers", "1"]
+    command = [sys.executable, "-m", "datagen", *args, "--out", str(folder)]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+        wait_for(lambda: list(folder.glob("state/*.json")), process)
+        wait_for(lambda: list(folder.glob(".partial/*/*.mcap")), process)
+        process.send_signal(number)
+        _, stderr = process.communicate(timeout=120)
+    assert process.returncode == 130
+    assert "Traceback" not in stderr
+    kept = read_states(folder)
+    assert 1 <= len(kept) < 3
+    assert not (folder / ".partial").exists()
+    assert len(list(folder.glob("rounds/*"))) == len(kept)
+    assert verify(folder, "full").ok
+    if number == signal.SIGINT:
+        done = datagen(*args, "--out", folder, "--json")
+        assert json.loads(done.stdout)["recorded_frames"] == 60 * (3 - len(kept))
+        assert verify(folder, "full").ok
+
+
+def test_a_worker_that_dies_costs_its_round_only_and_the_round_is_tried_again(
+    tmp_path: Path,
+) -> None:
+    jobs = make_jobs(tmp_path, rounds=2, frames=30)
+    killed: list[str] = []
+    done: list[str] = []
+
+    def hear(message: FramesDone | RoundDone) -> None:
+        if isinstance(message, RoundDone):
+            done.append(message.state.id)
+        elif not killed:
+            killed.append(message.round_id)
+            crew._workers[0].process.kill()
+
+    crew = ProcessPool(1, hear)
+    assert crew.run(jobs) == []
+    assert killed == ["round-000"]
+    assert sorted(done) == ["round-000", "round-001"] == sorted(read_states(tmp_path))
+
+
+def test_a_round_that_cannot_be_driven_is_tried_once_and_told_in_one_line(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+    samples: Samples,
+) -> None:
+    """Forked workers take the stand-in for recording with them."""
+
+    def record(plan: RoundPlan, plan_hash: str, path: Path, *rest: object) -> None:
+        with (tmp_path / "attempts").open("a") as stream:
+            stream.write(f"{plan.id}\n")
+        if plan.id == "round-000":
+            raise RoundFailed("the car left the road 21 times")
+        header = replace(samples.header("r001"), id=plan.id, seed=plan.seed)
+        samples.write(path, header, samples.frames(3, seed=1))
+
+    monkeypatch.setattr("datagen.recorder.record.record_round", record)
+    monkeypatch.setattr(
+        "datagen.execution.process_pool.CONTEXT", multiprocessing.get_context("fork")
+    )
+    plan = make_small_plan(2, 3)
+    capfd.readouterr()  # what libraries said when they were loaded
+    expected = r"1 of 2 rounds failed \(round-000: the car left the road 21 times\); what was"
+    with pytest.raises(DatasetError, match=expected) as told:
+        collect(plan, tmp_path / "data", workers=1)
+    assert "another --seed" in str(told.value)
+    assert (tmp_path / "attempts").read_text().split() == ["round-000", "round-001"]
+    assert capfd.readouterr().err == ""
+    assert list(read_states(tmp_path / "data")) == ["round-001"]
+    assert verify(tmp_path / "data", "full").ok
+
+
+def test_a_car_that_is_reset_too_often_ends_its_round(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("datagen.recorder.record.MOST_RESETS", 0)
+    monkeypatch.setattr(
+        "datagen.recorder.record.ScriptedDriver.command", lambda *args: Command(1.0, 1.0)
+    )
+    (job,) = make_jobs(tmp_path, rounds=1, frames=200)
+    job = replace(job, plan=replace(job.plan, camera=CameraInfo(width=56, height=42)))
+    message = attempted(job)
+    assert isinstance(message, RoundBroken)
+    assert message.final
+    assert "left the road 1 times on oval, " in message.reason
+    assert not list(tmp_path.glob("rounds/*"))
+
+
+def wait_for(found: Callable[[], object], process: subprocess.Popen[str]) -> None:
+    stderr = process.stderr
+    assert stderr is not None
+    deadline = time.monotonic() + 300.0
+    while not found():
+        assert process.poll() is None, stderr.read()
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+
+
+def test_a_process_that_gives_no_sign_of_life_is_replaced(tmp_path: Path) -> None:
+    """A stopped one: it is alive and says nothing."""
+    stopped: list[int] = []
+    done: list[str] = []
+
+    def hear(message: FramesDone | RoundDone) -> None:
+        if isinstance(message, RoundDone):
+            done.append(message.state.id)
+        elif message.frames:
+            worker = crew._workers[0]
+            if not stopped:
+                stopped.append(worker.process.pid or 0)
+                os.kill(stopped[0], signal.SIGSTOP)
+            if worker.process.pid == stopped[0]:
+                worker.heard -= limits.silence_s - 1.0  # one second is left of its time
+
+    limits = Limits(delay_s=0.1)
+    crew = ProcessPool(1, hear, limits)
+    assert crew.run(make_jobs(tmp_path, rounds=1, frames=400)) == []
+    assert done == ["round-000"]
+    with pytest.raises(ProcessLookupError):
+        os.kill(stopped[0], 0)
+
+
+def test_a_round_that_takes_too_long_is_tried_three_times_and_given_up(tmp_path: Path) -> None:
+    started: list[float] = []
+
+    def hear(message: FramesDone | RoundDone) -> None:
+        if isinstance(message, FramesDone) and message.frames == 0:
+            started.append(time.monotonic())
+
+    crew = ProcessPool(1, hear, Limits(start_s=1.0, frame_s=0.0, delay_s=0.2))
+    (failure,) = crew.run(make_jobs(tmp_path, rounds=1, frames=100_000))
+    assert failure.round_id == "round-000"
+    assert "it was not finished for 1 s" in failure.reason
+    assert not failure.final
+    assert len(started) == ATTEMPTS
+
+
+def test_tries_come_with_growing_delay_and_end_after_the_third(tmp_path: Path) -> None:
+    (job, other) = make_jobs(tmp_path, rounds=2, frames=10)
+    tries = Tries([job, other], Limits(delay_s=2.0))
+    assert tries.take(0.0) == job
+    tries.failed(job, "first", now=10.0)
+    assert (tries.next_at(), tries.take(10.0)) == (0.0, other)
+    assert (tries.next_at(), tries.take(11.9)) == (12.0, None)
+    assert tries.take(12.0) == job
+    tries.failed(job, "second", now=20.0)
+    assert (tries.take(27.9), tries.take(28.0)) == (None, job)
+    tries.failed(job, "third", now=30.0)
+    assert (len(tries), tries.take(1e9)) == (0, None)
+    assert [(f.round_id, f.reason, f.final) for f in tries.failures] == [
+        ("round-000", "third", False)
+    ]
+    tries.failed(other, "for good", now=30.0, final=True)
+    assert tries.failures[1].final
+
+
+def test_processes_that_only_die_end_the_collection(tmp_path: Path) -> None:
+    tries = Tries(make_jobs(tmp_path, rounds=1, frames=10), Limits())
+    for _ in range(DEATHS_IN_A_ROW - 1):
+        tries.died("code -11")
+    tries.done()
+    for _ in range(DEATHS_IN_A_ROW - 1):
+        tries.died("code -11")
+    with pytest.raises(DatasetError, match=r"ended one after the other .*code -11"):
+        tries.died("code -11")
+
+
+def test_no_worker_outlives_a_collector_that_was_killed(tmp_path: Path) -> None:
+    args = ["collect", "--rounds", "2", "--frames", "5000", "--tracks", "oval", "--workers", "1"]
+    command = [sys.executable, "-m", "datagen", *args, "--out", str(tmp_path / "data")]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+        wait_for(lambda: list(tmp_path.glob("data/.partial/*/*.mcap")), process)
+        children = _children(process.pid)
+        process.kill()
+        process.communicate(timeout=120)
+    assert children
+    deadline = time.monotonic() + 120.0
+    while any(Path(f"/proc/{child}/cmdline").exists() for child in children):
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+
+
+def _children(process: int) -> list[int]:
+    tasks = Path(f"/proc/{process}/task/{process}/children").read_text()
+    return [int(child) for child in tasks.split()]
+
+
+@pytest.mark.slow
+def test_kills_of_the_whole_tree_at_random_moments_lose_nothing() -> None:
+    """The benchmark in small."""
+    script = Path(__file__).parents[3] / "benchmarks" / "killed.py"
+    small = ["--kills", "3", "--rounds", "3", "--frames", "10", "--seed", "2"]
+    done = subprocess.run(
+        [sys.executable, str(script), *small], capture_output=True, text=True, timeout=500
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert json.loads(done.stdout)["kills"] == 3

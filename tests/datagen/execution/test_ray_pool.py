@@ -1,0 +1,59 @@
+"""Rounds recorded on a Ray cluster are those of this machine."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from datagen.execution.ray_pool import RayCrew
+from datagen.execution.retry import Limits
+from datagen.recorder.job import FramesDone, RoundDone
+from datagen.recording.folder import read_states
+from datagen.recording.integrity.verify import verify
+from tests.datagen.commands import SHORT, datagen, datagen_here, make_jobs
+from trackfeatures.errors import UserError
+
+pytestmark = pytest.mark.slow
+
+
+def test_two_ray_workers_give_the_same_dataset(collected: Path, tmp_path: Path) -> None:
+    pytest.importorskip("ray")
+    folder = tmp_path / "data"
+    done = datagen(
+        "collect", *SHORT, "--out", folder, "--executor", "ray", "--workers", "2", "--json"
+    )
+    assert done.returncode == 0, done.stderr
+    info = json.loads(datagen_here("info", collected, "--json").stdout)
+    assert json.loads(done.stdout)["content_hash"] == info["content_hash"]
+    for path in sorted((collected / "rounds").iterdir()):
+        assert path.read_bytes() == (folder / "rounds" / path.name).read_bytes()
+    assert verify(folder, "full").ok
+    assert not (folder / ".partial").exists()
+
+
+def test_an_actor_that_dies_costs_its_round_only(tmp_path: Path) -> None:
+    ray = pytest.importorskip("ray")
+    done: list[str] = []
+    killed: list[str] = []
+
+    def hear(message: FramesDone | RoundDone) -> None:
+        if isinstance(message, RoundDone):
+            done.append(message.state.id)
+        elif message.frames and not killed:
+            killed.append(message.round_id)
+            ray.kill(crew._seats[0].actor)
+
+    crew = RayCrew(1, hear, Limits(delay_s=0.1))
+    assert crew.run(make_jobs(tmp_path, rounds=1, frames=600)) == []
+    assert killed == done == ["round-000"] == list(read_states(tmp_path))
+    assert not ray.is_initialized()
+
+
+def test_what_no_round_can_get_round_ends_it_at_once(tmp_path: Path) -> None:
+    pytest.importorskip("ray")
+    (job,) = make_jobs(tmp_path, rounds=1, frames=10)
+    changed = replace(job, plan=replace(job.plan, track_hash="0" * 64))
+    with pytest.raises(UserError, match="track oval is not the one this dataset was planned with"):
+        RayCrew(1, lambda message: None).run([changed])
+    assert not read_states(tmp_path)

@@ -1,0 +1,156 @@
+"""Several collectors on one plan: shards beside each other, locks, and putting folders together."""
+
+import json
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+import trackfeatures as tf
+from datagen.execution.lock import held
+from datagen.execution.merge import merge
+from datagen.planning.plan import Shard
+from datagen.recording import Dataset
+from datagen.recording.errors import DatasetError
+from datagen.recording.folder import read_states
+from datagen.recording.integrity.verify import verify
+from tests.datagen.commands import datagen, datagen_here, make_small_plan
+
+ROUNDS = ["--rounds", "3", "--frames", "20", "--tracks", "oval", "--workers", "1"]
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in sorted((folder / "rounds").iterdir())}
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("shards") / "whole"
+    assert datagen("collect", *ROUNDS, "--out", folder).returncode == 0
+    return folder
+
+
+def test_a_shard_is_every_nth_round() -> None:
+    rounds = make_small_plan(7, 10).rounds
+    parts = [Shard(number, 3).of(rounds) for number in (1, 2, 3)]
+    assert [e.id[-1] for e in parts[1]] == ["1", "4"]
+    assert sorted(e.id for part in parts for e in part) == [e.id for e in rounds]
+    assert Shard.parse("2/3") == Shard(2, 3)
+
+
+@pytest.mark.parametrize("text", ["0/3", "4/3", "2", "a/b", "1/0", "-1/3"])
+def test_what_is_no_shard_is_refused(text: str) -> None:
+    with pytest.raises(tf.UserError, match="as 1/4 to 4/4"):
+        Shard.parse(text)
+
+
+@pytest.mark.slow
+def test_shards_at_the_same_time_make_what_one_collector_makes(whole: Path, tmp_path: Path) -> None:
+    shared = tmp_path / "shared"
+    command = [sys.executable, "-m", "datagen", "collect", *ROUNDS, "--out", str(shared), "--json"]
+    running = [
+        subprocess.Popen(
+            [*command, "--shard", f"{number}/2"], stdout=subprocess.PIPE, stderr=subprocess.PIPE
+        )
+        for number in (1, 2)
+    ]
+    ended = [process.communicate(timeout=600) for process in running]
+    assert [process.returncode for process in running] == [0, 0], ended
+    results = [json.loads(stdout) for stdout, _ in ended]
+    assert [result["rounds"] for result in results] == [2, 1]
+    assert files(shared) == files(whole)
+    # The last to end has derived the manifest.
+    last = next(result for result in results if result["content_hash"])
+    assert last["content_hash"] == Dataset.open(whole).content_hash
+    assert (shared / "manifest.json").read_text() == (whole / "manifest.json").read_text()
+    assert verify(shared, "full").ok
+
+
+def test_folders_of_shards_are_merged(
+    whole: Path, tmp_path: Path, refused: Callable[..., str]
+) -> None:
+    parts = [_without(whole, tmp_path / "one", ("001",)), tmp_path / "two"]
+    _without(whole, parts[1], ("000", "002"))
+    out = tmp_path / "out"
+    merged = merge([parts[0]], out)
+    assert (merged.rounds, merged.planned, merged.added) == (2, 3, 2)
+    done = datagen_here("merge", *parts, "--out", out, "--json")
+    both = json.loads(done.stdout)
+    assert (both["rounds"], both["added"], both["frames"]) == (3, 1, 60)
+    assert both["content_hash"] == Dataset.open(whole).content_hash
+    assert files(out) == files(whole)
+    assert (out / "manifest.json").read_text() == (whole / "manifest.json").read_text()
+    assert verify(out, "full").ok
+    assert not (out / ".partial").exists()
+
+
+def test_what_is_no_shard_of_the_plan_or_damaged_is_not_merged(
+    whole: Path, tmp_path: Path, refused: Callable[..., str]
+) -> None:
+    new, part = tmp_path / "new", _without(whole, tmp_path / "part", ())
+    assert "no folder of `datagen collect`" in refused("merge", tmp_path, "--out", new)
+    (other := tmp_path / "other").mkdir()
+    plan = json.loads((whole / "plan.json").read_text()) | {"hash": "0" * 64}
+    (other / "plan.json").write_text(json.dumps(plan))
+    assert "another plan" in refused("merge", whole, other, "--out", new)
+    assert not new.exists()
+    damaged = part / "rounds" / "round-001.mcap"
+    content = bytearray(damaged.read_bytes())
+    content[len(content) // 2] ^= 1
+    damaged.write_bytes(content)
+    assert "is damaged" in refused("merge", part, "--out", new)
+    assert list(read_states(new)) == ["round-000"]
+    assert not (new / ".partial" / "round-001").exists()
+    assert "is not a dataset" in refused("merge", part, "--out", tmp_path / "part" / "rounds")
+
+
+def _without(whole: Path, folder: Path, numbers: tuple[str, ...]) -> Path:
+    """What a shard leaves: the dataset without some rounds."""
+    shutil.copytree(whole, folder)
+    for number in numbers:
+        (folder / "rounds" / f"round-{number}.mcap").unlink()
+        (folder / "state" / f"round-{number}.json").unlink()
+    return folder
+
+
+def test_two_collectors_of_the_same_rounds_are_refused(tmp_path: Path) -> None:
+    with held(tmp_path, Shard(1, 2)):
+        with held(tmp_path, Shard(2, 2)):
+            pass
+        for other in (Shard(1, 2), Shard(1, 3), None):
+            with (
+                pytest.raises(DatasetError, match=r"is being recorded|is writing to"),
+                held(tmp_path, other),
+            ):
+                pass
+    with held(tmp_path, Shard(1, 3)):
+        pass
+    with (
+        held(tmp_path, None),
+        pytest.raises(DatasetError, match="another `datagen collect`"),
+        held(tmp_path, Shard(1, 2)),
+    ):
+        pass
+
+
+def test_a_collector_refuses_a_folder_that_another_process_holds(
+    whole: Path, refused: Callable[..., str]
+) -> None:
+    hold = (
+        "import sys, time; from pathlib import Path; from datagen.execution.lock import held\n"
+        "with held(Path(sys.argv[1]), None): print('held', flush=True); time.sleep(300)"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", hold, str(whole)], stdout=subprocess.PIPE, text=True
+    ) as other:
+        assert other.stdout is not None
+        assert other.stdout.readline() == "held\n"
+        assert "another `datagen collect`" in refused("collect", *ROUNDS, "--out", whole)
+        other.kill()
+    deadline = time.monotonic() + 120.0
+    while datagen("collect", *ROUNDS, "--out", whole).returncode:  # the lock ended with it
+        assert time.monotonic() < deadline

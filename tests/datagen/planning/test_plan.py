@@ -1,0 +1,136 @@
+"""The plan: pure, evenly dealt, and split without leaks."""
+
+from collections import Counter
+from dataclasses import replace
+from itertools import pairwise
+from typing import Any
+
+import pytest
+
+import trackfeatures as tf
+from datagen.planning.plan import LIGHTS, TRAJECTORIES, CollectConfig, TrackChoice
+from datagen.planning.planner import JITTER, make_plan
+from datagen.planning.tracks import TORCS_TRACKS, choose_tracks
+
+NINE = tuple(TrackChoice(f"track-{i}", f"{i}" * 64) for i in range(9))
+
+
+def wanted(**changes: Any) -> CollectConfig:
+    return replace(CollectConfig(rounds=60, frames=2000, seed=0, tracks=NINE), **changes)
+
+
+def test_the_same_wishes_give_the_same_plan_and_others_another() -> None:
+    plan = make_plan(wanted())
+    assert plan == make_plan(wanted())
+    others = [
+        wanted(seed=1), wanted(rounds=61), wanted(frames=100), wanted(lanes=(1, 2)),
+        wanted(codec="png"), wanted(tracks=(*NINE[:-1], TrackChoice("track-8", "f" * 64))),
+    ]  # fmt: skip
+    hashes = {plan.hash, *(make_plan(other).hash for other in others)}
+    assert len(hashes) == 7
+
+
+def test_sixty_rounds_cover_everything_evenly() -> None:
+    rounds = make_plan(wanted()).rounds
+    tracks = Counter(entry.track for entry in rounds)
+    assert set(tracks.values()) == {6, 7}
+    assert set(Counter(e.lanes for e in rounds).values()) <= {19, 20, 21}
+    pairs = Counter((e.track, e.lanes) for e in rounds)
+    assert len(pairs) == 27
+    assert set(pairs.values()) <= {2, 3}
+    assert set(Counter(e.traffic for e in rounds)) == set(range(9))
+    for dealt, kinds in (("trajectory", TRAJECTORIES), ("lights", [(kind,) for kind in LIGHTS])):
+        counts = Counter(getattr(e, dealt) for e in rounds)
+        assert set(counts) == set(kinds)
+        assert max(counts.values()) - min(counts.values()) <= 1
+    assert 40 <= min(e.speed_kmh for e in rounds) < 41
+    assert 74 < max(e.speed_kmh for e in rounds) <= 75
+    for track in tracks:
+        starts = sorted(e.start for e in rounds if e.track == track)
+        assert max(b - a for a, b in pairwise(starts)) < 0.35
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_quarter_is_for_testing_and_every_track_and_lane_count_is_on_both_sides(
+    seed: int,
+) -> None:
+    rounds = make_plan(wanted(seed=seed)).rounds
+    sides = {side: [e for e in rounds if e.split == side] for side in ("train", "test")}
+    assert len(sides["test"]) == 15
+    for side in sides.values():
+        assert {e.track for e in side} == {choice.name for choice in NINE}
+        assert {e.lanes for e in side} == {1, 2, 3}
+        assert {light for e in side for light in e.lights} == set(LIGHTS)
+        assert {e.trajectory for e in side} == set(TRAJECTORIES)
+    roads = {side: {(e.track, e.lanes) for e in sides[side]} for side in sides}
+    assert roads["test"] <= roads["train"]  # of 27 roads each has two rounds or three
+    assert len({e.seed for e in rounds}) == 60
+    assert not {e.seed for e in rounds} & {e.seed for e in make_plan(wanted(seed=seed + 1)).rounds}
+
+
+def test_small_plans_keep_a_round_of_each_track_for_training() -> None:
+    twelve = make_plan(wanted(rounds=12, tracks=NINE[:4])).rounds
+    train = [e for e in twelve if e.split == "train"]
+    assert {e.track for e in train} == {e.track for e in twelve}
+    assert {e.track for e in twelve if e.split == "test"} == {e.track for e in twelve}
+    assert [e.split for e in make_plan(wanted(rounds=1)).rounds] == ["train"]
+    assert sorted(e.split for e in make_plan(wanted(rounds=2)).rounds) == ["test", "train"]
+    assert {e.split for e in make_plan(wanted(test_share=0.0)).rounds} == {"train"}
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{"rounds": 0}, {"frames": 0}, {"seed": -1}, {"lanes": (4,)}, {"lanes": ()}, {"tracks": ()},
+     {"test_share": 1.0}, {"lights": ("disco",)}, {"codec": "gif"}, {"split": "seen"},
+     {"rounds": 600_000}],
+)  # fmt: skip
+def test_wishes_that_cannot_be_met_are_refused(changes: dict[str, Any]) -> None:
+    with pytest.raises(tf.UserError):
+        wanted(**changes)
+
+
+@pytest.mark.usefixtures("no_torcs_install")
+def test_without_torcs_the_projects_own_tracks_are_driven() -> None:
+    names = [choice.name for choice in choose_tracks((), None)]
+    assert len(names) >= 4
+    assert not set(names) & set(TORCS_TRACKS)
+    (one,) = choose_tracks((names[0],), None)
+    assert one.name == names[0]
+    assert len(one.content_hash) == 64
+
+
+def test_jittered_cameras_differ_and_stay_near_the_datasets_own() -> None:
+    plan = make_plan(wanted(jitter_camera=True))
+    about = wanted().camera
+    for name, half in JITTER.items():
+        values = [getattr(entry.camera, name) - getattr(about, name) for entry in plan.rounds]
+        assert len({*values}) == 60
+        assert max(map(abs, values)) <= half + 1e-4
+        assert max(values) > 0.9 * half
+        assert min(values) < -0.9 * half
+    assert {entry.nominal_camera for entry in plan.rounds} == {about}
+    assert {(e.camera.width, e.camera.x, e.camera.y) for e in plan.rounds} == {(280, 0.75, 0.0)}
+    assert {entry.camera for entry in make_plan(wanted()).rounds} == {about}
+
+
+def test_rounds_of_an_unseen_track_share_no_seed_with_those_to_train_on() -> None:
+    plan = make_plan(wanted(split="unseen"))
+    assert {entry.split for entry in plan.rounds} == {"unseen"}
+    usual = {entry.seed for seed in range(3) for entry in make_plan(wanted(seed=seed)).rounds}
+    assert not usual & {entry.seed for entry in plan.rounds}
+
+
+def test_the_unseen_track_is_in_no_usual_plan() -> None:
+    (unseen,) = choose_tracks((), None, unseen=True)
+    usual = [choice.name for choice in choose_tracks((), None)]
+    assert unseen.name not in usual
+    with pytest.raises(tf.UserError, match="one of those to train on"):
+        choose_tracks((usual[0],), None, unseen=True)
+    assert [c.name for c in choose_tracks((unseen.name,), None, unseen=True)] == [unseen.name]
+
+
+def test_another_version_of_the_program_has_another_plan(monkeypatch: pytest.MonkeyPatch) -> None:
+    plan = make_plan(wanted())
+    before = plan.hash
+    monkeypatch.setattr("datagen.planning.plan.program", lambda: "driverview 99")
+    assert plan.hash != before

@@ -1,0 +1,48 @@
+"""Frames a second: fewer of them show more road, and the car is steered as often as before."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from datagen.planning.plan import CONTROL_HZ, CollectConfig, TrackChoice
+from datagen.planning.planner import make_plan
+from datagen.recording import Dataset
+from datagen.view.steps import Steps
+from simulator.world.physics import PHYSICS_HZ
+from tests.datagen.commands import datagen
+
+OPTIONS = ("--rounds", "1", "--tracks", "oval", "--lights", "clear", "--stretch", "0")
+
+
+@pytest.mark.parametrize("hertz", [h for h in range(1, PHYSICS_HZ + 1) if PHYSICS_HZ % h == 0])
+def test_the_car_is_steered_often_enough(hertz: int) -> None:
+    wanted = CollectConfig(rounds=1, frames=1, seed=0, tracks=(TrackChoice("oval", "0"),))
+    entry = make_plan(replace(wanted, frequency_hz=hertz)).rounds[0]
+    control_hz = hertz * entry.steps_a_frame
+    assert control_hz >= CONTROL_HZ
+    assert PHYSICS_HZ % control_hz == 0
+    assert (entry.steps_a_frame == 1) == (hertz >= CONTROL_HZ)
+
+
+def test_every_fifth_frame_is_that_of_a_round_of_twenty_a_second(tmp_path: Path) -> None:
+    """The drive is the same: only what is recorded of it differs."""
+    for name, options in {"all": ("--frames", "50"), "few": ("--frames", "10")}.items():
+        hertz = ("--frequency", "4" if name == "few" else "20")
+        done = datagen("collect", "--out", tmp_path / name, *OPTIONS, *options, *hertz)
+        assert done.returncode == 0, done.stderr
+    every, few = (Dataset.open(tmp_path / name).select("all") for name in ("all", "few"))
+    np.testing.assert_array_equal(few.labels.s, every.labels.s[::5])
+    np.testing.assert_array_equal(few.labels.angle, every.labels.angle[::5])
+    np.testing.assert_array_equal(few.read_batch(range(10)), every.read_batch(range(0, 50, 5)))
+    steps = Steps.open(few.rounds[0].path)
+    assert [step.time_s for step in steps] == pytest.approx([0.25 * k for k in range(10)])
+    done = datagen("verify", tmp_path / "few", "--level", "deep", "--replay", "1")
+    assert done.returncode == 0, done.stderr + done.stdout
+
+
+def test_a_rate_that_the_physics_cannot_keep_is_refused() -> None:
+    done = datagen("collect", "--frequency", "7", "--dry-run")
+    assert done.returncode != 0
+    assert "7 Hz does not divide" in done.stderr

@@ -1,0 +1,55 @@
+"""Rounds simulated again are those that were recorded."""
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from datagen.recorder.replay import replay
+from datagen.recording.frame import EgoState
+from datagen.recording.schema import messages
+from tests.datagen.commands import datagen
+
+
+def test_a_replay_gives_the_same_labels_states_and_pixels(collected: Path) -> None:
+    done = datagen("verify", collected, "--level", "quick", "--replay", "5", "--pixels", "--json")
+    report = json.loads(done.stdout)
+    assert (done.returncode, report["problems"]) == (0, [])
+    assert report["replayed"] == ["round-000", "round-001"]
+
+
+def test_another_round_under_the_same_name_is_seen(
+    collected: Path, tmp_path: Path, refused: Callable[..., str]
+) -> None:
+    folder = shutil.copytree(collected, tmp_path / "data")
+    plan = json.loads((folder / "plan.json").read_text())
+    plan["rounds"][1]["speed_kmh"] += 0.5
+    (folder / "plan.json").write_text(json.dumps(plan))
+    names, problems = replay(folder, 2)
+    assert names == ["round-000", "round-001"]
+    labels, states = sorted(problems, reverse=True)
+    assert labels.startswith("round-001.mcap: simulated again, /labels differs from frame ")
+    assert states.startswith("round-001.mcap: simulated again, /ego/state differs from frame 0 on")
+    (folder / "plan.json").unlink()
+    assert "only what has a plan" in refused("verify", folder, "--level", "quick", "--replay", "1")
+
+
+def test_one_bit_of_one_state_is_seen(collected: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    real = messages.ego_state
+    asked: list[EgoState] = []
+
+    def twenty_first_is_another(ego: EgoState) -> bytes:
+        asked.append(ego)
+        data = real(ego)
+        return data[:-1] + bytes([data[-1] ^ 1]) if len(asked) == 21 else data
+
+    monkeypatch.setattr(messages, "ego_state", twenty_first_is_another)
+    names, (problem,) = replay(collected, 1)
+    assert names == ["round-000"]
+    assert "/ego/state differs from frame 20 on" in problem
+
+
+def test_a_round_count_below_one_is_refused(collected: Path, refused: Callable[..., str]) -> None:
+    assert "--replay is -1" in refused("verify", collected, "--level", "quick", "--replay", "-1")

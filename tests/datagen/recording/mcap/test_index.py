@@ -1,0 +1,109 @@
+"""Finding messages without the official reader: it is the oracle, and damage is never followed."""
+
+import resource
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+
+from datagen.recording import Dataset, DatasetError
+from datagen.recording.folder import round_path
+from datagen.recording.labels import read_labels
+from datagen.recording.mcap.footer import read_metadata, read_summary
+from datagen.recording.mcap.index import open_round
+from datagen.recording.mcap.mmap import map_file
+from datagen.recording.mcap.records import MESSAGE_INDEX, RECORD
+from datagen.recording.schema import topics
+from tests.datagen.conftest import Samples
+
+
+@pytest.fixture
+def path(samples: Samples, tmp_path: Path) -> Path:
+    path = tmp_path / "r.mcap"
+    samples.write(path, samples.header(), samples.frames(90, seed=3))
+    return path
+
+
+@pytest.fixture
+def few_descriptors() -> Iterator[int]:
+    before = resource.getrlimit(resource.RLIMIT_NOFILE)
+    limit = len(list(Path("/proc/self/fd").iterdir())) + 20
+    resource.setrlimit(resource.RLIMIT_NOFILE, (limit, before[1]))
+    yield limit
+    resource.setrlimit(resource.RLIMIT_NOFILE, before)
+
+
+def test_the_summary_is_that_of_the_official_reader(path: Path) -> None:
+    view = map_file(path)
+    mine = read_summary(view)
+    with path.open("rb") as stream:
+        reader = make_reader(stream)
+        official = reader.get_summary()
+        metadata = {record.name: record.metadata for record in reader.iter_metadata()}
+    assert official is not None
+    assert official.statistics is not None
+    assert mine.channels == {c.topic: c.id for c in official.channels.values()}
+    assert [(c.start, c.compression, c.indexes) for c in mine.chunks] == [
+        (c.chunk_start_offset, c.compression, c.message_index_offsets)
+        for c in official.chunk_indexes
+    ]
+    assert len(mine.chunks) > 1
+    assert mine.counts == official.statistics.channel_message_counts
+    assert {name: read_metadata(view, at) for name, at in mine.metadata.items()} == metadata
+
+
+def test_more_rounds_can_be_open_than_file_descriptors(path: Path, few_descriptors: int) -> None:
+    indexes = [open_round(path) for _ in range(few_descriptors + 100)]
+    one = indexes[0].messages[topics.CAMERA].payload(7)
+    assert all(index.messages[topics.CAMERA].payload(7) == one for index in indexes)
+
+
+def test_a_map_goes_with_its_last_view(path: Path) -> None:
+    def maps() -> int:
+        return Path("/proc/self/maps").read_text().count(str(path))
+
+    view = map_file(path)
+    assert view.readonly
+    array = np.frombuffer(view, np.uint8)
+    del view
+    assert (maps(), array.tobytes()) == (1, path.read_bytes())
+    del array
+    assert maps() == 0
+
+
+def test_a_damaged_index_is_refused_when_it_is_opened(path: Path) -> None:
+    data = bytearray(path.read_bytes())
+    data[-400] ^= 1
+    path.write_bytes(data)
+    with pytest.raises(DatasetError, match="its index is damaged"):
+        open_round(path)
+
+
+@pytest.mark.parametrize("entry", ["log_time", "place"])
+def test_a_damaged_message_index_is_refused_when_it_is_followed(dataset: Path, entry: str) -> None:
+    """It lies outside the index at the end: what it points at has to prove itself."""
+    path = round_path(dataset, "r000")
+    data = bytearray(path.read_bytes())
+    summary = read_summary(memoryview(bytes(data)))
+    index_at = summary.chunks[0].indexes[summary.channels[topics.CAMERA]]
+    entry_at = index_at + RECORD.size + MESSAGE_INDEX.size + 16 * 7
+    data[entry_at + (0 if entry == "log_time" else 8)] ^= 0x01
+    path.write_bytes(data)
+    with pytest.raises(DatasetError):
+        _read_all(dataset)
+
+
+def test_a_round_without_frames_is_refused(samples: Samples, tmp_path: Path) -> None:
+    path = tmp_path / "empty.mcap"
+    samples.write(path, samples.header(), [])
+    with pytest.raises(DatasetError, match="has no frames"):
+        read_labels(open_round(path), 0)
+
+
+def _read_all(dataset: Path) -> None:
+    frames = Dataset.open(dataset).select("all")
+    _ = frames.labels
+    for i in range(len(frames)):
+        frames.jpeg(i)

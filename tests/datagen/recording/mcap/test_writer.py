@@ -1,0 +1,208 @@
+"""The bytes of a round: every topic, the official readers' view of them, and their repetition."""
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import mcap.writer
+import numpy as np
+import pytest
+import simplejpeg
+from foxglove_schemas_protobuf.PointsAnnotation_pb2 import PointsAnnotation
+from mcap.reader import make_reader
+from mcap_protobuf.decoder import DecoderFactory
+
+import trackfeatures as tf
+from datagen.recording.images import decode_into, encode
+from datagen.recording.labels import read_labels
+from datagen.recording.mcap.index import MappedMessages, RoundIndex, load_round, open_round
+from datagen.recording.mcap.protobuf_wire import points_field
+from datagen.recording.schema import topics
+from tests.datagen.conftest import Samples
+
+SCHEMAS = {
+    "/camera/front": "foxglove.CompressedImage",
+    "/camera/front/calibration": "foxglove.CameraCalibration",
+    "/camera/front/annotations": "foxglove.ImageAnnotations",
+    "/labels": "driverview.TrackFeatures",
+    "/ego/state": "driverview.VehicleState",
+    "/sensors": "driverview.Sensors",
+    "/command": "driverview.Command",
+    "/traffic": "foxglove.SceneUpdate",
+    "/track/scene": "foxglove.SceneUpdate",
+    "/tf": "foxglove.FrameTransforms",
+}
+
+
+def test_every_topic_is_there_at_its_rate_and_decodes_with_the_official_reader(
+    samples: Samples, tmp_path: Path
+) -> None:
+    path = tmp_path / "r.mcap"
+    frames = samples.frames(45, seed=3)
+    samples.write(path, samples.header(), frames)
+    seen: dict[str, list[Any]] = {topic: [] for topic in SCHEMAS}
+    with path.open("rb") as stream:
+        reader = make_reader(stream, validate_crcs=True, decoder_factories=[DecoderFactory()])
+        for schema, channel, message, decoded in reader.iter_decoded_messages():
+            assert schema is not None
+            assert schema.name == SCHEMAS[channel.topic]
+            assert (message.log_time - topics.EPOCH_NS) % (topics.NANOSECONDS // 20) == 0
+            seen[channel.topic].append(decoded)
+        summary = reader.get_summary()
+    counts = {topic: len(found) for topic, found in seen.items()}
+    assert counts == {
+        **dict.fromkeys(SCHEMAS, 45), "/camera/front/calibration": 3, "/track/scene": 1,
+    }  # fmt: skip
+    assert summary is not None
+    assert all(chunk.compression == "" for chunk in summary.chunk_indexes)
+    image = simplejpeg.decode_jpeg(seen["/camera/front"][7].data, "RGB")
+    assert np.abs(image.astype(int) - frames[7].image).mean() < 6.0
+    assert seen["/command"][0].gear == 3
+    assert list(seen["/sensors"][5].range) == list(frames[5].sensors.range)
+    assert len(seen["/traffic"][0].entities) == 3  # the ego car and two others
+    line = seen["/camera/front/annotations"][2].points[0]
+    assert np.allclose([(p.x, p.y) for p in line.points], frames[2].markings[0])
+
+
+def test_labels_keep_every_digit_and_absence_is_unset(samples: Samples, tmp_path: Path) -> None:
+    path = tmp_path / "r.mcap"
+    frames = samples.frames(200, seed=4)
+    samples.write(path, samples.header(), frames)
+    with path.open("rb") as stream:
+        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+        found = [decoded for *_, decoded in reader.iter_decoded_messages(["/labels"])]
+    absent = 0
+    for message, frame in zip(found, frames, strict=True):
+        for name, value in frame.features.distances.items():
+            field = f"to_marking_{name}"
+            assert message.HasField(field) == (value is not None)
+            assert value is None or getattr(message, field) == value
+            absent += value is None
+        assert message.HasField("to_lane_centre") == (frame.features.to_lane_centre is not None)
+        assert message.angle == frame.features.angle
+        assert message.heading == frame.features.heading
+        assert (message.s, message.to_middle) == (frame.place.s, frame.place.to_middle)
+    assert absent > 100  # the samples do have absent distances
+
+
+def test_our_reader_and_the_official_one_find_the_same(samples: Samples, tmp_path: Path) -> None:
+    path = tmp_path / "r.mcap"
+    samples.write(path, samples.header(), samples.frames(60, seed=5))
+    fast, official = open_round(path), load_round(path)
+    assert fast.mapped
+    assert not official.mapped
+    assert (fast.header, fast.result) == (official.header, official.result)
+    _assert_same(fast, official)
+
+
+@pytest.mark.parametrize("kind", ["zstd", "unindexed"])
+def test_compressed_and_unindexed_files_go_through_the_official_reader(
+    samples: Samples, tmp_path: Path, kind: str
+) -> None:
+    path, other = tmp_path / "r.mcap", tmp_path / "other.mcap"
+    samples.write(path, samples.header(), samples.frames(30, seed=6))
+    _rewrite(path, other, kind)
+    index = open_round(other)
+    assert not index.mapped
+    _assert_same(index, open_round(path))
+
+
+def test_the_same_round_gives_the_same_bytes_in_two_processes(
+    samples: Samples, tmp_path: Path
+) -> None:
+    code = (
+        "import importlib.util, pathlib, sys\n"
+        f"spec = importlib.util.spec_from_file_location('c', {str(Path(__file__).parents[2])!r} + "
+        "'/conftest.py')\n"
+        "c = importlib.util.module_from_spec(spec); spec.loader.exec_module(c)\n"
+        "s = c.Samples(); s.write(pathlib.Path(sys.argv[1]), s.header(), s.frames(25, seed=7))\n"
+    )
+    paths = [tmp_path / "a.mcap", tmp_path / "b.mcap"]
+    for path in paths:
+        subprocess.run([sys.executable, "-c", code, str(path)], check=True)
+    assert paths[0].read_bytes() == paths[1].read_bytes()
+    mine = tmp_path / "c.mcap"
+    samples.write(mine, samples.header(), samples.frames(25, seed=7))
+    assert mine.read_bytes() == paths[0].read_bytes()
+
+
+def test_the_content_hash_knows_images_and_labels_but_not_names(
+    samples: Samples, tmp_path: Path
+) -> None:
+    frames = samples.frames(10, seed=8)
+    first = samples.write(tmp_path / "a.mcap", samples.header("r001"), frames)
+    renamed = samples.write(tmp_path / "b.mcap", samples.header("r002"), frames)
+    shorter = samples.write(tmp_path / "c.mcap", samples.header("r001"), frames[:-1])
+    assert first.content_hash == renamed.content_hash != shorter.content_hash
+
+
+def test_png_loses_nothing_and_jpeg_little() -> None:
+    rng = np.random.default_rng(0)
+    image = rng.integers(0, 256, (42, 56, 3), dtype=np.uint8)
+    out = np.empty_like(image)
+    decode_into(encode(image, "png"), out)
+    assert np.array_equal(out, image)
+    smooth = np.tile(np.arange(56, dtype=np.uint8)[None, :, None] * 4, (42, 1, 3))
+    decode_into(encode(smooth, "jpeg"), out)
+    assert np.abs(out.astype(int) - smooth).max() <= 4
+
+
+def test_an_image_of_another_size_is_refused() -> None:
+    small = encode(np.zeros((20, 20, 3), np.uint8), "jpeg")
+    with pytest.raises(ValueError, match="20x20 px where 56x42"):
+        decode_into(small, np.empty((42, 56, 3), np.uint8))
+
+
+def _assert_same(one: RoundIndex, other: RoundIndex) -> None:
+    for topic in (topics.CAMERA, topics.LABELS, topics.EGO_STATE):
+        a, b = one.messages[topic], other.messages[topic]
+        assert np.array_equal(a.log_time, b.log_time)
+        assert all(a.payload(i) == b.payload(i) for i in range(len(a.log_time)))
+    assert isinstance(one.messages[topics.CAMERA], MappedMessages) == one.mapped
+    mine, theirs = read_labels(one, 0), read_labels(other, 0)
+    assert np.array_equal(mine.distances, theirs.distances, equal_nan=True)
+    assert np.array_equal(mine.angle, theirs.angle)
+    assert set(np.unique(mine.heading)) <= set(tf.Heading)
+
+
+def _rewrite(source: Path, target: Path, kind: str) -> None:
+    """The same messages in another kind of MCAP file."""
+    kinds: dict[str, dict[str, Any]] = {
+        "zstd": {"compression": mcap.writer.CompressionType.ZSTD},
+        "unindexed": {
+            "compression": mcap.writer.CompressionType.NONE,
+            "index_types": mcap.writer.IndexType.METADATA,
+            "use_chunking": False,
+        },
+    }
+    with source.open("rb") as stream, target.open("wb") as out:
+        reader = make_reader(stream)
+        writer = mcap.writer.Writer(out, **kinds[kind])
+        writer.start()
+        for record in reader.iter_metadata():
+            writer.add_metadata(record.name, record.metadata)
+        channels: dict[int, int] = {}
+        for schema, channel, message in reader.iter_messages(log_time_order=False):
+            if channel.id not in channels:
+                assert schema is not None
+                number = writer.register_schema(schema.name, schema.encoding, schema.data)
+                channels[channel.id] = writer.register_channel(
+                    channel.topic, channel.message_encoding, number
+                )
+            writer.add_message(
+                channels[channel.id], message.log_time, message.data, message.publish_time
+            )
+        writer.finish()  # type: ignore[no-untyped-call]  # mcap leaves it untyped
+
+
+def test_points_are_written_as_protobuf_writes_them() -> None:
+    points = np.array([[1.5, -2.25], [0.0, 1e9], [3.0, 0.0]])
+    plain = PointsAnnotation(thickness=2.0)
+    for x, y in points.tolist():
+        plain.points.add(x=x, y=y)
+    packed = PointsAnnotation(thickness=2.0)
+    packed.MergeFromString(points_field(PointsAnnotation.POINTS_FIELD_NUMBER, points))
+    assert packed == plain
+    assert packed.SerializeToString() == plain.SerializeToString()
+    assert points_field(3, np.zeros((0, 2))) == b""

@@ -1,0 +1,92 @@
+"""The dataset card: its figures are the dataset's, its program runs, the hub can read its head."""
+
+import re
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from datagen.recording.card import SIZES, card
+from datagen.recording.dataset import Dataset
+from datagen.recording.manifest import rebuild
+from datagen.recording.schema.fields import FIELDS
+from datagen.recording.schema.topics import MESSAGE_TYPES
+from datagen.recording.splits import Split
+from datagen.recording.statistics import describe
+from tests.datagen.conftest import Samples
+
+
+@pytest.fixture
+def text(dataset: Path) -> str:
+    return (dataset / "README.md").read_text()
+
+
+def test_the_head_is_what_the_hub_reads(text: str) -> None:
+    yaml = pytest.importorskip("yaml")
+    _, head, _ = text.split("---\n", 2)
+    found = yaml.safe_load(head)
+    assert found["license"] == "mit"
+    assert found["size_categories"] == ["n<1K"]
+    assert found["pretty_name"] == "data: driver-view images and track features"
+    assert {"image-classification", "robotics"} == set(found["task_categories"])
+    assert found["viewer"] is False
+
+
+def test_the_program_of_the_card_reads_the_dataset(text: str, dataset: Path) -> None:
+    (program,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    assert len([line for line in program.splitlines() if line]) == 5
+    done = subprocess.run(
+        [sys.executable, "-c", program], cwd=dataset, capture_output=True, text=True, timeout=300
+    )
+    assert done.stdout.startswith("90 ["), done.stderr
+
+
+def test_every_field_topic_and_file_is_named(text: str, dataset: Path) -> None:
+    for message, fields in FIELDS.items():
+        assert f"`driverview.{message}`" in text
+        for name, field in fields.items():
+            assert f"| `{name}` | {field.unit} | {field.meaning}" in text
+    for topic in MESSAGE_TYPES:
+        assert f"| `{topic}` |" in text
+    for named in ("splits/default.json", "proto/driverview.proto", "stats.json", "manifest.json",
+                  "schemas/driverview.schema.json", "layouts/foxglove.json"):  # fmt: skip
+        assert named in text
+        assert (dataset / named).is_file()
+
+
+def test_the_figures_are_the_datasets(text: str, dataset: Path) -> None:
+    opened = Dataset.open(dataset)
+    statistics = describe(opened)
+    assert opened.content_hash in text
+    assert "135 frames in 3 rounds, 20 a second, 56 x 42 px" in text
+    assert "never by frame: 2 train, 1 test." in text
+    assert "| frames | 135 | 90 | 45 |" in text
+    deviation = statistics["test"]["mean_deviation"]["angle"]
+    assert re.search(
+        rf"mean deviation of angle \|.*\| {deviation:.3f} rad \(100% active\) \|", text
+    )
+    assert "- track: a-track: 135\n" in text
+    assert "JPEG, quality 95" in text
+
+
+def test_size_categories_are_the_hubs(dataset: Path) -> None:
+    opened = Dataset.open(dataset)
+    for frames, name in ((999, "n<1K"), (1000, "1K<n<10K"), (120_000, "100K<n<1M"),
+                         (10**6, "1M<n<10M")):  # fmt: skip
+        assert f"size_categories:\n- {name}\n" in card(
+            opened, describe(opened) | {"frames": frames}
+        )
+    assert [most for most, _ in SIZES] == sorted(most for most, _ in SIZES)
+
+
+def test_jitter_and_lossless_rounds_are_told(samples: Samples, dataset: Path) -> None:
+    tilted = replace(samples.camera, pitch_deg=1.5)
+    header = samples.header("r003", camera=tilted, nominal_camera=samples.camera, codec="png")
+    samples.add_round(dataset, header)
+    rebuild(dataset, Split(("r000", "r001"), ("r002",)))
+    text = (dataset / "README.md").read_text()
+    assert "each round's a little off" in text
+    assert "PNG, lossless" in text
+    assert "2 train, 1 test, 1 of no side." in text

@@ -1,0 +1,71 @@
+"""Batches: every frame once an epoch, a function of seed and step."""
+
+from collections.abc import Generator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mtlnet.data.loader import Loader
+from mtlnet.inference.model_card import Camera
+
+
+@dataclass(frozen=True)
+class FakeLabels:
+    distances: NDArray[np.float32]
+    angle: NDArray[np.float32]
+    heading: NDArray[np.int64]
+
+
+class FakeFrames:
+    """Images of one colour: their frame number."""
+
+    def __init__(self, count: int) -> None:
+        angle = np.linspace(-0.4, 0.4, count).astype(np.float32)
+        distances = np.tile(np.array([-2, 2, np.nan, np.nan, np.nan], np.float32), (count, 1))
+        self.labels = FakeLabels(distances, angle, np.arange(count) % 3)
+
+    def __len__(self) -> int:
+        return len(self.labels.angle)
+
+    def read_batch(self, indices: NDArray[np.int64], out: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        out[:] = np.asarray(indices, np.uint8)[:, None, None, None]
+        return out
+
+
+def loader(seed: int = 0, *, augment: bool = False, part: tuple[int, int] = (0, 1)) -> Loader:
+    camera = Camera(width=24, height=16)
+    return Loader(FakeFrames(20), camera, 8, seed, augment=augment, part=part)
+
+
+def test_every_frame_once_an_epoch_across_batches() -> None:
+    order = np.concatenate([loader().indices(step) for step in range(5)])
+    assert sorted(order[:20]) == sorted(order[20:]) == list(range(20))
+    assert order[:20].tolist() != order[20:].tolist()
+
+
+def test_batches_carry_the_labels_of_their_frames() -> None:
+    made = loader()
+    batches = made.batches(3)
+    assert isinstance(batches, Generator)
+    batch = next(batches)
+    assert batch.images[:, 0, 0, 0].tolist() == made.indices(3).tolist()
+    np.testing.assert_array_equal(batch.coded, made.coded[made.indices(3)])
+    assert next(batches).images[:, 0, 0, 0].tolist() == made.indices(4).tolist()
+    batches.close()
+
+
+def test_same_seed_and_step_same_batch() -> None:
+    one, two = loader(augment=True).make(4), loader(augment=True).make(4)
+    other = loader(seed=1, augment=True).make(4)
+    np.testing.assert_array_equal(one.images, two.images)
+    np.testing.assert_array_equal(one.coded, two.coded)
+    assert one.images.tolist() != other.images.tolist()
+
+
+def test_parts_of_a_batch_are_the_batch() -> None:
+    whole = loader(augment=True).make(5)
+    parts = [loader(augment=True, part=(which, 4)).make(5) for which in range(4)]
+    for name in ("images", "coded", "heading"):
+        together = np.concatenate([getattr(part, name) for part in parts])
+        np.testing.assert_array_equal(together, getattr(whole, name))

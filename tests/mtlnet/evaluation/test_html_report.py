@@ -1,0 +1,179 @@
+"""The evaluation's page: its figures are the report's, its worst frames are the worst."""
+
+import base64
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import simplejpeg
+from numpy.typing import NDArray
+
+import trackfeatures as tf
+from datagen.recording import Dataset, Frames
+from mtlnet.evaluation.html_report import (
+    APART,
+    EACH,
+    MOST_DRIVES,
+    Worst,
+    figures,
+    page,
+    worst_frames,
+)
+from mtlnet.evaluation.metrics import judge_all, mean_answer, signed_errors
+from mtlnet.inference.model_card import CENTRE_HEIGHT_M
+from mtlnet.inference.overlay import ANSWER_COLOUR, TRUTH_COLOUR, marking_line, to_pixels
+from mtlnet.inference.uncertainty import FEATURES
+from tests.mtlnet.page import Page
+
+ORDER = ("to_lane_centre", "angle", "ml", "mr", "m", "l", "r")
+OFF = {9: 1.0, 30: -0.8, 60: 0.3}
+"""Frames on which the answer for `ml` is so many m wrong."""
+
+
+@pytest.fixture(scope="module")
+def frames(dataset: Path) -> Frames:
+    return Dataset.open(dataset).select("all")
+
+
+@pytest.fixture(scope="module")
+def outputs(frames: Frames) -> NDArray[np.float32]:
+    """Right answers but for `OFF` and a little everywhere; each says 0.25 m or rad."""
+    labels = frames.labels
+    said = labels.distances.astype(np.float64)
+    said[:, 0] -= 0.01
+    for row, error in OFF.items():
+        said[row, 0] = labels.distances[row, 0] + error
+    coded = tf.encode(said, labels.angle + 0.002)
+    classes = np.eye(3)[labels.heading] * 0.7 + 0.1
+    doubt = np.full((len(frames), 8), 0.25)
+    doubt[: len(frames) // 4, -1] = 2.0  # a quarter is called strange
+    return np.concatenate([coded, classes, doubt], 1).astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def report(frames: Frames, outputs: NDArray[np.float32]) -> dict[str, Any]:
+    return {
+        "model": "a <model>",
+        "model_hash": "0123456789abcdef" * 4,
+        "engine": "openvino",
+        "precision": "f32",
+        "data": "some/data",
+        "split": "all",
+        "rounds": len(frames.rounds),
+        **judge_all(outputs, frames, mean_answer(frames.labels)),
+    }
+
+
+@pytest.fixture(scope="module")
+def shown(report: dict[str, Any], frames: Frames, outputs: NDArray[np.float32]) -> Page:
+    return Page(page(report, frames, outputs))
+
+
+def test_the_page_needs_nothing_beside_it(shown: Page) -> None:
+    shown.require_alone()
+    assert shown.all("title")[0].text == "a <model>: evaluation"
+    assert "$" not in shown.source
+
+
+def test_its_tables_are_the_reports(shown: Page, report: dict[str, Any]) -> None:
+    summary = shown.rows(0)
+    assert [row[0] for row in summary[1:]] == [
+        f"{name} ({'rad' if name == 'angle' else 'm'})" for name in FEATURES
+    ]
+    found = report["errors"]["ml"]
+    assert summary[1][1:5] == [f"{found[k]:.3f}" for k in ("mean", "median", "p95", "p99")]
+    assert summary[1][1:3] == [f"{found['mean']:.3f}", "0.010"]
+    assert summary[7][1] == "0.0020"
+    counted = shown.rows(1)
+    totals = [sum(int(cell.split()[0]) for cell in row[1:] if cell != "-") for row in counted[1:]]
+    assert sum(totals) == report["frames"]
+    assert "100.00% right" in shown.source
+    rates = report["presence"]["m"]
+    assert None not in rates.values()
+    shares = [f"{rates[kind]:.1%}" for kind in ("false_active", "false_inactive")]
+    assert shown.rows(2)[4] == ["m", *shares]
+    assert shown.rows(2)[1][:2] == ["ml", "-"]  # it is nowhere absent
+    coverage = shown.rows(3)
+    assert coverage[7] == ["angle", "100.0%", "100.0%"]
+    assert "25.0% of these frames are called out of distribution" in shown.source
+    tracks = shown.rows(4)
+    assert [row[:2] for row in tracks[1:]] == [["alpha", "48"], ["beta", "48"]]
+    assert tracks[0][-1] == "strange"
+
+
+def test_a_drive_of_each_track_with_its_band(shown: Page, frames: Frames) -> None:
+    tracks = {info.track for info in frames.rounds}
+    assert len(shown.all("h3")) == len(tracks) <= MOST_DRIVES
+    # Two charts a drive: offset and angle, each with truth, answer and two standard deviations.
+    for kind in ("truth", "said", "band"):
+        assert len(shown.all("path", kind)) == 2 * len(tracks)
+    assert len(shown.all("path", "dot")) == sum(
+        10 for name in FEATURES if name in ("ml", "mr", "to_lane_centre", "angle", "l", "m", "r")
+    )
+
+
+def test_the_worst_frames_are_the_worst() -> None:
+    rng = np.random.default_rng(5)
+    errors = rng.normal(size=(2000, 7))
+    errors[rng.random(errors.shape) < 0.2] = np.nan
+    errors[:, 3] = np.nan  # a feature never active
+    rounds = np.repeat(np.arange(5), 400)
+    chosen = worst_frames(errors, rounds)
+    assert [w.feature for w in chosen] == [
+        n for n in ORDER if n != FEATURES[3] for _ in range(EACH)
+    ]
+    taken: list[Worst] = []
+    for one in chosen:
+        column = FEATURES.index(one.feature)
+        assert one.error == errors[one.row, column]
+        # Whatever is worse stands too near to what is shown already.
+        for row in np.flatnonzero(np.abs(errors[:, column]) > abs(one.error)).tolist():
+            assert any(abs(row - w.row) < APART and rounds[row] == rounds[w.row] for w in taken)
+        assert not any(
+            abs(one.row - w.row) < APART and rounds[one.row] == rounds[w.row] for w in taken
+        )
+        taken.append(one)
+
+
+def test_they_are_shown_with_their_errors(
+    shown: Page, frames: Frames, outputs: NDArray[np.float32]
+) -> None:
+    errors = signed_errors(outputs, frames.labels.distances, frames.labels.angle)
+    chosen = worst_frames(errors, frames.labels.round)
+    worst_ml = [w for w in chosen if w.feature == "to_lane_centre"]
+    assert [w.row for w in worst_ml] == [9, 30]  # half of the error of `ml`, in rounds 0 and 1
+    assert [w.error for w in worst_ml] == pytest.approx([0.5, -0.4], abs=1e-5)
+    captions = [e.text for e in shown.all("figcaption") if "s =" in e.text]
+    assert len(captions) == len(chosen) == len(shown.all("img"))
+    assert captions[0].startswith("to_lane_centre +0.5 m, said to be known to 0.25 m")
+    assert "called out of distribution" in captions[0]
+    assert "called out of distribution" not in captions[1]
+    assert "r000, beta, s = 7 m" in captions[0]
+
+
+def test_markings_are_drawn_where_they_are(frames: Frames, outputs: NDArray[np.float32]) -> None:
+    (figure,) = figures(frames, outputs, [Worst(9, "ml", 1.0)])
+    (image,) = Page(figure).all("img")
+    jpeg = base64.b64decode(image.attributes["src"].removeprefix("data:image/jpeg;base64,"))
+    pixels = simplejpeg.decode_jpeg(jpeg).astype(int)
+    camera, labels = frames.camera, frames.labels
+    assert pixels.shape[0] == 2 * camera.height
+    for distance, angle, colour in (
+        (labels.distances[9, 0], labels.angle[9], TRUTH_COLOUR),
+        (labels.distances[9, 0] + 1.0, labels.angle[9] + 0.002, ANSWER_COLOUR),
+    ):
+        line = marking_line(float(distance), float(angle), float(labels.curvature[9]))
+        points = to_pixels(line, camera, camera.z + CENTRE_HEIGHT_M)
+        near = list(_inside(points, camera.width * 2, camera.height * 2))
+        assert near
+        for u, v in near:
+            around = pixels[v - 1 : v + 2, u - 1 : u + 2].reshape(-1, 3)
+            assert np.abs(around - colour).sum(1).min() < 150, (u, v, colour, around)
+
+
+def _inside(points: NDArray[np.int32], width: int, height: int) -> Iterator[tuple[int, int]]:
+    for u, v in points[: len(points) // 2].tolist():
+        if 4 <= u < width - 4 and 4 <= v < height - 4:
+            yield u, v

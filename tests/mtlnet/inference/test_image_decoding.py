@@ -1,0 +1,220 @@
+"""Which images pass, with which pixels, and which are refused, with which problem."""
+
+import struct
+import zlib
+
+import cv2
+import numpy as np
+import pytest
+import simplejpeg
+
+from mtlnet.inference import image_decoding as images
+from mtlnet.inference.image_decoding.crop import Box, visible
+from mtlnet.inference.image_decoding.errors import ImageError
+from mtlnet.inference.image_decoding.jpeg_structure import end as jpeg_end
+from mtlnet.inference.model_card import Camera
+from serve.api.problems import (
+    DAMAGED_IMAGE,
+    FIELD_OF_VIEW,
+    IMAGE_ASPECT,
+    IMAGE_SIZE,
+    NOT_AN_IMAGE,
+    TRAILING_BYTES,
+    UNSUPPORTED_IMAGE,
+    Kind,
+    Problem,
+    image_problem,
+)
+from tests.serve.conftest import jpeg, picture, png
+
+VIEW = Camera()
+
+
+def pixels(body: bytes) -> np.ndarray:
+    return images.decode(body, images.inspect(body, VIEW), VIEW)
+
+
+def refusal(body: bytes) -> Problem:
+    with pytest.raises(ImageError) as caught:
+        pixels(body)
+    return image_problem(caught.value)
+
+
+def chunk(kind: bytes, data: bytes) -> bytes:
+    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+
+def handmade_png(
+    width: int = 280,
+    height: int = 210,
+    rows: bytes | None = None,
+    *,
+    depth: int = 8,
+    colour: int = 2,
+    interlace: int = 0,
+    extra: bytes = b"",
+) -> bytes:
+    if rows is None:
+        rows = (b"\0" + b"\x40\x80\xc0" * width) * height
+    header = struct.pack(">IIBBBBB", width, height, depth, colour, 0, 0, interlace)
+    return (
+        b"\x89PNG\r\n\x1a\n"
+        + chunk(b"IHDR", header)
+        + extra
+        + chunk(b"IDAT", zlib.compress(rows))
+        + chunk(b"IEND", b"")
+    )
+
+
+def test_a_jpeg_of_the_cameras_size_comes_through_as_the_decoder_gives_it() -> None:
+    body = jpeg(picture())
+    assert np.array_equal(pixels(body), simplejpeg.decode_jpeg(body))
+
+
+def test_a_png_comes_through_bit_for_bit_in_rgb() -> None:
+    image = picture()
+    assert np.array_equal(pixels(png(image[:, :, ::-1])), image)
+
+
+@pytest.mark.parametrize("body", [jpeg(picture()[:, :, :1], "GRAY"), png(picture()[:, :, 0])])
+def test_grey_becomes_rgb(body: bytes) -> None:
+    image = pixels(body)
+    assert image.shape == (210, 280, 3)
+    assert np.abs(image.astype(int) - picture()[:, :, :1]).max() <= 3
+
+
+def test_alpha_is_dropped() -> None:
+    image = picture(channels=4)
+    assert np.array_equal(pixels(png(image))[:, :, ::-1], image[:, :, :3])
+
+
+def test_sixteen_bits_become_the_upper_eight() -> None:
+    image = (picture().astype(np.uint16) << 8) + 17
+    assert np.array_equal(pixels(png(image))[:, :, ::-1], picture())
+
+
+def test_one_bit_palette_and_interlaced_images_are_read() -> None:
+    row = b"\0" + b"\xff" * 35
+    assert (pixels(handmade_png(rows=row * 210, depth=1, colour=0)) == 255).all()
+    palette = chunk(b"PLTE", bytes([10, 20, 30, 40, 50, 60]))
+    indexed = handmade_png(rows=row * 210, depth=1, colour=3, extra=palette)
+    assert (pixels(indexed) == (40, 50, 60)).all()
+    # Adam7 of 280 x 210: (columns, rows) of the seven passes.
+    sizes = [(35, 27), (35, 27), (70, 26), (70, 53), (140, 52), (140, 105), (280, 105)]
+    rows = b"".join((b"\0" + b"\x40\x80\xc0" * columns) * count for columns, count in sizes)
+    assert (pixels(handmade_png(rows=rows, interlace=1)) == (0x40, 0x80, 0xC0)).all()
+
+
+def test_another_size_of_the_same_shape_is_area_averaged() -> None:
+    large = picture(1120, 840)
+    mean = large.reshape(210, 4, 280, 4, 3).mean(axis=(1, 3))
+    assert np.abs(pixels(png(large[:, :, ::-1])) - mean).max() <= 1.0
+    assert pixels(jpeg(picture(140, 105))).shape == (210, 280, 3)
+
+
+def test_side_chunks_change_nothing() -> None:
+    """Neither a mark that says "turn me" nor an animation makes another picture of it."""
+    turned = b"MM\0\x2a\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0\x06\0\0\0\0\0\0"
+    marked = handmade_png(extra=chunk(b"eXIf", turned) + chunk(b"acTL", bytes(8)))
+    assert np.array_equal(pixels(marked), pixels(handmade_png()))
+
+
+def test_one_percent_of_another_aspect_passes_and_more_is_cropped_or_refused() -> None:
+    assert pixels(jpeg(picture(278, 210))).shape == (210, 280, 3)
+    problem = refusal(jpeg(picture(276, 210)))
+    assert problem.kind is IMAGE_ASPECT
+    assert "276 x 210" in problem.detail
+    assert "280 x 210" in problem.detail
+    wide = picture(480, 210)
+    assert np.array_equal(pixels(png(wide[:, :, ::-1])), wide[:, 100:380])
+
+
+def test_a_wider_lens_is_cropped_and_a_narrower_one_refused() -> None:
+    """tan(67.5 / 2 deg) = 0.66818 of tan(45 deg): 210 rows seen with 67.5 are 314.3 with 90."""
+    large = picture(420, 314)
+    body = png(large[:, :, ::-1])
+    header = images.inspect(body, VIEW, 90.0)
+    assert np.array_equal(images.decode(body, header, VIEW, 90.0), large[52:262, 70:350])
+    assert visible(420, 314, VIEW, 90.0) == Box(70, 52, 280, 210)
+    with pytest.raises(ImageError, match="50 degrees") as caught:
+        images.inspect(body, VIEW, 50.0)
+    assert image_problem(caught.value).kind is FIELD_OF_VIEW
+
+
+def test_up_to_64_bytes_may_follow_the_picture() -> None:
+    for body in (JPEG, PNG):
+        assert np.array_equal(pixels(body + bytes(64)), pixels(body))
+        problem = refusal(body + JPEG)
+        assert problem.kind is TRAILING_BYTES
+        assert f"{len(JPEG)} bytes" in problem.detail
+        assert refusal(body + bytes(65)).kind is TRAILING_BYTES
+
+
+def test_a_progressive_jpeg_and_filling_bytes_are_read() -> None:
+    image = picture()
+    options = [cv2.IMWRITE_JPEG_PROGRESSIVE, 1, cv2.IMWRITE_JPEG_RST_INTERVAL, 2]
+    body = cv2.imencode(".jpg", image, options)[1].tobytes()
+    assert jpeg_end(body) == len(body)
+    filled = body[:2] + b"\xff" * 5 + body[2:]
+    assert np.array_equal(pixels(filled), pixels(body))
+
+
+JPEG, PNG = jpeg(picture()), png(picture())
+
+
+@pytest.mark.parametrize(
+    ("body", "kind"),
+    [
+        (b"", NOT_AN_IMAGE),
+        (b"hello, this is text", NOT_AN_IMAGE),
+        (b"GIF89a" + bytes(50), NOT_AN_IMAGE),
+        (JPEG[:4], DAMAGED_IMAGE),
+        (JPEG[:-1], DAMAGED_IMAGE),
+        (JPEG[: len(JPEG) // 2], DAMAGED_IMAGE),
+        (PNG[:10], DAMAGED_IMAGE),
+        (PNG[:-1], DAMAGED_IMAGE),
+        (PNG[: len(PNG) // 2], DAMAGED_IMAGE),
+        (PNG[:200] + b"\x55\xaa" + PNG[202:], DAMAGED_IMAGE),
+        (handmade_png(rows=bytes(10)), DAMAGED_IMAGE),
+        (handmade_png(rows=bytes(211 * 841)), DAMAGED_IMAGE),
+        (handmade_png(rows=(b"\x05" + bytes(840)) * 210), DAMAGED_IMAGE),
+        (handmade_png(extra=chunk(b"ABCD", b"")), UNSUPPORTED_IMAGE),
+        (handmade_png(extra=chunk(b"abCd", b"") * 10_000), UNSUPPORTED_IMAGE),
+        (handmade_png(depth=3), UNSUPPORTED_IMAGE),
+        (handmade_png(interlace=2), UNSUPPORTED_IMAGE),
+        (JPEG[:-2] + b"\xff\xda\0\x02" * 101, UNSUPPORTED_IMAGE),
+        (bytes(simplejpeg.encode_jpeg(picture(channels=4), 95, "CMYK")), UNSUPPORTED_IMAGE),
+        (jpeg(picture(12, 9)), IMAGE_SIZE),
+        (jpeg(picture(4104, 3078)), IMAGE_SIZE),
+        (jpeg(picture(3600, 2700)), IMAGE_SIZE),
+        (handmade_png(0, 0, rows=b""), IMAGE_SIZE),
+        (handmade_png(2**32 - 1, 2**32 - 1, rows=b""), IMAGE_SIZE),
+    ],
+)
+def test_a_bad_image_is_refused_for_what_it_is(body: bytes, kind: Kind) -> None:
+    problem = refusal(body)
+    assert problem.kind is kind
+    assert problem.detail
+
+
+def test_a_bomb_is_refused_from_its_header(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("decoded"))
+    bomb = handmade_png(16000, 16000, rows=bytes(1 + 48000) * 200)
+    problem = refusal(bomb)
+    assert problem.kind is IMAGE_SIZE
+    assert "16000 x 16000" in problem.detail
+
+
+def test_pixels_beyond_the_headers_promise_are_never_inflated() -> None:
+    """A PNG whose header is small but whose pixels inflate to 1 GB: refused without the memory."""
+    import tracemalloc
+
+    data = zlib.compressobj(9)
+    bomb_rows = b"".join(data.compress(bytes(2**20)) for _ in range(256)) + data.flush()
+    bomb = handmade_png(rows=b"")
+    plain = chunk(b"IDAT", zlib.compress(b""))
+    body = bomb.replace(plain, chunk(b"IDAT", bomb_rows))
+    tracemalloc.start()
+    assert refusal(body).kind is DAMAGED_IMAGE
+    assert tracemalloc.get_traced_memory()[1] < 4e6
+    tracemalloc.stop()

@@ -1,0 +1,132 @@
+"""Networks beside the paper's: their layers, their folding, their graphs, and that they learn."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from datagen.recording import Dataset
+from mtlnet.data.loader import Loader
+from mtlnet.export.openvino_graph import TOLERANCE, build_graph
+from mtlnet.inference.engine import Kind, load_engine
+from mtlnet.inference.model_card import Camera, read_card
+from mtlnet.model.architecture import PLANS, Architecture, find_plan
+from mtlnet.model.network import Network, answer_images, fold, initialise
+from mtlnet.training.config import TrainConfig
+from mtlnet.training.recipes import RECIPES
+from mtlnet.training.start import start_training
+from mtlnet.training.trainer import Trainer
+from trackfeatures.errors import UserError
+
+BACKBONES = [plan.name for plan in PLANS.values() if plan.backbone]
+KINDS: tuple[Kind, Kind] = ("openvino", "torch")
+OTHERS = [name for name in PLANS if name != "mtl"]
+
+
+def made(name: str, *, batch_norm: bool = False, seed: int = 1) -> Network:
+    network = Network(plan=thin(name), batch_norm=batch_norm)
+    initialise(network, seed)
+    with torch.no_grad():  # heads as large as trained ones, so that features matter
+        network.get_parameter("heads.distance.weight").mul_(10)
+    return network.eval()
+
+
+def thin(name: str) -> Architecture:
+    """The same network with narrow fully connected layers: a tenth of the time."""
+    plan = find_plan(name)
+    return replace(plan, shared=(*[64] * (len(plan.shared) - 1), 256))
+
+
+def images(count: int, seed: int = 0) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
+    return np.random.default_rng(seed).integers(0, 256, (count, 210, 280, 3), dtype=np.uint8)
+
+
+def test_deepdriving_is_alexnet_with_a_fourth_layer() -> None:
+    # Filters, inputs of one group and kernel of Caffe's AlexNet; 280 x 210 ends as 8 x 6.
+    convolutions = [(96, 3, 11), (256, 48, 5), (384, 256, 3), (384, 192, 3), (256, 192, 3)]
+    linears = [(256 * 8 * 6, 4096), (4096, 4096), (4096, 256), (256, 9)]
+    expected = sum(o * i * k * k + o for o, i, k in convolutions)
+    expected += sum(i * o + o for i, o in linears)
+    assert expected == 70_502_281
+    network = Network(plan=find_plan("deepdriving"))
+    assert sum(p.numel() for p in network.parameters()) == expected
+    sizes: list[tuple[int, ...]] = []
+    for module in network.features.children():
+        if isinstance(module, torch.nn.MaxPool2d):
+            module.register_forward_hook(lambda _m, _i, out: sizes.append(tuple(out.shape[2:])))
+    network(torch.from_numpy(images(1)))
+    assert sizes == [(25, 34), (12, 17), (6, 8)]
+
+
+def test_deepdriving_knows_no_class() -> None:
+    answers = answer_images(made("deepdriving"), images(2))
+    np.testing.assert_allclose(answers[:, 6:], 1 / 3, atol=1e-6)
+    with pytest.raises(UserError, match="deepdriving has no class"):
+        TrainConfig(Path("data"), Path("out"), network="deepdriving")
+    with pytest.raises(UserError, match="no network 'vgg'; choose one of mtl, deepdriving"):
+        TrainConfig(Path("data"), Path("out"), network="vgg")
+
+
+@pytest.mark.parametrize("name", BACKBONES)
+def test_folding_a_backbone_changes_no_answer(name: str) -> None:
+    network = made(name, batch_norm=True).train()
+    generator = torch.Generator().manual_seed(1)
+    with torch.no_grad():
+        network(torch.from_numpy(images(4)))  # moves the running statistics
+        for module in network.modules():
+            if isinstance(module, torch.nn.BatchNorm2d):
+                module.bias.uniform_(-0.2, 0.2, generator=generator)
+    network.target_mean.copy_(torch.linspace(0.2, 0.7, 6))
+    network.target_std.copy_(torch.linspace(0.02, 0.3, 6))
+    folded = fold(network)
+    assert not [m for m in folded.modules() if isinstance(m, torch.nn.BatchNorm2d)]
+    before, after = (answer_images(n, images(2, seed=9)) for n in (network, folded))
+    assert np.ptp(before[:, :6], axis=0).max() > 2e-4
+    np.testing.assert_allclose(before, after, atol=2e-5)
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_the_graph_answers_as_torch_does(name: str) -> None:
+    import openvino
+
+    network = fold(made(name))
+    options = {"INFERENCE_PRECISION_HINT": "f32"}
+    request = openvino.Core().compile_model(build_graph(network), "CPU", options)
+    frames = images(2, seed=3)
+    expected = answer_images(network, frames)
+    found = np.concatenate([request(frame[None])[0] for frame in frames])
+    assert np.ptp(expected[:, :5], axis=0).max() > 10 * TOLERANCE
+    np.testing.assert_allclose(found, expected, atol=TOLERANCE)
+
+
+@pytest.mark.parametrize("name", ["mobilenet_v3_small", "deepdriving"])
+def test_another_network_learns(dataset: Path, name: str) -> None:
+    plan = thin(name)
+    loader = Loader(Dataset.open(dataset).select("train"), Camera(), 4, 0, augment=False)
+    recipe = replace(RECIPES["fast"], augment=False)
+    trainer = Trainer(recipe, plan.default_alpha, 0, torch.device("cpu"), plan)
+    trainer.standardise(loader)
+    batch = loader.make(0)
+    totals = [float(trainer.step(batch, 0.05).total.detach()) for _ in range(12)]
+    assert totals[-1] < 0.5 * totals[0]
+
+
+def test_another_network_is_trained_published_and_run_the_same_way(
+    dataset: Path, tmp_path: Path
+) -> None:
+    options = {"data": dataset, "network": "mobilenet_v3_small", "iterations": 2, "batch": 4}
+    result = start_training({**options, "device": "cpu"}, None, tmp_path / "run", resume=False)
+    card = read_card(tmp_path / "run")
+    assert (card.network, card.iterations) == ("mobilenet_v3_small", 2)
+    assert result["export_check"]["openvino_f32_max"] < TOLERANCE
+    frame = Dataset.open(dataset).select("test").image(0)
+    fast, oracle = (load_engine(tmp_path / "run", kind, "f32") for kind in KINDS)
+    np.testing.assert_allclose(fast(frame), oracle(frame), atol=TOLERANCE)
+
+
+def test_seeds_fix_a_backbone() -> None:
+    first, second, other = (made("mobilenet_v3_small", seed=s) for s in (1, 1, 2))
+    a, b, c = (answer_images(n, images(1)) for n in (first, second, other))
+    assert a.tolist() == b.tolist() != c.tolist()

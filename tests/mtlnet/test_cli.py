@@ -1,0 +1,139 @@
+"""The `mtlnet` command from outside: what it prints, and one clear line for what it refuses."""
+
+import json
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import simplejpeg
+
+from datagen.recording.splits import Split, split_path, write_split
+from mtlnet.training.logging import read_curves
+from tests.typed import typed
+
+
+def mtlnet(*arguments: object, folder: Path | None = None) -> subprocess.CompletedProcess[str]:
+    return typed("mtlnet", *arguments, folder=folder)
+
+
+def refused(*arguments: object, folder: Path | None = None) -> str:
+    done = mtlnet(*arguments, folder=folder)
+    assert done.returncode == 1, done.stdout + done.stderr
+    assert "Traceback" not in done.stderr
+    last = done.stderr.strip().splitlines()[-1]
+    assert last.startswith("error: ")
+    return last
+
+
+def test_help_imports_nothing_heavy() -> None:
+    code = (
+        "import sys, mtlnet.cli, typer.testing as t;"
+        "t.CliRunner().invoke(mtlnet.cli.app, ['train', '--help']);"
+        "print([m for m in ('torch', 'openvino', 'cv2', 'mcap') if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_the_service_needs_no_torch(published: Path) -> None:
+    code = (
+        "import sys, numpy as np; from pathlib import Path;"
+        "from mtlnet.inference.engine import load_engine;"
+        "from mtlnet.inference.prediction import decode_outputs;"
+        f"e = load_engine(Path({str(published)!r})); "
+        "decode_outputs(e(np.zeros((210, 280, 3), np.uint8)));"
+        "print([m for m in ('torch', 'mcap', 'safetensors') if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.stdout.strip() == "[]", done.stderr
+
+
+@pytest.mark.usefixtures("small_network")
+def test_train_evaluate_and_predict(dataset: Path, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    base = ["train", "--data", dataset, "--out", run, "--batch", 4, "--iterations", 2]
+    trained = mtlnet(*base, "--alpha", "0.3,0.2,0.5", "--json")
+    assert trained.returncode == 0, trained.stderr
+    assert json.loads(trained.stdout)["iterations"] == 2
+
+    evaluated = mtlnet("evaluate", "--model", run, "--data", dataset, "--split", "test", "--json")
+    report = json.loads(evaluated.stdout)
+    assert report["frames"] == 24
+    assert set(report["mae_m"]) == {"ml", "mr", "l", "m", "r"}
+    assert 0 < report["mae_m"]["ml"] < 5
+    assert report["by_lanes"]["1"]["mae_m"] == report["mae_m"]
+    assert report["baseline"]["angle_mae_rad"] == pytest.approx(0.04, abs=0.02)
+    table = mtlnet("evaluate", "--model", run, "--data", dataset, "--every", "5")
+    assert "on 5 test frames" in table.stdout
+    assert "to lane centre (m)" in table.stdout
+
+    unseen = shutil.copytree(dataset, tmp_path / "unseen")
+    write_split(split_path(unseen), Split(train=(), test=(), unseen=("r003",)))
+    known = refused("evaluate", "--model", run, "--data", unseen, "--split", "unseen")
+    assert "was trained on track alpha, which is not unseen to it" in known
+    card = json.loads((run / "card.json").read_text())
+    card["data"]["tracks"] = ["beta"]
+    (run / "card.json").write_text(json.dumps(card))
+    judged = mtlnet("evaluate", "--model", run, "--data", unseen, "--split", "unseen", "--json")
+    assert json.loads(judged.stdout)["frames"] == 24
+
+    image = tmp_path / "frame.jpg"
+    pixels = np.full((420, 560, 3), 90, np.uint8)  # twice the size: scaled down
+    image.write_bytes(simplejpeg.encode_jpeg(pixels))
+    answers = json.loads(mtlnet("predict", "--model", run, image, image, "--json").stdout)
+    assert len(answers) == 2
+    assert set(answers[0]) >= {"distances_m", "to_lane_centre_m", "angle_rad", "heading", "model"}
+    assert sum(answers[0]["heading"].values()) == pytest.approx(1, abs=1e-5)
+
+    again = refused(*base)
+    assert f"{run} already exists" in again
+
+
+def test_what_is_no_image(published: Path, tmp_path: Path) -> None:
+    text, cut, narrow = (tmp_path / name for name in ("a.jpg", "b.jpg", "c.jpg"))
+    text.write_text("not an image at all")
+    cut.write_bytes(simplejpeg.encode_jpeg(np.zeros((210, 280, 3), np.uint8))[:20])
+    narrow.write_bytes(simplejpeg.encode_jpeg(np.zeros((210, 100, 3), np.uint8)))
+    for path, seen in [
+        (tmp_path / "none.jpg", "there is no image file"),
+        (text, "a.jpg: no JPEG or PNG file, but 19 bytes"),
+        (cut, "b.jpg: the JPEG cannot be decoded"),
+        (narrow, "c.jpg: the image is 100 x 210 px"),
+    ]:
+        assert seen in refused("predict", "--model", published, path)
+
+
+def test_what_training_refuses(dataset: Path, tmp_path: Path) -> None:
+    new = tmp_path / "new"
+    train = ["train", "--data", dataset, "--out", new]
+    assert "weight for angle is -1" in refused(*train, "--alpha", "0.3,-1,0.5")
+    assert "has 2 weight(s)" in refused(*train, "--alpha", "0.3,0.2")
+    assert "no training run" in refused(*train, "--resume")
+    assert "no recorded rounds" in refused("train", "--data", tmp_path / "no", "--out", new)
+    assert not new.exists()
+    assert "no runs/latest" in refused("evaluate", "--data", dataset, folder=tmp_path)
+
+
+def test_ctrl_c_leaves_a_checkpoint_to_resume_from(dataset: Path, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    command = ["train", "--data", dataset, "--out", run, "--batch", 2, "--iterations", 2000]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "mtlnet", *map(str, command)], stderr=subprocess.PIPE, text=True
+    )
+    limit = time.monotonic() + 300
+    while not read_curves(run / "curves.csv") and time.monotonic() < limit:
+        time.sleep(0.2)
+    process.send_signal(signal.SIGINT)
+    _, said = process.communicate(timeout=300)
+    assert process.returncode == 130, said
+    assert "--resume" in said
+    (checkpoint,) = (run / "checkpoints").iterdir()
+    step = int(checkpoint.stem.removeprefix("step-"))
+    assert step >= 10
+    done = mtlnet("train", "--out", run, "--resume", "--iterations", step + 1, "--json")
+    assert json.loads(done.stdout)["iterations"] == step + 1, done.stderr

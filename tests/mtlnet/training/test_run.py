@@ -1,0 +1,291 @@
+"""Training learns, and a run that was stopped goes on to the same bits."""
+
+import json
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from safetensors.numpy import load_file
+
+import mtlnet.training.loop
+from datagen.recording import Dataset
+from mtlnet.data.loader import Loader
+from mtlnet.inference.model_card import DOUBT, GRAPH, WEIGHTS, Camera, ModelError, read_card
+from mtlnet.model.cpu_kernels.forward import training_outputs
+from mtlnet.training.checkpoint import list_checkpoints
+from mtlnet.training.config import TrainConfig, resume_config
+from mtlnet.training.logging import read_curves
+from mtlnet.training.loop import Progress, Stopped
+from mtlnet.training.recipes import RECIPES, learning_rate
+from mtlnet.training.run import train
+from mtlnet.training.trainer import Trainer
+from trackfeatures.errors import UserError
+
+CPU = torch.device("cpu")
+
+
+def config(dataset: Path, out: Path, **changes: Any) -> TrainConfig:
+    values = {"iterations": 4, "batch": 4, "seed": 7, "device": "cpu", "threads": 1, **changes}
+    return TrainConfig(dataset, out, **values)
+
+
+class StopAt:
+    """Ctrl-C after so many steps: `requested` is asked once before each until it is true."""
+
+    def __init__(self, steps: int) -> None:
+        self.steps = steps
+
+    @property
+    def requested(self) -> bool:
+        self.steps -= 1
+        return self.steps < 0
+
+    def __enter__(self) -> "StopAt":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        return
+
+
+def test_one_batch_is_overfitted(dataset: Path) -> None:
+    frames = Dataset.open(dataset).select("train")
+    loader = Loader(frames, Camera(), 8, 0, augment=False)
+    recipe = replace(RECIPES["fast"], augment=False, batch=8)
+    trainer = Trainer(recipe, (0.3, 0.2, 0.5), 0, CPU)
+    trainer.standardise(loader)
+    batch = loader.make(0)
+    first = trainer.step(batch, 0.05)
+    for _ in range(30):
+        last = trainer.step(batch, 0.05)
+    # In units of the targets' variances the answer of the mean costs about 0.3 + 0.2 + 0.5 ln 3.
+    assert first.total.item() > 0.6
+    assert last.total.item() < 0.05
+    assert float(last.angle) < 0.1 * float(np.var(batch.coded[:, 5]))
+
+
+def test_late_in_a_run_statistics_of_batches_stay(dataset: Path) -> None:
+    frames = Dataset.open(dataset).select("train")
+    recipe = replace(RECIPES["fast"], batch=4)
+    trainer = Trainer(recipe, (0.3, 0.2, 0.5), 0, CPU)
+    batch = Loader(frames, Camera(), 4, 0, augment=False).make(0)
+    mean = trainer.network.get_buffer("features.conv0.norm.running_mean")
+    seen = [mean.clone()]
+    late = recipe.settled
+    for steps, progress in ((200, late - 0.1), (200, late), (200, 0.99), (5, 0.99)):
+        trainer.step_number = steps
+        trainer.step(batch, progress)
+        seen.append(mean.clone())
+    moved = [not torch.equal(a, b) for a, b in pairwise(seen)]
+    # A run of a few steps has not seen enough for statistics that could stay.
+    assert moved == [True, False, False, True]
+
+
+def test_the_first_convolutions_learn_for_a_part_of_the_run(dataset: Path) -> None:
+    frames = Dataset.open(dataset).select("train")
+    recipe = replace(RECIPES["fast"], batch=4)
+    trainer = Trainer(recipe, (0.3, 0.2, 0.5), 0, CPU)
+    batch = Loader(frames, Camera(), 4, 0, augment=False).make(0)
+    network = trainer.network
+    assert [share for share, _ in recipe.rests] == sorted(share for share, _ in recipe.rests)
+    for progress, count in [(0.1, 0), *recipe.rests, (0.99, recipe.rests[-1][1])]:
+        before = {name: weight.detach().clone() for name, weight in network.named_parameters()}
+        trainer.step(batch, progress)
+        still = {
+            n.split(".")[1] for n, w in network.named_parameters() if torch.equal(w, before[n])
+        }
+        assert still == set(network.plan.convolutions[:count])
+
+
+@pytest.mark.parametrize(("recipe", "balance"), [("fast", "dwa"), ("paper", "uncertainty")])
+def test_stopped_and_resumed_is_the_unbroken_run(
+    dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, recipe: str, balance: str
+) -> None:
+    monkeypatch.setattr("mtlnet.training.task_weighting.STRETCH", 1)
+    monkeypatch.setattr("mtlnet.training.loop.LOG_EVERY", 1)
+    train(config(dataset, tmp_path / "whole", recipe=recipe, balance=balance), None)
+    broken = config(dataset, tmp_path / "broken", recipe=recipe, balance=balance)
+    with monkeypatch.context() as patch:
+        patch.setattr(mtlnet.training.loop, "StopRequest", lambda: StopAt(2))
+        with pytest.raises(Stopped, match="step-00000002"):
+            train(broken, None)
+    with pytest.raises(ModelError, match="no finished model"):
+        read_card(broken.out)
+    resumed, data = resume_config(broken.out, {})
+    assert resumed == broken
+    train(resumed, data)
+    assert differences(tmp_path / "whole", broken.out) == []
+    weights = [weights_in(tmp_path / run) for run in ("whole", "broken")]
+    assert weights[0] == weights[1]
+    assert len({tuple(row) for row in weights[0]}) > 1  # they move
+
+
+def differences(one: Path, other: Path) -> list[str]:
+    """Names of the weights that are not bit-equal in two runs."""
+    a, b = load_file(one / WEIGHTS), load_file(other / WEIGHTS)
+    return [name for name in a if not np.array_equal(a[name], b[name])]
+
+
+def weights_in(run: Path) -> list[list[float]]:
+    """The tasks' weights along a run."""
+    names = ("distance_weight", "angle_weight", "type_weight")
+    return [[point[name] for name in names] for point in read_curves(run / "curves.csv")]
+
+
+def test_a_full_gpu_is_one_line(
+    dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> None:
+        raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 MiB.\n...")
+
+    monkeypatch.setattr("mtlnet.training.run.learn", full)
+    with pytest.raises(UserError, match="memory of cpu is used up; give a smaller --batch than 4"):
+        train(config(dataset, tmp_path / "run"), None)
+
+
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+import mtlnet.training.loop, mtlnet.training.run, runtime.files
+from mtlnet.training.config import TrainConfig
+sync, seen = os.fsync, []
+def die(file):
+    if os.readlink(f"/proc/self/fd/{file}").endswith("00000004.safetensors.partial"):
+        os.kill(os.getpid(), signal.SIGKILL)
+    sync(file)
+runtime.files.os.fsync = die
+mtlnet.training.loop.CHECKPOINT_SECONDS = 0.0
+data, out = map(Path, sys.argv[1:])
+given = {"iterations": 6, "batch": 4, "seed": 7, "device": "cpu", "threads": 1}
+mtlnet.training.run.train(TrainConfig(data, out, **given), None)
+"""
+
+
+def test_killed_while_it_saves_it_goes_on_from_the_checkpoint_before(
+    dataset: Path, tmp_path: Path
+) -> None:
+    killed = tmp_path / "killed"
+    done = subprocess.run([sys.executable, "-c", KILLED, dataset, killed], capture_output=True)
+    assert done.returncode == -signal.SIGKILL, done.stderr
+    assert [path.name for path in list_checkpoints(killed)][-1] == "step-00000003.safetensors"
+    resumed, data = resume_config(killed, {})
+    train(resumed, data)
+    train(config(dataset, tmp_path / "whole", iterations=6), None)
+    assert differences(tmp_path / "whole", killed) == []
+
+
+def test_a_loss_that_is_no_number_stops_the_run_at_its_batch(
+    dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("mtlnet.training.loop.CHECKPOINT_SECONDS", 0.0)
+    sound = training_outputs
+    calls: list[int] = []
+
+    def outputs(*given: Any) -> torch.Tensor:
+        calls.append(1)
+        return sound(*given) * (float("nan") if len(calls) == 3 else 1.0)
+
+    monkeypatch.setattr("mtlnet.training.trainer.training_outputs", outputs)
+    with pytest.raises(UserError, match="the loss of batch 3 is no finite number") as caught:
+        train(config(dataset, tmp_path / "run"), None)
+    assert "\n" not in str(caught.value)
+    (*_, last) = list_checkpoints(tmp_path / "run")
+    assert last.name == "step-00000002.safetensors"
+    assert all(np.isfinite(value).all() for value in load_file(last).values())
+
+
+def test_a_run_keeps_what_it_was(dataset: Path, tmp_path: Path) -> None:
+    points: list[Progress] = []
+    done = train(config(dataset, tmp_path / "run", iterations=10), None, points.append)
+    run = tmp_path / "run"
+    assert read_card(run) == done
+    assert done.iterations == 10
+    assert done.export_check["openvino_f32_max"] < 2e-4
+    assert set(done.files) == {WEIGHTS, DOUBT, GRAPH, "model.bin"}
+    assert done.data["content_hash"] == Dataset.open(dataset).content_hash
+    assert done.data["split"]["test"] == ["r003"]
+    labels = Dataset.open(dataset).select("train").labels
+    assert done.data["mean"]["angle_rad"] == pytest.approx(labels.angle.mean(), abs=1e-6)
+    stored = json.loads((run / "config.json").read_text())
+    assert stored["config"]["seed"] == 7
+    assert stored["recipe"]["name"] == "fast"
+    curve = read_curves(run / "curves.csv")
+    assert [point["step"] for point in curve] == [10]
+    assert curve[0]["total_loss"] == pytest.approx(points[0].losses[3], rel=1e-4)
+    assert list((run / "tensorboard").glob("events.out.*"))
+    assert [path.suffix for path in list_checkpoints(run)] == [".safetensors"]
+
+
+@pytest.mark.usefixtures("small_network")
+def test_a_timed_run_ends_by_the_clock(dataset: Path, tmp_path: Path) -> None:
+    run = config(dataset, tmp_path / "timed", iterations=None, minutes=1 / 60)
+    started = time.monotonic()
+    card = train(run, None)
+    assert card.iterations >= 1
+    assert 1.0 <= time.monotonic() - started < 60.0  # a second of steps; then it is published
+
+
+@pytest.mark.usefixtures("small_network")
+def test_refused_before_anything_is_written(dataset: Path, tmp_path: Path) -> None:
+    (tmp_path / "kept").mkdir()
+    (tmp_path / "kept" / "mine").write_text("precious")
+    with pytest.raises(UserError, match=r"kept already exists.*--resume"):
+        train(config(dataset, tmp_path / "kept"), None)
+    assert (tmp_path / "kept" / "mine").read_text() == "precious"
+    with pytest.raises(UserError, match="no recorded rounds"):
+        train(config(tmp_path / "kept", tmp_path / "new"), None)
+    with pytest.raises(UserError, match="no recipe 'slow'"):
+        train(config(dataset, tmp_path / "new", recipe="slow"), None)
+    for device in ("gpu", "cpu:x", "cuda:x", "cuda:99", ""):
+        with pytest.raises(UserError, match="--device"):
+            train(config(dataset, tmp_path / "new", device=device), None)
+    assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.usefixtures("small_network")
+def test_another_run_is_not_resumed(dataset: Path, tmp_path: Path) -> None:
+    run = config(dataset, tmp_path / "run", iterations=1)
+    train(run, None)
+    with pytest.raises(UserError, match="started with seed 7, now 8"):
+        resume_config(run.out, {"seed": 8})
+    resumed, data = resume_config(run.out, {"iterations": 2, "seed": 7})
+    assert resumed.iterations == 2
+    with pytest.raises(ModelError, match=r"content hash .* is not the one"):
+        train(resumed, {**data, "content_hash": "other"})
+    list_checkpoints(run.out)[-1].write_bytes(b"rubbish")
+    with pytest.raises(ModelError, match="cannot be read"):
+        train(resumed, data)
+
+
+def test_learning_rates() -> None:
+    paper, fast = RECIPES["paper"], RECIPES["fast"]
+    assert learning_rate(paper, 9_999, 0.1) == 1e-3
+    assert learning_rate(paper, 30_000, 0.2) == pytest.approx(1e-3 * 0.9**3)
+    assert (paper.batch, paper.iterations) == (32, 150_000)
+    peak = fast.learning_rate
+    assert learning_rate(fast, 0, 0.05) == pytest.approx(peak)
+    assert learning_rate(fast, 0, 0.525) == pytest.approx(peak / 2)
+    assert learning_rate(fast, 0, 1.0) == pytest.approx(0, abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("changes", "seen"),
+    [
+        ({"iterations": 0}, "--iterations is 0"),
+        ({"minutes": 0.0}, "--minutes is 0"),
+        ({"batch": 1}, "--batch is 1"),
+        ({"seed": -1}, "--seed is -1"),
+        ({"threads": -1}, "--threads is -1"),
+        ({"threads": 2**31}, "--threads is 2147483648"),
+    ],
+)
+def test_numbers_out_of_range(changes: dict[str, Any], seen: str) -> None:
+    with pytest.raises(UserError, match=seen):
+        config(Path("data"), Path("out"), **changes)

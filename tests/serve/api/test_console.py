@@ -1,0 +1,96 @@
+"""The console: what it is made of, and what a real browser shows."""
+
+import json
+import math
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from mtlnet.inference.model_card import Camera
+from serve.api.console import FOLDER
+from tests.serve.conftest import Served
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+
+
+def test_the_page_and_all_it_loads_come_from_the_service(service: Served) -> None:
+    page = service.ask("GET", "/")
+    assert page.status == 200
+    assert page.headers["content-type"].startswith("text/html")
+    assert "default-src 'none'" in page.headers["content-security-policy"]
+    text = page.content.decode()
+    for path in re.findall(r'(?:href|src)="(console/[^"]+)"', text):
+        assert service.ask("GET", f"/{path}").status == 200
+    for file in (*FOLDER.glob("*.html"), *FOLDER.glob("*.css"), *FOLDER.glob("*.js")):
+        assert set(re.findall(r"https?://[^/\s<]+", file.read_text())) <= {"http://127.0.0.1:8000"}
+    assert service.ask("GET", "/console/../app.py").status == 404
+    assert service.ask("GET", "/console/no-such.js").status == 404
+
+
+def test_every_sample_is_what_the_model_sees_and_has_its_truth(service: Served) -> None:
+    samples = service.ask("GET", "/console/samples.json").content
+    assert len(samples) >= 6
+    camera = Camera()
+    for sample in samples:
+        body = service.ask("GET", f"/console/{sample['file']}").content
+        image = cv2.imdecode(np.frombuffer(body, np.uint8), cv2.IMREAD_COLOR)
+        assert image is not None
+        assert image.shape == (camera.height, camera.width, 3)
+        truth = sample["truth"]
+        ml, mr = truth["distances_m"]["ml"], truth["distances_m"]["mr"]
+        if ml is not None:
+            assert truth["to_lane_centre_m"] == pytest.approx((ml + mr) / 2, abs=2e-4)
+        assert abs(truth["angle_rad"]) < 0.3
+        assert service.post(body).status == 200
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(CHROMIUM is None, reason="no chromium (Debian: apt-get install chromium)")
+def test_a_browser_shows_the_answer(service: Served, tmp_path: Path) -> None:
+    """The page asks about its first sample by itself."""
+    shot = tmp_path / "console.png"
+    assert CHROMIUM is not None
+    command = [CHROMIUM, "--headless", "--no-sandbox", "--hide-scrollbars", "--dump-dom"]
+    command += ["--window-size=1360,1000", "--virtual-time-budget=10000", f"--screenshot={shot}"]
+    done = subprocess.run(
+        [*command, f"--user-data-dir={tmp_path}", service.url],
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    text = " ".join(re.sub(r"<[^>]*>", " ", done.stdout).split())
+    assert "0.00 m left of the lane's centre, pointing 5.7° to the right." in text
+    assert "ml -2.00 m" in text
+    assert "mr 2.00 m" in text
+    assert "straight 50 %" in text
+    # The markings are drawn, in the blue of a marking of the car's lane.
+    picture = cv2.imread(str(shot))
+    assert picture is not None
+    assert picture.shape == (1000, 1360, 3)
+    blue = np.abs(picture.astype(int) - (214, 132, 10)).sum(axis=2) < 60
+    assert blue[:, :900].sum() > 800
+
+
+@pytest.mark.skipif(shutil.which("node") is None, reason="no node")
+def test_the_geometry_of_the_console_is_that_of_the_pinhole(tmp_path: Path) -> None:
+    """A marking 2 m to the right, 5 m ahead of the camera, is where the camera's matrix puts it."""
+    script = tmp_path / "ask.mjs"
+    module = (FOLDER / "geometry.js").as_uri()
+    camera = Camera()
+    script.write_text(
+        f"import {{ onMarking, project }} from '{module}';\n"
+        f"const camera = {json.dumps(vars(camera))};\n"
+        "console.log(JSON.stringify([project(onMarking(2, 0, 5.75), camera),"
+        " onMarking(2, 0.1, 0), onMarking(0, 0.1, 10)]));\n"
+    )
+    done = subprocess.run(["node", str(script)], capture_output=True, text=True, check=True)
+    pixel, beside, ahead = json.loads(done.stdout)
+    focal = 105 / math.tan(math.radians(67.5) / 2)
+    assert pixel == pytest.approx([140 + focal * 2 / 5, 105 + focal * 1.2 / 5])
+    assert beside == pytest.approx([2 * math.sin(0.1), -2 * math.cos(0.1)])
+    assert ahead == pytest.approx([10 * math.cos(0.1), 10 * math.sin(0.1)])

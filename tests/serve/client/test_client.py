@@ -1,0 +1,232 @@
+"""The client against the service, and against listeners that behave badly."""
+
+import asyncio
+import re
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import pytest
+
+from runtime.sockets import bind
+from serve.client import Client, ServiceError
+from serve.client.aio import AsyncClient
+from serve.config import Limits
+from tests.serve.conftest import CARD, FakeEngine, Served, jpeg, outputs, picture, png, serving
+
+JPEG, PNG = jpeg(picture()), png(picture())
+
+
+@contextmanager
+def listener(behave: Callable[[socket.socket, int], object]) -> Iterator[str]:
+    """A server that hands each connection and its number to `behave`; gives its URL."""
+    server = bind("127.0.0.1", 0)
+    server.listen()
+
+    def run() -> None:
+        number = 0
+        while True:
+            try:
+                connection, _ = server.accept()
+            except OSError:
+                return
+            with connection:
+                behave(connection, number)
+            number += 1
+
+    thread = threading.Thread(target=run, daemon=True)
+    thread.start()
+    try:
+        yield f"http://127.0.0.1:{server.getsockname()[1]}"
+    finally:
+        server.shutdown(socket.SHUT_RDWR)
+        server.close()
+        thread.join(5)
+
+
+def reply(content: bytes, status: str = "200 OK") -> bytes:
+    return b"HTTP/1.1 %s\r\nContent-Length: %d\r\n\r\n%s" % (status.encode(), len(content), content)
+
+
+def test_a_token_is_sent_as_given_or_as_the_environment_has_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    token = "a-token-of-some-length"
+    engine = FakeEngine(lambda _image: outputs())
+    with serving(engine, limits=Limits(token=token)) as service:
+        with Client(service.url) as unknown, pytest.raises(ServiceError, match="token") as refused:
+            unknown.features(JPEG)
+        assert refused.value.status == 401
+        with Client(service.url, token=token) as known:
+            assert known.features(JPEG)["model"] == CARD.model_hash
+        monkeypatch.setenv("DRIVERVIEW_TOKEN", token)
+
+        async def ask() -> str:
+            async with AsyncClient(service.url) as client:
+                return str((await client.features(JPEG))["model"])
+
+        assert asyncio.run(ask()) == CARD.model_hash
+
+
+def test_answers_come_as_the_service_gave_them(service: Served) -> None:
+    with Client(service.url + "/") as client:
+        assert client.ready()
+        client.wait_until_ready(1)
+        answer = client.features(JPEG, frame_id="17")
+        assert answer["distances_m"]["ml"] == pytest.approx(-2.0, abs=1e-5)
+        assert answer["frame_id"] == "17"
+        assert client.features(PNG)["model"] == CARD.model_hash
+        assert client.model()["camera"]["width"] == 280
+    assert Client(f"127.0.0.1:{service.port}").ready()
+
+
+def test_asyncio_clients_ask_at_once(service: Served) -> None:
+    async def ask(number: int) -> dict[str, Any]:
+        async with AsyncClient(service.url) as client:
+            assert await client.ready()
+            assert (await client.model())["model"] == CARD.model_hash
+            with pytest.raises(ServiceError, match="4 bytes"):
+                await client.features(b"text")
+            return await client.features(JPEG, frame_id=str(number), deadline_s=20)
+
+    async def crowd() -> list[dict[str, Any]]:
+        return await asyncio.gather(*(ask(number) for number in range(4)))
+
+    answers = asyncio.run(crowd())
+    assert [answer["frame_id"] for answer in answers] == ["0", "1", "2", "3"]
+
+
+def test_a_refusal_carries_the_problem(service: Served) -> None:
+    with Client(service.url) as client:
+        with pytest.raises(ServiceError, match="4 bytes that begin with b'text'") as caught:
+            client.features(b"text")
+        assert caught.value.status == 422
+        assert caught.value.problem == "/problems/not-an-image"
+        assert client.features(JPEG)
+
+
+def test_waiting_ends_with_the_services_reason() -> None:
+    gate = threading.Event()
+    engine = FakeEngine(lambda _image: outputs())
+    with serving(engine, lambda _engine: gate.wait(20)) as served:
+        client = Client(served.url)
+        assert not client.ready()
+        with pytest.raises(ServiceError, match=r"not ready within 0\.3 s.*warming up"):
+            client.wait_until_ready(0.3)
+        threading.Timer(0.2, gate.set).start()
+        client.wait_until_ready(10)
+        assert client.ready()
+
+
+def test_a_dropped_idle_connection_is_opened_again() -> None:
+    def one_answer_each(connection: socket.socket, number: int) -> None:
+        connection.recv(65536)
+        connection.sendall(reply(b'{"number": %d}' % number))
+
+    with listener(one_answer_each) as url, Client(url) as client:
+        assert [client.model()["number"] for _ in range(3)] == [0, 1, 2]
+
+
+def test_with_a_deadline_it_asks_again_where_that_helps_and_no_longer() -> None:
+    full = b'{"type": "/problems/overloaded", "retry_after_ms": 5}'
+    gone = b'{"type": "/problems/superseded", "retry_after_ms": 5}'
+    asked: list[bytes] = []
+
+    def full_twice(connection: socket.socket, number: int) -> None:
+        asked.append(connection.recv(65536))
+        busy = reply(full, "503 Service Unavailable")
+        connection.sendall(busy if number < 2 else reply(b'{"number": %d}' % number))
+
+    with listener(full_twice) as url:
+        assert Client(url).features(b"image", deadline_s=20, stream="front") == {"number": 2}
+        sent = [float(re.findall(rb"X-Deadline-Ms: (\S+)", found)[0]) for found in asked]
+        assert 20_000 >= sent[0] > sent[1] > sent[2] > 0
+        assert b"X-Stream-Id: front" in asked[0]
+
+    def always(content: bytes) -> Callable[[socket.socket, int], None]:
+        def behave(connection: socket.socket, _number: int) -> None:
+            asked.append(connection.recv(65536))
+            connection.sendall(reply(content, "503 Service Unavailable"))
+
+        return behave
+
+    for content, deadline_s, most in ((gone, 20.0, 1), (full, 0.1, 50)):
+        asked.clear()
+        with listener(always(content)) as url, pytest.raises(ServiceError, match="503") as caught:
+            Client(url).features(b"image", deadline_s=deadline_s)
+        assert caught.value.retry_after_s == 0.005
+        assert 1 <= len(asked) <= most
+
+
+def test_a_silent_service_is_left_at_the_deadline() -> None:
+    quiet = threading.Event()
+    with listener(lambda _connection, _number: quiet.wait(20)) as url:
+        begin = time.monotonic()
+        with pytest.raises(ServiceError, match="gave no answer"):
+            Client(url, timeout_s=15).features(JPEG, deadline_s=0.2)
+        assert time.monotonic() - begin < 10
+        quiet.set()
+
+
+def test_a_service_that_always_hangs_up_is_an_error() -> None:
+    with listener(lambda connection, _number: connection.recv(65536)) as url:
+        client = Client(url)
+        with pytest.raises(ServiceError, match="closed the connection"):
+            client.model()
+
+
+def test_a_silent_service_and_none_at_all() -> None:
+    quiet = threading.Event()
+    with listener(lambda _connection, _number: quiet.wait(60)) as url:
+        with pytest.raises(ServiceError, match=r"no answer within 0\.2 s"):
+            Client(url, timeout_s=0.2).features(JPEG)
+        quiet.set()
+    free = bind("127.0.0.1", 0)
+    url = f"http://127.0.0.1:{free.getsockname()[1]}"
+    free.close()
+    with pytest.raises(ServiceError, match="start one with `serve`"):
+        Client(url).features(JPEG)
+
+
+@pytest.mark.parametrize(
+    ("sent", "message"),
+    [
+        (reply(b"<html>"), "something else than JSON"),
+        (reply(b"[1]"), "something else than JSON"),
+        (reply(b"{}", "500 Oops"), "answered 500: no reason given"),
+        (b"SSH-2.0-OpenSSH\r\n", "does not answer as HTTP"),
+        (b"HTTP/1.1 200 OK\r\nContent-Length: 99\r\n\r\n{}", "does not answer as HTTP"),
+    ],
+)
+def test_something_else_at_the_address(sent: bytes, message: str) -> None:
+    def behave(connection: socket.socket, _number: int) -> None:
+        connection.recv(65536)
+        connection.sendall(sent)
+
+    with listener(behave) as url, pytest.raises(ServiceError, match=message):
+        Client(url).model()
+
+
+@pytest.mark.parametrize(
+    "url",
+    [
+        "",
+        "ftp://x:1",
+        "http://",
+        "http://x:port",
+        "http://x:99999",
+        "http://[::1",
+        "http://exa..mple:8000",
+        f"http://{'x' * 64}.org",
+        "http://host/\xe4",
+        "http://host/a b",
+        "http://a b",
+        "http://a\0b",
+    ],
+)
+def test_what_is_no_address(url: str) -> None:
+    with pytest.raises(ServiceError, match="no address of a service"):
+        Client(url)

@@ -1,0 +1,99 @@
+"""Counts over all workers, and a log that can be searched and cannot be flooded."""
+
+import json
+import logging
+import re
+from collections.abc import Iterator
+
+import pytest
+
+from serve.api.problems import KINDS
+from serve.config import Limits
+from serve.observability.logs import REFUSALS_PER_S, JsonFormatter
+from serve.workers import shared_memory as shared
+from tests.serve.conftest import FakeEngine, Served, jpeg, outputs, picture, serving
+
+JPEG = jpeg(picture())
+SAMPLE = re.compile(r'^(driverview_\w+)(\{\w+="[^"]*"(?:,\w+="[^"]*")*\})? (\S+)$')
+
+
+def read(page: bytes) -> dict[str, float]:
+    """The samples of a page, each line of which must be one or a comment."""
+    found = {}
+    for line in page.decode().splitlines():
+        if line.startswith("# "):
+            assert re.match(r"# (HELP|TYPE) driverview_\w+ \S", line)
+            continue
+        match = SAMPLE.match(line)
+        assert match, line
+        found[match[1] + (match[2] or "")] = float(match[3])
+    return found
+
+
+def test_frames_are_counted_by_what_became_of_them(service: Served) -> None:
+    for _ in range(3):
+        service.post(JPEG)
+    service.post(b"text")
+    service.post(JPEG, X_Deadline_Ms="x")
+    reply = service.ask("GET", "/metrics")
+    assert reply.headers["content-type"].startswith("text/plain; version=0.0.4")
+    found = read(reply.content)
+    for outcome, count in (("answered", 3), ("not-an-image", 1), ("invalid-request", 1)):
+        assert found[f'driverview_frames_total{{outcome="{outcome}"}}'] == count
+    counted = [value for name, value in found.items() if name.startswith("driverview_frames_total")]
+    assert len(counted) == len(KINDS) + 1
+    assert sum(counted) == 5
+    for stage in ("queue", "decode", "forward", "total"):
+        name = f"driverview_{stage}_seconds"
+        buckets = [value for key, value in found.items() if key.startswith(f"{name}_bucket")]
+        assert buckets == sorted(buckets)
+        assert buckets[-1] == found[f"{name}_count"] == 3
+        assert 0 < found[f"{name}_sum"] < 30
+    assert found["driverview_connections"] == 1
+    assert found["driverview_workers"] == 1
+
+
+def test_each_worker_tells_of_all() -> None:
+    memory = shared.create(slots=2)
+    engine = FakeEngine(lambda _image: outputs())
+    with serving(engine, shared=memory) as one, serving(engine, shared=memory, slot=1) as two:
+        one.post(JPEG)
+        two.post(JPEG)
+        two.post(b"")
+        pages = [read(service.ask("GET", "/metrics").content) for service in (one, two)]
+    for page in pages:
+        assert page['driverview_frames_total{outcome="answered"}'] == 2
+        assert page['driverview_frames_total{outcome="not-an-image"}'] == 1
+        assert page["driverview_workers"] == page["driverview_workers_ready"] == 2
+
+
+@pytest.fixture
+def lines(caplog: pytest.LogCaptureFixture) -> Iterator[pytest.LogCaptureFixture]:
+    with caplog.at_level(logging.INFO, logger="serve"):
+        yield caplog
+
+
+def test_refusals_stand_in_the_log_with_their_request_and_cannot_flood_it(
+    service: Served, lines: pytest.LogCaptureFixture
+) -> None:
+    service.post(b"", X_Request_Id='my "id"')
+    record = lines.records[-1]
+    content = json.loads(JsonFormatter().format(record))
+    assert content["request"] == 'my "id"'
+    assert content["problem"] == "/problems/not-an-image"
+    assert (content["status"], content["client"]) == (422, "127.0.0.1")
+    service.post(JPEG)
+    assert lines.records[-1] is record  # answers only where they are asked for
+    for _ in range(200):
+        service.post(b"")
+    # What the bucket held, and what flowed into it in the time 200 requests may take.
+    assert REFUSALS_PER_S - 1 <= len(lines.records) < 150
+
+
+def test_answers_are_logged_on_request(lines: pytest.LogCaptureFixture) -> None:
+    limits = Limits(log_answers=True)
+    with serving(FakeEngine(lambda _image: outputs()), limits=limits) as service:
+        service.post(JPEG, X_Request_Id="7")
+    content = json.loads(JsonFormatter().format(lines.records[-1]))
+    assert (content["message"], content["request"], content["status"]) == ("answered", "7", 200)
+    assert content["total_ms"] > 0

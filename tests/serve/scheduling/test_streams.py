@@ -1,0 +1,132 @@
+"""The newest frame of a stream wins, in one worker and over several; late frames are dropped."""
+
+from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
+
+import pytest
+
+from serve.scheduling.streams import FORGOTTEN_NS, PROBES, Streams, stream_key
+from serve.workers import shared_memory as shared
+from tests.serve.conftest import (
+    FakeEngine,
+    Gate,
+    Reply,
+    Served,
+    jpeg,
+    outputs,
+    picture,
+    serving,
+    until,
+)
+from tests.serve.test_app import assert_problem
+
+JPEG = jpeg(picture())
+
+
+class Crowd:
+    """Clients of a service, each with a connection and a thread of its own."""
+
+    def __init__(self, service: Served, pool: ThreadPoolExecutor) -> None:
+        self._service, self._pool = service, pool
+
+    def post(self, **headers: str) -> "Future[Reply]":
+        return self._pool.submit(lambda: Served(self._service.port).post(JPEG, **headers))
+
+    def queue(self, waiting: int, **headers: str) -> "Future[Reply]":
+        """Post, and return once so many frames wait."""
+        future = self.post(**headers)
+        until(lambda: self._service.app.perceiver.waiting == waiting)
+        return future
+
+
+@contextmanager
+def busy(gate: Gate, memory: shared.Shared | None = None) -> Iterator[Crowd]:
+    """A service that is at work on a first frame, and stays so until the gate is opened."""
+    with serving(gate.engine, shared=memory) as service, ThreadPoolExecutor(8) as pool:
+        crowd = Crowd(service, pool)
+        first = crowd.post()
+        assert gate.busy.wait(20)
+        yield crowd
+        gate.open.set()
+        assert first.result().status == 200
+
+
+def test_a_newer_frame_takes_the_queued_ones_place_at_once() -> None:
+    gate = Gate()
+    with busy(gate) as crowd:
+        old = crowd.queue(1, X_Stream_Id="front")
+        other = crowd.queue(2, X_Stream_Id="rear")
+        alone = crowd.queue(3)
+        new = crowd.post(X_Stream_Id="front")
+        assert_problem(old.result(20), 503, "superseded")  # while the engine is still at work
+        gate.open.set()
+        assert [f.result().status for f in (new, other, alone)] == [200] * 3
+    assert len(gate.engine.images) == 4
+
+
+def test_a_full_queue_still_takes_a_newer_frame_of_its_own_streams() -> None:
+    gate = Gate()
+    with busy(gate) as crowd:
+        old = crowd.queue(1, X_Stream_Id="front")
+        others = [crowd.queue(n) for n in (2, 3, 4)]
+        assert_problem(crowd.post(X_Stream_Id="rear").result(20), 503, "overloaded")
+        new = crowd.post(X_Stream_Id="front")
+        assert_problem(old.result(20), 503, "superseded")
+        gate.open.set()
+        assert [f.result().status for f in (new, *others)] == [200] * 4
+
+
+def test_a_newer_frame_at_another_worker_supersedes_too() -> None:
+    gate, memory = Gate(), shared.create(slots=2)
+    with busy(gate, memory) as crowd:
+        old = crowd.queue(1, X_Stream_Id="front")
+        kept = crowd.queue(2, X_Stream_Id="rear")
+        with serving(FakeEngine(lambda _image: outputs()), shared=memory, slot=1) as second:
+            assert second.post(JPEG, X_Stream_Id="front").status == 200
+        gate.open.set()
+        assert_problem(old.result(), 503, "superseded")
+        assert kept.result().status == 200
+    assert len(gate.engine.images) == 2
+
+
+def test_a_late_frame_is_dropped_before_it_is_decoded() -> None:
+    gate = Gate()
+    with busy(gate) as crowd:
+        late = crowd.queue(1, X_Deadline_Ms="1")
+        early = crowd.queue(2, X_Deadline_Ms="60000")
+        gate.open.set()
+        assert_problem(late.result(), 503, "deadline-passed")
+        assert early.result().status == 200
+    assert len(gate.engine.images) == 2
+
+
+@pytest.mark.parametrize("text", ["-1", "60001", "nan", "soon", "", "1_0é"])
+def test_a_deadline_that_is_none_is_refused(service: Served, text: str) -> None:
+    assert_problem(service.post(JPEG, X_Deadline_Ms=text), 422, "invalid-request")
+
+
+def test_the_table_knows_the_newest_stamp_of_each_stream() -> None:
+    memory = shared.create(slots=1)
+    here, there = Streams(memory.streams()), Streams(shared.attach(memory.fd, 1).streams())
+    front, other = stream_key("10.0.0.1", "front"), stream_key("10.0.0.2", "front")
+    assert front != other
+    now = 10 * FORGOTTEN_NS
+    here.announce(front, now)
+    assert [there.superseded(front, now + d) for d in (-1, 0, 1)] == [True, False, False]
+    assert not there.superseded(other, 0)
+    there.announce(front, now - 5)  # an older one that comes late takes nothing back
+    assert here.superseded(front, now - 1)
+
+
+def test_a_full_table_forgets_streams_that_ended_and_never_errs() -> None:
+    streams = Streams(shared.create(slots=1).streams())
+    now = 10 * FORGOTTEN_NS
+    keys = [1 + 1024 * n for n in range(PROBES + 1)]  # all of them want the same places
+    for key in keys:
+        streams.announce(key, now)
+    assert [streams.superseded(key, now - 1) for key in keys] == [True] * PROBES + [False]
+    later = now + FORGOTTEN_NS + 1
+    streams.announce(keys[-1], later)
+    assert streams.superseded(keys[-1], later - 1)
+    assert not streams.superseded(keys[0], now - 1)

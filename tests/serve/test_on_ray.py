@@ -1,0 +1,123 @@
+"""The service on Ray Serve: two replicas on this machine, and the names that the two share."""
+
+import http.client
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import tomllib
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
+
+import pytest
+
+from mtlnet.inference.engine import load_engine
+from mtlnet.inference.model_card import golden_image, read_card
+from mtlnet.inference.prediction import decode_outputs
+from runtime.sockets import bind
+from serve.cli import main
+from tests.serve.conftest import png
+from tests.serve.test_cli import ROOT, command
+from tests.typed import typed
+from trackfeatures.errors import UserError
+
+TOKEN = "0123456789abcdef"
+REQUESTS = 40
+
+
+@contextmanager
+def on_ray(model: Path, token_file: Path, replicas: int) -> Iterator[int]:
+    """The running command, on a Ray of its own; its port."""
+    with bind("127.0.0.1", 0) as listener:
+        port = listener.getsockname()[1]
+    words = ("ray", "--model", str(model), "--port", str(port), "--replicas", str(replicas))
+    environment = {
+        **{name: value for name, value in os.environ.items() if not name.startswith("RAY_")},
+        "PYTHONPATH": str(ROOT),
+        "RAY_ENABLE_UV_RUN_RUNTIME_ENV": "0",
+    }
+    with subprocess.Popen(
+        command(*words, "--token-file", str(token_file)),
+        stderr=subprocess.PIPE,
+        text=True,
+        env=environment,
+    ) as process:
+        try:
+            assert process.stderr is not None
+            said = []
+            for line in process.stderr:
+                said.append(line)
+                if line.startswith("serving "):
+                    break
+            else:
+                pytest.fail("".join(said[-20:]))
+            yield port
+            process.send_signal(signal.SIGTERM)
+            process.communicate(timeout=120)
+            assert process.returncode == 0
+        finally:
+            process.kill()
+
+
+@pytest.mark.slow
+@pytest.mark.alone
+def test_two_replicas_answer_as_the_engine_does(published: Path, tmp_path: Path) -> None:
+    pytest.importorskip("ray.serve", reason="no ray[serve]")
+    (tmp_path / "token").write_text(TOKEN)
+    image = golden_image(280, 210)
+    body, right = png(image[:, :, ::-1]), decode_outputs(load_engine(published)(image)).as_json()
+    with on_ray(published, tmp_path / "token", replicas=2) as port:
+        assert ask(port, "POST", "/features", body, token="wrong")[0] == 401
+        answers = [ask(port, "POST", "/features", body) for _ in range(REQUESTS)]
+        counts = {answered(ask(port, "GET", "/metrics")[1]) for _ in range(20)}
+    for status, content in answers:
+        answer = json.loads(content)
+        assert status == 200
+        assert {name: answer[name] for name in right} == right
+        assert answer["model"] == read_card(published).model_hash
+    # Each replica counts its own: two have answered, and all of the requests between them.
+    assert all(0 < count < REQUESTS for count in counts)
+    assert sum(counts) == (REQUESTS if len(counts) == 2 else REQUESTS // 2)
+
+
+def ask(
+    port: int, method: str, path: str, body: bytes | None = None, token: str = TOKEN
+) -> tuple[int, bytes]:
+    with closing(http.client.HTTPConnection("127.0.0.1", port, timeout=60)) as connection:
+        headers = {"Authorization": f"Bearer {token}", "Content-Type": "image/png"}
+        connection.request(method, path, body, headers)
+        response = connection.getresponse()
+        return response.status, response.read()
+
+
+def answered(page: bytes) -> int:
+    found = re.search(rb'frames_total{outcome="answered"} (\d+)', page)
+    assert found is not None
+    return int(found[1])
+
+
+def test_the_builder_takes_what_it_knows(published: Path) -> None:
+    on_ray_module = pytest.importorskip("serve.on_ray", reason="no ray[serve]")
+    assert on_ray_module.build({"model": str(published), "replicas": 2}) is not None
+    with pytest.raises(UserError, match="no argument speed"):
+        on_ray_module.build({"speed": 9})
+    with pytest.raises(UserError, match="no run"):
+        on_ray_module.build({"model": "/none"})
+
+
+def test_without_ray_serve_it_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "serve.on_ray", None)
+    done = typed("serve", "ray")
+    assert done.returncode == 1
+    assert "driverview[rayserve]" in done.stderr
+    assert done.stderr.count("\n") == 1
+    assert "set a token" in typed("serve", "ray", "--host", "0.0.0.0").stderr
+
+
+def test_ray_cannot_take_our_command_away() -> None:
+    """Ray has a console script `serve`, too; who of the two is installed last has the name."""
+    scripts = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
+    assert scripts["driverview-serve"] == scripts["serve"] == f"{main.__module__}:{main.__name__}"

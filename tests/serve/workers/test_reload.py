@@ -1,0 +1,178 @@
+"""New weights and new workers in a running service: no request is lost, no answer is wrong."""
+
+import os
+import shutil
+import signal
+import subprocess
+import threading
+import time
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from mtlnet.inference.engine import load_engine
+from mtlnet.inference.model_card import golden_image, read_card
+from mtlnet.inference.prediction import decode_outputs
+from serve.client import Client
+from tests.serve.conftest import png, publish_untrained, until
+from tests.serve.test_cli import address, command, started
+
+BODY = png(golden_image(280, 210)[:, :, ::-1])
+
+
+@pytest.fixture(scope="module")
+def models(published: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """Two models with different weights."""
+    other = tmp_path_factory.mktemp("other") / "run"
+    publish_untrained(other, seed=4)
+    return published, other
+
+
+def expected(run: Path) -> tuple[str, dict[str, Any]]:
+    """(hash, what it answers to BODY)."""
+    return read_card(run).model_hash, decode_outputs(
+        load_engine(run)(golden_image(280, 210))
+    ).as_json()
+
+
+class Traffic:
+    """Clients that ask without a pause, and what they were answered."""
+
+    def __init__(self, url: str, clients: int) -> None:
+        self._url = url
+        self._stop = threading.Event()
+        self.answers: list[dict[str, Any]] = []
+        self.faults: list[Exception] = []
+        self._threads = [threading.Thread(target=self._drive) for _ in range(clients)]
+        for thread in self._threads:
+            thread.start()
+
+    def _drive(self) -> None:
+        with Client(self._url, timeout_s=60) as client:
+            while not self._stop.is_set():
+                try:
+                    self.answers.append(client.features(BODY))
+                except Exception as fault:  # noqa: BLE001  # the test looks at them
+                    self.faults.append(fault)
+                    return
+
+    def end(self) -> None:
+        self._stop.set()
+        for thread in self._threads:
+            thread.join()
+
+
+@contextmanager
+def traffic(url: str, clients: int = 3) -> Iterator[Traffic]:
+    Client(url, timeout_s=60).wait_until_ready(60)
+    found = Traffic(url, clients)
+    try:
+        until(lambda: len(found.answers) > 5)
+        yield found
+    finally:
+        found.end()
+
+
+def run(*arguments: str) -> subprocess.CompletedProcess[str]:
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[3])}
+    return subprocess.run(
+        command(*arguments), capture_output=True, text=True, env=environment, timeout=120
+    )
+
+
+@pytest.mark.slow
+def test_reload_and_restart_lose_no_request_and_give_no_wrong_answer(
+    models: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    known = dict(expected(model) for model in models)
+    old, new = (read_card(model).model_hash for model in models)
+    link = tmp_path / "current"
+    link.symlink_to(models[0])
+    with started("--model", str(models[0]), "--port", "0", "--workers", "2") as (process, line):
+        url = address(line)
+        port = url.rpartition(":")[2]
+        with traffic(url) as found:
+            done = run("reload", "--port", port, "--model", str(models[1]))
+            assert done.stdout.strip() == f"now serving model {new[:12]}", done.stderr
+            changed = len(found.answers)
+            until(lambda: len(found.answers) > changed + 10)
+            # Whatever was asked after the command's end is answered by the new model.
+            assert {a["model"] for a in found.answers[changed + 4 :]} == {new}
+
+            broken = tmp_path / "broken"
+            shutil.copytree(models[0], broken)
+            with (broken / "model.bin").open("r+b") as file:
+                file.write(b"x" * 100)
+            done = run("reload", "--port", port, "--model", str(broken))
+            assert done.returncode == 1
+            assert "damaged" in done.stderr
+            assert "old model goes on answering" in done.stderr
+
+            done = run("restart", "--port", port)
+            assert done.returncode == 0, done.stderr
+            changed = len(found.answers)
+            until(lambda: len(found.answers) > changed + 10)
+            assert found.answers[-1]["model"] == new
+        assert found.faults == []
+        assert set(Counter(a["model"] for a in found.answers)) == {old, new}
+        for answer in found.answers:
+            right = known[answer["model"]]
+            assert {key: answer[key] for key in right} == right
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(30) == 0
+
+
+@pytest.mark.slow
+def test_hangup_takes_what_the_folder_holds_now_and_a_dead_worker_is_replaced(
+    models: tuple[Path, Path], tmp_path: Path
+) -> None:
+    current = tmp_path / "current"
+    shutil.copytree(models[0], current)
+    new = read_card(models[1]).model_hash
+    with started("--model", str(current), "--port", "0") as (process, line):
+        with Client(address(line), timeout_s=60) as client:
+            client.wait_until_ready(60)
+            shutil.rmtree(current)
+            shutil.copytree(models[1], current)
+            process.send_signal(signal.SIGHUP)
+            until(lambda: client.features(BODY)["model"] == new)
+            workers = subprocess.run(
+                ["ps", "-o", "pid=", "--ppid", str(process.pid)], capture_output=True, text=True
+            ).stdout.split()
+            assert len(workers) == 1
+            os.kill(int(workers[0]), signal.SIGKILL)
+            until(lambda: not client.ready())
+            client.wait_until_ready(60)
+            assert client.features(BODY)["model"] == new
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(30) == 0
+
+
+def test_an_open_address_needs_a_token_and_a_command_needs_a_service(
+    published: Path, tmp_path: Path
+) -> None:
+    arguments = ("--model", str(published), "--port", "0")
+    for more, said in (
+        (("--host", "0.0.0.0"), "set a token"),
+        (("--token-file", str(tmp_path / "none")), "no token file"),
+        (("reload", "--port", "1"), "no service of yours on port 1"),
+    ):
+        begin = time.monotonic()
+        done = run(*(more if more[0] == "reload" else (*arguments, *more)))
+        assert done.returncode == 1
+        assert said in done.stderr
+        assert done.stderr.count("\n") == 1
+        assert time.monotonic() - begin < 60
+    (tmp_path / "token").write_text("0123456789abcdef\n")
+    with started(*arguments, "--host", "0.0.0.0", "--token-file", str(tmp_path / "token")) as (
+        process,
+        line,
+    ):
+        assert "http://0.0.0.0:" in line
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(30) == 0

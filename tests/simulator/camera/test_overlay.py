@@ -1,0 +1,63 @@
+"""Lines of the true markings: on the road, before the eye, near the picture, in whole runs."""
+
+import numpy as np
+import pytest
+from numpy.typing import ArrayLike
+
+from simulator.camera.core import optics
+from simulator.camera.core.optics import DRIVER_SEAT
+from simulator.camera.overlay import BEHIND_M, STEP_M, marking_polylines
+from simulator.camera.snapshot import standing_pose
+from simulator.track.catalogue import find_track
+from simulator.track.kernel import road_points
+from simulator.track.road import Road
+
+
+class Eye:
+    """What an overlay needs of a camera, without a renderer."""
+
+    width, height = 280, 210
+
+    def project(
+        self, points: ArrayLike, body_pose: ArrayLike, view: str = "front"
+    ) -> tuple[optics.FloatArray, optics.FloatArray]:
+        matrix = optics.intrinsics(DRIVER_SEAT, self.width, self.height)
+        return optics.project(optics.eye_of(DRIVER_SEAT, body_pose, view), matrix, points)
+
+
+@pytest.mark.parametrize("name", ["mountain-pass", "ring-road", "oval"])
+def test_compiled_points_are_those_of_the_road_plane(name: str) -> None:
+    track = find_track(name)
+    s = np.random.default_rng(1).uniform(-50.0, 2.0 * track.length_m, 200)
+    y = np.array([-6.0, 0.0, 2.0])
+    points = road_points(track.arrays(), s, y)
+    for k, offset in enumerate(y):
+        at = track.at(s, offset)
+        assert np.allclose(points[k], np.stack([at.x, at.y, at.z], axis=1), rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("view", ["front", "left", "rear", "top"])
+@pytest.mark.parametrize("angle", [0.0, 0.6, 2.0])
+def test_lines_are_the_runs_of_points_that_can_be_seen(view: str, angle: float) -> None:
+    """Point by point, as one would write it down."""
+    road, eye = Road(find_track("circuit"), 3), Eye()
+    pose = standing_pose(road, 150.0, 3.0, angle)
+    start, end = (-60.0, BEHIND_M) if view == "rear" else (-BEHIND_M, 60.0)
+    start = -60.0 if view in ("left", "top") else start
+    expected: list[list[tuple[float, float]]] = []
+    for y in road.markings_y:
+        run: list[tuple[float, float]] = []
+        for s in np.arange(start, end + STEP_M / 2, STEP_M):
+            at = road.track.at(150.0 + s, y)
+            ((u, v),), (depth,) = eye.project([[at.x, at.y, at.z]], pose, view)
+            if depth > 0.24 and -140.0 < u < 420.0 and -140.0 < v < 350.0:
+                run.append((u, v))
+                continue
+            expected += [run] if len(run) >= 2 else []
+            run = []
+        expected += [run] if len(run) >= 2 else []
+    found = marking_polylines(eye, road, (150.0, pose), view=view)
+    assert len(found) == len(expected)
+    assert expected or angle
+    for line, points in zip(found, expected, strict=True):
+        assert np.allclose(line, points, rtol=0, atol=1e-6)

@@ -1,0 +1,300 @@
+"""Depth and class of each pixel, and several views at once, against the track's own geometry."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from simulator.camera import CLASSES, VIEWS, Camera, Light, Mount, intrinsics
+from simulator.camera.colourise import CLASS_COLOURS, in_false_colours
+from simulator.camera.core.optics import eye_of, rotation
+from simulator.camera.scene.carmesh import HEIGHT_M, LENGTH_M, WIDTH_M
+from simulator.camera.snapshot import standing_pose, write_contact_sheet
+from simulator.track.catalogue import find_track
+from simulator.track.markings import MarkingStyle
+from simulator.track.road import Road
+from trackfeatures.errors import UserError
+
+FloatArray = NDArray[np.float64]
+ROAD, MARKING, CAR, GROUND, SKY, OBJECT = range(6)
+
+
+@pytest.fixture(scope="module")
+def road() -> Road:
+    return Road(find_track("mountain-pass"), 2)
+
+
+def light(kind: str = "clear") -> Light:
+    return Light.named(kind, np.random.default_rng(1))
+
+
+def rays(camera: Camera, pose: FloatArray, view: str = "front") -> tuple[FloatArray, FloatArray]:
+    """The eye (3,) and what a metre of depth along each pixel's ray is (height, width, 3)."""
+    eye = eye_of(camera.mount, pose, view)
+    matrix = camera.intrinsics
+    u = (np.arange(camera.width) + 0.5 - matrix[0, 2]) / matrix[0, 0]
+    v = (np.arange(camera.height) + 0.5 - matrix[1, 2]) / matrix[1, 1]
+    right, up, ahead = eye.axes
+    return eye.place, ahead + u[None, :, None] * right - v[:, None, None] * up
+
+
+def test_classes_are_published() -> None:
+    assert CLASSES == ("road", "marking", "car", "ground", "sky", "object")
+
+
+@pytest.mark.parametrize("lanes", [1, 3])
+def test_road_lies_at_the_depth_of_the_tracks_surface(lanes: int) -> None:
+    """A road pixel's place, eye plus ray times depth, is a point of the track's road plane."""
+    road = Road(find_track("mountain-pass"), lanes)
+    rng = np.random.default_rng(3)
+    heights = []
+    with Camera(road, seed=2, light=light()) as camera:
+        for s in rng.uniform(0.0, road.track.length_m, 12):
+            pose = standing_pose(road, s, rng.uniform(-1.0, 1.0), rng.normal(0.0, 0.05))
+            found = camera.render_views(pose, views=("front:depth", "front:class"))
+            depth, kind = found["front:depth"], found["front:class"]
+            eye, ray = rays(camera, pose)
+            near = ((kind == ROAD) | (kind == MARKING)) & (depth < 40.0)
+            pick = rng.permutation(np.flatnonzero(near.reshape(-1)))[:150]
+            points = eye + ray.reshape(-1, 3)[pick] * depth.reshape(-1)[pick, None]
+            hint = s
+            for x, y, z in points:
+                at, offset = road.track.project(float(x), float(y), hint)
+                heights.append(float(road.track.at(at, offset).z) - z)
+                assert abs(offset) <= road.half_asphalt + 0.01
+    assert len(heights) > 1500
+    assert np.abs(heights).max() < 0.03
+    assert np.median(np.abs(heights)) < 0.002
+
+
+def places(camera: Camera, pose: FloatArray, depth: NDArray[np.float32]) -> FloatArray:
+    """World places (height, width, 3) that the pixels show."""
+    eye, ray = rays(camera, pose)
+    return np.asarray(eye + ray * depth[..., None].astype(np.float64))
+
+
+def test_marking_pixels_are_those_on_the_markings() -> None:
+    """Each marking pixel shows a place on a line of paint; no road pixel one on the outer lines,
+    which are without gaps."""
+    track = replace(find_track("circuit"), markings=MarkingStyle())
+    road = Road(track, 2)
+    half = track.markings.line_width / 2
+    rng = np.random.default_rng(4)
+    on, off = [], []
+    with Camera(road, seed=2, light=light()) as camera:
+        for s in rng.uniform(0.0, track.length_m, 8):
+            pose = standing_pose(road, s, rng.uniform(-1.0, 1.0), rng.normal(0.0, 0.05))
+            found = camera.render_views(pose, views=("front:depth", "front:class"))
+            depth, kind = found["front:depth"], found["front:class"]
+            seen = places(camera, pose, depth)
+            for x, y, _ in seen[(kind == MARKING) & (depth < 30.0)]:
+                _, offset = track.project(float(x), float(y), s)
+                on.append(np.abs(road.markings_y - offset).min())
+            # Road pixels next to paint, where a mistake would be.
+            beside = cv2.dilate((kind == MARKING).astype(np.uint8), np.ones((3, 3), np.uint8)) == 1
+            for x, y, _ in seen[beside & (kind == ROAD) & (depth < 30.0)]:
+                _, offset = track.project(float(x), float(y), s)
+                off.append(np.abs(road.markings_y[[0, -1]] - offset).min())
+    assert min(len(on), len(off)) > 1500
+    assert max(on) < half + 0.01
+    assert min(off) > half - 0.01
+
+
+def test_car_pixels_lie_in_the_cars_box(road: Road) -> None:
+    """They fill most of where the box of the car projects, and lie at the box's depths."""
+    with Camera(road, seed=1, light=light(), width=420, height=315) as camera:
+        pose = standing_pose(road, 100.0, 0.0)
+        for gap, offset in ((10.0, 2.0), (22.0, -2.0), (35.0, 2.0)):
+            car = standing_pose(road, 100.0 + gap, offset, height=0.0)
+            found = camera.render_views(pose, car[None], ("front:depth", "front:class"))
+            corners = np.array(
+                [
+                    (x, y, z)
+                    for x in (-LENGTH_M / 2 - 0.1, LENGTH_M / 2 + 0.1)
+                    for y in (-WIDTH_M / 2 - 0.1, WIDTH_M / 2 + 0.1)
+                    for z in (0.0, HEIGHT_M)
+                ]
+            )
+            pixels, away = camera.project(corners @ rotation(*car[3:]).T + car[:3], pose)
+            box = np.zeros((camera.height, camera.width), np.uint8)
+            hull = cv2.convexHull(np.rint(pixels * 16 - 8).astype(np.int32))
+            cv2.fillConvexPoly(box, hull, 1, shift=4)
+            drawn = found["front:class"] == CAR
+            assert (drawn & (cv2.dilate(box, np.ones((3, 3), np.uint8)) == 0)).sum() == 0
+            assert (drawn & (box == 1)).sum() > 0.5 * box.sum()
+            depth = found["front:depth"][drawn]
+            assert depth.min() > away.min() - 0.05
+            assert depth.max() < away.max() + 0.05
+
+
+def test_sky_is_where_the_colour_of_the_sky_is(road: Road) -> None:
+    """Under a magenta sky in clear air, and only there."""
+    magenta = (1.0, 0.0, 1.0)
+    odd = replace(
+        light(), zenith=magenta, horizon=magenta, haze=magenta, haze_per_km=1e-6, clouds=0.0
+    )
+    odd = replace(odd, sun=(0.0, 0.0, 0.0), sky=(0.3, 0.3, 0.3), exposure=1.0)
+    with Camera(road, seed=3, light=odd) as camera:
+        for s in (50.0, 400.0, 900.0):
+            pose = standing_pose(road, s, 0.0)
+            found = camera.render_views(pose, views=("front", "front:class", "front:depth"))
+            is_sky = found["front:class"] == SKY
+            assert np.array_equal(is_sky, np.isinf(found["front:depth"]))
+            assert 0.05 < is_sky.mean() < 0.7
+            red, green, blue = found["front"].astype(int).transpose(2, 0, 1)
+            coloured = (np.minimum(red, blue) - green) > 128
+            # Only the soft edges of leaves are a bit of both.
+            assert (coloured != is_sky).mean() < 0.004
+
+
+def test_a_car_changes_the_colours_where_its_class_is(road: Road) -> None:
+    with Camera(road, seed=1, light=light("overcast")) as camera:
+        pose = standing_pose(road, 300.0, 0.0)
+        car = standing_pose(road, 312.0, 1.5, height=0.0)
+        found = camera.render_views(pose, car[None], ("front", "front:class"))
+        empty = camera.render_views(pose, None, ("front", "front:class"))
+    drawn = found["front:class"] == CAR
+    assert not (empty["front:class"] == CAR).any()
+    changed = np.abs(found["front"].astype(int) - empty["front"]).sum(axis=2) > 30
+    assert changed[drawn].mean() > 0.9
+    # Beside it only its shadow, which lies below.
+    beside = changed & ~drawn
+    assert beside[: np.nonzero(drawn)[0].min()].sum() == 0
+    same = ~(drawn | changed)
+    assert np.array_equal(found["front:class"][same], empty["front:class"][same])
+
+
+def test_objects_stand_beside_the_road(road: Road) -> None:
+    """Nothing of them hangs lower than 3 m over the asphalt, where bridges do, or farther."""
+    offsets = []
+    with Camera(road, seed=5, light=light()) as camera:
+        for s in np.linspace(0.0, road.track.length_m, 8, endpoint=False):
+            pose = standing_pose(road, s, 0.0)
+            found = camera.render_views(pose, views=("front:depth", "front:class"))
+            near = (found["front:class"] == OBJECT) & (found["front:depth"] < 25.0)
+            for x, y, z in places(camera, pose, found["front:depth"])[near][::7]:
+                at, offset = road.track.project(float(x), float(y), s)
+                if z - float(road.track.at(at, offset).z) < 3.0:
+                    offsets.append(abs(offset))
+    assert len(offsets) > 200
+    assert min(offsets) > road.half_asphalt - 0.5
+
+
+def test_depth_from_above_is_the_height(road: Road) -> None:
+    pose = standing_pose(road, 200.0, 0.0)
+    with Camera(road, seed=1, light=light(), width=64, height=64) as camera:
+        found = camera.render_views(pose, views=("top:depth", "top:class"))
+        depth, kind = found["top:depth"], found["top:class"]
+    assert kind[32, 32] == CAR
+    assert 22.0 < depth[32, 32] < 23.5
+    beside = depth[kind == ROAD]
+    assert np.median(beside) == pytest.approx(24.25, abs=0.3)
+
+
+def test_rain_and_snow_change_no_class(road: Road) -> None:
+    pose = standing_pose(road, 250.0, 1.0)
+    found = []
+    for kind in ("overcast", "rain", "snow"):
+        with Camera(road, seed=4, light=light(kind)) as camera:
+            found.append(camera.render_views(pose, views=("front:class", "front:depth")))
+    for other in found[1:]:
+        assert np.array_equal(found[0]["front:class"], other["front:class"])
+        assert np.array_equal(found[0]["front:depth"], other["front:depth"])
+
+
+def test_many_views_are_the_single_ones(road: Road) -> None:
+    names = [f"{view}{kind}" for view in VIEWS for kind in ("", ":depth", ":class")]
+    pose = standing_pose(road, 70.0, -1.0)
+    cars = np.array([standing_pose(road, 85.0, 2.0, height=0.0)])
+    with Camera(road, seed=1, light=light()) as camera:
+        together = camera.render_views(pose, cars, names[::-1])
+        assert list(together) == names[::-1]
+        for name in names:
+            alone = camera.render_views(pose, cars, (name,))[name]
+            assert np.array_equal(together[name], alone), name
+        for view in VIEWS:
+            assert np.array_equal(together[view], camera.render(pose, cars, view))
+            assert together[view].shape == (210, 280, 3)
+            assert together[f"{view}:depth"].shape == (210, 280)
+            assert together[f"{view}:depth"].dtype == np.float32
+            assert together[f"{view}:class"].dtype == np.uint8
+        assert camera.render_views(pose, cars, ()) == {}
+
+
+def test_unknown_views_and_kinds_are_refused(road: Road) -> None:
+    pose = standing_pose(road, 0.0, 0.0)
+    with Camera(road, seed=1, light=light(), width=16, height=16) as camera:
+        for name in ("below", "below:depth", ""):
+            with pytest.raises(UserError, match="the views are front, left, right, rear, chase"):
+                camera.render_views(pose, views=("front", name))
+        for name in ("front:depths", "front:", "front:depth:class"):
+            with pytest.raises(UserError, match="the kinds are colour, depth, class"):
+                camera.render_views(pose, views=(name,))
+        with pytest.raises(UserError, match="unknown camera view 'below'"):
+            camera.extrinsics("below")
+
+
+@pytest.mark.parametrize("view", VIEWS)
+def test_calibration_tells_where_points_are_seen(road: Road, view: str) -> None:
+    """K E p is the projection of a point p of the body frame, for any size, lens and pose."""
+    rng = np.random.default_rng(6)
+    pose = np.array([31.0, -12.0, 4.0, 0.05, -0.1, 2.2])
+    points = rng.uniform(-30.0, 30.0, (200, 3))
+    mount = Mount(x=0.4, y=0.2, z=1.3, pitch_deg=7.0, fov_y_deg=41.0)
+    with Camera(road, seed=1, light=light(), mount=mount, width=352, height=160) as camera:
+        matrix, frame = camera.intrinsics, camera.extrinsics(view, pose)
+        world = points @ rotation(*pose[3:]).T + pose[:3]
+        pixels, depth = camera.project(world, pose, view)
+        if view not in ("chase", "top"):
+            assert frame == pytest.approx(camera.extrinsics(view))
+    assert frame[3] == pytest.approx([0.0, 0.0, 0.0, 1.0])
+    assert frame[:3, :3] @ frame[:3, :3].T == pytest.approx(np.eye(3))
+    assert np.linalg.det(frame[:3, :3]) == pytest.approx(1.0)
+    seen = np.column_stack([points, np.ones(len(points))]) @ frame.T
+    assert seen[:, 2] == pytest.approx(depth)
+    ahead = depth > 0.5
+    homogeneous = seen[ahead, :3] @ matrix.T
+    assert homogeneous[:, :2] / homogeneous[:, 2:] == pytest.approx(pixels[ahead])
+    assert ahead.sum() > 50
+
+
+@pytest.mark.parametrize("size", [(280, 210), (64, 48), (1920, 1080), (100, 300)])
+@pytest.mark.parametrize("fov", [20.0, 67.5, 120.0])
+def test_intrinsics_of_any_size_and_lens(size: tuple[int, int], fov: float) -> None:
+    width, height = size
+    matrix = intrinsics(Mount(fov_y_deg=fov), width, height)
+    up, down = (np.arctan((v - matrix[1, 2]) / matrix[1, 1]) for v in (0.0, height))
+    assert np.degrees(down - up) == pytest.approx(fov)
+    assert (matrix[0, 2], matrix[1, 2], matrix[0, 0]) == (width / 2, height / 2, matrix[1, 1])
+
+
+def test_false_colours_tell_kinds_apart(road: Road) -> None:
+    depth = np.array([[2.0, 30.0, 499.0, np.inf]], dtype=np.float32)
+    near, middle, far, sky = in_false_colours(depth, "depth")[0].astype(int)
+    assert near[0] > near[2]
+    assert middle[1] > middle[0]
+    assert far[2] > far[0]
+    assert sky.max() < 20
+    classes = np.arange(len(CLASSES), dtype=np.uint8)[None]
+    colours = in_false_colours(classes, "class")[0]
+    assert [tuple(colour) for colour in colours.tolist()] == list(CLASS_COLOURS.values())
+    picture = np.arange(12, dtype=np.uint8).reshape(2, 2, 3)
+    assert np.array_equal(in_false_colours(picture, "colour"), picture)
+
+
+def test_a_contact_sheet_of_one_view_and_kind(road: Road, tmp_path: Path) -> None:
+    """All but the captions is in the colours of the classes; the rear view is no front view."""
+    sheets = []
+    for view in ("rear", None):
+        out = tmp_path / f"{view}.png"
+        write_contact_sheet(road, out, seed=0, traffic=1, light="clear", view=view, kind="class")
+        sheet = cv2.imread(str(out))
+        assert sheet is not None
+        sheets.append(sheet[..., ::-1].astype(int))
+    palette = np.array(list(CLASS_COLOURS.values()))
+    known = (sheets[0][:, :, None] == palette).all(axis=-1).any(axis=-1)
+    assert known.mean() > 0.98
+    assert (sheets[0] != sheets[1]).any(axis=-1).mean() > 0.1

@@ -1,0 +1,182 @@
+"""Heavy shadow on every track, and bridges whose shadows lie where the sun throws them."""
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from simulator.camera import Camera, Light
+from simulator.camera.bridges import bridges
+from simulator.camera.bridges.bridges import CLEARANCE_M, Bridge
+from simulator.camera.bridges.shadow import cast_bridges
+from simulator.camera.scene import shadow_mask as shade
+from simulator.camera.scene.road_mesh import build as build_ribbon
+from simulator.camera.scene.terrain import CentreLine, Survey
+from simulator.camera.scene.terrain import build as build_terrain
+from simulator.camera.scene.themes import LOOKS, look_of
+from simulator.camera.snapshot import standing_pose
+from simulator.track.catalogue import OWN_TRACKS, find_track
+from simulator.track.own import LOOKS as TRACK_LOOKS
+from simulator.track.road import Road
+
+FloatArray = NDArray[np.float64]
+
+NAMES = sorted(path.stem for path in OWN_TRACKS.glob("*.toml"))
+
+
+def light(kind: str, seed: int) -> Light:
+    return Light.named(kind, np.random.default_rng(seed))
+
+
+def bridges_of(road: Road, seed: int) -> tuple[Bridge, ...]:
+    """The bridges that a scene of this seed has."""
+    look, survey = look_of(road.track.look), Survey.of(road)
+    line = survey.line
+    terrain = build_terrain(road, survey, look, np.random.default_rng([seed, 1]))
+    strips = build_ribbon(road, line, terrain)
+    return bridges.build(road, line, strips, terrain, look, np.random.default_rng([seed, 8]))
+
+
+def test_every_look_that_a_track_may_have_is_drawn() -> None:
+    assert set(TRACK_LOOKS) == set(LOOKS)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_heavy_shadow_covers_30_to_80_percent_of_every_road(name: str) -> None:
+    for number in range(2):
+        lanes = 1 + (len(name) + number) % 3
+        road = Road(find_track(name), lanes)
+        seed = 10 * number + len(name)
+        with Camera(
+            road, seed=seed, light=light("heavy-shadow", seed), width=8, height=8
+        ) as camera:
+            mask = camera._setting.scene.mask
+        places = np.arange(0.0, road.track.length_m, 3.0)
+        shares = [mask.fraction(float(s), road.half_asphalt) for s in places]
+        assert min(shares) >= 0.3, (lanes, seed)
+        assert max(shares) <= 0.8, (lanes, seed)
+        assert np.std(shares) > 0.02
+
+
+def lit_and_dark(camera: Camera, s: float) -> tuple[FloatArray, FloatArray]:
+    """Light (not display values) of road pixels 3 to 15 m ahead that the mask has in the sun, and
+    in the shade, away from the lines and the shadows' edges."""
+    road, mask = camera.road, camera._setting.scene.mask
+    pose = standing_pose(road, s, 0.0)
+    grey = np.square(camera.render(pose) / 255.0).mean(axis=2)
+    at_s, at_y = np.meshgrid(s + np.arange(3.0, 15.0, 0.1), np.arange(-3.4, -0.6, 0.1))
+    place = road.track.at(at_s % road.track.length_m, at_y)
+    pixels, _ = camera.project(np.stack([place.x, place.y, place.z], axis=-1).reshape(-1, 3), pose)
+    u, v = np.floor(pixels).astype(int).T
+    rows, columns = mask.strip.shape
+    i = np.floor(at_y / shade.TEXEL_M + rows / 2).astype(int).ravel()
+    j = np.floor(at_s / mask.along_m).astype(int).ravel() % columns
+    around = np.array(
+        [mask.strip[i + a, (j + b) % columns] for a in (-2, 0, 2) for b in (-2, 0, 2)]
+    )
+    shown = (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
+    sunny, dark = shown & (around.max(axis=0) < 20), shown & (around.min(axis=0) > 235)
+    return grey[v[sunny], u[sunny]], grey[v[dark], u[dark]]
+
+
+@pytest.mark.parametrize("name", ["town", "oval", "gravel-valley"])
+def test_shadow_has_at_most_two_fifths_of_the_lit_luminance(name: str) -> None:
+    road = Road(find_track(name), 2)
+    rng = np.random.default_rng(4)
+    for seed in (1, 2):
+        with Camera(road, seed=seed, light=light("heavy-shadow", seed)) as camera:
+            found = [lit_and_dark(camera, s) for s in rng.uniform(0.0, road.track.length_m, 12)]
+        sunny = np.concatenate([one for one, _ in found])
+        dark = np.concatenate([other for _, other in found])
+        assert min(len(sunny), len(dark)) > 300
+        assert np.mean(dark) < 0.4 * np.mean(sunny)
+
+
+def test_shadows_are_hard_edged() -> None:
+    """Few texels of the mask lie between light and shade: an edge is about a texel wide."""
+    road = Road(find_track("forest"), 2)
+    with Camera(road, seed=3, light=light("heavy-shadow", 3)) as camera:
+        strip = camera._setting.scene.mask.strip
+    half = round(road.half_asphalt / shade.TEXEL_M)
+    middle = strip.shape[0] // 2
+    asphalt = strip[middle - half : middle + half]
+    # road.frag.glsl draws all of the change between 0.3 and 0.7.
+    between = np.mean((asphalt > 0.3 * 255) & (asphalt < 0.7 * 255))
+    assert between < 0.06
+
+
+@pytest.mark.parametrize("kind", ["clear", "heavy-shadow"])
+def test_no_shadow_ends_in_a_line_beside_the_road(kind: str) -> None:
+    """The rows at the mask's rim hold the land's even shade, and there is no step towards them."""
+    road = Road(find_track("forest"), 2)
+    with Camera(road, seed=3, light=light(kind, 3)) as camera:
+        strip = camera._setting.scene.mask.strip.astype(np.float64)
+    assert strip.shape[0] * shade.TEXEL_M > 2 * (road.wall_offset + 10.0)
+    for rows in (strip, strip[::-1]):
+        assert rows[:4].std(axis=0).max() < 1.0
+        means = (rows >= 128).mean(axis=1)
+        wall = round((strip.shape[0] * shade.TEXEL_M / 2 - road.wall_offset) / shade.TEXEL_M)
+        assert np.abs(np.diff(means[: wall + 4])).max() < 0.15
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_bridges_clear_the_road_and_stand_beside_it(name: str) -> None:
+    """Nothing that is drawn of a bridge stands between the wall lines; over the asphalt there is
+    room for a lorry, or 3 m where an arch springs."""
+    road = Road(find_track(name), 1 + len(name) % 3)
+    line = CentreLine.of(road)
+    found = bridges_of(road, seed=2)
+    assert len(found) >= 2
+    for bridge in found:
+        points = bridge.triangles[:, :3]
+        near = line.distance(points[:, 0], points[:, 1])
+        over = points[near < road.half_asphalt]
+        edge = road.track.at(bridge.s, np.linspace(-road.half_asphalt, road.half_asphalt, 9))
+        assert points[near < road.wall_offset, 2].min(initial=np.inf) > edge.z.min() + 2.4
+        assert over[:, 2].min(initial=np.inf) > edge.z.max() + 3.0
+        crown = bridge.boxes[np.abs(bridge.boxes[:, :, 1]).min(axis=1) < 1.5]
+        assert crown[:, 0, 2].min(initial=np.inf) > CLEARANCE_M - 0.2
+        assert bridge.half_across > road.wall_offset
+
+
+def traced_from(bridge: Bridge, point: FloatArray, sun: FloatArray) -> bool:
+    """Whether a ray from `point` to the sun meets a drawn triangle (Moeller and Trumbore, 1997)."""
+    corners = bridge.triangles[:, :3].reshape(-1, 3, 3)
+    a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    across = np.cross(sun, b)
+    area = np.einsum("ij,ij->i", a, across)
+    area = np.where(np.abs(area) > 1e-9, area, np.inf)
+    from_corner = point - corners[:, 0]
+    u = np.einsum("ij,ij->i", from_corner, across) / area
+    turned = np.cross(from_corner, a)
+    v = turned @ sun / area
+    reach = np.einsum("ij,ij->i", b, turned) / area
+    return bool(np.any((u >= 0) & (v >= 0) & (u + v <= 1) & (reach > 0.0)))
+
+
+@pytest.mark.parametrize(("name", "seed"), [("highway", 3), ("circuit", 5), ("coast", 1)])
+def test_a_bridge_darkens_what_it_hides_from_the_sun(name: str, seed: int) -> None:
+    """The mask against rays through the triangles that are drawn."""
+    road = Road(find_track(name), 2)
+    sunny = light("clear", seed)
+    sun = np.array(sunny.sun_direction)
+    strip = np.zeros((120, round(road.track.length_m / shade.TEXEL_M)), dtype=np.uint8)
+    along = road.track.length_m / strip.shape[1]
+    over = bridges_of(road, seed)
+    assert len(over) >= 3
+    cast_bridges(strip, road, along, shade.TEXEL_M, over, sunny)
+    rng = np.random.default_rng(1)
+    agreed, dark = [], 0
+    for bridge in over:
+        columns = (bridge.s + rng.uniform(-25.0, 25.0, 60)) / along
+        rows = rng.uniform(-road.half_asphalt, road.half_asphalt, 60) / shade.TEXEL_M + 60
+        for i, j in zip(rows.astype(int), columns.astype(int) % strip.shape[1], strict=True):
+            value = strip[i, j]
+            if 0 < value < 255:
+                continue
+            place = road.track.at((j + 0.5) * along, (i + 0.5 - 60) * shade.TEXEL_M)
+            hidden = traced_from(bridge, np.array([place.x, place.y, place.z]), sun)
+            agreed.append(hidden == (value == 255))
+            dark += int(value == 255)
+    assert dark > 15
+    # Railings are drawn but throw no shadow.
+    assert np.mean(agreed) > 0.93

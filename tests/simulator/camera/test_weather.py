@@ -1,0 +1,186 @@
+"""Rain and snow: each light looks as its name says, the same pose gives the same drops, and the
+markings stay to be seen."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from simulator.camera import KINDS, Camera, Light
+from simulator.camera.scene.light import WEATHERS
+from simulator.camera.snapshot import standing_pose
+from simulator.track.catalogue import find_track
+from simulator.track.markings import MarkingStyle
+from simulator.track.road import Road
+
+FloatArray = NDArray[np.float64]
+
+SEEDS = (1, 2)
+PLACES = (40.0, 730.0)
+
+
+@cache
+def road() -> Road:
+    return Road(replace(find_track("countryside"), markings=MarkingStyle()), 2)
+
+
+@cache
+def bare_road() -> Road:
+    return Road(replace(road().track, markings=MarkingStyle(line_width=1e-6)), 2)
+
+
+def light(kind: str, seed: int = 1) -> Light:
+    return replace(Light.named(kind, np.random.default_rng(seed)), exposure=1.0)
+
+
+@cache
+def pictures(kind: str) -> FloatArray:
+    """Pictures (seeds * places, 210, 280, 3), in light rather than display values, 0 to 1."""
+    taken = []
+    for seed in SEEDS:
+        with Camera(road(), seed=5, light=light(kind, seed)) as camera:
+            taken += [camera.render(standing_pose(road(), s, 0.4)) for s in PLACES]
+    return np.square(np.array(taken) / 255.0)
+
+
+def ground(kind: str) -> FloatArray:
+    return pictures(kind)[:, 130:]
+
+
+def saturation(part: FloatArray) -> float:
+    return float(np.mean(part.max(axis=-1) - part.min(axis=-1)) / np.mean(part))
+
+
+def detail_far_away(kind: str) -> float:
+    """Contrast of what stands 60 m away and more, just over the horizon, without the drops."""
+    found = []
+    for seed in SEEDS:
+        still = replace(light(kind, seed), falling=0.0)
+        with Camera(road(), seed=5, light=still) as camera:
+            for s in PLACES:
+                strip = camera.render(standing_pose(road(), s, 0.4))[96:108].astype(np.float64)
+                found.append(strip.mean(axis=2).std(axis=1).mean())
+    return float(np.mean(found))
+
+
+def test_the_kinds_are_those_that_the_design_names() -> None:
+    assert KINDS == ("clear", "overcast", "dusk", "fog", "heavy-shadow", "rain", "snow")
+    assert WEATHERS == ("rain", "snow")
+    for kind in KINDS:
+        assert light(kind).weather == (kind if kind in WEATHERS else "")
+
+
+def test_snow_is_white_and_rain_is_dark_and_grey() -> None:
+    assert ground("snow").mean() > 1.8 * ground("overcast").mean()
+    asphalt = {kind: pictures(kind)[:, 180:, 110:170].mean() for kind in ("overcast", "rain")}
+    assert asphalt["rain"] < 0.75 * asphalt["overcast"]
+    sky = {kind: pictures(kind)[:, :60] for kind in KINDS}
+    assert saturation(sky["rain"]) < 0.3 * saturation(sky["clear"])
+    assert saturation(sky["snow"]) < 0.3 * saturation(sky["clear"])
+    assert sky["rain"].mean() < 0.7 * sky["overcast"].mean()
+    # Wheel tracks are dark in the snow: the road has more contrast than a dry one.
+    assert ground("snow").std() > 1.5 * ground("overcast").std()
+
+
+def test_rain_and_snow_shorten_the_view_but_less_than_fog() -> None:
+    seen = {kind: detail_far_away(kind) for kind in ("clear", "rain", "snow", "fog")}
+    assert seen["fog"] < seen["rain"] < 0.8 * seen["clear"]
+    assert seen["snow"] < 0.8 * seen["clear"]
+    for kind in WEATHERS:
+        reach = [light(kind, seed).haze_per_km for seed in range(40)]
+        assert max(light("clear", seed).haze_per_km for seed in range(40)) < min(reach)
+        assert max(reach) < 10.0
+
+
+def test_a_wet_road_mirrors_the_sky() -> None:
+    """The far road, seen at a grazing angle, comes near to the sky; the near road is dark."""
+    for kind, low, high in (("rain", 1.7, 9.0), ("overcast", 0.7, 1.6)):
+        clear_air = replace(light(kind), haze_per_km=0.1, falling=0.0)
+        with Camera(bare_road(), seed=5, light=clear_air) as camera:
+            shots = [camera.render(standing_pose(road(), s, 2.0)) for s in PLACES]
+        values = np.square(np.array(shots) / 255.0)
+        far, near = values[:, 116:122, 130:150].mean(), values[:, 190:, 100:180].mean()
+        assert low < far / near < high, kind
+
+
+@pytest.mark.parametrize("kind", WEATHERS)
+def test_drops_come_from_the_pose_and_the_seed(kind: str) -> None:
+    pose = standing_pose(road(), 120.0, 0.0)
+    beside = pose + np.array([0.002, 0.0, 0.0, 0.0, 0.0, 0.0])
+
+    def drops(camera: Camera, still: Camera, at: FloatArray) -> NDArray[np.bool_]:
+        apart = camera.render(at).astype(int) - still.render(at).astype(int)
+        return np.asarray(np.abs(apart).sum(axis=2) > 20)
+
+    falling = light(kind, 4)
+    with (
+        Camera(road(), seed=3, light=falling) as camera,
+        Camera(road(), seed=3, light=falling) as again,
+        Camera(road(), seed=9, light=falling) as other,
+        Camera(road(), seed=3, light=replace(falling, falling=0.0)) as still,
+        Camera(road(), seed=9, light=replace(falling, falling=0.0)) as other_still,
+    ):
+        first = camera.render(pose)
+        camera.render(beside)
+        camera.render(pose, view="rear")
+        assert np.array_equal(camera.render(pose), first)
+        assert np.array_equal(again.render(pose), first)
+        here = drops(camera, still, pose)
+        assert 0.002 < here.mean() < 0.2
+        for moved in (drops(camera, still, beside), drops(other, other_still, pose)):
+            assert (here & moved).sum() < 0.5 * here.sum()
+
+
+@pytest.mark.parametrize("kind", WEATHERS)
+def test_what_varies_within_a_kind_is_drawn_from_the_seed(kind: str) -> None:
+    drawn = [Light.named(kind, np.random.default_rng(seed)) for seed in range(30)]
+    assert drawn[7] == Light.named(kind, np.random.default_rng(7))
+    for name in ("sun_azimuth", "sun_elevation", "haze_per_km", "cover", "falling", "exposure"):
+        values = [getattr(each, name) for each in drawn]
+        assert np.ptp(values) > 0.25 * abs(np.mean(values)), name
+    assert all(0.0 < each.cover <= 1.0 and 0.0 < each.falling <= 1.0 for each in drawn)
+
+
+def marking_contrast(kind: str, seed: int) -> float:
+    """Mean light of the outer lines, 4 to 25 m ahead, over that of the road beside them."""
+    ratios = []
+    with Camera(road(), seed=5, light=light(kind, seed)) as camera:
+        for s in PLACES:
+            pose = standing_pose(road(), s, 0.0)
+            grey = np.square(camera.render(pose) / 255.0).mean(axis=2)
+            for y in (-4.0, 4.0):
+                line, beside = (
+                    _along(camera, grey, pose, s, y + shift) for shift in (0.0, -np.sign(y) * 0.5)
+                )
+                ratios.append(line.mean() / beside.mean())
+    return float(np.median(ratios))
+
+
+def _along(camera: Camera, grey: FloatArray, pose: FloatArray, s: float, y: float) -> FloatArray:
+    place = road().track.at(s + np.arange(4.0, 25.0, 0.25), y)
+    pixels, _ = camera.project(np.stack([place.x, place.y, place.z], axis=1), pose)
+    u, v = np.floor(pixels).astype(int).T
+    shown = (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
+    return np.asarray(grey[v[shown], u[shown]])
+
+
+def test_markings_stay_to_be_seen_in_rain() -> None:
+    dry = np.mean([marking_contrast("overcast", seed) for seed in SEEDS])
+    wet = [marking_contrast("rain", seed) for seed in SEEDS]
+    assert dry > 2.5
+    assert min(wet) > 1.5
+
+
+def test_weather_costs_the_dry_kinds_nothing() -> None:
+    """Dry kinds draw with programs of their own, into which no weather is compiled."""
+    from simulator.camera.core.context import WEATHERED, graphics
+
+    shared = graphics()
+    for name in WEATHERED:
+        assert shared.weathered(name, "") == name
+        for kind in WEATHERS:
+            assert shared.weathered(name, kind) != name
+            assert shared.programs[shared.weathered(name, kind)] is not shared.programs[name]
+    assert light("clear").falling == 0.0

@@ -1,0 +1,302 @@
+"""The Gymnasium environments: the checker, spaces, reward, endings, seeds, vectors, bad input."""
+
+import math
+import re
+import subprocess
+import sys
+import warnings
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+import simulator.env  # registers the names
+from simulator.env.reward import step_reward
+from simulator.sensors import Sensor
+from trackfeatures.errors import UserError
+
+STATE_ID = "driverview/LateralControl-v0"
+IMAGE_ID = "driverview/DriverView-v0"
+SMALL = {"width": 64, "height": 48}
+
+
+def make(**options: Any) -> gym.Env[Any, Any]:
+    return gym.make(STATE_ID, **{"track": "circuit", **options})
+
+
+def steer(value: float) -> np.ndarray[Any, Any]:
+    return np.array([value], np.float32)
+
+
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [
+        (STATE_ID, {"traffic": 2, "lanes": 2, "noise": True}),
+        (STATE_ID, {"sensors": ("range", "v_x"), "sensor_noise": {"range": 0.1}}),
+        (IMAGE_ID, {"views": ("front", "rear:depth", "front:class"), **SMALL}),
+        (IMAGE_ID, {"observation": "image", "render_mode": "rgb_array", **SMALL}),
+    ],
+)
+def test_gymnasiums_checker_passes_without_a_warning(name: str, options: dict[str, Any]) -> None:
+    env = gym.make(name, track="circuit", **options)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_env(env.unwrapped)
+    env.close()
+
+
+def test_gymnasiums_checker_only_minds_the_range_of_the_gear() -> None:
+    env = make(controls="full")
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        check_env(env.unwrapped)
+    assert ["normalized space" in str(warning.message) for warning in told] == [True]
+    env.close()
+
+
+def test_the_observation_is_the_papers_state() -> None:
+    env = make()
+    observation, _ = env.reset(
+        seed=0, options={"s": 100.0, "to_middle": 1.2, "angle": -0.3, "speed": 10.0}
+    )
+    world = env.unwrapped.world  # type: ignore[attr-defined]
+    half_width = world.road.half_width
+    heading = np.eye(3)[int(world.features().heading)]
+    expected = [1.2 / half_width, -0.3 / math.pi, 36.0 / 75.0, 0.0, *heading]
+    np.testing.assert_allclose(observation, expected, atol=1e-6)
+    assert observation.dtype == np.float32
+    env.close()
+
+
+def test_throttle_and_gear_are_held_and_the_score_is_the_sum_of_rewards() -> None:
+    env = make()
+    env.reset(seed=1)
+    total = 0.0
+    info: dict[str, Any] = {}
+    for _ in range(120):
+        state = env.unwrapped.world.state  # type: ignore[attr-defined]
+        wheel = -(state.to_middle - 2.0 * state.angle)
+        _, reward, ended, cut, info = env.step(steer(min(max(wheel, -1.0), 1.0)))
+        total += float(reward)
+        assert not ended
+        assert not cut
+    state = env.unwrapped.world.state  # type: ignore[attr-defined]
+    assert state.gear == 1
+    assert info["score"] == pytest.approx(total)
+    assert (info["steps"], info["ended"]) == (120, "")
+    assert 15.0 < info["speed_kmh"] < 30.0
+    env.close()
+
+
+def test_the_reward_by_hand() -> None:
+    assert step_reward(0.0, 0.0, 5.0, ended=False) == 1.0
+    expected = math.cos(0.2) - math.sin(0.2) - 0.3
+    assert step_reward(-0.2, 1.5, 5.0, ended=False) == pytest.approx(expected)
+    assert step_reward(0.2, 1.5, 5.0, False, 0.5) == pytest.approx(
+        math.cos(0.2) - 0.5 * math.sin(0.2) - 0.3
+    )
+    assert step_reward(1.6, 0.0, 5.0, ended=False) == -2.0
+    assert step_reward(0.0, 0.0, 5.0, ended=True) == -2.0
+
+
+def test_leaving_the_track_ends_the_episode_with_minus_two() -> None:
+    env = make()
+    env.reset(seed=0, options={"s": 60.0, "speed": 15.0})
+    for _ in range(200):
+        _, reward, ended, _, info = env.step(steer(0.3))
+        if ended:
+            break
+    assert ended
+    assert reward == -2.0
+    assert info["ended"] == "off_track"
+    env.close()
+
+
+def test_a_collision_ends_the_episode_with_minus_two() -> None:
+    env = make(track="oval", traffic=1, controls="full")
+    _, info = env.reset(seed=0, options={"speed": 20.0})
+    for _ in range(1500):
+        wheel = info["angle"] - 0.1 * info["to_middle"]
+        action = np.clip([wheel, 0.3, 0.0, 2.0], -1.0, 2.0).astype(np.float32)
+        _, reward, ended, _, info = env.step(action)
+        if ended:
+            break
+    assert ended
+    assert (reward, info["ended"], info["collision"]) == (-2.0, "collision", "traffic")
+    env.close()
+
+
+@pytest.mark.parametrize("frequency_hz", [10, 50])
+def test_recordings_play_at_the_speed_of_life(frequency_hz: int) -> None:
+    env = make(frequency_hz=frequency_hz)
+    assert env.metadata["render_fps"] == frequency_hz
+    env.close()
+    assert simulator.env.LateralControl.metadata["render_fps"] == 20
+
+
+def test_an_episode_is_cut_after_6500_steps_or_as_many_as_asked_for() -> None:
+    spec = gym.spec(STATE_ID)
+    assert spec.max_episode_steps == 6500
+    env = make(max_episode_steps=3)
+    env.reset(seed=0)
+    assert [env.step(steer(0.0))[2:4] for _ in range(3)] == [(False, c) for c in (0, 0, 1)]
+    env.close()
+
+
+def test_noise_is_the_papers_and_seeded() -> None:
+    quiet, noisy = make(), make(noise=True)
+    base, _ = quiet.reset(seed=3)
+    states = [noisy.reset(seed=seed)[0] for seed in range(200)]
+    assert np.std(np.array(states) - base) == pytest.approx(0.05, rel=0.1)
+    np.testing.assert_array_equal(noisy.reset(seed=3)[0], states[3])
+    quiet.close()
+    noisy.close()
+
+
+def test_full_controls_shift_and_brake() -> None:
+    env = make(controls="full")
+    env.reset(seed=0, options={"s": 30.0, "speed": 15.0})
+    for _ in range(20):
+        _, _, _, _, info = env.step(np.array([0.0, 0.0, 1.0, 2.4], np.float32))
+    assert info["speed_kmh"] < 10.0
+    assert env.unwrapped.world.state.gear == 2  # type: ignore[attr-defined]
+    env.close()
+
+
+def test_two_environments_beside_each_other_are_like_one_alone() -> None:
+    vector = gym.make_vec(STATE_ID, num_envs=2, vectorization_mode="async", track="circuit")
+    assert isinstance(vector, gym.vector.AsyncVectorEnv)
+    observations, _ = vector.reset(seed=[4, 5])
+    for _ in range(30):
+        observations, *_ = vector.step(np.array([[0.02], [-0.02]], np.float32))
+    vector.close()
+    for row, action in ((0, 0.02), (1, -0.02)):
+        env = make()
+        alone, _ = env.reset(seed=4 + row)
+        for _ in range(30):
+            alone, *_ = env.step(steer(action))
+        np.testing.assert_array_equal(observations[row], alone)
+        env.close()
+
+
+@pytest.mark.parametrize(
+    ("action", "message"),
+    [
+        ([math.nan], "steer = nan; give a finite number"),
+        ([1.5], "steer = 1.5"),
+        ([-math.inf], "steer = -inf"),
+        ([-1.01], "steer"),
+        ([0.0, 0.0], "shape"),
+        ([0.0, 1.1, 0.0, 1.0], "throttle = 1.1"),
+        ([0.0, 0.0, -0.5, 1.0], "brake = -0.5"),
+        ([0.0, 0.0, 0.0, 7.0], "gear = 7"),
+    ],
+)
+def test_bad_actions_are_refused(action: list[float], message: str) -> None:
+    env = make(disable_env_checker=True, controls="full" if len(action) == 4 else "steer")
+    env.reset(seed=0)
+    with pytest.raises(UserError, match=message):
+        env.unwrapped.step(np.array(action, np.float32))
+    env.close()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"track": "no-such-track"}, "no-such-track"),
+        ({"lanes": 4}, "4 lanes"),
+        ({"frequency_hz": 30}, "30 Hz"),
+        ({"noise": -1.0}, "noise"),
+        ({"noise": math.nan}, "noise"),
+        ({"controls": "feet"}, "controls"),
+        ({"colour": "red"}, "colour"),
+        ({"trafic": 3}, "did you mean 'traffic'"),
+        ({"lambda_": math.nan}, "lambda_"),
+        ({"reward": 3.0}, "reward is 3.0"),
+        ({"reward": lambda state, road, ending: 0.0, "lambda_": 2.0}, "lambda_"),
+        ({"ends": ("off_track", "boredom")}, "boredom"),
+        ({"ends": "off_track"}, "give a list"),
+        ({"traffic": 50}, "50 traffic cars"),
+        ({"light": "bogus"}, "unknown light 'bogus'"),
+        ({"width": 4}, "picture size 4"),
+        ({"render_view": "inside"}, "render_view is 'inside'"),
+        ({"observation": "smell"}, "observation is 'smell'"),
+        ({"observation": "image", "views": ()}, "one picture"),
+        ({"observation": "state", "views": ("front",)}, "views are part"),
+        ({"observation": "image", "sensors": ("v_x",)}, "sensors are part"),
+        ({"views": ("below",)}, "unknown camera view 'below'"),
+        ({"views": ("front:heat",)}, "unknown kind of picture 'heat'"),
+        ({"views": "front"}, "give a list"),
+        ({"views": ("front", "front")}, "once"),
+        ({"sensors": ("lidar",)}, "unknown sensor 'lidar'"),
+        ({"sensors": ("v_x", "v_x")}, "share a name"),
+        ({"sensors": ("v_x",), "sensor_noise": {"v_y": 1.0}}, "noise is set for"),
+        ({"sensors": (Sensor("state", "", lambda world: 0.0),)}, "named like"),
+    ],
+)
+def test_bad_options_are_refused(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(UserError, match=re.escape(message)):
+        make(**options)
+
+
+def test_an_unknown_render_mode_is_refused() -> None:
+    with pytest.raises(UserError, match="render_mode is 'ansi'"):
+        simulator.env.LateralControl(render_mode="ansi")
+
+
+def test_unknown_reset_options_are_refused() -> None:
+    env = make()
+    with pytest.raises(UserError, match="velocity"):
+        env.reset(seed=0, options={"velocity": 3.0})
+    env.close()
+
+
+def test_a_step_without_an_episode_is_refused() -> None:
+    env = simulator.env.LateralControl("circuit")
+    with pytest.raises(UserError, match="call reset"):
+        env.step(steer(0.0))
+    env.reset(seed=0, options={"s": 60.0, "speed": 15.0})
+    while not env.step(steer(0.5))[2]:
+        pass
+    # What Gymnasium's own wrapper raises too, so that callers catch one error.
+    with pytest.raises(gym.error.ResetNeeded, match="after an end"):
+        env.step(steer(0.0))
+    env.reset(seed=0)
+    env.step(steer(0.0))
+    env.close()
+    with pytest.raises(UserError, match="call reset"):
+        env.step(steer(0.0))
+    with pytest.raises(UserError, match="closed"):
+        env.reset(seed=0)
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        "import gymnasium, simulator; print(gymnasium.spec('driverview/DriverView-v0').id)",
+        "import gymnasium as g; e = g.make('simulator.env:driverview/DriverView-v0', width=64);"
+        "print(e.spec.id)",
+        "import gymnasium as g; e = g.make_vec('simulator.env:driverview/DriverView-v0', 2,"
+        "vectorization_mode='sync'); print(e.spec.id)",
+    ],
+)
+def test_the_names_are_known_after_an_import_or_by_the_modules_name(code: str) -> None:
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
+    assert result.stdout.splitlines()[-1] == IMAGE_ID
+
+
+def test_the_driver_view_gives_image_and_state() -> None:
+    env = gym.make(IMAGE_ID, track="circuit", lanes=2, width=140, height=105)
+    try:
+        observation, _ = env.reset(seed=0)
+        assert env.observation_space.contains(observation)
+        assert observation["image"].shape == (105, 140, 3)
+        assert observation["image"].std() > 10.0  # a picture, not a blank
+        moved, *_ = env.step(steer(0.0))
+        assert moved["state"].shape == (7,)
+    finally:
+        env.close()

@@ -1,0 +1,23 @@
+"""A few of the replay benchmark's random episodes, one with pictures: bit-equal wherever run."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+BENCHMARK = Path(__file__).parents[3] / "benchmarks" / "replay.py"
+
+
+@pytest.mark.slow
+def test_random_episodes_replay_bit_for_bit_in_another_process_and_in_a_vector(
+    tmp_path: Path,
+) -> None:
+    out = tmp_path / "replay.json"
+    command = [sys.executable, str(BENCHMARK), "--episodes", "5", "--json", str(out)]
+    subprocess.run(command, check=True, capture_output=True)
+    result = json.loads(out.read_text())
+    assert result["different"] == {"another_process": [], "async_vector": []}
+    assert (result["distinct"], result["with_pictures"]) == (5, 1)
+    assert result["steps"] > 100

@@ -1,0 +1,107 @@
+"""The sequence lock step by step, then against writers at full speed and killed processes."""
+
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from simulator.link.sync.seqlock import DAMAGED, NOTHING, READ, checksum, publish, take
+
+BENCHMARK = Path(__file__).parents[3] / "benchmarks" / "link.py"
+WORDS, PICTURE = 12, 5
+BOUND_S = 2.0
+
+
+class Block:
+    """One direction in ordinary memory, with both sides' own copies."""
+
+    def __init__(self) -> None:
+        self.shared, self.picture = np.zeros(WORDS, np.uint64), np.zeros(PICTURE, np.uint64)
+        self.sequence = self.shared.view(np.uint32)[:1]
+        self.message, self.image = np.zeros(WORDS, np.uint64), np.zeros(PICTURE, np.uint64)
+        self.copy, self.image_copy = np.zeros(WORDS, np.uint64), np.zeros(PICTURE, np.uint64)
+
+    def write(self, value: int) -> None:
+        self.message[1:-1] = value
+        self.image[:] = value
+        publish(self.sequence, self.shared, self.message, self.picture, self.image)
+
+    def read(self, seen: int = 0) -> tuple[int, int]:
+        return take(self.sequence, self.shared, self.copy, self.picture, self.image_copy, seen)
+
+
+def test_a_message_arrives_whole_with_its_picture() -> None:
+    block = Block()
+    block.write(7)
+    assert block.read() == (READ, 2)
+    assert block.copy[1:-1].tolist() == [7] * (WORDS - 2)
+    assert block.image_copy.tolist() == [7] * PICTURE
+    assert block.read(seen=2) == (NOTHING, 2)
+    block.write(8)
+    assert block.read(seen=2) == (READ, 4)
+
+
+def test_nothing_is_taken_while_the_writer_is_at_work() -> None:
+    block = Block()
+    block.write(7)
+    block.sequence[0] += 1
+    assert block.read() == (NOTHING, 0)
+
+
+def test_a_writer_goes_on_where_a_killed_one_stopped() -> None:
+    block = Block()
+    block.write(7)
+    block.sequence[0] += 1
+    block.shared[3] = 99
+    block.write(8)
+    assert block.read() == (READ, 4)
+    assert set(block.copy[1:-1].tolist()) == {8}
+
+
+def test_the_checksum_sees_any_changed_word() -> None:
+    for word in range(1, WORDS):
+        block = Block()
+        block.write(7)
+        block.shared[word] ^= np.uint64(1 << 40)
+        assert block.read()[0] == DAMAGED
+
+
+def test_the_sequence_wraps_around() -> None:
+    block = Block()
+    block.sequence[0] = 2**32 - 2
+    block.write(7)
+    assert block.sequence[0] == 0
+    assert block.read(seen=2**32 - 2) == (READ, 0)
+
+
+def test_the_checksum_is_fnv_1a() -> None:
+    """Against Python's integers; the offset and the prime are those of the published hash."""
+    message = np.arange(WORDS, dtype=np.uint64) * np.uint64(0x9E3779B97F4A7C15)
+    value = 0xCBF29CE484222325
+    for word in message[1:-1].tolist():
+        value = (value ^ word) * 0x100000001B3 % 2**64
+    assert int(checksum(message)) == value
+
+
+@pytest.mark.slow
+@pytest.mark.alone
+def test_no_torn_message_no_hang_and_nothing_leaked() -> None:
+    """The benchmark, small: 20,000 messages each way while there is time, each kind of kill."""
+    if shutil.which("gcc") is None:
+        pytest.skip("no gcc on this machine")
+    counts = ("--messages", "20000", "--patience", "5", "--kills", "4", "--steps", "0")
+    command = [sys.executable, str(BENCHMARK), *counts]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    assert done.stdout, done.stderr
+    result: dict[str, Any] = json.loads(done.stdout)
+    for way in ("engine_to_client", "client_to_engine"):
+        assert (result[way]["torn"], result[way]["damaged"]) == (0, 0)
+        assert result[way]["messages"] > 100
+    killed = result["killed"]
+    assert (killed["kills"], killed["leaked_segments"]) == (4, [])
+    assert max(killed["longest_s"].values()) < BOUND_S

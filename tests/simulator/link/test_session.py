@@ -1,0 +1,347 @@
+"""Clients that come, leave, err and die; an engine that goes on, or ends as it is told."""
+
+import json
+import math
+import os
+import signal
+import subprocess
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from simulator.link.client import Link
+from simulator.link.command import picture_size
+from simulator.link.errors import (
+    ClientLost,
+    EngineDied,
+    LinkError,
+    LinkTimeout,
+    NameInUse,
+    Refused,
+)
+from simulator.link.layout import Mode, Refusal
+from simulator.link.process import LinkConfig, run
+from simulator.link.server import Summary
+from simulator.vehicle.state import Command
+from tests.typed import typed
+from trackfeatures.errors import UserError
+
+WAIT_S = 180.0
+BOUND_S = 2.0
+"""No survivor waits longer."""
+
+Start = Callable[..., "subprocess.Popen[str]"]
+
+
+@pytest.mark.parametrize(
+    ("command", "said"),
+    [
+        (Command(steer=math.nan), "steer = nan"),
+        (Command(steer=1.01), r"steer = 1\.01"),
+        (Command(throttle=-0.1), r"throttle = -0\.1"),
+        (Command(brake=math.inf), "brake = inf"),
+        (Command(gear=7), "gear = 7"),
+    ],
+)
+def test_a_bad_command_is_refused_and_the_car_stands_where_it_stood(
+    oval: str, command: Command, said: str
+) -> None:
+    with Link(oval, wait_s=WAIT_S) as link:
+        link.reset(seed=1)
+        before = link.step(Command(throttle=0.5))
+        with pytest.raises(Refused, match=said) as refusal:
+            link.step(command)
+        assert refusal.value.code == Refusal.BAD_COMMAND
+        assert link.latest().state == before.state
+        assert link.step(Command(throttle=0.5)).step == 2
+
+
+@pytest.mark.parametrize(
+    ("start", "said"),
+    [
+        ({"s": math.inf}, "s = inf"),
+        ({"to_middle": math.nan}, "to_middle = nan"),
+        ({"to_middle": 50.0}, r"to_middle = 50\.0 m"),
+        ({"speed": 1e9}, r"speed = 1000000000\.0"),
+    ],
+)
+def test_a_bad_start_is_refused_and_the_episode_goes_on(
+    oval: str, start: dict[str, float], said: str
+) -> None:
+    with Link(oval, wait_s=WAIT_S) as link:
+        link.reset(seed=1)
+        link.step(Command())
+        with pytest.raises(Refused, match=said) as refusal:
+            link.reset(seed=1, **start)
+        assert refusal.value.code == Refusal.BAD_RESET
+        assert link.step(Command()).step == 2
+
+
+def test_a_step_needs_an_episode_that_has_not_ended(oval: str) -> None:
+    with Link(oval, wait_s=WAIT_S) as link:
+        with pytest.raises(LinkError, match="ask for a reset first"):
+            link.step(Command())
+        message = link.reset(seed=1, speed=25.0, angle=0.6)
+        while message.ended is None:
+            message = link.step(Command(steer=-1.0))
+        assert (message.ended, message.reward) == ("off_track", -2.0)
+        with pytest.raises(Refused, match=r"ended \(off_track\)") as refusal:
+            link.step(Command())
+        assert refusal.value.code == Refusal.EPISODE_ENDED
+        assert link.reset(seed=1).ended is None
+
+
+def test_an_unknown_request_is_answered(oval: str) -> None:
+    with Link(oval, wait_s=WAIT_S) as link:
+        link.reset(seed=1)
+        link._outbox.record["request"] = 99
+        with pytest.raises(Refused, match="the request is 99") as refusal:
+            link._ask()
+        assert refusal.value.code == Refusal.UNKNOWN_REQUEST
+        assert link.step(Command()).step == 1
+
+
+def test_a_damaged_command_is_answered(oval: str) -> None:
+    with Link(oval, wait_s=WAIT_S) as link:
+        link.reset(seed=1)
+        words = link._outbox._place.arrays[1]
+        words[5] ^= 1  # as a client without the sequence lock might write now and then
+        words.view("u4")[0] += 2
+        deadline = time.monotonic() + WAIT_S
+        while not (link._receive(0.05) and link._inbox.record["error"]):
+            assert time.monotonic() < deadline
+        assert link._inbox.record["error"] == Refusal.BAD_CHECKSUM
+        assert link.step(Command()).step == 1
+
+
+def test_seeds_the_client_does_not_name_are_the_engines(oval: str) -> None:
+    with Link(oval, wait_s=WAIT_S) as link:
+        first = link.reset()
+        second = link.reset()
+        assert first.seed == 7 + first.episode  # the engine was started with --seed 7
+        assert second.seed == first.seed + 1
+        assert link.reset(seed=11).seed == 11
+
+
+def test_one_client_at_a_time(oval: str) -> None:
+    with Link(oval, wait_s=WAIT_S), pytest.raises(NameInUse, match="has a client already"):
+        Link(oval)
+    with Link(oval) as after:
+        assert after.reset(seed=1).step == 0
+
+
+def test_an_episode_ends_with_its_client(oval: str) -> None:
+    with Link(oval, wait_s=WAIT_S) as link:
+        link.reset(seed=1)
+    with Link(oval) as link, pytest.raises(Refused, match="no episode yet"):
+        link.step(Command())
+
+
+def test_a_closed_link_says_so(oval: str) -> None:
+    link = Link(oval, wait_s=WAIT_S)
+    link.close()
+    link.close()
+    with pytest.raises(LinkError, match="is closed"):
+        link.step(Command())
+    with pytest.raises(LinkError, match="is closed"):
+        link.latest()
+
+
+def test_a_second_engine_of_the_name_is_refused(oval: str) -> None:
+    with Link(oval, wait_s=WAIT_S):
+        done = run_engine("--name", oval, "--track", "oval")
+    assert done.returncode == 1
+    assert one_error(done).startswith(f"error: an engine of the link {oval} is running")
+
+
+def test_quit_ends_the_engine_and_tells_what_it_did(name: str) -> None:
+    with serving(LinkConfig(name=name, track="oval")) as served, Link(name, wait_s=WAIT_S) as link:
+        link.reset(seed=1)
+        for _ in range(5):
+            link.step(Command(throttle=1.0))
+        with pytest.raises(Refused):
+            link.step(Command(gear=9))
+        link.quit()
+        summary = served.result(WAIT_S)
+    expected = {"clients": 1, "clients_lost": 0, "episodes": 1, "steps": 5, "refused": 1}
+    assert asdict(summary) == expected
+    assert served.said == [
+        f"{name}: oval is ready for a client",
+        f"client {os.getpid()} has come",
+        f"client {os.getpid()} has left",
+    ]
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_stopped_engine_tells_its_client_and_prints_json(
+    engine: Start, name: str, number: int
+) -> None:
+    process = engine("--track", "oval", "--json")
+    with Link(name, wait_s=WAIT_S) as link:
+        link.reset(seed=1)
+        process.send_signal(number)
+        out, said = process.communicate(timeout=WAIT_S)
+        with pytest.raises(EngineDied, match="has ended"):
+            link.step(Command())
+    assert process.returncode == 0
+    expected = {"clients": 1, "clients_lost": 0, "episodes": 1, "steps": 0, "refused": 0}
+    assert json.loads(out) == expected
+    assert f"{name}: stopped" in said
+
+
+@pytest.mark.alone
+def test_a_stopped_process_is_given_two_seconds(engine: Start, name: str) -> None:
+    process = engine("--track", "oval")
+    with Link(name, wait_s=WAIT_S, timeout_s=0.5) as link:
+        link.reset(seed=1)
+        process.send_signal(signal.SIGSTOP)
+        began = time.monotonic()
+        with pytest.raises(LinkTimeout, match=r"lives, but has not answered within 0\.5 s"):
+            link.step(Command())
+        assert 0.4 < time.monotonic() - began < BOUND_S
+        process.send_signal(signal.SIGCONT)
+        assert link.reset(seed=1).step == 0
+
+
+def test_once_ends_with_the_first_client(name: str) -> None:
+    with serving(LinkConfig(name=name, track="oval", once=True)) as served:
+        with Link(name, wait_s=WAIT_S) as link:
+            link.reset(seed=1)
+        assert served.result(WAIT_S).clients == 1
+
+
+@pytest.mark.alone
+def test_a_client_that_dies_ends_an_engine_for_once(name: str) -> None:
+    config = LinkConfig(name=name, track="oval", once=True)
+    with serving(config) as served:
+        link = Link(name, wait_s=WAIT_S)
+        link.reset(seed=1)
+        link._segment.close()  # no leave is taken
+        with pytest.raises(ClientLost, match=r"has died at step 0 of episode 1"):
+            served.result(BOUND_S)
+
+
+@pytest.mark.alone
+def test_a_silent_client_is_given_up(name: str) -> None:
+    config = LinkConfig(name=name, track="oval", patience_s=0.3)
+    with serving(config) as served, Link(name, wait_s=WAIT_S) as link:
+        link.reset(seed=1)
+        with pytest.raises(ClientLost, match=r"lives, but has sent nothing for 0\.3 s"):
+            served.result(BOUND_S)
+        with pytest.raises(EngineDied, match="has ended"):
+            link.step(Command())
+
+
+@pytest.mark.alone
+def test_real_time_goes_on_by_itself(name: str) -> None:
+    config = LinkConfig(name=name, track="oval", realtime=True, frequency_hz=50)
+    with serving(config), Link(name, wait_s=WAIT_S) as link:
+        assert link.info.mode is Mode.REALTIME
+        assert link.reset(seed=1).step == 0
+        held = link.step(Command(throttle=1.0))
+        began = time.monotonic()
+        time.sleep(1.0)
+        seconds = time.monotonic() - began
+        later = link.latest()
+        ticked = later.step + later.late_steps - held.step
+        assert ticked == pytest.approx(50.0 * seconds, abs=15)
+        assert later.state.vx > held.state.vx + 1.0  # the throttle is held
+        with pytest.raises(Refused, match="steer = nan"):
+            link.step(Command(steer=math.nan))
+        assert link.step(Command(throttle=1.0)).step > later.step
+        link.quit()
+
+
+def test_without_a_command_the_real_car_stands(name: str) -> None:
+    config = LinkConfig(name=name, track="oval", realtime=True, frequency_hz=100)
+    with serving(config), Link(name, wait_s=WAIT_S) as link:
+        link.reset(seed=1)
+        deadline = time.monotonic() + WAIT_S
+        while link.latest().step < 30:
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+        assert abs(link.latest().state.vx) < 0.5
+        link.quit()
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"name": "driverview"}, "begins with a slash"),
+        ({"name": "/" + "x" * 300}, "has 301 bytes"),
+        ({"track": "no-such-track"}, "no track 'no-such-track'"),
+        ({"frequency_hz": 30}, "30 Hz does not divide"),
+        ({"frequency_hz": 0}, "0 Hz does not divide"),
+        ({"lanes": 4}, "4"),
+        ({"lane_width": 9.0}, "9"),
+        ({"picture": (9999, 10)}, "9999 x 10"),
+        ({"picture": (64, 48), "light": "noon"}, "unknown light 'noon'"),
+        ({"patience_s": -1.0}, "--patience is -1"),
+        ({"patience_s": math.nan}, "--patience is nan"),
+        ({"tracks_dir": Path("/no/such/folder")}, "/no/such/folder"),
+    ],
+    ids=str,
+)
+def test_what_cannot_be_is_said(name: str, options: dict[str, Any], said: str) -> None:
+    with pytest.raises(UserError, match=said):
+        run(LinkConfig(**{"name": name, **options}), lambda text: None)
+
+
+@pytest.mark.parametrize("text", ["280", "0x10", "10x0", "ax10", "10x10x3", "-3x4", ""])
+def test_odd_picture_sizes(text: str) -> None:
+    with pytest.raises(UserError, match="give a size such as 280x210, or none"):
+        picture_size(text)
+    assert (picture_size("280x210"), picture_size("none")) == ((280, 210), (0, 0))
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (("--name", "driverview"), "begins with a slash"),
+        (("--frequency", "30"), "30 Hz does not divide"),
+        (("--camera", "280"), "--camera is '280'"),
+        (("--header", "/no/such/folder/x.h"), "/no/such/folder"),
+    ],
+)
+def test_the_command_gives_one_clear_line(options: tuple[str, ...], said: str) -> None:
+    done = run_engine(*options)
+    assert done.returncode == 1
+    assert said in one_error(done)
+
+
+class Served:
+    """An engine in a thread of this process."""
+
+    def __init__(self, config: LinkConfig) -> None:
+        self.said: list[str] = []
+        self._pool = ThreadPoolExecutor(1)
+        self._future = self._pool.submit(run, config, self.said.append)
+
+    def result(self, seconds: float) -> Summary:
+        return self._future.result(seconds)
+
+
+@contextmanager
+def serving(config: LinkConfig) -> Iterator[Served]:
+    served = Served(config)
+    try:
+        yield served
+    finally:
+        served._pool.shutdown(wait=True)
+
+
+def run_engine(*options: str) -> "subprocess.CompletedProcess[str]":
+    return typed("simulator", "link", *options)
+
+
+def one_error(done: "subprocess.CompletedProcess[str]") -> str:
+    assert "Traceback" not in done.stderr
+    errors = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
+    assert len(errors) == 1, done.stderr
+    return errors[0]

@@ -1,0 +1,153 @@
+"""Track files that are hostile or broken: one clear line each, and nothing opened on their word."""
+
+import math
+import os
+from pathlib import Path
+
+import pytest
+
+from simulator.track.catalogue import list_tracks, read_track, track_files
+from simulator.track.errors import TrackError
+from simulator.track.torcs.torcs import read_torcs
+
+FIXTURES = Path(__file__).parent / "fixtures"
+STADIUM = (FIXTURES / "sticky-grade.xml").read_text()
+
+
+def refused(path: Path) -> str:
+    with pytest.raises(TrackError) as caught:
+        read_track(path)
+    message = str(caught.value)
+    assert str(path) in message
+    assert "\n" not in message
+    return message
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ('name="lg" val="100"', 'name="lg" val="0"', "lg 0"),
+        ('name="lg" val="100"', 'name="lg" val="-5"', "lg -5"),
+        ('name="lg" val="100"', 'name="lg" val="nan"', "'nan'"),
+        ('name="lg" val="100"', 'name="lg" val="inf"', "'inf'"),
+        ('name="lg" val="100"', 'name="lg" val="1e9"', "1e+09"),
+        ('name="lg" val="100"', 'name="length" val="100"', "lg 0"),
+        ('name="lg" val="100" unit="m"', 'name="lg" val="100" unit="furlong"', "furlong"),
+        ('name="radius" val="50"', 'name="radius" val="-50"', "radius -50"),
+        ('name="arc" val="180" unit="deg"', 'name="arc" val="180"', "deg"),
+        ('name="arc" val="180"', 'name="arc" val="170"', "from their start"),
+        ('name="arc" val="180"', 'name="arc" val="0"', "arc 0"),
+        ('name="z end" val="0"', 'name="z end" val="2"', "2.00 m above or below"),
+        ('name="type" val="str"', 'name="type" val="loop"', "'loop'"),
+        ('name="width" val="10"', 'name="width" val="-10"', "-10 m wide"),
+        ('name="version" val="4"', 'name="version" val="7"', "version 7"),
+        ('name="Main Track"', 'name="Side Track"', "Main Track"),
+        ('name="Track Segments"', 'name="Segments"', "Track Segments"),
+        (
+            '<attstr name="profil" val="linear"/>',
+            '<attnum name="profil steps" val="1e12"/>',
+            "steps",
+        ),
+    ],
+)
+def test_wrong_values_are_named(tmp_path: Path, old: str, new: str, said: str) -> None:
+    assert old in STADIUM
+    path = tmp_path / "bad.xml"
+    path.write_text(STADIUM.replace(old, new))
+    assert said in refused(path)
+
+
+def test_a_gap_of_more_than_the_tolerance(tmp_path: Path) -> None:
+    path = tmp_path / "gap.xml"
+    first = STADIUM.replace('name="lg" val="100"', 'name="lg" val="100.25"', 1)
+    path.write_text(first)
+    assert read_torcs(path).length_m == pytest.approx(200.25 + 100.0 * math.pi)
+    path.write_text(STADIUM.replace('name="lg" val="100"', 'name="lg" val="100.3"', 1))
+    assert "0.30 m from their start" in refused(path)
+
+
+def test_no_segments(tmp_path: Path) -> None:
+    path = tmp_path / "empty.xml"
+    path.write_text(STADIUM.replace('attstr name="type"', 'attstr name="kind"'))
+    assert "no segments" in refused(path)
+
+
+def test_entity_bomb(tmp_path: Path) -> None:
+    levels = "".join(f'<!ENTITY l{i} "{f"&l{i - 1};" * 10}">' for i in range(1, 10))
+    path = tmp_path / "bomb.xml"
+    path.write_text(f'<!DOCTYPE params [<!ENTITY l0 "lol">{levels}]><params name="x">&l9;</params>')
+    assert "entities" in refused(path)
+
+
+@pytest.mark.parametrize("name", ["default-pits", "default-surfaces"])
+def test_external_and_own_entities(tmp_path: Path, name: str) -> None:
+    secret = tmp_path / "secret.txt"
+    secret.write_text('<attstr name="read" val="yes"/>')
+    path = tmp_path / "outside.xml"
+    # `default-surfaces` as an own (internal) entity is none of TORCS's.
+    kind = f'SYSTEM "{secret}"' if name == "default-pits" else '"<section/>"'
+    declared = f"<!ENTITY {name} {kind}>"
+    path.write_text(f'<!DOCTYPE params [{declared}]><params name="x">&{name};</params>')
+    assert "entities" in refused(path)
+
+
+def test_parameter_entities_and_undeclared_ones(tmp_path: Path) -> None:
+    path = tmp_path / "parameter.xml"
+    path.write_text('<!DOCTYPE params [<!ENTITY % p SYSTEM "file:///etc/passwd"> %p;]><params/>')
+    assert "entities" in refused(path)
+    path.write_text("<params>&undeclared;</params>")
+    refused(path)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        b"not xml at all",
+        STADIUM.encode()[: len(STADIUM) // 2],
+        b"\x00\x01\x02\xff" * 50,
+        b'<?xml version="1.0" encoding="no-such-code"?><params/>',
+        b'<?xml version="1.0" encoding="UTF-8"?><params name="\xff\xfe"/>',
+        b"<html><body/></html>",
+        b"<params>" + b"<section>" * 200_000,
+    ],
+    ids=["empty", "text", "cut", "binary", "encoding", "utf8", "html", "nested"],
+)
+def test_not_a_track_file(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "broken.xml"
+    path.write_bytes(content)
+    refused(path)
+
+
+def test_too_large(tmp_path: Path) -> None:
+    path = tmp_path / "large.xml"
+    path.write_bytes(b"<params>" + b" " * (5 * 2**20) + b"</params>")
+    assert "bytes" in refused(path)
+
+
+@pytest.mark.usefixtures("no_torcs_install")
+def test_a_bad_file_in_a_folder_is_skipped_with_a_warning(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "good.xml").write_text(STADIUM)
+    (tmp_path / "bad.xml").write_text("no")
+    names = [track.name for track in list_tracks(tmp_path)]
+    assert "good" in names
+    assert "bad" not in names
+    warnings = capsys.readouterr().err
+    assert warnings.count("warning: ") == 1
+    assert "bad.xml" in warnings
+
+
+@pytest.mark.parametrize("encoding", ["undefined", "punycode", "no-such-code"])
+def test_an_encoding_that_is_none(tmp_path: Path, encoding: str) -> None:
+    path = tmp_path / "odd.xml"
+    path.write_text(f'<?xml version="1.0" encoding="{encoding}"?>\n<params name="\u00e9"/>')
+    assert "cannot be read as text" in refused(path)
+
+
+def test_pipes_are_not_waited_for(tmp_path: Path) -> None:
+    (tmp_path / "deep").mkdir()
+    for name in ("flat.csv", "deep/deep.xml"):
+        os.mkfifo(tmp_path / name)
+    assert not {"flat", "deep"} & set(track_files(tmp_path))

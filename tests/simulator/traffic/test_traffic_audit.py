@@ -1,0 +1,81 @@
+"""Twelve cars for ten minutes, the own car among them or parked: nobody touches anybody."""
+
+import math
+
+import numpy as np
+import pytest
+
+from simulator.track.catalogue import find_track
+from simulator.track.road import Road
+from simulator.traffic.kernel import along_centre
+from simulator.world.boxes import overlap, overlapping
+from tests.simulator.traffic_audit import Disorder, watch
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("track", "lanes", "parked"),
+    [("town", 1, False), ("circuit", 2, False), ("oval", 3, True)],
+)
+def test_ten_minutes_without_a_touch(track: str, lanes: int, parked: bool) -> None:
+    seen = watch(Road(find_track(track), lanes), 600.0, parked=parked)
+    assert seen.steps == 12_000
+    assert (seen.lane_changes > 3) == (lanes > 1)
+    # Behind a parked car those of its lane stand; all others drive.
+    assert seen.mean_speed_kmh > (5.0 if parked else 30.0)
+    assert seen.own_laps == 0 if parked else seen.own_laps > 1
+
+
+def test_a_touch_would_be_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Traffic that does not look ahead runs into the car that is parked before it."""
+    monkeypatch.setattr("simulator.traffic.traffic.Traffic._see_ego", lambda *_: None)
+    with pytest.raises(Disorder, match=r"hit traffic|overlap"):
+        watch(Road(find_track("town"), 1), 300.0, parked=True)
+
+
+def corners(box: np.ndarray) -> np.ndarray:
+    """(n, 2) points all round the edge of a box (x, y, yaw, length, width)."""
+    side = np.linspace(-0.5, 0.5, 201)
+    edge = np.concatenate(
+        [np.column_stack((side, np.full(201, end))) for end in (-0.5, 0.5)]
+        + [np.column_stack((np.full(201, end), side)) for end in (-0.5, 0.5)]
+    )
+    along, across = edge[:, 0] * box[3], edge[:, 1] * box[4]
+    cos, sin = math.cos(box[2]), math.sin(box[2])
+    return np.column_stack(
+        (box[0] + along * cos - across * sin, box[1] + along * sin + across * cos)
+    )
+
+
+def test_boxes_overlap_where_points_of_one_lie_in_the_other() -> None:
+    rng, seen = np.random.default_rng(0), []
+    for _ in range(400):
+        a = np.array([0.0, 0.0, rng.uniform(-4, 4), 4.5, 1.9])
+        b = np.array([*rng.uniform(-5, 5, 2), rng.uniform(-4, 4), 4.4, 1.8])
+        points = corners(b) - a[:2]
+        cos, sin = math.cos(a[2]), math.sin(a[2])
+        along, across = points @ (cos, sin), points @ (-sin, cos)
+        inside = bool(np.any((abs(along) < 2.25) & (abs(across) < 0.95)))
+        # Edges are dense: only a corner that just pokes in could be missed.
+        deep = bool(np.any((abs(along) < 2.2) & (abs(across) < 0.9)))
+        assert overlap(a, b) >= deep
+        assert overlap(b, a) == overlap(a, b)
+        assert inside or not overlap(a, b) or not deep
+        seen.append(overlap(a, b))
+        assert (overlapping(np.array([a, b])) == (0, 1)) == overlap(a, b)
+    assert 50 < sum(seen) < 350
+
+
+def test_a_car_goes_its_way_across_a_joint_of_two_bends() -> None:
+    """s advances by the way over 1 - k y on either side, k changing where the pieces meet."""
+    track = find_track("town")
+    table = track.arrays()
+    joint = int(np.argmax(np.abs(np.diff(track.curvature0)))) + 1
+    s = float(track.s0[joint]) - 0.4
+    for y in (-3.0, 0.0, 3.0):
+        before, after = (1.0 - track.curvature0[joint - 1 : joint + 1] * y).tolist()
+        way = 0.4 * before + 0.3 * after
+        assert along_centre(table, s, y, way) == pytest.approx(0.7, abs=1e-9)
+        assert along_centre(table, s, y, 0.0) == 0.0
+    round_once = float(track.length_m)
+    assert along_centre(table, s, 0.0, round_once) == pytest.approx(round_once, abs=1e-6)

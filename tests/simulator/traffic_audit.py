@@ -1,0 +1,100 @@
+"""Watching traffic for long: who touches whom, who leaves a lane, who jumps, how they change lanes.
+
+The tests hold a few roads to it, `benchmarks/traffic.py` all of them.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from simulator.driving.cruise import Cruise
+from simulator.track.road import Road
+from simulator.traffic.traffic import DESIRED_KMH, EGO_SIZE, MOST_CARS, SIZE, Traffic
+from simulator.vehicle.state import CarState, Command
+from simulator.world.boxes import overlapping
+from simulator.world.world import World
+
+FREQUENCY_HZ = 20
+PARKED = Command(brake=1.0, gear=0)
+FASTEST_SIDEWAYS_M_S = 3.0
+ROUNDING_M = 1e-6
+
+
+@dataclass(frozen=True)
+class Watched:
+    """What was seen of one road's traffic."""
+
+    steps: int
+    lane_changes: int
+    mean_speed_kmh: float
+    stopped_at_end: int
+    own_laps: int
+
+
+class Disorder(Exception):
+    """The traffic did what it never should."""
+
+
+def watch(road: Road, seconds: float, *, parked: bool = False, seed: int = 0) -> Watched:
+    """Let `MOST_CARS` cars drive among which the own car drives by the same model, or is parked.
+
+    Raises Disorder where two cars overlap, one leaves its lanes, jumps, or breaks the speed law.
+    """
+    driver = Cruise(road, speed_kmh=70.0, frequency_hz=FREQUENCY_HZ)
+    steps, changes, driven = round(seconds * FREQUENCY_HZ), 0, 0.0
+    with World(road, traffic=MOST_CARS, frequency_hz=FREQUENCY_HZ) as world:
+        lane_y = 0.5 * (road.markings_y[-1] + road.markings_y[-2])
+        state = world.reset(seed=seed, to_middle=float(lane_y))
+        before = _Moment(world.traffic)
+        for _ in range(steps):
+            command = PARKED if parked else driver.command(state, world.traffic)
+            state = world.step(command)
+            now = _Moment(world.traffic)
+            _check(road, state, before, now)
+            changes += int(np.count_nonzero(now.lane(road) != before.lane(road)))
+            driven += float(now.speed.sum())
+            before = now
+        mean = 3.6 * driven / (steps * MOST_CARS)
+        stopped = int(np.count_nonzero(before.speed < 0.1))
+        return Watched(steps, changes, mean, stopped, state.lap)
+
+
+class _Moment:
+    """The traffic's places at one time."""
+
+    def __init__(self, traffic: Traffic) -> None:
+        self.poses, self.s = traffic.poses(), traffic.s
+        self.to_middle, self.speed = traffic.to_middle, traffic.speed
+
+    def lane(self, road: Road) -> NDArray[np.int64]:
+        """(n,) number of the lane that each car's middle is in."""
+        return np.searchsorted(-road.markings_y, -self.to_middle)
+
+
+def _check(road: Road, state: CarState, before: _Moment, now: _Moment) -> None:
+    if state.collision is not None:
+        raise Disorder(f"the own car hit {state.collision} at {state.time_s:.2f} s")
+    boxes = np.empty((len(now.s) + 1, 5))
+    boxes[:-1, :2], boxes[:-1, 2], boxes[:-1, 3:] = now.poses[:, :2], now.poses[:, 5], SIZE[:2]
+    boxes[-1] = (state.x, state.y, state.yaw, *EGO_SIZE[:2])
+    pair = overlapping(boxes)
+    if pair[0] >= 0:
+        raise Disorder(f"cars {pair} overlap at {state.time_s:.2f} s")
+    if np.any(np.abs(now.to_middle) + 0.5 * SIZE[1] > road.markings_y[0]):
+        raise Disorder(f"a car is off the lanes at {state.time_s:.2f} s")
+    if np.any(now.speed < 0.0) or np.any(3.6 * now.speed > DESIRED_KMH[1] + ROUNDING_M):
+        raise Disorder(f"a speed is out of bounds at {state.time_s:.2f} s")
+    dt, length = 1.0 / FREQUENCY_HZ, road.track.length_m
+    forward = (now.s - before.s + 0.5 * length) % length - 0.5 * length
+    way = np.hypot(*(now.poses[:, :2] - before.poses[:, :2]).T)
+    sideways = np.abs(now.to_middle - before.to_middle)
+    most = np.maximum(now.speed, before.speed) * dt
+    # A car that changes lanes goes a little farther than its speed along the lane.
+    if np.any(way > np.hypot(most, sideways) + 0.02) or np.any(forward < -ROUNDING_M):
+        raise Disorder(f"a car jumped at {state.time_s:.2f} s")
+    if np.any(sideways > FASTEST_SIDEWAYS_M_S * dt):
+        raise Disorder(f"a car slid sideways at {state.time_s:.2f} s")
+    if not math.isfinite(float(now.poses.sum())):
+        raise Disorder(f"a place is no number at {state.time_s:.2f} s")

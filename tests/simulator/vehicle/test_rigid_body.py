@@ -1,0 +1,115 @@
+"""The compiled mover of the free body against PyBullet's own."""
+
+import math
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from simulator.track.catalogue import find_track
+from simulator.track.road import Road
+from simulator.traffic.traffic import SIZE
+from simulator.vehicle.car import CarParameters
+from simulator.vehicle.dynamics import DT, MOTION, PIECE, advance
+from simulator.vehicle.rigid_body import fall, fly, near_anything
+from simulator.vehicle.state import Command
+from simulator.vehicle.surface import ground
+from simulator.world.physics import Scene
+from simulator.world.world import World
+
+CAR = CarParameters()
+
+
+def scene() -> Scene:
+    made = Scene()
+    made.rebuild([CAR])
+    return made
+
+
+def test_a_tumbling_body_moves_as_pybullet_moves_it() -> None:
+    bullet, params = scene(), CAR.packed()
+    here, there = np.zeros(MOTION), np.zeros(MOTION)
+    here[:] = (1.0, 2.0, 30.0, 0.0, 0.0, 0.0, 1.0, 12.0, -3.0, 4.0, 0.7, -0.4, 1.1)
+    there[:] = here
+    rng = np.random.default_rng(0)
+    for _ in range(400):
+        wrench = rng.normal(0.0, 1.0, 6) * (3e3, 3e3, 3e3, 1e3, 1e3, 1e3)
+        bullet.put(bullet.cars[0], there)
+        bullet.push(bullet.cars[0], wrench, there)
+        bullet.step()
+        bullet.read(bullet.cars[0], there)
+        fall(params[0], here, wrench.copy())
+    np.testing.assert_allclose(here, there, rtol=0.0, atol=1e-9)
+    bullet.close()
+
+
+@pytest.mark.parametrize("track", ["mountain-pass", "circuit"])
+def test_a_drive_is_the_same_whoever_moves_the_body(track: str) -> None:
+    road = Road(find_track(track))
+    with World(road) as world:
+        state = world.reset(seed=0, speed=15.0)
+        bullet, memory, motion = scene(), world._memory.copy(), world._motion.copy()
+        wrench, apart = np.zeros(6), []
+        for step in range(400):
+            steer = 0.2 * math.sin(0.1 * step) - 0.3 * state.to_middle + state.angle
+            command = Command(steer=max(-1.0, min(1.0, steer)), throttle=0.25)
+            controls = np.array([command.steer, command.throttle, 0.0, 1.0])
+            state = world.step(command)
+            for _ in range(10):
+                params, table = world._params, road.track.arrays()
+                advance(params, table, ground(road), motion, memory, controls, wrench)
+                bullet.put(bullet.cars[0], motion)
+                bullet.push(bullet.cars[0], wrench, motion)
+                bullet.step()
+                bullet.read(bullet.cars[0], motion)
+            apart.append(math.hypot(motion[0] - state.x, motion[1] - state.y))
+        assert state.odometer_m > 200.0
+        assert max(apart) < 1e-8
+        bullet.close()
+
+
+def test_flight_ends_before_anything_can_be_touched() -> None:
+    road = Road(find_track("circuit"))
+    with World(road) as world:
+        world.reset(seed=0, s=100.0, to_middle=2.0, angle=-1.2, speed=60.0)
+        motion, memory = world._motion, world._memory
+        others = np.zeros((0, 6))
+        arguments = (world._params, road.track.arrays(), ground(road), motion, memory)
+        controls, reach = np.array([0.0, 0.0, 0.0, 0.0]), road.wall_offset
+        done = fly(*arguments, controls, reach, others, others, 0, 200)
+        assert 0 < done < 200
+        reached = float(road.track.project(motion[0], motion[1])[1])
+        assert reach - 3.5 < reached < reach - 3.5 + 60.0 * DT
+        # It starts no more than a step away from touching.
+        assert fly(*arguments, controls, reach, others, others, 0, 200) == 0
+
+
+def near(road: Road, world: World, other: NDArray[np.float64], goes: float, share: float) -> bool:
+    motion, piece = world._motion, int(world._memory[PIECE])
+    move = np.array([[goes, 0.0, 0.0, 0.0, 0.0, 0.0]])
+    table, params = road.track.arrays(), world._params[0]
+    return bool(near_anything(params, table, motion, piece, 1e3, other, move, share))
+
+
+def test_another_car_is_near_before_it_can_be_touched_but_not_in_the_next_lane() -> None:
+    road = Road(find_track("circuit"))
+    with World(road) as world:
+        state = world.reset(seed=0, s=5.0, speed=20.0)
+        assert state.curvature == 0.0
+        bumpers = 0.5 * (CAR.length + SIZE[0])
+        step = (20.0 + 20.0) * DT + 0.3
+        other = np.array([[state.x, state.y, 0.0, 0.0, 0.0, state.yaw]])
+        ahead, left = np.array([math.cos(state.yaw), math.sin(state.yaw)]), np.zeros(2)
+        left[:] = -ahead[1], ahead[0]
+        for way, touching in ((ahead, bumpers), (left, 0.5 * (CAR.width + SIZE[1]))):
+            other[0, :2] = (state.x, state.y) + way * (touching + step - 0.01)
+            assert near(road, world, other, 0.0, 0.0)
+            other[0, :2] += 0.02 * way
+            assert not near(road, world, other, 0.0, 0.0)
+        other[0, :2] = (state.x, state.y) + left * 4.0
+        assert not near(road, world, other, 0.0, 0.0)
+        # Half of its way it will have come nearer.
+        other[0, :2] = (state.x, state.y) + ahead * 6.0
+        assert state.yaw == pytest.approx(0.0, abs=1e-9)
+        assert not near(road, world, other, -4.0, 0.0)
+        assert near(road, world, other, -4.0, 0.5)

@@ -1,0 +1,199 @@
+"""Hits have physical effect: on traffic, which is pushed on, and on walls, which hold."""
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+
+from simulator.env.reward import ending
+from simulator.track.geometry import Track
+from simulator.track.markings import MarkingStyle
+from simulator.track.pieces import Piece, assemble
+from simulator.track.road import Road
+from simulator.traffic.traffic import SIZE
+from simulator.traffic.wreck import TRAFFIC_CAR
+from simulator.vehicle.car import CarParameters
+from simulator.vehicle.state import CarState, Command
+from simulator.world.walls import Walls
+from simulator.world.world import World
+
+COAST = Command(gear=0)
+FULL_BRAKE = Command(brake=1.0, gear=0)
+
+
+def stadium(width: float = 12.0, lanes: int = 1, straight: float = 1500.0) -> Road:
+    """Two straights and two half circles of 40 m radius, to the left, flat."""
+    bend = Piece(math.pi * 40.0, 1 / 40.0, 0, 0, 0, 0)
+    pieces = [Piece(straight, 0.0, 0, 0, 0, 0), bend]
+    track = Track.from_placed(
+        assemble(pieces * 2),
+        name="stadium",
+        source="own",
+        width=width,
+        surface="asphalt",
+        look="circuit",
+        markings=MarkingStyle(),
+    )
+    return Road(track, lanes)
+
+
+def follow(state: CarState, throttle: float) -> Command:
+    steer = -0.4 * state.to_middle + 2.0 * state.angle
+    return Command(steer=min(max(steer, -1.0), 1.0), throttle=throttle, gear=2)
+
+
+def drive_into_traffic(world: World, seed: int = 0) -> tuple[CarState, CarState, float]:
+    """From behind, on the straight: (state before the hit, after it, the other's speed before)."""
+    state = world.reset(seed=seed, s=5.0, speed=28.0)
+    for _ in range(40 * world.frequency_hz):
+        before, other = state, float(world.traffic.speed[0])
+        state = world.step(follow(state, 0.5))
+        if state.collision is not None:
+            return before, state, other
+    raise AssertionError("nobody was hit")
+
+
+def test_a_rear_end_hit_conserves_momentum_and_pushes_the_other_on() -> None:
+    with World(stadium(), traffic=1, frequency_hz=200) as world:
+        before, state, other = drive_into_traffic(world)
+        assert state.collision == "traffic"
+        assert state.curvature == 0.0
+        mine, its = CarParameters().total_mass, TRAFFIC_CAR.total_mass
+        momentum = mine * before.speed + its * other
+        first = mine * state.speed + its * float(world.traffic.speed[0])
+        assert first == pytest.approx(momentum, rel=2e-3)
+        for _ in range(4):
+            state = world.step(COAST)
+        both = mine * state.speed + its * float(world.traffic.speed[0])
+        # The road's part in 20 ms: its brakes take a little, my spinning wheels push a little.
+        assert both == pytest.approx(momentum, rel=0.02)
+        # Of the speed that the two ran into each other with, little is left.
+        closing = before.speed - other
+        assert closing > 5.0
+        left = float(world.traffic.speed[0]) - state.speed
+        assert 0.0 <= left < 0.3 * closing
+        assert state.speed < before.speed - 0.3 * closing
+        assert world.traffic.speed[0] > other + 0.3 * closing
+
+
+def test_a_struck_car_leaves_the_lanes_order_and_comes_to_rest() -> None:
+    with World(stadium(), traffic=1) as world:
+        drive_into_traffic(world)
+        assert world.traffic.struck.tolist() == [True]
+        place = world.traffic.poses()[0, :2]
+        for _ in range(160):
+            world.step(FULL_BRAKE)
+        went = world.traffic.poses()[0, :2] - place
+        assert np.hypot(*went) > 5.0
+        assert world.traffic.speed[0] == 0.0
+        resting = world.traffic.poses().tobytes()
+        for _ in range(20):
+            world.step(FULL_BRAKE)
+        assert world.traffic.poses().tobytes() == resting
+        # The next episode knows nothing of it.
+        assert not world.reset(seed=1).collision
+        assert world.traffic.struck.tolist() == [False]
+
+
+def test_a_wreck_is_pushed_again() -> None:
+    with World(stadium(), traffic=1) as world:
+        drive_into_traffic(world)
+        for _ in range(160):
+            state = world.step(FULL_BRAKE)
+        place, hits = world.traffic.poses()[0, :2], 0
+        for _ in range(400):
+            state = world.step(follow(state, 0.4))
+            hits += state.collision == "traffic"
+        assert hits > 0
+        assert np.hypot(*(world.traffic.poses()[0, :2] - place)) > 0.5
+
+
+def test_the_others_stop_behind_the_wreck() -> None:
+    with World(stadium(straight=200.0), traffic=4) as world:
+        world.reset(seed=2)
+        drive_into_traffic(world, seed=2)
+        for _ in range(1200):
+            world.step(FULL_BRAKE)
+            length = world.road.track.length_m
+            on_lane = np.sort(np.append(world.traffic.s, world.state.s))
+            gaps = np.diff(np.append(on_lane, on_lane[0] + length))
+            assert gaps.min() > SIZE[0] - 0.3  # two boxes at rest may lean on each other
+        assert np.all(world.traffic.speed < 0.1)
+
+
+@pytest.mark.parametrize("where", ["straight", "bend"])
+@pytest.mark.parametrize("side", [1, -1])
+def test_no_wall_is_crossed_at_any_speed_or_angle(side: int, where: str) -> None:
+    place = 100.0 if where == "straight" else 1530.0
+    with World(stadium(width=20.0)) as world:
+        for angle, kmh in itertools.product((0.1, 0.3, 0.8, 1.5), (60.0, 150.0, 250.0)):
+            state = world.reset(seed=0, s=place, angle=-side * angle, speed=kmh / 3.6)
+            for _ in range(60):
+                state = world.step(COAST)
+                assert abs(state.to_middle) < world.road.wall_offset - 0.8, (angle, kmh)
+                assert abs(state.roll) < 0.5
+                assert state.z < 0.6
+
+
+def test_a_wall_is_no_hole_at_a_low_control_rate() -> None:
+    with World(stadium(width=20.0), frequency_hz=1) as world:
+        state = world.reset(seed=0, s=100.0, angle=-0.8, speed=50.0)
+        state = world.step(COAST)
+        assert state.collision == "wall"
+        assert abs(state.to_middle) < world.road.wall_offset
+
+
+def test_a_glancing_hit_turns_the_car_along_the_wall() -> None:
+    with World(stadium(width=20.0)) as world:
+        state = world.reset(seed=0, s=100.0, angle=-0.2, speed=45.0)
+        while state.collision is None:
+            before = state
+            state = world.step(COAST)
+        for _ in range(5):
+            state = world.step(COAST)
+        assert abs(state.angle) < 0.5 * abs(before.angle)
+        assert 0.9 * before.speed < state.speed < before.speed - 0.3
+
+
+def test_a_head_on_hit_takes_nearly_all_speed() -> None:
+    with World(stadium(width=20.0)) as world:
+        state = world.reset(seed=0, s=100.0, angle=-1.5, speed=20.0)
+        while state.collision is None:
+            state = world.step(COAST)
+        assert abs(state.speed) < 0.3 * 20.0
+
+
+def test_a_wall_ends_the_drive_where_leaving_the_track_does_not() -> None:
+    with World(stadium()) as world:
+        state = world.reset(seed=0, s=100.0, angle=-0.5, speed=20.0)
+        reasons = []
+        while state.collision is None:
+            state = world.step(COAST)
+            reasons.append((ending(state), ending(state, ("backwards", "collision"))))
+        assert ("off_track", None) in reasons
+        assert reasons[-1] == ("off_track", "collision")
+
+
+def test_a_wall_is_open_where_another_part_of_the_track_lies() -> None:
+    # A hairpin whose two straights are 12 m apart: walls 8.5 m out would stand on the other one.
+    tight = Piece(math.pi * 6.0, 1 / 6.0, 0, 0, 0, 0)
+    wide = Piece(math.pi * 6.0, 1 / 6.0, 0, 0, 0, 0)
+    straight = Piece(200.0, 0.0, 0, 0, 0, 0)
+    track = Track.from_placed(
+        assemble([straight, tight, straight, wide]),
+        name="hairpin",
+        source="own",
+        width=12.0,
+        surface="asphalt",
+        look="circuit",
+        markings=MarkingStyle(),
+    )
+    walls = Walls(Road(track))
+    assert walls.panel(100.0, 6.5, 3.5) is None
+    outer = walls.panel(100.0, -6.5, 3.5)
+    assert outer is not None
+    assert (outer.x, outer.yaw) == pytest.approx((100.0, 0.0))
+    assert outer.y == pytest.approx(-walls.offset - 1.5)
+    assert walls.panel(100.0, -3.0, 3.5) is None  # too far
+    assert walls.panel(100.0, -9.0, 3.5) is None  # behind it

@@ -1,0 +1,20 @@
+"""Quaternions of body axes against PyBullet's own matrices, in all four branches."""
+
+import numpy as np
+import pybullet
+import pytest
+
+from simulator.vehicle.orientation import quaternion, rotation
+
+
+@pytest.mark.parametrize(
+    "euler",
+    [(0.0, 0.0, 0.0), (3.1, 0.1, 0.2), (0.1, 0.2, 3.1), (3.0, 0.2, 3.0), (0.3, -1.2, -2.0)],
+)
+def test_quaternion_and_rotation_are_pybullets(euler: tuple[float, float, float]) -> None:
+    turn = pybullet.getQuaternionFromEuler(euler)
+    matrix = np.array(pybullet.getMatrixFromQuaternion(turn)).reshape(3, 3)
+    forward, left, up = matrix.T
+    ours = quaternion(forward, left, up)
+    assert abs(float(np.dot(ours, turn))) == pytest.approx(1.0)  # q and -q are one orientation
+    np.testing.assert_allclose(rotation(np.array(turn)), matrix.T, atol=1e-12)

@@ -1,0 +1,65 @@
+"""Walls stand beside the road all along it, tight bends included, and never across it."""
+
+import math
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from simulator.track.geometry import Track
+from simulator.track.markings import MarkingStyle
+from simulator.track.pieces import Piece, assemble
+from simulator.track.road import Road
+from simulator.world.walls import PANEL, Panel, Walls
+
+
+def loop(radius: float, straight: float) -> Track:
+    bend = Piece(math.pi * radius, 1.0 / radius, 0.0, 0.0, 0.0, 0.0)
+    pieces = [Piece(straight, 0.0, 0.0, 0.0, 0.0, 0.0), bend] * 2
+    return Track.from_placed(
+        assemble(pieces),
+        name="loop",
+        source="own",
+        width=9.0,
+        surface="asphalt",
+        look="town",
+        markings=MarkingStyle(),
+    )
+
+
+def inner_face(panel: Panel) -> NDArray[np.float64]:
+    """(7, 2) points along the face that looks at the road."""
+    along = np.linspace(-0.5, 0.5, 7)[:, None] * PANEL[0]
+    ahead = np.array([math.cos(panel.yaw), math.sin(panel.yaw)])
+    points: NDArray[np.float64] = np.array(panel.face) + along * ahead
+    return points
+
+
+@pytest.mark.parametrize("radius", [8.0, 10.0, 11.0, 20.0, 60.0])
+@pytest.mark.parametrize("side", [1, -1])
+def test_walls_follow_every_bend(radius: float, side: int) -> None:
+    track = loop(radius, 40.0)
+    road = Road(track)
+    walls = Walls(road)
+    for s in np.arange(0.0, track.length_m, 0.7):
+        panel = walls.panel(float(s), side * (road.wall_offset - 2.0), 3.5)
+        if panel is None:
+            # Within a metre of the middle of the bend there is no room for one.
+            assert side > 0
+            assert radius - road.wall_offset <= 1.0
+            continue
+        face = inner_face(panel)
+        offsets = [track.project(float(x), float(y))[1] * side for x, y in face]
+        assert offsets[3] == pytest.approx(road.wall_offset, abs=1e-6)
+        # Flat where the wall is bent, but never over the road.
+        assert min(offsets) > road.edge
+        reach = 0.5 * PANEL[0]
+        sagitta = reach**2 / (2.0 * (radius - side * road.wall_offset))
+        assert np.ptp(offsets) < 1.2 * sagitta + 1e-6 or radius < 12.0
+
+
+def test_a_car_meets_no_wall_from_afar_nor_from_behind() -> None:
+    walls = Walls(Road(loop(60.0, 200.0)))
+    assert walls.panel(100.0, walls.offset - 3.6, 3.5) is None
+    assert walls.panel(100.0, walls.offset - 3.4, 3.5) is not None
+    assert walls.panel(100.0, walls.offset + 0.1, 3.5) is None
