@@ -57,9 +57,9 @@ def decoder(frames: Frames, order: NDArray[np.int64]) -> Read:
 
 def ours(frames: Frames, batches: int) -> Read:
     from mtlnet.data.loader import Loader
-    from mtlnet.inference.model_card import Camera
+    from trackfeatures.camera import CameraParameters
 
-    camera = Camera(width=frames.camera.width, height=frames.camera.height)
+    camera = CameraParameters(width=frames.camera.width, height=frames.camera.height)
     endless = Loader(frames, camera, BATCH, 0, augment=False).batches(0)
 
     def read() -> int:

@@ -31,6 +31,7 @@ from simulator.camera.core.context import graphics
 from simulator.camera.snapshot import standing_pose
 from simulator.track.catalogue import find_track
 from simulator.track.road import Road
+from trackfeatures.camera import CameraParameters
 
 CLAIM_FRAMES_PER_SECOND = 150.0
 TRACKS = ("circuit", "forest", "town", "mountain-pass")
@@ -127,7 +128,7 @@ def frames_per_second(jobs: dict[str, Job], turns: int) -> dict[str, float]:
 def camera(track: str, light: str, size: tuple[int, int] = (280, 210)) -> Camera:
     road = Road(find_track(track))
     kind = Light.named(light, np.random.default_rng([0, 2]))
-    return Camera(road, seed=0, light=kind, width=size[0], height=size[1])
+    return Camera(road, CameraParameters(*size), seed=0, light=kind)
 
 
 def environments(stack: ExitStack) -> Iterator[tuple[str, Job]]:

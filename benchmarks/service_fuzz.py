@@ -19,10 +19,10 @@ import simplejpeg
 
 from mtlnet.inference.image_decoding.decode import decode, inspect
 from mtlnet.inference.image_decoding.errors import ImageError
-from mtlnet.inference.model_card import Camera
+from trackfeatures.camera import CameraParameters
 
 MAX_GROWTH = 0.01
-VIEW = Camera()
+VIEW = CameraParameters()
 
 
 def seeds() -> list[bytes]:

@@ -30,11 +30,11 @@ from torch import Tensor
 import trackfeatures as tf
 from datagen.recording import Dataset, Frames
 from mtlnet.data.loader import Loader
-from mtlnet.inference.model_card import Camera
 from mtlnet.model.network import Network, initialise
 from mtlnet.training.loss import multi_task_loss
 from mtlnet.training.recipes import RECIPES, WARM_UP
 from mtlnet.training.trainer import SETTLING_STEPS, Trainer, keep_freed_memory
+from trackfeatures.camera import CameraParameters
 
 MOST_OVER_MEMORY = 1.05
 LEAST_OVER_PLAIN = 2.0
@@ -53,7 +53,7 @@ def ours(frames: Frames, size: int, steps: int) -> dict[str, Step]:
     `steps` in a row are spread over a run; those called `all` are of its beginning.
     """
     recipe = RECIPES["fast"]
-    camera = Camera()
+    camera = CameraParameters()
     changed = Loader(frames, camera, size, 0, augment=True)
     trainer = Trainer(recipe, ALPHA, 0, torch.device("cpu"))
     trainer.standardise(changed)

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import trackfeatures as tf
 from controllers.closed_loop import THROTTLE, DriveLog, DriveResult, run_lap
-from controllers.perception import open_eyes
+from controllers.perception import open_perception
 from controllers.registry import Setting, make_controller
 from simulator.camera import check_light
 from simulator.track.catalogue import find_track
@@ -79,7 +79,7 @@ def drive(config: DriveConfig, progress: Callable[[int, int], None] | None = Non
         world = stack.enter_context(World(road, traffic=config.traffic, frequency_hz=FREQUENCY_HZ))
         world.reset(seed=config.seed, to_middle=lane.start_d)
         eyes = stack.enter_context(
-            open_eyes(
+            open_perception(
                 config.perception,
                 world,
                 model=config.model,

@@ -1,6 +1,6 @@
-"""How a drive perceives the road: the truth, a model in this process, or a service over HTTP.
+"""Perception in a closed loop: ground truth, a model in this process, or a service over HTTP.
 
-Each is a function of the world as it stands; a fake in a test is a lambda.
+Each is a function from the simulated world to `Perceived` (m, rad, 1/m; left positive).
 """
 
 import math
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 import trackfeatures as tf
 from trackfeatures import Heading, UserError
+from trackfeatures.camera import CameraParameters
 
 if TYPE_CHECKING:
     from simulator.camera import Camera
@@ -22,34 +23,35 @@ if TYPE_CHECKING:
 Image = NDArray[np.uint8]
 JPEG_QUALITY = 95  # that of the recorded training images
 LOOK_AHEAD_S = 0.1
-"""The truth tells the curvature this far ahead: about what steering and tyres take to answer."""
+"""The ground truth gives the curvature this far ahead: about the delay of steering and tyres."""
 
 
 @dataclass(frozen=True, slots=True)
 class Perceived:
-    """What is seen of the road at one moment; m, rad and 1/m, left positive."""
+    """What a controller receives of the road in one step."""
 
     to_lane_centre: float | None
-    """None where no marking is seen."""
+    """m, left positive; None where no marking is visible."""
     angle: float
+    """rad, positive when the car points to the right of the track."""
     heading: Heading
     curvature: float | None = None
-    """Of the road just ahead; None where nobody tells."""
+    """1/m, left positive, of the road just ahead; None where it is not estimated."""
 
 
 class Perceive(Protocol):
-    """Reads the road off the world as it stands."""
+    """Measures or estimates the road at the present state of the world."""
 
     def __call__(self, world: "World") -> Perceived: ...
 
 
 class FeatureModel(Protocol):
-    """What `CameraPerception` asks of a network: its camera, and its answer to an image."""
+    """What `CameraPerception` needs of a network: its camera, and its prediction for an image."""
 
-    camera: dict[str, Any]
+    camera: CameraParameters
 
-    def look(self, image: Image) -> dict[str, Any]:
-        """The answer to an image (H, W, 3) RGB, as the service gives it."""
+    def predict(self, image: Image) -> dict[str, Any]:
+        """The prediction for an image (H, W, 3) RGB, in the format of the service's answers."""
         ...
 
     def close(self) -> None: ...
@@ -75,25 +77,23 @@ class LocalModel:
     """The model of a run, in this process."""
 
     def __init__(self, run: str) -> None:
-        from dataclasses import asdict
-
         from mtlnet.inference.engine import load_engine
         from mtlnet.inference.model_card import resolve_run
         from mtlnet.inference.prediction import decode_outputs
 
         self._engine = load_engine(resolve_run(run))
-        self._interpret = decode_outputs
-        self.camera: dict[str, Any] = asdict(self._engine.card.camera)
+        self._decode = decode_outputs
+        self.camera: CameraParameters = self._engine.card.camera
 
-    def look(self, image: Image) -> dict[str, Any]:
-        return self._interpret(self._engine(image)).as_json()
+    def predict(self, image: Image) -> dict[str, Any]:
+        return self._decode(self._engine(image)).as_json()
 
     def close(self) -> None:
-        """Nothing to give back."""
+        """Nothing is held open."""
 
 
-class Service:
-    """A perception service at `url`, which may be that of the service or of its /features."""
+class ServiceModel:
+    """The model of the perception service at `url`, with or without the path /features."""
 
     def __init__(self, url: str) -> None:
         from serve.client import Client
@@ -101,11 +101,9 @@ class Service:
         self._client = Client(url.rstrip("/").removesuffix("/features"))
         card = self._client.model()
         tf.require_version(str(card.get("definitions_version")), f"the service at {url}")
-        if not isinstance(card.get("camera"), dict):
-            raise UserError(f"the service at {url} does not say which camera its model saw through")
-        self.camera: dict[str, Any] = card["camera"]
+        self.camera: CameraParameters = parse_camera(card.get("camera"))
 
-    def look(self, image: Image) -> dict[str, Any]:
+    def predict(self, image: Image) -> dict[str, Any]:
         import simplejpeg
 
         body = simplejpeg.encode_jpeg(
@@ -117,42 +115,60 @@ class Service:
         self._client.close()
 
 
+def parse_camera(content: Any) -> CameraParameters:
+    """The camera in a service's model card. Raises UserError where it is missing or incomplete."""
+    try:
+        return CameraParameters(
+            width=int(content["width"]),
+            height=int(content["height"]),
+            fov_y_deg=float(content["fov_y_deg"]),
+            x=float(content["x"]),
+            y=float(content["y"]),
+            z=float(content["z"]),
+            pitch_deg=float(content["pitch_deg"]),
+        )
+    except (KeyError, TypeError, ValueError) as error:
+        raise UserError(
+            f"the service's model card gives no usable camera ({error!r}), found {content}; use a "
+            "perception service of this version"
+        ) from error
+
+
 class CameraPerception:
     """Perception by a camera on the car and a network that reads its images."""
 
-    def __init__(self, camera: "Camera", vision: FeatureModel) -> None:
+    def __init__(self, camera: "Camera", model: FeatureModel) -> None:
         self._camera = camera
-        self._vision = vision
+        self._model = model
 
     def __call__(self, world: "World") -> Perceived:
         image = self._camera.render(world.body_pose(), world.traffic.poses())
-        return read_answer(self._vision.look(image))
+        return parse_prediction(self._model.predict(image))
 
 
-def read_answer(answer: dict[str, Any]) -> Perceived:
-    """What an answer of the service says; UserError when it is none."""
+def parse_prediction(answer: dict[str, Any]) -> Perceived:
+    """The quantities that steering needs. Raises UserError where one is missing or not finite."""
     try:
         offset, angle = answer["to_lane_centre_m"], float(answer["angle_rad"])
-        classes = answer["heading"]
-        likeliest = max(Heading, key=lambda heading: float(classes[heading.name.lower()]))
+        probabilities = [float(answer["heading"][heading.name.lower()]) for heading in Heading]
         to_lane_centre = None if offset is None else float(offset)
-        _finite(angle, to_lane_centre or 0.0, *(float(classes[h.name.lower()]) for h in Heading))
+        _require_finite(angle, to_lane_centre or 0.0, *probabilities)
     except (KeyError, TypeError, ValueError) as error:
         raise UserError(
             "the service's answer lacks to_lane_centre_m, angle_rad or heading in finite numbers "
             f"({error!r}); is it a perception service of this version?"
         ) from error
-    return Perceived(to_lane_centre, angle, likeliest)
+    return Perceived(to_lane_centre, angle, Heading(int(np.argmax(probabilities))))
 
 
-def _finite(*values: float) -> None:
-    # A NaN passes every comparison that would stop it, and would steer to full lock.
+def _require_finite(*values: float) -> None:
+    # A NaN passes every comparison meant to stop it, and would steer to full lock.
     if not all(map(math.isfinite, values)):
         raise ValueError(f"{values} are not all finite")
 
 
 class PerceptionSource:
-    """A `Perceive` chosen by name, with what it holds open. A context manager."""
+    """A perception function and the resources it holds open. A context manager."""
 
     def __init__(self, perceive: Perceive, *closing: Callable[[], None]) -> None:
         self.perceive = perceive
@@ -167,38 +183,30 @@ class PerceptionSource:
         self._stack.close()
 
 
-def open_eyes(
-    perception: str, world: "World", *, model: str, lane_centre: float, light: str, seed: int
+def open_perception(
+    name: str, world: "World", *, model: str, lane_centre: float, light: str, seed: int
 ) -> PerceptionSource:
-    """The perception named "truth", "model" or a service's address.
+    """The perception named "truth", "model" or by a service's address.
 
-    Raises UserError for any other word, a missing model, or a service that is not there.
+    Raises UserError for any other name, a missing model, or a service that does not answer.
     """
-    if perception == "truth":
+    if name == "truth":
         return PerceptionSource(truth(lane_centre))
-    if perception == "model":
-        vision: FeatureModel = LocalModel(model)
-    elif ":" in perception:
-        vision = Service(perception)
+    if name == "model":
+        network: FeatureModel = LocalModel(model)
+    elif ":" in name:
+        network = ServiceModel(name)
     else:
         raise UserError(
-            f"perception {perception!r} is unknown; give truth, model, or the address of a "
+            f"perception {name!r} is unknown; give truth, model, or the address of a "
             "service such as http://127.0.0.1:8000"
         )
-    camera = _camera(vision.camera, world, light, seed)
-    return PerceptionSource(CameraPerception(camera, vision), vision.close, camera.close)
+    camera = _open_camera(network.camera, world, light, seed)
+    return PerceptionSource(CameraPerception(camera, network), network.close, camera.close)
 
 
-def _camera(wanted: dict[str, Any], world: "World", light: str, seed: int) -> "Camera":
-    """The camera a model saw through in training, on this road."""
-    from simulator.camera import Camera, Light, Mount
+def _open_camera(parameters: CameraParameters, world: "World", light: str, seed: int) -> "Camera":
+    from simulator.camera import Camera, Light
 
-    try:
-        size = int(wanted["width"]), int(wanted["height"])
-        place = {name: float(wanted[name]) for name in ("x", "y", "z", "pitch_deg", "fov_y_deg")}
-    except (KeyError, TypeError, ValueError) as error:
-        raise UserError(f"the model's camera {wanted} is incomplete ({error!r})") from error
-    sky = Light.named(light, np.random.default_rng([seed, 2]))
-    return Camera(
-        world.road, seed=seed, light=sky, mount=Mount(**place), width=size[0], height=size[1]
-    )
+    drawn = Light.named(light, np.random.default_rng([seed, 2]))
+    return Camera(world.road, parameters, seed=seed, light=drawn)

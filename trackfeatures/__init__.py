@@ -23,6 +23,7 @@ from trackfeatures.definitions import (
 from trackfeatures.errors import DefinitionsMismatch, UserError, require_version
 
 if TYPE_CHECKING:
+    from trackfeatures.camera import CameraParameters
     from trackfeatures.coding import (
         decode,
         decode_features,
@@ -55,6 +56,7 @@ __all__ = [
     "RANGES",
     "TARGETS",
     "VERSION",
+    "CameraParameters",
     "CentreLine",
     "DefinitionsMismatch",
     "Heading",
@@ -80,7 +82,7 @@ __all__ = [
     "wrap_angle",
 ]
 
-_ON_ARRAYS = ("coding", "measurement")
+_ON_ARRAYS = ("camera", "coding", "measurement")
 
 
 def __getattr__(name: str) -> object:

@@ -15,11 +15,12 @@ from numpy.typing import NDArray
 
 from controllers.demo.frames import Asked
 from controllers.demo.run import DemoConfig, DemoResult
-from datagen.recording import CameraInfo, Dataset
+from datagen.recording import Dataset
 from mtlnet.inference.overlay import draw_answer
 from mtlnet.training.logging import read_curves
 from simulator.vehicle.car import CarParameters
 from trackfeatures import MARKINGS
+from trackfeatures.camera import CameraParameters
 
 LIMITS = {"ml": 0.35, "mr": 0.35, "angle": 0.03, "heading": 0.85}
 """What the demo must reach: mean error in m and rad, and the share of right classes."""
@@ -133,7 +134,7 @@ def _pair(true: float | None, answered: float | None, digits: int) -> str:
     return " / ".join("absent" if v is None else f"{v:+.{digits}f}" for v in (true, answered))
 
 
-def _pictures(camera: CameraInfo, asked: list[Asked]) -> str:
+def _pictures(camera: CameraParameters, asked: list[Asked]) -> str:
     height_m = camera.z + CarParameters().cg_height
     figures = []
     for one in asked:

@@ -17,10 +17,10 @@ import pyarrow.parquet as pq
 from datagen.export.lerobot_features import IMAGE, Columns, columns, features, table
 from datagen.export.lerobot_stats import Histogram, Stats, of_numbers
 from datagen.export.sides import Progress, Side
-from datagen.recording.camera import CameraInfo
 from datagen.recording.errors import DatasetError
 from datagen.recording.round_metadata import RoundInfo
 from datagen.view.steps import Step, Steps
+from trackfeatures.camera import CameraParameters
 
 VERSION = "v3.0"
 CHUNK_FILES = 1000
@@ -30,7 +30,7 @@ EPISODES_FILE = "meta/episodes/chunk-000/file-000.parquet"
 INDEX_NAME = "__index_level_0__"
 
 
-def write(folder: Path, parts: list[Side], camera: CameraInfo, progress: Progress) -> None:
+def write(folder: Path, parts: list[Side], camera: CameraParameters, progress: Progress) -> None:
     """Write all rounds of `parts` into `folder`; DatasetError when their rates differ."""
     rounds = [info for side in parts for info in side.rounds]
     tasks = sorted({_task(info) for info in rounds})
@@ -87,7 +87,7 @@ class _DataFiles:
 class _Episodes:
     """Rounds in, one at a time; their rows of meta/episodes and the statistics of all out."""
 
-    def __init__(self, files: _DataFiles, camera: CameraInfo, tasks: list[str]) -> None:
+    def __init__(self, files: _DataFiles, camera: CameraParameters, tasks: list[str]) -> None:
         self.rows: list[dict[str, Any]] = []
         self.frames, self.fps = 0, 0
         self._files, self._camera, self._tasks = files, camera, tasks
@@ -180,7 +180,7 @@ def _pandas_column(name: str | None, field: str, numpy_type: str, kind: str) -> 
 
 
 def _info(
-    writer: _Episodes, parts: list[Side], tasks: list[str], camera: CameraInfo
+    writer: _Episodes, parts: list[Side], tasks: list[str], camera: CameraParameters
 ) -> dict[str, Any]:
     ends = list(accumulate((len(side.rounds) for side in parts), initial=0))
     return {

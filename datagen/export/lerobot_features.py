@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 import trackfeatures as tf
 from datagen.export.webdataset import SUFFIX
-from datagen.recording.camera import CameraInfo
 from datagen.view.steps import Step, values
+from trackfeatures.camera import CameraParameters
 
 IMAGE = "observation.images.front"
 STATE = ("vx", "vy", "yaw_rate")
@@ -37,7 +37,7 @@ COUNTERS = ("frame_index", "episode_index", "index", "task_index")
 Columns = dict[str, NDArray[Any]]
 
 
-def features(camera: CameraInfo) -> dict[str, Any]:
+def features(camera: CameraParameters) -> dict[str, Any]:
     """`features` of meta/info.json."""
     image = {
         "dtype": "image",

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from datagen.recording.camera import CameraInfo
 from datagen.recording.images import decode_into
 from datagen.view.steps import Step
+from trackfeatures.camera import CameraParameters
 
 QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
 LEVELS = 256
@@ -54,7 +54,7 @@ class Histogram:
         self.counts = np.zeros((3, LEVELS), np.int64)
 
     @staticmethod
-    def of(steps: Sequence[Step], camera: CameraInfo) -> "Histogram":
+    def of(steps: Sequence[Step], camera: CameraParameters) -> "Histogram":
         """Raises ValueError where an image cannot be decoded."""
         found = Histogram()
         image = np.empty((camera.height, camera.width, 3), np.uint8)

@@ -12,11 +12,11 @@ from typing import Any
 
 import trackfeatures as tf
 from datagen.driving.trajectory import KINDS as TRAJECTORIES
-from datagen.recording.camera import CameraInfo
 from datagen.recording.images import CODECS
 from datagen.recording.splits import UNSEEN
 from simulator.camera import KINDS as LIGHTS
 from simulator.world.physics import PHYSICS_HZ, check_frequency
+from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
 
 TEST_SHARE = 0.25
@@ -55,7 +55,7 @@ class CollectConfig:
     codec: str = "jpeg"
     frequency_hz: int = 20
     """Of the frames; the car is steered at `CONTROL_HZ` or more."""
-    camera: CameraInfo = field(default_factory=CameraInfo)
+    camera: CameraParameters = field(default_factory=CameraParameters)
     stretch: int = 0
     """After so many frames the scenery and the light are others; 0: never in a round."""
     scenes: int = 0
@@ -122,8 +122,8 @@ class RoundPlan:
     frames: int
     frequency_hz: int
     codec: str
-    camera: CameraInfo
-    nominal_camera: CameraInfo
+    camera: CameraParameters
+    nominal_camera: CameraParameters
     """The dataset's camera, of which `camera` may be a jittered copy."""
     lane_width_m: float = tf.LANE_WIDTH_M
 
@@ -138,7 +138,7 @@ class RoundPlan:
     @staticmethod
     def from_json(entry: dict[str, Any]) -> "RoundPlan":
         """Raises KeyError or TypeError where the entry is not one of this program."""
-        cameras = {key: CameraInfo(**entry[key]) for key in ("camera", "nominal_camera")}
+        cameras = {key: CameraParameters(**entry[key]) for key in ("camera", "nominal_camera")}
         return RoundPlan(**{**entry, **cameras, "lights": tuple(entry["lights"])})
 
 

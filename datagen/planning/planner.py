@@ -21,8 +21,8 @@ from datagen.planning.plan import (
     RoundPlan,
     TrackChoice,
 )
-from datagen.recording.camera import CameraInfo
 from datagen.recording.splits import UNSEEN
+from trackfeatures.camera import CameraParameters
 
 MOST_TRAFFIC = 8
 SPEED_KMH = (40.0, 75.0)
@@ -78,7 +78,7 @@ def _first_seed(wanted: CollectConfig) -> int:
     return wanted.seed * SEEDS_A_PLAN + (SEEDS_A_PLAN // 2 if wanted.split == UNSEEN else 0)
 
 
-def _cameras(wanted: CollectConfig, rng: np.random.Generator) -> list[CameraInfo]:
+def _cameras(wanted: CollectConfig, rng: np.random.Generator) -> list[CameraParameters]:
     if not wanted.jitter_camera:
         return [wanted.camera] * wanted.rounds
     about = wanted.camera

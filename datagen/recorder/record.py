@@ -19,7 +19,7 @@ from datagen.planning.plan import RoundPlan, program
 from datagen.recording.frame import DriverCommand, EgoState, Frame, RoadPlace, SensorReadings
 from datagen.recording.mcap.writer import RoundWriter
 from datagen.recording.round_metadata import RoundHeader
-from simulator.camera import Camera, Light, Mount
+from simulator.camera import Camera, Light
 from simulator.camera.overlay import marking_polylines
 from simulator.sensors.sensor import SensorSuite
 from simulator.sensors.standard import STANDARD
@@ -192,20 +192,10 @@ def scene_of(plan: RoundPlan, tracks_dir: Path | None) -> Iterator[tuple[RoundSi
     longest = plan.frames / plan.frequency_hz * speed * 1.1 + 50.0
     course = make_course(plan.trajectory, road, longest, np.random.default_rng([plan.seed, 3]))
     control_hz = plan.frequency_hz * plan.steps_a_frame
-    about = plan.camera
     seed, light = scenery(plan, 0)
-    mount = Mount(about.x, about.y, about.z, about.pitch_deg, about.fov_y_deg)
     with (
         World(road, traffic=plan.traffic, frequency_hz=control_hz) as world,
-        Camera(
-            road,
-            seed=seed,
-            light=light,
-            mount=mount,
-            width=about.width,
-            height=about.height,
-            scenes=MOST_SCENES,
-        ) as camera,
+        Camera(road, plan.camera, seed=seed, light=light, scenes=MOST_SCENES) as camera,
     ):
         driver = ScriptedDriver(road, course, speed, control_hz)
         yield RoundSimulation(plan, world, driver), camera

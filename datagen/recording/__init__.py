@@ -12,7 +12,6 @@ What is listed here is stable: it changes with a new version of the program only
 is opened with `open_round`; `verify` and `recover` look after folders and files.
 """
 
-from datagen.recording.camera import CameraInfo
 from datagen.recording.dataset import Dataset, Frames
 from datagen.recording.errors import DatasetError, UndecodableImage
 from datagen.recording.labels import Labels
@@ -21,7 +20,6 @@ from datagen.recording.round_metadata import Recovery, RoundHeader, RoundInfo, R
 from datagen.recording.splits import Split
 
 __all__ = [
-    "CameraInfo",
     "Dataset",
     "DatasetError",
     "Frames",

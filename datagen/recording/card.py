@@ -7,13 +7,13 @@ from collections.abc import Iterator
 from typing import Any
 
 import trackfeatures as tf
-from datagen.recording.camera import CameraInfo
 from datagen.recording.dataset import Dataset
 from datagen.recording.images import JPEG_QUALITY
 from datagen.recording.schema.fields import FIELDS, Field
 from datagen.recording.schema.json_schema import SCHEMA
 from datagen.recording.schema.topics import MESSAGE_TYPES
 from datagen.recording.splits import SIDES
+from trackfeatures.camera import CameraParameters
 
 SIZES = ((1_000, "n<1K"), (10_000, "1K<n<10K"), (100_000, "10K<n<100K"), (1_000_000, "100K<n<1M"))
 LARGEST = "1M<n<10M"
@@ -177,7 +177,7 @@ def _stretches(frames: set[int]) -> str:
     )
 
 
-def _camera(camera: CameraInfo) -> str:
+def _camera(camera: CameraParameters) -> str:
     return (
         f"{camera.fov_y_deg:g} degrees of vertical field of view, at ({camera.x:g}, {camera.y:g}, "
         f"{camera.z:g}) m ahead, left and above of the centre of gravity, pitch "

@@ -19,7 +19,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 import trackfeatures as tf
-from datagen.recording.camera import CameraInfo
 from datagen.recording.errors import DatasetError, UndecodableImage
 from datagen.recording.images import decode_into
 from datagen.recording.labels import Labels, concatenate, read_labels
@@ -37,6 +36,7 @@ from datagen.recording.splits import (
     require_known_recovered,
     split_path,
 )
+from trackfeatures.camera import CameraParameters
 
 if TYPE_CHECKING:
     from datagen.recording.bulk import BulkDecoder
@@ -52,7 +52,7 @@ class Frames:
         self,
         rounds: Sequence[RoundInfo],
         indexes: Sequence[RoundIndex],
-        camera: CameraInfo,
+        camera: CameraParameters,
         rows: NDArray[np.int64] | None = None,
     ) -> None:
         """`rows`: the frames of these rounds that are meant, ascending; None: all."""
@@ -173,7 +173,7 @@ class Dataset:
 
     path: Path
     rounds: list[RoundInfo]
-    camera: CameraInfo
+    camera: CameraParameters
     content_hash: str
     indexes: list[RoundIndex]
 
@@ -232,7 +232,7 @@ def _require_sound_split(split: Split, indexes: Sequence[RoundIndex]) -> None:
     )
 
 
-def _one_camera(indexes: Sequence[RoundIndex]) -> CameraInfo:
+def _one_camera(indexes: Sequence[RoundIndex]) -> CameraParameters:
     """The camera all rounds are of; in a dataset with jitter each round's differs a little."""
     camera = indexes[0].header.dataset_camera
     for index in indexes:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import trackfeatures as tf
-from datagen.recording.camera import CameraInfo
+from trackfeatures.camera import CameraParameters
 
 ROUND_METADATA = "driverview.round"
 RESULT_METADATA = "driverview.result"
@@ -45,13 +45,13 @@ class RoundHeader:
     plan_hash: str = ""
     definitions: str = tf.VERSION
     program: str = ""
-    camera: CameraInfo = field(default_factory=CameraInfo)
+    camera: CameraParameters = field(default_factory=CameraParameters)
     """What the images were taken with; varies from round to round where it was jittered..."""
-    nominal_camera: CameraInfo | None = None
+    nominal_camera: CameraParameters | None = None
     """...about this one, the dataset's; absent where it was not."""
 
     @property
-    def dataset_camera(self) -> CameraInfo:
+    def dataset_camera(self) -> CameraParameters:
         return self.nominal_camera or self.camera
 
     def require_sane(self) -> None:
@@ -74,7 +74,7 @@ class RoundHeader:
         values: dict[str, Any] = {name: json.loads(text) for name, text in metadata.items()}
         for name in ("camera", "nominal_camera"):
             if values[name] is not None:
-                values[name] = CameraInfo(**values[name])
+                values[name] = CameraParameters(**values[name])
         values["lights"] = tuple(values["lights"])
         values["definitions"] = str(values["definitions"])
         return RoundHeader(**values)

@@ -42,7 +42,7 @@ def _camera(contents: Contents, recording: rr.RecordingStream, time: rr.TimeColu
     placed = rr.Transform3D(translation=pose.place, quaternion=rr.Quaternion(xyzw=pose.turn))
     recording.log(CAMERA, placed, static=True)
     pinhole = rr.Pinhole(
-        image_from_camera=camera.intrinsics,
+        image_from_camera=camera.intrinsics(),
         width=camera.width,
         height=camera.height,
         image_plane_distance=3.0,

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 import trackfeatures as tf
 from mtlnet.inference.image_decoding.decode import inspect, read_image
-from mtlnet.inference.model_card import Camera
+from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
 
 LABELS = "labels.csv"
@@ -68,7 +68,7 @@ def is_own(folder: Path) -> bool:
     return (folder / LABELS).is_file()
 
 
-def open_own_images(folder: Path, camera: Camera) -> OwnImages:
+def open_own_images(folder: Path, camera: CameraParameters) -> OwnImages:
     """Read, check and decode all of a folder, scaled to the camera's size.
 
     Raises UserError that names the line of `labels.csv` that is wrong, ImageError (a UserError)
@@ -93,7 +93,7 @@ def open_own_images(folder: Path, camera: Camera) -> OwnImages:
     return OwnImages(folder, labels, images, digest.hexdigest())
 
 
-def _read_whole_view(path: Path, camera: Camera) -> NDArray[np.uint8]:
+def _read_whole_view(path: Path, camera: CameraParameters) -> NDArray[np.uint8]:
     """An image of the camera's shape, at its size: not cropped, as one that is asked about may be.
 
     A label would not know what was cut away.

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 import trackfeatures as tf
 from mtlnet.data.augment.pipeline import change_images, changed_labels, draw_changes, fit_to
-from mtlnet.inference.model_card import Camera
+from trackfeatures.camera import CameraParameters
 
 AHEAD = 3  # batches in the making
 MAKERS = 2  # at a time: while one batch waits for its last image, the next is begun
@@ -69,7 +69,7 @@ class Loader:
     def __init__(
         self,
         frames: Images,
-        camera: Camera,
+        camera: CameraParameters,
         batch: int,
         seed: int,
         *,

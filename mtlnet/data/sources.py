@@ -9,10 +9,11 @@ import numpy as np
 from datagen.recording import Dataset, DatasetError, Frames, UndecodableImage
 from mtlnet.data.custom_images import OwnImages, is_own, open_own_images
 from mtlnet.evaluation.metrics import describe_data, mean_answer
-from mtlnet.inference.model_card import Camera, ModelCard, ModelError
+from mtlnet.inference.model_card import ModelCard, ModelError
 from mtlnet.model.architecture import HEIGHT, WIDTH
 from mtlnet.training.config import TrainConfig
 from mtlnet.uncertainty_fit.head import hold_out
+from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
 
 
@@ -22,7 +23,7 @@ class TrainingData:
 
     frames: Frames | OwnImages
     held_out: Frames | None
-    camera: Camera
+    camera: CameraParameters
     about: dict[str, Any]
 
 
@@ -89,9 +90,8 @@ def round_material(dataset: Dataset, *, skip_undecodable: bool = False) -> Train
     if skip_undecodable and held_out is not None:
         held_out, more = decodable(held_out, dataset.path)
         left_out += more
-    camera = Camera(**dataset.camera.as_dict())  # type: ignore[arg-type]  # sizes are int
     about = describe_data(dataset, frames, held_out)
-    return TrainingData(frames, held_out, camera, {**about, "undecodable": left_out})
+    return TrainingData(frames, held_out, dataset.camera, {**about, "undecodable": left_out})
 
 
 def continued(material: TrainingData, card: ModelCard) -> TrainingData:

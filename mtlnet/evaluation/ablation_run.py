@@ -37,7 +37,6 @@ from mtlnet.evaluation.ablation import (
 )
 from mtlnet.evaluation.evaluate import evaluate
 from mtlnet.inference.engine import load_engine
-from mtlnet.inference.model_card import Camera
 from mtlnet.model.architecture import find_plan
 from mtlnet.training.config import TrainConfig
 from mtlnet.training.logging import CURVES, read_curves
@@ -158,8 +157,9 @@ def step_seconds(
     if speeds:
         return config.batch / statistics.median(speeds)
     recipe, plan = find_recipe(config.recipe), find_plan(network)
-    camera = Camera(**dataset.camera.as_dict())  # type: ignore[arg-type]  # sizes are int
-    loader = Loader(dataset.select("train"), camera, config.batch, 0, augment=recipe.augment)
+    loader = Loader(
+        dataset.select("train"), dataset.camera, config.batch, 0, augment=recipe.augment
+    )
     device = choose_device(config.device)
     trainer = Trainer(recipe, plan.default_alpha, 0, device, plan)
     trainer.standardise(loader)

@@ -17,7 +17,6 @@ import trackfeatures as tf
 from datagen.recording import Frames
 from mtlnet.evaluation.metrics import Numbers, signed_errors
 from mtlnet.evaluation.slices import GROUPS
-from mtlnet.inference.model_card import CENTRE_HEIGHT_M
 from mtlnet.inference.overlay import draw_answer
 from mtlnet.inference.prediction import OUTPUTS, Prediction, decode_outputs
 from mtlnet.inference.uncertainty import FEATURES
@@ -267,7 +266,7 @@ def figures(frames: Frames, outputs: NDArray[np.float32], chosen: list[Worst]) -
         image = draw_answer(
             frames.image(one.row),
             camera,
-            camera.z + CENTRE_HEIGHT_M,
+            camera.height_above_road_m,
             float(labels.curvature[one.row]),
             (dict(zip(tf.MARKINGS, truth, strict=True)), float(labels.angle[one.row])),
             (answer.distances_m, answer.angle_rad),

@@ -20,7 +20,6 @@ from mtlnet.inference.model_card import (
     GRAPH_WEIGHTS,
     MODEL_FILES,
     WEIGHTS,
-    Camera,
     ModelCard,
     ModelError,
     file_hash,
@@ -30,6 +29,7 @@ from mtlnet.inference.prediction import OUTPUTS
 from mtlnet.inference.uncertainty import FittedDoubt, UncertaintyHead, texture, write_doubt
 from mtlnet.model.network import HEIGHT, WIDTH, Network, answer_images, describe_images, fold
 from runtime.files import atomic_write
+from trackfeatures.camera import CameraParameters
 
 PACKAGES = ("driverview", "torch", "openvino", "numpy")
 
@@ -39,7 +39,7 @@ def publish(
     run: Path,
     images: NDArray[np.uint8],
     *,
-    camera: Camera | None = None,
+    camera: CameraParameters | None = None,
     alpha: tuple[float, float, float] = (0.3, 0.2, 0.5),
     recipe: str = "fast",
     iterations: int = 0,
@@ -73,7 +73,7 @@ def publish(
         network=folded.plan.name,
         definitions_version=tf.VERSION,
         program_version=package_versions()["driverview"],
-        camera=camera or Camera(),
+        camera=camera or CameraParameters(),
         alpha=alpha,
         recipe=recipe,
         iterations=iterations,

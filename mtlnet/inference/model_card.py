@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runtime.files import atomic_write
+from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError, require_version
 
 RUNS = Path("runs")
@@ -26,25 +27,8 @@ MODEL_FILES = (WEIGHTS, GRAPH, GRAPH_WEIGHTS)
 FORMAT = 4  # 2: `network`; 3: `doubt`; 4: how the camera is aimed
 
 
-CENTRE_HEIGHT_M = 0.25
-"""Of the car's centre of gravity over the road; the camera's place is told from there."""
-
-
 class ModelError(UserError):
     """A model that is missing, unfinished, damaged or not for this image."""
-
-
-@dataclass(frozen=True)
-class Camera:
-    """The camera the model saw through: pixels, degrees, and metres from the centre of gravity."""
-
-    width: int = 280
-    height: int = 210
-    fov_y_deg: float = 67.5
-    x: float = 0.75
-    y: float = 0.0
-    z: float = 0.95
-    pitch_deg: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -55,7 +39,7 @@ class ModelCard:
     network: str  # of `mtlnet.model.architecture.PLANS`
     definitions_version: str
     program_version: str
-    camera: Camera
+    camera: CameraParameters
     alpha: tuple[float, float, float]
     recipe: str
     iterations: int
@@ -103,7 +87,7 @@ def read_card(run: Path) -> ModelCard:
         if found != FORMAT:
             raise ModelError(f"{path} has format {found}, this program reads {FORMAT}; train anew")
         values = {field.name: content[field.name] for field in fields(ModelCard)}
-        values["camera"] = Camera(**values["camera"])
+        values["camera"] = CameraParameters(**values["camera"])
         values["alpha"] = tuple(values["alpha"])
         values["golden"] = tuple(values["golden"])
         card = ModelCard(**values)

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from datagen.recording import CameraInfo
+from trackfeatures.camera import CameraParameters
 
 Image = NDArray[np.uint8]
 Distances = Mapping[str, float | None]
@@ -32,10 +32,10 @@ def marking_line(distance: float, angle: float, curvature: float) -> NDArray[np.
 
 
 def to_pixels(
-    points: NDArray[np.float64], camera: CameraInfo, height_m: float
+    points: NDArray[np.float64], camera: CameraParameters, height_m: float
 ) -> NDArray[np.int32]:
     """Where the camera, `height_m` over the road, sees road points (N, 2) of the car frame."""
-    focal = camera.height / 2 / math.tan(math.radians(camera.fov_y_deg) / 2)
+    focal = camera.focal_px
     ahead, left = points[:, 0] - camera.x, points[:, 1] - camera.y
     pitch = math.radians(camera.pitch_deg)  # positive looks down
     depth = ahead * math.cos(pitch) + height_m * math.sin(pitch)
@@ -47,7 +47,7 @@ def to_pixels(
 
 def draw_answer(
     frame: Image,
-    camera: CameraInfo,
+    camera: CameraParameters,
     height_m: float,
     curvature: float,
     truth: tuple[Distances, float],

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from mtlnet.data.augment.pipeline import homography
 from mtlnet.data.loader import Images
-from mtlnet.inference.model_card import Camera
 from mtlnet.inference.uncertainty import (
     BANDS,
     CELLS,
@@ -27,6 +26,7 @@ from mtlnet.inference.uncertainty import (
     ROWS_OF_CELLS,
     texture,
 )
+from trackfeatures.camera import CameraParameters
 
 MOST_PITCH_RAD, MOST_WIDER = 0.26, 0.5
 """15 degrees, and so many times wider or narrower as a logarithm of the tangent."""
@@ -47,7 +47,7 @@ class Layer:
     bias: Numbers
 
 
-def draw_aim(camera: Camera, rng: np.random.Generator) -> tuple[float, float]:
+def draw_aim(camera: CameraParameters, rng: np.random.Generator) -> tuple[float, float]:
     """Another aim: pitch (rad, down) and width (logarithm); the middle shows only what is there."""
     while True:
         pitch = rng.uniform(-MOST_PITCH_RAD, MOST_PITCH_RAD)
@@ -56,7 +56,7 @@ def draw_aim(camera: Camera, rng: np.random.Generator) -> tuple[float, float]:
             return pitch, wider
 
 
-def aimed(camera: Camera, pitch: float, wider: float) -> NDArray[np.float64]:
+def aimed(camera: CameraParameters, pitch: float, wider: float) -> NDArray[np.float64]:
     """Where pixels go, (3, 3), when the camera looks `pitch` (rad) further down and sees
     exp(`wider`) times as far to the sides."""
     across, down = (camera.width - 1) / 2, (camera.height - 1) / 2
@@ -66,7 +66,7 @@ def aimed(camera: Camera, pitch: float, wider: float) -> NDArray[np.float64]:
     return moved
 
 
-def _within(camera: Camera, pitch: float, wider: float) -> bool:
+def _within(camera: CameraParameters, pitch: float, wider: float) -> bool:
     band = camera.height // (ROWS_OF_CELLS * BANDS)
     cell = camera.width // COLUMNS_OF_CELLS
     # One pixel more: differences reach to the next.
@@ -79,7 +79,7 @@ def _within(camera: Camera, pitch: float, wider: float) -> bool:
     return bool(inside.all() and (w > 0).all())
 
 
-def turn_frames(frames: Images, camera: Camera, seed: int) -> tuple[Numbers, Numbers]:
+def turn_frames(frames: Images, camera: CameraParameters, seed: int) -> tuple[Numbers, Numbers]:
     """Middles (N, M) of frames seen by other cameras, and how far down these look (N,), rad."""
     rng = np.random.default_rng([seed, 4])
     chosen = np.linspace(0, len(frames) - 1, min(FRAMES, len(frames))).astype(np.int64)

@@ -22,7 +22,6 @@ from mtlnet.data.loader import Images
 from mtlnet.evaluation.metrics import coverage, signed_errors
 from mtlnet.export.openvino_graph import describing_graph
 from mtlnet.inference.engine import best_precision
-from mtlnet.inference.model_card import Camera
 from mtlnet.inference.prediction import OUTPUTS
 from mtlnet.inference.uncertainty import (
     CELLS,
@@ -34,6 +33,7 @@ from mtlnet.inference.uncertainty import (
 )
 from mtlnet.model.network import HEIGHT, WIDTH, Network
 from mtlnet.uncertainty_fit.camera_pitch import fit_aim, turn_frames
+from trackfeatures.camera import CameraParameters
 
 HELD_OUT_SHARE = 1 / 12
 LEAST_ROUNDS = 8
@@ -101,7 +101,7 @@ def fit_doubt(
     learned: Images,
     held_out: Images | None,
     seed: int,
-    camera: Camera | None = None,
+    camera: CameraParameters | None = None,
 ) -> FittedDoubt:
     """The second head of `network` (folded), fitted on frames held out of its training.
 
@@ -117,7 +117,7 @@ def fit_doubt(
     seen, limits = known.texture, None if judged is None else judged.texture
     if limits is None:  # without any, every second one of the known
         seen, limits = seen[::2], seen[1::2]
-    turned = turn_frames(learned, camera or Camera(), seed)
+    turned = turn_frames(learned, camera or CameraParameters(), seed)
     aim = fit_aim(seen[:, CELLS:], turned, limits[:, CELLS:], FALSE_ALARMS / 2, seed)
     torch.set_num_threads(threads)
     usual, directions = novelty(seen[:, :CELLS], limits[:, :CELLS], FALSE_ALARMS / 2)

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-from mtlnet.inference.image_decoding.crop import View, visible
+from mtlnet.inference.image_decoding.crop import visible
 from mtlnet.inference.image_decoding.decode import decode, inspect
 from mtlnet.inference.image_decoding.errors import ImageError
 from serve.api.http_io import (
@@ -31,6 +31,7 @@ from serve.observability.logs import Refusals, tell_answer
 from serve.observability.metrics import Metrics
 from serve.scheduling.frame_queue import Done, Frame, FrameQueue, Perceived, Reader
 from serve.scheduling.streams import stream_key
+from trackfeatures.camera import CameraParameters
 
 SMALL_PIXELS = 640 * 480  # decoded in a millisecond or two
 
@@ -202,7 +203,9 @@ def client_of(scope: Scope) -> str:
     return client[0] if client else ""
 
 
-def crop_of(width: int, height: int, view: View, fov_y_deg: float | None) -> list[int] | None:
+def crop_of(
+    width: int, height: int, view: CameraParameters, fov_y_deg: float | None
+) -> list[int] | None:
     """[left, top, width, height] of what the model sees of a picture, px; None: all of it."""
     box = visible(width, height, view, fov_y_deg)
     return None if box is None else [box.left, box.top, box.width, box.height]

@@ -24,10 +24,10 @@ from numpy.typing import NDArray
 
 import trackfeatures as tf
 from mtlnet.inference.engine import Engine
-from mtlnet.inference.model_card import Camera
 from mtlnet.inference.prediction import Prediction, decode_outputs
 from serve.api.problems import DEADLINE_PASSED, NOT_READY, OVERLOADED, SUPERSEDED, Problem
 from serve.scheduling.streams import Streams
+from trackfeatures.camera import CameraParameters
 
 SMOOTHING = 0.1  # weight of the latest frame in the mean time a frame takes
 QUICK_MS = 10.0  # for so long the event loop may be kept from everything else
@@ -35,7 +35,7 @@ FULL_PAUSE_S = 0.002  # between two looks at who has come, while all of them are
 QUICK_RUN = 8  # frames in a row that took no longer, before it is trusted with one
 logger = logging.getLogger(__name__)
 
-Reader = Callable[[Camera], NDArray[np.uint8]]
+Reader = Callable[[CameraParameters], NDArray[np.uint8]]
 Done = Callable[["Perceived | Exception"], None]
 
 

@@ -1,7 +1,7 @@
 """Pictures of the simulated road: the camera, its light and its mounts."""
 
 from simulator.camera.core.camera import Camera, check_size
-from simulator.camera.core.optics import VIEWS, Mount, intrinsics
+from simulator.camera.core.optics import VIEWS
 from simulator.camera.core.render_modes import CLASSES, PICTURE_KINDS
 from simulator.camera.scene.light import KINDS, Light, check_light
 
@@ -12,8 +12,6 @@ __all__ = [
     "VIEWS",
     "Camera",
     "Light",
-    "Mount",
     "check_light",
     "check_size",
-    "intrinsics",
 ]

@@ -23,6 +23,7 @@ from simulator.camera.core.render_modes import CLASS, CLASSES, COLOUR, DEPTH, Vi
 from simulator.camera.scene.light import KINDS, Light, check_light
 from simulator.track.road import Road
 from simulator.vehicle.car import CarParameters
+from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
 
 FloatArray = NDArray[np.float64]
@@ -79,7 +80,7 @@ def write_contact_sheet(
     pictures: list[Picture | None] = [None] * len(shots)
     for kind in dict.fromkeys(shot.light for shot in shots):
         drawn = Light.named(kind, np.random.default_rng([seed, 11]))
-        with Camera(road, seed=seed, light=drawn, width=WIDTH, height=HEIGHT) as camera:
+        with Camera(road, CameraParameters(WIDTH, HEIGHT), seed=seed, light=drawn) as camera:
             for k, shot in enumerate(shots):
                 if shot.light == kind:
                     rng = np.random.default_rng([seed, 12, k])

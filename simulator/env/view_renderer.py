@@ -2,7 +2,7 @@
 
 import weakref
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 from simulator.track.road import Road
 from simulator.vehicle.state import CarState
 from simulator.world.world import World
+from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
 
 if TYPE_CHECKING:
-    from simulator.camera import Camera, Mount
+    from simulator.camera import Camera
 
 
 @dataclass(frozen=True)
@@ -28,8 +29,9 @@ class PictureOptions:
     """A kind of light and weather by its name."""
 
     light_seed: int = 0
-    mount: "Mount | None" = None
-    """Place, pitch and lens of the driver camera; None is the driver's seat."""
+    mount: CameraParameters | None = None
+    """Place, pitch and lens of the driver camera, whose size is `width` and `height`; None is the
+    driver's seat."""
 
     render_view: str = "front"
     """The view in colour that `render()` shows."""
@@ -43,6 +45,11 @@ class PictureOptions:
             raise UserError(
                 f"render_view is {self.render_view!r}; the views are {', '.join(VIEWS)}"
             )
+
+    @property
+    def camera(self) -> CameraParameters:
+        mount = self.mount or CameraParameters()
+        return replace(mount, width=self.width, height=self.height)
 
 
 class Pictures:
@@ -96,26 +103,19 @@ class Pictures:
     def calibration(self, views: Sequence[str]) -> dict[str, NDArray[np.float64]]:
         """`intrinsics` (3, 3) in pixels, and by each view's name its extrinsics (4, 4), from the
         body frame to the camera's; see `Camera.extrinsics`. Draws nothing."""
-        from simulator.camera.core.optics import extrinsics, intrinsics
+        from simulator.camera.core.optics import extrinsics
         from simulator.camera.core.render_modes import ViewRequest
 
-        mount = self._mount
-        height, width, _ = self.shape
+        camera = self._options.camera
         at_rest = np.zeros(6)
-        by_view = {view: extrinsics(mount, at_rest, ViewRequest.of(view).view) for view in views}
-        return {"intrinsics": intrinsics(mount, width, height)} | by_view
-
-    @property
-    def _mount(self) -> "Mount":
-        from simulator.camera import Mount
-
-        return self._options.mount or Mount()
+        by_view = {view: extrinsics(camera, at_rest, ViewRequest.of(view).view) for view in views}
+        return {"intrinsics": camera.intrinsics()} | by_view
 
     @property
     def camera(self) -> "Camera":
         """The camera; making it draws the scenery and takes a moment."""
         if self._camera is None:
-            self._camera = _make_camera(self._road, self._options, self._mount)
+            self._camera = _make_camera(self._road, self._options)
             # Graphics memory of an environment that is dropped without close() comes back too.
             weakref.finalize(self, self._camera.close).atexit = False
         return self._camera
@@ -128,15 +128,8 @@ class Pictures:
         self._drawn = {}
 
 
-def _make_camera(road: Road, options: PictureOptions, mount: "Mount") -> "Camera":
+def _make_camera(road: Road, options: PictureOptions) -> "Camera":
     from simulator.camera import Camera, Light  # the renderer only where images are
 
     light = Light.named(options.light, np.random.default_rng([options.light_seed, 2]))
-    return Camera(
-        road,
-        seed=options.light_seed,
-        light=light,
-        mount=mount,
-        width=options.width,
-        height=options.height,
-    )
+    return Camera(road, options.camera, seed=options.light_seed, light=light)

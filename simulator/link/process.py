@@ -21,6 +21,7 @@ from simulator.track.catalogue import find_track
 from simulator.track.road import Road
 from simulator.world.world import World
 from trackfeatures import LANE_WIDTH_M
+from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
 
 if TYPE_CHECKING:
@@ -122,4 +123,4 @@ def _camera(road: Road, config: LinkConfig) -> "Camera":
 
     light = Light.named(config.light, np.random.default_rng([config.seed, 2]))
     width, height = config.picture
-    return Camera(road, seed=config.seed, light=light, width=width, height=height)
+    return Camera(road, CameraParameters(width, height), seed=config.seed, light=light)

@@ -9,6 +9,7 @@ import simplejpeg
 from simulator.camera import Camera, Light, check_light
 from simulator.track.road import Road
 from simulator.world.world import World
+from trackfeatures.camera import CameraParameters
 
 SIZE: Final = (560, 420)
 """Width, height: twice the driver view's pixels each way."""
@@ -36,9 +37,8 @@ class Pictures:
         if self._camera is None:
             light = Light.named(self.light, np.random.default_rng([self._seed, 2]))
             width, height = SIZE
-            self._camera = Camera(
-                self.road, seed=self._seed, light=light, width=width, height=height
-            )
+            camera = CameraParameters(width, height)
+            self._camera = Camera(self.road, camera, seed=self._seed, light=light)
         return self._camera
 
     def take(self, world: World, views: Sequence[str]) -> dict[str, bytes]:

@@ -1,4 +1,4 @@
-"""Perception: reading answers, refusing what is none, and seeing through a model's camera."""
+"""Perception: parsing predictions, refusing malformed ones, rendering the model's camera."""
 
 from typing import Any
 
@@ -6,11 +6,19 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from controllers.perception import CameraPerception, Perceived, Service, open_eyes, read_answer
+from controllers.perception import (
+    CameraPerception,
+    Perceived,
+    ServiceModel,
+    open_perception,
+    parse_camera,
+    parse_prediction,
+)
 from simulator.track.catalogue import find_track
 from simulator.track.road import Road
 from simulator.world.world import World
 from trackfeatures import VERSION, DefinitionsMismatch, Heading, UserError
+from trackfeatures.camera import CameraParameters
 
 ANSWER: dict[str, Any] = {
     "distances_m": {"ml": -1.5, "mr": 2.5, "l": None, "m": None, "r": None},
@@ -24,7 +32,7 @@ CAMERA = {
 
 
 class FakeClient:
-    """Stands for `serve.client.Client`."""
+    """Replaces `serve.client.Client`."""
 
     card: dict[str, Any] = {"definitions_version": VERSION, "camera": CAMERA}  # noqa: RUF012  # replaced whole
     bodies: list[bytes] = []  # noqa: RUF012  # emptied by the test
@@ -51,9 +59,9 @@ def client(monkeypatch: pytest.MonkeyPatch) -> type[FakeClient]:
     return FakeClient
 
 
-def test_an_answer_is_read() -> None:
-    assert read_answer(ANSWER) == Perceived(0.5, -0.03, Heading.RIGHT)
-    assert read_answer({**ANSWER, "to_lane_centre_m": None}).to_lane_centre is None
+def test_a_prediction_is_parsed() -> None:
+    assert parse_prediction(ANSWER) == Perceived(0.5, -0.03, Heading.RIGHT)
+    assert parse_prediction({**ANSWER, "to_lane_centre_m": None}).to_lane_centre is None
 
 
 @pytest.mark.parametrize(
@@ -70,41 +78,41 @@ def test_an_answer_is_read() -> None:
         {**ANSWER, "heading": {**ANSWER["heading"], "left": float("nan")}},
     ],
 )
-def test_what_is_no_answer_is_refused(answer: dict[str, Any]) -> None:
+def test_a_malformed_prediction_is_refused(answer: dict[str, Any]) -> None:
     with pytest.raises(UserError, match="perception service"):
-        read_answer(answer)
+        parse_prediction(answer)
 
 
-def test_a_service_gets_a_jpeg(client: type[FakeClient]) -> None:
-    service = Service("http://127.0.0.1:8000/features")
+def test_an_image_is_sent_to_the_service_as_jpeg(client: type[FakeClient]) -> None:
+    service = ServiceModel("http://127.0.0.1:8000/features")
     assert client.url == "http://127.0.0.1:8000"
     image: NDArray[np.uint8] = np.full((63, 84, 3), 90, np.uint8)
-    assert service.look(image) == ANSWER
+    assert service.predict(image) == ANSWER
     assert client.bodies[0][:2] == b"\xff\xd8"
-    assert service.camera == CAMERA
+    assert service.camera == CameraParameters(width=84, height=63)
 
 
-def test_a_service_of_other_definitions_is_refused(
+def test_a_service_with_other_definitions_or_no_camera_is_refused(
     client: type[FakeClient], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(client, "card", {"definitions_version": "0", "camera": CAMERA})
     with pytest.raises(DefinitionsMismatch):
-        Service("http://127.0.0.1:8000")
+        ServiceModel("http://127.0.0.1:8000")
     monkeypatch.setattr(client, "card", {"definitions_version": VERSION})
     with pytest.raises(UserError, match="camera"):
-        Service("http://127.0.0.1:8000")
+        ServiceModel("http://127.0.0.1:8000")
 
 
-def test_the_camera_is_that_of_the_model(client: type[FakeClient]) -> None:
-    """A rendered picture of the model's size, encoded for the service, comes back as features."""
+def test_images_are_rendered_with_the_models_camera(client: type[FakeClient]) -> None:
+    """An image of the model's size is rendered, encoded and sent; the answer is parsed."""
     with World(Road(find_track("oval"))) as world:
         world.reset(seed=0)
-        eyes = open_eyes(
+        source = open_perception(
             "http://127.0.0.1:8000", world, model="latest", lane_centre=0.0, light="clear", seed=0
         )
-        with eyes:
-            assert isinstance(eyes.perceive, CameraPerception)
-            assert eyes.perceive(world) == Perceived(0.5, -0.03, Heading.RIGHT)
+        with source:
+            assert isinstance(source.perceive, CameraPerception)
+            assert source.perceive(world) == Perceived(0.5, -0.03, Heading.RIGHT)
     import simplejpeg
 
     picture = simplejpeg.decode_jpeg(client.bodies[0])
@@ -112,8 +120,16 @@ def test_the_camera_is_that_of_the_model(client: type[FakeClient]) -> None:
     assert picture.std() > 10  # a scene, not a blank
 
 
+@pytest.mark.parametrize(
+    "camera", [None, {}, {**CAMERA, "x": "far"}, {**CAMERA, "fov_y_deg": 180.0}]
+)
+def test_a_malformed_camera_is_refused(camera: Any) -> None:
+    with pytest.raises(UserError, match="model card gives no usable camera"):
+        parse_camera(camera)
+
+
 @pytest.mark.parametrize("word", ["modle", "", "Truth"])
-def test_an_unknown_perception_is_named(word: str) -> None:
+def test_an_unknown_perception_is_refused(word: str) -> None:
     expected = pytest.raises(UserError, match="give truth, model, or the address")
     with World(Road(find_track("oval"))) as world, expected:
-        open_eyes(word, world, model="latest", lane_centre=0.0, light="clear", seed=0)
+        open_perception(word, world, model="latest", lane_centre=0.0, light="clear", seed=0)

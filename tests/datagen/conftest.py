@@ -12,7 +12,6 @@ import pytest
 
 import trackfeatures as tf
 from datagen.cli import main as datagen_main
-from datagen.recording.camera import CameraInfo
 from datagen.recording.folder import RoundState, file_sha256, partial_path, prepare, publish
 from datagen.recording.frame import DriverCommand, EgoState, Frame, RoadPlace, SensorReadings
 from datagen.recording.manifest import rebuild
@@ -20,9 +19,10 @@ from datagen.recording.mcap.writer import RoundWriter
 from datagen.recording.round_metadata import RoundHeader, RoundResult
 from datagen.recording.splits import Split
 from tests.datagen.commands import SHORT, datagen
+from trackfeatures.camera import CameraParameters
 
 LANES = 2
-CAMERA = CameraInfo(width=56, height=42)
+CAMERA = CameraParameters(width=56, height=42)
 
 
 FRAMES = 45

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mtlnet.inference.model_card import Camera
+from trackfeatures.camera import CameraParameters
 
 WIDTH, HEIGHT = 280, 210
 Image = NDArray[np.uint8]
@@ -89,7 +89,9 @@ def interior(rng: np.random.Generator) -> Image:
     return cv2.GaussianBlur(image, (3, 3), 0).astype(np.uint8)
 
 
-def seen_by(image: Image, camera: Camera, fov_y_deg: float, pitch_deg: float = 0.0) -> Image:
+def seen_by(
+    image: Image, camera: CameraParameters, fov_y_deg: float, pitch_deg: float = 0.0
+) -> Image:
     """What a camera of another field of view and pitch (down positive) sees in the same place.
 
     Exact where it looks at what `image` shows; its border is drawn out beyond.
@@ -103,7 +105,7 @@ def seen_by(image: Image, camera: Camera, fov_y_deg: float, pitch_deg: float = 0
     return cv2.warpPerspective(image, warp, size, borderMode=cv2.BORDER_REPLICATE).astype(np.uint8)
 
 
-def _intrinsics(camera: Camera, fov_y_deg: float) -> NDArray[np.float64]:
+def _intrinsics(camera: CameraParameters, fov_y_deg: float) -> NDArray[np.float64]:
     focal = camera.height / 2 / np.tan(np.radians(fov_y_deg) / 2)
     return np.array([[focal, 0, camera.width / 2], [0, focal, camera.height / 2], [0, 0, 1]])
 

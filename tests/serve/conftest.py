@@ -19,12 +19,13 @@ from numpy.typing import NDArray
 
 import trackfeatures as tf
 from mtlnet.inference.engine import Engine
-from mtlnet.inference.model_card import WEIGHTS, Camera, ModelCard, golden_image
+from mtlnet.inference.model_card import WEIGHTS, ModelCard, golden_image
 from runtime.sockets import bind
 from serve.app import Service
 from serve.config import Limits
 from serve.server.worker_server import WorkerServer
 from serve.workers.shared_memory import BlockPeers, Shared
+from trackfeatures.camera import CameraParameters
 
 if TYPE_CHECKING:
     from opentelemetry.trace import Tracer
@@ -33,7 +34,7 @@ CARD = ModelCard(
     name="fake",
     definitions_version=tf.VERSION,
     program_version="0",
-    camera=Camera(),
+    camera=CameraParameters(),
     alpha=(0.3, 0.2, 0.5),
     network="mtl",
     recipe="fast",

@@ -20,12 +20,13 @@ from websockets.sync.client import connect
 import trackfeatures as tf
 from mtlnet.inference.engine import Engine, load_engine
 from mtlnet.inference.image_decoding.decode import decode, inspect
-from mtlnet.inference.model_card import Camera, golden_image
+from mtlnet.inference.model_card import golden_image
 from mtlnet.inference.prediction import decode_outputs
 from serve.client import Client
 from serve.scheduling.warmup import TOLERANCE
 from tests.serve.conftest import jpeg, picture, serving, until
 from tests.serve.test_cli import address, started
+from trackfeatures.camera import CameraParameters
 
 JPEG = jpeg(picture())
 INFER = "/v2/models/track/infer"
@@ -191,7 +192,7 @@ def oracle(lively: Path) -> Engine:
 
 def seen(image: bytes) -> NDArray[np.uint8]:
     """What an engine gets to see of an image."""
-    camera = Camera()
+    camera = CameraParameters()
     return decode(image, inspect(image, camera), camera)
 
 

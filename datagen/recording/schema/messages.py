@@ -17,7 +17,6 @@ from google.protobuf.timestamp_pb2 import Timestamp
 from numpy.typing import NDArray
 
 import trackfeatures as tf
-from datagen.recording.camera import CameraInfo
 from datagen.recording.frame import DriverCommand, EgoState, Frame, SensorReadings
 from datagen.recording.mcap.protobuf_wire import points_field
 from datagen.recording.schema.proto.driverview_pb2 import (
@@ -27,6 +26,7 @@ from datagen.recording.schema.proto.driverview_pb2 import (
     VehicleState,
 )
 from datagen.recording.schema.topics import NANOSECONDS
+from trackfeatures.camera import CameraParameters
 
 WORLD, EGO, CAMERA_FRAME = "world", "ego", "camera_front"
 EGO_SIZE = (4.52, 1.94, 1.10)
@@ -49,8 +49,8 @@ def compressed_image(data: bytes, codec: str, time: Timestamp) -> bytes:
     return _bytes(CompressedImage(timestamp=time, frame_id=CAMERA_FRAME, data=data, format=codec))
 
 
-def calibration(camera: CameraInfo, time: Timestamp) -> bytes:
-    k = camera.intrinsics
+def calibration(camera: CameraParameters, time: Timestamp) -> bytes:
+    k = camera.intrinsics()
     projection = np.hstack([k, np.zeros((3, 1))])
     return _bytes(
         CameraCalibration(
@@ -178,7 +178,7 @@ def track_scene(lines: Mapping[str, NDArray[np.float64]], time: Timestamp) -> by
     return _bytes(message)
 
 
-def transforms(ego: EgoState, camera: CameraInfo, time: Timestamp) -> bytes:
+def transforms(ego: EgoState, camera: CameraParameters, time: Timestamp) -> bytes:
     message = FrameTransforms()
     _add_transform(
         message, WORLD, EGO, (ego.x, ego.y, ego.z), quaternion(ego.roll, ego.pitch, ego.yaw), time

@@ -10,19 +10,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 import trackfeatures as tf
-from mtlnet.inference.model_card import CENTRE_HEIGHT_M, Camera
+from trackfeatures.camera import CameraParameters
 
 FURTHEST_M = 0.6
 
 
-def shift_lateral(image: NDArray[np.uint8], camera: Camera, metres: float) -> None:
+def shift_lateral(image: NDArray[np.uint8], camera: CameraParameters, metres: float) -> None:
     """Move the camera of an image (H, W, 3) to the left by `metres`, in place."""
     tilt = np.radians(camera.pitch_deg)
-    focal = camera.height / 2 / np.tan(np.radians(camera.fov_y_deg) / 2)
+    focal = camera.focal_px
     horizon = (camera.height - 1) / 2 - focal * np.tan(tilt)
     first = max(int(np.ceil(horizon)), 0)
     road = image[first:]
-    shear = metres * np.cos(tilt) / (camera.z + CENTRE_HEIGHT_M)
+    shear = metres * np.cos(tilt) / camera.height_above_road_m
     matrix = np.array([[1.0, shear, shear * (first - horizon)], [0.0, 1.0, 0.0]])
     # What comes into view is bare road: mirrored, a marking would turn round at the border.
     bare = image[-1].mean(0).tolist()

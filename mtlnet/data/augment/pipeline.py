@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 import trackfeatures as tf
 from mtlnet.data.augment.geometric import metres_aside, shift_lateral
 from mtlnet.data.augment.shadows import SHADES, shade
-from mtlnet.inference.model_card import Camera
+from trackfeatures.camera import CameraParameters
 
 # Of the images. Few: a run of an hour sees each frame some five times, and with twice as much of
 # all this it learned less, on frames of its own as well as on others.
@@ -85,7 +85,9 @@ def fit_to(changes: AugmentParams, distances: NDArray[np.float32]) -> AugmentPar
     return replace(changes, aside=metres_aside(changes.aside, distances))
 
 
-def change_images(images: NDArray[np.uint8], changes: AugmentParams, camera: Camera) -> None:
+def change_images(
+    images: NDArray[np.uint8], changes: AugmentParams, camera: CameraParameters
+) -> None:
     """Change images (B, H, W, 3) as a camera's picture comes about: scene, light, lens, file."""
     for row, image in enumerate(images):
         if changes.aside[row]:
@@ -119,7 +121,7 @@ def turns() -> NDArray[np.float64]:
     return np.vstack([np.zeros(2), drawn])
 
 
-def turn(image: NDArray[np.uint8], camera: Camera, which: int) -> None:
+def turn(image: NDArray[np.uint8], camera: CameraParameters, which: int) -> None:
     """Turn the camera by turn number `which`.
 
     Exact up to the border: a turn about the optical centre is a homography, whatever the scene.
@@ -130,7 +132,7 @@ def turn(image: NDArray[np.uint8], camera: Camera, which: int) -> None:
 
 
 @lru_cache(maxsize=TURNS)
-def sources(camera: Camera, which: int) -> tuple[NDArray[np.int16], NDArray[np.uint16]]:
+def sources(camera: CameraParameters, which: int) -> tuple[NDArray[np.int16], NDArray[np.uint16]]:
     """Where each pixel of a turned image comes from, as OpenCV's fixed-point maps."""
     back = np.linalg.inv(homography(camera, *turns()[which].tolist()))
     columns, rows = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
@@ -171,7 +173,7 @@ def changed_labels(
     angle: NDArray[np.float32],
     heading: NDArray[np.int64],
     changes: AugmentParams,
-    camera: Camera,
+    camera: CameraParameters,
 ) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
     """Coded targets (B, 6) and classes (B,) after the changes."""
     aside = (changes.aside * np.cos(angle)).astype(np.float32)
@@ -181,9 +183,9 @@ def changed_labels(
     return mirrored, np.where(chosen, tf.mirror_heading(heading), heading)
 
 
-def homography(camera: Camera, yaw: float, pitch: float = 0.0) -> NDArray[np.float64]:
+def homography(camera: CameraParameters, yaw: float, pitch: float = 0.0) -> NDArray[np.float64]:
     """Where pixels go, (3, 3), when the car turns left by `yaw` and the camera down by `pitch`."""
-    focal = camera.height / 2 / np.tan(np.radians(camera.fov_y_deg) / 2)
+    focal = camera.focal_px
     intrinsics = np.array(
         [[focal, 0, (camera.width - 1) / 2], [0, focal, (camera.height - 1) / 2], [0, 0, 1]]
     )
@@ -205,7 +207,7 @@ def turned_labels(
     distances: NDArray[np.float32],
     angle: NDArray[np.float32],
     yaw: NDArray[np.float64],
-    camera: Camera,
+    camera: CameraParameters,
 ) -> NDArray[np.float32]:
     """Coded targets (B, 6) after the turns `yaw` (B,): of a car whose camera stays where it is.
 

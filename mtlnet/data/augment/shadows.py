@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mtlnet.inference.model_card import CENTRE_HEIGHT_M, Camera
+from trackfeatures.camera import CameraParameters
 
 SHADES = 64  # shadows to choose from; the first is none
 DARKNESS = (0.3, 0.75)  # of the light, what a shadow takes
@@ -21,13 +21,13 @@ FURTHEST_M = 40.0  # beyond it a shadow is even
 FIELD = 1024  # cells a side
 
 
-def shade(image: NDArray[np.uint8], camera: Camera, which: int) -> None:
+def shade(image: NDArray[np.uint8], camera: CameraParameters, which: int) -> None:
     """Darken an image (H, W, 3) by shadow number `which`, in place."""
     cv2.multiply(image, shades(camera)[which], dst=image, scale=1 / 255)
 
 
 @lru_cache(maxsize=2)
-def shades(camera: Camera) -> NDArray[np.uint8]:
+def shades(camera: CameraParameters) -> NDArray[np.uint8]:
     """What is left of the light (SHADES, H, W, 3), 255 where there is no shadow."""
     rng = np.random.default_rng(0)
     ahead, aside = road_places(camera)
@@ -46,16 +46,16 @@ def shades(camera: Camera) -> NDArray[np.uint8]:
     return drawn
 
 
-def road_places(camera: Camera) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def road_places(camera: CameraParameters) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Which place of a flat road each pixel shows, (H, W) each: m ahead, m to the left.
 
     Above the horizon and far away: at least `FURTHEST_M` ahead.
     """
-    focal = camera.height / 2 / np.tan(np.radians(camera.fov_y_deg) / 2)
+    focal = camera.focal_px
     tilt = np.radians(camera.pitch_deg)
     rows, columns = np.mgrid[: camera.height, : camera.width].astype(np.float64)
     down = (rows - (camera.height - 1) / 2) * np.cos(tilt) + focal * np.sin(tilt)
-    height = camera.z + CENTRE_HEIGHT_M
+    height = camera.height_above_road_m
     depth = focal * height / np.maximum(down, focal * height / (2 * FURTHEST_M))
     return depth, -(columns - (camera.width - 1) / 2) * depth / focal
 

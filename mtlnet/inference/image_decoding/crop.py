@@ -7,24 +7,11 @@ one, and a picture that does not hold it is refused.
 
 from dataclasses import dataclass
 from math import radians, tan
-from typing import Protocol
 
 from mtlnet.inference.image_decoding.errors import Fault, ImageError
+from trackfeatures.camera import CameraParameters
 
 TOLERANCE = 0.01  # of width and height: rounding to whole pixels, and small errors of calibration
-
-
-class View(Protocol):
-    """What a model's camera shows: its picture's size, px, and vertical field of view, degrees."""
-
-    @property
-    def width(self) -> int: ...
-
-    @property
-    def height(self) -> int: ...
-
-    @property
-    def fov_y_deg(self) -> float: ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +24,9 @@ class Box:
     height: int
 
 
-def visible(width: int, height: int, view: View, fov_y_deg: float | None = None) -> Box | None:
+def visible(
+    width: int, height: int, view: CameraParameters, fov_y_deg: float | None = None
+) -> Box | None:
     """The part of a width x height picture that shows `view`; None: all of it does.
 
     `fov_y_deg` is the vertical field of view of the picture, None: the view's own. A pinhole camera
@@ -59,7 +48,9 @@ def visible(width: int, height: int, view: View, fov_y_deg: float | None = None)
     return Box((width - kept_columns) // 2, (height - kept_rows) // 2, kept_columns, kept_rows)
 
 
-def _too_narrow(width: int, height: int, view: View, fov_y_deg: float | None) -> ImageError:
+def _too_narrow(
+    width: int, height: int, view: CameraParameters, fov_y_deg: float | None
+) -> ImageError:
     shape = f"{view.width} x {view.height} ({view.width / view.height:.3f})"
     if fov_y_deg is None:
         return ImageError(

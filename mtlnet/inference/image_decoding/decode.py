@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 
 from mtlnet.inference.image_decoding import jpeg_structure as jpeg
 from mtlnet.inference.image_decoding import png_structure as png
-from mtlnet.inference.image_decoding.crop import View, visible
+from mtlnet.inference.image_decoding.crop import visible
 from mtlnet.inference.image_decoding.errors import Fault, ImageError
+from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
 
 MAX_FILE_BYTES = 32 << 20
@@ -34,7 +35,7 @@ class ImageHeader:
     png_header: png.PngHeader | None = None
 
 
-def read_image(path: Path, view: View) -> NDArray[np.uint8]:
+def read_image(path: Path, view: CameraParameters) -> NDArray[np.uint8]:
     """The JPEG or PNG at `path` as uint8 RGB (view.height, view.width, 3).
 
     Another size is scaled, a wider picture cropped; a narrower one is refused, for it does not
@@ -54,7 +55,7 @@ def read_image(path: Path, view: View) -> NDArray[np.uint8]:
         raise ImageError(error.fault, f"{path}: {error}") from error
 
 
-def inspect(body: bytes, view: View, fov_y_deg: float | None = None) -> ImageHeader:
+def inspect(body: bytes, view: CameraParameters, fov_y_deg: float | None = None) -> ImageHeader:
     """The header of an image that may be decoded for a model of this view.
 
     `fov_y_deg`: the image's own vertical field of view, None: the view's. Raises ImageError.
@@ -106,7 +107,7 @@ def check_size(width: int, height: int) -> None:
 
 
 def decode(
-    body: bytes, header: ImageHeader, view: View, fov_y_deg: float | None = None
+    body: bytes, header: ImageHeader, view: CameraParameters, fov_y_deg: float | None = None
 ) -> NDArray[np.uint8]:
     """The image as uint8 RGB (view.height, view.width, 3), cropped and area-averaged to it.
 
@@ -124,7 +125,9 @@ def decode(
     return fit(image, view, fov_y_deg)
 
 
-def fit(image: NDArray[np.uint8], view: View, fov_y_deg: float | None = None) -> NDArray[np.uint8]:
+def fit(
+    image: NDArray[np.uint8], view: CameraParameters, fov_y_deg: float | None = None
+) -> NDArray[np.uint8]:
     """An image (H, W, 3) cropped and scaled to (view.height, view.width, 3). Raises ImageError."""
     box = visible(image.shape[1], image.shape[0], view, fov_y_deg)
     if box is not None:

@@ -11,7 +11,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from simulator.camera.core import optics
 from simulator.camera.core.context import FRAME_BINDING, Graphics, graphics
-from simulator.camera.core.optics import DRIVER_SEAT, Mount
 from simulator.camera.core.render_modes import CLASS, COLOUR, DEPTH, ViewRequest
 from simulator.camera.scene.cars import cars_of
 from simulator.camera.scene.light import Light
@@ -21,12 +20,14 @@ from simulator.camera.scene.sky import Sky
 from simulator.camera.scene.terrain import Survey
 from simulator.track.road import Road
 from simulator.vehicle.car import CarParameters
+from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
 
 FloatArray = NDArray[np.float64]
 Picture = NDArray[Any]
 
 MAX_SIZE = 4096
+DRIVER_CAMERA = CameraParameters()
 _OWN_PAINT = 0
 
 
@@ -78,17 +79,16 @@ class Camera:
     def __init__(
         self,
         road: Road,
+        parameters: CameraParameters = DRIVER_CAMERA,
         *,
         seed: int,
         light: Light,
-        mount: Mount = DRIVER_SEAT,
-        width: int = 280,
-        height: int = 210,
         scenes: int = 1,
     ) -> None:
-        check_size(width, height)
-        self.road, self.mount = road, mount
-        self.width, self.height = width, height
+        check_size(parameters.width, parameters.height)
+        self.road, self.parameters = road, parameters
+        self.width, self.height = parameters.width, parameters.height
+        self.intrinsics: FloatArray = parameters.intrinsics()
         self._graphics: Graphics = graphics()
         self._cars = cars_of(self._graphics)
         self._survey = Survey.of(road)
@@ -117,7 +117,7 @@ class Camera:
     def _set_up(self, seed: int, light: Light) -> _Setting:
         graphics = self._graphics
         frame = np.concatenate([np.zeros(24), *_light_rows(light)]).astype(np.float32)
-        self._set_frame(frame, optics.eye_of(self.mount, np.zeros(6), "front"))
+        self._set_frame(frame, optics.eye_of(self.parameters, np.zeros(6), "front"))
         return _Setting(
             light,
             Scene(graphics, self.road, self._survey, seed, light),
@@ -173,7 +173,7 @@ class Camera:
     def _aim(self, body_pose: ArrayLike, others: ArrayLike | None, view: str) -> _Shot:
         """Point at a view and find what it may show."""
         setting = self._setting
-        eye = optics.eye_of(self.mount, body_pose, view)
+        eye = optics.eye_of(self.parameters, body_pose, view)
         self._set_frame(setting.frame, eye)
         planes = optics.frustum(eye, self.intrinsics)
         cars, paints = self._cars_in_view(body_pose, others, view)
@@ -204,11 +204,6 @@ class Camera:
         self._setting.scene.draw(shot.seen, labels=True)
         return target.labels()
 
-    @property
-    def intrinsics(self) -> FloatArray:
-        """Pinhole matrix (3, 3) in pixels; square pixels, principal point in the middle."""
-        return optics.intrinsics(self.mount, self.width, self.height)
-
     def extrinsics(self, view: str = "front", body_pose: ArrayLike = (0.0,) * 6) -> FloatArray:
         """Body frame to camera frame (4, 4): x right, y down, z ahead (the optical axis), metres.
 
@@ -216,13 +211,15 @@ class Camera:
         roll and pitch of `body_pose`. With `intrinsics` K, K @ (E @ point)[:3] is (u, v, 1) times
         the depth. Raises UserError for an unknown view.
         """
-        return optics.extrinsics(self.mount, body_pose, view)
+        return optics.extrinsics(self.parameters, body_pose, view)
 
     def project(
         self, points: ArrayLike, body_pose: ArrayLike, view: str = "front"
     ) -> tuple[FloatArray, FloatArray]:
         """Pixels (N, 2) (u right, v down; NaN behind the eye) and depth (N,) m of world points."""
-        return optics.project(optics.eye_of(self.mount, body_pose, view), self.intrinsics, points)
+        return optics.project(
+            optics.eye_of(self.parameters, body_pose, view), self.intrinsics, points
+        )
 
     def close(self) -> None:
         """Free the scenes' graphics memory; the camera draws no more."""

@@ -1,4 +1,4 @@
-"""Where the eye is and how it sees: mounts, views, pinhole projection.
+"""Where the eye is and how it sees: views, pinhole projection.
 
 Body frame: x ahead, y to the left, z up, origin at the centre of gravity; a body pose is
 (x, y, z, roll, pitch, yaw) as PyBullet's Euler angles (R = Rz Ry Rx, pitch positive nose down).
@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from runtime.jit import compiled
+from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
 
 FloatArray = NDArray[np.float64]
@@ -26,26 +27,6 @@ FAR_M = 6000.0
 _YAW_DEG = {"front": 0.0, "left": 90.0, "right": -90.0, "rear": 180.0}
 _CHASE_BACK_M, _CHASE_UP_M, _CHASE_PITCH_DEG = 7.5, 2.9, 12.0
 _TOP_UP_M = 24.0
-
-
-@dataclass(frozen=True)
-class Mount:
-    """Place of the driver camera in the body frame (m), its pitch (deg, nose down) and lens."""
-
-    x: float = 0.75
-    y: float = 0.0
-    z: float = 0.95
-    pitch_deg: float = 0.0
-    fov_y_deg: float = 67.5
-
-    def __post_init__(self) -> None:
-        if not 1.0 <= self.fov_y_deg <= 150.0:
-            raise UserError(
-                f"vertical field of view {self.fov_y_deg} deg; give one between 1 and 150 deg"
-            )
-
-
-DRIVER_SEAT = Mount()
 
 
 @dataclass(frozen=True)
@@ -71,7 +52,7 @@ def rotation(roll: float, pitch: float, yaw: float) -> FloatArray:
     )
 
 
-def eye_of(mount: Mount, body_pose: ArrayLike, view: str) -> Eye:
+def eye_of(camera: CameraParameters, body_pose: ArrayLike, view: str) -> Eye:
     """The eye of `view` on a car at `body_pose`. Raises UserError for an unknown view."""
     pose = np.asarray(body_pose, dtype=np.float64)
     yaw = float(pose[5])
@@ -85,8 +66,8 @@ def eye_of(mount: Mount, body_pose: ArrayLike, view: str) -> Eye:
     if view not in _YAW_DEG:
         raise UserError(f"unknown camera view '{view}'; the views are {', '.join(VIEWS)}")
     body = rotation(float(pose[3]), float(pose[4]), yaw)
-    turn = rotation(0.0, math.radians(mount.pitch_deg), math.radians(_YAW_DEG[view]))
-    return _eye(pose[:3] + body @ np.array([mount.x, mount.y, mount.z]), body @ turn)
+    turn = rotation(0.0, math.radians(camera.pitch_deg), math.radians(_YAW_DEG[view]))
+    return _eye(pose[:3] + body @ np.array([camera.x, camera.y, camera.z]), body @ turn)
 
 
 def _eye(place: FloatArray, turn: FloatArray) -> Eye:
@@ -95,16 +76,10 @@ def _eye(place: FloatArray, turn: FloatArray) -> Eye:
     return Eye(place, axes)
 
 
-def intrinsics(mount: Mount, width: int, height: int) -> FloatArray:
-    """Pinhole matrix (3, 3) in pixels."""
-    focal = height / 2 / math.tan(math.radians(mount.fov_y_deg) / 2)
-    return np.array([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
-
-
-def extrinsics(mount: Mount, body_pose: ArrayLike, view: str) -> FloatArray:
+def extrinsics(camera: CameraParameters, body_pose: ArrayLike, view: str) -> FloatArray:
     """Body frame to camera frame (x right, y down, z ahead) of `view`, (4, 4)."""
     pose = np.asarray(body_pose, dtype=np.float64)
-    eye = eye_of(mount, pose, view)
+    eye = eye_of(camera, pose, view)
     right, up, ahead = eye.axes
     turn = np.stack([right, -up, ahead])
     matrix = np.eye(4)

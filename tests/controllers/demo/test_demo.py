@@ -16,11 +16,11 @@ from controllers.demo.process import run_module
 from controllers.demo.report import verdicts
 from controllers.demo.run import DemoConfig, run_demo
 from controllers.demo.tables import print_tables
-from datagen.recording import CameraInfo
 from mtlnet.inference.overlay import SCALE, draw_answer, marking_line, to_pixels
 from trackfeatures import UserError
+from trackfeatures.camera import CameraParameters
 
-CAMERA = CameraInfo(width=200, height=100, fov_y_deg=90.0, x=0.0, y=0.0, z=1.0, pitch_deg=0.0)
+CAMERA = CameraParameters(width=200, height=100, fov_y_deg=90.0, x=0.0, y=0.0, z=1.0, pitch_deg=0.0)
 NOTHING = dict.fromkeys(("ml", "mr", "l", "m", "r"))
 
 

@@ -16,7 +16,7 @@ import trackfeatures as tf
 from datagen.execution.collect import collect, require_fitting
 from datagen.planning.plan import RoundPlan
 from datagen.recorder.job import RoundDone
-from datagen.recording import CameraInfo, Dataset
+from datagen.recording import Dataset
 from datagen.recording.errors import DatasetError
 from datagen.recording.folder import read_states
 from datagen.recording.integrity.verify import verify
@@ -28,6 +28,7 @@ from tests.datagen.commands import (
     make_jobs,
     make_small_plan,
 )
+from trackfeatures.camera import CameraParameters
 
 
 def test_what_is_collected_verifies_and_reads(collected: Path) -> None:
@@ -216,7 +217,7 @@ def test_rounds_of_an_unseen_track_with_jittered_cameras_are_a_dataset_of_their_
     with pytest.raises(DatasetError, match="none for train"):
         dataset.select("train")
     cameras = [index.header.camera for index in dataset.indexes]
-    assert cameras[0] != cameras[1] != dataset.camera == CameraInfo()
+    assert cameras[0] != cameras[1] != dataset.camera == CameraParameters()
     assert verify(folder, "deep").ok
     info = datagen_here("info", folder).stdout
     assert "unseen: 20 frames" in info

@@ -19,13 +19,13 @@ from datagen.execution.process_pool import ProcessPool
 from datagen.execution.retry import ATTEMPTS, DEATHS_IN_A_ROW, Limits, Tries
 from datagen.planning.plan import RoundPlan
 from datagen.recorder.job import FramesDone, RoundBroken, RoundDone
-from datagen.recording.camera import CameraInfo
 from datagen.recording.errors import DatasetError
 from datagen.recording.folder import read_states
 from datagen.recording.integrity.verify import verify
 from simulator.vehicle.state import Command
 from tests.datagen.commands import attempted, datagen, make_jobs, make_small_plan
 from tests.datagen.conftest import Samples
+from trackfeatures.camera import CameraParameters
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -113,7 +113,7 @@ def test_a_car_that_is_reset_too_often_ends_its_round(
         "datagen.recorder.record.ScriptedDriver.command", lambda *args: Command(1.0, 1.0)
     )
     (job,) = make_jobs(tmp_path, rounds=1, frames=200)
-    job = replace(job, plan=replace(job.plan, camera=CameraInfo(width=56, height=42)))
+    job = replace(job, plan=replace(job.plan, camera=CameraParameters(width=56, height=42)))
     message = attempted(job)
     assert isinstance(message, RoundBroken)
     assert message.final

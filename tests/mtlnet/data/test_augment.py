@@ -34,9 +34,9 @@ from mtlnet.data.augment.pipeline import (
     turns,
 )
 from mtlnet.data.augment.shadows import SHADES, road_places, shade
-from mtlnet.inference.model_card import Camera
+from trackfeatures.camera import CameraParameters
 
-SMALL = Camera(width=70, height=52)
+SMALL = CameraParameters(width=70, height=52)
 
 
 def none(count: int) -> AugmentParams:
@@ -62,7 +62,7 @@ def as_tensor(image: NDArray[np.uint8]) -> torch.Tensor:
 
 
 def pixel_of(
-    camera: Camera, to_middle: float, yaw: float, point: NDArray[np.float64]
+    camera: CameraParameters, to_middle: float, yaw: float, point: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Pinhole projection from first principles: the pixel of a ground point (x, y) of the track.
 
@@ -79,7 +79,7 @@ def pixel_of(
 
 @pytest.mark.parametrize("turned", [-0.08, 0.03])
 def test_a_turned_image_is_that_of_the_turned_car(turned: float) -> None:
-    camera, to_middle, yaw = Camera(), 0.4, 0.05
+    camera, to_middle, yaw = CameraParameters(), 0.4, 0.05
     # The camera stays: the centre of gravity swings about it.
     before, after = (np.array([np.cos(a), np.sin(a)]) for a in (yaw, yaw + turned))
     swung = np.array([0.0, to_middle]) + camera.x * (before - after)
@@ -103,7 +103,7 @@ def test_a_turned_image_is_that_of_the_turned_car(turned: float) -> None:
 @pytest.mark.parametrize("metres", [-0.5, 0.3])
 @pytest.mark.parametrize("pitch_deg", [0.0, 4.0])
 def test_a_shifted_image_is_that_of_a_car_aside(metres: float, pitch_deg: float) -> None:
-    camera = Camera(pitch_deg=pitch_deg)
+    camera = CameraParameters(pitch_deg=pitch_deg)
     image = np.zeros((210, 280, 3), np.uint8)
     focal, tilt = 105 / np.tan(np.radians(33.75)), np.radians(pitch_deg)
 
@@ -142,7 +142,7 @@ def test_labels_of_a_car_aside_are_those_measured_there() -> None:
 
 
 def test_shadows_darken_the_road_alone() -> None:
-    camera = Camera()
+    camera = CameraParameters()
     white = np.full((210, 280, 3), 255, np.uint8)
     covered = []
     for which in (1, 20, SHADES - 1):
@@ -160,7 +160,7 @@ def test_shadows_darken_the_road_alone() -> None:
 
 
 def test_turns_are_normal_and_move_the_picture() -> None:
-    camera, deck = Camera(), turns()
+    camera, deck = CameraParameters(), turns()
     assert deck[0].tolist() == [0.0, 0.0]
     yaw = deck[1:, 0]
     assert np.abs(yaw).max() <= TURN_LIMIT_RAD
@@ -196,10 +196,12 @@ def test_labels_follow_a_turn_and_then_the_mirror() -> None:
     changes = replace(none(1), turn=np.array([9]), mirrored=np.array([True]))
     yaw = turns()[9, 0]
     lane = np.array([[-2.0, 2.0, np.nan, np.nan, np.nan]], np.float32)
-    coded, _ = changed_labels(lane, np.zeros(1, np.float32), np.array([1]), changes, Camera())
+    coded, _ = changed_labels(
+        lane, np.zeros(1, np.float32), np.array([1]), changes, CameraParameters()
+    )
     distances, angle = tf.decode(coded)
     assert angle[0] == pytest.approx(yaw, abs=1e-6)  # turned: -yaw; mirrored: yaw
-    aside = Camera().x * np.sin(yaw)
+    aside = CameraParameters().x * np.sin(yaw)
     np.testing.assert_allclose(distances[0, :2], [-2 + aside, 2 + aside], atol=1e-6)
 
 
@@ -226,11 +228,11 @@ def colour(
 def test_colours_are_torchvisions() -> None:
     before = picture()
     saturated, scaled = before[None].copy(), before[None].copy()
-    change_images(saturated, colour(saturation=0.5), Camera())
+    change_images(saturated, colour(saturation=0.5), CameraParameters())
     # torchvision rounds its luma (0.2989, 0.587, 0.114) to a whole level first.
     expected = vision.adjust_saturation(as_tensor(before), 0.5)
     assert int((as_tensor(saturated[0]).int() - expected.int()).abs().max()) <= 1
-    change_images(scaled, colour(contrast=1.3, brightness=0.3), Camera())
+    change_images(scaled, colour(contrast=1.3, brightness=0.3), CameraParameters())
     brighter = vision.adjust_brightness(as_tensor(before), 1.3)
     assert int((as_tensor(scaled[0]).int() - brighter.int()).abs().max()) <= 1
 

@@ -12,11 +12,11 @@ import torch
 from datagen.recording import Dataset
 from mtlnet.data.gpu_cache import SHARE, DeviceBatch, GpuDataset, resident_or_not
 from mtlnet.data.loader import Loader
-from mtlnet.inference.model_card import Camera
 from mtlnet.training.cuda_graph import WARM_UP, CudaGraphStep
 from mtlnet.training.loss import Losses
 from mtlnet.training.recipes import RECIPES
 from mtlnet.training.trainer import Trainer
+from trackfeatures.camera import CameraParameters
 
 CPU = torch.device("cpu")
 BATCH = 8
@@ -25,7 +25,7 @@ Work = Callable[[], Losses]
 
 def loader(dataset: Path, *, augment: bool = False, part: tuple[int, int] = (0, 1)) -> Loader:
     frames = Dataset.open(dataset).select("train")
-    return Loader(frames, Camera(), BATCH, 3, augment=augment, part=part)
+    return Loader(frames, CameraParameters(), BATCH, 3, augment=augment, part=part)
 
 
 @pytest.mark.parametrize("part", [(0, 1), (1, 2)])

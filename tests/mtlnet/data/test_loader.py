@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mtlnet.data.loader import Loader
-from mtlnet.inference.model_card import Camera
+from trackfeatures.camera import CameraParameters
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class FakeFrames:
 
 
 def loader(seed: int = 0, *, augment: bool = False, part: tuple[int, int] = (0, 1)) -> Loader:
-    camera = Camera(width=24, height=16)
+    camera = CameraParameters(width=24, height=16)
     return Loader(FakeFrames(20), camera, 8, seed, augment=augment, part=part)
 
 

@@ -22,7 +22,6 @@ from mtlnet.evaluation.html_report import (
     worst_frames,
 )
 from mtlnet.evaluation.metrics import judge_all, mean_answer, signed_errors
-from mtlnet.inference.model_card import CENTRE_HEIGHT_M
 from mtlnet.inference.overlay import ANSWER_COLOUR, TRUTH_COLOUR, marking_line, to_pixels
 from mtlnet.inference.uncertainty import FEATURES
 from tests.mtlnet.page import Page
@@ -165,7 +164,7 @@ def test_markings_are_drawn_where_they_are(frames: Frames, outputs: NDArray[np.f
         (labels.distances[9, 0] + 1.0, labels.angle[9] + 0.002, ANSWER_COLOUR),
     ):
         line = marking_line(float(distance), float(angle), float(labels.curvature[9]))
-        points = to_pixels(line, camera, camera.z + CENTRE_HEIGHT_M)
+        points = to_pixels(line, camera, camera.height_above_road_m)
         near = list(_inside(points, camera.width * 2, camera.height * 2))
         assert near
         for u, v in near:

@@ -12,7 +12,6 @@ from mtlnet.inference import image_decoding as images
 from mtlnet.inference.image_decoding.crop import Box, visible
 from mtlnet.inference.image_decoding.errors import ImageError
 from mtlnet.inference.image_decoding.jpeg_structure import end as jpeg_end
-from mtlnet.inference.model_card import Camera
 from serve.api.problems import (
     DAMAGED_IMAGE,
     FIELD_OF_VIEW,
@@ -26,8 +25,9 @@ from serve.api.problems import (
     image_problem,
 )
 from tests.serve.conftest import jpeg, picture, png
+from trackfeatures.camera import CameraParameters
 
-VIEW = Camera()
+VIEW = CameraParameters()
 
 
 def pixels(body: bytes) -> np.ndarray:

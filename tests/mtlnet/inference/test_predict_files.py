@@ -11,10 +11,10 @@ import simplejpeg
 
 from mtlnet.inference.image_decoding.decode import decode, inspect, read_image
 from mtlnet.inference.image_decoding.errors import Fault, ImageError
-from mtlnet.inference.model_card import Camera
+from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
 
-VIEW = Camera()
+VIEW = CameraParameters()
 NOISE = np.random.default_rng(3).integers(0, 256, (210, 280, 3), np.uint8)
 JPEG: bytes = simplejpeg.encode_jpeg(NOISE, 90)
 PNG = cv2.imencode(".png", NOISE)[1].tobytes()

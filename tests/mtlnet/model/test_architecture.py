@@ -11,13 +11,14 @@ from datagen.recording import Dataset
 from mtlnet.data.loader import Loader
 from mtlnet.export.openvino_graph import TOLERANCE, build_graph
 from mtlnet.inference.engine import Kind, load_engine
-from mtlnet.inference.model_card import Camera, read_card
+from mtlnet.inference.model_card import read_card
 from mtlnet.model.architecture import PLANS, Architecture, find_plan
 from mtlnet.model.network import Network, answer_images, fold, initialise
 from mtlnet.training.config import TrainConfig
 from mtlnet.training.recipes import RECIPES
 from mtlnet.training.start import start_training
 from mtlnet.training.trainer import Trainer
+from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
 
 BACKBONES = [plan.name for plan in PLANS.values() if plan.backbone]
@@ -104,7 +105,7 @@ def test_the_graph_answers_as_torch_does(name: str) -> None:
 @pytest.mark.parametrize("name", ["mobilenet_v3_small", "deepdriving"])
 def test_another_network_learns(dataset: Path, name: str) -> None:
     plan = thin(name)
-    loader = Loader(Dataset.open(dataset).select("train"), Camera(), 4, 0, augment=False)
+    loader = Loader(Dataset.open(dataset).select("train"), CameraParameters(), 4, 0, augment=False)
     recipe = replace(RECIPES["fast"], augment=False)
     trainer = Trainer(recipe, plan.default_alpha, 0, torch.device("cpu"), plan)
     trainer.standardise(loader)

@@ -18,7 +18,7 @@ from safetensors.numpy import load_file
 import mtlnet.training.loop
 from datagen.recording import Dataset
 from mtlnet.data.loader import Loader
-from mtlnet.inference.model_card import DOUBT, GRAPH, WEIGHTS, Camera, ModelError, read_card
+from mtlnet.inference.model_card import DOUBT, GRAPH, WEIGHTS, ModelError, read_card
 from mtlnet.model.cpu_kernels.forward import training_outputs
 from mtlnet.training.checkpoint import list_checkpoints
 from mtlnet.training.config import TrainConfig, resume_config
@@ -27,6 +27,7 @@ from mtlnet.training.loop import Progress, Stopped
 from mtlnet.training.recipes import RECIPES, learning_rate
 from mtlnet.training.run import train
 from mtlnet.training.trainer import Trainer
+from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
 
 CPU = torch.device("cpu")
@@ -57,7 +58,7 @@ class StopAt:
 
 def test_one_batch_is_overfitted(dataset: Path) -> None:
     frames = Dataset.open(dataset).select("train")
-    loader = Loader(frames, Camera(), 8, 0, augment=False)
+    loader = Loader(frames, CameraParameters(), 8, 0, augment=False)
     recipe = replace(RECIPES["fast"], augment=False, batch=8)
     trainer = Trainer(recipe, (0.3, 0.2, 0.5), 0, CPU)
     trainer.standardise(loader)
@@ -75,7 +76,7 @@ def test_late_in_a_run_statistics_of_batches_stay(dataset: Path) -> None:
     frames = Dataset.open(dataset).select("train")
     recipe = replace(RECIPES["fast"], batch=4)
     trainer = Trainer(recipe, (0.3, 0.2, 0.5), 0, CPU)
-    batch = Loader(frames, Camera(), 4, 0, augment=False).make(0)
+    batch = Loader(frames, CameraParameters(), 4, 0, augment=False).make(0)
     mean = trainer.network.get_buffer("features.conv0.norm.running_mean")
     seen = [mean.clone()]
     late = recipe.settled
@@ -92,7 +93,7 @@ def test_the_first_convolutions_learn_for_a_part_of_the_run(dataset: Path) -> No
     frames = Dataset.open(dataset).select("train")
     recipe = replace(RECIPES["fast"], batch=4)
     trainer = Trainer(recipe, (0.3, 0.2, 0.5), 0, CPU)
-    batch = Loader(frames, Camera(), 4, 0, augment=False).make(0)
+    batch = Loader(frames, CameraParameters(), 4, 0, augment=False).make(0)
     network = trainer.network
     assert [share for share, _ in recipe.rests] == sorted(share for share, _ in recipe.rests)
     for progress, count in [(0.1, 0), *recipe.rests, (0.99, recipe.rests[-1][1])]:

@@ -10,12 +10,12 @@ import pytest
 from datagen.recording import Dataset
 from mtlnet.evaluation.metrics import calibration, coverage
 from mtlnet.inference.engine import load_engine
-from mtlnet.inference.model_card import Camera
 from mtlnet.inference.prediction import OUTPUTS, decode_outputs
 from mtlnet.inference.uncertainty import CELLS, FEATURES, UncertaintyHead, read_doubt, texture
 from mtlnet.uncertainty_fit.camera_pitch import aimed, draw_aim
 from mtlnet.uncertainty_fit.head import fit_head, novelty
 from tests.mtlnet.strange import no_road, seen_by
+from trackfeatures.camera import CameraParameters
 
 NO_ROAD = 1000
 
@@ -116,7 +116,7 @@ def test_roads_are_known_and_foreign_cameras_are_not(published: Path, dataset: P
     strange = [decode_outputs(engine(image)).out_of_distribution for image in images]
     assert sum(map(bool, strange)) <= 2
     views = [
-        seen_by(image, Camera(), fov, pitch)
+        seen_by(image, CameraParameters(), fov, pitch)
         for image in images[:6]
         for fov, pitch in ((67.5, 15.0), (67.5, -15.0), (100.0, 20.0), (50.0, -15.0))
     ]
@@ -130,7 +130,9 @@ def test_a_camera_that_looks_elsewhere(
 ) -> None:
     frames = Dataset.open(dataset).select("test")
     images = frames.read_batch(np.arange(len(frames)))
-    views = np.stack([texture(seen_by(i, Camera(), fov_y_deg, pitch_deg)) for i in images])
+    views = np.stack(
+        [texture(seen_by(i, CameraParameters(), fov_y_deg, pitch_deg)) for i in images]
+    )
     doubt = read_doubt(published)
     aim = doubt.aim(views[:, CELLS:])[:, 0]
     assert (aim**2 > 1).mean() > 0.9
@@ -140,7 +142,7 @@ def test_a_camera_that_looks_elsewhere(
 
 
 def test_no_border_is_ever_seen() -> None:
-    camera, rng = Camera(), np.random.default_rng(8)
+    camera, rng = CameraParameters(), np.random.default_rng(8)
     shape = (camera.height, camera.width)
     steepest = 0.0
     for _ in range(200):
@@ -153,7 +155,7 @@ def test_no_border_is_ever_seen() -> None:
 
 
 def test_an_aim_is_seen_as_by_that_camera(dataset: Path) -> None:
-    camera = Camera()
+    camera = CameraParameters()
     image = Dataset.open(dataset).select("test").image(0)
     expected = seen_by(image, camera, 80.0, 5.0)
     wider = np.log(np.tan(np.radians(40.0)) / np.tan(np.radians(camera.fov_y_deg / 2)))

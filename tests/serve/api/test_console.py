@@ -11,9 +11,9 @@ import cv2
 import numpy as np
 import pytest
 
-from mtlnet.inference.model_card import Camera
 from serve.api.console import FOLDER
 from tests.serve.conftest import Served
+from trackfeatures.camera import CameraParameters
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 
@@ -35,7 +35,7 @@ def test_the_page_and_all_it_loads_come_from_the_service(service: Served) -> Non
 def test_every_sample_is_what_the_model_sees_and_has_its_truth(service: Served) -> None:
     samples = service.ask("GET", "/console/samples.json").content
     assert len(samples) >= 6
-    camera = Camera()
+    camera = CameraParameters()
     for sample in samples:
         body = service.ask("GET", f"/console/{sample['file']}").content
         image = cv2.imdecode(np.frombuffer(body, np.uint8), cv2.IMREAD_COLOR)
@@ -81,7 +81,7 @@ def test_the_geometry_of_the_console_is_that_of_the_pinhole(tmp_path: Path) -> N
     """A marking 2 m to the right, 5 m ahead of the camera, is where the camera's matrix puts it."""
     script = tmp_path / "ask.mjs"
     module = (FOLDER / "geometry.js").as_uri()
-    camera = Camera()
+    camera = CameraParameters()
     script.write_text(
         f"import {{ onMarking, project }} from '{module}';\n"
         f"const camera = {json.dumps(vars(camera))};\n"

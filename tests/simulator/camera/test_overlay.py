@@ -5,24 +5,25 @@ import pytest
 from numpy.typing import ArrayLike
 
 from simulator.camera.core import optics
-from simulator.camera.core.optics import DRIVER_SEAT
 from simulator.camera.overlay import BEHIND_M, STEP_M, marking_polylines
 from simulator.camera.snapshot import standing_pose
 from simulator.track.catalogue import find_track
 from simulator.track.kernel import road_points
 from simulator.track.road import Road
+from trackfeatures.camera import CameraParameters
 
 
 class Eye:
     """What an overlay needs of a camera, without a renderer."""
 
-    width, height = 280, 210
+    parameters = CameraParameters()
+    width, height = parameters.width, parameters.height
 
     def project(
         self, points: ArrayLike, body_pose: ArrayLike, view: str = "front"
     ) -> tuple[optics.FloatArray, optics.FloatArray]:
-        matrix = optics.intrinsics(DRIVER_SEAT, self.width, self.height)
-        return optics.project(optics.eye_of(DRIVER_SEAT, body_pose, view), matrix, points)
+        matrix = self.parameters.intrinsics()
+        return optics.project(optics.eye_of(self.parameters, body_pose, view), matrix, points)
 
 
 @pytest.mark.parametrize("name", ["mountain-pass", "ring-road", "oval"])

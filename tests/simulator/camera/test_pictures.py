@@ -8,13 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from simulator.camera import KINDS, VIEWS, Camera, Light, Mount
+from simulator.camera import KINDS, VIEWS, Camera, Light
 from simulator.camera.core import context as camera_context
 from simulator.camera.overlay import marking_polylines
 from simulator.camera.scene.carmesh import WIDTH_M
 from simulator.camera.snapshot import standing_pose, write_contact_sheet
 from simulator.track.catalogue import find_track
 from simulator.track.road import Road
+from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
 
 
@@ -61,7 +62,7 @@ def test_another_process_draws_the_same_bytes() -> None:
 @pytest.mark.parametrize("size", [(64, 64), (280, 210), (333, 97), (640, 480)])
 def test_any_size_shows_the_same_scene(road: Road, size: tuple[int, int]) -> None:
     width, height = size
-    with Camera(road, seed=1, light=light(), width=width, height=height) as camera:
+    with Camera(road, CameraParameters(width, height), seed=1, light=light()) as camera:
         picture = camera.render(standing_pose(road, 30.0, 0.0))
         matrix = camera.intrinsics
     assert picture.shape == (height, width, 3)
@@ -93,7 +94,7 @@ def test_every_view_is_a_picture_of_its_own(road: Road) -> None:
 def test_the_mount_is_where_the_driver_sits(road: Road) -> None:
     """A point straight ahead of the mount lies in the middle; one to the left, left of it."""
     pose = np.array([10.0, 20.0, 3.0, 0.0, 0.0, np.pi / 2])
-    with Camera(road, seed=1, light=light(), mount=Mount(x=1.0, z=0.5)) as camera:
+    with Camera(road, CameraParameters(x=1.0, z=0.5), seed=1, light=light()) as camera:
         points = np.array([[10.0, 31.0, 3.5], [9.0, 31.0, 3.5], [10.0, 31.0, 4.5], [10, 0, 3.5]])
         pixels, depth = camera.project(points, pose)
         focal = camera.intrinsics[0, 0]
@@ -192,9 +193,9 @@ def test_cameras_leave_nothing_in_memory(road: Road) -> None:
 
 def test_impossible_pictures_are_refused(road: Road) -> None:
     with pytest.raises(UserError, match="picture size 0 x 210"):
-        Camera(road, seed=1, light=light(), width=0)
+        Camera(road, CameraParameters(width=0), seed=1, light=light())
     with pytest.raises(UserError, match="field of view"):
-        Mount(fov_y_deg=180.0)
+        CameraParameters(fov_y_deg=180.0)
 
 
 def test_without_egl_the_message_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from simulator.camera import CLASSES, VIEWS, Camera, Light, Mount, intrinsics
+from simulator.camera import CLASSES, VIEWS, Camera, Light
 from simulator.camera.colourise import CLASS_COLOURS, in_false_colours
 from simulator.camera.core.optics import eye_of, rotation
 from simulator.camera.scene.carmesh import HEIGHT_M, LENGTH_M, WIDTH_M
@@ -16,6 +16,7 @@ from simulator.camera.snapshot import standing_pose, write_contact_sheet
 from simulator.track.catalogue import find_track
 from simulator.track.markings import MarkingStyle
 from simulator.track.road import Road
+from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
 
 FloatArray = NDArray[np.float64]
@@ -33,7 +34,7 @@ def light(kind: str = "clear") -> Light:
 
 def rays(camera: Camera, pose: FloatArray, view: str = "front") -> tuple[FloatArray, FloatArray]:
     """The eye (3,) and what a metre of depth along each pixel's ray is (height, width, 3)."""
-    eye = eye_of(camera.mount, pose, view)
+    eye = eye_of(camera.parameters, pose, view)
     matrix = camera.intrinsics
     u = (np.arange(camera.width) + 0.5 - matrix[0, 2]) / matrix[0, 0]
     v = (np.arange(camera.height) + 0.5 - matrix[1, 2]) / matrix[1, 1]
@@ -105,7 +106,7 @@ def test_marking_pixels_are_those_on_the_markings() -> None:
 
 def test_car_pixels_lie_in_the_cars_box(road: Road) -> None:
     """They fill most of where the box of the car projects, and lie at the box's depths."""
-    with Camera(road, seed=1, light=light(), width=420, height=315) as camera:
+    with Camera(road, CameraParameters(420, 315), seed=1, light=light()) as camera:
         pose = standing_pose(road, 100.0, 0.0)
         for gap, offset in ((10.0, 2.0), (22.0, -2.0), (35.0, 2.0)):
             car = standing_pose(road, 100.0 + gap, offset, height=0.0)
@@ -185,7 +186,7 @@ def test_objects_stand_beside_the_road(road: Road) -> None:
 
 def test_depth_from_above_is_the_height(road: Road) -> None:
     pose = standing_pose(road, 200.0, 0.0)
-    with Camera(road, seed=1, light=light(), width=64, height=64) as camera:
+    with Camera(road, CameraParameters(64, 64), seed=1, light=light()) as camera:
         found = camera.render_views(pose, views=("top:depth", "top:class"))
         depth, kind = found["top:depth"], found["top:class"]
     assert kind[32, 32] == CAR
@@ -226,7 +227,7 @@ def test_many_views_are_the_single_ones(road: Road) -> None:
 
 def test_unknown_views_and_kinds_are_refused(road: Road) -> None:
     pose = standing_pose(road, 0.0, 0.0)
-    with Camera(road, seed=1, light=light(), width=16, height=16) as camera:
+    with Camera(road, CameraParameters(16, 16), seed=1, light=light()) as camera:
         for name in ("below", "below:depth", ""):
             with pytest.raises(UserError, match="the views are front, left, right, rear, chase"):
                 camera.render_views(pose, views=("front", name))
@@ -243,8 +244,8 @@ def test_calibration_tells_where_points_are_seen(road: Road, view: str) -> None:
     rng = np.random.default_rng(6)
     pose = np.array([31.0, -12.0, 4.0, 0.05, -0.1, 2.2])
     points = rng.uniform(-30.0, 30.0, (200, 3))
-    mount = Mount(x=0.4, y=0.2, z=1.3, pitch_deg=7.0, fov_y_deg=41.0)
-    with Camera(road, seed=1, light=light(), mount=mount, width=352, height=160) as camera:
+    parameters = CameraParameters(352, 160, x=0.4, y=0.2, z=1.3, pitch_deg=7.0, fov_y_deg=41.0)
+    with Camera(road, parameters, seed=1, light=light()) as camera:
         matrix, frame = camera.intrinsics, camera.extrinsics(view, pose)
         world = points @ rotation(*pose[3:]).T + pose[:3]
         pixels, depth = camera.project(world, pose, view)
@@ -265,7 +266,7 @@ def test_calibration_tells_where_points_are_seen(road: Road, view: str) -> None:
 @pytest.mark.parametrize("fov", [20.0, 67.5, 120.0])
 def test_intrinsics_of_any_size_and_lens(size: tuple[int, int], fov: float) -> None:
     width, height = size
-    matrix = intrinsics(Mount(fov_y_deg=fov), width, height)
+    matrix = CameraParameters(width, height, fov).intrinsics()
     up, down = (np.arctan((v - matrix[1, 2]) / matrix[1, 1]) for v in (0.0, height))
     assert np.degrees(down - up) == pytest.approx(fov)
     assert (matrix[0, 2], matrix[1, 2], matrix[0, 0]) == (width / 2, height / 2, matrix[1, 1])

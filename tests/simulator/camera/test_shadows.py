@@ -17,6 +17,7 @@ from simulator.camera.snapshot import standing_pose
 from simulator.track.catalogue import OWN_TRACKS, find_track
 from simulator.track.own import LOOKS as TRACK_LOOKS
 from simulator.track.road import Road
+from trackfeatures.camera import CameraParameters
 
 FloatArray = NDArray[np.float64]
 
@@ -46,9 +47,8 @@ def test_heavy_shadow_covers_30_to_80_percent_of_every_road(name: str) -> None:
         lanes = 1 + (len(name) + number) % 3
         road = Road(find_track(name), lanes)
         seed = 10 * number + len(name)
-        with Camera(
-            road, seed=seed, light=light("heavy-shadow", seed), width=8, height=8
-        ) as camera:
+        shadows = light("heavy-shadow", seed)
+        with Camera(road, CameraParameters(8, 8), seed=seed, light=shadows) as camera:
             mask = camera._setting.scene.mask
         places = np.arange(0.0, road.track.length_m, 3.0)
         shares = [mask.fraction(float(s), road.half_asphalt) for s in places]

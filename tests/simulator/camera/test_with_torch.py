@@ -5,11 +5,13 @@ import sys
 
 DRAW_THEN_LEARN = """
 from simulator.camera import Camera, Light
+from trackfeatures.camera import CameraParameters
 from simulator.track.catalogue import find_track
 from simulator.track.road import Road
 import numpy as np
 light = Light.named("clear", np.random.default_rng(0))
-with Camera(Road(find_track("oval")), seed=0, light=light, width=64, height=48) as camera:
+road, size = Road(find_track("oval")), CameraParameters(64, 48)
+with Camera(road, size, seed=0, light=light) as camera:
     picture = camera.render(np.array([0.0, 0.0, 0.3, 0.0, 0.0, 0.0]))
 import torch
 weight = torch.nn.Parameter(torch.ones(3))

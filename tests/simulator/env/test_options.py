@@ -11,11 +11,12 @@ import pytest
 from gymnasium.wrappers import AddRenderObservation, RecordVideo, RenderCollection
 
 import simulator.env  # registers the names
-from simulator.camera import CLASSES, Mount
+from simulator.camera import CLASSES
 from simulator.env.reward import Ending
 from simulator.sensors import STANDARD, Sensor
 from simulator.track.road import Road
 from simulator.vehicle.state import CarState
+from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
 
 STATE_ID = "driverview/LateralControl-v0"
@@ -85,7 +86,9 @@ def test_views_are_those_of_the_camera_and_drawn_once_a_step() -> None:
 
 
 def test_calibration_takes_a_point_of_the_body_to_its_pixel() -> None:
-    env = gym.make(IMAGE_ID, views=("front", "rear:depth"), mount=Mount(x=1.0, z=1.2), **SMALL)
+    env = gym.make(
+        IMAGE_ID, views=("front", "rear:depth"), mount=CameraParameters(x=1.0, z=1.2), **SMALL
+    )
     calibration = env.unwrapped.calibration()  # type: ignore[attr-defined]
     env.close()
     focal = 24.0 / math.tan(math.radians(67.5 / 2))

@@ -18,6 +18,7 @@ from simulator.track.catalogue import find_track
 from simulator.track.road import Road
 from simulator.vehicle.state import CarState, Command
 from simulator.world.world import World
+from trackfeatures.camera import CameraParameters
 
 WAIT_S = 180.0
 
@@ -76,7 +77,7 @@ def test_with_traffic_and_pictures_too(
     light = Light.named("dusk", np.random.default_rng([4, 2]))
     with (
         World(road, traffic=6, frequency_hz=10) as world,
-        Camera(road, seed=4, light=light, width=45, height=33) as camera,
+        Camera(road, CameraParameters(45, 33), seed=4, light=light) as camera,
         Link(name, wait_s=WAIT_S) as link,
     ):
         assert (link.info.traffic, link.info.frequency_hz, link.info.lanes) == (6, 10, 2)

@@ -15,6 +15,7 @@ from simulator.track.road import Road
 from simulator.traffic.traffic import SIZE
 from simulator.world.world import Command, World
 from tests.simulator.oracles import BruteForce
+from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
 
 
@@ -145,7 +146,8 @@ def test_the_papers_table_is_complete() -> None:
 def test_the_camera_is_a_sensor_of_the_table() -> None:
     road = Road(find_track("oval"))
     light = Light.named("clear", np.random.default_rng(0))
-    with World(road) as world, Camera(road, seed=0, light=light, width=96, height=72) as camera:
+    camera_parameters = CameraParameters(96, 72)
+    with World(road) as world, Camera(road, camera_parameters, seed=0, light=light) as camera:
         world.reset(seed=0)
         sensors = [camera_sensor(camera), camera_sensor(camera, "rear")]
         exact = SensorSuite(sensors).read(world)

@@ -1,0 +1,33 @@
+"""Camera parameters: pinhole matrix, height above the road, refused values, stored form."""
+
+import numpy as np
+import pytest
+
+from trackfeatures import UserError
+from trackfeatures.camera import CameraParameters
+
+
+def test_intrinsics_of_a_lens_of_90_degrees() -> None:
+    """tan(45 deg) = 1: the focal length is half of the height."""
+    camera = CameraParameters(width=280, height=210, fov_y_deg=90.0)
+    assert camera.focal_px == pytest.approx(105.0)
+    expected = [[105.0, 0.0, 140.0], [0.0, 105.0, 105.0], [0.0, 0.0, 1.0]]
+    assert np.allclose(camera.intrinsics(), expected)
+
+
+def test_the_default_camera_is_1_20_m_above_the_road() -> None:
+    assert CameraParameters().height_above_road_m == pytest.approx(1.20)
+
+
+@pytest.mark.parametrize("fov_y_deg", [0.0, -20.0, 180.0, float("nan")])
+def test_an_impossible_field_of_view_is_refused(fov_y_deg: float) -> None:
+    """As a UserError to whoever gives it, as a ValueError to a reader of a damaged file."""
+    with pytest.raises(UserError, match="between 1 and 150 deg") as caught:
+        CameraParameters(fov_y_deg=fov_y_deg)
+    assert isinstance(caught.value, ValueError)
+
+
+def test_the_stored_form_has_the_names_of_recordings_and_model_cards() -> None:
+    stored = CameraParameters(pitch_deg=3.0).as_dict()
+    assert list(stored) == ["width", "height", "fov_y_deg", "x", "y", "z", "pitch_deg"]
+    assert CameraParameters(**stored) == CameraParameters(pitch_deg=3.0)
