@@ -1,6 +1,6 @@
-"""The shared language of all parts: what a track feature is, its unit, sign, range and coding.
+"""Definitions that all packages share: track features with units, signs, ranges and coding; camera.
 
-What computes on arrays is imported when it is first used: a command's help needs no numpy.
+Modules that need numpy are imported at first use, so that `--help` of a command is fast.
 """
 
 from importlib import import_module
@@ -19,6 +19,7 @@ from trackfeatures.definitions import (
     Heading,
     Range,
     TrackFeatures,
+    lane_offset,
 )
 from trackfeatures.errors import DefinitionsMismatch, UserError, require_version
 
@@ -72,6 +73,7 @@ __all__ = [
     "encode_features",
     "lane_centre",
     "lane_index",
+    "lane_offset",
     "localise",
     "marking_offsets",
     "measure",
@@ -82,12 +84,12 @@ __all__ = [
     "wrap_angle",
 ]
 
-_ON_ARRAYS = ("camera", "coding", "measurement")
+_NUMPY_MODULES = ("camera", "coding", "measurement")
 
 
 def __getattr__(name: str) -> object:
     if name in __all__:
-        for module in _ON_ARRAYS:
+        for module in _NUMPY_MODULES:
             found = getattr(import_module(f"trackfeatures.{module}"), name, None)
             if found is not None:
                 globals()[name] = found

@@ -1,4 +1,4 @@
-"""Between features in metres and radians and the six values a network is trained on.
+"""Encodes features in metres and radians as the six values a network is trained on, and back.
 
 `y = 0.1 + 0.8 (x - lo) / (hi - lo)`, clipped to [0, 1]; the columns are those of `TARGETS`. An
 absent distance is NaN in metres, and the outer end of its range when coded.
@@ -11,9 +11,11 @@ from trackfeatures.definitions import MARKINGS, RANGES, TARGETS, Heading, TrackF
 
 OFFSET, SPAN = 0.1, 0.8
 IN_LANE_WIDTH_LIMIT_M = 5.5
-"""The in-lane pair is present when its markings are nearer to each other than this."""
+"""Decoding: `ml` and `mr` are present when they are nearer to each other than this."""
 ON_MARKING_LIMIT_M = 2.75
+"""Decoding: `m` is present below this."""
 NEIGHBOUR_LIMIT_M = 6.75
+"""Decoding: `l` and `r` are present beside a present `m` when nearer than this."""
 
 _LO = np.array([RANGES[name].lo for name in TARGETS])
 _WIDTH = np.array([RANGES[name].hi - RANGES[name].lo for name in TARGETS])
@@ -30,7 +32,7 @@ def encode(distances: ArrayLike, angle: ArrayLike) -> NDArray[np.float32]:
 
 
 def decode_values(coded: ArrayLike) -> NDArray[np.float64]:
-    """The values (N, 6) in m and rad that `coded` (N, 6) says, absent or not."""
+    """The values (N, 6) in m and rad of `coded` (N, 6), without a test for absent ones."""
     y = np.atleast_2d(np.asarray(coded, dtype=np.float64))
     values: NDArray[np.float64] = _LO + (y - OFFSET) / SPAN * _WIDTH
     return values
@@ -57,7 +59,7 @@ def encode_features(features: TrackFeatures) -> NDArray[np.float32]:
 
 
 def decode_features(coded: ArrayLike, heading: Heading) -> TrackFeatures:
-    """The features that coded values (6,) and a class say."""
+    """The features of coded values (6,) and a class."""
     distances, angle = decode(coded)
     ml, mr, l, m, r = (None if np.isnan(d) else float(d) for d in distances[0])
     return TrackFeatures(ml, mr, l, m, r, float(angle[0]), heading)

@@ -1,10 +1,10 @@
-"""What goes wrong because of what the user gave us, said in one line each."""
+"""Errors caused by the input, each reported in one line."""
 
 from trackfeatures.definitions import VERSION
 
 
 class UserError(Exception):
-    """A problem the user can mend: it says what was seen, what was expected and what to do."""
+    """A problem the user can fix; the message gives what was seen, expected, and what to do."""
 
 
 class DefinitionsMismatch(UserError):
@@ -12,10 +12,10 @@ class DefinitionsMismatch(UserError):
 
 
 def require_version(found: str, what: str) -> None:
-    """Raise DefinitionsMismatch unless `what` was made with the definitions in force."""
+    """Raise DefinitionsMismatch unless `what` was made with this version of the definitions."""
     if found != VERSION:
         raise DefinitionsMismatch(
             f"{what} was made with version {found!r} of the track-feature definitions, this "
             f"program has version {VERSION!r}; make it again with this program, or use the program "
-            f"it came from"
+            "it was made with"
         )

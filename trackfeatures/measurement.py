@@ -1,4 +1,7 @@
-"""Measures track features from the truth: where the car is on a track with painted lanes."""
+"""Track features from the true pose of a car, and the lane offset from track features.
+
+SI units; `to_middle` is the distance from the centre line of the road, left positive.
+"""
 
 import math
 from typing import Protocol
@@ -16,15 +19,16 @@ from trackfeatures.definitions import (
     OUTSIDE_REACH_M,
     Heading,
     TrackFeatures,
+    lane_offset,
 )
 from trackfeatures.errors import UserError
 
 
 class CentreLine(Protocol):
-    """A closed track, as far as measuring needs it: m, rad counter-clockwise, 1/m left positive."""
+    """The centre line of a closed track: m, rad counter-clockwise, 1/m left positive."""
 
     def project(self, x: float, y: float) -> tuple[float, float]:
-        """The foot (s, to_middle) of a point on the centre line."""
+        """Arc length s and lateral distance `to_middle` of a point."""
         ...
 
     def heading(self, s: float) -> float: ...
@@ -35,30 +39,30 @@ class CentreLine(Protocol):
 def check_lanes(lanes: int, lane_width_m: float) -> None:
     """Raise UserError unless the road is one that the definitions cover."""
     if lanes not in LANES:
-        raise UserError(f"{lanes} lanes asked for; a road has 1, 2 or 3")
+        raise UserError(f"a road of {lanes} lanes is not supported; give 1, 2 or 3")
     lo, hi = LANE_WIDTH_LIMITS_M
     if not lo <= lane_width_m <= hi:
-        raise UserError(f"lane width {lane_width_m} m asked for; it must be {lo} to {hi} m")
+        raise UserError(f"lane width {lane_width_m} m is out of range; give {lo} to {hi} m")
 
 
 def marking_offsets(lanes: int, lane_width_m: float) -> NDArray[np.float64]:
-    """Lateral places (lanes + 1,) of the markings in m, from the leftmost to the rightmost."""
+    """Lateral positions (lanes + 1,) of the markings in m, from the leftmost to the rightmost."""
     return lane_width_m * (lanes / 2 - np.arange(lanes + 1, dtype=np.float64))
 
 
 def lane_index(to_middle: float, lanes: int, lane_width_m: float) -> int:
-    """The lane the car is in or nearest to: 0 is the leftmost."""
+    """Index of the lane the car is in or nearest to: 0 is the leftmost."""
     lane = math.floor(lanes / 2 - to_middle / lane_width_m)
     return min(max(lane, 0), lanes - 1)
 
 
 def lane_centre(index: int, lanes: int, lane_width_m: float) -> float:
-    """Lateral place of a lane's centre (m, left positive)."""
+    """Lateral position of a lane's centre (m, left positive)."""
     return lane_width_m * (lanes / 2 - index - 0.5)
 
 
 def classify_heading(curvature: float, curvature_ahead: float) -> Heading:
-    """The class at a place with `curvature`, and `curvature_ahead` 20 m further on (1/m)."""
+    """The class for `curvature` at the car and `curvature_ahead` 20 m further on (1/m)."""
     for kappa in (curvature, curvature_ahead):
         if abs(kappa) >= BEND_CURVATURE:
             return Heading.LEFT if kappa > 0 else Heading.RIGHT
@@ -120,21 +124,9 @@ def _on_marking(
     return left, m, right
 
 
-# Localisation: from distances to markings to the offset from the centre of the lane.
-
-
 def localise(distances: ArrayLike) -> NDArray[np.float64]:
-    """`to_lane_centre` (N,) in m, left positive, NaN where nothing is seen, of distances (N, 5).
-
-    The in-lane pair wins. Else the lane lies on the car's side of the marking `m` it drives on;
-    outside the road it is the only lane next to that marking. The same rule for one moment is
-    `TrackFeatures.to_lane_centre`.
-    """
-    ml, mr, l, m, r = np.atleast_2d(np.asarray(distances, dtype=np.float64)).T
-    in_lane = (ml + mr) / 2
-    right_lane, left_lane = (m + r) / 2, (l + m) / 2
-    first = np.where(m <= 0, right_lane, left_lane)
-    second = np.where(m <= 0, left_lane, right_lane)
-    on_marking = np.where(np.isnan(first), second, first)
-    nearest: NDArray[np.float64] = np.where(np.isnan(in_lane), on_marking, in_lane)
-    return nearest
+    """`lane_offset` (N,) in m, NaN where none is visible, of distances (N, 5), NaN where absent."""
+    rows = np.atleast_2d(np.asarray(distances, dtype=np.float64)).tolist()
+    present = ((None if math.isnan(d) else d for d in row) for row in rows)
+    offsets = (lane_offset(*row) for row in present)
+    return np.array([math.nan if d is None else d for d in offsets], dtype=np.float64)

@@ -1,4 +1,4 @@
-"""Coding: the table of the definitions, round trips, mirroring, localisation, versions."""
+"""Coding: range ends, round trips, mirroring, lane offsets of a batch, versions."""
 
 import numpy as np
 import pytest
@@ -44,9 +44,7 @@ def test_values_beyond_the_range_are_clipped_to_0_and_1() -> None:
 
 
 @given(LANES, WIDTHS, OFFSETS, ANGLES)
-def test_decoding_what_was_encoded_gives_the_features_back(
-    lanes: int, width: float, to_middle: float, angle: float
-) -> None:
+def test_decode_inverts_encode(lanes: int, width: float, to_middle: float, angle: float) -> None:
     truth = tf.measure(to_middle, angle, 0.0, 0.01, lanes, width)
     back = tf.decode_features(tf.encode_features(truth), truth.heading)
     assert back.angle == pytest.approx(angle, abs=1e-6)
@@ -64,7 +62,7 @@ def test_decoding_what_was_encoded_gives_the_features_back(
 
 
 @given(LANES, WIDTHS, OFFSETS, ANGLES)
-def test_mirrored_codes_are_the_codes_of_the_mirrored_scene(
+def test_mirror_coded_equals_encoding_the_mirrored_scene(
     lanes: int, width: float, to_middle: float, angle: float
 ) -> None:
     assume(min(abs(to_middle - tf.marking_offsets(lanes, width))) > 1e-9)
@@ -76,7 +74,7 @@ def test_mirrored_codes_are_the_codes_of_the_mirrored_scene(
 
 
 @given(st.lists(st.tuples(LANES, WIDTHS, OFFSETS), min_size=1, max_size=20))
-def test_localising_a_batch_equals_localising_each(
+def test_localise_of_a_batch_equals_to_lane_centre_of_each(
     scenes: list[tuple[int, float, float]],
 ) -> None:
     features = [tf.measure(d, 0.0, 0.0, 0.0, lanes, width) for lanes, width, d in scenes]
@@ -85,12 +83,12 @@ def test_localising_a_batch_equals_localising_each(
     np.testing.assert_allclose(tf.localise(distances), expected, equal_nan=True)
 
 
-def test_a_lane_pair_too_wide_to_be_one_is_absent() -> None:
+def test_a_lane_pair_further_apart_than_the_limit_is_absent() -> None:
     distances, _ = tf.decode(tf.encode([[-2.8, 2.8, np.nan, np.nan, np.nan]], [0.0]))
     assert np.isnan(distances[0]).all()
 
 
-def test_another_version_is_refused_with_what_to_do() -> None:
+def test_another_version_is_refused() -> None:
     tf.require_version(tf.VERSION, "the dataset")
     with pytest.raises(tf.DefinitionsMismatch, match="the dataset was made with version '0'"):
         tf.require_version("0", "the dataset")

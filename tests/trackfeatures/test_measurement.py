@@ -1,4 +1,4 @@
-"""Measuring: signs, limits of the two systems, and a brute-force geometric oracle."""
+"""Measurement: signs, limits of the two marking systems, and a brute-force geometric oracle."""
 
 import math
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ def measure(to_middle: float, lanes: int, width: float = 4.0) -> tf.TrackFeature
     return tf.measure(to_middle, 0.0, 0.0, 0.0, lanes, width)
 
 
-def test_in_the_middle_of_one_lane_markings_are_half_a_lane_away() -> None:
+def test_in_the_middle_of_a_lane_both_markings_are_half_a_lane_width_away() -> None:
     features = measure(0.0, lanes=1)
     assert (features.ml, features.mr) == (-2.0, 2.0)
     assert (features.l, features.m, features.r) == (None, None, None)
@@ -65,7 +65,7 @@ def test_a_one_lane_road_has_no_neighbour_lane() -> None:
 
 
 @pytest.mark.parametrize("side", [-1, 1])
-def test_outside_the_road_its_marking_is_told_to_two_metres(side: int) -> None:
+def test_outside_the_road_the_outer_marking_is_measured_up_to_two_metres(side: int) -> None:
     edge = 2 * 4.0 / 2
     seen = measure(side * (edge + 1.99), lanes=2)
     assert seen.m == pytest.approx(side * 1.99)
@@ -145,7 +145,7 @@ class Circle:
 
 
 def oracle(ring: Circle, x: float, y: float, lanes: int, width: float) -> dict[str, float | None]:
-    """Distances found by searching 20,000 points of every painted circle, without the formulas."""
+    """Distances by a search over 20,000 points of every painted circle, without the formulas."""
     turn = np.linspace(0, math.tau, 20_000, endpoint=False)
     gaps = []
     for offset in tf.marking_offsets(lanes, width):
@@ -168,7 +168,7 @@ def oracle(ring: Circle, x: float, y: float, lanes: int, width: float) -> dict[s
 
 
 @given(st.floats(25.0, 200.0), LANES, WIDTHS, OFFSETS, st.floats(-3.0, 3.0), st.floats(-0.5, 0.5))
-def test_a_pose_on_a_ring_road_measures_what_a_search_finds(
+def test_measured_pose_on_a_ring_road_equals_a_brute_force_search(
     radius: float, lanes: int, width: float, to_middle: float, turn: float, angle: float
 ) -> None:
     ring = Circle(radius)
