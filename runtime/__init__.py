@@ -1,0 +1,1 @@
+"""Infrastructure of every package: commands, sockets, files, compiled kernels, HTML and charts."""

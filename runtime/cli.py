@@ -1,4 +1,7 @@
-"""How every command of this project ends: its result, or one clear line and a non-zero exit."""
+"""What all commands share: exit codes, the error line, the option `--json`.
+
+Results go to stdout; errors, progress and logs go to stderr.
+"""
 
 import errno
 import json
@@ -11,19 +14,22 @@ import typer
 
 from trackfeatures.errors import UserError
 
+FAILED = 1  # a UserError or OSError; typer ends with 2 for a wrong option
 INTERRUPTED = 130  # the shell's code for a process ended by Ctrl-C
+
+AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON on stdout.")]
 
 
 def main(app: Callable[[], object]) -> None:
-    """Run `app`; a mistake of the user or of the machine becomes `error: ...` on stderr, exit 1."""
+    """Run `app`. A UserError or OSError becomes one line `error: ...` on stderr and exit code 1."""
     try:
         app()
     except UserError as error:
         fail(str(error))
     except BrokenPipeError:
-        # Whoever read our output left (`| head`): nothing to report, and nothing more to flush.
+        # The reader of our output has gone (`| head`): nothing is left to report or to flush.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        sys.exit(1)
+        sys.exit(FAILED)
     except OSError as error:
         fail(_describe(error))
     except KeyboardInterrupt:
@@ -32,8 +38,19 @@ def main(app: Callable[[], object]) -> None:
 
 
 def fail(message: str) -> None:
+    """Write the error line and exit."""
     sys.stderr.write(f"error: {message}\n")
-    sys.exit(1)
+    sys.exit(FAILED)
+
+
+def print_result(content: dict[str, Any], as_json: bool, line: str) -> None:
+    """Print `content` as JSON, or `line`."""
+    sys.stdout.write(f"{json.dumps(content, indent=1) if as_json else line}\n")
+
+
+def counted(count: int, noun: str) -> str:
+    """The number with its noun, e.g. "1 round", "2 rounds"."""
+    return f"{count} {noun}{'' if count == 1 else 's'}"
 
 
 def _describe(error: OSError) -> str:
@@ -43,17 +60,3 @@ def _describe(error: OSError) -> str:
     if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
         return f"no permission to write or read{where}; choose another folder or change its mode"
     return f"{error.strerror or error}{where}"
-
-
-# How the commands of `datagen` give their results: one line, or JSON on stdout.
-
-
-AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON on stdout.")]
-
-
-def print_result(content: dict[str, Any], as_json: bool, line: str) -> None:
-    sys.stdout.write(f"{json.dumps(content, indent=1) if as_json else line}\n")
-
-
-def counted(count: int, noun: str) -> str:
-    return f"{count} {noun}{'' if count == 1 else 's'}"

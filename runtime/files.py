@@ -1,4 +1,4 @@
-"""Files are written whole or not at all: an older one stays until the new one is complete."""
+"""Atomic writes: a file is replaced in one step, and the old one stays until then."""
 
 import os
 from pathlib import Path
@@ -7,10 +7,7 @@ from trackfeatures.errors import UserError
 
 
 def check_folder(path: Path) -> None:
-    """Raises UserError where `path` cannot be written for want of its folder; ask before long work.
-
-    A pipe or a device is written to where it is.
-    """
+    """Raise UserError unless a file `path` can be made; to be called before a long computation."""
     if path.is_dir():
         raise UserError(f"{path} is a folder; give the name of a file in it")
     if not path.parent.is_dir():
@@ -18,7 +15,7 @@ def check_folder(path: Path) -> None:
 
 
 def atomic_write(path: Path, content: str | bytes, *, fsync: bool = False) -> None:
-    """Replace the file at `path` in one step, through a file beside it; text is written as UTF-8.
+    """Replace the file at `path` in one step, by renaming a file beside it; text becomes UTF-8.
 
     When writing fails (a full disk, a power cut) the old file stays. `fsync` waits until the data
     is on the disk. Raises UserError where the folder is missing, OSError with the file's name.
@@ -26,7 +23,7 @@ def atomic_write(path: Path, content: str | bytes, *, fsync: bool = False) -> No
     check_folder(path)
     data = content.encode() if isinstance(content, str) else content
     if path.exists() and not path.is_file():
-        # A pipe or /dev/stdout cannot be replaced, and must not be.
+        # A pipe or /dev/stdout must not be replaced.
         path.write_bytes(data)
         return
     partial = path.with_name(path.name + ".partial")
@@ -38,7 +35,7 @@ def atomic_write(path: Path, content: str | bytes, *, fsync: bool = False) -> No
                 os.fsync(file.fileno())
         partial.replace(path)
     except OSError as error:
-        # A failed write does not know its file's name, which the user needs.
+        # The error of a failed write lacks the file's name, which the user needs.
         error.filename = error.filename or str(path)
         raise
     finally:

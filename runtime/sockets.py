@@ -1,5 +1,7 @@
-"""The socket of every command that serves: bound before anything else, so that a port in use is
-one clear line."""
+"""Listening sockets of the commands that serve.
+
+A socket is bound before anything else is loaded, so that a port in use is reported at once.
+"""
 
 import socket
 
@@ -7,7 +9,7 @@ from trackfeatures.errors import UserError
 
 
 def bind(host: str, port: int) -> socket.socket:
-    """A socket bound to the address. Raises UserError when that is taken, unknown or forbidden."""
+    """A bound TCP socket. Raises UserError when the address is taken, unknown or forbidden."""
     try:
         family, kind, protocol, _, address = socket.getaddrinfo(
             host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
@@ -26,6 +28,6 @@ def bind(host: str, port: int) -> socket.socket:
 
 
 def address(listener: socket.socket, host: str) -> str:
-    """The URL of a bound socket, with the port that it really has."""
+    """The URL of a bound socket, with the port that the system chose for port 0."""
     shown = f"[{host}]" if ":" in host else host
     return f"http://{shown}:{listener.getsockname()[1]}"

@@ -1,0 +1,53 @@
+"""Atomic writes: replaced in one step, old content kept on failure, pipes written through."""
+
+import errno
+import os
+import threading
+from pathlib import Path
+
+import pytest
+
+from runtime.files import atomic_write, check_folder
+from trackfeatures import UserError
+
+
+def test_text_and_bytes_replace_the_file_and_leave_nothing_beside_it(tmp_path: Path) -> None:
+    path = tmp_path / "file.txt"
+    atomic_write(path, b"old")
+    atomic_write(path, "café", fsync=True)
+    assert path.read_bytes() == b"caf\xc3\xa9"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_failed_write_keeps_the_old_file_and_names_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def disk_full(_: int) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    path = tmp_path / "file.txt"
+    path.write_text("old")
+    monkeypatch.setattr(os, "fsync", disk_full)
+    with pytest.raises(OSError, match="No space left") as caught:
+        atomic_write(path, "new", fsync=True)
+    assert caught.value.filename == str(path)
+    assert path.read_text() == "old"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_pipe_is_written_to_and_not_replaced(tmp_path: Path) -> None:
+    path, received = tmp_path / "pipe", []
+    os.mkfifo(path)
+    reader = threading.Thread(target=lambda: received.append(path.read_bytes()))
+    reader.start()
+    atomic_write(path, "through")
+    reader.join()
+    assert received == [b"through"]
+    assert path.is_fifo()
+
+
+def test_a_missing_folder_or_a_folder_as_file_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="there is no folder"):
+        check_folder(tmp_path / "missing" / "file")
+    with pytest.raises(UserError, match="is a folder"):
+        check_folder(tmp_path)
