@@ -1,1 +1,1 @@
-"""Lateral controllers and the closed-loop drive."""
+"""Lateral controllers, closed-loop driving, and the demo of the whole pipeline."""

@@ -1,4 +1,4 @@
-"""Controllers at the wheel. Run: `controllers drive --controller lqr --track oval`."""
+"""The command `controllers`. Run: `controllers drive --controller lqr --track oval`."""
 
 import json
 from pathlib import Path
@@ -6,61 +6,75 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from controllers.config import DemoConfig, DriveConfig
 from runtime import cli as command
 
 if TYPE_CHECKING:
     from rich.console import Console
 
     from controllers.closed_loop import DriveResult
-    from controllers.drive import DriveConfig
+
+DRIVE, DEMO = DriveConfig(), DemoConfig()
 
 app = typer.Typer(add_completion=False, rich_markup_mode="rich", no_args_is_help=True)
+
+ControllerName = Annotated[
+    str, typer.Option(help="lqr, or torcs: the control law of the reference laps.")
+]
+Track = Annotated[str, typer.Option(help="Its name (`simulator tracks`) or file.")]
+Lanes = Annotated[int, typer.Option(help="1, 2 or 3.")]
+Perception = Annotated[
+    str, typer.Option(help="truth, model, or a service such as http://127.0.0.1:8000")
+]
+Steps = Annotated[int | None, typer.Option(help="Control steps of 50 ms [default: about one lap]")]
+Log = Annotated[Path | None, typer.Option(help="Write the drive to this CSV file.")]
+Model = Annotated[str, typer.Option(help="Run for perception model.")]
+StartD = Annotated[float | None, typer.Option(help="Start this far left of the track's centre, m.")]
+TargetLane = Annotated[
+    int | None, typer.Option(help="Lane to follow, 0 the leftmost [default: the nearest]")
+]
+Throttle = Annotated[float, typer.Option(help="Held open loop, 0 to 1.")]
+Traffic = Annotated[int, typer.Option(help="Other cars, 0 to 12.")]
+Light = Annotated[str, typer.Option(help="clear, overcast, dusk, fog, heavy-shadow, rain or snow.")]
+DriveSeed = Annotated[int, typer.Option(help="Of traffic, light and scenery.", min=0)]
+TracksDir = Annotated[Path | None, typer.Option(help="Folder of TORCS tracks.")]
+
+DemoFolder = Annotated[Path, typer.Option(help="Folder for all results.")]
+Rounds = Annotated[int, typer.Option(help="Rounds to collect.", min=12)]
+FramesARound = Annotated[int, typer.Option(help="Frames a round.", min=20)]
+Minutes = Annotated[float, typer.Option(help="Training time.", min=0.1)]
+DemoSeed = Annotated[int, typer.Option(help="Of the collection and the training.", min=0)]
 
 
 @app.callback()
 def controllers() -> None:
-    """Drive the simulated car with a controller, on the truth or on what a model perceives."""
+    """Drive the simulated car with a controller, on the true state or on a model's perception."""
 
 
 @app.command()
 def drive(
-    controller: Annotated[
-        str, typer.Option(help="lqr, or torcs: the reference laps' law.")
-    ] = "lqr",
-    track: Annotated[str, typer.Option(help="Its name (`simulator tracks`) or file.")] = "oval",
-    lanes: Annotated[int, typer.Option(help="1, 2 or 3.")] = 1,
-    perception: Annotated[
-        str, typer.Option(help="truth, model, or a service such as http://127.0.0.1:8000")
-    ] = "truth",
-    steps: Annotated[
-        int | None, typer.Option(help="Control steps of 50 ms [default: about one lap]")
-    ] = None,
-    log: Annotated[Path | None, typer.Option(help="Write the drive to this CSV file.")] = None,
-    model: Annotated[str, typer.Option(help="Run for perception model.")] = "default",
-    start_d: Annotated[
-        float | None, typer.Option(help="Start this far left of the track's centre, m.")
-    ] = None,
-    target_lane: Annotated[
-        int | None, typer.Option(help="Lane to follow, 0 the leftmost [default: the nearest]")
-    ] = None,
-    throttle: Annotated[float, typer.Option(help="Held open loop, 0 to 1.")] = 0.2,
-    traffic: Annotated[int, typer.Option(help="Other cars, 0 to 12.")] = 0,
-    light: Annotated[str, typer.Option(help="clear, overcast, dusk, fog, heavy-shadow.")] = "clear",
-    seed: Annotated[int, typer.Option(help="Of traffic, light and scenery.", min=0)] = 0,
-    tracks_dir: Annotated[Path | None, typer.Option(help="Folder of TORCS tracks.")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
+    controller: ControllerName = DRIVE.controller,
+    track: Track = DRIVE.track,
+    lanes: Lanes = DRIVE.lanes,
+    perception: Perception = DRIVE.perception,
+    steps: Steps = DRIVE.steps,
+    log: Log = DRIVE.log,
+    model: Model = DRIVE.model,
+    start_d: StartD = DRIVE.start_d,
+    target_lane: TargetLane = DRIVE.target_lane,
+    throttle: Throttle = DRIVE.throttle,
+    traffic: Traffic = DRIVE.traffic,
+    light: Light = DRIVE.light,
+    seed: DriveSeed = DRIVE.seed,
+    tracks_dir: TracksDir = DRIVE.tracks_dir,
+    as_json: command.AsJson = False,
 ) -> None:
-    """Drive closed loop from 25 m before the line, at rest, and score it.
+    """Drive closed loop from 25 m before the line, at rest, and print the score.
 
-    Gear 1 and the throttle are held, but for slower traffic ahead. The score is a sum over the
-    steps asked for; leaving the track, turning round or a collision ends the drive.
+    Gear 1 and the throttle are held, except behind slower traffic. The score is the sum of the
+    rewards over the steps requested; leaving the track, turning round or a collision ends the
+    drive.
     """
-    from rich.markup import escape
-    from rich.progress import MofNCompleteColumn, Progress
-
-    from controllers.drive import DriveConfig
-    from controllers.drive import drive as drive_trip
-
     config = DriveConfig(
         controller=controller,
         track=track,
@@ -77,34 +91,29 @@ def drive(
         seed=seed,
         tracks_dir=tracks_dir,
     )
-    columns = (*Progress.get_default_columns(), MofNCompleteColumn())
-    with Progress(*columns, console=_stderr(), transient=True) as bar:
-        task = bar.add_task(escape(f"{controller} on {track}"), total=None)
-        result = drive_trip(
-            config, lambda done, total: bar.update(task, completed=done, total=total)
-        )
+    result = _drive_with_progress(config)
     if as_json:
         typer.echo(json.dumps(result.as_json()))
     else:
-        _show(config, result)
+        _print_table(config, result)
 
 
 @app.command()
 def demo(
-    out: Annotated[Path, typer.Option(help="Folder for all that comes of it.")] = Path("demo"),
-    rounds: Annotated[int, typer.Option(help="Rounds to collect.", min=12)] = 100,
-    frames: Annotated[int, typer.Option(help="Frames a round.", min=20)] = 200,
-    minutes: Annotated[float, typer.Option(help="Training time.", min=0.1)] = 8.5,
-    seed: Annotated[int, typer.Option(help="Of the collection and the training.", min=0)] = 1,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
+    out: DemoFolder = DEMO.out,
+    rounds: Rounds = DEMO.rounds,
+    frames: FramesARound = DEMO.frames,
+    minutes: Minutes = DEMO.minutes,
+    seed: DemoSeed = DEMO.seed,
+    as_json: command.AsJson = False,
 ) -> None:
-    """The whole pipeline: collect, train, evaluate, serve, ask, drive, and an HTML report.
+    """The whole pipeline: collect, train, evaluate, serve, predict, drive, and an HTML report.
 
-    The same command again goes on where it was stopped. Exit 1 when the model misses a limit.
+    The same command continues where it was stopped. Exit 1 when the model misses a limit.
     """
     from controllers.demo.process import stop_on_sigterm
     from controllers.demo.report import verdicts, write_report
-    from controllers.demo.run import DemoConfig, run_demo
+    from controllers.demo.run import run_demo
     from controllers.demo.tables import print_tables
 
     stop_on_sigterm()
@@ -125,13 +134,25 @@ def demo(
         )
 
 
+def _drive_with_progress(config: DriveConfig) -> "DriveResult":
+    from rich.markup import escape
+    from rich.progress import MofNCompleteColumn, Progress
+
+    from controllers.drive import drive
+
+    columns = (*Progress.get_default_columns(), MofNCompleteColumn())
+    with Progress(*columns, console=_stderr(), transient=True) as bar:
+        task = bar.add_task(escape(f"{config.controller} on {config.track}"), total=None)
+        return drive(config, lambda done, total: bar.update(task, completed=done, total=total))
+
+
 def _stderr() -> "Console":
     from rich.console import Console
 
     return Console(stderr=True)
 
 
-def _show(config: "DriveConfig", result: "DriveResult") -> None:
+def _print_table(config: DriveConfig, result: "DriveResult") -> None:
     from rich.console import Console
     from rich.markup import escape
     from rich.table import Table
@@ -141,17 +162,17 @@ def _show(config: "DriveConfig", result: "DriveResult") -> None:
     table.add_column("figure")
     table.add_column("value", justify="right")
     for name, value in result.as_json().items():
-        table.add_row(name, escape(_shown(value)))
+        table.add_row(name, escape(_cell(value)))
     Console().print(table)
     if config.log is not None:
         typer.echo(f"log: {config.log}")
 
 
-def _shown(value: object) -> str:
+def _cell(value: object) -> str:
     if isinstance(value, float):
         return f"{value:.4f}"
     if isinstance(value, list):
-        return " to ".join(_shown(part) for part in value)
+        return " to ".join(_cell(part) for part in value)
     return "-" if value is None else str(value)
 
 

@@ -1,4 +1,4 @@
-"""What a controller is told and what it must answer. SI units, track frame, left positive."""
+"""What a controller receives and returns. SI units, track frame, left positive."""
 
 from dataclasses import dataclass
 from typing import Protocol
@@ -8,7 +8,7 @@ from trackfeatures import Heading
 
 @dataclass(frozen=True, slots=True)
 class Observation:
-    """One control step as the car knows it: what is perceived, and the car's own sensors."""
+    """One control step: the perceived road and the car's own sensors."""
 
     to_lane_centre: float
     """m from the middle of the lane to follow; the paper's e1."""
@@ -22,7 +22,7 @@ class Observation:
     yaw_rate: float
     """rad/s, counter-clockwise."""
     curvature: float | None = None
-    """1/m, left positive, of the road just ahead; None where nobody tells, as in perception."""
+    """1/m, left positive, of the road just ahead; None where it is not measured (perception)."""
 
 
 class Controller(Protocol):

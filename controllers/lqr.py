@@ -5,13 +5,14 @@ Minimises sum(x'Qx + rho delta^2) for the linear lateral model; the gains follow
 Deviations from the paper:
 - discretised at the control rate (zero-order hold), then the discrete Riccati equation: the
   continuous gains are bang-bang at 20 Hz and leave the road on alpine-2;
-- gains for every speed (a grid, linear in between) in place of one design speed;
+- gains scheduled by speed (a grid, interpolated linearly) in place of one design speed;
 - two sets of weights for all tracks, where the paper tunes five numbers a track: one of the
-  paper's for the exact state, and a softer one for a perceived state. With the errors of a young
-  model (0.25 m, 0.025 rad) the paper's weights swing up to 4 m on alpine-2, the softer ones 0.6 m;
-- feed-forward of the road's curvature, with the slip angle a bend needs as the set point, when
-  somebody tells the curvature. On perception it is estimated from the yaw rate (a slow filter,
-  held to the side the heading class names), which takes the standing offset out of bends.
+  paper's for the exact state, and a softer one for a perceived state. With the errors of a briefly
+  trained model (0.25 m, 0.025 rad) the car swings up to 4 m on alpine-2 with the paper's weights,
+  0.6 m with the softer ones;
+- feed-forward of the road's curvature, with the slip angle of a steady bend as the set point. On
+  perception the curvature is estimated from the yaw rate (low-pass filter, its sign limited by the
+  heading class), which removes the steady offset in bends.
 """
 
 import math
@@ -28,9 +29,35 @@ from trackfeatures import Heading
 Matrix = NDArray[np.float64]
 
 
+SLOWEST_M_S = 3.0
+"""The model divides by the speed; below this speed the gains are constant."""
+FASTEST_M_S = 45.0
+GRID_M_S = 2.0
+
+
+@dataclass(frozen=True)
+class LqrWeights:
+    """Q = diag(offset, offset_rate, heading, heading_rate) and R = rho."""
+
+    offset: float
+    offset_rate: float
+    heading: float
+    heading_rate: float
+    rho: float
+
+
+WEIGHTS_EXACT = LqrWeights(2.0, 0.2, 2.0, 0.1, 0.01)
+"""The paper's for forza and g-track-3."""
+WEIGHTS_PERCEIVED = LqrWeights(1.0, 1.0, 5.0, 1.0, 10.0)
+
+
 @dataclass(frozen=True)
 class LateralModel:
-    """The paper's car; stiffness is that of one tyre, and an axle has two."""
+    """Linear single-track model of the paper's car (Rajamani, "Vehicle Dynamics and Control", 2.5).
+
+    Masses in kg and kg m2, axle distances in m, stiffness in N/rad of one tyre; an axle has two.
+    The state is (e1, e1', e2, e2'): offset from the path and heading error, m and rad, with rates.
+    """
 
     mass: float = 1150.0
     yaw_inertia: float = 2000.0
@@ -40,7 +67,7 @@ class LateralModel:
     rear_stiffness: float = 80_000.0
 
     def matrices(self, speed: float) -> tuple[Matrix, Matrix, Matrix]:
-        """A (4, 4), B (4, 1) and the effect of the road's turning rate (4, 1) at `speed` m/s."""
+        """A (4, 4), B (4, 1) and the column (4, 1) of the road's turning rate, at `speed` m/s."""
         m, inertia, lf, lr = self.mass, self.yaw_inertia, self.front_axle, self.rear_axle
         front, rear = 2.0 * self.front_stiffness, 2.0 * self.rear_stiffness
         total, moment = front + rear, -front * lf + rear * lr
@@ -66,37 +93,15 @@ class LateralModel:
         return step[:4, :4], step[:4, 4:]
 
     def cornering(self, speed: float) -> tuple[float, float]:
-        """Per unit of curvature (1/m) in a steady bend with e1 = 0: (wheel angle, e2), rad m.
+        """Wheel angle and e2 per unit of curvature, rad m, in a steady bend with e1 = 0.
 
-        The heading error is not zero in a bend: the car's nose points off its path by its slip.
+        e2 is not zero in a bend: the car points off its path by its slip angle.
         """
         A, B, turn = self.matrices(speed)
         # 0 = A x + B delta + turn * speed * curvature with x = (0, 0, e2, 0).
         unknown = np.column_stack([B[[1, 3], 0], A[[1, 3], 2]])
         wheel_angle, heading = np.linalg.solve(unknown, -turn[[1, 3], 0] * speed)
         return float(wheel_angle), float(heading)
-
-
-SLOWEST_M_S = 3.0
-"""The model divides by the speed; below this its gains are held."""
-FASTEST_M_S = 45.0
-GRID_M_S = 2.0
-
-
-@dataclass(frozen=True)
-class LqrWeights:
-    """Q = diag(offset, offset_rate, heading, heading_rate) and R = rho."""
-
-    offset: float
-    offset_rate: float
-    heading: float
-    heading_rate: float
-    rho: float
-
-
-EXACT = LqrWeights(2.0, 0.2, 2.0, 0.1, 0.01)
-"""The paper's for forza and g-track-3."""
-PERCEIVED = LqrWeights(1.0, 1.0, 5.0, 1.0, 10.0)
 
 
 def dlqr(A: Matrix, B: Matrix, Q: Matrix, R: Matrix) -> Matrix:
@@ -115,12 +120,12 @@ def gain_at(model: LateralModel, weights: LqrWeights, speed: float, dt: float) -
 
 
 class Lqr:
-    """Speed-scheduled LQR at a control step of `dt` s; all gains are solved when it is made."""
+    """Speed-scheduled LQR at a control step of `dt` s; the constructor computes all gains."""
 
     def __init__(
         self,
         dt: float = 0.05,
-        weights: LqrWeights = EXACT,
+        weights: LqrWeights = WEIGHTS_EXACT,
         model: LateralModel | None = None,
         *,
         curvature_filter_s: float = 0.4,
@@ -130,19 +135,19 @@ class Lqr:
         self.model = model or LateralModel()
         self._speeds = np.arange(SLOWEST_M_S, FASTEST_M_S + GRID_M_S, GRID_M_S)
         self._gains = np.array([gain_at(self.model, self.weights, v, dt) for v in self._speeds])
-        self._bends = np.array([self.model.cornering(v) for v in self._speeds])
+        self._steady_bends = np.array([self.model.cornering(v) for v in self._speeds])
         self._blend = dt / (dt + curvature_filter_s)
         self._curvature = 0.0
 
     def gain(self, speed: float) -> Matrix:
         """K (4,) at `speed` m/s."""
-        return self._at(speed, self._gains)
+        return self._interpolate(speed, self._gains)
 
     def update(self, observation: Observation) -> float:
         speed = max(observation.vx, SLOWEST_M_S)
-        curvature = self._road(observation)
+        curvature = self._road_curvature(observation)
         theta = -observation.angle
-        wheel_per_bend, theta_per_bend = self._at(speed, self._bends)
+        wheel_per_bend, theta_per_bend = self._interpolate(speed, self._steady_bends)
         error = np.array(
             [
                 observation.to_lane_centre,
@@ -154,8 +159,8 @@ class Lqr:
         wheel_angle = wheel_per_bend * curvature - float(self.gain(speed) @ error)
         return steer_for(float(wheel_angle))
 
-    def _road(self, observation: Observation) -> float:
-        """The curvature told, or else one estimated from how the car has been turning."""
+    def _road_curvature(self, observation: Observation) -> float:
+        """The measured curvature, or one estimated from yaw rate and speed where there is none."""
         if observation.curvature is not None:
             return observation.curvature
         turning = observation.yaw_rate / max(observation.vx, SLOWEST_M_S)
@@ -166,8 +171,8 @@ class Lqr:
             self._curvature = min(self._curvature, 0.0)
         return self._curvature
 
-    def _at(self, speed: float, table: Matrix) -> Matrix:
-        """Linear interpolation of the rows of `table` at `speed`, held beyond the grid."""
+    def _interpolate(self, speed: float, table: Matrix) -> Matrix:
+        """Linear interpolation of the rows of `table` at `speed`, constant beyond the grid."""
         place = (min(max(speed, SLOWEST_M_S), FASTEST_M_S) - SLOWEST_M_S) / GRID_M_S
         low = min(int(place), len(table) - 2)
         share = place - low

@@ -4,33 +4,29 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from controllers.interface import Controller
-from controllers.lqr import EXACT, PERCEIVED, Lqr
-from controllers.torcs_feedback import Feedback
+from controllers.lqr import WEIGHTS_EXACT, WEIGHTS_PERCEIVED, Lqr
+from controllers.torcs_feedback import StateFeedback
 from trackfeatures.errors import UserError
 
 
 @dataclass(frozen=True)
-class Setting:
-    """What a controller is made for."""
+class LoopConfig:
+    """The control loop that a controller is made for."""
 
     dt: float
     """s between two control steps."""
-    perceived: bool = False
-    """Whether the road is perceived, with errors, or known exactly."""
+    noisy: bool = False
+    """Whether the state is estimated by a perception, with errors, or exact."""
 
 
-CONTROLLERS: dict[str, Callable[[Setting], Controller]] = {
-    "lqr": lambda setting: Lqr(setting.dt, PERCEIVED if setting.perceived else EXACT),
-    "torcs": lambda setting: Feedback(),
+CONTROLLERS: dict[str, Callable[[LoopConfig], Controller]] = {
+    "lqr": lambda loop: Lqr(loop.dt, WEIGHTS_PERCEIVED if loop.noisy else WEIGHTS_EXACT),
+    "torcs": lambda loop: StateFeedback(),
 }
-PLANNED = ("mpc", "rl")
 
 
-def make_controller(name: str, setting: Setting) -> Controller:
-    """Raises UserError for a name that is not there (yet)."""
-    if name in CONTROLLERS:
-        return CONTROLLERS[name](setting)
-    there = ", ".join(CONTROLLERS)
-    if name in PLANNED:
-        raise UserError(f"the controller {name!r} is not there yet; use one of: {there}")
-    raise UserError(f"there is no controller {name!r}; use one of: {there}")
+def make_controller(name: str, loop: LoopConfig) -> Controller:
+    """The controller `name`. Raises UserError where there is none of that name."""
+    if name not in CONTROLLERS:
+        raise UserError(f"there is no controller {name!r}; use one of: {', '.join(CONTROLLERS)}")
+    return CONTROLLERS[name](loop)

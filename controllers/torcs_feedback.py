@@ -2,8 +2,8 @@
 
 front wheel angle (rad) = -(1.0 d + 0.1 (vy + vx sin theta) + 2.0 theta + 0.1 yaw rate)
 
-No model, no feed-forward. It is the yardstick for the simulated car: the same law in TORCS and here
-must drive the same laps.
+Without model and feed-forward. It compares the simulated car with TORCS: the same law must drive
+the same laps in both.
 """
 
 import math
@@ -21,8 +21,8 @@ def steer_for(wheel_angle: float, lock: float = STEERING_LOCK) -> float:
 
 
 @dataclass(frozen=True)
-class Feedback:
-    """Gains on the offset (rad/m), its rate, the heading error and the yaw rate."""
+class StateFeedback:
+    """Gains: rad of the front wheels per m, m/s, rad and rad/s."""
 
     offset: float = 1.0
     offset_rate: float = 0.1

@@ -13,9 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from controllers.closed_loop import GEAR, THROTTLE
+from controllers.closed_loop import GEAR
+from controllers.config import THROTTLE
 from controllers.interface import Observation
-from controllers.torcs_feedback import Feedback
+from controllers.torcs_feedback import StateFeedback
 from simulator.track.catalogue import find_track
 from simulator.track.road import Road
 from simulator.vehicle.state import CarState, Command
@@ -95,7 +96,7 @@ def drive_laps(road: Road, start_d: float, holds: list[int]) -> list[CarState]:
 
     `holds`: physics steps from one control step to the next, again and again.
     """
-    law, seen = Feedback(), []
+    law, seen = StateFeedback(), []
     with World(road, frequency_hz=PHYSICS_HZ) as world:
         now = world.reset(seed=0, to_middle=start_d)
         for hold in itertools.cycle(holds):

@@ -1,1 +1,1 @@
-"""`controllers demo`: the whole pipeline in one go, told in a table and an HTML report."""
+"""`controllers demo`: the whole pipeline in one command, with a table and an HTML report."""

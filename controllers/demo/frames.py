@@ -1,4 +1,4 @@
-"""Held-out frames for the demo: spread over the test rounds, then asked of the service."""
+"""Held-out frames for the demo: chosen from all test rounds, then posted to the service."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -12,7 +12,7 @@ from trackfeatures import MARKINGS, Heading, localise
 
 @dataclass(frozen=True, slots=True)
 class Asked:
-    """One held-out frame (JPEG), the truth about it, and what the service answered."""
+    """One held-out frame (JPEG), its labels, and the answer of the service."""
 
     jpeg: bytes
     round_id: str
@@ -32,7 +32,7 @@ class Asked:
 
 
 def spread(frames: Frames, count: int, rng: np.random.Generator) -> list[int]:
-    """`count` frame numbers, the same share of every round, drawn without repetition."""
+    """`count` frame numbers, equally many of every round, drawn without repetition."""
     rounds = frames.labels.round
     shares = np.array_split(np.arange(count), len(np.unique(rounds)))
     chosen: list[int] = []
@@ -43,11 +43,11 @@ def spread(frames: Frames, count: int, rng: np.random.Generator) -> list[int]:
 
 
 def ask(frames: Frames, indices: list[int], client: Client) -> list[Asked]:
-    """Post the recorded JPEG files and set the answers beside the labels."""
-    return [_ask_one(frames, index, client) for index in indices]
+    """Post the recorded JPEG files; the answers with their labels."""
+    return [_ask_frame(frames, index, client) for index in indices]
 
 
-def _ask_one(frames: Frames, index: int, client: Client) -> Asked:
+def _ask_frame(frames: Frames, index: int, client: Client) -> Asked:
     labels = frames.labels
     jpeg = bytes(frames.jpeg(index))
     answer = client.features(jpeg)
@@ -62,7 +62,7 @@ def _ask_one(frames: Frames, index: int, client: Client) -> Asked:
             name: None if np.isnan(value) else float(value)
             for name, value in zip(MARKINGS, values, strict=True)
         },
-        to_lane_centre=_localised(values),
+        to_lane_centre=_lane_offset(values),
         angle=float(labels.angle[index]),
         heading=Heading(int(labels.heading[index])).name.lower(),
         curvature=float(labels.curvature[index]),
@@ -70,6 +70,6 @@ def _ask_one(frames: Frames, index: int, client: Client) -> Asked:
     )
 
 
-def _localised(values: Any) -> float | None:
+def _lane_offset(values: Any) -> float | None:
     centre = float(localise(values)[0])
     return None if np.isnan(centre) else centre

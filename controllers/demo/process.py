@@ -1,6 +1,6 @@
-"""The project's commands as processes of their own: run to their end, or served and stopped.
+"""The project's commands as child processes: run to the end, or started and stopped (the service).
 
-Whatever ends the demo, Ctrl-C or SIGTERM, its processes get the time to leave nothing half done.
+On Ctrl-C and SIGTERM the child processes get `STOP_LIMIT_S` to end by themselves.
 """
 
 import signal
@@ -19,7 +19,7 @@ STOP_LIMIT_S = 10.0
 
 
 class Terminated(KeyboardInterrupt):
-    """SIGTERM: unlike the terminal's Ctrl-C, it has not reached the child processes."""
+    """SIGTERM: unlike Ctrl-C in a terminal, it does not reach the child processes by itself."""
 
 
 def stop_on_sigterm() -> None:
@@ -37,17 +37,17 @@ def run_module(command: list[str]) -> tuple[int, str]:
         [sys.executable, "-m", *command], stdout=subprocess.PIPE, text=True
     ) as child:
         try:
-            said, _ = child.communicate()
+            output, _ = child.communicate()
         except KeyboardInterrupt as reason:
             if isinstance(reason, Terminated):
                 child.terminate()
             _wait(child)
             raise
-    return child.returncode, said
+    return child.returncode, output
 
 
 def free_port() -> int:
-    """A port of the loopback interface that nobody listens on now."""
+    """A port of the loopback interface that is free now."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port: int = probe.getsockname()[1]
@@ -56,10 +56,9 @@ def free_port() -> int:
 
 @contextmanager
 def running_service(model: Path, log: Path) -> Iterator[str]:
-    """Serve the run folder `model`; gives the service's address while the block runs.
+    """Serve the run folder `model`; yields the service's address.
 
-    Raises UserError with the end of the log if the service does not become ready or does not stop
-    when asked to.
+    Raises UserError with the end of the log if the service does not become ready or does not stop.
     """
     port = free_port()
     url = f"http://127.0.0.1:{port}"
@@ -82,10 +81,10 @@ def _wait_until_ready(server: subprocess.Popen[bytes], url: str, log: Path) -> N
         with Client(url) as client:
             client.wait_until_ready(START_LIMIT_S)
     except UserError as error:
-        said = log.read_text(errors="replace").strip().splitlines()[-3:]
+        last_lines = log.read_text(errors="replace").strip().splitlines()[-3:]
         state = "still running" if server.poll() is None else f"ended with {server.returncode}"
         raise UserError(
-            f"the service is not ready ({state}): {error}; {' | '.join(said)}"
+            f"the service is not ready ({state}): {error}; {' | '.join(last_lines)}"
         ) from None
 
 
@@ -95,7 +94,7 @@ def _stop(server: subprocess.Popen[bytes]) -> bool:
 
 
 def _wait(child: "subprocess.Popen[bytes] | subprocess.Popen[str]") -> bool:
-    """Give the process its time to stop by itself; False when it had to be killed."""
+    """Wait `STOP_LIMIT_S` for the process to end; False when it had to be killed."""
     try:
         child.wait(STOP_LIMIT_S)
     except subprocess.TimeoutExpired:

@@ -13,8 +13,9 @@ import numpy as np
 import simplejpeg
 from numpy.typing import NDArray
 
+from controllers.config import DemoConfig
 from controllers.demo.frames import Asked
-from controllers.demo.run import DemoConfig, DemoResult
+from controllers.demo.run import DemoResult
 from datagen.recording import Dataset
 from mtlnet.inference.overlay import draw_answer
 from mtlnet.training.logging import read_curves

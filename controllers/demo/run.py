@@ -1,4 +1,4 @@
-"""The steps of the demo. Each is the command that a user would type, printed before it runs."""
+"""The steps of the demo. Each is a command of this project, printed before it runs."""
 
 import json
 import shlex
@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
+from controllers.config import DemoConfig
 from controllers.demo.frames import Asked, ask, spread
 from controllers.demo.process import run_module, running_service
 from datagen.recording import Dataset
@@ -19,29 +20,12 @@ from trackfeatures import UserError
 
 LOG = Console(stderr=True, highlight=False)
 DRIVE_STEPS = 800
-"""of 50 ms: 40 s from a standing start"""
-
-
-@dataclass(frozen=True, slots=True)
-class DemoConfig:
-    """What the demo collects and how long it learns; the defaults fit 15 minutes on two cores."""
-
-    out: Path
-    tracks: str = "circuit,countryside,forest,highway,mountain-pass"
-    rounds: int = 100
-    frames: int = 200
-    seed: int = 1
-    minutes: float = 8.5
-    """of training"""
-    alpha: str = "0.3,0.2,0.5"
-    asked: int = 12
-    """held-out frames that are posted to the service"""
-    drive_track: str = "highway"
+"""Of 50 ms: 40 s from a standing start."""
 
 
 @dataclass(slots=True)
 class DemoResult:
-    """What every step said, for the report."""
+    """The output of every step, for the report."""
 
     collected: dict[str, Any] = field(default_factory=dict)
     evaluation: dict[str, Any] = field(default_factory=dict)
@@ -51,7 +35,7 @@ class DemoResult:
     seconds: dict[str, float] = field(default_factory=dict)
 
     def as_json(self) -> dict[str, Any]:
-        """All of it but the pictures."""
+        """All of it except the images."""
         content = asdict(self)
         for one in content["asked"]:
             del one["jpeg"]
@@ -59,16 +43,16 @@ class DemoResult:
 
 
 def run_demo(config: DemoConfig) -> DemoResult:
-    """Collect, verify, train, evaluate, serve, ask, drive; `config.out` holds all that comes of it.
+    """Collect, verify, train, evaluate, serve, predict, drive; all results go to `config.out`.
 
-    Raises UserError when `config.out` holds something else than an earlier demo, or a step fails.
+    Raises UserError when `config.out` holds other files than an earlier demo's, or a step fails.
     """
     _check_folder(config.out)
     result = DemoResult()
     data, run = str(config.out / "data"), str(config.out / "run")
     collect = ["datagen", "collect", "--out", data, "--json"]
     collect += ["--rounds", str(config.rounds), "--frames", str(config.frames)]
-    collect += ["--scenes", "4"]  # rounds so short would show one each
+    collect += ["--scenes", "4"]  # rounds this short would have one each
     collect += ["--tracks", config.tracks, "--seed", str(config.seed)]
     train = ["mtlnet", "train", "--data", data, "--out", run, "--alpha", config.alpha]
     train += ["--recipe", "fast", "--minutes", f"{config.minutes:g}", "--seed", str(config.seed)]
@@ -87,9 +71,9 @@ def run_demo(config: DemoConfig) -> DemoResult:
 
 
 def _use_service(config: DemoConfig, result: DemoResult) -> None:
-    """Post held-out frames and let the answers steer a car, on one service."""
+    """Post held-out frames, and drive a car on the answers, with one service."""
     started = time.monotonic()
-    _show(result, f"serve --model {config.out / 'run'}")
+    _log_command(result, f"serve --model {config.out / 'run'}")
     frames = Dataset.open(config.out / "data").select("test")
     chosen = spread(frames, config.asked, np.random.default_rng([config.seed, 1]))
     with (
@@ -105,19 +89,19 @@ def _use_service(config: DemoConfig, result: DemoResult) -> None:
 
 
 def _step(result: DemoResult, name: str, command: list[str]) -> str:
-    """Run one of the project's commands; its standard output comes back, the rest is shown."""
+    """Run one of the project's commands and return its stdout; its stderr is not captured."""
     shown = shlex.join(command)
-    _show(result, shown)
+    _log_command(result, shown)
     started = time.monotonic()
-    code, said = run_module(command)
+    code, output = run_module(command)
     result.seconds[name] = time.monotonic() - started
     if code:
-        sys.stderr.write(said)
+        sys.stderr.write(output)
         raise UserError(f"`{shown}` ended with exit code {code}; its message is above")
-    return said
+    return output
 
 
-def _show(result: DemoResult, command: str) -> None:
+def _log_command(result: DemoResult, command: str) -> None:
     result.commands.append(command)
     LOG.print(f"$ {command}", style="bold", markup=False)
 
@@ -125,6 +109,6 @@ def _show(result: DemoResult, command: str) -> None:
 def _check_folder(out: Path) -> None:
     marker = out / "driverview-demo"
     if out.exists() and any(out.iterdir()) and not marker.exists():
-        raise UserError(f"{out} holds other files; name an empty or new folder with --out")
+        raise UserError(f"{out} holds other files; give an empty or new folder with --out")
     out.mkdir(parents=True, exist_ok=True)
     marker.touch()

@@ -1,4 +1,4 @@
-"""The `controllers` command: JSON on stdout, one clear line on stderr when something is wrong."""
+"""The `controllers` command: JSON on stdout, one error line on stderr."""
 
 import json
 import subprocess
@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from controllers.demo.process import free_port
+from simulator.camera import KINDS
 from tests.typed import typed
 
 
@@ -24,14 +25,14 @@ def test_drive_prints_json_and_writes_the_log(tmp_path: Path) -> None:
     assert len(log.read_text().splitlines()) == 61
 
 
-def test_drive_prints_a_table_for_people() -> None:
+def test_drive_prints_a_table() -> None:
     done = run("drive", "--track", "oval", "--steps", "20", "--controller", "torcs")
     assert done.returncode == 0, done.stderr
     assert "torcs on oval" in done.stdout
     assert "score_per_step" in done.stdout
 
 
-def test_a_service_that_is_down() -> None:
+def test_a_service_that_does_not_answer_is_one_error_line() -> None:
     url = f"http://127.0.0.1:{free_port()}"
     done = run("drive", "--steps", "20", "--perception", url)
     assert done.returncode == 1
@@ -41,10 +42,15 @@ def test_a_service_that_is_down() -> None:
     assert "Traceback" not in done.stderr
 
 
+def test_the_help_of_drive_names_every_light() -> None:
+    shown = run("drive", "--help").stdout
+    assert all(kind in shown for kind in KINDS)
+
+
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "message"),
     [
-        (("--controller", "mpc"), "not there yet; use one of"),
+        (("--controller", "mpc"), "no controller 'mpc'; use one of: lqr, torcs"),
         (("--lanes", "7"), "7"),
         (("--throttle", "2"), "throttle 2.0"),
         (("--steps", "0"), "0 steps"),
@@ -56,10 +62,10 @@ def test_a_service_that_is_down() -> None:
     ],
     ids=lambda value: " ".join(value) if isinstance(value, tuple) else None,
 )
-def test_mistakes_get_one_line(arguments: tuple[str, ...], said: str) -> None:
+def test_a_wrong_option_is_one_error_line(arguments: tuple[str, ...], message: str) -> None:
     done = run("drive", "--steps", "20", *arguments)
     assert done.returncode == 1, done.stdout
     assert "Traceback" not in done.stderr
     errors = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
     assert len(errors) == 1, done.stderr
-    assert said in errors[0]
+    assert message in errors[0]

@@ -1,4 +1,4 @@
-"""Closed-loop driving on a fake world (whose sums are known) and on the real one."""
+"""Closed-loop driving on a fake world with known sums, and on the simulator."""
 
 import csv
 import io
@@ -11,11 +11,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from controllers.closed_loop import COLUMNS, DriveLog, OffsetMemory, pedals, run_lap
-from controllers.drive import DriveConfig, choose_lane, drive, steps_for
+from controllers.closed_loop import COLUMNS, DriveLog, OffsetMemory, run_lap, throttle_and_brake
+from controllers.config import DriveConfig
+from controllers.drive import choose_lane, drive, steps_for
 from controllers.interface import Observation
-from controllers.lqr import PERCEIVED, Lqr
-from controllers.perception import Perceived, truth
+from controllers.lqr import WEIGHTS_PERCEIVED, Lqr
+from controllers.perception import Perceived, PerceptionSource, truth
 from simulator.track.catalogue import find_track
 from simulator.track.road import Road
 from simulator.traffic.traffic import Traffic
@@ -37,7 +38,7 @@ def at_rest(**changes: float) -> CarState:
 
 
 class FakeWorld:
-    """Plays back `states`; remembers the commands."""
+    """Plays back `states` and stores the commands."""
 
     def __init__(self, *states: CarState, traffic: Traffic | None = None) -> None:
         self.road = Road(find_track("oval"))
@@ -53,14 +54,14 @@ class FakeWorld:
         return self.state
 
 
-class Answering:
-    """A controller that answers with `law` of what it is told."""
+class FunctionController:
+    """A controller whose steering is `law` of the observation."""
 
     def __init__(self, law: Callable[[Observation], float]) -> None:
         self.update = law
 
 
-def seen(offset: float | None = 0.0) -> Callable[[FakeWorld], Perceived]:
+def perceiving(offset: float | None = 0.0) -> Callable[[FakeWorld], Perceived]:
     return lambda world: Perceived(offset, 0.0, Heading.STRAIGHT)
 
 
@@ -69,7 +70,7 @@ def test_the_score_is_the_sum_of_the_rewards_after_each_step() -> None:
         at_rest(to_middle=0.5, angle=0.1, vx=10.0),
         at_rest(to_middle=-1.0, angle=-0.2, vx=20.0, lap=3),
     )
-    result = run_lap(world, Answering(lambda told: 0.25), seen(), 2)
+    result = run_lap(world, FunctionController(lambda observation: 0.25), perceiving(), 2)
     first = math.cos(0.1) - math.sin(0.1) - 0.5 / HALF_WIDTH
     second = math.cos(0.2) - math.sin(0.2) - 1.0 / HALF_WIDTH
     assert result.score == pytest.approx(first + second)
@@ -90,58 +91,60 @@ def test_the_score_is_the_sum_of_the_rewards_after_each_step() -> None:
         ({"collision": "traffic"}, "collision"),
     ],
 )
-def test_an_ending_costs_two_and_the_steps_after_it_give_nothing(
+def test_an_ending_step_scores_minus_two_and_later_steps_zero(
     change: dict[str, float], ended: str
 ) -> None:
     world = FakeWorld(at_rest(), at_rest(**change), at_rest())
-    result = run_lap(world, Answering(lambda told: 0.0), seen(), 10)
+    result = run_lap(world, FunctionController(lambda observation: 0.0), perceiving(), 10)
     assert result.ended == ended
     assert (result.steps, result.steps_asked) == (2, 10)
     assert result.score == pytest.approx(1.0 - 2.0)
     assert result.score_per_step == pytest.approx(-0.1)
 
 
-def test_the_controller_is_told_what_is_perceived_and_what_the_car_senses() -> None:
-    told: list[Observation] = []
+def test_the_observation_holds_the_perception_and_the_cars_sensors() -> None:
+    observations: list[Observation] = []
     world = FakeWorld(at_rest())
     world.state = at_rest(vx=12.0, vy=0.3, yaw_rate=0.1, to_middle=9.0, angle=9.0)
 
     def law(observation: Observation) -> float:
-        told.append(observation)
+        observations.append(observation)
         return 0.0
 
     run_lap(
         world,
-        Answering(law),
+        FunctionController(law),
         lambda world: Perceived(0.7, -0.02, Heading.LEFT, 0.01),
         1,
     )
-    assert told == [Observation(0.7, -0.02, Heading.LEFT, 12.0, 0.3, 0.1, 0.01)]
+    assert observations == [Observation(0.7, -0.02, Heading.LEFT, 12.0, 0.3, 0.1, 0.01)]
 
 
-def test_a_lost_offset_is_held_and_then_dropped() -> None:
+def test_a_lost_offset_is_held_for_a_time_then_zero() -> None:
     memory = OffsetMemory(hold_steps=2)
     answers = [memory.fill(offset) for offset in (None, 0.4, None, None, None, 0.1, None)]
     assert answers == [0.0, 0.4, 0.4, 0.4, 0.0, 0.1, 0.1]
     assert memory.blind_steps == 5
-    result = run_lap(FakeWorld(*[at_rest()] * 3), Answering(lambda told: 0.0), seen(None), 3)
+    straight_on = FunctionController(lambda observation: 0.0)
+    result = run_lap(FakeWorld(*[at_rest()] * 3), straight_on, perceiving(None), 3)
     assert result.blind_steps == 3
 
 
-def test_pedals_give_way_to_a_slower_car_ahead() -> None:
+def test_throttle_is_eased_and_brake_applied_behind_a_slower_car() -> None:
     road = Road(find_track("oval"))
     traffic = Traffic(road, 1, np.random.default_rng(0), clear_s=0.0)
     s, speed = float(traffic.s[0]), float(traffic.speed[0])
 
     def behind(gap: float, vx: float) -> tuple[float, float]:
-        return pedals(traffic, at_rest(s=s - gap - 4.46, vx=vx), 0.2)
+        return throttle_and_brake(traffic, at_rest(s=s - gap - 4.46, vx=vx), 0.2)
 
     assert behind(200.0, speed) == (0.2, 0.0)
     throttle, brake = behind(5.0, speed + 5.0)
     assert throttle == 0.0
     assert 0.1 < brake <= 1.0
     assert list(behind(2.0, 25.0)) == pytest.approx([0.0, (9.0 - 1.0) / 15.0])
-    assert pedals(Traffic(road, 0, np.random.default_rng(0)), at_rest(), 0.3) == (0.3, 0.0)
+    no_traffic = Traffic(road, 0, np.random.default_rng(0))
+    assert throttle_and_brake(no_traffic, at_rest(), 0.3) == (0.3, 0.0)
 
 
 def test_log_has_the_columns_and_signs_of_the_reference_laps() -> None:
@@ -156,7 +159,7 @@ def test_log_has_the_columns_and_signs_of_the_reference_laps() -> None:
     assert (float(values["t"]), float(values["steer"])) == (1.05, 0.75)
 
 
-def test_lqr_on_the_truth_stays_in_the_middle(tmp_path: Path) -> None:
+def test_lqr_on_the_true_state_stays_in_the_middle(tmp_path: Path) -> None:
     """15 s from rest, half a metre off at the start, through the first bend of the town."""
     log = tmp_path / "drive.csv"
     config = DriveConfig(track="town", steps=300, start_d=0.5, log=log)
@@ -183,17 +186,17 @@ def test_two_lanes_follow_the_target_lane_among_traffic() -> None:
     assert result.max_abs_d_m < 0.3
 
 
-def test_the_truth_tells_the_offset_from_the_target_lane() -> None:
+def test_truth_measures_the_offset_from_the_target_lane() -> None:
     with World(Road(find_track("oval"), lanes=3)) as world:
         world.reset(seed=0, to_middle=-3.0, angle=0.05)
-        told = truth(-4.0)(world)
-    assert told.to_lane_centre == pytest.approx(1.0, abs=1e-6)
-    assert told.angle == pytest.approx(0.05, abs=1e-6)
-    assert (told.heading, told.curvature) == (Heading.STRAIGHT, 0.0)
+        measured = truth(-4.0)(world)
+    assert measured.to_lane_centre == pytest.approx(1.0, abs=1e-6)
+    assert measured.angle == pytest.approx(0.05, abs=1e-6)
+    assert (measured.heading, measured.curvature) == (Heading.STRAIGHT, 0.0)
 
 
 def test_lqr_drives_on_a_noisy_perception() -> None:
-    """Errors of a young model; the weights for a perceived state keep the car in its lane."""
+    """Errors of a briefly trained model; the weights for it keep the car in its lane."""
     rng = np.random.default_rng(3)
 
     def perceive(world: World) -> Perceived:
@@ -208,10 +211,23 @@ def test_lqr_drives_on_a_noisy_perception() -> None:
 
     with World(Road(find_track("town"))) as world:
         world.reset(seed=0)
-        result = run_lap(world, Lqr(0.05, PERCEIVED), perceive, 600)
+        result = run_lap(world, Lqr(0.05, WEIGHTS_PERCEIVED), perceive, 600, noisy=True)
     assert result.ended is None
     assert result.max_abs_d_m < 0.8
     assert result.blind_steps > 20
+    assert result.noisy
+
+
+@pytest.mark.parametrize(("perception", "noisy"), [("truth", False), ("model", True)])
+def test_a_drive_on_perception_is_noisy(
+    perception: str, noisy: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def open_perception(*_: object, **__: object) -> PerceptionSource:
+        return PerceptionSource(truth(0.0))
+
+    monkeypatch.setattr("controllers.drive.open_perception", open_perception)
+    result = drive(DriveConfig(perception=perception, steps=3))
+    assert result.as_json()["noisy"] is noisy
 
 
 def test_steps_by_track() -> None:
@@ -223,7 +239,7 @@ def test_steps_by_track() -> None:
 
 
 @pytest.mark.parametrize(
-    ("changes", "said"),
+    ("changes", "message"),
     [
         ({"target_lane": 2}, "target lane 2"),
         ({"target_lane": -1}, "target lane -1"),
@@ -232,13 +248,13 @@ def test_steps_by_track() -> None:
         ({"target_lane": 0, "start_d": -2.0, "perception": "model"}, "only the lane"),
     ],
 )
-def test_lanes_that_cannot_be(changes: dict[str, float], said: str) -> None:
+def test_an_impossible_lane_or_start_is_refused(changes: dict[str, float], message: str) -> None:
     config = replace(DriveConfig(lanes=2), **changes)  # type: ignore[arg-type]  # as above
-    with pytest.raises(UserError, match=said):
+    with pytest.raises(UserError, match=message):
         choose_lane(config, Road(find_track("oval"), lanes=2))
 
 
-def test_the_lane_to_follow() -> None:
+def test_choice_of_the_lane_to_follow() -> None:
     road = Road(find_track("oval"), lanes=2)
     assert choose_lane(DriveConfig(lanes=2, target_lane=0), road).start_d == 2.0
     assert choose_lane(DriveConfig(lanes=2, start_d=-1.0), road).centre == -2.0
@@ -247,8 +263,10 @@ def test_the_lane_to_follow() -> None:
     assert (single.start_d, single.centre) == (0.0, 0.0)
 
 
-def test_the_result_speaks_json() -> None:
-    result = run_lap(FakeWorld(at_rest()), Answering(lambda told: 0.0), seen(), 1)
+def test_the_result_is_written_as_json() -> None:
+    result = run_lap(
+        FakeWorld(at_rest()), FunctionController(lambda observation: 0.0), perceiving(), 1
+    )
     content = json.loads(json.dumps(result.as_json()))
     named = "steps score score_per_step laps mean_abs_d_m max_abs_d_m speed_kmh ended"
     assert set(named.split()) <= set(content)

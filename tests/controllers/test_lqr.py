@@ -1,4 +1,4 @@
-"""The LQR against textbook cases, the stability of its loop, its signs, its step response."""
+"""LQR: textbook cases, stability of the closed loop, signs, step response."""
 
 import math
 from dataclasses import replace
@@ -10,18 +10,18 @@ from scipy.linalg import solve_discrete_are
 
 from controllers.interface import Controller, Observation
 from controllers.lqr import (
-    EXACT,
     FASTEST_M_S,
-    PERCEIVED,
     SLOWEST_M_S,
+    WEIGHTS_EXACT,
+    WEIGHTS_PERCEIVED,
     LateralModel,
     Lqr,
     LqrWeights,
     Matrix,
     dlqr,
 )
-from controllers.registry import Setting, make_controller
-from controllers.torcs_feedback import STEERING_LOCK, Feedback
+from controllers.registry import LoopConfig, make_controller
+from controllers.torcs_feedback import STEERING_LOCK, StateFeedback
 from trackfeatures import Heading, UserError
 
 STRAIGHT_AT_20 = Observation(
@@ -35,14 +35,14 @@ STRAIGHT_AT_20 = Observation(
 )
 
 
-def test_scalar_regulator_has_its_closed_form() -> None:
+def test_scalar_regulator_has_the_closed_form_gain() -> None:
     """x' = x + u, cost x^2 + u^2: P is the golden ratio, K = P / (1 + P)."""
     gain = dlqr(np.eye(1), np.eye(1), np.eye(1), np.eye(1))
     golden = (1 + math.sqrt(5)) / 2
     assert gain[0, 0] == pytest.approx(golden / (1 + golden))
 
 
-def test_gain_is_that_of_the_discrete_riccati_equation() -> None:
+def test_gain_solves_the_discrete_riccati_equation() -> None:
     """Double integrator at 0.1 s: u = -(R + B'PB)^-1 B'PA x, and P solves the equation."""
     A, B = np.array([[1.0, 0.1], [0.0, 1.0]]), np.array([[0.005], [0.1]])
     Q, R = np.diag([1.0, 0.5]), np.array([[0.2]])
@@ -52,7 +52,7 @@ def test_gain_is_that_of_the_discrete_riccati_equation() -> None:
     np.testing.assert_allclose(Q + A.T @ P @ (A - B @ gain), P, rtol=1e-9)
 
 
-def test_model_is_rajamanis() -> None:
+def test_model_matrices_are_those_of_the_paper() -> None:
     """The entries of the paper's A and B, typed from it, at 20 m/s."""
     A, B, turn = LateralModel().matrices(20.0)
     c, m, inertia, lf, lr, v = 80_000.0, 1150.0, 2000.0, 1.27, 1.37, 20.0
@@ -71,7 +71,7 @@ def test_model_is_rajamanis() -> None:
     assert turn[1, 0] == pytest.approx(moment / (m * v) - v)
 
 
-def test_discretisation_equals_small_steps() -> None:
+def test_discretisation_equals_integration_in_small_steps() -> None:
     model, speed, dt = LateralModel(), 20.0, 0.05
     A, B, _ = model.matrices(speed)
     state, wheel = np.array([0.5, -0.2, 0.05, 0.1]), 0.03
@@ -82,7 +82,7 @@ def test_discretisation_equals_small_steps() -> None:
     np.testing.assert_allclose(exact[0] @ state + exact[1][:, 0] * wheel, small, atol=2e-5)
 
 
-@pytest.mark.parametrize("weights", [EXACT, PERCEIVED])
+@pytest.mark.parametrize("weights", [WEIGHTS_EXACT, WEIGHTS_PERCEIVED])
 @pytest.mark.parametrize("dt", [0.02, 0.05, 0.1])
 def test_the_closed_loop_is_stable_at_every_speed(weights: LqrWeights, dt: float) -> None:
     lqr = Lqr(dt, weights)
@@ -100,10 +100,10 @@ def test_gains_are_held_beyond_the_grid() -> None:
 
 
 @pytest.mark.parametrize("name", ["lqr", "torcs"])
-@pytest.mark.parametrize("perceived", [False, True])
-def test_signs(name: str, perceived: bool) -> None:
+@pytest.mark.parametrize("noisy", [False, True])
+def test_steering_signs(name: str, noisy: bool) -> None:
     def steer(**changes: Any) -> float:
-        controller = make_controller(name, Setting(0.05, perceived))
+        controller = make_controller(name, LoopConfig(0.05, noisy))
         return controller.update(replace(STRAIGHT_AT_20, **changes))
 
     assert steer() == 0.0
@@ -144,7 +144,7 @@ def response(controller: Controller, speed: float, curvature: float = 0.0) -> Ma
     heading = Heading.STRAIGHT if curvature == 0 else Heading.LEFT
     for _ in range(200):
         e1, e1_rate, e2, e2_rate = state
-        told = Observation(
+        observation = Observation(
             to_lane_centre=e1,
             angle=-e2,
             heading=heading,
@@ -153,7 +153,7 @@ def response(controller: Controller, speed: float, curvature: float = 0.0) -> Ma
             yaw_rate=e2_rate + speed * curvature,
             curvature=None,
         )
-        wheel = controller.update(told) * STEERING_LOCK
+        wheel = controller.update(observation) * STEERING_LOCK
         for _ in range(parts):
             push = B[:, 0] * wheel + turn[:, 0] * speed * curvature
             state = state + (A @ state + push) * dt / parts
@@ -162,25 +162,25 @@ def response(controller: Controller, speed: float, curvature: float = 0.0) -> Ma
 
 
 @pytest.mark.parametrize("speed", [8.0, 15.0, 22.0])
-@pytest.mark.parametrize("weights", [EXACT, PERCEIVED])
+@pytest.mark.parametrize("weights", [WEIGHTS_EXACT, WEIGHTS_PERCEIVED])
 def test_step_response(speed: float, weights: LqrWeights) -> None:
     offsets = response(Lqr(0.05, weights), speed)
     assert offsets.min() > -0.15  # overshoots by less than 15 %
     assert np.abs(offsets[100:]).max() < 0.02  # there within 5 s
-    assert np.abs(response(Feedback(), speed)[100:]).max() < 0.05
+    assert np.abs(response(StateFeedback(), speed)[100:]).max() < 0.05
 
 
-def test_no_standing_offset_in_a_bend_that_nobody_tells() -> None:
-    for weights in (EXACT, PERCEIVED):
+def test_no_steady_offset_in_a_bend_of_unmeasured_curvature() -> None:
+    for weights in (WEIGHTS_EXACT, WEIGHTS_PERCEIVED):
         assert abs(response(Lqr(0.05, weights), 15.0, 1 / 80)[-1]) < 0.02
 
 
-def test_the_class_bounds_the_estimated_curvature() -> None:
-    """Turning left where the road is said to turn right is an error, not a bend."""
-    told = replace(STRAIGHT_AT_20, yaw_rate=0.4, curvature=None)
-    corrected = Lqr().update(replace(told, heading=Heading.RIGHT))
-    believed = Lqr().update(replace(told, heading=Heading.LEFT))
-    assert corrected < believed
+def test_the_heading_class_limits_the_estimated_curvature() -> None:
+    """Yaw to the left where the road turns right is an error, not a bend."""
+    observation = replace(STRAIGHT_AT_20, yaw_rate=0.4, curvature=None)
+    limited = Lqr().update(replace(observation, heading=Heading.RIGHT))
+    estimated = Lqr().update(replace(observation, heading=Heading.LEFT))
+    assert limited < estimated
 
 
 @pytest.mark.parametrize(
@@ -190,18 +190,15 @@ def test_the_class_bounds_the_estimated_curvature() -> None:
         (0.1692, 0.01342, 19.7329, -0.0663, -0.80748, -0.36879),
     ],
 )
-def test_reference_law(d: float, th: float, vx: float, vy: float, yr: float, steer: float) -> None:
-    """Two rows of a lap of the real program (forza), state and the steering that it got."""
-    seen = Observation(d, -th, Heading.RIGHT, vx, vy, yr)
-    assert Feedback().update(seen) == pytest.approx(steer, abs=2e-4)
+def test_torcs_feedback_reproduces_recorded_steering(
+    d: float, th: float, vx: float, vy: float, yr: float, steer: float
+) -> None:
+    """Two rows of a lap of the real TORCS (forza): the state and its steering."""
+    observation = Observation(d, -th, Heading.RIGHT, vx, vy, yr)
+    assert StateFeedback().update(observation) == pytest.approx(steer, abs=2e-4)
 
 
-@pytest.mark.parametrize("name", ["mpc", "rl"])
-def test_planned_controllers_say_so(name: str) -> None:
-    with pytest.raises(UserError, match="not there yet; use one of: lqr"):
-        make_controller(name, Setting(0.05))
-
-
-def test_an_unknown_controller_is_named() -> None:
-    with pytest.raises(UserError, match="'pid'"):
-        make_controller("pid", Setting(0.05))
+@pytest.mark.parametrize("name", ["mpc", "rl", "pid"])
+def test_an_unknown_controller_is_refused_with_the_known_names(name: str) -> None:
+    with pytest.raises(UserError, match=f"no controller '{name}'; use one of: lqr, torcs"):
+        make_controller(name, LoopConfig(0.05))

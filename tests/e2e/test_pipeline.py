@@ -8,10 +8,11 @@ from typing import Any
 
 import pytest
 
+from controllers.config import DemoConfig
 from controllers.demo.frames import ask
 from controllers.demo.process import running_service
 from controllers.demo.report import write_report
-from controllers.demo.run import DemoConfig, DemoResult
+from controllers.demo.run import DemoResult
 from datagen.recording import Dataset
 from serve.client import Client
 from trackfeatures import MARKINGS
