@@ -97,7 +97,7 @@ def answer_frames(
 
 def require_fit(card: ModelCard, frames: Frames, split: str) -> None:
     """Raise ModelError when the camera differs, or when what is to judge it was trained on."""
-    found, expected = frames.camera.as_dict(), vars(card.camera)
+    found, expected = frames.camera.as_dict(), card.camera.as_dict()
     if found != expected:
         differing = ", ".join(
             f"{k} {found[k]:g} instead of {expected[k]:g}"
