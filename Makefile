@@ -71,9 +71,15 @@ api: $(READY) ## a thousand requests an operation, made from the OpenAPI documen
 e2e: $(READY) ## one round from the simulator to a steered car
 	$(BIN)/pytest tests/e2e
 
-bench: $(READY) ## every benchmark but the hour-long one, side by side with what it claims to beat
-	missed=0; for script in $(filter-out %_fuzz.py %/endurance.py,$(wildcard benchmarks/*.py)); do \
-		echo "== $$script"; $(BIN)/python $$script || missed=1; done; exit $$missed
+# A benchmark ends with 0: claim reached, 3: not measured, anything else: missed or failed.
+bench: $(READY) ## every benchmark but the hour-long one; fails where a claim is missed
+	@missed=; unmeasured=; \
+	for script in $(filter-out %_fuzz.py %/endurance.py,$(wildcard benchmarks/*.py)); do \
+	  echo "== $$script"; $(BIN)/python $$script; \
+	  case $$? in 0) ;; 3) unmeasured="$$unmeasured $$script" ;; *) missed="$$missed $$script" ;; esac; \
+	done; \
+	if [ -n "$$unmeasured" ]; then echo "not measured:$$unmeasured"; fi; \
+	if [ -n "$$missed" ]; then echo "missed or failed:$$missed"; exit 1; fi
 
 endurance: $(READY) ## an hour of controllers, with restarts and new models under them
 	$(BIN)/python benchmarks/endurance.py

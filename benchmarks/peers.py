@@ -24,6 +24,7 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
+from benchmarks.material.outcome import exit_code, not_measured
 from benchmarks.material.servers import (
     OURS,
     PEERS,
@@ -111,6 +112,8 @@ def main() -> int:
     parser.add_argument("--seconds", type=float, default=10.0, help="of a turn with many clients")
     parser.add_argument("--turns", type=int, default=3)
     options = parser.parse_args()
+    if list(pythons(options)) == [OURS]:
+        return not_measured("give at least one peer, e.g. --litserve PYTHON")
     result = measure(options)
     text = json.dumps(result, indent=1)
     print(text)
@@ -118,7 +121,7 @@ def main() -> int:
         options.out.write_text(f"{text}\n")
     for name in result["skipped"]:
         print(f"skipped {name}: give --{name} PYTHON")
-    return 0 if all(each.get("held", True) for each in result["servers"].values()) else 1
+    return exit_code(all(each.get("held", True) for each in result["servers"].values()))
 
 
 if __name__ == "__main__":

@@ -23,6 +23,7 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
+from benchmarks.material.outcome import REACHED, exit_code
 from tests.serve.conftest import FakeEngine, jpeg, outputs, picture
 
 CLAIM = 0.75
@@ -185,7 +186,7 @@ def measure(requests: int) -> dict[str, Any]:
     return {**figures, "requests": requests, "overhead_ratio": ratio, "claim": CLAIM}
 
 
-def main() -> None:
+def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--quick", action="store_true", help="a tenth of the requests")
     parser.add_argument("--out", type=Path, help="write the figures here, too")
@@ -193,7 +194,7 @@ def main() -> None:
     options = parser.parse_args()
     if options.serve:
         serve(options.serve[0], int(options.serve[1]))
-        return
+        return REACHED
     result = measure(1_000 if options.quick else 10_000)
     text = json.dumps(result, indent=1)
     print(text)
@@ -201,7 +202,8 @@ def main() -> None:
         options.out.write_text(f"{text}\n")
     held = result["overhead_ratio"] <= CLAIM
     print(f"overhead {result['overhead_ratio']:.2f} of plain FastAPI's, claim {CLAIM}: {held}")
+    return exit_code(held)
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

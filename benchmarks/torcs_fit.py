@@ -1,8 +1,8 @@
-"""The simulated car against the real TORCS: the same law, the same tracks, the flying lap.
+"""The simulated car against the real TORCS: same control law, same tracks, the flying lap.
 
 Run: `TORCS_TRACKS=FOLDER python benchmarks/torcs_fit.py [--json FILE]`; FOLDER holds `tracks/` and
 the reference laps `drives/NAME-lqr.csv`. Limits: steps within 1 %, score a step within 0.004, mean
-|d| within 0.02 m, max |d| within 0.15 m; exits 1 when one is missed.
+|d| within 0.02 m, max |d| within 0.15 m. Exit code 1 when one is missed, 3 without reference laps.
 """
 
 import argparse
@@ -12,6 +12,9 @@ import sys
 from dataclasses import asdict
 from pathlib import Path
 
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from benchmarks.material.outcome import exit_code, not_measured
 from benchmarks.material.torcs_laps import LIMITS, TRACKS, Fit, compare
 
 
@@ -30,8 +33,7 @@ def main() -> int:
     arguments = parser.parse_args()
     folder = Path(os.environ.get("TORCS_TRACKS") or "nowhere") / "drives"
     if not folder.is_dir():
-        print("TORCS_TRACKS names no folder with drives/; nothing to compare with", file=sys.stderr)
-        return 0
+        return not_measured("set TORCS_TRACKS to a folder with drives/, laps of the real TORCS")
     results = []
     for name in TRACKS:
         for sampling, as_recorded in (("as recorded", True), ("every 50 ms", False)):
@@ -41,7 +43,7 @@ def main() -> int:
             results.append(asdict(fit) | record)
     if arguments.json:
         arguments.json.write_text(json.dumps(results, indent=2) + "\n")
-    return 0 if all(all(result["within"].values()) for result in results) else 1
+    return exit_code(all(all(result["within"].values()) for result in results))
 
 
 if __name__ == "__main__":
