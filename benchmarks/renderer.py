@@ -48,16 +48,16 @@ CARS_AHEAD_M = (9.0, 16.0, 26.0, 38.0, 55.0, 80.0)
 TURNS, FRAMES = 5, 60
 
 Job = Callable[[int], float]
-"""Draws so many frames; how many seconds they took."""
+"""Draws the given number of frames; returns the seconds they took."""
 
 
 def clock() -> float:
-    """Processor time of the process where it draws, else the time of day."""
+    """Processor time of the process where the CPU renders, else wall time."""
     return time.process_time() if "llvmpipe" in graphics().renderer else time.perf_counter()
 
 
 def camera_job(camera: Camera, views: tuple[str, ...] = ("front",), cars: int = 0) -> Job:
-    """Pictures from places all round the road of `camera`, `cars` cars standing ahead."""
+    """Images from positions all along the road of `camera`, with `cars` cars standing ahead."""
     road = camera.road
     places = np.linspace(0.0, road.track.length_m, FRAMES, endpoint=False)
     shots = [
@@ -79,7 +79,7 @@ def camera_job(camera: Camera, views: tuple[str, ...] = ("front",), cars: int = 
 
 
 def environment_job(env: gym.Env[Any, Any]) -> Job:
-    """Steps of our environment, kept on the road by the true state."""
+    """Steps of our environment, steered by the true state."""
     return _stepping(env, lambda info: _steering(info))
 
 
@@ -119,9 +119,9 @@ def frames_per_second(jobs: dict[str, Job], turns: int) -> dict[str, float]:
     for turn in range(turns + 1):
         for name, job in jobs.items():
             figure = FRAMES / job(FRAMES)
-            if turn:  # the one before the first only warms up
+            if turn:  # turn 0 is the warm-up
                 figures[name].append(figure)
-        print(f"turn {turn} of {turns}, {len(jobs)} contestants", file=sys.stderr)
+        print(f"turn {turn} of {turns}, {len(jobs)} jobs", file=sys.stderr)
     return {name: round(statistics.median(values), 1) for name, values in figures.items()}
 
 
@@ -142,25 +142,25 @@ def environments(stack: ExitStack) -> Iterator[tuple[str, Job]]:
 def cameras(stack: ExitStack) -> Iterator[tuple[str, Job]]:
     for track in TRACKS:
         for light in LIGHTS:
-            eye = stack.enter_context(camera(track, light))
+            view = stack.enter_context(camera(track, light))
             for cars in (0, len(CARS_AHEAD_M)):
-                yield f"{track}, {light}, {cars} cars", camera_job(eye, cars=cars)
+                yield f"{track}, {light}, {cars} cars", camera_job(view, cars=cars)
 
 
 def sizes(stack: ExitStack) -> Iterator[tuple[str, Job]]:
     for size in SIZES:
-        eye = stack.enter_context(camera("circuit", "clear", size))
-        yield f"{size[0]} x {size[1]}", camera_job(eye)
+        view = stack.enter_context(camera("circuit", "clear", size))
+        yield f"{size[0]} x {size[1]}", camera_job(view)
 
 
 def kinds(stack: ExitStack) -> Iterator[tuple[str, Job]]:
-    eye = stack.enter_context(camera("circuit", "clear"))
+    view = stack.enter_context(camera("circuit", "clear"))
     for name, views in KINDS.items():
-        yield name, camera_job(eye, views)
+        yield name, camera_job(view, views)
 
 
 def measure(turns: int) -> dict[str, dict[str, float]]:
-    """Frames a second of all contestants, by group."""
+    """Frames a second of all jobs, by group."""
     figures = {}
     for group in (environments, cameras, sizes, kinds):
         with ExitStack() as stack:

@@ -1,7 +1,6 @@
-"""A command as a user types it, run in this process: no new one has to import everything again.
+"""Runs a command of the project in this process, which saves the imports of a new one.
 
-What the process itself does (signals, its exit, clean stdout of libraries) is for tests that start
-one.
+Tests of signals, exit and of what libraries print start a process instead.
 """
 
 import contextlib
@@ -14,7 +13,7 @@ from unittest import mock
 
 
 def typed(*words: object, folder: Path | None = None) -> subprocess.CompletedProcess[str]:
-    """Run `words`, a command and its arguments, in `folder`; what it said, and its exit code."""
+    """Run `words`, a command and its arguments, in `folder`; the output and exit code."""
     arguments = [str(word) for word in words]
     out, err, code = io.StringIO(), io.StringIO(), 0
     with contextlib.ExitStack() as stack:

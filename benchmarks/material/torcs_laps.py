@@ -1,8 +1,8 @@
-"""The simulated car beside the real TORCS: one law, one track, the flying lap of each.
+"""The simulated car against the real TORCS: one control law, one track, one flying lap each.
 
-A recording is a CSV of `drives/`: laps of the real program under the law of `feedback`. The same
-law drives here, from the same start and at the same moments: the program ticks at 20 to 22 ms,
-so that its control steps take 40 to 66 ms, and a law as stiff as this one feels that.
+A recording is a CSV of `drives/`: laps of TORCS under `controllers.torcs_feedback`. The same law
+drives the simulator from the same start and at the same times: TORCS ticks every 20 to 22 ms, so
+that its control steps take 40 to 66 ms, which matters for gains as high as these.
 """
 
 import itertools
@@ -27,7 +27,7 @@ from trackfeatures import Heading, UserError
 TRACKS = ("forza", "g-track-3")
 FLYING_LAP = 2
 LIMITS = {"steps": 0.01, "score_per_step": 0.004, "mean_abs_d_m": 0.02, "max_abs_d_m": 0.15}
-"""How far the two laps may be apart: of the steps a share, of the others the figure itself."""
+"""Largest differences of the two laps: relative for the steps, absolute for the others."""
 EVEN_STEPS = PHYSICS_HZ // 20
 
 Rows = NDArray[Any]
@@ -47,7 +47,7 @@ class Lap:
 
 @dataclass(frozen=True)
 class Fit:
-    """A flying lap here and the program's."""
+    """A flying lap in the simulator and one in TORCS."""
 
     track: str
     here: Lap
@@ -61,12 +61,12 @@ class Fit:
 
     @property
     def within(self) -> dict[str, bool]:
-        """Which of LIMITS are kept."""
+        """For each of LIMITS whether it is kept."""
         return {name: abs(apart) <= LIMITS[name] for name, apart in self.difference.items()}
 
 
 def read_recording(path: Path) -> Rows:
-    """The rows of a drive of TORCS, as a structured array named by its columns."""
+    """The rows of a drive in TORCS, as a structured array with the column names."""
     try:
         return np.genfromtxt(path, delimiter=",", names=True, skip_header=1)
     except OSError as error:
@@ -74,14 +74,14 @@ def read_recording(path: Path) -> Rows:
 
 
 def compare(name: str, drives: Path, *, as_recorded: bool = True) -> Fit:
-    """Drive the laps of `drives`/NAME-lqr.csv again and compare the flying ones.
+    """Drive the laps of `drives`/NAME-lqr.csv again and compare the flying laps.
 
-    With `as_recorded=False` the law acts every 50 ms instead of at the recording's moments.
+    With `as_recorded=False` the law acts every 50 ms instead of at the recorded times.
     """
     recording = read_recording(drives / f"{name}-lqr.csv")
     road = Road(find_track(name))
-    moments = np.round(recording["t"] * PHYSICS_HZ).astype(int)
-    holds = np.diff(moments).tolist() if as_recorded else [EVEN_STEPS]
+    ticks = np.round(recording["t"] * PHYSICS_HZ).astype(int)
+    holds = np.diff(ticks).tolist() if as_recorded else [EVEN_STEPS]
     states = drive_laps(road, float(recording["d"][0]), holds)
     here = np.array(
         [(now.to_middle, -now.angle, now.speed) for now in states],
@@ -92,30 +92,30 @@ def compare(name: str, drives: Path, *, as_recorded: bool = True) -> Fit:
 
 
 def drive_laps(road: Road, start_d: float, holds: list[int]) -> list[CarState]:
-    """The states that the law saw in its flying lap.
+    """The states at the control steps of the flying lap.
 
-    `holds`: physics steps from one control step to the next, again and again.
+    `holds`: physics steps from one control step to the next, repeated.
     """
-    law, seen = StateFeedback(), []
+    law, states = StateFeedback(), []
     with World(road, frequency_hz=PHYSICS_HZ) as world:
         now = world.reset(seed=0, to_middle=start_d)
         for hold in itertools.cycle(holds):
             if now.lap == FLYING_LAP:
-                seen.append(now)
+                states.append(now)
             command = Command(
                 law.update(_observed(now, world.features().heading)), THROTTLE, gear=GEAR
             )
             for _ in range(hold):
                 now = world.step(command)
             if now.lap > FLYING_LAP:
-                return seen
+                return states
             if now.off_track or now.backwards:
                 raise UserError(f"the law left {road.track.name!r} at s = {now.s:.0f} m")
     raise AssertionError("a cycle does not end")
 
 
 def figures(lap: Rows, half_width: float) -> Lap:
-    """Of rows with d (m), th (rad, yaw minus tangent) and v (m/s), one a control step."""
+    """Figures of rows with d (m), th (rad, yaw minus tangent) and v (m/s), one a control step."""
     offset, speed = np.abs(lap["d"]), 3.6 * lap["v"]
     score = np.cos(lap["th"]) - np.abs(np.sin(lap["th"])) - offset / half_width
     return Lap(

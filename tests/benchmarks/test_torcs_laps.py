@@ -1,4 +1,4 @@
-"""The flying laps of the real TORCS, driven again by the same law: within DESIGN's limits."""
+"""Flying laps of the real TORCS, driven again with the same control law: within the limits."""
 
 import os
 from pathlib import Path
@@ -27,7 +27,9 @@ recorded = pytest.mark.skipif(
 @pytest.mark.slow
 @pytest.mark.parametrize("as_recorded", [True, False], ids=["as-recorded", "every-50-ms"])
 @pytest.mark.parametrize("track", TRACKS)
-def test_the_flying_lap_is_that_of_torcs(track: str, as_recorded: bool) -> None:
+def test_the_flying_lap_equals_that_of_torcs_within_the_limits(
+    track: str, as_recorded: bool
+) -> None:
     fit = compare(track, FOLDER, as_recorded=as_recorded)
     assert all(fit.within.values()), fit.difference
     assert fit.here.least_speed_kmh == pytest.approx(fit.torcs.least_speed_kmh, abs=1.0)
@@ -39,7 +41,7 @@ def test_the_flying_lap_is_that_of_torcs(track: str, as_recorded: bool) -> None:
     ("track", "steps", "score", "mean_d", "max_d"),
     [("forza", 6281, 0.9966, 0.009, 0.369), ("g-track-3", 3118, 0.9896, 0.026, 0.161)],
 )
-def test_the_reference_figures_are_read_right(
+def test_the_figures_of_the_reference_laps(
     track: str, steps: int, score: float, mean_d: float, max_d: float
 ) -> None:
     rows = read_recording(FOLDER / f"{track}-lqr.csv")
@@ -50,7 +52,7 @@ def test_the_reference_figures_are_read_right(
     assert lap.max_abs_d_m == pytest.approx(max_d, abs=6e-4)
 
 
-def test_a_lap_too_far_off_is_told() -> None:
+def test_a_lap_outside_the_limits_is_missed() -> None:
     torcs = Lap(1000, 0.99, 0.01, 0.2, 50.0, 70.0)
     worse = Lap(1011, 0.985, 0.04, 0.36, 50.0, 70.0)
     assert not any(Fit("forza", worse, torcs).within.values())
@@ -71,6 +73,6 @@ def test_figures_of_a_lap() -> None:
     assert (lap.least_speed_kmh, lap.most_speed_kmh) == (36.0, 72.0)
 
 
-def test_a_missing_recording_is_named(tmp_path: Path) -> None:
+def test_a_missing_recording_is_refused(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="no recorded laps at"):
         read_recording(tmp_path / "forza-lqr.csv")

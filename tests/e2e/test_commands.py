@@ -1,4 +1,4 @@
-"""What every command owes its user: quick help, and one clear line when something is wrong."""
+"""Every command: fast help, light imports for help, one error line for wrong input."""
 
 import json
 import os
@@ -20,13 +20,13 @@ BIN = Path(sys.executable).parent
 PROGRAMS = ("simulator", "datagen", "mtlnet", "serve", "controllers")
 HELP_LIMIT_S = 0.5
 TRIES = 5
-# What takes long to import, or needs a machine to be set up; a help text needs none of it.
+# Slow to import, or in need of system libraries; a help text needs none of them.
 HEAVY = {
     "cv2", "fastapi", "google", "gymnasium", "matplotlib", "mcap", "moderngl", "numba", "numpy",
     "openvino", "pyarrow", "pybullet", "ray", "scipy", "simplejpeg", "torch", "uvicorn",
 }  # fmt: skip
-# Typer's own help of one command with one option: what no command of ours can undercut.
-BARE = """
+# Typer's own help of one command with one option: the lower bound for our commands.
+MINIMAL_TYPER_APP = """
 import typer
 app = typer.Typer()
 app.command()(lambda: None)
@@ -39,24 +39,28 @@ import contextlib, importlib, io, json, sys
 heavy, commands = set(json.loads(sys.argv[1])), json.loads(sys.argv[2])
 for command in commands:
     sys.argv = [*command, "--help"]
-    with contextlib.redirect_stdout(io.StringIO()) as shown, contextlib.suppress(SystemExit):
+    with contextlib.redirect_stdout(io.StringIO()) as output, contextlib.suppress(SystemExit):
         importlib.import_module(f"{command[0]}.cli").main()
-    assert "Usage" in shown.getvalue(), command
+    assert "Usage" in output.getvalue(), command
     found = heavy & {name.split(".")[0] for name in sys.modules}
     assert not found, f"{' '.join(command)} --help imports {', '.join(sorted(found))}"
 """
 
 
-def below(command: Any, words: tuple[str, ...]) -> Iterator[tuple[str, ...]]:
+def walk_commands(command: Any, words: tuple[str, ...]) -> Iterator[tuple[str, ...]]:
     yield words
     for name, subcommand in getattr(command, "commands", {}).items():
-        yield from below(subcommand, (*words, name))
+        yield from walk_commands(subcommand, (*words, name))
 
 
 def all_commands() -> list[tuple[str, ...]]:
     """Every command and subcommand that a user can type."""
     apps = {name: import_module(f"{name}.cli").app for name in PROGRAMS}
-    return [words for name in apps for words in below(typer.main.get_command(apps[name]), (name,))]
+    return [
+        words
+        for name in apps
+        for words in walk_commands(typer.main.get_command(apps[name]), (name,))
+    ]
 
 
 COMMANDS = all_commands()
@@ -64,42 +68,41 @@ COMMANDS = all_commands()
 
 @dataclass(frozen=True)
 class Help:
-    """What `--help` shows, and the processor time (s, user and system) it takes."""
+    """The output of `--help`, and its processor time (s, user and system)."""
 
-    shown: str
-    cost_s: float
+    text: str
+    cpu_s: float
 
 
-def measured(*command: str) -> Help:
-    """Runs `command` until it costs less than the limit, `TRIES` times at most; its best.
+def measure_help(*command: str) -> Help:
+    """The best of at most `TRIES` runs of `command`; ends at the first below the limit.
 
-    Processor time, not the clock's: a machine that is busy with other work makes a command wait,
-    and that is not the command's fault. Memory and cores shared with that work make it dearer
-    too, therefore the best of a few tries.
+    Processor time and not wall time, because other work on the machine makes a command wait. That
+    work also slows the processor down by sharing it, therefore the best of several runs.
     """
     best = float("inf")
     for _ in range(TRIES):
         process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
         assert process.stdout is not None
         assert process.stderr is not None
-        shown, said = process.stdout.read().decode(), process.stderr.read().decode()
+        output, errors = process.stdout.read().decode(), process.stderr.read().decode()
         _, status, usage = os.wait4(process.pid, 0)
         process.returncode = os.waitstatus_to_exitcode(status)
-        assert process.returncode == 0, said
+        assert process.returncode == 0, errors
         best = min(best, usage.ru_utime + usage.ru_stime)
         if best < HELP_LIMIT_S:
             break
-    return Help(shown, best)
+    return Help(output, best)
 
 
 @cache
 def help_of(*command: str) -> Help:
-    return measured(str(BIN / command[0]), *command[1:], "--help")
+    return measure_help(str(BIN / command[0]), *command[1:], "--help")
 
 
 @cache
-def cost_of_typer_s() -> float:
-    return measured(sys.executable, "-c", BARE, "work", "--help").cost_s
+def typer_cpu_s() -> float:
+    return measure_help(sys.executable, "-c", MINIMAL_TYPER_APP, "work", "--help").cpu_s
 
 
 def run(*arguments: str) -> subprocess.CompletedProcess[str]:
@@ -111,9 +114,9 @@ def run(*arguments: str) -> subprocess.CompletedProcess[str]:
 @pytest.mark.parametrize("command", COMMANDS, ids=" ".join)
 def test_help_costs_half_a_second_at_most(command: tuple[str, ...]) -> None:
     found = help_of(*command)
-    assert "Usage" in found.shown
-    if found.cost_s >= HELP_LIMIT_S:  # only a machine on which typer alone takes half of it may
-        assert found.cost_s < 2 * cost_of_typer_s()
+    assert "Usage" in found.text
+    if found.cpu_s >= HELP_LIMIT_S:  # allowed where typer alone takes more than half of it
+        assert found.cpu_s < 2 * typer_cpu_s()
 
 
 @pytest.mark.parametrize("program", PROGRAMS)
@@ -127,7 +130,7 @@ def test_help_imports_nothing_heavy(program: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "message"),
     [
         (("simulator", "centreline", "no-such-track", "--out", "x.csv"), "no-such-track"),
         (("simulator", "snapshot", "no-such-track", "--out", "x.png"), "no-such-track"),
@@ -147,8 +150,8 @@ def test_help_imports_nothing_heavy(program: str) -> None:
     ],
     ids=lambda value: " ".join(value) if isinstance(value, tuple) else None,
 )
-def test_a_mistake_gets_one_line_that_names_it(
-    arguments: tuple[str, ...], said: str, tmp_path: Path
+def test_wrong_input_is_one_error_line_that_names_it(
+    arguments: tuple[str, ...], message: str, tmp_path: Path
 ) -> None:
     filled = [str(tmp_path / "out") if a == "OUT" else a for a in arguments]
     done = run(*filled)
@@ -156,7 +159,7 @@ def test_a_mistake_gets_one_line_that_names_it(
     assert "Traceback" not in done.stderr
     errors = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
     assert len(errors) == 1, done.stderr
-    assert said in errors[0]
+    assert message in errors[0]
 
 
 def readme_commands() -> list[list[str]]:
@@ -171,7 +174,7 @@ def test_the_readme_uses_only_options_that_exist() -> None:
     assert len(commands) >= 8
     for words in commands:
         subcommands = [w for w in words[1:2] if (words[0], w) in COMMANDS]
-        shown = re.sub(r"\s+", " ", help_of(words[0], *subcommands).shown)
+        shown = re.sub(r"\s+", " ", help_of(words[0], *subcommands).text)
         for option in (word for word in words if word.startswith("--")):
             assert re.search(rf"{option}\b", shown), f"{' '.join(words)}: no {option}"
 

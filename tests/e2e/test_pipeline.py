@@ -1,4 +1,4 @@
-"""The whole pipeline, real, in small: one round, a few steps, a service, a steered car."""
+"""The whole pipeline at a small scale: one round, a few training steps, a service, a drive."""
 
 import json
 import subprocess
@@ -21,7 +21,7 @@ pytestmark = pytest.mark.slow
 
 
 def command(*arguments: str) -> Any:
-    """Run one of the project's commands; what it says with --json."""
+    """Run one of the project's commands; its result with --json."""
     done = subprocess.run(
         [sys.executable, "-m", *arguments], capture_output=True, text=True, timeout=600
     )
@@ -29,7 +29,7 @@ def command(*arguments: str) -> Any:
     return json.loads(done.stdout) if "--json" in arguments else None
 
 
-def test_from_one_round_to_a_steered_car(tmp_path: Path) -> None:
+def test_collect_train_evaluate_serve_and_drive(tmp_path: Path) -> None:
     data, run = str(tmp_path / "data"), str(tmp_path / "run")
     collected = command(
         *("datagen", "collect", "--rounds", "1", "--frames", "300", "--tracks", "oval"),
@@ -43,10 +43,10 @@ def test_from_one_round_to_a_steered_car(tmp_path: Path) -> None:
 
     train = ("mtlnet", "train", "--data", data, "--out", run, "--alpha", "0.3,0.2,0.5")
     command(*train, "--recipe", "fast", "--iterations", "150")
-    judged = command(
+    evaluated = command(
         "mtlnet", "evaluate", "--model", run, "--data", data, "--split", "all", "--json"
     )
-    assert judged["frames"] == 300
+    assert evaluated["frames"] == 300
 
     frames = Dataset.open(Path(data)).select("all")
     image = tmp_path / "frame.jpg"
@@ -63,16 +63,16 @@ def test_from_one_round_to_a_steered_car(tmp_path: Path) -> None:
             *("controllers", "drive", "--controller", "lqr", "--track", "oval", "--lanes", "1"),
             *("--perception", url, "--steps", "400", "--log", str(log), "--json"),
         )
-    # 400 steps of 50 ms: 20 s. They begin on the oval's straight, which a model that has seen 150
-    # batches of that very road can follow; the first bend comes later.
+    # 400 steps of 50 ms: 20 s, on the oval's straight, which a model trained on 150 batches of that
+    # road can follow; the first bend comes later.
     rows = log.read_text().splitlines()
     assert drive["ended"] is None
     assert drive["steps"] == len(rows) - 1 == 400
     assert drive["distance_m"] > 100
     steering = {row.split(",")[8] for row in rows[1:]}
-    assert len(steering) > 100, "the answers must steer, not a constant"
+    assert len(steering) > 100, "steering must vary with the answers"
 
-    result = DemoResult(collected, judged, drive, asked, ["datagen collect"], {"collect": 1.0})
+    result = DemoResult(collected, evaluated, drive, asked, ["datagen collect"], {"collect": 1.0})
     page = write_report(DemoConfig(out=tmp_path), result).read_text()
     assert page.count("data:image/jpeg;base64,") == 2
-    assert f"{judged['angle_mae_rad']:.4f}" in page
+    assert f"{evaluated['angle_mae_rad']:.4f}" in page

@@ -1,4 +1,4 @@
-"""The demo's own parts: pictures by hand-computed pixels, choice of frames, verdicts, stopping."""
+"""The demo: overlays at hand-computed pixels, choice of frames, verdicts, child processes."""
 
 import os
 import signal
@@ -25,7 +25,7 @@ CAMERA = CameraParameters(width=200, height=100, fov_y_deg=90.0, x=0.0, y=0.0, z
 NOTHING = dict.fromkeys(("ml", "mr", "l", "m", "r"))
 
 
-def test_a_road_point_is_seen_where_the_pinhole_says() -> None:
+def test_a_road_point_is_projected_by_the_pinhole_model() -> None:
     # 90 degrees over 100 px: focal length 50 px. 10 m ahead, 2 m left, 1 m below the camera.
     pixels = to_pixels(np.array([[10.0, 2.0]]), CAMERA, height_m=1.0)
     assert pixels.tolist() == [[(100 - 50 * 2 / 10) * SCALE, (50 + 50 * 1 / 10) * SCALE]]
@@ -37,12 +37,12 @@ def test_a_positive_distance_is_drawn_to_the_right() -> None:
     assert (to_pixels(line, CAMERA, 1.0)[:, 0] > 100 * SCALE).all()
 
 
-def test_a_car_pointing_right_sees_the_road_go_left() -> None:
+def test_a_marking_goes_left_when_the_car_points_right() -> None:
     line = marking_line(0.0, angle=0.1, curvature=0.0)
     assert line[-1] == pytest.approx([14 * np.cos(0.1), 14 * np.sin(0.1)])
 
 
-def test_a_left_bend_bends_left() -> None:
+def test_a_marking_in_a_left_bend_curves_left() -> None:
     assert marking_line(0.0, 0.0, curvature=0.01)[-1, 1] == pytest.approx(0.01 * 14**2 / 2)
 
 
@@ -58,13 +58,13 @@ def test_absent_distances_are_not_drawn() -> None:
 
 
 class FakeFrames:
-    """Only what `spread` asks for: the round of each frame."""
+    """Only what `spread` reads: the round of each frame."""
 
     class labels:  # noqa: N801  # stands for an attribute
         round = np.repeat([3, 4, 9], [50, 5, 50])
 
 
-def test_frames_are_asked_from_every_round() -> None:
+def test_frames_are_chosen_from_every_round() -> None:
     chosen = spread(FakeFrames, 12, np.random.default_rng(1))  # type: ignore[arg-type]  # a fake
     assert len(set(chosen)) == 12
     assert np.bincount(FakeFrames.labels.round[chosen]).tolist() == [0, 0, 0, 4, 4, 0, 0, 0, 0, 4]
@@ -92,7 +92,9 @@ def evaluation(angle: float = 0.02, ml: float = 0.2, heading: float = 0.9) -> di
         ({"heading": 0.84}, ["heading (share right)"]),
     ],
 )
-def test_a_limit_is_reached_only_when_learned(change: dict[str, float], missed: list[str]) -> None:
+def test_a_limit_also_requires_a_share_of_the_mean_predictors_error(
+    change: dict[str, float], missed: list[str]
+) -> None:
     found = verdicts(evaluation(**change))
     assert [one.what for one in found] == [
         *("ml (m)", "mr (m)", "m (m)", "r (m)", "angle (rad)", "heading (share right)")
@@ -115,22 +117,22 @@ def test_tables_show_true_and_answered_values(capsys: pytest.CaptureFixture[str]
         assert cell in said
 
 
-def test_a_folder_of_other_files_is_left_alone(tmp_path: Path) -> None:
+def test_a_folder_with_other_files_is_refused(tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").touch()
     with pytest.raises(UserError, match="holds other files"):
         run_demo(DemoConfig(out=tmp_path))
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
 
 
-def test_a_command_gives_its_output_and_exit_code() -> None:
+def test_run_module_returns_exit_code_and_output() -> None:
     assert run_module(["json.tool", "--help"])[0] == 0
     code, said = run_module(["json.tool", "no-such-file"])
     assert code != 0
     assert said == ""
 
 
-def test_sigterm_ends_the_child_too(tmp_path: Path) -> None:
-    """The child has time to leave: here, to write that it was told to."""
+def test_sigterm_also_ends_the_child_process(tmp_path: Path) -> None:
+    """The child has time to clean up: here, to write a file."""
     (tmp_path / "child.py").write_text(
         "import pathlib, signal, sys, time\n"
         "def stop(*_):\n    pathlib.Path('stopped').touch()\n    sys.exit(0)\n"
