@@ -1,10 +1,10 @@
-"""Pictures a second on one core: the bare camera, and the image environment beside CarRacing-v3.
+"""Images a second on one core: the camera alone, and the image environment against CarRacing-v3.
 
 Run: `python benchmarks/renderer.py [--json FILE]`, about three minutes. Claim, on one core of
-Mesa's llvmpipe: the whole step of `driverview/DriverView-v0` with its 280 x 210 picture, shadows
-on, at least 150 times a second on every track and in every light tried. Everything takes turns in
-one process pinned to one core; figures are medians of the turns, of processor time, or of the clock
-where a GPU draws and processor time says little. Resets are not counted. `--quick` takes one turn.
+Mesa's llvmpipe: a complete step of `driverview/DriverView-v0` with its 280 x 210 image, shadows
+on, at least 150 times a second on every track and in both lights. The jobs take turns in one
+process pinned to one core; figures are medians over the turns, of processor time, or of wall time
+where a GPU renders. Resets are not counted. `--quick` takes one turn.
 """
 
 import argparse

@@ -112,9 +112,9 @@ def test_tables_show_true_and_answered_values(capsys: pytest.CaptureFixture[str]
     distances = {**NOTHING, "ml": -1.6, "mr": 2.4}
     asked = Asked(b"", "r1", "oval", 2, distances, 0.4, 0.01, "straight", 0.0, answer)
     print_tables(verdicts(evaluation(angle=0.05)), [asked])
-    said = capsys.readouterr().out
+    output = capsys.readouterr().out
     for cell in ("-1.60 -1.50", "+0.40 +0.50", "+0.010 +0.012", "straight right", "1.25 ", "NO"):
-        assert cell in said
+        assert cell in output
 
 
 def test_a_folder_with_other_files_is_refused(tmp_path: Path) -> None:
@@ -126,9 +126,9 @@ def test_a_folder_with_other_files_is_refused(tmp_path: Path) -> None:
 
 def test_run_module_returns_exit_code_and_output() -> None:
     assert run_module(["json.tool", "--help"])[0] == 0
-    code, said = run_module(["json.tool", "no-such-file"])
+    code, output = run_module(["json.tool", "no-such-file"])
     assert code != 0
-    assert said == ""
+    assert output == ""
 
 
 def test_sigterm_also_ends_the_child_process(tmp_path: Path) -> None:
