@@ -36,7 +36,7 @@ ASPECT_TOLERANCE = 0.01
 
 
 @dataclass(frozen=True)
-class OwnLabels:
+class CustomLabels:
     """`distances` (N, 5) m, NaN where absent; `angle` (N,) rad; `heading` (N,) classes."""
 
     distances: NDArray[np.float32]
@@ -45,11 +45,11 @@ class OwnLabels:
 
 
 @dataclass(frozen=True)
-class OwnImages:
+class CustomImages:
     """Labelled images in memory, (N, H, W, 3) uint8 of the camera's size (0.18 MB each)."""
 
     path: Path
-    labels: OwnLabels
+    labels: CustomLabels
     images: NDArray[np.uint8]
     content_hash: str
 
@@ -63,12 +63,12 @@ class OwnImages:
         return np.take(self.images, indices, axis=0, out=out)
 
 
-def is_own(folder: Path) -> bool:
+def has_labels_file(folder: Path) -> bool:
     """Whether a folder holds a user's own images rather than recorded rounds."""
     return (folder / LABELS).is_file()
 
 
-def open_own_images(folder: Path, camera: CameraParameters) -> OwnImages:
+def open_custom_images(folder: Path, camera: CameraParameters) -> CustomImages:
     """Read, check and decode all of a folder, scaled to the camera's size.
 
     Raises UserError that names the line of `labels.csv` that is wrong, ImageError (a UserError)
@@ -90,7 +90,7 @@ def open_own_images(folder: Path, camera: CameraParameters) -> OwnImages:
     with ThreadPoolExecutor() as pool:
         for part in pool.map(decode, range(len(files))):
             digest.update(part)
-    return OwnImages(folder, labels, images, digest.hexdigest())
+    return CustomImages(folder, labels, images, digest.hexdigest())
 
 
 def _read_whole_view(path: Path, camera: CameraParameters) -> NDArray[np.uint8]:
@@ -110,7 +110,7 @@ def _read_whole_view(path: Path, camera: CameraParameters) -> NDArray[np.uint8]:
     return image
 
 
-def read_labels(path: Path) -> tuple[list[tuple[int, str]], OwnLabels]:
+def read_labels(path: Path) -> tuple[list[tuple[int, str]], CustomLabels]:
     """The lines and files of a `labels.csv`, and the labels; UserError that names a wrong line."""
     files: list[tuple[int, str]] = []
     rows: list[tuple[list[float], float, int]] = []
@@ -140,7 +140,7 @@ def read_labels(path: Path) -> tuple[list[tuple[int, str]], OwnLabels]:
         if name in seen:
             raise UserError(f"{path}, line {line}: {name} stands in line {seen[name]} already")
         seen[name] = line
-    labels = OwnLabels(
+    labels = CustomLabels(
         np.array([row[0] for row in rows], np.float32),
         np.array([row[1] for row in rows], np.float32),
         np.array([row[2] for row in rows], np.int64),

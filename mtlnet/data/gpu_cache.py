@@ -74,7 +74,7 @@ def _decode(loader: Loader, device: torch.device) -> Tensor:
     return images
 
 
-def resident_or_not(
+def cache_if_it_fits(
     loader: Loader, device: torch.device, free_bytes: int | None = None
 ) -> Loader | GpuDataset:
     """The loader's frames on `device`, or the loader: where they do not fit, or are changed.

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from datagen.recording import Dataset, DatasetError, Frames, UndecodableImage
-from mtlnet.data.custom_images import OwnImages, is_own, open_own_images
+from mtlnet.data.custom_images import CustomImages, has_labels_file, open_custom_images
 from mtlnet.evaluation.metrics import describe_data, mean_answer
 from mtlnet.inference.model_card import ModelCard, ModelError
 from mtlnet.model.architecture import HEIGHT, WIDTH
@@ -21,13 +21,13 @@ from trackfeatures.errors import UserError
 class TrainingData:
     """What a run learns from; `held_out` rounds are for its second head, `about` for its card."""
 
-    frames: Frames | OwnImages
+    frames: Frames | CustomImages
     held_out: Frames | None
     camera: CameraParameters
     about: dict[str, Any]
 
 
-def open_material(
+def open_training_data(
     config: TrainConfig, init: ModelCard | None, *, checked: bool = False
 ) -> TrainingData:
     """What `config.data` holds, recorded rounds or a user's own images; UserError: it cannot be.
@@ -37,17 +37,17 @@ def open_material(
     """
     if init is not None and init.network != config.network:
         raise UserError(f"--init is a {init.network}, not a {config.network}; leave out --network")
-    if is_own(config.data):
-        material = own_material(config.data, init)
+    if has_labels_file(config.data):
+        material = custom_training_data(config.data, init)
     else:
-        dataset = open_training_data(config.data)
+        dataset = open_training_dataset(config.data)
         if not (checked or config.skip_undecodable):
             require_decodable(dataset.select("train"), config.data, skippable=True)
-        material = round_material(dataset, skip_undecodable=config.skip_undecodable)
-    return material if init is None else continued(material, init)
+        material = recorded_training_data(dataset, skip_undecodable=config.skip_undecodable)
+    return material if init is None else continue_from_model(material, init)
 
 
-def open_training_data(path: Path) -> Dataset:
+def open_training_dataset(path: Path) -> Dataset:
     """The dataset in folder `path`; UserError when it does not fit this network."""
     dataset = Dataset.open(path)
     camera = dataset.camera
@@ -60,14 +60,14 @@ def open_training_data(path: Path) -> Dataset:
     return dataset
 
 
-def own_material(folder: Path, card: ModelCard | None) -> TrainingData:
+def custom_training_data(folder: Path, card: ModelCard | None) -> TrainingData:
     """A user's own images, of the camera of the model that is tuned; UserError without one."""
     if card is None:
         raise UserError(
             f"{folder} holds images of your own, which do not say what camera took them; give the "
             "model to fine-tune with --init RUN, or --init default"
         )
-    images = open_own_images(folder, card.camera)
+    images = open_custom_images(folder, card.camera)
     about = {
         "path": str(folder),
         "content_hash": images.content_hash,
@@ -81,7 +81,7 @@ def own_material(folder: Path, card: ModelCard | None) -> TrainingData:
     return TrainingData(images, None, card.camera, about)
 
 
-def round_material(dataset: Dataset, *, skip_undecodable: bool = False) -> TrainingData:
+def recorded_training_data(dataset: Dataset, *, skip_undecodable: bool = False) -> TrainingData:
     """The train rounds of a dataset; with `skip_undecodable` the frames that can be decoded."""
     frames, held_out = hold_out(dataset)
     left_out: list[str] = []
@@ -94,7 +94,7 @@ def round_material(dataset: Dataset, *, skip_undecodable: bool = False) -> Train
     return TrainingData(frames, held_out, dataset.camera, {**about, "undecodable": left_out})
 
 
-def continued(material: TrainingData, card: ModelCard) -> TrainingData:
+def continue_from_model(material: TrainingData, card: ModelCard) -> TrainingData:
     """The same, of a model that goes on from that of `card`: what that has seen, this has seen."""
     if material.camera != card.camera:
         raise ModelError(

@@ -27,7 +27,7 @@ from mtlnet.inference.model_card import (
     read_card,
 )
 from mtlnet.inference.prediction import OUTPUTS
-from mtlnet.model.network import HEIGHT, WIDTH, Network, answer_images, load_network
+from mtlnet.model.network import HEIGHT, WIDTH, Network, predict_images, load_network
 from trackfeatures.errors import UserError
 
 FORMATS, PRECISIONS = ("onnx", "openvino"), ("f32", "bf16", "int8")
@@ -206,7 +206,7 @@ def check_on(
     options = {"INFERENCE_PRECISION_HINT": computed}
     request = core.compile_model(str(path), "CPU", options).create_infer_request()
     found = np.concatenate([request.infer([image[None]])[0].copy() for image in images])
-    difference = np.abs(found[:, :OUTPUTS] - answer_images(network, images))
+    difference = np.abs(found[:, :OUTPUTS] - predict_images(network, images))
     return {
         "frames": len(images),
         "computed_in": computed,

@@ -18,11 +18,11 @@ from torch import nn
 
 from mtlnet.inference.uncertainty import (
     BANDS,
-    COLUMNS_OF_CELLS,
-    MIDDLE_BANDS,
-    MIDDLE_COLUMNS,
-    ROWS_OF_CELLS,
-    SMALLEST,
+    CELL_COLUMNS,
+    CENTRE_BANDS,
+    CENTRE_COLUMNS,
+    CELL_ROWS,
+    SQRT_EPSILON,
     UncertaintyHead,
 )
 from mtlnet.model.architecture import HEADS, HEIGHT, WIDTH, Architecture, LocalNorm, Pool
@@ -30,7 +30,7 @@ from mtlnet.model.network import Network
 
 # Largest difference of any output (coded, or a probability) from torch in float32.
 TOLERANCE = 2e-4
-DOUBT_TOLERANCE = 5e-3
+UNCERTAINTY_TOLERANCE = 5e-3
 """The same of a standard deviation or the novelty, as a share of it."""
 
 
@@ -43,12 +43,12 @@ def build_graph(network: Network, doubt: UncertaintyHead | None = None) -> Any:
     from openvino import opset13 as ops
 
     images, pixels, x, nine = _network_graph(ops, network)
-    second = [] if doubt is None else doubt_outputs(ops, x, pixels, doubt)
+    second = [] if doubt is None else uncertainty_outputs(ops, x, pixels, doubt)
     outputs = ops.concat([nine, *second], 1)
     return openvino.Model([ops.result(outputs)], [images], "mtlnet")
 
 
-def describing_graph(network: Network) -> Any:
+def build_feature_graph(network: Network) -> Any:
     """The same with two results: the nine outputs, and the last shared features (1, F)."""
     import openvino
     from openvino import opset13 as ops
@@ -66,7 +66,7 @@ def _network_graph(ops: Any, network: Network) -> tuple[Any, Any, Any, Any]:
     x = ops.subtract(ops.multiply(x, np.float32(1 / 127.5)), np.float32(1))
     pixels = ops.transpose(x, np.array([0, 3, 1, 2]))
     x = features_graph(ops, pixels, network)
-    for number in range(len(network.plan.shared)):
+    for number in range(len(network.architecture.shared)):
         x = ops.relu(_linear(ops, x, weights, f"shared.fc{number}.layer"))
     distance, angle, kind = (
         precise_linear(ops, x, weights[f"heads.{name}.weight"], weights[f"heads.{name}.bias"])
@@ -110,10 +110,10 @@ def write_graph(
 
 def features_graph(ops: Any, x: Any, network: Network) -> Any:
     """The features of a folded network, (1, 3, H, W) -> (1, F)."""
-    if network.plan.backbone:
+    if network.architecture.backbone:
         x = backbone_graph(ops, x, network.features)
     else:
-        x = plan_graph(ops, x, network.plan, network.features)
+        x = plan_graph(ops, x, network.architecture, network.features)
     return ops.reshape(x, np.array([1, -1]), special_zero=False)
 
 
@@ -228,7 +228,7 @@ def precise_linear(ops: Any, x: Any, weight: NDArray[np.float32], bias: NDArray[
     return ops.add(precise_product(ops, x, weight), bias[None])
 
 
-def doubt_outputs(ops: Any, x: Any, pixels: Any, doubt: UncertaintyHead) -> list[Any]:
+def uncertainty_outputs(ops: Any, x: Any, pixels: Any, doubt: UncertaintyHead) -> list[Any]:
     """`UncertaintyHead.assess` of the last shared features x (1, F) and pixels (1, 3, H, W) in [-1,
     1]."""
     z = ops.multiply(ops.subtract(x, doubt.centre[None]), doubt.scale[None])
@@ -256,11 +256,11 @@ def texture_graph(ops: Any, pixels: Any) -> tuple[Any, Any]:
         one, all_, by = np.array([1]), np.array([size + 1]), np.array([1])
         later = ops.slice(longer, one, all_, by, np.array([axis]))
         planes.append(ops.abs(ops.subtract(later, grey)))
-    band = [height // (ROWS_OF_CELLS * BANDS), width // COLUMNS_OF_CELLS]
+    band = [height // (CELL_ROWS * BANDS), width // CELL_COLUMNS]
     narrow = [_means(ops, plane, band) for plane in planes]
     cells = [_means(ops, plane, [BANDS, 1]) for plane in narrow]
-    first = np.array([MIDDLE_BANDS.start, MIDDLE_COLUMNS.start])
-    last = np.array([MIDDLE_BANDS.stop, MIDDLE_COLUMNS.stop])
+    first = np.array([CENTRE_BANDS.start, CENTRE_COLUMNS.start])
+    last = np.array([CENTRE_BANDS.stop, CENTRE_COLUMNS.stop])
     steps, axes = np.array([1, 1]), np.array([2, 3])
     middle = [ops.slice(plane, first, last, steps, axes) for plane in narrow]
     return _flat(ops, cells), _flat(ops, middle)
@@ -273,5 +273,5 @@ def _means(ops: Any, plane: Any, cell: list[int]) -> Any:
 def _flat(ops: Any, planes: list[Any]) -> Any:
     """Colours as they are and roots of the differences, as one row."""
     colours, *others = planes
-    roots = [ops.sqrt(ops.add(plane, np.float32(SMALLEST))) for plane in others]
+    roots = [ops.sqrt(ops.add(plane, np.float32(SQRT_EPSILON))) for plane in others]
     return ops.reshape(ops.concat([colours, *roots], 1), np.array([1, -1]), special_zero=False)

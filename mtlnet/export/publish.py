@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from safetensors.torch import save
 
 import trackfeatures as tf
-from mtlnet.export.openvino_graph import DOUBT_TOLERANCE, TOLERANCE, write_graph
+from mtlnet.export.openvino_graph import UNCERTAINTY_TOLERANCE, TOLERANCE, write_graph
 from mtlnet.inference.model_card import (
-    DOUBT,
+    UNCERTAINTY_WEIGHTS,
     GRAPH,
     GRAPH_WEIGHTS,
     MODEL_FILES,
@@ -26,8 +26,8 @@ from mtlnet.inference.model_card import (
     golden_image,
 )
 from mtlnet.inference.prediction import OUTPUTS
-from mtlnet.inference.uncertainty import FittedDoubt, UncertaintyHead, texture, write_doubt
-from mtlnet.model.network import HEIGHT, WIDTH, Network, answer_images, describe_images, fold
+from mtlnet.inference.uncertainty import FittedUncertainty, UncertaintyHead, texture, write_uncertainty_head
+from mtlnet.model.network import HEIGHT, WIDTH, Network, predict_images, run_network, fold
 from runtime.files import atomic_write
 from trackfeatures.camera import CameraParameters
 
@@ -46,7 +46,7 @@ def publish(
     batch: int = 32,
     seed: int = 0,
     data: dict[str, Any] | None = None,
-    doubt: FittedDoubt | None = None,
+    doubt: FittedUncertainty | None = None,
 ) -> ModelCard:
     """Fold `network`, write all of `mtlnet.inference.model_card.MODEL_FILES` and the card into
     folder `run`.
@@ -62,15 +62,15 @@ def publish(
     atomic_write(run / WEIGHTS, save(weights), fsync=True)
     head = None if doubt is None else doubt.head
     if head is not None:
-        write_doubt(run, head)
+        write_uncertainty_head(run, head)
     write_graph(folded, run / GRAPH, run / GRAPH_WEIGHTS, head)
     check = compare(folded, run, images, head)
     _require_equal(run, check)
     golden = golden_image(WIDTH, HEIGHT)
-    names = MODEL_FILES if doubt is None else (*MODEL_FILES, DOUBT)
+    names = MODEL_FILES if doubt is None else (*MODEL_FILES, UNCERTAINTY_WEIGHTS)
     card = ModelCard(
         name=run.resolve().name,
-        network=folded.plan.name,
+        network=folded.architecture.name,
         definitions_version=tf.VERSION,
         program_version=package_versions()["driverview"],
         camera=camera or CameraParameters(),
@@ -83,7 +83,7 @@ def publish(
         versions=package_versions(),
         files={name: file_hash(run / name) for name in names},
         export_check=check,
-        golden=tuple(float(v) for v in answer_images(folded, golden[None])[0]),
+        golden=tuple(float(v) for v in predict_images(folded, golden[None])[0]),
         doubt=None if doubt is None else doubt.about,
     )
     card.write(run)
@@ -91,7 +91,7 @@ def publish(
 
 
 def _require_equal(run: Path, check: dict[str, float]) -> None:
-    limits = {"openvino_f32_max": TOLERANCE, "openvino_f32_doubt": DOUBT_TOLERANCE}
+    limits = {"openvino_f32_max": TOLERANCE, "openvino_f32_doubt": UNCERTAINTY_TOLERANCE}
     for name, limit in limits.items():
         if not check.get(name, 0.0) <= limit:  # written so that NaN is a failure too
             raise ModelError(
@@ -112,7 +112,7 @@ def compare(
 
     from mtlnet.inference.engine import best_precision
 
-    x, expected = describe_images(network, images)
+    x, expected = run_network(network, images)
     textures = np.stack([texture(image) for image in images])
     second = None if doubt is None else doubt.assess(x, textures)
     core = openvino.Core()

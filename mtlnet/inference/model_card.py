@@ -22,7 +22,7 @@ from trackfeatures.errors import UserError, require_version
 RUNS = Path("runs")
 SHIPPED = Path(__file__).parents[1] / "weights" / "default"
 CARD, WEIGHTS, GRAPH, GRAPH_WEIGHTS = "card.json", "model.safetensors", "model.xml", "model.bin"
-DOUBT = "doubt.safetensors"
+UNCERTAINTY_WEIGHTS = "doubt.safetensors"
 MODEL_FILES = (WEIGHTS, GRAPH, GRAPH_WEIGHTS)
 FORMAT = 4  # 2: `network`; 3: `doubt`; 4: how the camera is aimed
 
@@ -36,7 +36,7 @@ class ModelCard:
     """What a model is. `files` are SHA-256 in hex; `data` describes the dataset it learned from."""
 
     name: str
-    network: str  # of `mtlnet.model.architecture.PLANS`
+    network: str  # of `mtlnet.model.architecture.ARCHITECTURES`
     definitions_version: str
     program_version: str
     camera: CameraParameters

@@ -99,7 +99,7 @@ ALEXNET: tuple[Layer, ...] = (
     Pool(same=False),
 )
 MTL = Architecture("mtl", FEATURES, SHARED)
-PLANS = {
+ARCHITECTURES = {
     plan.name: plan
     for plan in (
         MTL,
@@ -110,14 +110,14 @@ PLANS = {
 }
 
 
-def find_plan(name: str) -> Architecture:
+def find_architecture(name: str) -> Architecture:
     """The network of that name; UserError when there is none."""
-    if name not in PLANS:
-        raise UserError(f"there is no network {name!r}; choose one of {', '.join(PLANS)}")
-    return PLANS[name]
+    if name not in ARCHITECTURES:
+        raise UserError(f"there is no network {name!r}; choose one of {', '.join(ARCHITECTURES)}")
+    return ARCHITECTURES[name]
 
 
-def require_learnable(plan: Architecture, alpha: tuple[float, float, float]) -> None:
+def require_task_heads(plan: Architecture, alpha: tuple[float, float, float]) -> None:
     """Raise UserError when `alpha` weighs a task that the network does not have."""
     if alpha[2] > 0 and "type" not in plan.tasks:
         raise UserError(

@@ -27,7 +27,7 @@ from mtlnet.model.architecture import (
     Conv,
     LocalNorm,
     Pool,
-    find_plan,
+    find_architecture,
     output_size,
     same_padding,
 )
@@ -36,8 +36,8 @@ __all__ = [
     "HEIGHT",
     "WIDTH",
     "Network",
-    "answer_images",
-    "describe_images",
+    "predict_images",
+    "run_network",
     "fold",
     "initialise",
     "load_network",
@@ -98,7 +98,7 @@ def initialise(network: Network, seed: int) -> None:
     for name, module in network.named_modules():
         if isinstance(module, nn.Conv2d | nn.Linear):
             gain = 0.01 if name.startswith("heads") else 2.0
-            if name == "heads.heading" and "type" not in network.plan.tasks:
+            if name == "heads.heading" and "type" not in network.architecture.tasks:
                 gain = 0.0  # never trained: the same probability for each class
             fan_in = module.weight[0].numel()
             with torch.no_grad():
@@ -120,7 +120,7 @@ def fold(network: Network) -> Network:
             double.get_parameter(f"heads.{name}.weight").mul_(std[:, None])
             bias = double.get_parameter(f"heads.{name}.bias")
             bias.mul_(std).add_(double.target_mean[rows])
-    folded = Network(plan=network.plan)
+    folded = Network(plan=network.architecture)
     state = double.state_dict()
     folded.load_state_dict({name: state[name].float() for name in folded.state_dict()})
     return folded.eval()
@@ -128,17 +128,17 @@ def fold(network: Network) -> Network:
 
 def load_network(path: Path, name: str = MTL.name) -> Network:
     """The network called `name` with the weights of a `model.safetensors`."""
-    network = Network(plan=find_plan(name))
+    network = Network(plan=find_architecture(name))
     network.load_state_dict(load_file(path))
     return network.eval()
 
 
-def answer_images(network: Network, images: NDArray[np.uint8]) -> NDArray[np.float32]:
+def predict_images(network: Network, images: NDArray[np.uint8]) -> NDArray[np.float32]:
     """Images (B, 210, 280, 3) -> (B, 9): coded distances and angle, class probabilities."""
-    return describe_images(network, images)[1]
+    return run_network(network, images)[1]
 
 
-def describe_images(
+def run_network(
     network: Network, images: NDArray[np.uint8]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """The last shared features (B, 256) of images (B, 210, 280, 3), and the answers (B, 9)."""

@@ -10,7 +10,7 @@ from mtlnet.inference.model_card import RUNS, ModelCard
 from mtlnet.model.network import HEIGHT, WIDTH, fold
 from mtlnet.training.config import TrainConfig
 from mtlnet.training.trainer import Trainer
-from mtlnet.uncertainty_fit.head import fit_doubt
+from mtlnet.uncertainty_fit.head import fit_uncertainty_head
 
 CHECK_FRAMES = 16
 """Frames on which the exported graph is held against torch."""
@@ -32,7 +32,7 @@ def finish(config: TrainConfig, trainer: Trainer, material: TrainingData) -> Mod
         batch=config.batch,
         seed=config.seed,
         data=material.about,
-        doubt=fit_doubt(
+        doubt=fit_uncertainty_head(
             fold(trainer.network), frames, material.held_out, config.seed, material.camera
         ),
     )

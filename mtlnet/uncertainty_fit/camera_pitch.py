@@ -19,11 +19,11 @@ from mtlnet.data.augment.pipeline import homography
 from mtlnet.data.loader import Images
 from mtlnet.inference.uncertainty import (
     BANDS,
-    CELLS,
-    COLUMNS_OF_CELLS,
-    MIDDLE_BANDS,
-    MIDDLE_COLUMNS,
-    ROWS_OF_CELLS,
+    CELL_VALUES,
+    CELL_COLUMNS,
+    CENTRE_BANDS,
+    CENTRE_COLUMNS,
+    CELL_ROWS,
     texture,
 )
 from trackfeatures.camera import CameraParameters
@@ -67,11 +67,11 @@ def aimed(camera: CameraParameters, pitch: float, wider: float) -> NDArray[np.fl
 
 
 def _within(camera: CameraParameters, pitch: float, wider: float) -> bool:
-    band = camera.height // (ROWS_OF_CELLS * BANDS)
-    cell = camera.width // COLUMNS_OF_CELLS
+    band = camera.height // (CELL_ROWS * BANDS)
+    cell = camera.width // CELL_COLUMNS
     # One pixel more: differences reach to the next.
-    x = np.array([MIDDLE_COLUMNS.start, MIDDLE_COLUMNS.stop]) * cell
-    y = np.array([MIDDLE_BANDS.start, MIDDLE_BANDS.stop]) * band
+    x = np.array([CENTRE_COLUMNS.start, CENTRE_COLUMNS.stop]) * cell
+    y = np.array([CENTRE_BANDS.start, CENTRE_BANDS.stop]) * band
     corners = np.array([[a, b, 1] for a in x for b in y]).T
     u, v, w = np.linalg.inv(aimed(camera, pitch, wider)) @ corners
     u, v = u / w, v / w
@@ -93,7 +93,7 @@ def turn_frames(frames: Images, camera: CameraParameters, seed: int) -> tuple[Nu
             turned = cv2.warpPerspective(
                 image[0], aimed(camera, *aim), size, borderMode=cv2.BORDER_REFLECT_101
             )
-            middles.append(texture(turned.astype(np.uint8, copy=False))[CELLS:])
+            middles.append(texture(turned.astype(np.uint8, copy=False))[CELL_VALUES:])
             pitches.append(aim[0])
     return np.array(middles), np.array(pitches, np.float32)
 

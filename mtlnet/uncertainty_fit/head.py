@@ -20,14 +20,14 @@ import trackfeatures as tf
 from datagen.recording import Dataset, Frames
 from mtlnet.data.loader import Images
 from mtlnet.evaluation.metrics import coverage, signed_errors
-from mtlnet.export.openvino_graph import describing_graph
+from mtlnet.export.openvino_graph import build_feature_graph
 from mtlnet.inference.engine import best_precision
 from mtlnet.inference.prediction import OUTPUTS
 from mtlnet.inference.uncertainty import (
-    CELLS,
+    CELL_VALUES,
     FEATURES,
-    TEXTURE,
-    FittedDoubt,
+    TEXTURE_VALUES,
+    FittedUncertainty,
     UncertaintyHead,
     texture,
 )
@@ -96,13 +96,13 @@ class Seen:
     texture: Numbers
 
 
-def fit_doubt(
+def fit_uncertainty_head(
     network: Network,
     learned: Images,
     held_out: Images | None,
     seed: int,
     camera: CameraParameters | None = None,
-) -> FittedDoubt:
+) -> FittedUncertainty:
     """The second head of `network` (folded), fitted on frames held out of its training.
 
     Without any, on those learned from: it then trusts the network too much, and the card says so.
@@ -118,9 +118,9 @@ def fit_doubt(
     if limits is None:  # without any, every second one of the known
         seen, limits = seen[::2], seen[1::2]
     turned = turn_frames(learned, camera or CameraParameters(), seed)
-    aim = fit_aim(seen[:, CELLS:], turned, limits[:, CELLS:], FALSE_ALARMS / 2, seed)
+    aim = fit_aim(seen[:, CELL_VALUES:], turned, limits[:, CELL_VALUES:], FALSE_ALARMS / 2, seed)
     torch.set_num_threads(threads)
-    usual, directions = novelty(seen[:, :CELLS], limits[:, :CELLS], FALSE_ALARMS / 2)
+    usual, directions = novelty(seen[:, :CELL_VALUES], limits[:, :CELL_VALUES], FALSE_ALARMS / 2)
     strange = {"usual": usual, "directions": directions, **aim}
     doubt = UncertaintyHead(centre, scale.astype(np.float32), **head, **strange)
     judged = judged or known
@@ -131,7 +131,7 @@ def fit_doubt(
         "false_alarm_rate": FALSE_ALARMS,
         "coverage": coverage(doubt.assess(judged.x, judged.texture)[:, :-1], judged.error),
     }
-    return FittedDoubt(doubt, about)
+    return FittedUncertainty(doubt, about)
 
 
 def look(network: Network, frames: Images, most: int) -> Seen:
@@ -140,9 +140,9 @@ def look(network: Network, frames: Images, most: int) -> Seen:
     By OpenVINO, a request a core: three times as fast as torch in float32.
     """
     chosen = np.linspace(0, len(frames) - 1, min(most, len(frames))).astype(np.int64)
-    x = np.empty((len(chosen), network.plan.shared[-1]), np.float32)
+    x = np.empty((len(chosen), network.architecture.shared[-1]), np.float32)
     outputs = np.empty((len(chosen), OUTPUTS), np.float32)
-    textures = np.empty((len(chosen), TEXTURE), np.float32)
+    textures = np.empty((len(chosen), TEXTURE_VALUES), np.float32)
 
     def note(request: Any, row: int) -> None:
         outputs[row] = request.get_output_tensor(0).data[0]
@@ -174,7 +174,7 @@ def _requests(network: Network) -> Any:
         "NUM_STREAMS": cores,
         "ENABLE_CPU_PINNING": False,
     }
-    return openvino.AsyncInferQueue(core.compile_model(describing_graph(network), "CPU", options))
+    return openvino.AsyncInferQueue(core.compile_model(build_feature_graph(network), "CPU", options))
 
 
 def novelty(

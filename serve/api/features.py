@@ -207,7 +207,7 @@ def crop_of(
     width: int, height: int, view: CameraParameters, fov_y_deg: float | None
 ) -> list[int] | None:
     """[left, top, width, height] of what the model sees of a picture, px; None: all of it."""
-    box = visible(width, height, view, fov_y_deg)
+    box = crop_box(width, height, view, fov_y_deg)
     return None if box is None else [box.left, box.top, box.width, box.height]
 
 

@@ -16,9 +16,9 @@ from datagen.recording.round_metadata import RoundHeader
 from datagen.recording.splits import Split, split_path, write_split
 from mtlnet.evaluation.metrics import describe_data
 from mtlnet.export.publish import publish
-from mtlnet.model.architecture import FEATURES, HEIGHT, MTL, PLANS, WIDTH, Conv
+from mtlnet.model.architecture import FEATURES, HEIGHT, MTL, ARCHITECTURES, WIDTH, Conv
 from mtlnet.model.network import Network, initialise
-from mtlnet.uncertainty_fit.head import fit_doubt
+from mtlnet.uncertainty_fit.head import fit_uncertainty_head
 
 FRAMES = 24
 TRAIN, TEST = ("r000", "r001", "r002"), ("r003",)
@@ -94,7 +94,7 @@ def published(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     run = tmp_path_factory.mktemp("runs") / "untrained"
     data = Dataset.open(dataset)
     frames = data.select("train")
-    doubt = fit_doubt(network, frames, None, 0)
+    doubt = fit_uncertainty_head(network, frames, None, 0)
     images = np.stack([draw_road(d, 0.0) for d in (-1.0, 0.5)])
     publish(network, run, images, doubt=doubt, data=describe_data(data, frames))
     return run
@@ -104,4 +104,4 @@ def published(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def small_network(monkeypatch: pytest.MonkeyPatch) -> None:
     """The network has few filters and units: for tests of what happens around its training."""
     few = tuple(replace(spec, filters=8) if isinstance(spec, Conv) else spec for spec in FEATURES)
-    monkeypatch.setitem(PLANS, MTL.name, replace(MTL, features=few, shared=(32, 16, 16)))
+    monkeypatch.setitem(ARCHITECTURES, MTL.name, replace(MTL, features=few, shared=(32, 16, 16)))

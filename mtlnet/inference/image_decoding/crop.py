@@ -24,7 +24,7 @@ class Box:
     height: int
 
 
-def visible(
+def crop_box(
     width: int, height: int, view: CameraParameters, fov_y_deg: float | None = None
 ) -> Box | None:
     """The part of a width x height picture that shows `view`; None: all of it does.

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from mtlnet.inference.image_decoding import jpeg_structure as jpeg
 from mtlnet.inference.image_decoding import png_structure as png
-from mtlnet.inference.image_decoding.crop import visible
+from mtlnet.inference.image_decoding.crop import crop_box
 from mtlnet.inference.image_decoding.errors import Fault, ImageError
 from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
@@ -69,7 +69,7 @@ def inspect(body: bytes, view: CameraParameters, fov_y_deg: float | None = None)
         seen = f"{len(body)} bytes that begin with {body[:8]!r}" if body else "nothing at all"
         raise ImageError(Fault.NOT_AN_IMAGE, f"no JPEG or PNG file, but {seen}")
     check_size(header.width, header.height)
-    visible(header.width, header.height, view, fov_y_deg)
+    crop_box(header.width, header.height, view, fov_y_deg)
     return header
 
 
@@ -122,14 +122,14 @@ def decode(
             f"the image decodes to {image.shape[1]} x {image.shape[0]} px, its header says "
             f"{header.width} x {header.height}; save it anew",
         )
-    return fit(image, view, fov_y_deg)
+    return crop_and_resize(image, view, fov_y_deg)
 
 
-def fit(
+def crop_and_resize(
     image: NDArray[np.uint8], view: CameraParameters, fov_y_deg: float | None = None
 ) -> NDArray[np.uint8]:
     """An image (H, W, 3) cropped and scaled to (view.height, view.width, 3). Raises ImageError."""
-    box = visible(image.shape[1], image.shape[0], view, fov_y_deg)
+    box = crop_box(image.shape[1], image.shape[0], view, fov_y_deg)
     if box is not None:
         image = image[box.top : box.top + box.height, box.left : box.left + box.width]
     if image.shape[:2] == (view.height, view.width):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import trackfeatures as tf
-from mtlnet.data.custom_images import MARKING_LIMITS_M, OwnImages, open_own_images, read_labels
+from mtlnet.data.custom_images import MARKING_LIMITS_M, CustomImages, open_custom_images, read_labels
 from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
 
@@ -79,22 +79,22 @@ def test_wrong_files_are_refused(tmp_path: Path) -> None:
         read_labels(write(tmp_path))
     write(tmp_path, GOOD)
     with pytest.raises(UserError, match=r"line 2: there is no image file .*a\.png"):
-        open_own_images(tmp_path, CameraParameters())
+        open_custom_images(tmp_path, CameraParameters())
     picture(tmp_path / "a.png", 280, 200)
     with pytest.raises(UserError, match=r"line 2: .*280 x 200 px, .* 280 x 210: give"):
-        open_own_images(tmp_path, CameraParameters())
+        open_custom_images(tmp_path, CameraParameters())
 
 
 def test_images_of_any_size_of_the_cameras_shape(tmp_path: Path) -> None:
     write(tmp_path, GOOD, "b.png,,,,,,0,left")
     picture(tmp_path / "a.png", 280, 210)
     picture(tmp_path / "b.png", 562, 420, 30)  # 0.4 percent off
-    found = open_own_images(tmp_path, CameraParameters())
-    assert isinstance(found, OwnImages)
+    found = open_custom_images(tmp_path, CameraParameters())
+    assert isinstance(found, CustomImages)
     assert found.images.shape == (2, 210, 280, 3)
     batch = found.read_batch(np.array([1, 0]))
     assert batch[:, 100, 20].tolist() == [[30, 30, 30], [90, 90, 90]]
     assert batch[:, 100, 260].tolist() == [[255, 0, 0]] * 2  # RGB
     before = found.content_hash
     picture(tmp_path / "a.png", 280, 210, 91)
-    assert open_own_images(tmp_path, CameraParameters()).content_hash != before
+    assert open_custom_images(tmp_path, CameraParameters()).content_hash != before

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from datagen.recording import Dataset
-from mtlnet.data.gpu_cache import SHARE, DeviceBatch, GpuDataset, resident_or_not
+from mtlnet.data.gpu_cache import SHARE, DeviceBatch, GpuDataset, cache_if_it_fits
 from mtlnet.data.loader import Loader
 from mtlnet.training.cuda_graph import WARM_UP, CudaGraphStep
 from mtlnet.training.loss import Losses
@@ -43,10 +43,10 @@ def test_resident_batches_are_the_loaders(dataset: Path, part: tuple[int, int]) 
 def test_only_what_fits_and_is_not_changed_is_kept(dataset: Path) -> None:
     plain, changed = loader(dataset), loader(dataset, augment=True)
     size = len(plain.frames) * 210 * 280 * 3
-    assert isinstance(resident_or_not(plain, CPU, int(size / SHARE) + 1), GpuDataset)
-    assert resident_or_not(plain, CPU, int(size / SHARE) - 1) is plain
-    assert resident_or_not(changed, CPU, 100 * size) is changed
-    assert resident_or_not(plain, CPU) is plain  # a CPU keeps nothing
+    assert isinstance(cache_if_it_fits(plain, CPU, int(size / SHARE) + 1), GpuDataset)
+    assert cache_if_it_fits(plain, CPU, int(size / SHARE) - 1) is plain
+    assert cache_if_it_fits(changed, CPU, 100 * size) is changed
+    assert cache_if_it_fits(plain, CPU) is plain  # a CPU keeps nothing
 
 
 class Notebook:
@@ -114,7 +114,7 @@ def test_recorded_training_is_training(dataset: Path) -> None:
 @pytest.mark.usefixtures("small_network")
 def test_a_gpu_replays_what_it_recorded(dataset: Path) -> None:
     gpu = torch.device("cuda")
-    kept = resident_or_not(loader(dataset), gpu)
+    kept = cache_if_it_fits(loader(dataset), gpu)
     assert isinstance(kept, GpuDataset)
     recipe = replace(RECIPES["paper"], dropout=0.0, learning_rate=0.02)
     plain, recorded = (Trainer(recipe, (0.3, 0.2, 0.5), 1, gpu) for _ in range(2))

@@ -18,7 +18,7 @@ from mtlnet.export.convert import export_model
 from mtlnet.export.openvino_graph import TOLERANCE
 from mtlnet.inference.engine import load_engine
 from mtlnet.inference.exported import ABOUT, INT8, gate, passed_gate
-from mtlnet.inference.model_card import DOUBT, GRAPH, GRAPH_WEIGHTS, WEIGHTS, ModelError, read_card
+from mtlnet.inference.model_card import UNCERTAINTY_WEIGHTS, GRAPH, GRAPH_WEIGHTS, WEIGHTS, ModelError, read_card
 from mtlnet.model.network import load_network
 from mtlnet.training.config import TrainConfig
 from mtlnet.training.run import train
@@ -108,7 +108,7 @@ def test_int8_is_taken_once_its_gate_is_passed(
     assert found["gate"]["frames"] == 24
     weights = [(path / GRAPH_WEIGHTS).stat().st_size for path in (run, run / INT8)]
     last = load_file(run / WEIGHTS)["shared.fc2.layer.weight"].nbytes
-    kept = last + (run / DOUBT).stat().st_size  # and the second head
+    kept = last + (run / UNCERTAINTY_WEIGHTS).stat().st_size  # and the second head
     assert weights[1] == pytest.approx((weights[0] - kept) / 4 + kept, rel=0.01)
     rounded_to = openvino.Core().read_model(run / INT8 / GRAPH).get_ordered_ops()
     rounding = [op for op in rounded_to if op.get_type_name() == "FakeQuantize"]

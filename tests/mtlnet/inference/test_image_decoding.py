@@ -9,7 +9,7 @@ import pytest
 import simplejpeg
 
 from mtlnet.inference import image_decoding as images
-from mtlnet.inference.image_decoding.crop import Box, visible
+from mtlnet.inference.image_decoding.crop import Box, crop_box
 from mtlnet.inference.image_decoding.errors import ImageError
 from mtlnet.inference.image_decoding.jpeg_structure import end as jpeg_end
 from serve.api.problems import (
@@ -135,7 +135,7 @@ def test_a_wider_lens_is_cropped_and_a_narrower_one_refused() -> None:
     body = png(large[:, :, ::-1])
     header = images.inspect(body, VIEW, 90.0)
     assert np.array_equal(images.decode(body, header, VIEW, 90.0), large[52:262, 70:350])
-    assert visible(420, 314, VIEW, 90.0) == Box(70, 52, 280, 210)
+    assert crop_box(420, 314, VIEW, 90.0) == Box(70, 52, 280, 210)
     with pytest.raises(ImageError, match="50 degrees") as caught:
         images.inspect(body, VIEW, 50.0)
     assert image_problem(caught.value).kind is FIELD_OF_VIEW

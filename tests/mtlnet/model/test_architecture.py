@@ -12,8 +12,8 @@ from mtlnet.data.loader import Loader
 from mtlnet.export.openvino_graph import TOLERANCE, build_graph
 from mtlnet.inference.engine import Kind, load_engine
 from mtlnet.inference.model_card import read_card
-from mtlnet.model.architecture import PLANS, Architecture, find_plan
-from mtlnet.model.network import Network, answer_images, fold, initialise
+from mtlnet.model.architecture import ARCHITECTURES, Architecture, find_architecture
+from mtlnet.model.network import Network, predict_images, fold, initialise
 from mtlnet.training.config import TrainConfig
 from mtlnet.training.recipes import RECIPES
 from mtlnet.training.start import start_training
@@ -21,9 +21,9 @@ from mtlnet.training.trainer import Trainer
 from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
 
-BACKBONES = [plan.name for plan in PLANS.values() if plan.backbone]
+BACKBONES = [plan.name for plan in ARCHITECTURES.values() if plan.backbone]
 KINDS: tuple[Kind, Kind] = ("openvino", "torch")
-OTHERS = [name for name in PLANS if name != "mtl"]
+OTHERS = [name for name in ARCHITECTURES if name != "mtl"]
 
 
 def made(name: str, *, batch_norm: bool = False, seed: int = 1) -> Network:
@@ -36,7 +36,7 @@ def made(name: str, *, batch_norm: bool = False, seed: int = 1) -> Network:
 
 def thin(name: str) -> Architecture:
     """The same network with narrow fully connected layers: a tenth of the time."""
-    plan = find_plan(name)
+    plan = find_architecture(name)
     return replace(plan, shared=(*[64] * (len(plan.shared) - 1), 256))
 
 
@@ -51,7 +51,7 @@ def test_deepdriving_is_alexnet_with_a_fourth_layer() -> None:
     expected = sum(o * i * k * k + o for o, i, k in convolutions)
     expected += sum(i * o + o for i, o in linears)
     assert expected == 70_502_281
-    network = Network(plan=find_plan("deepdriving"))
+    network = Network(plan=find_architecture("deepdriving"))
     assert sum(p.numel() for p in network.parameters()) == expected
     sizes: list[tuple[int, ...]] = []
     for module in network.features.children():
@@ -62,7 +62,7 @@ def test_deepdriving_is_alexnet_with_a_fourth_layer() -> None:
 
 
 def test_deepdriving_knows_no_class() -> None:
-    answers = answer_images(made("deepdriving"), images(2))
+    answers = predict_images(made("deepdriving"), images(2))
     np.testing.assert_allclose(answers[:, 6:], 1 / 3, atol=1e-6)
     with pytest.raises(UserError, match="deepdriving has no class"):
         TrainConfig(Path("data"), Path("out"), network="deepdriving")
@@ -83,7 +83,7 @@ def test_folding_a_backbone_changes_no_answer(name: str) -> None:
     network.target_std.copy_(torch.linspace(0.02, 0.3, 6))
     folded = fold(network)
     assert not [m for m in folded.modules() if isinstance(m, torch.nn.BatchNorm2d)]
-    before, after = (answer_images(n, images(2, seed=9)) for n in (network, folded))
+    before, after = (predict_images(n, images(2, seed=9)) for n in (network, folded))
     assert np.ptp(before[:, :6], axis=0).max() > 2e-4
     np.testing.assert_allclose(before, after, atol=2e-5)
 
@@ -96,7 +96,7 @@ def test_the_graph_answers_as_torch_does(name: str) -> None:
     options = {"INFERENCE_PRECISION_HINT": "f32"}
     request = openvino.Core().compile_model(build_graph(network), "CPU", options)
     frames = images(2, seed=3)
-    expected = answer_images(network, frames)
+    expected = predict_images(network, frames)
     found = np.concatenate([request(frame[None])[0] for frame in frames])
     assert np.ptp(expected[:, :5], axis=0).max() > 10 * TOLERANCE
     np.testing.assert_allclose(found, expected, atol=TOLERANCE)
@@ -129,5 +129,5 @@ def test_another_network_is_trained_published_and_run_the_same_way(
 
 def test_seeds_fix_a_backbone() -> None:
     first, second, other = (made("mobilenet_v3_small", seed=s) for s in (1, 1, 2))
-    a, b, c = (answer_images(n, images(1)) for n in (first, second, other))
+    a, b, c = (predict_images(n, images(1)) for n in (first, second, other))
     assert a.tolist() == b.tolist() != c.tolist()

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from mtlnet.model.architecture import FEATURES, SHARED, Conv, same_padding
-from mtlnet.model.network import Network, answer_images, fold, initialise, normalise
+from mtlnet.model.network import Network, predict_images, fold, initialise, normalise
 
 # Paper, section IV-C, and the sizes SAME padding gives for 280 x 210: layer, (rows, columns).
 LAYERS = [
@@ -115,7 +115,7 @@ def test_probabilities_sum_to_one_and_seeds_fix_the_weights() -> None:
     initialise(first, 3)
     initialise(second, 3)
     initialise(other, 4)
-    answers = answer_images(first, images(2).numpy())
+    answers = predict_images(first, images(2).numpy())
     np.testing.assert_allclose(answers[:, 6:].sum(1), 1, atol=1e-6)
-    assert answers.tolist() == answer_images(second, images(2).numpy()).tolist()
-    assert answers.tolist() != answer_images(other, images(2).numpy()).tolist()
+    assert answers.tolist() == predict_images(second, images(2).numpy()).tolist()
+    assert answers.tolist() != predict_images(other, images(2).numpy()).tolist()

@@ -11,7 +11,7 @@ from datagen.recording import Dataset
 from mtlnet.evaluation.metrics import calibration, coverage
 from mtlnet.inference.engine import load_engine
 from mtlnet.inference.prediction import OUTPUTS, decode_outputs
-from mtlnet.inference.uncertainty import CELLS, FEATURES, UncertaintyHead, read_doubt, texture
+from mtlnet.inference.uncertainty import CELL_VALUES, FEATURES, UncertaintyHead, read_uncertainty_head, texture
 from mtlnet.uncertainty_fit.camera_pitch import aimed, draw_aim
 from mtlnet.uncertainty_fit.head import fit_head, novelty
 from tests.mtlnet.strange import no_road, seen_by
@@ -84,7 +84,7 @@ def test_a_texture_by_hand() -> None:
     image = np.zeros((210, 280, 3), np.uint8)
     image[:, 70:] = 255  # the third of eight columns of cells begins there
     whole = texture(image)
-    cells, middle = whole[:CELLS].reshape(5, 14, 8), whole[CELLS:].reshape(5, 24, 4)
+    cells, middle = whole[:CELL_VALUES].reshape(5, 14, 8), whole[CELL_VALUES:].reshape(5, 24, 4)
     assert cells[:3, :, :2] == pytest.approx(-1)
     assert cells[:3, :, 2:] == pytest.approx(1)
     assert cells[3, :, 1] == pytest.approx((2 / 35) ** 0.5, rel=1e-3)  # one step of 2 in 35 pixels
@@ -92,7 +92,7 @@ def test_a_texture_by_hand() -> None:
     assert cells[4] == pytest.approx(1e-3)
     assert middle[:3] == pytest.approx(1)
     image[:50] = 0  # the second of the bands of 5 rows in the middle begins there, at row 45
-    middle = texture(image)[CELLS:].reshape(5, 24, 4)
+    middle = texture(image)[CELL_VALUES:].reshape(5, 24, 4)
     assert middle[0, 0] == pytest.approx(-1)
     assert middle[0, 1:] == pytest.approx(1)
     assert middle[4, 0] == pytest.approx((2 / 5) ** 0.5, rel=1e-3)
@@ -100,7 +100,7 @@ def test_a_texture_by_hand() -> None:
 
 
 def test_a_thousand_pictures_of_no_road_are_strange(published: Path) -> None:
-    doubt = read_doubt(published)
+    doubt = read_uncertainty_head(published)
     kinds, textures = zip(
         *((kind, texture(image)) for kind, image in no_road(NO_ROAD, 5)), strict=True
     )
@@ -133,12 +133,12 @@ def test_a_camera_that_looks_elsewhere(
     views = np.stack(
         [texture(seen_by(i, CameraParameters(), fov_y_deg, pitch_deg)) for i in images]
     )
-    doubt = read_doubt(published)
-    aim = doubt.aim(views[:, CELLS:])[:, 0]
+    doubt = read_uncertainty_head(published)
+    aim = doubt.aim(views[:, CELL_VALUES:])[:, 0]
     assert (aim**2 > 1).mean() > 0.9
     assert (np.sign(aim) == np.sign(pitch_deg)).mean() > 0.9  # and it knows which way
     known = np.stack([texture(image) for image in images])
-    assert (np.abs(doubt.aim(known[:, CELLS:])) > 1).sum() <= 1
+    assert (np.abs(doubt.aim(known[:, CELL_VALUES:])) > 1).sum() <= 1
 
 
 def test_no_border_is_ever_seen() -> None:
