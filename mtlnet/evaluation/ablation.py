@@ -16,11 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 import trackfeatures as tf
+from mtlnet.inference.curves import CURVES, read_curves
 from mtlnet.inference.model_card import CARD, read_card
 from mtlnet.model.architecture import find_architecture
 from mtlnet.training.checkpoint import FOLDER as CHECKPOINTS
 from mtlnet.training.config import CONFIG, TrainConfig, resume_config
-from mtlnet.training.logging import CURVES, read_curves
 from mtlnet.training.loss import Alpha
 from mtlnet.training.recipes import find_recipe
 from runtime.files import atomic_write

@@ -36,10 +36,10 @@ from mtlnet.evaluation.ablation import (
     training_curve,
 )
 from mtlnet.evaluation.evaluate import evaluate
+from mtlnet.inference.curves import CURVES, read_curves
 from mtlnet.inference.engine import load_engine
 from mtlnet.model.architecture import find_architecture
 from mtlnet.training.config import TrainConfig
-from mtlnet.training.logging import CURVES, read_curves
 from mtlnet.training.loop import Progress
 from mtlnet.training.loss import TASKS
 from mtlnet.training.recipes import find_recipe

@@ -39,7 +39,7 @@ CELL_VALUES = PLANES * CELL_ROWS * CELL_COLUMNS
 CENTRE_VALUES = PLANES * 24 * 4
 TEXTURE_VALUES = CELL_VALUES + CENTRE_VALUES
 SQRT_EPSILON = 1e-6
-"""Added to a mean difference before its square root, which has no slope at 0."""
+"""Added to a mean difference before its square root; the difference is 0 in a flat cell."""
 
 Numbers = NDArray[np.float32]
 
@@ -54,8 +54,8 @@ class UncertaintyHead:
     hidden_bias: Numbers  # (H,)
     weight: Numbers  # (D, H)
     bias: Numbers  # (D,) log(standard deviation) of m and rad
-    low: Numbers  # (D,) limits of that logarithm: beyond them an unfamiliar image...
-    high: Numbers  # (D,) ...gives values without meaning
+    low: Numbers  # (D,) lower limit of that logarithm: unfamiliar images give extreme values
+    high: Numbers  # (D,) upper limit
     texture_mean: Numbers  # (C,)
     texture_directions: Numbers  # (C, C) distance = |directions (cells - mean)|^2; > 1: OOD
     pitch_centre: Numbers  # (M,)

@@ -56,7 +56,7 @@ class Trainer:
             # A backbone has its own, unless it goes on from a finished model.
             batch_norm=recipe.batch_norm or (plan.backbone and not folded),
             dropout=recipe.dropout,
-            plan=plan,
+            architecture=plan,
         )
         initialise(network, seed)
         self.network = network.to(device).to(memory_format=torch.channels_last)

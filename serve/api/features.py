@@ -11,7 +11,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-from mtlnet.inference.image_decoding.crop import visible
+from mtlnet.inference.image_decoding.crop import crop_box
 from mtlnet.inference.image_decoding.decode import decode, inspect
 from mtlnet.inference.image_decoding.errors import ImageError
 from serve.api.http_io import (

@@ -11,7 +11,7 @@ import torch
 from datagen.recording import Dataset
 from mtlnet.data.sources import continue_from_model, custom_training_data
 from mtlnet.inference.model_card import WEIGHTS, read_card
-from mtlnet.model.network import Network, predict_images, load_network
+from mtlnet.model.network import Network, load_network, predict_images
 from mtlnet.training.config import TrainConfig
 from mtlnet.training.fine_tune import open_init, take_weights
 from mtlnet.training.start import start_training

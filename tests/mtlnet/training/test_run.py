@@ -18,11 +18,11 @@ from safetensors.numpy import load_file
 import mtlnet.training.loop
 from datagen.recording import Dataset
 from mtlnet.data.loader import Loader
-from mtlnet.inference.model_card import UNCERTAINTY_WEIGHTS, GRAPH, WEIGHTS, ModelError, read_card
+from mtlnet.inference.curves import read_curves
+from mtlnet.inference.model_card import GRAPH, UNCERTAINTY_WEIGHTS, WEIGHTS, ModelError, read_card
 from mtlnet.model.cpu_kernels.forward import training_outputs
 from mtlnet.training.checkpoint import list_checkpoints
 from mtlnet.training.config import TrainConfig, resume_config
-from mtlnet.training.logging import read_curves
 from mtlnet.training.loop import Progress, Stopped
 from mtlnet.training.recipes import RECIPES, learning_rate
 from mtlnet.training.run import train
