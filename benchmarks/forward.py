@@ -1,12 +1,11 @@
-"""What a forward pass takes: the engine in bf16 and in int8 against torch in float32.
+"""Time of a forward pass: the OpenVINO graph in bf16 and int8, compared with torch in float32.
 
-One image, one thread each; torch runs the published network channels-last, as fast as it gets
-without another precision. They are asked in turns, so that a busy machine disturbs all alike. The
-int8 graph is quantised here, on noise: its answers are of no use, its time is that of any other.
+One image, one thread each; torch runs the published network channels-last, its fastest float32
+layout. The variants run in turns, so that other load on the machine affects all alike. The int8
+graph is calibrated on noise: its outputs are useless, its time is that of any int8 graph.
 
-Both sides compute the network's nine outputs. What an engine adds to them in the same pass,
-deviations and novelty (`mtlnet.inference.uncertainty`), torch does not compute here: with a model
-that has them the passes `with doubt` are told, too, and judged by nothing.
+All compute the network's nine outputs. For a model with an uncertainty head
+(`mtlnet.inference.uncertainty`) the passes `with uncertainty` are reported too, without a claim.
 
     python benchmarks/forward.py [--model RUN] [--rounds 200] [--out FILE]
     claims: bf16 at most 0.40 of torch's time, int8 at most 0.20
@@ -22,7 +21,7 @@ from statistics import median
 from time import perf_counter
 from typing import Any
 
-# Before numpy and torch are loaded: their own threads would be two engines in one process.
+# Set before numpy and torch are imported, which read it then.
 os.environ["OMP_NUM_THREADS"] = "1"
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
@@ -43,7 +42,7 @@ WARM_UP = 20
 Forward = Callable[[NDArray[np.uint8]], Any]
 
 
-def in_torch(run: Path) -> Forward:
+def torch_pass(run: Path) -> Forward:
     """The network in float32, channels-last, on one thread."""
     torch.set_num_threads(1)
     network = load_network(run / WEIGHTS, read_card(run).network)
@@ -51,17 +50,19 @@ def in_torch(run: Path) -> Forward:
 
     def forward(image: NDArray[np.uint8]) -> Any:
         with torch.inference_mode():
-            return network.answer(network.describe(torch.from_numpy(image[None])))
+            return network.forward_heads(network.forward_features(torch.from_numpy(image[None])))
 
     return forward
 
 
-def in_openvino(run: Path, images: NDArray[np.uint8] | None, *, doubt: bool = False) -> Forward:
-    """The network's graph, or that of the run `with doubt`, in bf16; in int8 with `images`."""
+def openvino_pass(
+    run: Path, images: NDArray[np.uint8] | None, *, uncertainty: bool = False
+) -> Forward:
+    """The OpenVINO graph in bf16, or in int8 calibrated on `images`."""
     import openvino
 
     core = openvino.Core()
-    if doubt:
+    if uncertainty:
         graph = core.read_model(str(run / GRAPH))
     else:
         graph = build_graph(load_network(run / WEIGHTS, read_card(run).network))
@@ -78,21 +79,21 @@ def in_openvino(run: Path, images: NDArray[np.uint8] | None, *, doubt: bool = Fa
 
 
 def measure(run: Path, rounds: int) -> dict[str, Any]:
-    """Median times, ms, and their ratios to torch's."""
+    """Median times in ms, their ratios to torch, and whether the claims hold."""
     rng = np.random.default_rng(0)
     camera = read_card(run).camera
     images = rng.integers(0, 256, (16, camera.height, camera.width, 3), np.uint8)
-    ways = {
-        "torch f32": in_torch(run),
-        "bf16": in_openvino(run, None),
-        "int8": in_openvino(run, images),
+    passes = {
+        "torch f32": torch_pass(run),
+        "bf16": openvino_pass(run, None),
+        "int8": openvino_pass(run, images),
     }
     if read_card(run).doubt is not None:
-        ways["bf16 with doubt"] = in_openvino(run, None, doubt=True)
-        ways["int8 with doubt"] = in_openvino(run, images, doubt=True)
-    times: dict[str, list[float]] = {name: [] for name in ways}
+        passes["bf16 with uncertainty"] = openvino_pass(run, None, uncertainty=True)
+        passes["int8 with uncertainty"] = openvino_pass(run, images, uncertainty=True)
+    times: dict[str, list[float]] = {name: [] for name in passes}
     for number in range(WARM_UP + rounds):
-        for name, forward in ways.items():
+        for name, forward in passes.items():
             start = perf_counter()
             forward(images[number % len(images)])
             times[name].append(1e3 * (perf_counter() - start))
@@ -104,9 +105,9 @@ def measure(run: Path, rounds: int) -> dict[str, Any]:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--model", type=Path, help="a run's folder; without it untrained weights")
+    parser.add_argument("--model", type=Path, help="a run's folder; default: untrained weights")
     parser.add_argument("--rounds", type=int, default=200)
-    parser.add_argument("--out", type=Path, help="write the figures here, too")
+    parser.add_argument("--out", type=Path, help="also write the result to this file")
     options = parser.parse_args()
     with model(options.model) as run:
         result = measure(run, options.rounds)

@@ -17,8 +17,8 @@ from controllers.config import DemoConfig
 from controllers.demo.frames import Asked
 from controllers.demo.run import DemoResult
 from datagen.recording import Dataset
-from mtlnet.inference.overlay import draw_answer
-from mtlnet.training.logging import read_curves
+from mtlnet.inference.curves import read_curves
+from mtlnet.inference.overlay import draw_overlay
 from simulator.vehicle.car import CarParameters
 from trackfeatures import MARKINGS
 from trackfeatures.camera import CameraParameters
@@ -142,7 +142,7 @@ def _pictures(camera: CameraParameters, asked: list[Asked]) -> str:
         frame = simplejpeg.decode_jpeg(one.jpeg)
         answer = (one.answer["distances_m"], one.answer["angle_rad"])
         truth = (one.distances, one.angle)
-        drawn = draw_answer(frame, camera, height_m, one.curvature, truth, answer)
+        drawn = draw_overlay(frame, camera, height_m, one.curvature, truth, answer)
         caption = html.escape(
             f"{one.track}, {one.lanes} lane{'s'[: one.lanes > 1]}, {one.round_id}"
         )

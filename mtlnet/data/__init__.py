@@ -1,0 +1,1 @@
+"""Training data: its sources, batches, and augmentation."""

@@ -1,9 +1,9 @@
-"""A user's own images with a `labels.csv`, to fine-tune a model with: `mtlnet train --init RUN`.
+"""A user's own images with a `labels.csv`, for fine-tuning: `mtlnet train --init RUN`.
 
-Columns (a header names them, in any order): `file`, a path within the folder; `ml`, `mr`, `l`, `m`,
-`r`, m, left negative, empty where there is no such marking; `angle`, rad, positive when the car
-points to the right of the track; `heading`, left, straight or right. The images are of the camera
-of the model that is fine-tuned, at any size of its shape.
+Columns (named by a header, in any order): `file`, a path within the folder; `ml`, `mr`, `l`, `m`,
+`r`, in m, left negative, empty where there is no such marking; `angle`, rad, positive when the car
+points to the right of the track; `heading`: left, straight or right. The images must be of the
+camera of the model to fine-tune, in any size of the same aspect ratio.
 """
 
 import csv
@@ -30,13 +30,13 @@ MARKING_LIMITS_M = {
     "m": (-2.0, 2.75),
     "r": (1.5, 7.0),
 }
-"""What the network's coding can say (DESIGN section 2); beyond it a label would be cut off."""
+"""Range of the network's coding (DESIGN section 2); labels beyond it would be clipped."""
 ANGLE_LIMIT_RAD = 0.5
 ASPECT_TOLERANCE = 0.01
 
 
 @dataclass(frozen=True)
-class OwnLabels:
+class CustomLabels:
     """`distances` (N, 5) m, NaN where absent; `angle` (N,) rad; `heading` (N,) classes."""
 
     distances: NDArray[np.float32]
@@ -45,11 +45,11 @@ class OwnLabels:
 
 
 @dataclass(frozen=True)
-class OwnImages:
+class CustomImages:
     """Labelled images in memory, (N, H, W, 3) uint8 of the camera's size (0.18 MB each)."""
 
     path: Path
-    labels: OwnLabels
+    labels: CustomLabels
     images: NDArray[np.uint8]
     content_hash: str
 
@@ -63,16 +63,16 @@ class OwnImages:
         return np.take(self.images, indices, axis=0, out=out)
 
 
-def is_own(folder: Path) -> bool:
+def has_labels_file(folder: Path) -> bool:
     """Whether a folder holds a user's own images rather than recorded rounds."""
     return (folder / LABELS).is_file()
 
 
-def open_own_images(folder: Path, camera: CameraParameters) -> OwnImages:
-    """Read, check and decode all of a folder, scaled to the camera's size.
+def open_custom_images(folder: Path, camera: CameraParameters) -> CustomImages:
+    """Read labels and images of a folder; images are scaled to the camera's size.
 
-    Raises UserError that names the line of `labels.csv` that is wrong, ImageError (a UserError)
-    for an image that is damaged or of another shape than the camera's.
+    Raises UserError that names the faulty line of `labels.csv`, also for an image that is missing,
+    damaged, or of another aspect ratio than the camera's.
     """
     files, labels = read_labels(folder / LABELS)
     images = np.empty((len(files), camera.height, camera.width, 3), np.uint8)
@@ -80,7 +80,7 @@ def open_own_images(folder: Path, camera: CameraParameters) -> OwnImages:
     def decode(number: int) -> bytes:
         path = folder / files[number][1]
         try:
-            images[number] = _read_whole_view(path, camera)
+            images[number] = _read_uncropped(path, camera)
         except UserError as error:
             error.args = (f"{folder / LABELS}, line {files[number][0]}: {error}",)
             raise
@@ -90,13 +90,13 @@ def open_own_images(folder: Path, camera: CameraParameters) -> OwnImages:
     with ThreadPoolExecutor() as pool:
         for part in pool.map(decode, range(len(files))):
             digest.update(part)
-    return OwnImages(folder, labels, images, digest.hexdigest())
+    return CustomImages(folder, labels, images, digest.hexdigest())
 
 
-def _read_whole_view(path: Path, camera: CameraParameters) -> NDArray[np.uint8]:
-    """An image of the camera's shape, at its size: not cropped, as one that is asked about may be.
+def _read_uncropped(path: Path, camera: CameraParameters) -> NDArray[np.uint8]:
+    """An image of the camera's aspect ratio, at its size.
 
-    A label would not know what was cut away.
+    Unlike images for prediction it is not cropped: its labels belong to the whole image.
     """
     image = read_image(path, camera)
     header = inspect(path.read_bytes(), camera)
@@ -104,14 +104,17 @@ def _read_whole_view(path: Path, camera: CameraParameters) -> NDArray[np.uint8]:
     if abs(stretch - 1) > ASPECT_TOLERANCE:
         raise UserError(
             f"{path} is {header.width} x {header.height} px, the camera of the model gives "
-            f"{camera.width} x {camera.height}: give images of that shape (within 1 percent), of "
-            "any size"
+            f"{camera.width} x {camera.height}: give images of that aspect ratio (within 1 "
+            "percent), of any size"
         )
     return image
 
 
-def read_labels(path: Path) -> tuple[list[tuple[int, str]], OwnLabels]:
-    """The lines and files of a `labels.csv`, and the labels; UserError that names a wrong line."""
+def read_labels(path: Path) -> tuple[list[tuple[int, str]], CustomLabels]:
+    """(line, file) of each row of a `labels.csv`, and the labels.
+
+    Raises UserError that names the faulty line.
+    """
     files: list[tuple[int, str]] = []
     rows: list[tuple[list[float], float, int]] = []
     with path.open(newline="", encoding="utf-8-sig") as file:
@@ -140,7 +143,7 @@ def read_labels(path: Path) -> tuple[list[tuple[int, str]], OwnLabels]:
         if name in seen:
             raise UserError(f"{path}, line {line}: {name} stands in line {seen[name]} already")
         seen[name] = line
-    labels = OwnLabels(
+    labels = CustomLabels(
         np.array([row[0] for row in rows], np.float32),
         np.array([row[1] for row in rows], np.float32),
         np.array([row[2] for row in rows], np.int64),
@@ -149,7 +152,10 @@ def read_labels(path: Path) -> tuple[list[tuple[int, str]], OwnLabels]:
 
 
 def _parse(row: dict[str, str | None]) -> tuple[str, list[float], float, int]:
-    """One row: file, distances in m (NaN absent), angle in rad, class; ValueError: its fault."""
+    """File, distances in m (NaN absent), angle in rad and class of a row.
+
+    Raises ValueError that describes the fault.
+    """
     if None in row or None in row.values():
         raise ValueError(f"it has not {len(COLUMNS)} values")
     cells = {name: (text or "").strip() for name, text in row.items()}

@@ -1,8 +1,8 @@
-"""A data set kept on the GPU: decoded once, then every batch is a choice of its rows.
+"""A dataset in GPU memory: decoded once, then each batch is an index into it.
 
-Batches are those of the loader (`mtlnet.data.loader`), in its order; only for recipes that change
-no image, for those changes are made on the CPU. A step of the paper's network takes a data-centre
-GPU about a millisecond: decoding 32 images on the CPU takes longer.
+The batches are those of the loader (`mtlnet.data.loader`), in its order. Only for recipes without
+augmentation, which runs on the CPU. A training step of the paper's network takes a data-centre GPU
+about a millisecond, less than decoding 32 images on the CPU.
 """
 
 from collections.abc import Iterator
@@ -14,14 +14,14 @@ from torch import Tensor
 
 from mtlnet.data.loader import Batch, Loader
 
-SHARE = 0.6
-"""Of the free memory: the rest is for the network."""
-CHUNK = 256  # images decoded at once on their way to the device
+MEMORY_SHARE = 0.6
+"""Largest share of the free GPU memory for the images; the rest is for training."""
+CHUNK = 256  # images decoded at once
 
 
 @dataclass(frozen=True)
 class DeviceBatch:
-    """A batch where the network is: `images` (B, H, W, 3) uint8, `coded` (B, 6), `heading` (B,)."""
+    """A batch on the device: `images` (B, H, W, 3) uint8, `coded` (B, 6), `heading` (B,)."""
 
     images: Tensor
     coded: Tensor
@@ -37,7 +37,7 @@ def on_device(batch: Batch | DeviceBatch, device: torch.device) -> DeviceBatch:
 
 
 class GpuDataset:
-    """The frames of `loader` on `device`, and its batches made of them."""
+    """The frames of `loader` on `device`, and the loader's batches made from them."""
 
     def __init__(self, loader: Loader, device: torch.device) -> None:
         self._loader = loader
@@ -47,12 +47,12 @@ class GpuDataset:
         self._heading = torch.from_numpy(loader.heading).to(device)
 
     def make(self, step: int) -> DeviceBatch:
-        """This part of batch number `step`."""
+        """This process's rows of batch `step`."""
         loader = self._loader
         rows = torch.from_numpy(loader.indices(step)[loader.rows])
         rows = rows.to(self._device, non_blocking=True)
         return DeviceBatch(
-            *(whole.index_select(0, rows) for whole in (self._images, self._coded, self._heading))
+            *(tensor.index_select(0, rows) for tensor in (self._images, self._coded, self._heading))
         )
 
     def batches(self, first: int) -> Iterator[DeviceBatch]:
@@ -74,16 +74,16 @@ def _decode(loader: Loader, device: torch.device) -> Tensor:
     return images
 
 
-def resident_or_not(
+def cache_if_it_fits(
     loader: Loader, device: torch.device, free_bytes: int | None = None
 ) -> Loader | GpuDataset:
-    """The loader's frames on `device`, or the loader: where they do not fit, or are changed.
+    """The loader's frames on `device`; the loader itself if they do not fit or are augmented.
 
-    `free_bytes`: of the device's memory, None: as it says; a CPU has its images beside it anyway.
+    `free_bytes`: free memory of the device, None: as it reports. On a CPU nothing is cached.
     """
     if free_bytes is None:
         free_bytes = torch.cuda.mem_get_info(device)[0] if device.type == "cuda" else 0
     needed = len(loader.frames) * loader.camera.height * loader.camera.width * 3
-    if loader.augment or needed > SHARE * free_bytes:
+    if loader.augment or needed > MEMORY_SHARE * free_bytes:
         return loader
     return GpuDataset(loader, device)

@@ -1,6 +1,7 @@
-"""Batches for training, decoded and mirrored on threads while the network computes.
+"""Batches for training, decoded and augmented on threads while the network computes.
 
-A batch is a pure function of (seed, step): a resumed run sees what an unbroken one would have.
+A batch is a pure function of (seed, step): a resumed run gets the same batches as one without
+interruption.
 """
 
 import ctypes
@@ -15,15 +16,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 import trackfeatures as tf
-from mtlnet.data.augment.pipeline import change_images, changed_labels, draw_changes, fit_to
+from mtlnet.data.augment.pipeline import (
+    apply_params,
+    augment_labels,
+    draw_params,
+    resolve_lateral_shift,
+)
 from trackfeatures.camera import CameraParameters
 
-AHEAD = 3  # batches in the making
-MAKERS = 2  # at a time: while one batch waits for its last image, the next is begun
+PREFETCH = 3  # batches made or waiting
+WORKERS = 2  # threads: while one waits for the last image of its batch, the other starts the next
 
 
 class LabelArrays(Protocol):
-    """The labels training needs; see `datagen.recording.Labels`."""
+    """Labels for training; `datagen.recording.Labels` has them."""
 
     @property
     def distances(self) -> NDArray[np.float32]:
@@ -61,9 +67,10 @@ class Batch:
 
 
 class Loader:
-    """Endless batches from `frames`, each epoch in its own order.
+    """Endless batches from `frames`, shuffled anew in each epoch.
 
-    `part` (which, of how many): makes that part of each batch of `batch` images, as whole.
+    `part` (index, count): makes only that part of each batch of `batch` images, for one of several
+    processes; the images are those of the whole batch.
     """
 
     def __init__(
@@ -81,10 +88,10 @@ class Loader:
         self.seed = seed
         self.augment = augment
         self.camera = camera
-        which, parts = part
-        self.rows = slice(which * batch // parts, (which + 1) * batch // parts)
+        index, parts = part
+        self.rows = slice(index * batch // parts, (index + 1) * batch // parts)
         shape = (self.rows.stop - self.rows.start, camera.height, camera.width, 3)
-        self._memory = BufferPool(shape)
+        self._buffers = BufferPool(shape)
         labels = frames.labels
         self.coded = tf.encode(labels.distances, labels.angle)
         self.heading = np.asarray(labels.heading, dtype=np.int64)
@@ -94,16 +101,16 @@ class Loader:
         return np.random.default_rng([self.seed, 1, epoch]).permutation(len(self.heading))
 
     def indices(self, step: int) -> NDArray[np.int64]:
-        """The frames of the whole batch `step`; every frame once an epoch."""
+        """Rows of `frames` in the whole batch `step`; each frame occurs once an epoch."""
         places = np.arange(step * self.batch, (step + 1) * self.batch)
         epochs, rows = np.divmod(places, len(self.heading))
         parts = [self._permutation(e)[rows[epochs == e]] for e in np.unique(epochs).tolist()]
         return np.concatenate(parts)
 
     def make(self, step: int) -> Batch:
-        """This part of batch number `step`."""
+        """This process's part of batch `step`."""
         chosen = self.indices(step)[self.rows]
-        images = self._memory.take()
+        images = self._buffers.take()
         self.frames.read_batch(chosen, images)
         heading = self.heading[chosen]
         if not self.augment:
@@ -112,16 +119,19 @@ class Loader:
         size = (self.camera.height, self.camera.width)
         labels = self.frames.labels
         distances, angle = labels.distances[chosen], labels.angle[chosen]
-        changes = fit_to(draw_changes(self.batch, *size, rng).take(self.rows), distances)
-        change_images(images, changes, self.camera)
-        coded, heading = changed_labels(distances, angle, heading, changes, self.camera)
+        drawn = draw_params(self.batch, *size, rng).take(self.rows)
+        params = resolve_lateral_shift(drawn, distances)
+        apply_params(images, params, self.camera)
+        coded, heading = augment_labels(distances, angle, heading, params, self.camera)
         return Batch(images, coded, heading)
 
     def batches(self, first: int) -> Iterator[Batch]:
-        """Batches `first`, `first` + 1, ... without end, made ahead on threads."""
-        with ThreadPoolExecutor(MAKERS, thread_name_prefix="loader") as pool:
-            waiting: list[Future[Batch]] = [pool.submit(self.make, first + i) for i in range(AHEAD)]
-            step = first + AHEAD
+        """Batches `first`, `first` + 1, ... without end, made in advance on threads."""
+        with ThreadPoolExecutor(WORKERS, thread_name_prefix="loader") as pool:
+            waiting: list[Future[Batch]] = [
+                pool.submit(self.make, first + i) for i in range(PREFETCH)
+            ]
+            step = first + PREFETCH
             try:
                 while True:
                     batch = waiting.pop(0).result()
@@ -133,28 +143,26 @@ class Loader:
                     future.cancel()
 
 
-# Memory for batches that is used again: a new one costs a page fault every 4 KB.
-
-
 class BufferPool:
-    """uint8 arrays of one shape; the memory of one that nobody refers to any more is lent again.
+    """uint8 arrays of one shape whose memory is reused once no array or view refers to it.
 
-    There are never more than were in use at the same time.
+    Fresh memory costs a page fault every 4 KiB. There are never more buffers than were in use at
+    the same time.
     """
 
     def __init__(self, shape: tuple[int, ...]) -> None:
         self._shape = shape
-        self._kind = ctypes.c_ubyte * int(np.prod(shape))
+        self._buffer_type = ctypes.c_ubyte * int(np.prod(shape))
         self._free: list[NDArray[np.uint8]] = []
 
     def take(self) -> NDArray[np.uint8]:
-        """An array; what it holds is anything."""
+        """An array with arbitrary content."""
         try:
             memory = self._free.pop()
         except IndexError:
-            memory = np.empty(ctypes.sizeof(self._kind), np.uint8)
-        # Every view of the array keeps this alive, whatever becomes of the array itself.
-        lent = self._kind.from_buffer(memory.data)
-        weakref.finalize(lent, self._free.append, memory).atexit = False
-        array: NDArray[np.uint8] = np.frombuffer(memoryview(lent), np.uint8).reshape(self._shape)
+            memory = np.empty(ctypes.sizeof(self._buffer_type), np.uint8)
+        # Every view of the array holds a reference to this object, which returns the memory.
+        owner = self._buffer_type.from_buffer(memory.data)
+        weakref.finalize(owner, self._free.append, memory).atexit = False
+        array: NDArray[np.uint8] = np.frombuffer(memoryview(owner), np.uint8).reshape(self._shape)
         return array

@@ -1,54 +1,62 @@
-"""What a run learns from: the train rounds of a dataset, or a user's own images."""
+"""Training data of a run: the train rounds of a dataset, or a user's own images."""
 
-from dataclasses import dataclass
+import hashlib
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from datagen.recording import Dataset, DatasetError, Frames, UndecodableImage
-from mtlnet.data.custom_images import OwnImages, is_own, open_own_images
+from mtlnet.data.custom_images import CustomImages, has_labels_file, open_custom_images
 from mtlnet.evaluation.metrics import describe_data, mean_answer
 from mtlnet.inference.model_card import ModelCard, ModelError
 from mtlnet.model.architecture import HEIGHT, WIDTH
 from mtlnet.training.config import TrainConfig
-from mtlnet.uncertainty_fit.head import hold_out
 from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
+
+HELD_OUT_SHARE = 1 / 12
+MIN_ROUNDS_TO_HOLD_OUT = 8
+"""With fewer train rounds none is held out."""
+CHUNK = 64  # images decoded at a time
+MAX_NAMED = 5  # undecodable images named in a message
 
 
 @dataclass(frozen=True)
 class TrainingData:
-    """What a run learns from; `held_out` rounds are for its second head, `about` for its card."""
+    """Frames of a run, of one camera."""
 
-    frames: Frames | OwnImages
+    frames: Frames | CustomImages
     held_out: Frames | None
+    """Rounds for fitting the uncertainty head."""
     camera: CameraParameters
     about: dict[str, Any]
+    """The `data` field of the model card."""
 
 
-def open_material(
+def open_training_data(
     config: TrainConfig, init: ModelCard | None, *, checked: bool = False
 ) -> TrainingData:
-    """What `config.data` holds, recorded rounds or a user's own images; UserError: it cannot be.
+    """Open `config.data`, recorded rounds or a user's own images, with the model to fine-tune.
 
-    All images are decoded once, for a fault in one would end the run where it is met; `checked`:
-    they were.
+    All images are decoded once, so that a damaged one ends the run at its start; `checked`: this
+    was done before. Raises UserError for data that does not fit the network or the model.
     """
     if init is not None and init.network != config.network:
         raise UserError(f"--init is a {init.network}, not a {config.network}; leave out --network")
-    if is_own(config.data):
-        material = own_material(config.data, init)
+    if has_labels_file(config.data):
+        data = custom_training_data(config.data, init)
     else:
-        dataset = open_training_data(config.data)
+        dataset = open_training_dataset(config.data)
         if not (checked or config.skip_undecodable):
             require_decodable(dataset.select("train"), config.data, skippable=True)
-        material = round_material(dataset, skip_undecodable=config.skip_undecodable)
-    return material if init is None else continued(material, init)
+        data = recorded_training_data(dataset, skip_undecodable=config.skip_undecodable)
+    return data if init is None else continue_from_model(data, init)
 
 
-def open_training_data(path: Path) -> Dataset:
-    """The dataset in folder `path`; UserError when it does not fit this network."""
+def open_training_dataset(path: Path) -> Dataset:
+    """The dataset in folder `path`; UserError when its images do not have the network's size."""
     dataset = Dataset.open(path)
     camera = dataset.camera
     if (camera.width, camera.height) != (WIDTH, HEIGHT):
@@ -60,14 +68,14 @@ def open_training_data(path: Path) -> Dataset:
     return dataset
 
 
-def own_material(folder: Path, card: ModelCard | None) -> TrainingData:
-    """A user's own images, of the camera of the model that is tuned; UserError without one."""
+def custom_training_data(folder: Path, card: ModelCard | None) -> TrainingData:
+    """A user's own images, taken by the camera of the model `card`; UserError without a model."""
     if card is None:
         raise UserError(
-            f"{folder} holds images of your own, which do not say what camera took them; give the "
+            f"{folder} holds images of your own, without a description of their camera; give the "
             "model to fine-tune with --init RUN, or --init default"
         )
-    images = open_own_images(folder, card.camera)
+    images = open_custom_images(folder, card.camera)
     about = {
         "path": str(folder),
         "content_hash": images.content_hash,
@@ -81,34 +89,64 @@ def own_material(folder: Path, card: ModelCard | None) -> TrainingData:
     return TrainingData(images, None, card.camera, about)
 
 
-def round_material(dataset: Dataset, *, skip_undecodable: bool = False) -> TrainingData:
-    """The train rounds of a dataset; with `skip_undecodable` the frames that can be decoded."""
-    frames, held_out = hold_out(dataset)
+def recorded_training_data(dataset: Dataset, *, skip_undecodable: bool = False) -> TrainingData:
+    """The train rounds of a dataset; `skip_undecodable`: without frames that cannot be decoded."""
+    frames, held_out = hold_out_rounds(dataset)
     left_out: list[str] = []
     if skip_undecodable:
-        frames, left_out = decodable(frames, dataset.path)
+        frames, left_out = drop_undecodable(frames, dataset.path)
     if skip_undecodable and held_out is not None:
-        held_out, more = decodable(held_out, dataset.path)
+        held_out, more = drop_undecodable(held_out, dataset.path)
         left_out += more
     about = describe_data(dataset, frames, held_out)
     return TrainingData(frames, held_out, dataset.camera, {**about, "undecodable": left_out})
 
 
-def continued(material: TrainingData, card: ModelCard) -> TrainingData:
-    """The same, of a model that goes on from that of `card`: what that has seen, this has seen."""
-    if material.camera != card.camera:
+def hold_out_rounds(dataset: Dataset) -> tuple[Frames, Frames | None]:
+    """Divide the train rounds of a dataset: those to train on, and those held out.
+
+    The held-out rounds are for fitting the uncertainty head. They depend only on the set of rounds;
+    rounds whose tracks and lights occur least among those already held out come first.
+    """
+    rounds = [info for info in dataset.rounds if info.split == "train"]
+    conditions = {info.id: {info.track, *info.lights} for info in rounds}
+    if len(conditions) < MIN_ROUNDS_TO_HOLD_OUT:
+        return dataset.select("train"), None
+    held_out: list[str] = []
+    order = sorted(conditions, key=lambda name: hashlib.sha256(name.encode()).digest())
+    for _ in range(round(len(conditions) * HELD_OUT_SHARE) or 1):
+        seen = [condition for name in held_out for condition in conditions[name]]
+        left = [name for name in order if name not in held_out]
+        held_out.append(min(left, key=lambda name: sum(seen.count(c) for c in conditions[name])))
+    kept = [name for name in conditions if name not in held_out]
+    return _select_rounds(dataset, kept), _select_rounds(dataset, held_out)
+
+
+def _select_rounds(dataset: Dataset, names: list[str]) -> Frames:
+    chosen = [i for i, info in enumerate(dataset.rounds) if info.id in names]
+    return Frames(
+        [dataset.rounds[i] for i in chosen], [dataset.indexes[i] for i in chosen], dataset.camera
+    )
+
+
+def continue_from_model(data: TrainingData, card: ModelCard) -> TrainingData:
+    """The data for fine-tuning the model of `card`, whose training data is added to `about`.
+
+    Raises ModelError for data of another camera.
+    """
+    if data.camera != card.camera:
         raise ModelError(
-            f"the camera of the data is {material.camera}, that of model {card.name} "
+            f"the camera of the data is {data.camera}, that of model {card.name} "
             f"{card.camera}; a model keeps the camera it was trained for"
         )
-    about = {**material.about, "init": {"name": card.name, "model_hash": card.model_hash}}
+    about = {**data.about, "init": {"name": card.name, "model_hash": card.model_hash}}
     for name in ("seeds", "tracks"):
         about[name] = sorted({*about[name], *card.data.get(name, ())})
-    return TrainingData(material.frames, material.held_out, material.camera, about)
+    return replace(data, about=about)
 
 
 def require_same_data(config: TrainConfig, resumed: dict[str, Any], data: dict[str, Any]) -> None:
-    """Raise ModelError unless the run goes on with what it began with."""
+    """Raise ModelError unless a resumed run's data is that of its start."""
     for name in ("content_hash", "split", "init"):
         if resumed.get(name) != data.get(name):
             raise ModelError(
@@ -117,15 +155,8 @@ def require_same_data(config: TrainConfig, resumed: dict[str, Any], data: dict[s
             )
 
 
-# Images that cannot be decoded, found before a run that would meet them after an hour.
-
-
-CHUNK = 64  # images at a time
-NAMED = 5
-
-
-def undecodable(frames: Frames) -> dict[int, UndecodableImage]:
-    """Which frames have an image that cannot be decoded, and why; all are decoded."""
+def find_undecodable(frames: Frames) -> dict[int, UndecodableImage]:
+    """Decode all frames; the errors of those that cannot be decoded, by row."""
     images = np.empty((CHUNK, frames.camera.height, frames.camera.width, 3), np.uint8)
     found: dict[int, UndecodableImage] = {}
     for first in range(0, len(frames), CHUNK):
@@ -133,11 +164,11 @@ def undecodable(frames: Frames) -> dict[int, UndecodableImage]:
         try:
             frames.read_batch(rows, images[: len(rows)])
         except UndecodableImage:
-            found.update(_each(frames, rows.tolist()))
+            found.update(_decode_each(frames, rows.tolist()))
     return found
 
 
-def _each(frames: Frames, rows: list[int]) -> dict[int, UndecodableImage]:
+def _decode_each(frames: Frames, rows: list[int]) -> dict[int, UndecodableImage]:
     found = {}
     for row in rows:
         try:
@@ -148,15 +179,15 @@ def _each(frames: Frames, rows: list[int]) -> dict[int, UndecodableImage]:
 
 
 def require_decodable(frames: Frames, data: Path, *, skippable: bool = False) -> None:
-    """Raise DatasetError that counts and names the images that cannot be decoded.
+    """Decode all frames; DatasetError that counts and names those that cannot be decoded.
 
-    `skippable`: the command has --skip-undecodable.
+    `skippable`: whether the command has the option --skip-undecodable.
     """
-    found = list(undecodable(frames).values())
+    found = list(find_undecodable(frames).values())
     if not found:
         return
-    named = ", ".join(f"image {e.frame} of round {e.round_id}" for e in found[:NAMED])
-    more = f" and {len(found) - NAMED} more" if len(found) > NAMED else ""
+    named = ", ".join(f"image {e.frame} of round {e.round_id}" for e in found[:MAX_NAMED])
+    more = f" and {len(found) - MAX_NAMED} more" if len(found) > MAX_NAMED else ""
     skip = ", or leave these frames out with --skip-undecodable" if skippable else ""
     raise DatasetError(
         f"{len(found)} of {len(frames)} images in {data} cannot be decoded: {named}{more} "
@@ -164,12 +195,12 @@ def require_decodable(frames: Frames, data: Path, *, skippable: bool = False) ->
     )
 
 
-def decodable(frames: Frames, data: Path) -> tuple[Frames, list[str]]:
-    """`frames` without those that cannot be decoded, and the names of these.
+def drop_undecodable(frames: Frames, data: Path) -> tuple[Frames, list[str]]:
+    """`frames` without those that cannot be decoded, and the names of the latter.
 
-    Raises DatasetError when none are left.
+    Raises DatasetError when none is left.
     """
-    found = undecodable(frames)
+    found = find_undecodable(frames)
     if len(found) == len(frames):
         require_decodable(frames, data)
     names = [f"{error.round_id}/{error.frame}" for error in found.values()]
@@ -177,6 +208,6 @@ def decodable(frames: Frames, data: Path) -> tuple[Frames, list[str]]:
 
 
 def require_all_decodable(dataset: Dataset, sides: tuple[str, ...]) -> None:
-    """Raise DatasetError unless every image of these sides of a split can be decoded."""
+    """Raise DatasetError unless every image of these sides of the split can be decoded."""
     for side in sides:
         require_decodable(dataset.select(side), dataset.path)

@@ -16,11 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 import trackfeatures as tf
+from mtlnet.inference.curves import CURVES, read_curves
 from mtlnet.inference.model_card import CARD, read_card
-from mtlnet.model.architecture import find_plan
+from mtlnet.model.architecture import find_architecture
 from mtlnet.training.checkpoint import FOLDER as CHECKPOINTS
 from mtlnet.training.config import CONFIG, TrainConfig, resume_config
-from mtlnet.training.logging import CURVES, read_curves
 from mtlnet.training.loss import Alpha
 from mtlnet.training.recipes import find_recipe
 from runtime.files import atomic_write
@@ -55,10 +55,10 @@ PAPER_ROWS = (
 
 def rows_of(backbone: str = BACKBONE) -> tuple[Row, ...]:
     """The paper's seven rows, DeepDriving and a backbone; UserError when it is none."""
-    plan = find_plan(backbone)
+    plan = find_architecture(backbone)
     if not plan.backbone:
         raise UserError(f"{backbone} is no backbone of torchvision; give {BACKBONE} or another")
-    others = (find_plan("deepdriving"), plan)
+    others = (find_architecture("deepdriving"), plan)
     titles = ("DeepDriving (Chen et al.)", backbone)
     return PAPER_ROWS + tuple(
         Row(p.name, title, p.name, p.default_alpha) for p, title in zip(others, titles, strict=True)

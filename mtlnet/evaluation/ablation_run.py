@@ -20,7 +20,7 @@ from rich.console import Console
 
 from datagen.recording import Dataset
 from mtlnet.data.loader import Loader
-from mtlnet.data.sources import open_training_data, require_all_decodable
+from mtlnet.data.sources import open_training_dataset, require_all_decodable
 from mtlnet.evaluation.ablation import (
     ERRORS,
     LOSSES,
@@ -36,10 +36,10 @@ from mtlnet.evaluation.ablation import (
     training_curve,
 )
 from mtlnet.evaluation.evaluate import evaluate
+from mtlnet.inference.curves import CURVES, read_curves
 from mtlnet.inference.engine import load_engine
-from mtlnet.model.architecture import find_plan
+from mtlnet.model.architecture import find_architecture
 from mtlnet.training.config import TrainConfig
-from mtlnet.training.logging import CURVES, read_curves
 from mtlnet.training.loop import Progress
 from mtlnet.training.loss import TASKS
 from mtlnet.training.recipes import find_recipe
@@ -59,7 +59,7 @@ def ablate(config: AblationConfig, rows: Sequence[Row], *, dry_run: bool = False
     Raises UserError when the folder was made with other settings, or a run fails.
     """
     console = Console(stderr=True)
-    dataset = open_training_data(config.data)
+    dataset = open_training_dataset(config.data)
     dataset.select(config.split)  # raises where there are no such rounds
     runs = plan_runs(config, rows)
     if dry_run:
@@ -156,7 +156,7 @@ def step_seconds(
     ]
     if speeds:
         return config.batch / statistics.median(speeds)
-    recipe, plan = find_recipe(config.recipe), find_plan(network)
+    recipe, plan = find_recipe(config.recipe), find_architecture(network)
     loader = Loader(
         dataset.select("train"), dataset.camera, config.batch, 0, augment=recipe.augment
     )

@@ -17,7 +17,7 @@ import trackfeatures as tf
 from datagen.recording import Frames
 from mtlnet.evaluation.metrics import Numbers, signed_errors
 from mtlnet.evaluation.slices import GROUPS
-from mtlnet.inference.overlay import draw_answer
+from mtlnet.inference.overlay import draw_overlay
 from mtlnet.inference.prediction import OUTPUTS, Prediction, decode_outputs
 from mtlnet.inference.uncertainty import FEATURES
 from runtime.files import atomic_write
@@ -263,7 +263,7 @@ def figures(frames: Frames, outputs: NDArray[np.float32], chosen: list[Worst]) -
     for one in chosen:
         answer = decode_outputs(outputs[one.row])
         truth = [None if np.isnan(d) else float(d) for d in labels.distances[one.row]]
-        image = draw_answer(
+        image = draw_overlay(
             frames.image(one.row),
             camera,
             camera.height_above_road_m,

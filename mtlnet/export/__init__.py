@@ -1,0 +1,1 @@
+"""Writing a trained network for deployment: OpenVINO graph, int8, ONNX, published run folder."""

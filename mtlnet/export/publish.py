@@ -1,9 +1,11 @@
-"""The end of a training run: the paper's network, its OpenVINO graph and its card, checked.
+"""Publishing a trained model: folded weights, OpenVINO graph and model card in a run's folder.
 
-Nothing is said to be finished before the exported graph has answered real frames as torch does.
+The card is written last, after the graph has been compared with torch on real frames: a run without
+a card holds no finished model.
 """
 
 import platform
+from dataclasses import dataclass, field, fields
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -13,12 +15,13 @@ from numpy.typing import NDArray
 from safetensors.torch import save
 
 import trackfeatures as tf
-from mtlnet.export.openvino_graph import DOUBT_TOLERANCE, TOLERANCE, write_graph
+from mtlnet.export.openvino_graph import TOLERANCE, UNCERTAINTY_TOLERANCE, write_graph
+from mtlnet.inference.engine import best_precision
 from mtlnet.inference.model_card import (
-    DOUBT,
     GRAPH,
     GRAPH_WEIGHTS,
     MODEL_FILES,
+    UNCERTAINTY_WEIGHTS,
     WEIGHTS,
     ModelCard,
     ModelError,
@@ -26,74 +29,79 @@ from mtlnet.inference.model_card import (
     golden_image,
 )
 from mtlnet.inference.prediction import OUTPUTS
-from mtlnet.inference.uncertainty import FittedDoubt, UncertaintyHead, texture, write_doubt
-from mtlnet.model.network import HEIGHT, WIDTH, Network, answer_images, describe_images, fold
+from mtlnet.inference.uncertainty import (
+    FittedUncertainty,
+    UncertaintyHead,
+    texture_features,
+    write_uncertainty_head,
+)
+from mtlnet.model.architecture import HEIGHT, WIDTH
+from mtlnet.model.network import Network, fold, predict_images, run_network
 from runtime.files import atomic_write
 from trackfeatures.camera import CameraParameters
 
 PACKAGES = ("driverview", "torch", "openvino", "numpy")
 
 
+@dataclass(frozen=True)
+class Provenance:
+    """How a network was trained; fields of the model card."""
+
+    camera: CameraParameters = field(default_factory=CameraParameters)
+    alpha: tuple[float, float, float] = (0.3, 0.2, 0.5)
+    recipe: str = "fast"
+    iterations: int = 0
+    batch: int = 32
+    seed: int = 0
+    data: dict[str, Any] = field(default_factory=dict)
+
+
 def publish(
     network: Network,
     run: Path,
     images: NDArray[np.uint8],
-    *,
-    camera: CameraParameters | None = None,
-    alpha: tuple[float, float, float] = (0.3, 0.2, 0.5),
-    recipe: str = "fast",
-    iterations: int = 0,
-    batch: int = 32,
-    seed: int = 0,
-    data: dict[str, Any] | None = None,
-    doubt: FittedDoubt | None = None,
+    provenance: Provenance | None = None,
+    uncertainty: FittedUncertainty | None = None,
 ) -> ModelCard:
-    """Fold `network`, write all of `mtlnet.inference.model_card.MODEL_FILES` and the card into
-    folder `run`.
+    """Fold `network` and write `MODEL_FILES`, the uncertainty head and the card to folder `run`.
 
-    `images` (N, 210, 280, 3): frames on which the graph is held against torch. `doubt`: its second
-    head (`mtlnet.uncertainty_fit.head`); without one the model gives no standard deviations. Raises
-    ModelError when the graph differs by more than `mtlnet.export.openvino_graph.TOLERANCE`; the run
-    then has no card.
+    `images` (N, 210, 280, 3): frames on which the graph is compared with torch. Without
+    `uncertainty` the model predicts no standard deviations. Raises ModelError when the graph
+    differs by more than the tolerances of `mtlnet.export.openvino_graph`; the run then has no card.
     """
     run.mkdir(parents=True, exist_ok=True)
     folded = fold(network)
     weights = {name: t.contiguous() for name, t in folded.state_dict().items()}
     atomic_write(run / WEIGHTS, save(weights), fsync=True)
-    head = None if doubt is None else doubt.head
+    head = None if uncertainty is None else uncertainty.head
     if head is not None:
-        write_doubt(run, head)
+        write_uncertainty_head(run, head)
     write_graph(folded, run / GRAPH, run / GRAPH_WEIGHTS, head)
-    check = compare(folded, run, images, head)
+    check = compare_graph(folded, run, images, head)
     _require_equal(run, check)
     golden = golden_image(WIDTH, HEIGHT)
-    names = MODEL_FILES if doubt is None else (*MODEL_FILES, DOUBT)
+    names = MODEL_FILES if head is None else (*MODEL_FILES, UNCERTAINTY_WEIGHTS)
+    origin = provenance or Provenance()
     card = ModelCard(
         name=run.resolve().name,
-        network=folded.plan.name,
+        network=folded.architecture.name,
         definitions_version=tf.VERSION,
         program_version=package_versions()["driverview"],
-        camera=camera or CameraParameters(),
-        alpha=alpha,
-        recipe=recipe,
-        iterations=iterations,
-        batch=batch,
-        seed=seed,
-        data=data or {},
+        **{field.name: getattr(origin, field.name) for field in fields(origin)},
         versions=package_versions(),
         files={name: file_hash(run / name) for name in names},
         export_check=check,
-        golden=tuple(float(v) for v in answer_images(folded, golden[None])[0]),
-        doubt=None if doubt is None else doubt.about,
+        golden=tuple(float(v) for v in predict_images(folded, golden[None])[0]),
+        doubt=None if uncertainty is None else uncertainty.about,
     )
     card.write(run)
     return card
 
 
 def _require_equal(run: Path, check: dict[str, float]) -> None:
-    limits = {"openvino_f32_max": TOLERANCE, "openvino_f32_doubt": DOUBT_TOLERANCE}
+    limits = {"openvino_f32_max": TOLERANCE, "openvino_f32_doubt": UNCERTAINTY_TOLERANCE}
     for name, limit in limits.items():
-        if not check.get(name, 0.0) <= limit:  # written so that NaN is a failure too
+        if not check.get(name, 0.0) <= limit:  # written so that a NaN fails too
             raise ModelError(
                 f"the exported graph {run / GRAPH} differs from torch by {check[name]:.2g} "
                 f"({name}), at most {limit:g} is expected: the model is not published; report this "
@@ -101,20 +109,19 @@ def _require_equal(run: Path, check: dict[str, float]) -> None:
             )
 
 
-def compare(
-    network: Network, run: Path, images: NDArray[np.uint8], doubt: UncertaintyHead | None = None
+def compare_graph(
+    network: Network, run: Path, images: NDArray[np.uint8], head: UncertaintyHead | None = None
 ) -> dict[str, float]:
-    """Largest difference between torch in float32 and the graph, per precision.
+    """Largest difference between torch in float32 and the run's graph, by precision.
 
-    Of any of the nine outputs; and, as a share of its value, of any of the second head's.
+    `openvino_PRECISION_max`: absolute, of the nine outputs; `openvino_PRECISION_doubt`: relative,
+    of the uncertainty head's outputs.
     """
     import openvino
 
-    from mtlnet.inference.engine import best_precision
-
-    x, expected = describe_images(network, images)
-    textures = np.stack([texture(image) for image in images])
-    second = None if doubt is None else doubt.assess(x, textures)
+    x, expected = run_network(network, images)
+    textures = np.stack([texture_features(image) for image in images])
+    uncertainty = None if head is None else head.predict(x, textures)
     core = openvino.Core()
     differences = {"frames": float(len(images))}
     for precision in dict.fromkeys(("f32", best_precision(core))):
@@ -127,17 +134,17 @@ def compare(
                 f"OpenVINO cannot load {run / GRAPH}, just written ({reason}): the model is not "
                 "published; is the disk full?"
             ) from error
-        answers = np.concatenate([request.infer([image[None]])[0].copy() for image in images])
-        nine = answers[:, :OUTPUTS]
-        differences[f"openvino_{precision}_max"] = float(np.abs(nine - expected).max())
-        if second is not None:
-            share = np.abs(answers[:, OUTPUTS:] / second - 1)
-            differences[f"openvino_{precision}_doubt"] = float(share.max())
+        outputs = np.concatenate([request.infer([image[None]])[0].copy() for image in images])
+        difference = np.abs(outputs[:, :OUTPUTS] - expected)
+        differences[f"openvino_{precision}_max"] = float(difference.max())
+        if uncertainty is not None:
+            relative = np.abs(outputs[:, OUTPUTS:] / uncertainty - 1)
+            differences[f"openvino_{precision}_doubt"] = float(relative.max())
     return differences
 
 
 def package_versions() -> dict[str, str]:
-    """Versions of what made the model."""
+    """Versions of Python and the packages that made the model."""
     versions = {"python": platform.python_version()}
     for package in PACKAGES:
         try:

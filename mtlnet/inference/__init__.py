@@ -1,0 +1,1 @@
+"""Running a published model on images, without torch: all of mtlnet that `serve` may import."""

@@ -1,76 +1,79 @@
-"""Running a trained model on images: OpenVINO by default, torch in float32 as the oracle.
+"""Inference engines: OpenVINO by default, torch in float32 as the reference.
 
-Free of torch until the torch engine is asked for: the serving image has none. An engine takes one
-image as it came from the camera, uint8 RGB; its normalisation is part of the exported graph.
+An engine takes one camera image, uint8 RGB; normalisation is part of the exported graph. torch is
+imported only when the torch engine is requested: the serving image does not contain it.
 """
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mtlnet.inference.exported import int8_graph, passed_gate
 from mtlnet.inference.model_card import (
-    DOUBT,
     GRAPH,
     GRAPH_WEIGHTS,
-    WEIGHTS,
     ModelCard,
     ModelError,
     check_files,
     read_card,
 )
-from mtlnet.inference.uncertainty import read_doubt, texture
 
-if TYPE_CHECKING:
-    from mtlnet.model.network import Network
-
-Kind = Literal["openvino", "torch"]
+EngineKind = Literal["openvino", "torch"]
 Precision = Literal["bf16", "f32", "int8"]
 
 
 class Engine(Protocol):
-    """A model ready to run; not to be shared between threads."""
+    """A model ready to run; must not be shared between threads."""
 
     @property
     def card(self) -> ModelCard:
-        """What the model is."""
+        """The model's card."""
 
     @property
     def kind(self) -> str:
-        """The program that runs it: "openvino" or "torch"."""
+        """The library that runs it: "openvino" or "torch"."""
 
     @property
     def precision(self) -> str:
-        """What it computes in: "f32", "bf16" or "int8"."""
+        """The precision it computes in: "f32", "bf16" or "int8"."""
 
     def __call__(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """Image (H, W, 3) RGB of `card.camera`'s size -> outputs (9,) or (17,), see `answer`."""
+        """Image (H, W, 3) RGB of `card.camera`'s size -> outputs (9,) or (17,).
+
+        `mtlnet.inference.prediction.decode_outputs` converts them to metres and radians. Raises
+        ModelError for an image of another size or type.
+        """
 
 
 def load_engine(
     run: Path,
-    kind: Kind = "openvino",
+    kind: EngineKind = "openvino",
     precision: Precision | None = None,
     threads: int = 1,
 ) -> Engine:
-    """The model of folder `run` (see `mtlnet.inference.model_card.resolve_run`), ready to run.
+    """Load the model in folder `run` (see `mtlnet.inference.model_card.resolve_run`).
 
-    `precision` None: int8 where the model has a graph of it that passed its gate, else bf16 where
-    the CPU computes in it, float32 elsewhere. The torch engine knows
-    float32 only. Raises ModelError when the model is missing, unfinished or damaged.
+    `precision` None selects int8 if the model has an int8 graph that passed its accuracy gate, else
+    bf16 if the CPU supports it, else float32. The torch engine supports float32 only. Raises
+    ModelError when the model is missing, unfinished or damaged.
     """
     card = read_card(run)
     if kind == "torch":
         if precision not in (None, "f32"):
-            raise ModelError("the torch engine is the float32 oracle; ask for precision f32")
+            raise ModelError(
+                f"the torch engine computes in float32 only, not in {precision}; choose precision "
+                "f32 or the openvino engine"
+            )
+        from mtlnet.inference.torch_engine import TorchEngine
+
         return TorchEngine(run, card, threads)
     return OpenVinoEngine(run, card, precision, threads)
 
 
 class OpenVinoEngine:
-    """The exported graph, compiled for this CPU. `precision` is what it really computes in."""
+    """The exported graph, compiled for this CPU; `precision` is the one it computes in."""
 
     kind = "openvino"
 
@@ -84,13 +87,13 @@ class OpenVinoEngine:
         self.card = card
         best = best_precision(core)
         self.precision: Precision = precision or ("int8" if passed_gate(run, card) else best)
-        eight = self.precision == "int8"
-        graph = int8_graph(run, card) if eight else run / GRAPH
+        quantised = self.precision == "int8"
+        graph = int8_graph(run, card) if quantised else run / GRAPH
         options = {
-            "INFERENCE_PRECISION_HINT": best if eight else self.precision,
+            "INFERENCE_PRECISION_HINT": best if quantised else self.precision,
             "INFERENCE_NUM_THREADS": threads,
             "NUM_STREAMS": 1,
-            # Two workers told to pin would choose the same core.
+            # With pinning, two worker processes would choose the same core.
             "ENABLE_CPU_PINNING": False,
         }
         try:
@@ -113,46 +116,16 @@ class OpenVinoEngine:
         return outputs
 
 
-class TorchEngine:
-    """The same network in torch, float32: the oracle the exported graph is held against."""
-
-    kind = "torch"
-
-    def __init__(self, run: Path, card: ModelCard, threads: int = 1) -> None:
-        import torch
-
-        from mtlnet.model.network import load_network
-
-        names = (WEIGHTS,) if card.doubt is None else (WEIGHTS, DOUBT)
-        check_files(run, card, names)
-        torch.set_num_threads(threads)
-        self.card = card
-        self.precision: Precision = "f32"
-        self._network: Network = load_network(run / WEIGHTS, card.network)
-        self._doubt = None if card.doubt is None else read_doubt(run)
-        self._shape = (card.camera.height, card.camera.width, 3)
-
-    def __call__(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
-        from mtlnet.model.network import describe_images
-
-        check_image(image, self._shape)
-        x, outputs = describe_images(self._network, image[None])
-        if self._doubt is not None:
-            outputs = np.concatenate([outputs, self._doubt.assess(x, texture(image)[None])], 1)
-        answer: NDArray[np.float32] = outputs[0]
-        return answer
-
-
-def parse_kind(text: str) -> Kind:
-    """The engine called `text`; ModelError when there is none."""
-    kinds: dict[str, Kind] = {"openvino": "openvino", "torch": "torch"}
+def parse_kind(text: str) -> EngineKind:
+    """The engine kind called `text`; ModelError for an unknown one."""
+    kinds: dict[str, EngineKind] = {"openvino": "openvino", "torch": "torch"}
     if text in kinds:
         return kinds[text]
     raise ModelError(f"there is no engine {text!r}; choose openvino or torch")
 
 
 def parse_precision(text: str | None) -> Precision | None:
-    """The precision called `text`, None for the CPU's best; ModelError when there is none."""
+    """The precision called `text`, None for the default; ModelError for an unknown one."""
     precisions: dict[str, Precision] = {"bf16": "bf16", "f32": "f32", "int8": "int8"}
     if text is None:
         return None
@@ -162,7 +135,7 @@ def parse_precision(text: str | None) -> Precision | None:
 
 
 def best_precision(core: Any) -> Precision:
-    """bf16 where this CPU computes in it natively (AVX512-BF16 or AMX), float32 elsewhere."""
+    """bf16 if this CPU supports it natively (AVX512-BF16 or AMX), else float32."""
     return "bf16" if "BF16" in core.get_property("CPU", "OPTIMIZATION_CAPABILITIES") else "f32"
 
 

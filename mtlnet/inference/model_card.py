@@ -1,9 +1,8 @@
-"""The card of a trained model: what it was made from and for, and where its folder is.
+"""The card of a trained model (`card.json`), and how a run's folder is found and checked.
 
-Free of torch: the service reads cards. A run's folder holds `card.json`, `config.json`,
-`model.safetensors` (the folded weights of the network), `doubt.safetensors` (the second head that
-says how sure an answer is), `model.xml` and `model.bin` (both for OpenVINO), `curves.csv`,
-`checkpoints/` and `tensorboard/`.
+A run's folder holds `card.json`, `config.json`, `model.safetensors` (the network's weights, batch
+normalisation folded), `doubt.safetensors` (the uncertainty head), `model.xml` and `model.bin` (the
+OpenVINO graph), `curves.csv`, `checkpoints/` and `tensorboard/`.
 """
 
 import hashlib
@@ -22,21 +21,23 @@ from trackfeatures.errors import UserError, require_version
 RUNS = Path("runs")
 SHIPPED = Path(__file__).parents[1] / "weights" / "default"
 CARD, WEIGHTS, GRAPH, GRAPH_WEIGHTS = "card.json", "model.safetensors", "model.xml", "model.bin"
-DOUBT = "doubt.safetensors"
+UNCERTAINTY_WEIGHTS = "doubt.safetensors"
 MODEL_FILES = (WEIGHTS, GRAPH, GRAPH_WEIGHTS)
-FORMAT = 4  # 2: `network`; 3: `doubt`; 4: how the camera is aimed
+FORMAT = 4  # 2: `network`; 3: `doubt`; 4: the camera's pitch
+SKY, GRASS, ASPHALT, PAINT = (150, 180, 220), (70, 110, 60), (95, 95, 100), (230, 230, 225)
 
 
 class ModelError(UserError):
-    """A model that is missing, unfinished, damaged or not for this image."""
+    """A model that is missing, unfinished or damaged, or that does not fit the image or data."""
 
 
 @dataclass(frozen=True)
 class ModelCard:
-    """What a model is. `files` are SHA-256 in hex; `data` describes the dataset it learned from."""
+    """Description of a trained model; the keys of `card.json`."""
 
     name: str
-    network: str  # of `mtlnet.model.architecture.PLANS`
+    network: str
+    """A name of `mtlnet.model.architecture.ARCHITECTURES`."""
     definitions_version: str
     program_version: str
     camera: CameraParameters
@@ -46,21 +47,23 @@ class ModelCard:
     batch: int
     seed: int
     data: dict[str, Any]
+    """The dataset it was trained on."""
     versions: dict[str, str]
     files: dict[str, str]
+    """SHA-256 in hex, by file name."""
     export_check: dict[str, float]
-    golden: tuple[
-        float, ...
-    ]  # what torch in float32 answers to `mtlnet.inference.model_card.golden_image`, (9,)
-    doubt: dict[str, Any] | None  # how its standard deviations were fitted; None: it gives none
+    golden: tuple[float, ...]
+    """Outputs (9,) of torch in float32 for `golden_image`."""
+    doubt: dict[str, Any] | None
+    """How the uncertainty head was fitted; None for a model without one."""
 
     @property
     def model_hash(self) -> str:
-        """The hash that names these weights in every answer."""
+        """SHA-256 of the weights; part of every response of the service."""
         return self.files[WEIGHTS]
 
     def write(self, run: Path) -> None:
-        """Write `card.json`, whole or not at all."""
+        """Write `card.json`, atomically."""
         text = json.dumps(
             {"format": FORMAT, "model_hash": self.model_hash, **asdict(self)}, indent=1
         )
@@ -70,8 +73,8 @@ class ModelCard:
 def read_card(run: Path) -> ModelCard:
     """The card of the run in folder `run`.
 
-    Raises ModelError when it is missing or unreadable, DefinitionsMismatch when it was trained
-    on another version of the track-feature definitions.
+    Raises ModelError when it is missing or unreadable, DefinitionsMismatch for a model of another
+    version of the track-feature definitions.
     """
     path = run / CARD
     if not run.is_dir():
@@ -98,7 +101,7 @@ def read_card(run: Path) -> ModelCard:
 
 
 def check_files(run: Path, card: ModelCard, names: tuple[str, ...]) -> None:
-    """Raise ModelError unless the named files of `run` are those the card was written for."""
+    """Raise ModelError unless the named files of `run` have the hashes of the card."""
     for name in names:
         path = run / name
         if not path.is_file():
@@ -120,8 +123,8 @@ def file_hash(path: Path) -> str:
 def resolve_run(name: str | Path, runs: Path = RUNS) -> Path:
     """The folder of a run given as a path, a name in `runs/`, "latest" or "default".
 
-    "default" is the model shipped with the project or, while there is none, the latest run. The
-    result names the folder really meant (links resolved), so that a command can say which.
+    "default" is the model shipped with the project or, while there is none, the latest run. Links
+    are resolved in the result.
     """
     if str(name) == "default":
         if (SHIPPED / CARD).is_file():
@@ -148,21 +151,18 @@ def _latest(runs: Path, why: str) -> Path:
     return latest.resolve()
 
 
-# One image every model has answered before it was published: the service asks it again at start.
-# Free of torch. Drawn in integers, so that it has the same bits on every machine.
-
-
-SKY, GRASS, ASPHALT, PAINT = (150, 180, 220), (70, 110, 60), (95, 95, 100), (230, 230, 225)
-
-
 def golden_image(width: int, height: int) -> NDArray[np.uint8]:
-    """A straight one-lane road under a clear sky, uint8 RGB (height, width, 3)."""
+    """A straight one-lane road under a clear sky, uint8 RGB (height, width, 3).
+
+    Every model is published with its outputs for this image; the service compares its own with them
+    at start. Drawn in integers, so that it is the same on every machine.
+    """
     image = np.empty((height, width, 3), np.uint8)
     horizon = height // 2
     image[:horizon] = SKY
     image[horizon:] = GRASS
-    # Twice the offset from the middle column, and the road's half width in that row: it grows
-    # linearly from the horizon down, as a flat road's does.
+    # Twice the offset from the middle column, and twice the road's half width in that row, which
+    # increases linearly below the horizon, as that of a flat road.
     offset = np.abs(2 * np.arange(width) - (width - 1))[None, :]
     depth = np.arange(1, height - horizon + 1)[:, None]
     half_width = depth * 5 * width // (3 * (height - horizon))

@@ -1,5 +1,6 @@
-"""Pictures of one answer: the markings it tells drawn over the frame, and the car in its lane
-from above. Flat road, car frame: x ahead, y left (m); pixels from the top left corner.
+"""Overlay of predicted and true markings on a frame, beside a view of the car from above.
+
+Flat road. Car frame: x ahead, y left (m). Pixels from the top left corner.
 """
 
 import math
@@ -15,16 +16,18 @@ Image = NDArray[np.uint8]
 Distances = Mapping[str, float | None]
 
 TRUTH_COLOUR = (60, 220, 90)
-ANSWER_COLOUR = (255, 140, 30)
+PREDICTION_COLOUR = (255, 140, 30)
 NEAR_M, FAR_M = 3.0, 14.0
 SCALE = 2
-"""Frames are shown this much larger, so that thin lines stay thin."""
-PLAN_WIDTH, PLAN_METRES = 160, 16.0
+"""Factor by which frames are enlarged, so that lines look thin."""
+TOP_VIEW_WIDTH, TOP_VIEW_METRES = 160, 16.0
 
 
 def marking_line(distance: float, angle: float, curvature: float) -> NDArray[np.float64]:
-    """Points (N, 2) of a marking `distance` m to the right, on a track at `angle` (rad) that bends
-    by `curvature` (1/m, left positive)."""
+    """Points (N, 2) of a marking `distance` m to the right of the car, m in the car frame.
+
+    `angle`: of the car to the track, rad; `curvature` of the track: 1/m, left positive.
+    """
     along = np.linspace(NEAR_M, FAR_M, 24)
     left = curvature * along**2 / 2 - distance
     cos, sin = math.cos(angle), math.sin(angle)
@@ -34,7 +37,10 @@ def marking_line(distance: float, angle: float, curvature: float) -> NDArray[np.
 def to_pixels(
     points: NDArray[np.float64], camera: CameraParameters, height_m: float
 ) -> NDArray[np.int32]:
-    """Where the camera, `height_m` over the road, sees road points (N, 2) of the car frame."""
+    """Pixels (N, 2), enlarged by `SCALE`, of road points (N, 2) in the car frame.
+
+    `height_m`: height of the camera above the road.
+    """
     focal = camera.focal_px
     ahead, left = points[:, 0] - camera.x, points[:, 1] - camera.y
     pitch = math.radians(camera.pitch_deg)  # positive looks down
@@ -45,41 +51,43 @@ def to_pixels(
     return np.round(np.column_stack([u, v]) * SCALE).astype(np.int32)
 
 
-def draw_answer(
+def draw_overlay(
     frame: Image,
     camera: CameraParameters,
     height_m: float,
     curvature: float,
     truth: tuple[Distances, float],
-    answer: tuple[Distances, float],
+    prediction: tuple[Distances, float],
 ) -> Image:
-    """The frame (H, W, 3) RGB, doubled, with a plan view beside it: truth green, answer orange.
+    """The enlarged frame (H, W, 3) RGB beside a top view: truth green, prediction orange.
 
-    Both are drawn along the road's true bend, which no answer tells.
+    `truth` and `prediction` are distances (m) and the angle (rad). Both are drawn with the road's
+    true curvature, which is not predicted.
     """
     size = (frame.shape[1] * SCALE, frame.shape[0] * SCALE)
     canvas = cv2.resize(frame, size, interpolation=cv2.INTER_CUBIC)
-    plan = np.full((canvas.shape[0], PLAN_WIDTH, 3), 48, np.uint8)
-    styles = ((truth, TRUTH_COLOUR, 3), (answer, ANSWER_COLOUR, 1))
+    top_view = np.full((canvas.shape[0], TOP_VIEW_WIDTH, 3), 48, np.uint8)
+    styles = ((truth, TRUTH_COLOUR, 3), (prediction, PREDICTION_COLOUR, 1))
     for (distances, angle), colour, thickness in styles:
         for distance in distances.values():
             if distance is None:
                 continue
             line = marking_line(distance, angle, curvature)
             pixels = to_pixels(line, camera, height_m)
+            from_above = _top_view_pixels(line, top_view)
             cv2.polylines(canvas, [pixels], False, colour, thickness, cv2.LINE_AA)
-            cv2.polylines(plan, [_on_plan(line, plan)], False, colour, thickness, cv2.LINE_AA)
-    _draw_car(plan)
-    return np.hstack([canvas, plan])
+            cv2.polylines(top_view, [from_above], False, colour, thickness, cv2.LINE_AA)
+    _draw_car(top_view)
+    return np.hstack([canvas, top_view])
 
 
-def _on_plan(points: NDArray[np.float64], plan: Image) -> NDArray[np.int32]:
-    scale = PLAN_WIDTH / PLAN_METRES
-    u = PLAN_WIDTH / 2 - points[:, 1] * scale
-    v = plan.shape[0] * 0.8 - points[:, 0] * scale
+def _top_view_pixels(points: NDArray[np.float64], top_view: Image) -> NDArray[np.int32]:
+    scale = TOP_VIEW_WIDTH / TOP_VIEW_METRES
+    u = TOP_VIEW_WIDTH / 2 - points[:, 1] * scale
+    v = top_view.shape[0] * 0.8 - points[:, 0] * scale
     return np.round(np.column_stack([u, v])).astype(np.int32)
 
 
-def _draw_car(plan: Image) -> None:
+def _draw_car(top_view: Image) -> None:
     corners = np.array([[2.26, 0.97], [2.26, -0.97], [-2.26, -0.97], [-2.26, 0.97]])
-    cv2.fillPoly(plan, [_on_plan(corners, plan)], (200, 200, 210), cv2.LINE_AA)
+    cv2.fillPoly(top_view, [_top_view_pixels(corners, top_view)], (200, 200, 210), cv2.LINE_AA)

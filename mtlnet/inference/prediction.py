@@ -1,7 +1,7 @@
-"""What the network says about one image, in metres and radians. Free of torch: the service uses it.
+"""Decoding a model's outputs into track features, in metres and radians.
 
-Units and signs are those of `trackfeatures`: left negative for distances, left positive for the
-lateral offset, the angle positive when the car points to the right of the track.
+Units and signs are those of `trackfeatures`: distances are negative to the left, the lateral offset
+is positive to the left, the angle is positive when the car points to the right of the track.
 """
 
 from dataclasses import dataclass
@@ -19,24 +19,26 @@ WITH_UNCERTAINTY = OUTPUTS + COLUMNS  # and the columns of `mtlnet.inference.unc
 
 @dataclass(frozen=True, slots=True)
 class Prediction:
-    """Track features read from one image.
+    """Track features predicted from one image.
 
-    Distances in m, None where the marking is absent; `to_lane_centre_m` in m, left positive, None
-    where no marking is near; the angle in rad; `heading` the probability of each class. `std`: the
-    standard deviation of the error of each of `mtlnet.inference.uncertainty.FEATURES` in m and rad,
-    None for what is absent. `out_of_distribution`: the image is unlike those the model learned
-    from. Both are None where the model was published without frames to learn them from.
+    `std` and `out_of_distribution` are None for a model without an uncertainty head.
     """
 
     distances_m: dict[str, float | None]
+    """By marking; None where the marking is absent."""
     to_lane_centre_m: float | None
+    """Left positive; None where no marking is near."""
     angle_rad: float
     heading: dict[str, float]
+    """Probability of each class."""
     std: dict[str, float | None] | None = None
+    """Standard deviation of the error of each of `mtlnet.inference.uncertainty.FEATURES`, m or rad;
+    None for an absent feature."""
     out_of_distribution: bool | None = None
+    """Whether the image differs from the training images more than those from each other."""
 
     def as_json(self) -> dict[str, Any]:
-        """The answer as the service gives it (DESIGN §9)."""
+        """The prediction as the service returns it (DESIGN §9)."""
         return {
             "distances_m": dict(self.distances_m),
             "to_lane_centre_m": self.to_lane_centre_m,
@@ -48,7 +50,7 @@ class Prediction:
 
 
 def decode_outputs(outputs: NDArray[np.float32]) -> Prediction:
-    """The prediction in a model's outputs: `OUTPUTS` of them, or `WITH_UNCERTAINTY`."""
+    """Decode one image's outputs, of shape (`OUTPUTS`,) or (`WITH_UNCERTAINTY`,)."""
     if outputs.shape not in ((OUTPUTS,), (WITH_UNCERTAINTY,)):
         raise ValueError(
             f"a model gives {OUTPUTS} or {WITH_UNCERTAINTY} numbers an image, "
@@ -56,13 +58,13 @@ def decode_outputs(outputs: NDArray[np.float32]) -> Prediction:
         )
     coded, probabilities, uncertainty = outputs[:6], outputs[6:OUTPUTS], outputs[OUTPUTS:]
     distances, angle = tf.decode(coded[None])
-    found = [*distances[0], tf.localise(distances)[0]]
-    values = [None if np.isnan(value) else float(value) for value in found]
+    decoded = [*distances[0], tf.localise(distances)[0]]
+    values = [None if np.isnan(value) else float(value) for value in decoded]
     std = None
     if len(uncertainty):
-        here = [value is not None for value in values] + [True]  # the angle is never absent
-        stated = zip(FEATURES, uncertainty[:-1].tolist(), here, strict=True)
-        std = {name: value if present else None for name, value, present in stated}
+        present = [value is not None for value in values] + [True]  # the angle is never absent
+        columns = zip(FEATURES, uncertainty[:-1].tolist(), present, strict=True)
+        std = {name: value if found else None for name, value, found in columns}
     return Prediction(
         distances_m=dict(zip(tf.MARKINGS, values[:5], strict=True)),
         to_lane_centre_m=values[5],

@@ -1,0 +1,1 @@
+"""The network: its architectures, its layers in torch, and faster kernels for training on a CPU."""

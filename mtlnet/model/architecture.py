@@ -1,15 +1,16 @@
-"""What each network is made of, layer by layer. Free of torch: commands name networks by it.
+"""Architectures of the networks, layer by layer; without torch.
 
 `mtl`: the paper's network (section IV-C), with TensorFlow's SAME padding.
 
 `deepdriving`: the network of Chen et al. (DeepDriving, ICCV 2015), which the paper compares with:
-AlexNet with a fourth fully connected layer, trained on one task, the regression of coded numbers.
-Layers, padding and places of the local normalisation are those of the authors' Caffe model.
-Deviations: outputs are our six coded numbers, not their fourteen, and linear, not a sigmoid's; no
-mean image is subtracted; it is trained by our recipes. It knows no class: one third for each.
+AlexNet with a fourth fully connected layer, trained on one task, the regression of coded values.
+Layers, padding and local response normalisation are those of the authors' Caffe model. Deviations:
+the outputs are our six coded values, not their fourteen, and linear, without a sigmoid; no mean
+image is subtracted; training uses our recipes. It has no classifier: each class has probability
+one third.
 
-`mobilenet_v3_small`, `regnet_y_400mf`: small modern backbones of torchvision, from random
-weights, as a yardstick: their pooled features, one layer of 256, the same nine outputs.
+`mobilenet_v3_small`, `regnet_y_400mf`: small modern backbones of torchvision with random initial
+weights, for comparison: their pooled features, one layer of 256 units, the same nine outputs.
 """
 
 from dataclasses import dataclass
@@ -21,7 +22,7 @@ HEIGHT, WIDTH = 210, 280
 
 @dataclass(frozen=True)
 class Conv:
-    """Conv(n, k, s) of the paper: n filters of k x k with stride s, ReLU; `pad` None is SAME."""
+    """Conv(n, k, s) of the paper: n filters of k x k, stride s, ReLU; `pad` None: SAME padding."""
 
     filters: int
     kernel: int
@@ -32,7 +33,7 @@ class Conv:
 
 @dataclass(frozen=True)
 class Pool:
-    """MaxPool(k, s): SAME padding as in the paper, or Caffe's, which rounds sizes up."""
+    """MaxPool(k, s): SAME padding as in the paper, or as in Caffe, which rounds sizes up."""
 
     kernel: int = 3
     stride: int = 2
@@ -58,18 +59,18 @@ class Architecture:
     name: str
     features: tuple[Layer, ...]
     shared: tuple[int, ...]
-    tasks: tuple[str, ...] = ("distance", "angle", "type")
+    tasks: tuple[str, ...] = ("distance", "angle", "heading")
     backbone: bool = False
-    """The features are those of the torchvision model called `name`."""
+    """Whether the features are those of the torchvision model called `name`."""
 
     @property
     def default_alpha(self) -> tuple[float, float, float]:
-        """The paper's MTL 3, or one plain squared error over all numbers for a single task."""
-        return (0.3, 0.2, 0.5) if "type" in self.tasks else (1.0, 1.0, 0.0)
+        """Task weights: the paper's MTL 3, or equal ones for a network without a classifier."""
+        return (0.3, 0.2, 0.5) if "heading" in self.tasks else (1.0, 1.0, 0.0)
 
     @property
     def convolutions(self) -> tuple[str, ...]:
-        """Names of the convolutions, the first of all first; none where a backbone stands."""
+        """Submodule names of the convolutions, in order; none for a torchvision backbone."""
         each = enumerate(self.features)
         return tuple(f"conv{number}" for number, spec in each if isinstance(spec, Conv))
 
@@ -99,9 +100,9 @@ ALEXNET: tuple[Layer, ...] = (
     Pool(same=False),
 )
 MTL = Architecture("mtl", FEATURES, SHARED)
-PLANS = {
-    plan.name: plan
-    for plan in (
+ARCHITECTURES = {
+    architecture.name: architecture
+    for architecture in (
         MTL,
         Architecture("deepdriving", ALEXNET, (4096, 4096, 256), tasks=("distance", "angle")),
         Architecture("mobilenet_v3_small", (), (256,), backbone=True),
@@ -110,31 +111,31 @@ PLANS = {
 }
 
 
-def find_plan(name: str) -> Architecture:
-    """The network of that name; UserError when there is none."""
-    if name not in PLANS:
-        raise UserError(f"there is no network {name!r}; choose one of {', '.join(PLANS)}")
-    return PLANS[name]
+def find_architecture(name: str) -> Architecture:
+    """The architecture of that name; UserError for an unknown one."""
+    if name not in ARCHITECTURES:
+        raise UserError(f"there is no network {name!r}; choose one of {', '.join(ARCHITECTURES)}")
+    return ARCHITECTURES[name]
 
 
-def require_learnable(plan: Architecture, alpha: tuple[float, float, float]) -> None:
-    """Raise UserError when `alpha` weighs a task that the network does not have."""
-    if alpha[2] > 0 and "type" not in plan.tasks:
+def require_task_heads(architecture: Architecture, alpha: tuple[float, float, float]) -> None:
+    """Raise UserError when `alpha` gives weight to a task that the network does not have."""
+    if alpha[2] > 0 and "heading" not in architecture.tasks:
         raise UserError(
-            f"network {plan.name} has no class, so alpha's third weight must be 0, not "
+            f"network {architecture.name} has no class, so alpha's third weight must be 0, not "
             f"{alpha[2]:g}; give for example --alpha 1,1,0"
         )
 
 
 def same_padding(size: int, kernel: int, stride: int) -> tuple[int, int, int]:
-    """TensorFlow's SAME: output size, zeros before, zeros after; the odd one goes after."""
+    """TensorFlow's SAME padding: (output size, zeros before, zeros after)."""
     out = -(-size // stride)
     total = max((out - 1) * stride + kernel - size, 0)
     return out, total // 2, total - total // 2
 
 
 def output_size(size: int, layer: Layer) -> int:
-    """How many rows (or columns) a layer makes of `size` of them."""
+    """Number of output rows (or columns) of a layer with `size` input rows (or columns)."""
     if isinstance(layer, LocalNorm):
         return size
     if isinstance(layer, Conv) and layer.pad is not None:

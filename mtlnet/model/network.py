@@ -1,10 +1,10 @@
-"""The multi-task network of the paper (section IV-C), and others in its place:
+"""The multi-task network of the paper (section IV-C), and the others of
 `mtlnet.model.architecture`.
 
 Input: uint8 RGB images (B, 210, 280, 3). Output (B, 9): five coded distances and the coded angle
-(linear), and the scores of the classes left, straight, right (before softmax). Recipe `fast`
-trains a rescaled form of it, with batch normalisation after every convolution, and
-heads that answer in standard deviations; `fold` turns that into the paper's network, exactly.
+(linear), and scores of the classes left, straight, right (before the softmax). Recipe `fast` trains
+a reparametrised form, with batch normalisation after every convolution and standardised regression
+targets; `fold` converts it to the paper's network, exactly.
 """
 
 import copy
@@ -27,21 +27,13 @@ from mtlnet.model.architecture import (
     Conv,
     LocalNorm,
     Pool,
-    find_plan,
+    find_architecture,
     output_size,
     same_padding,
 )
 
-__all__ = [
-    "HEIGHT",
-    "WIDTH",
-    "Network",
-    "answer_images",
-    "describe_images",
-    "fold",
-    "initialise",
-    "load_network",
-]
+NORM_EPS = 1e-5
+NORM_MOMENTUM = 0.1
 
 
 class Network(nn.Module):
@@ -51,34 +43,34 @@ class Network(nn.Module):
     target_std: Tensor
 
     def __init__(
-        self, *, batch_norm: bool = False, dropout: float = 0.0, plan: Architecture = MTL
+        self, *, batch_norm: bool = False, dropout: float = 0.0, architecture: Architecture = MTL
     ) -> None:
         super().__init__()
-        self.plan = plan
-        self.features, size = build_features(plan, batch_norm=batch_norm)
+        self.architecture = architecture
+        self.features, size = build_features(architecture, batch_norm=batch_norm)
         self.shared = nn.Sequential()
-        for number, units in enumerate(plan.shared):
-            # Not normalised: what neighbours in a batch add to an image is noise to a distance.
+        for number, units in enumerate(architecture.shared):
+            # No batch normalisation here: batch statistics add noise to the distances.
             self.shared.add_module(f"fc{number}", block(nn.Linear(size, units), None, dropout))
             size = units
         self.heads = nn.ModuleDict({name: nn.Linear(size, units) for name, units in HEADS})
-        # Heads answer in these units; (0, 1), the paper's, unless recipe `fast` sets others.
+        # Mean and deviation of the targets: (0, 1) as in the paper, set by recipe `fast`.
         self.register_buffer("target_mean", torch.zeros(6), persistent=batch_norm)
         self.register_buffer("target_std", torch.ones(6), persistent=batch_norm)
 
     def forward(self, images: Tensor) -> Tensor:
-        """Images (B, 210, 280, 3), uint8 or already normalised float -> (B, 9) float32."""
-        return self.answer(self.describe(images))
+        """Images (B, 210, 280, 3), uint8 or normalised float -> outputs (B, 9) float32."""
+        return self.forward_heads(self.forward_features(images))
 
-    def describe(self, images: Tensor) -> Tensor:
-        """The last shared features (B, 256) of images, from which the heads answer."""
+    def forward_features(self, images: Tensor) -> Tensor:
+        """The last shared features (B, 256) of images, the input of the heads."""
         x = (normalise(images) if images.dtype == torch.uint8 else images).permute(0, 3, 1, 2)
-        described: Tensor = self.shared(self.features(x).flatten(1))
-        return described
+        features: Tensor = self.shared(self.features(x).flatten(1))
+        return features
 
-    def answer(self, x: Tensor) -> Tensor:
+    def forward_heads(self, x: Tensor) -> Tensor:
         """The outputs (B, 9) for last shared features (B, 256)."""
-        # The heads are small: in float32 also under autocast, for coded values near each other.
+        # In float32 also under autocast: coded values differ by little, and the heads are small.
         with torch.autocast(x.device.type, enabled=False):
             x = x.float()
             coded = torch.cat([self.heads["distance"](x), self.heads["angle"](x)], 1)
@@ -93,13 +85,13 @@ def normalise(images: Tensor) -> Tensor:
 
 
 def initialise(network: Network, seed: int) -> None:
-    """He's normal initialisation for layers before a ReLU, small heads; same seed, same weights."""
+    """Initialise the weights from `seed`: He normal before a ReLU, small values in the heads."""
     generator = torch.Generator().manual_seed(seed)
     for name, module in network.named_modules():
         if isinstance(module, nn.Conv2d | nn.Linear):
             gain = 0.01 if name.startswith("heads") else 2.0
-            if name == "heads.heading" and "type" not in network.plan.tasks:
-                gain = 0.0  # never trained: the same probability for each class
+            if name == "heads.heading" and "heading" not in network.architecture.tasks:
+                gain = 0.0  # not trained: equal probabilities
             fan_in = module.weight[0].numel()
             with torch.no_grad():
                 module.weight.normal_(0.0, (gain / fan_in) ** 0.5, generator=generator)
@@ -107,59 +99,39 @@ def initialise(network: Network, seed: int) -> None:
                     module.bias.zero_()
 
 
-def fold(network: Network) -> Network:
-    """The plain network that computes what `network` computes in evaluation mode.
-
-    For `mtl` that is the paper's. Folded in double precision.
-    """
-    double = copy.deepcopy(network).cpu().double()
-    fold_norms(double)
-    for name, rows in (("distance", slice(0, 5)), ("angle", slice(5, 6))):
-        std = double.target_std[rows]
-        with torch.no_grad():
-            double.get_parameter(f"heads.{name}.weight").mul_(std[:, None])
-            bias = double.get_parameter(f"heads.{name}.bias")
-            bias.mul_(std).add_(double.target_mean[rows])
-    folded = Network(plan=network.plan)
-    state = double.state_dict()
-    folded.load_state_dict({name: state[name].float() for name in folded.state_dict()})
-    return folded.eval()
-
-
 def load_network(path: Path, name: str = MTL.name) -> Network:
     """The network called `name` with the weights of a `model.safetensors`."""
-    network = Network(plan=find_plan(name))
+    network = Network(architecture=find_architecture(name))
     network.load_state_dict(load_file(path))
     return network.eval()
 
 
-def answer_images(network: Network, images: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Images (B, 210, 280, 3) -> (B, 9): coded distances and angle, class probabilities."""
-    return describe_images(network, images)[1]
-
-
-def describe_images(
+def run_network(
     network: Network, images: NDArray[np.uint8]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """The last shared features (B, 256) of images (B, 210, 280, 3), and the answers (B, 9)."""
+    """Images (B, 210, 280, 3) -> last shared features (B, 256) and outputs (B, 9).
+
+    The outputs are coded distances, coded angle and class probabilities.
+    """
     device = next(network.parameters()).device
     network.eval()
     with torch.inference_mode():
-        x = network.describe(torch.from_numpy(images).to(device)).float()
-        outputs = network.answer(x)
+        x = network.forward_features(torch.from_numpy(images).to(device)).float()
+        outputs = network.forward_heads(x)
         outputs[:, 6:] = torch.softmax(outputs[:, 6:], 1)
     return x.cpu().numpy(), outputs.cpu().numpy()
 
 
-# The layers of a plan as torch modules, and batch normalisation folded into convolutions.
+def predict_images(network: Network, images: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """The outputs (B, 9) of `run_network`."""
+    return run_network(network, images)[1]
 
 
-NORM_EPS = 1e-5
-NORM_MOMENTUM = 0.1
+# Layers.
 
 
 class SamePad(nn.Module):
-    """Zeros around an image, as SAME padding of the next layer asks."""
+    """Zero padding that gives the next layer TensorFlow's SAME padding."""
 
     def __init__(self, height: int, width: int, layer: Conv | Pool) -> None:
         super().__init__()
@@ -168,7 +140,7 @@ class SamePad(nn.Module):
         self.pads = (left, right, top, bottom)
 
     def forward(self, x: Tensor) -> Tensor:
-        # A maximum of values after ReLU is not changed by zeros, so pools are padded with them too.
+        # Zeros do not change a maximum of values after ReLU, so pools are padded with zeros too.
         return nn.functional.pad(x, self.pads) if any(self.pads) else x
 
 
@@ -186,13 +158,13 @@ def block(layer: nn.Module, norm: nn.Module | None, dropout: float = 0.0) -> nn.
     return sequence
 
 
-def build_features(plan: Architecture, *, batch_norm: bool) -> tuple[nn.Module, int]:
-    """The part before the fully connected layers, (B, 3, H, W) -> (B, ...), and its size."""
-    if plan.backbone:
-        return build_backbone(plan.name, batch_norm=batch_norm)
+def build_features(architecture: Architecture, *, batch_norm: bool) -> tuple[nn.Module, int]:
+    """The module before the fully connected layers, (B, 3, H, W) -> (B, ...), and its size."""
+    if architecture.backbone:
+        return build_backbone(architecture.name, batch_norm=batch_norm)
     features = nn.Sequential()
     channels, height, width = 3, HEIGHT, WIDTH
-    for number, spec in enumerate(plan.features):
+    for number, spec in enumerate(architecture.features):
         if isinstance(spec, LocalNorm):
             norm = nn.LocalResponseNorm(spec.size, spec.alpha, spec.beta)
             features.add_module(f"norm{number}", norm)
@@ -223,9 +195,9 @@ def _convolution(channels: int, spec: Conv, batch_norm: bool) -> nn.Sequential:
 
 
 def build_backbone(name: str, *, batch_norm: bool) -> tuple[nn.Module, int]:
-    """A torchvision model up to its pooled features, random weights, and their number.
+    """A torchvision model without its classifier, randomly initialised, and its feature count.
 
-    Without `batch_norm`: the form it takes once its normalisation is folded away.
+    Without `batch_norm`: with batch normalisation folded away.
     """
     from torchvision.models import get_model
 
@@ -235,15 +207,37 @@ def build_backbone(name: str, *, batch_norm: bool) -> tuple[nn.Module, int]:
     setattr(model, last, nn.Identity())
     for module in model.modules():
         if isinstance(module, nn.BatchNorm2d):
-            # torchvision's 0.01 is for runs of 100,000 steps: after 500 the means would be stale.
+            # torchvision's 0.01 is for runs of 100,000 steps; in short ones the means would lag.
             module.momentum = NORM_MOMENTUM
     if not batch_norm:
         fold_norms(model)
     return model, int(classifier.in_features)
 
 
+# Folding batch normalisation and target standardisation.
+
+
+def fold(network: Network) -> Network:
+    """The network without batch normalisation and target standardisation, in evaluation mode.
+
+    It computes the same, and for `mtl` is the paper's network. Folded in float64.
+    """
+    double = copy.deepcopy(network).cpu().double()
+    fold_norms(double)
+    for name, rows in (("distance", slice(0, 5)), ("angle", slice(5, 6))):
+        std = double.target_std[rows]
+        with torch.no_grad():
+            double.get_parameter(f"heads.{name}.weight").mul_(std[:, None])
+            bias = double.get_parameter(f"heads.{name}.bias")
+            bias.mul_(std).add_(double.target_mean[rows])
+    folded = Network(architecture=network.architecture)
+    state = double.state_dict()
+    folded.load_state_dict({name: state[name].float() for name in folded.state_dict()})
+    return folded.eval()
+
+
 def fold_norms(network: nn.Module) -> None:
-    """Fold every batch normalisation into the convolution before it, in evaluation mode."""
+    """Fold every batch normalisation into the convolution before it; sets evaluation mode."""
     network.eval()
     for sequence in [m for m in network.modules() if isinstance(m, nn.Sequential)]:
         for (first, conv), (second, norm) in pairwise(list(sequence.named_children())):

@@ -8,7 +8,7 @@ from typing import Any
 
 import trackfeatures as tf
 from mtlnet.inference.model_card import ModelError
-from mtlnet.model.architecture import find_plan, require_learnable
+from mtlnet.model.architecture import find_architecture, require_task_heads
 from mtlnet.training.loss import Alpha
 from mtlnet.training.recipes import Recipe, find_recipe
 from mtlnet.training.task_weighting import find_balance
@@ -28,7 +28,7 @@ class TrainConfig:
     data: Path
     out: Path
     network: str = "mtl"
-    """A name of `mtlnet.model.architecture.PLANS`."""
+    """A name of `mtlnet.model.architecture.ARCHITECTURES`."""
     alpha: Alpha = (0.3, 0.2, 0.5)
     balance: str = "fixed"
     """A name of `mtlnet.training.task_weighting.BALANCES`; unless fixed, alpha only says what is
@@ -50,7 +50,7 @@ class TrainConfig:
     """Leave out the frames whose image cannot be decoded; they are named in the model's card."""
 
     def __post_init__(self) -> None:
-        require_learnable(find_plan(self.network), self.alpha)
+        require_task_heads(find_architecture(self.network), self.alpha)
         find_balance(self.balance)
         if self.batch == 0:
             object.__setattr__(self, "batch", find_recipe(self.recipe).batch)

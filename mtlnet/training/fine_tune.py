@@ -26,7 +26,7 @@ def open_init(name: str | Path) -> tuple[Path, ModelCard]:
 
 def take_weights(network: Network, run: Path) -> None:
     """Make `network` answer as the model of `run`, whatever units its own heads answer in."""
-    state = load_network(run / WEIGHTS, network.plan.name).state_dict()
+    state = load_network(run / WEIGHTS, network.architecture.name).state_dict()
     mean, std = network.target_mean.cpu(), network.target_std.cpu()
     for name, rows in (("distance", slice(0, 5)), ("angle", slice(5, 6))):
         weight, bias = (f"heads.{name}.{kind}" for kind in ("weight", "bias"))

@@ -5,12 +5,13 @@ from pathlib import Path
 import numpy as np
 
 from mtlnet.data.sources import TrainingData
-from mtlnet.export.publish import publish
+from mtlnet.export.publish import Provenance, publish
 from mtlnet.inference.model_card import RUNS, ModelCard
-from mtlnet.model.network import HEIGHT, WIDTH, fold
+from mtlnet.model.architecture import HEIGHT, WIDTH
+from mtlnet.model.network import fold
 from mtlnet.training.config import TrainConfig
 from mtlnet.training.trainer import Trainer
-from mtlnet.uncertainty_fit.head import fit_doubt
+from mtlnet.uncertainty_fit.head import fit_uncertainty_head
 
 CHECK_FRAMES = 16
 """Frames on which the exported graph is held against torch."""
@@ -25,14 +26,16 @@ def finish(config: TrainConfig, trainer: Trainer, material: TrainingData) -> Mod
         trainer.network,
         config.out,
         images,
-        camera=material.camera,
-        alpha=config.alpha,
-        recipe=config.recipe,
-        iterations=trainer.step_number,
-        batch=config.batch,
-        seed=config.seed,
-        data=material.about,
-        doubt=fit_doubt(
+        Provenance(
+            camera=material.camera,
+            alpha=config.alpha,
+            recipe=config.recipe,
+            iterations=trainer.step_number,
+            batch=config.batch,
+            seed=config.seed,
+            data=material.about,
+        ),
+        uncertainty=fit_uncertainty_head(
             fold(trainer.network), frames, material.held_out, config.seed, material.camera
         ),
     )

@@ -1,6 +1,5 @@
 """The losses of a run as it learns: `curves.csv` and TensorBoard."""
 
-import math
 import socket
 import time
 from collections.abc import Iterable, Mapping
@@ -12,22 +11,8 @@ from tensorboard.compat.proto.event_pb2 import Event, SessionLog
 from tensorboard.compat.proto.summary_pb2 import Summary
 from tensorboard.summary.writer.record_writer import RecordWriter
 
+from mtlnet.inference.curves import COLUMNS, CURVES, HEADER, read_curves
 from runtime.files import atomic_write
-
-COLUMNS = (
-    "step",
-    "elapsed_s",
-    "learning_rate",
-    "images_per_second",
-    "distance_loss",
-    "angle_loss",
-    "type_loss",
-    "total_loss",
-    "distance_weight",
-    "angle_weight",
-    "type_weight",
-)
-CURVES = "curves.csv"
 
 
 class Curves:
@@ -38,7 +23,7 @@ class Curves:
     def __init__(self, run: Path, step: int) -> None:
         path = run / CURVES
         kept = [_row(point) for point in read_curves(path) if point["step"] <= step]
-        atomic_write(path, "".join([_line(COLUMNS), *map(_line, kept)]).encode(), fsync=True)
+        atomic_write(path, "".join([HEADER, *map(_line, kept)]).encode(), fsync=True)
         self._board = Board(run / "tensorboard", step + 1 if step else None)
         self._file = path.open("a", newline="", encoding="utf-8")
 
@@ -60,30 +45,6 @@ class Curves:
     ) -> None:
         with closing(self._board), closing(self._file):
             pass
-
-
-def read_curves(path: Path) -> list[dict[str, float]]:
-    """The points of a `curves.csv`; none where there is no file.
-
-    Damaged rows are left out: a full disk or a power cut can leave half of the last one.
-    """
-    if not path.is_file():
-        return []
-    lines = path.read_text(encoding="utf-8", errors="replace").splitlines(keepends=True)
-    if not lines or lines[0] != _line(COLUMNS):
-        return []
-    points = (_point(line) for line in lines[1:] if line.endswith("\n"))
-    return [point for point in points if point is not None]
-
-
-def _point(line: str) -> dict[str, float] | None:
-    try:
-        values = [float(text) for text in line.split(",")]
-    except ValueError:
-        return None
-    if len(values) != len(COLUMNS) or not all(map(math.isfinite, values)):
-        return None
-    return dict(zip(COLUMNS, values, strict=True))
 
 
 def _row(point: Mapping[str, float]) -> list[str]:

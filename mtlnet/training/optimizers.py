@@ -39,7 +39,7 @@ class Optimisers:
             return
         weights = {name: p for name, p in network.named_parameters() if p.ndim > 1}
         others = [p for p in network.parameters() if p.ndim <= 1]
-        if recipe.optimiser == "muon" and not network.plan.backbone:
+        if recipe.optimiser == "muon" and not network.architecture.backbone:
             large = [name for name, weight in weights.items() if has_muon(name, weight)]
             self._rows = [(p, nn.Parameter(as_rows(p.detach()))) for p in map(weights.pop, large)]
             rows = [{"params": [row for _, row in self._rows], "times": MUON_RATE}]

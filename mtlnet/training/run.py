@@ -12,11 +12,11 @@ from typing import Any
 import cv2
 import torch
 
-from mtlnet.data.gpu_cache import resident_or_not
+from mtlnet.data.gpu_cache import cache_if_it_fits
 from mtlnet.data.loader import Loader
-from mtlnet.data.sources import TrainingData, open_material, require_same_data
+from mtlnet.data.sources import TrainingData, open_training_data, require_same_data
 from mtlnet.inference.model_card import ModelCard, read_card
-from mtlnet.model.architecture import find_plan
+from mtlnet.model.architecture import find_architecture
 from mtlnet.training.checkpoint import list_checkpoints, load_checkpoint
 from mtlnet.training.config import TrainConfig, write_config
 from mtlnet.training.distributed import Part, find_part, joined, wait
@@ -66,7 +66,7 @@ def _train(
     if resumed is None and part.first:
         require_new(config.out)
     init = None if config.init is None else open_init(config.init)
-    material = open_material(config, init[1] if init else None, checked=checked)
+    material = open_training_data(config, init[1] if init else None, checked=checked)
     if resumed is None and part.first:
         create_run(config, find_recipe(config.recipe), material.about)
     if resumed is not None:
@@ -77,7 +77,7 @@ def _train(
     elapsed_s = load_checkpoint(checkpoints[-1], trainer) if checkpoints else 0.0
     wait()  # until all have read it, the first one writes nothing
     try:
-        batches = resident_or_not(loader, device)
+        batches = cache_if_it_fits(loader, device)
         learn(config, trainer, batches, elapsed_s, report, part)
         if part.first:
             finish(config, trainer, material)
@@ -108,7 +108,7 @@ def prepare(
         config.alpha,
         config.seed,
         device,
-        find_plan(config.network),
+        find_architecture(config.network),
         balance=config.balance,
         epoch=max(len(material.frames) // config.batch, 1),
         part=mine,

@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
 
 from mtlnet.inference.model_card import RUNS, ModelError
-from mtlnet.model.architecture import find_plan
+from mtlnet.model.architecture import find_architecture
 from mtlnet.training.config import CONFIG, TrainConfig, resume_config
 from mtlnet.training.distributed import find_part
 from mtlnet.training.fine_tune import open_init
@@ -40,7 +40,7 @@ def start_training(
             same = {"network": card.network, "alpha": card.alpha, "recipe": "tune"}
             usual, options["init"] = same, str(run)
         else:
-            usual["alpha"] = find_plan(options.get("network", "mtl")).default_alpha
+            usual["alpha"] = find_architecture(options.get("network", "mtl")).default_alpha
         recipe = find_recipe(options.get("recipe", usual["recipe"])).name
         folder = out or RUNS / f"{time.strftime('%Y%m%d-%H%M%S')}-{recipe}"
         config = TrainConfig(**{"data": DATASET, "out": folder, **usual, **options})

@@ -56,7 +56,7 @@ class Trainer:
             # A backbone has its own, unless it goes on from a finished model.
             batch_norm=recipe.batch_norm or (plan.backbone and not folded),
             dropout=recipe.dropout,
-            plan=plan,
+            architecture=plan,
         )
         initialise(network, seed)
         self.network = network.to(device).to(memory_format=torch.channels_last)
@@ -119,7 +119,7 @@ class Trainer:
         """What the network in training answers, (B, 9), to images (B, 210, 280, 3) uint8."""
         on_cpu = self.device.type == "cpu"
         dtype = torch.bfloat16 if not on_cpu or cpu_has_bf16() else torch.float32
-        if on_cpu and self.network.plan is MTL:
+        if on_cpu and self.network.architecture is MTL:
             seed = [self.seed, 3, self.step_number]
             masks = dropout_masks(self.recipe.dropout, MTL.shared, len(images), seed, self.part)
             return training_outputs(self.network, images, dtype, masks)
@@ -137,7 +137,7 @@ def settle_norms(network: Network) -> None:
 
 def rest(network: Network, count: int) -> None:
     """Let the first `count` convolutions keep their weights; no work goes into their gradients."""
-    for number, name in enumerate(network.plan.convolutions):
+    for number, name in enumerate(network.architecture.convolutions):
         for parameter in network.features.get_submodule(name).parameters():
             parameter.requires_grad_(number >= count)
 

@@ -1,0 +1,1 @@
+"""Fitting the uncertainty head of a trained network; the network itself is frozen."""

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-from mtlnet.inference.image_decoding.crop import visible
+from mtlnet.inference.image_decoding.crop import crop_box
 from mtlnet.inference.image_decoding.decode import decode, inspect
 from mtlnet.inference.image_decoding.errors import ImageError
 from serve.api.http_io import (
@@ -207,7 +207,7 @@ def crop_of(
     width: int, height: int, view: CameraParameters, fov_y_deg: float | None
 ) -> list[int] | None:
     """[left, top, width, height] of what the model sees of a picture, px; None: all of it."""
-    box = visible(width, height, view, fov_y_deg)
+    box = crop_box(width, height, view, fov_y_deg)
     return None if box is None else [box.left, box.top, box.width, box.height]
 
 

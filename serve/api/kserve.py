@@ -17,7 +17,7 @@ from fastapi.responses import JSONResponse, Response
 from numpy.typing import NDArray
 
 import trackfeatures as tf
-from mtlnet.inference.image_decoding.decode import check_size, decode, fit, inspect
+from mtlnet.inference.image_decoding.decode import check_size, crop_and_resize, decode, inspect
 from mtlnet.inference.image_decoding.errors import ImageError
 from mtlnet.inference.prediction import Prediction
 from mtlnet.inference.uncertainty import FEATURES
@@ -227,7 +227,7 @@ def _reader(
         return lambda view: decode(body, header, view, fov_y_deg)
     pixels = read_pixels(tensor, binary)
     check_size(pixels.shape[1], pixels.shape[0])
-    return lambda view: fit(pixels, view, fov_y_deg)
+    return lambda view: crop_and_resize(pixels, view, fov_y_deg)
 
 
 def _tensors(answer: Prediction) -> dict[str, NDArray[np.float32]]:

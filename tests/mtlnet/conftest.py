@@ -1,4 +1,4 @@
-"""A small dataset of drawn roads, and a published model, shared by the tests of `mtlnet`."""
+"""Fixtures of the mtlnet tests: a small dataset of drawn roads and a published model."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -15,17 +15,18 @@ from datagen.recording.mcap.writer import RoundWriter
 from datagen.recording.round_metadata import RoundHeader
 from datagen.recording.splits import Split, split_path, write_split
 from mtlnet.evaluation.metrics import describe_data
-from mtlnet.export.publish import publish
-from mtlnet.model.architecture import FEATURES, HEIGHT, MTL, PLANS, WIDTH, Conv
+from mtlnet.export.publish import Provenance, publish
+from mtlnet.inference.prediction import decode_outputs
+from mtlnet.model.architecture import ARCHITECTURES, FEATURES, HEIGHT, MTL, WIDTH, Conv
 from mtlnet.model.network import Network, initialise
-from mtlnet.uncertainty_fit.head import fit_doubt
+from mtlnet.uncertainty_fit.head import fit_uncertainty_head
 
 FRAMES = 24
 TRAIN, TEST = ("r000", "r001", "r002"), ("r003",)
 
 
 def draw_road(to_middle: float, angle: float) -> NDArray[np.uint8]:
-    """A flat one-lane road, 4 m wide, seen from 1.2 m: enough to learn from."""
+    """A flat one-lane road, 4 m wide, seen from 1.2 m above; uint8 RGB (HEIGHT, WIDTH, 3)."""
     focal = HEIGHT / 2 / np.tan(np.radians(67.5 / 2))
     rows, columns = np.mgrid[:HEIGHT, :WIDTH]
     below = np.maximum((rows + 0.5 - HEIGHT / 2) / focal, 1e-3)
@@ -53,7 +54,7 @@ def drawn_frame(rng: np.random.Generator) -> Frame:
 
 
 def write_round(folder: Path, name: str, number: int, **changes: Any) -> None:
-    """A round of `FRAMES` drawn frames in a dataset folder; `changes`: of its header."""
+    """Write a round of `FRAMES` drawn frames to a dataset folder; `changes` to its header."""
     rng = np.random.default_rng(number)
     values: dict[str, Any] = {
         "id": name,
@@ -74,6 +75,16 @@ def write_round(folder: Path, name: str, number: int, **changes: Any) -> None:
         writer.finish()
 
 
+def require_close(
+    outputs: NDArray[np.float32], expected: NDArray[np.float32], *, metres: float, radians: float
+) -> None:
+    """Assert that a model's outputs decode to nearly the same distances, offset and angle."""
+    found, wanted = decode_outputs(outputs), decode_outputs(expected)
+    assert found.distances_m == pytest.approx(wanted.distances_m, abs=metres)
+    assert found.to_lane_centre_m == pytest.approx(wanted.to_lane_centre_m, abs=metres)
+    assert found.angle_rad == pytest.approx(wanted.angle_rad, abs=radians)
+
+
 @pytest.fixture(scope="session")
 def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Three train rounds and a test round of `FRAMES` frames each."""
@@ -88,20 +99,21 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def published(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run folder with an untrained, published network; its doubt was fitted."""
+    """A run folder with an untrained, published network and a fitted uncertainty head."""
     network = Network()
     initialise(network, 5)
     run = tmp_path_factory.mktemp("runs") / "untrained"
     data = Dataset.open(dataset)
     frames = data.select("train")
-    doubt = fit_doubt(network, frames, None, 0)
+    uncertainty = fit_uncertainty_head(network, frames, None, 0)
     images = np.stack([draw_road(d, 0.0) for d in (-1.0, 0.5)])
-    publish(network, run, images, doubt=doubt, data=describe_data(data, frames))
+    provenance = Provenance(data=describe_data(data, frames))
+    publish(network, run, images, provenance, uncertainty)
     return run
 
 
 @pytest.fixture
 def small_network(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The network has few filters and units: for tests of what happens around its training."""
+    """Replace the paper's network by one with few filters and units, to save time."""
     few = tuple(replace(spec, filters=8) if isinstance(spec, Conv) else spec for spec in FEATURES)
-    monkeypatch.setitem(PLANS, MTL.name, replace(MTL, features=few, shared=(32, 16, 16)))
+    monkeypatch.setitem(ARCHITECTURES, MTL.name, replace(MTL, features=few, shared=(32, 16, 16)))

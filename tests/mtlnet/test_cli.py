@@ -13,7 +13,7 @@ import pytest
 import simplejpeg
 
 from datagen.recording.splits import Split, split_path, write_split
-from mtlnet.training.logging import read_curves
+from mtlnet.inference.curves import read_curves
 from tests.typed import typed
 
 

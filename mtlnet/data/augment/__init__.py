@@ -1,0 +1,1 @@
+"""Augmentation of training images, with labels that change accordingly."""

@@ -1,9 +1,16 @@
-"""Frames of a car some way aside: the road is shifted under the camera, the labels follow.
+"""Augmentation by another pose of the camera: lateral shift and rotation, and their labels.
 
-A camera that moves left by s sees a point at depth Z f s / Z pixels further right: on a plane, that
-is s / h pixels for each row below the horizon, h the camera's height. What stands on the road is
-sheared with it, and what lies above the horizon stays: right for the markings near the car.
+Lateral shift: a camera that moves left by s sees a point at depth Z f s / Z pixels further right.
+On a flat road that is s / h pixels for each row below the horizon, with h the height of the camera,
+so the image is sheared there and unchanged above. Right for markings near the car; objects on the
+road are sheared too.
+
+Rotation: exact for any scene, except at the border, because a rotation about the optical centre is
+a homography (Hartley and Zisserman 2004, section 8.4).
 """
+
+from functools import lru_cache
+from statistics import NormalDist
 
 import cv2
 import numpy as np
@@ -12,7 +19,10 @@ from numpy.typing import NDArray
 import trackfeatures as tf
 from trackfeatures.camera import CameraParameters
 
-FURTHEST_M = 0.6
+MAX_SHIFT_M = 0.6
+YAW_STD_RAD, PITCH_STD_RAD = 0.035, 0.006
+MAX_YAW_RAD = 0.09
+ROTATIONS = 64  # rotations to choose from, with maps that are computed once; number 0 is none
 
 
 def shift_lateral(image: NDArray[np.uint8], camera: CameraParameters, metres: float) -> None:
@@ -24,23 +34,23 @@ def shift_lateral(image: NDArray[np.uint8], camera: CameraParameters, metres: fl
     road = image[first:]
     shear = metres * np.cos(tilt) / camera.height_above_road_m
     matrix = np.array([[1.0, shear, shear * (first - horizon)], [0.0, 1.0, 0.0]])
-    # What comes into view is bare road: mirrored, a marking would turn round at the border.
-    bare = image[-1].mean(0).tolist()
+    # The new border is filled with the mean colour of the road: mirrored markings would be wrong.
+    fill = image[-1].mean(0).tolist()
     size = (camera.width, len(road))
-    cv2.warpAffine(road.copy(), matrix, size, dst=road, flags=cv2.INTER_LINEAR, borderValue=bare)
+    cv2.warpAffine(road.copy(), matrix, size, dst=road, flags=cv2.INTER_LINEAR, borderValue=fill)
 
 
-def room(distances: NDArray[np.float32]) -> NDArray[np.float64]:
-    """How far (N, 2) a car may move right (negative) and left, m, for the same markings to count.
+def shift_limits_m(distances: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Limits (N, 2) of a shift to the right (negative) and left, m, within which labels are known.
 
-    `distances` (N, 5) in m, NaN where absent. Further on another marking would have to be told of,
-    whose distance, or whether it is there at all, is not known.
+    `distances` (N, 5) in m, NaN where absent. Beyond the limits another marking would be measured,
+    whose distance, or presence, is not known.
     """
     ml, mr, l, m, r = distances.astype(np.float64).T
     margin, reach = tf.IN_LANE_MARGIN_M, tf.ON_MARKING_REACH_M
     in_lane, on_marking = ~np.isnan(ml), ~np.isnan(m)
-    low, high = np.full(len(m), -FURTHEST_M), np.full(len(m), FURTHEST_M)
-    # In a lane, at least `margin` from both markings; alone, too far from them to be on one.
+    low, high = np.full(len(m), -MAX_SHIFT_M), np.full(len(m), MAX_SHIFT_M)
+    # In a lane: at least `margin` from both markings, or `reach` if not also on a marking.
     least = np.where(on_marking, margin, reach)
     low = np.where(in_lane, np.maximum(low, least - mr), low)
     high = np.where(in_lane, np.minimum(high, -least - ml), high)
@@ -52,8 +62,79 @@ def room(distances: NDArray[np.float32]) -> NDArray[np.float64]:
     return np.column_stack([low.clip(max=0.0), high.clip(min=0.0)])
 
 
-def metres_aside(share: NDArray[np.float64], distances: NDArray[np.float32]) -> NDArray[np.float64]:
-    """How far (N,) to move to the left, for shares (N,) in [-1, 1] of the room there is."""
-    to_the_right, to_the_left = room(distances).T
+def lateral_shift_m(
+    share: NDArray[np.float64], distances: NDArray[np.float32]
+) -> NDArray[np.float64]:
+    """Shifts (N,) to the left, m, for shares (N,) in [-1, 1] of the limits of `shift_limits_m`."""
+    to_the_right, to_the_left = shift_limits_m(distances).T
     metres: NDArray[np.float64] = np.where(share < 0, -share * to_the_right, share * to_the_left)
     return metres
+
+
+@lru_cache(maxsize=1)
+def rotations() -> NDArray[np.float64]:
+    """The rotations (ROTATIONS, 2): yaw to the left and pitch down, rad; the first is none."""
+    rng = np.random.default_rng(0)
+    # Quantiles of the normal distribution rather than draws: few values represent it well.
+    quantiles = (np.arange(1, ROTATIONS) - 0.5) / (ROTATIONS - 1)
+    yaw = [NormalDist(0.0, YAW_STD_RAD).inv_cdf(quantile) for quantile in quantiles]
+    angles = np.column_stack([yaw, rng.normal(0.0, PITCH_STD_RAD, ROTATIONS - 1)])
+    angles[:, 0] = angles[:, 0].clip(-MAX_YAW_RAD, MAX_YAW_RAD)
+    return np.vstack([np.zeros(2), angles])
+
+
+def rotate(image: NDArray[np.uint8], camera: CameraParameters, number: int) -> None:
+    """Rotate the camera of an image (H, W, 3) by rotation `number`, in place."""
+    coarse, fine = rotation_maps(camera, number)
+    border = cv2.BORDER_REFLECT_101
+    cv2.remap(image.copy(), coarse, fine, cv2.INTER_LINEAR, dst=image, borderMode=border)
+
+
+@lru_cache(maxsize=ROTATIONS)
+def rotation_maps(
+    camera: CameraParameters, number: int
+) -> tuple[NDArray[np.int16], NDArray[np.uint16]]:
+    """Source pixel of each pixel of a rotated image, as OpenCV's fixed-point maps."""
+    inverse = np.linalg.inv(rotation_homography(camera, *rotations()[number].tolist()))
+    columns, rows = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
+    x, y, scale = np.tensordot(inverse, np.stack([columns, rows, np.ones_like(rows)]), 1)
+    maps = (x / scale).astype(np.float32), (y / scale).astype(np.float32)
+    coarse, fine = cv2.convertMaps(*maps, cv2.CV_16SC2)
+    return coarse.astype(np.int16, copy=False), fine.astype(np.uint16, copy=False)
+
+
+def rotation_homography(
+    camera: CameraParameters, yaw: float, pitch: float = 0.0
+) -> NDArray[np.float64]:
+    """Homography (3, 3) of pixels when the car turns left by `yaw`, the camera down by `pitch`."""
+    focal = camera.focal_px
+    # Pixel centres have whole coordinates here, unlike in `CameraParameters.intrinsics`.
+    intrinsics = np.array(
+        [[focal, 0, (camera.width - 1) / 2], [0, focal, (camera.height - 1) / 2], [0, 0, 1]]
+    )
+    cosine, sine = np.cos(yaw), np.sin(yaw)
+    # Camera frame: x right, y down, z ahead. After a turn to the left, what was ahead is right.
+    about_vertical = np.array([[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]])
+    tilt = np.radians(camera.pitch_deg)
+    rotation = _pitch_rotation(tilt + pitch) @ about_vertical @ _pitch_rotation(-tilt)
+    homography: NDArray[np.float64] = intrinsics @ rotation @ np.linalg.inv(intrinsics)
+    return homography
+
+
+def _pitch_rotation(down: float) -> NDArray[np.float64]:
+    cosine, sine = np.cos(down), np.sin(down)
+    return np.array([[1, 0, 0], [0, cosine, -sine], [0, sine, cosine]])
+
+
+def rotate_labels(
+    distances: NDArray[np.float32],
+    angle: NDArray[np.float32],
+    yaw: NDArray[np.float64],
+    camera: CameraParameters,
+) -> NDArray[np.float32]:
+    """Coded targets (B, 6) after the car turned left by `yaw` (B,) about its camera.
+
+    Its centre of gravity, `camera.x` behind the camera, moves to the right by camera.x sin(yaw).
+    """
+    shift = -camera.x * np.sin(yaw)
+    return tf.encode(distances + shift[:, None], angle - yaw)

@@ -1,7 +1,6 @@
-"""Shadows of trees laid over a frame: patches on the road, drawn once and used again.
+"""Augmentation by shadows of trees on the road, drawn once and used again.
 
-A shadow is a property of the place where it was recorded; a network that saw few such places takes
-its edges for markings.
+A network trained on few shaded places mistakes the edges of shadows for markings.
 """
 
 from functools import lru_cache
@@ -12,59 +11,59 @@ from numpy.typing import NDArray
 
 from trackfeatures.camera import CameraParameters
 
-SHADES = 64  # shadows to choose from; the first is none
-DARKNESS = (0.3, 0.75)  # of the light, what a shadow takes
-COVERED = (0.15, 0.7)  # of the road
-CELL_M = 0.08  # of the field that shadows are cut from
-LEAVES_CELLS, CROWN_CELLS = 3.0, 14.0  # standard deviations: flecks of light, whole crowns
-FURTHEST_M = 40.0  # beyond it a shadow is even
+SHADOWS = 64  # shadows to choose from; number 0 is none
+DARKNESS = (0.3, 0.75)  # share of the light that a shadow removes
+COVERED = (0.15, 0.7)  # share of the road that is shaded
+CELL_M = 0.08  # of the noise field from which shadows are cut
+LEAF_CELLS, CROWN_CELLS = 3.0, 14.0  # standard deviations of the blur: leaves, crowns
+MAX_DISTANCE_M = 40.0  # beyond it a shadow is uniform
 FIELD = 1024  # cells a side
 
 
-def shade(image: NDArray[np.uint8], camera: CameraParameters, which: int) -> None:
-    """Darken an image (H, W, 3) by shadow number `which`, in place."""
-    cv2.multiply(image, shades(camera)[which], dst=image, scale=1 / 255)
+def add_shadow(image: NDArray[np.uint8], camera: CameraParameters, number: int) -> None:
+    """Darken an image (H, W, 3) by shadow `number`, in place."""
+    cv2.multiply(image, shadow_masks(camera)[number], dst=image, scale=1 / 255)
 
 
 @lru_cache(maxsize=2)
-def shades(camera: CameraParameters) -> NDArray[np.uint8]:
-    """What is left of the light (SHADES, H, W, 3), 255 where there is no shadow."""
+def shadow_masks(camera: CameraParameters) -> NDArray[np.uint8]:
+    """Remaining light (SHADOWS, H, W, 3), 255 where there is no shadow."""
     rng = np.random.default_rng(0)
-    ahead, aside = road_places(camera)
-    drawn = np.full((SHADES, camera.height, camera.width, 3), 255, np.uint8)
-    for which in range(1, SHADES):
+    ahead, left = road_points(camera)
+    masks = np.full((SHADOWS, camera.height, camera.width, 3), 255, np.uint8)
+    for number in range(1, SHADOWS):
         field = _field(rng)
-        turned = rng.uniform(0, 2 * np.pi)
-        u = (ahead * np.cos(turned) - aside * np.sin(turned)) / CELL_M + rng.uniform(0, FIELD)
-        v = (ahead * np.sin(turned) + aside * np.cos(turned)) / CELL_M + rng.uniform(0, FIELD)
+        rotation = rng.uniform(0, 2 * np.pi)
+        u = (ahead * np.cos(rotation) - left * np.sin(rotation)) / CELL_M + rng.uniform(0, FIELD)
+        v = (ahead * np.sin(rotation) + left * np.cos(rotation)) / CELL_M + rng.uniform(0, FIELD)
         shadow = field[u.astype(int) % FIELD, v.astype(int) % FIELD]
-        even = ahead > FURTHEST_M
-        shadow[even] = field.mean()
+        far = ahead > MAX_DISTANCE_M
+        shadow[far] = field.mean()
         shadow = cv2.GaussianBlur(shadow, (3, 3), 0.8)
-        left = 1.0 - rng.uniform(*DARKNESS) * shadow
-        drawn[which] = (255 * left + 0.5).astype(np.uint8)[..., None]
-    return drawn
+        light = 1.0 - rng.uniform(*DARKNESS) * shadow
+        masks[number] = (255 * light + 0.5).astype(np.uint8)[..., None]
+    return masks
 
 
-def road_places(camera: CameraParameters) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Which place of a flat road each pixel shows, (H, W) each: m ahead, m to the left.
+def road_points(camera: CameraParameters) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Point of a flat road that each pixel shows, (H, W) each: m ahead, m to the left.
 
-    Above the horizon and far away: at least `FURTHEST_M` ahead.
+    Pixels above the horizon or far away are more than `MAX_DISTANCE_M` ahead.
     """
     focal = camera.focal_px
     tilt = np.radians(camera.pitch_deg)
     rows, columns = np.mgrid[: camera.height, : camera.width].astype(np.float64)
     down = (rows - (camera.height - 1) / 2) * np.cos(tilt) + focal * np.sin(tilt)
     height = camera.height_above_road_m
-    depth = focal * height / np.maximum(down, focal * height / (2 * FURTHEST_M))
+    depth = focal * height / np.maximum(down, focal * height / (2 * MAX_DISTANCE_M))
     return depth, -(columns - (camera.width - 1) / 2) * depth / focal
 
 
 def _field(rng: np.random.Generator) -> NDArray[np.float32]:
-    """A field of shadow (FIELD, FIELD) in [0, 1] that repeats without a seam."""
+    """Shadow density (FIELD, FIELD) in [0, 1], periodic in both directions."""
     noise = rng.standard_normal((FIELD, FIELD)).astype(np.float32)
     total = np.zeros_like(noise)
-    for deviation, weight in ((CROWN_CELLS, 1.0), (LEAVES_CELLS, rng.uniform(0.1, 0.9))):
+    for deviation, weight in ((CROWN_CELLS, 1.0), (LEAF_CELLS, rng.uniform(0.1, 0.9))):
         wide = np.pad(noise, 64, mode="wrap")
         smooth = cv2.GaussianBlur(wide, (0, 0), deviation)[64:-64, 64:-64]
         total += weight * smooth / smooth.std()

@@ -1,1 +1,1 @@
-"""Reading an image of unknown origin: structure first, then limits, then pixels."""
+"""Decoding images from untrusted sources: structure and limits are checked before pixels."""

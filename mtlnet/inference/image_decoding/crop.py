@@ -1,8 +1,8 @@
-"""Which part of a picture shows what the model's camera shows: pinhole geometry, centred.
+"""The part of an image that shows the field of view of the model's camera (pinhole, centred).
 
-The model learned metres and radians from one view. A picture that is stretched, or seen through
-another lens, gives wrong ones without a sign of it; so the model's view is cut out of a larger
-one, and a picture that does not hold it is refused.
+A model was trained with one camera: a stretched image, or one of another field of view, would give
+wrong distances and angles without any error. So a wider image is cropped to the camera's field of
+view, and a narrower one is refused.
 """
 
 from dataclasses import dataclass
@@ -11,12 +11,12 @@ from math import radians, tan
 from mtlnet.inference.image_decoding.errors import Fault, ImageError
 from trackfeatures.camera import CameraParameters
 
-TOLERANCE = 0.01  # of width and height: rounding to whole pixels, and small errors of calibration
+TOLERANCE = 0.01  # of width and height, for rounding to whole pixels and small calibration errors
 
 
 @dataclass(frozen=True, slots=True)
 class Box:
-    """A part of a picture, px."""
+    """A rectangle of an image, px."""
 
     left: int
     top: int
@@ -24,14 +24,14 @@ class Box:
     height: int
 
 
-def visible(
+def crop_box(
     width: int, height: int, view: CameraParameters, fov_y_deg: float | None = None
 ) -> Box | None:
-    """The part of a width x height picture that shows `view`; None: all of it does.
+    """The part of a width x height image that `view` shows; None: all of it.
 
-    `fov_y_deg` is the vertical field of view of the picture, None: the view's own. A pinhole camera
-    with focal length f px shows 2 f tan(fov/2) px. Raises ImageError where the picture shows less
-    than the view.
+    `fov_y_deg` is the vertical field of view of the image, None: that of `view`. A pinhole camera
+    of focal length f px shows 2 f tan(fov/2) px. Raises ImageError when the image shows less than
+    `view`.
     """
     ratio = 1.0
     if fov_y_deg is not None:
@@ -57,11 +57,11 @@ def _too_narrow(
             Fault.ASPECT,
             f"the image is {width} x {height} px (width / height {width / height:.3f}), the "
             f"model's camera gives {shape}; a wider image is cropped to it, a narrower one cannot "
-            "be: give the whole view of such a camera, at any size",
+            "be: give the whole image of such a camera, at any size",
         )
     return ImageError(
         Fault.FIELD_OF_VIEW,
         f"the image is {width} x {height} px with a vertical field of view of {fov_y_deg:g} "
         f"degrees, the model's camera gives {shape} with {view.fov_y_deg:g}: such an image does "
-        "not hold all that the model must see; use a wider lens",
+        "not show all that the model needs; use a wider lens",
     )

@@ -1,9 +1,9 @@
-"""Everything between an image's bytes and pixels the model may see: limits, header, strict decode.
+"""From an image file's bytes to the model's input: limits, header, strict decoding, scaling.
 
-Free of torch; `mtlnet predict` and `serve` see the same pixels. The size of an image is read from
-its header before anything is decoded: a PNG of 31 KB can ask for 1.5 GB. A wider picture is cropped
-to the model's view (`mtlnet.inference.image_decoding.crop`). Rotation marks (EXIF) are ignored,
-alpha is dropped, grey becomes RGB, 16 bits become 8.
+Used by `mtlnet predict` and `serve`, which so get the same pixels. The size is read from the header
+before decoding: a PNG of 31 KB can need 1.5 GB. A wider image is cropped to the model's field of
+view (`mtlnet.inference.image_decoding.crop`). EXIF orientation is ignored, alpha is dropped, grey
+becomes RGB, 16 bits become 8.
 """
 
 from dataclasses import dataclass
@@ -16,19 +16,19 @@ from numpy.typing import NDArray
 
 from mtlnet.inference.image_decoding import jpeg_structure as jpeg
 from mtlnet.inference.image_decoding import png_structure as png
-from mtlnet.inference.image_decoding.crop import visible
+from mtlnet.inference.image_decoding.crop import crop_box
 from mtlnet.inference.image_decoding.errors import Fault, ImageError
 from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
 
 MAX_FILE_BYTES = 32 << 20
 MIN_SIDE_PX, MAX_SIDE_PX, MAX_PIXELS = 16, 4096, 8_400_000
-MAX_TRAILING_BYTES = 64  # what some cameras pad with; more is another file behind the picture
+MAX_TRAILING_BYTES = 64  # padding of some cameras; more could be another file
 
 
 @dataclass(frozen=True, slots=True)
 class ImageHeader:
-    """What an image says of itself; `png_header` is set for a PNG."""
+    """Size of an image, px; `png_header` is set for a PNG."""
 
     width: int
     height: int
@@ -38,8 +38,8 @@ class ImageHeader:
 def read_image(path: Path, view: CameraParameters) -> NDArray[np.uint8]:
     """The JPEG or PNG at `path` as uint8 RGB (view.height, view.width, 3).
 
-    Another size is scaled, a wider picture cropped; a narrower one is refused, for it does not
-    show all of the view. Raises ImageError, or UserError where there is no file to read.
+    It is scaled, and cropped if wider than the view. Raises ImageError for an image that cannot be
+    used, UserError for a missing or too large file.
     """
     if not path.is_file():
         raise UserError(f"there is no image file {path}")
@@ -56,9 +56,9 @@ def read_image(path: Path, view: CameraParameters) -> NDArray[np.uint8]:
 
 
 def inspect(body: bytes, view: CameraParameters, fov_y_deg: float | None = None) -> ImageHeader:
-    """The header of an image that may be decoded for a model of this view.
+    """The header of an image, checked against all limits before decoding.
 
-    `fov_y_deg`: the image's own vertical field of view, None: the view's. Raises ImageError.
+    `fov_y_deg`: the image's vertical field of view, None: that of `view`. Raises ImageError.
     """
     if body.startswith(png.SIGNATURE):
         found = png.read_header(body)
@@ -69,40 +69,40 @@ def inspect(body: bytes, view: CameraParameters, fov_y_deg: float | None = None)
         seen = f"{len(body)} bytes that begin with {body[:8]!r}" if body else "nothing at all"
         raise ImageError(Fault.NOT_AN_IMAGE, f"no JPEG or PNG file, but {seen}")
     check_size(header.width, header.height)
-    visible(header.width, header.height, view, fov_y_deg)
+    crop_box(header.width, header.height, view, fov_y_deg)
     return header
 
 
 def _inspect_jpeg(body: bytes) -> ImageHeader:
     try:
-        # The decoder's own reading of the header: it cannot differ from what it decodes later.
+        # The decoder's own header reader, so that sizes cannot differ from the decoded image.
         height, width, colours, _ = simplejpeg.decode_jpeg_header(body)
     except ValueError as error:
         raise _damaged_jpeg(error) from error
     if colours not in ("Gray", "YCbCr", "RGB"):
         raise ImageError(Fault.UNSUPPORTED, f"the JPEG's colours are {colours}; save it in RGB")
-    check_trailing(len(body) - jpeg.end(body))
+    check_trailing(len(body) - jpeg.jpeg_length(body))
     return ImageHeader(width, height)
 
 
 def check_trailing(count: int) -> None:
-    """Raise ImageError when `count` bytes behind the end of a picture are too many."""
+    """Raise ImageError when more than `MAX_TRAILING_BYTES` follow the end of the image."""
     if count > MAX_TRAILING_BYTES:
         raise ImageError(
             Fault.TRAILING,
-            f"{count} bytes follow the end of the picture, at most {MAX_TRAILING_BYTES} are "
-            "taken; send the picture alone",
+            f"{count} bytes follow the end of the image, at most {MAX_TRAILING_BYTES} are "
+            "accepted; send the image alone",
         )
 
 
 def check_size(width: int, height: int) -> None:
-    """Raise ImageError unless a picture of so many px is taken."""
+    """Raise ImageError unless an image of that size (px) is within the limits."""
     sides = min(width, height) >= MIN_SIDE_PX and max(width, height) <= MAX_SIDE_PX
     if not sides or width * height > MAX_PIXELS:
         raise ImageError(
             Fault.SIZE,
             f"the image is {width} x {height} px; {MIN_SIDE_PX} to {MAX_SIDE_PX} px a side and at "
-            f"most {MAX_PIXELS / 1e6:.1f} million px are taken: scale it to the model's camera",
+            f"most {MAX_PIXELS / 1e6:.1f} million px are accepted: scale it to the model's camera",
         )
 
 
@@ -122,14 +122,14 @@ def decode(
             f"the image decodes to {image.shape[1]} x {image.shape[0]} px, its header says "
             f"{header.width} x {header.height}; save it anew",
         )
-    return fit(image, view, fov_y_deg)
+    return crop_and_resize(image, view, fov_y_deg)
 
 
-def fit(
+def crop_and_resize(
     image: NDArray[np.uint8], view: CameraParameters, fov_y_deg: float | None = None
 ) -> NDArray[np.uint8]:
     """An image (H, W, 3) cropped and scaled to (view.height, view.width, 3). Raises ImageError."""
-    box = visible(image.shape[1], image.shape[0], view, fov_y_deg)
+    box = crop_box(image.shape[1], image.shape[0], view, fov_y_deg)
     if box is not None:
         image = image[box.top : box.top + box.height, box.left : box.left + box.width]
     if image.shape[:2] == (view.height, view.width):

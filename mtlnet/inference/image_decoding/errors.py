@@ -1,4 +1,4 @@
-"""Why an image is not taken: one error with a kind, which `serve` maps to HTTP."""
+"""The error for an image that cannot be used, with a kind that `serve` maps to HTTP."""
 
 from enum import StrEnum
 
@@ -18,7 +18,7 @@ class Fault(StrEnum):
 
 
 class ImageError(UserError):
-    """Bytes that are no image this model can read; `fault` says of which kind."""
+    """An image that this model cannot use; `fault` is the kind of reason."""
 
     def __init__(self, fault: Fault, message: str) -> None:
         super().__init__(message)

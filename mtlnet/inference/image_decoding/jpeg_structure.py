@@ -1,7 +1,7 @@
-"""Reading a JPEG's structure before anything is decoded: where it ends, and how many scans it has.
+"""The structure of a JPEG, checked before decoding: its end and its number of scans.
 
-Source: ITU-T T.81, annex B. The decoder stops at the end mark and says nothing of what follows;
-here that is found, and with it a second file hidden behind the picture.
+Source: ITU-T T.81, annex B. The decoder stops at the end marker and ignores what follows; here the
+end is found, so that a file appended to the image is detected.
 """
 
 import re
@@ -11,14 +11,14 @@ from mtlnet.inference.image_decoding.errors import Fault, ImageError
 START = b"\xff\xd8"
 SIGNATURE = b"\xff\xd8\xff"
 SOS, EOI = 0xDA, 0xD9
-# In entropy-coded data FF 00 is a byte FF, FF D0 to D7 a restart, FF FF a filling byte.
+# In entropy-coded data FF 00 is a byte FF, FF D0 to D7 a restart marker, FF FF a fill byte.
 MARKER = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")
-MAX_SCANS = 100  # a progressive JPEG has about ten; each more costs a pass over all pixels
+MAX_SCANS = 100  # a progressive JPEG has about ten; each costs a pass over all pixels
 MAX_SEGMENTS = 1_000
 
 
-def end(body: bytes) -> int:
-    """The length of the JPEG that begins `body`, its end mark included. Raises ImageError."""
+def jpeg_length(body: bytes) -> int:
+    """Length of the JPEG at the start of `body`, with its end marker. Raises ImageError."""
     at, scans = len(START), 0
     for _ in range(MAX_SEGMENTS):
         at, marker = _marker(body, at)
@@ -40,7 +40,7 @@ def end(body: bytes) -> int:
 
 
 def _marker(body: bytes, at: int) -> tuple[int, int]:
-    """(the byte behind the marker at `at`, the marker's code)."""
+    """(Offset after the marker at offset `at`, the marker's code)."""
     if at + 2 > len(body):
         raise _ends_early(body)
     if body[at] != 0xFF:
@@ -64,5 +64,5 @@ def _length(body: bytes, at: int) -> int:
 def _ends_early(body: bytes) -> ImageError:
     return ImageError(
         Fault.DAMAGED,
-        f"the JPEG ends after {len(body)} bytes, before its end mark; give the whole file",
+        f"the JPEG ends after {len(body)} bytes, before its end marker; give the whole file",
     )

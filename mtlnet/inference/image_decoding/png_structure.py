@@ -1,8 +1,8 @@
-"""Reading a PNG's structure before anything is decoded: header, checksums, amount of pixel data.
+"""The structure of a PNG, checked before decoding: header, checksums, amount of pixel data.
 
-Source: PNG specification, third edition (W3C). Decoders differ in what damage they let pass and in
-what they make of side chunks (rotation, animation, colour profiles); `critical_chunks` takes both
-away from them.
+Source: PNG specification, third edition (W3C). Decoders differ in the damage they accept and in
+their use of ancillary chunks (orientation, animation, colour profiles). `critical_chunks` checks
+the former and removes the latter.
 """
 
 import struct
@@ -12,10 +12,10 @@ from dataclasses import dataclass
 from mtlnet.inference.image_decoding.errors import Fault, ImageError
 
 SIGNATURE = b"\x89PNG\r\n\x1a\n"
-MAX_CHUNKS = 10_000  # 4 MiB in the 8 KiB chunks that encoders write are 512
+MAX_CHUNKS = 10_000  # encoders write chunks of about 8 KiB: 512 for 4 MiB
 CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}  # by colour type
 DEPTHS = {0: (1, 2, 4, 8, 16), 2: (8, 16), 3: (1, 2, 4, 8), 4: (8, 16), 6: (8, 16)}
-# First column and row, then steps, of the seven passes of Adam7.
+# First column, first row, column step, row step of the seven Adam7 passes.
 PASSES = (
     (0, 0, 8, 8),
     (4, 0, 8, 8),
@@ -39,7 +39,7 @@ class PngHeader:
     interlaced: bool
 
     def passes(self) -> list[tuple[int, int]]:
-        """(rows, bytes a row without the filter byte) of each pass over the image."""
+        """(rows, bytes of a row without the filter byte) of each pass."""
         steps = PASSES if self.interlaced else ((0, 0, 1, 1),)
         sizes = []
         for column, row, across, down in steps:
@@ -62,13 +62,14 @@ def read_header(body: bytes) -> PngHeader:
         raise ImageError(
             Fault.UNSUPPORTED,
             f"the PNG's header asks for colour type {colour} with {depth} bits, compression "
-            f"{compression}, filter {filtering}, interlace {interlace}, which PNG does not know",
+            f"{compression}, filter {filtering}, interlace {interlace}, which PNG does not define; "
+            "save it anew",
         )
     return PngHeader(width, height, colour, depth * CHANNELS[colour], bool(interlace))
 
 
 def critical_chunks(body: bytes, header: PngHeader) -> tuple[bytes, int]:
-    """(the same image with nothing but header, palette and pixels, all checked; where it ends).
+    """(The PNG with only header, palette and pixel chunks, all checked; its end in `body`).
 
     Raises ImageError.
     """
@@ -82,7 +83,7 @@ def critical_chunks(body: bytes, header: PngHeader) -> tuple[bytes, int]:
             kept.append(view[at:end])
             if kind == b"IDAT":
                 pixels.append(view[at + 8 : end - 4])
-        elif not kind[0] & 0x20:  # bit 5 clear: a decoder that does not know it must stop
+        elif not kind[0] & 0x20:  # bit 5 clear: a critical chunk, which a decoder must not skip
             raise ImageError(
                 Fault.UNSUPPORTED, f"the PNG needs the unknown chunk {kind!r}; save it as plain PNG"
             )
@@ -96,11 +97,11 @@ def critical_chunks(body: bytes, header: PngHeader) -> tuple[bytes, int]:
 
 
 def _check_chunk(view: memoryview, at: int) -> tuple[int, bytes]:
-    """(end, type) of the chunk that begins at byte `at`."""
+    """(End, type) of the chunk at offset `at`; its checksum is verified."""
     if at + 12 > len(view):
         raise ImageError(
             Fault.DAMAGED,
-            f"the PNG ends after {len(view)} bytes, before its end mark; give the whole file",
+            f"the PNG ends after {len(view)} bytes, before its end chunk; give the whole file",
         )
     length = int.from_bytes(view[at : at + 4], "big")
     end = at + 12 + length
@@ -118,7 +119,7 @@ def _check_pixels(compressed: bytes, header: PngHeader) -> None:
     expected = sum(rows * (1 + row_bytes) for rows, row_bytes in header.passes())
     inflater = zlib.decompressobj()
     try:
-        # Never more than the header promised: the limit on dimensions is then one on memory.
+        # At most one byte more than the header declares, so that the size limits bound the memory.
         raw = inflater.decompress(compressed, expected + 1)
     except zlib.error as error:
         raise ImageError(

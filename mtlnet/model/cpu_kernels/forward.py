@@ -1,8 +1,6 @@
-"""The network's forward pass in training on a CPU: the same sums as `Network.forward`, faster.
+"""Forward pass of the paper's network in training on a CPU: the same as `Network.forward`, faster.
 
-Three layouts make the difference: `mtlnet.model.cpu_kernels.space_to_depth`,
-`mtlnet.model.cpu_kernels.im2col` and `mtlnet.model.cpu_kernels.norm_pool_relu`. In evaluation, and
-on a GPU, the network computes as written.
+It uses the other modules of this folder. In evaluation, and on a GPU, `Network.forward` is used.
 """
 
 from collections.abc import Sequence
@@ -12,30 +10,33 @@ from torch import Tensor, nn
 from torch.nn.functional import conv2d, linear, max_pool2d, relu
 
 from mtlnet.model.architecture import FEATURES, SHARED, Conv, Pool, same_padding
-from mtlnet.model.cpu_kernels.im2col import column_convolution
+from mtlnet.model.cpu_kernels.im2col import im2col_convolution
 from mtlnet.model.cpu_kernels.norm_pool_relu import norm_pool_relu, pool_arguments
-from mtlnet.model.cpu_kernels.space_to_depth import block_convolution, to_blocks
+from mtlnet.model.cpu_kernels.space_to_depth import space_to_depth, space_to_depth_convolution
 from mtlnet.model.network import Network
 
-MOST_COLUMN_PLACES = 64
-"""Images of at most so many places are convolved by `column_convolution`."""
+MAX_IM2COL_PIXELS = 64
+"""Feature maps of at most so many pixels are convolved by `im2col_convolution`."""
 
 
 def training_outputs(
     network: Network, images: Tensor, dtype: torch.dtype, masks: Sequence[Tensor] = ()
 ) -> Tensor:
-    """Images (B, 210, 280, 3) uint8 -> (B, 9) float32, computed in `dtype`; see `describe`."""
-    return network.answer(describe(network, images, dtype, masks))
+    """Images (B, 210, 280, 3) uint8 -> (B, 9) float32, computed in `dtype`.
+
+    `masks`: see `forward_features`.
+    """
+    return network.forward_heads(forward_features(network, images, dtype, masks))
 
 
-def describe(
+def forward_features(
     network: Network, images: Tensor, dtype: torch.dtype, masks: Sequence[Tensor] = ()
 ) -> Tensor:
     """The last shared features (B, 256) of images (B, 210, 280, 3) uint8, in `dtype`.
 
-    `masks`: what dropout leaves of each shared layer (B, units), already scaled up; none: all.
+    `masks`: dropout masks (B, units) of the shared layers, already scaled; none: no dropout.
     """
-    x = to_blocks(images, dtype)
+    x = space_to_depth(images, dtype)
     for number, spec in enumerate(FEATURES):
         if isinstance(spec, Conv):
             after = FEATURES[number + 1] if number + 1 < len(FEATURES) else None
@@ -68,11 +69,11 @@ def _layer(x: Tensor, number: int, spec: Conv, pool: Pool | None, block: nn.Modu
 
 def _convolve(x: Tensor, number: int, spec: Conv, weight: Tensor, bias: Tensor | None) -> Tensor:
     if number == 0:
-        return block_convolution(x, weight, bias, x.dtype)
+        return space_to_depth_convolution(x, weight, bias, x.dtype)
     weight = weight.to(x.dtype)
     height, width = x.shape[2:]
-    if height * width <= MOST_COLUMN_PLACES:
-        y = column_convolution(x, weight, spec.stride)
+    if height * width <= MAX_IM2COL_PIXELS:
+        y = im2col_convolution(x, weight, spec.stride)
         return y if bias is None else y + bias.to(x.dtype)[:, None, None]
     (_, top, bottom), (_, left, right) = (
         same_padding(size, spec.kernel, spec.stride) for size in (height, width)

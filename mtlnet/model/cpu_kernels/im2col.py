@@ -1,8 +1,8 @@
-"""A convolution of a small image as one matrix product.
+"""Convolution of a small feature map as one matrix product (im2col).
 
-The last three convolutions see at most 7 x 9 places: there a CPU's convolution spends its time on
-reordering weights, of which they have most. A product of the windows, laid side by side, with the
-weights as they lie in memory takes a sixth of the time.
+The last three convolutions have inputs of at most 7 x 9 pixels and most of the weights. There a
+CPU's convolution spends most of its time on reordering weights; im2col, which uses the weights as
+they are stored, takes a sixth of the time.
 """
 
 from typing import Any
@@ -13,7 +13,7 @@ from torch import Tensor
 from mtlnet.model.architecture import same_padding
 
 
-class _Columns(torch.autograd.Function):
+class _Im2colConvolution(torch.autograd.Function):
     """x (B, H, W, C), weight (F, k, k, C) -> (B, h, w, F), SAME padding."""
 
     @staticmethod
@@ -37,7 +37,7 @@ class _Columns(torch.autograd.Function):
         count, out_h, out_w, filters = gradient.shape
         k, stride, (top, left) = weight.shape[1], ctx.stride, ctx.corner
         flat = gradient.reshape(-1, filters)
-        to_weight = (flat.t() @ columns).view(weight.shape)
+        weight_gradient = (flat.t() @ columns).view(weight.shape)
         parts = (flat @ weight.reshape(filters, -1)).view(count, out_h, out_w, k, k, -1)
         padded = gradient.new_zeros(ctx.padded)
         for i in range(k):
@@ -46,11 +46,11 @@ class _Columns(torch.autograd.Function):
                 cells = slice(j, j + stride * (out_w - 1) + 1, stride)
                 padded[:, rows, cells] += parts[:, :, :, i, j]
         _, height, width, _ = ctx.shape
-        return padded[:, top : top + height, left : left + width], to_weight, None
+        return padded[:, top : top + height, left : left + width], weight_gradient, None
 
 
-def column_convolution(x: Tensor, weight: Tensor, stride: int) -> Tensor:
+def im2col_convolution(x: Tensor, weight: Tensor, stride: int) -> Tensor:
     """`x` (B, C, H, W) and `weight` (F, C, k, k), both channels-last -> (B, F, h, w), SAME."""
-    places = _Columns.apply(x.permute(0, 2, 3, 1), weight.permute(0, 2, 3, 1), stride)
-    out: Tensor = places.permute(0, 3, 1, 2)
+    out_nhwc = _Im2colConvolution.apply(x.permute(0, 2, 3, 1), weight.permute(0, 2, 3, 1), stride)
+    out: Tensor = out_nhwc.permute(0, 3, 1, 2)
     return out

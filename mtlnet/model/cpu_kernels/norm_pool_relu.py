@@ -1,8 +1,8 @@
-"""Batch normalisation, max-pooling and ReLU of a layer in training, in this order's cheapest form.
+"""Fused batch normalisation, max pooling and ReLU in training.
 
-max(relu(a x + b)) = relu(a max(x) + b) for a >= 0, so the layer is pooled first and three quarters
-of the work is never done; where a is negative, the caller turns the sign of the filter and of a.
-Statistics are those of the batch of all processes together (Ioffe and Szegedy 2015, algorithm 1).
+max(relu(a x + b)) = relu(a max(x) + b) for a >= 0, so pooling comes first and saves three quarters
+of the work; where a is negative, the caller negates the filter and a. Statistics are those of the
+batch over all processes (Ioffe and Szegedy 2015, algorithm 1).
 """
 
 from typing import Any
@@ -18,9 +18,9 @@ native = torch.ops.aten
 
 
 def pool_arguments(height: int, width: int, pool: Pool) -> dict[str, Any]:
-    """Arguments of `max_pool2d` for SAME padding: before by `padding`, after by `ceil_mode`.
+    """Arguments of `max_pool2d` for SAME padding: `padding` before, `ceil_mode` after.
 
-    Padding with nothing equals the padding with zeros of `mtlnet.model.network`, before a ReLU.
+    Before a ReLU it equals the zero padding of `mtlnet.model.network`.
     """
     before = [same_padding(size, pool.kernel, pool.stride)[1] for size in (height, width)]
     return {
@@ -32,13 +32,16 @@ def pool_arguments(height: int, width: int, pool: Pool) -> dict[str, Any]:
 
 
 def statistics(x: Tensor) -> tuple[Tensor, Tensor, int]:
-    """Mean, (biased) variance (C,), float32 for bf16, and number of the values x (B, C, H, W)."""
+    """Mean (C,), biased variance (C,) and count of values x (B, C, H, W), over all processes.
+
+    float32 for x in bf16.
+    """
     unused = torch.zeros(2, x.shape[1], dtype=torch.promote_types(x.dtype, torch.float32))
     mean, variance = native.batch_norm_update_stats(x, unused[0], unused[1], 0.0)
     count = x.numel() // x.shape[1]
     if not dist.is_initialized() or dist.get_world_size() == 1:
         return mean, variance, count
-    world = dist.get_world_size()  # each process has as many images
+    world = dist.get_world_size()  # each process has the same number of images
     moments = torch.stack([mean, variance + mean.square()]).double()
     dist.all_reduce(moments)
     moments /= world
@@ -70,21 +73,30 @@ class _NormPoolRelu(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, Tensor, Tensor, None, None, None]:
         x, pooled, y, gain, mean, variance, places = ctx.saved_tensors
-        open_ = native.threshold_backward(gradients[0], y, 0)
+        relu_gradient = native.threshold_backward(gradients[0], y, 0)
         deviation = torch.sqrt(variance + ctx.eps)
-        direct, to_gain, to_shift = native.native_batch_norm_backward(
-            open_, pooled, gain, mean, variance, None, None, False, ctx.eps, [True, True, True]
+        direct, gain_gradient, shift_gradient = native.native_batch_norm_backward(
+            relu_gradient,
+            pooled,
+            gain,
+            mean,
+            variance,
+            None,
+            None,
+            False,
+            ctx.eps,
+            [True, True, True],
         )
         if ctx.pool is not None:
             direct = _unpool(direct, x, ctx.pool, places)
-        sums = torch.stack([to_gain, to_shift])
+        sums = torch.stack([gain_gradient, shift_gradient])
         if dist.is_initialized() and dist.get_world_size() > 1:
             dist.all_reduce(sums)
-        # What x does through the mean and the variance: -(a / n) (sum(g) + z sum(g z)), where
+        # Gradient through the mean and the variance: -(a / n) (sum(g) + z sum(g z)), where
         # a = gain / deviation and z = (x - mean) / deviation: an affine function of x.
         a = -gain / deviation / ctx.count
         through = batch_norm(x, mean, variance, a * sums[0], a * sums[1], False, 0.0, ctx.eps)
-        return direct.add_(through), to_gain, to_shift, None, None, None
+        return direct.add_(through), gain_gradient, shift_gradient, None, None, None
 
 
 def _unpool(gradient: Tensor, x: Tensor, pool: dict[str, Any], places: Tensor) -> Tensor:
@@ -102,12 +114,13 @@ def _unpool(gradient: Tensor, x: Tensor, pool: dict[str, Any], places: Tensor) -
 
 
 def norm_pool_relu(x: Tensor, sign: Tensor, norm: nn.BatchNorm2d, pool: Pool | None) -> Tensor:
-    """Normalise x (B, C, H, W) = `sign` (C,) times the layer's sums; pool, ReLU.
+    """Batch normalisation, max pooling and ReLU of x (B, C, H, W).
 
-    Moves the running statistics of `norm` as torch does, or takes them when it is in evaluation.
+    x is the convolution's output times `sign` (C,), the sign of the normalisation's gain. Updates
+    the running statistics of `norm` like torch, or uses them if `norm` is in evaluation mode.
     """
     if not norm.training:
-        return _settled(x, sign, norm, pool)
+        return _frozen_norm_pool_relu(x, sign, norm, pool)
     with torch.no_grad():
         mean, variance, count = statistics(x)
         momentum = norm.momentum or 0.0
@@ -123,7 +136,9 @@ def norm_pool_relu(x: Tensor, sign: Tensor, norm: nn.BatchNorm2d, pool: Pool | N
     return out
 
 
-def _settled(x: Tensor, sign: Tensor, norm: nn.BatchNorm2d, pool: Pool | None) -> Tensor:
+def _frozen_norm_pool_relu(
+    x: Tensor, sign: Tensor, norm: nn.BatchNorm2d, pool: Pool | None
+) -> Tensor:
     assert norm.running_mean is not None
     pooled = x if pool is None else max_pool2d(x, **pool_arguments(x.shape[2], x.shape[3], pool))
     mean, gain = norm.running_mean * sign, norm.weight * sign

@@ -17,7 +17,7 @@ from controllers.demo.process import run_module
 from controllers.demo.report import verdicts
 from controllers.demo.run import run_demo
 from controllers.demo.tables import print_tables
-from mtlnet.inference.overlay import SCALE, draw_answer, marking_line, to_pixels
+from mtlnet.inference.overlay import SCALE, draw_overlay, marking_line, to_pixels
 from trackfeatures import UserError
 from trackfeatures.camera import CameraParameters
 
@@ -48,8 +48,8 @@ def test_a_marking_in_a_left_bend_curves_left() -> None:
 
 def test_absent_distances_are_not_drawn() -> None:
     frame = np.zeros((100, 200, 3), np.uint8)
-    empty = draw_answer(frame, CAMERA, 1.0, 0.0, (NOTHING, 0.0), (NOTHING, 0.0))
-    drawn = draw_answer(frame, CAMERA, 1.0, 0.0, (NOTHING, 0.0), ({**NOTHING, "mr": 2.0}, 0.0))
+    empty = draw_overlay(frame, CAMERA, 1.0, 0.0, (NOTHING, 0.0), (NOTHING, 0.0))
+    drawn = draw_overlay(frame, CAMERA, 1.0, 0.0, (NOTHING, 0.0), ({**NOTHING, "mr": 2.0}, 0.0))
     changed = (drawn != empty).any(axis=2)
     assert changed[:, : 200 * SCALE // 2].sum() == 0, "nothing on the left half of the frame"
     red, _, blue = drawn[changed].astype(int).T

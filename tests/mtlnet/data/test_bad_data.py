@@ -1,4 +1,4 @@
-"""Data that cannot be learned from or judged on: one line that names it, and nothing made."""
+"""Datasets that cannot be used: one error message that says why, and no files written."""
 
 import json
 import shutil
@@ -10,7 +10,7 @@ import pytest
 
 from datagen.recording import Dataset, UndecodableImage
 from datagen.recording.splits import Split, split_path, write_split
-from mtlnet.data.sources import undecodable
+from mtlnet.data.sources import find_undecodable
 from mtlnet.evaluation.ablation import AblationConfig, rows_of
 from mtlnet.evaluation.ablation_run import ablate
 from mtlnet.evaluation.evaluate import evaluate
@@ -23,7 +23,7 @@ from trackfeatures.errors import UserError
 
 
 def damage(folder: Path, name: str, frame: int) -> None:
-    """Spoil the picture data of one image of a round, in its file."""
+    """Overwrite part of the JPEG data of one image in a round's file."""
     frames = Dataset.open(folder).select("all")
     first = [info.id for info in frames.rounds].index(name) * FRAMES
     jpeg = bytes(frames.jpeg(first + frame))
@@ -31,9 +31,9 @@ def damage(folder: Path, name: str, frame: int) -> None:
     content = path.read_bytes()
     assert content.count(jpeg) == 1
     at, middle = content.index(jpeg), len(jpeg) // 2
-    spoilt = content[: at + middle] + b"\xff\xd9" * 40 + content[at + middle + 80 :]
-    path.unlink()  # what is mapped must not be cut
-    path.write_bytes(spoilt)
+    damaged_content = content[: at + middle] + b"\xff\xd9" * 40 + content[at + middle + 80 :]
+    path.unlink()  # the old file may be memory-mapped
+    path.write_bytes(damaged_content)
 
 
 @pytest.fixture
@@ -59,15 +59,15 @@ def judge(published: Path, data: Path, split: str) -> dict[str, Any]:
     return evaluate([load_engine(published, precision="f32")], data, split)
 
 
-def test_undecodable_images_are_found_where_they_are(damaged: Path) -> None:
+def test_undecodable_images_are_found_by_round_and_frame(damaged: Path) -> None:
     frames = Dataset.open(damaged).select("train")
-    found = undecodable(frames)
+    found = find_undecodable(frames)
     assert sorted(found) == [7, 2 * FRAMES + 20]
     assert {(e.round_id, e.frame) for e in found.values()} == {("r000", 7), ("r002", 20)}
     rest = frames.without(found)
     assert len(rest) == len(frames) - 2
-    assert undecodable(rest) == {}
-    # What comes after the gap is still the frame it was, with its labels.
+    assert find_undecodable(rest) == {}
+    # Frames after the gap keep their images and labels.
     np.testing.assert_array_equal(rest.image(7), frames.image(8))
     kept = np.delete(frames.labels.distances, sorted(found), axis=0)
     np.testing.assert_array_equal(rest.labels.distances, kept)
@@ -76,7 +76,9 @@ def test_undecodable_images_are_found_where_they_are(damaged: Path) -> None:
 
 
 @pytest.mark.usefixtures("small_network")
-def test_training_refuses_them_unless_told_to_skip(damaged: Path, tmp_path: Path) -> None:
+def test_training_refuses_undecodable_images_without_skip_option(
+    damaged: Path, tmp_path: Path
+) -> None:
     out = tmp_path / "run"
     seen = (
         rf"2 of {3 * FRAMES} images in .*damaged cannot be decoded: image 7 of round r000, "
@@ -96,7 +98,7 @@ def test_training_refuses_them_unless_told_to_skip(damaged: Path, tmp_path: Path
 
 
 @pytest.mark.usefixtures("small_network")
-def test_nothing_is_left_when_all_are_damaged(dataset: Path, tmp_path: Path) -> None:
+def test_training_fails_when_all_images_are_undecodable(dataset: Path, tmp_path: Path) -> None:
     folder = shutil.copytree(dataset, tmp_path / "data")
     write_split(split_path(folder), Split(("r001",), ("r003",)))
     for frame in range(FRAMES):
@@ -106,13 +108,13 @@ def test_nothing_is_left_when_all_are_damaged(dataset: Path, tmp_path: Path) -> 
     assert not (tmp_path / "run").exists()
 
 
-def test_evaluation_counts_them(damaged: Path, published: Path) -> None:
+def test_evaluation_names_undecodable_images(damaged: Path, published: Path) -> None:
     damage(damaged, "r003", 11)
     with pytest.raises(UserError, match=rf"2 of {FRAMES} images .* image 2 of round r003, image"):
         judge(published, damaged, "test")
 
 
-def test_an_ablation_looks_at_both_sides_first(damaged: Path, tmp_path: Path) -> None:
+def test_ablation_checks_train_and_test_images_first(damaged: Path, tmp_path: Path) -> None:
     with pytest.raises(UserError, match=rf"2 of {3 * FRAMES} images .* image 7 of round r000"):
         ablation(damaged, tmp_path / "out")
     write_split(split_path(damaged), Split(("r001",), ("r003",)))
@@ -121,7 +123,9 @@ def test_an_ablation_looks_at_both_sides_first(damaged: Path, tmp_path: Path) ->
     assert not (tmp_path / "out").exists()
 
 
-def test_labels_of_another_version(dataset: Path, published: Path, tmp_path: Path) -> None:
+def test_labels_of_another_definitions_version_are_refused(
+    dataset: Path, published: Path, tmp_path: Path
+) -> None:
     folder = shutil.copytree(dataset, tmp_path / "data")
     write_round(folder, "r009", 9, definitions="0-old")
     seen = r"r009.mcap was made with version '0-old' of the track-feature definitions, .* '1'; make"
@@ -135,7 +139,9 @@ def test_labels_of_another_version(dataset: Path, published: Path, tmp_path: Pat
     assert not (tmp_path / "out").exists()
 
 
-def test_no_frames_in_the_split(dataset: Path, published: Path, tmp_path: Path) -> None:
+def test_a_split_side_without_rounds_is_refused(
+    dataset: Path, published: Path, tmp_path: Path
+) -> None:
     folder = shutil.copytree(dataset, tmp_path / "data")
     write_split(split_path(folder), Split((), TRAIN))
     with pytest.raises(UserError, match="4 rounds but none for train; collect more"):

@@ -1,4 +1,4 @@
-"""A user's own images: what labels.csv may say, and what of it is refused, by line."""
+"""A user's own images: valid `labels.csv` files, and error messages that name the faulty line."""
 
 from pathlib import Path
 
@@ -7,7 +7,12 @@ import numpy as np
 import pytest
 
 import trackfeatures as tf
-from mtlnet.data.custom_images import MARKING_LIMITS_M, OwnImages, open_own_images, read_labels
+from mtlnet.data.custom_images import (
+    MARKING_LIMITS_M,
+    CustomImages,
+    open_custom_images,
+    read_labels,
+)
 from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
 
@@ -26,7 +31,7 @@ def picture(path: Path, width: int, height: int, value: int = 90) -> None:
     cv2.imwrite(str(path), image)
 
 
-def test_labels_are_read_with_units_and_absences(tmp_path: Path) -> None:
+def test_labels_are_read_with_absent_markings_as_nan(tmp_path: Path) -> None:
     path = write(tmp_path, GOOD, "sub/b.jpg,,,-4.1,-0.1,,-0.3,left", "c.png,,,,,,0,right")
     files, labels = read_labels(path)
     assert files == [(2, "a.png"), (3, "sub/b.jpg"), (4, "c.png")]
@@ -35,18 +40,18 @@ def test_labels_are_read_with_units_and_absences(tmp_path: Path) -> None:
     np.testing.assert_allclose(labels.distances, expected, rtol=1e-6)
     np.testing.assert_allclose(labels.angle, [0.02, -0.3, 0], rtol=1e-6)
     assert labels.heading.tolist() == [tf.Heading.STRAIGHT, tf.Heading.LEFT, tf.Heading.RIGHT]
-    # What is given comes back through the network's coding.
+    # The labels survive the network's coding.
     distances, _ = tf.decode(tf.encode(labels.distances, labels.angle))
     np.testing.assert_allclose(distances, labels.distances, atol=1e-5)
 
 
-def test_the_limits_are_those_of_the_coding() -> None:
+def test_label_limits_are_those_of_the_coding() -> None:
     for i, marking in enumerate(tf.MARKINGS):
         for limit, coded in zip(MARKING_LIMITS_M[marking], (0.1, 0.9), strict=True):
             values = np.full((1, 5), np.nan)
             values[0, i] = limit
             found = float(tf.encode(values, np.zeros(1))[0, i])
-            # m ends where it would be read as absent, before the end of its range.
+            # Beyond its limit m would be decoded as absent, before the end of its range.
             assert found == pytest.approx(0.1 + 0.8 * 4.75 / 5.5 if limit == 2.75 else coded)
 
 
@@ -67,34 +72,34 @@ def test_the_limits_are_those_of_the_coding() -> None:
         ("a.png,-1,1,,,,0,left", "line 3: a.png stands in line 2 already"),
     ],
 )
-def test_a_wrong_row_is_named(tmp_path: Path, row: str, seen: str) -> None:
+def test_a_faulty_row_is_refused_with_its_line_number(tmp_path: Path, row: str, seen: str) -> None:
     with pytest.raises(UserError, match=seen):
         read_labels(write(tmp_path, GOOD, row))
 
 
-def test_wrong_files_are_refused(tmp_path: Path) -> None:
+def test_faulty_files_are_refused(tmp_path: Path) -> None:
     with pytest.raises(UserError, match=r"first line must name file, ml, mr, l, m, r"):
         read_labels(write(tmp_path, GOOD, head="file,ml,mr"))
     with pytest.raises(UserError, match="names no images"):
         read_labels(write(tmp_path))
     write(tmp_path, GOOD)
     with pytest.raises(UserError, match=r"line 2: there is no image file .*a\.png"):
-        open_own_images(tmp_path, CameraParameters())
+        open_custom_images(tmp_path, CameraParameters())
     picture(tmp_path / "a.png", 280, 200)
     with pytest.raises(UserError, match=r"line 2: .*280 x 200 px, .* 280 x 210: give"):
-        open_own_images(tmp_path, CameraParameters())
+        open_custom_images(tmp_path, CameraParameters())
 
 
-def test_images_of_any_size_of_the_cameras_shape(tmp_path: Path) -> None:
+def test_images_of_any_size_with_the_cameras_aspect_ratio(tmp_path: Path) -> None:
     write(tmp_path, GOOD, "b.png,,,,,,0,left")
     picture(tmp_path / "a.png", 280, 210)
     picture(tmp_path / "b.png", 562, 420, 30)  # 0.4 percent off
-    found = open_own_images(tmp_path, CameraParameters())
-    assert isinstance(found, OwnImages)
+    found = open_custom_images(tmp_path, CameraParameters())
+    assert isinstance(found, CustomImages)
     assert found.images.shape == (2, 210, 280, 3)
     batch = found.read_batch(np.array([1, 0]))
     assert batch[:, 100, 20].tolist() == [[30, 30, 30], [90, 90, 90]]
     assert batch[:, 100, 260].tolist() == [[255, 0, 0]] * 2  # RGB
     before = found.content_hash
     picture(tmp_path / "a.png", 280, 210, 91)
-    assert open_own_images(tmp_path, CameraParameters()).content_hash != before
+    assert open_custom_images(tmp_path, CameraParameters()).content_hash != before

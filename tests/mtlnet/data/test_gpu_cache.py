@@ -1,4 +1,4 @@
-"""Data kept where the network is, and a step that is recorded: the same batches, the same steps."""
+"""A cached dataset gives the loader's batches; a captured training step gives the same weights."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from datagen.recording import Dataset
-from mtlnet.data.gpu_cache import SHARE, DeviceBatch, GpuDataset, resident_or_not
+from mtlnet.data.gpu_cache import MEMORY_SHARE, DeviceBatch, GpuDataset, cache_if_it_fits
 from mtlnet.data.loader import Loader
 from mtlnet.training.cuda_graph import WARM_UP, CudaGraphStep
 from mtlnet.training.loss import Losses
@@ -29,28 +29,28 @@ def loader(dataset: Path, *, augment: bool = False, part: tuple[int, int] = (0, 
 
 
 @pytest.mark.parametrize("part", [(0, 1), (1, 2)])
-def test_resident_batches_are_the_loaders(dataset: Path, part: tuple[int, int]) -> None:
-    made = loader(dataset, part=part)
-    kept = GpuDataset(made, CPU)
-    steps_over_the_end_of_an_epoch = range(5, 16)  # of 9 batches
-    for step, batch in zip(steps_over_the_end_of_an_epoch, kept.batches(5), strict=False):
-        expected = made.make(step)
+def test_cached_batches_are_those_of_the_loader(dataset: Path, part: tuple[int, int]) -> None:
+    source = loader(dataset, part=part)
+    cached = GpuDataset(source, CPU)
+    across_an_epoch = range(5, 16)  # of 9 batches
+    for step, batch in zip(across_an_epoch, cached.batches(5), strict=False):
+        expected = source.make(step)
         np.testing.assert_array_equal(batch.images.numpy(), expected.images)
         np.testing.assert_array_equal(batch.coded.numpy(), expected.coded)
         np.testing.assert_array_equal(batch.heading.numpy(), expected.heading)
 
 
-def test_only_what_fits_and_is_not_changed_is_kept(dataset: Path) -> None:
-    plain, changed = loader(dataset), loader(dataset, augment=True)
+def test_only_data_that_fits_and_is_not_augmented_is_cached(dataset: Path) -> None:
+    plain, augmented = loader(dataset), loader(dataset, augment=True)
     size = len(plain.frames) * 210 * 280 * 3
-    assert isinstance(resident_or_not(plain, CPU, int(size / SHARE) + 1), GpuDataset)
-    assert resident_or_not(plain, CPU, int(size / SHARE) - 1) is plain
-    assert resident_or_not(changed, CPU, 100 * size) is changed
-    assert resident_or_not(plain, CPU) is plain  # a CPU keeps nothing
+    assert isinstance(cache_if_it_fits(plain, CPU, int(size / MEMORY_SHARE) + 1), GpuDataset)
+    assert cache_if_it_fits(plain, CPU, int(size / MEMORY_SHARE) - 1) is plain
+    assert cache_if_it_fits(augmented, CPU, 100 * size) is augmented
+    assert cache_if_it_fits(plain, CPU) is plain  # nothing is cached on a CPU
 
 
-class Notebook:
-    """Stands in for a GPU's recorder: what is recorded is done again when it is replayed."""
+class FakeRecorder:
+    """In place of a CUDA graph: replaying runs the recorded function again."""
 
     def __init__(self) -> None:
         self.ran = self.recorded = self.replayed = 0
@@ -69,39 +69,39 @@ class Notebook:
         return again
 
 
-def test_a_recorded_step_sees_each_batch_in_the_same_memory() -> None:
-    places: list[int] = []
+def test_a_captured_step_gets_each_batch_in_the_same_memory() -> None:
+    addresses: list[int] = []
 
     def work(batch: DeviceBatch) -> Losses:
-        places.append(batch.coded.data_ptr())
+        addresses.append(batch.coded.data_ptr())
         first = batch.coded[0]
         return Losses(first[0], first[1], first[2], first[3], first[:3])
 
-    book = Notebook()
-    step = CudaGraphStep(work, book)
+    recorder = FakeRecorder()
+    step = CudaGraphStep(work, recorder)
     found = []
     for number in range(8):
         full = torch.full((2, 6), float(number))
         batch = DeviceBatch(torch.zeros(2, 1, 1, 3, dtype=torch.uint8), full, torch.zeros(2).long())
         found.append(step(batch, 0.1 if number < 6 else 0.09))
-    assert len(set(places)) == 1
-    assert (book.ran, book.replayed) == (WARM_UP, 8 - WARM_UP)
-    assert book.recorded == 2  # and anew for another rate
-    # What was given out stays as it was, though the memory it came from is used again.
+    assert len(set(addresses)) == 1
+    assert (recorder.ran, recorder.replayed) == (WARM_UP, 8 - WARM_UP)
+    assert recorder.recorded == 2  # and again for another learning rate
+    # Losses already returned do not change when the memory is reused.
     assert [float(losses.total) for losses in found[WARM_UP:]] == [3.0, 4.0, 5.0, 6.0, 7.0]
 
 
-def steps(trainer: Trainer, kept: GpuDataset, count: int) -> list[float]:
-    return [float(trainer.step(batch, 0.1).total) for batch in islice(kept.batches(0), count)]
+def steps(trainer: Trainer, cached: GpuDataset, count: int) -> list[float]:
+    return [float(trainer.step(batch, 0.1).total) for batch in islice(cached.batches(0), count)]
 
 
 @pytest.mark.usefixtures("small_network")
-def test_recorded_training_is_training(dataset: Path) -> None:
-    kept = GpuDataset(loader(dataset), CPU)
+def test_captured_training_gives_the_same_weights(dataset: Path) -> None:
+    cached = GpuDataset(loader(dataset), CPU)
     recipe = replace(RECIPES["paper"], dropout=0.0, learning_rate=0.02)
     plain, recorded = (Trainer(recipe, (0.3, 0.2, 0.5), 1, CPU) for _ in range(2))
-    recorded.captured = CudaGraphStep(recorded.learn, Notebook())
-    one, other = steps(plain, kept, 6), steps(recorded, kept, 6)
+    recorded.captured = CudaGraphStep(recorded.learn, FakeRecorder())
+    one, other = steps(plain, cached, 6), steps(recorded, cached, 6)
     assert one == other
     assert len(set(one)) == 6
     assert recorded.step_number == 6
@@ -112,18 +112,18 @@ def test_recorded_training_is_training(dataset: Path) -> None:
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
 @pytest.mark.usefixtures("small_network")
-def test_a_gpu_replays_what_it_recorded(dataset: Path) -> None:
+def test_a_cuda_graph_replays_training_steps(dataset: Path) -> None:
     gpu = torch.device("cuda")
-    kept = resident_or_not(loader(dataset), gpu)
-    assert isinstance(kept, GpuDataset)
+    cached = cache_if_it_fits(loader(dataset), gpu)
+    assert isinstance(cached, GpuDataset)
     recipe = replace(RECIPES["paper"], dropout=0.0, learning_rate=0.02)
     plain, recorded = (Trainer(recipe, (0.3, 0.2, 0.5), 1, gpu) for _ in range(2))
     assert isinstance(recorded.captured, CudaGraphStep)
     plain.captured = None
-    assert steps(recorded, kept, 12) == pytest.approx(steps(plain, kept, 12), rel=2e-2)
-    # With another rate it is recorded anew, and learns on.
+    assert steps(recorded, cached, 12) == pytest.approx(steps(plain, cached, 12), rel=2e-2)
+    # With another learning rate it is captured again, and training continues.
     before = [p.clone() for p in recorded.network.parameters()]
     recorded.recipe = plain.recipe = replace(recipe, learning_rate=0.01)
-    assert steps(recorded, kept, 4) == pytest.approx(steps(plain, kept, 4), rel=2e-2)
+    assert steps(recorded, cached, 4) == pytest.approx(steps(plain, cached, 4), rel=2e-2)
     after = recorded.network.parameters()
     assert any(not torch.equal(a, b) for a, b in zip(before, after, strict=True))

@@ -1,4 +1,4 @@
-"""Batches: every frame once an epoch, a function of seed and step."""
+"""The loader: each frame once an epoch; batches are a function of seed and step."""
 
 from collections.abc import Generator
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ class FakeLabels:
 
 
 class FakeFrames:
-    """Images of one colour: their frame number."""
+    """Images whose pixels all have the value of the frame number."""
 
     def __init__(self, count: int) -> None:
         angle = np.linspace(-0.4, 0.4, count).astype(np.float32)
@@ -38,24 +38,24 @@ def loader(seed: int = 0, *, augment: bool = False, part: tuple[int, int] = (0, 
     return Loader(FakeFrames(20), camera, 8, seed, augment=augment, part=part)
 
 
-def test_every_frame_once_an_epoch_across_batches() -> None:
+def test_each_frame_occurs_once_an_epoch() -> None:
     order = np.concatenate([loader().indices(step) for step in range(5)])
     assert sorted(order[:20]) == sorted(order[20:]) == list(range(20))
     assert order[:20].tolist() != order[20:].tolist()
 
 
 def test_batches_carry_the_labels_of_their_frames() -> None:
-    made = loader()
-    batches = made.batches(3)
+    source = loader()
+    batches = source.batches(3)
     assert isinstance(batches, Generator)
     batch = next(batches)
-    assert batch.images[:, 0, 0, 0].tolist() == made.indices(3).tolist()
-    np.testing.assert_array_equal(batch.coded, made.coded[made.indices(3)])
-    assert next(batches).images[:, 0, 0, 0].tolist() == made.indices(4).tolist()
+    assert batch.images[:, 0, 0, 0].tolist() == source.indices(3).tolist()
+    np.testing.assert_array_equal(batch.coded, source.coded[source.indices(3)])
+    assert next(batches).images[:, 0, 0, 0].tolist() == source.indices(4).tolist()
     batches.close()
 
 
-def test_same_seed_and_step_same_batch() -> None:
+def test_batches_depend_only_on_seed_and_step() -> None:
     one, two = loader(augment=True).make(4), loader(augment=True).make(4)
     other = loader(seed=1, augment=True).make(4)
     np.testing.assert_array_equal(one.images, two.images)
@@ -63,9 +63,9 @@ def test_same_seed_and_step_same_batch() -> None:
     assert one.images.tolist() != other.images.tolist()
 
 
-def test_parts_of_a_batch_are_the_batch() -> None:
+def test_parts_of_a_batch_make_up_the_whole() -> None:
     whole = loader(augment=True).make(5)
     parts = [loader(augment=True, part=(which, 4)).make(5) for which in range(4)]
     for name in ("images", "coded", "heading"):
-        together = np.concatenate([getattr(part, name) for part in parts])
-        np.testing.assert_array_equal(together, getattr(whole, name))
+        joined = np.concatenate([getattr(part, name) for part in parts])
+        np.testing.assert_array_equal(joined, getattr(whole, name))

@@ -23,9 +23,9 @@ from mtlnet.evaluation.ablation import (
     training_curve,
 )
 from mtlnet.evaluation.ablation_run import ablate, write_result
+from mtlnet.inference.curves import COLUMNS as CURVE_COLUMNS
 from mtlnet.inference.model_card import CARD, ModelCard, read_card
 from mtlnet.training.config import TrainConfig
-from mtlnet.training.logging import COLUMNS as CURVE_COLUMNS
 from mtlnet.training.loop import Stopped
 from tests.mtlnet.page import Page
 from trackfeatures.errors import UserError

@@ -22,7 +22,7 @@ from mtlnet.evaluation.html_report import (
     worst_frames,
 )
 from mtlnet.evaluation.metrics import judge_all, mean_answer, signed_errors
-from mtlnet.inference.overlay import ANSWER_COLOUR, TRUTH_COLOUR, marking_line, to_pixels
+from mtlnet.inference.overlay import PREDICTION_COLOUR, TRUTH_COLOUR, marking_line, to_pixels
 from mtlnet.inference.uncertainty import FEATURES
 from tests.mtlnet.page import Page
 
@@ -161,7 +161,7 @@ def test_markings_are_drawn_where_they_are(frames: Frames, outputs: NDArray[np.f
     assert pixels.shape[0] == 2 * camera.height
     for distance, angle, colour in (
         (labels.distances[9, 0], labels.angle[9], TRUTH_COLOUR),
-        (labels.distances[9, 0] + 1.0, labels.angle[9] + 0.002, ANSWER_COLOUR),
+        (labels.distances[9, 0] + 1.0, labels.angle[9] + 0.002, PREDICTION_COLOUR),
     ):
         line = marking_line(float(distance), float(angle), float(labels.curvature[9]))
         points = to_pixels(line, camera, camera.height_above_road_m)

@@ -1,11 +1,10 @@
-"""Exports answer as torch does, and an int8 graph is used only when its gate is passed."""
+"""Exports match torch, and the int8 graph is used by default only if it passed its gate."""
 
 import json
 import shutil
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import openvino
 import pytest
 import torch
@@ -15,26 +14,35 @@ import mtlnet.export.int8
 from datagen.recording import Dataset
 from mtlnet.evaluation.tables import export_lines
 from mtlnet.export.convert import export_model
+from mtlnet.export.int8 import gate
 from mtlnet.export.openvino_graph import TOLERANCE
 from mtlnet.inference.engine import load_engine
-from mtlnet.inference.exported import ABOUT, INT8, gate, passed_gate
-from mtlnet.inference.model_card import DOUBT, GRAPH, GRAPH_WEIGHTS, WEIGHTS, ModelError, read_card
+from mtlnet.inference.exported import EXPORT_FILE, INT8, passed_gate
+from mtlnet.inference.model_card import (
+    GRAPH,
+    GRAPH_WEIGHTS,
+    UNCERTAINTY_WEIGHTS,
+    WEIGHTS,
+    ModelError,
+    read_card,
+)
 from mtlnet.model.network import load_network
 from mtlnet.training.config import TrainConfig
 from mtlnet.training.run import train
+from tests.mtlnet.conftest import require_close
 from trackfeatures.errors import UserError
 
 
 @pytest.fixture(scope="module")
 def trained(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run of two steps: its answers differ from frame to frame."""
+    """A run of two steps, whose outputs differ from frame to frame."""
     out = tmp_path_factory.mktemp("trained") / "run"
     train(TrainConfig(dataset, out, iterations=2, batch=4, device="cpu", threads=1), None)
     return out
 
 
 def result(**changes: Any) -> dict[str, Any]:
-    """An evaluation."""
+    """An evaluation result with `changes`."""
     mae = {"ml": 0.05, "mr": 0.05, "l": 0.1, "m": 0.06, "r": None}
     return {
         "mae_m": {**mae, **changes.pop("mae_m", {})},
@@ -61,13 +69,13 @@ def result(**changes: Any) -> dict[str, Any]:
         ({"to_lane_centre_mae_m": None}, ["to_lane_centre"]),
     ],
 )
-def test_the_gate(changes: dict[str, Any], failed: list[str]) -> None:
+def test_the_gate_fails_beyond_its_limits(changes: dict[str, Any], failed: list[str]) -> None:
     found = gate(result(), result(**changes))
     assert (found["failed"], found["passed"]) == (failed, not failed)
-    assert "r" not in found["worse"]  # no label tells
+    assert "r" not in found["worse"]  # without labels
 
 
-def test_openvino_in_halves(trained: Path, dataset: Path, tmp_path: Path) -> None:
+def test_openvino_bf16_halves_the_weights(trained: Path, dataset: Path, tmp_path: Path) -> None:
     exact = export_model(trained, "openvino", "f32", dataset, tmp_path / "f32", frames=4)
     half = export_model(trained, "openvino", "bf16", dataset, tmp_path / "bf16", frames=4)
     assert exact["check"]["largest"] < TOLERANCE
@@ -75,11 +83,11 @@ def test_openvino_in_halves(trained: Path, dataset: Path, tmp_path: Path) -> Non
     assert TOLERANCE / 10 < half["check"]["largest"] < 0.05
     sizes = [(tmp_path / p / GRAPH_WEIGHTS).stat().st_size for p in ("f32", "bf16")]
     assert sizes[1] / sizes[0] == pytest.approx(0.5, abs=0.01)
-    assert json.loads((tmp_path / "bf16" / ABOUT).read_text())["check"] == half["check"]
+    assert json.loads((tmp_path / "bf16" / EXPORT_FILE).read_text())["check"] == half["check"]
 
 
 @pytest.mark.slow
-def test_onnx_in_halves(trained: Path, dataset: Path, tmp_path: Path) -> None:
+def test_onnx_bf16_halves_the_weights(trained: Path, dataset: Path, tmp_path: Path) -> None:
     exact = export_model(trained, "onnx", "f32", dataset, tmp_path / "f32", frames=4)
     half = export_model(trained, "onnx", "bf16", dataset, tmp_path / "bf16", frames=4)
     assert exact["check"]["largest"] < TOLERANCE
@@ -88,13 +96,13 @@ def test_onnx_in_halves(trained: Path, dataset: Path, tmp_path: Path) -> None:
     assert sizes[1] / sizes[0] == pytest.approx(0.5, abs=0.01)
 
 
-def read_by(operation: Any) -> Any:
-    """The inputs that an operation's output goes to."""
+def consumers(operation: Any) -> Any:
+    """The inputs that read an operation's output."""
     return operation.output(0).get_target_inputs()
 
 
 @pytest.mark.slow
-def test_int8_is_taken_once_its_gate_is_passed(
+def test_int8_is_the_default_once_it_passed_its_gate(
     trained: Path, dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(mtlnet.export.int8, "CALIBRATION_FRAMES", 8)
@@ -108,39 +116,40 @@ def test_int8_is_taken_once_its_gate_is_passed(
     assert found["gate"]["frames"] == 24
     weights = [(path / GRAPH_WEIGHTS).stat().st_size for path in (run, run / INT8)]
     last = load_file(run / WEIGHTS)["shared.fc2.layer.weight"].nbytes
-    kept = last + (run / DOUBT).stat().st_size  # and the second head
+    kept = last + (run / UNCERTAINTY_WEIGHTS).stat().st_size  # and the uncertainty head
     assert weights[1] == pytest.approx((weights[0] - kept) / 4 + kept, rel=0.01)
     rounded_to = openvino.Core().read_model(run / INT8 / GRAPH).get_ordered_ops()
     rounding = [op for op in rounded_to if op.get_type_name() == "FakeQuantize"]
-    readers = {i.get_node().get_type_name() for op in rounding for i in read_by(op)}
+    readers = {i.get_node().get_type_name() for op in rounding for i in consumers(op)}
     assert len(rounding) == 3
     assert readers <= {"Convolution", "MaxPool"}  # nothing of the heads
-    exact = load_engine(run, precision="f32")(frame)
-    rounded = load_engine(run, precision="int8")(frame)
-    assert 0 < np.abs(exact - rounded)[:9].max() <= found["check"]["largest"] + 0.1
-    about = json.loads((run / INT8 / ABOUT).read_text())
+    reference = load_engine(run, precision="f32")(frame)
+    quantised = load_engine(run, precision="int8")(frame)
+    assert (quantised != reference).any()
+    require_close(quantised, reference, metres=0.05, radians=0.005)
+    about = json.loads((run / INT8 / EXPORT_FILE).read_text())
     assert about["gate"] == found["gate"]
     for passed in (True, False):
         about["gate"]["passed"] = passed
-        (run / INT8 / ABOUT).write_text(json.dumps(about))
+        (run / INT8 / EXPORT_FILE).write_text(json.dumps(about))
         assert (load_engine(run).precision == "int8") is passed is passed_gate(run, card)
     about.update(model_hash="of other weights", gate={"passed": True})
-    (run / INT8 / ABOUT).write_text(json.dumps(about))
+    (run / INT8 / EXPORT_FILE).write_text(json.dumps(about))
     assert load_engine(run).precision != "int8"
     with pytest.raises(ModelError, match="other weights"):
         load_engine(run, precision="int8")
     about["model_hash"] = card.model_hash
-    (run / INT8 / ABOUT).write_text(json.dumps(about))
+    (run / INT8 / EXPORT_FILE).write_text(json.dumps(about))
     (run / INT8 / GRAPH_WEIGHTS).write_bytes(b"rubbish")
     with pytest.raises(ModelError, match="missing or damaged"):
         load_engine(run)
 
 
-def test_what_cannot_be_exported(trained: Path, dataset: Path, tmp_path: Path) -> None:
+def test_unsupported_exports_are_refused(trained: Path, dataset: Path, tmp_path: Path) -> None:
     for kind, precision, seen in (
-        ("tflite", "f32", "no tflite in f32"),
-        ("onnx", "f16", "no onnx in f16"),
-        ("onnx", "int8", "int8 is made for OpenVINO"),
+        ("tflite", "f32", "no export to tflite in f32"),
+        ("onnx", "f16", "no export to onnx in f16"),
+        ("onnx", "int8", "int8 needs --format openvino"),
     ):
         with pytest.raises(UserError, match=seen):
             export_model(trained, kind, precision, dataset)
@@ -150,14 +159,14 @@ def test_what_cannot_be_exported(trained: Path, dataset: Path, tmp_path: Path) -
         export_model(trained, "openvino", "int8", dataset, tmp_path)
 
 
-def test_an_exported_network_is_the_papers(trained: Path) -> None:
-    # The run was trained with batch normalisation; what is exported has none left.
+def test_a_published_network_is_the_papers(trained: Path) -> None:
+    # The run was trained with batch normalisation, which was folded.
     network = load_network(trained / WEIGHTS)
     assert sum(p.numel() for p in network.parameters()) == 9_259_913
     assert not [m for m in network.modules() if isinstance(m, torch.nn.BatchNorm2d)]
 
 
-def test_what_the_command_prints() -> None:
+def test_printed_lines_of_the_export_command() -> None:
     check = {"frames": 64, "coded": 0.0012, "probability": 0.03, "computed_in": "bf16"}
     verdict = gate(result(), result(angle_mae_rad=0.0042))
     lines = export_lines(

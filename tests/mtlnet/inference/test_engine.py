@@ -1,4 +1,4 @@
-"""The engine: the exported graph answers as torch does, and refuses what is not its model."""
+"""The engines: agreement of OpenVINO and torch, damaged models, model cards, decoded outputs."""
 
 import json
 import shutil
@@ -10,10 +10,11 @@ import pytest
 from numpy.typing import NDArray
 
 import trackfeatures as tf
-from mtlnet.inference import model_card as cards
+from mtlnet.inference import model_card
 from mtlnet.inference.engine import load_engine
 from mtlnet.inference.model_card import ModelError, read_card, resolve_run
 from mtlnet.inference.prediction import OUTPUTS, decode_outputs
+from tests.mtlnet.conftest import draw_road, require_close
 
 IMAGE = np.random.default_rng(3).integers(0, 256, (210, 280, 3), dtype=np.uint8)
 
@@ -23,19 +24,27 @@ def copy(published: Path, tmp_path: Path) -> Path:
     return shutil.copytree(published, tmp_path / "run")
 
 
-def test_openvino_answers_as_torch(published: Path) -> None:
-    oracle = load_engine(published, "torch")(IMAGE)
-    single = load_engine(published, precision="f32")(IMAGE)
-    np.testing.assert_allclose(single[:OUTPUTS], oracle[:OUTPUTS], atol=2e-5)
-    np.testing.assert_allclose(single[OUTPUTS:], oracle[OUTPUTS:], rtol=5e-3)
-    fast = load_engine(published)
-    np.testing.assert_allclose(fast(IMAGE)[:OUTPUTS], oracle[:OUTPUTS], atol=0.05)
-    assert fast(IMAGE).tolist() == fast(IMAGE).tolist()
-    other = fast(255 - IMAGE)
-    assert other.tolist() != fast(IMAGE).tolist()
+def test_openvino_in_float32_matches_torch(published: Path) -> None:
+    expected = load_engine(published, "torch")(IMAGE)
+    outputs = load_engine(published, precision="f32")(IMAGE)
+    np.testing.assert_allclose(outputs[:OUTPUTS], expected[:OUTPUTS], atol=2e-5)
+    np.testing.assert_allclose(outputs[OUTPUTS:], expected[OUTPUTS:], rtol=5e-3)
 
 
-def test_answers_are_not_overwritten_by_the_next(published: Path) -> None:
+def test_the_default_engine_is_within_2_cm_and_2_mrad_of_torch(published: Path) -> None:
+    engine, reference = load_engine(published), load_engine(published, "torch")
+    for offset in (-1.0, 0.0, 1.0):
+        image = draw_road(offset, 0.03)
+        require_close(engine(image), reference(image), metres=0.02, radians=0.002)
+
+
+def test_the_same_image_gives_the_same_outputs(published: Path) -> None:
+    engine = load_engine(published)
+    assert engine(IMAGE).tolist() == engine(IMAGE).tolist()
+    assert engine(255 - IMAGE).tolist() != engine(IMAGE).tolist()
+
+
+def test_outputs_are_not_overwritten_by_the_next_call(published: Path) -> None:
     engine = load_engine(published, precision="f32")
     first = engine(IMAGE)
     before = first.copy()
@@ -43,7 +52,7 @@ def test_answers_are_not_overwritten_by_the_next(published: Path) -> None:
     assert first.tolist() == before.tolist()
 
 
-def test_images_of_another_kind_are_refused(published: Path) -> None:
+def test_images_of_another_size_or_type_are_refused(published: Path) -> None:
     for kind in ("openvino", "torch"):
         engine = load_engine(published, kind)
         others: list[NDArray[Any]] = [IMAGE[:100], IMAGE[..., 0], IMAGE.astype(np.float32)]
@@ -52,7 +61,7 @@ def test_images_of_another_kind_are_refused(published: Path) -> None:
                 engine(image)
 
 
-def test_damage_is_seen(copy: Path) -> None:
+def test_damaged_files_are_refused(copy: Path) -> None:
     content = bytearray((copy / "model.bin").read_bytes())
     content[1000] ^= 1
     (copy / "model.bin").write_bytes(content)
@@ -75,9 +84,11 @@ def test_models_of_other_definitions_are_refused(copy: Path) -> None:
         load_engine(copy)
 
 
-def test_finding_a_run(published: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_resolving_a_runs_name(
+    published: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(cards, "SHIPPED", tmp_path / "nothing")
+    monkeypatch.setattr(model_card, "SHIPPED", tmp_path / "nothing")
     with pytest.raises(ModelError, match=r"no runs/latest"):
         resolve_run("default")
     with pytest.raises(ModelError, match="there is no run mine"):
@@ -88,50 +99,50 @@ def test_finding_a_run(published: Path, tmp_path: Path, monkeypatch: pytest.Monk
     for name in ("default", "latest", "runs/latest"):
         assert resolve_run(name) == tmp_path / "runs" / "mine"
     assert resolve_run("mine") == Path("runs/mine")
-    monkeypatch.setattr(cards, "SHIPPED", tmp_path / "runs" / "mine")
+    monkeypatch.setattr(model_card, "SHIPPED", tmp_path / "runs" / "mine")
     Path("runs/latest").unlink()
     assert resolve_run("default") == tmp_path / "runs" / "mine"
 
 
-def test_a_card_survives_writing(published: Path, tmp_path: Path) -> None:
+def test_a_card_is_read_back_as_written(published: Path, tmp_path: Path) -> None:
     card = read_card(published)
     card.write(tmp_path)
     assert read_card(tmp_path) == card
     assert card.model_hash == card.files["model.safetensors"]
 
 
-def test_interpreting_outputs() -> None:
+def test_decoding_nine_outputs() -> None:
     coded = tf.encode([[-1.0, 3.0, np.nan, -1.0, 3.0]], [0.05])[0]
-    answer = decode_outputs(np.concatenate([coded, [0.7, 0.2, 0.1]]).astype(np.float32))
-    assert answer.distances_m["ml"] == pytest.approx(-1.0, abs=1e-5)
-    assert answer.distances_m["l"] is None
-    assert answer.to_lane_centre_m == pytest.approx(1.0, abs=1e-5)
-    assert answer.angle_rad == pytest.approx(0.05, abs=1e-6)
-    assert answer.heading == pytest.approx({"left": 0.7, "straight": 0.2, "right": 0.1})
-    assert list(answer.as_json()) == [
+    prediction = decode_outputs(np.concatenate([coded, [0.7, 0.2, 0.1]]).astype(np.float32))
+    assert prediction.distances_m["ml"] == pytest.approx(-1.0, abs=1e-5)
+    assert prediction.distances_m["l"] is None
+    assert prediction.to_lane_centre_m == pytest.approx(1.0, abs=1e-5)
+    assert prediction.angle_rad == pytest.approx(0.05, abs=1e-6)
+    assert prediction.heading == pytest.approx({"left": 0.7, "straight": 0.2, "right": 0.1})
+    assert list(prediction.as_json()) == [
         "distances_m", "to_lane_centre_m", "angle_rad", "heading", "std", "out_of_distribution",
     ]  # fmt: skip
-    assert answer.std is None
-    assert answer.out_of_distribution is None
+    assert prediction.std is None
+    assert prediction.out_of_distribution is None
     with pytest.raises(ValueError, match="9 or 17 numbers"):
         decode_outputs(coded)
 
 
-def test_interpreting_doubt() -> None:
+def test_decoding_uncertainty() -> None:
     coded = tf.encode([[-1.0, 3.0, np.nan, -1.0, 3.0]], [0.05])[0]
     std = [0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.01]
-    for novelty, strange in ((0.99, False), (1.01, True), (np.nan, True)):
-        outputs = np.concatenate([coded, [0.7, 0.2, 0.1], std, [novelty]]).astype(np.float32)
-        answer = decode_outputs(outputs)
-        assert answer.out_of_distribution is strange
-        assert answer.std == {
+    for ood_score, expected in ((0.99, False), (1.01, True), (np.nan, True)):
+        outputs = np.concatenate([coded, [0.7, 0.2, 0.1], std, [ood_score]]).astype(np.float32)
+        prediction = decode_outputs(outputs)
+        assert prediction.out_of_distribution is expected
+        assert prediction.std == {
             "ml": pytest.approx(0.1), "mr": pytest.approx(0.2), "l": None, "m": pytest.approx(0.4),
             "r": pytest.approx(0.5), "to_lane_centre": pytest.approx(0.6),
             "angle": pytest.approx(0.01),
         }  # fmt: skip
 
 
-def test_a_model_of_the_format_before_is_refused(copy: Path) -> None:
+def test_a_model_of_another_format_version_is_refused(copy: Path) -> None:
     content = json.loads((copy / "card.json").read_text())
     content["format"] = 1
     (copy / "card.json").write_text(json.dumps(content))
@@ -139,7 +150,7 @@ def test_a_model_of_the_format_before_is_refused(copy: Path) -> None:
         load_engine(copy)
 
 
-def test_a_damaged_second_head_is_seen(copy: Path) -> None:
+def test_a_damaged_uncertainty_head_is_refused(copy: Path) -> None:
     (copy / "doubt.safetensors").write_bytes(b"rubbish")
     with pytest.raises(ModelError, match=r"doubt\.safetensors is damaged"):
         load_engine(copy, "torch")

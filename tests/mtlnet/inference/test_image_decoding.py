@@ -1,43 +1,51 @@
-"""Which images pass, with which pixels, and which are refused, with which problem."""
+"""Image decoding: accepted images and their pixels, refused images and their faults."""
 
 import struct
 import zlib
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 import simplejpeg
+from numpy.typing import NDArray
 
-from mtlnet.inference import image_decoding as images
-from mtlnet.inference.image_decoding.crop import Box, visible
-from mtlnet.inference.image_decoding.errors import ImageError
-from mtlnet.inference.image_decoding.jpeg_structure import end as jpeg_end
-from serve.api.problems import (
-    DAMAGED_IMAGE,
-    FIELD_OF_VIEW,
-    IMAGE_ASPECT,
-    IMAGE_SIZE,
-    NOT_AN_IMAGE,
-    TRAILING_BYTES,
-    UNSUPPORTED_IMAGE,
-    Kind,
-    Problem,
-    image_problem,
-)
-from tests.serve.conftest import jpeg, picture, png
+from mtlnet.inference.image_decoding.crop import Box, crop_box
+from mtlnet.inference.image_decoding.decode import decode, inspect
+from mtlnet.inference.image_decoding.errors import Fault, ImageError
+from mtlnet.inference.image_decoding.jpeg_structure import jpeg_length
 from trackfeatures.camera import CameraParameters
 
 VIEW = CameraParameters()
 
 
+def picture(width: int = 280, height: int = 210, channels: int = 3) -> NDArray[np.uint8]:
+    """A smooth image (height, width, channels): a gradient in each channel."""
+    x, y = np.meshgrid(np.linspace(0, 200, width), np.linspace(0, 50, height))
+    planes = [(x + y * (1 + c)) % 256 for c in range(channels)]
+    return np.stack(planes, axis=2).astype(np.uint8)
+
+
+def jpeg(image: NDArray[np.uint8], colours: str = "RGB") -> bytes:
+    subsampling = "444" if colours == "RGB" else "Gray"
+    return bytes(simplejpeg.encode_jpeg(np.ascontiguousarray(image), 95, colours, subsampling))
+
+
+def png(image: NDArray[Any]) -> bytes:
+    """`image` in OpenCV's channel order (BGR, BGRA or grey)."""
+    done, data = cv2.imencode(".png", image)
+    assert done
+    return data.tobytes()
+
+
 def pixels(body: bytes) -> np.ndarray:
-    return images.decode(body, images.inspect(body, VIEW), VIEW)
+    return decode(body, inspect(body, VIEW), VIEW)
 
 
-def refusal(body: bytes) -> Problem:
+def refusal(body: bytes) -> ImageError:
     with pytest.raises(ImageError) as caught:
         pixels(body)
-    return image_problem(caught.value)
+    return caught.value
 
 
 def chunk(kind: bytes, data: bytes) -> bytes:
@@ -66,12 +74,12 @@ def handmade_png(
     )
 
 
-def test_a_jpeg_of_the_cameras_size_comes_through_as_the_decoder_gives_it() -> None:
+def test_a_jpeg_of_the_cameras_size_gives_the_decoders_pixels() -> None:
     body = jpeg(picture())
     assert np.array_equal(pixels(body), simplejpeg.decode_jpeg(body))
 
 
-def test_a_png_comes_through_bit_for_bit_in_rgb() -> None:
+def test_a_png_gives_its_exact_pixels_in_rgb() -> None:
     image = picture()
     assert np.array_equal(pixels(png(image[:, :, ::-1])), image)
 
@@ -112,49 +120,49 @@ def test_another_size_of_the_same_shape_is_area_averaged() -> None:
     assert pixels(jpeg(picture(140, 105))).shape == (210, 280, 3)
 
 
-def test_side_chunks_change_nothing() -> None:
-    """Neither a mark that says "turn me" nor an animation makes another picture of it."""
-    turned = b"MM\0\x2a\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0\x06\0\0\0\0\0\0"
-    marked = handmade_png(extra=chunk(b"eXIf", turned) + chunk(b"acTL", bytes(8)))
+def test_ancillary_png_chunks_are_ignored() -> None:
+    """Neither an EXIF orientation nor an animation changes the pixels."""
+    orientation = b"MM\0\x2a\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0\x06\0\0\0\0\0\0"
+    marked = handmade_png(extra=chunk(b"eXIf", orientation) + chunk(b"acTL", bytes(8)))
     assert np.array_equal(pixels(marked), pixels(handmade_png()))
 
 
-def test_one_percent_of_another_aspect_passes_and_more_is_cropped_or_refused() -> None:
+def test_aspect_ratios_within_1_percent_pass_and_others_are_cropped_or_refused() -> None:
     assert pixels(jpeg(picture(278, 210))).shape == (210, 280, 3)
-    problem = refusal(jpeg(picture(276, 210)))
-    assert problem.kind is IMAGE_ASPECT
-    assert "276 x 210" in problem.detail
-    assert "280 x 210" in problem.detail
+    error = refusal(jpeg(picture(276, 210)))
+    assert error.fault is Fault.ASPECT
+    assert "276 x 210" in str(error)
+    assert "280 x 210" in str(error)
     wide = picture(480, 210)
     assert np.array_equal(pixels(png(wide[:, :, ::-1])), wide[:, 100:380])
 
 
-def test_a_wider_lens_is_cropped_and_a_narrower_one_refused() -> None:
+def test_a_wider_field_of_view_is_cropped_and_a_narrower_one_refused() -> None:
     """tan(67.5 / 2 deg) = 0.66818 of tan(45 deg): 210 rows seen with 67.5 are 314.3 with 90."""
     large = picture(420, 314)
     body = png(large[:, :, ::-1])
-    header = images.inspect(body, VIEW, 90.0)
-    assert np.array_equal(images.decode(body, header, VIEW, 90.0), large[52:262, 70:350])
-    assert visible(420, 314, VIEW, 90.0) == Box(70, 52, 280, 210)
+    header = inspect(body, VIEW, 90.0)
+    assert np.array_equal(decode(body, header, VIEW, 90.0), large[52:262, 70:350])
+    assert crop_box(420, 314, VIEW, 90.0) == Box(70, 52, 280, 210)
     with pytest.raises(ImageError, match="50 degrees") as caught:
-        images.inspect(body, VIEW, 50.0)
-    assert image_problem(caught.value).kind is FIELD_OF_VIEW
+        inspect(body, VIEW, 50.0)
+    assert caught.value.fault is Fault.FIELD_OF_VIEW
 
 
-def test_up_to_64_bytes_may_follow_the_picture() -> None:
+def test_up_to_64_trailing_bytes_are_accepted() -> None:
     for body in (JPEG, PNG):
         assert np.array_equal(pixels(body + bytes(64)), pixels(body))
-        problem = refusal(body + JPEG)
-        assert problem.kind is TRAILING_BYTES
-        assert f"{len(JPEG)} bytes" in problem.detail
-        assert refusal(body + bytes(65)).kind is TRAILING_BYTES
+        error = refusal(body + JPEG)
+        assert error.fault is Fault.TRAILING
+        assert f"{len(JPEG)} bytes" in str(error)
+        assert refusal(body + bytes(65)).fault is Fault.TRAILING
 
 
-def test_a_progressive_jpeg_and_filling_bytes_are_read() -> None:
+def test_a_progressive_jpeg_and_fill_bytes_are_read() -> None:
     image = picture()
     options = [cv2.IMWRITE_JPEG_PROGRESSIVE, 1, cv2.IMWRITE_JPEG_RST_INTERVAL, 2]
     body = cv2.imencode(".jpg", image, options)[1].tobytes()
-    assert jpeg_end(body) == len(body)
+    assert jpeg_length(body) == len(body)
     filled = body[:2] + b"\xff" * 5 + body[2:]
     assert np.array_equal(pixels(filled), pixels(body))
 
@@ -163,49 +171,49 @@ JPEG, PNG = jpeg(picture()), png(picture())
 
 
 @pytest.mark.parametrize(
-    ("body", "kind"),
+    ("body", "fault"),
     [
-        (b"", NOT_AN_IMAGE),
-        (b"hello, this is text", NOT_AN_IMAGE),
-        (b"GIF89a" + bytes(50), NOT_AN_IMAGE),
-        (JPEG[:4], DAMAGED_IMAGE),
-        (JPEG[:-1], DAMAGED_IMAGE),
-        (JPEG[: len(JPEG) // 2], DAMAGED_IMAGE),
-        (PNG[:10], DAMAGED_IMAGE),
-        (PNG[:-1], DAMAGED_IMAGE),
-        (PNG[: len(PNG) // 2], DAMAGED_IMAGE),
-        (PNG[:200] + b"\x55\xaa" + PNG[202:], DAMAGED_IMAGE),
-        (handmade_png(rows=bytes(10)), DAMAGED_IMAGE),
-        (handmade_png(rows=bytes(211 * 841)), DAMAGED_IMAGE),
-        (handmade_png(rows=(b"\x05" + bytes(840)) * 210), DAMAGED_IMAGE),
-        (handmade_png(extra=chunk(b"ABCD", b"")), UNSUPPORTED_IMAGE),
-        (handmade_png(extra=chunk(b"abCd", b"") * 10_000), UNSUPPORTED_IMAGE),
-        (handmade_png(depth=3), UNSUPPORTED_IMAGE),
-        (handmade_png(interlace=2), UNSUPPORTED_IMAGE),
-        (JPEG[:-2] + b"\xff\xda\0\x02" * 101, UNSUPPORTED_IMAGE),
-        (bytes(simplejpeg.encode_jpeg(picture(channels=4), 95, "CMYK")), UNSUPPORTED_IMAGE),
-        (jpeg(picture(12, 9)), IMAGE_SIZE),
-        (jpeg(picture(4104, 3078)), IMAGE_SIZE),
-        (jpeg(picture(3600, 2700)), IMAGE_SIZE),
-        (handmade_png(0, 0, rows=b""), IMAGE_SIZE),
-        (handmade_png(2**32 - 1, 2**32 - 1, rows=b""), IMAGE_SIZE),
+        (b"", Fault.NOT_AN_IMAGE),
+        (b"hello, this is text", Fault.NOT_AN_IMAGE),
+        (b"GIF89a" + bytes(50), Fault.NOT_AN_IMAGE),
+        (JPEG[:4], Fault.DAMAGED),
+        (JPEG[:-1], Fault.DAMAGED),
+        (JPEG[: len(JPEG) // 2], Fault.DAMAGED),
+        (PNG[:10], Fault.DAMAGED),
+        (PNG[:-1], Fault.DAMAGED),
+        (PNG[: len(PNG) // 2], Fault.DAMAGED),
+        (PNG[:200] + b"\x55\xaa" + PNG[202:], Fault.DAMAGED),
+        (handmade_png(rows=bytes(10)), Fault.DAMAGED),
+        (handmade_png(rows=bytes(211 * 841)), Fault.DAMAGED),
+        (handmade_png(rows=(b"\x05" + bytes(840)) * 210), Fault.DAMAGED),
+        (handmade_png(extra=chunk(b"ABCD", b"")), Fault.UNSUPPORTED),
+        (handmade_png(extra=chunk(b"abCd", b"") * 10_000), Fault.UNSUPPORTED),
+        (handmade_png(depth=3), Fault.UNSUPPORTED),
+        (handmade_png(interlace=2), Fault.UNSUPPORTED),
+        (JPEG[:-2] + b"\xff\xda\0\x02" * 101, Fault.UNSUPPORTED),
+        (bytes(simplejpeg.encode_jpeg(picture(channels=4), 95, "CMYK")), Fault.UNSUPPORTED),
+        (jpeg(picture(12, 9)), Fault.SIZE),
+        (jpeg(picture(4104, 3078)), Fault.SIZE),
+        (jpeg(picture(3600, 2700)), Fault.SIZE),
+        (handmade_png(0, 0, rows=b""), Fault.SIZE),
+        (handmade_png(2**32 - 1, 2**32 - 1, rows=b""), Fault.SIZE),
     ],
 )
-def test_a_bad_image_is_refused_for_what_it_is(body: bytes, kind: Kind) -> None:
-    problem = refusal(body)
-    assert problem.kind is kind
-    assert problem.detail
+def test_a_bad_image_is_refused_with_its_fault(body: bytes, fault: Fault) -> None:
+    error = refusal(body)
+    assert error.fault is fault
+    assert str(error)
 
 
-def test_a_bomb_is_refused_from_its_header(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_decompression_bomb_is_refused_by_its_header(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("decoded"))
     bomb = handmade_png(16000, 16000, rows=bytes(1 + 48000) * 200)
-    problem = refusal(bomb)
-    assert problem.kind is IMAGE_SIZE
-    assert "16000 x 16000" in problem.detail
+    error = refusal(bomb)
+    assert error.fault is Fault.SIZE
+    assert "16000 x 16000" in str(error)
 
 
-def test_pixels_beyond_the_headers_promise_are_never_inflated() -> None:
+def test_pixels_beyond_the_headers_size_are_not_inflated() -> None:
     """A PNG whose header is small but whose pixels inflate to 1 GB: refused without the memory."""
     import tracemalloc
 
@@ -215,6 +223,6 @@ def test_pixels_beyond_the_headers_promise_are_never_inflated() -> None:
     plain = chunk(b"IDAT", zlib.compress(b""))
     body = bomb.replace(plain, chunk(b"IDAT", bomb_rows))
     tracemalloc.start()
-    assert refusal(body).kind is DAMAGED_IMAGE
+    assert refusal(body).fault is Fault.DAMAGED
     assert tracemalloc.get_traced_memory()[1] < 4e6
     tracemalloc.stop()

@@ -1,4 +1,4 @@
-"""The forward pass of training computes what the network says: outputs, gradients, statistics."""
+"""The CPU kernels match the plain network: outputs, gradients, running statistics."""
 
 import copy
 
@@ -7,10 +7,10 @@ import pytest
 import torch
 
 from mtlnet.model.architecture import SHARED
-from mtlnet.model.cpu_kernels.forward import describe, training_outputs
-from mtlnet.model.cpu_kernels.im2col import column_convolution
+from mtlnet.model.cpu_kernels.forward import forward_features, training_outputs
+from mtlnet.model.cpu_kernels.im2col import im2col_convolution
 from mtlnet.model.cpu_kernels.norm_pool_relu import statistics
-from mtlnet.model.cpu_kernels.space_to_depth import block_convolution, to_blocks
+from mtlnet.model.cpu_kernels.space_to_depth import space_to_depth, space_to_depth_convolution
 from mtlnet.model.network import Network, initialise
 from mtlnet.training.trainer import dropout_masks, settle_norms
 
@@ -21,7 +21,7 @@ def pictures(count: int) -> torch.Tensor:
 
 
 def some_network(*, batch_norm: bool) -> Network:
-    """With gains of both signs, as training may make them."""
+    """A network whose normalisation gains have both signs, as after training."""
     network = Network(batch_norm=batch_norm)
     initialise(network, 1)
     generator = torch.Generator().manual_seed(2)
@@ -33,41 +33,41 @@ def some_network(*, batch_norm: bool) -> Network:
     return network.to(memory_format=torch.channels_last).train()
 
 
-@pytest.mark.parametrize("norm", ["learning", "settled", "none"])
-def test_features_and_gradients_are_those_of_the_plain_network(norm: str) -> None:
-    # In float64: in float32, rounding sends the gradient of a maximum to its neighbour.
+@pytest.mark.parametrize("norm", ["training", "frozen", "none"])
+def test_features_and_gradients_match_the_plain_network(norm: str) -> None:
+    # In float64: with float32 rounding, a maximum may pass its gradient to a neighbour.
     images, plain = pictures(4), some_network(batch_norm=norm != "none").double()
-    if norm == "settled":
-        plain.describe(pictures(2).double() * (1 / 127.5) - 1.0)
+    if norm == "frozen":
+        plain.forward_features(pictures(2).double() * (1 / 127.5) - 1.0)
         settle_norms(plain)
-    swift = copy.deepcopy(plain)
-    expected = plain.describe(images.double() * (1 / 127.5) - 1.0)
-    found = describe(swift, images, torch.float64)
+    fast = copy.deepcopy(plain)
+    expected = plain.forward_features(images.double() * (1 / 127.5) - 1.0)
+    found = forward_features(fast, images, torch.float64)
     torch.testing.assert_close(found, expected)
-    given = torch.randn(expected.shape, generator=torch.Generator().manual_seed(3)).double()
-    torch.autograd.backward(expected, given)
-    torch.autograd.backward(found, given)
-    pairs = zip(plain.named_parameters(), swift.named_parameters(), strict=True)
+    gradient = torch.randn(expected.shape, generator=torch.Generator().manual_seed(3)).double()
+    torch.autograd.backward(expected, gradient)
+    torch.autograd.backward(found, gradient)
+    pairs = zip(plain.named_parameters(), fast.named_parameters(), strict=True)
     for (name, one), (_, other) in pairs:
         if name.startswith("heads"):
             continue
         assert one.grad is not None
         assert other.grad is not None
         torch.testing.assert_close(other.grad, one.grad, rtol=1e-6, atol=1e-8, msg=name)
-        # The fused optimisers walk memory: a gradient must lie as its parameter does.
+        # The fused optimizers need gradients with the memory layout of the parameters.
         assert other.grad.stride() == other.stride(), name
-    buffers = zip(plain.named_buffers(), swift.named_buffers(), strict=True)
+    buffers = zip(plain.named_buffers(), fast.named_buffers(), strict=True)
     for (name, before), (_, after) in buffers:
         torch.testing.assert_close(after, before, msg=name)
 
 
-def test_outputs_are_those_of_the_plain_network() -> None:
+def test_outputs_match_the_plain_network() -> None:
     images, network = pictures(2), some_network(batch_norm=False)
     expected, found = network(images), training_outputs(network, images, torch.float32)
     torch.testing.assert_close(found, expected, rtol=1e-5, atol=5e-6)
 
 
-def test_bf16_is_near_float32() -> None:
+def test_bf16_is_within_5_percent_of_float32() -> None:
     images, network = pictures(4), some_network(batch_norm=True)
     exact = training_outputs(copy.deepcopy(network), images, torch.float32)
     rounded = training_outputs(network, images, torch.bfloat16)
@@ -75,32 +75,34 @@ def test_bf16_is_near_float32() -> None:
     assert float((rounded - exact).detach().abs().max() / exact.detach().abs().max()) < 0.05
 
 
-def test_the_first_layer_by_blocks() -> None:
+def test_space_to_depth_convolution_matches_conv2d() -> None:
     rng = torch.Generator().manual_seed(0)
     weight = torch.randn((5, 3, 11, 11), generator=rng, dtype=torch.float64, requires_grad=True)
     for height, width in [(210, 280), (8, 12), (9, 8), (7, 16)]:
         images = torch.randint(0, 256, (2, height, width, 3), generator=rng, dtype=torch.uint8)
         x = images.double().permute(0, 3, 1, 2) / 127.5 - 1
         rows = (-(-height // 4) - 1) * 4 + 11 - height
-        # TensorFlow's SAME for 210 rows; here always 4 before, which it is for them.
+        # 4 rows of padding before: TensorFlow's SAME padding for 210 rows.
         padded = torch.nn.functional.pad(x, (3, 4, 4, max(rows - 4, 0)))
         expected = torch.nn.functional.conv2d(padded, weight, stride=4)
-        found = block_convolution(to_blocks(images, torch.float64), weight, None, torch.float64)
+        found = space_to_depth_convolution(
+            space_to_depth(images, torch.float64), weight, None, torch.float64
+        )
         torch.testing.assert_close(found, expected)
         (one,), (two,) = (torch.autograd.grad(y.square().sum(), weight) for y in (expected, found))
         torch.testing.assert_close(one, two)
 
 
-def test_a_convolution_as_a_product_passes_gradcheck() -> None:
+def test_im2col_convolution_matches_conv2d_and_passes_gradcheck() -> None:
     rng = torch.Generator().manual_seed(0)
     x = torch.randn((2, 3, 4, 5), generator=rng, dtype=torch.float64, requires_grad=True)
     weight = torch.randn((2, 3, 3, 3), generator=rng, dtype=torch.float64, requires_grad=True)
     plain = torch.nn.functional.conv2d(torch.nn.functional.pad(x, (1, 1, 0, 1)), weight, stride=2)
-    torch.testing.assert_close(column_convolution(x, weight, 2), plain)
-    assert torch.autograd.gradcheck(lambda a, b: column_convolution(a, b, 2), (x, weight))
+    torch.testing.assert_close(im2col_convolution(x, weight, 2), plain)
+    assert torch.autograd.gradcheck(lambda a, b: im2col_convolution(a, b, 2), (x, weight))
 
 
-def test_statistics_of_bf16_are_kept_in_float32() -> None:
+def test_batch_statistics_of_bf16_are_float32() -> None:
     x = torch.randn((4, 8, 20, 30), generator=torch.Generator().manual_seed(0)) * 3 + 5
     x = x.bfloat16().contiguous(memory_format=torch.channels_last)
     mean, variance, count = statistics(x)
@@ -110,7 +112,7 @@ def test_statistics_of_bf16_are_kept_in_float32() -> None:
     torch.testing.assert_close(variance.double(), expected, rtol=1e-4, atol=1e-4)
 
 
-def test_masks_are_a_function_of_the_seed_for_any_number_of_processes() -> None:
+def test_dropout_masks_depend_on_the_seed_and_not_on_the_number_of_processes() -> None:
     whole = dropout_masks(0.5, SHARED, 6, [1, 3, 40])
     assert [tuple(mask.shape) for mask in whole] == [(6, 4096), (6, 1024), (6, 256)]
     assert set(np.unique(whole[0].numpy()).tolist()) == {0.0, 2.0}

@@ -1,11 +1,11 @@
-"""The network is the paper's: layer by layer, padding by padding; and folding changes nothing."""
+"""The paper's network: layers, padding, parameter count; folding keeps the outputs."""
 
 import numpy as np
 import pytest
 import torch
 
 from mtlnet.model.architecture import FEATURES, SHARED, Conv, same_padding
-from mtlnet.model.network import Network, answer_images, fold, initialise, normalise
+from mtlnet.model.network import Network, fold, initialise, normalise, predict_images
 
 # Paper, section IV-C, and the sizes SAME padding gives for 280 x 210: layer, (rows, columns).
 LAYERS = [
@@ -36,7 +36,7 @@ def test_layers_are_those_of_the_paper() -> None:
     assert found == [layer for layer, _ in LAYERS]
 
 
-def test_sizes_of_the_layers() -> None:
+def test_output_sizes_of_the_layers() -> None:
     network, sizes = Network(), []
     for module in network.features.children():
         if type(module).__name__ != "SamePad":
@@ -67,7 +67,7 @@ def test_parameter_count() -> None:
         (1, 3, 2, (1, 1, 1)),
     ],
 )
-def test_same_padding_is_tensorflows(
+def test_same_padding_matches_tensorflow(
     size: int, kernel: int, stride: int, expected: tuple[int, int, int]
 ) -> None:
     # tf.nn: out = ceil(size / stride); pad = (out - 1) stride + kernel - size; the odd one after.
@@ -90,12 +90,12 @@ def test_first_layer_against_a_sum_by_hand() -> None:
         np.testing.assert_allclose(out[0, :, row, column].detach().numpy(), expected, atol=1e-4)
 
 
-def test_folding_gives_the_same_answers() -> None:
+def test_folding_keeps_the_outputs() -> None:
     network = Network(batch_norm=True, dropout=0.1)
     initialise(network, 2)
     network.train()
     with torch.no_grad():
-        network(images(4))  # moves the running statistics off their start
+        network(images(4))  # updates the running statistics
         for module in network.modules():
             if isinstance(module, torch.nn.BatchNorm2d):
                 module.weight.uniform_(0.5, 1.5)
@@ -110,12 +110,12 @@ def test_folding_gives_the_same_answers() -> None:
     assert float(difference) < 2e-5
 
 
-def test_probabilities_sum_to_one_and_seeds_fix_the_weights() -> None:
+def test_probabilities_sum_to_one_and_the_seed_determines_the_weights() -> None:
     first, second, other = Network(), Network(), Network()
     initialise(first, 3)
     initialise(second, 3)
     initialise(other, 4)
-    answers = answer_images(first, images(2).numpy())
-    np.testing.assert_allclose(answers[:, 6:].sum(1), 1, atol=1e-6)
-    assert answers.tolist() == answer_images(second, images(2).numpy()).tolist()
-    assert answers.tolist() != answer_images(other, images(2).numpy()).tolist()
+    outputs = predict_images(first, images(2).numpy())
+    np.testing.assert_allclose(outputs[:, 6:].sum(1), 1, atol=1e-6)
+    assert outputs.tolist() == predict_images(second, images(2).numpy()).tolist()
+    assert outputs.tolist() != predict_images(other, images(2).numpy()).tolist()

@@ -9,10 +9,10 @@ import pytest
 import torch
 from safetensors.numpy import load_file
 
+from mtlnet.inference.curves import read_curves
 from mtlnet.inference.model_card import WEIGHTS
 from mtlnet.training.config import TrainConfig
 from mtlnet.training.distributed import ALONE, Part, find_part, joined
-from mtlnet.training.logging import read_curves
 from mtlnet.training.run import train
 from trackfeatures.errors import UserError
 

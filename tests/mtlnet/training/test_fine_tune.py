@@ -9,9 +9,9 @@ import pytest
 import torch
 
 from datagen.recording import Dataset
-from mtlnet.data.sources import continued, own_material
+from mtlnet.data.sources import continue_from_model, custom_training_data
 from mtlnet.inference.model_card import WEIGHTS, read_card
-from mtlnet.model.network import Network, answer_images, load_network
+from mtlnet.model.network import Network, load_network, predict_images
 from mtlnet.training.config import TrainConfig
 from mtlnet.training.fine_tune import open_init, take_weights
 from mtlnet.training.start import start_training
@@ -39,8 +39,8 @@ def test_it_starts_with_the_models_answers(published: Path) -> None:
     network.target_std.copy_(torch.linspace(0.02, 0.3, 6))
     take_weights(network, published)
     frames = np.random.default_rng(0).integers(0, 256, (2, 210, 280, 3), dtype=np.uint8)
-    expected = answer_images(load_network(published / WEIGHTS), frames)
-    np.testing.assert_allclose(answer_images(network, frames), expected, atol=1e-5)
+    expected = predict_images(load_network(published / WEIGHTS), frames)
+    np.testing.assert_allclose(predict_images(network, frames), expected, atol=1e-5)
 
 
 def test_own_images_tune_a_model(published: Path, mine: Path, tmp_path: Path) -> None:
@@ -52,11 +52,11 @@ def test_own_images_tune_a_model(published: Path, mine: Path, tmp_path: Path) ->
     assert card.data["init"] == {"name": before.name, "model_hash": before.model_hash}
     assert card.data["frames"] == 6
     assert card.data["mean"]["distances_m"][:2] == pytest.approx([-1.25, 2.65])
-    material = own_material(mine, before)
+    material = custom_training_data(mine, before)
     images = material.frames.read_batch(np.arange(6))
     errors = []
     for run in (published, tmp_path / "run"):
-        coded = answer_images(load_network(run / WEIGHTS), images)[:, :2]
+        coded = predict_images(load_network(run / WEIGHTS), images)[:, :2]
         target = 0.1 + 0.8 * (np.array([[-1.25, 2.65]]) - [-5.5, 0.5]) / 5
         errors.append(np.abs(coded - target).mean())
     assert errors[1] < 0.8 * errors[0]
@@ -64,21 +64,21 @@ def test_own_images_tune_a_model(published: Path, mine: Path, tmp_path: Path) ->
 
 def test_what_is_refused(published: Path, mine: Path, dataset: Path, tmp_path: Path) -> None:
     with pytest.raises(UserError, match="give the model to fine-tune with --init"):
-        own_material(mine, None)
+        custom_training_data(mine, None)
     options = {"data": mine, "init": str(published), "network": "deepdriving"}
     with pytest.raises(UserError, match="--init is a mtl, not a deepdriving"):
         start_training({**options, "alpha": (1.0, 1.0, 0.0)}, None, tmp_path / "a", resume=False)
     with pytest.raises(UserError, match="recipe fast starts anew"):
         TrainConfig(dataset, tmp_path / "b", init=str(published), recipe="fast")
     _, card = open_init(published)
-    material = own_material(mine, card)
+    material = custom_training_data(mine, card)
     other = replace(material, camera=replace(card.camera, z=1.4))
     with pytest.raises(UserError, match=r"z=1\.4.*keeps the camera"):
-        continued(other, card)
+        continue_from_model(other, card)
 
 
 def test_what_a_model_has_seen_is_not_forgotten(published: Path, mine: Path) -> None:
     _, card = open_init(published)
     seen = replace(card, data={"seeds": [3, 1], "tracks": ["coast"]})
-    about = continued(own_material(mine, card), seen).about
+    about = continue_from_model(custom_training_data(mine, card), seen).about
     assert (about["seeds"], about["tracks"]) == ([1, 3], ["coast"])

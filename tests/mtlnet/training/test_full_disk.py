@@ -11,10 +11,11 @@ from tensorboard.backend.event_processing.event_file_loader import EventFileLoad
 from tensorboard.summary.writer.record_writer import RecordWriter
 
 import runtime.files
+from mtlnet.inference.curves import COLUMNS, read_curves
 from mtlnet.inference.model_card import ModelError, read_card
 from mtlnet.training.checkpoint import list_checkpoints
 from mtlnet.training.config import TrainConfig, resume_config
-from mtlnet.training.logging import COLUMNS, Board, Curves, read_curves
+from mtlnet.training.logging import Board, Curves
 from mtlnet.training.run import train
 from runtime.files import atomic_write
 from trackfeatures.errors import UserError

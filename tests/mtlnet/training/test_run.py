@@ -18,11 +18,11 @@ from safetensors.numpy import load_file
 import mtlnet.training.loop
 from datagen.recording import Dataset
 from mtlnet.data.loader import Loader
-from mtlnet.inference.model_card import DOUBT, GRAPH, WEIGHTS, ModelError, read_card
+from mtlnet.inference.curves import read_curves
+from mtlnet.inference.model_card import GRAPH, UNCERTAINTY_WEIGHTS, WEIGHTS, ModelError, read_card
 from mtlnet.model.cpu_kernels.forward import training_outputs
 from mtlnet.training.checkpoint import list_checkpoints
 from mtlnet.training.config import TrainConfig, resume_config
-from mtlnet.training.logging import read_curves
 from mtlnet.training.loop import Progress, Stopped
 from mtlnet.training.recipes import RECIPES, learning_rate
 from mtlnet.training.run import train
@@ -102,7 +102,7 @@ def test_the_first_convolutions_learn_for_a_part_of_the_run(dataset: Path) -> No
         still = {
             n.split(".")[1] for n, w in network.named_parameters() if torch.equal(w, before[n])
         }
-        assert still == set(network.plan.convolutions[:count])
+        assert still == set(network.architecture.convolutions[:count])
 
 
 @pytest.mark.parametrize(("recipe", "balance"), [("fast", "dwa"), ("paper", "uncertainty")])
@@ -209,7 +209,7 @@ def test_a_run_keeps_what_it_was(dataset: Path, tmp_path: Path) -> None:
     assert read_card(run) == done
     assert done.iterations == 10
     assert done.export_check["openvino_f32_max"] < 2e-4
-    assert set(done.files) == {WEIGHTS, DOUBT, GRAPH, "model.bin"}
+    assert set(done.files) == {WEIGHTS, UNCERTAINTY_WEIGHTS, GRAPH, "model.bin"}
     assert done.data["content_hash"] == Dataset.open(dataset).content_hash
     assert done.data["split"]["test"] == ["r003"]
     labels = Dataset.open(dataset).select("train").labels

@@ -1,4 +1,4 @@
-"""Doubt: standard deviations that are as large as the errors, and images that show no road."""
+"""The uncertainty head: standard deviations that match errors, and the OOD score."""
 
 from collections import Counter
 from pathlib import Path
@@ -11,110 +11,120 @@ from datagen.recording import Dataset
 from mtlnet.evaluation.metrics import calibration, coverage
 from mtlnet.inference.engine import load_engine
 from mtlnet.inference.prediction import OUTPUTS, decode_outputs
-from mtlnet.inference.uncertainty import CELLS, FEATURES, UncertaintyHead, read_doubt, texture
-from mtlnet.uncertainty_fit.camera_pitch import aimed, draw_aim
-from mtlnet.uncertainty_fit.head import fit_head, novelty
-from tests.mtlnet.strange import no_road, seen_by
+from mtlnet.inference.uncertainty import (
+    CELL_VALUES,
+    FEATURES,
+    UncertaintyHead,
+    read_uncertainty_head,
+    texture_features,
+)
+from mtlnet.uncertainty_fit.head import fit_std_layers
+from mtlnet.uncertainty_fit.ood import draw_view, fit_texture_distance, view_homography
+from tests.mtlnet.ood_images import images_without_road, seen_by
 from trackfeatures.camera import CameraParameters
 
-NO_ROAD = 1000
+OOD_IMAGES = 1000
 
 
-def no_aim() -> dict[str, np.ndarray]:
-    """Layers that tell nothing of any picture."""
+def zero_pitch_layers() -> dict[str, np.ndarray]:
+    """Pitch layers whose output is 0."""
     shapes: dict[str, tuple[int, ...]] = {"centre": (0,), "scale": (0,)}
     shapes |= {"hidden_weight": (1, 0), "hidden_bias": (1,), "weight": (1, 1), "bias": (1,)}
-    return {f"aim_{name}": np.zeros(shape, np.float32) for name, shape in shapes.items()}
+    return {f"pitch_{name}": np.zeros(shape, np.float32) for name, shape in shapes.items()}
 
 
 def fitted(
     seed: int, count: int, of: int
 ) -> tuple[UncertaintyHead, np.ndarray, np.ndarray, np.ndarray]:
-    """A head fitted to errors of known deviations; features, deviations, errors of other frames."""
+    """A head fitted to errors of known deviations; x, deviations and errors of other frames."""
     rng = np.random.default_rng(seed)
     x = rng.normal(size=(count + of, 6)).astype(np.float32)
     true = np.exp(0.5 * x[:, :1] - 2 + 0.2 * np.arange(7))
     error = (rng.normal(size=true.shape) * true).astype(np.float32)
     error[rng.random(error.shape) < 0.2] = np.nan
-    head = fit_head(x[:count], error[:count], 0, None)
-    nothing = np.zeros(1, np.float32)
-    doubt = UncertaintyHead(
-        np.zeros(6, np.float32), np.ones(6, np.float32), **head,
-        usual=nothing, directions=nothing[None], **no_aim(),
+    layers = fit_std_layers(x[:count], error[:count], 0, None)
+    zero = np.zeros(1, np.float32)
+    head = UncertaintyHead(
+        np.zeros(6, np.float32), np.ones(6, np.float32), **layers,
+        texture_mean=zero, texture_directions=zero[None], **zero_pitch_layers(),
     )  # fmt: skip
-    return doubt, x[count:], true[count:], error[count:]
+    return head, x[count:], true[count:], error[count:]
 
 
-def test_known_deviations_are_recovered() -> None:
-    doubt, x, true, error = fitted(1, 3000, 3000)
-    said = doubt.assess(x, np.zeros((len(x), 1), np.float32))[:, :-1]
-    assert np.median(np.abs(np.log(said / true))) < 0.12
-    for within in coverage(said, error).values():
+def test_known_standard_deviations_are_recovered() -> None:
+    head, x, true, error = fitted(1, 3000, 3000)
+    std = head.predict(x, np.zeros((len(x), 1), np.float32))[:, :-1]
+    assert np.median(np.abs(np.log(std / true))) < 0.12
+    for within in coverage(std, error).values():
         assert within[0] == pytest.approx(0.683, abs=0.04)
         assert within[1] == pytest.approx(0.954, abs=0.025)
-    for bins in calibration(said, error.astype(np.float64)).values():
+    for bins in calibration(std, error.astype(np.float64)).values():
         assert len(bins) == 10
         assert [b["said"] for b in bins] == sorted(b["said"] for b in bins)
         for part in bins:
             assert part["found"] == pytest.approx(part["said"], rel=0.3)
 
 
-def test_a_feature_never_active_takes_part_all_the_same() -> None:
+def test_a_feature_that_is_never_present_has_a_finite_deviation() -> None:
     rng = np.random.default_rng(2)
     error = rng.normal(size=(200, 7)).astype(np.float32)
     error[:, 2] = np.nan
-    head = fit_head(rng.normal(size=(200, 4)).astype(np.float32), error, 0, None)
-    assert all(np.isfinite(value).all() for value in head.values())
+    layers = fit_std_layers(rng.normal(size=(200, 4)).astype(np.float32), error, 0, None)
+    assert all(np.isfinite(value).all() for value in layers.values())
 
 
-def test_novelty_keeps_to_its_rate_of_false_alarms() -> None:
+def test_texture_distance_has_the_given_false_alarm_rate() -> None:
     rng = np.random.default_rng(3)
     mixing = rng.normal(size=(20, 20))
     known, held_out, new = (
         (rng.normal(size=(n, 20)) @ mixing).astype(np.float32) for n in (3000, 3000, 3000)
     )
-    usual, directions = novelty(known, held_out)
-    sizes = (((new - usual) @ directions.T) ** 2).sum(1)
-    assert float((sizes > 1).mean()) == pytest.approx(0.01, abs=0.007)
+    mean, directions = fit_texture_distance(known, held_out, 0.01)
+    squared = (((new - mean) @ directions.T) ** 2).sum(1)
+    assert float((squared > 1).mean()) == pytest.approx(0.01, abs=0.007)
     far = new + 8 * mixing[0]
-    assert float(((((far - usual) @ directions.T) ** 2).sum(1) > 1).mean()) > 0.99
+    assert float(((((far - mean) @ directions.T) ** 2).sum(1) > 1).mean()) > 0.99
 
 
-def test_a_texture_by_hand() -> None:
+def test_texture_features_of_a_step_edge() -> None:
     image = np.zeros((210, 280, 3), np.uint8)
-    image[:, 70:] = 255  # the third of eight columns of cells begins there
-    whole = texture(image)
-    cells, middle = whole[:CELLS].reshape(5, 14, 8), whole[CELLS:].reshape(5, 24, 4)
+    image[:, 70:] = 255  # where the third of eight cell columns begins
+    features = texture_features(image)
+    cells = features[:CELL_VALUES].reshape(5, 14, 8)
+    centre = features[CELL_VALUES:].reshape(5, 24, 4)
     assert cells[:3, :, :2] == pytest.approx(-1)
     assert cells[:3, :, 2:] == pytest.approx(1)
     assert cells[3, :, 1] == pytest.approx((2 / 35) ** 0.5, rel=1e-3)  # one step of 2 in 35 pixels
     assert np.delete(cells[3], 1, 1) == pytest.approx(1e-3)
     assert cells[4] == pytest.approx(1e-3)
-    assert middle[:3] == pytest.approx(1)
-    image[:50] = 0  # the second of the bands of 5 rows in the middle begins there, at row 45
-    middle = texture(image)[CELLS:].reshape(5, 24, 4)
-    assert middle[0, 0] == pytest.approx(-1)
-    assert middle[0, 1:] == pytest.approx(1)
-    assert middle[4, 0] == pytest.approx((2 / 5) ** 0.5, rel=1e-3)
-    assert middle[4, 1:] == pytest.approx(1e-3)
+    assert centre[:3] == pytest.approx(1)
+    image[:50] = 0  # up to the second band (5 rows) of the centre, which begins at row 45
+    centre = texture_features(image)[CELL_VALUES:].reshape(5, 24, 4)
+    assert centre[0, 0] == pytest.approx(-1)
+    assert centre[0, 1:] == pytest.approx(1)
+    assert centre[4, 0] == pytest.approx((2 / 5) ** 0.5, rel=1e-3)
+    assert centre[4, 1:] == pytest.approx(1e-3)
 
 
-def test_a_thousand_pictures_of_no_road_are_strange(published: Path) -> None:
-    doubt = read_doubt(published)
+def test_images_without_a_road_are_out_of_distribution(published: Path) -> None:
+    head = read_uncertainty_head(published)
     kinds, textures = zip(
-        *((kind, texture(image)) for kind, image in no_road(NO_ROAD, 5)), strict=True
+        *((kind, texture_features(image)) for kind, image in images_without_road(OOD_IMAGES, 5)),
+        strict=True,
     )
-    told = doubt.assess(np.zeros((NO_ROAD, 256), np.float32), np.stack(textures))[:, -1] > 1
-    by_kind = Counter(kind for kind, strange in zip(kinds, told, strict=True) if strange)
-    assert told.mean() > 0.98, by_kind
+    found = head.predict(np.zeros((OOD_IMAGES, 256), np.float32), np.stack(textures))[:, -1] > 1
+    by_kind = Counter(kind for kind, ood in zip(kinds, found, strict=True) if ood)
+    assert found.mean() > 0.98, by_kind
 
 
-def test_roads_are_known_and_foreign_cameras_are_not(published: Path, dataset: Path) -> None:
+def test_roads_are_in_distribution_and_other_cameras_are_not(
+    published: Path, dataset: Path
+) -> None:
     frames = Dataset.open(dataset).select("test")
     images = frames.read_batch(np.arange(len(frames)))
     engine = load_engine(published, precision="f32")
-    strange = [decode_outputs(engine(image)).out_of_distribution for image in images]
-    assert sum(map(bool, strange)) <= 2
+    ood = [decode_outputs(engine(image)).out_of_distribution for image in images]
+    assert sum(map(bool, ood)) <= 2
     views = [
         seen_by(image, CameraParameters(), fov, pitch)
         for image in images[:6]
@@ -125,51 +135,51 @@ def test_roads_are_known_and_foreign_cameras_are_not(published: Path, dataset: P
 
 
 @pytest.mark.parametrize(("pitch_deg", "fov_y_deg"), [(6, 67.5), (-6, 67.5), (7, 80), (-7, 58)])
-def test_a_camera_that_looks_elsewhere(
+def test_another_pitch_is_detected_with_its_sign(
     published: Path, dataset: Path, pitch_deg: float, fov_y_deg: float
 ) -> None:
     frames = Dataset.open(dataset).select("test")
     images = frames.read_batch(np.arange(len(frames)))
     views = np.stack(
-        [texture(seen_by(i, CameraParameters(), fov_y_deg, pitch_deg)) for i in images]
+        [texture_features(seen_by(i, CameraParameters(), fov_y_deg, pitch_deg)) for i in images]
     )
-    doubt = read_doubt(published)
-    aim = doubt.aim(views[:, CELLS:])[:, 0]
-    assert (aim**2 > 1).mean() > 0.9
-    assert (np.sign(aim) == np.sign(pitch_deg)).mean() > 0.9  # and it knows which way
-    known = np.stack([texture(image) for image in images])
-    assert (np.abs(doubt.aim(known[:, CELLS:])) > 1).sum() <= 1
+    head = read_uncertainty_head(published)
+    offset = head.pitch_offset(views[:, CELL_VALUES:])[:, 0]
+    assert (offset**2 > 1).mean() > 0.9
+    assert (np.sign(offset) == np.sign(pitch_deg)).mean() > 0.9
+    known = np.stack([texture_features(image) for image in images])
+    assert (np.abs(head.pitch_offset(known[:, CELL_VALUES:])) > 1).sum() <= 1
 
 
-def test_no_border_is_ever_seen() -> None:
+def test_the_centre_of_a_drawn_view_lies_in_the_frame() -> None:
     camera, rng = CameraParameters(), np.random.default_rng(8)
     shape = (camera.height, camera.width)
     steepest = 0.0
     for _ in range(200):
-        pitch, wider = draw_aim(camera, rng)
+        pitch, log_zoom = draw_view(camera, rng)
         steepest = max(steepest, abs(pitch))
         full = np.full((*shape, 3), 200, np.uint8)
-        seen = cv2.warpPerspective(full, aimed(camera, pitch, wider), shape[::-1])
+        seen = cv2.warpPerspective(full, view_homography(camera, pitch, log_zoom), shape[::-1])
         assert (seen[45:166, 70:211] == 200).all()
     assert steepest > np.radians(12)
 
 
-def test_an_aim_is_seen_as_by_that_camera(dataset: Path) -> None:
+def test_a_view_matches_that_cameras_image(dataset: Path) -> None:
     camera = CameraParameters()
     image = Dataset.open(dataset).select("test").image(0)
     expected = seen_by(image, camera, 80.0, 5.0)
-    wider = np.log(np.tan(np.radians(40.0)) / np.tan(np.radians(camera.fov_y_deg / 2)))
-    moved = aimed(camera, np.radians(5.0), wider)
-    found = cv2.warpPerspective(image, moved, (camera.width, camera.height))
-    middle = np.s_[50:160, 75:205]
-    # The oracle's picture is half a pixel aside.
-    assert np.abs(found[middle].astype(int) - expected[middle]).mean() < 6
+    log_zoom = np.log(np.tan(np.radians(40.0)) / np.tan(np.radians(camera.fov_y_deg / 2)))
+    homography = view_homography(camera, np.radians(5.0), log_zoom)
+    found = cv2.warpPerspective(image, homography, (camera.width, camera.height))
+    inside = np.s_[50:160, 75:205]
+    # The expected image is shifted by half a pixel.
+    assert np.abs(found[inside].astype(int) - expected[inside]).mean() < 6
 
 
-def test_answers_carry_their_doubt(published: Path) -> None:
+def test_predictions_have_standard_deviations_and_ood_flag(published: Path) -> None:
     outputs = load_engine(published)(np.zeros((210, 280, 3), np.uint8))
     assert outputs.shape == (OUTPUTS + len(FEATURES) + 1,)
-    answer = decode_outputs(outputs)
-    assert answer.out_of_distribution is True
-    assert answer.std is not None
-    assert answer.std["angle"] == pytest.approx(outputs[OUTPUTS + 6])
+    prediction = decode_outputs(outputs)
+    assert prediction.out_of_distribution is True
+    assert prediction.std is not None
+    assert prediction.std["angle"] == pytest.approx(outputs[OUTPUTS + 6])

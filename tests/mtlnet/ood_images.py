@@ -1,4 +1,4 @@
-"""Pictures that show no road, drawn from a seed, and views of a road by foreign cameras."""
+"""Out-of-distribution images: synthetic images without a road, and roads seen by other cameras."""
 
 from collections.abc import Iterator
 
@@ -12,8 +12,8 @@ WIDTH, HEIGHT = 280, 210
 Image = NDArray[np.uint8]
 
 
-def no_road(count: int, seed: int) -> Iterator[tuple[str, Image]]:
-    """`count` pictures (210, 280, 3) uint8 RGB with the name of their kind, each kind as often."""
+def images_without_road(count: int, seed: int) -> Iterator[tuple[str, Image]]:
+    """`count` images (210, 280, 3) uint8 RGB, each with the name of its kind; kinds alternate."""
     kinds = (uniform, noise, clouds, gradient, stripes, shapes, text, interior)
     for number in range(count):
         kind = kinds[number % len(kinds)]
@@ -31,7 +31,7 @@ def noise(rng: np.random.Generator) -> Image:
 
 
 def clouds(rng: np.random.Generator) -> Image:
-    """Noise of all sizes, as in a texture of stone or foliage."""
+    """Noise of all scales, like a texture of stone or foliage."""
     total = np.zeros((HEIGHT, WIDTH, 3))
     for octave in range(1, 8):
         layer = rng.normal(size=(2**octave, 2**octave, 3)) / octave
@@ -41,8 +41,8 @@ def clouds(rng: np.random.Generator) -> Image:
 
 def gradient(rng: np.random.Generator) -> Image:
     rows, columns = np.mgrid[0:1:210j, 0:1:280j]
-    turn = rng.uniform(0, 2 * np.pi)
-    along = rows * np.sin(turn) + columns * np.cos(turn)
+    direction = rng.uniform(0, 2 * np.pi)
+    along = rows * np.sin(direction) + columns * np.cos(direction)
     return _full_range(along[..., None] * rng.uniform(-1, 1, 3) + rng.uniform(0, 1, 3))
 
 
@@ -69,7 +69,7 @@ def shapes(rng: np.random.Generator) -> Image:
 
 
 def text(rng: np.random.Generator) -> Image:
-    """A page: dark letters on light paper, or the other way round."""
+    """A page of dark letters on light paper, or the reverse."""
     paper, ink = (245, 20) if rng.random() < 0.7 else (20, 235)
     image = np.full((HEIGHT, WIDTH, 3), paper, np.uint8)
     for line in range(14, HEIGHT, 15):
@@ -79,7 +79,7 @@ def text(rng: np.random.Generator) -> Image:
 
 
 def interior(rng: np.random.Generator) -> Image:
-    """Something like a photograph of a room: walls of soft light, boxes with shaded sides."""
+    """Similar to a photograph of a room: smooth walls, boxes with shaded sides."""
     image = gradient(rng) // 2 + clouds(rng) // 6
     for _ in range(rng.integers(3, 9)):
         x, y = rng.integers(0, WIDTH - 30), rng.integers(40, HEIGHT - 20)
@@ -92,16 +92,16 @@ def interior(rng: np.random.Generator) -> Image:
 def seen_by(
     image: Image, camera: CameraParameters, fov_y_deg: float, pitch_deg: float = 0.0
 ) -> Image:
-    """What a camera of another field of view and pitch (down positive) sees in the same place.
+    """The image of a camera with another field of view and pitch (down positive) at the same place.
 
-    Exact where it looks at what `image` shows; its border is drawn out beyond.
+    Exact where `image` shows the scene; beyond it the border is replicated.
     """
     inside, outside = (_intrinsics(camera, fov) for fov in (camera.fov_y_deg, fov_y_deg))
     down = np.radians(pitch_deg)
     cosine, sine = np.cos(down), np.sin(down)
-    turn = np.array([[1, 0, 0], [0, cosine, -sine], [0, sine, cosine]])
+    rotation = np.array([[1, 0, 0], [0, cosine, -sine], [0, sine, cosine]])
     size = (camera.width, camera.height)
-    warp = outside @ turn @ np.linalg.inv(inside)
+    warp = outside @ rotation @ np.linalg.inv(inside)
     return cv2.warpPerspective(image, warp, size, borderMode=cv2.BORDER_REPLICATE).astype(np.uint8)
 
 

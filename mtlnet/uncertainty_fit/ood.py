@@ -1,0 +1,215 @@
+"""Fitting the out-of-distribution score: texture distance and camera pitch.
+
+The pitch regressor needs images of cameras with another pitch. They are made from training frames
+by homographies, which are exact for a rotation about the optical centre (Hartley and Zisserman
+2004, section 8.4). Only views whose image centre lies within the frame are used, so that no
+extrapolated border is seen.
+
+The field of view of these images varies too, but is not predicted: on a straight flat road a wider
+view looks like that of a higher camera, except for the length of dashes. Tried: a field-of-view
+regressor detects only 2 to 5 % of the frames.
+"""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from mtlnet.data.augment.geometric import rotation_homography
+from mtlnet.data.loader import Images
+from mtlnet.inference.uncertainty import (
+    BANDS,
+    CELL_COLUMNS,
+    CELL_ROWS,
+    CELL_VALUES,
+    CENTRE_BANDS,
+    CENTRE_COLUMNS,
+    texture_features,
+)
+from trackfeatures.camera import CameraParameters
+
+MIN_SPREAD = 0.05
+"""Lower limit of a cell value's standard deviation: cells may be flat in all training frames."""
+RIDGE = 0.02
+"""Added to the variance along each principal axis of standardised textures, against overfitting."""
+MAX_PITCH_RAD, MAX_LOG_ZOOM = 0.26, 0.5
+"""15 degrees; and the logarithm of the ratio of the tangents of half the field of view."""
+PITCH_FRAMES, VIEWS_PER_FRAME = 1_500, 2
+PITCH_UNIT_RAD = 0.1  # unit of the regression target
+MIN_PITCH_LIMIT_RAD = 0.02
+"""Lower limit of the pitch that counts as out of distribution, for datasets of a few frames."""
+HIDDEN = 64
+
+Numbers = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class FitSettings:
+    """How a small regressor is trained; see `minimise`."""
+
+    steps: int
+    batch: int
+    learning_rate: float
+    weight_decay: float
+
+
+FIT = FitSettings(steps=800, batch=256, learning_rate=3e-3, weight_decay=0.1)
+
+
+def fit_texture_distance(
+    known: Numbers, held_out: Numbers, false_alarm_rate: float
+) -> tuple[Numbers, Numbers]:
+    """Mean (C,) and directions (C, C) of the Mahalanobis distance of texture cell values (N, C).
+
+    Scaled so that a share `false_alarm_rate` of the held-out frames exceeds a squared distance of
+    1.
+    """
+    mean, spread = known.mean(0), np.maximum(known.std(0), MIN_SPREAD)
+    variance, axes = np.linalg.eigh(np.cov((known - mean) / spread, rowvar=False))
+    directions = (axes / np.sqrt(np.maximum(variance, 0) + RIDGE)).T / spread
+    squared = (((held_out - mean) @ directions.T) ** 2).sum(1)
+    limit = max(float(np.quantile(squared, 1 - false_alarm_rate)), 1e-6)
+    return mean, np.asarray(directions / np.sqrt(limit), np.float32)
+
+
+def draw_view(camera: CameraParameters, rng: np.random.Generator) -> tuple[float, float]:
+    """Draw a pitch (rad, down positive) and a log zoom whose image centre lies in the frame."""
+    while True:
+        pitch = rng.uniform(-MAX_PITCH_RAD, MAX_PITCH_RAD)
+        log_zoom = rng.uniform(-MAX_LOG_ZOOM, MAX_LOG_ZOOM)
+        if _centre_in_frame(camera, pitch, log_zoom):
+            return pitch, log_zoom
+
+
+def view_homography(camera: CameraParameters, pitch: float, log_zoom: float) -> NDArray[np.float64]:
+    """Homography (3, 3) from pixels of `camera` to those of a camera with another view.
+
+    It looks `pitch` (rad) further down, and sees exp(`log_zoom`) times as far to the sides.
+    """
+    u0, v0 = (camera.width - 1) / 2, (camera.height - 1) / 2
+    scale = np.exp(-log_zoom)
+    zoom = np.array([[scale, 0, u0 * (1 - scale)], [0, scale, v0 * (1 - scale)], [0, 0, 1]])
+    homography: NDArray[np.float64] = zoom @ rotation_homography(camera, 0.0, pitch)
+    return homography
+
+
+def _centre_in_frame(camera: CameraParameters, pitch: float, log_zoom: float) -> bool:
+    band = camera.height // (CELL_ROWS * BANDS)
+    cell = camera.width // CELL_COLUMNS
+    # `stop` is one pixel beyond the centre: differences use the next pixel.
+    x = np.array([CENTRE_COLUMNS.start, CENTRE_COLUMNS.stop]) * cell
+    y = np.array([CENTRE_BANDS.start, CENTRE_BANDS.stop]) * band
+    corners = np.array([[a, b, 1] for a in x for b in y]).T
+    u, v, w = np.linalg.inv(view_homography(camera, pitch, log_zoom)) @ corners
+    u, v = u / w, v / w
+    inside = (u >= 0) & (u <= camera.width - 1) & (v >= 0) & (v <= camera.height - 1)
+    return bool(inside.all() and (w > 0).all())
+
+
+def pitched_views(frames: Images, camera: CameraParameters, seed: int) -> tuple[Numbers, Numbers]:
+    """Centre texture features (N, M) of frames seen at other pitches, and these (N,), rad down."""
+    rng = np.random.default_rng([seed, 4])
+    chosen = np.linspace(0, len(frames) - 1, min(PITCH_FRAMES, len(frames))).astype(np.int64)
+    image = np.empty((1, camera.height, camera.width, 3), np.uint8)
+    size = (camera.width, camera.height)
+    centres, pitches = [], []
+    for row in chosen:
+        frames.read_batch(np.array([row]), image)
+        for _ in range(VIEWS_PER_FRAME):
+            pitch, log_zoom = draw_view(camera, rng)
+            homography = view_homography(camera, pitch, log_zoom)
+            view = cv2.warpPerspective(
+                image[0], homography, size, borderMode=cv2.BORDER_REFLECT_101
+            )
+            centres.append(texture_features(view.astype(np.uint8, copy=False))[CELL_VALUES:])
+            pitches.append(pitch)
+    return np.array(centres), np.array(pitches, np.float32)
+
+
+def fit_pitch_offset(
+    known: Numbers,
+    views: tuple[Numbers, Numbers],
+    held_out: Numbers,
+    false_alarm_rate: float,
+    seed: int,
+) -> dict[str, Numbers]:
+    """Fit the pitch regressor; the `pitch_*` fields of `UncertaintyHead`.
+
+    `known` (N, M), `held_out` (K, M): centre texture features of unchanged frames; `views`: those
+    of `pitched_views`, and their pitches. Scaled so that a share `false_alarm_rate` of the held-out
+    frames has an offset beyond 1.
+    """
+    x = np.concatenate([known, views[0]])
+    target = np.concatenate([np.zeros(len(known), np.float32), views[1] / PITCH_UNIT_RAD])[:, None]
+    centre, scale = x.mean(0), 1 / np.maximum(x.std(0), 0.02)
+    first, second = _train(torch.from_numpy((x - centre) * scale), torch.from_numpy(target), seed)
+    hidden = np.maximum(((held_out - centre) * scale) @ first.weight.T + first.bias, 0)
+    predicted = hidden @ second.weight.T + second.bias
+    zero = np.median(predicted)
+    limit = max(
+        float(np.quantile(np.abs(predicted - zero), 1 - false_alarm_rate)),
+        MIN_PITCH_LIMIT_RAD / PITCH_UNIT_RAD,
+    )
+    return {
+        "pitch_centre": centre.astype(np.float32),
+        "pitch_scale": scale.astype(np.float32),
+        "pitch_hidden_weight": first.weight,
+        "pitch_hidden_bias": first.bias,
+        "pitch_weight": (second.weight / limit).astype(np.float32),
+        "pitch_bias": ((second.bias - zero) / limit).astype(np.float32),
+    }
+
+
+@dataclass(frozen=True)
+class _Layer:
+    """A linear layer: weight (N, M) and bias (N,)."""
+
+    weight: Numbers
+    bias: Numbers
+
+
+def _train(z: Tensor, target: Tensor, seed: int) -> tuple[_Layer, _Layer]:
+    """Two layers z (N, M) -> target (N, 1), trained with a smooth L1 loss."""
+    generator = torch.Generator().manual_seed(seed)
+    layers = nn.Linear(z.shape[1], HIDDEN), nn.Linear(HIDDEN, 1)
+    with torch.no_grad():
+        for layer in layers:
+            layer.weight.normal_(0.0, layer.in_features**-0.5, generator=generator)
+            layer.bias.zero_()
+
+    def loss(rows: Tensor) -> Tensor:
+        predicted = layers[1](layers[0](z[rows]).relu())
+        return nn.functional.smooth_l1_loss(predicted, target[rows], beta=0.1)
+
+    minimise(loss, [p for layer in layers for p in layer.parameters()], len(z), FIT, generator)
+    first, second = (
+        _Layer(layer.weight.detach().numpy(), layer.bias.detach().numpy()) for layer in layers
+    )
+    return first, second
+
+
+def minimise(
+    loss: Callable[[Tensor], Tensor],
+    parameters: Iterable[nn.Parameter],
+    count: int,
+    settings: FitSettings,
+    generator: torch.Generator,
+) -> None:
+    """Minimise `loss(rows)` over random batches of rows of `count` samples.
+
+    AdamW, with a learning rate that decreases to 0 along a cosine.
+    """
+    optimizer = torch.optim.AdamW(
+        parameters, settings.learning_rate, weight_decay=settings.weight_decay
+    )
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, max(settings.steps, 1))
+    for _ in range(settings.steps):
+        value = loss(torch.randint(count, (min(settings.batch, count),), generator=generator))
+        optimizer.zero_grad(set_to_none=True)
+        value.backward()  # type: ignore[no-untyped-call]  # torch leaves it untyped
+        optimizer.step()
+        schedule.step()
