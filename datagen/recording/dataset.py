@@ -7,13 +7,12 @@ batch = frames.read_batch([3, 1, 2])
 import hashlib
 import os
 from bisect import bisect_right
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import accumulate
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,11 +37,7 @@ from datagen.recording.splits import (
 )
 from trackfeatures.camera import CameraParameters
 
-if TYPE_CHECKING:
-    from datagen.recording.bulk import BulkDecoder
-
 IMAGE_DATA = 2  # number of the field `data` of foxglove.CompressedImage
-BULK = 8  # images: for fewer, compiled code is not worth loading
 
 
 class Frames:
@@ -87,7 +82,7 @@ class Frames:
         try:
             return bytes_field(self._images[number].payload(frame), IMAGE_DATA)
         except ValueError as error:
-            raise self._unreadable(i, error) from error
+            raise self._undecodable(i, error) from error
 
     def image(self, i: int) -> NDArray[np.uint8]:
         """The image of frame `i`, (H, W, 3) uint8 RGB; DatasetError when it cannot be decoded."""
@@ -97,48 +92,42 @@ class Frames:
     def read_batch(
         self, indices: Sequence[int] | NDArray[np.int64], out: NDArray[np.uint8] | None = None
     ) -> NDArray[np.uint8]:
-        """Decode the images of `indices` into `out` (B, H, W, 3) uint8 RGB, on all cores.
+        """Decode the images of `indices` into `out` (B, H, W, 3) uint8 RGB, one thread a core.
 
-        Returns `out`, a new array where none is given. IndexError for a frame that is not there,
-        DatasetError for an image that cannot be decoded. The first batch of a process takes 0.7 s
-        longer, the first on a machine some seconds: the decoder is compiled, and kept.
+        Returns `out`, a new array if none is given. Raises IndexError for a frame that does not
+        exist, UndecodableImage for a damaged image (the rest of `out` is then undefined), and
+        ValueError if `out` has another shape or type.
         """
         numbers = np.asarray(indices, dtype=np.int64)
         shape = (len(numbers), self.camera.height, self.camera.width, 3)
         out = np.empty(shape, np.uint8) if out is None else out
         if out.shape != shape or out.dtype != np.uint8:
             raise ValueError(f"`out` is {out.dtype} {out.shape}, expected uint8 {shape}")
-        left = np.arange(len(numbers))
-        if len(numbers) >= BULK and out.flags.c_contiguous:
-            left = np.flatnonzero(~self._decode_together(numbers, out))
-        if len(left):
-            # One iterator for all threads: each takes the next image when it is done with its last.
-            rows = zip(left.tolist(), numbers[left].tolist(), strict=True)
-            self._on_all_threads(lambda: self._decode(rows, out))
+        absent = numbers[(numbers < 0) | (numbers >= len(self))]
+        if len(absent):
+            raise IndexError(f"frame {absent[0]} of {len(self)}")
+        # One iterator for all threads: each takes the next image when it is done with its last.
+        rows = iter(enumerate(numbers.tolist()))
+        threads = min(self._threads, len(numbers))
+        parts = [self._pool.submit(self._decode, rows, out) for _ in range(threads)]
+        wait(parts)  # after an error no thread may still be writing to `out`
+        errors = [error for part in parts if (error := part.result()) is not None]
+        if errors:
+            raise min(errors)[1]
         return out
 
-    def _decode_together(
-        self, numbers: NDArray[np.int64], out: NDArray[np.uint8]
-    ) -> NDArray[np.bool_]:
-        """Which images our own decoder has decoded, (B,)."""
-        from datagen.recording.bulk import lots
-
-        found = lots([self.jpeg(i) for i in numbers.tolist()])
-        done = np.zeros(len(numbers), np.bool_)
-        self._on_all_threads(lambda: self._bulk.decode(found, out, done))
-        return done
-
-    def _decode(self, rows: Iterator[tuple[int, int]], out: NDArray[np.uint8]) -> None:
+    def _decode(
+        self, rows: Iterator[tuple[int, int]], out: NDArray[np.uint8]
+    ) -> tuple[int, UndecodableImage] | None:
+        """Decode until `rows` ends or an image is damaged; its row and error then."""
         for row, i in rows:
             try:
                 decode_into(self.jpeg(i), out[row])
+            except UndecodableImage as error:
+                return row, error
             except ValueError as error:
-                raise self._unreadable(i, error) from error
-
-    def _on_all_threads(self, work: Callable[[], None]) -> None:
-        parts = [self._pool.submit(work) for _ in range(self._threads)]
-        for part_done in parts:
-            part_done.result()
+                return row, self._undecodable(i, error)
+        return None
 
     def _locate(self, i: int) -> tuple[int, int]:
         if not 0 <= i < len(self):
@@ -147,7 +136,7 @@ class Frames:
         number = bisect_right(self._first, row) - 1
         return number, row - self._first[number]
 
-    def _unreadable(self, i: int, error: Exception) -> UndecodableImage:
+    def _undecodable(self, i: int, error: Exception) -> UndecodableImage:
         number, frame = self._locate(i)
         info = self.rounds[number]
         return UndecodableImage(info.id, info.path, frame, str(error))
@@ -155,12 +144,6 @@ class Frames:
     @cached_property
     def _threads(self) -> int:
         return len(os.sched_getaffinity(0))
-
-    @cached_property
-    def _bulk(self) -> "BulkDecoder":
-        from datagen.recording.bulk import BulkDecoder  # numba takes long to load
-
-        return BulkDecoder()
 
     @cached_property
     def _pool(self) -> ThreadPoolExecutor:

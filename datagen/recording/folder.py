@@ -6,7 +6,6 @@ A round is written under `.partial/`, read back, checked, hashed, synced and ren
 
 import hashlib
 import json
-import os
 import shutil
 from collections.abc import Iterable
 from contextlib import suppress
@@ -16,12 +15,12 @@ from pathlib import Path
 
 from datagen.recording.errors import DatasetError
 from datagen.recording.schema.json_schema import SCHEMA, schema_text
+from runtime.files import atomic_move, atomic_write, unfinished_path
 
 PARTIAL = ".partial"
 LOCKS = ".locks"
 SUBFOLDERS = ("rounds", "state", "splits", "layouts", "proto", "schemas")
 PUBLISHED = ("proto/driverview.proto", "layouts/foxglove.json", SCHEMA)
-UNFINISHED = ".{name}.new"  # a small file before it takes its place
 READ_BYTES = 1 << 20
 
 
@@ -52,14 +51,17 @@ def prepare(folder: Path) -> None:
     package = files("datagen.recording.schema")
     for name in PUBLISHED:
         text = schema_text() if name == SCHEMA else package.joinpath(name).read_text()
-        write_synced(folder / name, text)
+        write_if_changed(folder / name, text)
 
 
-def barely_begun(folder: Path, first: str) -> bool:
-    """Whether nothing is in the folder but empty parts of a dataset and the beginning of `first`,
-    the file that is written before all others: what a disk full at the start may leave."""
+def is_unstarted(folder: Path, first_file: str) -> bool:
+    """Whether `folder` holds at most empty parts of a dataset and an unfinished `first_file`.
+
+    That is what a disk that was full from the start leaves; `first_file` is written before all
+    others.
+    """
     return all(
-        path.name in (UNFINISHED.format(name=first), LOCKS)
+        path.name in (unfinished_path(folder / first_file).name, LOCKS)
         or (path.name in (*SUBFOLDERS, PARTIAL) and path.is_dir() and not any(path.iterdir()))
         for path in folder.iterdir()
     )
@@ -83,8 +85,8 @@ def partial_path(folder: Path, round_id: str) -> Path:
 
 def publish(folder: Path, partial: Path, state: RoundState) -> None:
     """Move a checked round to its place: after a power cut it is there whole or not at all."""
-    move_synced(partial, round_path(folder, state.id))
-    write_synced(state_path(folder, state.id), json.dumps(asdict(state), indent=1) + "\n")
+    atomic_move(partial, round_path(folder, state.id))
+    write_if_changed(state_path(folder, state.id), json.dumps(asdict(state), indent=1) + "\n")
     discard_partial(folder, state.id)
 
 
@@ -120,33 +122,7 @@ def file_sha256(path: Path) -> str:
     return digest.hexdigest()
 
 
-def move_synced(source: Path, target: Path) -> None:
-    """Put a finished file, or a folder of files, in its place: after a power cut it is there whole
-    or not at all."""
-    for path in (*source.rglob("*"), source):
-        _sync(path)
-    source.replace(target)
-    _sync(target.parent)
-
-
-def write_synced(path: Path, text: str) -> None:
-    """Replace a small file in one step; one that holds this text already is left alone."""
-    if path.is_file() and path.read_bytes() == text.encode():
-        return
-    beside = path.with_name(UNFINISHED.format(name=path.name))
-    try:
-        beside.write_text(text, encoding="utf-8")
-        _sync(beside)
-        beside.replace(path)
-    except OSError:
-        beside.unlink(missing_ok=True)
-        raise
-    _sync(path.parent)
-
-
-def _sync(path: Path) -> None:
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
+def write_if_changed(path: Path, text: str) -> None:
+    """Replace a small file in one step, on the disk; a file that holds `text` already is kept."""
+    if not (path.is_file() and path.read_bytes() == text.encode()):
+        atomic_write(path, text, fsync=True)

@@ -50,5 +50,5 @@ def decode_into(data: Buffer, out: NDArray[np.uint8]) -> None:
 def _require_shape(found: tuple[int, ...], out: NDArray[np.uint8]) -> None:
     if tuple(found) != out.shape[:2]:
         raise ValueError(
-            f"it is {found[1]}x{found[0]} px where {out.shape[1]}x{out.shape[0]} were expected"
+            f"it is {found[1]}x{found[0]} px, expected {out.shape[1]}x{out.shape[0]} px"
         )

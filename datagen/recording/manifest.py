@@ -12,7 +12,7 @@ from typing import Any
 import trackfeatures as tf
 from datagen.recording.card import card
 from datagen.recording.dataset import Dataset
-from datagen.recording.folder import PUBLISHED, file_sha256, read_states, write_synced
+from datagen.recording.folder import PUBLISHED, file_sha256, read_states, write_if_changed
 from datagen.recording.splits import Split, split_path, write_split
 from datagen.recording.statistics import describe
 
@@ -82,7 +82,7 @@ def rebuild(folder: Path, split: Split) -> dict[str, Any]:
     write_split(split_path(folder), split)
     dataset = Dataset.open(folder)
     statistics = describe(dataset)
-    write_synced(folder / "stats.json", as_text(statistics))
-    write_synced(folder / "README.md", card(dataset, statistics))
-    write_synced(folder / MANIFEST, as_text(describe_folder(dataset)))
+    write_if_changed(folder / "stats.json", as_text(statistics))
+    write_if_changed(folder / "README.md", card(dataset, statistics))
+    write_if_changed(folder / MANIFEST, as_text(describe_folder(dataset)))
     return statistics

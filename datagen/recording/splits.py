@@ -15,7 +15,7 @@ import numpy as np
 
 import trackfeatures as tf
 from datagen.recording.errors import DatasetError
-from datagen.recording.folder import write_synced
+from datagen.recording.folder import write_if_changed
 from datagen.recording.mcap.index import RoundIndex
 from datagen.recording.round_metadata import RoundInfo
 
@@ -73,7 +73,7 @@ def write_split(path: Path, split: Split) -> None:
     content = {"definitions": tf.VERSION} | {side: list(getattr(split, side)) for side in SIDES}
     if split.recovered:
         content["recovered"] = list(split.recovered)
-    write_synced(path, json.dumps(content, indent=1) + "\n")
+    write_if_changed(path, json.dumps(content, indent=1) + "\n")
 
 
 def require_disjoint(split: Split, rounds: Iterable[RoundKey]) -> None:

@@ -16,7 +16,6 @@ from datagen.recording.errors import DatasetError
 from datagen.recording.folder import (
     RoundState,
     file_sha256,
-    move_synced,
     partial_path,
     publish,
     state_path,
@@ -35,6 +34,7 @@ from datagen.recording.round_metadata import (
     RoundResult,
 )
 from datagen.recording.schema import messages, topics
+from runtime.files import atomic_move, unfinished_path
 
 ROUNDS = "rounds"
 
@@ -82,13 +82,13 @@ def recover(file: Path, out: Path | None = None) -> Recovered:
         partial = partial_path(folder, header.id)
     else:
         target.parent.mkdir(parents=True, exist_ok=True)
-        partial = target.with_name(f".{target.name}.new")
+        partial = unfinished_path(target)
     try:
         state = _write(partial, header, whole, recovery)
         if in_dataset:
             publish(folder, partial, state)
         else:
-            move_synced(partial, target)
+            atomic_move(partial, target)
     finally:
         partial.unlink(missing_ok=True)
     return Recovered(str(target), recovery.saved, recovery.lost, recovery.at_least)

@@ -36,7 +36,7 @@ def test_a_disk_full_from_the_start_leaves_a_folder_that_can_be_gone_on_with(
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     with monkeypatch.context() as patch:
-        patch.setattr("datagen.recording.folder._sync", full)
+        patch.setattr("runtime.files.fsync_path", full)
         with pytest.raises(OSError, match="No space left"):
             collect(plan, folder, workers=1)
     require_fitting(folder, plan)

@@ -124,7 +124,7 @@ def test_images_of_another_size_are_found_by_deep(samples: Samples, dataset: Pat
     frames = [replace(f, image=f.image[:20, :20]) for f in samples.frames(3, seed=9)]
     samples.write(round_path(dataset, "r000"), samples.header("r000"), frames)
     problems = verify(dataset, "deep").problems
-    assert sum("20x20 px where 56x42" in p for p in problems) == 3
+    assert sum("20x20 px, expected 56x42 px" in p for p in problems) == 3
 
 
 def test_a_leaking_split_and_one_of_other_definitions_are_reported(dataset: Path) -> None:

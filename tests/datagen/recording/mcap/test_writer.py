@@ -14,7 +14,6 @@ from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
 import trackfeatures as tf
-from datagen.recording.images import decode_into, encode
 from datagen.recording.labels import read_labels
 from datagen.recording.mcap.index import MappedMessages, RoundIndex, load_round, open_round
 from datagen.recording.mcap.protobuf_wire import points_field
@@ -135,23 +134,6 @@ def test_the_content_hash_knows_images_and_labels_but_not_names(
     renamed = samples.write(tmp_path / "b.mcap", samples.header("r002"), frames)
     shorter = samples.write(tmp_path / "c.mcap", samples.header("r001"), frames[:-1])
     assert first.content_hash == renamed.content_hash != shorter.content_hash
-
-
-def test_png_loses_nothing_and_jpeg_little() -> None:
-    rng = np.random.default_rng(0)
-    image = rng.integers(0, 256, (42, 56, 3), dtype=np.uint8)
-    out = np.empty_like(image)
-    decode_into(encode(image, "png"), out)
-    assert np.array_equal(out, image)
-    smooth = np.tile(np.arange(56, dtype=np.uint8)[None, :, None] * 4, (42, 1, 3))
-    decode_into(encode(smooth, "jpeg"), out)
-    assert np.abs(out.astype(int) - smooth).max() <= 4
-
-
-def test_an_image_of_another_size_is_refused() -> None:
-    small = encode(np.zeros((20, 20, 3), np.uint8), "jpeg")
-    with pytest.raises(ValueError, match="20x20 px where 56x42"):
-        decode_into(small, np.empty((42, 56, 3), np.uint8))
 
 
 def _assert_same(one: RoundIndex, other: RoundIndex) -> None:
