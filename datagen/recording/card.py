@@ -10,16 +10,21 @@ import trackfeatures as tf
 from datagen.recording.dataset import Dataset
 from datagen.recording.images import JPEG_QUALITY
 from datagen.recording.schema.fields import FIELDS, Field
-from datagen.recording.schema.json_schema import SCHEMA
+from datagen.recording.schema.json_schema import SCHEMA_FILE
 from datagen.recording.schema.topics import MESSAGE_TYPES
 from datagen.recording.splits import SIDES
 from trackfeatures.camera import CameraParameters
 
-SIZES = ((1_000, "n<1K"), (10_000, "1K<n<10K"), (100_000, "10K<n<100K"), (1_000_000, "100K<n<1M"))
-LARGEST = "1M<n<10M"
+SIZE_CATEGORIES = (
+    (1_000, "n<1K"),
+    (10_000, "1K<n<10K"),
+    (100_000, "10K<n<100K"),
+    (1_000_000, "100K<n<1M"),
+)
+LARGEST_CATEGORY = "1M<n<10M"
 CODECS = {"jpeg": f"JPEG, quality {JPEG_QUALITY}, 4:2:0", "png": "PNG, lossless"}
 
-CARD = """---
+TEMPLATE = """---
 license: mit
 pretty_name: "{name}: driver-view images and track features"
 annotations_creators:
@@ -129,55 +134,55 @@ designs: of their files only the lines of the road are in here.
 """
 
 
-def card(dataset: Dataset, statistics: dict[str, Any]) -> str:
+def render_card(dataset: Dataset, statistics: dict[str, Any]) -> str:
     """Markdown with a head of YAML; `statistics` is what `describe` says of the dataset."""
     headers = [index.header for index in dataset.indexes]
     jittered = any(header.nominal_camera for header in headers)
     rounds, frames = statistics["rounds"], statistics["frames"]
-    return CARD.format(
+    return TEMPLATE.format(
         name=dataset.path.resolve().name,
-        size=next((name for most, name in SIZES if frames < most), LARGEST),
+        size=next((name for most, name in SIZE_CATEGORIES if frames < most), LARGEST_CATEGORY),
         frames=f"{frames:,}",
         rounds=f"{rounds} round{'' if rounds == 1 else 's'}",
-        hertz=_listed({str(header.frequency_hz) for header in headers}),
+        hertz=_join({str(header.frequency_hz) for header in headers}),
         width=dataset.camera.width,
         height=dataset.camera.height,
         hash=dataset.content_hash,
         first=dataset.rounds[0].path.stem,
-        schema=SCHEMA,
+        schema=SCHEMA_FILE,
         definitions=tf.VERSION,
         topics="\n".join(
             f"| `{topic}` | {message.DESCRIPTOR.full_name} |"
             for topic, message in MESSAGE_TYPES.items()
         ),
-        fields="\n\n".join(_fields(message) for message in FIELDS),
-        program=_listed({header.program or "driverview" for header in headers}),
-        stretches=_stretches({header.stretch for header in headers} - {0}),
-        camera=_camera(dataset.camera),
+        fields="\n\n".join(_field_table(message) for message in FIELDS),
+        program=_join({header.program or "driverview" for header in headers}),
+        stretches=_describe_stretches({header.stretch for header in headers} - {0}),
+        camera=_describe_camera(dataset.camera),
         jitter=", each round's a little off (in its metadata)" if jittered else "",
         one_camera=", nearly" if jittered else "",
-        codecs=_listed({CODECS[header.codec] for header in headers}),
-        sides=_sides(dataset),
-        recovered=_recovered(dataset),
-        table="\n".join(_rows(statistics)),
+        codecs=_join({CODECS[header.codec] for header in headers}),
+        sides=_describe_sides(dataset),
+        recovered=_describe_recovered(dataset),
+        table="\n".join(_table_rows(statistics)),
         **{
-            name: _counts(statistics[name])
+            name: _format_counts(statistics[name])
             for name in ("by_track", "by_lanes", "by_traffic", "by_light", "by_trajectory")
         },
     )
 
 
-def _stretches(frames: set[int]) -> str:
+def _describe_stretches(frames: set[int]) -> str:
     if not frames:
         return ""
-    every = _listed({str(count) for count in frames})
+    every = _join({str(count) for count in frames})
     return (
         f"Every {every} frames the scenery, the weather and the light are others, while the drive "
         "goes on: pictures\njump there, labels and states do not. "
     )
 
 
-def _camera(camera: CameraParameters) -> str:
+def _describe_camera(camera: CameraParameters) -> str:
     return (
         f"{camera.fov_y_deg:g} degrees of vertical field of view, at ({camera.x:g}, {camera.y:g}, "
         f"{camera.z:g}) m ahead, left and above of the centre of gravity, pitch "
@@ -185,51 +190,51 @@ def _camera(camera: CameraParameters) -> str:
     )
 
 
-def _fields(message: str) -> str:
-    rows = "\n".join(_field(name, field) for name, field in FIELDS[message].items())
+def _field_table(message: str) -> str:
+    rows = "\n".join(_field_row(name, field) for name, field in FIELDS[message].items())
     return f"`driverview.{message}`:\n\n| field | unit | |\n|---|---|---|\n{rows}"
 
 
-def _field(name: str, field: Field) -> str:
+def _field_row(name: str, field: Field) -> str:
     absent = f"; absent where {field.absent}" if field.absent else ""
     return f"| `{name}` | {field.unit} | {field.meaning}{absent} |"
 
 
-def _sides(dataset: Dataset) -> str:
+def _describe_sides(dataset: Dataset) -> str:
     names = {side: [i.id for i in dataset.rounds if i.split == side] for side in (*SIDES, "")}
     return ", ".join(f"{len(ids)} {side or 'of no side'}" for side, ids in names.items() if ids)
 
 
-def _recovered(dataset: Dataset) -> str:
+def _describe_recovered(dataset: Dataset) -> str:
     found = [index.header.id for index in dataset.indexes if index.recovery]
     return f" Saved from damaged files, not whole: {', '.join(found)}." if found else ""
 
 
-def _rows(statistics: dict[str, Any]) -> Iterator[str]:
+def _table_rows(statistics: dict[str, Any]) -> Iterator[str]:
     names = [name for name in ("all", *SIDES) if statistics[name]["frames"]]
     sides = [statistics[name] for name in names]
-    yield _row("", names)
-    yield _row("---", ["---"] * len(names))
-    yield _row("frames", [str(side["frames"]) for side in sides])
+    yield _table_row("", names)
+    yield _table_row("---", ["---"] * len(names))
+    yield _table_row("frames", [str(side["frames"]) for side in sides])
     for kind in tf.Heading:
         name = kind.name.lower()
-        yield _row(name, [f"{side['heading'][name]:.1%}" for side in sides])
+        yield _table_row(name, [f"{side['heading'][name]:.1%}" for side in sides])
     for name in (*tf.MARKINGS, "to_lane_centre", "angle"):
         unit = "rad" if name == "angle" else "m"
         cells = [
             f"{s['mean_deviation'][name]:.3f} {unit} ({s['active'][name]:.0%} active)"
             for s in sides
         ]
-        yield _row(f"mean deviation of {name}", cells)
+        yield _table_row(f"mean deviation of {name}", cells)
 
 
-def _row(name: str, cells: list[str]) -> str:
+def _table_row(name: str, cells: list[str]) -> str:
     return f"| {name} | {' | '.join(cells)} |"
 
 
-def _counts(counts: dict[str, int]) -> str:
+def _format_counts(counts: dict[str, int]) -> str:
     return ", ".join(f"{name}: {count}" for name, count in counts.items())
 
 
-def _listed(words: set[str]) -> str:
+def _join(words: set[str]) -> str:
     return " or ".join(sorted(words))

@@ -1,4 +1,4 @@
-"""Reading a dataset folder: its rounds, their labels as arrays, their images as uint8 batches.
+"""Reading a dataset folder: rounds, labels as arrays, images as uint8 batches.
 
 frames = Dataset.open("datasets/default").select("train")
 batch = frames.read_batch([3, 1, 2])
@@ -32,7 +32,7 @@ from datagen.recording.splits import (
     Split,
     read_split,
     require_disjoint,
-    require_known_recovered,
+    require_recovered_declared,
     split_path,
 )
 from trackfeatures.camera import CameraParameters
@@ -41,7 +41,10 @@ IMAGE_DATA = 2  # number of the field `data` of foxglove.CompressedImage
 
 
 class Frames:
-    """The frames of some rounds, in round order; labels are parsed once, images on demand."""
+    """The frames of some rounds, in the order of the rounds.
+
+    Labels are parsed once, images are decoded on request.
+    """
 
     def __init__(
         self,
@@ -50,7 +53,7 @@ class Frames:
         camera: CameraParameters,
         rows: NDArray[np.int64] | None = None,
     ) -> None:
-        """`rows`: the frames of these rounds that are meant, ascending; None: all."""
+        """`rows`: numbers of the frames to use, ascending, counted over `rounds`; None: all."""
         self.rounds = list(rounds)
         self.camera = camera
         self._images = [index.messages[CAMERA] for index in indexes]
@@ -64,20 +67,25 @@ class Frames:
 
     @cached_property
     def labels(self) -> Labels:
-        each = concatenate([read_labels(ix, number) for number, ix in enumerate(self._indexes)])
-        return each if len(self) == self._first[-1] else each.take(self._rows)
+        """The labels of these frames. Raises DatasetError for a damaged round."""
+        parts = [read_labels(index, number) for number, index in enumerate(self._indexes)]
+        labels = concatenate(parts)
+        return labels if len(self) == self._first[-1] else labels.take(self._rows)
 
     def every(self, step: int) -> "Frames":
-        """Each `step`-th of these frames, from the first on."""
+        """Every `step`-th of these frames, starting with the first."""
         return Frames(self.rounds, self._indexes, self.camera, self._rows[::step])
 
-    def without(self, left_out: Iterable[int]) -> "Frames":
-        """These frames but those numbered `left_out`."""
-        kept = np.delete(self._rows, list(left_out))
+    def without(self, excluded: Iterable[int]) -> "Frames":
+        """These frames except the indices `excluded`."""
+        kept = np.delete(self._rows, list(excluded))
         return Frames(self.rounds, self._indexes, self.camera, kept)
 
     def jpeg(self, i: int) -> memoryview:
-        """The encoded image of frame `i` (a PNG in rounds recorded with that codec), not copied."""
+        """The encoded image of frame `i`, not copied; a PNG if the round has that codec.
+
+        Raises IndexError, or UndecodableImage if its message is damaged.
+        """
         number, frame = self._locate(i)
         try:
             return bytes_field(self._images[number].payload(frame), IMAGE_DATA)
@@ -85,7 +93,7 @@ class Frames:
             raise self._undecodable(i, error) from error
 
     def image(self, i: int) -> NDArray[np.uint8]:
-        """The image of frame `i`, (H, W, 3) uint8 RGB; DatasetError when it cannot be decoded."""
+        """The image of frame `i`, (H, W, 3) uint8 RGB; raises as `read_batch` does."""
         image: NDArray[np.uint8] = self.read_batch([i])[0]
         return image
 
@@ -119,7 +127,7 @@ class Frames:
     def _decode(
         self, rows: Iterator[tuple[int, int]], out: NDArray[np.uint8]
     ) -> tuple[int, UndecodableImage] | None:
-        """Decode until `rows` ends or an image is damaged; its row and error then."""
+        """Decode until `rows` ends or an image is damaged; return the row and error of that one."""
         for row, i in rows:
             try:
                 decode_into(self.jpeg(i), out[row])
@@ -130,6 +138,7 @@ class Frames:
         return None
 
     def _locate(self, i: int) -> tuple[int, int]:
+        """The round of frame `i`, as an index into `rounds`, and the frame's number in it."""
         if not 0 <= i < len(self):
             raise IndexError(f"frame {i} of {len(self)}")
         row = int(self._rows[i])
@@ -164,15 +173,15 @@ class Dataset:
     def open(path: str | Path, split: str = DEFAULT_SPLIT) -> "Dataset":
         """Open the rounds of a folder.
 
-        Raises DatasetError when there are none, one is damaged, cameras differ or the split leaks,
-        and DefinitionsMismatch when they were recorded under other definitions.
+        Raises DatasetError if there are none, a round is damaged, cameras differ or the split
+        leaks, and DefinitionsMismatch if a round was recorded under other label definitions.
         """
         folder = Path(path)
         indexes = [open_round(file) for file in round_files(folder)]
         for index in indexes:
             tf.require_version(index.header.definitions, str(index.path))
         chosen = read_split(split_path(folder, split))
-        _require_sound_split(chosen, indexes)
+        _validate_split(chosen, indexes)
         rounds = [
             RoundInfo.of(ix.path, ix.header, ix.result, chosen.side(ix.header.id)) for ix in indexes
         ]
@@ -180,7 +189,7 @@ class Dataset:
         return Dataset(folder, rounds, _one_camera(indexes), content_hash, indexes)
 
     def select(self, side: str = "all") -> Frames:
-        """The frames of the train, the test or the unseen rounds, or of all."""
+        """The frames of the rounds of one side of the split (train, test, unseen), or of all."""
         if side not in (*SIDES, "all"):
             raise DatasetError(
                 f"there is no side {side!r} of a split; choose {', '.join(SIDES)} or all"
@@ -198,7 +207,7 @@ class Dataset:
 
 
 def round_files(folder: Path) -> list[Path]:
-    """The finished rounds of a dataset folder, in order; DatasetError when there are none."""
+    """The finished rounds of a dataset folder, sorted by name; DatasetError if there are none."""
     files = sorted((folder / "rounds").glob("*.mcap"))
     if not files:
         raise DatasetError(
@@ -208,15 +217,15 @@ def round_files(folder: Path) -> list[Path]:
     return files
 
 
-def _require_sound_split(split: Split, indexes: Sequence[RoundIndex]) -> None:
-    require_known_recovered(split, indexes)
+def _validate_split(split: Split, indexes: Sequence[RoundIndex]) -> None:
+    require_recovered_declared(split, indexes)
     require_disjoint(
         split, [RoundKey(ix.header.id, ix.header.seed, ix.result.content_hash) for ix in indexes]
     )
 
 
 def _one_camera(indexes: Sequence[RoundIndex]) -> CameraParameters:
-    """The camera all rounds are of; in a dataset with jitter each round's differs a little."""
+    """The common camera of all rounds (with camera jitter: the nominal one); else DatasetError."""
     camera = indexes[0].header.dataset_camera
     for index in indexes:
         if index.header.dataset_camera != camera:
@@ -228,7 +237,7 @@ def _one_camera(indexes: Sequence[RoundIndex]) -> CameraParameters:
 
 
 def dataset_hash(content_hashes: Iterable[str]) -> str:
-    """One hash over the images and labels of all rounds, whatever their order and names."""
+    """SHA-256 over the images and labels of all rounds; independent of their order and names."""
     digest = hashlib.sha256(tf.VERSION.encode())
     for content in sorted(content_hashes):
         digest.update(content.encode())

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from datagen.recording.card import SIZES, card
+from datagen.recording.card import SIZE_CATEGORIES, render_card
 from datagen.recording.dataset import Dataset
 from datagen.recording.manifest import rebuild
 from datagen.recording.schema.fields import FIELDS
@@ -75,10 +75,10 @@ def test_size_categories_are_the_hubs(dataset: Path) -> None:
     opened = Dataset.open(dataset)
     for frames, name in ((999, "n<1K"), (1000, "1K<n<10K"), (120_000, "100K<n<1M"),
                          (10**6, "1M<n<10M")):  # fmt: skip
-        assert f"size_categories:\n- {name}\n" in card(
+        assert f"size_categories:\n- {name}\n" in render_card(
             opened, describe(opened) | {"frames": frames}
         )
-    assert [most for most, _ in SIZES] == sorted(most for most, _ in SIZES)
+    assert [most for most, _ in SIZE_CATEGORIES] == sorted(most for most, _ in SIZE_CATEGORIES)
 
 
 def test_jitter_and_lossless_rounds_are_told(samples: Samples, dataset: Path) -> None:

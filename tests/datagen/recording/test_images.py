@@ -48,7 +48,7 @@ def test_a_truncated_image_is_refused(codec: str) -> None:
     whole = encode(make_image(64, 96, 1, 20.0), codec)
     out = np.empty((64, 96, 3), np.uint8)
     for length in [*range(0, len(whole) - 12, 37), len(whole) - 12]:
-        with pytest.raises(ValueError, match="."):
+        with pytest.raises(ValueError, match=r"\w"):
             decode_into(whole[:length], out)
     decode_into(whole, out)
 

@@ -10,14 +10,13 @@ import numpy as np
 import pytest
 
 from datagen.cli.maintain import split as split_command
-from datagen.recording import Dataset, DatasetError, Labels, RoundInfo
-from datagen.recording import near_duplicates as grid
+from datagen.recording import Dataset, DatasetError, Labels, RoundInfo, near_duplicates
 from datagen.recording.folder import prepare, round_path
 from datagen.recording.integrity.recover import recover
 from datagen.recording.manifest import rebuild
-from datagen.recording.near_duplicates import Tolerances, find_neighbours
-from datagen.recording.split_report import SplitReportConfig, check_split, make_split
-from datagen.recording.splits import Split, divide, read_split, split_path, write_split
+from datagen.recording.near_duplicates import Tolerances, find_near_duplicates
+from datagen.recording.split_report import SplitConfig, check_split, make_split
+from datagen.recording.splits import Split, read_split, split_path, split_rounds, write_split
 from tests.datagen.commands import datagen_here
 from tests.datagen.conftest import Samples
 from trackfeatures.errors import UserError
@@ -68,19 +67,19 @@ def make_labels(rng: np.random.Generator, count: int, rounds: int) -> Labels:
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_by_round_every_track_is_on_both_sides_in_its_share(seed: int) -> None:
-    split = divide(SIXTY, "round", 0.25, seed)
+    split = split_rounds(SIXTY, "round", 0.25, seed)
     assert (len(split.train), len(split.test)) == (45, 15)
     assert sorted(split.train + split.test) == [info.id for info in SIXTY]
     track_of = {info.id: info.track for info in SIXTY}
     tested = Counter(track_of[i] for i in split.test)
     assert set(tested) == {info.track for info in SIXTY}
     assert max(tested.values()) <= 2
-    assert split == divide(SIXTY, "round", 0.25, seed)
-    assert split != divide(SIXTY, "round", 0.25, seed + 10)
+    assert split == split_rounds(SIXTY, "round", 0.25, seed)
+    assert split != split_rounds(SIXTY, "round", 0.25, seed + 10)
 
 
 def test_by_track_whole_tracks_are_held_back() -> None:
-    split = divide(SIXTY, "track", 0.34, 0)
+    split = split_rounds(SIXTY, "track", 0.34, 0)
     track_of = {info.id: info.track for info in SIXTY}
     train, test = ({track_of[i] for i in side} for side in (split.train, split.test))
     assert not train & test
@@ -92,7 +91,7 @@ def test_rounds_that_share_a_seed_or_content_stay_together() -> None:
     rounds[7] = replace(rounds[7], seed=rounds[2].seed)
     rounds[9] = replace(rounds[9], content_hash=rounds[7].content_hash)
     for seed in range(20):
-        split = divide(rounds, "round", 0.3, seed)
+        split = split_rounds(rounds, "round", 0.3, seed)
         assert len({split.side(f"r{n:03d}") for n in (2, 7, 9)}) == 1
         assert 1 <= len(split.test) <= 6
 
@@ -101,8 +100,8 @@ def test_rounds_that_share_a_seed_or_content_stay_together() -> None:
     ("rounds", "by", "share", "what"),
     [
         (SIXTY, "frame", 0.25, "cannot be divided by 'frame'; choose round or track"),
-        (SIXTY, "round", 0.0, "a test share of 0 is none"),
-        (SIXTY, "round", 1.5, "a test share of 1.5 is none"),
+        (SIXTY, "round", 0.0, "--test-share is 0; give a number"),
+        (SIXTY, "round", 1.5, "--test-share is 1.5; give a number"),
         (SIXTY[:1], "round", 0.25, "1 rounds that share no seed or content are too few"),
         ([make_info(n, "oval") for n in range(9)], "track", 0.25, "1 tracks that share no seed"),
     ],
@@ -111,7 +110,7 @@ def test_what_cannot_be_divided_is_refused(
     rounds: list[RoundInfo], by: str, share: float, what: str
 ) -> None:
     with pytest.raises(DatasetError, match=what):
-        divide(rounds, by, share, 0)
+        split_rounds(rounds, by, share, 0)
 
 
 @pytest.mark.parametrize("at_once", [100, 4_000_000])
@@ -119,12 +118,12 @@ def test_what_cannot_be_divided_is_refused(
 def test_near_frames_are_those_of_comparing_all_with_all(
     tolerances: Tolerances, at_once: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(grid, "PAIRS_AT_ONCE", at_once)
+    monkeypatch.setattr(near_duplicates, "MAX_PAIRS_AT_ONCE", at_once)
     rng = np.random.default_rng(0)
     rounds = [make_info(n, f"track-{n % 2}") for n in range(6)]
     labels = make_labels(rng, 1500, 6)
     test = labels.round % 3 == 0
-    found = find_neighbours(labels, rounds, test, ~test, tolerances)
+    found = find_near_duplicates(labels, rounds, test, ~test, tolerances)
     tracks = np.array([info.track for info in rounds])[labels.round]
     scene = np.strings.add(tracks, labels.light)
     scale = (tolerances.s_m, tolerances.to_middle_m, np.radians(tolerances.angle_deg))
@@ -146,7 +145,7 @@ def test_near_frames_are_those_of_comparing_all_with_all(
 def test_no_frames_on_a_side_are_near_none() -> None:
     labels = make_labels(np.random.default_rng(0), 50, 1)
     nobody = np.zeros(50, np.bool_)
-    found = find_neighbours(labels, [make_info(0, "oval")], ~nobody, nobody, Tolerances())
+    found = find_near_duplicates(labels, [make_info(0, "oval")], ~nobody, nobody, Tolerances())
     assert (found.frames, found.near, found.worst) == (50, 0, ())
 
 
@@ -167,7 +166,7 @@ def test_the_command_checks_the_split_and_finds_the_same_frames_on_both_sides(
     assert (found["frames"], found["near"], found["share"]) == (30, 30, 1.0)
     assert {pair["distance"] for pair in found["worst"]} == {0.0}
     text = datagen_here("split", str(folder)).stdout
-    assert "test   1 rounds, 30 frames; 30 (100.0%) nearly as one in train" in text
+    assert "test   1 rounds, 30 frames; 30 (100.0%) near-duplicates of train" in text
     assert "r001 frame 0 and r000 frame 0: a-track, 7.0 m, 0.00 of the tolerances apart" in text
 
 
@@ -190,7 +189,7 @@ def test_the_command_makes_a_split_once(dataset: Path) -> None:
 def test_what_is_unseen_stays_unseen(samples: Samples, dataset: Path) -> None:
     samples.add_round(dataset, samples.header("r003"))
     write_split(split_path(dataset), Split(("r000", "r001"), ("r002",), unseen=("r003",)))
-    make_split(dataset, "mine", SplitReportConfig(test_share=0.4))
+    make_split(dataset, "mine", SplitConfig(test_share=0.4))
     split = read_split(split_path(dataset, "mine"))
     assert split.unseen == ("r003",)
     assert sorted(split.train + split.test) == ["r000", "r001", "r002"]
@@ -198,7 +197,7 @@ def test_what_is_unseen_stays_unseen(samples: Samples, dataset: Path) -> None:
     assert (report.rounds["unseen"], report.near["unseen"].frames) == (1, 45)
     samples.add_round(dataset, samples.header("r004", seed=3), content_seed=9)
     with pytest.raises(DatasetError, match=r"seed 3 on both sides, (train|test) and unseen"):
-        make_split(dataset, "leak", SplitReportConfig(test_share=0.4))
+        make_split(dataset, "leak", SplitConfig(test_share=0.4))
     assert not split_path(dataset, "leak").exists()
 
 
@@ -232,7 +231,7 @@ def test_the_command_refuses_a_leak_in_one_line(dataset: Path) -> None:
         ({"near": "1,2"}, "--near is '1,2'; give three numbers"),
         ({"near": "1,0,2"}, "give numbers above 0"),
         ({"by": "frame", "name": "x"}, "cannot be divided by 'frame'"),
-        ({"by": "round", "name": "x", "test_share": 2.0}, "a test share of 2 is none"),
+        ({"by": "round", "name": "x", "test_share": 2.0}, "--test-share is 2; give a number"),
     ],
 )
 def test_bad_options_are_refused(dataset: Path, options: dict[str, Any], what: str) -> None:

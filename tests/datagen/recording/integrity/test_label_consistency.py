@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import trackfeatures as tf
-from datagen.recording.integrity.label_consistency import disagreements
+from datagen.recording.integrity.label_consistency import label_problems
 from datagen.recording.labels import Labels
 
 WIDTH = 4.0
@@ -45,7 +45,7 @@ def test_true_labels_agree_everywhere_and_on_either_side_of_every_border(
     borders = np.array([m + side * r for m in markings for r in reaches for side in (-1, 1)])
     beside = np.concatenate([borders + d for d in (-1e-6, -1e-8, -1e-15, 0.0, 1e-15, 1e-8, 1e-6)])
     places = np.concatenate([beside, np.linspace(-9.0, 9.0, 181)])
-    assert list(disagreements(_labels(places, lanes, width), lanes, width)) == []
+    assert list(label_problems(_labels(places, lanes, width), lanes, width)) == []
 
 
 @pytest.mark.parametrize(
@@ -68,15 +68,15 @@ def test_what_is_dropped_invented_or_wrong_is_found(
     labels = _labels(np.full(4, -2.3), lanes=2)
     name = "distances" if column in tf.MARKINGS else column
     changed = getattr(labels, name).copy()
-    assert list(disagreements(labels, 2, WIDTH)) == []
+    assert list(label_problems(labels, 2, WIDTH)) == []
     if name == "distances":
         changed[2, tf.MARKINGS.index(column)] = value
     else:
         changed[2] = value
-    found = list(disagreements(replace(labels, **{name: changed}), 2, WIDTH))
+    found = list(label_problems(replace(labels, **{name: changed}), 2, WIDTH))
     assert any(expected in line for line in found), found
 
 
 def test_a_road_that_cannot_be_is_found() -> None:
     labels = _labels(np.zeros(3), lanes=1)
-    assert "an impossible road: 7 lanes" in next(disagreements(labels, 7, WIDTH))
+    assert "an impossible road: 7 lanes" in next(label_problems(labels, 7, WIDTH))

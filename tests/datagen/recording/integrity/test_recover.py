@@ -187,7 +187,7 @@ def test_the_command_saves_a_round_of_a_dataset_aside(dataset: Path) -> None:
         (b"", "its first bytes"),
         (b"neither this nor that", "its first bytes"),
         (slice(300), "its first bytes|its header"),
-        (slice(3000), "no whole frame"),
+        (slice(3000), "no intact frame"),
     ],
 )
 def test_what_holds_no_frames_is_refused(

@@ -255,7 +255,7 @@ def test_splits_with_rounds_that_are_not_there_or_twice_are_reported(dataset: Pa
     problems = verify(dataset, "quick").problems
     assert [p.removeprefix(str(split_path(dataset))) for p in problems] == [
         " names round r000 twice",
-        " names round r007, which is not there",
+        " names round r007, which does not exist",
     ]
 
 
@@ -263,7 +263,7 @@ def test_a_missing_manifest_and_changed_files_are_told_by_full(dataset: Path) ->
     proto = dataset / "proto" / "driverview.proto"
     proto.write_text(proto.read_text() + "// changed\n")
     (problem,) = verify(dataset, "full").problems
-    assert problem.startswith(f"proto/driverview.proto in {dataset}: not what manifest.json was")
+    assert problem.startswith(f"proto/driverview.proto in {dataset}: other content than manifest")
     (dataset / "manifest.json").unlink()
     assert "there is no" in verify(dataset, "full").problems[0]
     assert verify(dataset, "quick").ok

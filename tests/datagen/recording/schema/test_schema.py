@@ -13,7 +13,7 @@ from mcap_protobuf.decoder import DecoderFactory
 import trackfeatures as tf
 from datagen.recording.folder import round_path
 from datagen.recording.schema.fields import FIELDS
-from datagen.recording.schema.json_schema import SCHEMA, json_schema
+from datagen.recording.schema.json_schema import SCHEMA_FILE, json_schema
 from datagen.recording.schema.proto import driverview_pb2
 from tests.datagen.conftest import Samples
 
@@ -30,7 +30,7 @@ def test_every_field_of_every_message_is_described_and_no_other() -> None:
 
 
 def test_the_schema_stands_beside_the_dataset_and_is_a_schema(dataset: Path) -> None:
-    found = json.loads((dataset / SCHEMA).read_text())
+    found = json.loads((dataset / SCHEMA_FILE).read_text())
     assert found == json_schema()
     jsonschema.Draft202012Validator.check_schema(found)
     ml = found["$defs"]["TrackFeatures"]["properties"]["to_marking_ml"]
