@@ -1,6 +1,6 @@
-"""The dataset card, README.md of a dataset folder: what it is, how it was made, how to read it.
+"""The dataset card, `README.md` of a dataset folder: content, origin, statistics, how to read it.
 
-Its head is what the Hugging Face hub reads: huggingface.co/docs/hub/datasets-cards.
+Its YAML header is that of the Hugging Face hub: huggingface.co/docs/hub/datasets-cards.
 """
 
 from collections.abc import Iterator
@@ -46,9 +46,9 @@ viewer: false
 # {name}: driver-view images and track features
 
 {frames} frames in {rounds}, {hertz} a second, {width} x {height} px.
-With every image: the distances to the lane markings, the angle to the road and the side to which it
-bends; the car's state, sensors and command, the other cars and the road. For training and judging
-models that drive by sight, or a part of it.
+With every image: the distances to the lane markings, the angle to the road, the class of the road
+ahead (left, straight, right), the state, sensors and command of the car, the other cars and the
+road. For training and testing camera-based lane perception and driving.
 
 Content hash, over all images and labels: `{hash}`.
 
@@ -58,35 +58,35 @@ Content hash, over all images and labels: `{hash}`.
 from datagen.recording import Dataset
 
 train = Dataset.open(".").select("train")  # or "test", "all"
-labels = train.labels                      # arrays, one row a frame, NaN where absent
+labels = train.labels                      # arrays, one row per frame, NaN where absent
 images = train.read_batch([0, 1, 2])       # (3, {height}, {width}, 3) uint8 RGB
 print(len(train), labels.to_lane_centre[:3], labels.angle[:3], labels.heading[:3])
 ```
 
-Or with any reader of MCAP: the schemas are inside the files. Foxglove shows a round with
-`layouts/foxglove.json`, Rerun opens it as it is, `datagen view rounds/{first}.mcap` with plots.
-`datagen export` writes WebDataset shards or a LeRobotDataset. `datagen verify` tells whether it is
-still what was recorded.
+Or with any MCAP reader: the schemas are inside the files. Foxglove shows a round with
+`layouts/foxglove.json`, Rerun opens it directly, `datagen view rounds/{first}.mcap` adds plots.
+`datagen export` writes WebDataset shards or a LeRobotDataset. `datagen verify` checks that nothing
+has changed since it was recorded.
 
 ## What is in the folder
 
 | | |
 |---|---|
-| `rounds/*.mcap` | one file a round, uncompressed MCAP, protobuf messages |
-| `splits/default.json` | which rounds train and which test |
-| `proto/driverview.proto` | our messages; the others are `foxglove.*` |
-| `{schema}` | unit, frame, reference point and limits of every value |
-| `stats.json`, `manifest.json` | the figures below in full; every round with its hashes |
-| `state/*.json`, `plan.json` | size and SHA-256 of each file; what was asked for |
+| `rounds/*.mcap` | one file per round, uncompressed MCAP, protobuf messages |
+| `splits/default.json` | the rounds of each side: train, test, unseen |
+| `proto/driverview.proto` | the `driverview.*` messages; the others are `foxglove.*` |
+| `{schema}` | unit, frame, reference point and limits of every field |
+| `stats.json`, `manifest.json` | all statistics; every round with its hashes |
+| `state/*.json`, `plan.json` | size and SHA-256 of each file; the plan of all rounds |
 | `layouts/foxglove.json` | a layout for Foxglove |
 
-The messages of one control step share one log time, which is simulated time counted from
-2020-01-01: an image carries the time of its labels.
+The messages of one control step have the same log time, which is simulated time counted from
+2020-01-01. An image and its labels are paired by it.
 
 ## What is recorded
 
-Units are SI unless said otherwise. Lateral values are positive to the left, except the distances to
-markings, which are negative to the left; `angle` is positive when the car points to the right.
+Units are SI unless stated otherwise. Lateral values are positive to the left, except the distances
+to markings, which are negative to the left; `angle` is positive when the car points to the right.
 Absent means unset, not zero. Definitions of the labels: version {definitions}.
 
 | topic | schema |
@@ -98,11 +98,11 @@ Absent means unset, not zero. Definitions of the labels: version {definitions}.
 ## How it was made
 
 By `datagen collect` of {program}: a simulated car (rigid body, tyres, suspension at 200 Hz) is
-driven by a scripted driver along a trajectory of its round, at a speed of its round, among cars
-that keep their distance; the labels are computed from the road's geometry. One seed fixes all.
+driven by a scripted driver; trajectory and speed differ by round; the other cars follow a
+car-following model. The labels are computed from the geometry of the road. One seed determines all.
 {stretches}Camera: {camera}{jitter}. Images: {codecs}.
 
-Frames by...
+Frames by
 
 - track: {by_track}
 - number of lanes: {by_lanes}
@@ -112,30 +112,30 @@ Frames by...
 
 ## Splits and figures
 
-By round, never by frame: {sides}. No seed and no content stands on two sides.{recovered}
+By round, never by frame: {sides}. No seed and no content hash is on two sides.{recovered}
 
 {table}
 
-"Mean deviation" is the error of always answering the mean: a model must do better than that.
+"Mean deviation" is the mean absolute error of predicting the mean: the baseline for a model.
 
 ## Known limits
 
-- All of it is simulated: cars, roads and weather are those of this program, not of the world.
-- Frames of a round are 1/{hertz} s apart and much alike: count rounds, not frames, when you judge
-  how sure a figure is.
-- Labels tell where markings are, also where paint is worn, hidden by a car or outside the picture.
-- Every image is of one camera{one_camera}. Train with others before you use others.
+- Everything is simulated: cars, roads and weather are those of this program, not real ones.
+- Frames of a round are 1/{hertz} s apart and similar: use the number of rounds, not of frames, for
+  confidence intervals.
+- Labels state where markings are, also where paint is worn, hidden by a car or outside the image.
+- Every image is of one camera{one_camera}. For other cameras, train with images of these.
 - No pedestrians, crossings, traffic lights or oncoming traffic.
 
 ## Licence
 
 MIT, as the program that made it. Roads imported from elsewhere (TORCS's tracks) are their authors'
-designs: of their files only the lines of the road are in here.
+work; only the geometry of the road is taken from their files.
 """
 
 
 def render_card(dataset: Dataset, statistics: dict[str, Any]) -> str:
-    """Markdown with a head of YAML; `statistics` is what `describe` says of the dataset."""
+    """Markdown with a YAML header; `statistics` is the result of `describe`."""
     headers = [index.header for index in dataset.indexes]
     jittered = any(header.nominal_camera for header in headers)
     rounds, frames = statistics["rounds"], statistics["frames"]
@@ -159,7 +159,9 @@ def render_card(dataset: Dataset, statistics: dict[str, Any]) -> str:
         program=_join({header.program or "driverview" for header in headers}),
         stretches=_describe_stretches({header.stretch for header in headers} - {0}),
         camera=_describe_camera(dataset.camera),
-        jitter=", each round's a little off (in its metadata)" if jittered else "",
+        jitter=", varied a little from round to round (see the metadata of a round)"
+        if jittered
+        else "",
         one_camera=", nearly" if jittered else "",
         codecs=_join({CODECS[header.codec] for header in headers}),
         sides=_describe_sides(dataset),
@@ -177,8 +179,8 @@ def _describe_stretches(frames: set[int]) -> str:
         return ""
     every = _join({str(count) for count in frames})
     return (
-        f"Every {every} frames the scenery, the weather and the light are others, while the drive "
-        "goes on: pictures\njump there, labels and states do not. "
+        f"Every {every} frames the scenery, the weather and the light change, while the drive goes "
+        "on: images\nchange abruptly there, labels and states do not. "
     )
 
 
@@ -207,7 +209,9 @@ def _describe_sides(dataset: Dataset) -> str:
 
 def _describe_recovered(dataset: Dataset) -> str:
     found = [index.header.id for index in dataset.indexes if index.recovery]
-    return f" Saved from damaged files, not whole: {', '.join(found)}." if found else ""
+    return (
+        f" Recovered from damaged files, with missing frames: {', '.join(found)}." if found else ""
+    )
 
 
 def _table_rows(statistics: dict[str, Any]) -> Iterator[str]:
