@@ -1,7 +1,8 @@
-"""`datagen verify --level full` of 120,000 frames, warm, beside reading and hashing the same files.
+"""Time of `datagen verify --level full`, beside reading and hashing the same files, warm.
 
-Run: `python benchmarks/verification.py [--data DIR] [--json FILE]`. Claim: at most 15 s on two
-cores. Without `--data`, 60 rounds of 2,000 frames are made out of a few collected ones.
+Run: `python benchmarks/verification.py [--data DIR] [--json FILE]`. Claim: at most 15 s for 120,000
+frames on two cores. Without `--data`, 60 rounds of 2,000 frames are made from a few collected ones.
+Exit code: 0 reached, 1 missed, 3 not measured (the dataset has fewer frames than the claim).
 """
 
 import argparse
@@ -21,8 +22,8 @@ LIMIT_FRAMES = 120_000
 REPEATS = 3
 
 
-def hash_alone(folder: Path) -> None:
-    """What no such check can do without: every byte read, one SHA-256 and one CRC over it."""
+def hash_files(folder: Path) -> None:
+    """Read every byte and compute SHA-256 and CRC-32: the minimum of any such check."""
 
     def one(file: Path) -> str:
         data = file.read_bytes()
@@ -46,11 +47,11 @@ def measure(folder: Path) -> dict[str, object]:
             report = verify(folder, level)
             seconds.append(time.perf_counter() - started)
             if not report.ok:
-                sys.exit(f"not in order: {report.problems[0]}")
+                sys.exit(f"the data set has problems: {report.problems[0]}")
             frames = report.frames
         cpu_s.append(time.process_time() - cpu)
         started = time.perf_counter()
-        hash_alone(folder)
+        hash_files(folder)
         hash_s.append(time.perf_counter() - started)
     size = sum(file.stat().st_size for file in (folder / "rounds").glob("*.mcap"))
     full, bare = statistics.median(verify_s["full"]), statistics.median(hash_s)
@@ -72,7 +73,7 @@ def measure(folder: Path) -> dict[str, object]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--data", type=Path, help="a dataset; else one is made")
+    parser.add_argument("--data", type=Path, help="a dataset; by default one is made")
     parser.add_argument("--rounds", type=int, default=60)
     parser.add_argument("--frames", type=int, default=2000)
     parser.add_argument("--json", type=Path)

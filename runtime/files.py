@@ -18,7 +18,8 @@ def atomic_write(path: Path, content: str | bytes, *, fsync: bool = False) -> No
     """Replace the file at `path` in one step, by renaming a file beside it; text becomes UTF-8.
 
     When writing fails (a full disk, a power cut) the old file stays. `fsync` waits until the data
-    is on the disk. Raises UserError where the folder is missing, OSError with the file's name.
+    and the new name are on the disk. Raises UserError where the folder is missing, OSError with
+    the file's name.
     """
     check_folder(path)
     data = content.encode() if isinstance(content, str) else content
@@ -26,17 +27,42 @@ def atomic_write(path: Path, content: str | bytes, *, fsync: bool = False) -> No
         # A pipe or /dev/stdout must not be replaced.
         path.write_bytes(data)
         return
-    partial = path.with_name(path.name + ".partial")
+    partial = unfinished_path(path)
     try:
-        with partial.open("wb") as file:
-            file.write(data)
-            if fsync:
-                file.flush()
-                os.fsync(file.fileno())
+        partial.write_bytes(data)
+        if fsync:
+            fsync_path(partial)
         partial.replace(path)
+        if fsync:
+            fsync_path(path.parent)
     except OSError as error:
         # The error of a failed write lacks the file's name, which the user needs.
         error.filename = error.filename or str(path)
         raise
     finally:
         partial.unlink(missing_ok=True)
+
+
+def unfinished_path(path: Path) -> Path:
+    """The file that `atomic_write` fills before it renames it to `path`."""
+    return path.with_name(path.name + ".partial")
+
+
+def atomic_move(source: Path, target: Path) -> None:
+    """Rename a finished file, or a folder of files, once all of it is on the disk.
+
+    After a power cut `target` is complete or does not exist. Raises OSError.
+    """
+    for path in (*source.rglob("*"), source):
+        fsync_path(path)
+    source.replace(target)
+    fsync_path(target.parent)
+
+
+def fsync_path(path: Path) -> None:
+    """Wait until a file, or the names in a folder, are on the disk."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

@@ -53,13 +53,13 @@ def split(
     Tells how many frames have a near twin in train: road, place, offset,
     yaw and light. One that leaks is refused, one that exists is kept.
     """
-    from datagen.recording.split_report import SplitReportConfig, as_text, check_split, make_split
+    from datagen.recording.split_report import SplitConfig, check_split, format_report, make_split
 
     tolerances = _tolerances(near)
     if by:
-        make_split(folder, name, SplitReportConfig(by, test_share, seed, with_recovered))
+        make_split(folder, name, SplitConfig(by, test_share, seed, with_recovered))
     report = check_split(folder, name, tolerances, made=bool(by))
-    print_result(report.as_json(), as_json, as_text(report))
+    print_result(report.as_json(), as_json, format_report(report))
 
 
 def _tolerances(text: str) -> "Tolerances":

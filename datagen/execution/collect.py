@@ -22,12 +22,12 @@ from datagen.planning.plan import Plan, RoundPlan, Shard, program
 from datagen.recorder.job import Job
 from datagen.recording.errors import DatasetError
 from datagen.recording.folder import (
-    barely_begun,
     discard_partials,
+    is_unstarted,
     prepare,
     read_states,
     round_path,
-    write_synced,
+    write_if_changed,
 )
 from datagen.recording.manifest import rebuild
 from datagen.recording.splits import SIDES, Split, split_path, write_split
@@ -156,7 +156,7 @@ def require_fitting(folder: Path, plan: Plan) -> None:
         raise DatasetError(f"{folder} is a file; choose a folder with --out")
     path = folder / PLAN
     if not path.is_file():
-        if not barely_begun(folder, PLAN):
+        if not is_unstarted(folder, PLAN):
             raise DatasetError(
                 f"{folder} exists and is not a dataset of `datagen collect` (it has no {PLAN}); "
                 "nothing was changed; choose another folder with --out"
@@ -214,7 +214,7 @@ def _short(value: Any) -> str:
 def open_folder(folder: Path, plan: Plan) -> None:
     """Write what the rounds are to be found with, whatever happens to them."""
     # First of all: by its plan the same command knows the folder again, whatever fails next.
-    write_synced(folder / PLAN, json.dumps(plan.as_json(), indent=1) + "\n")
+    write_if_changed(folder / PLAN, json.dumps(plan.as_json(), indent=1) + "\n")
     prepare(folder)
     write_split(split_path(folder), split_of(plan, {entry.id for entry in plan.rounds}))
 

@@ -20,7 +20,7 @@ from datagen.recording.folder import (
     prepare,
     publish,
     read_states,
-    write_synced,
+    write_if_changed,
 )
 from datagen.recording.manifest import rebuild
 from datagen.recording.splits import SIDES, Split
@@ -55,7 +55,7 @@ def merge(folders: Sequence[Path], out: Path) -> Merged:
     plan = plans[0]
     out.mkdir(parents=True, exist_ok=True)
     with held(out, None):
-        write_synced(out / PLAN, json.dumps(plan, indent=1) + "\n")
+        write_if_changed(out / PLAN, json.dumps(plan, indent=1) + "\n")
         prepare(out)
         there = read_states(out).keys()
         found = {s.id: (folder, s) for folder in folders for s in read_states(folder).values()}

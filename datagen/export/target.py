@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from datagen.recording.folder import move_synced
+from runtime.files import atomic_move
 from trackfeatures.errors import UserError
 
 
@@ -31,7 +31,7 @@ def new_folder(target: Path) -> Iterator[Path]:
             _clear(partial)
             yield partial
             require_free(target)
-            move_synced(partial, target)
+            atomic_move(partial, target)
         except BaseException:
             shutil.rmtree(partial, ignore_errors=True)
             raise

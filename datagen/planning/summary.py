@@ -10,7 +10,7 @@ from rich.table import Table
 import trackfeatures as tf
 from datagen.planning.class_balance import LEAST_SHARE, Forecast, expected_shares
 from datagen.planning.plan import Plan, RoundPlan
-from datagen.recording.round_metadata import the_light
+from datagen.recording.round_metadata import summarize_lights
 from datagen.recording.splits import SIDES
 
 
@@ -50,7 +50,15 @@ def listing(plan: Plan) -> RenderableType:
     for name in names:
         table.add_column(name, justify="right" if name in ("km/h", "start") else "left")
     for e in plan.rounds:
-        cells = (e.id, e.split, e.track, e.lanes, e.traffic, e.trajectory, the_light(e.lights))
+        cells = (
+            e.id,
+            e.split,
+            e.track,
+            e.lanes,
+            e.traffic,
+            e.trajectory,
+            summarize_lights(e.lights),
+        )
         table.add_row(*map(str, cells), f"{e.speed_kmh:.1f}", f"{e.start:.3f}")
     return table
 

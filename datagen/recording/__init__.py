@@ -4,12 +4,12 @@
 
     dataset = Dataset.open("datasets/default")      # or Dataset.open(folder, split="by-track")
     train = dataset.select("train")                 # Frames; also "test", "all"
-    labels = train.labels                           # arrays, one row a frame: see Labels
+    labels = train.labels                           # arrays, one row per frame: see Labels
     image = train.image(0)                          # (H, W, 3) uint8 RGB
-    batch = train.read_batch([5, 0, 7])             # (3, H, W, 3) uint8, decoded on all cores
+    batch = train.read_batch([5, 0, 7])             # (3, H, W, 3) uint8, one thread per core
 
-What is listed here is stable: it changes with a new version of the program only. A round by itself
-is opened with `open_round`; `verify` and `recover` look after folders and files.
+The names listed here are the public interface: they change only with a new version of the program.
+`open_round` opens a single round; `integrity/` has verification and recovery.
 """
 
 from datagen.recording.dataset import Dataset, Frames

@@ -1,6 +1,6 @@
-"""The dataset card, README.md of a dataset folder: what it is, how it was made, how to read it.
+"""The dataset card, `README.md` of a dataset folder: content, origin, statistics, how to read it.
 
-Its head is what the Hugging Face hub reads: huggingface.co/docs/hub/datasets-cards.
+Its YAML header is that of the Hugging Face hub: huggingface.co/docs/hub/datasets-cards.
 """
 
 from collections.abc import Iterator
@@ -10,16 +10,21 @@ import trackfeatures as tf
 from datagen.recording.dataset import Dataset
 from datagen.recording.images import JPEG_QUALITY
 from datagen.recording.schema.fields import FIELDS, Field
-from datagen.recording.schema.json_schema import SCHEMA
+from datagen.recording.schema.json_schema import SCHEMA_FILE
 from datagen.recording.schema.topics import MESSAGE_TYPES
 from datagen.recording.splits import SIDES
 from trackfeatures.camera import CameraParameters
 
-SIZES = ((1_000, "n<1K"), (10_000, "1K<n<10K"), (100_000, "10K<n<100K"), (1_000_000, "100K<n<1M"))
-LARGEST = "1M<n<10M"
+SIZE_CATEGORIES = (
+    (1_000, "n<1K"),
+    (10_000, "1K<n<10K"),
+    (100_000, "10K<n<100K"),
+    (1_000_000, "100K<n<1M"),
+)
+LARGEST_CATEGORY = "1M<n<10M"
 CODECS = {"jpeg": f"JPEG, quality {JPEG_QUALITY}, 4:2:0", "png": "PNG, lossless"}
 
-CARD = """---
+TEMPLATE = """---
 license: mit
 pretty_name: "{name}: driver-view images and track features"
 annotations_creators:
@@ -41,9 +46,9 @@ viewer: false
 # {name}: driver-view images and track features
 
 {frames} frames in {rounds}, {hertz} a second, {width} x {height} px.
-With every image: the distances to the lane markings, the angle to the road and the side to which it
-bends; the car's state, sensors and command, the other cars and the road. For training and judging
-models that drive by sight, or a part of it.
+With every image: the distances to the lane markings, the angle to the road, the class of the road
+ahead (left, straight, right), the state, sensors and command of the car, the other cars and the
+road. For training and testing camera-based lane perception and driving.
 
 Content hash, over all images and labels: `{hash}`.
 
@@ -53,35 +58,35 @@ Content hash, over all images and labels: `{hash}`.
 from datagen.recording import Dataset
 
 train = Dataset.open(".").select("train")  # or "test", "all"
-labels = train.labels                      # arrays, one row a frame, NaN where absent
+labels = train.labels                      # arrays, one row per frame, NaN where absent
 images = train.read_batch([0, 1, 2])       # (3, {height}, {width}, 3) uint8 RGB
 print(len(train), labels.to_lane_centre[:3], labels.angle[:3], labels.heading[:3])
 ```
 
-Or with any reader of MCAP: the schemas are inside the files. Foxglove shows a round with
-`layouts/foxglove.json`, Rerun opens it as it is, `datagen view rounds/{first}.mcap` with plots.
-`datagen export` writes WebDataset shards or a LeRobotDataset. `datagen verify` tells whether it is
-still what was recorded.
+Or with any MCAP reader: the schemas are inside the files. Foxglove shows a round with
+`layouts/foxglove.json`, Rerun opens it directly, `datagen view rounds/{first}.mcap` adds plots.
+`datagen export` writes WebDataset shards or a LeRobotDataset. `datagen verify` checks that nothing
+has changed since it was recorded.
 
 ## What is in the folder
 
 | | |
 |---|---|
-| `rounds/*.mcap` | one file a round, uncompressed MCAP, protobuf messages |
-| `splits/default.json` | which rounds train and which test |
-| `proto/driverview.proto` | our messages; the others are `foxglove.*` |
-| `{schema}` | unit, frame, reference point and limits of every value |
-| `stats.json`, `manifest.json` | the figures below in full; every round with its hashes |
-| `state/*.json`, `plan.json` | size and SHA-256 of each file; what was asked for |
+| `rounds/*.mcap` | one file per round, uncompressed MCAP, protobuf messages |
+| `splits/default.json` | the rounds of each side: train, test, unseen |
+| `proto/driverview.proto` | the `driverview.*` messages; the others are `foxglove.*` |
+| `{schema}` | unit, frame, reference point and limits of every field |
+| `stats.json`, `manifest.json` | all statistics; every round with its hashes |
+| `state/*.json`, `plan.json` | size and SHA-256 of each file; the plan of all rounds |
 | `layouts/foxglove.json` | a layout for Foxglove |
 
-The messages of one control step share one log time, which is simulated time counted from
-2020-01-01: an image carries the time of its labels.
+The messages of one control step have the same log time, which is simulated time counted from
+2020-01-01. An image and its labels are paired by it.
 
 ## What is recorded
 
-Units are SI unless said otherwise. Lateral values are positive to the left, except the distances to
-markings, which are negative to the left; `angle` is positive when the car points to the right.
+Units are SI unless stated otherwise. Lateral values are positive to the left, except the distances
+to markings, which are negative to the left; `angle` is positive when the car points to the right.
 Absent means unset, not zero. Definitions of the labels: version {definitions}.
 
 | topic | schema |
@@ -93,11 +98,11 @@ Absent means unset, not zero. Definitions of the labels: version {definitions}.
 ## How it was made
 
 By `datagen collect` of {program}: a simulated car (rigid body, tyres, suspension at 200 Hz) is
-driven by a scripted driver along a trajectory of its round, at a speed of its round, among cars
-that keep their distance; the labels are computed from the road's geometry. One seed fixes all.
+driven by a scripted driver; trajectory and speed differ by round; the other cars follow a
+car-following model. The labels are computed from the geometry of the road. One seed determines all.
 {stretches}Camera: {camera}{jitter}. Images: {codecs}.
 
-Frames by...
+Frames by
 
 - track: {by_track}
 - number of lanes: {by_lanes}
@@ -107,77 +112,79 @@ Frames by...
 
 ## Splits and figures
 
-By round, never by frame: {sides}. No seed and no content stands on two sides.{recovered}
+By round, never by frame: {sides}. No seed and no content hash is on two sides.{recovered}
 
 {table}
 
-"Mean deviation" is the error of always answering the mean: a model must do better than that.
+"Mean deviation" is the mean absolute error of predicting the mean: the baseline for a model.
 
 ## Known limits
 
-- All of it is simulated: cars, roads and weather are those of this program, not of the world.
-- Frames of a round are 1/{hertz} s apart and much alike: count rounds, not frames, when you judge
-  how sure a figure is.
-- Labels tell where markings are, also where paint is worn, hidden by a car or outside the picture.
-- Every image is of one camera{one_camera}. Train with others before you use others.
+- Everything is simulated: cars, roads and weather are those of this program, not real ones.
+- Frames of a round are 1/{hertz} s apart and similar: use the number of rounds, not of frames, for
+  confidence intervals.
+- Labels state where markings are, also where paint is worn, hidden by a car or outside the image.
+- Every image is of one camera{one_camera}. For other cameras, train with images of these.
 - No pedestrians, crossings, traffic lights or oncoming traffic.
 
 ## Licence
 
 MIT, as the program that made it. Roads imported from elsewhere (TORCS's tracks) are their authors'
-designs: of their files only the lines of the road are in here.
+work; only the geometry of the road is taken from their files.
 """
 
 
-def card(dataset: Dataset, statistics: dict[str, Any]) -> str:
-    """Markdown with a head of YAML; `statistics` is what `describe` says of the dataset."""
+def render_card(dataset: Dataset, statistics: dict[str, Any]) -> str:
+    """Markdown with a YAML header; `statistics` is the result of `describe`."""
     headers = [index.header for index in dataset.indexes]
     jittered = any(header.nominal_camera for header in headers)
     rounds, frames = statistics["rounds"], statistics["frames"]
-    return CARD.format(
+    return TEMPLATE.format(
         name=dataset.path.resolve().name,
-        size=next((name for most, name in SIZES if frames < most), LARGEST),
+        size=next((name for most, name in SIZE_CATEGORIES if frames < most), LARGEST_CATEGORY),
         frames=f"{frames:,}",
         rounds=f"{rounds} round{'' if rounds == 1 else 's'}",
-        hertz=_listed({str(header.frequency_hz) for header in headers}),
+        hertz=_join({str(header.frequency_hz) for header in headers}),
         width=dataset.camera.width,
         height=dataset.camera.height,
         hash=dataset.content_hash,
         first=dataset.rounds[0].path.stem,
-        schema=SCHEMA,
+        schema=SCHEMA_FILE,
         definitions=tf.VERSION,
         topics="\n".join(
             f"| `{topic}` | {message.DESCRIPTOR.full_name} |"
             for topic, message in MESSAGE_TYPES.items()
         ),
-        fields="\n\n".join(_fields(message) for message in FIELDS),
-        program=_listed({header.program or "driverview" for header in headers}),
-        stretches=_stretches({header.stretch for header in headers} - {0}),
-        camera=_camera(dataset.camera),
-        jitter=", each round's a little off (in its metadata)" if jittered else "",
+        fields="\n\n".join(_field_table(message) for message in FIELDS),
+        program=_join({header.program or "driverview" for header in headers}),
+        stretches=_describe_stretches({header.stretch for header in headers} - {0}),
+        camera=_describe_camera(dataset.camera),
+        jitter=", varied a little from round to round (see the metadata of a round)"
+        if jittered
+        else "",
         one_camera=", nearly" if jittered else "",
-        codecs=_listed({CODECS[header.codec] for header in headers}),
-        sides=_sides(dataset),
-        recovered=_recovered(dataset),
-        table="\n".join(_rows(statistics)),
+        codecs=_join({CODECS[header.codec] for header in headers}),
+        sides=_describe_sides(dataset),
+        recovered=_describe_recovered(dataset),
+        table="\n".join(_table_rows(statistics)),
         **{
-            name: _counts(statistics[name])
+            name: _format_counts(statistics[name])
             for name in ("by_track", "by_lanes", "by_traffic", "by_light", "by_trajectory")
         },
     )
 
 
-def _stretches(frames: set[int]) -> str:
+def _describe_stretches(frames: set[int]) -> str:
     if not frames:
         return ""
-    every = _listed({str(count) for count in frames})
+    every = _join({str(count) for count in frames})
     return (
-        f"Every {every} frames the scenery, the weather and the light are others, while the drive "
-        "goes on: pictures\njump there, labels and states do not. "
+        f"Every {every} frames the scenery, the weather and the light change, while the drive goes "
+        "on: images\nchange abruptly there, labels and states do not. "
     )
 
 
-def _camera(camera: CameraParameters) -> str:
+def _describe_camera(camera: CameraParameters) -> str:
     return (
         f"{camera.fov_y_deg:g} degrees of vertical field of view, at ({camera.x:g}, {camera.y:g}, "
         f"{camera.z:g}) m ahead, left and above of the centre of gravity, pitch "
@@ -185,51 +192,53 @@ def _camera(camera: CameraParameters) -> str:
     )
 
 
-def _fields(message: str) -> str:
-    rows = "\n".join(_field(name, field) for name, field in FIELDS[message].items())
+def _field_table(message: str) -> str:
+    rows = "\n".join(_field_row(name, field) for name, field in FIELDS[message].items())
     return f"`driverview.{message}`:\n\n| field | unit | |\n|---|---|---|\n{rows}"
 
 
-def _field(name: str, field: Field) -> str:
+def _field_row(name: str, field: Field) -> str:
     absent = f"; absent where {field.absent}" if field.absent else ""
     return f"| `{name}` | {field.unit} | {field.meaning}{absent} |"
 
 
-def _sides(dataset: Dataset) -> str:
+def _describe_sides(dataset: Dataset) -> str:
     names = {side: [i.id for i in dataset.rounds if i.split == side] for side in (*SIDES, "")}
     return ", ".join(f"{len(ids)} {side or 'of no side'}" for side, ids in names.items() if ids)
 
 
-def _recovered(dataset: Dataset) -> str:
+def _describe_recovered(dataset: Dataset) -> str:
     found = [index.header.id for index in dataset.indexes if index.recovery]
-    return f" Saved from damaged files, not whole: {', '.join(found)}." if found else ""
+    return (
+        f" Recovered from damaged files, with missing frames: {', '.join(found)}." if found else ""
+    )
 
 
-def _rows(statistics: dict[str, Any]) -> Iterator[str]:
+def _table_rows(statistics: dict[str, Any]) -> Iterator[str]:
     names = [name for name in ("all", *SIDES) if statistics[name]["frames"]]
     sides = [statistics[name] for name in names]
-    yield _row("", names)
-    yield _row("---", ["---"] * len(names))
-    yield _row("frames", [str(side["frames"]) for side in sides])
+    yield _table_row("", names)
+    yield _table_row("---", ["---"] * len(names))
+    yield _table_row("frames", [str(side["frames"]) for side in sides])
     for kind in tf.Heading:
         name = kind.name.lower()
-        yield _row(name, [f"{side['heading'][name]:.1%}" for side in sides])
+        yield _table_row(name, [f"{side['heading'][name]:.1%}" for side in sides])
     for name in (*tf.MARKINGS, "to_lane_centre", "angle"):
         unit = "rad" if name == "angle" else "m"
         cells = [
             f"{s['mean_deviation'][name]:.3f} {unit} ({s['active'][name]:.0%} active)"
             for s in sides
         ]
-        yield _row(f"mean deviation of {name}", cells)
+        yield _table_row(f"mean deviation of {name}", cells)
 
 
-def _row(name: str, cells: list[str]) -> str:
+def _table_row(name: str, cells: list[str]) -> str:
     return f"| {name} | {' | '.join(cells)} |"
 
 
-def _counts(counts: dict[str, int]) -> str:
+def _format_counts(counts: dict[str, int]) -> str:
     return ", ".join(f"{name}: {count}" for name, count in counts.items())
 
 
-def _listed(words: set[str]) -> str:
+def _join(words: set[str]) -> str:
     return " or ".join(sorted(words))

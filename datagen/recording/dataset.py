@@ -1,4 +1,4 @@
-"""Reading a dataset folder: its rounds, their labels as arrays, their images as uint8 batches.
+"""Reading a dataset folder: rounds, labels as arrays, images as uint8 batches.
 
 frames = Dataset.open("datasets/default").select("train")
 batch = frames.read_batch([3, 1, 2])
@@ -7,13 +7,12 @@ batch = frames.read_batch([3, 1, 2])
 import hashlib
 import os
 from bisect import bisect_right
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import accumulate
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,20 +32,19 @@ from datagen.recording.splits import (
     Split,
     read_split,
     require_disjoint,
-    require_known_recovered,
+    require_recovered_declared,
     split_path,
 )
 from trackfeatures.camera import CameraParameters
 
-if TYPE_CHECKING:
-    from datagen.recording.bulk import BulkDecoder
-
 IMAGE_DATA = 2  # number of the field `data` of foxglove.CompressedImage
-BULK = 8  # images: for fewer, compiled code is not worth loading
 
 
 class Frames:
-    """The frames of some rounds, in round order; labels are parsed once, images on demand."""
+    """The frames of some rounds, in the order of the rounds.
+
+    Labels are parsed once, images are decoded on request.
+    """
 
     def __init__(
         self,
@@ -55,7 +53,7 @@ class Frames:
         camera: CameraParameters,
         rows: NDArray[np.int64] | None = None,
     ) -> None:
-        """`rows`: the frames of these rounds that are meant, ascending; None: all."""
+        """`rows`: numbers of the frames to use, ascending, counted over `rounds`; None: all."""
         self.rounds = list(rounds)
         self.camera = camera
         self._images = [index.messages[CAMERA] for index in indexes]
@@ -69,85 +67,85 @@ class Frames:
 
     @cached_property
     def labels(self) -> Labels:
-        each = concatenate([read_labels(ix, number) for number, ix in enumerate(self._indexes)])
-        return each if len(self) == self._first[-1] else each.take(self._rows)
+        """The labels of these frames. Raises DatasetError for a damaged round."""
+        parts = [read_labels(index, number) for number, index in enumerate(self._indexes)]
+        labels = concatenate(parts)
+        return labels if len(self) == self._first[-1] else labels.take(self._rows)
 
     def every(self, step: int) -> "Frames":
-        """Each `step`-th of these frames, from the first on."""
+        """Every `step`-th of these frames, starting with the first."""
         return Frames(self.rounds, self._indexes, self.camera, self._rows[::step])
 
-    def without(self, left_out: Iterable[int]) -> "Frames":
-        """These frames but those numbered `left_out`."""
-        kept = np.delete(self._rows, list(left_out))
+    def without(self, excluded: Iterable[int]) -> "Frames":
+        """These frames except the indices `excluded`."""
+        kept = np.delete(self._rows, list(excluded))
         return Frames(self.rounds, self._indexes, self.camera, kept)
 
     def jpeg(self, i: int) -> memoryview:
-        """The encoded image of frame `i` (a PNG in rounds recorded with that codec), not copied."""
+        """The encoded image of frame `i`, not copied; a PNG if the round has that codec.
+
+        Raises IndexError, or UndecodableImage if its message is damaged.
+        """
         number, frame = self._locate(i)
         try:
             return bytes_field(self._images[number].payload(frame), IMAGE_DATA)
         except ValueError as error:
-            raise self._unreadable(i, error) from error
+            raise self._undecodable(i, error) from error
 
     def image(self, i: int) -> NDArray[np.uint8]:
-        """The image of frame `i`, (H, W, 3) uint8 RGB; DatasetError when it cannot be decoded."""
+        """The image of frame `i`, (H, W, 3) uint8 RGB; raises as `read_batch` does."""
         image: NDArray[np.uint8] = self.read_batch([i])[0]
         return image
 
     def read_batch(
         self, indices: Sequence[int] | NDArray[np.int64], out: NDArray[np.uint8] | None = None
     ) -> NDArray[np.uint8]:
-        """Decode the images of `indices` into `out` (B, H, W, 3) uint8 RGB, on all cores.
+        """Decode the images of `indices` into `out` (B, H, W, 3) uint8 RGB, one thread a core.
 
-        Returns `out`, a new array where none is given. IndexError for a frame that is not there,
-        DatasetError for an image that cannot be decoded. The first batch of a process takes 0.7 s
-        longer, the first on a machine some seconds: the decoder is compiled, and kept.
+        Returns `out`, a new array if none is given. Raises IndexError for a frame that does not
+        exist, UndecodableImage for a damaged image (the rest of `out` is then undefined), and
+        ValueError if `out` has another shape or type.
         """
         numbers = np.asarray(indices, dtype=np.int64)
         shape = (len(numbers), self.camera.height, self.camera.width, 3)
         out = np.empty(shape, np.uint8) if out is None else out
         if out.shape != shape or out.dtype != np.uint8:
             raise ValueError(f"`out` is {out.dtype} {out.shape}, expected uint8 {shape}")
-        left = np.arange(len(numbers))
-        if len(numbers) >= BULK and out.flags.c_contiguous:
-            left = np.flatnonzero(~self._decode_together(numbers, out))
-        if len(left):
-            # One iterator for all threads: each takes the next image when it is done with its last.
-            rows = zip(left.tolist(), numbers[left].tolist(), strict=True)
-            self._on_all_threads(lambda: self._decode(rows, out))
+        absent = numbers[(numbers < 0) | (numbers >= len(self))]
+        if len(absent):
+            raise IndexError(f"frame {absent[0]} of {len(self)}")
+        # One iterator for all threads: each takes the next image when it is done with its last.
+        rows = iter(enumerate(numbers.tolist()))
+        threads = min(self._threads, len(numbers))
+        parts = [self._pool.submit(self._decode, rows, out) for _ in range(threads)]
+        wait(parts)  # after an error no thread may still be writing to `out`
+        errors = [error for part in parts if (error := part.result()) is not None]
+        if errors:
+            raise min(errors)[1]
         return out
 
-    def _decode_together(
-        self, numbers: NDArray[np.int64], out: NDArray[np.uint8]
-    ) -> NDArray[np.bool_]:
-        """Which images our own decoder has decoded, (B,)."""
-        from datagen.recording.bulk import lots
-
-        found = lots([self.jpeg(i) for i in numbers.tolist()])
-        done = np.zeros(len(numbers), np.bool_)
-        self._on_all_threads(lambda: self._bulk.decode(found, out, done))
-        return done
-
-    def _decode(self, rows: Iterator[tuple[int, int]], out: NDArray[np.uint8]) -> None:
+    def _decode(
+        self, rows: Iterator[tuple[int, int]], out: NDArray[np.uint8]
+    ) -> tuple[int, UndecodableImage] | None:
+        """Decode until `rows` ends or an image is damaged; return the row and error of that one."""
         for row, i in rows:
             try:
                 decode_into(self.jpeg(i), out[row])
+            except UndecodableImage as error:
+                return row, error
             except ValueError as error:
-                raise self._unreadable(i, error) from error
-
-    def _on_all_threads(self, work: Callable[[], None]) -> None:
-        parts = [self._pool.submit(work) for _ in range(self._threads)]
-        for part_done in parts:
-            part_done.result()
+                return row, self._undecodable(i, error)
+        return None
 
     def _locate(self, i: int) -> tuple[int, int]:
+        """The round of frame `i`, as an index into `rounds`, and the frame's number in it."""
         if not 0 <= i < len(self):
             raise IndexError(f"frame {i} of {len(self)}")
         row = int(self._rows[i])
         number = bisect_right(self._first, row) - 1
         return number, row - self._first[number]
 
-    def _unreadable(self, i: int, error: Exception) -> UndecodableImage:
+    def _undecodable(self, i: int, error: Exception) -> UndecodableImage:
         number, frame = self._locate(i)
         info = self.rounds[number]
         return UndecodableImage(info.id, info.path, frame, str(error))
@@ -155,12 +153,6 @@ class Frames:
     @cached_property
     def _threads(self) -> int:
         return len(os.sched_getaffinity(0))
-
-    @cached_property
-    def _bulk(self) -> "BulkDecoder":
-        from datagen.recording.bulk import BulkDecoder  # numba takes long to load
-
-        return BulkDecoder()
 
     @cached_property
     def _pool(self) -> ThreadPoolExecutor:
@@ -181,15 +173,15 @@ class Dataset:
     def open(path: str | Path, split: str = DEFAULT_SPLIT) -> "Dataset":
         """Open the rounds of a folder.
 
-        Raises DatasetError when there are none, one is damaged, cameras differ or the split leaks,
-        and DefinitionsMismatch when they were recorded under other definitions.
+        Raises DatasetError if there are none, a round is damaged, cameras differ or the split
+        leaks, and DefinitionsMismatch if a round was recorded under other label definitions.
         """
         folder = Path(path)
         indexes = [open_round(file) for file in round_files(folder)]
         for index in indexes:
             tf.require_version(index.header.definitions, str(index.path))
         chosen = read_split(split_path(folder, split))
-        _require_sound_split(chosen, indexes)
+        _validate_split(chosen, indexes)
         rounds = [
             RoundInfo.of(ix.path, ix.header, ix.result, chosen.side(ix.header.id)) for ix in indexes
         ]
@@ -197,7 +189,7 @@ class Dataset:
         return Dataset(folder, rounds, _one_camera(indexes), content_hash, indexes)
 
     def select(self, side: str = "all") -> Frames:
-        """The frames of the train, the test or the unseen rounds, or of all."""
+        """The frames of the rounds of one side of the split (train, test, unseen), or of all."""
         if side not in (*SIDES, "all"):
             raise DatasetError(
                 f"there is no side {side!r} of a split; choose {', '.join(SIDES)} or all"
@@ -215,7 +207,7 @@ class Dataset:
 
 
 def round_files(folder: Path) -> list[Path]:
-    """The finished rounds of a dataset folder, in order; DatasetError when there are none."""
+    """The finished rounds of a dataset folder, sorted by name; DatasetError if there are none."""
     files = sorted((folder / "rounds").glob("*.mcap"))
     if not files:
         raise DatasetError(
@@ -225,15 +217,15 @@ def round_files(folder: Path) -> list[Path]:
     return files
 
 
-def _require_sound_split(split: Split, indexes: Sequence[RoundIndex]) -> None:
-    require_known_recovered(split, indexes)
+def _validate_split(split: Split, indexes: Sequence[RoundIndex]) -> None:
+    require_recovered_declared(split, indexes)
     require_disjoint(
         split, [RoundKey(ix.header.id, ix.header.seed, ix.result.content_hash) for ix in indexes]
     )
 
 
 def _one_camera(indexes: Sequence[RoundIndex]) -> CameraParameters:
-    """The camera all rounds are of; in a dataset with jitter each round's differs a little."""
+    """The common camera of all rounds (with camera jitter: the nominal one); else DatasetError."""
     camera = indexes[0].header.dataset_camera
     for index in indexes:
         if index.header.dataset_camera != camera:
@@ -245,7 +237,7 @@ def _one_camera(indexes: Sequence[RoundIndex]) -> CameraParameters:
 
 
 def dataset_hash(content_hashes: Iterable[str]) -> str:
-    """One hash over the images and labels of all rounds, whatever their order and names."""
+    """SHA-256 over the images and labels of all rounds; independent of their order and names."""
     digest = hashlib.sha256(tf.VERSION.encode())
     for content in sorted(content_hashes):
         digest.update(content.encode())

@@ -1,4 +1,4 @@
-"""What can be wrong with a recording or a dataset folder."""
+"""Errors of recordings and dataset folders."""
 
 from pathlib import Path
 
@@ -10,7 +10,7 @@ class DatasetError(UserError):
 
 
 class UndecodableImage(DatasetError):
-    """One image that cannot be decoded: image `frame` of the round called `round_id`, and why."""
+    """Image `frame` of the round `round_id` is damaged; `reason` says how."""
 
     def __init__(self, round_id: str, path: Path, frame: int, reason: str) -> None:
         super().__init__(

@@ -1,12 +1,11 @@
-"""A dataset folder on disk: how a round gets into it whole or not at all.
+"""The files of a dataset folder, and how a finished round is moved into it.
 
 A round is written under `.partial/`, read back, checked, hashed, synced and renamed into `rounds/`;
-`state/ID.json` then holds its hashes. Everything else in the folder is derived and can be rebuilt.
+`state/ID.json` then holds its hashes. All other files are derived from these (see `manifest`).
 """
 
 import hashlib
 import json
-import os
 import shutil
 from collections.abc import Iterable
 from contextlib import suppress
@@ -15,19 +14,19 @@ from importlib.resources import files
 from pathlib import Path
 
 from datagen.recording.errors import DatasetError
-from datagen.recording.schema.json_schema import SCHEMA, schema_text
+from datagen.recording.schema.json_schema import SCHEMA_FILE, schema_text
+from runtime.files import atomic_move, atomic_write, unfinished_path
 
 PARTIAL = ".partial"
 LOCKS = ".locks"
 SUBFOLDERS = ("rounds", "state", "splits", "layouts", "proto", "schemas")
-PUBLISHED = ("proto/driverview.proto", "layouts/foxglove.json", SCHEMA)
-UNFINISHED = ".{name}.new"  # a small file before it takes its place
+PUBLISHED_FILES = ("proto/driverview.proto", "layouts/foxglove.json", SCHEMA_FILE)
 READ_BYTES = 1 << 20
 
 
 @dataclass(frozen=True, slots=True)
 class RoundState:
-    """What is known of a finished file: enough to see that it is still the same."""
+    """Size and hashes of a finished round file, to detect later changes."""
 
     id: str
     file: str
@@ -39,6 +38,7 @@ class RoundState:
 
     @staticmethod
     def read(path: Path) -> "RoundState":
+        """Raises DatasetError for a file that is no round state."""
         try:
             return RoundState(**json.loads(path.read_text()))
         except (ValueError, TypeError) as error:
@@ -46,20 +46,23 @@ class RoundState:
 
 
 def prepare(folder: Path) -> None:
-    """Make the folder's parts and publish what explains its messages."""
+    """Make the subfolders and write the files that describe the messages."""
     for name in SUBFOLDERS:
         (folder / name).mkdir(parents=True, exist_ok=True)
     package = files("datagen.recording.schema")
-    for name in PUBLISHED:
-        text = schema_text() if name == SCHEMA else package.joinpath(name).read_text()
-        write_synced(folder / name, text)
+    for name in PUBLISHED_FILES:
+        text = schema_text() if name == SCHEMA_FILE else package.joinpath(name).read_text()
+        write_if_changed(folder / name, text)
 
 
-def barely_begun(folder: Path, first: str) -> bool:
-    """Whether nothing is in the folder but empty parts of a dataset and the beginning of `first`,
-    the file that is written before all others: what a disk full at the start may leave."""
+def is_unstarted(folder: Path, first_file: str) -> bool:
+    """Whether `folder` holds at most empty parts of a dataset and an unfinished `first_file`.
+
+    That is what a disk that was full from the start leaves; `first_file` is written before all
+    others.
+    """
     return all(
-        path.name in (UNFINISHED.format(name=first), LOCKS)
+        path.name in (unfinished_path(folder / first_file).name, LOCKS)
         or (path.name in (*SUBFOLDERS, PARTIAL) and path.is_dir() and not any(path.iterdir()))
         for path in folder.iterdir()
     )
@@ -74,7 +77,7 @@ def state_path(folder: Path, round_id: str) -> Path:
 
 
 def partial_path(folder: Path, round_id: str) -> Path:
-    """Where to write a round that is not finished; its own folder, made empty."""
+    """Where to write an unfinished round: `round.mcap` in a new, empty folder of its own."""
     home = folder / PARTIAL / round_id
     shutil.rmtree(home, ignore_errors=True)
     home.mkdir(parents=True)
@@ -82,27 +85,27 @@ def partial_path(folder: Path, round_id: str) -> Path:
 
 
 def publish(folder: Path, partial: Path, state: RoundState) -> None:
-    """Move a checked round to its place: after a power cut it is there whole or not at all."""
-    move_synced(partial, round_path(folder, state.id))
-    write_synced(state_path(folder, state.id), json.dumps(asdict(state), indent=1) + "\n")
+    """Move a checked round into `rounds/` and write its state; safe against a power cut."""
+    atomic_move(partial, round_path(folder, state.id))
+    write_if_changed(state_path(folder, state.id), json.dumps(asdict(state), indent=1) + "\n")
     discard_partial(folder, state.id)
 
 
 def discard_partial(folder: Path, round_id: str) -> None:
-    """What an attempt has left. Its parent stays: another round may be about to begin in it."""
+    """Remove an unfinished round. `.partial/` stays: another process may be about to use it."""
     shutil.rmtree(folder / PARTIAL / round_id, ignore_errors=True)
 
 
 def discard_partials(folder: Path, round_ids: Iterable[str]) -> None:
-    """What a crash or an interruption has left of these rounds."""
+    """Remove what a crash or an interruption has left of these rounds."""
     for round_id in round_ids:
         discard_partial(folder, round_id)
-    with suppress(OSError):  # it is not there, or other rounds are being written in it
+    with suppress(OSError):  # it does not exist, or other rounds are being written in it
         (folder / PARTIAL).rmdir()
 
 
 def read_states(folder: Path) -> dict[str, RoundState]:
-    """States of the rounds that are finished: the file is there and has its length."""
+    """States of the finished rounds by id: those whose file exists and has the stated size."""
     states = {}
     for path in sorted((folder / "state").glob("*.json")):
         state = RoundState.read(path)
@@ -113,6 +116,7 @@ def read_states(folder: Path) -> dict[str, RoundState]:
 
 
 def file_sha256(path: Path) -> str:
+    """SHA-256 of a file's bytes, in hexadecimal."""
     digest = hashlib.sha256()
     with path.open("rb") as stream:
         while block := stream.read(READ_BYTES):
@@ -120,33 +124,7 @@ def file_sha256(path: Path) -> str:
     return digest.hexdigest()
 
 
-def move_synced(source: Path, target: Path) -> None:
-    """Put a finished file, or a folder of files, in its place: after a power cut it is there whole
-    or not at all."""
-    for path in (*source.rglob("*"), source):
-        _sync(path)
-    source.replace(target)
-    _sync(target.parent)
-
-
-def write_synced(path: Path, text: str) -> None:
-    """Replace a small file in one step; one that holds this text already is left alone."""
-    if path.is_file() and path.read_bytes() == text.encode():
-        return
-    beside = path.with_name(UNFINISHED.format(name=path.name))
-    try:
-        beside.write_text(text, encoding="utf-8")
-        _sync(beside)
-        beside.replace(path)
-    except OSError:
-        beside.unlink(missing_ok=True)
-        raise
-    _sync(path.parent)
-
-
-def _sync(path: Path) -> None:
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
+def write_if_changed(path: Path, text: str) -> None:
+    """Replace a small file atomically and sync it; a file that already holds `text` is kept."""
+    if not (path.is_file() and path.read_bytes() == text.encode()):
+        atomic_write(path, text, fsync=True)

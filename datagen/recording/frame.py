@@ -1,4 +1,4 @@
-"""One control step as it is recorded: the image and everything true at that moment.
+"""One control step as it is recorded: the image, its labels and the state of the simulation.
 
 World frame: x, y in the plane, z up, angles counter-clockwise, SI units.
 """
@@ -44,7 +44,7 @@ class SensorReadings:
 
 @dataclass(frozen=True, slots=True)
 class DriverCommand:
-    """What the driver asked for at this step: steer in [-1, 1], left positive."""
+    """Control inputs of the step: steer in [-1, 1], left positive; throttle and brake in [0, 1]."""
 
     steer: float
     throttle: float
@@ -54,7 +54,7 @@ class DriverCommand:
 
 @dataclass(frozen=True, slots=True)
 class RoadPlace:
-    """Where the car is on the road: beside the features, what explains them."""
+    """Position of the car on the road: curvature in 1/m, `to_middle` and `s` in m."""
 
     lanes: int
     lane_index: int
@@ -65,9 +65,9 @@ class RoadPlace:
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """`image` (H, W, 3) uint8 RGB; `traffic` (n, 6) x, y, z, roll, pitch, yaw of each car.
+    """`image` (H, W, 3) uint8 RGB; `traffic` (n, 6): x, y, z, roll, pitch, yaw of each other car.
 
-    `markings` are pixel polylines, (k, 2) each, of the true lane markings over the image.
+    `markings` are the visible lane markings as polylines in pixels, (k, 2) each.
     """
 
     image: NDArray[np.uint8]

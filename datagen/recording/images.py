@@ -1,4 +1,4 @@
-"""Images to bytes and back: JPEG quality 95 4:2:0, or PNG where nothing may be lost."""
+"""Encoding and decoding of images: JPEG of quality 95 with 4:2:0 chroma, or lossless PNG."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +12,7 @@ Buffer = bytes | memoryview
 
 
 def encode(image: NDArray[np.uint8], codec: str) -> bytes:
-    """`image` (H, W, 3) RGB."""
+    """`image` (H, W, 3) uint8 RGB as JPEG or PNG bytes."""
     if codec == "jpeg":
         import simplejpeg
 
@@ -27,11 +27,15 @@ def encode(image: NDArray[np.uint8], codec: str) -> bytes:
 
 
 def decode_into(data: Buffer, out: NDArray[np.uint8]) -> None:
-    """Decode into `out` (H, W, 3) RGB; ValueError when it is damaged or of another size."""
+    """Decode a JPEG or PNG into `out` (H, W, 3) uint8 RGB, contiguous.
+
+    Raises ValueError for a damaged image, another format or another size. JPEG pixels are those of
+    libjpeg-turbo.
+    """
     if data[:2] == JPEG_MAGIC:
         import simplejpeg
 
-        # Given too small a buffer the decoder complains; a smaller image would pass unseen.
+        # The decoder refuses a buffer that is too small, but not one that is too large.
         height, width = simplejpeg.decode_jpeg_header(data)[:2]
         _require_shape((height, width), out)
         simplejpeg.decode_jpeg(data, "RGB", buffer=out)
@@ -50,5 +54,5 @@ def decode_into(data: Buffer, out: NDArray[np.uint8]) -> None:
 def _require_shape(found: tuple[int, ...], out: NDArray[np.uint8]) -> None:
     if tuple(found) != out.shape[:2]:
         raise ValueError(
-            f"it is {found[1]}x{found[0]} px where {out.shape[1]}x{out.shape[0]} were expected"
+            f"it is {found[1]}x{found[0]} px, expected {out.shape[1]}x{out.shape[0]} px"
         )

@@ -1,4 +1,4 @@
-"""The labels of many frames as arrays, in the frame and units of `trackfeatures`."""
+"""Labels of many frames as arrays, in the track frame and the units of `trackfeatures`."""
 
 from dataclasses import dataclass, fields
 
@@ -9,14 +9,14 @@ from numpy.typing import NDArray
 from datagen.recording.errors import DatasetError
 from datagen.recording.mcap.index import RoundIndex
 from datagen.recording.schema.proto.driverview_pb2 import TrackFeatures, VehicleState
-from datagen.recording.schema.topics import CAMERA, EGO_STATE, LABELS, frames_of
+from datagen.recording.schema.topics import CAMERA, EGO_STATE, LABELS, steps_at
 
 NAN = float("nan")
 
 
 @dataclass(frozen=True)
 class Labels:
-    """One row a frame; `distances` are ml, mr, l, m, r in m, NaN where not active."""
+    """One row per frame; `distances` are ml, mr, l, m, r in m, NaN where not active."""
 
     distances: NDArray[np.float32]  # (N, 5)
     angle: NDArray[np.float32]  # (N,) rad, as all below
@@ -40,7 +40,10 @@ class Labels:
 
 
 def read_labels(index: RoundIndex, round_number: int) -> Labels:
-    """Labels of all frames of a round; DatasetError unless each image has its label and state."""
+    """Labels of all frames of a round; `round_number` fills the column `round`.
+
+    Raises DatasetError if an image has no label or state, or a label is damaged.
+    """
     camera, labels, states = (index.messages[t] for t in (CAMERA, LABELS, EGO_STATE))
     count = len(camera)
     try:
@@ -50,39 +53,40 @@ def read_labels(index: RoundIndex, round_number: int) -> Labels:
                     f"{index.path.name}: {count} images do not pair with its {len(other)} {name}; "
                     "run `datagen verify` on the dataset and record the round again"
                 )
-        rows = np.array([_row(labels.payload(i)) for i in range(count)], dtype=np.float64)
-        motion = np.array([_motion(states.payload(i)) for i in range(count)], dtype=np.float64)
+        rows = np.array([_label_row(labels.payload(i)) for i in range(count)], dtype=np.float64)
+        motion = np.array([_motion_row(states.payload(i)) for i in range(count)], dtype=np.float64)
     except (DecodeError, ValueError) as error:
         raise DatasetError(f"{index.path.name}: a label is damaged ({error})") from error
     if not count:
         raise DatasetError(f"{index.path.name} has no frames; record the round again")
     return Labels(
-        distances=_narrow(rows[:, :5]),
-        to_lane_centre=_narrow(rows[:, 5]),
-        angle=_narrow(rows[:, 6]),
+        distances=_to_float32(rows[:, :5]),
+        to_lane_centre=_to_float32(rows[:, 5]),
+        angle=_to_float32(rows[:, 6]),
         heading=rows[:, 7].astype(np.int64),
         lanes=rows[:, 8].astype(np.int64),
         lane_index=rows[:, 9].astype(np.int64),
-        curvature=_narrow(rows[:, 10]),
-        to_middle=_narrow(rows[:, 11]),
-        s=_narrow(rows[:, 12]),
-        speed=_narrow(motion[:, 0]),
-        shadow_fraction=_narrow(motion[:, 1]),
-        light=lights_of(index),
+        curvature=_to_float32(rows[:, 10]),
+        to_middle=_to_float32(rows[:, 11]),
+        s=_to_float32(rows[:, 12]),
+        speed=_to_float32(motion[:, 0]),
+        shadow_fraction=_to_float32(motion[:, 1]),
+        light=light_per_frame(index),
         round=np.full(count, round_number, dtype=np.int64),
     )
 
 
-def lights_of(index: RoundIndex) -> NDArray[np.str_]:
-    """The light (N,) of each frame of a round: by its time, for frames may be missing."""
+def light_per_frame(index: RoundIndex) -> NDArray[np.str_]:
+    """The light (N,) of each frame of a round, from log times: a recovered round has gaps."""
     header = index.header
-    frames = frames_of(index.messages[CAMERA].log_time, header.frequency_hz)
+    frames = steps_at(index.messages[CAMERA].log_time, header.frequency_hz)
     stretch = header.stretch or int(frames.max(initial=0)) + 1
     lights: NDArray[np.str_] = np.array(header.lights)[frames // stretch % len(header.lights)]
     return lights
 
 
 def concatenate(parts: list[Labels]) -> Labels:
+    """The rows of all `parts`, one after the other."""
     return Labels(
         **{
             f.name: np.concatenate([getattr(part, f.name) for part in parts])
@@ -91,12 +95,12 @@ def concatenate(parts: list[Labels]) -> Labels:
     )
 
 
-def _narrow(values: NDArray[np.float64]) -> NDArray[np.float32]:
-    with np.errstate(over="ignore"):  # only a damaged label is out of float32's range
+def _to_float32(values: NDArray[np.float64]) -> NDArray[np.float32]:
+    with np.errstate(over="ignore"):  # only a damaged label exceeds the range of float32
         return values.astype(np.float32)
 
 
-def _row(payload: memoryview) -> tuple[float, ...]:
+def _label_row(payload: memoryview) -> tuple[float, ...]:
     m = TrackFeatures.FromString(bytes(payload))
     has = m.HasField
     return (
@@ -116,6 +120,6 @@ def _row(payload: memoryview) -> tuple[float, ...]:
     )
 
 
-def _motion(payload: memoryview) -> tuple[float, float]:
+def _motion_row(payload: memoryview) -> tuple[float, float]:
     state = VehicleState.FromString(bytes(payload))
     return state.vx, state.shadow_fraction

@@ -1,6 +1,7 @@
-"""`manifest.json`: the rounds of a dataset folder, their hashes and those of the files beside them.
+"""The derived files of a dataset folder: manifest, split, statistics and dataset card.
 
-It is derived: the rounds and their states say the same, so that damage in it can be seen.
+`manifest.json` lists the rounds with their metadata and hashes, and the hashes of other files. All
+of it can be computed again from the rounds, so that damage in it is found.
 """
 
 import json
@@ -10,19 +11,19 @@ from pathlib import Path
 from typing import Any
 
 import trackfeatures as tf
-from datagen.recording.card import card
+from datagen.recording.card import render_card
 from datagen.recording.dataset import Dataset
-from datagen.recording.folder import PUBLISHED, file_sha256, read_states, write_synced
+from datagen.recording.folder import PUBLISHED_FILES, file_sha256, read_states, write_if_changed
 from datagen.recording.splits import Split, split_path, write_split
 from datagen.recording.statistics import describe
 
 MANIFEST = "manifest.json"
-# The dataset card is not among them: people write into it.
-HASHED = (*PUBLISHED, "plan.json", "stats.json")
+# Not the dataset card: people edit it.
+HASHED_FILES = (*PUBLISHED_FILES, "plan.json", "stats.json")
 
 
-def describe_folder(dataset: Dataset) -> dict[str, Any]:
-    """The content of the manifest; needs the states of the rounds and the published files."""
+def build_manifest(dataset: Dataset) -> dict[str, Any]:
+    """The content of the manifest; reads the states of the rounds and the published files."""
     states = read_states(dataset.path)
     rounds = []
     for info, index in zip(dataset.rounds, dataset.indexes, strict=True):
@@ -37,7 +38,7 @@ def describe_folder(dataset: Dataset) -> dict[str, Any]:
                 "sha256": state.sha256 if state else None,
             }
         )
-    paths = {name: dataset.path / name for name in HASHED}
+    paths = {name: dataset.path / name for name in HASHED_FILES}
     return {
         "definitions": tf.VERSION,
         "content_hash": dataset.content_hash,
@@ -47,34 +48,32 @@ def describe_folder(dataset: Dataset) -> dict[str, Any]:
     }
 
 
-def as_text(content: dict[str, Any]) -> str:
+def to_json(content: dict[str, Any]) -> str:
     return json.dumps(content, indent=1) + "\n"
 
 
 def manifest_problems(folder: Path) -> Iterator[str]:
-    """What in the manifest is not so; raises as `Dataset.open` does."""
+    """What is wrong with the manifest, one line each; raises as `Dataset.open` does."""
     path = folder / MANIFEST
-    mend = "the same `datagen collect` again writes it anew"
+    remedy = "run the same `datagen collect` again to write it anew"
     if not path.is_file():
-        yield f"there is no {path}; {mend}"
+        yield f"there is no {path}; {remedy}"
         return
-    expected = describe_folder(Dataset.open(folder))
+    expected = build_manifest(Dataset.open(folder))
     data = path.read_bytes()
-    if data == as_text(expected).encode():
+    if data == to_json(expected).encode():
         return
     try:
         found = json.loads(data)
-        files, wanted = found["files"], expected["files"]
-        changed = [name for name in {**wanted, **files} if files.get(name) != wanted.get(name)]
+        stated, actual = found["files"], expected["files"]
+        names = {**actual, **stated}
+        changed = [name for name in names if stated.get(name) != actual.get(name)]
     except (ValueError, KeyError, TypeError, AttributeError):
         changed = []
     if changed:
-        yield f"{', '.join(sorted(changed))} in {folder}: not what {MANIFEST} was written for"
+        yield f"{', '.join(sorted(changed))} in {folder}: other content than {MANIFEST} was made of"
     else:
-        yield f"{path} does not describe the rounds that are there; {mend}"
-
-
-# The derived parts of a dataset folder: manifest, split, statistics and the dataset card.
+        yield f"{path} does not describe the rounds in the folder; {remedy}"
 
 
 def rebuild(folder: Path, split: Split) -> dict[str, Any]:
@@ -82,7 +81,7 @@ def rebuild(folder: Path, split: Split) -> dict[str, Any]:
     write_split(split_path(folder), split)
     dataset = Dataset.open(folder)
     statistics = describe(dataset)
-    write_synced(folder / "stats.json", as_text(statistics))
-    write_synced(folder / "README.md", card(dataset, statistics))
-    write_synced(folder / MANIFEST, as_text(describe_folder(dataset)))
+    write_if_changed(folder / "stats.json", to_json(statistics))
+    write_if_changed(folder / "README.md", render_card(dataset, statistics))
+    write_if_changed(folder / MANIFEST, to_json(build_manifest(dataset)))
     return statistics

@@ -1,6 +1,7 @@
-"""What a round says about itself: metadata `driverview.round` before it, `driverview.result` after.
+"""Metadata records of a round file: header, result and, in a recovered file, the recovery.
 
-MCAP metadata maps strings to strings, so every value is written as JSON.
+MCAP metadata maps strings to strings, so every value is written as JSON. The field names are part
+of the file format.
 """
 
 import json
@@ -15,17 +16,17 @@ from trackfeatures.camera import CameraParameters
 ROUND_METADATA = "driverview.round"
 RESULT_METADATA = "driverview.result"
 RECOVERY_METADATA = "driverview.recovered"
-MOST_PIXELS = 65_500  # of a side: what JPEG holds
+MAX_IMAGE_SIDE_PX = 65_500  # limit of JPEG
 
 
-def the_light(lights: tuple[str, ...]) -> str:
-    """One light by its name, several as "changing"."""
+def summarize_lights(lights: tuple[str, ...]) -> str:
+    """The name of the only light, or "changing" for several."""
     return lights[0] if len(set(lights)) == 1 else "changing"
 
 
 @dataclass(frozen=True, slots=True)
 class RoundHeader:
-    """All that is known of a round before its first frame."""
+    """The parameters of a round, known before its first frame: `driverview.round`."""
 
     id: str
     seed: int
@@ -36,41 +37,45 @@ class RoundHeader:
     traffic: int
     trajectory: str
     lights: tuple[str, ...]
-    """Of each scene of the round: its stretches show them in turn, and again."""
+    """Light of each stretch of the round; repeated when there are more stretches."""
     speed_kmh: float
     stretch: int = 0
-    """Frames; 0: the round is one stretch."""
+    """Frames with the same scenery and light; 0: the whole round."""
     frequency_hz: int = 20
     codec: str = "jpeg"
     plan_hash: str = ""
     definitions: str = tf.VERSION
     program: str = ""
     camera: CameraParameters = field(default_factory=CameraParameters)
-    """What the images were taken with; varies from round to round where it was jittered..."""
+    """The camera of this round's images; with camera jitter it differs from round to round."""
     nominal_camera: CameraParameters | None = None
-    """...about this one, the dataset's; absent where it was not."""
+    """The camera of the dataset, which was jittered; None without camera jitter."""
 
     @property
     def dataset_camera(self) -> CameraParameters:
         return self.nominal_camera or self.camera
 
-    def require_sane(self) -> None:
-        """Raise ValueError where a value cannot be: damage reaches no computation."""
+    def validate(self) -> None:
+        """Raise ValueError for an impossible value, before anything is computed with it."""
         camera = self.camera
         if type(self.frequency_hz) is not int or self.frequency_hz < 1:
-            raise ValueError(f"its header tells of {self.frequency_hz!r} frames a second")
+            raise ValueError(
+                f"its header has {self.frequency_hz!r} frames a second, expected 1 or more"
+            )
         if type(self.stretch) is not int or self.stretch < 0 or not self.lights:
-            raise ValueError(f"its header tells of {self.lights!r} by {self.stretch!r} frames")
+            raise ValueError(
+                f"its header has stretches of {self.stretch!r} frames with lights {self.lights!r}"
+            )
         for size in (camera.width, camera.height):
-            if type(size) is not int or not 0 < size <= MOST_PIXELS:
-                raise ValueError(f"its header tells of an image of {camera.width}x{camera.height}")
+            if type(size) is not int or not 0 < size <= MAX_IMAGE_SIDE_PX:
+                raise ValueError(f"its header has an image size of {camera.width}x{camera.height}")
 
     def to_metadata(self) -> dict[str, str]:
         return {name: json.dumps(value) for name, value in asdict(self).items()}
 
     @staticmethod
     def from_metadata(metadata: Mapping[str, str]) -> "RoundHeader":
-        """Raises KeyError, TypeError or ValueError where the metadata is not of our kind."""
+        """Raises KeyError, TypeError or ValueError for metadata of another kind or version."""
         values: dict[str, Any] = {name: json.loads(text) for name, text in metadata.items()}
         for name in ("camera", "nominal_camera"):
             if values[name] is not None:
@@ -82,7 +87,8 @@ class RoundHeader:
 
 @dataclass(frozen=True, slots=True)
 class RoundResult:
-    """What became of a round: `content_hash` covers its images and labels, not its name."""
+    """Totals of a finished round: `driverview.result`. `content_hash` is the SHA-256 of its images
+    and labels."""
 
     frames: int
     content_hash: str
@@ -101,9 +107,9 @@ class RoundResult:
 
 @dataclass(frozen=True, slots=True)
 class Recovery:
-    """What `datagen recover` notes in a round: not what was recorded, but what was whole of it.
+    """Added by `datagen recover`: the round holds only the undamaged frames of `source`.
 
-    `lost` frames are missing; when the file did not say how many it had, `at_least` so many.
+    `lost` frames are missing. `at_least`: the original number was unknown, more may be missing.
     """
 
     source: str
@@ -125,7 +131,7 @@ class Recovery:
 
 @dataclass(frozen=True, slots=True)
 class RoundInfo:
-    """A recorded round as the reader shows it; `split` is train or test."""
+    """A recorded round of an opened dataset; `split` is its side, empty for none."""
 
     id: str
     seed: int
@@ -143,11 +149,11 @@ class RoundInfo:
 
     @property
     def light(self) -> str:
-        """The round's light in a word."""
-        return the_light(self.lights)
+        """The round's light in one word."""
+        return summarize_lights(self.lights)
 
-    def kinds(self, name: str) -> tuple[str, ...]:
-        """What the round has of `name`: one track, but perhaps several lights."""
+    def values_of(self, name: str) -> tuple[str, ...]:
+        """The values of attribute `name` in this round: one track, but several lights."""
         return self.lights if name == "light" else (str(getattr(self, name)),)
 
     @staticmethod

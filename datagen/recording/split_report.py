@@ -1,4 +1,4 @@
-"""Checking or making the split of a dataset, and what it has in common across its sides."""
+"""Making and checking the split of a dataset, with its near-duplicates across sides."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -9,24 +9,24 @@ import numpy as np
 from datagen.recording.dataset import Dataset, round_files
 from datagen.recording.errors import DatasetError
 from datagen.recording.mcap.index import open_round
-from datagen.recording.near_duplicates import Neighbours, Tolerances, find_neighbours
+from datagen.recording.near_duplicates import NearDuplicates, Tolerances, find_near_duplicates
 from datagen.recording.round_metadata import RoundInfo
 from datagen.recording.splits import (
     SIDES,
     RoundKey,
-    divide,
     read_split,
     require_disjoint,
     split_path,
+    split_rounds,
     write_split,
 )
 
 TRAIN = SIDES[0]
-TOLD = 3  # of the nearest pairs, to people
+PAIRS_SHOWN = 3
 
 
 @dataclass(frozen=True, slots=True)
-class SplitReportConfig:
+class SplitConfig:
     """How to make a split."""
 
     by: str = "round"
@@ -37,13 +37,13 @@ class SplitReportConfig:
 
 @dataclass(frozen=True, slots=True)
 class SplitReport:
-    """A sound split: its size, and by side the frames that nearly stand among those of train."""
+    """A valid split: rounds and frames by side, and near-duplicates of training frames by side."""
 
     path: Path
     made: bool
     rounds: dict[str, int]
     frames: dict[str, int]
-    near: dict[str, Neighbours]
+    near: dict[str, NearDuplicates]
 
     def as_json(self) -> dict[str, Any]:
         return {
@@ -55,25 +55,25 @@ class SplitReport:
         }
 
 
-def make_split(folder: Path, name: str, wanted: SplitReportConfig) -> Path:
-    """Write a new split; what is unseen in the dataset's own split stays so.
+def make_split(folder: Path, name: str, config: SplitConfig) -> Path:
+    """Write a new split; rounds that are unseen in the default split stay unseen.
 
-    DatasetError when there is one of that name, rounds are too few, or it would leak.
+    Raises DatasetError if the name exists, there are too few rounds, or the split would leak.
     """
     path = split_path(folder, name)
     if path.exists():
         raise DatasetError(f"{path} exists and stays as it is; choose another --name")
     indexes = [open_round(file) for file in round_files(folder)]
-    usable = [ix for ix in indexes if wanted.with_recovered or ix.recovery is None]
-    own = split_path(folder)
-    unseen = set(read_split(own).unseen) if own.exists() else set()
+    usable = [ix for ix in indexes if config.with_recovered or ix.recovery is None]
+    default = split_path(folder)
+    unseen = set(read_split(default).unseen) if default.exists() else set()
     infos = [
         RoundInfo.of(ix.path, ix.header, ix.result, "")
         for ix in usable
         if ix.header.id not in unseen
     ]
     split = replace(
-        divide(infos, wanted.by, wanted.test_share, wanted.seed),
+        split_rounds(infos, config.by, config.test_share, config.seed),
         unseen=tuple(ix.header.id for ix in usable if ix.header.id in unseen),
         recovered=tuple(ix.header.id for ix in usable if ix.recovery is not None),
     )
@@ -86,7 +86,7 @@ def make_split(folder: Path, name: str, wanted: SplitReportConfig) -> Path:
 
 
 def check_split(folder: Path, name: str, tolerances: Tolerances, *, made: bool) -> SplitReport:
-    """The report of a split; DatasetError when a round, seed or content is on both sides."""
+    """The report of a split; DatasetError if a round, seed or content hash is on two sides."""
     dataset = Dataset.open(folder, name)
     frames = dataset.select("all")
     sides = np.array([info.split for info in frames.rounds])
@@ -98,7 +98,7 @@ def check_split(folder: Path, name: str, tolerances: Tolerances, *, made: bool) 
         rounds={side: int((sides == side).sum()) for side in here},
         frames={side: int((of_frame == side).sum()) for side in here},
         near={
-            side: find_neighbours(
+            side: find_near_duplicates(
                 frames.labels, frames.rounds, of_frame == side, of_frame == TRAIN, tolerances
             )
             for side in here
@@ -107,9 +107,11 @@ def check_split(folder: Path, name: str, tolerances: Tolerances, *, made: bool) 
     )
 
 
-def as_text(report: SplitReport) -> str:
-    """The report for people: a line a side, the nearest pairs below it."""
-    lines = [f"{report.path}{' (made)' if report.made else ''}: nothing stands on two sides"]
+def format_report(report: SplitReport) -> str:
+    """The report as text: a line per side, its nearest pairs below it."""
+    lines = [
+        f"{report.path}{' (made)' if report.made else ''}: no round, seed or content on two sides"
+    ]
     for side, rounds in report.rounds.items():
         line = f"  {side:<6} {rounds} rounds, {report.frames[side]} frames"
         found = report.near.get(side)
@@ -117,10 +119,10 @@ def as_text(report: SplitReport) -> str:
             lines.append(line)
             continue
         share = found.near / max(found.frames, 1)
-        lines.append(f"{line}; {found.near} ({share:.1%}) nearly as one in {TRAIN}")
+        lines.append(f"{line}; {found.near} ({share:.1%}) near-duplicates of {TRAIN}")
         lines += [
             f"    {p.round} frame {p.frame} and {p.other_round} frame {p.other_frame}: "
             f"{p.track}, {p.s_m:.1f} m, {p.distance:.2f} of the tolerances apart"
-            for p in found.worst[:TOLD]
+            for p in found.worst[:PAIRS_SHOWN]
         ]
     return "\n".join(lines)

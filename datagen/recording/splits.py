@@ -1,6 +1,7 @@
-"""Which rounds train a model and which judge it: by round, never by frame.
+"""Splits: which rounds train a model, which test it, and which are of unseen tracks.
 
-`splits/NAME.json` holds the ids of both sides; nothing of one side may stand on the other.
+A split is by round, never by frame. `splits/NAME.json` holds the ids of each side. No round, seed
+or content hash may be on two sides (a leak).
 """
 
 import json
@@ -15,19 +16,19 @@ import numpy as np
 
 import trackfeatures as tf
 from datagen.recording.errors import DatasetError
-from datagen.recording.folder import write_synced
+from datagen.recording.folder import write_if_changed
 from datagen.recording.mcap.index import RoundIndex
 from datagen.recording.round_metadata import RoundInfo
 
 UNSEEN = "unseen"
 SIDES = ("train", "test", UNSEEN)
-"""`unseen`: rounds of a track that no model is trained on."""
+"""`unseen`: rounds of tracks that no model is trained on."""
 DEFAULT_SPLIT = "default"
 
 
 @dataclass(frozen=True, slots=True)
 class RoundKey:
-    """What makes two rounds the same one."""
+    """What identifies a round: two rounds that share a value must not be on different sides."""
 
     id: str
     seed: int
@@ -36,14 +37,16 @@ class RoundKey:
 
 @dataclass(frozen=True, slots=True)
 class Split:
+    """Round ids of each side."""
+
     train: tuple[str, ...]
     test: tuple[str, ...]
     unseen: tuple[str, ...] = ()
     recovered: tuple[str, ...] = ()
-    """Rounds on any side that are known to be saved from damaged files."""
+    """Rounds on any side that were recovered from damaged files, and are used knowingly."""
 
     def side(self, round_id: str) -> str:
-        """Rounds in neither list belong to no side."""
+        """The side of a round; empty if it is on none."""
         return next((side for side in SIDES if round_id in getattr(self, side)), "")
 
 
@@ -52,6 +55,7 @@ def split_path(folder: Path, name: str = DEFAULT_SPLIT) -> Path:
 
 
 def read_split(path: Path) -> Split:
+    """Raises DatasetError for a missing or damaged file, DefinitionsMismatch for an old one."""
     try:
         found = json.loads(path.read_text())
         tf.require_version(str(found["definitions"]), str(path))
@@ -73,11 +77,11 @@ def write_split(path: Path, split: Split) -> None:
     content = {"definitions": tf.VERSION} | {side: list(getattr(split, side)) for side in SIDES}
     if split.recovered:
         content["recovered"] = list(split.recovered)
-    write_synced(path, json.dumps(content, indent=1) + "\n")
+    write_if_changed(path, json.dumps(content, indent=1) + "\n")
 
 
 def require_disjoint(split: Split, rounds: Iterable[RoundKey]) -> None:
-    """Raise DatasetError when a round, a seed or a content stands on both sides."""
+    """Raise DatasetError if a round, a seed or a content hash is on two sides."""
     keys = list(rounds)
     for one, other in combinations(SIDES, 2):
         both = set(getattr(split, one)) & set(getattr(split, other))
@@ -91,50 +95,47 @@ def require_disjoint(split: Split, rounds: Iterable[RoundKey]) -> None:
             raise _leak("content", min(contents)[:12], one, other)
 
 
-def require_known_recovered(split: Split, rounds: Iterable[RoundIndex]) -> None:
-    """Raise DatasetError when a recovered round stands on a side and the split does not say so."""
+def require_recovered_declared(split: Split, rounds: Iterable[RoundIndex]) -> None:
+    """Raise DatasetError if a recovered round is on a side but not in `split.recovered`."""
     for index in rounds:
         round_id = index.header.id
         if index.recovery and split.side(round_id) and round_id not in split.recovered:
             raise DatasetError(
                 f"round {round_id} was recovered from a damaged file ({index.recovery}) and the "
-                "split does not say that it takes such rounds; record it again, or make a split "
+                "split does not list it as recovered; record it again, or make a split "
                 "with `datagen split --with-recovered`"
             )
 
 
 def _leak(what: str, which: str, one: str, other: str) -> DatasetError:
     return DatasetError(
-        f"the split has {what} {which} on both sides, {one} and {other}: a model would be judged "
-        "on what it has seen; change the split file so that each stands on one side only"
+        f"the split has {what} {which} on both sides, {one} and {other}: a model would be tested "
+        "on data it was trained on; change the split file so that it is on one side only"
     )
 
 
-# Making a split: which rounds train and which judge, by round or by track. Rounds that share a
-# seed or a content go to the same side together.
+SPLIT_BY = ("round", "track")
 
 
-KINDS = ("round", "track")
+def split_rounds(rounds: Sequence[RoundInfo], by: str, test_share: float, seed: int) -> Split:
+    """A random split of `rounds` with about `test_share` of them on the test side.
 
-
-def divide(rounds: Sequence[RoundInfo], by: str, test_share: float, seed: int) -> Split:
-    """A split of `rounds` with about `test_share` of them to test.
-
-    By round, every track stands on both sides as far as it has rounds enough; by track, whole
-    tracks are held back. DatasetError when a side would be empty.
+    By "round", every track with enough rounds is on both sides; by "track", a track is on one side
+    only. Rounds that share a seed or a content hash stay together. Raises DatasetError for other
+    arguments, or if a side would be empty.
     """
-    if by not in KINDS:
-        raise DatasetError(f"rounds cannot be divided by {by!r}; choose {' or '.join(KINDS)}")
+    if by not in SPLIT_BY:
+        raise DatasetError(f"rounds cannot be divided by {by!r}; choose {' or '.join(SPLIT_BY)}")
     if not 0.0 < test_share < 1.0:
-        raise DatasetError(f"a test share of {test_share:g} is none; give one between 0 and 1")
+        raise DatasetError(f"--test-share is {test_share:g}; give a number between 0 and 1")
     rng = np.random.default_rng(seed)
-    groups = _bound(rounds, by)
+    groups = _inseparable_groups(rounds, by)
     if by == "track":
         order = [groups[i] for i in rng.permutation(len(groups))]
     else:
-        order = _by_track(groups, rng)
-    # The n-th group is for testing where the share of the groups so far passes a whole number; the
-    # first half a step later, so that neither end of the order is favoured.
+        order = _order_by_track(groups, rng)
+    # Group n is a test group where n * test_share, rounded to the nearest whole number, increases.
+    # Rounding to the nearest treats both ends of the order alike.
     marks = [floor((n * test_share) + 0.5) for n in range(len(order) + 1)]
     chosen = [group for n, group in enumerate(order) if marks[n + 1] > marks[n]]
     if not chosen and len(order) > 1:
@@ -149,27 +150,29 @@ def divide(rounds: Sequence[RoundInfo], by: str, test_share: float, seed: int) -
     return Split(tuple(i for i in ids if i not in test), tuple(i for i in ids if i in test))
 
 
-def _by_track(groups: list[list[RoundInfo]], rng: np.random.Generator) -> list[list[RoundInfo]]:
-    """Track after track, in each in random order: an even walk through it takes of every track."""
+def _order_by_track(
+    groups: list[list[RoundInfo]], rng: np.random.Generator
+) -> list[list[RoundInfo]]:
+    """Groups sorted by track, shuffled within a track: evenly spaced picks cover all tracks."""
     tracks: dict[str, list[list[RoundInfo]]] = defaultdict(list)
     for i in rng.permutation(len(groups)):
         tracks[groups[i][0].track].append(groups[i])
     return [group for track in sorted(tracks) for group in tracks[track]]
 
 
-def _bound(rounds: Sequence[RoundInfo], by: str) -> list[list[RoundInfo]]:
-    """Rounds that must stay together, each group once, in order of their first rounds."""
+def _inseparable_groups(rounds: Sequence[RoundInfo], by: str) -> list[list[RoundInfo]]:
+    """Groups of rounds that must be on the same side, sorted by the id of their first round."""
     groups: list[list[RoundInfo]] = []
     keys: list[set[object]] = []
     for info in rounds:
-        mine: set[object] = {("seed", info.seed), ("content", info.content_hash)}
+        own: set[object] = {("seed", info.seed), ("content", info.content_hash)}
         if by == "track":
-            mine.add(("track", info.track))
+            own.add(("track", info.track))
         members = [info]
         for i in reversed(range(len(groups))):
-            if keys[i] & mine:
+            if keys[i] & own:
                 members = groups.pop(i) + members
-                mine |= keys.pop(i)
+                own |= keys.pop(i)
         groups.append(members)
-        keys.append(mine)
+        keys.append(own)
     return sorted(groups, key=lambda group: group[0].id)

@@ -1,4 +1,4 @@
-"""What is in a dataset, counted: the figures a model's errors are to be judged against."""
+"""Frame counts and label statistics of a dataset: the baseline for the errors of a model."""
 
 from collections import Counter
 from collections.abc import Iterable
@@ -14,7 +14,7 @@ from datagen.recording.splits import SIDES
 
 
 def describe(dataset: Dataset) -> dict[str, Any]:
-    """Counts and label statistics of all frames and of either side of the split."""
+    """Frame counts by track, lanes, light and so on, and label statistics of each side."""
     frames = dataset.select("all")
     labels, rounds = frames.labels, frames.rounds
     side = np.array([info.split for info in rounds])[labels.round]
@@ -36,7 +36,10 @@ def describe(dataset: Dataset) -> dict[str, Any]:
 
 
 def describe_labels(labels: Labels) -> dict[str, Any]:
-    """`mean_deviation` is the mean error of always answering the mean: what is no learning."""
+    """Statistics of `labels`; distances in m, angles in rad, speeds in km/h.
+
+    `mean_deviation` is the mean absolute error of a constant prediction, the mean.
+    """
     if not len(labels):
         return {"frames": 0}
     columns = dict(zip(tf.MARKINGS, labels.distances.T, strict=True))

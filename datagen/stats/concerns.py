@@ -45,7 +45,7 @@ def _one_sided(rounds: list[RoundInfo]) -> Iterator[str]:
     if not all(sides.values()):
         return
     for kind in KINDS:
-        train, test = ({k for i in sides[side] for k in i.kinds(kind)} for side in NEEDED)
+        train, test = ({k for i in sides[side] for k in i.values_of(kind)} for side in NEEDED)
         for only, other, side in ((train - test, "test", "train"), (test - train, "train", "test")):
             if only:
                 names = ", ".join(sorted(only))

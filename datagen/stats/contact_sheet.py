@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from datagen.recording.dataset import Dataset
 from datagen.recording.images import decode_into
-from datagen.recording.labels import lights_of
+from datagen.recording.labels import light_per_frame
 from datagen.recording.mcap.index import RoundIndex
 from datagen.recording.mcap.protobuf_wire import bytes_field
 from datagen.recording.round_metadata import RoundInfo
@@ -76,7 +76,7 @@ def _card(info: RoundInfo, index: RoundIndex, frame: int, size: tuple[int, int])
         points = np.array([(p.x, p.y) for p in line.points]) * SCALE
         cv2.polylines(big, [np.round(points).astype(np.int32)], False, _GREEN, 1, cv2.LINE_AA)
     lanes = f"{info.lanes} lane{'s' if info.lanes > 1 else ''}"
-    light = lights_of(index)[frame]
+    light = light_per_frame(index)[frame]
     about = f"{info.id} #{frame} ({info.split or 'no side'}): {info.track}, {lanes}, {light}"
     return Card(np.asarray(big, np.uint8), about, notes.texts[0].text if notes.texts else "")
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 import trackfeatures as tf
 from datagen.recording.errors import DatasetError
-from datagen.recording.round_metadata import RoundHeader, the_light
+from datagen.recording.round_metadata import RoundHeader, summarize_lights
 from datagen.recording.schema.messages import EGO, WORLD
 from datagen.recording.schema.topics import (
     ANNOTATIONS,
@@ -85,7 +85,7 @@ class Contents:
         lanes = f"{h.lanes} lane{'' if h.lanes == 1 else 's'}"
         cars = f"{h.traffic} other car{'' if h.traffic == 1 else 's'}"
         return (
-            f"{h.id}: {h.track}, {lanes}, {cars}, {the_light(h.lights)}, {h.trajectory}, "
+            f"{h.id}: {h.track}, {lanes}, {cars}, {summarize_lights(h.lights)}, {h.trajectory}, "
             f"{h.speed_kmh:g} km/h; {frames} frames, {frames / h.frequency_hz:g} s"
         )
 

@@ -10,8 +10,8 @@ import numpy as np
 
 from datagen.recording.dataset import IMAGE_DATA
 from datagen.recording.errors import DatasetError
-from datagen.recording.labels import lights_of
-from datagen.recording.mcap.index import DAMAGE, RoundIndex, open_round
+from datagen.recording.labels import light_per_frame
+from datagen.recording.mcap.index import DAMAGE_ERRORS, RoundIndex, open_round
 from datagen.recording.mcap.protobuf_wire import bytes_field
 from datagen.recording.schema.proto.driverview_pb2 import Command, TrackFeatures, VehicleState
 from datagen.recording.schema.topics import (
@@ -81,19 +81,19 @@ class Steps:
         """Message `number` of a topic the round was opened for, parsed; DatasetError if damaged."""
         try:
             return MESSAGE_TYPES[topic].FromString(bytes(self.payload(topic, number)))
-        except DAMAGE as error:
+        except DAMAGE_ERRORS as error:
             raise self._damaged(topic, number, error) from error
 
     def payload(self, topic: str, number: int) -> memoryview:
         try:
             return self.index.messages[topic].payload(number)
-        except DAMAGE as error:
+        except DAMAGE_ERRORS as error:
             raise self._damaged(topic, number, error) from error
 
     @cached_property
     def lights(self) -> list[str]:
         """The light at each step."""
-        lights: list[str] = lights_of(self.index).tolist()
+        lights: list[str] = light_per_frame(self.index).tolist()
         return lights
 
     @cached_property

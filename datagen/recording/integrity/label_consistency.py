@@ -1,7 +1,7 @@
-"""Whether recorded labels follow from the offset that was recorded beside them.
+"""Checks that recorded labels follow from the lateral offset recorded with them.
 
-Labels are read as float32. At the border of a measuring system, or of a lane, that little decides
-which of them applies: a label is right when it is right for a place within TOLERANCE_M.
+Labels are read as float32. At the border of a measuring system or of a lane, rounding decides which
+one applies, so a label is right if it is right for some offset within TOLERANCE_M.
 """
 
 from collections.abc import Iterator
@@ -16,16 +16,16 @@ TOLERANCE_M = 1e-4
 SHIFTS_M = (0.0, -TOLERANCE_M, TOLERANCE_M)
 
 
-def disagreements(labels: Labels, lanes: int, lane_width_m: float) -> Iterator[str]:
-    """What contradicts the definitions in the labels of one round, one line a kind."""
+def label_problems(labels: Labels, lanes: int, lane_width_m: float) -> Iterator[str]:
+    """Contradictions to the definitions in the labels of one round, one line per kind."""
     try:
         tf.check_lanes(lanes, lane_width_m)
     except (tf.UserError, TypeError) as error:
-        yield f"its header tells of an impossible road: {error}"
+        yield f"its header has an impossible road: {error}"
         return
     count = len(labels)
-    if other := int((labels.lanes != lanes).sum()):
-        yield f"{other} of {count} labels do not have the {lanes} lanes of the round"
+    if wrong := int((labels.lanes != lanes).sum()):
+        yield f"{wrong} of {count} labels do not have the {lanes} lanes of the round"
     if wrong := sum(not _distances_follow(labels, i, lanes, lane_width_m) for i in range(count)):
         yield f"{wrong} of {count} labels do not follow from the offset recorded beside them"
     if wrong := sum(not _lane_follows(labels, i, lanes, lane_width_m) for i in range(count)):
@@ -35,21 +35,21 @@ def disagreements(labels: Labels, lanes: int, lane_width_m: float) -> Iterator[s
 
 
 def _distances_follow(labels: Labels, i: int, lanes: int, lane_width_m: float) -> bool:
-    place, found = float(labels.to_middle[i]), labels.distances[i]
-    if not np.isfinite(place):
+    offset, found = float(labels.to_middle[i]), labels.distances[i]
+    if not np.isfinite(offset):
         return False
     for shift in SHIFTS_M:
-        values = tf.measure(place + shift, 0.0, 0.0, 0.0, lanes, lane_width_m).distances.values()
+        values = tf.measure(offset + shift, 0.0, 0.0, 0.0, lanes, lane_width_m).distances.values()
         expected = np.array([np.nan if d is None else d for d in values])
-        if _same(expected, found, TOLERANCE_M + abs(shift)).all():
+        if _close(expected, found, TOLERANCE_M + abs(shift)).all():
             return True
     return False
 
 
 def _lane_follows(labels: Labels, i: int, lanes: int, lane_width_m: float) -> bool:
-    place = float(labels.to_middle[i])
-    return np.isfinite(place) and any(
-        tf.lane_index(place + shift, lanes, lane_width_m) == labels.lane_index[i]
+    offset = float(labels.to_middle[i])
+    return np.isfinite(offset) and any(
+        tf.lane_index(offset + shift, lanes, lane_width_m) == labels.lane_index[i]
         for shift in SHIFTS_M
     )
 
@@ -58,14 +58,14 @@ def _centre_follows(labels: Labels) -> NDArray[np.bool_]:
     follows = np.zeros(len(labels), dtype=np.bool_)
     for shift in SHIFTS_M:
         expected = tf.localise(labels.distances.astype(np.float64) + shift)
-        follows |= _same(expected, labels.to_lane_centre, TOLERANCE_M + abs(shift))
+        follows |= _close(expected, labels.to_lane_centre, TOLERANCE_M + abs(shift))
     return follows
 
 
-def _same(
+def _close(
     expected: NDArray[np.float64], found: NDArray[np.float32], tolerance: float
 ) -> NDArray[np.bool_]:
-    """Both absent, or both there and close."""
+    """Where both are NaN, or both are present and differ by at most `tolerance`."""
     absent = np.isnan(expected) & np.isnan(found)
     same: NDArray[np.bool_] = absent | (np.abs(expected - found) <= tolerance)
     return same

@@ -1,6 +1,6 @@
-"""Saving what is whole in a damaged round file: a new round, readable, indexed, and marked as such.
+"""Recovery of a damaged round file: its intact frames are written as a new round, marked as such.
 
-A frame is whole when all its messages are: the image, its label and what was recorded with them.
+A frame is intact if all its messages are: the image, its label and everything recorded with them.
 """
 
 import hashlib
@@ -16,13 +16,17 @@ from datagen.recording.errors import DatasetError
 from datagen.recording.folder import (
     RoundState,
     file_sha256,
-    move_synced,
     partial_path,
     publish,
     state_path,
 )
 from datagen.recording.integrity.round_checks import check_round
-from datagen.recording.mcap.fragments import Fragment, fragments, metadata, pieces
+from datagen.recording.mcap.fragments import (
+    FoundMessage,
+    chunk_messages,
+    find_chunks,
+    find_metadata,
+)
 from datagen.recording.mcap.protobuf_wire import bytes_field
 from datagen.recording.mcap.records import MAGIC
 from datagen.recording.mcap.writer import RoundFile
@@ -35,23 +39,24 @@ from datagen.recording.round_metadata import (
     RoundResult,
 )
 from datagen.recording.schema import messages, topics
+from runtime.files import atomic_move, unfinished_path
 
 ROUNDS = "rounds"
 
-Step = dict[str, Fragment]
+Step = dict[str, FoundMessage]
 
 
 @dataclass(frozen=True, slots=True)
-class Whole:
-    """The frames all of whose messages were found, by number, in order; the track where it was."""
+class IntactFrames:
+    """Intact frames by number, in order, and the track scene if it was found."""
 
     steps: dict[int, Step]
-    scene: Fragment | None
+    scene: FoundMessage | None
 
 
 @dataclass(frozen=True, slots=True)
 class Recovered:
-    """What was saved, and where it is."""
+    """The result of `datagen recover`; its fields are the keys of `--json`."""
 
     out: str
     saved: int
@@ -63,65 +68,67 @@ class Recovered:
 
 
 def recover(file: Path, out: Path | None = None) -> Recovered:
-    """Write what is whole in `file` to `out`, or to where `default_out` says; `file` stays.
+    """Write the intact frames of `file` to `out` (default: `default_out`); `file` is kept.
 
-    Written into the `rounds/` of a dataset it becomes a round of it, still marked as recovered.
-    Raises DatasetError when nothing can be saved or `out` cannot be, OSError as it comes.
+    In the `rounds/` of a dataset it becomes a round of that dataset, marked as recovered. Raises
+    DatasetError if nothing can be saved or `out` cannot be used, and OSError.
     """
     target = default_out(file) if out is None else out
     data = file.read_bytes()
     header = _header(file, data)
     in_dataset = target.parent.name == ROUNDS and (target.parent.parent / "state").is_dir()
     _require_free(target, header.id if in_dataset else "")
-    whole = find_whole(data, header.frequency_hz)
-    if not whole.steps:
-        raise DatasetError(f"{file} holds no whole frame: there is nothing to save")
-    recovery = _recovery(file, data, whole)
+    intact = find_intact_frames(data, header.frequency_hz)
+    if not intact.steps:
+        raise DatasetError(f"{file} holds no intact frame: there is nothing to save")
+    recovery = _recovery(file, data, intact)
     folder = target.parent.parent
     if in_dataset:
         partial = partial_path(folder, header.id)
     else:
         target.parent.mkdir(parents=True, exist_ok=True)
-        partial = target.with_name(f".{target.name}.new")
+        partial = unfinished_path(target)
     try:
-        state = _write(partial, header, whole, recovery)
+        state = _write(partial, header, intact, recovery)
         if in_dataset:
             publish(folder, partial, state)
         else:
-            move_synced(partial, target)
+            atomic_move(partial, target)
     finally:
         partial.unlink(missing_ok=True)
     return Recovered(str(target), recovery.saved, recovery.lost, recovery.at_least)
 
 
 def default_out(file: Path) -> Path:
-    """Beside the file; out of the way of a dataset's rounds."""
+    """Beside the file; for a round of a dataset in its folder `recovered/`."""
     if file.parent.name == ROUNDS:
         return file.parent.parent / "recovered" / file.name
     return file.with_name(f"{file.stem}.recovered.mcap")
 
 
-def find_whole(data: bytes, frequency_hz: int) -> Whole:
-    """Every frame that is whole, on either side of the damage."""
+def find_intact_frames(data: bytes, frequency_hz: int) -> IntactFrames:
+    """All intact frames, before and after the damage."""
     steps: dict[int, Step] = defaultdict(dict)
     scene = None
-    for piece in pieces(data):
-        for fragment in fragments(piece):
-            if fragment.topic == topics.TRACK_SCENE:
-                scene = scene or fragment
-            elif fragment.log_time == topics.log_time_ns(fragment.step, frequency_hz):
-                steps[fragment.step].setdefault(fragment.topic, fragment)
-    whole = {n: steps[n] for n in sorted(steps) if all(t in steps[n] for t in topics.EVERY_STEP)}
-    return Whole(whole, scene)
+    for chunk in find_chunks(data):
+        for message in chunk_messages(chunk):
+            if message.topic == topics.TRACK_SCENE:
+                scene = scene or message
+            elif message.log_time == topics.log_time_ns(message.step, frequency_hz):
+                steps[message.step].setdefault(message.topic, message)
+    intact = {n: steps[n] for n in sorted(steps) if all(t in steps[n] for t in topics.EVERY_STEP)}
+    return IntactFrames(intact, scene)
 
 
 def _header(file: Path, data: bytes) -> RoundHeader:
-    found = metadata(data, ROUND_METADATA) if data.startswith(MAGIC) else None
+    found = find_metadata(data, ROUND_METADATA) if data.startswith(MAGIC) else None
     try:
         if found is None:
-            raise ValueError("its first bytes, which say what round it is, are not those of one")
+            raise ValueError(
+                "its first bytes, with the header of the round, are damaged or of another format"
+            )
         header = RoundHeader.from_metadata(found)
-        header.require_sane()
+        header.validate()
     except (ValueError, KeyError, TypeError) as error:
         raise DatasetError(
             f"{file} cannot be recovered ({error}); record the round again"
@@ -135,42 +142,41 @@ def _require_free(target: Path, round_id: str) -> None:
         raise DatasetError(f"{target} exists; nothing was changed; choose another --out")
     if round_id and target.stem != round_id:
         raise DatasetError(
-            f"a round of a dataset bears the name of its id: expected {round_id}.mcap, "
-            f"--out is {target}"
+            f"the file name of a round must be its id: expected {round_id}.mcap, --out is {target}"
         )
 
 
-def _recovery(file: Path, data: bytes, whole: Whole) -> Recovery:
-    """How many frames there were is in the file's end, or in the state file beside it."""
-    saved = len(whole.steps)
-    recorded = _recorded(data)
+def _recovery(file: Path, data: bytes, intact: IntactFrames) -> Recovery:
+    """The original number of frames is in the result metadata, or in the state of the round."""
+    saved = len(intact.steps)
+    recorded = _recorded_frames(data)
     if not recorded and file.parent.name == ROUNDS:
         state = state_path(file.parent.parent, file.stem)
         recorded = RoundState.read(state).frames if state.is_file() else 0
     known = recorded >= saved
-    total = recorded if known else max(whole.steps) + 1
+    total = recorded if known else max(intact.steps) + 1
     return Recovery(file.name, saved, total - saved, at_least=not known)
 
 
-def _recorded(data: bytes) -> int:
-    found = metadata(data, RESULT_METADATA)
+def _recorded_frames(data: bytes) -> int:
+    found = find_metadata(data, RESULT_METADATA)
     try:
         return 0 if found is None else RoundResult.from_metadata(found).frames
     except (ValueError, TypeError):
         return 0
 
 
-def _write(path: Path, header: RoundHeader, whole: Whole, recovery: Recovery) -> RoundState:
-    """The round as `RoundWriter` would have written it, with the gaps that the damage left."""
+def _write(path: Path, header: RoundHeader, intact: IntactFrames, recovery: Recovery) -> RoundState:
+    """Write the round as `RoundWriter` would have, with gaps where frames are damaged."""
     content = hashlib.sha256()
     with RoundFile(path, header) as file:
-        for topic, log_time, number, payload in _messages(header, whole):
+        for topic, log_time, number, payload in _messages(header, intact):
             file.add(topic, log_time, number, payload)
             if topic == topics.CAMERA:
                 content.update(bytes_field(payload, IMAGE_DATA))
             elif topic == topics.LABELS:
                 content.update(payload)
-        result = RoundResult(len(whole.steps), content.hexdigest())
+        result = RoundResult(len(intact.steps), content.hexdigest())
         file.add_metadata(RECOVERY_METADATA, recovery.to_metadata())
         file.add_metadata(RESULT_METADATA, result.to_metadata())
         file.finish()
@@ -185,19 +191,21 @@ def _write(path: Path, header: RoundHeader, whole: Whole, recovery: Recovery) ->
     )
     _, problems = check_round(path, "full", state)
     if problems:
-        raise DatasetError(f"what was saved cannot be read back: {problems[0]}")
+        raise DatasetError(f"the recovered round cannot be read back: {problems[0]}")
     return state
 
 
-def _messages(header: RoundHeader, whole: Whole) -> Iterator[tuple[str, int, int, memoryview]]:
-    first = min(whole.steps)
+def _messages(
+    header: RoundHeader, intact: IntactFrames
+) -> Iterator[tuple[str, int, int, memoryview]]:
+    first = min(intact.steps)
     time = topics.log_time_ns(first, header.frequency_hz)
-    if whole.scene is not None:
-        yield topics.TRACK_SCENE, time, first, whole.scene.payload
-    if topics.CALIBRATION not in whole.steps[first]:
-        own = messages.calibration(header.camera, messages.timestamp(time))
-        yield topics.CALIBRATION, time, first, memoryview(own)
-    for number, step in whole.steps.items():
+    if intact.scene is not None:
+        yield topics.TRACK_SCENE, time, first, intact.scene.payload
+    if topics.CALIBRATION not in intact.steps[first]:
+        calibration = messages.calibration(header.camera, messages.timestamp(time))
+        yield topics.CALIBRATION, time, first, memoryview(calibration)
+    for number, step in intact.steps.items():
         for topic in (topics.CALIBRATION, *topics.EVERY_STEP):
             if topic in step:
                 yield topic, step[topic].log_time, number, step[topic].payload

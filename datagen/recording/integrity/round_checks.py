@@ -1,7 +1,7 @@
-"""What can be wrong with one recorded round, found level by level.
+"""Checks of one recorded round, in three levels.
 
-quick: its end, its index and its counts. full: every byte by CRC and hash, time, images paired with
-labels. deep: every image and message decoded, labels against the definitions.
+quick: footer, index and message counts. full: every byte by CRC and SHA-256, log times, images
+paired with labels. deep: every image and message decoded, labels compared with the definitions.
 """
 
 import hashlib
@@ -18,7 +18,7 @@ from datagen.recording.dataset import IMAGE_DATA
 from datagen.recording.errors import DatasetError
 from datagen.recording.folder import RoundState
 from datagen.recording.images import decode_into
-from datagen.recording.integrity.label_consistency import disagreements
+from datagen.recording.integrity.label_consistency import label_problems
 from datagen.recording.labels import read_labels
 from datagen.recording.mcap.index import RoundIndex, open_round
 from datagen.recording.mcap.protobuf_wire import bytes_field
@@ -26,11 +26,11 @@ from datagen.recording.mcap.scan import Scan, scan
 from datagen.recording.schema import topics
 
 LEVELS = ("quick", "full", "deep")
-TOLD = 5  # problems of one kind in one round; more of them say no more
+MAX_LISTED = 5  # problems of one kind in one round
 
 
 def check_round(path: Path, level: str, state: RoundState | None) -> tuple[int, list[str]]:
-    """Frames found, and the problems, one line each; never raises for a bad file."""
+    """Number of frames, and the problems, one line each; never raises for a bad file."""
     if level not in LEVELS:
         raise DatasetError(f"there is no level {level!r}; choose {', '.join(LEVELS)}")
     try:
@@ -38,12 +38,12 @@ def check_round(path: Path, level: str, state: RoundState | None) -> tuple[int, 
     except DatasetError as error:
         return 0, [str(error)]
     except OSError as error:
-        return 0, [unreadable(path, error)]
+        return 0, [describe_read_error(path, error)]
     problems: list[str] = []
     try:
         problems += _quick(index, state)
         if level != "quick":
-            problems += _full(index, state, _Listener(index, deep=level == "deep"))
+            problems += _full(index, state, _MessageChecker(index, deep=level == "deep"))
         if level == "deep":
             problems += _labels(index)
     except OSError as error:
@@ -51,7 +51,8 @@ def check_round(path: Path, level: str, state: RoundState | None) -> tuple[int, 
     return len(index.messages[topics.CAMERA]), [f"{path.name}: {p}" for p in problems]
 
 
-def unreadable(path: Path, error: OSError) -> str:
+def describe_read_error(path: Path, error: OSError) -> str:
+    """One line for a file that cannot be read."""
     return f"{path} cannot be read ({error.strerror})"
 
 
@@ -76,28 +77,28 @@ def _quick(index: RoundIndex, state: RoundState | None) -> Iterator[str]:
         "definitions": header.definitions,
     }
     for name, value in expected.items():
-        if (noted := getattr(state, name)) != value:
-            yield f"its {name} is {value}, its state file says {noted}"
+        if (stated := getattr(state, name)) != value:
+            yield f"its {name} is {value}, its state file says {stated}"
 
 
-def _full(index: RoundIndex, state: RoundState | None, listener: "_Listener") -> Iterator[str]:
-    found = scan(index.path, listener.hear)
+def _full(index: RoundIndex, state: RoundState | None, checker: "_MessageChecker") -> Iterator[str]:
+    found = scan(index.path, checker.on_message)
     if state is not None and found.sha256 != state.sha256:
         yield "its bytes are not those that were written (sha256 differs)"
     yield from found.problems
     if index.summary is not None and found.chunks != index.summary.chunks:
-        yield "its index is not that of its chunks"
+        yield "its index does not match its chunks"
     yield from _times(index, found)
-    yield from listener.problems()
-    if listener.content.hexdigest() != index.result.content_hash:
+    yield from checker.problems()
+    if checker.content.hexdigest() != index.result.content_hash:
         yield "its images and labels are not those that were recorded (content hash differs)"
 
 
 def _times(index: RoundIndex, found: Scan) -> Iterator[str]:
-    """Every topic of the control steps once a step, on the clock of the round."""
+    """Every per-step topic has one message per control step, at the log time of that step."""
     frames, hertz = index.result.frames, index.header.frequency_hz
     clock = [topics.log_time_ns(step, hertz) for step in range(frames)]
-    if index.recovery is not None:  # frames are missing: only the others' times can be right
+    if index.recovery is not None:  # with gaps: compare with the image times instead
         clock = found.times.get(topics.CAMERA, [])
     for topic in topics.EVERY_STEP:
         times = found.times.get(topic, [])
@@ -120,11 +121,11 @@ def _labels(index: RoundIndex) -> Iterator[str]:
     except DatasetError as error:
         yield str(error)
         return
-    yield from disagreements(labels, index.header.lanes, index.header.lane_width_m)
+    yield from label_problems(labels, index.header.lanes, index.header.lane_width_m)
 
 
-class _Listener:
-    """Hears every message of a round: hashes images and labels; `deep`: decodes all of them."""
+class _MessageChecker:
+    """Called for every message of a round: hashes images and labels; `deep`: decodes everything."""
 
     def __init__(self, index: RoundIndex, *, deep: bool) -> None:
         self.content = hashlib.sha256()
@@ -133,12 +134,12 @@ class _Listener:
         camera = index.header.camera
         self._image = np.empty((camera.height, camera.width, 3), np.uint8)
 
-    def hear(self, topic: str, log_time: int, payload: memoryview) -> None:
+    def on_message(self, topic: str, log_time: int, payload: memoryview) -> None:
         try:
             if topic == topics.LABELS:
                 self.content.update(payload)
             elif topic == topics.CAMERA:
-                self._hear_image(log_time, payload)
+                self._check_image(log_time, payload)
             if self._deep and topic in topics.MESSAGE_TYPES:
                 self._decode(topic, log_time, payload)
         except (ValueError, DecodeError) as error:
@@ -147,11 +148,11 @@ class _Listener:
 
     def problems(self) -> Iterator[str]:
         for found in self._wrong.values():
-            yield from found[:TOLD]
-            if len(found) > TOLD:
-                yield f"... and {len(found) - TOLD} more of this topic"
+            yield from found[:MAX_LISTED]
+            if len(found) > MAX_LISTED:
+                yield f"... and {len(found) - MAX_LISTED} more of this topic"
 
-    def _hear_image(self, log_time: int, payload: memoryview) -> None:
+    def _check_image(self, log_time: int, payload: memoryview) -> None:
         data = bytes_field(payload, IMAGE_DATA)
         self.content.update(data)
         if self._deep:
@@ -160,4 +161,4 @@ class _Listener:
     def _decode(self, topic: str, log_time: int, payload: memoryview) -> None:
         message: Any = topics.MESSAGE_TYPES[topic].FromString(bytes(payload))
         if topic == topics.CAMERA and message.timestamp.ToNanoseconds() != log_time:
-            raise ValueError("the image carries another time than its message")
+            raise ValueError("the image has another timestamp than its message")

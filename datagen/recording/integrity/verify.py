@@ -1,4 +1,7 @@
-"""Whether a dataset folder is what was recorded; a bad file is reported, never raised."""
+"""Verification of a dataset folder: every round, the splits and the manifest.
+
+A bad file is reported, never raised.
+"""
 
 import os
 from collections.abc import Callable, Iterator
@@ -10,7 +13,7 @@ import trackfeatures as tf
 from datagen.recording.dataset import dataset_hash, round_files
 from datagen.recording.errors import DatasetError
 from datagen.recording.folder import RoundState, round_path, state_path
-from datagen.recording.integrity.round_checks import LEVELS, check_round, unreadable
+from datagen.recording.integrity.round_checks import LEVELS, check_round, describe_read_error
 from datagen.recording.manifest import manifest_problems
 from datagen.recording.mcap.index import RoundIndex, open_round
 from datagen.recording.splits import (
@@ -18,15 +21,15 @@ from datagen.recording.splits import (
     RoundKey,
     read_split,
     require_disjoint,
-    require_known_recovered,
+    require_recovered_declared,
 )
 
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """The result of `datagen verify`.
+    """The result of `datagen verify`; its fields are the keys of `--json`.
 
-    `content_hash` is the dataset's (see `Dataset`), absent when a round cannot be read.
+    `content_hash` is that of the dataset, None if a round cannot be read.
     """
 
     ok: bool
@@ -35,16 +38,19 @@ class Report:
     problems: tuple[str, ...]
     content_hash: str | None = None
     recovered: tuple[str, ...] = ()
-    """Rounds that `datagen recover` saved, one line each: known, and no problem by themselves."""
+    """Rounds saved by `datagen recover`, one line each; not a problem by themselves."""
 
     def as_json(self) -> dict[str, object]:
         return asdict(self)
 
 
-def verify(folder: Path, level: str, seen: Callable[[str], None] = lambda name: None) -> Report:
-    """Check every round at `level` (quick, full or deep) and what belongs to them, on all cores.
+def verify(
+    folder: Path, level: str, on_round_done: Callable[[str], None] = lambda round_id: None
+) -> Report:
+    """Check every round at `level` (quick, full or deep), the splits and the manifest.
 
-    `seen` hears of each round that is done, on any thread. DatasetError for another level.
+    One thread per core. `on_round_done` is called with the id of each checked round, on any thread.
+    Raises DatasetError for another level.
     """
     if level not in LEVELS:
         raise DatasetError(f"there is no level {level!r}; choose {', '.join(LEVELS)}")
@@ -55,17 +61,22 @@ def verify(folder: Path, level: str, seen: Callable[[str], None] = lambda name: 
 
     def check(file: Path) -> tuple[int, list[str]]:
         done = _check(folder, file, level)
-        seen(file.stem)
+        on_round_done(file.stem)
         return done
 
-    # Threads: hashing, CRCs and decoding, nearly all of the time, leave Python to the others.
+    # Threads: hashing, CRCs and decoding release the GIL, and are nearly all of the time.
     with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
         checked = list(pool.map(check, files))
     problems = [problem for _, found in checked for problem in found]
-    rounds = list(_opened(files))
-    problems += [*_missing(folder), *_foreign(folder), *_doubles(rounds), *_splits(folder, rounds)]
+    rounds = list(_open_readable(files))
+    problems += [
+        *_missing_rounds(folder),
+        *_unexpected_files(folder),
+        *_duplicate_rounds(rounds),
+        *_split_problems(folder, rounds),
+    ]
     if level != "quick" and not problems:
-        problems += _derived(folder)
+        problems += _manifest_problems(folder)
     return Report(
         not problems,
         len(files),
@@ -84,46 +95,46 @@ def _check(folder: Path, file: Path, level: str) -> tuple[int, list[str]]:
     except DatasetError as error:
         problems.append(str(error))
     except OSError as error:
-        problems.append(unreadable(path, error))
+        problems.append(describe_read_error(path, error))
     if state is not None and state.file != f"rounds/{file.name}":
-        problems.append(f"{path} is of {state.file}")
+        problems.append(f"{path} belongs to {state.file}")
     frames, found = check_round(file, level, state)
     return frames, problems + found
 
 
-def _opened(files: list[Path]) -> Iterator[RoundIndex]:
+def _open_readable(files: list[Path]) -> Iterator[RoundIndex]:
     for file in files:
         try:
             yield open_round(file)
         except (DatasetError, OSError):
-            continue  # already told
+            continue  # reported by check_round
 
 
-def _derived(folder: Path) -> Iterator[str]:
+def _manifest_problems(folder: Path) -> Iterator[str]:
     try:
         yield from manifest_problems(folder)
     except tf.UserError as error:
         yield str(error)
     except OSError as error:
-        yield unreadable(Path(error.filename or folder), error)
+        yield describe_read_error(Path(error.filename or folder), error)
 
 
-def _missing(folder: Path) -> Iterator[str]:
-    """Rounds that were finished once and whose file is gone."""
+def _missing_rounds(folder: Path) -> Iterator[str]:
+    """Rounds with a state but without a file."""
     for path in sorted((folder / "state").glob("*.json")):
         if not round_path(folder, path.stem).is_file():
-            yield f"{path.stem}.mcap is missing: state/{path.name} says that it was recorded"
+            yield f"{path.stem}.mcap is missing: state/{path.name} lists it as recorded"
 
 
-def _foreign(folder: Path) -> Iterator[str]:
-    """What stands among the rounds and is none."""
+def _unexpected_files(folder: Path) -> Iterator[str]:
+    """Files in `rounds/` that are no rounds."""
     for path in sorted((folder / "rounds").iterdir()):
         if path.suffix != ".mcap":
             yield f"{path} is no round (expected *.mcap); move it elsewhere"
 
 
-def _doubles(rounds: list[RoundIndex]) -> Iterator[str]:
-    """Files under another's name, and rounds that are there twice."""
+def _duplicate_rounds(rounds: list[RoundIndex]) -> Iterator[str]:
+    """Files with the name of another round, and rounds with equal content."""
     contents: dict[str, str] = {}
     for index in rounds:
         name, header = index.path.name, index.header
@@ -137,7 +148,7 @@ def _doubles(rounds: list[RoundIndex]) -> Iterator[str]:
             yield f"{name} has the same images and labels as {first}; keep one of them"
 
 
-def _splits(folder: Path, rounds: list[RoundIndex]) -> Iterator[str]:
+def _split_problems(folder: Path, rounds: list[RoundIndex]) -> Iterator[str]:
     keys = [RoundKey(r.header.id, r.header.seed, r.result.content_hash) for r in rounds]
     paths = sorted((folder / "splits").glob("*.json"))
     if not paths:
@@ -146,15 +157,15 @@ def _splits(folder: Path, rounds: list[RoundIndex]) -> Iterator[str]:
         try:
             split = read_split(path)
             require_disjoint(split, keys)
-            require_known_recovered(split, rounds)
+            require_recovered_declared(split, rounds)
         except (DatasetError, tf.DefinitionsMismatch) as error:
             yield str(error)
         except OSError as error:
-            yield unreadable(path, error)
+            yield describe_read_error(path, error)
         else:
             named = [round_id for side in SIDES for round_id in getattr(split, side)]
             for round_id in sorted(set(named)):
                 if named.count(round_id) > 1:
                     yield f"{path} names round {round_id} twice"
                 if not round_path(folder, round_id).is_file():
-                    yield f"{path} names round {round_id}, which is not there"
+                    yield f"{path} names round {round_id}, which does not exist"

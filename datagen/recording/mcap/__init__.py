@@ -1,0 +1,1 @@
+"""Reading and writing MCAP files, below the level of frames and labels."""

@@ -1,7 +1,7 @@
-"""What the end of an MCAP file says about the rest: channels, chunks, metadata, counts.
+"""The footer and summary section of an MCAP file: channels, chunks, metadata, message counts.
 
-The official reader builds an object for each of thousands of entries; opening many rounds would
-take seconds. Both are held equal by a test.
+The official reader builds an object for each of thousands of entries, which takes seconds for many
+rounds; a test compares both. Source of the format: mcap.dev/spec.
 """
 
 import zlib
@@ -27,8 +27,8 @@ from datagen.recording.mcap.records import (
 
 
 @dataclass(frozen=True, slots=True)
-class ChunkPlace:
-    """Where a chunk starts in the file, and the message index of each of its channels."""
+class ChunkIndex:
+    """File offsets of a chunk and of its message indexes, by channel."""
 
     start: int
     compression: str
@@ -37,21 +37,21 @@ class ChunkPlace:
 
 @dataclass(frozen=True, slots=True)
 class Summary:
-    """`channels` by topic, `metadata` as (start, end) by name, `counts` of messages by channel."""
+    """`channels`: number by topic; `metadata`: (start, end) by name; `counts`: by channel."""
 
     channels: dict[str, int] = field(default_factory=dict)
-    chunks: list[ChunkPlace] = field(default_factory=list)
+    chunks: list[ChunkIndex] = field(default_factory=list)
     metadata: dict[str, tuple[int, int]] = field(default_factory=dict)
     counts: dict[int, int] = field(default_factory=dict)
 
 
 def read_summary(view: memoryview) -> Summary:
-    """Empty when the file has none; ValueError when it is no whole MCAP file or is damaged there.
+    """The summary of an MCAP file, checked against its CRC; empty if the file has none.
 
-    Its CRC is checked: what it says can be relied on.
+    Raises ValueError if the file is no complete MCAP file or its summary is damaged.
     """
     found = Summary()
-    start, end = _bounds(view)
+    start, end = _summary_bounds(view)
     if not start:
         return found
     for opcode, at, _ in records(view, start, end):
@@ -71,16 +71,16 @@ def read_summary(view: memoryview) -> Summary:
 
 
 def read_metadata(view: memoryview, place: tuple[int, int]) -> dict[str, str]:
-    """The metadata record at `place` of a summary; ValueError when it is not there."""
+    """The metadata record at `place` = (start, end); ValueError if there is none."""
     for opcode, at, _ in records(view, *place):
         if opcode == Opcode.METADATA:
             _, after = text(view, at)
             return text_map(view, after)
-    raise ValueError("there is no metadata where the index places it")
+    raise ValueError("there is no metadata record where the index points")
 
 
-def _bounds(view: memoryview) -> tuple[int, int]:
-    """Start and end of the summary records; start 0 when there are none."""
+def _summary_bounds(view: memoryview) -> tuple[int, int]:
+    """Start and end of the summary section; start 0 if there is none."""
     footer_at = len(view) - len(MAGIC) - FOOTER.size
     if footer_at < len(MAGIC) + DATA_END.size:
         raise ValueError(f"{len(view)} bytes are too few for an MCAP file")
@@ -90,7 +90,7 @@ def _bounds(view: memoryview) -> tuple[int, int]:
         raise ValueError("its end is missing (it does not end with the MCAP magic)")
     opcode, length, start, _, crc = FOOTER.unpack_from(view, footer_at)
     if (opcode, length) != (Opcode.FOOTER, FOOTER.size - 9):
-        raise ValueError("its footer is not where it belongs")
+        raise ValueError("its footer is missing or damaged")
     if start and not len(MAGIC) + DATA_END.size <= start <= footer_at:
         raise ValueError("its footer does not say where the index is")
     covered = footer_at + FOOTER.size - CRC_BYTES
@@ -99,10 +99,10 @@ def _bounds(view: memoryview) -> tuple[int, int]:
     return start, footer_at
 
 
-def _chunk(view: memoryview, at: int) -> ChunkPlace:
+def _chunk(view: memoryview, at: int) -> ChunkIndex:
     _, _, start, _, size = CHUNK_INDEX.unpack_from(view, at)
     at += CHUNK_INDEX.size
     indexes = dict(INDEX_OFFSET.iter_unpack(view[at : at + size]))
     at += size + LONG_LENGTH.size  # the indexes' total length
     (length,) = LENGTH.unpack_from(view, at)
-    return ChunkPlace(start, text(view, at)[0] if length else "", indexes)
+    return ChunkIndex(start, text(view, at)[0] if length else "", indexes)

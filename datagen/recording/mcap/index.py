@@ -1,8 +1,8 @@
-"""Where the messages of a round lie in its file, found without walking through it.
+"""Opening a round: random access to the messages of its MCAP file.
 
-An uncompressed, indexed MCAP file is memory-mapped and its message indexes are read as arrays when
-they are first asked for; any other goes through the official reader, message by message. Both give
-the same `RoundIndex`.
+An uncompressed, indexed file is memory-mapped, and a message index is read as an array on first
+use. Any other file is read with the official reader, message by message. Both give the same
+`RoundIndex`.
 """
 
 import errno
@@ -39,13 +39,13 @@ from datagen.recording.round_metadata import (
 )
 from datagen.recording.schema import topics
 
-# What the official reader and our own raise on bytes that are no MCAP file; the last one when a
-# damaged length asks for more than there is.
-DAMAGE = (
+# What the official reader and this one raise on bytes that are no MCAP file; MemoryError when a
+# damaged length asks for too much.
+DAMAGE_ERRORS = (
     McapError, ValueError, KeyError, TypeError, IndexError, OverflowError, struct.error,
     MemoryError,
 )  # fmt: skip
-READ_TOPICS = (topics.CAMERA, topics.LABELS, topics.EGO_STATE)
+LABEL_READER_TOPICS = (topics.CAMERA, topics.LABELS, topics.EGO_STATE)
 
 
 class Messages(Protocol):
@@ -55,15 +55,15 @@ class Messages(Protocol):
 
     @property
     def log_time(self) -> NDArray[np.int64]:
-        """(N,) ns since 1970, simulated time from `topics.EPOCH_NS`."""
+        """(N,) ns; simulated time plus `topics.EPOCH_NS`."""
 
     def payload(self, i: int) -> memoryview:
-        """The serialised message; ValueError when it is not where the index places it."""
+        """The serialised message `i`; ValueError if the index points at something else."""
 
 
 @dataclass(frozen=True)
 class MappedMessages:
-    """Messages in a memory-mapped file; only the places that are asked for are read."""
+    """Messages in a memory-mapped file; a message index is read on first use."""
 
     view: memoryview
     summary: Summary
@@ -80,7 +80,7 @@ class MappedMessages:
     def payload(self, i: int) -> memoryview:
         times, places = self._table
         start = int(places[i])
-        opcode, length, channel, _, log_time, _ = self._read(MESSAGE, start)
+        opcode, length, channel, _, log_time, _ = self._unpack(MESSAGE, start)
         if (opcode, channel, log_time) != (Opcode.MESSAGE, self.channel, times[i]):
             raise ValueError("a message index points at something else")
         end = start + RECORD.size + length
@@ -90,7 +90,7 @@ class MappedMessages:
 
     @cached_property
     def _table(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Log times and places in the file, read from the message index after each chunk."""
+        """Log times and file offsets, read from the message index after each chunk."""
         parts, starts, sizes = [], [], []
         for chunk in self.summary.chunks:
             at = chunk.indexes.get(self.channel)
@@ -102,28 +102,30 @@ class MappedMessages:
             return np.zeros(0, np.int64), np.zeros(0, np.int64)
         entries = np.concatenate(parts)
         if len(entries) != self.summary.counts.get(self.channel, len(entries)):
-            raise ValueError(f"{len(entries)} messages are indexed, more or fewer were counted")
+            raise ValueError(
+                f"{len(entries)} messages are indexed, but the summary counts another number"
+            )
         return entries[:, 0], entries[:, 1] + np.repeat(np.array(starts, np.int64), sizes)
 
     def _entries(self, at: int) -> NDArray[np.int64]:
-        opcode, _ = self._read(RECORD, at)
-        channel, size = self._read(MESSAGE_INDEX, at + RECORD.size)
+        opcode, _ = self._unpack(RECORD, at)
+        channel, size = self._unpack(MESSAGE_INDEX, at + RECORD.size)
         if (opcode, channel) != (Opcode.MESSAGE_INDEX, self.channel):
-            raise ValueError("there is no message index where the file's index places it")
+            raise ValueError("there is no message index where the summary points")
         start = at + RECORD.size + MESSAGE_INDEX.size
         entries: NDArray[np.int64] = np.frombuffer(self.view, "<i8", size // 8, start)
         return entries.reshape(-1, 2)
 
-    def _read(self, what: struct.Struct, at: int) -> tuple[int, ...]:
+    def _unpack(self, layout: struct.Struct, at: int) -> tuple[int, ...]:
         try:
-            return what.unpack_from(self.view, at)
+            return layout.unpack_from(self.view, at)
         except struct.error as error:
             raise ValueError("an index points outside the file") from error
 
 
 @dataclass(frozen=True)
 class LoadedMessages:
-    """Messages held in memory, for files that cannot be mapped."""
+    """Messages held in memory, of a file that is compressed or not indexed."""
 
     log_time: NDArray[np.int64]
     payloads: Sequence[bytes]
@@ -137,9 +139,9 @@ class LoadedMessages:
 
 @dataclass(frozen=True)
 class RoundIndex:
-    """An opened round: what it says about itself, and the messages that a reader of labels needs.
+    """An opened round: its metadata, and its messages by topic.
 
-    `messages` has the topics it was opened for: `READ_TOPICS`, unless others were asked for.
+    `messages` has the topics the round was opened for, by default `LABEL_READER_TOPICS`.
     """
 
     path: Path
@@ -147,64 +149,64 @@ class RoundIndex:
     result: RoundResult
     messages: dict[str, Messages]
     summary: Summary | None
-    """Absent when the official reader had to read the file."""
+    """None if the file was read with the official reader."""
     recovery: Recovery | None = None
-    """Present when the round was saved from a damaged file: frames of it are missing."""
+    """Set if the round was recovered from a damaged file: frames are missing."""
 
     @property
     def mapped(self) -> bool:
         return self.summary is not None
 
 
-def open_round(path: Path, wanted: Sequence[str] = READ_TOPICS) -> RoundIndex:
-    """Index topics of a recorded round; DatasetError when it is damaged or not one of ours."""
-    return _guarded(path, lambda: _map_round(path, wanted) or _load_round(path, wanted))
+def open_round(path: Path, wanted: Sequence[str] = LABEL_READER_TOPICS) -> RoundIndex:
+    """Index topics of a recorded round; DatasetError if it is damaged or of another format."""
+    return _with_clear_errors(path, lambda: _map_round(path, wanted) or _load_round(path, wanted))
 
 
-def load_round(path: Path, wanted: Sequence[str] = READ_TOPICS) -> RoundIndex:
-    """The same through the official reader: slow, for any kind of MCAP file, and the oracle."""
-    return _guarded(path, lambda: _load_round(path, wanted))
+def load_round(path: Path, wanted: Sequence[str] = LABEL_READER_TOPICS) -> RoundIndex:
+    """As `open_round`, with the official reader: slow, for any MCAP file; the oracle in tests."""
+    return _with_clear_errors(path, lambda: _load_round(path, wanted))
 
 
-class _ForeignError(ValueError):
-    """A whole MCAP file that is none of ours."""
+class _NotARoundError(ValueError):
+    """An undamaged MCAP file that is not a round of this program."""
 
 
-class _VersionError(ValueError):
-    """A round that another version of this program has written."""
+class _OtherVersionError(ValueError):
+    """A round written by another version of this program."""
 
 
-def _guarded(path: Path, read: Callable[[], RoundIndex]) -> RoundIndex:
+def _with_clear_errors(path: Path, read: Callable[[], RoundIndex]) -> RoundIndex:
     try:
         return read()
-    except _ForeignError as error:
+    except _NotARoundError as error:
         raise DatasetError(
             f"{path} is an MCAP file but no round of driverview ({error}); move it elsewhere"
         ) from error
-    except _VersionError as error:
+    except _OtherVersionError as error:
         raise DatasetError(
             f"{path} was written by another version of this program ({error}); record it again "
             "with this one, or use the program it came from"
         ) from error
-    except (*DAMAGE, OSError) as error:
-        # A damaged offset is an invalid argument to the system; other errors are not the file's.
+    except (*DAMAGE_ERRORS, OSError) as error:
+        # A damaged offset gives EINVAL; other OSErrors are not the fault of the file.
         if isinstance(error, OSError) and error.errno != errno.EINVAL:
             raise
         raise DatasetError(
             f"{path} is damaged or not a recorded round ({error or type(error).__name__}); delete "
-            "it and run the same `datagen collect` again, or save its whole frames with "
+            "it and run the same `datagen collect` again, or save its undamaged frames with "
             "`datagen recover`"
         ) from error
 
 
 def _map_round(path: Path, wanted: Sequence[str]) -> RoundIndex | None:
-    """None when the file is compressed or has no message index."""
+    """The round, memory-mapped; None if the file is compressed or has no message index."""
     view = map_file(path)
     summary = read_summary(view)
     if not summary.chunks or any(c.compression or not c.indexes for c in summary.chunks):
         return None
     metadata = {n: read_metadata(view, place) for n, place in summary.metadata.items()}
-    header, result, recovery = _describe(metadata)
+    header, result, recovery = _parse_metadata(metadata)
     found: dict[str, Messages] = {
         topic: MappedMessages(view, summary, _channel(summary, topic)) for topic in wanted
     }
@@ -217,12 +219,12 @@ def _channel(summary: Summary, topic: str) -> int:
     return summary.channels[topic]
 
 
-def _describe(
+def _parse_metadata(
     metadata: dict[str, dict[str, str]],
 ) -> tuple[RoundHeader, RoundResult, Recovery | None]:
     for name in (ROUND_METADATA, RESULT_METADATA):
         if name not in metadata:
-            raise _ForeignError(f"it has no metadata {name}")
+            raise _NotARoundError(f"it has no metadata {name}")
     noted = metadata.get(RECOVERY_METADATA)
     try:
         header = RoundHeader.from_metadata(metadata[ROUND_METADATA])
@@ -230,8 +232,8 @@ def _describe(
         recovery = None if noted is None else Recovery.from_metadata(noted)
     except (KeyError, TypeError) as error:
         program = metadata[ROUND_METADATA].get("program", "an unknown program")
-        raise _VersionError(f"{program}; {type(error).__name__}: {error}") from error
-    header.require_sane()
+        raise _OtherVersionError(f"{program}; {type(error).__name__}: {error}") from error
+    header.validate()
     return header, result, recovery
 
 
@@ -241,7 +243,7 @@ def _load_round(path: Path, wanted: Sequence[str]) -> RoundIndex:
     with path.open("rb") as stream:
         reader = make_reader(stream)
         metadata = {record.name: record.metadata for record in reader.iter_metadata()}
-        header, result, recovery = _describe(metadata)
+        header, result, recovery = _parse_metadata(metadata)
         for _, channel, message in reader.iter_messages(wanted, log_time_order=False):
             times[channel.topic].append(message.log_time)
             payloads[channel.topic].append(message.data)

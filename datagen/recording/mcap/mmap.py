@@ -1,7 +1,7 @@
-"""A file's bytes in memory with no file descriptor held open: any number of rounds stay open.
+"""Memory-mapping of files without an open file descriptor, so that any number can be mapped.
 
-Python's own `mmap` keeps a duplicate of the descriptor as long as the map lives; the system needs
-none. The map goes when the last view of it does. Source: mmap(2).
+Python's own `mmap` keeps a duplicate of the descriptor for the lifetime of the map; mmap(2) does
+not need it. A file is unmapped when the last view of it is garbage-collected.
 """
 
 import ctypes
@@ -11,24 +11,25 @@ import weakref
 from functools import lru_cache
 from pathlib import Path
 
-FAILED = ctypes.c_void_p(-1).value
+MAP_FAILED = ctypes.c_void_p(-1).value
 
 
 def map_file(path: Path) -> memoryview:
-    """All bytes of `path`, read-only, shared with every process that maps it; OSError, ValueError.
+    """All bytes of `path`, read-only and shared between processes.
 
-    The file must not be cut while the view lives: the system ends a process that reads beyond it.
+    Raises OSError, or ValueError for an empty file. The file must not be truncated while the view
+    exists: reading beyond its end kills the process (SIGBUS).
     """
     with path.open("rb", buffering=0) as stream:
         size = os.fstat(stream.fileno()).st_size
         if not size:
             raise ValueError("0 bytes are too few for an MCAP file")
         address = _libc().mmap(None, size, mmap.PROT_READ, mmap.MAP_SHARED, stream.fileno(), 0)
-        if address == FAILED:
+        if address == MAP_FAILED:
             number = ctypes.get_errno()
             raise OSError(number, os.strerror(number), str(path))
     array = (ctypes.c_ubyte * size).from_address(address)
-    # Not at the process's end: threads may still be reading, and the system unmaps all by itself.
+    # Not at exit: other threads may still read, and the system unmaps everything then.
     weakref.finalize(array, _libc().munmap, address, size).atexit = False
     return memoryview(array).cast("B").toreadonly()
 

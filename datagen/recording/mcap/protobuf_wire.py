@@ -1,4 +1,4 @@
-"""Protobuf's wire format, where its library is slow: finding one field, writing many points.
+"""Protobuf wire format, for two cases where its library is slow: one field, and many points.
 
 Source: protobuf.dev/programming-guides/encoding.
 """
@@ -10,26 +10,26 @@ from numpy.typing import ArrayLike
 POINT2 = np.dtype(
     [("tag", "u1"), ("length", "u1"), ("x_tag", "u1"), ("x", "<f8"), ("y_tag", "u1"), ("y", "<f8")]
 )
-DOUBLE_1, DOUBLE_2 = 1 << 3 | 1, 2 << 3 | 1
+DOUBLE_TAG_1, DOUBLE_TAG_2 = 1 << 3 | 1, 2 << 3 | 1
 
 
 def bytes_field(message: memoryview, wanted: int) -> memoryview:
-    """The length-delimited field numbered `wanted`; ValueError when it is not there."""
+    """The length-delimited field with number `wanted`; ValueError if it is not there."""
     at, end = 0, len(message)
     while at < end:
         tag, at = _varint(message, at)
-        kind = tag & 7
-        if kind == 2:
+        wire_type = tag & 7
+        if wire_type == 2:
             length, at = _varint(message, at)
             if at + length > end:
                 break
             if tag >> 3 == wanted:
                 return message[at : at + length]
             at += length
-        elif kind == 0:
+        elif wire_type == 0:
             _, at = _varint(message, at)
-        elif kind in (1, 5):
-            at += 8 if kind == 1 else 4
+        elif wire_type in (1, 5):
+            at += 8 if wire_type == 1 else 4
         else:
             break
     raise ValueError(f"the message is damaged: field {wanted} was not found")
@@ -44,14 +44,14 @@ def _varint(message: memoryview, at: int) -> tuple[int, int]:
         if byte < 0x80:
             return value, at
         shift += 7
-    raise ValueError("the message is damaged: a number has no end")
+    raise ValueError("the message is damaged: a varint has no end")
 
 
 def points_field(number: int, points: ArrayLike) -> bytes:
-    """A repeated field `number` (below 16) of foxglove.Point2, of `points` (N, 2)."""
-    places = np.asarray(points, dtype=np.float64).reshape(-1, 2)
-    fields = np.empty(len(places), POINT2)
+    """`points` (N, 2) as the repeated foxglove.Point2 field `number`, which is below 16."""
+    xy = np.asarray(points, dtype=np.float64).reshape(-1, 2)
+    fields = np.empty(len(xy), POINT2)
     fields["tag"], fields["length"] = number << 3 | 2, POINT2.itemsize - 2
-    fields["x_tag"], fields["y_tag"] = DOUBLE_1, DOUBLE_2
-    fields["x"], fields["y"] = places[:, 0], places[:, 1]
+    fields["x_tag"], fields["y_tag"] = DOUBLE_TAG_1, DOUBLE_TAG_2
+    fields["x"], fields["y"] = xy[:, 0], xy[:, 1]
     return fields.tobytes()

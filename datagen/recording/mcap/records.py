@@ -1,4 +1,4 @@
-"""The binary layout of the MCAP records that are read here without the official library.
+"""Binary layout of the MCAP records that are read without the official library.
 
 All numbers are little-endian. Source: mcap.dev/spec.
 """
@@ -7,13 +7,13 @@ import struct
 from collections.abc import Iterator
 
 MAGIC = b"\x89MCAP0\r\n"
-RECORD = struct.Struct("<BQ")  # opcode, length of what follows
-MESSAGE = struct.Struct("<BQHIQQ")  # and channel, sequence, log time, publish time
-MESSAGE_FIELDS = MESSAGE.size - RECORD.size  # counted in the record's length, before the payload
+RECORD = struct.Struct("<BQ")  # opcode, length of the content
+MESSAGE = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, log time, publish time
+MESSAGE_FIELDS = MESSAGE.size - RECORD.size  # bytes of the content before the payload
 CHUNK = struct.Struct("<QQQII")  # first and last time, size, CRC, length of the compression's name
 CHUNK_INDEX = struct.Struct("<QQQQI")  # first and last time, start, length, bytes of the offsets
-INDEX_OFFSET = struct.Struct("<HQ")  # channel, where its message index lies
-MESSAGE_INDEX = struct.Struct("<HI")  # channel, bytes of the entries (log time, place in the chunk)
+INDEX_OFFSET = struct.Struct("<HQ")  # channel, offset of its message index
+MESSAGE_INDEX = struct.Struct("<HI")  # channel, bytes of the entries (log time, offset)
 STATISTICS = struct.Struct("<QHIIIIQQI")  # counts, times, bytes of the counts by channel
 CHANNEL_COUNT = struct.Struct("<HQ")  # channel, messages
 DATA_END = struct.Struct("<BQI")  # opcode, length, CRC of all before it
@@ -21,14 +21,14 @@ FOOTER = struct.Struct("<BQQQI")  # opcode, length, summary start, offset start,
 LENGTH = struct.Struct("<I")
 LONG_LENGTH = struct.Struct("<Q")
 CRC_BYTES = 4
-# Of an uncompressed chunk record, up to its messages.
+# Bytes of an uncompressed chunk record before its messages.
 CHUNK_HEAD = RECORD.size + CHUNK.size + LONG_LENGTH.size
 
 
 def records(view: memoryview, at: int, end: int) -> Iterator[tuple[int, int, int]]:
-    """(opcode, start of its content, end of its content) of the records from `at` to `end`.
+    """(opcode, start, end of the content) of each record from `at` to `end`.
 
-    ValueError where a record does not fit: what follows is then unknown.
+    Raises ValueError for a record that does not fit.
     """
     while at < end:
         if at + RECORD.size > end:
@@ -37,12 +37,12 @@ def records(view: memoryview, at: int, end: int) -> Iterator[tuple[int, int, int
         start = at + RECORD.size
         at = start + length
         if at > end:
-            raise ValueError(f"a record at byte {start - RECORD.size} reaches beyond its end")
+            raise ValueError(f"a record at byte {start - RECORD.size} reaches beyond the end")
         yield opcode, start, at
 
 
 def text(view: memoryview, at: int) -> tuple[str, int]:
-    """A string at `at`, and where it ends."""
+    """The string at `at`, and the position after it."""
     (length,) = LENGTH.unpack_from(view, at)
     start = at + LENGTH.size
     if start + length > len(view):
@@ -51,7 +51,7 @@ def text(view: memoryview, at: int) -> tuple[str, int]:
 
 
 def text_map(view: memoryview, at: int) -> dict[str, str]:
-    """A map of strings at `at`."""
+    """The map of strings at `at`."""
     (length,) = LENGTH.unpack_from(view, at)
     at += LENGTH.size
     end = at + length

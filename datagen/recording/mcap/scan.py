@@ -1,7 +1,7 @@
-"""One reading of a whole file, front to back: hashes, CRCs, and every message at its place.
+"""Checking a whole MCAP file in one pass: SHA-256, CRCs, and the index of every message.
 
-A chunk at a time is in memory, and no byte is read twice. Source of the checksums: mcap.dev/spec
-(Chunk, DataEnd, Footer); zero stands for one that was not taken.
+One chunk at a time is in memory. Source of the checksums: mcap.dev/spec (Chunk, DataEnd, Footer);
+a CRC of zero means that it was not computed.
 """
 
 import hashlib
@@ -17,8 +17,8 @@ from mcap.opcode import Opcode
 from mcap.records import Chunk
 from mcap.stream_reader import get_chunk_data_stream
 
-from datagen.recording.mcap.footer import ChunkPlace
-from datagen.recording.mcap.index import DAMAGE
+from datagen.recording.mcap.footer import ChunkIndex
+from datagen.recording.mcap.index import DAMAGE_ERRORS
 from datagen.recording.mcap.records import (
     CHUNK,
     CHUNK_HEAD,
@@ -32,46 +32,48 @@ from datagen.recording.mcap.records import (
 from datagen.recording.mcap.records import text as read_text
 from datagen.recording.schema.topics import seconds
 
-# Hears of every message: topic, log time, payload.
-Look = Callable[[str, int, memoryview], None]
+# Called for every message with its topic, log time (ns) and payload.
+OnMessage = Callable[[str, int, memoryview], None]
 READ_BYTES = 1 << 20
 MESSAGE_HEAD = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 
 
 @dataclass
 class Scan:
-    """What one reading found. `times` are log times by topic, in file order."""
+    """Result of a scan: `times` are log times (ns) by topic, in file order."""
 
     sha256: str = ""
     size: int = 0
     times: dict[str, list[int]] = field(default_factory=dict)
-    chunks: list[ChunkPlace] = field(default_factory=list)
+    chunks: list[ChunkIndex] = field(default_factory=list)
     problems: list[str] = field(default_factory=list)
 
 
-def scan(path: Path, look: Look) -> Scan:
-    """Read `path` once; what is wrong with it is in `problems`. OSError when it cannot be read."""
+def scan(path: Path, on_message: OnMessage) -> Scan:
+    """Read `path` once; damage is listed in `problems`. Raises OSError if it cannot be read."""
     with path.open("rb") as stream:
-        return _Scanner(stream, path.stat().st_size, look).run()
+        return _Scanner(stream, path.stat().st_size, on_message).run()
 
 
 class _Scanner:
-    def __init__(self, stream: BufferedIOBase, size: int, look: Look) -> None:
+    def __init__(self, stream: BufferedIOBase, size: int, on_message: OnMessage) -> None:
         self._stream = stream
         self._size = size
-        self._look = look
+        self._on_message = on_message
         self._digest = hashlib.sha256()
         self._at = 0
-        self._crc = 0  # of the section that is being read
+        self._crc = 0  # of the current section
         self._topics: dict[int, str] = {}  # by channel
-        self._entries: dict[int, list[int]] = {}  # of the last chunk: log times and places
+        self._entries: dict[
+            int, list[int]
+        ] = {}  # of the last chunk, by channel: log times and offsets
         self._found = Scan(size=size)
 
     def run(self) -> Scan:
         found = self._found
         try:
             self._read_all()
-        except DAMAGE as error:
+        except DAMAGE_ERRORS as error:
             found.problems.append(f"cannot be read to its end: {error or type(error).__name__}")
         while block := self._stream.read(READ_BYTES):
             self._digest.update(block)
@@ -79,15 +81,15 @@ class _Scanner:
         return found
 
     def _read_all(self) -> None:
-        if self._take(len(MAGIC)) != MAGIC:
+        if self._read(len(MAGIC)) != MAGIC:
             raise ValueError("it does not start with the MCAP magic")
         opcode = 0
         summary_at = 0
         while opcode != Opcode.FOOTER:
             start, before = self._at, self._crc
-            opcode, body = self._record()
+            opcode, body = self._read_record()
             if opcode == Opcode.CHUNK:
-                self._end_of_indexes()
+                self._end_chunk()
                 self._chunk(start, memoryview(body))
             elif opcode == Opcode.MESSAGE_INDEX:
                 self._message_index(start, memoryview(body))
@@ -96,23 +98,23 @@ class _Scanner:
             elif opcode == Opcode.CHANNEL:
                 self._channel(memoryview(body), 0)
             elif opcode == Opcode.DATA_END:
-                self._end_of_indexes()
-                self._compare(before, body, "its data section is damaged (the section's CRC)")
+                self._end_chunk()
+                self._check_crc(before, body, "its data section is damaged (the section's CRC)")
                 self._crc, summary_at = 0, self._at
         if not summary_at:
             self._found.problems.append("its data section has no end")
         self._footer(before, body, summary_at)
-        if (rest := self._take(self._size - self._at)) != MAGIC:
+        if (rest := self._read(self._size - self._at)) != MAGIC:
             raise ValueError(f"{len(rest)} bytes follow where the MCAP magic ends a file")
 
-    def _record(self) -> tuple[int, bytes]:
-        head = self._take(RECORD.size)
+    def _read_record(self) -> tuple[int, bytes]:
+        head = self._read(RECORD.size)
         opcode, length = RECORD.unpack(head)
         if length > self._size - self._at:
             raise ValueError(f"a record at byte {self._at - RECORD.size} reaches beyond the end")
-        return opcode, self._take(length)
+        return opcode, self._read(length)
 
-    def _take(self, count: int) -> bytes:
+    def _read(self, count: int) -> bytes:
         data = self._stream.read(count)
         self._digest.update(data)
         self._crc = zlib.crc32(data, self._crc)
@@ -130,7 +132,7 @@ class _Scanner:
             data = decompressed(body)
         if crc and zlib.crc32(data) != crc:
             self._found.problems.append(f"damaged near {seconds(first):.2f} s (a chunk's CRC)")
-        self._found.chunks.append(ChunkPlace(start, compression, {}))
+        self._found.chunks.append(ChunkIndex(start, compression, {}))
         at, end = 0, len(data)
         while at < end:
             opcode, length = RECORD.unpack_from(data, at)
@@ -151,7 +153,7 @@ class _Scanner:
         self._entries.setdefault(channel, []).extend((time, at))
         topic = self._topics[channel]
         self._found.times.setdefault(topic, []).append(time)
-        self._look(topic, time, data[at + MESSAGE.size : after])
+        self._on_message(topic, time, data[at + MESSAGE.size : after])
 
     def _message_index(self, start: int, body: memoryview) -> None:
         channel, _ = MESSAGE_INDEX.unpack_from(body)
@@ -160,10 +162,10 @@ class _Scanner:
         entries = self._entries.pop(channel, [])
         head = MESSAGE_INDEX.pack(channel, 8 * len(entries))
         if body != head + struct.pack(f"<{len(entries)}Q", *entries):
-            self._found.problems.append(f"a message index at byte {start} is not of its chunk")
+            self._found.problems.append(f"a message index at byte {start} does not match its chunk")
 
-    def _end_of_indexes(self) -> None:
-        """Every channel of a chunk has an index after it, in a file that has any."""
+    def _end_chunk(self) -> None:
+        """If the file has message indexes, every channel of the last chunk must have had one."""
         chunks = self._found.chunks
         if self._entries and chunks and any(chunk.indexes for chunk in chunks):
             self._found.problems.append(f"no message index for channels {sorted(self._entries)}")
@@ -174,15 +176,17 @@ class _Scanner:
         if start not in (0, summary_at):
             self._found.problems.append("its footer does not say where the index is")
         head = FOOTER.pack(Opcode.FOOTER, len(body), start, offsets, 0)[:-CRC_BYTES]
-        self._compare(zlib.crc32(head, before), body[-CRC_BYTES:], "its index is damaged (its CRC)")
+        self._check_crc(
+            zlib.crc32(head, before), body[-CRC_BYTES:], "its index is damaged (its CRC)"
+        )
 
-    def _compare(self, crc: int, stored: bytes, problem: str) -> None:
+    def _check_crc(self, crc: int, stored: bytes, problem: str) -> None:
         expected = int.from_bytes(stored, "little")
         if len(stored) != CRC_BYTES or (expected and expected != crc):
             self._found.problems.append(problem)
 
 
 def decompressed(body: memoryview) -> memoryview:
-    """The messages of a compressed chunk; an error of the official library when it cannot."""
+    """The messages of a compressed chunk. Raises what the official library raises."""
     stream, length = get_chunk_data_stream(Chunk.read(ReadDataStream(BytesIO(body))))
     return memoryview(stream.read(length))

@@ -1,4 +1,4 @@
-"""Writing one round as an MCAP file; the same frames give the same bytes on any machine."""
+"""Writing one round as an MCAP file. The same frames give the same bytes on any machine."""
 
 import hashlib
 from collections.abc import Mapping
@@ -22,9 +22,9 @@ from datagen.recording.schema import messages, topics
 
 
 class RoundWriter:
-    """Frames in, one at a time; `finish` closes the file. A context manager: an error closes it.
+    """Writes frames one at a time; `finish` completes the file. A context manager, which closes it.
 
-    `scene` are named polylines of the track in the world, (N, 3) m each.
+    `scene`: named polylines of the track in the world frame, (N, 3) m each.
     """
 
     def __init__(
@@ -40,7 +40,7 @@ class RoundWriter:
         self._add(topics.TRACK_SCENE, start, track)
 
     def add(self, frame: Frame) -> None:
-        """Append one control step to every topic."""
+        """Append one control step to all topics."""
         header = self.header
         time = topics.log_time_ns(self.frames, header.frequency_hz)
         stamp = messages.timestamp(time)
@@ -67,7 +67,7 @@ class RoundWriter:
         distance_m: float = 0.0,
         mean_speed_kmh: float = 0.0,
     ) -> RoundResult:
-        """Write the result and the index, and close the file."""
+        """Write the result and the index, and close the file. `distance_m` in m, speed in km/h."""
         result = RoundResult(
             frames=self.frames,
             content_hash=self._content.hexdigest(),
@@ -95,16 +95,13 @@ class RoundWriter:
         self._file.add(topic, time, self.frames, data)
 
 
-# The MCAP file of a round as it is written: our topics, our chunks, fixed order, fixed bytes.
-
-
-# Bytes a pixel that the codecs need on our images, and what the other topics need a step.
+# Estimates for the chunk size: image bytes per pixel, and bytes per step of all other topics.
 BYTES_PER_PIXEL = {"jpeg": 0.5, "png": 1.8}
 OTHER_BYTES = 6_000
 
 
 class RoundFile:
-    """Serialised messages in, one at a time; `finish` closes the file. A context manager."""
+    """Writes serialised messages; `finish` completes the file. A context manager closes it."""
 
     def __init__(self, path: Path, header: RoundHeader) -> None:
         self._stream = path.open("wb")
@@ -124,6 +121,7 @@ class RoundFile:
         self._mcap.add_message(channel, log_time, bytes(data), publish_time=log_time, sequence=step)
 
     def add_metadata(self, name: str, values: dict[str, str]) -> None:
+        """Append a metadata record."""
         self._mcap.add_metadata(name, values)
 
     def finish(self) -> None:
@@ -158,7 +156,7 @@ class RoundFile:
 
 
 def _chunk_bytes(header: RoundHeader) -> int:
-    """About one second of messages."""
+    """Size of about one second of messages. It is part of the recorded bytes: never change it."""
     pixels = header.camera.width * header.camera.height
     step = pixels * BYTES_PER_PIXEL[header.codec] + OTHER_BYTES
     return int(step * header.frequency_hz)

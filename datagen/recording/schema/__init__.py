@@ -1,0 +1,1 @@
+"""Topics and messages of a recording, and the description of their fields."""

@@ -1,8 +1,8 @@
-"""The JSON schema of what is recorded on our own topics, for people and programs that read it.
+"""The JSON schema of the `driverview.*` messages, published in every dataset folder.
 
 It describes the messages as `google.protobuf.json_format.MessageToDict` gives them with
-`preserving_proto_field_name`. Source of the format: json-schema.org, draft 2020-12; the keys that
-start with `x-` are ours.
+`preserving_proto_field_name`. Source of the format: json-schema.org, draft 2020-12; keys that
+start with `x-` are extensions of this project.
 """
 
 import json
@@ -17,19 +17,24 @@ from datagen.recording.schema import topics
 from datagen.recording.schema.fields import FIELDS, Field
 from datagen.recording.schema.proto import driverview_pb2
 
-SCHEMA = "schemas/driverview.schema.json"
+SCHEMA_FILE = "schemas/driverview.schema.json"
 INTEGERS = (FieldDescriptor.CPPTYPE_INT32, FieldDescriptor.CPPTYPE_UINT32)
 
 
 @lru_cache(maxsize=1)
 def schema_text() -> str:
-    """The schema as it stands beside a dataset."""
+    """The text of the schema file."""
     return json.dumps(json_schema(), indent=1) + "\n"
 
 
 def json_schema() -> dict[str, Any]:
-    """One definition a message, one property a field, and which topic carries which message."""
-    ours = {t: m.DESCRIPTOR.name for t, m in topics.MESSAGE_TYPES.items() if _is_ours(m)}
+    """One definition per message, one property per field, and the message of each topic."""
+    package = driverview_pb2.DESCRIPTOR.package
+    own_types = {
+        topic: kind.DESCRIPTOR.name
+        for topic, kind in topics.MESSAGE_TYPES.items()
+        if kind.DESCRIPTOR.file.package == package
+    }
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         "title": "driverview recordings",
@@ -38,7 +43,7 @@ def json_schema() -> dict[str, Any]:
             "not exist there, it is not zero. x-unit is 1 where there is none."
         ),
         "x-definitions-version": tf.VERSION,
-        "x-topics": ours,
+        "x-topics": own_types,
         "x-clock": {
             "unit": "ns",
             "meaning": "log time: simulated time since the start of the round, plus the epoch",
@@ -46,10 +51,6 @@ def json_schema() -> dict[str, Any]:
         },
         "$defs": {name: _message(name) for name in FIELDS},
     }
-
-
-def _is_ours(message_type: Any) -> bool:
-    return bool(message_type.DESCRIPTOR.file.package == driverview_pb2.DESCRIPTOR.package)
 
 
 def _message(name: str) -> dict[str, Any]:

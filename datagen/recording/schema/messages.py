@@ -1,4 +1,7 @@
-"""Frames as protobuf messages, one function a topic; each returns the serialised message."""
+"""Frames as protobuf messages: one function per topic, which returns the serialised message.
+
+World frame: x, y in the plane, z up; SI units, angles in rad, counter-clockwise.
+"""
 
 from collections.abc import Mapping
 from math import cos, sin
@@ -29,12 +32,12 @@ from datagen.recording.schema.topics import NANOSECONDS
 from trackfeatures.camera import CameraParameters
 
 WORLD, EGO, CAMERA_FRAME = "world", "ego", "camera_front"
-EGO_SIZE = (4.52, 1.94, 1.10)
-TRAFFIC_SIZE = (4.4, 1.8, 1.4)
-EGO_HEIGHT = 0.30  # of the body's middle above its centre of gravity
+EGO_SIZE_M = (4.52, 1.94, 1.10)
+TRAFFIC_SIZE_M = (4.4, 1.8, 1.4)
+EGO_BOX_CENTRE_HEIGHT_M = 0.30  # above the centre of gravity
 GREEN = Color(r=0.1, g=1.0, b=0.3, a=1.0)
 WHITE = Color(r=1.0, g=1.0, b=1.0, a=1.0)
-SHADE = Color(r=0.0, g=0.0, b=0.0, a=0.5)
+TEXT_BACKGROUND = Color(r=0.0, g=0.0, b=0.0, a=0.5)
 BLUE = Color(r=0.2, g=0.4, b=1.0, a=1.0)
 GREY = Color(r=0.7, g=0.7, b=0.7, a=1.0)
 
@@ -46,13 +49,15 @@ def timestamp(log_time_ns: int) -> Timestamp:
 
 
 def compressed_image(data: bytes, codec: str, time: Timestamp) -> bytes:
-    return _bytes(CompressedImage(timestamp=time, frame_id=CAMERA_FRAME, data=data, format=codec))
+    return _serialize(
+        CompressedImage(timestamp=time, frame_id=CAMERA_FRAME, data=data, format=codec)
+    )
 
 
 def calibration(camera: CameraParameters, time: Timestamp) -> bytes:
     k = camera.intrinsics()
     projection = np.hstack([k, np.zeros((3, 1))])
-    return _bytes(
+    return _serialize(
         CameraCalibration(
             timestamp=time,
             frame_id=CAMERA_FRAME,
@@ -68,7 +73,7 @@ def calibration(camera: CameraParameters, time: Timestamp) -> bytes:
 
 
 def annotations(frame: Frame, time: Timestamp) -> bytes:
-    """The true markings and a line of figures over the image."""
+    """The lane markings as polylines (pixels) and one line of text with the labels."""
     message = ImageAnnotations(timestamp=time)
     for polyline in frame.markings:
         line = message.points.add()
@@ -83,11 +88,12 @@ def annotations(frame: Frame, time: Timestamp) -> bytes:
     text.font_size = 9.0
     text.text = caption(frame.features)
     text.text_color.CopyFrom(WHITE)
-    text.background_color.CopyFrom(SHADE)
-    return _bytes(message)
+    text.background_color.CopyFrom(TEXT_BACKGROUND)
+    return _serialize(message)
 
 
 def caption(features: tf.TrackFeatures) -> str:
+    """The labels in one line: active distances in m, angle in rad, heading."""
     distances = " ".join(
         f"{name} {value:.2f}" for name, value in features.distances.items() if value is not None
     )
@@ -96,7 +102,7 @@ def caption(features: tf.TrackFeatures) -> str:
 
 def labels(frame: Frame) -> bytes:
     features, place = frame.features, frame.place
-    return _bytes(
+    return _serialize(
         TrackFeatures(
             to_marking_ml=features.ml,
             to_marking_mr=features.mr,
@@ -116,7 +122,7 @@ def labels(frame: Frame) -> bytes:
 
 
 def ego_state(ego: EgoState) -> bytes:
-    return _bytes(
+    return _serialize(
         VehicleState(
             x=ego.x,
             y=ego.y,
@@ -133,7 +139,7 @@ def ego_state(ego: EgoState) -> bytes:
 
 
 def sensors(readings: SensorReadings) -> bytes:
-    return _bytes(
+    return _serialize(
         Sensors(
             range=readings.range,
             angle=readings.angle,
@@ -149,23 +155,31 @@ def sensors(readings: SensorReadings) -> bytes:
 
 
 def command(given: DriverCommand) -> bytes:
-    return _bytes(
+    return _serialize(
         Command(steer=given.steer, throttle=given.throttle, brake=given.brake, gear=given.gear)
     )
 
 
 def traffic(frame: Frame, time: Timestamp) -> bytes:
-    """The cars as boxes in the world, the ego car in its own frame among them."""
+    """All cars as boxes: the others in the world frame, the ego car in its own."""
     message = SceneUpdate()
-    _add_box(message, "ego", EGO, (0.0, 0.0, EGO_HEIGHT, 0.0, 0.0, 0.0), EGO_SIZE, BLUE, time)
+    _add_box(
+        message,
+        "ego",
+        EGO,
+        (0.0, 0.0, EGO_BOX_CENTRE_HEIGHT_M, 0.0, 0.0, 0.0),
+        EGO_SIZE_M,
+        BLUE,
+        time,
+    )
     for number, (x, y, z, roll, pitch, yaw) in enumerate(frame.traffic.tolist()):
-        middle = (x, y, z + TRAFFIC_SIZE[2] / 2.0, roll, pitch, yaw)
-        _add_box(message, f"car {number}", WORLD, middle, TRAFFIC_SIZE, GREY, time)
-    return _bytes(message)
+        middle = (x, y, z + TRAFFIC_SIZE_M[2] / 2.0, roll, pitch, yaw)
+        _add_box(message, f"car {number}", WORLD, middle, TRAFFIC_SIZE_M, GREY, time)
+    return _serialize(message)
 
 
 def track_scene(lines: Mapping[str, NDArray[np.float64]], time: Timestamp) -> bytes:
-    """Named world polylines, (N, 3) m each."""
+    """Named polylines in the world frame, (N, 3) m each."""
     message = SceneUpdate()
     for name, points in lines.items():
         entity = message.entities.add(id=name, frame_id=WORLD)
@@ -175,18 +189,19 @@ def track_scene(lines: Mapping[str, NDArray[np.float64]], time: Timestamp) -> by
         line.color.CopyFrom(WHITE)
         for x, y, z in points.tolist():
             line.points.add(x=x, y=y, z=z)
-    return _bytes(message)
+    return _serialize(message)
 
 
 def transforms(ego: EgoState, camera: CameraParameters, time: Timestamp) -> bytes:
+    """The ego pose in the world, and the camera pose on the car."""
     message = FrameTransforms()
     _add_transform(
         message, WORLD, EGO, (ego.x, ego.y, ego.z), quaternion(ego.roll, ego.pitch, ego.yaw), time
     )
-    # The optical frame looks along its z axis, with x to the right and y down.
-    level = quaternion(-np.pi / 2.0 - np.radians(camera.pitch_deg), 0.0, -np.pi / 2.0)
-    _add_transform(message, EGO, CAMERA_FRAME, (camera.x, camera.y, camera.z), level, time)
-    return _bytes(message)
+    # The optical frame has z along the view, x to the right and y down.
+    optical = quaternion(-np.pi / 2.0 - np.radians(camera.pitch_deg), 0.0, -np.pi / 2.0)
+    _add_transform(message, EGO, CAMERA_FRAME, (camera.x, camera.y, camera.z), optical, time)
+    return _serialize(message)
 
 
 def quaternion(roll: float, pitch: float, yaw: float) -> Quaternion:
@@ -237,5 +252,5 @@ def _add_transform(
     rotation.x, rotation.y, rotation.z, rotation.w = turn
 
 
-def _bytes(message: Any) -> bytes:
+def _serialize(message: Any) -> bytes:
     return bytes(message.SerializeToString())

@@ -1,4 +1,4 @@
-"""The topics of a recording, their schemas and the clock they share."""
+"""Topics of a recording, their message types, and the common clock (ns)."""
 
 from typing import Any
 
@@ -30,7 +30,7 @@ TRAFFIC = "/traffic"
 TRACK_SCENE = "/track/scene"
 TRANSFORMS = "/tf"
 
-# The order fixes channel numbers, and with them the bytes of every file.
+# The order sets the channel numbers, and so the bytes of every file: never change it.
 MESSAGE_TYPES: dict[str, Any] = {
     CAMERA: CompressedImage,
     CALIBRATION: CameraCalibration,
@@ -45,17 +45,18 @@ MESSAGE_TYPES: dict[str, Any] = {
 }
 EVERY_STEP = (CAMERA, ANNOTATIONS, LABELS, EGO_STATE, SENSORS, COMMAND, TRAFFIC, TRANSFORMS)
 
-# Simulated time zero is 2020-01-01T00:00:00Z: viewers want a date, and a fixed one keeps the bytes.
+# Simulated time 0 is 2020-01-01T00:00:00Z: viewers expect a date; a fixed one keeps files equal.
 EPOCH_NS = 1_577_836_800_000_000_000
 NANOSECONDS = 1_000_000_000
 
 
 def log_time_ns(step: int, frequency_hz: int) -> int:
+    """Log time of control step `step`, ns since 1970."""
     return EPOCH_NS + step * NANOSECONDS // frequency_hz
 
 
-def frames_of(log_times: NDArray[np.int64], frequency_hz: int) -> NDArray[np.int64]:
-    """The steps (N,) that have these log times."""
+def steps_at(log_times: NDArray[np.int64], frequency_hz: int) -> NDArray[np.int64]:
+    """The control steps (N,) of log times (N,): the inverse of `log_time_ns`."""
     steps: NDArray[np.int64] = -(-(log_times - EPOCH_NS) * frequency_hz // NANOSECONDS)
     return steps
 
@@ -76,7 +77,7 @@ def schema_data(message_type: Any) -> bytes:
 
 
 def _collect(file: FileDescriptor, files: dict[str, FileDescriptor]) -> None:
-    """Dependencies first, each once."""
+    """Add `file` to `files` after its dependencies, each once."""
     if file.name in files:
         return
     for dependency in file.dependencies:

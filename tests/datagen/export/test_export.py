@@ -258,7 +258,7 @@ def test_a_full_disk_leaves_nothing(
     def full(*args: object) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr("datagen.recording.folder._sync", full)
+    monkeypatch.setattr("runtime.files.fsync_path", full)
     line = refused("export", dataset, "--format", kind, "--out", tmp_path / "out")
     assert "the disk is full" in line
     assert not (tmp_path / "out").exists()

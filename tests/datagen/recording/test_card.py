@@ -1,4 +1,4 @@
-"""The dataset card: its figures are the dataset's, its program runs, the hub can read its head."""
+"""The dataset card: YAML header, example program, statistics."""
 
 import re
 import subprocess
@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from datagen.recording.card import SIZES, card
+from datagen.recording.card import SIZE_CATEGORIES, render_card
 from datagen.recording.dataset import Dataset
 from datagen.recording.manifest import rebuild
 from datagen.recording.schema.fields import FIELDS
@@ -23,7 +23,7 @@ def text(dataset: Path) -> str:
     return (dataset / "README.md").read_text()
 
 
-def test_the_head_is_what_the_hub_reads(text: str) -> None:
+def test_the_yaml_header_has_the_fields_of_the_hub(text: str) -> None:
     yaml = pytest.importorskip("yaml")
     _, head, _ = text.split("---\n", 2)
     found = yaml.safe_load(head)
@@ -34,7 +34,7 @@ def test_the_head_is_what_the_hub_reads(text: str) -> None:
     assert found["viewer"] is False
 
 
-def test_the_program_of_the_card_reads_the_dataset(text: str, dataset: Path) -> None:
+def test_the_example_program_reads_the_dataset(text: str, dataset: Path) -> None:
     (program,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
     assert len([line for line in program.splitlines() if line]) == 5
     done = subprocess.run(
@@ -43,7 +43,7 @@ def test_the_program_of_the_card_reads_the_dataset(text: str, dataset: Path) -> 
     assert done.stdout.startswith("90 ["), done.stderr
 
 
-def test_every_field_topic_and_file_is_named(text: str, dataset: Path) -> None:
+def test_every_field_topic_and_file_is_listed(text: str, dataset: Path) -> None:
     for message, fields in FIELDS.items():
         assert f"`driverview.{message}`" in text
         for name, field in fields.items():
@@ -56,7 +56,7 @@ def test_every_field_topic_and_file_is_named(text: str, dataset: Path) -> None:
         assert (dataset / named).is_file()
 
 
-def test_the_figures_are_the_datasets(text: str, dataset: Path) -> None:
+def test_the_statistics_are_those_of_the_dataset(text: str, dataset: Path) -> None:
     opened = Dataset.open(dataset)
     statistics = describe(opened)
     assert opened.content_hash in text
@@ -71,22 +71,22 @@ def test_the_figures_are_the_datasets(text: str, dataset: Path) -> None:
     assert "JPEG, quality 95" in text
 
 
-def test_size_categories_are_the_hubs(dataset: Path) -> None:
+def test_size_categories_follow_the_number_of_frames(dataset: Path) -> None:
     opened = Dataset.open(dataset)
     for frames, name in ((999, "n<1K"), (1000, "1K<n<10K"), (120_000, "100K<n<1M"),
                          (10**6, "1M<n<10M")):  # fmt: skip
-        assert f"size_categories:\n- {name}\n" in card(
+        assert f"size_categories:\n- {name}\n" in render_card(
             opened, describe(opened) | {"frames": frames}
         )
-    assert [most for most, _ in SIZES] == sorted(most for most, _ in SIZES)
+    assert [most for most, _ in SIZE_CATEGORIES] == sorted(most for most, _ in SIZE_CATEGORIES)
 
 
-def test_jitter_and_lossless_rounds_are_told(samples: Samples, dataset: Path) -> None:
+def test_camera_jitter_and_lossless_rounds_are_stated(samples: Samples, dataset: Path) -> None:
     tilted = replace(samples.camera, pitch_deg=1.5)
     header = samples.header("r003", camera=tilted, nominal_camera=samples.camera, codec="png")
     samples.add_round(dataset, header)
     rebuild(dataset, Split(("r000", "r001"), ("r002",)))
     text = (dataset / "README.md").read_text()
-    assert "each round's a little off" in text
+    assert "varied a little from round to round" in text
     assert "PNG, lossless" in text
     assert "2 train, 1 test, 1 of no side." in text

@@ -1,4 +1,4 @@
-"""Splits: made, refused, and searched for frames that nearly stand on both sides."""
+"""Splits: making them, refusing leaks, and finding near-duplicates across sides."""
 
 import json
 from collections import Counter
@@ -10,14 +10,13 @@ import numpy as np
 import pytest
 
 from datagen.cli.maintain import split as split_command
-from datagen.recording import Dataset, DatasetError, Labels, RoundInfo
-from datagen.recording import near_duplicates as grid
+from datagen.recording import Dataset, DatasetError, Labels, RoundInfo, near_duplicates
 from datagen.recording.folder import prepare, round_path
 from datagen.recording.integrity.recover import recover
 from datagen.recording.manifest import rebuild
-from datagen.recording.near_duplicates import Tolerances, find_neighbours
-from datagen.recording.split_report import SplitReportConfig, check_split, make_split
-from datagen.recording.splits import Split, divide, read_split, split_path, write_split
+from datagen.recording.near_duplicates import Tolerances, find_near_duplicates
+from datagen.recording.split_report import SplitConfig, check_split, make_split
+from datagen.recording.splits import Split, read_split, split_path, split_rounds, write_split
 from tests.datagen.commands import datagen_here
 from tests.datagen.conftest import Samples
 from trackfeatures.errors import UserError
@@ -42,11 +41,11 @@ def make_info(number: int, track: str, **changes: object) -> RoundInfo:
     return replace(info, **changes)  # type: ignore[arg-type]  # the tests name its own fields
 
 
-SIXTY = [make_info(n, f"track-{n % 9}") for n in range(60)]
+SIXTY_ROUNDS = [make_info(n, f"track-{n % 9}") for n in range(60)]
 
 
 def make_labels(rng: np.random.Generator, count: int, rounds: int) -> Labels:
-    """Frames all over a short road, so that many are near each other."""
+    """Frames on a short road, so that many are near each other."""
     nothing = np.zeros(count, np.float32)
     whole = np.zeros(count, np.int64)
     return Labels(
@@ -67,21 +66,21 @@ def make_labels(rng: np.random.Generator, count: int, rounds: int) -> Labels:
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
-def test_by_round_every_track_is_on_both_sides_in_its_share(seed: int) -> None:
-    split = divide(SIXTY, "round", 0.25, seed)
+def test_by_round_every_track_is_on_both_sides_in_proportion(seed: int) -> None:
+    split = split_rounds(SIXTY_ROUNDS, "round", 0.25, seed)
     assert (len(split.train), len(split.test)) == (45, 15)
-    assert sorted(split.train + split.test) == [info.id for info in SIXTY]
-    track_of = {info.id: info.track for info in SIXTY}
+    assert sorted(split.train + split.test) == [info.id for info in SIXTY_ROUNDS]
+    track_of = {info.id: info.track for info in SIXTY_ROUNDS}
     tested = Counter(track_of[i] for i in split.test)
-    assert set(tested) == {info.track for info in SIXTY}
+    assert set(tested) == {info.track for info in SIXTY_ROUNDS}
     assert max(tested.values()) <= 2
-    assert split == divide(SIXTY, "round", 0.25, seed)
-    assert split != divide(SIXTY, "round", 0.25, seed + 10)
+    assert split == split_rounds(SIXTY_ROUNDS, "round", 0.25, seed)
+    assert split != split_rounds(SIXTY_ROUNDS, "round", 0.25, seed + 10)
 
 
-def test_by_track_whole_tracks_are_held_back() -> None:
-    split = divide(SIXTY, "track", 0.34, 0)
-    track_of = {info.id: info.track for info in SIXTY}
+def test_by_track_each_track_is_on_one_side_only() -> None:
+    split = split_rounds(SIXTY_ROUNDS, "track", 0.34, 0)
+    track_of = {info.id: info.track for info in SIXTY_ROUNDS}
     train, test = ({track_of[i] for i in side} for side in (split.train, split.test))
     assert not train & test
     assert (len(train), len(test)) == (6, 3)
@@ -92,7 +91,7 @@ def test_rounds_that_share_a_seed_or_content_stay_together() -> None:
     rounds[7] = replace(rounds[7], seed=rounds[2].seed)
     rounds[9] = replace(rounds[9], content_hash=rounds[7].content_hash)
     for seed in range(20):
-        split = divide(rounds, "round", 0.3, seed)
+        split = split_rounds(rounds, "round", 0.3, seed)
         assert len({split.side(f"r{n:03d}") for n in (2, 7, 9)}) == 1
         assert 1 <= len(split.test) <= 6
 
@@ -100,31 +99,31 @@ def test_rounds_that_share_a_seed_or_content_stay_together() -> None:
 @pytest.mark.parametrize(
     ("rounds", "by", "share", "what"),
     [
-        (SIXTY, "frame", 0.25, "cannot be divided by 'frame'; choose round or track"),
-        (SIXTY, "round", 0.0, "a test share of 0 is none"),
-        (SIXTY, "round", 1.5, "a test share of 1.5 is none"),
-        (SIXTY[:1], "round", 0.25, "1 rounds that share no seed or content are too few"),
+        (SIXTY_ROUNDS, "frame", 0.25, "cannot be divided by 'frame'; choose round or track"),
+        (SIXTY_ROUNDS, "round", 0.0, "--test-share is 0; give a number"),
+        (SIXTY_ROUNDS, "round", 1.5, "--test-share is 1.5; give a number"),
+        (SIXTY_ROUNDS[:1], "round", 0.25, "1 rounds that share no seed or content are too few"),
         ([make_info(n, "oval") for n in range(9)], "track", 0.25, "1 tracks that share no seed"),
     ],
 )
-def test_what_cannot_be_divided_is_refused(
+def test_impossible_splits_are_refused(
     rounds: list[RoundInfo], by: str, share: float, what: str
 ) -> None:
     with pytest.raises(DatasetError, match=what):
-        divide(rounds, by, share, 0)
+        split_rounds(rounds, by, share, 0)
 
 
 @pytest.mark.parametrize("at_once", [100, 4_000_000])
 @pytest.mark.parametrize("tolerances", [Tolerances(), Tolerances(3.0, 0.5, 2.0)])
-def test_near_frames_are_those_of_comparing_all_with_all(
+def test_near_duplicates_equal_those_of_comparing_all_pairs(
     tolerances: Tolerances, at_once: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(grid, "PAIRS_AT_ONCE", at_once)
+    monkeypatch.setattr(near_duplicates, "MAX_PAIRS_AT_ONCE", at_once)
     rng = np.random.default_rng(0)
     rounds = [make_info(n, f"track-{n % 2}") for n in range(6)]
     labels = make_labels(rng, 1500, 6)
     test = labels.round % 3 == 0
-    found = find_neighbours(labels, rounds, test, ~test, tolerances)
+    found = find_near_duplicates(labels, rounds, test, ~test, tolerances)
     tracks = np.array([info.track for info in rounds])[labels.round]
     scene = np.strings.add(tracks, labels.light)
     scale = (tolerances.s_m, tolerances.to_middle_m, np.radians(tolerances.angle_deg))
@@ -143,16 +142,14 @@ def test_near_frames_are_those_of_comparing_all_with_all(
     assert scene[one] == scene[other]
 
 
-def test_no_frames_on_a_side_are_near_none() -> None:
+def test_an_empty_side_has_no_near_duplicates() -> None:
     labels = make_labels(np.random.default_rng(0), 50, 1)
-    nobody = np.zeros(50, np.bool_)
-    found = find_neighbours(labels, [make_info(0, "oval")], ~nobody, nobody, Tolerances())
+    none = np.zeros(50, np.bool_)
+    found = find_near_duplicates(labels, [make_info(0, "oval")], ~none, none, Tolerances())
     assert (found.frames, found.near, found.worst) == (50, 0, ())
 
 
-def test_the_command_checks_the_split_and_finds_the_same_frames_on_both_sides(
-    samples: Samples, tmp_path: Path
-) -> None:
+def test_the_command_reports_equal_frames_on_both_sides(samples: Samples, tmp_path: Path) -> None:
     folder = tmp_path / "data"
     prepare(folder)
     samples.add_round(folder, samples.header("r000"))
@@ -167,11 +164,11 @@ def test_the_command_checks_the_split_and_finds_the_same_frames_on_both_sides(
     assert (found["frames"], found["near"], found["share"]) == (30, 30, 1.0)
     assert {pair["distance"] for pair in found["worst"]} == {0.0}
     text = datagen_here("split", str(folder)).stdout
-    assert "test   1 rounds, 30 frames; 30 (100.0%) nearly as one in train" in text
+    assert "test   1 rounds, 30 frames; 30 (100.0%) near-duplicates of train" in text
     assert "r001 frame 0 and r000 frame 0: a-track, 7.0 m, 0.00 of the tolerances apart" in text
 
 
-def test_the_command_makes_a_split_once(dataset: Path) -> None:
+def test_the_command_never_overwrites_a_split(dataset: Path) -> None:
     made = datagen_here(
         "split", str(dataset), "--name", "mine", "--by", "round", "--test-share", "0.4",
         "--seed", "2", "--near", "1,1,5", "--json",
@@ -187,10 +184,10 @@ def test_the_command_makes_a_split_once(dataset: Path) -> None:
     assert read_split(split_path(dataset, "mine")) == split
 
 
-def test_what_is_unseen_stays_unseen(samples: Samples, dataset: Path) -> None:
+def test_unseen_rounds_stay_unseen_in_a_new_split(samples: Samples, dataset: Path) -> None:
     samples.add_round(dataset, samples.header("r003"))
     write_split(split_path(dataset), Split(("r000", "r001"), ("r002",), unseen=("r003",)))
-    make_split(dataset, "mine", SplitReportConfig(test_share=0.4))
+    make_split(dataset, "mine", SplitConfig(test_share=0.4))
     split = read_split(split_path(dataset, "mine"))
     assert split.unseen == ("r003",)
     assert sorted(split.train + split.test) == ["r000", "r001", "r002"]
@@ -198,11 +195,11 @@ def test_what_is_unseen_stays_unseen(samples: Samples, dataset: Path) -> None:
     assert (report.rounds["unseen"], report.near["unseen"].frames) == (1, 45)
     samples.add_round(dataset, samples.header("r004", seed=3), content_seed=9)
     with pytest.raises(DatasetError, match=r"seed 3 on both sides, (train|test) and unseen"):
-        make_split(dataset, "leak", SplitReportConfig(test_share=0.4))
+        make_split(dataset, "leak", SplitConfig(test_share=0.4))
     assert not split_path(dataset, "leak").exists()
 
 
-def test_a_made_split_takes_recovered_rounds_only_when_asked(dataset: Path) -> None:
+def test_a_new_split_has_recovered_rounds_only_on_request(dataset: Path) -> None:
     path = round_path(dataset, "r001")
     damaged = dataset.parent / "r001.mcap"
     path.rename(damaged)
@@ -217,7 +214,7 @@ def test_a_made_split_takes_recovered_rounds_only_when_asked(dataset: Path) -> N
     assert split.recovered == ("r001",)
 
 
-def test_the_command_refuses_a_leak_in_one_line(dataset: Path) -> None:
+def test_the_command_refuses_a_leak_with_a_one_line_error(dataset: Path) -> None:
     write_split(split_path(dataset, "leak"), Split(("r000", "r001"), ("r001", "r002")))
     done = datagen_here("split", str(dataset), "--name", "leak")
     assert (done.returncode, done.stdout) == (1, "")
@@ -232,7 +229,7 @@ def test_the_command_refuses_a_leak_in_one_line(dataset: Path) -> None:
         ({"near": "1,2"}, "--near is '1,2'; give three numbers"),
         ({"near": "1,0,2"}, "give numbers above 0"),
         ({"by": "frame", "name": "x"}, "cannot be divided by 'frame'"),
-        ({"by": "round", "name": "x", "test_share": 2.0}, "a test share of 2 is none"),
+        ({"by": "round", "name": "x", "test_share": 2.0}, "--test-share is 2; give a number"),
     ],
 )
 def test_bad_options_are_refused(dataset: Path, options: dict[str, Any], what: str) -> None:

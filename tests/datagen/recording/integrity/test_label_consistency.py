@@ -1,4 +1,4 @@
-"""Labels against the definitions: nothing true is refused, nothing wrong is passed."""
+"""Label consistency: correct labels pass, wrong ones are found."""
 
 from dataclasses import replace
 
@@ -6,46 +6,46 @@ import numpy as np
 import pytest
 
 import trackfeatures as tf
-from datagen.recording.integrity.label_consistency import disagreements
+from datagen.recording.integrity.label_consistency import label_problems
 from datagen.recording.labels import Labels
 
 WIDTH = 4.0
 
 
-def _labels(places: np.ndarray, lanes: int, width: float = WIDTH) -> Labels:
-    """As they come out of a recording: measured in float64, read as float32."""
-    features = [tf.measure(y, 0.0, 0.0, 0.0, lanes, width) for y in places.tolist()]
+def _labels(offsets: np.ndarray, lanes: int, width: float = WIDTH) -> Labels:
+    """Labels as read from a recording: measured in float64, read as float32."""
+    features = [tf.measure(y, 0.0, 0.0, 0.0, lanes, width) for y in offsets.tolist()]
     distances = np.array([[*f.distances.values()] for f in features], dtype=np.float64)
     centre = np.array([f.to_lane_centre for f in features], dtype=np.float64)
-    zeros = np.zeros(len(places), dtype=np.float32)
+    zeros = np.zeros(len(offsets), dtype=np.float32)
     return Labels(
         distances=distances.astype(np.float32),
         angle=zeros,
-        heading=np.ones(len(places), dtype=np.int64),
-        lanes=np.full(len(places), lanes),
-        lane_index=np.array([tf.lane_index(y, lanes, width) for y in places.tolist()]),
+        heading=np.ones(len(offsets), dtype=np.int64),
+        lanes=np.full(len(offsets), lanes),
+        lane_index=np.array([tf.lane_index(y, lanes, width) for y in offsets.tolist()]),
         curvature=zeros,
         to_lane_centre=centre.astype(np.float32),
-        to_middle=places.astype(np.float32),
+        to_middle=offsets.astype(np.float32),
         s=zeros,
         speed=zeros,
         shadow_fraction=zeros,
-        light=np.full(len(places), "clear"),
-        round=np.zeros(len(places), dtype=np.int64),
+        light=np.full(len(offsets), "clear"),
+        round=np.zeros(len(offsets), dtype=np.int64),
     )
 
 
 @pytest.mark.parametrize("lanes", tf.LANES)
 @pytest.mark.parametrize("width", [3.0, 3.7, 4.5])
-def test_true_labels_agree_everywhere_and_on_either_side_of_every_border(
+def test_correct_labels_have_no_problems_anywhere_near_the_borders(
     lanes: int, width: float
 ) -> None:
     markings = tf.marking_offsets(lanes, width)
     reaches = [0.0, 0.5, 1.2, 2.0, width / 2]
     borders = np.array([m + side * r for m in markings for r in reaches for side in (-1, 1)])
     beside = np.concatenate([borders + d for d in (-1e-6, -1e-8, -1e-15, 0.0, 1e-15, 1e-8, 1e-6)])
-    places = np.concatenate([beside, np.linspace(-9.0, 9.0, 181)])
-    assert list(disagreements(_labels(places, lanes, width), lanes, width)) == []
+    offsets = np.concatenate([beside, np.linspace(-9.0, 9.0, 181)])
+    assert list(label_problems(_labels(offsets, lanes, width), lanes, width)) == []
 
 
 @pytest.mark.parametrize(
@@ -61,22 +61,22 @@ def test_true_labels_agree_everywhere_and_on_either_side_of_every_border(
         ("lanes", 3, "1 of 4 labels do not have the 2 lanes of the round"),
     ],
 )
-def test_what_is_dropped_invented_or_wrong_is_found(
+def test_missing_invented_and_wrong_labels_are_found(
     column: str, value: float, expected: str
 ) -> None:
     """All cars stand 0.3 m right of the centre of the right lane of two: ml -2.3, mr 1.7."""
     labels = _labels(np.full(4, -2.3), lanes=2)
     name = "distances" if column in tf.MARKINGS else column
     changed = getattr(labels, name).copy()
-    assert list(disagreements(labels, 2, WIDTH)) == []
+    assert list(label_problems(labels, 2, WIDTH)) == []
     if name == "distances":
         changed[2, tf.MARKINGS.index(column)] = value
     else:
         changed[2] = value
-    found = list(disagreements(replace(labels, **{name: changed}), 2, WIDTH))
+    found = list(label_problems(replace(labels, **{name: changed}), 2, WIDTH))
     assert any(expected in line for line in found), found
 
 
-def test_a_road_that_cannot_be_is_found() -> None:
+def test_an_impossible_road_is_found() -> None:
     labels = _labels(np.zeros(3), lanes=1)
-    assert "an impossible road: 7 lanes" in next(disagreements(labels, 7, WIDTH))
+    assert "an impossible road: 7 lanes" in next(label_problems(labels, 7, WIDTH))

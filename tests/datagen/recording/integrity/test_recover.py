@@ -1,4 +1,4 @@
-"""Saving damaged rounds: every whole frame before the damage, nothing that the damage touched."""
+"""Recovery of damaged rounds: all frames outside the damage, none that it touched."""
 
 import json
 from itertools import pairwise
@@ -31,9 +31,11 @@ def frames(samples: Samples) -> list[Frame]:
 
 
 @pytest.fixture(scope="module")
-def good(samples: Samples, frames: list[Frame], tmp_path_factory: pytest.TempPathFactory) -> bytes:
+def undamaged(
+    samples: Samples, frames: list[Frame], tmp_path_factory: pytest.TempPathFactory
+) -> bytes:
     """A round of several chunks."""
-    path = tmp_path_factory.mktemp("good") / "r007.mcap"
+    path = tmp_path_factory.mktemp("undamaged") / "r007.mcap"
     samples.write(path, samples.header("r007"), frames)
     data = path.read_bytes()
     assert len(read_summary(memoryview(data)).chunks) >= 2
@@ -41,17 +43,17 @@ def good(samples: Samples, frames: list[Frame], tmp_path_factory: pytest.TempPat
 
 
 @pytest.fixture(scope="module")
-def ends(good: bytes, tmp_path_factory: pytest.TempPathFactory) -> list[int]:
-    """Where each frame is complete in the file, by the official reader: its last message's end."""
+def ends(undamaged: bytes, tmp_path_factory: pytest.TempPathFactory) -> list[int]:
+    """The offset where each frame is complete: the end of its last message (official reader)."""
     path = tmp_path_factory.mktemp("ends") / "r.mcap"
-    path.write_bytes(good)
+    path.write_bytes(undamaged)
     with path.open("rb") as stream:
         last = [m.data for *_, m in make_reader(stream).iter_messages([topics.TRANSFORMS])]
-    return [good.index(payload) + len(payload) for payload in last]
+    return [undamaged.index(payload) + len(payload) for payload in last]
 
 
 def saved_frames(path: Path) -> list[int]:
-    """Numbers of the frames of a recovered file, as the official reader sees them."""
+    """Frame numbers of a recovered file, by the official reader."""
     with path.open("rb") as stream:
         reader = make_reader(stream, validate_crcs=True, decoder_factories=[DecoderFactory()])
         found: dict[str, list[int]] = {}
@@ -63,14 +65,14 @@ def saved_frames(path: Path) -> list[int]:
     return labels
 
 
-def test_of_a_file_cut_anywhere_all_frames_before_the_cut_are_saved(
-    good: bytes, ends: list[int], tmp_path: Path
+def test_all_frames_before_a_cut_are_recovered(
+    undamaged: bytes, ends: list[int], tmp_path: Path
 ) -> None:
     rng = np.random.default_rng(1)
-    cuts = [*rng.integers(ends[0], len(good), 190).tolist(), *ends[10:15], ends[20] - 1]
+    cuts = [*rng.integers(ends[0], len(undamaged), 190).tolist(), *ends[10:15], ends[20] - 1]
     file, out = tmp_path / "cut.mcap", tmp_path / "out.mcap"
-    for cut in [*cuts, len(good) - 1, len(good) - 9, len(good) - 60, len(good)]:
-        file.write_bytes(good[:cut])
+    for cut in [*cuts, len(undamaged) - 1, len(undamaged) - 9, len(undamaged) - 60, len(undamaged)]:
+        file.write_bytes(undamaged[:cut])
         done = recover(file, out)
         expected = sum(end <= cut for end in ends)
         assert (done.saved, saved_frames(out)) == (expected, list(range(expected))), cut
@@ -79,16 +81,16 @@ def test_of_a_file_cut_anywhere_all_frames_before_the_cut_are_saved(
         out.unlink()
 
 
-def test_garbage_and_zeros_in_place_of_the_end_are_told_from_frames(
-    good: bytes, ends: list[int], tmp_path: Path
+def test_garbage_and_zeros_after_a_cut_are_not_taken_for_frames(
+    undamaged: bytes, ends: list[int], tmp_path: Path
 ) -> None:
     rng = np.random.default_rng(2)
     file, out = tmp_path / "cut.mcap", tmp_path / "out.mcap"
     for trial in range(40):
         cut = int(rng.integers(ends[0], ends[-1]))
-        rest = (len(good) - cut) if trial % 2 else int(rng.integers(1, 4000))
+        rest = (len(undamaged) - cut) if trial % 2 else int(rng.integers(1, 4000))
         tail = bytes(rest) if trial % 4 < 2 else rng.bytes(rest)
-        file.write_bytes(good[:cut] + tail)
+        file.write_bytes(undamaged[:cut] + tail)
         saved = recover(file, out).saved
         whole = sum(end <= cut for end in ends)
         # The frame that ends where the garbage begins cannot be told from one that it touches.
@@ -97,20 +99,20 @@ def test_garbage_and_zeros_in_place_of_the_end_are_told_from_frames(
         out.unlink()
 
 
-def test_a_flipped_bit_costs_its_chunk_only_and_nothing_damaged_is_kept(
-    good: bytes, ends: list[int], tmp_path: Path
+def test_a_flipped_bit_loses_only_the_frames_of_its_chunk(
+    undamaged: bytes, ends: list[int], tmp_path: Path
 ) -> None:
     rng = np.random.default_rng(3)
     file, out, whole = (tmp_path / f"{name}.mcap" for name in ("bad", "out", "whole"))
-    whole.write_bytes(good)
+    whole.write_bytes(undamaged)
     original = open_round(whole).messages[topics.CAMERA]
-    chunks = [chunk.start for chunk in read_summary(memoryview(good)).chunks]
+    chunks = [chunk.start for chunk in read_summary(memoryview(undamaged)).chunks]
     begins = [chunks[0], *ends[:-1]]
     for _ in range(60):
-        bad = bytearray(good)
-        at = int(rng.integers(chunks[0], len(good)))
+        bad = bytearray(undamaged)
+        at = int(rng.integers(chunks[0], len(undamaged)))
         hit = max(start for start in chunks if start <= at)
-        after = min((start for start in chunks if start > at), default=len(good))
+        after = min((start for start in chunks if start > at), default=len(undamaged))
         touched = [b < after and e > hit for b, e in zip(begins, ends, strict=True)]
         bad[at] ^= 1 << int(rng.integers(8))
         file.write_bytes(bad)
@@ -125,12 +127,12 @@ def test_a_flipped_bit_costs_its_chunk_only_and_nothing_damaged_is_kept(
         out.unlink()
 
 
-def test_a_recovered_round_says_so_and_is_read_like_any_other(
-    samples: Samples, good: bytes, frames: list[Frame], ends: list[int], dataset: Path
+def test_a_recovered_round_is_marked_and_can_be_read(
+    samples: Samples, undamaged: bytes, frames: list[Frame], ends: list[int], dataset: Path
 ) -> None:
     path = round_path(dataset, "r007")
     file = dataset.parent / "r007.mcap"
-    file.write_bytes(good[: ends[39] + 10])
+    file.write_bytes(undamaged[: ends[39] + 10])
     done = recover(file, path)
     assert (done.saved, done.lost, done.at_least) == (40, 0, True)
     index = open_round(path)
@@ -143,11 +145,11 @@ def test_a_recovered_round_says_so_and_is_read_like_any_other(
     assert state_path(dataset, "r007").is_file()
 
 
-def test_verify_tells_of_a_recovered_round_and_no_split_takes_it_unasked(
-    good: bytes, ends: list[int], dataset: Path
+def test_verify_lists_a_recovered_round_and_splits_must_declare_it(
+    undamaged: bytes, ends: list[int], dataset: Path
 ) -> None:
     file = dataset.parent / "r007.mcap"
-    file.write_bytes(good[: ends[39] + 10])
+    file.write_bytes(undamaged[: ends[39] + 10])
     recover(file, round_path(dataset, "r007"))
     report = verify(dataset, "quick")
     assert report.ok
@@ -163,22 +165,22 @@ def test_verify_tells_of_a_recovered_round_and_no_split_takes_it_unasked(
     assert verify(dataset, "deep").ok
 
 
-def test_the_command_saves_a_round_of_a_dataset_aside(dataset: Path) -> None:
+def test_the_command_writes_to_the_folder_recovered(dataset: Path) -> None:
     path = round_path(dataset, "r001")
     path.write_bytes(path.read_bytes()[:-30_000])
     done = datagen_here("recover", str(path), "--json")
     assert done.returncode == 0, done.stderr
-    told = json.loads(done.stdout)
-    assert told["out"] == str(dataset / "recovered" / "r001.mcap")
-    assert told["saved"] + told["lost"] == 45  # as the state file beside it says
-    assert told["at_least"] is False
-    assert 0 < told["saved"] == len(saved_frames(Path(told["out"])))
+    result = json.loads(done.stdout)
+    assert result["out"] == str(dataset / "recovered" / "r001.mcap")
+    assert result["saved"] + result["lost"] == 45  # as the state file beside it says
+    assert result["at_least"] is False
+    assert 0 < result["saved"] == len(saved_frames(Path(result["out"])))
     again = datagen_here("recover", str(path))
     assert (again.returncode, again.stdout) == (1, "")
     assert again.stderr.endswith("exists; nothing was changed; choose another --out\n")
     aside = dataset.parent / "mine.mcap"
     done = datagen_here("recover", str(path), "--out", str(aside))
-    assert done.stdout == f"{aside}: {told['saved']} frames saved, {told['lost']} lost\n"
+    assert done.stdout == f"{aside}: {result['saved']} frames saved, {result['lost']} lost\n"
 
 
 @pytest.mark.parametrize(
@@ -187,29 +189,29 @@ def test_the_command_saves_a_round_of_a_dataset_aside(dataset: Path) -> None:
         (b"", "its first bytes"),
         (b"neither this nor that", "its first bytes"),
         (slice(300), "its first bytes|its header"),
-        (slice(3000), "no whole frame"),
+        (slice(3000), "no intact frame"),
     ],
 )
-def test_what_holds_no_frames_is_refused(
-    good: bytes, content: bytes | slice, what: str, tmp_path: Path
+def test_a_file_without_intact_frames_is_refused(
+    undamaged: bytes, content: bytes | slice, what: str, tmp_path: Path
 ) -> None:
     file = tmp_path / "r.mcap"
-    file.write_bytes(content if isinstance(content, bytes) else good[content])
+    file.write_bytes(content if isinstance(content, bytes) else undamaged[content])
     with pytest.raises(DatasetError, match=what):
         recover(file)
     assert [path.name for path in tmp_path.iterdir()] == ["r.mcap"]
 
 
-def test_a_round_of_a_dataset_keeps_its_name(good: bytes, dataset: Path) -> None:
+def test_a_recovered_round_of_a_dataset_must_keep_its_name(undamaged: bytes, dataset: Path) -> None:
     file = dataset.parent / "r007.mcap"
-    file.write_bytes(good)
+    file.write_bytes(undamaged)
     with pytest.raises(DatasetError, match=r"expected r007\.mcap"):
         recover(file, round_path(dataset, "r008"))
     with pytest.raises(DatasetError, match=r"r001\.mcap exists"):
         recover(file, round_path(dataset, "r001"))
 
 
-def test_a_missing_file_is_one_line() -> None:
+def test_a_missing_file_gives_a_one_line_error() -> None:
     done = datagen_here("recover", "/no/such/r.mcap")
     assert done.returncode == 1
     assert done.stderr.count("\n") == 1

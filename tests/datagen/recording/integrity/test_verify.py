@@ -1,4 +1,4 @@
-"""What verification finds, level by level; whatever it is given, it reports and never raises."""
+"""Verification at each level: what it finds, and that a bad file is reported, never raised."""
 
 import json
 from collections.abc import Iterable
@@ -20,7 +20,7 @@ from tests.datagen.conftest import Samples
 
 
 @pytest.mark.parametrize("level", ["quick", "full", "deep"])
-def test_a_good_dataset_is_in_order_at_every_level(dataset: Path, level: str) -> None:
+def test_a_good_dataset_has_no_problems_at_any_level(dataset: Path, level: str) -> None:
     report = verify(dataset, level)
     assert (report.ok, report.rounds, report.frames, report.problems) == (True, 3, 135, ())
 
@@ -49,7 +49,7 @@ def test_a_truncated_file_is_found_by_quick(dataset: Path) -> None:
 
 
 @pytest.mark.parametrize("content", [b"", b"not an mcap file at all" * 9, b"\x89MCAP0\r\n" * 9])
-def test_a_foreign_file_is_reported(dataset: Path, content: bytes) -> None:
+def test_a_file_that_is_not_mcap_is_reported(dataset: Path, content: bytes) -> None:
     (dataset / "rounds" / "zz.mcap").write_bytes(content)
     for level in ("quick", "full", "deep"):
         report = verify(dataset, level)
@@ -60,7 +60,7 @@ def test_a_foreign_file_is_reported(dataset: Path, content: bytes) -> None:
 
 
 @pytest.mark.parametrize("level", ["quick", "full", "deep"])
-def test_what_is_no_readable_file_is_reported(dataset: Path, level: str) -> None:
+def test_folders_and_broken_links_in_place_of_files_are_reported(dataset: Path, level: str) -> None:
     (dataset / "rounds" / "folder.mcap").mkdir()
     (dataset / "rounds" / "nowhere.mcap").symlink_to("/no/such/file")
     (dataset / "splits" / "folder.json").mkdir()
@@ -75,7 +75,7 @@ def test_what_is_no_readable_file_is_reported(dataset: Path, level: str) -> None
     assert "cannot be read (Is a directory" in report.problems[2]
 
 
-def test_a_disk_that_fails_while_it_is_read_is_reported(
+def test_a_read_error_of_the_disk_is_reported(
     dataset: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def broken(*args: object) -> None:
@@ -124,7 +124,7 @@ def test_images_of_another_size_are_found_by_deep(samples: Samples, dataset: Pat
     frames = [replace(f, image=f.image[:20, :20]) for f in samples.frames(3, seed=9)]
     samples.write(round_path(dataset, "r000"), samples.header("r000"), frames)
     problems = verify(dataset, "deep").problems
-    assert sum("20x20 px where 56x42" in p for p in problems) == 3
+    assert sum("20x20 px, expected 56x42 px" in p for p in problems) == 3
 
 
 def test_a_leaking_split_and_one_of_other_definitions_are_reported(dataset: Path) -> None:
@@ -137,7 +137,7 @@ def test_a_leaking_split_and_one_of_other_definitions_are_reported(dataset: Path
     assert "0-old" in problems[1]
 
 
-def test_random_damage_never_raises_and_is_always_found_without_any_hash_beside_it(
+def test_random_damage_never_raises_and_is_found_without_state_files(
     dataset: Path,
 ) -> None:
     state_path(dataset, "r000").unlink()  # with its sha256, every damage would be found anyway
@@ -157,8 +157,8 @@ def test_random_damage_never_raises_and_is_always_found_without_any_hash_beside_
         assert _other_than_state(verify(dataset, "full").problems)
 
 
-def test_a_changed_byte_is_found_wherever_it_is(samples: Samples, tmp_path: Path) -> None:
-    """The file's own checksums leave no byte out."""
+def test_scan_finds_any_changed_byte(samples: Samples, tmp_path: Path) -> None:
+    """The checksums in the file cover every byte."""
     path = tmp_path / "small.mcap"
     samples.write(path, samples.header(), samples.frames(2, seed=1))
     good = path.read_bytes()
@@ -170,7 +170,7 @@ def test_a_changed_byte_is_found_wherever_it_is(samples: Samples, tmp_path: Path
 
 
 @pytest.mark.parametrize("where", ["rounds", "state", "splits", "proto", "manifest.json"])
-def test_a_single_flipped_bit_is_found_wherever_it_is(dataset: Path, where: str) -> None:
+def test_verify_finds_any_flipped_bit(dataset: Path, where: str) -> None:
     rng = np.random.default_rng(5)
     files = sorted(p for p in dataset.rglob("*") if p.is_file())
     files = [p for p in files if p.relative_to(dataset).parts[0] == where]
@@ -187,7 +187,7 @@ def test_a_single_flipped_bit_is_found_wherever_it_is(dataset: Path, where: str)
     assert verify(dataset, "full").ok
 
 
-def test_swapped_files_are_named(dataset: Path) -> None:
+def test_swapped_files_are_reported(dataset: Path) -> None:
     one, other, aside = (round_path(dataset, name) for name in ("r000", "r001", "aside"))
     one.rename(aside)
     other.rename(one)
@@ -198,7 +198,7 @@ def test_swapped_files_are_named(dataset: Path) -> None:
         assert "r001.mcap holds round r000: files were swapped, copied or renamed" in problems
 
 
-def test_a_copied_round_is_named(dataset: Path) -> None:
+def test_a_copied_round_is_reported(dataset: Path) -> None:
     round_path(dataset, "r009").write_bytes(round_path(dataset, "r001").read_bytes())
     problems = " / ".join(verify(dataset, "quick").problems)
     assert "r009.mcap: no state file holds its hashes" in problems
@@ -206,7 +206,7 @@ def test_a_copied_round_is_named(dataset: Path) -> None:
     assert "r009.mcap has the same images and labels as r001.mcap" in problems
 
 
-def test_a_foreign_mcap_file_is_named_for_what_it_is(dataset: Path) -> None:
+def test_an_mcap_file_that_is_no_round_is_reported_as_such(dataset: Path) -> None:
     path = dataset / "rounds" / "drive.mcap"
     with path.open("wb") as stream:
         writer = Writer(stream)
@@ -225,14 +225,14 @@ def test_a_foreign_mcap_file_is_named_for_what_it_is(dataset: Path) -> None:
         )
 
 
-def test_a_round_of_other_definitions_is_named(samples: Samples, dataset: Path) -> None:
+def test_a_round_of_other_definitions_is_reported(samples: Samples, dataset: Path) -> None:
     samples.add_round(dataset, samples.header("r003", definitions="0-old"))
     (problem,) = verify(dataset, "full").problems
     assert problem.startswith("r003.mcap: recorded under definitions 0-old, this program has ")
 
 
 @pytest.mark.parametrize("change", [{"camera": None}, {"weather": '"mild"'}], ids=["less", "more"])
-def test_a_round_whose_header_is_of_another_version_is_named(
+def test_a_round_with_the_header_of_another_version_is_reported(
     samples: Samples, dataset: Path, monkeypatch: pytest.MonkeyPatch, change: dict[str, str | None]
 ) -> None:
     ours = RoundHeader.to_metadata
@@ -250,26 +250,26 @@ def test_a_round_whose_header_is_of_another_version_is_named(
     assert "driverview 0.0.9" in problem
 
 
-def test_splits_with_rounds_that_are_not_there_or_twice_are_reported(dataset: Path) -> None:
+def test_splits_with_missing_or_repeated_rounds_are_reported(dataset: Path) -> None:
     write_split(split_path(dataset), Split(("r000", "r001", "r000"), ("r002", "r007")))
     problems = verify(dataset, "quick").problems
     assert [p.removeprefix(str(split_path(dataset))) for p in problems] == [
         " names round r000 twice",
-        " names round r007, which is not there",
+        " names round r007, which does not exist",
     ]
 
 
-def test_a_missing_manifest_and_changed_files_are_told_by_full(dataset: Path) -> None:
+def test_a_missing_manifest_and_changed_files_are_found_by_full(dataset: Path) -> None:
     proto = dataset / "proto" / "driverview.proto"
     proto.write_text(proto.read_text() + "// changed\n")
     (problem,) = verify(dataset, "full").problems
-    assert problem.startswith(f"proto/driverview.proto in {dataset}: not what manifest.json was")
+    assert problem.startswith(f"proto/driverview.proto in {dataset}: other content than manifest")
     (dataset / "manifest.json").unlink()
     assert "there is no" in verify(dataset, "full").problems[0]
     assert verify(dataset, "quick").ok
 
 
-def test_a_clock_that_jumps_is_found(
+def test_a_gap_in_log_times_is_found(
     samples: Samples, dataset: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def jumping(step: int, frequency_hz: int) -> int:

@@ -1,4 +1,4 @@
-"""Finding messages without the official reader: it is the oracle, and damage is never followed."""
+"""The index reader, with the official reader as the oracle, and its behaviour on damaged files."""
 
 import resource
 from collections.abc import Iterator
@@ -35,7 +35,7 @@ def few_descriptors() -> Iterator[int]:
     resource.setrlimit(resource.RLIMIT_NOFILE, before)
 
 
-def test_the_summary_is_that_of_the_official_reader(path: Path) -> None:
+def test_the_summary_equals_that_of_the_official_reader(path: Path) -> None:
     view = map_file(path)
     mine = read_summary(view)
     with path.open("rb") as stream:
@@ -60,7 +60,7 @@ def test_more_rounds_can_be_open_than_file_descriptors(path: Path, few_descripto
     assert all(index.messages[topics.CAMERA].payload(7) == one for index in indexes)
 
 
-def test_a_map_goes_with_its_last_view(path: Path) -> None:
+def test_a_file_is_unmapped_with_its_last_view(path: Path) -> None:
     def maps() -> int:
         return Path("/proc/self/maps").read_text().count(str(path))
 
@@ -73,7 +73,7 @@ def test_a_map_goes_with_its_last_view(path: Path) -> None:
     assert maps() == 0
 
 
-def test_a_damaged_index_is_refused_when_it_is_opened(path: Path) -> None:
+def test_a_damaged_summary_is_refused_on_opening(path: Path) -> None:
     data = bytearray(path.read_bytes())
     data[-400] ^= 1
     path.write_bytes(data)
@@ -82,8 +82,8 @@ def test_a_damaged_index_is_refused_when_it_is_opened(path: Path) -> None:
 
 
 @pytest.mark.parametrize("entry", ["log_time", "place"])
-def test_a_damaged_message_index_is_refused_when_it_is_followed(dataset: Path, entry: str) -> None:
-    """It lies outside the index at the end: what it points at has to prove itself."""
+def test_a_damaged_message_index_is_refused_on_reading(dataset: Path, entry: str) -> None:
+    """The CRC of the summary does not cover it: the message it points at is checked."""
     path = round_path(dataset, "r000")
     data = bytearray(path.read_bytes())
     summary = read_summary(memoryview(bytes(data)))

@@ -1,4 +1,4 @@
-"""The published schema: every recorded value is described, and recordings keep to it."""
+"""The published JSON schema: it describes every field, and recordings are valid under it."""
 
 import json
 from pathlib import Path
@@ -13,7 +13,7 @@ from mcap_protobuf.decoder import DecoderFactory
 import trackfeatures as tf
 from datagen.recording.folder import round_path
 from datagen.recording.schema.fields import FIELDS
-from datagen.recording.schema.json_schema import SCHEMA, json_schema
+from datagen.recording.schema.json_schema import SCHEMA_FILE, json_schema
 from datagen.recording.schema.proto import driverview_pb2
 from tests.datagen.conftest import Samples
 
@@ -29,8 +29,8 @@ def test_every_field_of_every_message_is_described_and_no_other() -> None:
             assert bool(fields[field.name].absent) == optional, f"{name}.{field.name}"
 
 
-def test_the_schema_stands_beside_the_dataset_and_is_a_schema(dataset: Path) -> None:
-    found = json.loads((dataset / SCHEMA).read_text())
+def test_the_published_schema_is_valid_json_schema(dataset: Path) -> None:
+    found = json.loads((dataset / SCHEMA_FILE).read_text())
     assert found == json_schema()
     jsonschema.Draft202012Validator.check_schema(found)
     ml = found["$defs"]["TrackFeatures"]["properties"]["to_marking_ml"]
@@ -61,7 +61,7 @@ def validator(topic: str) -> jsonschema.Draft202012Validator:
     )
 
 
-def test_recordings_keep_to_the_schema(dataset: Path) -> None:
+def test_recorded_messages_are_valid_under_the_schema(dataset: Path) -> None:
     messages = recorded(round_path(dataset, "r000"))
     validators = {topic: validator(topic) for topic in json_schema()["x-topics"]}
     for topic, message in messages:
@@ -80,7 +80,7 @@ def test_recordings_keep_to_the_schema(dataset: Path) -> None:
         ("/sensors", {"range": [201.0]}),
     ],
 )
-def test_the_schema_refuses_what_cannot_be(topic: str, change: dict[str, Any]) -> None:
+def test_the_schema_refuses_impossible_values(topic: str, change: dict[str, Any]) -> None:
     validator(topic).validate({})
     with pytest.raises(jsonschema.ValidationError):
         validator(topic).validate(change)

@@ -1,4 +1,4 @@
-"""A full disk, and folders that may not be written to."""
+"""Collection on a full disk, and into folders without write permission."""
 
 import ctypes
 import errno
@@ -22,10 +22,10 @@ PR_CAPBSET_DROP, CAP_DAC_OVERRIDE = 24, 1  # <linux/prctl.h>, <linux/capability.
 
 
 @pytest.mark.parametrize("failing", range(5))
-def test_a_disk_full_from_the_start_leaves_a_folder_that_can_be_gone_on_with(
+def test_collection_resumes_after_a_disk_that_was_full_from_the_start(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, failing: int
 ) -> None:
-    """Each of the writes before the first round fails once; the same command then works."""
+    """Each write before the first round fails once; the same command then works."""
     folder = tmp_path / "data"
     plan = make_small_plan(1, 10)
     synced: list[Path] = []
@@ -36,7 +36,7 @@ def test_a_disk_full_from_the_start_leaves_a_folder_that_can_be_gone_on_with(
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     with monkeypatch.context() as patch:
-        patch.setattr("datagen.recording.folder._sync", full)
+        patch.setattr("runtime.files.fsync_path", full)
         with pytest.raises(OSError, match="No space left"):
             collect(plan, folder, workers=1)
     require_fitting(folder, plan)
@@ -44,17 +44,17 @@ def test_a_disk_full_from_the_start_leaves_a_folder_that_can_be_gone_on_with(
     assert json.loads((folder / "plan.json").read_text())["hash"] == plan.hash
 
 
-def test_a_folder_without_permission_is_told_in_one_line(tmp_path: Path) -> None:
-    """Without the capability to pass over modes, for where the tests run as root."""
+def test_a_folder_without_permission_gives_a_one_line_error(tmp_path: Path) -> None:
+    """As root, the child process drops the capability to ignore file modes."""
 
-    def humble() -> None:
+    def drop_capability() -> None:
         ctypes.CDLL(None).prctl(PR_CAPBSET_DROP, CAP_DAC_OVERRIDE, 0, 0, 0)
 
     tmp_path.chmod(0o555)
     (plain := tmp_path.with_name("plain")).mkdir()
     plain.chmod(0o555)
     for folder in (tmp_path / "new", plain):
-        done = datagen("collect", *SHORT, "--out", folder, preexec_fn=humble)
+        done = datagen("collect", *SHORT, "--out", folder, preexec_fn=drop_capability)
         assert (done.returncode, done.stdout, done.stderr.count("\n")) == (1, "", 1)
         assert done.stderr.startswith("error: no permission to write or read: ")
         assert str(folder) in done.stderr
@@ -62,7 +62,7 @@ def test_a_folder_without_permission_is_told_in_one_line(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize("reason", [errno.ENOSPC, errno.EACCES])
-def test_a_full_disk_ends_a_round_without_a_trace(
+def test_a_full_disk_leaves_no_file_of_the_round(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, reason: int
 ) -> None:
     def full(*args: object) -> None:
@@ -78,8 +78,8 @@ def test_a_full_disk_ends_a_round_without_a_trace(
     assert not list(tmp_path.glob("rounds/*"))
 
 
-def test_a_disk_that_fills_up_gives_one_line_and_keeps_the_rounds(collected: Path) -> None:
-    """A limit on the size of files stands in for the full disk: the same write fails."""
+def test_a_write_error_gives_one_line_and_keeps_finished_rounds(collected: Path) -> None:
+    """A limit on the file size stands in for a full disk: the same write fails."""
     lost = collected / "rounds" / "round-001.mcap"
     before = lost.read_bytes()
     lost.unlink()
@@ -100,7 +100,7 @@ def test_a_disk_that_fills_up_gives_one_line_and_keeps_the_rounds(collected: Pat
 
 @pytest.fixture
 def small_disk(tmp_path: Path) -> Iterator[Path]:
-    """A file system of two megabytes of its own: a round and a half of 40 frames."""
+    """A file system of 2 MB: one and a half rounds of 40 frames."""
     disk = tmp_path / "disk"
     disk.mkdir()
     mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=2m", "none", disk])
@@ -111,7 +111,7 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
 
 
 @pytest.mark.skipif(shutil.which("mount") is None, reason="there is no mount command")
-def test_a_real_disk_that_is_full_in_the_middle_keeps_what_is_finished(small_disk: Path) -> None:
+def test_a_small_file_system_that_fills_up_keeps_finished_rounds(small_disk: Path) -> None:
     args = ["--rounds", "3", "--frames", "40", "--tracks", "circuit", "--workers", "1"]
     folder = small_disk / "data"
     done = datagen("collect", *args, "--out", folder)
