@@ -87,10 +87,10 @@ def test_a_damaged_image_of_a_large_batch_is_named(dataset: Path) -> None:
         frames.read_batch(np.arange(120, 152))
 
 
-def test_the_snippet_of_the_readme_runs_on_a_dataset(
+def test_the_example_of_the_documentation_runs_on_a_dataset(
     dataset: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    text = (Path(__file__).parents[3] / "README.md").read_text()
+    text = (Path(__file__).parents[3] / "docs" / "how-to" / "collect.md").read_text()
     (snippet,) = re.findall(r"```python\n(from datagen\.recording.*?)```", text, flags=re.DOTALL)
     assert snippet.count("\n") <= 6
     names: dict[str, Any] = {}
