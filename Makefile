@@ -7,7 +7,7 @@ PACKAGES := trackfeatures runtime simulator datagen mtlnet serve controllers
 # Debian keeps ldconfig in /sbin, which is not on every user's PATH.
 export PATH := $(CURDIR)/$(BIN):$(PATH):/usr/sbin:/sbin
 
-.PHONY: help setup system demo test check compiled quick fuzz api e2e bench endurance format lock clean
+.PHONY: help setup system demo test check docs compiled quick fuzz api e2e bench endurance format lock clean
 
 help: ## list the targets
 	@grep -hE '^[a-z0-9]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 10
@@ -53,11 +53,15 @@ compiled: $(READY)
 	$(BIN)/datagen collect --rounds 1 --frames 3 --tracks oval --workers 1 --out $$folder/data \
 	  >/dev/null 2>$$folder/said || { cat $$folder/said >&2; exit 1; }; rm -rf $$folder
 
-check: $(READY) ## format, lint, types, imports
+check: $(READY) ## format, lint, types, imports, links
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy $(PACKAGES) tests benchmarks
 	$(BIN)/lint-imports
+	@$(MAKE) --no-print-directory docs
+
+docs: $(READY) ## build the documentation in build/docs; a broken link fails
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict
 
 quick: $(READY) ## the tests that take seconds
 	$(BIN)/pytest $(PARALLEL) -m "not slow and not alone"

@@ -162,16 +162,18 @@ def test_wrong_input_is_one_error_line_that_names_it(
     assert message in errors[0]
 
 
-def readme_commands() -> list[list[str]]:
-    """The project's own commands that the README tells a user to type."""
-    blocks = re.findall(r"```sh\n(.*?)```", (ROOT / "README.md").read_text(), flags=re.DOTALL)
+def documented_commands() -> list[list[str]]:
+    """The project's own commands that the README and docs/ tell a user to type."""
+    pages = [ROOT / "README.md", *(ROOT / "docs").rglob("*.md")]
+    text = "\n".join(page.read_text() for page in pages)
+    blocks = re.findall(r"```sh\n(.*?)```", text, flags=re.DOTALL)
     lines = [line.split("#")[0].split() for block in blocks for line in block.splitlines()]
     return [words for words in lines if words and words[0] in PROGRAMS]
 
 
-def test_the_readme_uses_only_options_that_exist() -> None:
-    commands = readme_commands()
-    assert len(commands) >= 8
+def test_the_documentation_uses_only_options_that_exist() -> None:
+    commands = documented_commands()
+    assert len(commands) >= 50
     for words in commands:
         subcommands = [w for w in words[1:2] if (words[0], w) in COMMANDS]
         shown = re.sub(r"\s+", " ", help_of(words[0], *subcommands).text)

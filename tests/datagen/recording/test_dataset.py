@@ -111,10 +111,10 @@ def test_no_thread_writes_to_the_batch_after_an_error(
     assert len(started) == len(finished) + 1
 
 
-def test_the_readme_snippet_runs_on_a_dataset(
+def test_the_example_of_the_documentation_runs_on_a_dataset(
     dataset: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    text = (Path(__file__).parents[3] / "README.md").read_text()
+    text = (Path(__file__).parents[3] / "docs" / "how-to" / "collect.md").read_text()
     (snippet,) = re.findall(r"```python\n(from datagen\.recording.*?)```", text, flags=re.DOTALL)
     assert snippet.count("\n") <= 6
     names: dict[str, Any] = {}

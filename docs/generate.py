@@ -1,0 +1,136 @@
+"""Fills the reference pages from the code: MkDocs calls `on_page_markdown` for every page.
+
+`<!-- generated: NAME -->` in a page is replaced by the Markdown that `GENERATORS[NAME]` returns.
+"""
+
+import inspect
+import re
+from collections.abc import Iterator
+from importlib import import_module
+from typing import Any
+
+PROGRAMS = ("simulator", "datagen", "mtlnet", "serve", "controllers")
+MARKER = re.compile(r"<!-- generated: (\w+) -->")
+
+
+def on_page_markdown(markdown: str, **_: object) -> str:
+    """The page with its markers replaced; a marker of an unknown name raises KeyError."""
+    return MARKER.sub(lambda marker: GENERATORS[marker.group(1)](), markdown)
+
+
+def commands() -> str:
+    """Every command and subcommand with its arguments and options."""
+    parts = []
+    for program in PROGRAMS:
+        parts.append(f"## {program}")
+        for words, command in _tree((program,), _click(program)):
+            parts += _describe(words, command)
+    return "\n\n".join(parts)
+
+
+def _click(program: str) -> Any:
+    import typer
+
+    return typer.main.get_command(import_module(f"{program}.cli").app)
+
+
+def _tree(words: tuple[str, ...], command: Any) -> Iterator[tuple[tuple[str, ...], Any]]:
+    yield words, command
+    for name, child in getattr(command, "commands", {}).items():
+        yield from _tree((*words, name), child)
+
+
+def _describe(words: tuple[str, ...], command: Any) -> list[str]:
+    parts = [f"### {' '.join(words)}", inspect.cleandoc(command.help or "").replace("\x08\n", "")]
+    shown = [p for p in command.params if p.name != "help" and not getattr(p, "hidden", False)]
+    if shown:
+        rows = ["| | default | |", "|---|---|---|"]
+        for p in shown:
+            rows.append(f"| `{_name(p)}` | {_default(p)} | {_cell(getattr(p, 'help', ''))} |")
+        parts.append("\n".join(rows))
+    return parts
+
+
+def _name(parameter: Any) -> str:
+    return max(parameter.opts, key=len) if parameter.param_type_name == "option" else parameter.name
+
+
+def _default(parameter: Any) -> str:
+    value = parameter.default
+    empty = value is None or value == "" or value is False or callable(value)
+    return "" if empty or "Sentinel" in type(value).__name__ else f"`{value}`"
+
+
+def _cell(text: str | None) -> str:
+    return " ".join((text or "").split()).replace("|", "\\|").replace("<", "&lt;")
+
+
+def _openapi() -> dict[str, Any]:
+    from unittest.mock import MagicMock
+
+    from serve.app import Service
+
+    document: dict[str, Any] = Service(MagicMock()).framework.openapi()  # answers no request
+    return document
+
+
+def operations() -> str:
+    """The operations of the OpenAPI document."""
+    rows = ["| operation | |", "|---|---|"]
+    for path, methods in _openapi()["paths"].items():
+        for method, about in methods.items():
+            rows.append(f"| `{method.upper()} {path}` | {_cell(about.get('summary'))} |")
+    return "\n".join(rows)
+
+
+def answer() -> str:
+    """The fields of the answer of `POST /features`."""
+    schemas = _openapi()["components"]["schemas"]
+    rows = ["| field | |", "|---|---|"]
+    for name, field in schemas["Features"]["properties"].items():
+        rows.append(f"| `{name}` | {_cell(field.get('description'))} |")
+    return "\n".join(rows)
+
+
+def problems() -> str:
+    """The types of problems by status."""
+    from serve.api import problems as module
+
+    kinds = sorted(
+        (k.status, k.name, k.title) for k in vars(module).values() if isinstance(k, module.Kind)
+    )
+    rows = ["| status | type | |", "|---|---|---|"]
+    return "\n".join(rows + [f"| {status} | `{name}` | {title} |" for status, name, title in kinds])
+
+
+def messages() -> str:
+    """The fields of every message of our own, with unit and frame."""
+    from datagen.recording.schema.json_schema import json_schema
+
+    parts = []
+    for name, message in json_schema()["$defs"].items():
+        rows = [f"### {name}\n", "| field | unit | | frame, reference point | absent |"]
+        rows.append("|---|---|---|---|---|")
+        for field, about in message["properties"].items():
+            place = ", ".join(filter(None, map(about.get, ("x-frame", "x-reference-point"))))
+            cells = (about.get("x-unit"), about["description"], place, about.get("x-absent"))
+            rows.append(f"| `{field}` | " + " | ".join(_cell(c) for c in cells) + " |")
+        parts.append("\n".join(rows))
+    return "\n\n".join(parts)
+
+
+def header() -> str:
+    """The generated C header."""
+    from simulator.link.header import c_header
+
+    return f"```c\n{c_header()}\n```"
+
+
+GENERATORS = {
+    "commands": commands,
+    "operations": operations,
+    "answer": answer,
+    "problems": problems,
+    "messages": messages,
+    "header": header,
+}

@@ -1,0 +1,156 @@
+"""The README and the pages in docs/: programs run, commands exist, links lead to files."""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import fields
+from pathlib import Path
+
+import pytest
+
+from simulator.env import OPTIONS
+
+ROOT = Path(__file__).parents[2]
+PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
+PROGRAMS = ("simulator", "datagen", "mtlnet", "serve", "controllers")
+ADDRESS = "http://127.0.0.1:8000"
+# Options that make a command of the README or the tutorial small; the last one given counts.
+SMALL = {
+    ("datagen", "collect"): ["--rounds", "4", "--frames", "30", "--tracks", "oval,coast"],
+    ("mtlnet", "train"): ["--iterations", "2"],
+    ("controllers", "drive"): ["--steps", "10"],
+}
+
+
+def blocks(page: Path, language: str) -> list[str]:
+    """The fenced code blocks of a language in a page."""
+    text = (
+        re.sub(r"^ +", "", page.read_text(), flags=re.M) if language == "sh" else page.read_text()
+    )
+    return re.findall(rf"^```{language}\n(.*?)^```", text, flags=re.DOTALL | re.M)
+
+
+def name(page: Path) -> str:
+    return str(page.relative_to(ROOT))
+
+
+def commands(text: str) -> list[list[str]]:
+    """The project's own commands in a block, one a line, without comments."""
+    lines = [line.split(" #")[0].split() for line in text.splitlines()]
+    return [words for words in lines if words and words[0] in PROGRAMS]
+
+
+def run(words: list[str], folder: Path) -> None:
+    """Run a command in its smallest form; it must succeed."""
+    small = SMALL.get((words[0], words[1]), [])
+    subprocess.run([sys.executable, "-m", *words, *small], cwd=folder, check=True, timeout=300)
+
+
+@pytest.fixture(scope="module")
+def project(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, str]]:
+    """A folder in which the README's commands were run, and the address of its service."""
+    folder = tmp_path_factory.mktemp("project")
+    chain = [words for text in blocks(ROOT / "README.md", "sh") for words in commands(text)]
+    assert [words[:2] for words in chain] == [
+        ["datagen", "collect"],
+        ["mtlnet", "train"],
+        ["mtlnet", "evaluate"],
+        ["serve", "--model"],
+        ["controllers", "drive"],
+    ]
+    for words in chain[:3]:
+        run(words, folder)
+    with subprocess.Popen(
+        [sys.executable, "-m", *chain[3], "--port", "0"],
+        cwd=folder,
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as service:
+        assert service.stderr is not None
+        first = service.stderr.readline()
+        address = re.search(r"http://\S+", first)
+        assert address, first + service.stderr.read()
+        image = "from datagen.recording import Dataset; from pathlib import Path; Path('image.jpg')"
+        image += ".write_bytes(bytes(Dataset.open('datasets/default').select('all').jpeg(0)))"
+        subprocess.run([sys.executable, "-c", image], cwd=folder, check=True)
+        drive = [word.replace(ADDRESS, address.group()) for word in chain[4]]
+        run(drive, folder)
+        yield folder, address.group()
+        service.send_signal(signal.SIGTERM)
+
+
+@pytest.mark.slow
+def test_the_commands_of_the_readme_run(project: tuple[Path, str]) -> None:
+    folder, _ = project
+    assert (folder / "datasets" / "default" / "manifest.json").is_file()
+    assert (folder / "runs" / "latest" / "config.json").is_file()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("page", "number"),
+    [(page, k) for page in PAGES for k in range(len(blocks(page, "python")))],
+    ids=lambda value: name(value) if isinstance(value, Path) else str(value),
+)
+def test_a_python_example_runs(page: Path, number: int, project: tuple[Path, str]) -> None:
+    folder, address = project
+    program = blocks(page, "python")[number].replace(ADDRESS, address)
+    program = program.replace("timeout_s=0.1", "timeout_s=9").replace(
+        "deadline_s=0.05", "deadline_s=8"
+    )
+    program = program.replace("[0, 500, 1000]", "[0, 5, 10]")
+    subprocess.run(
+        [sys.executable, "-W", "error::UserWarning", "-c", program],
+        cwd=folder,
+        check=True,
+        timeout=300,
+    )
+    if "RecordVideo" in program:
+        assert list(folder.glob("videos/*.mp4"))
+
+
+@pytest.mark.slow
+def test_the_tutorial_runs(tmp_path: Path) -> None:
+    text = (ROOT / "docs" / "tutorial.md").read_text()
+    chain = re.findall(r"<!-- run -->\n```sh\n(.*?)```", text, flags=re.DOTALL)
+    assert len(chain) == 4
+    for words in (words for block in chain for words in commands(block)):
+        run([word for word in words if word not in ("--minutes", "1")], tmp_path)
+    assert (tmp_path / "tutorial" / "report.html").is_file()
+
+
+def test_every_link_of_the_readme_leads_to_a_file() -> None:
+    for page in ROOT.glob("*.md"):
+        links = re.findall(r"\]\(([^)#]+)(?:#[^)]*)?\)", page.read_text())
+        missing = [link for link in links if "://" not in link and not (ROOT / link).exists()]
+        assert not missing, f"{page.name} links to {missing}"
+
+
+def test_the_readme_is_short() -> None:
+    assert len((ROOT / "README.md").read_text().splitlines()) <= 130
+
+
+def test_the_table_of_the_environments_names_every_option() -> None:
+    text = (ROOT / "docs" / "reference" / "environments.md").read_text()
+    rows = [line.split("|")[1] for line in text.splitlines() if line.startswith("| `")]
+    named = set(re.findall(r"`(\w+)`", " ".join(rows)))
+    options = {field.name for group in OPTIONS for field in fields(group)}
+    assert named == options | {"render_mode", "max_episode_steps"}
+
+
+@pytest.mark.slow
+def test_the_documentation_builds_without_a_warning(tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path)],
+        cwd=ROOT,
+        env={**os.environ, "NO_MKDOCS_2_WARNING": "1"},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    page = (tmp_path / "reference" / "commands" / "index.html").read_text()
+    assert "--split-test-share" in page
+    assert "<!-- generated" not in page
