@@ -67,7 +67,8 @@ def collect(
     from datagen.execution.collect import collect as run
     from datagen.execution.progress import shown
     from datagen.planning.class_balance import TrackForecast
-    from datagen.planning.plan import LIGHTS, CollectConfig, Shard
+    from datagen.planning.config import CollectConfig, all_lights
+    from datagen.planning.plan import Shard
     from datagen.planning.planner import make_plan
     from datagen.planning.summary import expected_classes, listing, overview
     from datagen.planning.tracks import choose_tracks
@@ -80,7 +81,7 @@ def collect(
         frequency_hz=frequency,
         tracks=choose_tracks(_names(tracks), tracks_dir, unseen=split == UNSEEN),
         lanes=_numbers(lanes),
-        lights=_names(lights) or LIGHTS,
+        lights=_names(lights) or all_lights(),
         stretch=stretch,
         scenes=scenes,
         test_share=split_test_share,
@@ -102,7 +103,7 @@ def collect(
             )
         return
     folder = out or (UNSEEN_FOLDER if split else DEFAULT_FOLDER)
-    mine = plan.rounds if part is None else part.of(plan.rounds)
+    mine = plan.rounds if part is None else part.select(plan.rounds)
     try:
         with shown(len(mine), len(mine) * frames, overview(plan, classes)) as progress:
             result = run(

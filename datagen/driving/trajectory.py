@@ -1,7 +1,7 @@
-"""The lateral course a round is to follow: an offset for each metre driven, left positive, in m.
+"""The lateral course of a round: an offset for each metre driven, in m, left positive.
 
-Perception must see every place on the road and every small angle, so no round just keeps its lane:
-each kind covers the width in another way, and a slow wobble lies over all of them.
+The data must cover the whole width of the road and all small angles to it. Each kind of trajectory
+covers them in another way, and a slow random wobble is added to all.
 """
 
 from collections.abc import Callable
@@ -15,28 +15,28 @@ from simulator.track.road import Road
 
 FloatArray = NDArray[np.float64]
 
-KINDS = ("lane", "offsets", "weave", "lane-changes", "yaw-recoveries", "offset-recoveries")
+TRAJECTORIES = ("lane", "offsets", "weave", "lane-changes", "yaw-recoveries", "offset-recoveries")
 OUTSIDE_M = 1.0
-"""Farthest from an outer marking, outwards, that a course leads."""
+"""Farthest that a course leads outside of an outer marking."""
 BODY_HALF_WIDTH_M = 0.97
 WALL_CLEARANCE_M = 0.75
 EDGE_CLEARANCE_M = 0.7
-JUMP_M = 4.5
-"""Farthest move between two offsets: more at once would be steep."""
+MAX_OFFSET_STEP_M = 4.5
+"""Largest change between two offsets, so that the angle to the road stays small."""
 WOBBLE_ANGLE_RAD = 0.024
 """Standard deviation of the wobble's angle to the road."""
 
 
 @dataclass(frozen=True)
 class Course:
-    """Offset, slope and bend of the course at each metre driven; beyond its end it repeats."""
+    """Offset, slope and curvature at each metre driven. After its end the course repeats."""
 
     offset: FloatArray  # m
     slope: FloatArray  # m per m
-    bend: FloatArray  # 1/m
+    curvature: FloatArray  # 1/m, relative to the road
 
     def at(self, driven_m: float) -> tuple[float, float, float]:
-        """Offset (m), slope and bend (1/m) after `driven_m`, linear between the metres."""
+        """Offset (m), slope and curvature (1/m) after `driven_m`, linearly interpolated."""
         count = len(self.offset)
         cell = int(driven_m)
         part = driven_m - cell
@@ -44,12 +44,12 @@ class Course:
         return (
             float(self.offset[a] + part * (self.offset[b] - self.offset[a])),
             float(self.slope[a] + part * (self.slope[b] - self.slope[a])),
-            float(self.bend[a] + part * (self.bend[b] - self.bend[a])),
+            float(self.curvature[a] + part * (self.curvature[b] - self.curvature[a])),
         )
 
 
-def reach(road: Road) -> float:
-    """How far from the track centre a course may lead."""
+def max_offset(road: Road) -> float:
+    """Farthest (m) from the centre of the track that a course may lead."""
     return min(
         road.lanes * road.lane_width / 2 + OUTSIDE_M,
         road.edge - EDGE_CLEARANCE_M,
@@ -58,14 +58,14 @@ def reach(road: Road) -> float:
 
 
 def make_course(kind: str, road: Road, length_m: float, rng: np.random.Generator) -> Course:
-    """A course of `kind` (one of KINDS), at least `length_m` long."""
+    """A course of `kind` (one of TRAJECTORIES), at least `length_m` long; UserError for others."""
     count = int(length_m) + 1
     if kind not in _MAKERS:
-        raise tf.UserError(f"unknown trajectory {kind!r}; choose {', '.join(KINDS)}")
+        raise tf.UserError(f"unknown trajectory {kind!r}; choose {', '.join(TRAJECTORIES)}")
     base, smoothing_m = _MAKERS[kind](road, count, rng)
     offset = _smooth(base, smoothing_m) + _wobble(count, rng)
-    # Bounded softly at the end of what is allowed, so that the slope stays smooth.
-    limit = reach(road)
+    # tanh instead of a hard limit keeps the slope smooth.
+    limit = max_offset(road)
     offset = limit * np.tanh(1.1 * offset / limit) / np.tanh(1.1)
     offset = _smooth(np.clip(offset, -limit, limit), 3.0)
     slope = np.gradient(offset)
@@ -73,27 +73,29 @@ def make_course(kind: str, road: Road, length_m: float, rng: np.random.Generator
 
 
 def _lane(road: Road, count: int, rng: np.random.Generator) -> tuple[FloatArray, float]:
-    """One lane, a little beside its centre."""
+    """One lane, at a small constant offset from its centre."""
     lane = int(rng.integers(road.lanes))
     centre = tf.lane_centre(lane, road.lanes, road.lane_width)
     return np.full(count, centre + rng.normal(0.0, 0.4)), 1.0
 
 
 def _offsets(road: Road, count: int, rng: np.random.Generator) -> tuple[FloatArray, float]:
-    """Constant offsets anywhere on the road, another one every 60 to 140 m."""
-    limit = reach(road)
+    """Constant offsets anywhere on the road, changed every 60 to 140 m."""
+    limit = max_offset(road)
     offset = rng.uniform(-limit, limit)
 
-    def another() -> float:
+    def next_offset() -> float:
         nonlocal offset
-        offset = rng.uniform(max(offset - JUMP_M, -limit), min(offset + JUMP_M, limit))
+        offset = rng.uniform(
+            max(offset - MAX_OFFSET_STEP_M, -limit), min(offset + MAX_OFFSET_STEP_M, limit)
+        )
         return offset
 
-    return _steps(count, (60.0, 140.0), another, rng), 14.0
+    return _steps(count, (60.0, 140.0), next_offset, rng), 14.0
 
 
 def _weave(road: Road, count: int, rng: np.random.Generator) -> tuple[FloatArray, float]:
-    """Waves within a lane or over the width of the road; wide ones are long ones."""
+    """Sine waves within a lane or over the width of the road; the wider, the longer."""
     half = road.lanes * road.lane_width / 2
     if rng.uniform() < 0.5:
         middle = tf.lane_centre(int(rng.integers(road.lanes)), road.lanes, road.lane_width)
@@ -103,34 +105,34 @@ def _weave(road: Road, count: int, rng: np.random.Generator) -> tuple[FloatArray
         amplitude = rng.uniform(0.4, 0.8) * (half - abs(middle))
     steepest = rng.uniform(0.05, 0.085)
     wave = 2.0 * np.pi * amplitude / steepest
-    # The length of the waves drifts: a fixed one would tie the angle to the offset.
+    # The wavelength drifts: with a constant one, the angle would be a function of the offset.
     phase = np.cumsum(2.0 * np.pi / wave * (1.0 + 0.3 * _noise(count, 80.0, rng)))
     return middle + amplitude * np.sin(phase + rng.uniform(0.0, 2.0 * np.pi)), 1.0
 
 
 def _lane_changes(road: Road, count: int, rng: np.random.Generator) -> tuple[FloatArray, float]:
-    """From lane to lane every 50 to 130 m; on one lane, from one side of it to the other."""
-    places = np.array([tf.lane_centre(n, road.lanes, road.lane_width) for n in range(road.lanes)])
+    """A lane change every 50 to 130 m; on one lane, from one side of it to the other."""
+    centres = np.array([tf.lane_centre(n, road.lanes, road.lane_width) for n in range(road.lanes)])
     if road.lanes == 1:
-        places = np.array([-1.1, 1.1])
-    place = int(rng.integers(len(places)))
+        centres = np.array([-1.1, 1.1])
+    lane = int(rng.integers(len(centres)))
 
     def change() -> float:
-        nonlocal place
-        place = int(rng.choice([n for n in (place - 1, place + 1) if 0 <= n < len(places)]))
-        return float(places[place] + rng.normal(0.0, 0.35))
+        nonlocal lane
+        lane = int(rng.choice([n for n in (lane - 1, lane + 1) if 0 <= n < len(centres)]))
+        return float(centres[lane] + rng.normal(0.0, 0.35))
 
     return _steps(count, (50.0, 130.0), change, rng), 16.0
 
 
 def _yaw_recoveries(road: Road, count: int, rng: np.random.Generator) -> tuple[FloatArray, float]:
-    """A lane, from which the car is turned away every 40 to 90 m and steers back."""
+    """A lane; every 40 to 90 m a fast turn away from it and a slow return."""
     base, _ = _lane(road, count, rng)
     metres = np.arange(count, dtype=np.float64)
     at = rng.uniform(20.0, 60.0)
     while at < count:
         width = rng.uniform(8.0, 14.0)
-        # Away at once, back slowly; the factor e/width makes `steepest` the slope at its start.
+        # x * exp(-x / width): its slope at the start is `steepest`.
         steepest = rng.choice([-1.0, 1.0]) * rng.uniform(0.10, 0.24)
         past = np.maximum(metres - at, 0.0)
         base = base + steepest * past * np.exp(-past / width)
@@ -141,16 +143,15 @@ def _yaw_recoveries(road: Road, count: int, rng: np.random.Generator) -> tuple[F
 def _offset_recoveries(
     road: Road, count: int, rng: np.random.Generator
 ) -> tuple[FloatArray, float]:
-    """A lane, from which the car is pushed 1 to 2.4 m aside every 60 to 110 m: it finds itself
-    there, straight on, for some metres, and comes back."""
+    """A lane; every 60 to 110 m the course is shifted by 1 to 2.4 m for some metres and returns."""
     base, _ = _lane(road, count, rng)
     at = rng.uniform(20.0, 60.0)
     while at < count:
-        aside = rng.choice([-1.0, 1.0]) * rng.uniform(1.0, 2.4)
-        there, back = at + rng.uniform(6.0, 18.0), rng.uniform(8.0, 16.0)
-        base[int(at) : int(there)] += aside
-        past = np.arange(int(there), count) - int(there)
-        base[int(there) :] += aside * np.exp(-0.5 * (past / back) ** 2)
+        shift = rng.choice([-1.0, 1.0]) * rng.uniform(1.0, 2.4)
+        end, width = at + rng.uniform(6.0, 18.0), rng.uniform(8.0, 16.0)
+        base[int(at) : int(end)] += shift
+        past = np.arange(int(end), count) - int(end)
+        base[int(end) :] += shift * np.exp(-0.5 * (past / width) ** 2)
         at += rng.uniform(60.0, 110.0)
     return base, 4.0
 
@@ -172,7 +173,7 @@ def _steps(
     next_offset: Callable[[], float],
     rng: np.random.Generator,
 ) -> FloatArray:
-    """Constant offsets with jumps; smoothing makes the transitions."""
+    """Piecewise constant offsets, for lengths drawn from `apart_m`; to be smoothed."""
     offset = np.empty(count)
     at = 0
     while at < count:
@@ -183,19 +184,19 @@ def _steps(
 
 
 def _wobble(count: int, rng: np.random.Generator) -> FloatArray:
-    """Slow drifting to and fro, as of a driver who does not quite attend."""
+    """Slow random drift of the offset, m, as of an inattentive driver."""
     noise = _noise(count, 9.0, rng)
     return noise * (WOBBLE_ANGLE_RAD / max(float(np.gradient(noise).std()), 1e-9))
 
 
 def _noise(count: int, length_m: float, rng: np.random.Generator) -> FloatArray:
-    """Smooth noise of unit deviation over about `length_m`."""
+    """Noise of unit standard deviation, correlated over about `length_m`."""
     noise = _smooth(rng.normal(size=count + 64), length_m)[:count]
     return noise / max(float(noise.std()), 1e-9)
 
 
 def _smooth(values: FloatArray, deviation_m: float) -> FloatArray:
-    """Gaussian mean over the metres, with the ends held."""
+    """Gaussian filter along the course; the end values continue beyond the ends."""
     half = int(np.ceil(4.0 * deviation_m))
     kernel = np.exp(-0.5 * (np.arange(-half, half + 1) / deviation_m) ** 2)
     padded = np.pad(values, half, mode="edge")

@@ -70,7 +70,7 @@ def collect(
     OSError as they come. Finished rounds stay in every case, unfinished ones leave no trace.
     """
     started = time.perf_counter()
-    mine = plan.rounds if shard is None else shard.of(plan.rounds)
+    mine = plan.rounds if shard is None else shard.select(plan.rounds)
     make_crew(executor, workers, lambda message: None)  # what cannot be is refused first
     require_fitting(folder, plan)
     folder.mkdir(parents=True, exist_ok=True)
@@ -196,7 +196,7 @@ def foreign_files(folder: Path, plan: Plan) -> list[Path]:
 
 
 def _differences(found: dict[str, Any], plan: Plan) -> str:
-    wanted = json.loads(json.dumps(asdict(plan.wanted)))
+    wanted = json.loads(json.dumps(asdict(plan.config)))
     named = [
         f"{name}: {_short(found.get(name))} there, {_short(value)} asked for"
         for name, value in wanted.items()

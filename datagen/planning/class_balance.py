@@ -1,7 +1,8 @@
-"""How often the road goes left, straight and right in a round that is only planned.
+"""Starts of the rounds, chosen so that no class of the heading (left, straight, right) is rare.
 
-A round drives on from its start at the scripted speed, so the classes of its frames follow from
-the track. What traffic costs on one lane is estimated; nothing is simulated.
+Roads are straight for most of their length, and circuits turn more to one side than to the other.
+The classes of a round's frames are forecast from the track and the scripted speed alone: nothing is
+simulated, and the delay by traffic on one lane is estimated.
 """
 
 from collections.abc import Mapping, Sequence
@@ -14,8 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 import trackfeatures as tf
-from datagen.driving.trajectory import reach
-from datagen.planning.plan import RoundPlan, TrackChoice
+from datagen.driving.trajectory import max_offset
+from datagen.planning.config import TrackChoice
+from datagen.planning.plan import RoundPlan
 from simulator.driving.speed import bend_profile
 from simulator.track.catalogue import find_track
 from simulator.track.geometry import Track
@@ -23,11 +25,20 @@ from simulator.track.road import Road
 from simulator.traffic.traffic import DESIRED_KMH
 
 FloatArray = NDArray[np.float64]
-KMH = 3.6
+KMH = 3.6  # km/h per m/s
+
+MIN_SHARE = 0.15
+"""No class may have a smaller share of the frames."""
+TARGET_SHARE = 0.19
+"""Forecast shares are brought to this: `MIN_SHARE` plus the error of the forecast."""
+START_CANDIDATES = 48
+"""Starts that are tried for each round, evenly around the lap."""
+MIN_GAIN = 1e-4
+"""Smallest gain in share, times the number of rounds, that moves a round."""
 
 
 class Forecast(Protocol):
-    """What is expected of a round if it started elsewhere."""
+    """Forecasts the classes of a round's frames for other starts."""
 
     def __call__(self, entry: RoundPlan, starts: FloatArray) -> FloatArray:
         """Shares (N, 3) of the classes left, straight, right from each of `starts` (N,)."""
@@ -35,56 +46,58 @@ class Forecast(Protocol):
 
 
 @dataclass(frozen=True)
-class _Lap:
-    """Cells of a lap: where the track stands for each class, and what the bends allow (m/s)."""
+class _LapProfile:
+    """A lap in cells of equal length: the class of the heading and the speed limit of each."""
 
     is_class: NDArray[np.bool_]  # (3, cells)
-    limit: FloatArray  # (cells,)
+    limit: FloatArray  # (cells,), m/s
     cell_m: float
 
 
 class TrackForecast:
-    """A Forecast from the geometry of the tracks, by name."""
+    """A Forecast from the geometry of the tracks, given by name."""
 
     def __init__(self, tracks: Mapping[str, Track]) -> None:
         self._tracks = dict(tracks)
-        self._lap = cache(self._survey)
+        self._lap = cache(self._lap_profile)
 
     @staticmethod
     def of(choices: tuple[TrackChoice, ...], tracks_dir: Path | None) -> "TrackForecast":
+        """Read the chosen tracks."""
         return TrackForecast({c.name: find_track(c.name, tracks_dir) for c in choices})
 
     def __call__(self, entry: RoundPlan, starts: FloatArray) -> FloatArray:
         lap = self._lap(entry.track, entry.lanes, entry.lane_width_m)
         seconds = lap.cell_m / np.minimum(lap.limit, expected_speed(entry))
-        until = np.concatenate([[0.0], np.cumsum(np.tile(seconds, 2))])
-        lap_s = until[len(seconds)]
-        first = np.interp(starts * len(seconds), np.arange(len(until)), until)
+        # Time at each cell border, over two laps: a round may end in the lap after its start.
+        time = np.concatenate([[0.0], np.cumsum(np.tile(seconds, 2))])
+        lap_s = time[len(seconds)]
+        first = np.interp(starts * len(seconds), np.arange(len(time)), time)
         laps, rest = divmod(entry.frames / entry.frequency_hz, lap_s)
         spent = np.zeros((len(starts), len(tf.Heading)))
-        for kind in tf.Heading:
-            in_class = np.concatenate([[0.0], np.cumsum(np.tile(seconds * lap.is_class[kind], 2))])
-            spent[:, kind] = (
+        for heading in tf.Heading:
+            in_class = np.tile(seconds * lap.is_class[heading], 2)
+            in_class = np.concatenate([[0.0], np.cumsum(in_class)])
+            spent[:, heading] = (
                 laps * in_class[len(seconds)]
-                + np.interp(first + rest, until, in_class)
-                - np.interp(first, until, in_class)
+                + np.interp(first + rest, time, in_class)
+                - np.interp(first, time, in_class)
             )
         return np.asarray(spent / spent.sum(axis=1, keepdims=True))
 
-    def _survey(self, name: str, lanes: int, lane_width_m: float) -> _Lap:
+    def _lap_profile(self, name: str, lanes: int, lane_width_m: float) -> _LapProfile:
         track = self._tracks[name]
-        profile = bend_profile(track, reach(Road(track, lanes, lane_width_m)))
+        profile = bend_profile(track, max_offset(Road(track, lanes, lane_width_m)))
         s = (np.arange(len(profile.limit)) + 0.5) * profile.cell_m
         here, ahead = track.at(s).curvature, track.at(s + tf.LOOK_AHEAD_M).curvature
         pairs = zip(here.tolist(), ahead.tolist(), strict=True)
-        heading = np.array([tf.classify_heading(k, then) for k, then in pairs])
-        return _Lap(
-            np.stack([heading == kind for kind in tf.Heading]), profile.limit, profile.cell_m
-        )
+        classes = np.array([tf.classify_heading(now, then) for now, then in pairs])
+        is_class = np.stack([classes == heading for heading in tf.Heading])
+        return _LapProfile(is_class, profile.limit, profile.cell_m)
 
 
 def expected_speed(entry: RoundPlan) -> float:
-    """m/s on a straight: on one lane, the slowest of the cars in front is not overtaken."""
+    """Speed on a straight, m/s: on one lane, that of the slowest car, which cannot be overtaken."""
     speed = entry.speed_kmh
     if entry.lanes == 1 and entry.traffic:
         low, high = DESIRED_KMH
@@ -92,28 +105,14 @@ def expected_speed(entry: RoundPlan) -> float:
     return speed / KMH
 
 
-# Choosing where rounds start so that no class of the road ahead becomes rare. Roads are straight
-# for most of their length, and circuits turn one way more than the other. The rounds whose start
-# helps most are moved, as few as it takes.
-
-
-LEAST_SHARE = 0.15
-"""No class may have less of the frames..."""
-AIM = 0.19
-"""...and what is forecast is to be above it by what a forecast errs."""
-STARTS = 48
-"""Places around the lap that are tried."""
-GAIN = 1e-4
-
-
-def balanced(rounds: Sequence[RoundPlan], forecast: Forecast) -> tuple[RoundPlan, ...]:
-    """The same rounds, some with other starts; each side of the split is seen to by itself."""
-    made = list(rounds)
-    for side in dict.fromkeys(entry.split for entry in made):
-        chosen = [i for i, entry in enumerate(made) if entry.split == side]
-        for i, start in _better_starts([made[i] for i in chosen], forecast).items():
-            made[chosen[i]] = replace(made[chosen[i]], start=start)
-    return tuple(made)
+def balance_starts(rounds: Sequence[RoundPlan], forecast: Forecast) -> tuple[RoundPlan, ...]:
+    """The same rounds, some with other starts. Each side of the split is balanced on its own."""
+    moved = list(rounds)
+    for side in dict.fromkeys(entry.split for entry in moved):
+        numbers = [i for i, entry in enumerate(moved) if entry.split == side]
+        for i, start in _better_starts([moved[i] for i in numbers], forecast).items():
+            moved[numbers[i]] = replace(moved[numbers[i]], start=start)
+    return tuple(moved)
 
 
 def expected_shares(rounds: Sequence[RoundPlan], forecast: Forecast) -> FloatArray:
@@ -123,23 +122,25 @@ def expected_shares(rounds: Sequence[RoundPlan], forecast: Forecast) -> FloatArr
 
 
 def _better_starts(rounds: Sequence[RoundPlan], forecast: Forecast) -> dict[int, float]:
-    """New starts by place in `rounds`: the greatest gain first, until no class is below AIM."""
+    """New starts by place in `rounds`: greedily the greatest gain, until all classes are above
+    `TARGET_SHARE` or no move helps."""
     shares = np.array([forecast(entry, np.array([entry.start]))[0] for entry in rounds])
-    tried = [(entry.start + np.arange(STARTS) / STARTS) % 1.0 for entry in rounds]
-    options = np.array([forecast(e, starts) for e, starts in zip(rounds, tried, strict=True)])
+    steps = np.arange(START_CANDIDATES) / START_CANDIDATES
+    starts = [(entry.start + steps) % 1.0 for entry in rounds]
+    options = np.array([forecast(e, tried) for e, tried in zip(rounds, starts, strict=True)])
     moved: dict[int, float] = {}
-    while (missing := _missing(shares.mean(axis=0))) > 0.0:
+    while (missing := _missing_share(shares.mean(axis=0))) > 0.0:
         after = shares.mean(axis=0) + (options - shares[:, None]) / len(rounds)
-        gain = missing - _missing(after)
+        gain = missing - _missing_share(after)
         gain[list(moved)] = 0.0
         i, k = np.unravel_index(int(np.argmax(gain)), gain.shape)
-        if gain[i, k] < GAIN / len(rounds):
+        if gain[i, k] < MIN_GAIN / len(rounds):
             break
         shares[i] = options[i, k]
-        moved[int(i)] = round(float(tried[int(i)][k]), 5)
+        moved[int(i)] = round(float(starts[int(i)][k]), 5)
     return moved
 
 
-def _missing(shares: FloatArray) -> FloatArray:
-    """What all classes together lack to AIM; `shares` (..., 3)."""
-    return np.asarray(np.maximum(AIM - shares, 0.0).sum(axis=-1))
+def _missing_share(shares: FloatArray) -> FloatArray:
+    """Sum over the classes of what each lacks to `TARGET_SHARE`; `shares` (..., 3)."""
+    return np.asarray(np.maximum(TARGET_SHARE - shares, 0.0).sum(axis=-1))

@@ -1,4 +1,4 @@
-"""A plan for people: what will be recorded, before it is."""
+"""A plan as tables for the terminal: what will be recorded."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -8,27 +8,27 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 
 import trackfeatures as tf
-from datagen.planning.class_balance import LEAST_SHARE, Forecast, expected_shares
+from datagen.planning.class_balance import MIN_SHARE, Forecast, expected_shares
 from datagen.planning.plan import Plan, RoundPlan
 from datagen.recording.round_metadata import summarize_lights
 from datagen.recording.splits import SIDES
 
 
 def expected_classes(plan: Plan, forecast: Forecast) -> dict[str, dict[str, float]]:
-    """Share of each class of the road ahead that is to be expected, of all and of either side."""
+    """Forecast share of each class of the heading: of all rounds and of each side of the split."""
     sides = {"all": list(plan.rounds), **_sides(plan)}
     return {
         name: {
-            kind.name.lower(): round(float(share), 4)
-            for kind, share in zip(tf.Heading, expected_shares(rounds, forecast), strict=True)
+            heading.name.lower(): round(float(share), 4)
+            for heading, share in zip(tf.Heading, expected_shares(rounds, forecast), strict=True)
         }
         for name, rounds in sides.items()
     }
 
 
 def overview(plan: Plan, classes: dict[str, dict[str, float]]) -> RenderableType:
-    """How many rounds of what; the classes to be expected of either side."""
-    table = Table(title=f"{len(plan.rounds)} rounds of {plan.wanted.frames} frames", box=None)
+    """Number of rounds by each parameter, and the forecast classes, for each side of the split."""
+    table = Table(title=f"{len(plan.rounds)} rounds of {plan.config.frames} frames", box=None)
     table.add_column("")
     sides = _sides(plan)
     for side in sides:
@@ -40,11 +40,11 @@ def overview(plan: Plan, classes: dict[str, dict[str, float]]) -> RenderableType
     table.add_row("light", *(_counts(each) for each in lights))
     shares = (", ".join(f"{k} {v:.0%}" for k, v in classes[side].items()) for side in sides)
     table.add_row("road ahead", *shares)
-    return Group(table, *_rare(classes))
+    return Group(table, *_notes_on_rare_classes(classes))
 
 
 def listing(plan: Plan) -> RenderableType:
-    """One row a round."""
+    """One row for each round."""
     table = Table(box=None)
     names = ("round", "split", "track", "lanes", "traffic", "trajectory", "light", "km/h", "start")
     for name in names:
@@ -63,18 +63,17 @@ def listing(plan: Plan) -> RenderableType:
     return table
 
 
-def _rare(classes: dict[str, dict[str, float]]) -> list[str]:
-    """What even the best starts cannot give."""
+def _notes_on_rare_classes(classes: dict[str, dict[str, float]]) -> list[str]:
     return [
-        f"note: {kind} will be {share:.0%} of all frames; other --tracks, or more rounds, have more"
-        for kind, share in classes["all"].items()
-        if share < LEAST_SHARE
+        f"note: {name} will be {share:.0%} of all frames; other --tracks or more rounds give more"
+        for name, share in classes["all"].items()
+        if share < MIN_SHARE
     ]
 
 
 def _sides(plan: Plan) -> dict[str, list[RoundPlan]]:
-    of = {side: [entry for entry in plan.rounds if entry.split == side] for side in SIDES}
-    return {side: rounds for side, rounds in of.items() if rounds}
+    by_side = {side: [entry for entry in plan.rounds if entry.split == side] for side in SIDES}
+    return {side: rounds for side, rounds in by_side.items() if rounds}
 
 
 def _counts(values: Sequence[Any]) -> str:

@@ -1,29 +1,28 @@
-"""Which tracks a collection drives on."""
+"""The tracks that a collection drives on: TORCS's where they are installed, else our own."""
 
 from pathlib import Path
 
-from datagen.planning.plan import TrackChoice
+from datagen.planning.config import TrackChoice
 from simulator.track.catalogue import OWN_TRACKS, find_track, track_files
 from trackfeatures.errors import UserError
 
-# Those of the paper and of their kind: TORCS's road tracks, from fast to steep and tight.
+# The road tracks of TORCS that the paper uses and similar ones, from fast to steep and tight.
 TORCS_TRACKS = (
     "forza", "alpine-1", "alpine-2", "eroad", "g-track-1", "g-track-2", "g-track-3", "e-track-2",
     "e-track-3",
 )  # fmt: skip
-
-
-# Never trained on, so that a model can be asked about a road it has not seen.
+# Held out of every training plan, for tests on a track that no model was trained on.
 UNSEEN_TORCS, UNSEEN_OWN = "wheel-1", "coast"
 
 
 def choose_tracks(
     names: tuple[str, ...], tracks_dir: Path | None, unseen: bool = False
 ) -> tuple[TrackChoice, ...]:
-    """The named tracks; without names TORCS's nine where all are found, else the project's own.
+    """The named tracks. Without names: the nine of TORCS if all are installed, else our own.
 
-    With `unseen` the one that neither of those plans has; a named one must not be of them.
-    Raises UnknownTrack for a name that is not there, TrackError for a bad file.
+    With `unseen`: the held-out track, or named ones that are in neither of those sets.
+    Raises UnknownTrack for a name that is not found, TrackError for a bad file, UserError for a
+    training track given as unseen.
     """
     own = tuple(name for name in _own_tracks() if name != UNSEEN_OWN)
     torcs = {*TORCS_TRACKS, UNSEEN_TORCS} <= set(track_files(tracks_dir))

@@ -80,7 +80,7 @@ class RoundSimulation:
         self.laps += self.state.lap - lap
         if self.state.collision or self.state.off_track or self.state.backwards:
             self.resets += 1
-            if self.resets > MOST_RESETS * self.plan.steps_a_frame:
+            if self.resets > MOST_RESETS * self.plan.steps_per_frame:
                 raise RoundFailed(
                     f"the car hit something or left the road {self.resets} times on "
                     f"{self.plan.track}, {self.plan.lanes} lanes, {self.plan.speed_kmh:.0f} km/h"
@@ -191,7 +191,7 @@ def scene_of(plan: RoundPlan, tracks_dir: Path | None) -> Iterator[tuple[RoundSi
     speed = plan.speed_kmh / 3.6
     longest = plan.frames / plan.frequency_hz * speed * 1.1 + 50.0
     course = make_course(plan.trajectory, road, longest, np.random.default_rng([plan.seed, 3]))
-    control_hz = plan.frequency_hz * plan.steps_a_frame
+    control_hz = plan.frequency_hz * plan.steps_per_frame
     seed, light = scenery(plan, 0)
     with (
         World(road, traffic=plan.traffic, frequency_hz=control_hz) as world,
@@ -259,7 +259,7 @@ def _next_moment(
         markings=tuple(marking_polylines(camera, road, (now.s, pose), ANNOTATED_M)),
     )
     drive.step(command)
-    for _ in range(drive.plan.steps_a_frame - 1):
+    for _ in range(drive.plan.steps_per_frame - 1):
         drive.step(drive.command())
     return moment
 

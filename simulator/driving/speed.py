@@ -1,4 +1,7 @@
-"""How fast and in which gear: a speed profile of the track, engine and brake commands. SI units."""
+"""Speed of the scripted drivers: a speed profile of the track, and throttle, brake and gear.
+
+SI units.
+"""
 
 from dataclasses import dataclass
 from math import inf
@@ -7,50 +10,55 @@ import numpy as np
 from numpy.typing import NDArray
 
 from simulator.track.geometry import Track
+from simulator.traffic.idm import idm_acceleration
+from simulator.traffic.traffic import Traffic
 from simulator.vehicle.car import GRAVITY, RPM, CarParameters
+from simulator.vehicle.state import CarState
 
-SIDE_ACCELERATION = 4.0  # m/s2 in bends
-BRAKING = 2.5  # m/s2 before them
+LATERAL_ACCELERATION = 4.0  # m/s2 in bends
+BRAKING = 2.5  # m/s2 before bends
 CELL_M = 1.0
 SHIFT_UP_RPM, SHIFT_DOWN_RPM = 5500.0, 2600.0
 TOP_GEAR = 4
-MOST_THROTTLE = 0.9
+MAX_THROTTLE = 0.9
 INTEGRAL_GAIN = 0.15  # 1/s2
 INTEGRAL_LIMIT = 1.0  # m/s2
 
 
 @dataclass(frozen=True)
 class SpeedProfile:
-    """Highest speed (m/s) at each metre of the loop, braking before its bends included."""
+    """Speed limit (m/s) in cells along the lap: of the bends, and of braking before them."""
 
     limit: NDArray[np.float64]
     cell_m: float
 
     def at(self, s: float) -> float:
+        """Limit (m/s) at `s` (m); laps repeat."""
         return float(self.limit[int(s / self.cell_m) % len(self.limit)])
 
 
 def speed_profile(track: Track, desired: float, innermost_y: float) -> SpeedProfile:
-    """`desired` m/s where the road allows it; `innermost_y` (m) is how far inside a bend cuts."""
+    """At most `desired` (m/s); bends are taken up to `innermost_y` (m) inside the centre line."""
     bends = bend_profile(track, innermost_y)
     return SpeedProfile(np.minimum(bends.limit, desired), bends.cell_m)
 
 
 def bend_profile(track: Track, innermost_y: float) -> SpeedProfile:
-    """What the bends alone allow, m/s, for a driver whose wish is no limit."""
+    """Speed limit by the bends alone; `innermost_y` as for `speed_profile`."""
     cells = int(np.ceil(track.length_m / CELL_M))
     cell = track.length_m / cells
     bend = np.abs(track.at((np.arange(cells) + 0.5) * cell).curvature)
     bend = bend / np.maximum(1.0 - bend * innermost_y, 0.3)
-    squared = np.tile(SIDE_ACCELERATION / np.maximum(bend, 1e-6), 2)
-    # The bend that is hardest to brake for counts; twice round: the end brakes for the beginning.
-    fall = 2.0 * BRAKING * cell * np.arange(2 * cells)
-    hardest = np.minimum.accumulate((squared + fall)[::-1])[::-1] - fall
-    return SpeedProfile(np.sqrt(hardest[:cells]), cell)
+    squared = np.tile(LATERAL_ACCELERATION / np.maximum(bend, 1e-6), 2)
+    # v^2 may fall by 2 * BRAKING a metre; the bend ahead that allows least decides. Two laps,
+    # because the end of a lap brakes for the bends at its start.
+    drop = 2.0 * BRAKING * cell * np.arange(2 * cells)
+    allowed = np.minimum.accumulate((squared + drop)[::-1])[::-1] - drop
+    return SpeedProfile(np.sqrt(allowed[:cells]), cell)
 
 
 class Pedals:
-    """Turns a wanted acceleration into throttle, brake and gear, by the car's own figures."""
+    """Converts an acceleration into throttle, brake and gear by the inverse model of the car."""
 
     def __init__(self, car: CarParameters) -> None:
         self._car = car
@@ -64,7 +72,10 @@ class Pedals:
     def press(
         self, acceleration: float, speed: float, error: float, slope: float, dt: float
     ) -> tuple[float, float, int]:
-        """Throttle, brake, gear. `error` = wanted less present speed trims what the model lacks."""
+        """Throttle, brake, gear for `acceleration` (m/s2) on a road of `slope` (rise per m).
+
+        The integral of `error` (target minus actual speed, m/s) trims errors of the model.
+        """
         car = self._car
         step = INTEGRAL_GAIN * error * dt
         self._integral = min(max(self._integral + step, -INTEGRAL_LIMIT), INTEGRAL_LIMIT)
@@ -73,10 +84,10 @@ class Pedals:
         gear = self._choose_gear(speed)
         if force < 0.0:
             return 0.0, min(-force * car.wheel_radius / car.brake_torque, 1.0), gear
-        # The engine's own braking takes its share first (see `engine.engine_torque`).
+        # Engine braking acts at a closed throttle and has to be overcome first: see the powertrain.
         braking = self._engine_braking(speed, gear)
-        wanted = (force / self._pull(speed, gear) + braking) / (1.0 + braking)
-        return min(wanted, MOST_THROTTLE), 0.0, gear
+        throttle = (force / self._full_throttle_force(speed, gear) + braking) / (1.0 + braking)
+        return min(throttle, MAX_THROTTLE), 0.0, gear
 
     def _choose_gear(self, speed: float) -> int:
         if self._rpm(speed, self._gear) > SHIFT_UP_RPM and self._gear < TOP_GEAR:
@@ -97,15 +108,49 @@ class Pedals:
         above = max(self._rpm(speed, gear) - car.idle_rpm, 0.0)
         return car.engine_braking * above / (car.top_rpm - car.idle_rpm)
 
-    def _pull(self, speed: float, gear: int) -> float:
-        """Force (N) of full throttle."""
+    def _full_throttle_force(self, speed: float, gear: int) -> float:
+        """Driving force (N) at full throttle."""
         car = self._car
         rpm = max(self._rpm(speed, gear), car.idle_rpm)
         torque = float(np.interp(rpm, np.arange(len(car.torque)) * 1000.0, car.torque))
         return torque * self._ratio(gear) * car.driveline_efficiency / car.wheel_radius
 
 
-def wanted_acceleration(speed: float, target: float, pressed: float = inf) -> float:
-    """Towards `target`, within comfort; `pressed` is what the car ahead allows (m/s2)."""
+class SpeedControl:
+    """Throttle, brake and gear that follow a speed profile and keep the distance to a leader."""
+
+    def __init__(
+        self, profile: SpeedProfile, track: Track, car: CarParameters, step_s: float
+    ) -> None:
+        """`step_s` is the time between two commands."""
+        self._profile = profile
+        self._track = track
+        self._pedals = Pedals(car)
+        self._step_s = step_s
+
+    def reset(self) -> None:
+        self._pedals.reset()
+
+    def command(self, state: CarState, traffic: Traffic) -> tuple[float, float, int]:
+        """Throttle, brake, gear for one control step."""
+        speed = max(state.speed, 0.0)
+        target = self._profile.at(state.s + 0.5 * speed)
+        follow = inf
+        leader = traffic.leader(state.s, state.to_middle) if traffic.count else None
+        if leader is not None:
+            follow = float(idm_acceleration(leader[0], speed, leader[1], max(target, 1.0)))
+        acceleration = target_acceleration(speed, target, follow)
+        # The trim is for a free road: behind a car, the target speed is not reached on purpose.
+        error = target - speed if follow > acceleration else 0.0
+        error = error if abs(error) < BRAKING else 0.0
+        slope = float(self._track.slope(state.s))
+        return self._pedals.press(acceleration, speed, error, slope, self._step_s)
+
+
+def target_acceleration(speed: float, target: float, follow: float = inf) -> float:
+    """Comfortable acceleration (m/s2) towards `target` (m/s), at most `follow`.
+
+    `follow` is the acceleration that the car ahead allows.
+    """
     free = min(max(1.2 * (target - speed), -BRAKING * 1.6), 2.0)
-    return min(free, pressed)
+    return min(free, follow)

@@ -5,7 +5,8 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-from datagen.planning.plan import CollectConfig, Plan
+from datagen.planning.config import CollectConfig
+from datagen.planning.plan import Plan
 from datagen.planning.planner import make_plan
 from datagen.planning.tracks import choose_tracks
 from datagen.recorder.job import Ending, Job, attempt
@@ -33,7 +34,8 @@ def datagen_here(*args: object) -> subprocess.CompletedProcess[str]:
 
 
 def make_small_plan(rounds: int, frames: int) -> Plan:
-    return make_plan(CollectConfig(rounds, frames, seed=1, tracks=choose_tracks(("oval",), None)))
+    tracks = choose_tracks(("oval",), None)
+    return make_plan(CollectConfig(rounds, frames, seed=1, tracks=tracks, stretch=0))
 
 
 def make_jobs(folder: Path, rounds: int, frames: int) -> list[Job]:

@@ -8,13 +8,13 @@ from numpy.typing import NDArray
 
 import trackfeatures as tf
 from datagen.driving.scripted_driver import ScriptedDriver
-from datagen.driving.trajectory import KINDS, OUTSIDE_M, make_course, reach
+from datagen.driving.trajectory import OUTSIDE_M, TRAJECTORIES, make_course, max_offset
 from simulator.driving.speed import (
     BRAKING,
-    SIDE_ACCELERATION,
+    LATERAL_ACCELERATION,
     Pedals,
     speed_profile,
-    wanted_acceleration,
+    target_acceleration,
 )
 from simulator.track.catalogue import find_track
 from simulator.track.road import Road
@@ -23,14 +23,14 @@ from simulator.vehicle.state import Command
 from simulator.world.world import World
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", TRAJECTORIES)
 @pytest.mark.parametrize("lanes", [1, 2, 3])
 def test_a_course_stays_within_reach_and_is_gentle(kind: str, lanes: int) -> None:
     road = Road(find_track("circuit"), lanes)
     course = make_course(kind, road, 3000.0, np.random.default_rng([lanes, 1]))
     assert len(course.offset) >= 3000
-    assert np.abs(course.offset).max() <= reach(road) + 1e-9
-    assert reach(road) <= lanes * 2.0 + OUTSIDE_M
+    assert np.abs(course.offset).max() <= max_offset(road) + 1e-9
+    assert max_offset(road) <= lanes * 2.0 + OUTSIDE_M
     assert np.abs(course.slope).max() < 0.35
     assert np.allclose(np.gradient(course.offset), course.slope)
     offset, slope, _ = course.at(100.5)
@@ -56,7 +56,7 @@ def test_the_speed_profile_keeps_side_acceleration_and_braking() -> None:
     speed = np.array([profile.at(at) for at in s])
     curvature = np.abs(track.at(s).curvature)
     assert speed.max() == pytest.approx(20.0)
-    assert (speed**2 * curvature).max() <= SIDE_ACCELERATION + 1e-9
+    assert (speed**2 * curvature).max() <= LATERAL_ACCELERATION + 1e-9
     assert np.diff(speed**2).min() >= -2.0 * BRAKING * profile.cell_m - 1e-9
 
 
@@ -68,7 +68,7 @@ def test_pedals_balance_drag_and_slope_and_shift_up_once() -> None:
     assert pedals.press(0.0, 10.0, 0.0, 0.05, 0.05)[0] > throttle
     assert pedals.press(-3.0, 10.0, 0.0, 0.0, 0.05)[1] > 0.1
     assert [pedals.press(0.0, 20.0, 0.0, 0.0, 0.05)[2] for _ in range(5)] == [2] * 5
-    assert wanted_acceleration(10.0, 15.0, pressed=-4.0) == -4.0
+    assert target_acceleration(10.0, 15.0, follow=-4.0) == -4.0
 
 
 @pytest.mark.parametrize("speed", [8.0, 12.0, 18.0])
@@ -132,7 +132,7 @@ def test_labels_vary_enough_to_learn_from() -> None:
                 ("circuit", 3),
                 ("town", 2),
             ],
-            KINDS,
+            TRAJECTORIES,
             strict=True,
         )
     ]
@@ -163,7 +163,7 @@ def _drive(
             features = world.features()
             seen["bad"].append(bool(state.collision or state.off_track or state.backwards))
             seen["angle"].append(state.angle)
-            seen["error"].append(abs(state.to_middle - driver.place))
+            seen["error"].append(abs(state.to_middle - driver.target_offset))
             seen["speed_kmh"].append(state.speed_kmh)
             seen["in_lane"].append(features.ml is not None)
             seen["on_marking"].append(features.m is not None)

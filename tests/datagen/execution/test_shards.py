@@ -36,7 +36,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_a_shard_is_every_nth_round() -> None:
     rounds = make_small_plan(7, 10).rounds
-    parts = [Shard(number, 3).of(rounds) for number in (1, 2, 3)]
+    parts = [Shard(number, 3).select(rounds) for number in (1, 2, 3)]
     assert [e.id[-1] for e in parts[1]] == ["1", "4"]
     assert sorted(e.id for part in parts for e in part) == [e.id for e in rounds]
     assert Shard.parse("2/3") == Shard(2, 3)

@@ -11,17 +11,18 @@ import trackfeatures as tf
 from datagen.driving.scripted_driver import ScriptedDriver
 from datagen.driving.trajectory import make_course
 from datagen.planning.class_balance import (
-    AIM,
-    LEAST_SHARE,
+    MIN_SHARE,
+    TARGET_SHARE,
     TrackForecast,
-    balanced,
+    balance_starts,
     expected_shares,
     expected_speed,
 )
-from datagen.planning.plan import CollectConfig, RoundPlan, TrackChoice
+from datagen.planning.config import CollectConfig, TrackChoice
+from datagen.planning.plan import RoundPlan
 from datagen.planning.planner import make_plan
 from datagen.planning.tracks import TORCS_TRACKS, choose_tracks
-from simulator.driving.speed import SIDE_ACCELERATION, bend_profile, speed_profile
+from simulator.driving.speed import LATERAL_ACCELERATION, bend_profile, speed_profile
 from simulator.track.catalogue import find_track, track_files
 from simulator.track.road import Road
 from simulator.world.world import World
@@ -51,7 +52,7 @@ def test_no_class_is_rare_on_either_side_whatever_the_seed(
         assert plan == make_plan(wanted, forecast)
         for side in ("train", "test"):
             mine = [entry for entry in plan.rounds if entry.split == side]
-            assert expected_shares(mine, forecast).min() >= AIM > LEAST_SHARE
+            assert expected_shares(mine, forecast).min() >= TARGET_SHARE > MIN_SHARE
             mine = [entry for entry in plain.rounds if entry.split == side]
             before.append(expected_shares(mine, forecast).min())
         others = [replace(e, start=0.0) for e in plan.rounds]
@@ -60,7 +61,7 @@ def test_no_class_is_rare_on_either_side_whatever_the_seed(
         moved.append(sum(new != old for new, old in pairs))
     assert np.mean(moved) < 0.25 * rounds
     if rounds < 60:
-        assert min(before) < LEAST_SHARE  # there was something to do
+        assert min(before) < MIN_SHARE  # there was something to do
 
 
 def test_a_class_that_the_tracks_do_not_have_stays_rare_and_nothing_breaks() -> None:
@@ -83,7 +84,7 @@ def test_only_the_rounds_that_help_most_are_moved() -> None:
     )
     starts = (0.0, 0.1, 0.2, 0.3, 0.6, 0.4)
     rounds = [replace(e, start=s) for e, s in zip(plan.rounds, starts, strict=True)]
-    made = balanced(rounds, forecast)
+    made = balance_starts(rounds, forecast)
     assert expected_shares(rounds, forecast).tolist() == pytest.approx([1 / 6, 5 / 6, 0.0])
     assert expected_shares(made, forecast).tolist() == pytest.approx([1 / 3, 1 / 3, 1 / 3])
     assert made[4] == rounds[4]
@@ -125,7 +126,7 @@ def test_the_bend_profile_is_what_braking_backwards_gives() -> None:
     profile = bend_profile(track, 2.0)
     cells = len(profile.limit)
     bend = np.abs(track.at((np.arange(cells) + 0.5) * profile.cell_m).curvature)
-    squared = SIDE_ACCELERATION / np.maximum(bend / np.maximum(1.0 - 2.0 * bend, 0.3), 1e-6)
+    squared = LATERAL_ACCELERATION / np.maximum(bend / np.maximum(1.0 - 2.0 * bend, 0.3), 1e-6)
     for at in range(2 * cells - 1, -1, -1):
         ahead = squared[(at + 1) % cells] + 2.0 * 2.5 * profile.cell_m
         squared[at % cells] = min(squared[at % cells], ahead)
@@ -144,7 +145,7 @@ def test_what_is_driven_has_the_classes_that_were_forecast(traffic: bool, error:
         counts += _driven(entry)
     found = np.array([counts[kind] for kind in tf.Heading]) / counts.total()
     assert counts.total() == 8 * 300
-    assert found.min() > LEAST_SHARE
+    assert found.min() > MIN_SHARE
     assert np.abs(found - expected_shares(rounds, forecast)).max() < error
 
 

@@ -8,15 +8,17 @@ from typing import Any
 import pytest
 
 import trackfeatures as tf
-from datagen.planning.plan import LIGHTS, TRAJECTORIES, CollectConfig, TrackChoice
-from datagen.planning.planner import JITTER, make_plan
+from datagen.driving.trajectory import TRAJECTORIES
+from datagen.planning.config import CollectConfig, TrackChoice, all_lights
+from datagen.planning.planner import CAMERA_JITTER, make_plan
 from datagen.planning.tracks import TORCS_TRACKS, choose_tracks
 
+LIGHTS = all_lights()
 NINE = tuple(TrackChoice(f"track-{i}", f"{i}" * 64) for i in range(9))
 
 
 def wanted(**changes: Any) -> CollectConfig:
-    return replace(CollectConfig(rounds=60, frames=2000, seed=0, tracks=NINE), **changes)
+    return replace(CollectConfig(tracks=NINE, stretch=0), **changes)
 
 
 def test_the_same_wishes_give_the_same_plan_and_others_another() -> None:
@@ -102,7 +104,7 @@ def test_without_torcs_the_projects_own_tracks_are_driven() -> None:
 def test_jittered_cameras_differ_and_stay_near_the_datasets_own() -> None:
     plan = make_plan(wanted(jitter_camera=True))
     about = wanted().camera
-    for name, half in JITTER.items():
+    for name, half in CAMERA_JITTER.items():
         values = [getattr(entry.camera, name) - getattr(about, name) for entry in plan.rounds]
         assert len({*values}) == 60
         assert max(map(abs, values)) <= half + 1e-4

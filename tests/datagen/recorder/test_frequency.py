@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from datagen.planning.plan import CONTROL_HZ, CollectConfig, TrackChoice
+from datagen.planning.config import CollectConfig, TrackChoice
+from datagen.planning.plan import CONTROL_HZ
 from datagen.planning.planner import make_plan
 from datagen.recording import Dataset
 from datagen.view.steps import Steps
@@ -20,10 +21,10 @@ OPTIONS = ("--rounds", "1", "--tracks", "oval", "--lights", "clear", "--stretch"
 def test_the_car_is_steered_often_enough(hertz: int) -> None:
     wanted = CollectConfig(rounds=1, frames=1, seed=0, tracks=(TrackChoice("oval", "0"),))
     entry = make_plan(replace(wanted, frequency_hz=hertz)).rounds[0]
-    control_hz = hertz * entry.steps_a_frame
+    control_hz = hertz * entry.steps_per_frame
     assert control_hz >= CONTROL_HZ
     assert PHYSICS_HZ % control_hz == 0
-    assert (entry.steps_a_frame == 1) == (hertz >= CONTROL_HZ)
+    assert (entry.steps_per_frame == 1) == (hertz >= CONTROL_HZ)
 
 
 def test_every_fifth_frame_is_that_of_a_round_of_twenty_a_second(tmp_path: Path) -> None:

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from datagen.planning.plan import LIGHTS, CollectConfig, TrackChoice
+from datagen.planning.config import CollectConfig, TrackChoice, all_lights
 from datagen.planning.planner import make_plan
 from datagen.recorder.record import scenery
 from datagen.recorder.replay import replay
@@ -12,6 +12,7 @@ from datagen.recording import Dataset
 from datagen.view.steps import Steps
 from tests.datagen.commands import datagen
 
+LIGHTS = all_lights()
 TRACKS = (TrackChoice("oval", "0"),)
 
 
@@ -26,7 +27,7 @@ def test_every_light_comes_before_one_comes_again() -> None:
 
 
 def test_without_stretches_a_round_has_one_light() -> None:
-    plan = make_plan(CollectConfig(rounds=8, frames=500, seed=3, tracks=TRACKS))
+    plan = make_plan(CollectConfig(rounds=8, frames=500, seed=3, tracks=TRACKS, stretch=0))
     assert [len(entry.lights) for entry in plan.rounds] == [1] * 8
 
 

@@ -1,0 +1,103 @@
+"""The options of a collection, with the default of each."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import trackfeatures as tf
+from datagen.recording.images import CODECS
+from datagen.recording.splits import UNSEEN
+from trackfeatures.camera import CameraParameters
+from trackfeatures.errors import UserError
+
+DATASET_FOLDER = Path("datasets/default")
+UNSEEN_FOLDER = Path("datasets/unseen")
+
+FRAMES_PER_SCENE = 200
+"""Default number of frames for each scene; building one takes as long as about 15 frames."""
+SEEDS_PER_PLAN = 1_000_000
+MAX_ROUNDS = SEEDS_PER_PLAN // 2
+"""With more rounds the seeds would overlap those of another plan."""
+
+
+def all_lights() -> tuple[str, ...]:
+    """Names of all lighting conditions of the camera simulation."""
+    from simulator.camera import KINDS  # here, because help texts are printed without the simulator
+
+    return KINDS
+
+
+@dataclass(frozen=True, slots=True)
+class TrackChoice:
+    """Name of a track, and the hash of its geometry when the plan was made."""
+
+    name: str
+    content_hash: str
+
+
+@dataclass(frozen=True)
+class CollectConfig:
+    """Options of a collection. Raises UserError for values that cannot be collected."""
+
+    rounds: int = 60
+    frames: int = 2000
+    """Per round."""
+    seed: int = 0
+    tracks: tuple[TrackChoice, ...] = field(kw_only=True)
+    lanes: tuple[int, ...] = (1, 2, 3)
+    lights: tuple[str, ...] = field(default_factory=all_lights)
+    test_share: float = 0.25
+    """Share of the rounds that are for testing, 0 to below 1."""
+    codec: str = "jpeg"
+    frequency_hz: int = 20
+    """Frames per second. The car is controlled at `plan.CONTROL_HZ` or faster."""
+    camera: CameraParameters = field(default_factory=CameraParameters)
+    stretch: int = 1
+    """Frames after which scenery and light change; 0: they stay the same for the whole round."""
+    scenes: int = 0
+    """Number of sceneries that a round cycles through; 0: one for every `FRAMES_PER_SCENE`."""
+    jitter_camera: bool = False
+    """Vary height, pitch and field of view of the camera a little from round to round."""
+    split: str = ""
+    """"unseen": all rounds are for tests on a track without training data. Else train and test."""
+
+    def __post_init__(self) -> None:
+        self._check_numbers()
+        self._check_choices()
+
+    def _check_numbers(self) -> None:
+        from simulator.world.physics import check_frequency
+
+        if not 1 <= self.rounds <= MAX_ROUNDS or self.frames < 1:
+            raise UserError(
+                f"{self.rounds} rounds of {self.frames} frames asked for; give 1 to {MAX_ROUNDS} "
+                "rounds of at least 1 frame"
+            )
+        if self.stretch < 0:
+            raise UserError(
+                f"a stretch of {self.stretch} frames asked for; give the number of frames until "
+                "the scenery changes, or 0 for one scenery a round"
+            )
+        if self.scenes < 0:
+            raise UserError(
+                f"{self.scenes} scenes a round asked for; give at least 1, or 0 for one for every "
+                f"{FRAMES_PER_SCENE} frames"
+            )
+        if self.seed < 0:
+            raise UserError(f"the seed is {self.seed}; give a whole number from 0 up")
+        if not 0.0 <= self.test_share < 1.0:
+            raise UserError(f"the test share is {self.test_share}; give 0 to below 1, e.g. 0.25")
+        check_frequency(self.frequency_hz)
+
+    def _check_choices(self) -> None:
+        for lanes in self.lanes:
+            tf.check_lanes(lanes, tf.LANE_WIDTH_M)
+        if not (self.lanes and self.tracks and self.lights):
+            raise UserError("tracks, lanes or lights are empty; give at least one of each")
+        for name, given, known in (
+            ("light", self.lights, all_lights()),
+            ("codec", (self.codec,), CODECS),
+        ):
+            if unknown := set(given) - set(known):
+                raise UserError(f"unknown {name} {min(unknown)!r}; choose {', '.join(known)}")
+        if self.split not in ("", UNSEEN):
+            raise UserError(f"there is no split {self.split!r} to collect; give {UNSEEN} or none")
