@@ -13,7 +13,8 @@ import trackfeatures as tf
 from datagen.driving.trajectory import Course, reach
 from simulator.driving.speed import BRAKING, Pedals, speed_profile, wanted_acceleration
 from simulator.track.road import Road
-from simulator.traffic.traffic import EGO_SIZE, SIZE, Traffic, idm_acceleration
+from simulator.traffic.idm import idm_acceleration
+from simulator.traffic.traffic import EGO_CAR_SIZE, TRAFFIC_CAR_SIZE, Traffic
 from simulator.vehicle.car import CarParameters
 from simulator.vehicle.state import CarState, Command
 from simulator.vehicle.surface import SURFACES
@@ -161,7 +162,7 @@ class ScriptedDriver:
         """`wanted` kept on the road and away from cars alongside; False when it had to give way."""
         low, high = -self._reach, self._reach
         length = self._road.track.length_m
-        near = 0.5 * (SIZE[0] + EGO_SIZE[0]) + 2.0 + 0.4 * max(state.speed, 0.0)
+        near = 0.5 * (TRAFFIC_CAR_SIZE[0] + EGO_CAR_SIZE[0]) + 2.0 + 0.4 * max(state.speed, 0.0)
         for s, y in zip(traffic.s.tolist(), traffic.to_middle.tolist(), strict=True):
             ahead = (s - state.s + 0.5 * length) % length - 0.5 * length
             # A car in front in the same lane is kept off by the pedals, not by steering away.

@@ -15,7 +15,7 @@ from datagen.driving.trajectory import KINDS as TRAJECTORIES
 from datagen.recording.images import CODECS
 from datagen.recording.splits import UNSEEN
 from simulator.camera import KINDS as LIGHTS
-from simulator.world.physics import PHYSICS_HZ, check_frequency
+from simulator.world.control_rate import PHYSICS_HZ, check_frequency
 from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
 

@@ -1,4 +1,4 @@
-"""The README's programs with environments run as they stand there."""
+"""The README's programs with environments run, and its table lists every option."""
 
 import re
 import subprocess
