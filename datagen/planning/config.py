@@ -65,7 +65,7 @@ class CollectConfig:
         self._check_choices()
 
     def _check_numbers(self) -> None:
-        from simulator.world.physics import check_frequency
+        from simulator.world.control_rate import check_frequency
 
         if not 1 <= self.rounds <= MAX_ROUNDS or self.frames < 1:
             raise UserError(
