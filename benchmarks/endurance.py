@@ -34,7 +34,7 @@ from mtlnet.inference.image_decoding.decode import decode, inspect
 from mtlnet.inference.model_card import read_card
 from mtlnet.inference.prediction import decode_outputs
 from serve.client import Client, ServiceError
-from serve.workers.control_socket import ask
+from serve.workers.control_socket import send_command
 from tests.serve.conftest import jpeg, picture, publish_untrained
 
 CLIENTS, HERTZ, WORKERS = 8, 20.0, 2
@@ -102,7 +102,7 @@ def disturb(port: int, runs: list[Path], reign: Reign, end: float) -> Counter[st
     begin = time.monotonic()
     plans: dict[str, tuple[float, Callable[[], object]]] = {
         "reload": (RELOAD_S, lambda: _reload(port, runs[(done["reload"] + 1) % 2], reign)),
-        "restart": (RESTART_S, lambda: ask(port, "restart")),
+        "restart": (RESTART_S, lambda: send_command(port, "restart")),
     }
     while True:
         due, name = min((begin + (done[n] + 1) * every, n) for n, (every, _) in plans.items())
@@ -115,7 +115,7 @@ def disturb(port: int, runs: list[Path], reign: Reign, end: float) -> Counter[st
 
 def _reload(port: int, run: Path, reign: Reign) -> None:
     begun = time.monotonic()
-    ask(port, "reload", str(run))
+    send_command(port, "reload", str(run))
     reign.changes.append((begun, time.monotonic(), read_card(run).model_hash))
 
 

@@ -1,4 +1,4 @@
-"""`python -m serve` is the `serve` command."""
+"""`python -m serve` runs the command `serve`."""
 
 from serve.cli import main
 

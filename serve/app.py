@@ -1,4 +1,4 @@
-"""The service as one application: frames by hand, all else by FastAPI."""
+"""The service as one ASGI application: POST /features and /stream directly, the rest by FastAPI."""
 
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable
@@ -13,36 +13,33 @@ from fastapi.responses import JSONResponse, PlainTextResponse, Response
 from starlette.routing import Route
 
 from mtlnet.inference.engine import Engine
-from serve.api import failures, problems
-from serve.api import kserve as inference
-from serve.api import schemas as contract
-from serve.api.console import add_console
-from serve.api.docs import PATH as DOCS
-from serve.api.docs import add_docs
-from serve.api.features import FeaturesEndpoint, FeaturesRequest, FrameHandler, client_of
-from serve.api.http_io import Receive, Reply, Scope, Send, refusal, reply
-from serve.api.problems import Problem
+from serve.api import kserve, problems, schemas
+from serve.api.console import DOCS_PATH, add_console
+from serve.api.features import (
+    FeaturesEndpoint,
+    FeaturesRequest,
+    FrameHandler,
+    RequestFactory,
+    client_address,
+)
+from serve.api.http_io import Receive, Reply, Scope, Send, problem_reply, send_reply
+from serve.api.problems import Problem, install_problem_handlers
 from serve.api.request_options import Headers, check_token
 from serve.api.stream import Stream
 from serve.config import Limits
 from serve.observability.metrics import MEDIA_TYPE, Metrics
 from serve.scheduling.frame_queue import FrameQueue
-from serve.scheduling.rate_limit import Rate
-from serve.scheduling.streams import Streams
+from serve.scheduling.rate_limit import RateLimiter
+from serve.scheduling.streams import StreamTable
 from serve.scheduling.warmup import warm_up
-from serve.workers.shared_memory import Shared, create
+from serve.workers.shared_memory import SharedMemory, create_shared_memory
 
 if TYPE_CHECKING:
     from opentelemetry.trace import Tracer
 
 App = Callable[[Scope, Receive, Send], Awaitable[None]]
-Begin = Callable[[FrameHandler, str, Callable[[Reply], None]], FeaturesRequest]
 
-PROBES = {
-    "/healthz",
-    "/readyz",
-    *inference.PROBES,
-}  # what a balancer asks, often and without a token
+PROBES = {"/healthz", "/readyz", *kserve.PROBES}  # load balancers need no token for these
 DESCRIPTION = "One driver-view image in, track features out. Angles in rad, distances in m."
 
 
@@ -54,97 +51,99 @@ class Service:
         engine: Engine,
         check: Callable[[Engine], None] = warm_up,
         limits: Limits | None = None,
-        shared: Shared | None = None,
-        slot: int = 0,
+        shared: SharedMemory | None = None,
+        block: int = 0,
         tracer: "Tracer | None" = None,
     ) -> None:
-        """`check` warms an engine up and raises when its answers are wrong.
+        """`check` warms up an engine and raises when its outputs are wrong.
 
-        It runs when the application starts (its lifespan): until it is through, /readyz and
-        /features answer 503. `shared` None: this is the only worker; else `slot` is its block.
-        `tracer` None: nothing is traced.
+        It runs when the application starts (its lifespan); until it has returned, /readyz and
+        /features answer 503. `shared` None: this is the only worker; else `block` is its block.
+        `tracer` None: no traces.
         """
         self.limits = limits or Limits()
-        self.shared = shared or create(slots=1)
-        streams = Streams(self.shared.streams())
-        self.perceiver = FrameQueue(engine, check, streams, self.limits.queue)
-        self.metrics = Metrics(self.shared, slot)
-        self.sight = FrameHandler(self.perceiver, self.metrics, self.limits.log_answers)
-        self._begin: Begin = FeaturesRequest
+        self.shared = shared or create_shared_memory(1)
+        streams = StreamTable(self.shared.streams())
+        self.frame_queue = FrameQueue(engine, check, streams, self.limits.queue)
+        self.metrics = Metrics(self.shared, block)
+        self.frames = FrameHandler(self.frame_queue, self.metrics, self.limits.log_answers)
+        self._make_request: RequestFactory = FeaturesRequest
         if tracer is not None:
-            self.sight, self._begin = _traced(self, tracer)
-        self.features = FeaturesEndpoint(self.sight, self._begin)
-        self.rate = Rate(self.shared.clients(), self.limits.rate)
+            self.frames, self._make_request = _traced(self, tracer)
+        self.features = FeaturesEndpoint(self.frames, self._make_request)
+        self.rate_limiter = RateLimiter(self.shared.clients(), self.limits.rate)
         self._token = self.limits.token
-        self._stream: App = Stream(self.sight, self.rate)
+        self._stream: App = Stream(self.frames, self.rate_limiter)
         self.framework = _framework(self)
-        self._other: App = self.framework
+        self._framework_app: App = self.framework
         if tracer is not None:
-            self._stream, self._other = _traced_apps(tracer, self._stream, self._other)
+            self._stream, self._framework_app = _traced_apps(
+                tracer, self._stream, self._framework_app
+            )
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] == "lifespan":
             await self.framework(scope, receive, send)
             return
-        way = "http" if scope["type"] == "http" else "websocket.http"
+        protocol = "http" if scope["type"] == "http" else "websocket.http"
         if not _is_public(scope["path"]):
-            stopped = self._at_the_door(dict(scope["headers"]), client_of(scope))
-            if stopped is not None:
-                await reply(send, stopped, way)
+            refusal = self._authorize(dict(scope["headers"]), client_address(scope))
+            if refusal is not None:
+                await send_reply(send, refusal, protocol)
                 return
         if scope["type"] == "websocket":
             await self._stream(scope, receive, send)
         elif scope["path"] == "/features" and scope["method"] == "POST":
             await self.features(scope, receive, send)
         else:
-            await self._other(scope, receive, send)
+            await self._framework_app(scope, receive, send)
 
     def open(
         self, headers: Headers, client: str, send: Callable[[Reply], None]
     ) -> FeaturesRequest | None:
-        """A POST /features whose body is wanted; None: it was replied to."""
-        stopped = self._at_the_door(headers, client)
-        if stopped is not None:
-            send(stopped)
+        """Begin a POST /features; None: it was refused, and the refusal was sent."""
+        refusal = self._authorize(headers, client)
+        if refusal is not None:
+            send(refusal)
             return None
-        exchange = self._begin(self.sight, client, send)
-        return exchange if exchange.open(headers) else None
+        request = self._make_request(self.frames, client, send)
+        return request if request.open(headers) else None
 
-    def _at_the_door(self, headers: Headers, client: str) -> Reply | None:
-        """The reply to a client who may not come in."""
+    def _authorize(self, headers: Headers, client: str) -> Reply | None:
+        """The refusal of a client over its rate or without the token, else None."""
         try:
-            self.rate.check(client)
+            self.rate_limiter.check(client)
             check_token(headers, self._token)
         except Problem as problem:
-            self.metrics.refused(problem.kind, self.perceiver.waiting)
-            return refusal(problem)
+            self.metrics.count_refusal(problem.type, self.frame_queue.waiting)
+            return problem_reply(problem)
         return None
 
 
-def _traced(service: Service, tracer: "Tracer") -> tuple[FrameHandler, Begin]:
-    from serve.observability.tracing import TracedExchange, TracedSight
+def _traced(service: Service, tracer: "Tracer") -> tuple[FrameHandler, RequestFactory]:
+    from serve.observability.tracing import TracedFeaturesRequest, TracedFrameHandler
 
-    about = (service.perceiver, service.metrics, service.limits.log_answers)
-    return TracedSight(tracer, *about), partial(TracedExchange, tracer)
+    arguments = (service.frame_queue, service.metrics, service.limits.log_answers)
+    return TracedFrameHandler(tracer, *arguments), partial(TracedFeaturesRequest, tracer)
 
 
 def _traced_apps(tracer: "Tracer", *apps: App) -> list[App]:
-    from serve.observability.tracing import Traced
+    from serve.observability.tracing import TracedApp
 
-    return [Traced(tracer, app) for app in apps]
+    return [TracedApp(tracer, app) for app in apps]
 
 
 def _is_public(path: str) -> bool:
-    """Whether a path needs no token: probes, the console's own files, which ask for one, docs."""
-    return path in PROBES or path in ("/", DOCS) or path.startswith("/console/")
+    """Whether a path needs no token: probes, the console (it asks for the token), the docs."""
+    return path in PROBES or path in ("/", DOCS_PATH) or path.startswith("/console/")
 
 
 def _framework(service: Service) -> FastAPI:
     @asynccontextmanager
     async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
-        service.perceiver.start()
+        service.frame_queue.start()
         yield
-        service.perceiver.close()
+        service.frame_queue.close()
 
     app = FastAPI(
         title="driverview",
@@ -152,40 +151,40 @@ def _framework(service: Service) -> FastAPI:
         description=DESCRIPTION,
         lifespan=lifespan,
         redirect_slashes=False,
-        docs_url=None,  # the framework's own pages load their scripts from elsewhere
+        docs_url=None,  # FastAPI's own page loads its scripts from the internet
         redoc_url=None,
     )
-    failures.install(app)
-    contract.install_openapi(app, PROBES)
-    # Reached only with another method than POST: who sends one is told which there is.
+    install_problem_handlers(app)
+    schemas.install_openapi(app, PROBES, token_required=service.limits.token is not None)
+    # Reached with other methods than POST only; answers 405 with the allowed method.
     app.router.routes.append(Route("/features", service.features, methods=["POST"]))
-    _add_status(app, service.perceiver)
+    _add_status(app, service.frame_queue)
     _add_metrics(app, service)
-    inference.install(app, service.sight)
+    kserve.add_kserve(app, service.frames)
     add_console(app)
-    add_docs(app)
     return app
 
 
-def _add_status(app: FastAPI, perceiver: FrameQueue) -> None:
-    @app.get("/healthz", summary="Is the process alive?", response_model=contract.Status)
+def _add_status(app: FastAPI, frame_queue: FrameQueue) -> None:
+    @app.get("/healthz", summary="Is the process alive?", response_model=schemas.Status)
     async def healthz() -> Response:
         return JSONResponse({"status": "alive"})
 
     @app.get(
         "/readyz",
-        summary="Is the model warm, and did it give its golden answer?",
-        response_model=contract.Status,
-        responses=contract.problem_responses(problems.NOT_READY),
+        summary="Is the model warm, and did it pass its check?",
+        response_model=schemas.Status,
+        responses=schemas.problem_responses(problems.NOT_READY),
     )
     async def readyz() -> Response:
-        perceiver.check_ready()
-        return JSONResponse({"status": "ready", "model": perceiver.loaded.origin["model"]})
+        frame_queue.check_ready()
+        model = frame_queue.loaded.provenance["model"]
+        return JSONResponse({"status": "ready", "model": model})
 
-    @app.get("/model", summary="What the model was made from, and for which camera")
+    @app.get("/model", summary="The model card: training, data and camera")
     async def model() -> dict[str, Any]:
-        loaded = perceiver.loaded
-        return {**loaded.origin, **asdict(loaded.engine.card)}
+        loaded = frame_queue.loaded
+        return {**loaded.provenance, **asdict(loaded.engine.card)}
 
 
 def _add_metrics(app: FastAPI, service: Service) -> None:
@@ -195,5 +194,6 @@ def _add_metrics(app: FastAPI, service: Service) -> None:
         response_class=PlainTextResponse,
     )
     async def metrics() -> Response:
-        origin = service.perceiver.loaded.origin
-        return Response(service.metrics.page(time.monotonic(), origin), media_type=MEDIA_TYPE)
+        provenance = service.frame_queue.loaded.provenance
+        page = service.metrics.page(time.monotonic(), provenance)
+        return Response(page, media_type=MEDIA_TYPE)

@@ -1,5 +1,6 @@
-"""The perception service. Run: `serve`, or `serve --model runs/NAME --port 8000 --workers 2`;
-`serve reload` and `serve restart` while it runs.
+"""Command line of the perception service. Run: `serve`, or
+`serve --model runs/NAME --port 8000 --workers 2`; `serve reload` and `serve restart` control a
+running service.
 """
 
 from pathlib import Path
@@ -8,57 +9,77 @@ from typing import Annotated
 import typer
 
 from runtime import cli as command
+from serve.config import Limits, ServiceConfig, check_exposure, read_token
+from trackfeatures.errors import UserError
 
 app = typer.Typer(add_completion=False, rich_markup_mode="rich")
 
 
-Port = Annotated[int, typer.Option(help="The running service's port.", min=1, max=65535)]
+ServicePort = Annotated[int, typer.Option(help="Port of the running service.", min=1, max=65535)]
 Model = Annotated[
-    str, typer.Option(help="A run's folder or its name in runs/; 'latest'; 'default': the shipped.")
+    str,
+    typer.Option(
+        help="A run's folder, its name in runs/, 'latest', or 'default' (the shipped model)."
+    ),
+]
+NewModel = Annotated[
+    str | None,
+    typer.Option(help="Model to load instead of the current one; values as for `serve --model`."),
 ]
 Host = Annotated[str, typer.Option(help="Address to listen on.")]
+Port = Annotated[int, typer.Option(help="Port to listen on; 0: any free one.", min=0, max=65535)]
+RayPort = Annotated[int, typer.Option(help="Port of Ray's proxy.", min=1, max=65535)]
+Workers = Annotated[
+    int,
+    typer.Option(help="Worker processes, each with one engine; one per core.", min=1, max=256),
+]
+Replicas = Annotated[int, typer.Option(help="Engines; each uses one core of the cluster.", min=1)]
 TokenFile = Annotated[
     Path | None,
-    typer.Option(help="What clients must know: Authorization: Bearer. Or $DRIVERVIEW_TOKEN."),
+    typer.Option(
+        help="File with the token that clients send as Authorization: Bearer. "
+        "Default: $DRIVERVIEW_TOKEN."
+    ),
 ]
 Insecure = Annotated[
-    bool, typer.Option("--insecure", help="Listen on an open --host without a token.")
+    bool,
+    typer.Option("--insecure", help="Allow a --host that other machines reach, without a token."),
+]
+RequestRate = Annotated[
+    float,
+    typer.Option(help="Requests a second from one other machine; 0: no limit.", min=0),
+]
+Connections = Annotated[
+    int, typer.Option(help="Largest number of open connections.", min=1, max=65536)
+]
+LogAnswers = Annotated[
+    bool, typer.Option("--log-answers", help="Log answered requests as well as refused ones.")
 ]
 
 
 @app.callback(invoke_without_command=True)
 def serve(
     context: typer.Context,
-    model: Model = "default",
-    host: Host = "127.0.0.1",
-    port: Annotated[
-        int, typer.Option(help="Port to listen on; 0: any free one.", min=0, max=65535)
-    ] = 8000,
-    workers: Annotated[
-        int, typer.Option(help="Processes, each with one engine: one a core.", min=1, max=256)
-    ] = 1,
+    model: Model = ServiceConfig.model,
+    host: Host = ServiceConfig.host,
+    port: Port = ServiceConfig.port,
+    workers: Workers = ServiceConfig.workers,
     token_file: TokenFile = None,
     insecure: Insecure = False,
-    rate: Annotated[
-        float, typer.Option(help="Requests a second of one other machine; 0: any.", min=0)
-    ] = 200.0,
-    connections: Annotated[
-        int, typer.Option(help="Open connections at most.", min=1, max=65536)
-    ] = 256,
-    log_answers: Annotated[
-        bool, typer.Option("--log-answers", help="Log answered requests too, not only refused.")
-    ] = False,
+    rate: RequestRate = Limits.rate,
+    connections: Connections = Limits.connections,
+    log_answers: LogAnswers = False,
 ) -> None:
     """Answer driver-view images over HTTP with track features.
 
-    The first line on stderr says which model answers, and where. Post an image with
+    The first line on stderr names the model and the address. Send an image with
     [bold]curl -H "Content-Type: image/jpeg" --data-binary @frame.jpg URL/features[/bold];
-    the docs are at URL/docs. SIGTERM or Ctrl-C stops it, SIGHUP loads the model anew.
+    the API documentation is at URL/docs. SIGTERM or Ctrl-C stops the service, SIGHUP reloads the
+    model.
     """
     if context.invoked_subcommand is not None:
         return
-    from serve.config import Limits
-    from serve.launch import ServiceConfig, read_token, run
+    from serve.launch import run
 
     token = read_token(token_file)
     limits = Limits(connections=connections, rate=rate, token=token, log_answers=log_answers)
@@ -66,52 +87,41 @@ def serve(
 
 
 @app.command()
-def reload(
-    port: Port = 8000,
-    model: Annotated[
-        str | None, typer.Option(help="Another model than the one served; as for `serve`.")
-    ] = None,
-) -> None:
-    """Load the model anew in the service that runs here, without losing a request.
+def reload(port: ServicePort = ServiceConfig.port, model: NewModel = None) -> None:
+    """Load new weights into the service that runs on this machine; no request is lost.
 
-    The new weights are loaded and checked beside the old. If they are bad, the old ones go on
-    answering, and this command says why.
+    Every worker loads and checks the new weights while the old ones go on answering. If they fail
+    the check, the old weights stay in use and this command prints the reason.
     """
-    from serve.workers.control_socket import ask
+    from serve.workers.control_socket import send_command
 
-    # Its own working folder may be another: a path is told whole.
-    named = str(Path(model).resolve()) if model is not None and Path(model).is_dir() else model
-    typer.echo(ask(port, "reload", named))
+    # The service may run in another working folder: send an absolute path.
+    name = str(Path(model).resolve()) if model is not None and Path(model).is_dir() else model
+    typer.echo(send_command(port, "reload", name))
 
 
 @app.command()
-def restart(port: Port = 8000) -> None:
-    """Replace the workers of the service that runs here one by one, without losing a request."""
-    from serve.workers.control_socket import ask
+def restart(port: ServicePort = ServiceConfig.port) -> None:
+    """Replace the workers of the running service one by one; no request is lost."""
+    from serve.workers.control_socket import send_command
 
-    typer.echo(ask(port, "restart"))
+    typer.echo(send_command(port, "restart"))
 
 
 @app.command()
 def ray(
-    model: Model = "default",
-    host: Host = "127.0.0.1",
-    port: Annotated[int, typer.Option(help="Port of Ray's proxy.", min=1, max=65535)] = 8000,
-    replicas: Annotated[
-        int, typer.Option(help="Engines, each with a core of the cluster.", min=1)
-    ] = 1,
+    model: Model = ServiceConfig.model,
+    host: Host = ServiceConfig.host,
+    port: RayPort = ServiceConfig.port,
+    replicas: Replicas = 1,
     token_file: TokenFile = None,
     insecure: Insecure = False,
 ) -> None:
-    """Serve on Ray, on one machine or many: on the cluster of $RAY_ADDRESS, or on one of its own.
+    """Serve on Ray: on the cluster of $RAY_ADDRESS, or on a new local one.
 
-    Needs [bold]pip install 'driverview\\[rayserve]'[/bold]. The model's folder must be there on
-    all machines.
+    Needs [bold]pip install 'driverview\\[rayserve]'[/bold]. The model's folder must exist on all
+    machines of the cluster.
     """
-    from serve.config import Limits
-    from serve.launch import check_exposure, read_token
-    from trackfeatures.errors import UserError
-
     token = read_token(token_file)
     check_exposure(host, token, insecure)
     try:
@@ -124,4 +134,5 @@ def ray(
 
 
 def main() -> None:
+    """Entry point of the console script."""
     command.main(app)

@@ -1,39 +1,91 @@
-"""How much the service takes from its clients, and how long it waits for them."""
+"""Configuration of the service: limits on its clients, the token, and the address to listen on."""
 
-from dataclasses import dataclass
+import os
+from dataclasses import dataclass, field
 from ipaddress import ip_address
+from pathlib import Path
+
+from trackfeatures.errors import UserError
 
 MAX_BODY_BYTES = 4 << 20
 MAX_HEAD_BYTES = 32 << 10
-MAX_NAME = 128  # characters of a frame's, a request's or a stream's name
-MAX_DEADLINE_MS = 60_000  # the longest a client may give
+MAX_NAME = 128  # characters of a frame id, a request id or a stream id
+MAX_DEADLINE_MS = 60_000  # the longest deadline that a client may set
 TOKEN_VARIABLE = "DRIVERVIEW_TOKEN"
+MIN_TOKEN_LENGTH = 16
 
 
 @dataclass(frozen=True)
 class Limits:
-    """What may be changed without a change of the program; the defaults are those of the README."""
+    """Limits on clients. The README documents these defaults."""
 
     connections: int = 256
     """Open connections of all workers together."""
     queue: int = 4
-    """Frames a worker lets wait while it answers one."""
+    """Frames that may wait in one worker while it processes another."""
     head_s: float = 5.0
-    """Within which the headers of a request must be there."""
+    """Time to receive the headers of a request."""
     body_s: float = 10.0
-    """Within which its body must be there, from its headers on."""
+    """Time to receive the body of a request, counted from the end of its headers."""
     idle_s: float = 30.0
-    """For which a connection may stay open with no request in it."""
+    """Time a connection may stay open without a request."""
     rate: float = 200.0
-    """Requests a second of one client address, in bursts of as many; 0: any number."""
+    """Requests a second from one client address, and the size of a burst; 0: no limit."""
     log_answers: bool = False
-    """Whether answered requests stand in the log, not only refused ones."""
+    """Log every answered request. Refused requests are always logged."""
     token: str | None = None
-    """What `Authorization: Bearer` must hold; None: nothing is asked."""
+    """Required in `Authorization: Bearer`; None: no token is required."""
+
+
+@dataclass(frozen=True)
+class ServiceConfig:
+    """Options of the command `serve`."""
+
+    model: str = "default"
+    """A run's folder, its name in runs/, "latest" or "default"."""
+    host: str = "127.0.0.1"
+    port: int = 8000
+    """0: any free port; the first line on stderr names it."""
+    workers: int = 1
+    insecure: bool = False
+    """Listen on addresses that other machines can reach, without a token."""
+    limits: Limits = field(default_factory=Limits)
+
+
+def read_token(path: Path | None) -> str | None:
+    """The token in a file, else in $DRIVERVIEW_TOKEN, else None. Raises UserError."""
+    if path is None:
+        token = os.environ.get(TOKEN_VARIABLE, "").strip()
+        source = f"${TOKEN_VARIABLE}"
+    elif path.is_file():
+        token, source = path.read_text(encoding="utf-8").strip(), str(path)
+    else:
+        raise UserError(f"there is no token file {path}; create one with `openssl rand -hex 32`")
+    if not token:
+        if path is not None:
+            raise UserError(f"{source} is empty; `openssl rand -hex 32` creates a token")
+        return None
+    printable = token.isascii() and token.isprintable() and " " not in token
+    if len(token) < MIN_TOKEN_LENGTH or not printable:
+        raise UserError(
+            f"the token in {source} must be {MIN_TOKEN_LENGTH} or more printable ASCII characters "
+            "without a space; `openssl rand -hex 32` creates one"
+        )
+    return token
+
+
+def check_exposure(host: str, token: str | None, insecure: bool) -> None:
+    """Raise UserError when other machines could use the service without a token."""
+    if is_loopback(host) or token is not None or insecure:
+        return
+    raise UserError(
+        f"--host {host} can be reached from other machines: set a token (--token-file, or "
+        f"{TOKEN_VARIABLE} in the environment), or pass --insecure if a proxy protects the service"
+    )
 
 
 def is_loopback(host: str) -> bool:
-    """Whether an address, or the name "localhost", means this machine alone."""
+    """Whether an address, or the name "localhost", can be reached from this machine only."""
     try:
         found = ip_address(host.partition("%")[0])
     except ValueError:

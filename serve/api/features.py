@@ -1,7 +1,7 @@
-"""POST /features, whatever carries it. What it takes and gives is in `serve.api.schemas`.
+"""POST /features: from the headers of a request to its reply. The JSON is in `serve.api.schemas`.
 
-The service's own connections (`serve.server.fast_path`) open an `FeaturesRequest` for each request;
-`FeaturesEndpoint` is the same as an ASGI application, for other servers.
+`serve.server.fast_path` creates a `FeaturesRequest` for each request; `FeaturesEndpoint` is the
+same as an ASGI application, for other servers. `FrameHandler` also serves the other endpoints.
 """
 
 import asyncio
@@ -15,128 +15,145 @@ from mtlnet.inference.image_decoding.crop import crop_box
 from mtlnet.inference.image_decoding.decode import decode, inspect
 from mtlnet.inference.image_decoding.errors import ImageError
 from serve.api.http_io import (
-    Departed,
+    ClientDisconnectedError,
     Receive,
     Reply,
     Scope,
     Send,
-    as_problem,
+    problem_reply,
     read_body,
-    refusal,
-    reply,
+    send_reply,
 )
-from serve.api.problems import Problem, failure
-from serve.api.request_options import Headers, RequestOptions, check_headers, read_ask, request_id
-from serve.observability.logs import Refusals, tell_answer
+from serve.api.problems import Problem, as_problem, internal_error
+from serve.api.request_options import (
+    Headers,
+    RequestOptions,
+    check_image_headers,
+    parse_options,
+    request_id_of,
+)
+from serve.observability.logs import RefusalLog, log_answer
 from serve.observability.metrics import Metrics
-from serve.scheduling.frame_queue import Done, Frame, FrameQueue, Perceived, Reader
+from serve.scheduling.frame_queue import (
+    Frame,
+    FrameQueue,
+    FrameResult,
+    PixelReader,
+    ResultCallback,
+)
 from serve.scheduling.streams import stream_key
 from trackfeatures.camera import CameraParameters
 
-SMALL_PIXELS = 640 * 480  # decoded in a millisecond or two
+SMALL_PIXELS = 640 * 480  # decoded in one or two milliseconds
 
 logger = logging.getLogger(__name__)
 
 
 class FrameHandler:
-    """What every way into the service does with a frame: see it, count it, tell of it."""
+    """What every endpoint does with a frame: queue it, count its result, log it."""
 
-    def __init__(self, perceiver: FrameQueue, metrics: Metrics, log_answers: bool) -> None:
-        self.perceiver = perceiver
+    def __init__(self, queue: FrameQueue, metrics: Metrics, log_answers: bool) -> None:
+        self.queue = queue
         self._metrics = metrics
-        self._refusals = Refusals()
+        self._refusals = RefusalLog()
         self._log_answers = log_answers
 
-    def admit(self, ask: RequestOptions, body: bytes, client: str, done: Done) -> list[int] | None:
-        """Have `done` called with what the model sees in an image's bytes, or with an error.
+    def submit(
+        self, options: RequestOptions, body: bytes, client: str, on_result: ResultCallback
+    ) -> list[int] | None:
+        """Queue the image file in `body`; `on_result` is called with its result or an error.
 
-        The part of the image that it sees, as in `crop_of`. Raises Problem, ImageError.
+        Returns the part of the image that the model sees, as `crop_px`. Raises Problem,
+        ImageError.
         """
-        self.perceiver.check_ready()
-        if ask.stream is None:
-            self.perceiver.check_room()  # who has too much to do reads no headers of images
-        camera, fov = self.perceiver.loaded.engine.card.camera, ask.fov_y_deg
+        self.queue.check_ready()
+        if options.stream is None:
+            self.queue.check_capacity()  # an overloaded worker does not parse images
+        camera, fov = self.queue.loaded.engine.card.camera, options.fov_y_deg
         header = inspect(body, camera, fov)
         small = header.width * header.height <= SMALL_PIXELS
-        frame = _frame(ask, client, lambda view: decode(body, header, view, fov), small)
-        self.perceiver.admit(frame, done)
-        return crop_of(header.width, header.height, camera, fov)
+        frame = _frame(options, client, lambda view: decode(body, header, view, fov), small)
+        self.queue.submit(frame, on_result)
+        return crop_px(header.width, header.height, camera, fov)
 
-    async def look(self, ask: RequestOptions, body: bytes, client: str) -> dict[str, Any]:
-        """What `serve.api.schemas.FeaturesEndpoint` says of an image's bytes. Raises Problem,
-        ImageError."""
-        future: asyncio.Future[Perceived] = asyncio.get_running_loop().create_future()
-        crop = self.admit(ask, body, client, partial(settle, future))
-        perceived = await future
-        self.answered(ask, client, perceived)
-        return content_of(ask, perceived, crop)
+    async def predict_file(
+        self, options: RequestOptions, body: bytes, client: str
+    ) -> dict[str, Any]:
+        """The answer for an image file, as in `serve.api.schemas`. Raises Problem, ImageError."""
+        future: asyncio.Future[FrameResult] = asyncio.get_running_loop().create_future()
+        crop = self.submit(options, body, client, partial(resolve, future))
+        result = await future
+        self.record_answer(options, client, result)
+        return response_content(options, result, crop)
 
-    async def see(self, ask: RequestOptions, client: str, read: Reader) -> Perceived:
-        """What the model sees in the pixels that `read` gives. Raises Problem, ImageError."""
-        future: asyncio.Future[Perceived] = asyncio.get_running_loop().create_future()
-        self.perceiver.admit(_frame(ask, client, read, False), partial(settle, future))
-        perceived = await future
-        self.answered(ask, client, perceived)
-        return perceived
+    async def predict_pixels(
+        self, options: RequestOptions, client: str, read: PixelReader
+    ) -> FrameResult:
+        """The result for the pixels that `read` gives. Raises Problem, ImageError."""
+        future: asyncio.Future[FrameResult] = asyncio.get_running_loop().create_future()
+        self.queue.submit(_frame(options, client, read, False), partial(resolve, future))
+        result = await future
+        self.record_answer(options, client, result)
+        return result
 
-    def answered(self, ask: RequestOptions, client: str, perceived: Perceived) -> None:
-        """Count an answer; told to the log where that is wanted."""
-        total_s = (time.monotonic_ns() - ask.stamp_ns) / 1e9
-        self._metrics.answered(perceived, total_s, self.perceiver.waiting)
+    def record_answer(self, options: RequestOptions, client: str, result: FrameResult) -> None:
+        """Count an answer, and log it where that is configured."""
+        total_s = (time.monotonic_ns() - options.stamp_ns) / 1e9
+        self._metrics.count_answer(result, total_s, self.queue.waiting)
         if self._log_answers:
-            tell_answer(ask.request_id, client, 1e3 * total_s)
+            log_answer(options.request_id, client, 1e3 * total_s)
 
-    def refused(self, error: Problem | ImageError, request: str, client: str) -> Problem:
-        """The problem that an error is to a client; counted, and told to the log."""
+    def record_refusal(self, error: Problem | ImageError, request_id: str, client: str) -> Problem:
+        """Count and log an error; the problem to answer with."""
         problem = as_problem(error)
-        self._refusals.tell(request, client, problem)
-        self._metrics.refused(problem.kind, self.perceiver.waiting)
+        self._refusals.log(request_id, client, problem)
+        self._metrics.count_refusal(problem.type, self.queue.waiting)
         return problem
 
 
 class FeaturesRequest:
-    """One request, from its headers to its reply: `open`, then `take` its body.
+    """One request, from its headers to its reply: call `open`, then `submit` with its body.
 
-    `send` is called once, unless the client departs before its body is whole.
+    `send` is called once, unless the client disconnects before its body is complete.
     """
 
-    __slots__ = ("_ask", "_client", "_crop", "_name", "_send", "_sight")
+    __slots__ = ("_client", "_crop", "_frames", "_options", "_request_id", "_send")
 
-    def __init__(self, sight: FrameHandler, client: str, send: Callable[[Reply], None]) -> None:
-        self._sight = sight
+    def __init__(self, frames: FrameHandler, client: str, send: Callable[[Reply], None]) -> None:
+        self._frames = frames
         self._client = client
         self._send = send
 
     def open(self, headers: Headers) -> bool:
-        """Whether the body is wanted; if not, it was refused."""
-        stamp = time.monotonic_ns()
-        self._name = request_id(headers)
+        """Check the headers; False: the request was refused, its body is not needed."""
+        stamp_ns = time.monotonic_ns()
+        self._request_id = request_id_of(headers)
         try:
             if b"x-stream-id" not in headers:
-                self._sight.perceiver.check_room()  # who has too much to do reads no more
-            self._ask = read_ask(headers, stamp, self._name)
-            check_headers(headers)
+                self._frames.queue.check_capacity()  # an overloaded worker reads no bodies
+            self._options = parse_options(headers, stamp_ns, self._request_id)
+            check_image_headers(headers)
         except Problem as problem:
             self.refuse(problem)
             return False
         return True
 
-    def take(self, body: bytes) -> None:
-        """Have the whole body answered."""
+    def submit(self, body: bytes) -> None:
+        """Queue the complete body."""
         try:
-            self._crop = self._sight.admit(self._ask, body, self._client, self._answer)
+            self._crop = self._frames.submit(self._options, body, self._client, self._on_result)
         except (Problem, ImageError) as error:
             self.refuse(error)
         except Exception:
-            logger.exception("request %s failed", self._name)
-            self.refuse(failure())
+            logger.exception("request %s failed", self._request_id)
+            self.refuse(internal_error())
 
     def refuse(self, error: Problem | ImageError) -> None:
-        """Reply with the problem that an error is."""
-        problem = self._sight.refused(error, self._name, self._client)
-        self._send(refusal(problem, (b"x-request-id", self._name.encode())))
+        """Reply with the problem of an error."""
+        problem = self._frames.record_refusal(error, self._request_id, self._client)
+        self._send(problem_reply(problem, (b"x-request-id", self._request_id.encode())))
 
-    def _answer(self, result: Perceived | Exception) -> None:
+    def _on_result(self, result: FrameResult | Exception) -> None:
         try:
             if isinstance(result, Exception):
                 raise result
@@ -144,46 +161,47 @@ class FeaturesRequest:
         except (Problem, ImageError) as error:
             self.refuse(error)
         except Exception:
-            logger.exception("request %s failed", self._name)
-            self.refuse(failure())
+            logger.exception("request %s failed", self._request_id)
+            self.refuse(internal_error())
         else:
             self._send(reply)
 
-    def _reply(self, perceived: Perceived) -> Reply:
-        ask = self._ask
-        self._sight.answered(ask, self._client, perceived)
-        headers = [(b"x-request-id", self._name.encode()), ask.format.header]
-        return Reply(200, headers, ask.format.encode(content_of(ask, perceived, self._crop)))
+    def _reply(self, result: FrameResult) -> Reply:
+        options = self._options
+        self._frames.record_answer(options, self._client, result)
+        headers = [(b"x-request-id", self._request_id.encode()), options.format.header]
+        content = response_content(options, result, self._crop)
+        return Reply(200, headers, options.format.encode(content))
+
+
+RequestFactory = Callable[[FrameHandler, str, Callable[[Reply], None]], FeaturesRequest]
+"""Makes a request from the handler, the client's address and the function that sends the reply."""
 
 
 class FeaturesEndpoint:
-    """The endpoint, as an ASGI application."""
+    """POST /features as an ASGI application."""
 
     def __init__(
-        self,
-        sight: FrameHandler,
-        begin: Callable[
-            [FrameHandler, str, Callable[[Reply], None]], FeaturesRequest
-        ] = FeaturesRequest,
+        self, frames: FrameHandler, make_request: RequestFactory = FeaturesRequest
     ) -> None:
-        self._sight = sight
-        self._begin = begin
+        self._frames = frames
+        self._make_request = make_request
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        found: asyncio.Future[Reply] = asyncio.get_running_loop().create_future()
-        exchange = self._begin(self._sight, client_of(scope), partial(settle, found))
-        if exchange.open(dict(scope["headers"])):
+        reply: asyncio.Future[Reply] = asyncio.get_running_loop().create_future()
+        request = self._make_request(self._frames, client_address(scope), partial(resolve, reply))
+        if request.open(dict(scope["headers"])):
             try:
-                exchange.take(await read_body(receive))
-            except Departed:
+                request.submit(await read_body(receive))
+            except ClientDisconnectedError:
                 return
             except Problem as problem:
-                exchange.refuse(problem)
-        await reply(send, await found)
+                request.refuse(problem)
+        await send_reply(send, await reply)
 
 
-def settle(future: "asyncio.Future[Any]", result: Any) -> None:
-    """Give a future its result, or the exception that it is; none is due to who was cancelled."""
+def resolve(future: "asyncio.Future[Any]", result: Any) -> None:
+    """Set a future's result or exception; ignored when the future was cancelled."""
     if future.done():
         return
     if isinstance(result, Exception):
@@ -192,36 +210,38 @@ def settle(future: "asyncio.Future[Any]", result: Any) -> None:
         future.set_result(result)
 
 
-def _frame(ask: RequestOptions, client: str, read: Reader, small: bool) -> Frame:
-    stream = stream_key(client, ask.stream) if ask.stream else 0
-    return Frame(read, ask.stamp_ns, stream, ask.deadline_ns, small)
+def _frame(options: RequestOptions, client: str, read: PixelReader, small: bool) -> Frame:
+    stream = stream_key(client, options.stream) if options.stream else 0
+    return Frame(read, options.stamp_ns, stream, options.deadline_ns, small)
 
 
-def client_of(scope: Scope) -> str:
-    """The address of whoever asks."""
+def client_address(scope: Scope) -> str:
+    """The client's address, empty where it is unknown."""
     client = scope.get("client")
     return client[0] if client else ""
 
 
-def crop_of(
+def crop_px(
     width: int, height: int, view: CameraParameters, fov_y_deg: float | None
 ) -> list[int] | None:
-    """[left, top, width, height] of what the model sees of a picture, px; None: all of it."""
+    """[left, top, width, height] of the part the model sees, px; None: the whole image."""
     box = crop_box(width, height, view, fov_y_deg)
     return None if box is None else [box.left, box.top, box.width, box.height]
 
 
-def content_of(ask: RequestOptions, perceived: Perceived, crop: list[int] | None) -> dict[str, Any]:
-    """The answer, not through the schema: the tests hold it to that, once for all requests."""
+def response_content(
+    options: RequestOptions, result: FrameResult, crop: list[int] | None
+) -> dict[str, Any]:
+    """The answer. Not validated against the schema here, for speed; the tests validate it."""
     return {
-        **perceived.answer.as_json(),
-        **perceived.origin,
+        **result.prediction.as_json(),
+        **result.provenance,
         "crop_px": crop,
         "timing_ms": {
-            "queue": round(perceived.queue_ms, 3),
-            "decode": round(perceived.decode_ms, 3),
-            "forward": round(perceived.forward_ms, 3),
-            "total": round((time.monotonic_ns() - ask.stamp_ns) / 1e6, 3),
+            "queue": round(result.queue_ms, 3),
+            "decode": round(result.decode_ms, 3),
+            "forward": round(result.forward_ms, 3),
+            "total": round((time.monotonic_ns() - options.stamp_ns) / 1e6, 3),
         },
-        "frame_id": ask.frame_id,
+        "frame_id": options.frame_id,
     }

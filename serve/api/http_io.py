@@ -1,4 +1,4 @@
-"""A request on its way in and out: its whole body within the limit, its answer in one go."""
+"""Reading the body of a request within the size limit, and writing a whole reply."""
 
 from collections.abc import Awaitable, Callable, MutableMapping
 from functools import lru_cache
@@ -7,9 +7,8 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from mtlnet.inference.image_decoding.errors import ImageError
-from serve.api.problems import MEDIA_TYPE, Kind, Problem, image_problem
-from serve.api.request_options import too_large
+from serve.api.problems import MEDIA_TYPE, Problem, ProblemType
+from serve.api.request_options import body_too_large
 from serve.config import MAX_BODY_BYTES
 
 Scope = MutableMapping[str, Any]
@@ -22,79 +21,76 @@ STATUS_LINES: dict[int, bytes] = {
     status: f"HTTP/1.1 {status} {status.phrase}\r\n".encode() for status in HTTPStatus
 }
 PROBLEM_HEADER: Header = (b"content-type", MEDIA_TYPE.encode())
-KNOWN_PROBLEMS = 128  # whose replies are kept, ready to be sent again
-encode_problem = msgspec.json.Encoder().encode
+CACHED_PROBLEMS = 128  # encoded problems that are kept
+_encode_json = msgspec.json.Encoder().encode
 
 
 class Reply(NamedTuple):
-    """A whole answer to a request; its length stands not in the headers."""
+    """A complete HTTP reply; `headers` does not include Content-Length."""
 
     status: int
     headers: list[Header]
     body: bytes
 
 
-class Departed(Exception):
-    """The client left before its body was whole: nobody waits for an answer."""
+class ClientDisconnectedError(Exception):
+    """The client closed the connection before its body was complete."""
 
 
 async def read_body(receive: Receive) -> bytes:
-    """The whole body, as long as it stays within the limit. Raises Problem, Departed."""
+    """The whole body. Raises Problem when it is too large, ClientDisconnectedError."""
     message = await receive()
     if message["type"] == "http.disconnect":
-        raise Departed
+        raise ClientDisconnectedError
     body: bytes = message.get("body", b"")
     if not message.get("more_body", False):
-        check_size(len(body))
+        check_body_size(len(body))
         return body
     parts = bytearray(body)
     while message.get("more_body", False):
         message = await receive()
         if message["type"] == "http.disconnect":
-            raise Departed
+            raise ClientDisconnectedError
         parts += message.get("body", b"")
-        check_size(len(parts))
+        check_body_size(len(parts))
     return bytes(parts)
 
 
-def check_size(size: int) -> None:
-    """Raise Problem when a body of so many bytes is too large."""
+def check_body_size(size: int) -> None:
+    """Raise Problem when a body of `size` bytes is too large."""
     if size > MAX_BODY_BYTES:
-        raise too_large(f"more than {MAX_BODY_BYTES} bytes")
+        raise body_too_large(f"more than {MAX_BODY_BYTES} bytes")
 
 
-async def reply(send: Send, whole: Reply, way: str = "http") -> None:
-    """Send a reply; `way` "websocket.http": to the handshake of a WebSocket."""
-    headers = [*whole.headers, (b"content-length", b"%d" % len(whole.body))]
-    await send({"type": f"{way}.response.start", "status": whole.status, "headers": headers})
-    await send({"type": f"{way}.response.body", "body": whole.body})
+async def send_reply(send: Send, reply: Reply, protocol: str = "http") -> None:
+    """Send a reply over ASGI; `protocol` "websocket.http": as the refusal of a handshake."""
+    headers = [*reply.headers, (b"content-length", b"%d" % len(reply.body))]
+    await send({"type": f"{protocol}.response.start", "status": reply.status, "headers": headers})
+    await send({"type": f"{protocol}.response.body", "body": reply.body})
 
 
-def refusal(problem: Problem, *headers: Header) -> Reply:
-    """The reply that tells a client of a problem."""
-    added, content = _told(problem.kind, problem.detail, problem.retry_after_ms)
-    return Reply(problem.kind.status, [*added, *headers], content)
+def problem_reply(problem: Problem, *headers: Header) -> Reply:
+    """The reply for a problem."""
+    own_headers, body = _encode_problem(problem.type, problem.detail, problem.retry_after_ms)
+    return Reply(problem.type.status, [*own_headers, *headers], body)
 
 
-@lru_cache(KNOWN_PROBLEMS)
-def _told(kind: Kind, detail: str, retry_after_ms: int | None) -> tuple[list[Header], bytes]:
-    """The headers and the body that tell of a problem; an overloaded service says few things."""
-    problem = Problem(kind, detail, retry_after_ms)
-    added = [(k.lower().encode(), v.encode()) for k, v in problem.headers.items()]
-    return [PROBLEM_HEADER, *added], encode_problem(problem.content)
+@lru_cache(CACHED_PROBLEMS)
+def _encode_problem(
+    problem_type: ProblemType, detail: str, retry_after_ms: int | None
+) -> tuple[list[Header], bytes]:
+    """The headers and the body of a problem; an overloaded service repeats a few of them."""
+    problem = Problem(problem_type, detail, retry_after_ms)
+    headers = [(k.lower().encode(), v.encode()) for k, v in problem.headers.items()]
+    return [PROBLEM_HEADER, *headers], _encode_json(problem.content)
 
 
-def head_of(whole: Reply, *more: Header) -> bytes:
-    """The bytes of a reply before its body, as HTTP/1.1 has them."""
+def encode_head(reply: Reply, *extra: Header) -> bytes:
+    """The bytes of a reply before its body, in HTTP/1.1."""
     lines = [
-        STATUS_LINES[whole.status],
-        *[b"%b: %b\r\n" % header for header in more],
-        *[b"%b: %b\r\n" % header for header in whole.headers],
-        b"content-length: %d\r\n\r\n" % len(whole.body),
+        STATUS_LINES[reply.status],
+        *[b"%b: %b\r\n" % header for header in extra],
+        *[b"%b: %b\r\n" % header for header in reply.headers],
+        b"content-length: %d\r\n\r\n" % len(reply.body),
     ]
     return b"".join(lines)
-
-
-def as_problem(error: Problem | ImageError) -> Problem:
-    """What an error of the image's reader, or a problem already, is to a client."""
-    return image_problem(error) if isinstance(error, ImageError) else error

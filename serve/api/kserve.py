@@ -3,7 +3,7 @@
 Inputs: `image` (BYTES [1, 1], the bytes of a JPEG or PNG file) or `pixels` (UINT8 [1, height,
 width, 3], RGB). Outputs, float32: `distances_m` (1, 5) in the order ml, mr, l, m, r, NaN where
 absent; `std` in the order of `mtlnet.inference.uncertainty`; `out_of_distribution` 0 or 1; the
-others are named and mean as in POST /features, whose request headers hold here too.
+others as in POST /features, whose request headers apply here too.
 """
 
 import logging
@@ -21,21 +21,26 @@ from mtlnet.inference.image_decoding.decode import check_size, crop_and_resize, 
 from mtlnet.inference.image_decoding.errors import ImageError
 from mtlnet.inference.prediction import Prediction
 from mtlnet.inference.uncertainty import FEATURES
-from serve.api.features import FrameHandler, client_of
-from serve.api.http_io import Departed, read_body
+from serve.api.features import FrameHandler, client_address
+from serve.api.http_io import ClientDisconnectedError, read_body
 from serve.api.kserve_tensors import (
     InferRequest,
-    invalid,
-    parse,
+    encode_response,
+    invalid_request,
+    parse_request,
     read_image_bytes,
     read_pixels,
-    write,
 )
-from serve.api.problems import MEDIA_TYPE, NOT_READY, Problem, failure
-from serve.api.request_options import Headers, check_body_headers, read_ask, request_id
+from serve.api.problems import MEDIA_TYPE, NOT_READY, Problem, internal_error
+from serve.api.request_options import (
+    Headers,
+    check_body_headers,
+    parse_options,
+    request_id_of,
+)
 from serve.api.schemas import REFUSALS, header_parameters, problem_responses
 from serve.config import MAX_BODY_BYTES
-from serve.scheduling.frame_queue import Reader
+from serve.scheduling.frame_queue import PixelReader
 
 NAME, VERSION = "track", "1"
 HEADER = "Inference-Header-Content-Length"
@@ -73,11 +78,11 @@ REQUEST: dict[str, Any] = {
     "type": "object",
     "required": ["inputs"],
     "properties": {
-        "id": {"type": ["string", "null"], "description": "comes back in the answer"},
+        "id": {"type": ["string", "null"], "description": "returned in the answer"},
         "inputs": {"type": "array", "minItems": 1, "maxItems": 1, "items": TENSOR},
         "outputs": {
             "type": "array",
-            "description": "which outputs are wanted; without it, all",
+            "description": "the requested outputs; all if absent",
             "items": {
                 "type": "object",
                 "required": ["name"],
@@ -86,7 +91,7 @@ REQUEST: dict[str, Any] = {
         },
         "parameters": {
             **PARAMETERS,
-            "description": "`binary_data_output`: outputs are wanted as bytes behind the JSON part",
+            "description": "`binary_data_output`: return outputs as bytes after the JSON part",
         },
     },
 }
@@ -96,14 +101,14 @@ INFER_BODY: dict[str, Any] = {
             "name": HEADER,
             "in": "header",
             "required": False,
-            "description": "Bytes of the body's JSON part, where binary tensors follow it",
+            "description": "Length of the JSON part, bytes, where binary tensors follow it",
             "schema": {"type": "integer", "minimum": 0, "maximum": MAX_BODY_BYTES},
         },
         *header_parameters(),
     ],
     "requestBody": {
         "required": True,
-        "description": "An inference request in JSON; with its header's length also binary tensors",
+        "description": "An inference request in JSON, optionally followed by binary tensors",
         "content": {
             "application/json": {"schema": REQUEST},
             "application/octet-stream": {"schema": {"type": "string", "format": "binary"}},
@@ -112,7 +117,7 @@ INFER_BODY: dict[str, Any] = {
 }
 BINARY_ANSWER: dict[int | str, dict[str, Any]] = {
     200: {
-        "description": "The outputs, in JSON, or with binary ones behind it",
+        "description": "The outputs in JSON, or JSON followed by binary tensors",
         "content": {
             "application/json": {"schema": {"type": "object"}},
             "application/octet-stream": {"schema": {"type": "string", "format": "binary"}},
@@ -123,7 +128,7 @@ BINARY_ANSWER: dict[int | str, dict[str, Any]] = {
 logger = logging.getLogger(__name__)
 
 
-def install(app: FastAPI, sight: FrameHandler) -> None:
+def add_kserve(app: FastAPI, frames: FrameHandler) -> None:
     """Add the protocol's paths to `app`."""
     not_ready = problem_responses(NOT_READY)
 
@@ -133,7 +138,7 @@ def install(app: FastAPI, sight: FrameHandler) -> None:
 
     @app.get("/v2/health/ready", summary="Is the service ready?", responses=not_ready)
     async def ready() -> dict[str, Any]:
-        sight.perceiver.check_ready()
+        frames.queue.check_ready()
         return {"ready": True}
 
     @app.get("/v2", summary="The service, as the Open Inference Protocol describes it")
@@ -142,9 +147,8 @@ def install(app: FastAPI, sight: FrameHandler) -> None:
         return {"name": "driverview", "version": version("driverview"), "extensions": extensions}
 
     for model in MODELS:
-        hidden = model != MODEL
-        add: dict[str, Any] = {"include_in_schema": not hidden}
-        app.get(model, summary="The model's inputs and outputs", **add)(_metadata(sight))
+        add: dict[str, Any] = {"include_in_schema": model == MODEL}
+        app.get(model, summary="The model's inputs and outputs", **add)(_metadata(frames))
         app.get(f"{model}/ready", summary="Is the model ready?", responses=not_ready, **add)(ready)
         app.post(
             f"{model}/infer",
@@ -152,75 +156,77 @@ def install(app: FastAPI, sight: FrameHandler) -> None:
             responses={**BINARY_ANSWER, **problem_responses(*REFUSALS)},
             openapi_extra=INFER_BODY,
             **add,
-        )(_infer(sight))
+        )(_infer(frames))
 
 
-def _metadata(sight: FrameHandler) -> Any:
+def _metadata(frames: FrameHandler) -> Any:
     async def metadata() -> dict[str, Any]:
         outputs = [{"name": k, "datatype": "FP32", "shape": [1, n]} for k, n in OUTPUTS.items()]
-        platform = f"driverview_{sight.perceiver.loaded.origin['engine']}"
-        found = {"name": NAME, "versions": [VERSION], "platform": platform}
-        return {**found, "inputs": INPUTS, "outputs": outputs}
+        platform = f"driverview_{frames.queue.loaded.provenance['engine']}"
+        content = {"name": NAME, "versions": [VERSION], "platform": platform}
+        return {**content, "inputs": INPUTS, "outputs": outputs}
 
     return metadata
 
 
-def _infer(sight: FrameHandler) -> Any:
+def _infer(frames: FrameHandler) -> Any:
     async def infer(request: Request) -> Response:
-        stamp = time.monotonic_ns()
+        stamp_ns = time.monotonic_ns()
         headers: Headers = dict(request.scope["headers"])
-        name, client = request_id(headers), client_of(request.scope)
+        request_id, client = request_id_of(headers), client_address(request.scope)
         try:
-            return await _answer(sight, request, headers, stamp, name)
-        except Departed:
-            return Response(status_code=400)  # nobody reads it
+            return await _answer(frames, request, headers, stamp_ns, request_id)
+        except ClientDisconnectedError:
+            return Response(status_code=400)  # never sent
         except (Problem, ImageError) as error:
-            problem = sight.refused(error, name, client)
+            problem = frames.record_refusal(error, request_id, client)
         except Exception:
-            logger.exception("request %s failed", name)
-            problem = sight.refused(failure(), name, client)
-        # The protocol's own member beside those of a problem.
+            logger.exception("request %s failed", request_id)
+            problem = frames.record_refusal(internal_error(), request_id, client)
+        # `error` is the protocol's own member.
         content = {**problem.content, "error": problem.detail}
-        return JSONResponse(content, problem.kind.status, problem.headers, MEDIA_TYPE)
+        return JSONResponse(content, problem.type.status, problem.headers, MEDIA_TYPE)
 
     return infer
 
 
 async def _answer(
-    sight: FrameHandler, request: Request, headers: Headers, stamp_ns: int, name: str
+    frames: FrameHandler, request: Request, headers: Headers, stamp_ns: int, request_id: str
 ) -> Response:
-    ask = read_ask({k: v for k, v in headers.items() if k != b"accept"}, stamp_ns, name)
+    without_accept = {k: v for k, v in headers.items() if k != b"accept"}
+    options = parse_options(without_accept, stamp_ns, request_id)
     check_body_headers(headers)
     body = await read_body(request.receive)
-    wanted, binary = parse(body, headers.get(HEADER.lower().encode()))
-    sight.perceiver.check_ready()
-    read = _reader(wanted, binary, sight, ask.fov_y_deg)
-    perceived = await sight.see(ask, client_of(request.scope), read)
+    infer_request, binary = parse_request(body, headers.get(HEADER.lower().encode()))
+    frames.queue.check_ready()
+    read = _pixel_reader(infer_request, binary, frames, options.fov_y_deg)
+    result = await frames.predict_pixels(options, client_address(request.scope), read)
     head: dict[str, Any] = {
         "model_name": NAME,
         "model_version": VERSION,
-        "parameters": perceived.origin,
+        "parameters": result.provenance,
     }
-    if wanted.id is not None:
-        head["id"] = wanted.id
-    content, json_length = write(head, _tensors(perceived.answer), wanted)
+    if infer_request.id is not None:
+        head["id"] = infer_request.id
+    content, json_length = encode_response(head, _tensors(result.prediction), infer_request)
+    sent = {"X-Request-Id": request_id}
     if json_length is None:
-        return Response(content, media_type="application/json", headers={"X-Request-Id": name})
-    sent = {"X-Request-Id": name, HEADER: str(json_length)}
+        return Response(content, media_type="application/json", headers=sent)
+    sent[HEADER] = str(json_length)
     return Response(content, media_type="application/octet-stream", headers=sent)
 
 
-def _reader(
-    wanted: InferRequest, binary: memoryview, sight: FrameHandler, fov_y_deg: float | None
-) -> Reader:
-    """How to read the pixels of the one input. Raises Problem, ImageError."""
-    if len(wanted.inputs) != 1 or wanted.inputs[0].name not in ("image", "pixels"):
-        raise invalid("there must be one input, called image or pixels")
-    tensor = wanted.inputs[0]
-    unknown = next((o.name for o in wanted.outputs if o.name not in OUTPUTS), None)
+def _pixel_reader(
+    request: InferRequest, binary: memoryview, frames: FrameHandler, fov_y_deg: float | None
+) -> PixelReader:
+    """The reader of the pixels of the one input. Raises Problem, ImageError."""
+    if len(request.inputs) != 1 or request.inputs[0].name not in ("image", "pixels"):
+        raise invalid_request("expected one input, named image or pixels")
+    tensor = request.inputs[0]
+    unknown = next((o.name for o in request.outputs if o.name not in OUTPUTS), None)
     if unknown is not None:
-        raise invalid(f"there is no output {unknown[:80]!r}; there are {', '.join(OUTPUTS)}")
-    camera = sight.perceiver.loaded.engine.card.camera
+        raise invalid_request(f"unknown output {unknown[:80]!r}; there are {', '.join(OUTPUTS)}")
+    camera = frames.queue.loaded.engine.card.camera
     if tensor.name == "image":
         body = read_image_bytes(tensor, binary)
         header = inspect(body, camera, fov_y_deg)
@@ -230,14 +236,14 @@ def _reader(
     return lambda view: crop_and_resize(pixels, view, fov_y_deg)
 
 
-def _tensors(answer: Prediction) -> dict[str, NDArray[np.float32]]:
-    offset = answer.to_lane_centre_m
+def _tensors(prediction: Prediction) -> dict[str, NDArray[np.float32]]:
+    """The outputs by name, each (1, n)."""
     rows: dict[str, list[float | None]] = {
-        "distances_m": [answer.distances_m[name] for name in tf.MARKINGS],
-        "to_lane_centre_m": [offset],
-        "angle_rad": [answer.angle_rad],
-        "heading": [answer.heading[name] for name in ("left", "straight", "right")],
-        "std": [(answer.std or {}).get(name) for name in FEATURES],
-        "out_of_distribution": [answer.out_of_distribution],
+        "distances_m": [prediction.distances_m[name] for name in tf.MARKINGS],
+        "to_lane_centre_m": [prediction.to_lane_centre_m],
+        "angle_rad": [prediction.angle_rad],
+        "heading": [prediction.heading[name] for name in ("left", "straight", "right")],
+        "std": [(prediction.std or {}).get(name) for name in FEATURES],
+        "out_of_distribution": [prediction.out_of_distribution],
     }
     return {k: np.array([row], np.float32) for k, row in rows.items()}  # None becomes NaN

@@ -1,8 +1,8 @@
-"""Tensors on the wire, as the Open Inference Protocol v2 writes them: JSON or raw binary.
+"""Encoding of tensors in the Open Inference Protocol v2: JSON or raw binary.
 
-Source: Open Inference Protocol, REST, and its binary tensor data extension: behind a JSON header of
-`Inference-Header-Content-Length` bytes stand the tensors that have `binary_data_size`, in order,
-little-endian, row-major; an element of BYTES has its length before it, as a 4-byte number.
+Source: Open Inference Protocol, REST, and its binary tensor data extension: a JSON header of
+`Inference-Header-Content-Length` bytes is followed by the tensors that have `binary_data_size`, in
+order, little-endian, row-major; each element of BYTES is preceded by its length as a 4-byte number.
 """
 
 import base64
@@ -21,14 +21,14 @@ MAX_DEPTH = 4
 
 
 class RequestedOutput(msgspec.Struct):
-    """An output that is asked for."""
+    """A requested output."""
 
     name: str
     parameters: dict[str, Any] = {}
 
 
 class Tensor(msgspec.Struct):
-    """An input."""
+    """An input tensor."""
 
     name: str
     shape: list[int]
@@ -46,46 +46,48 @@ class InferRequest(msgspec.Struct):
     parameters: dict[str, Any] = {}
 
 
-def parse(body: bytes, header_length: bytes | None) -> tuple[InferRequest, memoryview]:
+def parse_request(body: bytes, header_length: bytes | None) -> tuple[InferRequest, memoryview]:
     """(the JSON part, the binary part) of a request. Raises Problem."""
     length = len(body)
     if header_length is not None:
         if not header_length.isdigit() or int(header_length[:20]) > len(body):
-            raise invalid("Inference-Header-Content-Length is no number of bytes of this body")
+            raise invalid_request(
+                "Inference-Header-Content-Length is not a length within this body"
+            )
         length = int(header_length)
     try:
         request = msgspec.json.decode(body[:length], type=InferRequest)
     except (msgspec.DecodeError, RecursionError) as error:
-        raise invalid(f"the request is no inference request: {error}") from error
+        raise invalid_request(f"the body is not an inference request: {error}") from error
     return request, memoryview(body)[length:]
 
 
 def read_image_bytes(tensor: Tensor, binary: memoryview) -> bytes:
-    """The one element of a BYTES tensor: a file; in JSON it stands in base64. Raises Problem."""
+    """The file in a BYTES tensor of one element; in JSON it is base64. Raises Problem."""
     if tensor.datatype != "BYTES" or tensor.shape not in ([1], [1, 1]):
-        raise invalid(
+        raise invalid_request(
             f"{tensor.name} is {tensor.datatype[:20]} {tensor.shape[:8]}; it takes BYTES [1, 1]"
         )
     raw = _binary(tensor, binary)
     if raw is not None:
         if len(raw) < 4 or int.from_bytes(raw[:4], "little") != len(raw) - 4:
-            raise invalid(f"{tensor.name} does not hold one element with its length before it")
+            raise invalid_request(f"{tensor.name} must hold one element, preceded by its length")
         return bytes(raw[4:])
     elements = list(_flat(tensor.data))
     if len(elements) != 1 or not isinstance(elements[0], str):
-        raise invalid(f"{tensor.name} must hold one file in base64")
+        raise invalid_request(f"{tensor.name} must hold one file in base64")
     try:
         return base64.b64decode(elements[0], validate=True)
     except (binascii.Error, ValueError) as error:
-        raise invalid(f"{tensor.name} is no base64: {error}") from error
+        raise invalid_request(f"{tensor.name} is not base64: {error}") from error
 
 
 def read_pixels(tensor: Tensor, binary: memoryview) -> NDArray[np.uint8]:
-    """A UINT8 tensor (H, W, 3), with or without a 1 before it. Raises Problem."""
+    """A UINT8 tensor as (height, width, 3); a leading 1 is removed. Raises Problem."""
     shape = tensor.shape[1:] if len(tensor.shape) == 4 and tensor.shape[0] == 1 else tensor.shape
     usable = len(shape) == 3 and shape[2] == 3 and min(shape) > 0
     if tensor.datatype != "UINT8" or not usable:
-        raise invalid(
+        raise invalid_request(
             f"{tensor.name} is {tensor.datatype[:20]} {tensor.shape[:8]}; it takes UINT8 "
             "[1, height, width, 3]"
         )
@@ -95,10 +97,12 @@ def read_pixels(tensor: Tensor, binary: memoryview) -> NDArray[np.uint8]:
     else:
         elements = list(_flat(tensor.data))
         if not all(type(value) is int and 0 <= value <= 255 for value in elements):
-            raise invalid(f"{tensor.name} holds other values than 0 to 255")
+            raise invalid_request(f"{tensor.name} must hold integers from 0 to 255")
         values = np.array(elements, np.uint8)
     if values.size != prod(shape):
-        raise invalid(f"{tensor.name} has {values.size} values, its shape needs {prod(shape)}")
+        raise invalid_request(
+            f"{tensor.name} has {values.size} values, its shape needs {prod(shape)}"
+        )
     return values.reshape(shape)
 
 
@@ -106,41 +110,47 @@ def _binary(tensor: Tensor, binary: memoryview) -> memoryview | None:
     size = tensor.parameters.get("binary_data_size")
     if size is None:
         if len(binary):
-            raise invalid(f"{tensor.name} has no binary_data_size, but bytes follow the header")
+            raise invalid_request(
+                f"{tensor.name} has no binary_data_size, but bytes follow the JSON part"
+            )
         return None
     if type(size) is not int or size != len(binary):
-        raise invalid(f"{tensor.name} says binary_data_size {size!r}, {len(binary)} bytes follow")
+        raise invalid_request(
+            f"{tensor.name} declares binary_data_size {size!r}, but {len(binary)} bytes follow"
+        )
     return binary
 
 
 def _flat(data: Any, depth: int = MAX_DEPTH) -> Iterator[Any]:
-    """The elements of nested lists, row by row. Raises Problem where they are nested too deep."""
+    """The elements of nested lists in order. Raises Problem where they are nested too deep."""
     if isinstance(data, list):
         if depth == 0:
-            raise invalid(f"the data are nested deeper than {MAX_DEPTH} lists")
+            raise invalid_request(f"the data is nested deeper than {MAX_DEPTH} lists")
         for part in data:
             yield from _flat(part, depth - 1)
     elif data is not None:
         yield data
 
 
-def write(
+def encode_response(
     head: dict[str, Any], tensors: dict[str, NDArray[np.float32]], request: InferRequest
 ) -> tuple[bytes, int | None]:
-    """(the body of an answer, the length of its JSON part where binary follows). Raises Problem."""
-    wanted = request.outputs or [RequestedOutput(name) for name in tensors]
+    """(body of the answer, length of its JSON part or None where all is JSON). Raises Problem."""
+    requested = request.outputs or [RequestedOutput(name) for name in tensors]
     default = bool(request.parameters.get("binary_data_output", False))
     outputs, parts = [], []
-    for want in wanted:
-        if want.name not in tensors:
-            raise invalid(f"there is no output {want.name[:80]!r}; there are {', '.join(tensors)}")
-        values = tensors[want.name]
+    for output_request in requested:
+        if output_request.name not in tensors:
+            raise invalid_request(
+                f"unknown output {output_request.name[:80]!r}; there are {', '.join(tensors)}"
+            )
+        values = tensors[output_request.name]
         output: dict[str, Any] = {
-            "name": want.name,
+            "name": output_request.name,
             "datatype": "FP32",
             "shape": list(values.shape),
         }
-        if want.parameters.get("binary_data", default):
+        if output_request.parameters.get("binary_data", default):
             parts.append(values.astype("<f4").tobytes())
             output["parameters"] = {"binary_data_size": len(parts[-1])}
         else:
@@ -150,6 +160,6 @@ def write(
     return content + b"".join(parts), len(content) if parts else None
 
 
-def invalid(detail: str) -> Problem:
-    """The problem of a request that does not follow the protocol."""
+def invalid_request(detail: str) -> Problem:
+    """The problem of a request that violates the protocol."""
     return Problem(INVALID_REQUEST, detail)

@@ -1,11 +1,19 @@
-"""What the service says when it cannot answer: RFC 9457 problems, each kind with a stable type.
+"""Error answers of the service: RFC 9457 problems, each with a stable type, and the handlers that
+turn every error of the FastAPI application into one.
 
-A problem's `type` names its kind and never changes; `detail` says what was seen and what to do.
+`type` never changes; `detail` says what was seen, what was expected and what to do.
 """
 
+import http
+import json
 from dataclasses import dataclass
 from math import ceil
 from typing import Any
+
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from starlette.exceptions import HTTPException
+from starlette.responses import Response
 
 from mtlnet.inference.image_decoding.errors import Fault, ImageError
 from trackfeatures.errors import UserError
@@ -14,46 +22,58 @@ MEDIA_TYPE = "application/problem+json"
 
 
 @dataclass(frozen=True, slots=True)
-class Kind:
-    """One kind of problem: its name in the type URI, its HTTP status, its title."""
+class ProblemType:
+    """A type of problem: its name in the type URI, its HTTP status, its title."""
 
     name: str
     status: int
     title: str
 
     @property
-    def type(self) -> str:
+    def uri(self) -> str:
         """The type URI, relative to the service's address."""
         return f"/problems/{self.name}"
 
 
-MALFORMED = Kind("malformed-request", 400, "This is no HTTP request")
-UNAUTHORIZED = Kind("unauthorized", 401, "The token is missing or wrong")
-FORBIDDEN_ORIGIN = Kind("forbidden-origin", 403, "Another site's page may not use this service")
-NOT_FOUND = Kind("not-found", 404, "There is nothing at this path")
-METHOD_NOT_ALLOWED = Kind("method-not-allowed", 405, "This path does not take this method")
-NOT_ACCEPTABLE = Kind("not-acceptable", 406, "The answer cannot be had in the accepted types")
-TOO_SLOW = Kind("request-timeout", 408, "The request came too slowly")
-BODY_TOO_LARGE = Kind("body-too-large", 413, "The body is too large")
-UNSUPPORTED_TYPE = Kind("unsupported-media-type", 415, "The body has another type than an image")
-INVALID_REQUEST = Kind("invalid-request", 422, "The request is not understood")
-NOT_AN_IMAGE = Kind("not-an-image", 422, "The body is no JPEG or PNG image")
-DAMAGED_IMAGE = Kind("damaged-image", 422, "The image is damaged or incomplete")
-UNSUPPORTED_IMAGE = Kind("unsupported-image", 422, "The image has a coding that is not supported")
-TRAILING_BYTES = Kind("trailing-bytes", 422, "More than the image is in the body")
-IMAGE_SIZE = Kind("image-size", 422, "The image is too small or too large")
-IMAGE_ASPECT = Kind("image-aspect", 422, "The image has another shape than the model's camera")
-FIELD_OF_VIEW = Kind("field-of-view", 422, "The image shows less than the model's camera does")
-RATE_LIMITED = Kind("rate-limited", 429, "This client asks too often")
-HEAD_TOO_LARGE = Kind("headers-too-large", 431, "The headers are too large")
-INTERNAL = Kind("internal", 500, "The service failed")
-NOT_READY = Kind("not-ready", 503, "The service is not ready")
-OVERLOADED = Kind("overloaded", 503, "The service has too much to do")
-TOO_MANY_CONNECTIONS = Kind("too-many-connections", 503, "The service has too many connections")
-SUPERSEDED = Kind("superseded", 503, "A newer frame of the stream took this one's place")
-DEADLINE_PASSED = Kind("deadline-passed", 503, "The frame's deadline passed before its turn came")
+MALFORMED = ProblemType("malformed-request", 400, "This is not an HTTP request")
+UNAUTHORIZED = ProblemType("unauthorized", 401, "The token is missing or wrong")
+FORBIDDEN_ORIGIN = ProblemType(
+    "forbidden-origin", 403, "Pages of other sites may not use this service"
+)
+NOT_FOUND = ProblemType("not-found", 404, "There is nothing at this path")
+METHOD_NOT_ALLOWED = ProblemType("method-not-allowed", 405, "This path does not take this method")
+NOT_ACCEPTABLE = ProblemType(
+    "not-acceptable", 406, "The answer is not available in the accepted types"
+)
+TOO_SLOW = ProblemType("request-timeout", 408, "The request was sent too slowly")
+BODY_TOO_LARGE = ProblemType("body-too-large", 413, "The body is too large")
+UNSUPPORTED_TYPE = ProblemType(
+    "unsupported-media-type", 415, "The body is not declared as an image"
+)
+INVALID_REQUEST = ProblemType("invalid-request", 422, "The request is not valid")
+NOT_AN_IMAGE = ProblemType("not-an-image", 422, "The body is not a JPEG or PNG image")
+DAMAGED_IMAGE = ProblemType("damaged-image", 422, "The image is damaged or incomplete")
+UNSUPPORTED_IMAGE = ProblemType("unsupported-image", 422, "The image uses an unsupported coding")
+TRAILING_BYTES = ProblemType("trailing-bytes", 422, "The body contains more than the image")
+IMAGE_SIZE = ProblemType("image-size", 422, "The image is too small or too large")
+IMAGE_ASPECT = ProblemType(
+    "image-aspect", 422, "The image has another aspect ratio than the model's camera"
+)
+FIELD_OF_VIEW = ProblemType("field-of-view", 422, "The image shows less than the model's camera")
+RATE_LIMITED = ProblemType("rate-limited", 429, "This client sends too many requests")
+HEAD_TOO_LARGE = ProblemType("headers-too-large", 431, "The headers are too large")
+INTERNAL = ProblemType("internal", 500, "The service failed")
+NOT_READY = ProblemType("not-ready", 503, "The service is not ready")
+OVERLOADED = ProblemType("overloaded", 503, "The service is overloaded")
+TOO_MANY_CONNECTIONS = ProblemType(
+    "too-many-connections", 503, "The service has too many connections"
+)
+SUPERSEDED = ProblemType("superseded", 503, "A newer frame of the stream replaced this one")
+DEADLINE_PASSED = ProblemType(
+    "deadline-passed", 503, "The deadline passed before the frame was processed"
+)
 
-KINDS = (
+PROBLEM_TYPES = (
     MALFORMED,
     UNAUTHORIZED,
     FORBIDDEN_ORIGIN,
@@ -80,7 +100,7 @@ KINDS = (
     SUPERSEDED,
     DEADLINE_PASSED,
 )
-IMAGE_KINDS = {
+IMAGE_PROBLEMS = {
     Fault.NOT_AN_IMAGE: NOT_AN_IMAGE,
     Fault.DAMAGED: DAMAGED_IMAGE,
     Fault.UNSUPPORTED: UNSUPPORTED_IMAGE,
@@ -89,55 +109,107 @@ IMAGE_KINDS = {
     Fault.FIELD_OF_VIEW: FIELD_OF_VIEW,
     Fault.TRAILING: TRAILING_BYTES,
 }
-# What a client of this service can do about it, beside what the image's reader says.
+# Added to the image decoder's message: what a client of this service can do.
 HINTS = {
     NOT_AN_IMAGE: "; post the bytes of the file itself",
     IMAGE_SIZE: " (GET /model)",
-    IMAGE_ASPECT: " (GET /model says how it is mounted)",
-    FIELD_OF_VIEW: " (GET /model says how the model's is mounted)",
+    IMAGE_ASPECT: " (GET /model gives its mounting)",
+    FIELD_OF_VIEW: " (GET /model gives the mounting of the model's camera)",
 }
-RETRY_AFTER_MS = 1000  # where nothing better is known
+RETRY_AFTER_MS = 1000  # where no better estimate exists
 
 
 class Problem(UserError):
-    """A request that gets no answer, and why; `retry_after_ms` says when to ask again."""
+    """A request that cannot be answered; `retry_after_ms` is when to send it again, ms."""
 
-    def __init__(self, kind: Kind, detail: str, retry_after_ms: float | None = None) -> None:
+    def __init__(
+        self, problem_type: ProblemType, detail: str, retry_after_ms: float | None = None
+    ) -> None:
         super().__init__(detail)
-        self.kind = kind
+        self.type = problem_type
         self.detail = detail
-        if retry_after_ms is None and kind.status in (429, 503):
+        if retry_after_ms is None and problem_type.status in (429, 503):
             retry_after_ms = RETRY_AFTER_MS
         self.retry_after_ms = None if retry_after_ms is None else max(1, round(retry_after_ms))
 
     @property
     def content(self) -> dict[str, Any]:
-        """The problem's members, `retry_after_ms` in milliseconds among them where it is known."""
-        content = members(self.kind.type, self.kind.title, self.kind.status, self.detail)
+        """The members of the JSON object; `retry_after_ms` only where it is known."""
+        content = _members(self.type.uri, self.type.title, self.type.status, self.detail)
         if self.retry_after_ms is not None:
             content["retry_after_ms"] = self.retry_after_ms
         return content
 
     @property
     def headers(self) -> dict[str, str]:
-        """The headers that go with it."""
-        headers = {"WWW-Authenticate": "Bearer"} if self.kind is UNAUTHORIZED else {}
-        if self.retry_after_ms is not None:  # whole seconds, the header's unit
+        """The HTTP headers of this problem."""
+        headers = {"WWW-Authenticate": "Bearer"} if self.type is UNAUTHORIZED else {}
+        if self.retry_after_ms is not None:  # the header's unit is whole seconds
             headers["Retry-After"] = str(max(1, ceil(self.retry_after_ms / 1e3)))
         return headers
 
 
-def image_problem(error: ImageError) -> Problem:
-    """The problem that an unreadable image is here."""
-    kind = IMAGE_KINDS[error.fault]
-    return Problem(kind, f"{error}{HINTS.get(kind, '')}")
+def as_problem(error: Problem | ImageError) -> Problem:
+    """The problem of an image that cannot be decoded; a Problem is returned as it is."""
+    if isinstance(error, Problem):
+        return error
+    problem_type = IMAGE_PROBLEMS[error.fault]
+    return Problem(problem_type, f"{error}{HINTS.get(problem_type, '')}")
 
 
-def failure() -> Problem:
-    """The problem that a fault of ours is to a client, who gets nothing of our insides."""
-    return Problem(INTERNAL, "the request could not be answered; the service's log says why")
+def internal_error() -> Problem:
+    """The problem of an unexpected exception; it reveals nothing about the exception."""
+    return Problem(INTERNAL, "the request could not be answered; see the service's log")
 
 
-def members(type_uri: str, title: str, status: int, detail: str) -> dict[str, Any]:
-    """The members that every problem has."""
+def _members(type_uri: str, title: str, status: int, detail: str) -> dict[str, Any]:
     return {"type": type_uri, "title": title, "status": status, "detail": detail}
+
+
+def install_problem_handlers(app: FastAPI) -> None:
+    """Answer every error that leaves `app`, also those of the framework, with a problem."""
+    app.add_exception_handler(Problem, _on_expected)
+    app.add_exception_handler(ImageError, _on_expected)
+    app.add_exception_handler(HTTPException, _on_http_exception)
+    app.add_exception_handler(RequestValidationError, _on_validation_error)
+    app.add_exception_handler(Exception, _on_unexpected)
+
+
+def _response(problem: Problem, headers: dict[str, str] | None = None) -> Response:
+    return _json_response(problem.content, {**problem.headers, **(headers or {})})
+
+
+def _json_response(content: dict[str, Any], headers: dict[str, str] | None) -> Response:
+    return Response(json.dumps(content), content["status"], headers, MEDIA_TYPE)
+
+
+def _on_expected(_request: Request, error: Exception) -> Response:
+    assert isinstance(error, Problem | ImageError)
+    return _response(as_problem(error))
+
+
+def _on_http_exception(request: Request, error: Exception) -> Response:
+    assert isinstance(error, HTTPException)
+    headers = dict(error.headers or {})
+    path = request.url.path
+    if error.status_code == 404:
+        detail = f"there is nothing at {path}; send images to POST /features, see /docs"
+        return _response(Problem(NOT_FOUND, detail), headers)
+    if error.status_code == 405:
+        allowed = headers.get("allow") or headers.get("Allow") or "another method"
+        detail = f"{path} takes {allowed}, not {request.method}; see /docs"
+        return _response(Problem(METHOD_NOT_ALLOWED, detail), headers)
+    title = http.HTTPStatus(error.status_code).phrase
+    content = _members("about:blank", title, error.status_code, str(error.detail))
+    return _json_response(content, headers)
+
+
+def _on_validation_error(_request: Request, error: Exception) -> Response:
+    assert isinstance(error, RequestValidationError)
+    seen = "; ".join(f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors())
+    return _response(Problem(INVALID_REQUEST, f"{seen}; see /docs"))
+
+
+def _on_unexpected(_request: Request, _error: Exception) -> Response:
+    # The server logs the error, and closes the connection after it.
+    return _response(internal_error(), {"Connection": "close"})

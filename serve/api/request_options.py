@@ -1,4 +1,6 @@
-"""An answer as bytes: JSON or MessagePack, whichever the client's `Accept` prefers."""
+"""The options of one request, read and checked from its headers: ids, stream, deadline, field of
+view, the format of the answer (JSON or MessagePack), the token, and the declared body.
+"""
 
 import itertools
 import os
@@ -21,10 +23,21 @@ from serve.api.problems import (
 )
 from serve.config import MAX_BODY_BYTES, MAX_DEADLINE_MS, MAX_NAME
 
+FRAME_ID, REQUEST_ID, STREAM_ID = "X-Frame-Id", "X-Request-Id", "X-Stream-Id"
+DEADLINE, FIELD_OF_VIEW = "X-Deadline-Ms", "X-Camera-Fov-Y"
+MEDIA_TYPES = ("image/jpeg", "image/png")
+IMAGE_MEDIA_TYPES = frozenset(name.encode() for name in MEDIA_TYPES)
+MIN_FOV_DEG, MAX_FOV_DEG = 1.0, 179.0
+
+Headers = dict[bytes, bytes]  # by lower-case name
+
+_process_id = os.urandom(4).hex()  # part of the request ids that this process makes
+_request_numbers = itertools.count(1)
+
 
 @dataclass(frozen=True, slots=True)
-class Format:
-    """One way to write an answer; `names` are the media types that ask for it."""
+class ResponseFormat:
+    """An encoding of the answer; `names` are the media types that select it."""
 
     media_type: str
     names: tuple[str, ...]
@@ -36,32 +49,32 @@ class Format:
         return b"content-type", self.media_type.encode()
 
 
-JSON = Format("application/json", ("application/json",), msgspec.json.Encoder().encode)
-MSGPACK = Format(
+JSON = ResponseFormat("application/json", ("application/json",), msgspec.json.Encoder().encode)
+MSGPACK = ResponseFormat(
     "application/msgpack",
     ("application/msgpack", "application/vnd.msgpack", "application/x-msgpack"),
     msgspec.msgpack.Encoder().encode,
 )
-FORMATS = (JSON, MSGPACK)  # in the order of our own preference
+FORMATS = (JSON, MSGPACK)  # the first is preferred where the client has no preference
 
 
 @lru_cache(256)
-def negotiate(accept: str) -> Format:
-    """The format that an `Accept` header asks for (RFC 9110, 12.5.1). Raises Problem."""
+def negotiate(accept: str) -> ResponseFormat:
+    """The format that an `Accept` header prefers (RFC 9110, 12.5.1). Raises Problem."""
     if not accept.strip():
         return JSON
-    ranges = [_read_range(item) for item in accept.split(",")]
-    weights = [_weight(found, ranges) for found in FORMATS]
+    ranges = [_parse_media_range(item) for item in accept.split(",")]
+    weights = [_quality(choice, ranges) for choice in FORMATS]
     best = max(weights)
     if best <= 0:
         raise Problem(
             NOT_ACCEPTABLE,
-            f"Accept is {accept[:80]!r}; the answers are {JSON.media_type} or {MSGPACK.media_type}",
+            f"Accept is {accept[:80]!r}; available are {JSON.media_type} and {MSGPACK.media_type}",
         )
     return FORMATS[weights.index(best)]
 
 
-def _read_range(item: str) -> tuple[str, float]:
+def _parse_media_range(item: str) -> tuple[str, float]:
     name, *parameters = (part.strip().lower() for part in item.split(";"))
     weight = 1.0
     for parameter in parameters:
@@ -74,33 +87,18 @@ def _read_range(item: str) -> tuple[str, float]:
     return name, weight
 
 
-def _weight(found: Format, ranges: list[tuple[str, float]]) -> float:
-    """What the most specific range that fits says of a format."""
-    for names in (found.names, ("application/*",), ("*/*",)):
-        fitting = [weight for name, weight in ranges if name in names]
-        if fitting:
-            return max(fitting)
+def _quality(choice: ResponseFormat, ranges: list[tuple[str, float]]) -> float:
+    """The quality value of a format: that of the most specific media range that matches it."""
+    for names in (choice.names, ("application/*",), ("*/*",)):
+        matching = [weight for name, weight in ranges if name in names]
+        if matching:
+            return max(matching)
     return 0.0
-
-
-# What a client asks for beside the image: its headers, read and checked once.
-
-
-FRAME_ID, REQUEST_ID, STREAM_ID = "X-Frame-Id", "X-Request-Id", "X-Stream-Id"
-DEADLINE, FIELD_OF_VIEW = "X-Deadline-Ms", "X-Camera-Fov-Y"
-MEDIA_TYPES = ("image/jpeg", "image/png")
-KNOWN_TYPES = frozenset(name.encode() for name in MEDIA_TYPES)
-MIN_FOV_DEG, MAX_FOV_DEG = 1.0, 179.0
-
-Headers = dict[bytes, bytes]  # by lower-case name
-
-_run = os.urandom(4).hex()
-_numbers = itertools.count(1)
 
 
 @dataclass(frozen=True, slots=True)
 class RequestOptions:
-    """What one frame asks for. `stamp_ns` is when it arrived; `deadline_ns` None: none."""
+    """The options of one frame. Times are ns of the monotonic clock; `stamp_ns`: its arrival."""
 
     stamp_ns: int
     request_id: str = ""
@@ -108,37 +106,37 @@ class RequestOptions:
     stream: str | None = None
     deadline_ns: int | None = None
     fov_y_deg: float | None = None
-    format: Format = JSON
+    format: ResponseFormat = JSON
 
 
-def read_ask(headers: Headers, stamp_ns: int, name: str) -> RequestOptions:
-    """What the headers of the request called `name` ask for. Raises Problem."""
+def parse_options(headers: Headers, stamp_ns: int, request_id: str) -> RequestOptions:
+    """The options in the headers of a request. Raises Problem."""
     return RequestOptions(
         stamp_ns,
-        name,
-        read_name(headers.get(b"x-frame-id"), FRAME_ID),
-        read_name(headers.get(b"x-stream-id"), STREAM_ID),
-        read_deadline(headers.get(b"x-deadline-ms"), stamp_ns),
-        read_fov(headers.get(b"x-camera-fov-y")),
-        read_format(headers.get(b"accept")),
+        request_id,
+        parse_name(headers.get(b"x-frame-id"), FRAME_ID),
+        parse_name(headers.get(b"x-stream-id"), STREAM_ID),
+        parse_deadline(headers.get(b"x-deadline-ms"), stamp_ns),
+        parse_fov_deg(headers.get(b"x-camera-fov-y")),
+        parse_format(headers.get(b"accept")),
     )
 
 
-def read_format(accept: bytes | None) -> Format:
+def parse_format(accept: bytes | None) -> ResponseFormat:
     """The format of the answer. Raises Problem."""
     if accept is None or accept == b"*/*":
         return JSON
     return negotiate(accept.decode("latin-1"))
 
 
-def read_name(sent: bytes | None, header: str) -> str | None:
-    """The name in a header, None without it. Raises Problem."""
+def parse_name(sent: bytes | None, header: str) -> str | None:
+    """The value of a header that holds a name; None without it. Raises Problem."""
     if sent is None:
         return None
     if not is_name(sent):
         raise Problem(
             INVALID_REQUEST,
-            f"{header} has {len(sent)} characters; at most {MAX_NAME} of printable ASCII are taken",
+            f"{header} has {len(sent)} characters; expected at most {MAX_NAME}, printable ASCII",
         )
     return sent.decode("ascii")
 
@@ -148,28 +146,28 @@ def is_name(sent: bytes) -> bool:
     return len(sent) <= MAX_NAME and sent.isascii() and sent.decode("ascii").isprintable()
 
 
-def request_id(headers: Headers) -> str:
-    """The request's id: the client's own where it is one, else a new one."""
+def request_id_of(headers: Headers) -> str:
+    """The id of a request: the client's own where it is valid, else a new one."""
     sent = headers.get(b"x-request-id")
     if sent and is_name(sent):
         return sent.decode("ascii")
-    return f"{_run}-{next(_numbers):x}"
+    return f"{_process_id}-{next(_request_numbers):x}"
 
 
-def read_deadline(sent: bytes | str | None, stamp_ns: int) -> int | None:
-    """When a frame is too late, ns of the monotonic clock. Raises Problem."""
+def parse_deadline(sent: bytes | str | None, stamp_ns: int) -> int | None:
+    """The time of a deadline given in ms after `stamp_ns`, ns. Raises Problem."""
     if sent is None:
         return None
-    wait_ms = _number(sent, DEADLINE, 0.0, MAX_DEADLINE_MS)
+    wait_ms = _parse_number(sent, DEADLINE, 0.0, MAX_DEADLINE_MS)
     return stamp_ns + round(1e6 * wait_ms)
 
 
-def read_fov(sent: bytes | str | None) -> float | None:
-    """A vertical field of view, degrees. Raises Problem."""
-    return None if sent is None else _number(sent, FIELD_OF_VIEW, MIN_FOV_DEG, MAX_FOV_DEG)
+def parse_fov_deg(sent: bytes | str | None) -> float | None:
+    """The vertical field of view of an image, degrees. Raises Problem."""
+    return None if sent is None else _parse_number(sent, FIELD_OF_VIEW, MIN_FOV_DEG, MAX_FOV_DEG)
 
 
-def _number(sent: bytes | str, header: str, low: float, high: float) -> float:
+def _parse_number(sent: bytes | str, header: str, low: float, high: float) -> float:
     text = sent.decode("latin-1") if isinstance(sent, bytes) else sent
     try:
         value = float(text) if text.isascii() else float("nan")
@@ -178,13 +176,13 @@ def _number(sent: bytes | str, header: str, low: float, high: float) -> float:
     if not (isfinite(value) and low <= value <= high):
         raise Problem(
             INVALID_REQUEST,
-            f"{header} is {text[:40]!r}; a number from {low:g} to {high:g} is taken",
+            f"{header} is {text[:40]!r}; expected a number from {low:g} to {high:g}",
         )
     return value
 
 
 def check_token(headers: Headers, token: str | None) -> None:
-    """Refuse whoever does not know the service's token. Raises Problem."""
+    """Raise Problem unless the request carries the service's token."""
     if token is None:
         return
     scheme, _, sent = headers.get(b"authorization", b"").partition(b" ")
@@ -194,10 +192,13 @@ def check_token(headers: Headers, token: str | None) -> None:
         )
 
 
-def check_headers(headers: Headers) -> None:
-    """Refuse a body that the headers alone rule out. Raises Problem."""
+def check_image_headers(headers: Headers) -> None:
+    """Raise Problem when the headers show that the body is not a usable image."""
     sent = headers.get(b"content-type", b"")
-    if sent not in KNOWN_TYPES and sent.partition(b";")[0].strip().lower() not in KNOWN_TYPES:
+    if (
+        sent not in IMAGE_MEDIA_TYPES
+        and sent.partition(b";")[0].strip().lower() not in IMAGE_MEDIA_TYPES
+    ):
         seen = f"is {sent[:80].decode('latin-1')!r}" if sent else "has no Content-Type"
         raise Problem(
             UNSUPPORTED_TYPE,
@@ -208,7 +209,7 @@ def check_headers(headers: Headers) -> None:
 
 
 def check_body_headers(headers: Headers) -> None:
-    """Refuse a body that is compressed or too long. Raises Problem."""
+    """Raise Problem when the headers announce a compressed or too large body."""
     coding = headers.get(b"content-encoding", b"identity")
     if coding.strip().lower() != b"identity":
         raise Problem(
@@ -217,13 +218,13 @@ def check_body_headers(headers: Headers) -> None:
         )
     length = headers.get(b"content-length", b"")
     if length.isdigit() and int(length[:20]) > MAX_BODY_BYTES:
-        raise too_large(f"{int(length[:20])} bytes")
+        raise body_too_large(f"{int(length[:20])} bytes")
 
 
-def too_large(seen: str) -> Problem:
-    """The problem that a body of so many bytes is."""
+def body_too_large(seen: str) -> Problem:
+    """The problem of a body that is too large; `seen` describes its size."""
     return Problem(
         BODY_TOO_LARGE,
-        f"the body has {seen}, at most {MAX_BODY_BYTES} are taken; send a smaller image or "
+        f"the body has {seen}, the limit is {MAX_BODY_BYTES}; send a smaller image or "
         "compress it more",
     )

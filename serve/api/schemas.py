@@ -1,4 +1,4 @@
-"""The service's answers as schemas, and the parts of its OpenAPI document FastAPI cannot derive."""
+"""Schemas of the answers, and the parts of the OpenAPI document that FastAPI cannot derive."""
 
 from collections.abc import Collection
 from typing import Any
@@ -8,7 +8,7 @@ from fastapi.openapi.utils import get_openapi
 from pydantic import BaseModel, Field, JsonValue
 
 from serve.api import problems
-from serve.api.problems import KINDS, MEDIA_TYPE, Kind
+from serve.api.problems import MEDIA_TYPE, PROBLEM_TYPES, ProblemType
 from serve.api.request_options import (
     DEADLINE,
     FIELD_OF_VIEW,
@@ -22,7 +22,7 @@ from serve.api.request_options import (
 )
 from serve.config import MAX_DEADLINE_MS, MAX_NAME
 
-PROBLEM_TYPES: list[JsonValue] = [*(kind.type for kind in KINDS), "about:blank"]
+PROBLEM_URIS: list[JsonValue] = [*(found.uri for found in PROBLEM_TYPES), "about:blank"]
 
 
 class Distances(BaseModel):
@@ -36,7 +36,7 @@ class Distances(BaseModel):
 
 
 class HeadingProbabilities(BaseModel):
-    """How likely the road bends left, goes straight on, bends right; they sum to 1."""
+    """Probabilities that the road bends left, goes straight, bends right; they sum to 1."""
 
     left: float
     straight: float
@@ -44,16 +44,16 @@ class HeadingProbabilities(BaseModel):
 
 
 class Deviations(Distances):
-    """Standard deviation of the error of each feature, m and rad; null for what is absent."""
+    """Standard deviation of the error of each feature, m and rad; null where it is absent."""
 
     to_lane_centre: float | None = Field(description="of to_lane_centre_m, m")
     angle: float = Field(description="of angle_rad, rad")
 
 
 class Timing(BaseModel):
-    """Where the service spent its time, ms. `queue` and `total` include receiving the body."""
+    """Time of each stage, ms. `queue` and `total` include receiving the body."""
 
-    queue: float = Field(description="from the first of the request to its turn")
+    queue: float = Field(description="from the start of the request to the start of decoding")
     decode: float
     forward: float
     total: float
@@ -71,18 +71,17 @@ class Features(BaseModel):
         description="track heading minus the car's, rad: positive when the car points to the right"
     )
     heading: HeadingProbabilities
-    std: Deviations | None = Field(
-        description="null where the model was published without frames to learn them from"
-    )
+    std: Deviations | None = Field(description="null where the model has no uncertainty head")
     out_of_distribution: bool | None = Field(
-        description="the image is unlike those the model learned from: do not drive by it"
+        description="the image is unlike the training images: do not drive by the prediction; "
+        "null where the model cannot detect it"
     )
-    model: str = Field(description="hash of the weights that answered")
-    definitions_version: str = Field(description="version of what the features mean")
+    model: str = Field(description="hash of the weights that were used")
+    definitions_version: str = Field(description="version of the definitions of the features")
     engine: str
     precision: str
     crop_px: list[int] | None = Field(
-        description="left, top, width, height of what the model saw of the image, px; null: all",
+        description="left, top, width, height of the part of the image that is used, px; null: all",
         min_length=4,
         max_length=4,
     )
@@ -91,35 +90,35 @@ class Features(BaseModel):
 
 
 class Status(BaseModel):
-    """How the service is."""
+    """State of the service."""
 
     status: str
-    model: str | None = Field(default=None, description="hash of the weights that will answer")
+    model: str | None = Field(default=None, description="hash of the weights that will be used")
 
 
 class ProblemDetails(BaseModel):
-    """Why there is no answer (RFC 9457)."""
+    """Why a request was refused (RFC 9457)."""
 
     type: str = Field(
-        description="the kind of problem; stable",
-        json_schema_extra={"enum": PROBLEM_TYPES},
+        description="the type of the problem; stable",
+        json_schema_extra={"enum": PROBLEM_URIS},
     )
     title: str
     status: int
-    detail: str = Field(description="what was seen and what to do")
+    detail: str = Field(description="what was seen, what was expected and what to do")
     retry_after_ms: int | None = Field(
-        default=None, description="when to ask again, ms; only where that may help"
+        default=None, description="when to send the request again, ms; only where that may help"
     )
 
 
-# What any request may meet before its path matters; a probe needs no token and has no rate.
-DOOR = (
+# Refusals of any request. Probes need no token and have no rate limit.
+SERVER_REFUSALS = (
     problems.MALFORMED,
     problems.TOO_SLOW,
     problems.HEAD_TOO_LARGE,
     problems.TOO_MANY_CONNECTIONS,
 )
-GUARD = (problems.UNAUTHORIZED, problems.RATE_LIMITED)
+AUTHORIZATION_REFUSALS = (problems.UNAUTHORIZED, problems.RATE_LIMITED)
 REFUSALS = (
     problems.NOT_ACCEPTABLE,
     problems.BODY_TOO_LARGE,
@@ -140,40 +139,40 @@ REFUSALS = (
 )
 NAME: dict[str, Any] = {"type": "string", "maxLength": MAX_NAME, "pattern": "^[ -~]*$"}
 HEADERS: dict[str, tuple[str, dict[str, Any]]] = {
-    FRAME_ID: ("Comes back as `frame_id`. Printable ASCII.", NAME),
+    FRAME_ID: ("Returned as `frame_id`. Printable ASCII.", NAME),
     STREAM_ID: (
-        "Names a stream of frames of this client, one camera's for instance: a newer frame takes "
-        "the place of one that waits, which is answered 503, `superseded`.",
+        "Name of a stream of frames of this client, for example of one camera: a newer frame "
+        "replaces a queued one, which is answered with 503, `superseded`.",
         NAME,
     ),
     DEADLINE: (
-        "A frame whose turn comes later than so many ms after its request began is not decoded, "
-        "but answered 503, `deadline-passed`.",
+        "A frame that is not processed within this time after its request began, ms, is answered "
+        "with 503, `deadline-passed`.",
         {"type": "number", "minimum": 0, "maximum": MAX_DEADLINE_MS},
     ),
     FIELD_OF_VIEW: (
-        "The image's vertical field of view, degrees; without it, the model's. The model's view is "
-        "cut out of a larger one.",
+        "Vertical field of view of the image, degrees; default: that of the model's camera. A "
+        "larger one is cropped to the model's.",
         {"type": "number", "minimum": MIN_FOV_DEG, "maximum": MAX_FOV_DEG},
     ),
     REQUEST_ID: (
-        "Comes back in a header of the same name, and stands in the log. One that is not printable "
-        f"ASCII of at most {MAX_NAME} characters is replaced by a new one.",
+        "Returned in a header of the same name, and written to the log. A value that is not "
+        f"printable ASCII of at most {MAX_NAME} characters is replaced by a new one.",
         {"type": "string"},
     ),
 }
 
 
 def header_parameters() -> list[dict[str, Any]]:
-    """The headers that speak of an image, as OpenAPI has them."""
+    """OpenAPI parameters: the request headers of an image."""
     return [
-        {"name": name, "in": "header", "required": False, "description": text, "schema": kind}
-        for name, (text, kind) in HEADERS.items()
+        {"name": name, "in": "header", "required": False, "description": text, "schema": schema}
+        for name, (text, schema) in HEADERS.items()
     ]
 
 
 def features_operation() -> dict[str, Any]:
-    """POST /features as OpenAPI has it: that path bypasses the framework."""
+    """OpenAPI operation of POST /features, which bypasses FastAPI."""
     schema = {"$ref": "#/components/schemas/Features"}
     return {
         "summary": "Track features of one driver-view image",
@@ -182,8 +181,8 @@ def features_operation() -> dict[str, Any]:
         "requestBody": {
             "required": True,
             "description": "The bytes of one JPEG or PNG file: no form, no base64. At most 4 MiB, "
-            "16 to 4096 px a side, 8.4 million px. The model's view is cut out of a wider image; "
-            "one that does not hold it is refused.",
+            "16 to 4096 px a side, 8.4 million px. A wider image is cropped to the model's view; "
+            "an image that does not contain this view is refused.",
             "content": {
                 name: {"schema": {"type": "string", "format": "binary", "contentMediaType": name}}
                 for name in MEDIA_TYPES
@@ -191,7 +190,7 @@ def features_operation() -> dict[str, Any]:
         },
         "responses": {
             "200": {
-                "description": "What the model sees, in the type that `Accept` prefers",
+                "description": "The track features, in the media type that `Accept` prefers",
                 "content": {form.media_type: {"schema": schema} for form in FORMATS},
                 "headers": {REQUEST_ID: {"schema": NAME}},
             },
@@ -200,32 +199,32 @@ def features_operation() -> dict[str, Any]:
     }
 
 
-def problem_responses(*kinds: Kind) -> dict[int | str, dict[str, Any]]:
-    """The `responses` of a route that can fail in these ways."""
-    statuses = dict.fromkeys(kind.status for kind in kinds)
+def problem_responses(*types: ProblemType) -> dict[int | str, dict[str, Any]]:
+    """OpenAPI responses of a route that can be refused with these problems."""
+    statuses = dict.fromkeys(found.status for found in types)
     schema = {"$ref": "#/components/schemas/ProblemDetails"}
     return {
         status: {
-            "description": "; ".join(kind.title for kind in kinds if kind.status == status),
+            "description": "; ".join(found.title for found in types if found.status == status),
             "content": {MEDIA_TYPE: {"schema": schema}},
         }
         for status in statuses
     }
 
 
-def add_door(operation: dict[str, Any], guarded: bool) -> None:
-    """Add what the door refuses to an operation's responses, beside what it refuses itself."""
-    kinds = (*DOOR, *GUARD) if guarded else DOOR
+def add_common_responses(operation: dict[str, Any], needs_token: bool) -> None:
+    """Add the refusals that any request may get to an operation's own responses."""
+    types = (*SERVER_REFUSALS, *AUTHORIZATION_REFUSALS) if needs_token else SERVER_REFUSALS
     responses = operation["responses"]
-    for status, response in problem_responses(*kinds).items():
+    for status, response in problem_responses(*types).items():
         own = responses.get(str(status))
         if own is not None:
             response["description"] = f"{own['description']}; {response['description']}"
         responses[str(status)] = response
 
 
-def install_openapi(app: FastAPI, public: Collection[str]) -> None:
-    """Give `app` an OpenAPI document with the paths and schemas that it does not know of.
+def install_openapi(app: FastAPI, public: Collection[str], token_required: bool) -> None:
+    """Complete the OpenAPI document of `app` with the paths and schemas that FastAPI lacks.
 
     `public`: the paths that need no token.
     """
@@ -238,16 +237,25 @@ def install_openapi(app: FastAPI, public: Collection[str]) -> None:
                 description=app.description,
                 routes=app.routes,
             )
-            schemas = schema.setdefault("components", {}).setdefault("schemas", {})
-            for model in (ProblemDetails, Features):
-                found = model.model_json_schema(ref_template="#/components/schemas/{model}")
-                schemas.update(found.pop("$defs", {}))
-                schemas[model.__name__] = found
-            schema["paths"] = {"/features": {"post": features_operation()}, **schema["paths"]}
-            for path, item in schema["paths"].items():
-                for operation in item.values():
-                    add_door(operation, path not in public)
+            _complete(schema, public, token_required)
             app.openapi_schema = schema
         return app.openapi_schema
 
     app.openapi = document  # type: ignore[method-assign]  # FastAPI's documented way to extend it
+
+
+def _complete(schema: dict[str, Any], public: Collection[str], token_required: bool) -> None:
+    components = schema.setdefault("components", {})
+    schemas = components.setdefault("schemas", {})
+    for model in (ProblemDetails, Features):
+        definition = model.model_json_schema(ref_template="#/components/schemas/{model}")
+        schemas.update(definition.pop("$defs", {}))
+        schemas[model.__name__] = definition
+    if token_required:
+        components["securitySchemes"] = {"token": {"type": "http", "scheme": "bearer"}}
+    schema["paths"] = {"/features": {"post": features_operation()}, **schema["paths"]}
+    for path, item in schema["paths"].items():
+        for operation in item.values():
+            add_common_responses(operation, path not in public)
+            if token_required and path not in public:
+                operation["security"] = [{"token": []}]

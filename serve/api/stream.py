@@ -1,11 +1,11 @@
 """GET /stream: frames and answers over one WebSocket, with the rules of POST /features.
 
 A binary message is one image; its answer is a text message of JSON, or with the subprotocol
-`driverview.msgpack` a binary one of MessagePack. A frame that comes while another of the same
-WebSocket waits takes its place. A text message before an image is a JSON object for that image:
-`frame_id`, `deadline_ms`. What holds for all images goes with the handshake: X-Camera-Fov-Y,
-X-Deadline-Ms, X-Stream-Id, or, from a browser, ?fov_y=&deadline_ms=. A frame that is refused is
-answered by its problem and its frame_id; the WebSocket stays open.
+`driverview.msgpack` a binary message of MessagePack. A new frame replaces a frame of the same
+WebSocket that is still queued. A text message before an image is a JSON object with options of that
+image: `frame_id`, `deadline_ms`. Options of all images are sent with the handshake: X-Camera-Fov-Y,
+X-Deadline-Ms, X-Stream-Id, or, from a browser, ?fov_y=&deadline_ms=. A refused frame is answered
+with its problem and its frame_id; the WebSocket stays open.
 """
 
 import asyncio
@@ -18,151 +18,170 @@ from urllib.parse import parse_qs, urlsplit
 import msgspec
 
 from mtlnet.inference.image_decoding.errors import ImageError
-from serve.api.features import FrameHandler, client_of
-from serve.api.http_io import Receive, Scope, Send, refusal, reply
-from serve.api.problems import FORBIDDEN_ORIGIN, INVALID_REQUEST, NOT_FOUND, Problem, failure
+from serve.api.features import FrameHandler, client_address
+from serve.api.http_io import Receive, Scope, Send, problem_reply, send_reply
+from serve.api.problems import (
+    FORBIDDEN_ORIGIN,
+    INVALID_REQUEST,
+    NOT_FOUND,
+    Problem,
+    internal_error,
+)
 from serve.api.request_options import (
     JSON,
     MSGPACK,
     Headers,
     RequestOptions,
     is_name,
-    read_ask,
-    read_deadline,
-    read_fov,
-    request_id,
+    parse_deadline,
+    parse_fov_deg,
+    parse_options,
+    request_id_of,
 )
-from serve.scheduling.rate_limit import Rate
+from serve.scheduling.rate_limit import RateLimiter
 
 PATH = "/stream"
 PROTOCOLS = {"driverview.json": JSON, "driverview.msgpack": MSGPACK}
-MAX_UNSENT = 8  # answers that wait for a client who does not read them; then no more is read
+MAX_PENDING = 8  # frames of one WebSocket whose answers are not sent; then no more is received
 
 logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
-class Terms:
-    """What a handshake agreed on; `deadline_ms` as it was sent."""
+class StreamOptions:
+    """The options of a WebSocket, from its handshake; `deadline_ms` as the client sent it."""
 
-    ask: RequestOptions
+    defaults: RequestOptions
     protocol: str | None
     deadline_ms: str | None
     client: str
 
 
 class Stream:
-    """The endpoint, as an ASGI application for WebSockets."""
+    """GET /stream as an ASGI application for WebSockets."""
 
-    def __init__(self, sight: FrameHandler, rate: Rate) -> None:
-        self._sight = sight
-        self._rate = rate
+    def __init__(self, frames: FrameHandler, rate_limiter: RateLimiter) -> None:
+        self._frames = frames
+        self._rate_limiter = rate_limiter
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         await receive()  # websocket.connect
-        name = request_id(dict(scope["headers"]))
+        request_id = request_id_of(dict(scope["headers"]))
         try:
-            terms = _agree(scope, name)
-        except Problem as problem:
-            found = self._sight.refused(problem, name, client_of(scope))
-            await reply(send, refusal(found), "websocket.http")
+            options = _parse_handshake(scope, request_id)
+        except Problem as error:
+            problem = self._frames.record_refusal(error, request_id, client_address(scope))
+            await send_reply(send, problem_reply(problem), "websocket.http")
             return
-        headers = [(b"x-request-id", name.encode())]
-        await send({"type": "websocket.accept", "subprotocol": terms.protocol, "headers": headers})
-        await self._talk(terms, receive, send)
+        headers = [(b"x-request-id", request_id.encode())]
+        accept = {"type": "websocket.accept", "subprotocol": options.protocol, "headers": headers}
+        await send(accept)
+        await self._receive_frames(options, receive, send)
 
-    async def _talk(self, terms: Terms, receive: Receive, send: Send) -> None:
-        unsent: set[asyncio.Task[None]] = set()
-        number, about = 0, ""
+    async def _receive_frames(self, options: StreamOptions, receive: Receive, send: Send) -> None:
+        pending: set[asyncio.Task[None]] = set()
+        number, metadata = 0, ""
         while (message := await receive())["type"] == "websocket.receive":
             if message.get("bytes") is None:
-                about = message["text"]
+                metadata = message["text"]
                 continue
             number += 1
-            stamp = time.monotonic_ns()
+            stamp_ns = time.monotonic_ns()
+            body = message["bytes"]
             task = asyncio.ensure_future(
-                self._answer(terms, stamp, str(number), about, message["bytes"], send)
+                self._answer(options, stamp_ns, str(number), metadata, body, send)
             )
-            about = ""
-            unsent.add(task)
-            task.add_done_callback(unsent.discard)
-            await asyncio.sleep(0)  # the frame goes into the queue before the next is read
-            if len(unsent) >= MAX_UNSENT:
-                await asyncio.wait(unsent, return_when=asyncio.FIRST_COMPLETED)
-        for task in unsent:
+            metadata = ""
+            pending.add(task)
+            task.add_done_callback(pending.discard)
+            await asyncio.sleep(0)  # queue this frame before the next one is received
+            if len(pending) >= MAX_PENDING:
+                await asyncio.wait(pending, return_when=asyncio.FIRST_COMPLETED)
+        for task in pending:
             task.cancel()
 
     async def _answer(
-        self, terms: Terms, stamp_ns: int, number: str, about: str, body: bytes, send: Send
+        self,
+        stream: StreamOptions,
+        stamp_ns: int,
+        number: str,
+        metadata: str,
+        body: bytes,
+        send: Send,
     ) -> None:
-        name, frame_id = f"{terms.ask.request_id}/{number}", number
+        request_id, frame_id = f"{stream.defaults.request_id}/{number}", number
         try:
-            self._rate.check(terms.client)
-            frame_id, deadline_ms = _read_about(about, number, terms.deadline_ms)
-            ask = replace(
-                terms.ask,
+            self._rate_limiter.check(stream.client)
+            frame_id, deadline_ms = _parse_metadata(metadata, number, stream.deadline_ms)
+            options = replace(
+                stream.defaults,
                 stamp_ns=stamp_ns,
-                request_id=name,
+                request_id=request_id,
                 frame_id=frame_id,
-                deadline_ns=read_deadline(deadline_ms, stamp_ns),
+                deadline_ns=parse_deadline(deadline_ms, stamp_ns),
             )
-            content = await self._sight.look(ask, body, terms.client)
+            content = await self._frames.predict_file(options, body, stream.client)
         except (Problem, ImageError) as error:
-            content = self._sight.refused(error, name, terms.client).content
+            content = self._frames.record_refusal(error, request_id, stream.client).content
         except Exception:
-            logger.exception("request %s failed", name)
-            content = self._sight.refused(failure(), name, terms.client).content
+            logger.exception("request %s failed", request_id)
+            problem = internal_error()
+            content = self._frames.record_refusal(problem, request_id, stream.client).content
         content["frame_id"] = frame_id
-        data = terms.ask.format.encode(content)
-        if terms.ask.format is JSON:
+        data = stream.defaults.format.encode(content)
+        if stream.defaults.format is JSON:
             await send({"type": "websocket.send", "text": data.decode()})
         else:
             await send({"type": "websocket.send", "bytes": data})
 
 
-def _agree(scope: Scope, name: str) -> Terms:
-    """What the handshake asks for. Raises Problem."""
+def _parse_handshake(scope: Scope, request_id: str) -> StreamOptions:
+    """The options in a handshake. Raises Problem."""
     headers: Headers = dict(scope["headers"])
     if scope["path"] != PATH:
-        raise Problem(NOT_FOUND, f"there is no WebSocket at {scope['path']}, but at {PATH}")
+        raise Problem(NOT_FOUND, f"there is no WebSocket at {scope['path']}, only at {PATH}")
     _check_origin(headers)
     query = parse_qs(scope["query_string"].decode("latin-1"))
-    ask = read_ask(headers, time.monotonic_ns(), name)
+    options = parse_options(headers, time.monotonic_ns(), request_id)
     if "fov_y" in query:
-        ask = replace(ask, fov_y_deg=read_fov(query["fov_y"][0]))
-    deadline = headers.get(b"x-deadline-ms", b"").decode("latin-1") or None
-    deadline = query.get("deadline_ms", [deadline])[0]
-    read_deadline(deadline, 0)
+        options = replace(options, fov_y_deg=parse_fov_deg(query["fov_y"][0]))
+    deadline_ms = headers.get(b"x-deadline-ms", b"").decode("latin-1") or None
+    deadline_ms = query.get("deadline_ms", [deadline_ms])[0]
+    parse_deadline(deadline_ms, 0)
     protocol = next((p for p in scope["subprotocols"] if p in PROTOCOLS), None)
-    form = PROTOCOLS[protocol] if protocol else ask.format
-    # Each WebSocket is a stream of its own, unless it says that it goes on with another.
-    ask = replace(ask, stream=ask.stream or f"websocket {name}", format=form)
-    return Terms(ask, protocol, deadline, client_of(scope))
+    response_format = PROTOCOLS[protocol] if protocol else options.format
+    # Each WebSocket is a stream of its own, unless it names a stream.
+    stream = options.stream or f"websocket {request_id}"
+    options = replace(options, stream=stream, format=response_format)
+    return StreamOptions(options, protocol, deadline_ms, client_address(scope))
 
 
 def _check_origin(headers: Headers) -> None:
-    """A page of another site, open in a browser here, may not use this service unasked."""
+    """Raise Problem for a page of another site: it could use the browser of a user in here."""
     origin = headers.get(b"origin")
     if origin is None:
         return
     if urlsplit(origin.decode("latin-1")).netloc.encode("latin-1") != headers.get(b"host"):
-        raise Problem(FORBIDDEN_ORIGIN, f"the page's origin is {origin[:80].decode('latin-1')!r}")
+        raise Problem(
+            FORBIDDEN_ORIGIN,
+            f"the page's origin is {origin[:80].decode('latin-1')!r}, not this service",
+        )
 
 
-def _read_about(text: str, number: str, deadline_ms: str | None) -> tuple[str, str | None]:
-    """(frame_id, deadline_ms) of a frame with this text message before it. Raises Problem."""
+def _parse_metadata(text: str, number: str, deadline_ms: str | None) -> tuple[str, str | None]:
+    """(frame_id, deadline_ms) of a frame from its text message. Raises Problem."""
     if not text:
         return number, deadline_ms
     try:
-        about: Any = msgspec.json.decode(text)
+        metadata: Any = msgspec.json.decode(text)
     except msgspec.DecodeError:
-        about = None
-    if not isinstance(about, dict) or not about.keys() <= {"frame_id", "deadline_ms"}:
+        metadata = None
+    if not isinstance(metadata, dict) or not metadata.keys() <= {"frame_id", "deadline_ms"}:
         raise Problem(
             INVALID_REQUEST,
-            "a text message must be a JSON object with frame_id and deadline_ms, or one of them",
+            "a text message must be a JSON object with frame_id, deadline_ms or both",
         )
-    frame_id = str(about.get("frame_id", number))
+    frame_id = str(metadata.get("frame_id", number))
     if not is_name(frame_id.encode()):
         raise Problem(INVALID_REQUEST, "frame_id must be printable ASCII, 128 characters at most")
-    return frame_id, str(about["deadline_ms"]) if "deadline_ms" in about else deadline_ms
+    return frame_id, str(metadata["deadline_ms"]) if "deadline_ms" in metadata else deadline_ms

@@ -1,4 +1,4 @@
-"""The client of the service: blocking (`Client`) and for asyncio (`AsyncClient`)."""
+"""Clients of the service: `Client` (blocking) and `AsyncClient` (asyncio)."""
 
 from serve.client.aio import AsyncClient
 from serve.client.sync import Client, ServiceError

@@ -1,10 +1,10 @@
-"""The client of the service for asyncio: one connection, kept open; one request at a time on it.
+"""Asyncio client of the service, with one persistent connection and one request at a time.
 
     async with AsyncClient("http://127.0.0.1:8000") as client:
         answer = await client.features(jpeg_bytes, deadline_s=0.05)
 
-It is `serve.client.Client` in a thread of its own, so that both follow the same rules. Requests of
-one client wait for each other; for several at once, make several.
+It runs `serve.client.Client` in a thread of its own. Requests of one client wait for each other;
+for concurrent requests, make several clients.
 """
 
 import asyncio
@@ -20,7 +20,7 @@ T = TypeVar("T")
 
 
 class AsyncClient:
-    """A connection to the service at `url`; see `serve.client.Client` for what its methods do."""
+    """A connection to the service at `url`; the methods are those of `serve.client.Client`."""
 
     def __init__(
         self,
@@ -28,7 +28,7 @@ class AsyncClient:
         timeout_s: float = 5.0,
         token: str | None = None,
     ) -> None:
-        """Raises ServiceError when `url` is none. Nothing is sent before the first request."""
+        """Raises ServiceError when `url` is not valid. Connects at the first request."""
         self._client = Client(url, timeout_s, token)
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="driverview-client")
 
@@ -41,20 +41,20 @@ class AsyncClient:
         stream: str | None = None,
         deadline_s: float | None = None,
     ) -> dict[str, Any]:
-        """The service's answer to an image. Raises ServiceError."""
-        ask = partial(self._client.features, stream=stream, deadline_s=deadline_s)
-        return await self._in_thread(partial(ask, image, content_type, frame_id))
+        """The track features of a JPEG or PNG file. Raises ServiceError."""
+        send = partial(self._client.features, stream=stream, deadline_s=deadline_s)
+        return await self._in_thread(partial(send, image, content_type, frame_id))
 
     async def model(self) -> dict[str, Any]:
-        """The card of the model that answers. Raises ServiceError."""
+        """The card of the model that is served. Raises ServiceError."""
         return await self._in_thread(self._client.model)
 
     async def ready(self) -> bool:
-        """Whether the service answers images now."""
+        """Whether the service can answer images."""
         return await self._in_thread(self._client.ready)
 
     async def close(self) -> None:
-        """Close the connection and end the thread."""
+        """Close the connection and stop the thread."""
         await self._in_thread(self._client.close)
         self._thread.shutdown(wait=False)
 

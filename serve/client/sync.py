@@ -1,10 +1,10 @@
-"""A client of the service on the standard library alone: one connection, kept open.
+"""Blocking client of the service, on the standard library alone, with one persistent connection.
 
     with Client("http://127.0.0.1:8000") as client:
         client.wait_until_ready()
         answer = client.features(jpeg_bytes)
 
-Not to be shared between threads: each makes its own.
+Not thread-safe: make one client per thread.
 """
 
 import http.client
@@ -19,20 +19,20 @@ from urllib.parse import SplitResult, urlsplit
 from serve.config import MAX_DEADLINE_MS, TOKEN_VARIABLE
 from trackfeatures.errors import UserError
 
-POLL_S = 0.1
-# Refusals of a frame that stay true when it is sent again.
-FINAL = ("/problems/superseded", "/problems/deadline-passed")
-UNSENDABLE = re.compile("[^!-~]")  # what the path of an HTTP request cannot hold
+RETRY_S = 0.1
+# Refusals of a frame for which a retry is useless.
+NOT_RETRIED = ("/problems/superseded", "/problems/deadline-passed")
+UNSENDABLE = re.compile("[^!-~]")  # characters that the path of an HTTP request cannot contain
 PNG_SIGNATURE = b"\x89PNG"
-# How a connection dies that the service closed while it was idle.
+# Errors on a connection that the service has closed while it was idle.
 DROPPED = (http.client.RemoteDisconnected, ConnectionResetError, BrokenPipeError)
 
 
 class ServiceError(UserError):
-    """The service cannot be reached or gave no answer.
+    """The service cannot be reached, or refused the request.
 
-    `status` is the HTTP status and `problem` the problem's type, None where nothing came back;
-    `retry_after_s` is when the service says to ask again.
+    `status` is the HTTP status and `problem` the type of the problem, None where no reply came;
+    `retry_after_s` is the service's advice on when to try again, s.
     """
 
     def __init__(
@@ -49,18 +49,18 @@ class ServiceError(UserError):
 
 
 def retry_pause_s(error: ServiceError) -> float | None:
-    """How long to wait before the same is asked again, s; None where that would not help."""
-    if error.status is None:  # nobody answered: it may be starting
-        return POLL_S
-    if error.status not in (429, 503) or error.problem in FINAL:
+    """Time to wait before a retry, s; None where a retry is useless."""
+    if error.status is None:  # no reply: the service may be starting
+        return RETRY_S
+    if error.status not in (429, 503) or error.problem in NOT_RETRIED:
         return None
-    return POLL_S if error.retry_after_s is None else min(error.retry_after_s, POLL_S)
+    return RETRY_S if error.retry_after_s is None else min(error.retry_after_s, RETRY_S)
 
 
 class Client:
     """A connection to the service at `url` ("http://HOST:PORT" or "HOST:PORT").
 
-    `token`: what the service asks of its clients; None: $DRIVERVIEW_TOKEN, or nothing.
+    `token`: the service's token; None: $DRIVERVIEW_TOKEN if it is set. `timeout_s`: of one request.
     """
 
     def __init__(
@@ -69,8 +69,8 @@ class Client:
         timeout_s: float = 5.0,
         token: str | None = None,
     ) -> None:
-        """Raises ServiceError when `url` is none. Nothing is sent before the first request."""
-        parts = _parse(url)
+        """Raises ServiceError when `url` is not valid. Connects at the first request."""
+        parts = _parse_url(url)
         self.url = parts.geturl().rstrip("/")
         self._path = parts.path.rstrip("/")
         kind = http.client.HTTPSConnection if parts.scheme == "https" else _plain_connection
@@ -78,7 +78,7 @@ class Client:
         self._connection = kind(parts.hostname, parts.port, timeout=timeout_s)
         self._timeout_s = timeout_s
         token = os.environ.get(TOKEN_VARIABLE, "").strip() if token is None else token
-        self._known = {"Authorization": f"Bearer {token}"} if token else {}
+        self._auth_headers = {"Authorization": f"Bearer {token}"} if token else {}
 
     def features(
         self,
@@ -89,12 +89,12 @@ class Client:
         stream: str | None = None,
         deadline_s: float | None = None,
     ) -> dict[str, Any]:
-        """The service's answer to a JPEG or PNG file's bytes, as DESIGN §9 gives it.
+        """The track features of a JPEG or PNG file, `image` being its bytes.
 
-        `content_type` None: by the image's first bytes. `stream`: a newer frame of it supersedes
-        this one. With `deadline_s` the service drops the frame when it is late, and where asking
-        again may help (it is full, not ready, or restarts), that is done until then. Raises
-        ServiceError.
+        The members are those of POST /features. `content_type` None: detected from the first bytes.
+        `stream`: a newer frame of this stream replaces this one. With `deadline_s` (from now) the
+        service drops the frame when it is late, and the request is retried until then where that
+        may help (the service is overloaded, not ready, or restarting). Raises ServiceError.
         """
         if content_type is None:
             content_type = "image/png" if image.startswith(PNG_SIGNATURE) else "image/jpeg"
@@ -104,58 +104,58 @@ class Client:
         if stream is not None:
             headers["X-Stream-Id"] = stream
         if deadline_s is None:
-            return self._ask("POST", "/features", image, headers)
-        return self._ask_until(time.monotonic() + deadline_s, image, headers)
+            return self._request("POST", "/features", image, headers)
+        return self._request_until(time.monotonic() + deadline_s, image, headers)
 
-    def _ask_until(self, end: float, image: bytes, headers: dict[str, str]) -> dict[str, Any]:
-        """Ask, and ask again as long as that may help, until `end` (s, monotonic)."""
+    def _request_until(self, end: float, image: bytes, headers: dict[str, str]) -> dict[str, Any]:
+        """Send, and retry as long as that may help, until `end` (s, monotonic)."""
         while True:
             left_s = max(0.0, end - time.monotonic())
             headers["X-Deadline-Ms"] = f"{min(1e3 * left_s, MAX_DEADLINE_MS):.1f}"
-            self._wait_at_most(max(left_s, 0.001))
+            self._set_timeout(max(left_s, 0.001))
             try:
-                return self._ask("POST", "/features", image, headers)
+                return self._request("POST", "/features", image, headers)
             except ServiceError as error:
                 pause_s = retry_pause_s(error)
                 if pause_s is None or time.monotonic() + pause_s >= end:
                     raise
             finally:
-                self._wait_at_most(self._timeout_s)
+                self._set_timeout(self._timeout_s)
             time.sleep(pause_s)
 
-    def _wait_at_most(self, seconds: float) -> None:
+    def _set_timeout(self, seconds: float) -> None:
         self._connection.timeout = seconds
         if self._connection.sock is not None:
             self._connection.sock.settimeout(seconds)
 
     def model(self) -> dict[str, Any]:
-        """The card of the model that answers. Raises ServiceError."""
-        return self._ask("GET", "/model")
+        """The card of the model that is served. Raises ServiceError."""
+        return self._request("GET", "/model")
 
     def ready(self) -> bool:
-        """Whether the service answers images now."""
+        """Whether the service can answer images."""
         try:
-            self._ask("GET", "/readyz")
+            self._request("GET", "/readyz")
         except ServiceError:
             return False
         return True
 
     def wait_until_ready(self, timeout_s: float = 30.0) -> None:
-        """Return once the service is ready; raise ServiceError with its last reason if not."""
+        """Wait until the service is ready; raise ServiceError with the last reason otherwise."""
         end = time.monotonic() + timeout_s
         while True:
             try:
-                self._ask("GET", "/readyz")
+                self._request("GET", "/readyz")
             except ServiceError as error:
                 if time.monotonic() >= end:
                     message = f"the service was not ready within {timeout_s:g} s: {error}"
                     raise ServiceError(message, error.status, error.problem) from error
             else:
                 return
-            time.sleep(POLL_S)
+            time.sleep(RETRY_S)
 
     def close(self) -> None:
-        """Close the connection; the next request opens another."""
+        """Close the connection; the next request opens a new one."""
         self._connection.close()
 
     def __enter__(self) -> "Client":
@@ -169,38 +169,38 @@ class Client:
     ) -> None:
         self.close()
 
-    def _ask(
+    def _request(
         self,
         method: str,
         path: str,
         body: bytes | None = None,
         headers: dict[str, str] | None = None,
     ) -> dict[str, Any]:
-        # Only an old connection may be dead for no fault of the service. Asking for features
-        # twice does no harm: nothing is stored.
+        # A reused connection may have been closed while it was idle; then the request is sent again
+        # on a new one. Nothing is stored, so a request may be sent twice.
         fresh = self._connection.sock is None
         try:
-            status, content = self._exchange(method, path, body, headers or {})
+            status, content = self._send(method, path, body, headers or {})
         except DROPPED as error:
             if fresh:
-                raise ServiceError(f"{self.url} closed the connection without an answer") from error
-            status, content = self._exchange_again(method, path, body, headers or {})
-        return _read(status, content, f"{self.url}{path}")
+                raise ServiceError(f"{self.url} closed the connection without a reply") from error
+            status, content = self._send_again(method, path, body, headers or {})
+        return _parse_reply(status, content, f"{self.url}{path}")
 
-    def _exchange_again(
+    def _send_again(
         self, method: str, path: str, body: bytes | None, headers: dict[str, str]
     ) -> tuple[int, bytes]:
         try:
-            return self._exchange(method, path, body, headers)
+            return self._send(method, path, body, headers)
         except DROPPED as error:
-            raise ServiceError(f"{self.url} closed the connection twice, unanswered") from error
+            raise ServiceError(f"{self.url} closed the connection twice without a reply") from error
 
-    def _exchange(
+    def _send(
         self, method: str, path: str, body: bytes | None, headers: dict[str, str]
     ) -> tuple[int, bytes]:
         try:
-            everything = {**self._known, **headers}
-            self._connection.request(method, self._path + path, body, everything)
+            all_headers = {**self._auth_headers, **headers}
+            self._connection.request(method, self._path + path, body, all_headers)
             response = self._connection.getresponse()
             return response.status, response.read()
         except DROPPED:
@@ -213,7 +213,8 @@ class Client:
             ) from error
         except TimeoutError as error:
             self.close()
-            raise ServiceError(f"{self.url} gave no answer within {self._timeout_s:g} s") from error
+            limit_s = self._connection.timeout  # a deadline shortens it
+            raise ServiceError(f"{self.url} did not reply within {limit_s:.3g} s") from error
         except OSError as error:
             self.close()
             raise ServiceError(f"cannot reach {self.url}: {error.strerror or error}") from error
@@ -226,37 +227,39 @@ def _plain_connection(host: str, port: int | None, *, timeout: float) -> http.cl
     return http.client.HTTPConnection(host, port, timeout=timeout)
 
 
-def _parse(url: str) -> SplitResult:
+def _parse_url(url: str) -> SplitResult:
     try:
         parts = urlsplit(url if "://" in url else f"http://{url}")
         host = parts.hostname or ""
-        host.encode("idna")  # as looking it up will do
+        host.encode("idna")  # as the name lookup does
         usable = host and parts.scheme in ("http", "https") and parts.port != 0
         usable = usable and host.isprintable() and " " not in host
         usable = usable and not UNSENDABLE.search(parts.path)
-    except ValueError:  # an open bracket, a port that is no number, a label too long (UnicodeError)
+    except (
+        ValueError
+    ):  # an open bracket, a port that is not a number, a label too long (UnicodeError)
         usable = False
     if not usable:
         raise ServiceError(
-            f"{url!r} is no address of a service; it looks like http://127.0.0.1:8000"
+            f"{url!r} is not the address of a service; expected one like http://127.0.0.1:8000"
         )
     return parts
 
 
-def _read(status: int, content: bytes, asked: str) -> dict[str, Any]:
+def _parse_reply(status: int, content: bytes, url: str) -> dict[str, Any]:
     try:
         answer = json.loads(content)
     except ValueError:
         answer = None
     if not isinstance(answer, dict):
         raise ServiceError(
-            f"{asked} answered {status} with something else than JSON; is it this service?", status
+            f"{url} replied {status}, but not with a JSON object; is it this service?", status
         )
     if status != 200:
         detail = answer.get("detail", "no reason given")
         after_ms = answer.get("retry_after_ms")
         after_s = after_ms / 1e3 if isinstance(after_ms, int | float) else None
         raise ServiceError(
-            f"{asked} answered {status}: {detail}", status, answer.get("type"), after_s
+            f"{url} answered {status}: {detail}", status, answer.get("type"), after_s
         )
     return answer

@@ -1,7 +1,7 @@
-"""The service's log: one JSON object a line on stderr, with the request's id.
+"""The service's log: one JSON object a line on stderr, with the id of the request.
 
-Refusals are told ten times a second at most: who sends rubbish must not fill the disk. The count of
-those that were not told stands in the next that is.
+Refusals are logged at most ten times a second, so that a faulty client cannot fill the disk. The
+number of those left out is in the next one logged, as `untold`.
 """
 
 import json
@@ -10,8 +10,10 @@ import os
 import sys
 import time
 from datetime import UTC, datetime
+from typing import TYPE_CHECKING
 
-from serve.api.problems import Problem
+if TYPE_CHECKING:
+    from serve.api.problems import Problem  # loads FastAPI, which the supervisor does without
 
 REFUSALS_PER_S = 10.0
 FIELDS = ("request", "client", "problem", "status", "total_ms", "untold")
@@ -20,7 +22,7 @@ logger = logging.getLogger("serve.requests")
 
 
 class JsonFormatter(logging.Formatter):
-    """A record as one line of JSON."""
+    """Formats a record as one line of JSON."""
 
     def format(self, record: logging.LogRecord) -> str:
         content: dict[str, object] = {
@@ -38,43 +40,49 @@ class JsonFormatter(logging.Formatter):
 
 
 def set_up() -> None:
-    """Log to stderr from now on."""
+    """Configure logging to stderr."""
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(JsonFormatter())
     logging.basicConfig(handlers=[handler], level=logging.WARNING)
     logging.getLogger("serve").setLevel(logging.INFO)
-    # What a client did wrong is in our own lines.
+    # Errors of clients are in the lines of this module.
     logging.getLogger("uvicorn").setLevel(logging.ERROR)
 
 
-class Refusals:
-    """Tells of refused requests, not too often."""
+class RefusalLog:
+    """Logs refused requests, limited by a token bucket."""
 
     def __init__(self) -> None:
-        self._left, self._when, self._untold = REFUSALS_PER_S, time.monotonic(), 0
+        self._tokens, self._updated_s, self._suppressed = REFUSALS_PER_S, time.monotonic(), 0
 
-    def tell(self, request: str, client: str, problem: Problem) -> None:
-        """Log that a request got a problem."""
+    def log(self, request_id: str, client: str, problem: "Problem") -> None:
+        """Log a refused request, or only count it when there were too many."""
         now = time.monotonic()
-        self._left = min(REFUSALS_PER_S, self._left + (now - self._when) * REFUSALS_PER_S)
-        self._when = now
-        if self._left < 1.0:
-            self._untold += 1
+        elapsed_s = now - self._updated_s
+        self._tokens = min(REFUSALS_PER_S, self._tokens + elapsed_s * REFUSALS_PER_S)
+        self._updated_s = now
+        if self._tokens < 1.0:
+            self._suppressed += 1
             return
-        self._left -= 1.0
+        self._tokens -= 1.0
         fields: dict[str, object] = {
-            "request": request,
+            "request": request_id,
             "client": client,
-            "problem": problem.kind.type,
-            "status": problem.kind.status,
+            "problem": problem.type.uri,
+            "status": problem.type.status,
         }
-        if self._untold:
-            fields["untold"] = self._untold
-        self._untold = 0
+        if self._suppressed:
+            fields["untold"] = self._suppressed
+        self._suppressed = 0
         logger.info("refused: %s", problem.detail, extra=fields)
 
 
-def tell_answer(request: str, client: str, total_ms: float) -> None:
-    """Log that a request was answered."""
-    fields = {"request": request, "client": client, "status": 200, "total_ms": round(total_ms, 3)}
+def log_answer(request_id: str, client: str, total_ms: float) -> None:
+    """Log an answered request."""
+    fields = {
+        "request": request_id,
+        "client": client,
+        "status": 200,
+        "total_ms": round(total_ms, 3),
+    }
     logger.info("answered", extra=fields)

@@ -1,9 +1,10 @@
-"""Traces by OpenTelemetry (the extra `telemetry`), switched on by its own environment variables.
+"""Setup of OpenTelemetry traces (the extra `telemetry`) from its standard environment variables.
 
-On where $OTEL_TRACES_EXPORTER (`otlp`, `console`; `none`: off) or $OTEL_EXPORTER_OTLP_ENDPOINT, or
-the latter's variant for traces, is set and $OTEL_SDK_DISABLED is not `true`. Service name,
-resource, sampler, propagators and batches follow their standard variables. What is traced is in
-`serve.observability.tracing`; while this is off neither that nor an exporter is loaded.
+Enabled when $OTEL_TRACES_EXPORTER (`otlp`, `console`; `none`: off) or $OTEL_EXPORTER_OTLP_ENDPOINT,
+or the latter's variant for traces, is set and $OTEL_SDK_DISABLED is not `true`. Service name,
+resource, sampler, propagators and batches follow their standard variables. The spans are in
+`serve.observability.tracing`, which is imported, like the exporter, only when traces are enabled:
+this module is imported by every process of the service and loads nothing heavy.
 """
 
 import os
@@ -19,15 +20,15 @@ if TYPE_CHECKING:
 EXPORTER = "OTEL_TRACES_EXPORTER"
 ENDPOINTS = ("OTEL_EXPORTER_OTLP_ENDPOINT", "OTEL_EXPORTER_OTLP_TRACES_ENDPOINT")
 PROTOCOLS = ("OTEL_EXPORTER_OTLP_TRACES_PROTOCOL", "OTEL_EXPORTER_OTLP_PROTOCOL")
-GROUP = "opentelemetry_traces_exporter"  # where packages of OpenTelemetry name their exporters
+GROUP = "opentelemetry_traces_exporter"  # entry points of OpenTelemetry exporters
 BY_PROTOCOL = {"http/protobuf": "otlp_proto_http", "grpc": "otlp_proto_grpc"}
 INSTALL = "pip install 'driverview[telemetry]'"
 
 
 def exporter_name(environment: Mapping[str, str] = os.environ) -> str | None:
-    """The exporter that the environment asks for, as its entry point is called; None: no traces.
+    """The entry point of the exporter that the environment selects; None: no traces.
 
-    Raises UserError when the packages that it needs are not installed.
+    Raises UserError when it is not installed.
     """
     found = environment.get(EXPORTER, "").strip().lower()
     asked = found or any(environment.get(name) for name in ENDPOINTS)
@@ -39,14 +40,14 @@ def exporter_name(environment: Mapping[str, str] = os.environ) -> str | None:
     known = sorted(entry.name for entry in entry_points(group=GROUP))
     if found not in known:
         raise UserError(
-            f"there is no exporter of traces {found!r}, but {', '.join(known) or 'none'}: "
-            f"{INSTALL}, or set {EXPORTER} to another or to none"
+            f"the trace exporter {found!r} is not installed (installed: "
+            f"{', '.join(known) or 'none'}): {INSTALL}, or set {EXPORTER} to another or to none"
         )
     return found
 
 
 def tracer() -> "Tracer | None":
-    """What makes the spans of this process, exported as the environment says; None: off."""
+    """The tracer of this process, with the selected exporter; None: traces are off."""
     name = exporter_name()
     if name is None:
         return None
@@ -55,17 +56,17 @@ def tracer() -> "Tracer | None":
     from opentelemetry.sdk.trace.export import BatchSpanProcessor
 
     (entry,) = entry_points(group=GROUP, name=name)
-    provider = TracerProvider(resource=Resource.create(_about()))
+    provider = TracerProvider(resource=Resource.create(_resource_attributes()))
     provider.add_span_processor(BatchSpanProcessor(entry.load()()))
-    return provider.get_tracer("serve", version("driverview"))  # it ends with the process
+    return provider.get_tracer("serve", version("driverview"))
 
 
-def _about() -> dict[str, Any]:
-    about: dict[str, Any] = {
+def _resource_attributes() -> dict[str, Any]:
+    attributes: dict[str, Any] = {
         "service.version": version("driverview"),
         "service.instance.id": str(os.getpid()),
     }
     named = "service.name=" in os.environ.get("OTEL_RESOURCE_ATTRIBUTES", "")
     if not named and not os.environ.get("OTEL_SERVICE_NAME"):
-        about["service.name"] = "driverview"
-    return about
+        attributes["service.name"] = "driverview"
+    return attributes

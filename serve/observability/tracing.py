@@ -1,10 +1,10 @@
-"""What is traced: a span a request for features, in it one for its frame, in that its stages. A
-request's trace goes on from its `traceparent` (W3C Trace Context), a frame's of a WebSocket from
-that of the handshake. Probes, pages and what the door refuses have no span; nor has a request whose
-client departs before its body is whole.
+"""OpenTelemetry spans: one per request for features, in it one for the frame, in that its stages.
 
-Loaded only where telemetry is on (`serve.observability.telemetry`): the hot path knows nothing of
-it. Names after OpenTelemetry's semantic conventions for HTTP, our own under `driverview.`.
+A request continues the trace of its `traceparent` header (W3C Trace Context); a frame of a
+WebSocket that of the handshake. Probes, pages, requests refused before they are read (rate, token)
+and requests whose client disconnects have no span. Imported only when traces are enabled
+(`serve.observability.telemetry`). Attributes follow the semantic conventions for HTTP; our own
+begin with `driverview.`.
 """
 
 import time
@@ -16,105 +16,104 @@ from opentelemetry import context, propagate, trace
 from opentelemetry.trace import Span, SpanKind, Status, StatusCode, Tracer
 
 from mtlnet.inference.image_decoding.errors import ImageError
-from serve.api.features import FeaturesRequest, FrameHandler, client_of
+from serve.api.features import FeaturesRequest, FrameHandler, client_address
 from serve.api.http_io import Message, Receive, Reply, Scope, Send
 from serve.api.kserve import MODELS
 from serve.api.problems import Problem
 from serve.api.request_options import Headers, RequestOptions
-from serve.scheduling.frame_queue import Perceived
+from serve.scheduling.frame_queue import FrameResult
 
 App = Callable[[Scope, Receive, Send], Awaitable[None]]
-INFERENCE = {f"{model}/infer" for model in MODELS}
+INFER_PATHS = {f"{model}/infer" for model in MODELS}
 
 
-class TracedSight(FrameHandler):
-    """`FrameHandler`, with a span a frame: `perceive`, and in it `queue`, `decode` and
-    `forward`."""
+class TracedFrameHandler(FrameHandler):
+    """A FrameHandler with a span for each frame: `perceive`, in it `queue`, `decode`, `forward`."""
 
     def __init__(self, tracer: Tracer, *arguments: Any) -> None:
         super().__init__(*arguments)
         self._tracer = tracer
 
-    def answered(self, ask: RequestOptions, client: str, perceived: Perceived) -> None:
-        super().answered(ask, client, perceived)
-        begin = ask.stamp_ns + time.time_ns() - time.monotonic_ns()  # since 1970, ns
-        about = {"driverview.request_id": ask.request_id, "client.address": client}
-        about |= {f"driverview.{name}": value for name, value in perceived.origin.items()}
-        if ask.frame_id is not None:
-            about["driverview.frame_id"] = ask.frame_id
-        span = self._tracer.start_span("perceive", start_time=begin, attributes=about)
-        inside, at = trace.set_span_in_context(span), begin
-        for name, spent_ms in (
-            ("queue", perceived.queue_ms),
-            ("decode", perceived.decode_ms),
-            ("forward", perceived.forward_ms),
+    def record_answer(self, options: RequestOptions, client: str, result: FrameResult) -> None:
+        super().record_answer(options, client, result)
+        start_ns = options.stamp_ns + time.time_ns() - time.monotonic_ns()  # since 1970
+        attributes = {"driverview.request_id": options.request_id, "client.address": client}
+        attributes |= {f"driverview.{name}": value for name, value in result.provenance.items()}
+        if options.frame_id is not None:
+            attributes["driverview.frame_id"] = options.frame_id
+        span = self._tracer.start_span("perceive", start_time=start_ns, attributes=attributes)
+        context_of_span, at = trace.set_span_in_context(span), start_ns
+        for name, time_ms in (
+            ("queue", result.queue_ms),
+            ("decode", result.decode_ms),
+            ("forward", result.forward_ms),
         ):
-            end = at + round(1e6 * spent_ms)
-            self._tracer.start_span(name, inside, start_time=at).end(end)
+            end = at + round(1e6 * time_ms)
+            self._tracer.start_span(name, context_of_span, start_time=at).end(end)
             at = end
         span.end()
 
-    def refused(self, error: Problem | ImageError, request: str, client: str) -> Problem:
-        problem = super().refused(error, request, client)
+    def record_refusal(self, error: Problem | ImageError, request_id: str, client: str) -> Problem:
+        problem = super().record_refusal(error, request_id, client)
         span = trace.get_current_span()
         if span.is_recording():
-            _blame(span, problem, request)
-        else:  # a frame of a WebSocket, which has no span around it
+            _set_problem(span, problem, request_id)
+        else:  # a frame of a WebSocket: there is no span of a request
             with self._tracer.start_as_current_span("refuse") as own:
-                _blame(own, problem, request)
+                _set_problem(own, problem, request_id)
         return problem
 
 
-class TracedExchange(FeaturesRequest):
-    """POST /features, with a span from its headers to its reply."""
+class TracedFeaturesRequest(FeaturesRequest):
+    """POST /features with a span from its headers to its reply."""
 
-    __slots__ = ("_context", "_reply_to", "_span", "_tracer")
+    __slots__ = ("_context", "_send_reply", "_span", "_tracer")
 
     def __init__(
-        self, tracer: Tracer, sight: FrameHandler, client: str, send: Callable[[Reply], None]
+        self, tracer: Tracer, frames: FrameHandler, client: str, send: Callable[[Reply], None]
     ) -> None:
-        super().__init__(sight, client, self._end)
+        super().__init__(frames, client, self._end)
         self._tracer = tracer
-        self._reply_to = send
+        self._send_reply = send
 
     def open(self, headers: Headers) -> bool:
-        found = _context_of(headers.items())
-        about = _about("/features", self._client)
-        self._span = self._tracer.start_span("POST /features", found, SpanKind.SERVER, about)
-        self._context = trace.set_span_in_context(self._span, found)
-        with _within(self._context):
+        parent = _parent_context(headers.items())
+        attributes = _request_attributes("/features", self._client)
+        self._span = self._tracer.start_span("POST /features", parent, SpanKind.SERVER, attributes)
+        self._context = trace.set_span_in_context(self._span, parent)
+        with _attached(self._context):
             return super().open(headers)
 
-    def take(self, body: bytes) -> None:
-        with _within(self._context):
-            super().take(body)
+    def submit(self, body: bytes) -> None:
+        with _attached(self._context):
+            super().submit(body)
 
     def refuse(self, error: Problem | ImageError) -> None:
-        with _within(self._context):
+        with _attached(self._context):
             super().refuse(error)
 
-    def _answer(self, result: Perceived | Exception) -> None:
-        with _within(self._context):
-            super()._answer(result)
+    def _on_result(self, result: FrameResult | Exception) -> None:
+        with _attached(self._context):
+            super()._on_result(result)
 
     def _end(self, reply: Reply) -> None:
-        _tell_status(self._span, reply.status)
+        _set_status(self._span, reply.status)
         self._span.end()
-        self._reply_to(reply)
+        self._send_reply(reply)
 
 
-class Traced:
-    """An ASGI application beside POST /features, with a span around each request for features."""
+class TracedApp:
+    """An ASGI application with a span for each inference request that it serves."""
 
     def __init__(self, tracer: Tracer, app: App) -> None:
         self._tracer = tracer
         self._app = app
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] == "http" and _is_inference(scope):
+        if scope["type"] == "http" and _is_infer_request(scope):
             await self._answer(scope, receive, send)
         elif scope["type"] == "websocket":
-            with _within(_context_of(scope["headers"])):  # each frame's task inherits it
+            with _attached(_parent_context(scope["headers"])):  # inherited by each frame's task
                 await self._app(scope, receive, send)
         else:
             await self._app(scope, receive, send)
@@ -122,49 +121,49 @@ class Traced:
     async def _answer(self, scope: Scope, receive: Receive, send: Send) -> None:
         with self._tracer.start_as_current_span(
             f"POST {scope['path']}",
-            _context_of(scope["headers"]),
+            _parent_context(scope["headers"]),
             SpanKind.SERVER,
-            _about(scope["path"], client_of(scope)),
+            _request_attributes(scope["path"], client_address(scope)),
         ) as span:
 
-            async def send_and_tell(message: Message) -> None:
+            async def send_and_record(message: Message) -> None:
                 if message["type"] == "http.response.start":
-                    _tell_status(span, message["status"])
+                    _set_status(span, message["status"])
                 await send(message)
 
-            await self._app(scope, receive, send_and_tell)
+            await self._app(scope, receive, send_and_record)
 
 
-def _is_inference(scope: Scope) -> bool:
+def _is_infer_request(scope: Scope) -> bool:
     path: str = scope["path"]
-    return scope["method"] == "POST" and path in INFERENCE
+    return scope["method"] == "POST" and path in INFER_PATHS
 
 
-def _about(path: str, client: str) -> dict[str, str]:
+def _request_attributes(path: str, client: str) -> dict[str, str]:
     return {"http.request.method": "POST", "url.path": path, "client.address": client}
 
 
-def _context_of(headers: Iterable[tuple[bytes, bytes]]) -> context.Context:
+def _parent_context(headers: Iterable[tuple[bytes, bytes]]) -> context.Context:
     return propagate.extract({k.decode("latin-1"): v.decode("latin-1") for k, v in headers})
 
 
 @contextmanager
-def _within(found: context.Context) -> Iterator[None]:
-    token = context.attach(found)
+def _attached(to: context.Context) -> Iterator[None]:
+    token = context.attach(to)
     try:
         yield
     finally:
         context.detach(token)
 
 
-def _tell_status(span: Span, status: int) -> None:
+def _set_status(span: Span, status: int) -> None:
     span.set_attribute("http.response.status_code", status)
     if status >= 500:
         span.set_status(Status(StatusCode.ERROR))
 
 
-def _blame(span: Span, problem: Problem, request: str) -> None:
-    span.set_attribute("error.type", problem.kind.type)
-    span.set_attribute("driverview.request_id", request)
-    if problem.kind.status >= 500:
+def _set_problem(span: Span, problem: Problem, request_id: str) -> None:
+    span.set_attribute("error.type", problem.type.uri)
+    span.set_attribute("driverview.request_id", request_id)
+    if problem.type.status >= 500:
         span.set_status(Status(StatusCode.ERROR, problem.detail))

@@ -1,0 +1,1 @@
+"""The order in which frames are processed, and who may send how many."""

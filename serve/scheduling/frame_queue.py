@@ -1,12 +1,12 @@
-"""One engine with a short queue before it, and a thread of its own: the event loop stays free.
+"""A short queue of frames before one engine, and the thread that runs the engine.
 
-An engine is neither re-entrant nor thread-safe, and waiting longer than a few frames helps no
-controller: what does not fit into the queue is refused at once. In a stream a newer frame takes a
-queued one's place; a frame whose deadline has passed is dropped before it is decoded.
+An engine is neither re-entrant nor thread-safe, and a frame that waits for long is of no use to a
+controller, so a frame that does not fit into the queue is refused at once. A newer frame of a
+stream replaces the queued one; a frame whose deadline has passed is dropped before it is decoded.
 
-A frame that comes alone to a quick engine is answered by the event loop itself: the way to another
-thread and back costs more than all else that is not the model. Whoever comes meanwhile would have
-waited for that frame anyway. As soon as two frames wait, the thread takes them.
+A small frame that arrives alone at a fast engine is processed on the event loop itself: handing it
+to another thread and back costs more than everything else beside the model. Frames that arrive
+meanwhile would have had to wait for that frame anyway. Two or more go to the thread.
 """
 
 import asyncio
@@ -26,44 +26,52 @@ import trackfeatures as tf
 from mtlnet.inference.engine import Engine
 from mtlnet.inference.prediction import Prediction, decode_outputs
 from serve.api.problems import DEADLINE_PASSED, NOT_READY, OVERLOADED, SUPERSEDED, Problem
-from serve.scheduling.streams import Streams
+from serve.scheduling.streams import StreamTable
 from trackfeatures.camera import CameraParameters
 
-SMOOTHING = 0.1  # weight of the latest frame in the mean time a frame takes
-QUICK_MS = 10.0  # for so long the event loop may be kept from everything else
-FULL_PAUSE_S = 0.002  # between two looks at who has come, while all of them are refused
-QUICK_RUN = 8  # frames in a row that took no longer, before it is trusted with one
+SMOOTHING = 0.1  # weight of the latest frame in the running mean of the time per frame
+INLINE_MAX_MS = 10.0  # a frame may block the event loop for so long
+INLINE_AFTER = 8  # frames in a row within INLINE_MAX_MS before the event loop runs the engine
 logger = logging.getLogger(__name__)
 
-Reader = Callable[[CameraParameters], NDArray[np.uint8]]
-Done = Callable[["Perceived | Exception"], None]
+PixelReader = Callable[[CameraParameters], NDArray[np.uint8]]
+"""Gives the pixels (height, width, 3), RGB, as the model's camera sees them."""
+ResultCallback = Callable[["FrameResult | Exception"], None]
 
 
 @dataclass(frozen=True, slots=True)
-class Loaded:
-    """An engine, and what every answer says of it."""
+class LoadedEngine:
+    """An engine and the members of every answer that name it."""
 
     engine: Engine
-    origin: dict[str, str]
+    provenance: dict[str, str]
 
-
-def load(engine: Engine) -> Loaded:
-    """`engine` with its origin."""
-    origin = {
-        "model": engine.card.model_hash,
-        "definitions_version": tf.VERSION,
-        "engine": engine.kind,
-        "precision": engine.precision,
-    }
-    return Loaded(engine, origin)
+    @classmethod
+    def of(cls, engine: Engine) -> "LoadedEngine":
+        """`engine` with its provenance."""
+        provenance = {
+            "model": engine.card.model_hash,
+            "definitions_version": tf.VERSION,
+            "engine": engine.kind,
+            "precision": engine.precision,
+        }
+        return cls(engine, provenance)
 
 
 @dataclass(frozen=True, slots=True)
-class Perceived:
-    """An answer, the engine it is from, and where its time went, ms."""
+class StagedEngine:
+    """An engine that replaces the current one as soon as `is_committed()` is true."""
 
-    answer: Prediction
-    origin: dict[str, str]
+    loaded: LoadedEngine
+    is_committed: Callable[[], bool]
+
+
+@dataclass(frozen=True, slots=True)
+class FrameResult:
+    """The prediction for a frame, the engine it came from, and the time of each stage, ms."""
+
+    prediction: Prediction
+    provenance: dict[str, str]
     queue_ms: float
     decode_ms: float
     forward_ms: float
@@ -71,13 +79,12 @@ class Perceived:
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """An image that waits: how to read its pixels, and what `serve.api.request_options` says of its
-    turn.
+    """An image to process. Times are ns of the monotonic clock.
 
-    `stream` 0: of no stream. `small`: read in less time than the engine takes.
+    `stream` 0: it belongs to no stream. `small`: it is decoded in less time than the engine takes.
     """
 
-    read: Reader
+    read: PixelReader
     stamp_ns: int
     stream: int = 0
     deadline_ns: int | None = None
@@ -85,222 +92,228 @@ class Frame:
 
 
 class Slot:
-    """A place in the queue, the frame that has it now, and who is told of its answer."""
+    """A place in the queue: the frame that holds it, and the callback for its result."""
 
-    __slots__ = ("done", "frame")
+    __slots__ = ("frame", "on_result")
 
-    def __init__(self, frame: Frame, done: Done) -> None:
+    def __init__(self, frame: Frame, on_result: ResultCallback) -> None:
         self.frame = frame
-        self.done = done
+        self.on_result = on_result
 
 
 class FrameQueue:
-    """Answers images with one engine, one at a time. Start it in a running event loop.
+    """Processes frames with one engine, one at a time. Start it in a running event loop.
 
-    All but what the thread does is for that loop's thread alone.
+    `submit` and `check_capacity` are for that loop's thread only. `stage_model` and
+    `drop_staged_model` may be called from any thread.
     """
 
     def __init__(
-        self, engine: Engine, warm_up: Callable[[Engine], None], streams: Streams, queue: int
+        self,
+        engine: Engine,
+        warm_up: Callable[[Engine], None],
+        streams: StreamTable,
+        capacity: int,
     ) -> None:
-        self._loaded = load(engine)
-        self._staged: tuple[Loaded, Callable[[], bool]] | None = None
+        """`capacity`: frames that may wait while one is processed."""
+        self._current = LoadedEngine.of(engine)
+        self._staged: StagedEngine | None = None
+        self._model_lock = threading.Lock()  # guards the two above, for a few instructions
         self._warm_up = warm_up
         self._warm: Future[None] = Future()
         self._ready = False
         self._streams = streams
-        self._limit = queue
+        self._capacity = capacity
         self._waiting: deque[Slot] = deque()
-        self._busy = False  # the thread has a frame in work
-        self._awake = False  # somebody is about to look at the queue
-        self._lock = threading.Lock()
-        self._pausing = False  # the loop is about to
-        self._answered = threading.Lock()  # open from when the thread answers until a pause
-        self._answered.acquire()
-        self._calls: SimpleQueue[bool] = SimpleQueue()  # True: to the queue; False: the end
-        self._frame_ms = 5.0
-        self._quick = 0  # frames in a row of this engine that took no longer than QUICK_MS
-        self._thread = threading.Thread(target=self._run, name="forward", daemon=True)
+        self._queue_lock = threading.Lock()  # guards the slots above, for a few instructions
+        self._thread_busy = False  # the thread is processing a frame
+        self._dispatched = False  # the loop or the thread is about to look at the queue
+        self._wake_ups: SimpleQueue[bool] = SimpleQueue()  # True: frames wait; False: stop
+        self._mean_frame_ms = 5.0
+        self._fast_engine: LoadedEngine | None = None  # that processed the latest frame, and
+        self._fast_frames = 0  # its latest frames in a row within INLINE_MAX_MS
+        self._thread = threading.Thread(target=self._run_thread, name="forward", daemon=True)
 
     @property
-    def loaded(self) -> Loaded:
-        """The engine that answers the next frame."""
-        staged = self._staged
-        if staged is not None and staged[1]():
-            self._loaded, self._staged, self._quick = staged[0], None, 0
-        return self._loaded
+    def loaded(self) -> LoadedEngine:
+        """The engine that will process the next frame."""
+        with self._model_lock:
+            staged = self._staged
+            return staged.loaded if staged and staged.is_committed() else self._current
 
     @property
     def ready(self) -> bool:
-        """Whether the engine is warm and has given its golden answer."""
+        """Whether the engine is warm and has passed its check."""
         return self._ready
 
     @property
     def waiting(self) -> int:
-        """Frames in the queue."""
+        """Number of frames in the queue."""
         return len(self._waiting)
 
     def start(self) -> None:
-        """Warm the engine up behind the caller's back; `check_ready` says when that is done."""
+        """Warm up the engine in the thread; `check_ready` reports when that is done."""
         self._loop = asyncio.get_running_loop()
         self._thread.start()
 
     def check_ready(self) -> None:
-        """Raise Problem until the engine is warm and has given its golden answer."""
+        """Raise Problem until the engine is warm and has passed its check."""
         if self._ready:
             return
         if not self._warm.done():
             raise Problem(NOT_READY, "the model is warming up; ask again in a second")
-        fault = self._warm.exception()
-        if fault is not None:
-            raise Problem(NOT_READY, f"the model failed its check and answers nothing: {fault}")
+        error = self._warm.exception()
+        if error is not None:
+            raise Problem(NOT_READY, f"the model failed its check, no image is answered: {error}")
 
-    def stage(self, engine: Engine, chosen: Callable[[], bool]) -> None:
-        """Answer with `engine`, warm and checked, from the first frame on for which `chosen`."""
-        self._staged = load(engine), chosen
+    def stage_model(self, engine: Engine, is_committed: Callable[[], bool]) -> None:
+        """Switch to `engine`, warm and checked, at the first frame at which `is_committed()`."""
+        with self._model_lock:
+            self._promote_staged()
+            self._staged = StagedEngine(LoadedEngine.of(engine), is_committed)
 
-    def drop(self) -> None:
-        """Forget what was staged."""
-        self._staged = None
+    def drop_staged_model(self) -> None:
+        """Discard a staged engine that is not committed."""
+        with self._model_lock:
+            self._promote_staged()
+            self._staged = None
 
-    def when_warm(self, do: Callable[[], None]) -> None:
-        """Call `do`, in another thread, once the engine is warm and right."""
-        self._warm.add_done_callback(lambda warm: None if warm.exception() else do())
+    def _promote_staged(self) -> None:
+        """Make a committed staged engine the current one. Call it with `_model_lock` held."""
+        if self._staged is not None and self._staged.is_committed():
+            self._current, self._staged = self._staged.loaded, None
 
-    def check_room(self) -> None:
-        """Raise Problem when a frame that takes no other's place would be refused."""
-        if self._full():
-            if not self._pausing:
-                self._pausing = True
-                self._loop.call_soon(self._pause)
+    def on_warm(self, callback: Callable[[], None]) -> None:
+        """Call `callback`, in the engine's thread, once the engine has passed its check."""
+        self._warm.add_done_callback(lambda warm: None if warm.exception() else callback())
+
+    @property
+    def full(self) -> bool:
+        """Whether a frame that replaces no other would be refused."""
+        return len(self._waiting) + self._thread_busy > self._capacity
+
+    def check_capacity(self) -> None:
+        """Raise Problem when the queue is full."""
+        if self.full:
             raise self._overloaded()
 
-    def _full(self) -> bool:
-        return len(self._waiting) + self._busy > self._limit
+    def submit(self, frame: Frame, on_result: ResultCallback) -> None:
+        """Queue a frame; `on_result` is called on the loop with its result or its error.
 
-    def _pause(self) -> None:
-        """Keep the loop from its clients until some have come, or a frame is answered.
-
-        To refuse several at once takes less of the core than to be woken by each, and the engine
-        needs that core.
-        """
-        self._pausing = False
-        if self._full():
-            self._answered.acquire(timeout=FULL_PAUSE_S)
-
-    def admit(self, frame: Frame, done: Done) -> None:
-        """Have `done` called with what the model sees in a frame, or with the error it got.
-
-        Raises Problem at once where there is no room or no engine yet.
+        Raises Problem at once where the queue is full or the engine is not ready.
         """
         self.check_ready()
-        lost = None
-        with self._lock:
+        superseded = None
+        with self._queue_lock:
             if frame.stream:
-                lost = self._replace(frame, done)
-            if lost is None:
-                self.check_room()
-                self._waiting.append(Slot(frame, done))
-                if not self._awake:
-                    self._awake = True
-                    # Not at once: first all is read that came in the meantime.
-                    self._loop.call_soon(self._begin)
-        if lost is not None:
-            lost(Problem(SUPERSEDED, "a newer frame of this stream came meanwhile"))
+                superseded = self._supersede(frame, on_result)
+            if superseded is None:
+                self.check_capacity()
+                self._waiting.append(Slot(frame, on_result))
+                if not self._dispatched:
+                    self._dispatched = True
+                    # Not at once: first the loop reads all requests that have arrived.
+                    self._loop.call_soon(self._dispatch)
+        if superseded is not None:
+            superseded(Problem(SUPERSEDED, "a newer frame of this stream arrived"))
         if frame.stream:
             self._streams.announce(frame.stream, frame.stamp_ns)
 
-    def _replace(self, frame: Frame, done: Done) -> Done | None:
-        """Put a frame in the place of its stream's queued one; whoever has lost their turn."""
-        for queued in self._waiting:
-            if queued.frame.stream != frame.stream:
+    def _supersede(self, frame: Frame, on_result: ResultCallback) -> ResultCallback | None:
+        """Put a frame into its stream's slot; the callback of the older of the two, if any."""
+        for slot in self._waiting:
+            if slot.frame.stream != frame.stream:
                 continue
-            if queued.frame.stamp_ns > frame.stamp_ns:
-                return done
-            lost = queued.done
-            queued.frame, queued.done = frame, done
-            return lost
+            if slot.frame.stamp_ns > frame.stamp_ns:
+                return on_result
+            superseded = slot.on_result
+            slot.frame, slot.on_result = frame, on_result
+            return superseded
         return None
 
-    def _begin(self) -> None:
-        """Answer a lone small frame here; leave all else to the thread."""
-        if self._quick < QUICK_RUN or len(self._waiting) > 1 or not self._waiting[0].frame.small:
-            self._calls.put(True)
+    def _dispatch(self) -> None:
+        """Process a single small frame here, on the loop; leave everything else to the thread."""
+        alone = len(self._waiting) == 1 and self._waiting[0].frame.small
+        fast = self._fast_frames >= INLINE_AFTER and self.loaded is self._fast_engine
+        if not (alone and fast):
+            self._wake_ups.put(True)
             return
-        turn = self._waiting.popleft()
-        result = self._attempt(turn.frame)
-        self._awake = False
-        turn.done(result)
+        slot = self._waiting.popleft()
+        result = self._process(slot.frame)
+        self._dispatched = False
+        slot.on_result(result)
 
     def _overloaded(self) -> Problem:
         waiting = len(self._waiting)
         return Problem(
             OVERLOADED,
-            f"{waiting} frames wait already; send this one again later, or a newer one, or start "
-            "the service with more --workers",
-            self._frame_ms * (waiting + 1),
+            f"{waiting} frames are waiting; send this one or a newer one later, or start the "
+            "service with more --workers",
+            self._mean_frame_ms * (waiting + 1),
         )
 
-    def _run(self) -> None:
+    def _run_thread(self) -> None:
         try:
-            self._warm_up(self._loaded.engine)
+            self._warm_up(self._current.engine)
         except tf.UserError as error:
-            logger.error("the model failed its check and answers nothing: %s", error)
+            logger.error("the model failed its check, no image is answered: %s", error)
             self._warm.set_exception(error)
             return
         except Exception as error:  # any fault of a model must show in /readyz
-            logger.exception("the model failed its check and answers nothing")
+            logger.exception("the model failed its check, no image is answered")
             self._warm.set_exception(error)
             return
         self._ready = True
         self._warm.set_result(None)
-        while self._calls.get():
-            while (turn := self._next()) is not None:
-                result = self._attempt(turn.frame)
-                self._loop.call_soon_threadsafe(turn.done, result)
-                if self._answered.locked():
-                    self._answered.release()
+        while self._wake_ups.get():
+            while (slot := self._take_slot()) is not None:
+                result = self._process(slot.frame)
+                self._loop.call_soon_threadsafe(slot.on_result, result)
 
-    def _next(self) -> Slot | None:
-        """The thread's next turn; None: it may rest."""
-        with self._lock:
-            self._busy = self._awake = bool(self._waiting)
+    def _take_slot(self) -> Slot | None:
+        """The next slot for the thread; None: the queue is empty."""
+        with self._queue_lock:
+            self._thread_busy = self._dispatched = bool(self._waiting)
             return self._waiting.popleft() if self._waiting else None
 
-    def _attempt(self, frame: Frame) -> "Perceived | Exception":
+    def _process(self, frame: Frame) -> "FrameResult | Exception":
         try:
-            return self._perceive(frame)
+            return self._infer(frame)
         except tf.UserError as error:
             return error
-        except Exception as error:  # goes to who asked, and never ends the thread
+        except Exception as error:  # reported to the client; the thread goes on
             logger.exception("a frame failed")
             return error
 
-    def _perceive(self, frame: Frame) -> Perceived:
+    def _infer(self, frame: Frame) -> FrameResult:
         start = time.monotonic_ns()
         if frame.deadline_ns is not None and start > frame.deadline_ns:
             late_ms = (start - frame.deadline_ns) / 1e6
-            raise Problem(DEADLINE_PASSED, f"its turn came {late_ms:.1f} ms after its deadline")
-        if frame.stream and self._streams.superseded(frame.stream, frame.stamp_ns):
-            raise Problem(SUPERSEDED, "a newer frame of this stream came meanwhile")
-        loaded = self.loaded
+            raise Problem(DEADLINE_PASSED, f"it was due {late_ms:.1f} ms after its deadline")
+        if frame.stream and self._streams.is_superseded(frame.stream, frame.stamp_ns):
+            raise Problem(SUPERSEDED, "a newer frame of this stream arrived")
+        with self._model_lock:
+            self._promote_staged()
+            loaded = self._current
+        if loaded is not self._fast_engine:
+            self._fast_engine, self._fast_frames = loaded, 0
         image = frame.read(loaded.engine.card.camera)
         decoded = time.monotonic_ns()
-        answer = decode_outputs(loaded.engine(image))
+        prediction = decode_outputs(loaded.engine(image))
         end = time.monotonic_ns()
         frame_ms = (end - start) / 1e6
-        self._frame_ms += SMOOTHING * (frame_ms - self._frame_ms)
-        self._quick = self._quick + 1 if frame_ms <= QUICK_MS else 0
-        return Perceived(
-            answer,
-            loaded.origin,
+        self._mean_frame_ms += SMOOTHING * (frame_ms - self._mean_frame_ms)
+        self._fast_frames = self._fast_frames + 1 if frame_ms <= INLINE_MAX_MS else 0
+        return FrameResult(
+            prediction,
+            loaded.provenance,
             (start - frame.stamp_ns) / 1e6,
             (decoded - start) / 1e6,
             (end - decoded) / 1e6,
         )
 
     def close(self) -> None:
-        """Finish what was begun and what waits, end the thread."""
-        for last in (True, False):
-            self._calls.put(last)
+        """Process the frames that wait, then end the thread."""
+        for frames_wait in (True, False):
+            self._wake_ups.put(frames_wait)
         self._thread.join()

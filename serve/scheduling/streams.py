@@ -1,57 +1,57 @@
-"""Which frame of a stream is the newest, over all workers.
+"""The newest frame of each stream, over all workers.
 
-A frame's stamp is the time its request began, in ns of the machine's monotonic clock, the same for
-all processes. An admitted frame is announced; one whose stream has a later stamp is superseded.
+A frame's stamp is the time at which its request began, in ns of the machine's monotonic clock,
+which is the same for all processes. A queued frame is announced; a frame is superseded when its
+stream has a later stamp.
 """
 
 from functools import lru_cache
 from hashlib import blake2b
 
-from serve.workers.shared_memory import STREAM_SLOTS, STREAM_WORDS
+from serve.workers.shared_memory import PROBES, STREAM_ENTRIES, STREAM_WORDS
 
-PROBES = 8
-FORGOTTEN_NS = 10_000_000_000  # no frame waits this long: the slot may go to another stream
+EXPIRY_NS = 10_000_000_000  # longer than any frame waits; then another stream may take the entry
 
 
 @lru_cache(4096)
 def stream_key(client: str, name: str) -> int:
-    """The number of a client's stream, never 0. Two clients' streams of one name are two."""
+    """The key of a client's stream, never 0. Streams of two clients are never the same."""
     digest = blake2b(f"{client}\0{name}".encode(), digest_size=8).digest()
     return int.from_bytes(digest, "big") | 1
 
 
-class Streams:
-    """The table of streams: (key, newest stamp) in open addressing."""
+class StreamTable:
+    """The newest stamp of each stream: (key, stamp) in open addressing."""
 
     def __init__(self, cells: "memoryview[int]") -> None:
         self._cells = cells
 
-    def announce(self, key: int, stamp: int) -> None:
-        """Say that a frame was admitted. With no room left in the table, nothing is said."""
+    def announce(self, key: int, stamp_ns: int) -> None:
+        """Record a queued frame. Nothing is recorded where the table has no free entry."""
         cells = self._cells
         free = -1
-        for at in _places(key):
+        for at in _indices(key):
             if cells[at] == key:
-                # Two workers at once may lose one of two announcements: then an old frame is
-                # answered, which is no fault.
-                if cells[at + 1] < stamp:
-                    cells[at + 1] = stamp
+                # Two workers at once may lose one of two stamps: then an old frame is answered,
+                # which does no harm.
+                if cells[at + 1] < stamp_ns:
+                    cells[at + 1] = stamp_ns
                 return
-            if free < 0 and cells[at + 1] + FORGOTTEN_NS < stamp:
+            if free < 0 and cells[at + 1] + EXPIRY_NS < stamp_ns:
                 free = at
         if free >= 0:
             cells[free + 1] = 0
             cells[free] = key
-            cells[free + 1] = stamp
+            cells[free + 1] = stamp_ns
 
-    def superseded(self, key: int, stamp: int) -> bool:
-        """Whether a newer frame than this was admitted to its stream."""
+    def is_superseded(self, key: int, stamp_ns: int) -> bool:
+        """Whether a frame newer than `stamp_ns` was announced for this stream."""
         cells = self._cells
-        for at in _places(key):
+        for at in _indices(key):
             if cells[at] == key:
-                return bool(cells[at + 1] > stamp)
+                return bool(cells[at + 1] > stamp_ns)
         return False
 
 
-def _places(key: int) -> list[int]:
-    return [(key + probe) % STREAM_SLOTS * STREAM_WORDS for probe in range(PROBES)]
+def _indices(key: int) -> list[int]:
+    return [(key + probe) % STREAM_ENTRIES * STREAM_WORDS for probe in range(PROBES)]

@@ -1,0 +1,1 @@
+"""The HTTP server below ASGI, built on internals of uvicorn."""

@@ -1,7 +1,7 @@
-"""HTTP connections that cannot be held open for nothing: deadlines, a limit, a bound on headers.
+"""HTTP connections with deadlines, a limit on their number, and a limit on the size of headers.
 
 uvicorn's protocol on httptools, with a deadline for the headers and one for the body of each
-request. `sweep` looks at them ten times a second, so that a request costs two assignments.
+request. `close_expired` checks them ten times a second, so that a request costs two assignments.
 """
 
 import asyncio
@@ -13,92 +13,115 @@ from typing import Any
 
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
-from serve.api.http_io import head_of, refusal
+from serve.api.http_io import encode_head, problem_reply
 from serve.api.problems import (
     HEAD_TOO_LARGE,
     MALFORMED,
     TOO_MANY_CONNECTIONS,
     TOO_SLOW,
-    Kind,
     Problem,
+    ProblemType,
 )
 from serve.config import MAX_HEAD_BYTES, Limits
 
-LINGER_S = 0.5  # for a client to read why it is dismissed, before the connection is cut
-EVICTABLE_S = 0.1  # headers or a body that take longer make room for another connection
+LINGER_S = 0.5  # for a client to read the problem before its connection is closed
+EVICTABLE_S = 0.1  # connections in headers or a body for longer give way to new ones
+REFUSAL_PAUSE_S = 0.002  # for which refused clients are not read while the queue is full
 
 
 class Phase(Enum):
-    """Where a connection is."""
+    """State of a connection."""
 
-    HEAD = auto()  # headers are awaited
-    BODY = auto()
-    WORK = auto()  # the answer is awaited
+    HEAD = auto()  # waiting for headers
+    BODY = auto()  # waiting for a body
+    WORK = auto()  # waiting for the answer
     IDLE = auto()  # between requests
-    DISMISSED = auto()
+    CLOSING = auto()
 
 
 @dataclass
-class Guard:
-    """What the connections of a worker share. `others` counts those of the other workers."""
+class ConnectionGuard:
+    """State that the connections of one worker share."""
 
     limits: Limits
-    others: Callable[[], int] = lambda: 0
-    dismissed: Callable[[Kind], None] = lambda _kind: None
-    draining: bool = field(default=False)
-    unfinished: dict["GuardedProtocol", None] = field(default_factory=dict)
-    """Those in the middle of headers or a body, the one that has been for longest first."""
+    other_connections: Callable[[], int] = lambda: 0
+    """Counts the connections of the other workers."""
+    count_closed: Callable[[ProblemType], None] = lambda _type: None
+    draining: bool = False
+    receiving: dict["GuardedProtocol", None] = field(default_factory=dict)
+    """Connections in the middle of headers or a body, the one that began first at the front."""
+    paused: list["GuardedProtocol"] = field(default_factory=list)
+    """Connections that are not read because they were refused while the queue is full."""
+
+    def pause_reading(self, connection: "GuardedProtocol") -> None:
+        """Read no more from a refused client for REFUSAL_PAUSE_S.
+
+        Its next request, and those of others refused meanwhile, are then handled together. Waking
+        the loop for each of them would take the core from the engine.
+        """
+        if not self.paused:
+            connection.loop.call_later(REFUSAL_PAUSE_S, self._resume_reading)
+        connection.flow.pause_reading()
+        self.paused.append(connection)
+
+    def _resume_reading(self) -> None:
+        paused, self.paused = self.paused, []
+        for connection in paused:
+            if not (connection.transport.is_closing() or connection.flow.write_paused):
+                connection.flow.resume_reading()
 
 
 class GuardedProtocol(HttpToolsProtocol):
     """One HTTP connection."""
 
-    def __init__(self, *arguments: Any, guard: Guard, **named: Any) -> None:
+    def __init__(self, *arguments: Any, guard: ConnectionGuard, **named: Any) -> None:
         super().__init__(*arguments, **named)
         self._guard = guard
         self._phase = Phase.HEAD
-        self._due = inf
-        self._since = 0.0  # when these headers, or this body, began
+        self._deadline_s = inf
+        self._phase_start_s = 0.0  # of these headers or this body
         self._served = False
-        self._head_bytes = 0  # of headers that are too large
-        self._part_bytes = 0  # of what came last
-        self._unread_bytes = (
-            0  # of all that came since the last whole request, and what came with it
-        )
+        self._head_bytes = 0  # size of headers that are too large
+        self._part_bytes = 0  # received last
+        # Received since the last complete request, with the part in which that request ended.
+        self._unread_bytes = 0
 
     @property
     def active(self) -> bool:
-        """Whether it has asked for something, and may soon ask again."""
+        """Whether it has sent a request before, or is sending one, and may soon send another."""
         return self._served or self._phase in (Phase.BODY, Phase.WORK)
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         super().connection_made(transport)
-        self._await(Phase.HEAD)
+        self._begin_receiving(Phase.HEAD)
         limit = self._guard.limits.connections
-        if len(self.connections) + self._guard.others() > limit and not self._make_room():
-            detail = f"{limit} connections are open already; keep one open for all requests"
-            self._dismiss(Problem(TOO_MANY_CONNECTIONS, detail))
+        if (
+            len(self.connections) + self._guard.other_connections() > limit
+            and not self._evict_slowest()
+        ):
+            detail = f"{limit} connections are open; use one connection for all requests"
+            self._close_with(Problem(TOO_MANY_CONNECTIONS, detail))
 
     def data_received(self, data: bytes) -> None:
-        if self._phase is Phase.DISMISSED:
+        if self._phase is Phase.CLOSING:
             return
         if self._phase is Phase.IDLE:
             self._unread_bytes = 0
-            self._await(Phase.HEAD)
+            self._begin_receiving(Phase.HEAD)
         self._part_bytes = len(data)
         self._unread_bytes += self._part_bytes
         super().data_received(data)
-        # A header that has no end yet is counted as it comes.
+        # Headers that have not ended yet are counted as they arrive.
         if self._phase is Phase.HEAD and self._unread_bytes > MAX_HEAD_BYTES:
-            self._dismiss(_head_too_large())
+            self._close_with(_head_too_large())
 
     def check_head(self) -> None:
-        """Go on to the body when the headers are not too large; else an error for the parser."""
+        """Begin to receive the body. Raises ValueError, for the parser, on too large headers."""
         if self._unread_bytes > MAX_HEAD_BYTES:
             self._head_bytes = len(self.url) + sum(len(k) + len(v) for k, v in self.headers)
             if self._head_bytes > MAX_HEAD_BYTES:
                 raise ValueError("headers too large")  # ends in `send_400_response`
-        self._await(Phase.BODY)
+        self._begin_receiving(Phase.BODY)
 
     def on_headers_complete(self) -> None:
         self.check_head()
@@ -106,16 +129,16 @@ class GuardedProtocol(HttpToolsProtocol):
         if self._guard.draining and self.cycle is not None:
             self.cycle.keep_alive = False
 
-    def body_is_whole(self) -> None:
-        """Wait for the answer, unless it was given."""
+    def on_body_complete(self) -> None:
+        """Wait for the answer, unless it was sent."""
         self._unread_bytes = self._part_bytes
         if self.cycle is None or self.cycle.response_complete:
-            self._rest()
+            self._become_idle()
         else:
-            self._leave(Phase.WORK)
+            self._stop_receiving(Phase.WORK)
 
     def on_message_complete(self) -> None:
-        self.body_is_whole()
+        self.on_body_complete()
         super().on_message_complete()
 
     def on_response_complete(self) -> None:
@@ -126,98 +149,97 @@ class GuardedProtocol(HttpToolsProtocol):
         self.server_state.total_requests += 1
         self.flow.resume_reading()
         if self._phase is Phase.WORK:
-            self._rest()
+            self._become_idle()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        self._leave(Phase.DISMISSED)
+        self._stop_receiving(Phase.CLOSING)
         super().connection_lost(exc)
 
-    def _rest(self) -> None:
+    def _become_idle(self) -> None:
         """Wait for the next request."""
-        self._leave(Phase.IDLE)
-        self._due = self.loop.time() + self._guard.limits.idle_s
+        self._stop_receiving(Phase.IDLE)
+        self._deadline_s = self.loop.time() + self._guard.limits.idle_s
 
-    def _await(self, phase: Phase) -> None:
-        """Wait for headers or a body that began now."""
-        limits, unfinished = self._guard.limits, self._guard.unfinished
-        self._phase, self._since = phase, self.loop.time()
-        self._due = self._since + (limits.head_s if phase is Phase.HEAD else limits.body_s)
-        unfinished.pop(self, None)
-        unfinished[self] = None
+    def _begin_receiving(self, phase: Phase) -> None:
+        """Wait for headers or a body, from now on."""
+        limits, receiving = self._guard.limits, self._guard.receiving
+        self._phase, self._phase_start_s = phase, self.loop.time()
+        limit_s = limits.head_s if phase is Phase.HEAD else limits.body_s
+        self._deadline_s = self._phase_start_s + limit_s
+        receiving.pop(self, None)
+        receiving[self] = None
 
-    def _leave(self, phase: Phase) -> None:
-        """Wait no more for headers or a body."""
-        self._phase, self._due = phase, inf
-        self._guard.unfinished.pop(self, None)
+    def _stop_receiving(self, phase: Phase) -> None:
+        """Go to a phase in which no headers or body are expected."""
+        self._phase, self._deadline_s = phase, inf
+        self._guard.receiving.pop(self, None)
 
     def handle_websocket_upgrade(self) -> None:
-        self._leave(Phase.WORK)
+        self._stop_receiving(Phase.WORK)
         super().handle_websocket_upgrade()
 
     def send_400_response(self, msg: str) -> None:
         if self._head_bytes > MAX_HEAD_BYTES:
-            self._dismiss(_head_too_large())
+            self._close_with(_head_too_large())
         else:
-            self._dismiss(
-                Problem(MALFORMED, "the bytes on this connection are no HTTP/1.1 request")
-            )
+            self._close_with(Problem(MALFORMED, "the bytes received are not an HTTP/1.1 request"))
 
     def _unsupported_upgrade_warning(self) -> None:
-        """An upgrade that is not taken is no event: the request is answered as it is."""
+        """Log nothing: a request with an unsupported upgrade is answered without it."""
 
     def expire(self, now: float) -> None:
-        """Dismiss the client when its deadline has passed."""
-        if now < self._due:
+        """Close the connection when its deadline has passed."""
+        if now < self._deadline_s:
             return
         if self._phase is Phase.IDLE:
-            self._due = inf
-            # Closed in peace, unless it asked and never read the answer.
+            self._deadline_s = inf
+            # Abort when the client has not read its answer; close would wait for it.
             unread = self.transport.get_write_buffer_size()
             (self.transport.abort if unread else self.transport.close)()
             return
-        what, within = "headers", self._guard.limits.head_s
+        part, limit_s = "headers", self._guard.limits.head_s
         if self._phase is Phase.BODY:
-            what, within = "body", self._guard.limits.body_s
+            part, limit_s = "body", self._guard.limits.body_s
         if self._phase is Phase.HEAD and not self._unread_bytes:
-            self._leave(Phase.DISMISSED)
-            self.transport.abort()  # it never asked for anything
+            self._stop_receiving(Phase.CLOSING)
+            self.transport.abort()  # nothing was received: there is nobody to answer
             return
-        self._dismiss(Problem(TOO_SLOW, f"the {what} did not come within {within:g} s"))
+        self._close_with(Problem(TOO_SLOW, f"the {part} did not arrive within {limit_s:g} s"))
 
-    def _make_room(self) -> bool:
-        """Cut the connection that has sent too little for longest; False where there is none."""
-        oldest = next(iter(self._guard.unfinished))  # at the latest this one itself
-        if self.loop.time() - oldest._since <= EVICTABLE_S:
+    def _evict_slowest(self) -> bool:
+        """Abort the connection that has been receiving for longest; False where there is none."""
+        oldest = next(iter(self._guard.receiving))  # this one itself, if there is no other
+        if self.loop.time() - oldest._phase_start_s <= EVICTABLE_S:
             return False
-        oldest._leave(Phase.DISMISSED)
+        oldest._stop_receiving(Phase.CLOSING)
         oldest.transport.abort()
-        self._guard.dismissed(TOO_MANY_CONNECTIONS)
+        self._guard.count_closed(TOO_MANY_CONNECTIONS)
         return True
 
-    def _dismiss(self, problem: Problem) -> None:
-        """Say why, and cut the connection."""
-        self._leave(Phase.DISMISSED)
-        self._guard.dismissed(problem.kind)
+    def _close_with(self, problem: Problem) -> None:
+        """Send a problem and close the connection."""
+        self._stop_receiving(Phase.CLOSING)
+        self._guard.count_closed(problem.type)
         if self.cycle is not None and not self.cycle.response_complete:
             self.cycle.disconnected = True
             self.cycle.message_event.set()
         self._unset_keepalive_if_required()
         if self.transport.is_closing():
             return
-        whole = refusal(problem, (b"connection", b"close"))
-        self.transport.write(head_of(whole) + whole.body)
-        # Cut at once, the answer would be lost to whoever is still sending.
+        reply = problem_reply(problem, (b"connection", b"close"))
+        self.transport.write(encode_head(reply) + reply.body)
+        # Aborted at once, the reply would be lost to a client that is still sending.
         if self.transport.can_write_eof():
             self.transport.write_eof()
         self.loop.call_later(LINGER_S, self.transport.abort)
 
 
-def sweep(connections: Iterable[object], now: float) -> None:
-    """Dismiss those whose deadline has passed."""
+def close_expired(connections: Iterable[object], now: float) -> None:
+    """Close the connections whose deadline has passed; `now` in s of the loop's clock."""
     for connection in list(connections):
         if isinstance(connection, GuardedProtocol):
             connection.expire(now)
 
 
 def _head_too_large() -> Problem:
-    return Problem(HEAD_TOO_LARGE, f"the headers have over {MAX_HEAD_BYTES} bytes; send fewer")
+    return Problem(HEAD_TOO_LARGE, f"the headers have more than {MAX_HEAD_BYTES} bytes; send fewer")

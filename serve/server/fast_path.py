@@ -1,60 +1,60 @@
-"""POST /features straight from the parser to its reply: no scope, no task, no messages between.
+"""POST /features from the HTTP parser to its reply without ASGI: no scope, no task, no messages.
 
-What stands in the way of ASGI costs more than all else that a request needs beside the model. All
-other requests take that way, and so do the few for this path that need more of it: an upgrade, a
-client that waits for "100 Continue", a proxy's word about its client, one request before the reply
-to the last.
+ASGI would cost more than everything else that a request needs beside the model. All other requests
+go through ASGI, and so do requests for this path with an upgrade, with "Expect: 100-continue",
+with X-Forwarded-For, or pipelined before the reply to the previous one.
 """
 
 from functools import partial
+from http import HTTPStatus
 from typing import Any
 
 from serve.api.features import FeaturesRequest
-from serve.api.http_io import Header, Reply, check_size, head_of
+from serve.api.http_io import Header, Reply, check_body_size, encode_head
 from serve.api.problems import Problem
 from serve.api.request_options import Headers
 from serve.app import Service
 from serve.server.connection import GuardedProtocol, Phase
 
-CLOSE: Header = (b"connection", b"close")
-INDIRECT = frozenset({b"expect", b"upgrade", b"x-forwarded-for"})
+CLOSE_HEADER: Header = (b"connection", b"close")
+ASGI_HEADERS = frozenset({b"expect", b"upgrade", b"x-forwarded-for"})
 
 
-class Nobody:
-    """An event that nobody waits for."""
+class NullEvent:
+    """An event that nothing waits for."""
 
     def set(self) -> None:
-        pass
+        """Do nothing."""
 
 
-class Direct:
-    """A request on its way; where uvicorn looks at it, it looks like one of its cycles."""
+class DirectRequest:
+    """A request in progress, with the attributes of uvicorn's RequestResponseCycle that it uses."""
 
-    __slots__ = ("disconnected", "exchange", "keep_alive", "parts", "response_complete", "size")
-    message_event = Nobody()
+    __slots__ = ("disconnected", "features", "keep_alive", "parts", "response_complete", "size")
+    message_event = NullEvent()
 
     def __init__(self, keep_alive: bool) -> None:
         self.keep_alive = keep_alive
         self.disconnected = self.response_complete = False
-        self.exchange: FeaturesRequest | None = None
+        self.features: FeaturesRequest | None = None
         self.parts: list[bytes] = []
         self.size = 0
 
     def add(self, part: bytes) -> None:
-        """Take some of the body, unless the request was refused."""
-        if self.exchange is None:
+        """Add a part of the body, unless the request was refused."""
+        if self.features is None:
             return
         self.parts.append(part)
         self.size += len(part)
         try:
-            check_size(self.size)
+            check_body_size(self.size)
         except Problem as problem:
-            self.exchange.refuse(problem)
-            self.exchange = None
+            self.features.refuse(problem)
+            self.features = None
 
     @property
     def body(self) -> bytes:
-        """What has come."""
+        """All parts received."""
         return self.parts[0] if len(self.parts) == 1 else b"".join(self.parts)
 
 
@@ -64,7 +64,7 @@ class DirectProtocol(GuardedProtocol):
     def __init__(self, *arguments: Any, service: Service, **named: Any) -> None:
         super().__init__(*arguments, **named)
         self._service = service
-        self._direct: Direct | None = None
+        self._request: DirectRequest | None = None
 
     def on_message_begin(self) -> None:
         self.url = b""
@@ -75,63 +75,67 @@ class DirectProtocol(GuardedProtocol):
 
     def on_headers_complete(self) -> None:
         headers = dict(self.headers)
-        if not self._goes_directly(headers):
+        if not self._bypasses_asgi(headers):
             self._build_scope()
             super().on_headers_complete()
             return
         self.check_head()
-        self.cycle: Any = Direct(not self._guard.draining and self.parser.should_keep_alive())
-        self._direct = direct = self.cycle
-        send = partial(self._reply, direct)
-        direct.exchange = self._service.open(headers, self.client[0] if self.client else "", send)
+        self.cycle: Any = DirectRequest(
+            not self._guard.draining and self.parser.should_keep_alive()
+        )
+        self._request = request = self.cycle
+        send = partial(self._reply, request)
+        request.features = self._service.open(headers, self.client[0] if self.client else "", send)
 
     def on_body(self, body: bytes) -> None:
-        if self._direct is None:
+        if self._request is None:
             super().on_body(body)
         else:
-            self._direct.add(body)
+            self._request.add(body)
 
     def on_message_complete(self) -> None:
-        direct, self._direct = self._direct, None
-        if direct is None:
+        request, self._request = self._request, None
+        if request is None:
             super().on_message_complete()
             return
-        self.body_is_whole()
-        if direct.exchange is not None:
-            direct.exchange.take(direct.body)
+        self.on_body_complete()
+        if request.features is not None:
+            request.features.submit(request.body)
 
     def resume_writing(self) -> None:
         super().resume_writing()
         self.flow.resume_reading()
 
-    def _goes_directly(self, headers: Headers) -> bool:
+    def _bypasses_asgi(self, headers: Headers) -> bool:
         return (
             self.url == b"/features"
             and self.parser.get_method() == b"POST"
             and (self.cycle is None or self.cycle.response_complete)
             and self.parser.get_http_version() == "1.1"
-            and headers.keys().isdisjoint(INDIRECT)
+            and headers.keys().isdisjoint(ASGI_HEADERS)
         )
 
     def _build_scope(self) -> None:
-        """What uvicorn does as it reads a request, done when that request is to be its own."""
+        """Build the ASGI scope as uvicorn does while it parses a request."""
         url, headers = self.url, self.headers
         super().on_message_begin()
         self.url = url
         for name, value in headers:
             super().on_header(name, value)
 
-    def _reply(self, direct: Direct, whole: Reply) -> None:
-        direct.response_complete = True
-        direct.exchange = None  # which holds it in turn, by its way to reply
-        if direct.disconnected or self.transport.is_closing() or self._phase is Phase.DISMISSED:
+    def _reply(self, request: DirectRequest, reply: Reply) -> None:
+        request.response_complete = True
+        request.features = None  # breaks a reference cycle: it holds this method
+        if request.disconnected or self.transport.is_closing() or self._phase is Phase.CLOSING:
             return
-        more = self.server_state.default_headers
-        if not direct.keep_alive:
-            more = [*more, CLOSE]
-        self.transport.write(head_of(whole, *more) + whole.body)
-        if not direct.keep_alive:
+        headers = self.server_state.default_headers
+        if not request.keep_alive:
+            headers = [*headers, CLOSE_HEADER]
+        self.transport.write(encode_head(reply, *headers) + reply.body)
+        if not request.keep_alive:
             self.transport.close()
         self.on_response_complete()
-        if self.flow.write_paused:  # whoever does not read is not listened to
+        if self.flow.write_paused:  # a client that reads no replies may send no more requests
             self.flow.pause_reading()
+        elif reply.status == HTTPStatus.SERVICE_UNAVAILABLE and self._service.frame_queue.full:
+            self._guard.pause_reading(self)

@@ -1,4 +1,6 @@
-"""A WebSocket whose end the client learns of, even in the middle of a message that is too long."""
+"""WebSocket connections that report to the client why they are closed, also on a message that is
+too long.
+"""
 
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 
@@ -6,22 +8,22 @@ from serve.server.connection import LINGER_S
 
 
 class GuardedWebSocket(WebSocketsSansIOProtocol):
-    """One WebSocket connection, from its handshake on."""
+    """One WebSocket connection."""
 
-    _ended = False
+    _discarding = False
 
     def data_received(self, data: bytes) -> None:
-        if not self._ended:
+        if not self._discarding:
             super().data_received(data)
 
     def handle_parser_exception(self) -> None:
-        """Say why, then read on for a while without listening.
+        """Send the close frame, then discard what the client still sends for LINGER_S.
 
-        Closed with bytes unread, a connection is reset, and the reset overtakes the reason.
+        A connection closed with unread bytes is reset, and the client would lose the close frame.
         """
         closing = self.conn.close_sent
         assert closing is not None
-        self._ended = self.close_sent = True
+        self._discarding = self.close_sent = True
         self.stop_keepalive()
         self.queue.put_nowait(
             {"type": "websocket.disconnect", "code": closing.code, "reason": closing.reason}

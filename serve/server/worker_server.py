@@ -1,8 +1,9 @@
-"""The server of one worker: it takes connections in turn with the others, and drains at its end.
+"""The server of one worker: it shares new connections with the other workers, and drains them when
+it stops.
 
-All workers listen on one socket and all are woken by a connection; the one with the fewest takes
-it. (Left to the kernel, one of two workers may get six of eight cars, and keep them for hours.)
-One that is still warming up leaves them to those that can answer.
+All workers listen on one socket and all are woken by a new connection; the one with the fewest
+connections accepts it. (If the kernel chose, one of two workers could get six of eight clients and
+keep them for hours.) A worker that is warming up leaves connections to those that are ready.
 """
 
 import asyncio
@@ -20,34 +21,36 @@ import uvicorn
 
 from serve.app import Service
 from serve.config import MAX_BODY_BYTES, Limits
-from serve.server.connection import Guard, GuardedProtocol, sweep
+from serve.server.connection import ConnectionGuard, GuardedProtocol, close_expired
 from serve.server.fast_path import DirectProtocol
 from serve.server.websocket import GuardedWebSocket
-from serve.workers.shared_memory import BlockPeers
+from serve.workers.shared_memory import WorkerPeers
 
-GRACE_S = 5  # for requests in progress when the service is told to stop
-DRAIN_S = 1.0  # for clients at work to send one more request and be told to connect anew
-TURN_S = 0.002  # for which a worker leaves a connection to one that has fewer
-REST_S = 0.1  # after the system has no more descriptors
+GRACE_S = 5  # for requests in progress when the service stops
+DRAIN_S = 1.0  # for active clients to send one more request, answered with Connection: close
+YIELD_S = 0.002  # for which a worker leaves a connection to one that has fewer
+NO_DESCRIPTOR_PAUSE_S = 0.1  # after the system has run out of file descriptors
 
 logger = logging.getLogger(__name__)
 
 
 class WorkerServer(uvicorn.Server):
-    """uvicorn with our own accepting, deadlines and draining."""
+    """uvicorn's server with shared accepting, deadlines and draining."""
 
-    def __init__(self, app: Service, limits: Limits, peers: BlockPeers | None = None) -> None:
-        self.guard = Guard(
-            limits, others=lambda: sum(self._peers.others()), dismissed=app.metrics.dismissed
+    def __init__(self, app: Service, limits: Limits, peers: WorkerPeers | None = None) -> None:
+        self.guard = ConnectionGuard(
+            limits,
+            other_connections=lambda: sum(self._peers.other_connections()),
+            count_closed=app.metrics.count_closed,
         )
-        super().__init__(_settings(app, limits))
+        super().__init__(_uvicorn_config(app))
         self._app = app
-        self._peers = peers or BlockPeers(app.shared, 0)
-        self._waited = False
+        self._peers = peers or WorkerPeers(app.shared, 0)
+        self._yielded = False
 
     @contextmanager
     def capture_signals(self) -> Iterator[None]:
-        """SIGTERM ends the worker; Ctrl-C, which all of the group get, is the supervisor's."""
+        """SIGTERM stops the worker; Ctrl-C and the other signals are left to the supervisor."""
         if threading.current_thread() is threading.main_thread():
             signal.signal(signal.SIGTERM, self.handle_exit)
             for number in (signal.SIGINT, signal.SIGHUP, signal.SIGUSR2):
@@ -55,7 +58,7 @@ class WorkerServer(uvicorn.Server):
         yield
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
-        """Start the application, then take connections from the one listening socket."""
+        """Start the application, then accept connections from the one listening socket."""
         assert sockets is not None
         await self.lifespan.startup()
         if self.lifespan.should_exit:
@@ -64,7 +67,7 @@ class WorkerServer(uvicorn.Server):
         self._listener = sockets[0]
         self._listener.setblocking(False)
         self._loop = asyncio.get_running_loop()
-        self._make = partial(
+        self._make_protocol = partial(
             DirectProtocol,
             service=self._app,
             guard=self.guard,
@@ -73,53 +76,53 @@ class WorkerServer(uvicorn.Server):
             app_state=self.lifespan.state,
             _loop=self._loop,
         )
-        self._listen()
+        self._start_accepting()
         self.started = True
 
     async def on_tick(self, counter: int) -> bool:
-        """Ten times a second."""
-        sweep(self.server_state.connections, self._loop.time())
-        self._tell()
+        """Close expired connections and publish the status; called ten times a second."""
+        close_expired(self.server_state.connections, self._loop.time())
+        self._publish_status()
         return await super().on_tick(counter)
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
-        """Take no more connections, tell the clients at work, finish what was begun."""
+        """Accept no more connections, drain the active ones, finish requests in progress."""
         self._loop.remove_reader(self._listener.fileno())
         self.guard.draining = True
-        self._peers.leave()
+        self._peers.withdraw()
         end = self._loop.time() + DRAIN_S
-        while self._at_work() and self._loop.time() < end and not self.force_exit:
+        while self._has_active_clients() and self._loop.time() < end and not self.force_exit:
             await asyncio.sleep(0.02)
         await super().shutdown(sockets)
 
-    def _at_work(self) -> bool:
-        """Whether a connection is open that may soon ask once more."""
+    def _has_active_clients(self) -> bool:
+        """Whether a client is connected that may soon send another request."""
         return any(
-            isinstance(found, GuardedProtocol) and found.active
-            for found in self.server_state.connections
+            isinstance(connection, GuardedProtocol) and connection.active
+            for connection in self.server_state.connections
         )
 
-    def _listen(self) -> None:
+    def _start_accepting(self) -> None:
         self._loop.add_reader(self._listener.fileno(), self._accept)
 
-    def _rest(self, seconds: float) -> None:
+    def _pause_accepting(self, seconds: float) -> None:
         self._loop.remove_reader(self._listener.fileno())
-        self._loop.call_later(seconds, self._resume)
+        self._loop.call_later(seconds, self._resume_accepting)
 
-    def _resume(self) -> None:
+    def _resume_accepting(self) -> None:
         if not self.guard.draining:
-            self._listen()
+            self._start_accepting()
 
     def _accept(self) -> None:
-        if not self._app.perceiver.ready and self._peers.other_is_ready():
-            self._rest(TURN_S)
+        if not self._app.frame_queue.ready and self._peers.other_is_ready():
+            self._pause_accepting(YIELD_S)
             return
-        mine, others = len(self.server_state.connections), self._peers.others()
-        if others and mine > min(others) and not self._waited:
-            self._waited = True  # once: the other may hang
-            self._rest(TURN_S)
+        own, others = len(self.server_state.connections), self._peers.other_connections()
+        if others and own > min(others) and not self._yielded:
+            self._yielded = True  # only once: the other worker may hang
+            self._pause_accepting(YIELD_S)
             return
-        self._waited = False
+        self._yielded = False
         try:
             connection, _ = self._listener.accept()
         except (BlockingIOError, InterruptedError, ConnectionAbortedError):
@@ -127,8 +130,8 @@ class WorkerServer(uvicorn.Server):
         except OSError as error:
             if error.errno not in (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM):
                 raise
-            logger.error("cannot take a connection: %s", error.strerror)
-            self._rest(REST_S)
+            logger.error("cannot accept a connection: %s", error.strerror)
+            self._pause_accepting(NO_DESCRIPTOR_PAUSE_S)
             return
         connection.setblocking(False)
         task = self._loop.create_task(self._serve_connection(connection))
@@ -136,21 +139,21 @@ class WorkerServer(uvicorn.Server):
         task.add_done_callback(self.server_state.tasks.discard)
 
     async def _serve_connection(self, connection: socket.socket) -> None:
-        await self._loop.connect_accepted_socket(self._make, connection)
-        self._tell()
+        await self._loop.connect_accepted_socket(self._make_protocol, connection)
+        self._publish_status()
 
-    def _tell(self) -> None:
-        self._peers.tell(len(self.server_state.connections), self._app.perceiver.ready)
+    def _publish_status(self) -> None:
+        self._peers.publish(len(self.server_state.connections), self._app.frame_queue.ready)
 
 
-def _settings(app: Any, limits: Limits) -> uvicorn.Config:
+def _uvicorn_config(app: Any) -> uvicorn.Config:
     return uvicorn.Config(
         app,
         loop="uvloop",
         http="httptools",
         ws=GuardedWebSocket,
         ws_max_size=MAX_BODY_BYTES,
-        ws_per_message_deflate=False,  # images do not shrink
+        ws_per_message_deflate=False,  # images are compressed already
         lifespan="on",
         log_config=None,
         access_log=False,

@@ -1,0 +1,1 @@
+"""The worker processes, their supervisor, and what they share."""

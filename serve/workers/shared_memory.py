@@ -1,8 +1,16 @@
-"""What all workers of a service see at once: one piece of memory, inherited by file descriptor.
+"""Memory that all workers of a service share, and the layout of every cell in it.
 
-Cells are 64-bit words, each written by one process or, in the tables, by any: a word is stored in
-one instruction, so a reader sees the old or the new one, never half of each. Layout, in words:
-the head, a block for each worker slot, the table of streams, the table of clients.
+Cells are 64-bit words. A word is stored in one instruction, so a reader sees the old or the new
+value, never a mixture; there are no locks. Layout, in this order:
+
+    head            HEAD_WORDS unsigned integers, written by the supervisor
+    worker blocks   WORKER_WORDS reals each, written by the one worker that owns the block
+    stream table    STREAM_ENTRIES x (key, newest time stamp in ns), unsigned, written by any worker
+    client table    CLIENT_ENTRIES x (key, tokens left, time of the last update in s), reals,
+                    written by any worker
+
+Both tables are hash tables with open addressing: a key lies in one of the `PROBES` entries that
+follow its hash.
 """
 
 import mmap
@@ -12,99 +20,103 @@ import time
 from dataclasses import dataclass
 
 HEAD_WORDS = 8
+COMMITTED_GENERATION = 0  # head: the generation of weights that all workers answer with
+
 WORKER_WORDS = 256
-STREAM_SLOTS, STREAM_WORDS = 1024, 2
-CLIENT_SLOTS, CLIENT_WORDS = 1024, 3
-COMMITTED = 0  # word of the head: the generation of weights that all workers are to answer with
+HEARTBEAT, CONNECTIONS, WAITING, READY = 0, 1, 2, 3  # monotonic s; counts; 1.0 or 0.0
+MAX_OUTCOMES = 64
+STAGES, STAGE_WORDS = 4, 16
+FRAME_COUNTS = 8  # MAX_OUTCOMES counters: frames by outcome
+CLOSED_COUNTS = FRAME_COUNTS + MAX_OUTCOMES  # MAX_OUTCOMES counters: closed connections by reason
+HISTOGRAMS = CLOSED_COUNTS + MAX_OUTCOMES  # STAGES x STAGE_WORDS: buckets, then the sum in s
+
+STREAM_ENTRIES, STREAM_WORDS = 1024, 2
+CLIENT_ENTRIES, CLIENT_WORDS = 1024, 3
+PROBES = 8
+
+HEARTBEAT_TIMEOUT_S = 1.0  # a worker whose heartbeat is older counts as gone
 
 
 @dataclass(frozen=True)
-class Shared:
-    """The memory of a service with `slots` worker slots, and the descriptor it is inherited by."""
+class SharedMemory:
+    """The memory of a service with `blocks` worker blocks; `fd` is its file descriptor."""
 
     fd: int
-    slots: int
+    blocks: int
     memory: mmap.mmap
 
     def head(self) -> "memoryview[int]":
-        """The unsigned words of the head."""
-        return self._part(0, HEAD_WORDS).cast("Q")
+        """The head, unsigned integers (HEAD_WORDS,)."""
+        return self._words(0, HEAD_WORDS).cast("Q")
 
-    def worker(self, slot: int) -> "memoryview[float]":
-        """The reals of a worker's block: its counts, see `serve.observability.metrics`."""
-        return self._part(HEAD_WORDS + slot * WORKER_WORDS, WORKER_WORDS).cast("d")
+    def worker(self, block: int) -> "memoryview[float]":
+        """One worker's block, reals (WORKER_WORDS,)."""
+        return self._words(HEAD_WORDS + block * WORKER_WORDS, WORKER_WORDS).cast("d")
 
     def streams(self) -> "memoryview[int]":
-        """The unsigned words of the table of streams, see `serve.scheduling.streams`."""
-        first = HEAD_WORDS + self.slots * WORKER_WORDS
-        return self._part(first, STREAM_SLOTS * STREAM_WORDS).cast("Q")
+        """The stream table, unsigned integers (STREAM_ENTRIES * STREAM_WORDS,)."""
+        first = HEAD_WORDS + self.blocks * WORKER_WORDS
+        return self._words(first, STREAM_ENTRIES * STREAM_WORDS).cast("Q")
 
     def clients(self) -> "memoryview[float]":
-        """The reals of the table of clients, see `serve.scheduling.rate_limit`."""
-        first = HEAD_WORDS + self.slots * WORKER_WORDS + STREAM_SLOTS * STREAM_WORDS
-        return self._part(first, CLIENT_SLOTS * CLIENT_WORDS).cast("d")
+        """The client table, reals (CLIENT_ENTRIES * CLIENT_WORDS,)."""
+        first = HEAD_WORDS + self.blocks * WORKER_WORDS + STREAM_ENTRIES * STREAM_WORDS
+        return self._words(first, CLIENT_ENTRIES * CLIENT_WORDS).cast("d")
 
-    def _part(self, first: int, count: int) -> "memoryview[int]":
+    def _words(self, first: int, count: int) -> "memoryview[int]":
         return memoryview(self.memory)[8 * first : 8 * (first + count)]
 
 
-def create(slots: int) -> Shared:
-    """New memory, all zero, that child processes may inherit."""
+def create_shared_memory(blocks: int) -> SharedMemory:
+    """New memory, all zero, whose descriptor child processes inherit."""
     if hasattr(os, "memfd_create"):
         fd = os.memfd_create("driverview-serve", 0)
-    else:  # not Linux: a file that has no name any more
+    else:  # not Linux: an unlinked file
         with tempfile.TemporaryFile() as file:
             fd = os.dup(file.fileno())
-    os.ftruncate(fd, _size(slots))
+    os.ftruncate(fd, _size_bytes(blocks))
     os.set_inheritable(fd, True)
-    return attach(fd, slots)
+    return attach_shared_memory(fd, blocks)
 
 
-def attach(fd: int, slots: int) -> Shared:
+def attach_shared_memory(fd: int, blocks: int) -> SharedMemory:
     """The memory behind an inherited descriptor."""
-    return Shared(fd, slots, mmap.mmap(fd, _size(slots)))
+    return SharedMemory(fd, blocks, mmap.mmap(fd, _size_bytes(blocks)))
 
 
-def _size(slots: int) -> int:
-    tables = STREAM_SLOTS * STREAM_WORDS + CLIENT_SLOTS * CLIENT_WORDS
-    return 8 * (HEAD_WORDS + slots * WORKER_WORDS + tables)
+def _size_bytes(blocks: int) -> int:
+    tables = STREAM_ENTRIES * STREAM_WORDS + CLIENT_ENTRIES * CLIENT_WORDS
+    return 8 * (HEAD_WORDS + blocks * WORKER_WORDS + tables)
 
 
-# What a worker tells the others, in its block of the shared memory, and what it knows of them.
+class WorkerPeers:
+    """The status of a worker and of its peers: heartbeat, connections, readiness."""
 
+    def __init__(self, shared: SharedMemory, block: int) -> None:
+        """`block` is the number of this worker's own block."""
+        blocks = [shared.worker(number) for number in range(shared.blocks)]
+        self._own = blocks[block]
+        self._others = [cells for number, cells in enumerate(blocks) if number != block]
 
-BEAT, CONNECTIONS, WAITING, READY = 0, 1, 2, 3  # s of the monotonic clock; numbers; 1.0 or 0.0
-COUNTS = 8  # where the counts of `serve.observability.metrics` begin
-SILENT_S = 1.0  # a worker that has said nothing for so long may be gone
+    def publish(self, connections: int, ready: bool) -> None:
+        """Write this worker's status and heartbeat."""
+        self._own[CONNECTIONS] = connections
+        self._own[READY] = ready
+        self._own[HEARTBEAT] = time.monotonic()
 
+    def withdraw(self) -> None:
+        """Clear this worker's status: it takes no more connections."""
+        for cell in (HEARTBEAT, CONNECTIONS, WAITING, READY):
+            self._own[cell] = 0.0
 
-class BlockPeers:
-    """The other workers of a service, seen from the one in `slot`."""
-
-    def __init__(self, shared: Shared, slot: int) -> None:
-        self._blocks = [shared.worker(number) for number in range(shared.slots)]
-        self._mine = self._blocks[slot]
-        self._others = [block for number, block in enumerate(self._blocks) if number != slot]
-
-    def tell(self, connections: int, ready: bool) -> None:
-        """Say that this worker is alive, has so many connections, and whether it can answer."""
-        self._mine[CONNECTIONS] = connections
-        self._mine[READY] = ready
-        self._mine[BEAT] = time.monotonic()
-
-    def leave(self) -> None:
-        """Say that this worker takes no more connections."""
-        for cell in (BEAT, CONNECTIONS, WAITING, READY):
-            self._mine[cell] = 0.0
-
-    def others(self) -> list[int]:
-        """The connections of each of the other workers that are alive."""
-        return [int(block[CONNECTIONS]) for block in self._alive()]
+    def other_connections(self) -> list[int]:
+        """The number of open connections of each other live worker."""
+        return [int(cells[CONNECTIONS]) for cells in self._live()]
 
     def other_is_ready(self) -> bool:
-        """Whether another worker can answer."""
-        return any(block[READY] for block in self._alive())
+        """Whether another live worker can answer images."""
+        return any(cells[READY] for cells in self._live())
 
-    def _alive(self) -> list["memoryview[float]"]:
-        since = time.monotonic() - SILENT_S
-        return [block for block in self._others if block[BEAT] > since]
+    def _live(self) -> list["memoryview[float]"]:
+        since = time.monotonic() - HEARTBEAT_TIMEOUT_S
+        return [cells for cells in self._others if cells[HEARTBEAT] > since]

@@ -1,8 +1,8 @@
-"""The parent of the workers: starts them, replaces those that die, brings in new weights.
+"""The parent of the workers: starts them, replaces those that die, distributes new weights.
 
-It answers no request and loads no engine. SIGTERM and SIGINT end the service, SIGHUP loads the
-model anew, SIGUSR2 replaces the workers one by one; `serve reload` and `serve restart` ask for the
-same over a Unix socket and hear how it went.
+It answers no request and loads no engine. SIGTERM and SIGINT stop the service, SIGHUP reloads the
+model, SIGUSR2 replaces the workers one by one; `serve reload` and `serve restart` do the latter two
+over a Unix socket and report the result.
 """
 
 import asyncio
@@ -16,21 +16,25 @@ from pathlib import Path
 from typing import Any
 
 from serve.config import Limits
-from serve.workers.shared_memory import COMMITTED, Shared, create
-from serve.workers.worker_process import Child, Task, start
+from serve.workers.shared_memory import (
+    COMMITTED_GENERATION,
+    SharedMemory,
+    create_shared_memory,
+)
+from serve.workers.worker_process import WorkerProcess, WorkerTask, start_worker
 from trackfeatures.errors import UserError
 
-LOAD_S = 120.0  # for a worker to load a model, on a machine that is busy
-STOP_S = 15.0  # for a worker to end when told to; then it is killed
-FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.5, 30.0  # before a worker that died is replaced
-STEADY_S = 10.0  # a worker that lived for so long did not die of its start
+LOAD_TIMEOUT_S = 120.0  # for a worker to load a model on a busy machine
+STOP_TIMEOUT_S = 15.0  # for a worker to stop on SIGTERM; then it is killed
+MIN_BACKOFF_S, MAX_BACKOFF_S = 0.5, 30.0  # before a worker that died is replaced
+STABLE_AGE_S = 10.0  # a worker that lived this long did not fail at its start
 
 logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class ServicePlan:
-    """What is served, by how many. `resolve` gives the folder of a model's name, or raises."""
+    """What is served, and by how many workers. `resolve` maps a model's name to its folder."""
 
     model: str
     resolve: Callable[[str], Path]
@@ -44,16 +48,17 @@ class Supervisor:
     def __init__(self, plan: ServicePlan, listener: socket.socket) -> None:
         self._plan = plan
         self._listener = listener
-        # One more than workers: a replacement runs beside the worker that it replaces.
-        self._shared: Shared = create(slots=plan.workers + 1)
+        # One block more than workers: a replacement runs beside the worker that it replaces.
+        self._shared: SharedMemory = create_shared_memory(plan.workers + 1)
         self._head = self._shared.head()
-        self._children: dict[int, Child] = {}
+        self._workers: dict[int, WorkerProcess] = {}  # by position, 0 to plan.workers - 1
         self._folder = plan.resolve(plan.model)
         self._model = plan.model
-        self._hash: str | None = None
-        self._changing = asyncio.Lock()
+        self._model_hash: str | None = None
+        self._last_generation = 0  # of any reload, also of those that failed
+        self._change_lock = asyncio.Lock()
         self._stopping = asyncio.Event()
-        self._terminal = _has_terminal()
+        self._has_terminal = _has_terminal()
 
     @property
     def folder(self) -> Path:
@@ -61,128 +66,146 @@ class Supervisor:
         return self._folder
 
     async def start(self) -> dict[str, Any]:
-        """Start all workers; what the first says of its engine. Raises UserError."""
+        """Start all workers; the first one's report of its engine. Raises UserError."""
         loop = asyncio.get_running_loop()
         for number in (signal.SIGTERM, signal.SIGINT):
             loop.add_signal_handler(number, self._stopping.set)
-        for slot in range(self._plan.workers):
-            self._children[slot] = await self._start(slot)
+        for position in range(self._plan.workers):
+            self._workers[position] = await self._start_worker(self._free_block())
         try:
-            answers = [await child.loaded(0, LOAD_S) for child in self._children.values()]
+            reports = [await w.wait_loaded(0, LOAD_TIMEOUT_S) for w in self._workers.values()]
         except UserError:
-            await self._stop()
+            await self._stop_workers()
             raise
-        self._hash = answers[0]["model"]
-        return answers[0]
+        self._model_hash = reports[0]["model"]
+        return reports[0]
 
     async def run(self) -> None:
-        """Watch over the workers until told to stop."""
+        """Replace workers that die, until the service is stopped."""
         loop = asyncio.get_running_loop()
         tasks: set[asyncio.Task[Any]] = set()
 
-        def begin(what: Callable[[], Any]) -> None:
-            task = asyncio.ensure_future(_told(what))
+        def begin(action: Callable[[], Any]) -> None:
+            task = asyncio.ensure_future(_log_errors(action))
             tasks.add(task)
             task.add_done_callback(tasks.discard)
 
         loop.add_signal_handler(signal.SIGHUP, self._on_hangup, lambda: begin(self.reload))
         loop.add_signal_handler(signal.SIGUSR2, begin, self.restart)
-        watchers = [asyncio.ensure_future(self._watch(slot)) for slot in range(self._plan.workers)]
+        watchers = [
+            asyncio.ensure_future(self._replace_dead(position))
+            for position in range(self._plan.workers)
+        ]
         await self._stopping.wait()
         for task in (*watchers, *tasks):
             task.cancel()
-        await self._stop()
+        await self._stop_workers()
 
-    async def _stop(self) -> None:
-        await asyncio.gather(*(child.stop(STOP_S) for child in self._children.values()))
+    async def _stop_workers(self) -> None:
+        await asyncio.gather(*(worker.stop(STOP_TIMEOUT_S) for worker in self._workers.values()))
 
     async def reload(self, model: str | None = None) -> str:
-        """Load `model`, None: the one served, anew in all workers, then answer with it.
+        """Load `model` (None: the current one, again) in all workers, then answer with it.
 
-        Gives its hash. Raises UserError, and then the old one goes on answering.
+        Returns its hash. Raises UserError; the old weights then stay in use.
         """
-        async with self._changing:
+        async with self._change_lock:
             name = model or self._model
             folder = self._plan.resolve(name)
-            generation = self._head[COMMITTED] + 1
-            children = [child for child in self._children.values() if child.alive]
-            if not children:
-                raise UserError("no worker is alive; they are being started")
-            for child in children:
-                child.say(load=str(folder.resolve()), generation=generation)
-            answers = await asyncio.gather(
-                *(child.loaded(generation, LOAD_S) for child in children), return_exceptions=True
+            workers = [worker for worker in self._workers.values() if worker.alive]
+            if not workers:
+                raise UserError("no worker is alive; they are being restarted, try again")
+            # A number is never used twice: a late report of a failed reload is not taken for one
+            # of the next.
+            self._last_generation += 1
+            generation = self._last_generation
+            for worker in workers:
+                worker.send(load=str(folder.resolve()), generation=generation)
+            reports = await asyncio.gather(
+                *(worker.wait_loaded(generation, LOAD_TIMEOUT_S) for worker in workers),
+                return_exceptions=True,
             )
-            fault = self._fault(answers)
-            if fault is not None:
-                for child in children:
-                    child.say(drop=generation)
-                raise UserError(f"{fault}; the old model goes on answering")
-            found = str(answers[0]["model"])  # type: ignore[index]
-            # From this instant on every worker answers with the new weights.
-            self._head[COMMITTED] = generation
-            self._folder, self._model, self._hash = folder, name, found
-            logger.info("now serving %s, model %s", folder, found[:12])
-            return found
+            problem = _load_problem(reports)
+            if problem is not None:
+                for worker in workers:
+                    worker.send(drop=generation)
+                raise UserError(f"{problem}; the old model stays in use")
+            model_hash = str(reports[0]["model"])  # type: ignore[index]
+            # From this store on, every worker answers with the new weights.
+            self._head[COMMITTED_GENERATION] = generation
+            self._folder, self._model, self._model_hash = folder, name, model_hash
+            logger.info("now serving %s, model %s", folder, model_hash[:12])
+            return model_hash
 
     def _on_hangup(self, reload: Callable[[], None]) -> None:
-        """SIGHUP is also what a terminal sends that closes: then it is the end."""
-        if self._terminal and not _has_terminal():
+        """SIGHUP: reload; but stop when it was sent because the terminal was closed."""
+        if self._has_terminal and not _has_terminal():
             self._stopping.set()
         else:
             reload()
 
-    @staticmethod
-    def _fault(answers: list[Any]) -> str | None:
-        for answer in answers:
-            if isinstance(answer, UserError):
-                return str(answer)
-            if isinstance(answer, BaseException):
-                raise answer
-        hashes = {answer["model"] for answer in answers}
-        return "the workers loaded different weights" if len(hashes) > 1 else None
-
     async def restart(self) -> None:
-        """Replace the workers one by one; each goes only when its replacement is ready."""
-        async with self._changing:
-            for slot, old in list(self._children.items()):
-                new = await self._start(self._free_slot())
-                await new.loaded(self._head[COMMITTED], LOAD_S)
-                await new.ready(LOAD_S)
-                self._children[slot] = new
-                await old.stop(STOP_S)
+        """Replace the workers one by one; an old one is stopped once the new one is ready.
 
-    async def _watch(self, slot: int) -> None:
-        pause = FIRST_PAUSE_S
+        Raises UserError when a new one does not become ready; it is stopped then, and the old
+        one stays.
+        """
+        async with self._change_lock:
+            for position, old in list(self._workers.items()):
+                new = await self._start_worker(self._free_block())
+                try:
+                    await new.wait_loaded(self._head[COMMITTED_GENERATION], LOAD_TIMEOUT_S)
+                    await new.wait_ready(LOAD_TIMEOUT_S)
+                except BaseException:  # also when the service stops meanwhile
+                    await new.stop(STOP_TIMEOUT_S)
+                    raise
+                self._workers[position] = new
+                await old.stop(STOP_TIMEOUT_S)
+
+    async def _replace_dead(self, position: int) -> None:
+        backoff_s = MIN_BACKOFF_S
         while True:
-            child = self._children[slot]
-            await child.ended()
-            if self._children[slot] is not child:
-                pause = FIRST_PAUSE_S
+            worker = self._workers[position]
+            await worker.wait_exit()
+            if self._workers[position] is not worker:
+                backoff_s = MIN_BACKOFF_S
                 continue
-            pause = FIRST_PAUSE_S if child.age() > STEADY_S else min(2 * pause, LONGEST_PAUSE_S)
-            logger.error("worker %d ended (%s); starting another", child.pid, child.how_ended())
-            await asyncio.sleep(pause)
-            async with self._changing:
-                if self._children[slot] is child:
-                    self._children[slot] = await self._start(self._free_slot(without=child))
+            stable = worker.age_s() > STABLE_AGE_S
+            backoff_s = MIN_BACKOFF_S if stable else min(2 * backoff_s, MAX_BACKOFF_S)
+            logger.error("worker %d ended (%s); starting another", worker.pid, worker.exit_reason())
+            await asyncio.sleep(backoff_s)
+            async with self._change_lock:
+                if self._workers[position] is worker:
+                    block = self._free_block(without=worker)
+                    self._workers[position] = await self._start_worker(block)
 
-    async def _start(self, place: int) -> Child:
-        task = Task(
+    async def _start_worker(self, block: int) -> WorkerProcess:
+        task = WorkerTask(
             folder=str(self._folder.resolve()),
-            generation=self._head[COMMITTED],
-            expected=self._hash,
+            generation=self._head[COMMITTED_GENERATION],
+            expected=self._model_hash,
             listener=self._listener.fileno(),
             memory=self._shared.fd,
-            slots=self._shared.slots,
-            slot=place,
+            blocks=self._shared.blocks,
+            block=block,
             limits=self._plan.limits,
         )
-        return await start(task)
+        return await start_worker(task)
 
-    def _free_slot(self, without: Child | None = None) -> int:
-        used = {c.task.slot for c in self._children.values() if c is not without}
-        return min(set(range(self._shared.slots)) - used)
+    def _free_block(self, without: WorkerProcess | None = None) -> int:
+        used = {w.task.block for w in self._workers.values() if w is not without}
+        return min(set(range(self._shared.blocks)) - used)
+
+
+def _load_problem(reports: list[Any]) -> str | None:
+    """Why a reload failed, None if all workers loaded the same weights."""
+    for report in reports:
+        if isinstance(report, UserError):
+            return str(report)
+        if isinstance(report, BaseException):
+            raise report
+    hashes = {report["model"] for report in reports}
+    return "the workers loaded different weights" if len(hashes) > 1 else None
 
 
 def _has_terminal() -> bool:
@@ -193,9 +216,9 @@ def _has_terminal() -> bool:
     return True
 
 
-async def _told(what: Callable[[], Any]) -> None:
-    """Do what a signal asked for; nobody but the log hears that it failed."""
+async def _log_errors(action: Callable[[], Any]) -> None:
+    """Run what a signal asked for; errors go to the log only."""
     try:
-        await what()
+        await action()
     except UserError as error:
         logger.error("%s", error)

@@ -1,4 +1,7 @@
-"""What a supervisor tells a new worker to do."""
+"""The supervisor's side of a worker process: its start, its messages, its end.
+
+The messages between the two are described in `serve.workers.worker`.
+"""
 
 import asyncio
 import json
@@ -13,44 +16,43 @@ from typing import Any
 from serve.config import Limits
 from trackfeatures.errors import UserError
 
+logger = logging.getLogger(__name__)
+
 
 @dataclass(frozen=True)
-class Task:
-    """What a worker is to do. `expected` is the hash its weights must have, None: any."""
+class WorkerTask:
+    """What a new worker is to do, sent as its first message.
+
+    `expected`: the hash its weights must have, None: any. `listener`, `memory`: inherited file
+    descriptors. `block`: its own block of the shared memory, which has `blocks` of them.
+    """
 
     folder: str
     generation: int
     expected: str | None
     listener: int
     memory: int
-    slots: int
-    slot: int
+    blocks: int
+    block: int
     limits: Limits
 
-    def as_line(self) -> bytes:
-        """As it goes over the socket."""
+    def to_json_line(self) -> bytes:
+        """The task as one line of JSON."""
         return json.dumps(asdict(self)).encode() + b"\n"
 
-
-def read_task(line: str) -> Task:
-    """The task in a line."""
-    content = json.loads(line)
-    return Task(**{**content, "limits": Limits(**content["limits"])})
-
-
-# A worker process, seen from its supervisor: `serve.workers.worker` says what goes over the
-# socket.
+    @classmethod
+    def from_json_line(cls, line: str) -> "WorkerTask":
+        """The task in a line of JSON."""
+        content = json.loads(line)
+        return cls(**{**content, "limits": Limits(**content["limits"])})
 
 
-logger = logging.getLogger(__name__)
-
-
-class Child:
-    """A worker process and what it has said."""
+class WorkerProcess:
+    """A running worker process and the messages received from it."""
 
     def __init__(
         self,
-        task: Task,
+        task: WorkerTask,
         process: Process,
         reader: asyncio.StreamReader,
         writer: asyncio.StreamWriter,
@@ -59,98 +61,101 @@ class Child:
         self.pid = process.pid
         self._process = process
         self._writer = writer
-        self._began = time.monotonic()
-        self._answers: dict[int, asyncio.Future[dict[str, Any]]] = {}
+        self._started_s = time.monotonic()
+        self._load_results: dict[int, asyncio.Future[dict[str, Any]]] = {}
         self._ready = asyncio.Event()
-        self._why = ""
-        self._listening = asyncio.ensure_future(self._listen(reader))
-
-    def age(self) -> float:
-        """Since its start, s."""
-        return time.monotonic() - self._began
-
-    def how_ended(self) -> str:
-        """What it said was wrong, else its exit code or the signal that ended it."""
-        if self._why:
-            return self._why
-        code = self._process.returncode
-        return f"signal {-code}" if code is not None and code < 0 else f"exit code {code}"
-
-    def say(self, **message: Any) -> None:
-        """Send it a message."""
-        self._writer.write(json.dumps(message).encode() + b"\n")
+        self._start_error = ""
+        self._reading = asyncio.ensure_future(self._read_messages(reader))
 
     @property
     def alive(self) -> bool:
-        """Whether the process still runs."""
+        """Whether the process is running."""
         return self._process.returncode is None
 
-    async def loaded(self, generation: int, within_s: float) -> dict[str, Any]:
-        """What it says of the engine it loaded. Raises UserError when it could not."""
-        answer = self._answer(generation)
-        if self._listening.done():
-            self._give_up()
+    def age_s(self) -> float:
+        """Time since its start, s."""
+        return time.monotonic() - self._started_s
+
+    def exit_reason(self) -> str:
+        """The error it reported at its start, else its exit code or signal."""
+        if self._start_error:
+            return self._start_error
+        code = self._process.returncode
+        return f"signal {-code}" if code is not None and code < 0 else f"exit code {code}"
+
+    def send(self, **message: Any) -> None:
+        """Send a message to the worker."""
+        self._writer.write(json.dumps(message).encode() + b"\n")
+
+    async def wait_loaded(self, generation: int, timeout_s: float) -> dict[str, Any]:
+        """Wait until it has loaded a generation of weights; its report. Raises UserError."""
+        result = self._load_result(generation)
+        if self._reading.done():
+            self._fail_pending_loads()
         try:
-            message = await asyncio.wait_for(asyncio.shield(answer), within_s)
+            message = await asyncio.wait_for(asyncio.shield(result), timeout_s)
         except TimeoutError:
-            raise UserError(f"worker {self.pid} loaded no model in {within_s:g} s") from None
+            raise UserError(
+                f"worker {self.pid} did not load the model within {timeout_s:g} s"
+            ) from None
         if "failed" in message:
             raise UserError(message["why"])
         return message
 
-    async def ready(self, within_s: float) -> None:
-        """Return once it answers images. Raises UserError."""
-        waits = [asyncio.ensure_future(w) for w in (self._ready.wait(), self.ended())]
-        await asyncio.wait(waits, timeout=within_s, return_when=asyncio.FIRST_COMPLETED)
+    async def wait_ready(self, timeout_s: float) -> None:
+        """Wait until it can answer images. Raises UserError."""
+        waits = [asyncio.ensure_future(w) for w in (self._ready.wait(), self.wait_exit())]
+        await asyncio.wait(waits, timeout=timeout_s, return_when=asyncio.FIRST_COMPLETED)
         for wait in waits:
             wait.cancel()
         if not self._ready.is_set():
-            raise UserError(f"worker {self.pid} was not ready within {within_s:g} s")
+            raise UserError(f"worker {self.pid} was not ready within {timeout_s:g} s")
 
-    async def ended(self) -> None:
-        """Return once the process is gone."""
+    async def wait_exit(self) -> None:
+        """Wait until the process has ended."""
         await self._process.wait()
 
-    async def stop(self, within_s: float) -> None:
-        """End it in peace, by force where it does not."""
+    async def stop(self, timeout_s: float) -> None:
+        """Send SIGTERM, then SIGKILL if the process has not ended in time."""
         if self._process.returncode is None:
             self._process.terminate()
             try:
-                await asyncio.wait_for(self._process.wait(), within_s)
+                await asyncio.wait_for(self._process.wait(), timeout_s)
             except TimeoutError:
-                logger.error("worker %d does not end; killed", self.pid)
+                logger.error("worker %d did not stop within %g s; killed", self.pid, timeout_s)
                 self._process.kill()
                 await self._process.wait()
-        self._listening.cancel()
+        self._reading.cancel()
         self._writer.close()
 
-    def _answer(self, generation: int) -> "asyncio.Future[dict[str, Any]]":
-        if generation not in self._answers:
-            self._answers[generation] = asyncio.get_running_loop().create_future()
-        return self._answers[generation]
+    def _load_result(self, generation: int) -> "asyncio.Future[dict[str, Any]]":
+        if generation not in self._load_results:
+            self._load_results[generation] = asyncio.get_running_loop().create_future()
+        return self._load_results[generation]
 
-    async def _listen(self, reader: asyncio.StreamReader) -> None:
+    async def _read_messages(self, reader: asyncio.StreamReader) -> None:
         async for line in reader:
             message = json.loads(line)
             if "ready" in message:
                 self._ready.set()
                 continue
-            self._why = message.get("why", "")
-            answer = self._answer(message.get("loaded", message.get("failed")))
-            if not answer.done():
-                answer.set_result(message)
-        await self.ended()
-        self._give_up()
+            if "failed" in message and not self._ready.is_set():
+                self._start_error = message["why"]
+            result = self._load_result(message.get("loaded", message.get("failed")))
+            if not result.done():
+                result.set_result(message)
+        await self.wait_exit()
+        self._fail_pending_loads()
 
-    def _give_up(self) -> None:
-        for answer in self._answers.values():
-            if not answer.done():
-                why = f"worker {self.pid} ended while it loaded the model ({self.how_ended()})"
-                answer.set_result({"failed": True, "why": why})
+    def _fail_pending_loads(self) -> None:
+        for result in self._load_results.values():
+            if not result.done():
+                why = f"worker {self.pid} ended while it loaded the model ({self.exit_reason()})"
+                result.set_result({"failed": True, "why": why})
 
 
-async def start(task: Task) -> Child:
-    """A new worker process at its task."""
+async def start_worker(task: WorkerTask) -> WorkerProcess:
+    """Start a worker process with its task."""
     ours, theirs = socket.socketpair()
     with theirs:
         process = await asyncio.create_subprocess_exec(
@@ -159,10 +164,10 @@ async def start(task: Task) -> Child:
             "serve.workers.worker",
             str(theirs.fileno()),
             pass_fds=(theirs.fileno(), task.listener, task.memory),
-            start_new_session=True,  # Ctrl-C is for the supervisor
+            start_new_session=True,  # Ctrl-C goes to the supervisor only
             stdin=asyncio.subprocess.DEVNULL,
         )
     ours.setblocking(False)
     reader, writer = await asyncio.open_connection(sock=ours)
-    writer.write(task.as_line())
-    return Child(task, process, reader, writer)
+    writer.write(task.to_json_line())
+    return WorkerProcess(task, process, reader, writer)

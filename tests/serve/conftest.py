@@ -24,7 +24,7 @@ from runtime.sockets import bind
 from serve.app import Service
 from serve.config import Limits
 from serve.server.worker_server import WorkerServer
-from serve.workers.shared_memory import BlockPeers, Shared
+from serve.workers.shared_memory import SharedMemory, WorkerPeers
 from trackfeatures.camera import CameraParameters
 
 if TYPE_CHECKING:
@@ -172,8 +172,8 @@ def serving(
     engine: Engine,
     check: Callable[[Any], object] = lambda _engine: None,
     limits: Limits | None = None,
-    shared: Shared | None = None,
-    slot: int = 0,
+    shared: SharedMemory | None = None,
+    block: int = 0,
     tracer: "Tracer | None" = None,
     beside: Served | None = None,
 ) -> Iterator[Served]:
@@ -187,8 +187,8 @@ def serving(
 
     listener = beside.listener.dup() if beside is not None else bind("127.0.0.1", 0)
     listener.listen(2048)
-    app = Service(engine, checked, limits, shared, slot, tracer)
-    server = WorkerServer(app, limits or Limits(), BlockPeers(app.shared, slot))
+    app = Service(engine, checked, limits, shared, block, tracer)
+    server = WorkerServer(app, limits or Limits(), WorkerPeers(app.shared, block))
     thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
     thread.start()
     try:

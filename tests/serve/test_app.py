@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 import trackfeatures as tf
 from mtlnet.inference.model_card import ModelError, golden_image
-from serve.api.problems import KINDS
+from serve.api.problems import PROBLEM_TYPES
 from serve.api.schemas import Features
 from serve.config import MAX_BODY_BYTES
 from serve.scheduling.warmup import warm_up
@@ -44,7 +44,7 @@ def assert_problem(reply: Reply, status: int, name: str) -> None:
     assert set(content) == {"type", "title", "status", "detail"} | hint
     assert content["type"] == f"/problems/{name}"
     assert content["status"] == status
-    assert content["title"] == next(k.title for k in KINDS if k.name == name)
+    assert content["title"] == next(k.title for k in PROBLEM_TYPES if k.name == name)
     assert len(content["detail"]) > 20
     assert "Traceback" not in content["detail"]
 

@@ -18,7 +18,7 @@ from mtlnet.inference.model_card import CARD, SHIPPED, golden_image, read_card
 from mtlnet.inference.prediction import decode_outputs
 from runtime.sockets import bind
 from serve.client import Client
-from serve.workers.worker import Control, say_ready
+from serve.workers.worker import SupervisorConnection, send_ready
 from tests.serve.conftest import png
 from tests.typed import typed
 
@@ -153,7 +153,7 @@ def test_a_ready_worker_keeps_what_it_loaded_from_the_garbage_collector() -> Non
     """To look through all of it takes so long that every client notices."""
     ours, other = socket.socketpair()
     with other:
-        say_ready(Control(ours.detach()))
+        send_ready(SupervisorConnection(ours.detach()))
         try:
             assert json.loads(other.recv(1024)) == {"ready": True}
             assert gc.get_freeze_count() > 10_000

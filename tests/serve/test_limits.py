@@ -11,9 +11,8 @@ import pytest
 
 from serve.api.problems import Problem
 from serve.config import Limits, is_loopback
-from serve.scheduling import frame_queue as perceiver
-from serve.scheduling.rate_limit import Rate
-from serve.workers import shared_memory as shared
+from serve.scheduling.rate_limit import RateLimiter
+from serve.workers import shared_memory
 from tests.serve.conftest import FakeEngine, Gate, Served, jpeg, outputs, picture, serving, until
 from tests.serve.test_app import assert_problem
 
@@ -187,22 +186,22 @@ def test_only_who_knows_the_token_is_answered() -> None:
 
 
 def test_a_client_that_asks_too_often_is_told_when_to_come_back() -> None:
-    memory = shared.create(slots=1)
-    here = Rate(memory.clients(), 10.0)
-    there = Rate(shared.attach(memory.fd, 1).clients(), 10.0)
+    memory = shared_memory.create_shared_memory(blocks=1)
+    here = RateLimiter(memory.clients(), 10.0)
+    there = RateLimiter(shared_memory.attach_shared_memory(memory.fd, 1).clients(), 10.0)
     now = 1000.0
     for number in range(10):
         (here, there)[number % 2].check("10.0.0.1", now)
     with pytest.raises(Problem) as caught:
         there.check("10.0.0.1", now)
-    assert caught.value.kind.status == 429
+    assert caught.value.type.status == 429
     assert caught.value.retry_after_ms == pytest.approx(100)
     assert caught.value.headers["Retry-After"] == "1"
     here.check("10.0.0.2", now)  # another client
     here.check("10.0.0.1", now + 0.11)
     for _ in range(1000):
         here.check("127.0.0.1", now)  # this machine
-        Rate(memory.clients(), 0.0).check("10.0.0.1", now)  # no limit
+        RateLimiter(memory.clients(), 0.0).check("10.0.0.1", now)  # no limit
 
 
 def test_which_addresses_are_this_machine() -> None:
@@ -212,17 +211,15 @@ def test_which_addresses_are_this_machine() -> None:
     )
 
 
-def test_a_full_service_pauses_until_a_frame_is_answered(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Refusals are given several at a time; an answer never waits for that."""
-    monkeypatch.setattr(perceiver, "FULL_PAUSE_S", 15.0)
+def test_a_refused_client_is_paused_and_then_read_again() -> None:
+    """While the queue is full its next request waits for a moment; nothing else does."""
     gate = Gate()
-    with serving(gate.engine, limits=Limits(queue=1)) as service, ThreadPoolExecutor(2) as pool:
-        admitted = [pool.submit(Served(service.port).post, JPEG)]
+    with serving(gate.engine, limits=Limits(queue=0)) as service, ThreadPoolExecutor(1) as pool:
+        first = pool.submit(Served(service.port).post, JPEG)
         until(gate.busy.is_set)
-        admitted.append(pool.submit(Served(service.port).post, JPEG))
-        until(lambda: service.app.perceiver.waiting == 1)
-        begin = time.monotonic()
-        assert service.post(JPEG).status == 503
+        for _ in range(20):
+            assert_problem(service.post(JPEG), 503, "overloaded")
+        assert service.ask("GET", "/healthz").status == 200
         gate.open.set()
-        assert [asked.result().status for asked in admitted] == [200, 200]
-        assert time.monotonic() - begin < 10.0
+        assert first.result().status == 200
+        until(lambda: service.post(JPEG).status == 200)

@@ -102,7 +102,7 @@ def answered(page: bytes) -> int:
 def test_the_builder_takes_what_it_knows(published: Path) -> None:
     on_ray_module = pytest.importorskip("serve.on_ray", reason="no ray[serve]")
     assert on_ray_module.build({"model": str(published), "replicas": 2}) is not None
-    with pytest.raises(UserError, match="no argument speed"):
+    with pytest.raises(UserError, match="unknown argument speed"):
         on_ray_module.build({"speed": 9})
     with pytest.raises(UserError, match="no run"):
         on_ray_module.build({"model": "/none"})

@@ -73,7 +73,7 @@ def test_the_newest_frame_wins_and_late_ones_are_dropped() -> None:
         assert (problem["type"], problem["frame_id"]) == ("/problems/superseded", "2")
         other.send(json.dumps({"deadline_ms": 1}))
         other.send(JPEG)
-        until(lambda: service.app.perceiver.waiting == 2)
+        until(lambda: service.app.frame_queue.waiting == 2)
         time.sleep(0.01)  # ten times what the frame may wait
         gate.open.set()
         assert [read(socket)["frame_id"] for _ in range(2)] == ["1", "3"]

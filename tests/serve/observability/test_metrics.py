@@ -7,10 +7,10 @@ from collections.abc import Iterator
 
 import pytest
 
-from serve.api.problems import KINDS
+from serve.api.problems import PROBLEM_TYPES
 from serve.config import Limits
 from serve.observability.logs import REFUSALS_PER_S, JsonFormatter
-from serve.workers import shared_memory as shared
+from serve.workers import shared_memory
 from tests.serve.conftest import FakeEngine, Served, jpeg, outputs, picture, serving
 
 JPEG = jpeg(picture())
@@ -41,7 +41,7 @@ def test_frames_are_counted_by_what_became_of_them(service: Served) -> None:
     for outcome, count in (("answered", 3), ("not-an-image", 1), ("invalid-request", 1)):
         assert found[f'driverview_frames_total{{outcome="{outcome}"}}'] == count
     counted = [value for name, value in found.items() if name.startswith("driverview_frames_total")]
-    assert len(counted) == len(KINDS) + 1
+    assert len(counted) == len(PROBLEM_TYPES) + 1
     assert sum(counted) == 5
     for stage in ("queue", "decode", "forward", "total"):
         name = f"driverview_{stage}_seconds"
@@ -54,9 +54,9 @@ def test_frames_are_counted_by_what_became_of_them(service: Served) -> None:
 
 
 def test_each_worker_tells_of_all() -> None:
-    memory = shared.create(slots=2)
+    memory = shared_memory.create_shared_memory(blocks=2)
     engine = FakeEngine(lambda _image: outputs())
-    with serving(engine, shared=memory) as one, serving(engine, shared=memory, slot=1) as two:
+    with serving(engine, shared=memory) as one, serving(engine, shared=memory, block=1) as two:
         one.post(JPEG)
         two.post(JPEG)
         two.post(b"")

@@ -6,8 +6,9 @@ from contextlib import contextmanager
 
 import pytest
 
-from serve.scheduling.streams import FORGOTTEN_NS, PROBES, Streams, stream_key
-from serve.workers import shared_memory as shared
+from serve.scheduling.streams import EXPIRY_NS, StreamTable, stream_key
+from serve.workers import shared_memory
+from serve.workers.shared_memory import PROBES
 from tests.serve.conftest import (
     FakeEngine,
     Gate,
@@ -36,12 +37,12 @@ class Crowd:
     def queue(self, waiting: int, **headers: str) -> "Future[Reply]":
         """Post, and return once so many frames wait."""
         future = self.post(**headers)
-        until(lambda: self._service.app.perceiver.waiting == waiting)
+        until(lambda: self._service.app.frame_queue.waiting == waiting)
         return future
 
 
 @contextmanager
-def busy(gate: Gate, memory: shared.Shared | None = None) -> Iterator[Crowd]:
+def busy(gate: Gate, memory: shared_memory.SharedMemory | None = None) -> Iterator[Crowd]:
     """A service that is at work on a first frame, and stays so until the gate is opened."""
     with serving(gate.engine, shared=memory) as service, ThreadPoolExecutor(8) as pool:
         crowd = Crowd(service, pool)
@@ -78,11 +79,11 @@ def test_a_full_queue_still_takes_a_newer_frame_of_its_own_streams() -> None:
 
 
 def test_a_newer_frame_at_another_worker_supersedes_too() -> None:
-    gate, memory = Gate(), shared.create(slots=2)
+    gate, memory = Gate(), shared_memory.create_shared_memory(blocks=2)
     with busy(gate, memory) as crowd:
         old = crowd.queue(1, X_Stream_Id="front")
         kept = crowd.queue(2, X_Stream_Id="rear")
-        with serving(FakeEngine(lambda _image: outputs()), shared=memory, slot=1) as second:
+        with serving(FakeEngine(lambda _image: outputs()), shared=memory, block=1) as second:
             assert second.post(JPEG, X_Stream_Id="front").status == 200
         gate.open.set()
         assert_problem(old.result(), 503, "superseded")
@@ -107,26 +108,27 @@ def test_a_deadline_that_is_none_is_refused(service: Served, text: str) -> None:
 
 
 def test_the_table_knows_the_newest_stamp_of_each_stream() -> None:
-    memory = shared.create(slots=1)
-    here, there = Streams(memory.streams()), Streams(shared.attach(memory.fd, 1).streams())
+    memory = shared_memory.create_shared_memory(blocks=1)
+    here = StreamTable(memory.streams())
+    there = StreamTable(shared_memory.attach_shared_memory(memory.fd, 1).streams())
     front, other = stream_key("10.0.0.1", "front"), stream_key("10.0.0.2", "front")
     assert front != other
-    now = 10 * FORGOTTEN_NS
+    now = 10 * EXPIRY_NS
     here.announce(front, now)
-    assert [there.superseded(front, now + d) for d in (-1, 0, 1)] == [True, False, False]
-    assert not there.superseded(other, 0)
+    assert [there.is_superseded(front, now + d) for d in (-1, 0, 1)] == [True, False, False]
+    assert not there.is_superseded(other, 0)
     there.announce(front, now - 5)  # an older one that comes late takes nothing back
-    assert here.superseded(front, now - 1)
+    assert here.is_superseded(front, now - 1)
 
 
 def test_a_full_table_forgets_streams_that_ended_and_never_errs() -> None:
-    streams = Streams(shared.create(slots=1).streams())
-    now = 10 * FORGOTTEN_NS
+    streams = StreamTable(shared_memory.create_shared_memory(blocks=1).streams())
+    now = 10 * EXPIRY_NS
     keys = [1 + 1024 * n for n in range(PROBES + 1)]  # all of them want the same places
     for key in keys:
         streams.announce(key, now)
-    assert [streams.superseded(key, now - 1) for key in keys] == [True] * PROBES + [False]
-    later = now + FORGOTTEN_NS + 1
+    assert [streams.is_superseded(key, now - 1) for key in keys] == [True] * PROBES + [False]
+    later = now + EXPIRY_NS + 1
     streams.announce(keys[-1], later)
-    assert streams.superseded(keys[-1], later - 1)
-    assert not streams.superseded(keys[0], now - 1)
+    assert streams.is_superseded(keys[-1], later - 1)
+    assert not streams.is_superseded(keys[0], now - 1)

@@ -12,8 +12,8 @@ import pytest
 from numpy.typing import NDArray
 
 from serve.config import MAX_BODY_BYTES, Limits
-from serve.scheduling import frame_queue as perceiver
-from serve.scheduling.frame_queue import QUICK_RUN
+from serve.scheduling import frame_queue
+from serve.scheduling.frame_queue import INLINE_AFTER
 from tests.serve.conftest import FakeEngine, Served, jpeg, outputs, picture, serving, until
 
 JPEG = jpeg(picture())
@@ -62,7 +62,7 @@ def dial(service: Served) -> socket.socket:
 def test_a_lone_frame_of_a_quick_engine_is_answered_by_the_event_loop(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(perceiver, "QUICK_MS", QUICK_MS)
+    monkeypatch.setattr(frame_queue, "INLINE_MAX_MS", QUICK_MS)
     engine = Witness()
     large = jpeg(picture(1120, 840))
     with serving(engine) as service:
@@ -74,7 +74,7 @@ def test_a_lone_frame_of_a_quick_engine_is_answered_by_the_event_loop(
         def by_the_loop() -> bool:
             return ask() != "forward"
 
-        assert [ask() for _ in range(QUICK_RUN)] == ["forward"] * QUICK_RUN
+        assert [ask() for _ in range(INLINE_AFTER)] == ["forward"] * INLINE_AFTER
         until(by_the_loop)  # at once, unless a frame was slow after all
         assert ask(large) == "forward"
         until(by_the_loop)
@@ -84,7 +84,7 @@ def test_a_lone_frame_of_a_quick_engine_is_answered_by_the_event_loop(
 
 
 def test_frames_that_come_together_are_left_to_the_thread(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(perceiver, "QUICK_MS", QUICK_MS)
+    monkeypatch.setattr(frame_queue, "INLINE_MAX_MS", QUICK_MS)
     engine = Witness()
     with serving(engine) as service:
         until(lambda: service.post(JPEG).status == 200 and engine.threads[-1] != "forward")
@@ -94,7 +94,7 @@ def test_frames_that_come_together_are_left_to_the_thread(monkeypatch: pytest.Mo
             for client in clients:
                 client.sendall(WHOLE)
             assert [read(client, 1)[0][0] for client in clients] == [200] * 4
-        assert engine.threads.count("forward") > QUICK_RUN + 10
+        assert engine.threads.count("forward") > INLINE_AFTER + 10
 
 
 def test_replies_come_in_the_order_of_their_requests(service: Served) -> None:

@@ -1,0 +1,140 @@
+"""Reload and restart when a worker fails: with fake workers, so that no model is loaded."""
+
+import asyncio
+import json
+import socket
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from runtime.sockets import bind
+from serve.config import Limits
+from serve.workers import supervisor as module
+from serve.workers.supervisor import ServicePlan, Supervisor
+from serve.workers.worker_process import WorkerProcess, WorkerTask
+from trackfeatures.errors import UserError
+
+
+class FakeProcess:
+    """The process of a worker: it runs until it is terminated."""
+
+    def __init__(self) -> None:
+        self.pid = 1
+        self.returncode: int | None = None
+        self._ended = asyncio.Event()
+
+    async def wait(self) -> int:
+        await self._ended.wait()
+        return 0
+
+    def terminate(self) -> None:
+        self.returncode = 0
+        self._ended.set()
+
+
+class FakeWorkers:
+    """Starts workers that answer the supervisor's messages as `on_load` and `is_ready` say."""
+
+    def __init__(self) -> None:
+        self.started: list[WorkerProcess] = []
+        self.failing_folders: set[str] = set()
+        self.is_ready = True
+        self._tasks: set[asyncio.Task[None]] = set()
+
+    async def start(self, task: WorkerTask) -> WorkerProcess:
+        ours, theirs = socket.socketpair()
+        reader, writer = await asyncio.open_connection(sock=ours)
+        process: Any = FakeProcess()
+        worker = WorkerProcess(task, process, reader, writer)
+        self.started.append(worker)
+        run = asyncio.ensure_future(self._run(task, theirs))
+        self._tasks.add(run)
+        return worker
+
+    async def _run(self, task: WorkerTask, connection: socket.socket) -> None:
+        reader, writer = await asyncio.open_connection(sock=connection)
+
+        def send(**message: object) -> None:
+            writer.write(json.dumps(message).encode() + b"\n")
+
+        send(loaded=task.generation, model="a" * 64, engine="fake", precision="f32")
+        if self.is_ready:
+            send(ready=True)
+        async for line in reader:
+            message = json.loads(line)
+            if "load" not in message:
+                continue
+            if message["load"] in self.failing_folders:
+                send(failed=message["generation"], why="the weights are damaged")
+            else:
+                send(loaded=message["generation"], model="b" * 64, engine="fake", precision="f32")
+
+
+@pytest.fixture
+def workers(monkeypatch: pytest.MonkeyPatch) -> FakeWorkers:
+    found = FakeWorkers()
+    monkeypatch.setattr(module, "start_worker", found.start)
+    return found
+
+
+def make_supervisor(folder: Path) -> Supervisor:
+    plan = ServicePlan("run", lambda name: folder / name, 2, Limits())
+    return Supervisor(plan, bind("127.0.0.1", 0))
+
+
+def test_a_reload_after_a_failed_reload_loads_the_model(
+    workers: FakeWorkers, tmp_path: Path
+) -> None:
+    workers.failing_folders.add(str((tmp_path / "broken").resolve()))
+
+    async def scenario() -> None:
+        supervisor = make_supervisor(tmp_path)
+        await supervisor.start()
+        for _ in range(2):
+            with pytest.raises(UserError, match="damaged; the old model stays in use"):
+                await supervisor.reload("broken")
+        assert await supervisor.reload("good") == "b" * 64
+        assert supervisor.folder == tmp_path / "good"
+
+    asyncio.run(scenario())
+
+
+def test_a_replacement_that_does_not_become_ready_is_stopped(
+    workers: FakeWorkers, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def scenario() -> None:
+        supervisor = make_supervisor(tmp_path)
+        await supervisor.start()
+        monkeypatch.setattr(module, "LOAD_TIMEOUT_S", 0.05)
+        workers.is_ready = False
+        with pytest.raises(UserError, match="not ready"):
+            await supervisor.restart()
+        monkeypatch.setattr(module, "LOAD_TIMEOUT_S", 20.0)
+        workers.is_ready = True
+        await supervisor.restart()
+
+    asyncio.run(scenario())
+    first, second, timed_out, *replacements = workers.started
+    assert not timed_out.alive
+    assert not first.alive  # replaced by the second restart
+    assert not second.alive
+    assert all(worker.alive for worker in replacements)
+    blocks = [worker.task.block for worker in replacements]
+    assert len(set(blocks)) == len(blocks) == 2  # no two write the same metrics
+
+
+def test_a_worker_that_failed_a_reload_and_died_later_reports_how_it_died(
+    workers: FakeWorkers, tmp_path: Path
+) -> None:
+    workers.failing_folders.add(str((tmp_path / "broken").resolve()))
+
+    async def scenario() -> str:
+        supervisor = make_supervisor(tmp_path)
+        await supervisor.start()
+        with pytest.raises(UserError):
+            await supervisor.reload("broken")
+        await workers.started[0].stop(1.0)
+        return workers.started[0].exit_reason()
+
+    assert asyncio.run(scenario()) == "exit code 0"
