@@ -5,8 +5,8 @@ The dataset stays in `FOLDER/data` where a folder is given. Claim (on two cores 
 210): at least 250 frames a second, physics, rendering, labels, JPEG, MCAP and checks included, and
 at least 0.75 of what drawing alone reaches. The bare loop draws the same frames, traffic and all,
 and does nothing else; its scenes are built before the clock starts. Ratios are of wall time, which
-decides, and of processor time, which neighbours spoil less. Sixty rounds are the default plan's:
-with fewer, start-up and the end, when a core idles, weigh more than in real use.
+decides, and of processor time, which depends less on other jobs. Sixty rounds are the default: with
+fewer, start-up and the end, when a core idles, weigh more than in real use.
 """
 
 import argparse
@@ -29,7 +29,7 @@ FRAMES_OF_WARM_UP = 20
 
 
 def collect(out: Path, rounds: int, frames: int, seed: int) -> dict[str, Any]:
-    """`datagen collect --json`; what it says, and the processor time of all its processes."""
+    """Run `datagen collect --json`: its result, and the processor time of all its processes."""
     command = [sys.executable, "-m", "datagen", "collect", "--json", "--out", str(out)]
     command += ["--rounds", str(rounds), "--frames", str(frames), "--seed", str(seed)]
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
@@ -40,22 +40,22 @@ def collect(out: Path, rounds: int, frames: int, seed: int) -> dict[str, Any]:
 
 
 def draw_round(entry: dict[str, Any]) -> tuple[int, float, float]:
-    """Drive a round of the plan; of drawing its frames: how many, wall and processor seconds."""
-    # Mesa and numpy are to use one thread a process, as the collector's workers do.
+    """Simulate a round of the plan and render it: number of frames, wall and processor seconds."""
+    # One thread per process for Mesa and numpy, as in the collector's workers.
     os.environ.update(LP_NUM_THREADS="0", OMP_NUM_THREADS="1")
     from datagen.planning.plan import RoundPlan
-    from datagen.recorder.record import moments_of, scene_of
+    from datagen.recorder.record import open_simulation, simulate
 
-    with scene_of(RoundPlan.from_json(entry), None) as (drive, camera):
+    with open_simulation(RoundPlan.from_json(entry), None) as (simulation, camera):
         drawn, wall_s, cpu_s = 0, 0.0, 0.0
-        for moments in moments_of(drive, camera):
-            moments[0].picture(camera)
+        for batch in simulate(simulation, camera):
+            batch[0].render(camera)
             started, cpu = time.perf_counter(), time.process_time()
-            for moment in moments:
-                moment.picture(camera)
+            for truth in batch:
+                truth.render(camera)
             wall_s += time.perf_counter() - started
             cpu_s += time.process_time() - cpu
-            drawn += len(moments)
+            drawn += len(batch)
         return drawn, wall_s, cpu_s
 
 

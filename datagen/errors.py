@@ -1,7 +1,7 @@
-"""What can go wrong while a dataset is collected, beyond what `datagen.recording` knows."""
+"""Errors of collecting; those of the dataset format are in `datagen.recording.errors`."""
 
 from trackfeatures.errors import UserError
 
 
 class RoundFailed(UserError):
-    """The driver cannot drive this round: with the same plan it never will."""
+    """The driver cannot complete this round. Another attempt would fail in the same way."""

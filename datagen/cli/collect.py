@@ -1,80 +1,112 @@
-"""The commands `datagen collect` and `datagen merge`."""
+"""The commands `datagen collect` and `datagen merge`.
+
+datagen collect --rounds 60 --out datasets/default
+"""
 
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from datagen.planning.config import DATASET_FOLDER, UNSEEN_FOLDER, CollectConfig, all_lights
+from datagen.recording.splits import UNSEEN
 from runtime import cli as command
 from runtime.cli import AsJson, counted, print_result
 from trackfeatures.errors import UserError
 
-DEFAULT_FOLDER = Path("datasets/default")
-UNSEEN_FOLDER = Path("datasets/unseen")
-FREQUENCY_HZ = 20
-STRETCH = 1  # frames: neighbours that look alike are one picture to a network
+if TYPE_CHECKING:
+    from datagen.execution.progress import CollectResult
+    from datagen.planning.plan import Plan, Shard
+
+    ClassShares = dict[str, dict[str, float]]
+
+DEFAULT_LANES = ",".join(map(str, CollectConfig.lanes))
+PIPE_WIDTH = 120  # characters, for tables where stdout is no terminal
+
+Rounds = Annotated[int, typer.Option(help="Number of rounds.")]
+Frames = Annotated[int, typer.Option(help="Frames per round.")]
+Frequency = Annotated[
+    int, typer.Option(help="Frames per second. The car is controlled at 20 Hz or faster.")
+]
+Out = Annotated[
+    Path | None,
+    typer.Option(
+        help="Dataset folder; an unfinished dataset is continued. "
+        f"Default: {DATASET_FOLDER}, or {UNSEEN_FOLDER} with --split unseen."
+    ),
+]
+Seed = Annotated[int, typer.Option(help="Seed of everything random.")]
+Workers = Annotated[int, typer.Option(help="Recording processes; 0: one for each core.")]
+Tracks = Annotated[
+    str, typer.Option(help="Track names or files, separated by commas; empty: a selection.")
+]
+Lanes = Annotated[str, typer.Option(help="Lane counts, separated by commas.")]
+Lights = Annotated[
+    str,
+    typer.Option(
+        help="Lights, separated by commas, from: clear, overcast, dusk, fog, heavy-shadow, rain, "
+        "snow; empty: all."
+    ),
+]
+Stretch = Annotated[
+    int, typer.Option(help="Frames after which the scenery changes; 0: one scenery a round.")
+]
+Scenes = Annotated[
+    int, typer.Option(help="Sceneries that a round cycles through; 0: one for every 200 frames.")
+]
+TracksDir = Annotated[Path | None, typer.Option(help="Folder of TORCS tracks.")]
+TestShare = Annotated[float, typer.Option(help="Share of rounds for testing.")]
+SplitName = Annotated[
+    str, typer.Option(help="unseen: rounds on a track that no training plan contains.")
+]
+Codec = Annotated[str, typer.Option(help="jpeg (quality 95) or png (lossless).")]
+JitterCamera = Annotated[
+    bool,
+    typer.Option(
+        "--jitter-camera", help="Vary height, pitch and field of view from round to round."
+    ),
+]
+ShardOf = Annotated[
+    str, typer.Option(help="2/4: only the second of four parts, for batch systems.")
+]
+ExecutorName = Annotated[
+    str,
+    typer.Option(help="local, or ray: on the cluster at $RAY_ADDRESS, else on this machine."),
+]
+DryRun = Annotated[bool, typer.Option("--dry-run", help="Print the plan; record nothing.")]
 
 
 def collect(
-    rounds: Annotated[int, typer.Option(help="How many rounds.")] = 60,
-    frames: Annotated[int, typer.Option(help="Frames a round.")] = 2000,
-    frequency: Annotated[
-        int, typer.Option(help="Frames a second; the car is steered 20 times a second or more.")
-    ] = FREQUENCY_HZ,
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            help="Dataset folder; an unfinished one is finished. "
-            f"Default: {DEFAULT_FOLDER}, or {UNSEEN_FOLDER} with --split unseen."
-        ),
-    ] = None,
-    seed: Annotated[int, typer.Option(help="Everything random comes from it.")] = 0,
-    workers: Annotated[int, typer.Option(help="Processes; 0: one a core.")] = 0,
-    tracks: Annotated[str, typer.Option(help="Names or files, by commas; empty: a choice.")] = "",
-    lanes: Annotated[str, typer.Option(help="Lane counts, by commas.")] = "1,2,3",
-    lights: Annotated[str, typer.Option(help="Lights, by commas; empty: all.")] = "",
-    stretch: Annotated[
-        int, typer.Option(help="Frames until another scenery's turn; 0: a round shows one.")
-    ] = STRETCH,
-    scenes: Annotated[
-        int, typer.Option(help="Sceneries a round, shown in turn; 0: one for every 200 frames.")
-    ] = 0,
-    tracks_dir: Annotated[Path | None, typer.Option(help="Folder of TORCS tracks.")] = None,
-    split_test_share: Annotated[float, typer.Option(help="Share of rounds for testing.")] = 0.25,
-    split: Annotated[
-        str, typer.Option(help="unseen: rounds of a track that no training plan has.")
-    ] = "",
-    codec: Annotated[str, typer.Option(help="jpeg (quality 95) or png (lossless).")] = "jpeg",
-    jitter_camera: Annotated[
-        bool,
-        typer.Option("--jitter-camera", help="Vary height, pitch and lens from round to round."),
-    ] = False,
-    shard: Annotated[
-        str, typer.Option(help="2/4: only the second of four parts, for batch systems.")
-    ] = "",
-    executor: Annotated[
-        str, typer.Option(help="local, or ray: on the cluster of $RAY_ADDRESS, or on this machine.")
-    ] = "local",
-    dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Print the plan; record and touch nothing.")
-    ] = False,
+    rounds: Rounds = CollectConfig.rounds,
+    frames: Frames = CollectConfig.frames,
+    frequency: Frequency = CollectConfig.frequency_hz,
+    out: Out = None,
+    seed: Seed = CollectConfig.seed,
+    workers: Workers = 0,
+    tracks: Tracks = "",
+    lanes: Lanes = DEFAULT_LANES,
+    lights: Lights = "",
+    stretch: Stretch = CollectConfig.stretch,
+    scenes: Scenes = CollectConfig.scenes,
+    tracks_dir: TracksDir = None,
+    split_test_share: TestShare = CollectConfig.test_share,
+    split: SplitName = CollectConfig.split,
+    codec: Codec = CollectConfig.codec,
+    jitter_camera: JitterCamera = CollectConfig.jitter_camera,
+    shard: ShardOf = "",
+    executor: ExecutorName = "local",
+    dry_run: DryRun = False,
     as_json: AsJson = False,
 ) -> None:
-    """Let the scripted driver drive and record rounds; the same command again goes on."""
-    from rich.console import Console
-
-    from datagen.execution.collect import collect as run
-    from datagen.execution.progress import shown
+    """Record rounds with the scripted driver; the same command again continues them."""
     from datagen.planning.class_balance import TrackForecast
-    from datagen.planning.config import CollectConfig, all_lights
     from datagen.planning.plan import Shard
     from datagen.planning.planner import make_plan
-    from datagen.planning.summary import expected_classes, listing, overview
+    from datagen.planning.summary import expected_classes
     from datagen.planning.tracks import choose_tracks
-    from datagen.recording.splits import UNSEEN
 
-    wanted = CollectConfig(
+    config = CollectConfig(
         rounds=rounds,
         frames=frames,
         seed=seed,
@@ -90,34 +122,14 @@ def collect(
         split=split,
     )
     part = Shard.parse(shard) if shard else None
-    forecast = TrackForecast.of(wanted.tracks, tracks_dir)
-    plan = make_plan(wanted, forecast)
+    forecast = TrackForecast.of(config.tracks, tracks_dir)
+    plan = make_plan(config, forecast)
     classes = expected_classes(plan, forecast)
     if dry_run:
-        if as_json:
-            print_result({**plan.as_json(), "expected_classes": classes}, True, "")
-        else:
-            # A pipe has no width of its own.
-            Console(width=None if sys.stdout.isatty() else 120).print(
-                listing(plan), overview(plan, classes)
-            )
+        _print_plan(plan, classes, as_json)
         return
-    folder = out or (UNSEEN_FOLDER if split else DEFAULT_FOLDER)
-    mine = plan.rounds if part is None else part.select(plan.rounds)
-    try:
-        with shown(len(mine), len(mine) * frames, overview(plan, classes)) as progress:
-            result = run(
-                plan,
-                folder,
-                workers,
-                tracks_dir,
-                progress,
-                executor=executor,
-                shard=part,
-            )
-    except KeyboardInterrupt:
-        sys.stderr.write("interrupted: finished rounds are kept; the same command goes on\n")
-        raise typer.Exit(command.INTERRUPTED) from None
+    folder = out or (UNSEEN_FOLDER if split else DATASET_FOLDER)
+    result = _record(plan, classes, folder, workers, tracks_dir, executor, part)
     line = (
         f"{result.out}: {counted(result.rounds, 'round')}, "
         f"{counted(result.frames, 'frame')}; recorded "
@@ -127,12 +139,48 @@ def collect(
     print_result(result.as_json(), as_json, line)
 
 
+def _print_plan(plan: "Plan", classes: "ClassShares", as_json: bool) -> None:
+    from rich.console import Console
+
+    from datagen.planning.summary import listing, overview
+
+    if as_json:
+        print_result({**plan.as_json(), "expected_classes": classes}, True, "")
+        return
+    console = Console(width=None if sys.stdout.isatty() else PIPE_WIDTH)
+    console.print(listing(plan), overview(plan, classes))
+
+
+def _record(
+    plan: "Plan",
+    classes: "ClassShares",
+    folder: Path,
+    workers: int,
+    tracks_dir: Path | None,
+    executor: str,
+    shard: "Shard | None",
+) -> "CollectResult":
+    """Record with a progress bar; exits with code 130 after Ctrl-C."""
+    from datagen.execution.collect import collect as run
+    from datagen.execution.progress import progress_bar
+    from datagen.planning.summary import overview
+
+    rounds = plan.rounds if shard is None else shard.select(plan.rounds)
+    frames = len(rounds) * plan.config.frames
+    try:
+        with progress_bar(len(rounds), frames, overview(plan, classes)) as progress:
+            return run(plan, folder, workers, tracks_dir, progress, executor=executor, shard=shard)
+    except KeyboardInterrupt:
+        sys.stderr.write("interrupted: finished rounds are kept; the same command continues\n")
+        raise typer.Exit(command.INTERRUPTED) from None
+
+
 def merge(
     folders: Annotated[list[Path], typer.Argument(metavar="DIR...", help="Folders of shards.")],
-    out: Annotated[Path, typer.Option(help="Dataset folder to make, or to go on with.")],
+    out: Annotated[Path, typer.Option(help="Dataset folder to create or to add to.")],
     as_json: AsJson = False,
 ) -> None:
-    """Put the rounds that shards recorded into folders of their own together."""
+    """Merge the rounds that shards recorded into folders of their own."""
     from datagen.execution.merge import merge as run
 
     merged = run(folders, out)
@@ -149,5 +197,5 @@ def _numbers(text: str) -> tuple[int, ...]:
         return tuple(sorted({int(part) for part in _names(text)}))
     except ValueError as error:
         raise UserError(
-            f"--lanes is {text!r}; give numbers with commas between, as 1,2,3"
+            f"--lanes is {text!r}; give numbers separated by commas, such as 1,2,3"
         ) from error

@@ -1,4 +1,4 @@
-"""The commands that show a dataset or hand it on: `datagen view`, `stats`, `export`.
+"""The commands that show and export datasets: `datagen info`, `stats`, `view`, `export`.
 
 datagen view datasets/default/rounds/round-000.mcap
 datagen stats datasets/default --out stats.html
@@ -12,22 +12,31 @@ from typing import Annotated, Any
 import typer
 
 import trackfeatures as tf
+from datagen.planning.config import DATASET_FOLDER
 from datagen.recording.splits import SIDES, UNSEEN
 from runtime.cli import AsJson, counted, print_result
 
-DEFAULT_FOLDER = Path("datasets/default")
+DatasetFolder = Annotated[Path, typer.Argument(metavar="DIR", help="A dataset folder.")]
+
+
+def info(folder: DatasetFolder = DATASET_FOLDER, as_json: AsJson = False) -> None:
+    """Count the contents of a dataset, and the error of always predicting the mean."""
+    from datagen.recording.dataset import Dataset
+    from datagen.recording.statistics import describe
+
+    statistics = describe(Dataset.open(folder))
+    print_result(statistics, as_json, _info_text(statistics))
 
 
 def stats(
-    folder: Annotated[
-        Path, typer.Argument(metavar="DIR", help="A dataset folder.")
-    ] = DEFAULT_FOLDER,
+    folder: DatasetFolder = DATASET_FOLDER,
     out: Annotated[
-        Path | None, typer.Option(help="The page to write; else stats.html in the dataset folder.")
+        Path | None,
+        typer.Option(help="The page to write. Default: DIR/stats.html."),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Write a page of distributions, balance, concerns and sample frames."""
+    """Write an HTML page of distributions, class balance, concerns and sample frames."""
     from datagen.recording.dataset import Dataset
     from datagen.recording.statistics import describe
     from datagen.stats.concerns import concerns
@@ -46,9 +55,7 @@ def stats(
 
 
 def export(
-    folder: Annotated[
-        Path, typer.Argument(metavar="DIR", help="A dataset folder.")
-    ] = DEFAULT_FOLDER,
+    folder: DatasetFolder = DATASET_FOLDER,
     kind: Annotated[
         str,
         typer.Option(
@@ -56,30 +63,30 @@ def export(
         ),
     ] = "webdataset",
     out: Annotated[
-        Path | None, typer.Option(help="The folder to write; else DIR-FORMAT beside the dataset.")
+        Path | None,
+        typer.Option(help="The folder to write. Default: DIR-FORMAT."),
     ] = None,
     split: Annotated[
-        str, typer.Option(help="Side to take: train, test, unseen or all, kept apart by name.")
+        str,
+        typer.Option(help="Side of the split: train, test, unseen, or all (files by side)."),
     ] = "all",
-    shard_size: Annotated[int, typer.Option(help="webdataset: frames of a shard.")] = 1000,
+    shard_size: Annotated[int, typer.Option(help="webdataset: frames per shard.")] = 1000,
     shuffle: Annotated[
         bool,
-        typer.Option(
-            "--shuffle", help="webdataset: random order, the same each time; else by time."
-        ),
+        typer.Option("--shuffle", help="webdataset: fixed random order instead of order of time."),
     ] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Write a dataset in the format of other trainers; images are copied, not encoded again."""
+    """Convert a dataset to WebDataset or LeRobot; images are copied, not encoded again."""
     from rich.console import Console
 
     from datagen.export.run import ExportConfig
     from datagen.export.run import export as run
 
     target = out or folder.resolve().with_name(f"{folder.resolve().name}-{kind}")
-    wanted = ExportConfig(kind, split, shard_size, shuffle)
+    config = ExportConfig(kind, split, shard_size, shuffle)
     with Console(stderr=True).status(f"reading {folder}") as status:
-        done = run(folder, target, wanted, lambda n: status.update(f"{n:,} frames written"))
+        done = run(folder, target, config, lambda n: status.update(f"{n:,} frames written"))
     megabytes = f"{done.bytes / 1e6:.1f} MB in {counted(done.files, 'file')}"
     line = (
         f"{target}: {counted(done.frames, 'frame')} of {counted(done.rounds, 'round')}, {megabytes}"
@@ -93,58 +100,54 @@ def view(
     ],
     html: Annotated[
         Path | None,
-        typer.Option(help="Write a page with pictures, plan and plots, for any browser."),
+        typer.Option(help="Write an HTML page with images, map and plots."),
     ] = None,
     save: Annotated[
-        Path | None, typer.Option(help="Write a file for Rerun (.rrd) instead of opening it.")
+        Path | None, typer.Option(help="Write a Rerun file (.rrd) instead of opening a window.")
     ] = None,
     web: Annotated[
-        bool, typer.Option("--web", help="Serve Rerun's viewer to a browser until interrupted.")
+        bool, typer.Option("--web", help="Serve Rerun's viewer to browsers until interrupted.")
     ] = False,
     port: Annotated[
-        int, typer.Option(help="With --web: the viewer's port; its data take the next one.")
+        int, typer.Option(help="With --web: port of the viewer; the data use the next port.")
     ] = 9090,
     as_json: AsJson = False,
 ) -> None:
-    """Open a round: its pictures with true markings, the road in 3D, plots of labels and driving.
+    """Show a round: images with the true markings, the road in 3D, plots of labels and driving.
 
-    Without an option a window of Rerun opens.
+    Without an option, a window of Rerun opens.
     """
-
     from datagen.view.contents import Contents
-    from datagen.view.show import Ways, show
+    from datagen.view.show import ShowConfig, show
 
-    def told(place: str) -> None:
-        about = {"round": contents.header.id, "frames": len(contents.steps), "shown": place}
-        print_result(about, as_json, f"{contents.about}\n{place}")
-        sys.stdout.flush()  # a server goes on
+    def on_shown(place: str) -> None:
+        result = {"round": contents.header.id, "frames": len(contents.steps), "shown": place}
+        print_result(result, as_json, f"{contents.about}\n{place}")
+        sys.stdout.flush()  # with --web this process continues to run
 
-    ways = Ways(html, save, web, port)
-    ways.require_sane()
+    config = ShowConfig(html, save, web, port)
+    config.validate()
     contents = Contents.open(recorded)
-    show(contents, ways, told)
+    show(contents, config, on_shown)
 
 
-# `datagen info` as text.
-
-
-def text(statistics: dict[str, Any]) -> str:
-    """The statistics of `datagen.recording.statistics.describe`, for people."""
+def _info_text(statistics: dict[str, Any]) -> str:
+    """The result of `datagen.recording.statistics.describe` as text."""
     lines = [f"{statistics['rounds']} rounds, {statistics['frames']} frames"]
     for name in ("track", "lanes", "light", "traffic", "trajectory"):
         counts = statistics[f"by_{name}"]
         lines.append(f"{name + ':':<12}" + ", ".join(f"{key} {n}" for key, n in counts.items()))
     for side in SIDES:
-        lines += _side(side, statistics[side])
+        lines += _side_lines(side, statistics[side])
     return "\n".join(lines)
 
 
-def _side(name: str, side: dict[str, Any]) -> list[str]:
+def _side_lines(name: str, side: dict[str, Any]) -> list[str]:
     if not side["frames"]:
         return [] if name == UNSEEN else [f"{name}: no frames"]
     classes = ", ".join(f"{kind} {share:.1%}" for kind, share in side["heading"].items())
     lines = [f"{name}: {side['frames']} frames; {classes}"]
-    lines.append("  always answering the mean misses by (where active):")
+    lines.append("  mean absolute error of always predicting the mean (where active):")
     for feature in (*tf.MARKINGS, "to_lane_centre", "angle"):
         unit = "rad" if feature == "angle" else "m"
         missed, active = side["mean_deviation"][feature], side["active"][feature]

@@ -1,29 +1,87 @@
-"""The commands that look after recorded rounds: `datagen recover` and `datagen split`.
+"""The commands that check and repair datasets: `datagen verify`, `recover` and `split`.
 
-datagen recover datasets/default/rounds/r007.mcap
+datagen verify datasets/default --level full
 """
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from datagen.cli.inspect import DatasetFolder
+from datagen.planning.config import DATASET_FOLDER, CollectConfig
 from runtime.cli import AsJson, counted, print_result
 from trackfeatures.errors import UserError
 
 if TYPE_CHECKING:
+    from datagen.recording.integrity.verify import Report
     from datagen.recording.near_duplicates import Tolerances
+
+Level = Annotated[
+    str,
+    typer.Option(help="quick: ends and counts. full: every byte. deep: every image and label."),
+]
+Replay = Annotated[
+    int, typer.Option(help="Also simulate this many rounds again: labels must be bit-equal.")
+]
+Pixels = Annotated[
+    bool, typer.Option("--pixels", help="With --replay: images too, on the same renderer.")
+]
+TracksDir = Annotated[Path | None, typer.Option(help="With --replay: folder of TORCS tracks.")]
+
+
+def verify(
+    folder: DatasetFolder = DATASET_FOLDER,
+    level: Level = "full",
+    replay: Replay = 0,
+    pixels: Pixels = False,
+    tracks_dir: TracksDir = None,
+    as_json: AsJson = False,
+) -> None:
+    """Check that a dataset is unchanged since it was recorded; exit 1 if it is not."""
+    from rich.console import Console
+
+    from datagen.recording.integrity.round_checks import LEVELS
+    from datagen.recording.integrity.verify import verify as run
+
+    if level not in LEVELS:
+        raise UserError(f"there is no level {level!r}; choose {', '.join(LEVELS)}")
+    with Console(stderr=True).status(f"checking {folder}") as status:
+        report = run(folder, level, lambda name: status.update(f"checked {name}"))
+        replayed: list[str] = []
+        if replay and report.ok:
+            from datagen.recorder.replay import replay as simulate
+
+            replayed, problems = simulate(
+                folder, replay, tracks_dir, pixels, lambda name: status.update(f"replayed {name}")
+            )
+            report = replace(report, ok=not problems, problems=tuple(problems))
+    _print_report(report, folder, level, replayed, as_json)
+    if not report.ok:
+        raise typer.Exit(1)
+
+
+def _print_report(
+    report: "Report", folder: Path, level: str, replayed: list[str], as_json: bool
+) -> None:
+    verdict = "in order" if report.ok else counted(len(report.problems), "problem")
+    contents = f"{counted(report.rounds, 'round')}, {counted(report.frames, 'frame')}"
+    again = f", {len(replayed)} replayed" if replayed else ""
+    line = f"{folder}: {contents}, level {level}{again}: {verdict}"
+    result = {**report.as_json(), "replayed": replayed}
+    print_result(result, as_json, "\n".join([line, *report.problems, *report.recovered]))
 
 
 def recover(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="A damaged round.")],
     out: Annotated[
         Path | None,
-        typer.Option(help="The new file; else beside it, or in DIR/recovered for DIR/rounds."),
+        typer.Option(help="The new file. Default: beside FILE; DIR/recovered for DIR/rounds."),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Save the whole frames of a cut or damaged round into a new file, marked as recovered."""
+    """Copy the intact frames of a damaged round to a new file, marked as recovered."""
     from datagen.recording.integrity.recover import recover as run
 
     done = run(file, out)
@@ -33,25 +91,28 @@ def recover(
 
 
 def split(
-    folder: Annotated[Path, typer.Argument(metavar="DIR", help="A dataset folder.")],
-    name: Annotated[str, typer.Option(help="Which split: splits/NAME.json.")] = "default",
+    folder: DatasetFolder,
+    name: Annotated[str, typer.Option(help="Name of the split: splits/NAME.json.")] = "default",
     by: Annotated[
-        str, typer.Option(help="Make it: divide by round, or by track (whole tracks held back).")
+        str,
+        typer.Option(help="Create the split: by round, or by track (tests whole tracks)."),
     ] = "",
-    test_share: Annotated[float, typer.Option(help="With --by: share of rounds to test.")] = 0.25,
-    seed: Annotated[int, typer.Option(help="With --by: another seed, another choice.")] = 0,
+    test_share: Annotated[
+        float, typer.Option(help="With --by: share of rounds for testing.")
+    ] = CollectConfig.test_share,
+    seed: Annotated[int, typer.Option(help="With --by: seed of the random choice.")] = 0,
     with_recovered: Annotated[
-        bool, typer.Option("--with-recovered", help="With --by: take recovered rounds too.")
+        bool, typer.Option("--with-recovered", help="With --by: include recovered rounds.")
     ] = False,
     near: Annotated[
-        str, typer.Option(help="Near is within: m along the road, m across it, deg of yaw.")
+        str, typer.Option(help="Limits for near twins: m along the road, m across it, deg of yaw.")
     ] = "0.5,0.1,0.5",
     as_json: AsJson = False,
 ) -> None:
-    """Check a split, or make one with --by: no round, seed or content on two sides.
+    """Check a split, or create one with --by: no round, seed or content may be on two sides.
 
-    Tells how many frames have a near twin in train: road, place, offset,
-    yaw and light. One that leaks is refused, one that exists is kept.
+    Counts the frames that have a near twin in train: same road and light, similar position, offset
+    and yaw. A split that leaks is refused; an existing split is not overwritten.
     """
     from datagen.recording.split_report import SplitConfig, check_split, format_report, make_split
 
@@ -68,7 +129,7 @@ def _tolerances(text: str) -> "Tolerances":
     try:
         s, offset, yaw = (float(part) for part in text.split(","))
     except ValueError as error:
-        raise UserError(f"--near is {text!r}; give three numbers, as 0.5,0.1,0.5") from error
+        raise UserError(f"--near is {text!r}; give three numbers, such as 0.5,0.1,0.5") from error
     if not all(0.0 < value < float("inf") for value in (s, offset, yaw)):
         raise UserError(f"--near is {text!r}; give numbers above 0")
     return Tolerances(s, offset, yaw)

@@ -1,4 +1,6 @@
-"""Collecting a dataset: the plan, the folder and the crew; interrupted, it goes on where it was.
+"""Collects a dataset: records the missing rounds of a plan into a folder.
+
+An interrupted collection is continued by the same command.
 
 datagen collect --rounds 60 --out datasets/default
 """
@@ -14,9 +16,9 @@ from types import FrameType
 from typing import Any, Protocol
 
 import trackfeatures as tf
-from datagen.execution.lock import held, setting_up
-from datagen.execution.process_pool import Hear, ProcessPool
-from datagen.execution.progress import Collected, ProgressCallback, Tally
+from datagen.execution.lock import folder_lock, setup_lock
+from datagen.execution.process_pool import OnMessage, ProcessPool
+from datagen.execution.progress import CollectProgress, CollectResult, ProgressCallback
 from datagen.execution.retry import Failure
 from datagen.planning.plan import Plan, RoundPlan, Shard, program
 from datagen.recorder.job import Job
@@ -33,25 +35,26 @@ from datagen.recording.manifest import rebuild
 from datagen.recording.splits import SIDES, Split, split_path, write_split
 
 EXECUTORS = ("local", "ray")
+PLAN_FILE = "plan.json"
 
 
 class Executor(Protocol):
-    """Records rounds; see `crew.ProcessPool.run`."""
+    """Records rounds, see `ProcessPool.run`."""
 
     def run(self, jobs: Iterable[Job]) -> list[Failure]: ...
 
 
-def make_crew(executor: str, workers: int, hear: Hear) -> Executor:
-    """Processes of this machine, or of a Ray cluster. Raises UserError for anything else."""
+def make_pool(executor: str, workers: int, on_message: OnMessage) -> Executor:
+    """Processes on this machine, or actors on a Ray cluster. Raises UserError for others."""
     if workers < 0:
-        raise tf.UserError(f"{workers} workers asked for; give 1 or more, or 0 for one a core")
+        raise tf.UserError(f"{workers} workers asked for; give 1 or more, or 0 for all cores")
     if executor not in EXECUTORS:
         raise tf.UserError(f"there is no executor {executor!r}; choose {', '.join(EXECUTORS)}")
     if executor == "ray":
-        from datagen.execution.ray_pool import RayCrew
+        from datagen.execution.ray_pool import RayPool
 
-        return RayCrew(workers, hear)
-    return ProcessPool(workers, hear)
+        return RayPool(workers, on_message)
+    return ProcessPool(workers, on_message)
 
 
 def collect(
@@ -63,64 +66,64 @@ def collect(
     *,
     executor: str = "local",
     shard: Shard | None = None,
-) -> Collected:
-    """Record what is missing of the plan, or of its part `shard`, into `folder`.
+) -> CollectResult:
+    """Record the missing rounds of the plan, or of its part `shard`, into `folder`.
 
-    Raises DatasetError when the folder holds something else or rounds failed; UserError and
-    OSError as they come. Finished rounds stay in every case, unfinished ones leave no trace.
+    Raises DatasetError when the folder has other contents or rounds failed, and UserError or
+    OSError of the recording. In all cases finished rounds stay and unfinished ones are removed.
     """
     started = time.perf_counter()
-    mine = plan.rounds if shard is None else shard.select(plan.rounds)
-    make_crew(executor, workers, lambda message: None)  # what cannot be is refused first
-    require_fitting(folder, plan)
+    rounds = plan.rounds if shard is None else shard.select(plan.rounds)
+    make_pool(executor, workers, lambda message: None)  # checks the options before any change
+    require_matching_folder(folder, plan)
     folder.mkdir(parents=True, exist_ok=True)
-    with _terminable(), held(folder, shard):
-        with setting_up(folder):
-            open_folder(folder, plan)
-        _sweep(folder, mine)
-        tally = Tally(mine, read_states(folder).keys(), progress)
-        missing = [entry for entry in mine if entry.id not in tally.finished]
-        crew = make_crew(executor, workers, tally.hear)
+    with _sigterm_as_interrupt(), folder_lock(folder, shard):
+        with setup_lock(folder):
+            initialise_folder(folder, plan)
+        _remove_leftovers(folder, rounds)
+        counter = CollectProgress(rounds, read_states(folder).keys(), progress)
+        missing = [entry for entry in rounds if entry.id not in counter.finished]
+        pool = make_pool(executor, workers, counter.on_message)
         try:
-            failures = crew.run(Job(e, plan.hash, folder, tracks_dir) for e in missing)
+            failures = pool.run(Job(e, plan.hash, folder, tracks_dir) for e in missing)
         except BaseException:
-            with suppress(OSError, tf.UserError):  # what went wrong first is what is told
-                _sweep(folder, mine)
-                _derive(folder, plan, shard)
+            with suppress(OSError, tf.UserError):  # the first error is reported, not a later one
+                _remove_leftovers(folder, rounds)
+                _write_derived_files(folder, plan, shard)
             raise
-        _sweep(folder, mine)
-        content_hash = _derive(folder, plan, shard)
+        _remove_leftovers(folder, rounds)
+        content_hash = _write_derived_files(folder, plan, shard)
     if failures:
-        raise DatasetError(_told(failures, len(mine)))
-    return tally.result(folder, time.perf_counter() - started, content_hash)
+        raise DatasetError(_failure_message(failures, len(rounds)))
+    return counter.result(folder, time.perf_counter() - started, content_hash)
 
 
-def _derive(folder: Path, plan: Plan, shard: Shard | None) -> str | None:
-    """Manifest, split, statistics and card of what is there; the dataset's hash.
+def _write_derived_files(folder: Path, plan: Plan, shard: Shard | None) -> str | None:
+    """Write manifest, split, statistics and card of the finished rounds; the dataset's hash.
 
-    The last shard of a folder to end finds all rounds there; the others leave it to that one.
+    With shards only the last one to end does this, as it finds all rounds finished; others: None.
     """
-    with setting_up(folder):
+    with setup_lock(folder):
         finished = read_states(folder).keys() & {entry.id for entry in plan.rounds}
         if not finished or (shard is not None and len(finished) < len(plan.rounds)):
             return None
         return str(rebuild(folder, split_of(plan, set(finished)))["content_hash"])
 
 
-def _told(failures: Sequence[Failure], planned: int) -> str:
+def _failure_message(failures: Sequence[Failure], planned: int) -> str:
     names = ", ".join(failure.round_id for failure in failures)
     if all(failure.final for failure in failures):
         advice = "other --tracks or another --seed, with another --out, may avoid this"
     else:
-        advice = "run the same command again to try what failed once more"
+        advice = "run the same command again for another attempt"
     return (
         f"{len(failures)} of {planned} rounds failed ({names}: {failures[0].reason}); "
-        f"what was finished can be used; {advice}"
+        f"the finished rounds can be used; {advice}"
     )
 
 
-def _sweep(folder: Path, rounds: Sequence[RoundPlan]) -> None:
-    """Take away what interruptions left of these rounds."""
+def _remove_leftovers(folder: Path, rounds: Sequence[RoundPlan]) -> None:
+    """Delete unfinished files of these rounds, left by interruptions."""
     discard_partials(folder, (entry.id for entry in rounds))
     states = read_states(folder)
     for entry in rounds:
@@ -129,8 +132,8 @@ def _sweep(folder: Path, rounds: Sequence[RoundPlan]) -> None:
 
 
 @contextmanager
-def _terminable() -> Iterator[None]:
-    """SIGTERM ends a collection as Ctrl-C does."""
+def _sigterm_as_interrupt() -> Iterator[None]:
+    """Treat SIGTERM like Ctrl-C."""
 
     def interrupt(number: int, frame: FrameType | None) -> None:
         raise KeyboardInterrupt
@@ -142,29 +145,26 @@ def _terminable() -> Iterator[None]:
         signal.signal(signal.SIGTERM, before)
 
 
-# Opening a dataset folder for a plan: new, empty, or the beginning of this very plan.
+def require_matching_folder(folder: Path, plan: Plan) -> None:
+    """Raise DatasetError unless `folder` is new, empty, or an unfinished dataset of `plan`.
 
-
-PLAN = "plan.json"
-
-
-def require_fitting(folder: Path, plan: Plan) -> None:
-    """The folder is new, empty, or holds the beginning of this very plan."""
+    Raises DefinitionsMismatch for a dataset of other definitions.
+    """
     if not folder.exists():
         return
     if not folder.is_dir():
         raise DatasetError(f"{folder} is a file; choose a folder with --out")
-    path = folder / PLAN
+    path = folder / PLAN_FILE
     if not path.is_file():
-        if not is_unstarted(folder, PLAN):
+        if not is_unstarted(folder, PLAN_FILE):
             raise DatasetError(
-                f"{folder} exists and is not a dataset of `datagen collect` (it has no {PLAN}); "
-                "nothing was changed; choose another folder with --out"
+                f"{folder} exists and is not a dataset of `datagen collect` (no {PLAN_FILE}). "
+                "Nothing was changed; choose another folder with --out"
             )
         return
     try:
         found = json.loads(path.read_text())
-        found_hash, definitions, wanted = found["hash"], found["definitions"], found["wanted"]
+        found_hash, definitions, options = found["hash"], found["definitions"], found["wanted"]
         maker = found["program"]
     except (ValueError, KeyError, TypeError) as error:
         raise DatasetError(
@@ -178,7 +178,7 @@ def require_fitting(folder: Path, plan: Plan) -> None:
         )
     if found_hash != plan.hash:
         raise DatasetError(
-            f"{folder} was begun with another plan ({_differences(wanted, plan)}); give the same "
+            f"{folder} was begun with another plan ({_differences(options, plan)}); give the same "
             "options to finish it, or choose another folder with --out"
         )
 
@@ -190,19 +190,20 @@ def require_fitting(folder: Path, plan: Plan) -> None:
 
 
 def foreign_files(folder: Path, plan: Plan) -> list[Path]:
-    """What lies among the rounds and is not of them: it would be read as one."""
+    """Files in rounds/ that are not of the plan: they would be read as rounds."""
     names = {f"{entry.id}.mcap" for entry in plan.rounds}
     return [path for path in sorted(folder.glob("rounds/*.mcap")) if path.name not in names]
 
 
 def _differences(found: dict[str, Any], plan: Plan) -> str:
+    """The options that differ, as text."""
     wanted = json.loads(json.dumps(asdict(plan.config)))
     named = [
         f"{name}: {_short(found.get(name))} there, {_short(value)} asked for"
         for name, value in wanted.items()
         if found.get(name) != value
     ]
-    return "; ".join(named) or "dealt otherwise"
+    return "; ".join(named) or "the same options, other rounds"
 
 
 def _short(value: Any) -> str:
@@ -211,16 +212,16 @@ def _short(value: Any) -> str:
     return str(value)
 
 
-def open_folder(folder: Path, plan: Plan) -> None:
-    """Write what the rounds are to be found with, whatever happens to them."""
-    # First of all: by its plan the same command knows the folder again, whatever fails next.
-    write_if_changed(folder / PLAN, json.dumps(plan.as_json(), indent=1) + "\n")
+def initialise_folder(folder: Path, plan: Plan) -> None:
+    """Write plan and split and create the subfolders."""
+    # The plan first: with it, the same command can continue whatever fails next.
+    write_if_changed(folder / PLAN_FILE, json.dumps(plan.as_json(), indent=1) + "\n")
     prepare(folder)
     write_split(split_path(folder), split_of(plan, {entry.id for entry in plan.rounds}))
 
 
 def split_of(plan: Plan, finished: set[str]) -> Split:
-    """The plan's split, of the rounds that are there."""
+    """The split of the plan, restricted to the `finished` rounds."""
     return Split(
         **{
             side: tuple(e.id for e in plan.rounds if e.split == side and e.id in finished)

@@ -1,7 +1,7 @@
-"""Who may write to a dataset folder: one collector, or one for each shard of the same plan.
+"""Locks of a dataset folder: one collector may write to it, or one for each shard of a plan.
 
-Locks are on files in `.locks/` and end with the process that holds them, however it ends. They are
-`flock` locks: Linux carries them over NFS too.
+The locks are `flock` locks on files in `.locks/`. The operating system releases them when the
+process ends, however it ends. On Linux they also work over NFS.
 """
 
 import fcntl
@@ -14,15 +14,15 @@ from datagen.planning.plan import Shard
 from datagen.recording.errors import DatasetError
 from datagen.recording.folder import LOCKS
 
-FOLDER, SETTING_UP = "folder", "setting-up"
+FOLDER_LOCK, SETUP_LOCK = "folder", "setting-up"
 
 
 @contextmanager
-def held(folder: Path, shard: Shard | None) -> Iterator[None]:
-    """Hold the folder, or its part `shard`. Raises DatasetError when another collector has it."""
+def folder_lock(folder: Path, shard: Shard | None) -> Iterator[None]:
+    """Lock the folder, or its part `shard`. Raises DatasetError when another collector holds it."""
     (folder / LOCKS).mkdir(exist_ok=True)
-    with _open(folder, FOLDER) as whole:
-        if not _try(whole, fcntl.LOCK_EX if shard is None else fcntl.LOCK_SH):
+    with _open(folder, FOLDER_LOCK) as descriptor:
+        if not _try_lock(descriptor, fcntl.LOCK_EX if shard is None else fcntl.LOCK_SH):
             raise DatasetError(
                 f"another `datagen collect` is writing to {folder}; wait for it or choose another "
                 "--out"
@@ -31,31 +31,34 @@ def held(folder: Path, shard: Shard | None) -> Iterator[None]:
             yield
             return
         name = f"shard-{shard.number}-of-{shard.count}"
-        with _open(folder, name) as mine:
-            if not _try(mine, fcntl.LOCK_EX):
-                raise DatasetError(f"shard {shard} of {folder} is being recorded already")
+        with _open(folder, name) as shard_descriptor:
+            if not _try_lock(shard_descriptor, fcntl.LOCK_EX):
+                raise DatasetError(
+                    f"shard {shard} of {folder} is being recorded by another `datagen collect`; "
+                    "wait for it or give another --shard"
+                )
             _require_same_count(folder, shard)
             yield
 
 
 @contextmanager
-def setting_up(folder: Path) -> Iterator[None]:
-    """Alone for a moment: what all shards write alike is written by one at a time."""
-    with _open(folder, SETTING_UP) as descriptor:
+def setup_lock(folder: Path) -> Iterator[None]:
+    """Lock for the files that all shards write: one collector at a time; waits for the others."""
+    with _open(folder, SETUP_LOCK) as descriptor:
         fcntl.flock(descriptor, fcntl.LOCK_EX)
         yield
 
 
 def _require_same_count(folder: Path, shard: Shard) -> None:
-    """Shards of another division would record the same rounds at the same time."""
+    """Raise DatasetError while shards of another count run: they would record the same rounds."""
     for path in sorted((folder / LOCKS).glob("shard-*-of-*")):
         if path.name.endswith(f"-of-{shard.count}"):
             continue
         with _open(folder, path.name) as other:
-            if not _try(other, fcntl.LOCK_EX):
+            if not _try_lock(other, fcntl.LOCK_EX):
                 raise DatasetError(
-                    f"{path.name} of {folder} is being recorded, which does not go with shard "
-                    f"{shard}; divide by the same number, or wait for it"
+                    f"{path.name} of {folder} is being recorded, which overlaps with shard "
+                    f"{shard}; use the same number of shards, or wait for it"
                 )
 
 
@@ -68,7 +71,8 @@ def _open(folder: Path, name: str) -> Iterator[int]:
         os.close(descriptor)
 
 
-def _try(descriptor: int, kind: int) -> bool:
+def _try_lock(descriptor: int, kind: int) -> bool:
+    """False when another process holds the lock."""
     try:
         fcntl.flock(descriptor, kind | fcntl.LOCK_NB)
     except BlockingIOError:

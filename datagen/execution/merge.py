@@ -1,4 +1,4 @@
-"""Putting together what the shards of one plan recorded into folders of their own."""
+"""Merges the folders that the shards of one plan were recorded into."""
 
 import json
 import shutil
@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import trackfeatures as tf
-from datagen.execution.collect import PLAN
-from datagen.execution.lock import held
+from datagen.execution.collect import PLAN_FILE
+from datagen.execution.lock import folder_lock
 from datagen.recording.errors import DatasetError
 from datagen.recording.folder import (
     RoundState,
@@ -27,8 +27,8 @@ from datagen.recording.splits import SIDES, Split
 
 
 @dataclass(frozen=True, slots=True)
-class Merged:
-    """`rounds` of the plan's `planned` are in the folder now, `added` of them just came."""
+class MergeResult:
+    """`rounds` of the `planned` rounds are in the folder now; this merge added `added`."""
 
     rounds: int
     planned: int
@@ -41,53 +41,55 @@ class Merged:
         return asdict(self)
 
 
-def merge(folders: Sequence[Path], out: Path) -> Merged:
-    """Copy the finished rounds of `folders` into `out`; those that are there already stay.
+def merge(folders: Sequence[Path], out: Path) -> MergeResult:
+    """Copy the finished rounds of `folders` into `out`; rounds already in `out` stay.
 
-    Raises DatasetError when a folder holds no plan or another one, or a round is damaged.
+    Raises DatasetError for a folder without a plan or with another plan, and for a damaged round.
     """
-    plans = [_plan_of(folder) for folder in folders]
-    if (out / PLAN).is_file():
-        plans.append(_plan_of(out))
+    plans = [_read_plan(folder) for folder in folders]
+    if (out / PLAN_FILE).is_file():
+        plans.append(_read_plan(out))
     elif out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise DatasetError(f"{out} exists and is not a dataset; choose another --out")
     _require_one_plan(plans, [*folders, out])
     plan = plans[0]
     out.mkdir(parents=True, exist_ok=True)
-    with held(out, None):
-        write_if_changed(out / PLAN, json.dumps(plan, indent=1) + "\n")
+    with folder_lock(out, None):
+        write_if_changed(out / PLAN_FILE, json.dumps(plan, indent=1) + "\n")
         prepare(out)
-        there = read_states(out).keys()
+        present = read_states(out).keys()
         found = {s.id: (folder, s) for folder in folders for s in read_states(folder).values()}
         planned = {entry["id"]: entry["split"] for entry in plan["rounds"]}
-        for round_id in sorted(found.keys() & planned.keys() - there):
-            _copy(*found[round_id], out)
+        for round_id in sorted(found.keys() & planned.keys() - present):
+            _copy_round(*found[round_id], out)
         discard_partials(out, planned)
         states = {i: state for i, state in read_states(out).items() if i in planned}
         if not states:
-            raise DatasetError("no folder holds a finished round of the plan")
+            raise DatasetError("no folder has a finished round of the plan; record a shard first")
         sides = {side: tuple(i for i in states if planned[i] == side) for side in SIDES}
         statistics = rebuild(out, Split(**sides))
-    return Merged(
+    return MergeResult(
         rounds=len(states),
         planned=len(planned),
-        added=len(states) - len(there & planned.keys()),
+        added=len(states) - len(present & planned.keys()),
         frames=sum(state.frames for state in states.values()),
         content_hash=str(statistics["content_hash"]),
         out=str(out),
     )
 
 
-def _plan_of(folder: Path) -> dict[str, Any]:
-    path = folder / PLAN
+def _read_plan(folder: Path) -> dict[str, Any]:
+    path = folder / PLAN_FILE
     try:
         plan: dict[str, Any] = json.loads(path.read_text())
         tf.require_version(str(plan["definitions"]), str(folder))
         _ = plan["hash"], [(entry["id"], entry["split"]) for entry in plan["rounds"]]
     except FileNotFoundError as error:
-        raise DatasetError(f"{folder} is no folder of `datagen collect` (no {PLAN})") from error
+        raise DatasetError(
+            f"{folder} is no folder of `datagen collect` (no {PLAN_FILE})"
+        ) from error
     except (ValueError, KeyError, TypeError) as error:
-        raise DatasetError(f"{path} is no plan of this program ({error!r})") from error
+        raise DatasetError(f"{path} is not a plan of this version ({error!r})") from error
     return plan
 
 
@@ -100,14 +102,14 @@ def _require_one_plan(plans: Sequence[dict[str, Any]], folders: Sequence[Path]) 
             )
 
 
-def _copy(folder: Path, state: RoundState, out: Path) -> None:
+def _copy_round(folder: Path, state: RoundState, out: Path) -> None:
     partial = partial_path(out, state.id)
     try:
         shutil.copyfile(folder / state.file, partial)
         if file_sha256(partial) != state.sha256:
             raise DatasetError(
-                f"{folder / state.file} is damaged (its sha256 is not that of its state); delete "
-                "it and record that shard again"
+                f"{folder / state.file} is damaged (its SHA-256 differs from the recorded one); "
+                "delete it and record that shard again"
             )
         publish(out, partial, state)
     finally:

@@ -1,4 +1,4 @@
-"""Several recording processes at once; one that dies or hangs costs its round, which is retried."""
+"""Records rounds in several processes. If one ends or hangs, its round is attempted again."""
 
 import multiprocessing
 import os
@@ -10,13 +10,21 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from time import monotonic
 
-from datagen.execution.retry import Failure, Limits, Tries
-from datagen.recorder.job import FatalError, FramesDone, Job, Message, RoundBroken, RoundDone, work
+from datagen.execution.retry import Failure, RetryQueue, Timeouts
+from datagen.recorder.job import (
+    AttemptFailed,
+    FatalError,
+    FramesDone,
+    Job,
+    Message,
+    RoundDone,
+    worker_main,
+)
 
-STOP_S = 5.0
-CONTEXT = multiprocessing.get_context("spawn")  # a forked graphics context does not work
+STOP_S = 5.0  # s: for a process to end, before it is killed
+CONTEXT = multiprocessing.get_context("spawn")  # graphics contexts do not survive a fork
 
-Hear = Callable[[FramesDone | RoundDone], None]
+OnMessage = Callable[[FramesDone | RoundDone], None]
 
 
 @dataclass
@@ -24,47 +32,45 @@ class Worker:
     process: BaseProcess
     connection: Connection
     job: Job | None = None
-    since: float = 0.0
-    heard: float = 0.0
+    started: float = 0.0
+    last_heartbeat: float = 0.0
 
-    def deadline(self, limits: Limits) -> float:
-        if self.job is None:
-            return float("inf")
-        return min(self.heard + limits.silence_s, self.since + limits.round_s(self.job))
+    def deadline(self, timeouts: Timeouts) -> float:
+        return timeouts.deadline(self.job, self.started, self.last_heartbeat)
 
 
 class ProcessPool:
-    """`size` processes (0: one a core). `hear` gets FramesDone and RoundDone as they come."""
+    """`size` processes (0: one for each core). `on_message` is called with each message."""
 
-    def __init__(self, size: int, hear: Hear, limits: Limits | None = None) -> None:
+    def __init__(self, size: int, on_message: OnMessage, timeouts: Timeouts | None = None) -> None:
         self._size = size or os.cpu_count() or 1
-        self._hear = hear
-        self._limits = limits or Limits()
+        self._on_message = on_message
+        self._timeouts = timeouts or Timeouts()
         self._workers: list[Worker] = []
-        self._tries = Tries((), self._limits)
+        self._queue = RetryQueue((), self._timeouts)
 
     def run(self, jobs: Iterable[Job]) -> list[Failure]:
-        """Record all rounds; those that failed for good, or too often, are returned.
+        """Record all rounds; returns those that failed finally or too often.
 
-        Raises what no round can get round (disk full, unknown track): UserError or OSError. Leaves
-        no process behind, however it ends.
+        Raises errors that every round would meet (disk full, unknown track): UserError or OSError.
+        All processes have ended when it returns or raises.
         """
-        self._tries = Tries(jobs, self._limits)
+        self._queue = RetryQueue(jobs, self._timeouts)
         try:
             with _single_threaded(self._size):
-                for _ in range(min(self._size, len(self._tries))):
-                    self._workers.append(self._hire())
+                for _ in range(min(self._size, len(self._queue))):
+                    self._workers.append(self._start_worker())
                 while self._assign():
-                    self._listen()
-                    self._end_the_stuck()
+                    self._receive()
+                    self._kill_hung_workers()
         finally:
-            self._dismiss()
-        return self._tries.failures
+            self._stop_workers()
+        return self._queue.failures
 
-    def _hire(self) -> Worker:
+    def _start_worker(self) -> Worker:
         mine, theirs = CONTEXT.Pipe()
-        process = CONTEXT.Process(target=work, args=(theirs, os.getpid()), daemon=True)
-        # A new process keeps ignoring what is ignored here: Ctrl-C is for this one to handle.
+        process = CONTEXT.Process(target=worker_main, args=(theirs, os.getpid()), daemon=True)
+        # Child processes inherit ignored signals: only this process handles Ctrl-C.
         before = signal.signal(signal.SIGINT, signal.SIG_IGN)
         try:
             process.start()
@@ -74,27 +80,27 @@ class ProcessPool:
         return Worker(process, mine)
 
     def _assign(self) -> bool:
-        """Give idle workers something to do; False when all is done."""
+        """Give a round to each idle worker; False when all rounds are done."""
         for worker in self._workers:
             if worker.job is not None:
                 continue
-            worker.since = worker.heard = monotonic()
-            worker.job = self._tries.take(worker.since)
+            worker.started = worker.last_heartbeat = monotonic()
+            worker.job = self._queue.take(worker.started)
             if worker.job is None:
                 break
             try:
                 worker.connection.send(worker.job)
             except BrokenPipeError:
-                continue  # it has died: `_listen` will see
-        return bool(self._tries) or any(worker.job is not None for worker in self._workers)
+                continue  # the process has ended: `_receive` replaces it
+        return bool(self._queue) or any(worker.job is not None for worker in self._workers)
 
-    def _listen(self) -> None:
-        """Hear what there is to hear until the next thing is due."""
+    def _receive(self) -> None:
+        """Handle messages; wait for one until the next deadline or attempt."""
         idle = any(worker.job is None for worker in self._workers)
-        due = min(worker.deadline(self._limits) for worker in self._workers)
-        due = min(due, self._tries.next_at() if idle else due)
-        patience = max(due - monotonic(), 0.0)
-        ready = set(wait([worker.connection for worker in self._workers], patience))
+        due = min(worker.deadline(self._timeouts) for worker in self._workers)
+        due = min(due, self._queue.next_at() if idle else due)
+        wait_s = max(due - monotonic(), 0.0)
+        ready = set(wait([worker.connection for worker in self._workers], wait_s))
         for number, worker in enumerate(self._workers):
             if worker.connection not in ready:
                 continue
@@ -103,48 +109,48 @@ class ProcessPool:
             except (EOFError, ConnectionResetError):
                 self._replace(number, f"its process ended with code {_code(worker.process)}")
             else:
-                worker.heard = monotonic()
-                self._take(worker, message)
+                worker.last_heartbeat = monotonic()
+                self._handle(worker, message)
 
-    def _end_the_stuck(self) -> None:
+    def _kill_hung_workers(self) -> None:
         now = monotonic()
         for number, worker in enumerate(self._workers):
-            if worker.job is None or now < worker.deadline(self._limits):
+            if worker.job is None or now < worker.deadline(self._timeouts):
                 continue
-            silent = now - worker.heard >= self._limits.silence_s
-            worker.process.kill()  # a stopped one would not hear anything gentler
-            spent = now - (worker.heard if silent else worker.since)
+            silent = now - worker.last_heartbeat >= self._timeouts.heartbeat_s
+            worker.process.kill()  # a suspended process does not react to SIGTERM
+            spent = now - (worker.last_heartbeat if silent else worker.started)
             what = "its process gave no sign of life" if silent else "it was not finished"
             self._replace(number, f"{what} for {spent:.0f} s")
 
-    def _take(self, worker: Worker, message: Message) -> None:
+    def _handle(self, worker: Worker, message: Message) -> None:
         if isinstance(message, FatalError):
             raise message.error
-        if isinstance(message, RoundBroken):
+        if isinstance(message, AttemptFailed):
             self._retry(worker, message.reason, message.final)
             return
         if isinstance(message, RoundDone):
             worker.job = None
-            self._tries.done()
-        self._hear(message)
+            self._queue.record_success()
+        self._on_message(message)
 
     def _replace(self, number: int, reason: str) -> None:
-        """A worker is dead: put another in its place."""
-        dead = self._workers[number]
-        dead.connection.close()
-        dead.process.join()
-        self._tries.died(reason)
-        self._workers[number] = self._hire()
-        self._retry(dead, reason)
+        """Start another worker in place of an ended one."""
+        ended = self._workers[number]
+        ended.connection.close()
+        ended.process.join()
+        self._queue.record_death(reason)
+        self._workers[number] = self._start_worker()
+        self._retry(ended, reason)
 
     def _retry(self, worker: Worker, reason: str, final: bool = False) -> None:
         job, worker.job = worker.job, None
         if job is not None:
-            self._hear(FramesDone(job.plan.id, 0))
-            self._tries.failed(job, reason, monotonic(), final)
+            self._on_message(FramesDone(job.plan.id, 0))
+            self._queue.record_failure(job, reason, monotonic(), final)
 
-    def _dismiss(self) -> None:
-        """Idle workers are asked to go, busy ones are stopped."""
+    def _stop_workers(self) -> None:
+        """Idle workers are asked to end, busy ones are killed."""
         for worker in self._workers:
             if worker.connection.closed:
                 continue
@@ -171,11 +177,10 @@ def _code(process: BaseProcess) -> int | None:
 
 @contextmanager
 def _single_threaded(workers: int) -> Iterator[None]:
-    """Each process gets its share of the cores: libraries that start threads of their own read
-    these variables when they are loaded, so they are set before the processes start."""
-    wanted = thread_limits(workers)
-    before = {name: os.environ.get(name) for name in wanted}
-    os.environ.update(wanted)
+    """Set `thread_limits` for child processes: libraries read them when they are loaded."""
+    limits = thread_limits(workers)
+    before = {name: os.environ.get(name) for name in limits}
+    os.environ.update(limits)
     try:
         yield
     finally:
@@ -187,7 +192,7 @@ def _single_threaded(workers: int) -> Iterator[None]:
 
 
 def thread_limits(workers: int) -> dict[str, str]:
-    """Environment variables for each of `workers` processes on this machine."""
+    """Environment variables that give each of `workers` processes its share of the cores."""
     share = (os.cpu_count() or 1) // workers
     return {
         "LP_NUM_THREADS": str(share if share > 1 else 0),

@@ -1,4 +1,4 @@
-"""What a collection has done so far, counted from what its crew reports."""
+"""Progress of a collection: counted from the messages of the executor, and shown as a bar."""
 
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
@@ -23,17 +23,17 @@ from datagen.recorder.job import FramesDone, RoundDone
 
 
 class ProgressCallback(Protocol):
-    """Hears how the collection goes."""
+    """Called with the numbers of frames and rounds that are done."""
 
     def __call__(self, done_frames: int, done_rounds: int) -> None: ...
 
 
 @dataclass(frozen=True, slots=True)
-class Collected:
-    """`rounds` and `frames` are in the folder; `recorded_frames` of them came in this run.
+class CollectResult:
+    """Result of a collection: `rounds` and `frames` in the folder, `recorded_frames` in this run.
 
-    `content_hash` is the dataset's (see `datagen.recording.dataset`), absent while a shard's part
-    is all there is.
+    `content_hash` is the dataset's (see `datagen.recording.dataset`); None while other shards of
+    the plan are missing.
     """
 
     rounds: int
@@ -49,8 +49,8 @@ class Collected:
         return asdict(self)
 
 
-class Tally:
-    """Counts `rounds`, of which those in `finished` are there before it begins."""
+class CollectProgress:
+    """Counts what is done of `rounds`; `finished` are the ids of those done before."""
 
     def __init__(
         self, rounds: Sequence[RoundPlan], finished: Collection[str], progress: ProgressCallback
@@ -63,7 +63,7 @@ class Tally:
         self._progress = progress
         progress(self._before, len(self.finished))
 
-    def hear(self, message: FramesDone | RoundDone) -> None:
+    def on_message(self, message: FramesDone | RoundDone) -> None:
         if isinstance(message, FramesDone):
             self._running[message.round_id] = message.frames
         else:
@@ -72,9 +72,9 @@ class Tally:
             self._resets += message.resets
         self._progress(self._done() + sum(self._running.values()), len(self.finished))
 
-    def result(self, folder: Path, seconds: float, content_hash: str | None) -> Collected:
+    def result(self, folder: Path, seconds: float, content_hash: str | None) -> CollectResult:
         recorded = self._done() - self._before
-        return Collected(
+        return CollectResult(
             rounds=len(self.finished),
             frames=self._done(),
             seconds=round(seconds, 3),
@@ -89,11 +89,11 @@ class Tally:
         return sum(self._frames_of[round_id] for round_id in self.finished)
 
 
-# The progress bar of a collection, on stderr.
-
-
 class FramesPerSecond(ProgressColumn):
-    """Of the last seconds; at the end of all. Frames there were before (`begun`) do not count."""
+    """Frames per second: recent ones while running, of the whole run at the end.
+
+    Frames from earlier runs (the field `begun`) do not count.
+    """
 
     def render(self, task: Task) -> Text:
         speed = task.speed
@@ -103,8 +103,13 @@ class FramesPerSecond(ProgressColumn):
 
 
 @contextmanager
-def shown(rounds: int, frames: int, heading: RenderableType = "") -> Iterator[ProgressCallback]:
-    """A function that takes the counts and shows them, below `heading`, until the block ends."""
+def progress_bar(
+    rounds: int, frames: int, heading: RenderableType = ""
+) -> Iterator[ProgressCallback]:
+    """Show a bar on stderr, below `heading`, for the duration of the block.
+
+    Yields the function that updates it; the bar appears at the first update.
+    """
     bar = Progress(
         TextColumn("[bold]{task.description}"),
         BarColumn(),
@@ -119,7 +124,7 @@ def shown(rounds: int, frames: int, heading: RenderableType = "") -> Iterator[Pr
     task = bar.add_task(f"0/{rounds} rounds", total=frames, begun=0)
 
     def update(done_frames: int, done_rounds: int) -> None:
-        if not bar.live.is_started:  # only now: what is refused before it begins shows nothing
+        if not bar.live.is_started:  # not earlier: errors before the start print no bar
             bar.console.print(heading)
             bar.start()
             bar.update(task, begun=done_frames)

@@ -1,9 +1,9 @@
-"""Recording on a Ray cluster: the same rounds by the same code, gathered into one folder here.
+"""Records rounds on a Ray cluster; the files are collected in one folder on this machine.
 
-datagen collect --executor ray        # $RAY_ADDRESS names the cluster; without one, this machine
+datagen collect --executor ray        # on the cluster at $RAY_ADDRESS, else on this machine
 
-A round is recorded on the other machine's own disk and comes back as bytes, so that no disk need
-be shared. Every machine needs this program, and the tracks where they are not the project's own.
+An actor records on its machine's own disk and returns the file as bytes: no shared disk is needed.
+Every machine needs this program, and the track files unless they are the project's own.
 """
 
 import hashlib
@@ -15,35 +15,35 @@ from pathlib import Path
 from time import monotonic
 from typing import Any
 
-from datagen.execution.process_pool import Hear, thread_limits
-from datagen.execution.retry import Failure, Limits, Tries
+from datagen.execution.process_pool import OnMessage, thread_limits
+from datagen.execution.retry import Failure, RetryQueue, Timeouts
 from datagen.recorder.job import (
-    Ending,
+    AttemptFailed,
     FatalError,
     FramesDone,
     Job,
-    RoundBroken,
+    Outcome,
     RoundDone,
     attempt,
 )
 from datagen.recording.folder import discard_partial, partial_path, prepare, publish
 from trackfeatures.errors import UserError
 
-PULSE_S = 0.5
+POLL_S = 0.5
 
 
 class Recorder:
-    """The actor: records in its main thread, and answers from another one how far it is."""
+    """The Ray actor: records in its main thread; another thread answers `heartbeat`."""
 
     def __init__(self) -> None:
         from datagen.recorder.job import warm_up
 
-        self._signs = 0
+        self._heartbeats = 0
         self._frames = 0
         warm_up()
 
-    def record(self, job: Job) -> tuple[Ending, bytes]:
-        """The round's file comes with RoundDone, else nothing does."""
+    def record(self, job: Job) -> tuple[Outcome, bytes]:
+        """Record a round: the outcome, and the bytes of the file (empty unless RoundDone)."""
         with tempfile.TemporaryDirectory(prefix="datagen-") as home:
             prepare(Path(home))
             ending = attempt(replace(job, folder=Path(home)), self._report)
@@ -51,72 +51,72 @@ class Recorder:
                 return ending, b""
             return ending, (Path(home) / ending.state.file).read_bytes()
 
-    def pulse(self) -> tuple[int, int]:
-        """Signs of life so far, and frames of the present round."""
-        return self._signs, self._frames
+    def heartbeat(self) -> tuple[int, int]:
+        """Number of heartbeats so far, and frames of the current round."""
+        return self._heartbeats, self._frames
 
     def _report(self, message: FramesDone) -> None:
-        self._signs += 1
+        self._heartbeats += 1
         self._frames = message.frames
 
 
 @dataclass
-class Seat:
-    """One actor and what it is doing."""
+class ActorSlot:
+    """One actor and its current round."""
 
     actor: Any
     job: Job | None = None
     result: Any = None
-    pulse: Any = None
-    signs: int = -1
-    since: float | None = None
-    """When it was first heard of with this job; an actor may wait long for its machine."""
-    heard: float = 0.0
+    heartbeat: Any = None
+    heartbeats: int = -1
+    started: float | None = None
+    """Time of its first heartbeat with this job: an actor may wait long for a free machine."""
+    last_heartbeat: float = 0.0
 
-    def deadline(self, limits: Limits) -> float:
-        if self.job is None or self.since is None:
+    def deadline(self, timeouts: Timeouts) -> float:
+        if self.started is None:
             return float("inf")
-        return min(self.heard + limits.silence_s, self.since + limits.round_s(self.job))
+        return timeouts.deadline(self.job, self.started, self.last_heartbeat)
 
 
-class RayCrew:
-    """`size` actors (0: one a core of the cluster); the same `run` as `crew.ProcessPool`."""
+class RayPool:
+    """`size` actors (0: one for each core of the cluster), with the interface of ProcessPool."""
 
-    def __init__(self, size: int, hear: Hear, limits: Limits | None = None) -> None:
+    def __init__(self, size: int, on_message: OnMessage, timeouts: Timeouts | None = None) -> None:
         self._ray = _import_ray()
         self._size = size
-        self._hear = hear
-        self._limits = limits or Limits()
-        self._seats: list[Seat] = []
-        self._tries = Tries((), self._limits)
+        self._on_message = on_message
+        self._timeouts = timeouts or Timeouts()
+        self._slots: list[ActorSlot] = []
+        self._queue = RetryQueue((), self._timeouts)
 
     def run(self, jobs: Iterable[Job]) -> list[Failure]:
-        """Record all rounds; those that failed for good, or too often, are returned.
+        """Record all rounds; returns those that failed finally or too often.
 
-        Raises UserError without Ray's cluster, and what no round can get round.
+        Raises UserError without a Ray cluster, and errors that every round would meet.
         """
-        self._tries = Tries(jobs, self._limits)
-        if not self._tries:
+        self._queue = RetryQueue(jobs, self._timeouts)
+        if not self._queue:
             return []
         started_here = self._connect()
         try:
             size = self._size or int(self._ray.cluster_resources().get("CPU", 1))
-            for _ in range(min(size, len(self._tries))):
-                self._seats.append(self._hire())
+            for _ in range(min(size, len(self._queue))):
+                self._slots.append(self._start_worker())
             while self._assign():
-                self._gather()
-                self._feel_pulses()
-                self._end_the_stuck()
+                self._receive()
+                self._poll_heartbeats()
+                self._kill_hung_workers()
         finally:
-            for seat in self._seats:
-                self._ray.kill(seat.actor)
-            self._seats = []
+            for slot in self._slots:
+                self._ray.kill(slot.actor)
+            self._slots = []
             if started_here:
                 self._ray.shutdown()
-        return self._tries.failures
+        return self._queue.failures
 
     def _connect(self) -> bool:
-        """Join the cluster, or start one here; False when this process was in one already."""
+        """Join the cluster, or start one here; False if this process is connected already."""
         if self._ray.is_initialized():
             return False
         try:
@@ -137,90 +137,94 @@ class RayCrew:
             ) from error
         return True
 
-    def _hire(self) -> Seat:
+    def _start_worker(self) -> ActorSlot:
         recorder = self._ray.remote(
             num_cpus=1,
             max_restarts=0,
-            concurrency_groups={"watching": 1},
+            concurrency_groups={"heartbeat": 1},
             runtime_env={"env_vars": thread_limits(cpu_count() or 1)},
         )(Recorder)
-        return Seat(recorder.remote())
+        return ActorSlot(recorder.remote())
 
     def _assign(self) -> bool:
-        for seat in self._seats:
-            if seat.job is None:
-                seat.job = self._tries.take(monotonic())
-                if seat.job is None:
+        for slot in self._slots:
+            if slot.job is None:
+                slot.job = self._queue.take(monotonic())
+                if slot.job is None:
                     break
-                seat.since, seat.signs = None, -1
-                seat.result = seat.actor.record.remote(seat.job)
-        return bool(self._tries) or any(seat.job is not None for seat in self._seats)
+                slot.started, slot.heartbeats = None, -1
+                slot.result = slot.actor.record.remote(slot.job)
+        return bool(self._queue) or any(slot.job is not None for slot in self._slots)
 
-    def _gather(self) -> None:
-        busy = [seat for seat in self._seats if seat.job is not None]
-        ready, _ = self._ray.wait([s.result for s in busy], timeout=PULSE_S) if busy else ([], [])
-        for seat in busy:
-            if seat.result not in ready:
+    def _receive(self) -> None:
+        busy = [slot for slot in self._slots if slot.job is not None]
+        ready, _ = self._ray.wait([s.result for s in busy], timeout=POLL_S) if busy else ([], [])
+        for slot in busy:
+            if slot.result not in ready:
                 continue
             try:
-                ending, data = self._ray.get(seat.result)
+                ending, data = self._ray.get(slot.result)
             except self._ray.exceptions.RayError as error:
-                self._replace(seat, f"its actor ended ({_first_line(error)})")
+                self._replace(slot, f"its actor ended ({_first_line(error)})")
             else:
-                self._take(seat, ending, data)
+                self._handle(slot, ending, data)
 
-    def _take(self, seat: Seat, ending: Ending, data: bytes) -> None:
+    def _handle(self, slot: ActorSlot, ending: Outcome, data: bytes) -> None:
         if isinstance(ending, FatalError):
             raise ending.error
-        if isinstance(ending, RoundBroken):
-            self._retry(seat, ending.reason, ending.final)
+        if isinstance(ending, AttemptFailed):
+            self._retry(slot, ending.reason, ending.final)
             return
-        if seat.job is None or hashlib.sha256(data).hexdigest() != ending.state.sha256:
-            self._retry(seat, "its bytes were damaged on the way")
+        if slot.job is None or hashlib.sha256(data).hexdigest() != ending.state.sha256:
+            self._retry(slot, "its bytes were damaged in transfer")
             return
-        _publish(seat.job.folder, ending, data)
-        seat.job = None
-        self._tries.done()
-        self._hear(ending)
+        _publish(slot.job.folder, ending, data)
+        slot.job = None
+        self._queue.record_success()
+        self._on_message(ending)
 
-    def _feel_pulses(self) -> None:
-        for seat in self._seats:
-            if seat.job is None:
+    def _poll_heartbeats(self) -> None:
+        for slot in self._slots:
+            if slot.job is None:
                 continue
-            if seat.pulse is None:
-                seat.pulse = seat.actor.pulse.options(concurrency_group="watching").remote()
+            if slot.heartbeat is None:
+                slot.heartbeat = slot.actor.heartbeat.options(
+                    concurrency_group="heartbeat"
+                ).remote()
                 continue
-            if not self._ray.wait([seat.pulse], timeout=0)[0]:
+            if not self._ray.wait([slot.heartbeat], timeout=0)[0]:
                 continue
-            pulse, seat.pulse = seat.pulse, None
+            heartbeat, slot.heartbeat = slot.heartbeat, None
             try:
-                signs, frames = self._ray.get(pulse)
+                heartbeats, frames = self._ray.get(heartbeat)
             except self._ray.exceptions.RayError:
-                continue  # its result will tell
+                continue  # `_receive` handles the ended actor
             now = monotonic()
-            if seat.since is None:
-                seat.since = seat.heard = now
-            if signs != seat.signs:
-                seat.signs, seat.heard = signs, now
-                self._hear(FramesDone(seat.job.plan.id, frames))
+            if slot.started is None:
+                slot.started = slot.last_heartbeat = now
+            if heartbeats != slot.heartbeats:
+                slot.heartbeats, slot.last_heartbeat = heartbeats, now
+                self._on_message(FramesDone(slot.job.plan.id, frames))
 
-    def _end_the_stuck(self) -> None:
+    def _kill_hung_workers(self) -> None:
         now = monotonic()
-        for seat in self._seats:
-            if now >= seat.deadline(self._limits):
-                self._ray.kill(seat.actor)
-                self._replace(seat, f"nothing was heard of it for {now - seat.heard:.0f} s")
+        for slot in self._slots:
+            if now >= slot.deadline(self._timeouts):
+                self._ray.kill(slot.actor)
+                self._replace(
+                    slot, f"its actor gave no sign of life for {now - slot.last_heartbeat:.0f} s"
+                )
 
-    def _replace(self, seat: Seat, reason: str) -> None:
-        self._tries.died(reason)
-        seat.actor, seat.pulse = self._hire().actor, None
-        self._retry(seat, reason)
+    def _replace(self, slot: ActorSlot, reason: str) -> None:
+        self._queue.record_death(reason)
+        slot.actor, slot.heartbeat = self._start_worker().actor, None
+        self._retry(slot, reason)
 
-    def _retry(self, seat: Seat, reason: str, final: bool = False) -> None:
-        job, seat.job = seat.job, None
+    def _retry(self, slot: ActorSlot, reason: str, final: bool = False) -> None:
+        job, slot.job = slot.job, None
         if job is not None:
-            self._hear(FramesDone(job.plan.id, 0))
-            self._tries.failed(job, reason, monotonic(), final)
+            self._on_message(FramesDone(job.plan.id, 0))
+            self._queue.record_failure(job, reason, monotonic(), final)
 
 
 def _publish(folder: Path, done: RoundDone, data: bytes) -> None:

@@ -1,4 +1,4 @@
-"""Which rounds are to be recorded, tried again, or given up; the same for every kind of crew."""
+"""The queue of rounds to record, with retries; used by all executors."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -8,39 +8,44 @@ from datagen.recording.errors import DatasetError
 
 ATTEMPTS = 3
 DEATHS_IN_A_ROW = 12
-"""So many processes ending without one round finished between them is no accident."""
+"""After this many ended processes without a finished round between them, the collection stops."""
 
 
 @dataclass(frozen=True, slots=True)
-class Limits:
-    """How long to wait, s. Measured by a clock that nobody sets."""
+class Timeouts:
+    """Time limits in s, measured with the monotonic clock."""
 
-    silence_s: float = 300.0
-    """Without a sign of life a process is taken to hang; compiling for the first time is one."""
-    start_s: float = 600.0
+    heartbeat_s: float = 300.0
+    """A process without a message for this long is stopped as hanging. Compiling sends none."""
+    round_start_s: float = 600.0
     frame_s: float = 1.0
-    """A round may take `start_s` and this for each frame."""
-    delay_s: float = 1.0
-    """Before the second try; four times as long before the third."""
+    """A round may take `round_start_s`, and this for each frame."""
+    retry_delay_s: float = 1.0
+    """Delay before the second attempt; four times as long before the third."""
 
-    def round_s(self, job: Job) -> float:
-        return self.start_s + self.frame_s * job.plan.frames
+    def deadline(self, job: Job | None, started: float, last_heartbeat: float) -> float:
+        """When a process that records `job` is to be stopped; infinite without a job."""
+        if job is None:
+            return float("inf")
+        round_s = self.round_start_s + self.frame_s * job.plan.frames
+        return min(last_heartbeat + self.heartbeat_s, started + round_s)
 
 
 @dataclass(frozen=True, slots=True)
 class Failure:
     round_id: str
     reason: str
-    final: bool  # the same round will fail again
+    final: bool
+    """The same round would fail again."""
 
 
-class Tries:
-    """The rounds that are to do, each with the time before which it is not to be tried."""
+class RetryQueue:
+    """The rounds that wait, each with the earliest time of its next attempt."""
 
-    def __init__(self, jobs: Iterable[Job], limits: Limits) -> None:
+    def __init__(self, jobs: Iterable[Job], timeouts: Timeouts) -> None:
         self._waiting = [(0.0, job) for job in jobs]
-        self._limits = limits
-        self._tried: dict[str, int] = {}
+        self._timeouts = timeouts
+        self._attempts: dict[str, int] = {}
         self._deaths = 0
         self.failures: list[Failure] = []
 
@@ -48,7 +53,7 @@ class Tries:
         return len(self._waiting)
 
     def take(self, now: float) -> Job | None:
-        """The first round whose time has come."""
+        """Remove and return the first round that may be attempted at `now`; None without one."""
         for place, (not_before, job) in enumerate(self._waiting):
             if not_before <= now:
                 del self._waiting[place]
@@ -56,26 +61,26 @@ class Tries:
         return None
 
     def next_at(self) -> float:
-        """When the next round may be tried; infinite when none waits."""
+        """Time of the next attempt; infinite when no round waits."""
         return min((not_before for not_before, _ in self._waiting), default=float("inf"))
 
-    def done(self) -> None:
+    def record_success(self) -> None:
         self._deaths = 0
 
-    def died(self, reason: str) -> None:
-        """Raises DatasetError when processes do nothing but die."""
+    def record_death(self, reason: str) -> None:
+        """Count an ended process. Raises DatasetError at `DEATHS_IN_A_ROW` without a success."""
         self._deaths += 1
         if self._deaths >= DEATHS_IN_A_ROW:
             raise DatasetError(
-                f"{self._deaths} recording processes ended one after the other and no round was "
-                f"finished (the last one: {reason}); what was finished before can be used"
+                f"{self._deaths} recording processes ended one after the other without a finished "
+                f"round (the last one: {reason}); the rounds finished before can be used"
             )
 
-    def failed(self, job: Job, reason: str, now: float, final: bool = False) -> None:
-        """Another try later, or none when it was the last or `final`."""
-        tried = self._tried[job.plan.id] = self._tried.get(job.plan.id, 0) + 1
-        if tried < ATTEMPTS and not final:
-            delay = self._limits.delay_s * 4.0 ** (tried - 1)
+    def record_failure(self, job: Job, reason: str, now: float, final: bool = False) -> None:
+        """Schedule another attempt, or give up after `ATTEMPTS` or when `final`."""
+        attempts = self._attempts[job.plan.id] = self._attempts.get(job.plan.id, 0) + 1
+        if attempts < ATTEMPTS and not final:
+            delay = self._timeouts.retry_delay_s * 4.0 ** (attempts - 1)
             self._waiting.append((now + delay, job))
         else:
             self.failures.append(Failure(job.plan.id, reason, final))

@@ -1,1 +1,1 @@
-"""Datasets in the formats of other trainers: WebDataset and LeRobot. Images are copied bytes."""
+"""Export of datasets to WebDataset and LeRobot; encoded images are copied unchanged."""

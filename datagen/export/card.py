@@ -1,4 +1,4 @@
-"""README.md of an export: what it is, what it was made from, how to read it."""
+"""README.md of an export: contents, source dataset, and how to read it."""
 
 from datagen.export.sides import Side
 from datagen.recording.dataset import Dataset
@@ -13,9 +13,9 @@ license: mit
 of the driverview dataset `{name}`, content hash
 `{hash}`.
 `KEY.jpg` is the recorded image byte for byte (`KEY.png` where it was recorded without loss),
-`KEY.json` the labels (null: absent), the car's state and the driver's command of the same moment.
-`sample.schema.json` says unit, frame, sign and meaning of every value.
-Rounds stand on one side only; frames of one round are alike: shuffle across shards.
+`KEY.json` the labels (null: absent), the car's state and the driver's command of the same time.
+`sample.schema.json` describes unit, frame, sign and meaning of every value.
+A round is in one side of the split only. Frames of a round are similar: shuffle across shards.
 
 ```python
 import webdataset as wds
@@ -59,7 +59,7 @@ CARDS = {"webdataset": WEBDATASET, "lerobot": LEROBOT}
 
 
 def card(dataset: Dataset, parts: list[Side], kind: str, shard_size: int) -> str:
-    """Markdown with the front matter that Hugging Face reads."""
+    """Markdown with the front matter for Hugging Face."""
     counts = ", ".join(
         f"{side.name} {counted(side.frames, 'frame')} of {counted(len(side.rounds), 'round')}"
         for side in parts

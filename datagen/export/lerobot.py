@@ -1,7 +1,7 @@
 """A dataset as a LeRobotDataset v3.0: one episode a round, images embedded in parquet files.
 
-LeRobotDataset("driverview/data", root=OUT) reads it. Image bytes are copied as recorded; episodes
-stand in the order train, test, and `splits` in meta/info.json says which are which.
+Read it with LeRobotDataset("driverview/data", root=OUT). Image bytes are copied as recorded.
+Episodes are in the order train, test; `splits` in meta/info.json has the episodes of each side.
 Source of the format: github.com/huggingface/lerobot, datasets/lerobot_dataset.py and utils.py.
 """
 
@@ -15,7 +15,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from datagen.export.lerobot_features import IMAGE, Columns, columns, features, table
-from datagen.export.lerobot_stats import Histogram, Stats, of_numbers
+from datagen.export.lerobot_stats import Histogram, Stats, column_stats
 from datagen.export.sides import Progress, Side
 from datagen.recording.errors import DatasetError
 from datagen.recording.round_metadata import RoundInfo
@@ -31,7 +31,7 @@ INDEX_NAME = "__index_level_0__"
 
 
 def write(folder: Path, parts: list[Side], camera: CameraParameters, progress: Progress) -> None:
-    """Write all rounds of `parts` into `folder`; DatasetError when their rates differ."""
+    """Write all rounds of `parts` into `folder`. Raises DatasetError for different frame rates."""
     rounds = [info for side in parts for info in side.rounds]
     tasks = sorted({_task(info) for info in rounds})
     with _DataFiles(folder) as files:
@@ -51,10 +51,10 @@ def _task(info: RoundInfo) -> str:
 
 
 class _DataFiles:
-    """data/chunk-000/file-000.parquet and so on, a row group an episode, up to FILE_MB each."""
+    """Writes data/chunk-000/file-000.parquet and so on: a row group per episode, FILE_MB each."""
 
     def __init__(self, folder: Path) -> None:
-        self.place = (0, 0)  # of the chunk, and of the file in it
+        self.place = (0, 0)  # numbers of the chunk and of the file in it
         self._folder, self._bytes = folder, 0
         self._writer: pq.ParquetWriter | None = None
 
@@ -85,7 +85,7 @@ class _DataFiles:
 
 
 class _Episodes:
-    """Rounds in, one at a time; their rows of meta/episodes and the statistics of all out."""
+    """Writes rounds one at a time; collects the rows of meta/episodes and the statistics."""
 
     def __init__(self, files: _DataFiles, camera: CameraParameters, tasks: list[str]) -> None:
         self.rows: list[dict[str, Any]] = []
@@ -99,19 +99,19 @@ class _Episodes:
         if self.fps not in (0, header.frequency_hz):
             raise DatasetError(
                 f"{info.path} has {header.frequency_hz} frames a second, the rounds before it "
-                f"{self.fps}: LeRobot knows one rate; export them apart"
+                f"{self.fps}: LeRobot supports one rate a dataset; export them separately"
             )
         self.fps = header.frequency_hz
         steps = list(round_steps)
         task = self._tasks.index(_task(info))
         numbers = columns(steps, self.fps, len(self.rows), self.frames, task)
         self._files.add(table(steps, numbers, header.codec))
-        self._note(info, numbers, self._count_pixels(info, steps))
+        self._add_row(info, numbers, self._count_pixels(info, steps))
 
     def stats(self) -> dict[str, Stats]:
         names = self._numbers[0]
         whole = {name: np.concatenate([part[name] for part in self._numbers]) for name in names}
-        return {IMAGE: self._pixels.stats(), **of_numbers(whole)}
+        return {IMAGE: self._pixels.stats(), **column_stats(whole)}
 
     def _count_pixels(self, info: RoundInfo, steps: list[Step]) -> Stats:
         try:
@@ -124,10 +124,10 @@ class _Episodes:
         self._pixels.add(pixels)
         return pixels.stats()
 
-    def _note(self, info: RoundInfo, numbers: Columns, pixels: Stats) -> None:
+    def _add_row(self, info: RoundInfo, numbers: Columns, pixels: Stats) -> None:
         chunk, file = self._files.place
         count = len(numbers["index"])
-        stats = {IMAGE: pixels, **of_numbers(numbers)}
+        stats = {IMAGE: pixels, **column_stats(numbers)}
         self.rows.append(
             {
                 "episode_index": len(self.rows),

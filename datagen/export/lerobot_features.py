@@ -1,4 +1,4 @@
-"""What a LeRobot export holds of each frame, and how it stands in its parquet files.
+"""Features of a LeRobot export, and their columns in its parquet files.
 
 Source: LeRobotDataset v3.0, github.com/huggingface/lerobot. Vectors are float32; an absent distance
 is NaN, as lists of its tensors hold no nulls. Units and signs are those of the recording.
@@ -55,7 +55,7 @@ def features(camera: CameraParameters) -> dict[str, Any]:
 
 
 def columns(steps: Sequence[Step], fps: int, episode: int, first: int, task: int) -> Columns:
-    """The numbers of an episode, one row a frame; `first` is the number of its first frame."""
+    """Numbers of an episode, one row per frame; `first` is the index of its first frame."""
     rows = [_row(step) for step in steps]
     found: Columns = {
         name: np.array([[row[part] for part in parts] for row in rows], np.float32)
@@ -70,13 +70,13 @@ def columns(steps: Sequence[Step], fps: int, episode: int, first: int, task: int
 
 
 def _row(step: Step) -> dict[str, Any]:
-    """Every number of a frame by name; absent ones None, which becomes NaN."""
+    """Numbers of a frame by name; absent ones are None, which becomes NaN."""
     row = values(step.labels) | values(step.ego) | values(step.command)
     return row | {"heading": step.labels.heading}
 
 
 def table(steps: Sequence[Step], numbers: Columns, codec: str) -> pa.Table:
-    """An episode as it stands in data/."""
+    """Rows of an episode for the files in data/."""
     images = pa.StructArray.from_arrays(
         [
             pa.array([bytes(step.image) for step in steps], pa.binary()),
@@ -91,13 +91,13 @@ def table(steps: Sequence[Step], numbers: Columns, codec: str) -> pa.Table:
 def _array(column: NDArray[Any]) -> pa.Array:
     if column.ndim == 1:
         return pa.array(column)
-    if column.shape[1] == 1:  # a vector of one is a plain number there
+    if column.shape[1] == 1:  # LeRobot stores vectors of length 1 as numbers
         return pa.array(column[:, 0])
     return pa.FixedSizeListArray.from_arrays(pa.array(column.ravel()), column.shape[1])
 
 
 def _hugging_face() -> str:
-    """What tells the library `datasets` that the images are images."""
+    """Metadata by which the library `datasets` decodes the image column."""
     types: dict[str, Any] = {IMAGE: {"_type": "Image"}}
     for name, parts in VECTORS.items():
         number = {"dtype": "float32", "_type": "Value"}

@@ -1,7 +1,7 @@
-"""The statistics that LeRobot normalises with: of each episode, and of all.
+"""Statistics by which LeRobot normalises: of each episode, and of the whole dataset.
 
-Those of numbers leave absent ones out (a column without any has zeros). Those of images come from
-the histogram of every channel over frames spread over the episode, in [0, 1], shaped (3, 1, 1).
+Statistics of numbers skip absent values (zeros for a column without values). Those of images are
+from histograms of each channel over frames spread over the episode: in [0, 1], shape (3, 1, 1).
 """
 
 from collections.abc import Mapping, Sequence
@@ -22,19 +22,19 @@ MOST_IMAGES = 100
 Stats = dict[str, list[Any]]
 
 
-def of_numbers(columns: Mapping[str, NDArray[Any]]) -> dict[str, Stats]:
-    """Of each column, (N,) or (N, k): lists of k values."""
-    return {name: _of_column(column) for name, column in columns.items()}
+def column_stats(columns: Mapping[str, NDArray[Any]]) -> dict[str, Stats]:
+    """Statistics of each column, (N,) or (N, k), as lists of k values."""
+    return {name: _stats_of_column(column) for name, column in columns.items()}
 
 
-def _of_column(column: NDArray[Any]) -> Stats:
+def _stats_of_column(column: NDArray[Any]) -> Stats:
     rows = column.reshape(len(column), -1).astype(np.float64)
-    parts = [_of_values(values[~np.isnan(values)]) for values in rows.T]
+    parts = [_stats_of_values(values[~np.isnan(values)]) for values in rows.T]
     lists = {name: [part[name] for part in parts] for name in parts[0]}
     return {**lists, "count": [len(column)]}
 
 
-def _of_values(values: NDArray[np.float64]) -> dict[str, float]:
+def _stats_of_values(values: NDArray[np.float64]) -> dict[str, float]:
     present = values if values.size else np.zeros(1)
     quantiles = np.quantile(present, list(QUANTILES.values()))
     return {
@@ -47,7 +47,7 @@ def _of_values(values: NDArray[np.float64]) -> dict[str, float]:
 
 
 class Histogram:
-    """How often each level, 0 to 255, of each channel was seen."""
+    """Counts of each level, 0 to 255, of each channel."""
 
     def __init__(self) -> None:
         self.images = 0
@@ -55,7 +55,7 @@ class Histogram:
 
     @staticmethod
     def of(steps: Sequence[Step], camera: CameraParameters) -> "Histogram":
-        """Raises ValueError where an image cannot be decoded."""
+        """Count the pixels of an episode. Raises ValueError for an image that cannot be decoded."""
         found = Histogram()
         image = np.empty((camera.height, camera.width, 3), np.uint8)
         chosen = np.linspace(0, len(steps) - 1, min(len(steps), MOST_IMAGES)).astype(int)
@@ -71,12 +71,12 @@ class Histogram:
         self.counts += other.counts
 
     def stats(self) -> Stats:
-        parts = [_of_levels(channel) for channel in self.counts]
+        parts = [_stats_of_levels(channel) for channel in self.counts]
         shaped = {name: [[[part[name]]] for part in parts] for name in parts[0]}
         return {**shaped, "count": [self.images]}
 
 
-def _of_levels(counts: NDArray[np.int64]) -> dict[str, float]:
+def _stats_of_levels(counts: NDArray[np.int64]) -> dict[str, float]:
     levels = np.arange(LEVELS) / (LEVELS - 1)
     seen, total = levels[counts > 0], counts.sum()
     mean = float(levels @ counts / total)

@@ -1,4 +1,4 @@
-"""One export: chosen rounds of a dataset, in one format, into a folder that was not there."""
+"""Exports chosen rounds of a dataset in one format into a new folder."""
 
 from dataclasses import asdict, dataclass
 from importlib.util import find_spec
@@ -17,7 +17,7 @@ FORMATS = ("webdataset", "lerobot")
 
 @dataclass(frozen=True, slots=True)
 class ExportConfig:
-    """What to export, and how."""
+    """Options of an export."""
 
     format: str
     split: str = "all"
@@ -27,14 +27,14 @@ class ExportConfig:
     shuffle: bool = False
     """Put WebDataset's frames in random order, the same each time."""
 
-    def require_sane(self) -> None:
-        """Raise UserError where it cannot be done, before anything is read."""
+    def validate(self) -> None:
+        """Raise UserError for options that cannot be met, before anything is read."""
         if self.format not in FORMATS:
             raise UserError(f"there is no format {self.format!r}; choose {' or '.join(FORMATS)}")
         if self.shard_size < 1:
-            raise UserError(f"a shard of {self.shard_size} frames holds none; give at least 1")
+            raise UserError(f"--shard-size is {self.shard_size}; give at least 1 frame")
         if self.format == "lerobot" and self.shuffle:
-            raise UserError("LeRobot's episodes are in order of time; leave --shuffle away")
+            raise UserError("LeRobot's episodes are in order of time; leave out --shuffle")
         if self.format == "lerobot" and find_spec("pyarrow") is None:
             raise UserError(
                 "LeRobot's format needs pyarrow, which is not installed; "
@@ -43,8 +43,8 @@ class ExportConfig:
 
 
 @dataclass(frozen=True, slots=True)
-class Exported:
-    """`content_hash` is that of the dataset it was made from."""
+class ExportResult:
+    """Result of an export; `content_hash` is that of the source dataset."""
 
     format: str
     out: str
@@ -58,20 +58,20 @@ class Exported:
         return asdict(self)
 
 
-def export(folder: Path, out: Path, wanted: ExportConfig, progress: Progress) -> Exported:
-    """Write the export. Raises UserError (DatasetError) or OSError; `out` is then not there."""
-    wanted.require_sane()
+def export(folder: Path, out: Path, config: ExportConfig, progress: Progress) -> ExportResult:
+    """Write the export. Raises UserError (DatasetError) or OSError; `out` then does not exist."""
+    config.validate()
     require_free(out)
     dataset = Dataset.open(folder)
-    parts = sides(dataset, wanted.split)
+    parts = sides(dataset, config.split)
     with new_folder(out) as partial:
-        _write(partial, dataset, parts, wanted, progress)
-        about = card(dataset, parts, wanted.format, wanted.shard_size)
+        _write(partial, dataset, parts, config, progress)
+        about = card(dataset, parts, config.format, config.shard_size)
         (partial / "README.md").write_text(about, encoding="utf-8")
         files = [path for path in partial.rglob("*") if path.is_file()]
         size = sum(path.stat().st_size for path in files)
-    return Exported(
-        format=wanted.format,
+    return ExportResult(
+        format=config.format,
         out=str(out),
         rounds=sum(len(side.rounds) for side in parts),
         frames=sum(side.frames for side in parts),
@@ -82,10 +82,10 @@ def export(folder: Path, out: Path, wanted: ExportConfig, progress: Progress) ->
 
 
 def _write(
-    partial: Path, dataset: Dataset, parts: list[Side], wanted: ExportConfig, progress: Progress
+    partial: Path, dataset: Dataset, parts: list[Side], config: ExportConfig, progress: Progress
 ) -> None:
-    if wanted.format == "webdataset":
-        webdataset.write(partial, parts, wanted.shard_size, wanted.shuffle, progress)
+    if config.format == "webdataset":
+        webdataset.write(partial, parts, config.shard_size, config.shuffle, progress)
         return
     from datagen.export import lerobot
 

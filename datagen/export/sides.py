@@ -1,4 +1,4 @@
-"""Which rounds an export takes, and in which order: train rounds first, then test, then others."""
+"""Rounds of an export in order: train, test, unseen, then those without a side."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -9,15 +9,15 @@ from datagen.recording.splits import SIDES
 from datagen.view.steps import Steps
 
 Progress = Callable[[int], None]
-"""Hears how many frames are written."""
+"""Called with the number of frames written so far."""
 
 NO_SIDE = "unsplit"
-"""What rounds are called that the split gives to no side."""
+"""Name for the rounds that are in no side of the split."""
 
 
 @dataclass(frozen=True, slots=True)
 class Side:
-    """The rounds of one side of the split, in order of their names."""
+    """Rounds of one side of the split, sorted by name."""
 
     name: str
     rounds: tuple[RoundInfo, ...]
@@ -27,14 +27,14 @@ class Side:
         return sum(info.frames for info in self.rounds)
 
     def open(self) -> Iterator[tuple[RoundInfo, Steps]]:
-        """Each round, opened when its turn comes."""
+        """Yield each round, opened when it is reached."""
         for info in self.rounds:
             yield info, Steps.open(info.path)
 
 
-def sides(dataset: Dataset, wanted: str) -> list[Side]:
-    """Sides that have rounds, of `wanted`: one of them or all; DatasetError when there are none."""
-    chosen = dataset.select(wanted).rounds
+def sides(dataset: Dataset, split: str) -> list[Side]:
+    """Sides of `split` (a side or "all") with rounds. Raises DatasetError if there are none."""
+    chosen = dataset.select(split).rounds
     found = [
         Side(name or NO_SIDE, tuple(info for info in chosen if info.split == name))
         for name in (*SIDES, "")

@@ -1,7 +1,7 @@
-"""The folder that an export goes to: whole or not at all.
+"""The output folder of an export, written atomically.
 
-It is written beside its place, as `.NAME.partial`, and renamed when complete: a killed export never
-looks like one, and the next clears what it left.
+It is written as `.NAME.partial` beside the target and renamed when complete, so that a killed
+export is never taken for a complete one. The next export deletes what is left of it.
 """
 
 import fcntl
@@ -17,16 +17,16 @@ from trackfeatures.errors import UserError
 
 @contextmanager
 def new_folder(target: Path) -> Iterator[Path]:
-    """A folder to write to that becomes `target` when the block ends without an error.
+    """Yield a folder to write to, which becomes `target` when the block ends without an error.
 
-    Raises UserError where `target` holds something, or another export is writing to it.
+    Raises UserError if `target` is not empty or another export is writing to it.
     """
     require_free(target)
     partial = target.with_name(f".{target.name}.partial")
     partial.mkdir(parents=True, exist_ok=True)
     descriptor = os.open(partial, os.O_RDONLY | os.O_CLOEXEC)
     try:
-        _own(descriptor, partial, target)
+        _lock(descriptor, partial, target)
         try:
             _clear(partial)
             yield partial
@@ -40,21 +40,21 @@ def new_folder(target: Path) -> Iterator[Path]:
 
 
 def require_free(target: Path) -> None:
-    """Raise UserError unless `target` is not there yet, or is an empty folder."""
+    """Raise UserError unless `target` does not exist or is an empty folder."""
     if not target.name or (target.exists() and not target.is_dir()):
         raise UserError(f"{target} is no folder to write to; give another --out")
     if target.is_dir() and any(target.iterdir()):
         raise UserError(f"{target} is not empty; remove it or give another --out")
 
 
-def _own(descriptor: int, partial: Path, target: Path) -> None:
-    """The lock ends with the process; a folder renamed meanwhile is another's finished export."""
+def _lock(descriptor: int, partial: Path, target: Path) -> None:
+    """Lock the folder until this process ends. If another export has renamed it, it is not ours."""
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        mine = partial.exists() and partial.stat().st_ino == os.fstat(descriptor).st_ino
+        is_ours = partial.exists() and partial.stat().st_ino == os.fstat(descriptor).st_ino
     except BlockingIOError:
-        mine = False
-    if not mine:
+        is_ours = False
+    if not is_ours:
         raise UserError(f"another `datagen export` is writing to {target}; give another --out")
 
 

@@ -1,7 +1,7 @@
 """A dataset as WebDataset shards: `train-000000.tar` and so on, two files a frame.
 
-KEY.jpg is the recorded image, byte for byte (KEY.png in rounds recorded so), KEY.json what is true
-at that moment; `sample.schema.json` beside the shards says unit, frame and meaning of each value.
+KEY.jpg is the recorded image, byte for byte (KEY.png in lossless rounds), KEY.json the truth of the
+frame; `sample.schema.json` beside the shards describes unit, frame and meaning of each value.
 The same dataset gives the same bytes. Source: github.com/webdataset/webdataset.
 """
 
@@ -57,14 +57,14 @@ def _samples(side: Side, shuffle: bool) -> Iterator[tuple[RoundInfo, Step, str]]
 
 
 def _add_sample(shard: tarfile.TarFile, info: RoundInfo, step: Step, codec: str) -> None:
-    # A key ends at its first dot, so it may hold none.
+    # WebDataset ends a key at the first dot.
     key = f"{info.path.stem.replace('.', '_')}-{step.number:06d}"
     _add(shard, f"{key}.{SUFFIX[codec]}", bytes(step.image))
     _add(shard, f"{key}.json", json.dumps(sample(info, step)).encode())
 
 
 def sample(info: RoundInfo, step: Step) -> dict[str, Any]:
-    """What KEY.json holds; absent distances are null."""
+    """Content of KEY.json; absent distances are null."""
     return {
         "round": info.id,
         "frame": step.number,
@@ -79,13 +79,13 @@ def sample(info: RoundInfo, step: Step) -> dict[str, Any]:
 
 
 def _add(shard: tarfile.TarFile, name: str, data: bytes) -> None:
-    entry = tarfile.TarInfo(name)  # its time, owner and mode are constants
+    entry = tarfile.TarInfo(name)  # time, owner and mode keep their constant defaults
     entry.size = len(data)
     shard.addfile(entry, io.BytesIO(data))
 
 
 def sample_schema() -> dict[str, Any]:
-    """The JSON schema of KEY.json: the messages' own, null where they are unset."""
+    """JSON schema of KEY.json: that of the messages, with null for absent fields."""
     recorded = json_schema()
     text, count = {"type": "string"}, {"type": "integer", "minimum": 0}
     parts = {

@@ -1,6 +1,6 @@
-"""One round from its plan to its place in a dataset folder: there whole and checked, or not at all.
+"""Records one round into a dataset folder, checked and atomically; and the recording process.
 
-The same for a process of this machine and for one of a Ray cluster.
+Used by the processes on this machine and by Ray actors.
 """
 
 import ctypes
@@ -29,10 +29,13 @@ from datagen.recording.mcap.index import open_round
 from trackfeatures.errors import UserError
 
 REPORT_EVERY = 10  # frames
+PR_SET_PDEATHSIG = 1  # <linux/prctl.h>
 
 
 @dataclass(frozen=True, slots=True)
 class Job:
+    """A round to record, and where."""
+
     plan: RoundPlan
     plan_hash: str
     folder: Path
@@ -41,7 +44,7 @@ class Job:
 
 @dataclass(frozen=True, slots=True)
 class FramesDone:
-    """So far; sent at least at every step of the work, as a sign of life."""
+    """Frames recorded so far; also a heartbeat."""
 
     round_id: str
     frames: int
@@ -49,13 +52,15 @@ class FramesDone:
 
 @dataclass(frozen=True, slots=True)
 class RoundDone:
+    """The round is in the dataset folder."""
+
     state: RoundState
     resets: int
 
 
 @dataclass(frozen=True, slots=True)
-class RoundBroken:
-    """This round failed; the others may do better, and so may another try, unless `final`."""
+class AttemptFailed:
+    """This attempt failed. Another may succeed, unless `final`; other rounds are not affected."""
 
     round_id: str
     reason: str
@@ -64,34 +69,34 @@ class RoundBroken:
 
 @dataclass(frozen=True, slots=True)
 class FatalError:
-    """The user's or the machine's mistake, which every round would meet: `error` is raised."""
+    """An error that every round would meet, such as a full disk: the collection raises it."""
 
     error: UserError | OSError
 
 
-Ending = RoundDone | RoundBroken | FatalError
-Message = FramesDone | Ending
+Outcome = RoundDone | AttemptFailed | FatalError
+Message = FramesDone | Outcome
 Report = Callable[[FramesDone], None]
 
 
-def attempt(job: Job, report: Report) -> Ending:
-    """Try to record a round; what went wrong is in the answer. BrokenPipeError is for `report`."""
+def attempt(job: Job, report: Report) -> Outcome:
+    """Try to record a round and return the outcome. BrokenPipeError comes from `report` only."""
     try:
         return record_and_publish(job, report)
     except BrokenPipeError:
         raise
     except RoundFailed as error:
-        return RoundBroken(job.plan.id, str(error), final=True)
+        return AttemptFailed(job.plan.id, str(error), final=True)
     except (UserError, OSError) as error:
         return FatalError(_portable(error, job.folder))
-    except Exception as error:  # noqa: BLE001  # whatever it is costs this round, not the others
+    except Exception as error:  # noqa: BLE001  # any other error fails this round only
         traceback.print_exc()
-        return RoundBroken(job.plan.id, f"{type(error).__name__}: {error}")
+        return AttemptFailed(job.plan.id, f"{type(error).__name__}: {error}")
 
 
 def record_and_publish(job: Job, report: Report = lambda message: None) -> RoundDone:
-    """Record one round into its dataset folder: afterwards it is there, checked, or not at all."""
-    # Only here: the parent loads this module too, and needs neither physics nor graphics.
+    """Record one round, check the file, and move it into the dataset folder."""
+    # Imported here: the parent process imports this module and needs no physics or graphics.
     from datagen.recorder.record import record_round
 
     def progress(frames: int) -> None:
@@ -102,15 +107,15 @@ def record_and_publish(job: Job, report: Report = lambda message: None) -> Round
     try:
         record_round(job.plan, job.plan_hash, partial, job.tracks_dir, progress)
         report(FramesDone(job.plan.id, job.plan.frames))
-        state, resets = _checked(job.plan.id, partial)
+        state, resets = _check_recorded(job.plan.id, partial)
         publish(job.folder, partial, state)
     finally:
         discard_partial(job.folder, job.plan.id)
     return RoundDone(state, resets)
 
 
-def _checked(round_id: str, partial: Path) -> tuple[RoundState, int]:
-    """The state of a file that is what was written, and how often its car was put back."""
+def _check_recorded(round_id: str, partial: Path) -> tuple[RoundState, int]:
+    """State of the recorded file, and number of resets. Raises RuntimeError for a damaged one."""
     index = open_round(partial)
     state = RoundState(
         id=round_id,
@@ -123,36 +128,33 @@ def _checked(round_id: str, partial: Path) -> tuple[RoundState, int]:
     )
     _, problems = check_round(partial, "full", state)
     if problems:
-        raise RuntimeError(f"read back, it is not what was written: {problems[0]}")
+        raise RuntimeError(f"the recorded file is damaged: {problems[0]}")
     return state, index.result.resets
 
 
 def _portable(error: UserError | OSError, folder: Path) -> UserError | OSError:
-    """The same error, sure to survive the way to another process, and to say where it was."""
+    """The same error in a form that can be pickled, with the path where it happened."""
     if isinstance(error, OSError):
         where = error.filename or str(folder)
         return OSError(error.errno or 0, error.strerror or str(error), where)
     return UserError(str(error))
 
 
-# A recording process: takes rounds from its parent, one after the other, until told to stop. It
-# lives across rounds because compiled code and the graphics context cost seconds to set up.
+def worker_main(connection: Connection, parent: int) -> None:
+    """Main function of a recording process: records the rounds that come over `connection`.
 
-
-PR_SET_PDEATHSIG = 1  # <linux/prctl.h>
-
-
-def work(connection: Connection, parent: int) -> None:
-    """Main function of the process; `parent` is the process that it works for."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the parent, which decides
-    die_with(parent)
-    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # stdout belongs to the result
+    `parent` is the process id of the collector. One process records many rounds, because compiled
+    code and the graphics context take seconds to set up.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C
+    exit_with_parent(parent)
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # stdout is for the result only
     warm_up()
     while True:
         try:
             job: Job | None = connection.recv()
         except EOFError:
-            return  # the parent is gone
+            return  # the parent has ended
         if job is None:
             return
         try:
@@ -161,8 +163,8 @@ def work(connection: Connection, parent: int) -> None:
             return
 
 
-def die_with(parent: int) -> None:
-    """No round goes on when its collector was killed: the next one may be recording it already."""
+def exit_with_parent(parent: int) -> None:
+    """Make this process end with its collector: another one may be recording the round already."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
     if os.getppid() != parent:
@@ -170,14 +172,14 @@ def die_with(parent: int) -> None:
 
 
 def warm_up() -> None:
-    """Load what takes long to load."""
-    with _silence():
+    """Import the modules that take long to load."""
+    with _stderr_silenced():
         import_module("simulator.world.physics")
 
 
 @contextmanager
-def _silence() -> Iterator[None]:
-    """PyBullet greets on stderr when it is loaded: the user has no use for that."""
+def _stderr_silenced() -> Iterator[None]:
+    """Hide PyBullet's greeting, which it prints to stderr when it is imported."""
     kept = os.dup(2)
     nothing = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nothing, 2)

@@ -1,4 +1,4 @@
-"""Recording one round: drive, look, measure, write. A pure function of the round's plan entry."""
+"""Records one round: simulate, render, measure, write. A pure function of its plan entry."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -29,21 +29,21 @@ from simulator.track.road import Road
 from simulator.vehicle.state import CarState, Command
 from simulator.world.world import World
 
-ANNOTATED_M = 60.0
-SCENE_STEP_M = 4.0
+MARKING_LENGTH_M = 60.0  # of the markings drawn into an image
+TRACK_LINE_STEP_M = 4.0
 WHEELS = ("front_left", "front_right", "rear_left", "rear_right")
 NOT_RECORDED = ("range_traffic",)
-MOST_RESETS = 20  # a control step of each frame: rounds of fewer frames a second drive for longer
-# Steps are simulated, then drawn, then written, so many at a time: the driver needs no picture, and
-# code that is run again at once is twice as fast as code that waits for a picture in between.
-BATCH = 20
-MOST_SCENES = BATCH  # kept ready by the camera, so that none is built twice for one batch
-SCENERIES_APART = 2**40  # between the seeds of a round's sceneries: beyond the seed of any round
+MAX_RESETS = 20  # times control steps per frame: at low frame rates a round is a longer drive
+# Frames are simulated, rendered and written in batches: the driver needs no image, and simulation
+# is twice as fast without rendering in between.
+BATCH_FRAMES = 20
+CACHED_SCENES = BATCH_FRAMES  # scenes kept by the camera: none is built twice in a batch
+SCENERY_SEED_STRIDE = 2**40  # between the seeds of a round's sceneries: above all round seeds
 
 
 @dataclass
 class RoundSimulation:
-    """The state of a round while it is driven."""
+    """State of a round during its simulation."""
 
     plan: RoundPlan
     world: World
@@ -62,16 +62,20 @@ class RoundSimulation:
         self._start(start, self.driver.offset_at(0.0))
 
     def scenery_at(self, frame: int) -> tuple[int, Light]:
-        """Seed and light of what stands round the car at a frame."""
+        """Seed of the scenery, and light, at a frame."""
         return self.sceneries[
             frame // (self.plan.stretch or self.plan.frames) % len(self.sceneries)
         ]
 
     def command(self) -> Command:
+        """The driver's command for the next control step."""
         return self.driver.command(self.state, self.world.traffic, self.driven_m)
 
     def step(self, command: Command) -> None:
-        """One control step; a car that hits something or leaves the road is put back on it."""
+        """One control step. After a collision or off the road, the car is reset onto the road.
+
+        Raises RoundFailed after too many resets.
+        """
         self.steps += 1
         self.speed_sum += max(self.state.speed, 0.0)
         lap = self.state.lap
@@ -80,7 +84,7 @@ class RoundSimulation:
         self.laps += self.state.lap - lap
         if self.state.collision or self.state.off_track or self.state.backwards:
             self.resets += 1
-            if self.resets > MOST_RESETS * self.plan.steps_per_frame:
+            if self.resets > MAX_RESETS * self.plan.steps_per_frame:
                 raise RoundFailed(
                     f"the car hit something or left the road {self.resets} times on "
                     f"{self.plan.track}, {self.plan.lanes} lanes, {self.plan.speed_kmh:.0f} km/h"
@@ -90,7 +94,7 @@ class RoundSimulation:
 
     def _start(self, s: float, to_middle: float) -> None:
         self.state = self.world.reset(
-            seed=self.plan.seed,  # never a neighbour's: it may stand on the split's other side
+            seed=self.plan.seed,  # no other round's seed: it may be on the other side of the split
             s=s,
             to_middle=to_middle,
             speed=self.driver.speed_at(s),
@@ -99,7 +103,7 @@ class RoundSimulation:
 
 @dataclass(frozen=True, slots=True)
 class FrameTruth:
-    """A frame whose picture has not been taken yet."""
+    """Truth of a frame, before its image is rendered."""
 
     scenery: tuple[int, Light]
     pose: NDArray[np.float64]
@@ -111,12 +115,12 @@ class FrameTruth:
     sensors: SensorReadings
     markings: tuple[NDArray[np.float64], ...]
 
-    def picture(self, camera: Camera) -> NDArray[np.uint8]:
-        """What the camera sees, (height, width, 3)."""
+    def render(self, camera: Camera) -> NDArray[np.uint8]:
+        """The camera image, (height, width, 3) RGB."""
         camera.change_scene(*self.scenery)
         return camera.render(self.pose, self.traffic)
 
-    def seen(self, image: NDArray[np.uint8]) -> Frame:
+    def with_image(self, image: NDArray[np.uint8]) -> Frame:
         return Frame(
             image=image,
             features=self.features,
@@ -136,50 +140,53 @@ def record_round(
     tracks_dir: Path | None,
     progress: Callable[[int], None] = lambda frames: None,
 ) -> None:
-    """Drive the round and write it to `path`; `progress` hears how many frames are done."""
-    with scene_of(plan, tracks_dir) as (drive, camera):
-        header = _header(plan, plan_hash, drive.world.road)
-        with RoundWriter(path, header, scene_lines(drive.world.road)) as writer:
+    """Record the round to `path`; `progress` is called with the number of frames written."""
+    with open_simulation(plan, tracks_dir) as (simulation, camera):
+        road = simulation.world.road
+        header = _header(plan, plan_hash, road)
+        with RoundWriter(path, header, track_lines(road)) as writer:
             done = count(1)
-            for moments in moments_of(drive, camera):
-                images = [moment.picture(camera) for moment in moments]
-                for moment, image in zip(moments, images, strict=True):
-                    writer.add(moment.seen(image))
+            for batch in simulate(simulation, camera):
+                images = [truth.render(camera) for truth in batch]
+                for truth, image in zip(batch, images, strict=True):
+                    writer.add(truth.with_image(image))
                     progress(next(done))
             writer.finish(
-                laps=drive.laps,
-                resets=drive.resets,
-                distance_m=round(drive.driven_m, 3),
-                mean_speed_kmh=round(3.6 * drive.speed_sum / drive.steps, 3),
+                laps=simulation.laps,
+                resets=simulation.resets,
+                distance_m=round(simulation.driven_m, 3),
+                mean_speed_kmh=round(3.6 * simulation.speed_sum / simulation.steps, 3),
             )
 
 
-def moments_of(drive: RoundSimulation, camera: Camera) -> Iterator[list[FrameTruth]]:
-    """All moments of a round from its beginning, some at a time."""
+def simulate(simulation: RoundSimulation, camera: Camera) -> Iterator[list[FrameTruth]]:
+    """Simulate all frames of a round; yields them in batches of `BATCH_FRAMES`."""
     suite = SensorSuite([s for s in STANDARD if s.name not in NOT_RECORDED])
-    frames = drive.plan.frames
-    for start in range(0, frames, BATCH):
-        batch = range(start, min(start + BATCH, frames))
-        yield [_next_moment(drive, camera, suite, drive.scenery_at(frame)) for frame in batch]
+    frames = simulation.plan.frames
+    for start in range(0, frames, BATCH_FRAMES):
+        batch = range(start, min(start + BATCH_FRAMES, frames))
+        yield [_next_frame(simulation, camera, suite, frame) for frame in batch]
 
 
 def scenery(plan: RoundPlan, number: int) -> tuple[int, Light]:
-    """Seed and light of a round's scene, number 0 the first: no other round's."""
+    """Seed and light of scene `number` (from 0) of a round; no two rounds share one."""
     rng = np.random.default_rng([plan.seed, 2, number])
-    return plan.seed + number * SCENERIES_APART, Light.named(plan.lights[number], rng)
+    return plan.seed + number * SCENERY_SEED_STRIDE, Light.named(plan.lights[number], rng)
 
 
 @lru_cache(maxsize=16)
 def _track(name: str, tracks_dir: Path | None) -> Track:
-    """Read once a process: a TORCS file takes a third of a second."""
+    """Read a track once per process: a TORCS file takes a third of a second."""
     return find_track(name, tracks_dir)
 
 
 @contextmanager
-def scene_of(plan: RoundPlan, tracks_dir: Path | None) -> Iterator[tuple[RoundSimulation, Camera]]:
-    """The world of a round with its driver at the start, and the camera that looks at it.
+def open_simulation(
+    plan: RoundPlan, tracks_dir: Path | None
+) -> Iterator[tuple[RoundSimulation, Camera]]:
+    """Create the simulation of a round at its start, and its camera.
 
-    Raises UserError when a track is not there or not the one of the plan, or nothing can draw.
+    Raises UserError for a track that is missing or changed, and without a renderer.
     """
     track = _track(plan.track, tracks_dir)
     if track.content_hash != plan.track_hash:
@@ -195,7 +202,7 @@ def scene_of(plan: RoundPlan, tracks_dir: Path | None) -> Iterator[tuple[RoundSi
     seed, light = scenery(plan, 0)
     with (
         World(road, traffic=plan.traffic, frequency_hz=control_hz) as world,
-        Camera(road, plan.camera, seed=seed, light=light, scenes=MOST_SCENES) as camera,
+        Camera(road, plan.camera, seed=seed, light=light, scenes=CACHED_SCENES) as camera,
     ):
         driver = ScriptedDriver(road, course, speed, control_hz)
         yield RoundSimulation(plan, world, driver), camera
@@ -223,14 +230,15 @@ def _header(plan: RoundPlan, plan_hash: str, road: Road) -> RoundHeader:
     )
 
 
-def _next_moment(
-    drive: RoundSimulation, camera: Camera, suite: SensorSuite, scene: tuple[int, Light]
+def _next_frame(
+    simulation: RoundSimulation, camera: Camera, suite: SensorSuite, number: int
 ) -> FrameTruth:
-    """Everything true now and the command that is given; then the car goes on to the next."""
+    """Truth and command of frame `number`; afterwards the simulation is at the next frame."""
+    scene = simulation.scenery_at(number)
     camera.change_scene(*scene)
-    world, now = drive.world, drive.state
-    road, pose, command = world.road, world.body_pose(), drive.command()
-    moment = FrameTruth(
+    world, now = simulation.world, simulation.state
+    road, pose, command = world.road, world.body_pose(), simulation.command()
+    truth = FrameTruth(
         scenery=scene,
         pose=pose,
         traffic=world.traffic.poses(),
@@ -256,12 +264,12 @@ def _next_moment(
         ),
         command=DriverCommand(command.steer, command.throttle, command.brake, command.gear),
         sensors=_readings(suite.read(world)),
-        markings=tuple(marking_polylines(camera, road, (now.s, pose), ANNOTATED_M)),
+        markings=tuple(marking_polylines(camera, road, (now.s, pose), MARKING_LENGTH_M)),
     )
-    drive.step(command)
-    for _ in range(drive.plan.steps_per_frame - 1):
-        drive.step(drive.command())
-    return moment
+    simulation.step(command)
+    for _ in range(simulation.plan.steps_per_frame - 1):
+        simulation.step(simulation.command())
+    return truth
 
 
 def _readings(read: dict[str, Any]) -> SensorReadings:
@@ -278,9 +286,9 @@ def _readings(read: dict[str, Any]) -> SensorReadings:
     )
 
 
-def scene_lines(road: Road) -> dict[str, NDArray[np.float64]]:
-    """The markings and both edges of the asphalt all the way round, (N, 3) m each."""
-    count = int(np.ceil(road.track.length_m / SCENE_STEP_M))
+def track_lines(road: Road) -> dict[str, NDArray[np.float64]]:
+    """Markings and both edges of the asphalt along the whole lap by name, (N, 3) m each."""
+    count = int(np.ceil(road.track.length_m / TRACK_LINE_STEP_M))
     s = np.linspace(0.0, road.track.length_m, count + 1)
     places = {f"marking {i}": y for i, y in enumerate(road.markings_y.tolist())}
     places |= {"left edge": road.half_asphalt, "right edge": -road.half_asphalt}

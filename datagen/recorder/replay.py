@@ -1,4 +1,4 @@
-"""Simulating recorded rounds again: what is recorded must come out of the plan once more.
+"""Simulates recorded rounds again from their plan and compares the result with the files.
 
 datagen verify datasets/default --replay 3
 """
@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 import trackfeatures as tf
-from datagen.execution.collect import PLAN
+from datagen.execution.collect import PLAN_FILE
 from datagen.planning.plan import RoundPlan, program
-from datagen.recorder.record import moments_of, scene_of
+from datagen.recorder.record import open_simulation, simulate
 from datagen.recording.dataset import IMAGE_DATA
 from datagen.recording.errors import DatasetError
 from datagen.recording.folder import read_states, round_path
@@ -24,7 +24,8 @@ from datagen.recording.schema import messages, topics
 
 NO_IMAGE: NDArray[np.uint8] = np.zeros((0, 0, 3), np.uint8)
 
-Seen = Callable[[str], None]
+OnReplayed = Callable[[str], None]
+"""Called with the id of each replayed round."""
 
 
 def replay(
@@ -32,12 +33,12 @@ def replay(
     count: int,
     tracks_dir: Path | None = None,
     pixels: bool = False,
-    seen: Seen = lambda name: None,
+    on_replayed: OnReplayed = lambda name: None,
 ) -> tuple[list[str], list[str]]:
-    """Simulate up to `count` rounds, spread over the plan; their names, and what is not the same.
+    """Simulate up to `count` rounds, spread over the plan; their ids, and the differences found.
 
-    Labels and states are held to the bytes that were recorded; with `pixels` images too, which are
-    the same on the same renderer only. Raises UserError when a round cannot be simulated here.
+    Labels and states must be equal in every byte; with `pixels` images too, which only the same
+    renderer reproduces. Raises UserError if a round cannot be simulated on this machine.
     """
     if count < 1:
         raise tf.UserError(f"--replay is {count}; give how many rounds to simulate again")
@@ -45,32 +46,35 @@ def replay(
     problems: list[str] = []
     for entry in entries:
         problems += differences(entry, round_path(folder, entry.id), tracks_dir, pixels)
-        seen(entry.id)
+        on_replayed(entry.id)
     return [entry.id for entry in entries], problems
 
 
 def differences(
     entry: RoundPlan, path: Path, tracks_dir: Path | None, pixels: bool
 ) -> Iterator[str]:
-    """What a recorded round and the simulation of its entry differ in, one line a topic."""
+    """Differences between a recorded round and the simulation of its entry, one line per topic."""
     index = open_round(path)
     recorded = {topic: index.messages[topic] for topic in (topics.LABELS, topics.EGO_STATE)}
     first: dict[str, int] = {}
     number = 0
-    with scene_of(entry, tracks_dir) as (drive, camera):
-        for moments in moments_of(drive, camera):
-            for moment in moments:
-                frame = moment.seen(NO_IMAGE)
-                again = {
+    with open_simulation(entry, tracks_dir) as (simulation, camera):
+        for batch in simulate(simulation, camera):
+            for truth in batch:
+                frame = truth.with_image(NO_IMAGE)
+                simulated = {
                     topics.LABELS: messages.labels(frame),
                     topics.EGO_STATE: messages.ego_state(frame.ego),
                 }
-                for topic, data in again.items():
-                    here = recorded[topic]
-                    if number >= len(here.log_time) or here.payload(number) != data:
+                for topic, data in simulated.items():
+                    messages_of_topic = recorded[topic]
+                    if (
+                        number >= len(messages_of_topic.log_time)
+                        or messages_of_topic.payload(number) != data
+                    ):
                         first.setdefault(topic, number)
                 if pixels and not _same_image(
-                    index, number, encode(moment.picture(camera), entry.codec)
+                    index, number, encode(truth.render(camera), entry.codec)
                 ):
                     first.setdefault(topics.CAMERA, number)
                 number += 1
@@ -89,16 +93,18 @@ def _same_image(index: RoundIndex, number: int, image: bytes) -> bool:
 
 
 def _recorded(folder: Path) -> list[RoundPlan]:
-    """The plan's entries of the rounds that are there."""
-    path = folder / PLAN
+    """Plan entries of the recorded rounds."""
+    path = folder / PLAN_FILE
     states = read_states(folder)
     try:
         entries = json.loads(path.read_text())["rounds"]
         return [RoundPlan.from_json(entry) for entry in entries if entry["id"] in states]
     except FileNotFoundError as error:
-        raise DatasetError(f"there is no {path}: only what has a plan can be replayed") from error
+        raise DatasetError(
+            f"there is no {path}: only a dataset with a plan can be replayed"
+        ) from error
     except (ValueError, KeyError, TypeError) as error:
-        raise DatasetError(f"{path} is no plan of this program ({error!r})") from error
+        raise DatasetError(f"{path} is not a plan of this version ({error!r})") from error
 
 
 def _spread(entries: Sequence[RoundPlan], count: int) -> list[RoundPlan]:

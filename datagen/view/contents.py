@@ -1,4 +1,4 @@
-"""What a viewer shows of a round: images, markings, poses, boxes, and named series over time.
+"""Contents of a round for viewers: images, markings, poses, boxes, and named series over time.
 
 Frames and units are those of the recording; absent values of a series are None.
 """
@@ -32,9 +32,9 @@ Points = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Plot:
-    """Series of one unit in one picture, on a scale of `limits` or of what there is.
+    """Series of one unit in one plot, scaled to `limits` or to the values.
 
-    `dots`: values may be absent, so that a line between neighbours would tell of what is not there.
+    `dots`: values may be absent, so they are not joined by lines.
     """
 
     title: str
@@ -46,15 +46,15 @@ class Plot:
 
 @dataclass(frozen=True, slots=True)
 class Pose:
-    """`place` (3,) m and `turn` (4,) x, y, z, w, of a frame in its parent."""
+    """`position` (3,) in m and `quaternion` (4,) x, y, z, w, of a frame in its parent."""
 
-    place: Points
-    turn: Points
+    position: Points
+    quaternion: Points
 
 
 @dataclass(frozen=True, slots=True)
 class Box:
-    """`size` (3,) m, with its middle at `pose`."""
+    """A box of `size` (3,) in m with its centre at `pose`."""
 
     pose: Pose
     size: Points
@@ -62,13 +62,13 @@ class Box:
 
 @dataclass(frozen=True)
 class Contents:
-    """A round with all its topics; what is asked for is parsed then."""
+    """A round with all its topics. Messages are parsed when they are accessed."""
 
     steps: Steps
 
     @staticmethod
     def open(path: Path) -> "Contents":
-        """Raises DatasetError where there is no whole round."""
+        """Open the file of a round. Raises DatasetError for a folder or a damaged round."""
         if path.is_dir():
             example = next(iter(sorted(path.glob("rounds/*.mcap"))), path / "rounds/ID.mcap")
             raise DatasetError(f"{path} is a folder; name one of its rounds, such as {example}")
@@ -80,7 +80,7 @@ class Contents:
 
     @property
     def about(self) -> str:
-        """The round in a line."""
+        """Summary of the round in one line."""
         h, frames = self.header, len(self.steps)
         lanes = f"{h.lanes} lane{'' if h.lanes == 1 else 's'}"
         cars = f"{h.traffic} other car{'' if h.traffic == 1 else 's'}"
@@ -94,7 +94,7 @@ class Contents:
         return _plots(list(self.steps))
 
     def markings(self, number: int) -> list[Points]:
-        """True markings over the image, (k, 2) px each."""
+        """True markings in the image, (k, 2) px each."""
         lines = self.steps.message(ANNOTATIONS, number).points
         return [np.array([(p.x, p.y) for p in line.points]).reshape(-1, 2) for line in lines]
 
@@ -102,14 +102,14 @@ class Contents:
         return " ".join(t.text for t in self.steps.message(ANNOTATIONS, number).texts)
 
     def pose(self, number: int, child: str = EGO) -> Pose:
-        """Of the car in the world, or of another frame in its parent."""
-        for found in self.steps.message(TRANSFORMS, number).transforms:
-            if found.child_frame_id == child:
-                return Pose(_vector(found.translation), _quaternion(found.rotation))
+        """Pose of the car in the world, or of frame `child` in its parent."""
+        for transform in self.steps.message(TRANSFORMS, number).transforms:
+            if transform.child_frame_id == child:
+                return Pose(_vector(transform.translation), _quaternion(transform.rotation))
         raise DatasetError(f"{self.steps.index.path}: no transform of {child} in step {number}")
 
     def boxes(self, number: int, frame: str = WORLD) -> list[Box]:
-        """The other cars in the world, or in frame `EGO` the car itself."""
+        """Boxes of the other cars in the world; with `frame` EGO, of the car itself."""
         entities = self.steps.message(TRAFFIC, number).entities
         return [
             Box(Pose(_vector(c.pose.position), _quaternion(c.pose.orientation)), _vector(c.size))
@@ -120,7 +120,7 @@ class Contents:
 
     @cached_property
     def scene(self) -> dict[str, Points]:
-        """The track's lines in the world by name, (N, 3) m each."""
+        """Lines of the track in the world by name, (N, 3) m each."""
         return {
             entity.id: np.array([(p.x, p.y, p.z) for line in entity.lines for p in line.points])
             for entity in self.steps.message(TRACK_SCENE, 0).entities

@@ -52,9 +52,9 @@ def _frame(contents: Contents, number: int) -> dict[str, Any]:
 
 def _on_plan(pose: Pose) -> list[float]:
     """x, y (m) and yaw (rad) in the world."""
-    x, y, z, w = pose.turn.tolist()
+    x, y, z, w = pose.quaternion.tolist()
     yaw = atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-    return [round(float(pose.place[0]), 2), round(float(pose.place[1]), 2), round(yaw, 3)]
+    return [round(float(pose.position[0]), 2), round(float(pose.position[1]), 2), round(yaw, 3)]
 
 
 def _plot(plot: Plot) -> dict[str, Any]:

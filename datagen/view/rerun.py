@@ -1,6 +1,6 @@
-"""A round as a Rerun recording: images with markings, the world in 3D, series; and their layout.
+"""Converts a round to a Rerun recording: images with markings, the world in 3D, plots; and layout.
 
-World frame as recorded, z up. Time is that since the start of the round.
+World frame as recorded, z up. Time is counted from the start of the round, s.
 """
 
 import re
@@ -25,7 +25,7 @@ SERIES = ((59, 111, 212), (224, 122, 46), (47, 158, 92), (176, 64, 154), (136, 1
 
 
 def log(contents: Contents, recording: rr.RecordingStream) -> None:
-    """Send the whole round to `recording`, and how it is to be laid out."""
+    """Send the whole round and the layout of the viewer to `recording`."""
     recording.send_blueprint(layout(contents))
     recording.log(ABOUT, rr.TextDocument(contents.about), static=True)
     recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
@@ -39,8 +39,10 @@ def log(contents: Contents, recording: rr.RecordingStream) -> None:
 def _camera(contents: Contents, recording: rr.RecordingStream, time: rr.TimeColumn) -> None:
     camera = contents.header.camera
     pose = contents.pose(0, CAMERA_FRAME)
-    placed = rr.Transform3D(translation=pose.place, quaternion=rr.Quaternion(xyzw=pose.turn))
-    recording.log(CAMERA, placed, static=True)
+    mounting = rr.Transform3D(
+        translation=pose.position, quaternion=rr.Quaternion(xyzw=pose.quaternion)
+    )
+    recording.log(CAMERA, mounting, static=True)
     pinhole = rr.Pinhole(
         image_from_camera=camera.intrinsics(),
         width=camera.width,
@@ -62,15 +64,18 @@ def _camera(contents: Contents, recording: rr.RecordingStream, time: rr.TimeColu
 def _world(contents: Contents, recording: rr.RecordingStream, time: rr.TimeColumn) -> None:
     numbers = range(len(contents.steps))
     for name, line in contents.scene.items():
-        recording.log(f"{TRACK}/{_word(name)}", rr.LineStrips3D([line], colors=[GREY]), static=True)
+        recording.log(
+            f"{TRACK}/{_entity_name(name)}", rr.LineStrips3D([line], colors=[GREY]), static=True
+        )
     poses = [contents.pose(number) for number in numbers]
-    moved = rr.Transform3D.columns(
-        translation=[pose.place for pose in poses], quaternion=[pose.turn for pose in poses]
+    car_poses = rr.Transform3D.columns(
+        translation=[pose.position for pose in poses],
+        quaternion=[pose.quaternion for pose in poses],
     )
-    _send(recording, CAR, time, moved)
+    _send(recording, CAR, time, car_poses)
     body = contents.boxes(0, EGO)
     shape = rr.Boxes3D(
-        centers=[box.pose.place for box in body],
+        centers=[box.pose.position for box in body],
         sizes=[box.size for box in body],
         colors=[BLUE],
     )
@@ -80,9 +85,9 @@ def _world(contents: Contents, recording: rr.RecordingStream, time: rr.TimeColum
     if not boxes:
         return
     columns = rr.Boxes3D.columns(
-        centers=[box.pose.place for box in boxes],
+        centers=[box.pose.position for box in boxes],
         half_sizes=[box.size / 2 for box in boxes],
-        quaternions=[box.pose.turn for box in boxes],
+        quaternions=[box.pose.quaternion for box in boxes],
     )
     _send(recording, TRAFFIC, time, columns.partition([len(step) for step in cars]))
     recording.log(TRAFFIC, rr.Boxes3D.from_fields(colors=[GREY]), static=True)
@@ -90,7 +95,7 @@ def _world(contents: Contents, recording: rr.RecordingStream, time: rr.TimeColum
 
 def _plot(plot: Plot, times: list[float], recording: rr.RecordingStream) -> None:
     for colour, (name, column) in zip(SERIES, plot.series.items(), strict=False):
-        entity = f"{place(plot)}/{name}"
+        entity = f"{plot_entity(plot)}/{name}"
         style = (
             rr.SeriesPoints(names=[name], colors=[colour], marker_sizes=[1.5])
             if plot.dots
@@ -109,21 +114,21 @@ def _send(recording: rr.RecordingStream, entity: str, time: rr.TimeColumn, colum
     rr.send_columns(entity, indexes=[time], columns=columns, recording=recording)
 
 
-def place(plot: Plot) -> str:
-    """The entity that holds the series of a plot."""
-    return f"{PLOTS}/{_word(plot.title)}"
+def plot_entity(plot: Plot) -> str:
+    """Path of the entity that holds the series of a plot."""
+    return f"{PLOTS}/{_entity_name(plot.title)}"
 
 
-def _word(title: str) -> str:
-    """Without the spaces and signs that have a meaning in the name of an entity."""
+def _entity_name(title: str) -> str:
+    """`title` without the characters that have a meaning in Rerun's entity paths."""
     return re.sub("[^a-z0-9]+", "_", title.lower())
 
 
 def layout(contents: Contents) -> rrb.Blueprint:
-    """Pictures to the left, plots to the right, the 3D view going along with the car."""
+    """Layout of the viewer: images and 3D view left, plots right; the 3D view follows the car."""
     plots = [
         rrb.TimeSeriesView(
-            origin=place(plot),
+            origin=plot_entity(plot),
             name=f"{plot.title} ({plot.unit})",
             axis_y=rrb.ScalarAxis(range=plot.limits) if plot.limits else None,
             plot_legend=rrb.PlotLegend(visible=len(plot.series) > 1),
@@ -134,7 +139,9 @@ def layout(contents: Contents) -> rrb.Blueprint:
         origin="world",
         name="World",
         eye_controls=rrb.EyeControls3D(
-            position=_behind(contents), look_target=contents.pose(0).place, tracking_entity=CAR
+            position=_camera_position(contents),
+            look_target=contents.pose(0).position,
+            tracking_entity=CAR,
         ),
     )
     texts = rrb.Horizontal(
@@ -160,9 +167,9 @@ def layout(contents: Contents) -> rrb.Blueprint:
     )
 
 
-def _behind(contents: Contents) -> list[float]:
-    """25 m behind the car at the start and 12 m above it."""
+def _camera_position(contents: Contents) -> list[float]:
+    """Of the 3D view: 25 m behind the car at the start and 12 m above it."""
     pose = contents.pose(0)
-    x, y, z, w = pose.turn.tolist()
+    x, y, z, w = pose.quaternion.tolist()
     ahead = np.array([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 0.0])
-    return [float(v) for v in pose.place - 25.0 * ahead + np.array([0.0, 0.0, 12.0])]
+    return [float(v) for v in pose.position - 25.0 * ahead + np.array([0.0, 0.0, 12.0])]

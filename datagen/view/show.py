@@ -1,4 +1,4 @@
-"""Opening a round: in Rerun's viewer, in a file for it, over the web, or as a page of HTML."""
+"""Shows a round: in Rerun's viewer, as a Rerun file, over the web, or as an HTML page."""
 
 import os
 import socket
@@ -14,30 +14,30 @@ from datagen.view.contents import Contents
 from runtime.files import atomic_write, check_folder
 from trackfeatures.errors import UserError
 
-Told = Callable[[str], None]
-"""Hears where the round is shown."""
+OnShown = Callable[[str], None]
+"""Called with the place where the round is shown: a path, a URL, or a window."""
 
 
 @dataclass(frozen=True, slots=True)
-class Ways:
-    """How to show a round; a window of Rerun where nothing is given."""
+class ShowConfig:
+    """How to show a round. Without any option: in a window of Rerun."""
 
     html: Path | None = None
     save: Path | None = None
     web: bool = False
     port: int = 9090
 
-    def require_sane(self) -> None:
-        """Raise UserError where it cannot be done, before anything is read."""
+    def validate(self) -> None:
+        """Raise UserError for options that cannot be met, before anything is read."""
         if sum((self.html is not None, self.save is not None, self.web)) > 1:
-            raise UserError("--html, --save and --web are three ways to show it; give one of them")
+            raise UserError("--html, --save and --web exclude each other; give one of them")
         for path in (self.html, self.save):
             if path is not None:
                 check_folder(path)
         if self.html is not None:
             return
         _require_rerun()
-        os.environ.setdefault("RUST_LOG", "off")  # what goes wrong is said here, in one line
+        os.environ.setdefault("RUST_LOG", "off")  # errors are reported below, in one line
         if self.web:
             _require_free(self.port)
             _require_free(self.port + 1)
@@ -45,25 +45,25 @@ class Ways:
             _require_screen()
 
 
-def show(contents: Contents, ways: Ways, told: Told) -> None:
-    """Show a round. Raises UserError, OSError, or KeyboardInterrupt when a server is ended."""
-    if ways.html is not None:
+def show(contents: Contents, config: ShowConfig, on_shown: OnShown) -> None:
+    """Show a round. Raises UserError or OSError; KeyboardInterrupt when a server is stopped."""
+    if config.html is not None:
         from datagen.view.html_page import page
 
-        atomic_write(ways.html, page(contents))
-        told(str(ways.html))
-    elif ways.save is not None:
-        save(contents, ways.save)
-        told(str(ways.save))
-    elif ways.web:
-        _serve(contents, ways.port, told)
+        atomic_write(config.html, page(contents))
+        on_shown(str(config.html))
+    elif config.save is not None:
+        save(contents, config.save)
+        on_shown(str(config.save))
+    elif config.web:
+        _serve(contents, config.port, on_shown)
     else:
         _open_window(contents)
-        told("Rerun's window")
+        on_shown("Rerun's window")
 
 
 def save(contents: Contents, path: Path) -> None:
-    """Write a .rrd file for Rerun, whole or not at all."""
+    """Write a Rerun file (.rrd), atomically."""
     import rerun as rr
 
     from datagen.view.rerun import APPLICATION, log
@@ -75,19 +75,19 @@ def save(contents: Contents, path: Path) -> None:
         log(contents, recording)
         recording.flush()
         recording.disconnect()
-        _require_whole(partial, len(contents.steps))
+        _require_all_images(partial, len(contents.steps))
         partial.replace(path)
     except (RuntimeError, ValueError) as error:
         raise UserError(
-            f"{path} could not be written whole ({error}); is the disk full? Free some space and "
-            "run the same command again"
+            f"{path} could not be written completely ({error}); is the disk full? Free some space "
+            "and run the same command again"
         ) from error
     finally:
         partial.unlink(missing_ok=True)
 
 
-def _require_whole(path: Path, frames: int) -> None:
-    """Raise ValueError unless all images have arrived: Rerun writes in the background."""
+def _require_all_images(path: Path, frames: int) -> None:
+    """Raise ValueError unless all images are in the file: Rerun writes in the background."""
     from rerun.chunk import RrdReader
 
     from datagen.view.rerun import IMAGE
@@ -98,7 +98,7 @@ def _require_whole(path: Path, frames: int) -> None:
 
 
 def _open_window(contents: Contents) -> None:
-    """The window stays when this process ends."""
+    """Open Rerun's window, which stays open after this process ends."""
     import rerun as rr
 
     from datagen.view.rerun import APPLICATION, log
@@ -109,7 +109,7 @@ def _open_window(contents: Contents) -> None:
     recording.flush()
 
 
-def _serve(contents: Contents, port: int, told: Told) -> None:
+def _serve(contents: Contents, port: int, on_shown: OnShown) -> None:
     import rerun as rr
 
     from datagen.view.rerun import APPLICATION, log
@@ -119,7 +119,7 @@ def _serve(contents: Contents, port: int, told: Told) -> None:
     rr.serve_web_viewer(web_port=port, open_browser=False, connect_to=data)
     log(contents, recording)
     recording.flush()
-    told(f"http://localhost:{port}/?url={quote(data, safe=':/')}")
+    on_shown(f"http://localhost:{port}/?url={quote(data, safe=':/')}")
     while True:
         time.sleep(1)
 
@@ -127,13 +127,13 @@ def _serve(contents: Contents, port: int, told: Told) -> None:
 def _require_rerun() -> None:
     if find_spec("rerun") is None:
         raise UserError(
-            "Rerun is not installed; run `pip install 'driverview[view]'`, or make a page that "
-            "needs nothing with --html FILE"
+            "Rerun is not installed; run `pip install 'driverview[view]'`, or write a page "
+            "with --html FILE"
         )
 
 
 def _require_screen() -> None:
-    """Without one the viewer would end without a word."""
+    """Raise UserError without a display: the viewer would end without a message."""
     if sys.platform == "linux" and not any(map(os.environ.get, ("DISPLAY", "WAYLAND_DISPLAY"))):
         raise UserError(
             "there is no screen to open a window on; give --web, --save FILE.rrd or --html FILE"

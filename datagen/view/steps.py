@@ -1,4 +1,4 @@
-"""A round's control steps with their messages parsed: what `datagen export` and `view` read."""
+"""The frames of a round with their messages parsed; used by `datagen export` and `view`."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -30,7 +30,7 @@ Value = float | int | str | list[float] | None
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """What is true at one moment; `image` is encoded, and not copied."""
+    """Image and truth of one frame. `image` is the encoded image, not a copy."""
 
     number: int
     time_s: float
@@ -43,13 +43,13 @@ class Step:
 
 @dataclass(frozen=True)
 class Steps:
-    """The steps of a round, in order: `steps[0]`, `len(steps)`, `for step in steps`."""
+    """The steps of a round, as a sequence: `steps[0]`, `len(steps)`, `for step in steps`."""
 
     index: RoundIndex
 
     @staticmethod
     def open(path: Path, topics: tuple[str, ...] = TOPICS) -> "Steps":
-        """Raises DatasetError unless every image has its label, state and command."""
+        """Open a round. Raises DatasetError unless every image has label, state and command."""
         steps = Steps(open_round(path, topics))
         times = steps.index.messages[CAMERA].log_time
         for topic in TOPICS[1:]:
@@ -78,13 +78,14 @@ class Steps:
         return (self[number] for number in range(len(self)))
 
     def message(self, topic: str, number: int) -> Any:
-        """Message `number` of a topic the round was opened for, parsed; DatasetError if damaged."""
+        """Message `number` of an opened topic, parsed. Raises DatasetError if it is damaged."""
         try:
             return MESSAGE_TYPES[topic].FromString(bytes(self.payload(topic, number)))
         except DAMAGE_ERRORS as error:
             raise self._damaged(topic, number, error) from error
 
     def payload(self, topic: str, number: int) -> memoryview:
+        """Bytes of message `number` of a topic."""
         try:
             return self.index.messages[topic].payload(number)
         except DAMAGE_ERRORS as error:
@@ -92,7 +93,7 @@ class Steps:
 
     @cached_property
     def lights(self) -> list[str]:
-        """The light at each step."""
+        """Name of the light at each step."""
         lights: list[str] = light_per_frame(self.index).tolist()
         return lights
 
@@ -112,7 +113,7 @@ class Steps:
 
 
 def values(message: Any) -> dict[str, Value]:
-    """The fields of one of our messages: None where absent, classes by name in lower case."""
+    """Fields of a message by name: None where absent, enum values as lower-case names."""
     return {f.name: _value(message, f) for f in message.DESCRIPTOR.fields}
 
 

@@ -9,7 +9,7 @@ from datagen.planning.config import CollectConfig
 from datagen.planning.plan import Plan
 from datagen.planning.planner import make_plan
 from datagen.planning.tracks import choose_tracks
-from datagen.recorder.job import Ending, Job, attempt
+from datagen.recorder.job import Job, Outcome, attempt
 from datagen.recording.folder import prepare
 from tests.typed import typed
 
@@ -44,5 +44,5 @@ def make_jobs(folder: Path, rounds: int, frames: int) -> list[Job]:
     return [Job(entry, plan.hash, folder, None) for entry in plan.rounds]
 
 
-def attempted(job: Job) -> Ending:
+def attempted(job: Job) -> Outcome:
     return attempt(job, lambda message: None)

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import trackfeatures as tf
-from datagen.execution.collect import collect, require_fitting
+from datagen.execution.collect import collect, require_matching_folder
 from datagen.planning.plan import RoundPlan
 from datagen.recorder.job import RoundDone
 from datagen.recording import Dataset
@@ -57,7 +57,7 @@ def test_verify_and_info_as_commands(
     assert report["problems"] == []
     assert report["content_hash"] == info["content_hash"]
     assert (info["rounds"], info["by_lanes"]) == (2, {"1": 30, "2": 30})
-    assert "mean misses by" in datagen_here("info", collected).stdout
+    assert "always predicting the mean" in datagen_here("info", collected).stdout
     nothing = datagen_here("verify", tmp_path / "nothing", "--json")
     assert nothing.returncode == 1
     assert not json.loads(nothing.stdout)["ok"]
@@ -124,7 +124,7 @@ def test_empty_parts_of_a_dataset_are_no_foreign_folder(tmp_path: Path) -> None:
     (tmp_path / "rounds").mkdir()
     (tmp_path / "state").mkdir()
     (tmp_path / ".plan.json.new").write_text('{"rou')
-    require_fitting(tmp_path, plan)
+    require_matching_folder(tmp_path, plan)
     (tmp_path / "rounds" / "somebody.mcap").write_text("else's")
     with pytest.raises(DatasetError, match="is not a dataset"):
         collect(plan, tmp_path, workers=1)

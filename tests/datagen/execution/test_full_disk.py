@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from datagen.execution.collect import collect, open_folder, require_fitting
+from datagen.execution.collect import collect, initialise_folder, require_matching_folder
 from datagen.recorder.job import FatalError
 from datagen.recording.folder import read_states
 from datagen.recording.integrity.verify import verify
@@ -39,8 +39,8 @@ def test_collection_resumes_after_a_disk_that_was_full_from_the_start(
         patch.setattr("runtime.files.fsync_path", full)
         with pytest.raises(OSError, match="No space left"):
             collect(plan, folder, workers=1)
-    require_fitting(folder, plan)
-    open_folder(folder, plan)
+    require_matching_folder(folder, plan)
+    initialise_folder(folder, plan)
     assert json.loads((folder / "plan.json").read_text())["hash"] == plan.hash
 
 

@@ -16,9 +16,9 @@ import pytest
 from datagen.errors import RoundFailed
 from datagen.execution.collect import collect
 from datagen.execution.process_pool import ProcessPool
-from datagen.execution.retry import ATTEMPTS, DEATHS_IN_A_ROW, Limits, Tries
+from datagen.execution.retry import ATTEMPTS, DEATHS_IN_A_ROW, RetryQueue, Timeouts
 from datagen.planning.plan import RoundPlan
-from datagen.recorder.job import FramesDone, RoundBroken, RoundDone
+from datagen.recorder.job import AttemptFailed, FramesDone, RoundDone
 from datagen.recording.errors import DatasetError
 from datagen.recording.folder import read_states
 from datagen.recording.integrity.verify import verify
@@ -60,15 +60,15 @@ def test_a_worker_that_dies_costs_its_round_only_and_the_round_is_tried_again(
     killed: list[str] = []
     done: list[str] = []
 
-    def hear(message: FramesDone | RoundDone) -> None:
+    def on_message(message: FramesDone | RoundDone) -> None:
         if isinstance(message, RoundDone):
             done.append(message.state.id)
         elif not killed:
             killed.append(message.round_id)
-            crew._workers[0].process.kill()
+            pool._workers[0].process.kill()
 
-    crew = ProcessPool(1, hear)
-    assert crew.run(jobs) == []
+    pool = ProcessPool(1, on_message)
+    assert pool.run(jobs) == []
     assert killed == ["round-000"]
     assert sorted(done) == ["round-000", "round-001"] == sorted(read_states(tmp_path))
 
@@ -108,14 +108,14 @@ def test_a_round_that_cannot_be_driven_is_tried_once_and_told_in_one_line(
 def test_a_car_that_is_reset_too_often_ends_its_round(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("datagen.recorder.record.MOST_RESETS", 0)
+    monkeypatch.setattr("datagen.recorder.record.MAX_RESETS", 0)
     monkeypatch.setattr(
         "datagen.recorder.record.ScriptedDriver.command", lambda *args: Command(1.0, 1.0)
     )
     (job,) = make_jobs(tmp_path, rounds=1, frames=200)
     job = replace(job, plan=replace(job.plan, camera=CameraParameters(width=56, height=42)))
     message = attempted(job)
-    assert isinstance(message, RoundBroken)
+    assert isinstance(message, AttemptFailed)
     assert message.final
     assert "left the road 1 times on oval, " in message.reason
     assert not list(tmp_path.glob("rounds/*"))
@@ -136,20 +136,22 @@ def test_a_process_that_gives_no_sign_of_life_is_replaced(tmp_path: Path) -> Non
     stopped: list[int] = []
     done: list[str] = []
 
-    def hear(message: FramesDone | RoundDone) -> None:
+    def on_message(message: FramesDone | RoundDone) -> None:
         if isinstance(message, RoundDone):
             done.append(message.state.id)
         elif message.frames:
-            worker = crew._workers[0]
+            worker = pool._workers[0]
             if not stopped:
                 stopped.append(worker.process.pid or 0)
                 os.kill(stopped[0], signal.SIGSTOP)
             if worker.process.pid == stopped[0]:
-                worker.heard -= limits.silence_s - 1.0  # one second is left of its time
+                worker.last_heartbeat -= (
+                    timeouts.heartbeat_s - 1.0
+                )  # one second is left of its time
 
-    limits = Limits(delay_s=0.1)
-    crew = ProcessPool(1, hear, limits)
-    assert crew.run(make_jobs(tmp_path, rounds=1, frames=400)) == []
+    timeouts = Timeouts(retry_delay_s=0.1)
+    pool = ProcessPool(1, on_message, timeouts)
+    assert pool.run(make_jobs(tmp_path, rounds=1, frames=400)) == []
     assert done == ["round-000"]
     with pytest.raises(ProcessLookupError):
         os.kill(stopped[0], 0)
@@ -158,12 +160,12 @@ def test_a_process_that_gives_no_sign_of_life_is_replaced(tmp_path: Path) -> Non
 def test_a_round_that_takes_too_long_is_tried_three_times_and_given_up(tmp_path: Path) -> None:
     started: list[float] = []
 
-    def hear(message: FramesDone | RoundDone) -> None:
+    def on_message(message: FramesDone | RoundDone) -> None:
         if isinstance(message, FramesDone) and message.frames == 0:
             started.append(time.monotonic())
 
-    crew = ProcessPool(1, hear, Limits(start_s=1.0, frame_s=0.0, delay_s=0.2))
-    (failure,) = crew.run(make_jobs(tmp_path, rounds=1, frames=100_000))
+    pool = ProcessPool(1, on_message, Timeouts(round_start_s=1.0, frame_s=0.0, retry_delay_s=0.2))
+    (failure,) = pool.run(make_jobs(tmp_path, rounds=1, frames=100_000))
     assert failure.round_id == "round-000"
     assert "it was not finished for 1 s" in failure.reason
     assert not failure.final
@@ -172,32 +174,32 @@ def test_a_round_that_takes_too_long_is_tried_three_times_and_given_up(tmp_path:
 
 def test_tries_come_with_growing_delay_and_end_after_the_third(tmp_path: Path) -> None:
     (job, other) = make_jobs(tmp_path, rounds=2, frames=10)
-    tries = Tries([job, other], Limits(delay_s=2.0))
-    assert tries.take(0.0) == job
-    tries.failed(job, "first", now=10.0)
-    assert (tries.next_at(), tries.take(10.0)) == (0.0, other)
-    assert (tries.next_at(), tries.take(11.9)) == (12.0, None)
-    assert tries.take(12.0) == job
-    tries.failed(job, "second", now=20.0)
-    assert (tries.take(27.9), tries.take(28.0)) == (None, job)
-    tries.failed(job, "third", now=30.0)
-    assert (len(tries), tries.take(1e9)) == (0, None)
-    assert [(f.round_id, f.reason, f.final) for f in tries.failures] == [
+    queue = RetryQueue([job, other], Timeouts(retry_delay_s=2.0))
+    assert queue.take(0.0) == job
+    queue.record_failure(job, "first", now=10.0)
+    assert (queue.next_at(), queue.take(10.0)) == (0.0, other)
+    assert (queue.next_at(), queue.take(11.9)) == (12.0, None)
+    assert queue.take(12.0) == job
+    queue.record_failure(job, "second", now=20.0)
+    assert (queue.take(27.9), queue.take(28.0)) == (None, job)
+    queue.record_failure(job, "third", now=30.0)
+    assert (len(queue), queue.take(1e9)) == (0, None)
+    assert [(f.round_id, f.reason, f.final) for f in queue.failures] == [
         ("round-000", "third", False)
     ]
-    tries.failed(other, "for good", now=30.0, final=True)
-    assert tries.failures[1].final
+    queue.record_failure(other, "for good", now=30.0, final=True)
+    assert queue.failures[1].final
 
 
 def test_processes_that_only_die_end_the_collection(tmp_path: Path) -> None:
-    tries = Tries(make_jobs(tmp_path, rounds=1, frames=10), Limits())
+    queue = RetryQueue(make_jobs(tmp_path, rounds=1, frames=10), Timeouts())
     for _ in range(DEATHS_IN_A_ROW - 1):
-        tries.died("code -11")
-    tries.done()
+        queue.record_death("code -11")
+    queue.record_success()
     for _ in range(DEATHS_IN_A_ROW - 1):
-        tries.died("code -11")
+        queue.record_death("code -11")
     with pytest.raises(DatasetError, match=r"ended one after the other .*code -11"):
-        tries.died("code -11")
+        queue.record_death("code -11")
 
 
 def test_no_worker_outlives_a_collector_that_was_killed(tmp_path: Path) -> None:

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from datagen.execution.ray_pool import RayCrew
-from datagen.execution.retry import Limits
+from datagen.execution.ray_pool import RayPool
+from datagen.execution.retry import Timeouts
 from datagen.recorder.job import FramesDone, RoundDone
 from datagen.recording.folder import read_states
 from datagen.recording.integrity.verify import verify
@@ -37,15 +37,15 @@ def test_an_actor_that_dies_costs_its_round_only(tmp_path: Path) -> None:
     done: list[str] = []
     killed: list[str] = []
 
-    def hear(message: FramesDone | RoundDone) -> None:
+    def on_message(message: FramesDone | RoundDone) -> None:
         if isinstance(message, RoundDone):
             done.append(message.state.id)
         elif message.frames and not killed:
             killed.append(message.round_id)
-            ray.kill(crew._seats[0].actor)
+            ray.kill(pool._slots[0].actor)
 
-    crew = RayCrew(1, hear, Limits(delay_s=0.1))
-    assert crew.run(make_jobs(tmp_path, rounds=1, frames=600)) == []
+    pool = RayPool(1, on_message, Timeouts(retry_delay_s=0.1))
+    assert pool.run(make_jobs(tmp_path, rounds=1, frames=600)) == []
     assert killed == done == ["round-000"] == list(read_states(tmp_path))
     assert not ray.is_initialized()
 
@@ -55,5 +55,5 @@ def test_what_no_round_can_get_round_ends_it_at_once(tmp_path: Path) -> None:
     (job,) = make_jobs(tmp_path, rounds=1, frames=10)
     changed = replace(job, plan=replace(job.plan, track_hash="0" * 64))
     with pytest.raises(UserError, match="track oval is not the one this dataset was planned with"):
-        RayCrew(1, lambda message: None).run([changed])
+        RayPool(1, lambda message: None).run([changed])
     assert not read_states(tmp_path)

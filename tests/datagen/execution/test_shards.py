@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 import trackfeatures as tf
-from datagen.execution.lock import held
+from datagen.execution.lock import folder_lock
 from datagen.execution.merge import merge
 from datagen.planning.plan import Shard
 from datagen.recording import Dataset
@@ -118,21 +118,21 @@ def _without(whole: Path, folder: Path, numbers: tuple[str, ...]) -> Path:
 
 
 def test_two_collectors_of_the_same_rounds_are_refused(tmp_path: Path) -> None:
-    with held(tmp_path, Shard(1, 2)):
-        with held(tmp_path, Shard(2, 2)):
+    with folder_lock(tmp_path, Shard(1, 2)):
+        with folder_lock(tmp_path, Shard(2, 2)):
             pass
         for other in (Shard(1, 2), Shard(1, 3), None):
             with (
                 pytest.raises(DatasetError, match=r"is being recorded|is writing to"),
-                held(tmp_path, other),
+                folder_lock(tmp_path, other),
             ):
                 pass
-    with held(tmp_path, Shard(1, 3)):
+    with folder_lock(tmp_path, Shard(1, 3)):
         pass
     with (
-        held(tmp_path, None),
+        folder_lock(tmp_path, None),
         pytest.raises(DatasetError, match="another `datagen collect`"),
-        held(tmp_path, Shard(1, 2)),
+        folder_lock(tmp_path, Shard(1, 2)),
     ):
         pass
 

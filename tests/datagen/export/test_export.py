@@ -18,7 +18,7 @@ from typer.testing import CliRunner
 
 from datagen.cli import app
 from datagen.export.lerobot_features import ACTION, IMAGE, LABELS
-from datagen.export.lerobot_stats import Histogram, of_numbers
+from datagen.export.lerobot_stats import Histogram, column_stats
 from datagen.export.webdataset import SCHEMA_FILE
 from datagen.recording.dataset import Dataset
 from datagen.recording.manifest import rebuild
@@ -194,7 +194,7 @@ def test_lerobots_statistics_are_those_of_the_frames(dataset: Path, tmp_path: Pa
 
 
 def test_a_distance_that_is_nowhere_has_statistics_of_zero() -> None:
-    stats = of_numbers({"labels": np.array([[1.0, np.nan], [3.0, np.nan]], np.float32)})["labels"]
+    stats = column_stats({"labels": np.array([[1.0, np.nan], [3.0, np.nan]], np.float32)})["labels"]
     assert (stats["mean"], stats["std"], stats["count"]) == ([2.0, 0.0], [1.0, 0.0], [2])
 
 
@@ -227,7 +227,7 @@ def test_what_cannot_be_exported_is_refused_in_one_line(
 ) -> None:
     out = tmp_path / "out"
     assert "no format 'zip'" in refused("export", dataset, "--format", "zip", "--out", out)
-    assert "holds none" in refused("export", dataset, "--shard-size", "0", "--out", out)
+    assert "--shard-size is 0" in refused("export", dataset, "--shard-size", "0", "--out", out)
     assert "--shuffle" in refused(
         "export", dataset, "--format", "lerobot", "--shuffle", "--out", out
     )

@@ -33,7 +33,9 @@ def test_another_round_under_the_same_name_is_seen(
     assert labels.startswith("round-001.mcap: simulated again, /labels differs from frame ")
     assert states.startswith("round-001.mcap: simulated again, /ego/state differs from frame 0 on")
     (folder / "plan.json").unlink()
-    assert "only what has a plan" in refused("verify", folder, "--level", "quick", "--replay", "1")
+    assert "only a dataset with a plan" in refused(
+        "verify", folder, "--level", "quick", "--replay", "1"
+    )
 
 
 def test_one_bit_of_one_state_is_seen(collected: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -58,8 +58,8 @@ def test_the_contents_are_what_was_recorded(recorded: Path, dataset: Path) -> No
         assert shown == pytest.approx(labels.distances[FRAMES:, i], nan_ok=True)
     assert series["speed"] == pytest.approx([54.0] * FRAMES)  # 15 m/s
     assert series["steer"] == pytest.approx([0.1] * FRAMES)
-    assert contents.pose(3).place.tolist() == [1.0, 2.0, 0.3]
-    assert contents.pose(3, CAMERA_FRAME).place.tolist() == [0.75, 0.0, 0.95]
+    assert contents.pose(3).position.tolist() == [1.0, 2.0, 0.3]
+    assert contents.pose(3, CAMERA_FRAME).position.tolist() == [0.75, 0.0, 0.95]
     assert [len(line) for line in contents.markings(0)] == [12, 8]
     assert len(contents.boxes(0)) == 2
     assert contents.boxes(0, EGO)[0].size.tolist() == [4.52, 1.94, 1.10]
@@ -121,7 +121,7 @@ def test_reruns_file_holds_every_frame_on_every_entity(recorded: Path, tmp_path:
     for plot in contents.plots:
         for name, column in plot.series.items():
             present = sum(value is not None for value in column)
-            assert moving[f"/{rerun_log.place(plot)}/{name}"] == present
+            assert moving[f"/{rerun_log.plot_entity(plot)}/{name}"] == present
     for entity in (rerun_log.CAMERA, rerun_log.BODY, f"{rerun_log.TRACK}/left", rerun_log.ABOUT):
         assert still[f"/{entity}"] >= 1
     assert len(RrdReader(out).blueprints()) == 1
