@@ -29,10 +29,10 @@ MAX_DURATION_NS = 366 * 86_400 * topics.NANOSECONDS
 
 @dataclass(frozen=True, slots=True)
 class ChunkBytes:
-    """The messages of a chunk. `whole`: its CRC is right; else its end is cut or overwritten."""
+    """The messages of a chunk. `intact`: its CRC is right; else its end is cut or overwritten."""
 
     data: memoryview
-    whole: bool
+    intact: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,21 +57,21 @@ def find_chunks(data: bytes) -> Iterator[ChunkBytes]:
         size, crc = _chunk_size_and_crc(view, at)
         messages = view[at + CHUNK_HEAD : at + CHUNK_HEAD + size]
         if size and len(messages) == size and zlib.crc32(messages) == crc:
-            yield ChunkBytes(messages, whole=True)
+            yield ChunkBytes(messages, intact=True)
             at, torn = at + CHUNK_HEAD + size, None
             continue
         if size and torn is None and not _has_message_index(view, at + CHUNK_HEAD + size):
-            torn = ChunkBytes(messages, whole=False)
+            torn = ChunkBytes(messages, intact=False)
         at += 1
     if torn is not None:
         yield torn
 
 
 def chunk_messages(chunk: ChunkBytes) -> Iterator[FoundMessage]:
-    """The messages of a chunk, front to back, as far as they are sure to be what was written."""
+    """The messages of a chunk in file order; of a cut chunk only those certain to be complete."""
     found, cut = _parse_messages(chunk.data)
     # If other bytes follow the messages, they may have overwritten the end of the last one.
-    yield from found if chunk.whole or cut else found[:-1]
+    yield from found if chunk.intact or cut else found[:-1]
 
 
 def find_metadata(data: bytes, name: str) -> dict[str, str] | None:

@@ -158,14 +158,16 @@ class RoundIndex:
         return self.summary is not None
 
 
-def open_round(path: Path, wanted: Sequence[str] = LABEL_READER_TOPICS) -> RoundIndex:
+def open_round(path: Path, topic_names: Sequence[str] = LABEL_READER_TOPICS) -> RoundIndex:
     """Index topics of a recorded round; DatasetError if it is damaged or of another format."""
-    return _with_clear_errors(path, lambda: _map_round(path, wanted) or _load_round(path, wanted))
+    return _with_clear_errors(
+        path, lambda: _map_round(path, topic_names) or _load_round(path, topic_names)
+    )
 
 
-def load_round(path: Path, wanted: Sequence[str] = LABEL_READER_TOPICS) -> RoundIndex:
+def load_round(path: Path, topic_names: Sequence[str] = LABEL_READER_TOPICS) -> RoundIndex:
     """As `open_round`, with the official reader: slow, for any MCAP file; the oracle in tests."""
-    return _with_clear_errors(path, lambda: _load_round(path, wanted))
+    return _with_clear_errors(path, lambda: _load_round(path, topic_names))
 
 
 class _NotARoundError(ValueError):
@@ -199,7 +201,7 @@ def _with_clear_errors(path: Path, read: Callable[[], RoundIndex]) -> RoundIndex
         ) from error
 
 
-def _map_round(path: Path, wanted: Sequence[str]) -> RoundIndex | None:
+def _map_round(path: Path, topic_names: Sequence[str]) -> RoundIndex | None:
     """The round, memory-mapped; None if the file is compressed or has no message index."""
     view = map_file(path)
     summary = read_summary(view)
@@ -208,7 +210,7 @@ def _map_round(path: Path, wanted: Sequence[str]) -> RoundIndex | None:
     metadata = {n: read_metadata(view, place) for n, place in summary.metadata.items()}
     header, result, recovery = _parse_metadata(metadata)
     found: dict[str, Messages] = {
-        topic: MappedMessages(view, summary, _channel(summary, topic)) for topic in wanted
+        topic: MappedMessages(view, summary, _channel(summary, topic)) for topic in topic_names
     }
     return RoundIndex(path, header, result, found, summary, recovery)
 
@@ -225,11 +227,11 @@ def _parse_metadata(
     for name in (ROUND_METADATA, RESULT_METADATA):
         if name not in metadata:
             raise _NotARoundError(f"it has no metadata {name}")
-    noted = metadata.get(RECOVERY_METADATA)
+    recovered = metadata.get(RECOVERY_METADATA)
     try:
         header = RoundHeader.from_metadata(metadata[ROUND_METADATA])
         result = RoundResult.from_metadata(metadata[RESULT_METADATA])
-        recovery = None if noted is None else Recovery.from_metadata(noted)
+        recovery = None if recovered is None else Recovery.from_metadata(recovered)
     except (KeyError, TypeError) as error:
         program = metadata[ROUND_METADATA].get("program", "an unknown program")
         raise _OtherVersionError(f"{program}; {type(error).__name__}: {error}") from error
@@ -237,17 +239,17 @@ def _parse_metadata(
     return header, result, recovery
 
 
-def _load_round(path: Path, wanted: Sequence[str]) -> RoundIndex:
-    times: dict[str, list[int]] = {topic: [] for topic in wanted}
-    payloads: dict[str, list[bytes]] = {topic: [] for topic in wanted}
+def _load_round(path: Path, topic_names: Sequence[str]) -> RoundIndex:
+    times: dict[str, list[int]] = {topic: [] for topic in topic_names}
+    payloads: dict[str, list[bytes]] = {topic: [] for topic in topic_names}
     with path.open("rb") as stream:
         reader = make_reader(stream)
         metadata = {record.name: record.metadata for record in reader.iter_metadata()}
         header, result, recovery = _parse_metadata(metadata)
-        for _, channel, message in reader.iter_messages(wanted, log_time_order=False):
+        for _, channel, message in reader.iter_messages(topic_names, log_time_order=False):
             times[channel.topic].append(message.log_time)
             payloads[channel.topic].append(message.data)
     found: dict[str, Messages] = {
-        t: LoadedMessages(np.array(times[t], dtype=np.int64), payloads[t]) for t in wanted
+        t: LoadedMessages(np.array(times[t], dtype=np.int64), payloads[t]) for t in topic_names
     }
     return RoundIndex(path, header, result, found, None, recovery)

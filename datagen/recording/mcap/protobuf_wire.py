@@ -13,8 +13,8 @@ POINT2 = np.dtype(
 DOUBLE_TAG_1, DOUBLE_TAG_2 = 1 << 3 | 1, 2 << 3 | 1
 
 
-def bytes_field(message: memoryview, wanted: int) -> memoryview:
-    """The length-delimited field with number `wanted`; ValueError if it is not there."""
+def bytes_field(message: memoryview, number: int) -> memoryview:
+    """The length-delimited field with number `number`; ValueError if it is not there."""
     at, end = 0, len(message)
     while at < end:
         tag, at = _varint(message, at)
@@ -23,7 +23,7 @@ def bytes_field(message: memoryview, wanted: int) -> memoryview:
             length, at = _varint(message, at)
             if at + length > end:
                 break
-            if tag >> 3 == wanted:
+            if tag >> 3 == number:
                 return message[at : at + length]
             at += length
         elif wire_type == 0:
@@ -32,7 +32,7 @@ def bytes_field(message: memoryview, wanted: int) -> memoryview:
             at += 8 if wire_type == 1 else 4
         else:
             break
-    raise ValueError(f"the message is damaged: field {wanted} was not found")
+    raise ValueError(f"the message is damaged: field {number} was not found")
 
 
 def _varint(message: memoryview, at: int) -> tuple[int, int]:

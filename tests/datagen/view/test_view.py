@@ -231,7 +231,7 @@ def test_a_file_for_rerun_that_is_cut_short_is_not_kept(
 
 
 def layout() -> dict[str, Any]:
-    text = files("datagen.recording").joinpath("layouts/foxglove.json").read_text()
+    text = files("datagen.recording.schema").joinpath("layouts/foxglove.json").read_text()
     found: dict[str, Any] = json.loads(text)
     return found
 

@@ -79,4 +79,4 @@ def test_missing_invented_and_wrong_labels_are_found(
 
 def test_an_impossible_road_is_found() -> None:
     labels = _labels(np.zeros(3), lanes=1)
-    assert "an impossible road: 7 lanes" in next(label_problems(labels, 7, WIDTH))
+    assert "an impossible road: a road of 7 lanes" in next(label_problems(labels, 7, WIDTH))
