@@ -119,7 +119,7 @@ def decode(
     if image.shape != (header.height, header.width, 3):
         raise ImageError(
             Fault.DAMAGED,
-            f"the image decodes to {image.shape[1]} x {image.shape[0]} px, its header says "
+            f"the image decodes to {image.shape[1]} x {image.shape[0]} px, its header declares "
             f"{header.width} x {header.height}; save it anew",
         )
     return crop_and_resize(image, view, fov_y_deg)
