@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 os.environ.update(OMP_NUM_THREADS="1", SDL_VIDEODRIVER="dummy")
+sys.path.insert(0, str(Path(__file__).parents[1]))  # to import from tests
 
 import gymnasium as gym
 import highway_env  # noqa: F401  (registers racetrack-v0)

@@ -1,8 +1,8 @@
-"""Twelve cars for ten minutes on one, two and three lanes of every track, the own car among them.
+"""Traffic of twelve cars for ten minutes on one, two and three lanes of every track.
 
 Run: `python benchmarks/traffic.py [--minutes 10] [--tracks town,highway] [--json FILE]`. Claim: no
-two cars ever overlap, whether the own car drives along or is parked in the rightmost lane; on two
-and three lanes cars do change lanes. Exits 1 otherwise.
+two cars ever overlap, whether the ego car drives or is parked in the rightmost lane; on two and
+three lanes cars change lanes. Exits 1 otherwise.
 """
 
 import argparse
@@ -14,19 +14,21 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
+sys.path.insert(0, str(Path(__file__).parents[1]))  # to import from tests
+
 from simulator.track.catalogue import find_track, track_files
 from simulator.track.road import Road
-from tests.simulator.traffic_audit import Disorder, watch
+from tests.simulator.traffic_audit import TrafficViolation, audit_traffic
 
 
 def one(case: tuple[str, int, bool], seconds: float) -> dict[str, Any]:
-    """Watch one road; what was seen, or what went wrong."""
+    """The statistics of one road, or the violation found."""
     name, lanes, parked = case
-    about = {"track": name, "lanes": lanes, "own_car": "parked" if parked else "drives"}
+    about = {"track": name, "lanes": lanes, "ego_car": "parked" if parked else "drives"}
     try:
-        return about | asdict(watch(Road(find_track(name), lanes), seconds, parked=parked))
-    except Disorder as wrong:
-        return about | {"disorder": str(wrong)}
+        return about | asdict(audit_traffic(Road(find_track(name), lanes), seconds, parked=parked))
+    except TrafficViolation as wrong:
+        return about | {"violation": str(wrong)}
 
 
 def main() -> int:
@@ -41,12 +43,12 @@ def main() -> int:
         results = list(pool.map(one, cases, [60.0 * arguments.minutes] * len(cases)))
     for result in results:
         print(json.dumps(result))
-    wrong = [result for result in results if "disorder" in result]
+    wrong = [result for result in results if "violation" in result]
     changes = {
         lanes: sum(r.get("lane_changes", 0) for r in results if r["lanes"] == lanes)
         for lanes in (1, 2, 3)
     }
-    print(f"{len(results)} roads, {len(wrong)} in disorder; lane changes by lanes: {changes}")
+    print(f"{len(results)} roads, {len(wrong)} in violation; lane changes by lanes: {changes}")
     if arguments.json:
         arguments.json.write_text(json.dumps(results, indent=2) + "\n")
     return 0 if not wrong and changes[1] == 0 and changes[2] > 0 and changes[3] > 0 else 1

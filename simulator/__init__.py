@@ -1,12 +1,12 @@
 """VTORCS: tracks, physics, traffic, sensors, camera and the Gymnasium environments.
 
-Gymnasium learns the environments' names when this package is imported after it, or from
-`import simulator.env`; Gymnasium itself looks for no packages since its version 1.0.
+The environments are registered with Gymnasium when this package is imported after `gymnasium`, or
+by `import simulator.env`; Gymnasium 1.0 and later does not search packages for environments.
 """
 
 import sys
 
-if "gymnasium" in sys.modules:  # a command that needs no environment does not pay for importing it
+if "gymnasium" in sys.modules:  # commands without environments do not import gymnasium
     from simulator.registration import register_environments
 
     register_environments()

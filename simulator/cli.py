@@ -1,4 +1,4 @@
-"""The `simulator` command: lists tracks, writes centre lines, shows what a track looks like.
+"""The `simulator` command: tracks, centre lines, rendered views, the link server, the live view.
 
 simulator tracks --json
 simulator tracks plot forza --out forza.png

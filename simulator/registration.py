@@ -1,4 +1,4 @@
-"""Makes Gymnasium know the environments (see the package's own page for when this happens)."""
+"""Registers the environments with Gymnasium; the package's docstring says when."""
 
 ENVIRONMENTS = {
     "driverview/LateralControl-v0": "simulator.env:LateralControl",

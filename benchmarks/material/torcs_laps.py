@@ -20,7 +20,7 @@ from controllers.torcs_feedback import StateFeedback
 from simulator.track.catalogue import find_track
 from simulator.track.road import Road
 from simulator.vehicle.state import CarState, Command
-from simulator.world.physics import PHYSICS_HZ
+from simulator.world.control_rate import PHYSICS_HZ
 from simulator.world.world import World
 from trackfeatures import Heading, UserError
 

@@ -10,7 +10,7 @@ from datagen.driving.trajectory import Course, max_offset
 from simulator.driving.lateral_law import MIN_SPEED, PREVIEW_S, LateralLaw, feedback_speed
 from simulator.driving.speed import SpeedControl, speed_profile
 from simulator.track.road import Road
-from simulator.traffic.traffic import EGO_SIZE, SIZE, Traffic
+from simulator.traffic.traffic import EGO_CAR_SIZE, TRAFFIC_CAR_SIZE, Traffic
 from simulator.vehicle.car import CarParameters
 from simulator.vehicle.state import CarState, Command
 
@@ -130,7 +130,7 @@ class ScriptedDriver:
         """`wanted` (m) kept on the road and clear of cars alongside; False if it was changed."""
         low, high = -self._max_offset, self._max_offset
         length = self._road.track.length_m
-        near = 0.5 * (SIZE[0] + EGO_SIZE[0]) + 2.0 + 0.4 * max(state.speed, 0.0)
+        near = 0.5 * (TRAFFIC_CAR_SIZE[0] + EGO_CAR_SIZE[0]) + 2.0 + 0.4 * max(state.speed, 0.0)
         for s, y in zip(traffic.s.tolist(), traffic.to_middle.tolist(), strict=True):
             ahead = (s - state.s + 0.5 * length) % length - 0.5 * length
             # For a car ahead in the same lane the driver brakes; it does not steer away.

@@ -12,7 +12,7 @@ from typing import Any
 
 import trackfeatures as tf
 from datagen.planning.config import CollectConfig
-from simulator.world.physics import PHYSICS_HZ
+from simulator.world.control_rate import PHYSICS_HZ
 from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
 

@@ -11,8 +11,8 @@ or, without the second line, by Gymnasium's own syntax for names that a module r
     gymnasium.make("simulator.env:driverview/LateralControl-v0")
 
 An episode starts 25 m before the line, at rest, unless `reset(options={"s", "to_middle", "angle",
-"speed"})` says otherwise; it ends off the track, backwards or in a collision, and is cut after
-6500 steps (`max_episode_steps` of `gymnasium.make`).
+"speed"})` sets another start. It terminates off the track, backwards or in a collision, and is
+truncated after 6500 steps (`max_episode_steps` of `gymnasium.make`).
 """
 
 import difflib
@@ -30,7 +30,7 @@ from simulator.env.action import Controls, action_space, check_controls, to_comm
 from simulator.env.episode import EpisodeOptions
 from simulator.env.observation import Kind, Observation, ObservationOptions, Observer
 from simulator.env.reward import Ending
-from simulator.env.view_renderer import PictureOptions, Pictures
+from simulator.env.view_renderer import RenderOptions, ViewRenderer
 from simulator.registration import register_environments
 from simulator.track.catalogue import find_track
 from simulator.track.road import Road
@@ -43,12 +43,12 @@ START_OPTIONS = ("s", "to_middle", "angle", "speed")
 
 
 class ResetNeeded(UserError, gym.error.ResetNeeded):
-    """A step was taken where there is no episode to take it in."""
+    """`step` was called before `reset` or after the end of an episode."""
 
 
 @dataclass(frozen=True)
 class DriveOptions:
-    """The road, what is on it, and how one drives."""
+    """The road, its traffic and the controls."""
 
     track: str = "circuit"
     lanes: int = 1
@@ -57,34 +57,34 @@ class DriveOptions:
     """Other cars, 0 to 12."""
 
     frequency_hz: int = 20
-    """Control steps a second; divides the physics' 200 Hz."""
+    """Control steps per second; must divide the physics' 200 Hz."""
 
     controls: Controls = "steer"
-    """"steer": the steering, throttle 0.2 and gear 1 held; "full": steering, throttle, brake,
+    """"steer": steering only, at throttle 0.2 in gear 1; "full": steering, throttle, brake and
     gear."""
 
     tracks_dir: str | Path | None = None
-    """A folder of further tracks."""
+    """A folder to search for tracks as well."""
 
     def __post_init__(self) -> None:
         check_controls(self.controls)
 
 
-OPTIONS = (DriveOptions, EpisodeOptions, ObservationOptions, PictureOptions)
+OPTIONS = (DriveOptions, EpisodeOptions, ObservationOptions, RenderOptions)
 
 
 class LateralControl(gym.Env[Any, Any]):
-    """Keep the car in the middle of the track, on its state.
+    """Keep the car in the middle of the track, from its state.
 
     Observation (7,) float32: to_middle/w, angle/pi, v_x and v_y over 75 km/h, heading class
     one-hot (left, straight, right). Action: steering in [-1, 1], left positive.
 
     Keyword arguments are the fields of DriveOptions, EpisodeOptions, ObservationOptions and
-    PictureOptions, and `render_mode` ("rgb_array" or None). Raises UserError for options or actions
+    RenderOptions, and `render_mode` ("rgb_array" or None). Raises UserError for options or actions
     out of their ranges, ResetNeeded for a step before a reset or after the end of an episode.
     """
 
-    # Gymnasium types it as an instance's, but reads it off the class.
+    # Gymnasium types it as an instance attribute, but reads it from the class.
     metadata: dict[str, Any] = RENDERING
     kind: ClassVar[Kind] = "state"
 
@@ -98,11 +98,13 @@ class LateralControl(gym.Env[Any, Any]):
     ) -> None:
         if render_mode not in (None, "rgb_array"):
             raise UserError(f'render_mode is {render_mode!r}; choose "rgb_array" or leave it out')
-        drive, self.rules, observation, picture = _split({"track": track, "lanes": lanes} | options)
+        drive, self._episode, observation, picture = _split_options(
+            {"track": track, "lanes": lanes} | options
+        )
         tracks_dir = None if drive.tracks_dir is None else Path(drive.tracks_dir)
         road = Road(find_track(drive.track, tracks_dir), drive.lanes, drive.lane_width)
-        self._pictures, self._render_view = Pictures(road, picture), picture.render_view
-        self._observer = Observer(observation.completed(self.kind), self._pictures)
+        self._renderer, self._render_view = ViewRenderer(road, picture), picture.render_view
+        self._observer = Observer(observation.resolved(self.kind), self._renderer)
         self.world = World(road, traffic=drive.traffic, frequency_hz=drive.frequency_hz)
         self.render_mode = render_mode
         self.metadata = {**RENDERING, "render_fps": drive.frequency_hz}
@@ -125,7 +127,7 @@ class LateralControl(gym.Env[Any, Any]):
         self._observer.restart(episode)
         self._running = True
         self._score, self._steps = 0.0, 0
-        return self._report(state, None)
+        return self._observe(state, None)
 
     def step(
         self, action: NDArray[np.float32]
@@ -135,30 +137,32 @@ class LateralControl(gym.Env[Any, Any]):
                 "there is no episode to step in: call reset() first, and after an end"
             )
         state = self.world.step(to_command(action, self._controls))
-        ending = self.rules.ending(state)
-        reward = self.rules.pay(state, self.world.road, ending)
+        ending = self._episode.ending(state)
+        reward = self._episode.compute_reward(state, self.world.road, ending)
         self._running = ending is None
         self._score += reward
         self._steps += 1
-        observation, info = self._report(state, ending)
+        observation, info = self._observe(state, ending)
         return observation, reward, ending is not None, False, info
 
     def render(self) -> NDArray[np.uint8] | None:
         """`render_view` (H, W, 3) with `render_mode="rgb_array"`, else None."""
         if self.render_mode is None:
             return None
-        return self._pictures.take(self.world, (self._render_view,))[self._render_view]
+        return self._renderer.render(self.world, (self._render_view,))[self._render_view]
 
     def calibration(self) -> dict[str, NDArray[np.float64]]:
         """`intrinsics` (3, 3) in pixels, and by each view's name its `Camera.extrinsics` (4, 4)."""
-        return self._pictures.calibration(self._observer.views or (self._render_view,))
+        return self._renderer.calibration(self._observer.views or (self._render_view,))
 
     def close(self) -> None:
         self._running = False
-        self._pictures.close()
+        self._renderer.close()
         self.world.close()
 
-    def _report(self, state: CarState, ending: Ending | None) -> tuple[Observation, dict[str, Any]]:
+    def _observe(
+        self, state: CarState, ending: Ending | None
+    ) -> tuple[Observation, dict[str, Any]]:
         features = self.world.features()
         observation = self._observer.observe(self.world, features, self.np_random)
         return observation, {
@@ -174,12 +178,12 @@ class LateralControl(gym.Env[Any, Any]):
             "rpm": state.rpm,
             "collision": state.collision or "",
             "ended": ending or "",
-            "features": _plain(features),
+            "features": _feature_values(features),
         }
 
 
 class DriverView(LateralControl):
-    """Keep the car in the middle on what the driver sees.
+    """Keep the car in the middle of the track, from the driver's camera view.
 
     Observation: {"image": (height, width, 3) uint8 RGB, "state": (7,) as in LateralControl}.
     """
@@ -187,10 +191,10 @@ class DriverView(LateralControl):
     kind: ClassVar[Kind] = "dict"
 
 
-def _split(
+def _split_options(
     given: dict[str, Any],
-) -> tuple[DriveOptions, EpisodeOptions, ObservationOptions, PictureOptions]:
-    """The four groups of options out of keyword arguments."""
+) -> tuple[DriveOptions, EpisodeOptions, ObservationOptions, RenderOptions]:
+    """The four groups of options from keyword arguments. Raises UserError for an unknown one."""
     names = [field.name for group in OPTIONS for field in fields(group)]
     for name in given:
         if name not in names:
@@ -205,12 +209,12 @@ def _split(
         DriveOptions(**drive),
         EpisodeOptions(**episode),
         ObservationOptions(**observation),
-        PictureOptions(**picture),
+        RenderOptions(**picture),
     )
 
 
-def _plain(features: tf.TrackFeatures) -> dict[str, float]:
-    """The features there are; an absent one is left out, as Gymnasium's vectors expect it."""
+def _feature_values(features: tf.TrackFeatures) -> dict[str, float]:
+    """The features that are present; absent ones are left out, as Gymnasium's vectors expect."""
     given = features.distances | {"to_lane_centre": features.to_lane_centre}
     present = {name: value for name, value in given.items() if value is not None}
     return present | {"angle": features.angle, "heading": int(features.heading)}

@@ -12,7 +12,7 @@ from trackfeatures.errors import UserError
 Controls = Literal["steer", "full"]
 
 THROTTLE, GEAR = 0.2, 1
-"""The paper holds both while it steers."""
+"""Held constant while only the steering is controlled, as in the paper."""
 
 LIMITS = {
     "steer": (-1.0, 1.0),
@@ -36,7 +36,7 @@ def action_space(controls: Controls) -> gym.spaces.Box:
 
 
 def to_command(action: Any, controls: Controls) -> Command:
-    """What `action` commands; the gear is rounded. Raises UserError for one out of the space."""
+    """The command for `action`; the gear is rounded. Raises UserError outside the action space."""
     values = np.asarray(action, dtype=np.float64)
     names = NAMES[controls]
     if values.shape != (len(names),):

@@ -1,4 +1,4 @@
-"""What an agent observes: the paper's state, pictures, or a dict of both and of sensors."""
+"""Observations: the paper's state vector, a camera view, or a dict of state, views and sensors."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import trackfeatures as tf
-from simulator.env.view_renderer import Pictures
+from simulator.env.view_renderer import ViewRenderer
 from simulator.sensors.sensor import Reading, Sensor, SensorSuite
 from simulator.sensors.standard import CAMERA, picture_sensor, sensors_of
 from simulator.world.world import World
@@ -22,32 +22,32 @@ Observation = dict[str, NDArray[Any]] | NDArray[Any]
 KINDS: tuple[Kind, ...] = get_args(Kind)
 STATE_SIZE = 7
 SPEED_SCALE = 75.0 / 3.6  # m/s
-PAPERS_NOISE = 0.05
+PAPER_STATE_NOISE = 0.05
 STATE_LIMIT = 10.0
-"""Ten half widths, 750 km/h: no drive comes near; it gives the space bounds."""
+"""Bound of the observation space: ten half widths, 750 km/h; beyond what a drive can reach."""
 STATE, IMAGE = "state", "image"
 
 
 @dataclass(frozen=True)
 class ObservationOptions:
-    """What an environment observes, and how exactly."""
+    """Contents and noise of the observations. Raises UserError for a bad option."""
 
     observation: Kind | None = None
-    """"state": (7,); "image": one picture; "dict": the state, each view and each sensor by its
-    name, one view alone as "image". None: what the environment is for, or a dict where `views` or
-    `sensors` ask for more."""
+    """"state": (7,); "image": one view; "dict": the state, each view and each sensor by its name (a
+    single view is named "image"). None: the environment's own kind, or "dict" if `views` or
+    `sensors` are given."""
 
     views: Sequence[str] | None = None
-    """Names of the pictures; None is the driver's view where there is to be a picture."""
+    """Names of the views; None is the driver's view, if the observation has images."""
 
     sensors: Sequence[str | Sensor] = ()
-    """Sensors by their name in the paper's table, or of the user's own."""
+    """Sensors by their name in the paper's table, or Sensor objects."""
 
     noise: float | bool = 0.0
-    """Standard deviation of the noise on the state; True is the paper's 0.05."""
+    """Standard deviation of the noise on the state; True means the paper's 0.05."""
 
     sensor_noise: Mapping[str, float] = field(default_factory=dict)
-    """Standard deviation of a sensor's noise in its unit, by the sensor's name."""
+    """Standard deviation of each sensor's noise, in its unit, by sensor name."""
 
     def __post_init__(self) -> None:
         if self.observation is not None and self.observation not in KINDS:
@@ -61,12 +61,12 @@ class ObservationOptions:
     @property
     def state_noise(self) -> float:
         """Standard deviation of the noise on the state."""
-        return PAPERS_NOISE if self.noise is True else float(self.noise)
+        return PAPER_STATE_NOISE if self.noise is True else float(self.noise)
 
-    def completed(self, kind: Kind) -> "ObservationOptions":
-        """With `observation` and `views` filled in for an environment that is made for `kind`.
+    def resolved(self, kind: Kind) -> "ObservationOptions":
+        """A copy with `observation` and `views` filled in for an environment of this `kind`.
 
-        Raises UserError where they do not fit each other.
+        Raises UserError for options that contradict each other.
         """
         chosen = self.observation or ("dict" if self.views or self.sensors else kind)
         pictured = chosen == "image" or (chosen == kind == "dict")
@@ -85,36 +85,36 @@ class ObservationOptions:
 
 
 class Observer:
-    """Builds an environment's observations; `options` are completed ones."""
+    """Builds an environment's observations; `options` must be resolved."""
 
-    def __init__(self, options: ObservationOptions, pictures: Pictures) -> None:
+    def __init__(self, options: ObservationOptions, renderer: ViewRenderer) -> None:
         self._kind, self._noise = options.observation, options.state_noise
-        self._pictures = pictures
+        self._renderer = renderer
         self.views = tuple(options.views or ())
         self.suite = SensorSuite(
-            sensors_of(self._with_camera(options.sensors)), noise=options.sensor_noise
+            sensors_of(self._replace_camera_sensor(options.sensors)), noise=options.sensor_noise
         )
-        # The noise of a state has its own bounds: ten standard deviations more.
+        # The bounds of a noisy state are wider by ten standard deviations.
         self._limit = STATE_LIMIT * (1.0 + self._noise)
         self.space = self._space()
 
     def restart(self, seed: int) -> None:
-        """Begin the sensors' noise of an episode."""
+        """Seed the sensors' noise for an episode."""
         self.suite.restart(seed)
 
     def observe(
         self, world: World, features: tf.TrackFeatures, rng: np.random.Generator
     ) -> Observation:
-        """The observation of the present moment; `rng` draws the noise on the state."""
+        """The observation of the current state; `rng` draws the noise on the state."""
         if self._kind == "image":
-            return self._pictures.take(world, self.views)[self.views[0]]
+            return self._renderer.render(world, self.views)[self.views[0]]
         state = self._state(world, features, rng)
         if self._kind == "state":
             return state
         observed: dict[str, NDArray[Any]] = {STATE: state}
         if self.views:
-            taken = self._pictures.take(world, self.views)
-            observed |= {self._key(view): picture for view, picture in taken.items()}
+            images = self._renderer.render(world, self.views)
+            observed |= {self._key(view): image for view, image in images.items()}
         for sensor, reading in zip(
             self.suite.sensors, self.suite.read(world).values(), strict=True
         ):
@@ -143,7 +143,7 @@ class Observer:
 
     def _space(self) -> gym.Space[Any]:
         state = gym.spaces.Box(-self._limit, self._limit, (STATE_SIZE,), np.float32)
-        views = {self._key(view): self._pictures.space(view) for view in self.views}
+        views = {self._key(view): self._renderer.space(view) for view in self.views}
         if self._kind == "state":
             return state
         if self._kind == "image":
@@ -151,17 +151,17 @@ class Observer:
         sensors = {sensor.name: _sensor_space(sensor) for sensor in self.suite.sensors}
         clash = sorted({STATE, *views} & set(sensors))
         if clash:
-            raise UserError(f"sensors are named like the observation's own parts: {clash}")
+            raise UserError(f"sensors are named like other parts of the observation: {clash}")
         return gym.spaces.Dict({STATE: state, **views, **sensors})
 
     def _key(self, view: str) -> str:
         return IMAGE if len(self.views) == 1 else view
 
-    def _with_camera(self, sensors: Sequence[str | Sensor]) -> list[str | Sensor]:
-        """The table's camera, wherever it is asked for, is the driver's view."""
-        pictures = self._pictures
+    def _replace_camera_sensor(self, sensors: Sequence[str | Sensor]) -> list[str | Sensor]:
+        """Replace the name "camera" by a sensor that renders the driver's view."""
+        renderer = self._renderer
         camera = picture_sensor(
-            CAMERA, lambda world: pictures.take(world, ("front",))["front"], pictures.shape
+            CAMERA, lambda world: renderer.render(world, ("front",))["front"], renderer.shape
         )
         return [camera if sensor == CAMERA else sensor for sensor in sensors]
 

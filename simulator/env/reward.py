@@ -1,4 +1,8 @@
-"""The reward of the paper (section on the RL control module): heading and place on the track."""
+"""The reward of a control step, and what ends an episode.
+
+The formula is that of the paper's section on the RL control module, with one difference: the paper
+divides the lateral offset by half the width of the lane, this code by half the width of the track.
+"""
 
 import math
 from collections.abc import Collection
@@ -13,12 +17,12 @@ OFF_TRACK_REWARD = -2.0
 
 
 def ending(state: CarState, ends: Collection[Ending] = ENDINGS) -> Ending | None:
-    """Which of `ends` ends a drive at `state`, None while it goes on.
+    """Which of `ends` ends an episode at `state`, None if it goes on.
 
-    The rails belong to leaving the track; where that ends nothing, a blow on them is a collision.
+    Contact with a wall counts as "off_track"; if that is not among `ends`, as "collision".
     """
-    # Walls stand 2.5 m beyond the edge, so that the car is off the track before it meets one; it
-    # stays so where the blow throws it back onto the road within the same control step.
+    # Walls stand 2.5 m beyond the edge, so the car is off the track before it touches one. The
+    # contact counts even if the car is back on the road by the end of the same control step.
     if (state.off_track or state.collision == "wall") and "off_track" in ends:
         return "off_track"
     if state.backwards and "backwards" in ends:
@@ -33,10 +37,11 @@ def step_reward(
     ended: bool,
     weight: float = 1.0,
 ) -> float:
-    """cos(angle) - weight |sin(angle)| - |to_middle| / half_width, or -2 when the episode ends.
+    """cos(angle) - weight |sin(angle)| - |to_middle| / half_width, or -2 when the episode ends or
+    the car points backwards (|angle| >= pi/2).
 
-    angle in rad, to_middle and half_width (half of the track's own width) in m. A score is the
-    sum over a fixed number of steps.
+    angle in rad, to_middle and half_width (half of the track's own width) in m; weight is the
+    paper's lambda. A score is the sum over a fixed number of steps.
     """
     if ended or abs(angle) >= 0.5 * math.pi:
         return OFF_TRACK_REWARD

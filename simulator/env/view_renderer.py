@@ -1,4 +1,4 @@
-"""An environment's pictures: one camera, made when first needed; each view drawn once a step."""
+"""Rendering of an environment's views: one camera, built on first use; each view once a step."""
 
 import weakref
 from collections.abc import Sequence
@@ -20,21 +20,21 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class PictureOptions:
-    """An environment's pictures; their scenery and light depend on `light_seed` only."""
+class RenderOptions:
+    """Rendering of an environment's views; scenery and light depend on `light_seed` only."""
 
     width: int = 280
     height: int = 210
     light: str = "clear"
-    """A kind of light and weather by its name."""
+    """Name of a light and weather condition."""
 
     light_seed: int = 0
     mount: CameraParameters | None = None
-    """Place, pitch and lens of the driver camera, whose size is `width` and `height`; None is the
-    driver's seat."""
+    """Position, pitch and field of view of the driver camera, whose size is `width` and `height`;
+    None is the default position."""
 
     render_view: str = "front"
-    """The view in colour that `render()` shows."""
+    """The view that `render()` returns, in colour."""
 
     def __post_init__(self) -> None:
         from simulator.camera import VIEWS, check_light, check_size
@@ -52,17 +52,17 @@ class PictureOptions:
         return replace(mount, width=self.width, height=self.height)
 
 
-class Pictures:
-    """Views of a world by name, each drawn at most once for one moment."""
+class ViewRenderer:
+    """Renders views of a world by name, each at most once per state."""
 
-    def __init__(self, road: Road, options: PictureOptions) -> None:
+    def __init__(self, road: Road, options: RenderOptions) -> None:
         self._road, self._options = road, options
         self._camera: Camera | None = None
-        self._moment: CarState | None = None
-        self._drawn: dict[str, NDArray[Any]] = {}
+        self._rendered_state: CarState | None = None
+        self._images: dict[str, NDArray[Any]] = {}
 
     def space(self, view: str) -> gym.spaces.Box:
-        """Of the pictures of `view`. Raises UserError for an unknown one."""
+        """The observation space of `view`. Raises UserError for an unknown view."""
         from simulator.camera.core.optics import FAR_M
         from simulator.camera.core.render_modes import CLASS, CLASSES, DEPTH, ViewRequest
 
@@ -76,29 +76,30 @@ class Pictures:
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        """(height, width, 3) of a picture in colour."""
+        """(height, width, 3) of an image in colour."""
         return self._options.height, self._options.width, 3
 
-    def take(self, world: World, views: Sequence[str]) -> dict[str, NDArray[Any]]:
-        """The views of the present moment, in the order asked for; the caller's to keep.
+    def render(self, world: World, views: Sequence[str]) -> dict[str, NDArray[Any]]:
+        """Copies of the views of the current state, in the order of `views`.
 
-        As `Camera.render_views` has them, but the sky is as far as the space goes, 6000 m.
+        As from `Camera.render_views`, but with the depth of the sky at the bound of the space,
+        6000 m.
         """
-        if world.state is not self._moment:
-            self._moment, self._drawn = world.state, {}
-        missing = [view for view in views if view not in self._drawn]
+        if world.state is not self._rendered_state:
+            self._rendered_state, self._images = world.state, {}
+        missing = [view for view in views if view not in self._images]
         if missing:
-            self._drawn |= self._draw(world, missing)
-        return {view: self._drawn[view].copy() for view in views}
+            self._images |= self._render_missing(world, missing)
+        return {view: self._images[view].copy() for view in views}
 
-    def _draw(self, world: World, views: Sequence[str]) -> dict[str, NDArray[Any]]:
+    def _render_missing(self, world: World, views: Sequence[str]) -> dict[str, NDArray[Any]]:
         from simulator.camera.core.optics import FAR_M
 
-        drawn = self.camera.render_views(world.body_pose(), world.traffic.poses(), views)
-        for picture in drawn.values():
-            if picture.dtype == np.float32:
-                np.minimum(picture, FAR_M, out=picture)
-        return drawn
+        images = self.camera.render_views(world.body_pose(), world.traffic.poses(), views)
+        for image in images.values():
+            if image.dtype == np.float32:
+                np.minimum(image, FAR_M, out=image)
+        return images
 
     def calibration(self, views: Sequence[str]) -> dict[str, NDArray[np.float64]]:
         """`intrinsics` (3, 3) in pixels, and by each view's name its extrinsics (4, 4), from the
@@ -113,23 +114,23 @@ class Pictures:
 
     @property
     def camera(self) -> "Camera":
-        """The camera; making it draws the scenery and takes a moment."""
+        """The camera, built on first use: building the scenery takes seconds."""
         if self._camera is None:
-            self._camera = _make_camera(self._road, self._options)
-            # Graphics memory of an environment that is dropped without close() comes back too.
+            self._camera = _build_camera(self._road, self._options)
+            # Frees the graphics memory of an environment that is dropped without close().
             weakref.finalize(self, self._camera.close).atexit = False
         return self._camera
 
     def close(self) -> None:
-        """Free the graphics memory; another picture makes a new camera."""
+        """Free the graphics memory; the next `render` builds a new camera."""
         if self._camera is not None:
             self._camera.close()
             self._camera = None
-        self._drawn = {}
+        self._images = {}
 
 
-def _make_camera(road: Road, options: PictureOptions) -> "Camera":
-    from simulator.camera import Camera, Light  # the renderer only where images are
+def _build_camera(road: Road, options: RenderOptions) -> "Camera":
+    from simulator.camera import Camera, Light  # loads the renderer only when images are needed
 
     light = Light.named(options.light, np.random.default_rng([options.light_seed, 2]))
     return Camera(road, options.camera, seed=options.light_seed, light=light)

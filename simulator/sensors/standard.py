@@ -20,7 +20,7 @@ from simulator.sensors.beams import (
 )
 from simulator.sensors.sensor import Sensor
 from simulator.track.kernel import index_at
-from simulator.traffic.traffic import SIZE
+from simulator.traffic.traffic import TRAFFIC_CAR_SIZE
 from simulator.world.world import World
 from trackfeatures.errors import UserError
 
@@ -44,7 +44,16 @@ def read_range(world: World) -> NDArray[np.float64]:
     if world.traffic.count and distances[0] >= 0.0:
         now = world.state
         poses = world.traffic.poses()
-        shorten_at_boxes(distances, now.x, now.y, now.yaw, BEAM_ANGLES, poses, SIZE[0], SIZE[1])
+        shorten_at_boxes(
+            distances,
+            now.x,
+            now.y,
+            now.yaw,
+            BEAM_ANGLES,
+            poses,
+            TRAFFIC_CAR_SIZE[0],
+            TRAFFIC_CAR_SIZE[1],
+        )
     return distances
 
 

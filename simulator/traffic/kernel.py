@@ -1,7 +1,7 @@
-"""One step of all traffic cars: who leads whom, lane changes, speeds, places.
+"""Compiled step of all traffic cars: leaders, lane changes, speeds, positions.
 
-Everything is in the track frame: s along the centre line, y to the left, m and m/s. A car in the
-middle of a lane change holds both lanes: others keep behind it in either.
+Track frame: s along the centre line, y to the left, m and m/s. A car in a lane change occupies both
+lanes: cars in either lane follow it.
 """
 
 import math
@@ -14,33 +14,35 @@ from simulator.track import kernel
 from simulator.traffic.idm import COMFORTABLE_BRAKING, STANDSTILL_GAP_M, idm_acceleration
 
 # Columns of a car's row.
-S, Y, SPEED, DESIRED, Y_FROM, Y_TO, DONE, CHANGE_M, REST_S, STRUCK = range(10)
+S, Y, SPEED, DESIRED, Y_FROM, Y_TO, CHANGE_PROGRESS, CHANGE_LENGTH_M, COOLDOWN_S, STRUCK = range(10)
 CAR_COLUMNS = 10
-# A car that was hit (STRUCK is 1) is moved by others: here it only stands in the way.
-# Columns of a body's row: what others see of a car, or of the ego car (the last row).
+# CHANGE_PROGRESS goes from 0 to 1 over a lane change of CHANGE_LENGTH_M; COOLDOWN_S: time until
+# the next one may start. A car with STRUCK = 1 was hit: physics moves it, here it is an obstacle.
+# Columns of a body's row: the extent and speed of a car as others see it; the last row is the ego
+# car.
 B_S, B_RIGHT, B_LEFT, B_SPEED, B_HALF_LENGTH, B_DESIRED = range(6)
 BODY_COLUMNS = 6
 
-SIDE_MARGIN_M = 0.3  # cars that pass closer than this are in each other's way
+SIDE_MARGIN_M = 0.3  # cars with a smaller lateral gap than this are in one corridor
 CHANGE_TIME_S = 4.0
-SHORTEST_CHANGE_M = 25.0
-REST_BETWEEN_CHANGES_S = 3.0
-SAFE_BRAKING = COMFORTABLE_BRAKING  # a lane change asks no more than this of anyone
-WORTH_CHANGING = 0.2  # m/s2 to be gained
-LEAST_STRETCH = 0.05  # of a metre of s, near the middle of a bend
-POLITENESS = 0.2  # MOBIL: how much the loss of the new follower counts
+MIN_CHANGE_LENGTH_M = 25.0
+CHANGE_COOLDOWN_S = 3.0
+SAFE_BRAKING = COMFORTABLE_BRAKING  # m/s2: the most a lane change may require of any car
+MIN_GAIN = 0.2  # m/s2: the gain in acceleration above which a car changes lanes
+MIN_LENGTH_RATIO = 0.05  # lane length over centre-line length, near the centre of a bend
+POLITENESS = 0.2  # MOBIL: weight of the new follower's loss
 
 Table = NDArray[np.float64]
 
 
 @compiled
-def ahead_m(from_s: float, to_s: float, length: float) -> float:
-    """How far `to_s` lies ahead of `from_s` on a loop, in [-length/2, length/2)."""
+def signed_distance(from_s: float, to_s: float, length: float) -> float:
+    """Distance (m) of `to_s` ahead of `from_s` on a loop, in [-length/2, length/2)."""
     return (to_s - from_s + 0.5 * length) % length - 0.5 * length
 
 
 @compiled
-def neighbour(
+def nearest_body(
     bodies: Table,
     me: int,
     s: float,
@@ -52,8 +54,8 @@ def neighbour(
 ) -> tuple[int, float]:
     """The nearest body in the corridor [right, left], ahead or behind: (row, bumper gap in m).
 
-    (-1, inf) when there is none. The gap is negative when the two overlap lengthwise. Bodies at
-    the same s count as ahead in the order of their rows, so that every pair has one follower.
+    (-1, inf) if there is none. The gap is negative when the two overlap lengthwise. Of two bodies
+    at the same s, the one with the higher row is ahead, so that each pair has one follower.
     """
     found, smallest = -1, math.inf
     for other in range(bodies.shape[0]):
@@ -63,7 +65,7 @@ def neighbour(
             continue
         if bodies[other, B_LEFT] < right - SIDE_MARGIN_M:
             continue
-        distance = ahead_m(s, bodies[other, B_S], length)
+        distance = signed_distance(s, bodies[other, B_S], length)
         is_ahead = distance > 0.0 or (distance == 0.0 and other > me)
         if is_ahead != ahead:
             continue
@@ -74,7 +76,7 @@ def neighbour(
 
 
 @compiled
-def follow(
+def following_acceleration(
     bodies: Table,
     me: int,
     s: float,
@@ -86,13 +88,13 @@ def follow(
     length: float,
 ) -> float:
     """Acceleration (m/s2) of a car at `s` in the corridor [right, left]."""
-    lead, gap = neighbour(bodies, me, s, right, left, half_length, length, True)
+    lead, gap = nearest_body(bodies, me, s, right, left, half_length, length, True)
     lead_speed = bodies[lead, B_SPEED] if lead >= 0 else speed
     return idm_acceleration(gap, speed, lead_speed, desired)
 
 
 @compiled
-def room_in(
+def lane_change_safe(
     bodies: Table,
     me: int,
     s: float,
@@ -102,27 +104,27 @@ def room_in(
     half_length: float,
     length: float,
 ) -> tuple[bool, float]:
-    """Whether a car may move into the corridor: (both gaps are safe, follower's loss in m/s2)."""
-    lead, gap = neighbour(bodies, me, s, right, left, half_length, length, True)
+    """Whether a car may change into the corridor: (both gaps are safe, follower's loss in m/s2)."""
+    lead, gap = nearest_body(bodies, me, s, right, left, half_length, length, True)
     if lead >= 0:
         lead_speed = bodies[lead, B_SPEED]
         if gap < STANDSTILL_GAP_M + 0.5 * speed:
             return False, 0.0
-        # Judged without a wish for speed of its own: only what the leader asks.
+        # At an unlimited desired speed, so that only the leader's effect is judged.
         if idm_acceleration(gap, speed, lead_speed, 1e3) < -SAFE_BRAKING:
             return False, 0.0
-    behind, gap = neighbour(bodies, me, s, right, left, half_length, length, False)
+    behind, gap = nearest_body(bodies, me, s, right, left, half_length, length, False)
     if behind < 0:
         return True, 0.0
-    his = bodies[behind, B_SPEED]
-    if gap < STANDSTILL_GAP_M + 0.5 * his:
+    follower_speed = bodies[behind, B_SPEED]
+    if gap < STANDSTILL_GAP_M + 0.5 * follower_speed:
         return False, 0.0
-    after = idm_acceleration(gap, his, speed, bodies[behind, B_DESIRED])
-    before = follow(
+    after = idm_acceleration(gap, follower_speed, speed, bodies[behind, B_DESIRED])
+    before = following_acceleration(
         bodies,
         behind,
         bodies[behind, B_S],
-        his,
+        follower_speed,
         bodies[behind, B_DESIRED],
         bodies[behind, B_RIGHT],
         bodies[behind, B_LEFT],
@@ -133,8 +135,8 @@ def room_in(
 
 
 @compiled
-def show(cars: Table, bodies: Table, half_length: float, half_width: float) -> None:
-    """Writes what others see of the cars into the first rows of `bodies`."""
+def update_bodies(cars: Table, bodies: Table, half_length: float, half_width: float) -> None:
+    """Update the first rows of `bodies` (n + 1, BODY_COLUMNS) from `cars`; skips struck cars."""
     for i in range(cars.shape[0]):
         if cars[i, STRUCK] > 0.0:
             continue
@@ -147,65 +149,73 @@ def show(cars: Table, bodies: Table, half_length: float, half_width: float) -> N
 
 
 @compiled
-def choose_lane(
+def decide_lane_change(
     cars: Table, bodies: Table, i: int, lane_y: Table, half_width: float, length: float
 ) -> None:
-    """Starts a lane change of car `i` where it is safe and pays (MOBIL, Kesting et al. 2007)."""
+    """Start a lane change of car `i` if it is safe and gains enough (MOBIL, Kesting 2007)."""
     y, speed, half_length = cars[i, Y_TO], cars[i, SPEED], bodies[i, B_HALF_LENGTH]
     s, desired = cars[i, S], cars[i, DESIRED]
-    here = follow(bodies, i, s, speed, desired, y - half_width, y + half_width, half_length, length)
-    best, best_gain = y, WORTH_CHANGING
+    here = following_acceleration(
+        bodies, i, s, speed, desired, y - half_width, y + half_width, half_length, length
+    )
+    best, best_gain = y, MIN_GAIN
     spacing = abs(lane_y[0] - lane_y[1])
     for target in lane_y:
         if abs(abs(target - y) - spacing) > 0.01:
             continue  # not the lane beside this one
         right, left = target - half_width, target + half_width
-        safe, loss = room_in(bodies, i, s, speed, right, left, half_length, length)
+        safe, loss = lane_change_safe(bodies, i, s, speed, right, left, half_length, length)
         if not safe:
             continue
-        there = follow(bodies, i, s, speed, desired, right, left, half_length, length)
+        there = following_acceleration(
+            bodies, i, s, speed, desired, right, left, half_length, length
+        )
         gain = there - here - POLITENESS * loss
         if gain > best_gain:
             best, best_gain = target, gain
     if best != y:
-        cars[i, Y_FROM], cars[i, Y_TO], cars[i, DONE] = y, best, 0.0
-        cars[i, CHANGE_M] = max(SHORTEST_CHANGE_M, CHANGE_TIME_S * speed)
-        cars[i, REST_S] = REST_BETWEEN_CHANGES_S
+        cars[i, Y_FROM], cars[i, Y_TO], cars[i, CHANGE_PROGRESS] = y, best, 0.0
+        cars[i, CHANGE_LENGTH_M] = max(MIN_CHANGE_LENGTH_M, CHANGE_TIME_S * speed)
+        cars[i, COOLDOWN_S] = CHANGE_COOLDOWN_S
 
 
 @compiled
-def along_centre(table: Table, s: float, y: float, way: float) -> float:
-    """How far s grows while a car goes `way` m at the offset `y`: a lane inside a bend is shorter
-    than the centre line. Exact across the joints of a track, where the bend may change at once."""
+def centre_line_advance(table: Table, s: float, y: float, distance: float) -> float:
+    """Increase of s while a car drives `distance` m at the lateral offset `y`.
+
+    A lane on the inside of a bend is shorter than the centre line. Exact across the joints of
+    pieces, where the curvature jumps.
+    """
     gained, index = 0.0, kernel.index_at(table, s)
     at = kernel.wrap(table, s)
     for _ in range(table.shape[0] + 1):
-        stretch = max(1.0 - table[index, kernel.CURVATURE] * y, LEAST_STRETCH)
+        length_ratio = max(1.0 - table[index, kernel.CURVATURE] * y, MIN_LENGTH_RATIO)
         left = max(table[index, kernel.S0] + table[index, kernel.LENGTH] - at, 0.0)
-        if way <= left * stretch:
-            return float(gained + way / stretch)
+        if distance <= left * length_ratio:
+            return float(gained + distance / length_ratio)
         gained += left
-        way -= left * stretch
+        distance -= left * length_ratio
         index = (index + 1) % table.shape[0]
         at = table[index, kernel.S0]
     return gained
 
 
 @compiled
-def move(cars: Table, i: int, advance_m: float, dt: float, length: float) -> None:
-    """Moves car `i` along its lane; sideways by the way made, so a car at rest stays in place."""
+def move_car(cars: Table, i: int, advance_m: float, dt: float, length: float) -> None:
+    """Advance car `i` along its lane. The lateral motion of a lane change depends on the distance
+    driven, so a car at rest does not move sideways."""
     cars[i, S] = (cars[i, S] + advance_m) % length
-    if cars[i, DONE] >= 1.0:
-        cars[i, REST_S] = max(cars[i, REST_S] - dt, 0.0)
+    if cars[i, CHANGE_PROGRESS] >= 1.0:
+        cars[i, COOLDOWN_S] = max(cars[i, COOLDOWN_S] - dt, 0.0)
         return
-    done = min(cars[i, DONE] + advance_m / cars[i, CHANGE_M], 1.0)
+    done = min(cars[i, CHANGE_PROGRESS] + advance_m / cars[i, CHANGE_LENGTH_M], 1.0)
     share = done**3 * (10.0 - 15.0 * done + 6.0 * done**2)  # smooth to the second derivative
-    cars[i, DONE] = done
+    cars[i, CHANGE_PROGRESS] = done
     cars[i, Y] = cars[i, Y_FROM] + share * (cars[i, Y_TO] - cars[i, Y_FROM])
 
 
 @compiled
-def advance(
+def step_traffic(
     cars: Table,
     bodies: Table,
     dt: float,
@@ -216,18 +226,18 @@ def advance(
     half_length: float,
     half_width: float,
 ) -> None:
-    """One step of `dt` s. `speed_limit` holds one value a cell around the loop.
+    """One step of `dt` s; `speed_limit` (cells,) in m/s, in equal cells around the loop.
 
-    Lane changes are decided one car after the other, each seeing the decisions before it; all
-    accelerations come from the state before the step.
+    Lane changes are decided car by car, each based on the decisions before it; all accelerations
+    are computed from the state before the step.
     """
     count = cars.shape[0]
     if lane_y.shape[0] > 1:
         for i in range(count):
-            idle = cars[i, DONE] >= 1.0 and cars[i, REST_S] <= 0.0
+            idle = cars[i, CHANGE_PROGRESS] >= 1.0 and cars[i, COOLDOWN_S] <= 0.0
             if idle and cars[i, STRUCK] == 0.0:
-                choose_lane(cars, bodies, i, lane_y, half_width, length)
-                show(cars, bodies, half_length, half_width)
+                decide_lane_change(cars, bodies, i, lane_y, half_width, length)
+                update_bodies(cars, bodies, half_length, half_width)
     cells = speed_limit.shape[0]
     for i in range(count):
         if cars[i, STRUCK] > 0.0:
@@ -238,20 +248,22 @@ def advance(
         desired = min(cars[i, DESIRED], limit)
         right, left = bodies[i, B_RIGHT], bodies[i, B_LEFT]
         speed = cars[i, SPEED]
-        wish = follow(bodies, i, cars[i, S], speed, desired, right, left, half_length, length)
-        # The limits fall no faster than one brakes in comfort, so they can be kept to exactly.
+        wish = following_acceleration(
+            bodies, i, cars[i, S], speed, desired, right, left, half_length, length
+        )
+        # The limits decrease no faster than comfortable braking, so clamping to them is feasible.
         cars[i, SPEED] = min(max(speed + wish * dt, 0.0), limit)
-        way = 0.5 * (speed + cars[i, SPEED]) * dt
-        move(cars, i, along_centre(table, cars[i, S], cars[i, Y], way), dt, length)
-    show(cars, bodies, half_length, half_width)
+        distance = 0.5 * (speed + cars[i, SPEED]) * dt
+        move_car(cars, i, centre_line_advance(table, cars[i, S], cars[i, Y], distance), dt, length)
+    update_bodies(cars, bodies, half_length, half_width)
 
 
 @compiled
-def place(cars: Table, table: Table, poses: Table) -> None:
-    """Fills `poses` (n, 6): x, y, z, roll, pitch, yaw of the ground point under each car.
+def update_poses(cars: Table, table: Table, poses: Table) -> None:
+    """Fill `poses` (n, 6): x, y, z, roll, pitch, yaw of the ground point under each car.
 
-    Angles are those of pybullet (R = Rz(yaw) Ry(pitch) Rx(roll), pitch positive nose down); the
-    car stands square on the road plane. Leaves the poses of struck cars alone.
+    Angles as in PyBullet (R = Rz(yaw) Ry(pitch) Rx(roll), pitch positive nose down); the car's up
+    axis is the road normal. Poses of struck cars are not changed.
     """
     for i in range(cars.shape[0]):
         if cars[i, STRUCK] > 0.0:
@@ -261,9 +273,9 @@ def place(cars: Table, table: Table, poses: Table) -> None:
         x0, y0, _, heading, _ = kernel.pose_at(table, s)
         z, nx, ny, nz = kernel.surface(table, index, s, y)
         sideways = 0.0
-        if cars[i, DONE] < 1.0:
-            done = cars[i, DONE]
-            slope = 30.0 * done**2 * (1.0 - done) ** 2 / cars[i, CHANGE_M]
+        if cars[i, CHANGE_PROGRESS] < 1.0:
+            done = cars[i, CHANGE_PROGRESS]
+            slope = 30.0 * done**2 * (1.0 - done) ** 2 / cars[i, CHANGE_LENGTH_M]
             sideways = math.atan(slope * (cars[i, Y_TO] - cars[i, Y_FROM]))
         yaw = heading + sideways
         poses[i, 0] = x0 - y * math.sin(heading)
@@ -276,10 +288,10 @@ def place(cars: Table, table: Table, poses: Table) -> None:
 
 
 @compiled
-def brake_ahead(squared: Table, gain: float) -> None:
-    """Lower the squared speed limits (n,) of cells around a loop where the next one's is lower by
-    more than the `gain` that can be braked off within a cell."""
+def limit_deceleration(squared: Table, gain: float) -> None:
+    """Lower the squared speed limits (n,) of cells around a loop, in place, so that from one cell
+    to the next they fall by at most `gain`, the decrease one can brake within a cell."""
     cells = squared.shape[0]
-    for cell in range(2 * cells - 1, -1, -1):  # twice round: the end brakes for the beginning
+    for cell in range(2 * cells - 1, -1, -1):  # two laps: the limits wrap around at the line
         ahead = squared[(cell + 1) % cells] + gain
         squared[cell % cells] = min(squared[cell % cells], ahead)

@@ -1,6 +1,6 @@
-"""A traffic car that was hit: no longer a thought on a lane but a body with wheels, its brakes on.
+"""A traffic car that was hit: a rigid body with wheels and its brakes applied, until it is at rest.
 
-It slides, turns and pushes others until it rests; traffic behind it sees it and stops.
+Other traffic treats it as an obstacle and stops behind it. World frame, SI units.
 """
 
 from dataclasses import dataclass
@@ -12,19 +12,19 @@ from numpy.typing import NDArray
 from runtime.jit import compiled
 from simulator.track.kernel import Table, index_at
 from simulator.vehicle.car import RPM, CarParameters
-from simulator.vehicle.dynamics import ENGINE, MEMORY, PIECE, SPIN, advance
+from simulator.vehicle.dynamics import ENGINE, MEMORY, PIECE, SPIN, compute_forces
 from simulator.vehicle.orientation import rotation
 from simulator.vehicle.surface import Ground
 from simulator.vehicle.track_state import (
-    ALONG,
     ANGLE,
-    OFFSET,
     PITCH,
-    PLACE,
-    READINGS,
     ROLL,
+    TRACK_OFFSET,
+    TRACK_S,
+    TRACK_SPEED,
+    TRACK_STATE_SIZE,
     YAW,
-    read_out,
+    measure_track_state,
 )
 
 FloatArray = NDArray[np.float64]
@@ -48,7 +48,7 @@ TRAFFIC_CAR = CarParameters(
     lift_front=0.0,
     lift_rear=0.0,
 )
-"""What the cars of the traffic are as bodies: an ordinary car, without wings and on road tyres."""
+"""Parameters of the traffic cars: an ordinary passenger car without wings, on road tyres."""
 
 BRAKE = 0.6
 CG_HEIGHT = TRAFFIC_CAR.cg_height
@@ -61,14 +61,16 @@ class Wreck:
     """One struck car; `moving` until it has come to rest."""
 
     row: int
-    """Which of the traffic's cars it is."""
+    """Index of the car in the traffic."""
     motion: FloatArray
     memory: FloatArray
     moving: bool = True
 
     @classmethod
-    def of(cls, row: int, motion: FloatArray, s: float, speed: float, table: Table) -> "Wreck":
-        """The car of `row`, which drove `speed` m/s at `s` and has got this motion by the blow."""
+    def from_traffic(
+        cls, row: int, motion: FloatArray, s: float, speed: float, table: Table
+    ) -> "Wreck":
+        """Traffic car `row`, which drove `speed` m/s at `s`, with the motion after the impact."""
         memory = np.zeros(MEMORY)
         memory[PIECE] = index_at(table, s)
         memory[SPIN : SPIN + 4] = speed / TRAFFIC_CAR.wheel_radius
@@ -76,36 +78,35 @@ class Wreck:
         return cls(row, motion, memory)
 
     def forces(self, params: NDArray[Any], table: Table, ground: Ground) -> FloatArray:
-        """(force, torque) (6,) of road, air and weight over the next physics step."""
+        """(force, torque) (6,) of road, air and gravity over the next physics step."""
         wrench = np.empty(6)
-        advance(params, table, ground, self.motion, self.memory, _CONTROLS, wrench)
+        compute_forces(params, table, ground, self.motion, self.memory, _CONTROLS, wrench)
         return wrench
 
-    def settle(self) -> None:
-        """Note whether it has come to rest, and hold it there if so."""
+    def update_rest(self) -> None:
+        """Update `moving`; a car that has come to rest gets zero velocity."""
         slow = np.linalg.norm(self.motion[7:10]) < AT_REST_M_S
         self.moving = not (slow and np.linalg.norm(self.motion[10:13]) < AT_REST_RAD_S)
         if not self.moving:
             self.motion[7:13] = 0.0
 
-    def seen(self, table: Table) -> tuple[FloatArray, FloatArray]:
-        """What the traffic sees of it: (ground pose (6,), (s, left positive offset, angle, speed
-        along the track))."""
-        readings = np.empty(READINGS)
-        read_out(table, self.motion, self.memory, readings)
+    def pose_for_traffic(self, table: Table) -> tuple[FloatArray, FloatArray]:
+        """(ground pose (6,); s, to_middle, angle and speed along the track (4,))."""
+        readings = np.empty(TRACK_STATE_SIZE)
+        measure_track_state(table, self.motion, self.memory, readings)
         up = rotation(self.motion[3:7])[2]
         pose = np.empty(6)
         pose[:3] = self.motion[:3] - up * TRAFFIC_CAR.cg_height
         pose[3:] = readings[[ROLL, PITCH, YAW]]
-        return pose, readings[[PLACE, OFFSET, ANGLE, ALONG]]
+        return pose, readings[[TRACK_S, TRACK_OFFSET, ANGLE, TRACK_SPEED]]
 
 
 @compiled
-def path_motion(
+def lane_motion(
     pose: FloatArray, move: FloatArray, share: float, dt: float, motion: FloatArray
 ) -> None:
-    """Motion (13,) of a traffic car that goes its way: `share` of `move` (6,) beyond its ground
-    `pose` (6,) at the start of a control step of `dt` s."""
+    """Fill `motion` (13,) of a traffic car in its lane: its ground `pose` (6,) at the start of a
+    control step of `dt` s plus the fraction `share` of its change `move` (6,) over the step."""
     roll = 0.5 * (pose[3] + share * move[3])
     pitch = 0.5 * (pose[4] + share * move[4])
     yaw = 0.5 * (pose[5] + share * move[5])

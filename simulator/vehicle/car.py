@@ -1,9 +1,10 @@
-"""The car as one frozen record of parameters (SI units; body frame x forward, y left, z up).
+"""The parameters of a car (SI units; body frame x forward, y left, z up).
 
-The figures are those of TORCS's car1-trb1, on which the paper drives. The paper's yaw inertia
-(2000 kg m2) and cornering stiffness (80 kN/rad a tyre) are not that car's: its recorded laps show
-1120 kg m2 and 125 kN/rad, and with the paper's it leaves the line by twice as much in the kink of
-g-track-3. The paper's stay where they are its controllers' model (`controllers.lqr`).
+The defaults describe TORCS's car1-trb1, the car of the paper's experiments. The mass and the axle
+distances (lf, lr) are also the paper's. Two values differ from the paper: its yaw inertia
+(2000 kg m2) and cornering stiffness (80 kN/rad per tyre) belong to the model of its controllers
+(`controllers.lqr`). The recorded TORCS laps of this car show 1120 kg m2 and 125 kN/rad; with the
+paper's values it deviates twice as far in the kink of g-track-3.
 """
 
 from dataclasses import astuple, dataclass, fields
@@ -23,15 +24,18 @@ LOWEST_GEAR, HIGHEST_GEAR = -1, 6  # -1 reverse, 0 neutral
 
 @dataclass(frozen=True)
 class CarParameters:
-    """All that makes one car differ from another; the defaults are the paper's car."""
+    """The parameters of one car; the defaults are TORCS's car1-trb1 (see the module's docstring).
+
+    Raises UserError for a value that is not positive, or a torque table of another length.
+    """
 
     mass: float = 1150.0
     """kg, without fuel."""
     fuel: float = 80.0
-    """kg; it rides at the centre of gravity and is not used up."""
+    """kg; at the centre of gravity; constant."""
     inertia: tuple[float, float, float] = (477.0, 868.0, 1113.0)
-    """kg m2 about x (roll), y (pitch) and z (yaw): of a box of the car's size, its length counted
-    with TORCS's mass repartition of 0.62."""
+    """kg m2 about x (roll), y (pitch) and z (yaw): a box of the car's size, with TORCS's mass
+    repartition coefficient of 0.62 on its length."""
     front_axle: float = 1.27
     """m from the centre of gravity to the front axle, lf."""
     rear_axle: float = 1.37
@@ -51,10 +55,10 @@ class CarParameters:
     """N s/m at the wheel."""
     damper_rear: float = 7_000.0
     anti_roll_front: float = 20_000.0
-    """N for each metre by which one wheel of the axle is pushed in further than the other."""
+    """N/m of difference in compression between the two wheels of the axle."""
     anti_roll_rear: float = 10_000.0
     bump_travel: float = 0.08
-    """m of compression from rest to the bump stop."""
+    """m of compression beyond rest at which the bump stop acts."""
     bump_spring: float = 600_000.0
     """N/m added beyond the bump stop."""
 
@@ -62,25 +66,25 @@ class CarParameters:
     wheel_inertia: float = 1.2
     """kg m2, one wheel."""
     friction: float = 1.6
-    """Largest tyre force over its load at `working_load`, on ground of grip 1."""
+    """Friction coefficient (largest tyre force over load) at `working_load`, on grip 1."""
     tyre_stiffness: float = 20.0
-    """1/rad: slope of the tyre force at no slip, over its largest (Pacejka's B C)."""
+    """1/rad: slope of the tyre force at zero slip over its largest value (Pacejka's B C)."""
     tyre_shape: float = 1.41
     """C of the magic formula (Pacejka, Tyre and Vehicle Dynamics, 4.3.1)."""
     tyre_curvature: float = 0.7
     """E of the magic formula."""
     camber_gain_front: float = 1.048
-    """What the wheels' camber adds to the friction: 1 + 0.05 sin(18 camber), 4 deg."""
+    """Factor of the wheels' camber on the friction: 1 + 0.05 sin(18 camber), camber 4 deg."""
     camber_gain_rear: float = 1.040
-    """3 deg."""
+    """The same, camber 3 deg."""
     working_load: float = 1.2
-    """Load at which the tyre has its nominal friction, over the static one without fuel."""
+    """Load at which the friction is nominal, over the static load without fuel."""
     friction_unloaded: float = 1.6
-    """Share of the nominal friction left (or gained) at no load ..."""
+    """Friction at zero load over the nominal one; it falls exponentially with the load ..."""
     friction_overloaded: float = 0.8
-    """... and at any load; between them it falls exponentially."""
+    """... to this factor at infinite load."""
     rolling_resistance: float = 0.001
-    """Over the load, on asphalt."""
+    """Rolling resistance force over load, on asphalt."""
 
     steering_lock: float = 0.36652
     """rad of the front wheels at steer = 1 (21 deg)."""
@@ -101,7 +105,7 @@ class CarParameters:
     final_drive: float = 4.5
     driveline_efficiency: float = 0.984
     engine_inertia: float = 0.02
-    """kg m2, at the crankshaft; fitted: in gear 1 TORCS's car is 6.3 % heavier than at rest."""
+    """kg m2, at the crankshaft; fitted: in gear 1 the effective mass is 6.3 % larger in TORCS."""
     idle_rpm: float = 900.0
     limiter_rpm: float = 9152.0
     top_rpm: float = 10_000.0
@@ -111,12 +115,12 @@ class CarParameters:
     )  # fmt: skip
     """N m at full throttle at 0, 1000, ... 10000 rev/min."""
     engine_braking: float = 0.33
-    """Share of the full-load torque that a closed throttle takes at `top_rpm`; none at idle."""
+    """Braking torque at closed throttle over full-load torque, at `top_rpm`; 0 at idle."""
     differential_viscosity: float = 30.0
     """N m s/rad between the rear wheels."""
 
     brake_torque: float = 9_000.0
-    """N m at full brake, four wheels together; enough to lock them."""
+    """N m at full brake, sum of the four wheels; enough to lock them."""
     brake_front_share: float = 0.58
 
     def __post_init__(self) -> None:
@@ -139,7 +143,7 @@ class CarParameters:
 
     @property
     def static_loads(self) -> tuple[float, float]:
-        """N on one front and on one rear tyre, at rest on a level road."""
+        """Load (N) of one front and of one rear tyre, at rest on a level road."""
         half_weight = 0.5 * self.total_mass * GRAVITY
         return (
             half_weight * self.rear_axle / self.wheelbase,
@@ -147,7 +151,7 @@ class CarParameters:
         )
 
     def cornering_stiffness(self, front: bool, grip: float) -> float:
-        """N/rad of one tyre at its static load, on ground of this grip."""
+        """Cornering stiffness (N/rad) of one tyre at its static load, on ground of this grip."""
         load = self.static_loads[0 if front else 1]
         share = load / (self.working_load * load * self.mass / self.total_mass)
         spread = self.friction_unloaded - self.friction_overloaded
@@ -157,7 +161,7 @@ class CarParameters:
         return float(self.tyre_stiffness * self.friction * nominal * gain * grip * load)
 
     def packed(self) -> NDArray[Any]:
-        """The parameters as a structured array of shape (1,), one field a parameter, for numba."""
+        """The parameters and derived loads as a structured array (1,), for compiled code."""
         layout = [
             (field.name, "f8", (len(value),) if isinstance(value, tuple) else ())
             for field, value in zip(fields(self), astuple(self), strict=True)

@@ -1,7 +1,7 @@
-"""Forces of the four wheels and of the air on the car's body, at 200 Hz, in one compiled step.
+"""Forces of the wheels, the air and gravity on the car's body, in one compiled step of 1/200 s.
 
 World frame z up; body frame x forward, y left, z up, origin at the centre of gravity. SI units.
-This file only says which force and torque act on the body; `flight` and PyBullet move it.
+This module computes force and torque; `rigid_body` or PyBullet moves the body.
 """
 
 import math
@@ -16,34 +16,42 @@ from simulator.vehicle.car import GRAVITY
 from simulator.vehicle.orientation import rotation
 from simulator.vehicle.powertrain import clutch, free_engine_speed, gear_ratio
 from simulator.vehicle.surface import Ground
-from simulator.vehicle.wheels import ALONG, WHEEL, add_tyres, feel, stand, tyre_grips
-from simulator.world.physics import PHYSICS_HZ
+from simulator.vehicle.wheels import (
+    ALONG,
+    WHEEL,
+    add_tyre_forces,
+    locate_contacts,
+    tyre_slip_gains,
+    update_loads,
+)
+from simulator.world.control_rate import PHYSICS_HZ
 
 Vector = NDArray[np.float64]
 
 DT = 1.0 / PHYSICS_HZ
 
-# What the car remembers between steps beside its body's motion: `memory`, shape (MEMORY,).
+# Internal state of the car beside its body's motion, `memory` (MEMORY,): front-wheel angle (rad),
+# engine speed (rad/s), four wheel speeds (rad/s), track piece of the last lookup, odometer (m).
 STEER, ENGINE, SPIN, PIECE, ODOMETER, MEMORY = 0, 1, 2, 6, 7, 8
-# One motion: position, quaternion (x, y, z, w), velocity, angular velocity, all in the world.
+# A motion (MOTION,): position, quaternion (x, y, z, w), velocity, angular velocity; world frame.
 MOTION = 13
-BELLY_CLEARANCE = 0.10
-"""m of the centre of gravity over the road at which the underbody touches it."""
-BELLY_SPRING, BELLY_DAMPER = 500_000.0, 20_000.0
+UNDERBODY_CLEARANCE_M = 0.10
+"""Height of the centre of gravity over the road (m) at which the underbody touches it."""
+UNDERBODY_SPRING, UNDERBODY_DAMPER = 500_000.0, 20_000.0
 
 
 @compiled
 def move_steering(p: Any, angle: float, command: float, dt: float) -> float:
-    """Front wheel angle (rad) after `dt` of turning towards `command` in [-1, 1]."""
+    """Front-wheel angle (rad) after `dt` s of turning towards `command` in [-1, 1]."""
     step = p.steering_rate * dt
     wanted = command * p.steering_lock
     return float(angle + min(max(wanted - angle, -step), step))
 
 
 @compiled
-def braked(spin: float, brake: float, inertia: float, dt: float) -> float:
-    """`spin` (rad/s) after a friction torque `brake` (N m) has acted for `dt`; it never reverses
-    the wheel."""
+def apply_brake(spin: float, brake: float, inertia: float, dt: float) -> float:
+    """Wheel speed (rad/s) after a brake torque `brake` (N m) has acted on `spin` for `dt` s; it
+    stops the wheel but never reverses it."""
     lost = brake * dt / inertia
     if spin > lost:
         return spin - lost
@@ -53,11 +61,13 @@ def braked(spin: float, brake: float, inertia: float, dt: float) -> float:
 
 
 @compiled
-def spin_wheels(p: Any, memory: Vector, command: Vector, wheels: Vector, grip: Vector) -> None:
-    """Advance the four wheel speeds in `memory` over one step, implicitly in the tyre force.
+def update_wheel_speeds(
+    p: Any, memory: Vector, command: Vector, wheels: Vector, slip_gain: Vector
+) -> None:
+    """Advance the four wheel speeds and the engine speed in `memory` by one step, implicitly in the
+    tyre force.
 
-    `grip` (4,): tyre force (N) for each m/s by which the tread runs faster than the ground.
-    command: steer, throttle, brake, gear.
+    slip_gain (4,): tyre force per m/s of slip speed (N s/m); command: steer, throttle, brake, gear.
     """
     r, gear = p.wheel_radius, int(command[3])
     ratio = gear_ratio(p, gear)
@@ -66,9 +76,9 @@ def spin_wheels(p: Any, memory: Vector, command: Vector, wheels: Vector, grip: V
     front_brake = 0.5 * brake * p.brake_front_share
     rear_brake = 0.5 * brake * (1.0 - p.brake_front_share)
     for wheel in range(2):
-        drag = p.wheel_inertia + DT * r * r * grip[wheel]
-        free = (p.wheel_inertia * spin[wheel] + DT * r * grip[wheel] * along[wheel]) / drag
-        spin[wheel] = braked(free, front_brake, drag, DT)
+        drag = p.wheel_inertia + DT * r * r * slip_gain[wheel]
+        free = (p.wheel_inertia * spin[wheel] + DT * r * slip_gain[wheel] * along[wheel]) / drag
+        spin[wheel] = apply_brake(free, front_brake, drag, DT)
     torque, inertia = 0.0, 0.0
     if ratio == 0.0:
         memory[ENGINE] = free_engine_speed(p, memory[ENGINE], command[1], DT)
@@ -77,25 +87,28 @@ def spin_wheels(p: Any, memory: Vector, command: Vector, wheels: Vector, grip: V
         _, shaft_torque, shaft_inertia = clutch(p, shaft, command[1])
         torque = 0.5 * shaft_torque * ratio * p.driveline_efficiency
         inertia = 0.5 * shaft_inertia * ratio * ratio
-    # An open differential gives both wheels the same torque; the engine's inertia turns with
-    # their mean. The viscous coupling brings their speeds together.
-    mean_grip = 0.5 * (grip[2] + grip[3])
-    pull = 0.5 * r * (grip[2] * (along[2] - r * spin[2]) + grip[3] * (along[3] - r * spin[3]))
-    heavy = p.wheel_inertia + inertia + DT * r * r * mean_grip
-    mean = 0.5 * (spin[2] + spin[3]) + DT * (torque + pull) / heavy
-    apart = r * (grip[2] * (along[2] - r * spin[2]) - grip[3] * (along[3] - r * spin[3]))
-    light = p.wheel_inertia + DT * (r * r * mean_grip + 2.0 * p.differential_viscosity)
+    # An open differential gives both rear wheels the same torque, and the engine's inertia acts on
+    # their mean speed. The viscous coupling reduces the difference of their speeds.
+    mean_gain = 0.5 * (slip_gain[2] + slip_gain[3])
+    moment_left = slip_gain[2] * (along[2] - r * spin[2])
+    moment_right = slip_gain[3] * (along[3] - r * spin[3])
+    road_moment = 0.5 * r * (moment_left + moment_right)
+    mean_inertia = p.wheel_inertia + inertia + DT * r * r * mean_gain
+    mean = 0.5 * (spin[2] + spin[3]) + DT * (torque + road_moment) / mean_inertia
+    moment_difference = r * (moment_left - moment_right)
+    difference_inertia = p.wheel_inertia + DT * (r * r * mean_gain + 2.0 * p.differential_viscosity)
     half = 0.5 * (spin[2] - spin[3])
-    half += 0.5 * DT * (apart - 4.0 * p.differential_viscosity * half) / light
-    spin[2] = braked(mean + half, rear_brake, heavy, DT)
-    spin[3] = braked(mean - half, rear_brake, heavy, DT)
+    viscous = 4.0 * p.differential_viscosity * half
+    half += 0.5 * DT * (moment_difference - viscous) / difference_inertia
+    spin[2] = apply_brake(mean + half, rear_brake, mean_inertia, DT)
+    spin[3] = apply_brake(mean - half, rear_brake, mean_inertia, DT)
     if ratio != 0.0:
         memory[ENGINE], _, _ = clutch(p, 0.5 * (spin[2] + spin[3]) * ratio, command[1])
 
 
 @compiled
-def add_air(p: Any, axes: Vector, velocity: Vector, wrench: Vector) -> None:
-    """Drag along the body, downforce at both axles (quadratic in the forward speed)."""
+def add_aerodynamics(p: Any, axes: Vector, velocity: Vector, wrench: Vector) -> None:
+    """Add drag along the body and downforce at both axles (quadratic in the forward speed)."""
     ahead, up = axes[0], axes[2]
     speed = ahead[0] * velocity[0] + ahead[1] * velocity[1] + ahead[2] * velocity[2]
     pressure = 0.5 * p.air_density * speed * speed
@@ -103,7 +116,7 @@ def add_air(p: Any, axes: Vector, velocity: Vector, wrench: Vector) -> None:
     if speed < 0.0:
         drag = -drag
     front, rear = pressure * p.lift_front, pressure * p.lift_rear
-    # The downforce at the axles turns the body about its left axis.
+    # Pitch torque of the downforce at the axles, about the body's left axis.
     turn = p.front_axle * front - p.rear_axle * rear
     for i in range(3):
         wrench[i] -= drag * ahead[i] + (front + rear) * up[i]
@@ -111,14 +124,15 @@ def add_air(p: Any, axes: Vector, velocity: Vector, wrench: Vector) -> None:
 
 
 @compiled
-def add_belly(
+def add_underbody_contact(
     depth: float, normal: tuple[float, float, float], velocity: Vector, wrench: Vector
 ) -> None:
-    """Hold a car that lies on its belly, side or roof above the road (the wheels then do not)."""
+    """Add the contact force of an underbody `depth` m below the road: it supports a car that lies
+    on its underbody, side or roof, where the wheels do not."""
     if depth > 0.0:
         nx, ny, nz = normal
         closing = -(velocity[0] * nx + velocity[1] * ny + velocity[2] * nz)
-        push = max(BELLY_SPRING * depth + BELLY_DAMPER * closing, 0.0)
+        push = max(UNDERBODY_SPRING * depth + UNDERBODY_DAMPER * closing, 0.0)
         wrench[0] += push * nx
         wrench[1] += push * ny
         wrench[2] += push * nz
@@ -126,7 +140,7 @@ def add_belly(
 
 @compiled
 def accelerate(p: Any, axes: Vector, wrench: Vector, dt: float, velocity: Vector) -> None:
-    """Add to `velocity` (6,) what (force, torque) makes of it in `dt`."""
+    """Add the change of `velocity` (6,), linear and angular, under `wrench` (6,) over `dt` s."""
     for i in range(3):
         velocity[i] += dt * wrench[i] / p.total_mass
     for i in range(3):
@@ -137,7 +151,7 @@ def accelerate(p: Any, axes: Vector, wrench: Vector, dt: float, velocity: Vector
 
 
 @compiled
-def advance(
+def compute_forces(
     params: NDArray[Any],
     table: Table,
     ground: Ground,
@@ -147,35 +161,35 @@ def advance(
     wrench: Vector,
 ) -> None:
     """One 200 Hz step: updates `memory` and fills `wrench` (6,), the (force, torque) on the body
-    at its centre of gravity, in the world frame, gravity included.
+    at its centre of gravity in the world frame, gravity included.
 
-    The forces are those at the velocity half a step ahead (the midpoint rule). With those of the
-    velocity now, yaw settles as if the car had 15 % less inertia: tyres are stiff for 200 Hz.
+    Forces are evaluated at the velocity half a step ahead (midpoint rule): tyres are stiff for
+    200 Hz, and with the present velocity yaw would settle as if the car had 15 % less inertia.
     params: `CarParameters.packed()`; command: steer, throttle, brake in their ranges, and gear.
     """
     p = params[0]
-    wheels, grip, spin = np.empty((4, WHEEL)), np.empty(4), memory[SPIN : SPIN + 4]
+    wheels, slip_gain, spin = np.empty((4, WHEEL)), np.empty(4), memory[SPIN : SPIN + 4]
     axes = rotation(motion[3:7])
     piece, s, d = locate(table, motion[0], motion[1], int(memory[PIECE]))
     memory[PIECE] = piece
     z, nx, ny, nz = surface(table, piece, s, d)
-    depth = BELLY_CLEARANCE - (motion[2] - z) * nz
+    depth = UNDERBODY_CLEARANCE_M - (motion[2] - z) * nz
     before = memory[STEER]
     memory[STEER] = move_steering(p, before, command[0], DT)
-    stand(p, table, ground, piece, motion, axes, 0.5 * (before + memory[STEER]), wheels)
+    locate_contacts(p, table, ground, piece, motion, axes, 0.5 * (before + memory[STEER]), wheels)
     velocity = motion[7:13].copy()
-    for half in range(2):
-        feel(p, velocity, wheels)
-        tyre_grips(p, spin, wheels, grip)
-        if half == 1:
-            spin_wheels(p, memory, command, wheels, grip)
-            tyre_grips(p, spin, wheels, grip)
+    for stage in range(2):
+        update_loads(p, velocity, wheels)
+        tyre_slip_gains(p, spin, wheels, slip_gain)
+        if stage == 1:
+            update_wheel_speeds(p, memory, command, wheels, slip_gain)
+            tyre_slip_gains(p, spin, wheels, slip_gain)
         wrench[:] = 0.0
         wrench[2] = -p.total_mass * GRAVITY
-        add_tyres(p, spin, wheels, grip, wrench)
-        add_air(p, axes, velocity, wrench)
-        add_belly(depth, (nx, ny, nz), velocity, wrench)
-        if half == 0:
+        add_tyre_forces(p, spin, wheels, slip_gain, wrench)
+        add_aerodynamics(p, axes, velocity, wrench)
+        add_underbody_contact(depth, (nx, ny, nz), velocity, wrench)
+        if stage == 0:
             accelerate(p, axes, wrench, 0.5 * DT, velocity)
     speed = math.sqrt(motion[7] ** 2 + motion[8] ** 2 + motion[9] ** 2)
     memory[ODOMETER] += DT * speed

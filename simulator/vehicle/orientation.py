@@ -1,4 +1,4 @@
-"""Orientation of a body: a quaternion from its axes in the world frame, and back."""
+"""Conversion between the axes of a body in the world frame and a quaternion (x, y, z, w)."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,9 +9,9 @@ from runtime.jit import compiled
 def quaternion(
     forward: NDArray[np.float64], left: NDArray[np.float64], up: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Unit quaternion (x, y, z, w) of the frame with these axes.
+    """Unit quaternion (x, y, z, w) of the frame with these orthonormal axes, each (3,).
 
-    Of the four equivalent formulas the one with the largest divisor is used (Shepperd, 1978).
+    Uses the one of four equivalent formulas that has the largest divisor (Shepperd, 1978).
     """
     trace = forward[0] + left[1] + up[2]
     w = 1.0 + trace

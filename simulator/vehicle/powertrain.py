@@ -1,4 +1,4 @@
-"""Engine, gearbox and clutch: torque from speed and throttle. rad/s and N m."""
+"""Engine, gearbox and clutch: torque (N m) from speed (rad/s) and throttle."""
 
 from typing import Any
 
@@ -8,7 +8,7 @@ from simulator.vehicle.car import RPM, TORQUE_RPM_STEP
 
 @compiled
 def gear_ratio(p: Any, gear: int) -> float:
-    """Engine turns for one turn of the rear wheels; negative in reverse, 0 in neutral."""
+    """Engine speed over rear-wheel speed; negative in reverse, 0 in neutral."""
     if gear > 0:
         return float(p.gears[gear - 1] * p.final_drive)
     if gear < 0:
@@ -20,8 +20,8 @@ def gear_ratio(p: Any, gear: int) -> float:
 def engine_torque(p: Any, speed: float, throttle: float) -> float:
     """Torque (N m) at the crankshaft at `speed` rad/s.
 
-    As TORCS has it: the full-load curve times (throttle (1 + b) - b), where the engine braking b
-    grows linearly from 0 at idle. It fits the accelerations in TORCS's drives to 0.003 m/s2.
+    As in TORCS: the full-load torque times (throttle (1 + b) - b), where the engine braking b grows
+    linearly from 0 at idle. Matches the accelerations in recorded TORCS drives to 0.003 m/s2.
     """
     rpm = speed * RPM
     place = min(max(rpm / TORQUE_RPM_STEP, 0.0), 9.999)
@@ -34,16 +34,17 @@ def engine_torque(p: Any, speed: float, throttle: float) -> float:
 
 @compiled
 def free_engine_speed(p: Any, speed: float, throttle: float, dt: float) -> float:
-    """Speed (rad/s) after `dt` of an engine out of gear."""
+    """Engine speed (rad/s) after `dt` s in neutral."""
     faster = speed + dt * engine_torque(p, speed, throttle) / p.engine_inertia
     return float(min(max(faster, p.idle_rpm / RPM), p.top_rpm / RPM))
 
 
 @compiled
 def clutch(p: Any, shaft_speed: float, throttle: float) -> tuple[float, float, float]:
-    """What the gearbox input shaft feels at `shaft_speed` rad/s: (engine speed, torque, inertia).
+    """(engine speed, torque, inertia) at the gearbox input shaft turning at `shaft_speed` rad/s.
 
-    Below idle the clutch slips: the engine keeps idling, sends its torque, but not its inertia.
+    Below idle speed the clutch slips: the engine idles and transmits its torque, but its inertia
+    does not act on the shaft.
     """
     idle = p.idle_rpm / RPM
     if shaft_speed < idle:

@@ -1,7 +1,7 @@
-"""The car's body where nothing can touch it: whole control steps in one compiled call.
+"""Rigid-body motion of the ego car while no contact is possible, in one compiled call.
 
-The scheme is PyBullet's own (semi-implicit Euler, exact rotation), so that it makes no difference
-who moves the body; the tests hold the two together. World frame, SI units.
+Integrates with PyBullet's scheme (semi-implicit Euler, exact rotation), so that the result is the
+same whether PyBullet or this code moves the body. World frame, SI units.
 """
 
 import math
@@ -13,27 +13,27 @@ from numpy.typing import NDArray
 from runtime.jit import compiled
 from simulator.track.kernel import Table, locate
 from simulator.traffic.wreck import TRAFFIC_CAR
-from simulator.vehicle.dynamics import DT, PIECE, accelerate, advance
+from simulator.vehicle.dynamics import DT, PIECE, accelerate, compute_forces
 from simulator.vehicle.orientation import rotation
 from simulator.vehicle.surface import Ground
-from simulator.world.boxes import overlap
+from simulator.world.boxes import boxes_overlap
 
 Vector = NDArray[np.float64]
 
-NEAR_WALL_M = 3.5
-"""No part of the car is farther than this from its centre of gravity, with a margin for the way of
-one physics step."""
-NEAR_CAR_M = 6.5
-"""Nor is any car farther than this from one that it may touch."""
-FASTEST_TRAFFIC_M_S = 20.0
-LEAST_APART_M = 0.3
+WALL_RANGE_M = 3.5
+"""Largest distance of any part of the car from its centre of gravity, with a margin for the motion
+of one physics step."""
+CAR_RANGE_M = 6.5
+"""Largest distance between the centres of two cars that may touch within one physics step."""
+MAX_TRAFFIC_SPEED_M_S = 20.0
+CLEARANCE_M = 0.3
 OTHER_LENGTH, OTHER_WIDTH = TRAFFIC_CAR.length, TRAFFIC_CAR.width
 
 
 @compiled
-def tumble(p: Any, axes: Vector, motion: Vector) -> tuple[float, float, float]:
-    """How a step without torque changes the angular velocity (body frame, rad/s): Euler's
-    equations, one Newton step of the implicit rule, as in PyBullet (Catto, GDC 2015)."""
+def gyroscopic_change(p: Any, axes: Vector, motion: Vector) -> tuple[float, float, float]:
+    """Change of the angular velocity (body frame, rad/s) by one step of Euler's equations without
+    torque: one Newton step of the implicit rule, as in PyBullet (Catto, GDC 2015)."""
     wx = axes[0, 0] * motion[10] + axes[0, 1] * motion[11] + axes[0, 2] * motion[12]
     wy = axes[1, 0] * motion[10] + axes[1, 1] * motion[11] + axes[1, 2] * motion[12]
     wz = axes[2, 0] * motion[10] + axes[2, 1] * motion[11] + axes[2, 2] * motion[12]
@@ -52,7 +52,7 @@ def tumble(p: Any, axes: Vector, motion: Vector) -> tuple[float, float, float]:
 
 
 @compiled
-def turn(quaternion: Vector, wx: float, wy: float, wz: float, dt: float) -> None:
+def rotate(quaternion: Vector, wx: float, wy: float, wz: float, dt: float) -> None:
     """Rotate a unit quaternion (x, y, z, w) by the angular velocity (world frame) over `dt`."""
     rate = math.sqrt(wx * wx + wy * wy + wz * wz)
     half = 0.5 * rate * dt
@@ -68,33 +68,34 @@ def turn(quaternion: Vector, wx: float, wy: float, wz: float, dt: float) -> None
 
 
 @compiled
-def fall(p: Any, motion: Vector, wrench: Vector) -> None:
-    """Move a free body by one physics step under (force, torque)."""
+def integrate(p: Any, motion: Vector, wrench: Vector) -> None:
+    """Move a free body by one physics step under `wrench` (6,), (force, torque)."""
     axes = rotation(motion[3:7])
-    tx, ty, tz = tumble(p, axes, motion)
+    tx, ty, tz = gyroscopic_change(p, axes, motion)
     accelerate(p, axes, wrench, DT, motion[7:13])
     for i in range(3):
         motion[10 + i] += tx * axes[0, i] + ty * axes[1, i] + tz * axes[2, i]
         motion[i] += DT * motion[7 + i]
-    turn(motion[3:7], motion[10], motion[11], motion[12], DT)
+    rotate(motion[3:7], motion[10], motion[11], motion[12], DT)
 
 
 @compiled
-def may_touch(p: Any, motion: Vector, dx: float, dy: float, yaw: float) -> bool:
-    """Whether the box of a traffic car (dx, dy) m off may meet the car's within a physics step."""
+def boxes_may_touch(p: Any, motion: Vector, dx: float, dy: float, yaw: float) -> bool:
+    """Whether the rectangle of a traffic car at the offset (dx, dy) m may touch the ego car's
+    within one physics step."""
     forward = rotation(motion[3:7])[0]
-    mine, other = np.zeros(5), np.zeros(5)
-    speed = math.sqrt(motion[7] ** 2 + motion[8] ** 2) + FASTEST_TRAFFIC_M_S
-    grown = 2.0 * (speed * DT + LEAST_APART_M)
-    mine[2] = math.atan2(forward[1], forward[0])
-    mine[3], mine[4] = p.length + grown, p.width + grown
+    own, other = np.zeros(5), np.zeros(5)
+    speed = math.sqrt(motion[7] ** 2 + motion[8] ** 2) + MAX_TRAFFIC_SPEED_M_S
+    grown = 2.0 * (speed * DT + CLEARANCE_M)
+    own[2] = math.atan2(forward[1], forward[0])
+    own[3], own[4] = p.length + grown, p.width + grown
     other[0], other[1], other[2] = dx, dy, yaw
     other[3], other[4] = OTHER_LENGTH, OTHER_WIDTH
-    return overlap(mine, other)
+    return boxes_overlap(own, other)
 
 
 @compiled
-def near_anything(
+def contact_possible(
     p: Any,
     table: Table,
     motion: Vector,
@@ -104,26 +105,27 @@ def near_anything(
     move: Vector,
     share: float,
 ) -> bool:
-    """Whether the car may touch something within a physics step.
+    """Whether the ego car may touch something within one physics step.
 
     reach: distance (m) of the walls from the track's centre; others (n, 6): ground poses of the
-    traffic at the start of the control step, move: how far they go in it, share of it done.
+    traffic at the start of the control step; move (n, 6): their change over it; share: fraction of
+    the control step already done.
     """
     _, _, d = locate(table, motion[0], motion[1], piece)
-    if abs(d) > reach - NEAR_WALL_M:
+    if abs(d) > reach - WALL_RANGE_M:
         return True
     for i in range(others.shape[0]):
         dx = others[i, 0] + share * move[i, 0] - motion[0]
         dy = others[i, 1] + share * move[i, 1] - motion[1]
-        if dx * dx + dy * dy < NEAR_CAR_M * NEAR_CAR_M:
+        if dx * dx + dy * dy < CAR_RANGE_M * CAR_RANGE_M:
             yaw = others[i, 5] + share * move[i, 5]
-            if may_touch(p, motion, dx, dy, yaw):
+            if boxes_may_touch(p, motion, dx, dy, yaw):
                 return True
     return False
 
 
 @compiled
-def fly(
+def advance_free(
     params: NDArray[Any],
     table: Table,
     ground: Ground,
@@ -136,16 +138,18 @@ def fly(
     done: int,
     steps: int,
 ) -> int:
-    """Advance the car from physics step `done` of `steps` until it may touch something.
+    """Advance the ego car from physics step `done` of `steps` until it may touch something.
 
-    Returns how many steps are then done.
+    Returns the number of steps then done.
     """
     wrench = np.empty(6)
     while done < steps:
         share = done / steps
-        if near_anything(params[0], table, motion, int(memory[PIECE]), reach, others, move, share):
+        if contact_possible(
+            params[0], table, motion, int(memory[PIECE]), reach, others, move, share
+        ):
             return done
-        advance(params, table, ground, motion, memory, command, wrench)
-        fall(params[0], motion, wrench)
+        compute_forces(params, table, ground, motion, memory, command, wrench)
+        integrate(params[0], motion, wrench)
         done += 1
     return done

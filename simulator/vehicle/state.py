@@ -1,4 +1,4 @@
-"""What a driver commands and what the car then does. SI units; angles counter-clockwise, rad."""
+"""The command to a car and the state of a car. SI units; angles in rad, counter-clockwise."""
 
 import math
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ Collision = Literal["traffic", "wall"]
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """The four controls of the paper."""
+    """The paper's four actuator commands."""
 
     steer: float = 0.0
     """[-1, 1], left positive; times the steering lock is the front-wheel angle."""
@@ -23,7 +23,7 @@ class Command:
 
 @dataclass(frozen=True, slots=True)
 class CarState:
-    """The car at one moment; x, y, z is its centre of gravity."""
+    """The car at one time; x, y, z is its centre of gravity in the world frame (m)."""
 
     time_s: float
     x: float
@@ -51,12 +51,12 @@ class CarState:
     wheel_spin: tuple[float, float, float, float]
     """rad/s: front left, front right, rear left, rear right."""
     steer: float
-    """Where the front wheels stand, as a share of the lock: lags the command."""
+    """Actual front-wheel angle as a fraction of the lock; lags the command."""
     lap: int
     odometer_m: float
     lap_time_s: float
     collision: Collision | None
-    """What the body touched during the last control step."""
+    """What the body touched during the last control step, None for nothing."""
     off_track: bool
     backwards: bool
 

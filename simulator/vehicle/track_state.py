@@ -1,6 +1,6 @@
-"""What the track and the road say of a body's motion: its place, its angles, its speeds.
+"""A body's state relative to the track: position, orientation and speeds. SI units, rad.
 
-The one place where angle = tangent - yaw is formed. SI units, angles in rad.
+This is the only place that computes angle = track tangent - yaw.
 """
 
 import math
@@ -15,15 +15,16 @@ from simulator.vehicle.orientation import rotation
 
 Vector = NDArray[np.float64]
 
-# Places in `out` (READINGS,); ALONG is the speed in the track's direction, TILT the height of the
-# body's up axis: 1 on a level road, below 0 on its roof.
+# Indices into the track state (TRACK_STATE_SIZE,). TRACK_SPEED: speed along the track (m/s).
+# UPRIGHT_COSINE: z of the body's up axis, 1 on a level road, below 0 upside down.
 YAW, PITCH, ROLL, VX, VY, YAW_RATE = 0, 1, 2, 3, 4, 5
-PLACE, OFFSET, ANGLE, BEND, ALONG, TILT, READINGS = 6, 7, 8, 9, 10, 11, 12
+TRACK_S, TRACK_OFFSET, ANGLE, TRACK_CURVATURE, TRACK_SPEED, UPRIGHT_COSINE = 6, 7, 8, 9, 10, 11
+TRACK_STATE_SIZE = 12
 
 
 @compiled
-def read_out(table: Table, motion: Vector, memory: Vector, out: Vector) -> None:
-    """Fill `out` (READINGS,) with the readings of one car; moves its PIECE in `memory`."""
+def measure_track_state(table: Table, motion: Vector, memory: Vector, out: Vector) -> None:
+    """Fill `out` (TRACK_STATE_SIZE,) for one car, and update its PIECE in `memory`."""
     piece, s, to_middle = locate(table, motion[0], motion[1], int(memory[PIECE]))
     memory[PIECE] = piece
     curvature = table[piece, CURVATURE]
@@ -40,6 +41,6 @@ def read_out(table: Table, motion: Vector, memory: Vector, out: Vector) -> None:
     out[VX] = ahead[0] * motion[7] + ahead[1] * motion[8] + ahead[2] * motion[9]
     out[VY] = left[0] * motion[7] + left[1] * motion[8] + left[2] * motion[9]
     out[YAW_RATE] = up[0] * motion[10] + up[1] * motion[11] + up[2] * motion[12]
-    out[PLACE], out[OFFSET], out[BEND] = s, to_middle, curvature
-    out[ALONG] = math.cos(tangent) * motion[7] + math.sin(tangent) * motion[8]
-    out[TILT] = up[2]
+    out[TRACK_S], out[TRACK_OFFSET], out[TRACK_CURVATURE] = s, to_middle, curvature
+    out[TRACK_SPEED] = math.cos(tangent) * motion[7] + math.sin(tangent) * motion[8]
+    out[UPRIGHT_COSINE] = up[2]

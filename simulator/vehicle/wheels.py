@@ -1,4 +1,4 @@
-"""The four wheels on the road: where they stand, how they move, what they press and pull with.
+"""Contact of the four wheels with the road: geometry, suspension loads and tyre forces.
 
 World frame z up; body frame x forward, y left, z up, origin at the centre of gravity. SI units.
 """
@@ -11,19 +11,20 @@ from numpy.typing import NDArray
 
 from runtime.jit import compiled
 from simulator.track.kernel import Table, locate, surface
-from simulator.vehicle.surface import Ground, under_wheel
-from simulator.vehicle.tyre import peak_force, tyre_grip
+from simulator.vehicle.surface import Ground, surface_under_wheel
+from simulator.vehicle.tyre import peak_force, tyre_slip_gain
 
 Vector = NDArray[np.float64]
 
-FULL_TRAVEL_M = 0.25
-"""The most a wheel can be pushed in from rest: then it is in its arch."""
-LEAST_LEAN = 0.2
-"""Cosine of the lean beyond which a car lies on its side, wheels in the air."""
+MAX_TRAVEL_M = 0.25
+"""Largest compression of a suspension strut from rest."""
+MIN_UPRIGHT_COSINE = 0.2
+"""Cosine of the angle between the car's up axis and the road normal below which the car lies on its
+side, without wheel contact."""
 
 # One wheel's row of `wheels` (4, WHEEL): arm from the centre of gravity to the contact point, road
-# normal, directions forward and left in the road plane (3 each); force of the spring (N), damper
-# constant along the normal (N s/m), grip and rolling of the ground; speed along and across (m/s),
+# normal, directions forward and left in the road plane (3 each); spring force (N), damper constant
+# along the normal (N s/m), grip and rolling factors of the surface; speed along and across (m/s),
 # load (N), largest tyre force (N).
 ARM, NORMAL, FORWARD, LEFT = 0, 3, 6, 9
 SPRING, DAMPER, GRIP, ROLLING, ALONG, ACROSS, LOAD, PEAK, WHEEL = 12, 13, 14, 15, 16, 17, 18, 19, 20
@@ -31,8 +32,8 @@ SPRING, DAMPER, GRIP, ROLLING, ALONG, ACROSS, LOAD, PEAK, WHEEL = 12, 13, 14, 15
 
 @compiled
 def wheel_angle(p: Any, wheel: int, steer: float) -> float:
-    """Angle (rad) of one wheel: both front wheels roll about one centre (Ackermann), and the inner
-    one has the angle asked for, as in TORCS."""
+    """Angle (rad) of one wheel under Ackermann steering: the inner front wheel has the commanded
+    angle `steer`, as in TORCS, and both front wheels roll about one centre."""
     if wheel > 1 or steer == 0.0:
         return 0.0
     inner = (wheel == 0) == (steer > 0.0)
@@ -46,7 +47,7 @@ def wheel_angle(p: Any, wheel: int, steer: float) -> float:
 
 
 @compiled
-def stand(
+def locate_contacts(
     p: Any,
     table: Table,
     ground: Ground,
@@ -56,9 +57,10 @@ def stand(
     steer: float,
     wheels: Vector,
 ) -> None:
-    """Where each wheel meets the road, which way it points and how far it is pushed in.
+    """Fill the entries of `wheels` that do not depend on the body's velocity: contact point,
+    directions, spring force, damper constant and surface.
 
-    Fills all of `wheels` that does not depend on the body's velocity.
+    axes (3, 3): body axes as rows; steer: front-wheel angle (rad).
     """
     ahead, left, up = axes[0], axes[1], axes[2]
     upright = True
@@ -72,16 +74,18 @@ def stand(
         pz = motion[2] + ahead[2] * x + left[2] * y
         at, s, d = locate(table, px, py, piece)
         z, nx, ny, nz = surface(table, at, s, d)
-        lean = max(up[0] * nx + up[1] * ny + up[2] * nz, LEAST_LEAN)
-        reach = (pz - z) * nz / lean  # along the strut, from the height of the CG to the road
+        upright_cosine = max(up[0] * nx + up[1] * ny + up[2] * nz, MIN_UPRIGHT_COSINE)
+        reach = (
+            (pz - z) * nz / upright_cosine
+        )  # along the strut, from the height of the CG to the road
         for i in range(3):
             row[ARM + i] = ahead[i] * x + left[i] * y - up[i] * reach
         row[NORMAL], row[NORMAL + 1], row[NORMAL + 2] = nx, ny, nz
-        point(p, row, axes, wheel_angle(p, wheel, steer))
-        row[SPRING] = min(p.cg_height - reach, FULL_TRAVEL_M)  # compression from rest
-        row[DAMPER] = (p.damper_front if front else p.damper_rear) / lean
-        upright = upright and lean > LEAST_LEAN
-        row[GRIP], row[ROLLING] = under_wheel(ground, d)
+        set_directions(p, row, axes, wheel_angle(p, wheel, steer))
+        row[SPRING] = min(p.cg_height - reach, MAX_TRAVEL_M)  # compression from rest
+        row[DAMPER] = (p.damper_front if front else p.damper_rear) / upright_cosine
+        upright = upright and upright_cosine > MIN_UPRIGHT_COSINE
+        row[GRIP], row[ROLLING] = surface_under_wheel(ground, d)
     for axle in range(2):
         a, b = wheels[2 * axle, SPRING], wheels[2 * axle + 1, SPRING]
         wheels[2 * axle, SPRING] = spring_force(p, axle == 0, a, b)
@@ -91,8 +95,8 @@ def stand(
 
 
 @compiled
-def point(p: Any, row: Vector, axes: Vector, angle: float) -> None:
-    """Fill in a wheel's directions in the road plane, `angle` rad left of the body's."""
+def set_directions(p: Any, row: Vector, axes: Vector, angle: float) -> None:
+    """Fill in a wheel's directions in the road plane, `angle` rad to the left of the body's."""
     cos_a, sin_a = math.cos(angle), math.sin(angle)
     nx, ny, nz = row[NORMAL], row[NORMAL + 1], row[NORMAL + 2]
     fx = axes[0, 0] * cos_a + axes[1, 0] * sin_a
@@ -109,18 +113,19 @@ def point(p: Any, row: Vector, axes: Vector, angle: float) -> None:
 
 
 @compiled
-def spring_force(p: Any, front: bool, squeeze: float, other: float) -> float:
-    """Force (N) of one wheel's springs, pushed in by `squeeze` m from rest, its neighbour by
-    `other`."""
+def spring_force(p: Any, front: bool, compression: float, other: float) -> float:
+    """Force (N) of one wheel's spring, anti-roll bar and bump stop, at `compression` m from rest,
+    the other wheel of the axle at `other` m."""
     force = p.load_front if front else p.load_rear
-    force += (p.spring_front if front else p.spring_rear) * squeeze
-    force += (p.anti_roll_front if front else p.anti_roll_rear) * (squeeze - other)
-    return float(force + p.bump_spring * max(squeeze - p.bump_travel, 0.0))
+    force += (p.spring_front if front else p.spring_rear) * compression
+    force += (p.anti_roll_front if front else p.anti_roll_rear) * (compression - other)
+    return float(force + p.bump_spring * max(compression - p.bump_travel, 0.0))
 
 
 @compiled
-def feel(p: Any, velocity: Vector, wheels: Vector) -> None:
-    """Fill in what of `wheels` depends on the body's `velocity` (6,): linear and angular."""
+def update_loads(p: Any, velocity: Vector, wheels: Vector) -> None:
+    """Fill the entries of `wheels` that depend on the body's `velocity` (6,), linear and angular:
+    contact point speeds, load, largest tyre force."""
     for wheel in range(4):
         row = wheels[wheel]
         x, y, z = row[ARM], row[ARM + 1], row[ARM + 2]
@@ -135,22 +140,24 @@ def feel(p: Any, velocity: Vector, wheels: Vector) -> None:
 
 
 @compiled
-def tyre_grips(p: Any, spin: Vector, wheels: Vector, grip: Vector) -> None:
-    """Fill `grip` (4,): tyre force (N) for each m/s of slip speed; `spin` (4,) rad/s."""
+def tyre_slip_gains(p: Any, spin: Vector, wheels: Vector, slip_gain: Vector) -> None:
+    """Fill `slip_gain` (4,): tyre force per m/s of slip speed (N s/m); `spin` (4,) rad/s."""
     for wheel in range(4):
         row = wheels[wheel]
-        grip[wheel] = tyre_grip(p, row[PEAK], row[ALONG], row[ACROSS], spin[wheel])
+        slip_gain[wheel] = tyre_slip_gain(p, row[PEAK], row[ALONG], row[ACROSS], spin[wheel])
 
 
 @compiled
-def add_tyres(p: Any, spin: Vector, wheels: Vector, grip: Vector, wrench: Vector) -> None:
-    """Add what the road does to the body through the four wheels."""
+def add_tyre_forces(
+    p: Any, spin: Vector, wheels: Vector, slip_gain: Vector, wrench: Vector
+) -> None:
+    """Add the forces and torques of the road on the four wheels to `wrench` (6,)."""
     for wheel in range(4):
         row = wheels[wheel]
         along, load = row[ALONG], row[LOAD]
         rolling = p.rolling_resistance * row[ROLLING] * load * min(max(along / 0.5, -1.0), 1.0)
-        forward = grip[wheel] * (spin[wheel] * p.wheel_radius - along) - rolling
-        leftward = -grip[wheel] * row[ACROSS]
+        forward = slip_gain[wheel] * (spin[wheel] * p.wheel_radius - along) - rolling
+        leftward = -slip_gain[wheel] * row[ACROSS]
         add_force(
             wrench,
             row[FORWARD] * forward + row[LEFT] * leftward + row[NORMAL] * load,
@@ -162,7 +169,7 @@ def add_tyres(p: Any, spin: Vector, wheels: Vector, grip: Vector, wrench: Vector
 
 @compiled
 def add_force(wrench: Vector, fx: float, fy: float, fz: float, arm: Vector) -> None:
-    """Add a world-frame force at `arm` from the centre of gravity to (force, torque)."""
+    """Add a world-frame force at `arm` (3,) from the centre of gravity to `wrench` (6,)."""
     wrench[0] += fx
     wrench[1] += fy
     wrench[2] += fz

@@ -11,7 +11,7 @@ from simulator.camera import KINDS, VIEWS
 from simulator.sensors.beams import BEAM_ANGLES, RANGE_M
 from simulator.sensors.standard import read_range
 from simulator.track.road import Road
-from simulator.traffic.traffic import EGO_SIZE, SIZE
+from simulator.traffic.traffic import EGO_CAR_SIZE, TRAFFIC_CAR_SIZE
 from simulator.vehicle.state import CarState
 from simulator.world.world import World
 
@@ -37,8 +37,8 @@ def scene_message(road: Road, *, controls: bool) -> str:
         "edge": road.edge,
         "beam_angles": np.round(BEAM_ANGLES, 5).tolist(),
         "range_m": RANGE_M,
-        "car": EGO_SIZE[:2],
-        "other": SIZE[:2],
+        "car": EGO_CAR_SIZE[:2],
+        "other": TRAFFIC_CAR_SIZE[:2],
         "views": list(VIEWS),
         "lights": list(KINDS),
         "controls": controls,

@@ -1,4 +1,4 @@
-"""Cars seen from above as boxes: which of them overlap. World frame, metres, radians."""
+"""Overlap test of cars as rectangles in the plane. World frame, metres, radians."""
 
 import math
 
@@ -11,7 +11,7 @@ FloatArray = NDArray[np.float64]
 
 
 @compiled
-def overlap(a: FloatArray, b: FloatArray) -> bool:
+def boxes_overlap(a: FloatArray, b: FloatArray) -> bool:
     """Whether two boxes (x, y, yaw, length, width) overlap, by the separating-axis theorem."""
     dx, dy = b[0] - a[0], b[1] - a[1]
     turn = b[2] - a[2]
@@ -27,12 +27,12 @@ def overlap(a: FloatArray, b: FloatArray) -> bool:
 
 
 @compiled
-def overlapping(boxes: FloatArray) -> tuple[int, int]:
-    """The first pair of `boxes` (n, 5) that overlap, (-1, -1) where none do."""
+def first_overlap(boxes: FloatArray) -> tuple[int, int]:
+    """Indices of the first pair of `boxes` (n, 5) that overlap, (-1, -1) if none do."""
     for i in range(boxes.shape[0]):
         for j in range(i + 1, boxes.shape[0]):
             reach = boxes[i, 3] + boxes[j, 3]
             near = abs(boxes[i, 0] - boxes[j, 0]) < reach and abs(boxes[i, 1] - boxes[j, 1]) < reach
-            if near and overlap(boxes[i], boxes[j]):
+            if near and boxes_overlap(boxes[i], boxes[j]):
                 return i, j
     return -1, -1

@@ -1,6 +1,8 @@
-"""VTORCS's world: one car on one road with walls and traffic, advanced by PyBullet at 200 Hz.
+"""The simulated world: one ego car on one road with walls and traffic, stepped at 200 Hz.
 
-World frame: x, y in the plane, z up, yaw counter-clockwise; s and to_middle in the track frame.
+Compiled code moves the ego car while nothing can touch it (`vehicle.rigid_body`); near walls, other
+cars and moving wrecks PyBullet computes the contacts (`collisions`). World frame: x, y in the
+plane, z up, yaw counter-clockwise; s and to_middle in the track frame.
 """
 
 import math
@@ -17,33 +19,33 @@ from simulator.vehicle.car import HIGHEST_GEAR, LOWEST_GEAR, RPM, CarParameters
 from simulator.vehicle.dynamics import ENGINE, MEMORY, MOTION, ODOMETER, PIECE, SPIN, STEER
 from simulator.vehicle.orientation import quaternion
 from simulator.vehicle.powertrain import gear_ratio
-from simulator.vehicle.rigid_body import fly
+from simulator.vehicle.rigid_body import advance_free
 from simulator.vehicle.state import CarState, Collision, Command
 from simulator.vehicle.surface import ground
 from simulator.vehicle.track_state import (
-    ALONG,
     ANGLE,
-    BEND,
-    OFFSET,
     PITCH,
-    PLACE,
-    READINGS,
     ROLL,
+    TRACK_CURVATURE,
+    TRACK_OFFSET,
+    TRACK_S,
+    TRACK_SPEED,
+    TRACK_STATE_SIZE,
     VX,
     VY,
     YAW,
     YAW_RATE,
-    read_out,
+    measure_track_state,
 )
-from simulator.world.collisions import Impacts
-from simulator.world.physics import PHYSICS_HZ, check_frequency
+from simulator.world.collisions import ContactPhysics
+from simulator.world.control_rate import PHYSICS_HZ, check_frequency
 from trackfeatures.errors import UserError
 
 __all__ = ["CarState", "Command", "World"]
 
-ROLLING_BACK_M_S = -0.5
-"""Slower than this along the track is driving backwards."""
-FASTEST_START_M_S = 150.0
+BACKWARDS_SPEED_M_S = -0.5
+"""Below this speed along the track, the car drives backwards."""
+MAX_START_SPEED_M_S = 150.0
 FloatArray = NDArray[np.float64]
 NO_TRAFFIC = np.zeros((0, 6))
 
@@ -63,21 +65,21 @@ class World:
         self.road = road
         self.frequency_hz = int(frequency_hz)
         self.car = car or CarParameters()
-        self._count = traffic
+        self._traffic_count = traffic
         self.traffic = Traffic(road, traffic, np.random.default_rng(0))
         self._params = self.car.packed()
         self._table = road.track.arrays()
         self._ground = ground(road)
         self._motion = np.zeros(MOTION)
         self._memory = np.zeros(MEMORY)
-        self._readings = np.zeros(READINGS)
+        self._readings = np.zeros(TRACK_STATE_SIZE)
         self._controls = np.zeros(4)
-        self._impacts = Impacts(road, self.car)
+        self._contacts = ContactPhysics(road, self.car)
         self._state: CarState | None = None
 
     @property
     def state(self) -> CarState:
-        """The car now. Raises UserError before the first reset."""
+        """The current state of the ego car. Raises UserError before the first reset."""
         if self._state is None:
             raise UserError("the world has no episode yet; call reset(seed=...) first")
         return self._state
@@ -91,17 +93,18 @@ class World:
         angle: float = 0.0,
         speed: float = 0.0,
     ) -> CarState:
-        """Start an episode. `s` defaults to 25 m before the line; angle as in DESIGN (positive:
-        the car points to the right of the track), rad; speed in m/s along the body.
+        """Start an episode. `s` (m) defaults to 25 m before the line; `angle` is track tangent
+        minus yaw (rad, positive when the car points to the right); `speed` in m/s along the body.
 
-        The episode is a function of the arguments alone, whatever this world did before.
+        The episode depends on the arguments only, not on earlier episodes. Raises UserError for a
+        value out of range.
         """
         start = -START_BEFORE_LINE_M if s is None else float(s)
         check_seed(seed)
         for name, value in (("s", start), ("to_middle", to_middle), ("angle", angle)):
             if not math.isfinite(value):
                 raise UserError(f"reset got {name} = {value}; give a finite number")
-        if not abs(speed) <= FASTEST_START_M_S:  # true for NaN, too
+        if not abs(speed) <= MAX_START_SPEED_M_S:  # true for NaN, too
             raise UserError(f"reset got speed = {speed}; give m/s between -150 and 150")
         if abs(to_middle) > self.road.edge:
             raise UserError(
@@ -109,26 +112,26 @@ class World:
                 "its centre, so give less"
             )
         self.traffic = Traffic(
-            self.road, self._count, np.random.default_rng([seed, 1]), clear_s=start
+            self.road, self._traffic_count, np.random.default_rng([seed, 1]), ego_s=start
         )
-        self._impacts.start(self.traffic)
+        self._contacts.start(self.traffic)
         self._place(start, to_middle, angle, speed)
         self._lap, self._steps, self._lap_start = 0, 0, 0
         self._s = float(start % self.road.track.length_m)
-        self._state = self._measure(1, None)
+        self._state = self._build_state(1, None)
         return self._state
 
     def step(self, command: Command) -> CarState:
         """Hold `command` for one control step; raises UserError for a value out of its range."""
         before = self.state
-        _check(command, self._controls)
-        hit = self._move(*self._advance_traffic(before))
+        _fill_controls(command, self._controls)
+        collision = self._advance_car(*self._advance_traffic(before))
         self._steps += 1
-        self._state = self._measure(command.gear, hit)
+        self._state = self._build_state(command.gear, collision)
         return self._state
 
     def features(self) -> tf.TrackFeatures:
-        """The true track features of the present moment."""
+        """The true track features of the current state."""
         now = self.state
         return self.road.measure(now.s, now.to_middle, now.angle)
 
@@ -138,8 +141,8 @@ class World:
         return np.array([now.x, now.y, now.z, now.roll, now.pitch, now.yaw])
 
     def close(self) -> None:
-        """Give the physics client back; a closed world refuses to reset and to step."""
-        self._impacts.close()
+        """Release the physics client; afterwards `reset` and `step` raise UserError."""
+        self._contacts.close()
         self._state = None
 
     def __enter__(self) -> Self:
@@ -149,14 +152,14 @@ class World:
         self.close()
 
     def _place(self, s: float, to_middle: float, angle: float, speed: float) -> None:
-        """Stand the car on its wheels at a place of the road, rolling at `speed`."""
+        """Place the car on its wheels at (s, to_middle), rolling at `speed`."""
         piece = index_at(self._table, s)
         wrapped = s % self.road.track.length_m
         pose = self.road.track.at(s, to_middle)
         z, *normal = surface(self._table, piece, wrapped, to_middle)
         up = np.array(normal)
         yaw = float(pose.heading) - angle
-        # In the road plane, and seen from above exactly in the direction of yaw.
+        # Forward lies in the road plane; its projection on the x-y plane has the direction of yaw.
         rise = -(up[0] * math.cos(yaw) + up[1] * math.sin(yaw)) / up[2]
         forward = np.array([math.cos(yaw), math.sin(yaw), rise])
         forward /= np.linalg.norm(forward)
@@ -172,7 +175,8 @@ class World:
         self._memory[ENGINE] = max(turning, self.car.idle_rpm / RPM)
 
     def _advance_traffic(self, before: CarState) -> tuple[FloatArray, FloatArray]:
-        """Let the traffic drive one control step; returns where it was and how far it moves."""
+        """Advance the traffic by one control step; returns its poses (n, 6) before the step and
+        their change over it (n, 6)."""
         if not self.traffic.count:
             return NO_TRAFFIC, NO_TRAFFIC
         old = self.traffic.poses()
@@ -181,25 +185,26 @@ class World:
         move[:, 3:] = (move[:, 3:] + math.pi) % (2.0 * math.pi) - math.pi
         return old, move
 
-    def _move(self, others: FloatArray, move: FloatArray) -> Collision | None:
-        """Drive one control step while the traffic goes from `others` on by `move` (n, 6 each);
-        returns what the car first touched."""
+    def _advance_car(self, others: FloatArray, move: FloatArray) -> Collision | None:
+        """Advance the ego car by one control step while the traffic moves from `others` by `move`
+        ((n, 6) each); returns what the ego car touched first."""
         steps, done = PHYSICS_HZ // self.frequency_hz, 0
-        hit: Collision | None = None
+        collision: Collision | None = None
         while done < steps:
-            if not self._impacts.going_on:
-                done = self._fly(others, move, done, steps)
+            if not self._contacts.has_moving_wrecks:
+                done = self._advance_free(others, move, done, steps)
             if done < steps:
                 share, dt = done / steps, 1.0 / self.frequency_hz
-                met = self._impacts.step(
+                touched = self._contacts.step(
                     self._motion, self._memory, self._controls, others, move, share, dt
                 )
-                hit, done = hit or met, done + 1
-        return hit
+                collision, done = collision or touched, done + 1
+        return collision
 
-    def _fly(self, others: FloatArray, move: FloatArray, done: int, steps: int) -> int:
-        """Drive on from physics step `done` until something is near; returns how far it came."""
-        return fly(
+    def _advance_free(self, others: FloatArray, move: FloatArray, done: int, steps: int) -> int:
+        """Advance without contacts from physics step `done` until something is near; returns the
+        number of physics steps then done."""
+        return advance_free(
             self._params,
             self._table,
             self._ground,
@@ -213,12 +218,12 @@ class World:
             steps,
         )
 
-    def _measure(self, gear: int, hit: Collision | None) -> CarState:
-        """Read the state off the body."""
-        read_out(self._table, self._motion, self._memory, self._readings)
+    def _build_state(self, gear: int, collision: Collision | None) -> CarState:
+        """The state of the ego car, from its motion and internal state."""
+        measure_track_state(self._table, self._motion, self._memory, self._readings)
         motion, memory = self._motion.tolist(), self._memory.tolist()
         readings = self._readings.tolist()
-        self._count_laps(readings[PLACE])
+        self._count_laps(readings[TRACK_S])
         return CarState(
             time_s=self._steps / self.frequency_hz,
             x=motion[0],
@@ -230,10 +235,10 @@ class World:
             vx=readings[VX],
             vy=readings[VY],
             yaw_rate=readings[YAW_RATE],
-            s=readings[PLACE],
-            to_middle=readings[OFFSET],
+            s=readings[TRACK_S],
+            to_middle=readings[TRACK_OFFSET],
             angle=readings[ANGLE],
-            curvature=readings[BEND],
+            curvature=readings[TRACK_CURVATURE],
             rpm=memory[ENGINE] * RPM,
             gear=gear,
             wheel_spin=(memory[SPIN], memory[SPIN + 1], memory[SPIN + 2], memory[SPIN + 3]),
@@ -241,13 +246,14 @@ class World:
             lap=self._lap,
             odometer_m=memory[ODOMETER],
             lap_time_s=(self._steps - self._lap_start) / self.frequency_hz,
-            collision=hit,
-            off_track=abs(readings[OFFSET]) > self.road.edge,
-            backwards=abs(readings[ANGLE]) > 0.5 * math.pi or readings[ALONG] < ROLLING_BACK_M_S,
+            collision=collision,
+            off_track=abs(readings[TRACK_OFFSET]) > self.road.edge,
+            backwards=abs(readings[ANGLE]) > 0.5 * math.pi
+            or readings[TRACK_SPEED] < BACKWARDS_SPEED_M_S,
         )
 
     def _count_laps(self, s: float) -> None:
-        """Crossing the line adds a lap (crossing it backwards takes one away again)."""
+        """Crossing the line adds a lap; crossing it backwards subtracts one."""
         length = self.road.track.length_m
         moved = s - self._s
         if moved < -0.5 * length:
@@ -259,13 +265,13 @@ class World:
 
 
 def check_seed(seed: int) -> None:
-    """Raises UserError for what numpy's generator would not take."""
+    """Raises UserError unless `seed` is a non-negative integer."""
     if not isinstance(seed, int | np.integer) or seed < 0:
         raise UserError(f"reset got seed = {seed!r}; give a whole number of 0 or more")
 
 
-def _check(command: Command, controls: FloatArray) -> None:
-    """Fill `controls` with (steer, throttle, brake, gear) for the kernel."""
+def _fill_controls(command: Command, controls: FloatArray) -> None:
+    """Check `command` and write (steer, throttle, brake, gear) into `controls` (4,)."""
     steer, throttle, brake, gear = command.steer, command.throttle, command.brake, command.gear
     # Comparisons with NaN are false, so these hold for it as well.
     if not (-1.0 <= steer <= 1.0 and 0.0 <= throttle <= 1.0 and 0.0 <= brake <= 1.0):

@@ -132,7 +132,7 @@ def test_a_lost_offset_is_held_for_a_time_then_zero() -> None:
 
 def test_throttle_is_eased_and_brake_applied_behind_a_slower_car() -> None:
     road = Road(find_track("oval"))
-    traffic = Traffic(road, 1, np.random.default_rng(0), clear_s=0.0)
+    traffic = Traffic(road, 1, np.random.default_rng(0), ego_s=0.0)
     s, speed = float(traffic.s[0]), float(traffic.speed[0])
 
     def behind(gap: float, vx: float) -> tuple[float, float]:

@@ -1,7 +1,7 @@
-"""The plain way to measure range beams, for tests and benchmarks to hold the quick way to it.
+"""Brute-force range beams, the reference for `simulator.sensors.beams` in tests and benchmarks.
 
-Both edges of the road are drawn as polylines and the other cars as rectangles; a beam ends at the
-nearest of all these segments that it cuts. Metres, radians; about 1 ms a look.
+Both edges of the road are polylines and the other cars rectangles; a beam ends at the nearest of
+all these segments that it intersects. Metres, radians; about 1 ms per pose.
 """
 
 import math
@@ -21,7 +21,8 @@ NO_BOXES: FloatArray = np.zeros((0, 6))
 class BruteForce:
     """All segments of a road's edges, `step_m` long along the centre line.
 
-    A chord of 0.2 m lies 0.3 mm off a bend of 20 m radius; beams that graze the edge multiply that.
+    A chord of 0.2 m deviates 0.3 mm from a bend of 20 m radius; beams nearly parallel to the edge
+    multiply this error.
     """
 
     def __init__(self, road: Road, step_m: float = 0.2) -> None:
@@ -60,7 +61,8 @@ def cut_by(
     directions: FloatArray,
     distances: FloatArray,
 ) -> None:
-    """Shorten `distances` (n,) of rays from (x, y) to the nearest of segments (m, 2) they cut."""
+    """Shorten `distances` (n,) of rays from (x, y) to the nearest of the segments (m, 2) that they
+    intersect."""
     for i in range(directions.shape[0]):
         ray_x, ray_y = math.cos(directions[i]), math.sin(directions[i])
         for k in range(starts.shape[0]):
@@ -75,7 +77,7 @@ def cut_by(
 
 
 def _rectangles(boxes: FloatArray, size: tuple[float, float]) -> tuple[FloatArray, FloatArray]:
-    """First corner and side (4 k, 2) of the sides of rectangles at `boxes`."""
+    """Start point and side vector (4 k, 2) of the sides of the rectangles at `boxes` (k, 6)."""
     corners = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * 0.5 * np.array(size)
     cos_yaw, sin_yaw = np.cos(boxes[:, 5, None]), np.sin(boxes[:, 5, None])
     placed = np.stack(

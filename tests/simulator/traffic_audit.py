@@ -1,6 +1,6 @@
-"""Watching traffic for long: who touches whom, who leaves a lane, who jumps, how they change lanes.
+"""Checks of the traffic at every step of a long drive: overlaps, lanes, speeds, jumps.
 
-The tests hold a few roads to it, `benchmarks/traffic.py` all of them.
+The tests run it on a few roads, `benchmarks/traffic.py` on all of them.
 """
 
 import math
@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from simulator.driving.cruise import Cruise
 from simulator.track.road import Road
-from simulator.traffic.traffic import DESIRED_KMH, EGO_SIZE, MOST_CARS, SIZE, Traffic
+from simulator.traffic.traffic import DESIRED_KMH, EGO_CAR_SIZE, MAX_CARS, TRAFFIC_CAR_SIZE, Traffic
 from simulator.vehicle.state import CarState, Command
-from simulator.world.boxes import overlapping
+from simulator.world.boxes import first_overlap
 from simulator.world.world import World
 
 FREQUENCY_HZ = 20
@@ -23,8 +23,8 @@ ROUNDING_M = 1e-6
 
 
 @dataclass(frozen=True)
-class Watched:
-    """What was seen of one road's traffic."""
+class TrafficAudit:
+    """Statistics of the traffic on one road."""
 
     steps: int
     lane_changes: int
@@ -33,18 +33,22 @@ class Watched:
     own_laps: int
 
 
-class Disorder(Exception):
-    """The traffic did what it never should."""
+class TrafficViolation(Exception):
+    """The traffic broke one of the checked rules."""
 
 
-def watch(road: Road, seconds: float, *, parked: bool = False, seed: int = 0) -> Watched:
-    """Let `MOST_CARS` cars drive among which the own car drives by the same model, or is parked.
+def audit_traffic(
+    road: Road, seconds: float, *, parked: bool = False, seed: int = 0
+) -> TrafficAudit:
+    """Drive MAX_CARS cars for `seconds`, with the ego car among them: it drives by the same model
+    or is parked.
 
-    Raises Disorder where two cars overlap, one leaves its lanes, jumps, or breaks the speed law.
+    Raises TrafficViolation when two cars overlap, or one leaves its lanes, jumps, or exceeds its
+    speed range.
     """
     driver = Cruise(road, speed_kmh=70.0, frequency_hz=FREQUENCY_HZ)
     steps, changes, driven = round(seconds * FREQUENCY_HZ), 0, 0.0
-    with World(road, traffic=MOST_CARS, frequency_hz=FREQUENCY_HZ) as world:
+    with World(road, traffic=MAX_CARS, frequency_hz=FREQUENCY_HZ) as world:
         lane_y = 0.5 * (road.markings_y[-1] + road.markings_y[-2])
         state = world.reset(seed=seed, to_middle=float(lane_y))
         before = _Moment(world.traffic)
@@ -56,45 +60,49 @@ def watch(road: Road, seconds: float, *, parked: bool = False, seed: int = 0) ->
             changes += int(np.count_nonzero(now.lane(road) != before.lane(road)))
             driven += float(now.speed.sum())
             before = now
-        mean = 3.6 * driven / (steps * MOST_CARS)
+        mean = 3.6 * driven / (steps * MAX_CARS)
         stopped = int(np.count_nonzero(before.speed < 0.1))
-        return Watched(steps, changes, mean, stopped, state.lap)
+        return TrafficAudit(steps, changes, mean, stopped, state.lap)
 
 
 class _Moment:
-    """The traffic's places at one time."""
+    """Positions and speeds of the traffic at one time."""
 
     def __init__(self, traffic: Traffic) -> None:
         self.poses, self.s = traffic.poses(), traffic.s
         self.to_middle, self.speed = traffic.to_middle, traffic.speed
 
     def lane(self, road: Road) -> NDArray[np.int64]:
-        """(n,) number of the lane that each car's middle is in."""
+        """(n,) index of the lane that each car's centre is in."""
         return np.searchsorted(-road.markings_y, -self.to_middle)
 
 
 def _check(road: Road, state: CarState, before: _Moment, now: _Moment) -> None:
     if state.collision is not None:
-        raise Disorder(f"the own car hit {state.collision} at {state.time_s:.2f} s")
+        raise TrafficViolation(f"the ego car hit {state.collision} at {state.time_s:.2f} s")
     boxes = np.empty((len(now.s) + 1, 5))
-    boxes[:-1, :2], boxes[:-1, 2], boxes[:-1, 3:] = now.poses[:, :2], now.poses[:, 5], SIZE[:2]
-    boxes[-1] = (state.x, state.y, state.yaw, *EGO_SIZE[:2])
-    pair = overlapping(boxes)
+    boxes[:-1, :2], boxes[:-1, 2], boxes[:-1, 3:] = (
+        now.poses[:, :2],
+        now.poses[:, 5],
+        TRAFFIC_CAR_SIZE[:2],
+    )
+    boxes[-1] = (state.x, state.y, state.yaw, *EGO_CAR_SIZE[:2])
+    pair = first_overlap(boxes)
     if pair[0] >= 0:
-        raise Disorder(f"cars {pair} overlap at {state.time_s:.2f} s")
-    if np.any(np.abs(now.to_middle) + 0.5 * SIZE[1] > road.markings_y[0]):
-        raise Disorder(f"a car is off the lanes at {state.time_s:.2f} s")
+        raise TrafficViolation(f"cars {pair} overlap at {state.time_s:.2f} s")
+    if np.any(np.abs(now.to_middle) + 0.5 * TRAFFIC_CAR_SIZE[1] > road.markings_y[0]):
+        raise TrafficViolation(f"a car is off the lanes at {state.time_s:.2f} s")
     if np.any(now.speed < 0.0) or np.any(3.6 * now.speed > DESIRED_KMH[1] + ROUNDING_M):
-        raise Disorder(f"a speed is out of bounds at {state.time_s:.2f} s")
+        raise TrafficViolation(f"a speed is out of bounds at {state.time_s:.2f} s")
     dt, length = 1.0 / FREQUENCY_HZ, road.track.length_m
     forward = (now.s - before.s + 0.5 * length) % length - 0.5 * length
     way = np.hypot(*(now.poses[:, :2] - before.poses[:, :2]).T)
     sideways = np.abs(now.to_middle - before.to_middle)
     most = np.maximum(now.speed, before.speed) * dt
-    # A car that changes lanes goes a little farther than its speed along the lane.
+    # A car that changes lanes moves a little farther than its speed along the lane gives.
     if np.any(way > np.hypot(most, sideways) + 0.02) or np.any(forward < -ROUNDING_M):
-        raise Disorder(f"a car jumped at {state.time_s:.2f} s")
+        raise TrafficViolation(f"a car jumped at {state.time_s:.2f} s")
     if np.any(sideways > FASTEST_SIDEWAYS_M_S * dt):
-        raise Disorder(f"a car slid sideways at {state.time_s:.2f} s")
+        raise TrafficViolation(f"a car slid sideways at {state.time_s:.2f} s")
     if not math.isfinite(float(now.poses.sum())):
-        raise Disorder(f"a place is no number at {state.time_s:.2f} s")
+        raise TrafficViolation(f"a position is not finite at {state.time_s:.2f} s")

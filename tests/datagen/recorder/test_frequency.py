@@ -11,7 +11,7 @@ from datagen.planning.plan import CONTROL_HZ
 from datagen.planning.planner import make_plan
 from datagen.recording import Dataset
 from datagen.view.steps import Steps
-from simulator.world.physics import PHYSICS_HZ
+from simulator.world.control_rate import PHYSICS_HZ
 from tests.datagen.commands import datagen
 
 OPTIONS = ("--rounds", "1", "--tracks", "oval", "--lights", "clear", "--stretch", "0")

@@ -1,4 +1,4 @@
-"""The Gymnasium environments: the checker, spaces, reward, endings, seeds, vectors, bad input."""
+"""The Gymnasium environments: env checker, spaces, reward, termination, seeds, vectors, errors."""
 
 import math
 import re
@@ -47,7 +47,7 @@ def test_gymnasiums_checker_passes_without_a_warning(name: str, options: dict[st
     env.close()
 
 
-def test_gymnasiums_checker_only_minds_the_range_of_the_gear() -> None:
+def test_gymnasiums_checker_warns_only_of_the_range_of_the_gear() -> None:
     env = make(controls="full")
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
@@ -90,7 +90,7 @@ def test_throttle_and_gear_are_held_and_the_score_is_the_sum_of_rewards() -> Non
     env.close()
 
 
-def test_the_reward_by_hand() -> None:
+def test_reward_equals_hand_computed_values() -> None:
     assert step_reward(0.0, 0.0, 5.0, ended=False) == 1.0
     expected = math.cos(0.2) - math.sin(0.2) - 0.3
     assert step_reward(-0.2, 1.5, 5.0, ended=False) == pytest.approx(expected)
@@ -129,14 +129,14 @@ def test_a_collision_ends_the_episode_with_minus_two() -> None:
 
 
 @pytest.mark.parametrize("frequency_hz", [10, 50])
-def test_recordings_play_at_the_speed_of_life(frequency_hz: int) -> None:
+def test_render_fps_is_the_control_rate(frequency_hz: int) -> None:
     env = make(frequency_hz=frequency_hz)
     assert env.metadata["render_fps"] == frequency_hz
     env.close()
     assert simulator.env.LateralControl.metadata["render_fps"] == 20
 
 
-def test_an_episode_is_cut_after_6500_steps_or_as_many_as_asked_for() -> None:
+def test_an_episode_is_truncated_after_max_episode_steps() -> None:
     spec = gym.spec(STATE_ID)
     assert spec.max_episode_steps == 6500
     env = make(max_episode_steps=3)
@@ -145,7 +145,7 @@ def test_an_episode_is_cut_after_6500_steps_or_as_many_as_asked_for() -> None:
     env.close()
 
 
-def test_noise_is_the_papers_and_seeded() -> None:
+def test_state_noise_is_0_05_and_seeded() -> None:
     quiet, noisy = make(), make(noise=True)
     base, _ = quiet.reset(seed=3)
     states = [noisy.reset(seed=seed)[0] for seed in range(200)]
@@ -155,7 +155,7 @@ def test_noise_is_the_papers_and_seeded() -> None:
     noisy.close()
 
 
-def test_full_controls_shift_and_brake() -> None:
+def test_full_controls_shift_gears_and_brake() -> None:
     env = make(controls="full")
     env.reset(seed=0, options={"s": 30.0, "speed": 15.0})
     for _ in range(20):
@@ -165,7 +165,7 @@ def test_full_controls_shift_and_brake() -> None:
     env.close()
 
 
-def test_two_environments_beside_each_other_are_like_one_alone() -> None:
+def test_a_vector_of_two_equals_two_single_environments() -> None:
     vector = gym.make_vec(STATE_ID, num_envs=2, vectorization_mode="async", track="circuit")
     assert isinstance(vector, gym.vector.AsyncVectorEnv)
     observations, _ = vector.reset(seed=[4, 5])
@@ -282,20 +282,20 @@ def test_a_step_without_an_episode_is_refused() -> None:
         "vectorization_mode='sync'); print(e.spec.id)",
     ],
 )
-def test_the_names_are_known_after_an_import_or_by_the_modules_name(code: str) -> None:
+def test_environments_are_registered_by_import_or_by_module_prefix(code: str) -> None:
     result = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True
     )
     assert result.stdout.splitlines()[-1] == IMAGE_ID
 
 
-def test_the_driver_view_gives_image_and_state() -> None:
+def test_driver_view_observes_image_and_state() -> None:
     env = gym.make(IMAGE_ID, track="circuit", lanes=2, width=140, height=105)
     try:
         observation, _ = env.reset(seed=0)
         assert env.observation_space.contains(observation)
         assert observation["image"].shape == (105, 140, 3)
-        assert observation["image"].std() > 10.0  # a picture, not a blank
+        assert observation["image"].std() > 10.0  # not a blank image
         moved, *_ = env.step(steer(0.0))
         assert moved["state"].shape == (7,)
     finally:

@@ -1,4 +1,4 @@
-"""Options of the environments: kinds of observation, views, sensors, reward, endings, videos."""
+"""Options of the environments: observations, views, sensors, rewards, termination, videos."""
 
 import math
 from pathlib import Path
@@ -11,7 +11,7 @@ import pytest
 from gymnasium.wrappers import AddRenderObservation, RecordVideo, RenderCollection
 
 import simulator.env  # registers the names
-from simulator.camera import CLASSES
+from simulator.camera import CLASSES, Camera, Light
 from simulator.env.reward import Ending
 from simulator.sensors import STANDARD, Sensor
 from simulator.track.road import Road
@@ -62,17 +62,25 @@ def spaces_of(name: str, **options: Any) -> dict[str, tuple[int, ...]]:
         ),
     ],
 )
-def test_each_kind_of_observation_has_its_parts(
+def test_observations_have_these_parts_and_shapes(
     name: str, options: dict[str, Any], shapes: dict[str, tuple[int, ...]]
 ) -> None:
     assert spaces_of(name, **options) == shapes
 
 
-def test_views_are_those_of_the_camera_and_drawn_once_a_step() -> None:
-    views = ("front", "front:depth", "front:class")
+def test_views_are_those_of_the_camera_and_rendered_once_a_step() -> None:
+    views = ("front", "rear", "left", "chase", "top", "front:depth", "rear:depth", "front:class")
     env = gym.make(IMAGE_ID, track="oval", views=views, render_mode="rgb_array", **SMALL).unwrapped
     assert isinstance(env, simulator.env.LateralControl)
-    observation, _ = env.reset(seed=0)
+    env.reset(seed=0)
+    observation, *_ = env.step(AHEAD)
+    world = env.world
+    light = Light.named("clear", np.random.default_rng([0, 2]))
+    with Camera(world.road, CameraParameters(**SMALL), seed=0, light=light) as camera:
+        expected = camera.render_views(world.body_pose(), world.traffic.poses(), views)
+    for view in views:
+        limited = np.minimum(expected[view], 6000.0) if "depth" in view else expected[view]
+        np.testing.assert_array_equal(observation[view], limited, err_msg=view)
     sky = observation["front:class"] == CLASSES.index("sky")
     assert 0.2 < sky.mean() < 0.8
     np.testing.assert_array_equal(sky, observation["front:depth"] == 6000.0)
@@ -81,11 +89,11 @@ def test_views_are_those_of_the_camera_and_drawn_once_a_step() -> None:
         shown = env.render()
         assert shown is not None
         np.testing.assert_array_equal(shown, observation["front"])
-        shown[:] = 0  # what is handed out is the caller's own
+        shown[:] = 0  # the returned array is a copy
     env.close()
 
 
-def test_calibration_takes_a_point_of_the_body_to_its_pixel() -> None:
+def test_calibration_projects_a_point_of_the_body_to_its_pixel() -> None:
     env = gym.make(
         IMAGE_ID, views=("front", "rear:depth"), mount=CameraParameters(x=1.0, z=1.2), **SMALL
     )
@@ -102,7 +110,7 @@ def test_calibration_takes_a_point_of_the_body_to_its_pixel() -> None:
     assert (calibration["rear:depth"] @ point)[2] == pytest.approx(-10.0)
 
 
-def test_sensors_are_read_in_their_units_and_noisy_where_asked_for() -> None:
+def test_sensor_units_and_noise() -> None:
     options: dict[str, Any] = {"track": "oval", "sensors": ("v_x", "range", "engine")}
     exact, noisy = (
         gym.make(STATE_ID, **options),
@@ -122,7 +130,7 @@ def test_sensors_are_read_in_their_units_and_noisy_where_asked_for() -> None:
     noisy.close()
 
 
-def test_a_sensor_of_the_users_takes_a_few_lines() -> None:
+def test_a_custom_sensor_is_in_the_observation() -> None:
     slip = Sensor(
         "side_slip",
         "rad",
@@ -137,25 +145,25 @@ def test_a_sensor_of_the_users_takes_a_few_lines() -> None:
     env.close()
 
 
-def test_all_standard_sensors_fit_their_spaces_off_the_track_too() -> None:
+def test_all_standard_sensors_stay_in_their_spaces_on_and_off_the_track() -> None:
     names = [sensor.name for sensor in STANDARD]
     env = gym.make(STATE_ID, track="oval", traffic=3, sensors=names, ends=())
     env.reset(seed=0, options={"s": 100.0, "speed": 20.0})
-    left_it = False
+    left_the_track = False
     for _ in range(60):
         observation, *_ = env.step(np.ones(1, np.float32))
         assert env.observation_space.contains(observation)
-        left_it |= observation["range"][0] == -1.0
-    assert left_it
+        left_the_track |= observation["range"][0] == -1.0
+    assert left_the_track
     env.close()
 
 
 def quadratic(state: CarState, road: Road, ending: Ending | None) -> float:
-    """The paper's other reward, of its comparison of controllers."""
+    """The quadratic cost of the paper's comparison of controllers, negated."""
     return -(0.3 * state.to_middle**2 + state.angle**2 + 0.03 * state.steer**2)
 
 
-def test_a_reward_of_ones_own_replaces_the_papers() -> None:
+def test_a_custom_reward_replaces_the_default() -> None:
     env = gym.make(STATE_ID, track="oval", reward=quadratic)
     env.reset(seed=0, options={"to_middle": 1.0, "angle": 0.1, "speed": 8.0})
     _, reward, *_, info = env.step(AHEAD)
@@ -165,7 +173,7 @@ def test_a_reward_of_ones_own_replaces_the_papers() -> None:
     env.close()
 
 
-def test_a_reward_that_is_no_number_is_refused() -> None:
+def test_a_reward_that_is_not_finite_is_refused() -> None:
     env = gym.make(STATE_ID, reward=lambda state, road, ending: math.nan)
     env.reset(seed=0)
     with pytest.raises(UserError, match="returned nan"):
@@ -181,7 +189,7 @@ def test_a_reward_that_is_no_number_is_refused() -> None:
         ((), ""),
     ],
 )
-def test_only_the_chosen_endings_end_an_episode(ends: tuple[str, ...], expected: str) -> None:
+def test_only_events_in_ends_terminate_an_episode(ends: tuple[str, ...], expected: str) -> None:
     env = gym.make(STATE_ID, track="oval", ends=ends)
     env.reset(seed=0, options={"s": 100.0, "speed": 20.0, "angle": 0.4})
     farthest = 0.0
@@ -196,7 +204,7 @@ def test_only_the_chosen_endings_end_an_episode(ends: tuple[str, ...], expected:
     env.close()
 
 
-def test_backwards_ends_only_where_chosen() -> None:
+def test_driving_backwards_terminates_only_if_in_ends() -> None:
     for ends, expected in ((("backwards",), "backwards"), (("off_track",), "")):
         env = gym.make(STATE_ID, track="oval", ends=ends)
         env.reset(seed=0, options={"speed": -5.0})
@@ -212,11 +220,11 @@ def test_info_holds_the_true_features_that_are_present() -> None:
     assert (features["ml"], features["mr"]) == pytest.approx((-2.0, 2.0))
     assert (features["to_lane_centre"], features["angle"]) == pytest.approx((0.0, 0.1))
     assert features["heading"] == 1
-    assert "m" not in features  # it drives on no marking
+    assert "m" not in features  # no marking within reach of the on-marking system
     env.close()
 
 
-def test_a_vector_stacks_features_and_tells_which_are_present() -> None:
+def test_a_vector_environment_stacks_features_with_presence_masks() -> None:
     vector = gym.make_vec(STATE_ID, 2, vectorization_mode="sync", track="oval", lanes=2)
     _, infos = vector.reset(seed=0, options={"to_middle": 0.0})
     np.testing.assert_array_equal(infos["features"]["_m"], [True, True])
@@ -241,12 +249,12 @@ def test_record_video_writes_every_frame(tmp_path: Path, view: str) -> None:
     while (read := video.read())[0]:
         frames.append(read[1])
     assert video.get(cv2.CAP_PROP_FPS) == pytest.approx(20.0)
-    assert len(frames) == 25  # that of the reset, and one a step
+    assert len(frames) == 25  # one of the reset and one per step
     assert frames[0].shape == (48, 64, 3)
     assert frames[0].std() > 10.0
 
 
-def test_gymnasiums_own_wrappers_see_the_pictures() -> None:
+def test_gymnasium_render_wrappers_return_the_images() -> None:
     env = gym.make(STATE_ID, render_mode="rgb_array", **SMALL)
     collected = RenderCollection(env)
     collected.reset(seed=0)

@@ -1,4 +1,4 @@
-"""A few of the replay benchmark's random episodes, one with pictures: bit-equal wherever run."""
+"""Random episodes of the replay benchmark, one with images, are bit-equal wherever they run."""
 
 import json
 import subprocess

@@ -12,7 +12,7 @@ from simulator.sensors.sensor import Sensor, SensorSuite
 from simulator.sensors.standard import STANDARD, camera_sensor, read_range, read_track_range
 from simulator.track.catalogue import find_track
 from simulator.track.road import Road
-from simulator.traffic.traffic import SIZE
+from simulator.traffic.traffic import TRAFFIC_CAR_SIZE
 from simulator.world.world import Command, World
 from tests.simulator.oracles import BruteForce
 from trackfeatures.camera import CameraParameters
@@ -56,7 +56,7 @@ def test_both_sets_of_beams_agree_with_brute_force_at_every_step_of_a_drive(
             to_edge, to_anything = read_track_range(world), read_range(world)
             np.testing.assert_allclose(to_edge, oracle.distances(*place), atol=0.02)
             cars = world.traffic.poses()
-            expected = oracle.distances(*place, boxes=cars, size=SIZE[:2])
+            expected = oracle.distances(*place, boxes=cars, size=TRAFFIC_CAR_SIZE[:2])
             np.testing.assert_allclose(to_anything, expected, atol=0.02)
             cut_short += int(np.count_nonzero(to_anything < to_edge))
     assert (cut_short > 20) == (traffic > 0)

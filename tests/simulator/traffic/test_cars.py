@@ -12,7 +12,13 @@ from simulator.track.geometry import Track
 from simulator.track.markings import MarkingStyle
 from simulator.track.pieces import Piece, assemble
 from simulator.track.road import Road
-from simulator.traffic.traffic import DESIRED_KMH, EGO_SIZE, SIDE_ACCELERATION, SIZE, Traffic
+from simulator.traffic.traffic import (
+    DESIRED_KMH,
+    EGO_CAR_SIZE,
+    LATERAL_ACCELERATION,
+    TRAFFIC_CAR_SIZE,
+    Traffic,
+)
 from trackfeatures.errors import UserError
 
 DT = 0.05
@@ -60,7 +66,7 @@ def apart(a: NDArray[np.float64], b: NDArray[np.float64]) -> bool:
 def run(lanes: int, seed: int, steps: int, ego_speed: float = 14.0) -> tuple[Traffic, list[Any]]:
     """Traffic round an ego car that drives in the rightmost lane; samples of all places."""
     road = Road(stadium(), lanes=lanes, lane_width=3.2)
-    traffic = Traffic(road, 12, np.random.default_rng(seed), clear_s=500.0)
+    traffic = Traffic(road, 12, np.random.default_rng(seed), ego_s=500.0)
     ego_y = float(0.5 * (road.markings_y[-1] + road.markings_y[-2]))
     ego_s, places = 500.0, []
     for step in range(steps):
@@ -82,7 +88,7 @@ def test_twelve_cars_never_touch_in_three_minutes(lanes: int) -> None:
         at = track.at(ego_s, ego_y)
         ego = np.array([[at.x, at.y, at.z, 0.0, 0.0, at.heading]], dtype=np.float64)
         # Only near cars can touch: a cheap filter before the exact test.
-        boxes = np.concatenate([corners(poses, SIZE), corners(ego, EGO_SIZE)])
+        boxes = np.concatenate([corners(poses, TRAFFIC_CAR_SIZE), corners(ego, EGO_CAR_SIZE)])
         middles = boxes.mean(axis=1)
         for i, j in itertools.combinations(range(13), 2):
             if np.hypot(*(middles[i] - middles[j])) < 6.0:
@@ -113,7 +119,7 @@ def test_speeds_keep_to_the_range_and_to_the_bends() -> None:
         for row, v, y in zip(poses, speed, to_middle, strict=True):
             s, _ = traffic.road.track.project(row[0], row[1])
             k = traffic.road.track.curvature(s)
-            assert v * v * abs(k / (1 - k * y)) <= SIDE_ACCELERATION * 1.02
+            assert v * v * abs(k / (1 - k * y)) <= LATERAL_ACCELERATION * 1.02
 
 
 def test_lateral_motion_is_smooth_and_yaw_follows_it() -> None:
@@ -159,30 +165,30 @@ def test_cars_stand_on_the_road_plane() -> None:
 def test_nobody_starts_near_the_ego_car() -> None:
     road = Road(stadium(), lanes=3)
     for seed in range(20):
-        traffic = Traffic(road, 12, np.random.default_rng(seed), clear_s=10.0)
+        traffic = Traffic(road, 12, np.random.default_rng(seed), ego_s=10.0)
         gaps = np.abs((traffic.s - 10.0 + 400.0) % road.track.length_m - 400.0)
-        assert gaps.min() >= 25.0 + 0.5 * (SIZE[0] + EGO_SIZE[0]) - 1e-9
+        assert gaps.min() >= 25.0 + 0.5 * (TRAFFIC_CAR_SIZE[0] + EGO_CAR_SIZE[0]) - 1e-9
 
 
 def test_cars_stop_behind_an_ego_car_at_rest() -> None:
     road = Road(stadium(), lanes=1)
-    traffic = Traffic(road, 3, np.random.default_rng(0), clear_s=300.0)
+    traffic = Traffic(road, 3, np.random.default_rng(0), ego_s=300.0)
     for _ in range(2400):
         traffic.step(DT, 300.0, 0.0, 0.0)
     assert np.all(traffic.speed < 0.05)
     behind = np.sort((300.0 - traffic.s) % road.track.length_m)
-    assert behind[0] - 0.5 * (SIZE[0] + EGO_SIZE[0]) == pytest.approx(2.5, abs=0.7)
+    assert behind[0] - 0.5 * (TRAFFIC_CAR_SIZE[0] + EGO_CAR_SIZE[0]) == pytest.approx(2.5, abs=0.7)
 
 
 def test_leader_is_the_nearest_car_in_the_same_lane() -> None:
     road = Road(stadium(), lanes=2)
-    traffic = Traffic(road, 8, np.random.default_rng(2), clear_s=0.0)
+    traffic = Traffic(road, 8, np.random.default_rng(2), ego_s=0.0)
     for lane_y in (2.0, -2.0):
         rows = np.flatnonzero(np.abs(traffic.to_middle - lane_y) < 0.1)
         first = rows[np.argmin(traffic.s[rows])]
         found = traffic.leader(0.0, lane_y)
         assert found is not None
-        gap = traffic.s[first] - 0.5 * (SIZE[0] + EGO_SIZE[0])
+        gap = traffic.s[first] - 0.5 * (TRAFFIC_CAR_SIZE[0] + EGO_CAR_SIZE[0])
         assert found[0] == pytest.approx(gap)
         assert found[1] == pytest.approx(traffic.speed[first])
         beside = traffic.leader(0.0, lane_y, exclude=int(first))

@@ -7,7 +7,7 @@ import pytest
 from simulator.traffic.idm import (
     COMFORTABLE_ACCELERATION,
     COMFORTABLE_BRAKING,
-    HARDEST_BRAKING,
+    MAX_BRAKING,
     STANDSTILL_GAP_M,
     TIME_HEADWAY_S,
     idm_acceleration,
@@ -34,6 +34,6 @@ def test_equilibrium_gap() -> None:
 def test_brakes_harder_the_closer_and_the_faster_but_within_physics() -> None:
     gaps = [idm_acceleration(g, 15.0, 10.0, 15.0) for g in (80.0, 40.0, 20.0, 10.0)]
     assert gaps == sorted(gaps, reverse=True)
-    assert idm_acceleration(0.0, 15.0, 0.0, 15.0) == -HARDEST_BRAKING
-    assert idm_acceleration(-3.0, 15.0, 15.0, 15.0) == -HARDEST_BRAKING
+    assert idm_acceleration(0.0, 15.0, 0.0, 15.0) == -MAX_BRAKING
+    assert idm_acceleration(-3.0, 15.0, 15.0, 15.0) == -MAX_BRAKING
     assert idm_acceleration(math.inf, 0.0, 0.0, 0.0) == COMFORTABLE_ACCELERATION

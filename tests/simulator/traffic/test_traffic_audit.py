@@ -7,9 +7,9 @@ import pytest
 
 from simulator.track.catalogue import find_track
 from simulator.track.road import Road
-from simulator.traffic.kernel import along_centre
-from simulator.world.boxes import overlap, overlapping
-from tests.simulator.traffic_audit import Disorder, watch
+from simulator.traffic.kernel import centre_line_advance
+from simulator.world.boxes import boxes_overlap, first_overlap
+from tests.simulator.traffic_audit import TrafficViolation, audit_traffic
 
 
 @pytest.mark.slow
@@ -18,7 +18,7 @@ from tests.simulator.traffic_audit import Disorder, watch
     [("town", 1, False), ("circuit", 2, False), ("oval", 3, True)],
 )
 def test_ten_minutes_without_a_touch(track: str, lanes: int, parked: bool) -> None:
-    seen = watch(Road(find_track(track), lanes), 600.0, parked=parked)
+    seen = audit_traffic(Road(find_track(track), lanes), 600.0, parked=parked)
     assert seen.steps == 12_000
     assert (seen.lane_changes > 3) == (lanes > 1)
     # Behind a parked car those of its lane stand; all others drive.
@@ -28,9 +28,9 @@ def test_ten_minutes_without_a_touch(track: str, lanes: int, parked: bool) -> No
 
 def test_a_touch_would_be_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
     """Traffic that does not look ahead runs into the car that is parked before it."""
-    monkeypatch.setattr("simulator.traffic.traffic.Traffic._see_ego", lambda *_: None)
-    with pytest.raises(Disorder, match=r"hit traffic|overlap"):
-        watch(Road(find_track("town"), 1), 300.0, parked=True)
+    monkeypatch.setattr("simulator.traffic.traffic.Traffic._update_ego", lambda *_: None)
+    with pytest.raises(TrafficViolation, match=r"hit traffic|overlap"):
+        audit_traffic(Road(find_track("town"), 1), 300.0, parked=True)
 
 
 def corners(box: np.ndarray) -> np.ndarray:
@@ -58,11 +58,11 @@ def test_boxes_overlap_where_points_of_one_lie_in_the_other() -> None:
         inside = bool(np.any((abs(along) < 2.25) & (abs(across) < 0.95)))
         # Edges are dense: only a corner that just pokes in could be missed.
         deep = bool(np.any((abs(along) < 2.2) & (abs(across) < 0.9)))
-        assert overlap(a, b) >= deep
-        assert overlap(b, a) == overlap(a, b)
-        assert inside or not overlap(a, b) or not deep
-        seen.append(overlap(a, b))
-        assert (overlapping(np.array([a, b])) == (0, 1)) == overlap(a, b)
+        assert boxes_overlap(a, b) >= deep
+        assert boxes_overlap(b, a) == boxes_overlap(a, b)
+        assert inside or not boxes_overlap(a, b) or not deep
+        seen.append(boxes_overlap(a, b))
+        assert (first_overlap(np.array([a, b])) == (0, 1)) == boxes_overlap(a, b)
     assert 50 < sum(seen) < 350
 
 
@@ -75,7 +75,7 @@ def test_a_car_goes_its_way_across_a_joint_of_two_bends() -> None:
     for y in (-3.0, 0.0, 3.0):
         before, after = (1.0 - track.curvature0[joint - 1 : joint + 1] * y).tolist()
         way = 0.4 * before + 0.3 * after
-        assert along_centre(table, s, y, way) == pytest.approx(0.7, abs=1e-9)
-        assert along_centre(table, s, y, 0.0) == 0.0
+        assert centre_line_advance(table, s, y, way) == pytest.approx(0.7, abs=1e-9)
+        assert centre_line_advance(table, s, y, 0.0) == 0.0
     round_once = float(track.length_m)
-    assert along_centre(table, s, 0.0, round_once) == pytest.approx(round_once, abs=1e-6)
+    assert centre_line_advance(table, s, 0.0, round_once) == pytest.approx(round_once, abs=1e-6)

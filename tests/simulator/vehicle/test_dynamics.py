@@ -12,7 +12,7 @@ from simulator.track.markings import MarkingStyle
 from simulator.track.pieces import Piece, assemble
 from simulator.track.road import Road
 from simulator.vehicle.car import GRAVITY, CarParameters
-from simulator.vehicle.dynamics import DT, MEMORY, MOTION, PIECE, advance
+from simulator.vehicle.dynamics import DT, MEMORY, MOTION, PIECE, compute_forces
 from simulator.vehicle.state import CarState, Command
 from simulator.vehicle.surface import SURFACES, VERGE, ground
 from simulator.vehicle.tyre import peak_force
@@ -94,7 +94,7 @@ def test_static_loads_carry_the_weight_and_balance_it() -> None:
     memory[PIECE] = -1
     road, wrench = plain(), np.ones(6)
     table, command = road.track.arrays(), np.zeros(4)
-    advance(CAR.packed(), table, ground(road), motion, memory, command, wrench)
+    compute_forces(CAR.packed(), table, ground(road), motion, memory, command, wrench)
     np.testing.assert_allclose(wrench, 0.0, atol=1e-6)
 
 

@@ -8,20 +8,20 @@ from numpy.typing import NDArray
 
 from simulator.track.catalogue import find_track
 from simulator.track.road import Road
-from simulator.traffic.traffic import SIZE
+from simulator.traffic.traffic import TRAFFIC_CAR_SIZE
 from simulator.vehicle.car import CarParameters
-from simulator.vehicle.dynamics import DT, MOTION, PIECE, advance
-from simulator.vehicle.rigid_body import fall, fly, near_anything
+from simulator.vehicle.dynamics import DT, MOTION, PIECE, compute_forces
+from simulator.vehicle.rigid_body import advance_free, contact_possible, integrate
 from simulator.vehicle.state import Command
 from simulator.vehicle.surface import ground
-from simulator.world.physics import Scene
+from simulator.world.physics import PhysicsClient
 from simulator.world.world import World
 
 CAR = CarParameters()
 
 
-def scene() -> Scene:
-    made = Scene()
+def scene() -> PhysicsClient:
+    made = PhysicsClient()
     made.rebuild([CAR])
     return made
 
@@ -34,11 +34,11 @@ def test_a_tumbling_body_moves_as_pybullet_moves_it() -> None:
     rng = np.random.default_rng(0)
     for _ in range(400):
         wrench = rng.normal(0.0, 1.0, 6) * (3e3, 3e3, 3e3, 1e3, 1e3, 1e3)
-        bullet.put(bullet.cars[0], there)
-        bullet.push(bullet.cars[0], wrench, there)
+        bullet.set_motion(bullet.cars[0], there)
+        bullet.apply_wrench(bullet.cars[0], wrench, there)
         bullet.step()
         bullet.read(bullet.cars[0], there)
-        fall(params[0], here, wrench.copy())
+        integrate(params[0], here, wrench.copy())
     np.testing.assert_allclose(here, there, rtol=0.0, atol=1e-9)
     bullet.close()
 
@@ -57,9 +57,9 @@ def test_a_drive_is_the_same_whoever_moves_the_body(track: str) -> None:
             state = world.step(command)
             for _ in range(10):
                 params, table = world._params, road.track.arrays()
-                advance(params, table, ground(road), motion, memory, controls, wrench)
-                bullet.put(bullet.cars[0], motion)
-                bullet.push(bullet.cars[0], wrench, motion)
+                compute_forces(params, table, ground(road), motion, memory, controls, wrench)
+                bullet.set_motion(bullet.cars[0], motion)
+                bullet.apply_wrench(bullet.cars[0], wrench, motion)
                 bullet.step()
                 bullet.read(bullet.cars[0], motion)
             apart.append(math.hypot(motion[0] - state.x, motion[1] - state.y))
@@ -76,19 +76,19 @@ def test_flight_ends_before_anything_can_be_touched() -> None:
         others = np.zeros((0, 6))
         arguments = (world._params, road.track.arrays(), ground(road), motion, memory)
         controls, reach = np.array([0.0, 0.0, 0.0, 0.0]), road.wall_offset
-        done = fly(*arguments, controls, reach, others, others, 0, 200)
+        done = advance_free(*arguments, controls, reach, others, others, 0, 200)
         assert 0 < done < 200
         reached = float(road.track.project(motion[0], motion[1])[1])
         assert reach - 3.5 < reached < reach - 3.5 + 60.0 * DT
         # It starts no more than a step away from touching.
-        assert fly(*arguments, controls, reach, others, others, 0, 200) == 0
+        assert advance_free(*arguments, controls, reach, others, others, 0, 200) == 0
 
 
 def near(road: Road, world: World, other: NDArray[np.float64], goes: float, share: float) -> bool:
     motion, piece = world._motion, int(world._memory[PIECE])
     move = np.array([[goes, 0.0, 0.0, 0.0, 0.0, 0.0]])
     table, params = road.track.arrays(), world._params[0]
-    return bool(near_anything(params, table, motion, piece, 1e3, other, move, share))
+    return bool(contact_possible(params, table, motion, piece, 1e3, other, move, share))
 
 
 def test_another_car_is_near_before_it_can_be_touched_but_not_in_the_next_lane() -> None:
@@ -96,12 +96,12 @@ def test_another_car_is_near_before_it_can_be_touched_but_not_in_the_next_lane()
     with World(road) as world:
         state = world.reset(seed=0, s=5.0, speed=20.0)
         assert state.curvature == 0.0
-        bumpers = 0.5 * (CAR.length + SIZE[0])
+        bumpers = 0.5 * (CAR.length + TRAFFIC_CAR_SIZE[0])
         step = (20.0 + 20.0) * DT + 0.3
         other = np.array([[state.x, state.y, 0.0, 0.0, 0.0, state.yaw]])
         ahead, left = np.array([math.cos(state.yaw), math.sin(state.yaw)]), np.zeros(2)
         left[:] = -ahead[1], ahead[0]
-        for way, touching in ((ahead, bumpers), (left, 0.5 * (CAR.width + SIZE[1]))):
+        for way, touching in ((ahead, bumpers), (left, 0.5 * (CAR.width + TRAFFIC_CAR_SIZE[1]))):
             other[0, :2] = (state.x, state.y) + way * (touching + step - 0.01)
             assert near(road, world, other, 0.0, 0.0)
             other[0, :2] += 0.02 * way

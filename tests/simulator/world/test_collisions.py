@@ -11,7 +11,7 @@ from simulator.track.geometry import Track
 from simulator.track.markings import MarkingStyle
 from simulator.track.pieces import Piece, assemble
 from simulator.track.road import Road
-from simulator.traffic.traffic import SIZE
+from simulator.traffic.traffic import TRAFFIC_CAR_SIZE
 from simulator.traffic.wreck import TRAFFIC_CAR
 from simulator.vehicle.car import CarParameters
 from simulator.vehicle.state import CarState, Command
@@ -59,13 +59,13 @@ def test_a_rear_end_hit_conserves_momentum_and_pushes_the_other_on() -> None:
         before, state, other = drive_into_traffic(world)
         assert state.collision == "traffic"
         assert state.curvature == 0.0
-        mine, its = CarParameters().total_mass, TRAFFIC_CAR.total_mass
-        momentum = mine * before.speed + its * other
-        first = mine * state.speed + its * float(world.traffic.speed[0])
+        own_mass, other_mass = CarParameters().total_mass, TRAFFIC_CAR.total_mass
+        momentum = own_mass * before.speed + other_mass * other
+        first = own_mass * state.speed + other_mass * float(world.traffic.speed[0])
         assert first == pytest.approx(momentum, rel=2e-3)
         for _ in range(4):
             state = world.step(COAST)
-        both = mine * state.speed + its * float(world.traffic.speed[0])
+        both = own_mass * state.speed + other_mass * float(world.traffic.speed[0])
         # The road's part in 20 ms: its brakes take a little, my spinning wheels push a little.
         assert both == pytest.approx(momentum, rel=0.02)
         # Of the speed that the two ran into each other with, little is left.
@@ -118,7 +118,9 @@ def test_the_others_stop_behind_the_wreck() -> None:
             length = world.road.track.length_m
             on_lane = np.sort(np.append(world.traffic.s, world.state.s))
             gaps = np.diff(np.append(on_lane, on_lane[0] + length))
-            assert gaps.min() > SIZE[0] - 0.3  # two boxes at rest may lean on each other
+            assert (
+                gaps.min() > TRAFFIC_CAR_SIZE[0] - 0.3
+            )  # two boxes at rest may lean on each other
         assert np.all(world.traffic.speed < 0.1)
 
 

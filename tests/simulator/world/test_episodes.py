@@ -138,7 +138,7 @@ def test_a_car_has_left_the_track_before_it_meets_the_wall() -> None:
             seen = [world.step(Command(gear=0)) for _ in range(120)]
             off = next(i for i, state in enumerate(seen) if state.off_track)
             hits = [i for i, state in enumerate(seen) if state.collision]
-            assert not hits or off <= hits[0]  # both may fall into one control step
+            assert not hits or off <= hits[0]  # both may integrate into one control step
             assert world.road.edge < seen[off].to_middle < world.road.edge + 0.8
 
 
