@@ -27,12 +27,12 @@ import numpy as np
 from runtime.jit import compiled
 from simulator.link.channel import Receiver, Sender, state_image_bytes
 from simulator.link.client import Link
-from simulator.link.errors import EngineDied, LinkError
-from simulator.link.handshake import EngineInfo, write_header
+from simulator.link.errors import LinkError, ServerDied
+from simulator.link.handshake import ServerInfo, write_header
 from simulator.link.layout import COMMAND, STATE, Mode, segment_size
 from simulator.link.segment import SHM, Segment, create
-from simulator.link.server import Engine
-from simulator.link.sync.seqlock import DAMAGED, READ, publish, spin, take
+from simulator.link.server import LinkServer
+from simulator.link.sync.seqlock import DAMAGED, READ, publish, spin_until_new, try_read
 from simulator.track.catalogue import find_track
 from simulator.track.road import Road
 from simulator.vehicle.state import Command
@@ -40,10 +40,10 @@ from simulator.world.world import World
 
 BOUND_S = 2.0
 START_S = 180.0
-"""An engine compiles first, where its cache is cold."""
+"""A server compiles first, where its cache is cold."""
 PICTURE = 32, 24
 TRACK = "oval"
-INFO = EngineInfo("none", 1, 4.0, 1.0, 1.0, 1.0, 1.0, 0, 20, Mode.LOCK_STEP, 0, 0, 0, (0.0,) * 19)
+INFO = ServerInfo("none", 1, 4.0, 1.0, 1.0, 1.0, 1.0, 0, 20, Mode.LOCK_STEP, 0, 0, 0, (0.0,) * 19)
 
 
 def fresh_name() -> str:
@@ -76,7 +76,7 @@ def flood(
         local_image[:] = number
         publish(sequence, shared, local, shared_image, local_image)
         # Up to 4 us, of changing length so that the two sides do not keep in step.
-        spin(sequence, int(sequence[0]), number % 7 * 1000)
+        spin_until_new(sequence, int(sequence[0]), number % 7 * 1000)
     return first + 5000
 
 
@@ -89,7 +89,7 @@ def verify(
     for _ in range(1_000_000):
         if whole + torn >= goal:
             break
-        outcome, seen = take(sequence, shared, local, shared_image, local_image, seen)
+        outcome, seen = try_read(sequence, shared, local, shared_image, local_image, seen)
         if outcome == DAMAGED:
             damaged += 1
         if outcome == READ:
@@ -101,7 +101,7 @@ def verify(
 
 
 def segment_for_flood(name: str, picture: tuple[int, int]) -> Segment:
-    """The engine's end of a link without an engine."""
+    """The server's end of a link without a server."""
     info = INFO.__class__(
         **{**INFO.__dict__, "image_width": picture[0], "image_height": picture[1]}
     )
@@ -114,13 +114,13 @@ def segment_for_flood(name: str, picture: tuple[int, int]) -> Segment:
 def write_states(name: str) -> None:
     """In a process of its own: state messages as fast as it can, until it is killed."""
     segment = segment_for_flood(name, PICTURE)
-    arrays = Sender(segment, STATE, state_image_bytes(segment))._place.arrays
+    arrays = Sender(segment, STATE, state_image_bytes(segment))._buffer.arrays
     number = 1
     while True:
         number = flood(*arrays, number)
 
 
-def engine_to_client(hammer: str, task: str, messages: int, patience_s: float) -> dict[str, float]:
+def server_to_client(hammer: str, task: str, messages: int, patience_s: float) -> dict[str, float]:
     """numba writes states with pictures, C reads them."""
     name = fresh_name()
     writer = start(sys.executable, __file__, "--write-states", name)
@@ -139,12 +139,12 @@ def engine_to_client(hammer: str, task: str, messages: int, patience_s: float) -
     return result
 
 
-def client_to_engine(hammer: str, messages: int, patience_s: float) -> dict[str, float]:
+def client_to_server(hammer: str, messages: int, patience_s: float) -> dict[str, float]:
     """C writes commands, numba reads them."""
     name = fresh_name()
     segment = segment_for_flood(name, (0, 0))
     writer = start(hammer, "write", name)
-    arrays = Receiver(segment, COMMAND)._place.arrays
+    arrays = Receiver(segment, COMMAND)._buffer.arrays
     verify(*arrays, 0)  # compiled before the clock runs
     whole, torn, damaged = 0, 0, 0
     began = time.monotonic()
@@ -167,7 +167,7 @@ def client_to_engine(hammer: str, messages: int, patience_s: float) -> dict[str,
 # ---- kills -----------------------------------------------------------------------------------
 
 
-def start_engine() -> tuple[str, "subprocess.Popen[str]"]:
+def start_server() -> tuple[str, "subprocess.Popen[str]"]:
     name = fresh_name()
     command = [sys.executable, "-m", "simulator", "link", "--name", name, "--track", TRACK]
     return name, start(*command, out=subprocess.DEVNULL)
@@ -179,34 +179,34 @@ class Killer:
     def __init__(self, hammer: str, seed: int) -> None:
         self._hammer = hammer
         self._random = random.Random(seed)
-        self._name, self._engine = start_engine()
-        self._next = start_engine()  # the next is made while this one is in use
+        self._name, self._server = start_server()
+        self._next = start_server()  # the next is made while this one is in use
 
-    def engine_under_python(self) -> float:
-        """Seconds from the engine's death to EngineDied."""
+    def server_under_python(self) -> float:
+        """Seconds from the server's death to ServerDied."""
         with Link(self._name, wait_s=START_S) as link:
             message = link.reset(seed=1)
             killed: list[float] = []
-            timer = threading.Timer(self._moment(), self._kill_engine, [killed])
+            timer = threading.Timer(self._moment(), self._kill_server, [killed])
             timer.start()
             try:
                 while True:
                     message = link.step(Command(throttle=0.2))
                     if message.ended:
                         message = link.reset(seed=1)
-            except EngineDied:
+            except ServerDied:
                 return self._done(time.monotonic() - killed[0])
 
-    def engine_under_c(self) -> float:
-        """Seconds from the engine's death to the C client's end."""
+    def server_under_c(self) -> float:
+        """Seconds from the server's death to the C client's end."""
         client = self._drive()
         time.sleep(self._moment())
         killed: list[float] = []
-        self._kill_engine(killed)
+        self._kill_server(killed)
         _, said = client.communicate(timeout=10.0 * BOUND_S)
         seconds = time.monotonic() - killed[0]
         if "has died" not in said or client.returncode != 1:
-            raise SystemExit(f"the client does not say that its engine died: {said!r}")
+            raise SystemExit(f"the client does not say that its server died: {said!r}")
         return self._done(seconds)
 
     def client(self) -> float:
@@ -222,9 +222,9 @@ class Killer:
 
     def close(self) -> list[str]:
         """Stop what runs; names of segments left behind."""
-        for name, engine in ((self._name, self._engine), self._next):
+        for name, server in ((self._name, self._server), self._next):
             Link(name, wait_s=START_S).quit()
-            engine.communicate(timeout=START_S)
+            server.communicate(timeout=START_S)
         return [path.name for path in SHM.glob("drvlink-bench-*")]
 
     def _moment(self) -> float:
@@ -234,29 +234,29 @@ class Killer:
         client = start(self._hammer, "drive", self._name)
         assert client.stdout is not None
         if client.stdout.readline() != "driving\n":
-            self._engine.kill()
-            told = client.communicate()[1] + self._engine.communicate()[1]
+            self._server.kill()
+            told = client.communicate()[1] + self._server.communicate()[1]
             raise SystemExit(f"the client does not drive: {told}")
         return client
 
-    def _kill_engine(self, killed: list[float]) -> None:
+    def _kill_server(self, killed: list[float]) -> None:
         killed.append(time.monotonic())
-        self._engine.send_signal(signal.SIGKILL)
+        self._server.send_signal(signal.SIGKILL)
 
     def _done(self, seconds: float) -> float:
-        self._engine.communicate()
+        self._server.communicate()
         if (SHM / self._name[1:]).exists():
             raise SystemExit(f"the segment {self._name} is left behind")
-        (self._name, self._engine), self._next = self._next, start_engine()
+        (self._name, self._server), self._next = self._next, start_server()
         return seconds
 
 
 def kill(hammer: str, kills: int) -> dict[str, Any]:
     killer = Killer(hammer, seed=1)
-    sides = {"client": killer.client, "engine": killer.engine_under_c}
-    sides["engine_python"] = killer.engine_under_python
-    # As many engines as clients.
-    order = [("client", "engine", "client", "engine_python")[i % 4] for i in range(kills)]
+    sides = {"client": killer.client, "server": killer.server_under_c}
+    sides["server_python"] = killer.server_under_python
+    # As many servers as clients.
+    order = [("client", "server", "client", "server_python")[i % 4] for i in range(kills)]
     random.Random(2).shuffle(order)
     times: dict[str, list[float]] = {side: [] for side in sides}
     for number, side in enumerate(order):
@@ -285,14 +285,14 @@ class Echo:
     def answer(self, request: Any) -> None:
         self._record["step"] += 1
 
-    def drop(self) -> None:
+    def end_episode(self) -> None:
         pass
 
 
 def serve_echo(name: str) -> None:
     make: Any = Echo
-    with Engine(name, INFO, make) as engine:
-        engine.serve()
+    with LinkServer(name, INFO, make) as server:
+        server.serve()
 
 
 def figures(microseconds: list[float]) -> dict[str, float]:
@@ -342,7 +342,7 @@ def steps_here(world: World, steps: int) -> list[float]:
 def speed(hammer: str, steps: int) -> dict[str, Any]:
     """Interleaved, so that other work on the machine meets all of them alike."""
     echo = fresh_name()
-    name, engine = start_engine()
+    name, server = start_server()
     echoing = start(sys.executable, __file__, "--echo", echo)
     taken: dict[str, list[float]] = {}
     with World(Road(find_track(TRACK))) as world:
@@ -351,13 +351,13 @@ def speed(hammer: str, steps: int) -> dict[str, Any]:
             part = steps // 5
             for what, more in (
                 ("world_in_process", steps_here(world, part)),
-                ("engine_python_client", steps_in_python(name, part)),
-                ("engine_c_client", steps_in_c(hammer, name, part)),
+                ("server_python_client", steps_in_python(name, part)),
+                ("server_c_client", steps_in_c(hammer, name, part)),
                 ("link_alone_python_client", steps_in_python(echo, part)),
                 ("link_alone_c_client", steps_in_c(hammer, echo, part)),
             ):
                 taken.setdefault(what, []).extend(more)
-    for link_name, process in ((name, engine), (echo, echoing)):
+    for link_name, process in ((name, server), (echo, echoing)):
         Link(link_name).quit()
         process.communicate(timeout=START_S)
     return {what: figures(times) for what, times in taken.items()}
@@ -387,9 +387,9 @@ def main() -> None:
         result: dict[str, Any] = {"cores": os.cpu_count()}
         if arguments.messages:
             wanted = arguments.messages, arguments.patience
-            result["engine_to_client"] = engine_to_client(hammer, "read", *wanted)
-            result["client_to_engine"] = client_to_engine(hammer, *wanted)
-            result["control_without_lock"] = engine_to_client(hammer, "racy", *wanted)
+            result["server_to_client"] = server_to_client(hammer, "read", *wanted)
+            result["client_to_server"] = client_to_server(hammer, *wanted)
+            result["control_without_lock"] = server_to_client(hammer, "racy", *wanted)
         if arguments.kills:
             result["killed"] = kill(hammer, arguments.kills)
         if arguments.steps:
@@ -404,7 +404,7 @@ def main() -> None:
 def missed(result: dict[str, Any], messages: int) -> list[str]:
     """Which limits were, in words; also on stderr."""
     found = []
-    for way in ("engine_to_client", "client_to_engine"):
+    for way in ("server_to_client", "client_to_server"):
         if way in result:
             count = result[way]
             if count["torn"] or count["damaged"]:

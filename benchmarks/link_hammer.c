@@ -46,7 +46,7 @@ static int flood(struct drvlink *link) {
         link->command.number = number - 1; /* drvlink_send counts it up */
         link->state.number = number;       /* and says that this is the message seen */
         drvlink_send(link);
-        if (number % 4096 == 0 && !drvlink_engine_lives(link)) return 0;
+        if (number % 4096 == 0 && !drvlink_server_lives(link)) return 0;
     }
 }
 

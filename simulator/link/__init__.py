@@ -1,8 +1,8 @@
-"""The shared-memory link: an engine process drives the car, a client in any language steers it.
+"""The shared-memory link: a server process runs the simulator, a client in any language drives.
 
-    simulator link --track forza --name /driverview      the engine
+    simulator link --track forza --name /driverview      the server
     simulator.link.client.Link                           a client in Python
     simulator/link/c/lap.c, driverview_link.h            a client in C
 
-`layout` is the one definition of what lies where; the C header is made from it.
+`layout` defines the memory; the C header is generated from it.
 """

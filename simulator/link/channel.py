@@ -1,7 +1,7 @@
-"""The two directions of a link: a sender that owns a block of the memory, a receiver that reads it.
+"""The two directions of a link: a sender writes a block of the shared memory, a receiver reads it.
 
-Who sends fills `record` (and `image`), then calls `send`; who receives finds both as the newest
-whole message left them.
+A sender fills `record` (and `image`) and calls `send`. A receiver's `record` and `image` hold the
+newest complete message.
 """
 
 from typing import Any
@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 from simulator.link.layout import IMAGE_OFFSET, MESSAGE_ALIGNMENT, STATE, Block
 from simulator.link.segment import Segment
 from simulator.link.sync import futex
-from simulator.link.sync.seqlock import DAMAGED, NOTHING, publish, spin, take
+from simulator.link.sync.seqlock import DAMAGED, NOTHING, publish, spin_until_new, try_read
 
-SPINS = 30_000
-"""Looks before sleeping: about 20 us, what it takes to be woken from a sleep."""
+SPIN_COUNT = 30_000
+"""Polls before sleeping: about 20 us, the cost of a wake-up."""
 
 
-class _Place:
-    """Where the messages of one direction lie: shared words, our own copy of them, a picture."""
+class _MessageBuffer:
+    """The messages of one direction: the shared words, a local copy of them, and the image."""
 
     def __init__(self, segment: Segment, block: Block, image_bytes: int) -> None:
         shared = segment.bytes()
@@ -39,44 +39,44 @@ class Sender:
     """The only writer of `block`."""
 
     def __init__(self, segment: Segment, block: Block, image_bytes: int = 0) -> None:
-        self._place = _Place(segment, block, image_bytes)
-        self.record, self.image = self._place.record, self._place.image
+        self._buffer = _MessageBuffer(segment, block, image_bytes)
+        self.record, self.image = self._buffer.record, self._buffer.image
 
     def send(self) -> None:
-        publish(*self._place.arrays)
+        publish(*self._buffer.arrays)
         self.wake()
 
     def wake(self) -> None:
-        """Let the receiver look up, although there is no message."""
-        futex.wake(self._place.address)
+        """Wake the receiver without a message."""
+        futex.wake(self._buffer.address)
 
 
 class Receiver:
-    """Reads `block` without disturbing its writer; many may."""
+    """Reads `block` without blocking its writer; any number of receivers may."""
 
     def __init__(self, segment: Segment, block: Block, image_bytes: int = 0) -> None:
-        self._place = _Place(segment, block, image_bytes)
+        self._buffer = _MessageBuffer(segment, block, image_bytes)
         self._seen = 0
         self.damaged = False
-        self.record, self.image = self._place.record, self._place.image
+        self.record, self.image = self._buffer.record, self._buffer.image
 
     def poll(self) -> bool:
-        """Whether there was a message newer than the last; it is in `record` then.
+        """Whether there was a newer message, which is then in `record`.
 
-        `damaged` says that its checksum is wrong: its writer does not keep to the protocol.
+        `damaged` is True if its checksum is wrong: its writer violates the protocol.
         """
-        outcome, self._seen = take(*self._place.arrays, self._seen)
+        outcome, self._seen = try_read(*self._buffer.arrays, self._seen)
         self.damaged = outcome == DAMAGED
         return bool(outcome != NOTHING)
 
     def wait(self, seconds: float) -> bool:
-        """As `poll`, but wait up to about `seconds` for a message: briefly awake, then asleep."""
-        current = int(spin(self._place.sequence, self._seen, SPINS))
+        """As `poll`, but wait up to about `seconds` for a message: spin briefly, then sleep."""
+        current = int(spin_until_new(self._buffer.sequence, self._seen, SPIN_COUNT))
         if current == self._seen or current & 1:
-            futex.wait(self._place.address, current, seconds)
+            futex.wait(self._buffer.address, current, seconds)
         return self.poll()
 
 
 def state_image_bytes(segment: Segment) -> int:
-    """Bytes of the picture that a segment's state messages carry."""
+    """Size in bytes of the image in a segment's state messages."""
     return len(segment.memory) - STATE.end

@@ -18,33 +18,31 @@ from types import TracebackType
 from typing import Self
 
 from simulator.link.channel import Receiver, Sender, state_image_bytes
+from simulator.link.config import DEFAULT_NAME
 from simulator.link.errors import (
     DamagedMessage,
-    EngineDied,
     LinkError,
     LinkTimeout,
-    NoEngine,
+    NoServer,
     Refused,
+    ServerDied,
 )
-from simulator.link.handshake import EngineInfo, phase, read_header
+from simulator.link.handshake import ServerInfo, phase, read_header
 from simulator.link.layout import COMMAND, STATE, Phase, Request
 from simulator.link.message import Message, read_message, write_command
-from simulator.link.segment import Segment, attach
+from simulator.link.segment import POLL_INTERVAL_S, Segment, attach
 from simulator.link.sync import futex
 from simulator.vehicle.state import Command
 
-DEFAULT_NAME = "/driverview"
-SLICE_S = 0.05
-"""Between two looks at whether the engine lives."""
 RETRY_S = 0.02
 
 
 class Link:
-    """One client of one engine. `wait_s`: how long to wait for an engine that is not there yet;
-    `timeout_s`: for an answer of one that lives.
+    """A client connected to one server. `wait_s`: time to wait for a server that does not exist
+    yet; `timeout_s`: time to wait for each answer.
 
-    Every call raises EngineDied within a moment of the engine's end, LinkTimeout, or Refused when
-    the engine will not do what was asked. The constructor raises NoEngine, NameInUse,
+    Every call raises ServerDied soon after the server's end, LinkTimeout without an answer in time,
+    and Refused if the server refuses the request. The constructor raises NoServer, NameInUse,
     LayoutMismatch.
     """
 
@@ -72,42 +70,42 @@ class Link:
         angle: float = 0.0,
         speed: float = 0.0,
     ) -> Message:
-        """Start an episode, as `World.reset`; without `seed` the engine chooses one."""
+        """Start an episode, as `World.reset`; without `seed` the server chooses one."""
         record = self._outbox.record
         record["request"] = Request.RESET
         record["seed"] = -1 if seed is None else seed
         record["start_s"] = math.nan if s is None else s
         record["start_to_middle"], record["start_angle"] = to_middle, angle
         record["start_speed"] = speed
-        return self._ask()
+        return self._request()
 
     def step(self, command: Command) -> Message:
         """Hold `command` for a control step. In real time: from the next step on."""
         write_command(self._outbox.record, command)
-        return self._ask()
+        return self._request()
 
     def latest(self) -> Message:
-        """The newest message, without asking for anything: to look on in real time."""
+        """The newest message, without a request; for observers in real time."""
         self._check_open()
         self._receive()
         return self._message()
 
     def quit(self) -> None:
-        """End the engine, and this link."""
+        """End the server, and this link."""
         self._outbox.record["request"] = Request.QUIT
-        self._exchange()
+        self._send_and_wait()
         self._closed = True
         self._segment.close()
 
     def close(self) -> None:
-        """Take our leave; the engine waits for its next client."""
+        """Disconnect; the server waits for its next client."""
         if self._closed:
             return
         try:
             self._outbox.record["request"] = Request.LEAVE
-            self._exchange()
+            self._send_and_wait()
         except LinkError:
-            pass  # it is gone or does not listen: all the same now
+            pass  # the server has ended or does not answer; nothing is left to do
         self._closed = True
         self._segment.close()
 
@@ -122,15 +120,15 @@ class Link:
     ) -> None:
         self.close()
 
-    def _ask(self) -> Message:
-        self._exchange()
+    def _request(self) -> Message:
+        self._send_and_wait()
         record = self._inbox.record
         if record["error"]:
             text = record["error_text"].decode(errors="ignore")
             raise Refused(int(record["error"]), text)
         return self._message()
 
-    def _exchange(self) -> None:
+    def _send_and_wait(self) -> None:
         """Send the command and wait for the message that answers it."""
         self._check_open()
         self._number += 1
@@ -138,41 +136,41 @@ class Link:
         record["number"], record["seen"] = self._number, self._inbox.record["number"]
         self._outbox.send()
         until = time.monotonic() + self._timeout_s
-        while not (self._receive(SLICE_S) and self._answered()):
+        while not (self._receive(POLL_INTERVAL_S) and self._answered()):
             if time.monotonic() > until:
                 raise LinkTimeout(
-                    f"{self._engine} lives, but has not answered within {self._timeout_s:g} s; "
+                    f"{self._server} lives, but has not answered within {self._timeout_s:g} s; "
                     "is it stopped, or too busy? A longer timeout_s waits longer"
                 )
 
     def _receive(self, seconds: float = 0.0) -> bool:
-        """Whether a new message came within `seconds`. Raises EngineDied, DamagedMessage."""
+        """Whether a new message came within `seconds`. Raises ServerDied, DamagedMessage."""
         came = self._inbox.wait(seconds) if seconds else self._inbox.poll()
-        if not came and not self._segment.other_end_lives():
-            came = self._inbox.poll()  # its last word may have come meanwhile
+        if not came and not self._segment.peer_is_alive():
+            came = self._inbox.poll()  # a last message may have arrived before the server ended
             if not came:
-                self._give_up()
+                self._raise_server_died()
         if came and self._inbox.damaged:
-            raise DamagedMessage(f"a message of {self._engine} is damaged: its checksum is wrong")
+            raise DamagedMessage(f"a message of {self._server} is damaged: its checksum is wrong")
         return came
 
     def _answered(self) -> bool:
         mine, theirs = self._outbox.record, self._inbox.record
         return bool(theirs["session"] == mine["session"] and theirs["answers"] == mine["number"])
 
-    def _give_up(self) -> None:
+    def _raise_server_died(self) -> None:
         ended = phase(self._segment) == Phase.CLOSED
         self._closed = True
         self._segment.close()
-        raise EngineDied(
-            f"{self._engine} has {'ended' if ended else 'died'} (the last message was of step "
+        raise ServerDied(
+            f"{self._server} has {'ended' if ended else 'died'} (the last message was of step "
             f"{int(self._inbox.record['step'])}); start it again"
         )
 
     def _message(self) -> Message:
         record, image = self._inbox.record, None
         if not record["number"]:
-            raise LinkError(f"{self._engine} has sent nothing yet; ask for a reset first")
+            raise LinkError(f"{self._server} has sent nothing yet; ask for a reset first")
         height, width = self.info.image_height, self.info.image_width
         if width:
             image = self._inbox.image[: height * width * 3].reshape(height, width, 3)
@@ -180,15 +178,15 @@ class Link:
 
     def _check_open(self) -> None:
         if self._closed or self._segment.descriptor < 0:
-            raise LinkError(f"the link to {self._engine} is closed; make a new one")
+            raise LinkError(f"the link to {self._server} is closed; make a new one")
 
     @property
-    def _engine(self) -> str:
-        return f"the engine of {self._segment.name} (process {self.info.engine_pid})"
+    def _server(self) -> str:
+        return f"the server of {self._segment.name} (process {self.info.engine_pid})"
 
 
-def _attach(name: str, wait_s: float) -> tuple[Segment, EngineInfo]:
-    """Attach to a ready engine, trying again for `wait_s`."""
+def _attach(name: str, wait_s: float) -> tuple[Segment, ServerInfo]:
+    """Attach to a ready server, trying again for `wait_s`."""
     until = time.monotonic() + wait_s
     while True:
         try:
@@ -198,7 +196,7 @@ def _attach(name: str, wait_s: float) -> tuple[Segment, EngineInfo]:
             except BaseException:
                 segment.close()
                 raise
-        except NoEngine:
+        except NoServer:
             if time.monotonic() >= until:
                 raise
         time.sleep(RETRY_S)

@@ -1,4 +1,4 @@
-"""`simulator link`: an engine that a client in any language drives over shared memory.
+"""`simulator link`: a server that a client in any language drives over shared memory.
 
 simulator link --track forza --name /driverview
 simulator link --header driverview_link.h
@@ -12,54 +12,64 @@ from typing import Annotated
 
 import typer
 
-from trackfeatures import LANE_WIDTH_M
+from simulator.link.config import LinkConfig
 from trackfeatures.errors import UserError
+
+Name = Annotated[str, typer.Option(help="Name of the shared memory: a slash and letters.")]
+Track = Annotated[str, typer.Option(help="Name of a track, or a track file.")]
+Lanes = Annotated[int, typer.Option(help="Number of lanes, 1 to 3.")]
+LaneWidth = Annotated[float, typer.Option(help="Metres, 3.0 to 4.5.")]
+Traffic = Annotated[int, typer.Option(help="Number of other cars.", min=0, max=12)]
+Frequency = Annotated[int, typer.Option(help="Control steps per second; must divide 200.")]
+Seed = Annotated[
+    int, typer.Option(help="Seed of scenery, light and episodes that name none.", min=0)
+]
+CameraSize = Annotated[str, typer.Option(help="Image size such as 280x210, or none.")]
+LightName = Annotated[str, typer.Option(help="Light of the images, by name.")]
+TracksDir = Annotated[Path | None, typer.Option(help="Folder of TORCS tracks.")]
+Realtime = Annotated[
+    bool,
+    typer.Option(
+        "--realtime/--lock-step",
+        help="Step by the wall clock and hold the last command; or wait for a command each step.",
+    ),
+]
+Once = Annotated[bool, typer.Option("--once", help="End when the first client leaves.")]
+Patience = Annotated[
+    float,
+    typer.Option(help="Seconds without a command before a client is given up; 0: no limit."),
+]
+Header = Annotated[
+    Path | None, typer.Option(help="Write the C header of the memory to this file, and end.")
+]
+AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 
 
 def link(
-    track: Annotated[str, typer.Option(help="Name of a track, or a file of one.")] = "circuit",
-    name: Annotated[str, typer.Option(help="Of the shared memory: /letters.")] = "/driverview",
-    lanes: Annotated[int, typer.Option(help="Number of lanes, 1 to 3.")] = 1,
-    lane_width: Annotated[float, typer.Option(help="Metres, 3.0 to 4.5.")] = LANE_WIDTH_M,
-    traffic: Annotated[int, typer.Option(help="Number of other cars.", min=0, max=12)] = 0,
-    frequency: Annotated[int, typer.Option(help="Control steps a second; divides 200.")] = 20,
-    seed: Annotated[
-        int, typer.Option(help="Of scenery, light and episodes without a seed.", min=0)
-    ] = 0,
-    camera: Annotated[str, typer.Option(help="Picture size such as 280x210, or none.")] = "none",
-    light: Annotated[str, typer.Option(help="Light of the pictures, by name.")] = "clear",
-    tracks_dir: Annotated[Path | None, typer.Option(help="Folder of TORCS tracks.")] = None,
-    realtime: Annotated[
-        bool,
-        typer.Option(
-            "--realtime/--lock-step",
-            help="Step by the clock, holding the last command; or wait for one each step.",
-        ),
-    ] = False,
-    once: Annotated[bool, typer.Option("--once", help="End with the first client.")] = False,
-    patience: Annotated[
-        float,
-        typer.Option(help="Seconds to bear with a living client that sends nothing; 0: any."),
-    ] = 600.0,
-    header: Annotated[
-        Path | None, typer.Option(help="Write the C header of the memory there, and end.")
-    ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
+    track: Track = LinkConfig.track,
+    name: Name = LinkConfig.name,
+    lanes: Lanes = LinkConfig.lanes,
+    lane_width: LaneWidth = LinkConfig.lane_width,
+    traffic: Traffic = LinkConfig.traffic,
+    frequency: Frequency = LinkConfig.frequency_hz,
+    seed: Seed = LinkConfig.seed,
+    camera: CameraSize = "none",
+    light: LightName = LinkConfig.light,
+    tracks_dir: TracksDir = LinkConfig.tracks_dir,
+    realtime: Realtime = LinkConfig.realtime,
+    once: Once = LinkConfig.once,
+    patience: Patience = LinkConfig.patience_s,
+    header: Header = None,
+    as_json: AsJson = False,
 ) -> None:
-    """Run the simulator for a client in another process: C, Python, anything.
+    """Run the simulator for a client in another process: C, Python, any language.
 
-    A client asks for a reset, then for one control step after the other; see driverview_link.h.
-    Ctrl-C, SIGTERM or the client's request to quit ends it.
+    A client sends a reset, then one command per control step; see driverview_link.h. Ctrl-C,
+    SIGTERM or a client's QUIT request ends it.
     """
     if header is not None:
-        from runtime.files import atomic_write
-        from simulator.link.header import c_header
-
-        atomic_write(header, c_header())
+        _write_header(header)
         return
-    from simulator.link.process import LinkConfig, run
-
-    signal.signal(signal.SIGTERM, _interrupt)
     config = LinkConfig(
         track=track,
         name=name,
@@ -75,6 +85,20 @@ def link(
         once=once,
         patience_s=patience,
     )
+    _serve(config, as_json)
+
+
+def _write_header(path: Path) -> None:
+    from runtime.files import atomic_write
+    from simulator.link.header import c_header
+
+    atomic_write(path, c_header())
+
+
+def _serve(config: LinkConfig, as_json: bool) -> None:
+    from simulator.link.process import run
+
+    signal.signal(signal.SIGTERM, _interrupt)
     summary = run(config, lambda text: typer.echo(text, err=True))
     if as_json:
         typer.echo(json.dumps(asdict(summary)))
@@ -96,5 +120,5 @@ def picture_size(text: str) -> tuple[int, int]:
 
 
 def _interrupt(number: int, frame: object) -> None:
-    """SIGTERM is Ctrl-C without a terminal."""
+    """Handle SIGTERM like Ctrl-C."""
     raise KeyboardInterrupt

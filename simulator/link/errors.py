@@ -1,4 +1,4 @@
-"""What can go wrong on the link, each with what to do about it."""
+"""Exceptions of the link; each message says what to do."""
 
 from trackfeatures.errors import UserError
 
@@ -7,36 +7,36 @@ class LinkError(UserError):
     """The link cannot be made or is lost."""
 
 
-class NoEngine(LinkError):
-    """Nobody serves a link of that name (yet)."""
+class NoServer(LinkError):
+    """There is no server of that name (yet)."""
 
 
 class NameInUse(LinkError):
-    """Somebody else holds this name, or this end of the link."""
+    """Another process holds this name, or this role on the link."""
 
 
 class LayoutMismatch(LinkError):
-    """The two sides were built for different layouts of the memory."""
+    """Server and client use different layouts of the memory."""
 
 
-class EngineDied(LinkError):
-    """The engine's process is gone, or it has closed the link."""
+class ServerDied(LinkError):
+    """The server's process is gone, or it has closed the link."""
 
 
 class ClientLost(LinkError):
-    """The engine's client has died, or says nothing any more."""
+    """The server's client has died, or has sent nothing for too long."""
 
 
 class DamagedMessage(LinkError):
-    """A message whose checksum is wrong: its writer does not keep to the protocol."""
+    """A message has a wrong checksum: its writer violates the protocol."""
 
 
 class LinkTimeout(LinkError):
-    """The engine lives, but has not answered in time."""
+    """The server is alive, but has not answered in time."""
 
 
 class Refused(LinkError):
-    """The engine lives and has refused a command; the car stands where it stood.
+    """The server has refused a command; the state of the car is unchanged.
 
     `code` is one of `layout.Refusal`.
     """

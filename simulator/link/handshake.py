@@ -1,4 +1,4 @@
-"""The header: what the engine says of itself, and how a client makes sure it understands it."""
+"""The header of the shared memory: the server's description, and the client's check of it."""
 
 from dataclasses import dataclass, fields
 from typing import Any
@@ -14,8 +14,8 @@ from simulator.link.sync.seqlock import get_word, set_word
 
 
 @dataclass(frozen=True)
-class EngineInfo:
-    """What holds as long as the engine runs; the layout's HEADER gives the units."""
+class ServerInfo:
+    """The constant properties of a server; units as in the layout's HEADER."""
 
     track: str
     lanes: int
@@ -33,8 +33,8 @@ class EngineInfo:
     beam_angles: tuple[float, ...]
 
 
-def write_header(segment: Segment, info: EngineInfo) -> None:
-    """Describe the engine, in a segment not yet published."""
+def write_header(segment: Segment, info: ServerInfo) -> None:
+    """Describe the server, in a segment not yet published."""
     record = _record(segment)
     record["magic"] = MAGIC
     record["byte_order"] = layout.BYTE_ORDER
@@ -43,18 +43,18 @@ def write_header(segment: Segment, info: EngineInfo) -> None:
     record["segment_size"] = len(segment.memory)
     record["image_bytes"] = layout.image_bytes(info.image_width, info.image_height)
     record["phase"] = Phase.OPEN
-    for field in fields(EngineInfo):
+    for field in fields(ServerInfo):
         value = getattr(info, field.name)
-        record[field.name] = _cut(value) if isinstance(value, str) else value
+        record[field.name] = _truncate(value) if isinstance(value, str) else value
 
 
-def read_header(segment: Segment) -> EngineInfo:
-    """What the engine says of itself. Raises LayoutMismatch."""
+def read_header(segment: Segment) -> ServerInfo:
+    """The server's description. Raises LayoutMismatch."""
     check_identity(segment)
     record = _record(segment)
-    values = {field.name: record[field.name].item() for field in fields(EngineInfo)[1:-1]}
+    values = {field.name: record[field.name].item() for field in fields(ServerInfo)[1:-1]}
     values["mode"] = Mode(values["mode"])
-    return EngineInfo(
+    return ServerInfo(
         track=record["track"].decode(),
         beam_angles=tuple(record["beam_angles"].tolist()),
         **values,
@@ -62,7 +62,7 @@ def read_header(segment: Segment) -> EngineInfo:
 
 
 def check_identity(segment: Segment) -> None:
-    """Raises LayoutMismatch unless the engine writes the layout that this program reads."""
+    """Raises LayoutMismatch unless the server uses the layout of this program."""
     name, size = segment.name, len(segment.memory)
     if size < IDENTITY.itemsize:
         raise LayoutMismatch(f"the segment {name} has {size} bytes, too few for a link's header")
@@ -70,20 +70,20 @@ def check_identity(segment: Segment) -> None:
     swapped = int.from_bytes(layout.BYTE_ORDER.to_bytes(4, "big"), "little")
     if found["byte_order"] == swapped:
         raise LayoutMismatch(
-            f"the engine of {name} writes the other byte order; run both sides on one machine"
+            f"the server of {name} writes the other byte order; run both sides on one machine"
         )
     theirs = int(found["version"]), int(found["layout_hash"])
     ours = layout.VERSION, layout.layout_hash()
     if theirs != ours:
         raise LayoutMismatch(
-            f"the engine of {name} writes layout {theirs[0]} ({theirs[1]:016x}), this client reads "
+            f"the server of {name} writes layout {theirs[0]} ({theirs[1]:016x}), this client reads "
             f"layout {ours[0]} ({ours[1]:016x}); use the same version of driverview on both sides"
         )
     stated = int(found["segment_size"])
     if size < HEADER.end or not size == stated == layout.STATE.end + _image_bytes(segment):
         raise LayoutMismatch(
             f"the segment {name} has {size} bytes and its header says {stated}; it is damaged: "
-            "start the engine again"
+            "start the server again"
         )
 
 
@@ -96,7 +96,7 @@ def phase(segment: Segment) -> Phase:
 
 
 def set_phase(segment: Segment, value: Phase) -> None:
-    """Everything written before is seen by whoever sees the phase."""
+    """Store the phase; a process that reads it also sees everything written before."""
     set_word(_phase_word(segment), int(value))
 
 
@@ -110,6 +110,6 @@ def _phase_word(segment: Segment) -> NDArray[np.uint32]:
     return segment.bytes()[place : place + size].view(np.uint32)
 
 
-def _cut(text: str) -> bytes:
-    """UTF-8 that fits its field with the 0 behind it."""
+def _truncate(text: str) -> bytes:
+    """`text` as UTF-8, cut to fit its field with a terminating 0."""
     return text.encode()[:63].decode(errors="ignore").encode()

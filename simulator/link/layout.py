@@ -1,9 +1,9 @@
-"""What lies where in the link's shared memory: the one definition, in tables of typed fields.
+"""The layout of the link's shared memory: the single definition, as tables of typed fields.
 
-Three blocks follow each other, then the camera's picture: HEADER (written once by the engine),
-COMMAND (written by the client) and STATE (written by the engine). Native byte order, no padding
-that is not a field; every block is a multiple of a cache line. `simulator link --header FILE` turns
-the tables into a C header. Whoever changes them counts VERSION up; the hash catches who forgets to.
+Three blocks, then the camera image: HEADER (written once by the server), COMMAND (written by the
+client) and STATE (written by the server). Native byte order; all padding is explicit; each block is
+a multiple of a cache line. `simulator link --header FILE` generates a C header from the tables. A
+change of the tables must increase VERSION; a forgotten increase is caught by the layout hash.
 """
 
 import hashlib
@@ -28,21 +28,21 @@ MESSAGE_ALIGNMENT: Final = 8
 
 
 class Phase(IntEnum):
-    """Whether the engine still answers (HEADER.phase)."""
+    """Whether the server is running (HEADER.phase)."""
 
     OPEN = 1
     CLOSED = 2
 
 
 class Mode(IntEnum):
-    """Who waits for whom (HEADER.mode)."""
+    """Whether the server waits for commands or steps by the wall clock (HEADER.mode)."""
 
     LOCK_STEP = 0
     REALTIME = 1
 
 
 class Request(IntEnum):
-    """What the client asks for (COMMAND.request)."""
+    """The client's request (COMMAND.request)."""
 
     STEP = 1
     RESET = 2
@@ -51,7 +51,7 @@ class Request(IntEnum):
 
 
 class Refusal(IntEnum):
-    """Why the engine has not done what the last command asked for (STATE.error)."""
+    """Why the server refused the last command (STATE.error)."""
 
     NONE = 0
     NO_EPISODE = 1
@@ -119,7 +119,7 @@ class Block:
 
     @cached_property
     def dtype(self) -> np.dtype[Any]:
-        """Aligned as a C compiler aligns it."""
+        """The structured dtype, with the alignment of a C compiler."""
         return np.dtype([(f.name, f.numpy_format) for f in self.fields], align=True)
 
     @property
@@ -151,23 +151,24 @@ _SEQUENCE: Final = (
 )
 _CHECK: Final = _u8("check", "FNV-1a over the 8-byte words between the first and this")
 
-# The first five fields keep their places in every version: by them any two sides know each other.
+# The first five fields have the same offsets in every version, so that any two versions can compare
+# them.
 _IDENTITY: Final = (
     Field("magic", "char", "", '"DRVLINK"', len(MAGIC)),
-    _u4("byte_order", "DRVLINK_BYTE_ORDER as the engine writes it"),
-    _u4("version", "DRVLINK_VERSION of the engine"),
-    _u8("layout_hash", "DRVLINK_LAYOUT_HASH of the engine"),
+    _u4("byte_order", "DRVLINK_BYTE_ORDER as the server writes it"),
+    _u4("version", "DRVLINK_VERSION of the server"),
+    _u8("layout_hash", "DRVLINK_LAYOUT_HASH of the server"),
     _u8("segment_size", "bytes, the picture included"),
 )
 
 HEADER: Final = Block(
     "header",
-    "What does not change while the engine runs, but for `phase`.",
+    "What does not change while the server runs, but for `phase`.",
     (
         *_IDENTITY,
         _u4("phase", "enum drvlink_phase"),
         _u4("mode", "enum drvlink_mode"),
-        _u8("engine_pid", "for messages only: the locks tell who lives"),
+        _u8("engine_pid", "of the server, for messages only: the locks show who is running"),
         _u4("frequency_hz", "control steps in a simulated second"),
         _u4("lanes", "lanes of the road"),
         _f("lane_width", "m", "of each lane"),
@@ -188,11 +189,11 @@ HEADER: Final = Block(
 
 COMMAND: Final = Block(
     "command",
-    "Client to engine.",
+    "Client to server.",
     (
         *_SEQUENCE,
         _u8("number", "of this command, counted up by the client"),
-        _u8("session", "one more than the client found when it came"),
+        _u8("session", "one more than the value found when the client connected"),
         _u8("seen", "number of the newest state message read: the step acknowledged"),
         _u4("request", "enum drvlink_request"),
         _u4("client_pid", "for messages only"),
@@ -201,7 +202,7 @@ COMMAND: Final = Block(
         _f("brake", "1", "0 to 1"),
         Field("gear", "i4", "", "-1 reverse, 0 neutral, 1 to 6"),
         _u4("spare2", "0"),
-        Field("seed", "i8", "", "RESET: fixes the episode; negative: the engine chooses"),
+        Field("seed", "i8", "", "RESET: fixes the episode; negative: the server chooses"),
         _f("start_s", "m", "RESET: place along the centre line; NaN: 25 m before the line"),
         _f("start_to_middle", "m", "RESET: left of the centre line"),
         _f("start_angle", "rad", "RESET: track tangent minus yaw, right positive"),
@@ -214,17 +215,17 @@ COMMAND: Final = Block(
 
 STATE: Final = Block(
     "state",
-    "Engine to client; the picture, if there is a camera, belongs to the same message.",
+    "Server to client; the picture, if there is a camera, belongs to the same message.",
     (
         *_SEQUENCE,
-        _u8("number", "of this message since the engine began"),
+        _u8("number", "of this message since the server began"),
         _u8("session", "of the command answered"),
         _u8("answers", "number of the last command taken"),
         _u4("error", "enum drvlink_refusal of that command; the state is as before it"),
-        _u4("ended", "enum drvlink_ended: asks for a reset"),
-        _u8("episode", "resets since the engine began; 0: none yet"),
+        _u4("ended", "enum drvlink_ended: a reset is needed"),
+        _u8("episode", "resets since the server began; 0: none yet"),
         _u8("step", "control steps since the reset"),
-        _u8("late_steps", "REALTIME: steps of this episode that began too late"),
+        _u8("late_steps", "REALTIME: late steps of this episode"),
         Field("seed", "i8", "", "of the episode"),
         _f("time_s", "s", "since the reset"),
         _f("x", "m", "centre of gravity, world frame"),
@@ -242,7 +243,7 @@ STATE: Final = Block(
         _f("curvature", "1/m", "of the centre line, left positive"),
         _f("rpm", "rev/min", "of the engine"),
         _f("wheel_spin", "rad/s", f"of the wheels: {', '.join(WHEELS)}", len(WHEELS)),
-        _f("steer", "1", "where the front wheels stand, as a share of the lock"),
+        _f("steer", "1", "actual front-wheel angle / lock"),
         _f("odometer_m", "m", "driven since the reset"),
         _f("lap_time_s", "s", "since the line was crossed last"),
         Field("lap", "i4", "", "lines crossed since the reset"),

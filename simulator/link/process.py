@@ -1,26 +1,24 @@
-"""An engine from its options: makes the world, warms it up, serves until it is told to end."""
+"""Runs a link server from its options: builds the world, warms it up, serves until the end."""
 
 import os
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from simulator.link.handshake import EngineInfo
+from simulator.link.config import LinkConfig
+from simulator.link.handshake import ServerInfo
 from simulator.link.layout import COMMAND, STATE, Mode, Request, image_bytes
-from simulator.link.segment import clear
-from simulator.link.server import Engine, Summary
+from simulator.link.segment import remove_stale
+from simulator.link.server import LinkServer, Summary
 from simulator.link.simulation import Simulation
 from simulator.link.sync import futex
 from simulator.sensors.beams import BEAM_ANGLES
 from simulator.track.catalogue import find_track
 from simulator.track.road import Road
 from simulator.world.world import World
-from trackfeatures import LANE_WIDTH_M
 from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
 
@@ -28,35 +26,15 @@ if TYPE_CHECKING:
     from simulator.camera import Camera
 
 
-@dataclass(frozen=True)
-class LinkConfig:
-    """All that makes one engine."""
-
-    track: str = "circuit"
-    name: str = "/driverview"
-    lanes: int = 1
-    lane_width: float = LANE_WIDTH_M
-    traffic: int = 0
-    frequency_hz: int = 20
-    seed: int = 0
-    picture: tuple[int, int] = (0, 0)
-    """Width and height, (0, 0) for none."""
-    light: str = "clear"
-    tracks_dir: Path | None = None
-    realtime: bool = False
-    once: bool = False
-    patience_s: float = 600.0
-
-
 def run(config: LinkConfig, report: Callable[[str], None]) -> Summary:
-    """Serve until a client's request to quit or a KeyboardInterrupt; `report` is told what happens.
+    """Serve until a client's QUIT request or a KeyboardInterrupt; `report` receives log lines.
 
-    Raises UserError for what cannot be; ClientLost, see `Engine.serve`.
+    Raises UserError for bad options, ClientLost as `LinkServer.serve` does.
     """
     futex.check_system()
     if not config.patience_s >= 0.0:  # NaN too
         raise UserError(f"--patience is {config.patience_s}; give seconds, or 0 for any number")
-    clear(config.name)  # a name in use is told before the world is made
+    remove_stale(config.name)  # fails on a name in use before the world is built
     with ExitStack() as stack:
         road = Road(find_track(config.track, config.tracks_dir), config.lanes, config.lane_width)
         world = stack.enter_context(
@@ -68,8 +46,8 @@ def run(config: LinkConfig, report: Callable[[str], None]) -> Summary:
             return Simulation(world, record, image, seed=config.seed, camera=camera)
 
         _warm_up(simulation, config)
-        engine = stack.enter_context(
-            Engine(
+        server = stack.enter_context(
+            LinkServer(
                 config.name,
                 describe(world, config),
                 simulation,
@@ -80,16 +58,16 @@ def run(config: LinkConfig, report: Callable[[str], None]) -> Summary:
         )
         report(f"{config.name}: {road.track.name} is ready for a client")
         try:
-            engine.serve()
+            server.serve()
         except KeyboardInterrupt:
             report(f"{config.name}: stopped")
-        return engine.summary
+        return server.summary
 
 
-def describe(world: World, config: LinkConfig) -> EngineInfo:
-    """What the engine's clients are told of it."""
+def describe(world: World, config: LinkConfig) -> ServerInfo:
+    """The header's description of the server."""
     road = world.road
-    return EngineInfo(
+    return ServerInfo(
         track=road.track.name,
         lanes=road.lanes,
         lane_width=road.lane_width,
@@ -110,7 +88,7 @@ def describe(world: World, config: LinkConfig) -> EngineInfo:
 def _warm_up(
     simulation: Callable[[Any, NDArray[np.uint8]], Simulation], config: LinkConfig
 ) -> None:
-    """Compile, and draw a first picture, before a client waits for it."""
+    """Compile, and render a first image, before the first client connects."""
     state, command = np.zeros(1, STATE.dtype)[0], np.zeros(1, COMMAND.dtype)[0]
     trial = simulation(state, np.zeros(image_bytes(*config.picture), np.uint8))
     for request in (Request.RESET, Request.STEP):
@@ -119,7 +97,7 @@ def _warm_up(
 
 
 def _camera(road: Road, config: LinkConfig) -> "Camera":
-    from simulator.camera import Camera, Light  # the renderer only where pictures are
+    from simulator.camera import Camera, Light  # loads the renderer only when images are needed
 
     light = Light.named(config.light, np.random.default_rng([config.seed, 2]))
     width, height = config.picture

@@ -1,11 +1,11 @@
-"""Keeps the engine's control steps to the wall clock."""
+"""The wall-clock timing of the control steps in real-time mode."""
 
 import time
 
 
-class Clock:
-    """Ticks `frequency_hz` times a second. A tick that comes late moves those after it: nothing is
-    caught up on."""
+class RealtimeClock:
+    """Ticks `frequency_hz` times a second. A late tick shifts those after it; missed time is not
+    made up."""
 
     def __init__(self, frequency_hz: int) -> None:
         self._period_s = 1.0 / frequency_hz
@@ -17,7 +17,7 @@ class Clock:
         self._next = time.monotonic() + self._period_s
 
     def wait(self) -> bool:
-        """Sleep until the tick; whether it was missed by more than a period."""
+        """Sleep until the next tick; returns whether it was missed by more than one period."""
         now = time.monotonic()
         late = now > self._next + self._period_s
         if now < self._next:

@@ -1,11 +1,11 @@
-"""A named POSIX shared memory segment with two ends, and locks that tell which of them are held.
+"""A named POSIX shared memory segment with two roles, server and client, each held by a file lock.
 
-Each end holds an open-file-description lock on a byte of its own. The kernel releases it with the
-process, however that ends, so a lock is never stale: no pid to be reused, no heartbeat to be late,
-and it holds between containers that share /dev/shm but not their process numbers. Who holds the
-engine's lock may remove the segment, nobody else.
+Each role is an open-file-description lock on one byte. The kernel releases it when the process
+ends, however that happens, so a lock is never stale, unlike a stored pid or a heartbeat; it also
+works between containers that share /dev/shm but not their process ids. Only the holder of the
+server's lock may remove the segment.
 
-Not `multiprocessing.shared_memory`: its resource tracker removes the segment of a living engine
+Not `multiprocessing.shared_memory`: its resource tracker removes the segment of a running server
 when a client of another process tree ends.
 """
 
@@ -22,42 +22,44 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from simulator.link.errors import LinkError, NameInUse, NoEngine
+from simulator.link.errors import LinkError, NameInUse, NoServer
 from simulator.link.layout import MAGIC
 
 SHM = Path("/dev/shm")
 """Where Linux keeps POSIX shared memory."""
-LONGEST_NAME = 250
-CLEANING_S = 0.2
+POLL_INTERVAL_S = 0.05
+"""Interval at which a waiting process checks that its peer is alive."""
+MAX_NAME_BYTES = 250
+CLEANUP_TIMEOUT_S = 0.2
 FLOCK = "hhqqi4x"  # struct flock: type, whence, start, length, pid
 
 
-class End(IntEnum):
-    """Which byte of the segment an end locks."""
+class Role(IntEnum):
+    """The byte of the segment that a role locks."""
 
-    ENGINE = 0
+    SERVER = 0
     CLIENT = 1
 
 
 @dataclass(eq=False)
 class Segment:
-    """A mapped segment of which we hold one end."""
+    """A mapped segment in which this process holds one role."""
 
     name: str
-    end: End
+    role: Role
     descriptor: int
     memory: mmap.mmap
 
     def bytes(self) -> NDArray[np.uint8]:
-        """All of it, shared with the other end."""
+        """All bytes of the segment, shared with the peer."""
         return np.frombuffer(self.memory, dtype=np.uint8)
 
-    def other_end_lives(self) -> bool:
-        """Whether somebody holds the other end."""
-        return is_held(self.descriptor, End(1 - self.end))
+    def peer_is_alive(self) -> bool:
+        """Whether a process holds the other role."""
+        return is_locked(self.descriptor, Role(1 - self.role))
 
     def publish(self) -> None:
-        """Give a new segment, complete by now, its name; that of a dead engine makes way.
+        """Give a new, complete segment its name; replaces the segment of a dead server.
 
         Raises NameInUse, LinkError; see `clear`.
         """
@@ -69,14 +71,14 @@ class Segment:
                     ours = f"/proc/self/fd/{self.descriptor}"
                     os.link(ours, _path(self.name), src_dir_fd=folder, follow_symlinks=True)
                 except FileExistsError:
-                    clear(self.name)
+                    remove_stale(self.name)
                 else:
                     return
         finally:
             os.close(folder)
 
     def close(self) -> None:
-        """Give our end back; without a living engine the segment is removed.
+        """Release the role; removes the segment if no server is running.
 
         The memory itself stays mapped as long as there are views of it.
         """
@@ -89,15 +91,15 @@ class Segment:
 _open: "weakref.WeakSet[Segment]" = weakref.WeakSet()
 
 
-def _forget_in_child() -> None:
-    """A forked child shares our locks and would keep them beyond our death."""
+def _close_in_child() -> None:
+    """Close the descriptors in a forked child: it shares the locks and would keep them held."""
     for segment in _open:
         if segment.descriptor >= 0:
             os.close(segment.descriptor)
             segment.descriptor = -1
 
 
-os.register_at_fork(after_in_child=_forget_in_child)
+os.register_at_fork(after_in_child=_close_in_child)
 
 
 def check_name(name: str) -> str:
@@ -106,25 +108,25 @@ def check_name(name: str) -> str:
         raise LinkError(f"the link's name is {name!r}; it begins with a slash: /driverview")
     if "/" in name[1:] or "\0" in name or name in ("/.", "/.."):
         raise LinkError(f"the link's name is {name!r}; give one slash and then a plain name")
-    if len(os.fsencode(name)) > LONGEST_NAME:
+    if len(os.fsencode(name)) > MAX_NAME_BYTES:
         raise LinkError(
-            f"the link's name has {len(os.fsencode(name))} bytes; give at most {LONGEST_NAME}"
+            f"the link's name has {len(os.fsencode(name))} bytes; give at most {MAX_NAME_BYTES}"
         )
     return name
 
 
 def create(name: str, size: int) -> Segment:
-    """A segment of zeros, our end the engine's; nobody sees it before it is published.
+    """A segment of zeros with the server's role held; it has no name until it is published.
 
-    The memory is claimed now: a write to a page that there is no room for would be a bus error.
-    Raises LinkError when there is no room.
+    The memory is allocated now: a later write to a page without memory would be a bus error.
+    Raises LinkError when there is not enough memory.
     """
     check_name(name)
     descriptor = os.open(SHM, os.O_TMPFILE | os.O_RDWR, 0o600)
     try:
         os.posix_fallocate(descriptor, 0, size)
-        try_lock(descriptor, End.ENGINE)
-        return _mapped(name, End.ENGINE, descriptor)
+        try_lock(descriptor, Role.SERVER)
+        return _map(name, Role.SERVER, descriptor)
     except OSError as error:
         os.close(descriptor)
         raise LinkError(
@@ -133,10 +135,10 @@ def create(name: str, size: int) -> Segment:
         ) from error
 
 
-def clear(name: str) -> None:
-    """Remove the segment of a dead engine, if there is one.
+def remove_stale(name: str) -> None:
+    """Remove the segment of a dead server, if there is one.
 
-    Raises NameInUse when its engine lives, LinkError when it is another program's.
+    Raises NameInUse when its server is running, LinkError when it belongs to another program.
     """
     try:
         descriptor = _open_name(check_name(name), os.O_RDWR)
@@ -144,62 +146,62 @@ def clear(name: str) -> None:
         return
     try:
         _check_is_link(name, descriptor)
-        until = time.monotonic() + CLEANING_S
-        while not try_lock(descriptor, End.ENGINE):
-            # A client that removes a dead engine's segment holds this lock for a moment.
+        until = time.monotonic() + CLEANUP_TIMEOUT_S
+        while not try_lock(descriptor, Role.SERVER):
+            # A client that removes a dead server's segment holds this lock for a moment.
             if time.monotonic() > until:
                 raise NameInUse(
-                    f"an engine of the link {name} is running; end it, or choose another --name"
+                    f"a server of the link {name} is running; end it, or choose another --name"
                 )
-            time.sleep(CLEANING_S / 20)
+            time.sleep(CLEANUP_TIMEOUT_S / 20)
         _remove_if_dead(name, descriptor)
     finally:
         os.close(descriptor)
 
 
 def attach(name: str) -> Segment:
-    """The segment of a living engine, our end the client's.
+    """The segment of a running server, with the client's role held.
 
-    Raises NoEngine when there is none (a dead engine's segment is removed), NameInUse when another
+    Raises NoServer when there is none (a dead server's segment is removed), NameInUse when another
     client is there.
     """
     check_name(name)
     try:
         descriptor = _open_name(name, os.O_RDWR)
     except FileNotFoundError:
-        raise NoEngine(
-            f"there is no engine of the link {name}; start one: simulator link --name {name}"
+        raise NoServer(
+            f"there is no server of the link {name}; start one: simulator link --name {name}"
         ) from None
     try:
         _check_is_link(name, descriptor)
-        if not is_held(descriptor, End.ENGINE):
+        if not is_locked(descriptor, Role.SERVER):
             _remove_if_dead(name, descriptor)
-            raise NoEngine(f"the engine of {name} has died; start it again")
-        if not try_lock(descriptor, End.CLIENT):
+            raise NoServer(f"the server of {name} has died; start it again")
+        if not try_lock(descriptor, Role.CLIENT):
             raise NameInUse(
-                f"the engine of {name} has a client already, and serves one at a time; end that "
-                "one, or start another engine under another name"
+                f"the server of {name} has a client already, and serves one at a time; end that "
+                "one, or start another server under another name"
             )
-        return _mapped(name, End.CLIENT, descriptor)
+        return _map(name, Role.CLIENT, descriptor)
     except BaseException:
         os.close(descriptor)
         raise
 
 
-def _mapped(name: str, end: End, descriptor: int) -> Segment:
-    # An opening of its own: mmap keeps a copy of the descriptor it gets, and with it our lock.
+def _map(name: str, role: Role, descriptor: int) -> Segment:
+    # A separate open: mmap keeps a duplicate of its descriptor, which would keep the lock held.
     mapped = os.open(f"/proc/self/fd/{descriptor}", os.O_RDWR)
     try:
         memory = mmap.mmap(mapped, os.fstat(mapped).st_size)
     finally:
         os.close(mapped)
-    segment = Segment(name, end, descriptor, memory)
+    segment = Segment(name, role, descriptor, memory)
     _open.add(segment)
     return segment
 
 
 def _check_is_link(name: str, descriptor: int) -> None:
-    """Raises LinkError for the memory of another program."""
+    """Raises LinkError if the segment belongs to another program."""
     start = os.pread(descriptor, len(MAGIC), 0)
     if start != MAGIC:
         raise LinkError(
@@ -209,21 +211,21 @@ def _check_is_link(name: str, descriptor: int) -> None:
 
 
 def _remove_if_dead(name: str, descriptor: int) -> None:
-    """Remove a segment whose engine is dead, unless another engine has the name by now."""
-    if try_lock(descriptor, End.ENGINE) and _is_named(name, descriptor):
+    """Remove a segment whose server is dead, unless a new server has taken the name."""
+    if try_lock(descriptor, Role.SERVER) and _is_named(name, descriptor):
         _path(name).unlink()
 
 
-def is_held(descriptor: int, end: End) -> bool:
-    """Whether another process (or another opening of the segment) holds `end`."""
-    wanted = struct.pack(FLOCK, fcntl.F_WRLCK, os.SEEK_SET, end, 1, 0)
+def is_locked(descriptor: int, role: Role) -> bool:
+    """Whether another process (or another opening of the segment) holds `role`."""
+    wanted = struct.pack(FLOCK, fcntl.F_WRLCK, os.SEEK_SET, role, 1, 0)
     found = fcntl.fcntl(descriptor, fcntl.F_OFD_GETLK, wanted)
     return bool(struct.unpack(FLOCK, found)[0] != fcntl.F_UNLCK)
 
 
-def try_lock(descriptor: int, end: End) -> bool:
-    """Take `end` for as long as the descriptor is open; False when somebody else has it."""
-    wanted = struct.pack(FLOCK, fcntl.F_WRLCK, os.SEEK_SET, end, 1, 0)
+def try_lock(descriptor: int, role: Role) -> bool:
+    """Take `role` for as long as the descriptor is open; False if another process holds it."""
+    wanted = struct.pack(FLOCK, fcntl.F_WRLCK, os.SEEK_SET, role, 1, 0)
     try:
         fcntl.fcntl(descriptor, fcntl.F_OFD_SETLK, wanted)
     except (BlockingIOError, PermissionError):
@@ -244,7 +246,7 @@ def _is_named(name: str, descriptor: int) -> bool:
 
 
 def _path(name: str) -> Path:
-    """What C opens with shm_open(name)."""
+    """The file that shm_open(name) opens in C."""
     return SHM / name[1:]
 
 

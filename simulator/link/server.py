@@ -1,8 +1,7 @@
-"""The engine's loop: takes commands from the link, lets the simulation answer them, watches for
-clients that come, leave and die.
+"""The loop of a link server: reads commands, answers them with a Simulation, tracks its client.
 
-In lock step it waits for a command for every control step. In real time it steps by the clock,
-holding the last command, as long as an episode runs.
+In lock-step mode it waits for a command before each control step. In real-time mode it steps by the
+wall clock, holding the last command, while an episode runs.
 """
 
 import time
@@ -13,7 +12,7 @@ from typing import Any, Self
 
 from simulator.link.channel import Receiver, Sender
 from simulator.link.errors import ClientLost
-from simulator.link.handshake import EngineInfo, set_phase, write_header
+from simulator.link.handshake import ServerInfo, set_phase, write_header
 from simulator.link.layout import (
     COMMAND,
     STATE,
@@ -23,43 +22,41 @@ from simulator.link.layout import (
     image_bytes,
     segment_size,
 )
-from simulator.link.realtime import Clock
-from simulator.link.segment import create
+from simulator.link.realtime import RealtimeClock
+from simulator.link.segment import POLL_INTERVAL_S, create
 from simulator.link.simulation import Simulation
-
-SLICE_S = 0.05
-"""Between two looks at whether the other side lives."""
 
 MakeSimulation = Callable[[Any, Any], Simulation]
 
 
-_LAST = (Request.LEAVE, Request.QUIT)
+_LEAVING = (Request.LEAVE, Request.QUIT)
 
 
 @dataclass(frozen=True)
 class Summary:
-    """What an engine has done."""
+    """Counts of a server's clients, episodes, steps and refusals."""
 
     clients: int
     clients_lost: int
-    """Died, without taking their leave."""
+    """Clients that died without disconnecting."""
     episodes: int
     steps: int
     refused: int
-    """Commands that could not be obeyed."""
+    """Refused commands."""
 
 
-class Engine:
-    """Serves one link. `make_simulation` is given the record and the picture to write answers in.
+class LinkServer:
+    """Serves one link. `make_simulation(record, image)` builds the Simulation that fills them.
 
-    `once`: end with the first client. `patience_s`: a client that lives but sends nothing for
-    longer is given up (0: never). Raises NameInUse, LinkError; see `segment`.
+    `once`: end when the first client leaves. `patience_s`: give up a running client that sends
+    nothing for longer (0: never). `report` receives log lines. Raises NameInUse, LinkError; see
+    `segment`.
     """
 
     def __init__(
         self,
         name: str,
-        info: EngineInfo,
+        info: ServerInfo,
         make_simulation: MakeSimulation,
         *,
         once: bool = False,
@@ -71,25 +68,25 @@ class Engine:
         self._inbox = Receiver(self._segment, COMMAND)
         self._outbox = Sender(self._segment, STATE, size)
         self._simulation = make_simulation(self._outbox.record, self._outbox.image)
-        self._clock = Clock(info.frequency_hz) if info.mode is Mode.REALTIME else None
+        self._clock = RealtimeClock(info.frequency_hz) if info.mode is Mode.REALTIME else None
         self._once, self._patience_s, self._report = once, patience_s, report
         self._session, self._pid = 0, 0
-        self._heard = 0.0
+        self._last_command_s = 0.0
         self._done = False
         self._clients, self._lost = 0, 0
         write_header(self._segment, info)
         self._segment.publish()
 
     def serve(self) -> None:
-        """Answer until a client asks to quit, or `once` and it leaves.
+        """Answer requests until a client sends QUIT, or leaves with `once`.
 
-        Raises ClientLost when a client dies with `once`, or is silent beyond all patience.
+        Raises ClientLost when a client dies with `once`, or sends nothing for `patience_s`.
         """
         while not self._done:
-            if self._await_command():
+            if self._wait_for_command():
                 self._handle(self._inbox.record)
             elif self._session:
-                self._watch_client()
+                self._check_client()
 
     @property
     def summary(self) -> Summary:
@@ -103,7 +100,7 @@ class Engine:
         )
 
     def close(self) -> None:
-        """Say that it is over, and remove the segment."""
+        """Mark the link as closed, wake the client, and remove the segment."""
         set_phase(self._segment, Phase.CLOSED)
         self._outbox.wake()
         self._segment.close()
@@ -119,10 +116,11 @@ class Engine:
     ) -> None:
         self.close()
 
-    def _await_command(self) -> bool:
-        """Whether there is a new command, after a while of waiting for it."""
+    def _wait_for_command(self) -> bool:
+        """Wait up to POLL_INTERVAL_S for a command, or in real time until the next tick; returns
+        whether there is one."""
         if self._clock is None or not self._simulation.running:
-            return self._inbox.wait(SLICE_S)
+            return self._inbox.wait(POLL_INTERVAL_S)
         self._outbox.record["late_steps"] += self._clock.wait()
         if self._inbox.poll():
             return True
@@ -132,8 +130,8 @@ class Engine:
 
     def _handle(self, request: Any) -> None:
         if int(request["session"]) != self._session:
-            self._welcome(request)
-        self._heard = time.monotonic()
+            self._accept_client(request)
+        self._last_command_s = time.monotonic()
         record = self._outbox.record
         before = int(record["episode"]), int(record["step"])
         if self._inbox.damaged:
@@ -143,44 +141,44 @@ class Engine:
         if int(record["episode"]) != before[0] and self._clock is not None:
             self._clock.restart()
         elif self._clock is not None and before[1] == record["step"] and self._simulation.running:
-            self._simulation.advance()  # refused: the clock goes on all the same
+            self._simulation.advance()  # refused, but in real time the step takes place
         record["session"], record["answers"] = request["session"], request["number"]
         self._send()
-        if not self._inbox.damaged and request["request"] in _LAST:
-            self._part(Request(int(request["request"])))
+        if not self._inbox.damaged and request["request"] in _LEAVING:
+            self._release_client(Request(int(request["request"])))
 
     def _send(self) -> None:
         self._outbox.record["number"] += 1
         self._outbox.send()
 
-    def _welcome(self, request: Any) -> None:
+    def _accept_client(self, request: Any) -> None:
         if self._session:
-            self._lose()
+            self._drop_client()
         self._session, self._pid = int(request["session"]), int(request["client_pid"])
         self._clients += 1
-        self._simulation.drop()
+        self._simulation.end_episode()
         self._report(f"client {self._pid} has come")
 
-    def _part(self, request: Request) -> None:
+    def _release_client(self, request: Request) -> None:
         self._report(f"client {self._pid} has left")
         self._session = 0
-        self._simulation.drop()
+        self._simulation.end_episode()
         self._done = self._once or request is Request.QUIT
 
-    def _watch_client(self) -> None:
-        if not self._segment.other_end_lives():
-            self._lose()
-        elif 0.0 < self._patience_s < time.monotonic() - self._heard:
+    def _check_client(self) -> None:
+        if not self._segment.peer_is_alive():
+            self._drop_client()
+        elif 0.0 < self._patience_s < time.monotonic() - self._last_command_s:
             raise ClientLost(
                 f"client {self._pid} lives, but has sent nothing for {self._patience_s:g} s; "
-                "start the engine again, with a longer --patience for a slower client"
+                "start the server again, with a longer --patience for a slower client"
             )
 
-    def _lose(self) -> None:
-        said = f"client {self._pid} has died {self._simulation.place}"
+    def _drop_client(self) -> None:
+        message = f"client {self._pid} has died {self._simulation.position_text}"
         self._session = 0
         self._lost += 1
-        self._simulation.drop()
+        self._simulation.end_episode()
         if self._once:
-            raise ClientLost(said)
-        self._report(said)
+            raise ClientLost(message)
+        self._report(message)

@@ -1,7 +1,7 @@
-"""What the engine does with a request: it drives the world and writes the answer into a record.
+"""Handles a client's requests: steps the world and writes the answer into a record.
 
-Knows nothing of shared memory. A mistake of the client becomes an error code and a sentence in the
-answer; the car then stands where it stood.
+Independent of the shared memory. A bad request is answered with an error code and a message; the
+state of the car is then unchanged.
 """
 
 import math
@@ -23,9 +23,9 @@ if TYPE_CHECKING:
 
 
 class Simulation:
-    """One world behind a link. `record` is a row of the layout's STATE, `image` its picture.
+    """One world behind a link. `record` is a row of the layout's STATE, `image` its image buffer.
 
-    `seed` chooses the episodes of resets that name none: episode n then has seed + n.
+    A reset without a seed starts episode n with the seed `seed` + n.
     """
 
     def __init__(
@@ -48,8 +48,8 @@ class Simulation:
         return int(self._record["episode"])
 
     @property
-    def place(self) -> str:
-        """Where in the drive we are, for messages."""
+    def position_text(self) -> str:
+        """Step and episode, for messages."""
         return f"at step {int(self._record['step'])} of episode {self.episodes}"
 
     @property
@@ -57,12 +57,12 @@ class Simulation:
         """Whether there is an episode that has not ended."""
         return self._open and not self._record["ended"]
 
-    def drop(self) -> None:
-        """End the episode: its client is gone."""
+    def end_episode(self) -> None:
+        """End the episode because its client has left."""
         self._open = False
 
     def answer(self, request: Any) -> None:
-        """Do what `request`, a row of the layout's COMMAND, asks for."""
+        """Execute `request`, a row of the layout's COMMAND, and fill the record."""
         record = self._record
         record["error"], record["error_text"] = Refusal.NONE, b""
         asked = int(request["request"])
@@ -75,11 +75,11 @@ class Simulation:
             self._refuse(Refusal.UNKNOWN_REQUEST, f"the request is {asked}; there are {known}")
 
     def reject(self, text: str) -> None:
-        """Answer to a command that came damaged."""
+        """Answer a command with a wrong checksum."""
         self._refuse(Refusal.BAD_CHECKSUM, text)
 
     def advance(self) -> None:
-        """One more step under the command held, without being asked."""
+        """Step with the last command, without a request (real-time mode)."""
         self._measure(self._world.step(self._held), stepped=True)
 
     def _reset(self, request: Any) -> None:
@@ -123,7 +123,8 @@ class Simulation:
             self._measure(state, stepped=True)
 
     def _measure(self, state: CarState, *, stepped: bool) -> None:
-        """Write down the moment; a reset earns nothing."""
+        """Write state, features, ranges, reward and image into the record; the reward of a reset
+        is 0."""
         record, world = self._record, self._world
         ended = ending(state)
         reward = 0.0
@@ -138,7 +139,7 @@ class Simulation:
         write_ending(record, ended)
         write_features(record, world.features())
         record["ranges"] = read_track_range(world)
-        # Without traffic both are the same, and the beams are what costs.
+        # Without traffic both are the same; computing the beams twice would be expensive.
         record["ranges_traffic"] = read_range(world) if world.traffic.count else record["ranges"]
         if self._camera is not None:
             picture = self._camera.render(world.body_pose(), world.traffic.poses())

@@ -1,14 +1,14 @@
-/* lap.c: drives one lap over the link, steered by a state feedback, and tells how it went.
+/* lap.c: drives one lap over the link with state feedback steering, and prints the result.
  *
  *   simulator link --track oval --name /driverview &
  *   simulator link --header driverview_link.h
  *   gcc -std=c11 -O2 -D_GNU_SOURCE -o lap lap.c -lm
  *   ./lap /driverview [SEED [LOG]]
  *
- * The law is that of TORCS's reference laps: front-wheel angle (rad)
+ * The control law is that of TORCS's reference laps: front-wheel angle (rad)
  * = -(1.0 d + 0.1 (vy + vx sin th) + 2.0 th + 0.1 yr), with d the metres left of the track's centre
  * and th = yaw - tangent, counter-clockwise: the link's `angle` with the other sign. Throttle 0.2
- * and gear 1 are held. LOG receives every state message as it lies in the memory.
+ * and gear 1 are held. LOG receives every state message, as raw bytes.
  *
  * The drive begins at rest, 25 m before the line; the lap is from the first crossing to the second.
  */

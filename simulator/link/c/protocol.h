@@ -5,10 +5,10 @@
  * while (!drvlink_step(&link, steer, throttle, 0.0, 1)) { ... link.state.to_middle ... }
  * drvlink_detach(&link);
  *
- * Every function returns 0, or -1 with a sentence in link.error. After a refusal (link.state.error
- * is not 0) the engine goes on, and the car stands where it stood; after any other error the link
- * is of no more use. `link.image`, if you set it to link.header.image_bytes bytes, receives the
- * picture of every message. One thread at a time; no fork() without exec(): it would share the lock.
+ * Every function returns 0, or -1 with a message in link.error. After a refusal (link.state.error
+ * is not 0) the link stays usable and the state of the car is unchanged; after any other error the
+ * link is unusable. `link.image`, if set to a buffer of link.header.image_bytes bytes, receives the
+ * image of every message. One thread at a time; no fork() without exec(): it would share the lock.
  */
 #include <errno.h>
 #include <fcntl.h>
@@ -32,7 +32,7 @@ struct drvlink {
     uint8_t *image;                 /* NULL, or where to copy pictures to */
     double timeout_s;               /* for an answer; 2 s unless you change it */
     char error[512];
-    /* Not for you: */
+    /* Internal: */
     int fd;
     uint8_t *memory;
     char name[256];
@@ -61,11 +61,11 @@ static inline int drvlink_lock(int fd, int how, int end) {
     return how == F_OFD_GETLK ? !failed && lock.l_type != F_UNLCK : !failed;
 }
 
-static inline int drvlink_engine_lives(const struct drvlink *link) {
+static inline int drvlink_server_lives(const struct drvlink *link) {
     return drvlink_lock(link->fd, F_OFD_GETLK, 0);
 }
 
-/* Removes the segment if its engine is dead and the name still leads to it. */
+/* Removes the segment if its server is dead and the name still leads to it. */
 static inline void drvlink_remove_if_dead(struct drvlink *link) {
     struct stat ours, named;
     int fd = drvlink_lock(link->fd, F_OFD_SETLK, 0) ? shm_open(link->name, O_RDONLY, 0) : -1;
@@ -114,7 +114,7 @@ static inline int drvlink_read(struct drvlink *link) {
     return 0;
 }
 
-/* Waits for a message for a moment: briefly awake, then asleep. */
+/* Waits for a message: spins briefly, then sleeps for at most DRVLINK_SLICE_S. */
 static inline void drvlink_wait(struct drvlink *link) {
     uint32_t *sequence = (uint32_t *)(void *)(link->memory + DRVLINK_STATE_OFFSET), now = 0;
     for (int i = 0; i < DRVLINK_SPINS; i++) {
@@ -125,13 +125,13 @@ static inline void drvlink_wait(struct drvlink *link) {
     syscall(SYS_futex, sequence, 0 /* FUTEX_WAIT */, now, &limit, NULL, 0);
 }
 
-/* The newest message, without asking for anything. 1 if there was a new one, 0, -1. */
+/* The newest message, without a request. 1 if there was a new one, 0 if not, -1 on an error. */
 static inline int drvlink_latest(struct drvlink *link) {
-    int lives = drvlink_engine_lives(link), came = drvlink_read(link);
+    int lives = drvlink_server_lives(link), came = drvlink_read(link);
     if (came || lives) return came;
     int closed = ((struct drvlink_header *)(void *)link->memory)->phase == DRVLINK_PHASE_CLOSED;
     snprintf(link->error, sizeof link->error,
-             "the engine of %s (process %llu) has %s; start it again", link->name,
+             "the server of %s (process %llu) has %s; start it again", link->name,
              (unsigned long long)link->header.engine_pid, closed ? "ended" : "died");
     return -1;
 }
@@ -169,7 +169,7 @@ static inline int drvlink_ask(struct drvlink *link) {
         return link->state.error ? -1 : 0;
     }
     snprintf(link->error, sizeof link->error,
-             "the engine of %s (process %llu) lives, but has not answered within %g s", link->name,
+             "the server of %s (process %llu) lives, but has not answered within %g s", link->name,
              (unsigned long long)link->header.engine_pid, link->timeout_s);
     return -1;
 }
@@ -185,7 +185,7 @@ static inline int drvlink_reset_at(struct drvlink *link, int64_t seed, double s,
     return drvlink_ask(link);
 }
 
-/* 25 m before the line, at rest; a negative seed lets the engine choose one. */
+/* 25 m before the line, at rest; a negative seed lets the server choose one. */
 static inline int drvlink_reset(struct drvlink *link, int64_t seed) {
     return drvlink_reset_at(link, seed, NAN, 0.0, 0.0, 0.0);
 }
@@ -210,14 +210,14 @@ static inline void drvlink_close(struct drvlink *link) {
     link->fd = -1;
 }
 
-/* Takes leave; the engine waits for its next client. */
+/* Disconnects; the server waits for its next client. */
 static inline void drvlink_detach(struct drvlink *link) {
     link->command.request = DRVLINK_REQUEST_LEAVE;
-    if (link->memory && drvlink_engine_lives(link)) drvlink_ask(link);
+    if (link->memory && drvlink_server_lives(link)) drvlink_ask(link);
     drvlink_close(link);
 }
 
-/* Ends the engine. */
+/* Ends the server. */
 static inline int drvlink_quit(struct drvlink *link) {
     link->command.request = DRVLINK_REQUEST_QUIT;
     int failed = drvlink_ask(link);
@@ -236,7 +236,7 @@ static inline int drvlink_check(struct drvlink *link, size_t size) {
         return snprintf(link->error, room, "%s has the other byte order", link->name), -1;
     if (theirs->version != DRVLINK_VERSION || theirs->layout_hash != DRVLINK_LAYOUT_HASH)
         return snprintf(link->error, room,
-                        "the engine of %s writes layout %u (%016llx), this program was compiled "
+                        "the server of %s writes layout %u (%016llx), this program was compiled "
                         "for %u (%016llx): compile it with the header of `simulator link --header`",
                         link->name, theirs->version, (unsigned long long)theirs->layout_hash,
                         DRVLINK_VERSION, (unsigned long long)DRVLINK_LAYOUT_HASH), -1;
@@ -246,7 +246,7 @@ static inline int drvlink_check(struct drvlink *link, size_t size) {
     return 0;
 }
 
-/* 0, -1, or 1 if there is no engine (yet). */
+/* 0, -1, or 1 if there is no server (yet). */
 static inline int drvlink_open(struct drvlink *link) {
     struct stat about;
     size_t room = sizeof link->error;
@@ -256,9 +256,9 @@ static inline int drvlink_open(struct drvlink *link) {
         return errno == ENOENT ? 1 : -1;
     }
     if (drvlink_check(link, (size_t)about.st_size)) return -1;
-    if (!drvlink_engine_lives(link)) {
+    if (!drvlink_server_lives(link)) {
         drvlink_remove_if_dead(link);
-        return snprintf(link->error, room, "the engine of %s has died", link->name), 1;
+        return snprintf(link->error, room, "the server of %s has died", link->name), 1;
     }
     if (!drvlink_lock(link->fd, F_OFD_SETLK, 1))
         return snprintf(link->error, room, "%s has a client already", link->name), -1;
@@ -269,7 +269,7 @@ static inline int drvlink_open(struct drvlink *link) {
     return 0;
 }
 
-/* Becomes the client of the engine of that name; waits up to wait_s for it to be there. */
+/* Becomes the client of the server of that name; waits up to wait_s for it to be there. */
 static inline int drvlink_attach(struct drvlink *link, const char *name, double wait_s) {
     double until = drvlink_now() + wait_s;
     memset(link, 0, sizeof *link);

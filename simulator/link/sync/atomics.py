@@ -1,7 +1,7 @@
-"""Atomic loads, stores and fences on numpy arrays inside compiled functions, as C11 has them.
+"""C11 atomic loads, stores and fences on numpy arrays, for compiled functions (numba has none).
 
-numba has none of its own. Each is one instruction of LLVM, so it is right on every processor, also
-where the hardware itself reorders (ARM). Arrays are of integers, aligned to their item.
+Each is one LLVM instruction, so it is correct on every processor, including those that reorder
+memory accesses (ARM). Arrays are of integers, aligned to their item size.
 """
 
 from collections.abc import Callable

@@ -1,6 +1,6 @@
-"""Sleeping until a word of shared memory changes: Linux's futex, across processes.
+"""Wait until a word of shared memory changes: Linux's futex, across processes.
 
-A signal, or a change before the sleep began, ends it early: callers look again in a loop.
+A signal, or a change before the wait began, ends it early: callers check again in a loop.
 """
 
 import ctypes
@@ -11,7 +11,7 @@ from typing import Final
 from simulator.link.errors import LinkError
 
 WAIT, WAKE = 0, 1
-EVERYBODY: Final = 2**31 - 1
+ALL_WAITERS: Final = 2**31 - 1
 _NUMBERS: Final = {"x86_64": 202, "aarch64": 98, "riscv64": 98, "ppc64le": 221, "s390x": 238}
 
 
@@ -35,8 +35,8 @@ def wait(address: int, value: int, seconds: float) -> None:
 
 
 def wake(address: int) -> None:
-    """Wake all who sleep on the word at `address`."""
-    _call(address, WAKE, EVERYBODY, None)
+    """Wake all processes waiting on the word at `address`."""
+    _call(address, WAKE, ALL_WAITERS, None)
 
 
 _syscall = ctypes.CDLL(None).syscall

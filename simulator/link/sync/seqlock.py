@@ -1,13 +1,13 @@
-"""The sequence lock: a writer never waits, and a reader never takes a torn message for a whole one.
+"""A sequence lock: the writer never waits, and a reader never accepts a torn message.
 
-The sequence is odd while the writer is at work, and even, two higher, when it is done. A reader
-copies the message between two looks at the sequence and throws the copy away unless both saw the
-same even number. Orderings after Boehm, "Can seqlocks get along with programming language memory
-models?" (MSPC 2012): relaxed atomic words, a release fence behind the odd store and an acquire
-fence before the second look. Not only x86-64 is safe thereby. `c/protocol.h` does the same in C11.
+The sequence is odd during a write, and even, two higher, after it. A reader copies the message
+between two reads of the sequence and discards the copy unless both were the same even number.
+Memory orderings after Boehm, "Can seqlocks get along with programming language memory models?"
+(MSPC 2012): relaxed atomic words, a release fence after the odd store and an acquire fence before
+the second read; correct on all architectures. `c/protocol.h` is the same in C11.
 
-Arrays: `sequence` (1,) uint32 and `shared` (n,) uint64 lie in the shared memory, over each other;
-`local` (n,) uint64 is a message of our own; word 0 holds the sequence, word n-1 the checksum.
+Arrays: `sequence` (1,) uint32 and `shared` (n,) uint64 are views of the same shared memory; `local`
+(n,) uint64 is a local copy of the message; word 0 holds the sequence, word n-1 the checksum.
 `shared_image` and `local_image` (k,) uint64 belong to the same message; k may be 0.
 """
 
@@ -32,12 +32,12 @@ Sequence = NDArray[np.uint32]
 FNV_OFFSET, FNV_PRIME = np.uint64(0xCBF29CE484222325), np.uint64(0x100000001B3)
 
 NOTHING, READ, DAMAGED = 0, 1, 2
-TRIES = 100
+MAX_TRIES = 100
 
 
 @compiled
 def checksum(message: Words) -> Any:
-    """FNV-1a over words 1 to n-2; found damaged means a writer that is no such writer."""
+    """FNV-1a over words 1 to n-2; a wrong one means that the writer violates the protocol."""
     value = FNV_OFFSET
     for i in range(1, message.shape[0] - 1):
         value = (value ^ message[i]) * FNV_PRIME
@@ -48,9 +48,9 @@ def checksum(message: Words) -> Any:
 def publish(
     sequence: Sequence, shared: Words, local: Words, shared_image: Words, local_image: Words
 ) -> None:
-    """Write `local` and its picture. Only one process may, which the link's locks see to.
+    """Write `local` and its image. Only one process may write; the link's locks ensure it.
 
-    A writer that was killed half-way left an odd number: it is taken up from there.
+    A writer killed during a write leaves an odd sequence; the next one continues from it.
     """
     last = local.shape[0] - 1
     local[last] = checksum(local)
@@ -65,7 +65,7 @@ def publish(
 
 
 @compiled
-def take(
+def try_read(
     sequence: Sequence,
     shared: Words,
     local: Words,
@@ -73,12 +73,12 @@ def take(
     local_image: Words,
     seen: int,
 ) -> tuple[int, int]:
-    """Copy the message into `local` if it is whole and newer than sequence `seen`.
+    """Copy the message into `local` if it is complete and newer than sequence `seen`.
 
-    Returns (NOTHING, READ or DAMAGED, its sequence). Gives up after TRIES, so never blocks; with
-    NOTHING or DAMAGED, what `local` holds is of no use.
+    Returns (NOTHING, READ or DAMAGED; its sequence). Gives up after MAX_TRIES, so it never blocks;
+    after NOTHING or DAMAGED the contents of `local` are undefined.
     """
-    for _ in range(TRIES):
+    for _ in range(MAX_TRIES):
         begun = load_acquire(sequence, 0)
         if begun == seen:
             return NOTHING, seen
@@ -96,8 +96,9 @@ def take(
 
 
 @compiled
-def spin(sequence: Sequence, seen: int, turns: int) -> Any:
-    """Look up to `turns` times for a finished message other than `seen`; the sequence seen last."""
+def spin_until_new(sequence: Sequence, seen: int, turns: int) -> Any:
+    """Poll the sequence up to `turns` times until it is even and not `seen`; returns the last one
+    read."""
     current = load_acquire(sequence, 0)
     for _ in range(turns):
         if current != seen and not current & 1:
@@ -108,11 +109,11 @@ def spin(sequence: Sequence, seen: int, turns: int) -> Any:
 
 @compiled
 def set_word(word: Sequence, value: int) -> None:
-    """Store a single word, after all that was written before it."""
+    """Store a single word with release order: earlier writes are visible before it."""
     store_release(word, 0, np.uint32(value))
 
 
 @compiled
 def get_word(word: Sequence) -> Any:
-    """Load a single word, before all that is read after it."""
+    """Load a single word with acquire order: later reads happen after it."""
     return load_acquire(word, 0)

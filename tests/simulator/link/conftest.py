@@ -1,4 +1,4 @@
-"""Engines as processes of their own, and the C client compiled."""
+"""Servers as processes of their own, and the C client compiled."""
 
 import contextlib
 import os
@@ -19,7 +19,7 @@ SHM = Path("/dev/shm")
 Start = Callable[..., "subprocess.Popen[str]"]
 
 
-def start_engine(name: str, *options: str) -> "subprocess.Popen[str]":
+def start_server(name: str, *options: str) -> "subprocess.Popen[str]":
     command = [sys.executable, "-m", "simulator", "link", "--name", name, *options]
     return subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=os.environ
@@ -42,12 +42,12 @@ def name() -> Iterator[str]:
 
 
 @pytest.fixture
-def engine(name: str) -> Iterator[Start]:
-    """Starts engines of `name`; those still running are stopped at the end, as a user would."""
+def server(name: str) -> Iterator[Start]:
+    """Starts servers of `name`; those still running are stopped at the end, as a user would."""
     with contextlib.ExitStack() as stack:
 
         def start(*options: str) -> "subprocess.Popen[str]":
-            process = start_engine(name, *options)
+            process = start_server(name, *options)
             stack.callback(stop, process)
             return process
 
@@ -56,9 +56,9 @@ def engine(name: str) -> Iterator[Start]:
 
 @pytest.fixture(scope="session")
 def oval() -> Iterator[str]:
-    """The name of an engine in lock step on the oval, with two lanes, for many clients."""
+    """The name of a server in lock step on the oval, with two lanes, for many clients."""
     name = fresh_name()
-    process = start_engine(name, "--track", "oval", "--lanes", "2", "--seed", "7")
+    process = start_server(name, "--track", "oval", "--lanes", "2", "--seed", "7")
     yield name
     stop(process)
     assert process.returncode == 0
@@ -83,7 +83,7 @@ def compile_c(source: Path, out: Path, *options: str) -> None:
 
 
 def stop(process: "subprocess.Popen[str]") -> tuple[str, str]:
-    """Stop an engine with SIGTERM if it still runs; what it said on stdout and stderr."""
+    """Stop a server with SIGTERM if it still runs; what it said on stdout and stderr."""
     if process.poll() is None:
         process.send_signal(signal.SIGTERM)
     try:

@@ -1,4 +1,4 @@
-"""An engine in a process of its own against the same world driven in this one: bit-equal."""
+"""A server in a process of its own against the same world driven in this one: bit-equal."""
 
 import math
 import re
@@ -67,12 +67,12 @@ def test_states_are_those_of_the_world_in_this_process(oval: str) -> None:
 
 
 def test_with_traffic_and_pictures_too(
-    engine: Callable[..., "subprocess.Popen[str]"], name: str
+    server: Callable[..., "subprocess.Popen[str]"], name: str
 ) -> None:
     from simulator.camera import Camera, Light
 
     options = ("--track", "town", "--lanes", "2", "--traffic", "6", "--camera", "45x33")
-    engine(*options, "--light", "dusk", "--seed", "4", "--frequency", "10")
+    server(*options, "--light", "dusk", "--seed", "4", "--frequency", "10")
     road = Road(find_track("town"), 2)
     light = Light.named("dusk", np.random.default_rng([4, 2]))
     with (
@@ -95,7 +95,7 @@ def test_with_traffic_and_pictures_too(
             assert picture.std() > 5.0
 
 
-def test_the_engine_says_what_it_is(oval: str) -> None:
+def test_the_server_says_what_it_is(oval: str) -> None:
     road = Road(find_track("oval"), 2)
     with Link(oval, wait_s=WAIT_S) as link:
         info = link.info

@@ -10,15 +10,15 @@ from pathlib import Path
 
 import pytest
 
-from simulator.link.errors import LinkError, NameInUse, NoEngine
+from simulator.link.errors import LinkError, NameInUse, NoServer
 from simulator.link.layout import MAGIC
-from simulator.link.segment import Segment, attach, check_name, clear, create
+from simulator.link.segment import Segment, attach, check_name, create, remove_stale
 
 SIZE = 4096
 SHM = Path("/dev/shm")
 
 
-def engine_end(name: str) -> Segment:
+def server_end(name: str) -> Segment:
     """A published segment with nothing but the mark in it."""
     segment = create(name, SIZE)
     segment.memory[: len(MAGIC)] = MAGIC
@@ -51,26 +51,26 @@ def test_the_longest_name_works() -> None:
 
 
 def test_each_end_is_held_once_and_sees_the_other(name: str) -> None:
-    ours = engine_end(name)
-    assert not ours.other_end_lives()
+    ours = server_end(name)
+    assert not ours.peer_is_alive()
     with pytest.raises(NameInUse, match="is running"):
-        engine_end(name)
+        server_end(name)
     client = attach(name)
-    assert ours.other_end_lives()
-    assert client.other_end_lives()
+    assert ours.peer_is_alive()
+    assert client.peer_is_alive()
     with pytest.raises(NameInUse, match="has a client already"):
         attach(name)
     client.close()
-    assert not ours.other_end_lives()
+    assert not ours.peer_is_alive()
     again = attach(name)
     ours.close()
-    assert not again.other_end_lives()
+    assert not again.peer_is_alive()
     assert not (SHM / name[1:]).exists()
     again.close()
 
 
-def test_without_an_engine_there_is_nothing_to_attach_to(name: str) -> None:
-    with pytest.raises(NoEngine, match=f"there is no engine of the link {name}"):
+def test_without_an_server_there_is_nothing_to_attach_to(name: str) -> None:
+    with pytest.raises(NoServer, match=f"there is no server of the link {name}"):
         attach(name)
 
 
@@ -89,47 +89,47 @@ def killed_owner(name: str) -> None:
     process.stdout.close()
 
 
-def test_a_new_engine_takes_over_from_a_killed_one(name: str) -> None:
+def test_a_new_server_takes_over_from_a_killed_one(name: str) -> None:
     killed_owner(name)
     old = (SHM / name[1:]).stat().st_ino
-    ours = engine_end(name)
+    ours = server_end(name)
     assert (SHM / name[1:]).stat().st_ino != old
     assert not ours.bytes()[8:].any()
     ours.close()
 
 
-def test_a_client_that_finds_a_killed_engine_cleans_up(name: str) -> None:
+def test_a_client_that_finds_a_killed_server_cleans_up(name: str) -> None:
     killed_owner(name)
-    with pytest.raises(NoEngine, match="has died"):
+    with pytest.raises(NoServer, match="has died"):
         attach(name)
     assert not (SHM / name[1:]).exists()
 
 
 def test_nobody_sees_a_segment_before_it_is_published(name: str) -> None:
     ours = create(name, SIZE)
-    with pytest.raises(NoEngine):
+    with pytest.raises(NoServer):
         attach(name)
     ours.close()
 
 
-def test_clearing_leaves_a_living_engine_alone(name: str) -> None:
-    clear(name)
+def test_clearing_leaves_a_living_server_alone(name: str) -> None:
+    remove_stale(name)
     killed_owner(name)
-    clear(name)
+    remove_stale(name)
     assert not (SHM / name[1:]).exists()
-    ours = engine_end(name)
+    ours = server_end(name)
     with pytest.raises(NameInUse, match="is running"):
-        clear(name)
+        remove_stale(name)
     assert (SHM / name[1:]).exists()
     ours.close()
 
 
-def test_a_client_of_a_killed_engine_does_not_remove_its_successors_segment(name: str) -> None:
-    first = engine_end(name)
+def test_a_client_of_a_killed_server_does_not_remove_its_successors_segment(name: str) -> None:
+    first = server_end(name)
     client = attach(name)
     os.close(first.descriptor)  # as the kernel does at its death
     first.descriptor = -1
-    second = engine_end(name)
+    second = server_end(name)
     client.close()
     assert (SHM / name[1:]).exists()
     second.close()
@@ -138,7 +138,7 @@ def test_a_client_of_a_killed_engine_does_not_remove_its_successors_segment(name
 def test_the_memory_of_another_program_is_left_alone(name: str) -> None:
     path = SHM / name[1:]
     path.write_bytes(b"somebody else's")
-    for action in (lambda: engine_end(name), lambda: attach(name), lambda: clear(name)):
+    for action in (lambda: server_end(name), lambda: attach(name), lambda: remove_stale(name)):
         with pytest.raises(LinkError, match="is no link of this program"):
             action()
     assert path.read_bytes() == b"somebody else's"
@@ -158,7 +158,7 @@ def test_no_room_is_an_error_and_leaves_nothing(name: str) -> None:
 
 
 def test_a_forked_child_does_not_keep_our_end_alive(name: str) -> None:
-    ours = engine_end(name)
+    ours = server_end(name)
     client = attach(name)
     child = os.fork()
     if child == 0:
@@ -167,9 +167,9 @@ def test_a_forked_child_does_not_keep_our_end_alive(name: str) -> None:
     try:
         deadline = time.monotonic() + 60.0  # the child closes its copy first of all
         client.close()
-        while ours.other_end_lives() and time.monotonic() < deadline:
+        while ours.peer_is_alive() and time.monotonic() < deadline:
             time.sleep(0.01)
-        assert not ours.other_end_lives()
+        assert not ours.peer_is_alive()
     finally:
         os.kill(child, signal.SIGKILL)
         os.waitpid(child, 0)

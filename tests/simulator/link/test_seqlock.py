@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from simulator.link.sync.seqlock import DAMAGED, NOTHING, READ, checksum, publish, take
+from simulator.link.sync.seqlock import DAMAGED, NOTHING, READ, checksum, publish, try_read
 
 BENCHMARK = Path(__file__).parents[3] / "benchmarks" / "link.py"
 WORDS, PICTURE = 12, 5
@@ -32,7 +32,7 @@ class Block:
         publish(self.sequence, self.shared, self.message, self.picture, self.image)
 
     def read(self, seen: int = 0) -> tuple[int, int]:
-        return take(self.sequence, self.shared, self.copy, self.picture, self.image_copy, seen)
+        return try_read(self.sequence, self.shared, self.copy, self.picture, self.image_copy, seen)
 
 
 def test_a_message_arrives_whole_with_its_picture() -> None:
@@ -99,7 +99,7 @@ def test_no_torn_message_no_hang_and_nothing_leaked() -> None:
     done = subprocess.run(command, capture_output=True, text=True, timeout=300)
     assert done.stdout, done.stderr
     result: dict[str, Any] = json.loads(done.stdout)
-    for way in ("engine_to_client", "client_to_engine"):
+    for way in ("server_to_client", "client_to_server"):
         assert (result[way]["torn"], result[way]["damaged"]) == (0, 0)
         assert result[way]["messages"] > 100
     killed = result["killed"]

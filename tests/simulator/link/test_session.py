@@ -1,4 +1,4 @@
-"""Clients that come, leave, err and die; an engine that goes on, or ends as it is told."""
+"""Clients that come, leave, err and die; a server that goes on, or ends as it is told."""
 
 import json
 import math
@@ -19,11 +19,11 @@ from simulator.link.client import Link
 from simulator.link.command import picture_size
 from simulator.link.errors import (
     ClientLost,
-    EngineDied,
     LinkError,
     LinkTimeout,
     NameInUse,
     Refused,
+    ServerDied,
 )
 from simulator.link.layout import Mode, Refusal
 from simulator.link.process import LinkConfig, run
@@ -102,7 +102,7 @@ def test_an_unknown_request_is_answered(oval: str) -> None:
         link.reset(seed=1)
         link._outbox.record["request"] = 99
         with pytest.raises(Refused, match="the request is 99") as refusal:
-            link._ask()
+            link._request()
         assert refusal.value.code == Refusal.UNKNOWN_REQUEST
         assert link.step(Command()).step == 1
 
@@ -110,7 +110,7 @@ def test_an_unknown_request_is_answered(oval: str) -> None:
 def test_a_damaged_command_is_answered(oval: str) -> None:
     with Link(oval, wait_s=WAIT_S) as link:
         link.reset(seed=1)
-        words = link._outbox._place.arrays[1]
+        words = link._outbox._buffer.arrays[1]
         words[5] ^= 1  # as a client without the sequence lock might write now and then
         words.view("u4")[0] += 2
         deadline = time.monotonic() + WAIT_S
@@ -120,11 +120,11 @@ def test_a_damaged_command_is_answered(oval: str) -> None:
         assert link.step(Command()).step == 1
 
 
-def test_seeds_the_client_does_not_name_are_the_engines(oval: str) -> None:
+def test_seeds_the_client_does_not_name_are_the_servers(oval: str) -> None:
     with Link(oval, wait_s=WAIT_S) as link:
         first = link.reset()
         second = link.reset()
-        assert first.seed == 7 + first.episode  # the engine was started with --seed 7
+        assert first.seed == 7 + first.episode  # the server was started with --seed 7
         assert second.seed == first.seed + 1
         assert link.reset(seed=11).seed == 11
 
@@ -153,14 +153,14 @@ def test_a_closed_link_says_so(oval: str) -> None:
         link.latest()
 
 
-def test_a_second_engine_of_the_name_is_refused(oval: str) -> None:
+def test_a_second_server_of_the_name_is_refused(oval: str) -> None:
     with Link(oval, wait_s=WAIT_S):
-        done = run_engine("--name", oval, "--track", "oval")
+        done = run_server("--name", oval, "--track", "oval")
     assert done.returncode == 1
-    assert one_error(done).startswith(f"error: an engine of the link {oval} is running")
+    assert one_error(done).startswith(f"error: a server of the link {oval} is running")
 
 
-def test_quit_ends_the_engine_and_tells_what_it_did(name: str) -> None:
+def test_quit_ends_the_server_and_tells_what_it_did(name: str) -> None:
     with serving(LinkConfig(name=name, track="oval")) as served, Link(name, wait_s=WAIT_S) as link:
         link.reset(seed=1)
         for _ in range(5):
@@ -179,15 +179,15 @@ def test_quit_ends_the_engine_and_tells_what_it_did(name: str) -> None:
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_a_stopped_engine_tells_its_client_and_prints_json(
-    engine: Start, name: str, number: int
+def test_a_stopped_server_tells_its_client_and_prints_json(
+    server: Start, name: str, number: int
 ) -> None:
-    process = engine("--track", "oval", "--json")
+    process = server("--track", "oval", "--json")
     with Link(name, wait_s=WAIT_S) as link:
         link.reset(seed=1)
         process.send_signal(number)
         out, said = process.communicate(timeout=WAIT_S)
-        with pytest.raises(EngineDied, match="has ended"):
+        with pytest.raises(ServerDied, match="has ended"):
             link.step(Command())
     assert process.returncode == 0
     expected = {"clients": 1, "clients_lost": 0, "episodes": 1, "steps": 0, "refused": 0}
@@ -196,8 +196,8 @@ def test_a_stopped_engine_tells_its_client_and_prints_json(
 
 
 @pytest.mark.alone
-def test_a_stopped_process_is_given_two_seconds(engine: Start, name: str) -> None:
-    process = engine("--track", "oval")
+def test_a_stopped_process_is_given_two_seconds(server: Start, name: str) -> None:
+    process = server("--track", "oval")
     with Link(name, wait_s=WAIT_S, timeout_s=0.5) as link:
         link.reset(seed=1)
         process.send_signal(signal.SIGSTOP)
@@ -217,7 +217,7 @@ def test_once_ends_with_the_first_client(name: str) -> None:
 
 
 @pytest.mark.alone
-def test_a_client_that_dies_ends_an_engine_for_once(name: str) -> None:
+def test_a_client_that_dies_ends_an_server_for_once(name: str) -> None:
     config = LinkConfig(name=name, track="oval", once=True)
     with serving(config) as served:
         link = Link(name, wait_s=WAIT_S)
@@ -234,7 +234,7 @@ def test_a_silent_client_is_given_up(name: str) -> None:
         link.reset(seed=1)
         with pytest.raises(ClientLost, match=r"lives, but has sent nothing for 0\.3 s"):
             served.result(BOUND_S)
-        with pytest.raises(EngineDied, match="has ended"):
+        with pytest.raises(ServerDied, match="has ended"):
             link.step(Command())
 
 
@@ -310,13 +310,13 @@ def test_odd_picture_sizes(text: str) -> None:
     ],
 )
 def test_the_command_gives_one_clear_line(options: tuple[str, ...], said: str) -> None:
-    done = run_engine(*options)
+    done = run_server(*options)
     assert done.returncode == 1
     assert said in one_error(done)
 
 
 class Served:
-    """An engine in a thread of this process."""
+    """A server in a thread of this process."""
 
     def __init__(self, config: LinkConfig) -> None:
         self.said: list[str] = []
@@ -336,7 +336,7 @@ def serving(config: LinkConfig) -> Iterator[Served]:
         served._pool.shutdown(wait=True)
 
 
-def run_engine(*options: str) -> "subprocess.CompletedProcess[str]":
+def run_server(*options: str) -> "subprocess.CompletedProcess[str]":
     return typed("simulator", "link", *options)
 
 

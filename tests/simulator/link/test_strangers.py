@@ -10,12 +10,12 @@ import pytest
 
 from simulator.link import layout
 from simulator.link.client import Link
-from simulator.link.errors import LayoutMismatch, LinkError, NoEngine
-from simulator.link.handshake import EngineInfo, read_header, write_header
+from simulator.link.errors import LayoutMismatch, LinkError, NoServer
+from simulator.link.handshake import ServerInfo, read_header, write_header
 from simulator.link.layout import HEADER, Mode, segment_size
 from simulator.link.segment import Segment, create
 
-INFO = EngineInfo(
+INFO = ServerInfo(
     track="næset",
     lanes=2,
     lane_width=3.5,
@@ -83,7 +83,7 @@ def test_a_refused_client_leaves_room_for_the_next(name: str) -> None:
     for _ in range(2):
         with pytest.raises(LayoutMismatch):
             Link(name)
-    assert not segment.other_end_lives()
+    assert not segment.peer_is_alive()
     segment.close()
 
 
@@ -103,8 +103,8 @@ def test_the_c_client_knows_another_programs_memory_and_a_bad_name(
     path.unlink()
 
 
-def test_waiting_for_an_engine_has_an_end(name: str) -> None:
-    with pytest.raises(NoEngine, match="simulator link --name"):
+def test_waiting_for_an_server_has_an_end(name: str) -> None:
+    with pytest.raises(NoServer, match="simulator link --name"):
         Link(name, wait_s=0.1)
 
 
@@ -126,7 +126,7 @@ def test_an_old_program_is_told_to_be_compiled_again(
     program = tmp_path / "lap"
     command = ["gcc", "-std=c11", "-D_GNU_SOURCE", "-o", str(program), str(tmp_path / "lap.c")]
     subprocess.run([*command, "-lm"], check=True)
-    with Link(oval, wait_s=180.0):  # so that the engine is there
+    with Link(oval, wait_s=180.0):  # so that the server is there
         pass
     done = subprocess.run([str(program), oval], capture_output=True, text=True, timeout=300)
     assert done.returncode == 1
