@@ -16,7 +16,7 @@ BEAM_ANGLES: FloatArray = np.radians(np.arange(90.0, -91.0, -10.0))
 """(19,) from the left (+90 deg) to the right of the car's heading."""
 
 MOST_PIECES = 4096
-"""Pieces a beam may cross; 200 m of the finest spiral are some hundred."""
+"""Limit on the track pieces a beam may cross; 200 m of the finest spiral have some hundred."""
 
 
 @compiled
@@ -30,9 +30,8 @@ def track_beams(
     edge: float,
     distances: FloatArray,
 ) -> None:
-    """Fill `distances` (n,) m to the track's edge along `angles` from the heading; -1 off it.
-
-    `piece` is where to look for (x, y) first, -1 anywhere.
+    """Fill `distances` (n,) with m to the track's edge along `angles` from the heading; -1 off the
+    track. `piece`: the track piece at which the search for (x, y) starts, -1 if unknown.
     """
     at, _, d = locate(table, x, y, piece)
     for i in range(angles.shape[0]):
@@ -48,8 +47,8 @@ def edge_distance(
 ) -> float:
     """Distance (m) from a point on the road to where the ray leaves it; at most RANGE_M.
 
-    The ray is followed from piece to piece; in each, both edges are lines or circles, which it
-    meets at the root of a quadratic equation.
+    Follows the ray from piece to piece; in each, both edges are lines or circles, and the
+    intersection is the root of a quadratic equation.
     """
     cos_d, sin_d = math.cos(direction), math.sin(direction)
     passed, last_move = 0.0, 0
@@ -61,11 +60,11 @@ def edge_distance(
         u, v = dx * cos_h + dy * sin_h, dy * cos_h - dx * sin_h
         cu, cv = cos_d * cos_h + sin_d * sin_h, sin_d * cos_h - cos_d * sin_h
         exit_t = leaves_edges(k, u, v, cu, cv, edge, passed)
-        # A straight line turns one way only about the bend's centre: it goes through the piece
-        # forwards or backwards, and can leave at one of its ends.
+        # A straight line rotates in one direction about the bend's centre: it crosses the piece
+        # either forwards or backwards, and can leave it at one end only.
         ahead = cu * (1.0 - k * v) + cv * k * u > 0.0
         move = 1 if ahead else -1
-        # Going back and forth means that the ray lies in a kink between two pieces.
+        # A change of direction means that the ray lies in a kink between two pieces.
         if move == -last_move:
             return min(exit_t, RANGE_M)
         end_t = crosses_end(table[piece, LENGTH] if ahead else 0.0, k, u, v, cu, cv, move)
@@ -80,7 +79,7 @@ def edge_distance(
 def leaves_edges(
     k: float, u: float, v: float, cu: float, cv: float, edge: float, passed: float
 ) -> float:
-    """Where, from `passed` on, the ray leaves the road of an endless piece of curvature `k`.
+    """Ray distance (m), from `passed` on, at which the ray leaves an endless piece of curvature k.
 
     The offset d of (u, v) is the root of k d^2 - 2 d = k (u^2 + v^2) - 2 v, so that the ray's
     distance from an edge has the sign of a t^2 + 2 b t + c, free of cancellation as k goes to 0.
@@ -101,7 +100,7 @@ def leaves_edges(
 
 @compiled
 def falling_root(a: float, half_b: float, c: float, passed: float) -> float:
-    """Where a t^2 + 2 half_b t + c, positive at `passed`, next falls to 0; infinite if nowhere."""
+    """The next root t of a t^2 + 2 half_b t + c, positive at `passed`; infinite if none."""
     square = half_b * half_b - a * c
     if square < 0.0:
         return math.inf
@@ -118,7 +117,8 @@ def falling_root(a: float, half_b: float, c: float, passed: float) -> float:
 def crosses_end(
     along: float, k: float, u: float, v: float, cu: float, cv: float, move: int
 ) -> float:
-    """Where the ray crosses the normal of the centre line `along` m from the piece's start."""
+    """Ray distance (m) at which it crosses the normal of the centre line `along` m from the start
+    of the piece."""
     half_turn = 0.5 * along * k
     sin_half, cos_half = math.sin(half_turn), math.cos(half_turn)
     chord = along if half_turn == 0.0 else along * sin_half / half_turn

@@ -1,6 +1,6 @@
-"""What a sensor is: a name, a unit, a scale, how to read it off the world, and its noise.
+"""Sensors: a name, a unit, limits, a function that reads it from the world, and its noise.
 
-A sensor of your own is one line, and reads along with the others:
+A custom sensor is declared in one line and read with the others:
 
     slip = Sensor("side_slip", "rad", lambda world: atan2(world.state.vy, world.state.vx))
     suite = SensorSuite([*STANDARD, slip], seed=1)
@@ -27,7 +27,7 @@ Reading = float | NDArray[Any]
 class Sensor:
     """One declared sensor; `read` returns a number or an array of `shape` in `unit`.
 
-    Like an instrument it stops at the end of its scale: a reading beyond `limits` is the limit.
+    Readings are clipped to `limits`. Raises UserError for contradictory limits or bad noise.
     """
 
     name: str
@@ -40,8 +40,8 @@ class Sensor:
     """Least and largest reading; noise stays within them."""
 
     invalid: float | None = None
-    """A reading outside `limits` that says there is none, such as the range meter's -1 off the
-    track; neither limits nor noise touch it."""
+    """A value outside `limits` that means "no reading", such as the range meter's -1 off the track;
+    it is neither clipped nor noisy."""
 
     shape: tuple[int, ...] = ()
     """Of a reading; () is a number."""
@@ -66,7 +66,7 @@ class Sensor:
             )
 
     def measure(self, world: World, rng: np.random.Generator | None = None) -> Reading:
-        """The reading now, on the sensor's scale; noisy if `rng` is given.
+        """The present reading, clipped to the limits; noisy if `rng` is given.
 
         Raises UserError for a reading that is not of the declared shape.
         """
@@ -121,17 +121,16 @@ class SensorSuite:
         self.restart()
 
     def restart(self, seed: int | None = None) -> None:
-        """Begin the noise anew, as at construction or with another seed; call at the start of an
-        episode."""
+        """Restart the noise, with another seed if given; call at the start of an episode."""
         self._seed = self._seed if seed is None else seed
-        # One stream a sensor: adding a sensor leaves the noise of the others as it was.
+        # One random stream per sensor: adding a sensor does not change the noise of the others.
         self._rngs = [
             np.random.default_rng([self._seed, *sensor.name.encode()]) if sensor.noise else None
             for sensor in self.sensors
         ]
 
     def read(self, world: World) -> dict[str, Reading]:
-        """All readings of the present moment, by name."""
+        """All readings of the current state, by name."""
         return {
             sensor.name: sensor.measure(world, rng)
             for sensor, rng in zip(self.sensors, self._rngs, strict=True)

@@ -26,7 +26,7 @@ from trackfeatures.errors import UserError
 
 KMH = 3.6  # km/h in a m/s
 CAMERA = "camera"
-"""Name of the one sensor of the table that needs a `simulator.camera.Camera`."""
+"""Name of the camera sensor, the only one that needs a `simulator.camera.Camera`."""
 
 
 def read_track_range(world: World) -> NDArray[np.float64]:
@@ -84,13 +84,13 @@ STANDARD: tuple[Sensor, ...] = (
     wheel_meter("wheel_spin_rear_left", 2),
     wheel_meter("wheel_spin_rear_right", 3),
 )
-"""All of the paper's table but the camera, for which see `camera_sensor`."""
+"""The sensors of the paper's table, except the camera (see `camera_sensor`)."""
 
 
 def camera_sensor(camera: Any, view: str = "front") -> Sensor:
-    """The image (H, W, 3) uint8 of a `simulator.camera.Camera`, the table's last line.
+    """A sensor of the image (H, W, 3) uint8 of a `simulator.camera.Camera`.
 
-    Its name is `camera`, for another view than the driver's `camera_VIEW`.
+    Its name is `camera`, or `camera_VIEW` for a view other than the driver's.
     """
 
     def read(world: World) -> NDArray[np.uint8]:
@@ -103,7 +103,7 @@ def camera_sensor(camera: Any, view: str = "front") -> Sensor:
 def picture_sensor(
     name: str, read: Callable[[World], NDArray[np.uint8]], shape: tuple[int, int, int]
 ) -> Sensor:
-    """A sensor of pictures of `shape` with grey levels 0 to 255."""
+    """A sensor of uint8 images of `shape`."""
     return Sensor(name, "-", read, limits=(0.0, 255.0), shape=shape, dtype="uint8")
 
 

@@ -1,0 +1,1 @@
+"""Traffic cars: intelligent driver model, lane changes, wrecks."""

@@ -1,0 +1,1 @@
+"""The ego car: parameters, tyre and wheel forces, powertrain, rigid-body motion, state."""

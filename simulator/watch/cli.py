@@ -25,8 +25,8 @@ def watch(
 ) -> None:
     """Watch a live drive in the browser, and take the wheel with the arrow keys.
 
-    Pictures from several views, the plan of the track, and the sensors. The first line on stderr
-    says where; no display is needed here. Ctrl-C ends it.
+    Shows several camera views, the plan of the track and the sensors. The first line on stderr is
+    the address; this machine needs no display. Ctrl-C ends it.
     """
     from simulator.watch.command import WatchConfig
     from simulator.watch.command import watch as run

@@ -1,4 +1,4 @@
-"""`simulator watch`: checks what it is asked to do, then drives and serves until Ctrl-C.
+"""Runs `simulator watch`: checks the options, then drives and serves until Ctrl-C.
 
 simulator watch --track coast --lanes 2 --traffic 6 --port 8765
 """
@@ -25,7 +25,7 @@ FREQUENCY_HZ: Final = 20
 
 @dataclass(frozen=True)
 class WatchConfig:
-    """What `simulator watch` is asked to do."""
+    """The options of `simulator watch`."""
 
     track: str = "circuit"
     lanes: int = 1
@@ -35,7 +35,7 @@ class WatchConfig:
     port: int = 8765
     """0: any free one; the first line says which."""
     speed: float = 1.0
-    """Simulated seconds a second of the clock."""
+    """Simulated seconds per second of wall-clock time."""
     seed: int = 0
     tracks_dir: Path | None = None
 
@@ -77,8 +77,11 @@ def _drive(road: Road, config: WatchConfig, listener: socket.socket) -> None:
 
 @contextmanager
 def _interrupts() -> Iterator[Callable[[], bool]]:
-    """Whether Ctrl-C was pressed. Raised where it strikes, KeyboardInterrupt can be lost: in a
-    callback or a finaliser Python only reports it. A second one is raised all the same."""
+    """A function that returns whether Ctrl-C was pressed.
+
+    A KeyboardInterrupt raised inside a callback or finaliser would only be printed and lost. A
+    second Ctrl-C is raised as usual.
+    """
     seen: list[int] = []
 
     def note(number: int, _frame: FrameType | None) -> None:

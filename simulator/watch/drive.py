@@ -1,4 +1,4 @@
-"""The drive that `simulator watch` shows: a built-in driver, or whoever holds the keys."""
+"""The drive that `simulator watch` shows: by the built-in driver, or by a browser's keys."""
 
 import time
 from typing import Final
@@ -10,24 +10,24 @@ from simulator.watch.hub import Browser, Hub
 from simulator.watch.keyboard import Keyboard
 from simulator.watch.messages import scene_message, state_message
 from simulator.watch.pace import Pacer, Rate
-from simulator.watch.pictures import Pictures
-from simulator.watch.requests import Order
+from simulator.watch.pictures import JpegRenderer
+from simulator.watch.requests import BrowserRequest
 from simulator.watch.score import Score
 from simulator.watch.server import FIRST_VIEW
 from simulator.world.world import World
 
 SHOW_S: Final = 1.0 / 26.0
-"""A browser is shown something new at most this often (s of the clock)."""
-STALEST_S: Final = 0.25
-"""Pictures are left out when the drive is late, but no longer than this."""
+"""Least interval between updates of the browsers (s of wall-clock time)."""
+MAX_IMAGE_AGE_S: Final = 0.25
+"""Images are skipped while the drive is late, but for no longer than this."""
 ENDED_S: Final = 2.0
 """How long the end of an episode is shown before the next begins."""
 
 
 class Drive:
-    """One endless drive in `world`; what browsers ask of it comes through `hub`.
+    """A drive in `world` without end; requests of browsers come through `hub`.
 
-    Raises NoRendererError at once where nothing can draw.
+    Raises NoRendererError if there is no renderer.
     """
 
     def __init__(
@@ -43,19 +43,19 @@ class Drive:
         self._holder: Browser | None = None
         self._score = Score()
         self._rate, self._shown = Rate(), Rate()
-        self._pictures = Pictures(world.road, light, seed)
+        self._renderer = JpegRenderer(world.road, light, seed)
         self._seed, self._number = seed, 0
         self._ended_at: float | None = None
         self._last_show = self._last_picture = 0.0
         self._taken: set[str] = set()
-        """Views of which there is a picture of the present state."""
+        """Views already rendered for the current state."""
         self._scene = scene_message(world.road, controls=True)
         self._warm_up()
         self._start()
 
     def advance(self) -> None:
-        """One control step, what browsers want to see of it, and the wait until it is due."""
-        self._obey()
+        """Do one control step, publish it to the browsers, and wait until the next is due."""
+        self._handle_requests()
         if self._ended_at is not None:
             if time.monotonic() - self._ended_at > ENDED_S:
                 self._start()
@@ -65,11 +65,11 @@ class Drive:
         self._pacer.wait()
 
     def close(self) -> None:
-        self._pictures.close()
+        self._renderer.close()
 
     def _warm_up(self) -> None:
-        """Compile and build what is used first, before anybody waits for it: seconds, more where
-        nothing is cached. Leaves no trace in the drive."""
+        """Compile and build everything before a browser waits for it; takes seconds, more with an
+        empty cache. Does not change the drive."""
         self.world.reset(seed=self._seed)
         for command in (
             self._cruise.command(self.world.state, self.world.traffic),
@@ -77,10 +77,10 @@ class Drive:
         ):
             self.world.step(command)
         state_message(self.world)
-        self._pictures.take(self.world, [FIRST_VIEW])
+        self._renderer.render(self.world, [FIRST_VIEW])
 
     def _start(self) -> None:
-        """The next episode: another seed, so other traffic."""
+        """Start the next episode, with another seed and so other traffic."""
         road = self.world.road
         lane = tf.lane_centre(road.lanes - 1, road.lanes, road.lane_width)
         self.world.reset(seed=self._seed, to_middle=lane)
@@ -103,34 +103,34 @@ class Drive:
             return self._keyboard.command(state)
         return self._cruise.command(state, self.world.traffic)
 
-    def _obey(self) -> None:
-        orders, left = self.hub.take_orders()
-        for browser, order in orders:
-            self._follow(browser, order)
+    def _handle_requests(self) -> None:
+        requests, left = self.hub.take_requests()
+        for browser, request in requests:
+            self._handle_request(browser, request)
         if self._holder in left:
-            self._give_back()
+            self._release_controls()
 
-    def _follow(self, browser: Browser, order: Order) -> None:
-        if order.kind == "keys" and isinstance(order.value, frozenset):
-            if order.value:
+    def _handle_request(self, browser: Browser, request: BrowserRequest) -> None:
+        if request.kind == "keys" and isinstance(request.value, frozenset):
+            if request.value:
                 self.driver, self._holder = "keyboard", browser
             if browser is self._holder:
-                self._keyboard.hold(order.value)
-        elif order.kind == "driver":
-            if order.value == "keyboard":
+                self._keyboard.hold(request.value)
+        elif request.kind == "driver":
+            if request.value == "keyboard":
                 self.driver, self._holder = "keyboard", browser
             else:
-                self._give_back()
-        elif order.kind == "pause":
-            self.paused = bool(order.value)
-        elif order.kind == "reset":
+                self._release_controls()
+        elif request.kind == "pause":
+            self.paused = bool(request.value)
+        elif request.kind == "reset":
             self._start()
-        elif order.kind == "light":
-            self._pictures.set_light(str(order.value))
+        elif request.kind == "light":
+            self._renderer.set_light(str(request.value))
             self._taken.clear()
 
-    def _give_back(self) -> None:
-        """The built-in driver goes on, in the lane where the car is."""
+    def _release_controls(self) -> None:
+        """Return control to the built-in driver, in the car's present lane."""
         self.driver, self._holder = "built-in", None
         self._keyboard.release()
         self._cruise.take_over()
@@ -142,8 +142,8 @@ class Drive:
             return
         self._last_show = now
         pictures: dict[str, bytes] = {}
-        if views and (not self._pacer.late or now - self._last_picture > STALEST_S):
-            pictures = self._pictures.take(self.world, views)
+        if views and (not self._pacer.late or now - self._last_picture > MAX_IMAGE_AGE_S):
+            pictures = self._renderer.render(self.world, views)
             self._taken.update(views)
             self._last_picture = now
             self._shown.add(1.0)
@@ -154,7 +154,7 @@ class Drive:
             **self._score.as_dict(),
             paused=self.paused,
             driver=self.driver,
-            light=self._pictures.light,
+            light=self._renderer.light,
             rate=0.0 if self.paused else round(self._rate.value, 2),
             asked_rate=self._speed,
             pictures_per_s=round(self._shown.value, 1),

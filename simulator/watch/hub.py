@@ -1,31 +1,31 @@
-"""Where a drive leaves its newest state and pictures, and browsers pick them up.
+"""Exchange between a drive (one thread) and its browsers (the server's event loop).
 
-The drive (one thread) never waits: what a browser did not fetch in time is replaced by what is
-newer. Browsers live in the server's event loop and are woken when something new is there.
+The drive never waits: a state or image that a browser has not fetched is replaced by the next.
+Browsers are woken when there is a new state.
 """
 
 import asyncio
 import threading
 from dataclasses import dataclass, field
 
-from simulator.watch.requests import Order
+from simulator.watch.requests import BrowserRequest
 
-MOST_BROWSERS = 16
-MOST_ORDERS = 256
-IN_FLIGHT = 2
-"""Messages a browser may owe an answer to; on a slow line the next one then is a new one."""
+MAX_BROWSERS = 16
+MAX_REQUESTS = 256
+MAX_UNANSWERED = 2
+"""Most unanswered messages per browser; on a slow connection older states are then skipped."""
 
 
 @dataclass(frozen=True)
-class Newest:
-    """What there is to show: the state as JSON, and of each view the last picture (JPEG)."""
+class Snapshot:
+    """The latest state as JSON, and the last image (JPEG) of each view."""
 
     number: int
     scene: str
-    """What does not change while one road is driven, as JSON."""
+    """The constant data of one road, as JSON."""
     state: str
     pictures: dict[str, tuple[int, bytes]]
-    """By view, with the number of the state it was taken at."""
+    """By view: the number of the state it shows, and the JPEG."""
 
 
 @dataclass(eq=False)
@@ -49,26 +49,26 @@ class Hub:
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._browsers: set[Browser] = set()
-        self._orders: list[tuple[Browser, Order]] = []
+        self._requests: list[tuple[Browser, BrowserRequest]] = []
         self._left: list[Browser] = []
         self._loop: asyncio.AbstractEventLoop | None = None
-        self.newest: Newest | None = None
+        self.latest: Snapshot | None = None
 
-    # The drive's side.
+    # Called by the drive.
 
     def publish(self, number: int, scene: str, state: str, pictures: dict[str, bytes]) -> None:
-        """Replace what there is to show; `pictures` holds those that are new."""
+        """Publish a state; `pictures` holds the views rendered for it."""
         with self._lock:
-            before = self.newest
+            before = self.latest
             kept = before.pictures if before is not None and before.scene is scene else {}
             new = {view: (number, picture) for view, picture in pictures.items()}
-            self.newest = Newest(number, scene, state, {**kept, **new})
+            self.latest = Snapshot(number, scene, state, {**kept, **new})
             loop = self._loop
         if loop is not None and self._browsers:
             self._call(loop)
 
     def wanted_views(self) -> tuple[str, ...]:
-        """The views that browsers look at, each once."""
+        """The views that browsers show, each once."""
         with self._lock:
             return tuple(dict.fromkeys(browser.view for browser in self._browsers))
 
@@ -77,20 +77,20 @@ class Hub:
         """How many browsers are connected."""
         return len(self._browsers)
 
-    def take_orders(self) -> tuple[list[tuple[Browser, Order]], list[Browser]]:
-        """What browsers ask for since the last call, and which of them left."""
+    def take_requests(self) -> tuple[list[tuple[Browser, BrowserRequest]], list[Browser]]:
+        """The requests since the last call, and the browsers that have disconnected."""
         with self._lock:
-            orders, left = self._orders, self._left
-            self._orders, self._left = [], []
-        return orders, left
+            requests, left = self._requests, self._left
+            self._requests, self._left = [], []
+        return requests, left
 
-    # The server's side, in its event loop.
+    # Called by the server, in its event loop.
 
     def join(self, view: str) -> Browser | None:
-        """A new browser; None when there are too many."""
+        """Register a new browser; None if there are too many."""
         with self._lock:
             self._loop = asyncio.get_running_loop()
-            if len(self._browsers) >= MOST_BROWSERS:
+            if len(self._browsers) >= MAX_BROWSERS:
                 return None
             browser = Browser(view)
             self._browsers.add(browser)
@@ -102,11 +102,11 @@ class Hub:
             self._browsers.discard(browser)
             self._left.append(browser)
 
-    def order(self, browser: Browser, order: Order) -> None:
-        """Pass on what a browser asks for; the oldest is lost when nobody takes them."""
+    def submit(self, browser: Browser, request: BrowserRequest) -> None:
+        """Queue a browser's request for the drive; beyond MAX_REQUESTS the oldest are dropped."""
         with self._lock:
-            self._orders.append((browser, order))
-            del self._orders[:-MOST_ORDERS]
+            self._requests.append((browser, request))
+            del self._requests[:-MAX_REQUESTS]
 
     def _call(self, loop: asyncio.AbstractEventLoop) -> None:
         try:

@@ -1,4 +1,4 @@
-"""Driving with four keys: left and right steer, up accelerates, down brakes."""
+"""Keyboard driving with four keys: left and right steer, up accelerates, down brakes."""
 
 import time
 from collections.abc import Callable
@@ -10,16 +10,16 @@ from simulator.vehicle.car import CarParameters
 from simulator.vehicle.state import CarState, Command
 
 HELD_S: Final = 0.7
-"""A browser repeats the keys that are held; from a silent one none is."""
-SIDE_ACCELERATION: Final = 6.0  # m/s2 that a held key asks for
-MOST_STEER: Final = 0.7
+"""Time after which keys count as released, unless the browser repeats them."""
+LATERAL_ACCELERATION: Final = 6.0  # m/s2 that a held key asks for
+MAX_STEER: Final = 0.7
 STEER_RATE: Final = 2.0  # 1/s
-FASTEST: Final = 45.0  # m/s
+MAX_SPEED: Final = 45.0  # m/s
 FORWARD, BACK, COAST = 3.0, -7.0, -0.6  # m/s2
 
 
 class Keyboard:
-    """Turns the keys held down into commands, smoothly, at any speed."""
+    """Converts the keys held down into smooth commands, at any speed."""
 
     def __init__(
         self, road: Road, frequency_hz: int, clock: Callable[[], float] = time.monotonic
@@ -32,14 +32,14 @@ class Keyboard:
         self.release()
 
     def release(self) -> None:
-        """No key is held, and the wheel stands straight."""
+        """Release all keys and centre the steering."""
         self._keys: frozenset[str] = frozenset()
         self._until = 0.0
         self._steer = 0.0
         self._pedals.reset()
 
     def hold(self, keys: frozenset[str]) -> None:
-        """These keys are down now."""
+        """Set the keys that are held down."""
         self._keys, self._until = keys, self._clock() + HELD_S
 
     def command(self, state: CarState) -> Command:
@@ -51,7 +51,7 @@ class Keyboard:
         speed = max(state.speed, 0.0)
         if "down" in keys:
             acceleration = BACK if speed > 0.5 else -1.0
-        elif "up" in keys and speed < FASTEST:
+        elif "up" in keys and speed < MAX_SPEED:
             acceleration = FORWARD
         else:
             acceleration = COAST if speed > 0.5 else -1.0
@@ -60,7 +60,7 @@ class Keyboard:
         return Command(self._steer, throttle, brake, gear)
 
     def _reach(self, speed: float) -> float:
-        """How far a held key steers: less at speed, by the sideways acceleration it brings."""
+        """Steering of a held key: limited by LATERAL_ACCELERATION, so less at higher speed."""
         car = self._car
-        wheel = SIDE_ACCELERATION * car.wheelbase / max(speed * speed, 1.0)
-        return min(wheel / car.steering_lock, MOST_STEER)
+        wheel = LATERAL_ACCELERATION * car.wheelbase / max(speed * speed, 1.0)
+        return min(wheel / car.steering_lock, MAX_STEER)

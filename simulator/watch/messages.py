@@ -1,5 +1,5 @@
-"""What a browser is told: the scene once, the state with every picture. JSON, SI units unless the
-name says otherwise; angles counter-clockwise but for `angle`, which is DESIGN's."""
+"""Messages to a browser: the scene once, the state with every image. JSON, SI units unless the name
+says otherwise; angles counter-clockwise except `angle`, which is track tangent minus yaw."""
 
 import json
 import math
@@ -16,13 +16,13 @@ from simulator.vehicle.state import CarState
 from simulator.world.world import World
 
 STATION_M: Final = 3.0
-MOST_STATIONS: Final = 6000
+MAX_STATIONS: Final = 6000
 
 
 def scene_message(road: Road, *, controls: bool) -> str:
-    """What stays while one road is driven; `controls`: whether a browser may drive and pause."""
+    """The constant data of one road; `controls`: whether a browser may drive and pause."""
     track = road.track
-    count = min(math.ceil(track.length_m / STATION_M), MOST_STATIONS)
+    count = min(math.ceil(track.length_m / STATION_M), MAX_STATIONS)
     pose = track.at(np.arange(count) * track.length_m / count)
     scene = {
         "type": "scene",
@@ -47,7 +47,7 @@ def scene_message(road: Road, *, controls: bool) -> str:
 
 
 def state_message(world: World, **about: Any) -> str:
-    """The car and what is around it now; `about` is what the drive adds (score, rate, ...)."""
+    """The car and its surroundings; `about` holds the drive's own values (score, rate, ...)."""
     now = world.state
     features = world.features()
     state = {

@@ -1,4 +1,4 @@
-"""Keeping simulated time level with the clock, and saying honestly how well that works."""
+"""Pacing of simulated time by the wall clock, and measurement of the rate reached."""
 
 import time
 from collections import deque
@@ -8,14 +8,14 @@ from typing import Final
 from trackfeatures.errors import UserError
 
 SPEEDS: Final = (0.05, 100.0)
-FORGIVEN_S: Final = 0.25
-"""Farther behind than this, a drive does not race to catch up."""
+MAX_CATCH_UP_S: Final = 0.25
+"""A delay longer than this is not made up."""
 WINDOW_S: Final = 1.5
 """Time over which a rate is measured."""
 
 
 def check_speed(speed: float) -> None:
-    """Raises UserError for a speed (times real time) that is none."""
+    """Raises UserError for a speed (times real time) out of range."""
     if not SPEEDS[0] <= speed <= SPEEDS[1]:
         raise UserError(
             f"a speed of {speed:g} times real time was asked for; it must be "
@@ -24,7 +24,7 @@ def check_speed(speed: float) -> None:
 
 
 class Rate:
-    """How much of something there was a second of the clock, lately."""
+    """Amount per second of wall-clock time, over the last WINDOW_S."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
@@ -32,7 +32,7 @@ class Rate:
         self._sum = 0.0
 
     def add(self, amount: float) -> None:
-        """Something happened now."""
+        """Add an amount at the present time."""
         now = self._clock()
         self._sum += amount
         self._marks.append((now, self._sum))
@@ -41,7 +41,7 @@ class Rate:
 
     @property
     def value(self) -> float:
-        """A second of the clock; 0 while there is nothing to measure."""
+        """Amount per second; 0 while there is too little data."""
         if len(self._marks) < 2:
             return 0.0
         first, before = self._marks[0]
@@ -50,7 +50,7 @@ class Rate:
 
 
 class Pacer:
-    """Lets one step of `step_s` simulated seconds pass every `step_s / speed` of the clock."""
+    """Paces steps of `step_s` simulated seconds to one per `step_s / speed` wall-clock s."""
 
     def __init__(
         self,
@@ -67,7 +67,7 @@ class Pacer:
 
     @property
     def late(self) -> bool:
-        """Whether the next step is overdue: no time for what can be left out."""
+        """Whether the next step is overdue, so that optional work should be skipped."""
         return self._clock() > self._due
 
     def wait(self) -> None:
@@ -75,6 +75,6 @@ class Pacer:
         ahead = self._due - self._clock()
         if ahead > 0.0:
             self._sleep(ahead)
-        elif ahead < -FORGIVEN_S:
+        elif ahead < -MAX_CATCH_UP_S:
             self._due = self._clock()
         self._due += self._interval

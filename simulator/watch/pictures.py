@@ -1,4 +1,4 @@
-"""Pictures of a watched world as JPEG, in any light; the scene is built when first wanted."""
+"""JPEG images of a watched world, in any light; the scene is built on first use."""
 
 from collections.abc import Sequence
 from typing import Final
@@ -16,8 +16,8 @@ SIZE: Final = (560, 420)
 QUALITY: Final = 82
 
 
-class Pictures:
-    """Takes pictures of worlds on one road; call from one thread."""
+class JpegRenderer:
+    """Renders worlds on one road as JPEG images; call from one thread."""
 
     def __init__(self, road: Road, light: str, seed: int = 0) -> None:
         check_light(light)
@@ -26,7 +26,7 @@ class Pictures:
         self._camera: Camera | None = None
 
     def set_light(self, light: str) -> None:
-        """From the next picture on."""
+        """Set the light from the next image on. Raises UserError for an unknown light."""
         check_light(light)
         if light != self.light:
             self.light = light
@@ -41,7 +41,7 @@ class Pictures:
             self._camera = Camera(self.road, camera, seed=self._seed, light=light)
         return self._camera
 
-    def take(self, world: World, views: Sequence[str]) -> dict[str, bytes]:
+    def render(self, world: World, views: Sequence[str]) -> dict[str, bytes]:
         """JPEGs of `world` now, by view."""
         if not views:
             return {}

@@ -5,7 +5,7 @@ from simulator.world.world import World
 
 
 class Score:
-    """Sums the reward over an episode; a time that runs backwards is a new one."""
+    """Sums the reward over an episode; a decrease of the time starts a new episode."""
 
     def __init__(self) -> None:
         self.episode = 0

@@ -16,8 +16,8 @@ import uvicorn
 from fastapi import FastAPI, WebSocket, WebSocketDisconnect
 from fastapi.responses import HTMLResponse, Response
 
-from simulator.watch.hub import IN_FLIGHT, Browser, Hub
-from simulator.watch.requests import BadOrder, parse
+from simulator.watch.hub import MAX_UNANSWERED, Browser, Hub
+from simulator.watch.requests import BadRequest, parse
 from trackfeatures.errors import UserError
 
 PAGE: Final = Path(__file__).parent / "page.html"
@@ -68,23 +68,23 @@ def create_app(hub: Hub) -> FastAPI:
 
 
 async def _send(connection: WebSocket, hub: Hub, browser: Browser) -> None:
-    """Send what is newest whenever the browser has shown what it got before."""
+    """Send the latest state and image whenever the browser has answered the one before."""
     while True:
         await browser.changed.wait()
         browser.changed.clear()
-        newest = hub.newest
-        if newest is None or browser.pending >= IN_FLIGHT:
+        latest = hub.latest
+        if latest is None or browser.pending >= MAX_UNANSWERED:
             continue
-        if newest.scene is not browser.scene:
-            browser.scene = newest.scene
-            await connection.send_text(newest.scene)
-        taken, picture = newest.pictures.get(browser.view, (0, b""))
+        if latest.scene is not browser.scene:
+            browser.scene = latest.scene
+            await connection.send_text(latest.scene)
+        taken, picture = latest.pictures.get(browser.view, (0, b""))
         fresh = picture != b"" and (browser.view, taken) != browser.picture
-        if newest.number == browser.sent and not fresh:
+        if latest.number == browser.sent and not fresh:
             continue
-        browser.sent = newest.number
+        browser.sent = latest.number
         browser.pending += 1
-        await connection.send_text(newest.state)
+        await connection.send_text(latest.state)
         if fresh:
             browser.picture = (browser.view, taken)
             await connection.send_bytes(picture)
@@ -93,20 +93,20 @@ async def _send(connection: WebSocket, hub: Hub, browser: Browser) -> None:
 async def _receive(connection: WebSocket, hub: Hub, browser: Browser) -> None:
     while True:
         try:
-            order = parse(await connection.receive_text())
+            request = parse(await connection.receive_text())
         except (WebSocketDisconnect, RuntimeError):
             return
-        except (BadOrder, KeyError) as error:  # KeyError: bytes where text was expected
+        except (BadRequest, KeyError) as error:  # KeyError: bytes where text was expected
             await connection.close(POLICY_VIOLATION, str(error)[:120])
             return
-        if order.kind == "got":
-            browser.pending = 0 if order.value == browser.sent else max(browser.pending - 1, 0)
+        if request.kind == "got":
+            browser.pending = 0 if request.value == browser.sent else max(browser.pending - 1, 0)
             browser.changed.set()
-        elif order.kind == "view":
-            browser.view = str(order.value)
+        elif request.kind == "view":
+            browser.view = str(request.value)
             browser.changed.set()
         else:
-            hub.order(browser, order)
+            hub.submit(browser, request)
 
 
 def _own_page(connection: WebSocket) -> bool:

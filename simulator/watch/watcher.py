@@ -1,4 +1,4 @@
-"""Watch any drive of your own in the browser, such as an agent in training."""
+"""Shows a drive of the user's own program in the browser, such as an agent in training."""
 
 import sys
 import time
@@ -10,14 +10,14 @@ from simulator.track.road import Road
 from simulator.watch.hub import Hub
 from simulator.watch.messages import scene_message, state_message
 from simulator.watch.pace import Pacer, Rate
-from simulator.watch.pictures import Pictures
+from simulator.watch.pictures import JpegRenderer
 from simulator.watch.score import Score
 from simulator.watch.server import Server
 from simulator.world.world import World
 from trackfeatures.errors import UserError
 
 SHOW_S: Final = 1.0 / 20.0
-"""Browsers are shown something new at most this often (s of the clock)."""
+"""Least interval between updates of the browsers (s of wall-clock time)."""
 
 
 class Watcher:
@@ -43,7 +43,7 @@ class Watcher:
         self._light, self._speed = light, speed
         self._score, self._rate, self._shown = Score(), Rate(), Rate()
         self._road: Road | None = None
-        self._pictures: Pictures | None = None
+        self._renderer: JpegRenderer | None = None
         self._pacer: Pacer | None = None
         self._number, self._last_show, self._scene = 0, 0.0, ""
         self._server = Server(self._hub, listener)
@@ -61,7 +61,7 @@ class Watcher:
             self._change_road(world)
         passed = self._score.count(world)
         self._rate.add(passed)
-        self._obey()
+        self._handle_requests()
         now = time.monotonic()
         if self._hub.watching and now - self._last_show >= SHOW_S:
             self._last_show = now
@@ -72,8 +72,8 @@ class Watcher:
     def close(self) -> None:
         """End the server; browsers say that the drive is over."""
         self._server.stop()
-        if self._pictures is not None:
-            self._pictures.close()
+        if self._renderer is not None:
+            self._renderer.close()
 
     def __enter__(self) -> Self:
         return self
@@ -87,25 +87,25 @@ class Watcher:
         self.close()
 
     def _change_road(self, world: World) -> None:
-        if self._pictures is not None:
-            self._pictures.close()
+        if self._renderer is not None:
+            self._renderer.close()
         self._road = world.road
-        self._pictures = Pictures(world.road, self._light)
+        self._renderer = JpegRenderer(world.road, self._light)
         self._scene = scene_message(world.road, controls=False)
         if self._speed is not None:
             self._pacer = Pacer(1.0 / world.frequency_hz, self._speed)
 
-    def _obey(self) -> None:
-        """Of what a browser may ask, only the light is ours to change; the drive is not."""
-        orders, _ = self._hub.take_orders()
-        for _, order in orders:
-            if order.kind == "light" and self._pictures is not None:
-                self._light = str(order.value)
-                self._pictures.set_light(self._light)
+    def _handle_requests(self) -> None:
+        """Handle requests for another light; all others would change the drive and are ignored."""
+        requests, _ = self._hub.take_requests()
+        for _, request in requests:
+            if request.kind == "light" and self._renderer is not None:
+                self._light = str(request.value)
+                self._renderer.set_light(self._light)
 
     def _show(self, world: World) -> None:
-        assert self._pictures is not None
-        pictures = self._pictures.take(world, self._hub.wanted_views())
+        assert self._renderer is not None
+        pictures = self._renderer.render(world, self._hub.wanted_views())
         self._shown.add(1.0)
         self._number += 1
         state = state_message(

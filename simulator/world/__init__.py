@@ -1,0 +1,1 @@
+"""The simulated world: ego car, walls, traffic and contact physics."""

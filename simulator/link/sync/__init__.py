@@ -1,0 +1,1 @@
+"""Synchronisation in shared memory: sequence lock, atomics, futex."""

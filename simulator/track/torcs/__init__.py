@@ -1,0 +1,1 @@
+"""Import of TORCS track files (XML)."""

@@ -20,7 +20,7 @@ MAX_PIECES: Final = 200_000
 def read_torcs(path: Path) -> Track:
     """The track of one TORCS XML file, named after the file.
 
-    Raises TrackError for a file that is unreadable or hostile (see `parameter_file`), for lengths
+    Raises TrackError for a file that is unreadable or unsafe (see `torcs_xml`), for lengths
     that are not positive, and for segments that do not close (see `pieces.MAX_GAP_M`).
     """
     root = read_parameter_file(path)

@@ -101,7 +101,7 @@ def test_gcc_lays_every_field_where_the_tables_say(tmp_path: Path) -> None:
     assert printed.splitlines() == expected
 
 
-def test_a_header_that_lies_about_a_place_does_not_compile(tmp_path: Path) -> None:
+def test_a_header_with_a_wrong_offset_does_not_compile(tmp_path: Path) -> None:
     if shutil.which("gcc") is None:
         pytest.skip("no gcc on this machine")
     lying = c_header().replace("double ranges[19];", "double ranges[18];")
@@ -113,7 +113,7 @@ def test_a_header_that_lies_about_a_place_does_not_compile(tmp_path: Path) -> No
     assert "offsetof(struct drvlink_state, ranges_traffic) == " in done.stderr
 
 
-def test_the_header_serves_cpp_too(tmp_path: Path) -> None:
+def test_the_header_compiles_as_cpp(tmp_path: Path) -> None:
     if shutil.which("g++") is None:
         pytest.skip("no g++ on this machine")
     source = tmp_path / "use.cpp"

@@ -35,7 +35,7 @@ class Block:
         return try_read(self.sequence, self.shared, self.copy, self.picture, self.image_copy, seen)
 
 
-def test_a_message_arrives_whole_with_its_picture() -> None:
+def test_a_message_is_read_complete_with_its_image() -> None:
     block = Block()
     block.write(7)
     assert block.read() == (READ, 2)
@@ -46,14 +46,14 @@ def test_a_message_arrives_whole_with_its_picture() -> None:
     assert block.read(seen=2) == (READ, 4)
 
 
-def test_nothing_is_taken_while_the_writer_is_at_work() -> None:
+def test_nothing_is_read_during_a_write() -> None:
     block = Block()
     block.write(7)
     block.sequence[0] += 1
     assert block.read() == (NOTHING, 0)
 
 
-def test_a_writer_goes_on_where_a_killed_one_stopped() -> None:
+def test_a_writer_continues_after_a_killed_one() -> None:
     block = Block()
     block.write(7)
     block.sequence[0] += 1

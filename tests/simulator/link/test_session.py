@@ -17,6 +17,7 @@ import pytest
 
 from simulator.link.client import Link
 from simulator.link.command import picture_size
+from simulator.link.config import LinkConfig
 from simulator.link.errors import (
     ClientLost,
     LinkError,
@@ -26,7 +27,7 @@ from simulator.link.errors import (
     ServerDied,
 )
 from simulator.link.layout import Mode, Refusal
-from simulator.link.process import LinkConfig, run
+from simulator.link.process import run
 from simulator.link.server import Summary
 from simulator.vehicle.state import Command
 from tests.typed import typed
@@ -143,7 +144,7 @@ def test_an_episode_ends_with_its_client(oval: str) -> None:
         link.step(Command())
 
 
-def test_a_closed_link_says_so(oval: str) -> None:
+def test_a_closed_link_raises(oval: str) -> None:
     link = Link(oval, wait_s=WAIT_S)
     link.close()
     link.close()
@@ -288,13 +289,13 @@ def test_without_a_command_the_real_car_stands(name: str) -> None:
     ],
     ids=str,
 )
-def test_what_cannot_be_is_said(name: str, options: dict[str, Any], said: str) -> None:
+def test_bad_server_options_are_refused(name: str, options: dict[str, Any], said: str) -> None:
     with pytest.raises(UserError, match=said):
         run(LinkConfig(**{"name": name, **options}), lambda text: None)
 
 
 @pytest.mark.parametrize("text", ["280", "0x10", "10x0", "ax10", "10x10x3", "-3x4", ""])
-def test_odd_picture_sizes(text: str) -> None:
+def test_bad_image_sizes_are_refused(text: str) -> None:
     with pytest.raises(UserError, match="give a size such as 280x210, or none"):
         picture_size(text)
     assert (picture_size("280x210"), picture_size("none")) == ((280, 210), (0, 0))
@@ -309,7 +310,11 @@ def test_odd_picture_sizes(text: str) -> None:
         (("--header", "/no/such/folder/x.h"), "/no/such/folder"),
     ],
 )
+<<<<<<< HEAD
 def test_the_command_gives_one_clear_line(options: tuple[str, ...], said: str) -> None:
+=======
+def test_errors_of_the_command_are_one_line(options: tuple[str, ...], said: str) -> None:
+>>>>>>> e329f5ccb956c02a9c26d50a49a7dc68f2422723
     done = run_server(*options)
     assert done.returncode == 1
     assert said in one_error(done)

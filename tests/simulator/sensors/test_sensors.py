@@ -41,7 +41,7 @@ def test_range_beams_agree_with_brute_force(name: str, lanes: int) -> None:
 
 
 @pytest.mark.parametrize(("name", "lanes", "traffic"), [("circuit", 1, 0), ("town", 3, 12)])
-def test_both_sets_of_beams_agree_with_brute_force_at_every_step_of_a_drive(
+def test_both_sets_of_beams_agree_with_brute_force_during_a_drive(
     name: str, lanes: int, traffic: int
 ) -> None:
     road = Road(find_track(name), lanes)
@@ -161,7 +161,7 @@ def test_the_camera_is_a_sensor_of_the_table() -> None:
     assert np.std(grain[(picture > 60) & (picture < 190)]) == pytest.approx(12.0, rel=0.05)
 
 
-def test_an_instrument_stops_at_the_end_of_its_scale() -> None:
+def test_readings_are_clipped_to_the_limits() -> None:
     with World(Road(find_track("oval"))) as world:
         world.reset(seed=0, speed=80.0)
         readings = SensorSuite(STANDARD).read(world)
@@ -196,7 +196,7 @@ def test_noise_is_off_by_default_seeded_and_of_the_size_asked_for() -> None:
     assert np.std(ranges) == pytest.approx(0.5, rel=0.05)
 
 
-def test_noise_keeps_to_the_range_meters_limits_and_to_its_sign_of_no_track() -> None:
+def test_noise_respects_limits_and_the_off_track_value() -> None:
     with World(Road(find_track("oval"))) as world:
         world.reset(seed=0, s=_straight(world.road))
         suite = SensorSuite(STANDARD, seed=7, noise={"range": 300.0})

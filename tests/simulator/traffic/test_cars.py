@@ -99,7 +99,7 @@ def test_twelve_cars_never_touch_in_three_minutes(lanes: int) -> None:
     assert (changes > 3.0) == (lanes > 1)  # and change lanes where there are lanes
 
 
-def test_same_seed_same_bits() -> None:
+def test_same_seed_is_bit_identical() -> None:
     first, _ = run(3, seed=5, steps=600)
     second, _ = run(3, seed=5, steps=600)
     other, _ = run(3, seed=6, steps=600)
@@ -107,7 +107,7 @@ def test_same_seed_same_bits() -> None:
     assert first.poses().tobytes() != other.poses().tobytes()
 
 
-def test_speeds_keep_to_the_range_and_to_the_bends() -> None:
+def test_speeds_stay_in_range_and_below_the_curve_limit() -> None:
     traffic, places = run(2, seed=3, steps=2000)
     assert np.all(traffic.desired_speed * 3.6 >= DESIRED_KMH[0])
     assert np.all(traffic.desired_speed * 3.6 <= DESIRED_KMH[1])
@@ -162,7 +162,7 @@ def test_cars_stand_on_the_road_plane() -> None:
         assert yaw == pytest.approx(float(road.track.at(s_i).heading))
 
 
-def test_nobody_starts_near_the_ego_car() -> None:
+def test_no_car_starts_near_the_ego_car() -> None:
     road = Road(stadium(), lanes=3)
     for seed in range(20):
         traffic = Traffic(road, 12, np.random.default_rng(seed), ego_s=10.0)
@@ -204,7 +204,7 @@ def test_more_cars_than_fit_are_refused(count: int) -> None:
         Traffic(Road(stadium(), lanes=3), count, np.random.default_rng(0))
 
 
-def test_a_short_track_takes_fewer() -> None:
+def test_a_short_track_has_room_for_fewer_cars() -> None:
     tiny = Road(stadium(straight=20.0, radius=25.0, hill=0.0), lanes=1)
     with pytest.raises(UserError, match="takes 0 to 8"):
         Traffic(tiny, 12, np.random.default_rng(0))

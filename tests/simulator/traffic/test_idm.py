@@ -31,7 +31,7 @@ def test_equilibrium_gap() -> None:
     assert idm_acceleration(gap + 1, speed, speed, desired) > 0
 
 
-def test_brakes_harder_the_closer_and_the_faster_but_within_physics() -> None:
+def test_braking_grows_with_speed_and_proximity_up_to_its_limit() -> None:
     gaps = [idm_acceleration(g, 15.0, 10.0, 15.0) for g in (80.0, 40.0, 20.0, 10.0)]
     assert gaps == sorted(gaps, reverse=True)
     assert idm_acceleration(0.0, 15.0, 0.0, 15.0) == -MAX_BRAKING

@@ -17,7 +17,11 @@ from tests.simulator.traffic_audit import TrafficViolation, audit_traffic
     ("track", "lanes", "parked"),
     [("town", 1, False), ("circuit", 2, False), ("oval", 3, True)],
 )
+<<<<<<< HEAD
 def test_ten_minutes_without_a_touch(track: str, lanes: int, parked: bool) -> None:
+=======
+def test_ten_minutes_of_traffic_without_a_violation(track: str, lanes: int, parked: bool) -> None:
+>>>>>>> e329f5ccb956c02a9c26d50a49a7dc68f2422723
     seen = audit_traffic(Road(find_track(track), lanes), 600.0, parked=parked)
     assert seen.steps == 12_000
     assert (seen.lane_changes > 3) == (lanes > 1)
@@ -26,7 +30,7 @@ def test_ten_minutes_without_a_touch(track: str, lanes: int, parked: bool) -> No
     assert seen.own_laps == 0 if parked else seen.own_laps > 1
 
 
-def test_a_touch_would_be_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_audit_detects_a_collision(monkeypatch: pytest.MonkeyPatch) -> None:
     """Traffic that does not look ahead runs into the car that is parked before it."""
     monkeypatch.setattr("simulator.traffic.traffic.Traffic._update_ego", lambda *_: None)
     with pytest.raises(TrafficViolation, match=r"hit traffic|overlap"):
@@ -47,7 +51,7 @@ def corners(box: np.ndarray) -> np.ndarray:
     )
 
 
-def test_boxes_overlap_where_points_of_one_lie_in_the_other() -> None:
+def test_box_overlap_agrees_with_sampled_points() -> None:
     rng, seen = np.random.default_rng(0), []
     for _ in range(400):
         a = np.array([0.0, 0.0, rng.uniform(-4, 4), 4.5, 1.9])
@@ -66,7 +70,7 @@ def test_boxes_overlap_where_points_of_one_lie_in_the_other() -> None:
     assert 50 < sum(seen) < 350
 
 
-def test_a_car_goes_its_way_across_a_joint_of_two_bends() -> None:
+def test_centre_line_advance_across_a_joint_of_two_bends() -> None:
     """s advances by the way over 1 - k y on either side, k changing where the pieces meet."""
     track = find_track("town")
     table = track.arrays()

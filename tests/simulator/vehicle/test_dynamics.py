@@ -66,7 +66,7 @@ def drive(
     return states
 
 
-def test_twenty_metres_a_second_for_two_seconds_is_forty_metres() -> None:
+def test_20_m_s_for_2_s_is_40_m() -> None:
     end = drive(FREE, 2.0, lambda _: NEUTRAL, speed=20.0)[-1]
     assert end.s - 300.0 == pytest.approx(40.0, abs=0.01)
     assert end.odometer_m == pytest.approx(40.0, abs=0.01)
@@ -74,7 +74,7 @@ def test_twenty_metres_a_second_for_two_seconds_is_forty_metres() -> None:
     assert end.speed_kmh == pytest.approx(72.0, abs=0.02)
 
 
-def test_a_free_car_keeps_its_energy_up_a_hill() -> None:
+def test_a_coasting_car_conserves_energy_up_a_hill() -> None:
     grade = 0.05
     states = drive(FREE, 4.0, lambda _: NEUTRAL, speed=20.0, grade=grade)
     # The wheels carry energy too: each weighs J / r^2 more than it does.
@@ -174,7 +174,7 @@ def test_reverse_gear_and_gear_range() -> None:
         drive(CAR, 1.0, lambda _: Command(gear=7))
 
 
-def test_a_car_that_cannot_be_is_refused() -> None:
+def test_bad_car_parameters_are_refused() -> None:
     with pytest.raises(UserError, match="mass is -1"):
         CarParameters(mass=-1.0)
     with pytest.raises(UserError, match="torque table has 2"):
@@ -191,7 +191,7 @@ def test_the_tyres_stiffness_is_that_of_the_recorded_laps() -> None:
         assert 115e3 < CAR.cornering_stiffness(front, ASPHALT) < 135e3
 
 
-def test_a_harder_pressed_tyre_has_more_grip_but_less_for_its_load() -> None:
+def test_tyre_friction_falls_with_load() -> None:
     p = CAR.packed()[0]
     light, heavy = peak_force(p, True, 2000.0, ASPHALT), peak_force(p, True, 6000.0, ASPHALT)
     assert light < heavy < 3.0 * light
@@ -199,7 +199,7 @@ def test_a_harder_pressed_tyre_has_more_grip_but_less_for_its_load() -> None:
     assert nominal == pytest.approx(CAR.friction * CAR.camber_gain_front * p["working_front"])
 
 
-def test_the_inner_front_wheel_turns_further() -> None:
+def test_ackermann_steering_of_the_inner_wheel() -> None:
     p = CAR.packed()[0]
     for sign in (1.0, -1.0):
         left, right = wheel_angle(p, 0, 0.3 * sign), wheel_angle(p, 1, 0.3 * sign)
@@ -212,7 +212,7 @@ def test_the_inner_front_wheel_turns_further() -> None:
     assert wheel_angle(p, 2, 0.3) == 0.0
 
 
-def test_the_verge_brakes_worse_and_rolls_harder() -> None:
+def test_the_verge_has_less_grip_and_more_rolling_resistance() -> None:
     """One lane on a track 16 m wide: asphalt to 3 m, then verge."""
     road = plain(width=16.0)
     slowed = {}

@@ -26,7 +26,7 @@ def scene() -> PhysicsClient:
     return made
 
 
-def test_a_tumbling_body_moves_as_pybullet_moves_it() -> None:
+def test_a_rotating_free_body_moves_as_in_pybullet() -> None:
     bullet, params = scene(), CAR.packed()
     here, there = np.zeros(MOTION), np.zeros(MOTION)
     here[:] = (1.0, 2.0, 30.0, 0.0, 0.0, 0.0, 1.0, 12.0, -3.0, 4.0, 0.7, -0.4, 1.1)
@@ -44,7 +44,7 @@ def test_a_tumbling_body_moves_as_pybullet_moves_it() -> None:
 
 
 @pytest.mark.parametrize("track", ["mountain-pass", "circuit"])
-def test_a_drive_is_the_same_whoever_moves_the_body(track: str) -> None:
+def test_compiled_motion_equals_pybullet_motion(track: str) -> None:
     road = Road(find_track(track))
     with World(road) as world:
         state = world.reset(seed=0, speed=15.0)
@@ -68,7 +68,7 @@ def test_a_drive_is_the_same_whoever_moves_the_body(track: str) -> None:
         bullet.close()
 
 
-def test_flight_ends_before_anything_can_be_touched() -> None:
+def test_compiled_motion_stops_before_a_possible_contact() -> None:
     road = Road(find_track("circuit"))
     with World(road) as world:
         world.reset(seed=0, s=100.0, to_middle=2.0, angle=-1.2, speed=60.0)
@@ -91,7 +91,7 @@ def near(road: Road, world: World, other: NDArray[np.float64], goes: float, shar
     return bool(contact_possible(params, table, motion, piece, 1e3, other, move, share))
 
 
-def test_another_car_is_near_before_it_can_be_touched_but_not_in_the_next_lane() -> None:
+def test_contact_is_possible_before_a_touch_but_not_in_the_next_lane() -> None:
     road = Road(find_track("circuit"))
     with World(road) as world:
         state = world.reset(seed=0, s=5.0, speed=20.0)

@@ -23,7 +23,7 @@ from simulator.camera import VIEWS
 from simulator.sensors.beams import RANGE_M
 from simulator.track.catalogue import find_track
 from simulator.track.road import Road
-from simulator.watch.hub import MOST_BROWSERS
+from simulator.watch.hub import MAX_BROWSERS
 from simulator.watch.pictures import SIZE
 
 ROAD = Road(find_track("oval"), 2)
@@ -135,7 +135,7 @@ def watched() -> Iterator[Watched]:
     watched.close()
 
 
-def test_the_page_comes_whole_and_asks_nobody_else(watched: Watched) -> None:
+def test_the_page_is_self_contained(watched: Watched) -> None:
     connection = HTTPConnection("127.0.0.1", watched.port, timeout=120)
     connection.request("GET", "/")
     response = connection.getresponse()
@@ -157,7 +157,7 @@ def test_the_scene_is_the_road(watched: Watched) -> None:
     assert [scene["x"][k], scene["y"][k]] == pytest.approx([float(pose.x), float(pose.y)], abs=0.01)
 
 
-def test_states_are_true(watched: Watched) -> None:
+def test_state_messages_match_the_road(watched: Watched) -> None:
     with watched.browser() as page:
         page.ask(reset=True)
         page.until(lambda state: state["time_s"] < 1.0)
@@ -196,7 +196,7 @@ def test_pictures_of_the_view_that_is_chosen(watched: Watched) -> None:
 
 
 def test_another_light(watched: Watched) -> None:
-    """Pictures under way are still of the light before: wait for the sky of the one asked for."""
+    """Images in flight still have the earlier light: wait for the sky of the new one."""
     with watched.browser() as page:
         page.ask(view="front")
         page.ask(light="dusk")
@@ -208,7 +208,7 @@ def test_another_light(watched: Watched) -> None:
         assert clear.mean() > dusk.mean() + 10.0
 
 
-def test_keys_take_the_wheel_and_leaving_gives_it_back(watched: Watched) -> None:
+def test_keys_take_control_and_disconnecting_releases_it(watched: Watched) -> None:
     with watched.browser() as other:
         with watched.browser() as page:
             page.ask(reset=True)
@@ -267,7 +267,7 @@ def test_the_end_of_an_episode_is_shown_and_another_begins(watched: Watched) -> 
 
 
 @pytest.mark.alone
-def test_one_that_never_reads_holds_up_nobody(watched: Watched) -> None:
+def test_a_browser_that_never_reads_does_not_delay_others(watched: Watched) -> None:
     deaf = socket.create_connection(("127.0.0.1", watched.port))
     deaf.sendall(
         b"GET /live HTTP/1.1\r\nHost: x\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
@@ -286,10 +286,10 @@ def test_one_that_never_reads_holds_up_nobody(watched: Watched) -> None:
         states = [json.loads(data) for data in waiting if isinstance(data, str)]
         assert 1 <= len(states) <= 2
         assert len(waiting) <= 4
-        # Having answered, it gets what is newest, not what it missed.
+        # Having answered, it gets what is latest, not what it missed.
         mute.ask(got=states[-1]["number"])
-        newest = json.loads(mute.line.recv(timeout=60))["number"]
-        assert newest > numbers[-1] - 3
+        latest = json.loads(mute.line.recv(timeout=60))["number"]
+        assert latest > numbers[-1] - 3
     deaf.close()
 
 
@@ -298,7 +298,7 @@ def test_one_that_never_reads_holds_up_nobody(watched: Watched) -> None:
     ["no json", "[1]", '{"view": "inside"}', '{"keys": ["q"]}', '{"keys": "left"}', '{"got": true}',
      '{"light": ["clear"]}', '{"pause": 1}', '{"view": "top", "reset": true}', "9" * 600],
 )  # fmt: skip
-def test_nonsense_ends_its_own_line_only(watched: Watched, message: str) -> None:
+def test_a_bad_message_closes_only_its_connection(watched: Watched, message: str) -> None:
     with watched.browser() as page, watched.browser() as good:
         page.line.send(message)
         with pytest.raises(ConnectionClosed, match="1008"):
@@ -306,7 +306,7 @@ def test_nonsense_ends_its_own_line_only(watched: Watched, message: str) -> None
         assert good.state()["time_s"] >= 0.0
 
 
-def test_pages_of_other_sites_are_refused(watched: Watched) -> None:
+def test_pages_of_other_origins_are_refused(watched: Watched) -> None:
     url = f"ws://127.0.0.1:{watched.port}/live"
     with pytest.raises(InvalidStatus), connect(url, additional_headers={"Origin": "http://x.org"}):
         pass
@@ -315,10 +315,10 @@ def test_pages_of_other_sites_are_refused(watched: Watched) -> None:
         assert json.loads(line.recv(timeout=120))["type"] == "scene"
 
 
-def test_there_is_room_for_so_many(watched: Watched) -> None:
+def test_the_number_of_browsers_is_limited(watched: Watched) -> None:
     with ExitStack() as stack:
-        pages = [stack.enter_context(watched.browser()) for _ in range(MOST_BROWSERS)]
-        assert pages[0].until(lambda state: state["watching"] == MOST_BROWSERS)
+        pages = [stack.enter_context(watched.browser()) for _ in range(MAX_BROWSERS)]
+        assert pages[0].until(lambda state: state["watching"] == MAX_BROWSERS)
         late = stack.enter_context(connect(f"ws://127.0.0.1:{watched.port}/live"))
         with pytest.raises(ConnectionClosed, match="1013"):
             late.recv(timeout=120)

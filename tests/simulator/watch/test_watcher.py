@@ -95,7 +95,7 @@ def test_another_road_is_another_scene() -> None:
 
 
 @pytest.mark.alone
-def test_nobody_looking_it_costs_microseconds() -> None:
+def test_an_update_without_browsers_costs_microseconds() -> None:
     with Watcher(port=0) as watcher, World(Road(find_track("oval"))) as world:
         world.reset(seed=1, speed=15.0)
         watcher.update(world)
@@ -120,7 +120,7 @@ def test_held_to_a_speed() -> None:
         assert 0.4 < time.monotonic() - began < 4.0
 
 
-def test_what_it_cannot_show() -> None:
+def test_objects_without_a_world_are_refused() -> None:
     with Watcher(port=0) as watcher, pytest.raises(UserError, match="cannot show str"):
         watcher.update("my env")
 

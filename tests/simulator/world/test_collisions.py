@@ -54,7 +54,7 @@ def drive_into_traffic(world: World, seed: int = 0) -> tuple[CarState, CarState,
     raise AssertionError("nobody was hit")
 
 
-def test_a_rear_end_hit_conserves_momentum_and_pushes_the_other_on() -> None:
+def test_a_rear_end_collision_conserves_momentum() -> None:
     with World(stadium(), traffic=1, frequency_hz=200) as world:
         before, state, other = drive_into_traffic(world)
         assert state.collision == "traffic"
@@ -77,7 +77,7 @@ def test_a_rear_end_hit_conserves_momentum_and_pushes_the_other_on() -> None:
         assert world.traffic.speed[0] > other + 0.3 * closing
 
 
-def test_a_struck_car_leaves_the_lanes_order_and_comes_to_rest() -> None:
+def test_a_struck_car_leaves_its_lane_and_comes_to_rest() -> None:
     with World(stadium(), traffic=1) as world:
         drive_into_traffic(world)
         assert world.traffic.struck.tolist() == [True]
@@ -96,7 +96,7 @@ def test_a_struck_car_leaves_the_lanes_order_and_comes_to_rest() -> None:
         assert world.traffic.struck.tolist() == [False]
 
 
-def test_a_wreck_is_pushed_again() -> None:
+def test_a_wreck_at_rest_can_be_hit_again() -> None:
     with World(stadium(), traffic=1) as world:
         drive_into_traffic(world)
         for _ in range(160):
@@ -109,7 +109,7 @@ def test_a_wreck_is_pushed_again() -> None:
         assert np.hypot(*(world.traffic.poses()[0, :2] - place)) > 0.5
 
 
-def test_the_others_stop_behind_the_wreck() -> None:
+def test_traffic_stops_behind_a_wreck() -> None:
     with World(stadium(straight=200.0), traffic=4) as world:
         world.reset(seed=2)
         drive_into_traffic(world, seed=2)
@@ -138,7 +138,7 @@ def test_no_wall_is_crossed_at_any_speed_or_angle(side: int, where: str) -> None
                 assert state.z < 0.6
 
 
-def test_a_wall_is_no_hole_at_a_low_control_rate() -> None:
+def test_walls_hold_at_a_low_control_rate() -> None:
     with World(stadium(width=20.0), frequency_hz=1) as world:
         state = world.reset(seed=0, s=100.0, angle=-0.8, speed=50.0)
         state = world.step(COAST)

@@ -106,7 +106,7 @@ def test_reset_places_the_car_as_asked() -> None:
         assert (roll, pitch) == (moved.roll, moved.pitch)
 
 
-def test_features_are_those_of_the_place() -> None:
+def test_features_match_the_position() -> None:
     with World(stadium()) as world:
         world.reset(seed=0, s=100.0, to_middle=1.0, angle=0.1)
         features = world.features()
@@ -160,7 +160,7 @@ def test_running_into_traffic_is_recorded_and_slows_the_car() -> None:
         assert hit.speed < before.speed - 0.5
 
 
-def test_driving_backwards_is_noticed() -> None:
+def test_driving_backwards_is_reported() -> None:
     with World(stadium()) as world:
         assert not world.reset(seed=0, s=50.0, angle=1.5).backwards
         assert world.reset(seed=0, s=50.0, angle=1.6).backwards
@@ -197,7 +197,7 @@ def test_bad_input_is_refused() -> None:
             world.reset(seed=0, s=math.nan)
 
 
-def test_a_closed_world_says_so() -> None:
+def test_a_closed_world_raises() -> None:
     world = World(stadium())
     world.reset(seed=0)
     world.close()
@@ -208,7 +208,7 @@ def test_a_closed_world_says_so() -> None:
         world.step(Command())
 
 
-def test_any_rate_that_divides_200_gives_the_same_drive() -> None:
+def test_every_control_rate_gives_the_same_drive() -> None:
     ends = []
     for frequency in (20, 40, 200):
         with World(stadium(), frequency_hz=frequency) as world:

@@ -15,7 +15,7 @@ def resident_mib() -> float:
     return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**20
 
 
-def test_a_closed_world_gives_its_memory_back() -> None:
+def test_closing_a_world_frees_its_memory() -> None:
     road = Road(find_track("oval"))
 
     def make() -> None:

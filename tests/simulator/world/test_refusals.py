@@ -19,31 +19,31 @@ def road(lanes: int = 1) -> Road:
 
 
 @pytest.mark.parametrize("frequency", [0, -20, 30, 400, 0.5, 20.5, NAN])
-def test_control_rates(frequency: Any) -> None:
+def test_bad_control_rates_are_refused(frequency: Any) -> None:
     with pytest.raises(UserError, match="does not divide the physics"):
         World(road(), frequency_hz=frequency)
 
 
 @pytest.mark.parametrize("count", [-1, 13, 10_000])
-def test_counts_of_traffic(count: int) -> None:
+def test_bad_traffic_counts_are_refused(count: int) -> None:
     with pytest.raises(UserError, match=r"takes 0 to 12; ask for fewer"):
         World(road(), traffic=count)
 
 
 @pytest.mark.parametrize("count", [2.5, "3", None, True])
-def test_counts_of_traffic_that_are_no_numbers(count: Any) -> None:
+def test_traffic_counts_that_are_not_integers_are_refused(count: Any) -> None:
     with pytest.raises(UserError, match="give a whole number"):
         World(road(), traffic=count)
 
 
 @pytest.mark.parametrize("lanes", [0, -1, 4, 100])
-def test_lanes(lanes: int) -> None:
+def test_bad_lane_counts_are_refused(lanes: int) -> None:
     with pytest.raises(UserError, match="lane"):
         road(lanes)
 
 
 @pytest.mark.parametrize("width", [0.0, 2.9, 4.6, NAN])
-def test_lane_widths(width: float) -> None:
+def test_bad_lane_widths_are_refused(width: float) -> None:
     with pytest.raises(UserError, match="lane"):
         Road(find_track("oval"), 1, width)
 
@@ -63,7 +63,7 @@ def test_lane_widths(width: float) -> None:
         ({"speed": 151.0}, "speed = 151"),
     ],
 )
-def test_starts(what: dict[str, Any], match: str) -> None:
+def test_bad_starts_are_refused(what: dict[str, Any], match: str) -> None:
     with World(road()) as world:
         with pytest.raises(UserError, match=match):
             world.reset(**({"seed": 0} | what))
@@ -92,7 +92,7 @@ def test_starts(what: dict[str, Any], match: str) -> None:
         Command(gear=INF),  # type: ignore[arg-type]
     ],
 )
-def test_commands(command: Command) -> None:
+def test_bad_commands_are_refused(command: Command) -> None:
     with World(road(), traffic=2) as world:
         before = world.reset(seed=0)
         places = world.traffic.poses().tobytes()
@@ -102,7 +102,7 @@ def test_commands(command: Command) -> None:
         assert world.traffic.poses().tobytes() == places
 
 
-def test_nothing_works_before_the_first_reset() -> None:
+def test_use_before_the_first_reset_is_refused() -> None:
     with World(road()) as world:
         for use in (world.features, world.body_pose, lambda: world.state):
             with pytest.raises(UserError, match="call reset"):

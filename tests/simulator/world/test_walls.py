@@ -58,7 +58,7 @@ def test_walls_follow_every_bend(radius: float, side: int) -> None:
         assert np.ptp(offsets) < 1.2 * sagitta + 1e-6 or radius < 12.0
 
 
-def test_a_car_meets_no_wall_from_afar_nor_from_behind() -> None:
+def test_no_panel_far_from_the_wall_or_behind_it() -> None:
     walls = Walls(Road(loop(60.0, 200.0)))
     assert walls.panel(100.0, walls.offset - 3.6, 3.5) is None
     assert walls.panel(100.0, walls.offset - 3.4, 3.5) is not None
