@@ -310,11 +310,7 @@ def test_bad_image_sizes_are_refused(text: str) -> None:
         (("--header", "/no/such/folder/x.h"), "/no/such/folder"),
     ],
 )
-<<<<<<< HEAD
-def test_the_command_gives_one_clear_line(options: tuple[str, ...], said: str) -> None:
-=======
 def test_errors_of_the_command_are_one_line(options: tuple[str, ...], said: str) -> None:
->>>>>>> e329f5ccb956c02a9c26d50a49a7dc68f2422723
     done = run_server(*options)
     assert done.returncode == 1
     assert said in one_error(done)

@@ -17,11 +17,7 @@ from tests.simulator.traffic_audit import TrafficViolation, audit_traffic
     ("track", "lanes", "parked"),
     [("town", 1, False), ("circuit", 2, False), ("oval", 3, True)],
 )
-<<<<<<< HEAD
-def test_ten_minutes_without_a_touch(track: str, lanes: int, parked: bool) -> None:
-=======
 def test_ten_minutes_of_traffic_without_a_violation(track: str, lanes: int, parked: bool) -> None:
->>>>>>> e329f5ccb956c02a9c26d50a49a7dc68f2422723
     seen = audit_traffic(Road(find_track(track), lanes), 600.0, parked=parked)
     assert seen.steps == 12_000
     assert (seen.lane_changes > 3) == (lanes > 1)
