@@ -96,9 +96,7 @@ def problems() -> str:
     """The types of problems by status."""
     from serve.api import problems as module
 
-    kinds = sorted(
-        (k.status, k.name, k.title) for k in vars(module).values() if isinstance(k, module.Kind)
-    )
+    kinds = sorted((k.status, k.name, k.title) for k in module.PROBLEM_TYPES)
     rows = ["| status | type | |", "|---|---|---|"]
     return "\n".join(rows + [f"| {status} | `{name}` | {title} |" for status, name, title in kinds])
 
