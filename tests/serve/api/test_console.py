@@ -5,6 +5,7 @@ import math
 import re
 import shutil
 import subprocess
+from dataclasses import asdict
 from pathlib import Path
 
 import cv2
@@ -84,7 +85,7 @@ def test_the_geometry_of_the_console_is_that_of_the_pinhole(tmp_path: Path) -> N
     camera = CameraParameters()
     script.write_text(
         f"import {{ onMarking, project }} from '{module}';\n"
-        f"const camera = {json.dumps(vars(camera))};\n"
+        f"const camera = {json.dumps(asdict(camera))};\n"
         "console.log(JSON.stringify([project(onMarking(2, 0, 5.75), camera),"
         " onMarking(2, 0.1, 0), onMarking(0, 0.1, 10)]));\n"
     )
