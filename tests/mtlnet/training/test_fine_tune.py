@@ -73,7 +73,7 @@ def test_what_is_refused(published: Path, mine: Path, dataset: Path, tmp_path: P
     _, card = open_init(published)
     material = custom_training_data(mine, card)
     other = replace(material, camera=replace(card.camera, z=1.4))
-    with pytest.raises(UserError, match=r"z=1\.4.*keeps the camera"):
+    with pytest.raises(UserError, match=r"0, 1\.4\) m.*keeps the camera"):
         continue_from_model(other, card)
 
 
