@@ -13,7 +13,9 @@ import numpy as np
 import pytest
 
 import trackfeatures as tf
+from datagen.cli.collect import Lights
 from datagen.execution.collect import collect, require_matching_folder
+from datagen.planning.config import all_lights
 from datagen.planning.plan import RoundPlan
 from datagen.recorder.job import RoundDone
 from datagen.recording import Dataset
@@ -230,3 +232,8 @@ def test_help_is_quick() -> None:
     )
     heavy = {"numba", "pybullet", "moderngl", "cv2", "mcap", "simulator"}
     assert not heavy & set(loaded.stdout.split())
+
+
+def test_the_help_of_lights_names_every_light() -> None:
+    (option,) = Lights.__metadata__
+    assert f"from: {', '.join(all_lights())};" in option.help
