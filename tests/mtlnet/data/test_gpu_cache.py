@@ -100,7 +100,7 @@ def test_captured_training_gives_the_same_weights(dataset: Path) -> None:
     cached = GpuDataset(loader(dataset), CPU)
     recipe = replace(RECIPES["paper"], dropout=0.0, learning_rate=0.02)
     plain, recorded = (Trainer(recipe, (0.3, 0.2, 0.5), 1, CPU) for _ in range(2))
-    recorded.cuda_graph = CudaGraphStep(recorded.learn, FakeRecorder())
+    recorded.cuda_graph = CudaGraphStep(recorded.optimize, FakeRecorder())
     one, other = steps(plain, cached, 6), steps(recorded, cached, 6)
     assert one == other
     assert len(set(one)) == 6
