@@ -33,7 +33,7 @@ from mtlnet.data.loader import Loader
 from mtlnet.model.network import Network, initialise
 from mtlnet.training.loss import multi_task_loss
 from mtlnet.training.recipes import RECIPES, WARM_UP
-from mtlnet.training.trainer import SETTLING_STEPS, Trainer, keep_freed_memory
+from mtlnet.training.trainer import MIN_STEPS_BEFORE_BN_FREEZE, Trainer, keep_freed_memory
 from trackfeatures.camera import CameraParameters
 
 MOST_OVER_MEMORY = 1.05
@@ -57,7 +57,7 @@ def ours(frames: Frames, size: int, steps: int) -> dict[str, Step]:
     changed = Loader(frames, camera, size, 0, augment=True)
     trainer = Trainer(recipe, ALPHA, 0, torch.device("cpu"))
     trainer.standardise(changed)
-    trainer.step_number = SETTLING_STEPS
+    trainer.step_number = MIN_STEPS_BEFORE_BN_FREEZE
     kept = changed.make(0)
     fresh = changed.batches(0)
     plain = Loader(frames, camera, size, 0, augment=False).batches(0)

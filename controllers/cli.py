@@ -112,9 +112,8 @@ def demo(
     The same command continues where it was stopped. Exit 1 when the model misses a limit.
     """
     from controllers.demo.process import stop_on_sigterm
-    from controllers.demo.report import verdicts, write_report
+    from controllers.demo.report import print_tables, verdicts, write_report
     from controllers.demo.run import run_demo
-    from controllers.demo.tables import print_tables
 
     stop_on_sigterm()
     config = DemoConfig(out=out, rounds=rounds, frames=frames, seed=seed, minutes=minutes)

@@ -1,1 +1,1 @@
-"""The multi-task perception network: training, evaluation, export and the engine that runs it."""
+"""The multi-task perception network: training, evaluation, export and inference."""

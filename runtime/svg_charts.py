@@ -1,24 +1,31 @@
-"""Axes of charts: where a value lies, and the round numbers beside it; linear or logarithmic."""
+"""Charts of HTML pages as SVG: line plots, reliability diagrams, histograms and bars.
+
+A plot's SVG, in coordinates from 0 to `SIDE` with y down, is stretched over its box and labelled in
+HTML: its lines scale with the page and its text does not. Pages with charts include
+`svg_charts.css`.
+"""
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from html import escape
-from importlib.resources import files
 from itertools import groupby
 
 import numpy as np
+from markupsafe import Markup, escape
 from numpy.typing import NDArray
 
-SIDE = 1000.0  # of a chart's own coordinates, both ways
-LEAST = 1e-9  # what a logarithmic axis takes 0 for
+SIDE = 1000.0
+LOG_FLOOR = 1e-9
+"""The value at which a logarithmic axis draws 0."""
+MAX_POINTS = 800
+"""Points of a line that a page has room for."""
 
 Numbers = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Axis:
-    """Values -> [0, SIDE], from `first` to `last`; `log`: by their logarithms."""
+    """Maps values to [0, SIDE], from `first` to `last`; `log`: by their logarithms."""
 
     first: float
     last: float
@@ -26,7 +33,7 @@ class Axis:
 
     def __call__(self, value: float) -> float:
         first, last, here = (
-            math.log10(max(v, LEAST)) if self.log else v for v in (self.first, self.last, value)
+            math.log10(max(v, LOG_FLOOR)) if self.log else v for v in (self.first, self.last, value)
         )
         return (here - first) * SIDE / ((last - first) or 1.0)
 
@@ -34,23 +41,25 @@ class Axis:
     def ticks(self) -> list[float]:
         """Round numbers on this axis, ascending."""
         low, high = sorted((self.first, self.last))
-        return log_ticks(max(low, LEAST), max(high, LEAST)) if self.log else ticks(low, high)
+        return (
+            log_ticks(max(low, LOG_FLOOR), max(high, LOG_FLOOR)) if self.log else ticks(low, high)
+        )
 
 
-def span(columns: Iterable[Numbers], *, log: bool) -> tuple[float, float]:
-    """What an axis must reach from and to for all finite values of `columns`, with a margin."""
+def value_range(columns: Iterable[Numbers], *, log: bool) -> tuple[float, float]:
+    """Least and greatest finite value of `columns`, with a margin for an axis."""
     values = np.concatenate([column[np.isfinite(column)] for column in columns])
     if not len(values):
-        return (LEAST, 1.0) if log else (-1.0, 1.0)
+        return (LOG_FLOOR, 1.0) if log else (-1.0, 1.0)
     low, high = float(values.min()), float(values.max())
     if log:
-        return max(low, LEAST) * 0.9, max(high, LEAST) * 1.1
+        return max(low, LOG_FLOOR) * 0.9, max(high, LOG_FLOOR) * 1.1
     margin = 0.06 * (high - low) or 0.5
     return low - margin, high + margin
 
 
 def ticks(low: float, high: float) -> list[float]:
-    """Round numbers within, three to eight of them; none within nothing."""
+    """Three to eight round numbers from `low` to `high`; none where `high` is not above `low`."""
     if not high > low:
         return []
     step = 10 ** math.floor(math.log10((high - low) / 3))
@@ -60,7 +69,7 @@ def ticks(low: float, high: float) -> list[float]:
 
 
 def log_ticks(low: float, high: float) -> list[float]:
-    """Round values between two positive numbers: 1, 2 and 5 of a decade, or only 1 of many."""
+    """Ticks between two positive numbers: 1, 2 and 5 of each decade, or only 1 of many decades."""
     decades = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
     found = [float(f"{digit}e{decade}") for decade in decades for digit in (1, 2, 5)]
     inside = [value for value in found if low <= value <= high]
@@ -68,20 +77,15 @@ def log_ticks(low: float, high: float) -> list[float]:
     return tens if len(tens) > 4 else inside
 
 
-# Charts of HTML pages: SVG stretched over its box, with labels in HTML beside it. The lines
-# stretch with the page and the text does not, so that both are readable on a phone. A page with
-# charts has `style` in its own.
-
-
-MOST_POINTS = 800
+# Line plots and reliability diagrams.
 
 
 @dataclass(frozen=True)
 class Line:
-    """A line through y (N,) at x (N,), NaN breaks it; `band` (low, high) lies behind it.
+    """A line through y (N,) at x (N,), broken at NaN; `band` (low, high) is filled behind it.
 
-    `kind`: its class in the page's style. With a `label` it is named in the legend, and has its
-    own `colour`.
+    `kind`: its class in `svg_charts.css`. A line with a `label` is named in the legend and has a
+    `colour` of its own.
     """
 
     kind: str
@@ -94,7 +98,7 @@ class Line:
 
 @dataclass(frozen=True)
 class Plot:
-    """Lines, and shaded spans (from, to) of x behind them; `log`: up, logarithms."""
+    """Lines, and intervals (from, to) of x shaded behind them; `log`: logarithmic y axis."""
 
     title: str
     lines: Sequence[Line]
@@ -103,45 +107,42 @@ class Plot:
     log: bool = False
 
 
-def style() -> str:
-    """What the style of a page with charts must hold."""
-    return files("runtime").joinpath("svg_charts.css").read_text(encoding="utf-8")
-
-
-def plot(what: Plot) -> str:
-    """The figure; a note in its place where there is nothing to draw."""
-    if not what.lines:
-        return f"<figure><figcaption>{escape(what.title)}</figcaption><p>not yet</p></figure>"
-    # The bands of charts with names belong to them; others may be cut off, the line may not.
-    fitted = [line.y for line in what.lines]
-    fitted += [edge for line in what.lines if line.label for edge in line.band or ()]
-    low, high = span(fitted, log=what.log)
-    xs = np.concatenate([line.x for line in what.lines])
-    across, up = Axis(float(xs.min()), float(xs.max())), Axis(high, low, what.log)  # y points down
+def line_plot(plot: Plot) -> Markup:
+    """The figure; the note "not yet" in its place when there is no line."""
+    if not plot.lines:
+        note = Markup("<figure><figcaption>{}</figcaption><p>not yet</p></figure>")
+        return note.format(plot.title)
+    # The axis fits the bands of lines with a label; the other bands may be cut off at its ends.
+    fitted = [line.y for line in plot.lines]
+    fitted += [edge for line in plot.lines if line.label for edge in line.band or ()]
+    low, high = value_range(fitted, log=plot.log)
+    x = np.concatenate([line.x for line in plot.lines])
+    x_axis = Axis(float(x.min()), float(x.max()))
+    y_axis = Axis(high, low, plot.log)
     drawn = [
-        f'<rect class=shade x="{across(a):.1f}" y="0" width="{across(b) - across(a):.1f}" '
+        f'<rect class=shade x="{x_axis(a):.1f}" y="0" width="{x_axis(b) - x_axis(a):.1f}" '
         f'height="{SIDE:.0f}"/>'
-        for a, b in what.shaded
+        for a, b in plot.shaded
     ]
-    drawn += [f'<path class=grid d="M0,{up(t):.1f}H{SIDE:.0f}"/>' for t in up.ticks]
-    drawn += [_band(across, up, line) for line in what.lines if line.band is not None]
+    drawn += [f'<path class=grid d="M0,{y_axis(t):.1f}H{SIDE:.0f}"/>' for t in y_axis.ticks]
+    drawn += [_band(x_axis, y_axis, line) for line in plot.lines if line.band is not None]
     drawn += [
-        f'<path class="{line.kind}"{_colour("stroke", line)} d="{_path(across, up, line)}"/>'
-        for line in what.lines
+        f'<path class="{line.kind}"{_colour("stroke", line)} d="{_path(x_axis, y_axis, line)}"/>'
+        for line in plot.lines
     ]
-    labels = [_label("y", up(t), t) for t in up.ticks]
-    labels += [_label("x", across(t), t) for t in across.ticks]
-    return _figure(what.title, drawn, labels, what.x_unit, legend=_legend(what.lines))
+    labels = [_tick_label("y", y_axis(t), t) for t in y_axis.ticks]
+    labels += [_tick_label("x", x_axis(t), t) for t in x_axis.ticks]
+    return _figure(plot.title, drawn, labels, plot.x_unit, legend=_legend(plot.lines))
 
 
-def reliability(title: str, said: Numbers, found: Numbers) -> str:
-    """Errors found against standard deviations said, both axes logarithmic, the diagonal drawn."""
-    both = np.maximum(np.concatenate([said, found]), LEAST)
+def reliability_diagram(title: str, predicted: Numbers, observed: Numbers) -> Markup:
+    """Observed errors against predicted standard deviations, logarithmic, with the diagonal."""
+    both = np.maximum(np.concatenate([predicted, observed]), LOG_FLOOR)
     low, high = float(both.min()) * 0.8, float(both.max()) * 1.25
-    across, up = Axis(low, high, log=True), Axis(high, low, log=True)
+    x_axis, y_axis = Axis(low, high, log=True), Axis(high, low, log=True)
     dots = [
-        f'<path class=dot d="M{across(s):.1f},{up(f):.1f}h0"/>'
-        for s, f in zip(said.tolist(), found.tolist(), strict=True)
+        f'<path class=dot d="M{x_axis(x):.1f},{y_axis(y):.1f}h0"/>'
+        for x, y in zip(predicted.tolist(), observed.tolist(), strict=True)
     ]
     labels = [
         f'<span class=y style="top:97%">{low:.2g}</span>',
@@ -150,39 +151,39 @@ def reliability(title: str, said: Numbers, found: Numbers) -> str:
         f'<span class=x style="left:100%">{high:.2g}</span>',
     ]
     diagonal = f'<path class=grid d="M0,{SIDE:.0f}L{SIDE:.0f},0"/>'
-    return _figure(title, [diagonal, *dots], labels, "said", "square")
+    return _figure(title, [diagonal, *dots], labels, "predicted", "square")
 
 
-def _path(across: Axis, up: Axis, line: Line) -> str:
+def _path(x_axis: Axis, y_axis: Axis, line: Line) -> str:
     parts, drawing = [], False
     for x, y in zip(line.x.tolist(), line.y.tolist(), strict=True):
         present = bool(np.isfinite(y))
         if present:
-            parts.append(f"{'L' if drawing else 'M'}{across(x):.1f},{up(y):.1f}")
+            parts.append(f"{'L' if drawing else 'M'}{x_axis(x):.1f},{y_axis(y):.1f}")
         drawing = present
     return "".join(parts)
 
 
-def _band(across: Axis, up: Axis, line: Line) -> str:
+def _band(x_axis: Axis, y_axis: Axis, line: Line) -> str:
     assert line.band is not None
-    first, last = sorted((up.first, up.last))
+    first, last = sorted((y_axis.first, y_axis.last))
     low, high = (edge.clip(first, last) for edge in line.band)
     present = np.isfinite(low) & np.isfinite(high)
     rings = []
-    for here, rows in groupby(range(len(line.x)), key=lambda row: bool(present[row])):
-        if here:
+    for drawn, rows in groupby(range(len(line.x)), key=lambda row: bool(present[row])):
+        if drawn:
             there = list(rows)
             ring = [(line.x[i], high[i]) for i in there]
             ring += [(line.x[i], low[i]) for i in reversed(there)]
-            rings.append("M" + "L".join(f"{across(x):.1f},{up(y):.1f}" for x, y in ring) + "Z")
+            rings.append("M" + "L".join(f"{x_axis(x):.1f},{y_axis(y):.1f}" for x, y in ring) + "Z")
     return f'<path class=band{_colour("fill", line)} d="{"".join(rings)}"/>'
 
 
-def _colour(what: str, line: Line) -> str:
-    return f' style="{what}:{line.colour}"' if line.colour else ""
+def _colour(style: str, line: Line) -> str:
+    return f' style="{style}:{line.colour}"' if line.colour else ""
 
 
-def _label(side: str, place: float, value: float) -> str:
+def _tick_label(side: str, place: float, value: float) -> str:
     edge = "top" if side == "y" else "left"
     return f'<span class={side} style="{edge}:{100 * place / SIDE:.1f}%">{value:g}</span>'
 
@@ -204,11 +205,103 @@ def _figure(
     x_unit: str,
     kind: str = "wide",
     legend: str = "",
-) -> str:
+) -> Markup:
     name = escape(title)
-    return (
+    return Markup(
         f'<figure class="chart {kind}"><figcaption>{name}</figcaption><div class=plot>'
         f'<svg viewBox="0 0 {SIDE:.0f} {SIDE:.0f}" preserveAspectRatio=none role=img '
         f'aria-label="{name}">{"".join(drawn)}</svg>{"".join(labels)}'
         f"<span class=unit>{escape(x_unit)}</span></div>{legend}</figure>"
+    )
+
+
+# Histograms and bars of the splits of a dataset, drawn over and under each other.
+
+
+BINS = 48
+SPLIT_COLOURS = {"train": "#3b6fd4", "test": "#e07a2e", "unseen": "#2a9d5c"}
+WIDTH, HEIGHT = 320, 120
+MARGIN, FOOT = 6, 18
+"""Of a histogram: space left and right, and below for the labels."""
+
+
+def histogram(title: str, unit: str, values: Mapping[str, NDArray[np.float32]]) -> Markup:
+    """Shares of the finite values of each split (N,) in `BINS` equal bins; NaN is inactive.
+
+    The shares of a split sum to one, so that splits of different sizes can be compared.
+    """
+    finite = {split: column[np.isfinite(column)] for split, column in values.items()}
+    filled = [column for column in finite.values() if column.size]
+    if not filled:
+        return _histogram_figure(title, "never active")
+    low = min(float(column.min()) for column in filled)
+    high = max(float(column.max()) for column in filled)
+    high = high if high > low else low + 1.0
+    shares = {
+        split: np.histogram(column, BINS, (low, high))[0] / max(column.size, 1)
+        for split, column in finite.items()
+    }
+    top = max(float(share.max()) for share in shares.values())
+    outlines = "".join(_outline(share / top, SPLIT_COLOURS[s]) for s, share in shares.items())
+    active = ", ".join(
+        f"{split} {column.size / max(len(values[split]), 1):.0%}"
+        for split, column in finite.items()
+    )
+    note = "" if active.count("100%") == len(finite) else f" active: {active}"
+    return _histogram_figure(title, f"{unit}{note}", _value_axis(low, high) + outlines)
+
+
+def bars(title: str, counts: Mapping[str, Sequence[int]]) -> Markup:
+    """A row of bars for each name: its frames in each split, in the order of `SPLIT_COLOURS`."""
+    top = max((max(row) for row in counts.values()), default=0) or 1
+    rows = []
+    for name, row in counts.items():
+        cells = "".join(
+            f'<i style="width:{100 * count / top:.1f}%;background:{colour}"></i>'
+            for colour, count in zip(SPLIT_COLOURS.values(), row, strict=False)
+        )
+        numbers = " / ".join(f"{count:,}" for count in row)
+        rows.append(f"<tr><th>{escape(name)}<td>{cells}<td class=count>{numbers}")
+    return Markup(
+        f"<figure class=bars><figcaption>{escape(title)}</figcaption>"
+        f"<table>{''.join(rows)}</table></figure>"
+    )
+
+
+def _outline(share: Numbers, colour: str) -> str:
+    """A stepped area; `share` (BINS,) in [0, 1]."""
+    floor = HEIGHT - FOOT
+    points = [f"{_bin_x(0.0):.1f},{floor}"]
+    for k, part in enumerate(share.tolist()):
+        y = floor - part * (floor - 4)
+        points += [f"{_bin_x(k / BINS):.1f},{y:.1f}", f"{_bin_x((k + 1) / BINS):.1f},{y:.1f}"]
+    points.append(f"{_bin_x(1.0):.1f},{floor}")
+    return f'<polygon points="{" ".join(points)}" fill="{colour}" stroke="{colour}"/>'
+
+
+def _value_axis(low: float, high: float) -> str:
+    """The labels of both ends, and a line at zero where it is between them."""
+    drawn = _text(MARGIN, "start", f"{low:.3g}") + _text(WIDTH - MARGIN, "end", f"{high:.3g}")
+    if low < 0.0 < high:
+        zero = -low / (high - low)
+        x = _bin_x(zero)
+        drawn += f'<line x1="{x:.1f}" x2="{x:.1f}" y1="0" y2="{HEIGHT - FOOT}" class="zero"/>'
+        if 0.12 < zero < 0.88:
+            drawn += _text(x, "middle", "0")
+    return drawn
+
+
+def _bin_x(share: float) -> float:
+    return MARGIN + share * (WIDTH - 2 * MARGIN)
+
+
+def _text(x: float, anchor: str, text: str) -> str:
+    return f'<text x="{x:.1f}" y="{HEIGHT - 4}" text-anchor="{anchor}">{text}</text>'
+
+
+def _histogram_figure(title: str, note: str, drawn: str = "") -> Markup:
+    svg = f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img">{drawn}</svg>' if drawn else ""
+    return Markup(
+        f"<figure class=histogram><figcaption>{escape(title)} <small>{escape(note)}</small>"
+        f"</figcaption>{svg}</figure>"
     )

@@ -1,17 +1,15 @@
-"""The demo's HTML report: one self-contained page with figures, curves and pictures."""
+"""The demo's results: verdicts, tables for the terminal, and a self-contained HTML report."""
 
-import base64
-import html
-from collections.abc import Iterable
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from string import Template
 from typing import Any
 
-import cv2
 import numpy as np
 import simplejpeg
-from numpy.typing import NDArray
+from markupsafe import Markup
+from rich.console import Console
+from rich.table import Table
 
 from controllers.config import DemoConfig
 from controllers.demo.frames import Asked
@@ -19,44 +17,38 @@ from controllers.demo.run import DemoResult
 from datagen.recording import Dataset
 from mtlnet.inference.curves import read_curves
 from mtlnet.inference.overlay import draw_overlay
+from runtime.files import atomic_write
+from runtime.html import embed_jpeg, render
+from runtime.svg_charts import Line, Plot, line_plot
 from simulator.vehicle.car import CarParameters
 from trackfeatures import MARKINGS
 from trackfeatures.camera import CameraParameters
 
 LIMITS = {"ml": 0.35, "mr": 0.35, "angle": 0.03, "heading": 0.85}
-"""What the demo must reach: mean error in m and rad, and the share of right classes."""
-VERDICT_COLUMNS = ("feature", "mean error", "limit", "always the mean", "ratio", "reached")
+"""What the demo must reach: mean error in m and rad, and the accuracy of the heading class."""
+VERDICT_COLUMNS = ("feature", "mean error", "limit", "training mean", "ratio", "reached")
 LEARNED_RATIO = 0.65
-"""Learned, not guessed: at most this share of the error of always answering the training mean."""
-
-
-def write_report(config: DemoConfig, result: DemoResult) -> Path:
-    """Write `report.html` into the demo's folder; gives its path."""
-    page = Template((Path(__file__).parent / "report.html").read_text())
-    path = config.out / "report.html"
-    path.write_text(
-        page.substitute(
-            summary=_summary(config, result),
-            accuracy=_accuracy(result.evaluation),
-            curves=_curves(config.out / "run" / "curves.csv"),
-            pictures=_pictures(Dataset.open(config.out / "data").camera, result.asked),
-            answers=_answers(result.asked),
-            drive=_drive(result.drive),
-            commands=html.escape("\n".join(result.commands)),
-        )
-    )
-    return path
+"""A feature counts as learned when its error is at most this share of the baseline's, which always
+predicts the mean of the training labels."""
+MIN_TERMINAL_WIDTH = 120
+"""Columns that the tables need; a narrower terminal wraps whole lines, which is easier to read."""
+ANSWER_COLUMNS = (
+    *("round", "track", "lanes"),
+    *(f"{name} (m)" for name in MARKINGS),
+    *("to lane centre (m)", "angle (rad)", "heading"),
+)
+CURVE_COLOURS = {"distance": "#22bb66", "angle": "#ee8822", "type": "#3366cc"}
 
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """One figure of the evaluation beside its limit and that of always answering the mean."""
+    """A result of the evaluation beside its limit and the result of the baseline."""
 
     what: str
     figure: float
     mean: float
     limit: float | None = None
-    """None: the demo sets none for it."""
+    """None: the demo sets no limit."""
     reached: bool = True
 
     @property
@@ -67,18 +59,19 @@ class Verdict:
 
 
 def verdicts(evaluation: dict[str, Any]) -> list[Verdict]:
-    """What the model reached, feature by feature."""
+    """The verdicts on an evaluation, feature by feature."""
     baseline = evaluation["baseline"]
     rows = []
     for name in MARKINGS:
         error, mean = evaluation["mae_m"][name], baseline["mae_m"][name]
-        if error is not None and mean is not None:  # on one lane, no test frame may show an `l`
+        if error is not None and mean is not None:  # on one lane no test frame may show an `l`
             rows.append(_error_verdict(f"{name} (m)", error, mean, LIMITS.get(name)))
     angle, mean_angle = evaluation["angle_mae_rad"], baseline["angle_mae_rad"]
     rows.append(_error_verdict("angle (rad)", angle, mean_angle, LIMITS["angle"]))
-    right, most_frequent = evaluation["heading_accuracy"], baseline["heading_accuracy"]
+    accuracy, most_frequent = evaluation["heading_accuracy"], baseline["heading_accuracy"]
     least = LIMITS["heading"]
-    rows.append(Verdict("heading (share right)", right, most_frequent, least, right >= least))
+    name = "heading (share right)"
+    rows.append(Verdict(name, accuracy, most_frequent, least, accuracy >= least))
     return rows
 
 
@@ -87,104 +80,126 @@ def _error_verdict(what: str, error: float, mean: float, limit: float | None) ->
     return Verdict(what, error, mean, limit, reached)
 
 
-def _summary(config: DemoConfig, result: DemoResult) -> str:
-    collected = result.collected
-    steps = ", ".join(f"{name} {seconds:.0f} s" for name, seconds in result.seconds.items())
+def verdict_cells(verdict: Verdict) -> tuple[str, ...]:
+    """A verdict as the cells of `VERDICT_COLUMNS`."""
+    limit = "" if verdict.limit is None else f"{verdict.limit:g}"
+    ratio = f"{verdict.figure / verdict.mean:.2f}"
+    figures = (f"{verdict.figure:.4f}", limit, f"{verdict.mean:.4f}")
+    return verdict.what, *figures, ratio, verdict.word
+
+
+# The HTML report.
+
+
+def write_report(config: DemoConfig, result: DemoResult) -> Path:
+    """Write `report.html` into the demo's folder and return its path."""
+    path = config.out / "report.html"
+    camera = Dataset.open(config.out / "data").camera
+    page = render(
+        "controllers.demo",
+        "report.html",
+        config=config,
+        result=result,
+        learned_ratio=LEARNED_RATIO,
+        verdict_columns=VERDICT_COLUMNS,
+        verdict_rows=[verdict_cells(one) for one in verdicts(result.evaluation)],
+        curves=_training_curves(config.out / "run" / "curves.csv"),
+        figures=_figures(camera, result.asked),
+        answer_columns=ANSWER_COLUMNS,
+        answer_rows=[_answer_cells(one) for one in result.asked],
+    )
+    atomic_write(path, page)
+    return path
+
+
+def _answer_cells(asked: Asked) -> tuple[str, ...]:
+    """True and predicted values of a frame, separated by a slash."""
+    answer = asked.answer
+    distances = ((asked.distances[name], answer["distances_m"][name]) for name in MARKINGS)
     return (
-        f"{collected['frames']} frames in {collected['rounds']} rounds at "
-        f"{collected['frames_per_second']:.0f} frames a second; "
-        f"trained {config.minutes:g} minutes with alpha {html.escape(config.alpha)}; "
-        f"{result.evaluation['frames']} frames of unseen rounds judge it. Time: {steps}."
+        asked.round_id,
+        asked.track,
+        str(asked.lanes),
+        *(_pair(*values, 2) for values in distances),
+        _pair(asked.to_lane_centre, answer["to_lane_centre_m"], 2),
+        _pair(asked.angle, answer["angle_rad"], 3),
+        f"{asked.heading} / {asked.answered_heading}",
     )
 
 
-def _accuracy(evaluation: dict[str, Any]) -> str:
-    rows = [verdict_cells(one) for one in verdicts(evaluation)]
-    return _table(VERDICT_COLUMNS, rows)
+def _pair(true: float | None, predicted: float | None, digits: int) -> str:
+    return " / ".join("inactive" if v is None else f"{v:+.{digits}f}" for v in (true, predicted))
 
 
-def verdict_cells(one: Verdict) -> tuple[str, ...]:
-    """A verdict as the cells of `VERDICT_COLUMNS`."""
-    limit = "" if one.limit is None else f"{one.limit:g}"
-    ratio = f"{one.figure / one.mean:.2f}"
-    return one.what, f"{one.figure:.4f}", limit, f"{one.mean:.4f}", ratio, one.word
-
-
-def _answers(asked: list[Asked]) -> str:
-    head = ("round", "track", "lanes", *(f"{name} (m)" for name in MARKINGS))
-    head += ("to lane centre (m)", "angle (rad)", "heading")
-    rows = []
-    for one in asked:
-        found = one.answer["distances_m"]
-        centre = one.answer["to_lane_centre_m"]
-        rows.append(
-            (
-                one.round_id,
-                one.track,
-                str(one.lanes),
-                *(_pair(one.distances[name], found[name], 2) for name in MARKINGS),
-                _pair(one.to_lane_centre, centre, 2),
-                _pair(one.angle, one.answer["angle_rad"], 3),
-                f"{one.heading} / {one.answered_heading}",
-            )
-        )
-    return _table(head, rows)
-
-
-def _pair(true: float | None, answered: float | None, digits: int) -> str:
-    return " / ".join("absent" if v is None else f"{v:+.{digits}f}" for v in (true, answered))
-
-
-def _pictures(camera: CameraParameters, asked: list[Asked]) -> str:
+def _figures(camera: CameraParameters, asked: list[Asked]) -> Iterator[dict[str, str]]:
+    """The frames with true and predicted markings drawn on them, and their captions."""
     height_m = camera.z + CarParameters().cg_height
-    figures = []
     for one in asked:
         frame = simplejpeg.decode_jpeg(one.jpeg)
-        answer = (one.answer["distances_m"], one.answer["angle_rad"])
+        prediction = (one.answer["distances_m"], one.answer["angle_rad"])
         truth = (one.distances, one.angle)
-        drawn = draw_overlay(frame, camera, height_m, one.curvature, truth, answer)
-        caption = html.escape(
-            f"{one.track}, {one.lanes} lane{'s'[: one.lanes > 1]}, {one.round_id}"
-        )
-        figures.append(f'<figure><img src="{_data_uri(drawn)}"><figcaption>{caption}</figure>')
-    return "".join(figures)
+        drawn = draw_overlay(frame, camera, height_m, one.curvature, truth, prediction)
+        lanes = f"{one.lanes} lane{'s' if one.lanes > 1 else ''}"
+        yield {"jpeg": embed_jpeg(drawn), "caption": f"{one.track}, {lanes}, {one.round_id}"}
 
 
-def _data_uri(image: NDArray[np.uint8]) -> str:
-    _, encoded = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
-    return "data:image/jpeg;base64," + base64.b64encode(encoded.tobytes()).decode()
-
-
-def _curves(path: Path) -> str:
-    """The training losses as SVG lines, each scaled to its own first value."""
+def _training_curves(path: Path) -> Markup | None:
+    """The training losses, each as a share of its first value; None without a logged point."""
     rows = read_curves(path)
     if not rows:
-        return "<p>The training was too short for a curve.</p>"
-    steps = [row["step"] for row in rows]
-    lines, legend = [], []
-    for task, colour in (("distance", "#2b6"), ("angle", "#e82"), ("type", "#36c")):
-        loss = [row[f"{task}_loss"] for row in rows]
-        points = " ".join(
-            f"{600 * step / steps[-1]:.1f},{180 - 170 * min(value / loss[0], 1.0):.1f}"
-            for step, value in zip(steps, loss, strict=True)
-        )
-        lines.append(f'<polyline stroke="{colour}" points="{points}"/>')
-        legend.append(f'<b style="color:{colour}">{task}</b> {loss[0]:.3g} to {loss[-1]:.3g}')
-    svg = f'<svg viewBox="0 0 600 185" role="img" aria-label="losses">{"".join(lines)}</svg>'
-    return f"{svg}<p>Losses over {steps[-1]:.0f} steps: {', '.join(legend)}.</p>"
+        return None
+    steps = np.array([row["step"] for row in rows])
+    lines = []
+    for task, colour in CURVE_COLOURS.items():
+        losses = np.array([row[f"{task}_loss"] for row in rows])
+        label = f"{task} {losses[0]:.3g} to {losses[-1]:.3g}"
+        lines.append(Line("curve", steps, np.minimum(losses / losses[0], 1.0), label, colour))
+    return line_plot(Plot("losses, as a share of their first values", lines, "steps"))
 
 
-def _drive(drive: dict[str, Any]) -> str:
-    ended = drive["ended"] or "all its steps"
-    return (
-        f"The LQR controller, steered by the service's answers alone: {drive['steps']} steps of "
-        f"50 ms, ended by {html.escape(str(ended))}, mean |d| {drive['mean_abs_d_m']:.2f} m, "
-        f"largest {drive['max_abs_d_m']:.2f} m, {drive['score_per_step']:.3f} points a step."
+# The tables for the terminal.
+
+
+def print_tables(verdicts: list[Verdict], asked: list[Asked]) -> None:
+    """Print the verdicts, and true beside predicted values, on standard output."""
+    console = Console()
+    console = Console(width=max(console.width, MIN_TERMINAL_WIDTH))
+    console.print(_verdict_table(verdicts))
+    console.print(_answers_table(asked))
+
+
+def _verdict_table(verdicts: list[Verdict]) -> Table:
+    title = (
+        f"Rounds of unseen seeds (learned: an error of at most {LEARNED_RATIO} of the training "
+        "mean's)"
     )
+    table = Table(title=title)
+    for column in VERDICT_COLUMNS:
+        table.add_column(column, justify="left" if column == "feature" else "right")
+    for one in verdicts:
+        table.add_row(*verdict_cells(one))
+    return table
 
 
-def _table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
-    def line(tag: str, cells: Iterable[str]) -> str:
-        return "<tr>" + "".join(f"<{tag}>{html.escape(c)}</{tag}>" for c in cells) + "</tr>"
+def _answers_table(asked: list[Asked]) -> Table:
+    table = Table(
+        title="Held-out frames: true, predicted (centre: offset from the centre of the lane)"
+    )
+    columns = ("track", "lanes", "centre (m)", "ml (m)", "mr (m)", "m (m)", "angle (rad)")
+    for column in (*columns, "heading"):
+        table.add_column(column, no_wrap=True, justify="right")
+    for one in asked:
+        found = one.answer["distances_m"]
+        table.add_row(
+            one.track,
+            str(one.lanes),
+            _aligned_pair(one.to_lane_centre, one.answer["to_lane_centre_m"]),
+            *(_aligned_pair(one.distances[name], found[name]) for name in ("ml", "mr", "m")),
+            f"{one.angle:+.3f} {one.answer['angle_rad']:+.3f}",
+            f"{one.heading} {one.answered_heading}",
+        )
+    return table
 
-    return "<table>" + line("th", head) + "".join(line("td", row) for row in rows) + "</table>"
+
+def _aligned_pair(true: float | None, predicted: float | None) -> str:
+    return " ".join("  -  " if v is None else f"{v:+.2f}" for v in (true, predicted))

@@ -39,8 +39,7 @@ def stats(
     """Write an HTML page of distributions, class balance, concerns and sample frames."""
     from datagen.recording.dataset import Dataset
     from datagen.recording.statistics import describe
-    from datagen.stats.concerns import concerns
-    from datagen.stats.page import page
+    from datagen.stats.page import concerns, page
     from runtime.files import atomic_write, check_folder
 
     dataset = Dataset.open(folder)

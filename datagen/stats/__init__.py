@@ -1,1 +1,1 @@
-"""A dataset as a page to look at: distributions, balance, concerns and a contact sheet."""
+"""The statistics page of a dataset: distributions, balance, concerns and a contact sheet."""

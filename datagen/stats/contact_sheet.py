@@ -1,4 +1,4 @@
-"""Frames of a dataset to look at, spread over its tracks and lights, true markings drawn on them.
+"""Contact sheet of a dataset: frames spread over its tracks and lights, with their true markings.
 
 The markings are the recorded ones (topic /camera/front/annotations), in pixels.
 """
@@ -25,13 +25,13 @@ Image = NDArray[np.uint8]
 
 IMAGE_DATA = 2  # number of the field `data` of foxglove.CompressedImage
 SCALE = 2
-"""Frames are shown this much larger, so that thin lines stay thin."""
+"""Factor by which frames are enlarged, so that thin lines stay thin."""
 _GREEN = (40, 255, 80)
 
 
 @dataclass(frozen=True)
 class Card:
-    """A frame of the sheet."""
+    """A frame of the contact sheet."""
 
     image: Image
     """(2 H, 2 W, 3) uint8 RGB."""
@@ -40,29 +40,30 @@ class Card:
 
 
 def contact_sheet(dataset: Dataset, most: int = 24) -> Iterator[Card]:
-    """Up to `most` frames: each round's turn comes after those whose track and light are rarer."""
-    chosen = _spread(dataset.rounds)[:most]
-    for turn, number in enumerate(chosen):
+    """Up to `most` frames, one a round; rounds of tracks and lights not shown yet come first."""
+    chosen = _diverse_order(dataset.rounds)[:most]
+    for place, number in enumerate(chosen):
         info, index = dataset.rounds[number], dataset.indexes[number]
-        frame = int((turn * 0.6180339887498949 % 1.0) * info.frames)  # anywhere in the round
+        # Multiples of the golden ratio: evenly spread over the places in a round.
+        frame = int((place * 0.6180339887498949 % 1.0) * info.frames)
         yield _card(info, index, frame, (dataset.camera.height, dataset.camera.width))
 
 
-def _spread(rounds: list[RoundInfo]) -> list[int]:
-    """Numbers of all rounds, those first that differ most from the ones before them."""
+def _diverse_order(rounds: list[RoundInfo]) -> list[int]:
+    """The indices of all rounds; each next one shares the fewest properties with those before."""
     left, order = list(range(len(rounds))), list[int]()
     seen: dict[tuple[str, str | int], int] = {}
     while left:
-        kinds = {n: _kinds(rounds[n]) for n in left}
-        best = min(left, key=lambda n: sum(seen.get(kind, 0) for kind in kinds[n]))
-        for kind in kinds[best]:
-            seen[kind] = seen.get(kind, 0) + 1
+        properties = {n: _properties(rounds[n]) for n in left}
+        best = min(left, key=lambda n: sum(seen.get(p, 0) for p in properties[n]))
+        for item in properties[best]:
+            seen[item] = seen.get(item, 0) + 1
         order.append(best)
         left.remove(best)
     return order
 
 
-def _kinds(info: RoundInfo) -> tuple[tuple[str, str | int], ...]:
+def _properties(info: RoundInfo) -> tuple[tuple[str, str | int], ...]:
     return (("track", info.track), ("light", info.light), ("lanes", info.lanes))
 
 
@@ -70,19 +71,20 @@ def _card(info: RoundInfo, index: RoundIndex, frame: int, size: tuple[int, int])
     data = bytes_field(index.messages[CAMERA].payload(frame), IMAGE_DATA)
     image = np.empty((*size, 3), np.uint8)
     decode_into(data, image)
-    notes = _annotations(info.path, int(index.messages[CAMERA].log_time[frame]))
+    annotations = _annotations(info.path, int(index.messages[CAMERA].log_time[frame]))
     big = cv2.resize(image, None, fx=SCALE, fy=SCALE, interpolation=cv2.INTER_LINEAR)
-    for line in notes.points:
+    for line in annotations.points:
         points = np.array([(p.x, p.y) for p in line.points]) * SCALE
         cv2.polylines(big, [np.round(points).astype(np.int32)], False, _GREEN, 1, cv2.LINE_AA)
     lanes = f"{info.lanes} lane{'s' if info.lanes > 1 else ''}"
     light = light_per_frame(index)[frame]
     about = f"{info.id} #{frame} ({info.split or 'no side'}): {info.track}, {lanes}, {light}"
-    return Card(np.asarray(big, np.uint8), about, notes.texts[0].text if notes.texts else "")
+    caption = annotations.texts[0].text if annotations.texts else ""
+    return Card(np.asarray(big, np.uint8), about, caption)
 
 
 def _annotations(path: Path, log_time: int) -> ImageAnnotations:
-    """What was drawn over the image of this moment."""
+    """The annotations of the image recorded at `log_time` (ns)."""
     with path.open("rb") as file:
         reader = make_reader(file)
         for _, _, message in reader.iter_messages(

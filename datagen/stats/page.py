@@ -1,87 +1,82 @@
-"""The page of a dataset: one HTML file that needs nothing beside it."""
+"""The HTML page of a dataset: distributions, balance, concerns and a contact sheet."""
 
-import base64
-from collections.abc import Iterator
-from html import escape
-from importlib.resources import files
-from string import Template
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import numpy as np
-import simplejpeg
+from markupsafe import Markup
 
 import trackfeatures as tf
 from datagen.recording.dataset import Dataset
 from datagen.recording.labels import Labels
+from datagen.recording.round_metadata import RoundInfo
 from datagen.recording.splits import SIDES
 from datagen.recording.statistics import describe
-from datagen.stats.charts import Numbers, bars, histogram
-from datagen.stats.concerns import NEEDED, concerns
-from datagen.stats.contact_sheet import Card, contact_sheet
+from datagen.stats.contact_sheet import contact_sheet
+from runtime.html import embed_jpeg, render
+from runtime.svg_charts import bars, histogram
 
-KINDS = ("track", "lanes", "trajectory", "traffic")
-SHEET_QUALITY = 80
+BALANCED_BY = ("track", "lanes", "trajectory", "traffic")
+"""Properties of a round whose frames are counted."""
+MIN_CLASS_SHARE = 0.15
+MIN_ACTIVE_SHARE = 0.02
+SHARED_BY_SPLITS = ("track", "lanes", "light", "trajectory")
+"""Properties of a round of which both splits should have the same values."""
+REQUIRED_SPLITS = ("train", "test")
+"""Splits that every dataset needs; `unseen` is collected on request, and differs on purpose."""
 
 
 def page(dataset: Dataset) -> str:
-    """HTML of distributions, balance and a contact sheet."""
+    """The page's HTML; it needs no other file."""
     statistics = describe(dataset)
     labels = dataset.select("all").labels
-    sides = np.array([info.split for info in dataset.rounds])[labels.round]
-    shown = [side for side in SIDES if side in sides or side in NEEDED]
-    parts = {side: labels.take(np.flatnonzero(sides == side)) for side in shown}
-    template = Template(files("datagen.stats").joinpath("page.html").read_text())
-    return template.substitute(
-        name=escape(dataset.path.resolve().name),
-        summary=_summary(statistics),
-        hash=statistics["content_hash"],
-        concerns=_concerns(concerns(statistics, dataset.rounds)),
-        balance="".join(_balance(dataset, parts)),
-        histograms="".join(_histograms(parts)),
-        sheet="".join(_picture(card) for card in contact_sheet(dataset)),
+    splits = np.array([info.split for info in dataset.rounds])[labels.round]
+    shown = [split for split in SIDES if split in splits or split in REQUIRED_SPLITS]
+    by_split = {split: labels.take(np.flatnonzero(splits == split)) for split in shown}
+    return render(
+        "datagen.stats",
+        "page.html",
+        name=dataset.path.resolve().name,
+        statistics=statistics,
+        concerns=concerns(statistics, dataset.rounds),
+        balance=_balance(dataset, by_split),
+        histograms=_histograms(by_split),
+        cards=(
+            {"jpeg": embed_jpeg(card.image), "about": card.about, "caption": card.caption}
+            for card in contact_sheet(dataset)
+        ),
     )
 
 
-def _summary(statistics: dict[str, Any]) -> str:
-    camera = statistics["camera"]
-    return (
-        f"{statistics['frames']:,} frames in {statistics['rounds']} rounds, {camera['width']} x "
-        f"{camera['height']} px, vertical field of view {camera['fov_y_deg']:g}&deg;; "
-        f"{statistics['train']['frames']:,} to train, {statistics['test']['frames']:,} to test."
-    )
-
-
-def _concerns(sentences: list[str]) -> str:
-    if not sentences:
-        return "<p class=good>Nothing stands out: no rare class, no one-sided track or light.</p>"
-    return f"<ul class=bad>{''.join(f'<li>{escape(s)}' for s in sentences)}</ul>"
-
-
-def _balance(dataset: Dataset, parts: dict[str, Labels]) -> Iterator[str]:
-    counts = {side: np.bincount(part.heading, minlength=3).tolist() for side, part in parts.items()}
+def _balance(dataset: Dataset, by_split: dict[str, Labels]) -> Iterator[Markup]:
+    counts = [np.bincount(labels.heading, minlength=3).tolist() for labels in by_split.values()]
     yield bars(
         "heading class",
-        {kind.name.lower(): [counts[side][kind] for side in parts] for kind in tf.Heading},
+        {kind.name.lower(): [count[kind] for count in counts] for kind in tf.Heading},
     )
-    sides = list(parts)
-    for kind in KINDS:
+    splits = list(by_split)
+    for name in BALANCED_BY:
         frames: dict[str, list[int]] = {}
         for info in dataset.rounds:
-            row = frames.setdefault(str(getattr(info, kind)), [0] * len(sides))
-            if info.split in sides:
-                row[sides.index(info.split)] += info.frames
-        yield bars(kind, dict(sorted(frames.items(), key=_in_order)))
-    lights = sorted({light for part in parts.values() for light in part.light.tolist()})
-    yield bars("light", {k: [int((parts[s].light == k).sum()) for s in parts] for k in lights})
+            row = frames.setdefault(str(getattr(info, name)), [0] * len(splits))
+            if info.split in splits:
+                row[splits.index(info.split)] += info.frames
+        yield bars(name, dict(sorted(frames.items(), key=_numbers_in_order)))
+    lights = sorted({light for labels in by_split.values() for light in labels.light.tolist()})
+    yield bars(
+        "light",
+        {k: [int((labels.light == k).sum()) for labels in by_split.values()] for k in lights},
+    )
 
 
-def _in_order(item: tuple[str, Any]) -> tuple[int, str]:
+def _numbers_in_order(item: tuple[str, Any]) -> tuple[int, str]:
     return (int(item[0]) if item[0].isdigit() else 0, item[0])
 
 
-def _histograms(parts: dict[str, Labels]) -> Iterator[str]:
+def _histograms(by_split: dict[str, Labels]) -> Iterator[Markup]:
     for i, marking in enumerate(tf.MARKINGS):
-        yield histogram(marking, "m", {s: part.distances[:, i] for s, part in parts.items()})
+        columns = {split: labels.distances[:, i] for split, labels in by_split.items()}
+        yield histogram(marking, "m", columns)
     for name, unit, scale in (
         ("to_lane_centre", "m", 1.0),
         ("to_middle", "m", 1.0),
@@ -90,15 +85,57 @@ def _histograms(parts: dict[str, Labels]) -> Iterator[str]:
         ("speed", "km/h", 3.6),
         ("shadow_fraction", "of the road within 30 m", 1.0),
     ):
-        columns: dict[str, Numbers] = {s: getattr(p, name) * scale for s, p in parts.items()}
+        columns = {split: getattr(labels, name) * scale for split, labels in by_split.items()}
         yield histogram(name.replace("_", " "), unit, columns)
 
 
-def _picture(card: Card) -> str:
-    jpeg = simplejpeg.encode_jpeg(np.ascontiguousarray(card.image), quality=SHEET_QUALITY)
-    data = base64.b64encode(jpeg).decode()
-    return (
-        f'<figure><img src="data:image/jpeg;base64,{data}" alt="{escape(card.about)}">'
-        f"<figcaption>{escape(card.about)}<br><small>{escape(card.caption)}</small></figcaption>"
-        "</figure>"
-    )
+# Concerns: properties of a dataset that would make a model worse.
+
+
+def concerns(statistics: dict[str, Any], rounds: Iterable[RoundInfo]) -> list[str]:
+    """Sentences on the `statistics` of `datagen.recording.statistics.describe` and the rounds."""
+    return [
+        *_empty_splits(statistics),
+        *_rare_labels(statistics),
+        *_one_sided_properties(list(rounds)),
+    ]
+
+
+def _empty_splits(statistics: dict[str, Any]) -> Iterator[str]:
+    for split in REQUIRED_SPLITS:
+        if not statistics[split]["frames"]:
+            yield f"No round is for {split}: collect more rounds or make another split."
+
+
+def _rare_labels(statistics: dict[str, Any]) -> Iterator[str]:
+    for split in REQUIRED_SPLITS:
+        if not statistics[split]["frames"]:
+            continue
+        for name, share in statistics[split]["heading"].items():
+            if share < MIN_CLASS_SHARE:
+                yield (
+                    f"Class {name} has {share:.1%} of the {split} frames, less than "
+                    f"{MIN_CLASS_SHARE:.0%}: a model may learn to leave it out."
+                )
+        for name, share in statistics[split]["active"].items():
+            if share < MIN_ACTIVE_SHARE:
+                yield (
+                    f"{name} is active in {share:.1%} of the {split} frames: too few to evaluate "
+                    "a model on."
+                )
+
+
+def _one_sided_properties(rounds: list[RoundInfo]) -> Iterator[str]:
+    """Values of a property that occur in one split and not in the other."""
+    by_split = {s: [info for info in rounds if info.split == s] for s in REQUIRED_SPLITS}
+    if not all(by_split.values()):
+        return
+    for name in SHARED_BY_SPLITS:
+        train, test = ({v for i in by_split[s] for v in i.values_of(name)} for s in REQUIRED_SPLITS)
+        for only, other, split in (
+            (train - test, "test", "train"),
+            (test - train, "train", "test"),
+        ):
+            if only:
+                values = ", ".join(sorted(only))
+                yield f"{name.capitalize()} {values}: in {split} rounds only, in no {other} round."

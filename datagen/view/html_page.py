@@ -1,57 +1,52 @@
-"""A round as one page of HTML that needs nothing beside it: pictures, plan and plots in step."""
+"""A recorded round as one HTML page that needs no other file: images, plan view and plots in step.
 
-import base64
-import json
-from html import escape
-from importlib.resources import files
+Positions are in m in the world frame, angles in rad, markings in pixels of the image.
+"""
+
 from math import atan2
-from string import Template
 from typing import Any
 
 import numpy as np
 
 from datagen.recording.images import PNG_MAGIC
 from datagen.view.contents import Contents, Plot, Points, Pose
+from runtime.html import data_uri, render
 
-MOST_FRAMES = 500
-"""More are thinned out evenly, so that the page stays below about 15 MB."""
+MAX_FRAMES = 500
+"""Longer rounds are subsampled evenly, so that the page stays below about 15 MB."""
 
 
-def page(contents: Contents, most: int = MOST_FRAMES) -> str:
-    """The page's HTML; plots hold every step, pictures at most `most`."""
+def page(contents: Contents, max_frames: int = MAX_FRAMES) -> str:
+    """The page's HTML; plots have every step, images are at most `max_frames`."""
     count = len(contents.steps)
-    shown = range(0, count, -(-count // most))
+    shown = range(0, count, -(-count // max_frames))
     data = {
         "times": contents.steps.times_s,
         "frames": [_frame(contents, number) for number in shown],
         "plots": [_plot(plot) for plot in contents.plots],
-        "lines": [_rounded(line[:, :2]) for line in contents.scene.values() if len(line)],
+        "lines": [_flatten(line[:, :2]) for line in contents.scene.values() if len(line)],
         "size": [contents.header.camera.width, contents.header.camera.height],
     }
-    # A closing tag inside a script would end it.
-    text = json.dumps(data, separators=(",", ":")).replace("</", "<\\/")
-    template = Template(files("datagen.view").joinpath("page.html").read_text(encoding="utf-8"))
-    thinned = "" if len(shown) == count else f"; one picture in {shown.step}"
-    return template.substitute(
-        name=escape(contents.header.id), about=escape(contents.about + thinned), data=text
-    )
+    subsampled = "" if len(shown) == count else f"; one image in {shown.step} steps"
+    about = contents.about + subsampled
+    return render("datagen.view", "page.html", name=contents.header.id, about=about, data=data)
 
 
 def _frame(contents: Contents, number: int) -> dict[str, Any]:
     image = bytes(contents.steps[number].image)
-    kind = "png" if image.startswith(PNG_MAGIC) else "jpeg"
+    media_type = "image/png" if image.startswith(PNG_MAGIC) else "image/jpeg"
     return {
         "step": number,
-        "image": f"data:image/{kind};base64,{base64.b64encode(image).decode()}",
-        "markings": [_rounded(line, 1) for line in contents.markings(number)],
+        "image": data_uri(image, media_type),
+        "markings": [_flatten(line, 1) for line in contents.markings(number)],
         "caption": contents.caption(number),
-        "car": _on_plan(contents.pose(number)),
-        "traffic": [_on_plan(box.pose) for box in contents.boxes(number)],
+        "car": _planar_pose(contents.pose(number)),
+        "traffic": [_planar_pose(box.pose) for box in contents.boxes(number)],
     }
 
 
-def _on_plan(pose: Pose) -> list[float]:
-    """x, y (m) and yaw (rad) in the world."""
+def _planar_pose(pose: Pose) -> list[float]:
+    """x, y (m) and yaw (rad) in the world frame."""
     x, y, z, w = pose.quaternion.tolist()
     yaw = atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
     return [round(float(pose.position[0]), 2), round(float(pose.position[1]), 2), round(yaw, 3)]
@@ -71,6 +66,6 @@ def _plot(plot: Plot) -> dict[str, Any]:
     }
 
 
-def _rounded(points: Points, digits: int = 2) -> list[float]:
-    """x, y, x, y, ..."""
+def _flatten(points: Points, digits: int = 2) -> list[float]:
+    """Points (N, 2) as x, y, x, y, ..., rounded."""
     return [float(value) for value in np.round(points, digits).ravel()]

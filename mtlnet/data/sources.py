@@ -9,7 +9,7 @@ import numpy as np
 
 from datagen.recording import Dataset, DatasetError, Frames, UndecodableImage
 from mtlnet.data.custom_images import CustomImages, has_labels_file, open_custom_images
-from mtlnet.evaluation.metrics import describe_data, mean_answer
+from mtlnet.evaluation.metrics import describe_data, mean_labels
 from mtlnet.inference.model_card import ModelCard, ModelError
 from mtlnet.model.architecture import HEIGHT, WIDTH
 from mtlnet.training.config import TrainConfig
@@ -84,7 +84,7 @@ def custom_training_data(folder: Path, card: ModelCard | None) -> TrainingData:
         "held_out": [],
         "seeds": [],
         "tracks": [],
-        "mean": mean_answer(images.labels),
+        "mean": mean_labels(images.labels),
     }
     return TrainingData(images, None, card.camera, about)
 

@@ -1,0 +1,1 @@
+"""Evaluation: metrics, the report page, and the ablation of the paper."""

@@ -1,8 +1,8 @@
-"""The paper's ablation: which tasks to learn together, and how much of each; and two yardsticks.
+"""The paper's ablation: which tasks to learn together, with which weights; and two other networks.
 
-Every row is trained anew for each seed, with equal iterations, on the same data, and judged on the
-same rounds, in float32. A run is an ordinary run folder; what is finished is kept, so that a
-killed ablation goes on where it stood.
+Every row is trained for each seed with equal iterations on the same data, and evaluated on the same
+rounds in float32. A run is an ordinary run folder. Finished runs are kept, so that an interrupted
+ablation continues with the first unfinished one.
 """
 
 import json
@@ -28,11 +28,14 @@ from trackfeatures.errors import UserError
 
 SETTINGS, EVALUATION = "settings.json", "evaluation.json"
 BACKBONE = "mobilenet_v3_small"
+TASK_NAMES = ("distance", "angle", "type")
+"""The tasks as the paper, the rows and the columns of `curves.csv` name them; `type` is the heading
+class."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """One row of the table; `paper`: its distance loss, angle loss and accuracy there."""
+    """One row of the table; `paper`: the paper's distance loss, angle loss and accuracy."""
 
     name: str
     title: str
@@ -53,11 +56,11 @@ PAPER_ROWS = (
 )
 
 
-def rows_of(backbone: str = BACKBONE) -> tuple[Row, ...]:
-    """The paper's seven rows, DeepDriving and a backbone; UserError when it is none."""
+def ablation_rows(backbone: str = BACKBONE) -> tuple[Row, ...]:
+    """The paper's seven rows, DeepDriving and `backbone`; UserError when it is no backbone."""
     plan = find_architecture(backbone)
     if not plan.backbone:
-        raise UserError(f"{backbone} is no backbone of torchvision; give {BACKBONE} or another")
+        raise UserError(f"{backbone} is not a backbone of torchvision; give {BACKBONE} or another")
     others = (find_architecture("deepdriving"), plan)
     titles = ("DeepDriving (Chen et al.)", backbone)
     return PAPER_ROWS + tuple(
@@ -67,7 +70,7 @@ def rows_of(backbone: str = BACKBONE) -> tuple[Row, ...]:
 
 @dataclass(frozen=True)
 class AblationConfig:
-    """One ablation. `rows` and `seeds` may grow from one call to the next, nothing else changes."""
+    """One ablation. Between calls only `seeds`, `device` and `threads` may change."""
 
     data: Path
     out: Path
@@ -77,7 +80,7 @@ class AblationConfig:
     batch: int = 32
     split: str = "test"
     every: int = 5
-    """Each so many-th frame is judged."""
+    """Every n-th frame is evaluated."""
     device: str = "auto"
     threads: int = 0
 
@@ -86,8 +89,8 @@ class AblationConfig:
         if not self.seeds or len(set(self.seeds)) != len(self.seeds):
             raise UserError(f"--seeds {self.seeds} must be different numbers, at least one")
 
-    def fixed(self) -> dict[str, Any]:
-        """What makes two runs comparable."""
+    def shared_settings(self) -> dict[str, Any]:
+        """The settings that must be equal for runs to be comparable."""
         same = ("iterations", "recipe", "batch", "split", "every")
         return {"definitions": tf.VERSION, **{name: getattr(self, name) for name in same}}
 
@@ -102,26 +105,26 @@ class Run:
 
     @property
     def state(self) -> str:
-        """finished, stopped (its training or its evaluation is not complete) or new."""
+        """finished, stopped (its training or evaluation is not complete) or new."""
         if read_evaluation(self.folder) is not None:
             return "finished"
         return "stopped" if (self.folder / CONFIG).is_file() else "new"
 
 
 Train = Callable[[TrainConfig, dict[str, Any] | None], Any]
-Judge = Callable[[Path, AblationConfig], dict[str, Any]]
+Evaluate = Callable[[Path, AblationConfig], dict[str, Any]]
 
 
 def parse_seeds(text: str) -> tuple[int, ...]:
-    """Seeds "1,2,3"; UserError when one is no number from 0."""
+    """Seeds given as "1,2,3"; UserError when one is not a non-negative integer."""
     parts = [part.strip() for part in text.split(",")]
     if not all(part.isascii() and part.isdigit() for part in parts):
-        raise UserError(f"--seeds {text!r} has no numbers; give them as 1,2,3")
+        raise UserError(f"--seeds {text!r} is not a list of whole numbers; give them as 1,2,3")
     return tuple(int(part) for part in parts)
 
 
 def plan_runs(config: AblationConfig, rows: Sequence[Row]) -> list[Run]:
-    """All runs, the first seed of every row first: an early table is a whole one."""
+    """All runs, seed by seed, so that the table is complete as early as possible."""
     return [
         Run(row, seed, config.out / "runs" / f"{row.name}-seed{seed}")
         for seed in config.seeds
@@ -130,15 +133,15 @@ def plan_runs(config: AblationConfig, rows: Sequence[Row]) -> list[Run]:
 
 
 def require_same_settings(config: AblationConfig, content_hash: str) -> None:
-    """Write what all runs of the folder share, or raise UserError when it is something else."""
-    wanted = {**config.fixed(), "content_hash": content_hash}
+    """Write the settings of a new folder; UserError when it was made with others."""
+    settings = {**config.shared_settings(), "content_hash": content_hash}
     path = config.out / SETTINGS
     if path.is_file():
         try:
             found = json.loads(path.read_text(encoding="utf-8"))
         except ValueError as error:
             raise UserError(f"{path} is damaged ({error}); give a new --out") from error
-        for name, value in wanted.items():
+        for name, value in settings.items():
             if found.get(name) != value:
                 raise UserError(
                     f"the ablation in {config.out} was made with {name} {found.get(name)}, now it "
@@ -146,24 +149,26 @@ def require_same_settings(config: AblationConfig, content_hash: str) -> None:
                 )
         return
     if config.out.exists() and any(config.out.iterdir()):
-        raise UserError(f"{config.out} holds something else ({SETTINGS} is missing); give another")
+        raise UserError(
+            f"{config.out} holds other files ({SETTINGS} is missing); give another --out"
+        )
     config.out.mkdir(parents=True, exist_ok=True)
-    atomic_write(path, (json.dumps(wanted, indent=1) + "\n").encode(), fsync=True)
+    atomic_write(path, json.dumps(settings, indent=1) + "\n", fsync=True)
 
 
-def carry_out(
-    config: AblationConfig, runs: Sequence[Run], train: Train, judge: Judge
+def finish_runs(
+    config: AblationConfig, runs: Sequence[Run], train: Train, evaluate: Evaluate
 ) -> Iterator[Run]:
-    """Finish the runs one by one; each is given out when it is finished, old ones at once."""
+    """Finish the runs one by one and yield each; those finished before are yielded at once."""
     for run in runs:
         if run.state != "finished":
-            _finish(config, run, train, judge)
+            _finish(config, run, train, evaluate)
         yield run
 
 
-def _finish(config: AblationConfig, run: Run, train: Train, judge: Judge) -> None:
-    """Train (or go on), judge, and drop what only training needs."""
-    wanted = TrainConfig(
+def _finish(config: AblationConfig, run: Run, train: Train, evaluate: Evaluate) -> None:
+    """Train or resume, evaluate, and delete the checkpoints."""
+    train_config = TrainConfig(
         data=config.data,
         out=run.folder,
         network=run.row.network,
@@ -177,20 +182,20 @@ def _finish(config: AblationConfig, run: Run, train: Train, judge: Judge) -> Non
     )
     if not (run.folder / CARD).is_file():
         if (run.folder / CONFIG).is_file():
-            given = {k: v for k, v in vars(wanted).items() if k not in ("out", "minutes")}
+            given = {k: v for k, v in vars(train_config).items() if k not in ("out", "minutes")}
             train(*resume_config(run.folder, given))
         else:
-            # A folder without a configuration: killed while it was made.
+            # A folder without a configuration: the process was killed while it made it.
             shutil.rmtree(run.folder, ignore_errors=True)
-            train(wanted, None)
-    result = judge(run.folder, config)
-    atomic_write(run.folder / EVALUATION, (json.dumps(result) + "\n").encode(), fsync=True)
-    # Twice 100 MB and more a run, of no use once it is finished.
+            train(train_config, None)
+    result = evaluate(run.folder, config)
+    atomic_write(run.folder / EVALUATION, json.dumps(result) + "\n", fsync=True)
+    # More than 200 MB a run, which a finished run does not need.
     shutil.rmtree(run.folder / CHECKPOINTS, ignore_errors=True)
 
 
 def read_evaluation(folder: Path) -> dict[str, Any] | None:
-    """The evaluation of a finished run; None while there is none, or of other weights."""
+    """The evaluation of a finished run; None when there is none, or it is of other weights."""
     if not (folder / EVALUATION).is_file() or not (folder / CARD).is_file():
         return None
     try:
@@ -203,27 +208,38 @@ def read_evaluation(folder: Path) -> dict[str, Any] | None:
 # The figures of an ablation, mean and spread over its seeds, and its training curves.
 
 
-# Name, heading, unit, digits, and which task it judges (index into alpha).
+@dataclass(frozen=True)
+class Column:
+    """A figure of the table; `task`: the index in alpha of the task that it measures."""
+
+    name: str
+    title: str
+    unit: str
+    digits: int
+    task: int
+    scale: float = 1.0
+
+
 LOSSES = (
-    ("distance_loss", "distance loss", "squared", 5, 0),
-    ("distance_absolute", "distance loss", "absolute", 4, 0),
-    ("angle_loss", "angle loss", "squared", 5, 1),
-    ("angle_absolute", "angle loss", "absolute", 5, 1),
-    ("accuracy", "type accuracy", "%", 2, 2),
+    Column("distance_loss", "distance loss", "squared", 5, 0),
+    Column("distance_absolute", "distance loss", "absolute", 4, 0),
+    Column("angle_loss", "angle loss", "squared", 5, 1),
+    Column("angle_absolute", "angle loss", "absolute", 5, 1),
+    Column("accuracy", "type accuracy", "%", 2, 2, scale=100.0),
 )
 ERRORS = (
-    *((marking, marking, "m", 3, 0) for marking in tf.MARKINGS),
-    ("to_lane_centre", "to lane centre", "m", 3, 0),
-    ("angle", "angle", "rad", 4, 1),
+    *(Column(marking, marking, "m", 3, 0) for marking in tf.MARKINGS),
+    Column("to_lane_centre", "to lane centre", "m", 3, 0),
+    Column("angle", "angle", "rad", 4, 1),
 )
 COLUMNS = LOSSES + ERRORS
-# After which columns the paper's figures stand: it does not say how its losses are taken.
+# The columns followed by the paper's figures; the paper does not define its losses exactly.
 PAPER_COLUMNS = ("distance_absolute", "angle_absolute", "accuracy")
-POINTS = 120  # of a curve
+MAX_CURVE_POINTS = 120
 
 
 def figures(result: dict[str, Any]) -> dict[str, float | None]:
-    """What the table says of one evaluation, for each of `COLUMNS`."""
+    """The value of each of `COLUMNS` in one evaluation."""
     return {
         "distance_loss": result["coded"]["distance"],
         "distance_absolute": result["coded"]["distance_absolute"],
@@ -240,7 +256,7 @@ def table(rows: Sequence[Row], runs: Sequence[Run]) -> list[dict[str, Any]]:
     """One entry a row: {"row", "seeds", "figures": {column: {"mean", "std", "values"} or None}}.
 
     A column is None where the row did not learn that task. `std` is the sample standard deviation
-    over the seeds, None of a single one.
+    over the seeds, None for a single seed.
     """
     entries = []
     for row in rows:
@@ -253,8 +269,10 @@ def table(rows: Sequence[Row], runs: Sequence[Run]) -> list[dict[str, Any]]:
                 "seeds": [seed for seed, _ in done],
                 "frames": done[0][1]["frames"] if done else None,
                 "figures": {
-                    name: _spread([f[name] for f in each]) if row.alpha[task] > 0 else None
-                    for name, _, _, _, task in COLUMNS
+                    c.name: _mean_and_std([f[c.name] for f in each])
+                    if row.alpha[c.task] > 0
+                    else None
+                    for c in COLUMNS
                 },
             }
         )
@@ -262,7 +280,7 @@ def table(rows: Sequence[Row], runs: Sequence[Run]) -> list[dict[str, Any]]:
 
 
 def best(entries: Sequence[dict[str, Any]], column: str) -> int | None:
-    """The entry that is best in a column, by its mean; None while there is none."""
+    """The index of the entry with the best mean in a column; None when no entry has one."""
     means = [
         (entry["figures"][column] or {}).get("mean", None) if entry["seeds"] else None
         for entry in entries
@@ -276,9 +294,9 @@ def best(entries: Sequence[dict[str, Any]], column: str) -> int | None:
 def training_curve(
     runs: Sequence[Run], row: Row, task: str
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
-    """Steps (P,) and losses (seeds, P) of a task in training; None without a finished run.
+    """Steps (P,) and training losses (seeds, P) of a task; None without a finished run.
 
-    Each point is the mean of an equal share of the logged ones: the loss of a batch jumps.
+    Each point is the mean over an equal share of the logged points, which smooths the curve.
     """
     series = []
     for run in runs:
@@ -288,12 +306,12 @@ def training_curve(
     if not series:
         return None
     length = min(len(points) for points in series)
-    chunks = np.array_split(np.arange(length), min(POINTS, length))
+    chunks = np.array_split(np.arange(length), min(MAX_CURVE_POINTS, length))
     steps = np.array([series[0][chunk, 0].max() for chunk in chunks])
     return steps, np.array([[p[chunk, 1].mean() for chunk in chunks] for p in series])
 
 
-def _spread(values: list[float | None]) -> dict[str, Any] | None:
+def _mean_and_std(values: list[float | None]) -> dict[str, Any] | None:
     present = [value for value in values if value is not None]
     if not present:
         return None

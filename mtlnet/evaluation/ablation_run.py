@@ -1,7 +1,7 @@
-"""`mtlnet ablate --out FOLDER --iterations N --seeds 1,2,3`: the table of the paper, made anew.
+"""Runs the paper's ablation: `mtlnet ablate --out FOLDER --iterations N --seeds 1,2,3`.
 
-The folder holds `runs/ROW-seedS`, `ablation.json` and `ablation.html`, written again after every
-finished run: the page can be read while the ablation goes on.
+The folder holds `runs/ROW-seedS`, `ablation.json` and `ablation.html`. Both files are written again
+after every finished run, so that the page can be read while the ablation continues.
 """
 
 import json
@@ -9,13 +9,11 @@ import os
 import statistics
 import time
 from collections.abc import Sequence
-from html import escape
-from importlib.resources import files
 from pathlib import Path
-from string import Template
 from typing import Any
 
 import numpy as np
+from markupsafe import Markup
 from rich.console import Console
 
 from datagen.recording import Dataset
@@ -25,11 +23,14 @@ from mtlnet.evaluation.ablation import (
     ERRORS,
     LOSSES,
     PAPER_COLUMNS,
+    TASK_NAMES,
     AblationConfig,
+    Column,
     Row,
     Run,
+    Train,
     best,
-    carry_out,
+    finish_runs,
     plan_runs,
     require_same_settings,
     table,
@@ -40,21 +41,21 @@ from mtlnet.inference.curves import CURVES, read_curves
 from mtlnet.inference.engine import load_engine
 from mtlnet.model.architecture import find_architecture
 from mtlnet.training.config import TrainConfig
-from mtlnet.training.loop import Progress
-from mtlnet.training.loss import TASKS
+from mtlnet.training.loop import TrainProgress
 from mtlnet.training.recipes import find_recipe
 from mtlnet.training.run import train
 from mtlnet.training.trainer import Trainer, choose_device
 from runtime.files import atomic_write
-from runtime.svg_charts import Line, Numbers, Plot, plot, style
+from runtime.html import render
+from runtime.svg_charts import Line, Numbers, Plot, line_plot
 from trackfeatures.errors import UserError
 
 TIMED_STEPS = 2
-SAY_SECONDS = 30.0
+REPORT_SECONDS = 30.0
 
 
 def ablate(config: AblationConfig, rows: Sequence[Row], *, dry_run: bool = False) -> dict[str, Any]:
-    """Carry an ablation out, or only say what it would do; what `--json` prints.
+    """Run an ablation, or with `dry_run` print its plan; returns what `--json` prints.
 
     Raises UserError when the folder was made with other settings, or a run fails.
     """
@@ -63,10 +64,12 @@ def ablate(config: AblationConfig, rows: Sequence[Row], *, dry_run: bool = False
     dataset.select(config.split)  # raises where there are no such rounds
     runs = plan_runs(config, rows)
     if dry_run:
-        return _tell_plan(config, runs, dataset, console)
+        return _plan_with_times(config, runs, dataset, console)
     require_all_decodable(dataset, ("train", config.split))  # once for all runs
     require_same_settings(config, dataset.content_hash)
-    for number, run in enumerate(carry_out(config, runs, _trainer(console), _judge), 1):
+    for number, run in enumerate(
+        finish_runs(config, runs, _train_with_messages(console), _evaluate_run), 1
+    ):
         console.print(f"{number} of {len(runs)}: {run.folder} is finished")
         write_result(config, rows, runs)
     console.print(f"the table: {config.out / 'ablation.html'}")
@@ -74,32 +77,29 @@ def ablate(config: AblationConfig, rows: Sequence[Row], *, dry_run: bool = False
 
 
 def write_result(config: AblationConfig, rows: Sequence[Row], runs: list[Run]) -> dict[str, Any]:
-    """Write `ablation.json` and `ablation.html` of what is finished; the content of the former."""
+    """Write `ablation.json` and `ablation.html` of the finished runs; the content of the former."""
     entries = table(rows, runs)
-    result = {**config.fixed(), "data": str(config.data), "rows": entries}
-    atomic_write(
-        config.out / "ablation.json", (json.dumps(result, indent=1) + "\n").encode(), fsync=True
-    )
-    atomic_write(
-        config.out / "ablation.html", page(config, entries, rows, runs).encode(), fsync=True
-    )
+    result = {**config.shared_settings(), "data": str(config.data), "rows": entries}
+    text = json.dumps(result, indent=1) + "\n"
+    atomic_write(config.out / "ablation.json", text, fsync=True)
+    atomic_write(config.out / "ablation.html", page(config, entries, rows, runs), fsync=True)
     return result
 
 
-def _trainer(console: Console) -> Any:
-    """`train` that says how far it is now and then."""
+def _train_with_messages(console: Console) -> Train:
+    """`train` that prints its step every `REPORT_SECONDS`."""
 
-    def work(config: TrainConfig, resumed: dict[str, Any] | None) -> None:
-        said = time.perf_counter()
+    def train_run(config: TrainConfig, resumed: dict[str, Any] | None) -> None:
+        printed = time.perf_counter()
         console.print(f"training {config.out}")
 
-        def report(point: Progress) -> None:
-            nonlocal said
-            if time.perf_counter() - said > SAY_SECONDS:
-                said = time.perf_counter()
+        def report(progress: TrainProgress) -> None:
+            nonlocal printed
+            if time.perf_counter() - printed > REPORT_SECONDS:
+                printed = time.perf_counter()
                 console.print(
-                    f"  step {point.step} of {config.iterations}, "
-                    f"{point.images_per_second:.0f} images/s"
+                    f"  step {progress.step} of {config.iterations}, "
+                    f"{progress.images_per_second:.0f} images/s"
                 )
 
         try:
@@ -107,24 +107,24 @@ def _trainer(console: Console) -> Any:
         except UserError as error:
             raise UserError(f"the run in {config.out} failed: {error}") from error
 
-    return work
+    return train_run
 
 
-def _judge(run: Path, config: AblationConfig) -> dict[str, Any]:
+def _evaluate_run(run: Path, config: AblationConfig) -> dict[str, Any]:
     """The evaluation of a finished run, in float32."""
     engines = [load_engine(run, "openvino", "f32") for _ in range(os.cpu_count() or 1)]
     return evaluate(engines, config.data, config.split, every=config.every)
 
 
-def _tell_plan(
+def _plan_with_times(
     config: AblationConfig, runs: Sequence[Run], dataset: Dataset, console: Console
 ) -> dict[str, Any]:
-    """The plan with the seconds that each run still needs."""
+    """The runs with the seconds that each still needs."""
     seconds = {
         name: step_seconds(config, name, runs, dataset)
         for name in dict.fromkeys(run.row.network for run in runs)
     }
-    plan = []
+    plan: list[dict[str, Any]] = []
     for run in runs:
         left = 0.0 if run.state == "finished" else config.iterations * seconds[run.row.network]
         alpha = list(run.row.alpha)
@@ -139,7 +139,7 @@ def _tell_plan(
             }
         )
         console.print(f"{run.folder}  {run.row.network} {alpha}: {run.state}, {left / 60:.1f} min")
-    total = sum(entry["seconds"] for entry in plan)  # type: ignore[misc]  # ints
+    total: int = sum(entry["seconds"] for entry in plan)
     console.print(f"{len(runs)} runs of {config.iterations} steps, about {total / 3600:.1f} h left")
     return {"runs": plan, "seconds": total, "step_seconds": seconds}
 
@@ -147,7 +147,7 @@ def _tell_plan(
 def step_seconds(
     config: AblationConfig, network: str, runs: Sequence[Run], dataset: Dataset
 ) -> float:
-    """Seconds a step: as finished runs of the network took, else of a few steps taken now."""
+    """Median seconds a step: of finished runs of the network, else of a few steps taken now."""
     speeds = [
         point["images_per_second"]
         for run in runs
@@ -171,103 +171,103 @@ def step_seconds(
     return statistics.median(taken[1:])  # the first one chooses kernels
 
 
-# The page of an ablation: one HTML file that needs nothing beside it.
+# The page of an ablation: one HTML file that needs no other file.
 
 
 COLOURS = ("#3b6fd4", "#e07a2e", "#2a9d5c", "#c23b6b")
-SINGLE = "#6a3fb5"  # the paper's purple line
-END = 0.05  # the share of a run over which its final loss is averaged
-Column = tuple[str, str, str, int, int]
+SINGLE_TASK_COLOUR = "#6a3fb5"  # the paper's purple line
+FINAL_SHARE = 0.05
+"""Share of a run over which its final loss is averaged."""
 PAPER_DIGITS = {"distance_absolute": 5, "angle_absolute": 5, "accuracy": 2}
-NONE = '<td class="none">&ndash;'
 
 
 def page(
     config: AblationConfig, entries: Sequence[dict[str, Any]], rows: Sequence[Row], runs: list[Run]
 ) -> str:
-    """HTML of the table beside the paper's, every marking, and the training curves."""
-    finished = sum(run.state == "finished" for run in runs)
-    frames = next((entry["frames"] for entry in entries if entry["frames"]), 0)
-    template = Template(
-        files("mtlnet.evaluation").joinpath("ablation.html").read_text(encoding="utf-8")
-    )
-    return template.substitute(
-        chart_style=style(),
-        summary=f"{finished} of {len(runs)} runs of {config.iterations:,} iterations each, judged "
-        f"on {frames:,} {escape(config.split)} frames.",
-        settings=f"Data <code>{escape(str(config.data))}</code>, recipe {escape(config.recipe)}, "
-        f"batches of {config.batch}, seeds {', '.join(map(str, config.seeds))}.",
-        losses=_table(entries, LOSSES),
-        errors=_table(entries, ERRORS),
-        charts="".join(_chart(number, rows, runs) for number in range(len(TASKS))),
+    """HTML of the losses beside the paper's, errors in metres and radians, and training curves."""
+    return render(
+        "mtlnet.evaluation",
+        "ablation.html",
+        config=config,
+        finished=sum(run.state == "finished" for run in runs),
+        runs=len(runs),
+        frames=next((entry["frames"] for entry in entries if entry["frames"]), 0),
+        losses=_results(entries, LOSSES),
+        errors=_results(entries, ERRORS),
+        charts=[_training_chart(number, rows, runs) for number in range(len(TASK_NAMES))],
     )
 
 
-def _table(entries: Sequence[dict[str, Any]], columns: Sequence[Column]) -> str:
-    """Rows that learn something of the `columns`, the paper's figures beside ours."""
-    winners = {name: best(entries, name) for name, *_ in columns}
-    heads = "".join(
-        f"<th>{title}<br><small>{unit}</small>"
-        + ('<th class="paper">paper' if name in PAPER_COLUMNS else "")
-        for name, title, unit, _, _ in columns
-    )
-    body = []
+def _results(entries: Sequence[dict[str, Any]], columns: Sequence[Column]) -> dict[str, Any]:
+    """Columns and rows of a table; rows that learn none of the columns' tasks are left out."""
+    best_rows = {column.name: best(entries, column.name) for column in columns}
+    rows = []
     for i, entry in enumerate(entries):
-        if all(entry["row"]["alpha"][task] == 0 for *_, task in columns):
+        row = entry["row"]
+        if all(row["alpha"][column.task] == 0 for column in columns):
             continue
         cells = []
-        for name, _, _, digits, _ in columns:
-            scale = 100.0 if name == "accuracy" else 1.0
-            cells.append(_cell(entry["figures"][name], digits, scale, bold=winners[name] == i))
-            if name in PAPER_COLUMNS:
-                value = entry["row"]["paper"][PAPER_COLUMNS.index(name)]
-                cells.append(
-                    '<td class="paper">'
-                    + ("" if value is None else f"{value * scale:.{PAPER_DIGITS[name]}f}")
-                )
-        part = ' class="part"' if entry["row"]["name"] in ("mtl-1", "deepdriving") else ""
-        body.append(f"<tr{part}>{_title(entry)}{''.join(cells)}")
-    return f"<table><thead><tr><th>row<th>alpha{heads}<tbody>{''.join(body)}</table>"
+        for column in columns:
+            cells.append(_cell(entry, column, is_best=best_rows[column.name] == i))
+            if column.name in PAPER_COLUMNS:
+                cells.append(_paper_cell(row, column))
+        rows.append(
+            {
+                "title": row["title"],
+                "alpha": _alpha_text(row["alpha"]),
+                "starts_part": row["name"] in ("mtl-1", "deepdriving"),
+                "cells": cells,
+            }
+        )
+    heads = [{"title": c.title, "unit": c.unit, "paper": c.name in PAPER_COLUMNS} for c in columns]
+    return {"columns": heads, "rows": rows}
 
 
-def _title(entry: dict[str, Any]) -> str:
-    alpha = ", ".join(f"{weight:g}" for weight in entry["row"]["alpha"])
-    return f"<th>{escape(entry['row']['title'])}<td>{alpha}"
+def _cell(entry: dict[str, Any], column: Column, *, is_best: bool) -> dict[str, str] | None:
+    figure = entry["figures"][column.name]
+    if figure is None:
+        return None
+    texts = {
+        name: f"{figure[name] * column.scale:.{column.digits}f}"
+        for name in ("mean", "std")
+        if figure[name] is not None
+    }
+    kind = "best" if is_best else ""
+    return {"text": texts["mean"], "std": texts.get("std", ""), "kind": kind}
 
 
-def _cell(value: dict[str, Any] | None, digits: int, scale: float, *, bold: bool = False) -> str:
-    if value is None:
-        return NONE
-    spread = ""
-    if value["std"] is not None:
-        spread = f" <small>&plusmn; {value['std'] * scale:.{digits}f}</small>"
-    mark = ' class="best"' if bold else ""
-    return f"<td{mark}>{value['mean'] * scale:.{digits}f}{spread}"
+def _paper_cell(row: dict[str, Any], column: Column) -> dict[str, str]:
+    value = row["paper"][PAPER_COLUMNS.index(column.name)]
+    text = "" if value is None else f"{value * column.scale:.{PAPER_DIGITS[column.name]}f}"
+    return {"text": text, "std": "", "kind": "paper"}
 
 
-def _chart(task: int, rows: Sequence[Row], runs: Sequence[Run]) -> str:
-    """The training loss of one task: MTL 1 to 4, and where the task ends when learned alone."""
-    name = TASKS[task]
-    together = [row for row in rows if row.network == "mtl" and sum(a > 0 for a in row.alpha) > 1]
-    lines, last = [], 1.0
-    for colour, row in zip(COLOURS, together, strict=False):
+def _alpha_text(alpha: Sequence[float]) -> str:
+    return ", ".join(f"{weight:g}" for weight in alpha)
+
+
+def _training_chart(task: int, rows: Sequence[Row], runs: Sequence[Run]) -> Markup:
+    """The training loss of one task: MTL 1 to 4, and the final loss of the task learned alone."""
+    name = TASK_NAMES[task]
+    multi_task = [row for row in rows if row.network == "mtl" and sum(a > 0 for a in row.alpha) > 1]
+    lines, last_step = [], 1.0
+    for colour, row in zip(COLOURS, multi_task, strict=False):
         curve = training_curve(runs, row, name)
         if curve is not None:
             steps, losses = curve
-            last = max(last, float(steps[-1]))
-            alpha = ", ".join(f"{weight:g}" for weight in row.alpha)
-            label = f"{row.title} ({alpha})"
+            last_step = max(last_step, float(steps[-1]))
+            label = f"{row.title} ({_alpha_text(row.alpha)})"
             band = losses.min(0), losses.max(0)
             lines.append(Line("curve", steps, losses.mean(0), label, colour, band))
-    alone = next((row for row in rows if row.name == name), None)
-    curve = training_curve(runs, alone, name) if alone is not None else None
+    single_task = next((row for row in rows if row.name == name), None)
+    curve = training_curve(runs, single_task, name) if single_task is not None else None
     if curve is not None:
-        lines.append(_level(curve[1], last, f"{name} alone, at the end"))
-    return plot(Plot(f"({'abc'[task]}) {name}", lines, "iterations", log=True))
+        lines.append(_final_loss_line(curve[1], last_step, f"{name} alone, final loss"))
+    return line_plot(Plot(f"({'abc'[task]}) {name}", lines, "iterations", log=True))
 
 
-def _level(losses: Numbers, last: float, label: str) -> Line:
-    """The mean over the end of losses (seeds, P), as a line up to x = `last`."""
-    end = max(1, round(END * losses.shape[1]))
-    level = np.full(2, losses[:, -end:].mean())
-    return Line("level", np.array([0.0, last]), level, label, SINGLE)
+def _final_loss_line(losses: Numbers, last_step: float, label: str) -> Line:
+    """A horizontal line at the mean of the end of losses (seeds, P)."""
+    count = max(1, round(FINAL_SHARE * losses.shape[1]))
+    level = np.full(2, losses[:, -count:].mean())
+    return Line("level", np.array([0.0, last_step]), level, label, SINGLE_TASK_COLOUR)

@@ -1,4 +1,4 @@
-"""Judging a model on the rounds of a dataset: `mtlnet evaluate --model RUN --data DIR --json`."""
+"""Evaluates a model on the rounds of a dataset: `mtlnet evaluate --model RUN --data DIR --json`."""
 
 import threading
 from collections.abc import Callable, Sequence
@@ -13,12 +13,12 @@ from datagen.recording import Dataset, Frames, UndecodableImage
 from mtlnet.data.loader import Images
 from mtlnet.data.sources import require_decodable
 from mtlnet.evaluation.html_report import write_page
-from mtlnet.evaluation.metrics import judge_all
+from mtlnet.evaluation.metrics import evaluate_by_groups
 from mtlnet.inference.engine import Engine
 from mtlnet.inference.model_card import ModelCard, ModelError
 from trackfeatures.errors import UserError
 
-CHUNK = 32
+CHUNK = 32  # frames that a thread reads at a time
 
 
 def evaluate(
@@ -29,22 +29,20 @@ def evaluate(
     page: Path | None = None,
     every: int = 1,
 ) -> dict[str, Any]:
-    """The report of `mtlnet.evaluation.metrics.judge` on one side of a dataset, whole and by
-    groups.
+    """The report of `mtlnet.evaluation.metrics` on one split of a dataset, as a whole and by group.
 
-    `page`: where to write it as HTML as well, a file or a folder. `every`: judge each so many-th
-    frame only; its neighbours show much the same.
-    `engines`: the same model, once for each thread. `report(done, all)` is told how far it is.
-    Raises UserError when data and model do not fit.
+    `engines`: the same model, once for each thread. `report(done, all)` is called after each chunk
+    of frames. `page`: an HTML file to write too, or its folder. `every`: evaluate every n-th frame
+    only; frames next to each other are much alike. Raises UserError when data and model do not fit.
     """
     if every < 1:
-        raise UserError(f"--every is {every}; give 1 for all frames, 5 for each fifth")
+        raise UserError(f"--every is {every}; give 1 for all frames, 5 for every fifth")
     engine = engines[0]
     dataset = Dataset.open(data)
     frames = dataset.select(split).every(every)
     require_fit(engine.card, frames, split)
     try:
-        outputs = answer_frames(engines, frames, report)
+        outputs = predict_frames(engines, frames, report)
     except UndecodableImage:
         require_decodable(frames, data)  # to name and count all of them
         raise
@@ -58,35 +56,35 @@ def evaluate(
         "split": split,
         "every": every,
         "rounds": len(frames.rounds),
-        **judge_all(outputs, frames, mean),
+        **evaluate_by_groups(outputs, frames, mean),
     }
     if page is not None:
         found["page"] = str(write_page(page, found, frames, outputs))
     return found
 
 
-def answer_frames(
+def predict_frames(
     engines: Sequence[Engine],
     frames: Images,
     report: Callable[[int, int], None] = lambda *_: None,
 ) -> NDArray[np.float32]:
-    """The outputs (N, 9 or 17) for all frames, one by one as in service, on a thread an engine."""
+    """Outputs (N, 9 or 17) for all frames, one at a time as in the service, a thread an engine."""
     chunks = iter(range(0, len(frames), CHUNK))
-    taking = threading.Lock()
+    lock = threading.Lock()
     parts: dict[int, list[NDArray[np.float32]]] = {}
 
     def work(engine: Engine) -> None:
         camera = engine.card.camera
         images = np.empty((CHUNK, camera.height, camera.width, 3), np.uint8)
         while True:
-            with taking:
+            with lock:
                 first = next(chunks, None)
             if first is None:
                 return
             rows = np.arange(first, min(first + CHUNK, len(frames)))
             batch = frames.read_batch(rows, images[: len(rows)])
             parts[first] = [engine(image) for image in batch]
-            with taking:
+            with lock:
                 report(min(len(parts) * CHUNK, len(frames)), len(frames))
 
     with ThreadPoolExecutor(len(engines), thread_name_prefix="engine") as pool:
@@ -96,7 +94,7 @@ def answer_frames(
 
 
 def require_fit(card: ModelCard, frames: Frames, split: str) -> None:
-    """Raise ModelError when the camera differs, or when what is to judge it was trained on."""
+    """Raise ModelError when the camera differs, or when the model was trained on these rounds."""
     found, expected = frames.camera.as_dict(), card.camera.as_dict()
     if found != expected:
         differing = ", ".join(
@@ -109,14 +107,16 @@ def require_fit(card: ModelCard, frames: Frames, split: str) -> None:
             "the model's camera, or train a model for this one"
         )
     if "mean" not in card.data:
-        raise ModelError(f"model {card.name} does not say what it was trained on; train it anew")
+        raise ModelError(
+            f"model {card.name} has no description of its training data; train a new one"
+        )
     if split not in ("test", "unseen"):
         return
     seen = {info.seed for info in frames.rounds} & set(card.data["seeds"])
     if seen:
         raise ModelError(
             f"model {card.name} was trained on the round of seed {min(seen)}, a {split} round of "
-            "this data: the result would say nothing; use --split all, or other rounds"
+            "this data; it cannot be tested on it: use --split all, or other rounds"
         )
     known = {info.track for info in frames.rounds} & set(card.data.get("tracks", ()))
     if split == "unseen" and known:

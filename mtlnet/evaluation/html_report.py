@@ -1,161 +1,176 @@
-"""The evaluation as one HTML page that needs nothing beside it: `mtlnet evaluate --report FILE`."""
+"""The evaluation as one HTML page that needs no other file: `mtlnet evaluate --report FILE`."""
 
-import base64
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
-from html import escape
-from importlib.resources import files
 from pathlib import Path
-from string import Template
 from typing import Any
 
 import numpy as np
-import simplejpeg
+from markupsafe import Markup
 from numpy.typing import NDArray
 
 import trackfeatures as tf
 from datagen.recording import Frames
-from mtlnet.evaluation.metrics import Numbers, signed_errors
+from mtlnet.evaluation.metrics import Numbers, feature_mean, signed_errors
 from mtlnet.evaluation.slices import GROUPS
 from mtlnet.inference.overlay import draw_overlay
 from mtlnet.inference.prediction import OUTPUTS, Prediction, decode_outputs
 from mtlnet.inference.uncertainty import FEATURES
 from runtime.files import atomic_write
-from runtime.svg_charts import MOST_POINTS, Line, Plot, plot, reliability, style
+from runtime.html import embed_jpeg, format_number, format_percent, render
+from runtime.svg_charts import MAX_POINTS, Line, Plot, line_plot, reliability_diagram
 
-PAGE = "report.html"
-MOST_DRIVES = 8
+FILE_NAME = "report.html"
+MAX_ROUNDS = 8
+"""Rounds drawn along the track."""
 HEAVY_SHADOW = 0.3
-"""Share of the road in shadow from which a stretch is shaded in the figures."""
+"""Share of the road in shadow from which an interval of a plot is shaded."""
+UNITS = {name: "rad" if name == "angle" else "m" for name in FEATURES}
+DIGITS = {name: 4 if name == "angle" else 3 for name in FEATURES}
+TITLES = {name: f"{name} ({unit})" for name, unit in UNITS.items()}
+
+Rows = list[list[str]]
 
 
 def write_page(path: Path, report: dict[str, Any], frames: Frames, outputs: Any) -> Path:
-    """Write the page of `mtlnet.evaluation.evaluate`'s report to `path`, or into the folder
-    `path`."""
+    """Write the page of `mtlnet.evaluation.evaluate`'s report to `path`, a file or a folder."""
     if path.is_dir():
-        path = path / PAGE
+        path = path / FILE_NAME
     path.parent.mkdir(parents=True, exist_ok=True)
-    atomic_write(path, page(report, frames, outputs).encode(), fsync=True)
+    atomic_write(path, page(report, frames, outputs), fsync=True)
     return path
 
 
 def page(report: dict[str, Any], frames: Frames, outputs: NDArray[np.float32]) -> str:
     """HTML of `report` on `outputs` (N, 9 or 17) for `frames`."""
     errors = signed_errors(outputs, frames.labels.distances, frames.labels.angle)
-    template = Template(
-        files("mtlnet.evaluation").joinpath("report.html").read_text(encoding="utf-8")
-    )
-    worst = worst_frames(errors, frames.labels.round)
-    return template.substitute(
-        chart_style=style(),
-        model=escape(report["model"]),
-        about=escape(
-            f"{report['frames']:,} {report['split']} frames in {report['rounds']} rounds of "
-            f"{report['data']}; engine {report['engine']}, {report['precision']}"
-        ),
-        hash=report["model_hash"][:16],
-        summary=_summary(report),
-        classes=_classes(report),
-        presence=_presence(report),
-        coded=_coded(report["coded"]),
-        drives="".join(_drives(frames, outputs)),
-        doubt=_doubt(report),
-        worst="".join(figures(frames, outputs, worst)),
-        groups="".join(_groups(report)),
+    return render(
+        "mtlnet.evaluation",
+        "report.html",
+        report=report,
+        error_rows=_error_rows(report),
+        confusion_head=["", *(f"predicted {name}" for name in report["confusion"])],
+        confusion_rows=_confusion_rows(report["confusion"]),
+        presence_rows=[
+            [name, format_percent(rates["false_active"]), format_percent(rates["false_inactive"])]
+            for name, rates in report["presence"].items()
+        ],
+        coded_rows=_coded_rows(report["coded"]),
+        drives=_drives(frames, outputs),
+        coverage_rows=[
+            [name, *map(format_percent, shares)]
+            for name, shares in report.get("doubt", {}).get("coverage", {}).items()
+        ],
+        reliability=_reliability(report.get("doubt", {})),
+        worst=worst_figures(frames, outputs, worst_frames(errors, frames.labels.round)),
+        groups=_groups(report),
     )
 
 
-def _summary(report: dict[str, Any]) -> str:
+def _error_rows(report: dict[str, Any]) -> Rows:
     rows = []
     for name in FEATURES:
-        unit, digits = ("rad", 4) if name == "angle" else ("m", 3)
-        found, guess = report["errors"][name], _mean_error(report["baseline"], name)
-        ratio = None if found["mean"] is None or not guess else found["mean"] / guess
-        cells = [_number(found[k], digits) for k in ("mean", "median", "p95", "p99")]
-        cells += [_number(guess, digits), _number(ratio, 2), f"{found['frames']:,}"]
-        rows.append([f"{name} ({unit})", *cells])
-    head = ("", "mean", "median", "95 %", "99 %", "mean's answer", "ratio", "frames")
-    return _table(head, rows)
+        digits = DIGITS[name]
+        found, baseline = report["errors"][name], feature_mean(report["baseline"], name)
+        ratio = None if found["mean"] is None or not baseline else found["mean"] / baseline
+        cells = [format_number(found[k], digits) for k in ("mean", "median", "p95", "p99")]
+        cells += [format_number(baseline, digits), format_number(ratio, 2)]
+        rows.append([TITLES[name], *cells, f"{found['frames']:,}"])
+    return rows
 
 
-def _mean_error(part: dict[str, Any], name: str) -> float | None:
-    found: float | None = part["mae_m"].get(name) if name in tf.MARKINGS else None
-    if name not in tf.MARKINGS:
-        found = part["angle_mae_rad" if name == "angle" else "to_lane_centre_mae_m"]
-    return found
-
-
-def _classes(report: dict[str, Any]) -> str:
-    counts = report["confusion"]
+def _confusion_rows(confusion: dict[str, dict[str, int]]) -> Rows:
     rows = []
-    for name, row in counts.items():
+    for name, row in confusion.items():
         total = sum(row.values())
         shares = [f"{n:,} ({n / total:.1%})" if total else "-" for n in row.values()]
         rows.append([f"truly {name}", *shares])
-    right, guess = report["heading_accuracy"], report["baseline"]["heading_accuracy"]
-    told = f"<p>{right:.2%} right; always the most frequent class of training: {guess:.1%}.</p>"
-    return told + _table(("", *(f"said {name}" for name in counts)), rows)
+    return rows
 
 
-def _presence(report: dict[str, Any]) -> str:
-    rows = [
-        [name, _share(rates["false_active"]), _share(rates["false_inactive"])]
-        for name, rates in report["presence"].items()
-    ]
-    return _table(("", "false active", "false inactive"), rows)
-
-
-def _coded(coded: dict[str, float]) -> str:
-    rows = [
+def _coded_rows(coded: dict[str, float]) -> Rows:
+    return [
         ["distance (five summed)", f"{coded['distance']:.5f}", f"{coded['distance_absolute']:.5f}"],
         ["angle", f"{coded['angle']:.6f}", f"{coded['angle_absolute']:.5f}"],
         ["type (cross-entropy)", f"{coded['type']:.4f}", ""],
     ]
-    return _table(("", "mean squared", "mean absolute"), rows)
 
 
-def _drives(frames: Frames, outputs: NDArray[np.float32]) -> Iterator[str]:
-    """The paper's perception figure: a round of each track, offset and angle against the truth."""
+def _reliability(doubt: dict[str, Any]) -> Iterator[Markup]:
+    for name, bins in doubt.get("calibration", {}).items():
+        if bins:
+            predicted = np.array([part["said"] for part in bins])
+            observed = np.array([part["found"] for part in bins])
+            yield reliability_diagram(TITLES[name], predicted, observed)
+
+
+def _groups(report: dict[str, Any]) -> Iterator[dict[str, Any]]:
+    """A table for each grouping: its title, mean errors by feature and accuracy of the class."""
+    for grouping, label in GROUPS.items():
+        head = [label, "frames", *TITLES.values(), "class"]
+        if "doubt" in report:
+            head.append("out of distribution")
+        rows = []
+        for key, part in report[grouping].items():
+            means = [format_number(part["errors"][n]["mean"], DIGITS[n]) for n in FEATURES]
+            row = [key, f"{part['frames']:,}", *means, format_percent(part["heading_accuracy"])]
+            if "doubt" in report:
+                row.append(format_percent(part["doubt"]["out_of_distribution"]))
+            rows.append(row)
+        yield {"head": head, "rows": rows}
+
+
+# Offset and angle along the track, as in the paper's perception figure.
+
+
+def _drives(frames: Frames, outputs: NDArray[np.float32]) -> Iterator[dict[str, Any]]:
+    """The first round of each track: true and predicted offset and angle."""
     shown: set[str] = set()
     for number, info in enumerate(frames.rounds):
-        if info.track in shown or len(shown) == MOST_DRIVES:
+        if info.track in shown or len(shown) == MAX_ROUNDS:
             continue
         shown.add(info.track)
         rows = np.flatnonzero(frames.labels.round == number)
-        about = f"{info.track}, {info.lanes} lane(s), {info.light} ({info.id})"
-        yield f"<h3>{escape(about)}</h3>{_drive(frames, rows, outputs[rows])}"
+        yield {
+            "about": f"{info.track}, {info.lanes} lane(s), {info.light} ({info.id})",
+            "charts": _drive_charts(frames, rows, outputs[rows]),
+        }
 
 
-def _drive(frames: Frames, rows: NDArray[np.int64], outputs: NDArray[np.float32]) -> str:
+def _drive_charts(
+    frames: Frames, rows: NDArray[np.int64], outputs: NDArray[np.float32]
+) -> Iterator[Markup]:
     labels = frames.labels.take(rows)
-    metres = _driven(labels.s.astype(np.float64))
-    said = tf.localise(tf.decode(outputs[:, :6])[0])
+    metres = _distance_driven(labels.s.astype(np.float64))
+    offset = tf.localise(tf.decode(outputs[:, :6])[0])
     angle = tf.decode_values(outputs[:, :6])[:, 5]
-    thin = slice(None, None, -(-len(rows) // MOST_POINTS))
-    shaded = _spans(metres, labels.shadow_fraction >= HEAVY_SHADOW)
-    drawn = []
-    for title, unit, true, value, column in (
-        ("offset from the lane centre", "m", tf.localise(labels.distances), said, -3),
+    thinned = slice(None, None, -(-len(rows) // MAX_POINTS))
+    shaded = _intervals(metres, labels.shadow_fraction >= HEAVY_SHADOW)
+    for title, unit, true, predicted, column in (
+        ("offset from the lane centre", "m", tf.localise(labels.distances), offset, -3),
         ("angle", "rad", labels.angle.astype(np.float64), angle, -2),
     ):
         band = None
         if outputs.shape[1] > OUTPUTS:
-            wide = 2 * outputs[:, column].astype(np.float64)
-            band = (value - wide)[thin], (value + wide)[thin]
-        along = metres[thin]
-        lines = [Line("truth", along, true[thin]), Line("said", along, value[thin], band=band)]
-        drawn.append(plot(Plot(f"{title} ({unit})", lines, "m driven", shaded)))
-    return "".join(drawn)
+            width = 2 * outputs[:, column].astype(np.float64)
+            band = (predicted - width)[thinned], (predicted + width)[thinned]
+        x = metres[thinned]
+        lines = [
+            Line("truth", x, true[thinned]),
+            Line("predicted", x, predicted[thinned], band=band),
+        ]
+        yield line_plot(Plot(f"{title} ({unit})", lines, "m driven", shaded))
 
 
-def _driven(s: Numbers) -> Numbers:
-    """Metres since the first frame; crossing the start line is no jump back."""
+def _distance_driven(s: Numbers) -> Numbers:
+    """Metres since the first frame (N,) of track positions s; crossing the start line adds 0."""
     steps = np.diff(s)
     steps[steps < 0] = 0.0
     return np.concatenate([[0.0], np.cumsum(steps)])
 
 
-def _spans(x: Numbers, chosen: NDArray[np.bool_]) -> list[tuple[float, float]]:
+def _intervals(x: Numbers, chosen: NDArray[np.bool_]) -> list[tuple[float, float]]:
+    """Where `chosen` (N,) is true without a gap: the x of its beginning and end."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], chosen, [False]]).astype(int)))
     last = len(x) - 1
     return [
@@ -163,131 +178,73 @@ def _spans(x: Numbers, chosen: NDArray[np.bool_]) -> list[tuple[float, float]]:
     ]
 
 
-def _doubt(report: dict[str, Any]) -> str:
-    doubt = report.get("doubt")
-    if doubt is None:
-        return "<p>This model gives no standard deviations.</p>"
-    rows = [[name, *map(_share, shares)] for name, shares in doubt["coverage"].items()]
-    table = _table(("", "within 1 &sigma; (68.3 %)", "within 2 &sigma; (95.4 %)"), rows)
-    charts = "".join(
-        reliability(
-            f"{name} ({'rad' if name == 'angle' else 'm'})",
-            np.array([part["said"] for part in bins]),
-            np.array([part["found"] for part in bins]),
-        )
-        for name, bins in doubt["calibration"].items()
-        if bins
-    )
-    strange = (
-        f"<p>{doubt['out_of_distribution']:.1%} of these frames are called out of distribution."
-    )
-    return f'{table}<div class="grid small">{charts}</div>{strange}</p>'
+# The frames with the largest errors, with true and predicted markings drawn on them.
 
 
-def _groups(report: dict[str, Any]) -> Iterator[str]:
-    features = [f"{name} ({'rad' if name == 'angle' else 'm'})" for name in FEATURES]
-    head = ["frames", *features, "class"]
-    for way, label in GROUPS.items():
-        rows = []
-        for key, part in report[way].items():
-            cells = [
-                _number(part["errors"][name]["mean"], 4 if name == "angle" else 3)
-                for name in FEATURES
-            ]
-            right = f"{part['heading_accuracy']:.1%}"
-            rows.append([escape(key), f"{part['frames']:,}", *cells, right])
-        columns = [label, *head]
-        if "doubt" in report:
-            columns.append("strange")
-            for row, part in zip(rows, report[way].values(), strict=True):
-                row.append(_share(part["doubt"]["out_of_distribution"]))
-        yield _table(columns, rows)
-
-
-def _table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
-    """A table; cells are HTML already. The first column names the row."""
-    top = "".join(f"<th>{cell}" for cell in head)
-    body = "".join(
-        "<tr>" + "".join(f"<{'td' if i else 'th'}>{cell}" for i, cell in enumerate(row))
-        for row in rows
-    )
-    return f"<div class=scroll><table><thead><tr>{top}<tbody>{body}</table></div>"
-
-
-def _number(value: float | None, digits: int) -> str:
-    return "-" if value is None else f"{value:.{digits}f}"
-
-
-def _share(value: float | None) -> str:
-    return "-" if value is None else f"{value:.1%}"
-
-
-# The frames on which a model errs most, with true and answered markings drawn on them.
-
-
-EACH = 2
-"""Frames of each feature..."""
-APART = 40
-"""...which in the same round lie at least so many frames apart: one bad place is shown once."""
-QUALITY = 80
+WORST_PER_FEATURE = 2
+MIN_FRAMES_APART = 40
+"""Frames between two worst frames of a round, so that one place is shown once."""
 
 
 @dataclass(frozen=True)
-class Worst:
-    """Frame `row`, on which `feature` is `error` (m or rad, signed) off."""
+class WorstFrame:
+    """Frame `row`, on which `feature` has the signed `error` (m or rad)."""
 
     row: int
     feature: str
     error: float
 
 
-def worst_frames(errors: Numbers, rounds: NDArray[np.int64]) -> list[Worst]:
-    """The `EACH` worst frames of each feature, errors (N, 7); no place is shown twice."""
-    chosen: list[Worst] = []
+def worst_frames(errors: Numbers, rounds: NDArray[np.int64]) -> list[WorstFrame]:
+    """The `WORST_PER_FEATURE` worst frames of each feature; errors (N, 7), rounds (N,)."""
+    chosen: list[WorstFrame] = []
     for i in (5, 6, 0, 1, 3, 2, 4):
         sizes = np.abs(errors[:, i])
         order = np.argsort(-np.nan_to_num(sizes, nan=-1.0), kind="stable")
         found = 0
         for row in order.tolist():
-            if found == EACH or np.isnan(sizes[row]):
+            if found == WORST_PER_FEATURE or np.isnan(sizes[row]):
                 break
-            if all(abs(row - w.row) >= APART or rounds[row] != rounds[w.row] for w in chosen):
-                chosen.append(Worst(row, FEATURES[i], float(errors[row, i])))
+            if all(
+                abs(row - w.row) >= MIN_FRAMES_APART or rounds[row] != rounds[w.row] for w in chosen
+            ):
+                chosen.append(WorstFrame(row, FEATURES[i], float(errors[row, i])))
                 found += 1
     return chosen
 
 
-def figures(frames: Frames, outputs: NDArray[np.float32], chosen: list[Worst]) -> Iterator[str]:
-    """The chosen frames as HTML figures: truth green, answer orange."""
+def worst_figures(
+    frames: Frames, outputs: NDArray[np.float32], chosen: list[WorstFrame]
+) -> Iterator[dict[str, str]]:
+    """Of each chosen frame: its image (truth green, prediction orange) and its caption."""
     labels, camera = frames.labels, frames.camera
-    for one in chosen:
-        answer = decode_outputs(outputs[one.row])
-        truth = [None if np.isnan(d) else float(d) for d in labels.distances[one.row]]
+    for worst in chosen:
+        row = worst.row
+        prediction = decode_outputs(outputs[row])
+        truth = [None if np.isnan(d) else float(d) for d in labels.distances[row]]
         image = draw_overlay(
-            frames.image(one.row),
+            frames.image(row),
             camera,
             camera.height_above_road_m,
-            float(labels.curvature[one.row]),
-            (dict(zip(tf.MARKINGS, truth, strict=True)), float(labels.angle[one.row])),
-            (answer.distances_m, answer.angle_rad),
+            float(labels.curvature[row]),
+            (dict(zip(tf.MARKINGS, truth, strict=True)), float(labels.angle[row])),
+            (prediction.distances_m, prediction.angle_rad),
         )
-        jpeg = simplejpeg.encode_jpeg(np.ascontiguousarray(image), quality=QUALITY)
-        yield (
-            f'<figure><img src="data:image/jpeg;base64,{base64.b64encode(jpeg).decode()}" '
-            f'alt="{one.feature}"><figcaption>{_caption(frames, one, answer)}</figcaption></figure>'
-        )
+        yield {"jpeg": embed_jpeg(image), **_caption(frames, worst, prediction)}
 
 
-def _caption(frames: Frames, one: Worst, answer: Prediction) -> str:
-    labels = frames.labels
-    info = frames.rounds[int(labels.round[one.row])]
-    unit = "rad" if one.feature == "angle" else "m"
-    said = None if answer.std is None else answer.std[one.feature]
-    doubt = "" if said is None else f", said to be known to {said:.2g} {unit}"
-    strange = ", called out of distribution" if answer.out_of_distribution else ""
-    place = f"{info.id}, {info.track}, s = {labels.s[one.row]:.0f} m"
-    about = f"{info.lanes} lane(s), {labels.light[one.row]}, {labels.speed[one.row] * 3.6:.0f} km/h"
-    return (
-        f"<b>{one.feature} {one.error:+.2g} {unit}</b>{doubt}{strange}"
-        f"<br><small>{escape(place)}; {escape(about)}</small>"
-    )
+def _caption(frames: Frames, worst: WorstFrame, prediction: Prediction) -> dict[str, str]:
+    labels, unit = frames.labels, UNITS[worst.feature]
+    info = frames.rounds[int(labels.round[worst.row])]
+    note = ""
+    if prediction.std is not None:
+        note = f", predicted standard deviation {prediction.std[worst.feature]:.2g} {unit}"
+    if prediction.out_of_distribution:
+        note += ", out of distribution"
+    return {
+        "feature": worst.feature,
+        "error": f"{worst.error:+.2g} {unit}",
+        "note": note,
+        "place": f"{info.id}, {info.track}, s = {labels.s[worst.row]:.0f} m; {info.lanes} lane(s), "
+        f"{labels.light[worst.row]}, {labels.speed[worst.row] * 3.6:.0f} km/h",
+    }

@@ -1,8 +1,8 @@
-"""Errors of a model's outputs on labelled frames, in m and rad, feature by feature.
+"""Metrics of a model's outputs on labelled frames: errors in m and rad, by feature.
 
-A feature is one of `mtlnet.inference.uncertainty.FEATURES`: the five markings, `to_lane_centre`,
-`angle`. Errors are signed (answer minus truth), and NaN where the label has none: what is not
-active is not judged.
+A feature is one of `mtlnet.inference.uncertainty.FEATURES`: the five markings, `to_lane_centre` and
+`angle`. Errors are predicted minus true, and NaN (not counted) where the label is inactive.
+The baseline is a constant prediction, the mean of the training labels.
 """
 
 from typing import Any, Protocol
@@ -21,8 +21,8 @@ PERCENTILES = {"median": 50, "p95": 95, "p99": 99}
 CALIBRATION_BINS = 10
 
 
-class Truth(Protocol):
-    """The labels that errors need; see `datagen.recording.Labels`."""
+class LabelArrays(Protocol):
+    """The labels of which a mean is taken; see `datagen.recording.Labels`."""
 
     @property
     def distances(self) -> NDArray[np.float32]: ...
@@ -35,8 +35,8 @@ class Truth(Protocol):
 def signed_errors(outputs: NDArray[np.float32], distances: Any, angle: Any) -> Numbers:
     """Errors (N, 7) of outputs (N, 9 or more).
 
-    A marking's is that of the value the network gives, whether or not it decodes to "absent"; that
-    of `to_lane_centre` counts where both the label and the answer have one.
+    That of a marking is taken on the predicted value, even where it decodes to "inactive"; that of
+    `to_lane_centre` where both the label and the prediction have one.
     """
     values = tf.decode_values(outputs[:, :6])
     offset = tf.localise(tf.decode(outputs[:, :6])[0]) - tf.localise(distances)
@@ -44,12 +44,12 @@ def signed_errors(outputs: NDArray[np.float32], distances: Any, angle: Any) -> N
     return np.concatenate(columns, axis=1)
 
 
-def spread(errors: Numbers) -> dict[str, dict[str, float | None]]:
-    """By feature: mean, median, 95th and 99th percentile of the absolute error, how many frames."""
-    return {name: _spread(np.abs(errors[:, i])) for i, name in enumerate(FEATURES)}
+def error_percentiles(errors: Numbers) -> dict[str, dict[str, float | None]]:
+    """By feature: mean, median, 95th and 99th percentile of the absolute error; frames."""
+    return {name: _percentiles(np.abs(errors[:, i])) for i, name in enumerate(FEATURES)}
 
 
-def _spread(sizes: Numbers) -> dict[str, float | None]:
+def _percentiles(sizes: Numbers) -> dict[str, float | None]:
     present = sizes[~np.isnan(sizes)]
     if not len(present):
         return {"mean": None, **dict.fromkeys(PERCENTILES), "frames": 0}
@@ -58,11 +58,13 @@ def _spread(sizes: Numbers) -> dict[str, float | None]:
     return {"mean": float(present.mean()), **percentiles, "frames": len(present)}
 
 
-def confusion(heading: NDArray[np.int64], said: NDArray[np.int64]) -> dict[str, dict[str, int]]:
-    """Frames by true class, then by the class that was said."""
+def confusion(
+    heading: NDArray[np.int64], predicted: NDArray[np.int64]
+) -> dict[str, dict[str, int]]:
+    """Number of frames by true class, then by predicted class."""
     names = [kind.name.lower() for kind in tf.Heading]
     counts = np.zeros((len(names), len(names)), np.int64)
-    np.add.at(counts, (heading, said), 1)
+    np.add.at(counts, (heading, predicted), 1)
     return {
         name: dict(zip(names, row, strict=True))
         for name, row in zip(names, counts.tolist(), strict=True)
@@ -70,9 +72,9 @@ def confusion(heading: NDArray[np.int64], said: NDArray[np.int64]) -> dict[str, 
 
 
 def coverage(std: NDArray[Any], errors: NDArray[Any]) -> dict[str, list[float | None]]:
-    """By feature: shares of errors within one and two standard deviations (N, 7).
+    """By feature: shares of errors (N, 7) within one and two standard deviations (N, 7).
 
-    Of a normal distribution 0.683 and 0.954.
+    Those of a normal distribution are 0.683 and 0.954.
     """
     ratio = np.abs(errors) / std
     return {name: [_within(ratio[:, i], k) for k in (1, 2)] for i, name in enumerate(FEATURES)}
@@ -84,9 +86,10 @@ def _within(ratio: NDArray[Any], limit: float) -> float | None:
 
 
 def calibration(std: NDArray[Any], errors: Numbers) -> dict[str, list[dict[str, float]]]:
-    """By feature: the errors found where a standard deviation was said, in bins of equal count.
+    """By feature: predicted standard deviations and observed errors, in bins of equal count.
 
-    Each bin: root mean square of the said deviations, that of the errors, frames.
+    Each bin: root mean square of the predicted deviations ("said"), that of the errors ("found"),
+    and the number of frames.
     """
     return {name: _bins(std[:, i], errors[:, i]) for i, name in enumerate(FEATURES)}
 
@@ -106,37 +109,36 @@ def _rms(values: NDArray[Any]) -> float:
     return float(np.sqrt((values.astype(np.float64) ** 2).mean()))
 
 
-# How good a model's answers are, in metres and radians, beside always answering the mean. Errors
-# are taken on active labels only (`mtlnet.evaluation.metrics`); how often presence itself is wrong
-# stands beside them.
+# The description of the training data in a model's card, with the mean of its labels.
 
 
 def describe_data(
     dataset: Dataset, frames: Frames, held_out: Frames | None = None
 ) -> dict[str, Any]:
-    """What a model was trained on, and the mean of its labels: the answer of one who guesses.
+    """The data a model was trained on, and the mean of its labels, which is the baseline.
 
-    `held_out`: rounds on which only its doubt was fitted; it has seen them all the same.
+    `held_out`: rounds on which only the uncertainty head was fitted. They count as seen; `frames`
+    does not include theirs.
     """
     rounds = [*frames.rounds, *(held_out.rounds if held_out is not None else [])]
-    sides = {
-        side: [info.id for info in dataset.rounds if info.split == side]
-        for side in ("train", "test")
+    splits = {
+        split: [info.id for info in dataset.rounds if info.split == split]
+        for split in ("train", "test")
     }
     return {
         "path": str(dataset.path),
         "content_hash": dataset.content_hash,
         "frames": len(frames),
-        "split": sides,
+        "split": splits,
         "held_out": [info.id for info in held_out.rounds] if held_out is not None else [],
         "seeds": [info.seed for info in rounds],
         "tracks": sorted({info.track for info in rounds}),
-        "mean": mean_answer(frames.labels),
+        "mean": mean_labels(frames.labels),
     }
 
 
-def mean_answer(labels: Truth) -> dict[str, Any]:
-    """The mean of labels: the answer of one who guesses. None where nothing is labelled."""
+def mean_labels(labels: LabelArrays) -> dict[str, Any]:
+    """The mean of labels and their most frequent class; None for markings that are never active."""
     distances = labels.distances.astype(np.float64)
     counts = (~np.isnan(distances)).sum(0)
     sums = np.nansum(distances, axis=0)
@@ -151,49 +153,56 @@ def mean_answer(labels: Truth) -> dict[str, Any]:
     }
 
 
-def judge(outputs: NDArray[np.float32], labels: Labels, mean: dict[str, Any]) -> dict[str, Any]:
-    """The report (DESIGN §9) on `outputs` (N, 9 or 17) for `labels`, `mean` as of `describe_data`.
+# The report of an evaluation.
 
-    `doubt` is there where the model gives standard deviations.
+
+def evaluate_outputs(
+    outputs: NDArray[np.float32], labels: Labels, mean: dict[str, Any]
+) -> dict[str, Any]:
+    """The report (DESIGN §9) on `outputs` (N, 9 or 17) for `labels`; `mean`: of `mean_labels`.
+
+    It has `doubt` when the model predicts standard deviations.
     """
     errors = signed_errors(outputs, labels.distances, labels.angle)
-    said = outputs[:, 6:OUTPUTS].argmax(1)
-    model = _means(errors, said == labels.heading)
-    guess = _means(_constant_errors(mean, labels), labels.heading == mean["heading"])
+    heading = outputs[:, 6:OUTPUTS].argmax(1)
+    model = _means(errors, heading == labels.heading)
+    baseline = _means(_baseline_errors(mean, labels), labels.heading == mean["heading"])
     report = {
         "frames": len(labels),
         **model,
-        "errors": spread(errors),
-        "confusion": confusion(labels.heading, said),
+        "errors": error_percentiles(errors),
+        "confusion": confusion(labels.heading, heading),
         "coded": coded_losses(outputs, labels),
         "presence": presence(outputs, labels),
-        "baseline": guess,
-        "ratio": _ratios(model, guess),
+        "baseline": baseline,
+        "ratio": _ratios(model, baseline),
     }
     if outputs.shape[1] > OUTPUTS:
-        std, novelty = outputs[:, OUTPUTS:-1], outputs[:, -1]
-        strange = float((~(novelty <= 1)).mean())
-        report["doubt"] = {"coverage": coverage(std, errors), "out_of_distribution": strange}
+        std, ood_score = outputs[:, OUTPUTS:-1], outputs[:, -1]
+        share = float((~(ood_score <= 1)).mean())
+        report["doubt"] = {"coverage": coverage(std, errors), "out_of_distribution": share}
     return report
 
 
-def judge_all(outputs: NDArray[np.float32], frames: Frames, mean: dict[str, Any]) -> dict[str, Any]:
-    """The report on all frames, and the same by each of `mtlnet.evaluation.slices.groups`:
-    `by_track`, ..."""
+def evaluate_by_groups(
+    outputs: NDArray[np.float32], frames: Frames, mean: dict[str, Any]
+) -> dict[str, Any]:
+    """The report on all frames, and on the groups of `mtlnet.evaluation.slices`: `by_track`, ..."""
     labels = frames.labels
-    report = judge(outputs, labels, mean)
+    report = evaluate_outputs(outputs, labels, mean)
     if outputs.shape[1] > OUTPUTS:
         errors = signed_errors(outputs, labels.distances, labels.angle)
         report["doubt"]["calibration"] = calibration(outputs[:, OUTPUTS:-1], errors)
     for name, parts in groups(frames):
         report[name] = {
-            key: judge(outputs[rows], labels.take(rows), mean) for key, rows in parts.items()
+            key: evaluate_outputs(outputs[rows], labels.take(rows), mean)
+            for key, rows in parts.items()
         }
     return report
 
 
 def _means(errors: Numbers, right: NDArray[np.bool_]) -> dict[str, Any]:
-    """Mean absolute errors, and the share of right classes, under the names of DESIGN §9."""
+    """Mean absolute errors and the accuracy of the class, under the names of DESIGN §9."""
     sizes = [_mean(np.abs(column)) for column in errors.T]
     by_name = dict(zip(FEATURES, sizes, strict=True))
     return {
@@ -204,49 +213,57 @@ def _means(errors: Numbers, right: NDArray[np.bool_]) -> dict[str, Any]:
     }
 
 
-def _ratios(model: dict[str, Any], guess: dict[str, Any]) -> dict[str, Any]:
+def feature_mean(means: dict[str, Any], name: str) -> float | None:
+    """The mean of feature `name` among those of a report or of its `baseline` or `ratio`."""
+    keys = {"to_lane_centre": "to_lane_centre_mae_m", "angle": "angle_mae_rad"}
+    found: float | None = means[keys[name]] if name in keys else means["mae_m"][name]
+    return found
+
+
+def _ratios(model: dict[str, Any], baseline: dict[str, Any]) -> dict[str, Any]:
     return {
-        "mae_m": {m: _ratio(model["mae_m"][m], guess["mae_m"][m]) for m in tf.MARKINGS},
-        **{k: _ratio(model[k], guess[k]) for k in ("to_lane_centre_mae_m", "angle_mae_rad")},
+        "mae_m": {m: _ratio(model["mae_m"][m], baseline["mae_m"][m]) for m in tf.MARKINGS},
+        **{k: _ratio(model[k], baseline[k]) for k in ("to_lane_centre_mae_m", "angle_mae_rad")},
     }
 
 
 def coded_losses(outputs: NDArray[np.float32], labels: Labels) -> dict[str, float]:
     """The losses of the paper's table on coded values, inactive ones included.
 
-    `distance`, `angle`: mean over the frames of the squared error, of the five distances summed, as
-    trained; `distance_absolute`, `angle_absolute`: of the absolute error; `type`: cross-entropy.
+    `distance`, `angle`: mean over the frames of the squared error, summed over the five distances,
+    as trained; `distance_absolute`, `angle_absolute`: of the absolute error; `type`: cross-entropy
+    of the heading class.
     """
     target = tf.encode(labels.distances, labels.angle).astype(np.float64)
     difference = outputs[:, :6] - target
     squared, absolute = difference**2, np.abs(difference)
-    chosen = outputs[np.arange(len(labels)), 6 + labels.heading].astype(np.float64)
+    likelihood = outputs[np.arange(len(labels)), 6 + labels.heading].astype(np.float64)
     return {
         "distance": float(squared[:, :5].sum(1).mean()),
         "angle": float(squared[:, 5].mean()),
-        "type": float(-np.log(np.maximum(chosen, 1e-12)).mean()),
+        "type": float(-np.log(np.maximum(likelihood, 1e-12)).mean()),
         "distance_absolute": float(absolute[:, :5].sum(1).mean()),
         "angle_absolute": float(absolute[:, 5].mean()),
     }
 
 
 def presence(outputs: NDArray[np.float32], labels: Labels) -> dict[str, dict[str, float | None]]:
-    """Per distance: share of active labels answered as absent, and of absent ones as active."""
+    """Per distance: share of active labels predicted inactive, and of inactive ones as active."""
     distances, _ = tf.decode(outputs[:, :6])
     truth = labels.distances
-    absent = np.isnan(np.column_stack([distances, tf.localise(distances)]))
-    truly_absent = np.isnan(np.column_stack([truth, tf.localise(truth)]))
+    inactive = np.isnan(np.column_stack([distances, tf.localise(distances)]))
+    truly_inactive = np.isnan(np.column_stack([truth, tf.localise(truth)]))
     return {
         name: {
-            "false_inactive": _mean(absent[~truly_absent[:, i], i].astype(np.float64)),
-            "false_active": _mean(1.0 - absent[truly_absent[:, i], i]),
+            "false_inactive": _mean(inactive[~truly_inactive[:, i], i].astype(np.float64)),
+            "false_active": _mean(1.0 - inactive[truly_inactive[:, i], i]),
         }
         for i, name in enumerate(FEATURES[:-1])
     }
 
 
-def _constant_errors(mean: dict[str, Any], labels: Labels) -> Numbers:
-    """Errors (N, 7) of always answering the training mean."""
+def _baseline_errors(mean: dict[str, Any], labels: Labels) -> Numbers:
+    """Errors (N, 7) of always predicting the training mean."""
     distances = [np.nan if d is None else d for d in mean["distances_m"]]
     offset = mean["to_lane_centre_m"] - tf.localise(labels.distances)
     angle = mean["angle_rad"] - labels.angle
@@ -254,7 +271,7 @@ def _constant_errors(mean: dict[str, Any], labels: Labels) -> Numbers:
 
 
 def _mean(values: Numbers) -> float | None:
-    """The mean of what is there; None where nothing is."""
+    """The mean of the values that are not NaN; None when there are none."""
     present = values[~np.isnan(values)]
     return float(present.mean()) if len(present) else None
 

@@ -1,4 +1,4 @@
-"""The groups by which a model is judged: where, on which road, in what light, how fast."""
+"""Groups of frames by which a model is evaluated: track, lanes, light, shadow, radius, speed."""
 
 from collections.abc import Iterator
 from itertools import pairwise
@@ -15,37 +15,37 @@ GROUPS = {
     "by_lanes": "lanes",
     "by_light": "light",
     "by_shadow": "road in shadow",
-    "by_radius": "bend's radius",
+    "by_radius": "radius of the bend",
     "by_speed": "speed",
 }
 SHADOW = (0.05, 0.3, 0.6)
 """Limits of the share of the road within 30 m that lies in shadow."""
 RADIUS_M = (40.0, 80.0, 170.0)
-"""Limits of the bend's radius; beyond the last the definitions call it straight."""
+"""Limits of the radius of the bend; the heading class of a larger one is straight."""
 SPEED_KMH = (30.0, 45.0, 60.0)
 
 
 def groups(frames: "Frames") -> Iterator[tuple[str, dict[str, NDArray[np.int64]]]]:
-    """Each way to part the frames: its name in `GROUPS`, and the rows of each part, in order.
+    """Each grouping: its name in `GROUPS`, and the rows of each of its groups, in order.
 
-    The parts of one way are all frames, each once.
+    Each frame is in one group of every grouping.
     """
     labels = frames.labels
     of_round = labels.round
-    yield "by_track", _parts(np.array([info.track for info in frames.rounds])[of_round])
-    yield "by_lanes", _parts(labels.lanes.astype(str))
-    yield "by_light", _parts(labels.light)
-    yield "by_shadow", _ranges(labels.shadow_fraction, SHADOW, "")
+    yield "by_track", _by_value(np.array([info.track for info in frames.rounds])[of_round])
+    yield "by_lanes", _by_value(labels.lanes.astype(str))
+    yield "by_light", _by_value(labels.light)
+    yield "by_shadow", _by_range(labels.shadow_fraction, SHADOW, "")
     radius = 1 / np.maximum(np.abs(labels.curvature), 1e-9)
-    yield "by_radius", _ranges(radius, RADIUS_M, " m")
-    yield "by_speed", _ranges(labels.speed * 3.6, SPEED_KMH, " km/h")
+    yield "by_radius", _by_range(radius, RADIUS_M, " m")
+    yield "by_speed", _by_range(labels.speed * 3.6, SPEED_KMH, " km/h")
 
 
-def _parts(keys: NDArray[np.str_]) -> dict[str, NDArray[np.int64]]:
+def _by_value(keys: NDArray[np.str_]) -> dict[str, NDArray[np.int64]]:
     return {key: np.flatnonzero(keys == key) for key in np.unique(keys).tolist()}
 
 
-def _ranges(
+def _by_range(
     values: NDArray[Any], limits: tuple[float, ...], unit: str
 ) -> dict[str, NDArray[np.int64]]:
     names = [f"under {limits[0]:g}{unit}"]

@@ -1,12 +1,14 @@
-"""Results as tables for people."""
+"""Results of the `mtlnet` commands as tables and text for the terminal."""
 
 from typing import Any
 
 from rich.table import Table
 
 import trackfeatures as tf
+from mtlnet.evaluation.metrics import feature_mean
 from mtlnet.evaluation.slices import GROUPS
 from mtlnet.inference.uncertainty import FEATURES
+from runtime.html import format_number, format_percent
 
 ROWS = {
     **{m: (f"to {m} (m)", 3) for m in tf.MARKINGS},
@@ -16,26 +18,19 @@ ROWS = {
 
 
 def evaluation_table(result: dict[str, Any]) -> Table:
-    """Errors of a model on active labels, beside those of always answering the training mean."""
+    """Errors of a model on active labels, beside those of the constant training mean."""
     title = f"{result['model']} on {result['frames']} {result['split']} frames of {result['data']}"
     table = Table(title=title)
-    for column in ("", "mean", "median", "95 %", "99 %", "mean's answer", "ratio"):
+    for column in ("", "mean", "median", "95 %", "99 %", "training mean", "ratio"):
         table.add_column(column, justify="left" if not column else "right", no_wrap=not column)
     for name, (label, digits) in ROWS.items():
-        base, ratio = (_of(result[part], name) for part in ("baseline", "ratio"))
+        base, ratio = (feature_mean(result[part], name) for part in ("baseline", "ratio"))
         sizes = [*(result["errors"][name][k] for k in ("mean", "median", "p95", "p99")), base]
-        cells = [_number(v, digits) for v in sizes]
-        table.add_row(label, *cells, _number(ratio, 2))
+        cells = [format_number(v, digits) for v in sizes]
+        table.add_row(label, *cells, format_number(ratio, 2))
     accuracy, base = (result["heading_accuracy"], result["baseline"]["heading_accuracy"])
     table.add_row("class right", f"{100 * accuracy:.1f} %", "", "", "", f"{100 * base:.1f} %", "")
     return table
-
-
-def _of(part: dict[str, Any], name: str) -> float | None:
-    """The figure of a feature under the names of DESIGN §9."""
-    names = {"to_lane_centre": "to_lane_centre_mae_m", "angle": "angle_mae_rad"}
-    found: float | None = part[names[name]] if name in names else part["mae_m"][name]
-    return found
 
 
 def group_table(result: dict[str, Any]) -> Table:
@@ -51,50 +46,50 @@ def group_table(result: dict[str, Any]) -> Table:
             table.add_row(
                 key,
                 str(part["frames"]),
-                *(_number(part["errors"][f]["mean"], 4 if f == "angle" else 3) for f in FEATURES),
+                *(
+                    format_number(part["errors"][f]["mean"], 4 if f == "angle" else 3)
+                    for f in FEATURES
+                ),
                 f"{100 * part['heading_accuracy']:.1f}%",
             )
     return table
 
 
-def doubt_table(result: dict[str, Any]) -> Table:
-    """How many errors were as small as the model said, and how many frames it called strange."""
+def uncertainty_table(result: dict[str, Any]) -> Table:
+    """Shares of errors within one and two predicted standard deviations, and of frames that are
+    classified as out of distribution."""
     doubt = result["doubt"]
-    strange = f"{doubt['out_of_distribution']:.1%} of the frames called out of distribution"
-    table = Table(title=f"standard deviations; {strange}")
+    share = f"{doubt['out_of_distribution']:.1%} of the frames classified as out of distribution"
+    table = Table(title=f"standard deviations; {share}")
     for column in ("", "within 1 (68.3 %)", "within 2 (95.4 %)"):
         table.add_column(column, justify="left" if not column else "right")
     for name, shares in doubt["coverage"].items():
-        table.add_row(name, *("-" if s is None else f"{100 * s:.1f} %" for s in shares))
+        table.add_row(name, *(format_percent(share) for share in shares))
     return table
 
 
-def answer_table(answers: list[dict[str, Any]]) -> Table:
-    """Track features of images."""
+def prediction_table(predictions: list[dict[str, Any]]) -> Table:
+    """The track features predicted for images."""
     table = Table(title="track features")
     table.add_column("image")
     for m in tf.MARKINGS:
         table.add_column(f"{m} (m)", justify="right")
     for column in ("to lane centre (m)", "angle (rad)", "heading"):
         table.add_column(column, justify="right")
-    for answer in answers:
-        best = max(answer["heading"], key=answer["heading"].__getitem__)
+    for prediction in predictions:
+        heading = max(prediction["heading"], key=prediction["heading"].__getitem__)
         table.add_row(
-            answer["image"],
-            *(_number(answer["distances_m"][m], 2) for m in tf.MARKINGS),
-            _number(answer["to_lane_centre_m"], 2),
-            _number(answer["angle_rad"], 4),
-            f"{best} {100 * answer['heading'][best]:.0f} %",
+            prediction["image"],
+            *(format_number(prediction["distances_m"][m], 2) for m in tf.MARKINGS),
+            format_number(prediction["to_lane_centre_m"], 2),
+            format_number(prediction["angle_rad"], 4),
+            f"{heading} {100 * prediction['heading'][heading]:.0f} %",
         )
     return table
 
 
-def _number(value: float | None, digits: int) -> str:
-    return "-" if value is None else f"{value:.{digits}f}"
-
-
 def export_lines(result: dict[str, Any]) -> str:
-    """What came of an export: where it is, how far from torch, and its gate."""
+    """The result of an export: its files, largest differences from torch, and the accuracy gate."""
     check, gate = result["check"], result.get("gate")
     lines = [
         f"{result['out']}: {', '.join(result['files'])}",

@@ -1,7 +1,8 @@
-"""Checkpoints of a run in training: one safetensors file each, written whole or not at all.
+"""Checkpoints of a run in training: one safetensors file each, written atomically.
 
-Tensors: `network.*`, `optimiser.WHICH.INDEX.NAME`, `balance.NAME`, `rng` (torch's generator, for
-dropout). Metadata: the step and the seconds trained so far.
+Tensors: `network.*`, `optimiser.OPTIMIZER.PARAMETER.NAME`, `balance.NAME` (task weighting) and
+`rng` (torch's CPU generator of the first process, for dropout). Metadata: the step and the seconds
+trained so far.
 """
 
 from pathlib import Path
@@ -17,23 +18,23 @@ from mtlnet.training.trainer import Trainer
 from runtime.files import atomic_write
 
 FOLDER = "checkpoints"
-KEPT = 2
+MAX_CHECKPOINTS = 2
 
 
 def save_checkpoint(run: Path, trainer: Trainer, elapsed_s: float) -> Path:
-    """Write the state of `trainer` to `run`; the latest `KEPT` checkpoints stay."""
+    """Write the state of `trainer` to `run`, and delete all but the latest `MAX_CHECKPOINTS`."""
     folder = run / FOLDER
     folder.mkdir(exist_ok=True)
     path = folder / f"step-{trainer.step_number:08d}.safetensors"
     metadata = {"step": str(trainer.step_number), "elapsed_s": repr(elapsed_s)}
     atomic_write(path, save(_tensors(trainer), metadata), fsync=True)
-    for old in list_checkpoints(run)[:-KEPT]:
+    for old in list_checkpoints(run)[:-MAX_CHECKPOINTS]:
         old.unlink()
     return path
 
 
 def load_checkpoint(path: Path, trainer: Trainer) -> float:
-    """Put the state in `path` into `trainer`; the seconds trained so far.
+    """Restore `trainer` from `path`; returns the seconds trained so far.
 
     Raises ModelError when the file is damaged or of another network.
     """
@@ -41,8 +42,8 @@ def load_checkpoint(path: Path, trainer: Trainer) -> float:
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata()
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 no dict
-        _restore(trainer, tensors)
         trainer.step_number = int(metadata["step"])
+        _restore(trainer, tensors)
         return float(metadata["elapsed_s"])
     except (SafetensorError, RuntimeError, KeyError, ValueError, TypeError) as error:
         reason = str(error).splitlines()[0]
@@ -59,40 +60,41 @@ def list_checkpoints(run: Path) -> list[Path]:
 
 def _tensors(trainer: Trainer) -> dict[str, Tensor]:
     tensors = {f"network.{name}": t for name, t in trainer.network.state_dict().items()}
-    for which, optimiser in enumerate(trainer.optimisers.parts):
-        for index, state in optimiser.state_dict()["state"].items():
+    for number, optimizer in enumerate(trainer.optimizers.optimizers):
+        for index, state in optimizer.state_dict()["state"].items():
             for name, value in state.items():
                 if isinstance(value, Tensor):
-                    tensors[f"optimiser.{which}.{index}.{name}"] = value
-    for name, tensor in trainer.balance.state().items():
+                    tensors[f"optimiser.{number}.{index}.{name}"] = value
+    for name, tensor in trainer.task_weighting.state().items():
         tensors[f"balance.{name}"] = tensor
     tensors["rng"] = torch.get_rng_state()
     return {name: t.detach().cpu().contiguous() for name, t in tensors.items()}
 
 
 def _restore(trainer: Trainer, tensors: dict[str, Tensor]) -> None:
-    prefix = "network."
-    trainer.network.load_state_dict(
-        {name.removeprefix(prefix): t for name, t in tensors.items() if name.startswith(prefix)}
-    )
-    for which, optimiser in enumerate(trainer.optimisers.parts):
-        prefix = f"optimiser.{which}."
-        kept = {n.removeprefix(prefix): t for n, t in tensors.items() if n.startswith(prefix)}
-        _restore_optimiser(optimiser, kept)
-    kept = {n.removeprefix("balance."): t for n, t in tensors.items() if n.startswith("balance.")}
-    trainer.balance.restore(kept)
-    torch.set_rng_state(tensors["rng"])
+    trainer.network.load_state_dict(_with_prefix(tensors, "network."))
+    for number, optimizer in enumerate(trainer.optimizers.optimizers):
+        _restore_optimizer(optimizer, _with_prefix(tensors, f"optimiser.{number}."))
+    trainer.task_weighting.restore(_with_prefix(tensors, "balance."))
+    trainer.seed_dropout()
+    if trainer.rank.is_first:
+        torch.set_rng_state(tensors["rng"])
 
 
-def _restore_optimiser(optimiser: Optimizer, tensors: dict[str, Tensor]) -> None:
+def _with_prefix(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
+    """The tensors whose names begin with `prefix`, under the rest of their names."""
+    return {n.removeprefix(prefix): t for n, t in tensors.items() if n.startswith(prefix)}
+
+
+def _restore_optimizer(optimizer: Optimizer, tensors: dict[str, Tensor]) -> None:
     state: dict[int, dict[str, Tensor]] = {}
     for key, tensor in tensors.items():
         index, name = key.split(".", 1)
         state.setdefault(int(index), {})[name] = tensor
-    groups = optimiser.state_dict()["param_groups"]
-    optimiser.load_state_dict({"state": state, "param_groups": groups})
-    # Fused optimisers walk a parameter and its state in memory order: channels-last, both.
-    for parameter, values in optimiser.state.items():
+    groups = optimizer.state_dict()["param_groups"]
+    optimizer.load_state_dict({"state": state, "param_groups": groups})
+    # Fused optimizers read a parameter and its state in memory order: both must be channels-last.
+    for parameter, values in optimizer.state.items():
         for name, value in values.items():
             if isinstance(value, Tensor) and value.shape == parameter.shape:
                 values[name] = torch.empty_like(parameter).copy_(value)

@@ -1,4 +1,4 @@
-"""What a training run was asked to do: kept in its `config.json`, and obeyed on `--resume`."""
+"""The configuration of a training run: stored in its `config.json`, and used by `--resume`."""
 
 import json
 from collections.abc import Mapping
@@ -11,14 +11,14 @@ from mtlnet.inference.model_card import ModelError
 from mtlnet.model.architecture import find_architecture, require_task_heads
 from mtlnet.training.loss import Alpha
 from mtlnet.training.recipes import Recipe, find_recipe
-from mtlnet.training.task_weighting import find_balance
+from mtlnet.training.task_weighting import require_method
 from runtime.files import atomic_write
 from trackfeatures.errors import UserError
 
 CONFIG = "config.json"
 MAX_THREADS = 1024
-# What may change when a run goes on; all else would make it another run.
-FLEXIBLE = ("iterations", "minutes", "device", "threads", "data")
+# Fields that may change when a run is resumed; any other would make it a different run.
+RESUMABLE_WITH = ("iterations", "minutes", "device", "threads", "data")
 
 
 @dataclass(frozen=True)
@@ -31,15 +31,15 @@ class TrainConfig:
     """A name of `mtlnet.model.architecture.ARCHITECTURES`."""
     alpha: Alpha = (0.3, 0.2, 0.5)
     balance: str = "fixed"
-    """A name of `mtlnet.training.task_weighting.BALANCES`; unless fixed, alpha only says what is
-    learned."""
+    """A name of `mtlnet.training.task_weighting.METHODS`; unless it is fixed, alpha only selects
+    the tasks that are learned."""
     recipe: str = "fast"
     iterations: int | None = None
     """Steps; None: the recipe's, or as many as fit into `minutes`."""
     minutes: float | None = None
-    """Time for the training itself; the schedule follows the clock."""
+    """Duration of the training itself; the schedule then follows the time elapsed."""
     init: str | None = None
-    """The run whose model training starts from."""
+    """The run folder of the model to fine-tune."""
     seed: int = 0
     batch: int = 0
     """Images a step; 0: the recipe's."""
@@ -47,15 +47,17 @@ class TrainConfig:
     threads: int = 0
     """CPU threads; 0: one a core."""
     skip_undecodable: bool = False
-    """Leave out the frames whose image cannot be decoded; they are named in the model's card."""
+    """Omit frames whose image cannot be decoded; the model's card lists them."""
 
     def __post_init__(self) -> None:
         require_task_heads(find_architecture(self.network), self.alpha)
-        find_balance(self.balance)
+        require_method(self.balance)
         if self.batch == 0:
             object.__setattr__(self, "batch", find_recipe(self.recipe).batch)
         if self.init is not None and find_recipe(self.recipe).batch_norm:
-            raise UserError(f"recipe {self.recipe} starts anew; with --init give --recipe tune")
+            raise UserError(
+                f"recipe {self.recipe} starts from new weights; with --init give --recipe tune"
+            )
         if self.iterations is not None and self.iterations < 1:
             raise UserError(f"--iterations is {self.iterations}; give at least 1")
         if self.minutes is not None and not self.minutes > 0:
@@ -83,10 +85,12 @@ def write_config(config: TrainConfig, recipe: Recipe, data: Mapping[str, Any]) -
 
 
 def read_config(run: Path) -> tuple[TrainConfig, dict[str, Any]]:
-    """The configuration of a run, and the description of its data."""
+    """The configuration of a run, and the description of its data. Raises ModelError."""
     path = run / CONFIG
     if not path.is_file():
-        raise ModelError(f"{run} is no training run ({CONFIG} is missing); nothing to resume")
+        raise ModelError(
+            f"{run} is not a training run ({CONFIG} is missing); give the --out of a run to resume"
+        )
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
         tf.require_version(content["definitions"], f"the run in {run}")
@@ -98,16 +102,16 @@ def read_config(run: Path) -> tuple[TrainConfig, dict[str, Any]]:
 
 
 def resume_config(run: Path, given: Mapping[str, Any]) -> tuple[TrainConfig, dict[str, Any]]:
-    """The stored configuration with what was `given` on the command line to go on with.
+    """The stored configuration, with the fields `given` on the command line.
 
-    Raises UserError when something is given that would make it another run.
+    Raises UserError when a field is given that would make it a different run.
     """
     stored, data = read_config(run)
     for name, value in given.items():
         kept = getattr(stored, name)
-        if name not in FLEXIBLE and value != kept:
+        if name not in RESUMABLE_WITH and value != kept:
             raise UserError(
                 f"{run} was started with {name} {kept}, now {value} is asked for; leave it out to "
                 "resume, or start a new run with another --out"
             )
-    return replace(stored, **{k: v for k, v in given.items() if k in FLEXIBLE}), data
+    return replace(stored, **{k: v for k, v in given.items() if k in RESUMABLE_WITH}), data

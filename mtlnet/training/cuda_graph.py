@@ -1,8 +1,8 @@
-"""A training step recorded once as a CUDA graph and then replayed: one launch in place of hundreds.
+"""A training step recorded as a CUDA graph and replayed: one launch in place of hundreds.
 
-What the step computes with must be the same memory every time, so each batch is copied into the
-first one's; and numbers that it holds (the learning rate) are part of the recording, so that it is
-recorded anew when they change: every 10,000 steps in recipe `paper`.
+A replay uses the same memory as the recording, so each batch is copied into the first one's. Python
+numbers such as the learning rate are constants of the recording, which is repeated when they
+change: every 10,000 steps in recipe `paper`.
 """
 
 from collections.abc import Callable
@@ -14,34 +14,35 @@ import torch
 from mtlnet.data.gpu_cache import DeviceBatch
 from mtlnet.training.loss import Losses
 
-WARM_UP = 3  # steps taken as they are: what is made at the first step is not made in the graph
+WARM_UP = 3
+"""Steps run before the recording, so that what the first steps allocate is not part of it."""
 
 Work = Callable[[], Losses]
 
 
 class Recorder(Protocol):
-    """What runs a piece of work, and what records it."""
+    """Runs a step, or records it."""
 
     def run(self, work: Work) -> Losses:
-        """Do it now, where it will be recorded later."""
+        """Run `work` now, on the stream on which it will be recorded."""
 
     def record(self, work: Work) -> Work:
-        """What does `work` again, on the same memory; it is not done now."""
+        """Record `work` without running it; the result runs it on the same memory."""
 
 
 class CudaRecorder:
-    """Records on a stream of its own, as torch.cuda.graph asks for backward passes."""
+    """Records on a side stream, which torch.cuda.graph requires for backward passes."""
 
     def __init__(self, device: torch.device) -> None:
         self._stream = torch.cuda.Stream(device)  # type: ignore[no-untyped-call]  # torch's
 
     def run(self, work: Work) -> Losses:
-        here = torch.cuda.current_stream(self._stream.device)
-        self._stream.wait_stream(here)
+        current = torch.cuda.current_stream(self._stream.device)
+        self._stream.wait_stream(current)
         with torch.cuda.stream(self._stream):
-            done = work()
-        here.wait_stream(self._stream)
-        return done
+            losses = work()
+        current.wait_stream(self._stream)
+        return losses
 
     def record(self, work: Work) -> Work:
         graph = torch.cuda.CUDAGraph()
@@ -56,32 +57,32 @@ class CudaRecorder:
 
 
 class CudaGraphStep:
-    """`work` on one batch after the other: the first ones as they are, then as recorded."""
+    """Runs `work` on batches of one shape: directly `WARM_UP` times, then as a recorded graph."""
 
     def __init__(self, work: Callable[[DeviceBatch], Losses], recorder: Recorder) -> None:
         self._work = work
         self._recorder = recorder
         self._batch: DeviceBatch | None = None
-        self._left = WARM_UP
+        self._warm_up_left = WARM_UP
         self._constants: object = None
         self._replay: Work | None = None
 
     def __call__(self, batch: DeviceBatch, constants: object) -> Losses:
-        """The losses of `work(batch)`; `constants`: what else it depends on, compared by ==."""
-        held = self._hold(batch)
-        if self._left:
-            self._left -= 1
-            return self._recorder.run(lambda: self._work(held))
+        """The losses of `work(batch)`; `constants`: Python values it depends on, compared by ==."""
+        static = self._copy_in(batch)
+        if self._warm_up_left:
+            self._warm_up_left -= 1
+            return self._recorder.run(lambda: self._work(static))
         if self._replay is None or constants != self._constants:
-            self._replay = None  # its memory is free for the next one's
-            self._replay = self._recorder.record(lambda: self._work(held))
+            self._replay = None  # frees the memory of the last graph before the next is recorded
+            self._replay = self._recorder.record(lambda: self._work(static))
             self._constants = constants
         losses = self._replay()
-        # Those of the recording are overwritten by the next replay.
+        # Copied, because the next replay overwrites the tensors of the graph.
         return Losses(*(getattr(losses, f.name).detach().clone() for f in fields(Losses)))
 
-    def _hold(self, batch: DeviceBatch) -> DeviceBatch:
-        """The batch, in the memory of the first."""
+    def _copy_in(self, batch: DeviceBatch) -> DeviceBatch:
+        """The batch in the memory of the first one."""
         if self._batch is None:
             self._batch = DeviceBatch(
                 *(getattr(batch, f.name).clone() for f in fields(DeviceBatch))

@@ -1,7 +1,7 @@
 """Several processes that train one network: `torchrun --nproc-per-node N -m mtlnet train ...`.
 
-Each makes its part of every batch; gradients, losses and the statistics of batch normalisation are
-averaged, so that N processes take the steps of one. The first process alone writes.
+Each computes its part of every batch. Gradients, losses and the statistics of batch normalisation
+are averaged, so that N processes take the steps of one. Only the first process writes files.
 """
 
 import os
@@ -10,61 +10,74 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import timedelta
 
+import numpy as np
 import torch
 import torch.distributed as dist
 from torch import Tensor
 
 from trackfeatures.errors import UserError
 
-PATIENCE = timedelta(minutes=30)  # while the first process exports, the others wait
+TIMEOUT = timedelta(minutes=30)  # the other processes wait while the first one exports
 
 
 @dataclass(frozen=True)
-class Part:
-    """Which of how many processes this is; `local` of them share this machine."""
+class Rank:
+    """The index of this process among all, and among those on this machine."""
 
-    rank: int = 0
-    world: int = 1
-    local_rank: int = 0
-    local: int = 1
+    index: int = 0
+    world_size: int = 1
+    local_index: int = 0
+    local_world_size: int = 1
 
     @property
-    def first(self) -> bool:
-        """Whether this process writes and speaks."""
-        return self.rank == 0
+    def is_first(self) -> bool:
+        """Whether this process writes files and messages."""
+        return self.index == 0
 
 
-ALONE = Part()
+SINGLE_PROCESS = Rank()
 
 
-def find_part() -> Part:
-    """This process's part as torchrun told it; the only one without torchrun."""
+def read_rank() -> Rank:
+    """This process's rank from the environment that torchrun sets; a single process without it."""
     names = ("RANK", "WORLD_SIZE", "LOCAL_RANK", "LOCAL_WORLD_SIZE")
     values = [os.environ.get(name) for name in names]
     if None in values:
-        return Part()
-    return Part(*(int(value or 0) for value in values))
+        return SINGLE_PROCESS
+    return Rank(*(int(value or 0) for value in values))
 
 
 @contextmanager
-def joined(part: Part, device: torch.device, batch: int) -> Iterator[None]:
-    """Joined with the other processes; UserError when the batch does not divide among them."""
-    if part.world == 1:
+def process_group(rank: Rank, device: torch.device, batch: int) -> Iterator[None]:
+    """Connects the processes; UserError when the batch does not divide among them."""
+    if rank.world_size == 1:
         yield
         return
-    if batch % part.world:
+    if batch % rank.world_size:
         raise UserError(
-            f"--batch {batch} does not divide among {part.world} processes; give a multiple of it"
+            f"--batch {batch} does not divide among {rank.world_size} processes; give a multiple "
+            f"of {rank.world_size}"
         )
-    dist.init_process_group("nccl" if device.type == "cuda" else "gloo", timeout=PATIENCE)
+    dist.init_process_group("nccl" if device.type == "cuda" else "gloo", timeout=TIMEOUT)
     try:
         yield
     finally:
         dist.destroy_process_group()
 
 
+def dropout_seed(seed: int, rank: int, step: int = 0) -> int:
+    """The seed of torch's generators in process `rank`, for a run that (re)starts at `step`.
+
+    It differs between processes, which would otherwise draw the same dropout masks for different
+    images. The first process of a new run uses `seed` itself.
+    """
+    if rank == step == 0:
+        return seed
+    return int(np.random.SeedSequence([seed, rank, step]).generate_state(1, np.uint64)[0] >> 1)
+
+
 def average(tensors: Sequence[Tensor]) -> None:
-    """Replace tensors by their means over all processes, in one message."""
+    """Replace tensors by their means over all processes, in one all-reduce."""
     if not dist.is_initialized():
         return
     flat = torch.cat([tensor.reshape(-1) for tensor in tensors])
@@ -76,8 +89,8 @@ def average(tensors: Sequence[Tensor]) -> None:
         begin += tensor.numel()
 
 
-def agree(values: Sequence[float], device: torch.device) -> list[float]:
-    """The first process's values, for decisions that all must take alike."""
+def broadcast(values: Sequence[float], device: torch.device) -> list[float]:
+    """The first process's values, for decisions that must be the same in all processes."""
     if not dist.is_initialized():
         return list(values)
     tensor = torch.tensor(values, dtype=torch.float64, device=device)
@@ -85,7 +98,7 @@ def agree(values: Sequence[float], device: torch.device) -> list[float]:
     return [float(value) for value in tensor]
 
 
-def wait() -> None:
-    """Wait for the others."""
+def barrier() -> None:
+    """Wait until all processes have come here."""
     if dist.is_initialized():
         dist.barrier()

@@ -1,4 +1,4 @@
-"""The losses of a run as it learns: `curves.csv` and TensorBoard."""
+"""Logs the losses of a run in training: `curves.csv` and TensorBoard."""
 
 import socket
 import time
@@ -15,16 +15,19 @@ from mtlnet.inference.curves import COLUMNS, CURVES, HEADER, read_curves
 from runtime.files import atomic_write
 
 
-class Curves:
-    """Appends points to the curves of `run`; points past `step` (of a lost end) are dropped."""
+class CurveLog:
+    """Appends points to the curves of `run`; points after `step` are dropped first.
+
+    They are left when a run was killed after its last checkpoint.
+    """
 
     columns = COLUMNS
 
     def __init__(self, run: Path, step: int) -> None:
         path = run / CURVES
         kept = [_row(point) for point in read_curves(path) if point["step"] <= step]
-        atomic_write(path, "".join([HEADER, *map(_line, kept)]).encode(), fsync=True)
-        self._board = Board(run / "tensorboard", step + 1 if step else None)
+        atomic_write(path, "".join([HEADER, *map(_line, kept)]), fsync=True)
+        self._tensorboard = TensorBoardWriter(run / "tensorboard", step + 1 if step else None)
         self._file = path.open("a", newline="", encoding="utf-8")
 
     def write(self, point: Mapping[str, float]) -> None:
@@ -32,9 +35,9 @@ class Curves:
         self._file.write(_line(_row(point)))
         self._file.flush()
         values = {f"train/{name}": value for name, value in point.items() if name != "step"}
-        self._board.add(int(point["step"]), values)
+        self._tensorboard.add(int(point["step"]), values)
 
-    def __enter__(self) -> "Curves":
+    def __enter__(self) -> "CurveLog":
         return self
 
     def __exit__(
@@ -43,7 +46,7 @@ class Curves:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        with closing(self._board), closing(self._file):
+        with closing(self._tensorboard), closing(self._file):
             pass
 
 
@@ -55,22 +58,21 @@ def _line(cells: Iterable[str]) -> str:
     return ",".join(cells) + "\n"
 
 
-# Event files for TensorBoard, written as each point comes. torch's SummaryWriter writes them from
-# a thread: on a full disk that prints a traceback of its own.
+class TensorBoardWriter:
+    """Appends scalars to a new event file in `folder`; earlier points from `purge_step` are void.
 
+    torch's SummaryWriter writes from a thread, which prints its own traceback on a full disk.
+    """
 
-class Board:
-    """Appends scalars to a new event file in `folder`; points from step `purge` on are void."""
-
-    def __init__(self, folder: Path, purge: int | None = None) -> None:
+    def __init__(self, folder: Path, purge_step: int | None = None) -> None:
         folder.mkdir(exist_ok=True)
         # TensorBoard reads the files of a folder in the order of their names.
         name = f"events.out.tfevents.{time.time():.6f}.{socket.gethostname()}"
         self._file = (folder / name).open("wb")
         self._records = RecordWriter(self._file)
         self._add(Event(file_version="brain.Event:2"))
-        if purge is not None:
-            self._add(Event(step=purge, session_log=SessionLog(status=SessionLog.START)))
+        if purge_step is not None:
+            self._add(Event(step=purge_step, session_log=SessionLog(status=SessionLog.START)))
 
     def add(self, step: int, values: dict[str, float]) -> None:
         """Add a point to the curve of each name."""
@@ -84,7 +86,7 @@ class Board:
             self._file.flush()
         except OSError as error:
             error.filename = self._file.name
-            with suppress(OSError):  # what is left in the buffer fails once more
+            with suppress(OSError):  # writing the rest of the buffer fails again
                 self._file.close()
             raise
 

@@ -1,4 +1,4 @@
-"""The steps of a run, until its iterations or its minutes are used up; checkpoints on the way."""
+"""The training loop: steps until the iterations or the minutes are used up, with checkpoints."""
 
 import signal
 import time
@@ -17,22 +17,23 @@ from mtlnet.data.gpu_cache import DeviceBatch, GpuDataset
 from mtlnet.data.loader import Batch, Loader
 from mtlnet.training.checkpoint import save_checkpoint
 from mtlnet.training.config import TrainConfig
-from mtlnet.training.distributed import Part, agree
-from mtlnet.training.logging import Curves
+from mtlnet.training.distributed import broadcast
+from mtlnet.training.logging import CurveLog
 from mtlnet.training.trainer import Trainer
 from trackfeatures.errors import UserError
 
 LOG_EVERY = 10
+"""Steps between two points of the curves."""
 CHECKPOINT_SECONDS = 60.0
 DIVERGED = (
-    "training stops, the last good checkpoint stays; start anew with smaller --alpha or another "
-    "--seed, or look at the data with `datagen verify`"
+    "training stops and the last good checkpoint is kept; start a new run with smaller --alpha or "
+    "another --seed, or check the data with `datagen verify`"
 )
 
 
 @dataclass(frozen=True)
-class Progress:
-    """Where a run is: `fraction` in [0, 1]; losses as logged (distance, angle, type, total)."""
+class TrainProgress:
+    """The state of a run: `fraction` done in [0, 1]; `losses` (distance, angle, heading, total)."""
 
     step: int
     fraction: float
@@ -42,42 +43,45 @@ class Progress:
 
 
 class Stopped(KeyboardInterrupt):
-    """The user stopped the run; its state is in the checkpoint named."""
+    """The user stopped the run; its argument is the path of the checkpoint."""
 
 
-Report = Callable[[Progress], None]
+Report = Callable[[TrainProgress], None]
 
 
-def learn(
+def train_loop(
     config: TrainConfig,
     trainer: Trainer,
     loader: Loader | GpuDataset,
     elapsed_s: float,
     report: Report,
-    part: Part,
 ) -> None:
-    """Take steps until the iterations or the minutes are used up; checkpoints on the way."""
-    written = Curves(config.out, trainer.step_number) if part.first else None
+    """Train until the iterations or the minutes are used up, and save checkpoints on the way.
+
+    `elapsed_s`: seconds trained before this call. Raises Stopped after Ctrl-C, UserError when
+    training diverges.
+    """
+    log = CurveLog(config.out, trainer.step_number) if trainer.rank.is_first else None
     begin = time.perf_counter() - elapsed_s
     saved = logged = time.perf_counter()
     window: list[torch.Tensor] = []
-    with written or nullcontext() as curves, StopRequest() as stop:
+    with log or nullcontext(), StopRequest() as stop:
         batches: Iterator[Batch | DeviceBatch] = loader.batches(trainer.step_number)
         while True:
             now = time.perf_counter()
-            here = [fraction(config, trainer, now - begin), stop.requested, now - saved]
-            done, stopping, unsaved_s = agree(here, trainer.device)
+            own = [fraction_done(config, trainer, now - begin), stop.requested, now - saved]
+            fraction, stopping, unsaved_s = broadcast(own, trainer.device)
             if stopping or unsaved_s > CHECKPOINT_SECONDS:
                 require_finite(window, trainer.step_number)
-                path = keep(config, trainer, now - begin, part)
+                path = save(config, trainer, now - begin)
                 saved = now
                 if stopping:
                     raise Stopped(str(path))
-            if done >= 1.0:
+            if fraction >= 1.0:
                 break
-            losses = trainer.step(next(batches), done)
+            losses = trainer.step(next(batches), fraction)
             window.append(losses.row())
-            if trainer.device.type == "cpu":  # on a GPU, asking would wait for it
+            if trainer.device.type == "cpu":  # on a GPU this would wait for the step to end
                 require_finite(window[-1:], trainer.step_number)
             if trainer.step_number % LOG_EVERY == 0:
                 now = time.perf_counter()
@@ -85,63 +89,68 @@ def learn(
                 means = torch.stack(window).double().mean(0).cpu().numpy()
                 speed = len(window) * config.batch / (now - logged)
                 window, logged = [], now
-                point = Progress(trainer.step_number, done, now - begin, speed, means)
-                if curves is not None:
-                    row = as_row(point, trainer)
-                    curves.write(dict(zip(curves.columns, row, strict=True)))
-                    report(point)
+                progress = TrainProgress(trainer.step_number, fraction, now - begin, speed, means)
+                if log is not None:
+                    log.write(curve_point(progress, trainer))
+                    report(progress)
         require_finite(window, trainer.step_number)
-        keep(config, trainer, time.perf_counter() - begin, part)
+        save(config, trainer, time.perf_counter() - begin)
 
 
-def keep(config: TrainConfig, trainer: Trainer, elapsed_s: float, part: Part) -> Path:
-    """Save a checkpoint, in the first process."""
-    if not part.first:
+def save(config: TrainConfig, trainer: Trainer, elapsed_s: float) -> Path:
+    """Save a checkpoint in the first process; UserError when a weight is not finite."""
+    if not trainer.rank.is_first:
         return config.out
     if not all(bool(p.isfinite().all()) for p in trainer.network.parameters()):
         raise UserError(
-            f"a weight is no finite number after batch {trainer.step_number}; {DIVERGED}"
+            f"a weight is not a finite number after batch {trainer.step_number}; {DIVERGED}"
         )
     return save_checkpoint(config.out, trainer, elapsed_s)
 
 
-def fraction(config: TrainConfig, trainer: Trainer, elapsed_s: float) -> float:
-    """How much of the run is done, by steps or by the clock, whichever is further."""
+def fraction_done(config: TrainConfig, trainer: Trainer, elapsed_s: float) -> float:
+    """The fraction of the run that is done: by steps or by time, whichever is larger."""
     recipe_steps = None if config.minutes is not None else trainer.recipe.iterations
     steps = config.iterations or recipe_steps
     by_steps = trainer.step_number / steps if steps else 0.0
-    by_clock = elapsed_s / (60 * config.minutes) if config.minutes is not None else 0.0
-    return max(by_steps, by_clock)
+    by_time = elapsed_s / (60 * config.minutes) if config.minutes is not None else 0.0
+    return max(by_steps, by_time)
 
 
-def as_row(point: Progress, trainer: Trainer) -> tuple[float, ...]:
-    """A point of the curves, in the order of their columns."""
-    rate = trainer.optimisers.rate
-    head = (point.step, point.elapsed_s, rate, point.images_per_second)
-    return (*head, *point.losses.tolist(), *trainer.balance.weights())
+def curve_point(progress: TrainProgress, trainer: Trainer) -> dict[str, float]:
+    """A point of the curves, by column."""
+    values = (
+        progress.step,
+        progress.elapsed_s,
+        trainer.optimizers.learning_rate,
+        progress.images_per_second,
+        *progress.losses.tolist(),
+        *trainer.task_weighting.current_weights(),
+    )
+    return dict(zip(CurveLog.columns, values, strict=True))
 
 
 def require_finite(window: Sequence[torch.Tensor], step: int) -> None:
-    """Raise UserError when training has diverged in the last steps: losses (4,) each."""
-    for before, losses in enumerate(reversed(window)):
+    """Raise UserError when one of the last losses (4,) is not finite; `step`: that of the last."""
+    for steps_before, losses in enumerate(reversed(window)):
         if not bool(losses.isfinite().all()):
             raise UserError(
-                f"the loss of batch {step - before} is no finite number (distance, angle, type, "
-                f"total: {losses.tolist()}); {DIVERGED}"
+                f"the loss of batch {step - steps_before} is not a finite number (distance, angle, "
+                f"heading, total: {losses.tolist()}); {DIVERGED}"
             )
 
 
-# Ctrl-C as a request, to be met between two steps and not in the middle of one.
-
-
 class StopRequest:
-    """While entered, the first Ctrl-C (or SIGTERM) sets `requested`; a second one interrupts."""
+    """Within its context the first SIGINT or SIGTERM sets `requested`; a second one interrupts.
+
+    The training loop stops between two steps, never in the middle of one.
+    """
 
     def __init__(self) -> None:
         self.requested = False
-        self._before: dict[int, Any] = {}
+        self._handlers: dict[int, Any] = {}
 
-    def _note(self, number: int, frame: FrameType | None) -> None:
+    def _handle(self, number: int, frame: FrameType | None) -> None:
         if self.requested:
             raise KeyboardInterrupt
         self.requested = True
@@ -149,8 +158,8 @@ class StopRequest:
     def __enter__(self) -> "StopRequest":
         for number in (signal.SIGINT, signal.SIGTERM):
             try:
-                self._before[number] = signal.signal(number, self._note)
-            except ValueError:  # only the main thread may; elsewhere nobody interrupts us
+                self._handlers[number] = signal.signal(number, self._handle)
+            except ValueError:  # only the main thread may, and only it is interrupted
                 break
         return self
 
@@ -160,5 +169,5 @@ class StopRequest:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        for number, handler in self._before.items():
+        for number, handler in self._handlers.items():
             signal.signal(number, handler)

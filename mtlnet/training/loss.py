@@ -1,8 +1,9 @@
 """The multi-task loss (paper, equations 6 to 9): three tasks weighted by alpha.
 
-Distances: squared error, summed over the five coded distances, mean over the batch. Angle: squared
-error of the coded angle, mean over the batch. Type: cross-entropy of the class, mean over the
-batch. The L2 term is the optimiser's: a weight decay of 2 lambda is the gradient of lambda |w|^2.
+Distance: squared error, summed over the five coded distances, mean over the batch. Angle: squared
+error of the coded angle, mean over the batch. Heading (the paper's "type"): cross-entropy of the
+class, mean over the batch. The L2 term is part of the optimizer: a weight decay of 2 lambda is the
+gradient of lambda |w|^2.
 """
 
 import math
@@ -15,57 +16,74 @@ from torch.nn.functional import cross_entropy, smooth_l1_loss
 
 from trackfeatures.errors import UserError
 
-TASKS = ("distance", "angle", "type")
+TASKS = ("distance", "angle", "heading")
 Alpha = tuple[float, float, float]
-ANGLE_BEND, ANGLE_GAIN = 1.0, 5.0
-DISTANCE_GAIN = 2.5
 
 
 class AlphaError(UserError):
-    """Task weights that are no task weights."""
+    """Task weights that are missing, negative, not numbers, or all zero."""
+
+
+@dataclass(frozen=True)
+class HuberLoss:
+    """The Huber loss (Huber 1964) of errors in standard deviations of their targets, and gains.
+
+    An error is squared up to `distance_beta` or `angle_beta` standard deviations and linear beyond.
+    Where a distance has two possible values, the best prediction is then the likelier one; a
+    squared error asks for a value in between. The angle does not jump: its beta is large.
+
+    The gains multiply the terms of distance and angle. Without them the cross-entropy of the
+    heading, which stays large, outweighs both: distances are learned far better with them, and
+    nothing is learned worse (EXPERIMENTS).
+    """
+
+    distance_beta: float
+    angle_beta: float = 1.0
+    distance_gain: float = 2.5
+    angle_gain: float = 5.0
 
 
 @dataclass(frozen=True)
 class Losses:
     """The unweighted loss of each task, as reported, and the sum that is minimised.
 
-    `terms` (3,): what that sum weighs, of each task.
+    `terms` (3,): the term of each task in that sum, before its weight.
     """
 
     distance: Tensor
     angle: Tensor
-    type: Tensor
+    heading: Tensor
     total: Tensor
     terms: Tensor
 
     def row(self) -> Tensor:
-        """Distance, angle, type, total (4,), without the graph."""
-        return torch.stack([self.distance, self.angle, self.type, self.total.detach()])
+        """Distance, angle, heading, total (4,), without the graph."""
+        return torch.stack([self.distance, self.angle, self.heading, self.total.detach()])
 
 
 def parse_alpha(text: str) -> Alpha:
-    """Three weights "distance,angle,type", non-negative, of any sum; 0 leaves a task out.
+    """Three weights given as "distance,angle,heading": not negative, of any sum; 0 omits a task.
 
-    Raises AlphaError naming what was seen.
+    Raises AlphaError.
     """
     parts = [part.strip() for part in text.split(",")]
-    how = "give three weights for distance, angle and type, such as --alpha 0.3,0.2,0.5"
+    how = "give three weights for distance, angle and heading, such as --alpha 0.3,0.2,0.5"
     if len(parts) != len(TASKS):
         raise AlphaError(f"alpha has {len(parts)} weight(s) ({text!r}); {how}")
     try:
-        distance, angle, kind = (float(part) for part in parts)
+        distance, angle, heading = (float(part) for part in parts)
     except ValueError:
         raise AlphaError(
             f"alpha {text!r} has a weight that is missing or no number; {how}"
         ) from None
-    for task, weight in zip(TASKS, (distance, angle, kind), strict=True):
+    for task, weight in zip(TASKS, (distance, angle, heading), strict=True):
         if not math.isfinite(weight) or weight < 0:
             raise AlphaError(
                 f"alpha's weight for {task} is {weight:g}; it must be 0 or more; {how}"
             )
-    if distance == angle == kind == 0:
+    if distance == angle == heading == 0:
         raise AlphaError(f"alpha {text!r} leaves nothing to learn; give at least one task a weight")
-    return distance, angle, kind
+    return distance, angle, heading
 
 
 def multi_task_loss(
@@ -73,46 +91,44 @@ def multi_task_loss(
     coded: Tensor,
     heading: Tensor,
     combine: Alpha | Callable[[Tensor], Tensor],
-    scale: Tensor | None = None,
-    bend: float = 0.0,
+    target_variance: Tensor | None = None,
+    huber: HuberLoss | None = None,
 ) -> Losses:
     """Losses of outputs (B, 9) for targets coded (B, 6) and heading (B,) int64.
 
-    `combine`: the tasks' weights, or what makes the sum to minimise out of their terms (3,).
-
-    `scale` (6,): variances of the coded targets. With it, the sum that is minimised (never the
-    reported losses) counts squared errors in units of them, distances as their mean: a task
-    answered by its mean then costs about 1, whatever its range. `bend`: from so many standard
-    deviations on a distance's error costs what it is, not its square (Huber 1964), 0: never.
-    Between two possible answers the best is then the likelier, where a squared error asks for one
-    in between. The angle never jumps: with `bend` its errors count squared up to `ANGLE_BEND`.
-    With `bend` distances count `DISTANCE_GAIN` times and the angle `ANGLE_GAIN` times: what the
-    paper's weights ask of coded numbers they then ask of these units, beside a class whose loss
-    stays large. Distances are learned far better so, and nothing worse (EXPERIMENTS).
+    `combine`: the weights of the tasks, or a function from their terms (3,) to the sum to minimise.
+    `target_variance` (6,): variances of the coded targets. With it the sum that is minimised (never
+    the reported losses) has squared errors in units of them, and the mean over the distances: a
+    task then costs about 1 when its mean is predicted, whatever its range. `huber`: with
+    `target_variance`, Huber losses in place of squares.
     """
     errors = outputs[:, :6].float() - coded
     squared = errors**2
     distance = squared[:, :5].sum(1).mean()
     angle = squared[:, 5].mean()
-    kind = cross_entropy(outputs[:, 6:].float(), heading)
-    if scale is None:
-        terms = (distance, angle, kind)
+    cross = cross_entropy(outputs[:, 6:].float(), heading)
+    if target_variance is None:
+        terms = (distance, angle, cross)
     else:
-        scaled = _bent(errors, scale, bend) if bend else squared / scale
-        terms = (scaled[:, :5].mean(), scaled[:, 5].mean(), kind)
+        scaled = (
+            squared / target_variance if huber is None else _huber(errors, target_variance, huber)
+        )
+        terms = (scaled[:, :5].mean(), scaled[:, 5].mean(), cross)
     if callable(combine):
         total = combine(torch.stack(terms))
     else:
         # A weight of 0 takes the task out of the graph: a true single-task network.
         weighted = [weight * term for weight, term in zip(combine, terms, strict=True) if weight]
         total = torch.stack(weighted).sum()
-    kept = torch.stack(terms).detach()
-    return Losses(distance.detach(), angle.detach(), kind.detach(), total, kept)
+    detached = torch.stack(terms).detach()
+    return Losses(distance.detach(), angle.detach(), cross.detach(), total, detached)
 
 
-def _bent(errors: Tensor, scale: Tensor, bend: float) -> Tensor:
-    units = errors * scale.rsqrt()
-    none = torch.zeros_like(units)
-    distances = smooth_l1_loss(units[:, :5], none[:, :5], reduction="none", beta=bend)
-    angle = smooth_l1_loss(units[:, 5:], none[:, 5:], reduction="none", beta=ANGLE_BEND)
-    return torch.cat([DISTANCE_GAIN * distances, ANGLE_GAIN * angle], 1)
+def _huber(errors: Tensor, target_variance: Tensor, huber: HuberLoss) -> Tensor:
+    deviations = errors * target_variance.rsqrt()
+    zero = torch.zeros_like(deviations)
+    distances = smooth_l1_loss(
+        deviations[:, :5], zero[:, :5], reduction="none", beta=huber.distance_beta
+    )
+    angle = smooth_l1_loss(deviations[:, 5:], zero[:, 5:], reduction="none", beta=huber.angle_beta)
+    return torch.cat([huber.distance_gain * distances, huber.angle_gain * angle], 1)

@@ -1,10 +1,9 @@
-"""What changes the weights in training: SGD, AdamW, or Muon for the large layers beside AdamW.
+"""Optimizers: SGD, AdamW, or Muon for the large layers with AdamW for the others.
 
-Muon (Jordan et al. 2024) steps along the gradient with all its singular values made equal, in as
-many directions as a layer has; in short trials `fast` needed half the images. It has the layers
-whose matrix is cheap: the convolutions and the first shared layer. What is small, and the wide
-second shared layer, stays with AdamW; so do torchvision's backbones, whose thin layers have few
-directions.
+Muon (Jordan et al. 2024) steps along the gradient with its singular values made equal; in short
+trials recipe `fast` needed half the images with it. It trains the layers whose matrix is cheap: the
+convolutions and the first shared layer. AdamW trains small parameters, the wide second shared layer
+and torchvision's backbones, whose matrices have few rows.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -18,74 +17,77 @@ from mtlnet.model.network import Network
 from mtlnet.training.recipes import MOMENTUM, Recipe
 
 MUON_LAYERS = ("features.", "shared.fc0.")
-MUON_SIDE = 1024
-"""Directions of a layer at most. The work grows with their square: the 4096 of network
-`deepdriving` cost two cores twenty seconds a step."""
-MUON_RATE = 8.0
-"""Times the recipe's rate: with updates scaled to AdamW's size, Muon bears longer steps."""
+MUON_MAX_SIDE = 1024
+"""Largest shorter side of a layer's matrix. The cost grows with its square: the 4096 of network
+`deepdriving` take two cores twenty seconds a step."""
+MUON_LR_SCALE = 8.0
+"""Muon's learning rate over the recipe's: with updates of AdamW's size it allows longer steps."""
 
 
-class Optimisers:
-    """The optimisers of a network, stepped together; `beside`: parameters that never decay."""
+class OptimizerSet:
+    """The optimizers of a network, stepped together; `extra`: parameters without weight decay."""
 
-    def __init__(self, network: Network, recipe: Recipe, beside: Sequence[nn.Parameter]) -> None:
-        self.parts: list[Optimizer] = []
-        self.parameters = [*network.parameters(), *beside]
-        self._rows: list[tuple[nn.Parameter, nn.Parameter]] = []
-        if recipe.optimiser == "sgd":
+    def __init__(self, network: Network, recipe: Recipe, extra: Sequence[nn.Parameter]) -> None:
+        self.optimizers: list[Optimizer] = []
+        self.parameters = [*network.parameters(), *extra]
+        self._matrices: list[tuple[nn.Parameter, nn.Parameter]] = []
+        if recipe.optimizer == "sgd":
             # The gradient of l2 * |w|^2 is 2 * l2 * w.
-            groups = _groups(list(network.parameters()), 2 * recipe.l2, beside)
-            self.parts.append(SGD(groups, recipe.learning_rate, MOMENTUM, fused=True))
+            groups = _groups(list(network.parameters()), 2 * recipe.l2, extra)
+            self.optimizers.append(SGD(groups, recipe.learning_rate, MOMENTUM, fused=True))
             return
         weights = {name: p for name, p in network.named_parameters() if p.ndim > 1}
         others = [p for p in network.parameters() if p.ndim <= 1]
-        if recipe.optimiser == "muon" and not network.architecture.backbone:
-            large = [name for name, weight in weights.items() if has_muon(name, weight)]
-            self._rows = [(p, nn.Parameter(as_rows(p.detach()))) for p in map(weights.pop, large)]
-            rows = [{"params": [row for _, row in self._rows], "times": MUON_RATE}]
-            rate = recipe.learning_rate * MUON_RATE
-            self.parts.append(GramMuon(rows, rate, recipe.l2))
-        groups = _groups(list(weights.values()), recipe.l2, [*others, *beside])
-        self.parts.append(AdamW(groups, recipe.learning_rate, betas=(0.9, 0.99), fused=True))
+        if recipe.optimizer == "muon" and not network.architecture.backbone:
+            large = [name for name, weight in weights.items() if uses_muon(name, weight)]
+            self._matrices = [
+                (p, nn.Parameter(as_matrix(p.detach()))) for p in map(weights.pop, large)
+            ]
+            matrices = [matrix for _, matrix in self._matrices]
+            muon_groups = [{"params": matrices, "lr_scale": MUON_LR_SCALE}]
+            rate = recipe.learning_rate * MUON_LR_SCALE
+            self.optimizers.append(GramMuon(muon_groups, rate, recipe.l2))
+        groups = _groups(list(weights.values()), recipe.l2, [*others, *extra])
+        self.optimizers.append(AdamW(groups, recipe.learning_rate, betas=(0.9, 0.99), fused=True))
 
     def gradients(self) -> list[Tensor]:
-        """Those there are, to be averaged over processes."""
+        """The gradients that exist, to be averaged over processes."""
         return [p.grad for p in self.parameters if p.grad is not None]
 
     def zero_grad(self) -> None:
-        """Forget the gradients."""
+        """Delete the gradients."""
         for parameter in self.parameters:
             parameter.grad = None
 
-    def set_rate(self, rate: float) -> None:
-        """The learning rate from now on."""
-        for part in self.parts:
-            for group in part.param_groups:
-                group["lr"] = rate * group.get("times", 1.0)
+    def set_learning_rate(self, rate: float) -> None:
+        """Set the recipe's learning rate; Muon's is `MUON_LR_SCALE` times as large."""
+        for optimizer in self.optimizers:
+            for group in optimizer.param_groups:
+                group["lr"] = rate * group.get("lr_scale", 1.0)
 
     @property
-    def rate(self) -> float:
-        """The learning rate."""
-        group = self.parts[-1].param_groups[0]
+    def learning_rate(self) -> float:
+        """The recipe's learning rate that is set."""
+        group = self.optimizers[-1].param_groups[0]
         return float(group["lr"])
 
     def step(self) -> None:
-        """Change the weights by their gradients."""
-        for parameter, row in self._rows:
-            row.grad = None if parameter.grad is None else as_rows(parameter.grad)
-        for part in self.parts:
-            part.step()
+        """Update the weights by their gradients."""
+        for parameter, matrix in self._matrices:
+            matrix.grad = None if parameter.grad is None else as_matrix(parameter.grad)
+        for optimizer in self.optimizers:
+            optimizer.step()
 
 
-def has_muon(name: str, weight: Tensor) -> bool:
-    """Whether a layer is Muon's."""
-    return name.startswith(MUON_LAYERS) and min(as_rows(weight).shape) <= MUON_SIDE
+def uses_muon(name: str, weight: Tensor) -> bool:
+    """Whether Muon trains a layer."""
+    return name.startswith(MUON_LAYERS) and min(as_matrix(weight).shape) <= MUON_MAX_SIDE
 
 
-def as_rows(weight: Tensor) -> Tensor:
-    """A layer's weights (F, C, H, W) or (F, C) as a matrix (F, all else), of the same memory.
+def as_matrix(weight: Tensor) -> Tensor:
+    """A layer's weights (F, C, H, W) or (F, C) as a matrix (F, -1) that shares their memory.
 
-    The order of its columns, here of channels-last memory, means nothing to Muon.
+    The columns are in the order of channels-last memory; their order does not matter to Muon.
     """
     return weight if weight.ndim == 2 else weight.permute(0, 2, 3, 1).flatten(1)
 
@@ -100,32 +102,31 @@ def _groups(
 
 
 # Muon with its iteration on the Gram matrix, in float32. A step goes along the gradient with its
-# singular values made (nearly) equal, by five steps of Newton and Schulz. torch's Muon takes them
-# on the whole matrix in bf16, which suits a GPU; a CPU without bf16 spends more on that than on
-# the rest of a training step. Every one of those steps multiplies by a polynomial of the matrix's
-# Gram matrix: so they are taken on that, which is small, and the large matrix is read twice
-# instead of ten times.
+# singular values made (nearly) equal, by five Newton-Schulz iterations. torch's Muon iterates on
+# the whole matrix in bf16, which suits a GPU; on a CPU without bf16 that takes longer than the rest
+# of a training step. Each iteration multiplies by a polynomial of the Gram matrix, so that it can
+# run on the Gram matrix, which is small: the large matrix is read twice instead of ten times.
 
 
 RMS_OF_ADAMW = 0.2
-"""Steps have the size of AdamW's: this times the root of the matrix's longer side."""
+"""Root mean square of AdamW's updates, to which Muon's are scaled."""
 
 
 class GramMuon(Muon):
-    """Muon for matrices (F, C); its state is that of torch's."""
+    """Muon for matrices (F, C), with the state of torch.optim.Muon."""
 
     def __init__(self, params: Iterable[Any], lr: float, weight_decay: float) -> None:
         super().__init__(params, lr, weight_decay, adjust_lr_fn="match_rms_adamw")
 
     @torch.no_grad()
     def step(self, closure: Callable[[], float] | None = None) -> None:  # type: ignore[override]
-        """Change the weights by their gradients; a `closure` is not asked."""
+        """Update the weights by their gradients; `closure` is not called."""
         for group in self.param_groups:
             for weight in group["params"]:
                 if weight.grad is not None:
-                    self._change(weight, weight.grad, group)
+                    self._update(weight, weight.grad, group)
 
-    def _change(self, weight: Tensor, gradient: Tensor, group: dict[str, Any]) -> None:
+    def _update(self, weight: Tensor, gradient: Tensor, group: dict[str, Any]) -> None:
         rate, momentum = group["lr"], group["momentum"]
         state = self.state[weight]
         if "momentum_buffer" not in state:
@@ -142,20 +143,23 @@ class GramMuon(Muon):
 
 
 def orthogonalize(
-    matrix: Tensor, coefficients: tuple[float, float, float], steps: int, least: float
+    matrix: Tensor, coefficients: tuple[float, float, float], steps: int, min_norm: float
 ) -> Tensor:
-    """`matrix` (F, C) with its singular values brought near 1; `least`: the smallest norm."""
+    """`matrix` (F, C) with its singular values brought near 1; its norm is taken as >= `min_norm`.
+
+    Newton-Schulz iterations with a quintic polynomial (Jordan et al. 2024).
+    """
     wide = matrix if matrix.shape[0] <= matrix.shape[1] else matrix.T
-    wide = wide / wide.norm().clamp(min=least)
+    wide = wide / wide.norm().clamp(min=min_norm)
     first, second, third = coefficients
     gram, product = wide @ wide.T, None
     for left in reversed(range(steps)):
         factor = torch.addmm(gram, gram, gram, beta=second, alpha=third)
         factor.diagonal().add_(first)
-        # Polynomials of one matrix: their order does not matter.
+        # Polynomials of the same matrix commute.
         product = factor if product is None else factor @ product
         if left:
             gram = factor @ gram @ factor
     assert product is not None
-    even: Tensor = product @ wide
-    return even if matrix.shape[0] <= matrix.shape[1] else even.T
+    result: Tensor = product @ wide
+    return result if matrix.shape[0] <= matrix.shape[1] else result.T

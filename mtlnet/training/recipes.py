@@ -1,65 +1,67 @@
-"""How a network is trained: the paper's recipe, and one that gives a good model in minutes.
+"""Training recipes: `paper` as published, `fast` for a good model in minutes, `tune` to fine-tune.
 
 `paper`: SGD with momentum 0.9, batch 32, learning rate 0.001 times 0.9 every 10,000 steps, 150,000
-steps. Dropout 0.5 and L2 5e-4 are ours: the paper gives neither.
+steps. Dropout 0.5 and L2 5e-4 are our choice: the paper states neither.
 
-`fast`: what differs, and why.
-- Batch normalisation of the convolutions in training, folded away afterwards: it speeds learning
-  several times. Not of the shared layers: batch statistics are noise to a distance. So they are
-  to the last convolutions, of whose few places a batch has but some hundred: in the last part of a
-  run the statistics stay, and the network learns as what it will be.
-- The first two convolutions learn for a part of the run only (FreezeOut, Brock et al. 2017): they
-  are soon what they will be, and near nine tenths of a backward pass are theirs. What rests makes
-  room for more steps.
-- The heads answer in standard deviations of each target, and so does the loss: the coded angle
-  varies by 0.03 where a coded distance varies by 0.2, and would hardly be learned beside it.
+`fast` differs as follows.
+- Batch normalisation of the convolutions in training, folded away afterwards: learning is several
+  times faster. The shared layers have none, since batch statistics are noise to a distance. In the
+  last part of a run the statistics are frozen: the last convolutions have only some hundred places
+  a batch, and the network then trains as it will be used.
+- The first two convolutions are frozen after a part of the run (FreezeOut, Brock et al. 2017): they
+  converge early, and take nearly nine tenths of a backward pass. The time saved goes into more
+  steps.
+- The heads predict in standard deviations of each target, and the loss counts errors in them: the
+  coded angle varies by 0.03 and a coded distance by 0.2, so that the angle would hardly be learned.
 - Muon for the large layers (`mtlnet.training.optimizers`): in short trials half as many images for
-  the same errors. The rate rises, then falls to nothing as a cosine over the run. Batches of 64,
-  since its own work does not grow with the batch.
-- A distance's error counts as it is, not squared, from a twentieth of a standard deviation on: `l`,
-  `m` and `r` jump where they become inactive, and a squared error answers in between. The angle's
-  counts squared, and both count more than a class's (`mtlnet.training.loss`).
-- No dropout: it adds noise to what must come out as a number to a few per cent.
-- Images mirrored, turned and covered in places, with labels that follow
-  (`mtlnet.data.augment.pipeline`); other brightness, contrast and tint. Rounds are few: without it
-  their scenery is learned by heart.
+  the same errors. The learning rate warms up, then falls to zero as a cosine. Batches of 64, since
+  Muon's own cost does not grow with the batch.
+- Huber losses with a gain (`mtlnet.training.loss.HuberLoss`): `l`, `m` and `r` jump where they
+  become inactive, and a squared error asks for a value in between.
+- No dropout: it adds noise to outputs that must be accurate to a few per cent.
+- Images mirrored, turned, partly covered and changed in brightness, contrast and tint, with labels
+  that follow (`mtlnet.data.augment.pipeline`): rounds are few, and a network overfits to their
+  scenery.
 
-`tune`: `fast` from a finished model (`--init`): AdamW with a tenth of the rate, 500 steps, no
-normalisation.
+`tune`: `fast` from a finished model (`--init`), with AdamW, a tenth of the learning rate, 500 steps
+and no batch normalisation.
 """
 
 import math
 from dataclasses import dataclass
 
+from mtlnet.training.loss import HuberLoss
 from trackfeatures.errors import UserError
 
 
 @dataclass(frozen=True)
 class Recipe:
-    """One way to train; stored with the model."""
+    """How a network is trained; stored in the run's `config.json`."""
 
     name: str
-    optimiser: str
+    optimizer: str
+    """sgd, adamw or muon (which leaves small layers to AdamW)."""
     learning_rate: float
     batch: int
     iterations: int
     dropout: float
     l2: float
-    """Weight of the L2 term |w|^2 (`paper`), or decoupled decay (`fast`)."""
+    """Weight of the L2 term |w|^2 (sgd), or decoupled weight decay (adamw, muon)."""
     batch_norm: bool
     standardise: bool
     augment: bool
-    settled: float = 1.0
-    """From this share of the run on, batch normalisation keeps the statistics it has."""
-    bend: float = 0.0
-    """Errors count as they are, not squared, from so many standard deviations on; 0: never."""
-    rests: tuple[tuple[float, int], ...] = ()
-    """(share, count): from this share of the run on, the first `count` convolutions rest."""
+    freeze_bn_at: float = 1.0
+    """Share of the run after which the statistics of batch normalisation are frozen."""
+    huber: HuberLoss | None = None
+    """None: squared errors, without gains."""
+    freeze_schedule: tuple[tuple[float, int], ...] = ()
+    """(share, count): after this share of the run the first `count` convolutions are frozen."""
 
 
+HUBER = HuberLoss(distance_beta=0.05)
 RECIPES = {
     "paper": Recipe("paper", "sgd", 1e-3, 32, 150_000, 0.5, 5e-4, False, False, False),
-    "tune": Recipe("tune", "adamw", 1e-4, 32, 500, 0.0, 2e-2, False, True, True, bend=0.05),
+    "tune": Recipe("tune", "adamw", 1e-4, 32, 500, 0.0, 2e-2, False, True, True, huber=HUBER),
     "fast": Recipe(
         "fast",
         "muon",
@@ -71,14 +73,16 @@ RECIPES = {
         batch_norm=True,
         standardise=True,
         augment=True,
-        settled=0.6,
-        bend=0.05,
-        rests=((0.3, 1), (0.6, 2)),
+        freeze_bn_at=0.6,
+        huber=HUBER,
+        freeze_schedule=((0.3, 1), (0.6, 2)),
     ),
 }
 MOMENTUM = 0.9
 WARM_UP = 0.05
+"""Share of a run over which the learning rate rises (adamw, muon)."""
 DECAY, DECAY_STEPS = 0.9, 10_000
+"""Factor of the learning rate after so many steps (sgd)."""
 
 
 def find_recipe(name: str) -> Recipe:
@@ -88,17 +92,17 @@ def find_recipe(name: str) -> Recipe:
     return RECIPES[name]
 
 
-def resting(recipe: Recipe, progress: float) -> int:
-    """How many of the first convolutions rest where `progress` in [0, 1] of the run is done."""
-    return max((count for share, count in recipe.rests if progress >= share), default=0)
+def frozen_convolutions(recipe: Recipe, progress: float) -> int:
+    """How many of the first convolutions are frozen at `progress` in [0, 1] of the run."""
+    return max((count for share, count in recipe.freeze_schedule if progress >= share), default=0)
 
 
 def learning_rate(recipe: Recipe, step: int, progress: float) -> float:
-    """The rate at `step`, where `progress` in [0, 1] of the run is done."""
-    if recipe.optimiser == "sgd":
+    """The learning rate at `step`, at `progress` in [0, 1] of the run."""
+    if recipe.optimizer == "sgd":
         return recipe.learning_rate * DECAY ** (step // DECAY_STEPS)
     if progress < WARM_UP:
-        # Never 0: a run that is timed starts at progress 0.
+        # Not 0: a run limited by time starts at progress 0.
         return recipe.learning_rate * max(progress / WARM_UP, 0.02)
     fall = (min(progress, 1.0) - WARM_UP) / (1 - WARM_UP)
     return recipe.learning_rate * 0.5 * (1 + math.cos(math.pi * fall))

@@ -1,7 +1,8 @@
-"""Training a model from a dataset: `mtlnet train --data DIR --out RUN --alpha 0.3,0.2,0.5`.
+"""A training run from its configuration to a published model: `mtlnet train --data DIR --out RUN`.
 
-Ends with the finished model in the run's folder (see `mtlnet.export.publish`); stopped by Ctrl-C it
-leaves a checkpoint to go on from with `--resume`.
+Ends with the finished model in the run's folder (see `mtlnet.export.publish`). Stopped by Ctrl-C it
+leaves a checkpoint, from which `--resume` continues. With `--init` it fine-tunes a finished model,
+which keeps its network and its camera.
 """
 
 import os
@@ -10,22 +11,36 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import numpy as np
 import torch
 
 from mtlnet.data.gpu_cache import cache_if_it_fits
 from mtlnet.data.loader import Loader
 from mtlnet.data.sources import TrainingData, open_training_data, require_same_data
-from mtlnet.inference.model_card import ModelCard, read_card
-from mtlnet.model.architecture import find_architecture
+from mtlnet.export.publish import Provenance, publish
+from mtlnet.inference.model_card import (
+    RUNS,
+    WEIGHTS,
+    ModelCard,
+    check_files,
+    read_card,
+    resolve_run,
+)
+from mtlnet.model.architecture import HEIGHT, WIDTH, find_architecture
+from mtlnet.model.network import Network, fold, load_network
 from mtlnet.training.checkpoint import list_checkpoints, load_checkpoint
 from mtlnet.training.config import TrainConfig, write_config
-from mtlnet.training.distributed import Part, find_part, joined, wait
-from mtlnet.training.fine_tune import TUNED_LEAST, open_init, take_weights
-from mtlnet.training.finish import finish
-from mtlnet.training.loop import Report, learn
+from mtlnet.training.distributed import Rank, barrier, process_group, read_rank
+from mtlnet.training.loop import Report, train_loop
 from mtlnet.training.recipes import Recipe, find_recipe
 from mtlnet.training.trainer import Trainer, choose_device, keep_freed_memory
+from mtlnet.uncertainty_fit.head import fit_uncertainty_head
 from trackfeatures.errors import UserError
+
+EXPORT_CHECK_FRAMES = 16
+"""Frames on which the exported graph is compared with torch."""
+FINE_TUNE_MIN_STD = (0.15,) * 5 + (0.03,)
+"""Lower bounds of the heads' units (6,), those of varied driving: a few images may be all alike."""
 
 
 def train(
@@ -37,16 +52,16 @@ def train(
 ) -> ModelCard:
     """Train by `config` and publish the model in `config.out`.
 
-    `resumed`: the description of the data as the run was started with, to go on with it; None
-    starts a new run. `checked`: the images are known to be decodable. Raises UserError (data, an
-    existing folder), Stopped after Ctrl-C.
+    `resumed`: the description of the data stored by the run to resume; None starts a new run.
+    `checked`: all images are known to be decodable. Raises UserError (data, an existing folder,
+    memory, disk), Stopped after Ctrl-C.
     """
-    find_recipe(config.recipe)  # raises where there is none
-    part = find_part()
-    device = choose_device(config.device, part)
+    find_recipe(config.recipe)  # raises when there is none
+    rank = read_rank()
+    device = choose_device(config.device, rank)
     try:
-        with joined(part, device, config.batch):
-            return _train(config, resumed, report, device, part, checked=checked)
+        with process_group(rank, device, config.batch):
+            return _train(config, resumed, report, device, rank, checked=checked)
     except torch.OutOfMemoryError as error:
         raise UserError(
             f"the memory of {device} is used up; give a smaller --batch than {config.batch}, or "
@@ -59,79 +74,39 @@ def _train(
     resumed: dict[str, Any] | None,
     report: Report,
     device: torch.device,
-    part: Part,
+    rank: Rank,
     *,
     checked: bool,
 ) -> ModelCard:
-    if resumed is None and part.first:
+    if resumed is None and rank.is_first:
         require_new(config.out)
-    init = None if config.init is None else open_init(config.init)
-    material = open_training_data(config, init[1] if init else None, checked=checked)
-    if resumed is None and part.first:
-        create_run(config, find_recipe(config.recipe), material.about)
+    init = None if config.init is None else open_pretrained(config.init)
+    data = open_training_data(config, init[1] if init else None, checked=checked)
+    if resumed is None and rank.is_first:
+        create_run(config, find_recipe(config.recipe), data.about)
     if resumed is not None:
-        require_same_data(config, resumed, material.about)
-    settle(config, part)
-    trainer, loader = prepare(config, material, init[0] if init else None, device, part)
+        require_same_data(config, resumed, data.about)
+    configure_cpu(config, rank)
+    trainer, loader = prepare(config, data, init[0] if init else None, device, rank)
     checkpoints = list_checkpoints(config.out) if resumed is not None else []
     elapsed_s = load_checkpoint(checkpoints[-1], trainer) if checkpoints else 0.0
-    wait()  # until all have read it, the first one writes nothing
+    barrier()  # the first process writes nothing until all have read the checkpoint
     try:
-        batches = cache_if_it_fits(loader, device)
-        learn(config, trainer, batches, elapsed_s, report, part)
-        if part.first:
-            finish(config, trainer, material)
-        wait()
+        train_loop(config, trainer, cache_if_it_fits(loader, device), elapsed_s, report)
+        if rank.is_first:
+            finish(config, trainer, data)
+        barrier()
         return read_card(config.out)
     except OSError as error:
         where = f" ({error.filename})" if error.filename else ""
         raise UserError(
-            f"the run in {config.out} broke off: {error.strerror or error}{where}; mend that, then "
-            f"go on with `mtlnet train --out {config.out} --resume`"
+            f"the run in {config.out} broke off: {error.strerror or error}{where}; repair that, "
+            f"then continue with `mtlnet train --out {config.out} --resume`"
         ) from error
 
 
-def settle(config: TrainConfig, part: Part) -> None:
-    """Share out this machine's cores, and keep memory that is used again."""
-    torch.set_num_threads(config.threads or max((os.cpu_count() or 1) // part.local, 1))
-    cv2.setNumThreads(1)  # the loader's images are small: a second pool would only fight torch's
-    keep_freed_memory()
-
-
-def prepare(
-    config: TrainConfig, material: TrainingData, init: Path | None, device: torch.device, part: Part
-) -> tuple[Trainer, Loader]:
-    """A network at its first step, or with the weights of the run `init`, and its batches."""
-    recipe, mine = find_recipe(config.recipe), (part.rank, part.world)
-    trainer = Trainer(
-        recipe,
-        config.alpha,
-        config.seed,
-        device,
-        find_architecture(config.network),
-        balance=config.balance,
-        epoch=max(len(material.frames) // config.batch, 1),
-        part=mine,
-        folded=init is not None,
-    )
-    loader = Loader(
-        material.frames,
-        material.camera,
-        config.batch,
-        config.seed,
-        augment=recipe.augment,
-        part=mine,
-    )
-    if init is None:
-        trainer.standardise(loader)
-    else:
-        trainer.standardise(loader, TUNED_LEAST)
-        take_weights(trainer.network, init)
-    return trainer, loader
-
-
 def require_new(out: Path) -> None:
-    """Raise UserError when there is something already where a run is to be."""
+    """Raise UserError when the folder of a new run exists."""
     if out.exists():
         raise UserError(
             f"{out} already exists; continue that run with --resume, or choose another --out"
@@ -139,10 +114,106 @@ def require_new(out: Path) -> None:
 
 
 def create_run(config: TrainConfig, recipe: Recipe, data: dict[str, Any]) -> None:
-    """Make the folder of a new run."""
+    """Make the folder of a new run with its `config.json`."""
     config.out.mkdir(parents=True)
     try:
         write_config(config, recipe, data)
     except OSError:
-        shutil.rmtree(config.out)  # so that the same command works when the disk does
+        shutil.rmtree(config.out)  # so that the same command works once the disk has room
         raise
+
+
+def configure_cpu(config: TrainConfig, rank: Rank) -> None:
+    """Divide this machine's cores among its processes, and keep freed memory."""
+    torch.set_num_threads(config.threads or max((os.cpu_count() or 1) // rank.local_world_size, 1))
+    cv2.setNumThreads(1)  # the images are small: a second thread pool would compete with torch's
+    keep_freed_memory()
+
+
+def prepare(
+    config: TrainConfig, data: TrainingData, init: Path | None, device: torch.device, rank: Rank
+) -> tuple[Trainer, Loader]:
+    """The trainer before its first step, with the weights of the run `init`, and the batches."""
+    recipe = find_recipe(config.recipe)
+    trainer = Trainer(
+        recipe,
+        config.alpha,
+        config.seed,
+        device,
+        find_architecture(config.network),
+        balance=config.balance,
+        steps_per_epoch=max(len(data.frames) // config.batch, 1),
+        rank=rank,
+        folded=init is not None,
+    )
+    loader = Loader(
+        data.frames,
+        data.camera,
+        config.batch,
+        config.seed,
+        augment=recipe.augment,
+        part=(rank.index, rank.world_size),
+    )
+    if init is None:
+        trainer.standardise(loader)
+    else:
+        trainer.standardise(loader, FINE_TUNE_MIN_STD)
+        load_pretrained(trainer.network, init)
+    return trainer, loader
+
+
+def finish(config: TrainConfig, trainer: Trainer, data: TrainingData) -> ModelCard:
+    """Publish the trained network in the run's folder."""
+    frames = data.frames
+    count = min(EXPORT_CHECK_FRAMES, len(frames))
+    rows = np.linspace(0, len(frames) - 1, count).astype(np.int64)
+    images = frames.read_batch(rows, np.empty((count, HEIGHT, WIDTH, 3), np.uint8))
+    provenance = Provenance(
+        camera=data.camera,
+        alpha=config.alpha,
+        recipe=config.recipe,
+        iterations=trainer.step_number,
+        batch=config.batch,
+        seed=config.seed,
+        data=data.about,
+    )
+    uncertainty = fit_uncertainty_head(
+        fold(trainer.network), frames, data.held_out, config.seed, data.camera
+    )
+    card = publish(trainer.network, config.out, images, provenance, uncertainty=uncertainty)
+    link_latest(config.out)
+    return card
+
+
+def link_latest(run: Path) -> None:
+    """Point `runs/latest` to `run` when it lies in `runs/`."""
+    if run.resolve().parent != RUNS.resolve():
+        return
+    link = RUNS / "latest.partial"
+    link.unlink(missing_ok=True)
+    link.symlink_to(run.resolve().name)
+    link.replace(RUNS / "latest")
+
+
+# Fine-tuning: a run that starts with the weights of a finished model.
+
+
+def open_pretrained(name: str | Path) -> tuple[Path, ModelCard]:
+    """The folder and card of the model to fine-tune; ModelError when it is missing or damaged."""
+    run = resolve_run(name)
+    card = read_card(run)
+    check_files(run, card, (WEIGHTS,))
+    return run, card
+
+
+def load_pretrained(network: Network, run: Path) -> None:
+    """Make `network` compute the outputs of the model of `run`, in the units of its own heads."""
+    state = load_network(run / WEIGHTS, network.architecture.name).state_dict()
+    mean, std = network.target_mean.cpu(), network.target_std.cpu()
+    for name, rows in (("distance", slice(0, 5)), ("angle", slice(5, 6))):
+        weight, bias = (f"heads.{name}.{kind}" for kind in ("weight", "bias"))
+        state[weight] = state[weight] / std[rows, None]
+        state[bias] = (state[bias] - mean[rows]) / std[rows]
+    with torch.no_grad():
+        for name, parameter in network.named_parameters():
+            parameter.copy_(state[name])

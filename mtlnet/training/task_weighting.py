@@ -1,13 +1,15 @@
-"""How the three tasks are weighed against each other: `--balance fixed|uncertainty|dwa`.
+"""Weights of the three tasks in the loss: `--balance fixed|uncertainty|dwa`.
 
-`fixed`: the weights of `--alpha`, as in the paper. The others find weights themselves; alpha then
-only says which tasks are learned (0: not).
+`fixed`: the weights of `--alpha`, as in the paper. The other methods find the weights; alpha then
+only selects the tasks that are learned (0: not).
 
-`uncertainty` (Kendall, Gal and Cipolla 2018, equation 7): a task's variance exp(s) is learned with
-the network; its term L counts exp(-s) L / 2 + s / 2, or exp(-s) L + s / 2 for classes.
-`dwa` (Liu, Johns and Davison 2019, equation 7): tasks that fell less count more. A task's weight is
-K exp(r / T) / sum(exp(r / T)), r its mean term over the last stretch of steps by that of the one
-before; K the number of tasks, T = 2. A stretch is an epoch, or 500 steps where that is shorter.
+`uncertainty` (Kendall, Gal and Cipolla 2018, equation 7): the log variance s of each task is
+learned with the network; a squared error L counts exp(-s) L / 2 + s / 2, a cross-entropy
+exp(-s) L + s / 2.
+`dwa`, dynamic weight average (Liu, Johns and Davison 2019, equation 7): a task whose loss falls
+more slowly counts more. Its weight is K exp(r / T) / sum(exp(r / T)), where r is the ratio of its
+mean term over the last window of steps to that over the window before, K the number of tasks and
+T = 2. A window is an epoch, or `WINDOW_STEPS` where that is shorter.
 """
 
 import torch
@@ -16,81 +18,91 @@ from torch import Tensor, nn
 from mtlnet.training.loss import TASKS, Alpha
 from trackfeatures.errors import UserError
 
-BALANCES = ("fixed", "uncertainty", "dwa")
-HALF = (0.5, 0.5, 1.0)  # of an error's term: a normal's exponent is halved, a softmax's is not
+METHODS = ("fixed", "uncertainty", "dwa")
+LIKELIHOOD_FACTORS = (0.5, 0.5, 1.0)
+"""Of exp(-s) L: the exponent of a normal distribution is halved, a cross-entropy is not."""
 TEMPERATURE = 2.0
-STRETCH = 500
+WINDOW_STEPS = 500
 
 
-def find_balance(name: str) -> str:
-    """`name`; UserError when there is no such balance."""
-    if name not in BALANCES:
-        raise UserError(f"there is no balance {name!r}; choose one of {', '.join(BALANCES)}")
+def require_method(name: str) -> str:
+    """`name`; UserError when there is no such method."""
+    if name not in METHODS:
+        raise UserError(f"there is no balance {name!r}; choose one of {', '.join(METHODS)}")
     return name
 
 
-class Balance:
-    """The weights of the tasks at this step, and what they depend on."""
+class TaskWeighting:
+    """The weights of the tasks at the current step, and the state they depend on."""
 
-    def __init__(self, kind: str, alpha: Alpha, device: torch.device, epoch: int = STRETCH) -> None:
-        self.kind = find_balance(kind)
-        self.used = torch.tensor([weight > 0 for weight in alpha], device=device)
-        self.stretch = max(min(epoch, STRETCH), 1)
+    def __init__(
+        self, method: str, alpha: Alpha, device: torch.device, steps_per_epoch: int = WINDOW_STEPS
+    ) -> None:
+        self.method = require_method(method)
+        self.learned = torch.tensor([weight > 0 for weight in alpha], device=device)
+        self.window = max(min(steps_per_epoch, WINDOW_STEPS), 1)
         self.log_variance = nn.Parameter(torch.zeros(len(TASKS), device=device))
         fixed = torch.tensor(alpha, device=device)
-        self.current = fixed if kind == "fixed" else self.used.float()
+        self.weights = fixed if method == "fixed" else self.learned.float()
         self.sums = torch.zeros(len(TASKS), dtype=torch.float64, device=device)
-        self.before = torch.zeros_like(self.sums)
-        self.counts = torch.zeros(2, dtype=torch.int64)  # steps in this stretch, stretches done
+        self.previous_means = torch.zeros_like(self.sums)
+        self.counts = torch.zeros(2, dtype=torch.int64)
+        """Steps in this window, windows completed."""
 
     @property
     def parameters(self) -> list[nn.Parameter]:
-        """What is learned beside the network."""
-        return [self.log_variance] if self.kind == "uncertainty" else []
+        """Parameters that are trained with the network's."""
+        return [self.log_variance] if self.method == "uncertainty" else []
 
     def total(self, terms: Tensor) -> Tensor:
         """The sum to minimise of the tasks' terms (3,)."""
-        if self.kind != "uncertainty":
+        if self.method != "uncertainty":
             # A weight of 0 takes the task out of the graph: a true single-task network.
-            return (terms[self.used] * self.current[self.used]).sum()
-        s, half = self.log_variance[self.used], torch.tensor(HALF, device=terms.device)
-        return (half[self.used] * torch.exp(-s) * terms[self.used] + 0.5 * s).sum()
+            return (terms[self.learned] * self.weights[self.learned]).sum()
+        s = self.log_variance[self.learned]
+        factors = torch.tensor(LIKELIHOOD_FACTORS, device=terms.device)
+        return (factors[self.learned] * torch.exp(-s) * terms[self.learned] + 0.5 * s).sum()
 
     @torch.no_grad()
-    def weights(self) -> list[float]:
-        """What each task's term is multiplied by now, for the curves."""
-        if self.kind != "uncertainty":
-            return [float(weight) for weight in self.current]
-        learned = torch.tensor(HALF) * torch.exp(-self.log_variance.cpu()) * self.used.cpu()
+    def current_weights(self) -> list[float]:
+        """The factor of each task's term at this step."""
+        if self.method != "uncertainty":
+            return [float(weight) for weight in self.weights]
+        factors = torch.tensor(LIKELIHOOD_FACTORS)
+        learned = factors * torch.exp(-self.log_variance.cpu()) * self.learned.cpu()
         return [float(weight) for weight in learned]
 
     @torch.no_grad()
-    def note(self, terms: Tensor) -> None:
-        """Take in the terms (3,) of a step, of the whole batch: `dwa` weighs by them."""
-        if self.kind != "dwa":
+    def update(self, terms: Tensor) -> None:
+        """Add the terms (3,) of a step, averaged over the whole batch; `dwa` weighs by them."""
+        if self.method != "dwa":
             return
         self.sums += terms
         self.counts[0] += 1
-        if int(self.counts[0]) < self.stretch:
+        if int(self.counts[0]) < self.window:
             return
-        means = self.sums / self.stretch
+        means = self.sums / self.window
         if int(self.counts[1]) > 0:
-            pace = means[self.used] / self.before[self.used].clamp_min(1e-12) / TEMPERATURE
-            share = torch.softmax(pace, 0) * int(self.used.sum())
-            self.current[self.used] = share.float()
-        self.before = means
+            previous = self.previous_means[self.learned].clamp_min(1e-12)
+            ratios = means[self.learned] / previous / TEMPERATURE
+            weights = torch.softmax(ratios, 0) * int(self.learned.sum())
+            self.weights[self.learned] = weights.float()
+        self.previous_means = means
         self.sums.zero_()
         self.counts = torch.tensor([0, int(self.counts[1]) + 1])
 
     def state(self) -> dict[str, Tensor]:
-        """What a checkpoint keeps."""
-        return {name: getattr(self, name).detach() for name in _KEPT}
+        """The tensors of a checkpoint, under the names it stores."""
+        return {
+            "log_variance": self.log_variance.detach(),
+            "current": self.weights,
+            "sums": self.sums,
+            "before": self.previous_means,
+            "counts": self.counts,
+        }
 
     @torch.no_grad()
     def restore(self, state: dict[str, Tensor]) -> None:
-        """Go on from a `state`. Raises KeyError when something is missing from it."""
-        for name in _KEPT:
-            getattr(self, name).copy_(state[name])
-
-
-_KEPT = ("log_variance", "current", "sums", "before", "counts")
+        """Continue from a `state`. Raises KeyError when a tensor is missing."""
+        for name, tensor in self.state().items():
+            tensor.copy_(state[name])

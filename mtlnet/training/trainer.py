@@ -1,4 +1,4 @@
-"""One network in training: its optimiser, its step, its state."""
+"""The trainer: a network, its optimizers and one training step; and the device it runs on."""
 
 import ctypes
 import re
@@ -17,20 +17,25 @@ from mtlnet.model.architecture import MTL, Architecture
 from mtlnet.model.cpu_kernels.forward import training_outputs
 from mtlnet.model.network import Network, initialise
 from mtlnet.training.cuda_graph import CudaGraphStep, CudaRecorder
-from mtlnet.training.distributed import ALONE, Part, average
+from mtlnet.training.distributed import SINGLE_PROCESS, Rank, average, dropout_seed
 from mtlnet.training.loss import Alpha, Losses, multi_task_loss
-from mtlnet.training.optimizers import Optimisers
-from mtlnet.training.recipes import Recipe, learning_rate, resting
-from mtlnet.training.task_weighting import STRETCH, Balance
+from mtlnet.training.optimizers import OptimizerSet
+from mtlnet.training.recipes import Recipe, frozen_convolutions, learning_rate
+from mtlnet.training.task_weighting import WINDOW_STEPS, TaskWeighting
 from trackfeatures.errors import UserError
 
-MIN_TARGET_STD = 0.01
-SETTLING_STEPS = 100
-"""After so many the running statistics of batch normalisation know nothing of the first weights."""
+MIN_TARGET_STD = (0.01,) * 6
+MIN_STEPS_BEFORE_BN_FREEZE = 100
+"""Steps until the running statistics of batch normalisation no longer depend on the first weights.
+"""
 
 
 class Trainer:
-    """Trains a network; `step_number` counts the steps taken."""
+    """Trains a network; `step_number` counts the steps taken.
+
+    `steps_per_epoch`: for the task weighting `balance`. `folded`: the network has no batch
+    normalisation, since it starts as a finished model.
+    """
 
     def __init__(
         self,
@@ -38,134 +43,154 @@ class Trainer:
         alpha: Alpha,
         seed: int,
         device: torch.device,
-        plan: Architecture = MTL,
+        architecture: Architecture = MTL,
         *,
         balance: str = "fixed",
-        epoch: int = STRETCH,
-        part: tuple[int, int] = (0, 1),
+        steps_per_epoch: int = WINDOW_STEPS,
+        rank: Rank = SINGLE_PROCESS,
         folded: bool = False,
     ) -> None:
         self.recipe = recipe
         self.alpha = alpha
         self.seed = seed
         self.device = device
-        self.part = part
-        self.balance = Balance(balance, alpha, device, epoch)
+        self.rank = rank
+        self.task_weighting = TaskWeighting(balance, alpha, device, steps_per_epoch)
         self.step_number = 0
         network = Network(
-            # A backbone has its own, unless it goes on from a finished model.
-            batch_norm=recipe.batch_norm or (plan.backbone and not folded),
+            batch_norm=recipe.batch_norm or (architecture.backbone and not folded),
             dropout=recipe.dropout,
-            architecture=plan,
+            architecture=architecture,
         )
         initialise(network, seed)
         self.network = network.to(device).to(memory_format=torch.channels_last)
-        self.optimisers = Optimisers(self.network, recipe, self.balance.parameters)
-        self.scale: Tensor | None = None
-        # Of the others, the rate changes at every step, or the weights of the tasks.
-        lasting = recipe.optimiser == "sgd" and balance == "fixed" and part[1] == 1
-        on_gpu = device.type == "cuda"
-        self.captured = (
-            CudaGraphStep(self.learn, CudaRecorder(device)) if lasting and on_gpu else None
-        )
-        if recipe.dropout:
-            # Dropout takes no generator of its own: this is torch's only place for a seed.
-            torch.manual_seed(seed)
+        self.optimizers = OptimizerSet(self.network, recipe, self.task_weighting.parameters)
+        self.target_variance: Tensor | None = None
+        self.cuda_graph = self._cuda_graph(balance)
+        self.seed_dropout()
 
-    def standardise(self, loader: Loader, least: Sequence[float] = (MIN_TARGET_STD,) * 6) -> None:
+    def _cuda_graph(self, balance: str) -> CudaGraphStep | None:
+        """The recorded step on a GPU, where the numbers it computes with seldom change.
+
+        Otherwise the learning rate or the tasks' weights change at every step.
+        """
+        constant = self.recipe.optimizer == "sgd" and balance == "fixed"
+        if self.device.type != "cuda" or not constant or self.rank.world_size > 1:
+            return None
+        return CudaGraphStep(self.optimize, CudaRecorder(self.device))
+
+    def seed_dropout(self) -> None:
+        """Seed torch's global generators, from which its dropout layers draw their masks.
+
+        These layers accept no generator of their own.
+        """
+        if self.recipe.dropout:
+            torch.manual_seed(dropout_seed(self.seed, self.rank.index, self.step_number))
+
+    def standardise(self, loader: Loader, min_std: Sequence[float] = MIN_TARGET_STD) -> None:
         """Set the heads' units to the mean and standard deviation of the training targets.
 
-        `least` (6,): no unit is smaller.
+        `min_std` (6,): lower bounds of the standard deviations.
         """
         if not self.recipe.standardise:
             return
         coded = torch.from_numpy(loader.coded).double()
         mean, std = coded.mean(0), coded.std(0, correction=0)
-        std = std.clamp_min(torch.tensor(least, dtype=std.dtype))
+        std = std.clamp_min(torch.tensor(min_std, dtype=std.dtype))
         self.network.target_mean.copy_(mean)
         self.network.target_std.copy_(std)
-        self.scale = (std**2).float().to(self.device)
+        self.target_variance = (std**2).float().to(self.device)
 
     def step(self, batch: Batch | DeviceBatch, progress: float) -> Losses:
-        """Learn from one batch; its losses, before the step."""
+        """Train on one batch at `progress` in [0, 1] of the run; its losses before the step."""
         self.network.train()
-        if progress >= self.recipe.settled and self.step_number >= SETTLING_STEPS:
-            settle_norms(self.network)
-        rest(self.network, resting(self.recipe, progress))
+        settled = self.step_number >= MIN_STEPS_BEFORE_BN_FREEZE
+        if settled and progress >= self.recipe.freeze_bn_at:
+            freeze_batch_norm(self.network)
+        freeze_convolutions(self.network, frozen_convolutions(self.recipe, progress))
         rate = learning_rate(self.recipe, self.step_number, progress)
-        self.optimisers.set_rate(rate)
-        given = on_device(batch, self.device)
-        losses = self.learn(given) if self.captured is None else self.captured(given, rate)
-        self.balance.note(losses.terms)
+        self.optimizers.set_learning_rate(rate)
+        moved = on_device(batch, self.device)
+        graph = self.cuda_graph
+        losses = self.optimize(moved) if graph is None else graph(moved, rate)
+        self.task_weighting.update(losses.terms)
         self.step_number += 1
         return losses
 
-    def learn(self, batch: DeviceBatch) -> Losses:
-        """Change the weights by one batch, at the rate that is set."""
-        outputs = self.outputs(batch.images)
-        combine, bend = self._combine(), self.recipe.bend
-        losses = multi_task_loss(outputs, batch.coded, batch.heading, combine, self.scale, bend)
-        self.optimisers.zero_grad()
+    def optimize(self, batch: DeviceBatch) -> Losses:
+        """Update the weights by one batch, at the learning rate that is set."""
+        losses = multi_task_loss(
+            self.outputs(batch.images),
+            batch.coded,
+            batch.heading,
+            self._combine(),
+            self.target_variance,
+            self.recipe.huber,
+        )
+        self.optimizers.zero_grad()
         losses.total.backward()  # type: ignore[no-untyped-call]  # torch leaves it untyped
-        seen = [losses.distance, losses.angle, losses.type, losses.total.detach(), losses.terms]
-        average([*seen, *self.optimisers.gradients()])
-        self.optimisers.step()
+        reported = [losses.distance, losses.angle, losses.heading, losses.total.detach()]
+        average([*reported, losses.terms, *self.optimizers.gradients()])
+        self.optimizers.step()
         return losses
 
     def _combine(self) -> Alpha | Callable[[Tensor], Tensor]:
-        return self.alpha if self.balance.kind == "fixed" else self.balance.total
+        weighting = self.task_weighting
+        return self.alpha if weighting.method == "fixed" else weighting.total
 
     def outputs(self, images: Tensor) -> Tensor:
-        """What the network in training answers, (B, 9), to images (B, 210, 280, 3) uint8."""
+        """Outputs (B, 9) of the network in training for images (B, 210, 280, 3) uint8."""
         on_cpu = self.device.type == "cpu"
         dtype = torch.bfloat16 if not on_cpu or cpu_has_bf16() else torch.float32
         if on_cpu and self.network.architecture is MTL:
             seed = [self.seed, 3, self.step_number]
-            masks = dropout_masks(self.recipe.dropout, MTL.shared, len(images), seed, self.part)
+            part = (self.rank.index, self.rank.world_size)
+            masks = dropout_masks(self.recipe.dropout, MTL.shared, len(images), seed, part)
             return training_outputs(self.network, images, dtype, masks)
         with torch.autocast(self.device.type, dtype, enabled=dtype != torch.float32):
-            answers: Tensor = self.network(images)
-        return answers
+            outputs: Tensor = self.network(images)
+        return outputs
 
 
-def settle_norms(network: Network) -> None:
-    """Let batch normalisation keep its statistics, until the next `network.train()`."""
+def freeze_batch_norm(network: Network) -> None:
+    """Freeze the statistics of batch normalisation until the next `network.train()`."""
     for module in network.modules():
         if isinstance(module, nn.BatchNorm2d):
             module.eval()
 
 
-def rest(network: Network, count: int) -> None:
-    """Let the first `count` convolutions keep their weights; no work goes into their gradients."""
+def freeze_convolutions(network: Network, count: int) -> None:
+    """Freeze the first `count` convolutions (no gradients), and unfreeze the others."""
     for number, name in enumerate(network.architecture.convolutions):
         for parameter in network.features.get_submodule(name).parameters():
             parameter.requires_grad_(number >= count)
 
 
 def dropout_masks(
-    share: float,
+    probability: float,
     layers: Sequence[int],
     count: int,
     seed: list[int],
     part: tuple[int, int] = (0, 1),
 ) -> list[Tensor]:
-    """What is left of `layers` of so many units, scaled up; the same for one process or many.
+    """Dropout masks (count, units) of each layer of so many units, scaled by 1 / (1 - probability).
 
-    A mask is a function of the seed, so that a run can be resumed from its weights alone.
+    They are a function of the seed, so that a run can be resumed without a generator's state.
+    `part`: process and number of processes; the masks of all together are those of a single one.
     """
-    if not share:
+    if not probability:
         return []
-    which, parts = part
+    index, parts = part
     rng = np.random.default_rng(seed)
-    rows = slice(which * count, (which + 1) * count)
+    rows = slice(index * count, (index + 1) * count)
     drawn = [rng.random((parts * count, units), np.float32)[rows] for units in layers]
-    return [torch.from_numpy((d >= share) / np.float32(1 - share)) for d in drawn]
+    return [torch.from_numpy((d >= probability) / np.float32(1 - probability)) for d in drawn]
 
 
 def keep_freed_memory() -> None:
-    """Tell glibc to keep the memory of freed tensors: a step is then a sixth faster.
+    """Configure glibc to keep the memory of freed tensors: a step is then a sixth faster.
 
-    By default it returns them to the kernel and page-faults them in again, 30,000 pages a step.
+    By default glibc returns it to the kernel, and each step causes 30,000 page faults.
     """
     if not sys.platform.startswith("linux"):
         return
@@ -177,28 +202,25 @@ def keep_freed_memory() -> None:
     mallopt(mmap_threshold, 32 << 20)
 
 
-# Where a run computes.
-
-
-def choose_device(name: str, part: Part = ALONE) -> torch.device:
-    """The device called `name`; "auto": a GPU where there is one."""
+def choose_device(name: str, rank: Rank = SINGLE_PROCESS) -> torch.device:
+    """The device called `name`; "auto": a GPU where there is one. Raises UserError."""
     if name == "auto":
         name = "cuda" if torch.cuda.is_available() else "cpu"
-    if name == "cuda" and part.local > 1:
-        name = f"cuda:{part.local_rank}"
+    if name == "cuda" and rank.local_world_size > 1:
+        name = f"cuda:{rank.local_index}"
     if not re.fullmatch(r"cpu|cuda(:\d{1,3})?", name):
-        raise UserError(f"--device {name!r} is not known; use auto, cpu, cuda or cuda:NUMBER")
+        raise UserError(f"--device {name!r} is unknown; use auto, cpu, cuda or cuda:NUMBER")
     device = torch.device(name)
     if device.type == "cuda" and not torch.cuda.is_available():
-        raise UserError(f"--device {name}: torch finds no GPU here; use --device cpu")
+        raise UserError(f"--device {name}: torch finds no GPU on this machine; use --device cpu")
     if device.type == "cuda" and (device.index or 0) >= torch.cuda.device_count():
-        raise UserError(f"--device {name}: torch finds {torch.cuda.device_count()} GPU(s) here")
+        raise UserError(f"--device {name}: torch finds {torch.cuda.device_count()} GPU(s)")
     return device
 
 
 @cache
 def cpu_has_bf16() -> bool:
-    """Whether the CPU multiplies bf16 natively (AVX512-BF16 or AMX); elsewhere it is slower."""
+    """Whether the CPU multiplies bf16 natively (AVX512-BF16 or AMX); others are slower in it."""
     info = Path("/proc/cpuinfo")
     if not info.is_file():
         return False

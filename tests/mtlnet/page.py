@@ -1,4 +1,4 @@
-"""Reading HTML pages that the project writes: their elements, and whether they are well-formed."""
+"""Parses the HTML pages that the project writes: their elements, and whether each is closed."""
 
 import re
 from dataclasses import dataclass, field
@@ -6,7 +6,7 @@ from html.parser import HTMLParser
 
 VOID = {"meta", "img", "br", "link", "input", "hr"}
 UNCLOSED = {"html", "head", "body", "p", "tr", "td", "th", "thead", "tbody", "li"}
-"""Elements whose end tag HTML lets one leave out..."""
+"""Elements whose end tag may be omitted in HTML."""
 CELLS = ("td", "th")
 ENDS = {
     "td": CELLS,
@@ -16,7 +16,7 @@ ENDS = {
     "p": ("p",),
     "table": ("p",),
 }
-"""...and what the beginning of another one ends."""
+"""By element: the open elements that its start tag ends."""
 
 
 @dataclass
@@ -24,14 +24,15 @@ class Element:
     tag: str
     attributes: dict[str, str]
     text: str = ""
-    inside: list[str] = field(default_factory=list)  # tags around it, from the outermost
+    inside: list[str] = field(default_factory=list)
+    """Tags around it, from the outermost."""
 
     def has_class(self, name: str) -> bool:
         return name in self.attributes.get("class", "").split()
 
 
 class Page(HTMLParser):
-    """The elements of a page in their order; AssertionError where one is not closed as it must."""
+    """The elements of a page in their order; AssertionError when one is not closed."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
@@ -51,8 +52,8 @@ class Page(HTMLParser):
         """The cells of a table's rows."""
         return self._tables[table]
 
-    def require_alone(self) -> None:
-        """AssertionError unless the page needs nothing beside it: no network, no other file."""
+    def require_self_contained(self) -> None:
+        """AssertionError when the page needs the network or another file."""
         for element in self.elements:
             assert element.tag not in ("script", "link", "iframe", "object"), element
             for name in ("src", "href", "srcset", "action", "data"):

@@ -1,4 +1,4 @@
-"""The `mtlnet` command from outside: what it prints, and one clear line for what it refuses."""
+"""The `mtlnet` command: what it prints, and one clear line for each mistake of the user."""
 
 import json
 import shutil
@@ -94,7 +94,7 @@ def test_train_evaluate_and_predict(dataset: Path, tmp_path: Path) -> None:
     assert f"{run} already exists" in again
 
 
-def test_what_is_no_image(published: Path, tmp_path: Path) -> None:
+def test_files_that_are_no_images_are_refused(published: Path, tmp_path: Path) -> None:
     text, cut, narrow = (tmp_path / name for name in ("a.jpg", "b.jpg", "c.jpg"))
     text.write_text("not an image at all")
     cut.write_bytes(simplejpeg.encode_jpeg(np.zeros((210, 280, 3), np.uint8))[:20])
@@ -108,12 +108,12 @@ def test_what_is_no_image(published: Path, tmp_path: Path) -> None:
         assert seen in refused("predict", "--model", published, path)
 
 
-def test_what_training_refuses(dataset: Path, tmp_path: Path) -> None:
+def test_wrong_options_of_training_are_refused(dataset: Path, tmp_path: Path) -> None:
     new = tmp_path / "new"
     train = ["train", "--data", dataset, "--out", new]
     assert "weight for angle is -1" in refused(*train, "--alpha", "0.3,-1,0.5")
     assert "has 2 weight(s)" in refused(*train, "--alpha", "0.3,0.2")
-    assert "no training run" in refused(*train, "--resume")
+    assert "is not a training run" in refused(*train, "--resume")
     assert "no recorded rounds" in refused("train", "--data", tmp_path / "no", "--out", new)
     assert not new.exists()
     assert "no runs/latest" in refused("evaluate", "--data", dataset, folder=tmp_path)
@@ -129,9 +129,9 @@ def test_ctrl_c_leaves_a_checkpoint_to_resume_from(dataset: Path, tmp_path: Path
     while not read_curves(run / "curves.csv") and time.monotonic() < limit:
         time.sleep(0.2)
     process.send_signal(signal.SIGINT)
-    _, said = process.communicate(timeout=300)
-    assert process.returncode == 130, said
-    assert "--resume" in said
+    _, stderr = process.communicate(timeout=300)
+    assert process.returncode == 130, stderr
+    assert "--resume" in stderr
     (checkpoint,) = (run / "checkpoints").iterdir()
     step = int(checkpoint.stem.removeprefix("step-"))
     assert step >= 10

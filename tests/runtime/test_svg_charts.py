@@ -1,24 +1,24 @@
-"""Charts: what is drawn where, in the coordinates of their SVG (0 to 1000, y down)."""
+"""Charts: positions in the coordinates of their SVG (0 to 1000, y down)."""
 
 import math
 
 import numpy as np
 import pytest
 
-from runtime.svg_charts import Axis, Line, Plot, log_ticks, plot, reliability, ticks
+from runtime.svg_charts import Axis, Line, Plot, line_plot, log_ticks, reliability_diagram, ticks
 from tests.mtlnet.page import Page
 
 NAN = math.nan
 X = np.array([0.0, 10.0, 20.0, 30.0])
 
 
-def numbers(path: str) -> list[list[float]]:
+def points_of(path: str) -> list[list[float]]:
     """The points of an SVG path."""
     pairs = path.replace("M", " ").replace("L", " ").replace("Z", " ").split()
     return [[float(v) for v in pair.split(",")] for pair in pairs]
 
 
-def test_axes_place_values() -> None:
+def test_axes_map_values_to_coordinates() -> None:
     assert [Axis(0, 10)(v) for v in (0, 5, 10)] == [0, 500, 1000]
     assert [Axis(10, 0)(v) for v in (0, 5, 10)] == [1000, 500, 0]
     placed = [Axis(0.01, 100, log=True)(v) for v in (0.01, 0.1, 1, 100)]
@@ -40,8 +40,10 @@ def test_ticks_are_round() -> None:
 
 
 def test_a_line_is_drawn_where_its_values_are() -> None:
-    page = Page(plot(Plot("offset (m)", [Line("said", X, np.array([0, 1, NAN, 1]))], "m driven")))
-    (line,) = page.all("path", "said")
+    page = Page(
+        line_plot(Plot("offset (m)", [Line("predicted", X, np.array([0, 1, NAN, 1]))], "m driven"))
+    )
+    (line,) = page.all("path", "predicted")
     # A margin of 6 %: from -0.06 to 1.06. NaN breaks the line.
     assert line.attributes["d"] == "M0.0,946.4L333.3,53.6M1000.0,53.6"
     grid = [path.attributes["d"] for path in page.all("path", "grid")]
@@ -54,32 +56,32 @@ def test_a_line_is_drawn_where_its_values_are() -> None:
     assert page.all("figcaption")[0].text == "offset (m)"
 
 
-def test_a_band_lies_behind_and_is_cut_at_the_edge() -> None:
+def test_a_band_is_drawn_behind_its_line_and_cut_off_at_the_edge() -> None:
     y = np.array([0.0, 1.0, NAN, 1.0])
-    page = Page(plot(Plot("t", [Line("said", X, y, band=(y - 0.05, y + 9.0))])))
+    page = Page(line_plot(Plot("t", [Line("predicted", X, y, band=(y - 0.05, y + 9.0))])))
     paths = [e.attributes["class"] for e in page.all("path") if not e.has_class("grid")]
-    assert paths == ["band", "said"]
+    assert paths == ["band", "predicted"]
     rings = page.all("path", "band")[0].attributes["d"].split("Z")
-    assert [numbers(ring) for ring in rings if ring] == [
+    assert [points_of(ring) for ring in rings if ring] == [
         [[0, 0], [333.3, 0], [333.3, 98.2], [0, 991.1]],  # up to the edge, 0; down to y - 0.05
         [[1000, 0], [1000, 98.2]],
     ]
 
 
-def test_stretches_are_shaded() -> None:
+def test_intervals_are_shaded() -> None:
     shaded = [(0.0, 10.0), (15.0, 30.0)]
-    page = Page(plot(Plot("t", [Line("truth", X, X)], shaded=shaded)))
+    page = Page(line_plot(Plot("t", [Line("truth", X, X)], shaded=shaded)))
     boxes = [(e.attributes["x"], e.attributes["width"]) for e in page.all("rect", "shade")]
     assert boxes == [("0.0", "333.3"), ("500.0", "500.0")]
 
 
-def test_curves_with_names_on_a_logarithmic_axis() -> None:
+def test_labelled_lines_on_a_logarithmic_axis() -> None:
     y = np.array([1.0, 0.1, 0.01, 0.001])
     named = Line("curve", X, y, "MTL <1>", "#123456", band=(y, y * 10))
     level = Line("level", np.array([0.0, 40.0]), np.full(2, 0.1), "alone", "#654321")
-    page = Page(plot(Plot("loss", [named, level], "iterations", log=True)))
+    page = Page(line_plot(Plot("loss", [named, level], "iterations", log=True)))
     (curve,) = page.all("path", "curve")
-    points = numbers(curve.attributes["d"])
+    points = points_of(curve.attributes["d"])
     assert [x for x, _ in points] == [0, 250, 500, 750]
     assert np.diff([y for _, y in points]) == pytest.approx(
         np.full(3, points[1][1] - points[0][1]), abs=0.2
@@ -87,31 +89,31 @@ def test_curves_with_names_on_a_logarithmic_axis() -> None:
     assert curve.attributes["style"] == "stroke:#123456"
     (band,) = page.all("path", "band")
     assert band.attributes["style"] == "fill:#123456"
-    ring = numbers(band.attributes["d"])
+    ring = points_of(band.attributes["d"])
     assert ring[1][1] == points[0][1]  # ten times 0.1 is 1: the axis reaches up to the band
-    height = numbers(page.all("path", "level")[0].attributes["d"])
+    height = points_of(page.all("path", "level")[0].attributes["d"])
     assert [y for _, y in height] == [points[1][1]] * 2
     assert [e.text for e in page.all("span") if "p" in e.inside] == ["MTL <1>", "alone"]
 
 
-def test_nothing_to_draw_is_said() -> None:
-    page = Page(plot(Plot("later & more", [], log=True)))
+def test_a_plot_without_lines_is_a_note() -> None:
+    page = Page(line_plot(Plot("later & more", [], log=True)))
     assert [e.text for e in page.all("p")] == ["not yet"]
     assert page.all("figcaption")[0].text == "later & more"
     assert (
-        Page(plot(Plot("t", [Line("said", X, np.full(4, NAN))])))
-        .all("path", "said")[0]
+        Page(line_plot(Plot("t", [Line("predicted", X, np.full(4, NAN))])))
+        .all("path", "predicted")[0]
         .attributes["d"]
         == ""
     )
 
 
-def test_reliable_deviations_lie_on_the_diagonal() -> None:
-    said = np.array([0.01, 0.02, 0.08])
-    page = Page(reliability("ml (m)", said, said * [1, 1, 2]))
-    dots = [numbers(e.attributes["d"].removesuffix("h0"))[0] for e in page.all("path", "dot")]
+def test_correct_standard_deviations_lie_on_the_diagonal() -> None:
+    predicted = np.array([0.01, 0.02, 0.08])
+    page = Page(reliability_diagram("ml (m)", predicted, predicted * [1, 1, 2]))
+    dots = [points_of(e.attributes["d"].removesuffix("h0"))[0] for e in page.all("path", "dot")]
     assert [x + y for x, y in dots[:2]] == pytest.approx([1000, 1000], abs=0.2)
-    assert sum(dots[2]) < 950  # said too small a deviation: above the diagonal
+    assert sum(dots[2]) < 950  # twice the predicted deviation: above the diagonal
     # From 0.8 times the least, 0.008, to 1.25 times the greatest, 0.2.
     share = math.log(0.01 / 0.008) / math.log(0.2 / 0.008)
     assert dots[0][0] == pytest.approx(1000 * share, abs=0.1)

@@ -14,9 +14,8 @@ import pytest
 from controllers.config import DemoConfig
 from controllers.demo.frames import Asked, spread
 from controllers.demo.process import run_module
-from controllers.demo.report import verdicts
+from controllers.demo.report import print_tables, verdicts
 from controllers.demo.run import run_demo
-from controllers.demo.tables import print_tables
 from mtlnet.inference.overlay import SCALE, draw_overlay, marking_line, to_pixels
 from trackfeatures import UserError
 from trackfeatures.camera import CameraParameters

@@ -1,4 +1,4 @@
-"""`datagen stats`: what the page counts, what it is concerned about, what it shows."""
+"""`datagen stats`: the counts, concerns and frames of its page."""
 
 import json
 import re
@@ -12,13 +12,12 @@ from typer.testing import CliRunner
 from datagen.cli import app
 from datagen.recording.dataset import Dataset
 from datagen.recording.statistics import describe
-from datagen.stats.charts import BINS, FOOT, HEIGHT, histogram
-from datagen.stats.concerns import concerns
 from datagen.stats.contact_sheet import contact_sheet
-from datagen.stats.page import page
+from datagen.stats.page import concerns, page
+from runtime.svg_charts import BINS, FOOT, HEIGHT, histogram
 
 
-def test_the_page_stands_alone_and_counts_what_is_there(dataset: Path) -> None:
+def test_the_page_needs_no_other_file_and_counts_the_frames(dataset: Path) -> None:
     text = page(Dataset.open(dataset))
     assert not re.search(r'(src|href)="(?!data:)', text)
     assert "135 frames in 3 rounds, 56 x 42 px" in text
@@ -38,12 +37,12 @@ def test_a_histogram_counts_each_bin() -> None:
     assert all(height == 0 for height in heights[1:-1])
 
 
-def test_a_feature_that_is_never_active_says_so() -> None:
+def test_a_histogram_of_a_feature_that_is_never_active_is_a_note() -> None:
     absent = np.full(5, np.nan, np.float32)
     assert "never active" in histogram("l", "m", {"train": absent, "test": absent})
 
 
-def test_a_rare_class_an_empty_side_and_a_one_sided_track_are_concerns(dataset: Path) -> None:
+def test_rare_classes_empty_splits_and_one_sided_tracks_are_concerns(dataset: Path) -> None:
     opened = Dataset.open(dataset)
     statistics = describe(opened)
     statistics["train"]["heading"]["left"] = 0.149
@@ -60,7 +59,7 @@ def test_a_rare_class_an_empty_side_and_a_one_sided_track_are_concerns(dataset: 
     assert "No round is for test" in "\n".join(concerns(statistics, elsewhere))
 
 
-def test_the_sheet_shows_other_tracks_and_lights_first(dataset: Path) -> None:
+def test_the_contact_sheet_shows_other_tracks_and_lights_first(dataset: Path) -> None:
     opened = Dataset.open(dataset)
     opened.rounds[2] = replace(opened.rounds[2], track="hill")
     cards = list(contact_sheet(opened, most=2))
@@ -72,7 +71,7 @@ def test_the_sheet_shows_other_tracks_and_lights_first(dataset: Path) -> None:
     assert green.sum() > 20  # the recorded markings
 
 
-def test_the_command_writes_the_page_and_tells_its_figures(dataset: Path, tmp_path: Path) -> None:
+def test_the_command_writes_the_page_and_prints_its_figures(dataset: Path, tmp_path: Path) -> None:
     done = CliRunner().invoke(app, ["stats", str(dataset), "--json"])
     assert done.exit_code == 0
     result = json.loads(done.stdout)

@@ -93,12 +93,12 @@ def test_the_page_holds_images_markings_and_series_in_step(
     assert len(data["lines"][0]) == 20
 
 
-def test_a_long_round_is_thinned_out_in_pictures_not_in_plots(recorded: Path) -> None:
-    text = page(Contents.open(recorded), most=10)
+def test_a_long_round_is_subsampled_in_images_not_in_plots(recorded: Path) -> None:
+    text = page(Contents.open(recorded), max_frames=10)
     data = read_page(text)
     assert [frame["step"] for frame in data["frames"]] == list(range(0, FRAMES, 5))
     assert len(data["plots"][0]["series"]["ml"]) == FRAMES
-    assert "one picture in 5" in text
+    assert "one image in 5 steps" in text
 
 
 def rows(path: Path, static: bool) -> Counter[str]:

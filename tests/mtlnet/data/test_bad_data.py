@@ -11,7 +11,7 @@ import pytest
 from datagen.recording import Dataset, UndecodableImage
 from datagen.recording.splits import Split, split_path, write_split
 from mtlnet.data.sources import find_undecodable
-from mtlnet.evaluation.ablation import AblationConfig, rows_of
+from mtlnet.evaluation.ablation import AblationConfig, ablation_rows
 from mtlnet.evaluation.ablation_run import ablate
 from mtlnet.evaluation.evaluate import evaluate
 from mtlnet.inference.engine import load_engine
@@ -52,7 +52,7 @@ def config(data: Path, out: Path, **changes: Any) -> TrainConfig:
 
 def ablation(data: Path, out: Path, **changes: Any) -> None:
     given = AblationConfig(data, out, iterations=1, seeds=(1,), batch=2, **changes)
-    ablate(given, rows_of())
+    ablate(given, ablation_rows())
 
 
 def judge(published: Path, data: Path, split: str) -> dict[str, Any]:

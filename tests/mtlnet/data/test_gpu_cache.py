@@ -100,7 +100,7 @@ def test_captured_training_gives_the_same_weights(dataset: Path) -> None:
     cached = GpuDataset(loader(dataset), CPU)
     recipe = replace(RECIPES["paper"], dropout=0.0, learning_rate=0.02)
     plain, recorded = (Trainer(recipe, (0.3, 0.2, 0.5), 1, CPU) for _ in range(2))
-    recorded.captured = CudaGraphStep(recorded.learn, FakeRecorder())
+    recorded.cuda_graph = CudaGraphStep(recorded.optimize, FakeRecorder())
     one, other = steps(plain, cached, 6), steps(recorded, cached, 6)
     assert one == other
     assert len(set(one)) == 6
@@ -118,8 +118,8 @@ def test_a_cuda_graph_replays_training_steps(dataset: Path) -> None:
     assert isinstance(cached, GpuDataset)
     recipe = replace(RECIPES["paper"], dropout=0.0, learning_rate=0.02)
     plain, recorded = (Trainer(recipe, (0.3, 0.2, 0.5), 1, gpu) for _ in range(2))
-    assert isinstance(recorded.captured, CudaGraphStep)
-    plain.captured = None
+    assert isinstance(recorded.cuda_graph, CudaGraphStep)
+    plain.cuda_graph = None
     assert steps(recorded, cached, 12) == pytest.approx(steps(plain, cached, 12), rel=2e-2)
     # With another learning rate it is captured again, and training continues.
     before = [p.clone() for p in recorded.network.parameters()]

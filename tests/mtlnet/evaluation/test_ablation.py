@@ -1,4 +1,4 @@
-"""The ablation: the paper's rows, figures over seeds, and going on after a kill."""
+"""The ablation: the paper's rows, figures over seeds, and resuming after an interruption."""
 
 import json
 from dataclasses import replace
@@ -13,12 +13,12 @@ from mtlnet.evaluation.ablation import (
     PAPER_ROWS,
     AblationConfig,
     Run,
+    ablation_rows,
     best,
-    carry_out,
+    finish_runs,
     parse_seeds,
     plan_runs,
     require_same_settings,
-    rows_of,
     table,
     training_curve,
 )
@@ -33,8 +33,8 @@ from trackfeatures.errors import UserError
 ALPHAS = {row.name: row.alpha for row in PAPER_ROWS}
 
 
-class Bench:
-    """Stands in for training and judging; writes what they would, and counts the calls."""
+class FakeTraining:
+    """Writes the files of training and evaluation, and records the calls of `train`."""
 
     def __init__(self, card: ModelCard, stop_at: int = 99) -> None:
         self.card = card
@@ -60,7 +60,7 @@ class Bench:
         (config.out / "curves.csv").write_text("\n".join([",".join(CURVE_COLUMNS), *points, ""]))
         replace(self.card, name=config.out.name, alpha=config.alpha).write(config.out)
 
-    def judge(self, run: Path, config: AblationConfig) -> dict[str, Any]:
+    def evaluate(self, run: Path, config: AblationConfig) -> dict[str, Any]:
         seed = int(run.name[-1])
         marking = dict.fromkeys(("ml", "mr", "l", "m"), 0.1 * seed)
         return {
@@ -89,14 +89,14 @@ def settings(tmp_path: Path, **changes: Any) -> AblationConfig:
     return AblationConfig(Path("data"), tmp_path / "ablation", **values)
 
 
-def done(config: AblationConfig, bench: Bench) -> list[Run]:
-    runs = plan_runs(config, rows_of())
+def finish_all(config: AblationConfig, fake: FakeTraining) -> list[Run]:
+    runs = plan_runs(config, ablation_rows())
     require_same_settings(config, "hash")
-    assert list(carry_out(config, runs, bench.train, bench.judge)) == runs
+    assert list(finish_runs(config, runs, fake.train, fake.evaluate)) == runs
     return runs
 
 
-def test_rows_are_the_papers() -> None:
+def test_the_rows_are_those_of_the_paper() -> None:
     assert [ALPHAS[f"mtl-{n}"] for n in (1, 2, 3, 4)] == [
         (0.1, 0.1, 0.2),
         (0.2, 0.2, 0.6),
@@ -104,15 +104,15 @@ def test_rows_are_the_papers() -> None:
         (0.5, 0.3, 0.2),
     ]
     assert [list(ALPHAS[n]) for n in ("distance", "angle", "type")] == np.eye(3).tolist()
-    assert [row.network for row in rows_of()[7:]] == ["deepdriving", "mobilenet_v3_small"]
-    assert rows_of("regnet_y_400mf")[7].alpha == (1, 1, 0)
-    with pytest.raises(UserError, match="mtl is no backbone"):
-        rows_of("mtl")
+    assert [row.network for row in ablation_rows()[7:]] == ["deepdriving", "mobilenet_v3_small"]
+    assert ablation_rows("regnet_y_400mf")[7].alpha == (1, 1, 0)
+    with pytest.raises(UserError, match="mtl is not a backbone"):
+        ablation_rows("mtl")
 
 
-def test_figures_over_seeds(tmp_path: Path, card: ModelCard) -> None:
-    runs = done(settings(tmp_path), Bench(card))
-    entries = {entry["row"]["name"]: entry for entry in table(rows_of(), runs)}
+def test_figures_have_mean_and_deviation_over_the_seeds(tmp_path: Path, card: ModelCard) -> None:
+    runs = finish_all(settings(tmp_path), FakeTraining(card))
+    entries = {entry["row"]["name"]: entry for entry in table(ablation_rows(), runs)}
     distance = entries["distance"]["figures"]
     # Seeds 1 and 3: 0.01 and 0.03, sample standard deviation 0.02 / sqrt(2).
     assert distance["distance_loss"]["mean"] == pytest.approx(0.02)
@@ -122,31 +122,31 @@ def test_figures_over_seeds(tmp_path: Path, card: ModelCard) -> None:
     assert entries["mtl-1"]["figures"]["mr"]["values"] == pytest.approx([0.1, 0.3])
     assert entries["mtl-1"]["figures"]["r"] is None
     assert best(list(entries.values()), "accuracy") == [*entries].index("mtl-2")
-    curve = training_curve(runs, rows_of()[0], "distance")
+    curve = training_curve(runs, ablation_rows()[0], "distance")
     assert curve is not None
     steps, losses = curve
     assert (steps[0], steps[-1], losses.shape) == (10, 400, (2, 40))
     np.testing.assert_allclose(losses[:, 9], [0.1, 0.3])
 
 
-def test_a_killed_ablation_goes_on(tmp_path: Path, card: ModelCard) -> None:
-    config, bench = settings(tmp_path), Bench(card, stop_at=3)
-    runs = plan_runs(config, rows_of())
+def test_an_interrupted_ablation_is_resumed(tmp_path: Path, card: ModelCard) -> None:
+    config, fake = settings(tmp_path), FakeTraining(card, stop_at=3)
+    runs = plan_runs(config, ablation_rows())
     require_same_settings(config, "hash")
     with pytest.raises(Stopped):
-        list(carry_out(config, runs, bench.train, bench.judge))
+        list(finish_runs(config, runs, fake.train, fake.evaluate))
     assert [run.state for run in runs[:4]] == ["finished", "finished", "stopped", "new"]
     kept = (runs[0].folder / CARD).stat().st_mtime_ns
-    again = Bench(card)
-    done(config, again)
+    again = FakeTraining(card)
+    finish_all(config, again)
     assert again.trained[:2] == [("type-seed1", True), ("mtl-1-seed1", False)]
     assert len(again.trained) == len(runs) - 2
     assert (runs[0].folder / CARD).stat().st_mtime_ns == kept
     assert not list(config.out.glob("runs/*/checkpoints"))
     # A seed more: only its runs are trained.
-    more = Bench(card)
-    done(replace(config, seeds=(1, 3, 2)), more)
-    assert [name for name, _ in more.trained] == [f"{row.name}-seed2" for row in rows_of()]
+    more = FakeTraining(card)
+    finish_all(replace(config, seeds=(1, 3, 2)), more)
+    assert [name for name, _ in more.trained] == [f"{row.name}-seed2" for row in ablation_rows()]
 
 
 def test_other_settings_are_refused(tmp_path: Path) -> None:
@@ -158,17 +158,21 @@ def test_other_settings_are_refused(tmp_path: Path) -> None:
         require_same_settings(config, "other")
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "file").write_text("")
-    with pytest.raises(UserError, match="holds something else"):
+    with pytest.raises(UserError, match="holds other files"):
         require_same_settings(replace(config, out=tmp_path / "mine"), "hash")
-    for text, seen in (("1,x", "no numbers"), ("1,1", "different"), ("", "no numbers")):
+    for text, seen in (
+        ("1,x", "not a list of whole numbers"),
+        ("1,1", "different"),
+        ("", "not a list of whole numbers"),
+    ):
         with pytest.raises(UserError, match=seen):
             settings(tmp_path, seeds=parse_seeds(text))
 
 
-def test_the_page_shows_the_table_beside_the_papers(tmp_path: Path, card: ModelCard) -> None:
+def test_the_page_shows_the_table_beside_that_of_the_paper(tmp_path: Path, card: ModelCard) -> None:
     config = settings(tmp_path)
-    runs = done(config, Bench(card))
-    result = write_result(config, rows_of(), runs)
+    runs = finish_all(config, FakeTraining(card))
+    result = write_result(config, ablation_rows(), runs)
     assert json.loads((config.out / "ablation.json").read_text()) == json.loads(json.dumps(result))
     text = (config.out / "ablation.html").read_text()
     found = Page(text)
@@ -186,18 +190,18 @@ def test_the_page_shows_the_table_beside_the_papers(tmp_path: Path, card: ModelC
     # Four alphas and the line of the single task in each of three charts.
     assert len(found.all("path", "curve")) == 12
     assert len(found.all("path", "level")) == 3
-    found.require_alone()
+    found.require_self_contained()
 
 
-def test_an_unfinished_ablation_has_a_page_too(tmp_path: Path) -> None:
+def test_an_unfinished_ablation_has_a_page(tmp_path: Path) -> None:
     config = settings(tmp_path)
     require_same_settings(config, "hash")
-    result = write_result(config, rows_of(), plan_runs(config, rows_of()))
+    result = write_result(config, ablation_rows(), plan_runs(config, ablation_rows()))
     assert [row["seeds"] for row in result["rows"]] == [[]] * 9
     assert "0 of 18 runs" in (config.out / "ablation.html").read_text()
 
 
-def test_the_dry_run_estimates_and_writes_nothing(
+def test_a_dry_run_estimates_the_time_and_writes_nothing(
     dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def seconds(_config: AblationConfig, name: str, *_: object) -> float:
@@ -205,7 +209,7 @@ def test_the_dry_run_estimates_and_writes_nothing(
 
     monkeypatch.setattr(mtlnet.evaluation.ablation_run, "step_seconds", seconds)
     config = replace(settings(tmp_path), data=dataset)
-    result = ablate(config, rows_of(), dry_run=True)
+    result = ablate(config, ablation_rows(), dry_run=True)
     assert result["seconds"] == 2 * 400 * (7 * 0.5 + 2 * 1.0)
     assert not config.out.exists()
 
@@ -222,12 +226,12 @@ def test_steps_are_timed(dataset: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_two_rows_for_real(dataset: Path, tmp_path: Path) -> None:
+def test_two_rows_are_trained_and_evaluated(dataset: Path, tmp_path: Path) -> None:
     config = replace(settings(tmp_path, iterations=10, seeds=(1,)), data=dataset, batch=2)
-    result = ablate(config, [rows_of()[0], rows_of()[5]])
-    alone, together = result["rows"]
-    assert alone["figures"]["accuracy"] is None
-    assert 0 <= together["figures"]["accuracy"]["mean"] <= 1
-    assert together["frames"] == 5  # each fifth of 24
+    result = ablate(config, [ablation_rows()[0], ablation_rows()[5]])
+    single, multi = result["rows"]
+    assert single["figures"]["accuracy"] is None
+    assert 0 <= multi["figures"]["accuracy"]["mean"] <= 1
+    assert multi["frames"] == 5  # every fifth of 24
     text = (config.out / "ablation.html").read_text()
     assert "2 of 2 runs of 10 iterations" in text

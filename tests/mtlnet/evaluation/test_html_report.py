@@ -1,4 +1,4 @@
-"""The evaluation's page: its figures are the report's, its worst frames are the worst."""
+"""The evaluation's page: its figures are the report's, and its worst frames are the worst."""
 
 import base64
 from collections.abc import Iterator
@@ -13,22 +13,22 @@ from numpy.typing import NDArray
 import trackfeatures as tf
 from datagen.recording import Dataset, Frames
 from mtlnet.evaluation.html_report import (
-    APART,
-    EACH,
-    MOST_DRIVES,
-    Worst,
-    figures,
+    MAX_ROUNDS,
+    MIN_FRAMES_APART,
+    WORST_PER_FEATURE,
+    WorstFrame,
     page,
+    worst_figures,
     worst_frames,
 )
-from mtlnet.evaluation.metrics import judge_all, mean_answer, signed_errors
+from mtlnet.evaluation.metrics import evaluate_by_groups, mean_labels, signed_errors
 from mtlnet.inference.overlay import PREDICTION_COLOUR, TRUTH_COLOUR, marking_line, to_pixels
 from mtlnet.inference.uncertainty import FEATURES
 from tests.mtlnet.page import Page
 
 ORDER = ("to_lane_centre", "angle", "ml", "mr", "m", "l", "r")
-OFF = {9: 1.0, 30: -0.8, 60: 0.3}
-"""Frames on which the answer for `ml` is so many m wrong."""
+ERRORS_M = {9: 1.0, 30: -0.8, 60: 0.3}
+"""Frames on which the predicted `ml` has this error in m."""
 
 
 @pytest.fixture(scope="module")
@@ -38,16 +38,16 @@ def frames(dataset: Path) -> Frames:
 
 @pytest.fixture(scope="module")
 def outputs(frames: Frames) -> NDArray[np.float32]:
-    """Right answers but for `OFF` and a little everywhere; each says 0.25 m or rad."""
+    """Outputs with `ERRORS_M` and small errors on all frames; standard deviations 0.25 m or rad."""
     labels = frames.labels
-    said = labels.distances.astype(np.float64)
-    said[:, 0] -= 0.01
-    for row, error in OFF.items():
-        said[row, 0] = labels.distances[row, 0] + error
-    coded = tf.encode(said, labels.angle + 0.002)
+    predicted = labels.distances.astype(np.float64)
+    predicted[:, 0] -= 0.01
+    for row, error in ERRORS_M.items():
+        predicted[row, 0] = labels.distances[row, 0] + error
+    coded = tf.encode(predicted, labels.angle + 0.002)
     classes = np.eye(3)[labels.heading] * 0.7 + 0.1
     doubt = np.full((len(frames), 8), 0.25)
-    doubt[: len(frames) // 4, -1] = 2.0  # a quarter is called strange
+    doubt[: len(frames) // 4, -1] = 2.0  # a quarter is out of distribution
     return np.concatenate([coded, classes, doubt], 1).astype(np.float32)
 
 
@@ -61,7 +61,7 @@ def report(frames: Frames, outputs: NDArray[np.float32]) -> dict[str, Any]:
         "data": "some/data",
         "split": "all",
         "rounds": len(frames.rounds),
-        **judge_all(outputs, frames, mean_answer(frames.labels)),
+        **evaluate_by_groups(outputs, frames, mean_labels(frames.labels)),
     }
 
 
@@ -70,13 +70,13 @@ def shown(report: dict[str, Any], frames: Frames, outputs: NDArray[np.float32]) 
     return Page(page(report, frames, outputs))
 
 
-def test_the_page_needs_nothing_beside_it(shown: Page) -> None:
-    shown.require_alone()
+def test_the_page_needs_no_other_file(shown: Page) -> None:
+    shown.require_self_contained()
     assert shown.all("title")[0].text == "a <model>: evaluation"
-    assert "$" not in shown.source
+    assert "a &lt;model&gt;" in shown.source
 
 
-def test_its_tables_are_the_reports(shown: Page, report: dict[str, Any]) -> None:
+def test_its_tables_are_those_of_the_report(shown: Page, report: dict[str, Any]) -> None:
     summary = shown.rows(0)
     assert [row[0] for row in summary[1:]] == [
         f"{name} ({'rad' if name == 'angle' else 'm'})" for name in FEATURES
@@ -93,20 +93,20 @@ def test_its_tables_are_the_reports(shown: Page, report: dict[str, Any]) -> None
     assert None not in rates.values()
     shares = [f"{rates[kind]:.1%}" for kind in ("false_active", "false_inactive")]
     assert shown.rows(2)[4] == ["m", *shares]
-    assert shown.rows(2)[1][:2] == ["ml", "-"]  # it is nowhere absent
+    assert shown.rows(2)[1][:2] == ["ml", "-"]  # it is nowhere inactive
     coverage = shown.rows(3)
     assert coverage[7] == ["angle", "100.0%", "100.0%"]
-    assert "25.0% of these frames are called out of distribution" in shown.source
+    assert "25.0% of these frames are classified as out of distribution" in shown.source
     tracks = shown.rows(4)
     assert [row[:2] for row in tracks[1:]] == [["alpha", "48"], ["beta", "48"]]
-    assert tracks[0][-1] == "strange"
+    assert tracks[0][-1] == "out of distribution"
 
 
-def test_a_drive_of_each_track_with_its_band(shown: Page, frames: Frames) -> None:
+def test_a_round_of_each_track_is_drawn_with_its_band(shown: Page, frames: Frames) -> None:
     tracks = {info.track for info in frames.rounds}
-    assert len(shown.all("h3")) == len(tracks) <= MOST_DRIVES
-    # Two charts a drive: offset and angle, each with truth, answer and two standard deviations.
-    for kind in ("truth", "said", "band"):
+    assert len(shown.all("h3")) == len(tracks) <= MAX_ROUNDS
+    # Two charts a round: offset and angle, each with truth, prediction and two standard deviations.
+    for kind in ("truth", "predicted", "band"):
         assert len(shown.all("path", kind)) == 2 * len(tracks)
     assert len(shown.all("path", "dot")) == sum(
         10 for name in FEATURES if name in ("ml", "mr", "to_lane_centre", "angle", "l", "m", "r")
@@ -121,22 +121,25 @@ def test_the_worst_frames_are_the_worst() -> None:
     rounds = np.repeat(np.arange(5), 400)
     chosen = worst_frames(errors, rounds)
     assert [w.feature for w in chosen] == [
-        n for n in ORDER if n != FEATURES[3] for _ in range(EACH)
+        n for n in ORDER if n != FEATURES[3] for _ in range(WORST_PER_FEATURE)
     ]
-    taken: list[Worst] = []
+    taken: list[WorstFrame] = []
     for one in chosen:
         column = FEATURES.index(one.feature)
         assert one.error == errors[one.row, column]
-        # Whatever is worse stands too near to what is shown already.
+        # Every worse frame is too near to one that is shown already.
         for row in np.flatnonzero(np.abs(errors[:, column]) > abs(one.error)).tolist():
-            assert any(abs(row - w.row) < APART and rounds[row] == rounds[w.row] for w in taken)
+            assert any(
+                abs(row - w.row) < MIN_FRAMES_APART and rounds[row] == rounds[w.row] for w in taken
+            )
         assert not any(
-            abs(one.row - w.row) < APART and rounds[one.row] == rounds[w.row] for w in taken
+            abs(one.row - w.row) < MIN_FRAMES_APART and rounds[one.row] == rounds[w.row]
+            for w in taken
         )
         taken.append(one)
 
 
-def test_they_are_shown_with_their_errors(
+def test_the_worst_frames_are_shown_with_their_errors(
     shown: Page, frames: Frames, outputs: NDArray[np.float32]
 ) -> None:
     errors = signed_errors(outputs, frames.labels.distances, frames.labels.angle)
@@ -146,16 +149,15 @@ def test_they_are_shown_with_their_errors(
     assert [w.error for w in worst_ml] == pytest.approx([0.5, -0.4], abs=1e-5)
     captions = [e.text for e in shown.all("figcaption") if "s =" in e.text]
     assert len(captions) == len(chosen) == len(shown.all("img"))
-    assert captions[0].startswith("to_lane_centre +0.5 m, said to be known to 0.25 m")
-    assert "called out of distribution" in captions[0]
-    assert "called out of distribution" not in captions[1]
+    assert captions[0].startswith("to_lane_centre +0.5 m, predicted standard deviation 0.25 m")
+    assert "out of distribution" in captions[0]
+    assert "out of distribution" not in captions[1]
     assert "r000, beta, s = 7 m" in captions[0]
 
 
 def test_markings_are_drawn_where_they_are(frames: Frames, outputs: NDArray[np.float32]) -> None:
-    (figure,) = figures(frames, outputs, [Worst(9, "ml", 1.0)])
-    (image,) = Page(figure).all("img")
-    jpeg = base64.b64decode(image.attributes["src"].removeprefix("data:image/jpeg;base64,"))
+    (figure,) = worst_figures(frames, outputs, [WorstFrame(9, "ml", 1.0)])
+    jpeg = base64.b64decode(figure["jpeg"].removeprefix("data:image/jpeg;base64,"))
     pixels = simplejpeg.decode_jpeg(jpeg).astype(int)
     camera, labels = frames.camera, frames.labels
     assert pixels.shape[0] == 2 * camera.height

@@ -1,4 +1,4 @@
-"""The figures of `mtlnet evaluate` on four frames, worked out by hand."""
+"""The metrics of `mtlnet evaluate` on four frames against numbers worked out by hand."""
 
 import math
 from types import SimpleNamespace
@@ -8,7 +8,7 @@ import pytest
 
 import trackfeatures as tf
 from datagen.recording import Labels
-from mtlnet.evaluation.metrics import judge, judge_all, presence
+from mtlnet.evaluation.metrics import evaluate_by_groups, evaluate_outputs, presence
 from mtlnet.evaluation.slices import GROUPS
 
 NAN = float("nan")
@@ -18,13 +18,13 @@ TRUE = [
     [NAN, NAN, -3.8, 0.2, 4.2],
     [-2.5, 1.5, NAN, NAN, NAN],
 ]
-SAID = [
+PREDICTED = [
     [-2.1, 2.1, NAN, NAN, NAN],
     [-1.0, 3.3, NAN, -0.8, 3.0],
     [NAN, NAN, -3.8, 0.3, 4.1],
     [-2.5, 1.5, NAN, 2.0, NAN],
 ]
-ANGLE, SAID_ANGLE = [0.0, 0.1, -0.1, 0.0], [0.02, 0.1, -0.12, 0.0]
+ANGLE, PREDICTED_ANGLE = [0.0, 0.1, -0.1, 0.0], [0.02, 0.1, -0.12, 0.0]
 HEADING = np.array([0, 1, 2, 1])
 PROBABILITIES = [[0.8, 0.1, 0.1], [0.1, 0.8, 0.1], [0.6, 0.2, 0.2], [0.2, 0.5, 0.3]]
 MEAN = {
@@ -55,22 +55,24 @@ def labels() -> Labels:
     )
 
 
-OUTPUTS = np.concatenate([tf.encode(SAID, SAID_ANGLE), np.array(PROBABILITIES, np.float32)], axis=1)
+OUTPUTS = np.concatenate(
+    [tf.encode(PREDICTED, PREDICTED_ANGLE), np.array(PROBABILITIES, np.float32)], axis=1
+)
 
 
-def test_errors_on_active_labels() -> None:
-    report = judge(OUTPUTS, labels(), MEAN)
+def test_errors_are_taken_on_active_labels() -> None:
+    report = evaluate_outputs(OUTPUTS, labels(), MEAN)
     assert report["frames"] == 4
     expected = {"ml": 0.1 / 3, "mr": 0.4 / 3, "l": 0.0, "m": 0.3 / 2, "r": 0.1 / 2}
     assert report["mae_m"] == pytest.approx(expected, abs=1e-5)
-    # Offsets: said 0, 1.15, 0.3 - 3.8 halved, -0.5; true 0, 1, 0.2 - 3.8 halved, -0.5.
+    # Offsets: predicted 0, 1.15, 0.3 - 3.8 halved, -0.5; true 0, 1, 0.2 - 3.8 halved, -0.5.
     assert report["to_lane_centre_mae_m"] == pytest.approx((0.15 + 0.05) / 4, abs=1e-5)
     assert report["angle_mae_rad"] == pytest.approx(0.04 / 4, abs=1e-6)
     assert report["heading_accuracy"] == 0.75
 
 
-def test_beside_always_answering_the_training_mean() -> None:
-    report = judge(OUTPUTS, labels(), MEAN)
+def test_the_baseline_predicts_the_training_mean() -> None:
+    report = evaluate_outputs(OUTPUTS, labels(), MEAN)
     base = report["baseline"]
     expected = {"ml": 1.5 / 3, "mr": 1.5 / 3, "l": 0.2, "m": 1.2 / 2, "r": 1.2 / 2}
     assert base["mae_m"] == pytest.approx(expected, abs=1e-5)
@@ -81,7 +83,7 @@ def test_beside_always_answering_the_training_mean() -> None:
 
 
 def test_coded_losses_are_those_of_training() -> None:
-    coded = judge(OUTPUTS, labels(), MEAN)["coded"]
+    coded = evaluate_outputs(OUTPUTS, labels(), MEAN)["coded"]
     in_lane, on_marking = 0.8 / 5.0, 0.8 / 5.5
     squares = [
         2 * (0.1 * in_lane) ** 2,
@@ -95,7 +97,7 @@ def test_coded_losses_are_those_of_training() -> None:
     assert coded["type"] == pytest.approx(-math.log(likelihood) / 4, rel=1e-5)
 
 
-def test_presence_counts_missed_and_invented() -> None:
+def test_presence_counts_false_inactive_and_false_active() -> None:
     counted = presence(OUTPUTS, labels())
     assert counted["m"] == {"false_inactive": 0.0, "false_active": 0.5}
     assert counted["ml"] == {"false_inactive": 0.0, "false_active": 0.0}
@@ -103,28 +105,28 @@ def test_presence_counts_missed_and_invented() -> None:
     without_m[2, 3] = 0.9  # decodes to the inactive end
     assert presence(without_m, labels())["m"]["false_inactive"] == 0.5
     # The error is still taken, on the value given: 3.5 m instead of 0.2 m.
-    error = judge(without_m, labels(), MEAN)["mae_m"]["m"]
+    error = evaluate_outputs(without_m, labels(), MEAN)["mae_m"]["m"]
     assert error == pytest.approx((3.3 + 0.2) / 2, abs=1e-4)
 
 
-def test_nothing_active_is_none_not_nan() -> None:
+def test_the_error_of_a_feature_that_is_never_active_is_none() -> None:
     only = labels().take(np.array([0]))
-    report = judge(OUTPUTS[:1], only, MEAN)
+    report = evaluate_outputs(OUTPUTS[:1], only, MEAN)
     assert report["mae_m"]["l"] is None
     assert report["ratio"]["mae_m"]["l"] is None
 
 
 def many(count: int) -> tuple[np.ndarray, Labels]:
-    """Outputs (N, 17) that are off by known errors, and labels of every group."""
+    """Outputs (N, 17) with known errors, and labels of every group."""
     rng = np.random.default_rng(4)
     column = rng.uniform(-1.4, 1.4, (count, 1)).astype(np.float32)
     absent = np.full((count, 3), np.nan, np.float32)
     distances = np.concatenate([column - 2, column + 2, absent], 1)
     angle = rng.uniform(-0.1, 0.1, count).astype(np.float32)
     error = rng.normal(0.0, 0.05, (count, 2))
-    said = distances.astype(np.float64)
-    said[:, :2] += error
-    coded = tf.encode(said, angle + 0.01)
+    predicted = distances.astype(np.float64)
+    predicted[:, :2] += error
+    coded = tf.encode(predicted, angle + 0.01)
     doubt = np.tile([0.05] * 5 + [0.05 / 2**0.5, 0.02, 0.5], (count, 1))
     outputs = np.concatenate([coded, np.tile([0.2, 0.5, 0.3], (count, 1)), doubt], 1)
     lanes, zeros = rng.integers(1, 4, count), np.zeros(count, np.float32)
@@ -146,28 +148,28 @@ def many(count: int) -> tuple[np.ndarray, Labels]:
     return outputs.astype(np.float32), found
 
 
-class Drives:
-    """Frames of two rounds, as far as a judge asks of them."""
+class FakeFrames:
+    """Labels and tracks of two rounds."""
 
     def __init__(self, labels: Labels) -> None:
         self.labels = labels
         self.rounds = [SimpleNamespace(track=track) for track in ("oval", "town")]
 
 
-def test_percentiles_are_numpys() -> None:
+def test_percentiles_equal_those_of_numpy() -> None:
     outputs, found = many(500)
-    spread = judge(outputs, found, MEAN)["errors"]
+    spread = evaluate_outputs(outputs, found, MEAN)["errors"]
     error = np.abs(tf.decode_values(outputs[:, :6])[:, 0] - found.distances[:, 0])
     for name, share in (("median", 50), ("p95", 95), ("p99", 99)):
         assert spread["ml"][name] == pytest.approx(np.percentile(error, share))
-    assert spread["ml"]["mean"] == judge(outputs, found, MEAN)["mae_m"]["ml"]
+    assert spread["ml"]["mean"] == evaluate_outputs(outputs, found, MEAN)["mae_m"]["ml"]
     assert spread["angle"]["p99"] == pytest.approx(0.01, abs=1e-5)
     assert spread["m"] == {"mean": None, "median": None, "p95": None, "p99": None, "frames": 0}
 
 
 def test_groups_sum_to_the_whole() -> None:
     outputs, found = many(600)
-    report = judge_all(outputs, Drives(found), MEAN)  # type: ignore[arg-type]
+    report = evaluate_by_groups(outputs, FakeFrames(found), MEAN)  # type: ignore[arg-type]
     for way in GROUPS:
         parts = report[way].values()
         assert sum(part["frames"] for part in parts) == 600
@@ -175,8 +177,8 @@ def test_groups_sum_to_the_whole() -> None:
         mean = sum(part["errors"]["mr"]["mean"] * part["frames"] for part in parts) / 600
         assert mean == pytest.approx(report["mae_m"]["mr"])
         for true, row in report["confusion"].items():
-            for said, count in row.items():
-                assert sum(part["confusion"][true][said] for part in parts) == count
+            for predicted, count in row.items():
+                assert sum(part["confusion"][true][predicted] for part in parts) == count
     assert list(report["by_speed"]) == [
         "under 30 km/h", "30 to 45 km/h", "45 to 60 km/h", "over 60 km/h",
     ]  # fmt: skip
@@ -184,9 +186,9 @@ def test_groups_sum_to_the_whole() -> None:
     assert report["by_speed"]["under 30 km/h"]["frames"] == slow
 
 
-def test_what_is_said_of_doubt() -> None:
+def test_coverage_and_calibration_of_the_standard_deviations() -> None:
     outputs, found = many(2000)
-    doubt = judge_all(outputs, Drives(found), MEAN)["doubt"]  # type: ignore[arg-type]
+    doubt = evaluate_by_groups(outputs, FakeFrames(found), MEAN)["doubt"]  # type: ignore[arg-type]
     assert doubt["coverage"]["ml"][0] == pytest.approx(0.683, abs=0.03)
     assert doubt["coverage"]["to_lane_centre"][1] == pytest.approx(0.954, abs=0.02)
     assert doubt["coverage"]["angle"] == [1.0, 1.0]
@@ -194,4 +196,4 @@ def test_what_is_said_of_doubt() -> None:
     assert doubt["out_of_distribution"] == 0.0
     assert sum(part["frames"] for part in doubt["calibration"]["ml"]) == 2000
     outputs[:500, -1] = 1.5
-    assert judge(outputs, found, MEAN)["doubt"]["out_of_distribution"] == 0.25
+    assert evaluate_outputs(outputs, found, MEAN)["doubt"]["out_of_distribution"] == 0.25

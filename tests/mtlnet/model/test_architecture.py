@@ -116,7 +116,7 @@ def test_other_networks_overfit_a_batch(dataset: Path, name: str) -> None:
 
 def test_another_network_is_trained_published_and_run(dataset: Path, tmp_path: Path) -> None:
     options = {"data": dataset, "network": "mobilenet_v3_small", "iterations": 2, "batch": 4}
-    result = start_training({**options, "device": "cpu"}, None, tmp_path / "run", resume=False)
+    result = start_training({**options, "device": "cpu"}, tmp_path / "run", resume=False)
     card = read_card(tmp_path / "run")
     assert (card.network, card.iterations) == ("mobilenet_v3_small", 2)
     assert result["export_check"]["openvino_f32_max"] < TOLERANCE

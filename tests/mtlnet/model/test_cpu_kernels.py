@@ -12,7 +12,7 @@ from mtlnet.model.cpu_kernels.im2col import im2col_convolution
 from mtlnet.model.cpu_kernels.norm_pool_relu import statistics
 from mtlnet.model.cpu_kernels.space_to_depth import space_to_depth, space_to_depth_convolution
 from mtlnet.model.network import Network, initialise
-from mtlnet.training.trainer import dropout_masks, settle_norms
+from mtlnet.training.trainer import dropout_masks, freeze_batch_norm
 
 
 def pictures(count: int) -> torch.Tensor:
@@ -39,7 +39,7 @@ def test_features_and_gradients_match_the_plain_network(norm: str) -> None:
     images, plain = pictures(4), some_network(batch_norm=norm != "none").double()
     if norm == "frozen":
         plain.forward_features(pictures(2).double() * (1 / 127.5) - 1.0)
-        settle_norms(plain)
+        freeze_batch_norm(plain)
     fast = copy.deepcopy(plain)
     expected = plain.forward_features(images.double() * (1 / 127.5) - 1.0)
     found = forward_features(fast, images, torch.float64)

@@ -1,4 +1,4 @@
-"""Fine-tuning starts where the model stood, keeps its camera, and learns a user's own images."""
+"""Fine-tuning starts with the model's outputs, keeps its camera, and trains on custom images."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -13,13 +13,13 @@ from mtlnet.data.sources import continue_from_model, custom_training_data
 from mtlnet.inference.model_card import WEIGHTS, read_card
 from mtlnet.model.network import Network, load_network, predict_images
 from mtlnet.training.config import TrainConfig
-from mtlnet.training.fine_tune import open_init, take_weights
+from mtlnet.training.run import load_pretrained, open_pretrained
 from mtlnet.training.start import start_training
 from trackfeatures.errors import UserError
 
 
 @pytest.fixture
-def mine(dataset: Path, tmp_path: Path) -> Path:
+def custom_images(dataset: Path, tmp_path: Path) -> Path:
     """Six frames of the dataset as a user's own images, twice as large."""
     folder = tmp_path / "mine"
     folder.mkdir()
@@ -33,26 +33,28 @@ def mine(dataset: Path, tmp_path: Path) -> Path:
     return folder
 
 
-def test_it_starts_with_the_models_answers(published: Path) -> None:
+def test_fine_tuning_starts_with_the_outputs_of_the_model(published: Path) -> None:
     network = Network()
     network.target_mean.copy_(torch.linspace(0.2, 0.7, 6))
     network.target_std.copy_(torch.linspace(0.02, 0.3, 6))
-    take_weights(network, published)
+    load_pretrained(network, published)
     frames = np.random.default_rng(0).integers(0, 256, (2, 210, 280, 3), dtype=np.uint8)
     expected = predict_images(load_network(published / WEIGHTS), frames)
     np.testing.assert_allclose(predict_images(network, frames), expected, atol=1e-5)
 
 
-def test_own_images_tune_a_model(published: Path, mine: Path, tmp_path: Path) -> None:
-    options = {"data": mine, "init": str(published), "iterations": 30, "batch": 4}
+def test_fine_tuning_on_custom_images_lowers_their_error(
+    published: Path, custom_images: Path, tmp_path: Path
+) -> None:
+    options = {"data": custom_images, "init": str(published), "iterations": 30, "batch": 4}
     options.update(device="cpu", threads=1)
-    start_training(options, None, tmp_path / "run", resume=False)
+    start_training(options, tmp_path / "run", resume=False)
     before, card = read_card(published), read_card(tmp_path / "run")
     assert (card.recipe, card.network, card.camera) == ("tune", before.network, before.camera)
     assert card.data["init"] == {"name": before.name, "model_hash": before.model_hash}
     assert card.data["frames"] == 6
     assert card.data["mean"]["distances_m"][:2] == pytest.approx([-1.25, 2.65])
-    material = custom_training_data(mine, before)
+    material = custom_training_data(custom_images, before)
     images = material.frames.read_batch(np.arange(6))
     errors = []
     for run in (published, tmp_path / "run"):
@@ -62,23 +64,27 @@ def test_own_images_tune_a_model(published: Path, mine: Path, tmp_path: Path) ->
     assert errors[1] < 0.8 * errors[0]
 
 
-def test_what_is_refused(published: Path, mine: Path, dataset: Path, tmp_path: Path) -> None:
+def test_wrong_options_are_refused(
+    published: Path, custom_images: Path, dataset: Path, tmp_path: Path
+) -> None:
     with pytest.raises(UserError, match="give the model to fine-tune with --init"):
-        custom_training_data(mine, None)
-    options = {"data": mine, "init": str(published), "network": "deepdriving"}
+        custom_training_data(custom_images, None)
+    options = {"data": custom_images, "init": str(published), "network": "deepdriving"}
     with pytest.raises(UserError, match="--init is a mtl, not a deepdriving"):
-        start_training({**options, "alpha": (1.0, 1.0, 0.0)}, None, tmp_path / "a", resume=False)
-    with pytest.raises(UserError, match="recipe fast starts anew"):
+        start_training({**options, "alpha": (1.0, 1.0, 0.0)}, tmp_path / "a", resume=False)
+    with pytest.raises(UserError, match="recipe fast starts from new weights"):
         TrainConfig(dataset, tmp_path / "b", init=str(published), recipe="fast")
-    _, card = open_init(published)
-    material = custom_training_data(mine, card)
+    _, card = open_pretrained(published)
+    material = custom_training_data(custom_images, card)
     other = replace(material, camera=replace(card.camera, z=1.4))
     with pytest.raises(UserError, match=r"0, 1\.4\) m.*keeps the camera"):
         continue_from_model(other, card)
 
 
-def test_what_a_model_has_seen_is_not_forgotten(published: Path, mine: Path) -> None:
-    _, card = open_init(published)
+def test_the_card_lists_the_seeds_and_tracks_of_both_trainings(
+    published: Path, custom_images: Path
+) -> None:
+    _, card = open_pretrained(published)
     seen = replace(card, data={"seeds": [3, 1], "tracks": ["coast"]})
-    about = continue_from_model(custom_training_data(mine, card), seen).about
+    about = continue_from_model(custom_training_data(custom_images, card), seen).about
     assert (about["seeds"], about["tracks"]) == ([1, 3], ["coast"])

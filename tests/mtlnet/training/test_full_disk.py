@@ -1,4 +1,4 @@
-"""A disk that takes no more: one clear line, no half files, and a run that goes on afterwards."""
+"""A full disk: one clear message, no partial files, and a run that can be resumed."""
 
 import errno
 from collections.abc import Callable
@@ -15,7 +15,7 @@ from mtlnet.inference.curves import COLUMNS, read_curves
 from mtlnet.inference.model_card import ModelError, read_card
 from mtlnet.training.checkpoint import list_checkpoints
 from mtlnet.training.config import TrainConfig, resume_config
-from mtlnet.training.logging import Board, Curves
+from mtlnet.training.logging import CurveLog, TensorBoardWriter
 from mtlnet.training.run import train
 from runtime.files import atomic_write
 from trackfeatures.errors import UserError
@@ -40,7 +40,7 @@ def point(step: int) -> dict[str, float]:
     return dict.fromkeys(COLUMNS, 0.5) | {"step": step}
 
 
-def test_a_file_is_written_whole_or_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failed_write_keeps_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "file"
     atomic_write(path, b"old")
     monkeypatch.setattr("runtime.files.os.fsync", full)
@@ -63,8 +63,8 @@ def test_a_new_run_that_cannot_be_written_leaves_no_folder(
     train(new, None)
 
 
-def when_full(monkeypatch: pytest.MonkeyPatch, what: str) -> None:
-    """Let writing `what` fail as a full disk makes it."""
+def fail_writing(monkeypatch: pytest.MonkeyPatch, what: str) -> None:
+    """Make writing `what` fail as on a full disk."""
     if what == "graph":
 
         def save_model(_model: object, path: str, **_: object) -> None:
@@ -73,7 +73,7 @@ def when_full(monkeypatch: pytest.MonkeyPatch, what: str) -> None:
 
         monkeypatch.setattr(openvino, "save_model", save_model)
     elif what == "curves":
-        monkeypatch.setattr("mtlnet.training.logging.Board.add", full)
+        monkeypatch.setattr("mtlnet.training.logging.TensorBoardWriter.add", full)
     else:
         written: Callable[..., None] = runtime.files.atomic_write
 
@@ -88,7 +88,7 @@ def when_full(monkeypatch: pytest.MonkeyPatch, what: str) -> None:
 
 
 @pytest.mark.parametrize("what", ["curves", "checkpoint", "publish", "graph"])
-def test_a_run_goes_on_after_the_disk_was_full(
+def test_a_run_can_be_resumed_after_the_disk_was_full(
     dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, what: str
 ) -> None:
     monkeypatch.setattr("mtlnet.training.loop.LOG_EVERY", 1)
@@ -102,7 +102,7 @@ def test_a_run_goes_on_after_the_disk_was_full(
     assert kept == ["step-00000001.safetensors"]
     resumed, data = resume_config(new.out, {"iterations": 2})
     with monkeypatch.context() as patch:
-        when_full(patch, what)
+        fail_writing(patch, what)
         with pytest.raises(UserError, match=rf"{new.out} broke off: .*--resume") as caught:
             train(resumed, data)
     assert "\n" not in str(caught.value)
@@ -113,9 +113,9 @@ def test_a_run_goes_on_after_the_disk_was_full(
     assert [row["step"] for row in read_curves(new.out / "curves.csv")] == [1, 2]
 
 
-def test_half_written_rows_are_left_out(tmp_path: Path) -> None:
+def test_partial_rows_are_omitted(tmp_path: Path) -> None:
     path = tmp_path / "curves.csv"
-    with Curves(tmp_path, 0) as curves:
+    with CurveLog(tmp_path, 0) as curves:
         for step in (10, 20, 30):
             curves.write(point(step))
     whole = path.read_text()
@@ -123,7 +123,7 @@ def test_half_written_rows_are_left_out(tmp_path: Path) -> None:
         path.write_text(damage)
         found = [row["step"] for row in read_curves(path)]
         assert found in ([10, 20], [10, 20, 30])
-        with Curves(tmp_path, 20) as curves:
+        with CurveLog(tmp_path, 20) as curves:
             curves.write(point(30))
         assert path.read_text() == whole
     path.write_text("step,elap")
@@ -133,28 +133,28 @@ def test_half_written_rows_are_left_out(tmp_path: Path) -> None:
 def test_a_failing_rewrite_keeps_the_curves(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with Curves(tmp_path, 0) as curves:
+    with CurveLog(tmp_path, 0) as curves:
         curves.write(point(10))
     monkeypatch.setattr("runtime.files.os.fsync", full)
     with pytest.raises(OSError, match="No space"):
-        Curves(tmp_path, 10)
+        CurveLog(tmp_path, 10)
     assert [row["step"] for row in read_curves(tmp_path / "curves.csv")] == [10]
 
 
-def test_a_board_on_a_full_disk_says_which_file(
+def test_the_tensorboard_writer_names_its_file_on_a_full_disk(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    board = Board(tmp_path)
+    writer = TensorBoardWriter(tmp_path)
     monkeypatch.setattr(RecordWriter, "write", full)
     with pytest.raises(OSError, match="No space") as caught:
-        board.add(1, {"loss": 0.5})
+        writer.add(1, {"loss": 0.5})
     assert caught.value.filename == str(next(tmp_path.iterdir()))
-    board.close()
+    writer.close()
 
 
 def test_tensorboard_reads_the_points(tmp_path: Path) -> None:
     for first in (0, 10):
-        with Curves(tmp_path, first) as curves:
+        with CurveLog(tmp_path, first) as curves:
             curves.write(point(first + 10))
     old, new = sorted((tmp_path / "tensorboard").iterdir())
     steps = [event.step for event in EventFileLoader(str(old)).Load() if event.summary.value]

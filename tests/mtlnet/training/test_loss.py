@@ -1,18 +1,13 @@
-"""The losses, with numbers worked out by hand; and alpha, with what a user may mistype."""
+"""The losses against numbers worked out by hand; parsing of --alpha."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 
-from mtlnet.training.loss import (
-    ANGLE_BEND,
-    ANGLE_GAIN,
-    DISTANCE_GAIN,
-    AlphaError,
-    multi_task_loss,
-    parse_alpha,
-)
+from mtlnet.training.loss import AlphaError, HuberLoss, multi_task_loss, parse_alpha
+from mtlnet.training.recipes import RECIPES
 
 OUTPUTS = torch.tensor(
     [
@@ -24,18 +19,18 @@ TARGETS = torch.tensor([[0.4, 0.5, 0.5, 0.7, 0.5, 0.5], [0.1, 0.9, 0.1, 0.9, 0.9
 HEADING = torch.tensor([0, 1])
 DISTANCE = (0.1**2 + 0.2**2) / 2
 ANGLE = 0.3**2 / 2
-TYPE = (math.log(3) + math.log(2)) / 2  # probabilities 1/3 and 2/4
+CROSS_ENTROPY = (math.log(3) + math.log(2)) / 2  # probabilities 1/3 and 2/4
 
 
-def test_losses_by_hand() -> None:
+def test_losses_equal_those_by_hand() -> None:
     losses = multi_task_loss(OUTPUTS, TARGETS, HEADING, (0.3, 0.2, 0.5))
     assert float(losses.distance) == pytest.approx(DISTANCE)
     assert float(losses.angle) == pytest.approx(ANGLE)
-    assert float(losses.type) == pytest.approx(TYPE)
-    assert float(losses.total) == pytest.approx(0.3 * DISTANCE + 0.2 * ANGLE + 0.5 * TYPE)
+    assert float(losses.heading) == pytest.approx(CROSS_ENTROPY)
+    assert float(losses.total) == pytest.approx(0.3 * DISTANCE + 0.2 * ANGLE + 0.5 * CROSS_ENTROPY)
 
 
-def test_scaled_losses_count_in_variances() -> None:
+def test_scaled_losses_are_in_units_of_the_target_variance() -> None:
     scale = torch.tensor([0.01, 0.01, 0.01, 0.04, 0.01, 0.09])
     losses = multi_task_loss(OUTPUTS, TARGETS, HEADING, (1.0, 2.0, 0.0), scale)
     # Distances: mean over two images and five targets of 1 and 1; angle: one of two is 1.
@@ -43,27 +38,35 @@ def test_scaled_losses_count_in_variances() -> None:
     assert float(losses.distance) == pytest.approx(DISTANCE)
 
 
-def test_bent_losses_grow_as_errors_do() -> None:
+def test_huber_losses_equal_those_by_hand() -> None:
     scale = torch.tensor([0.01, 0.01, 0.01, 0.04, 0.01, 0.09])
     # In standard deviations two distances err by 1 and the angle of one image of two by 1.
-    bent = multi_task_loss(OUTPUTS, TARGETS, HEADING, (1.0, 2.0, 0.0), scale, 0.5)
-    angle = ANGLE_GAIN * (1 - ANGLE_BEND / 2) / 2
-    assert float(bent.total) == pytest.approx(DISTANCE_GAIN * 2 / 10 * (1 - 0.25) + 2 * angle)
-    # Below the bend: the square, by twice the bend.
-    small = multi_task_loss(OUTPUTS, TARGETS, HEADING, (1.0, 2.0, 0.0), scale, 2.0)
-    assert float(small.total) == pytest.approx(DISTANCE_GAIN * 2 / 10 / 4 + 2 * angle)
-    assert float(bent.distance) == pytest.approx(DISTANCE)
+    huber = HuberLoss(distance_beta=0.5, angle_beta=0.8, distance_gain=2.5, angle_gain=5.0)
+    linear = multi_task_loss(OUTPUTS, TARGETS, HEADING, (1.0, 2.0, 0.0), scale, huber)
+    angle = 5.0 * (1 - 0.8 / 2) / 2
+    assert float(linear.total) == pytest.approx(2.5 * 2 / 10 * (1 - 0.25) + 2 * angle)
+    # Below beta: the square over twice beta.
+    huber = replace(huber, distance_beta=2.0)
+    squared = multi_task_loss(OUTPUTS, TARGETS, HEADING, (1.0, 2.0, 0.0), scale, huber)
+    assert float(squared.total) == pytest.approx(2.5 * 2 / 10 / 4 + 2 * angle)
+    assert float(linear.distance) == pytest.approx(DISTANCE)
 
 
-def test_between_two_answers_the_likelier_is_cheapest_when_bent() -> None:
-    # 60 images in 100 have 0.2 as their first distance, the others 0.8, and nothing tells which.
+def test_the_recipe_holds_the_gains_of_the_loss() -> None:
+    assert RECIPES["fast"].huber == HuberLoss(0.05, 1.0, 2.5, 5.0)
+    assert RECIPES["tune"].huber == RECIPES["fast"].huber
+    assert RECIPES["paper"].huber is None
+
+
+def test_between_two_values_the_huber_loss_is_least_at_the_likelier() -> None:
+    # 60 images in 100 have 0.2 as their first distance, the others 0.8.
     targets = torch.full((100, 6), 0.5)
     targets[:, 0] = torch.where(torch.arange(100) < 60, 0.2, 0.8)
-    answers = [
+    outputs = [
         torch.full((100, 9), 0.5).index_fill(1, torch.tensor([0]), value / 100)
         for value in range(101)
     ]
-    for bend, best in ((0.0, 0.6 * 0.2 + 0.4 * 0.8), (0.05, 0.2)):
+    for huber, best in ((None, 0.6 * 0.2 + 0.4 * 0.8), (HuberLoss(0.05), 0.2)):
         costs = [
             float(
                 multi_task_loss(
@@ -72,15 +75,15 @@ def test_between_two_answers_the_likelier_is_cheapest_when_bent() -> None:
                     HEADING[:1].expand(100),
                     (1.0, 0.0, 0.0),
                     torch.full((6,), 0.09),
-                    bend,
+                    huber,
                 ).total
             )
-            for a in answers
+            for a in outputs
         ]
         assert costs.index(min(costs)) / 100 == pytest.approx(best, abs=0.011)
 
 
-def test_a_task_of_weight_zero_sends_no_gradient() -> None:
+def test_a_task_of_weight_zero_has_no_gradient() -> None:
     outputs = OUTPUTS.clone().requires_grad_()
     torch.autograd.backward(multi_task_loss(outputs, TARGETS, HEADING, (0.0, 1.0, 0.0)).total)
     assert outputs.grad is not None
@@ -88,7 +91,7 @@ def test_a_task_of_weight_zero_sends_no_gradient() -> None:
     assert outputs.grad[1, 5] == pytest.approx(2 * -0.3 / 2)
 
 
-def test_alpha_of_any_sum() -> None:
+def test_alpha_may_have_any_sum() -> None:
     assert parse_alpha("0.3,0.2,0.5") == (0.3, 0.2, 0.5)
     assert parse_alpha(" 0, 7 ,0") == (0.0, 7.0, 0.0)
 
@@ -102,11 +105,11 @@ def test_alpha_of_any_sum() -> None:
         ("0.3,x,0.5", "missing or no number"),
         ("0.3,-0.2,0.5", "weight for angle is -0.2"),
         ("nan,0.2,0.5", "weight for distance is nan"),
-        ("0.3,0.2,inf", "weight for type is inf"),
+        ("0.3,0.2,inf", "weight for heading is inf"),
         ("0,0,0", "nothing to learn"),
         ("", r"1 weight\(s\)"),
     ],
 )
-def test_alpha_refused(text: str, seen: str) -> None:
+def test_wrong_alpha_is_refused(text: str, seen: str) -> None:
     with pytest.raises(AlphaError, match=seen):
         parse_alpha(text)

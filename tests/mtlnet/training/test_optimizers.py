@@ -1,4 +1,4 @@
-"""Every weight is changed by one optimiser; Muon makes the directions of a step equal."""
+"""Every weight has one optimizer; Muon makes the singular values of a step equal."""
 
 from dataclasses import replace
 
@@ -6,61 +6,68 @@ import pytest
 import torch
 
 from mtlnet.model.network import Network, initialise
-from mtlnet.training.optimizers import MUON_RATE, MUON_SIDE, GramMuon, Optimisers, as_rows, has_muon
+from mtlnet.training.optimizers import (
+    MUON_LR_SCALE,
+    MUON_MAX_SIDE,
+    GramMuon,
+    OptimizerSet,
+    as_matrix,
+    uses_muon,
+)
 from mtlnet.training.recipes import RECIPES, Recipe
 
 
-def made(recipe: Recipe) -> tuple[Network, Optimisers]:
+def build(recipe: Recipe) -> tuple[Network, OptimizerSet]:
     network = Network(batch_norm=recipe.batch_norm, dropout=recipe.dropout)
     initialise(network, 1)
     network.to(memory_format=torch.channels_last)
-    return network, Optimisers(network, recipe, [])
+    return network, OptimizerSet(network, recipe, [])
 
 
 @pytest.mark.parametrize("name", RECIPES)
-def test_each_weight_belongs_to_one_optimiser(name: str) -> None:
-    network, optimisers = made(RECIPES[name])
+def test_each_weight_belongs_to_one_optimizer(name: str) -> None:
+    network, optimizers = build(RECIPES[name])
     addresses = [
         parameter.data_ptr()
-        for part in optimisers.parts
+        for part in optimizers.optimizers
         for group in part.param_groups
         for parameter in group["params"]
     ]
     assert sorted(addresses) == sorted(p.data_ptr() for p in network.parameters())
 
 
-def test_muon_has_the_convolutions_and_the_first_shared_layer() -> None:
-    network, optimisers = made(RECIPES["fast"])
+def test_muon_trains_the_convolutions_and_the_first_shared_layer() -> None:
+    network, optimizers = build(RECIPES["fast"])
     names = {p.data_ptr(): name for name, p in network.named_parameters()}
-    muon = {names[p.data_ptr()] for p in optimisers.parts[0].param_groups[0]["params"]}
+    muon = {names[p.data_ptr()] for p in optimizers.optimizers[0].param_groups[0]["params"]}
     convolutions = {f"features.conv{number}.layer.weight" for number in (0, 2, 4, 5, 6)}
     assert muon == convolutions | {"shared.fc0.layer.weight"}
 
 
-def test_layers_with_too_many_directions_are_left_to_adamw() -> None:
-    """Network `deepdriving` would take twenty seconds a step for its 4096."""
+def test_adamw_trains_layers_that_are_too_large_for_muon() -> None:
+    """The 4096 rows of network `deepdriving` would take Muon twenty seconds a step."""
     layer = "shared.fc0.layer.weight"
-    at_most = torch.empty(MUON_SIDE, 4 * MUON_SIDE, device="meta")
-    assert has_muon(layer, at_most)
-    assert has_muon(layer, at_most.T)
-    assert not has_muon(layer, torch.empty(MUON_SIDE + 1, 4 * MUON_SIDE, device="meta"))
+    at_most = torch.empty(MUON_MAX_SIDE, 4 * MUON_MAX_SIDE, device="meta")
+    assert uses_muon(layer, at_most)
+    assert uses_muon(layer, at_most.T)
+    assert not uses_muon(layer, torch.empty(MUON_MAX_SIDE + 1, 4 * MUON_MAX_SIDE, device="meta"))
 
 
-def test_a_step_goes_equally_far_in_all_directions() -> None:
-    network, optimisers = made(replace(RECIPES["fast"], l2=0.0))
+def test_the_singular_values_of_a_muon_step_are_nearly_equal() -> None:
+    network, optimizers = build(replace(RECIPES["fast"], l2=0.0))
     weight = network.get_parameter("features.conv5.layer.weight")
     generator = torch.Generator().manual_seed(0)
     left, _ = torch.linalg.qr(torch.randn(384, 384, generator=generator))
     right, _ = torch.linalg.qr(torch.randn(3456, 384, generator=generator))
     gradient = (left * torch.logspace(0, -2, 384)) @ right.T
     weight.grad = gradient.view(384, 3, 3, 384).permute(0, 3, 1, 2)
-    before = as_rows(weight.detach()).clone()
-    optimisers.set_rate(1e-3)
-    optimisers.step()
-    change = before - as_rows(weight.detach())
+    before = as_matrix(weight.detach()).clone()
+    optimizers.set_learning_rate(1e-3)
+    optimizers.step()
+    change = before - as_matrix(weight.detach())
     lengths = torch.linalg.svdvals(change)
-    # Newton and Schulz's five steps leave singular values between 0.5 and 1.5 (Jordan et al.).
-    size = 1e-3 * MUON_RATE * 0.2 * 3456**0.5
+    # Five Newton-Schulz iterations leave singular values between 0.5 and 1.5 (Jordan et al.).
+    size = 1e-3 * MUON_LR_SCALE * 0.2 * 3456**0.5
     assert size * 0.4 < float(lengths.min())
     assert float(lengths.max()) < size * 1.6
     # Down the gradient in every one of its directions.
@@ -68,36 +75,36 @@ def test_a_step_goes_equally_far_in_all_directions() -> None:
 
 
 @pytest.mark.parametrize("shape", [(96, 363), (384, 3456), (512, 64)])
-def test_steps_are_those_of_torchs_muon(shape: tuple[int, int]) -> None:
-    """Which rounds to bf16, to 8 bits, in each of its ten products."""
+def test_steps_equal_those_of_torchs_muon(shape: tuple[int, int]) -> None:
+    """To the precision of torch, which rounds each of ten products to bf16 (8 bits)."""
     generator = torch.Generator().manual_seed(0)
     start = torch.randn(shape, generator=generator)
     ours, theirs = (torch.nn.Parameter(start.clone()) for _ in range(2))
-    optimisers = (
+    optimizers = (
         GramMuon([ours], 0.02, 0.1),
         torch.optim.Muon([theirs], 0.02, 0.1, adjust_lr_fn="match_rms_adamw"),
     )
     for _ in range(3):
         gradient = torch.randn(shape, generator=generator)
-        for weight, optimiser in zip((ours, theirs), optimisers, strict=True):
+        for weight, optimizer in zip((ours, theirs), optimizers, strict=True):
             weight.grad = gradient.clone()
-            optimiser.step()  # type: ignore[no-untyped-call]  # torch leaves it untyped
+            optimizer.step()  # type: ignore[no-untyped-call]  # torch leaves it untyped
     change, expected = ours.detach() - start, theirs.detach() - start
     assert float((change - expected).norm() / expected.norm()) < 0.02
-    for name, state in optimisers[1].state[theirs].items():
-        torch.testing.assert_close(optimisers[0].state[ours][name], state)
+    for name, state in optimizers[1].state[theirs].items():
+        torch.testing.assert_close(optimizers[0].state[ours][name], state)
 
 
-def test_nothing_to_learn_changes_nothing() -> None:
+def test_a_gradient_of_zero_changes_nothing() -> None:
     weight = torch.nn.Parameter(torch.ones(4, 8))
     weight.grad = torch.zeros(4, 8)
     GramMuon([weight], 0.02, 0.0).step()
     torch.testing.assert_close(weight.detach(), torch.ones(4, 8))
 
 
-def test_the_rate_is_the_recipes_for_adamw_and_times_muons_for_muon() -> None:
-    _, optimisers = made(RECIPES["fast"])
-    optimisers.set_rate(4e-4)
-    rates = [group["lr"] for part in optimisers.parts for group in part.param_groups]
-    assert rates == [4e-4 * MUON_RATE, 4e-4, 4e-4]
-    assert optimisers.rate == 4e-4
+def test_the_learning_rate_of_muon_is_scaled() -> None:
+    _, optimizers = build(RECIPES["fast"])
+    optimizers.set_learning_rate(4e-4)
+    rates = [group["lr"] for part in optimizers.optimizers for group in part.param_groups]
+    assert rates == [4e-4 * MUON_LR_SCALE, 4e-4, 4e-4]
+    assert optimizers.learning_rate == 4e-4

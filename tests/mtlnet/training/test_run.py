@@ -1,4 +1,4 @@
-"""Training learns, and a run that was stopped goes on to the same bits."""
+"""Training reduces the loss, and a resumed run has the same weights as an uninterrupted one."""
 
 import json
 import signal
@@ -23,7 +23,7 @@ from mtlnet.inference.model_card import GRAPH, UNCERTAINTY_WEIGHTS, WEIGHTS, Mod
 from mtlnet.model.cpu_kernels.forward import training_outputs
 from mtlnet.training.checkpoint import list_checkpoints
 from mtlnet.training.config import TrainConfig, resume_config
-from mtlnet.training.loop import Progress, Stopped
+from mtlnet.training.loop import Stopped, TrainProgress
 from mtlnet.training.recipes import RECIPES, learning_rate
 from mtlnet.training.run import train
 from mtlnet.training.trainer import Trainer
@@ -39,7 +39,7 @@ def config(dataset: Path, out: Path, **changes: Any) -> TrainConfig:
 
 
 class StopAt:
-    """Ctrl-C after so many steps: `requested` is asked once before each until it is true."""
+    """A stop request after so many steps: `requested` is read once before each of them."""
 
     def __init__(self, steps: int) -> None:
         self.steps = steps
@@ -66,37 +66,43 @@ def test_one_batch_is_overfitted(dataset: Path) -> None:
     first = trainer.step(batch, 0.05)
     for _ in range(30):
         last = trainer.step(batch, 0.05)
-    # In units of the targets' variances the answer of the mean costs about 0.3 + 0.2 + 0.5 ln 3.
+    # In units of the target variances predicting the mean costs about 0.3 + 0.2 + 0.5 ln 3.
     assert first.total.item() > 0.6
     assert last.total.item() < 0.05
     assert float(last.angle) < 0.1 * float(np.var(batch.coded[:, 5]))
 
 
-def test_late_in_a_run_statistics_of_batches_stay(dataset: Path) -> None:
+def test_batch_norm_statistics_are_frozen_late_in_a_run(dataset: Path) -> None:
     frames = Dataset.open(dataset).select("train")
     recipe = replace(RECIPES["fast"], batch=4)
     trainer = Trainer(recipe, (0.3, 0.2, 0.5), 0, CPU)
     batch = Loader(frames, CameraParameters(), 4, 0, augment=False).make(0)
     mean = trainer.network.get_buffer("features.conv0.norm.running_mean")
     seen = [mean.clone()]
-    late = recipe.settled
+    late = recipe.freeze_bn_at
     for steps, progress in ((200, late - 0.1), (200, late), (200, 0.99), (5, 0.99)):
         trainer.step_number = steps
         trainer.step(batch, progress)
         seen.append(mean.clone())
     moved = [not torch.equal(a, b) for a, b in pairwise(seen)]
-    # A run of a few steps has not seen enough for statistics that could stay.
+    # After few steps the statistics are not frozen yet.
     assert moved == [True, False, False, True]
 
 
-def test_the_first_convolutions_learn_for_a_part_of_the_run(dataset: Path) -> None:
+def test_the_first_convolutions_are_frozen_after_a_part_of_the_run(dataset: Path) -> None:
     frames = Dataset.open(dataset).select("train")
     recipe = replace(RECIPES["fast"], batch=4)
     trainer = Trainer(recipe, (0.3, 0.2, 0.5), 0, CPU)
     batch = Loader(frames, CameraParameters(), 4, 0, augment=False).make(0)
     network = trainer.network
-    assert [share for share, _ in recipe.rests] == sorted(share for share, _ in recipe.rests)
-    for progress, count in [(0.1, 0), *recipe.rests, (0.99, recipe.rests[-1][1])]:
+    assert [share for share, _ in recipe.freeze_schedule] == sorted(
+        share for share, _ in recipe.freeze_schedule
+    )
+    for progress, count in [
+        (0.1, 0),
+        *recipe.freeze_schedule,
+        (0.99, recipe.freeze_schedule[-1][1]),
+    ]:
         before = {name: weight.detach().clone() for name, weight in network.named_parameters()}
         trainer.step(batch, progress)
         still = {
@@ -106,10 +112,10 @@ def test_the_first_convolutions_learn_for_a_part_of_the_run(dataset: Path) -> No
 
 
 @pytest.mark.parametrize(("recipe", "balance"), [("fast", "dwa"), ("paper", "uncertainty")])
-def test_stopped_and_resumed_is_the_unbroken_run(
+def test_a_resumed_run_equals_an_uninterrupted_one(
     dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, recipe: str, balance: str
 ) -> None:
-    monkeypatch.setattr("mtlnet.training.task_weighting.STRETCH", 1)
+    monkeypatch.setattr("mtlnet.training.task_weighting.WINDOW_STEPS", 1)
     monkeypatch.setattr("mtlnet.training.loop.LOG_EVERY", 1)
     train(config(dataset, tmp_path / "whole", recipe=recipe, balance=balance), None)
     broken = config(dataset, tmp_path / "broken", recipe=recipe, balance=balance)
@@ -122,13 +128,13 @@ def test_stopped_and_resumed_is_the_unbroken_run(
     resumed, data = resume_config(broken.out, {})
     assert resumed == broken
     train(resumed, data)
-    assert differences(tmp_path / "whole", broken.out) == []
+    assert differing_weights(tmp_path / "whole", broken.out) == []
     weights = [weights_in(tmp_path / run) for run in ("whole", "broken")]
     assert weights[0] == weights[1]
     assert len({tuple(row) for row in weights[0]}) > 1  # they move
 
 
-def differences(one: Path, other: Path) -> list[str]:
+def differing_weights(one: Path, other: Path) -> list[str]:
     """Names of the weights that are not bit-equal in two runs."""
     a, b = load_file(one / WEIGHTS), load_file(other / WEIGHTS)
     return [name for name in a if not np.array_equal(a[name], b[name])]
@@ -140,13 +146,13 @@ def weights_in(run: Path) -> list[list[float]]:
     return [[point[name] for name in names] for point in read_curves(run / "curves.csv")]
 
 
-def test_a_full_gpu_is_one_line(
+def test_a_full_gpu_is_reported_in_one_line(
     dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def full(*_: object) -> None:
         raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 MiB.\n...")
 
-    monkeypatch.setattr("mtlnet.training.run.learn", full)
+    monkeypatch.setattr("mtlnet.training.run.train_loop", full)
     with pytest.raises(UserError, match="memory of cpu is used up; give a smaller --batch than 4"):
         train(config(dataset, tmp_path / "run"), None)
 
@@ -169,7 +175,7 @@ mtlnet.training.run.train(TrainConfig(data, out, **given), None)
 """
 
 
-def test_killed_while_it_saves_it_goes_on_from_the_checkpoint_before(
+def test_a_run_killed_while_saving_resumes_from_the_checkpoint_before(
     dataset: Path, tmp_path: Path
 ) -> None:
     killed = tmp_path / "killed"
@@ -179,22 +185,22 @@ def test_killed_while_it_saves_it_goes_on_from_the_checkpoint_before(
     resumed, data = resume_config(killed, {})
     train(resumed, data)
     train(config(dataset, tmp_path / "whole", iterations=6), None)
-    assert differences(tmp_path / "whole", killed) == []
+    assert differing_weights(tmp_path / "whole", killed) == []
 
 
-def test_a_loss_that_is_no_number_stops_the_run_at_its_batch(
+def test_a_loss_that_is_not_finite_stops_the_run_at_its_batch(
     dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("mtlnet.training.loop.CHECKPOINT_SECONDS", 0.0)
-    sound = training_outputs
+    original = training_outputs
     calls: list[int] = []
 
     def outputs(*given: Any) -> torch.Tensor:
         calls.append(1)
-        return sound(*given) * (float("nan") if len(calls) == 3 else 1.0)
+        return original(*given) * (float("nan") if len(calls) == 3 else 1.0)
 
     monkeypatch.setattr("mtlnet.training.trainer.training_outputs", outputs)
-    with pytest.raises(UserError, match="the loss of batch 3 is no finite number") as caught:
+    with pytest.raises(UserError, match="the loss of batch 3 is not a finite number") as caught:
         train(config(dataset, tmp_path / "run"), None)
     assert "\n" not in str(caught.value)
     (*_, last) = list_checkpoints(tmp_path / "run")
@@ -202,8 +208,8 @@ def test_a_loss_that_is_no_number_stops_the_run_at_its_batch(
     assert all(np.isfinite(value).all() for value in load_file(last).values())
 
 
-def test_a_run_keeps_what_it_was(dataset: Path, tmp_path: Path) -> None:
-    points: list[Progress] = []
+def test_a_run_stores_its_configuration_data_and_curves(dataset: Path, tmp_path: Path) -> None:
+    points: list[TrainProgress] = []
     done = train(config(dataset, tmp_path / "run", iterations=10), None, points.append)
     run = tmp_path / "run"
     assert read_card(run) == done
@@ -217,6 +223,8 @@ def test_a_run_keeps_what_it_was(dataset: Path, tmp_path: Path) -> None:
     stored = json.loads((run / "config.json").read_text())
     assert stored["config"]["seed"] == 7
     assert stored["recipe"]["name"] == "fast"
+    gains = {"distance_beta": 0.05, "angle_beta": 1.0, "distance_gain": 2.5, "angle_gain": 5.0}
+    assert stored["recipe"]["huber"] == gains
     curve = read_curves(run / "curves.csv")
     assert [point["step"] for point in curve] == [10]
     assert curve[0]["total_loss"] == pytest.approx(points[0].losses[3], rel=1e-4)
@@ -225,7 +233,7 @@ def test_a_run_keeps_what_it_was(dataset: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("small_network")
-def test_a_timed_run_ends_by_the_clock(dataset: Path, tmp_path: Path) -> None:
+def test_a_run_limited_by_time_ends(dataset: Path, tmp_path: Path) -> None:
     run = config(dataset, tmp_path / "timed", iterations=None, minutes=1 / 60)
     started = time.monotonic()
     card = train(run, None)
@@ -234,7 +242,9 @@ def test_a_timed_run_ends_by_the_clock(dataset: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("small_network")
-def test_refused_before_anything_is_written(dataset: Path, tmp_path: Path) -> None:
+def test_wrong_configurations_are_refused_before_anything_is_written(
+    dataset: Path, tmp_path: Path
+) -> None:
     (tmp_path / "kept").mkdir()
     (tmp_path / "kept" / "mine").write_text("precious")
     with pytest.raises(UserError, match=r"kept already exists.*--resume"):
@@ -251,7 +261,9 @@ def test_refused_before_anything_is_written(dataset: Path, tmp_path: Path) -> No
 
 
 @pytest.mark.usefixtures("small_network")
-def test_another_run_is_not_resumed(dataset: Path, tmp_path: Path) -> None:
+def test_a_run_is_not_resumed_with_another_seed_or_other_data(
+    dataset: Path, tmp_path: Path
+) -> None:
     run = config(dataset, tmp_path / "run", iterations=1)
     train(run, None)
     with pytest.raises(UserError, match="started with seed 7, now 8"):
@@ -265,7 +277,7 @@ def test_another_run_is_not_resumed(dataset: Path, tmp_path: Path) -> None:
         train(resumed, data)
 
 
-def test_learning_rates() -> None:
+def test_learning_rate_schedules() -> None:
     paper, fast = RECIPES["paper"], RECIPES["fast"]
     assert learning_rate(paper, 9_999, 0.1) == 1e-3
     assert learning_rate(paper, 30_000, 0.2) == pytest.approx(1e-3 * 0.9**3)
@@ -287,6 +299,6 @@ def test_learning_rates() -> None:
         ({"threads": 2**31}, "--threads is 2147483648"),
     ],
 )
-def test_numbers_out_of_range(changes: dict[str, Any], seen: str) -> None:
+def test_numbers_out_of_range_are_refused(changes: dict[str, Any], seen: str) -> None:
     with pytest.raises(UserError, match=seen):
         config(Path("data"), Path("out"), **changes)

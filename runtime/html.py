@@ -1,0 +1,53 @@
+"""HTML pages: jinja2 templates with autoescape that extend one shell, and images embedded in them.
+
+A page is one file that needs nothing beside it. Its template extends `page_shell.html` (style
+sheet, title) and may import the tables and figures of `macros.html`.
+"""
+
+import base64
+from typing import Any
+
+import numpy as np
+import simplejpeg
+from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
+from numpy.typing import NDArray
+
+JPEG_QUALITY = 80
+
+
+def render(package: str, template: str, **values: Any) -> str:
+    """The HTML of `template`, a file of `package`; text among `values` is escaped.
+
+    Values that are HTML already (charts) are `markupsafe.Markup`. Raises jinja2.UndefinedError when
+    the template uses a value that is not given.
+    """
+    environment = Environment(
+        loader=ChoiceLoader([PackageLoader(package, ""), PackageLoader("runtime", "")]),
+        autoescape=True,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        undefined=StrictUndefined,
+    )
+    environment.filters.update(number=format_number, percent=format_percent)
+    environment.policies["json.dumps_kwargs"] = {"separators": (",", ":")}
+    return environment.get_template(template).render(**values)
+
+
+def format_number(value: float | None, digits: int) -> str:
+    """`value` with so many decimal places; "-" for None."""
+    return "-" if value is None else f"{value:.{digits}f}"
+
+
+def format_percent(share: float | None, digits: int = 1) -> str:
+    """A share in [0, 1] as a percentage; "-" for None."""
+    return "-" if share is None else f"{share:.{digits}%}"
+
+
+def data_uri(content: bytes, media_type: str = "image/jpeg") -> str:
+    """The URI of an embedded file."""
+    return f"data:{media_type};base64,{base64.b64encode(content).decode()}"
+
+
+def embed_jpeg(image: NDArray[np.uint8]) -> str:
+    """The URI of an image (H, W, 3) uint8 RGB, encoded as JPEG."""
+    return data_uri(simplejpeg.encode_jpeg(np.ascontiguousarray(image), quality=JPEG_QUALITY))
