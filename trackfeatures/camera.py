@@ -6,12 +6,13 @@ v down, square pixels, principal point in the middle.
 
 from dataclasses import asdict, dataclass
 from math import radians, tan
-from typing import Any, ClassVar
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from trackfeatures.errors import UserError
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
 
 FOV_LIMITS_DEG = (1.0, 150.0)
 
@@ -58,8 +59,10 @@ class CameraParameters:
         """Of the camera, on a car that stands level."""
         return self.z + self.cg_height_m
 
-    def intrinsics(self) -> NDArray[np.float64]:
+    def intrinsics(self) -> "NDArray[np.float64]":
         """Pinhole matrix K (3, 3) in pixels, measured from the image's top left corner."""
+        import numpy as np  # a command's help needs no numpy
+
         focal = self.focal_px
         return np.array([[focal, 0.0, self.width / 2], [0.0, focal, self.height / 2], [0, 0, 1]])
 

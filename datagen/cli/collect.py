@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from datagen.planning.config import DATASET_FOLDER, UNSEEN_FOLDER, CollectConfig, all_lights
-from datagen.recording.splits import UNSEEN
+from datagen.recording.names import UNSEEN
 from runtime import cli as command
 from runtime.cli import AsJson, counted, print_result
 from trackfeatures.errors import UserError

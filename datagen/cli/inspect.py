@@ -13,7 +13,7 @@ import typer
 
 import trackfeatures as tf
 from datagen.planning.config import DATASET_FOLDER
-from datagen.recording.splits import SIDES, UNSEEN
+from datagen.recording.names import SIDES, UNSEEN
 from runtime.cli import AsJson, counted, print_result
 
 DatasetFolder = Annotated[Path, typer.Argument(metavar="DIR", help="A dataset folder.")]

@@ -32,7 +32,8 @@ from datagen.recording.folder import (
     write_if_changed,
 )
 from datagen.recording.manifest import rebuild
-from datagen.recording.splits import SIDES, Split, split_path, write_split
+from datagen.recording.names import SIDES
+from datagen.recording.splits import Split, split_path, write_split
 
 EXECUTORS = ("local", "ray")
 PLAN_FILE = "plan.json"

@@ -23,7 +23,8 @@ from datagen.recording.folder import (
     write_if_changed,
 )
 from datagen.recording.manifest import rebuild
-from datagen.recording.splits import SIDES, Split
+from datagen.recording.names import SIDES
+from datagen.recording.splits import Split
 
 
 @dataclass(frozen=True, slots=True)

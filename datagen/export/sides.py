@@ -4,8 +4,8 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 from datagen.recording.dataset import Dataset
+from datagen.recording.names import SIDES
 from datagen.recording.round_metadata import RoundInfo
-from datagen.recording.splits import SIDES
 from datagen.view.steps import Steps
 
 Progress = Callable[[int], None]

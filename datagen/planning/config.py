@@ -4,8 +4,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import trackfeatures as tf
-from datagen.recording.images import CODECS
-from datagen.recording.splits import UNSEEN
+from datagen.recording.names import CODECS, UNSEEN
 from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
 

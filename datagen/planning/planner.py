@@ -15,7 +15,7 @@ from datagen.planning.class_balance import Forecast, balance_starts
 from datagen.planning.config import FRAMES_PER_SCENE, SEEDS_PER_PLAN, CollectConfig, TrackChoice
 from datagen.planning.plan import Plan, RoundPlan
 from datagen.planning.split import choose_test_rounds
-from datagen.recording.splits import UNSEEN
+from datagen.recording.names import UNSEEN
 from trackfeatures.camera import CameraParameters
 
 MAX_TRAFFIC = 8

@@ -10,8 +10,8 @@ from rich.table import Table
 import trackfeatures as tf
 from datagen.planning.class_balance import MIN_SHARE, Forecast, expected_shares
 from datagen.planning.plan import Plan, RoundPlan
+from datagen.recording.names import SIDES
 from datagen.recording.round_metadata import summarize_lights
-from datagen.recording.splits import SIDES
 
 
 def expected_classes(plan: Plan, forecast: Forecast) -> dict[str, dict[str, float]]:

@@ -12,13 +12,31 @@ The names listed here are the public interface: they change only with a new vers
 `open_round` opens a single round; `integrity/` has verification and recovery.
 """
 
-from datagen.recording.dataset import Dataset, Frames
-from datagen.recording.errors import DatasetError, UndecodableImage
-from datagen.recording.labels import Labels
-from datagen.recording.mcap.index import RoundIndex, open_round
-from datagen.recording.round_metadata import Recovery, RoundHeader, RoundInfo, RoundResult
-from datagen.recording.splits import Split
+from importlib import import_module
+from typing import TYPE_CHECKING
 
+if TYPE_CHECKING:
+    from datagen.recording.dataset import Dataset, Frames
+    from datagen.recording.errors import DatasetError, UndecodableImage
+    from datagen.recording.labels import Labels
+    from datagen.recording.mcap.index import RoundIndex, open_round
+    from datagen.recording.round_metadata import Recovery, RoundHeader, RoundInfo, RoundResult
+    from datagen.recording.splits import Split
+
+_MODULES = {
+    "Dataset": "dataset",
+    "DatasetError": "errors",
+    "Frames": "dataset",
+    "Labels": "labels",
+    "Recovery": "round_metadata",
+    "RoundHeader": "round_metadata",
+    "RoundIndex": "mcap.index",
+    "RoundInfo": "round_metadata",
+    "RoundResult": "round_metadata",
+    "Split": "splits",
+    "UndecodableImage": "errors",
+    "open_round": "mcap.index",
+}
 __all__ = [
     "Dataset",
     "DatasetError",
@@ -33,3 +51,12 @@ __all__ = [
     "UndecodableImage",
     "open_round",
 ]
+
+
+def __getattr__(name: str) -> object:
+    """Import a public name when it is first used: a command's help needs no numpy."""
+    if name not in _MODULES:
+        raise AttributeError(f"module 'datagen.recording' has no attribute {name!r}")
+    found = getattr(import_module(f"datagen.recording.{_MODULES[name]}"), name)
+    globals()[name] = found
+    return found

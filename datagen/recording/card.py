@@ -9,10 +9,10 @@ from typing import Any
 import trackfeatures as tf
 from datagen.recording.dataset import Dataset
 from datagen.recording.images import JPEG_QUALITY
+from datagen.recording.names import SIDES
 from datagen.recording.schema.fields import FIELDS, Field
 from datagen.recording.schema.json_schema import SCHEMA_FILE
 from datagen.recording.schema.topics import MESSAGE_TYPES
-from datagen.recording.splits import SIDES
 from trackfeatures.camera import CameraParameters
 
 SIZE_CATEGORIES = (

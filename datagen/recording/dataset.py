@@ -23,11 +23,11 @@ from datagen.recording.images import decode_into
 from datagen.recording.labels import Labels, concatenate, read_labels
 from datagen.recording.mcap.index import RoundIndex, open_round
 from datagen.recording.mcap.protobuf_wire import bytes_field
+from datagen.recording.names import SIDES
 from datagen.recording.round_metadata import RoundInfo
 from datagen.recording.schema.topics import CAMERA
 from datagen.recording.splits import (
     DEFAULT_SPLIT,
-    SIDES,
     RoundKey,
     Split,
     read_split,

@@ -3,7 +3,6 @@
 import numpy as np
 from numpy.typing import NDArray
 
-CODECS = ("jpeg", "png")
 JPEG_QUALITY = 95
 JPEG_MAGIC = b"\xff\xd8"
 PNG_MAGIC = b"\x89PNG"

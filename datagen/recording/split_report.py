@@ -9,10 +9,10 @@ import numpy as np
 from datagen.recording.dataset import Dataset, round_files
 from datagen.recording.errors import DatasetError
 from datagen.recording.mcap.index import open_round
+from datagen.recording.names import SIDES
 from datagen.recording.near_duplicates import NearDuplicates, Tolerances, find_near_duplicates
 from datagen.recording.round_metadata import RoundInfo
 from datagen.recording.splits import (
-    SIDES,
     RoundKey,
     read_split,
     require_disjoint,

@@ -18,11 +18,9 @@ import trackfeatures as tf
 from datagen.recording.errors import DatasetError
 from datagen.recording.folder import write_if_changed
 from datagen.recording.mcap.index import RoundIndex
+from datagen.recording.names import SIDES
 from datagen.recording.round_metadata import RoundInfo
 
-UNSEEN = "unseen"
-SIDES = ("train", "test", UNSEEN)
-"""`unseen`: rounds of tracks that no model is trained on."""
 DEFAULT_SPLIT = "default"
 
 

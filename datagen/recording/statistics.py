@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 import trackfeatures as tf
 from datagen.recording.dataset import Dataset
 from datagen.recording.labels import Labels
-from datagen.recording.splits import SIDES
+from datagen.recording.names import SIDES
 
 
 def describe(dataset: Dataset) -> dict[str, Any]:

@@ -9,8 +9,8 @@ from markupsafe import Markup
 import trackfeatures as tf
 from datagen.recording.dataset import Dataset
 from datagen.recording.labels import Labels
+from datagen.recording.names import SIDES
 from datagen.recording.round_metadata import RoundInfo
-from datagen.recording.splits import SIDES
 from datagen.recording.statistics import describe
 from datagen.stats.contact_sheet import contact_sheet
 from runtime.html import embed_jpeg, render

@@ -16,8 +16,8 @@ from datagen.recording.folder import RoundState, round_path, state_path
 from datagen.recording.integrity.round_checks import LEVELS, check_round, describe_read_error
 from datagen.recording.manifest import manifest_problems
 from datagen.recording.mcap.index import RoundIndex, open_round
+from datagen.recording.names import SIDES
 from datagen.recording.splits import (
-    SIDES,
     RoundKey,
     read_split,
     require_disjoint,

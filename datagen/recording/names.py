@@ -1,0 +1,6 @@
+"""Names that a dataset's files and the commands share: codecs of images, sides of a split."""
+
+CODECS = ("jpeg", "png")
+UNSEEN = "unseen"
+SIDES = ("train", "test", UNSEEN)
+"""`unseen`: rounds of tracks that no model is trained on."""
