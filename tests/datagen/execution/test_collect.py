@@ -94,7 +94,7 @@ def test_a_finished_dataset_is_left_alone_and_a_lost_round_made_again(collected:
     [
         (["--seed", "9"], "seed: 0 there, 9 asked for"),
         (["--tracks", "no-such-track"], "no track 'no-such-track'"),
-        (["--lanes", "1,5"], "5 lanes asked for"),
+        (["--lanes", "1,5"], "a road of 5 lanes is not supported"),
         (["--lanes", "one"], "--lanes is 'one'"),
         (["--workers", "-1"], "-1 workers"),
         (["--tracks-dir", "/no/such/folder"], "no folder /no/such/folder"),
@@ -126,7 +126,7 @@ def test_empty_parts_of_a_dataset_are_no_foreign_folder(tmp_path: Path) -> None:
     plan = make_small_plan(1, 10)
     (tmp_path / "rounds").mkdir()
     (tmp_path / "state").mkdir()
-    (tmp_path / ".plan.json.new").write_text('{"rou')
+    (tmp_path / "plan.json.partial").write_text('{"rou')
     require_matching_folder(tmp_path, plan)
     (tmp_path / "rounds" / "somebody.mcap").write_text("else's")
     with pytest.raises(DatasetError, match="is not a dataset"):

@@ -95,7 +95,7 @@ def test_a_round_that_cannot_be_driven_is_tried_once_and_told_in_one_line(
     )
     plan = make_small_plan(2, 3)
     capfd.readouterr()  # what libraries said when they were loaded
-    expected = r"1 of 2 rounds failed \(round-000: the car left the road 21 times\); what was"
+    expected = r"1 of 2 rounds failed \(round-000: the car left the road 21 times\); the finished"
     with pytest.raises(DatasetError, match=expected) as told:
         collect(plan, tmp_path / "data", workers=1)
     assert "another --seed" in str(told.value)

@@ -141,8 +141,9 @@ def test_a_collector_refuses_a_folder_that_another_process_holds(
     whole: Path, refused: Callable[..., str]
 ) -> None:
     hold = (
-        "import sys, time; from pathlib import Path; from datagen.execution.lock import held\n"
-        "with held(Path(sys.argv[1]), None): print('held', flush=True); time.sleep(300)"
+        "import sys, time; from pathlib import Path\n"
+        "from datagen.execution.lock import folder_lock\n"
+        "with folder_lock(Path(sys.argv[1]), None): print('held', flush=True); time.sleep(300)"
     )
     with subprocess.Popen(
         [sys.executable, "-c", hold, str(whole)], stdout=subprocess.PIPE, text=True
