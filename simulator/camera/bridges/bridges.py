@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from simulator.camera.bridges import styles as bridge_styles
 from simulator.camera.bridges.styles import Works
-from simulator.camera.scene.road_mesh import Ribbon
-from simulator.camera.scene.roadside import ground_height, place_beside
+from simulator.camera.scene.road_mesh import Ribbon, ground_height, place_beside
 from simulator.camera.scene.terrain import CentreLine, Terrain
 from simulator.camera.scene.themes import Look
 from simulator.track.road import Road

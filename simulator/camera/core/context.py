@@ -4,12 +4,17 @@ On llvmpipe the environment variable LP_NUM_THREADS, read by Mesa when the conte
 the drawing threads: 0 draws in the calling thread, which suits one worker process a core.
 """
 
+import ctypes
+import importlib.util
 import os
+import sys
 from importlib import resources
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from simulator.camera.core import textures
-from simulator.camera.core.llvm_isolation import load_triton_first
+import numpy as np
+from numpy.typing import NDArray
+
 from simulator.camera.core.render_modes import CLASSES
 from simulator.camera.core.targets import GPU_SAMPLES, Target, Targets
 from simulator.camera.vegetation import foliage
@@ -40,6 +45,7 @@ BLOCKS = {"Frame": FRAME_BINDING, "Scene": SCENE_BINDING}
 WEATHERED = ("sky", "land", "paved", "verge", "barrier", "prop", "tree")
 """Programs that rain and snow change; each weather gets its own, so that dry ones cost no more."""
 FRAME_FLOATS = 48
+NOISE_SIZE = 256
 NOISE_UNIT, SHADE_UNIT, ATLAS_UNIT, SKY_UNIT = range(4)
 UNITS = {"noise": NOISE_UNIT, "shade": SHADE_UNIT, "atlas": ATLAS_UNIT, "panorama": SKY_UNIT}
 """Texture units, by the name of the sampler."""
@@ -55,8 +61,8 @@ class Graphics:
     def __init__(self) -> None:
         self.context = _create_context()
         self.programs = {name: self._program(name) for name in PROGRAMS}
-        size = (textures.NOISE_SIZE, textures.NOISE_SIZE)
-        self.noise = self.context.texture(size, 4, textures.noise_tile().tobytes())
+        size = (NOISE_SIZE, NOISE_SIZE)
+        self.noise = self.context.texture(size, 4, noise_tile().tobytes())
         self.mipmapped(self.noise)
         # The nearest mipmap alone: noise shows no step, and a frame is drawn 1 ms sooner.
         self.noise.filter = (self.context.LINEAR_MIPMAP_NEAREST, self.context.LINEAR)
@@ -163,7 +169,7 @@ def _create_context() -> "moderngl.Context":
     import moderngl
 
     settings: dict[str, Any] = {"backend": "egl"}
-    load_triton_first()
+    _load_triton_first()
     try:
         return moderngl.create_context(require=330, standalone=True, **settings)
     except Exception as error:  # moderngl and glcontext raise bare Exception, ImportError, ...
@@ -171,3 +177,47 @@ def _create_context() -> "moderngl.Context":
             f"no OpenGL 3.3 through EGL on this machine ({error}); "
             "install it with: apt-get install libegl1 libgl1-mesa-dri"
         ) from error
+
+
+def _load_triton_first() -> None:
+    """Load triton's library before Mesa's, if triton is installed (about 30 ms, no import).
+
+    Mesa makes the symbols of its libLLVM global. A libtriton (of torch) that is loaded later binds
+    to them and crashes at import; loaded first, it keeps its own. A process that draws can then
+    use torch at any time.
+    """
+    if "triton" in sys.modules:
+        return
+    spec = importlib.util.find_spec("triton")
+    if spec is None or not spec.submodule_search_locations:
+        return
+    for library in Path(spec.submodule_search_locations[0]).glob("_C/libtriton*.so"):
+        ctypes.CDLL(str(library))
+
+
+def noise_tile() -> NDArray[np.uint8]:
+    """Tileable RGBA noise (256, 256, 4): grain, fine patches, broad patches, crack lines."""
+    rng = np.random.default_rng(20240607)
+    grain = _levelled(_filtered(rng, 0.35))
+    fine = _levelled(_filtered(rng, 1.15))
+    broad = _levelled(_filtered(rng, 1.7))
+    ridges = 1.0 - np.abs(2.0 * _levelled(_filtered(rng, 1.45)) - 1.0)
+    tile = np.stack([grain, fine, broad, ridges], axis=-1)
+    return np.rint(tile * 255.0).astype(np.uint8)
+
+
+def _filtered(rng: np.random.Generator, power: float) -> NDArray[np.float64]:
+    """Noise whose amplitude falls with frequency to `power`; periodic, so it tiles."""
+    frequency = np.hypot(*np.meshgrid(np.fft.fftfreq(NOISE_SIZE), np.fft.fftfreq(NOISE_SIZE)))
+    frequency[0, 0] = 1.0
+    weight = (frequency * NOISE_SIZE) ** -power
+    weight[0, 0] = 0.0
+    spectrum = np.fft.fft2(rng.standard_normal((NOISE_SIZE, NOISE_SIZE)))
+    return np.asarray(np.fft.ifft2(spectrum * weight).real)
+
+
+def _levelled(field: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Values spread evenly over [0, 1]: the rank of each."""
+    rank = np.empty(field.size)
+    rank[np.argsort(field, axis=None, kind="stable")] = np.linspace(0.0, 1.0, field.size)
+    return rank.reshape(field.shape)

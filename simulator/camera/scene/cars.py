@@ -1,5 +1,12 @@
-"""Cars and the shadows under them, drawn at their poses."""
+"""The cars: one triangle mesh, drawn at each car's pose, and the shadow on the ground below it.
 
+Car frame: x ahead, y left, z up, metres; origin on the ground below the middle of the car. A vertex
+is a position, a normal and a colour; the colour (-1, -1, -1) stands for the paint of the car.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -8,16 +15,170 @@ from numpy.typing import NDArray
 from simulator.camera.core.context import Graphics
 from simulator.camera.core.mesh import both_ways
 from simulator.camera.core.optics import rotation
-from simulator.camera.scene.carmesh import PAINTS, car_mesh
 from simulator.camera.scene.light import Light
 
 FloatArray = NDArray[np.float64]
+Point = tuple[float, float, float]
 
+LENGTH_M, WIDTH_M, HEIGHT_M = 4.4, 1.8, 1.4
 REACH_M, NEAR_M = 350.0, 40.0
 SHADOW_REACH_M = 120.0
 _RADIUS_M = 3.0
 _LONGEST_SHADOW = 4.0
 """A low sun draws shadows out to at most this times the height."""
+
+PAINTS: tuple[Point, ...] = (
+    (0.42, 0.025, 0.022), (0.03, 0.07, 0.28), (0.62, 0.62, 0.60), (0.035, 0.036, 0.04),
+    (0.30, 0.31, 0.32), (0.55, 0.40, 0.05), (0.03, 0.16, 0.07), (0.20, 0.10, 0.05),
+)  # fmt: skip
+_OWN: Point = (-1.0, -1.0, -1.0)
+_GLASS, _RUBBER, _RIM = (0.022, 0.03, 0.038), (0.012, 0.012, 0.013), (0.32, 0.32, 0.33)
+_TAIL, _HEAD, _PLATE, _DARK = (0.5, 0.01, 0.01), (0.85, 0.85, 0.78), (0.7, 0.7, 0.66), (0.02,) * 3
+
+# Side outline of the body and of the cabin: (x, z), and half the width there.
+_BODY = ((-2.2, 0.42, 0.78), (-2.18, 0.92, 0.82), (-1.35, 0.98, 0.9), (0.75, 0.94, 0.9),
+         (1.9, 0.74, 0.84), (2.2, 0.55, 0.74), (2.2, 0.3, 0.74))  # fmt: skip
+_CABIN = ((-1.75, 0.95, 0.78), (-1.05, 1.38, 0.62), (0.05, 1.4, 0.62), (0.95, 0.92, 0.78))
+_WHEELS_X, _WHEEL_RADIUS = (-1.35, 1.32), 0.33
+
+
+@dataclass(frozen=True)
+class CarMesh:
+    """Triangles of a car, (3 T, 9) float32: place, normal, colour. From near the first `near`
+    vertices are drawn, from afar those from `far` on, with fewer corners to the wheels."""
+
+    vertices: NDArray[np.float32]
+    near: int
+    far: int
+
+
+def car_mesh() -> CarMesh:
+    """The car's triangles in both levels of detail."""
+    wheels, far_wheels = (
+        [part for x in _WHEELS_X for side in (-1.0, 1.0) for part in wheel(x, side)]
+        for wheel in (_wheel, _far_wheel)
+    )
+    body = [*_hull(_BODY, 0.22, _OWN, _OWN), *_cabin(), *_fittings()]
+    near = sum(map(len, wheels)) + sum(map(len, body))
+    vertices = np.concatenate([*wheels, *body, *far_wheels]).astype(np.float32)
+    return CarMesh(vertices, near, sum(map(len, wheels)))
+
+
+def _quad(a: Point, b: Point, c: Point, d: Point, colour: Point) -> FloatArray:
+    return _face([a, b, c, d], colour)
+
+
+def _face(points: Sequence[Point], colour: Point) -> FloatArray:
+    """Two triangles; the normal points to where the four corners run counter-clockwise."""
+    corners = np.array(points)
+    normal = np.cross(corners[1] - corners[0], corners[2] - corners[0])
+    size = np.linalg.norm(normal)
+    if size < 1e-9:
+        normal = np.cross(corners[2] - corners[0], corners[3] - corners[0])
+        size = np.linalg.norm(normal)
+    rows = np.empty((6, 9))
+    rows[:, :3] = corners[[0, 1, 2, 0, 2, 3]]
+    rows[:, 3:6] = normal / max(float(size), 1e-9)
+    rows[:, 6:] = colour
+    return rows
+
+
+def _hull(outline: tuple[Point, ...], floor: float, top: Point, flank: Point) -> list[FloatArray]:
+    """A prism over an outline (x, z, half width), from rear to front, down to `floor`."""
+    parts = []
+    for (x0, z0, w0), (x1, z1, w1) in pairwise(outline):
+        parts.append(_quad((x0, w0, z0), (x0, -w0, z0), (x1, -w1, z1), (x1, w1, z1), top))
+        for side in (1.0, -1.0):
+            corners = [
+                (x0, side * w0, floor), (x0, side * w0, z0), (x1, side * w1, z1),
+                (x1, side * w1, floor),
+            ]  # fmt: skip
+            parts.append(_face(corners if side > 0 else corners[::-1], flank))
+    x, z, w = outline[0]
+    parts.append(_quad((x, w, floor), (x, -w, floor), (x, -w, z), (x, w, z), top))
+    x, z, w = outline[-1]
+    parts.append(_quad((x, w, z), (x, -w, z), (x, -w, floor), (x, w, floor), top))
+    return parts
+
+
+def _cabin() -> list[FloatArray]:
+    """Glass all round under a painted roof."""
+    parts = []
+    for k, (back, front) in enumerate(pairwise(_CABIN)):
+        (x0, z0, w0), (x1, z1, w1) = back, front
+        colour = _OWN if k == 1 else _GLASS
+        parts.append(_quad((x0, w0, z0), (x0, -w0, z0), (x1, -w1, z1), (x1, w1, z1), colour))
+    base = 0.94
+    for side in (1.0, -1.0):
+        rear, roof0, roof1, front = ((x, side * w, z) for x, z, w in _CABIN)
+        foot0, foot1 = (roof0[0], side * 0.78, base), (roof1[0], side * 0.78, base)
+        for corners in (
+            [foot0, roof0, rear, rear],
+            [foot1, roof1, roof0, foot0],
+            [front, front, roof1, foot1],
+        ):
+            parts.append(_face(corners if side < 0 else corners[::-1], _GLASS))
+    return parts
+
+
+def _wheel(x: float, side: float) -> list[FloatArray]:
+    """A tyre of eight faces with its rim, standing out of the flank a little."""
+    parts = []
+    outer, inner = side * 0.91, side * 0.68
+    angles = np.linspace(0.0, 2.0 * np.pi, 11)
+    for a, b in pairwise(angles):
+        ring = [
+            (x + r * np.cos(t), r * np.sin(t) + _WHEEL_RADIUS)
+            for r in (_WHEEL_RADIUS, 0.2)
+            for t in (a, b)
+        ]
+        (ax, az), (bx, bz), (cx, cz), (dx, dz) = ring
+        parts.append(
+            _quad((ax, inner, az), (bx, inner, bz), (bx, outer, bz), (ax, outer, az), _RUBBER)
+        )
+        face = [(ax, outer, az), (bx, outer, bz), (dx, outer, dz), (cx, outer, cz)]
+        hub = [
+            (cx, outer, cz),
+            (dx, outer, dz),
+            (x, outer, _WHEEL_RADIUS),
+            (x, outer, _WHEEL_RADIUS),
+        ]
+        for corners, colour in ((face, _RUBBER), (hub, _RIM)):
+            parts.append(_face(corners if side < 0 else corners[::-1], colour))
+    return parts
+
+
+def _far_wheel(x: float, side: float) -> list[FloatArray]:
+    """A tyre as one dark face of six corners."""
+    y = side * 0.91
+    ring = [
+        (x + _WHEEL_RADIUS * np.cos(t), y, _WHEEL_RADIUS * (1.0 + np.sin(t)))
+        for t in np.linspace(0.0, 2.0 * np.pi, 7)
+    ]
+    halves = ([ring[k] for k in (0, 1, 2, 3)], [ring[k] for k in (3, 4, 5, 0)])
+    return [_face(half if side < 0 else half[::-1], _RUBBER) for half in halves]
+
+
+def _fittings() -> list[FloatArray]:
+    """Lights, number plates and bumpers, a finger's breadth off the body."""
+    parts = []
+    for y0, y1 in ((0.78, 0.48), (-0.48, -0.78)):
+        parts.append(_rear_panel(y0, y1, 0.66, 0.84, _TAIL))
+        parts.append(_front_panel(y0, y1, 0.5, 0.62, _HEAD))
+    parts.append(_rear_panel(0.26, -0.26, 0.62, 0.73, _PLATE))
+    parts.append(_rear_panel(0.78, -0.78, 0.19, 0.42, _DARK))
+    parts.append(_front_panel(0.6, -0.6, 0.3, 0.44, _DARK))
+    return parts
+
+
+def _rear_panel(y0: float, y1: float, z0: float, z1: float, colour: Point) -> FloatArray:
+    x = -2.225
+    return _quad((x, y0, z0), (x, y1, z0), (x, y1, z1), (x, y0, z1), colour)
+
+
+def _front_panel(y0: float, y1: float, z0: float, z1: float, colour: Point) -> FloatArray:
+    x = 2.225
+    return _quad((x, y0, z1), (x, y1, z1), (x, y1, z0), (x, y0, z0), colour)
 
 
 class Cars:

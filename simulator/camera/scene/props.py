@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from simulator.camera.bridges.bridges import KEEP_FREE_M, Bridge, free_of
 from simulator.camera.core.mesh import Chunks, Surface
-from simulator.camera.scene.road_mesh import Ribbon
-from simulator.camera.scene.roadside import ground_height, place_beside
+from simulator.camera.scene.road_mesh import Ribbon, ground_height, place_beside
 from simulator.camera.scene.solids import (
     BOARD,
     CROWD,

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from simulator.camera.bridges import bridges
 from simulator.camera.core.context import SCENE_BINDING, SHADE_UNIT, Graphics
-from simulator.camera.core.mesh import Mesh
+from simulator.camera.core.mesh import Mesh, Surface
 from simulator.camera.core.optics import Eye
 from simulator.camera.scene import barriers, land, props
 from simulator.camera.scene import road_mesh as ribbon
@@ -47,69 +47,35 @@ class Scene:
     def __init__(
         self, graphics: Graphics, road: Road, survey: Survey, seed: int, light: Light
     ) -> None:
+        def rng(part: int) -> np.random.Generator:
+            return np.random.default_rng([seed, part])
+
         look, line = look_of(road.track.look), survey.line
-        terrain = build_terrain(road, survey, look, np.random.default_rng([seed, 1]))
+        terrain = build_terrain(road, survey, look, rng(1))
         strips = ribbon.build(road, line, terrain)
-        self._graphics = graphics
-
-        def named(program: str) -> str:
-            return graphics.weathered(program, light.weather)
-
-        over = bridges.build(road, line, strips, terrain, look, np.random.default_rng([seed, 8]))
-        trees = scenery.plant(
-            road,
-            line,
-            strips,
-            terrain,
-            look,
-            over,
-            np.random.default_rng([seed, 3]),
-            avenue=light.canopy,
-        )
+        over = bridges.build(road, line, strips, terrain, look, rng(8))
+        trees = scenery.plant(road, line, strips, terrain, look, over, rng(3), avenue=light.canopy)
         shadiness = land.Shadiness.of(terrain, line, trees, light)
-        layout = ("3f 2f 3f 1f", "at", "road", "facing", "kerbed")
-        asphalt, beside = ribbon.surfaces(strips, road)
-        paved = Mesh(graphics, named("paved"), asphalt, layout)
-        verge = Mesh(graphics, named("verge"), beside, layout)
-        shore = graphics.weathered("land", light.weather, *(["sea"] if look.sea else []))
-        hidden = ribbon.covers(strips, survey, margin_m=2.0)
-        fields = [
-            Mesh(
-                graphics,
-                shore,
-                land.surface(shadiness, hidden, span),
-                ("3f 3f 1f", "at", "facing", "sunlit"),
-            )
-            for span in LAND
-        ]
+        rails = barriers.build(road, strips, look, rng(5))
+        built = props.build(road, line, strips, terrain, look, over, rng(6))
+        covered = ribbon.covers(strips, survey, margin_m=2.0)
+        self.mask = shade.build(road, trees, over, shadiness, light, rng(4))
+        self._woods = Woods(graphics, trees, light.weather)
         self._barriers = Mesh(
             graphics,
-            named("barrier"),
-            barriers.build(road, strips, look, np.random.default_rng([seed, 5])),
+            graphics.weathered("barrier", light.weather),
+            rails,
             ("3f 2f 1f 3f", "at", "along", "kind", "facing"),
         )
-        built = props.build(
-            road, line, strips, terrain, look, over, np.random.default_rng([seed, 6])
+        self._solid = (
+            *_road_meshes(graphics, ribbon.surfaces(strips, road), light.weather),
+            *_prop_meshes(graphics, built, light.weather),
+            *_land_meshes(graphics, shadiness, covered, light.weather, look.sea),
         )
-        things = [
-            Mesh(
-                graphics,
-                graphics.weathered("prop", light.weather, material),
-                surface,
-                ("3f 3f 3f 2f", "at", "facing", "colour", "face"),
-            )
-            for material, surface in built.items()
-        ]
-        self.mask = shade.build(
-            road, trees, over, shadiness, light, np.random.default_rng([seed, 4])
-        )
-        self._woods = Woods(graphics, trees, light.weather)
-        self._solid = (paved, verge, *things, *fields)
-        palette = scene_block(road, look, np.random.default_rng([seed, 2]), self.mask, terrain.sea)
+        palette = scene_block(road, look, rng(2), self.mask, terrain.sea)
         self._block = graphics.context.buffer(palette.tobytes())
-        self._shade = graphics.context.texture(
-            self.mask.texels.shape[::-1], 1, self.mask.texels.tobytes()
-        )
+        texels = self.mask.texels
+        self._shade = graphics.context.texture(texels.shape[::-1], 1, texels.tobytes())
         graphics.mipmapped(self._shade)
         self._shade.filter = graphics.noise.filter
 
@@ -143,6 +109,39 @@ class Scene:
         self._woods.release()
         self._block.release()
         self._shade.release()
+
+
+def _road_meshes(graphics: Graphics, surfaces: tuple[Surface, Surface], weather: str) -> list[Mesh]:
+    """The asphalt, then the verges beside it."""
+    layout = ("3f 2f 3f 1f", "at", "road", "facing", "kerbed")
+    return [
+        Mesh(graphics, graphics.weathered(program, weather), surface, layout)
+        for program, surface in zip(("paved", "verge"), surfaces, strict=True)
+    ]
+
+
+def _prop_meshes(graphics: Graphics, props: dict[str, Surface], weather: str) -> list[Mesh]:
+    """Props and bridges, one mesh for each material."""
+    layout = ("3f 3f 3f 2f", "at", "facing", "colour", "face")
+    return [
+        Mesh(graphics, graphics.weathered("prop", weather, material), surface, layout)
+        for material, surface in props.items()
+    ]
+
+
+def _land_meshes(
+    graphics: Graphics,
+    shadiness: land.Shadiness,
+    covered: NDArray[np.bool_],
+    weather: str,
+    sea: bool,
+) -> list[Mesh]:
+    """The terrain, one mesh for each range of distance."""
+    program = graphics.weathered("land", weather, *(["sea"] if sea else []))
+    layout = ("3f 3f 1f", "at", "facing", "sunlit")
+    return [
+        Mesh(graphics, program, land.surface(shadiness, covered, span), layout) for span in LAND
+    ]
 
 
 def scene_block(

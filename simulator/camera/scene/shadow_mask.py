@@ -14,11 +14,10 @@ from numpy.typing import NDArray
 
 from runtime.jit import compiled
 from simulator.camera.bridges.bridges import Bridge
-from simulator.camera.bridges.shadow import cast_bridges
 from simulator.camera.scene.land import Shadiness
 from simulator.camera.scene.light import Light
 from simulator.camera.scene.road_mesh import SKIRT_M
-from simulator.camera.vegetation import canopy, foliage
+from simulator.camera.vegetation import foliage
 from simulator.camera.vegetation.scenery import Trees
 from simulator.track.road import Road
 
@@ -32,6 +31,17 @@ LOOK_M = 30.0
 LONGEST_SHADOW_M = 40.0
 RUN_OUT_M = (2.0, 5.5)
 """From the wall line to where the mask begins, and ends, to run out into the land's shade."""
+WINDOW_M = 12.0
+"""The covered share is set anew about every so many metres."""
+THINS_OUT_M = 5.0
+"""Beyond the wall line the clumps grow smaller over so many metres, and end."""
+SHARE = (0.40, 0.64)
+"""Bounds of the covered share of the asphalt in a window, bridges included."""
+FINE = 2
+"""Rays a texel in each direction; their mean softens the edge by a texel."""
+ROAD_Z_M = 2.5
+"""The road near a bridge lies within so much of its height below the bridge."""
+FARTHEST_M = 70.0
 
 
 @dataclass(frozen=True)
@@ -81,7 +91,7 @@ def build(
     if light.shade < 0.5:
         cast_bridges(strip, road, along_m, TEXEL_M, bridges, light)
         if light.canopy:
-            strip = canopy.grown(strip, road, along_m, TEXEL_M, rng)
+            strip = _with_canopy(strip, road, along_m, TEXEL_M, rng)
         else:
             _cast_trees(strip, road, along_m, trees, light)
         _run_out(strip, road, along_m, land)
@@ -159,3 +169,121 @@ def _stamp(
     columns = np.arange(low[0], high[0]) % strip.shape[1]
     part = strip[low[1] : high[1], columns]
     strip[low[1] : high[1], columns] = np.maximum(part, cast)
+
+
+def _with_canopy(
+    bridged: Strip, road: Road, along_m: float, texel_m: float, rng: np.random.Generator
+) -> Strip:
+    """The mask `bridged` (rows, columns), which holds the bridges' shadows, with a canopy added.
+
+    A noise field is cut at a level found anew every WINDOW_M so that the covered share of the
+    asphalt is what was drawn for that place; where a bridge covers more, the canopy stays away.
+    Over any 30 m the share lies between 0.3 and 0.8.
+    """
+    rows, columns = bridged.shape
+    field = _blobs(rows, columns, along_m, texel_m, rng)
+    half = round(road.half_asphalt / texel_m)
+    asphalt = slice(rows // 2 - half, rows // 2 + half)
+    count = max(3, columns // max(1, round(WINDOW_M / along_m)))
+    centres = (np.arange(count) + 0.5) * columns / count
+    wanted = rng.uniform(*SHARE, count)
+    wanted = 0.25 * np.roll(wanted, 1) + 0.5 * wanted + 0.25 * np.roll(wanted, -1)
+    edges = np.linspace(0, columns, count + 1).astype(int)
+    level = []
+    for a, b, share in zip(edges[:-1], edges[1:], wanted, strict=True):
+        sunny = bridged[asphalt, a:b] < 128
+        left = 1.0 - float(sunny.mean())
+        rest = np.clip((share - left) / max(1.0 - left, 1e-6), 0.02, 1.0)
+        part = field[asphalt, a:b]
+        level.append(float(np.quantile(part[sunny] if sunny.any() else part, 1.0 - rest)))
+    y = (np.arange(rows) + 0.5 - rows / 2) * texel_m
+    ends = 2.6 * np.clip((np.abs(y) - road.wall_offset + 1.0) / THINS_OUT_M, 0.0, 1.0)
+    field -= ends[:, None].astype(np.float32)
+    cut = np.interp(np.arange(columns), centres, level, period=columns).astype(np.float32)
+    soft = np.clip((field - cut) * np.float32(9.0 * 255.0) + np.float32(128.0), 0.0, 255.0)
+    return np.asarray(np.maximum(soft.astype(np.uint8), bridged), dtype=np.uint8)
+
+
+def _blobs(
+    rows: int, columns: int, along_m: float, texel_m: float, rng: np.random.Generator
+) -> NDArray[np.float32]:
+    """A field of leaf clumps and boughs (rows, columns), standard deviation 1."""
+    field = np.zeros((rows, columns), dtype=np.float32)
+    # Clumps need no noise finer than they are.
+    for size_m, weight, coarse in ((3.2, 1.0, 4), (1.3, 0.55, 2), (0.55, 0.3, 1)):
+        noise = rng.standard_normal((-(-rows // coarse), -(-columns // coarse)), dtype=np.float32)
+        smooth = cv2.GaussianBlur(
+            noise, (0, 0), size_m / 2.0 / along_m / coarse, sigmaY=size_m / 2.4 / texel_m / coarse,
+            borderType=cv2.BORDER_REFLECT,
+        )  # fmt: skip
+        smooth = cv2.resize(smooth, (columns, rows), interpolation=cv2.INTER_LINEAR)
+        field += np.float32(weight / max(float(smooth.std()), 1e-6)) * smooth
+    return np.asarray(field / max(float(field.std()), 1e-6), dtype=np.float32)
+
+
+def cast_bridges(
+    strip: Strip,
+    road: Road,
+    along_m: float,
+    texel_m: float,
+    bridges: Sequence[Bridge],
+    light: Light,
+) -> None:
+    """Darken the texels of `strip` (rows, columns) from which a bridge hides the sun."""
+    for bridge in bridges:
+        sun = bridge.turned(np.array(light.sun_direction))
+        low, high = _reach(bridge.boxes, sun)
+        # On the inside of a bend a metre of s is shorter, so that more of it is needed.
+        bend = 1.0 / max(0.5, 1.0 - abs(road.track.curvature(bridge.s)) * road.wall_offset)
+        first = int((bridge.s + max(low * bend, -FARTHEST_M)) / along_m) - 8
+        last = int((bridge.s + min(high * bend, FARTHEST_M)) / along_m) + 9
+        dark = _darkened(bridge, road, along_m, texel_m, (first, last), strip.shape[0], sun)
+        columns = np.arange(first, last) % strip.shape[1]
+        strip[:, columns] = np.maximum(strip[:, columns], dark)
+
+
+def _reach(boxes: FloatArray, sun: FloatArray) -> tuple[float, float]:
+    """How far along the road the shadows of the boxes begin and end."""
+    drop = boxes[:, 1, 2] + ROAD_Z_M
+    shift = -sun[0] / max(sun[2], 1e-3) * drop
+    low = np.minimum(boxes[:, 0, 0], boxes[:, 0, 0] + shift)
+    high = np.maximum(boxes[:, 1, 0], boxes[:, 1, 0] + shift)
+    return float(low.min()), float(high.max())
+
+
+def _darkened(
+    bridge: Bridge,
+    road: Road,
+    along_m: float,
+    texel_m: float,
+    columns: tuple[int, int],
+    rows: int,
+    sun: FloatArray,
+) -> Strip:
+    """The shadow on texels (rows, columns) of the unfolded mask; columns may pass its ends."""
+    first, last = columns
+    s = (first + (np.arange((last - first) * FINE) + 0.5) / FINE) * along_m
+    y = ((np.arange(rows * FINE) + 0.5) / FINE - rows / 2) * texel_m
+    pose = road.track.at(s[None, :] % road.track.length_m, y[:, None])
+    own = bridge.inside(np.stack(np.broadcast_arrays(pose.x, pose.y, pose.z), axis=-1))
+    slope = np.where(np.abs(sun) > 1e-6, sun, 1e-6)
+    reached = [np.ascontiguousarray(own[..., k] / slope[k], dtype=np.float32) for k in range(3)]
+    hidden = np.zeros(own.shape[:2], dtype=np.bool_)
+    for box in bridge.boxes:
+        hidden |= _hit(reached, box / slope)
+    shares = hidden.reshape(rows, FINE, last - first, FINE).mean(axis=(1, 3))
+    return np.asarray(np.rint(255.0 * shares), dtype=np.uint8)
+
+
+def _hit(reached: list[NDArray[np.float32]], box: FloatArray) -> NDArray[np.bool_]:
+    """From which points a ray towards the sun meets a box (slab method).
+
+    All is measured along the ray: each coordinate of points and box (2, 3) comes divided by the
+    ray's slope in it.
+    """
+    enter = np.zeros_like(reached[0])
+    leave = np.full_like(reached[0], np.inf)
+    for axis, place in enumerate(reached):
+        np.maximum(enter, np.float32(box[:, axis].min()) - place, out=enter)
+        np.minimum(leave, np.float32(box[:, axis].max()) - place, out=leave)
+    return np.asarray(enter < leave)

@@ -7,8 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from simulator.camera.bridges.bridges import Bridge, free_of
-from simulator.camera.scene.road_mesh import Ribbon
-from simulator.camera.scene.roadside import ground_height, place_beside
+from simulator.camera.scene.road_mesh import Ribbon, ground_height, place_beside
 from simulator.camera.scene.terrain import CentreLine, Terrain
 from simulator.camera.scene.themes import Look
 from simulator.camera.vegetation import foliage

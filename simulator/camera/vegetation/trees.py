@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from simulator.camera.core.context import Graphics
 from simulator.camera.core.frustum_culling import balls_seen, fans
 from simulator.camera.vegetation import foliage
-from simulator.camera.vegetation.outline import CORNERS
+from simulator.camera.vegetation.foliage import CORNERS
 from simulator.camera.vegetation.scenery import Trees
 
 FloatArray = NDArray[np.float64]

@@ -11,7 +11,7 @@ import pytest
 from simulator.camera import KINDS, VIEWS, Camera, Light
 from simulator.camera.core import context as camera_context
 from simulator.camera.overlay import marking_polylines
-from simulator.camera.scene.carmesh import WIDTH_M
+from simulator.camera.scene.cars import WIDTH_M
 from simulator.camera.snapshot import standing_pose, write_contact_sheet
 from simulator.track.catalogue import find_track
 from simulator.track.road import Road

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from simulator.camera import CLASSES, VIEWS, Camera, Light
 from simulator.camera.colourise import CLASS_COLOURS, in_false_colours
 from simulator.camera.core.optics import eye_of, rotation
-from simulator.camera.scene.carmesh import HEIGHT_M, LENGTH_M, WIDTH_M
+from simulator.camera.scene.cars import HEIGHT_M, LENGTH_M, WIDTH_M
 from simulator.camera.snapshot import standing_pose, write_contact_sheet
 from simulator.track.catalogue import find_track
 from simulator.track.markings import MarkingStyle

@@ -7,9 +7,9 @@ from numpy.typing import NDArray
 from simulator.camera import Camera, Light
 from simulator.camera.bridges import bridges
 from simulator.camera.bridges.bridges import CLEARANCE_M, Bridge
-from simulator.camera.bridges.shadow import cast_bridges
 from simulator.camera.scene import shadow_mask as shade
 from simulator.camera.scene.road_mesh import build as build_ribbon
+from simulator.camera.scene.shadow_mask import cast_bridges
 from simulator.camera.scene.terrain import CentreLine, Survey
 from simulator.camera.scene.terrain import build as build_terrain
 from simulator.camera.scene.themes import LOOKS, look_of
