@@ -12,10 +12,8 @@ from numpy.typing import NDArray
 
 from simulator.camera.bridges import styles as bridge_styles
 from simulator.camera.bridges.styles import Works
-from simulator.camera.scene.road_mesh import Ribbon, ground_height, place_beside
-from simulator.camera.scene.terrain import CentreLine, Terrain
+from simulator.camera.scene.road_mesh import Ground
 from simulator.camera.scene.themes import Look
-from simulator.track.road import Road
 
 FloatArray = NDArray[np.float64]
 
@@ -77,19 +75,12 @@ def free_of(
     return free
 
 
-def build(
-    road: Road,
-    line: CentreLine,
-    ribbon: Ribbon,
-    terrain: Terrain,
-    look: Look,
-    rng: np.random.Generator,
-) -> tuple[Bridge, ...]:
+def build(ground: Ground, look: Look, rng: np.random.Generator) -> tuple[Bridge, ...]:
     """The bridges of a scene, about one every `look.bridge_every_m`, none of them at a place where
     it would stand on another part of the track."""
     if not look.bridges:
         return ()
-    length = road.track.length_m
+    length = ground.road.track.length_m
     bridges: list[Bridge] = []
     wanted = max(1, round(length / look.bridge_every_m * rng.uniform(0.7, 1.3)))
     first = rng.uniform(0.0, length)
@@ -100,55 +91,42 @@ def build(
             apart = [abs((s - other.s + length / 2) % length - length / 2) for other in bridges]
             if min(apart, default=APART_M) < APART_M:
                 continue
-            bridge = _built(road, line, ribbon, terrain, s, style, rng)
+            bridge = _built(ground, s, style, rng)
             if bridge is not None:
                 bridges.append(bridge)
                 break
     return tuple(sorted(bridges, key=lambda bridge: bridge.s))
 
 
-def _clear_of_the_road(road: Road, line: CentreLine, points: FloatArray, z: float) -> bool:
+def _clear_of_the_road(ground: Ground, points: FloatArray, z: float) -> bool:
     """Whether what lies lower than HEADROOM_M keeps outside the wall lines, of this or any other
     part of the track; in a bend banks of earth may not."""
     corners = points.reshape(-1, 3, 3)
     edges = (corners + np.roll(corners, 1, axis=1)) / 2.0
     every = np.concatenate([points, edges.reshape(-1, 3)])
     low = every[every[:, 2] < z + HEADROOM_M]
-    return bool(np.all(line.distance(low[:, 0], low[:, 1]) > road.wall_offset))
+    return bool(np.all(ground.line.distance(low[:, 0], low[:, 1]) > ground.road.wall_offset))
 
 
-def _built(
-    road: Road,
-    line: CentreLine,
-    ribbon: Ribbon,
-    terrain: Terrain,
-    s: float,
-    style: str,
-    rng: np.random.Generator,
-) -> Bridge | None:
+def _built(ground: Ground, s: float, style: str, rng: np.random.Generator) -> Bridge | None:
     """A bridge of `style` over `s`, or None where there is no room for it."""
+    road = ground.road
     reach = bridge_styles.half_span(style, road.wall_offset)
     across = np.linspace(road.wall_offset + 1.0, reach + 4.0, 8)
     across = np.concatenate([across, -across])
     at = np.full(len(across), s)
-    free, x, y = place_beside(road, line, at, across, 0.5)
+    free, x, y = ground.place_beside(at, across, 0.5)
     if not free.all() or abs(road.track.curvature(s)) * reach > 0.5:
         return None
     pose = road.track.at(s)
     place = np.array([pose.x, pose.y, pose.z], dtype=np.float64)
-    ground = ground_height(ribbon, terrain, at, across, x, y) - place[2]
-    if ground.min() < -DEEPEST_M:
+    lowest = float((ground.height(at, across, x, y) - place[2]).min())
+    if lowest < -DEEPEST_M:
         return None
     along = s + np.linspace(-6.0, 6.0, 7)[:, None]
     top = float(road.track.at(along, np.linspace(-reach, reach, 9) * 0.5).z.max() - place[2])
-    works = Works()
-    bridge_styles.STYLES[style](
-        works,
-        rng,
-        wall=road.wall_offset,
-        under=max(top, 0.0) + CLEARANCE_M,
-        ground=float(ground.min()),
-    )
+    works = Works(road.wall_offset, max(top, 0.0) + CLEARANCE_M, lowest)
+    bridge_styles.STYLES[style](works, rng)
     heading = float(pose.heading)
     triangles, boxes = works.triangles(), works.boxes()
     low, high = triangles[:, :3].min(axis=0), triangles[:, :3].max(axis=0)
@@ -156,6 +134,6 @@ def _built(
     turn = _turn(heading)
     triangles[:, :3] = triangles[:, :3] @ turn.T + place
     triangles[:, 3:6] = triangles[:, 3:6] @ turn.T
-    if not _clear_of_the_road(road, line, triangles[:, :3], place[2]):
+    if not _clear_of_the_road(ground, triangles[:, :3], place[2]):
         return None
     return Bridge(s, place, heading, triangles, boxes, float(half_along), float(half_across))

@@ -4,7 +4,7 @@ x along the road, y to the left, z up from the road's centre, metres. Each style
 wall line is, the height that must stay free, and how deep the ground lies.
 """
 
-from typing import Protocol
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,9 +32,14 @@ SPAN_BEYOND_M = {"overpass": 13.0, "railway": 5.0, "footbridge": 3.0, "wooden": 
 
 
 class Works:
-    """Gathers the triangles of a bridge, and the boxes that throw its shadow."""
+    """Gathers the triangles of a bridge and the boxes that cast its shadow.
 
-    def __init__(self) -> None:
+    `wall` is the lateral offset of the wall line, `under` the least height of the underside of the
+    deck and `ground` the lowest terrain at its ends; metres, from the centre of the road.
+    """
+
+    def __init__(self, wall: float, under: float, ground: float) -> None:
+        self.wall, self.under, self.ground = wall, under, ground
         self._parts: list[FloatArray] = []
         self._boxes: list[FloatArray] = []
 
@@ -84,14 +89,8 @@ class Works:
         return np.array(self._boxes).reshape(-1, 2, 3)
 
 
-class Style(Protocol):
-    """Builds one bridge into `works`."""
-
-    def __call__(
-        self, works: Works, rng: np.random.Generator, *, wall: float, under: float, ground: float
-    ) -> None:
-        """`wall` is the wall line's offset, `under` the least height of the deck's underside,
-        `ground` the lowest land at its ends, all from the road's centre."""
+Style = Callable[[Works, np.random.Generator], None]
+"""Builds one bridge."""
 
 
 def half_span(style: str, wall: float) -> float:
@@ -132,10 +131,9 @@ def _ring(x: float, y0: float, y1: float, z: float) -> list[FloatArray]:
     return [np.array([u, v, z]) for u, v in ((-x, y0), (x, y0), (x, y1), (-x, y1))]
 
 
-def overpass(
-    works: Works, rng: np.random.Generator, *, wall: float, under: float, ground: float
-) -> None:
+def overpass(works: Works, rng: np.random.Generator) -> None:
     """A road of concrete on rows of columns."""
+    wall, under, ground = works.wall, works.under, works.ground
     width, depth = float(rng.uniform(7.0, 9.0)), 1.1
     reach, colour = half_span("overpass", wall), _pick(rng, CONCRETE)
     works.box((width, 2 * reach, depth), (0.0, 0.0, under), colour, MASONRY)
@@ -151,10 +149,9 @@ def overpass(
     _mounds(works, width, reach, under + depth, ground)
 
 
-def railway(
-    works: Works, rng: np.random.Generator, *, wall: float, under: float, ground: float
-) -> None:
+def railway(works: Works, rng: np.random.Generator) -> None:
     """Steel plate girders on abutments of masonry."""
+    wall, under, ground = works.wall, works.under, works.ground
     width, reach = 5.0, half_span("railway", wall)
     steel, stone = _pick(rng, STEEL), _pick(rng, STONE)
     works.box((width, 2 * reach, 0.5), (0.0, 0.0, under), steel)
@@ -169,25 +166,20 @@ def railway(
     _mounds(works, width, reach, under + 0.9, ground)
 
 
-def footbridge(
-    works: Works, rng: np.random.Generator, *, wall: float, under: float, ground: float
-) -> None:
+def footbridge(works: Works, rng: np.random.Generator) -> None:
     """A narrow steel deck with stairs down both sides."""
-    _walkway(works, "footbridge", _pick(rng, STEEL), wall, under, ground)
+    _walkway(works, "footbridge", _pick(rng, STEEL))
 
 
-def wooden(
-    works: Works, rng: np.random.Generator, *, wall: float, under: float, ground: float
-) -> None:
+def wooden(works: Works, rng: np.random.Generator) -> None:
     """The same of timber."""
-    _walkway(works, "wooden", WOOD, wall, under, ground)
+    _walkway(works, "wooden", WOOD)
 
 
-def adverts(
-    works: Works, rng: np.random.Generator, *, wall: float, under: float, ground: float
-) -> None:
+def adverts(works: Works, rng: np.random.Generator) -> None:
     """A footbridge behind a board along its whole length, as race tracks have."""
-    _walkway(works, "adverts", (0.30, 0.30, 0.31), wall, under, ground)
+    wall, under = works.wall, works.under
+    _walkway(works, "adverts", (0.30, 0.30, 0.31))
     reach, colour = half_span("adverts", wall), _pick(rng, ADVERTS)
     for x, facing in ((-1.42, 1.0), (1.42, -1.0)):
         count = max(2, round(2 * reach / 6.0))
@@ -196,9 +188,8 @@ def adverts(
             works.board((2 * reach / count, 1.7), (x, y, under - 0.05), colour, facing)
 
 
-def _walkway(
-    works: Works, style: str, colour: Point, wall: float, under: float, ground: float
-) -> None:
+def _walkway(works: Works, style: str, colour: Point) -> None:
+    wall, under, ground = works.wall, works.under, works.ground
     width, reach = 2.6, half_span(style, wall)
     works.box((width, 2 * reach, 0.38), (0.0, 0.0, under), colour)
     for x in (-width / 2, width / 2):
@@ -226,10 +217,9 @@ def _stairs(works: Works, y: float, top: float, ground: float, colour: Point) ->
         works.face(corners, colour, PLAIN)
 
 
-def gantry(
-    works: Works, rng: np.random.Generator, *, wall: float, under: float, ground: float
-) -> None:
+def gantry(works: Works, rng: np.random.Generator) -> None:
     """Two posts and a beam with direction signs over the lanes."""
+    wall, under, ground = works.wall, works.under, works.ground
     steel, reach = (0.34, 0.35, 0.36), wall + 0.8
     for y in (-reach, reach):
         works.box((0.35, 0.35, under - ground + 2.6), (0.0, y, ground - 1.0), steel)
@@ -243,10 +233,9 @@ def gantry(
         works.board((1.05 * wall / count, 2.2), (-0.25, y, under), colour, 1.0)
 
 
-def arch(
-    works: Works, rng: np.random.Generator, *, wall: float, under: float, ground: float
-) -> None:
+def arch(works: Works, rng: np.random.Generator) -> None:
     """A segmental arch of masonry under a level parapet."""
+    wall, under, ground = works.wall, works.under, works.ground
     width, reach, parts = float(rng.uniform(4.0, 6.0)), half_span("arch", wall), 20
     colour = _pick(rng, STONE)
     spring = wall + 0.6

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,6 +37,20 @@ class Chunks:
     reaches: tuple[float, ...]
     nearest: float = 0.0
     """Chunks that lie wholly nearer than this are left to a finer mesh."""
+
+    @classmethod
+    def from_boxes(
+        cls,
+        boxes: tuple[FloatArray, FloatArray],
+        first: NDArray[np.int64],
+        count: NDArray[np.int64],
+        reaches: tuple[float, ...],
+        nearest: float = 0.0,
+    ) -> Self:
+        """Chunks in the spheres round bounding boxes: lowest and highest corners, (N, 3) each."""
+        low, high = boxes
+        radii = np.linalg.norm(high - low, axis=1) / 2.0
+        return cls((low + high) / 2.0, radii, first, count, reaches, nearest)
 
 
 class Mesh:

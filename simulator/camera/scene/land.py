@@ -115,9 +115,8 @@ def _in_chunks(vertices: NDArray[np.float32], shown: NDArray[np.bool_], span: Sp
     places = vertices.reshape(-1, 7)[:, :3].astype(np.float64)[indices]
     low = np.minimum.reduceat(places.min(axis=1), first, axis=0)
     high = np.maximum.reduceat(places.max(axis=1), first, axis=0)
-    chunks = Chunks(
-        (low + high) / 2.0,
-        np.linalg.norm(high - low, axis=1) / 2.0,
+    chunks = Chunks.from_boxes(
+        (low, high),
         6 * first[None].astype(np.int64),
         6 * cells[None].astype(np.int64),
         (span.reach_m,),

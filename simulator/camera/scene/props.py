@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from simulator.camera.bridges.bridges import KEEP_FREE_M, Bridge, free_of
 from simulator.camera.core.mesh import Chunks, Surface
-from simulator.camera.scene.road_mesh import Ribbon, ground_height, place_beside
+from simulator.camera.scene.road_mesh import Ground
 from simulator.camera.scene.solids import (
     BOARD,
     CROWD,
@@ -24,10 +24,8 @@ from simulator.camera.scene.solids import (
     box,
     face,
 )
-from simulator.camera.scene.terrain import CentreLine, Terrain
 from simulator.camera.scene.themes import Look
 from simulator.camera.vegetation.scenery import DRY_M
-from simulator.track.road import Road
 
 FloatArray = NDArray[np.float64]
 
@@ -142,16 +140,8 @@ def lamp() -> FloatArray:
 class _Site:
     """Puts templates down beside the road and gathers their triangles."""
 
-    def __init__(
-        self,
-        road: Road,
-        line: CentreLine,
-        ribbon: Ribbon,
-        terrain: Terrain,
-        bridges: Sequence[Bridge],
-    ) -> None:
-        self.road, self.line, self.ribbon, self.terrain = road, line, ribbon, terrain
-        self.bridges = bridges
+    def __init__(self, ground: Ground, bridges: Sequence[Bridge]) -> None:
+        self.ground, self.bridges = ground, bridges
         self.wanted: list[tuple[FloatArray, float, float, float]] = []
         self.s: list[float] = []
         self.parts: list[FloatArray] = []
@@ -167,13 +157,13 @@ class _Site:
             return
         templates, *numbers = zip(*self.wanted, strict=True)
         s, offset, clear_m = (np.array(column) for column in numbers)
-        free, x, y = place_beside(self.road, self.line, s, offset, clear_m)
+        free, x, y = self.ground.place_beside(s, offset, clear_m)
         free &= free_of(self.bridges, x, y, clear_m + KEEP_FREE_M)
-        z = ground_height(self.ribbon, self.terrain, s, offset, x, y)
-        free &= z >= self.terrain.sea + DRY_M
+        z = self.ground.height(s, offset, x, y)
+        free &= z >= self.ground.terrain.sea + DRY_M
         # On the right side the template is turned round, so that its -y still faces the road; its
         # x axis then points against the traffic.
-        turn = self.road.track.at(s).heading + np.where(offset > 0, 0.0, np.pi)
+        turn = self.ground.road.track.at(s).heading + np.where(offset > 0, 0.0, np.pi)
         cos, sin = np.cos(turn), np.sin(turn)
         taken: list[tuple[float, float, float]] = []
         for k in np.flatnonzero(free).tolist():
@@ -199,20 +189,14 @@ class _Site:
 
 
 def build(
-    road: Road,
-    line: CentreLine,
-    ribbon: Ribbon,
-    terrain: Terrain,
-    look: Look,
-    bridges: Sequence[Bridge],
-    rng: np.random.Generator,
+    ground: Ground, look: Look, bridges: Sequence[Bridge], rng: np.random.Generator
 ) -> dict[str, Surface]:
     """All props of a scene, its bridges among them, by material; a vertex is as `solids` has it,
     without the material."""
-    site = _Site(road, line, ribbon, terrain, bridges)
+    site = _Site(ground, bridges)
     for bridge in bridges:
         site.add(bridge.s, bridge.triangles)
-    length, wall = road.track.length_m, road.wall_offset
+    length, wall = ground.road.track.length_m, ground.road.wall_offset
     for make, density, near, far, clear in (
         (house, look.houses, 9.0, 24.0, 7.5),
         (block, look.blocks, 13.0, 34.0, 11.0),
@@ -269,9 +253,8 @@ def _surface(parts: list[FloatArray], s: FloatArray, small: NDArray[np.bool_]) -
     )
     low = np.minimum.reduceat(vertices[:, :3], first, axis=0)
     high = np.maximum.reduceat(vertices[:, :3], first, axis=0)
-    chunks = Chunks(
-        (low + high) / 2.0,
-        np.linalg.norm(high - low, axis=1) / 2.0,
+    chunks = Chunks.from_boxes(
+        (low, high),
         np.stack([first, first]).astype(np.int64),
         count.astype(np.int64),
         (SMALL_REACH_M, REACH_M),

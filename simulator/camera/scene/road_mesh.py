@@ -6,6 +6,7 @@ between two of them leaves the true arc by less than `SAGITTA_M`, so what the sh
 """
 
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -173,28 +174,34 @@ def _kerb(ribbon: Ribbon, road: Road) -> FloatArray:
     return kerb
 
 
-def place_beside(
-    road: Road, line: CentreLine, s: FloatArray, offset: FloatArray, clear_m: float | FloatArray
-) -> tuple[NDArray[np.bool_], FloatArray, FloatArray]:
-    """Which of the places (s, offset) are `clear_m` outside every wall line, and their x, y."""
-    pose = road.track.at(s, offset)
-    near = line.distance(pose.x, pose.y)
-    # Samples of the centre line lie SAMPLE_M apart; half a step of slack covers the gaps.
-    free = near > road.wall_offset + clear_m
-    return free, pose.x, pose.y
+@dataclass(frozen=True)
+class Ground:
+    """What a scene stands on: the road with its centre line and mesh, and the terrain."""
 
+    road: Road
+    line: CentreLine
+    mesh: Ribbon
+    terrain: Terrain
 
-def ground_height(
-    ribbon: Ribbon,
-    terrain: Terrain,
-    s: FloatArray,
-    offset: FloatArray,
-    x: FloatArray,
-    y: FloatArray,
-) -> FloatArray:
-    """Height of what is seen at a place: the land, or the ribbon's skirt where that is higher."""
-    row = np.clip(np.searchsorted(ribbon.s, s), 0, len(ribbon.s) - 1)
-    skirt = ribbon.ground(row, offset)
-    on_skirt = (offset < ribbon.y[row, 0]) & (offset > ribbon.y[row, -1])
-    land = terrain.height(x, y)
-    return np.where(on_skirt, np.maximum(land, skirt), land)
+    @classmethod
+    def of(cls, road: Road, line: CentreLine, terrain: Terrain) -> Self:
+        """The ground of `road`, its mesh built."""
+        return cls(road, line, build(road, line, terrain), terrain)
+
+    def place_beside(
+        self, s: FloatArray, offset: FloatArray, clear_m: float | FloatArray
+    ) -> tuple[NDArray[np.bool_], FloatArray, FloatArray]:
+        """Which of the places (s, offset) are `clear_m` outside every wall line, and their x, y."""
+        pose = self.road.track.at(s, offset)
+        near = self.line.distance(pose.x, pose.y)
+        free = near > self.road.wall_offset + clear_m
+        return free, pose.x, pose.y
+
+    def height(self, s: FloatArray, offset: FloatArray, x: FloatArray, y: FloatArray) -> FloatArray:
+        """Visible height at places: the terrain, or the road mesh's skirt where it is higher."""
+        mesh = self.mesh
+        row = np.clip(np.searchsorted(mesh.s, s), 0, len(mesh.s) - 1)
+        skirt = mesh.ground(row, offset)
+        on_skirt = (offset < mesh.y[row, 0]) & (offset > mesh.y[row, -1])
+        land = self.terrain.height(x, y)
+        return np.where(on_skirt, np.maximum(land, skirt), land)

@@ -50,15 +50,15 @@ class Scene:
         def rng(part: int) -> np.random.Generator:
             return np.random.default_rng([seed, part])
 
-        look, line = look_of(road.track.look), survey.line
+        look = look_of(road.track.look)
         terrain = build_terrain(road, survey, look, rng(1))
-        strips = ribbon.build(road, line, terrain)
-        over = bridges.build(road, line, strips, terrain, look, rng(8))
-        trees = scenery.plant(road, line, strips, terrain, look, over, rng(3), avenue=light.canopy)
-        shadiness = land.Shadiness.of(terrain, line, trees, light)
-        rails = barriers.build(road, strips, look, rng(5))
-        built = props.build(road, line, strips, terrain, look, over, rng(6))
-        covered = ribbon.covers(strips, survey, margin_m=2.0)
+        ground = ribbon.Ground.of(road, survey.line, terrain)
+        over = bridges.build(ground, look, rng(8))
+        trees = scenery.plant(ground, look, over, rng(3), avenue=light.canopy)
+        shadiness = land.Shadiness.of(terrain, survey.line, trees, light)
+        rails = barriers.build(road, ground.mesh, look, rng(5))
+        built = props.build(ground, look, over, rng(6))
+        covered = ribbon.covers(ground.mesh, survey, margin_m=2.0)
         self.mask = shade.build(road, trees, over, shadiness, light, rng(4))
         self._woods = Woods(graphics, trees, light.weather)
         self._barriers = Mesh(
@@ -68,7 +68,7 @@ class Scene:
             ("3f 2f 1f 3f", "at", "along", "kind", "facing"),
         )
         self._solid = (
-            *_road_meshes(graphics, ribbon.surfaces(strips, road), light.weather),
+            *_road_meshes(graphics, ribbon.surfaces(ground.mesh, road), light.weather),
             *_prop_meshes(graphics, built, light.weather),
             *_land_meshes(graphics, shadiness, covered, light.weather, look.sea),
         )

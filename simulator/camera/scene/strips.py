@@ -69,13 +69,7 @@ def strip(
     return Surface(
         np.ascontiguousarray(vertices.reshape(rows * columns, -1)),
         np.concatenate(indices),
-        Chunks(
-            (low + high) / 2.0,
-            np.linalg.norm(high - low, axis=1) / 2.0,
-            first,
-            count,
-            tuple(level.reach_m for level in levels),
-        ),
+        Chunks.from_boxes((low, high), first, count, tuple(level.reach_m for level in levels)),
     )
 
 

@@ -7,8 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from simulator.camera.bridges.bridges import Bridge, free_of
-from simulator.camera.scene.road_mesh import Ribbon, ground_height, place_beside
-from simulator.camera.scene.terrain import CentreLine, Terrain
+from simulator.camera.scene.road_mesh import Ground
 from simulator.camera.scene.themes import Look
 from simulator.camera.vegetation import foliage
 from simulator.track.road import Road
@@ -45,10 +44,7 @@ class Trees:
 
 
 def plant(
-    road: Road,
-    line: CentreLine,
-    ribbon: Ribbon,
-    terrain: Terrain,
+    ground: Ground,
     look: Look,
     bridges: Sequence[Bridge],
     rng: np.random.Generator,
@@ -59,6 +55,7 @@ def plant(
 
     `avenue` plants one more close behind each wall line, tall enough to meet over the road.
     """
+    road = ground.road
     sites = [_groves(road, look, rng)]
     if avenue:
         sites.append(_avenue(road, look, np.random.default_rng(rng.integers(2**32))))
@@ -69,12 +66,12 @@ def plant(
     height = low + (high - low) * size
     width = height * np.array([foliage.ASPECT[kind] for kind in kinds])
     width *= rng.uniform(0.85, 1.15, len(s))
-    free, x, y = place_beside(road, line, s, offset, CLEAR_M - 0.1)
+    free, x, y = ground.place_beside(s, offset, CLEAR_M - 0.1)
     # Branches may reach over the rail; over the lanes only where they are high enough.
     near = np.abs(offset) - width / 2.0
     keep = free & (near > road.half_asphalt - 0.5 - overhang) & free_of(bridges, x, y)
-    z = ground_height(ribbon, terrain, s, offset, x, y) - 0.12
-    keep &= z > terrain.sea + DRY_M
+    z = ground.height(s, offset, x, y) - 0.12
+    keep &= z > ground.terrain.sea + DRY_M
     cell = np.array([foliage.KINDS.index(kind) for kind in kinds], dtype=np.int64)
     season = rng.choice([0.0, 0.0, 0.0, 0.35, 1.0])
     tint = _tints(rng, np.isin(kinds, LEAF_SHEDDING), float(season))

@@ -8,7 +8,7 @@ from simulator.camera import Camera, Light
 from simulator.camera.bridges import bridges
 from simulator.camera.bridges.bridges import CLEARANCE_M, Bridge
 from simulator.camera.scene import shadow_mask as shade
-from simulator.camera.scene.road_mesh import build as build_ribbon
+from simulator.camera.scene.road_mesh import Ground
 from simulator.camera.scene.shadow_mask import cast_bridges
 from simulator.camera.scene.terrain import CentreLine, Survey
 from simulator.camera.scene.terrain import build as build_terrain
@@ -31,10 +31,9 @@ def light(kind: str, seed: int) -> Light:
 def bridges_of(road: Road, seed: int) -> tuple[Bridge, ...]:
     """The bridges that a scene of this seed has."""
     look, survey = look_of(road.track.look), Survey.of(road)
-    line = survey.line
     terrain = build_terrain(road, survey, look, np.random.default_rng([seed, 1]))
-    strips = build_ribbon(road, line, terrain)
-    return bridges.build(road, line, strips, terrain, look, np.random.default_rng([seed, 8]))
+    ground = Ground.of(road, survey.line, terrain)
+    return bridges.build(ground, look, np.random.default_rng([seed, 8]))
 
 
 def test_every_look_that_a_track_may_have_is_drawn() -> None:
