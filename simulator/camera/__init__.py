@@ -1,4 +1,4 @@
-"""Pictures of the simulated road: the camera, its light and its mounts."""
+"""The renderer: camera images of the simulated road under different lights and weather."""
 
 from simulator.camera.core.camera import Camera, check_size
 from simulator.camera.core.optics import VIEWS

@@ -1,4 +1,4 @@
-"""Depth and class for the eye: pictures (height, width, 3) uint8 RGB, their colours a code."""
+"""Depth and class images in false colour, (height, width, 3) uint8 RGB."""
 
 import cv2
 import numpy as np
@@ -17,11 +17,11 @@ CLASS_COLOURS: dict[str, tuple[int, int, int]] = {
     "object": (232, 156, 30),
 }
 NEAREST_M, FARTHEST_M = 2.0, 500.0
-"""Depths of the first and the last colour; between them a colour stands for a ratio."""
+"""Depths of the first and the last colour; the scale is logarithmic."""
 _NO_DEPTH = (12, 12, 16)
 
 
-def in_false_colours(picture: NDArray[np.generic], kind: str) -> Picture:
+def colourise(picture: NDArray[np.generic], kind: str) -> Picture:
     """`picture` of `kind` "depth" (red near, blue far, black the sky) or "class" (the palette
     CLASS_COLOURS) in colours; one of "colour" as it is."""
     if kind == DEPTH:

@@ -1,4 +1,4 @@
-"""The true markings over a picture: where the painted lines must lie. Pixels, origin top left."""
+"""Projection of the true lane markings into an image, and drawing them. Pixels, origin top left."""
 
 from typing import TYPE_CHECKING, Protocol
 
@@ -20,8 +20,8 @@ BEHIND_M = 2.0
 _COLOUR = (255, 0, 200)
 
 
-class Seen(Protocol):
-    """What of a camera an overlay needs."""
+class Projector(Protocol):
+    """The part of `Camera` that an overlay needs."""
 
     width: int
     height: int
@@ -34,7 +34,7 @@ class Seen(Protocol):
 
 
 def marking_polylines(
-    camera: Seen,
+    camera: Projector,
     road: Road,
     at: "CarState | tuple[float, ArrayLike]",
     ahead_m: float = 60.0,
@@ -43,7 +43,8 @@ def marking_polylines(
     """Pixel polylines (n, 2) of the centres of the true markings, leftmost first.
 
     `at` is (s, body pose) of the car, or its state. Each line runs from just behind the eye to
-    `ahead_m`; what lies behind the eye or far outside the picture is cut off, hills do not hide it.
+    `ahead_m`; points behind the camera or far outside the image are cut off. Occlusion by hills is
+    ignored.
     """
     s, body_pose = at if isinstance(at, tuple) else (at.s, pose_of_state(at))
     # Backward views look at the road behind the car.
@@ -75,8 +76,8 @@ def draw(
     return drawn
 
 
-def _near_picture(camera: Seen, pixels: FloatArray, depth: FloatArray) -> NDArray[np.bool_]:
-    """Which points lie before the eye and not far outside the picture."""
+def _near_picture(camera: Projector, pixels: FloatArray, depth: FloatArray) -> NDArray[np.bool_]:
+    """Which points lie in front of the camera and not far outside the image."""
     margin = 0.5 * max(camera.width, camera.height)
     u, v = pixels[:, 0], pixels[:, 1]
     return np.asarray(

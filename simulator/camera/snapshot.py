@@ -1,4 +1,4 @@
-"""A contact sheet of a road: driver views all round it, the true markings drawn over them.
+"""A contact sheet of a road: driver views along it with the true markings drawn over them.
 
 simulator snapshot TRACK --out sheet.png --view chase --kind class --light rain
 """
@@ -16,7 +16,7 @@ from simulator.camera.colourise import (
     CLASS_COLOURS,
     FARTHEST_M,
     NEAREST_M,
-    in_false_colours,
+    colourise,
 )
 from simulator.camera.core.camera import Camera
 from simulator.camera.core.render_modes import CLASS, CLASSES, COLOUR, DEPTH, ViewRequest
@@ -38,7 +38,7 @@ CAR_GAP_M = (12.0, 60.0)
 
 @dataclass(frozen=True)
 class Shot:
-    """One picture of the sheet: where the car is (m, rad), what looks, in which light."""
+    """One picture of the sheet: pose of the car (m, rad), view, light and kind of image."""
 
     s: float
     to_middle: float
@@ -69,7 +69,7 @@ def write_contact_sheet(
     """
     if out.suffix.lower() != ".png":
         raise UserError(f"{out}: the contact sheet is a PNG file; give a name that ends in .png")
-    check_folder(out)  # before the pictures, which take a while
+    check_folder(out)  # before rendering, which takes a while
     if light is not None:
         check_light(light)
     ViewRequest.of(f"{view or 'front'}:{kind}")
@@ -84,21 +84,23 @@ def write_contact_sheet(
             for k, shot in enumerate(shots):
                 if shot.light == kind:
                     rng = np.random.default_rng([seed, 12, k])
-                    pictures[k] = take(camera, road, shot, traffic, rng)
+                    pictures[k] = render_shot(camera, road, shot, traffic, rng)
     made = [picture for picture in pictures if picture is not None]
     rows = [np.hstack(made[k : k + COLUMNS]) for k in range(0, len(made), COLUMNS)]
     done, png = cv2.imencode(".png", cv2.cvtColor(np.vstack(rows), cv2.COLOR_RGB2BGR))
     if not done:
-        raise UserError(f"{out}: the contact sheet could not be coded as PNG")
+        raise UserError(f"{out}: the contact sheet could not be encoded as PNG")
     atomic_write(out, png.tobytes())
 
 
-def take(camera: Camera, road: Road, shot: Shot, traffic: int, rng: np.random.Generator) -> Picture:
+def render_shot(
+    camera: Camera, road: Road, shot: Shot, traffic: int, rng: np.random.Generator
+) -> Picture:
     """The picture of `shot` with a caption; in colour with the true markings on its right half."""
     pose = standing_pose(road, shot.s, shot.to_middle, shot.angle)
     cars = _cars_ahead(road, shot, traffic, rng)
     name = f"{shot.view}:{shot.kind}"
-    picture = in_false_colours(camera.render_views(pose, cars, [name])[name], shot.kind)
+    picture = colourise(camera.render_views(pose, cars, [name])[name], shot.kind)
     if shot.kind == COLOUR:
         lines = overlay.marking_polylines(camera, road, (shot.s, pose), view=shot.view)
         half = camera.width // 2
@@ -121,7 +123,7 @@ def _write_legend(picture: Picture, kind: str) -> None:
 
 
 def _write(picture: Picture, text: str, place: tuple[int, int], colour: Colour) -> int:
-    """Write `text` with a shadow; how many pixels wide it is."""
+    """Write `text` with a shadow and return its width in pixels."""
     for shade, shift in (((0, 0, 0), 1), (colour, 0)):
         at = (place[0] + shift, place[1] + shift)
         cv2.putText(picture, text, at, _FONT, _FONT_SIZE, shade, 1, cv2.LINE_AA)

@@ -1,0 +1,1 @@
+"""Bridges over the road: where they stand and how they are built."""

@@ -1,7 +1,7 @@
 """Bridges over the road: where they stand, and the frame in which each is built.
 
 A bridge's own frame has its origin on the centre line, x along the road, y to the left, z up,
-metres. Its styles are in `bridge_styles`, the shadows it casts in `shade`.
+metres. The styles are in `bridges.styles`, the shadows in `scene.shadow_mask`.
 """
 
 from collections.abc import Sequence
@@ -11,27 +11,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from simulator.camera.bridges import styles as bridge_styles
-from simulator.camera.bridges.styles import Works
+from simulator.camera.bridges.styles import BridgeBuilder
 from simulator.camera.scene.road_mesh import Ground
-from simulator.camera.scene.themes import Look
+from simulator.camera.scene.themes import Theme
 
 FloatArray = NDArray[np.float64]
 
 CLEARANCE_M = 5.4
 HEADROOM_M = 2.5
-"""Even beside the asphalt, where an arch springs."""
+"""Least clearance beside the asphalt, where an arch starts."""
 APART_M = 140.0
 KEEP_FREE_M = 3.0
-"""Neither trees nor props come nearer to a bridge than this."""
+"""Least distance of trees and props from a bridge."""
 DEEPEST_M = 7.0
-"""No bridge where the land at its ends lies further below the road."""
+"""Largest depth of the terrain below the road at the ends of a bridge."""
 TRIES = 12
 
 
 @dataclass(frozen=True)
 class Bridge:
     """One bridge: its place, heading of the road below, triangles (n, 12) in the world, and the
-    boxes (m, 2, 3), least and greatest corner in its own frame, that throw its shadow."""
+    boxes (m, 2, 3), least and greatest corner in its own frame, that cast its shadow."""
 
     s: float
     place: FloatArray
@@ -50,14 +50,14 @@ class Bridge:
         return np.asarray(direction @ _turn(self.heading))
 
     def near(self, x: FloatArray, y: FloatArray, margin_m: float | FloatArray) -> NDArray[np.bool_]:
-        """Which places lie on its ground, or within `margin_m` of it."""
+        """Which places lie within `margin_m` of its footprint."""
         own = self.inside(np.stack([x, y, np.zeros_like(x)], axis=-1))
         along, across = np.abs(own[..., 0]), np.abs(own[..., 1])
         return (along < self.half_along + margin_m) & (across < self.half_across + margin_m)
 
 
 def _turn(heading: float) -> FloatArray:
-    """From a bridge's frame to the world, for row vectors the other way round."""
+    """Rotation (3, 3) from a bridge's frame to the world; row vectors times it go the other way."""
     cos, sin = np.cos(heading), np.sin(heading)
     return np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
 
@@ -68,24 +68,24 @@ def free_of(
     y: FloatArray,
     margin_m: float | FloatArray = KEEP_FREE_M,
 ) -> NDArray[np.bool_]:
-    """Which places are clear of every bridge."""
+    """Which places are farther than `margin_m` from every bridge."""
     free = np.ones(np.shape(x), dtype=np.bool_)
     for bridge in bridges:
         free &= ~bridge.near(x, y, margin_m)
     return free
 
 
-def build(ground: Ground, look: Look, rng: np.random.Generator) -> tuple[Bridge, ...]:
-    """The bridges of a scene, about one every `look.bridge_every_m`, none of them at a place where
-    it would stand on another part of the track."""
-    if not look.bridges:
+def build(ground: Ground, theme: Theme, rng: np.random.Generator) -> tuple[Bridge, ...]:
+    """The bridges of a scene, about one every `theme.bridge_every_m`, none on another part of the
+    track."""
+    if not theme.bridges:
         return ()
     length = ground.road.track.length_m
     bridges: list[Bridge] = []
-    wanted = max(1, round(length / look.bridge_every_m * rng.uniform(0.7, 1.3)))
+    wanted = max(1, round(length / theme.bridge_every_m * rng.uniform(0.7, 1.3)))
     first = rng.uniform(0.0, length)
     for k in range(wanted):
-        style = look.bridges[int(rng.integers(len(look.bridges)))]
+        style = theme.bridges[int(rng.integers(len(theme.bridges)))]
         for _ in range(TRIES):
             s = float((first + (k + rng.uniform(0.0, 0.8)) * length / wanted) % length)
             apart = [abs((s - other.s + length / 2) % length - length / 2) for other in bridges]
@@ -99,8 +99,8 @@ def build(ground: Ground, look: Look, rng: np.random.Generator) -> tuple[Bridge,
 
 
 def _clear_of_the_road(ground: Ground, points: FloatArray, z: float) -> bool:
-    """Whether what lies lower than HEADROOM_M keeps outside the wall lines, of this or any other
-    part of the track; in a bend banks of earth may not."""
+    """Whether all parts lower than HEADROOM_M lie outside the wall lines of every part of the
+    track; in a bend an embankment may not."""
     corners = points.reshape(-1, 3, 3)
     edges = (corners + np.roll(corners, 1, axis=1)) / 2.0
     every = np.concatenate([points, edges.reshape(-1, 3)])
@@ -125,10 +125,10 @@ def _built(ground: Ground, s: float, style: str, rng: np.random.Generator) -> Br
         return None
     along = s + np.linspace(-6.0, 6.0, 7)[:, None]
     top = float(road.track.at(along, np.linspace(-reach, reach, 9) * 0.5).z.max() - place[2])
-    works = Works(road.wall_offset, max(top, 0.0) + CLEARANCE_M, lowest)
-    bridge_styles.STYLES[style](works, rng)
+    builder = BridgeBuilder(road.wall_offset, max(top, 0.0) + CLEARANCE_M, lowest)
+    bridge_styles.STYLES[style](builder, rng)
     heading = float(pose.heading)
-    triangles, boxes = works.triangles(), works.boxes()
+    triangles, boxes = builder.triangles(), builder.boxes()
     low, high = triangles[:, :3].min(axis=0), triangles[:, :3].max(axis=0)
     half_along, half_across = np.maximum(np.abs(low), np.abs(high))[:2]
     turn = _turn(heading)

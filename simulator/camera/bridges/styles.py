@@ -1,7 +1,7 @@
 """How bridges are built: decks, piers, railings, arches and gantries, in the bridge's own frame.
 
-x along the road, y to the left, z up from the road's centre, metres. Each style is told where the
-wall line is, the height that must stay free, and how deep the ground lies.
+x along the road, y to the left, z up from the road's centre, metres. Each style
+builds into a `BridgeBuilder`, which holds the dimensions of the site.
 """
 
 from collections.abc import Callable
@@ -31,7 +31,7 @@ SPAN_BEYOND_M = {"overpass": 13.0, "railway": 5.0, "footbridge": 3.0, "wooden": 
 """How far a bridge of each style reaches beyond the wall line."""
 
 
-class Works:
+class BridgeBuilder:
     """Gathers the triangles of a bridge and the boxes that cast its shadow.
 
     `wall` is the lateral offset of the wall line, `under` the least height of the underside of the
@@ -45,15 +45,17 @@ class Works:
 
     def box(self, size: Point, at: Point, colour: Point, material: float = PLAIN) -> None:
         """A closed box of `size` that stands on `at`, the middle of its floor, and its shadow."""
-        self.thin(size, at, colour, material)
-        self.shadow(size, at)
+        self.box_without_shadow(size, at, colour, material)
+        self.shadow_box(size, at)
 
-    def thin(self, size: Point, at: Point, colour: Point, material: float = PLAIN) -> None:
-        """The same of something too thin to throw a shadow that would be seen."""
+    def box_without_shadow(
+        self, size: Point, at: Point, colour: Point, material: float = PLAIN
+    ) -> None:
+        """The same for a box too thin to cast a visible shadow."""
         self._parts.append(box(size, at, colour, material, floor=True))
 
-    def shadow(self, size: Point, at: Point) -> None:
-        """Let a box throw a shadow without drawing it."""
+    def shadow_box(self, size: Point, at: Point) -> None:
+        """Add a box that casts a shadow but is not drawn."""
         half = np.array([size[0] / 2, size[1] / 2, 0.0])
         self._boxes.append(np.array([at - half, at + half + np.array([0.0, 0.0, size[2]])]))
 
@@ -75,8 +77,8 @@ class Works:
         left, up = np.array([0.0, facing * wide / 2, 0.0]), np.array([0.0, 0.0, high])
         front = np.array(at) - np.array([0.045 * facing, 0.0, 0.0])
         corners = [front + left, front - left, front - left + up, front + left + up]
-        self.thin((0.08, wide, high), at, (0.2, 0.2, 0.2))
-        self.shadow((0.25, wide, high), at)
+        self.box_without_shadow((0.08, wide, high), at, (0.2, 0.2, 0.2))
+        self.shadow_box((0.25, wide, high), at)
         letters = [(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)]
         self._parts.append(face(corners, letters, colour, BOARD))
 
@@ -85,11 +87,11 @@ class Works:
         return np.concatenate(self._parts)
 
     def boxes(self) -> FloatArray:
-        """Least and greatest corners of what throws a shadow, (m, 2, 3)."""
+        """Least and greatest corners of the boxes that cast a shadow, (m, 2, 3)."""
         return np.array(self._boxes).reshape(-1, 2, 3)
 
 
-Style = Callable[[Works, np.random.Generator], None]
+Style = Callable[[BridgeBuilder, np.random.Generator], None]
 """Builds one bridge."""
 
 
@@ -102,16 +104,18 @@ def _pick(rng: np.random.Generator, colours: tuple[Point, ...]) -> Point:
     return colours[int(rng.integers(len(colours)))]
 
 
-def _railing(works: Works, x: float, reach: float, foot: float, colour: Point, step: float) -> None:
+def _railing(
+    builder: BridgeBuilder, x: float, reach: float, foot: float, colour: Point, step: float
+) -> None:
     """Posts and two bars across the road at `x`."""
     for height in (0.5, 1.02):
-        works.thin((0.06, 2 * reach, 0.06), (x, 0.0, foot + height), colour)
+        builder.box_without_shadow((0.06, 2 * reach, 0.06), (x, 0.0, foot + height), colour)
     for y in np.arange(-reach, reach + 0.01, step):
-        works.thin((0.06, 0.06, 1.05), (x, float(y), foot), colour)
+        builder.box_without_shadow((0.06, 0.06, 1.05), (x, float(y), foot), colour)
 
 
-def _mounds(works: Works, width: float, reach: float, top: float, ground: float) -> None:
-    """Banks of earth that carry the way up to both ends of a deck."""
+def _mounds(builder: BridgeBuilder, width: float, reach: float, top: float, ground: float) -> None:
+    """Embankments up to both ends of a deck."""
     low, spread = ground - 1.0, 1.4 * (top - ground)
     for side in (-1.0, 1.0):
         crest = _ring(width / 2 + 0.3, side * (reach - 0.6), side * (reach + 5.0), top)
@@ -123,119 +127,119 @@ def _mounds(works: Works, width: float, reach: float, top: float, ground: float)
         )
         for k in range(4):
             pair = [foot[k], foot[(k + 1) % 4], crest[(k + 1) % 4], crest[k]]
-            works.face(pair if side > 0 else pair[::-1], NO_COLOUR, EARTH)
-        works.face(crest if side > 0 else crest[::-1], NO_COLOUR, EARTH)
+            builder.face(pair if side > 0 else pair[::-1], NO_COLOUR, EARTH)
+        builder.face(crest if side > 0 else crest[::-1], NO_COLOUR, EARTH)
 
 
 def _ring(x: float, y0: float, y1: float, z: float) -> list[FloatArray]:
     return [np.array([u, v, z]) for u, v in ((-x, y0), (x, y0), (x, y1), (-x, y1))]
 
 
-def overpass(works: Works, rng: np.random.Generator) -> None:
+def overpass(builder: BridgeBuilder, rng: np.random.Generator) -> None:
     """A road of concrete on rows of columns."""
-    wall, under, ground = works.wall, works.under, works.ground
+    wall, under, ground = builder.wall, builder.under, builder.ground
     width, depth = float(rng.uniform(7.0, 9.0)), 1.1
     reach, colour = half_span("overpass", wall), _pick(rng, CONCRETE)
-    works.box((width, 2 * reach, depth), (0.0, 0.0, under), colour, MASONRY)
+    builder.box((width, 2 * reach, depth), (0.0, 0.0, under), colour, MASONRY)
     for x in (-width / 2, width / 2):
-        works.box((0.3, 2 * reach, 0.75), (x, 0.0, under + depth - 0.2), colour, MASONRY)
-        _railing(works, x, reach, under + depth + 0.1, (0.3, 0.3, 0.3), 2.5)
+        builder.box((0.3, 2 * reach, 0.75), (x, 0.0, under + depth - 0.2), colour, MASONRY)
+        _railing(builder, x, reach, under + depth + 0.1, (0.3, 0.3, 0.3), 2.5)
     for y in (-wall - 1.0, wall + 1.0):
-        works.box((width * 0.86, 0.9, 0.7), (0.0, y, under - 0.7), colour, MASONRY)
+        builder.box((width * 0.86, 0.9, 0.7), (0.0, y, under - 0.7), colour, MASONRY)
         for x in np.linspace(-0.34, 0.34, 3) * width:
-            works.box(
+            builder.box(
                 (0.7, 0.7, under - ground + 0.6), (float(x), y, ground - 1.0), colour, MASONRY
             )
-    _mounds(works, width, reach, under + depth, ground)
+    _mounds(builder, width, reach, under + depth, ground)
 
 
-def railway(works: Works, rng: np.random.Generator) -> None:
+def railway(builder: BridgeBuilder, rng: np.random.Generator) -> None:
     """Steel plate girders on abutments of masonry."""
-    wall, under, ground = works.wall, works.under, works.ground
+    wall, under, ground = builder.wall, builder.under, builder.ground
     width, reach = 5.0, half_span("railway", wall)
     steel, stone = _pick(rng, STEEL), _pick(rng, STONE)
-    works.box((width, 2 * reach, 0.5), (0.0, 0.0, under), steel)
+    builder.box((width, 2 * reach, 0.5), (0.0, 0.0, under), steel)
     for x in (-width / 2, width / 2):
-        works.box((0.25, 2 * reach, 1.7), (x, 0.0, under), steel)
+        builder.box((0.25, 2 * reach, 1.7), (x, 0.0, under), steel)
         for y in np.arange(-reach, reach, 1.8):
-            works.thin((0.5, 0.12, 1.7), (x, float(y), under), steel)
+            builder.box_without_shadow((0.5, 0.12, 1.7), (x, float(y), under), steel)
     for side in (-1.0, 1.0):
         height = under - ground + 2.0
         at = (0.0, side * (wall + 3.0), ground - 1.0)
-        works.box((width + 1.6, 4.0, height), (at[0], at[1], at[2]), stone, MASONRY)
-    _mounds(works, width, reach, under + 0.9, ground)
+        builder.box((width + 1.6, 4.0, height), (at[0], at[1], at[2]), stone, MASONRY)
+    _mounds(builder, width, reach, under + 0.9, ground)
 
 
-def footbridge(works: Works, rng: np.random.Generator) -> None:
+def footbridge(builder: BridgeBuilder, rng: np.random.Generator) -> None:
     """A narrow steel deck with stairs down both sides."""
-    _walkway(works, "footbridge", _pick(rng, STEEL))
+    _walkway(builder, "footbridge", _pick(rng, STEEL))
 
 
-def wooden(works: Works, rng: np.random.Generator) -> None:
-    """The same of timber."""
-    _walkway(works, "wooden", WOOD)
+def wooden(builder: BridgeBuilder, rng: np.random.Generator) -> None:
+    """A footbridge of timber."""
+    _walkway(builder, "wooden", WOOD)
 
 
-def adverts(works: Works, rng: np.random.Generator) -> None:
+def adverts(builder: BridgeBuilder, rng: np.random.Generator) -> None:
     """A footbridge behind a board along its whole length, as race tracks have."""
-    wall, under = works.wall, works.under
-    _walkway(works, "adverts", (0.30, 0.30, 0.31))
+    wall, under = builder.wall, builder.under
+    _walkway(builder, "adverts", (0.30, 0.30, 0.31))
     reach, colour = half_span("adverts", wall), _pick(rng, ADVERTS)
     for x, facing in ((-1.42, 1.0), (1.42, -1.0)):
         count = max(2, round(2 * reach / 6.0))
         for k in range(count):
             y = (k + 0.5) * 2 * reach / count - reach
-            works.board((2 * reach / count, 1.7), (x, y, under - 0.05), colour, facing)
+            builder.board((2 * reach / count, 1.7), (x, y, under - 0.05), colour, facing)
 
 
-def _walkway(works: Works, style: str, colour: Point) -> None:
-    wall, under, ground = works.wall, works.under, works.ground
+def _walkway(builder: BridgeBuilder, style: str, colour: Point) -> None:
+    wall, under, ground = builder.wall, builder.under, builder.ground
     width, reach = 2.6, half_span(style, wall)
-    works.box((width, 2 * reach, 0.38), (0.0, 0.0, under), colour)
+    builder.box((width, 2 * reach, 0.38), (0.0, 0.0, under), colour)
     for x in (-width / 2, width / 2):
-        works.box((0.12, 2 * reach, 0.6), (x, 0.0, under - 0.1), colour)
-        _railing(works, x, reach, under + 0.38, colour, 2.0)
+        builder.box((0.12, 2 * reach, 0.6), (x, 0.0, under - 0.1), colour)
+        _railing(builder, x, reach, under + 0.38, colour, 2.0)
     for side in (-1.0, 1.0):
         for x in (-0.9, 0.9):
             at = (x, side * (wall + 1.0), ground - 1.0)
-            works.box((0.34, 0.34, under - ground + 1.0), at, colour)
-        _stairs(works, side * (reach - 1.0), under + 0.38, ground, colour)
+            builder.box((0.34, 0.34, under - ground + 1.0), at, colour)
+        _stairs(builder, side * (reach - 1.0), under + 0.38, ground, colour)
 
 
-def _stairs(works: Works, y: float, top: float, ground: float, colour: Point) -> None:
+def _stairs(builder: BridgeBuilder, y: float, top: float, ground: float, colour: Point) -> None:
     """A flight down along the road, from the deck's edge."""
     steps = max(4, round((top - ground) / 0.5))
     for k in range(steps):
         z = top - (k + 1) * (top - ground) / steps
-        works.thin((0.72, 1.7, 0.2), (1.6 + 0.7 * k, y, z), colour)
+        builder.box_without_shadow((0.72, 1.7, 0.2), (1.6 + 0.7 * k, y, z), colour)
     run = 1.3 + 0.7 * steps
     for edge in (y - 0.85, y + 0.85):
         corners = [
             np.array([1.2, edge, top - 0.5]), np.array([1.2 + run, edge, ground - 0.5]),
             np.array([1.2 + run, edge, ground + 0.9]), np.array([1.2, edge, top + 0.9]),
         ]  # fmt: skip
-        works.face(corners, colour, PLAIN)
+        builder.face(corners, colour, PLAIN)
 
 
-def gantry(works: Works, rng: np.random.Generator) -> None:
+def gantry(builder: BridgeBuilder, rng: np.random.Generator) -> None:
     """Two posts and a beam with direction signs over the lanes."""
-    wall, under, ground = works.wall, works.under, works.ground
+    wall, under, ground = builder.wall, builder.under, builder.ground
     steel, reach = (0.34, 0.35, 0.36), wall + 0.8
     for y in (-reach, reach):
-        works.box((0.35, 0.35, under - ground + 2.6), (0.0, y, ground - 1.0), steel)
+        builder.box((0.35, 0.35, under - ground + 2.6), (0.0, y, ground - 1.0), steel)
     for z in (under + 0.35, under + 1.35):
-        works.box((0.22, 2 * reach, 0.22), (0.0, 0.0, z), steel)
+        builder.box((0.22, 2 * reach, 0.22), (0.0, 0.0, z), steel)
     for y in np.arange(-reach, reach, 1.5):
-        works.thin((0.1, 0.1, 1.0), (0.0, float(y), under + 0.4), steel)
+        builder.box_without_shadow((0.1, 0.1, 1.0), (0.0, float(y), under + 0.4), steel)
     colour, count = _pick(rng, ROAD_SIGNS), int(rng.integers(2, 4))
     for k in range(count):
         y = (k + 0.5) * 1.3 * wall / count - 0.65 * wall
-        works.board((1.05 * wall / count, 2.2), (-0.25, y, under), colour, 1.0)
+        builder.board((1.05 * wall / count, 2.2), (-0.25, y, under), colour, 1.0)
 
 
-def arch(works: Works, rng: np.random.Generator) -> None:
+def arch(builder: BridgeBuilder, rng: np.random.Generator) -> None:
     """A segmental arch of masonry under a level parapet."""
-    wall, under, ground = works.wall, works.under, works.ground
+    wall, under, ground = builder.wall, builder.under, builder.ground
     width, reach, parts = float(rng.uniform(4.0, 6.0)), half_span("arch", wall), 20
     colour = _pick(rng, STONE)
     spring = wall + 0.6
@@ -245,18 +249,18 @@ def arch(works: Works, rng: np.random.Generator) -> None:
     z = crown - rise * (y / spring) ** 2
     top = crown + 1.6
     for a, b, za, zb in zip(y[:-1], y[1:], z[:-1], z[1:], strict=True):
-        _arch_part(works, width, (a, b), (za, zb), top, colour)
+        _arch_part(builder, width, (a, b), (za, zb), top, colour)
     for side in (-1.0, 1.0):
         height = top - ground + 1.0
         at = (0.0, side * (spring + (reach - spring) / 2), ground - 1.0)
-        works.box((width, reach - spring, height), at, colour, MASONRY)
+        builder.box((width, reach - spring, height), at, colour, MASONRY)
     coping = (0.8 * colour[0], 0.8 * colour[1], 0.8 * colour[2])
-    works.box((width + 0.35, 2 * reach, 0.25), (0.0, 0.0, top), coping, MASONRY)
-    _mounds(works, width, reach, top - 0.9, ground)
+    builder.box((width + 0.35, 2 * reach, 0.25), (0.0, 0.0, top), coping, MASONRY)
+    _mounds(builder, width, reach, top - 0.9, ground)
 
 
 def _arch_part(
-    works: Works,
+    builder: BridgeBuilder,
     width: float,
     y: tuple[float, float],
     z: tuple[float, float],
@@ -269,12 +273,12 @@ def _arch_part(
             near, far = far, near
         corners = [np.array([x, *near]), np.array([x, *far])]
         corners += [np.array([x, far[0], top]), np.array([x, near[0], top])]
-        works.face(corners, colour, MASONRY)
+        builder.face(corners, colour, MASONRY)
     x = width / 2
     vault = [(-x, y[0], z[0]), (-x, y[1], z[1]), (x, y[1], z[1]), (x, y[0], z[0])]
-    works.face([np.array(corner) for corner in vault], colour, MASONRY)
+    builder.face([np.array(corner) for corner in vault], colour, MASONRY)
     low = min(z)
-    works.shadow((width, y[1] - y[0], top - low), (0.0, (y[0] + y[1]) / 2, low))
+    builder.shadow_box((width, y[1] - y[0], top - low), (0.0, (y[0] + y[1]) / 2, low))
 
 
 STYLES: dict[str, Style] = {

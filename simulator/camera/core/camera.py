@@ -1,4 +1,4 @@
-"""The camera: pictures of a road and the cars on it, from a pose. World frame, metres, radians."""
+"""The camera: renders a road and the cars on it from a pose. World frame, metres, radians."""
 
 import math
 from collections.abc import Sequence
@@ -12,10 +12,10 @@ from numpy.typing import ArrayLike, NDArray
 from simulator.camera.core import optics
 from simulator.camera.core.context import FRAME_BINDING, Graphics, graphics
 from simulator.camera.core.render_modes import CLASS, COLOUR, DEPTH, ViewRequest
-from simulator.camera.scene.cars import cars_of
+from simulator.camera.scene.cars import shared_cars
 from simulator.camera.scene.light import Light
-from simulator.camera.scene.precipitation import Fall
-from simulator.camera.scene.scene import Scene, Seen
+from simulator.camera.scene.precipitation import Precipitation
+from simulator.camera.scene.scene import Scene, VisibleScene
 from simulator.camera.scene.sky import Sky
 from simulator.camera.scene.terrain import Survey
 from simulator.track.road import Road
@@ -40,29 +40,29 @@ def check_size(width: int, height: int) -> None:
 
 
 @dataclass(frozen=True)
-class _Setting:
-    """One scenery under one light, in the graphics memory; `frame` is its block of uniforms."""
+class _LoadedScene:
+    """One scene under one light in graphics memory; `frame` is its uniform block."""
 
     light: Light
     scene: Scene
     sky: Sky
-    fall: Fall | None
+    precipitation: Precipitation | None
     frame: NDArray[np.float32]
     first_paint: int
 
     def release(self) -> None:
         """Free the graphics memory."""
-        for part in (self.scene, self.sky, self.fall):
+        for part in (self.scene, self.sky, self.precipitation):
             if part is not None:
                 part.release()
 
 
 @dataclass(frozen=True)
 class _Shot:
-    """One aimed view: the eye, what of the scene it may see, and the cars, nearest first."""
+    """One view: the eye, the visible part of the scene, and the visible cars, nearest first."""
 
     eye: optics.Eye
-    seen: Seen
+    seen: VisibleScene
     cars: FloatArray
     paints: list[int]
 
@@ -70,9 +70,9 @@ class _Shot:
 class Camera:
     """Draws one scene: `road` with the scenery of `seed` under `light`.
 
-    It keeps the last `scenes` it showed ready. Cameras of a process share one OpenGL context (see
-    `context`); use them from one thread. The same road, seed, light, pose and cars give the same
-    bytes on the same renderer.
+    It keeps the last `scenes` scenes in graphics memory. Cameras of a process share one OpenGL
+    context (see `context`); use them from one thread. The same road, seed, light, pose and
+    cars give the same bytes on the same renderer.
     Raises UserError for a picture size out of range, NoRendererError without EGL.
     """
 
@@ -90,42 +90,42 @@ class Camera:
         self.width, self.height = parameters.width, parameters.height
         self.intrinsics: FloatArray = parameters.intrinsics()
         self._graphics: Graphics = graphics()
-        self._cars = cars_of(self._graphics)
+        self._cars = shared_cars(self._graphics)
         self._survey = Survey.of(road)
-        self._keeps = scenes
-        self._settings: dict[tuple[int, Light], _Setting] = {}
-        self._shown: _Setting | None = None
+        self._cache_size = scenes
+        self._cache: dict[tuple[int, Light], _LoadedScene] = {}
+        self._current: _LoadedScene | None = None
         self._last_s: float | None = None
         self.change_scene(seed, light)
 
     @property
     def light(self) -> Light:
-        """The light it draws under."""
-        return self._setting.light
+        """The light of the current scene."""
+        return self._loaded.light
 
     def change_scene(self, seed: int, light: Light) -> None:
-        """Go on with the scenery of another `seed` under another `light`, on the same road."""
-        self._shown = None
-        found = self._settings.pop((seed, light), None)
+        """Switch to the scenery of `seed` under `light`, on the same road."""
+        self._current = None
+        found = self._cache.pop((seed, light), None)
         if found is None:
-            while len(self._settings) >= self._keeps:
-                self._settings.pop(next(iter(self._settings))).release()
-            found = self._set_up(seed, light)
-        # Shown last comes last: the first is the one to go.
-        self._settings[seed, light] = self._shown = found
+            while len(self._cache) >= self._cache_size:
+                self._cache.pop(next(iter(self._cache))).release()
+            found = self._load_scene(seed, light)
+        # Least recently used first: that one is released next.
+        self._cache[seed, light] = self._current = found
 
-    def _set_up(self, seed: int, light: Light) -> _Setting:
+    def _load_scene(self, seed: int, light: Light) -> _LoadedScene:
         graphics = self._graphics
         frame = np.concatenate([np.zeros(24), *_light_rows(light)]).astype(np.float32)
         self._set_frame(frame, optics.eye_of(self.parameters, np.zeros(6), "front"))
-        return _Setting(
+        return _LoadedScene(
             light,
             Scene(graphics, self.road, self._survey, seed, light),
-            # Painted under the light of the frame that is set.
+            # Rendered with the light of the frame that is bound.
             Sky(graphics, light.weather, float(self.intrinsics[0, 0])),
-            Fall(graphics, light, seed) if light.falling > 0.0 else None,
+            Precipitation(graphics, light, seed) if light.falling > 0.0 else None,
             frame,
-            # Cars of different rounds differ in colour; from the second on, so as to spare our own.
+            # Cars of different rounds differ in colour; index 0 is that of our own car.
             first_paint=1 + seed % 5,
         )
 
@@ -161,7 +161,7 @@ class Camera:
         taken: dict[ViewRequest, Picture] = {}
         for view in dict.fromkeys(each.view for each in wanted.values()):
             kinds = {each.kind for each in wanted.values() if each.view == view}
-            shot = self._aim(body_pose, others, view)
+            shot = self._prepare(body_pose, others, view)
             if COLOUR in kinds:
                 taken[ViewRequest(view)] = self._draw_colours(shot)
             if kinds - {COLOUR}:
@@ -170,30 +170,30 @@ class Camera:
                 taken[ViewRequest(view, CLASS)] = labels[..., 1].astype(np.uint8)
         return {name: taken[each] for name, each in wanted.items()}
 
-    def _aim(self, body_pose: ArrayLike, others: ArrayLike | None, view: str) -> _Shot:
-        """Point at a view and find what it may show."""
-        setting = self._setting
+    def _prepare(self, body_pose: ArrayLike, others: ArrayLike | None, view: str) -> _Shot:
+        """Bind the frame of a view and cull what it does not show."""
+        loaded = self._loaded
         eye = optics.eye_of(self.parameters, body_pose, view)
-        self._set_frame(setting.frame, eye)
+        self._set_frame(loaded.frame, eye)
         planes = optics.frustum(eye, self.intrinsics)
         cars, paints = self._cars_in_view(body_pose, others, view)
-        chosen = self._cars.seen(cars, eye.place, planes)
+        chosen = self._cars.visible(cars, eye.place, planes)
         return _Shot(
-            eye, setting.scene.seen(eye, planes), cars[chosen], [paints[k] for k in chosen]
+            eye, loaded.scene.visible(eye, planes), cars[chosen], [paints[k] for k in chosen]
         )
 
     def _draw_colours(self, shot: _Shot) -> NDArray[np.uint8]:
-        setting, place = self._setting, shot.eye.place
+        loaded, place = self._loaded, shot.eye.place
         target = self._graphics.targets.of(self.width, self.height, labels=False)
         self._graphics.begin(target)
         self._cars.draw(shot.cars, shot.paints, place, labels=False)
-        setting.scene.draw(shot.seen, labels=False)
-        setting.sky.draw()
+        loaded.scene.draw(shot.seen, labels=False)
+        loaded.sky.draw()
         self._graphics.blend()
-        self._cars.draw_shadows(shot.cars, place, setting.light)
-        setting.scene.draw_blended(shot.seen)
-        if setting.fall is not None:
-            setting.fall.draw(shot.eye, self.intrinsics[0, 0])
+        self._cars.draw_shadows(shot.cars, place, loaded.light)
+        loaded.scene.draw_blended(shot.seen)
+        if loaded.precipitation is not None:
+            loaded.precipitation.draw(shot.eye, self.intrinsics[0, 0])
         return target.colours()
 
     def _draw_labels(self, shot: _Shot) -> NDArray[np.float32]:
@@ -201,13 +201,13 @@ class Camera:
         target = self._graphics.targets.of(self.width, self.height, labels=True)
         self._graphics.begin(target, labels=True)
         self._cars.draw(shot.cars, shot.paints, shot.eye.place, labels=True)
-        self._setting.scene.draw(shot.seen, labels=True)
+        self._loaded.scene.draw(shot.seen, labels=True)
         return target.labels()
 
     def extrinsics(self, view: str = "front", body_pose: ArrayLike = (0.0,) * 6) -> FloatArray:
         """Body frame to camera frame (4, 4): x right, y down, z ahead (the optical axis), metres.
 
-        Fixed for views of the car's mounts; `chase` and `top` keep level, so theirs depend on the
+        Fixed for views mounted on the car; `chase` and `top` stay level, so theirs depend on the
         roll and pitch of `body_pose`. With `intrinsics` K, K @ (E @ point)[:3] is (u, v, 1) times
         the depth. Raises UserError for an unknown view.
         """
@@ -222,10 +222,10 @@ class Camera:
         )
 
     def close(self) -> None:
-        """Free the scenes' graphics memory; the camera draws no more."""
-        for setting in self._settings.values():
-            setting.release()
-        self._settings, self._shown = {}, None
+        """Free the graphics memory; a closed camera cannot render."""
+        for loaded in self._cache.values():
+            loaded.release()
+        self._cache, self._current = {}, None
 
     def __enter__(self) -> Self:
         return self
@@ -243,14 +243,14 @@ class Camera:
         pose = np.asarray(body_pose, dtype=np.float64)
         s, _ = self.road.track.project(float(pose[0]), float(pose[1]), self._last_s)
         self._last_s = s
-        return self._setting.scene.mask.fraction(s, self.road.half_asphalt)
+        return self._loaded.scene.mask.fraction(s, self.road.half_asphalt)
 
     def _cars_in_view(
         self, body_pose: ArrayLike, others: ArrayLike | None, view: str
     ) -> tuple[FloatArray, list[int]]:
         """Poses (n, 6) on the ground of the cars to draw, and the number of each one's paint."""
         poses = np.asarray(() if others is None else others, dtype=np.float64).reshape(-1, 6)
-        first = self._setting.first_paint
+        first = self._loaded.first_paint
         paints = [first + k for k in range(len(poses))]
         if view in ("chase", "top"):
             own = np.asarray(body_pose, dtype=np.float64).copy()
@@ -259,10 +259,10 @@ class Camera:
         return poses, paints
 
     @property
-    def _setting(self) -> _Setting:
-        if self._shown is None:
+    def _loaded(self) -> _LoadedScene:
+        if self._current is None:
             raise RuntimeError("this camera is closed; make a new one")
-        return self._shown
+        return self._current
 
     def _set_frame(self, block: NDArray[np.float32], eye: optics.Eye) -> None:
         """Fill the uniform block `Frame` of frame.glsl, which `block` keeps."""
@@ -274,7 +274,7 @@ class Camera:
 
 
 def _light_rows(light: Light) -> list[tuple[float, ...]]:
-    """The rows of the uniform block `Frame` that tell of light and air."""
+    """The rows of the uniform block `Frame` of light and air."""
     return [
         (*light.sun_direction, light.shade),
         (*light.sun, light.exposure),

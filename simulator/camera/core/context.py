@@ -34,25 +34,25 @@ PROGRAMS = (
     "tree",
     "car",
     "spot",
-    "fall",
+    "precipitation",
 )
 FRAME_BINDING, SCENE_BINDING = 0, 1
 VERTEX_SHADERS = {"paved": "road", "verge": "road"}
-"""Where a program takes another's."""
+"""Programs that use the vertex shader of another name."""
 LIBRARIES = ("output.glsl", "weather.glsl", "road.glsl", "sea.glsl")
 """Functions for fragment shaders."""
 BLOCKS = {"Frame": FRAME_BINDING, "Scene": SCENE_BINDING}
-WEATHERED = ("sky", "land", "paved", "verge", "barrier", "prop", "tree")
-"""Programs that rain and snow change; each weather gets its own, so that dry ones cost no more."""
+WEATHER_PROGRAMS = ("sky", "land", "paved", "verge", "barrier", "prop", "tree")
+"""Programs with variants for rain and snow, so that dry scenes cost no more."""
 FRAME_FLOATS = 48
 NOISE_SIZE = 256
-NOISE_UNIT, SHADE_UNIT, ATLAS_UNIT, SKY_UNIT = range(4)
-UNITS = {"noise": NOISE_UNIT, "shade": SHADE_UNIT, "atlas": ATLAS_UNIT, "panorama": SKY_UNIT}
+NOISE_UNIT, SHADOW_UNIT, ATLAS_UNIT, SKY_UNIT = range(4)
+UNITS = {"noise": NOISE_UNIT, "shade": SHADOW_UNIT, "atlas": ATLAS_UNIT, "panorama": SKY_UNIT}
 """Texture units, by the name of the sampler."""
 
 
 class NoRendererError(UserError):
-    """OpenGL through EGL is not to be had on this machine."""
+    """OpenGL through EGL is not available on this machine."""
 
 
 class Graphics:
@@ -63,12 +63,12 @@ class Graphics:
         self.programs = {name: self._program(name) for name in PROGRAMS}
         size = (NOISE_SIZE, NOISE_SIZE)
         self.noise = self.context.texture(size, 4, noise_tile().tobytes())
-        self.mipmapped(self.noise)
+        self.build_mipmaps(self.noise)
         # The nearest mipmap alone: noise shows no step, and a frame is drawn 1 ms sooner.
         self.noise.filter = (self.context.LINEAR_MIPMAP_NEAREST, self.context.LINEAR)
         sheet = foliage.atlas()
         self.atlas = self.context.texture(sheet.shape[1::-1], 4, sheet.tobytes())
-        self.mipmapped(self.atlas)
+        self.build_mipmaps(self.atlas)
         self.atlas.filter = self.noise.filter
         self.atlas.repeat_x = self.atlas.repeat_y = False
         self.frame = self.context.buffer(reserve=FRAME_FLOATS * 4, dynamic=True)
@@ -77,7 +77,7 @@ class Graphics:
 
     @property
     def renderer(self) -> str:
-        """Name of what draws, such as "llvmpipe (LLVM 15.0.6, 256 bits)"."""
+        """Name of the OpenGL renderer, such as "llvmpipe (LLVM 15.0.6, 256 bits)"."""
         return str(self.context.info["GL_RENDERER"])
 
     def begin(self, target: Target, labels: bool = False) -> None:
@@ -92,7 +92,7 @@ class Graphics:
         self.atlas.use(ATLAS_UNIT)
 
     def blend(self) -> None:
-        """From here on lay pictures with alpha over what is drawn, and leave the depth alone."""
+        """Turn on alpha blending for what is drawn from here on."""
         self.context.enable(self.context.BLEND)
         self.context.blend_func = (self.context.SRC_ALPHA, self.context.ONE_MINUS_SRC_ALPHA)
 
@@ -105,16 +105,16 @@ class Graphics:
             raise TypeError(f"{name} of program {program} is no uniform")
         return member
 
-    def weathered(self, name: str, weather: str, *features: str) -> str:
+    def weather_program(self, name: str, weather: str, *features: str) -> str:
         """Name in `programs` of program `name` as it is in `weather` ("" when dry), with what the
         shaders know as `features` ("sea": the land has a shore)."""
-        defines = [*features, *([weather] if weather and name in WEATHERED else [])]
+        defines = [*features, *([weather] if weather and name in WEATHER_PROGRAMS else [])]
         key = " ".join([name, *defines])
         if key not in self.programs:
             self.programs[key] = self._program(name, *defines)
         return key
 
-    def labelling(self, name: str) -> str:
+    def label_program(self, name: str) -> str:
         """Name in `programs` of the program that draws what `name` draws as depth and class."""
         key = f"{name.split()[0]} labels"
         if key not in self.programs:
@@ -142,7 +142,7 @@ class Graphics:
                 member.value = UNITS[key]
         return program
 
-    def mipmapped(self, texture: "moderngl.Texture") -> None:
+    def build_mipmaps(self, texture: "moderngl.Texture") -> None:
         """Build the texture's mipmaps and let it be filtered through them."""
         texture.build_mipmaps()
         texture.filter = (self.context.LINEAR_MIPMAP_LINEAR, self.context.LINEAR)

@@ -1,4 +1,4 @@
-"""What an eye may see: spheres against the side planes of its picture, in compiled code."""
+"""Frustum culling: bounding spheres against the side planes of a view, in compiled code."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +10,7 @@ Fan = NDArray[np.int64]
 
 
 @compiled
-def runs_seen(
+def visible_runs(
     spheres: FloatArray,
     first: NDArray[np.int64],
     count: NDArray[np.int64],
@@ -36,7 +36,7 @@ def runs_seen(
             level += 1
         if level == len(reaches) or start + 2.0 * radius <= nearest:
             continue
-        if not _meets(x, y, z, radius, planes):
+        if not _intersects(x, y, z, radius, planes):
             continue
         if count[level, k] == 0:
             continue
@@ -50,7 +50,7 @@ def runs_seen(
 
 
 @compiled
-def balls_seen(
+def visible_spheres(
     centres: FloatArray,
     radii: FloatArray,
     reach: float,
@@ -58,15 +58,14 @@ def balls_seen(
     eye: FloatArray,
     planes: FloatArray,
 ) -> NDArray[np.int64]:
-    """The balls (numbers, the nearest first) that meet the frustum within `reach`, `most` of them
-    at most."""
+    """Indices, nearest first, of the spheres in the frustum within `reach`; at most `most`."""
     chosen = np.empty(len(centres), dtype=np.int64)
     distance = np.empty(len(centres))
     found = 0
     for k in range(len(centres)):
         x, y, z = centres[k, 0] - eye[0], centres[k, 1] - eye[1], centres[k, 2] - eye[2]
         squared = x * x + y * y + z * z
-        if squared < reach * reach and _meets(x, y, z, radii[k], planes):
+        if squared < reach * reach and _intersects(x, y, z, radii[k], planes):
             chosen[found], distance[found] = k, squared
             found += 1
     order = np.argsort(distance[:found], kind="mergesort")
@@ -74,7 +73,7 @@ def balls_seen(
 
 
 @compiled
-def fans(
+def triangle_indices(
     trees: NDArray[np.int64], near: int, corners: int, near_fan: Fan, far_fan: Fan
 ) -> NDArray[np.uint32]:
     """Indices (triangles, 3) of the `trees`, each of `corners` vertices: of the first `near` by
@@ -93,7 +92,7 @@ def fans(
 
 
 @compiled
-def _meets(x: float, y: float, z: float, radius: float, planes: FloatArray) -> bool:
+def _intersects(x: float, y: float, z: float, radius: float, planes: FloatArray) -> bool:
     inside = True
     for plane in planes:
         inside &= x * plane[0] + y * plane[1] + z * plane[2] > -radius

@@ -1,4 +1,4 @@
-"""Meshes on the graphics card, drawn chunk by chunk where the eye can see them."""
+"""Triangle meshes in graphics memory, drawn by chunks that pass frustum culling."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from simulator.camera.core.context import Graphics
-from simulator.camera.core.frustum_culling import runs_seen
+from simulator.camera.core.frustum_culling import visible_runs
 
 if TYPE_CHECKING:
     import moderngl
@@ -66,20 +66,20 @@ class Mesh:
         context = graphics.context
         self._vertices = context.buffer(np.ascontiguousarray(surface.vertices).tobytes())
         self._indices = context.buffer(np.ascontiguousarray(surface.indices).tobytes())
-        self._arrays = both_ways(graphics, program, self._vertices, self._indices, layout)
+        self._arrays = vertex_arrays(graphics, program, self._vertices, self._indices, layout)
         chunks = surface.chunks
         self._spheres = np.column_stack([chunks.centres, chunks.radii])
         self._levels = chunks.first, chunks.count, np.array(chunks.reaches), chunks.nearest
         self._runs = np.empty((len(self._spheres), 2), dtype=np.int64)
 
-    def seen(self, eye: FloatArray, planes: FloatArray) -> list[list[int]]:
-        """What to draw for an eye: (first, count) runs of indices."""
-        found = runs_seen(self._spheres, *self._levels, eye, planes, self._runs)
+    def visible(self, eye: FloatArray, planes: FloatArray) -> list[list[int]]:
+        """Frustum culling: the (first, count) runs of indices visible from `eye` (3,)."""
+        found = visible_runs(self._spheres, *self._levels, eye, planes, self._runs)
         runs: list[list[int]] = self._runs[:found].tolist()
         return runs
 
     def draw(self, runs: list[list[int]], labels: bool) -> None:
-        """Draw the runs that are seen, as depth and class or in their colours."""
+        """Draw the visible runs, as depth and class (`labels`) or in colour."""
         array = self._arrays[labels]
         for first, count in runs:
             array.render(vertices=count, first=first)
@@ -92,7 +92,7 @@ class Mesh:
         self._vertices.release()
 
 
-def both_ways(
+def vertex_arrays(
     graphics: Graphics,
     program: str,
     vertices: "moderngl.Buffer",
@@ -109,6 +109,6 @@ def both_ways(
             index_element_size=4,
             skip_errors=True,
         )
-        for name in (program, graphics.labelling(program))
+        for name in (program, graphics.label_program(program))
     )
     return drawn, labelled

@@ -1,4 +1,4 @@
-"""Where the eye is and how it sees: views, pinhole projection.
+"""Camera views and the pinhole projection.
 
 Body frame: x ahead, y to the left, z up, origin at the centre of gravity; a body pose is
 (x, y, z, roll, pitch, yaw) as PyBullet's Euler angles (R = Rz Ry Rx, pitch positive nose down).
@@ -31,7 +31,7 @@ _TOP_UP_M = 24.0
 
 @dataclass(frozen=True)
 class Eye:
-    """One eye in the world: `place` (3,) m and `axes` (3, 3), rows right, up and ahead."""
+    """A camera pose in the world: `place` (3,) m and `axes` (3, 3), rows right, up and ahead."""
 
     place: FloatArray
     axes: FloatArray
@@ -57,7 +57,7 @@ def eye_of(camera: CameraParameters, body_pose: ArrayLike, view: str) -> Eye:
     pose = np.asarray(body_pose, dtype=np.float64)
     yaw = float(pose[5])
     if view == "chase":
-        # Behind the car but level with the horizon, as a following camera is.
+        # Behind the car, without roll.
         turn = rotation(0.0, math.radians(_CHASE_PITCH_DEG), yaw)
         back = rotation(0.0, float(pose[4]), yaw) @ np.array([-_CHASE_BACK_M, 0.0, 0.0])
         return _eye(pose[:3] + back + np.array([0.0, 0.0, _CHASE_UP_M]), turn)
@@ -117,7 +117,7 @@ def _pixels(
 def clip_matrix(eye: Eye, matrix: FloatArray, width: int, height: int) -> FloatArray:
     """From eye-relative world coordinates to clip space (4, 4), row vectors last.
 
-    The picture comes out upside down in GL's sense: its first row in memory is the top one.
+    The image is flipped against OpenGL's convention: its first row in memory is the top one.
     """
     x_scale = 2.0 * matrix[0, 0] / width
     y_scale = 2.0 * matrix[1, 1] / height

@@ -1,4 +1,4 @@
-"""What a picture can hold of a view: its colours, the depth or the class of each pixel."""
+"""Kinds of image of a view: colour, or the depth or class of each pixel."""
 
 from dataclasses import dataclass
 from typing import Self
@@ -7,15 +7,15 @@ from simulator.camera.core.optics import VIEWS
 from trackfeatures.errors import UserError
 
 CLASSES: tuple[str, ...] = ("road", "marking", "car", "ground", "sky", "object")
-"""Classes of a pixel by their number. `object` is what else stands beside the road: trees, rails,
-houses, signs; kerb, verge and land are `ground`; paint that is worn off is `road`."""
+"""Classes of a pixel by their number. `object` is all else beside the road: trees, rails,
+houses, signs; kerb, verge and terrain are `ground`; worn-off paint is `road`."""
 
 COLOUR, DEPTH, CLASS = PICTURE_KINDS = ("colour", "depth", "class")
 
 
 @dataclass(frozen=True)
 class ViewRequest:
-    """One picture of several: a view, and what of it."""
+    """A requested image: view and kind."""
 
     view: str
     kind: str = COLOUR

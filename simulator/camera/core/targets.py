@@ -1,4 +1,4 @@
-"""What pictures are drawn to: a frame of colours, or one of depth and class, and the way back."""
+"""Framebuffers for colour or for depth and class, and reading them back."""
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     import moderngl
 
 GPU_SAMPLES = 4
-"""Samples a pixel on a GPU. On llvmpipe one: four took 24 ms a frame instead of 6, and road and
+"""Samples per pixel on a GPU. On llvmpipe one: four took 24 ms a frame instead of 6, and road and
 paint are filtered in the shader anyway."""
 _KEPT = 16
 _SKY = float(CLASSES.index("sky"))
@@ -28,7 +28,7 @@ class Target:
     resolved: "moderngl.Framebuffer"
 
     def clear(self, labels: bool) -> None:
-        """Make it the one that is drawn to, with nothing on it: for labels, sky at infinity."""
+        """Bind and clear it; labels are cleared to sky at infinity."""
         self.drawn.use()
         if labels:
             self.drawn.clear(np.inf, _SKY)
@@ -63,7 +63,7 @@ class Target:
 
 
 class Targets:
-    """The targets of a context by size; the few latest are kept."""
+    """The targets of a context by size; a limited number is kept."""
 
     def __init__(self, context: "moderngl.Context", samples: int) -> None:
         self._context, self._samples = context, samples

@@ -1,15 +1,15 @@
 """Rails, walls, hedges and fences along both wall lines of the road, changing by section.
 
-World frame, metres. What is solid about them in the physics is `simulator.world.walls`.
+World frame, metres. Their collision shapes are in `simulator.world.walls`.
 """
 
 import numpy as np
 from numpy.typing import NDArray
 
 from simulator.camera.core.mesh import Surface
-from simulator.camera.scene.road_mesh import Ribbon
+from simulator.camera.scene.road_mesh import RoadMesh
 from simulator.camera.scene.strips import Level, strip
-from simulator.camera.scene.themes import Look
+from simulator.camera.scene.themes import Theme
 from simulator.track.road import Road
 
 FloatArray = NDArray[np.float64]
@@ -22,26 +22,26 @@ SECTION_M = (90.0, 420.0)
 LEVELS = (Level(35.0, 0.005, 16.0), Level(120.0, 0.03, 32.0), Level(300.0, 0.1, 64.0))
 
 
-def build(road: Road, ribbon: Ribbon, look: Look, rng: np.random.Generator) -> Surface:
+def build(road: Road, mesh: RoadMesh, theme: Theme, rng: np.random.Generator) -> Surface:
     """Both sides' barriers; a vertex is x, y, z, s, height, kind, normal (3)."""
     grids, profiles = [], []
-    for side, column in zip((1.0, -1.0), ribbon.wall, strict=True):
-        kind = _sections(ribbon.s, road.track.length_m, look, rng)
-        grid = _one_side(ribbon, road, side, column, kind)
+    for side, column in zip((1.0, -1.0), mesh.wall, strict=True):
+        kind = _sections(mesh.s, road.track.length_m, theme, rng)
+        grid = _one_side(mesh, road, side, column, kind)
         grids.append(grid)
-        # A row at which the kind changes says so loudly enough to stay.
-        profiles.append(np.column_stack([ribbon.points[:, column], 100.0 * kind]))
+        # The large weight keeps every row at which the kind changes.
+        profiles.append(np.column_stack([mesh.points[:, column], 100.0 * kind]))
     # One strip, the right side after the left; the quads that would join them have no area.
     left, right = grids
     bridge = np.stack([left[-1], right[0]])
     bridge[:, :, :3] = right[0, 0, :3]
     vertices = np.concatenate([left, bridge, right])
     ends = np.stack([profiles[0][-1], profiles[1][0]]) + 1e6
-    length = ribbon.s[-1]
+    length = mesh.s[-1]
     return strip(
         vertices,
         vertices[..., :3].astype(np.float64),
-        np.concatenate([ribbon.s, [length + 1.0, length + 2.0], length + 3.0 + ribbon.s]),
+        np.concatenate([mesh.s, [length + 1.0, length + 2.0], length + 3.0 + mesh.s]),
         np.concatenate([profiles[0], ends, profiles[1]]),
         [((0, 1), (1, 2))] * len(LEVELS),
         LEVELS,
@@ -49,21 +49,21 @@ def build(road: Road, ribbon: Ribbon, look: Look, rng: np.random.Generator) -> S
 
 
 def _sections(
-    s: FloatArray, length: float, look: Look, rng: np.random.Generator
+    s: FloatArray, length: float, theme: Theme, rng: np.random.Generator
 ) -> NDArray[np.intp]:
     """Kind of barrier of each row."""
     count = int(length / SECTION_M[0]) + 2
     ends = np.cumsum(rng.uniform(*SECTION_M, count))
-    choice = rng.choice(np.array([KINDS.index(kind) for kind in look.barriers]), count)
+    choice = rng.choice(np.array([KINDS.index(kind) for kind in theme.barriers]), count)
     return np.asarray(choice[np.searchsorted(ends, np.minimum(s, ends[-2]))], dtype=np.intp)
 
 
 def _one_side(
-    ribbon: Ribbon, road: Road, side: float, column: int, kind: NDArray[np.intp]
+    mesh: RoadMesh, road: Road, side: float, column: int, kind: NDArray[np.intp]
 ) -> NDArray[np.float32]:
     """Vertices (R, 3, 9): the foot, the upper edge, and the far edge of the top."""
-    foot = ribbon.points[:, column].copy()
-    heading = road.track.at(ribbon.s).heading
+    foot = mesh.points[:, column].copy()
+    heading = road.track.at(mesh.s).heading
     outwards = side * np.stack([-np.sin(heading), np.cos(heading), np.zeros_like(heading)], axis=1)
     height, thick = HEIGHT_M[kind], THICK_M[kind]
     up = np.array([0.0, 0.0, 1.0])
@@ -72,7 +72,7 @@ def _one_side(
     grid = np.empty((len(foot), 3, 9), dtype=np.float32)
     grid[:, 0, :3] = foot - 0.25 * up
     grid[:, 1, :3], grid[:, 2, :3] = edge, far
-    grid[..., 3] = ribbon.s[:, None]
+    grid[..., 3] = mesh.s[:, None]
     grid[:, 0, 4], grid[:, 1, 4], grid[:, 2, 4] = -0.25, height, height + thick
     grid[..., 5] = kind[:, None]
     grid[..., 6:9] = -outwards[:, None]

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from simulator.camera.core.context import Graphics
-from simulator.camera.core.mesh import both_ways
+from simulator.camera.core.mesh import vertex_arrays
 from simulator.camera.core.optics import rotation
 from simulator.camera.scene.light import Light
 
@@ -25,7 +25,7 @@ REACH_M, NEAR_M = 350.0, 40.0
 SHADOW_REACH_M = 120.0
 _RADIUS_M = 3.0
 _LONGEST_SHADOW = 4.0
-"""A low sun draws shadows out to at most this times the height."""
+"""Largest length of a shadow, as a multiple of the height."""
 
 PAINTS: tuple[Point, ...] = (
     (0.42, 0.025, 0.022), (0.03, 0.07, 0.28), (0.62, 0.62, 0.60), (0.035, 0.036, 0.04),
@@ -44,8 +44,8 @@ _WHEELS_X, _WHEEL_RADIUS = (-1.35, 1.32), 0.33
 
 @dataclass(frozen=True)
 class CarMesh:
-    """Triangles of a car, (3 T, 9) float32: place, normal, colour. From near the first `near`
-    vertices are drawn, from afar those from `far` on, with fewer corners to the wheels."""
+    """Triangles of a car, (3 T, 9) float32: place, normal, colour. The near level of detail is the
+    first `near` vertices; the far one those from `far` on, with simpler wheels."""
 
     vertices: NDArray[np.float32]
     near: int
@@ -160,7 +160,7 @@ def _far_wheel(x: float, side: float) -> list[FloatArray]:
 
 
 def _fittings() -> list[FloatArray]:
-    """Lights, number plates and bumpers, a finger's breadth off the body."""
+    """Lights, number plates and bumpers, 2.5 cm off the body."""
     parts = []
     for y0, y1 in ((0.78, 0.48), (-0.48, -0.78)):
         parts.append(_rear_panel(y0, y1, 0.66, 0.84, _TAIL))
@@ -182,12 +182,12 @@ def _front_panel(y0: float, y1: float, z0: float, z1: float, colour: Point) -> F
 
 
 class Cars:
-    """The car mesh of a process and what draws it."""
+    """The car mesh, shared by all cameras of a process, and its drawing."""
 
     def __init__(self, graphics: Graphics) -> None:
         context = graphics.context
         self._stands = [
-            graphics.uniform(name, "stand") for name in ("car", graphics.labelling("car"))
+            graphics.uniform(name, "stand") for name in ("car", graphics.label_program("car"))
         ]
         self._paint = graphics.uniform("car", "paint")
         self._spot = {name: graphics.uniform("spot", name) for name in ("stand", "reach", "middle")}
@@ -195,15 +195,15 @@ class Cars:
         mesh = car_mesh()
         triangles = context.buffer(mesh.vertices.tobytes())
         self._near, self._far = (0, mesh.near), (mesh.far, len(mesh.vertices) - mesh.far)
-        self._meshes = both_ways(
+        self._meshes = vertex_arrays(
             graphics, "car", triangles, None, ("3f 3f 3f", "at", "facing", "colour")
         )
         corners = np.array([-1, -1, 1, -1, -1, 1, 1, 1], dtype=np.float32)
         patch = context.buffer(corners.tobytes())
         self._patch = context.vertex_array(graphics.programs["spot"], [(patch, "2f", "corner")])
 
-    def seen(self, poses: FloatArray, eye: FloatArray, planes: FloatArray) -> NDArray[np.intp]:
-        """Which cars of `poses` (n, 6) may show, nearest first."""
+    def visible(self, poses: FloatArray, eye: FloatArray, planes: FloatArray) -> NDArray[np.intp]:
+        """Indices of the cars of `poses` (n, 6) in the frustum, nearest first."""
         if len(poses) == 0:
             return np.empty(0, dtype=np.intp)
         relative = poses[:, :3] - eye
@@ -212,16 +212,16 @@ class Cars:
         return np.flatnonzero(inside)[np.argsort(distance[inside], kind="stable")]
 
     def draw(self, poses: FloatArray, paints: list[int], eye: FloatArray, labels: bool) -> None:
-        """The bodies at `poses` (n, 6), in the paints of these numbers."""
+        """Draw the cars at `poses` (n, 6), with these indices of PAINTS."""
         for pose, paint in zip(poses, paints, strict=True):
-            self._stands[labels].write(_stand(pose, eye).tobytes())
+            self._stands[labels].write(_model_matrix(pose, eye).tobytes())
             self._paint.value = PAINTS[paint % len(PAINTS)]
             near = np.linalg.norm(pose[:3] - eye) < NEAR_M
             first, count = self._near if near else self._far
             self._meshes[labels].render(vertices=count, first=first)
 
     def draw_shadows(self, poses: FloatArray, eye: FloatArray, light: Light) -> None:
-        """The shadows on the ground; blending must be on."""
+        """Draw the shadows on the ground; blending must be on."""
         x, y, z = light.sun_direction
         fall = np.array([-x, -y]) / max(z, 1e-3)
         fall *= min(1.0, _LONGEST_SHADOW / max(float(np.hypot(*fall)), 1e-9))
@@ -230,13 +230,13 @@ class Cars:
                 continue
             cos, sin = np.cos(pose[5]), np.sin(pose[5])
             run = np.array([cos * fall[0] + sin * fall[1], -sin * fall[0] + cos * fall[1]])
-            self._spot["stand"].write(_stand(pose, eye).tobytes())
+            self._spot["stand"].write(_model_matrix(pose, eye).tobytes())
             self._spot["reach"].value = (*run, *(np.array([2.9, 1.6]) + 0.7 * np.abs(run)))
             self._spot["middle"].value = tuple(0.7 * run)
             self._patch.render(self._context.TRIANGLE_STRIP)
 
 
-def cars_of(graphics: Graphics) -> Cars:
+def shared_cars(graphics: Graphics) -> Cars:
     """The cars of this graphics, made on first use."""
     if graphics not in _made:
         _made[graphics] = Cars(graphics)
@@ -246,7 +246,7 @@ def cars_of(graphics: Graphics) -> Cars:
 _made: WeakKeyDictionary[Graphics, Cars] = WeakKeyDictionary()
 
 
-def _stand(pose: FloatArray, eye: FloatArray) -> NDArray[np.float32]:
+def _model_matrix(pose: FloatArray, eye: FloatArray) -> NDArray[np.float32]:
     """Car frame to eye-relative world, (4, 4), column by column as GL wants it."""
     matrix = np.eye(4)
     matrix[:3, :3] = rotation(float(pose[3]), float(pose[4]), float(pose[5]))

@@ -1,5 +1,5 @@
-"""The terrain grid as triangles: fine cells near the eye, coarse ones to the horizon; and how much
-of it lies in the shade of trees."""
+"""The terrain grid as triangle meshes, fine near the viewer and coarse up to the horizon, and the
+share of sunlight that trees keep from it. World frame, metres."""
 
 from dataclasses import dataclass
 
@@ -19,20 +19,20 @@ BLOCK = 4
 SMOOTH_M = 9.0
 MOST_SHADE = 0.8
 CANOPY, CANOPY_M = 0.55, 30.0
-"""In the heavy-shadow light trees stand so thick beside the road, to so far from its middle."""
+"""In the heavy-shadow light: shade of the canopy, and up to which distance from the road."""
 
 
 @dataclass(frozen=True)
-class Shadiness:
-    """Share of the sun that trees keep from the land, on the terrain's grid `shade` (rows y,
-    columns x), 0 to MOST_SHADE: smooth, where single shadows would be lost."""
+class TreeShade:
+    """Share of sunlight that trees keep from the terrain: `shade` (rows y, columns x) on its grid,
+    0 to MOST_SHADE. Smoothed: single shadows are not resolved."""
 
     terrain: Terrain
     shade: FloatArray
 
     @classmethod
-    def of(cls, terrain: Terrain, line: CentreLine, trees: Trees, light: Light) -> "Shadiness":
-        """The shade of `trees` under the sun of `light`, none where that casts no hard shadow."""
+    def of(cls, terrain: Terrain, line: CentreLine, trees: Trees, light: Light) -> "TreeShade":
+        """The shade of `trees` under the sun of `light`, zero where it casts no hard shadow."""
         shade: FloatArray = np.zeros(terrain.z.shape)
         if light.shade >= 0.5:
             return cls(terrain, shade)
@@ -61,8 +61,8 @@ class Shadiness:
 
 @dataclass(frozen=True)
 class Span:
-    """Where one grid of the land is drawn: cells of `step` x `step` of the finest, in chunks from
-    `start_m` to `reach_m`; where the road's ribbon lies on it too (`bare`), or not."""
+    """One level of detail of the terrain: cells of `step` x `step` of the finest grid, drawn in
+    chunks from `start_m` to `reach_m`; `bare`: also where the road mesh covers it."""
 
     step: int
     start_m: float
@@ -70,9 +70,12 @@ class Span:
     bare: bool
 
 
-def surface(land: Shadiness, hidden: NDArray[np.bool_], span: Span) -> Surface:
-    """The land by one grid, nowhere above the finest; a vertex is x, y, z, normal, share of the sun
-    that reaches it. `hidden` says which points (rows, columns) of the finest the ribbon covers."""
+def surface(land: TreeShade, hidden: NDArray[np.bool_], span: Span) -> Surface:
+    """The terrain at one level of detail, nowhere above the finest one.
+
+    A vertex is x, y, z, normal (3), share of sunlight. `hidden` (rows, columns) marks the points of
+    the finest grid that the road mesh covers.
+    """
     terrain, every = land.terrain, (slice(None, None, span.step),) * 2
     z, normals = lowered(terrain.z, span.step), terrain.normals()[every]
     rows, columns = z.shape
@@ -91,8 +94,8 @@ def surface(land: Shadiness, hidden: NDArray[np.bool_], span: Span) -> Surface:
 
 
 def lowered(z: FloatArray, step: int) -> FloatArray:
-    """Every `step`-th height of `z`, each as much lower as the triangles between them would rise
-    over any height beside it."""
+    """Every `step`-th height of `z`, each lowered by the most that the coarse triangles rise above
+    the fine heights next to it."""
     kept = z[::step, ::step]
     if step == 1:
         return kept

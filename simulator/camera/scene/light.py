@@ -1,4 +1,4 @@
-"""Light and air: where the sun stands, how bright sun and sky are, how far one sees.
+"""Light and weather: direction of the sun, brightness of sun and sky, visibility.
 
 Colours are linear RGB; azimuth in rad counter-clockwise from world x, elevation in rad.
 """
@@ -14,7 +14,7 @@ Colour = tuple[float, float, float]
 
 KINDS: tuple[str, ...] = ("clear", "overcast", "dusk", "fog", "heavy-shadow", "rain", "snow")
 WEATHERS: tuple[str, ...] = ("rain", "snow")
-"""The kinds in which something falls; the others are dry."""
+"""The kinds with precipitation; the others are dry."""
 
 
 @dataclass(frozen=True)
@@ -37,12 +37,12 @@ class Light:
     """Share of the sky that is cloud, 0 to 1."""
     shade: float
     canopy: bool = False
-    """The hard case: trees meet over the road and dapple it."""
+    """Whether trees meet over the road and cast dappled shadow on it (kind "heavy-shadow")."""
     exposure: float = 1.0
     cover: float = 0.0
     """Rain: how wet the road is; snow: how much of it is white; 0 to 1."""
     falling: float = 0.0
-    """How thick rain or snow falls, 0 to 1."""
+    """Density of rain or snow, 0 to 1."""
 
     @property
     def weather(self) -> str:
@@ -51,9 +51,9 @@ class Light:
 
     @staticmethod
     def named(kind: str, rng: np.random.Generator) -> "Light":
-        """A light of `kind` with what varies in it drawn from `rng`."""
+        """A light of `kind`, its random parameters drawn from `rng`. UserError if unknown."""
         check_light(kind)
-        light = _MAKERS[kind](rng)
+        light = _SAMPLERS[kind](rng)
         return replace(light, exposure=float(np.exp(rng.uniform(-0.16, 0.16))))
 
     @property
@@ -73,7 +73,7 @@ def check_light(kind: str) -> None:
         raise UserError(f"unknown light '{kind}'; the lights are {', '.join(KINDS)}")
 
 
-def _tinted(colour: Colour, rng: np.random.Generator, amount: float) -> Colour:
+def _jitter(colour: Colour, rng: np.random.Generator, amount: float) -> Colour:
     red, green, blue = (float(c * (1.0 + rng.uniform(-amount, amount))) for c in colour)
     return red, green, blue
 
@@ -87,10 +87,10 @@ def _clear(rng: np.random.Generator) -> Light:
         sun_azimuth=rng.uniform(-math.pi, math.pi),
         sun_elevation=elevation,
         sun=(1.9 * strength, 1.8 * strength * (0.5 + 0.5 * warm), 1.62 * strength * warm),
-        sky=_tinted((0.42, 0.48, 0.60), rng, 0.08),
-        zenith=_tinted((0.10, 0.24, 0.62), rng, 0.15),
-        horizon=_tinted((0.62, 0.74, 0.86), rng, 0.08),
-        haze=_tinted((0.60, 0.70, 0.80), rng, 0.08),
+        sky=_jitter((0.42, 0.48, 0.60), rng, 0.08),
+        zenith=_jitter((0.10, 0.24, 0.62), rng, 0.15),
+        horizon=_jitter((0.62, 0.74, 0.86), rng, 0.08),
+        haze=_jitter((0.60, 0.70, 0.80), rng, 0.08),
         haze_per_km=rng.uniform(0.25, 1.1),
         clouds=rng.uniform(0.0, 0.55),
         shade=0.0,
@@ -104,10 +104,10 @@ def _overcast(rng: np.random.Generator) -> Light:
         sun_azimuth=rng.uniform(-math.pi, math.pi),
         sun_elevation=math.radians(55.0),
         sun=(0.16 * grey, 0.16 * grey, 0.16 * grey),
-        sky=_tinted((1.25 * grey, 1.28 * grey, 1.34 * grey), rng, 0.04),
-        zenith=_tinted((0.42 * grey, 0.45 * grey, 0.50 * grey), rng, 0.06),
-        horizon=_tinted((0.62 * grey, 0.64 * grey, 0.67 * grey), rng, 0.05),
-        haze=_tinted((0.58 * grey, 0.60 * grey, 0.63 * grey), rng, 0.05),
+        sky=_jitter((1.25 * grey, 1.28 * grey, 1.34 * grey), rng, 0.04),
+        zenith=_jitter((0.42 * grey, 0.45 * grey, 0.50 * grey), rng, 0.06),
+        horizon=_jitter((0.62 * grey, 0.64 * grey, 0.67 * grey), rng, 0.05),
+        haze=_jitter((0.58 * grey, 0.60 * grey, 0.63 * grey), rng, 0.05),
         haze_per_km=rng.uniform(0.8, 2.5),
         clouds=1.0,
         shade=0.85,
@@ -121,10 +121,10 @@ def _dusk(rng: np.random.Generator) -> Light:
         sun_azimuth=rng.uniform(-math.pi, math.pi),
         sun_elevation=math.radians(rng.uniform(7.0, 14.0)),
         sun=(1.35 * warm, 0.72 * warm, 0.36),
-        sky=_tinted((0.34, 0.33, 0.42), rng, 0.1),
-        zenith=_tinted((0.13, 0.18, 0.36), rng, 0.15),
-        horizon=_tinted((0.85, 0.52, 0.33), rng, 0.12),
-        haze=_tinted((0.55, 0.43, 0.38), rng, 0.1),
+        sky=_jitter((0.34, 0.33, 0.42), rng, 0.1),
+        zenith=_jitter((0.13, 0.18, 0.36), rng, 0.15),
+        horizon=_jitter((0.85, 0.52, 0.33), rng, 0.12),
+        haze=_jitter((0.55, 0.43, 0.38), rng, 0.1),
         haze_per_km=rng.uniform(0.8, 2.0),
         clouds=rng.uniform(0.2, 0.7),
         shade=0.3,
@@ -133,13 +133,13 @@ def _dusk(rng: np.random.Generator) -> Light:
 
 def _fog(rng: np.random.Generator) -> Light:
     grey = rng.uniform(0.75, 1.05)
-    air = _tinted((0.62 * grey, 0.64 * grey, 0.66 * grey), rng, 0.05)
+    air = _jitter((0.62 * grey, 0.64 * grey, 0.66 * grey), rng, 0.05)
     return Light(
         "fog",
         sun_azimuth=rng.uniform(-math.pi, math.pi),
         sun_elevation=math.radians(50.0),
         sun=(0.05, 0.05, 0.05),
-        sky=_tinted((1.0 * grey, 1.02 * grey, 1.05 * grey), rng, 0.04),
+        sky=_jitter((1.0 * grey, 1.02 * grey, 1.05 * grey), rng, 0.04),
         zenith=air,
         horizon=air,
         haze=air,
@@ -156,7 +156,7 @@ def _heavy_shadow(rng: np.random.Generator) -> Light:
         kind="heavy-shadow",
         sun_elevation=math.radians(rng.uniform(42.0, 62.0)),
         sun=(2.25, 2.15, 1.9),
-        sky=_tinted((0.20, 0.225, 0.275), rng, 0.05),
+        sky=_jitter((0.20, 0.225, 0.275), rng, 0.05),
         clouds=rng.uniform(0.0, 0.3),
         canopy=True,
     )
@@ -165,15 +165,15 @@ def _heavy_shadow(rng: np.random.Generator) -> Light:
 def _rain(rng: np.random.Generator) -> Light:
     grey = rng.uniform(0.52, 0.85)
     heavy = rng.uniform(0.0, 1.0)
-    air = _tinted((0.50 * grey, 0.525 * grey, 0.56 * grey), rng, 0.04)
+    air = _jitter((0.50 * grey, 0.525 * grey, 0.56 * grey), rng, 0.04)
     return Light(
         "rain",
         sun_azimuth=rng.uniform(-math.pi, math.pi),
         sun_elevation=math.radians(rng.uniform(35.0, 60.0)),
         sun=(0.05 * grey, 0.05 * grey, 0.05 * grey),
-        sky=_tinted((1.05 * grey, 1.10 * grey, 1.18 * grey), rng, 0.04),
-        zenith=_tinted((0.34 * grey, 0.37 * grey, 0.42 * grey), rng, 0.06),
-        horizon=_tinted((0.56 * grey, 0.58 * grey, 0.61 * grey), rng, 0.05),
+        sky=_jitter((1.05 * grey, 1.10 * grey, 1.18 * grey), rng, 0.04),
+        zenith=_jitter((0.34 * grey, 0.37 * grey, 0.42 * grey), rng, 0.06),
+        horizon=_jitter((0.56 * grey, 0.58 * grey, 0.61 * grey), rng, 0.05),
         haze=air,
         haze_per_km=2.0 + 6.0 * heavy,
         clouds=1.0,
@@ -186,14 +186,14 @@ def _rain(rng: np.random.Generator) -> Light:
 def _snow(rng: np.random.Generator) -> Light:
     grey = rng.uniform(0.72, 1.0)
     heavy = rng.uniform(0.0, 1.0)
-    air = _tinted((0.60 * grey, 0.62 * grey, 0.65 * grey), rng, 0.03)
+    air = _jitter((0.60 * grey, 0.62 * grey, 0.65 * grey), rng, 0.03)
     return Light(
         "snow",
         sun_azimuth=rng.uniform(-math.pi, math.pi),
         sun_elevation=math.radians(rng.uniform(25.0, 50.0)),
         sun=(0.10 * grey, 0.10 * grey, 0.095 * grey),
-        sky=_tinted((0.80 * grey, 0.83 * grey, 0.88 * grey), rng, 0.03),
-        zenith=_tinted((0.50 * grey, 0.52 * grey, 0.56 * grey), rng, 0.04),
+        sky=_jitter((0.80 * grey, 0.83 * grey, 0.88 * grey), rng, 0.03),
+        zenith=_jitter((0.50 * grey, 0.52 * grey, 0.56 * grey), rng, 0.04),
         horizon=air,
         haze=air,
         haze_per_km=2.5 + 7.0 * heavy,
@@ -204,7 +204,7 @@ def _snow(rng: np.random.Generator) -> Light:
     )
 
 
-_MAKERS = {
+_SAMPLERS = {
     "clear": _clear,
     "overcast": _overcast,
     "dusk": _dusk,

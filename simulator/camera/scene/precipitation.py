@@ -1,8 +1,8 @@
-"""What falls: rain and snow between the eye and the road, as short streaks in the air.
+"""Rain and snow in front of the camera, as short streaks.
 
-The drops stand still in a box of air that repeats through the world, so that they pass by as the
-eye moves; how far they have fallen is drawn from the eye's place. So a picture needs no clock: the
-same pose gives the same drops. Metres, world frame.
+The drops are fixed in a box of air that repeats through the world, so they pass by as the camera
+moves. How far they have fallen is a hash of the camera position, so no clock is needed: the same
+pose gives the same drops. World frame, metres.
 """
 
 import math
@@ -16,13 +16,13 @@ from simulator.camera.core.optics import Eye
 from simulator.camera.scene.light import Light
 
 CAR_SPEED = 15.0
-"""m/s; the speed at which drops are taken to come towards the car."""
+"""m/s; the assumed speed of the car, which sets the slant of the streaks."""
 
 
 @dataclass(frozen=True)
 class Drops:
-    """One thing that falls: the box of air (m) that holds `most` of it at its thickest, how fast
-    it falls (m/s), how long the shutter is open (s), how wide it is (m), and how opaque."""
+    """Parameters of rain or snow: side of the box of air (m), drops in it at the highest density,
+    fall speed (m/s), exposure time (s), width (m) and opacity of a drop."""
 
     box_m: float
     most: int
@@ -37,8 +37,8 @@ SNOW = Drops(box_m=14.0, most=4500, speed=1.3, shutter_s=1 / 200, width_m=0.045,
 _CORNERS = np.array([[-1, 0], [1, 0], [-1, 1], [-1, 1], [1, 0], [1, 1]], dtype=np.float32)
 
 
-class Fall:
-    """The drops of one scene, drawn over all else."""
+class Precipitation:
+    """The rain or snow of one scene, drawn last."""
 
     def __init__(self, graphics: Graphics, light: Light, seed: int) -> None:
         self._drops = SNOW if light.weather == "snow" else RAIN
@@ -51,19 +51,19 @@ class Fall:
         wind = rng.normal(0.0, 1.2, 2)
         self._velocity = np.array([wind[0], wind[1], -self._drops.speed])
         self._buffer = graphics.context.buffer(vertices.tobytes())
-        program = graphics.programs["fall"]
+        program = graphics.programs["precipitation"]
         self._array = graphics.context.vertex_array(
             program, [(self._buffer, "4f 2f", "at", "corner")]
         )
         self._uniforms = {
-            name: graphics.uniform("fall", name) for name in ("shift", "streak", "shape")
+            name: graphics.uniform("precipitation", name) for name in ("shift", "streak", "shape")
         }
 
     def draw(self, eye: Eye, focal_px: float) -> None:
-        """Draw what falls before `eye`; blending must be on."""
+        """Draw the drops in front of `eye`; blending must be on."""
         drops = self._drops
         shift = np.append(-eye.place, 0.0) / drops.box_m
-        shift[2] += _fallen(eye.place)
+        shift[2] += _fall_phase(eye.place)
         ahead = eye.axes[2] * CAR_SPEED
         streak = (self._velocity - ahead) * drops.shutter_s
         self._uniforms["shift"].value = tuple((shift % 1.0).tolist())
@@ -77,8 +77,8 @@ class Fall:
         self._buffer.release()
 
 
-def _fallen(place: NDArray[np.float64]) -> float:
-    """A share of the box drawn from the eye's place to the millimetre."""
+def _fall_phase(place: NDArray[np.float64]) -> float:
+    """Fall distance as a share of the box: a hash of the camera position in millimetres."""
     x, y, z = (round(float(v) * 1000.0) for v in place)
     mixed = (x * 73_856_093) ^ (y * 19_349_663) ^ (z * 83_492_791)
     return math.fmod((mixed % 1_000_003) * 0.6180339887498949, 1.0)

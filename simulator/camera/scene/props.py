@@ -1,7 +1,7 @@
-"""Things that stand beside the road: houses, stands, signs, marker posts, lamps.
+"""Props beside the road: houses, grandstands, signs, marker posts, poles, lamps.
 
-Each is a template in its own frame (x along the road, y away from it, z up, metres), put down many
-times. World frame, metres.
+Each is a template in its own frame (x along the road, y away from it, z up, metres) that is placed
+many times in the world frame (metres).
 """
 
 from collections.abc import Sequence
@@ -24,16 +24,17 @@ from simulator.camera.scene.solids import (
     box,
     face,
 )
-from simulator.camera.scene.themes import Look
+from simulator.camera.scene.themes import Theme
 from simulator.camera.vegetation.scenery import DRY_M
 
 FloatArray = NDArray[np.float64]
 
 CHUNK_M, REACH_M = 50.0, 350.0
 SMALL_M2, SMALL_REACH_M = 14.0, 130.0
-"""Posts, lamps and signs, of less area than this, are nothing but a flicker from farther away."""
+"""Props of less area (posts, lamps, signs) are drawn up to this distance: farther off they
+only flicker."""
 BUILDING_M = 3.9
-"""What reaches farther from its middle is a building."""
+"""A prop that extends farther from its middle is a building."""
 POST_STEP_M, LAMP_STEP_M, POLE_STEP_M = 50.0, 42.0, 40.0
 _WALLS: tuple[Point, ...] = (
     (0.62, 0.58, 0.50), (0.66, 0.64, 0.60), (0.42, 0.22, 0.15), (0.58, 0.47, 0.30),
@@ -70,7 +71,7 @@ def house(rng: np.random.Generator) -> FloatArray:
     return np.concatenate(parts)
 
 
-def stand(rng: np.random.Generator) -> FloatArray:
+def grandstand(rng: np.random.Generator) -> FloatArray:
     """A grandstand: rising tiers full of people under a roof."""
     wide = float(rng.uniform(25.0, 45.0))
     colour = _BOARDS[rng.integers(len(_BOARDS))]
@@ -104,7 +105,7 @@ def marker_post() -> FloatArray:
     return box((0.09, 0.12, 1.3), (0.0, 0.0, -0.3), (0.72, 0.72, 0.70), STRIPED)
 
 
-def block(rng: np.random.Generator) -> FloatArray:
+def apartment_block(rng: np.random.Generator) -> FloatArray:
     """A building of four to nine floors under a flat roof."""
     wide, deep = float(rng.uniform(12.0, 26.0)), float(rng.uniform(9.0, 13.0))
     high = float(2.9 * rng.integers(4, 10) + 0.4)
@@ -137,32 +138,31 @@ def lamp() -> FloatArray:
     )
 
 
-class _Site:
-    """Puts templates down beside the road and gathers their triangles."""
+class _Placer:
+    """Places templates beside the road and collects their triangles."""
 
     def __init__(self, ground: Ground, bridges: Sequence[Bridge]) -> None:
         self.ground, self.bridges = ground, bridges
-        self.wanted: list[tuple[FloatArray, float, float, float]] = []
+        self.candidates: list[tuple[FloatArray, float, float, float]] = []
         self.s: list[float] = []
         self.parts: list[FloatArray] = []
 
-    def want(self, template: FloatArray, s: float, offset: float, clear_m: float) -> None:
-        """Stand `template` at (s, offset), if nothing is in its way: see `stand`."""
-        self.wanted.append((template, s, offset, clear_m))
+    def add(self, template: FloatArray, s: float, offset: float, clear_m: float) -> None:
+        """Add `template` at (s, offset) to the candidates that `place` decides on."""
+        self.candidates.append((template, s, offset, clear_m))
 
-    def stand(self) -> None:
-        """Put down what was wanted, in that order, but for what would come within its `clear_m` of
-        a wall line, under a bridge, into the sea or into another building."""
-        if not self.wanted:
+    def place(self) -> None:
+        """Place the candidates in order; skip those within `clear_m` of a wall line, near a bridge,
+        below the sea level or, for buildings, overlapping another one."""
+        if not self.candidates:
             return
-        templates, *numbers = zip(*self.wanted, strict=True)
+        templates, *numbers = zip(*self.candidates, strict=True)
         s, offset, clear_m = (np.array(column) for column in numbers)
         free, x, y = self.ground.place_beside(s, offset, clear_m)
         free &= free_of(self.bridges, x, y, clear_m + KEEP_FREE_M)
         z = self.ground.height(s, offset, x, y)
         free &= z >= self.ground.terrain.sea + DRY_M
-        # On the right side the template is turned round, so that its -y still faces the road; its
-        # x axis then points against the traffic.
+        # On the right side the template is rotated by 180 degrees, so that its -y faces the road.
         turn = self.ground.road.track.at(s).heading + np.where(offset > 0, 0.0, np.pi)
         cos, sin = np.cos(turn), np.sin(turn)
         taken: list[tuple[float, float, float]] = []
@@ -180,60 +180,60 @@ class _Site:
             placed[:, :2] = template[:, :2] @ rotate + np.array([x[k], y[k]])
             placed[:, 2] += z[k]
             placed[:, 3:5] = template[:, 3:5] @ rotate
-            self.add(s[k], placed)
+            self.add_placed(s[k], placed)
 
-    def add(self, s: float, triangles: FloatArray) -> None:
-        """Triangles (n, 12) that are in place already, near `s`."""
+    def add_placed(self, s: float, triangles: FloatArray) -> None:
+        """Add triangles (n, 12) in the world frame, near `s`."""
         self.s.append(s)
         self.parts.append(triangles)
 
 
 def build(
-    ground: Ground, look: Look, bridges: Sequence[Bridge], rng: np.random.Generator
+    ground: Ground, theme: Theme, bridges: Sequence[Bridge], rng: np.random.Generator
 ) -> dict[str, Surface]:
-    """All props of a scene, its bridges among them, by material; a vertex is as `solids` has it,
-    without the material."""
-    site = _Site(ground, bridges)
+    """All props and bridges of a scene by material; a vertex is that of `solids` without the
+    material."""
+    placer = _Placer(ground, bridges)
     for bridge in bridges:
-        site.add(bridge.s, bridge.triangles)
+        placer.add_placed(bridge.s, bridge.triangles)
     length, wall = ground.road.track.length_m, ground.road.wall_offset
     for make, density, near, far, clear in (
-        (house, look.houses, 9.0, 24.0, 7.5),
-        (block, look.blocks, 13.0, 34.0, 11.0),
-        (stand, look.stands, 9.0, 14.0, 6.5),
-        (sign, look.signs, 0.9, 2.2, 0.4),
+        (house, theme.houses, 9.0, 24.0, 7.5),
+        (apartment_block, theme.blocks, 13.0, 34.0, 11.0),
+        (grandstand, theme.stands, 9.0, 14.0, 6.5),
+        (sign, theme.signs, 0.9, 2.2, 0.4),
     ):
         for s in rng.uniform(0.0, length, rng.poisson(density * length / 100.0)):
             side = rng.choice([-1.0, 1.0])
             offset = side * (wall + rng.uniform(near, far))
-            site.want(make(rng), float(s), float(offset), clear)
-    if look.posts:
+            placer.add(make(rng), float(s), float(offset), clear)
+    if theme.posts:
         for s in np.arange(0.0, length, POST_STEP_M):
             for side in (-1.0, 1.0):
-                site.want(marker_post(), float(s), side * (wall + 0.35), 0.1)
-    if look.poles:
+                placer.add(marker_post(), float(s), side * (wall + 0.35), 0.1)
+    if theme.poles:
         side = rng.choice([-1.0, 1.0])
         for s in np.arange(0.0, length, POLE_STEP_M):
-            site.want(pole(), float(s), side * (wall + 3.0), 1.0)
-    if look.lamps:
+            placer.add(pole(), float(s), side * (wall + 3.0), 1.0)
+    if theme.lamps:
         side = rng.choice([-1.0, 1.0])
         for s in np.arange(0.0, length, LAMP_STEP_M):
-            site.want(lamp(), float(s), side * (wall + 1.0), 0.6)
-    site.stand()
-    return _gathered(site)
+            placer.add(lamp(), float(s), side * (wall + 1.0), 0.6)
+    placer.place()
+    return _gathered(placer)
 
 
-def _gathered(site: _Site) -> dict[str, Surface]:
+def _gathered(placer: _Placer) -> dict[str, Surface]:
     """The triangles of all props by the name of their material."""
-    small = [_area(part) < SMALL_M2 for part in site.parts]
+    small = [_area(part) < SMALL_M2 for part in placer.parts]
     surfaces = {}
     for number, material in enumerate(MATERIALS):
-        parts = [part[part[:, 11] == number, :11] for part in site.parts]
+        parts = [part[part[:, 11] == number, :11] for part in placer.parts]
         used = [k for k, part in enumerate(parts) if len(part)]
         if used:
             surfaces[material] = _surface(
                 [parts[k] for k in used],
-                np.array([site.s[k] for k in used]),
+                np.array([placer.s[k] for k in used]),
                 np.array([small[k] for k in used]),
             )
     return surfaces

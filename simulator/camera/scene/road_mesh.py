@@ -1,8 +1,8 @@
-"""The road as triangles: a ribbon of rows across the track, with (s, y) carried to every pixel.
+"""The triangle mesh of the road: rows of vertices across the track, with (s, y) per vertex.
 
 World frame, metres; s along the centre line, y left positive. Rows lie close enough that the chord
-between two of them leaves the true arc by less than `SAGITTA_M`, so what the shader paints at
-(s, y) stands where the geometry says.
+between two of them deviates from the true arc by less than `SAGITTA_M`. What the shader paints
+at (s, y) therefore lies where the track geometry has it.
 """
 
 from dataclasses import dataclass
@@ -21,25 +21,25 @@ FloatArray = NDArray[np.float64]
 SAGITTA_M = 0.0025
 LONGEST_ROW_M = 4.0
 TWIST_M = 0.004
-"""Two triangles miss the twisted road plane between two rows by no more."""
+"""Largest deviation of two triangles from the twisted road plane between two rows."""
 SKIRT_M = 10.0
-"""How far the ribbon reaches into the land beyond the wall."""
+"""How far the mesh extends beyond the wall line."""
 KERB_CURVATURE = 1.0 / 220.0
 SKIRT_WEIGHT, KERB_WEIGHT = 0.05, 0.3
-"""What an error there counts beside one of the road."""
+"""Weights of geometric errors there, relative to those of the road."""
 _ASPHALT = ((3, 4),)
 _LEFT, _RIGHT = ((0, 1), (1, 2), (2, 3)), ((4, 5), (5, 6), (6, 7))
 _FAR = ((0, 2), (2, 3), (4, 5), (5, 7))
 VERGE = (Level(30.0, 0.04, 12.0), Level(90.0, 0.1, 24.0), Level(300.0, 0.3, 48.0))
-"""Beside the asphalt nobody looks so closely."""
+"""Levels of detail of the verge, coarser than those of the asphalt."""
 LAP_M, LAP_DOWN_M, RISE_WEIGHT = 0.3, 0.06, 4.0
-"""How far the verge reaches in under the asphalt, how far below it, and what an error in height
-counts beside it, so that it never comes out on top."""
+"""How far the verge overlaps below the asphalt, how far below it lies, and the weight of its
+height error, which keeps it below the asphalt at every level of detail."""
 
 
 @dataclass(frozen=True)
-class Ribbon:
-    """Places of the road: rows `s` (R,), lateral columns `y` (R, C) and points (R, C, 3)."""
+class RoadMesh:
+    """Vertices of the road: rows `s` (R,), lateral columns `y` (R, C) and points (R, C, 3)."""
 
     s: FloatArray
     y: FloatArray
@@ -49,7 +49,7 @@ class Ribbon:
     """Columns of the left and the right wall line."""
 
     def ground(self, row: NDArray[np.intp], offset: FloatArray) -> FloatArray:
-        """Height of the ribbon's surface at lateral `offset` of a row, by the nearest columns."""
+        """Height of the mesh at lateral `offset` of a row, by the nearest columns."""
         y, z = self.y[row], self.points[row, :, 2]
         column = np.clip(np.sum(y > offset[:, None], axis=1), 1, y.shape[1] - 1)
         pick = np.arange(len(row))
@@ -59,7 +59,7 @@ class Ribbon:
 
 
 def rows_of(road: Road) -> FloatArray:
-    """Places s of the rows, from 0 to the track's length, both included."""
+    """Positions s of the rows, from 0 to the track's length, both included."""
     track = road.track
     radius = 1.0 / np.maximum(np.abs(track.curvature0), 1e-9)
     step = np.sqrt(8.0 * radius * SAGITTA_M)
@@ -75,8 +75,8 @@ def rows_of(road: Road) -> FloatArray:
     return np.append(start + size * number, track.length_m)
 
 
-def build(road: Road, line: CentreLine, terrain: Terrain) -> Ribbon:
-    """Lay the ribbon and let its skirts run out into the land."""
+def build(road: Road, line: CentreLine, terrain: Terrain) -> RoadMesh:
+    """Build the mesh, with skirts that end below the terrain."""
     s = rows_of(road)
     pose = road.track.at(s)
     wall = road.wall_offset
@@ -94,58 +94,58 @@ def build(road: Road, line: CentreLine, terrain: Terrain) -> Ribbon:
         points[:, outer, 2] = np.minimum(land, points[:, edge, 2] + 4.0)
         rise = points[:, outer, 2] - points[:, edge, 2]
         points[:, between, 2] = points[:, edge, 2] + 0.12 * rise - 0.05
-    return Ribbon(s, y, points, pose.curvature, (2, y.shape[1] - 3))
+    return RoadMesh(s, y, points, pose.curvature, (2, y.shape[1] - 3))
 
 
 def _skirt(
     road: Road, line: CentreLine, s: FloatArray, curvature: FloatArray, side: float
 ) -> FloatArray:
-    """Width of the skirt on one side (+1 left): never over another part of the road."""
+    """Width of the skirt on one side (+1 left): never overlapping another part of the road."""
     width = np.full(len(s), 0.4)
     for share in (0.25, 0.5, 0.75, 1.0):
         offset = road.wall_offset + SKIRT_M * share
         pose = road.track.at(s, side * offset)
         clear = line.distance(pose.x, pose.y) > offset - 1.0
-        # Beyond the centre of a bend the ribbon would fold over.
+        # Beyond the centre of a bend the mesh would fold over.
         clear &= curvature * side * offset < 0.85
         width = np.where(clear & (width >= SKIRT_M * (share - 0.25) - 0.1), SKIRT_M * share, width)
-    # A width that jumps would tear the skirt's edge; the narrowest neighbour counts.
+    # A width that jumps would leave gaps at the edge; take the narrowest neighbour.
     for _ in range(2):
         width = np.minimum(width, np.minimum(np.roll(width, 1), np.roll(width, -1)))
     return width
 
 
-def covers(ribbon: Ribbon, survey: Survey, margin_m: float) -> NDArray[np.bool_]:
-    """Which points of the grid (rows, columns) the ribbon covers, `margin_m` within its edges."""
-    row = np.clip(np.searchsorted(ribbon.s, survey.line.s), 1, len(ribbon.s) - 1)[survey.sample]
-    reach = np.minimum(ribbon.y[:, 0], -ribbon.y[:, -1])
+def covers(mesh: RoadMesh, survey: Survey, margin_m: float) -> NDArray[np.bool_]:
+    """Which grid points (rows, columns) the road mesh covers, `margin_m` inside its edges."""
+    row = np.clip(np.searchsorted(mesh.s, survey.line.s), 1, len(mesh.s) - 1)[survey.sample]
+    reach = np.minimum(mesh.y[:, 0], -mesh.y[:, -1])
     return np.asarray(survey.near < np.minimum(reach[row - 1], reach[row]) - margin_m)
 
 
-def surfaces(ribbon: Ribbon, road: Road) -> tuple[Surface, Surface]:
-    """The asphalt's triangles and those beside it; a vertex is x, y, z, s, y, normal (3), kerb."""
-    rows, columns = ribbon.y.shape
+def surfaces(mesh: RoadMesh, road: Road) -> tuple[Surface, Surface]:
+    """Surfaces of the asphalt and the verges; a vertex is x, y, z, s, y, normal (3), kerb."""
+    rows, columns = mesh.y.shape
     vertices = np.empty((rows, columns, 9), dtype=np.float32)
-    vertices[..., 0:3] = ribbon.points
-    vertices[..., 3] = ribbon.s[:, None]
-    vertices[..., 4] = ribbon.y
-    vertices[..., 5:8] = _normals(ribbon)
-    vertices[..., 8] = _kerb(ribbon, road)[:, None]
+    vertices[..., 0:3] = mesh.points
+    vertices[..., 3] = mesh.s[:, None]
+    vertices[..., 4] = mesh.y
+    vertices[..., 5:8] = _normals(mesh)
+    vertices[..., 8] = _kerb(mesh, road)[:, None]
     kerb = vertices[:, 0, 8]
-    profile = np.column_stack([ribbon.points[:, 2:-2].reshape(rows, -1), KERB_WEIGHT * kerb])
-    asphalt = strip(vertices, ribbon.points, ribbon.s, profile, [_ASPHALT] * len(LEVELS))
+    profile = np.column_stack([mesh.points[:, 2:-2].reshape(rows, -1), KERB_WEIGHT * kerb])
+    asphalt = strip(vertices, mesh.points, mesh.s, profile, [_ASPHALT] * len(LEVELS))
     weight = np.tile([1.0, 1.0, RISE_WEIGHT], (columns, 1))
     weight[[0, 1, -2, -1]] = SKIRT_WEIGHT
-    places = (ribbon.points * weight).reshape(rows, -1)
+    places = (mesh.points * weight).reshape(rows, -1)
     profile = np.column_stack([places, KERB_WEIGHT * kerb])
     cells = [(*_LEFT, *_RIGHT), _FAR, _FAR]
-    beside = strip(_lapped(vertices), ribbon.points, ribbon.s, profile, cells, VERGE)
+    beside = strip(_lapped(vertices), mesh.points, mesh.s, profile, cells, VERGE)
     return asphalt, beside
 
 
 def _lapped(vertices: NDArray[np.float32]) -> NDArray[np.float32]:
-    """The same, the verge's inner edges moved in under the asphalt: no gap opens between rows of
-    unlike detail."""
+    """The vertices with the verge's inner edges moved below the asphalt, so that no gap opens
+    between different levels of detail."""
     vertices = vertices.copy()
     for inner, outer in ((3, 2), (4, 5)):
         step = np.sign(vertices[:, inner, 4] - vertices[:, outer, 4])[:, None] * LAP_M
@@ -155,19 +155,19 @@ def _lapped(vertices: NDArray[np.float32]) -> NDArray[np.float32]:
     return vertices
 
 
-def _normals(ribbon: Ribbon) -> FloatArray:
-    along = np.gradient(ribbon.points, axis=0)
-    left, right = ribbon.points[:, 2:3], ribbon.points[:, -3:-2]
-    across = np.broadcast_to(left - right, ribbon.points.shape).copy()
-    across[:, :2] = ribbon.points[:, :1] - ribbon.points[:, 2:3]
-    across[:, -2:] = ribbon.points[:, -3:-2] - ribbon.points[:, -1:]
+def _normals(mesh: RoadMesh) -> FloatArray:
+    along = np.gradient(mesh.points, axis=0)
+    left, right = mesh.points[:, 2:3], mesh.points[:, -3:-2]
+    across = np.broadcast_to(left - right, mesh.points.shape).copy()
+    across[:, :2] = mesh.points[:, :1] - mesh.points[:, 2:3]
+    across[:, -2:] = mesh.points[:, -3:-2] - mesh.points[:, -1:]
     normal = np.cross(along, across)
     return np.asarray(normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-9))
 
 
-def _kerb(ribbon: Ribbon, road: Road) -> FloatArray:
+def _kerb(mesh: RoadMesh, road: Road) -> FloatArray:
     """1 where kerbs stand beside the asphalt, 0 elsewhere, with short ramps between."""
-    bend = np.abs(ribbon.curvature) > KERB_CURVATURE
+    bend = np.abs(mesh.curvature) > KERB_CURVATURE
     kerb = bend.astype(np.float64) * float(road.track.markings.kerbs)
     for _ in range(2):
         kerb = np.maximum(kerb, 0.5 * (np.roll(kerb, 1) + np.roll(kerb, -1)))
@@ -180,7 +180,7 @@ class Ground:
 
     road: Road
     line: CentreLine
-    mesh: Ribbon
+    mesh: RoadMesh
     terrain: Terrain
 
     @classmethod

@@ -1,8 +1,7 @@
-"""Shadows lying on the road: one mask over (s, y), 0 in the sun to 255 in the shade.
+"""Shadows of bridges and trees on the road: a mask over (s, y), 0 in the sun to 255 in shadow.
 
-The mask reaches as far to both sides as the ribbon of the road does, and is centred on y = 0. It is
-folded into bands of `BAND_TEXELS` along s, each with `GUARD` texels more on both sides, so that a
-long track fits one texture.
+The mask is as wide as the road mesh and centred on y = 0. It is folded into bands of `BAND_TEXELS`
+along s, each with `GUARD` more texels on both sides, so that a long track fits one texture.
 """
 
 from collections.abc import Sequence
@@ -14,7 +13,7 @@ from numpy.typing import NDArray
 
 from runtime.jit import compiled
 from simulator.camera.bridges.bridges import Bridge
-from simulator.camera.scene.land import Shadiness
+from simulator.camera.scene.land import TreeShade
 from simulator.camera.scene.light import Light
 from simulator.camera.scene.road_mesh import SKIRT_M
 from simulator.camera.vegetation import foliage
@@ -30,22 +29,22 @@ GUARD, BAND_TEXELS = 8, 4080
 LOOK_M = 30.0
 LONGEST_SHADOW_M = 40.0
 RUN_OUT_M = (2.0, 5.5)
-"""From the wall line to where the mask begins, and ends, to run out into the land's shade."""
+"""Distances from the wall line between which the mask fades into the shade of the terrain."""
 WINDOW_M = 12.0
-"""The covered share is set anew about every so many metres."""
+"""Length of a window of the canopy with its own covered share."""
 THINS_OUT_M = 5.0
-"""Beyond the wall line the clumps grow smaller over so many metres, and end."""
+"""Distance beyond the wall line over which the canopy thins out to nothing."""
 SHARE = (0.40, 0.64)
 """Bounds of the covered share of the asphalt in a window, bridges included."""
 FINE = 2
-"""Rays a texel in each direction; their mean softens the edge by a texel."""
+"""Rays per texel in each direction; their mean smooths the edge over a texel."""
 ROAD_Z_M = 2.5
-"""The road near a bridge lies within so much of its height below the bridge."""
+"""Largest difference in height between the road near a bridge and the road below it."""
 FARTHEST_M = 70.0
 
 
 @dataclass(frozen=True)
-class ShadeMask:
+class ShadowMask:
     """The mask `strip` and the same folded into `texels` (bands * rows, BAND_TEXELS + ...)."""
 
     strip: Strip
@@ -75,14 +74,13 @@ def build(
     road: Road,
     trees: Trees,
     bridges: Sequence[Bridge],
-    land: Shadiness,
+    land: TreeShade,
     light: Light,
     rng: np.random.Generator,
-) -> ShadeMask:
-    """The shadows of `light` on `road`: those of bridges and trees, or the hard case's canopy.
+) -> ShadowMask:
+    """The shadows of `light` on `road`: those of bridges, and of trees or of a closed canopy.
 
-    Towards its sides the mask runs out into the shadiness of the `land` there, so that it ends in
-    no line.
+    Towards its sides the mask fades into the shade of the `land`, so that no edge shows.
     """
     columns = max(GUARD, round(road.track.length_m / TEXEL_M))
     rows = 8 * int(np.ceil((road.wall_offset + SKIRT_M + 1.0) / TEXEL_M / 4.0))
@@ -95,11 +93,11 @@ def build(
         else:
             _cast_trees(strip, road, along_m, trees, light)
         _run_out(strip, road, along_m, land)
-    return ShadeMask(strip, _folded(strip), along_m)
+    return ShadowMask(strip, _folded(strip), along_m)
 
 
-def _run_out(strip: Strip, road: Road, along_m: float, land: Shadiness) -> None:
-    """Let the mask run out into the land's smooth shade beyond the wall lines."""
+def _run_out(strip: Strip, road: Road, along_m: float, land: TreeShade) -> None:
+    """Fade the mask into the smooth shade of the terrain beyond the wall lines."""
     rows, columns = strip.shape
     begin, end = RUN_OUT_M
     y = (np.arange(rows) + 0.5 - rows / 2) * TEXEL_M
@@ -129,7 +127,7 @@ def _folded(strip: Strip) -> NDArray[np.uint8]:
 
 
 def _cast_trees(strip: Strip, road: Road, along_m: float, trees: Trees, light: Light) -> None:
-    """Lay each tree's outline on the road plane, away from the sun, where it reaches the road."""
+    """Project the silhouette of each tree onto the road plane where its shadow reaches the road."""
     silhouettes = foliage.silhouettes()
     sx, sy, sz = light.sun_direction
     level = max(float(np.hypot(sx, sy)), 1e-6)
@@ -153,7 +151,7 @@ def _cast_trees(strip: Strip, road: Road, along_m: float, trees: Trees, light: L
 def _stamp(
     strip: Strip, shape: NDArray[np.uint8], foot: FloatArray, axis: FloatArray, across: FloatArray
 ) -> None:
-    """Draw `shape` (its foot at the bottom middle) over the parallelogram, keeping the darker."""
+    """Draw `shape` (foot at the bottom middle) over the parallelogram; the darker value stays."""
     corners = np.stack([foot - across / 2, foot + across / 2])
     corners = np.concatenate([corners, corners + axis])
     low = np.floor(corners.min(axis=0)).astype(int)
@@ -174,10 +172,10 @@ def _stamp(
 def _with_canopy(
     bridged: Strip, road: Road, along_m: float, texel_m: float, rng: np.random.Generator
 ) -> Strip:
-    """The mask `bridged` (rows, columns), which holds the bridges' shadows, with a canopy added.
+    """The mask `bridged` (rows, columns) of bridge shadows with a canopy added.
 
-    A noise field is cut at a level found anew every WINDOW_M so that the covered share of the
-    asphalt is what was drawn for that place; where a bridge covers more, the canopy stays away.
+    A noise field is thresholded, at a level found for each WINDOW_M, so that the covered share of
+    the asphalt is the random one of that window; where a bridge covers more, no canopy is added.
     Over any 30 m the share lies between 0.3 and 0.8.
     """
     rows, columns = bridged.shape
@@ -209,7 +207,7 @@ def _blobs(
 ) -> NDArray[np.float32]:
     """A field of leaf clumps and boughs (rows, columns), standard deviation 1."""
     field = np.zeros((rows, columns), dtype=np.float32)
-    # Clumps need no noise finer than they are.
+    # Large clumps need only coarse noise.
     for size_m, weight, coarse in ((3.2, 1.0, 4), (1.3, 0.55, 2), (0.55, 0.3, 1)):
         noise = rng.standard_normal((-(-rows // coarse), -(-columns // coarse)), dtype=np.float32)
         smooth = cv2.GaussianBlur(

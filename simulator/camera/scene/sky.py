@@ -1,7 +1,7 @@
-"""The sky: worked out once a scene on a panorama, which each picture shows on a dome round the eye.
+"""The sky: rendered once per scene to a panorama, which every image shows on a dome.
 
-A sky depends on the direction alone, so clouds and glow need not be worked out at every pixel of
-every frame. Panorama and dome have the same triangles, so a direction finds exactly its texel.
+The sky depends on the direction only, so clouds and glow are not computed again for each frame.
+Panorama and dome have the same triangles, so each direction maps exactly to its texel.
 """
 
 import math
@@ -20,8 +20,8 @@ _WIDTHS = (1024, 4096)
 
 
 class Sky:
-    """The sky of one light, sharp enough for pictures of focal length `focal_px`. The uniform block
-    of the frame must hold the light."""
+    """The sky of one light, with the resolution for images of focal length `focal_px`. The
+    uniform block of the frame must hold the light."""
 
     def __init__(self, graphics: Graphics, weather: str, focal_px: float) -> None:
         context = graphics.context
@@ -31,7 +31,7 @@ class Sky:
         self._buffer = context.buffer(_dome().tobytes())
         layout = (self._buffer, "3f 2f", "direction", "place")
         self._array = context.vertex_array(graphics.programs["dome"], [layout])
-        program = graphics.programs[graphics.weathered("sky", weather)]
+        program = graphics.programs[graphics.weather_program("sky", weather)]
         panorama = context.framebuffer([self._texture])
         painter = context.vertex_array(program, [layout])
         panorama.use()
@@ -42,7 +42,7 @@ class Sky:
         panorama.release()
 
     def draw(self) -> None:
-        """Paint the sky where nothing stands before it."""
+        """Draw the sky where no geometry covers it."""
         self._texture.use(SKY_UNIT)
         self._array.render()
 

@@ -1,7 +1,7 @@
-"""Boxes and faces of which props and bridges are put together, as triangles.
+"""Boxes and faces, as triangles, from which props and bridges are built.
 
-A vertex is place, normal, colour, (u, v) in metres and the number of its material; the frame is
-the maker's own, z up, metres.
+A vertex is position, normal, colour, (u, v) in metres and material number; the frame is that of the
+object, z up, metres.
 """
 
 from collections.abc import Sequence
@@ -14,7 +14,7 @@ FloatArray = NDArray[np.float64]
 Point = tuple[float, float, float]
 
 MATERIALS = ("plain", "facade", "crowd", "board", "striped", "tiles", "masonry", "earth")
-"""By number; prop.frag.glsl knows them by name."""
+"""Index is the material number; prop.frag.glsl uses the names."""
 PLAIN, FACADE, CROWD, BOARD, STRIPED, TILES, MASONRY, EARTH = map(float, range(len(MATERIALS)))
 
 
@@ -23,7 +23,7 @@ def box(
 ) -> FloatArray:
     """A box that stands on `at`, the middle of its floor, (30, 12) or with the floor (36, 12).
 
-    Its sides are of `material`; above and below, a facade's box is plain.
+    Its sides are of `material`; the top and floor of a facade box are plain.
     """
     rows = _unit_box()[: 36 if floor else 30].copy()
     rows[:, :3] = rows[:, :3] * size + at

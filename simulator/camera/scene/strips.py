@@ -1,7 +1,7 @@
-"""Strips along the road as triangles: grids of rows across it, in levels of detail, in chunks.
+"""Triangle strips along the road: grids of rows across it, in levels of detail and chunks.
 
-What a software renderer pays for is triangles that cover less than a block of 4 x 4 pixels, so
-rows are left out where the ones kept still say the same.
+A software renderer is slow on triangles smaller than a block of 4 x 4 pixels, so rows are left out
+where the remaining ones describe the surface well enough.
 """
 
 from collections.abc import Sequence
@@ -34,7 +34,7 @@ LEVELS = (
     Level(300.0, 0.08, 32.0),
     Level(650.0, 0.3, 64.0),
 )
-"""A quarter of a pixel of the driver's view, about; and light and air change evenly over a row."""
+"""Errors of about a quarter of a pixel in the driver view."""
 
 
 def strip(
@@ -47,8 +47,9 @@ def strip(
 ) -> Surface:
     """Triangles between the rows of a vertex grid (R, C, F) at `points` (R, C, 3) and places `s`.
 
-    `profile` (R, K) is what rows must tell, in metres; level k joins the pairs of columns
-    `cells[k]`. Rows that bound a chunk stay, so neighbours of unlike levels meet.
+    `profile` (R, K) holds the values, in metres, that the kept rows must interpolate; level k joins
+    the pairs of columns `cells[k]`. Rows that bound a chunk stay, so that neighbouring chunks of
+    different levels share their vertices.
     """
     rows, columns = vertices.shape[:2]
     starts = np.arange(0, rows - 1, CHUNK_ROWS)
@@ -80,7 +81,7 @@ def _steps(
     ends: NDArray[np.intp],
     levels: Sequence[Level],
 ) -> NDArray[np.intp]:
-    """How many rows on the next kept row lies, (levels, chunks)."""
+    """Spacing of the kept rows, (levels, chunks)."""
     steps = np.ones((len(levels), len(starts)), dtype=np.intp)
     row = np.arange(len(s) - 1)
     chunk = row // CHUNK_ROWS
@@ -99,7 +100,7 @@ def _steps(
 
 def _between(rows: NDArray[np.intp], columns: int, sides: NDArray[np.intp]) -> NDArray[np.uint32]:
     """Indices of two triangles for each pair of columns (n, 2) between consecutive `rows`; the
-    last corner, which says what is the same all over a triangle, is of the row before."""
+    last (provoking) vertex, which sets the flat attributes of a triangle, is of the row before."""
     near, far = columns * rows[:-1, None, None] + sides, columns * rows[1:, None, None] + sides
     corners = [near[..., 0], far[..., 0], near[..., 1], far[..., 0], far[..., 1], near[..., 1]]
     return np.stack(corners, axis=-1).reshape(-1).astype(np.uint32)

@@ -1,7 +1,7 @@
-"""The land round a track: a height grid that meets the road and rolls away from it.
+"""The terrain round a track: a height grid with hills that stays below the road.
 
-World frame, metres. Under the road the grid is sunk, so that no corner of it comes up through the
-asphalt; the ribbon's skirts (see `ribbon`) cover the join.
+World frame, metres. Below the road the grid is lowered, so that it never pierces the asphalt; the
+skirts of the road mesh (`road_mesh`) cover the gap.
 """
 
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from simulator.camera.scene.themes import Look
+from simulator.camera.scene.themes import Theme
 from simulator.track.road import Road
 
 if TYPE_CHECKING:
@@ -21,17 +21,17 @@ FloatArray = NDArray[np.float64]
 
 CELL_M = 8.0
 COARSEST = 8
-"""The grid is whole in cells so many times as wide."""
+"""The number of cells is a multiple of this: the step of the coarsest land mesh."""
 MARGIN_M = 400.0
 MAX_CELLS = 1200
 SAMPLE_M = 2.0
 SINK_M = 0.9
 SEA_BELOW_M = 3.0
-"""The sea lies so far below the lowest place of the road."""
+"""Depth of the sea level below the lowest point of the road."""
 SHORE_M = (14.0, 75.0)
-"""From the wall line outwards the land falls to the sea between these."""
+"""Distances from the wall line between which the terrain descends to the sea."""
 BANK_SLOPE = 0.55
-"""No land rises from the roadside more steeply than this."""
+"""Largest slope of the terrain at the roadside."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,9 @@ class CentreLine:
         length = road.track.length_m
         s = np.arange(0.0, length, length / max(8, round(length / SAMPLE_M)))
         pose = road.track.at(s)
-        from scipy.spatial import cKDTree  # costs 0.2 s, which a check of a light need not pay
+        from scipy.spatial import (
+            cKDTree,  # costs 0.2 s, which callers that only check a light do not need
+        )
 
         tree = cKDTree(np.stack([pose.x, pose.y], axis=1))
         return cls(s, pose.x, pose.y, pose.heading, tree)
@@ -63,10 +65,10 @@ class CentreLine:
 
 @dataclass(frozen=True)
 class Survey:
-    """What the road alone says of the land round it: the same in every scenery.
+    """What the terrain takes from the road alone; it is computed once for all scenes of a road.
 
-    The grid (rows y, columns x) from (x0, y0), and of each of its points: the greatest height that
-    keeps the road clear, the road's height spread out to it, the distance to the road and the
+    A grid (rows y, columns x) from (x0, y0). For each point: the greatest height that keeps the
+    road clear, the interpolated height of the road, the distance to the road and the index of the
     nearest sample of its centre line.
     """
 
@@ -81,7 +83,7 @@ class Survey:
 
     @classmethod
     def of(cls, road: Road) -> "Survey":
-        """Survey the land round `road`."""
+        """The survey of `road`."""
         line = CentreLine.of(road)
         span = max(np.ptp(line.x), np.ptp(line.y)) + 2 * MARGIN_M
         cell = max(CELL_M, span / MAX_CELLS)
@@ -106,7 +108,7 @@ class Terrain:
     """Level of the sea, where there is one."""
 
     def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
-        """Height at points, on the triangles that are drawn."""
+        """Height at points, interpolated on the triangles that are drawn."""
         return between(self.z, (x - self.x0) / self.cell, (y - self.y0) / self.cell)
 
     def normals(self) -> FloatArray:
@@ -117,7 +119,7 @@ class Terrain:
 
 
 def between(z: FloatArray, u: FloatArray, v: FloatArray) -> FloatArray:
-    """Height at column `u` and row `v` of the grid `z`, on the triangles that are drawn."""
+    """Height at column `u` and row `v` of the grid `z`, interpolated on the drawn triangles."""
     rows, columns = z.shape
     u, v = np.clip(u, 0.0, columns - 1.001), np.clip(v, 0.0, rows - 1.001)
     i, j = u.astype(np.intp), v.astype(np.intp)
@@ -130,14 +132,14 @@ def between(z: FloatArray, u: FloatArray, v: FloatArray) -> FloatArray:
     return np.where(fu + fv <= 1.0, low, high)
 
 
-def build(road: Road, survey: Survey, look: Look, rng: np.random.Generator) -> Terrain:
-    """The land round `road` in the style of `look`."""
+def build(road: Road, survey: Survey, theme: Theme, rng: np.random.Generator) -> Terrain:
+    """The terrain round `road` in the style of `theme`."""
     line, near, base = survey.line, survey.near, survey.base
     x0, y0, cell, shape = survey.x0, survey.y0, survey.cell, survey.near.shape
-    rolling = _rolling(shape, cell, rng) * look.hills_m
+    rolling = _rolling(shape, cell, rng) * theme.hills_m
     away = np.clip((near - road.wall_offset - 5.0) / 110.0, 0.0, 1.0)
     natural = base + rolling * away * away * (3.0 - 2.0 * away)
-    if not look.sea:
+    if not theme.sea:
         return Terrain(x0, y0, cell, np.minimum(natural, survey.cap))
     sea = float(road.track.at(line.s).z.min()) - SEA_BELOW_M
     fall = np.clip((near - road.wall_offset - SHORE_M[0]) / (SHORE_M[1] - SHORE_M[0]), 0.0, 1.0)
@@ -149,7 +151,7 @@ def build(road: Road, survey: Survey, look: Look, rng: np.random.Generator) -> T
 def _road_cap(
     road: Road, line: CentreLine, x0: float, y0: float, cell: float, shape: tuple[int, int]
 ) -> FloatArray:
-    """The greatest height each grid point may have, so that every road stays clear."""
+    """The greatest height each grid point may have, so that it covers no part of the road."""
     reach = road.wall_offset + 5.0 + 50.0
     offsets = np.arange(-reach, reach + 0.5 * cell, 0.6 * cell)
     s = line.s[:: max(1, round(0.6 * cell / SAMPLE_M))]
@@ -162,7 +164,7 @@ def _road_cap(
     j = np.rint((pose.y - y0) / cell).astype(np.intp)
     inside = (i >= 0) & (i < shape[1]) & (j >= 0) & (j < shape[0])
     np.minimum.at(cap, (j[inside], i[inside]), limit[inside])
-    # A sample speaks for its neighbours too: erosion is the minimum over 3 x 3.
+    # A sample limits its neighbours too: erosion is the minimum over 3 x 3.
     finite = np.where(np.isfinite(cap), cap, 1e9).astype(np.float32)
     return np.asarray(cv2.erode(finite, np.ones((3, 3), np.uint8)), dtype=np.float64)
 
@@ -170,7 +172,7 @@ def _road_cap(
 def _spread(
     road: Road, line: CentreLine, x0: float, y0: float, cell: float, shape: tuple[int, int]
 ) -> tuple[FloatArray, FloatArray, NDArray[np.int64]]:
-    """Road heights spread smoothly over the grid; each point's distance to the road and the nearest
+    """Smoothed road heights on the grid; each point's distance to the road and the nearest
     sample of its centre line."""
     x = x0 + cell * np.arange(shape[1])
     y = y0 + cell * np.arange(shape[0])
@@ -190,7 +192,7 @@ def _spread(
 def _outside(
     line: CentreLine, x0: float, y0: float, cell: float, shape: tuple[int, int]
 ) -> FloatArray:
-    """1 outside the loop that the road makes, 0 inside, with a soft step."""
+    """1 outside the loop of the road, 0 inside, with a smooth step."""
     loop = np.stack([(line.x - x0) / cell, (line.y - y0) / cell], axis=1)
     inside = np.zeros(shape, dtype=np.float32)
     cv2.fillPoly(inside, [np.rint(loop).astype(np.int32)], 1.0)

@@ -1,4 +1,4 @@
-"""What the land beside each kind of track is like: palettes, hills, what stands there.
+"""Scenery themes of the tracks: colours, hills, trees and objects beside the road.
 
 Colours are linear RGB albedos; densities are per 100 m of track.
 """
@@ -9,8 +9,8 @@ Colour = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
-class Look:
-    """One scenery style; what is drawn from the scene's seed varies around it."""
+class Theme:
+    """One scenery theme; a scene varies its values at random, by its seed."""
 
     asphalt: Colour
     verge: Colour
@@ -38,9 +38,9 @@ class Look:
     grassy: float = 0.35
     """Share of the verge that is grown over."""
     sea: bool = False
-    """Outside the loop the land falls to the sea."""
+    """Whether the terrain outside the loop descends to a sea."""
     bridges: tuple[str, ...] = ()
-    """Styles (see `bridge_styles`) of the bridges over the road."""
+    """Styles (see `bridges.styles`) of the bridges over the road."""
     bridge_every_m: float = 450.0
     worn: float = 0.4
     """How patched and cracked the surface is, 0 to 1."""
@@ -48,8 +48,8 @@ class Look:
 
 _GREEN, _DRY, _SOIL = (0.085, 0.15, 0.032), (0.21, 0.19, 0.075), (0.20, 0.145, 0.09)
 
-LOOKS: dict[str, Look] = {
-    "highway": Look(
+THEMES: dict[str, Theme] = {
+    "highway": Theme(
         (0.125, 0.125, 0.13),
         (0.16, 0.155, 0.145),
         _GREEN,
@@ -65,7 +65,7 @@ LOOKS: dict[str, Look] = {
         bridges=("overpass", "gantry", "overpass", "footbridge"),
         worn=0.3,
     ),
-    "ring-road": Look(
+    "ring-road": Theme(
         (0.115, 0.115, 0.12),
         (0.22, 0.215, 0.205),
         (0.09, 0.14, 0.045),
@@ -84,7 +84,7 @@ LOOKS: dict[str, Look] = {
         bridge_every_m=350.0,
         worn=0.35,
     ),
-    "mountain": Look(
+    "mountain": Theme(
         (0.12, 0.118, 0.118),
         (0.21, 0.20, 0.18),
         (0.10, 0.135, 0.05),
@@ -101,7 +101,7 @@ LOOKS: dict[str, Look] = {
         bridges=("arch", "railway"),
         worn=0.6,
     ),
-    "circuit": Look(
+    "circuit": Theme(
         (0.10, 0.10, 0.105),
         (0.10, 0.17, 0.04),
         (0.08, 0.16, 0.03),
@@ -117,7 +117,7 @@ LOOKS: dict[str, Look] = {
         bridges=("adverts", "footbridge", "gantry"),
         worn=0.2,
     ),
-    "oval": Look(
+    "oval": Theme(
         (0.115, 0.112, 0.112),
         (0.145, 0.14, 0.135),
         (0.085, 0.155, 0.035),
@@ -134,7 +134,7 @@ LOOKS: dict[str, Look] = {
         bridges=("adverts",),
         worn=0.3,
     ),
-    "town": Look(
+    "town": Theme(
         (0.13, 0.13, 0.132),
         (0.30, 0.285, 0.27),
         (0.09, 0.14, 0.04),
@@ -153,7 +153,7 @@ LOOKS: dict[str, Look] = {
         bridges=("railway", "footbridge", "arch"),
         worn=0.8,
     ),
-    "forest": Look(
+    "forest": Theme(
         (0.115, 0.115, 0.112),
         (0.15, 0.13, 0.085),
         (0.07, 0.115, 0.03),
@@ -171,7 +171,7 @@ LOOKS: dict[str, Look] = {
         bridges=("wooden", "arch"),
         worn=0.6,
     ),
-    "coast": Look(
+    "coast": Theme(
         (0.15, 0.148, 0.142),
         (0.30, 0.26, 0.19),
         (0.13, 0.16, 0.055),
@@ -188,7 +188,7 @@ LOOKS: dict[str, Look] = {
         bridges=("arch", "footbridge"),
         worn=0.5,
     ),
-    "gravel": Look(
+    "gravel": Theme(
         (0.24, 0.20, 0.15),
         (0.22, 0.17, 0.11),
         (0.11, 0.14, 0.045),
@@ -205,7 +205,7 @@ LOOKS: dict[str, Look] = {
         bridges=("wooden",),
         worn=1.0,
     ),
-    "countryside": Look(
+    "countryside": Theme(
         (0.13, 0.128, 0.125),
         (0.14, 0.15, 0.06),
         (0.095, 0.17, 0.035),
@@ -229,6 +229,6 @@ LOOKS: dict[str, Look] = {
 PLAIN = "countryside"
 
 
-def look_of(name: str) -> Look:
-    """The look called `name`; a track with a look of its own invention gets the countryside."""
-    return LOOKS.get(name, LOOKS[PLAIN])
+def find_theme(name: str) -> Theme:
+    """The theme called `name`; an unknown name gets the countryside."""
+    return THEMES.get(name, THEMES[PLAIN])

@@ -1,0 +1,1 @@
+"""Trees: where they stand, their textures and how they are drawn."""

@@ -1,4 +1,7 @@
-"""Pictures of trees, painted once a process: one atlas of cells, sqrt-coded colour and alpha."""
+"""Tree textures, made once per process: an atlas of cells, sqrt-coded colour and alpha; outlines.
+
+Frame of an outline: x from -0.5 to 0.5, y from 0 (foot) to 1, as in tree.vert.glsl.
+"""
 
 from functools import cache
 
@@ -20,7 +23,7 @@ _FINE = 2
 _BARK = np.array([70.0, 55.0, 42.0])
 CORNERS = 6
 _BLEED = 4
-"""Texels by which smaller versions of a picture spread; the outline keeps so far off."""
+"""Texels by which mipmaps spread the alpha; the outline keeps this margin."""
 Canvas = NDArray[np.float32]
 FloatArray = NDArray[np.float64]
 
@@ -200,7 +203,7 @@ def outline(alpha: NDArray[np.uint8]) -> FloatArray:
 
 
 def _one_fewer(polygon: FloatArray) -> FloatArray:
-    """The polygon with the edge taken out that costs the least area: its neighbours are drawn on
+    """The polygon with the edge taken out that costs the least area: its neighbours are extended
     until they meet."""
     best, least = polygon, np.inf
     for k in range(len(polygon)):

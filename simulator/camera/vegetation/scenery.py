@@ -1,4 +1,4 @@
-"""Where trees stand: seeded, beside the road, never on any part of it. World frame, metres."""
+"""Positions, sizes and tints of the trees beside the road, by seed. World frame, metres."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,16 +8,16 @@ from numpy.typing import NDArray
 
 from simulator.camera.bridges.bridges import Bridge, free_of
 from simulator.camera.scene.road_mesh import Ground
-from simulator.camera.scene.themes import Look
+from simulator.camera.scene.themes import Theme
 from simulator.camera.vegetation import foliage
 from simulator.track.road import Road
 
 FloatArray = NDArray[np.float64]
 
 CLEAR_M = 1.6
-"""No trunk stands nearer to a wall line than this."""
+"""Least distance of a trunk from a wall line."""
 DRY_M = 1.5
-"""Nor lower above the sea."""
+"""Least height of trees and props above the sea."""
 HEIGHT_M = {
     "oak": (6.0, 12.0), "poplar": (9.0, 17.0), "pine": (8.0, 16.0), "fir": (7.0, 18.0),
     "palm": (6.0, 10.0), "bush": (1.2, 3.0), "birch": (7.0, 13.0),
@@ -45,20 +45,20 @@ class Trees:
 
 def plant(
     ground: Ground,
-    look: Look,
+    theme: Theme,
     bridges: Sequence[Bridge],
     rng: np.random.Generator,
     *,
     avenue: bool,
 ) -> Trees:
-    """The trees of a scene; they stand in groves, denser near the road.
+    """The trees of a scene, in groves, denser near the road.
 
-    `avenue` plants one more close behind each wall line, tall enough to meet over the road.
+    `avenue` adds a row of tall trees behind each wall line that meet over the road.
     """
     road = ground.road
-    sites = [_groves(road, look, rng)]
+    sites = [_groves(road, theme, rng)]
     if avenue:
-        sites.append(_avenue(road, look, np.random.default_rng(rng.integers(2**32))))
+        sites.append(_avenue(road, theme, np.random.default_rng(rng.integers(2**32))))
     s, offset, kinds, size, overhang = (
         np.concatenate(column) for column in zip(*sites, strict=True)
     )
@@ -86,26 +86,26 @@ Sites = tuple[FloatArray, FloatArray, NDArray[np.str_], FloatArray, FloatArray]
 reach over the asphalt."""
 
 
-def _groves(road: Road, look: Look, rng: np.random.Generator) -> Sites:
+def _groves(road: Road, theme: Theme, rng: np.random.Generator) -> Sites:
     length = road.track.length_m
-    density = look.tree_density * rng.uniform(0.6, 1.3)
+    density = theme.tree_density * rng.uniform(0.6, 1.3)
     count = int(density * length / 100.0 * 2.0)
     s = rng.uniform(0.0, length, count)
     side = rng.choice([-1.0, 1.0], count)
-    reach = look.tree_reach_m * rng.beta(1.1, 2.0, count)
+    reach = theme.tree_reach_m * rng.beta(1.1, 2.0, count)
     # Groves and clearings: waves along s thin the trees out.
     phase = rng.uniform(0.0, 2 * np.pi, (3, 1))
     waves = np.sin(phase + 2 * np.pi * s / np.array([[310.0], [137.0], [71.0]]) + side)
-    stay = rng.uniform(0.0, 1.0, count) < 1.0 + look.clearings * (waves.sum(axis=0) - 1.5)
-    kinds = rng.choice(np.array(look.trees), count)
+    stay = rng.uniform(0.0, 1.0, count) < 1.0 + theme.clearings * (waves.sum(axis=0) - 1.5)
+    kinds = rng.choice(np.array(theme.trees), count)
     offset = side * (road.wall_offset + CLEAR_M + reach)
     size = rng.beta(2.0, 2.0, count)
     return s[stay], offset[stay], kinds[stay], size[stay], np.zeros(int(stay.sum()))
 
 
-def _avenue(road: Road, look: Look, rng: np.random.Generator) -> Sites:
+def _avenue(road: Road, theme: Theme, rng: np.random.Generator) -> Sites:
     """Tall trees along both wall lines; the kinds that grow here and give shade, else pines."""
-    shady = [kind for kind in look.trees if kind in SHADY] or ["pine"]
+    shady = [kind for kind in theme.trees if kind in SHADY] or ["pine"]
     step = road.track.length_m / max(1, round(road.track.length_m / AVENUE_STEP_M))
     s = np.tile(np.arange(0.0, road.track.length_m - 0.5 * step, step), 2)
     side = np.repeat([1.0, -1.0], len(s) // 2)
@@ -116,7 +116,7 @@ def _avenue(road: Road, look: Look, rng: np.random.Generator) -> Sites:
 
 
 def _tints(rng: np.random.Generator, sheds: NDArray[np.bool_], autumn: float) -> FloatArray:
-    """Colour factors (N, 3): each tree a little different, some that shed turned in autumn."""
+    """Random colour factors (N, 3); in autumn some deciduous trees turn yellow or red."""
     count = len(sheds)
     tone = rng.uniform(0.7, 1.25, (count, 1))
     tint = tone * (1.0 + rng.uniform(-0.12, 0.12, (count, 3)))

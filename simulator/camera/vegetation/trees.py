@@ -1,7 +1,7 @@
-"""Trees on the graphics card: the nearest seen ones, each a picture that turns to the eye.
+"""Drawing of trees: the nearest visible ones, each a billboard (a textured quad facing the camera).
 
-What of a tree is opaque is drawn first, the nearest first, so that it hides what is behind it; its
-soft edges come after all else, the farthest first, and are blended.
+The opaque part is drawn first, the nearest tree first, so that the depth test hides what is behind;
+the soft edges are blended after all else, the farthest first.
 """
 
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from simulator.camera.core.context import Graphics
-from simulator.camera.core.frustum_culling import balls_seen, fans
+from simulator.camera.core.frustum_culling import triangle_indices, visible_spheres
 from simulator.camera.vegetation import foliage
 from simulator.camera.vegetation.foliage import CORNERS
 from simulator.camera.vegetation.scenery import Trees
@@ -23,15 +23,15 @@ REACH_M = 420.0
 MOST = 160
 """Trees drawn at once; the farthest are left out."""
 NEAR_M = 80.0
-"""Nearer trees are drawn in two parts and within their outline, which has more corners than the
-whole picture; beyond, that would cost more than it saves."""
+"""Nearer trees are drawn in two passes and within their outline; beyond, the extra vertices cost
+more than they save."""
 _SQUARE = ((-0.5, 0.0), (0.5, 0.0), (0.5, 1.0), (-0.5, 1.0))
 _SQUARE_FAN = np.array([[0, 1, 2], [0, 2, 3]])
 _OUTLINE_FAN = 4 + np.array([[0, k, k + 1] for k in range(1, CORNERS - 1)])
 
 
 @dataclass(frozen=True)
-class Corners:
+class VisibleTrees:
     """Indices of the corners of triangles (n, 3), the nearest tree's first; the first `near` of
     them are those of near trees."""
 
@@ -39,7 +39,7 @@ class Corners:
     near: int
 
 
-class Woods:
+class TreeMesh:
     """All trees of a scene."""
 
     def __init__(self, graphics: Graphics, trees: Trees, weather: str) -> None:
@@ -59,9 +59,9 @@ class Woods:
         self._vertices = context.buffer(vertices.tobytes() or bytes(4))
         self._indices = context.buffer(reserve=MOST * _OUTLINE_FAN.size * 4, dynamic=True)
         programs: dict[Part, str] = {
-            "core": graphics.weathered("tree", weather, "core"),
-            "fringe": graphics.weathered("tree", weather),
-            "labels": graphics.labelling("tree"),
+            "core": graphics.weather_program("tree", weather, "core"),
+            "fringe": graphics.weather_program("tree", weather),
+            "labels": graphics.label_program("tree"),
         }
         self._arrays = {
             part: context.vertex_array(
@@ -74,19 +74,19 @@ class Woods:
             for part, program in programs.items()
         }
 
-    def seen(self, eye: FloatArray, planes: FloatArray, from_above: bool) -> Corners:
-        """What to draw for an eye."""
-        trees = balls_seen(self._feet, self._size, REACH_M, MOST, eye, planes)
+    def visible(self, eye: FloatArray, planes: FloatArray, from_above: bool) -> VisibleTrees:
+        """Frustum culling: the trees visible from `eye` (3,)."""
+        trees = visible_spheres(self._feet, self._size, REACH_M, MOST, eye, planes)
         squared = ((self._feet[trees] - eye) ** 2).sum(axis=1)
         near = int(np.searchsorted(squared, NEAR_M**2))
         # Seen from above, a tree is a crown of another outline.
         fan = _SQUARE_FAN if from_above else _OUTLINE_FAN
-        return Corners(
-            fans(trees, near, self._corners, fan, _SQUARE_FAN),
+        return VisibleTrees(
+            triangle_indices(trees, near, self._corners, fan, _SQUARE_FAN),
             near * len(fan),
         )
 
-    def draw(self, seen: Corners, part: Part) -> None:
+    def draw(self, seen: VisibleTrees, part: Part) -> None:
         """Draw the seen trees: the "core" of the near ones, then, blended over all else, the
         "fringe" and the far ones whole; or all of them at once as "labels"."""
         corners = seen.corners[: seen.near] if part == "core" else seen.corners

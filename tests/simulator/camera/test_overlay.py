@@ -1,4 +1,4 @@
-"""Lines of the true markings: on the road, before the eye, near the picture, in whole runs."""
+"""Marking polylines: on the road plane, in front of the camera, near the image, unbroken."""
 
 import numpy as np
 import pytest
@@ -40,7 +40,7 @@ def test_compiled_points_are_those_of_the_road_plane(name: str) -> None:
 @pytest.mark.parametrize("view", ["front", "left", "rear", "top"])
 @pytest.mark.parametrize("angle", [0.0, 0.6, 2.0])
 def test_lines_are_the_runs_of_points_that_can_be_seen(view: str, angle: float) -> None:
-    """Point by point, as one would write it down."""
+    """Against a point-by-point implementation."""
     road, eye = Road(find_track("circuit"), 3), Eye()
     pose = standing_pose(road, 150.0, 3.0, angle)
     start, end = (-60.0, BEHIND_M) if view == "rear" else (-BEHIND_M, 60.0)

@@ -1,4 +1,4 @@
-"""Pictures: sizes, views, determinism, lights, shadows, cars, and no memory left behind."""
+"""Pictures: sizes, views, determinism, lights, shadows, cars, and no memory leaks."""
 
 import subprocess
 import sys
@@ -91,7 +91,7 @@ def test_every_view_is_a_picture_of_its_own(road: Road) -> None:
                 assert np.abs(picture - pictures[other]).mean() > 5.0, (view, other)
 
 
-def test_the_mount_is_where_the_driver_sits(road: Road) -> None:
+def test_projection_follows_the_mount(road: Road) -> None:
     """A point straight ahead of the mount lies in the middle; one to the left, left of it."""
     pose = np.array([10.0, 20.0, 3.0, 0.0, 0.0, np.pi / 2])
     with Camera(road, CameraParameters(x=1.0, z=0.5), seed=1, light=light()) as camera:
@@ -122,7 +122,7 @@ def test_a_car_stands_where_its_pose_projects(road: Road) -> None:
 
 
 @pytest.mark.parametrize("lanes", [1, 3])
-def test_heavy_shadow_covers_the_road_as_hard_as_asked(lanes: int) -> None:
+def test_heavy_shadow_has_the_specified_contrast_and_share(lanes: int) -> None:
     """At most 0.4 of the lit luminance, over 30 to 80 % of the road within 30 m."""
     road = Road(find_track("forest"), lanes)
     rng = np.random.default_rng(8)
@@ -164,7 +164,7 @@ def test_lights_differ_and_vary(road: Road) -> None:
         light("noon")
 
 
-def test_a_closed_camera_draws_no_more(road: Road) -> None:
+def test_a_closed_camera_raises(road: Road) -> None:
     camera = Camera(road, seed=1, light=light())
     camera.close()
     camera.close()
@@ -173,7 +173,7 @@ def test_a_closed_camera_draws_no_more(road: Road) -> None:
 
 
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="needs Linux's /proc")
-def test_cameras_leave_nothing_in_memory(road: Road) -> None:
+def test_cameras_free_their_memory(road: Road) -> None:
     """A scene holds several megabytes; ten of them must not stay (llvmpipe's are in ours)."""
 
     def resident_mb() -> float:

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from simulator.camera import CLASSES, VIEWS, Camera, Light
-from simulator.camera.colourise import CLASS_COLOURS, in_false_colours
+from simulator.camera.colourise import CLASS_COLOURS, colourise
 from simulator.camera.core.optics import eye_of, rotation
 from simulator.camera.scene.cars import HEIGHT_M, LENGTH_M, WIDTH_M
 from simulator.camera.snapshot import standing_pose, write_contact_sheet
@@ -206,7 +206,7 @@ def test_rain_and_snow_change_no_class(road: Road) -> None:
         assert np.array_equal(found[0]["front:depth"], other["front:depth"])
 
 
-def test_many_views_are_the_single_ones(road: Road) -> None:
+def test_many_views_equal_single_ones(road: Road) -> None:
     names = [f"{view}{kind}" for view in VIEWS for kind in ("", ":depth", ":class")]
     pose = standing_pose(road, 70.0, -1.0)
     cars = np.array([standing_pose(road, 85.0, 2.0, height=0.0)])
@@ -239,7 +239,7 @@ def test_unknown_views_and_kinds_are_refused(road: Road) -> None:
 
 
 @pytest.mark.parametrize("view", VIEWS)
-def test_calibration_tells_where_points_are_seen(road: Road, view: str) -> None:
+def test_calibration_matches_the_projection(road: Road, view: str) -> None:
     """K E p is the projection of a point p of the body frame, for any size, lens and pose."""
     rng = np.random.default_rng(6)
     pose = np.array([31.0, -12.0, 4.0, 0.05, -0.1, 2.2])
@@ -272,18 +272,18 @@ def test_intrinsics_of_any_size_and_lens(size: tuple[int, int], fov: float) -> N
     assert (matrix[0, 2], matrix[1, 2], matrix[0, 0]) == (width / 2, height / 2, matrix[1, 1])
 
 
-def test_false_colours_tell_kinds_apart(road: Road) -> None:
+def test_false_colours_of_depth_and_class(road: Road) -> None:
     depth = np.array([[2.0, 30.0, 499.0, np.inf]], dtype=np.float32)
-    near, middle, far, sky = in_false_colours(depth, "depth")[0].astype(int)
+    near, middle, far, sky = colourise(depth, "depth")[0].astype(int)
     assert near[0] > near[2]
     assert middle[1] > middle[0]
     assert far[2] > far[0]
     assert sky.max() < 20
     classes = np.arange(len(CLASSES), dtype=np.uint8)[None]
-    colours = in_false_colours(classes, "class")[0]
+    colours = colourise(classes, "class")[0]
     assert [tuple(colour) for colour in colours.tolist()] == list(CLASS_COLOURS.values())
     picture = np.arange(12, dtype=np.uint8).reshape(2, 2, 3)
-    assert np.array_equal(in_false_colours(picture, "colour"), picture)
+    assert np.array_equal(colourise(picture, "colour"), picture)
 
 
 def test_a_contact_sheet_of_one_view_and_kind(road: Road, tmp_path: Path) -> None:

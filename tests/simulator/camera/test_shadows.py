@@ -1,4 +1,4 @@
-"""Heavy shadow on every track, and bridges whose shadows lie where the sun throws them."""
+"""Heavy shadow on every track, and bridge shadows in the right place."""
 
 import numpy as np
 import pytest
@@ -7,12 +7,12 @@ from numpy.typing import NDArray
 from simulator.camera import Camera, Light
 from simulator.camera.bridges import bridges
 from simulator.camera.bridges.bridges import CLEARANCE_M, Bridge
-from simulator.camera.scene import shadow_mask as shade
+from simulator.camera.scene import shadow_mask
 from simulator.camera.scene.road_mesh import Ground
 from simulator.camera.scene.shadow_mask import cast_bridges
 from simulator.camera.scene.terrain import CentreLine, Survey
 from simulator.camera.scene.terrain import build as build_terrain
-from simulator.camera.scene.themes import LOOKS, look_of
+from simulator.camera.scene.themes import THEMES, find_theme
 from simulator.camera.snapshot import standing_pose
 from simulator.track.catalogue import OWN_TRACKS, find_track
 from simulator.track.own import LOOKS as TRACK_LOOKS
@@ -30,14 +30,14 @@ def light(kind: str, seed: int) -> Light:
 
 def bridges_of(road: Road, seed: int) -> tuple[Bridge, ...]:
     """The bridges that a scene of this seed has."""
-    look, survey = look_of(road.track.look), Survey.of(road)
-    terrain = build_terrain(road, survey, look, np.random.default_rng([seed, 1]))
+    theme, survey = find_theme(road.track.look), Survey.of(road)
+    terrain = build_terrain(road, survey, theme, np.random.default_rng([seed, 1]))
     ground = Ground.of(road, survey.line, terrain)
-    return bridges.build(ground, look, np.random.default_rng([seed, 8]))
+    return bridges.build(ground, theme, np.random.default_rng([seed, 8]))
 
 
-def test_every_look_that_a_track_may_have_is_drawn() -> None:
-    assert set(TRACK_LOOKS) == set(LOOKS)
+def test_every_look_of_a_track_has_a_theme() -> None:
+    assert set(TRACK_LOOKS) == set(THEMES)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -48,7 +48,7 @@ def test_heavy_shadow_covers_30_to_80_percent_of_every_road(name: str) -> None:
         seed = 10 * number + len(name)
         shadows = light("heavy-shadow", seed)
         with Camera(road, CameraParameters(8, 8), seed=seed, light=shadows) as camera:
-            mask = camera._setting.scene.mask
+            mask = camera._loaded.scene.mask
         places = np.arange(0.0, road.track.length_m, 3.0)
         shares = [mask.fraction(float(s), road.half_asphalt) for s in places]
         assert min(shares) >= 0.3, (lanes, seed)
@@ -59,7 +59,7 @@ def test_heavy_shadow_covers_30_to_80_percent_of_every_road(name: str) -> None:
 def lit_and_dark(camera: Camera, s: float) -> tuple[FloatArray, FloatArray]:
     """Light (not display values) of road pixels 3 to 15 m ahead that the mask has in the sun, and
     in the shade, away from the lines and the shadows' edges."""
-    road, mask = camera.road, camera._setting.scene.mask
+    road, mask = camera.road, camera._loaded.scene.mask
     pose = standing_pose(road, s, 0.0)
     grey = np.square(camera.render(pose) / 255.0).mean(axis=2)
     at_s, at_y = np.meshgrid(s + np.arange(3.0, 15.0, 0.1), np.arange(-3.4, -0.6, 0.1))
@@ -67,7 +67,7 @@ def lit_and_dark(camera: Camera, s: float) -> tuple[FloatArray, FloatArray]:
     pixels, _ = camera.project(np.stack([place.x, place.y, place.z], axis=-1).reshape(-1, 3), pose)
     u, v = np.floor(pixels).astype(int).T
     rows, columns = mask.strip.shape
-    i = np.floor(at_y / shade.TEXEL_M + rows / 2).astype(int).ravel()
+    i = np.floor(at_y / shadow_mask.TEXEL_M + rows / 2).astype(int).ravel()
     j = np.floor(at_s / mask.along_m).astype(int).ravel() % columns
     around = np.array(
         [mask.strip[i + a, (j + b) % columns] for a in (-2, 0, 2) for b in (-2, 0, 2)]
@@ -94,8 +94,8 @@ def test_shadows_are_hard_edged() -> None:
     """Few texels of the mask lie between light and shade: an edge is about a texel wide."""
     road = Road(find_track("forest"), 2)
     with Camera(road, seed=3, light=light("heavy-shadow", 3)) as camera:
-        strip = camera._setting.scene.mask.strip
-    half = round(road.half_asphalt / shade.TEXEL_M)
+        strip = camera._loaded.scene.mask.strip
+    half = round(road.half_asphalt / shadow_mask.TEXEL_M)
     middle = strip.shape[0] // 2
     asphalt = strip[middle - half : middle + half]
     # road.frag.glsl draws all of the change between 0.3 and 0.7.
@@ -104,16 +104,18 @@ def test_shadows_are_hard_edged() -> None:
 
 
 @pytest.mark.parametrize("kind", ["clear", "heavy-shadow"])
-def test_no_shadow_ends_in_a_line_beside_the_road(kind: str) -> None:
+def test_shadows_have_no_edge_beside_the_road(kind: str) -> None:
     """The rows at the mask's rim hold the land's even shade, and there is no step towards them."""
     road = Road(find_track("forest"), 2)
     with Camera(road, seed=3, light=light(kind, 3)) as camera:
-        strip = camera._setting.scene.mask.strip.astype(np.float64)
-    assert strip.shape[0] * shade.TEXEL_M > 2 * (road.wall_offset + 10.0)
+        strip = camera._loaded.scene.mask.strip.astype(np.float64)
+    assert strip.shape[0] * shadow_mask.TEXEL_M > 2 * (road.wall_offset + 10.0)
     for rows in (strip, strip[::-1]):
         assert rows[:4].std(axis=0).max() < 1.0
         means = (rows >= 128).mean(axis=1)
-        wall = round((strip.shape[0] * shade.TEXEL_M / 2 - road.wall_offset) / shade.TEXEL_M)
+        wall = round(
+            (strip.shape[0] * shadow_mask.TEXEL_M / 2 - road.wall_offset) / shadow_mask.TEXEL_M
+        )
         assert np.abs(np.diff(means[: wall + 4])).max() < 0.15
 
 
@@ -153,29 +155,29 @@ def traced_from(bridge: Bridge, point: FloatArray, sun: FloatArray) -> bool:
 
 
 @pytest.mark.parametrize(("name", "seed"), [("highway", 3), ("circuit", 5), ("coast", 1)])
-def test_a_bridge_darkens_what_it_hides_from_the_sun(name: str, seed: int) -> None:
+def test_bridge_shadows_match_ray_tracing(name: str, seed: int) -> None:
     """The mask against rays through the triangles that are drawn."""
     road = Road(find_track(name), 2)
     sunny = light("clear", seed)
     sun = np.array(sunny.sun_direction)
-    strip = np.zeros((120, round(road.track.length_m / shade.TEXEL_M)), dtype=np.uint8)
+    strip = np.zeros((120, round(road.track.length_m / shadow_mask.TEXEL_M)), dtype=np.uint8)
     along = road.track.length_m / strip.shape[1]
     over = bridges_of(road, seed)
     assert len(over) >= 3
-    cast_bridges(strip, road, along, shade.TEXEL_M, over, sunny)
+    cast_bridges(strip, road, along, shadow_mask.TEXEL_M, over, sunny)
     rng = np.random.default_rng(1)
     agreed, dark = [], 0
     for bridge in over:
         columns = (bridge.s + rng.uniform(-25.0, 25.0, 60)) / along
-        rows = rng.uniform(-road.half_asphalt, road.half_asphalt, 60) / shade.TEXEL_M + 60
+        rows = rng.uniform(-road.half_asphalt, road.half_asphalt, 60) / shadow_mask.TEXEL_M + 60
         for i, j in zip(rows.astype(int), columns.astype(int) % strip.shape[1], strict=True):
             value = strip[i, j]
             if 0 < value < 255:
                 continue
-            place = road.track.at((j + 0.5) * along, (i + 0.5 - 60) * shade.TEXEL_M)
+            place = road.track.at((j + 0.5) * along, (i + 0.5 - 60) * shadow_mask.TEXEL_M)
             hidden = traced_from(bridge, np.array([place.x, place.y, place.z]), sun)
             agreed.append(hidden == (value == 255))
             dark += int(value == 255)
     assert dark > 15
-    # Railings are drawn but throw no shadow.
+    # Railings are drawn but cast no shadow.
     assert np.mean(agreed) > 0.93

@@ -1,5 +1,4 @@
-"""Rain and snow: each light looks as its name says, the same pose gives the same drops, and the
-markings stay to be seen."""
+"""Rain and snow: brightness and contrast of each kind, deterministic drops, visible markings."""
 
 from dataclasses import replace
 from functools import cache
@@ -106,7 +105,7 @@ def test_a_wet_road_mirrors_the_sky() -> None:
 
 
 @pytest.mark.parametrize("kind", WEATHERS)
-def test_drops_come_from_the_pose_and_the_seed(kind: str) -> None:
+def test_drops_depend_on_the_pose_and_the_seed_only(kind: str) -> None:
     pose = standing_pose(road(), 120.0, 0.0)
     beside = pose + np.array([0.002, 0.0, 0.0, 0.0, 0.0, 0.0])
 
@@ -166,21 +165,21 @@ def _along(camera: Camera, grey: FloatArray, pose: FloatArray, s: float, y: floa
     return np.asarray(grey[v[shown], u[shown]])
 
 
-def test_markings_stay_to_be_seen_in_rain() -> None:
+def test_markings_stay_visible_in_rain() -> None:
     dry = np.mean([marking_contrast("overcast", seed) for seed in SEEDS])
     wet = [marking_contrast("rain", seed) for seed in SEEDS]
     assert dry > 2.5
     assert min(wet) > 1.5
 
 
-def test_weather_costs_the_dry_kinds_nothing() -> None:
+def test_dry_kinds_use_programs_without_weather() -> None:
     """Dry kinds draw with programs of their own, into which no weather is compiled."""
-    from simulator.camera.core.context import WEATHERED, graphics
+    from simulator.camera.core.context import WEATHER_PROGRAMS, graphics
 
     shared = graphics()
-    for name in WEATHERED:
-        assert shared.weathered(name, "") == name
+    for name in WEATHER_PROGRAMS:
+        assert shared.weather_program(name, "") == name
         for kind in WEATHERS:
-            assert shared.weathered(name, kind) != name
-            assert shared.programs[shared.weathered(name, kind)] is not shared.programs[name]
+            assert shared.weather_program(name, kind) != name
+            assert shared.programs[shared.weather_program(name, kind)] is not shared.programs[name]
     assert light("clear").falling == 0.0

@@ -1,9 +1,9 @@
-"""A process that draws may learn too: Mesa's and triton's LLVM must not meet."""
+"""Training with torch in a process that renders: the LLVMs of Mesa and triton must not clash."""
 
 import subprocess
 import sys
 
-DRAW_THEN_LEARN = """
+RENDER_THEN_TRAIN = """
 from simulator.camera import Camera, Light
 from trackfeatures.camera import CameraParameters
 from simulator.track.catalogue import find_track
@@ -22,9 +22,9 @@ print(picture.shape, bool((weight < 1).all()))
 """
 
 
-def test_torch_learns_in_a_process_that_has_drawn() -> None:
+def test_torch_trains_in_a_process_that_has_rendered() -> None:
     done = subprocess.run(
-        [sys.executable, "-c", DRAW_THEN_LEARN], capture_output=True, text=True, timeout=600
+        [sys.executable, "-c", RENDER_THEN_TRAIN], capture_output=True, text=True, timeout=600
     )
     assert done.returncode == 0, done.stderr[-2000:]
     assert done.stdout.split("\n")[-2] == "(48, 64, 3) True"
