@@ -248,7 +248,7 @@ class Camera:
     def _cars_in_view(
         self, body_pose: ArrayLike, others: ArrayLike | None, view: str
     ) -> tuple[FloatArray, list[int]]:
-        """Poses (n, 6) on the ground of the cars to draw, and the number of each one's paint."""
+        """Poses (n, 6) on the ground of the cars to draw, and the paint index of each."""
         poses = np.asarray(() if others is None else others, dtype=np.float64).reshape(-1, 6)
         first = self._loaded.first_paint
         paints = [first + k for k in range(len(poses))]

@@ -107,7 +107,7 @@ class Graphics:
 
     def weather_program(self, name: str, weather: str, *features: str) -> str:
         """Name in `programs` of program `name` as it is in `weather` ("" when dry), with what the
-        shaders know as `features` ("sea": the land has a shore)."""
+        shaders define as `features` ("sea": the land has a shore)."""
         defines = [*features, *([weather] if weather and name in WEATHER_PROGRAMS else [])]
         key = " ".join([name, *defines])
         if key not in self.programs:

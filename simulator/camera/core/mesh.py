@@ -36,7 +36,7 @@ class Chunks:
     count: NDArray[np.int64]
     reaches: tuple[float, ...]
     nearest: float = 0.0
-    """Chunks that lie wholly nearer than this are left to a finer mesh."""
+    """Chunks wholly nearer than this are not drawn; a finer mesh covers them."""
 
     @classmethod
     def from_boxes(

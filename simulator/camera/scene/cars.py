@@ -64,10 +64,6 @@ def car_mesh() -> CarMesh:
     return CarMesh(vertices, near, sum(map(len, wheels)))
 
 
-def _quad(a: Point, b: Point, c: Point, d: Point, colour: Point) -> FloatArray:
-    return _face([a, b, c, d], colour)
-
-
 def _face(points: Sequence[Point], colour: Point) -> FloatArray:
     """Two triangles; the normal points to where the four corners run counter-clockwise."""
     corners = np.array(points)
@@ -87,7 +83,7 @@ def _hull(outline: tuple[Point, ...], floor: float, top: Point, flank: Point) ->
     """A prism over an outline (x, z, half width), from rear to front, down to `floor`."""
     parts = []
     for (x0, z0, w0), (x1, z1, w1) in pairwise(outline):
-        parts.append(_quad((x0, w0, z0), (x0, -w0, z0), (x1, -w1, z1), (x1, w1, z1), top))
+        parts.append(_face([(x0, w0, z0), (x0, -w0, z0), (x1, -w1, z1), (x1, w1, z1)], top))
         for side in (1.0, -1.0):
             corners = [
                 (x0, side * w0, floor), (x0, side * w0, z0), (x1, side * w1, z1),
@@ -95,9 +91,9 @@ def _hull(outline: tuple[Point, ...], floor: float, top: Point, flank: Point) ->
             ]  # fmt: skip
             parts.append(_face(corners if side > 0 else corners[::-1], flank))
     x, z, w = outline[0]
-    parts.append(_quad((x, w, floor), (x, -w, floor), (x, -w, z), (x, w, z), top))
+    parts.append(_face([(x, w, floor), (x, -w, floor), (x, -w, z), (x, w, z)], top))
     x, z, w = outline[-1]
-    parts.append(_quad((x, w, z), (x, -w, z), (x, -w, floor), (x, w, floor), top))
+    parts.append(_face([(x, w, z), (x, -w, z), (x, -w, floor), (x, w, floor)], top))
     return parts
 
 
@@ -107,7 +103,7 @@ def _cabin() -> list[FloatArray]:
     for k, (back, front) in enumerate(pairwise(_CABIN)):
         (x0, z0, w0), (x1, z1, w1) = back, front
         colour = _OWN if k == 1 else _GLASS
-        parts.append(_quad((x0, w0, z0), (x0, -w0, z0), (x1, -w1, z1), (x1, w1, z1), colour))
+        parts.append(_face([(x0, w0, z0), (x0, -w0, z0), (x1, -w1, z1), (x1, w1, z1)], colour))
     base = 0.94
     for side in (1.0, -1.0):
         rear, roof0, roof1, front = ((x, side * w, z) for x, z, w in _CABIN)
@@ -134,7 +130,7 @@ def _wheel(x: float, side: float) -> list[FloatArray]:
         ]
         (ax, az), (bx, bz), (cx, cz), (dx, dz) = ring
         parts.append(
-            _quad((ax, inner, az), (bx, inner, bz), (bx, outer, bz), (ax, outer, az), _RUBBER)
+            _face([(ax, inner, az), (bx, inner, bz), (bx, outer, bz), (ax, outer, az)], _RUBBER)
         )
         face = [(ax, outer, az), (bx, outer, bz), (dx, outer, dz), (cx, outer, cz)]
         hub = [
@@ -173,12 +169,12 @@ def _fittings() -> list[FloatArray]:
 
 def _rear_panel(y0: float, y1: float, z0: float, z1: float, colour: Point) -> FloatArray:
     x = -2.225
-    return _quad((x, y0, z0), (x, y1, z0), (x, y1, z1), (x, y0, z1), colour)
+    return _face([(x, y0, z0), (x, y1, z0), (x, y1, z1), (x, y0, z1)], colour)
 
 
 def _front_panel(y0: float, y1: float, z0: float, z1: float, colour: Point) -> FloatArray:
     x = 2.225
-    return _quad((x, y0, z1), (x, y1, z1), (x, y1, z0), (x, y0, z0), colour)
+    return _face([(x, y0, z1), (x, y1, z1), (x, y1, z0), (x, y0, z0)], colour)
 
 
 class Cars:

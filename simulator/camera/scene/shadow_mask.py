@@ -50,7 +50,7 @@ class ShadowMask:
     strip: Strip
     texels: NDArray[np.uint8]
     along_m: float
-    """Length of a texel along s, so that a whole number goes round the track."""
+    """Length of a texel along s, such that a whole number fits the track."""
 
     def fraction(self, s: float, half_width: float) -> float:
         """Share in shadow of the road within `half_width` of its centre, LOOK_M ahead of s."""

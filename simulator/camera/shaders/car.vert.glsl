@@ -4,7 +4,7 @@ in vec3 colour;
 out vec3 place;
 out vec3 normal;
 out vec3 albedo;
-uniform mat4 stand;  // car frame to eye-relative world
+uniform mat4 stand;  // model matrix: car frame to eye-relative world
 uniform vec3 paint;
 void main() {
     place = (stand * vec4(at, 1.0)).xyz;

@@ -1,10 +1,10 @@
-// A drop or a flake: a quad along its way while the shutter is open, turned to the eye.
+// A drop or a flake: a quad along its path during the exposure, facing the camera.
 in vec4 at;       // place in the box of air, 0 .. 1; w: how large it is
 in vec2 corner;   // across -1 .. 1, along 0 .. 1
 out vec2 across;
 out vec4 drop;
 uniform vec4 shift;
-uniform vec4 streak;  // way while the shutter is open, m; w: side of the box, m
+uniform vec4 streak;  // path during the exposure, m; w: side of the box, m
 uniform vec3 shape;   // width, m; least width at 1 m, m; alpha
 void main() {
     vec3 head = (fract(at.xyz + shift.xyz) - 0.5) * streak.w;

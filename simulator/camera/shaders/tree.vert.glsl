@@ -1,4 +1,4 @@
-// A tree is a picture that turns to the eye round its trunk; from straight above, a crown lying flat.
+// A tree is a billboard that turns to the camera about its trunk; from above, a flat crown.
 in vec3 at;
 in vec3 shape;   // width, height, cell of the atlas
 in vec3 tint;

@@ -1,4 +1,4 @@
-// What rain and snow do to surfaces. Compiled in only with RAIN or SNOW defined.
+// Effects of rain and snow on surfaces. Compiled in only with RAIN or SNOW defined.
 #ifdef RAIN
 // The grey sky mirrored in the film of water on a road.
 vec3 mirrored(vec3 normal, vec3 place, float film, float rough) {

@@ -19,7 +19,7 @@ ASPECT = {
 """Width over height of a tree of each kind."""
 
 _FINE = 2
-"""Cells are painted this many times as large, then averaged, for soft edges."""
+"""Supersampling factor of the cells, for soft edges."""
 _BARK = np.array([70.0, 55.0, 42.0])
 CORNERS = 6
 _BLEED = 4

@@ -87,7 +87,7 @@ class TreeMesh:
         )
 
     def draw(self, seen: VisibleTrees, part: Part) -> None:
-        """Draw the seen trees: the "core" of the near ones, then, blended over all else, the
+        """Draw the visible trees: the "core" of the near ones, then, blended over all else, the
         "fringe" and the far ones whole; or all of them at once as "labels"."""
         corners = seen.corners[: seen.near] if part == "core" else seen.corners
         if len(corners) == 0:

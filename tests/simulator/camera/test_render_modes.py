@@ -9,10 +9,9 @@ import pytest
 from numpy.typing import NDArray
 
 from simulator.camera import CLASSES, VIEWS, Camera, Light
-from simulator.camera.colourise import CLASS_COLOURS, colourise
 from simulator.camera.core.optics import eye_of, rotation
 from simulator.camera.scene.cars import HEIGHT_M, LENGTH_M, WIDTH_M
-from simulator.camera.snapshot import standing_pose, write_contact_sheet
+from simulator.camera.snapshot import CLASS_COLOURS, colourise, standing_pose, write_contact_sheet
 from simulator.track.catalogue import find_track
 from simulator.track.markings import MarkingStyle
 from simulator.track.road import Road
