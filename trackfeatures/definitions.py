@@ -12,7 +12,7 @@ from enum import IntEnum
 from types import MappingProxyType
 from typing import Final
 
-VERSION: Final = "1"
+VERSION: Final = "2"
 """Of these definitions; stored in every recording, model and answer."""
 
 MARKINGS: Final = ("ml", "mr", "l", "m", "r")

@@ -160,6 +160,20 @@ def surface(
 
 
 @compiled
+def foot_offset(table: Table, index: int, s: float, to_middle: float, z: float) -> float:
+    """Lateral offset (m) of the foot on the road plane of a point at (s, to_middle, z).
+
+    The foot is the nearest point of the road plane. On a banked road it does not lie vertically
+    below the point, but further up the bank.
+    """
+    z_road, nx, ny, nz = surface(table, index, s, to_middle)
+    height = (z - z_road) * nz
+    along = min(max(s - table[index, S0], 0.0), table[index, LENGTH])
+    heading = table[index, HEADING0] + table[index, CURVATURE] * along
+    return to_middle - height * (ny * math.cos(heading) - nx * math.sin(heading))
+
+
+@compiled
 def pose_at(table: Table, s: float) -> tuple[float, float, float, float, float]:
     """Centre-line pose (x, y, z, heading, curvature) at `s`; s wraps, heading is unwrapped."""
     index = index_at(table, s)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import trackfeatures as tf
-from simulator.track.kernel import index_at, surface
+from simulator.track.kernel import foot_offset, index_at, surface
 from simulator.track.road import START_BEFORE_LINE_M, Road
 from simulator.traffic.traffic import Traffic
 from simulator.vehicle.car import HIGHEST_GEAR, LOWEST_GEAR, RPM, CarParameters
@@ -131,9 +131,14 @@ class World:
         return self._state
 
     def features(self) -> tf.TrackFeatures:
-        """The true track features of the current state."""
+        """The true track features of the present moment.
+
+        Distances are measured in the road plane, from the foot of the centre of gravity on it.
+        """
         now = self.state
-        return self.road.measure(now.s, now.to_middle, now.angle)
+        piece = int(self._memory[PIECE])
+        offset = foot_offset(self._table, piece, now.s, now.to_middle, now.z)
+        return self.road.measure(now.s, offset, now.angle)
 
     def body_pose(self) -> NDArray[np.float64]:
         """x, y, z, roll, pitch, yaw of the centre of gravity (6,), as PyBullet's Euler angles."""

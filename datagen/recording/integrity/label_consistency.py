@@ -5,6 +5,7 @@ one applies, so a label is right if it is right for some offset within TOLERANCE
 """
 
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,10 +15,20 @@ from datagen.recording.labels import Labels
 
 TOLERANCE_M = 1e-4
 SHIFTS_M = (0.0, -TOLERANCE_M, TOLERANCE_M)
+MAX_HEIGHT_M = 1.0
+"""Distances are measured from the foot of the centre of gravity on the road plane, `to_middle` is
+recorded vertically below it. They are apart by the height times the tangent of the banking, which
+the roll angle shows; the suspension adds to the roll, and a jump to the height."""
+FOOT_SLACK_M = 0.005
 
 
-def label_problems(labels: Labels, lanes: int, lane_width_m: float) -> Iterator[str]:
-    """Contradictions to the definitions in the labels of one round, one line per kind."""
+def label_problems(
+    labels: Labels, roll: NDArray[np.float64], lanes: int, lane_width_m: float
+) -> Iterator[str]:
+    """Contradictions to the definitions in the labels of one round, one line per kind.
+
+    `roll` (N,) in rad is the car's, which bounds where its foot on a banked road may be.
+    """
     try:
         tf.check_lanes(lanes, lane_width_m)
     except (tf.UserError, TypeError) as error:
@@ -26,7 +37,11 @@ def label_problems(labels: Labels, lanes: int, lane_width_m: float) -> Iterator[
     count = len(labels)
     if wrong := int((labels.lanes != lanes).sum()):
         yield f"{wrong} of {count} labels do not have the {lanes} lanes of the round"
-    if wrong := sum(not _distances_follow(labels, i, lanes, lane_width_m) for i in range(count)):
+    reach = MAX_HEIGHT_M * np.tan(np.abs(roll)) + FOOT_SLACK_M
+    wrong = sum(
+        not _distances_follow(labels, i, reach[i], lanes, lane_width_m) for i in range(count)
+    )
+    if wrong:
         yield f"{wrong} of {count} labels do not follow from the offset recorded beside them"
     if wrong := sum(not _lane_follows(labels, i, lanes, lane_width_m) for i in range(count)):
         yield f"{wrong} of {count} lane indices do not follow from the offset recorded beside them"
@@ -34,16 +49,29 @@ def label_problems(labels: Labels, lanes: int, lane_width_m: float) -> Iterator[
         yield f"{wrong} of {count} lane-centre offsets do not follow from the distances"
 
 
-def _distances_follow(labels: Labels, i: int, lanes: int, lane_width_m: float) -> bool:
-    offset, found = float(labels.to_middle[i]), labels.distances[i]
+def _distances_follow(
+    labels: Labels, i: int, reach_m: float, lanes: int, lane_width_m: float
+) -> bool:
+    """Whether all distances of a frame belong to one foot within reach of the recorded offset."""
+    offset, found = float(labels.to_middle[i]), labels.distances[i].astype(np.float64)
     if not np.isfinite(offset):
         return False
-    for shift in SHIFTS_M:
-        values = tf.measure(offset + shift, 0.0, 0.0, 0.0, lanes, lane_width_m).distances.values()
-        expected = np.array([np.nan if d is None else d for d in values])
-        if _close(expected, found, TOLERANCE_M + abs(shift)).all():
-            return True
-    return False
+    gaps = found - _expected(offset, lanes, lane_width_m)
+    if np.isnan(gaps).all():  # a limit of the measuring systems may lie between the two
+        feet = np.linspace(-reach_m, reach_m, 41)
+    else:
+        feet = np.array([0.0, np.nanmedian(gaps)])
+    return any(
+        _close(_expected(offset + foot + shift, lanes, lane_width_m), found, 2 * TOLERANCE_M).all()
+        for foot in feet[np.abs(feet) <= reach_m]
+        for shift in SHIFTS_M
+    )
+
+
+def _expected(offset: float, lanes: int, lane_width_m: float) -> NDArray[np.float64]:
+    """The distances (5,) at an offset from the track's centre (m), NaN where absent."""
+    values = tf.measure(offset, 0.0, 0.0, 0.0, lanes, lane_width_m).distances.values()
+    return np.array([np.nan if d is None else d for d in values])
 
 
 def _lane_follows(labels: Labels, i: int, lanes: int, lane_width_m: float) -> bool:
@@ -63,7 +91,7 @@ def _centre_follows(labels: Labels) -> NDArray[np.bool_]:
 
 
 def _close(
-    expected: NDArray[np.float64], found: NDArray[np.float32], tolerance: float
+    expected: NDArray[np.float64], found: NDArray[np.floating[Any]], tolerance: float
 ) -> NDArray[np.bool_]:
     """Where both are NaN, or both are present and differ by at most `tolerance`."""
     absent = np.isnan(expected) & np.isnan(found)

@@ -24,6 +24,7 @@ from datagen.recording.mcap.index import RoundIndex, open_round
 from datagen.recording.mcap.protobuf_wire import bytes_field
 from datagen.recording.mcap.scan import Scan, scan
 from datagen.recording.schema import topics
+from datagen.recording.schema.proto.driverview_pb2 import VehicleState
 
 LEVELS = ("quick", "full", "deep")
 MAX_LISTED = 5  # problems of one kind in one round
@@ -121,7 +122,11 @@ def _labels(index: RoundIndex) -> Iterator[str]:
     except DatasetError as error:
         yield str(error)
         return
-    yield from label_problems(labels, index.header.lanes, index.header.lane_width_m)
+    states = index.messages[topics.EGO_STATE]
+    roll = np.array(
+        [VehicleState.FromString(bytes(states.payload(i))).roll for i in range(len(labels))]
+    )
+    yield from label_problems(labels, roll, index.header.lanes, index.header.lane_width_m)
 
 
 class _MessageChecker:

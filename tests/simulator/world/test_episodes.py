@@ -9,6 +9,8 @@ from dataclasses import astuple
 import numpy as np
 import pytest
 
+import trackfeatures as tf
+from simulator.track.catalogue import find_track
 from simulator.track.geometry import Track
 from simulator.track.markings import MarkingStyle
 from simulator.track.pieces import Piece, assemble
@@ -218,3 +220,25 @@ def test_every_control_rate_gives_the_same_drive() -> None:
             ends.append((state.time_s, state.x, state.y, state.yaw, state.rpm))
     np.testing.assert_array_equal(ends[0], ends[1])
     np.testing.assert_array_equal(ends[0], ends[2])
+
+
+@pytest.mark.parametrize("to_middle", [-2.9, 0.1, 2.7])
+def test_distances_on_a_bank_are_measured_from_the_foot_of_the_centre_of_gravity(
+    to_middle: float,
+) -> None:
+    """The foot found by search: the nearest of many points across the road plane."""
+    road = Road(find_track("oval"), lanes=3)
+    track = road.track
+    banks = [abs(float(track.at(s, 1.0).z - track.at(s, -1.0).z)) for s in range(0, 1000, 10)]
+    s = 10.0 * int(np.argmax(banks))
+    with World(road) as world:
+        now = world.reset(seed=1, s=s, to_middle=to_middle)
+        places = np.linspace(to_middle - 0.2, to_middle + 0.2, 40_001)
+        points = track.at(now.s, places)
+        gaps = np.hypot(np.hypot(points.x - now.x, points.y - now.y), points.z - now.z)
+        foot = float(places[np.argmin(gaps)])
+        assert foot == pytest.approx(to_middle, abs=1e-3)  # the car is placed upright on the bank
+        assert abs(foot - now.to_middle) > 0.03
+        expected = tf.measure(foot, 0.0, 0.0, 0.0, 3, road.lane_width).distances
+        for name, distance in world.features().distances.items():
+            assert distance == pytest.approx(expected[name], abs=1e-3)

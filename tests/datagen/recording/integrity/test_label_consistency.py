@@ -45,7 +45,10 @@ def test_correct_labels_have_no_problems_anywhere_near_the_borders(
     borders = np.array([m + side * r for m in markings for r in reaches for side in (-1, 1)])
     beside = np.concatenate([borders + d for d in (-1e-6, -1e-8, -1e-15, 0.0, 1e-15, 1e-8, 1e-6)])
     offsets = np.concatenate([beside, np.linspace(-9.0, 9.0, 181)])
-    assert list(label_problems(_labels(offsets, lanes, width), lanes, width)) == []
+    assert (
+        list(label_problems(_labels(offsets, lanes, width), np.zeros(len(offsets)), lanes, width))
+        == []
+    )
 
 
 @pytest.mark.parametrize(
@@ -68,15 +71,31 @@ def test_missing_invented_and_wrong_labels_are_found(
     labels = _labels(np.full(4, -2.3), lanes=2)
     name = "distances" if column in tf.MARKINGS else column
     changed = getattr(labels, name).copy()
-    assert list(label_problems(labels, 2, WIDTH)) == []
+    assert list(label_problems(labels, np.zeros(len(labels)), 2, WIDTH)) == []
     if name == "distances":
         changed[2, tf.MARKINGS.index(column)] = value
     else:
         changed[2] = value
-    found = list(label_problems(replace(labels, **{name: changed}), 2, WIDTH))
+    found = list(
+        label_problems(replace(labels, **{name: changed}), np.zeros(len(labels)), 2, WIDTH)
+    )
     assert any(expected in line for line in found), found
 
 
 def test_an_impossible_road_is_found() -> None:
     labels = _labels(np.zeros(3), lanes=1)
-    assert "an impossible road: a road of 7 lanes" in next(label_problems(labels, 7, WIDTH))
+    assert "an impossible road: a road of 7 lanes" in next(
+        label_problems(labels, np.zeros(4), 7, WIDTH)
+    )
+
+
+def test_on_a_bank_the_distances_may_belong_to_the_foot_on_the_road() -> None:
+    """0.25 m above a bank of 9 deg the foot is 0.04 m further up; on a level road it is below."""
+    offsets = np.linspace(-5.9, 5.9, 400)
+    feet = _labels(offsets + 0.04, 2, WIDTH)
+    labels = replace(
+        feet, to_middle=offsets.astype(np.float32), lane_index=_labels(offsets, 2, WIDTH).lane_index
+    )
+    assert list(label_problems(labels, np.full(400, 0.157), 2, WIDTH)) == []
+    (problem,) = label_problems(labels, np.zeros(400), 2, WIDTH)
+    assert "do not follow from the offset" in problem
