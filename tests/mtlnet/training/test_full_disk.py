@@ -45,7 +45,7 @@ def test_a_failed_write_keeps_the_old_file(tmp_path: Path, monkeypatch: pytest.M
     atomic_write(path, b"old")
     monkeypatch.setattr("runtime.files.os.fsync", full)
     with pytest.raises(OSError, match="No space") as caught:
-        atomic_write(path, b"new")
+        atomic_write(path, b"new", fsync=True)
     assert caught.value.filename == str(path)
     assert path.read_bytes() == b"old"
     assert list(tmp_path.iterdir()) == [path]

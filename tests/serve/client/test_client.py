@@ -228,5 +228,5 @@ def test_something_else_at_the_address(sent: bytes, message: str) -> None:
     ],
 )
 def test_what_is_no_address(url: str) -> None:
-    with pytest.raises(ServiceError, match="no address of a service"):
+    with pytest.raises(ServiceError, match="is not the address of a service"):
         Client(url)

@@ -94,6 +94,7 @@ def test_answers_are_logged_on_request(lines: pytest.LogCaptureFixture) -> None:
     limits = Limits(log_answers=True)
     with serving(FakeEngine(lambda _image: outputs()), limits=limits) as service:
         service.post(JPEG, X_Request_Id="7")
-    content = json.loads(JsonFormatter().format(lines.records[-1]))
+    (answered,) = (record for record in lines.records if record.getMessage() == "answered")
+    content = json.loads(JsonFormatter().format(answered))
     assert (content["message"], content["request"], content["status"]) == ("answered", "7", 200)
     assert content["total_ms"] > 0

@@ -197,7 +197,9 @@ def test_the_environment_switches_it() -> None:
         ({**endpoint, "OTEL_SDK_DISABLED": "true"}, None),
     ):
         assert telemetry.exporter_name(environment) == name
-    with pytest.raises(UserError, match=r"no exporter of traces 'zipkin'.*driverview\[telemetry\]"):
+    with pytest.raises(
+        UserError, match=r"exporter 'zipkin' is not installed.*driverview\[telemetry\]"
+    ):
         telemetry.exporter_name({"OTEL_TRACES_EXPORTER": "zipkin"})
 
 

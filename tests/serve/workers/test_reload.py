@@ -111,7 +111,7 @@ def test_reload_and_restart_lose_no_request_and_give_no_wrong_answer(
             done = run("reload", "--port", port, "--model", str(broken))
             assert done.returncode == 1
             assert "damaged" in done.stderr
-            assert "old model goes on answering" in done.stderr
+            assert "old model stays in use" in done.stderr
 
             done = run("restart", "--port", port)
             assert done.returncode == 0, done.stderr

@@ -95,7 +95,7 @@ def test_the_command(tmp_path: Path) -> None:
         (("no-such-track",), "no track 'no-such-track'"),
         (("oval", "--out", "x.jpg"), "ends in .png"),
         (("oval", "--out", "no/x.png"), "there is no folder no"),
-        (("oval", "--lanes", "4"), "4 lanes asked for"),
+        (("oval", "--lanes", "4"), "a road of 4 lanes"),
     ],
 )
 def test_mistakes_end_in_one_line(tmp_path: Path, arguments: tuple[str, ...], said: str) -> None:

@@ -76,7 +76,7 @@ def run(*flags: str, **environment: str) -> subprocess.CompletedProcess[str]:
     ("flags", "said"),
     [
         (("--track", "nowhere"), "there is no track 'nowhere'"),
-        (("--lanes", "5"), "5 lanes asked for"),
+        (("--lanes", "5"), "a road of 5 lanes"),
         (("--light", "disco"), "unknown light 'disco'"),
         (("--speed", "0"), "0 times real time"),
         (("--host", "256.1.1.1"), "cannot listen on 256.1.1.1"),
