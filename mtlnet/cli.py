@@ -225,6 +225,24 @@ def export_command(
         Console().print(export_lines(result))
 
 
+@app.command("ship")
+def ship_command(
+    out: Annotated[Path, typer.Option(help="New folder for the model.")],
+    model: Model = "default",
+    as_json: Json = False,
+) -> None:
+    """Write a model as weights alone, in float16: small enough for a repository."""
+    from mtlnet.export.ship import ship_model
+    from mtlnet.inference.model_card import resolve_run
+
+    result = ship_model(resolve_run(model), out)
+    if as_json:
+        typer.echo(json.dumps(result))
+    else:
+        mib = sum(result["files"].values()) / 2**20
+        typer.echo(f"{result['out']}: {mib:.1f} MiB; serve it with `serve --model {result['out']}`")
+
+
 @app.command("evaluate")
 def evaluate_command(
     model: Model = "default",

@@ -81,6 +81,11 @@ class Frames:
         kept = np.delete(self._rows, list(excluded))
         return Frames(self.rounds, self._indexes, self.camera, kept)
 
+    def places(self) -> NDArray[np.int64]:
+        """Where each frame lies (N, 2): number of its round in `rounds`, its own number in that."""
+        number = np.searchsorted(self._first, self._rows, "right") - 1
+        return np.column_stack([number, self._rows - np.array(self._first)[number]])
+
     def jpeg(self, i: int) -> memoryview:
         """The encoded image of frame `i`, not copied; a PNG if the round has that codec.
 

@@ -1,89 +1,129 @@
 """A dataset in GPU memory: decoded once, then each batch is an index into it.
 
-The batches are those of the loader (`mtlnet.data.loader`), in its order. Only for recipes without
-augmentation, which runs on the CPU. A training step of the paper's network takes a data-centre GPU
-about a millisecond, less than decoding 32 images on the CPU.
+The batches are those of the loader (`mtlnet.data.loader`), in its order. A training step of the
+paper's network takes a data-centre GPU about a millisecond, less than decoding 32 images on the
+CPU, or augmenting them.
 """
 
+from collections import deque
 from collections.abc import Iterator
-from dataclasses import dataclass
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from itertools import count
+from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
-from mtlnet.data.loader import Batch, Loader
+from mtlnet.data.augment.on_device import DeviceAugment
+from mtlnet.data.loader import Batch, BatchLabels, Loader
 
 MEMORY_SHARE = 0.6
 """Largest share of the free GPU memory for the images; the rest is for training."""
 CHUNK = 256  # images decoded at once
+PREFETCH = 4  # batches whose labels are made in advance
 
 
 @dataclass(frozen=True)
 class DeviceBatch:
-    """A batch on the device: `images` (B, H, W, 3) uint8, `coded` (B, 6), `heading` (B,)."""
+    """A batch on the device: `images` (B, H, W, 3) uint8, `coded` (B, 6), `heading` (B,), `ahead`
+    (B, A)."""
 
     images: Tensor
     coded: Tensor
     heading: Tensor
+    ahead: Tensor = field(default_factory=lambda: torch.zeros(0, 0))
 
 
 def on_device(batch: Batch | DeviceBatch, device: torch.device) -> DeviceBatch:
     """A batch as tensors on `device`."""
     if isinstance(batch, DeviceBatch):
         return batch
-    arrays = (batch.images, batch.coded, batch.heading)
+    arrays = (batch.images, batch.coded, batch.heading, batch.ahead)
     return DeviceBatch(*(torch.from_numpy(a).to(device, non_blocking=True) for a in arrays))
 
 
 class GpuDataset:
-    """The frames of `loader` on `device`, and the loader's batches made from them."""
+    """The frames of `loader` on `device`, and the loader's batches made from them.
 
-    def __init__(self, loader: Loader, device: torch.device) -> None:
+    Rows above `first_row` are not kept. Augmentation, if the loader asks for it, runs on the device
+    (`mtlnet.data.augment.on_device`), with labels that are made in advance.
+    """
+
+    def __init__(self, loader: Loader, device: torch.device, first_row: int = 0) -> None:
         self._loader = loader
         self._device = device
-        self._images = _decode(loader, device)
-        self._coded = torch.from_numpy(loader.coded).to(device)
-        self._heading = torch.from_numpy(loader.heading).to(device)
+        self._images = _decode(loader, device, first_row)
+        self._augment = None
+        if loader.augment:
+            self._augment = DeviceAugment(loader.camera, first_row, device)
+            return
+        everything = np.arange(len(loader.heading))
+        self._labels = [
+            self._to_device(labels)
+            for labels in (loader.coded, loader.heading, loader.read_ahead(everything))
+        ]
 
     def make(self, step: int) -> DeviceBatch:
         """This process's rows of batch `step`."""
-        loader = self._loader
-        rows = torch.from_numpy(loader.indices(step)[loader.rows])
-        rows = rows.to(self._device, non_blocking=True)
+        if self._augment is not None:
+            return self._augmented(self._loader.make_labels(step), step)
+        rows = self._to_device(self._loader.indices(step)[self._loader.rows])
         return DeviceBatch(
-            *(tensor.index_select(0, rows) for tensor in (self._images, self._coded, self._heading))
+            *(tensor.index_select(0, rows) for tensor in (self._images, *self._labels))
         )
 
     def batches(self, first: int) -> Iterator[DeviceBatch]:
         """Batches `first`, `first` + 1, ... without end."""
-        while True:
-            yield self.make(first)
-            first += 1
+        if self._augment is None:
+            for step in count(first):
+                yield self.make(step)
+        with ThreadPoolExecutor(PREFETCH, thread_name_prefix="labels") as pool:
+            make = self._loader.make_labels
+            waiting = deque(pool.submit(make, first + i) for i in range(PREFETCH))
+            for step in count(first):
+                labels = waiting.popleft().result()
+                waiting.append(pool.submit(make, step + PREFETCH))
+                yield self._augmented(labels, step)
+
+    def _augmented(self, labels: BatchLabels, step: int) -> DeviceBatch:
+        assert self._augment is not None
+        assert labels.params is not None
+        images = self._images.index_select(0, self._to_device(labels.chosen))
+        seed = int(np.random.SeedSequence([self._loader.seed, 4, step]).generate_state(1)[0])
+        images = self._augment(images, labels.params, seed)
+        arrays = (labels.coded, labels.heading, labels.ahead)
+        return DeviceBatch(images, *(self._to_device(each) for each in arrays))
+
+    def _to_device(self, values: NDArray[Any]) -> Tensor:
+        return torch.from_numpy(values).to(self._device, non_blocking=True)
 
 
-def _decode(loader: Loader, device: torch.device) -> Tensor:
-    camera, count = loader.camera, len(loader.frames)
+def _decode(loader: Loader, device: torch.device, first_row: int) -> Tensor:
+    camera, number = loader.camera, len(loader.frames)
     size = (camera.height, camera.width, 3)
-    images = torch.empty((count, *size), dtype=torch.uint8, device=device)
-    chunk = np.empty((min(CHUNK, count), *size), np.uint8)
-    for first in range(0, count, CHUNK):
-        rows = np.arange(first, min(first + CHUNK, count))
+    kept = (number, camera.height - first_row, *size[1:])
+    images = torch.empty(kept, dtype=torch.uint8, device=device)
+    chunk = np.empty((min(CHUNK, number), *size), np.uint8)
+    for first in range(0, number, CHUNK):
+        rows = np.arange(first, min(first + CHUNK, number))
         loader.frames.read_batch(rows, chunk[: len(rows)])
-        images[first : first + len(rows)] = torch.from_numpy(chunk[: len(rows)])
+        images[first : first + len(rows)] = torch.from_numpy(chunk[: len(rows), first_row:])
     return images
 
 
 def cache_if_it_fits(
-    loader: Loader, device: torch.device, free_bytes: int | None = None
+    loader: Loader, device: torch.device, free_bytes: int | None = None, first_row: int = 0
 ) -> Loader | GpuDataset:
-    """The loader's frames on `device`; the loader itself if they do not fit or are augmented.
+    """The loader's frames on `device`, from `first_row` on; the loader itself if they do not fit.
 
     `free_bytes`: free memory of the device, None: as it reports. On a CPU nothing is cached.
     """
     if free_bytes is None:
         free_bytes = torch.cuda.mem_get_info(device)[0] if device.type == "cuda" else 0
-    needed = len(loader.frames) * loader.camera.height * loader.camera.width * 3
-    if loader.augment or needed > MEMORY_SHARE * free_bytes:
+    rows = loader.camera.height - first_row
+    if len(loader.frames) * rows * loader.camera.width * 3 > MEMORY_SHARE * free_bytes:
         return loader
-    return GpuDataset(loader, device)
+    return GpuDataset(loader, device, first_row)

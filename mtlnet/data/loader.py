@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 import trackfeatures as tf
 from mtlnet.data.augment.pipeline import (
+    AugmentParams,
     apply_params,
     augment_labels,
     draw_params,
@@ -57,13 +58,35 @@ class Images(Protocol):
     ) -> NDArray[np.uint8]: ...
 
 
+class AheadLabels(Protocol):
+    """Labels of the road ahead; `mtlnet.data.road_ahead.RoadAhead` is one."""
+
+    def labels(
+        self, indices: NDArray[np.int64], params: AugmentParams | None = None
+    ) -> NDArray[np.float32]:
+        """(B, A) for frames augmented with `params`."""
+
+
 @dataclass(frozen=True)
 class Batch:
-    """`images` (B, H, W, 3) uint8, `coded` (B, 6), `heading` (B,)."""
+    """`images` (B, H, W, 3) uint8, `coded` (B, 6), `heading` (B,), `ahead` (B, A)."""
 
     images: NDArray[np.uint8]
     coded: NDArray[np.float32]
     heading: NDArray[np.int64]
+    ahead: NDArray[np.float32]
+    """Labels of the road ahead: no columns, or those of `mtlnet.model.auxiliary`."""
+
+
+@dataclass(frozen=True)
+class BatchLabels:
+    """A batch without its images: which frames, their augmentation, and the labels after it."""
+
+    chosen: NDArray[np.int64]  # (B,)
+    params: AugmentParams | None
+    coded: NDArray[np.float32]  # (B, 6)
+    heading: NDArray[np.int64]  # (B,)
+    ahead: NDArray[np.float32]  # (B, A)
 
 
 class Loader:
@@ -82,12 +105,14 @@ class Loader:
         *,
         augment: bool,
         part: tuple[int, int] = (0, 1),
+        ahead: AheadLabels | None = None,
     ) -> None:
         self.frames = frames
         self.batch = batch
         self.seed = seed
         self.augment = augment
         self.camera = camera
+        self._ahead = ahead
         index, parts = part
         self.rows = slice(index * batch // parts, (index + 1) * batch // parts)
         shape = (self.rows.stop - self.rows.start, camera.height, camera.width, 3)
@@ -109,21 +134,35 @@ class Loader:
 
     def make(self, step: int) -> Batch:
         """This process's part of batch `step`."""
-        chosen = self.indices(step)[self.rows]
+        labels = self.make_labels(step)
         images = self._buffers.take()
-        self.frames.read_batch(chosen, images)
+        self.frames.read_batch(labels.chosen, images)
+        if labels.params is not None:
+            apply_params(images, labels.params, self.camera)
+        return Batch(images, labels.coded, labels.heading, labels.ahead)
+
+    def make_labels(self, step: int) -> BatchLabels:
+        """The same without its images."""
+        chosen = self.indices(step)[self.rows]
         heading = self.heading[chosen]
         if not self.augment:
-            return Batch(images, self.coded[chosen], heading)
+            return BatchLabels(chosen, None, self.coded[chosen], heading, self.read_ahead(chosen))
         rng = np.random.default_rng([self.seed, 2, step])
         size = (self.camera.height, self.camera.width)
         labels = self.frames.labels
         distances, angle = labels.distances[chosen], labels.angle[chosen]
         drawn = draw_params(self.batch, *size, rng).take(self.rows)
         params = resolve_lateral_shift(drawn, distances)
-        apply_params(images, params, self.camera)
         coded, heading = augment_labels(distances, angle, heading, params, self.camera)
-        return Batch(images, coded, heading)
+        return BatchLabels(chosen, params, coded, heading, self.read_ahead(chosen, params))
+
+    def read_ahead(
+        self, chosen: NDArray[np.int64], params: AugmentParams | None = None
+    ) -> NDArray[np.float32]:
+        """Labels of the road ahead (B, A) of frames augmented with `params`."""
+        if self._ahead is None:
+            return np.zeros((len(chosen), 0), np.float32)
+        return self._ahead.labels(chosen, params)
 
     def batches(self, first: int) -> Iterator[Batch]:
         """Batches `first`, `first` + 1, ... without end, made in advance on threads."""

@@ -18,11 +18,12 @@ from datagen.recording import Dataset
 from mtlnet.evaluation.evaluate import require_fit
 from mtlnet.export.int8 import calibration_images, judge, quantise
 from mtlnet.export.openvino_graph import TOLERANCE
-from mtlnet.inference.engine import best_precision
+from mtlnet.inference.engine import best_precision, read_graph
 from mtlnet.inference.exported import EXPORT_FILE
 from mtlnet.inference.model_card import (
     GRAPH,
     GRAPH_WEIGHTS,
+    MODEL_FILES,
     WEIGHTS,
     ModelCard,
     ModelError,
@@ -57,7 +58,7 @@ def export_model(
     """
     _require_supported(kind, precision, out, frames)
     card = read_card(run)
-    check_files(run, card, (WEIGHTS, GRAPH, GRAPH_WEIGHTS))
+    check_files(run, card, tuple(name for name in MODEL_FILES if name in card.files))
     dataset = Dataset.open(data or Path(card.data.get("path", "datasets/default")))
     shown = dataset.select("all" if precision != "int8" else "test")
     require_fit(card, shown, "all")
@@ -67,7 +68,7 @@ def export_model(
     (folder / EXPORT_FILE).unlink(missing_ok=True)  # an interrupted export is then no export
     network = load_network(run / WEIGHTS, card.network)
     images = shown.read_batch(chosen)
-    names = _write(run, network, folder, (kind, precision), dataset)
+    names = _write(run, card, network, folder, (kind, precision), dataset)
     check = check_export(network, folder / names[0], precision, images)
     about: dict[str, Any] = {"format": kind, "precision": precision, "check": check}
     write_export(folder, card, names, **about)
@@ -105,14 +106,19 @@ def write_export(folder: Path, card: ModelCard, names: tuple[str, ...], **about:
 
 
 def _write(
-    run: Path, network: Network, folder: Path, form: tuple[str, str], dataset: Dataset
+    run: Path,
+    card: ModelCard,
+    network: Network,
+    folder: Path,
+    form: tuple[str, str],
+    dataset: Dataset,
 ) -> tuple[str, ...]:
     """Write the files of an export, `form` (format, precision); returns their names."""
     kind, precision = form
     try:
         if kind == "onnx":
             return write_onnx(network, folder, bf16=precision == "bf16")
-        return write_openvino(run, folder, precision, dataset)
+        return write_openvino(read_graph(run, card), folder, precision, dataset)
     except RuntimeError as error:  # OpenVINO's error for a failed write
         reason = str(error).strip().splitlines()[-1]
         raise UserError(f"{folder} could not be written ({reason}); is the disk full?") from error
@@ -180,11 +186,10 @@ def store_onnx_bf16(model: Any) -> None:
     model.graph.node.extend(nodes)
 
 
-def write_openvino(run: Path, folder: Path, precision: str, dataset: Dataset) -> tuple[str, ...]:
-    """Write `model.xml` and `model.bin`, made from the run's published graph."""
+def write_openvino(model: Any, folder: Path, precision: str, dataset: Dataset) -> tuple[str, ...]:
+    """Write `model.xml` and `model.bin`, made from a run's graph."""
     import openvino
 
-    model = openvino.Core().read_model(str(run / GRAPH))
     if precision == "bf16":
         store_openvino_bf16(model)
     if precision == "int8":

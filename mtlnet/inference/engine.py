@@ -14,6 +14,8 @@ from mtlnet.inference.exported import int8_graph, passed_gate
 from mtlnet.inference.model_card import (
     GRAPH,
     GRAPH_WEIGHTS,
+    UNCERTAINTY_WEIGHTS,
+    WEIGHTS,
     ModelCard,
     ModelError,
     check_files,
@@ -82,13 +84,11 @@ class OpenVinoEngine:
     ) -> None:
         import openvino
 
-        check_files(run, card, (GRAPH, GRAPH_WEIGHTS))
         core = openvino.Core()
         self.card = card
         best = best_precision(core)
         self.precision: Precision = precision or ("int8" if passed_gate(run, card) else best)
         quantised = self.precision == "int8"
-        graph = int8_graph(run, card) if quantised else run / GRAPH
         options = {
             "INFERENCE_PRECISION_HINT": best if quantised else self.precision,
             "INFERENCE_NUM_THREADS": threads,
@@ -97,11 +97,12 @@ class OpenVinoEngine:
             "ENABLE_CPU_PINNING": False,
         }
         try:
-            model = core.read_model(str(graph))
+            graph = int8_graph(run, card) if quantised else None
+            model = read_graph(run, card) if graph is None else core.read_model(str(graph))
             compiled = core.compile_model(model, "CPU", options)
         except RuntimeError as error:
             reason = str(error).strip().splitlines()[-1]
-            raise ModelError(f"OpenVINO cannot load {graph}: {reason}") from error
+            raise ModelError(f"OpenVINO cannot load the graph of {run}: {reason}") from error
         self._request = compiled.create_infer_request()
         self._shape = tuple(compiled.input(0).shape)
         self._input: NDArray[np.uint8] = np.empty(self._shape, np.uint8)
@@ -114,6 +115,26 @@ class OpenVinoEngine:
         self._request.infer()
         outputs: NDArray[np.float32] = self._output[0].copy()
         return outputs
+
+
+def read_graph(run: Path, card: ModelCard) -> Any:
+    """The OpenVINO model of a run: its graph or, if it holds weights alone, one built from these.
+
+    Raises ModelError when a file is missing or damaged, RuntimeError when OpenVINO cannot read it.
+    """
+    import openvino
+
+    if GRAPH in card.files:
+        check_files(run, card, (GRAPH, GRAPH_WEIGHTS))
+        return openvino.Core().read_model(str(run / GRAPH))
+    from mtlnet.inference.graph import model_from_weights
+    from mtlnet.inference.uncertainty import read_uncertainty_head
+    from mtlnet.inference.weights_file import read_weights
+
+    has_head = card.doubt is not None
+    check_files(run, card, (WEIGHTS, UNCERTAINTY_WEIGHTS) if has_head else (WEIGHTS,))
+    head = read_uncertainty_head(run) if has_head else None
+    return model_from_weights(card.network, read_weights(run / WEIGHTS), head)
 
 
 def parse_kind(text: str) -> EngineKind:

@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 import trackfeatures as tf
 from mtlnet.inference.model_card import UNCERTAINTY_WEIGHTS, ModelError
+from mtlnet.inference.weights_file import read_weights
 from runtime.files import atomic_write
 
 FEATURES = (*tf.MARKINGS, "to_lane_centre", "angle")
@@ -142,12 +143,11 @@ def write_uncertainty_head(run: Path, head: UncertaintyHead) -> None:
 
 def read_uncertainty_head(run: Path) -> UncertaintyHead:
     """The uncertainty head of the model in `run`; ModelError when it is damaged."""
-    from safetensors import SafetensorError
-    from safetensors.numpy import load_file
-
     path = run / UNCERTAINTY_WEIGHTS
     names = {tensor: field for field, tensor in TENSOR_NAMES.items()}
     try:
-        return UncertaintyHead(**{names.get(n, n): array for n, array in load_file(path).items()})
-    except (SafetensorError, TypeError, OSError) as error:
+        return UncertaintyHead(
+            **{names.get(n, n): array for n, array in read_weights(path).items()}
+        )
+    except (ModelError, TypeError, OSError) as error:
         raise ModelError(f"{path} cannot be read ({error}); train the model again") from error

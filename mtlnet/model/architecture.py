@@ -9,6 +9,11 @@ the outputs are our six coded values, not their fourteen, and linear, without a 
 image is subtracted; training uses our recipes. It has no classifier: each class has probability
 one third.
 
+`grid`: five convolutions that keep a grid of 9 x 18 places, where the paper's end in one; its
+answers are distributions over bins (`mtlnet.model.bins`). The rows of the sky are not read. In
+training the grid also tells where the lane's markings are, and the shared features how the road
+bends ahead (`mtlnet.model.auxiliary`).
+
 `mobilenet_v3_small`, `regnet_y_400mf`: small modern backbones of torchvision with random initial
 weights, for comparison: their pooled features, one layer of 256 units, the same nine outputs.
 """
@@ -62,11 +67,20 @@ class Architecture:
     tasks: tuple[str, ...] = ("distance", "angle", "heading")
     backbone: bool = False
     """Whether the features are those of the torchvision model called `name`."""
+    bins: bool = False
+    """Whether the outputs are distributions over bins, not the paper's coded numbers."""
+    first_row: int = 0
+    """Rows of the image above this one are not read."""
 
     @property
     def default_alpha(self) -> tuple[float, float, float]:
         """Task weights: the paper's MTL 3, or equal ones for a network without a classifier."""
         return (0.3, 0.2, 0.5) if "heading" in self.tasks else (1.0, 1.0, 0.0)
+
+    @property
+    def heads(self) -> tuple[tuple[str, int], ...]:
+        """The heads and how many numbers each gives."""
+        return BIN_HEADS if self.bins else HEADS
 
     @property
     def convolutions(self) -> tuple[str, ...]:
@@ -87,6 +101,13 @@ FEATURES: tuple[Conv | Pool, ...] = (
 )
 SHARED = (4096, 1024, 256)
 HEADS = (("distance", 5), ("angle", 1), ("heading", 3))
+PLACES, ANGLES = 70, 100
+"""Bins of a distance's range, beside one for "absent", and of the angle's."""
+NEAR = 4
+"""An answer is the expectation within so many bins of the likeliest."""
+PAIR = slice(0, 2)
+"""`ml` and `mr`: the car's lane is told of as a whole, or not at all."""
+BIN_HEADS = (("distance", 5 * (PLACES + 1)), ("angle", ANGLES), ("heading", 3))
 ALEXNET: tuple[Layer, ...] = (
     Conv(96, 11, 4, pad=0),
     Pool(same=False),
@@ -99,7 +120,15 @@ ALEXNET: tuple[Layer, ...] = (
     Conv(256, 3, 1, pad=1, groups=2),
     Pool(same=False),
 )
+GRID_FEATURES = (
+    Conv(64, 12, 4, pad=4),
+    Conv(128, 3, 2, pad=1),
+    Conv(192, 3, 2, pad=1),
+    Conv(192, 3, 1, pad=1),
+    Conv(32, 1, 1, pad=0),
+)
 MTL = Architecture("mtl", FEATURES, SHARED)
+GRID = Architecture("grid", GRID_FEATURES, (512, 256, 256), bins=True, first_row=66)
 ARCHITECTURES = {
     architecture.name: architecture
     for architecture in (
@@ -107,6 +136,7 @@ ARCHITECTURES = {
         Architecture("deepdriving", ALEXNET, (4096, 4096, 256), tasks=("distance", "angle")),
         Architecture("mobilenet_v3_small", (), (256,), backbone=True),
         Architecture("regnet_y_400mf", (), (256,), backbone=True),
+        GRID,
     )
 }
 
@@ -132,6 +162,15 @@ def same_padding(size: int, kernel: int, stride: int) -> tuple[int, int, int]:
     out = -(-size // stride)
     total = max((out - 1) * stride + kernel - size, 0)
     return out, total // 2, total - total // 2
+
+
+def grid_size(architecture: Architecture) -> tuple[int, int, int]:
+    """Channels, rows and columns of an architecture's last features."""
+    channels, height, width = 3, HEIGHT - architecture.first_row, WIDTH
+    for spec in architecture.features:
+        height, width = output_size(height, spec), output_size(width, spec)
+        channels = spec.filters if isinstance(spec, Conv) else channels
+    return channels, height, width
 
 
 def output_size(size: int, layer: Layer) -> int:

@@ -19,7 +19,6 @@ from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from mtlnet.model.architecture import (
-    HEADS,
     HEIGHT,
     MTL,
     WIDTH,
@@ -31,6 +30,8 @@ from mtlnet.model.architecture import (
     output_size,
     same_padding,
 )
+from mtlnet.model.auxiliary import AuxiliaryHeads
+from mtlnet.model.bins import Scores, read_scores, split_scores
 
 NORM_EPS = 1e-5
 NORM_MOMENTUM = 0.1
@@ -53,7 +54,12 @@ class Network(nn.Module):
             # No batch normalisation here: batch statistics add noise to the distances.
             self.shared.add_module(f"fc{number}", block(nn.Linear(size, units), None, dropout))
             size = units
-        self.heads = nn.ModuleDict({name: nn.Linear(size, units) for name, units in HEADS})
+        heads = {name: nn.Linear(size, units) for name, units in architecture.heads}
+        self.heads = nn.ModuleDict(heads)
+        # Only in training: `fold` leaves them out.
+        self.auxiliary = None
+        if architecture.bins and batch_norm:
+            self.auxiliary = AuxiliaryHeads(architecture, size)
         # Mean and deviation of the targets: (0, 1) as in the paper, set by recipe `fast`.
         self.register_buffer("target_mean", torch.zeros(6), persistent=batch_norm)
         self.register_buffer("target_std", torch.ones(6), persistent=batch_norm)
@@ -64,19 +70,35 @@ class Network(nn.Module):
 
     def forward_features(self, images: Tensor) -> Tensor:
         """The last shared features (B, 256) of images, the input of the heads."""
-        x = (normalise(images) if images.dtype == torch.uint8 else images).permute(0, 3, 1, 2)
-        features: Tensor = self.shared(self.features(x).flatten(1))
+        features: Tensor = self.shared(self.forward_grid(images).flatten(1))
         return features
+
+    def forward_grid(self, images: Tensor) -> Tensor:
+        """The last convolution's features (B, C, h, w) of images (B, 210, 280, 3)."""
+        # Counted from below: images may come without the rows that are not read.
+        images = images[:, images.shape[1] - HEIGHT + self.architecture.first_row :]
+        x = (normalise(images) if images.dtype == torch.uint8 else images).permute(0, 3, 1, 2)
+        grid: Tensor = self.features(x)
+        return grid
 
     def forward_heads(self, x: Tensor) -> Tensor:
         """The outputs (B, 9) for last shared features (B, 256)."""
         # In float32 also under autocast: coded values differ by little, and the heads are small.
         with torch.autocast(x.device.type, enabled=False):
             x = x.float()
+            if self.architecture.bins:
+                scores = self.forward_scores(x)
+                return torch.cat([read_scores(scores.distance, scores.angle), scores.heading], 1)
             coded = torch.cat([self.heads["distance"](x), self.heads["angle"](x)], 1)
             return torch.cat(
                 [coded * self.target_std + self.target_mean, self.heads["heading"](x)], 1
             )
+
+    def forward_scores(self, x: Tensor) -> Scores:
+        """The scores of heads over bins for last shared features (B, 256)."""
+        with torch.autocast(x.device.type, enabled=False):
+            each = [self.heads[name](x.float()) for name, _ in self.architecture.heads]
+            return split_scores(*each)
 
 
 def normalise(images: Tensor) -> Tensor:
@@ -89,7 +111,7 @@ def initialise(network: Network, seed: int) -> None:
     generator = torch.Generator().manual_seed(seed)
     for name, module in network.named_modules():
         if isinstance(module, nn.Conv2d | nn.Linear):
-            gain = 0.01 if name.startswith("heads") else 2.0
+            gain = 0.01 if name.startswith(("heads", "auxiliary")) else 2.0
             if name == "heads.heading" and "heading" not in network.architecture.tasks:
                 gain = 0.0  # not trained: equal probabilities
             fan_in = module.weight[0].numel()
@@ -163,7 +185,7 @@ def build_features(architecture: Architecture, *, batch_norm: bool) -> tuple[nn.
     if architecture.backbone:
         return build_backbone(architecture.name, batch_norm=batch_norm)
     features = nn.Sequential()
-    channels, height, width = 3, HEIGHT, WIDTH
+    channels, height, width = 3, HEIGHT - architecture.first_row, WIDTH
     for number, spec in enumerate(architecture.features):
         if isinstance(spec, LocalNorm):
             norm = nn.LocalResponseNorm(spec.size, spec.alpha, spec.beta)
@@ -224,7 +246,8 @@ def fold(network: Network) -> Network:
     """
     double = copy.deepcopy(network).cpu().double()
     fold_norms(double)
-    for name, rows in (("distance", slice(0, 5)), ("angle", slice(5, 6))):
+    coded = () if network.architecture.bins else (("distance", slice(0, 5)), ("angle", slice(5, 6)))
+    for name, rows in coded:
         std = double.target_std[rows]
         with torch.no_grad():
             double.get_parameter(f"heads.{name}.weight").mul_(std[:, None])

@@ -114,14 +114,20 @@ def multi_task_loss(
             squared / target_variance if huber is None else _huber(errors, target_variance, huber)
         )
         terms = (scaled[:, :5].mean(), scaled[:, 5].mean(), cross)
-    if callable(combine):
-        total = combine(torch.stack(terms))
-    else:
-        # A weight of 0 takes the task out of the graph: a true single-task network.
-        weighted = [weight * term for weight, term in zip(combine, terms, strict=True) if weight]
-        total = torch.stack(weighted).sum()
+    total = weighted_sum(terms, combine)
     detached = torch.stack(terms).detach()
     return Losses(distance.detach(), angle.detach(), cross.detach(), total, detached)
+
+
+def weighted_sum(
+    terms: tuple[Tensor, Tensor, Tensor], combine: Alpha | Callable[[Tensor], Tensor]
+) -> Tensor:
+    """The sum to minimise of the tasks' terms, by weights or by a function of the terms (3,)."""
+    if callable(combine):
+        return combine(torch.stack(terms))
+    # A weight of 0 takes the task out of the graph: a true single-task network.
+    weighted = [weight * term for weight, term in zip(combine, terms, strict=True) if weight]
+    return torch.stack(weighted).sum()
 
 
 def _huber(errors: Tensor, target_variance: Tensor, huber: HuberLoss) -> Tensor:

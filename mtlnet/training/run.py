@@ -14,8 +14,10 @@ import cv2
 import numpy as np
 import torch
 
+from datagen.recording import Frames
 from mtlnet.data.gpu_cache import cache_if_it_fits
 from mtlnet.data.loader import Loader
+from mtlnet.data.road_ahead import RoadAhead
 from mtlnet.data.sources import TrainingData, open_training_data, require_same_data
 from mtlnet.export.publish import Provenance, publish
 from mtlnet.inference.model_card import (
@@ -92,7 +94,9 @@ def _train(
     elapsed_s = load_checkpoint(checkpoints[-1], trainer) if checkpoints else 0.0
     barrier()  # the first process writes nothing until all have read the checkpoint
     try:
-        train_loop(config, trainer, cache_if_it_fits(loader, device), elapsed_s, report)
+        first_row = trainer.network.architecture.first_row
+        batches = cache_if_it_fits(loader, device, first_row=first_row)
+        train_loop(config, trainer, batches, elapsed_s, report)
         if rank.is_first:
             finish(config, trainer, data)
         barrier()
@@ -153,6 +157,7 @@ def prepare(
         config.seed,
         augment=recipe.augment,
         part=(rank.index, rank.world_size),
+        ahead=None if trainer.network.auxiliary is None else road_ahead(data, device),
     )
     if init is None:
         trainer.standardise(loader)
@@ -160,6 +165,13 @@ def prepare(
         trainer.standardise(loader, FINE_TUNE_MIN_STD)
         load_pretrained(trainer.network, init)
     return trainer, loader
+
+
+def road_ahead(data: TrainingData, device: torch.device) -> RoadAhead | None:
+    """Labels of the road ahead, if the data are recorded rounds; for a GPU read in advance."""
+    if not isinstance(data.frames, Frames):
+        return None
+    return RoadAhead(data.frames, data.camera, keep=device.type != "cpu")
 
 
 def finish(config: TrainConfig, trainer: Trainer, data: TrainingData) -> ModelCard:

@@ -14,8 +14,11 @@ from torch import Tensor, nn
 from mtlnet.data.gpu_cache import DeviceBatch, on_device
 from mtlnet.data.loader import Batch, Loader
 from mtlnet.model.architecture import MTL, Architecture
-from mtlnet.model.cpu_kernels.forward import training_outputs
+from mtlnet.model.auxiliary import auxiliary_loss
+from mtlnet.model.bins import Scores
+from mtlnet.model.cpu_kernels.forward import FAST, forward_grid, forward_shared, training_outputs
 from mtlnet.model.network import Network, initialise
+from mtlnet.training.bins_loss import bins_loss
 from mtlnet.training.cuda_graph import CudaGraphStep, CudaRecorder
 from mtlnet.training.distributed import SINGLE_PROCESS, Rank, average, dropout_seed
 from mtlnet.training.loss import Alpha, Losses, multi_task_loss
@@ -119,14 +122,7 @@ class Trainer:
 
     def optimize(self, batch: DeviceBatch) -> Losses:
         """Update the weights by one batch, at the learning rate that is set."""
-        losses = multi_task_loss(
-            self.outputs(batch.images),
-            batch.coded,
-            batch.heading,
-            self._combine(),
-            self.target_variance,
-            self.recipe.huber,
-        )
+        losses = self.losses(batch)
         self.optimizers.zero_grad()
         losses.total.backward()  # type: ignore[no-untyped-call]  # torch leaves it untyped
         reported = [losses.distance, losses.angle, losses.heading, losses.total.detach()]
@@ -134,22 +130,56 @@ class Trainer:
         self.optimizers.step()
         return losses
 
+    def losses(self, batch: DeviceBatch) -> Losses:
+        """The losses of the current weights."""
+        if self.network.architecture.bins:
+            scores, auxiliary = self.scores(batch.images, batch.ahead)
+            return bins_loss(scores, batch.coded, batch.heading, self._combine(), auxiliary)
+        return multi_task_loss(
+            self.outputs(batch.images),
+            batch.coded,
+            batch.heading,
+            self._combine(),
+            self.target_variance,
+            self.recipe.huber,
+        )
+
     def _combine(self) -> Alpha | Callable[[Tensor], Tensor]:
         weighting = self.task_weighting
         return self.alpha if weighting.method == "fixed" else weighting.total
 
     def outputs(self, images: Tensor) -> Tensor:
         """Outputs (B, 9) of the network in training for images (B, 210, 280, 3) uint8."""
-        on_cpu = self.device.type == "cpu"
-        dtype = torch.bfloat16 if not on_cpu or cpu_has_bf16() else torch.float32
-        if on_cpu and self.network.architecture is MTL:
-            seed = [self.seed, 3, self.step_number]
-            part = (self.rank.index, self.rank.world_size)
-            masks = dropout_masks(self.recipe.dropout, MTL.shared, len(images), seed, part)
-            return training_outputs(self.network, images, dtype, masks)
+        dtype = self._dtype()
+        if self.device.type == "cpu" and self.network.architecture in FAST:
+            return training_outputs(self.network, images, dtype, self._masks(len(images)))
         with torch.autocast(self.device.type, dtype, enabled=dtype != torch.float32):
             outputs: Tensor = self.network(images)
         return outputs
+
+    def scores(self, images: Tensor, ahead: Tensor) -> tuple[Scores, Tensor | None]:
+        """Scores of images (B, 210, 280, 3) uint8, and the auxiliary loss if there are labels."""
+        network, dtype = self.network, self._dtype()
+        if self.device.type == "cpu" and network.architecture in FAST:
+            grid = forward_grid(network, images, dtype)
+            x = forward_shared(network, grid, dtype, self._masks(len(images)))
+        else:
+            with torch.autocast(self.device.type, dtype, enabled=dtype != torch.float32):
+                grid = network.forward_grid(images)
+                x = network.shared(grid.flatten(1))
+        auxiliary = None
+        if network.auxiliary is not None and ahead.shape[1]:
+            auxiliary = auxiliary_loss(network.auxiliary(grid, x), ahead)
+        return network.forward_scores(x), auxiliary
+
+    def _dtype(self) -> torch.dtype:
+        on_cpu = self.device.type == "cpu"
+        return torch.bfloat16 if not on_cpu or cpu_has_bf16() else torch.float32
+
+    def _masks(self, count: int) -> list[Tensor]:
+        layers, seed = self.network.architecture.shared, [self.seed, 3, self.step_number]
+        part = (self.rank.index, self.rank.world_size)
+        return dropout_masks(self.recipe.dropout, layers, count, seed, part)
 
 
 def freeze_batch_norm(network: Network) -> None:

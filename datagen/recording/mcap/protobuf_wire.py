@@ -3,6 +3,8 @@
 Source: protobuf.dev/programming-guides/encoding.
 """
 
+from collections.abc import Iterator
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -15,6 +17,16 @@ DOUBLE_TAG_1, DOUBLE_TAG_2 = 1 << 3 | 1, 2 << 3 | 1
 
 def bytes_field(message: memoryview, number: int) -> memoryview:
     """The length-delimited field with number `number`; ValueError if it is not there."""
+    for start, end in bytes_fields(message, number):
+        return message[start:end]
+    raise ValueError(f"the message is damaged: field {number} was not found")
+
+
+def bytes_fields(message: memoryview, number: int) -> Iterator[tuple[int, int]]:
+    """Start and end of each length-delimited field with number `number`, in order.
+
+    Raises ValueError for a truncated message.
+    """
     at, end = 0, len(message)
     while at < end:
         tag, at = _varint(message, at)
@@ -24,7 +36,7 @@ def bytes_field(message: memoryview, number: int) -> memoryview:
             if at + length > end:
                 break
             if tag >> 3 == number:
-                return message[at : at + length]
+                yield at, at + length
             at += length
         elif wire_type == 0:
             _, at = _varint(message, at)
@@ -32,7 +44,8 @@ def bytes_field(message: memoryview, number: int) -> memoryview:
             at += 8 if wire_type == 1 else 4
         else:
             break
-    raise ValueError(f"the message is damaged: field {number} was not found")
+    if at != end:
+        raise ValueError(f"the message is damaged: it breaks off before field {number}")
 
 
 def _varint(message: memoryview, at: int) -> tuple[int, int]:

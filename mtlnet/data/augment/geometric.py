@@ -27,17 +27,25 @@ ROTATIONS = 64  # rotations to choose from, with maps that are computed once; nu
 
 def shift_lateral(image: NDArray[np.uint8], camera: CameraParameters, metres: float) -> None:
     """Move the camera of an image (H, W, 3) to the left by `metres`, in place."""
-    tilt = np.radians(camera.pitch_deg)
-    focal = camera.focal_px
-    horizon = (camera.height - 1) / 2 - focal * np.tan(tilt)
+    horizon = horizon_row(camera)
     first = max(int(np.ceil(horizon)), 0)
     road = image[first:]
-    shear = metres * np.cos(tilt) / camera.height_above_road_m
+    shear = metres * shear_per_metre(camera)
     matrix = np.array([[1.0, shear, shear * (first - horizon)], [0.0, 1.0, 0.0]])
     # The new border is filled with the mean colour of the road: mirrored markings would be wrong.
     fill = image[-1].mean(0).tolist()
     size = (camera.width, len(road))
     cv2.warpAffine(road.copy(), matrix, size, dst=road, flags=cv2.INTER_LINEAR, borderValue=fill)
+
+
+def horizon_row(camera: CameraParameters) -> float:
+    """Row of a level road's horizon, px from the centre of the first row."""
+    return float((camera.height - 1) / 2 - camera.focal_px * np.tan(np.radians(camera.pitch_deg)))
+
+
+def shear_per_metre(camera: CameraParameters) -> float:
+    """Shift of a row to the right, in px per row below the horizon and metre to the left."""
+    return float(np.cos(np.radians(camera.pitch_deg)) / camera.height_above_road_m)
 
 
 def shift_limits_m(distances: NDArray[np.float32]) -> NDArray[np.float64]:

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import conv2d, linear, max_pool2d, relu
 
-from mtlnet.model.architecture import FEATURES, SHARED, Conv, Pool, same_padding
+from mtlnet.model.architecture import GRID, HEIGHT, MTL, Conv, Pool, same_padding
 from mtlnet.model.cpu_kernels.im2col import im2col_convolution
 from mtlnet.model.cpu_kernels.norm_pool_relu import norm_pool_relu, pool_arguments
 from mtlnet.model.cpu_kernels.space_to_depth import space_to_depth, space_to_depth_convolution
@@ -17,6 +17,10 @@ from mtlnet.model.network import Network
 
 MAX_IM2COL_PIXELS = 64
 """Feature maps of at most so many pixels are convolved by `im2col_convolution`."""
+
+
+FAST = (MTL, GRID)
+"""The architectures whose layers this module has."""
 
 
 def training_outputs(
@@ -36,14 +40,28 @@ def forward_features(
 
     `masks`: dropout masks (B, units) of the shared layers, already scaled; none: no dropout.
     """
-    x = space_to_depth(images, dtype)
-    for number, spec in enumerate(FEATURES):
+    return forward_shared(network, forward_grid(network, images, dtype), dtype, masks)
+
+
+def forward_grid(network: Network, images: Tensor, dtype: torch.dtype) -> Tensor:
+    """The last convolution's features (B, C, h, w) of images (B, 210, 280, 3) uint8."""
+    layers = network.architecture.features
+    above = images.shape[1] - HEIGHT + network.architecture.first_row
+    x = space_to_depth(images[:, above:], dtype)
+    for number, spec in enumerate(layers):
         if isinstance(spec, Conv):
-            after = FEATURES[number + 1] if number + 1 < len(FEATURES) else None
+            after = layers[number + 1] if number + 1 < len(layers) else None
             pool = after if isinstance(after, Pool) else None
             x = _layer(x, number, spec, pool, network.features.get_submodule(f"conv{number}"))
-    x = x.flatten(1)
-    for number in range(len(SHARED)):
+    return x
+
+
+def forward_shared(
+    network: Network, grid: Tensor, dtype: torch.dtype, masks: Sequence[Tensor] = ()
+) -> Tensor:
+    """The last shared features (B, 256) of the last convolution's (B, C, h, w)."""
+    x = grid.flatten(1)
+    for number in range(len(network.architecture.shared)):
         layer = network.shared.get_submodule(f"fc{number}.layer")
         assert isinstance(layer, nn.Linear)
         x = relu(linear(x, layer.weight.to(dtype), layer.bias.to(dtype)))
@@ -72,11 +90,14 @@ def _convolve(x: Tensor, number: int, spec: Conv, weight: Tensor, bias: Tensor |
         return space_to_depth_convolution(x, weight, bias, x.dtype)
     weight = weight.to(x.dtype)
     height, width = x.shape[2:]
-    if height * width <= MAX_IM2COL_PIXELS:
+    if height * width <= MAX_IM2COL_PIXELS and spec.pad is None:
         y = im2col_convolution(x, weight, spec.stride)
         return y if bias is None else y + bias.to(x.dtype)[:, None, None]
-    (_, top, bottom), (_, left, right) = (
-        same_padding(size, spec.kernel, spec.stride) for size in (height, width)
-    )
-    assert (top, left) == (bottom, right)
+    if spec.pad is not None:
+        top = left = spec.pad
+    else:
+        (_, top, bottom), (_, left, right) = (
+            same_padding(size, spec.kernel, spec.stride) for size in (height, width)
+        )
+        assert (top, left) == (bottom, right)
     return conv2d(x, weight, None if bias is None else bias.to(x.dtype), spec.stride, (top, left))

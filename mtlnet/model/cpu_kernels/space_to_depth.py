@@ -2,7 +2,8 @@
 
 Space to depth: a block of 4 x 4 pixels becomes one pixel of 48 channels (row, column, colour). SAME
 padding starts a window 4 rows and 3 columns before its block, so 3 x 3 blocks contain it; the
-kernel is padded to 12 x 12. CPUs compute this three times as fast as with 3 channels.
+kernel is padded to 12 x 12. CPUs compute this three times as fast as with 3 channels. A convolution
+of 12 x 12 with four zeros around the image has that form already.
 """
 
 import torch
@@ -40,8 +41,9 @@ def space_to_depth(images: Tensor, dtype: torch.dtype) -> Tensor:
 def space_to_depth_convolution(
     x: Tensor, weight: Tensor, bias: Tensor | None, dtype: torch.dtype
 ) -> Tensor:
-    """The convolution with `weight` (F, 3, 11, 11) of x (B, 48, h, w): (B, F, h, w)."""
-    kernel = pad(weight * (1 / COLOUR_OFFSET), (1, 0, 0, 1))
+    """The convolution with `weight` (F, 3, 11, 11), or 12 x 12, of x (B, 48, h, w)."""
+    short = 3 * BLOCK - weight.shape[2]
+    kernel = pad(weight * (1 / COLOUR_OFFSET), (short, 0, 0, short))
     filters = len(weight)
     kernel = kernel.view(filters, 3, 3, BLOCK, 3, BLOCK).permute(0, 3, 5, 1, 2, 4)
     kernel = kernel.reshape(filters, BLOCK * ROW_BYTES, 3, 3).to(dtype)

@@ -1,0 +1,47 @@
+"""The markings recorded over an image: pixel polylines read back from its annotations.
+
+Frame: pixels, origin in the top left corner, a pixel's centre at half-integers.
+"""
+
+import numpy as np
+from foxglove_schemas_protobuf.ImageAnnotations_pb2 import ImageAnnotations
+from foxglove_schemas_protobuf.PointsAnnotation_pb2 import PointsAnnotation
+from google.protobuf.message import DecodeError
+from numpy.typing import NDArray
+
+from ..mcap.protobuf_wire import POINT2, bytes_fields
+
+LINES = ImageAnnotations.POINTS_FIELD_NUMBER
+POINTS = PointsAnnotation.POINTS_FIELD_NUMBER
+TAG = POINTS << 3 | 2
+
+
+def read_polylines(message: memoryview) -> list[NDArray[np.float64]]:
+    """The polylines (n, 2) of an ImageAnnotations message, in their order.
+
+    Points follow each other in 20 bytes each and are read as one array, not as so many objects of
+    protobuf. Raises ValueError when the message is damaged.
+    """
+    return [_points(message[start:end]) for start, end in bytes_fields(message, LINES)]
+
+
+def _points(line: memoryview) -> NDArray[np.float64]:
+    first = next(bytes_fields(line, POINTS), None)
+    if first is None:
+        return np.zeros((0, 2))
+    start = first[0] - 2  # its tag and length are a byte each
+    found = np.frombuffer(line[start:], POINT2, (len(line) - start) // POINT2.itemsize)
+    alike = (found["tag"] == TAG) & (found["length"] == POINT2.itemsize - 2)
+    count = len(alike) if alike.all() else int(alike.argmin())
+    after = start + count * POINT2.itemsize
+    if after < len(line) and line[after] == TAG:  # a coordinate of 0 is left out by protobuf
+        return _slowly(line)
+    return np.column_stack([found["x"][:count], found["y"][:count]])
+
+
+def _slowly(line: memoryview) -> NDArray[np.float64]:
+    try:
+        points = PointsAnnotation.FromString(bytes(line)).points
+    except DecodeError as error:
+        raise ValueError(f"a polyline is damaged ({error})") from error
+    return np.array([(point.x, point.y) for point in points]).reshape(-1, 2)

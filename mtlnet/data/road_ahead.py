@@ -1,0 +1,209 @@
+"""What of the road ahead a network may learn beside its answers, from recorded rounds.
+
+Columns: where the two markings of the car's lane cross the image rows `ROWS`, in px, from the
+polylines recorded with every image. Curvature: that of the road `AHEAD_M` in front of the car, in
+1/m, left positive, from the labels of all frames of the same track. NaN where it is not known: out
+of the image, or where no frame was recorded.
+
+For training only (`mtlnet.model.auxiliary`); answering needs none of it.
+"""
+
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from functools import lru_cache
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from datagen.recording import DatasetError, Frames
+from datagen.recording.mcap.index import Messages, open_round
+from datagen.recording.schema.polylines import read_polylines
+from datagen.recording.schema.topics import ANNOTATIONS, CAMERA
+from mtlnet.data.augment.geometric import (
+    horizon_row,
+    rotation_homography,
+    rotations,
+    shear_per_metre,
+)
+from mtlnet.data.augment.pipeline import AugmentParams
+from mtlnet.model.auxiliary import AHEAD_M, ROWS, SIDES
+from trackfeatures.camera import CameraParameters
+
+POINTS = 34
+"""Of a polyline, one a metre from just behind the eye on: the furthest row sees 25 m ahead."""
+NEAREST_M, APART_M = 12.0, 1.2
+"""A polyline that begins further away, or further to the side, is no marking of this lane."""
+CHUNK = 20_000  # frames read by a process at once
+KNOWN_M = 2.0
+"""A curvature is known where a frame was recorded so near."""
+
+Numbers = NDArray[np.float32]
+
+
+class RoadAhead:
+    """Labels of the road ahead for frames in order: columns and curvatures, of changed images.
+
+    `keep`: read the polylines of all frames now, on all cores, and keep them, 0.5 kB a frame.
+    """
+
+    def __init__(self, frames: Frames, camera: CameraParameters, *, keep: bool = False) -> None:
+        self._camera = camera
+        self._paths = [info.path for info in frames.rounds]
+        self._lines: dict[int, Messages] = {}
+        self._places = frames.places()
+        self._beside = lane_beside(frames)
+        self._kept = self._read_all() if keep else None
+        labels = frames.labels
+        tracks = np.array([info.track for info in frames.rounds])[labels.round]
+        self._curvature = curvature_ahead(labels.s, labels.curvature, tracks)
+
+    def labels(self, indices: NDArray[np.int64], params: AugmentParams | None = None) -> Numbers:
+        """Columns and curvatures of frames as one row each (B, `mtlnet.model.auxiliary.LABELS`)."""
+        columns = self.columns(indices, params).reshape(len(indices), -1)
+        return np.concatenate([columns, self.curvatures(indices, params)], 1)
+
+    def columns(self, indices: NDArray[np.int64], params: AugmentParams | None = None) -> Numbers:
+        """Columns (B, 2, ROWS) in px of frames, after `params` to their images."""
+        points = self._read(indices) if self._kept is None else self._kept[indices]
+        if params is None:
+            return crossings(points, self._camera.width)
+        return crossings(changed_points(points, params, self._camera), self._camera.width)
+
+    def _read(self, indices: NDArray[np.int64]) -> NDArray[np.float32]:
+        """The polylines (B, 2, POINTS, 2) in px of both markings, NaN where there is none."""
+        points = np.full((len(indices), SIDES, POINTS, 2), np.nan, np.float32)
+        for row, i in enumerate(indices.tolist()):
+            number, frame = self._places[i].tolist()
+            if number not in self._lines:
+                self._lines[number] = _annotations(self._paths[number])
+            lines = read_polylines(self._lines[number].payload(frame))
+            own_markings(lines, self._beside[i], self._camera, points[row])
+        return points
+
+    def _read_all(self) -> NDArray[np.float32]:
+        parts = np.array_split(np.arange(len(self._places)), max(len(self._places) // CHUNK, 1))
+        with ProcessPoolExecutor(mp_context=get_context("spawn")) as pool:
+            return np.concatenate(list(pool.map(self._read, parts)))
+
+    def curvatures(
+        self, indices: NDArray[np.int64], params: AugmentParams | None = None
+    ) -> Numbers:
+        """Curvatures (B, AHEAD_M) in 1/m of frames, after `params` to their images."""
+        found = self._curvature[indices]
+        return found if params is None else np.where(params.mirrored[:, None], -found, found)
+
+
+def _annotations(path: Path) -> Messages:
+    """The annotations of a round's frames; DatasetError unless each image has its own."""
+    found = open_round(path, (CAMERA, ANNOTATIONS)).messages
+    if not np.array_equal(found[CAMERA].log_time, found[ANNOTATIONS].log_time):
+        raise DatasetError(
+            f"{path.name}: its {len(found[CAMERA])} images do not pair with its "
+            f"{len(found[ANNOTATIONS])} annotations; record the round again"
+        )
+    return found[ANNOTATIONS]
+
+
+def lane_beside(frames: Frames) -> NDArray[np.float64]:
+    """Distances (N, 2) in m, left negative, to both markings of the lane that each car is in or
+    nearest to, whether or not they are active."""
+    labels, rounds = frames.labels, frames.rounds
+    width = np.array([info.lane_width_m for info in rounds])[labels.round]
+    centre = width * (labels.lanes / 2 - labels.lane_index - 0.5)
+    left = labels.to_middle - centre - width / 2
+    return np.column_stack([left, left + width])
+
+
+def own_markings(
+    lines: Sequence[NDArray[np.float64]],
+    beside: NDArray[np.float64],
+    camera: CameraParameters,
+    out: NDArray[np.floating[Any]],
+) -> None:
+    """Put the polylines of the lane's markings, `beside` (2,) m, into `out` (2, POINTS, 2).
+
+    Which is which is told at a polyline's near end, as if the road were level there: lanes are 3 m
+    wide at least.
+    """
+    horizon = horizon_row(camera) + 0.5  # from the image's upper border
+    nearest = np.full(SIDES, APART_M)
+    for line in lines:
+        u, below = line[0] - (camera.width / 2, horizon) if len(line) else (0.0, 0.0)
+        if below * NEAREST_M < camera.focal_px * camera.height_above_road_m:
+            continue
+        aside = u * camera.height_above_road_m / below
+        side = int(np.abs(beside - aside).argmin())
+        off = abs(beside[side] - aside)
+        if off < nearest[side]:
+            nearest[side] = off
+            out[side] = np.nan
+            out[side, : len(line)] = line[:POINTS]
+
+
+def changed_points(
+    points: NDArray[np.floating[Any]], params: AugmentParams, camera: CameraParameters
+) -> NDArray[np.float64]:
+    """Where points (B, 2, POINTS, 2) of images lie after `params` to these."""
+    # Images are changed in coordinates that count from the centre of the first pixel.
+    moved = points.astype(np.float64) - 0.5
+    below = np.maximum(moved[..., 1] - horizon_row(camera), 0.0)
+    moved[..., 0] += params.shift[:, None, None] * shear_per_metre(camera) * below
+    ways = _turned(camera)[params.rotation][:, None, None]
+    u, v, scale = np.moveaxis(
+        np.squeeze(ways @ np.concatenate([moved, np.ones_like(moved[..., :1])], -1)[..., None], -1),
+        -1,
+        0,
+    )
+    moved = np.stack([u / scale, v / scale], -1) + 0.5
+    flipped = moved[:, ::-1].copy()
+    flipped[..., 0] = camera.width - flipped[..., 0]
+    return np.where(params.mirrored[:, None, None, None], flipped, moved)
+
+
+@lru_cache(maxsize=2)
+def _turned(camera: CameraParameters) -> NDArray[np.float64]:
+    """The homographies (ROTATIONS, 3, 3) of the rotations there are."""
+    return np.stack([rotation_homography(camera, *turn) for turn in rotations().tolist()])
+
+
+def crossings(points: NDArray[np.floating[Any]], width: int) -> Numbers:
+    """The columns (B, 2, ROWS) in px at which polylines (B, 2, POINTS, 2) first cross `ROWS`.
+
+    NaN where one does not, or out of an image so many px wide.
+    """
+    u, v = points[..., 0], points[..., 1]
+    rows = np.array(ROWS)
+    v0, v1 = v[..., :-1, None], v[..., 1:, None]
+    # From the near end on a line goes up in the image; comparisons with NaN are false.
+    across = (v0 >= rows) & (v1 < rows)
+    first = across.argmax(2)  # (B, 2, ROWS)
+    found = across.any(2)
+    here = [np.take_along_axis(part, first + after, 2) for part in (u, v) for after in (0, 1)]
+    u0, u1, v_0, v_1 = here
+    with np.errstate(invalid="ignore", divide="ignore"):
+        column = u0 + (u1 - u0) * (v_0 - rows) / (v_0 - v_1)
+        found &= (column >= 0) & (column < width)
+    return np.where(found, column, np.nan).astype(np.float32)
+
+
+def curvature_ahead(s: Numbers, curvature: Numbers, tracks: NDArray[np.str_]) -> Numbers:
+    """Curvatures (N, AHEAD_M) in 1/m in front of cars at `s` (N,) m, where it is `curvature` (N,).
+
+    A track is the same in all its rounds, so that the frames of all of them tell of it; NaN where
+    none was near.
+    """
+    found = np.full((len(s), len(AHEAD_M)), np.nan, np.float32)
+    for track in np.unique(tracks).tolist():
+        here = np.flatnonzero(tracks == track)
+        order = here[np.argsort(s[here], kind="stable")]
+        places = s[order]
+        wanted = s[here][:, None] + np.array(AHEAD_M, np.float32)
+        after = np.searchsorted(places, wanted).clip(max=len(places) - 1)
+        before = np.maximum(after - 1, 0)
+        nearest = np.where(wanted - places[before] < places[after] - wanted, before, after)
+        near = np.abs(places[nearest] - wanted) <= KNOWN_M
+        found[here] = np.where(near, curvature[order][nearest], np.nan)
+    return found

@@ -1,0 +1,115 @@
+"""`mtlnet ship --model RUN --out DIR`: a model as weights alone, in half the bytes.
+
+`model.safetensors` in float16, the second head in float32 and the card: all an engine needs
+(`mtlnet.inference.engine.read_graph`). Its answers are those of the rounded weights, and so are the
+card's.
+"""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from safetensors.numpy import save
+
+from mtlnet.export.openvino_graph import TOLERANCE
+from mtlnet.inference.engine import load_engine
+from mtlnet.inference.model_card import (
+    CARD,
+    UNCERTAINTY_WEIGHTS,
+    WEIGHTS,
+    ModelCard,
+    ModelError,
+    check_files,
+    file_hash,
+    golden_image,
+    read_card,
+)
+from mtlnet.inference.prediction import OUTPUTS
+from mtlnet.inference.weights_file import read_weights
+from mtlnet.model.architecture import HEIGHT, WIDTH, find_architecture
+from mtlnet.model.network import load_network, predict_images
+from runtime.files import atomic_write
+from trackfeatures.errors import UserError
+
+CHECK_IMAGES = 4
+
+
+def ship_model(run: Path, out: Path) -> dict[str, Any]:
+    """Write the model of `run` into the new folder `out`; what `--json` prints.
+
+    Raises UserError when it cannot be made of weights alone or `out` has a model, ModelError when
+    the result does not answer as the run does, but for what rounding the weights makes of it.
+    """
+    card = read_card(run)
+    if find_architecture(card.network).backbone:
+        raise UserError(
+            f"network {card.network} is torchvision's: its graph cannot be made of weights alone; "
+            f"serve the run itself with `serve --model {run}`"
+        )
+    if (out / CARD).exists():
+        raise UserError(f"{out} already holds a model; give another --out or delete it")
+    names = (WEIGHTS,) if card.doubt is None else (WEIGHTS, UNCERTAINTY_WEIGHTS)
+    check_files(run, card, names)
+    out.mkdir(parents=True, exist_ok=True)
+    halves = {name: half(name, values) for name, values in read_weights(run / WEIGHTS).items()}
+    atomic_write(out / WEIGHTS, save(halves), fsync=True)
+    if card.doubt is not None:
+        atomic_write(
+            out / UNCERTAINTY_WEIGHTS, (run / UNCERTAINTY_WEIGHTS).read_bytes(), fsync=True
+        )
+    shipped = _card_of(out, card, names)
+    shipped.write(out)
+    try:
+        check = _check(run, out)
+    except ModelError:
+        (out / CARD).unlink()
+        raise
+    sizes = {name: (out / name).stat().st_size for name in (*names, CARD)}
+    return {"model": shipped.name, "out": str(out), "files": sizes, "check": check}
+
+
+def half(name: str, values: NDArray[np.float32]) -> NDArray[np.float16]:
+    """Weights in float16; ModelError when one is beyond its range."""
+    with np.errstate(over="ignore"):
+        rounded = values.astype(np.float16)
+    if not np.isfinite(rounded).all():
+        raise ModelError(f"{name} holds a weight beyond float16's range: train the model anew")
+    return rounded
+
+
+def _card_of(out: Path, card: ModelCard, names: tuple[str, ...]) -> ModelCard:
+    network = load_network(out / WEIGHTS, card.network)
+    golden = predict_images(network, golden_image(WIDTH, HEIGHT)[None])[0]
+    return replace(
+        card,
+        name=out.resolve().name,
+        files={name: file_hash(out / name) for name in names},
+        golden=tuple(float(value) for value in golden),
+    )
+
+
+def _check(run: Path, out: Path) -> dict[str, float]:
+    """Largest difference of what the shipped weights answer from torch, and from the run."""
+    rng = np.random.default_rng(0)
+    noise = rng.integers(0, 256, (CHECK_IMAGES, HEIGHT, WIDTH, 3), dtype=np.uint8)
+    images = [golden_image(WIDTH, HEIGHT), *noise]
+    engines = (
+        load_engine(out, "openvino", "f32"),
+        load_engine(out, "torch"),
+        load_engine(run, "torch"),
+    )
+    graph, torch, before = (
+        np.stack([engine(image)[:OUTPUTS] for image in images]) for engine in engines
+    )
+    found = {
+        "from_torch": float(np.abs(graph - torch).max()),
+        "from_run_on_golden_image": float(np.abs(graph - before)[0].max()),
+    }
+    if not found["from_torch"] <= TOLERANCE:
+        raise ModelError(
+            f"the weights in {out} answer as torch does but for {found['from_torch']:.2g}, at most "
+            f"{TOLERANCE:g} is expected; report this as a fault"
+        )
+    return found

@@ -1,0 +1,254 @@
+"""A network as an OpenVINO graph, built operation by operation from architecture and weights.
+
+Free of torch. Nothing is traced or converted: an implementation independent of torch's, with
+OpenVINO's own SAME padding, and a folder of weights is all that an engine needs.
+
+The heads and the uncertainty head are computed in float32 also where the rest is in bf16. OpenVINO
+rounds the results of a MatMul to bf16, in steps of 0.004 near 1, which is 0.025 m and 0.005 rad;
+element-wise operations at the end of a graph stay in float32.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+import trackfeatures as tf
+from mtlnet.inference.uncertainty import (
+    BANDS,
+    CELL_COLUMNS,
+    CELL_ROWS,
+    CENTRE_BANDS,
+    CENTRE_COLUMNS,
+    SQRT_EPSILON,
+    UncertaintyHead,
+)
+from mtlnet.model.architecture import (
+    ANGLES,
+    HEIGHT,
+    NEAR,
+    PAIR,
+    PLACES,
+    WIDTH,
+    Architecture,
+    Conv,
+    LocalNorm,
+    Pool,
+    find_architecture,
+)
+from trackfeatures.coding import OFFSET, SPAN
+
+MARKINGS = len(tf.MARKINGS)
+Weights = Mapping[str, NDArray[np.float32]]
+
+
+@dataclass(frozen=True)
+class Nodes:
+    """A network's nodes that others build on."""
+
+    images: Any  # uint8 (1, H, W, 3)
+    pixels: Any  # (1, 3, H, W) in [-1, 1]
+    shared: Any  # the last shared features (1, F)
+    outputs: Any  # (1, 9): see `mtlnet.inference.prediction`
+
+
+def network_nodes(
+    ops: Any,
+    architecture: Architecture,
+    weights: Weights,
+    features: Callable[[Any], Any] | None = None,
+) -> Nodes:
+    """The nodes of a folded network with these `weights`, named as in torch.
+
+    `features`: what makes features of pixels, where these layers are none of the architecture's.
+    """
+    images = ops.parameter([1, HEIGHT, WIDTH, 3], np.uint8, name="images")
+    x = ops.convert(images, np.float32)
+    x = ops.subtract(ops.multiply(x, np.float32(1 / 127.5)), np.float32(1))
+    pixels = ops.transpose(x, np.array([0, 3, 1, 2]))
+    x = (
+        features(pixels)
+        if features is not None
+        else convolutions(ops, pixels, architecture, weights)
+    )
+    x = ops.reshape(x, np.array([1, -1]), special_zero=False)
+    for number in range(len(architecture.shared)):
+        x = ops.relu(_linear(ops, x, weights, f"shared.fc{number}.layer"))
+    distance, angle, kind = (
+        linear_float32(ops, x, weights[f"heads.{name}.weight"], weights[f"heads.{name}.bias"])
+        for name, _ in architecture.heads
+    )
+    coded = [read_bins(ops, distance, angle)] if architecture.bins else [distance, angle]
+    return Nodes(images, pixels, x, ops.concat([*coded, ops.softmax(kind, 1)], 1))
+
+
+def model_of(nodes: Nodes, head: UncertaintyHead | None = None) -> Any:
+    """The OpenVINO model uint8 (1, 210, 280, 3) -> float32 (1, 9); with `head` (1, 17)."""
+    import openvino
+    from openvino import opset13 as ops
+
+    second = [] if head is None else uncertainty_outputs(ops, nodes.shared, nodes.pixels, head)
+    outputs = ops.concat([nodes.outputs, *second], 1)
+    return openvino.Model([ops.result(outputs)], [nodes.images], "mtlnet")
+
+
+def model_from_weights(network: str, weights: Weights, head: UncertaintyHead | None = None) -> Any:
+    """The OpenVINO model of the network of that name with these weights."""
+    from openvino import opset13 as ops
+
+    return model_of(network_nodes(ops, find_architecture(network), weights), head)
+
+
+def convolutions(ops: Any, x: Any, architecture: Architecture, weights: Weights) -> Any:
+    """The layers before the shared ones, (1, 3, H, W) -> (1, C, h, w)."""
+    if architecture.first_row:
+        first, last = np.array([architecture.first_row]), np.array([HEIGHT])
+        x = ops.slice(x, first, last, np.array([1]), np.array([2]))
+    for number, spec in enumerate(architecture.features):
+        if isinstance(spec, LocalNorm):
+            x = ops.lrn(x, np.array([1]), spec.alpha, spec.beta, 1.0, spec.size)
+        elif isinstance(spec, Pool):
+            x = _pool(ops, x, spec)
+        else:
+            name = f"features.conv{number}.layer"
+            x = _convolution(ops, x, spec, weights[f"{name}.weight"])
+            x = ops.relu(ops.add(x, weights[f"{name}.bias"].reshape(1, -1, 1, 1)))
+    return x
+
+
+def _convolution(ops: Any, x: Any, spec: Conv, weight: NDArray[np.float32]) -> Any:
+    how = {"auto_pad": "same_upper"} if spec.pad is None else {}
+    pads = [spec.pad or 0] * 2
+    return convolution(ops, x, weight, [spec.stride] * 2, pads, spec.groups, **how)
+
+
+def convolution(
+    ops: Any,
+    x: Any,
+    weight: NDArray[np.float32],
+    stride: list[int],
+    pads: list[int],
+    groups: int = 1,
+    **how: str,
+) -> Any:
+    """A convolution with a kernel (F, C, k, k), without bias."""
+    convolve = ops.convolution
+    if groups > 1:
+        outputs, inputs, *kernel = weight.shape
+        weight = weight.reshape(groups, outputs // groups, inputs, *kernel)
+        convolve = ops.group_convolution
+    return convolve(x, weight, stride, pads, pads, [1, 1], **how)
+
+
+def _pool(ops: Any, x: Any, spec: Pool) -> Any:
+    sizes = ([spec.stride] * 2, [1, 1], [0, 0], [0, 0], [spec.kernel] * 2)
+    how = {"auto_pad": "same_upper"} if spec.same else {"rounding_type": "ceil"}
+    return ops.max_pool(x, *sizes, **how).output(0)
+
+
+def _linear(ops: Any, x: Any, weights: Weights, name: str) -> Any:
+    product = ops.matmul(x, weights[f"{name}.weight"], False, True)
+    return ops.add(product, weights[f"{name}.bias"][None])
+
+
+def read_bins(ops: Any, distance: Any, angle: Any) -> Any:
+    """Coded answers (1, 6) of rows of scores (1, 5 (PLACES + 1)) and (1, ANGLES)."""
+    scores = ops.reshape(distance, np.array([MARKINGS, PLACES + 1]), special_zero=False)
+    absent = _columns(ops, ops.softmax(scores, 1), PLACES, PLACES + 1)  # (5, 1)
+    # `ml` and `mr` are absent together.
+    share = np.eye(MARKINGS, dtype=np.float32)
+    share[PAIR, PAIR] = 0.5
+    absent = ops.reduce_sum(
+        ops.multiply(ops.reshape(absent, np.array([1, MARKINGS]), special_zero=False), share),
+        np.array([1]),
+        keep_dims=True,
+    )
+    found = _expectation(ops, _columns(ops, scores, 0, PLACES), PLACES)
+    spans = [tf.RANGES[name] for name in tf.MARKINGS]
+    ends = np.array([[float(span.inactive != span.lo)] for span in spans], np.float32)
+    shares = ops.select(ops.greater(absent, np.float32(0.5)), ends, found)
+    row = ops.reshape(shares, np.array([1, MARKINGS]), special_zero=False)
+    row = ops.concat([row, _expectation(ops, angle, ANGLES)], 1)
+    return ops.add(ops.multiply(row, np.float32(SPAN)), np.float32(OFFSET))
+
+
+def _columns(ops: Any, x: Any, first: int, last: int) -> Any:
+    return ops.slice(x, np.array([first]), np.array([last]), np.array([1]), np.array([1]))
+
+
+def _expectation(ops: Any, scores: Any, count: int) -> Any:
+    """Shares (N, 1) in [0, 1] of scores (N, count): the mean within NEAR bins of the likeliest."""
+    axis = np.array([1])
+    number = np.arange(count, dtype=np.float32)[None]
+    highest = ops.reduce_max(scores, axis, keep_dims=True)
+    # The first of the highest, as torch's argmax: all others count as far away.
+    places = ops.select(ops.equal(scores, highest), number, np.float32(count))
+    best = ops.reduce_min(places, axis, keep_dims=True)
+    near = ops.less_equal(ops.abs(ops.subtract(number, best)), np.float32(NEAR))
+    weight = ops.exp(ops.subtract(scores, highest))
+    weight = ops.select(near, weight, np.float32(0))
+    middle = (number + 0.5) / np.float32(count)
+    total = ops.reduce_sum(weight, axis, keep_dims=True)
+    return ops.divide(ops.reduce_sum(ops.multiply(weight, middle), axis, keep_dims=True), total)
+
+
+def product_float32(ops: Any, x: Any, weight: NDArray[np.float32]) -> Any:
+    """x (1, F) times weight (N, F) transposed: (1, N)."""
+    # In two dimensions: OpenVINO would lay out three as the channels of an image, and back.
+    sums = ops.reduce_sum(ops.multiply(x, weight), np.array([1]))
+    return ops.unsqueeze(sums, np.array([0]))
+
+
+def linear_float32(ops: Any, x: Any, weight: NDArray[np.float32], bias: NDArray[np.float32]) -> Any:
+    """Linear layer with weight (N, F) and bias (N,) on x (1, F): (1, N)."""
+    return ops.add(product_float32(ops, x, weight), bias[None])
+
+
+def uncertainty_outputs(ops: Any, x: Any, pixels: Any, head: UncertaintyHead) -> list[Any]:
+    """`UncertaintyHead.predict` of last shared features x (1, F) and pixels (1, 3, H, W)."""
+    z = ops.multiply(ops.subtract(x, head.centre[None]), head.scale[None])
+    hidden = ops.relu(linear_float32(ops, z, head.hidden_weight, head.hidden_bias))
+    log_std = linear_float32(ops, hidden, head.weight, head.bias)
+    limited = ops.minimum(ops.maximum(log_std, head.low[None]), head.high[None])
+    cells, centre = texture_graph(ops, pixels)
+    deviation = ops.subtract(cells, head.texture_mean[None])
+    projected = product_float32(ops, deviation, head.texture_directions)
+    z = ops.multiply(ops.subtract(centre, head.pitch_centre[None]), head.pitch_scale[None])
+    hidden = ops.relu(linear_float32(ops, z, head.pitch_hidden_weight, head.pitch_hidden_bias))
+    pitch = linear_float32(ops, hidden, head.pitch_weight, head.pitch_bias)
+    distance = ops.reduce_sum(ops.multiply(projected, projected), np.array([1]), keep_dims=True)
+    return [ops.exp(limited), ops.maximum(distance, ops.multiply(pitch, pitch))]
+
+
+def texture_graph(ops: Any, pixels: Any) -> tuple[Any, Any]:
+    """`mtlnet.inference.uncertainty.texture_features` of pixels (1, 3, H, W): (1, C) and (1, M)."""
+    _, _, height, width = pixels.shape
+    grey = ops.reduce_mean(pixels, np.array([1]), keep_dims=True)
+    planes = [pixels]
+    for axis, size in ((3, width), (2, height)):
+        ends = np.array([0] * axis + [1] + [0] * (3 - axis))
+        longer = ops.pad(grey, np.zeros(4, int), ends, "edge")
+        first, last, step = np.array([1]), np.array([size + 1]), np.array([1])
+        following = ops.slice(longer, first, last, step, np.array([axis]))
+        planes.append(ops.abs(ops.subtract(following, grey)))
+    band = [height // (CELL_ROWS * BANDS), width // CELL_COLUMNS]
+    narrow = [_means(ops, plane, band) for plane in planes]
+    cells = [_means(ops, plane, [BANDS, 1]) for plane in narrow]
+    first = np.array([CENTRE_BANDS.start, CENTRE_COLUMNS.start])
+    last = np.array([CENTRE_BANDS.stop, CENTRE_COLUMNS.stop])
+    steps, axes = np.array([1, 1]), np.array([2, 3])
+    centre = [ops.slice(plane, first, last, steps, axes) for plane in narrow]
+    return _flat(ops, cells), _flat(ops, centre)
+
+
+def _means(ops: Any, plane: Any, cell: list[int]) -> Any:
+    return ops.avg_pool(plane, cell, [0, 0], [0, 0], cell, False)
+
+
+def _flat(ops: Any, planes: list[Any]) -> Any:
+    """One row: the colours, and the square roots of the differences."""
+    colours, *others = planes
+    roots = [ops.sqrt(ops.add(plane, np.float32(SQRT_EPSILON))) for plane in others]
+    return ops.reshape(ops.concat([colours, *roots], 1), np.array([1, -1]), special_zero=False)

@@ -1,0 +1,134 @@
+"""Distances and angle as distributions over bins: targets, and the answer read from the scores.
+
+A distance is a softmax over `PLACES` bins of its range (`trackfeatures.RANGES`) and one class
+"absent"; the angle one over `ANGLES` bins. A number's target is a normal distribution about it,
+integrated over each bin (HL-Gauss; Imani and White 2018, Farebrother et al. 2024). The answer is
+the expectation within `NEAR` bins of the likeliest one: where a marking's distance jumps to the
+next marking's, a regression answers in between, two peaks do not.
+
+All in torch operations without branches, so that a network ends with them when it is exported.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn.functional import log_softmax
+
+import trackfeatures as tf
+from mtlnet.model.architecture import ANGLES, NEAR, PAIR, PLACES
+from trackfeatures.coding import OFFSET, SPAN
+
+SPREAD = 1.0
+"""Standard deviation of a target, in bins."""
+
+_SPANS = [tf.RANGES[name] for name in tf.TARGETS]
+
+
+@dataclass(frozen=True)
+class Scores:
+    """What the heads say of B images, before softmax."""
+
+    distance: Tensor  # (B, 5, PLACES + 1), the last "absent"
+    angle: Tensor  # (B, ANGLES)
+    heading: Tensor  # (B, 3)
+
+
+def split_scores(distance: Tensor, angle: Tensor, heading: Tensor) -> Scores:
+    """Scores of the heads' rows (B, `DISTANCE_SCORES`), (B, `ANGLES`) and (B, 3)."""
+    return Scores(distance.reshape(-1, len(tf.MARKINGS), PLACES + 1), angle, heading)
+
+
+def bin_centres(low: float, high: float, count: int) -> list[float]:
+    """The middles of `count` bins between two values."""
+    width = (high - low) / count
+    return [low + width * (k + 0.5) for k in range(count)]
+
+
+def normal_targets(values: Tensor, low: float, high: float, count: int) -> Tensor:
+    """Probabilities (..., `count`) of bins between `low` and `high` for values (...).
+
+    A value outside counts as the nearer end; what of a distribution lies beyond is cut off.
+    """
+    width = (high - low) / count
+    edges = torch.linspace(low, high, count + 1, dtype=values.dtype, device=values.device)
+    away = (edges - values.clamp(low, high)[..., None]) / (SPREAD * width)
+    below = torch.special.ndtr(away)
+    mass: Tensor = (below[..., 1:] - below[..., :-1]) / (below[..., -1:] - below[..., :1])
+    return mass
+
+
+def bin_targets(coded: Tensor) -> tuple[Tensor, Tensor]:
+    """Target distributions (B, 5, PLACES + 1) and (B, ANGLES) of coded targets (B, 6)."""
+    values = _decoded(coded)
+    absent = absent_in(coded)
+    each = []
+    for column in range(len(tf.MARKINGS)):
+        span = _SPANS[column]
+        places = normal_targets(values[:, column], span.lo, span.hi, PLACES)
+        here = ~absent[:, column : column + 1]
+        each.append(torch.cat([places * here, (~here).to(places)], 1))
+    angle = normal_targets(values[:, -1], _SPANS[-1].lo, _SPANS[-1].hi, ANGLES)
+    return torch.stack(each, 1), angle
+
+
+def absent_in(coded: Tensor) -> Tensor:
+    """Which distances coded targets (B, 6) call absent: (B, 5) bool. A label says so by the
+    range's inactive end, which no marking that is there reaches."""
+    ends = [span.inactive for span in _SPANS[:-1]]
+    there = torch.tensor(ends, dtype=coded.dtype, device=coded.device)
+    low, width = _ranges(coded)
+    return (coded[:, :-1] - _code(there, low[:-1], width[:-1])).abs() < _SAME
+
+
+_SAME = 1e-4
+"""Of a coded value: float32's own error is a thousandth of this, the nearest marking 0.02 away."""
+
+
+def read_scores(distance: Tensor, angle: Tensor) -> Tensor:
+    """Coded answers (B, 6) of scores (B, 5, PLACES + 1) and (B, ANGLES).
+
+    An absent distance is coded as the inactive end of its range, as in a label.
+    """
+    absent = torch.softmax(distance, 2)[:, :, -1]
+    pair = absent[:, PAIR].mean(1, keepdim=True).expand(-1, 2)
+    absent = torch.cat([pair, absent[:, PAIR.stop :]], 1)
+    found = expectation(distance[:, :, :-1])  # in bins' places, [0, 1] of the range
+    ends = torch.tensor(
+        [0.0 if span.inactive == span.lo else 1.0 for span in _SPANS[:-1]],
+        dtype=found.dtype,
+        device=found.device,
+    )
+    shares = torch.where(absent > 0.5, ends.expand_as(found), found)
+    shares = torch.cat([shares, expectation(angle)[:, None]], 1)
+    return OFFSET + SPAN * shares
+
+
+def expectation(scores: Tensor) -> Tensor:
+    """Where in its range, as a share in [0, 1], a number lies by its bins' scores (..., count)."""
+    count = scores.shape[-1]
+    number = torch.arange(count, dtype=torch.float32, device=scores.device)
+    best = scores.argmax(-1, keepdim=True).to(torch.float32)
+    near = (number - best).abs() <= NEAR
+    weight = torch.exp(scores.float() - scores.float().amax(-1, keepdim=True)) * near
+    return (weight * ((number + 0.5) / count)).sum(-1) / weight.sum(-1)
+
+
+def soft_cross_entropy(scores: Tensor, targets: Tensor) -> Tensor:
+    """Cross-entropy (...) of scores (..., count) for target distributions (..., count)."""
+    return -(targets * log_softmax(scores, -1)).sum(-1)
+
+
+def _ranges(like: Tensor) -> tuple[Tensor, Tensor]:
+    low = torch.tensor([span.lo for span in _SPANS], dtype=like.dtype, device=like.device)
+    high = torch.tensor([span.hi for span in _SPANS], dtype=like.dtype, device=like.device)
+    return low, high - low
+
+
+def _code(values: Tensor, low: Tensor, width: Tensor) -> Tensor:
+    return OFFSET + SPAN * (values - low) / width
+
+
+def _decoded(coded: Tensor) -> Tensor:
+    low, width = _ranges(coded)
+    return low + (coded - OFFSET) / SPAN * width

@@ -1,0 +1,159 @@
+"""Answers as distributions over bins: targets, what is read from scores, and what is learned."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import trackfeatures as tf
+from mtlnet.export.convert import ONNX_FILE, check_export, write_onnx
+from mtlnet.export.openvino_graph import TOLERANCE, build_graph
+from mtlnet.model.architecture import ANGLES, GRID, PLACES, grid_size
+from mtlnet.model.bins import (
+    Scores,
+    absent_in,
+    bin_targets,
+    expectation,
+    normal_targets,
+    read_scores,
+)
+from mtlnet.model.network import Network, fold, initialise, predict_images
+from mtlnet.training.bins_loss import bins_loss
+from mtlnet.training.loss import Losses
+
+NAN = float("nan")
+CASES = [
+    # In a lane; on a marking between two lanes; on both systems at once; outside on the left.
+    ((-1.9, 2.1, NAN, NAN, NAN), 0.03),
+    ((NAN, NAN, -3.7, 0.3, 4.3), -0.12),
+    ((-0.8, 3.2, NAN, -0.8, 3.2), 0.3),
+    ((NAN, NAN, NAN, 1.5, 5.4), 0.0),
+]
+
+
+def coded_cases() -> torch.Tensor:
+    return torch.from_numpy(tf.encode([d for d, _ in CASES], [a for _, a in CASES]))
+
+
+def test_a_target_is_a_normal_distribution_over_its_bins() -> None:
+    found = normal_targets(torch.tensor([0.0, 0.05, -7.0]), -1.0, 1.0, 20).numpy()
+    np.testing.assert_allclose(found.sum(1), 1.0, atol=1e-6)
+    middles = np.linspace(-0.95, 0.95, 20)
+    # Standard deviation of a bin, and Sheppard's correction for its width.
+    for row, value in ((0, 0.0), (1, 0.05)):
+        mean = (found[row] * middles).sum()
+        assert mean == pytest.approx(value, abs=1e-4)
+        assert (found[row] * (middles - mean) ** 2).sum() == pytest.approx(0.01 * 13 / 12, rel=1e-3)
+    assert found[2].argmax() == 0  # a value outside counts as the nearer end
+
+
+def test_labels_say_what_is_absent() -> None:
+    expected = [[np.isnan(d) for d in distances] for distances, _ in CASES]
+    assert absent_in(coded_cases()).tolist() == expected
+    mirrored = torch.from_numpy(tf.mirror_coded(coded_cases().numpy()))
+    swapped = [[row[i] for i in (1, 0, 4, 3, 2)] for row in expected]
+    assert absent_in(mirrored).tolist() == swapped
+
+
+def test_what_is_read_from_a_target_is_its_value() -> None:
+    coded = coded_cases()
+    distances, angles = bin_targets(coded)
+    assert (distances.shape, angles.shape) == ((4, 5, PLACES + 1), (4, ANGLES))
+    read = read_scores(distances.clamp_min(1e-9).log(), angles.clamp_min(1e-9).log())
+    np.testing.assert_allclose(read.numpy(), coded.numpy(), atol=4e-4)
+    found, angle = tf.decode(read.numpy())
+    np.testing.assert_allclose(found, [d for d, _ in CASES], atol=3e-3)
+    np.testing.assert_allclose(angle, [a for _, a in CASES], atol=5e-4)
+
+
+def test_of_two_peaks_the_higher_is_the_answer() -> None:
+    both = 0.6 * normal_targets(torch.tensor(-3.0), -5.0, 0.0, PLACES)
+    both += 0.4 * normal_targets(torch.tensor(-1.0), -5.0, 0.0, PLACES)
+    share = float(expectation(both.clamp_min(1e-9).log()))
+    assert -5.0 + 5.0 * share == pytest.approx(-3.0, abs=0.01)
+
+
+def test_both_markings_of_the_lane_are_absent_together() -> None:
+    scores = torch.zeros(2, 5, PLACES + 1)
+    scores[:, 0, 45] = scores[:, 1, 20] = scores[:, 2:, 30] = 8.0
+    scores[0, 0, PLACES], scores[1, 0, PLACES] = 7.0, 12.0  # a little unsure, and quite sure
+    distances, _ = tf.decode(read_scores(scores, torch.zeros(2, ANGLES)).numpy())
+    assert np.isnan(distances[:, :2]).tolist() == [[False, False], [False, False]]
+    scores[1, 1, PLACES] = 7.99  # the mean of both probabilities is above a half
+    distances, _ = tf.decode(read_scores(scores, torch.zeros(2, ANGLES)).numpy())
+    assert np.isnan(distances[:, :2]).tolist() == [[False, False], [True, True]]
+
+
+def test_the_loss_is_least_at_the_target_and_follows_alpha() -> None:
+    coded, heading = coded_cases(), torch.tensor([0, 1, 2, 1])
+    exact = [part.clamp_min(1e-9).log() for part in bin_targets(coded)]
+    sure = torch.nn.functional.one_hot(heading, 3) * 20.0
+
+    def loss(distance: torch.Tensor, alpha: tuple[float, float, float]) -> Losses:
+        return bins_loss(Scores(distance, exact[1], sure), coded, heading, alpha)
+
+    best, off = (loss(d, (1.0, 0.0, 0.0)) for d in (exact[0], exact[0].roll(3, 2)))
+    assert float(best.total) < float(off.total) - 1.0
+    assert float(best.distance) < 1e-5 < float(off.distance)
+    assert float(best.total) == pytest.approx(float(best.terms[0]))
+    only_class = loss(exact[0].roll(3, 2), (0.0, 0.0, 0.5))
+    assert float(only_class.total) == pytest.approx(0.0, abs=1e-6)
+
+
+def made() -> Network:
+    """A network whose heads are as sure as trained ones."""
+    network = Network(architecture=GRID, batch_norm=True)
+    initialise(network, 1)
+    network.train()
+    with torch.no_grad():
+        network(torch.from_numpy(images(4)))  # moves the running statistics off their start
+        for name in ("distance", "angle"):
+            network.get_parameter(f"heads.{name}.weight").mul_(30)
+    return network.eval()
+
+
+def images(count: int, seed: int = 0) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
+    return np.random.default_rng(seed).integers(0, 256, (count, 210, 280, 3), dtype=np.uint8)
+
+
+def test_the_grid_keeps_its_places_and_reads_no_sky() -> None:
+    assert grid_size(GRID) == (32, 9, 18)
+    network, frames = made(), images(2, 3)
+    assert tuple(network.forward_grid(torch.from_numpy(frames)).shape) == (2, 32, 9, 18)
+    before = predict_images(network, frames)
+    frames[:, :66] = 0
+    assert before.tolist() == predict_images(network, frames).tolist()
+    frames[:, 66] = 0
+    assert before.tolist() != predict_images(network, frames).tolist()
+
+
+def test_what_is_for_training_only_is_gone_when_folded() -> None:
+    network = made()
+    folded = fold(network)
+    assert network.auxiliary is not None
+    assert folded.auxiliary is None
+    assert sum(p.numel() for p in folded.parameters()) == 3_630_634
+    frames = images(3, 4)
+    np.testing.assert_allclose(
+        predict_images(network, frames), predict_images(folded, frames), atol=2e-5
+    )
+
+
+def test_an_onnx_model_reads_bins_as_torch_does(tmp_path: Path) -> None:
+    network = fold(made())
+    write_onnx(network, tmp_path, bf16=False)
+    found = check_export(network, tmp_path / ONNX_FILE, "f32", images(4, 6))
+    assert found["largest"] < TOLERANCE
+
+
+def test_the_graph_reads_bins_as_torch_does() -> None:
+    import openvino
+
+    network, frames = fold(made()), images(12, 5)
+    options = {"INFERENCE_PRECISION_HINT": "f32"}
+    request = openvino.Core().compile_model(build_graph(network), "CPU", options)
+    expected = predict_images(network, frames)
+    found = np.concatenate([request(frame[None])[0] for frame in frames])
+    assert np.ptp(expected[:, :6], axis=0).max() > 0.05
+    np.testing.assert_allclose(found, expected, atol=TOLERANCE)
