@@ -1,0 +1,1 @@
+"""The scripted driver of a round and the trajectory that it follows."""

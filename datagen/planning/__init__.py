@@ -1,0 +1,1 @@
+"""The plan of a dataset: configuration, rounds, class balance, split."""

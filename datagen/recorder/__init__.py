@@ -1,0 +1,1 @@
+"""Recording one round: simulation, camera, writing, and replaying it."""

@@ -35,6 +35,7 @@ from mtlnet.training.config import TrainConfig, write_config
 from mtlnet.training.distributed import Rank, barrier, process_group, read_rank
 from mtlnet.training.loop import Report, train_loop
 from mtlnet.training.recipes import Recipe, find_recipe
+from mtlnet.training.task_weighting import TaskWeighting
 from mtlnet.training.trainer import Trainer, choose_device, keep_freed_memory
 from mtlnet.uncertainty_fit.head import fit_uncertainty_head
 from trackfeatures.errors import UserError
@@ -139,14 +140,14 @@ def prepare(
 ) -> tuple[Trainer, Loader]:
     """The trainer before its first step, with the weights of the run `init`, and the batches."""
     recipe = find_recipe(config.recipe)
+    steps_per_epoch = max(len(data.frames) // config.batch, 1)
     trainer = Trainer(
         recipe,
         config.alpha,
         config.seed,
         device,
         find_architecture(config.network),
-        balance=config.balance,
-        steps_per_epoch=max(len(data.frames) // config.batch, 1),
+        task_weighting=TaskWeighting(config.balance, config.alpha, device, steps_per_epoch),
         rank=rank,
         folded=init is not None,
     )

@@ -24,7 +24,7 @@ from mtlnet.training.distributed import SINGLE_PROCESS, Rank, average, dropout_s
 from mtlnet.training.loss import Alpha, Losses, multi_task_loss
 from mtlnet.training.optimizers import OptimizerSet
 from mtlnet.training.recipes import Recipe, frozen_convolutions, learning_rate
-from mtlnet.training.task_weighting import WINDOW_STEPS, TaskWeighting
+from mtlnet.training.task_weighting import TaskWeighting
 from trackfeatures.errors import UserError
 
 MIN_TARGET_STD = (0.01,) * 6
@@ -36,7 +36,7 @@ MIN_STEPS_BEFORE_BN_FREEZE = 100
 class Trainer:
     """Trains a network; `step_number` counts the steps taken.
 
-    `steps_per_epoch`: for the task weighting `balance`. `folded`: the network has no batch
+    `task_weighting`: None for the fixed weights `alpha`. `folded`: the network has no batch
     normalisation, since it starts as a finished model.
     """
 
@@ -48,8 +48,7 @@ class Trainer:
         device: torch.device,
         architecture: Architecture = MTL,
         *,
-        balance: str = "fixed",
-        steps_per_epoch: int = WINDOW_STEPS,
+        task_weighting: TaskWeighting | None = None,
         rank: Rank = SINGLE_PROCESS,
         folded: bool = False,
     ) -> None:
@@ -58,7 +57,7 @@ class Trainer:
         self.seed = seed
         self.device = device
         self.rank = rank
-        self.task_weighting = TaskWeighting(balance, alpha, device, steps_per_epoch)
+        self.task_weighting = task_weighting or TaskWeighting("fixed", alpha, device)
         self.step_number = 0
         network = Network(
             batch_norm=recipe.batch_norm or (architecture.backbone and not folded),
@@ -69,15 +68,15 @@ class Trainer:
         self.network = network.to(device).to(memory_format=torch.channels_last)
         self.optimizers = OptimizerSet(self.network, recipe, self.task_weighting.parameters)
         self.target_variance: Tensor | None = None
-        self.cuda_graph = self._cuda_graph(balance)
+        self.cuda_graph = self._cuda_graph()
         self.seed_dropout()
 
-    def _cuda_graph(self, balance: str) -> CudaGraphStep | None:
+    def _cuda_graph(self) -> CudaGraphStep | None:
         """The recorded step on a GPU, where the numbers it computes with seldom change.
 
         Otherwise the learning rate or the tasks' weights change at every step.
         """
-        constant = self.recipe.optimizer == "sgd" and balance == "fixed"
+        constant = self.recipe.optimizer == "sgd" and self.task_weighting.method == "fixed"
         if self.device.type != "cuda" or not constant or self.rank.world_size > 1:
             return None
         return CudaGraphStep(self.optimize, CudaRecorder(self.device))

@@ -1,0 +1,1 @@
+"""Driving without an operator: speed control and the steering law of scripted cars."""
