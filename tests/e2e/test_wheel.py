@@ -51,6 +51,7 @@ mtlnet train --data data --out run --alpha 0.3,0.2,0.5 --iterations 2 --batch 4 
 mtlnet evaluate --model run --data data --split all --report report.html
 mtlnet export --model run --data data --frames 4 --format onnx
 mtlnet ablate --data data --out ablation --iterations 2 --dry-run
+mtlnet ship --model run --out shipped
 controllers drive --steps 3
 controllers drive --steps 3 --perception model --model run
 """
