@@ -1,7 +1,6 @@
 """The `mtlnet` command: train, evaluate, export and run the perception network."""
 
 import json
-import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -126,7 +125,23 @@ ReportPage = Annotated[
     Path | None, typer.Option("--report", help="HTML page to write: a file, or a folder.")
 ]
 EveryFrame = Annotated[int, typer.Option(help="Evaluate every n-th frame only.")]
-ImageFiles = Annotated[list[Path], typer.Argument(help="JPEG or PNG files.")]
+PredictInputs = Annotated[
+    list[str],
+    typer.Argument(help="JPEG or PNG files, folders of them, patterns, films, rounds (.mcap)."),
+]
+PredictOut = Annotated[
+    list[Path] | None,
+    typer.Option(
+        help="Table (.csv, .jsonl), film (.mp4) or folder of pictures with the markings drawn in; "
+        "may be given several times."
+    ),
+]
+FieldOfView = Annotated[
+    float | None,
+    typer.Option(help="Vertical field of view of images and films, degrees.  [default: model's]"),
+]
+MAX_PRINTED = 40
+"""Rows of the table that `predict` prints."""
 
 
 @app.command("train")
@@ -287,33 +302,39 @@ def evaluate_command(
 
 @app.command("predict")
 def predict_command(
-    images: ImageFiles,
+    images: PredictInputs,
     model: Model = "default",
+    out: PredictOut = None,
+    fov_y_deg: FieldOfView = None,
     engine: EngineKind = "openvino",
     precision: Precision = None,
     as_json: Json = False,
 ) -> None:
-    """Track features of images from the model's camera."""
+    """Track features of images, films or recorded rounds; also as tables, pictures or a film."""
     from rich.console import Console
+    from rich.progress import Progress
 
     from mtlnet.evaluation.tables import prediction_table
-    from mtlnet.inference.image_decoding.decode import read_image
-    from mtlnet.inference.prediction import decode_outputs
+    from mtlnet.predict.run import predict_files
 
     _print_model(model)
-    predict = _load(model, engine, precision)
-    predictions = []
-    for path in images:
-        image = read_image(path, predict.card.camera)
-        begin = time.perf_counter()
-        prediction = decode_outputs(predict(image)).as_json()
-        latency_ms = round(1e3 * (time.perf_counter() - begin), 3)
-        about = {"model": predict.card.name, "latency_ms": latency_ms}
-        predictions.append({"image": str(path), **prediction, **about})
+    loaded = _load(model, engine, precision)
+    with Progress(console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task("predicting")
+
+        def report(done: int, total: int) -> None:
+            bar.update(task, completed=done, total=total)
+
+        predictions = predict_files(loaded, images, out or (), fov_y_deg, report)
     if as_json:
         typer.echo(json.dumps(predictions))
     else:
-        Console().print(prediction_table(predictions))
+        Console().print(prediction_table(predictions[:MAX_PRINTED]))
+        if len(predictions) > MAX_PRINTED:
+            typer.echo(
+                f"the first {MAX_PRINTED} of {len(predictions)}; --out features.csv has all",
+                err=True,
+            )
 
 
 def _print_model(name: str) -> None:

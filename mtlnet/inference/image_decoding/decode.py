@@ -35,11 +35,13 @@ class ImageHeader:
     png_header: png.PngHeader | None = None
 
 
-def read_image(path: Path, view: CameraParameters) -> NDArray[np.uint8]:
+def read_image(
+    path: Path, view: CameraParameters, fov_y_deg: float | None = None
+) -> NDArray[np.uint8]:
     """The JPEG or PNG at `path` as uint8 RGB (view.height, view.width, 3).
 
-    It is scaled, and cropped if wider than the view. Raises ImageError for an image that cannot be
-    used, UserError for a missing or too large file.
+    It is scaled, and cropped if wider than the view; `fov_y_deg` as in `inspect`. Raises ImageError
+    for an image that cannot be used, UserError for a missing or too large file.
     """
     if not path.is_file():
         raise UserError(f"there is no image file {path}")
@@ -50,7 +52,7 @@ def read_image(path: Path, view: CameraParameters) -> NDArray[np.uint8]:
         )
     body = path.read_bytes()
     try:
-        return decode(body, inspect(body, view), view)
+        return decode(body, inspect(body, view, fov_y_deg), view, fov_y_deg)
     except ImageError as error:
         raise ImageError(error.fault, f"{path}: {error}") from error
 

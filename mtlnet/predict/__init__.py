@@ -1,0 +1,1 @@
+"""`mtlnet predict`: track features of images, films and recorded rounds, as tables and pictures."""

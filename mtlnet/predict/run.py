@@ -1,0 +1,57 @@
+"""`mtlnet predict`: the features of images, films and recorded rounds, yielded and written."""
+
+import time
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+from mtlnet.inference.engine import Engine
+from mtlnet.inference.prediction import decode_outputs
+from mtlnet.predict.sources import find_sources, read_sources
+from mtlnet.predict.writers import open_writer
+from trackfeatures.errors import UserError
+
+KEPT_ROWS = 10_000
+"""Results returned at most; files get all."""
+
+
+def predict_files(
+    engine: Engine,
+    inputs: Sequence[str],
+    outputs: Sequence[Path] = (),
+    fov_y_deg: float | None = None,
+    report: Callable[[int, int], None] = lambda done, total: None,
+) -> list[dict[str, Any]]:
+    """The features of all images that `inputs` name (`mtlnet.predict.sources.find_sources`).
+
+    They are also written to each of `outputs` (`mtlnet.predict.writers.open_writer`), one image at
+    a time. `report`: takes the numbers of images done and in all. Raises UserError, after all
+    others were done, when an image could not be used; at once for outputs that cannot be written.
+    """
+    sources = find_sources(list(inputs))
+    total = sum(source.count for source in sources)
+    camera, name = engine.card.camera, engine.card.name
+    results: list[dict[str, Any]] = []
+    unusable: list[str] = []
+    with ExitStack() as stack:
+        fps = sources[0].fps
+        writers = [stack.enter_context(open_writer(path, camera, fps)) for path in outputs]
+        for done, item in enumerate(read_sources(sources, camera, fov_y_deg), start=1):
+            report(done, max(total, done))
+            if item.image is None:
+                unusable.append(item.error)
+                continue
+            begin = time.perf_counter()
+            prediction = decode_outputs(engine(item.image))
+            latency_ms = round(1e3 * (time.perf_counter() - begin), 3)
+            for writer in writers:
+                writer.write(item, prediction)
+            if len(results) < KEPT_ROWS:
+                about = {"model": name, "latency_ms": latency_ms}
+                results.append({"image": item.name, **prediction.as_json(), **about})
+    if unusable:
+        more = f" (and {len(unusable) - 1} more like it)" if len(unusable) > 1 else ""
+        others = f"; {len(results)} others were done" if results else ""
+        raise UserError(f"{unusable[0]}{more}{others}")
+    return results

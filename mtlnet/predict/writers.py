@@ -1,0 +1,190 @@
+"""Files that `mtlnet predict --out` writes: tables (.csv, .jsonl), a film (.mp4) or pictures.
+
+Each row and frame is written when it is known: an interrupted command keeps what was done.
+"""
+
+import csv
+import json
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Protocol, Self
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+import trackfeatures as tf
+from mtlnet.inference.overlay import draw_overlay
+from mtlnet.inference.prediction import Prediction
+from mtlnet.predict.sources import SourceImage
+from trackfeatures.camera import CameraParameters
+from trackfeatures.errors import UserError
+
+FILM_SUFFIX = ".mp4"
+TABLE_SUFFIXES = (".csv", ".jsonl")
+TEXT_HEIGHT = 64
+"""Rows of pixels below a picture that hold the features as text."""
+TEXT_COLOUR = (235, 235, 235)
+
+
+class Writer(Protocol):
+    """Takes one image and its prediction at a time; a context manager that closes its file."""
+
+    def write(self, item: SourceImage, prediction: Prediction) -> None: ...
+
+    def __enter__(self) -> Self: ...
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None: ...
+
+
+def open_writer(path: Path, camera: CameraParameters, fps: float) -> Writer:
+    """The writer that the suffix of `path` asks for; one without a suffix is a folder of pictures.
+
+    Raises UserError for another suffix, or a folder that does not exist.
+    """
+    kind = path.suffix.lower()
+    if kind not in (*TABLE_SUFFIXES, FILM_SUFFIX, ""):
+        kinds = ", ".join((*TABLE_SUFFIXES, FILM_SUFFIX))
+        raise UserError(f"--out {path}: give a file ending in {kinds}, or a folder for pictures")
+    if not path.parent.is_dir():
+        raise UserError(f"--out {path}: there is no folder {path.parent}; make it first")
+    if kind in TABLE_SUFFIXES:
+        return TableWriter(path)
+    return FilmWriter(path, camera, fps) if kind == FILM_SUFFIX else PictureWriter(path, camera)
+
+
+def table_row(name: str, prediction: Prediction) -> dict[str, Any]:
+    """One image's features as a flat row; None for what is absent or not predicted."""
+    std = prediction.std or {}
+    row: dict[str, Any] = {"image": name}
+    for marking in tf.MARKINGS:
+        row[f"{marking}_m"] = prediction.distances_m[marking]
+    row["to_lane_centre_m"] = prediction.to_lane_centre_m
+    row["angle_rad"] = prediction.angle_rad
+    row |= {f"p_{name}": probability for name, probability in prediction.heading.items()}
+    for name in (*tf.MARKINGS, "to_lane_centre", "angle"):
+        row[f"std_{name}"] = std.get(name)
+    return row | {"out_of_distribution": prediction.out_of_distribution}
+
+
+class TableWriter:
+    """Rows of `table_row` as CSV with a header, or as one JSON object a line."""
+
+    def __init__(self, path: Path) -> None:
+        self._as_csv = path.suffix.lower() == ".csv"
+        self._file = path.open("w", encoding="utf-8", newline="")
+        self._csv: csv.DictWriter[str] | None = None
+
+    def write(self, item: SourceImage, prediction: Prediction) -> None:
+        row = table_row(item.name, prediction)
+        if not self._as_csv:
+            self._file.write(json.dumps(row) + "\n")
+        else:
+            if self._csv is None:
+                self._csv = csv.DictWriter(self._file, list(row))
+                self._csv.writeheader()
+            self._csv.writerow(row)
+        self._file.flush()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._file.close()
+
+
+class FilmWriter:
+    """Drawn frames as an MP4 film (MPEG-4), playable also when the command is interrupted."""
+
+    def __init__(self, path: Path, camera: CameraParameters, fps: float) -> None:
+        self._path, self._camera, self._fps = path, camera, fps
+        self._film: cv2.VideoWriter | None = None
+
+    def write(self, item: SourceImage, prediction: Prediction) -> None:
+        picture = draw_prediction(item, prediction, self._camera)
+        if self._film is None:
+            code = cv2.VideoWriter.fourcc(*"mp4v")
+            size = (picture.shape[1], picture.shape[0])
+            self._film = cv2.VideoWriter(str(self._path), code, self._fps, size)
+            if not self._film.isOpened():
+                raise UserError(f"{self._path} cannot be written as a film; check folder and disk")
+        self._film.write(cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._film is not None:
+            self._film.release()
+
+
+class PictureWriter:
+    """Drawn frames as PNG files, `0000.png` and on, with the name of the image."""
+
+    def __init__(self, folder: Path, camera: CameraParameters) -> None:
+        self._folder, self._camera, self._count = folder, camera, 0
+        folder.mkdir(exist_ok=True)
+
+    def write(self, item: SourceImage, prediction: Prediction) -> None:
+        picture = draw_prediction(item, prediction, self._camera)
+        file, _, frame = item.name.partition("#")
+        name = "-".join((f"{self._count:04d}", Path(file).stem, *([frame] if frame else [])))
+        path = self._folder / f"{name}.png"
+        if not cv2.imwrite(str(path), cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)):
+            raise UserError(f"{path} cannot be written; check the disk")
+        self._count += 1
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+
+def draw_prediction(
+    item: SourceImage, prediction: Prediction, camera: CameraParameters
+) -> NDArray[np.uint8]:
+    """The image with its markings drawn (prediction orange, a round's labels green) beside a view
+    from above, and the features as text below: uint8 RGB.
+
+    Of an image without labels the markings are drawn straight: the curvature is not predicted.
+    """
+    assert item.image is not None
+    truth = item.truth
+    picture = draw_overlay(
+        item.image,
+        camera,
+        camera.height_above_road_m,
+        truth.curvature if truth else 0.0,
+        (truth.distances_m, truth.angle_rad) if truth else ({}, 0.0),
+        (prediction.distances_m, prediction.angle_rad),
+    )
+    below = np.full((TEXT_HEIGHT, picture.shape[1], 3), 24, np.uint8)
+    for line, text in enumerate(feature_lines(prediction)):
+        place = (10, 26 + 24 * line)
+        cv2.putText(below, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.5, TEXT_COLOUR, 1, cv2.LINE_AA)
+    return np.vstack([picture, below])
+
+
+def feature_lines(prediction: Prediction) -> tuple[str, str]:
+    """The features as two lines of text: distances in m, then lane centre, angle and class."""
+    distances = "  ".join(
+        f"{name} {_metres(value)}" for name, value in prediction.distances_m.items()
+    )
+    heading = max(prediction.heading, key=prediction.heading.__getitem__)
+    unfamiliar = "  out of distribution" if prediction.out_of_distribution else ""
+    return (
+        f"{distances}  (m)",
+        f"to lane centre {_metres(prediction.to_lane_centre_m)} m  "
+        f"angle {prediction.angle_rad:+.4f} rad  "
+        f"{heading} {100 * prediction.heading[heading]:.0f} %{unfamiliar}",
+    )
+
+
+def _metres(value: float | None) -> str:
+    return "--" if value is None else f"{value:+.2f}"

@@ -1,0 +1,191 @@
+"""`mtlnet predict` on images, folders, patterns, films and recorded rounds."""
+
+import csv
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import simplejpeg
+from numpy.typing import NDArray
+
+from mtlnet.inference.model_card import ModelCard, read_card
+from mtlnet.predict.run import predict_files
+from mtlnet.predict.sources import find_sources
+from mtlnet.predict.writers import TEXT_HEIGHT
+from trackfeatures.camera import CameraParameters
+from trackfeatures.errors import UserError
+
+
+@dataclass
+class BrightnessEngine:
+    """Answers the mean colour of an image as its first coded distance."""
+
+    card: ModelCard
+    kind: str = "openvino"
+    precision: str = "f32"
+    seen: list[tuple[int, ...]] = field(default_factory=list)
+
+    def __call__(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
+        self.seen.append(image.shape)
+        level = 0.1 + 0.8 * float(image.mean()) / 255
+        return np.array([level, 0.5, 0.5, 0.5, 0.5, 0.5, 0.1, 0.7, 0.2], np.float32)
+
+
+@pytest.fixture
+def engine(published: Path) -> BrightnessEngine:
+    return BrightnessEngine(read_card(published))
+
+
+def write_jpeg(path: Path, level: int, size: tuple[int, int] = (210, 280)) -> Path:
+    path.write_bytes(simplejpeg.encode_jpeg(np.full((*size, 3), level, np.uint8), quality=95))
+    return path
+
+
+def write_film(path: Path, levels: list[int]) -> Path:
+    film = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), 10.0, (560, 420))
+    for level in levels:
+        film.write(np.full((420, 560, 3), level, np.uint8))
+    film.release()
+    return path
+
+
+def test_a_folder_and_a_pattern_name_all_their_images(
+    engine: BrightnessEngine, tmp_path: Path
+) -> None:
+    for name, level in (("b.jpg", 50), ("a.jpg", 0), ("c.jpeg", 255)):
+        write_jpeg(tmp_path / name, level)
+    (tmp_path / "notes.txt").write_text("not an image")
+    results = predict_files(engine, [str(tmp_path)])
+    assert [Path(row["image"]).name for row in results] == ["a.jpg", "b.jpg", "c.jpeg"]
+    matched = predict_files(engine, [str(tmp_path / "*.jpg")])
+    assert [row["distances_m"] for row in matched] == [row["distances_m"] for row in results[:2]]
+    assert results[0]["distances_m"]["ml"] < results[2]["distances_m"]["ml"]
+
+
+def test_tables_hold_every_image(engine: BrightnessEngine, tmp_path: Path) -> None:
+    images = [str(write_jpeg(tmp_path / f"{n}.jpg", 80 * n)) for n in range(3)]
+    files = [tmp_path / "features.csv", tmp_path / "features.jsonl"]
+    results = predict_files(engine, images, files)
+    with files[0].open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    lines = [json.loads(line) for line in files[1].read_text().splitlines()]
+    assert [row["image"] for row in rows] == [line["image"] for line in lines] == images
+    for row, line, result in zip(rows, lines, results, strict=True):
+        assert line["ml_m"] == result["distances_m"]["ml"] == float(row["ml_m"])
+        assert line["angle_rad"] == result["angle_rad"]
+        assert row["p_straight"] == str(result["heading"]["straight"])
+
+
+def test_every_frame_of_a_film_is_read_and_drawn(engine: BrightnessEngine, tmp_path: Path) -> None:
+    film = write_film(tmp_path / "drive.mp4", [0, 60, 120, 180])
+    drawn, reports = tmp_path / "drawn.mp4", []
+    results = predict_files(
+        engine, [str(film)], [drawn], report=lambda done, total: reports.append((done, total))
+    )
+    assert [row["image"] for row in results] == [f"{film}#{n}" for n in range(4)]
+    assert engine.seen == [(210, 280, 3)] * 4
+    levels = [row["distances_m"]["ml"] for row in results]
+    assert levels == sorted(levels)
+    assert reports == [(n, 4) for n in (1, 2, 3, 4)]
+    capture = cv2.VideoCapture(str(drawn))
+    assert capture.get(cv2.CAP_PROP_FPS) == pytest.approx(10)
+    assert capture.get(cv2.CAP_PROP_FRAME_COUNT) == 4
+    found, frame = capture.read()
+    assert found
+    assert frame.shape == (2 * 210 + TEXT_HEIGHT, 2 * 280 + 160, 3)
+
+
+def test_a_cut_film_keeps_what_was_read(engine: BrightnessEngine, tmp_path: Path) -> None:
+    whole = tmp_path / "whole.avi"
+    writer = cv2.VideoWriter(str(whole), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, (560, 420))
+    rng = np.random.default_rng(0)
+    for _ in range(10):
+        writer.write(rng.integers(0, 256, (420, 560, 3), dtype=np.uint8))
+    writer.release()
+    cut = tmp_path / "cut.avi"
+    cut.write_bytes(whole.read_bytes()[: whole.stat().st_size // 2])
+    table = tmp_path / "rows.jsonl"
+    with pytest.raises(UserError, match=r"cut\.avi ends after \d of 10 frames; those were used"):
+        predict_files(engine, [str(cut)], [table])
+    rows = table.read_text().splitlines()
+    assert 2 <= len(rows) < 10
+
+
+def test_pictures_of_a_recorded_round_show_its_labels(
+    engine: BrightnessEngine, dataset: Path, tmp_path: Path
+) -> None:
+    path = sorted((dataset / "rounds").glob("*.mcap"))[0]
+    folder = tmp_path / "pictures"
+    results = predict_files(engine, [str(path)], [folder])
+    assert [row["image"] for row in results] == [f"{path}#{n}" for n in range(len(results))]
+    pictures = sorted(folder.glob("*.png"))
+    assert len(pictures) == len(results) == find_sources([str(path)])[0].count
+    assert pictures[0].name == f"0000-{path.stem}-0.png"
+    picture = cv2.imread(str(pictures[0]))
+    assert picture is not None
+    green = (picture[..., 1] > 200) & (picture[..., 0] < 130) & (picture[..., 2] < 130)
+    assert green.sum() > 50, "the round's labels are drawn in green"
+
+
+def test_a_damaged_image_does_not_stop_the_others(engine: BrightnessEngine, tmp_path: Path) -> None:
+    write_jpeg(tmp_path / "a.jpg", 10)
+    (tmp_path / "b.jpg").write_text("no image")
+    write_jpeg(tmp_path / "c.jpg", 200)
+    table = tmp_path / "rows.csv"
+    with pytest.raises(UserError, match=r"b\.jpg: no JPEG or PNG.*; 2 others were done"):
+        predict_files(engine, [str(tmp_path)], [table])
+    assert [line.split(",")[0][-5:] for line in table.read_text().splitlines()[1:]] == [
+        "a.jpg",
+        "c.jpg",
+    ]
+
+
+def test_an_interrupted_film_is_playable(engine: BrightnessEngine, tmp_path: Path) -> None:
+    film, drawn = write_film(tmp_path / "in.mp4", [30] * 8), tmp_path / "out.mp4"
+
+    def interrupt(done: int, total: int) -> None:
+        if done == 5:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        predict_files(engine, [str(film)], [drawn], report=interrupt)
+    assert cv2.VideoCapture(str(drawn)).get(cv2.CAP_PROP_FRAME_COUNT) == 4
+
+
+def test_a_wider_lens_is_cropped_to_the_models_view(
+    engine: BrightnessEngine, tmp_path: Path
+) -> None:
+    image = np.zeros((420, 560, 3), np.uint8)
+    image[105:315, 140:420] = 255  # what half the tangent of the field of view shows
+    path = tmp_path / "wide.png"
+    cv2.imwrite(str(path), image)
+    camera: CameraParameters = engine.card.camera
+    wide = float(np.degrees(2 * np.arctan(2 * np.tan(np.radians(camera.fov_y_deg) / 2))))
+    own, cropped = (predict_files(engine, [str(path)], fov_y_deg=fov)[0] for fov in (None, wide))
+    assert cropped["distances_m"]["ml"] > own["distances_m"]["ml"]
+
+
+@pytest.mark.parametrize(
+    ("inputs", "outputs", "message"),
+    [
+        (["none.jpg"], [], "there is no image file none.jpg"),
+        (["*.gif"], [], "there is no image file"),
+        (["a.jpg"], ["x.txt"], r"x\.txt: give a file ending in \.csv, \.jsonl, \.mp4"),
+        (["a.jpg"], ["none/x.csv"], "there is no folder"),
+    ],
+)
+def test_wrong_inputs_and_outputs_are_refused(
+    engine: BrightnessEngine,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    inputs: list[str],
+    outputs: list[str],
+    message: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_jpeg(tmp_path / "a.jpg", 10)
+    with pytest.raises(UserError, match=message):
+        predict_files(engine, inputs, [Path(name) for name in outputs])
