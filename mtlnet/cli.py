@@ -165,7 +165,7 @@ def train_command(
 ) -> None:
     """Train the network on the train rounds of a dataset; the result is a model for `serve`."""
     from mtlnet.training.loss import parse_alpha
-    from mtlnet.training.start import start_training
+    from mtlnet.training.run import start_training
 
     given = {
         "data": data,

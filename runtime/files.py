@@ -1,5 +1,6 @@
 """Atomic writes: a file is replaced in one step, and the old one stays until then."""
 
+import json
 import os
 from pathlib import Path
 
@@ -41,6 +42,11 @@ def atomic_write(path: Path, content: str | bytes, *, fsync: bool = False) -> No
         raise
     finally:
         partial.unlink(missing_ok=True)
+
+
+def write_json(path: Path, content: object) -> None:
+    """Replace the file at `path` by `content` in indented JSON; see `atomic_write` with `fsync`."""
+    atomic_write(path, json.dumps(content, indent=1) + "\n", fsync=True)
 
 
 def unfinished_path(path: Path) -> Path:

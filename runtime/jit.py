@@ -59,7 +59,8 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 @functools.cache
 def _cache_folder(package: str) -> str:
-    """The folder for the machine code of a package, chosen when its first function is compiled."""
+    """The folder for the machine code of a package, chosen when its first function is decorated."""
+    # Not at its first call: numba's Cache.__init__ opens the folder of the time of decoration.
     return str(code_folder("driverview", Path(str(sys.modules[package].__file__)).parent))
 
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from runtime.files import atomic_write
+from runtime.files import write_json
 from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError, require_version
 
@@ -64,10 +64,8 @@ class ModelCard:
 
     def write(self, run: Path) -> None:
         """Write `card.json`, atomically."""
-        text = json.dumps(
-            {"format": FORMAT, "model_hash": self.model_hash, **asdict(self)}, indent=1
-        )
-        atomic_write(run / CARD, f"{text}\n".encode(), fsync=True)
+        content = {"format": FORMAT, "model_hash": self.model_hash, **asdict(self)}
+        write_json(run / CARD, content)
 
 
 def read_card(run: Path) -> ModelCard:

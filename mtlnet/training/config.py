@@ -1,21 +1,32 @@
-"""The configuration of a training run: stored in its `config.json`, and used by `--resume`."""
+"""The configuration of a training run, from its options or from the `config.json` of a run."""
 
 import json
+import time
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import trackfeatures as tf
-from mtlnet.inference.model_card import ModelError
+from mtlnet.inference.model_card import (
+    RUNS,
+    WEIGHTS,
+    ModelCard,
+    ModelError,
+    check_files,
+    read_card,
+    resolve_run,
+)
 from mtlnet.model.architecture import find_architecture, require_task_heads
+from mtlnet.training.distributed import read_rank
 from mtlnet.training.loss import Alpha
 from mtlnet.training.recipes import Recipe, find_recipe
 from mtlnet.training.task_weighting import require_method
-from runtime.files import atomic_write
+from runtime.files import write_json
 from trackfeatures.errors import UserError
 
 CONFIG = "config.json"
+DATASET = Path("datasets/default")
 MAX_THREADS = 1024
 # Fields that may change when a run is resumed; any other would make it a different run.
 RESUMABLE_WITH = ("iterations", "minutes", "device", "threads", "data")
@@ -72,6 +83,31 @@ class TrainConfig:
             )
 
 
+def new_config(options: Mapping[str, Any], out: Path | None) -> TrainConfig:
+    """The configuration of a new run; defaults are those of the network or of the `init` model."""
+    if out is None and read_rank().world_size > 1:
+        raise UserError("give --out: several processes must use the same folder for the run")
+    values: dict[str, Any] = {"data": DATASET, "recipe": "fast"}
+    if "init" in options:
+        run, card = open_pretrained(options["init"])
+        values.update(network=card.network, alpha=card.alpha, recipe="tune")
+        options = {**options, "init": str(run)}
+    else:
+        values["alpha"] = find_architecture(options.get("network", "mtl")).default_alpha
+    values.update(options)
+    recipe = find_recipe(values["recipe"]).name
+    folder = out or RUNS / f"{time.strftime('%Y%m%d-%H%M%S')}-{recipe}"
+    return TrainConfig(out=folder, **values)
+
+
+def open_pretrained(name: str | Path) -> tuple[Path, ModelCard]:
+    """The folder and card of the model to fine-tune; ModelError when it is missing or damaged."""
+    run = resolve_run(name)
+    card = read_card(run)
+    check_files(run, card, (WEIGHTS,))
+    return run, card
+
+
 def write_config(config: TrainConfig, recipe: Recipe, data: Mapping[str, Any]) -> None:
     """Write `config.json` of a new run."""
     content = {
@@ -80,8 +116,7 @@ def write_config(config: TrainConfig, recipe: Recipe, data: Mapping[str, Any]) -
         "recipe": asdict(recipe),
         "data": dict(data),
     }
-    text = json.dumps(content, indent=1) + "\n"
-    atomic_write(config.out / CONFIG, text.encode(), fsync=True)
+    write_json(config.out / CONFIG, content)
 
 
 def read_config(run: Path) -> tuple[TrainConfig, dict[str, Any]]:
@@ -115,3 +150,11 @@ def resume_config(run: Path, given: Mapping[str, Any]) -> tuple[TrainConfig, dic
                 "resume, or start a new run with another --out"
             )
     return replace(stored, **{k: v for k, v in given.items() if k in RESUMABLE_WITH}), data
+
+
+def newest_run() -> Path:
+    """The run in `runs/` that was started last; ModelError when there is none."""
+    runs = [p.parent for p in RUNS.glob(f"*/{CONFIG}") if not p.parent.is_symlink()]
+    if not runs:
+        raise ModelError(f"there is no run in {RUNS}/ to resume; give its folder with --out")
+    return max(runs, key=lambda run: (run / CONFIG).stat().st_mtime)

@@ -7,12 +7,17 @@ which keeps its network and its camera.
 
 import os
 import shutil
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import torch
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn
 
 from datagen.recording import Frames
 from mtlnet.data.gpu_cache import cache_if_it_fits
@@ -20,20 +25,20 @@ from mtlnet.data.loader import Loader
 from mtlnet.data.road_ahead import RoadAhead
 from mtlnet.data.sources import TrainingData, open_training_data, require_same_data
 from mtlnet.export.publish import Provenance, publish
-from mtlnet.inference.model_card import (
-    RUNS,
-    WEIGHTS,
-    ModelCard,
-    check_files,
-    read_card,
-    resolve_run,
-)
+from mtlnet.inference.model_card import RUNS, WEIGHTS, ModelCard, read_card
 from mtlnet.model.architecture import HEIGHT, WIDTH, find_architecture
 from mtlnet.model.network import Network, fold, load_network
 from mtlnet.training.checkpoint import list_checkpoints, load_checkpoint
-from mtlnet.training.config import TrainConfig, write_config
+from mtlnet.training.config import (
+    TrainConfig,
+    new_config,
+    newest_run,
+    open_pretrained,
+    resume_config,
+    write_config,
+)
 from mtlnet.training.distributed import Rank, barrier, process_group, read_rank
-from mtlnet.training.loop import Report, train_loop
+from mtlnet.training.loop import Report, Stopped, TrainProgress, train_loop
 from mtlnet.training.recipes import Recipe, find_recipe
 from mtlnet.training.task_weighting import TaskWeighting
 from mtlnet.training.trainer import Trainer, choose_device, keep_freed_memory
@@ -44,6 +49,87 @@ EXPORT_CHECK_FRAMES = 16
 """Frames on which the exported graph is compared with torch."""
 FINE_TUNE_MIN_STD = (0.15,) * 5 + (0.03,)
 """Lower bounds of the heads' units (6,), those of varied driving: a few images may be all alike."""
+
+
+def start_training(options: Mapping[str, Any], out: Path | None, *, resume: bool) -> dict[str, Any]:
+    """Train, and return what `mtlnet train --json` prints; {} in all but the first process.
+
+    `options`: the fields of TrainConfig that were given. Raises UserError.
+    """
+    resumed = None
+    if resume:
+        config, resumed = resume_config(out or newest_run(), options)
+    else:
+        config = new_config(options, out)
+    is_first = read_rank().is_first
+    console = Console(stderr=True, quiet=not is_first)
+    console.print(
+        f"training {config.network} in {config.out} on {config.data}, recipe {config.recipe}"
+    )
+    begin = time.perf_counter()
+    try:
+        with _progress_bar(console) as report:
+            card = train(config, resumed, report)
+    except Stopped as stopped:
+        console.print(
+            f"stopped; the checkpoint is {stopped}; continue with "
+            f"`mtlnet train --out {config.out} --resume`"
+        )
+        raise
+    if not is_first:
+        return {}
+    _print_result(console, config.out, card)
+    return {
+        "run": str(config.out),
+        "iterations": card.iterations,
+        "seconds": round(time.perf_counter() - begin, 3),
+        "model_hash": card.model_hash,
+        "export_check": card.export_check,
+    }
+
+
+@contextmanager
+def _progress_bar(console: Console) -> Iterator[Report]:
+    """A progress bar within the context; yields the function that updates it."""
+    columns = (
+        TextColumn("{task.percentage:>3.0f} %"),
+        BarColumn(bar_width=24),
+        TextColumn("{task.fields[text]}"),
+        TextColumn("{task.fields[left]}"),
+    )
+    with Progress(*columns, console=console, refresh_per_second=2) as bar:
+        task = bar.add_task("", total=1.0, text="reading labels", left="")
+
+        def update(progress: TrainProgress) -> None:
+            text = _progress_text(progress)
+            bar.update(task, completed=progress.fraction, text=text, left=_time_left(progress))
+
+        yield update
+
+
+def _progress_text(progress: TrainProgress) -> str:
+    distance, angle, heading, _ = progress.losses.tolist()
+    return (
+        f"step {progress.step}  distance {distance:.4f}  angle {angle:.5f}  heading {heading:.3f}  "
+        f"{progress.images_per_second:.0f} images/s"
+    )
+
+
+def _time_left(progress: TrainProgress) -> str:
+    if progress.fraction <= 0.01:
+        return ""
+    seconds = progress.elapsed_s * (1 / progress.fraction - 1)
+    return f"{seconds // 60:.0f} min {seconds % 60:02.0f} s left"
+
+
+def _print_result(console: Console, run: Path, card: ModelCard) -> None:
+    check = card.export_check
+    differences = [f"{name} {value:.2g}" for name, value in check.items() if name != "frames"]
+    console.print(
+        f"exported and compared with torch on {check['frames']:.0f} frames, largest difference: "
+        f"{', '.join(differences)}"
+    )
+    console.print(f"finished: {run} (serve it with `serve --model {run}`)")
 
 
 def train(
@@ -206,17 +292,6 @@ def link_latest(run: Path) -> None:
     link.unlink(missing_ok=True)
     link.symlink_to(run.resolve().name)
     link.replace(RUNS / "latest")
-
-
-# Fine-tuning: a run that starts with the weights of a finished model.
-
-
-def open_pretrained(name: str | Path) -> tuple[Path, ModelCard]:
-    """The folder and card of the model to fine-tune; ModelError when it is missing or damaged."""
-    run = resolve_run(name)
-    card = read_card(run)
-    check_files(run, card, (WEIGHTS,))
-    return run, card
 
 
 def load_pretrained(network: Network, run: Path) -> None:

@@ -78,11 +78,16 @@ def write_round(folder: Path, name: str, number: int, **changes: Any) -> None:
 def require_close(
     outputs: NDArray[np.float32], expected: NDArray[np.float32], *, metres: float, radians: float
 ) -> None:
-    """Assert that a model's outputs decode to nearly the same distances, offset and angle."""
+    """Assert that a model's outputs decode to nearly the same features.
+
+    `metres`: of distances and offset; `radians`: of the angle; probabilities of the heading may
+    differ by 0.02.
+    """
     found, wanted = decode_outputs(outputs), decode_outputs(expected)
     assert found.distances_m == pytest.approx(wanted.distances_m, abs=metres)
     assert found.to_lane_centre_m == pytest.approx(wanted.to_lane_centre_m, abs=metres)
     assert found.angle_rad == pytest.approx(wanted.angle_rad, abs=radians)
+    assert found.heading == pytest.approx(wanted.heading, abs=0.02)
 
 
 @pytest.fixture(scope="session")

@@ -3,6 +3,7 @@
 import json
 import shutil
 import struct
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +16,16 @@ from datagen.recording import Dataset
 from mtlnet.export.openvino_graph import TOLERANCE
 from mtlnet.export.ship import half, ship_model
 from mtlnet.inference.engine import load_engine
-from mtlnet.inference.model_card import UNCERTAINTY_WEIGHTS, WEIGHTS, ModelError, read_card
+from mtlnet.inference.model_card import (
+    UNCERTAINTY_WEIGHTS,
+    WEIGHTS,
+    ModelError,
+    golden_image,
+    read_card,
+)
 from mtlnet.inference.weights_file import read_weights
+from mtlnet.model.architecture import HEIGHT, WIDTH
+from serve.scheduling.warmup import warm_up
 from trackfeatures.errors import UserError
 
 
@@ -44,10 +53,18 @@ def test_it_is_half_the_bytes_and_all_an_engine_needs(published: Path, shipped: 
     np.testing.assert_allclose(found[9:], expected[9:], rtol=5e-3)
 
 
-def test_its_golden_answer_is_its_own(shipped: Path) -> None:
-    from serve.scheduling.warmup import warm_up
-
-    warm_up(load_engine(shipped, "openvino", "f32"))
+def test_its_golden_answer_is_its_own(published: Path, shipped: Path, tmp_path: Path) -> None:
+    engine = load_engine(shipped, "openvino", "f32")
+    answer = engine(golden_image(WIDTH, HEIGHT))[:9]
+    np.testing.assert_allclose(answer, engine.card.golden, atol=TOLERANCE)
+    assert engine.card.golden != read_card(published).golden
+    warm_up(engine)
+    changed = tmp_path / "changed"
+    shutil.copytree(shipped, changed)
+    first, *others = engine.card.golden
+    replace(engine.card, golden=(first + 0.01, *others)).write(changed)
+    with pytest.raises(ModelError, match=r"differ by 0\.01 from the published ones"):
+        warm_up(load_engine(changed, "openvino", "f32"))
 
 
 def test_it_answers_frames_as_the_run_did(published: Path, shipped: Path, dataset: Path) -> None:

@@ -16,7 +16,7 @@ from mtlnet.model.architecture import ARCHITECTURES, Architecture, find_architec
 from mtlnet.model.network import Network, fold, initialise, predict_images
 from mtlnet.training.config import TrainConfig
 from mtlnet.training.recipes import RECIPES
-from mtlnet.training.start import start_training
+from mtlnet.training.run import start_training
 from mtlnet.training.trainer import Trainer
 from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError

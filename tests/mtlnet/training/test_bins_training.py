@@ -15,7 +15,7 @@ from mtlnet.inference.model_card import read_card
 from mtlnet.model.architecture import GRID
 from mtlnet.model.auxiliary import LABELS
 from mtlnet.training.recipes import RECIPES
-from mtlnet.training.start import start_training
+from mtlnet.training.run import start_training
 from mtlnet.training.trainer import Trainer
 from trackfeatures.camera import CameraParameters
 

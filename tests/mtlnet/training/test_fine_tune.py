@@ -12,9 +12,8 @@ from datagen.recording import Dataset
 from mtlnet.data.sources import continue_from_model, custom_training_data
 from mtlnet.inference.model_card import WEIGHTS, read_card
 from mtlnet.model.network import Network, load_network, predict_images
-from mtlnet.training.config import TrainConfig
-from mtlnet.training.run import load_pretrained, open_pretrained
-from mtlnet.training.start import start_training
+from mtlnet.training.config import TrainConfig, open_pretrained
+from mtlnet.training.run import load_pretrained, start_training
 from trackfeatures.errors import UserError
 
 
