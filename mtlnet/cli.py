@@ -41,12 +41,15 @@ Alpha = Annotated[
     str | None,
     typer.Option(
         help="Weights of the distance, angle and heading losses.  "
-        "[default: the network's, 0.3,0.2,0.5 for mtl]"
+        "[default: the network's, 0.3,0.2,0.5 for grid and mtl]"
     ),
 ]
 Network = Annotated[
     str | None,
-    typer.Option(help="mtl, deepdriving, mobilenet_v3_small, regnet_y_400mf.  [default: mtl]"),
+    typer.Option(
+        help="grid, mtl (the paper's), deepdriving, mobilenet_v3_small, regnet_y_400mf.  "
+        "[default: grid, with recipe paper mtl]"
+    ),
 ]
 Balance = Annotated[
     str | None,

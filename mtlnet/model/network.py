@@ -35,6 +35,8 @@ from mtlnet.model.bins import Scores, read_scores, split_scores
 
 NORM_EPS = 1e-5
 NORM_MOMENTUM = 0.1
+CODED_HEADS = (("distance", slice(0, 5)), ("angle", slice(5, 6)))
+"""The heads of coded values and their columns of the outputs."""
 
 
 class Network(nn.Module):
@@ -246,8 +248,7 @@ def fold(network: Network) -> Network:
     """
     double = copy.deepcopy(network).cpu().double()
     fold_norms(double)
-    coded = () if network.architecture.bins else (("distance", slice(0, 5)), ("angle", slice(5, 6)))
-    for name, rows in coded:
+    for name, rows in () if network.architecture.bins else CODED_HEADS:
         std = double.target_std[rows]
         with torch.no_grad():
             double.get_parameter(f"heads.{name}.weight").mul_(std[:, None])

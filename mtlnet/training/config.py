@@ -38,8 +38,8 @@ class TrainConfig:
 
     data: Path
     out: Path
-    network: str = "mtl"
-    """A name of `mtlnet.model.architecture.ARCHITECTURES`."""
+    network: str = ""
+    """A name of `mtlnet.model.architecture.ARCHITECTURES`; empty: the recipe's own."""
     alpha: Alpha = (0.3, 0.2, 0.5)
     balance: str = "fixed"
     """A name of `mtlnet.training.task_weighting.METHODS`; unless it is fixed, alpha only selects
@@ -61,6 +61,8 @@ class TrainConfig:
     """Omit frames whose image cannot be decoded; the model's card lists them."""
 
     def __post_init__(self) -> None:
+        if not self.network:
+            object.__setattr__(self, "network", find_recipe(self.recipe).network)
         require_task_heads(find_architecture(self.network), self.alpha)
         require_method(self.balance)
         if self.batch == 0:
@@ -92,8 +94,8 @@ def new_config(options: Mapping[str, Any], out: Path | None) -> TrainConfig:
         run, card = open_pretrained(options["init"])
         values.update(network=card.network, alpha=card.alpha, recipe="tune")
         options = {**options, "init": str(run)}
-    else:
-        values["alpha"] = find_architecture(options.get("network", "mtl")).default_alpha
+    elif network := options.get("network"):
+        values["alpha"] = find_architecture(network).default_alpha
     values.update(options)
     recipe = find_recipe(values["recipe"]).name
     folder = out or RUNS / f"{time.strftime('%Y%m%d-%H%M%S')}-{recipe}"

@@ -2,8 +2,8 @@
 
 Muon (Jordan et al. 2024) steps along the gradient with its singular values made equal; in short
 trials recipe `fast` needed half the images with it. It trains the layers whose matrix is cheap: the
-convolutions and the first shared layer. AdamW trains small parameters, the wide second shared layer
-and torchvision's backbones, whose matrices have few rows.
+convolutions, the first shared layer and small shared layers. AdamW trains heads, biases, wide
+shared layers and torchvision's backbones, whose matrices have few rows.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -20,6 +20,8 @@ MUON_LAYERS = ("features.", "shared.fc0.")
 MUON_MAX_SIDE = 1024
 """Largest shorter side of a layer's matrix. The cost grows with its square: the 4096 of network
 `deepdriving` take two cores twenty seconds a step."""
+MUON_MAX_SHARED_SIDE = 512
+"""Largest longer side of the matrix of another shared layer than the first."""
 MUON_LR_SCALE = 8.0
 """Muon's learning rate over the recipe's: with updates of AdamW's size it allows longer steps."""
 
@@ -81,7 +83,10 @@ class OptimizerSet:
 
 def uses_muon(name: str, weight: Tensor) -> bool:
     """Whether Muon trains a layer."""
-    return name.startswith(MUON_LAYERS) and min(as_matrix(weight).shape) <= MUON_MAX_SIDE
+    sides = as_matrix(weight).shape
+    if name.startswith("shared.") and max(sides) <= MUON_MAX_SHARED_SIDE:
+        return True
+    return name.startswith(MUON_LAYERS) and min(sides) <= MUON_MAX_SIDE
 
 
 def as_matrix(weight: Tensor) -> Tensor:

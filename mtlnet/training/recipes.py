@@ -30,6 +30,7 @@ and no batch normalisation.
 import math
 from dataclasses import dataclass
 
+from mtlnet.model.architecture import GRID, MTL
 from mtlnet.training.loss import HuberLoss
 from trackfeatures.errors import UserError
 
@@ -39,6 +40,8 @@ class Recipe:
     """How a network is trained; stored in the run's `config.json`."""
 
     name: str
+    network: str
+    """The network it trains unless another is given: the paper's recipe the paper's."""
     optimizer: str
     """sgd, adamw or muon (which leaves small layers to AdamW)."""
     learning_rate: float
@@ -60,10 +63,13 @@ class Recipe:
 
 HUBER = HuberLoss(distance_beta=0.05)
 RECIPES = {
-    "paper": Recipe("paper", "sgd", 1e-3, 32, 150_000, 0.5, 5e-4, False, False, False),
-    "tune": Recipe("tune", "adamw", 1e-4, 32, 500, 0.0, 2e-2, False, True, True, huber=HUBER),
+    "paper": Recipe("paper", MTL.name, "sgd", 1e-3, 32, 150_000, 0.5, 5e-4, False, False, False),
+    "tune": Recipe(
+        "tune", GRID.name, "adamw", 1e-4, 32, 500, 0.0, 2e-2, False, True, True, huber=HUBER
+    ),
     "fast": Recipe(
         "fast",
+        GRID.name,
         "muon",
         learning_rate=1e-3,
         batch=64,

@@ -27,7 +27,7 @@ from mtlnet.data.sources import TrainingData, open_training_data, require_same_d
 from mtlnet.export.publish import Provenance, publish
 from mtlnet.inference.model_card import RUNS, WEIGHTS, ModelCard, read_card
 from mtlnet.model.architecture import HEIGHT, WIDTH, find_architecture
-from mtlnet.model.network import Network, fold, load_network
+from mtlnet.model.network import CODED_HEADS, Network, fold, load_network
 from mtlnet.training.checkpoint import list_checkpoints, load_checkpoint
 from mtlnet.training.config import (
     TrainConfig,
@@ -298,7 +298,7 @@ def load_pretrained(network: Network, run: Path) -> None:
     """Make `network` compute the outputs of the model of `run`, in the units of its own heads."""
     state = load_network(run / WEIGHTS, network.architecture.name).state_dict()
     mean, std = network.target_mean.cpu(), network.target_std.cpu()
-    for name, rows in (("distance", slice(0, 5)), ("angle", slice(5, 6))):
+    for name, rows in () if network.architecture.bins else CODED_HEADS:
         weight, bias = (f"heads.{name}.{kind}" for kind in ("weight", "bias"))
         state[weight] = state[weight] / std[rows, None]
         state[bias] = (state[bias] - mean[rows]) / std[rows]

@@ -17,7 +17,7 @@ from datagen.recording.splits import Split, split_path, write_split
 from mtlnet.evaluation.metrics import describe_data
 from mtlnet.export.publish import Provenance, publish
 from mtlnet.inference.prediction import decode_outputs
-from mtlnet.model.architecture import ARCHITECTURES, FEATURES, HEIGHT, MTL, WIDTH, Conv
+from mtlnet.model.architecture import ARCHITECTURES, GRID, HEIGHT, MTL, WIDTH, Conv
 from mtlnet.model.network import Network, initialise
 from mtlnet.uncertainty_fit.head import fit_uncertainty_head
 
@@ -119,6 +119,10 @@ def published(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def small_network(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Replace the paper's network by one with few filters and units, to save time."""
-    few = tuple(replace(spec, filters=8) if isinstance(spec, Conv) else spec for spec in FEATURES)
-    monkeypatch.setitem(ARCHITECTURES, MTL.name, replace(MTL, features=few, shared=(32, 16, 16)))
+    """Replace the default network and the paper's by ones with few filters and units."""
+    for full in (MTL, GRID):
+        few = tuple(
+            replace(spec, filters=8) if isinstance(spec, Conv) else spec for spec in full.features
+        )
+        small = replace(full, features=few, shared=(32, 16, 16))
+        monkeypatch.setitem(ARCHITECTURES, full.name, small)

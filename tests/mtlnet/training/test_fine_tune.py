@@ -7,11 +7,13 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from safetensors.torch import save_file
 
 from datagen.recording import Dataset
 from mtlnet.data.sources import continue_from_model, custom_training_data
 from mtlnet.inference.model_card import WEIGHTS, read_card
-from mtlnet.model.network import Network, load_network, predict_images
+from mtlnet.model.architecture import GRID
+from mtlnet.model.network import Network, initialise, load_network, predict_images
 from mtlnet.training.config import TrainConfig, open_pretrained
 from mtlnet.training.run import load_pretrained, start_training
 from trackfeatures.errors import UserError
@@ -39,6 +41,18 @@ def test_fine_tuning_starts_with_the_outputs_of_the_model(published: Path) -> No
     load_pretrained(network, published)
     frames = np.random.default_rng(0).integers(0, 256, (2, 210, 280, 3), dtype=np.uint8)
     expected = predict_images(load_network(published / WEIGHTS), frames)
+    np.testing.assert_allclose(predict_images(network, frames), expected, atol=1e-5)
+
+
+def test_fine_tuning_a_network_with_bins_starts_with_its_outputs(tmp_path: Path) -> None:
+    trained = Network(architecture=GRID)
+    initialise(trained, 3)
+    save_file(trained.state_dict(), tmp_path / WEIGHTS)
+    network = Network(architecture=GRID)
+    network.target_std.copy_(torch.linspace(0.02, 0.3, 6))  # set from the images, not used
+    load_pretrained(network, tmp_path)
+    frames = np.random.default_rng(0).integers(0, 256, (2, 210, 280, 3), dtype=np.uint8)
+    expected = predict_images(trained.eval(), frames)
     np.testing.assert_allclose(predict_images(network, frames), expected, atol=1e-5)
 
 
