@@ -68,12 +68,8 @@ def coverage(std: NDArray[Any], errors: NDArray[Any]) -> dict[str, list[float | 
     Those of a normal distribution are 0.683 and 0.954.
     """
     ratio = np.abs(errors) / std
-    return {name: [_within(ratio[:, i], k) for k in (1, 2)] for i, name in enumerate(FEATURES)}
-
-
-def _within(ratio: NDArray[Any], limit: float) -> float | None:
-    present = ratio[~np.isnan(ratio)]
-    return float((present <= limit).mean()) if len(present) else None
+    within = [np.where(np.isnan(ratio), np.nan, ratio <= limit) for limit in (1, 2)]
+    return {name: [_mean(each[:, i]) for each in within] for i, name in enumerate(FEATURES)}
 
 
 def calibration(std: NDArray[Any], errors: Numbers) -> dict[str, list[dict[str, float]]]:
