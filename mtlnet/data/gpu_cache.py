@@ -5,9 +5,7 @@ paper's network takes a data-centre GPU about a millisecond, less than decoding 
 CPU, or augmenting them.
 """
 
-from collections import deque
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from itertools import count
 from typing import Any
@@ -18,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mtlnet.data.augment.on_device import DeviceAugment
-from mtlnet.data.loader import Batch, BatchLabels, Loader
+from mtlnet.data.loader import Batch, BatchLabels, Loader, make_ahead
 
 MEMORY_SHARE = 0.6
 """Largest share of the free GPU memory for the images; the rest is for training."""
@@ -78,15 +76,9 @@ class GpuDataset:
     def batches(self, first: int) -> Iterator[DeviceBatch]:
         """Batches `first`, `first` + 1, ... without end."""
         if self._augment is None:
-            for step in count(first):
-                yield self.make(step)
-        with ThreadPoolExecutor(PREFETCH, thread_name_prefix="labels") as pool:
-            make = self._loader.make_labels
-            waiting = deque(pool.submit(make, first + i) for i in range(PREFETCH))
-            for step in count(first):
-                labels = waiting.popleft().result()
-                waiting.append(pool.submit(make, step + PREFETCH))
-                yield self._augmented(labels, step)
+            return map(self.make, count(first))
+        labels = make_ahead(self._loader.make_labels, first, PREFETCH, PREFETCH)
+        return map(self._augmented, labels, count(first))
 
     def _augmented(self, labels: BatchLabels, step: int) -> DeviceBatch:
         assert self._augment is not None

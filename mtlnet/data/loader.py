@@ -6,11 +6,13 @@ interruption.
 
 import ctypes
 import weakref
-from collections.abc import Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections import deque
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Protocol
+from itertools import count
+from typing import Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +29,9 @@ from trackfeatures.camera import CameraParameters
 
 PREFETCH = 3  # batches made or waiting
 WORKERS = 2  # threads: while one waits for the last image of its batch, the other starts the next
+
+
+Made = TypeVar("Made")
 
 
 class LabelArrays(Protocol):
@@ -166,20 +171,21 @@ class Loader:
 
     def batches(self, first: int) -> Iterator[Batch]:
         """Batches `first`, `first` + 1, ... without end, made in advance on threads."""
-        with ThreadPoolExecutor(WORKERS, thread_name_prefix="loader") as pool:
-            waiting: list[Future[Batch]] = [
-                pool.submit(self.make, first + i) for i in range(PREFETCH)
-            ]
-            step = first + PREFETCH
-            try:
-                while True:
-                    batch = waiting.pop(0).result()
-                    waiting.append(pool.submit(self.make, step))
-                    step += 1
-                    yield batch
-            finally:
-                for future in waiting:
-                    future.cancel()
+        return make_ahead(self.make, first, PREFETCH, WORKERS)
+
+
+def make_ahead(make: Callable[[int], Made], first: int, ahead: int, workers: int) -> Iterator[Made]:
+    """make(first), make(first + 1), ... without end, on threads, `ahead` made or waiting."""
+    with ThreadPoolExecutor(workers, thread_name_prefix="loader") as pool:
+        waiting = deque(pool.submit(make, first + i) for i in range(ahead))
+        try:
+            for step in count(first + ahead):
+                made = waiting.popleft().result()
+                waiting.append(pool.submit(make, step))
+                yield made
+        finally:
+            for future in waiting:
+                future.cancel()
 
 
 class BufferPool:

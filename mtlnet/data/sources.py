@@ -1,6 +1,7 @@
 """Training data of a run: the train rounds of a dataset, or a user's own images."""
 
 import hashlib
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -161,20 +162,14 @@ def find_undecodable(frames: Frames) -> dict[int, UndecodableImage]:
     found: dict[int, UndecodableImage] = {}
     for first in range(0, len(frames), CHUNK):
         rows = np.arange(first, min(first + CHUNK, len(frames)))
-        try:
+        with suppress(UndecodableImage):
             frames.read_batch(rows, images[: len(rows)])
-        except UndecodableImage:
-            found.update(_decode_each(frames, rows.tolist()))
-    return found
-
-
-def _decode_each(frames: Frames, rows: list[int]) -> dict[int, UndecodableImage]:
-    found = {}
-    for row in rows:
-        try:
-            frames.image(row)
-        except UndecodableImage as error:
-            found[row] = error
+            continue
+        for row in rows.tolist():
+            try:
+                frames.image(row)
+            except UndecodableImage as error:
+                found[row] = error
     return found
 
 
@@ -205,9 +200,3 @@ def drop_undecodable(frames: Frames, data: Path) -> tuple[Frames, list[str]]:
         require_decodable(frames, data)
     names = [f"{error.round_id}/{error.frame}" for error in found.values()]
     return frames.without(found) if found else frames, names
-
-
-def require_all_decodable(dataset: Dataset, sides: tuple[str, ...]) -> None:
-    """Raise DatasetError unless every image of these sides of the split can be decoded."""
-    for side in sides:
-        require_decodable(dataset.select(side), dataset.path)

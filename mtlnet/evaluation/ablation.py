@@ -9,6 +9,8 @@ import json
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
+from functools import reduce
+from operator import getitem
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +25,7 @@ from mtlnet.training.checkpoint import FOLDER as CHECKPOINTS
 from mtlnet.training.config import CONFIG, TrainConfig, resume_config
 from mtlnet.training.loss import Alpha
 from mtlnet.training.recipes import find_recipe
-from runtime.files import atomic_write
+from runtime.files import atomic_write, write_json
 from trackfeatures.errors import UserError
 
 SETTINGS, EVALUATION = "settings.json", "evaluation.json"
@@ -153,7 +155,7 @@ def require_same_settings(config: AblationConfig, content_hash: str) -> None:
             f"{config.out} holds other files ({SETTINGS} is missing); give another --out"
         )
     config.out.mkdir(parents=True, exist_ok=True)
-    atomic_write(path, json.dumps(settings, indent=1) + "\n", fsync=True)
+    write_json(path, settings)
 
 
 def finish_runs(
@@ -210,46 +212,39 @@ def read_evaluation(folder: Path) -> dict[str, Any] | None:
 
 @dataclass(frozen=True)
 class Column:
-    """A figure of the table; `task`: the index in alpha of the task that it measures."""
+    """A figure of the table; `task`: the index in alpha of the task that it measures.
+
+    `path`: where an evaluation has it.
+    """
 
     name: str
     title: str
     unit: str
     digits: int
     task: int
+    path: tuple[str, ...]
     scale: float = 1.0
 
 
 LOSSES = (
-    Column("distance_loss", "distance loss", "squared", 5, 0),
-    Column("distance_absolute", "distance loss", "absolute", 4, 0),
-    Column("angle_loss", "angle loss", "squared", 5, 1),
-    Column("angle_absolute", "angle loss", "absolute", 5, 1),
-    Column("accuracy", "type accuracy", "%", 2, 2, scale=100.0),
+    Column("distance_loss", "distance loss", "squared", 5, 0, ("coded", "distance")),
+    Column("distance_absolute", "distance loss", "absolute", 4, 0, ("coded", "distance_absolute")),
+    Column("angle_loss", "angle loss", "squared", 5, 1, ("coded", "angle")),
+    Column("angle_absolute", "angle loss", "absolute", 5, 1, ("coded", "angle_absolute")),
+    Column("accuracy", "type accuracy", "%", 2, 2, ("heading_accuracy",), scale=100.0),
 )
 ERRORS = (
-    *(Column(marking, marking, "m", 3, 0) for marking in tf.MARKINGS),
-    Column("to_lane_centre", "to lane centre", "m", 3, 0),
-    Column("angle", "angle", "rad", 4, 1),
+    *(Column(marking, marking, "m", 3, 0, ("mae_m", marking)) for marking in tf.MARKINGS),
+    Column("to_lane_centre", "to lane centre", "m", 3, 0, ("to_lane_centre_mae_m",)),
+    Column("angle", "angle", "rad", 4, 1, ("angle_mae_rad",)),
 )
 COLUMNS = LOSSES + ERRORS
-# The columns followed by the paper's figures; the paper does not define its losses exactly.
-PAPER_COLUMNS = ("distance_absolute", "angle_absolute", "accuracy")
 MAX_CURVE_POINTS = 120
 
 
-def figures(result: dict[str, Any]) -> dict[str, float | None]:
+def figures(result: Any) -> dict[str, float | None]:
     """The value of each of `COLUMNS` in one evaluation."""
-    return {
-        "distance_loss": result["coded"]["distance"],
-        "distance_absolute": result["coded"]["distance_absolute"],
-        "angle_loss": result["coded"]["angle"],
-        "angle_absolute": result["coded"]["angle_absolute"],
-        "accuracy": result["heading_accuracy"],
-        **{marking: result["mae_m"][marking] for marking in tf.MARKINGS},
-        "to_lane_centre": result["to_lane_centre_mae_m"],
-        "angle": result["angle_mae_rad"],
-    }
+    return {column.name: reduce(getitem, column.path, result) for column in COLUMNS}
 
 
 def table(rows: Sequence[Row], runs: Sequence[Run]) -> list[dict[str, Any]]:
@@ -281,14 +276,9 @@ def table(rows: Sequence[Row], runs: Sequence[Run]) -> list[dict[str, Any]]:
 
 def best(entries: Sequence[dict[str, Any]], column: str) -> int | None:
     """The index of the entry with the best mean in a column; None when no entry has one."""
-    means = [
-        (entry["figures"][column] or {}).get("mean", None) if entry["seeds"] else None
-        for entry in entries
-    ]
-    present = [(mean, i) for i, mean in enumerate(means) if mean is not None]
-    if not present:
-        return None
-    return (max if column == "accuracy" else min)(present)[1]
+    found = [(entry["figures"][column], i) for i, entry in enumerate(entries)]
+    means = [(figure["mean"], i) for figure, i in found if figure is not None]
+    return (max if column == "accuracy" else min)(means, default=(None, None))[1]
 
 
 def training_curve(

@@ -4,7 +4,6 @@ The folder holds `runs/ROW-seedS`, `ablation.json` and `ablation.html`. Both fil
 after every finished run, so that the page can be read while the ablation continues.
 """
 
-import json
 import os
 import statistics
 import time
@@ -18,14 +17,13 @@ from rich.console import Console
 
 from datagen.recording import Dataset
 from mtlnet.data.loader import Loader
-from mtlnet.data.sources import open_training_dataset, require_all_decodable
+from mtlnet.data.sources import open_training_dataset, require_decodable
 from mtlnet.evaluation.ablation import (
+    COLUMNS,
     ERRORS,
     LOSSES,
-    PAPER_COLUMNS,
     TASK_NAMES,
     AblationConfig,
-    Column,
     Row,
     Run,
     Train,
@@ -45,7 +43,7 @@ from mtlnet.training.loop import TrainProgress
 from mtlnet.training.recipes import find_recipe
 from mtlnet.training.run import train
 from mtlnet.training.trainer import Trainer, choose_device
-from runtime.files import atomic_write
+from runtime.files import atomic_write, write_json
 from runtime.html import render
 from runtime.svg_charts import Line, Numbers, Plot, line_plot
 from trackfeatures.errors import UserError
@@ -65,7 +63,8 @@ def ablate(config: AblationConfig, rows: Sequence[Row], *, dry_run: bool = False
     runs = plan_runs(config, rows)
     if dry_run:
         return _plan_with_times(config, runs, dataset, console)
-    require_all_decodable(dataset, ("train", config.split))  # once for all runs
+    for side in ("train", config.split):  # once for all runs
+        require_decodable(dataset.select(side), dataset.path)
     require_same_settings(config, dataset.content_hash)
     for number, run in enumerate(
         finish_runs(config, runs, _train_with_messages(console), _evaluate_run), 1
@@ -80,8 +79,7 @@ def write_result(config: AblationConfig, rows: Sequence[Row], runs: list[Run]) -
     """Write `ablation.json` and `ablation.html` of the finished runs; the content of the former."""
     entries = table(rows, runs)
     result = {**config.shared_settings(), "data": str(config.data), "rows": entries}
-    text = json.dumps(result, indent=1) + "\n"
-    atomic_write(config.out / "ablation.json", text, fsync=True)
+    write_json(config.out / "ablation.json", result)
     atomic_write(config.out / "ablation.html", page(config, entries, rows, runs), fsync=True)
     return result
 
@@ -179,6 +177,7 @@ SINGLE_TASK_COLOUR = "#6a3fb5"  # the paper's purple line
 FINAL_SHARE = 0.05
 """Share of a run over which its final loss is averaged."""
 PAPER_DIGITS = {"distance_absolute": 5, "angle_absolute": 5, "accuracy": 2}
+"""The columns followed by the paper's figures; the paper does not define its losses exactly."""
 
 
 def page(
@@ -192,54 +191,18 @@ def page(
         finished=sum(run.state == "finished" for run in runs),
         runs=len(runs),
         frames=next((entry["frames"] for entry in entries if entry["frames"]), 0),
-        losses=_results(entries, LOSSES),
-        errors=_results(entries, ERRORS),
+        learners=lambda columns: [
+            (number, entry)
+            for number, entry in enumerate(entries)
+            if any(entry["row"]["alpha"][column.task] for column in columns)
+        ],
+        best={column.name: best(entries, column.name) for column in COLUMNS},
+        losses=LOSSES,
+        errors=ERRORS,
+        paper_digits=PAPER_DIGITS,
+        alpha_text=_alpha_text,
         charts=[_training_chart(number, rows, runs) for number in range(len(TASK_NAMES))],
     )
-
-
-def _results(entries: Sequence[dict[str, Any]], columns: Sequence[Column]) -> dict[str, Any]:
-    """Columns and rows of a table; rows that learn none of the columns' tasks are left out."""
-    best_rows = {column.name: best(entries, column.name) for column in columns}
-    rows = []
-    for i, entry in enumerate(entries):
-        row = entry["row"]
-        if all(row["alpha"][column.task] == 0 for column in columns):
-            continue
-        cells = []
-        for column in columns:
-            cells.append(_cell(entry, column, is_best=best_rows[column.name] == i))
-            if column.name in PAPER_COLUMNS:
-                cells.append(_paper_cell(row, column))
-        rows.append(
-            {
-                "title": row["title"],
-                "alpha": _alpha_text(row["alpha"]),
-                "starts_part": row["name"] in ("mtl-1", "deepdriving"),
-                "cells": cells,
-            }
-        )
-    heads = [{"title": c.title, "unit": c.unit, "paper": c.name in PAPER_COLUMNS} for c in columns]
-    return {"columns": heads, "rows": rows}
-
-
-def _cell(entry: dict[str, Any], column: Column, *, is_best: bool) -> dict[str, str] | None:
-    figure = entry["figures"][column.name]
-    if figure is None:
-        return None
-    texts = {
-        name: f"{figure[name] * column.scale:.{column.digits}f}"
-        for name in ("mean", "std")
-        if figure[name] is not None
-    }
-    kind = "best" if is_best else ""
-    return {"text": texts["mean"], "std": texts.get("std", ""), "kind": kind}
-
-
-def _paper_cell(row: dict[str, Any], column: Column) -> dict[str, str]:
-    value = row["paper"][PAPER_COLUMNS.index(column.name)]
-    text = "" if value is None else f"{value * column.scale:.{PAPER_DIGITS[column.name]}f}"
-    return {"text": text, "std": "", "kind": "paper"}
 
 
 def _alpha_text(alpha: Sequence[float]) -> str:

@@ -1,9 +1,9 @@
 """Evaluates a model on the rounds of a dataset: `mtlnet evaluate --model RUN --data DIR --json`."""
 
-import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from queue import SimpleQueue
 from typing import Any
 
 import numpy as np
@@ -69,28 +69,25 @@ def predict_frames(
     report: Callable[[int, int], None] = lambda *_: None,
 ) -> NDArray[np.float32]:
     """Outputs (N, 9 or 17) for all frames, one at a time as in the service, a thread an engine."""
-    chunks = iter(range(0, len(frames), CHUNK))
-    lock = threading.Lock()
-    parts: dict[int, list[NDArray[np.float32]]] = {}
-
-    def work(engine: Engine) -> None:
+    idle: SimpleQueue[tuple[Engine, NDArray[np.uint8]]] = SimpleQueue()
+    for engine in engines:
         camera = engine.card.camera
-        images = np.empty((CHUNK, camera.height, camera.width, 3), np.uint8)
-        while True:
-            with lock:
-                first = next(chunks, None)
-            if first is None:
-                return
-            rows = np.arange(first, min(first + CHUNK, len(frames)))
-            batch = frames.read_batch(rows, images[: len(rows)])
-            parts[first] = [engine(image) for image in batch]
-            with lock:
-                report(min(len(parts) * CHUNK, len(frames)), len(frames))
+        idle.put((engine, np.empty((CHUNK, camera.height, camera.width, 3), np.uint8)))
 
+    def predict(first: int) -> list[NDArray[np.float32]]:
+        engine, images = idle.get()
+        rows = np.arange(first, min(first + CHUNK, len(frames)))
+        try:
+            return [engine(image) for image in frames.read_batch(rows, images[: len(rows)])]
+        finally:
+            idle.put((engine, images))
+
+    outputs: list[NDArray[np.float32]] = []
     with ThreadPoolExecutor(len(engines), thread_name_prefix="engine") as pool:
-        for done in [pool.submit(work, engine) for engine in engines]:
-            done.result()
-    return np.stack([outputs for first in sorted(parts) for outputs in parts[first]])
+        for found in pool.map(predict, range(0, len(frames), CHUNK)):
+            outputs += found
+            report(len(outputs), len(frames))
+    return np.stack(outputs)
 
 
 def require_fit(card: ModelCard, frames: Frames, split: str) -> None:

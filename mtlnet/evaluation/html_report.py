@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 
 import trackfeatures as tf
 from datagen.recording import Frames
-from mtlnet.evaluation.metrics import Numbers, feature_mean, signed_errors
-from mtlnet.evaluation.slices import GROUPS
+from mtlnet.evaluation.metrics import GROUPS, Numbers, signed_errors
+from mtlnet.evaluation.tables import error_cells, mean_error_cells
 from mtlnet.inference.overlay import draw_overlay
 from mtlnet.inference.prediction import OUTPUTS, Prediction, decode_outputs
 from mtlnet.inference.uncertainty import FEATURES
 from runtime.files import atomic_write
-from runtime.html import embed_jpeg, format_number, format_percent, render
+from runtime.html import embed_jpeg, format_percent, render
 from runtime.svg_charts import MAX_POINTS, Line, Plot, line_plot, reliability_diagram
 
 FILE_NAME = "report.html"
@@ -26,7 +26,6 @@ MAX_ROUNDS = 8
 HEAVY_SHADOW = 0.3
 """Share of the road in shadow from which an interval of a plot is shaded."""
 UNITS = {name: "rad" if name == "angle" else "m" for name in FEATURES}
-DIGITS = {name: 4 if name == "angle" else 3 for name in FEATURES}
 TITLES = {name: f"{name} ({unit})" for name, unit in UNITS.items()}
 
 Rows = list[list[str]]
@@ -48,14 +47,16 @@ def page(report: dict[str, Any], frames: Frames, outputs: NDArray[np.float32]) -
         "mtlnet.evaluation",
         "report.html",
         report=report,
-        error_rows=_error_rows(report),
+        error_rows=[
+            [TITLES[name], *error_cells(report, name), f"{report['errors'][name]['frames']:,}"]
+            for name in FEATURES
+        ],
         confusion_head=["", *(f"predicted {name}" for name in report["confusion"])],
         confusion_rows=_confusion_rows(report["confusion"]),
         presence_rows=[
             [name, format_percent(rates["false_active"]), format_percent(rates["false_inactive"])]
             for name, rates in report["presence"].items()
         ],
-        coded_rows=_coded_rows(report["coded"]),
         drives=_drives(frames, outputs),
         coverage_rows=[
             [name, *map(format_percent, shares)]
@@ -67,18 +68,6 @@ def page(report: dict[str, Any], frames: Frames, outputs: NDArray[np.float32]) -
     )
 
 
-def _error_rows(report: dict[str, Any]) -> Rows:
-    rows = []
-    for name in FEATURES:
-        digits = DIGITS[name]
-        found, baseline = report["errors"][name], feature_mean(report["baseline"], name)
-        ratio = None if found["mean"] is None or not baseline else found["mean"] / baseline
-        cells = [format_number(found[k], digits) for k in ("mean", "median", "p95", "p99")]
-        cells += [format_number(baseline, digits), format_number(ratio, 2)]
-        rows.append([TITLES[name], *cells, f"{found['frames']:,}"])
-    return rows
-
-
 def _confusion_rows(confusion: dict[str, dict[str, int]]) -> Rows:
     rows = []
     for name, row in confusion.items():
@@ -86,14 +75,6 @@ def _confusion_rows(confusion: dict[str, dict[str, int]]) -> Rows:
         shares = [f"{n:,} ({n / total:.1%})" if total else "-" for n in row.values()]
         rows.append([f"truly {name}", *shares])
     return rows
-
-
-def _coded_rows(coded: dict[str, float]) -> Rows:
-    return [
-        ["distance (five summed)", f"{coded['distance']:.5f}", f"{coded['distance_absolute']:.5f}"],
-        ["angle", f"{coded['angle']:.6f}", f"{coded['angle_absolute']:.5f}"],
-        ["type (cross-entropy)", f"{coded['type']:.4f}", ""],
-    ]
 
 
 def _reliability(doubt: dict[str, Any]) -> Iterator[Markup]:
@@ -112,8 +93,8 @@ def _groups(report: dict[str, Any]) -> Iterator[dict[str, Any]]:
             head.append("out of distribution")
         rows = []
         for key, part in report[grouping].items():
-            means = [format_number(part["errors"][n]["mean"], DIGITS[n]) for n in FEATURES]
-            row = [key, f"{part['frames']:,}", *means, format_percent(part["heading_accuracy"])]
+            accuracy = format_percent(part["heading_accuracy"])
+            row = [key, f"{part['frames']:,}", *mean_error_cells(part), accuracy]
             if "doubt" in report:
                 row.append(format_percent(part["doubt"]["out_of_distribution"]))
             rows.append(row)

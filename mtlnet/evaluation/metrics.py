@@ -5,31 +5,22 @@ A feature is one of `mtlnet.inference.uncertainty.FEATURES`: the five markings, 
 The baseline is a constant prediction, the mean of the training labels.
 """
 
-from typing import Any, Protocol
+from collections.abc import Iterator
+from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 import trackfeatures as tf
 from datagen.recording import Dataset, Frames, Labels
-from mtlnet.evaluation.slices import groups
+from mtlnet.data.loader import LabelArrays
 from mtlnet.inference.prediction import OUTPUTS
 from mtlnet.inference.uncertainty import FEATURES
 
 Numbers = NDArray[np.float64]
 PERCENTILES = {"median": 50, "p95": 95, "p99": 99}
 CALIBRATION_BINS = 10
-
-
-class LabelArrays(Protocol):
-    """The labels of which a mean is taken; see `datagen.recording.Labels`."""
-
-    @property
-    def distances(self) -> NDArray[np.float32]: ...
-    @property
-    def angle(self) -> NDArray[np.float32]: ...
-    @property
-    def heading(self) -> NDArray[np.int64]: ...
 
 
 def signed_errors(outputs: NDArray[np.float32], distances: Any, angle: Any) -> Numbers:
@@ -77,12 +68,8 @@ def coverage(std: NDArray[Any], errors: NDArray[Any]) -> dict[str, list[float | 
     Those of a normal distribution are 0.683 and 0.954.
     """
     ratio = np.abs(errors) / std
-    return {name: [_within(ratio[:, i], k) for k in (1, 2)] for i, name in enumerate(FEATURES)}
-
-
-def _within(ratio: NDArray[Any], limit: float) -> float | None:
-    present = ratio[~np.isnan(ratio)]
-    return float((present <= limit).mean()) if len(present) else None
+    within = [np.where(np.isnan(ratio), np.nan, ratio <= limit) for limit in (1, 2)]
+    return {name: [_mean(each[:, i]) for each in within] for i, name in enumerate(FEATURES)}
 
 
 def calibration(std: NDArray[Any], errors: Numbers) -> dict[str, list[dict[str, float]]]:
@@ -153,6 +140,55 @@ def mean_labels(labels: LabelArrays) -> dict[str, Any]:
     }
 
 
+# Groups of frames by which a model is evaluated.
+
+
+GROUPS = {
+    "by_track": "track",
+    "by_lanes": "lanes",
+    "by_light": "light",
+    "by_shadow": "road in shadow",
+    "by_radius": "radius of the bend",
+    "by_speed": "speed",
+}
+SHADOW = (0.05, 0.3, 0.6)
+"""Limits of the share of the road within 30 m that lies in shadow."""
+RADIUS_M = (40.0, 80.0, 170.0)
+"""Limits of the radius of the bend; the heading class of a larger one is straight."""
+SPEED_KMH = (30.0, 45.0, 60.0)
+
+
+def groups(frames: Frames) -> Iterator[tuple[str, dict[str, NDArray[np.int64]]]]:
+    """Each grouping: its name in `GROUPS`, and the rows of each of its groups, in order.
+
+    Each frame is in one group of every grouping.
+    """
+    labels = frames.labels
+    of_round = labels.round
+    yield "by_track", _by_value(np.array([info.track for info in frames.rounds])[of_round])
+    yield "by_lanes", _by_value(labels.lanes.astype(str))
+    yield "by_light", _by_value(labels.light)
+    yield "by_shadow", _by_range(labels.shadow_fraction, SHADOW, "")
+    radius = 1 / np.maximum(np.abs(labels.curvature), 1e-9)
+    yield "by_radius", _by_range(radius, RADIUS_M, " m")
+    yield "by_speed", _by_range(labels.speed * 3.6, SPEED_KMH, " km/h")
+
+
+def _by_value(keys: NDArray[np.str_]) -> dict[str, NDArray[np.int64]]:
+    return {key: np.flatnonzero(keys == key) for key in np.unique(keys).tolist()}
+
+
+def _by_range(
+    values: NDArray[Any], limits: tuple[float, ...], unit: str
+) -> dict[str, NDArray[np.int64]]:
+    names = [f"under {limits[0]:g}{unit}"]
+    names += [f"{lo:g} to {hi:g}{unit}" for lo, hi in pairwise(limits)]
+    names += [f"over {limits[-1]:g}{unit}"]
+    numbers = np.digitize(values, limits)
+    rows = {name: np.flatnonzero(numbers == i) for i, name in enumerate(names)}
+    return {name: found for name, found in rows.items() if len(found)}
+
+
 # The report of an evaluation.
 
 
@@ -187,7 +223,7 @@ def evaluate_outputs(
 def evaluate_by_groups(
     outputs: NDArray[np.float32], frames: Frames, mean: dict[str, Any]
 ) -> dict[str, Any]:
-    """The report on all frames, and on the groups of `mtlnet.evaluation.slices`: `by_track`, ..."""
+    """The report on all frames, and on the groups of frames: `by_track`, ..."""
     labels = frames.labels
     report = evaluate_outputs(outputs, labels, mean)
     if outputs.shape[1] > OUTPUTS:

@@ -5,16 +5,28 @@ from typing import Any
 from rich.table import Table
 
 import trackfeatures as tf
-from mtlnet.evaluation.metrics import feature_mean
-from mtlnet.evaluation.slices import GROUPS
+from mtlnet.evaluation.metrics import GROUPS, feature_mean
 from mtlnet.inference.uncertainty import FEATURES
 from runtime.html import format_number, format_percent
 
-ROWS = {
-    **{m: (f"to {m} (m)", 3) for m in tf.MARKINGS},
-    "to_lane_centre": ("to lane centre (m)", 3),
-    "angle": ("angle (rad)", 4),
+TITLES = {
+    **{m: f"to {m} (m)" for m in tf.MARKINGS},
+    "to_lane_centre": "to lane centre (m)",
+    "angle": "angle (rad)",
 }
+DIGITS = {name: 4 if name == "angle" else 3 for name in FEATURES}
+
+
+def error_cells(result: dict[str, Any], name: str) -> list[str]:
+    """Of a feature's errors: mean, median, percentiles, that of the training mean, and ratio."""
+    baseline, ratio = (feature_mean(result[part], name) for part in ("baseline", "ratio"))
+    sizes = [*(result["errors"][name][k] for k in ("mean", "median", "p95", "p99")), baseline]
+    return [*(format_number(v, DIGITS[name]) for v in sizes), format_number(ratio, 2)]
+
+
+def mean_error_cells(result: dict[str, Any]) -> list[str]:
+    """The mean error of each feature."""
+    return [format_number(result["errors"][f]["mean"], DIGITS[f]) for f in FEATURES]
 
 
 def evaluation_table(result: dict[str, Any]) -> Table:
@@ -23,11 +35,8 @@ def evaluation_table(result: dict[str, Any]) -> Table:
     table = Table(title=title)
     for column in ("", "mean", "median", "95 %", "99 %", "training mean", "ratio"):
         table.add_column(column, justify="left" if not column else "right", no_wrap=not column)
-    for name, (label, digits) in ROWS.items():
-        base, ratio = (feature_mean(result[part], name) for part in ("baseline", "ratio"))
-        sizes = [*(result["errors"][name][k] for k in ("mean", "median", "p95", "p99")), base]
-        cells = [format_number(v, digits) for v in sizes]
-        table.add_row(label, *cells, format_number(ratio, 2))
+    for name, title in TITLES.items():
+        table.add_row(title, *error_cells(result, name))
     accuracy, base = (result["heading_accuracy"], result["baseline"]["heading_accuracy"])
     table.add_row("class right", f"{100 * accuracy:.1f} %", "", "", "", f"{100 * base:.1f} %", "")
     return table
@@ -43,15 +52,8 @@ def group_table(result: dict[str, Any]) -> Table:
         table.add_section()
         table.add_row(f"[bold]{label}")
         for key, part in result[group].items():
-            table.add_row(
-                key,
-                str(part["frames"]),
-                *(
-                    format_number(part["errors"][f]["mean"], 4 if f == "angle" else 3)
-                    for f in FEATURES
-                ),
-                f"{100 * part['heading_accuracy']:.1f}%",
-            )
+            accuracy = f"{100 * part['heading_accuracy']:.1f}%"
+            table.add_row(key, str(part["frames"]), *mean_error_cells(part), accuracy)
     return table
 
 

@@ -5,7 +5,6 @@ OpenVINO only, see `mtlnet.export.int8`; the engine uses it by default once it h
 accuracy gate on the test rounds. Each export is compared with torch on frames of a dataset.
 """
 
-import json
 import logging
 from pathlib import Path
 from typing import Any
@@ -17,9 +16,8 @@ from numpy.typing import NDArray
 from datagen.recording import Dataset
 from mtlnet.evaluation.evaluate import require_fit
 from mtlnet.export.int8 import calibration_images, judge, quantise
-from mtlnet.export.openvino_graph import TOLERANCE
-from mtlnet.inference.engine import best_precision, read_graph
-from mtlnet.inference.exported import EXPORT_FILE
+from mtlnet.export.openvino_graph import TOLERANCE, run_graph
+from mtlnet.inference.engine import EXPORT_FILE, best_precision, read_graph
 from mtlnet.inference.model_card import (
     GRAPH,
     GRAPH_WEIGHTS,
@@ -34,7 +32,7 @@ from mtlnet.inference.model_card import (
 from mtlnet.inference.prediction import OUTPUTS
 from mtlnet.model.architecture import HEIGHT, WIDTH
 from mtlnet.model.network import Network, load_network, predict_images
-from runtime.files import atomic_write
+from runtime.files import write_json
 from trackfeatures.errors import UserError
 
 FORMATS, PRECISIONS = ("onnx", "openvino"), ("f32", "bf16", "int8")
@@ -68,7 +66,14 @@ def export_model(
     (folder / EXPORT_FILE).unlink(missing_ok=True)  # an interrupted export is then no export
     network = load_network(run / WEIGHTS, card.network)
     images = shown.read_batch(chosen)
-    names = _write(run, card, network, folder, (kind, precision), dataset)
+    try:
+        if kind == "onnx":
+            names = write_onnx(network, folder, bf16=precision == "bf16")
+        else:
+            names = write_openvino(read_graph(run, card), folder, precision, dataset)
+    except RuntimeError as error:  # OpenVINO's error for a failed write
+        reason = str(error).strip().splitlines()[-1]
+        raise UserError(f"{folder} could not be written ({reason}); is the disk full?") from error
     check = check_export(network, folder / names[0], precision, images)
     about: dict[str, Any] = {"format": kind, "precision": precision, "check": check}
     write_export(folder, card, names, **about)
@@ -102,26 +107,7 @@ def write_export(folder: Path, card: ModelCard, names: tuple[str, ...], **about:
     """Write the `export.json` of the export in `folder`, with the hashes of its files."""
     files = {name: file_hash(folder / name) for name in names}
     content = {"model_hash": card.model_hash, "files": files, **about}
-    atomic_write(folder / EXPORT_FILE, (json.dumps(content, indent=1) + "\n").encode(), fsync=True)
-
-
-def _write(
-    run: Path,
-    card: ModelCard,
-    network: Network,
-    folder: Path,
-    form: tuple[str, str],
-    dataset: Dataset,
-) -> tuple[str, ...]:
-    """Write the files of an export, `form` (format, precision); returns their names."""
-    kind, precision = form
-    try:
-        if kind == "onnx":
-            return write_onnx(network, folder, bf16=precision == "bf16")
-        return write_openvino(read_graph(run, card), folder, precision, dataset)
-    except RuntimeError as error:  # OpenVINO's error for a failed write
-        reason = str(error).strip().splitlines()[-1]
-        raise UserError(f"{folder} could not be written ({reason}); is the disk full?") from error
+    write_json(folder / EXPORT_FILE, content)
 
 
 class WithProbabilities(torch.nn.Module):
@@ -222,11 +208,8 @@ def check_export(
     """Largest differences of the nine outputs, run by OpenVINO, from torch in float32."""
     import openvino
 
-    core = openvino.Core()
-    computed = "f32" if precision == "f32" else best_precision(core)
-    options = {"INFERENCE_PRECISION_HINT": computed}
-    request = core.compile_model(str(path), "CPU", options).create_infer_request()
-    found = np.concatenate([request.infer([image[None]])[0].copy() for image in images])
+    computed = "f32" if precision == "f32" else best_precision(openvino.Core())
+    found = run_graph(path, computed, images)
     difference = np.abs(found[:, :OUTPUTS] - predict_images(network, images))
     return {
         "frames": len(images),

@@ -66,6 +66,18 @@ def write_graph(
         staged.with_suffix(".bin").unlink(missing_ok=True)
 
 
+def run_graph(path: Path, precision: str, images: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """Outputs (N, 9 or 17) of the model in file `path` for images (N, 210, 280, 3), by OpenVINO.
+
+    Raises RuntimeError when OpenVINO cannot load it.
+    """
+    import openvino
+
+    options = {"INFERENCE_PRECISION_HINT": precision, "NUM_STREAMS": 1}
+    request = openvino.Core().compile_model(str(path), "CPU", options).create_infer_request()
+    return np.concatenate([request.infer([image[None]])[0].copy() for image in images])
+
+
 def _nodes(network: Network) -> Nodes:
     from openvino import opset13 as ops
 

@@ -1,4 +1,4 @@
-"""Publishing a trained model: folded weights, OpenVINO graph and model card in a run's folder.
+"""The model in a run's own folder, written when training ends: weights, OpenVINO graph, card.
 
 The card is written last, after the graph has been compared with torch on real frames: a run without
 a card holds no finished model.
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from safetensors.torch import save
 
 import trackfeatures as tf
-from mtlnet.export.openvino_graph import TOLERANCE, UNCERTAINTY_TOLERANCE, write_graph
+from mtlnet.export.openvino_graph import TOLERANCE, UNCERTAINTY_TOLERANCE, run_graph, write_graph
 from mtlnet.inference.engine import best_precision
 from mtlnet.inference.model_card import (
     GRAPH,
@@ -122,19 +122,16 @@ def compare_graph(
     x, expected = run_network(network, images)
     textures = np.stack([texture_features(image) for image in images])
     uncertainty = None if head is None else head.predict(x, textures)
-    core = openvino.Core()
     differences = {"frames": float(len(images))}
-    for precision in dict.fromkeys(("f32", best_precision(core))):
-        options = {"INFERENCE_PRECISION_HINT": precision, "NUM_STREAMS": 1}
+    for precision in dict.fromkeys(("f32", best_precision(openvino.Core()))):
         try:
-            request = core.compile_model(str(run / GRAPH), "CPU", options).create_infer_request()
+            outputs = run_graph(run / GRAPH, precision, images)
         except RuntimeError as error:
             reason = str(error).strip().splitlines()[-1]
             raise ModelError(
                 f"OpenVINO cannot load {run / GRAPH}, just written ({reason}): the model is not "
                 "published; is the disk full?"
             ) from error
-        outputs = np.concatenate([request.infer([image[None]])[0].copy() for image in images])
         difference = np.abs(outputs[:, :OUTPUTS] - expected)
         differences[f"openvino_{precision}_max"] = float(difference.max())
         if uncertainty is not None:

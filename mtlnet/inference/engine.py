@@ -4,13 +4,13 @@ An engine takes one camera image, uint8 RGB; normalisation is part of the export
 imported only when the torch engine is requested: the serving image does not contain it.
 """
 
+import json
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, Protocol, cast, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mtlnet.inference.exported import int8_graph, passed_gate
 from mtlnet.inference.model_card import (
     GRAPH,
     GRAPH_WEIGHTS,
@@ -19,11 +19,14 @@ from mtlnet.inference.model_card import (
     ModelCard,
     ModelError,
     check_files,
+    file_hash,
     read_card,
 )
 
 EngineKind = Literal["openvino", "torch"]
 Precision = Literal["bf16", "f32", "int8"]
+EXPORT_FILE = "export.json"
+INT8 = Path("export") / "openvino-int8"
 
 
 class Engine(Protocol):
@@ -137,22 +140,60 @@ def read_graph(run: Path, card: ModelCard) -> Any:
     return model_from_weights(card.network, read_weights(run / WEIGHTS), head)
 
 
+# The exports of a run, each with an `export.json` that `mtlnet export` writes. An int8 graph is
+# used by default only if it passed its accuracy gate (`mtlnet.export.int8`; DESIGN §7).
+
+
+def read_export(folder: Path) -> dict[str, Any] | None:
+    """The `export.json` of a folder, None if there is none; ModelError when it is damaged."""
+    path = folder / EXPORT_FILE
+    if not path.is_file():
+        return None
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        if not isinstance(content["files"], dict) or "model_hash" not in content:
+            raise TypeError("no files or no model_hash")
+    except (ValueError, KeyError, TypeError) as error:
+        raise ModelError(f"{path} is damaged ({error!r}); delete it or export again") from error
+    return dict(content)
+
+
+def passed_gate(run: Path, card: ModelCard) -> bool:
+    """Whether the run has an int8 graph of the card's weights that passed the accuracy gate."""
+    about = read_export(run / INT8)
+    if about is None or about["model_hash"] != card.model_hash:
+        return False
+    return bool((about.get("gate") or {}).get("passed"))
+
+
+def int8_graph(run: Path, card: ModelCard) -> Path:
+    """Path of a run's int8 graph; ModelError if missing, damaged or made from other weights."""
+    folder = run / INT8
+    about = read_export(folder)
+    how = f"make it with `mtlnet export --model {run} --format openvino --precision int8`"
+    if about is None:
+        raise ModelError(f"{run} has no int8 graph; {how}")
+    if about["model_hash"] != card.model_hash:
+        raise ModelError(f"{folder} was made from other weights than those of {run}; {how}")
+    for name in (GRAPH, GRAPH_WEIGHTS):
+        path = folder / name
+        if not path.is_file() or file_hash(path) != about["files"].get(name):
+            raise ModelError(f"{path} is missing or damaged; {how}")
+    return folder / GRAPH
+
+
 def parse_kind(text: str) -> EngineKind:
     """The engine kind called `text`; ModelError for an unknown one."""
-    kinds: dict[str, EngineKind] = {"openvino": "openvino", "torch": "torch"}
-    if text in kinds:
-        return kinds[text]
-    raise ModelError(f"there is no engine {text!r}; choose openvino or torch")
+    if text not in get_args(EngineKind):
+        raise ModelError(f"there is no engine {text!r}; choose openvino or torch")
+    return cast(EngineKind, text)
 
 
 def parse_precision(text: str | None) -> Precision | None:
     """The precision called `text`, None for the default; ModelError for an unknown one."""
-    precisions: dict[str, Precision] = {"bf16": "bf16", "f32": "f32", "int8": "int8"}
-    if text is None:
-        return None
-    if text in precisions:
-        return precisions[text]
-    raise ModelError(f"there is no precision {text!r}; choose int8, bf16 or f32")
+    if text not in (None, *get_args(Precision)):
+        raise ModelError(f"there is no precision {text!r}; choose int8, bf16 or f32")
+    return cast(Precision | None, text)
 
 
 def best_precision(core: Any) -> Precision:

@@ -146,9 +146,11 @@ def fit_pitch_offset(
     x = np.concatenate([known, views[0]])
     target = np.concatenate([np.zeros(len(known), np.float32), views[1] / PITCH_UNIT_RAD])[:, None]
     centre, scale = x.mean(0), 1 / np.maximum(x.std(0), 0.02)
-    first, second = _train(torch.from_numpy((x - centre) * scale), torch.from_numpy(target), seed)
-    hidden = np.maximum(((held_out - centre) * scale) @ first.weight.T + first.bias, 0)
-    predicted = hidden @ second.weight.T + second.bias
+    hidden_weight, hidden_bias, weight, bias = _train(
+        torch.from_numpy((x - centre) * scale), torch.from_numpy(target), seed
+    )
+    hidden = np.maximum(((held_out - centre) * scale) @ hidden_weight.T + hidden_bias, 0)
+    predicted = hidden @ weight.T + bias
     zero = np.median(predicted)
     limit = max(
         float(np.quantile(np.abs(predicted - zero), 1 - false_alarm_rate)),
@@ -157,23 +159,15 @@ def fit_pitch_offset(
     return {
         "pitch_centre": centre.astype(np.float32),
         "pitch_scale": scale.astype(np.float32),
-        "pitch_hidden_weight": first.weight,
-        "pitch_hidden_bias": first.bias,
-        "pitch_weight": (second.weight / limit).astype(np.float32),
-        "pitch_bias": ((second.bias - zero) / limit).astype(np.float32),
+        "pitch_hidden_weight": hidden_weight,
+        "pitch_hidden_bias": hidden_bias,
+        "pitch_weight": (weight / limit).astype(np.float32),
+        "pitch_bias": ((bias - zero) / limit).astype(np.float32),
     }
 
 
-@dataclass(frozen=True)
-class _Layer:
-    """A linear layer: weight (N, M) and bias (N,)."""
-
-    weight: Numbers
-    bias: Numbers
-
-
-def _train(z: Tensor, target: Tensor, seed: int) -> tuple[_Layer, _Layer]:
-    """Two layers z (N, M) -> target (N, 1), trained with a smooth L1 loss."""
+def _train(z: Tensor, target: Tensor, seed: int) -> list[Numbers]:
+    """Weight, bias, weight and bias of two layers z (N, M) -> target (N, 1), by smooth L1 loss."""
     generator = torch.Generator().manual_seed(seed)
     layers = nn.Linear(z.shape[1], HIDDEN), nn.Linear(HIDDEN, 1)
     with torch.no_grad():
@@ -185,11 +179,9 @@ def _train(z: Tensor, target: Tensor, seed: int) -> tuple[_Layer, _Layer]:
         predicted = layers[1](layers[0](z[rows]).relu())
         return nn.functional.smooth_l1_loss(predicted, target[rows], beta=0.1)
 
-    minimise(loss, [p for layer in layers for p in layer.parameters()], len(z), FIT, generator)
-    first, second = (
-        _Layer(layer.weight.detach().numpy(), layer.bias.detach().numpy()) for layer in layers
-    )
-    return first, second
+    parameters = [p for layer in layers for p in (layer.weight, layer.bias)]
+    minimise(loss, parameters, len(z), FIT, generator)
+    return [parameter.detach().numpy() for parameter in parameters]
 
 
 def minimise(

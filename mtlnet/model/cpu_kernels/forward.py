@@ -10,9 +10,12 @@ from torch import Tensor, nn
 from torch.nn.functional import conv2d, linear, max_pool2d, relu
 
 from mtlnet.model.architecture import GRID, HEIGHT, MTL, Conv, Pool, same_padding
-from mtlnet.model.cpu_kernels.im2col import im2col_convolution
+from mtlnet.model.cpu_kernels.convolutions import (
+    im2col_convolution,
+    space_to_depth,
+    space_to_depth_convolution,
+)
 from mtlnet.model.cpu_kernels.norm_pool_relu import norm_pool_relu, pool_arguments
-from mtlnet.model.cpu_kernels.space_to_depth import space_to_depth, space_to_depth_convolution
 from mtlnet.model.network import Network
 
 MAX_IM2COL_PIXELS = 64

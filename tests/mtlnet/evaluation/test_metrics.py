@@ -8,8 +8,7 @@ import pytest
 
 import trackfeatures as tf
 from datagen.recording import Labels
-from mtlnet.evaluation.metrics import evaluate_by_groups, evaluate_outputs, presence
-from mtlnet.evaluation.slices import GROUPS
+from mtlnet.evaluation.metrics import GROUPS, evaluate_by_groups, evaluate_outputs, presence
 
 NAN = float("nan")
 TRUE = [

@@ -16,8 +16,7 @@ from mtlnet.evaluation.tables import export_lines
 from mtlnet.export.convert import export_model
 from mtlnet.export.int8 import gate
 from mtlnet.export.openvino_graph import TOLERANCE
-from mtlnet.inference.engine import load_engine
-from mtlnet.inference.exported import EXPORT_FILE, INT8, passed_gate
+from mtlnet.inference.engine import EXPORT_FILE, INT8, load_engine, passed_gate
 from mtlnet.inference.model_card import (
     GRAPH,
     GRAPH_WEIGHTS,

@@ -7,10 +7,13 @@ import pytest
 import torch
 
 from mtlnet.model.architecture import GRID, MTL, SHARED, Architecture
+from mtlnet.model.cpu_kernels.convolutions import (
+    im2col_convolution,
+    space_to_depth,
+    space_to_depth_convolution,
+)
 from mtlnet.model.cpu_kernels.forward import forward_features, training_outputs
-from mtlnet.model.cpu_kernels.im2col import im2col_convolution
 from mtlnet.model.cpu_kernels.norm_pool_relu import statistics
-from mtlnet.model.cpu_kernels.space_to_depth import space_to_depth, space_to_depth_convolution
 from mtlnet.model.network import Network, initialise
 from mtlnet.training.trainer import dropout_masks, freeze_batch_norm
 

@@ -1,0 +1,103 @@
+"""Convolutions in the form that a CPU computes fastest: the first one and those of small maps.
+
+The first, 11 x 11 with stride 4 on 3 colours, becomes 3 x 3 with stride 1 on 48 channels by space
+to depth: a block of 4 x 4 pixels becomes one pixel of 48 channels (row, column, colour). SAME
+padding starts a window 4 rows and 3 columns before its block, so 3 x 3 blocks contain it; the
+kernel is padded to 12 x 12. CPUs compute this three times as fast as with 3 channels. A convolution
+of 12 x 12 with four zeros around the image has that form already.
+
+The last three have inputs of at most 7 x 9 pixels and most of the weights. There a CPU's
+convolution spends most of its time on reordering weights; one matrix product (im2col), which uses
+the weights as they are stored, takes a sixth of the time.
+"""
+
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.nn.functional import conv2d, pad
+
+from mtlnet.model.architecture import same_padding
+
+BLOCK = 4
+ROW_BYTES = 12  # of one row of a block: four pixels of three colours
+COLOUR_OFFSET = 127.5
+"""The uint8 value that is normalised to 0; exact in bf16, as are all colours minus it."""
+
+
+def space_to_depth(images: Tensor, dtype: torch.dtype) -> Tensor:
+    """uint8 (B, H, W, 3) -> (B, 48, ceil(H / 4), W / 4) channels-last.
+
+    Values are colours minus `COLOUR_OFFSET`. Rows below the image are 0. W must be a multiple of 4.
+    """
+    count, height, width, _ = images.shape
+    rows, columns, rest = -(-height // BLOCK), width // BLOCK, height % BLOCK
+    words = images.reshape(count, height, width * 3).view(torch.int32)  # copies 4 bytes at a time
+    blocks = torch.empty((count, rows, columns, BLOCK, ROW_BYTES // 4), dtype=torch.int32)
+    whole = height - rest
+    blocks[:, : whole // BLOCK] = (
+        words[:, :whole].view(count, whole // BLOCK, BLOCK, columns, ROW_BYTES // 4).transpose(2, 3)
+    )
+    if rest:
+        last = words[:, whole:].view(count, rest, columns, ROW_BYTES // 4)
+        blocks[:, -1, :, :rest] = last.transpose(1, 2)
+    x = blocks.view(torch.uint8).to(dtype).sub_(COLOUR_OFFSET)
+    if rest:
+        x[:, -1, :, rest:] = 0
+    return x.view(count, rows, columns, BLOCK * ROW_BYTES).permute(0, 3, 1, 2)
+
+
+def space_to_depth_convolution(
+    x: Tensor, weight: Tensor, bias: Tensor | None, dtype: torch.dtype
+) -> Tensor:
+    """The convolution with `weight` (F, 3, 11, 11), or 12 x 12, of x (B, 48, h, w)."""
+    short = 3 * BLOCK - weight.shape[2]
+    kernel = pad(weight * (1 / COLOUR_OFFSET), (short, 0, 0, short))
+    filters = len(weight)
+    kernel = kernel.view(filters, 3, 3, BLOCK, 3, BLOCK).permute(0, 3, 5, 1, 2, 4)
+    kernel = kernel.reshape(filters, BLOCK * ROW_BYTES, 3, 3).to(dtype)
+    kernel = kernel.contiguous(memory_format=torch.channels_last)
+    return conv2d(x, kernel, None if bias is None else bias.to(dtype), padding=1)
+
+
+class _Im2colConvolution(torch.autograd.Function):
+    """x (B, H, W, C), weight (F, k, k, C) -> (B, h, w, F), SAME padding."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, weight: Tensor, stride: int) -> Tensor:
+        count, height, width, channels = x.shape
+        filters, k = weight.shape[:2]
+        out_h, top, bottom = same_padding(height, k, stride)
+        out_w, left, right = same_padding(width, k, stride)
+        padded = x.new_zeros((count, height + top + bottom, width + left + right, channels))
+        padded[:, top : top + height, left : left + width] = x
+        windows = padded.unfold(1, k, stride).unfold(2, k, stride)  # (B, h, w, C, k, k)
+        columns = windows.permute(0, 1, 2, 4, 5, 3).reshape(count * out_h * out_w, -1)
+        ctx.save_for_backward(columns, weight)
+        ctx.shape, ctx.padded, ctx.stride, ctx.corner = x.shape, padded.shape, stride, (top, left)
+        return (columns @ weight.reshape(filters, -1).t()).view(count, out_h, out_w, filters)
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, Tensor, None]:
+        columns, weight = ctx.saved_tensors
+        gradient = gradients[0]
+        count, out_h, out_w, filters = gradient.shape
+        k, stride, (top, left) = weight.shape[1], ctx.stride, ctx.corner
+        flat = gradient.reshape(-1, filters)
+        weight_gradient = (flat.t() @ columns).view(weight.shape)
+        parts = (flat @ weight.reshape(filters, -1)).view(count, out_h, out_w, k, k, -1)
+        padded = gradient.new_zeros(ctx.padded)
+        for i in range(k):
+            for j in range(k):
+                rows = slice(i, i + stride * (out_h - 1) + 1, stride)
+                cells = slice(j, j + stride * (out_w - 1) + 1, stride)
+                padded[:, rows, cells] += parts[:, :, :, i, j]
+        _, height, width, _ = ctx.shape
+        return padded[:, top : top + height, left : left + width], weight_gradient, None
+
+
+def im2col_convolution(x: Tensor, weight: Tensor, stride: int) -> Tensor:
+    """`x` (B, C, H, W) and `weight` (F, C, k, k), both channels-last -> (B, F, h, w), SAME."""
+    out_nhwc = _Im2colConvolution.apply(x.permute(0, 2, 3, 1), weight.permute(0, 2, 3, 1), stride)
+    out: Tensor = out_nhwc.permute(0, 3, 1, 2)
+    return out
