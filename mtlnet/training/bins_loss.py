@@ -2,14 +2,16 @@
 
 Distances: the cross-entropy of each one's target distribution, mean over the five and the batch:
 summed, as the paper's squared errors are, they left the angle and the class behind in a pilot of
-300 steps. Angle and class: of one distribution each. Alpha weighs the three tasks as in the paper.
+300 steps. Angle: the cross-entropy and, beside it, the error of the distribution's mean in bins
+(Huber), as Ruiz et al. 2018 do for head pose: a softmax over bins does not know which are
+neighbours. Class: the cross-entropy. Alpha weighs the three tasks as in the paper.
 """
 
 from collections.abc import Callable
 
 import torch
 from torch import Tensor
-from torch.nn.functional import cross_entropy
+from torch.nn.functional import cross_entropy, smooth_l1_loss
 
 from mtlnet.model.bins import Scores, bin_targets, read_scores, soft_cross_entropy
 from mtlnet.training.loss import Alpha, Losses, weighted_sum
@@ -29,7 +31,7 @@ def bins_loss(
     distances, angles = bin_targets(coded)
     terms = (
         soft_cross_entropy(scores.distance, distances).mean(),
-        soft_cross_entropy(scores.angle, angles).mean(),
+        soft_cross_entropy(scores.angle, angles).mean() + mean_error(scores.angle, angles),
         cross_entropy(scores.heading, heading),
     )
     total = weighted_sum(terms, combine)
@@ -43,3 +45,9 @@ def bins_loss(
         total=total if auxiliary is None else total + auxiliary,
         terms=kept,
     )
+
+
+def mean_error(scores: Tensor, targets: Tensor) -> Tensor:
+    """The Huber loss, in bins, of the means of B distributions: scores and targets (B, bins)."""
+    number = torch.arange(scores.shape[1], dtype=torch.float32, device=scores.device)
+    return smooth_l1_loss(torch.softmax(scores, 1) @ number, targets @ number)
