@@ -11,6 +11,7 @@ import pytest
 import simplejpeg
 from numpy.typing import NDArray
 
+import trackfeatures as tf
 from mtlnet.inference.model_card import ModelCard, read_card
 from mtlnet.predict.run import predict_files
 from mtlnet.predict.sources import find_sources
@@ -21,7 +22,7 @@ from trackfeatures.errors import UserError
 
 @dataclass
 class BrightnessEngine:
-    """Answers the mean colour of an image as its first coded distance."""
+    """Answers the mean colour of an image as the coded angle."""
 
     card: ModelCard
     kind: str = "openvino"
@@ -31,7 +32,7 @@ class BrightnessEngine:
     def __call__(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
         self.seen.append(image.shape)
         level = 0.1 + 0.8 * float(image.mean()) / 255
-        return np.array([level, 0.5, 0.5, 0.5, 0.5, 0.5, 0.1, 0.7, 0.2], np.float32)
+        return np.array([0.5, 0.5, 0.5, 0.5, 0.5, level, 0.1, 0.7, 0.2], np.float32)
 
 
 @pytest.fixture
@@ -61,8 +62,8 @@ def test_a_folder_and_a_pattern_name_all_their_images(
     results = predict_files(engine, [str(tmp_path)])
     assert [Path(row["image"]).name for row in results] == ["a.jpg", "b.jpg", "c.jpeg"]
     matched = predict_files(engine, [str(tmp_path / "*.jpg")])
-    assert [row["distances_m"] for row in matched] == [row["distances_m"] for row in results[:2]]
-    assert results[0]["distances_m"]["ml"] < results[2]["distances_m"]["ml"]
+    assert [row["angle_rad"] for row in matched] == [row["angle_rad"] for row in results[:2]]
+    assert results[0]["angle_rad"] < results[2]["angle_rad"]
 
 
 def test_tables_hold_every_image(engine: BrightnessEngine, tmp_path: Path) -> None:
@@ -74,8 +75,9 @@ def test_tables_hold_every_image(engine: BrightnessEngine, tmp_path: Path) -> No
     lines = [json.loads(line) for line in files[1].read_text().splitlines()]
     assert [row["image"] for row in rows] == [line["image"] for line in lines] == images
     for row, line, result in zip(rows, lines, results, strict=True):
-        assert line["ml_m"] == result["distances_m"]["ml"] == float(row["ml_m"])
-        assert line["angle_rad"] == result["angle_rad"]
+        assert {m: line[f"{m}_m"] for m in tf.MARKINGS} == result["distances_m"]
+        assert row["ml_m"] == ("" if line["ml_m"] is None else str(line["ml_m"]))
+        assert line["angle_rad"] == result["angle_rad"] == float(row["angle_rad"])
         assert row["p_straight"] == str(result["heading"]["straight"])
 
 
@@ -87,7 +89,7 @@ def test_every_frame_of_a_film_is_read_and_drawn(engine: BrightnessEngine, tmp_p
     )
     assert [row["image"] for row in results] == [f"{film}#{n}" for n in range(4)]
     assert engine.seen == [(210, 280, 3)] * 4
-    levels = [row["distances_m"]["ml"] for row in results]
+    levels = [row["angle_rad"] for row in results]
     assert levels == sorted(levels)
     assert reports == [(n, 4) for n in (1, 2, 3, 4)]
     capture = cv2.VideoCapture(str(drawn))
@@ -165,7 +167,7 @@ def test_a_wider_lens_is_cropped_to_the_models_view(
     camera: CameraParameters = engine.card.camera
     wide = float(np.degrees(2 * np.arctan(2 * np.tan(np.radians(camera.fov_y_deg) / 2))))
     own, cropped = (predict_files(engine, [str(path)], fov_y_deg=fov)[0] for fov in (None, wide))
-    assert cropped["distances_m"]["ml"] > own["distances_m"]["ml"]
+    assert cropped["angle_rad"] > own["angle_rad"]
 
 
 @pytest.mark.parametrize(
