@@ -179,7 +179,7 @@ def _train(z: Tensor, target: Tensor, seed: int) -> list[Numbers]:
         predicted = layers[1](layers[0](z[rows]).relu())
         return nn.functional.smooth_l1_loss(predicted, target[rows], beta=0.1)
 
-    parameters = [p for layer in layers for p in (layer.weight, layer.bias)]
+    parameters = [p for layer in layers for p in layer.parameters()]
     minimise(loss, parameters, len(z), FIT, generator)
     return [parameter.detach().numpy() for parameter in parameters]
 
