@@ -39,21 +39,15 @@ class ClientDisconnectedError(Exception):
 
 async def read_body(receive: Receive) -> bytes:
     """The whole body. Raises Problem when it is too large, ClientDisconnectedError."""
-    message = await receive()
-    if message["type"] == "http.disconnect":
-        raise ClientDisconnectedError
-    body: bytes = message.get("body", b"")
-    if not message.get("more_body", False):
-        check_body_size(len(body))
-        return body
-    parts = bytearray(body)
-    while message.get("more_body", False):
+    body, more = bytearray(), True
+    while more:
         message = await receive()
         if message["type"] == "http.disconnect":
             raise ClientDisconnectedError
-        parts += message.get("body", b"")
-        check_body_size(len(parts))
-    return bytes(parts)
+        body += message.get("body", b"")
+        check_body_size(len(body))
+        more = message.get("more_body", False)
+    return bytes(body)
 
 
 def check_body_size(size: int) -> None:

@@ -6,9 +6,11 @@ absent; `std` in the order of `mtlnet.inference.uncertainty`; `out_of_distributi
 others as in POST /features, whose request headers apply here too.
 """
 
+import json
 import logging
 import time
 from importlib.metadata import version
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -39,7 +41,6 @@ from serve.api.request_options import (
     request_id_of,
 )
 from serve.api.schemas import REFUSALS, header_parameters, problem_responses
-from serve.config import MAX_BODY_BYTES
 from serve.scheduling.frame_queue import PixelReader
 
 NAME, VERSION = "track", "1"
@@ -59,71 +60,10 @@ OUTPUTS = {
     "std": len(FEATURES),
     "out_of_distribution": 1,
 }
-PARAMETERS: dict[str, Any] = {"type": "object"}
-TENSOR: dict[str, Any] = {
-    "type": "object",
-    "required": ["name", "shape", "datatype"],
-    "properties": {
-        "name": {"enum": [tensor["name"] for tensor in INPUTS]},
-        "shape": {"type": "array", "items": {"type": "integer"}},
-        "datatype": {"enum": [tensor["datatype"] for tensor in INPUTS]},
-        "parameters": {
-            **PARAMETERS,
-            "description": "`binary_data_size`: the bytes of this tensor follow the JSON part",
-        },
-        "data": {"description": "a file in base64, or values from 0 to 255, row by row"},
-    },
-}
-REQUEST: dict[str, Any] = {
-    "type": "object",
-    "required": ["inputs"],
-    "properties": {
-        "id": {"type": ["string", "null"], "description": "returned in the answer"},
-        "inputs": {"type": "array", "minItems": 1, "maxItems": 1, "items": TENSOR},
-        "outputs": {
-            "type": "array",
-            "description": "the requested outputs; all if absent",
-            "items": {
-                "type": "object",
-                "required": ["name"],
-                "properties": {"name": {"enum": [*OUTPUTS]}, "parameters": PARAMETERS},
-            },
-        },
-        "parameters": {
-            **PARAMETERS,
-            "description": "`binary_data_output`: return outputs as bytes after the JSON part",
-        },
-    },
-}
-INFER_BODY: dict[str, Any] = {
-    "parameters": [
-        {
-            "name": HEADER,
-            "in": "header",
-            "required": False,
-            "description": "Length of the JSON part, bytes, where binary tensors follow it",
-            "schema": {"type": "integer", "minimum": 0, "maximum": MAX_BODY_BYTES},
-        },
-        *header_parameters(),
-    ],
-    "requestBody": {
-        "required": True,
-        "description": "An inference request in JSON, optionally followed by binary tensors",
-        "content": {
-            "application/json": {"schema": REQUEST},
-            "application/octet-stream": {"schema": {"type": "string", "format": "binary"}},
-        },
-    },
-}
-BINARY_ANSWER: dict[int | str, dict[str, Any]] = {
-    200: {
-        "description": "The outputs in JSON, or JSON followed by binary tensors",
-        "content": {
-            "application/json": {"schema": {"type": "object"}},
-            "application/octet-stream": {"schema": {"type": "string", "format": "binary"}},
-        },
-    }
-}
+# The OpenAPI operation of an inference request, without the headers of every image.
+OPERATION: dict[str, Any] = json.loads(
+    Path(__file__).with_name("kserve_infer.json").read_text(encoding="utf-8")
+)
 
 logger = logging.getLogger(__name__)
 
@@ -131,6 +71,11 @@ logger = logging.getLogger(__name__)
 def add_kserve(app: FastAPI, frames: FrameHandler) -> None:
     """Add the protocol's paths to `app`."""
     not_ready = problem_responses(NOT_READY)
+    responses = {**OPERATION["responses"], **problem_responses(*REFUSALS)}
+    extra = {
+        "parameters": [*OPERATION["parameters"], *header_parameters()],
+        "requestBody": OPERATION["requestBody"],
+    }
 
     @app.get("/v2/health/live", summary="Is the process alive?")
     async def live() -> dict[str, Any]:
@@ -153,8 +98,8 @@ def add_kserve(app: FastAPI, frames: FrameHandler) -> None:
         app.post(
             f"{model}/infer",
             summary="Track features of one image, as tensors",
-            responses={**BINARY_ANSWER, **problem_responses(*REFUSALS)},
-            openapi_extra=INFER_BODY,
+            responses=responses,
+            openapi_extra=extra,
             **add,
         )(_infer(frames))
 

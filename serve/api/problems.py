@@ -73,33 +73,8 @@ DEADLINE_PASSED = ProblemType(
     "deadline-passed", 503, "The deadline passed before the frame was processed"
 )
 
-PROBLEM_TYPES = (
-    MALFORMED,
-    UNAUTHORIZED,
-    FORBIDDEN_ORIGIN,
-    NOT_FOUND,
-    METHOD_NOT_ALLOWED,
-    NOT_ACCEPTABLE,
-    TOO_SLOW,
-    BODY_TOO_LARGE,
-    UNSUPPORTED_TYPE,
-    INVALID_REQUEST,
-    NOT_AN_IMAGE,
-    DAMAGED_IMAGE,
-    UNSUPPORTED_IMAGE,
-    TRAILING_BYTES,
-    IMAGE_SIZE,
-    IMAGE_ASPECT,
-    FIELD_OF_VIEW,
-    RATE_LIMITED,
-    HEAD_TOO_LARGE,
-    INTERNAL,
-    NOT_READY,
-    OVERLOADED,
-    TOO_MANY_CONNECTIONS,
-    SUPERSEDED,
-    DEADLINE_PASSED,
-)
+# In the order of the definitions above, which is also that of the counters in shared memory.
+PROBLEM_TYPES = tuple(found for found in vars().values() if isinstance(found, ProblemType))
 IMAGE_PROBLEMS = {
     Fault.NOT_AN_IMAGE: NOT_AN_IMAGE,
     Fault.DAMAGED: DAMAGED_IMAGE,

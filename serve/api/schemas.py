@@ -119,23 +119,11 @@ SERVER_REFUSALS = (
     problems.TOO_MANY_CONNECTIONS,
 )
 AUTHORIZATION_REFUSALS = (problems.UNAUTHORIZED, problems.RATE_LIMITED)
-REFUSALS = (
-    problems.NOT_ACCEPTABLE,
-    problems.BODY_TOO_LARGE,
-    problems.UNSUPPORTED_TYPE,
-    problems.INVALID_REQUEST,
-    problems.NOT_AN_IMAGE,
-    problems.DAMAGED_IMAGE,
-    problems.UNSUPPORTED_IMAGE,
-    problems.TRAILING_BYTES,
-    problems.IMAGE_SIZE,
-    problems.IMAGE_ASPECT,
-    problems.FIELD_OF_VIEW,
-    problems.INTERNAL,
-    problems.NOT_READY,
-    problems.OVERLOADED,
-    problems.SUPERSEDED,
-    problems.DEADLINE_PASSED,
+OTHER_REFUSALS = (problems.FORBIDDEN_ORIGIN, problems.NOT_FOUND, problems.METHOD_NOT_ALLOWED)
+REFUSALS = tuple(  # of an image
+    found
+    for found in PROBLEM_TYPES
+    if found not in (*SERVER_REFUSALS, *AUTHORIZATION_REFUSALS, *OTHER_REFUSALS)
 )
 NAME: dict[str, Any] = {"type": "string", "maxLength": MAX_NAME, "pattern": "^[ -~]*$"}
 HEADERS: dict[str, tuple[str, dict[str, Any]]] = {

@@ -1,4 +1,4 @@
-// The console: ask the service about one image after the other, and show what it says.
+// The console: sends images to the service and shows its answers.
 
 import { IN_LANE, ON_MARKING } from "./geometry.js";
 import { drawAbove, drawLatency, drawPicture } from "./drawing.js";
@@ -61,7 +61,7 @@ function show(image, said, truth) {
   const last = latencies.at(-1);
   $("times").textContent =
     `service ${last.total.toFixed(1)} ms (decode ${last.decode.toFixed(1)}, forward ${last.forward.toFixed(1)}); ` +
-    `with the way there and back p50 ${at(0.5)}, p99 ${at(0.99)} ms over ${sorted.length}`;
+    `with the network p50 ${at(0.5)}, p99 ${at(0.99)} ms over ${sorted.length}`;
 }
 
 function fillTable(said, truth) {

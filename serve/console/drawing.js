@@ -1,14 +1,14 @@
-// Canvases: the picture with its markings, the car from above, the latencies.
+// The canvases: the image with its markings, the car from above, the latencies.
 
 import { IN_LANE, ON_MARKING, onMarking, project, seenPart } from "./geometry.js";
 
-const AHEAD_M = [3, 28]; // the lines are those of a straight and level road; far ahead it may bend away
+const AHEAD_M = [3, 28]; // the lines assume a straight and level road, so they end before a bend matters
 
 function colour(name) {
   return getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim();
 }
 
-// The marking of each distance that is there: [name, distance, standard deviation or null].
+// The markings that are present: [name, distance, standard deviation or null].
 function present(answer) {
   return [...IN_LANE, ...ON_MARKING]
     .filter((name) => answer.distances_m[name] != null)
@@ -92,14 +92,14 @@ export function drawAbove(canvas, answer, truth) {
     const left = distance < 0, text = `${name} ${Math.abs(distance).toFixed(2)} m`;
     context.textAlign = left ? "right" : "left";
     context.fillStyle = "#fff";
-    // in two rows, as both systems may be there at once
+    // in two rows, as both kinds of markings may be present
     context.fillText(text, left ? u - 10 : u + 10, car + (IN_LANE.includes(name) ? 50 : 85));
   }
   if (truth) for (const [, d] of present(truth)) line(d, truth.angle_rad, [3, 12], 4, "#8ce99a");
   drawCar(context, middle, car, scale);
   const offset = answer.to_lane_centre_m;
   if (offset != null) {
-    // left positive: the lane's centre lies that far to the right of the car
+    // positive when the car is left of the centre, which is then to its right
     const target = at(onMarking(offset, answer.angle_rad, 9));
     context.strokeStyle = context.fillStyle = "#ffe066";
     context.lineWidth = 3;
@@ -126,7 +126,7 @@ function drawCar(context, u, v, scale) {
   context.fill();
 }
 
-// `rows` of {total, trip}, ms, the newest last: bars of the service's time in the trip's.
+// `rows` of {total, trip}, ms, the newest last: in each bar the service's part of the round trip.
 export function drawLatency(canvas, rows, shown) {
   const context = canvas.getContext("2d"), { width, height } = canvas, foot = height - 8;
   context.clearRect(0, 0, width, height);

@@ -1,7 +1,7 @@
-// From track features to places: car frame (x ahead, y to the left, m, on the road, from the centre
-// of gravity), and from there to the picture through the model's camera.
+// From track features to points on the road, in the car frame (x ahead, y to the left, m, from the
+// centre of gravity), and from there to pixels through the model's camera.
 
-export const CG_HEIGHT_M = 0.25; // of the simulated car; the camera's place is measured from there
+export const CG_HEIGHT_M = 0.25; // of the simulated car; the camera's position is relative to it
 export const IN_LANE = ["ml", "mr"], ON_MARKING = ["l", "m", "r"];
 
 // A marking `distance` m away (left negative), `ahead` m along the track whose heading is `angle`
@@ -11,7 +11,7 @@ export function onMarking(distance, angle, ahead) {
   return [ahead * cos - left * sin, ahead * sin + left * cos];
 }
 
-// Pixels [u, v] of a place on the road, null behind the camera. `camera` is that of /model.
+// Pixel [u, v] of a point on the road, null behind the camera. `camera` is that of /model.
 export function project([x, y], camera) {
   const focal = camera.height / 2 / Math.tan(camera.fov_y_deg * Math.PI / 360);
   const pitch = camera.pitch_deg * Math.PI / 180; // positive: the camera looks down
@@ -22,8 +22,8 @@ export function project([x, y], camera) {
   return [camera.width / 2 - focal * left / depth, camera.height / 2 - focal * above / depth];
 }
 
-// The part of an image of `width` x `height` that the service looks at: the middle, as high as the
-// image and in the model's aspect (serve cuts it out; a narrower image is refused).
+// The part of an image of `width` x `height` that the service uses: the middle, as high as the image
+// and with the model's aspect ratio (the service refuses a narrower image).
 export function seenPart(width, height, camera) {
   const seen = Math.min(width, height * camera.width / camera.height);
   return { x: (width - seen) / 2, w: seen };

@@ -1,1 +1,1 @@
-"""The HTTP server below ASGI, built on internals of uvicorn."""
+"""The HTTP server that runs inside one worker process: its connections, built on uvicorn."""

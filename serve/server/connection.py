@@ -5,6 +5,7 @@ request. `close_expired` checks them ten times a second, so that a request costs
 """
 
 import asyncio
+import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from enum import Enum, auto
@@ -47,6 +48,8 @@ class ConnectionGuard:
     other_connections: Callable[[], int] = lambda: 0
     """Counts the connections of the other workers."""
     count_closed: Callable[[ProblemType], None] = lambda _type: None
+    clock: Callable[[], float] = time.monotonic
+    """Time for the deadlines, s."""
     draining: bool = False
     receiving: dict["GuardedProtocol", None] = field(default_factory=dict)
     """Connections in the middle of headers or a body, the one that began first at the front."""
@@ -158,12 +161,12 @@ class GuardedProtocol(HttpToolsProtocol):
     def _become_idle(self) -> None:
         """Wait for the next request."""
         self._stop_receiving(Phase.IDLE)
-        self._deadline_s = self.loop.time() + self._guard.limits.idle_s
+        self._deadline_s = self._guard.clock() + self._guard.limits.idle_s
 
     def _begin_receiving(self, phase: Phase) -> None:
         """Wait for headers or a body, from now on."""
         limits, receiving = self._guard.limits, self._guard.receiving
-        self._phase, self._phase_start_s = phase, self.loop.time()
+        self._phase, self._phase_start_s = phase, self._guard.clock()
         limit_s = limits.head_s if phase is Phase.HEAD else limits.body_s
         self._deadline_s = self._phase_start_s + limit_s
         receiving.pop(self, None)
@@ -209,7 +212,7 @@ class GuardedProtocol(HttpToolsProtocol):
     def _evict_slowest(self) -> bool:
         """Abort the connection that has been receiving for longest; False where there is none."""
         oldest = next(iter(self._guard.receiving))  # this one itself, if there is no other
-        if self.loop.time() - oldest._phase_start_s <= EVICTABLE_S:
+        if self._guard.clock() - oldest._phase_start_s <= EVICTABLE_S:
             return False
         oldest._stop_receiving(Phase.CLOSING)
         oldest.transport.abort()
@@ -235,7 +238,7 @@ class GuardedProtocol(HttpToolsProtocol):
 
 
 def close_expired(connections: Iterable[object], now: float) -> None:
-    """Close the connections whose deadline has passed; `now` in s of the loop's clock."""
+    """Close the connections whose deadline has passed; `now` in s of the guard's clock."""
     for connection in list(connections):
         if isinstance(connection, GuardedProtocol):
             connection.expire(now)

@@ -44,7 +44,7 @@ class WorkerServer(uvicorn.Server):
             count_closed=app.metrics.count_closed,
         )
         super().__init__(_uvicorn_config(app))
-        self._app = app
+        self.app = app
         self._peers = peers or WorkerPeers(app.shared, 0)
         self._yielded = False
 
@@ -69,7 +69,7 @@ class WorkerServer(uvicorn.Server):
         self._loop = asyncio.get_running_loop()
         self._make_protocol = partial(
             DirectProtocol,
-            service=self._app,
+            service=self.app,
             guard=self.guard,
             config=self.config,
             server_state=self.server_state,
@@ -81,7 +81,7 @@ class WorkerServer(uvicorn.Server):
 
     async def on_tick(self, counter: int) -> bool:
         """Close expired connections and publish the status; called ten times a second."""
-        close_expired(self.server_state.connections, self._loop.time())
+        close_expired(self.server_state.connections, self.guard.clock())
         self._publish_status()
         return await super().on_tick(counter)
 
@@ -114,7 +114,7 @@ class WorkerServer(uvicorn.Server):
             self._start_accepting()
 
     def _accept(self) -> None:
-        if not self._app.frame_queue.ready and self._peers.other_is_ready():
+        if not self.app.frame_queue.ready and self._peers.other_is_ready():
             self._pause_accepting(YIELD_S)
             return
         own, others = len(self.server_state.connections), self._peers.other_connections()
@@ -143,7 +143,7 @@ class WorkerServer(uvicorn.Server):
         self._publish_status()
 
     def _publish_status(self) -> None:
-        self._peers.publish(len(self.server_state.connections), self._app.frame_queue.ready)
+        self._peers.publish(len(self.server_state.connections), self.app.frame_queue.ready)
 
 
 def _uvicorn_config(app: Any) -> uvicorn.Config:

@@ -1,1 +1,1 @@
-"""The worker processes, their supervisor, and what they share."""
+"""The worker processes: their start, end and replacement by the supervisor; what they share."""

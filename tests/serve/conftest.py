@@ -1,4 +1,8 @@
-"""A fake engine, images, and a running service: what the tests of `serve` share."""
+"""A fake engine, images, and a running service: what the tests of `serve` share.
+
+A test waits for an event, never for a time: for `PATIENCE_S` at most, which is long enough on a
+machine that is busy. Where a time limit is tested, the test sets the service's clock (`Clock`).
+"""
 
 import http.client
 import json
@@ -8,6 +12,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,14 +26,20 @@ import trackfeatures as tf
 from mtlnet.inference.engine import Engine
 from mtlnet.inference.model_card import WEIGHTS, ModelCard, golden_image
 from runtime.sockets import bind
+from serve.api.problems import PROBLEM_TYPES
 from serve.app import Service
 from serve.config import Limits
+from serve.observability import metrics
+from serve.server import connection, websocket
 from serve.server.worker_server import WorkerServer
-from serve.workers.shared_memory import SharedMemory, WorkerPeers
+from serve.workers import shared_memory
+from serve.workers.shared_memory import HEARTBEAT, SharedMemory, WorkerPeers
 from trackfeatures.camera import CameraParameters
 
 if TYPE_CHECKING:
     from opentelemetry.trace import Tracer
+
+PATIENCE_S = 120.0  # the longest wait for an event
 
 CARD = ModelCard(
     name="fake",
@@ -102,16 +113,38 @@ class Gate:
 
     def _respond(self, _image: NDArray[np.uint8]) -> NDArray[np.float32]:
         self.busy.set()
-        assert self.open.wait(20)
+        assert self.open.wait(PATIENCE_S)
         return outputs()
 
 
 def until(condition: Callable[[], bool]) -> None:
-    """Return once `condition` holds; fail after 20 s."""
-    end = time.monotonic() + 20
+    """Return once `condition` holds; fail after PATIENCE_S."""
+    end = time.monotonic() + PATIENCE_S
     while not condition():
         assert time.monotonic() < end
         time.sleep(0.002)
+
+
+class Clock:
+    """A clock that stands still unless a test moves it; s."""
+
+    def __init__(self) -> None:
+        self.now_s = 1000.0
+
+    def __call__(self) -> float:
+        return self.now_s
+
+    def advance(self, seconds: float) -> None:
+        self.now_s += seconds
+
+
+@pytest.fixture(autouse=True)
+def patient_service(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let no slow test find that a worker counts as gone or that an unread problem is dropped."""
+    for module in (connection, websocket):
+        monkeypatch.setattr(module, "LINGER_S", PATIENCE_S)
+    for reader in (shared_memory, metrics):
+        monkeypatch.setattr(reader, "HEARTBEAT_TIMEOUT_S", PATIENCE_S)
 
 
 @pytest.fixture
@@ -128,29 +161,58 @@ class Reply:
     content: Any
 
 
+def assert_problem(reply: Reply, status: int, name: str) -> None:
+    assert reply.status == status
+    assert reply.headers["content-type"] == "application/problem+json"
+    content = reply.content
+    hint = {"retry_after_ms"} if status in (429, 503) else set()
+    assert set(content) == {"type", "title", "status", "detail"} | hint
+    assert content["type"] == f"/problems/{name}"
+    assert content["status"] == status
+    assert content["title"] == next(k.title for k in PROBLEM_TYPES if k.name == name)
+    assert len(content["detail"]) > 20
+    assert "Traceback" not in content["detail"]
+
+
 class Served:
     """A running service, and one connection to it."""
 
     def __init__(
-        self, port: int, app: Service | None = None, listener: socket.socket | None = None
+        self, port: int, server: WorkerServer | None = None, listener: socket.socket | None = None
     ) -> None:
         self.port = port
-        self._app = app
+        self._server = server
         self._listener = listener
         self.url = f"http://127.0.0.1:{port}"
-        self._connection = http.client.HTTPConnection("127.0.0.1", port, timeout=120)
+        self._connection = http.client.HTTPConnection("127.0.0.1", port, timeout=PATIENCE_S)
+
+    @property
+    def server(self) -> WorkerServer:
+        """What runs behind the port, in a thread of this process."""
+        assert self._server is not None
+        return self._server
 
     @property
     def app(self) -> Service:
-        """What runs behind the port, in a thread of this process."""
-        assert self._app is not None
-        return self._app
+        """The application of this server."""
+        return self.server.app
+
+    def received_bytes(self) -> list[int]:
+        """What has arrived of each request whose headers or body are incomplete, in order."""
+        return sorted(found._unread_bytes for found in list(self.server.guard.receiving))
 
     @property
     def listener(self) -> socket.socket:
         """The socket on which this process takes its connections."""
         assert self._listener is not None
         return self._listener
+
+    def wait_for_tick(self) -> None:
+        """Return once the server has looked for expired connections again."""
+        cells = self.app.shared.worker(0)
+        for _ in range(2):  # the first may have begun before
+            last = cells[HEARTBEAT]
+            until(partial(lambda last: cells[HEARTBEAT] != last, last))
 
     def ask(
         self, method: str, path: str, body: Any = None, headers: dict[str, str] | None = None
@@ -170,32 +232,38 @@ class Served:
 @contextmanager
 def serving(
     engine: Engine,
-    check: Callable[[Any], object] = lambda _engine: None,
+    check: Callable[[Any], object] | None = None,
     limits: Limits | None = None,
     shared: SharedMemory | None = None,
     block: int = 0,
     tracer: "Tracer | None" = None,
     beside: Served | None = None,
+    clock: Callable[[], float] | None = None,
 ) -> Iterator[Served]:
     """The service around `engine` on a free port, as `serve` runs it, in a thread of this process.
 
-    Ready when entered, unless `check` takes its time. `beside`: on its port, as another worker.
+    Ready when entered, unless there is a `check`. `beside`: on its port, as another worker.
+    `clock`: of the deadlines of its connections, s.
     """
 
     def checked(engine: Engine) -> None:
-        check(engine)
+        if check is not None:
+            check(engine)
 
     listener = beside.listener.dup() if beside is not None else bind("127.0.0.1", 0)
     listener.listen(2048)
     app = Service(engine, checked, limits, shared, block, tracer)
     server = WorkerServer(app, limits or Limits(), WorkerPeers(app.shared, block))
+    if clock is not None:
+        server.guard.clock = clock
     thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
     thread.start()
     try:
-        while not server.started:
-            assert thread.is_alive()
-            time.sleep(0.005)
-        yield Served(listener.getsockname()[1], app, listener)
+        until(lambda: server.started or not thread.is_alive())
+        assert server.started
+        if check is None:
+            until(lambda: app.frame_queue.ready)
+        yield Served(listener.getsockname()[1], server, listener)
     finally:
         server.should_exit = True
         thread.join()

@@ -1,4 +1,4 @@
-"""The command `serve`: a published model on a real port, its first line, its ends, its errors."""
+"""The command `serve`: a published model on a real port, the first line, the end, errors."""
 
 import gc
 import json
@@ -10,8 +10,11 @@ import socket
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, closing, contextmanager
+from http.client import HTTPConnection as Connection
 from pathlib import Path
+from typing import Any
 
 from mtlnet.inference.engine import load_engine
 from mtlnet.inference.model_card import CARD, SHIPPED, golden_image, read_card
@@ -19,7 +22,7 @@ from mtlnet.inference.prediction import decode_outputs
 from runtime.sockets import bind
 from serve.client import Client
 from serve.workers.worker import SupervisorConnection, send_ready
-from tests.serve.conftest import png
+from tests.serve.conftest import PATIENCE_S, png, until
 from tests.typed import typed
 
 ROOT = Path(__file__).parents[2]
@@ -58,7 +61,7 @@ def refused(*arguments: str, folder: Path = ROOT) -> str:
     return done.stderr
 
 
-def test_a_published_model_is_served_and_stops_when_told(published: Path) -> None:
+def test_a_published_model_is_served_until_sigterm(published: Path) -> None:
     engine = load_engine(published)
     image = golden_image(280, 210)
     with started("--model", str(published), "--port", "0") as (process, line):
@@ -66,44 +69,92 @@ def test_a_published_model_is_served_and_stops_when_told(published: Path) -> Non
         assert str(published) in line
         assert card.model_hash[:12] in line
         assert f"openvino {engine.precision}" in line
-        with Client(address(line)) as client:
-            client.wait_until_ready(120)
+        with Client(address(line), timeout_s=PATIENCE_S) as client:
+            client.wait_until_ready(PATIENCE_S)
             answer = client.features(png(image[:, :, ::-1]))
         expected = decode_outputs(engine(image)).as_json()
         assert {key: answer[key] for key in expected} == expected
         assert answer["model"] == card.model_hash
         process.send_signal(signal.SIGTERM)
-        assert process.wait(120) == 0
+        assert process.wait(PATIENCE_S) == 0
         assert process.stderr is not None
         assert process.stderr.read() == ""
 
 
-def test_bare_serve_takes_the_shipped_or_latest_model_and_ctrl_c_ends_it(published: Path) -> None:
+def test_serve_without_options_takes_the_shipped_or_latest_model_until_ctrl_c(
+    published: Path,
+) -> None:
     taken = str(SHIPPED) if (SHIPPED / CARD).is_file() else "runs/fresh"
     with started("--port", "0", folder=published.parents[1]) as (process, line):
         assert line.startswith("serving default")
         assert taken in line
-        Client(address(line)).wait_until_ready(120)
+        Client(address(line)).wait_until_ready(PATIENCE_S)
         process.send_signal(signal.SIGINT)
-        assert process.wait(120) == 0
+        assert process.wait(PATIENCE_S) == 0
 
 
-def test_two_workers_give_the_same_answers(published: Path) -> None:
-    body = png(golden_image(280, 210))
-    with started("--model", str(published), "--port", "0", "--workers", "2") as (process, line):
+def test_both_workers_behind_one_port_answer_alike_and_log_every_request(published: Path) -> None:
+    """A worker is known by the first part of the request ids that it makes."""
+    arguments = ("--model", str(published), "--port", "0", "--workers", "2", "--log-answers")
+    connections: dict[str, Connection] = {}  # by worker
+    requests: dict[str, tuple[str, int]] = {}  # (worker, status) by request id
+    answers: list[dict[str, Any]] = []
+
+    def ask(connection: Connection, body: bytes) -> str:
+        """The worker of a connection that posts `body`."""
+        connection.request("POST", "/features", body, {"Content-Type": "image/png"})
+        response = connection.getresponse()
+        content = json.loads(response.read())
+        request_id = response.headers["X-Request-Id"]
+        worker = request_id.partition("-")[0]
+        requests[request_id] = worker, response.status
+        if response.status == 200:
+            answers.append({k: v for k, v in content.items() if k != "timing_ms"})
+            connections[worker] = connection
+        return worker
+
+    image = png(golden_image(280, 210)[:, :, ::-1])
+    with (
+        ThreadPoolExecutor(1) as pool,
+        started(*arguments) as (process, line),
+        ExitStack() as stack,
+    ):
         assert "2 workers" in line
-        answers = set()
-        for _ in range(12):  # each connection may meet another worker
-            with Client(address(line), timeout_s=120) as client:
-                client.wait_until_ready(120)
-                answer = client.features(body)
-            answers.add(json.dumps({k: answer[k] for k in ("distances_m", "heading", "model")}))
-        assert len(answers) == 1
+        assert process.stderr is not None
+        log = pool.submit(process.stderr.read)
+        port = int(address(line).rpartition(":")[2])
+
+        def are_ready() -> bool:
+            with closing(Connection("127.0.0.1", port, timeout=PATIENCE_S)) as connection:
+                connection.request("GET", "/metrics")
+                return b"driverview_workers_ready 2\n" in connection.getresponse().read()
+
+        def have_answered() -> bool:
+            # All connections stay open, so the next one goes to the worker with fewer of them.
+            connection = Connection("127.0.0.1", port, timeout=PATIENCE_S)
+            ask(stack.enter_context(closing(connection)), image)
+            return len(connections) == 2
+
+        until(are_ready)
+        until(have_answered)
+        for worker, connection in connections.items():
+            assert ask(connection, image) == worker
+            assert ask(connection, b"no image") == worker
         process.send_signal(signal.SIGTERM)
-        assert process.wait(120) == 0
+        assert process.wait(PATIENCE_S) == 0
+        lines = [json.loads(text) for text in log.result().splitlines()]
+    expected = decode_outputs(load_engine(published)(golden_image(280, 210))).as_json()
+    assert {key: answers[0][key] for key in expected} == expected
+    assert all(answer == answers[0] for answer in answers)
+    logged = {entry["request"]: entry for entry in lines if "request" in entry}
+    assert {name: entry["status"] for name, entry in logged.items()} == {
+        name: status for name, (_, status) in requests.items()
+    }
+    pids = {(worker, logged[name]["pid"]) for name, (worker, _) in requests.items()}
+    assert len(pids) == len({pid for _, pid in pids}) == 2
 
 
-def test_a_damaged_model_is_one_line(published: Path, tmp_path: Path) -> None:
+def test_an_unusable_model_is_an_error_of_one_line(published: Path, tmp_path: Path) -> None:
     assert "no run" in refused("--model", str(tmp_path / "none"))
     assert "train" in refused("--model", "latest", folder=tmp_path)
     other = tmp_path / "other"
@@ -118,7 +169,7 @@ def test_a_damaged_model_is_one_line(published: Path, tmp_path: Path) -> None:
     assert "damaged" in refused("--model", str(other), "--port", "0")
 
 
-def test_a_taken_port_and_an_unknown_host_are_one_line(published: Path) -> None:
+def test_a_taken_port_and_an_unknown_host_are_errors_of_one_line(published: Path) -> None:
     taken = bind("127.0.0.1", 0)
     taken.listen()
     port = str(taken.getsockname()[1])
@@ -130,7 +181,7 @@ def test_a_taken_port_and_an_unknown_host_are_one_line(published: Path) -> None:
 
 
 def test_help_loads_nothing_heavy() -> None:
-    """Seconds would measure the machine; what is loaded says the same on all of them."""
+    """Tested by the modules that are loaded, as a time would depend on the machine."""
     code = (
         "import sys; from serve.cli import app; sys.argv[1:] = ['--help']\n"
         "try: app()\n"
@@ -149,8 +200,8 @@ def test_the_supervisor_loads_neither_framework_nor_engine() -> None:
     assert done.stdout == "set()\n", done.stderr
 
 
-def test_a_ready_worker_keeps_what_it_loaded_from_the_garbage_collector() -> None:
-    """To look through all of it takes so long that every client notices."""
+def test_a_ready_worker_excludes_its_modules_from_garbage_collection() -> None:
+    """A collection over all of them would delay every client."""
     ours, other = socket.socketpair()
     with other:
         send_ready(SupervisorConnection(ours.detach()))

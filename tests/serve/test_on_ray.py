@@ -19,7 +19,7 @@ from mtlnet.inference.model_card import golden_image, read_card
 from mtlnet.inference.prediction import decode_outputs
 from runtime.sockets import bind
 from serve.cli import main
-from tests.serve.conftest import png
+from tests.serve.conftest import PATIENCE_S, png
 from tests.serve.test_cli import ROOT, command
 from tests.typed import typed
 from trackfeatures.errors import UserError
@@ -56,7 +56,7 @@ def on_ray(model: Path, token_file: Path, replicas: int) -> Iterator[int]:
                 pytest.fail("".join(said[-20:]))
             yield port
             process.send_signal(signal.SIGTERM)
-            process.communicate(timeout=120)
+            process.communicate(timeout=PATIENCE_S)
             assert process.returncode == 0
         finally:
             process.kill()
@@ -86,7 +86,7 @@ def test_two_replicas_answer_as_the_engine_does(published: Path, tmp_path: Path)
 def ask(
     port: int, method: str, path: str, body: bytes | None = None, token: str = TOKEN
 ) -> tuple[int, bytes]:
-    with closing(http.client.HTTPConnection("127.0.0.1", port, timeout=60)) as connection:
+    with closing(http.client.HTTPConnection("127.0.0.1", port, timeout=PATIENCE_S)) as connection:
         headers = {"Authorization": f"Bearer {token}", "Content-Type": "image/png"}
         connection.request(method, path, body, headers)
         response = connection.getresponse()

@@ -21,7 +21,7 @@ from mtlnet.inference.model_card import golden_image
 from mtlnet.inference.prediction import decode_outputs
 from serve.scheduling.warmup import TOLERANCE, warm_up
 from serve.workers.shared_memory import create_shared_memory
-from tests.serve.conftest import Served, jpeg, picture, serving, until
+from tests.serve.conftest import PATIENCE_S, Served, jpeg, picture, serving, until
 from trackfeatures.camera import CameraParameters
 
 JPEG = jpeg(picture())
@@ -85,9 +85,9 @@ def by_raw_tensors(connection: Connection) -> dict[str, Any]:
 
 
 def by_websocket(port: int) -> dict[str, Any]:
-    with connect(f"ws://127.0.0.1:{port}/stream", open_timeout=60) as socket:
+    with connect(f"ws://127.0.0.1:{port}/stream", open_timeout=PATIENCE_S) as socket:
         socket.send(JPEG)
-        return dict(json.loads(socket.recv(60)))
+        return dict(json.loads(socket.recv(PATIENCE_S)))
 
 
 def as_features(tensors: dict[str, list[float | None]]) -> dict[str, Any]:
@@ -126,7 +126,7 @@ def test_workers_types_and_endpoints_give_the_same_answer(published: Path) -> No
     ):
         for service in (one, two):
             wait_until_ready(service)
-            with closing(Connection("127.0.0.1", service.port, timeout=120)) as connection:
+            with closing(Connection("127.0.0.1", service.port, timeout=PATIENCE_S)) as connection:
                 plain += [by_json(connection), by_messagepack(connection)]
                 plain += [by_websocket(service.port)]
                 tensors += [by_tensors(connection), by_raw_tensors(connection)]

@@ -20,7 +20,7 @@ EXAMPLES = int(os.environ.get("DRIVERVIEW_API_EXAMPLES", "10"))
 
 
 def bodies(image: bytes) -> st.SearchStrategy[bytes]:
-    """What a schema cannot tell apart: whole images, broken ones and no images at all."""
+    """Bodies that a schema cannot describe: whole images, broken images, other bytes."""
     broken = st.integers(1, len(image) - 1).map(lambda cut: image[:cut])
     return st.just(image) | broken | st.binary(max_size=200)
 
@@ -46,10 +46,53 @@ def test_the_running_service_gives_this_document(running: Served) -> None:
     assert {"/features", "/readyz", "/v2/models/track/infer"} < set(DOCUMENT["paths"])
 
 
+def references(node: Any) -> Iterator[str]:
+    if isinstance(node, dict):
+        if isinstance(node.get("$ref"), str):
+            yield node["$ref"]
+        node = list(node.values())
+    if isinstance(node, list):
+        for child in node:
+            yield from references(child)
+
+
+def test_the_document_lists_every_operation_and_refusal(running: Served) -> None:
+    document = running.ask("GET", "/openapi.json").content
+    assert document["openapi"].startswith("3.1")
+    for reference in references(document):
+        node = document
+        for key in reference.removeprefix("#/").split("/"):
+            node = node[key]
+        assert node
+    assert set(document["paths"]) == {
+        "/features",
+        "/healthz",
+        "/readyz",
+        "/model",
+        "/metrics",
+        "/v2",
+        "/v2/health/live",
+        "/v2/health/ready",
+        "/v2/models/track",
+        "/v2/models/track/ready",
+        "/v2/models/track/infer",
+    }
+    post = document["paths"]["/features"]["post"]
+    assert post["requestBody"]["required"]
+    assert set(post["requestBody"]["content"]) == {"image/jpeg", "image/png"}
+    refused = {"400", "401", "406", "408", "413", "415", "422", "429", "431", "500", "503"}
+    assert set(post["responses"]) == {"200"} | refused
+    for status, response in post["responses"].items():
+        good = {"application/json", "application/msgpack"}
+        kinds = good if status == "200" else {"application/problem+json"}
+        assert set(response["content"]) == kinds
+    assert "HTTPValidationError" not in document["components"]["schemas"]
+    kinds = document["components"]["schemas"]["ProblemDetails"]["properties"]["type"]["enum"]
+    assert "/problems/not-an-image" in kinds
+
+
 @schema.parametrize()
 @settings(max_examples=EXAMPLES, deadline=None, suppress_health_check=list(HealthCheck))
-def test_every_answer_is_as_the_document_says(
-    case: schemathesis.Case[Any], running: Served
-) -> None:
+def test_every_answer_follows_the_document(case: schemathesis.Case[Any], running: Served) -> None:
     response = case.call_and_validate(base_url=running.url)
     assert response.status_code != 500

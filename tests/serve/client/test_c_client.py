@@ -12,7 +12,18 @@ from pathlib import Path
 import pytest
 
 from serve.config import Limits
-from tests.serve.conftest import FakeEngine, Gate, Served, jpeg, outputs, picture, png, serving
+from tests.serve.conftest import (
+    PATIENCE_S,
+    FakeEngine,
+    Gate,
+    Served,
+    jpeg,
+    outputs,
+    picture,
+    png,
+    serving,
+    until,
+)
 
 SOURCE = Path(__file__).parents[3] / "examples" / "features.c"
 STRICT = ["-std=c11", "-Wall", "-Wextra", "-Wpedantic", "-Werror", "-O2"]
@@ -44,7 +55,9 @@ def ask(
 ) -> subprocess.CompletedProcess[str]:
     words = [str(program), "127.0.0.1", str(port), *map(str, images)]
     environment = {} if token is None else {"DRIVERVIEW_TOKEN": token}
-    return subprocess.run(words, capture_output=True, text=True, timeout=60, env=environment)
+    return subprocess.run(
+        words, capture_output=True, text=True, timeout=PATIENCE_S, env=environment
+    )
 
 
 def test_it_prints_what_the_service_answers(
@@ -62,7 +75,7 @@ def test_it_prints_what_the_service_answers(
     assert ask(program, service.port, image).returncode == 0
 
 
-def test_what_is_absent_is_said_and_a_token_is_sent(program: Path, image: Path) -> None:
+def test_absent_markings_are_printed_and_a_token_is_sent(program: Path, image: Path) -> None:
     nan = float("nan")
     engine = FakeEngine(lambda _image: outputs((nan, nan, -3.0, 0.5, 4.0), angle=-0.2))
     with serving(engine, limits=Limits(token="0123456789abcdef")) as service:
@@ -76,17 +89,14 @@ def test_a_busy_service_is_asked_again(program: Path, image: Path) -> None:
     with serving(gate.engine, limits=Limits(queue=0)) as service:
         first = threading.Thread(target=ask, args=(program, service.port, image))
         first.start()
-        assert gate.busy.wait(20)
+        assert gate.busy.wait(PATIENCE_S)
         second = subprocess.Popen(
             [program, "127.0.0.1", str(service.port), image], stdout=subprocess.PIPE, text=True
         )
         refusals = 'driverview_frames_total{outcome="overloaded"} '
-        end = time.monotonic() + 20
-        while f"{refusals}0" in service.ask("GET", "/metrics").content.decode():
-            assert time.monotonic() < end
-            time.sleep(0.01)
+        until(lambda: f"{refusals}0" not in service.ask("GET", "/metrics").content.decode())
         gate.open.set()
-        said, _ = second.communicate(timeout=30)
+        said, _ = second.communicate(timeout=PATIENCE_S)
         first.join()
     assert "class straight" in said
 
@@ -104,7 +114,10 @@ def answer() -> bytes:
 
 @contextmanager
 def scripted(*replies: bytes | None) -> Iterator[tuple[int, list[float]]]:
-    """A server that gives these replies byte by byte, None: hangs up; and when it was asked, s."""
+    """A server that sends these replies byte by byte (None: it closes the connection).
+
+    Gives its port and the times of the requests, s.
+    """
     times: list[float] = []
     listener = socket.create_server(("127.0.0.1", 0))
 
@@ -141,9 +154,7 @@ def read_request(connection: socket.socket) -> None:
         body += connection.recv(65536)
 
 
-def test_retry_after_is_obeyed_and_a_lost_connection_is_dialled_anew(
-    program: Path, image: Path
-) -> None:
+def test_it_waits_for_retry_after_and_reconnects(program: Path, image: Path) -> None:
     with scripted(refusal(), None, refusal("connection: close\r\n"), answer()) as (port, times):
         done = ask(program, port, image)
     assert done.returncode == 0, done.stderr
@@ -153,7 +164,9 @@ def test_retry_after_is_obeyed_and_a_lost_connection_is_dialled_anew(
     assert times[3] - times[2] >= 1.0
 
 
-def test_what_is_no_image_or_no_service_is_told(program: Path, tmp_path: Path, image: Path) -> None:
+def test_an_unreadable_image_and_an_invalid_reply_are_errors(
+    program: Path, tmp_path: Path, image: Path
+) -> None:
     assert "not readable" in ask(program, 9, tmp_path / "none.jpg").stderr
     with scripted(
         b"HTTP/1.1 200 OK\r\ncontent-length: 99999999\r\nx: close\r\n\r\n{", answer()
@@ -161,5 +174,5 @@ def test_what_is_no_image_or_no_service_is_told(program: Path, tmp_path: Path, i
         port,
         _,
     ):
-        assert "ml -1.500" in ask(program, port, image).stdout  # an absurd length is no answer
+        assert "ml -1.500" in ask(program, port, image).stdout  # a reply of that length is not read
     assert subprocess.run([program], capture_output=True).returncode == 2

@@ -1,17 +1,20 @@
-"""Counts over all workers, and a log that can be searched and cannot be flooded."""
+"""The counts of all workers, and the log: its fields, and its limit on refusals."""
 
 import json
 import logging
 import re
+import time
 from collections.abc import Iterator
+from types import SimpleNamespace
 
 import pytest
 
 from serve.api.problems import PROBLEM_TYPES
 from serve.config import Limits
+from serve.observability import logs
 from serve.observability.logs import REFUSALS_PER_S, JsonFormatter
 from serve.workers import shared_memory
-from tests.serve.conftest import FakeEngine, Served, jpeg, outputs, picture, serving
+from tests.serve.conftest import Clock, FakeEngine, Served, jpeg, outputs, picture, serving
 
 JPEG = jpeg(picture())
 SAMPLE = re.compile(r'^(driverview_\w+)(\{\w+="[^"]*"(?:,\w+="[^"]*")*\})? (\S+)$')
@@ -30,7 +33,7 @@ def read(page: bytes) -> dict[str, float]:
     return found
 
 
-def test_frames_are_counted_by_what_became_of_them(service: Served) -> None:
+def test_frames_are_counted_by_outcome(service: Served) -> None:
     for _ in range(3):
         service.post(JPEG)
     service.post(b"text")
@@ -53,7 +56,7 @@ def test_frames_are_counted_by_what_became_of_them(service: Served) -> None:
     assert found["driverview_workers"] == 1
 
 
-def test_each_worker_tells_of_all() -> None:
+def test_each_worker_reports_the_counts_of_all() -> None:
     memory = shared_memory.create_shared_memory(blocks=2)
     engine = FakeEngine(lambda _image: outputs())
     with serving(engine, shared=memory) as one, serving(engine, shared=memory, block=1) as two:
@@ -73,9 +76,12 @@ def lines(caplog: pytest.LogCaptureFixture) -> Iterator[pytest.LogCaptureFixture
         yield caplog
 
 
-def test_refusals_stand_in_the_log_with_their_request_and_cannot_flood_it(
-    service: Served, lines: pytest.LogCaptureFixture
+def test_refusals_are_logged_with_their_request_and_at_a_limited_rate(
+    service: Served, lines: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    clock = Clock()
+    clock.now_s = time.monotonic()
+    monkeypatch.setattr(logs, "time", SimpleNamespace(monotonic=clock))
     service.post(b"", X_Request_Id='my "id"')
     record = lines.records[-1]
     content = json.loads(JsonFormatter().format(record))
@@ -83,11 +89,13 @@ def test_refusals_stand_in_the_log_with_their_request_and_cannot_flood_it(
     assert content["problem"] == "/problems/not-an-image"
     assert (content["status"], content["client"]) == (422, "127.0.0.1")
     service.post(JPEG)
-    assert lines.records[-1] is record  # answers only where they are asked for
+    assert lines.records[-1] is record  # answers are logged on request only
     for _ in range(200):
         service.post(b"")
-    # What the bucket held, and what flowed into it in the time 200 requests may take.
-    assert REFUSALS_PER_S - 1 <= len(lines.records) < 150
+    assert len(lines.records) == REFUSALS_PER_S
+    clock.now_s += 1.0
+    service.post(b"")
+    assert json.loads(JsonFormatter().format(lines.records[-1]))["untold"] == 201 - REFUSALS_PER_S
 
 
 def test_answers_are_logged_on_request(lines: pytest.LogCaptureFixture) -> None:

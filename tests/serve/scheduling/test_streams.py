@@ -10,17 +10,18 @@ from serve.scheduling.streams import EXPIRY_NS, StreamTable, stream_key
 from serve.workers import shared_memory
 from serve.workers.shared_memory import PROBES
 from tests.serve.conftest import (
+    PATIENCE_S,
     FakeEngine,
     Gate,
     Reply,
     Served,
+    assert_problem,
     jpeg,
     outputs,
     picture,
     serving,
     until,
 )
-from tests.serve.test_app import assert_problem
 
 JPEG = jpeg(picture())
 
@@ -35,7 +36,7 @@ class Crowd:
         return self._pool.submit(lambda: Served(self._service.port).post(JPEG, **headers))
 
     def queue(self, waiting: int, **headers: str) -> "Future[Reply]":
-        """Post, and return once so many frames wait."""
+        """Post, and return once `waiting` frames wait."""
         future = self.post(**headers)
         until(lambda: self._service.app.frame_queue.waiting == waiting)
         return future
@@ -43,42 +44,44 @@ class Crowd:
 
 @contextmanager
 def busy(gate: Gate, memory: shared_memory.SharedMemory | None = None) -> Iterator[Crowd]:
-    """A service that is at work on a first frame, and stays so until the gate is opened."""
+    """A service whose engine is busy with a first frame until the gate is opened."""
     with serving(gate.engine, shared=memory) as service, ThreadPoolExecutor(8) as pool:
         crowd = Crowd(service, pool)
         first = crowd.post()
-        assert gate.busy.wait(20)
+        assert gate.busy.wait(PATIENCE_S)
         yield crowd
         gate.open.set()
         assert first.result().status == 200
 
 
-def test_a_newer_frame_takes_the_queued_ones_place_at_once() -> None:
+def test_a_newer_frame_replaces_the_queued_one_at_once() -> None:
     gate = Gate()
     with busy(gate) as crowd:
         old = crowd.queue(1, X_Stream_Id="front")
         other = crowd.queue(2, X_Stream_Id="rear")
         alone = crowd.queue(3)
         new = crowd.post(X_Stream_Id="front")
-        assert_problem(old.result(20), 503, "superseded")  # while the engine is still at work
+        assert_problem(
+            old.result(PATIENCE_S), 503, "superseded"
+        )  # while the engine is still at work
         gate.open.set()
         assert [f.result().status for f in (new, other, alone)] == [200] * 3
     assert len(gate.engine.images) == 4
 
 
-def test_a_full_queue_still_takes_a_newer_frame_of_its_own_streams() -> None:
+def test_a_full_queue_still_takes_a_newer_frame_of_a_queued_stream() -> None:
     gate = Gate()
     with busy(gate) as crowd:
         old = crowd.queue(1, X_Stream_Id="front")
         others = [crowd.queue(n) for n in (2, 3, 4)]
-        assert_problem(crowd.post(X_Stream_Id="rear").result(20), 503, "overloaded")
+        assert_problem(crowd.post(X_Stream_Id="rear").result(PATIENCE_S), 503, "overloaded")
         new = crowd.post(X_Stream_Id="front")
-        assert_problem(old.result(20), 503, "superseded")
+        assert_problem(old.result(PATIENCE_S), 503, "superseded")
         gate.open.set()
         assert [f.result().status for f in (new, *others)] == [200] * 4
 
 
-def test_a_newer_frame_at_another_worker_supersedes_too() -> None:
+def test_a_newer_frame_at_another_worker_replaces_an_older_one() -> None:
     gate, memory = Gate(), shared_memory.create_shared_memory(blocks=2)
     with busy(gate, memory) as crowd:
         old = crowd.queue(1, X_Stream_Id="front")
@@ -94,7 +97,7 @@ def test_a_newer_frame_at_another_worker_supersedes_too() -> None:
 def test_a_late_frame_is_dropped_before_it_is_decoded() -> None:
     gate = Gate()
     with busy(gate) as crowd:
-        late = crowd.queue(1, X_Deadline_Ms="1")
+        late = crowd.queue(1, X_Deadline_Ms="0")
         early = crowd.queue(2, X_Deadline_Ms="60000")
         gate.open.set()
         assert_problem(late.result(), 503, "deadline-passed")
@@ -103,11 +106,11 @@ def test_a_late_frame_is_dropped_before_it_is_decoded() -> None:
 
 
 @pytest.mark.parametrize("text", ["-1", "60001", "nan", "soon", "", "1_0é"])
-def test_a_deadline_that_is_none_is_refused(service: Served, text: str) -> None:
+def test_an_invalid_deadline_is_refused(service: Served, text: str) -> None:
     assert_problem(service.post(JPEG, X_Deadline_Ms=text), 422, "invalid-request")
 
 
-def test_the_table_knows_the_newest_stamp_of_each_stream() -> None:
+def test_the_table_holds_the_newest_stamp_of_each_stream() -> None:
     memory = shared_memory.create_shared_memory(blocks=1)
     here = StreamTable(memory.streams())
     there = StreamTable(shared_memory.attach_shared_memory(memory.fd, 1).streams())
@@ -117,14 +120,14 @@ def test_the_table_knows_the_newest_stamp_of_each_stream() -> None:
     here.announce(front, now)
     assert [there.is_superseded(front, now + d) for d in (-1, 0, 1)] == [True, False, False]
     assert not there.is_superseded(other, 0)
-    there.announce(front, now - 5)  # an older one that comes late takes nothing back
+    there.announce(front, now - 5)  # an older stamp changes nothing
     assert here.is_superseded(front, now - 1)
 
 
-def test_a_full_table_forgets_streams_that_ended_and_never_errs() -> None:
+def test_a_full_table_drops_streams_that_have_ended() -> None:
     streams = StreamTable(shared_memory.create_shared_memory(blocks=1).streams())
     now = 10 * EXPIRY_NS
-    keys = [1 + 1024 * n for n in range(PROBES + 1)]  # all of them want the same places
+    keys = [1 + 1024 * n for n in range(PROBES + 1)]  # all of them with the same hash
     for key in keys:
         streams.announce(key, now)
     assert [streams.is_superseded(key, now - 1) for key in keys] == [True] * PROBES + [False]

@@ -1,10 +1,13 @@
-"""Requests that go straight from the parser to the engine: who answers, and in which order."""
+"""POST /features without ASGI: the thread that runs the engine, the order of replies, bodies."""
 
+import contextlib
 import gc
 import json
 import socket
 import threading
 import time
+from functools import partial
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -12,27 +15,50 @@ import pytest
 from numpy.typing import NDArray
 
 from serve.config import MAX_BODY_BYTES, Limits
-from serve.scheduling import frame_queue
-from serve.scheduling.frame_queue import INLINE_AFTER
-from tests.serve.conftest import FakeEngine, Served, jpeg, outputs, picture, serving, until
+from serve.scheduling import frame_queue, rate_limit
+from serve.scheduling.frame_queue import INLINE_AFTER, INLINE_MAX_MS
+from serve.server.fast_path import DirectProtocol
+from tests.serve.conftest import (
+    PATIENCE_S,
+    Clock,
+    FakeEngine,
+    Served,
+    jpeg,
+    outputs,
+    picture,
+    serving,
+    until,
+)
 
 JPEG = jpeg(picture())
 HEAD = b"POST /features HTTP/1.1\r\nHost: x\r\nContent-Type: image/jpeg\r\n"
-QUICK_MS = 500.0  # longer than in earnest: a busy machine makes any frame slow
 WHOLE = HEAD + b"Content-Length: %d\r\n\r\n" % len(JPEG) + JPEG
 
 
-class Witness(FakeEngine):
-    """An engine that remembers which thread each frame was answered by, and can be made slow."""
+class RecordingEngine(FakeEngine):
+    """An engine that records which thread runs it, and says itself how long a frame takes.
 
-    def __init__(self) -> None:
+    The frame queue reads its clock from `monotonic_ns`, so a busy machine makes no frame slow. A
+    frame waits until `open`; `busy` is set once the engine has begun on it.
+    """
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         super().__init__(self._respond)
         self.threads: list[str] = []
-        self.wait_s = 0.0
+        self.frame_ms = 1.0
+        self.open, self.busy = threading.Event(), threading.Event()
+        self.open.set()
+        self._now_ns = time.monotonic_ns()
+        monkeypatch.setattr(frame_queue, "time", self)
+
+    def monotonic_ns(self) -> int:
+        return self._now_ns
 
     def _respond(self, _image: NDArray[np.uint8]) -> NDArray[np.float32]:
         self.threads.append(threading.current_thread().name)
-        time.sleep(self.wait_s)
+        self._now_ns += round(1e6 * self.frame_ms)
+        self.busy.set()
+        assert self.open.wait(PATIENCE_S)
         return outputs()
 
 
@@ -54,16 +80,13 @@ def read(connection: socket.socket, count: int) -> list[tuple[int, dict[str, Any
 
 
 def dial(service: Served) -> socket.socket:
-    connection = socket.create_connection(("127.0.0.1", service.port))
-    connection.settimeout(60)
-    return connection
+    return socket.create_connection(("127.0.0.1", service.port), PATIENCE_S)
 
 
-def test_a_lone_frame_of_a_quick_engine_is_answered_by_the_event_loop(
+def test_a_single_frame_of_a_fast_engine_is_processed_on_the_event_loop(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(frame_queue, "INLINE_MAX_MS", QUICK_MS)
-    engine = Witness()
+    engine = RecordingEngine(monkeypatch)
     large = jpeg(picture(1120, 840))
     with serving(engine) as service:
 
@@ -71,30 +94,36 @@ def test_a_lone_frame_of_a_quick_engine_is_answered_by_the_event_loop(
             assert service.post(image).status == 200
             return engine.threads[-1]
 
-        def by_the_loop() -> bool:
+        def on_the_loop() -> bool:
             return ask() != "forward"
 
         assert [ask() for _ in range(INLINE_AFTER)] == ["forward"] * INLINE_AFTER
-        until(by_the_loop)  # at once, unless a frame was slow after all
+        until(on_the_loop)  # not the next one if the thread has not yet gone back to sleep
         assert ask(large) == "forward"
-        until(by_the_loop)
-        engine.wait_s = 1.1 * QUICK_MS / 1e3
+        until(on_the_loop)
+        engine.frame_ms = 1.1 * INLINE_MAX_MS
         ask()
-        assert [ask() for _ in range(3)] == ["forward"] * 3  # it was slow, and is trusted no more
+        assert [ask() for _ in range(3)] == ["forward"] * 3  # the engine counts as slow now
 
 
-def test_frames_that_come_together_are_left_to_the_thread(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(frame_queue, "INLINE_MAX_MS", QUICK_MS)
-    engine = Witness()
+def test_frames_that_arrive_together_go_to_the_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    engine = RecordingEngine(monkeypatch)
     with serving(engine) as service:
+        first, *others = clients = [dial(service) for _ in range(4)]
+        for client in clients:  # the service reads all of them
+            client.sendall(WHOLE)
+            assert read(client, 1)[0][0] == 200
         until(lambda: service.post(JPEG).status == 200 and engine.threads[-1] != "forward")
-        engine.wait_s = 0.01
-        clients = [dial(service) for _ in range(4)]
-        for _ in range(10):
-            for client in clients:
+        for _ in range(5):
+            engine.open.clear()
+            engine.busy.clear()
+            first.sendall(WHOLE)
+            assert engine.busy.wait(PATIENCE_S)
+            for client in others:
                 client.sendall(WHOLE)
+            engine.open.set()
             assert [read(client, 1)[0][0] for client in clients] == [200] * 4
-        assert engine.threads.count("forward") > INLINE_AFTER + 10
+            assert engine.threads[-3:] == ["forward"] * 3
 
 
 def test_replies_come_in_the_order_of_their_requests(service: Served) -> None:
@@ -114,11 +143,16 @@ def test_replies_come_in_the_order_of_their_requests(service: Served) -> None:
     assert read(connection, 1)[0][1]["frame_id"] == "5"
 
 
-def test_a_body_may_come_in_pieces_and_in_chunks(service: Served) -> None:
+def has_received(service: Served, count: int) -> bool:
+    return service.received_bytes() == [count]
+
+
+def test_a_body_may_arrive_in_parts_and_in_chunks(service: Served) -> None:
     connection = dial(service)
     for at in range(0, len(WHOLE), 1000):
+        if at:
+            until(partial(has_received, service, at))
         connection.sendall(WHOLE[at : at + 1000])
-        time.sleep(0.002)
     pieces = read(connection, 1)[0]
     connection.sendall(HEAD + b"Transfer-Encoding: chunked\r\n\r\n")
     for at in range(0, len(JPEG), 999):
@@ -134,7 +168,7 @@ def test_a_body_may_come_in_pieces_and_in_chunks(service: Served) -> None:
         assert content["distances_m"] == pieces[1]["distances_m"]
 
 
-def test_a_reply_says_when_the_connection_ends(service: Served) -> None:
+def test_a_reply_says_that_the_connection_will_be_closed(service: Served) -> None:
     connection = dial(service)
     connection.sendall(WHOLE.replace(b"Host", b"Connection: close\r\nHost", 1))
     received = b""
@@ -146,45 +180,69 @@ def test_a_reply_says_when_the_connection_ends(service: Served) -> None:
         assert head.count(b"\r\n%b: " % name) == 1
 
 
-def test_who_asks_and_never_reads_stops_being_heard(service: Served) -> None:
-    """Refusals without end: what is unread stays within what the system and one piece hold."""
-    deaf = dial(service)
-    deaf.setblocking(False)
+def test_a_client_that_reads_no_replies_is_read_no_more(service: Served) -> None:
+    """What it has sent then stays within what the system and one part received hold."""
+    for option in (socket.SO_SNDBUF, socket.SO_RCVBUF):
+        service.listener.setsockopt(socket.SOL_SOCKET, option, 1 << 16)
+    client = dial(service)
+    client.setblocking(False)
     request = b"POST /features HTTP/1.1\r\nHost: x\r\nContent-Length: 0\r\n\r\n" * 500
-    sent, end = 0, time.monotonic() + 60
-    silent_since = time.monotonic()
-    while time.monotonic() < min(end, silent_since + 1.0):
-        try:
-            sent += deaf.send(request)
-            silent_since = time.monotonic()
-        except BlockingIOError:
-            time.sleep(0.01)
-    assert time.monotonic() < end
+    until(lambda: len(service.server.server_state.connections) == 1)
+    (connection,) = service.server.server_state.connections
+    assert isinstance(connection, DirectProtocol)
+    sent = 0
+
+    def send_until_paused() -> bool:
+        nonlocal sent
+        with contextlib.suppress(BlockingIOError):
+            sent += client.send(request)
+        return connection.flow.write_paused
+
+    until(send_until_paused)
+    until(lambda: connection.flow.read_paused)
+    with contextlib.suppress(BlockingIOError):
+        while sent < 32 << 20:
+            sent += client.send(request)
     assert sent < 32 << 20
     assert service.post(JPEG).status == 200
+    assert connection.flow.read_paused
+    client.close()
 
 
-def test_a_connection_without_requests_is_closed_in_time() -> None:
-    with serving(FakeEngine(lambda _image: outputs()), limits=Limits(idle_s=0.3)) as service:
+def test_a_connection_without_requests_is_closed_after_its_time() -> None:
+    clock, engine = Clock(), FakeEngine(lambda _image: outputs())
+    with serving(engine, limits=Limits(idle_s=30.0), clock=clock) as service:
         connection = dial(service)
-        for _ in range(2):
+        for _ in range(3):
             connection.sendall(WHOLE)
             assert read(connection, 1)[0][0] == 200
-            time.sleep(0.05)
-        begin = time.monotonic()
+            clock.now_s += 29.0
+        service.wait_for_tick()
+        connection.settimeout(0)
+        with pytest.raises(BlockingIOError):  # it is still open
+            connection.recv(1)
+        connection.settimeout(PATIENCE_S)
+        clock.now_s += 1.1
         assert connection.recv(1) == b""
-        assert time.monotonic() - begin > 0.2
+    with serving(engine, limits=Limits(idle_s=0.1)) as service:  # by the clock of the machine
+        connection = dial(service)
+        connection.sendall(WHOLE)
+        assert read(connection, 1)[0][0] == 200
+        assert connection.recv(1) == b""
 
 
-def test_a_proxy_names_the_client_whose_requests_are_counted() -> None:
+def test_requests_of_a_proxy_count_for_the_client_it_names(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(rate_limit, "time", SimpleNamespace(monotonic=Clock()))
     with serving(FakeEngine(lambda _image: outputs()), limits=Limits(rate=2.0)) as service:
         for _ in range(9):
-            assert service.post(JPEG).status == 200  # this machine
+            assert service.post(JPEG).status == 200  # this machine has no limit
         statuses = [service.post(JPEG, X_Forwarded_For="10.1.2.3").status for _ in range(3)]
         assert statuses == [200, 200, 429]
 
 
-def test_a_body_without_end_is_refused_once(service: Served) -> None:
+def test_an_endless_body_is_refused_once(service: Served) -> None:
     connection = dial(service)
     connection.sendall(HEAD + b"Transfer-Encoding: chunked\r\n\r\n")
     piece = b"%x\r\n%b\r\n" % (1 << 20, bytes(1 << 20))
@@ -195,7 +253,7 @@ def test_a_body_without_end_is_refused_once(service: Served) -> None:
 
 
 def test_requests_leave_nothing_for_the_garbage_collector(engine: FakeEngine) -> None:
-    """It holds up all clients while it looks for cycles."""
+    """A collection delays all clients."""
     with serving(engine, limits=Limits(queue=1)) as served:
         served.post(JPEG)
         gc.collect()

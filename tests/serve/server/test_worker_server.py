@@ -1,49 +1,67 @@
-"""Whose turn a connection is, among the workers that listen on one port."""
+"""Which of the workers on one port accepts a connection."""
 
 import threading
 
+import pytest
+
+from serve.server import worker_server
 from serve.workers import shared_memory
 from serve.workers.shared_memory import WorkerPeers
-from tests.serve.conftest import FakeEngine, Served, jpeg, outputs, picture, serving, until
+from tests.serve.conftest import (
+    PATIENCE_S,
+    FakeEngine,
+    Served,
+    jpeg,
+    outputs,
+    picture,
+    serving,
+    until,
+)
 
 JPEG = jpeg(picture())
 
 
-def clients(port: int) -> list[Served]:
+def make_clients(port: int) -> list[Served]:
     return [Served(port) for _ in range(8)]
 
 
-def ask_anew(asking: list[Served]) -> list[int]:
-    """The status that each client gets, all of whose connections stay open."""
-    return [client.post(JPEG).status for client in asking]
+def ask_each(clients: list[Served]) -> list[int]:
+    """The status that each client gets; all connections stay open."""
+    return [client.post(JPEG).status for client in clients]
 
 
-def test_a_worker_that_warms_up_leaves_connections_to_one_that_can_answer() -> None:
+def test_a_worker_that_warms_up_leaves_connections_to_one_that_is_ready(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     memory = shared_memory.create_shared_memory(blocks=2)
     ours, others = FakeEngine(lambda _image: outputs()), FakeEngine(lambda _image: outputs())
     warm = threading.Event()
     with (
         serving(ours, shared=memory) as one,
-        serving(others, lambda _engine: warm.wait(20), shared=memory, block=1, beside=one) as two,
+        serving(
+            others, lambda _engine: warm.wait(PATIENCE_S), shared=memory, block=1, beside=one
+        ) as two,
     ):
         until(lambda: one.app.frame_queue.ready)
         until(WorkerPeers(memory, 1).other_is_ready)
-        early, late = clients(one.port), clients(one.port)
-        assert ask_anew(early) == [200] * 8
+        early, late = make_clients(one.port), make_clients(one.port)
+        assert ask_each(early) == [200] * 8
         assert not others.images
         warm.set()
         until(lambda: two.app.frame_queue.ready)
-        assert ask_anew(late) == [200] * 8
-        assert others.images  # it has fewer connections, so they are its turn
+        # The worker with more connections leaves them to the other for longer than that can need.
+        monkeypatch.setattr(worker_server, "YIELD_S", PATIENCE_S)
+        assert ask_each(late) == [200] * 8
+        assert len(others.images) == 8
 
 
-def test_where_none_can_answer_yet_all_say_so() -> None:
+def test_while_no_worker_is_ready_requests_are_refused() -> None:
     memory = shared_memory.create_shared_memory(blocks=2)
     engine = FakeEngine(lambda _image: outputs())
     warm = threading.Event()
     with (
-        serving(engine, lambda _engine: warm.wait(20), shared=memory) as one,
-        serving(engine, lambda _engine: warm.wait(20), shared=memory, block=1, beside=one),
+        serving(engine, lambda _engine: warm.wait(PATIENCE_S), shared=memory) as one,
+        serving(engine, lambda _engine: warm.wait(PATIENCE_S), shared=memory, block=1, beside=one),
     ):
-        assert ask_anew(clients(one.port)) == [503] * 8
+        assert ask_each(make_clients(one.port)) == [503] * 8
         warm.set()

@@ -1,11 +1,10 @@
-"""New weights and new workers in a running service: no request is lost, no answer is wrong."""
+"""Reload and restart of a running service: no request is lost and no answer is wrong."""
 
 import os
 import shutil
 import signal
 import subprocess
 import threading
-import time
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -18,7 +17,7 @@ from mtlnet.inference.engine import load_engine
 from mtlnet.inference.model_card import golden_image, read_card
 from mtlnet.inference.prediction import decode_outputs
 from serve.client import Client
-from tests.serve.conftest import png, publish_untrained, until
+from tests.serve.conftest import PATIENCE_S, png, publish_untrained, until
 from tests.serve.test_cli import address, command, started
 
 BODY = png(golden_image(280, 210)[:, :, ::-1])
@@ -40,7 +39,7 @@ def expected(run: Path) -> tuple[str, dict[str, Any]]:
 
 
 class Traffic:
-    """Clients that ask without a pause, and what they were answered."""
+    """Clients that ask without a pause, and the answers and errors they got."""
 
     def __init__(self, url: str, clients: int) -> None:
         self._url = url
@@ -52,7 +51,7 @@ class Traffic:
             thread.start()
 
     def _drive(self) -> None:
-        with Client(self._url, timeout_s=60) as client:
+        with Client(self._url, timeout_s=PATIENCE_S) as client:
             while not self._stop.is_set():
                 try:
                     self.answers.append(client.features(BODY))
@@ -68,7 +67,7 @@ class Traffic:
 
 @contextmanager
 def traffic(url: str, clients: int = 3) -> Iterator[Traffic]:
-    Client(url, timeout_s=60).wait_until_ready(60)
+    Client(url, timeout_s=PATIENCE_S).wait_until_ready(PATIENCE_S)
     found = Traffic(url, clients)
     try:
         until(lambda: len(found.answers) > 5)
@@ -80,7 +79,7 @@ def traffic(url: str, clients: int = 3) -> Iterator[Traffic]:
 def run(*arguments: str) -> subprocess.CompletedProcess[str]:
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[3])}
     return subprocess.run(
-        command(*arguments), capture_output=True, text=True, env=environment, timeout=120
+        command(*arguments), capture_output=True, text=True, env=environment, timeout=PATIENCE_S
     )
 
 
@@ -124,33 +123,35 @@ def test_reload_and_restart_lose_no_request_and_give_no_wrong_answer(
             right = known[answer["model"]]
             assert {key: answer[key] for key in right} == right
         process.send_signal(signal.SIGTERM)
-        assert process.wait(30) == 0
+        assert process.wait(PATIENCE_S) == 0
+
+
+def children(pid: int) -> list[int]:
+    command = ["ps", "-o", "pid=", "--ppid", str(pid)]
+    return [int(found) for found in subprocess.check_output(command, text=True).split()]
 
 
 @pytest.mark.slow
-def test_hangup_takes_what_the_folder_holds_now_and_a_dead_worker_is_replaced(
+def test_sighup_loads_the_folder_again_and_a_dead_worker_is_replaced(
     models: tuple[Path, Path], tmp_path: Path
 ) -> None:
     current = tmp_path / "current"
     shutil.copytree(models[0], current)
     new = read_card(models[1]).model_hash
     with started("--model", str(current), "--port", "0") as (process, line):
-        with Client(address(line), timeout_s=60) as client:
-            client.wait_until_ready(60)
+        with Client(address(line), timeout_s=PATIENCE_S) as client:
+            client.wait_until_ready(PATIENCE_S)
             shutil.rmtree(current)
             shutil.copytree(models[1], current)
             process.send_signal(signal.SIGHUP)
             until(lambda: client.features(BODY)["model"] == new)
-            workers = subprocess.run(
-                ["ps", "-o", "pid=", "--ppid", str(process.pid)], capture_output=True, text=True
-            ).stdout.split()
-            assert len(workers) == 1
-            os.kill(int(workers[0]), signal.SIGKILL)
-            until(lambda: not client.ready())
-            client.wait_until_ready(60)
+            (worker,) = children(process.pid)
+            os.kill(worker, signal.SIGKILL)
+            until(lambda: children(process.pid) not in ([], [worker]))
+            client.wait_until_ready(PATIENCE_S)
             assert client.features(BODY)["model"] == new
         process.send_signal(signal.SIGTERM)
-        assert process.wait(30) == 0
+        assert process.wait(PATIENCE_S) == 0
 
 
 def test_an_open_address_needs_a_token_and_a_command_needs_a_service(
@@ -162,12 +163,10 @@ def test_an_open_address_needs_a_token_and_a_command_needs_a_service(
         (("--token-file", str(tmp_path / "none")), "no token file"),
         (("reload", "--port", "1"), "no service of yours on port 1"),
     ):
-        begin = time.monotonic()
         done = run(*(more if more[0] == "reload" else (*arguments, *more)))
         assert done.returncode == 1
         assert said in done.stderr
         assert done.stderr.count("\n") == 1
-        assert time.monotonic() - begin < 60
     (tmp_path / "token").write_text("0123456789abcdef\n")
     with started(*arguments, "--host", "0.0.0.0", "--token-file", str(tmp_path / "token")) as (
         process,
@@ -175,4 +174,4 @@ def test_an_open_address_needs_a_token_and_a_command_needs_a_service(
     ):
         assert "http://0.0.0.0:" in line
         process.send_signal(signal.SIGTERM)
-        assert process.wait(30) == 0
+        assert process.wait(PATIENCE_S) == 0

@@ -1,4 +1,4 @@
-"""Reload and restart when a worker fails: with fake workers, so that no model is loaded."""
+"""Reload and restart when a worker fails; the workers are fakes that load no model."""
 
 import asyncio
 import json
@@ -13,6 +13,7 @@ from serve.config import Limits
 from serve.workers import supervisor as module
 from serve.workers.supervisor import ServicePlan, Supervisor
 from serve.workers.worker_process import WorkerProcess, WorkerTask
+from tests.serve.conftest import PATIENCE_S
 from trackfeatures.errors import UserError
 
 
@@ -34,7 +35,7 @@ class FakeProcess:
 
 
 class FakeWorkers:
-    """Starts workers that answer the supervisor's messages as `on_load` and `is_ready` say."""
+    """Starts workers; they get ready if `is_ready`, and cannot load `failing_folders`."""
 
     def __init__(self) -> None:
         self.started: list[WorkerProcess] = []
@@ -50,6 +51,7 @@ class FakeWorkers:
         self.started.append(worker)
         run = asyncio.ensure_future(self._run(task, theirs))
         self._tasks.add(run)
+        await worker.wait_loaded(task.generation, PATIENCE_S)
         return worker
 
     async def _run(self, task: WorkerTask, connection: socket.socket) -> None:
@@ -110,7 +112,7 @@ def test_a_replacement_that_does_not_become_ready_is_stopped(
         workers.is_ready = False
         with pytest.raises(UserError, match="not ready"):
             await supervisor.restart()
-        monkeypatch.setattr(module, "LOAD_TIMEOUT_S", 20.0)
+        monkeypatch.setattr(module, "LOAD_TIMEOUT_S", PATIENCE_S)
         workers.is_ready = True
         await supervisor.restart()
 
