@@ -14,7 +14,6 @@ Give one Link to one thread of one process.
 import math
 import os
 import time
-from types import TracebackType
 from typing import Self
 
 from simulator.link.channel import Receiver, Sender, state_image_bytes
@@ -112,12 +111,7 @@ class Link:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def _request(self) -> Message:

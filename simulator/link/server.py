@@ -7,7 +7,6 @@ wall clock, holding the last command, while an episode runs.
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from types import TracebackType
 from typing import Any, Self
 
 from simulator.link.channel import Receiver, Sender
@@ -108,12 +107,7 @@ class LinkServer:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def _wait_for_command(self) -> bool:
