@@ -133,8 +133,8 @@ class Link:
         while not (self._receive(POLL_INTERVAL_S) and self._answered()):
             if time.monotonic() > until:
                 raise LinkTimeout(
-                    f"{self._server} lives, but has not answered within {self._timeout_s:g} s; "
-                    "is it stopped, or too busy? A longer timeout_s waits longer"
+                    f"{self._server} is running, but has not answered within {self._timeout_s:g} s"
+                    "; is it stopped, or too busy? A longer timeout_s waits longer"
                 )
 
     def _receive(self, seconds: float = 0.0) -> bool:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runtime.jit import compiled
-from simulator.track.kernel import Table, locate
+from simulator.track.piece_table import Table, locate
 from simulator.traffic.wreck import TRAFFIC_CAR
 from simulator.vehicle.dynamics import DT, PIECE, accelerate, compute_forces
 from simulator.vehicle.orientation import rotation

@@ -8,10 +8,10 @@ from runtime.sockets import address, bind
 from simulator.track.road import Road
 from simulator.watch.hub import Hub
 from simulator.watch.messages import scene_message, state_message
-from simulator.watch.pace import Pacer, Rate
 from simulator.watch.pictures import JpegRenderer
 from simulator.watch.score import Score
 from simulator.watch.server import Server
+from simulator.world.pace import Pacer, Rate
 from simulator.world.world import World
 from trackfeatures.errors import UserError
 

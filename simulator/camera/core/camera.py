@@ -267,6 +267,12 @@ class Camera:
         self._graphics.frame.bind_to_uniform_block(FRAME_BINDING)
 
 
+def open_camera(road: Road, parameters: CameraParameters, *, light: str, seed: int) -> Camera:
+    """A camera by the name of a light; `seed` draws the scenery and the light's parameters."""
+    drawn = Light.named(light, np.random.default_rng([seed, 2]))
+    return Camera(road, parameters, seed=seed, light=drawn)
+
+
 def _light_rows(light: Light) -> list[tuple[float, ...]]:
     """The rows of the uniform block `Frame` of light and air."""
     return [

@@ -15,8 +15,8 @@ from simulator.camera.scene.terrain import build as build_terrain
 from simulator.camera.scene.themes import find_theme, themes
 from simulator.camera.snapshot import standing_pose
 from simulator.track.catalogue import OWN_TRACKS, find_track
-from simulator.track.own import LOOKS as TRACK_LOOKS
 from simulator.track.road import Road
+from simulator.track.toml_track import LOOKS as TRACK_LOOKS
 from trackfeatures.camera import CameraParameters
 
 FloatArray = NDArray[np.float64]

@@ -174,8 +174,8 @@ def test_quit_ends_the_server_and_tells_what_it_did(name: str) -> None:
     assert asdict(summary) == expected
     assert served.said == [
         f"{name}: oval is ready for a client",
-        f"client {os.getpid()} has come",
-        f"client {os.getpid()} has left",
+        f"client {os.getpid()} has connected",
+        f"client {os.getpid()} has disconnected",
     ]
 
 
@@ -203,7 +203,7 @@ def test_a_stopped_process_is_given_two_seconds(server: Start, name: str) -> Non
         link.reset(seed=1)
         process.send_signal(signal.SIGSTOP)
         began = time.monotonic()
-        with pytest.raises(LinkTimeout, match=r"lives, but has not answered within 0\.5 s"):
+        with pytest.raises(LinkTimeout, match=r"is running, but has not answered within 0\.5 s"):
             link.step(Command())
         assert 0.4 < time.monotonic() - began < BOUND_S
         process.send_signal(signal.SIGCONT)
@@ -233,7 +233,7 @@ def test_a_silent_client_is_given_up(name: str) -> None:
     config = LinkConfig(name=name, track="oval", patience_s=0.3)
     with serving(config) as served, Link(name, wait_s=WAIT_S) as link:
         link.reset(seed=1)
-        with pytest.raises(ClientLost, match=r"lives, but has sent nothing for 0\.3 s"):
+        with pytest.raises(ClientLost, match=r"is running, but has sent nothing for 0\.3 s"):
             served.result(BOUND_S)
         with pytest.raises(ServerDied, match="has ended"):
             link.step(Command())

@@ -9,7 +9,7 @@ import pytest
 from simulator.track.catalogue import find_track, list_tracks
 from simulator.track.errors import TrackError
 from simulator.track.geometry import Track
-from simulator.track.own import LOOKS
+from simulator.track.toml_track import LOOKS
 from simulator.track.torcs.appearance import WITHOUT_KERBS
 from simulator.track.torcs.torcs import read_torcs
 

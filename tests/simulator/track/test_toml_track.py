@@ -11,7 +11,7 @@ from simulator.track.catalogue import OWN_TRACKS, find_track, read_track
 from simulator.track.errors import TrackError
 from simulator.track.geometry import Track
 from simulator.track.layout import Bend, close
-from simulator.track.own import LOOKS, Table, read_own, read_segments
+from simulator.track.toml_track import LOOKS, Table, read_segments, read_toml_track
 
 NAMES = sorted(path.stem for path in OWN_TRACKS.glob("*.toml"))
 TRACKS = {name: find_track(name) for name in NAMES}
@@ -126,7 +126,7 @@ def test_a_square_with_known_figures(tmp_path: Path) -> None:
     straight = '[[segment]]\ntype = "straight"\nlength = 100\n'
     path = tmp_path / "square.toml"
     path.write_text('look = "town"\nwidth = 8.0\n' + (straight + bend) * 4)
-    track = read_own(path)
+    track = read_toml_track(path)
     assert track.length_m == pytest.approx(4 * (100.0 + 20.0 * math.pi + 20.0))
     assert track.min_radius_m == pytest.approx(40.0)
     middle = 100.0 + (20.0 * math.pi + 20.0) / 2
@@ -157,7 +157,7 @@ def test_closing_must_leave_every_straight_a_length(tmp_path: Path) -> None:
     path = tmp_path / "short.toml"
     path.write_text('look = "town"\nwidth = 8.0\n' + "".join(sides) + straight(30.0) + bend)
     with pytest.raises(TrackError, match=r"short\.toml: closing the loop leaves a straight no"):
-        read_own(path)
+        read_toml_track(path)
 
 
 def test_a_track_without_straights_names_its_file(tmp_path: Path) -> None:
@@ -165,4 +165,4 @@ def test_a_track_without_straights_names_its_file(tmp_path: Path) -> None:
     path = tmp_path / "round.toml"
     path.write_text('look = "town"\nwidth = 8.0\n' + bend * 3)
     with pytest.raises(TrackError, match=r"round\.toml: straights in two directions"):
-        read_own(path)
+        read_toml_track(path)
