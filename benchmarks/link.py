@@ -43,7 +43,7 @@ from simulator.world.world import World
 
 
 class Echo:
-    """A simulation that does nothing: what is left is the link."""
+    """A simulation that does nothing, to time the link alone."""
 
     episodes, steps, refused, running, position_text = 0, 0, 0, False, ""
 
@@ -108,7 +108,7 @@ def steps_here(world: World, steps: int) -> list[float]:
 
 
 def speed(hammer: str, steps: int) -> dict[str, Any]:
-    """Interleaved, so that other work on the machine meets all of them alike."""
+    """The variants take turns, so that other load on the machine affects all of them alike."""
     echo = fresh_name()
     name, server = start_server()
     echoing = start(sys.executable, __file__, "--echo", echo)
@@ -141,7 +141,7 @@ def main() -> None:
     parser.add_argument("--write-states", help=argparse.SUPPRESS)
     parser.add_argument("--echo", help=argparse.SUPPRESS)
     arguments = parser.parse_args()
-    # Stopped from outside, it cleans up behind itself as with Ctrl-C.
+    # SIGTERM cleans up as Ctrl-C does.
     signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
     if arguments.write_states:
         write_states(arguments.write_states)
@@ -170,7 +170,7 @@ def main() -> None:
 
 
 def missed(result: dict[str, Any], messages: int) -> list[str]:
-    """Which limits were, in words; also on stderr."""
+    """The limits that were missed, as sentences; also printed on stderr."""
     found = []
     for way in ("server_to_client", "client_to_server"):
         if way in result:
@@ -180,7 +180,9 @@ def missed(result: dict[str, Any], messages: int) -> list[str]:
             if count["messages"] < messages:
                 found.append(f"{way}: only {count['messages']} messages in time")
     if "control_without_lock" in result and not result["control_without_lock"]["torn"]:
-        found.append("the control saw no torn message either: the test shows nothing")
+        found.append(
+            "the control without the lock saw no torn message either, so the test proves nothing"
+        )
     if "killed" in result:
         if max(result["killed"]["longest_s"].values()) > BOUND_S:
             found.append(f"a survivor took over {BOUND_S} s")

@@ -6,10 +6,10 @@ from typing import Any, Final, Self
 
 from runtime.sockets import address, bind
 from simulator.track.road import Road
+from simulator.watch.episode_score import Score
 from simulator.watch.hub import Hub
 from simulator.watch.messages import scene_message, state_message
 from simulator.watch.pictures import JpegRenderer
-from simulator.watch.score import Score
 from simulator.watch.server import Server
 from simulator.world.pace import Pacer, Rate
 from simulator.world.world import World
