@@ -50,7 +50,7 @@ Start = Callable[..., "subprocess.Popen[str]"]
         (Command(gear=7), "gear = 7"),
     ],
 )
-def test_a_bad_command_is_refused_and_the_car_stands_where_it_stood(
+def test_a_bad_command_is_refused_and_the_car_is_unchanged(
     oval: str, command: Command, said: str
 ) -> None:
     with Link(oval, wait_s=WAIT_S) as link:
@@ -161,7 +161,7 @@ def test_a_second_server_of_the_name_is_refused(oval: str) -> None:
     assert one_error(done).startswith(f"error: a server of the link {oval} is running")
 
 
-def test_quit_ends_the_server_and_tells_what_it_did(name: str) -> None:
+def test_quit_ends_the_server_which_prints_its_counts(name: str) -> None:
     with serving(LinkConfig(name=name, track="oval")) as served, Link(name, wait_s=WAIT_S) as link:
         link.reset(seed=1)
         for _ in range(5):
@@ -197,7 +197,7 @@ def test_a_stopped_server_tells_its_client_and_prints_json(
 
 
 @pytest.mark.alone
-def test_a_stopped_process_is_given_two_seconds(server: Start, name: str) -> None:
+def test_a_suspended_server_times_out_after_two_seconds(server: Start, name: str) -> None:
     process = server("--track", "oval")
     with Link(name, wait_s=WAIT_S, timeout_s=0.5) as link:
         link.reset(seed=1)
@@ -218,7 +218,7 @@ def test_once_ends_with_the_first_client(name: str) -> None:
 
 
 @pytest.mark.alone
-def test_a_client_that_dies_ends_an_server_for_once(name: str) -> None:
+def test_a_killed_client_ends_a_server_with_once(name: str) -> None:
     config = LinkConfig(name=name, track="oval", once=True)
     with serving(config) as served:
         link = Link(name, wait_s=WAIT_S)
@@ -229,7 +229,7 @@ def test_a_client_that_dies_ends_an_server_for_once(name: str) -> None:
 
 
 @pytest.mark.alone
-def test_a_silent_client_is_given_up(name: str) -> None:
+def test_a_client_that_sends_nothing_is_dropped(name: str) -> None:
     config = LinkConfig(name=name, track="oval", patience_s=0.3)
     with serving(config) as served, Link(name, wait_s=WAIT_S) as link:
         link.reset(seed=1)
@@ -240,7 +240,7 @@ def test_a_silent_client_is_given_up(name: str) -> None:
 
 
 @pytest.mark.alone
-def test_real_time_goes_on_by_itself(name: str) -> None:
+def test_real_time_steps_without_commands(name: str) -> None:
     config = LinkConfig(name=name, track="oval", realtime=True, frequency_hz=50)
     with serving(config), Link(name, wait_s=WAIT_S) as link:
         assert link.info.mode is Mode.REALTIME
@@ -259,7 +259,7 @@ def test_real_time_goes_on_by_itself(name: str) -> None:
         link.quit()
 
 
-def test_without_a_command_the_real_car_stands(name: str) -> None:
+def test_in_real_time_without_a_command_the_car_stands(name: str) -> None:
     config = LinkConfig(name=name, track="oval", realtime=True, frequency_hz=100)
     with serving(config), Link(name, wait_s=WAIT_S) as link:
         link.reset(seed=1)

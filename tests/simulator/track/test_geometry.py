@@ -110,7 +110,7 @@ def test_a_hint_tells_the_bridge_from_the_road_below() -> None:
         assert float(EIGHT.at(found, to_middle).z) == pytest.approx(height)
 
 
-def test_a_hint_far_off_is_mended() -> None:
+def test_a_wrong_hint_is_corrected() -> None:
     pose = MOUNTAIN.at(1500.0, 1.0)
     for hint in (0.0, 400.0, 900.0, 2400.0):
         found, to_middle = MOUNTAIN.project(float(pose.x), float(pose.y), hint)

@@ -43,7 +43,7 @@ def test_closes_to_the_millimetre(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_what_is_written_is_what_is_driven(name: str) -> None:
+def test_segments_have_the_lengths_and_angles_of_the_file(name: str) -> None:
     """Closing may change a straight by a rounding of the file, no more; nor the grades."""
     import tomllib
 
@@ -139,7 +139,7 @@ def test_a_square_with_known_figures(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("text", ["width = " + "9" * 5000, "width = " + "[" * 5000])
-def test_what_python_will_not_read_is_named(tmp_path: Path, text: str) -> None:
+def test_toml_that_python_cannot_parse_is_named(tmp_path: Path, text: str) -> None:
     path = tmp_path / "deep.toml"
     path.write_text(text)
     with pytest.raises(TrackError, match=r"deep\.toml: not a readable TOML file"):

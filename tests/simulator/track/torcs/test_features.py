@@ -138,7 +138,7 @@ def test_a_name_tells_the_look(tmp_path: Path, name: str, look: str) -> None:
     assert read_torcs(path).look == look
 
 
-def test_names_that_say_nothing_draw_different_looks(tmp_path: Path) -> None:
+def test_names_without_a_known_look_vary_in_look(tmp_path: Path) -> None:
     looks = []
     for number in range(12):
         path = tmp_path / f"g-track-{number}.xml"
