@@ -132,7 +132,7 @@ class Block:
 
 def _read_blocks() -> list[Block]:
     """The blocks of layout.toml, one after the other."""
-    text = files(__package__).joinpath("layout.toml").read_text(encoding="utf-8")
+    text = files("simulator.link").joinpath("layout.toml").read_text(encoding="utf-8")
     blocks: list[Block] = []
     for name, block in tomllib.loads(text).items():
         table = tuple(Field(*row) for row in block["fields"])

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from simulator.track.cli import TracksDir
+from simulator.track.cli import Lanes, TracksDir, Traffic
 
 
 @dataclass(frozen=True)
@@ -31,10 +31,8 @@ class WatchConfig:
 
 def watch(
     track: Annotated[str, typer.Option(help="Name of a track, or its file.")] = WatchConfig.track,
-    lanes: Annotated[int, typer.Option(help="Number of lanes, 1 to 3.")] = WatchConfig.lanes,
-    traffic: Annotated[
-        int, typer.Option(help="Number of other cars.", min=0, max=12)
-    ] = WatchConfig.traffic,
+    lanes: Lanes = WatchConfig.lanes,
+    traffic: Traffic = WatchConfig.traffic,
     light: Annotated[
         str, typer.Option(help="Kind of light, such as overcast or rain.")
     ] = WatchConfig.light,

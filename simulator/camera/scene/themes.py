@@ -53,7 +53,7 @@ class Theme:
 @cache
 def themes() -> dict[str, Theme]:
     """All themes by name, from themes.toml."""
-    text = files(__package__).joinpath("themes.toml").read_text(encoding="utf-8")
+    text = files("simulator.camera.scene").joinpath("themes.toml").read_text(encoding="utf-8")
     return {name: _theme(values) for name, values in tomllib.loads(text).items()}
 
 
