@@ -2,7 +2,7 @@
 
 Run: `python benchmarks/flips.py [--flips 1000] [--data DIR] [--json FILE]`. One bit of one file is
 flipped, the dataset verified, the bit put back. Of four flips three are in the rounds, at any byte,
-and one is in what lies beside them: states, splits, the manifest and all that it names. Without
+and one in the other files: states, splits, the manifest and all files that it names. Without
 `--data` a few rounds are collected; a given dataset is copied first.
 """
 

@@ -1,14 +1,14 @@
-"""Kill -9 of the whole process tree at random moments of a collection: nothing finished is lost.
+"""SIGKILL of the whole process tree at random moments of a collection: no finished round is lost.
 
 Run: `python benchmarks/killed.py [--kills 200] [--rounds 8] [--frames 20] [--json FILE]`. A run of
-`datagen collect` is killed at a random moment and started again, until it is through; then another
-folder is begun, until there were so many kills. Claim: every round that was finished at a kill
-still has the same bytes and time of writing at the end, and every dataset has the hash of an
+`datagen collect` is killed at a random moment and started again until it is complete; then the next
+folder is begun, until the number of kills is reached. Claim: every round that was finished at a
+kill has the same bytes and modification time at the end, and every dataset has the hash of an
 undisturbed run.
 
-A third of the kills come at any time of a run. Most of that is starting up, so the others wait for
-something to happen in the folder (a round is begun, has its name, has its state, was the last one)
-and come within a short random time of it. What the folder looked like is counted in `phases`.
+A third of the kills come at any time of a run, which is mostly start-up. The others wait for a
+change in the folder (a round is begun, renamed, has its state, was the last one) and come within a
+short random time after it. `phases` counts the states in which the folder was found.
 """
 
 import argparse

@@ -1,7 +1,7 @@
 """Two Ray workers on one host give the same dataset as one process.
 
 Run: `python benchmarks/ray_hash.py [--rounds 6] [--frames 200] [--json FILE]`. Claim: the dataset's
-hash and the bytes of every round are the same; seconds of both are printed side by side.
+hash and the bytes of every round are the same; the seconds of both are printed.
 """
 
 import argparse

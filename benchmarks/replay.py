@@ -1,11 +1,10 @@
-"""Random episodes, run again elsewhere: is every bit of them the same?
+"""Random episodes give bit-equal results in other processes and in vector environments.
 
 Run: `python benchmarks/replay.py [--episodes 100] [--json FILE]`, some five minutes on two
 cores. Claim: 100 episodes of random track, lanes, traffic, start, rate, controls, noise, sensors
 and, for every fifth, pictures in random light, give bit-equal observations, rewards, states, true
 features and info (a) in a process, (b) in another one that runs them in the opposite order and
-(c) beside each other in Gymnasium's `AsyncVectorEnv`. Each step is added to a SHA-256 as it is
-made.
+(c) in parallel in Gymnasium's `AsyncVectorEnv`. A SHA-256 over all steps is compared.
 """
 
 import argparse

@@ -2,9 +2,10 @@
 
 Run: `python benchmarks/state_env.py [--json FILE]`, about two minutes on two cores. Claims, on one
 core, with 19 range beams read in every step: at least 4,000 steps a second, 20 times CarRacing-v3,
-40 times racetrack-v0. The environments take turns in one process pinned to one core; figures are
-the medians of the turns, steps a second of processor time, resets not counted. Before, the beams
-of a stretch of driving are held to brute force. Vectors of two run on two cores by the clock.
+40 times racetrack-v0. The environments take turns in one process pinned to one core; a
+figure is the median over the turns of steps per second of processor time, without resets. First the
+beams of a short drive are compared with brute force. Vectors of two environments run on two cores;
+theirs is wall-clock time.
 """
 
 import argparse

@@ -1,12 +1,12 @@
-"""Training speed on a CPU, each claim's two sides by turns in one run.
+"""Training speed on a CPU; the two sides of each claim take turns in one run.
 
 Run: `python benchmarks/training.py [--data DIR] [--quick] [--json FILE]`. Claims, recipe `fast`, on
 a quiet machine: in batches of 32, a step with real data (reading, decoding, all changes to the
 images) takes at most 1.05 times the same step on one batch in memory; and in the recipe's own
 batches our loop learns from at least 2.0 times (aim: 2.5) as many images a second as a plain loop
 with the same batches of the same files: torch's layers as the network is written, float32, AdamW, a
-DataLoader with two workers that decodes and mirrors. Steps are taken from all over a run, in whose
-course layers come to rest; the ratios of steps in which all layers learn stand beside (`all`).
+DataLoader with two workers that decodes and mirrors. Steps are sampled from the
+whole run, in which layers are frozen one after another; `all` gives the ratios while none is.
 """
 
 import argparse

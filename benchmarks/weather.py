@@ -1,7 +1,8 @@
-"""What each kind of light costs a frame, against a clear day of the same scene, poses interleaved.
+"""Processor time a frame in each kind of light, relative to the clear light of the same scene.
 
 Run: `python benchmarks/weather.py [--poses 40] [--json FILE]`. Claim: rain and snow take at most
-1.25 times the processor time of the clear light, drawn in the calling thread on Mesa.
+1.25 times the processor time of the clear light, drawn in the calling thread on Mesa. The lights
+take turns, pose by pose.
 """
 
 import argparse

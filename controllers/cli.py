@@ -112,13 +112,13 @@ def demo(
     The same command continues where it was stopped. Exit 1 when the model misses a limit.
     """
     from controllers.demo.process import stop_on_sigterm
-    from controllers.demo.report import print_tables, verdicts, write_report
+    from controllers.demo.report import check_limits, print_tables, write_report
     from controllers.demo.run import run_demo
 
     stop_on_sigterm()
     config = DemoConfig(out=out, rounds=rounds, frames=frames, seed=seed, minutes=minutes)
     result = run_demo(config)
-    found = verdicts(result.evaluation)
+    found = check_limits(result.evaluation)
     report = write_report(config, result)
     if as_json:
         typer.echo(json.dumps(result.as_json()))

@@ -201,12 +201,7 @@ def open_perception(
             f"perception {name!r} is unknown; give truth, model, or the address of a "
             "service such as http://127.0.0.1:8000"
         )
-    camera = _open_camera(network.camera, world, light, seed)
+    from simulator.camera import open_camera
+
+    camera = open_camera(world.road, network.camera, light=light, seed=seed)
     return PerceptionSource(CameraPerception(camera, network), network.close, camera.close)
-
-
-def _open_camera(parameters: CameraParameters, world: "World", light: str, seed: int) -> "Camera":
-    from simulator.camera import Camera, Light
-
-    drawn = Light.named(light, np.random.default_rng([seed, 2]))
-    return Camera(world.road, parameters, seed=seed, light=drawn)

@@ -15,7 +15,7 @@ import typer
 
 from runtime import cli as command
 from simulator.link.command import link
-from simulator.track.cli import TrackName, TracksDir, tracks
+from simulator.track.cli import Lanes, LaneWidth, TrackName, TracksDir, Traffic, tracks
 from simulator.watch.cli import watch
 from trackfeatures import LANE_WIDTH_M
 
@@ -48,10 +48,10 @@ def centreline(
 def snapshot(
     track: TrackName,
     out: Annotated[Path, typer.Option(help="PNG file to write.")],
-    lanes: Annotated[int, typer.Option(help="Number of lanes, 1 to 3.")] = 2,
-    lane_width: Annotated[float, typer.Option(help="Metres, 3.0 to 4.5.")] = LANE_WIDTH_M,
+    lanes: Lanes = 2,
+    lane_width: LaneWidth = LANE_WIDTH_M,
     seed: Annotated[int, typer.Option(help="Fixes scenery, light and places.", min=0)] = 0,
-    traffic: Annotated[int, typer.Option(help="Number of other cars.", min=0, max=12)] = 3,
+    traffic: Traffic = 3,
     light: Annotated[
         str | None, typer.Option(help="One kind of light (e.g. rain); without it, all in turn.")
     ] = None,

@@ -11,7 +11,7 @@ from trackfeatures import MARKINGS, Heading, localise
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
+class PostedFrame:
     """One held-out frame (JPEG), its labels, and the answer of the service."""
 
     jpeg: bytes
@@ -42,18 +42,18 @@ def spread(frames: Frames, count: int, rng: np.random.Generator) -> list[int]:
     return sorted(chosen)
 
 
-def ask(frames: Frames, indices: list[int], client: Client) -> list[Asked]:
+def post_frames(frames: Frames, indices: list[int], client: Client) -> list[PostedFrame]:
     """Post the recorded JPEG files; the answers with their labels."""
-    return [_ask_frame(frames, index, client) for index in indices]
+    return [_post_frame(frames, index, client) for index in indices]
 
 
-def _ask_frame(frames: Frames, index: int, client: Client) -> Asked:
+def _post_frame(frames: Frames, index: int, client: Client) -> PostedFrame:
     labels = frames.labels
     jpeg = bytes(frames.jpeg(index))
     answer = client.features(jpeg)
     values = labels.distances[index]
     about = frames.rounds[int(labels.round[index])]
-    return Asked(
+    return PostedFrame(
         jpeg=jpeg,
         round_id=about.id,
         track=about.track,

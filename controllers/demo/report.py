@@ -1,4 +1,4 @@
-"""The demo's results: verdicts, tables for the terminal, and a self-contained HTML report."""
+"""The demo's results: limit checks, tables for the terminal, and a self-contained HTML report."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.table import Table
 
 from controllers.config import DemoConfig
-from controllers.demo.frames import Asked
+from controllers.demo.frames import PostedFrame
 from controllers.demo.run import DemoResult
 from datagen.recording import Dataset
 from mtlnet.inference.curves import read_curves
@@ -20,13 +20,12 @@ from mtlnet.inference.overlay import draw_overlay
 from runtime.files import atomic_write
 from runtime.html import embed_jpeg, render
 from runtime.svg_charts import Line, Plot, line_plot
-from simulator.vehicle.car import CarParameters
 from trackfeatures import MARKINGS
 from trackfeatures.camera import CameraParameters
 
 LIMITS = {"ml": 0.35, "mr": 0.35, "angle": 0.03, "heading": 0.85}
 """What the demo must reach: mean error in m and rad, and the accuracy of the heading class."""
-VERDICT_COLUMNS = ("feature", "mean error", "limit", "training mean", "ratio", "reached")
+LIMIT_COLUMNS = ("feature", "mean error", "limit", "training mean", "ratio", "reached")
 LEARNED_RATIO = 0.65
 """A feature counts as learned when its error is at most this share of the baseline's, which always
 predicts the mean of the training labels."""
@@ -41,7 +40,7 @@ CURVE_COLOURS = {"distance": "#22bb66", "angle": "#ee8822", "type": "#3366cc"}
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
+class LimitCheck:
     """A result of the evaluation beside its limit and the result of the baseline."""
 
     what: str
@@ -58,34 +57,34 @@ class Verdict:
         return "yes" if self.reached else "NO"
 
 
-def verdicts(evaluation: dict[str, Any]) -> list[Verdict]:
-    """The verdicts on an evaluation, feature by feature."""
+def check_limits(evaluation: dict[str, Any]) -> list[LimitCheck]:
+    """The results of an evaluation against the demo's limits, feature by feature."""
     baseline = evaluation["baseline"]
     rows = []
     for name in MARKINGS:
         error, mean = evaluation["mae_m"][name], baseline["mae_m"][name]
         if error is not None and mean is not None:  # on one lane no test frame may show an `l`
-            rows.append(_error_verdict(f"{name} (m)", error, mean, LIMITS.get(name)))
+            rows.append(_check_error(f"{name} (m)", error, mean, LIMITS.get(name)))
     angle, mean_angle = evaluation["angle_mae_rad"], baseline["angle_mae_rad"]
-    rows.append(_error_verdict("angle (rad)", angle, mean_angle, LIMITS["angle"]))
+    rows.append(_check_error("angle (rad)", angle, mean_angle, LIMITS["angle"]))
     accuracy, most_frequent = evaluation["heading_accuracy"], baseline["heading_accuracy"]
     least = LIMITS["heading"]
     name = "heading (share right)"
-    rows.append(Verdict(name, accuracy, most_frequent, least, accuracy >= least))
+    rows.append(LimitCheck(name, accuracy, most_frequent, least, accuracy >= least))
     return rows
 
 
-def _error_verdict(what: str, error: float, mean: float, limit: float | None) -> Verdict:
+def _check_error(what: str, error: float, mean: float, limit: float | None) -> LimitCheck:
     reached = limit is None or (error <= limit and error <= LEARNED_RATIO * mean)
-    return Verdict(what, error, mean, limit, reached)
+    return LimitCheck(what, error, mean, limit, reached)
 
 
-def verdict_cells(verdict: Verdict) -> tuple[str, ...]:
-    """A verdict as the cells of `VERDICT_COLUMNS`."""
-    limit = "" if verdict.limit is None else f"{verdict.limit:g}"
-    ratio = f"{verdict.figure / verdict.mean:.2f}"
-    figures = (f"{verdict.figure:.4f}", limit, f"{verdict.mean:.4f}")
-    return verdict.what, *figures, ratio, verdict.word
+def check_cells(check: LimitCheck) -> tuple[str, ...]:
+    """A check as the cells of `LIMIT_COLUMNS`."""
+    limit = "" if check.limit is None else f"{check.limit:g}"
+    ratio = f"{check.figure / check.mean:.2f}"
+    figures = (f"{check.figure:.4f}", limit, f"{check.mean:.4f}")
+    return check.what, *figures, ratio, check.word
 
 
 # The HTML report.
@@ -101,8 +100,8 @@ def write_report(config: DemoConfig, result: DemoResult) -> Path:
         config=config,
         result=result,
         learned_ratio=LEARNED_RATIO,
-        verdict_columns=VERDICT_COLUMNS,
-        verdict_rows=[verdict_cells(one) for one in verdicts(result.evaluation)],
+        limit_columns=LIMIT_COLUMNS,
+        limit_rows=[check_cells(one) for one in check_limits(result.evaluation)],
         curves=_training_curves(config.out / "run" / "curves.csv"),
         figures=_figures(camera, result.asked),
         answer_columns=ANSWER_COLUMNS,
@@ -112,18 +111,18 @@ def write_report(config: DemoConfig, result: DemoResult) -> Path:
     return path
 
 
-def _answer_cells(asked: Asked) -> tuple[str, ...]:
+def _answer_cells(frame: PostedFrame) -> tuple[str, ...]:
     """True and predicted values of a frame, separated by a slash."""
-    answer = asked.answer
-    distances = ((asked.distances[name], answer["distances_m"][name]) for name in MARKINGS)
+    answer = frame.answer
+    distances = ((frame.distances[name], answer["distances_m"][name]) for name in MARKINGS)
     return (
-        asked.round_id,
-        asked.track,
-        str(asked.lanes),
+        frame.round_id,
+        frame.track,
+        str(frame.lanes),
         *(_pair(*values, 2) for values in distances),
-        _pair(asked.to_lane_centre, answer["to_lane_centre_m"], 2),
-        _pair(asked.angle, answer["angle_rad"], 3),
-        f"{asked.heading} / {asked.answered_heading}",
+        _pair(frame.to_lane_centre, answer["to_lane_centre_m"], 2),
+        _pair(frame.angle, answer["angle_rad"], 3),
+        f"{frame.heading} / {frame.answered_heading}",
     )
 
 
@@ -131,14 +130,14 @@ def _pair(true: float | None, predicted: float | None, digits: int) -> str:
     return " / ".join("inactive" if v is None else f"{v:+.{digits}f}" for v in (true, predicted))
 
 
-def _figures(camera: CameraParameters, asked: list[Asked]) -> Iterator[dict[str, str]]:
+def _figures(camera: CameraParameters, frames: list[PostedFrame]) -> Iterator[dict[str, str]]:
     """The frames with true and predicted markings drawn on them, and their captions."""
-    height_m = camera.z + CarParameters().cg_height
-    for one in asked:
-        frame = simplejpeg.decode_jpeg(one.jpeg)
+    height_m = camera.height_above_road_m
+    for one in frames:
+        image = simplejpeg.decode_jpeg(one.jpeg)
         prediction = (one.answer["distances_m"], one.answer["angle_rad"])
         truth = (one.distances, one.angle)
-        drawn = draw_overlay(frame, camera, height_m, one.curvature, truth, prediction)
+        drawn = draw_overlay(image, camera, height_m, one.curvature, truth, prediction)
         lanes = f"{one.lanes} lane{'s' if one.lanes > 1 else ''}"
         yield {"jpeg": embed_jpeg(drawn), "caption": f"{one.track}, {lanes}, {one.round_id}"}
 
@@ -160,35 +159,35 @@ def _training_curves(path: Path) -> Markup | None:
 # The tables for the terminal.
 
 
-def print_tables(verdicts: list[Verdict], asked: list[Asked]) -> None:
-    """Print the verdicts, and true beside predicted values, on standard output."""
+def print_tables(checks: list[LimitCheck], frames: list[PostedFrame]) -> None:
+    """Print the limit checks, and true beside predicted values, on standard output."""
     console = Console()
     console = Console(width=max(console.width, MIN_TERMINAL_WIDTH))
-    console.print(_verdict_table(verdicts))
-    console.print(_answers_table(asked))
+    console.print(_limit_table(checks))
+    console.print(_answers_table(frames))
 
 
-def _verdict_table(verdicts: list[Verdict]) -> Table:
+def _limit_table(checks: list[LimitCheck]) -> Table:
     title = (
         f"Rounds of unseen seeds (learned: an error of at most {LEARNED_RATIO} of the training "
         "mean's)"
     )
     table = Table(title=title)
-    for column in VERDICT_COLUMNS:
+    for column in LIMIT_COLUMNS:
         table.add_column(column, justify="left" if column == "feature" else "right")
-    for one in verdicts:
-        table.add_row(*verdict_cells(one))
+    for one in checks:
+        table.add_row(*check_cells(one))
     return table
 
 
-def _answers_table(asked: list[Asked]) -> Table:
+def _answers_table(frames: list[PostedFrame]) -> Table:
     table = Table(
         title="Held-out frames: true, predicted (centre: offset from the centre of the lane)"
     )
     columns = ("track", "lanes", "centre (m)", "ml (m)", "mr (m)", "m (m)", "angle (rad)")
     for column in (*columns, "heading"):
         table.add_column(column, no_wrap=True, justify="right")
-    for one in asked:
+    for one in frames:
         found = one.answer["distances_m"]
         table.add_row(
             one.track,

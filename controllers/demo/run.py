@@ -12,7 +12,7 @@ import numpy as np
 from rich.console import Console
 
 from controllers.config import DemoConfig
-from controllers.demo.frames import Asked, ask, spread
+from controllers.demo.frames import PostedFrame, post_frames, spread
 from controllers.demo.process import run_module, running_service
 from datagen.recording import Dataset
 from serve.client import Client
@@ -30,7 +30,7 @@ class DemoResult:
     collected: dict[str, Any] = field(default_factory=dict)
     evaluation: dict[str, Any] = field(default_factory=dict)
     drive: dict[str, Any] = field(default_factory=dict)
-    asked: list[Asked] = field(default_factory=list)
+    asked: list[PostedFrame] = field(default_factory=list)
     commands: list[str] = field(default_factory=list)
     seconds: dict[str, float] = field(default_factory=dict)
 
@@ -80,7 +80,7 @@ def _use_service(config: DemoConfig, result: DemoResult) -> None:
         running_service(config.out / "run", config.out / "serve.log") as url,
         Client(url) as client,
     ):
-        result.asked = ask(frames, chosen, client)
+        result.asked = post_frames(frames, chosen, client)
         result.seconds["serve"] = time.monotonic() - started
         drive = ["controllers", "drive", "--controller", "lqr", "--track", config.drive_track]
         drive += ["--lanes", "1", "--perception", url, "--steps", str(DRIVE_STEPS), "--json"]

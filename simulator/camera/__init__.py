@@ -1,6 +1,6 @@
 """The renderer: camera images of the simulated road under different lights and weather."""
 
-from simulator.camera.core.camera import Camera, check_size
+from simulator.camera.core.camera import Camera, check_size, open_camera
 from simulator.camera.core.optics import VIEWS
 from simulator.camera.core.render_modes import CLASSES, PICTURE_KINDS
 from simulator.camera.scene.light import KINDS, Light, check_light
@@ -14,4 +14,5 @@ __all__ = [
     "Light",
     "check_light",
     "check_size",
+    "open_camera",
 ]

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from simulator.camera.core.optics import NEAR_M
-from simulator.track.kernel import road_points
+from simulator.track.piece_table import road_points
 from simulator.track.road import Road
 
 if TYPE_CHECKING:

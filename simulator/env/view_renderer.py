@@ -116,7 +116,12 @@ class ViewRenderer:
     def camera(self) -> "Camera":
         """The camera, built on first use: building the scenery takes seconds."""
         if self._camera is None:
-            self._camera = _build_camera(self._road, self._options)
+            from simulator.camera import open_camera  # loads the renderer only when it is needed
+
+            options = self._options
+            self._camera = open_camera(
+                self._road, options.camera, light=options.light, seed=options.light_seed
+            )
             # Frees the graphics memory of an environment that is dropped without close().
             weakref.finalize(self, self._camera.close).atexit = False
         return self._camera
@@ -127,10 +132,3 @@ class ViewRenderer:
             self._camera.close()
             self._camera = None
         self._images = {}
-
-
-def _build_camera(road: Road, options: RenderOptions) -> "Camera":
-    from simulator.camera import Camera, Light  # loads the renderer only when images are needed
-
-    light = Light.named(options.light, np.random.default_rng([options.light_seed, 2]))
-    return Camera(road, options.camera, seed=options.light_seed, light=light)

@@ -14,7 +14,6 @@ Give one Link to one thread of one process.
 import math
 import os
 import time
-from types import TracebackType
 from typing import Self
 
 from simulator.link.channel import Receiver, Sender, state_image_bytes
@@ -112,12 +111,7 @@ class Link:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def _request(self) -> Message:
@@ -139,8 +133,8 @@ class Link:
         while not (self._receive(POLL_INTERVAL_S) and self._answered()):
             if time.monotonic() > until:
                 raise LinkTimeout(
-                    f"{self._server} lives, but has not answered within {self._timeout_s:g} s; "
-                    "is it stopped, or too busy? A longer timeout_s waits longer"
+                    f"{self._server} is running, but has not answered within {self._timeout_s:g} s"
+                    "; is it stopped, or too busy? A longer timeout_s waits longer"
                 )
 
     def _receive(self, seconds: float = 0.0) -> bool:

@@ -13,13 +13,11 @@ from typing import Annotated
 import typer
 
 from simulator.link.config import LinkConfig
+from simulator.track.cli import Lanes, LaneWidth, Traffic
 from trackfeatures.errors import UserError
 
 Name = Annotated[str, typer.Option(help="Name of the shared memory: a slash and letters.")]
 Track = Annotated[str, typer.Option(help="Name of a track, or a track file.")]
-Lanes = Annotated[int, typer.Option(help="Number of lanes, 1 to 3.")]
-LaneWidth = Annotated[float, typer.Option(help="Metres, 3.0 to 4.5.")]
-Traffic = Annotated[int, typer.Option(help="Number of other cars.", min=0, max=12)]
 Frequency = Annotated[int, typer.Option(help="Control steps per second; must divide 200.")]
 Seed = Annotated[
     int, typer.Option(help="Seed of scenery, light and episodes that name none.", min=0)

@@ -97,8 +97,8 @@ def _warm_up(
 
 
 def _camera(road: Road, config: LinkConfig) -> "Camera":
-    from simulator.camera import Camera, Light  # loads the renderer only when images are needed
+    from simulator.camera import open_camera  # loads the renderer only when images are needed
 
-    light = Light.named(config.light, np.random.default_rng([config.seed, 2]))
-    width, height = config.picture
-    return Camera(road, CameraParameters(width, height), seed=config.seed, light=light)
+    return open_camera(
+        road, CameraParameters(*config.picture), light=config.light, seed=config.seed
+    )

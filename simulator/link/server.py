@@ -7,7 +7,6 @@ wall clock, holding the last command, while an episode runs.
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from types import TracebackType
 from typing import Any, Self
 
 from simulator.link.channel import Receiver, Sender
@@ -22,9 +21,9 @@ from simulator.link.layout import (
     image_bytes,
     segment_size,
 )
-from simulator.link.realtime import RealtimeClock
 from simulator.link.segment import POLL_INTERVAL_S, create
 from simulator.link.simulation import Simulation
+from simulator.world.pace import Pacer
 
 MakeSimulation = Callable[[Any, Any], Simulation]
 
@@ -68,7 +67,9 @@ class LinkServer:
         self._inbox = Receiver(self._segment, COMMAND)
         self._outbox = Sender(self._segment, STATE, size)
         self._simulation = make_simulation(self._outbox.record, self._outbox.image)
-        self._clock = RealtimeClock(info.frequency_hz) if info.mode is Mode.REALTIME else None
+        step_s = 1.0 / info.frequency_hz
+        realtime = info.mode is Mode.REALTIME
+        self._pacer = Pacer(step_s, catch_up_s=step_s) if realtime else None
         self._once, self._patience_s, self._report = once, patience_s, report
         self._session, self._pid = 0, 0
         self._last_command_s = 0.0
@@ -108,20 +109,15 @@ class LinkServer:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def _wait_for_command(self) -> bool:
         """Wait up to POLL_INTERVAL_S for a command, or in real time until the next tick; returns
         whether there is one."""
-        if self._clock is None or not self._simulation.running:
+        if self._pacer is None or not self._simulation.running:
             return self._inbox.wait(POLL_INTERVAL_S)
-        self._outbox.record["late_steps"] += self._clock.wait()
+        self._outbox.record["late_steps"] += self._pacer.wait()
         if self._inbox.poll():
             return True
         self._simulation.advance()
@@ -138,9 +134,9 @@ class LinkServer:
             self._simulation.reject("the command's checksum is wrong: see driverview_link.h")
         else:
             self._simulation.answer(request)
-        if int(record["episode"]) != before[0] and self._clock is not None:
-            self._clock.restart()
-        elif self._clock is not None and before[1] == record["step"] and self._simulation.running:
+        if int(record["episode"]) != before[0] and self._pacer is not None:
+            self._pacer.restart()
+        elif self._pacer is not None and before[1] == record["step"] and self._simulation.running:
             self._simulation.advance()  # refused, but in real time the step takes place
         record["session"], record["answers"] = request["session"], request["number"]
         self._send()
@@ -157,10 +153,10 @@ class LinkServer:
         self._session, self._pid = int(request["session"]), int(request["client_pid"])
         self._clients += 1
         self._simulation.end_episode()
-        self._report(f"client {self._pid} has come")
+        self._report(f"client {self._pid} has connected")
 
     def _release_client(self, request: Request) -> None:
-        self._report(f"client {self._pid} has left")
+        self._report(f"client {self._pid} has disconnected")
         self._session = 0
         self._simulation.end_episode()
         self._done = self._once or request is Request.QUIT
@@ -170,7 +166,7 @@ class LinkServer:
             self._drop_client()
         elif 0.0 < self._patience_s < time.monotonic() - self._last_command_s:
             raise ClientLost(
-                f"client {self._pid} lives, but has sent nothing for {self._patience_s:g} s; "
+                f"client {self._pid} is running, but has sent nothing for {self._patience_s:g} s; "
                 "start the server again, with a longer --patience for a slower client"
             )
 

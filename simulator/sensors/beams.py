@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runtime.jit import compiled
-from simulator.track.kernel import CURVATURE, HEADING0, LENGTH, X0, Y0, Table, locate
+from simulator.track.piece_table import CURVATURE, HEADING0, LENGTH, X0, Y0, Table, locate
 
 FloatArray = NDArray[np.float64]
 

@@ -19,7 +19,7 @@ from simulator.sensors.beams import (
     track_beams,
 )
 from simulator.sensors.sensor import Sensor
-from simulator.track.kernel import index_at
+from simulator.track.piece_table import index_at
 from simulator.traffic.traffic import TRAFFIC_CAR_SIZE
 from simulator.world.world import World
 from trackfeatures.errors import UserError

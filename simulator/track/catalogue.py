@@ -63,9 +63,9 @@ def _reader(suffix: str) -> Callable[[Path], Track]:
         from simulator.track.centre_line_csv import read_centre_line
 
         return read_centre_line
-    from simulator.track.own import read_own
+    from simulator.track.toml_track import read_toml_track
 
-    return read_own
+    return read_toml_track
 
 
 def track_files(tracks_dir: Path | None = None) -> dict[str, Path]:

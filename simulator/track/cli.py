@@ -18,6 +18,10 @@ TracksDir = Annotated[
     Path | None, typer.Option(help="Folder of TORCS (or .toml, .csv) tracks to look in as well.")
 ]
 
+Lanes = Annotated[int, typer.Option(help="Number of lanes, 1 to 3.")]
+LaneWidth = Annotated[float, typer.Option(help="Metres, 3.0 to 4.5.")]
+Traffic = Annotated[int, typer.Option(help="Number of other cars.", min=0, max=12)]
+
 tracks = typer.Typer(rich_markup_mode="rich")
 
 
@@ -45,7 +49,7 @@ def plot(
     context: typer.Context,
     track: TrackName,
     out: Annotated[Path | None, typer.Option(help="PNG file; NAME.png here if not given.")] = None,
-    lanes: Annotated[int, typer.Option(help="Number of lanes, 1 to 3.")] = 1,
+    lanes: Lanes = 1,
     tracks_dir: TracksDir = None,
 ) -> None:
     """Draw a track: plan, and height, curvature and heading class along the lap, as PNG."""

@@ -5,14 +5,14 @@ y and to_middle in metres, left positive; headings in radians, counter-clockwise
 """
 
 import hashlib
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from simulator.track import kernel
+from simulator.track import piece_table
 from simulator.track.markings import MarkingStyle
 from simulator.track.pieces import Placed
 
@@ -69,24 +69,8 @@ class Track:
         markings: MarkingStyle,
     ) -> Self:
         """Build a track from pieces put end to end."""
-        return cls(
-            name,
-            source,
-            width,
-            surface,
-            look,
-            markings,
-            placed.s0,
-            placed.length,
-            placed.x0,
-            placed.y0,
-            placed.heading0,
-            placed.curvature,
-            placed.z_left0,
-            placed.z_right0,
-            placed.z_left1,
-            placed.z_right1,
-        )
+        arrays = [getattr(placed, field.name) for field in fields(Placed) if field.name != "end"]
+        return cls(name, source, width, surface, look, markings, *arrays)
 
     @property
     def length_m(self) -> float:
@@ -119,23 +103,23 @@ class Track:
 
     @cached_property
     def _table(self) -> FloatArray:
-        table = np.empty((len(self.s0), kernel.COLUMNS), dtype=np.float64)
-        table[:, kernel.S0] = self.s0
-        table[:, kernel.LENGTH] = self.length
-        table[:, kernel.X0] = self.x0
-        table[:, kernel.Y0] = self.y0
-        table[:, kernel.HEADING0] = self.heading0
-        table[:, kernel.CURVATURE] = self.curvature0
-        table[:, kernel.Z_LEFT0] = self.z_left0
-        table[:, kernel.Z_RIGHT0] = self.z_right0
-        table[:, kernel.Z_LEFT1] = self.z_left1
-        table[:, kernel.Z_RIGHT1] = self.z_right1
-        table[:, kernel.HALF_WIDTH] = self.width / 2
-        table[:, kernel.TRACK_LENGTH] = self.length_m
+        table = np.empty((len(self.s0), piece_table.COLUMNS), dtype=np.float64)
+        table[:, piece_table.S0] = self.s0
+        table[:, piece_table.LENGTH] = self.length
+        table[:, piece_table.X0] = self.x0
+        table[:, piece_table.Y0] = self.y0
+        table[:, piece_table.HEADING0] = self.heading0
+        table[:, piece_table.CURVATURE] = self.curvature0
+        table[:, piece_table.Z_LEFT0] = self.z_left0
+        table[:, piece_table.Z_RIGHT0] = self.z_right0
+        table[:, piece_table.Z_LEFT1] = self.z_left1
+        table[:, piece_table.Z_RIGHT1] = self.z_right1
+        table[:, piece_table.HALF_WIDTH] = self.width / 2
+        table[:, piece_table.TRACK_LENGTH] = self.length_m
         return table
 
     def arrays(self) -> FloatArray:
-        """The C-contiguous (P, 12) table that the kernels of `track.kernel` take."""
+        """The C-contiguous (P, 12) table that the functions of `piece_table` take."""
         return self._table
 
     def at(self, s: ArrayLike, y: ArrayLike = 0.0) -> TrackPose:
@@ -167,22 +151,22 @@ class Track:
         the track near that s, which tells a bridge from the road below.
         """
         table = self.arrays()
-        hint = -1 if hint_s is None else kernel.index_at(table, float(hint_s))
-        _, s, to_middle = kernel.locate(table, float(x), float(y), hint)
+        hint = -1 if hint_s is None else piece_table.index_at(table, float(hint_s))
+        _, s, to_middle = piece_table.locate(table, float(x), float(y), hint)
         return float(s), float(to_middle)
 
     def heading(self, s: float) -> float:
         """Tangent direction at s, rad in (-pi, pi]."""
-        _, _, _, heading, _ = kernel.pose_at(self.arrays(), float(s))
+        _, _, _, heading, _ = piece_table.pose_at(self.arrays(), float(s))
         return float(wrap_angle(np.float64(heading)))
 
     def curvature(self, s: float) -> float:
         """Signed curvature at s (left positive), 1/m; s wraps. `at` is the vectorised one."""
-        return float(self.curvature0[kernel.index_at(self.arrays(), float(s))])
+        return float(self.curvature0[piece_table.index_at(self.arrays(), float(s))])
 
     def slope(self, s: float) -> float:
         """Rise of the centre line per metre of s at s (dz/ds, uphill positive)."""
-        i = kernel.index_at(self.arrays(), float(s))
+        i = piece_table.index_at(self.arrays(), float(s))
         rise = self.z_left1[i] + self.z_right1[i] - self.z_left0[i] - self.z_right0[i]
         return float(rise / 2.0 / self.length[i])
 

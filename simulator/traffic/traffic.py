@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from simulator.track.geometry import Track
 from simulator.track.road import START_BEFORE_LINE_M, Road
-from simulator.traffic import kernel
+from simulator.traffic import car_table
 from simulator.traffic.idm import COMFORTABLE_BRAKING, STANDSTILL_GAP_M, TIME_HEADWAY_S
 from simulator.traffic.wreck import TRAFFIC_CAR
 from simulator.vehicle.car import CarParameters
@@ -56,7 +56,7 @@ class Traffic:
         start = self._length - START_BEFORE_LINE_M if ego_s is None else ego_s
         self._limit = _curve_speed_limits(road.track, float(np.max(self._lane_y)))
         self._cars = self._initial_cars(count, rng, start % self._length)
-        self._bodies = np.zeros((count + 1, kernel.BODY_COLUMNS))
+        self._bodies = np.zeros((count + 1, car_table.BODY_COLUMNS))
         self._poses = np.zeros((count, 6))
         self._update_ego(start % self._length, 0.0, 0.0)
         self._update_bodies()
@@ -64,22 +64,22 @@ class Traffic:
     @property
     def s(self) -> FloatArray:
         """(n,) m along the centre line, of the car's centre."""
-        return self._cars[:, kernel.S].copy()
+        return self._cars[:, car_table.S].copy()
 
     @property
     def to_middle(self) -> FloatArray:
         """(n,) m, left positive."""
-        return self._cars[:, kernel.Y].copy()
+        return self._cars[:, car_table.Y].copy()
 
     @property
     def speed(self) -> FloatArray:
         """(n,) m/s along the lane."""
-        return self._cars[:, kernel.SPEED].copy()
+        return self._cars[:, car_table.SPEED].copy()
 
     @property
     def desired_speed(self) -> FloatArray:
         """(n,) m/s each car would drive on a free, straight road."""
-        return self._cars[:, kernel.DESIRED].copy()
+        return self._cars[:, car_table.DESIRED].copy()
 
     def poses(self) -> FloatArray:
         """(n, 6) x, y, z, roll, pitch, yaw (m, rad) of the ground point under each car's centre."""
@@ -90,7 +90,7 @@ class Traffic:
         if self.count == 0:
             return
         self._update_ego(ego_s, ego_to_middle, ego_speed)
-        kernel.step_traffic(
+        car_table.step_traffic(
             self._cars,
             self._bodies,
             dt,
@@ -101,17 +101,17 @@ class Traffic:
             0.5 * TRAFFIC_CAR_SIZE[0],
             0.5 * TRAFFIC_CAR_SIZE[1],
         )
-        kernel.update_poses(self._cars, self._table, self._poses)
+        car_table.update_poses(self._cars, self._table, self._poses)
 
     @property
     def struck(self) -> NDArray[np.bool_]:
         """(n,) whether each car was hit; struck cars are obstacles that physics moves."""
-        return self._cars[:, kernel.STRUCK] > 0.0
+        return self._cars[:, car_table.STRUCK] > 0.0
 
     def mark_struck(self, row: int) -> None:
         """Remove car `row` from lane driving; from now on `set_struck_pose` moves it."""
-        self._cars[row, kernel.STRUCK] = 1.0
-        self._cars[row, kernel.CHANGE_PROGRESS] = 1.0
+        self._cars[row, car_table.STRUCK] = 1.0
+        self._cars[row, car_table.CHANGE_PROGRESS] = 1.0
 
     def set_struck_pose(self, row: int, pose: FloatArray, track_state: FloatArray) -> None:
         """Set the ground `pose` (6,) of a struck car; `track_state` (4,): s, to_middle, angle and
@@ -121,7 +121,7 @@ class Traffic:
         half_length = 0.5 * (TRAFFIC_CAR_SIZE[0] * cos + TRAFFIC_CAR_SIZE[1] * sin)
         half_width = 0.5 * (TRAFFIC_CAR_SIZE[0] * sin + TRAFFIC_CAR_SIZE[1] * cos)
         self._poses[row] = pose
-        self._cars[row, [kernel.S, kernel.Y, kernel.SPEED]] = s, to_middle, speed
+        self._cars[row, [car_table.S, car_table.Y, car_table.SPEED]] = s, to_middle, speed
         left, right = to_middle + half_width, to_middle - half_width
         forward = max(speed, 0.0)
         self._bodies[row] = (s, right, left, forward, half_length, max(forward, 1.0))
@@ -141,7 +141,7 @@ class Traffic:
     def has_room(self, s: float, to_middle: float, speed: float) -> bool:
         """Whether the ego car at `s` may change to `to_middle` with both gaps safe."""
         half = 0.5 * EGO_CAR_SIZE[1]
-        safe, _ = kernel.lane_change_safe(
+        safe, _ = car_table.lane_change_safe(
             self._bodies,
             self.count,
             s,
@@ -157,7 +157,7 @@ class Traffic:
         self, s: float, to_middle: float, exclude: int | None, *, ahead: bool
     ) -> tuple[float, float] | None:
         half = 0.5 * EGO_CAR_SIZE[1]
-        row, gap = kernel.nearest_body(
+        row, gap = car_table.nearest_body(
             self._bodies[: self.count],
             -1 if exclude is None else exclude,
             s,
@@ -167,7 +167,7 @@ class Traffic:
             self._length,
             ahead,
         )
-        return None if row < 0 else (float(gap), float(self._bodies[row, kernel.B_SPEED]))
+        return None if row < 0 else (float(gap), float(self._bodies[row, car_table.B_SPEED]))
 
     def _update_ego(self, s: float, to_middle: float, speed: float) -> None:
         half = 0.5 * EGO_CAR_SIZE[1]
@@ -182,10 +182,10 @@ class Traffic:
         )
 
     def _update_bodies(self) -> None:
-        kernel.update_bodies(
+        car_table.update_bodies(
             self._cars, self._bodies, 0.5 * TRAFFIC_CAR_SIZE[0], 0.5 * TRAFFIC_CAR_SIZE[1]
         )
-        kernel.update_poses(self._cars, self._table, self._poses)
+        car_table.update_poses(self._cars, self._table, self._poses)
 
     def _initial_cars(self, count: int, rng: np.random.Generator, ego_s: float) -> FloatArray:
         nearest = MIN_START_GAP_M + 0.5 * (TRAFFIC_CAR_SIZE[0] + EGO_CAR_SIZE[0])
@@ -199,31 +199,31 @@ class Traffic:
                 f"{count} traffic cars asked for, but {self.road.track.name!r} with {lanes} "
                 f"lane(s) takes 0 to {fits}; ask for fewer"
             )
-        cars = np.zeros((count, kernel.CAR_COLUMNS))
+        cars = np.zeros((count, car_table.CAR_COLUMNS))
         lane = rng.permutation(np.arange(count) % lanes)
         reach = min(room, max(START_RANGE_M, _PER_CAR_M * count))
         for number in range(lanes):
             rows = np.flatnonzero(lane == number)
             ahead = nearest + _random_places(len(rows), reach, rng)
-            cars[rows, kernel.S] = (ego_s + ahead) % self._length
-            cars[rows, kernel.Y] = self._lane_y[number]
-            cars[rows, kernel.DESIRED] = rng.uniform(*DESIRED_KMH, size=len(rows)) / 3.6
+            cars[rows, car_table.S] = (ego_s + ahead) % self._length
+            cars[rows, car_table.Y] = self._lane_y[number]
+            cars[rows, car_table.DESIRED] = rng.uniform(*DESIRED_KMH, size=len(rows)) / 3.6
             gaps = np.append(np.diff(ahead), self._length - ahead[-1:]) - TRAFFIC_CAR_SIZE[0]
-            cars[rows, kernel.SPEED] = self._initial_speed(cars[rows], gaps)
-        cars[:, kernel.Y_FROM] = cars[:, kernel.Y_TO] = cars[:, kernel.Y]
-        cars[:, kernel.CHANGE_PROGRESS] = 1.0
+            cars[rows, car_table.SPEED] = self._initial_speed(cars[rows], gaps)
+        cars[:, car_table.Y_FROM] = cars[:, car_table.Y_TO] = cars[:, car_table.Y]
+        cars[:, car_table.CHANGE_PROGRESS] = 1.0
         # Different cooldowns, so that the first lane changes are not simultaneous.
-        cars[:, kernel.COOLDOWN_S] = rng.uniform(0.0, kernel.CHANGE_COOLDOWN_S, size=count)
+        cars[:, car_table.COOLDOWN_S] = rng.uniform(0.0, car_table.CHANGE_COOLDOWN_S, size=count)
         return cars
 
     def _initial_speed(self, cars: FloatArray, gaps: FloatArray) -> FloatArray:
         """(n,) start speed (m/s) that keeps the curve limit and the time headway, and from which a
         car can stop behind a leader at rest; `gaps` (n,) m."""
         cells = len(self._limit)
-        cell = (cars[:, kernel.S] / self._length * cells).astype(int) % cells
+        cell = (cars[:, car_table.S] / self._length * cells).astype(int) % cells
         free = np.maximum(gaps - STANDSTILL_GAP_M, 0.0)
         keeping = np.minimum(free / TIME_HEADWAY_S, np.sqrt(2 * COMFORTABLE_BRAKING * free))
-        speed: FloatArray = np.minimum(cars[:, kernel.DESIRED], self._limit[cell])
+        speed: FloatArray = np.minimum(cars[:, car_table.DESIRED], self._limit[cell])
         return np.minimum(speed, keeping)
 
 
@@ -244,6 +244,6 @@ def _curve_speed_limits(track: Track, outermost_y: float) -> FloatArray:
     sharpness = np.abs(curvature)
     innermost = sharpness / np.maximum(1.0 - sharpness * outermost_y, 0.1)
     squared = LATERAL_ACCELERATION / np.maximum(innermost, 1e-6)
-    kernel.limit_deceleration(squared, 2 * COMFORTABLE_BRAKING * step)
+    car_table.limit_deceleration(squared, 2 * COMFORTABLE_BRAKING * step)
     limit: FloatArray = np.sqrt(squared)
     return limit

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runtime.jit import compiled
-from simulator.track.kernel import Table, index_at
+from simulator.track.piece_table import Table, index_at
 from simulator.vehicle.car import RPM, CarParameters
 from simulator.vehicle.dynamics import ENGINE, MEMORY, PIECE, SPIN, compute_forces
 from simulator.vehicle.orientation import rotation

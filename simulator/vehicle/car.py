@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
 
 GRAVITY = 9.81  # m/s2
@@ -42,7 +43,7 @@ class CarParameters:
     """m from the centre of gravity to the rear axle, lr."""
     front_track: float = 1.68
     rear_track: float = 1.60
-    cg_height: float = 0.25
+    cg_height: float = CameraParameters.cg_height_m
     """m above the road, at rest."""
     length: float = 4.52
     width: float = 1.94

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runtime.jit import compiled
-from simulator.track.kernel import Table, locate, surface
+from simulator.track.piece_table import Table, locate, surface
 from simulator.vehicle.car import GRAVITY
 from simulator.vehicle.orientation import rotation
 from simulator.vehicle.powertrain import clutch, free_engine_speed, gear_ratio

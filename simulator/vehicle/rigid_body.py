@@ -11,12 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runtime.jit import compiled
-from simulator.track.kernel import Table, locate
+from simulator.track.piece_table import Table, locate
 from simulator.traffic.wreck import TRAFFIC_CAR
 from simulator.vehicle.dynamics import DT, PIECE, accelerate, compute_forces
 from simulator.vehicle.orientation import rotation
 from simulator.vehicle.surface import Ground
-from simulator.world.boxes import boxes_overlap
 
 Vector = NDArray[np.float64]
 
@@ -77,6 +76,22 @@ def integrate(p: Any, motion: Vector, wrench: Vector) -> None:
         motion[10 + i] += tx * axes[0, i] + ty * axes[1, i] + tz * axes[2, i]
         motion[i] += DT * motion[7 + i]
     rotate(motion[3:7], motion[10], motion[11], motion[12], DT)
+
+
+@compiled
+def boxes_overlap(a: Vector, b: Vector) -> bool:
+    """Whether two boxes (x, y, yaw, length, width) overlap, by the separating-axis theorem."""
+    dx, dy = b[0] - a[0], b[1] - a[1]
+    turn = b[2] - a[2]
+    cos, sin = abs(math.cos(turn)), abs(math.sin(turn))
+    for yaw, own, other in ((a[2], a, b), (b[2], b, a)):
+        along = abs(dx * math.cos(yaw) + dy * math.sin(yaw))
+        across = abs(-dx * math.sin(yaw) + dy * math.cos(yaw))
+        if along > 0.5 * (own[3] + other[3] * cos + other[4] * sin):
+            return False
+        if across > 0.5 * (own[4] + other[3] * sin + other[4] * cos):
+            return False
+    return True
 
 
 @compiled

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runtime.jit import compiled
-from simulator.track.kernel import CURVATURE, HEADING0, LENGTH, S0, Table, locate
+from simulator.track.piece_table import CURVATURE, HEADING0, LENGTH, S0, Table, locate
 from simulator.vehicle.dynamics import PIECE
 from simulator.vehicle.orientation import rotation
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runtime.jit import compiled
-from simulator.track.kernel import Table, locate, surface
+from simulator.track.piece_table import Table, locate, surface
 from simulator.vehicle.surface import Ground, surface_under_wheel
 from simulator.vehicle.tyre import peak_force, tyre_slip_gain
 

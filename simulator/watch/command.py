@@ -8,8 +8,6 @@ import socket
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
-from pathlib import Path
 from types import FrameType
 from typing import Final
 
@@ -18,26 +16,10 @@ from simulator.camera import check_light
 from simulator.camera.core.context import graphics
 from simulator.track.catalogue import find_track
 from simulator.track.road import Road
-from simulator.watch.pace import check_speed
+from simulator.watch.cli import WatchConfig
+from simulator.world.pace import check_speed
 
 FREQUENCY_HZ: Final = 20
-
-
-@dataclass(frozen=True)
-class WatchConfig:
-    """The options of `simulator watch`."""
-
-    track: str = "circuit"
-    lanes: int = 1
-    traffic: int = 0
-    light: str = "clear"
-    host: str = "127.0.0.1"
-    port: int = 8765
-    """0: any free one; the first line says which."""
-    speed: float = 1.0
-    """Simulated seconds per second of wall-clock time."""
-    seed: int = 0
-    tracks_dir: Path | None = None
 
 
 def watch(config: WatchConfig) -> None:

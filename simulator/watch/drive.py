@@ -6,14 +6,14 @@ from typing import Final
 import trackfeatures as tf
 from simulator.driving.cruise import Cruise
 from simulator.vehicle.state import CarState, Command
+from simulator.watch.episode_score import Score
 from simulator.watch.hub import Browser, Hub
 from simulator.watch.keyboard import Keyboard
 from simulator.watch.messages import scene_message, state_message
-from simulator.watch.pace import Pacer, Rate
 from simulator.watch.pictures import JpegRenderer
 from simulator.watch.requests import BrowserRequest
-from simulator.watch.score import Score
 from simulator.watch.server import FIRST_VIEW
+from simulator.world.pace import Pacer, Rate
 from simulator.world.world import World
 
 SHOW_S: Final = 1.0 / 26.0

@@ -3,10 +3,9 @@
 from collections.abc import Sequence
 from typing import Final
 
-import numpy as np
 import simplejpeg
 
-from simulator.camera import Camera, Light, check_light
+from simulator.camera import Camera, check_light, open_camera
 from simulator.track.road import Road
 from simulator.world.world import World
 from trackfeatures.camera import CameraParameters
@@ -35,10 +34,8 @@ class JpegRenderer:
     def open(self) -> Camera:
         """The camera, made on first use. Raises NoRendererError where nothing can draw."""
         if self._camera is None:
-            light = Light.named(self.light, np.random.default_rng([self._seed, 2]))
-            width, height = SIZE
-            camera = CameraParameters(width, height)
-            self._camera = Camera(self.road, camera, seed=self._seed, light=light)
+            parameters = CameraParameters(*SIZE)
+            self._camera = open_camera(self.road, parameters, light=self.light, seed=self._seed)
         return self._camera
 
     def render(self, world: World, views: Sequence[str]) -> dict[str, bytes]:

@@ -2,17 +2,16 @@
 
 import sys
 import time
-from types import TracebackType
 from typing import Any, Final, Self
 
 from runtime.sockets import address, bind
 from simulator.track.road import Road
+from simulator.watch.episode_score import Score
 from simulator.watch.hub import Hub
 from simulator.watch.messages import scene_message, state_message
-from simulator.watch.pace import Pacer, Rate
 from simulator.watch.pictures import JpegRenderer
-from simulator.watch.score import Score
 from simulator.watch.server import Server
+from simulator.world.pace import Pacer, Rate
 from simulator.world.world import World
 from trackfeatures.errors import UserError
 
@@ -78,12 +77,7 @@ class Watcher:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def _change_road(self, world: World) -> None:

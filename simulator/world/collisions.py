@@ -8,7 +8,7 @@ and moves as a rigid body. World frame, SI units.
 import numpy as np
 from numpy.typing import NDArray
 
-from simulator.track.kernel import locate
+from simulator.track.piece_table import locate
 from simulator.track.road import Road
 from simulator.traffic.traffic import Traffic
 from simulator.traffic.wreck import TRAFFIC_CAR, Wreck, lane_motion

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runtime.jit import compiled
-from simulator.track.kernel import Table, index_at, pose_at, surface
+from simulator.track.piece_table import Table, index_at, pose_at, surface
 from simulator.track.road import Road
 
 PANEL = (6.0, 3.0, 8.0)

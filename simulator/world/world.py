@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import trackfeatures as tf
-from simulator.track.kernel import foot_offset, index_at, surface
+from simulator.track.piece_table import foot_offset, index_at, surface
 from simulator.track.road import START_BEFORE_LINE_M, Road
 from simulator.traffic.traffic import Traffic
 from simulator.vehicle.car import HIGHEST_GEAR, LOWEST_GEAR, RPM, CarParameters

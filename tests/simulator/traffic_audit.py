@@ -9,11 +9,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from runtime.jit import compiled
 from simulator.driving.cruise import Cruise
 from simulator.track.road import Road
 from simulator.traffic.traffic import DESIRED_KMH, EGO_CAR_SIZE, MAX_CARS, TRAFFIC_CAR_SIZE, Traffic
+from simulator.vehicle.rigid_body import boxes_overlap
 from simulator.vehicle.state import CarState, Command
-from simulator.world.boxes import first_overlap
 from simulator.world.world import World
 
 FREQUENCY_HZ = 20
@@ -106,3 +107,15 @@ def _check(road: Road, state: CarState, before: _Moment, now: _Moment) -> None:
         raise TrafficViolation(f"a car slid sideways at {state.time_s:.2f} s")
     if not math.isfinite(float(now.poses.sum())):
         raise TrafficViolation(f"a position is not finite at {state.time_s:.2f} s")
+
+
+@compiled
+def first_overlap(boxes: NDArray[np.float64]) -> tuple[int, int]:
+    """Indices of the first pair of `boxes` (n, 5) that overlap, (-1, -1) if none do."""
+    for i in range(boxes.shape[0]):
+        for j in range(i + 1, boxes.shape[0]):
+            reach = boxes[i, 3] + boxes[j, 3]
+            near = abs(boxes[i, 0] - boxes[j, 0]) < reach and abs(boxes[i, 1] - boxes[j, 1]) < reach
+            if near and boxes_overlap(boxes[i], boxes[j]):
+                return i, j
+    return -1, -1

@@ -3,7 +3,6 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
@@ -230,12 +229,7 @@ class Camera:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def shadow_fraction(self, body_pose: ArrayLike) -> float:
@@ -271,6 +265,12 @@ class Camera:
         block[16:19], block[20:23] = eye.place, eye.axes[2]
         self._graphics.frame.write(block.tobytes())
         self._graphics.frame.bind_to_uniform_block(FRAME_BINDING)
+
+
+def open_camera(road: Road, parameters: CameraParameters, *, light: str, seed: int) -> Camera:
+    """A camera by the name of a light; `seed` draws the scenery and the light's parameters."""
+    drawn = Light.named(light, np.random.default_rng([seed, 2]))
+    return Camera(road, parameters, seed=seed, light=drawn)
 
 
 def _light_rows(light: Light) -> list[tuple[float, ...]]:

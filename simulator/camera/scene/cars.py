@@ -186,7 +186,9 @@ class Cars:
             graphics.uniform(name, "stand") for name in ("car", graphics.label_program("car"))
         ]
         self._paint = graphics.uniform("car", "paint")
-        self._spot = {name: graphics.uniform("spot", name) for name in ("stand", "reach", "middle")}
+        self._spot = {
+            name: graphics.uniform("spot", name) for name in ("stand", "shadow_extent", "middle")
+        }
         self._context = context
         mesh = car_mesh()
         triangles = context.buffer(mesh.vertices.tobytes())
@@ -227,7 +229,7 @@ class Cars:
             cos, sin = np.cos(pose[5]), np.sin(pose[5])
             run = np.array([cos * fall[0] + sin * fall[1], -sin * fall[0] + cos * fall[1]])
             self._spot["stand"].write(_model_matrix(pose, eye).tobytes())
-            self._spot["reach"].value = (*run, *(np.array([2.9, 1.6]) + 0.7 * np.abs(run)))
+            self._spot["shadow_extent"].value = (*run, *(np.array([2.9, 1.6]) + 0.7 * np.abs(run)))
             self._spot["middle"].value = tuple(0.7 * run)
             self._patch.render(self._context.TRIANGLE_STRIP)
 

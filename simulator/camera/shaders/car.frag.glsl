@@ -10,5 +10,5 @@ void main() {
     float sheen = 0.04 + 0.30 * pow(1.0 - abs(dot(facing, normalize(place))), 4.0);
     vec3 light = lit(albedo, facing, 1.0) + reflection * sheen;
     light += sunlight.rgb * 0.5 * pow(max(dot(mirrored, sun.xyz), 0.0), 60.0);
-    SHOW(finish(light, place), CAR);
+    OUTPUT(to_display(light, place), CAR);
 }

@@ -1,4 +1,4 @@
-// Shared by all shaders. Colours are linear until finish(); places are eye-relative world metres.
+// Shared by all shaders. Colours are linear until to_display(); places are eye-relative world metres.
 layout(std140) uniform Frame {
     mat4 clip;        // eye-relative world to clip space
     vec4 eye;         // place of the eye
@@ -32,8 +32,8 @@ vec3 lit(vec3 albedo, vec3 normal, float sun_share) {
     return albedo * (sunlight.rgb * direct + skylight.rgb * (0.62 + 0.38 * normal.z));
 }
 
-// Through the air to the eye, then to display values; 1/2.0 is near enough sRGB and cheap.
-vec4 finish(vec3 light, vec3 place) {
+// Attenuation and scattering by the air, then display values: a square root approximates sRGB.
+vec4 to_display(vec3 light, vec3 place) {
     float distance = length(place);
     float toward = max(dot(place, sun.xyz) / distance, 0.0);
     vec3 air = haze.rgb * (1.0 + 0.35 * sunlight.rgb * toward * toward * toward * toward);
@@ -41,28 +41,29 @@ vec4 finish(vec3 light, vec3 place) {
     return vec4(sqrt(colour), 1.0);
 }
 
-// The same for smooth ground, worked out at its vertices: the shares of the sun's and the sky's
-// light on it that reach the eye, and the light of the air before it.
-void see(vec3 place, vec3 normal, float sun_share, out vec2 reach, out vec3 mist) {
+// The same for smooth ground, computed per vertex. light_shares: shares of the sun's (x) and the
+// sky's (y) light on it that reach the eye; air_light: light scattered by the air in between.
+void light_at_vertex(vec3 place, vec3 normal, float sun_share, out vec2 light_shares, out vec3 air_light) {
     float distance = length(place);
     float left = exp2(-skylight.w * distance) * sunlight.w;
     float toward = max(dot(place, sun.xyz) / distance, 0.0);
     toward *= toward;
-    reach = vec2(max(dot(normal, sun.xyz), 0.0) * sun_share, 0.62 + 0.38 * normal.z) * left;
-    mist = haze.rgb * (1.0 + 0.35 * sunlight.rgb * toward * toward) * (sunlight.w - left);
+    light_shares = vec2(max(dot(normal, sun.xyz), 0.0) * sun_share, 0.62 + 0.38 * normal.z) * left;
+    air_light = haze.rgb * (1.0 + 0.35 * sunlight.rgb * toward * toward) * (sunlight.w - left);
 }
 
-// Light of smooth ground at the eye, and its display values; `sunny`: share of the sun in shadow.
-vec3 reaching(vec3 albedo, vec2 reach, float sunny) {
-    return albedo * (sunlight.rgb * (reach.x * sunny) + skylight.rgb * reach.y);
+// Light of smooth ground that arrives at the eye; `sunny`: share of sunlight left in shadow.
+vec3 light_at_eye(vec3 albedo, vec2 light_shares, float sunny) {
+    return albedo * (sunlight.rgb * (light_shares.x * sunny) + skylight.rgb * light_shares.y);
 }
 
-vec4 shown(vec3 light, vec3 mist) {
-    return vec4(sqrt(light + mist), 1.0);
+// Display values of that light with the air's light added.
+vec4 display_values(vec3 light, vec3 air_light) {
+    return vec4(sqrt(light + air_light), 1.0);
 }
 
-// How much of the meadow's tufts is seen from here.
-float nearness(vec3 place) {
+// Visibility of single tufts of grass: 1 at the eye, falling with the distance.
+float tuft_visibility(vec3 place) {
     return exp2(-0.0002 * dot(place, place));
 }
 

@@ -1,11 +1,11 @@
-// What a fragment shader writes: a colour, or depth and class of the pixel (then LABELS is defined).
+// Output of a fragment shader: colour, or with LABELS defined the pixel's depth and class.
 #ifdef LABELS
 out vec2 label;   // depth along the optical axis, m; number of the class
-#define SHOW(colour, number) label = vec2(1.0 / gl_FragCoord.w, float(number))
+#define OUTPUT(colour, number) label = vec2(1.0 / gl_FragCoord.w, float(number))
 #define LEAST_ALPHA 0.5
 #else
 out vec4 pixel;
-#define SHOW(colour, number) pixel = colour
+#define OUTPUT(colour, number) pixel = colour
 #define LEAST_ALPHA 0.0
 #endif
 

@@ -1,8 +1,8 @@
 // Asphalt and the paint on it from (s, y); every edge is filtered over the pixel's footprint.
 in vec2 track;
 in vec2 world;
-in vec2 reach;
-in vec3 mist;
+in vec2 light_shares;
+in vec3 air_light;
 in vec3 plain_verge;
 #ifdef RAIN
 in vec3 place;
@@ -22,14 +22,14 @@ void main() {
     float worn = asphalt.w;
     float tone = 0.86 + 0.34 * (fine.r - 0.5) + (0.25 + 0.5 * worn) * (broad.g - 0.5) + 0.2 * (fine.g - 0.5);
     tone *= 1.0 - 0.14 * exp2(-8.0 * track_off * track_off) * step(away, lane_left);
-    // Cracks from two layers of ridges of unlike scale, so that no tile repeats; thin, and few.
+    // Thin, sparse cracks from two noise layers of different scale: no tile visibly repeats.
     float crack = smoothstep(0.90, 0.97, max(fine.a, broad.a - 0.02)) * smoothstep(0.50, 0.75, broad.b);
     tone *= 1.0 - 0.45 * soil.w * crack;
     vec3 colour = asphalt.rgb * max(tone, 0.2);
     float repair = smoothstep(0.66, 0.67 + 0.02 * ws, broad.b + 0.03 * fine.g) * worn;
     colour *= 1.0 - 0.28 * repair;
 
-    // Paint: the nearest of the lines, its coverage, and what wear has left of it.
+    // Paint: coverage by the nearest line, reduced by wear.
     float number = clamp(floor((lane_left - y) / lanes.y + 0.5), 0.0, lanes.x);
     float line_y = lane_left - number * lanes.y;
     float paint = covered(y, wy, line_y - left_line.w, line_y + left_line.w);
@@ -37,7 +37,7 @@ void main() {
     if (divider) paint *= repeated(s, ws, dashes.x, dashes.y);
     float grit = fine.g * 0.55 + broad.g * 0.45;
     float left_over = 1.0 - line.w * (0.35 + 0.65 * smoothstep(0.40, 0.62, grit));
-    // Where the asphalt was mended most, nobody has painted it again.
+    // No paint on the most repaired patches.
     float gap = smoothstep(1.0 - dashes.z - 0.03, 1.0 - dashes.z + 0.03, broad.b);
     gap *= step(0.001, dashes.z);
     paint *= left_over * (1.0 - 0.92 * gap);
@@ -62,21 +62,21 @@ void main() {
 #endif
 
 #ifdef LABELS
-    // What the middle of the pixel shows; there is no half a class.
+    // The class at the pixel's centre: classes cannot be blended.
     bool painted = abs(y - line_y) < left_line.w && gap < 0.5;
     if (divider && fract(s / dashes.y) * dashes.y > dashes.x) painted = false;
-    SHOW(pixel, painted ? MARKING : ROAD);
+    OUTPUT(pixel, painted ? MARKING : ROAD);
 #else
     float inside = covered(y, wy, -lanes.z, lanes.z);
     colour = mix(plain_verge, colour, inside);
 #ifdef RAIN
     vec3 ripple = vec3((fine.rg - 0.5) * 0.05, 0.0);
-    vec3 light = reaching(colour, reach, 1.0);
-    pixel = shown(light + mirrored(normalize(normal + ripple), place, film * inside, fine.g) * reach.y, mist);
+    vec3 light = light_at_eye(colour, light_shares, 1.0);
+    pixel = display_values(light + mirrored(normalize(normal + ripple), place, film * inside, fine.g) * light_shares.y, air_light);
 #elif defined(SNOW)
-    pixel = shown(reaching(colour, reach, 1.0), mist);
+    pixel = display_values(light_at_eye(colour, light_shares, 1.0), air_light);
 #else
-    pixel = shown(reaching(colour, reach, sunshine(track)), mist);
+    pixel = display_values(light_at_eye(colour, light_shares, sunshine(track)), air_light);
 #endif
 #endif
 }

@@ -3,8 +3,8 @@ in vec2 world;
 in vec3 albedo;
 in vec2 across;
 in float upward;
-in vec2 reach;
-in vec3 mist;
+in vec2 light_shares;
+in vec3 air_light;
 
 void main() {
     vec3 colour = albedo;
@@ -48,5 +48,5 @@ void main() {
 #if defined(SNOW) && !defined(FACADE) && !defined(CROWD)
     colour = snowed(colour, smoothstep(0.35, 0.6, upward + 0.1 * (rough.g - 0.5)));
 #endif
-    SHOW(shown(reaching(colour, reach, 1.0), mist), OBJECT);
+    OUTPUT(display_values(light_at_eye(colour, light_shares, 1.0), air_light), OBJECT);
 }

@@ -7,14 +7,14 @@ out vec2 world;
 out vec3 albedo;
 out vec2 across;
 out float upward;
-out vec2 reach;
-out vec3 mist;
+out vec2 light_shares;
+out vec3 air_light;
 void main() {
     vec3 place = at - eye.xyz;
     world = at.xy;
     albedo = colour;
     across = face;
     upward = facing.z;
-    see(place, dot(facing, place) > 0.0 ? -facing : facing, 1.0, reach, mist);
+    light_at_vertex(place, dot(facing, place) > 0.0 ? -facing : facing, 1.0, light_shares, air_light);
     gl_Position = clip * vec4(place, 1.0);
 }

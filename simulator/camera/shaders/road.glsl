@@ -1,4 +1,4 @@
-// What asphalt and verge share: the shadows lying on them.
+// Shadow lookup shared by asphalt and verge.
 uniform sampler2D shade;
 
 // Share of the sun at a place on the track.

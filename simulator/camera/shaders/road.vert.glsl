@@ -4,9 +4,9 @@ in vec3 facing;
 in float kerbed;
 out vec2 track;
 out vec2 world;
-out vec2 lie;    // how much of a kerb stands here, how near it is
-out vec2 reach;
-out vec3 mist;
+out vec2 kerb_tufts;    // share of the kerb, visibility of tufts
+out vec2 light_shares;
+out vec3 air_light;
 // What asphalt and verge take each other's colour for in the pixels that both cover.
 out vec3 plain_asphalt;
 out vec3 plain_verge;
@@ -21,8 +21,8 @@ void main() {
     normal = facing;
     world = at.xy;
     track = road;
-    lie = vec2(kerbed, nearness(place));
-    see(place, facing, 1.0, reach, mist);
+    kerb_tufts = vec2(kerbed, tuft_visibility(place));
+    light_at_vertex(place, facing, 1.0, light_shares, air_light);
     plain_asphalt = asphalt.rgb * 0.86;
     plain_verge = mix(verge.rgb, mix(grass.rgb, dry.rgb, 0.3), verge.w);
 #ifdef RAIN

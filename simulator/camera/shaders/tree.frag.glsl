@@ -14,5 +14,5 @@ void main() {
     float lies = smoothstep(0.30, 0.62, dot(leaf.rgb, vec3(0.4)) + 0.10 * (1.0 - fract(picture.y * 2.0)));
     leaf.rgb = sqrt(mix(bright * 0.8, vec3(0.62), lies * (0.35 + 0.5 * horizon.w)));
 #endif
-    SHOW(vec4(sqrt(leaf.rgb * leaf.rgb * light * air.w + air.rgb), leaf.a), OBJECT);
+    OUTPUT(vec4(sqrt(leaf.rgb * leaf.rgb * light * air.w + air.rgb), leaf.a), OBJECT);
 }

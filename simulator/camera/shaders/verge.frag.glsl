@@ -1,9 +1,9 @@
 // Beside the asphalt: kerb, verge and the first metres of the meadow.
 in vec2 track;
 in vec2 world;
-in vec2 lie;
-in vec2 reach;
-in vec3 mist;
+in vec2 kerb_tufts;
+in vec2 light_shares;
+in vec3 air_light;
 in vec3 plain_asphalt;
 #ifdef RAIN
 in vec3 place;
@@ -15,11 +15,11 @@ void main() {
     vec4 fine = texture(noise, world * 0.137);
     vec4 broad = texture(noise, world * 0.0083);
     float away = abs(y);
-    vec3 green = ground(world, broad, fine, 1.0, lie.y);
+    vec3 green = ground(world, broad, fine, 1.0, kerb_tufts.y);
     vec3 stones = verge.rgb * (0.6 + 0.5 * fine.r + 0.3 * broad.g);
     float ragged = lanes.w + 0.5 * (fine.g - 0.5);
     vec3 side = mix(green, mix(stones, green, verge.w), covered(y, wy + 0.25, -ragged, ragged));
-    float on_kerb = lie.x * covered(away, wy, lanes.z, lanes.z + 0.9);
+    float on_kerb = kerb_tufts.x * covered(away, wy, lanes.z, lanes.z + 0.9);
     vec3 block = mix(vec3(0.62, 0.60, 0.57), vec3(0.50, 0.035, 0.03), repeated(s, ws, 1.0, 2.0));
     side = mix(side, block * (0.8 + 0.3 * fine.r), on_kerb);
 #ifdef SNOW
@@ -27,8 +27,8 @@ void main() {
 #endif
     side = mix(side, plain_asphalt, covered(y, wy, -lanes.z, lanes.z));
 #if defined(RAIN) || defined(SNOW)
-    SHOW(shown(reaching(side, reach, 1.0), mist), GROUND);
+    OUTPUT(display_values(light_at_eye(side, light_shares, 1.0), air_light), GROUND);
 #else
-    SHOW(shown(reaching(side, reach, sunshine(track)), mist), GROUND);
+    OUTPUT(display_values(light_at_eye(side, light_shares, sunshine(track)), air_light), GROUND);
 #endif
 }

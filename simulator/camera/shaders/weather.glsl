@@ -1,6 +1,6 @@
 // Effects of rain and snow on surfaces. Compiled in only with RAIN or SNOW defined.
 #ifdef RAIN
-// The grey sky mirrored in the film of water on a road.
+// Reflection of the grey sky in the water film on a road.
 vec3 mirrored(vec3 normal, vec3 place, float film, float rough) {
     vec3 view = normalize(place);
     float steep = clamp(-dot(view, normal), 0.0, 1.0);
@@ -8,7 +8,7 @@ vec3 mirrored(vec3 normal, vec3 place, float film, float rough) {
     grazing *= grazing;
     float mirror = 0.03 + film * (0.10 * grazing + 0.50 * grazing * grazing);
     vec3 up = reflect(view, normal);
-    // Dark things stand along the horizon: the mirrored sky is uneven from side to side.
+    // Vary the reflected sky sideways, as dark objects on the horizon would.
     float bank = texture(noise, normalize(up.xy) * 0.31 + rough * 0.02, 1.0).b;
     vec3 sky = mix(horizon.rgb, zenith.rgb, smoothstep(0.1, 0.9, up.z)) * (0.70 + 0.75 * bank);
     return sky * mirror;
@@ -20,7 +20,7 @@ vec3 snowed(vec3 albedo, float depth) {
 }
 #endif
 
-// The meadow as the weather leaves it: `level` is how level it lies (z of the normal).
+// The meadow in the present weather: `level` is how level it lies (z of the normal).
 vec3 ground(vec2 world, vec4 broad, vec4 fine, float level, float near) {
     vec3 colour = meadow(broad, fine, level, near);
 #ifdef RAIN

@@ -420,8 +420,8 @@ static inline void drvlink_wait(struct drvlink *link) {
 
 /* The newest message, without a request. 1 if there was a new one, 0 if not, -1 on an error. */
 static inline int drvlink_latest(struct drvlink *link) {
-    int lives = drvlink_server_lives(link), came = drvlink_read(link);
-    if (came || lives) return came;
+    int running = drvlink_server_lives(link), came = drvlink_read(link);
+    if (came || running) return came;
     int closed = ((struct drvlink_header *)(void *)link->memory)->phase == DRVLINK_PHASE_CLOSED;
     snprintf(link->error, sizeof link->error,
              "the server of %s (process %llu) has %s; start it again", link->name,
@@ -462,7 +462,7 @@ static inline int drvlink_ask(struct drvlink *link) {
         return link->state.error ? -1 : 0;
     }
     snprintf(link->error, sizeof link->error,
-             "the server of %s (process %llu) lives, but has not answered within %g s", link->name,
+             "the server of %s (process %llu) is running, but has not answered within %g s", link->name,
              (unsigned long long)link->header.engine_pid, link->timeout_s);
     return -1;
 }

@@ -1,4 +1,4 @@
-"""The demo: overlays at hand-computed pixels, choice of frames, verdicts, child processes."""
+"""The demo: overlays at hand-computed pixels, choice of frames, limit checks, child processes."""
 
 import os
 import signal
@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from controllers.config import DemoConfig
-from controllers.demo.frames import Asked, spread
+from controllers.demo.frames import PostedFrame, spread
 from controllers.demo.process import run_module
-from controllers.demo.report import print_tables, verdicts
+from controllers.demo.report import check_limits, print_tables
 from controllers.demo.run import run_demo
 from mtlnet.inference.overlay import SCALE, draw_overlay, marking_line, to_pixels
 from trackfeatures import UserError
@@ -94,7 +94,7 @@ def evaluation(angle: float = 0.02, ml: float = 0.2, heading: float = 0.9) -> di
 def test_a_limit_also_requires_a_share_of_the_mean_predictors_error(
     change: dict[str, float], missed: list[str]
 ) -> None:
-    found = verdicts(evaluation(**change))
+    found = check_limits(evaluation(**change))
     assert [one.what for one in found] == [
         *("ml (m)", "mr (m)", "m (m)", "r (m)", "angle (rad)", "heading (share right)")
     ]
@@ -109,8 +109,8 @@ def test_tables_show_true_and_answered_values(capsys: pytest.CaptureFixture[str]
         "heading": {"left": 0.1, "straight": 0.2, "right": 0.7},
     }
     distances = {**NOTHING, "ml": -1.6, "mr": 2.4}
-    asked = Asked(b"", "r1", "oval", 2, distances, 0.4, 0.01, "straight", 0.0, answer)
-    print_tables(verdicts(evaluation(angle=0.05)), [asked])
+    asked = PostedFrame(b"", "r1", "oval", 2, distances, 0.4, 0.01, "straight", 0.0, answer)
+    print_tables(check_limits(evaluation(angle=0.05)), [asked])
     output = capsys.readouterr().out
     for cell in ("-1.60 -1.50", "+0.40 +0.50", "+0.010 +0.012", "straight right", "1.25 ", "NO"):
         assert cell in output

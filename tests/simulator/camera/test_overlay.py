@@ -8,7 +8,7 @@ from simulator.camera.core import optics
 from simulator.camera.overlay import BEHIND_M, STEP_M, marking_polylines
 from simulator.camera.snapshot import standing_pose
 from simulator.track.catalogue import find_track
-from simulator.track.kernel import road_points
+from simulator.track.piece_table import road_points
 from simulator.track.road import Road
 from trackfeatures.camera import CameraParameters
 

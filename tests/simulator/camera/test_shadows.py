@@ -12,11 +12,11 @@ from simulator.camera.scene.road_mesh import Ground
 from simulator.camera.scene.shadow_mask import cast_bridges
 from simulator.camera.scene.terrain import CentreLine, Survey
 from simulator.camera.scene.terrain import build as build_terrain
-from simulator.camera.scene.themes import THEMES, find_theme
+from simulator.camera.scene.themes import find_theme, themes
 from simulator.camera.snapshot import standing_pose
 from simulator.track.catalogue import OWN_TRACKS, find_track
-from simulator.track.own import LOOKS as TRACK_LOOKS
 from simulator.track.road import Road
+from simulator.track.toml_track import LOOKS as TRACK_LOOKS
 from trackfeatures.camera import CameraParameters
 
 FloatArray = NDArray[np.float64]
@@ -37,7 +37,7 @@ def bridges_of(road: Road, seed: int) -> tuple[Bridge, ...]:
 
 
 def test_every_look_of_a_track_has_a_theme() -> None:
-    assert set(TRACK_LOOKS) == set(THEMES)
+    assert set(TRACK_LOOKS) == set(themes())
 
 
 @pytest.mark.parametrize("name", NAMES)

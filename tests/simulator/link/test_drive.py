@@ -95,7 +95,7 @@ def test_with_traffic_and_pictures_too(
             assert picture.std() > 5.0
 
 
-def test_the_server_says_what_it_is(oval: str) -> None:
+def test_the_servers_description_is_complete(oval: str) -> None:
     road = Road(find_track("oval"), 2)
     with Link(oval, wait_s=WAIT_S) as link:
         info = link.info

@@ -50,7 +50,7 @@ def test_the_longest_name_works() -> None:
     assert check_name("/" + "x" * 249)
 
 
-def test_each_end_is_held_once_and_sees_the_other(name: str) -> None:
+def test_each_role_is_held_once_and_sees_the_other(name: str) -> None:
     ours = server_end(name)
     assert not ours.peer_is_alive()
     with pytest.raises(NameInUse, match="is running"):
@@ -69,7 +69,7 @@ def test_each_end_is_held_once_and_sees_the_other(name: str) -> None:
     again.close()
 
 
-def test_without_an_server_there_is_nothing_to_attach_to(name: str) -> None:
+def test_attaching_without_a_server_is_refused(name: str) -> None:
     with pytest.raises(NoServer, match=f"there is no server of the link {name}"):
         attach(name)
 
@@ -105,14 +105,14 @@ def test_a_client_that_finds_a_killed_server_cleans_up(name: str) -> None:
     assert not (SHM / name[1:]).exists()
 
 
-def test_nobody_sees_a_segment_before_it_is_published(name: str) -> None:
+def test_a_segment_is_invisible_before_it_is_published(name: str) -> None:
     ours = create(name, SIZE)
     with pytest.raises(NoServer):
         attach(name)
     ours.close()
 
 
-def test_clearing_leaves_a_living_server_alone(name: str) -> None:
+def test_clearing_leaves_a_running_server_alone(name: str) -> None:
     remove_stale(name)
     killed_owner(name)
     remove_stale(name)
@@ -145,7 +145,7 @@ def test_the_memory_of_another_program_is_left_alone(name: str) -> None:
     path.unlink()
 
 
-def test_no_room_is_an_error_and_leaves_nothing(name: str) -> None:
+def test_a_lack_of_memory_is_an_error_and_leaves_no_segment(name: str) -> None:
     code = (
         "import resource; from simulator.link.segment import create;"
         "resource.setrlimit(resource.RLIMIT_FSIZE, (65536, resource.RLIM_INFINITY));"
@@ -157,7 +157,7 @@ def test_no_room_is_an_error_and_leaves_nothing(name: str) -> None:
     assert not (SHM / name[1:]).exists()
 
 
-def test_a_forked_child_does_not_keep_our_end_alive(name: str) -> None:
+def test_a_forked_child_does_not_hold_the_parents_lock(name: str) -> None:
     ours = server_end(name)
     client = attach(name)
     child = os.fork()

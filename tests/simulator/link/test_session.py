@@ -50,7 +50,7 @@ Start = Callable[..., "subprocess.Popen[str]"]
         (Command(gear=7), "gear = 7"),
     ],
 )
-def test_a_bad_command_is_refused_and_the_car_stands_where_it_stood(
+def test_a_bad_command_is_refused_and_the_car_is_unchanged(
     oval: str, command: Command, said: str
 ) -> None:
     with Link(oval, wait_s=WAIT_S) as link:
@@ -161,7 +161,7 @@ def test_a_second_server_of_the_name_is_refused(oval: str) -> None:
     assert one_error(done).startswith(f"error: a server of the link {oval} is running")
 
 
-def test_quit_ends_the_server_and_tells_what_it_did(name: str) -> None:
+def test_quit_ends_the_server_which_prints_its_counts(name: str) -> None:
     with serving(LinkConfig(name=name, track="oval")) as served, Link(name, wait_s=WAIT_S) as link:
         link.reset(seed=1)
         for _ in range(5):
@@ -174,8 +174,8 @@ def test_quit_ends_the_server_and_tells_what_it_did(name: str) -> None:
     assert asdict(summary) == expected
     assert served.said == [
         f"{name}: oval is ready for a client",
-        f"client {os.getpid()} has come",
-        f"client {os.getpid()} has left",
+        f"client {os.getpid()} has connected",
+        f"client {os.getpid()} has disconnected",
     ]
 
 
@@ -197,13 +197,13 @@ def test_a_stopped_server_tells_its_client_and_prints_json(
 
 
 @pytest.mark.alone
-def test_a_stopped_process_is_given_two_seconds(server: Start, name: str) -> None:
+def test_a_suspended_server_times_out_after_two_seconds(server: Start, name: str) -> None:
     process = server("--track", "oval")
     with Link(name, wait_s=WAIT_S, timeout_s=0.5) as link:
         link.reset(seed=1)
         process.send_signal(signal.SIGSTOP)
         began = time.monotonic()
-        with pytest.raises(LinkTimeout, match=r"lives, but has not answered within 0\.5 s"):
+        with pytest.raises(LinkTimeout, match=r"is running, but has not answered within 0\.5 s"):
             link.step(Command())
         assert 0.4 < time.monotonic() - began < BOUND_S
         process.send_signal(signal.SIGCONT)
@@ -218,7 +218,7 @@ def test_once_ends_with_the_first_client(name: str) -> None:
 
 
 @pytest.mark.alone
-def test_a_client_that_dies_ends_an_server_for_once(name: str) -> None:
+def test_a_killed_client_ends_a_server_with_once(name: str) -> None:
     config = LinkConfig(name=name, track="oval", once=True)
     with serving(config) as served:
         link = Link(name, wait_s=WAIT_S)
@@ -229,18 +229,18 @@ def test_a_client_that_dies_ends_an_server_for_once(name: str) -> None:
 
 
 @pytest.mark.alone
-def test_a_silent_client_is_given_up(name: str) -> None:
+def test_a_client_that_sends_nothing_is_dropped(name: str) -> None:
     config = LinkConfig(name=name, track="oval", patience_s=0.3)
     with serving(config) as served, Link(name, wait_s=WAIT_S) as link:
         link.reset(seed=1)
-        with pytest.raises(ClientLost, match=r"lives, but has sent nothing for 0\.3 s"):
+        with pytest.raises(ClientLost, match=r"is running, but has sent nothing for 0\.3 s"):
             served.result(BOUND_S)
         with pytest.raises(ServerDied, match="has ended"):
             link.step(Command())
 
 
 @pytest.mark.alone
-def test_real_time_goes_on_by_itself(name: str) -> None:
+def test_real_time_steps_without_commands(name: str) -> None:
     config = LinkConfig(name=name, track="oval", realtime=True, frequency_hz=50)
     with serving(config), Link(name, wait_s=WAIT_S) as link:
         assert link.info.mode is Mode.REALTIME
@@ -259,7 +259,7 @@ def test_real_time_goes_on_by_itself(name: str) -> None:
         link.quit()
 
 
-def test_without_a_command_the_real_car_stands(name: str) -> None:
+def test_in_real_time_without_a_command_the_car_stands(name: str) -> None:
     config = LinkConfig(name=name, track="oval", realtime=True, frequency_hz=100)
     with serving(config), Link(name, wait_s=WAIT_S) as link:
         link.reset(seed=1)

@@ -11,7 +11,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 import trackfeatures as tf
-from simulator.track import kernel
+from simulator.track import piece_table
 from simulator.track.catalogue import find_track
 from simulator.track.geometry import Track, wrap_angle
 from simulator.track.road import Road
@@ -110,7 +110,7 @@ def test_a_hint_tells_the_bridge_from_the_road_below() -> None:
         assert float(EIGHT.at(found, to_middle).z) == pytest.approx(height)
 
 
-def test_a_hint_far_off_is_mended() -> None:
+def test_a_wrong_hint_is_corrected() -> None:
     pose = MOUNTAIN.at(1500.0, 1.0)
     for hint in (0.0, 400.0, 900.0, 2400.0):
         found, to_middle = MOUNTAIN.project(float(pose.x), float(pose.y), hint)
@@ -121,8 +121,8 @@ def test_a_hint_far_off_is_mended() -> None:
 @pytest.mark.parametrize("y", [-4.0, 0.0, 6.0])
 def test_surface_normal_is_that_of_the_plane_through_near_points(s: float, y: float) -> None:
     table = STADIUM.arrays()
-    index = kernel.index_at(table, s)
-    z, *normal = kernel.surface(table, index, s, y)
+    index = piece_table.index_at(table, s)
+    z, *normal = piece_table.surface(table, index, s, y)
     assert z == pytest.approx(float(STADIUM.at(s, y).z))
     a, b = STADIUM.at([s - 1e-4, s + 1e-4], y), STADIUM.at(s, [y - 1e-4, y + 1e-4])
     along = np.array([np.diff(a.x)[0], np.diff(a.y)[0], np.diff(a.z)[0]])
@@ -131,9 +131,9 @@ def test_surface_normal_is_that_of_the_plane_through_near_points(s: float, y: fl
     assert normal == pytest.approx(expected / np.linalg.norm(expected), abs=1e-6)
 
 
-def test_kernel_and_arrays_agree() -> None:
+def test_compiled_pose_and_arrays_agree() -> None:
     for s in (-5.0, 0.0, 77.7, 1234.5, MOUNTAIN.length_m, 3000.0):
-        x, y, z, heading, curvature = kernel.pose_at(MOUNTAIN.arrays(), s)
+        x, y, z, heading, curvature = piece_table.pose_at(MOUNTAIN.arrays(), s)
         pose = MOUNTAIN.at(s)
         assert [x, y, z] == pytest.approx([float(pose.x), float(pose.y), float(pose.z)])
         assert float(wrap_angle(np.float64(heading))) == pytest.approx(float(pose.heading))

@@ -71,7 +71,7 @@ def test_a_picture_of_every_class(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["coast.png"]
 
 
-def test_a_name_that_is_no_formula(tmp_path: Path) -> None:
+def test_a_name_with_dollar_signs_is_drawn_as_text(tmp_path: Path) -> None:
     path = tmp_path / "a$b_$c^d.toml"
     path.write_bytes((OWN_TRACKS / "oval.toml").read_bytes())
     write_plot(Road(find_track(str(path))), tmp_path / "odd.png")

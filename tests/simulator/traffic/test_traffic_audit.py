@@ -7,9 +7,9 @@ import pytest
 
 from simulator.track.catalogue import find_track
 from simulator.track.road import Road
-from simulator.traffic.kernel import centre_line_advance
-from simulator.world.boxes import boxes_overlap, first_overlap
-from tests.simulator.traffic_audit import TrafficViolation, audit_traffic
+from simulator.traffic.car_table import centre_line_advance
+from simulator.vehicle.rigid_body import boxes_overlap
+from tests.simulator.traffic_audit import TrafficViolation, audit_traffic, first_overlap
 
 
 @pytest.mark.slow

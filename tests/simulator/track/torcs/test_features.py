@@ -9,7 +9,7 @@ import pytest
 from simulator.track.catalogue import find_track, list_tracks
 from simulator.track.errors import TrackError
 from simulator.track.geometry import Track
-from simulator.track.own import LOOKS
+from simulator.track.toml_track import LOOKS
 from simulator.track.torcs.appearance import WITHOUT_KERBS
 from simulator.track.torcs.torcs import read_torcs
 
@@ -138,7 +138,7 @@ def test_a_name_tells_the_look(tmp_path: Path, name: str, look: str) -> None:
     assert read_torcs(path).look == look
 
 
-def test_names_that_say_nothing_draw_different_looks(tmp_path: Path) -> None:
+def test_names_without_a_known_look_vary_in_look(tmp_path: Path) -> None:
     looks = []
     for number in range(12):
         path = tmp_path / f"g-track-{number}.xml"

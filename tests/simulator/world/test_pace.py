@@ -2,7 +2,7 @@
 
 import pytest
 
-from simulator.watch.pace import MAX_CATCH_UP_S, Pacer, Rate
+from simulator.world.pace import MAX_CATCH_UP_S, Pacer, Rate
 from trackfeatures.errors import UserError
 
 

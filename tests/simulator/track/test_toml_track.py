@@ -11,7 +11,7 @@ from simulator.track.catalogue import OWN_TRACKS, find_track, read_track
 from simulator.track.errors import TrackError
 from simulator.track.geometry import Track
 from simulator.track.layout import Bend, close
-from simulator.track.own import LOOKS, Table, read_own, read_segments
+from simulator.track.toml_track import LOOKS, Table, read_segments, read_toml_track
 
 NAMES = sorted(path.stem for path in OWN_TRACKS.glob("*.toml"))
 TRACKS = {name: find_track(name) for name in NAMES}
@@ -43,7 +43,7 @@ def test_closes_to_the_millimetre(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_what_is_written_is_what_is_driven(name: str) -> None:
+def test_segments_have_the_lengths_and_angles_of_the_file(name: str) -> None:
     """Closing may change a straight by a rounding of the file, no more; nor the grades."""
     import tomllib
 
@@ -126,7 +126,7 @@ def test_a_square_with_known_figures(tmp_path: Path) -> None:
     straight = '[[segment]]\ntype = "straight"\nlength = 100\n'
     path = tmp_path / "square.toml"
     path.write_text('look = "town"\nwidth = 8.0\n' + (straight + bend) * 4)
-    track = read_own(path)
+    track = read_toml_track(path)
     assert track.length_m == pytest.approx(4 * (100.0 + 20.0 * math.pi + 20.0))
     assert track.min_radius_m == pytest.approx(40.0)
     middle = 100.0 + (20.0 * math.pi + 20.0) / 2
@@ -139,7 +139,7 @@ def test_a_square_with_known_figures(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("text", ["width = " + "9" * 5000, "width = " + "[" * 5000])
-def test_what_python_will_not_read_is_named(tmp_path: Path, text: str) -> None:
+def test_toml_that_python_cannot_parse_is_named(tmp_path: Path, text: str) -> None:
     path = tmp_path / "deep.toml"
     path.write_text(text)
     with pytest.raises(TrackError, match=r"deep\.toml: not a readable TOML file"):
@@ -157,7 +157,7 @@ def test_closing_must_leave_every_straight_a_length(tmp_path: Path) -> None:
     path = tmp_path / "short.toml"
     path.write_text('look = "town"\nwidth = 8.0\n' + "".join(sides) + straight(30.0) + bend)
     with pytest.raises(TrackError, match=r"short\.toml: closing the loop leaves a straight no"):
-        read_own(path)
+        read_toml_track(path)
 
 
 def test_a_track_without_straights_names_its_file(tmp_path: Path) -> None:
@@ -165,4 +165,4 @@ def test_a_track_without_straights_names_its_file(tmp_path: Path) -> None:
     path = tmp_path / "round.toml"
     path.write_text('look = "town"\nwidth = 8.0\n' + bend * 3)
     with pytest.raises(TrackError, match=r"round\.toml: straights in two directions"):
-        read_own(path)
+        read_toml_track(path)

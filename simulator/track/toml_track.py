@@ -70,7 +70,7 @@ class Table:
                 raise TrackError(f"{self.where}: unknown key {key!r}, expected {', '.join(keys)}")
 
 
-def read_own(path: Path) -> Track:
+def read_toml_track(path: Path) -> Track:
     """The track of one TOML file, named after the file. Raises TrackError when it is not one."""
     table = Table(_load(path), str(path))
     table.only("look", "surface", "width", "vertical_curve", "markings", "segment")

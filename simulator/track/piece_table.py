@@ -1,4 +1,4 @@
-"""The track as compiled code sees it: one (P, 12) table of constant-curvature pieces.
+"""Compiled functions on the table of a track: (P, 12), one row a constant-curvature piece.
 
 A piece is a straight or an arc of the centre line with edge heights linear in its arc length.
 World frame (x, y plane, z up); s along the centre line, to_middle left positive; metres, radians.

@@ -1,4 +1,4 @@
-"""Compiled step of all traffic cars: leaders, lane changes, speeds, positions.
+"""Compiled functions on the table of all traffic cars: leaders, lane changes, speeds, positions.
 
 Track frame: s along the centre line, y to the left, m and m/s. A car in a lane change occupies both
 lanes: cars in either lane follow it.
@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runtime.jit import compiled
-from simulator.track import kernel
+from simulator.track import piece_table
 from simulator.traffic.idm import COMFORTABLE_BRAKING, STANDSTILL_GAP_M, idm_acceleration
 
 # Columns of a car's row.
@@ -186,17 +186,17 @@ def centre_line_advance(table: Table, s: float, y: float, distance: float) -> fl
     A lane on the inside of a bend is shorter than the centre line. Exact across the joints of
     pieces, where the curvature jumps.
     """
-    gained, index = 0.0, kernel.index_at(table, s)
-    at = kernel.wrap(table, s)
+    gained, index = 0.0, piece_table.index_at(table, s)
+    at = piece_table.wrap(table, s)
     for _ in range(table.shape[0] + 1):
-        length_ratio = max(1.0 - table[index, kernel.CURVATURE] * y, MIN_LENGTH_RATIO)
-        left = max(table[index, kernel.S0] + table[index, kernel.LENGTH] - at, 0.0)
+        length_ratio = max(1.0 - table[index, piece_table.CURVATURE] * y, MIN_LENGTH_RATIO)
+        left = max(table[index, piece_table.S0] + table[index, piece_table.LENGTH] - at, 0.0)
         if distance <= left * length_ratio:
             return float(gained + distance / length_ratio)
         gained += left
         distance -= left * length_ratio
         index = (index + 1) % table.shape[0]
-        at = table[index, kernel.S0]
+        at = table[index, piece_table.S0]
     return gained
 
 
@@ -269,9 +269,9 @@ def update_poses(cars: Table, table: Table, poses: Table) -> None:
         if cars[i, STRUCK] > 0.0:
             continue
         s, y = cars[i, S], cars[i, Y]
-        index = kernel.index_at(table, s)
-        x0, y0, _, heading, _ = kernel.pose_at(table, s)
-        z, nx, ny, nz = kernel.surface(table, index, s, y)
+        index = piece_table.index_at(table, s)
+        x0, y0, _, heading, _ = piece_table.pose_at(table, s)
+        z, nx, ny, nz = piece_table.surface(table, index, s, y)
         sideways = 0.0
         if cars[i, CHANGE_PROGRESS] < 1.0:
             done = cars[i, CHANGE_PROGRESS]

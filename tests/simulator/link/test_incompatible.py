@@ -87,7 +87,7 @@ def test_a_refused_client_leaves_room_for_the_next(name: str) -> None:
     segment.close()
 
 
-def test_the_c_client_knows_another_programs_memory_and_a_bad_name(
+def test_the_c_client_refuses_another_programs_memory_and_a_bad_name(
     name: str, lap_program: Path
 ) -> None:
     path = Path("/dev/shm") / name[1:]
@@ -103,12 +103,12 @@ def test_the_c_client_knows_another_programs_memory_and_a_bad_name(
     path.unlink()
 
 
-def test_waiting_for_an_server_has_an_end(name: str) -> None:
+def test_waiting_for_a_server_times_out(name: str) -> None:
     with pytest.raises(NoServer, match="simulator link --name"):
         Link(name, wait_s=0.1)
 
 
-def test_an_old_program_is_told_to_be_compiled_again(
+def test_an_old_c_program_is_told_to_recompile(
     oval: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A C client compiled with the header of a layout before this one."""

@@ -9,7 +9,7 @@ from trackfeatures.errors import UserError
 
 SPEEDS: Final = (0.05, 100.0)
 MAX_CATCH_UP_S: Final = 0.25
-"""A delay longer than this is not made up."""
+"""A delay of a watched drive that is longer than this is not made up."""
 WINDOW_S: Final = 1.5
 """Time over which a rate is measured."""
 
@@ -57,24 +57,33 @@ class Pacer:
         step_s: float,
         speed: float = 1.0,
         *,
+        catch_up_s: float = MAX_CATCH_UP_S,
         clock: Callable[[], float] = time.monotonic,
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
         check_speed(speed)
         self._interval = step_s / speed
+        self._catch_up_s = catch_up_s
         self._clock, self._sleep = clock, sleep
-        self._due = clock() + self._interval
+        self.restart()
+
+    def restart(self) -> None:
+        """The next step is due one interval from now."""
+        self._due = self._clock() + self._interval
 
     @property
     def late(self) -> bool:
         """Whether the next step is overdue, so that optional work should be skipped."""
         return self._clock() > self._due
 
-    def wait(self) -> None:
-        """Sleep until the next step is due."""
+    def wait(self) -> bool:
+        """Sleep until the next step is due; returns whether it was late by more than
+        `catch_up_s`, which is not made up."""
         ahead = self._due - self._clock()
+        late = ahead < -self._catch_up_s
         if ahead > 0.0:
             self._sleep(ahead)
-        elif ahead < -MAX_CATCH_UP_S:
+        elif late:
             self._due = self._clock()
         self._due += self._interval
+        return late
