@@ -2,6 +2,7 @@
 
 uvicorn's protocol on httptools, with a deadline for the headers and one for the body of each
 request. `close_expired` checks them ten times a second, so that a request costs two assignments.
+A WebSocket tells its client why it is closed, also on a message that is too long.
 """
 
 import asyncio
@@ -13,6 +14,7 @@ from math import inf
 from typing import Any
 
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
+from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 
 from serve.api.http_io import encode_head, problem_reply
 from serve.api.problems import (
@@ -235,6 +237,33 @@ class GuardedProtocol(HttpToolsProtocol):
         if self.transport.can_write_eof():
             self.transport.write_eof()
         self.loop.call_later(LINGER_S, self.transport.abort)
+
+
+class GuardedWebSocket(WebSocketsSansIOProtocol):
+    """One WebSocket connection."""
+
+    _discarding = False
+
+    def data_received(self, data: bytes) -> None:
+        if not self._discarding:
+            super().data_received(data)
+
+    def handle_parser_exception(self) -> None:
+        """Send the close frame, then discard what the client still sends for LINGER_S.
+
+        A connection closed with unread bytes is reset, and the client would lose the close frame.
+        """
+        closing = self.conn.close_sent
+        assert closing is not None
+        self._discarding = self.close_sent = True
+        self.stop_keepalive()
+        self.queue.put_nowait(
+            {"type": "websocket.disconnect", "code": closing.code, "reason": closing.reason}
+        )
+        self.transport.write(b"".join(self.conn.data_to_send()))
+        if self.transport.can_write_eof():
+            self.transport.write_eof()
+        self.close_timer = self.loop.call_later(LINGER_S, self.transport.abort)
 
 
 def close_expired(connections: Iterable[object], now: float) -> None:

@@ -30,7 +30,7 @@ from serve.api.problems import PROBLEM_TYPES
 from serve.app import Service
 from serve.config import Limits
 from serve.observability import metrics
-from serve.server import connection, websocket
+from serve.server import connection
 from serve.server.worker_server import WorkerServer
 from serve.workers import shared_memory
 from serve.workers.shared_memory import HEARTBEAT, SharedMemory, WorkerPeers
@@ -141,8 +141,7 @@ class Clock:
 @pytest.fixture(autouse=True)
 def patient_service(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let no slow test find that a worker counts as gone or that an unread problem is dropped."""
-    for module in (connection, websocket):
-        monkeypatch.setattr(module, "LINGER_S", PATIENCE_S)
+    monkeypatch.setattr(connection, "LINGER_S", PATIENCE_S)
     for reader in (shared_memory, metrics):
         monkeypatch.setattr(reader, "HEARTBEAT_TIMEOUT_S", PATIENCE_S)
 
@@ -206,6 +205,10 @@ class Served:
         """The socket on which this process takes its connections."""
         assert self._listener is not None
         return self._listener
+
+    def wait_received(self, *counts: int) -> None:
+        """Return once `counts` bytes have arrived of the incomplete requests, and of no others."""
+        until(lambda: self.received_bytes() == sorted(counts))
 
     def wait_for_tick(self) -> None:
         """Return once the server has looked for expired connections again."""

@@ -72,7 +72,7 @@ def test_slow_headers_slow_bodies_and_silent_connections_are_closed() -> None:
         for part in (HEAD, b"Content-Length: %d\r\n\r\n" % len(JPEG), JPEG):
             complete.sendall(part)
         assert complete.recv(65536).startswith(b"HTTP/1.1 200")
-        until(lambda: service.received_bytes() == [0, len(HEAD), len(begun)])
+        service.wait_received(0, len(HEAD), len(begun))
         clock.now_s += 5.1
         assert_too_slow(slow_head, "headers")
         assert is_cut(silent)
@@ -81,7 +81,7 @@ def test_slow_headers_slow_bodies_and_silent_connections_are_closed() -> None:
         assert_too_slow(slow_body, "body")
         # The second request of a connection has the same time.
         complete.sendall(HEAD)
-        until(lambda: service.received_bytes() == [len(HEAD)])
+        service.wait_received(len(HEAD))
         clock.now_s += 5.1
         assert_too_slow(complete, "headers")
         assert service.post(JPEG).status == 200
@@ -99,10 +99,10 @@ def test_single_bytes_do_not_extend_the_time_for_headers() -> None:
         connection = dial(service)
         connection.sendall(begun)
         for count in range(4):
-            until(lambda count=count: service.received_bytes() == [len(begun) + count])
+            service.wait_received(len(begun) + count)
             clock.now_s += 1.2  # 4.8 s in all
             connection.sendall(b"a")
-        until(lambda: service.received_bytes() == [len(begun) + 4])
+        service.wait_received(len(begun) + 4)
         clock.now_s += 0.3
         assert_too_slow(connection, "headers")
 
@@ -132,7 +132,7 @@ def test_connections_without_a_request_give_way_to_new_ones() -> None:
     clock = Clock()
     with limited(Limits(connections=4), clock) as service:
         silent = [dial(service) for _ in range(4)]
-        until(lambda: service.received_bytes() == [0] * 4)
+        service.wait_received(0, 0, 0, 0)
         clock.now_s += 1.01 * EVICTABLE_S
         assert service.post(JPEG).status == 200
         assert is_cut(silent[0])
@@ -149,7 +149,7 @@ def test_slow_requests_give_way_to_new_connections_but_served_clients_stay() -> 
         slow = [dial(service) for _ in range(3)]
         for connection, part in zip(slow, (begun, HEAD, HEAD), strict=True):
             connection.sendall(part)
-        until(lambda: service.received_bytes() == [len(HEAD), len(HEAD), len(begun)])
+        service.wait_received(len(HEAD), len(HEAD), len(begun))
         clock.now_s += 1.01 * EVICTABLE_S
         assert service.post(JPEG).status == 200
         ended, _, _ = select.select(slow, [], [], PATIENCE_S)

@@ -3,7 +3,6 @@
 import json
 import socket
 from collections.abc import Iterator
-from functools import partial
 from typing import Any
 
 import msgspec
@@ -168,10 +167,6 @@ def test_a_failing_engine_is_a_problem_that_does_not_reveal_the_exception(
     assert service.post(JPEG).status == 200
 
 
-def has_received(service: Served, count: int) -> bool:
-    return service.received_bytes() == [count]
-
-
 def test_a_client_that_disconnects_during_its_body_causes_no_error(
     service: Served, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -180,7 +175,7 @@ def test_a_client_that_disconnects_during_its_body_causes_no_error(
             head = "POST /features HTTP/1.1\r\nHost: x\r\nContent-Type: image/jpeg\r\n"
             begun = f"{head}Content-Length: {len(JPEG)}\r\n\r\n".encode() + JPEG[:99]
             connection.sendall(begun)
-            until(partial(has_received, service, len(begun)))
+            service.wait_received(len(begun))
         until(lambda: not service.server.server_state.connections)
     assert service.post(JPEG).status == 200
     assert [record for record in caplog.records if record.levelname == "ERROR"] == []

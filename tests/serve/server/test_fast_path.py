@@ -6,7 +6,6 @@ import json
 import socket
 import threading
 import time
-from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
@@ -143,15 +142,11 @@ def test_replies_come_in_the_order_of_their_requests(service: Served) -> None:
     assert read(connection, 1)[0][1]["frame_id"] == "5"
 
 
-def has_received(service: Served, count: int) -> bool:
-    return service.received_bytes() == [count]
-
-
 def test_a_body_may_arrive_in_parts_and_in_chunks(service: Served) -> None:
     connection = dial(service)
     for at in range(0, len(WHOLE), 1000):
         if at:
-            until(partial(has_received, service, at))
+            service.wait_received(at)
         connection.sendall(WHOLE[at : at + 1000])
     pieces = read(connection, 1)[0]
     connection.sendall(HEAD + b"Transfer-Encoding: chunked\r\n\r\n")
