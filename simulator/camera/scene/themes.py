@@ -59,7 +59,8 @@ def themes() -> dict[str, Theme]:
 
 def _theme(values: dict[str, Any]) -> Theme:
     """A theme from its table, whose lists become tuples."""
-    return Theme(**{k: tuple(v) if isinstance(v, list) else v for k, v in values.items()})
+    fields: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
+    return Theme(**fields)
 
 
 PLAIN = "countryside"
