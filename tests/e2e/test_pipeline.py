@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from controllers.config import DemoConfig
-from controllers.demo.frames import ask
+from controllers.demo.frames import post_frames
 from controllers.demo.process import running_service
 from controllers.demo.report import write_report
 from controllers.demo.run import DemoResult
@@ -57,7 +57,7 @@ def test_collect_train_evaluate_serve_and_drive(tmp_path: Path) -> None:
         assert list(answer["distances_m"]) == list(MARKINGS)
         assert sum(answer["heading"].values()) == pytest.approx(1.0, abs=1e-3)
         assert answer["angle_rad"] == pytest.approx(predicted[0]["angle_rad"], abs=1e-6)
-        asked = ask(frames, [100, 200], client)
+        posted = post_frames(frames, [100, 200], client)
         log = tmp_path / "drive.csv"
         drive = command(
             *("controllers", "drive", "--controller", "lqr", "--track", "oval", "--lanes", "1"),
@@ -72,7 +72,7 @@ def test_collect_train_evaluate_serve_and_drive(tmp_path: Path) -> None:
     steering = {row.split(",")[8] for row in rows[1:]}
     assert len(steering) > 100, "steering must vary with the answers"
 
-    result = DemoResult(collected, evaluated, drive, asked, ["datagen collect"], {"collect": 1.0})
+    result = DemoResult(collected, evaluated, drive, posted, ["datagen collect"], {"collect": 1.0})
     page = write_report(DemoConfig(out=tmp_path), result).read_text()
     assert page.count("data:image/jpeg;base64,") == 2
     assert f"{evaluated['angle_mae_rad']:.4f}" in page

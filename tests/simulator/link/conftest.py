@@ -13,8 +13,13 @@ from pathlib import Path
 
 import pytest
 
+from simulator.link.client import Link
+
 START_S = 180.0
 SHM = Path("/dev/shm")
+
+ANSWER_S = 60.0
+"""How long a client waits for an answer unless a test gives a time: other jobs may be running."""
 
 Start = Callable[..., "subprocess.Popen[str]"]
 
@@ -28,6 +33,12 @@ def start_server(name: str, *options: str) -> "subprocess.Popen[str]":
 
 def fresh_name() -> str:
     return f"/drvlink-test-{uuid.uuid4().hex[:12]}"
+
+
+@pytest.fixture(autouse=True)
+def patient_clients(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Clients in this process wait longer than by default."""
+    monkeypatch.setitem(Link.__init__.__kwdefaults__, "timeout_s", ANSWER_S)
 
 
 @pytest.fixture
