@@ -1,6 +1,6 @@
 """README.md of an export: contents, source dataset, and how to read it."""
 
-from datagen.export.sides import Side
+from datagen.export.split_sides import Side
 from datagen.recording.dataset import Dataset
 from runtime.cli import counted
 

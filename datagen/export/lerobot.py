@@ -16,7 +16,7 @@ import pyarrow.parquet as pq
 
 from datagen.export.lerobot_features import IMAGE, Columns, columns, features, table
 from datagen.export.lerobot_stats import Histogram, Stats, column_stats
-from datagen.export.sides import Progress, Side
+from datagen.export.split_sides import Progress, Side
 from datagen.recording.errors import DatasetError
 from datagen.recording.round_metadata import RoundInfo
 from datagen.view.steps import Step, Steps

@@ -7,8 +7,8 @@ from typing import Any
 
 from datagen.export import webdataset
 from datagen.export.card import card
-from datagen.export.sides import Progress, Side, sides
-from datagen.export.target import new_folder, require_free
+from datagen.export.output_folder import new_folder, require_free
+from datagen.export.split_sides import Progress, Side, sides
 from datagen.recording.dataset import Dataset
 from trackfeatures.errors import UserError
 

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from datagen.export.sides import Progress, Side
+from datagen.export.split_sides import Progress, Side
 from datagen.recording.round_metadata import RoundInfo
 from datagen.recording.schema.json_schema import json_schema
 from datagen.view.steps import Step, values

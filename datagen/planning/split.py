@@ -44,7 +44,7 @@ def choose_test_rounds(
         best_roads = _best_roads(road, track, track_of_road)
         open_rounds = np.flatnonzero(in_training & best_roads[road.of])
         # Summed from left to right: another order could round otherwise and choose other rounds.
-        shares = sum(group.test_share()[group.of[open_rounds]] for group in others)
+        shares = sum(group.tested_share()[group.of[open_rounds]] for group in others)
         ties = open_rounds[shares == np.min(shares)]
         number = int(ties[np.argmin(draw[ties])])
         chosen.add(number)
@@ -63,7 +63,7 @@ class _Groups:
         self.size: IntArray = np.bincount(self.of)
         self.tested: IntArray = np.zeros_like(self.size)
 
-    def test_share(self) -> NDArray[np.float64]:
+    def tested_share(self) -> NDArray[np.float64]:
         return np.asarray(self.tested / self.size)
 
     def in_training(self) -> IntArray:
@@ -76,7 +76,7 @@ def _best_roads(road: _Groups, track: _Groups, track_of_road: IntArray) -> NDArr
     last_of_track = (track.in_training() == 1)[track_of_road]
     penalty = 2 * last_of_track + (left == 1) + 4 * (left == 0)
     best = penalty == penalty.min()
-    share = track.test_share()[track_of_road]
+    share = track.tested_share()[track_of_road]
     return np.asarray(best & (share == share[best].min()))
 
 

@@ -13,17 +13,14 @@ from foxglove_schemas_protobuf.ImageAnnotations_pb2 import ImageAnnotations
 from mcap.reader import make_reader
 from numpy.typing import NDArray
 
-from datagen.recording.dataset import Dataset
-from datagen.recording.images import decode_into
+from datagen.recording.dataset import Dataset, Frames
 from datagen.recording.labels import light_per_frame
 from datagen.recording.mcap.index import RoundIndex
-from datagen.recording.mcap.protobuf_wire import bytes_field
 from datagen.recording.round_metadata import RoundInfo
 from datagen.recording.schema.topics import ANNOTATIONS, CAMERA
 
 Image = NDArray[np.uint8]
 
-IMAGE_DATA = 2  # number of the field `data` of foxglove.CompressedImage
 SCALE = 2
 """Factor by which frames are enlarged, so that thin lines stay thin."""
 _GREEN = (40, 255, 80)
@@ -46,7 +43,8 @@ def contact_sheet(dataset: Dataset, most: int = 24) -> Iterator[Card]:
         info, index = dataset.rounds[number], dataset.indexes[number]
         # Multiples of the golden ratio: evenly spread over the places in a round.
         frame = int((place * 0.6180339887498949 % 1.0) * info.frames)
-        yield _card(info, index, frame, (dataset.camera.height, dataset.camera.width))
+        image = Frames([info], [index], dataset.camera).image(frame)
+        yield _card(info, index, frame, image)
 
 
 def _diverse_order(rounds: list[RoundInfo]) -> list[int]:
@@ -67,10 +65,7 @@ def _properties(info: RoundInfo) -> tuple[tuple[str, str | int], ...]:
     return (("track", info.track), ("light", info.light), ("lanes", info.lanes))
 
 
-def _card(info: RoundInfo, index: RoundIndex, frame: int, size: tuple[int, int]) -> Card:
-    data = bytes_field(index.messages[CAMERA].payload(frame), IMAGE_DATA)
-    image = np.empty((*size, 3), np.uint8)
-    decode_into(data, image)
+def _card(info: RoundInfo, index: RoundIndex, frame: int, image: Image) -> Card:
     annotations = _annotations(info.path, int(index.messages[CAMERA].log_time[frame]))
     big = cv2.resize(image, None, fx=SCALE, fy=SCALE, interpolation=cv2.INTER_LINEAR)
     for line in annotations.points:

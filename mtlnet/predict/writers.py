@@ -6,7 +6,6 @@ Each row and frame is written when it is known: an interrupted command keeps wha
 import csv
 import json
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Protocol, Self
 
 import cv2
@@ -34,12 +33,7 @@ class Writer(Protocol):
 
     def __enter__(self) -> Self: ...
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None: ...
+    def __exit__(self, *_: object) -> None: ...
 
 
 def open_writer(path: Path, camera: CameraParameters, fps: float) -> Writer:

@@ -12,7 +12,6 @@ import json
 import os
 import re
 import time
-from types import TracebackType
 from typing import Any
 from urllib.parse import SplitResult, urlsplit
 
@@ -161,12 +160,7 @@ class Client:
     def __enter__(self) -> "Client":
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def _request(

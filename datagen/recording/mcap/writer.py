@@ -3,7 +3,6 @@
 import hashlib
 from collections.abc import Mapping
 from pathlib import Path
-from types import TracebackType
 
 import numpy as np
 from mcap.well_known import MessageEncoding, SchemaEncoding
@@ -83,13 +82,8 @@ class RoundWriter:
     def __enter__(self) -> "RoundWriter":
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self._file.__exit__(kind, error, trace)
+    def __exit__(self, *_: object) -> None:
+        self._file.close()
 
     def _add(self, topic: str, time: int, data: bytes) -> None:
         self._file.add(topic, time, self.frames, data)
@@ -129,16 +123,15 @@ class RoundFile:
         self._mcap.finish()  # type: ignore[no-untyped-call]  # mcap leaves it untyped
         self._stream.close()
 
+    def close(self) -> None:
+        """Close the file as it is."""
+        self._stream.close()
+
     def __enter__(self) -> "RoundFile":
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self._stream.close()
+    def __exit__(self, *_: object) -> None:
+        self.close()
 
     def _register(self) -> dict[str, int]:
         schemas: dict[str, int] = {}

@@ -4,6 +4,7 @@ World frame: x, y in the plane, z up; SI units, angles in rad, counter-clockwise
 """
 
 from collections.abc import Mapping
+from dataclasses import asdict
 from math import cos, sin
 from typing import Any
 
@@ -122,56 +123,22 @@ def labels(frame: Frame) -> bytes:
 
 
 def ego_state(ego: EgoState) -> bytes:
-    return _serialize(
-        VehicleState(
-            x=ego.x,
-            y=ego.y,
-            z=ego.z,
-            yaw=ego.yaw,
-            pitch=ego.pitch,
-            roll=ego.roll,
-            vx=ego.vx,
-            vy=ego.vy,
-            yaw_rate=ego.yaw_rate,
-            shadow_fraction=ego.shadow_fraction,
-        )
-    )
+    return _serialize(VehicleState(**asdict(ego)))
 
 
 def sensors(readings: SensorReadings) -> bytes:
-    return _serialize(
-        Sensors(
-            range=readings.range,
-            angle=readings.angle,
-            speed=readings.speed,
-            speed_x=readings.speed_x,
-            speed_y=readings.speed_y,
-            engine_rotation=readings.engine_rotation,
-            odometer=readings.odometer,
-            lap_time=readings.lap_time,
-            wheel_spin=readings.wheel_spin,
-        )
-    )
+    return _serialize(Sensors(**asdict(readings)))
 
 
 def command(given: DriverCommand) -> bytes:
-    return _serialize(
-        Command(steer=given.steer, throttle=given.throttle, brake=given.brake, gear=given.gear)
-    )
+    return _serialize(Command(**asdict(given)))
 
 
 def traffic(frame: Frame, time: Timestamp) -> bytes:
     """All cars as boxes: the others in the world frame, the ego car in its own."""
     message = SceneUpdate()
-    _add_box(
-        message,
-        "ego",
-        EGO,
-        (0.0, 0.0, EGO_BOX_CENTRE_HEIGHT_M, 0.0, 0.0, 0.0),
-        EGO_SIZE_M,
-        BLUE,
-        time,
-    )
+    ego = (0.0, 0.0, EGO_BOX_CENTRE_HEIGHT_M, 0.0, 0.0, 0.0)
+    _add_box(message, "ego", EGO, ego, EGO_SIZE_M, BLUE, time)
     for number, (x, y, z, roll, pitch, yaw) in enumerate(frame.traffic.tolist()):
         middle = (x, y, z + TRAFFIC_SIZE_M[2] / 2.0, roll, pitch, yaw)
         _add_box(message, f"car {number}", WORLD, middle, TRAFFIC_SIZE_M, GREY, time)

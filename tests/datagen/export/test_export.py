@@ -297,7 +297,7 @@ def test_a_killed_export_is_not_there_and_the_next_one_is_whole(
 def test_a_second_export_to_the_same_place_is_refused(
     dataset: Path, tmp_path: Path, refused: Refused
 ) -> None:
-    from datagen.export.target import new_folder
+    from datagen.export.output_folder import new_folder
 
     with new_folder(tmp_path / "out") as partial:
         (partial / "a").write_text("mine")
