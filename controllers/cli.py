@@ -107,9 +107,10 @@ def demo(
     seed: DemoSeed = DEMO.seed,
     as_json: command.AsJson = False,
 ) -> None:
-    """The whole pipeline: collect, train, evaluate, serve, predict, drive, and an HTML report.
+    """The shipped model on a first drive, then the whole pipeline: collect, train, evaluate, serve,
+    predict, drive, and an HTML report.
 
-    The same command continues where it was stopped. Exit 1 when the model misses a limit.
+    The same command continues where it was stopped. Exit 1 when a limit is missed.
     """
     from controllers.demo.process import stop_on_sigterm
     from controllers.demo.report import check_limits, print_tables, write_report
@@ -118,7 +119,7 @@ def demo(
     stop_on_sigterm()
     config = DemoConfig(out=out, rounds=rounds, frames=frames, seed=seed, minutes=minutes)
     result = run_demo(config)
-    found = check_limits(result.evaluation)
+    found = check_limits(result)
     report = write_report(config, result)
     if as_json:
         typer.echo(json.dumps(result.as_json()))
@@ -128,8 +129,8 @@ def demo(
     missed = [one.what for one in found if not one.reached]
     if missed:
         command.fail(
-            f"the model misses the limit for {', '.join(missed)}; a slower machine needs more "
-            "--minutes (with another --out)"
+            f"the limit is missed for {', '.join(missed)}; a slower machine needs more --minutes "
+            "(with another --out)"
         )
 
 

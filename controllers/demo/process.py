@@ -55,14 +55,14 @@ def free_port() -> int:
 
 
 @contextmanager
-def running_service(model: Path, log: Path) -> Iterator[str]:
-    """Serve the run folder `model`; yields the service's address.
+def running_service(model: str, log: Path) -> Iterator[str]:
+    """Serve the model of that name or run folder; yields the service's address.
 
     Raises UserError with the end of the log if the service does not become ready or does not stop.
     """
     port = free_port()
     url = f"http://127.0.0.1:{port}"
-    command = [sys.executable, "-m", "serve", "--model", str(model), "--port", str(port)]
+    command = [sys.executable, "-m", "serve", "--model", model, "--port", str(port)]
     with (
         log.open("wb") as output,
         subprocess.Popen(command, stdout=output, stderr=output) as server,

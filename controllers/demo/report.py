@@ -25,6 +25,8 @@ from trackfeatures.camera import CameraParameters
 
 LIMITS = {"ml": 0.35, "mr": 0.35, "angle": 0.03, "heading": 0.85}
 """What the demo must reach: mean error in m and rad, and the accuracy of the heading class."""
+MAX_MEAN_ABS_D_M = 0.3
+"""Of the drive on the service's answers; it must also not leave the road."""
 LIMIT_COLUMNS = ("feature", "mean error", "limit", "training mean", "ratio", "reached")
 LEARNED_RATIO = 0.65
 """A feature counts as learned when its error is at most this share of the baseline's, which always
@@ -45,7 +47,8 @@ class LimitCheck:
 
     what: str
     figure: float
-    mean: float
+    mean: float | None
+    """That of the baseline; None where there is none."""
     limit: float | None = None
     """None: the demo sets no limit."""
     reached: bool = True
@@ -57,7 +60,16 @@ class LimitCheck:
         return "yes" if self.reached else "NO"
 
 
-def check_limits(evaluation: dict[str, Any]) -> list[LimitCheck]:
+def check_limits(result: DemoResult) -> list[LimitCheck]:
+    """The demo's results against its limits: evaluation, posted frames, drive."""
+    return [
+        *check_evaluation(result.evaluation),
+        *check_posted(result.asked, result.evaluation),
+        check_drive(result.drive),
+    ]
+
+
+def check_evaluation(evaluation: dict[str, Any]) -> list[LimitCheck]:
     """The results of an evaluation against the demo's limits, feature by feature."""
     baseline = evaluation["baseline"]
     rows = []
@@ -79,12 +91,41 @@ def _check_error(what: str, error: float, mean: float, limit: float | None) -> L
     return LimitCheck(what, error, mean, limit, reached)
 
 
+def check_posted(frames: list[PostedFrame], evaluation: dict[str, Any]) -> list[LimitCheck]:
+    """The service's answers to posted frames: mean errors within the evaluation's 95th percentile.
+
+    A service that answers for another camera or model than the evaluated one is far outside.
+    """
+    found = []
+    for what, name, pairs in (
+        ("posted: angle (rad)", "angle", [(f.angle, f.answer["angle_rad"]) for f in frames]),
+        (
+            "posted: to lane centre (m)",
+            "to_lane_centre",
+            [(f.to_lane_centre, f.answer["to_lane_centre_m"]) for f in frames],
+        ),
+    ):
+        errors = [abs(true - answer) for true, answer in pairs if None not in (true, answer)]
+        limit = evaluation["errors"][name]["p95"]
+        if errors and limit is not None:
+            error = float(np.mean(errors))
+            found.append(LimitCheck(what, error, None, limit, error <= limit))
+    return found
+
+
+def check_drive(drive: dict[str, Any]) -> LimitCheck:
+    """The drive on the service's answers: on the road to the end, near the middle of its lane."""
+    mean = drive["mean_abs_d_m"]
+    stayed = drive["ended"] is None and mean <= MAX_MEAN_ABS_D_M
+    return LimitCheck("drive: mean |d| (m)", mean, None, MAX_MEAN_ABS_D_M, stayed)
+
+
 def check_cells(check: LimitCheck) -> tuple[str, ...]:
     """A check as the cells of `LIMIT_COLUMNS`."""
-    limit = "" if check.limit is None else f"{check.limit:g}"
-    ratio = f"{check.figure / check.mean:.2f}"
-    figures = (f"{check.figure:.4f}", limit, f"{check.mean:.4f}")
-    return check.what, *figures, ratio, check.word
+    limit = "" if check.limit is None else f"{check.limit:.4g}"
+    mean = "" if check.mean is None else f"{check.mean:.4f}"
+    ratio = "" if check.mean is None else f"{check.figure / check.mean:.2f}"
+    return check.what, f"{check.figure:.4f}", limit, mean, ratio, check.word
 
 
 # The HTML report.
@@ -101,8 +142,9 @@ def write_report(config: DemoConfig, result: DemoResult) -> Path:
         result=result,
         learned_ratio=LEARNED_RATIO,
         limit_columns=LIMIT_COLUMNS,
-        limit_rows=[check_cells(one) for one in check_limits(result.evaluation)],
+        limit_rows=[check_cells(one) for one in check_limits(result)],
         curves=_training_curves(config.out / "run" / "curves.csv"),
+        shipped_figures=_figures(camera, result.shipped),
         figures=_figures(camera, result.asked),
         answer_columns=ANSWER_COLUMNS,
         answer_rows=[_answer_cells(one) for one in result.asked],

@@ -19,6 +19,9 @@ from serve.client import Client
 from trackfeatures import UserError
 
 LOG = Console(stderr=True, highlight=False)
+FIRST_TRACK = "coast"
+"""No model is trained on it."""
+FIRST_FRAMES, FIRST_POSTED = 60, 4
 DRIVE_STEPS = 800
 """Of 50 ms: 40 s from a standing start."""
 
@@ -33,17 +36,21 @@ class DemoResult:
     asked: list[PostedFrame] = field(default_factory=list)
     commands: list[str] = field(default_factory=list)
     seconds: dict[str, float] = field(default_factory=dict)
+    shipped: list[PostedFrame] = field(default_factory=list)
+    """Frames answered by the shipped model."""
 
     def as_json(self) -> dict[str, Any]:
         """All of it except the images."""
         content = asdict(self)
-        for one in content["asked"]:
+        for one in content["asked"] + content["shipped"]:
             del one["jpeg"]
         return content
 
 
 def run_demo(config: DemoConfig) -> DemoResult:
-    """Collect, verify, train, evaluate, serve, predict, drive; all results go to `config.out`.
+    """Try the shipped model; collect, verify, train, evaluate, serve, predict, drive.
+
+    All results go to `config.out`.
 
     Raises UserError when `config.out` holds other files than an earlier demo's, or a step fails.
     """
@@ -60,6 +67,7 @@ def run_demo(config: DemoConfig) -> DemoResult:
         train.append("--resume")
     evaluate = ["mtlnet", "evaluate", "--model", run, "--data", data, "--split", "test", "--json"]
 
+    _try_shipped_model(config, result)
     result.collected = json.loads(_step(result, "collect", collect))
     _step(result, "verify", ["datagen", "verify", data, "--level", "full"])
     _step(result, "train", train)
@@ -70,6 +78,23 @@ def run_demo(config: DemoConfig) -> DemoResult:
     return result
 
 
+def _try_shipped_model(config: DemoConfig, result: DemoResult) -> None:
+    """Serve the shipped model, post it frames of a short round, and draw its answers in a film."""
+    folder = config.out / "first"
+    collect = ["datagen", "collect", "--out", str(folder), "--json", "--split", "unseen"]
+    collect += ["--rounds", "1", "--frames", str(FIRST_FRAMES), "--frequency", "5"]
+    collect += ["--stretch", "0", "--tracks", FIRST_TRACK, "--lanes", "2", "--lights", "clear"]
+    _step(result, "first round", [*collect, "--seed", str(config.seed)])
+    frames = Dataset.open(folder).select("unseen")
+    _log_command(result, "serve")
+    with running_service("default", config.out / "first.log") as url, Client(url) as client:
+        chosen = spread(frames, FIRST_POSTED, np.random.default_rng([config.seed, 2]))
+        result.shipped = post_frames(frames, chosen, client)
+    film = ["--out", str(config.out / "first.mp4"), "--out", str(config.out / "first.csv")]
+    _step(result, "first film", ["mtlnet", "predict", str(frames.rounds[0].path), *film])
+    LOG.print(f"the shipped model's answers are drawn in {config.out / 'first.mp4'}")
+
+
 def _use_service(config: DemoConfig, result: DemoResult) -> None:
     """Post held-out frames, and drive a car on the answers, with one service."""
     started = time.monotonic()
@@ -77,7 +102,7 @@ def _use_service(config: DemoConfig, result: DemoResult) -> None:
     frames = Dataset.open(config.out / "data").select("test")
     chosen = spread(frames, config.asked, np.random.default_rng([config.seed, 1]))
     with (
-        running_service(config.out / "run", config.out / "serve.log") as url,
+        running_service(str(config.out / "run"), config.out / "serve.log") as url,
         Client(url) as client,
     ):
         result.asked = post_frames(frames, chosen, client)

@@ -52,7 +52,7 @@ def test_collect_train_evaluate_serve_and_drive(tmp_path: Path) -> None:
     image = tmp_path / "frame.jpg"
     image.write_bytes(bytes(frames.jpeg(150)))
     predicted = command("mtlnet", "predict", "--model", run, str(image), "--json")
-    with running_service(Path(run), tmp_path / "serve.log") as url, Client(url) as client:
+    with running_service(run, tmp_path / "serve.log") as url, Client(url) as client:
         answer = client.features(image.read_bytes())
         assert list(answer["distances_m"]) == list(MARKINGS)
         assert sum(answer["heading"].values()) == pytest.approx(1.0, abs=1e-3)

@@ -14,7 +14,7 @@ import pytest
 from controllers.config import DemoConfig
 from controllers.demo.frames import PostedFrame, spread
 from controllers.demo.process import run_module
-from controllers.demo.report import check_limits, print_tables
+from controllers.demo.report import check_drive, check_evaluation, check_posted, print_tables
 from controllers.demo.run import run_demo
 from mtlnet.inference.overlay import SCALE, draw_overlay, marking_line, to_pixels
 from trackfeatures import UserError
@@ -94,7 +94,7 @@ def evaluation(angle: float = 0.02, ml: float = 0.2, heading: float = 0.9) -> di
 def test_a_limit_also_requires_a_share_of_the_mean_predictors_error(
     change: dict[str, float], missed: list[str]
 ) -> None:
-    found = check_limits(evaluation(**change))
+    found = check_evaluation(evaluation(**change))
     assert [one.what for one in found] == [
         *("ml (m)", "mr (m)", "m (m)", "r (m)", "angle (rad)", "heading (share right)")
     ]
@@ -110,10 +110,40 @@ def test_tables_show_true_and_answered_values(capsys: pytest.CaptureFixture[str]
     }
     distances = {**NOTHING, "ml": -1.6, "mr": 2.4}
     asked = PostedFrame(b"", "r1", "oval", 2, distances, 0.4, 0.01, "straight", 0.0, answer)
-    print_tables(check_limits(evaluation(angle=0.05)), [asked])
+    print_tables(check_evaluation(evaluation(angle=0.05)), [asked])
     output = capsys.readouterr().out
     for cell in ("-1.60 -1.50", "+0.40 +0.50", "+0.010 +0.012", "straight right", "1.25 ", "NO"):
         assert cell in output
+
+
+@pytest.mark.parametrize(
+    ("drive", "reached"),
+    [
+        ({"mean_abs_d_m": 0.29, "ended": None}, True),
+        ({"mean_abs_d_m": 0.31, "ended": None}, False),
+        ({"mean_abs_d_m": 0.1, "ended": "off_road"}, False),
+    ],
+)
+def test_a_drive_must_stay_on_the_road_near_the_middle(
+    drive: dict[str, Any], reached: bool
+) -> None:
+    assert check_drive(drive).reached is reached
+
+
+def test_posted_answers_must_be_as_good_as_the_evaluation_says() -> None:
+    limits = {"errors": {"angle": {"p95": 0.02}, "to_lane_centre": {"p95": 0.2}}}
+
+    def posted(angle: float, centre: float | None) -> PostedFrame:
+        answer = {"angle_rad": angle, "to_lane_centre_m": centre}
+        return PostedFrame(b"", "r1", "oval", 2, NOTHING, 0.4, 0.01, "straight", 0.0, answer)
+
+    good = check_posted([posted(0.02, 0.5), posted(0.0, None)], limits)
+    assert [(one.figure, one.reached) for one in good] == [
+        (pytest.approx(0.01), True),
+        (pytest.approx(0.1), True),
+    ]
+    bad = check_posted([posted(0.05, 0.7)], limits)
+    assert [one.reached for one in bad] == [False, False]
 
 
 def test_a_folder_with_other_files_is_refused(tmp_path: Path) -> None:
