@@ -128,6 +128,14 @@ ReportPage = Annotated[
     Path | None, typer.Option("--report", help="HTML page to write: a file, or a folder.")
 ]
 EveryFrame = Annotated[int, typer.Option(help="Evaluate every n-th frame only.")]
+ShipOut = Annotated[Path, typer.Option(help="Folder for the model.")]
+ShippedEvaluations = Annotated[
+    list[Path] | None,
+    typer.Option(help="Output of `mtlnet evaluate --json`, for README.md; several times."),
+]
+ShippedNotes = Annotated[
+    Path | None, typer.Option(help="Markdown for README.md, such as the commands.", exists=True)
+]
 PredictInputs = Annotated[
     list[str],
     typer.Argument(help="JPEG or PNG files, folders of them, patterns, films, rounds (.mcap)."),
@@ -245,14 +253,22 @@ def export_command(
 
 @app.command("ship")
 def ship_command(
-    out: Annotated[Path, typer.Option(help="New folder for the model.")],
+    out: ShipOut,
     model: Model = "default",
+    evaluation: ShippedEvaluations = None,
+    notes: ShippedNotes = None,
     as_json: Json = False,
 ) -> None:
-    """Write a model as weights alone, in float16: small enough for a repository."""
-    from mtlnet.export.ship import ship_model
+    """Write a model as weights alone, in float16: small enough for a repository.
+
+    With --evaluation: the page of figures of the model that is in --out.
+    """
+    from mtlnet.export.ship import ship_model, write_page
     from mtlnet.inference.model_card import resolve_run
 
+    if evaluation:
+        typer.echo(write_page(out, evaluation, "" if notes is None else notes.read_text()))
+        return
     result = ship_model(resolve_run(model), out)
     if as_json:
         typer.echo(json.dumps(result))

@@ -1,18 +1,22 @@
 """`mtlnet ship --model RUN --out DIR`: a model as weights alone, in half the bytes.
 
-`model.safetensors` in float16, the second head in float32 and the card: all an engine needs
+`model.safetensors` in float16, the uncertainty head in float32 and the card: all an engine needs
 (`mtlnet.inference.engine.read_graph`). Its answers are those of the rounded weights, and so are the
-card's.
+card's. `write_page` adds a README.md with the figures of evaluations.
 """
 
+import json
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jinja2 import Environment, PackageLoader, StrictUndefined
 from numpy.typing import NDArray
 from safetensors.numpy import save
 
+from mtlnet.evaluation.metrics import GROUPS
 from mtlnet.export.openvino_graph import TOLERANCE
 from mtlnet.inference.engine import load_engine
 from mtlnet.inference.model_card import (
@@ -31,6 +35,7 @@ from mtlnet.inference.weights_file import read_weights
 from mtlnet.model.architecture import HEIGHT, WIDTH, find_architecture
 from mtlnet.model.network import load_network, predict_images
 from runtime.files import atomic_write
+from runtime.html import format_number, format_percent
 from trackfeatures.errors import UserError
 
 CHECK_IMAGES = 4
@@ -85,6 +90,7 @@ def _card_of(out: Path, card: ModelCard, names: tuple[str, ...]) -> ModelCard:
     return replace(
         card,
         name=out.resolve().name,
+        data={**card.data, "path": Path(card.data["path"]).name},  # not this machine's folders
         files={name: file_hash(out / name) for name in names},
         golden=tuple(float(value) for value in golden),
     )
@@ -113,3 +119,36 @@ def _check(run: Path, out: Path) -> dict[str, float]:
             f"{TOLERANCE:g} is expected; report this as a fault"
         )
     return found
+
+
+def write_page(model: Path, evaluations: Sequence[Path], notes: str = "") -> Path:
+    """Write `README.md` into the model's folder: its card, `notes`, and the tables of evaluations.
+
+    `evaluations`: what `mtlnet evaluate --json` printed. Raises UserError for one of another model,
+    or one that cannot be read.
+    """
+    card = read_card(model)
+    found = [_read_evaluation(path, card) for path in evaluations]
+    environment = Environment(
+        loader=PackageLoader("mtlnet.export", ""), undefined=StrictUndefined, autoescape=False
+    )
+    page = environment.get_template("model_page.md").render(
+        card=card,
+        notes=notes.strip(),
+        evaluations=found,
+        groups=GROUPS,
+        number=format_number,
+        percent=format_percent,
+    )
+    atomic_write(model / "README.md", page)
+    return model / "README.md"
+
+
+def _read_evaluation(path: Path, card: ModelCard) -> dict[str, Any]:
+    try:
+        found: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        if found["model_hash"] != card.model_hash:
+            raise UserError(f"{path} evaluates {found['model']}, other weights than these")
+        return found
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise UserError(f"{path} is no result of `mtlnet evaluate --json` ({error!r})") from error

@@ -116,7 +116,9 @@ def test_wrong_options_of_training_are_refused(dataset: Path, tmp_path: Path) ->
     assert "is not a training run" in refused(*train, "--resume")
     assert "no recorded rounds" in refused("train", "--data", tmp_path / "no", "--out", new)
     assert not new.exists()
-    assert "no runs/latest" in refused("evaluate", "--data", dataset, folder=tmp_path)
+    assert "no runs/latest" in refused(
+        "evaluate", "--model", "latest", "--data", dataset, folder=tmp_path
+    )
 
 
 def test_ctrl_c_leaves_a_checkpoint_to_resume_from(dataset: Path, tmp_path: Path) -> None:

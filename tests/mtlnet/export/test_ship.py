@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from safetensors.numpy import save
 
 from datagen.recording import Dataset
+from mtlnet.evaluation.evaluate import evaluate
 from mtlnet.export.openvino_graph import TOLERANCE
-from mtlnet.export.ship import half, ship_model
+from mtlnet.export.ship import half, ship_model, write_page
 from mtlnet.inference.engine import load_engine
 from mtlnet.inference.model_card import (
     UNCERTAINTY_WEIGHTS,
@@ -140,3 +141,35 @@ def test_no_whole_file_of_weights(content: bytes, tmp_path: Path) -> None:
     path.write_bytes(content)
     with pytest.raises(ModelError, match="no whole file of weights"):
         read_weights(path)
+
+
+def test_the_page_of_a_shipped_model_has_the_figures_of_its_evaluations(
+    shipped: Path, dataset: Path, tmp_path: Path
+) -> None:
+    engine = load_engine(shipped, "openvino", "f32")
+    found = evaluate([engine], dataset, "test")
+    file = tmp_path / "test.json"
+    file.write_text(json.dumps(found))
+    page = write_page(shipped, [file], "Trained by hand.").read_text()
+    (shipped / "README.md").unlink()
+    assert "Trained by hand." in page
+    assert engine.card.model_hash in page
+    error = found["errors"]["ml"]
+    assert f"| `ml` (m) | {error['mean']:.3f} | {error['median']:.3f} |" in page
+    assert f"Class right: {found['heading_accuracy']:.1%}" in page
+    light = found["by_light"]["clear"]
+    assert f"| light: clear | {light['frames']} | {light['errors']['ml']['mean']:.3f} |" in page
+    rows = [line for line in page.splitlines() if line.startswith("|")]
+    assert {line.count("|") for line in rows} == {10, 11}, "every row has all its cells"
+
+    file.write_text(json.dumps({**found, "model_hash": "0" * 64}))
+    with pytest.raises(UserError, match="other weights than these"):
+        write_page(shipped, [file])
+    file.write_text("[]")
+    with pytest.raises(UserError, match="no result of"):
+        write_page(shipped, [file])
+
+
+def test_the_card_of_a_shipped_model_names_no_folder(published: Path, shipped: Path) -> None:
+    assert read_card(published).data["path"] != read_card(shipped).data["path"]
+    assert "/" not in read_card(shipped).data["path"]
