@@ -95,6 +95,8 @@ def read_card(run: Path) -> ModelCard:
     except (ValueError, KeyError, TypeError) as error:
         raise ModelError(f"{path} is damaged ({error!r}); train the model anew") from error
     require_version(card.definitions_version, f"the model in {run}")
+    if run == SHIPPED and card.files != SHIPPED_FILES:
+        raise ModelError(f"{run} holds not the weights that ship with this version; install again")
     return card
 
 

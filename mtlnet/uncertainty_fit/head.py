@@ -5,6 +5,7 @@ are held out of its training (`mtlnet.data.sources.hold_out_rounds`); they deter
 the standard deviations and the limit of the out-of-distribution score.
 """
 
+import math
 import os
 from dataclasses import dataclass, replace
 from typing import Any
@@ -48,10 +49,10 @@ FIT = FitSettings(steps=250, batch=256, learning_rate=1e-2, weight_decay=3e-2)
 FOLDS = 3
 MIN_PRESENT_FRAMES = 30  # frames from which a feature has a temperature of its own
 CHUNK = 32  # images read at once
-MIN_STD_SHARE, MAX_STD_SHARE = (
-    0.1,
-    20.0,
-)  # limits of a standard deviation, relative to the RMS error
+MIN_STD_SHARE, MAX_STD_SHARE = 0.1, 20.0
+"""Limits of a standard deviation, relative to the RMS error."""
+MIN_FEATURE_STD_SHARE = 0.1
+LOG_STD_LIMITS = (math.log(MIN_STD_SHARE), math.log(MAX_STD_SHARE))
 COVERED = 0.6827  # share of a normal distribution within one standard deviation
 
 Numbers = NDArray[np.float32]
@@ -83,7 +84,7 @@ def fit_uncertainty_head(
     """
     known = run_on_frames(network, train, MAX_TRAIN_FRAMES)
     unseen = None if held_out is None else run_on_frames(network, held_out, MAX_HELD_OUT_FRAMES)
-    centre, scale = known.x.mean(0), 1 / np.maximum(known.x.std(0), 1e-3)
+    centre, scale = standardisation(known.x)
     threads = torch.get_num_threads()
     torch.set_num_threads(1)  # the head is small: more threads take longer
     standardised = None if unseen is None else replace(unseen, x=(unseen.x - centre) * scale)
@@ -105,7 +106,7 @@ def fit_uncertainty_head(
     )
     head = UncertaintyHead(
         centre,
-        scale.astype(np.float32),
+        scale,
         **std_layers,
         texture_mean=mean,
         texture_directions=directions,
@@ -120,6 +121,17 @@ def fit_uncertainty_head(
         "coverage": coverage(head.predict(judged.x, judged.texture)[:, :-1], judged.error),
     }
     return FittedUncertainty(head, about)
+
+
+def standardisation(x: Numbers) -> tuple[Numbers, Numbers]:
+    """Mean (F,) and inverse standard deviation (F,) of features (N, F), for `UncertaintyHead`.
+
+    A feature that hardly varies counts as varying by `MIN_FEATURE_STD_SHARE` of the mean: a unit
+    that is silent on these frames would be thousands of deviations away on others.
+    """
+    std = x.std(0)
+    floor = max(MIN_FEATURE_STD_SHARE * float(std.mean()), 1e-3)
+    return x.mean(0), (1 / np.maximum(std, floor)).astype(np.float32)
 
 
 def run_on_frames(network: Network, frames: Images, limit: int) -> FrameOutputs:
@@ -234,7 +246,7 @@ def _train(z: Tensor, error: Tensor, seed: int) -> "_StdLayers":
     squares = error.nan_to_num() ** 2
 
     def loss(rows: Tensor) -> Tensor:
-        log_std = layers(z[rows])
+        log_std = layers(z[rows]).clamp(*LOG_STD_LIMITS)
         terms = log_std + 0.5 * squares[rows] * torch.exp(-2 * log_std)
         mean: Tensor = (terms * present[rows]).mean()
         return mean

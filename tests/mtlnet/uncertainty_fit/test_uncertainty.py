@@ -18,7 +18,7 @@ from mtlnet.inference.uncertainty import (
     read_uncertainty_head,
     texture_features,
 )
-from mtlnet.uncertainty_fit.head import fit_std_layers
+from mtlnet.uncertainty_fit.head import FrameOutputs, fit_std_layers, standardisation
 from mtlnet.uncertainty_fit.ood import draw_view, fit_texture_distance, view_homography
 from tests.mtlnet.ood_images import images_without_road, seen_by
 from trackfeatures.camera import CameraParameters
@@ -71,6 +71,20 @@ def test_a_feature_that_is_never_present_has_a_finite_deviation() -> None:
     error[:, 2] = np.nan
     layers = fit_std_layers(rng.normal(size=(200, 4)).astype(np.float32), error, 0, None)
     assert all(np.isfinite(value).all() for value in layers.values())
+
+
+def test_a_feature_that_is_silent_in_training_does_not_make_the_fit_diverge() -> None:
+    rng = np.random.default_rng(0)
+    x = rng.normal(0.0, 20.0, (900, 8)).astype(np.float32)
+    x[:, 0] = 0.0
+    x[::300, 0] = 0.004  # a ReLU that is on in three frames
+    unseen = x[:400].copy()
+    unseen[::2, 0] = 60.0
+    error = rng.normal(0.0, 0.1, (900, 7)).astype(np.float32)
+    centre, scale = standardisation(x)
+    held_out = FrameOutputs((unseen - centre) * scale, error[:400], np.zeros((400, 1), np.float32))
+    layers = fit_std_layers((x - centre) * scale, error, 0, held_out)
+    assert all(np.isfinite(values).all() for values in layers.values())
 
 
 def test_texture_distance_has_the_given_false_alarm_rate() -> None:
