@@ -34,7 +34,7 @@ from tests.datagen.commands import (
 from trackfeatures.camera import CameraParameters
 
 
-def test_what_is_collected_verifies_and_reads(collected: Path) -> None:
+def test_a_collected_dataset_passes_verify_and_can_be_read(collected: Path) -> None:
     report = verify(collected, "deep")
     assert report.ok, report.problems
     dataset = Dataset.open(collected)
@@ -105,7 +105,7 @@ def test_a_finished_dataset_is_left_alone_and_a_lost_round_made_again(collected:
         (["--jitter-camera"], "jitter_camera: False there, True asked for"),
     ],
 )
-def test_what_cannot_be_is_refused_in_one_line(
+def test_impossible_options_are_refused_with_a_one_line_error(
     collected: Path, refused: Callable[..., str], args: list[str], message: str
 ) -> None:
     before = {path: path.stat().st_mtime_ns for path in collected.rglob("*")}
@@ -113,7 +113,7 @@ def test_what_cannot_be_is_refused_in_one_line(
     assert {path: path.stat().st_mtime_ns for path in collected.rglob("*")} == before
 
 
-def test_a_folder_of_something_else_is_not_touched(
+def test_a_folder_that_is_no_dataset_is_not_changed(
     tmp_path: Path, refused: Callable[..., str]
 ) -> None:
     (tmp_path / "thesis.tex").write_text("years of work")
@@ -122,7 +122,7 @@ def test_a_folder_of_something_else_is_not_touched(
     assert "is a file" in refused("collect", *SHORT, "--out", tmp_path / "thesis.tex")
 
 
-def test_empty_parts_of_a_dataset_are_no_foreign_folder(tmp_path: Path) -> None:
+def test_a_folder_with_empty_dataset_subfolders_is_accepted(tmp_path: Path) -> None:
     plan = make_small_plan(1, 10)
     (tmp_path / "rounds").mkdir()
     (tmp_path / "state").mkdir()
@@ -140,10 +140,10 @@ def test_a_dataset_of_other_definitions_is_refused(tmp_path: Path) -> None:
         collect(plan, tmp_path, workers=1)
 
 
-def test_files_that_are_no_rounds_of_the_plan_are_told_before_anything_is_recorded(
+def test_files_outside_the_plan_are_reported_before_recording(
     collected: Path, refused: Callable[..., str]
 ) -> None:
-    """Another recording, of another program even, would be read as one of ours."""
+    """Any MCAP file in `rounds/` would be read as a round of the dataset."""
     foreign = collected / "rounds" / "drive-2024.mcap"
     foreign.write_bytes(b"\x89MCAP0\r\n" + bytes(100))
     try:
@@ -154,7 +154,7 @@ def test_files_that_are_no_rounds_of_the_plan_are_told_before_anything_is_record
     assert verify(collected, "full").ok
 
 
-def test_a_dataset_of_another_version_of_the_program_is_not_gone_on_with(tmp_path: Path) -> None:
+def test_a_dataset_of_another_program_version_is_not_continued(tmp_path: Path) -> None:
     plan = make_small_plan(1, 10)
     content = {**plan.as_json(), "program": "driverview 0.0.1", "hash": "0" * 64}
     (tmp_path / "plan.json").write_text(json.dumps(content))
@@ -162,7 +162,7 @@ def test_a_dataset_of_another_version_of_the_program_is_not_gone_on_with(tmp_pat
         collect(plan, tmp_path, workers=1)
 
 
-def test_without_a_renderer_one_line_says_what_to_install(tmp_path: Path) -> None:
+def test_without_a_renderer_the_error_says_what_to_install(tmp_path: Path) -> None:
     folder = tmp_path / "data"
     environment = os.environ | {"__EGL_VENDOR_LIBRARY_FILENAMES": str(tmp_path / "nothing.json")}
     done = datagen("collect", *SHORT, "--out", folder, env=environment)

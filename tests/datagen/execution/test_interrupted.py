@@ -53,7 +53,7 @@ def test_an_interruption_leaves_whole_rounds_only_and_is_resumed(
         assert verify(folder, "full").ok
 
 
-def test_a_worker_that_dies_costs_its_round_only_and_the_round_is_tried_again(
+def test_the_round_of_a_dead_worker_is_retried_and_the_others_are_kept(
     tmp_path: Path,
 ) -> None:
     jobs = make_jobs(tmp_path, rounds=2, frames=30)
@@ -73,13 +73,13 @@ def test_a_worker_that_dies_costs_its_round_only_and_the_round_is_tried_again(
     assert sorted(done) == ["round-000", "round-001"] == sorted(read_states(tmp_path))
 
 
-def test_a_round_that_cannot_be_driven_is_tried_once_and_told_in_one_line(
+def test_a_round_that_cannot_be_driven_is_tried_once_and_reported_in_one_line(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capfd: pytest.CaptureFixture[str],
     samples: Samples,
 ) -> None:
-    """Forked workers take the stand-in for recording with them."""
+    """Workers are forked, so they inherit the patched recording function."""
 
     def record(plan: RoundPlan, plan_hash: str, path: Path, *rest: object) -> None:
         with (tmp_path / "attempts").open("a") as stream:
@@ -131,8 +131,8 @@ def wait_for(found: Callable[[], object], process: subprocess.Popen[str]) -> Non
         time.sleep(0.02)
 
 
-def test_a_process_that_gives_no_sign_of_life_is_replaced(tmp_path: Path) -> None:
-    """A stopped one: it is alive and says nothing."""
+def test_a_process_without_heartbeat_is_replaced(tmp_path: Path) -> None:
+    """A process stopped by SIGSTOP is alive but sends no messages."""
     stopped: list[int] = []
     done: list[str] = []
 
@@ -172,7 +172,7 @@ def test_a_round_that_takes_too_long_is_tried_three_times_and_given_up(tmp_path:
     assert len(started) == ATTEMPTS
 
 
-def test_tries_come_with_growing_delay_and_end_after_the_third(tmp_path: Path) -> None:
+def test_retries_have_growing_delays_and_end_after_the_third_attempt(tmp_path: Path) -> None:
     (job, other) = make_jobs(tmp_path, rounds=2, frames=10)
     queue = RetryQueue([job, other], Timeouts(retry_delay_s=2.0))
     assert queue.take(0.0) == job
@@ -191,7 +191,7 @@ def test_tries_come_with_growing_delay_and_end_after_the_third(tmp_path: Path) -
     assert queue.failures[1].final
 
 
-def test_processes_that_only_die_end_the_collection(tmp_path: Path) -> None:
+def test_repeated_process_deaths_end_the_collection(tmp_path: Path) -> None:
     queue = RetryQueue(make_jobs(tmp_path, rounds=1, frames=10), Timeouts())
     for _ in range(DEATHS_IN_A_ROW - 1):
         queue.record_death("code -11")
@@ -224,7 +224,7 @@ def _children(process: int) -> list[int]:
 
 @pytest.mark.slow
 def test_kills_of_the_whole_tree_at_random_moments_lose_nothing() -> None:
-    """The benchmark in small."""
+    """A short run of the benchmark that kills collections."""
     script = Path(__file__).parents[3] / "benchmarks" / "killed.py"
     small = ["--kills", "3", "--rounds", "3", "--frames", "10", "--seed", "2"]
     done = subprocess.run(

@@ -1,11 +1,11 @@
-"""What the bar of a collection says of its speed."""
+"""Speed shown by the progress bar of a collection."""
 
 from rich.progress import Progress
 
 from datagen.execution.progress import FramesPerSecond
 
 
-def test_the_speed_at_the_end_is_that_of_the_frames_recorded_now() -> None:
+def test_the_final_speed_counts_only_frames_recorded_in_this_run() -> None:
     bar = Progress(disable=True)
     bar.add_task("", total=1000, begun=800)
     (task,) = bar.tasks

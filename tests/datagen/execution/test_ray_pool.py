@@ -1,4 +1,4 @@
-"""Rounds recorded on a Ray cluster are those of this machine."""
+"""Rounds recorded on a Ray cluster equal those of local processes."""
 
 import json
 from dataclasses import replace
@@ -32,7 +32,7 @@ def test_two_ray_workers_give_the_same_dataset(collected: Path, tmp_path: Path) 
     assert not (folder / ".partial").exists()
 
 
-def test_an_actor_that_dies_costs_its_round_only(tmp_path: Path) -> None:
+def test_the_round_of_a_dead_actor_is_retried(tmp_path: Path) -> None:
     ray = pytest.importorskip("ray")
     done: list[str] = []
     killed: list[str] = []
@@ -50,7 +50,7 @@ def test_an_actor_that_dies_costs_its_round_only(tmp_path: Path) -> None:
     assert not ray.is_initialized()
 
 
-def test_what_no_round_can_get_round_ends_it_at_once(tmp_path: Path) -> None:
+def test_a_changed_track_ends_the_collection_at_once(tmp_path: Path) -> None:
     pytest.importorskip("ray")
     (job,) = make_jobs(tmp_path, rounds=1, frames=10)
     changed = replace(job, plan=replace(job.plan, track_hash="0" * 64))

@@ -1,4 +1,4 @@
-"""Several collectors on one plan: shards beside each other, locks, and putting folders together."""
+"""Several collectors on one plan: parallel shards, locks, and merging of folders."""
 
 import json
 import shutil
@@ -43,13 +43,15 @@ def test_a_shard_is_every_nth_round() -> None:
 
 
 @pytest.mark.parametrize("text", ["0/3", "4/3", "2", "a/b", "1/0", "-1/3"])
-def test_what_is_no_shard_is_refused(text: str) -> None:
+def test_invalid_shard_options_are_refused(text: str) -> None:
     with pytest.raises(tf.UserError, match="as 1/4 to 4/4"):
         Shard.parse(text)
 
 
 @pytest.mark.slow
-def test_shards_at_the_same_time_make_what_one_collector_makes(whole: Path, tmp_path: Path) -> None:
+def test_parallel_shards_give_the_same_dataset_as_one_collector(
+    whole: Path, tmp_path: Path
+) -> None:
     shared = tmp_path / "shared"
     command = [sys.executable, "-m", "datagen", "collect", *ROUNDS, "--out", str(shared), "--json"]
     running = [
@@ -88,7 +90,7 @@ def test_folders_of_shards_are_merged(
     assert not (out / ".partial").exists()
 
 
-def test_what_is_no_shard_of_the_plan_or_damaged_is_not_merged(
+def test_merge_refuses_folders_of_other_plans_and_damaged_rounds(
     whole: Path, tmp_path: Path, refused: Callable[..., str]
 ) -> None:
     new, part = tmp_path / "new", _without(whole, tmp_path / "part", ())
@@ -109,7 +111,7 @@ def test_what_is_no_shard_of_the_plan_or_damaged_is_not_merged(
 
 
 def _without(whole: Path, folder: Path, numbers: tuple[str, ...]) -> Path:
-    """What a shard leaves: the dataset without some rounds."""
+    """A copy of the dataset without some rounds, as one shard leaves it."""
     shutil.copytree(whole, folder)
     for number in numbers:
         (folder / "rounds" / f"round-{number}.mcap").unlink()

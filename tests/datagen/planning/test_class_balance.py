@@ -1,4 +1,4 @@
-"""No class of the road ahead is rare: forecast over many seeds, and driven for real."""
+"""Class balance of the road ahead: forecast over many seeds, and compared with simulation."""
 
 from collections import Counter
 from dataclasses import replace
@@ -64,14 +64,14 @@ def test_no_class_is_rare_on_either_side_whatever_the_seed(
         assert min(before) < MIN_SHARE  # there was something to do
 
 
-def test_a_class_that_the_tracks_do_not_have_stays_rare_and_nothing_breaks() -> None:
+def test_balancing_accepts_a_class_that_the_tracks_do_not_have() -> None:
     tracks = choose_tracks(("oval",), None)
     forecast = TrackForecast.of(tracks, None)
     plan = make_plan(CollectConfig(6, 1000, seed=1, tracks=tracks), forecast)
     assert expected_shares(plan.rounds, forecast)[tf.Heading.RIGHT] == 0.0
 
 
-def test_only_the_rounds_that_help_most_are_moved() -> None:
+def test_balancing_moves_only_the_starts_that_help_most() -> None:
     """Two rounds on a road that is straight from 0 to 0.5 and bends left, then right, after it."""
 
     def forecast(entry: RoundPlan, starts: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -91,8 +91,8 @@ def test_only_the_rounds_that_help_most_are_moved() -> None:
     assert sum(a != b for a, b in zip(made, rounds, strict=True)) == 3
 
 
-def test_a_forecast_over_a_whole_lap_is_the_tracks_own_share_in_time() -> None:
-    """The stretch from a place to itself: the share does not depend on the place."""
+def test_the_forecast_over_a_lap_is_the_share_of_lap_time_in_each_class() -> None:
+    """Over a whole lap the shares do not depend on the start."""
     track = find_track("oval")
     forecast = TrackForecast({"oval": track})
     plan = make_plan(
@@ -112,7 +112,7 @@ def test_a_forecast_over_a_whole_lap_is_the_tracks_own_share_in_time() -> None:
         assert shares[0, tf.Heading.LEFT] == pytest.approx((bends | soon).mean(), abs=0.01)
 
 
-def test_behind_slow_cars_on_one_lane_the_forecast_is_slow() -> None:
+def test_the_expected_speed_on_one_lane_is_limited_by_traffic() -> None:
     plan = make_plan(CollectConfig(1, 100, seed=1, tracks=choose_tracks(("oval",), None)))
     entry = replace(plan.rounds[0], speed_kmh=72.0, lanes=1, traffic=0)
     assert expected_speed(entry) == pytest.approx(20.0)
@@ -121,7 +121,7 @@ def test_behind_slow_cars_on_one_lane_the_forecast_is_slow() -> None:
     assert expected_speed(replace(entry, traffic=1, speed_kmh=45.0)) == pytest.approx(12.5)
 
 
-def test_the_bend_profile_is_what_braking_backwards_gives() -> None:
+def test_the_bend_profile_equals_a_backward_braking_pass() -> None:
     track = find_track("mountain-pass")
     profile = bend_profile(track, 2.0)
     cells = len(profile.limit)
@@ -134,8 +134,8 @@ def test_the_bend_profile_is_what_braking_backwards_gives() -> None:
 
 
 @pytest.mark.parametrize(("traffic", "error"), [(False, 0.03), (True, 0.12)])
-def test_what_is_driven_has_the_classes_that_were_forecast(traffic: bool, error: float) -> None:
-    """The rounds of a plan in the world, without pictures; traffic, in short rounds, costs most."""
+def test_driven_class_shares_are_near_the_forecast(traffic: bool, error: float) -> None:
+    """Rounds simulated without rendering; in short rounds, traffic causes most of the error."""
     tracks = choose_tracks(("circuit", "forest", "town"), None)
     forecast = TrackForecast.of(tracks, None)
     plan = make_plan(CollectConfig(8, 300, seed=3, tracks=tracks), forecast)

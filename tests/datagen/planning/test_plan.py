@@ -1,4 +1,4 @@
-"""The plan: pure, evenly dealt, and split without leaks."""
+"""The plan: deterministic, balanced, and split without leaks."""
 
 from collections import Counter
 from dataclasses import replace
@@ -21,7 +21,7 @@ def wanted(**changes: Any) -> CollectConfig:
     return replace(CollectConfig(tracks=NINE, stretch=0), **changes)
 
 
-def test_the_same_wishes_give_the_same_plan_and_others_another() -> None:
+def test_equal_configs_give_equal_plans_and_other_configs_other_plans() -> None:
     plan = make_plan(wanted())
     assert plan == make_plan(wanted())
     others = [
@@ -86,7 +86,7 @@ def test_small_plans_keep_a_round_of_each_track_for_training() -> None:
      {"test_share": 1.0}, {"lights": ("disco",)}, {"codec": "gif"}, {"split": "seen"},
      {"rounds": 600_000}],
 )  # fmt: skip
-def test_wishes_that_cannot_be_met_are_refused(changes: dict[str, Any]) -> None:
+def test_impossible_configs_are_refused(changes: dict[str, Any]) -> None:
     with pytest.raises(tf.UserError):
         wanted(**changes)
 
@@ -101,7 +101,7 @@ def test_without_torcs_the_projects_own_tracks_are_driven() -> None:
     assert len(one.content_hash) == 64
 
 
-def test_jittered_cameras_differ_and_stay_near_the_datasets_own() -> None:
+def test_jittered_cameras_differ_and_stay_near_the_nominal_camera() -> None:
     plan = make_plan(wanted(jitter_camera=True))
     about = wanted().camera
     for name, half in CAMERA_JITTER.items():
@@ -122,7 +122,7 @@ def test_rounds_of_an_unseen_track_share_no_seed_with_those_to_train_on() -> Non
     assert not usual & {entry.seed for entry in plan.rounds}
 
 
-def test_the_unseen_track_is_in_no_usual_plan() -> None:
+def test_the_unseen_track_is_in_no_training_plan() -> None:
     (unseen,) = choose_tracks((), None, unseen=True)
     usual = [choice.name for choice in choose_tracks((), None)]
     assert unseen.name not in usual
@@ -131,7 +131,7 @@ def test_the_unseen_track_is_in_no_usual_plan() -> None:
     assert [c.name for c in choose_tracks((unseen.name,), None, unseen=True)] == [unseen.name]
 
 
-def test_another_version_of_the_program_has_another_plan(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_plan_hash_depends_on_the_program_version(monkeypatch: pytest.MonkeyPatch) -> None:
     plan = make_plan(wanted())
     before = plan.hash
     monkeypatch.setattr("datagen.planning.plan.program", lambda: "driverview 99")

@@ -1,4 +1,4 @@
-"""Choosing the test rounds: the same as in every version so far, and fast for large plans."""
+"""Choice of test rounds: equal to stored results of the first version, and fast for large plans."""
 
 import json
 import re
@@ -57,7 +57,7 @@ def test_a_road_keeps_its_last_training_round_while_another_has_two() -> None:
     assert sorted(number // 2 for number in chosen) == [0, 1, 2, 3]
 
 
-def test_a_single_round_or_a_share_of_nought_gives_no_test_round() -> None:
+def test_a_single_round_or_a_test_share_of_zero_gives_no_test_round() -> None:
     rng = np.random.default_rng(0)
     assert choose_test_rounds(0.25, ["a"], [1], (), rng) == set()
     assert choose_test_rounds(0.0, ["a", "a", "b"], [1, 1, 1], (), rng) == set()

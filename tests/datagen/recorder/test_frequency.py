@@ -1,4 +1,4 @@
-"""Frames a second: fewer of them show more road, and the car is steered as often as before."""
+"""The frame rate: it selects the recorded steps and leaves the control rate at 20 Hz or above."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -18,7 +18,7 @@ OPTIONS = ("--rounds", "1", "--tracks", "oval", "--lights", "clear", "--stretch"
 
 
 @pytest.mark.parametrize("hertz", [h for h in range(1, PHYSICS_HZ + 1) if PHYSICS_HZ % h == 0])
-def test_the_car_is_steered_often_enough(hertz: int) -> None:
+def test_the_control_rate_is_at_least_20_hz(hertz: int) -> None:
     wanted = CollectConfig(rounds=1, frames=1, seed=0, tracks=(TrackChoice("oval", "0"),))
     entry = make_plan(replace(wanted, frequency_hz=hertz)).rounds[0]
     control_hz = hertz * entry.steps_per_frame
@@ -27,8 +27,8 @@ def test_the_car_is_steered_often_enough(hertz: int) -> None:
     assert (entry.steps_per_frame == 1) == (hertz >= CONTROL_HZ)
 
 
-def test_every_fifth_frame_is_that_of_a_round_of_twenty_a_second(tmp_path: Path) -> None:
-    """The drive is the same: only what is recorded of it differs."""
+def test_frames_at_4_hz_equal_every_fifth_frame_at_20_hz(tmp_path: Path) -> None:
+    """The frame rate changes which steps are recorded, not how the car drives."""
     for name, options in {"all": ("--frames", "50"), "few": ("--frames", "10")}.items():
         hertz = ("--frequency", "4" if name == "few" else "20")
         done = datagen("collect", "--out", tmp_path / name, *OPTIONS, *options, *hertz)

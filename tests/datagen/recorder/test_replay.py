@@ -20,7 +20,7 @@ def test_a_replay_gives_the_same_labels_states_and_pixels(collected: Path) -> No
     assert report["replayed"] == ["round-000", "round-001"]
 
 
-def test_another_round_under_the_same_name_is_seen(
+def test_a_replay_finds_another_round_under_the_same_name(
     collected: Path, tmp_path: Path, refused: Callable[..., str]
 ) -> None:
     folder = shutil.copytree(collected, tmp_path / "data")
@@ -38,7 +38,9 @@ def test_another_round_under_the_same_name_is_seen(
     )
 
 
-def test_one_bit_of_one_state_is_seen(collected: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_replay_finds_one_changed_bit_of_one_state(
+    collected: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     real = messages.ego_state
     asked: list[EgoState] = []
 

@@ -16,7 +16,7 @@ LIGHTS = all_lights()
 TRACKS = (TrackChoice("oval", "0"),)
 
 
-def test_every_light_comes_before_one_comes_again() -> None:
+def test_every_light_is_used_before_one_repeats() -> None:
     plan = make_plan(
         CollectConfig(rounds=6, frames=500, seed=3, tracks=TRACKS, stretch=60, scenes=9)
     )
@@ -57,7 +57,7 @@ def test_scenery_and_light_change_where_a_stretch_ends(tmp_path: Path) -> None:
     assert replay(folder, 1)[1] == []
 
 
-def test_scenes_come_again_in_turn(tmp_path: Path) -> None:
+def test_scenes_repeat_in_order(tmp_path: Path) -> None:
     folder = tmp_path / "data"
     options = ("--rounds", "1", "--frames", "24", "--tracks", "oval", "--lights", "clear,fog")
     done = datagen("collect", "--out", folder, *options, "--stretch", "2", "--scenes", "3")
@@ -74,7 +74,7 @@ def test_scenes_come_again_in_turn(tmp_path: Path) -> None:
     assert replay(folder, 1, pixels=True)[1] == []
 
 
-def test_fewer_scenes_than_stretches_are_dealt() -> None:
+def test_the_number_of_scenes_is_limited_by_scenes_and_by_stretches() -> None:
     plan = make_plan(
         CollectConfig(rounds=5, frames=500, seed=3, tracks=TRACKS, stretch=20, scenes=7)
     )
@@ -85,7 +85,7 @@ def test_fewer_scenes_than_stretches_are_dealt() -> None:
     assert [len(entry.lights) for entry in plan.rounds] == [3] * 5
 
 
-def test_scenes_below_nought_are_refused() -> None:
+def test_a_negative_number_of_scenes_is_refused() -> None:
     done = datagen("collect", "--scenes", "-1", "--dry-run")
     assert done.returncode != 0
     assert "-1 scenes a round" in done.stderr

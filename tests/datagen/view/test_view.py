@@ -1,4 +1,4 @@
-"""`datagen view`: what the page and Rerun's file hold, and that other viewers know our files."""
+"""`datagen view`: contents of the page and of Rerun's file, and reading by other viewers."""
 
 import base64
 import json
@@ -148,7 +148,7 @@ def test_rerun_shows_the_recorded_values(recorded: Path, tmp_path: Path) -> None
 
 
 def test_rerun_opens_our_rounds_by_itself(recorded: Path, tmp_path: Path) -> None:
-    """No set-up: its own loader knows image, calibration and transforms, and reads the rest."""
+    """Rerun's own MCAP loader reads image, calibration, transforms and our messages."""
     out = tmp_path / "own.rrd"
     convert = ["rerun", "mcap", "convert", str(recorded), "-o", str(out)]
     program = Path(sys.executable).with_name("rerun")
@@ -184,7 +184,7 @@ def test_the_web_viewer_is_served_until_interrupted(recorded: Path) -> None:
 
 
 def free_port() -> int:
-    """One whose neighbour is free as well."""
+    """A free port whose next port is free as well."""
     while True:
         with socket.socket() as one, socket.socket() as other:
             one.bind(("", 0))
@@ -196,7 +196,7 @@ def free_port() -> int:
             return port
 
 
-def test_what_cannot_be_shown_is_refused_in_one_line(
+def test_rounds_that_cannot_be_shown_are_refused_with_a_one_line_error(
     recorded: Path, tmp_path: Path, refused: Refused, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     page_file = tmp_path / "a.html"
@@ -221,7 +221,7 @@ def test_what_cannot_be_shown_is_refused_in_one_line(
     assert "driverview[view]" in refused("view", recorded)
 
 
-def test_a_file_for_rerun_that_is_cut_short_is_not_kept(
+def test_an_incomplete_rerun_file_is_deleted(
     recorded: Path, tmp_path: Path, refused: Refused, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("datagen.view.rerun.log", lambda contents, recording: None)
@@ -260,7 +260,7 @@ def test_foxgloves_layout_shows_topics_and_fields_that_exist() -> None:
     assert panels["3D!world"]["followTf"] == EGO
 
 
-def test_every_panel_of_foxgloves_layout_is_placed_and_every_place_filled() -> None:
+def test_foxgloves_layout_places_exactly_the_panels_it_configures() -> None:
     content = layout()
     placed = [text for text in strings(content["layout"]) if "!" in text]
     assert sorted(placed) == sorted(content["configById"])

@@ -37,9 +37,7 @@ def _labels(offsets: np.ndarray, lanes: int, width: float = WIDTH) -> Labels:
 
 @pytest.mark.parametrize("lanes", tf.LANES)
 @pytest.mark.parametrize("width", [3.0, 3.7, 4.5])
-def test_correct_labels_have_no_problems_anywhere_near_the_borders(
-    lanes: int, width: float
-) -> None:
+def test_correct_labels_near_range_borders_have_no_problems(lanes: int, width: float) -> None:
     markings = tf.marking_offsets(lanes, width)
     reaches = [0.0, 0.5, 1.2, 2.0, width / 2]
     borders = np.array([m + side * r for m in markings for r in reaches for side in (-1, 1)])
@@ -89,7 +87,7 @@ def test_an_impossible_road_is_found() -> None:
     )
 
 
-def test_on_a_bank_the_distances_may_belong_to_the_foot_on_the_road() -> None:
+def test_on_banked_road_distances_may_be_measured_from_the_foot_point() -> None:
     """0.25 m above a bank of 9 deg the foot is 0.04 m further up; on a level road it is below."""
     offsets = np.linspace(-5.9, 5.9, 400)
     feet = _labels(offsets + 0.04, 2, WIDTH)

@@ -109,7 +109,7 @@ def test_labels_that_do_not_follow_from_the_offset_are_found_by_deep(
     assert any("do not follow from the offset" in p for p in verify(dataset, "deep").problems)
 
 
-def test_a_dropped_distance_is_found_by_deep(samples: Samples, dataset: Path) -> None:
+def test_a_missing_distance_is_found_by_deep(samples: Samples, dataset: Path) -> None:
     frames = [
         replace(f, features=replace(f.features, ml=None, mr=None, l=None, m=None, r=None))
         for f in samples.frames(20, seed=9)

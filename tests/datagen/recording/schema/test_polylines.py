@@ -1,4 +1,4 @@
-"""Markings over an image are read back as protobuf's own library reads them."""
+"""Polylines of image annotations: our reader agrees with the protobuf library."""
 
 import numpy as np
 import pytest
@@ -37,7 +37,7 @@ def test_polylines_are_read_back() -> None:
     assert read_polylines(memoryview(message([]))) == []
 
 
-def test_a_message_that_breaks_off_is_damaged() -> None:
+def test_a_truncated_message_is_refused() -> None:
     whole = message(LINES[:1])
     for length in (1, len(whole) // 2, len(whole) - 1):
         with pytest.raises(ValueError, match="damaged"):
