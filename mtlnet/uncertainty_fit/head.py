@@ -49,8 +49,8 @@ FIT = FitSettings(steps=250, batch=256, learning_rate=1e-2, weight_decay=3e-2)
 FOLDS = 3
 MIN_PRESENT_FRAMES = 30  # frames from which a feature has a temperature of its own
 CHUNK = 32  # images read at once
-MIN_STD_SHARE, MAX_STD_SHARE = 0.1, 20.0
-"""Limits of a standard deviation, relative to the RMS error."""
+MIN_STD_SHARE, MAX_STD_SHARE = 0.01, 20.0
+"""Limits of a standard deviation, relative to the RMS error, which a few large errors determine."""
 MIN_FEATURE_STD_SHARE = 0.1
 LOG_STD_LIMITS = (math.log(MIN_STD_SHARE), math.log(MAX_STD_SHARE))
 COVERED = 0.6827  # share of a normal distribution within one standard deviation
