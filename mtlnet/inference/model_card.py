@@ -22,6 +22,11 @@ RUNS = Path("runs")
 SHIPPED = Path(__file__).parents[1] / "weights" / "default"
 CARD, WEIGHTS, GRAPH, GRAPH_WEIGHTS = "card.json", "model.safetensors", "model.xml", "model.bin"
 UNCERTAINTY_WEIGHTS = "doubt.safetensors"
+SHIPPED_FILES = {
+    WEIGHTS: "a1ca88a81429e08e6be491db24090dfeb8cdaa8e90153f8e2170e70d4921f2ae",
+    UNCERTAINTY_WEIGHTS: "0eadd98a0ce43401a27c00f82f082b5f89b446b049fa2ac4d6ba99edc2be7901",
+}
+"""SHA-256 of the shipped model's files."""
 MODEL_FILES = (WEIGHTS, GRAPH, GRAPH_WEIGHTS)
 FORMAT = 4  # 2: `network`; 3: `doubt`; 4: the camera's pitch
 SKY, GRASS, ASPHALT, PAINT = (150, 180, 220), (70, 110, 60), (95, 95, 100), (230, 230, 225)
