@@ -34,9 +34,10 @@ from trackfeatures.errors import UserError
 
 @pytest.fixture(scope="module")
 def trained(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run of two steps, whose outputs differ from frame to frame."""
+    """A run of two steps of the paper's network, whose outputs differ from frame to frame."""
     out = tmp_path_factory.mktemp("trained") / "run"
-    train(TrainConfig(dataset, out, iterations=2, batch=4, device="cpu", threads=1), None)
+    steps: dict[str, Any] = {"iterations": 2, "batch": 4, "device": "cpu", "threads": 1}
+    train(TrainConfig(dataset, out, network="mtl", **steps), None)
     return out
 
 

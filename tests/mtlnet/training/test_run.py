@@ -201,7 +201,7 @@ def test_a_loss_that_is_not_finite_stops_the_run_at_its_batch(
 
     monkeypatch.setattr("mtlnet.training.trainer.training_outputs", outputs)
     with pytest.raises(UserError, match="the loss of batch 3 is not a finite number") as caught:
-        train(config(dataset, tmp_path / "run"), None)
+        train(config(dataset, tmp_path / "run", network="mtl"), None)
     assert "\n" not in str(caught.value)
     (*_, last) = list_checkpoints(tmp_path / "run")
     assert last.name == "step-00000002.safetensors"
