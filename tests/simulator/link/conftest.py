@@ -38,7 +38,9 @@ def fresh_name() -> str:
 @pytest.fixture(autouse=True)
 def patient_clients(monkeypatch: pytest.MonkeyPatch) -> None:
     """Clients in this process wait longer than by default."""
-    monkeypatch.setitem(Link.__init__.__kwdefaults__, "timeout_s", ANSWER_S)
+    defaults = Link.__init__.__kwdefaults__
+    assert defaults is not None
+    monkeypatch.setitem(defaults, "timeout_s", ANSWER_S)
 
 
 @pytest.fixture
