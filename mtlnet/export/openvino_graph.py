@@ -34,12 +34,12 @@ def build_graph(network: Network, head: UncertaintyHead | None = None) -> Any:
 
 
 def build_feature_graph(network: Network) -> Any:
-    """The same with two results: the nine outputs, and the last shared features (1, F)."""
+    """The same with two results: the nine outputs, and the uncertainty head's inputs (1, F)."""
     import openvino
     from openvino import opset13 as ops
 
     nodes = _nodes(network)
-    results = [ops.result(nodes.outputs), ops.result(nodes.shared)]
+    results = [ops.result(nodes.outputs), ops.result(nodes.uncertainty_inputs)]
     return openvino.Model(results, [nodes.images], "mtlnet")
 
 

@@ -27,6 +27,7 @@ from mtlnet.inference.uncertainty import (
 )
 from mtlnet.model.architecture import (
     ANGLES,
+    BIN_VARIANCE,
     HEIGHT,
     NEAR,
     PAIR,
@@ -50,7 +51,7 @@ class Nodes:
 
     images: Any  # uint8 (1, H, W, 3)
     pixels: Any  # (1, 3, H, W) in [-1, 1]
-    shared: Any  # the last shared features (1, F)
+    uncertainty_inputs: Any  # (1, F): the last shared features and, of bins, the log spreads
     outputs: Any  # (1, 9): see `mtlnet.inference.prediction`
 
 
@@ -80,8 +81,12 @@ def network_nodes(
         linear_float32(ops, x, weights[f"heads.{name}.weight"], weights[f"heads.{name}.bias"])
         for name, _ in architecture.heads
     )
-    coded = [read_bins(ops, distance, angle)] if architecture.bins else [distance, angle]
-    return Nodes(images, pixels, x, ops.concat([*coded, ops.softmax(kind, 1)], 1))
+    coded, inputs = [distance, angle], x
+    if architecture.bins:
+        scores = ops.reshape(distance, np.array([MARKINGS, PLACES + 1]), special_zero=False)
+        coded = [read_bins(ops, scores, angle)]
+        inputs = ops.concat([x, *_log_spreads(ops, scores, angle)], 1)
+    return Nodes(images, pixels, inputs, ops.concat([*coded, ops.softmax(kind, 1)], 1))
 
 
 def model_of(nodes: Nodes, head: UncertaintyHead | None = None) -> Any:
@@ -89,7 +94,11 @@ def model_of(nodes: Nodes, head: UncertaintyHead | None = None) -> Any:
     import openvino
     from openvino import opset13 as ops
 
-    second = [] if head is None else uncertainty_outputs(ops, nodes.shared, nodes.pixels, head)
+    second = (
+        []
+        if head is None
+        else uncertainty_outputs(ops, nodes.uncertainty_inputs, nodes.pixels, head)
+    )
     outputs = ops.concat([nodes.outputs, *second], 1)
     return openvino.Model([ops.result(outputs)], [nodes.images], "mtlnet")
 
@@ -153,9 +162,8 @@ def _linear(ops: Any, x: Any, weights: Weights, name: str) -> Any:
     return ops.add(product, weights[f"{name}.bias"][None])
 
 
-def read_bins(ops: Any, distance: Any, angle: Any) -> Any:
-    """Coded answers (1, 6) of rows of scores (1, 5 (PLACES + 1)) and (1, ANGLES)."""
-    scores = ops.reshape(distance, np.array([MARKINGS, PLACES + 1]), special_zero=False)
+def read_bins(ops: Any, scores: Any, angle: Any) -> Any:
+    """Coded answers (1, 6) of the scores of distances (5, PLACES + 1) and angle (1, ANGLES)."""
     absent = _columns(ops, ops.softmax(scores, 1), PLACES, PLACES + 1)  # (5, 1)
     # `ml` and `mr` are absent together.
     share = np.eye(MARKINGS, dtype=np.float32)
@@ -194,6 +202,26 @@ def _expectation(ops: Any, scores: Any, count: int) -> Any:
     return ops.divide(ops.reduce_sum(ops.multiply(weight, middle), axis, keep_dims=True), total)
 
 
+def _log_spreads(ops: Any, scores: Any, angle: Any) -> list[Any]:
+    """As `mtlnet.model.bins.log_spreads`: (1, 5) of the distances and (1, 1) of the angle."""
+    distances = _log_spread(ops, _columns(ops, scores, 0, PLACES), PLACES)
+    row = ops.reshape(distances, np.array([1, MARKINGS]), special_zero=False)
+    return [row, _log_spread(ops, angle, ANGLES)]
+
+
+def _log_spread(ops: Any, scores: Any, count: int) -> Any:
+    """(N, 1) of scores (N, count)."""
+    axis = np.array([1])
+    number = np.arange(count, dtype=np.float32)[None]
+    share = ops.softmax(scores, 1)
+    mean = ops.reduce_sum(ops.multiply(share, number), axis, keep_dims=True)
+    away = ops.subtract(number, mean)
+    squares = ops.multiply(share, ops.multiply(away, away))
+    variance = ops.reduce_sum(squares, axis, keep_dims=True)
+    half = np.float32(0.5)
+    return ops.multiply(ops.log(ops.add(variance, np.float32(BIN_VARIANCE))), half)
+
+
 def product_float32(ops: Any, x: Any, weight: NDArray[np.float32]) -> Any:
     """x (1, F) times weight (N, F) transposed: (1, N)."""
     # In two dimensions: OpenVINO would lay out three as the channels of an image, and back.
@@ -207,7 +235,8 @@ def linear_float32(ops: Any, x: Any, weight: NDArray[np.float32], bias: NDArray[
 
 
 def uncertainty_outputs(ops: Any, x: Any, pixels: Any, head: UncertaintyHead) -> list[Any]:
-    """`UncertaintyHead.predict` of last shared features x (1, F) and pixels (1, 3, H, W)."""
+    """`UncertaintyHead.predict` of inputs x (1, F) and pixels (1, 3, H, W)."""
+    x = _columns(ops, x, 0, len(head.centre))
     z = ops.multiply(ops.subtract(x, head.centre[None]), head.scale[None])
     hidden = ops.relu(linear_float32(ops, z, head.hidden_weight, head.hidden_bias))
     log_std = linear_float32(ops, hidden, head.weight, head.bias)

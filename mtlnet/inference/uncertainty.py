@@ -1,8 +1,9 @@
 """The uncertainty head: a standard deviation for each feature, and an out-of-distribution score.
 
-Standard deviations: two layers on the network's last shared features x (256,), standardised to z,
-predict the logarithm of the standard deviation of the error of each of `FEATURES` (Nix and Weigend
-1994). The network's nine outputs do not change.
+Standard deviations: two layers on the network's last shared features (256,) and, where its heads
+are distributions over bins, the logarithms of their spreads (6,), all standardised, predict the
+logarithm of the standard deviation of the error of each of `FEATURES` (Nix and Weigend 1994). The
+network's nine outputs do not change.
 
 Out-of-distribution (OOD) score: the larger of two values, each scaled so that 1 is the limit of
 what counts as known.
@@ -69,9 +70,10 @@ class UncertaintyHead:
     def predict(self, x: Numbers, textures: Numbers) -> Numbers:
         """Standard deviations and the OOD score, (N, D + 1).
 
-        `x` (N, F): last shared features; `textures` (N, C + M): see `texture_features`.
+        `x` (N, F or more): the network's inputs of this head, of which a head fitted on the shared
+        features alone reads the first; `textures` (N, C + M): see `texture_features`.
         """
-        z = (x - self.centre) * self.scale
+        z = (x[:, : len(self.centre)] - self.centre) * self.scale
         hidden = np.maximum(z @ self.hidden_weight.T + self.hidden_bias, 0)
         log_std = (hidden @ self.weight.T + self.bias).clip(self.low, self.high)
         cells, centre = np.split(textures, [len(self.texture_mean)], 1)

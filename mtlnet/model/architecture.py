@@ -83,6 +83,11 @@ class Architecture:
         return BIN_HEADS if self.bins else HEADS
 
     @property
+    def uncertainty_inputs(self) -> int:
+        """How many numbers the uncertainty head reads: features and, of bins, the spreads."""
+        return self.shared[-1] + (6 if self.bins else 0)
+
+    @property
     def convolutions(self) -> tuple[str, ...]:
         """Submodule names of the convolutions, in order; none for a torchvision backbone."""
         each = enumerate(self.features)
@@ -105,6 +110,8 @@ PLACES, ANGLES = 70, 100
 """Bins of a distance's range, beside one for "absent", and of the angle's."""
 NEAR = 4
 """An answer is the expectation within so many bins of the likeliest."""
+BIN_VARIANCE = 1 / 12
+"""The variance of a uniform distribution over one bin."""
 PAIR = slice(0, 2)
 """`ml` and `mr`: the car's lane is told of as a whole, or not at all."""
 BIN_HEADS = (("distance", 5 * (PLACES + 1)), ("angle", ANGLES), ("heading", 3))

@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.nn.functional import log_softmax
 
 import trackfeatures as tf
-from mtlnet.model.architecture import ANGLES, NEAR, PAIR, PLACES
+from mtlnet.model.architecture import ANGLES, BIN_VARIANCE, NEAR, PAIR, PLACES
 from trackfeatures.coding import OFFSET, SPAN
 
 SPREAD = 1.0
@@ -112,6 +112,22 @@ def expectation(scores: Tensor) -> Tensor:
     near = (number - best).abs() <= NEAR
     weight = torch.exp(scores.float() - scores.float().amax(-1, keepdim=True)) * near
     return (weight * ((number + 0.5) / count)).sum(-1) / weight.sum(-1)
+
+
+def log_spreads(distance: Tensor, angle: Tensor) -> Tensor:
+    """Logarithms (B, 6) of the standard deviations, in bins, of the distributions of such scores.
+
+    Over all bins but "absent", so that two separate peaks count as a wide distribution.
+    """
+    spreads = [_log_spread(distance[:, :, :-1]), _log_spread(angle)[:, None]]
+    return torch.cat(spreads, 1)
+
+
+def _log_spread(scores: Tensor) -> Tensor:
+    number = torch.arange(scores.shape[-1], dtype=torch.float32, device=scores.device)
+    share = torch.softmax(scores.float(), -1)
+    mean = (share * number).sum(-1, keepdim=True)
+    return 0.5 * torch.log((share * (number - mean) ** 2).sum(-1) + BIN_VARIANCE)
 
 
 def soft_cross_entropy(scores: Tensor, targets: Tensor) -> Tensor:

@@ -31,7 +31,7 @@ from mtlnet.model.architecture import (
     same_padding,
 )
 from mtlnet.model.auxiliary import AuxiliaryHeads
-from mtlnet.model.bins import Scores, read_scores, split_scores
+from mtlnet.model.bins import Scores, log_spreads, read_scores, split_scores
 
 NORM_EPS = 1e-5
 NORM_MOMENTUM = 0.1
@@ -96,6 +96,16 @@ class Network(nn.Module):
                 [coded * self.target_std + self.target_mean, self.heads["heading"](x)], 1
             )
 
+    def uncertainty_inputs(self, x: Tensor) -> Tensor:
+        """What the uncertainty head reads (B, `architecture.uncertainty_inputs`).
+
+        The last shared features x (B, 256) and, of heads over bins, the logarithms of the spreads.
+        """
+        if not self.architecture.bins:
+            return x
+        scores = self.forward_scores(x)
+        return torch.cat([x.float(), log_spreads(scores.distance, scores.angle)], 1)
+
     def forward_scores(self, x: Tensor) -> Scores:
         """The scores of heads over bins for last shared features (B, 256)."""
         with torch.autocast(x.device.type, enabled=False):
@@ -133,7 +143,7 @@ def load_network(path: Path, name: str = MTL.name) -> Network:
 def run_network(
     network: Network, images: NDArray[np.uint8]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Images (B, 210, 280, 3) -> last shared features (B, 256) and outputs (B, 9).
+    """Images (B, 210, 280, 3) -> inputs of the uncertainty head (B, F) and outputs (B, 9).
 
     The outputs are coded distances, coded angle and class probabilities.
     """
@@ -143,7 +153,8 @@ def run_network(
         x = network.forward_features(torch.from_numpy(images).to(device)).float()
         outputs = network.forward_heads(x)
         outputs[:, 6:] = torch.softmax(outputs[:, 6:], 1)
-    return x.cpu().numpy(), outputs.cpu().numpy()
+        inputs = network.uncertainty_inputs(x)
+    return inputs.cpu().numpy(), outputs.cpu().numpy()
 
 
 def predict_images(network: Network, images: NDArray[np.uint8]) -> NDArray[np.float32]:

@@ -8,17 +8,18 @@ import torch
 
 import trackfeatures as tf
 from mtlnet.export.convert import ONNX_FILE, check_export, write_onnx
-from mtlnet.export.openvino_graph import TOLERANCE, build_graph
+from mtlnet.export.openvino_graph import TOLERANCE, build_feature_graph
 from mtlnet.model.architecture import ANGLES, GRID, PLACES, grid_size
 from mtlnet.model.bins import (
     Scores,
     absent_in,
     bin_targets,
     expectation,
+    log_spreads,
     normal_targets,
     read_scores,
 )
-from mtlnet.model.network import Network, fold, initialise, predict_images
+from mtlnet.model.network import Network, fold, initialise, predict_images, run_network
 from mtlnet.training.bins_loss import bins_loss
 from mtlnet.training.loss import Losses
 
@@ -72,6 +73,19 @@ def test_of_two_peaks_the_higher_is_the_answer() -> None:
     both += 0.4 * normal_targets(torch.tensor(-1.0), -5.0, 0.0, PLACES)
     share = float(expectation(both.clamp_min(1e-9).log()))
     assert -5.0 + 5.0 * share == pytest.approx(-3.0, abs=0.01)
+
+
+def test_the_spread_of_two_peaks_is_their_distance() -> None:
+    width = 5.0 / PLACES
+    one = normal_targets(torch.tensor(-3.0), -5.0, 0.0, PLACES)
+    both = 0.5 * one + 0.5 * normal_targets(torch.tensor(-1.0), -5.0, 0.0, PLACES)
+    scores = torch.zeros(1, 5, PLACES + 1)
+    scores[0, 0, :-1], scores[0, 1, :-1] = one.clamp_min(1e-9).log(), both.clamp_min(1e-9).log()
+    scores[0, :, -1] = 5.0  # how likely "absent" is does not matter
+    spread = np.exp(log_spreads(scores, torch.zeros(1, ANGLES)).numpy()[0])
+    assert spread[0] == pytest.approx(1.0, abs=0.1)
+    assert spread[1] * width == pytest.approx(1.0, abs=0.02)
+    assert spread[5] == pytest.approx(ANGLES / 12**0.5, rel=1e-3)  # a uniform distribution
 
 
 def test_both_markings_of_the_lane_are_absent_together() -> None:
@@ -152,8 +166,10 @@ def test_the_graph_reads_bins_as_torch_does() -> None:
 
     network, frames = fold(made()), images(12, 5)
     options = {"INFERENCE_PRECISION_HINT": "f32"}
-    request = openvino.Core().compile_model(build_graph(network), "CPU", options)
-    expected = predict_images(network, frames)
-    found = np.concatenate([request(frame[None])[0] for frame in frames])
+    graph = openvino.Core().compile_model(build_feature_graph(network), "CPU", options)
+    inputs, expected = run_network(network, frames)
+    found = [graph(frame[None]) for frame in frames]
     assert np.ptp(expected[:, :6], axis=0).max() > 0.05
-    np.testing.assert_allclose(found, expected, atol=TOLERANCE)
+    np.testing.assert_allclose([row[0][0] for row in found], expected, atol=TOLERANCE)
+    assert inputs.shape == (12, GRID.uncertainty_inputs)
+    np.testing.assert_allclose([row[1][0] for row in found], inputs, rtol=1e-3, atol=1e-4)

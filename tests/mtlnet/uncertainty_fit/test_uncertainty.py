@@ -65,6 +65,18 @@ def test_known_standard_deviations_are_recovered() -> None:
             assert part["found"] == pytest.approx(part["said"], rel=0.3)
 
 
+def test_both_shares_are_near_those_of_a_normal_distribution_despite_outliers() -> None:
+    rng = np.random.default_rng(5)
+    x = rng.normal(size=(6000, 6)).astype(np.float32)
+    error = (rng.standard_t(3, (6000, 7)) * np.exp(0.5 * x[:, :1] - 2)).astype(np.float32)
+    layers = fit_std_layers(x[:3000], error[:3000], 0, None)
+    hidden = np.maximum(x[3000:] @ layers["hidden_weight"].T + layers["hidden_bias"], 0)
+    std = np.exp(hidden @ layers["weight"].T + layers["bias"])
+    for one, two in coverage(std, error[3000:]).values():
+        assert one == pytest.approx(0.683, abs=0.05)
+        assert two == pytest.approx(0.954, abs=0.05)
+
+
 def test_a_feature_that_is_never_present_has_a_finite_deviation() -> None:
     rng = np.random.default_rng(2)
     error = rng.normal(size=(200, 7)).astype(np.float32)
