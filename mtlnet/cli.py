@@ -51,6 +51,12 @@ Network = Annotated[
         "[default: grid, with recipe paper mtl]"
     ),
 ]
+Heads = Annotated[
+    str | None,
+    typer.Option(
+        help="bins (distributions) or coded (the paper's numbers).  [default: the network's]"
+    ),
+]
 Balance = Annotated[
     str | None,
     typer.Option(
@@ -161,6 +167,7 @@ def train_command(
     out: TrainOut = None,
     alpha: Alpha = None,
     network: Network = None,
+    heads: Heads = None,
     balance: Balance = None,
     init: Init = None,
     recipe: TrainRecipe = None,
@@ -182,6 +189,7 @@ def train_command(
         "data": data,
         "alpha": None if alpha is None else parse_alpha(alpha),
         "network": network,
+        "heads": heads,
         "balance": balance,
         "init": init,
         "recipe": recipe,

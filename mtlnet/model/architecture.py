@@ -18,7 +18,7 @@ bends ahead (`mtlnet.model.auxiliary`).
 weights, for comparison: their pooled features, one layer of 256 units, the same nine outputs.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from trackfeatures.errors import UserError
 
@@ -65,8 +65,8 @@ class Architecture:
     features: tuple[Layer, ...]
     shared: tuple[int, ...]
     tasks: tuple[str, ...] = ("distance", "angle", "heading")
-    backbone: bool = False
-    """Whether the features are those of the torchvision model called `name`."""
+    backbone: str = ""
+    """The torchvision model whose features these are; empty: `features` are the layers."""
     bins: bool = False
     """Whether the outputs are distributions over bins, not the paper's coded numbers."""
     first_row: int = 0
@@ -81,6 +81,11 @@ class Architecture:
     def heads(self) -> tuple[tuple[str, int], ...]:
         """The heads and how many numbers each gives."""
         return BIN_HEADS if self.bins else HEADS
+
+    @property
+    def keeps_places(self) -> bool:
+        """Whether the last features are a grid of places of the image, not one place."""
+        return bool(self.features) and grid_size(self)[1] > 1
 
     @property
     def uncertainty_inputs(self) -> int:
@@ -141,18 +146,35 @@ ARCHITECTURES = {
     for architecture in (
         MTL,
         Architecture("deepdriving", ALEXNET, (4096, 4096, 256), tasks=("distance", "angle")),
-        Architecture("mobilenet_v3_small", (), (256,), backbone=True),
-        Architecture("regnet_y_400mf", (), (256,), backbone=True),
+        Architecture("mobilenet_v3_small", (), (256,), backbone="mobilenet_v3_small"),
+        Architecture("regnet_y_400mf", (), (256,), backbone="regnet_y_400mf"),
         GRID,
     )
 }
+HEAD_KINDS = ("coded", "bins")
+"""Heads that give the paper's coded numbers, or distributions over bins."""
+ARCHITECTURES |= {
+    f"{base.name}-{kind}": replace(base, name=f"{base.name}-{kind}", bins=kind == "bins")
+    for base in list(ARCHITECTURES.values())
+    for kind in HEAD_KINDS
+    if base.bins != (kind == "bins")
+}  # each with the other kind of heads: `mtl-bins`, ..., `grid-coded`
 
 
 def find_architecture(name: str) -> Architecture:
     """The architecture of that name; UserError for an unknown one."""
     if name not in ARCHITECTURES:
-        raise UserError(f"there is no network {name!r}; choose one of {', '.join(ARCHITECTURES)}")
+        names = [name for name in ARCHITECTURES if not name.endswith(HEAD_KINDS)]
+        raise UserError(f"there is no network {name!r}; choose one of {', '.join(names)}")
     return ARCHITECTURES[name]
+
+
+def with_heads(name: str, kind: str) -> str:
+    """The name of network `name` with heads of a kind of `HEAD_KINDS`. Raises UserError."""
+    if kind not in HEAD_KINDS:
+        raise UserError(f"--heads {kind!r} is unknown; give {' or '.join(HEAD_KINDS)}")
+    base = name.removesuffix("-bins").removesuffix("-coded")
+    return base if find_architecture(base).bins == (kind == "bins") else f"{base}-{kind}"
 
 
 def require_task_heads(architecture: Architecture, alpha: tuple[float, float, float]) -> None:

@@ -60,7 +60,7 @@ class Network(nn.Module):
         self.heads = nn.ModuleDict(heads)
         # Only in training: `fold` leaves them out.
         self.auxiliary = None
-        if architecture.bins and batch_norm:
+        if architecture.bins and architecture.keeps_places and batch_norm:
             self.auxiliary = AuxiliaryHeads(architecture, size)
         # Mean and deviation of the targets: (0, 1) as in the paper, set by recipe `fast`.
         self.register_buffer("target_mean", torch.zeros(6), persistent=batch_norm)
@@ -196,7 +196,7 @@ def block(layer: nn.Module, norm: nn.Module | None, dropout: float = 0.0) -> nn.
 def build_features(architecture: Architecture, *, batch_norm: bool) -> tuple[nn.Module, int]:
     """The module before the fully connected layers, (B, 3, H, W) -> (B, ...), and its size."""
     if architecture.backbone:
-        return build_backbone(architecture.name, batch_norm=batch_norm)
+        return build_backbone(architecture.backbone, batch_norm=batch_norm)
     features = nn.Sequential()
     channels, height, width = 3, HEIGHT - architecture.first_row, WIDTH
     for number, spec in enumerate(architecture.features):

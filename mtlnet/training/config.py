@@ -17,7 +17,7 @@ from mtlnet.inference.model_card import (
     read_card,
     resolve_run,
 )
-from mtlnet.model.architecture import find_architecture, require_task_heads
+from mtlnet.model.architecture import find_architecture, require_task_heads, with_heads
 from mtlnet.training.distributed import read_rank
 from mtlnet.training.loss import Alpha
 from mtlnet.training.recipes import Recipe, find_recipe
@@ -98,6 +98,10 @@ def new_config(options: Mapping[str, Any], out: Path | None) -> TrainConfig:
         values["alpha"] = find_architecture(network).default_alpha
     values.update(options)
     recipe = find_recipe(values["recipe"]).name
+    if heads := values.pop("heads", None):
+        if "init" in options:
+            raise UserError("a fine-tuned model keeps its heads; leave --heads out with --init")
+        values["network"] = with_heads(values.get("network", find_recipe(recipe).network), heads)
     folder = out or RUNS / f"{time.strftime('%Y%m%d-%H%M%S')}-{recipe}"
     return TrainConfig(out=folder, **values)
 
@@ -144,6 +148,9 @@ def resume_config(run: Path, given: Mapping[str, Any]) -> tuple[TrainConfig, dic
     Raises UserError when a field is given that would make it a different run.
     """
     stored, data = read_config(run)
+    given = dict(given)
+    if heads := given.pop("heads", None):
+        given["network"] = with_heads(given.get("network", stored.network), heads)
     for name, value in given.items():
         kept = getattr(stored, name)
         if name not in RESUMABLE_WITH and value != kept:

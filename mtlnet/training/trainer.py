@@ -60,7 +60,7 @@ class Trainer:
         self.task_weighting = task_weighting or TaskWeighting("fixed", alpha, device)
         self.step_number = 0
         network = Network(
-            batch_norm=recipe.batch_norm or (architecture.backbone and not folded),
+            batch_norm=recipe.batch_norm or (bool(architecture.backbone) and not folded),
             dropout=recipe.dropout,
             architecture=architecture,
         )
@@ -150,7 +150,7 @@ class Trainer:
     def outputs(self, images: Tensor) -> Tensor:
         """Outputs (B, 9) of the network in training for images (B, 210, 280, 3) uint8."""
         dtype = self._dtype()
-        if self.device.type == "cpu" and self.network.architecture in FAST:
+        if self.device.type == "cpu" and self.network.architecture.features in FAST:
             return training_outputs(self.network, images, dtype, self._masks(len(images)))
         with torch.autocast(self.device.type, dtype, enabled=dtype != torch.float32):
             outputs: Tensor = self.network(images)
@@ -159,7 +159,7 @@ class Trainer:
     def scores(self, images: Tensor, ahead: Tensor) -> tuple[Scores, Tensor | None]:
         """Scores of images (B, 210, 280, 3) uint8, and the auxiliary loss if there are labels."""
         network, dtype = self.network, self._dtype()
-        if self.device.type == "cpu" and network.architecture in FAST:
+        if self.device.type == "cpu" and network.architecture.features in FAST:
             grid = forward_grid(network, images, dtype)
             x = forward_shared(network, grid, dtype, self._masks(len(images)))
         else:

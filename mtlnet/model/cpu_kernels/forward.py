@@ -22,8 +22,8 @@ MAX_IM2COL_PIXELS = 64
 """Feature maps of at most so many pixels are convolved by `im2col_convolution`."""
 
 
-FAST = (MTL, GRID)
-"""The architectures whose layers this module has."""
+FAST = (MTL.features, GRID.features)
+"""The convolutions that this module has, as `Architecture.features`."""
 
 
 def training_outputs(

@@ -12,18 +12,18 @@ from mtlnet.data.loader import Loader
 from mtlnet.export.openvino_graph import TOLERANCE, build_graph
 from mtlnet.inference.engine import EngineKind, load_engine
 from mtlnet.inference.model_card import read_card
-from mtlnet.model.architecture import ARCHITECTURES, Architecture, find_architecture
+from mtlnet.model.architecture import ARCHITECTURES, Architecture, find_architecture, with_heads
 from mtlnet.model.network import Network, fold, initialise, predict_images
-from mtlnet.training.config import TrainConfig
+from mtlnet.training.config import TrainConfig, new_config, resume_config
 from mtlnet.training.recipes import RECIPES
 from mtlnet.training.run import start_training
 from mtlnet.training.trainer import Trainer
 from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
 
-BACKBONES = [name for name, architecture in ARCHITECTURES.items() if architecture.backbone]
+BACKBONES = ["mobilenet_v3_small", "regnet_y_400mf"]
 KINDS: tuple[EngineKind, EngineKind] = ("openvino", "torch")
-OTHERS = [name for name in ARCHITECTURES if name != "mtl"]
+OTHERS = [*BACKBONES, "deepdriving", "grid", "grid-coded", "mtl-bins"]
 
 
 def build(name: str, *, batch_norm: bool = False, seed: int = 1) -> Network:
@@ -123,6 +123,30 @@ def test_another_network_is_trained_published_and_run(dataset: Path, tmp_path: P
     frame = Dataset.open(dataset).select("test").image(0)
     engine, reference = (load_engine(tmp_path / "run", kind, "f32") for kind in KINDS)
     np.testing.assert_allclose(engine(frame), reference(frame), atol=TOLERANCE)
+
+
+def test_a_network_has_a_variant_with_the_other_kind_of_heads() -> None:
+    for name, architecture in ARCHITECTURES.items():
+        kind, other = ("bins", "coded") if architecture.bins else ("coded", "bins")
+        assert with_heads(name, kind) == name
+        variant = find_architecture(with_heads(name, other))
+        assert (variant.bins, variant.features) == (not architecture.bins, architecture.features)
+        assert with_heads(variant.name, kind) == name
+    with pytest.raises(UserError, match="--heads 'angle' is unknown; give coded or bins"):
+        with_heads("mtl", "angle")
+
+
+def test_the_heads_are_chosen_by_an_option(dataset: Path, tmp_path: Path) -> None:
+    options = {"data": dataset, "network": "mtl", "iterations": 2, "batch": 4, "device": "cpu"}
+    result = start_training({**options, "heads": "bins"}, tmp_path / "run", resume=False)
+    assert read_card(tmp_path / "run").network == "mtl-bins"
+    assert result["export_check"]["openvino_f32_max"] < TOLERANCE
+    resumed, _ = resume_config(tmp_path / "run", {"network": "mtl", "heads": "bins"})
+    assert resumed.network == "mtl-bins"
+    with pytest.raises(UserError, match="started with network mtl-bins, now mtl is asked for"):
+        resume_config(tmp_path / "run", {"heads": "coded"})
+    with pytest.raises(UserError, match="keeps its heads"):
+        new_config({"init": str(tmp_path / "run"), "heads": "coded"}, tmp_path / "tuned")
 
 
 def test_the_seed_determines_a_backbones_weights() -> None:
