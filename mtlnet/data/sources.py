@@ -120,10 +120,11 @@ def hold_out_rounds(dataset: Dataset) -> tuple[Frames, Frames | None]:
         left = [name for name in order if name not in held_out]
         held_out.append(min(left, key=lambda name: sum(seen.count(c) for c in conditions[name])))
     kept = [name for name in conditions if name not in held_out]
-    return _select_rounds(dataset, kept), _select_rounds(dataset, held_out)
+    return select_rounds(dataset, kept), select_rounds(dataset, held_out)
 
 
-def _select_rounds(dataset: Dataset, names: list[str]) -> Frames:
+def select_rounds(dataset: Dataset, names: list[str]) -> Frames:
+    """The frames of the rounds with these ids."""
     chosen = [i for i, info in enumerate(dataset.rounds) if info.id in names]
     return Frames(
         [dataset.rounds[i] for i in chosen], [dataset.indexes[i] for i in chosen], dataset.camera

@@ -14,8 +14,15 @@ import torch
 from numpy.typing import NDArray
 
 from datagen.recording import Dataset
+from mtlnet.data.sources import select_rounds
 from mtlnet.evaluation.evaluate import require_fit
-from mtlnet.export.int8 import calibration_images, judge, quantise
+from mtlnet.export.int8 import (
+    FLOAT_ACTIVATIONS,
+    calibration_images,
+    choose_float_activations,
+    judge,
+    quantise,
+)
 from mtlnet.export.openvino_graph import TOLERANCE, run_graph
 from mtlnet.inference.engine import EXPORT_FILE, best_precision, read_graph
 from mtlnet.inference.model_card import (
@@ -66,16 +73,20 @@ def export_model(
     (folder / EXPORT_FILE).unlink(missing_ok=True)  # an interrupted export is then no export
     network = load_network(run / WEIGHTS, card.network)
     images = shown.read_batch(chosen)
+    about: dict[str, Any] = {"format": kind, "precision": precision}
     try:
         if kind == "onnx":
             names = write_onnx(network, folder, bf16=precision == "bf16")
         else:
-            names = write_openvino(read_graph(run, card), folder, precision, dataset)
+            graph = read_graph(run, card)
+            if precision == "int8":
+                graph, about["float_activations"] = _quantised(graph, card, dataset)
+            names = write_openvino(graph, folder, precision)
     except RuntimeError as error:  # OpenVINO's error for a failed write
         reason = str(error).strip().splitlines()[-1]
         raise UserError(f"{folder} could not be written ({reason}); is the disk full?") from error
     check = check_export(network, folder / names[0], precision, images)
-    about: dict[str, Any] = {"format": kind, "precision": precision, "check": check}
+    about["check"] = check
     write_export(folder, card, names, **about)
     if precision == "int8":
         about["gate"] = judge(run, dataset.path)
@@ -86,6 +97,20 @@ def export_model(
             f"{TOLERANCE:g} is expected; report this as a fault"
         )
     return {"model": card.name, "out": str(folder), "files": list(names), **about}
+
+
+def _quantised(graph: Any, card: ModelCard, dataset: Dataset) -> tuple[Any, tuple[int, ...]]:
+    """The int8 form of a graph, and the numbers of the convolutions with float activations.
+
+    They are chosen on the rounds held out of the training, if `dataset` is that of the training.
+    """
+    train = dataset.select("train")
+    images, chosen = calibration_images(train), FLOAT_ACTIVATIONS
+    names = (card.doubt or {}).get("held_out", [])
+    if names and card.data.get("content_hash") == dataset.content_hash:
+        held_out = select_rounds(dataset, names)
+        chosen = choose_float_activations(graph, images, held_out, card.data["mean"])
+    return quantise(graph, images, chosen), chosen
 
 
 def _require_supported(kind: str, precision: str, out: Path | None, frames: int) -> None:
@@ -172,14 +197,12 @@ def store_onnx_bf16(model: Any) -> None:
     model.graph.node.extend(nodes)
 
 
-def write_openvino(model: Any, folder: Path, precision: str, dataset: Dataset) -> tuple[str, ...]:
-    """Write `model.xml` and `model.bin`, made from a run's graph."""
+def write_openvino(model: Any, folder: Path, precision: str) -> tuple[str, ...]:
+    """Write `model.xml` and `model.bin`; `precision` bf16: large weights in bf16."""
     import openvino
 
     if precision == "bf16":
         store_openvino_bf16(model)
-    if precision == "int8":
-        model = quantise(model, calibration_images(dataset.select("train")))
     openvino.save_model(model, str(folder / GRAPH), compress_to_fp16=False)
     return (GRAPH, GRAPH_WEIGHTS)
 

@@ -66,15 +66,16 @@ def write_graph(
         staged.with_suffix(".bin").unlink(missing_ok=True)
 
 
-def run_graph(path: Path, precision: str, images: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Outputs (N, 9 or 17) of the model in file `path` for images (N, 210, 280, 3), by OpenVINO.
+def run_graph(graph: Any, precision: str, images: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """Outputs (N, 9 or 17) of a model or of that in a file for images (N, 210, 280, 3).
 
-    Raises RuntimeError when OpenVINO cannot load it.
+    `graph`: an OpenVINO model, or a path. Raises RuntimeError when OpenVINO cannot load it.
     """
     import openvino
 
     options = {"INFERENCE_PRECISION_HINT": precision, "NUM_STREAMS": 1}
-    request = openvino.Core().compile_model(str(path), "CPU", options).create_infer_request()
+    source = str(graph) if isinstance(graph, Path) else graph
+    request = openvino.Core().compile_model(source, "CPU", options).create_infer_request()
     return np.concatenate([request.infer([image[None]])[0].copy() for image in images])
 
 

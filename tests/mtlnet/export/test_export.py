@@ -5,6 +5,7 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import openvino
 import pytest
 import torch
@@ -14,7 +15,7 @@ import mtlnet.export.int8
 from datagen.recording import Dataset
 from mtlnet.evaluation.tables import export_lines
 from mtlnet.export.convert import export_model
-from mtlnet.export.int8 import gate
+from mtlnet.export.int8 import choose_float_activations, float_choices, gate
 from mtlnet.export.openvino_graph import TOLERANCE
 from mtlnet.inference.engine import EXPORT_FILE, INT8, load_engine, passed_gate
 from mtlnet.inference.model_card import (
@@ -143,6 +144,33 @@ def test_int8_is_the_default_once_it_passed_its_gate(
     (run / INT8 / GRAPH_WEIGHTS).write_bytes(b"rubbish")
     with pytest.raises(ModelError, match="missing or damaged"):
         load_engine(run)
+
+
+@pytest.mark.slow
+def test_float_activations_are_chosen_on_held_out_rounds(
+    trained: Path, dataset: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    card, data = read_card(trained), Dataset.open(dataset)
+    graph = openvino.Core().read_model(trained / GRAPH)
+    choices = float_choices(graph)
+    assert (choices[0], len(choices), len(set(choices))) == ((), 26, 26)
+    assert {len(choice) for choice in choices} == {0, 1, 2, 3}
+    tried: list[tuple[int, ...]] = []
+
+    def int8(model: Any, _: Any, chosen: tuple[int, ...]) -> Any:
+        tried.append(chosen)
+        return model
+
+    verdicts = iter([False, True])
+    monkeypatch.setattr(mtlnet.export.int8, "quantise", int8)
+    monkeypatch.setattr(
+        mtlnet.export.int8,
+        "gate",
+        lambda reference, found: {"passed": next(verdicts), "worse": {"ml": 1.0}},
+    )
+    arguments = (graph, data.select("train").read_batch(np.arange(2)), data.select("train"))
+    assert choose_float_activations(*arguments, card.data["mean"]) == choices[1]
+    assert tried == choices[:2]
 
 
 def test_unsupported_exports_are_refused(trained: Path, dataset: Path, tmp_path: Path) -> None:
