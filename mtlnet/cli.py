@@ -134,6 +134,12 @@ ReportPage = Annotated[
     Path | None, typer.Option("--report", help="HTML page to write: a file, or a folder.")
 ]
 EveryFrame = Annotated[int, typer.Option(help="Evaluate every n-th frame only.")]
+WorstSheet = Annotated[
+    Path | None, typer.Option("--worst", help="JPEG to write: the frames of the largest errors.")
+]
+ShippedPicture = Annotated[
+    Path | None, typer.Option(help="JPEG for README.md, of `mtlnet evaluate --worst`.", exists=True)
+]
 ShipOut = Annotated[Path, typer.Option(help="Folder for the model.")]
 ShippedEvaluations = Annotated[
     list[Path] | None,
@@ -265,6 +271,7 @@ def ship_command(
     model: Model = "default",
     evaluation: ShippedEvaluations = None,
     notes: ShippedNotes = None,
+    picture: ShippedPicture = None,
     as_json: Json = False,
 ) -> None:
     """Write a model as weights alone, in float16: small enough for a repository.
@@ -275,7 +282,8 @@ def ship_command(
     from mtlnet.inference.model_card import resolve_run
 
     if evaluation:
-        typer.echo(write_page(out, evaluation, "" if notes is None else notes.read_text()))
+        text = "" if notes is None else notes.read_text(encoding="utf-8")
+        typer.echo(write_page(out, evaluation, text, picture))
         return
     result = ship_model(resolve_run(model), out)
     if as_json:
@@ -291,6 +299,7 @@ def evaluate_command(
     data: Data = Path("datasets/default"),
     split: Split = "test",
     page: ReportPage = None,
+    worst: WorstSheet = None,
     every: EveryFrame = 1,
     engine: EngineKind = "openvino",
     precision: Precision = None,
@@ -314,7 +323,7 @@ def evaluate_command(
         def report(done: int, total: int) -> None:
             bar.update(task, completed=done, total=total)
 
-        result = evaluate(engines, data, split, report, page, every)
+        result = evaluate(engines, data, split, report, page, every, worst)
     if page is not None:
         typer.echo(f"report: {result['page']}", err=True)
     if as_json:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from datagen.recording import Dataset, Frames, UndecodableImage
 from mtlnet.data.loader import Images
 from mtlnet.data.sources import require_decodable
-from mtlnet.evaluation.html_report import write_page
+from mtlnet.evaluation.html_report import write_page, write_worst_sheet
 from mtlnet.evaluation.metrics import evaluate_by_groups
 from mtlnet.inference.engine import Engine
 from mtlnet.inference.model_card import ModelCard, ModelError
@@ -28,12 +28,14 @@ def evaluate(
     report: Callable[[int, int], None] = lambda *_: None,
     page: Path | None = None,
     every: int = 1,
+    worst: Path | None = None,
 ) -> dict[str, Any]:
     """The report of `mtlnet.evaluation.metrics` on one split of a dataset, as a whole and by group.
 
     `engines`: the same model, once for each thread. `report(done, all)` is called after each chunk
-    of frames. `page`: an HTML file to write too, or its folder. `every`: evaluate every n-th frame
-    only; frames next to each other are much alike. Raises UserError when data and model do not fit.
+    of frames. `page`: an HTML file to write too, or its folder; `worst`: a JPEG of the frames with
+    the largest errors. `every`: evaluate every n-th frame only; frames next to each other are much
+    alike. Raises UserError when data and model do not fit.
     """
     if every < 1:
         raise UserError(f"--every is {every}; give 1 for all frames, 5 for every fifth")
@@ -60,6 +62,8 @@ def evaluate(
     }
     if page is not None:
         found["page"] = str(write_page(page, found, frames, outputs))
+    if worst is not None:
+        write_worst_sheet(worst, frames, outputs)
     return found
 
 

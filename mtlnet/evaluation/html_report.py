@@ -5,7 +5,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
+import simplejpeg
 from markupsafe import Markup
 from numpy.typing import NDArray
 
@@ -63,7 +65,10 @@ def page(report: dict[str, Any], frames: Frames, outputs: NDArray[np.float32]) -
             for name, shares in report.get("doubt", {}).get("coverage", {}).items()
         ],
         reliability=_reliability(report.get("doubt", {})),
-        worst=worst_figures(frames, outputs, worst_frames(errors, frames.labels.round)),
+        worst=(
+            {**figure, "jpeg": embed_jpeg(figure["image"])}
+            for figure in worst_figures(frames, outputs, worst_frames(errors, frames.labels.round))
+        ),
         groups=_groups(report),
     )
 
@@ -196,8 +201,11 @@ def worst_frames(errors: Numbers, rounds: NDArray[np.int64]) -> list[WorstFrame]
 
 def worst_figures(
     frames: Frames, outputs: NDArray[np.float32], chosen: list[WorstFrame]
-) -> Iterator[dict[str, str]]:
-    """Of each chosen frame: its image (truth green, prediction orange) and its caption."""
+) -> Iterator[dict[str, Any]]:
+    """Of each chosen frame: its image (truth green, prediction orange) and its caption.
+
+    Each has `image`, RGB of twice the frame's size, and texts: `feature`, `error`, `note`, `place`.
+    """
     labels, camera = frames.labels, frames.camera
     for worst in chosen:
         row = worst.row
@@ -211,7 +219,7 @@ def worst_figures(
             (dict(zip(tf.MARKINGS, truth, strict=True)), float(labels.angle[row])),
             (prediction.distances_m, prediction.angle_rad),
         )
-        yield {"jpeg": embed_jpeg(image), **_caption(frames, worst, prediction)}
+        yield {"image": image, **_caption(frames, worst, prediction)}
 
 
 def _caption(frames: Frames, worst: WorstFrame, prediction: Prediction) -> dict[str, str]:
@@ -229,3 +237,27 @@ def _caption(frames: Frames, worst: WorstFrame, prediction: Prediction) -> dict[
         "place": f"{info.id}, {info.track}, s = {labels.s[worst.row]:.0f} m; {info.lanes} lane(s), "
         f"{labels.light[worst.row]}, {labels.speed[worst.row] * 3.6:.0f} km/h",
     }
+
+
+SHEET_COLUMNS = 4
+CAPTION_PX = 48
+
+
+def write_worst_sheet(path: Path, frames: Frames, outputs: NDArray[np.float32]) -> Path:
+    """Write the frames with the largest errors of each feature as one JPEG, with captions."""
+    errors = signed_errors(outputs, frames.labels.distances, frames.labels.angle)
+    figures = list(worst_figures(frames, outputs, worst_frames(errors, frames.labels.round)))
+    height, width = frames.camera.height, frames.camera.width
+    tile = height + CAPTION_PX
+    shape = (-(-len(figures) // SHEET_COLUMNS) * tile, SHEET_COLUMNS * width, 3)
+    sheet = np.full(shape, 255, np.uint8)
+    for number, figure in enumerate(figures):
+        top, left = number // SHEET_COLUMNS * tile, number % SHEET_COLUMNS * width
+        image = cv2.resize(figure["image"], (width, height), interpolation=cv2.INTER_AREA)
+        sheet[top : top + height, left : left + width] = image
+        texts = (f"{figure['feature']} {figure['error']}", *figure["place"].split("; "))
+        for line, text in enumerate(texts):
+            place = (left + 3, top + height + 13 + 14 * line)
+            cv2.putText(sheet, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.36, (0, 0, 0))
+    atomic_write(path, simplejpeg.encode_jpeg(sheet, quality=80), fsync=True)
+    return path

@@ -38,6 +38,7 @@ from runtime.files import atomic_write
 from runtime.html import format_number, format_percent
 from trackfeatures.errors import UserError
 
+PICTURE = "worst.jpg"
 CHECK_IMAGES = 4
 
 
@@ -121,11 +122,13 @@ def _check(run: Path, out: Path) -> dict[str, float]:
     return found
 
 
-def write_page(model: Path, evaluations: Sequence[Path], notes: str = "") -> Path:
+def write_page(
+    model: Path, evaluations: Sequence[Path], notes: str = "", picture: Path | None = None
+) -> Path:
     """Write `README.md` into the model's folder: its card, `notes`, and the tables of evaluations.
 
-    `evaluations`: what `mtlnet evaluate --json` printed. Raises UserError for one of another model,
-    or one that cannot be read.
+    `evaluations`: what `mtlnet evaluate --json` printed; `picture`: a JPEG of its worst frames,
+    which is copied there. Raises UserError for an evaluation of another model, or an unreadable one.
     """
     card = read_card(model)
     found = [_read_evaluation(path, card) for path in evaluations]
@@ -136,10 +139,13 @@ def write_page(model: Path, evaluations: Sequence[Path], notes: str = "") -> Pat
         card=card,
         notes=notes.strip(),
         evaluations=found,
+        picture=PICTURE if picture is not None else "",
         groups=GROUPS,
         number=format_number,
         percent=format_percent,
     )
+    if picture is not None:
+        atomic_write(model / PICTURE, picture.read_bytes())
     atomic_write(model / "README.md", page)
     return model / "README.md"
 

@@ -1,6 +1,5 @@
 """The evaluation's page: its figures are the report's, and its worst frames are the worst."""
 
-import base64
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -13,13 +12,16 @@ from numpy.typing import NDArray
 import trackfeatures as tf
 from datagen.recording import Dataset, Frames
 from mtlnet.evaluation.html_report import (
+    CAPTION_PX,
     MAX_ROUNDS,
     MIN_FRAMES_APART,
+    SHEET_COLUMNS,
     WORST_PER_FEATURE,
     WorstFrame,
     page,
     worst_figures,
     worst_frames,
+    write_worst_sheet,
 )
 from mtlnet.evaluation.metrics import evaluate_by_groups, mean_labels, signed_errors
 from mtlnet.inference.overlay import PREDICTION_COLOUR, TRUTH_COLOUR, marking_line, to_pixels
@@ -157,8 +159,7 @@ def test_the_worst_frames_are_shown_with_their_errors(
 
 def test_markings_are_drawn_where_they_are(frames: Frames, outputs: NDArray[np.float32]) -> None:
     (figure,) = worst_figures(frames, outputs, [WorstFrame(9, "ml", 1.0)])
-    jpeg = base64.b64decode(figure["jpeg"].removeprefix("data:image/jpeg;base64,"))
-    pixels = simplejpeg.decode_jpeg(jpeg).astype(int)
+    pixels = figure["image"].astype(int)
     camera, labels = frames.camera, frames.labels
     assert pixels.shape[0] == 2 * camera.height
     for distance, angle, colour in (
@@ -178,3 +179,23 @@ def _inside(points: NDArray[np.int32], width: int, height: int) -> Iterator[tupl
     for u, v in points[: len(points) // 2].tolist():
         if 4 <= u < width - 4 and 4 <= v < height - 4:
             yield u, v
+
+
+def test_the_sheet_of_worst_frames_shows_each_above_its_caption(
+    frames: Frames, outputs: NDArray[np.float32], tmp_path: Path
+) -> None:
+    sheet = simplejpeg.decode_jpeg(
+        write_worst_sheet(tmp_path / "worst.jpg", frames, outputs).read_bytes()
+    )
+    errors = signed_errors(outputs, frames.labels.distances, frames.labels.angle)
+    chosen = worst_frames(errors, frames.labels.round)
+    height, width = frames.camera.height, frames.camera.width
+    tile = height + CAPTION_PX
+    assert sheet.shape == (-(-len(chosen) // SHEET_COLUMNS) * tile, SHEET_COLUMNS * width, 3)
+    for number, figure in enumerate(worst_figures(frames, outputs, chosen)):
+        top, left = number // SHEET_COLUMNS * tile, number % SHEET_COLUMNS * width
+        image = sheet[top : top + height, left : left + width].astype(float)
+        expected = figure["image"].reshape(height, 2, width, 2, 3).mean((1, 3))
+        assert np.abs(image - expected).mean() < 8
+        caption = sheet[top + height : top + tile, left : left + width]
+        assert 0.005 < (caption < 128).mean() < 0.3

@@ -150,8 +150,13 @@ def test_the_page_of_a_shipped_model_has_the_figures_of_its_evaluations(
     found = evaluate([engine], dataset, "test")
     file = tmp_path / "test.json"
     file.write_text(json.dumps(found))
-    page = write_page(shipped, [file], "Trained by hand.").read_text()
-    (shipped / "README.md").unlink()
+    picture = tmp_path / "sheet.jpg"
+    picture.write_bytes(b"a JPEG")
+    page = write_page(shipped, [file], "Trained by hand.", picture).read_text()
+    assert "![frames with the largest errors](worst.jpg)" in page
+    assert (shipped / "worst.jpg").read_bytes() == b"a JPEG"
+    for name in ("README.md", "worst.jpg"):
+        (shipped / name).unlink()
     assert "Trained by hand." in page
     assert engine.card.model_hash in page
     error = found["errors"]["ml"]
