@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike
 
+from simulator.arrays import FloatArray
 from simulator.camera.core import optics
 from simulator.camera.overlay import BEHIND_M, STEP_M, marking_polylines
 from simulator.camera.snapshot import standing_pose
@@ -21,7 +22,7 @@ class Eye:
 
     def project(
         self, points: ArrayLike, body_pose: ArrayLike, view: str = "front"
-    ) -> tuple[optics.FloatArray, optics.FloatArray]:
+    ) -> tuple[FloatArray, FloatArray]:
         matrix = self.parameters.intrinsics()
         return optics.project(optics.eye_of(self.parameters, body_pose, view), matrix, points)
 

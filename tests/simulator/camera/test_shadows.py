@@ -164,7 +164,7 @@ def test_bridge_shadows_match_ray_tracing(name: str, seed: int) -> None:
     along = road.track.length_m / strip.shape[1]
     over = bridges_of(road, seed)
     assert len(over) >= 3
-    cast_bridges(strip, road, along, shadow_mask.TEXEL_M, over, sunny)
+    cast_bridges(strip, road, along, over, sunny)
     rng = np.random.default_rng(1)
     agreed, dark = [], 0
     for bridge in over:
