@@ -53,7 +53,7 @@ def saturation(part: FloatArray) -> float:
 
 
 def detail_far_away(kind: str) -> float:
-    """Contrast of what stands 60 m away and more, just over the horizon, without the drops."""
+    """Contrast of objects 60 m away and more, just above the horizon, without drops."""
     found = []
     for seed in SEEDS:
         still = replace(light(kind, seed), falling=0.0)
@@ -64,7 +64,7 @@ def detail_far_away(kind: str) -> float:
     return float(np.mean(found))
 
 
-def test_the_kinds_are_those_that_the_design_names() -> None:
+def test_light_kinds_are_the_documented_ones() -> None:
     assert KINDS == ("clear", "overcast", "dusk", "fog", "heavy-shadow", "rain", "snow")
     assert WEATHERS == ("rain", "snow")
     for kind in KINDS:
@@ -83,7 +83,7 @@ def test_snow_is_white_and_rain_is_dark_and_grey() -> None:
     assert ground("snow").std() > 1.5 * ground("overcast").std()
 
 
-def test_rain_and_snow_shorten_the_view_but_less_than_fog() -> None:
+def test_rain_and_snow_reduce_visibility_less_than_fog() -> None:
     seen = {kind: detail_far_away(kind) for kind in ("clear", "rain", "snow", "fog")}
     assert seen["fog"] < seen["rain"] < 0.8 * seen["clear"]
     assert seen["snow"] < 0.8 * seen["clear"]
@@ -93,8 +93,8 @@ def test_rain_and_snow_shorten_the_view_but_less_than_fog() -> None:
         assert max(reach) < 10.0
 
 
-def test_a_wet_road_mirrors_the_sky() -> None:
-    """The far road, seen at a grazing angle, comes near to the sky; the near road is dark."""
+def test_a_wet_road_reflects_the_sky_at_grazing_angles() -> None:
+    """The far road, at a grazing angle, is nearly as bright as the sky; the near road is dark."""
     for kind, low, high in (("rain", 1.7, 9.0), ("overcast", 0.7, 1.6)):
         clear_air = replace(light(kind), haze_per_km=0.1, falling=0.0)
         with Camera(bare_road(), seed=5, light=clear_air) as camera:
@@ -105,7 +105,7 @@ def test_a_wet_road_mirrors_the_sky() -> None:
 
 
 @pytest.mark.parametrize("kind", WEATHERS)
-def test_drops_depend_on_the_pose_and_the_seed_only(kind: str) -> None:
+def test_drops_depend_only_on_pose_and_seed(kind: str) -> None:
     pose = standing_pose(road(), 120.0, 0.0)
     beside = pose + np.array([0.002, 0.0, 0.0, 0.0, 0.0, 0.0])
 
@@ -133,7 +133,7 @@ def test_drops_depend_on_the_pose_and_the_seed_only(kind: str) -> None:
 
 
 @pytest.mark.parametrize("kind", WEATHERS)
-def test_what_varies_within_a_kind_is_drawn_from_the_seed(kind: str) -> None:
+def test_random_parameters_of_a_kind_depend_on_the_seed(kind: str) -> None:
     drawn = [Light.named(kind, np.random.default_rng(seed)) for seed in range(30)]
     assert drawn[7] == Light.named(kind, np.random.default_rng(7))
     for name in ("sun_azimuth", "sun_elevation", "haze_per_km", "cover", "falling", "exposure"):
@@ -172,8 +172,8 @@ def test_markings_stay_visible_in_rain() -> None:
     assert min(wet) > 1.5
 
 
-def test_dry_kinds_use_programs_without_weather() -> None:
-    """Dry kinds draw with programs of their own, into which no weather is compiled."""
+def test_dry_lights_use_shaders_without_weather() -> None:
+    """Dry lights use shader programs compiled without the weather code."""
     from simulator.camera.core.context import WEATHER_PROGRAMS, graphics
 
     shared = graphics()
