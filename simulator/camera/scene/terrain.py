@@ -76,9 +76,8 @@ class Grid:
     def axes(self) -> tuple[FloatArray, FloatArray]:
         """x of the columns and y of the rows."""
         rows, columns = self.shape
-        x: FloatArray = self.x0 + self.cell * np.arange(columns)
-        y: FloatArray = self.y0 + self.cell * np.arange(rows)
-        return x, y
+        x, y = np.arange(columns, dtype=np.float64), np.arange(rows, dtype=np.float64)
+        return self.x0 + self.cell * x, self.y0 + self.cell * y
 
     def nearest(
         self, x: FloatArray, y: FloatArray
