@@ -23,7 +23,7 @@ def test_acceleration_on_a_free_road() -> None:
 
 
 def test_no_acceleration_at_the_equilibrium_gap() -> None:
-    """At equal speeds the gap (s0 + v T) / sqrt(1 - (v/v0)^4) needs no acceleration (Treiber, eq. 4)."""
+    """The gap at equal speeds is (s0 + v T) / sqrt(1 - (v/v0)^4) (Treiber, eq. 4)."""
     speed, desired = 10.0, 15.0
     gap = (STANDSTILL_GAP_M + speed * TIME_HEADWAY_S) / math.sqrt(1 - (speed / desired) ** 4)
     assert idm_acceleration(gap, speed, speed, desired) == pytest.approx(0.0, abs=1e-12)
