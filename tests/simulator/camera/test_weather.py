@@ -142,6 +142,34 @@ def test_random_parameters_of_a_kind_depend_on_the_seed(kind: str) -> None:
     assert all(0.0 < each.cover <= 1.0 and 0.0 < each.falling <= 1.0 for each in drawn)
 
 
+@pytest.mark.parametrize(
+    ("kind", "azimuth", "sun_green", "horizon_red", "haze_per_km", "exposure"),
+    [
+        ("clear", 0.096293340, 1.986553341, 0.669518271, 0.967596382, 0.997769856),
+        ("overcast", 1.934849046, 0.165080164, 0.610820313, 2.326051934, 1.116449915),
+        ("dusk", 1.934849046, 0.807840842, 0.951831927, 1.813077245, 0.997769856),
+        ("fog", -2.802736057, 0.05, 0.633660605, 7.438819397, 1.173201524),
+        ("heavy-shadow", 0.096293340, 2.15, 0.669518271, 0.967596382, 1.129176240),
+        ("rain", -0.732814935, 0.039282548, 0.460827051, 6.847644738, 0.997769856),
+        ("snow", -0.732814935, 0.094540082, 0.567762088, 8.155585528, 1.116449915),
+    ],
+)
+def test_a_seed_always_draws_the_same_light(
+    kind: str,
+    azimuth: float,
+    sun_green: float,
+    horizon_red: float,
+    haze_per_km: float,
+    exposure: float,
+) -> None:
+    """Values are drawn in the order of light.toml, so another order would change the images."""
+    drawn = Light.named(kind, np.random.default_rng(5))
+    found = (drawn.sun_azimuth, drawn.sun[1], drawn.horizon[0], drawn.haze_per_km, drawn.exposure)
+    assert found == pytest.approx(
+        (azimuth, sun_green, horizon_red, haze_per_km, exposure), rel=1e-7
+    )
+
+
 def marking_contrast(kind: str, seed: int) -> float:
     """Mean light of the outer lines, 4 to 25 m ahead, over that of the road beside them."""
     ratios = []
