@@ -6,7 +6,22 @@ by `import simulator.env`; Gymnasium 1.0 and later does not search packages for 
 
 import sys
 
-if "gymnasium" in sys.modules:  # commands without environments do not import gymnasium
-    from simulator.registration import register_environments
+ENVIRONMENTS = {
+    "driverview/LateralControl-v0": "simulator.env:LateralControl",
+    "driverview/DriverView-v0": "simulator.env:DriverView",
+}
+MAX_STEPS = 6500
+"""The paper's longest episode, in control steps."""
 
+
+def register_environments() -> None:
+    """Register both environments; those already registered stay as they are."""
+    import gymnasium
+
+    for name, entry_point in ENVIRONMENTS.items():
+        if name not in gymnasium.registry:
+            gymnasium.register(id=name, entry_point=entry_point, max_episode_steps=MAX_STEPS)
+
+
+if "gymnasium" in sys.modules:  # commands without environments do not import gymnasium
     register_environments()

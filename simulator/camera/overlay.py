@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from simulator.arrays import FloatArray
 from simulator.camera.core.optics import NEAR_M
 from simulator.track.piece_table import road_points
 from simulator.track.road import Road
@@ -13,7 +14,6 @@ from simulator.track.road import Road
 if TYPE_CHECKING:
     from simulator.vehicle.state import CarState
 
-FloatArray = NDArray[np.float64]
 
 STEP_M = 1.0
 BEHIND_M = 2.0

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runtime.files import atomic_write, check_folder
+from simulator.arrays import FloatArray
 from simulator.camera import overlay
 from simulator.camera.core.camera import Camera
 from simulator.camera.core.render_modes import CLASS, CLASSES, COLOUR, DEPTH, ViewRequest
@@ -20,7 +21,6 @@ from simulator.vehicle.car import CarParameters
 from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
 
-FloatArray = NDArray[np.float64]
 Picture = NDArray[np.uint8]
 
 WIDTH, HEIGHT, COLUMNS = 480, 360, 4
@@ -201,7 +201,7 @@ def colourise(picture: NDArray[np.generic], kind: str) -> Picture:
     return np.asarray(picture, dtype=np.uint8)
 
 
-def _depth_colours(depth: NDArray[np.float64]) -> Picture:
+def _depth_colours(depth: FloatArray) -> Picture:
     share = np.log(np.clip(depth, NEAREST_M, FARTHEST_M) / NEAREST_M)
     level = np.rint(255.0 * (1.0 - share / np.log(FARTHEST_M / NEAREST_M))).astype(np.uint8)
     colours = cv2.cvtColor(cv2.applyColorMap(level, cv2.COLORMAP_TURBO), cv2.COLOR_BGR2RGB)

@@ -26,12 +26,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 import trackfeatures as tf
+from simulator import register_environments
 from simulator.env.action import Controls, action_space, check_controls, to_command
-from simulator.env.episode import EpisodeOptions
 from simulator.env.observation import Kind, Observation, ObservationOptions, Observer
-from simulator.env.reward import Ending
+from simulator.env.reward import Ending, EpisodeOptions
 from simulator.env.view_renderer import RenderOptions, ViewRenderer
-from simulator.registration import register_environments
 from simulator.track.catalogue import find_track
 from simulator.track.road import Road
 from simulator.vehicle.state import CarState

@@ -3,12 +3,10 @@
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from runtime.jit import compiled
+from simulator.arrays import FloatArray
 from simulator.track.piece_table import CURVATURE, HEADING0, LENGTH, X0, Y0, Table, locate
-
-FloatArray = NDArray[np.float64]
 
 RANGE_M = 200.0
 OFF_TRACK = -1.0

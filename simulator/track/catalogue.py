@@ -7,7 +7,7 @@ Looked in, in this order: `simulator/tracks`, the folder given (`--tracks-dir`),
 import difflib
 import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
@@ -50,22 +50,15 @@ def list_tracks(tracks_dir: Path | None = None) -> list[Track]:
 
 def read_track(path: Path) -> Track:
     """The track in one file; its kind is told by the suffix."""
-    return _reader(path.suffix.lower())(path)
-
-
-def _reader(suffix: str) -> Callable[[Path], Track]:
     # One import each: a collector of own tracks needs neither XML nor scipy.
-    if suffix == ".xml":
-        from simulator.track.torcs.torcs import read_torcs
-
-        return read_torcs
-    if suffix == ".csv":
-        from simulator.track.centre_line_csv import read_centre_line
-
-        return read_centre_line
-    from simulator.track.toml_track import read_toml_track
-
-    return read_toml_track
+    match path.suffix.lower():
+        case ".xml":
+            from simulator.track.torcs.torcs import read_torcs as read
+        case ".csv":
+            from simulator.track.centre_line_csv import read_centre_line as read
+        case _:
+            from simulator.track.toml_track import read_toml_track as read
+    return read(path)
 
 
 def track_files(tracks_dir: Path | None = None) -> dict[str, Path]:

@@ -12,10 +12,11 @@ import numpy as np
 from scipy.interpolate import splev, splprep
 
 from runtime.files import atomic_write
+from simulator.arrays import FloatArray
 from simulator.track.errors import TrackError
 from simulator.track.geometry import Track
 from simulator.track.markings import imported_style
-from simulator.track.pieces import FloatArray, Piece, Placed, assemble, check_closes
+from simulator.track.pieces import Piece, Placed, assemble, check_closes
 from trackfeatures.errors import UserError
 
 MAX_BYTES: Final = 16 * 2**20
@@ -139,10 +140,7 @@ def _arcs(points: FloatArray, path: Path) -> Placed:
     if abs(math.remainder(float(turn.sum()), 2.0 * math.pi)) > 1e-6:
         raise TrackError(f"{path}: the points do not run round a closed loop")
     length = _closing_lengths(np.full(count, s[-1] / count), turn, float(heading[0]))
-    pieces = [
-        Piece(float(ds), float(dh / ds), 0.0, 0.0, 0.0, 0.0)
-        for ds, dh in zip(length, turn, strict=True)
-    ]
+    pieces = [Piece(float(ds), float(dh / ds)) for ds, dh in zip(length, turn, strict=True)]
     return assemble(pieces, float(x[0]), float(y[0]), float(heading[0]))
 
 

@@ -12,11 +12,11 @@ from typing import Literal, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from simulator.arrays import FloatArray
 from simulator.track import piece_table
 from simulator.track.markings import MarkingStyle
 from simulator.track.pieces import Placed
 
-FloatArray = NDArray[np.float64]
 Source = Literal["own", "torcs", "csv"]
 Surface = Literal["asphalt", "gravel", "concrete"]
 

@@ -10,8 +10,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from simulator.arrays import FloatArray
 from simulator.track.errors import TrackError
-from simulator.track.pieces import FloatArray, Piece, Placed, assemble
+from simulator.track.pieces import Piece, Placed, assemble
 
 MAX_STEP_M: Final = 5.0
 SPIRAL_STEP_M: Final = 2.0
@@ -99,11 +100,7 @@ def _spiral(bend: Bend, sign: float, number: int) -> list[Row]:
 
 def place(steps: Steps) -> Placed:
     """The steps in the plane, without heights."""
-    flat = [
-        Piece(length, k, 0.0, 0.0, 0.0, 0.0)
-        for length, k in zip(steps.length, steps.curvature, strict=True)
-    ]
-    return assemble(flat)
+    return assemble([Piece(*step) for step in zip(steps.length, steps.curvature, strict=True)])
 
 
 def close(segments: list[Segment]) -> tuple[list[Segment], float]:
@@ -181,14 +178,5 @@ def lay(segments: list[Segment], width: float, vertical_curve: float) -> list[Pi
     z = heights(segments, s, vertical_curve)
     lift = np.tan(np.concatenate((steps.banking_end[-1:], steps.banking_end))) * width / 2.0
     left, right = z + lift, z - lift
-    return [
-        Piece(
-            float(steps.length[i]),
-            float(steps.curvature[i]),
-            float(left[i]),
-            float(right[i]),
-            float(left[i + 1]),
-            float(right[i + 1]),
-        )
-        for i in range(len(steps.length))
-    ]
+    columns = (steps.length, steps.curvature, left[:-1], right[:-1], left[1:], right[1:])
+    return [Piece(*row) for row in np.column_stack(columns).tolist()]

@@ -8,11 +8,9 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from simulator.arrays import FloatArray
 from simulator.track.errors import TrackError
-
-FloatArray = NDArray[np.float64]
 
 MAX_TURN: Final = math.pi / 2
 """No piece turns farther, so that a foot point on an arc is unique near it."""
@@ -28,10 +26,10 @@ class Piece:
 
     length: float
     curvature: float
-    z_left0: float
-    z_right0: float
-    z_left1: float
-    z_right1: float
+    z_left0: float = 0.0
+    z_right0: float = 0.0
+    z_left1: float = 0.0
+    z_right1: float = 0.0
 
 
 @dataclass(frozen=True)

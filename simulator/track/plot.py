@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 import trackfeatures as tf
 from runtime.files import atomic_write, check_folder
+from simulator.arrays import FloatArray
 from simulator.track.geometry import Track, TrackPose
 from simulator.track.road import Road
 from trackfeatures.definitions import BEND_CURVATURE
@@ -23,7 +24,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-FloatArray = NDArray[np.float64]
 
 COLOURS: Final = {
     tf.Heading.LEFT: "#1f6fb4",

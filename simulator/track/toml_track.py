@@ -16,7 +16,7 @@ import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, Final, get_args
+from typing import Any, Final, cast, get_args
 
 from simulator.track.errors import TrackError
 from simulator.track.geometry import Surface, Track
@@ -83,7 +83,7 @@ def read_toml_track(path: Path) -> Track:
         name=path.stem,
         source="own",
         width=width,
-        surface=_surface(table.choice("surface", get_args(Surface), "asphalt")),
+        surface=cast(Surface, table.choice("surface", get_args(Surface), "asphalt")),
         look=table.choice("look", LOOKS),
         markings=_markings(Table(table.values.get("markings", {}), f"{path}: [markings]")),
     )
@@ -152,10 +152,6 @@ def _load(path: Path) -> Mapping[str, Any]:
         raise TrackError(f"{path}: not a readable TOML file ({error})") from None
 
 
-def _surface(name: str) -> Surface:
-    return "gravel" if name == "gravel" else "concrete" if name == "concrete" else "asphalt"
-
-
 def _markings(table: Table) -> MarkingStyle:
     if not isinstance(table.values, Mapping):
         raise TrackError(f"{table.where}: expected a table")
@@ -169,7 +165,7 @@ def _markings(table: Table) -> MarkingStyle:
         line_width=table.number("line_width", 0.11, 0.15, plain.line_width),
         dash_length=table.number("dash_length", 1.0, 20.0, plain.dash_length),
         dash_gap=table.number("dash_gap", 1.0, 20.0, plain.dash_gap),
-        left_colour="yellow" if colour == "yellow" else "white",
+        left_colour=cast(LineColour, colour),
         kerbs=kerbs,
         wear=table.number("wear", 0.0, 1.0, plain.wear),
     )

@@ -6,10 +6,8 @@ lanes: cars in either lane follow it.
 
 import math
 
-import numpy as np
-from numpy.typing import NDArray
-
 from runtime.jit import compiled
+from simulator.arrays import FloatArray
 from simulator.track import piece_table
 from simulator.traffic.idm import COMFORTABLE_BRAKING, STANDSTILL_GAP_M, idm_acceleration
 
@@ -32,8 +30,6 @@ MIN_GAIN = 0.2  # m/s2: the gain in acceleration above which a car changes lanes
 MIN_LENGTH_RATIO = 0.05  # lane length over centre-line length, near the centre of a bend
 POLITENESS = 0.2  # MOBIL: weight of the new follower's loss
 
-Table = NDArray[np.float64]
-
 
 @compiled
 def signed_distance(from_s: float, to_s: float, length: float) -> float:
@@ -43,7 +39,7 @@ def signed_distance(from_s: float, to_s: float, length: float) -> float:
 
 @compiled
 def nearest_body(
-    bodies: Table,
+    bodies: FloatArray,
     me: int,
     s: float,
     right: float,
@@ -77,7 +73,7 @@ def nearest_body(
 
 @compiled
 def following_acceleration(
-    bodies: Table,
+    bodies: FloatArray,
     me: int,
     s: float,
     speed: float,
@@ -95,7 +91,7 @@ def following_acceleration(
 
 @compiled
 def lane_change_safe(
-    bodies: Table,
+    bodies: FloatArray,
     me: int,
     s: float,
     speed: float,
@@ -135,7 +131,9 @@ def lane_change_safe(
 
 
 @compiled
-def update_bodies(cars: Table, bodies: Table, half_length: float, half_width: float) -> None:
+def update_bodies(
+    cars: FloatArray, bodies: FloatArray, half_length: float, half_width: float
+) -> None:
     """Update the first rows of `bodies` (n + 1, BODY_COLUMNS) from `cars`; skips struck cars."""
     for i in range(cars.shape[0]):
         if cars[i, STRUCK] > 0.0:
@@ -150,7 +148,12 @@ def update_bodies(cars: Table, bodies: Table, half_length: float, half_width: fl
 
 @compiled
 def decide_lane_change(
-    cars: Table, bodies: Table, i: int, lane_y: Table, half_width: float, length: float
+    cars: FloatArray,
+    bodies: FloatArray,
+    i: int,
+    lane_y: FloatArray,
+    half_width: float,
+    length: float,
 ) -> None:
     """Start a lane change of car `i` if it is safe and gains enough (MOBIL, Kesting 2007)."""
     y, speed, half_length = cars[i, Y_TO], cars[i, SPEED], bodies[i, B_HALF_LENGTH]
@@ -180,7 +183,7 @@ def decide_lane_change(
 
 
 @compiled
-def centre_line_advance(table: Table, s: float, y: float, distance: float) -> float:
+def centre_line_advance(table: FloatArray, s: float, y: float, distance: float) -> float:
     """Increase of s while a car drives `distance` m at the lateral offset `y`.
 
     A lane on the inside of a bend is shorter than the centre line. Exact across the joints of
@@ -201,7 +204,7 @@ def centre_line_advance(table: Table, s: float, y: float, distance: float) -> fl
 
 
 @compiled
-def move_car(cars: Table, i: int, advance_m: float, dt: float, length: float) -> None:
+def move_car(cars: FloatArray, i: int, advance_m: float, dt: float, length: float) -> None:
     """Advance car `i` along its lane. The lateral motion of a lane change depends on the distance
     driven, so a car at rest does not move sideways."""
     cars[i, S] = (cars[i, S] + advance_m) % length
@@ -216,13 +219,13 @@ def move_car(cars: Table, i: int, advance_m: float, dt: float, length: float) ->
 
 @compiled
 def step_traffic(
-    cars: Table,
-    bodies: Table,
+    cars: FloatArray,
+    bodies: FloatArray,
     dt: float,
     length: float,
-    lane_y: Table,
-    table: Table,
-    speed_limit: Table,
+    lane_y: FloatArray,
+    table: FloatArray,
+    speed_limit: FloatArray,
     half_length: float,
     half_width: float,
 ) -> None:
@@ -259,7 +262,7 @@ def step_traffic(
 
 
 @compiled
-def update_poses(cars: Table, table: Table, poses: Table) -> None:
+def update_poses(cars: FloatArray, table: FloatArray, poses: FloatArray) -> None:
     """Fill `poses` (n, 6): x, y, z, roll, pitch, yaw of the ground point under each car.
 
     Angles as in PyBullet (R = Rz(yaw) Ry(pitch) Rx(roll), pitch positive nose down); the car's up
@@ -288,7 +291,7 @@ def update_poses(cars: Table, table: Table, poses: Table) -> None:
 
 
 @compiled
-def limit_deceleration(squared: Table, gain: float) -> None:
+def limit_deceleration(squared: FloatArray, gain: float) -> None:
     """Lower the squared speed limits (n,) of cells around a loop, in place, so that from one cell
     to the next they fall by at most `gain`, the decrease one can brake within a cell."""
     cells = squared.shape[0]

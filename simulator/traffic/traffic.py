@@ -10,6 +10,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from simulator.arrays import FloatArray
 from simulator.track.geometry import Track
 from simulator.track.road import START_BEFORE_LINE_M, Road
 from simulator.traffic import car_table
@@ -17,8 +18,6 @@ from simulator.traffic.idm import COMFORTABLE_BRAKING, STANDSTILL_GAP_M, TIME_HE
 from simulator.traffic.wreck import TRAFFIC_CAR
 from simulator.vehicle.car import CarParameters
 from trackfeatures.errors import UserError
-
-FloatArray = NDArray[np.float64]
 
 TRAFFIC_CAR_SIZE = (TRAFFIC_CAR.length, TRAFFIC_CAR.width, TRAFFIC_CAR.height)
 """Length, width, height of a traffic car (m)."""
@@ -126,17 +125,20 @@ class Traffic:
         forward = max(speed, 0.0)
         self._bodies[row] = (s, right, left, forward, half_length, max(forward, 1.0))
 
-    def leader(
-        self, s: float, to_middle: float, exclude: int | None = None
-    ) -> tuple[float, float] | None:
+    def leader(self, s: float, to_middle: float) -> tuple[float, float] | None:
         """Nearest car ahead in the path of a car of the ego's size: (bumper gap m, speed m/s)."""
-        return self._neighbour(s, to_middle, exclude, ahead=True)
-
-    def follower(
-        self, s: float, to_middle: float, exclude: int | None = None
-    ) -> tuple[float, float] | None:
-        """Nearest car behind, as for `leader`."""
-        return self._neighbour(s, to_middle, exclude, ahead=False)
+        half = 0.5 * EGO_CAR_SIZE[1]
+        row, gap = car_table.nearest_body(
+            self._bodies[: self.count],
+            -1,
+            s,
+            to_middle - half,
+            to_middle + half,
+            0.5 * EGO_CAR_SIZE[0],
+            self._length,
+            True,
+        )
+        return None if row < 0 else (float(gap), float(self._bodies[row, car_table.B_SPEED]))
 
     def has_room(self, s: float, to_middle: float, speed: float) -> bool:
         """Whether the ego car at `s` may change to `to_middle` with both gaps safe."""
@@ -152,22 +154,6 @@ class Traffic:
             self._length,
         )
         return bool(safe)
-
-    def _neighbour(
-        self, s: float, to_middle: float, exclude: int | None, *, ahead: bool
-    ) -> tuple[float, float] | None:
-        half = 0.5 * EGO_CAR_SIZE[1]
-        row, gap = car_table.nearest_body(
-            self._bodies[: self.count],
-            -1 if exclude is None else exclude,
-            s,
-            to_middle - half,
-            to_middle + half,
-            0.5 * EGO_CAR_SIZE[0],
-            self._length,
-            ahead,
-        )
-        return None if row < 0 else (float(gap), float(self._bodies[row, car_table.B_SPEED]))
 
     def _update_ego(self, s: float, to_middle: float, speed: float) -> None:
         half = 0.5 * EGO_CAR_SIZE[1]

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runtime.jit import compiled
+from simulator.arrays import FloatArray
 from simulator.track.piece_table import Table, index_at
 from simulator.vehicle.car import RPM, CarParameters
 from simulator.vehicle.dynamics import ENGINE, MEMORY, PIECE, SPIN, compute_forces
@@ -26,8 +27,6 @@ from simulator.vehicle.track_state import (
     YAW,
     measure_track_state,
 )
-
-FloatArray = NDArray[np.float64]
 
 TRAFFIC_CAR = CarParameters(
     mass=1200.0,

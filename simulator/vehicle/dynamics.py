@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runtime.jit import compiled
+from simulator.arrays import FloatArray
 from simulator.track.piece_table import Table, locate, surface
 from simulator.vehicle.car import GRAVITY
 from simulator.vehicle.orientation import rotation
@@ -25,8 +26,6 @@ from simulator.vehicle.wheels import (
     update_loads,
 )
 from simulator.world.control_rate import PHYSICS_HZ
-
-Vector = NDArray[np.float64]
 
 DT = 1.0 / PHYSICS_HZ
 
@@ -62,7 +61,7 @@ def apply_brake(spin: float, brake: float, inertia: float, dt: float) -> float:
 
 @compiled
 def update_wheel_speeds(
-    p: Any, memory: Vector, command: Vector, wheels: Vector, slip_gain: Vector
+    p: Any, memory: FloatArray, command: FloatArray, wheels: FloatArray, slip_gain: FloatArray
 ) -> None:
     """Advance the four wheel speeds and the engine speed in `memory` by one step, implicitly in the
     tyre force.
@@ -107,7 +106,7 @@ def update_wheel_speeds(
 
 
 @compiled
-def add_aerodynamics(p: Any, axes: Vector, velocity: Vector, wrench: Vector) -> None:
+def add_aerodynamics(p: Any, axes: FloatArray, velocity: FloatArray, wrench: FloatArray) -> None:
     """Add drag along the body and downforce at both axles (quadratic in the forward speed)."""
     ahead, up = axes[0], axes[2]
     speed = ahead[0] * velocity[0] + ahead[1] * velocity[1] + ahead[2] * velocity[2]
@@ -125,7 +124,7 @@ def add_aerodynamics(p: Any, axes: Vector, velocity: Vector, wrench: Vector) -> 
 
 @compiled
 def add_underbody_contact(
-    depth: float, normal: tuple[float, float, float], velocity: Vector, wrench: Vector
+    depth: float, normal: tuple[float, float, float], velocity: FloatArray, wrench: FloatArray
 ) -> None:
     """Add the contact force of an underbody `depth` m below the road: it supports a car that lies
     on its underbody, side or roof, where the wheels do not."""
@@ -139,7 +138,9 @@ def add_underbody_contact(
 
 
 @compiled
-def accelerate(p: Any, axes: Vector, wrench: Vector, dt: float, velocity: Vector) -> None:
+def accelerate(
+    p: Any, axes: FloatArray, wrench: FloatArray, dt: float, velocity: FloatArray
+) -> None:
     """Add the change of `velocity` (6,), linear and angular, under `wrench` (6,) over `dt` s."""
     for i in range(3):
         velocity[i] += dt * wrench[i] / p.total_mass
@@ -155,10 +156,10 @@ def compute_forces(
     params: NDArray[Any],
     table: Table,
     ground: Ground,
-    motion: Vector,
-    memory: Vector,
-    command: Vector,
-    wrench: Vector,
+    motion: FloatArray,
+    memory: FloatArray,
+    command: FloatArray,
+    wrench: FloatArray,
 ) -> None:
     """One 200 Hz step: updates `memory` and fills `wrench` (6,), the (force, torque) on the body
     at its centre of gravity in the world frame, gravity included.

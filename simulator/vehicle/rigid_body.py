@@ -11,13 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runtime.jit import compiled
+from simulator.arrays import FloatArray
 from simulator.track.piece_table import Table, locate
 from simulator.traffic.wreck import TRAFFIC_CAR
 from simulator.vehicle.dynamics import DT, PIECE, accelerate, compute_forces
 from simulator.vehicle.orientation import rotation
 from simulator.vehicle.surface import Ground
-
-Vector = NDArray[np.float64]
 
 WALL_RANGE_M = 3.5
 """Largest distance of any part of the car from its centre of gravity, with a margin for the motion
@@ -30,7 +29,7 @@ OTHER_LENGTH, OTHER_WIDTH = TRAFFIC_CAR.length, TRAFFIC_CAR.width
 
 
 @compiled
-def gyroscopic_change(p: Any, axes: Vector, motion: Vector) -> tuple[float, float, float]:
+def gyroscopic_change(p: Any, axes: FloatArray, motion: FloatArray) -> tuple[float, float, float]:
     """Change of the angular velocity (body frame, rad/s) by one step of Euler's equations without
     torque: one Newton step of the implicit rule, as in PyBullet (Catto, GDC 2015)."""
     wx = axes[0, 0] * motion[10] + axes[0, 1] * motion[11] + axes[0, 2] * motion[12]
@@ -51,7 +50,7 @@ def gyroscopic_change(p: Any, axes: Vector, motion: Vector) -> tuple[float, floa
 
 
 @compiled
-def rotate(quaternion: Vector, wx: float, wy: float, wz: float, dt: float) -> None:
+def rotate(quaternion: FloatArray, wx: float, wy: float, wz: float, dt: float) -> None:
     """Rotate a unit quaternion (x, y, z, w) by the angular velocity (world frame) over `dt`."""
     rate = math.sqrt(wx * wx + wy * wy + wz * wz)
     half = 0.5 * rate * dt
@@ -67,7 +66,7 @@ def rotate(quaternion: Vector, wx: float, wy: float, wz: float, dt: float) -> No
 
 
 @compiled
-def integrate(p: Any, motion: Vector, wrench: Vector) -> None:
+def integrate(p: Any, motion: FloatArray, wrench: FloatArray) -> None:
     """Move a free body by one physics step under `wrench` (6,), (force, torque)."""
     axes = rotation(motion[3:7])
     tx, ty, tz = gyroscopic_change(p, axes, motion)
@@ -79,7 +78,7 @@ def integrate(p: Any, motion: Vector, wrench: Vector) -> None:
 
 
 @compiled
-def boxes_overlap(a: Vector, b: Vector) -> bool:
+def boxes_overlap(a: FloatArray, b: FloatArray) -> bool:
     """Whether two boxes (x, y, yaw, length, width) overlap, by the separating-axis theorem."""
     dx, dy = b[0] - a[0], b[1] - a[1]
     turn = b[2] - a[2]
@@ -95,7 +94,7 @@ def boxes_overlap(a: Vector, b: Vector) -> bool:
 
 
 @compiled
-def boxes_may_touch(p: Any, motion: Vector, dx: float, dy: float, yaw: float) -> bool:
+def boxes_may_touch(p: Any, motion: FloatArray, dx: float, dy: float, yaw: float) -> bool:
     """Whether the rectangle of a traffic car at the offset (dx, dy) m may touch the ego car's
     within one physics step."""
     forward = rotation(motion[3:7])[0]
@@ -113,11 +112,11 @@ def boxes_may_touch(p: Any, motion: Vector, dx: float, dy: float, yaw: float) ->
 def contact_possible(
     p: Any,
     table: Table,
-    motion: Vector,
+    motion: FloatArray,
     piece: int,
     reach: float,
-    others: Vector,
-    move: Vector,
+    others: FloatArray,
+    move: FloatArray,
     share: float,
 ) -> bool:
     """Whether the ego car may touch something within one physics step.
@@ -144,12 +143,12 @@ def advance_free(
     params: NDArray[Any],
     table: Table,
     ground: Ground,
-    motion: Vector,
-    memory: Vector,
-    command: Vector,
+    motion: FloatArray,
+    memory: FloatArray,
+    command: FloatArray,
     reach: float,
-    others: Vector,
-    move: Vector,
+    others: FloatArray,
+    move: FloatArray,
     done: int,
     steps: int,
 ) -> int:

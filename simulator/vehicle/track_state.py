@@ -5,15 +5,11 @@ This is the only place that computes angle = track tangent - yaw.
 
 import math
 
-import numpy as np
-from numpy.typing import NDArray
-
 from runtime.jit import compiled
+from simulator.arrays import FloatArray
 from simulator.track.piece_table import CURVATURE, HEADING0, LENGTH, S0, Table, locate
 from simulator.vehicle.dynamics import PIECE
 from simulator.vehicle.orientation import rotation
-
-Vector = NDArray[np.float64]
 
 # Indices into the track state (TRACK_STATE_SIZE,). TRACK_SPEED: speed along the track (m/s).
 # UPRIGHT_COSINE: z of the body's up axis, 1 on a level road, below 0 upside down.
@@ -23,7 +19,9 @@ TRACK_STATE_SIZE = 12
 
 
 @compiled
-def measure_track_state(table: Table, motion: Vector, memory: Vector, out: Vector) -> None:
+def measure_track_state(
+    table: Table, motion: FloatArray, memory: FloatArray, out: FloatArray
+) -> None:
     """Fill `out` (TRACK_STATE_SIZE,) for one car, and update its PIECE in `memory`."""
     piece, s, to_middle = locate(table, motion[0], motion[1], int(memory[PIECE]))
     memory[PIECE] = piece

@@ -6,15 +6,11 @@ World frame z up; body frame x forward, y left, z up, origin at the centre of gr
 import math
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from runtime.jit import compiled
+from simulator.arrays import FloatArray
 from simulator.track.piece_table import Table, locate, surface
 from simulator.vehicle.surface import Ground, surface_under_wheel
 from simulator.vehicle.tyre import peak_force, tyre_slip_gain
-
-Vector = NDArray[np.float64]
 
 MAX_TRAVEL_M = 0.25
 """Largest compression of a suspension strut from rest."""
@@ -52,10 +48,10 @@ def locate_contacts(
     table: Table,
     ground: Ground,
     piece: int,
-    motion: Vector,
-    axes: Vector,
+    motion: FloatArray,
+    axes: FloatArray,
     steer: float,
-    wheels: Vector,
+    wheels: FloatArray,
 ) -> None:
     """Fill the entries of `wheels` that do not depend on the body's velocity: contact point,
     directions, spring force, damper constant and surface.
@@ -95,7 +91,7 @@ def locate_contacts(
 
 
 @compiled
-def set_directions(p: Any, row: Vector, axes: Vector, angle: float) -> None:
+def set_directions(p: Any, row: FloatArray, axes: FloatArray, angle: float) -> None:
     """Fill in a wheel's directions in the road plane, `angle` rad to the left of the body's."""
     cos_a, sin_a = math.cos(angle), math.sin(angle)
     nx, ny, nz = row[NORMAL], row[NORMAL + 1], row[NORMAL + 2]
@@ -123,7 +119,7 @@ def spring_force(p: Any, front: bool, compression: float, other: float) -> float
 
 
 @compiled
-def update_loads(p: Any, velocity: Vector, wheels: Vector) -> None:
+def update_loads(p: Any, velocity: FloatArray, wheels: FloatArray) -> None:
     """Fill the entries of `wheels` that depend on the body's `velocity` (6,), linear and angular:
     contact point speeds, load, largest tyre force."""
     for wheel in range(4):
@@ -140,7 +136,7 @@ def update_loads(p: Any, velocity: Vector, wheels: Vector) -> None:
 
 
 @compiled
-def tyre_slip_gains(p: Any, spin: Vector, wheels: Vector, slip_gain: Vector) -> None:
+def tyre_slip_gains(p: Any, spin: FloatArray, wheels: FloatArray, slip_gain: FloatArray) -> None:
     """Fill `slip_gain` (4,): tyre force per m/s of slip speed (N s/m); `spin` (4,) rad/s."""
     for wheel in range(4):
         row = wheels[wheel]
@@ -149,7 +145,7 @@ def tyre_slip_gains(p: Any, spin: Vector, wheels: Vector, slip_gain: Vector) -> 
 
 @compiled
 def add_tyre_forces(
-    p: Any, spin: Vector, wheels: Vector, slip_gain: Vector, wrench: Vector
+    p: Any, spin: FloatArray, wheels: FloatArray, slip_gain: FloatArray, wrench: FloatArray
 ) -> None:
     """Add the forces and torques of the road on the four wheels to `wrench` (6,)."""
     for wheel in range(4):
@@ -168,7 +164,7 @@ def add_tyre_forces(
 
 
 @compiled
-def add_force(wrench: Vector, fx: float, fy: float, fz: float, arm: Vector) -> None:
+def add_force(wrench: FloatArray, fx: float, fy: float, fz: float, arm: FloatArray) -> None:
     """Add a world-frame force at `arm` (3,) from the centre of gravity to `wrench` (6,)."""
     wrench[0] += fx
     wrench[1] += fy

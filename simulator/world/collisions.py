@@ -6,8 +6,8 @@ and moves as a rigid body. World frame, SI units.
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
+from simulator.arrays import FloatArray
 from simulator.track.piece_table import locate
 from simulator.track.road import Road
 from simulator.traffic.traffic import Traffic
@@ -19,8 +19,6 @@ from simulator.vehicle.state import Collision
 from simulator.vehicle.surface import ground
 from simulator.world.physics import PhysicsClient
 from simulator.world.walls import Walls
-
-FloatArray = NDArray[np.float64]
 
 
 class ContactPhysics:

@@ -9,9 +9,9 @@ import math
 from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 import trackfeatures as tf
+from simulator.arrays import FloatArray
 from simulator.track.piece_table import foot_offset, index_at, surface
 from simulator.track.road import START_BEFORE_LINE_M, Road
 from simulator.traffic.traffic import Traffic
@@ -46,7 +46,6 @@ __all__ = ["CarState", "Command", "World"]
 BACKWARDS_SPEED_M_S = -0.5
 """Below this speed along the track, the car drives backwards."""
 MAX_START_SPEED_M_S = 150.0
-FloatArray = NDArray[np.float64]
 NO_TRAFFIC = np.zeros((0, 6))
 
 
@@ -140,7 +139,7 @@ class World:
         offset = foot_offset(self._table, piece, now.s, now.to_middle, now.z)
         return self.road.measure(now.s, offset, now.angle)
 
-    def body_pose(self) -> NDArray[np.float64]:
+    def body_pose(self) -> FloatArray:
         """x, y, z, roll, pitch, yaw of the centre of gravity (6,), as PyBullet's Euler angles."""
         now = self.state
         return np.array([now.x, now.y, now.z, now.roll, now.pitch, now.yaw])

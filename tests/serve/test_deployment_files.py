@@ -1,4 +1,4 @@
-"""What ships the service says the same as the service: ports, paths, users, options."""
+"""Dockerfile and manifests agree with the service: ports, paths, users, options."""
 
 import re
 from pathlib import Path
@@ -36,7 +36,7 @@ def container(pod: dict[str, Any]) -> dict[str, Any]:
     return container
 
 
-def test_probes_ask_paths_that_the_service_answers(
+def test_probe_paths_are_answered_by_the_service(
     service: Served, container: dict[str, Any]
 ) -> None:
     for probe in ("startupProbe", "readinessProbe", "livenessProbe"):
@@ -44,7 +44,9 @@ def test_probes_ask_paths_that_the_service_answers(
         assert container[probe]["httpGet"]["port"] == container["ports"][0]["name"]
 
 
-def test_the_pod_is_as_careful_as_the_image(pod: dict[str, Any], container: dict[str, Any]) -> None:
+def test_pod_is_unprivileged_and_uses_the_images_user(
+    pod: dict[str, Any], container: dict[str, Any]
+) -> None:
     users = re.findall(r"--uid (\d+)", DOCKERFILE)
     assert pod["securityContext"]["runAsUser"] == int(users[0])
     assert pod["securityContext"]["runAsNonRoot"]
@@ -56,7 +58,7 @@ def test_the_pod_is_as_careful_as_the_image(pod: dict[str, Any], container: dict
     assert "token" not in str(container.get("args"))
 
 
-def test_ports_agree() -> None:
+def test_ports_of_image_and_manifests_agree() -> None:
     exposed = re.findall(r"^EXPOSE (\d+)$", DOCKERFILE, flags=re.MULTILINE)
     assert exposed == ["8000"]
     (container,) = manifest("deployment.yaml")["spec"]["template"]["spec"]["containers"]
@@ -68,7 +70,7 @@ def test_ports_agree() -> None:
     assert scraped["static_configs"][0]["targets"] == ["serve:8000"]
 
 
-def test_every_option_that_is_passed_exists(container: dict[str, Any]) -> None:
+def test_every_passed_option_exists(container: dict[str, Any]) -> None:
     shown = CliRunner().invoke(app, ["--help"], env={"COLUMNS": "200"}).output
     compose = yaml.safe_load((DEPLOY / "compose.yaml").read_text())["services"]
     image = re.findall(r'^CMD (\["serve".*\])$', DOCKERFILE, flags=re.MULTILINE)
@@ -80,7 +82,7 @@ def test_every_option_that_is_passed_exists(container: dict[str, Any]) -> None:
             assert re.search(rf"{option}\b", shown), option
 
 
-def test_the_manifests_name_each_other() -> None:
+def test_references_between_manifests_resolve() -> None:
     files = manifest("kustomization.yaml")["resources"]
     assert {path.name for path in (DEPLOY / "kubernetes").iterdir()} == {
         *files,
@@ -96,7 +98,7 @@ def test_the_manifests_name_each_other() -> None:
     assert deployment["spec"]["template"]["spec"]["containers"][0]["image"] == named
 
 
-def test_the_stage_that_serves_has_neither_torch_nor_physics() -> None:
+def test_serving_image_has_neither_torch_nor_simulator() -> None:
     stage = DOCKERFILE.split("FROM base AS serve")[1]
     assert "[" not in stage.split("pip install")[1].split("\n")[0].replace(
         "$(ls /wheels/*.whl)", ""

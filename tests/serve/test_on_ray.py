@@ -1,4 +1,4 @@
-"""The service on Ray Serve: two replicas on this machine, and the names that the two share."""
+"""The service on Ray Serve: two replicas, the application builder, the console script's name."""
 
 import http.client
 import json
@@ -30,7 +30,7 @@ REQUESTS = 40
 
 @contextmanager
 def on_ray(model: Path, token_file: Path, replicas: int) -> Iterator[int]:
-    """The running command, on a Ray of its own; its port."""
+    """The service on its own local Ray cluster; its port."""
     with bind("127.0.0.1", 0) as listener:
         port = listener.getsockname()[1]
     words = ("ray", "--model", str(model), "--port", str(port), "--replicas", str(replicas))
@@ -64,7 +64,7 @@ def on_ray(model: Path, token_file: Path, replicas: int) -> Iterator[int]:
 
 @pytest.mark.slow
 @pytest.mark.alone
-def test_two_replicas_answer_as_the_engine_does(published: Path, tmp_path: Path) -> None:
+def test_answers_of_two_replicas_equal_the_engines(published: Path, tmp_path: Path) -> None:
     pytest.importorskip("ray.serve", reason="no ray[serve]")
     (tmp_path / "token").write_text(TOKEN)
     image = golden_image(280, 210)
@@ -99,7 +99,7 @@ def answered(page: bytes) -> int:
     return int(found[1])
 
 
-def test_the_builder_takes_what_it_knows(published: Path) -> None:
+def test_the_builder_refuses_unknown_options(published: Path) -> None:
     on_ray_module = pytest.importorskip("serve.on_ray", reason="no ray[serve]")
     assert on_ray_module.build({"model": str(published), "replicas": 2}) is not None
     with pytest.raises(UserError, match="unknown argument speed"):
@@ -108,7 +108,7 @@ def test_the_builder_takes_what_it_knows(published: Path) -> None:
         on_ray_module.build({"model": "/none"})
 
 
-def test_without_ray_serve_it_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_error_without_ray_serve_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "serve.on_ray", None)
     done = typed("serve", "ray")
     assert done.returncode == 1
@@ -117,7 +117,7 @@ def test_without_ray_serve_it_is_one_line(monkeypatch: pytest.MonkeyPatch) -> No
     assert "set a token" in typed("serve", "ray", "--host", "0.0.0.0").stderr
 
 
-def test_ray_cannot_take_our_command_away() -> None:
-    """Ray has a console script `serve`, too; who of the two is installed last has the name."""
+def test_driverview_serve_stays_available_beside_rays_serve() -> None:
+    """Ray installs a console script `serve`, too; the package installed last owns that name."""
     scripts = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
     assert scripts["driverview-serve"] == scripts["serve"] == f"{main.__module__}:{main.__name__}"

@@ -1,4 +1,4 @@
-"""The same image gets the same answer from every worker, engine, media type and endpoint."""
+"""Answers for one image are equal across workers, engines, media types and endpoints."""
 
 import base64
 import http.client
@@ -91,7 +91,7 @@ def by_websocket(port: int) -> dict[str, Any]:
 
 
 def as_features(tensors: dict[str, list[float | None]]) -> dict[str, Any]:
-    """Tensors as the members of POST /features."""
+    """Output tensors in the form of an answer of POST /features."""
     stds = ("ml", "mr", "l", "m", "r", "to_lane_centre", "angle")
     spread = dict(zip(stds, tensors["std"], strict=True))
     (out,) = tensors["out_of_distribution"]
@@ -117,7 +117,7 @@ def wait_until_ready(service: Served) -> None:
 
 
 def test_workers_types_and_endpoints_give_the_same_answer(published: Path) -> None:
-    """Two workers on one machine, each on a port of its own: each is asked in every way."""
+    """Two workers, each on its own port, answer alike for every media type and endpoint."""
     memory = create_shared_memory(blocks=2)
     plain, tensors = [], []
     with (
@@ -137,8 +137,8 @@ def test_workers_types_and_endpoints_give_the_same_answer(published: Path) -> No
 
 @pytest.fixture(scope="module")
 def sensitive_model(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An untrained network with larger weights: its outputs change with the image by more than
-    the tolerances, as those of a trained one do."""
+    """An untrained network with enlarged weights: its outputs vary between images by more than
+    the tolerances, as a trained network's do."""
     import torch
 
     from mtlnet.export.publish import publish
@@ -161,7 +161,7 @@ def oracle(sensitive_model: Path) -> Engine:
 
 
 def model_input(image: bytes) -> NDArray[np.uint8]:
-    """The pixels that an engine gets for an image file."""
+    """The pixels of an image file as an engine receives them."""
     camera = CameraParameters()
     return decode(image, inspect(image, camera), camera)
 
@@ -170,7 +170,7 @@ def model_input(image: bytes) -> NDArray[np.uint8]:
 def test_engines_agree_within_the_stated_tolerance(
     sensitive_model: Path, oracle: Engine, precision: Literal["f32", "bf16"]
 ) -> None:
-    """Compared by coded outputs and probabilities, which the answer is decoded from."""
+    """Compares encoded outputs and probabilities, from which the answer is decoded."""
     engine = load_engine(sensitive_model, "openvino", precision)
     assert (engine.kind, engine.precision) == ("openvino", precision)
     image, other = model_input(JPEG), model_input(jpeg(picture()[:, :, ::-1]))

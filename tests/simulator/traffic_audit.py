@@ -35,7 +35,7 @@ class TrafficAudit:
 
 
 class TrafficViolation(Exception):
-    """The traffic broke one of the checked rules."""
+    """A checked rule of the traffic is violated."""
 
 
 def audit_traffic(

@@ -10,12 +10,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from simulator.arrays import FloatArray
 from simulator.camera.bridges import styles as bridge_styles
 from simulator.camera.bridges.styles import BridgeBuilder
 from simulator.camera.scene.road_mesh import Ground
 from simulator.camera.scene.themes import Theme
-
-FloatArray = NDArray[np.float64]
 
 CLEARANCE_M = 5.4
 HEADROOM_M = 2.5

@@ -7,11 +7,9 @@ builds into a `BridgeBuilder`, which holds the dimensions of the site.
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
+from simulator.arrays import FloatArray
 from simulator.camera.scene.solids import BOARD, EARTH, MASONRY, PLAIN, Point, box, face
-
-FloatArray = NDArray[np.float64]
 
 CONCRETE: tuple[Point, ...] = ((0.36, 0.35, 0.33), (0.42, 0.41, 0.38), (0.30, 0.30, 0.30))
 STEEL: tuple[Point, ...] = (

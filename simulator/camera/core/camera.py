@@ -8,6 +8,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from simulator.arrays import FloatArray
 from simulator.camera.core import optics
 from simulator.camera.core.context import FRAME_BINDING, Graphics, graphics
 from simulator.camera.core.render_modes import CLASS, COLOUR, DEPTH, ViewRequest
@@ -22,7 +23,6 @@ from simulator.vehicle.car import CarParameters
 from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
 
-FloatArray = NDArray[np.float64]
 Picture = NDArray[Any]
 
 MAX_SIZE = 4096
@@ -48,12 +48,6 @@ class _LoadedScene:
     precipitation: Precipitation | None
     frame: NDArray[np.float32]
     first_paint: int
-
-    def release(self) -> None:
-        """Free the graphics memory."""
-        for part in (self.scene, self.sky, self.precipitation):
-            if part is not None:
-                part.release()
 
 
 @dataclass(frozen=True)
@@ -108,7 +102,8 @@ class Camera:
         found = self._cache.pop((seed, light), None)
         if found is None:
             while len(self._cache) >= self._cache_size:
-                self._cache.pop(next(iter(self._cache))).release()
+                del self._cache[next(iter(self._cache))]
+            self._graphics.free_unused()
             found = self._load_scene(seed, light)
         # Least recently used first: that one is released next.
         self._cache[seed, light] = self._current = found
@@ -222,9 +217,8 @@ class Camera:
 
     def close(self) -> None:
         """Free the graphics memory; a closed camera cannot render."""
-        for loaded in self._cache.values():
-            loaded.release()
         self._cache, self._current = {}, None
+        self._graphics.free_unused()
 
     def __enter__(self) -> Self:
         return self

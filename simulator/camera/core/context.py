@@ -60,16 +60,10 @@ class Graphics:
 
     def __init__(self) -> None:
         self.context = _create_context()
+        self.context.gc_mode = "context_gc"  # see `free_unused`
         self.programs = {name: self._program(name) for name in PROGRAMS}
-        size = (NOISE_SIZE, NOISE_SIZE)
-        self.noise = self.context.texture(size, 4, noise_tile().tobytes())
-        self.build_mipmaps(self.noise)
-        # The nearest mipmap alone: noise shows no step, and a frame is drawn 1 ms sooner.
-        self.noise.filter = (self.context.LINEAR_MIPMAP_NEAREST, self.context.LINEAR)
-        sheet = foliage.atlas()
-        self.atlas = self.context.texture(sheet.shape[1::-1], 4, sheet.tobytes())
-        self.build_mipmaps(self.atlas)
-        self.atlas.filter = self.noise.filter
+        self.noise = self.texture(noise_tile())
+        self.atlas = self.texture(foliage.atlas())
         self.atlas.repeat_x = self.atlas.repeat_y = False
         self.frame = self.context.buffer(reserve=FRAME_FLOATS * 4, dynamic=True)
         samples = 0 if "llvmpipe" in self.renderer else min(GPU_SAMPLES, self.context.max_samples)
@@ -142,10 +136,20 @@ class Graphics:
                 member.value = UNITS[key]
         return program
 
-    def build_mipmaps(self, texture: "moderngl.Texture") -> None:
-        """Build the texture's mipmaps and let it be filtered through them."""
+    def texture(self, texels: NDArray[np.uint8]) -> "moderngl.Texture":
+        """A texture with mipmaps of `texels`, (rows, columns, components) or (rows, columns)."""
+        components = texels.shape[2] if texels.ndim == 3 else 1
+        texture = self.context.texture(texels.shape[1::-1], components, texels.tobytes())
         texture.build_mipmaps()
-        texture.filter = (self.context.LINEAR_MIPMAP_LINEAR, self.context.LINEAR)
+        # The nearest mipmap alone: noise shows no step, and a frame is drawn 1 ms sooner.
+        texture.filter = (self.context.LINEAR_MIPMAP_NEAREST, self.context.LINEAR)
+        return texture
+
+    def free_unused(self) -> None:
+        """Free the graphics memory of all objects that nothing refers to any more.
+
+        Not when Python drops them: a thread without the context, or a forked child, might."""
+        self.context.gc()
 
 
 _shared: dict[int, Graphics] = {}

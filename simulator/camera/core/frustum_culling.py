@@ -4,9 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runtime.jit import compiled
-
-FloatArray = NDArray[np.float64]
-Fan = NDArray[np.int64]
+from simulator.arrays import FloatArray
 
 
 @compiled
@@ -70,25 +68,6 @@ def visible_spheres(
             found += 1
     order = np.argsort(distance[:found], kind="mergesort")
     return chosen[order[:most]]
-
-
-@compiled
-def triangle_indices(
-    trees: NDArray[np.int64], near: int, corners: int, near_fan: Fan, far_fan: Fan
-) -> NDArray[np.uint32]:
-    """Indices (triangles, 3) of the `trees`, each of `corners` vertices: of the first `near` by
-    `near_fan`, of the others by `far_fan`, both (triangles, 3) of a tree's own vertices."""
-    near_count, far_count = len(near_fan), len(far_fan)
-    far = len(trees) - near
-    indices = np.empty((near * near_count + far * far_count, 3), dtype=np.uint32)
-    row = 0
-    for k in range(len(trees)):
-        fan = near_fan if k < near else far_fan
-        for triangle in fan:
-            for corner in range(3):
-                indices[row, corner] = trees[k] * corners + triangle[corner]
-            row += 1
-    return indices
 
 
 @compiled

@@ -2,18 +2,17 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from simulator.arrays import FloatArray
 from simulator.camera.core.context import Graphics
 from simulator.camera.core.frustum_culling import visible_runs
 
 if TYPE_CHECKING:
     import moderngl
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -27,30 +26,17 @@ class Surface:
 
 @dataclass(frozen=True)
 class Chunks:
-    """Spheres round runs of indices: centres (N, 3), radii (N,), and one row of first index and
-    number of indices a level of detail, (levels, N), the finest first; each up to `reaches` m."""
+    """Runs of indices with their bounding boxes: lowest and highest corners (N, 3), and one row of
+    first index and number of indices a level of detail, (levels, N), the finest first; each up to
+    `reaches` m. They are culled by the spheres round the boxes."""
 
-    centres: FloatArray
-    radii: FloatArray
+    low: FloatArray
+    high: FloatArray
     first: NDArray[np.int64]
     count: NDArray[np.int64]
     reaches: tuple[float, ...]
     nearest: float = 0.0
     """Chunks wholly nearer than this are not drawn; a finer mesh covers them."""
-
-    @classmethod
-    def from_boxes(
-        cls,
-        boxes: tuple[FloatArray, FloatArray],
-        first: NDArray[np.int64],
-        count: NDArray[np.int64],
-        reaches: tuple[float, ...],
-        nearest: float = 0.0,
-    ) -> Self:
-        """Chunks in the spheres round bounding boxes: lowest and highest corners, (N, 3) each."""
-        low, high = boxes
-        radii = np.linalg.norm(high - low, axis=1) / 2.0
-        return cls((low + high) / 2.0, radii, first, count, reaches, nearest)
 
 
 class Mesh:
@@ -64,11 +50,12 @@ class Mesh:
         layout: Sequence[str],
     ) -> None:
         context = graphics.context
-        self._vertices = context.buffer(np.ascontiguousarray(surface.vertices).tobytes())
-        self._indices = context.buffer(np.ascontiguousarray(surface.indices).tobytes())
-        self._arrays = vertex_arrays(graphics, program, self._vertices, self._indices, layout)
+        vertices = context.buffer(np.ascontiguousarray(surface.vertices).tobytes())
+        indices = context.buffer(np.ascontiguousarray(surface.indices).tobytes())
+        self._arrays = vertex_arrays(graphics, program, vertices, indices, layout)
         chunks = surface.chunks
-        self._spheres = np.column_stack([chunks.centres, chunks.radii])
+        radii = np.linalg.norm(chunks.high - chunks.low, axis=1) / 2.0
+        self._spheres = np.column_stack([(chunks.low + chunks.high) / 2.0, radii])
         self._levels = chunks.first, chunks.count, np.array(chunks.reaches), chunks.nearest
         self._runs = np.empty((len(self._spheres), 2), dtype=np.int64)
 
@@ -83,13 +70,6 @@ class Mesh:
         array = self._arrays[labels]
         for first, count in runs:
             array.render(vertices=count, first=first)
-
-    def release(self) -> None:
-        """Free the graphics memory."""
-        for array in self._arrays:
-            array.release()
-        self._indices.release()
-        self._vertices.release()
 
 
 def vertex_arrays(

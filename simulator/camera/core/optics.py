@@ -10,13 +10,12 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from runtime.jit import compiled
+from simulator.arrays import FloatArray
 from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
-
-FloatArray = NDArray[np.float64]
 
 VIEWS: tuple[str, ...] = ("front", "left", "right", "rear", "chase", "top")
 """`front` is the driver view; `chase` looks from behind and above, `top` straight down."""

@@ -52,15 +52,6 @@ class Target:
         self.resolved.read_into(read, components=2, dtype="f4")
         return read
 
-    def release(self) -> None:
-        """Free the graphics memory."""
-        for framebuffer in (self.drawn, self.resolved):
-            for attachment in framebuffer.color_attachments:
-                attachment.release()
-            if framebuffer.depth_attachment is not None:
-                framebuffer.depth_attachment.release()
-            framebuffer.release()
-
 
 class Targets:
     """The targets of a context by size; a limited number is kept."""
@@ -74,7 +65,8 @@ class Targets:
         key = (width, height, labels)
         if key not in self._kept:
             if len(self._kept) >= _KEPT:
-                self._kept.pop(next(iter(self._kept))).release()
+                del self._kept[next(iter(self._kept))]
+                self._context.gc()
             self._kept[key] = self._make(*key)
         return self._kept[key]
 

@@ -6,24 +6,25 @@ World frame, metres. Their collision shapes are in `simulator.world.walls`.
 import numpy as np
 from numpy.typing import NDArray
 
+from simulator.arrays import FloatArray
 from simulator.camera.core.mesh import Surface
 from simulator.camera.scene.road_mesh import RoadMesh
 from simulator.camera.scene.strips import Level, strip
 from simulator.camera.scene.themes import Theme
 from simulator.track.road import Road
 
-FloatArray = NDArray[np.float64]
-
 KINDS: tuple[str, ...] = ("rail", "wall", "hedge", "fence", "stones", "tyres")
 """In the order in which barrier.frag.glsl numbers them."""
 HEIGHT_M = np.array([0.8, 0.9, 1.25, 1.05, 0.75, 0.95])
 THICK_M = np.array([0.06, 0.25, 0.9, 0.06, 0.5, 0.7])
 SECTION_M = (90.0, 420.0)
+LAYOUT = ("3f 2f 1f 3f", "at", "along", "kind", "facing")
+"""Of a vertex: x, y, z, s, height, kind, normal (3)."""
 LEVELS = (Level(35.0, 0.005, 16.0), Level(120.0, 0.03, 32.0), Level(300.0, 0.1, 64.0))
 
 
 def build(road: Road, mesh: RoadMesh, theme: Theme, rng: np.random.Generator) -> Surface:
-    """Both sides' barriers; a vertex is x, y, z, s, height, kind, normal (3)."""
+    """Both sides' barriers."""
     grids, profiles = [], []
     for side, column in zip((1.0, -1.0), mesh.wall, strict=True):
         kind = _sections(mesh.s, road.track.length_m, theme, rng)

@@ -6,18 +6,19 @@ is a position, a normal and a colour; the colour (-1, -1, -1) stands for the pai
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import pairwise
-from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
 
+from simulator.arrays import FloatArray
 from simulator.camera.core.context import Graphics
 from simulator.camera.core.mesh import vertex_arrays
 from simulator.camera.core.optics import rotation
 from simulator.camera.scene.light import Light
+from simulator.camera.scene.solids import PLAIN, face
 
-FloatArray = NDArray[np.float64]
 Point = tuple[float, float, float]
 
 LENGTH_M, WIDTH_M, HEIGHT_M = 4.4, 1.8, 1.4
@@ -39,6 +40,14 @@ _TAIL, _HEAD, _PLATE, _DARK = (0.5, 0.01, 0.01), (0.85, 0.85, 0.78), (0.7, 0.7, 
 _BODY = ((-2.2, 0.42, 0.78), (-2.18, 0.92, 0.82), (-1.35, 0.98, 0.9), (0.75, 0.94, 0.9),
          (1.9, 0.74, 0.84), (2.2, 0.55, 0.74), (2.2, 0.3, 0.74))  # fmt: skip
 _CABIN = ((-1.75, 0.95, 0.78), (-1.05, 1.38, 0.62), (0.05, 1.4, 0.62), (0.95, 0.92, 0.78))
+# Lights, number plate and bumpers: x, y and z from and to, colour.
+_REAR_X, _FRONT_X = -2.225, 2.225
+_PANELS = (
+    (_REAR_X, 0.78, 0.48, 0.66, 0.84, _TAIL), (_FRONT_X, 0.78, 0.48, 0.5, 0.62, _HEAD),
+    (_REAR_X, -0.48, -0.78, 0.66, 0.84, _TAIL), (_FRONT_X, -0.48, -0.78, 0.5, 0.62, _HEAD),
+    (_REAR_X, 0.26, -0.26, 0.62, 0.73, _PLATE), (_REAR_X, 0.78, -0.78, 0.19, 0.42, _DARK),
+    (_FRONT_X, 0.6, -0.6, 0.3, 0.44, _DARK),
+)  # fmt: skip
 _WHEELS_X, _WHEEL_RADIUS = (-1.35, 1.32), 0.33
 
 
@@ -65,18 +74,9 @@ def car_mesh() -> CarMesh:
 
 
 def _face(points: Sequence[Point], colour: Point) -> FloatArray:
-    """Two triangles; the normal points to where the four corners run counter-clockwise."""
-    corners = np.array(points)
-    normal = np.cross(corners[1] - corners[0], corners[2] - corners[0])
-    size = np.linalg.norm(normal)
-    if size < 1e-9:
-        normal = np.cross(corners[2] - corners[0], corners[3] - corners[0])
-        size = np.linalg.norm(normal)
-    rows = np.empty((6, 9))
-    rows[:, :3] = corners[[0, 1, 2, 0, 2, 3]]
-    rows[:, 3:6] = normal / max(float(size), 1e-9)
-    rows[:, 6:] = colour
-    return rows
+    """Two triangles (6, 9); the normal points to where the four corners run counter-clockwise."""
+    corners = [np.array(point) for point in points]
+    return face(corners, [(0.0, 0.0)] * 4, colour, PLAIN)[:, :9]
 
 
 def _hull(outline: tuple[Point, ...], floor: float, top: Point, flank: Point) -> list[FloatArray]:
@@ -158,23 +158,10 @@ def _far_wheel(x: float, side: float) -> list[FloatArray]:
 def _fittings() -> list[FloatArray]:
     """Lights, number plates and bumpers, 2.5 cm off the body."""
     parts = []
-    for y0, y1 in ((0.78, 0.48), (-0.48, -0.78)):
-        parts.append(_rear_panel(y0, y1, 0.66, 0.84, _TAIL))
-        parts.append(_front_panel(y0, y1, 0.5, 0.62, _HEAD))
-    parts.append(_rear_panel(0.26, -0.26, 0.62, 0.73, _PLATE))
-    parts.append(_rear_panel(0.78, -0.78, 0.19, 0.42, _DARK))
-    parts.append(_front_panel(0.6, -0.6, 0.3, 0.44, _DARK))
+    for x, y0, y1, z0, z1, colour in _PANELS:
+        corners = [(x, y0, z0), (x, y1, z0), (x, y1, z1), (x, y0, z1)]
+        parts.append(_face(corners if x < 0.0 else corners[::-1], colour))
     return parts
-
-
-def _rear_panel(y0: float, y1: float, z0: float, z1: float, colour: Point) -> FloatArray:
-    x = -2.225
-    return _face([(x, y0, z0), (x, y1, z0), (x, y1, z1), (x, y0, z1)], colour)
-
-
-def _front_panel(y0: float, y1: float, z0: float, z1: float, colour: Point) -> FloatArray:
-    x = 2.225
-    return _face([(x, y0, z1), (x, y1, z1), (x, y1, z0), (x, y0, z0)], colour)
 
 
 class Cars:
@@ -234,14 +221,10 @@ class Cars:
             self._patch.render(self._context.TRIANGLE_STRIP)
 
 
+@lru_cache(maxsize=1)
 def shared_cars(graphics: Graphics) -> Cars:
     """The cars of this graphics, made on first use."""
-    if graphics not in _made:
-        _made[graphics] = Cars(graphics)
-    return _made[graphics]
-
-
-_made: WeakKeyDictionary[Graphics, Cars] = WeakKeyDictionary()
+    return Cars(graphics)
 
 
 def _model_matrix(pose: FloatArray, eye: FloatArray) -> NDArray[np.float32]:

@@ -7,13 +7,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from simulator.arrays import FloatArray
 from simulator.camera.core.mesh import Chunks, Surface
 from simulator.camera.scene.light import Light
 from simulator.camera.scene.terrain import CentreLine, Terrain, between
 from simulator.camera.vegetation.scenery import Trees
 
-FloatArray = NDArray[np.float64]
-
+LAYOUT = ("3f 3f 1f", "at", "facing", "sunlit")
+"""Of a vertex: x, y, z, normal (3), share of sunlight."""
 BLOCK = 4
 """A chunk is BLOCK x BLOCK cells."""
 SMOOTH_M = 9.0
@@ -39,22 +40,18 @@ class TreeShade:
         sx, sy, sz = light.sun_direction
         run = np.minimum(trees.height * np.hypot(sx, sy) / max(sz, 0.1), 40.0)
         area = 0.6 * trees.width * np.maximum(run, trees.width)
-        i = np.rint((trees.feet[:, 0] - 0.5 * run * sx - terrain.x0) / terrain.cell).astype(np.intp)
-        j = np.rint((trees.feet[:, 1] - 0.5 * run * sy - terrain.y0) / terrain.cell).astype(np.intp)
-        inside = (i >= 0) & (j >= 0) & (i < shade.shape[1]) & (j < shade.shape[0])
-        np.add.at(shade, (j[inside], i[inside]), area[inside] / terrain.cell**2)
-        shade = np.asarray(cv2.GaussianBlur(shade, (0, 0), SMOOTH_M / terrain.cell), np.float64)
+        grid, feet = terrain.grid, trees.feet
+        i, j, inside = grid.nearest(feet[:, 0] - 0.5 * run * sx, feet[:, 1] - 0.5 * run * sy)
+        np.add.at(shade, (j[inside], i[inside]), area[inside] / grid.cell**2)
+        shade = np.asarray(cv2.GaussianBlur(shade, (0, 0), SMOOTH_M / grid.cell), np.float64)
         if light.canopy:
-            x = terrain.x0 + terrain.cell * np.arange(shade.shape[1])
-            y = terrain.y0 + terrain.cell * np.arange(shade.shape[0])
-            near = line.distance(*np.meshgrid(x, y))
+            near = line.distance(*np.meshgrid(*grid.axes))
             shade = np.maximum(shade, CANOPY * np.clip(1.5 - near / CANOPY_M, 0.0, 1.0))
         return cls(terrain, MOST_SHADE * (1.0 - np.exp(-shade / MOST_SHADE)))
 
     def at(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """The shade at places, from the nearest grid point."""
-        i = np.rint((x - self.terrain.x0) / self.terrain.cell).astype(np.intp)
-        j = np.rint((y - self.terrain.y0) / self.terrain.cell).astype(np.intp)
+        i, j, _ = self.terrain.grid.nearest(x, y)
         rows, columns = self.shade.shape
         return np.asarray(self.shade[np.clip(j, 0, rows - 1), np.clip(i, 0, columns - 1)])
 
@@ -73,15 +70,15 @@ class Span:
 def surface(land: TreeShade, hidden: NDArray[np.bool_], span: Span) -> Surface:
     """The terrain at one level of detail, nowhere above the finest one.
 
-    A vertex is x, y, z, normal (3), share of sunlight. `hidden` (rows, columns) marks the points of
-    the finest grid that the road mesh covers.
+    `hidden` (rows, columns) marks the points of the finest grid that the road mesh covers.
     """
     terrain, every = land.terrain, (slice(None, None, span.step),) * 2
     z, normals = lowered(terrain.z, span.step), terrain.normals()[every]
     rows, columns = z.shape
     vertices = np.empty((rows, columns, 7), dtype=np.float32)
-    vertices[..., 0] = terrain.x0 + terrain.cell * span.step * np.arange(columns)
-    vertices[..., 1] = (terrain.y0 + terrain.cell * span.step * np.arange(rows))[:, None]
+    grid = terrain.grid
+    vertices[..., 0] = grid.x0 + grid.cell * span.step * np.arange(columns)
+    vertices[..., 1] = (grid.y0 + grid.cell * span.step * np.arange(rows))[:, None]
     vertices[..., 2] = z
     vertices[..., 3:6] = normals
     vertices[..., 6] = 0.9 * (1.0 - land.shade[every])
@@ -118,8 +115,9 @@ def _in_chunks(vertices: NDArray[np.float32], shown: NDArray[np.bool_], span: Sp
     places = vertices.reshape(-1, 7)[:, :3].astype(np.float64)[indices]
     low = np.minimum.reduceat(places.min(axis=1), first, axis=0)
     high = np.maximum.reduceat(places.max(axis=1), first, axis=0)
-    chunks = Chunks.from_boxes(
-        (low, high),
+    chunks = Chunks(
+        low,
+        high,
         6 * first[None].astype(np.int64),
         6 * cells[None].astype(np.int64),
         (span.reach_m,),

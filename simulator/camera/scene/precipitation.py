@@ -50,11 +50,9 @@ class Precipitation:
         self._count = count * 6
         wind = rng.normal(0.0, 1.2, 2)
         self._velocity = np.array([wind[0], wind[1], -self._drops.speed])
-        self._buffer = graphics.context.buffer(vertices.tobytes())
+        drops = graphics.context.buffer(vertices.tobytes())
         program = graphics.programs["precipitation"]
-        self._array = graphics.context.vertex_array(
-            program, [(self._buffer, "4f 2f", "at", "corner")]
-        )
+        self._array = graphics.context.vertex_array(program, [(drops, "4f 2f", "at", "corner")])
         self._uniforms = {
             name: graphics.uniform("precipitation", name) for name in ("shift", "streak", "shape")
         }
@@ -70,11 +68,6 @@ class Precipitation:
         self._uniforms["streak"].value = (*streak.tolist(), drops.box_m)
         self._uniforms["shape"].value = (drops.width_m, 0.8 / focal_px, drops.alpha)
         self._array.render(vertices=self._count)
-
-    def release(self) -> None:
-        """Free the graphics memory."""
-        self._array.release()
-        self._buffer.release()
 
 
 def _fall_phase(place: NDArray[np.float64]) -> float:

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from simulator.arrays import FloatArray
 from simulator.camera.bridges.bridges import KEEP_FREE_M, Bridge, free_of
 from simulator.camera.core.mesh import Chunks, Surface
 from simulator.camera.scene.road_mesh import Ground
@@ -27,8 +28,8 @@ from simulator.camera.scene.solids import (
 from simulator.camera.scene.themes import Theme
 from simulator.camera.vegetation.scenery import DRY_M
 
-FloatArray = NDArray[np.float64]
-
+LAYOUT = ("3f 3f 3f 2f", "at", "facing", "colour", "face")
+"""Of a vertex: that of `solids` without the material."""
 CHUNK_M, REACH_M = 50.0, 350.0
 SMALL_M2, SMALL_REACH_M = 14.0, 130.0
 """Props of less area (posts, lamps, signs) are drawn up to this distance: farther off they
@@ -191,8 +192,7 @@ class _Placer:
 def build(
     ground: Ground, theme: Theme, bridges: Sequence[Bridge], rng: np.random.Generator
 ) -> dict[str, Surface]:
-    """All props and bridges of a scene by material; a vertex is that of `solids` without the
-    material."""
+    """All props and bridges of a scene by material."""
     placer = _Placer(ground, bridges)
     for bridge in bridges:
         placer.add_placed(bridge.s, bridge.triangles)
@@ -253,8 +253,9 @@ def _surface(parts: list[FloatArray], s: FloatArray, small: NDArray[np.bool_]) -
     )
     low = np.minimum.reduceat(vertices[:, :3], first, axis=0)
     high = np.maximum.reduceat(vertices[:, :3], first, axis=0)
-    chunks = Chunks.from_boxes(
-        (low, high),
+    chunks = Chunks(
+        low,
+        high,
         np.stack([first, first]).astype(np.int64),
         count.astype(np.int64),
         (SMALL_REACH_M, REACH_M),

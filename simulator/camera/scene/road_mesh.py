@@ -11,13 +11,14 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
+from simulator.arrays import FloatArray
 from simulator.camera.core.mesh import Surface
 from simulator.camera.scene.strips import LEVELS, Level, strip
 from simulator.camera.scene.terrain import CentreLine, Survey, Terrain
 from simulator.track.road import Road
 
-FloatArray = NDArray[np.float64]
-
+LAYOUT = ("3f 2f 3f 1f", "at", "road", "facing", "kerbed")
+"""Of a vertex: x, y, z, s, y, normal (3), kerb."""
 SAGITTA_M = 0.0025
 LONGEST_ROW_M = 4.0
 TWIST_M = 0.004
@@ -122,8 +123,8 @@ def covers(mesh: RoadMesh, survey: Survey, margin_m: float) -> NDArray[np.bool_]
     return np.asarray(survey.near < np.minimum(reach[row - 1], reach[row]) - margin_m)
 
 
-def surfaces(mesh: RoadMesh, road: Road) -> tuple[Surface, Surface]:
-    """Surfaces of the asphalt and the verges; a vertex is x, y, z, s, y, normal (3), kerb."""
+def surfaces(mesh: RoadMesh, road: Road) -> dict[str, Surface]:
+    """Surfaces of the asphalt and, after it, the verges, by the names of their programs."""
     rows, columns = mesh.y.shape
     vertices = np.empty((rows, columns, 9), dtype=np.float32)
     vertices[..., 0:3] = mesh.points
@@ -140,7 +141,7 @@ def surfaces(mesh: RoadMesh, road: Road) -> tuple[Surface, Surface]:
     profile = np.column_stack([places, KERB_WEIGHT * kerb])
     cells = [(*_LEFT, *_RIGHT), _FAR, _FAR]
     beside = strip(_lapped(vertices), mesh.points, mesh.s, profile, cells, VERGE)
-    return asphalt, beside
+    return {"paved": asphalt, "verge": beside}
 
 
 def _lapped(vertices: NDArray[np.float32]) -> NDArray[np.float32]:

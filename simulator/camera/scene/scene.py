@@ -1,10 +1,12 @@
 """The static scene of one round: road, terrain, bridges, trees, props, and their colours."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from simulator.arrays import FloatArray
 from simulator.camera.bridges import bridges
 from simulator.camera.core.context import SCENE_BINDING, SHADOW_UNIT, Graphics
 from simulator.camera.core.mesh import Mesh, Surface
@@ -17,8 +19,6 @@ from simulator.camera.scene.themes import Colour, Theme, find_theme
 from simulator.camera.vegetation import scenery
 from simulator.camera.vegetation.trees import TreeMesh, VisibleTrees
 from simulator.track.road import Road
-
-FloatArray = NDArray[np.float64]
 
 LAND = (
     land.Span(1, 0.0, 40.0, bare=False),
@@ -59,23 +59,22 @@ class Scene:
         covered = road_mesh.covers(ground.mesh, survey, margin_m=2.0)
         self.mask = shadow_mask.build(road, trees, scene_bridges, tree_shade, light, rng(4))
         self._trees = TreeMesh(graphics, trees, light.weather)
-        self._barriers = Mesh(
-            graphics,
-            graphics.weather_program("barrier", light.weather),
-            rails,
-            ("3f 2f 1f 3f", "at", "along", "kind", "facing"),
-        )
+
+        def mesh(program: str, surface: Surface, layout: Sequence[str], *features: str) -> Mesh:
+            variant = graphics.weather_program(program, light.weather, *features)
+            return Mesh(graphics, variant, surface, layout)
+
+        surfaces = road_mesh.surfaces(ground.mesh, road)
+        lands = [land.surface(tree_shade, covered, span) for span in LAND]
+        self._barriers = mesh("barrier", rails, barriers.LAYOUT)
         self._solid = (
-            *_road_meshes(graphics, road_mesh.surfaces(ground.mesh, road), light.weather),
-            *_prop_meshes(graphics, built, light.weather),
-            *_land_meshes(graphics, tree_shade, covered, light.weather, theme.sea),
+            *(mesh(program, each, road_mesh.LAYOUT) for program, each in surfaces.items()),
+            *(mesh("prop", each, props.LAYOUT, name) for name, each in built.items()),
+            *(mesh("land", each, land.LAYOUT, *(["sea"] if theme.sea else [])) for each in lands),
         )
         palette = scene_block(road, theme, rng(2), self.mask, terrain.sea)
         self._block = graphics.context.buffer(palette.tobytes())
-        texels = self.mask.texels
-        self._shadow_texture = graphics.context.texture(texels.shape[::-1], 1, texels.tobytes())
-        graphics.build_mipmaps(self._shadow_texture)
-        self._shadow_texture.filter = graphics.noise.filter
+        self._shadow_texture = graphics.texture(self.mask.texels)
 
     def visible(self, eye: Eye, planes: FloatArray) -> VisibleScene:
         """Frustum culling: what is visible from `eye` within the side planes `planes` (4, 3)."""
@@ -99,47 +98,6 @@ class Scene:
         """Draw the transparent parts; call it after all opaque ones."""
         self._barriers.draw(seen.barriers, labels=False)
         self._trees.draw(seen.trees, "fringe")
-
-    def release(self) -> None:
-        """Free the graphics memory."""
-        for mesh in (*self._solid, self._barriers):
-            mesh.release()
-        self._trees.release()
-        self._block.release()
-        self._shadow_texture.release()
-
-
-def _road_meshes(graphics: Graphics, surfaces: tuple[Surface, Surface], weather: str) -> list[Mesh]:
-    """The asphalt, then the verges beside it."""
-    layout = ("3f 2f 3f 1f", "at", "road", "facing", "kerbed")
-    return [
-        Mesh(graphics, graphics.weather_program(program, weather), surface, layout)
-        for program, surface in zip(("paved", "verge"), surfaces, strict=True)
-    ]
-
-
-def _prop_meshes(graphics: Graphics, props: dict[str, Surface], weather: str) -> list[Mesh]:
-    """Props and bridges, one mesh for each material."""
-    layout = ("3f 3f 3f 2f", "at", "facing", "colour", "face")
-    return [
-        Mesh(graphics, graphics.weather_program("prop", weather, material), surface, layout)
-        for material, surface in props.items()
-    ]
-
-
-def _land_meshes(
-    graphics: Graphics,
-    tree_shade: land.TreeShade,
-    covered: NDArray[np.bool_],
-    weather: str,
-    sea: bool,
-) -> list[Mesh]:
-    """The terrain, one mesh for each range of distance."""
-    program = graphics.weather_program("land", weather, *(["sea"] if sea else []))
-    layout = ("3f 3f 1f", "at", "facing", "sunlit")
-    return [
-        Mesh(graphics, program, land.surface(tree_shade, covered, span), layout) for span in LAND
-    ]
 
 
 def scene_block(

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runtime.jit import compiled
+from simulator.arrays import FloatArray
 from simulator.camera.bridges.bridges import Bridge
 from simulator.camera.scene.land import TreeShade
 from simulator.camera.scene.light import Light
@@ -20,7 +21,6 @@ from simulator.camera.vegetation import foliage
 from simulator.camera.vegetation.scenery import Trees
 from simulator.track.road import Road
 
-FloatArray = NDArray[np.float64]
 Strip = NDArray[np.uint8]
 """An unfolded mask: (rows, columns), from right to left and once round the track."""
 
@@ -87,9 +87,9 @@ def build(
     strip: Strip = np.zeros((rows, columns), dtype=np.uint8)
     along_m = road.track.length_m / columns
     if light.shade < 0.5:
-        cast_bridges(strip, road, along_m, TEXEL_M, bridges, light)
+        cast_bridges(strip, road, along_m, bridges, light)
         if light.canopy:
-            strip = _with_canopy(strip, road, along_m, TEXEL_M, rng)
+            strip = _with_canopy(strip, road, along_m, rng)
         else:
             _cast_trees(strip, road, along_m, trees, light)
         _run_out(strip, road, along_m, land)
@@ -169,9 +169,7 @@ def _stamp(
     strip[low[1] : high[1], columns] = np.maximum(part, cast)
 
 
-def _with_canopy(
-    bridged: Strip, road: Road, along_m: float, texel_m: float, rng: np.random.Generator
-) -> Strip:
+def _with_canopy(bridged: Strip, road: Road, along_m: float, rng: np.random.Generator) -> Strip:
     """The mask `bridged` (rows, columns) of bridge shadows with a canopy added.
 
     A noise field is thresholded, at a level found for each WINDOW_M, so that the covered share of
@@ -179,8 +177,8 @@ def _with_canopy(
     Over any 30 m the share lies between 0.3 and 0.8.
     """
     rows, columns = bridged.shape
-    field = _blobs(rows, columns, along_m, texel_m, rng)
-    half = round(road.half_asphalt / texel_m)
+    field = _blobs(rows, columns, along_m, rng)
+    half = round(road.half_asphalt / TEXEL_M)
     asphalt = slice(rows // 2 - half, rows // 2 + half)
     count = max(3, columns // max(1, round(WINDOW_M / along_m)))
     centres = (np.arange(count) + 0.5) * columns / count
@@ -194,7 +192,7 @@ def _with_canopy(
         rest = np.clip((share - left) / max(1.0 - left, 1e-6), 0.02, 1.0)
         part = field[asphalt, a:b]
         level.append(float(np.quantile(part[sunny] if sunny.any() else part, 1.0 - rest)))
-    y = (np.arange(rows) + 0.5 - rows / 2) * texel_m
+    y = (np.arange(rows) + 0.5 - rows / 2) * TEXEL_M
     ends = 2.6 * np.clip((np.abs(y) - road.wall_offset + 1.0) / THINS_OUT_M, 0.0, 1.0)
     field -= ends[:, None].astype(np.float32)
     cut = np.interp(np.arange(columns), centres, level, period=columns).astype(np.float32)
@@ -203,7 +201,7 @@ def _with_canopy(
 
 
 def _blobs(
-    rows: int, columns: int, along_m: float, texel_m: float, rng: np.random.Generator
+    rows: int, columns: int, along_m: float, rng: np.random.Generator
 ) -> NDArray[np.float32]:
     """A field of leaf clumps and boughs (rows, columns), standard deviation 1."""
     field = np.zeros((rows, columns), dtype=np.float32)
@@ -211,7 +209,7 @@ def _blobs(
     for size_m, weight, coarse in ((3.2, 1.0, 4), (1.3, 0.55, 2), (0.55, 0.3, 1)):
         noise = rng.standard_normal((-(-rows // coarse), -(-columns // coarse)), dtype=np.float32)
         smooth = cv2.GaussianBlur(
-            noise, (0, 0), size_m / 2.0 / along_m / coarse, sigmaY=size_m / 2.4 / texel_m / coarse,
+            noise, (0, 0), size_m / 2.0 / along_m / coarse, sigmaY=size_m / 2.4 / TEXEL_M / coarse,
             borderType=cv2.BORDER_REFLECT,
         )  # fmt: skip
         smooth = cv2.resize(smooth, (columns, rows), interpolation=cv2.INTER_LINEAR)
@@ -223,7 +221,6 @@ def cast_bridges(
     strip: Strip,
     road: Road,
     along_m: float,
-    texel_m: float,
     bridges: Sequence[Bridge],
     light: Light,
 ) -> None:
@@ -235,7 +232,7 @@ def cast_bridges(
         bend = 1.0 / max(0.5, 1.0 - abs(road.track.curvature(bridge.s)) * road.wall_offset)
         first = int((bridge.s + max(low * bend, -FARTHEST_M)) / along_m) - 8
         last = int((bridge.s + min(high * bend, FARTHEST_M)) / along_m) + 9
-        dark = _darkened(bridge, road, along_m, texel_m, (first, last), strip.shape[0], sun)
+        dark = _darkened(bridge, road, along_m, (first, last), strip.shape[0], sun)
         columns = np.arange(first, last) % strip.shape[1]
         strip[:, columns] = np.maximum(strip[:, columns], dark)
 
@@ -253,7 +250,6 @@ def _darkened(
     bridge: Bridge,
     road: Road,
     along_m: float,
-    texel_m: float,
     columns: tuple[int, int],
     rows: int,
     sun: FloatArray,
@@ -261,7 +257,7 @@ def _darkened(
     """The shadow on texels (rows, columns) of the unfolded mask; columns may pass its ends."""
     first, last = columns
     s = (first + (np.arange((last - first) * FINE) + 0.5) / FINE) * along_m
-    y = ((np.arange(rows * FINE) + 0.5) / FINE - rows / 2) * texel_m
+    y = ((np.arange(rows * FINE) + 0.5) / FINE - rows / 2) * TEXEL_M
     pose = road.track.at(s[None, :] % road.track.length_m, y[:, None])
     own = bridge.inside(np.stack(np.broadcast_arrays(pose.x, pose.y, pose.z), axis=-1))
     slope = np.where(np.abs(sun) > 1e-6, sun, 1e-6)

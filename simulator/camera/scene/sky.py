@@ -28,28 +28,19 @@ class Sky:
         self._texture = context.texture(_panorama_size(focal_px), 4)
         self._texture.filter = (context.LINEAR, context.LINEAR)
         self._texture.repeat_y = False
-        self._buffer = context.buffer(_dome().tobytes())
-        layout = (self._buffer, "3f 2f", "direction", "place")
+        layout = (context.buffer(_dome().tobytes()), "3f 2f", "direction", "place")
         self._array = context.vertex_array(graphics.programs["dome"], [layout])
         program = graphics.programs[graphics.weather_program("sky", weather)]
         panorama = context.framebuffer([self._texture])
-        painter = context.vertex_array(program, [layout])
         panorama.use()
         context.enable_only(context.NOTHING)
         graphics.use_textures()
-        painter.render()
-        painter.release()
-        panorama.release()
+        context.vertex_array(program, [layout]).render()
 
     def draw(self) -> None:
         """Draw the sky where no geometry covers it."""
         self._texture.use(SKY_UNIT)
         self._array.render()
-
-    def release(self) -> None:
-        """Free the graphics memory."""
-        for thing in (self._array, self._buffer, self._texture):
-            thing.release()
 
 
 def _panorama_size(focal_px: float) -> tuple[int, int]:

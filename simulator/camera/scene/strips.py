@@ -10,9 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from simulator.arrays import FloatArray
 from simulator.camera.core.mesh import Chunks, Surface
-
-FloatArray = NDArray[np.float64]
 
 CHUNK_ROWS = 16
 _STEPS = (16, 8, 4, 2, 1)
@@ -70,7 +69,7 @@ def strip(
     return Surface(
         np.ascontiguousarray(vertices.reshape(rows * columns, -1)),
         np.concatenate(indices),
-        Chunks.from_boxes((low, high), first, count, tuple(level.reach_m for level in levels)),
+        Chunks(low, high, first, count, tuple(level.reach_m for level in levels)),
     )
 
 

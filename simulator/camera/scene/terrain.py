@@ -11,13 +11,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from simulator.arrays import FloatArray
 from simulator.camera.scene.themes import Theme
 from simulator.track.road import Road
 
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
 
-FloatArray = NDArray[np.float64]
 
 CELL_M = 8.0
 COARSEST = 8
@@ -64,18 +64,41 @@ class CentreLine:
 
 
 @dataclass(frozen=True)
-class Survey:
-    """What the terrain takes from the road alone; it is computed once for all scenes of a road.
+class Grid:
+    """A square grid from (x0, y0), `cell` m apart: `shape` is (rows along y, columns along x)."""
 
-    A grid (rows y, columns x) from (x0, y0). For each point: the greatest height that keeps the
-    road clear, the interpolated height of the road, the distance to the road and the index of the
-    nearest sample of its centre line.
-    """
-
-    line: CentreLine
     x0: float
     y0: float
     cell: float
+    shape: tuple[int, int]
+
+    @property
+    def axes(self) -> tuple[FloatArray, FloatArray]:
+        """x of the columns and y of the rows."""
+        rows, columns = self.shape
+        x, y = np.arange(columns, dtype=np.float64), np.arange(rows, dtype=np.float64)
+        return self.x0 + self.cell * x, self.y0 + self.cell * y
+
+    def nearest(
+        self, x: FloatArray, y: FloatArray
+    ) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.bool_]]:
+        """Column and row nearest to places, and whether the grid has them."""
+        i = np.rint((x - self.x0) / self.cell).astype(np.intp)
+        j = np.rint((y - self.y0) / self.cell).astype(np.intp)
+        return i, j, (i >= 0) & (j >= 0) & (i < self.shape[1]) & (j < self.shape[0])
+
+
+@dataclass(frozen=True)
+class Survey:
+    """What the terrain takes from the road alone; it is computed once for all scenes of a road.
+
+    For each point of the grid: the greatest height that keeps the road clear, the interpolated
+    height of the road, the distance to the road and the index of the nearest sample of its centre
+    line.
+    """
+
+    line: CentreLine
+    grid: Grid
     cap: FloatArray
     base: FloatArray
     near: FloatArray
@@ -90,30 +113,27 @@ class Survey:
         x0, y0 = line.x.min() - MARGIN_M, line.y.min() - MARGIN_M
         columns = COARSEST * int(np.ceil((np.ptp(line.x) + 2 * MARGIN_M) / cell / COARSEST)) + 1
         rows = COARSEST * int(np.ceil((np.ptp(line.y) + 2 * MARGIN_M) / cell / COARSEST)) + 1
-        shape = (rows, columns)
-        cap = _road_cap(road, line, x0, y0, cell, shape)
-        spread = _spread(road, line, x0, y0, cell, shape)
-        return cls(line, float(x0), float(y0), float(cell), cap, *spread)
+        grid = Grid(float(x0), float(y0), float(cell), (rows, columns))
+        return cls(line, grid, _road_cap(road, line, grid), *_spread(road, line, grid))
 
 
 @dataclass(frozen=True)
 class Terrain:
-    """Heights `z` (rows y, columns x) on a square grid from (x0, y0)."""
+    """Heights `z` (rows y, columns x) on a grid."""
 
-    x0: float
-    y0: float
-    cell: float
+    grid: Grid
     z: FloatArray
     sea: float = -np.inf
     """Level of the sea, where there is one."""
 
     def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """Height at points, interpolated on the triangles that are drawn."""
-        return between(self.z, (x - self.x0) / self.cell, (y - self.y0) / self.cell)
+        grid = self.grid
+        return between(self.z, (x - grid.x0) / grid.cell, (y - grid.y0) / grid.cell)
 
     def normals(self) -> FloatArray:
         """Unit normals (rows, columns, 3)."""
-        slope_y, slope_x = np.gradient(self.z, self.cell)
+        slope_y, slope_x = np.gradient(self.z, self.grid.cell)
         normal = np.stack([-slope_x, -slope_y, np.ones_like(self.z)], axis=-1)
         return np.asarray(normal / np.linalg.norm(normal, axis=-1, keepdims=True))
 
@@ -134,35 +154,30 @@ def between(z: FloatArray, u: FloatArray, v: FloatArray) -> FloatArray:
 
 def build(road: Road, survey: Survey, theme: Theme, rng: np.random.Generator) -> Terrain:
     """The terrain round `road` in the style of `theme`."""
-    line, near, base = survey.line, survey.near, survey.base
-    x0, y0, cell, shape = survey.x0, survey.y0, survey.cell, survey.near.shape
-    rolling = _rolling(shape, cell, rng) * theme.hills_m
+    line, grid, near, base = survey.line, survey.grid, survey.near, survey.base
+    rolling = _rolling(grid, rng) * theme.hills_m
     away = np.clip((near - road.wall_offset - 5.0) / 110.0, 0.0, 1.0)
     natural = base + rolling * away * away * (3.0 - 2.0 * away)
     if not theme.sea:
-        return Terrain(x0, y0, cell, np.minimum(natural, survey.cap))
+        return Terrain(grid, np.minimum(natural, survey.cap))
     sea = float(road.track.at(line.s).z.min()) - SEA_BELOW_M
     fall = np.clip((near - road.wall_offset - SHORE_M[0]) / (SHORE_M[1] - SHORE_M[0]), 0.0, 1.0)
-    fall *= fall * (3.0 - 2.0 * fall) * _outside(line, x0, y0, cell, shape)
+    fall *= fall * (3.0 - 2.0 * fall) * _outside(line, grid)
     natural += (sea - 4.0 - natural) * fall
-    return Terrain(x0, y0, cell, np.maximum(np.minimum(natural, survey.cap), sea), sea)
+    return Terrain(grid, np.maximum(np.minimum(natural, survey.cap), sea), sea)
 
 
-def _road_cap(
-    road: Road, line: CentreLine, x0: float, y0: float, cell: float, shape: tuple[int, int]
-) -> FloatArray:
+def _road_cap(road: Road, line: CentreLine, grid: Grid) -> FloatArray:
     """The greatest height each grid point may have, so that it covers no part of the road."""
     reach = road.wall_offset + 5.0 + 50.0
-    offsets = np.arange(-reach, reach + 0.5 * cell, 0.6 * cell)
-    s = line.s[:: max(1, round(0.6 * cell / SAMPLE_M))]
+    offsets = np.arange(-reach, reach + 0.5 * grid.cell, 0.6 * grid.cell)
+    s = line.s[:: max(1, round(0.6 * grid.cell / SAMPLE_M))]
     side = np.clip(offsets, -road.wall_offset, road.wall_offset)
     pose = road.track.at(s[:, None], offsets[None, :])
     plane = road.track.at(s[:, None], side[None, :]).z
     limit = plane - SINK_M + BANK_SLOPE * np.maximum(np.abs(offsets) - road.wall_offset - 4.0, 0.0)
-    cap = np.full(shape, np.inf)
-    i = np.rint((pose.x - x0) / cell).astype(np.intp)
-    j = np.rint((pose.y - y0) / cell).astype(np.intp)
-    inside = (i >= 0) & (i < shape[1]) & (j >= 0) & (j < shape[0])
+    cap = np.full(grid.shape, np.inf)
+    i, j, inside = grid.nearest(pose.x, pose.y)
     np.minimum.at(cap, (j[inside], i[inside]), limit[inside])
     # A sample limits its neighbours too: erosion is the minimum over 3 x 3.
     finite = np.where(np.isfinite(cap), cap, 1e9).astype(np.float32)
@@ -170,37 +185,34 @@ def _road_cap(
 
 
 def _spread(
-    road: Road, line: CentreLine, x0: float, y0: float, cell: float, shape: tuple[int, int]
+    road: Road, line: CentreLine, grid: Grid
 ) -> tuple[FloatArray, FloatArray, NDArray[np.int64]]:
     """Smoothed road heights on the grid; each point's distance to the road and the nearest
     sample of its centre line."""
-    x = x0 + cell * np.arange(shape[1])
-    y = y0 + cell * np.arange(shape[0])
-    points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    points = np.stack(np.meshgrid(*grid.axes), axis=-1).reshape(-1, 2)
     near, index = line.tree.query(points)
     height = road.track.at(line.s).z
-    nearest = height[index].reshape(shape).astype(np.float32)
-    near = near.reshape(shape)
+    nearest = height[index].reshape(grid.shape).astype(np.float32)
+    near = near.reshape(grid.shape)
     # The nearest road's height jumps midway between two roads; blurring removes the step,
     # a wide blur far out and a narrow one beside the road.
-    wide = cv2.GaussianBlur(nearest, (0, 0), 60.0 / cell)
-    narrow = cv2.GaussianBlur(nearest, (0, 0), 10.0 / cell)
+    wide = cv2.GaussianBlur(nearest, (0, 0), 60.0 / grid.cell)
+    narrow = cv2.GaussianBlur(nearest, (0, 0), 10.0 / grid.cell)
     far = np.clip((near - 25.0) / 60.0, 0.0, 1.0)
-    return narrow + (wide - narrow) * far, near, index.reshape(shape)
+    return narrow + (wide - narrow) * far, near, index.reshape(grid.shape)
 
 
-def _outside(
-    line: CentreLine, x0: float, y0: float, cell: float, shape: tuple[int, int]
-) -> FloatArray:
+def _outside(line: CentreLine, grid: Grid) -> FloatArray:
     """1 outside the loop of the road, 0 inside, with a smooth step."""
-    loop = np.stack([(line.x - x0) / cell, (line.y - y0) / cell], axis=1)
-    inside = np.zeros(shape, dtype=np.float32)
+    loop = np.stack([(line.x - grid.x0) / grid.cell, (line.y - grid.y0) / grid.cell], axis=1)
+    inside = np.zeros(grid.shape, dtype=np.float32)
     cv2.fillPoly(inside, [np.rint(loop).astype(np.int32)], 1.0)
-    return np.asarray(1.0 - cv2.GaussianBlur(inside, (0, 0), 12.0 / cell), dtype=np.float64)
+    return np.asarray(1.0 - cv2.GaussianBlur(inside, (0, 0), 12.0 / grid.cell), dtype=np.float64)
 
 
-def _rolling(shape: tuple[int, int], cell: float, rng: np.random.Generator) -> FloatArray:
+def _rolling(grid: Grid, rng: np.random.Generator) -> FloatArray:
     """Smooth hills of standard deviation about a half, both signs."""
+    shape, cell = grid.shape, grid.cell
     hills = np.zeros(shape)
     for wavelength, weight in ((420.0, 0.45), (160.0, 0.2), (60.0, 0.06)):
         knots = (int(shape[0] * cell / wavelength) + 3, int(shape[1] * cell / wavelength) + 3)

@@ -9,6 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from simulator.arrays import FloatArray
+
 CELL = 128
 COLUMNS, ROWS = 4, 2
 KINDS: tuple[str, ...] = ("oak", "poplar", "pine", "fir", "palm", "bush", "crown", "birch")
@@ -25,7 +27,6 @@ CORNERS = 6
 _BLEED = 4
 """Texels by which mipmaps spread the alpha; the outline keeps this margin."""
 Canvas = NDArray[np.float32]
-FloatArray = NDArray[np.float64]
 
 
 @cache
@@ -53,7 +54,7 @@ def silhouettes() -> NDArray[np.uint8]:
 
 
 @cache
-def outlines() -> NDArray[np.float64]:
+def outlines() -> FloatArray:
     """Polygons (kinds, CORNERS, 2) round the pictures of the trees; see `outline`."""
     return np.stack([outline(shape) for shape in silhouettes()])
 
@@ -80,14 +81,14 @@ def _finished(canvas: Canvas) -> NDArray[np.uint8]:
     return np.concatenate([np.clip(colour, 0, 255), small_alpha], axis=-1).astype(np.uint8)
 
 
-def _disc(canvas: Canvas, x: float, y: float, radius: float, colour: NDArray[np.float64]) -> None:
+def _disc(canvas: Canvas, x: float, y: float, radius: float, colour: FloatArray) -> None:
     """An opaque disc; x, y from the lower left in cell units 0 to 1."""
     size = canvas.shape[0]
     centre = (round(x * size), round((1.0 - y) * size))
     cv2.circle(canvas, centre, max(1, round(radius * size)), (*colour.tolist(), 1.0), -1)
 
 
-def _trunk(canvas: Canvas, top: float, width: float, bark: NDArray[np.float64] = _BARK) -> None:
+def _trunk(canvas: Canvas, top: float, width: float, bark: FloatArray = _BARK) -> None:
     size = canvas.shape[0]
     for k in range(24):
         share = k / 23

@@ -6,13 +6,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from simulator.arrays import FloatArray
 from simulator.camera.bridges.bridges import Bridge, free_of
 from simulator.camera.scene.road_mesh import Ground
 from simulator.camera.scene.themes import Theme
 from simulator.camera.vegetation import foliage
 from simulator.track.road import Road
-
-FloatArray = NDArray[np.float64]
 
 CLEAR_M = 1.6
 """Least distance of a trunk from a wall line."""

@@ -10,13 +10,13 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from simulator.arrays import FloatArray
 from simulator.camera.core.context import Graphics
-from simulator.camera.core.frustum_culling import triangle_indices, visible_spheres
+from simulator.camera.core.frustum_culling import visible_spheres
 from simulator.camera.vegetation import foliage
 from simulator.camera.vegetation.foliage import CORNERS
 from simulator.camera.vegetation.scenery import Trees
 
-FloatArray = NDArray[np.float64]
 Part = Literal["core", "fringe", "labels"]
 
 REACH_M = 420.0
@@ -56,7 +56,7 @@ class TreeMesh:
         vertices[:, :4, 9:11] = _SQUARE
         vertices[:, 4:, 9:11] = foliage.outlines()[trees.cell]
         context = graphics.context
-        self._vertices = context.buffer(vertices.tobytes() or bytes(4))
+        corners = context.buffer(vertices.tobytes() or bytes(4))
         self._indices = context.buffer(reserve=MOST * _OUTLINE_FAN.size * 4, dynamic=True)
         programs: dict[Part, str] = {
             "core": graphics.weather_program("tree", weather, "core"),
@@ -66,7 +66,7 @@ class TreeMesh:
         self._arrays = {
             part: context.vertex_array(
                 graphics.programs[program],
-                [(self._vertices, "3f 3f 3f 2f", "at", "shape", "tint", "corner")],
+                [(corners, "3f 3f 3f 2f", "at", "shape", "tint", "corner")],
                 index_buffer=self._indices,
                 index_element_size=4,
                 skip_errors=part == "labels",
@@ -81,10 +81,11 @@ class TreeMesh:
         near = int(np.searchsorted(squared, NEAR_M**2))
         # Seen from above, a tree is a crown of another outline.
         fan = _SQUARE_FAN if from_above else _OUTLINE_FAN
-        return VisibleTrees(
-            triangle_indices(trees, near, self._corners, fan, _SQUARE_FAN),
-            near * len(fan),
+        first = self._corners * trees[:, None, None]
+        corners = np.concatenate(
+            [(first[:near] + fan).reshape(-1, 3), (first[near:] + _SQUARE_FAN).reshape(-1, 3)]
         )
+        return VisibleTrees(corners.astype(np.uint32), near * len(fan))
 
     def draw(self, seen: VisibleTrees, part: Part) -> None:
         """Draw the visible trees: the "core" of the near ones, then, blended over all else, the
@@ -96,10 +97,3 @@ class TreeMesh:
         self._indices.orphan()
         self._indices.write(order.tobytes())
         self._arrays[part].render(vertices=order.size)
-
-    def release(self) -> None:
-        """Free the graphics memory."""
-        for array in self._arrays.values():
-            array.release()
-        self._indices.release()
-        self._vertices.release()

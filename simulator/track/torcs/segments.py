@@ -9,6 +9,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Final
 
+import numpy as np
+from numpy.typing import NDArray
+
 from simulator.track.errors import TrackError
 from simulator.track.pieces import Piece
 from simulator.track.torcs.torcs_xml import Section
@@ -18,16 +21,8 @@ MAX_ARC: Final = 4.0 * math.pi
 MAX_STEPS: Final = 100_000
 
 
-@dataclass(frozen=True)
-class Edges:
-    """A value for each edge of the road: a height (m) or a slope (dz/ds)."""
-
-    left: float
-    right: float
-
-    @property
-    def mean(self) -> float:
-        return (self.left + self.right) / 2.0
+Edges = NDArray[np.float64]
+"""(2,) a value for the left and the right edge of the road: a height (m) or a slope (dz/ds)."""
 
 
 @dataclass
@@ -42,7 +37,7 @@ class Profile:
 def read_pieces(segments: Section, main: Section, width: float) -> Iterator[Piece]:
     """The pieces of all segments in order, each segment cut into its profile steps."""
     global_step = main.number("profil steps length") or 0.0
-    profile = Profile(end=Edges(0.0, 0.0), tangent=Edges(0.0, 0.0))
+    profile = Profile(end=np.zeros(2), tangent=np.zeros(2))
     for segment in segments.sections():
         if segment.text("type") is not None:
             yield from _segment_pieces(segment, profile, width, global_step)
@@ -62,9 +57,7 @@ def _segment_pieces(
     for i in range(steps):
         t = (i + 1) / steps
         z1 = _hermite(start, end, tangents, length, t)
-        yield Piece(
-            lengths[i], sign / radii[i] if sign else 0.0, z0.left, z0.right, z1.left, z1.right
-        )
+        yield Piece(lengths[i], sign / radii[i] if sign else 0.0, *z0.tolist(), *z1.tolist())
         z0 = z1
     profile.end, profile.tangent = end, tangents[1]
 
@@ -109,38 +102,37 @@ def _end_heights(
     segment: Section, profile: Profile, width: float, length: float
 ) -> tuple[Edges, Edges]:
     """Heights of both edges at the start and at the end of a segment."""
-    start = Edges(
-        _or(segment.number("z start left"), profile.end.left),
-        _or(segment.number("z start right"), profile.end.right),
-    )
-    end = Edges(
-        _or(segment.number("z end left"), profile.end.left),
-        _or(segment.number("z end right"), profile.end.right),
-    )
-    z_start, z_end = segment.number("z start"), segment.number("z end")
+    start = _edges(segment, "z start", profile.end)
+    end = _edges(segment, "z end", profile.end)
     grade = segment.number("grade")
     if grade is not None:
         profile.grade = grade
-    if z_start is not None:
-        start = Edges(z_start, z_start)
-    middle_end = end.mean
-    if z_end is not None:
-        end = Edges(z_end, z_end)
-        middle_end = z_end
-    elif profile.grade is not None:
-        middle_end = start.mean + length * profile.grade
-    banking_start = segment.number("banking start")
-    banking_end = segment.number("banking end")
+    middle_start, middle_end = _mean(start), _mean(end)
+    if segment.number("z end") is None and profile.grade is not None:
+        middle_end = middle_start + length * profile.grade
     return (
-        _banked(start.mean, start, banking_start, width),
-        _banked(middle_end, end, banking_end, width),
+        _banked(middle_start, start, segment.number("banking start"), width),
+        _banked(middle_end, end, segment.number("banking end"), width),
     )
+
+
+def _edges(segment: Section, name: str, default: Edges) -> Edges:
+    """The attribute `name`, for both edges or for one by one, else `default`."""
+    left, right = (segment.number(f"{name} {side}") for side in ("left", "right"))
+    both = segment.number(name)
+    if both is not None:
+        return np.array([both, both])
+    return np.array([_or(left, default[0]), _or(right, default[1])])
+
+
+def _mean(edges: Edges) -> float:
+    return float((edges[0] + edges[1]) / 2.0)
 
 
 def _banked(middle: float, edges: Edges, banking: float | None, width: float) -> Edges:
     # Without an angle of its own a segment keeps the height difference of its edges.
-    half = (edges.left - edges.right) / 2.0 if banking is None else math.tan(banking) * width / 2.0
-    return Edges(middle + half, middle - half)
+    half = (edges[0] - edges[1]) / 2.0 if banking is None else math.tan(banking) * width / 2.0
+    return np.array([middle + half, middle - half])
 
 
 def _step_count(segment: Section, length: float, global_step: float) -> int:
@@ -162,22 +154,12 @@ def _tangents(
 ) -> tuple[Edges, Edges]:
     """Slopes of both edges at the start and at the end of the profile."""
     if not spline:
-        chord = Edges((end.left - start.left) / length, (end.right - start.right) / length)
+        chord: Edges = (end - start) / length
         return chord, chord
     previous = profile.tangent
     return (
-        _edge_slopes(segment, "profil start tangent", previous),
-        _edge_slopes(segment, "profil end tangent", previous),
-    )
-
-
-def _edge_slopes(segment: Section, name: str, default: Edges) -> Edges:
-    both = segment.number(name)
-    if both is not None:
-        return Edges(both, both)
-    return Edges(
-        _or(segment.number(f"{name} left"), default.left),
-        _or(segment.number(f"{name} right"), default.right),
+        _edges(segment, "profil start tangent", previous),
+        _edges(segment, "profil end tangent", previous),
     )
 
 
@@ -206,10 +188,8 @@ def _hermite(
     h_t0 = t * (1.0 - t) ** 2 * length
     h_t1 = t * t * (t - 1.0) * length
     first, last = tangents
-    return Edges(
-        start.left + (end.left - start.left) * h_end + first.left * h_t0 + last.left * h_t1,
-        start.right + (end.right - start.right) * h_end + first.right * h_t0 + last.right * h_t1,
-    )
+    height: Edges = start + (end - start) * h_end + first * h_t0 + last * h_t1
+    return height
 
 
 def _or(value: float | None, default: float) -> float:

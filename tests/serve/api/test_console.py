@@ -1,4 +1,4 @@
-"""The console: what it is made of, and what a real browser shows."""
+"""The console: its files, its samples, and its behaviour in a real browser."""
 
 import json
 import math
@@ -19,7 +19,7 @@ from trackfeatures.camera import CameraParameters
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 
 
-def test_the_page_and_all_it_loads_come_from_the_service(service: Served) -> None:
+def test_the_page_loads_files_of_the_service_only(service: Served) -> None:
     page = service.ask("GET", "/")
     assert page.status == 200
     assert page.headers["content-type"].startswith("text/html")
@@ -33,7 +33,7 @@ def test_the_page_and_all_it_loads_come_from_the_service(service: Served) -> Non
     assert service.ask("GET", "/console/no-such.js").status == 404
 
 
-def test_every_sample_is_what_the_model_sees_and_has_its_truth(service: Served) -> None:
+def test_every_sample_has_the_models_size_and_true_features(service: Served) -> None:
     samples = service.ask("GET", "/console/samples.json").content
     assert len(samples) >= 6
     camera = CameraParameters()
@@ -53,7 +53,7 @@ def test_every_sample_is_what_the_model_sees_and_has_its_truth(service: Served) 
 @pytest.mark.slow
 @pytest.mark.skipif(CHROMIUM is None, reason="no chromium (Debian: apt-get install chromium)")
 def test_a_browser_shows_the_answer(service: Served, tmp_path: Path) -> None:
-    """The page asks about its first sample by itself."""
+    """The page requests the answer for its first sample without user input."""
     shot = tmp_path / "console.png"
     assert CHROMIUM is not None
     command = [CHROMIUM, "--headless", "--no-sandbox", "--hide-scrollbars", "--dump-dom"]
@@ -78,8 +78,8 @@ def test_a_browser_shows_the_answer(service: Served, tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(shutil.which("node") is None, reason="no node")
-def test_the_geometry_of_the_console_is_that_of_the_pinhole(tmp_path: Path) -> None:
-    """A marking 2 m to the right, 5 m ahead of the camera, is where the camera's matrix puts it."""
+def test_console_geometry_equals_the_pinhole_camera(tmp_path: Path) -> None:
+    """A marking 2 m right and 5 m ahead is drawn at its projection by the camera matrix."""
     script = tmp_path / "ask.mjs"
     module = (FOLDER / "geometry.js").as_uri()
     camera = CameraParameters()

@@ -1,4 +1,4 @@
-"""The page at /docs: Swagger UI with the whole OpenAPI document, without any other site."""
+"""The page at /docs: Swagger UI with the whole OpenAPI document, without external requests."""
 
 import html
 import json
@@ -30,7 +30,7 @@ def test_the_page_contains_the_openapi_document(service: Served) -> None:
     assert embedded_document(reply.content.decode()) == document
 
 
-def test_every_file_comes_from_the_service_under_a_strict_policy(service: Served) -> None:
+def test_every_file_is_served_locally_with_a_strict_csp(service: Served) -> None:
     page = service.ask("GET", "/docs")
     policy = page.headers["content-security-policy"]
     assert "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'" in policy
@@ -46,7 +46,7 @@ def test_every_file_comes_from_the_service_under_a_strict_policy(service: Served
     assert service.ask("GET", "/console/docs.html").status == 404  # only as /docs
 
 
-def test_text_of_the_document_cannot_end_its_script_element() -> None:
+def test_document_text_cannot_close_the_script_element() -> None:
     app = FastAPI(title="</script><script>alert(1)</script>")
     page = docs_page(app)
     assert page.count("</script>") == 3

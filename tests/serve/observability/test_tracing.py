@@ -1,4 +1,4 @@
-"""Traces: which spans there are, whose children they are, and that a collector gets them."""
+"""Traces: names and parents of the spans, and their export to a collector."""
 
 import subprocess
 import sys
@@ -42,7 +42,7 @@ def traced(engine: FakeEngine, exporter: InMemorySpanExporter) -> Iterator[Serve
 
 
 def spans(exporter: InMemorySpanExporter, last: str) -> dict[str, ReadableSpan]:
-    """The spans by name, once the one called `last` has ended."""
+    """The finished spans by name; waits until the span `last` has ended."""
     until(lambda: last in {span.name for span in exporter.get_finished_spans()})
     return {span.name: span for span in exporter.get_finished_spans()}
 
@@ -62,7 +62,7 @@ def assert_child(child: ReadableSpan, parent: ReadableSpan) -> None:
 
 
 @pytest.mark.parametrize("way", [{}, {"X_Forwarded_For": "127.0.0.1"}], ids=["direct", "asgi"])
-def test_a_request_goes_on_with_its_trace(
+def test_a_request_continues_the_callers_trace(
     traced: Served, exporter: InMemorySpanExporter, way: dict[str, str]
 ) -> None:
     headers = {"X_Request_Id": "r1", "X_Frame_Id": "f1", **way}
@@ -90,7 +90,7 @@ def test_a_request_goes_on_with_its_trace(
         )
 
 
-def test_tensors_and_frames_of_a_websocket_are_traced(
+def test_tensor_requests_and_websocket_frames_are_traced(
     traced: Served, exporter: InMemorySpanExporter
 ) -> None:
     assert infer(traced, {"inputs": [BASE64]}, traceparent=TRACEPARENT).status == 200
@@ -111,7 +111,7 @@ def test_tensors_and_frames_of_a_websocket_are_traced(
     assert about(found["refuse"])["error.type"] == "/problems/not-an-image"
 
 
-def test_refusals_say_why_and_probes_are_no_spans(
+def test_refused_requests_record_the_reason_and_probes_have_no_span(
     traced: Served, exporter: InMemorySpanExporter
 ) -> None:
     for path in ("/readyz", "/metrics", "/model"):
@@ -134,7 +134,7 @@ def test_refusals_say_why_and_probes_are_no_spans(
 
 @contextmanager
 def collector() -> Iterator[tuple[str, list[ExportTraceServiceRequest]]]:
-    """A collector of OTLP over HTTP: its address, and what it was sent."""
+    """An OTLP collector over HTTP: its address, and the requests it received."""
     received: list[ExportTraceServiceRequest] = []
 
     class Handler(BaseHTTPRequestHandler):
@@ -159,7 +159,7 @@ def collector() -> Iterator[tuple[str, list[ExportTraceServiceRequest]]]:
         server.server_close()
 
 
-def test_a_collector_named_by_the_standard_variables_gets_them(
+def test_spans_are_exported_to_the_collector_of_the_standard_variables(
     engine: FakeEngine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with collector() as (address, received):
@@ -187,7 +187,7 @@ def sent(received: list[ExportTraceServiceRequest]) -> list[Any]:
     ]
 
 
-def test_the_environment_switches_it() -> None:
+def test_environment_variables_switch_tracing() -> None:
     endpoint = {"OTEL_EXPORTER_OTLP_ENDPOINT": "http://127.0.0.1:4318"}
     for environment, name in (
         ({}, None),
@@ -203,8 +203,8 @@ def test_the_environment_switches_it() -> None:
         telemetry.exporter_name({"OTEL_TRACES_EXPORTER": "zipkin"})
 
 
-def test_off_it_costs_nothing(service: Served) -> None:
-    """No exporter is loaded and nothing stands around the endpoints. (FastAPI loads the API.)"""
+def test_without_tracing_no_exporter_is_loaded_or_endpoint_wrapped(service: Served) -> None:
+    """No exporter is loaded and no endpoint is wrapped. (FastAPI imports the API.)"""
     code = (
         "import sys, serve.workers.worker, serve.launch\n"
         "from serve.observability import telemetry\n"

@@ -1,4 +1,4 @@
-"""The painted markings lie where the geometry says: in bends, over hills, on banked road."""
+"""Rendered markings coincide with the projected track geometry in bends, on hills and on banks."""
 
 from dataclasses import replace
 
@@ -35,7 +35,7 @@ def _errors(camera: Camera, bare: Camera, pose: FloatArray, s: float) -> FloatAr
     """Distances (pixels) from the true outer markings to the centres of the painted ones; NaN
     where no paint is seen within 0.4 m of the truth.
 
-    The paint is what `camera` sees and `bare`, on the same road without paint, does not.
+    Paint is the difference between the images of `camera` and of `bare`, whose road has no paint.
     """
     road = camera.road
     difference = camera.render(pose).astype(np.float64) - bare.render(pose)
@@ -73,7 +73,7 @@ def _errors(camera: Camera, bare: Camera, pose: FloatArray, s: float) -> FloatAr
         ("town", "rain"),
     ],
 )
-def test_paint_lies_on_the_projected_markings(name: str, kind: str) -> None:
+def test_rendered_paint_coincides_with_projected_markings(name: str, kind: str) -> None:
     painted = replace(find_track(name), markings=MarkingStyle())
     unpainted = replace(painted, markings=MarkingStyle(line_width=1e-6))
     rng = np.random.default_rng(5)

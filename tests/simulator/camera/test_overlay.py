@@ -1,9 +1,10 @@
-"""Marking polylines: on the road plane, in front of the camera, near the image, unbroken."""
+"""Marking polylines: points on the road plane, in front of the camera and near the image."""
 
 import numpy as np
 import pytest
 from numpy.typing import ArrayLike
 
+from simulator.arrays import FloatArray
 from simulator.camera.core import optics
 from simulator.camera.overlay import BEHIND_M, STEP_M, marking_polylines
 from simulator.camera.snapshot import standing_pose
@@ -14,20 +15,20 @@ from trackfeatures.camera import CameraParameters
 
 
 class Eye:
-    """What an overlay needs of a camera, without a renderer."""
+    """A camera's size and projection, without a renderer."""
 
     parameters = CameraParameters()
     width, height = parameters.width, parameters.height
 
     def project(
         self, points: ArrayLike, body_pose: ArrayLike, view: str = "front"
-    ) -> tuple[optics.FloatArray, optics.FloatArray]:
+    ) -> tuple[FloatArray, FloatArray]:
         matrix = self.parameters.intrinsics()
         return optics.project(optics.eye_of(self.parameters, body_pose, view), matrix, points)
 
 
 @pytest.mark.parametrize("name", ["mountain-pass", "ring-road", "oval"])
-def test_compiled_points_are_those_of_the_road_plane(name: str) -> None:
+def test_road_points_equal_track_at(name: str) -> None:
     track = find_track(name)
     s = np.random.default_rng(1).uniform(-50.0, 2.0 * track.length_m, 200)
     y = np.array([-6.0, 0.0, 2.0])
@@ -39,8 +40,8 @@ def test_compiled_points_are_those_of_the_road_plane(name: str) -> None:
 
 @pytest.mark.parametrize("view", ["front", "left", "rear", "top"])
 @pytest.mark.parametrize("angle", [0.0, 0.6, 2.0])
-def test_lines_are_the_runs_of_points_that_can_be_seen(view: str, angle: float) -> None:
-    """Against a point-by-point implementation."""
+def test_polylines_consist_of_consecutive_visible_points(view: str, angle: float) -> None:
+    """The polylines equal those of a point-by-point reference implementation."""
     road, eye = Road(find_track("circuit"), 3), Eye()
     pose = standing_pose(road, 150.0, 3.0, angle)
     start, end = (-60.0, BEHIND_M) if view == "rear" else (-BEHIND_M, 60.0)

@@ -32,7 +32,7 @@ def light(kind: str = "clear") -> Light:
 
 
 def rays(camera: Camera, pose: FloatArray, view: str = "front") -> tuple[FloatArray, FloatArray]:
-    """The eye (3,) and what a metre of depth along each pixel's ray is (height, width, 3)."""
+    """The eye (3,), and each pixel's ray vector per metre of depth (height, width, 3)."""
     eye = eye_of(camera.parameters, pose, view)
     matrix = camera.intrinsics
     u = (np.arange(camera.width) + 0.5 - matrix[0, 2]) / matrix[0, 0]
@@ -41,12 +41,12 @@ def rays(camera: Camera, pose: FloatArray, view: str = "front") -> tuple[FloatAr
     return eye.place, ahead + u[None, :, None] * right - v[:, None, None] * up
 
 
-def test_classes_are_published() -> None:
+def test_class_names_and_their_order() -> None:
     assert CLASSES == ("road", "marking", "car", "ground", "sky", "object")
 
 
 @pytest.mark.parametrize("lanes", [1, 3])
-def test_road_lies_at_the_depth_of_the_tracks_surface(lanes: int) -> None:
+def test_road_depth_equals_the_depth_of_the_track_surface(lanes: int) -> None:
     """A road pixel's place, eye plus ray times depth, is a point of the track's road plane."""
     road = Road(find_track("mountain-pass"), lanes)
     rng = np.random.default_rng(3)
@@ -76,9 +76,8 @@ def places(camera: Camera, pose: FloatArray, depth: NDArray[np.float32]) -> Floa
     return np.asarray(eye + ray * depth[..., None].astype(np.float64))
 
 
-def test_marking_pixels_are_those_on_the_markings() -> None:
-    """Each marking pixel shows a place on a line of paint; no road pixel one on the outer lines,
-    which are without gaps."""
+def test_marking_class_matches_the_painted_lines() -> None:
+    """Each marking pixel lies on a painted line; no road pixel lies on an outer (solid) line."""
     track = replace(find_track("circuit"), markings=MarkingStyle())
     road = Road(track, 2)
     half = track.markings.line_width / 2
@@ -103,8 +102,8 @@ def test_marking_pixels_are_those_on_the_markings() -> None:
     assert min(off) > half - 0.01
 
 
-def test_car_pixels_lie_in_the_cars_box(road: Road) -> None:
-    """They fill most of where the box of the car projects, and lie at the box's depths."""
+def test_car_class_and_depth_match_the_cars_box(road: Road) -> None:
+    """They cover most of the car's projected box, at depths within the box."""
     with Camera(road, CameraParameters(420, 315), seed=1, light=light()) as camera:
         pose = standing_pose(road, 100.0, 0.0)
         for gap, offset in ((10.0, 2.0), (22.0, -2.0), (35.0, 2.0)):
@@ -130,7 +129,7 @@ def test_car_pixels_lie_in_the_cars_box(road: Road) -> None:
             assert depth.max() < away.max() + 0.05
 
 
-def test_sky_is_where_the_colour_of_the_sky_is(road: Road) -> None:
+def test_sky_class_matches_sky_coloured_pixels(road: Road) -> None:
     """Under a magenta sky in clear air, and only there."""
     magenta = (1.0, 0.0, 1.0)
     odd = replace(
@@ -150,7 +149,7 @@ def test_sky_is_where_the_colour_of_the_sky_is(road: Road) -> None:
             assert (coloured != is_sky).mean() < 0.004
 
 
-def test_a_car_changes_the_colours_where_its_class_is(road: Road) -> None:
+def test_a_car_changes_colours_at_its_pixels_and_in_its_shadow(road: Road) -> None:
     with Camera(road, seed=1, light=light("overcast")) as camera:
         pose = standing_pose(road, 300.0, 0.0)
         car = standing_pose(road, 312.0, 1.5, height=0.0)
@@ -168,7 +167,7 @@ def test_a_car_changes_the_colours_where_its_class_is(road: Road) -> None:
 
 
 def test_objects_stand_beside_the_road(road: Road) -> None:
-    """Nothing of them hangs lower than 3 m over the asphalt, where bridges do, or farther."""
+    """No object is less than 3 m above the asphalt; bridges are higher."""
     offsets = []
     with Camera(road, seed=5, light=light()) as camera:
         for s in np.linspace(0.0, road.track.length_m, 8, endpoint=False):
@@ -183,7 +182,7 @@ def test_objects_stand_beside_the_road(road: Road) -> None:
     assert min(offsets) > road.half_asphalt - 0.5
 
 
-def test_depth_from_above_is_the_height(road: Road) -> None:
+def test_depth_of_the_top_view_is_the_camera_height(road: Road) -> None:
     pose = standing_pose(road, 200.0, 0.0)
     with Camera(road, CameraParameters(64, 64), seed=1, light=light()) as camera:
         found = camera.render_views(pose, views=("top:depth", "top:class"))
@@ -194,7 +193,7 @@ def test_depth_from_above_is_the_height(road: Road) -> None:
     assert np.median(beside) == pytest.approx(24.25, abs=0.3)
 
 
-def test_rain_and_snow_change_no_class(road: Road) -> None:
+def test_classes_are_the_same_in_rain_and_snow(road: Road) -> None:
     pose = standing_pose(road, 250.0, 1.0)
     found = []
     for kind in ("overcast", "rain", "snow"):
@@ -205,7 +204,7 @@ def test_rain_and_snow_change_no_class(road: Road) -> None:
         assert np.array_equal(found[0]["front:depth"], other["front:depth"])
 
 
-def test_many_views_equal_single_ones(road: Road) -> None:
+def test_views_rendered_together_equal_views_rendered_singly(road: Road) -> None:
     names = [f"{view}{kind}" for view in VIEWS for kind in ("", ":depth", ":class")]
     pose = standing_pose(road, 70.0, -1.0)
     cars = np.array([standing_pose(road, 85.0, 2.0, height=0.0)])
@@ -263,7 +262,7 @@ def test_calibration_matches_the_projection(road: Road, view: str) -> None:
 
 @pytest.mark.parametrize("size", [(280, 210), (64, 48), (1920, 1080), (100, 300)])
 @pytest.mark.parametrize("fov", [20.0, 67.5, 120.0])
-def test_intrinsics_of_any_size_and_lens(size: tuple[int, int], fov: float) -> None:
+def test_intrinsics_follow_size_and_field_of_view(size: tuple[int, int], fov: float) -> None:
     width, height = size
     matrix = CameraParameters(width, height, fov).intrinsics()
     up, down = (np.arctan((v - matrix[1, 2]) / matrix[1, 1]) for v in (0.0, height))
@@ -271,7 +270,7 @@ def test_intrinsics_of_any_size_and_lens(size: tuple[int, int], fov: float) -> N
     assert (matrix[0, 2], matrix[1, 2], matrix[0, 0]) == (width / 2, height / 2, matrix[1, 1])
 
 
-def test_false_colours_of_depth_and_class(road: Road) -> None:
+def test_colourise_maps_depth_and_class_to_colours(road: Road) -> None:
     depth = np.array([[2.0, 30.0, 499.0, np.inf]], dtype=np.float32)
     near, middle, far, sky = colourise(depth, "depth")[0].astype(int)
     assert near[0] > near[2]
@@ -286,7 +285,7 @@ def test_false_colours_of_depth_and_class(road: Road) -> None:
 
 
 def test_a_contact_sheet_of_one_view_and_kind(road: Road, tmp_path: Path) -> None:
-    """All but the captions is in the colours of the classes; the rear view is no front view."""
+    """All pixels but the captions have class colours; rear and front view differ."""
     sheets = []
     for view in ("rear", None):
         out = tmp_path / f"{view}.png"

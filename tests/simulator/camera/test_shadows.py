@@ -1,4 +1,4 @@
-"""Heavy shadow on every track, and bridge shadows in the right place."""
+"""Tree shadows in heavy-shadow light on every track; positions of bridges and their shadows."""
 
 import numpy as np
 import pytest
@@ -36,7 +36,7 @@ def bridges_of(road: Road, seed: int) -> tuple[Bridge, ...]:
     return bridges.build(ground, theme, np.random.default_rng([seed, 8]))
 
 
-def test_every_look_of_a_track_has_a_theme() -> None:
+def test_every_track_look_has_a_scenery_theme() -> None:
     assert set(TRACK_LOOKS) == set(themes())
 
 
@@ -57,8 +57,8 @@ def test_heavy_shadow_covers_30_to_80_percent_of_every_road(name: str) -> None:
 
 
 def lit_and_dark(camera: Camera, s: float) -> tuple[FloatArray, FloatArray]:
-    """Light (not display values) of road pixels 3 to 15 m ahead that the mask has in the sun, and
-    in the shade, away from the lines and the shadows' edges."""
+    """Linear light of road pixels 3 to 15 m ahead: those in the sun and those in shadow, by the
+    mask; markings and shadow edges are left out."""
     road, mask = camera.road, camera._loaded.scene.mask
     pose = standing_pose(road, s, 0.0)
     grey = np.square(camera.render(pose) / 255.0).mean(axis=2)
@@ -78,7 +78,7 @@ def lit_and_dark(camera: Camera, s: float) -> tuple[FloatArray, FloatArray]:
 
 
 @pytest.mark.parametrize("name", ["town", "oval", "gravel-valley"])
-def test_shadow_has_at_most_two_fifths_of_the_lit_luminance(name: str) -> None:
+def test_luminance_in_shadow_is_at_most_two_fifths_of_lit(name: str) -> None:
     road = Road(find_track(name), 2)
     rng = np.random.default_rng(4)
     for seed in (1, 2):
@@ -90,8 +90,8 @@ def test_shadow_has_at_most_two_fifths_of_the_lit_luminance(name: str) -> None:
         assert np.mean(dark) < 0.4 * np.mean(sunny)
 
 
-def test_shadows_are_hard_edged() -> None:
-    """Few texels of the mask lie between light and shade: an edge is about a texel wide."""
+def test_shadow_edges_are_about_one_texel_wide() -> None:
+    """Few texels lie between light and shadow: edges are about one texel wide."""
     road = Road(find_track("forest"), 2)
     with Camera(road, seed=3, light=light("heavy-shadow", 3)) as camera:
         strip = camera._loaded.scene.mask.strip
@@ -104,8 +104,8 @@ def test_shadows_are_hard_edged() -> None:
 
 
 @pytest.mark.parametrize("kind", ["clear", "heavy-shadow"])
-def test_shadows_have_no_edge_beside_the_road(kind: str) -> None:
-    """The rows at the mask's rim hold the land's even shade, and there is no step towards them."""
+def test_shadow_mask_fades_smoothly_at_its_rim(kind: str) -> None:
+    """At its rim the mask has the terrain's smooth shade, without a step towards it."""
     road = Road(find_track("forest"), 2)
     with Camera(road, seed=3, light=light(kind, 3)) as camera:
         strip = camera._loaded.scene.mask.strip.astype(np.float64)
@@ -120,9 +120,9 @@ def test_shadows_have_no_edge_beside_the_road(kind: str) -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_bridges_clear_the_road_and_stand_beside_it(name: str) -> None:
-    """Nothing that is drawn of a bridge stands between the wall lines; over the asphalt there is
-    room for a lorry, or 3 m where an arch springs."""
+def test_bridges_leave_the_specified_clearance_over_the_road(name: str) -> None:
+    """No part of a bridge is lower than 2.4 m between the wall lines, or lower than 3 m over the
+    asphalt; the middle of a bridge has the clearance of CLEARANCE_M."""
     road = Road(find_track(name), 1 + len(name) % 3)
     line = CentreLine.of(road)
     found = bridges_of(road, seed=2)
@@ -156,7 +156,7 @@ def traced_from(bridge: Bridge, point: FloatArray, sun: FloatArray) -> bool:
 
 @pytest.mark.parametrize(("name", "seed"), [("highway", 3), ("circuit", 5), ("coast", 1)])
 def test_bridge_shadows_match_ray_tracing(name: str, seed: int) -> None:
-    """The mask against rays through the triangles that are drawn."""
+    """The mask equals a ray test against the rendered triangles."""
     road = Road(find_track(name), 2)
     sunny = light("clear", seed)
     sun = np.array(sunny.sun_direction)
@@ -164,7 +164,7 @@ def test_bridge_shadows_match_ray_tracing(name: str, seed: int) -> None:
     along = road.track.length_m / strip.shape[1]
     over = bridges_of(road, seed)
     assert len(over) >= 3
-    cast_bridges(strip, road, along, shadow_mask.TEXEL_M, over, sunny)
+    cast_bridges(strip, road, along, over, sunny)
     rng = np.random.default_rng(1)
     agreed, dark = [], 0
     for bridge in over:

@@ -53,7 +53,7 @@ def saturation(part: FloatArray) -> float:
 
 
 def detail_far_away(kind: str) -> float:
-    """Contrast of what stands 60 m away and more, just over the horizon, without the drops."""
+    """Contrast of objects 60 m away and more, just above the horizon, without drops."""
     found = []
     for seed in SEEDS:
         still = replace(light(kind, seed), falling=0.0)
@@ -64,7 +64,7 @@ def detail_far_away(kind: str) -> float:
     return float(np.mean(found))
 
 
-def test_the_kinds_are_those_that_the_design_names() -> None:
+def test_light_kinds_are_the_documented_ones() -> None:
     assert KINDS == ("clear", "overcast", "dusk", "fog", "heavy-shadow", "rain", "snow")
     assert WEATHERS == ("rain", "snow")
     for kind in KINDS:
@@ -83,7 +83,7 @@ def test_snow_is_white_and_rain_is_dark_and_grey() -> None:
     assert ground("snow").std() > 1.5 * ground("overcast").std()
 
 
-def test_rain_and_snow_shorten_the_view_but_less_than_fog() -> None:
+def test_rain_and_snow_reduce_visibility_less_than_fog() -> None:
     seen = {kind: detail_far_away(kind) for kind in ("clear", "rain", "snow", "fog")}
     assert seen["fog"] < seen["rain"] < 0.8 * seen["clear"]
     assert seen["snow"] < 0.8 * seen["clear"]
@@ -93,8 +93,8 @@ def test_rain_and_snow_shorten_the_view_but_less_than_fog() -> None:
         assert max(reach) < 10.0
 
 
-def test_a_wet_road_mirrors_the_sky() -> None:
-    """The far road, seen at a grazing angle, comes near to the sky; the near road is dark."""
+def test_a_wet_road_reflects_the_sky_at_grazing_angles() -> None:
+    """The far road, at a grazing angle, is nearly as bright as the sky; the near road is dark."""
     for kind, low, high in (("rain", 1.7, 9.0), ("overcast", 0.7, 1.6)):
         clear_air = replace(light(kind), haze_per_km=0.1, falling=0.0)
         with Camera(bare_road(), seed=5, light=clear_air) as camera:
@@ -105,7 +105,7 @@ def test_a_wet_road_mirrors_the_sky() -> None:
 
 
 @pytest.mark.parametrize("kind", WEATHERS)
-def test_drops_depend_on_the_pose_and_the_seed_only(kind: str) -> None:
+def test_drops_depend_only_on_pose_and_seed(kind: str) -> None:
     pose = standing_pose(road(), 120.0, 0.0)
     beside = pose + np.array([0.002, 0.0, 0.0, 0.0, 0.0, 0.0])
 
@@ -133,13 +133,41 @@ def test_drops_depend_on_the_pose_and_the_seed_only(kind: str) -> None:
 
 
 @pytest.mark.parametrize("kind", WEATHERS)
-def test_what_varies_within_a_kind_is_drawn_from_the_seed(kind: str) -> None:
+def test_random_parameters_of_a_kind_depend_on_the_seed(kind: str) -> None:
     drawn = [Light.named(kind, np.random.default_rng(seed)) for seed in range(30)]
     assert drawn[7] == Light.named(kind, np.random.default_rng(7))
     for name in ("sun_azimuth", "sun_elevation", "haze_per_km", "cover", "falling", "exposure"):
         values = [getattr(each, name) for each in drawn]
         assert np.ptp(values) > 0.25 * abs(np.mean(values)), name
     assert all(0.0 < each.cover <= 1.0 and 0.0 < each.falling <= 1.0 for each in drawn)
+
+
+@pytest.mark.parametrize(
+    ("kind", "azimuth", "sun_green", "horizon_red", "haze_per_km", "exposure"),
+    [
+        ("clear", 0.096293340, 1.986553341, 0.669518271, 0.967596382, 0.997769856),
+        ("overcast", 1.934849046, 0.165080164, 0.610820313, 2.326051934, 1.116449915),
+        ("dusk", 1.934849046, 0.807840842, 0.951831927, 1.813077245, 0.997769856),
+        ("fog", -2.802736057, 0.05, 0.633660605, 7.438819397, 1.173201524),
+        ("heavy-shadow", 0.096293340, 2.15, 0.669518271, 0.967596382, 1.129176240),
+        ("rain", -0.732814935, 0.039282548, 0.460827051, 6.847644738, 0.997769856),
+        ("snow", -0.732814935, 0.094540082, 0.567762088, 8.155585528, 1.116449915),
+    ],
+)
+def test_a_seed_always_draws_the_same_light(
+    kind: str,
+    azimuth: float,
+    sun_green: float,
+    horizon_red: float,
+    haze_per_km: float,
+    exposure: float,
+) -> None:
+    """Values are drawn in the order of light.toml, so another order would change the images."""
+    drawn = Light.named(kind, np.random.default_rng(5))
+    found = (drawn.sun_azimuth, drawn.sun[1], drawn.horizon[0], drawn.haze_per_km, drawn.exposure)
+    assert found == pytest.approx(
+        (azimuth, sun_green, horizon_red, haze_per_km, exposure), rel=1e-7
+    )
 
 
 def marking_contrast(kind: str, seed: int) -> float:
@@ -172,8 +200,8 @@ def test_markings_stay_visible_in_rain() -> None:
     assert min(wet) > 1.5
 
 
-def test_dry_kinds_use_programs_without_weather() -> None:
-    """Dry kinds draw with programs of their own, into which no weather is compiled."""
+def test_dry_lights_use_shaders_without_weather() -> None:
+    """Dry lights use shader programs compiled without the weather code."""
     from simulator.camera.core.context import WEATHER_PROGRAMS, graphics
 
     shared = graphics()

@@ -1,4 +1,4 @@
-"""The built-in driver: keeps its lane round a lap, its distance, and slows down for bends."""
+"""The built-in driver keeps its lane and its distance to a leader, and slows down for bends."""
 
 import pytest
 
@@ -11,7 +11,7 @@ from simulator.world.world import World
 
 
 @pytest.mark.parametrize("name", ["town", "mountain-pass"])
-def test_a_lap_in_the_lane(name: str) -> None:
+def test_a_lap_stays_in_the_lane(name: str) -> None:
     road = Road(find_track(name))
     driver = Cruise(road)
     speeds: list[float] = []
@@ -27,7 +27,7 @@ def test_a_lap_in_the_lane(name: str) -> None:
     assert min(speeds[200:]) < 45.0  # bends of 30 m radius
 
 
-def test_behind_traffic_in_each_lane() -> None:
+def test_follows_traffic_in_each_lane_without_collision() -> None:
     road = Road(find_track("highway"), 3)
     for lane in range(3):
         driver = Cruise(road, speed_kmh=75.0)
@@ -42,7 +42,7 @@ def test_behind_traffic_in_each_lane() -> None:
             assert state.speed_kmh < 66.0  # nobody ahead drives faster than 62
 
 
-def test_it_takes_over_where_the_car_is() -> None:
+def test_take_over_keeps_the_cars_present_lane() -> None:
     road = Road(find_track("oval"), 2)
     driver = Cruise(road)
     with World(road) as world:
@@ -56,8 +56,8 @@ def test_it_takes_over_where_the_car_is() -> None:
         assert state.to_middle == pytest.approx(-2.0, abs=0.2)
 
 
-def test_a_leader_far_ahead_holds_nobody_back() -> None:
-    """It once drove at 37 km/h with the next car 300 m ahead, for want of the engine's braking."""
+def test_a_leader_far_ahead_does_not_reduce_the_speed() -> None:
+    """Regression: it drove at 37 km/h with a leader 300 m ahead, as it ignored engine braking."""
     road = Road(find_track("highway"), 2)
     driver = Cruise(road)
     with World(road, traffic=6) as world:

@@ -1,4 +1,4 @@
-"""The Gymnasium environments: env checker, spaces, reward, termination, seeds, vectors, errors."""
+"""The Gymnasium environments: checker, spaces, reward, termination, seeds, vectors, errors."""
 
 import math
 import re
@@ -39,7 +39,7 @@ def steer(value: float) -> np.ndarray[Any, Any]:
         (IMAGE_ID, {"observation": "image", "render_mode": "rgb_array", **SMALL}),
     ],
 )
-def test_gymnasiums_checker_passes_without_a_warning(name: str, options: dict[str, Any]) -> None:
+def test_env_checker_passes_without_a_warning(name: str, options: dict[str, Any]) -> None:
     env = gym.make(name, track="circuit", **options)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -47,7 +47,7 @@ def test_gymnasiums_checker_passes_without_a_warning(name: str, options: dict[st
     env.close()
 
 
-def test_gymnasiums_checker_warns_only_of_the_range_of_the_gear() -> None:
+def test_env_checker_warns_only_about_the_gear_range() -> None:
     env = make(controls="full")
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
@@ -56,7 +56,7 @@ def test_gymnasiums_checker_warns_only_of_the_range_of_the_gear() -> None:
     env.close()
 
 
-def test_the_observation_is_the_papers_state() -> None:
+def test_observation_equals_the_papers_state_vector() -> None:
     env = make()
     observation, _ = env.reset(
         seed=0, options={"s": 100.0, "to_middle": 1.2, "angle": -0.3, "speed": 10.0}
@@ -70,7 +70,7 @@ def test_the_observation_is_the_papers_state() -> None:
     env.close()
 
 
-def test_throttle_and_gear_are_held_and_the_score_is_the_sum_of_rewards() -> None:
+def test_throttle_and_gear_are_constant_and_score_sums_rewards() -> None:
     env = make()
     env.reset(seed=1)
     total = 0.0
@@ -165,7 +165,7 @@ def test_full_controls_shift_gears_and_brake() -> None:
     env.close()
 
 
-def test_a_vector_of_two_equals_two_single_environments() -> None:
+def test_a_vector_environment_equals_two_single_environments() -> None:
     vector = gym.make_vec(STATE_ID, num_envs=2, vectorization_mode="async", track="circuit")
     assert isinstance(vector, gym.vector.AsyncVectorEnv)
     observations, _ = vector.reset(seed=[4, 5])

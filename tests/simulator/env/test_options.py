@@ -62,13 +62,13 @@ def spaces_of(name: str, **options: Any) -> dict[str, tuple[int, ...]]:
         ),
     ],
 )
-def test_observations_have_these_parts_and_shapes(
+def test_observation_parts_and_shapes_follow_the_options(
     name: str, options: dict[str, Any], shapes: dict[str, tuple[int, ...]]
 ) -> None:
     assert spaces_of(name, **options) == shapes
 
 
-def test_views_are_those_of_the_camera_and_rendered_once_a_step() -> None:
+def test_views_equal_the_cameras_and_are_rendered_once_per_step() -> None:
     views = ("front", "rear", "left", "chase", "top", "front:depth", "rear:depth", "front:class")
     env = gym.make(IMAGE_ID, track="oval", views=views, render_mode="rgb_array", **SMALL).unwrapped
     assert isinstance(env, simulator.env.LateralControl)
@@ -110,7 +110,7 @@ def test_calibration_projects_a_point_of_the_body_to_its_pixel() -> None:
     assert (calibration["rear:depth"] @ point)[2] == pytest.approx(-10.0)
 
 
-def test_sensor_units_and_noise() -> None:
+def test_sensors_have_the_papers_units_and_the_requested_noise() -> None:
     options: dict[str, Any] = {"track": "oval", "sensors": ("v_x", "range", "engine")}
     exact, noisy = (
         gym.make(STATE_ID, **options),
@@ -145,7 +145,7 @@ def test_a_custom_sensor_is_in_the_observation() -> None:
     env.close()
 
 
-def test_all_standard_sensors_stay_in_their_spaces_on_and_off_the_track() -> None:
+def test_standard_sensor_readings_stay_in_their_spaces() -> None:
     names = [sensor.name for sensor in STANDARD]
     env = gym.make(STATE_ID, track="oval", traffic=3, sensors=names, ends=())
     env.reset(seed=0, options={"s": 100.0, "speed": 20.0})
@@ -159,7 +159,7 @@ def test_all_standard_sensors_stay_in_their_spaces_on_and_off_the_track() -> Non
 
 
 def quadratic(state: CarState, road: Road, ending: Ending | None) -> float:
-    """The quadratic cost of the paper's comparison of controllers, negated."""
+    """Negative quadratic cost, as in the paper's comparison of controllers."""
     return -(0.3 * state.to_middle**2 + state.angle**2 + 0.03 * state.steer**2)
 
 
@@ -213,7 +213,7 @@ def test_driving_backwards_terminates_only_if_in_ends() -> None:
         env.close()
 
 
-def test_info_holds_the_true_features_that_are_present() -> None:
+def test_info_contains_only_features_that_are_present() -> None:
     env = gym.make(STATE_ID, track="oval", lanes=2)
     _, info = env.reset(seed=0, options={"to_middle": 2.0, "angle": 0.1})
     features = info["features"]

@@ -1,4 +1,4 @@
-"""Random episodes of the replay benchmark, one with images, are bit-equal wherever they run."""
+"""Random episodes, one with images, are bit-identical in another process and vectorised."""
 
 import json
 import subprocess
@@ -11,7 +11,7 @@ BENCHMARK = Path(__file__).parents[3] / "benchmarks" / "replay.py"
 
 
 @pytest.mark.slow
-def test_random_episodes_replay_bit_for_bit_in_another_process_and_in_a_vector(
+def test_random_episodes_are_bit_identical_in_another_process_and_vectorised(
     tmp_path: Path,
 ) -> None:
     out = tmp_path / "replay.json"

@@ -1,4 +1,4 @@
-"""Servers as processes of their own, and the C client compiled."""
+"""Fixtures: link servers in separate processes, and the compiled C client."""
 
 import contextlib
 import os
@@ -37,7 +37,7 @@ def fresh_name() -> str:
 
 @pytest.fixture(autouse=True)
 def patient_clients(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Clients in this process wait longer than by default."""
+    """Clients in this process have a longer time-out than the default."""
     defaults = Link.__init__.__kwdefaults__
     assert defaults is not None
     monkeypatch.setitem(defaults, "timeout_s", ANSWER_S)
@@ -45,7 +45,7 @@ def patient_clients(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def name() -> Iterator[str]:
-    """A link's name of this test alone; nothing of it may be left."""
+    """A link name unique to the test; checks that no segment is left behind."""
     name = fresh_name()
     yield name
     left = SHM / name[1:]
@@ -56,7 +56,7 @@ def name() -> Iterator[str]:
 
 @pytest.fixture
 def server(name: str) -> Iterator[Start]:
-    """Starts servers of `name`; those still running are stopped at the end, as a user would."""
+    """Starts servers of `name`; servers still running at the end get SIGTERM."""
     with contextlib.ExitStack() as stack:
 
         def start(*options: str) -> "subprocess.Popen[str]":
@@ -96,7 +96,7 @@ def compile_c(source: Path, out: Path, *options: str) -> None:
 
 
 def stop(process: "subprocess.Popen[str]") -> tuple[str, str]:
-    """Stop a server with SIGTERM if it still runs; what it said on stdout and stderr."""
+    """Stop a server with SIGTERM if it still runs; returns its stdout and stderr."""
     if process.poll() is None:
         process.send_signal(signal.SIGTERM)
     try:

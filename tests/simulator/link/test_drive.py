@@ -1,4 +1,4 @@
-"""A server in a process of its own against the same world driven in this one: bit-equal."""
+"""States from a server process are bit-identical to those of a World in this process."""
 
 import math
 import re
@@ -24,7 +24,7 @@ WAIT_S = 180.0
 
 
 def law(state: CarState) -> Command:
-    """The law of TORCS's reference laps, written as in lap.c."""
+    """The steering law of the TORCS reference laps, as in lap.c."""
     th = -state.angle
     wheel = -(
         state.to_middle
@@ -50,7 +50,7 @@ def reward_of(world: World) -> float:
     return step_reward(state.angle, state.to_middle, world.road.half_width, ended)
 
 
-def test_states_are_those_of_the_world_in_this_process(oval: str) -> None:
+def test_states_equal_those_of_a_local_world(oval: str) -> None:
     start = {"s": 400.0, "to_middle": 1.5, "angle": -0.05, "speed": 15.0}
     with World(Road(find_track("oval"), 2)) as world, Link(oval, wait_s=WAIT_S) as link:
         message = link.reset(seed=3, **start)
@@ -66,7 +66,7 @@ def test_states_are_those_of_the_world_in_this_process(oval: str) -> None:
             assert (message.step, message.score, message.seed) == (step, score, 3)
 
 
-def test_with_traffic_and_pictures_too(
+def test_states_and_images_equal_those_of_a_local_world_with_traffic(
     server: Callable[..., "subprocess.Popen[str]"], name: str
 ) -> None:
     from simulator.camera import Camera, Light
@@ -95,7 +95,7 @@ def test_with_traffic_and_pictures_too(
             assert picture.std() > 5.0
 
 
-def test_the_servers_description_is_complete(oval: str) -> None:
+def test_server_info_describes_road_car_and_camera(oval: str) -> None:
     road = Road(find_track("oval"), 2)
     with Link(oval, wait_s=WAIT_S) as link:
         info = link.info
@@ -106,7 +106,7 @@ def test_the_servers_description_is_complete(oval: str) -> None:
     assert info.beam_angles == pytest.approx(np.radians(np.arange(90, -91, -10)))
 
 
-def test_the_c_client_drives_a_lap_bit_equal_to_python(
+def test_a_lap_of_the_c_client_is_bit_identical_to_python(
     oval: str, lap_program: Path, tmp_path: Path
 ) -> None:
     log = tmp_path / "log"

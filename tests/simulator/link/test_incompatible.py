@@ -1,4 +1,4 @@
-"""Segments that do not fit: another version, byte order or size; told by both clients."""
+"""Segments of another version, byte order or size are refused by the Python and the C client."""
 
 import subprocess
 from collections.abc import Callable
@@ -49,7 +49,7 @@ def other(**values: Any) -> Callable[[Any], None]:
     return change
 
 
-def test_the_header_comes_back_as_it_was_written(name: str) -> None:
+def test_header_round_trip(name: str) -> None:
     segment = stranger(name, other())
     assert read_header(segment) == INFO
     segment.close()
@@ -66,7 +66,7 @@ BAD = [
 
 
 @pytest.mark.parametrize(("change", "extra", "said"), BAD, ids=[said for _, _, said in BAD])
-def test_both_clients_refuse_it(
+def test_both_clients_refuse_an_incompatible_segment(
     name: str, lap_program: Path, change: Callable[[Any], None], extra: int, said: str
 ) -> None:
     segment = stranger(name, change, extra)
@@ -78,7 +78,7 @@ def test_both_clients_refuse_it(
     assert said in done.stderr
 
 
-def test_a_refused_client_leaves_room_for_the_next(name: str) -> None:
+def test_a_refused_client_releases_its_lock(name: str) -> None:
     segment = stranger(name, other(version=2))
     for _ in range(2):
         with pytest.raises(LayoutMismatch):
@@ -111,7 +111,7 @@ def test_waiting_for_a_server_times_out(name: str) -> None:
 def test_an_old_c_program_is_told_to_recompile(
     oval: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A C client compiled with the header of a layout before this one."""
+    """A C client compiled with an older layout's header is told to recompile."""
     import shutil
     from importlib.resources import files
 

@@ -1,4 +1,4 @@
-"""The layout's tables, the C header made from them, and what a compiler thinks of it."""
+"""The layout's tables, the C header generated from them, and its compilation."""
 
 import shutil
 import subprocess
@@ -18,7 +18,7 @@ from simulator.vehicle.state import CarState, Command
 COMMITTED = Path(str(files("simulator.link").joinpath("c/driverview_link.h")))
 
 
-def test_blocks_follow_each_other_without_holes() -> None:
+def test_blocks_are_contiguous() -> None:
     end = 0
     for block in BLOCKS:
         assert block.offset == end
@@ -38,12 +38,12 @@ def test_messages_begin_with_the_sequence_and_end_with_the_checksum() -> None:
         assert block.fields[-1].name == "check"
 
 
-def test_every_field_of_a_state_and_a_command_has_a_place() -> None:
+def test_every_state_and_command_field_is_in_the_layout() -> None:
     assert {f.name for f in fields(CarState)} <= {f.name for f in STATE.fields}
     assert {f.name for f in fields(Command)} <= {f.name for f in COMMAND.fields}
 
 
-def test_the_hash_sees_a_change_of_name_type_count_and_order(
+def test_layout_hash_changes_with_name_type_count_and_order(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     before = layout.layout_hash()
@@ -61,26 +61,26 @@ def test_the_hash_sees_a_change_of_name_type_count_and_order(
     assert layout.layout_hash() == before
 
 
-def test_a_picture_takes_whole_words() -> None:
+def test_image_size_is_rounded_up_to_whole_words() -> None:
     assert image_bytes(0, 0) == 0
     assert image_bytes(280, 210) == 176400
     assert image_bytes(9, 9) == 248  # 243 bytes
 
 
-def test_the_committed_header_is_the_generated_one() -> None:
+def test_committed_header_equals_the_generated_one() -> None:
     assert COMMITTED.read_text() == c_header(), (
         "run: simulator link --header simulator/link/c/driverview_link.h"
     )
 
 
-def test_header_option_writes_it(tmp_path: Path) -> None:
+def test_header_option_writes_the_header(tmp_path: Path) -> None:
     out = tmp_path / "link.h"
     command = [sys.executable, "-m", "simulator", "link", "--header", str(out)]
     subprocess.run(command, check=True, timeout=300)
     assert out.read_text() == c_header()
 
 
-def test_gcc_lays_every_field_where_the_tables_say(tmp_path: Path) -> None:
+def test_c_field_offsets_equal_the_layouts(tmp_path: Path) -> None:
     if shutil.which("gcc") is None:
         pytest.skip("no gcc on this machine")
     rows = [(f"struct drvlink_{block.name}", f.name) for block in BLOCKS for f in block.fields]

@@ -1,4 +1,4 @@
-"""Names, the two ends' locks, what is left by the dead, what belongs to others."""
+"""Shared-memory segments: names, role locks, segments of killed processes and of other programs."""
 
 import os
 import resource
@@ -19,7 +19,7 @@ SHM = Path("/dev/shm")
 
 
 def server_end(name: str) -> Segment:
-    """A published segment with nothing but the mark in it."""
+    """A published segment that contains only the magic number."""
     segment = create(name, SIZE)
     segment.memory[: len(MAGIC)] = MAGIC
     segment.publish()
@@ -46,11 +46,11 @@ def test_bad_names_are_refused(name: str, said: str) -> None:
         attach(name)
 
 
-def test_the_longest_name_works() -> None:
+def test_the_longest_allowed_name_is_accepted() -> None:
     assert check_name("/" + "x" * 249)
 
 
-def test_each_role_is_held_once_and_sees_the_other(name: str) -> None:
+def test_each_role_is_exclusive_and_detects_the_other(name: str) -> None:
     ours = server_end(name)
     assert not ours.peer_is_alive()
     with pytest.raises(NameInUse, match="is running"):
@@ -75,7 +75,7 @@ def test_attaching_without_a_server_is_refused(name: str) -> None:
 
 
 def killed_owner(name: str) -> None:
-    """Let a process make the segment, and kill it."""
+    """Create the segment in another process, and kill that process."""
     code = (
         "import time; from simulator.link.segment import create;"
         f"held = create({name!r}, {SIZE}); held.memory[:8] = {MAGIC!r}; held.publish();"
@@ -98,7 +98,7 @@ def test_a_new_server_takes_over_from_a_killed_one(name: str) -> None:
     ours.close()
 
 
-def test_a_client_that_finds_a_killed_server_cleans_up(name: str) -> None:
+def test_a_client_removes_the_segment_of_a_killed_server(name: str) -> None:
     killed_owner(name)
     with pytest.raises(NoServer, match="has died"):
         attach(name)
@@ -112,7 +112,7 @@ def test_a_segment_is_invisible_before_it_is_published(name: str) -> None:
     ours.close()
 
 
-def test_clearing_leaves_a_running_server_alone(name: str) -> None:
+def test_remove_stale_keeps_the_segment_of_a_running_server(name: str) -> None:
     remove_stale(name)
     killed_owner(name)
     remove_stale(name)
@@ -135,7 +135,7 @@ def test_a_client_of_a_killed_server_does_not_remove_its_successors_segment(name
     second.close()
 
 
-def test_the_memory_of_another_program_is_left_alone(name: str) -> None:
+def test_shared_memory_of_another_program_is_not_touched(name: str) -> None:
     path = SHM / name[1:]
     path.write_bytes(b"somebody else's")
     for action in (lambda: server_end(name), lambda: attach(name), lambda: remove_stale(name)):
@@ -145,7 +145,7 @@ def test_the_memory_of_another_program_is_left_alone(name: str) -> None:
     path.unlink()
 
 
-def test_a_lack_of_memory_is_an_error_and_leaves_no_segment(name: str) -> None:
+def test_out_of_memory_raises_and_leaves_no_segment(name: str) -> None:
     code = (
         "import resource; from simulator.link.segment import create;"
         "resource.setrlimit(resource.RLIMIT_FSIZE, (65536, resource.RLIM_INFINITY));"

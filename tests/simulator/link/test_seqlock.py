@@ -1,4 +1,4 @@
-"""The sequence lock step by step, then against writers at full speed and killed processes."""
+"""The sequence lock: single operations, then concurrent writers and killed processes."""
 
 import json
 import shutil
@@ -18,7 +18,7 @@ BOUND_S = 2.0
 
 
 class Block:
-    """One direction in ordinary memory, with both sides' own copies."""
+    """One message direction in ordinary memory, with the writer's and the reader's local copies."""
 
     def __init__(self) -> None:
         self.shared, self.picture = np.zeros(WORDS, np.uint64), np.zeros(PICTURE, np.uint64)
@@ -53,7 +53,7 @@ def test_nothing_is_read_during_a_write() -> None:
     assert block.read() == (NOTHING, 0)
 
 
-def test_a_writer_continues_after_a_killed_one() -> None:
+def test_a_new_writer_continues_after_a_killed_writer() -> None:
     block = Block()
     block.write(7)
     block.sequence[0] += 1
@@ -63,7 +63,7 @@ def test_a_writer_continues_after_a_killed_one() -> None:
     assert set(block.copy[1:-1].tolist()) == {8}
 
 
-def test_the_checksum_sees_any_changed_word() -> None:
+def test_checksum_detects_any_changed_word() -> None:
     for word in range(1, WORDS):
         block = Block()
         block.write(7)
@@ -80,7 +80,7 @@ def test_the_sequence_wraps_around() -> None:
 
 
 def test_the_checksum_is_fnv_1a() -> None:
-    """Against Python's integers; the offset and the prime are those of the published hash."""
+    """Equals FNV-1a in Python integers, with the published offset and prime."""
     message = np.arange(WORDS, dtype=np.uint64) * np.uint64(0x9E3779B97F4A7C15)
     value = 0xCBF29CE484222325
     for word in message[1:-1].tolist():
@@ -90,8 +90,8 @@ def test_the_checksum_is_fnv_1a() -> None:
 
 @pytest.mark.slow
 @pytest.mark.alone
-def test_no_torn_message_no_hang_and_nothing_leaked() -> None:
-    """The benchmark, small: 20,000 messages each way while there is time, each kind of kill."""
+def test_no_torn_messages_hangs_or_leaks_under_load() -> None:
+    """A short run of the benchmark: up to 20,000 messages each way, and each kind of kill."""
     if shutil.which("gcc") is None:
         pytest.skip("no gcc on this machine")
     counts = ("--messages", "20000", "--patience", "5", "--kills", "4", "--steps", "0")

@@ -1,4 +1,4 @@
-"""Clients that come, leave, err and die; a server that goes on, or ends as it is told."""
+"""Sessions of a link server: clients that connect, err, leave or die, and the server's end."""
 
 import json
 import math
@@ -98,7 +98,7 @@ def test_a_step_needs_an_episode_that_has_not_ended(oval: str) -> None:
         assert link.reset(seed=1).ended is None
 
 
-def test_an_unknown_request_is_answered(oval: str) -> None:
+def test_an_unknown_request_is_answered_with_an_error(oval: str) -> None:
     with Link(oval, wait_s=WAIT_S) as link:
         link.reset(seed=1)
         link._outbox.record["request"] = 99
@@ -108,7 +108,7 @@ def test_an_unknown_request_is_answered(oval: str) -> None:
         assert link.step(Command()).step == 1
 
 
-def test_a_damaged_command_is_answered(oval: str) -> None:
+def test_a_command_with_a_bad_checksum_is_answered_with_an_error(oval: str) -> None:
     with Link(oval, wait_s=WAIT_S) as link:
         link.reset(seed=1)
         words = link._outbox._buffer.arrays[1]
@@ -121,7 +121,7 @@ def test_a_damaged_command_is_answered(oval: str) -> None:
         assert link.step(Command()).step == 1
 
 
-def test_seeds_the_client_does_not_name_are_the_servers(oval: str) -> None:
+def test_a_reset_without_a_seed_uses_the_servers_seed(oval: str) -> None:
     with Link(oval, wait_s=WAIT_S) as link:
         first = link.reset()
         second = link.reset()
@@ -130,14 +130,14 @@ def test_seeds_the_client_does_not_name_are_the_servers(oval: str) -> None:
         assert link.reset(seed=11).seed == 11
 
 
-def test_one_client_at_a_time(oval: str) -> None:
+def test_a_second_client_is_refused(oval: str) -> None:
     with Link(oval, wait_s=WAIT_S), pytest.raises(NameInUse, match="has a client already"):
         Link(oval)
     with Link(oval) as after:
         assert after.reset(seed=1).step == 0
 
 
-def test_an_episode_ends_with_its_client(oval: str) -> None:
+def test_an_episode_ends_when_its_client_leaves(oval: str) -> None:
     with Link(oval, wait_s=WAIT_S) as link:
         link.reset(seed=1)
     with Link(oval) as link, pytest.raises(Refused, match="no episode yet"):
@@ -154,14 +154,14 @@ def test_a_closed_link_raises(oval: str) -> None:
         link.latest()
 
 
-def test_a_second_server_of_the_name_is_refused(oval: str) -> None:
+def test_a_second_server_with_the_same_name_is_refused(oval: str) -> None:
     with Link(oval, wait_s=WAIT_S):
         done = run_server("--name", oval, "--track", "oval")
     assert done.returncode == 1
     assert one_error(done).startswith(f"error: a server of the link {oval} is running")
 
 
-def test_quit_ends_the_server_which_prints_its_counts(name: str) -> None:
+def test_quit_ends_the_server_and_prints_its_summary(name: str) -> None:
     with serving(LinkConfig(name=name, track="oval")) as served, Link(name, wait_s=WAIT_S) as link:
         link.reset(seed=1)
         for _ in range(5):
@@ -180,9 +180,7 @@ def test_quit_ends_the_server_which_prints_its_counts(name: str) -> None:
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_a_stopped_server_tells_its_client_and_prints_json(
-    server: Start, name: str, number: int
-) -> None:
+def test_sigterm_notifies_the_client_and_prints_json(server: Start, name: str, number: int) -> None:
     process = server("--track", "oval", "--json")
     with Link(name, wait_s=WAIT_S) as link:
         link.reset(seed=1)
@@ -210,7 +208,7 @@ def test_a_suspended_server_times_out_after_two_seconds(server: Start, name: str
         assert link.reset(seed=1).step == 0
 
 
-def test_once_ends_with_the_first_client(name: str) -> None:
+def test_once_ends_the_server_when_its_client_leaves(name: str) -> None:
     with serving(LinkConfig(name=name, track="oval", once=True)) as served:
         with Link(name, wait_s=WAIT_S) as link:
             link.reset(seed=1)
@@ -259,7 +257,7 @@ def test_real_time_steps_without_commands(name: str) -> None:
         link.quit()
 
 
-def test_in_real_time_without_a_command_the_car_stands(name: str) -> None:
+def test_in_real_time_the_car_stands_until_a_command_arrives(name: str) -> None:
     config = LinkConfig(name=name, track="oval", realtime=True, frequency_hz=100)
     with serving(config), Link(name, wait_s=WAIT_S) as link:
         link.reset(seed=1)
@@ -310,7 +308,7 @@ def test_bad_image_sizes_are_refused(text: str) -> None:
         (("--header", "/no/such/folder/x.h"), "/no/such/folder"),
     ],
 )
-def test_errors_of_the_command_are_one_line(options: tuple[str, ...], said: str) -> None:
+def test_errors_of_the_link_command_are_one_line(options: tuple[str, ...], said: str) -> None:
     done = run_server(*options)
     assert done.returncode == 1
     assert said in one_error(done)

@@ -1,4 +1,4 @@
-"""Sensors: range beams against brute force and by hand, units, noise, a sensor of the user's."""
+"""Sensors: range beams against brute force and closed forms, units, noise, custom sensors."""
 
 import math
 
@@ -41,7 +41,7 @@ def test_range_beams_agree_with_brute_force(name: str, lanes: int) -> None:
 
 
 @pytest.mark.parametrize(("name", "lanes", "traffic"), [("circuit", 1, 0), ("town", 3, 12)])
-def test_both_sets_of_beams_agree_with_brute_force_during_a_drive(
+def test_range_and_range_traffic_agree_with_brute_force_in_a_drive(
     name: str, lanes: int, traffic: int
 ) -> None:
     road = Road(find_track(name), lanes)
@@ -62,7 +62,7 @@ def test_both_sets_of_beams_agree_with_brute_force_during_a_drive(
     assert (cut_short > 20) == (traffic > 0)
 
 
-def test_beams_across_a_straight_are_its_sides() -> None:
+def test_sideways_beams_on_a_straight_measure_to_its_edges() -> None:
     with World(Road(find_track("oval"))) as world:
         s = _straight(world.road)
         world.reset(seed=0, s=s, to_middle=1.0)
@@ -90,7 +90,7 @@ def test_a_beam_ends_at_a_box() -> None:
     assert beams[8] == RANGE_M  # 10 deg passes 3.1 m to the left of the box ahead
 
 
-def test_traffic_is_seen_by_the_second_set_only() -> None:
+def test_only_range_traffic_detects_traffic() -> None:
     with World(Road(find_track("oval")), traffic=1) as world:
         s = _straight(world.road)
         world.reset(seed=0, s=s)
@@ -123,7 +123,7 @@ def test_readings_have_the_papers_units() -> None:
     assert readings["lap_timer"] == pytest.approx(0.05)
 
 
-def test_the_papers_table_is_complete() -> None:
+def test_standard_sensors_are_those_of_the_papers_table() -> None:
     inf, pi = math.inf, math.pi
     table = {
         "range": (0.0, 200.0, "m"),
@@ -143,7 +143,7 @@ def test_the_papers_table_is_complete() -> None:
     assert declared == table | {"range_traffic": table["range"]}
 
 
-def test_the_camera_is_a_sensor_of_the_table() -> None:
+def test_camera_sensor_returns_the_rendered_image() -> None:
     road = Road(find_track("oval"))
     light = Light.named("clear", np.random.default_rng(0))
     camera_parameters = CameraParameters(96, 72)
@@ -196,7 +196,7 @@ def test_noise_is_off_by_default_seeded_and_of_the_size_asked_for() -> None:
     assert np.std(ranges) == pytest.approx(0.5, rel=0.05)
 
 
-def test_noise_respects_limits_and_the_off_track_value() -> None:
+def test_noise_keeps_limits_and_the_off_track_value() -> None:
     with World(Road(find_track("oval"))) as world:
         world.reset(seed=0, s=_straight(world.road))
         suite = SensorSuite(STANDARD, seed=7, noise={"range": 300.0})

@@ -1,4 +1,4 @@
-"""Track files that are hostile or broken: one clear line each, and nothing opened on their word."""
+"""Malformed or malicious track files raise one-line errors; files that they name stay closed."""
 
 import math
 import os
@@ -50,14 +50,14 @@ def refused(path: Path) -> str:
         ),
     ],
 )
-def test_wrong_values_are_named(tmp_path: Path, old: str, new: str, said: str) -> None:
+def test_errors_name_the_invalid_value(tmp_path: Path, old: str, new: str, said: str) -> None:
     assert old in STADIUM
     path = tmp_path / "bad.xml"
     path.write_text(STADIUM.replace(old, new))
     assert said in refused(path)
 
 
-def test_a_gap_of_more_than_the_tolerance(tmp_path: Path) -> None:
+def test_a_track_with_a_gap_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "gap.xml"
     first = STADIUM.replace('name="lg" val="100"', 'name="lg" val="100.25"', 1)
     path.write_text(first)
@@ -66,13 +66,13 @@ def test_a_gap_of_more_than_the_tolerance(tmp_path: Path) -> None:
     assert "0.30 m from their start" in refused(path)
 
 
-def test_no_segments(tmp_path: Path) -> None:
+def test_a_track_without_segments_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "empty.xml"
     path.write_text(STADIUM.replace('attstr name="type"', 'attstr name="kind"'))
     assert "no segments" in refused(path)
 
 
-def test_entity_bomb(tmp_path: Path) -> None:
+def test_an_entity_expansion_bomb_is_refused(tmp_path: Path) -> None:
     levels = "".join(f'<!ENTITY l{i} "{f"&l{i - 1};" * 10}">' for i in range(1, 10))
     path = tmp_path / "bomb.xml"
     path.write_text(f'<!DOCTYPE params [<!ENTITY l0 "lol">{levels}]><params name="x">&l9;</params>')
@@ -80,7 +80,7 @@ def test_entity_bomb(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["default-pits", "default-surfaces"])
-def test_external_and_own_entities(tmp_path: Path, name: str) -> None:
+def test_external_and_internal_entities_are_refused(tmp_path: Path, name: str) -> None:
     secret = tmp_path / "secret.txt"
     secret.write_text('<attstr name="read" val="yes"/>')
     path = tmp_path / "outside.xml"
@@ -91,7 +91,7 @@ def test_external_and_own_entities(tmp_path: Path, name: str) -> None:
     assert "entities" in refused(path)
 
 
-def test_parameter_entities_and_undeclared_ones(tmp_path: Path) -> None:
+def test_parameter_and_undeclared_entities_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "parameter.xml"
     path.write_text('<!DOCTYPE params [<!ENTITY % p SYSTEM "file:///etc/passwd"> %p;]><params/>')
     assert "entities" in refused(path)
@@ -113,13 +113,13 @@ def test_parameter_entities_and_undeclared_ones(tmp_path: Path) -> None:
     ],
     ids=["empty", "text", "cut", "binary", "encoding", "utf8", "html", "nested"],
 )
-def test_not_a_track_file(tmp_path: Path, content: bytes) -> None:
+def test_files_that_are_no_track_are_refused(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "broken.xml"
     path.write_bytes(content)
     refused(path)
 
 
-def test_too_large(tmp_path: Path) -> None:
+def test_a_file_over_the_size_limit_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "large.xml"
     path.write_bytes(b"<params>" + b" " * (5 * 2**20) + b"</params>")
     assert "bytes" in refused(path)
@@ -140,13 +140,13 @@ def test_a_bad_file_in_a_folder_is_skipped_with_a_warning(
 
 
 @pytest.mark.parametrize("encoding", ["undefined", "punycode", "no-such-code"])
-def test_an_encoding_that_is_none(tmp_path: Path, encoding: str) -> None:
+def test_an_unknown_encoding_is_refused(tmp_path: Path, encoding: str) -> None:
     path = tmp_path / "odd.xml"
     path.write_text(f'<?xml version="1.0" encoding="{encoding}"?>\n<params name="\u00e9"/>')
     assert "cannot be read as text" in refused(path)
 
 
-def test_pipes_are_not_waited_for(tmp_path: Path) -> None:
+def test_named_pipes_are_skipped(tmp_path: Path) -> None:
     (tmp_path / "deep").mkdir()
     for name in ("flat.csv", "deep/deep.xml"):
         os.mkfifo(tmp_path / name)

@@ -1,4 +1,4 @@
-"""Centre-line CSV, in the format of the TUM racetrack database: there and back, and mistakes."""
+"""Centre lines as CSV in the format of the TUM racetrack database: reading, writing, bad files."""
 
 import math
 from pathlib import Path
@@ -19,7 +19,7 @@ def circle(radius: float = 80.0, count: int = 100) -> list[str]:
 
 
 @pytest.mark.parametrize("repeat_first", [False, True])
-def test_a_circle_is_a_circle(tmp_path: Path, repeat_first: bool) -> None:
+def test_points_of_a_circle_give_its_radius_and_length(tmp_path: Path, repeat_first: bool) -> None:
     path = tmp_path / "ring.csv"
     points = circle()
     path.write_text(HEADER + "\n".join(points + points[:1] * repeat_first) + "\n")
@@ -32,8 +32,8 @@ def test_a_circle_is_a_circle(tmp_path: Path, repeat_first: bool) -> None:
 
 
 @pytest.mark.parametrize("name", ["circuit", "coast"])
-def test_there_and_back(tmp_path: Path, name: str) -> None:
-    """An own track, surveyed every 5 m with 2 cm of noise, comes back within 0.25 m."""
+def test_a_sampled_track_round_trips(tmp_path: Path, name: str) -> None:
+    """A track sampled every 5 m with 2 cm of noise is read back within 0.25 m."""
     track = find_track(name)
     s = np.linspace(0.0, track.length_m, int(track.length_m / 5), endpoint=False)
     pose = track.at(s)
@@ -52,10 +52,10 @@ def test_there_and_back(tmp_path: Path, name: str) -> None:
 
 @pytest.mark.parametrize("noise", [0.1, 0.2])
 @pytest.mark.parametrize("spacing", [2.0, 5.0])
-def test_a_noisy_survey_is_smoothed_by_its_own_noise(
+def test_smoothing_adapts_to_the_estimated_noise(
     tmp_path: Path, noise: float, spacing: float
 ) -> None:
-    """Unevenly spaced points, each off by 0.1 or 0.2 m, widths too: still the road it was."""
+    """Unevenly spaced points and widths with 0.1 or 0.2 m of noise still give the original road."""
     track = find_track("coast")
     count = int(track.length_m / spacing)
     rng = np.random.default_rng([7, int(10 * noise), int(spacing)])
@@ -75,7 +75,7 @@ def test_a_noisy_survey_is_smoothed_by_its_own_noise(
     assert np.abs(offsets).max() < 3.0 * noise
 
 
-def test_written_centre_line(tmp_path: Path) -> None:
+def test_written_rows_equal_the_track(tmp_path: Path) -> None:
     track = find_track("mountain-pass")
     path = tmp_path / "line.csv"
     rows = write_centre_line(track, 2.5, path)
@@ -108,7 +108,7 @@ def test_written_centre_line(tmp_path: Path) -> None:
         ([line.replace("5.5,6.0", "55,60") for line in circle()], "widths"),
     ],
 )
-def test_mistakes_are_named(tmp_path: Path, lines: list[str], said: str) -> None:
+def test_errors_name_the_fault(tmp_path: Path, lines: list[str], said: str) -> None:
     path = tmp_path / "bad.csv"
     path.write_text(HEADER + "\n".join(lines))
     with pytest.raises(TrackError, match=r"bad\.csv") as caught:

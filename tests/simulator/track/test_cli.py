@@ -1,4 +1,4 @@
-"""`simulator tracks` and `simulator centreline`, as a script outside this project calls them."""
+"""The commands `simulator tracks` and `simulator centreline`, run as subprocesses."""
 
 import json
 import subprocess
@@ -19,7 +19,7 @@ def simulator(*arguments: str) -> subprocess.CompletedProcess[str]:
     return typed("simulator", *arguments)
 
 
-def test_tracks_as_json() -> None:
+def test_tracks_json_lists_every_track() -> None:
     done = simulator("tracks", "--tracks-dir", str(FIXTURES), "--json")
     assert done.returncode == 0
     rows = {row["name"]: row for row in json.loads(done.stdout)}
@@ -32,7 +32,7 @@ def test_tracks_as_json() -> None:
     assert (ring["width_m"], ring["min_radius_m"]) == (20.0, 100.0)
 
 
-def test_centre_line_of_a_file(tmp_path: Path) -> None:
+def test_centreline_writes_the_csv_of_a_track_file(tmp_path: Path) -> None:
     out = tmp_path / "line.csv"
     done = simulator(
         "centreline", str(FIXTURES / "sticky-grade.xml"), "--step", "10", "--out", str(out)
@@ -62,7 +62,7 @@ def test_centre_line_of_a_file(tmp_path: Path) -> None:
         (("tracks", "--tracks-dir", "/no/such/folder"), "/no/such/folder"),
     ],
 )
-def test_mistakes_end_in_one_line(arguments: tuple[str, ...], said: str) -> None:
+def test_errors_are_one_line(arguments: tuple[str, ...], said: str) -> None:
     done = simulator(*arguments)
     assert done.returncode == 1
     assert done.stderr.startswith("error: ")
@@ -71,7 +71,7 @@ def test_mistakes_end_in_one_line(arguments: tuple[str, ...], said: str) -> None
     assert done.stdout == ""
 
 
-def test_a_name_with_brackets_is_listed_as_it_is(tmp_path: Path) -> None:
+def test_a_name_with_brackets_is_printed_verbatim(tmp_path: Path) -> None:
     folder = tmp_path / "[b]"
     folder.mkdir()
     (folder / "x[red].toml").write_bytes((OWN_TRACKS / "oval.toml").read_bytes())
@@ -81,7 +81,7 @@ def test_a_name_with_brackets_is_listed_as_it_is(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("option", [("--seed", "-1"), ("--traffic", "-1"), ("--traffic", "500")])
-def test_a_snapshot_out_of_range(tmp_path: Path, option: tuple[str, str]) -> None:
+def test_snapshot_options_out_of_range_are_refused(tmp_path: Path, option: tuple[str, str]) -> None:
     done = simulator("snapshot", "oval", "--out", str(tmp_path / "x.png"), *option)
     assert done.returncode == 2
     assert "Traceback" not in done.stderr
@@ -91,7 +91,7 @@ def test_a_snapshot_out_of_range(tmp_path: Path, option: tuple[str, str]) -> Non
 
 
 @pytest.mark.usefixtures("no_torcs_install")
-def test_torcs_variable_may_name_either_folder(
+def test_torcs_tracks_variable_may_name_the_folder_or_its_parent(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = tmp_path / "tracks" / "road" / "ring"
@@ -109,7 +109,7 @@ def test_torcs_variable_may_name_either_folder(
 
 
 @pytest.mark.usefixtures("no_torcs_install")
-def test_unknown_names_and_folders(tmp_path: Path) -> None:
+def test_unknown_track_names_and_folders_are_refused(tmp_path: Path) -> None:
     with pytest.raises(UnknownTrack, match=r"no track 'g-track-3'.*--tracks-dir"):
         find_track("g-track-3", tmp_path)
     with pytest.raises(UserError, match="no folder"):

@@ -39,7 +39,7 @@ def apart(track: Track, a: float, b: float) -> float:
     return abs((a - b + track.length_m / 2) % track.length_m - track.length_m / 2)
 
 
-def test_stadium_in_closed_form() -> None:
+def test_stadium_matches_its_closed_form() -> None:
     assert STADIUM.length_m == pytest.approx(LAP)
     assert STADIUM.min_radius_m == pytest.approx(50.0)
     assert STADIUM.z_range_m == pytest.approx(6.0)
@@ -70,8 +70,8 @@ def test_wrap_angle_keeps_pi() -> None:
     name=st.sampled_from(["stadium", "mountain-pass"]),
 )
 @example(share=1e-9, y=-4.0, wrong_by=0.0, name="mountain-pass")
-def test_projection_undoes_at(share: float, y: float, wrong_by: float, name: str) -> None:
-    """At the joint where a lap closes, to 1e-6 rad, a point beside it belongs to either piece."""
+def test_project_inverts_at(share: float, y: float, wrong_by: float, name: str) -> None:
+    """At the closing joint, which has a kink of up to 1e-6 rad, either piece is correct."""
     limit = 1e-6 * (1.0 + abs(y))
     track = STADIUM if name == "stadium" else MOUNTAIN
     s = share * track.length_m
@@ -85,7 +85,7 @@ def test_projection_undoes_at(share: float, y: float, wrong_by: float, name: str
 @settings(max_examples=100, deadline=None)
 @given(x=st.floats(-300.0, 600.0), y=st.floats(-150.0, 600.0))
 def test_projection_finds_the_nearest_point(x: float, y: float) -> None:
-    """Anywhere, inside hairpins and far off, no sampled point of the lap is nearer."""
+    """No sampled point of the lap is nearer than the projection, even in hairpins and far off."""
     s = np.arange(0.0, MOUNTAIN.length_m, 0.25)
     pose = MOUNTAIN.at(s)
     brute = float(np.hypot(pose.x - x, pose.y - y).min())
@@ -97,7 +97,7 @@ def test_projection_finds_the_nearest_point(x: float, y: float) -> None:
     assert abs(to_middle) == pytest.approx(distance, abs=1e-4)
 
 
-def test_a_hint_tells_the_bridge_from_the_road_below() -> None:
+def test_a_hint_distinguishes_a_bridge_from_the_road_below() -> None:
     lap = EIGHT.length_m
     end = EIGHT.at(lap - 1e-9)
     assert (float(end.x), float(end.y)) == pytest.approx((0.0, 0.0), abs=1e-6)
@@ -119,7 +119,7 @@ def test_a_wrong_hint_is_corrected() -> None:
 
 @pytest.mark.parametrize("s", [3.0, 150.0, 250.0, 330.0, 500.0])
 @pytest.mark.parametrize("y", [-4.0, 0.0, 6.0])
-def test_surface_normal_is_that_of_the_plane_through_near_points(s: float, y: float) -> None:
+def test_surface_normal_equals_that_of_nearby_points(s: float, y: float) -> None:
     table = STADIUM.arrays()
     index = piece_table.index_at(table, s)
     z, *normal = piece_table.surface(table, index, s, y)
@@ -131,7 +131,7 @@ def test_surface_normal_is_that_of_the_plane_through_near_points(s: float, y: fl
     assert normal == pytest.approx(expected / np.linalg.norm(expected), abs=1e-6)
 
 
-def test_compiled_pose_and_arrays_agree() -> None:
+def test_compiled_pose_equals_the_vectorised_one() -> None:
     for s in (-5.0, 0.0, 77.7, 1234.5, MOUNTAIN.length_m, 3000.0):
         x, y, z, heading, curvature = piece_table.pose_at(MOUNTAIN.arrays(), s)
         pose = MOUNTAIN.at(s)
@@ -141,14 +141,14 @@ def test_compiled_pose_and_arrays_agree() -> None:
         assert MOUNTAIN.heading(s) == pytest.approx(float(pose.heading))
 
 
-def test_content_hash_is_of_the_geometry() -> None:
+def test_equal_geometry_has_an_equal_content_hash() -> None:
     again = _samples().stadium()
     assert again.content_hash == STADIUM.content_hash
     assert len(STADIUM.content_hash) == 64
     assert EIGHT.content_hash != STADIUM.content_hash
 
 
-def test_road_lays_lanes_on_a_track() -> None:
+def test_road_widths_and_marking_offsets() -> None:
     narrow, wide = Road(STADIUM), Road(STADIUM, lanes=3)
     assert (narrow.half_width, narrow.half_asphalt, narrow.edge) == (5.0, 3.0, 5.0)
     assert (wide.half_width, wide.half_asphalt, wide.edge, wide.wall_offset) == (5.0, 7.0, 7.0, 9.5)

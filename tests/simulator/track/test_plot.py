@@ -1,4 +1,4 @@
-"""`simulator tracks plot`: what is drawn is the track, and mistakes end in one line."""
+"""The command `simulator tracks plot`: contents of the figure, and one-line errors."""
 
 import subprocess
 import sys
@@ -22,7 +22,7 @@ def simulator(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]
     return typed("simulator", "tracks", *arguments, folder=folder)
 
 
-def test_the_lap_is_classed_by_the_shared_rule() -> None:
+def test_heading_classes_follow_the_shared_definition() -> None:
     lap = sample(COAST)
     track = COAST.track
     for k in range(0, len(lap.s), 97):
@@ -34,7 +34,7 @@ def test_the_lap_is_classed_by_the_shared_rule() -> None:
     assert {kind for *_, kind in runs(lap.classes)} == set(tf.Heading)
 
 
-def test_runs_join_end_to_end() -> None:
+def test_runs_are_contiguous() -> None:
     left, straight = tf.Heading.LEFT, tf.Heading.STRAIGHT
     found = runs(np.array([1, 1, 0, 0, 0, 1]))
     assert found == [(0, 2, straight), (2, 5, left), (5, 6, straight)]
@@ -47,7 +47,7 @@ def test_ticks_are_round_and_few(length: float) -> None:
     assert str(step).rstrip("0") in ("1", "2", "25", "5")
 
 
-def test_axes_hold_the_lap() -> None:
+def test_axis_limits_and_labels_match_the_lap() -> None:
     figure = draw(sample(COAST))
     plan, height, curvature, *_ = figure.axes
     assert height.get_xlim() == (0.0, COAST.track.length_m)
@@ -59,7 +59,7 @@ def test_axes_hold_the_lap() -> None:
     assert "3,176 m, 10 m wide" in plan.get_title(loc="left")
 
 
-def test_a_picture_of_every_class(tmp_path: Path) -> None:
+def test_every_class_is_drawn_in_its_colour(tmp_path: Path) -> None:
     out = tmp_path / "coast.png"
     write_plot(COAST, out)
     picture = cv2.imread(str(out))
@@ -71,14 +71,14 @@ def test_a_picture_of_every_class(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["coast.png"]
 
 
-def test_a_name_with_dollar_signs_is_drawn_as_text(tmp_path: Path) -> None:
+def test_a_name_with_dollar_signs_is_not_a_formula(tmp_path: Path) -> None:
     path = tmp_path / "a$b_$c^d.toml"
     path.write_bytes((OWN_TRACKS / "oval.toml").read_bytes())
     write_plot(Road(find_track(str(path))), tmp_path / "odd.png")
     assert (tmp_path / "odd.png").stat().st_size > 10_000
 
 
-def test_the_command(tmp_path: Path) -> None:
+def test_the_command_writes_a_png(tmp_path: Path) -> None:
     (tmp_path / "more").mkdir()
     (tmp_path / "more" / "loop.toml").write_bytes((OWN_TRACKS / "town.toml").read_bytes())
     named = simulator(tmp_path, "plot", "loop", "--tracks-dir", "more", "--lanes", "3")
@@ -98,7 +98,7 @@ def test_the_command(tmp_path: Path) -> None:
         (("oval", "--lanes", "4"), "a road of 4 lanes"),
     ],
 )
-def test_mistakes_end_in_one_line(tmp_path: Path, arguments: tuple[str, ...], said: str) -> None:
+def test_errors_are_one_line(tmp_path: Path, arguments: tuple[str, ...], said: str) -> None:
     done = simulator(tmp_path, "plot", *arguments)
     assert done.returncode == 1
     assert done.stderr.startswith("error: ")
@@ -107,7 +107,7 @@ def test_mistakes_end_in_one_line(tmp_path: Path, arguments: tuple[str, ...], sa
     assert list(tmp_path.iterdir()) == []
 
 
-def test_without_matplotlib_it_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_error_without_matplotlib_names_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     with pytest.raises(UserError, match="pip install matplotlib"):
         draw(sample(COAST))

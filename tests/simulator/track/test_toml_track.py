@@ -1,4 +1,4 @@
-"""The project's own tracks: they close, keep clear of themselves, and turn both ways."""
+"""The project's own tracks: closed loops, distance between parts, class balance, bad files."""
 
 import math
 from pathlib import Path
@@ -26,7 +26,7 @@ def classes(track: Track) -> np.ndarray:
     return np.bincount(found, minlength=3) / len(found)
 
 
-def test_each_of_the_ten_has_a_look_of_its_own() -> None:
+def test_each_of_the_ten_tracks_has_its_own_look() -> None:
     assert len(NAMES) >= 10
     assert {track.look for track in TRACKS.values()} <= set(LOOKS)
     assert len({track.look for track in TRACKS.values()}) == len(TRACKS)
@@ -34,7 +34,7 @@ def test_each_of_the_ten_has_a_look_of_its_own() -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_closes_to_the_millimetre(name: str) -> None:
+def test_every_track_closes_within_a_millimetre(name: str) -> None:
     track = TRACKS[name]
     before, start = track.at(track.length_m - 1e-6, [5.0, 0.0, -5.0]), track.at(0.0, [5.0, 0.0, -5])
     for axis in ("x", "y", "z"):
@@ -44,7 +44,7 @@ def test_closes_to_the_millimetre(name: str) -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_segments_have_the_lengths_and_angles_of_the_file(name: str) -> None:
-    """Closing may change a straight by a rounding of the file, no more; nor the grades."""
+    """Closing the loop changes straights by rounding errors only, and no grades."""
     import tomllib
 
     path = OWN_TRACKS / f"{name}.toml"
@@ -56,7 +56,7 @@ def test_segments_have_the_lengths_and_angles_of_the_file(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_is_a_road_one_can_drive(name: str) -> None:
+def test_radii_grades_and_widths_are_drivable(name: str) -> None:
     track = TRACKS[name]
     assert 1200.0 <= track.length_m <= 4000.0
     assert track.min_radius_m >= 25.0
@@ -75,7 +75,7 @@ def test_is_a_road_one_can_drive(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_three_lanes_keep_clear_of_each_other(name: str) -> None:
+def test_parts_of_a_track_do_not_come_near_each_other(name: str) -> None:
     """Parts of the road farther than 100 m along it are at least 45 m apart in the plane."""
     track = TRACKS[name]
     s = np.arange(0.0, track.length_m, 3.0)
@@ -86,7 +86,7 @@ def test_three_lanes_keep_clear_of_each_other(name: str) -> None:
     assert apart[along > 100.0].min() >= 45.0
 
 
-def test_classes_are_balanced_over_the_set() -> None:
+def test_heading_classes_are_balanced_over_all_tracks() -> None:
     shares = np.mean([classes(track) for track in TRACKS.values()], axis=0)
     assert shares.min() >= 0.15
     assert shares.max() <= 0.60
@@ -111,7 +111,7 @@ def test_classes_are_balanced_over_the_set() -> None:
         ("width = 14.0", "width = true", "True"),
     ],
 )
-def test_mistakes_are_named(tmp_path: Path, old: str, new: str, said: str) -> None:
+def test_errors_name_the_fault(tmp_path: Path, old: str, new: str, said: str) -> None:
     assert old in OVAL
     path = tmp_path / "bad.toml"
     path.write_text(OVAL.replace(old, new, 1) if old != "[[segment]]" else OVAL.replace(old, new))
@@ -121,7 +121,7 @@ def test_mistakes_are_named(tmp_path: Path, old: str, new: str, said: str) -> No
     assert "\n" not in str(caught.value)
 
 
-def test_a_square_with_known_figures(tmp_path: Path) -> None:
+def test_a_square_track_has_the_known_figures(tmp_path: Path) -> None:
     bend = '[[segment]]\ntype = "bend"\nradius = 40\nangle = 90\nspiral = 20\nbanking = 4\n'
     straight = '[[segment]]\ntype = "straight"\nlength = 100\n'
     path = tmp_path / "square.toml"
@@ -139,14 +139,14 @@ def test_a_square_with_known_figures(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("text", ["width = " + "9" * 5000, "width = " + "[" * 5000])
-def test_toml_that_python_cannot_parse_is_named(tmp_path: Path, text: str) -> None:
+def test_unparsable_toml_is_refused(tmp_path: Path, text: str) -> None:
     path = tmp_path / "deep.toml"
     path.write_text(text)
     with pytest.raises(TrackError, match=r"deep\.toml: not a readable TOML file"):
         read_track(path)
 
 
-def test_closing_must_leave_every_straight_a_length(tmp_path: Path) -> None:
+def test_a_straight_left_without_length_is_refused(tmp_path: Path) -> None:
     bend = '[[segment]]\ntype = "bend"\nradius = 40\nangle = 90\n'
 
     def straight(length: float) -> str:
@@ -160,7 +160,7 @@ def test_closing_must_leave_every_straight_a_length(tmp_path: Path) -> None:
         read_toml_track(path)
 
 
-def test_a_track_without_straights_names_its_file(tmp_path: Path) -> None:
+def test_error_for_a_track_without_straights_names_its_file(tmp_path: Path) -> None:
     bend = '[[segment]]\ntype = "bend"\nradius = 40\nangle = 120\n'
     path = tmp_path / "round.toml"
     path.write_text('look = "town"\nwidth = 8.0\n' + bend * 3)

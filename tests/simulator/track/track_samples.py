@@ -1,4 +1,4 @@
-"""Small tracks whose every figure is known: a stadium, and a figure of eight with a bridge."""
+"""Small tracks with known dimensions: a stadium, and a figure of eight with a bridge."""
 
 import math
 

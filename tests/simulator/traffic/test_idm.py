@@ -14,7 +14,7 @@ from simulator.traffic.idm import (
 )
 
 
-def test_free_road() -> None:
+def test_acceleration_on_a_free_road() -> None:
     assert idm_acceleration(math.inf, 0.0, 0.0, 15.0) == COMFORTABLE_ACCELERATION
     assert idm_acceleration(math.inf, 15.0, 0.0, 15.0) == 0.0
     half = idm_acceleration(math.inf, 7.5, 0.0, 15.0)
@@ -22,8 +22,8 @@ def test_free_road() -> None:
     assert idm_acceleration(math.inf, 40.0, 0.0, 10.0) == -COMFORTABLE_BRAKING
 
 
-def test_equilibrium_gap() -> None:
-    """Treiber's eq. 4: gap (s0 + v T) / sqrt(1 - (v/v0)^4) at equal speeds needs no action."""
+def test_no_acceleration_at_the_equilibrium_gap() -> None:
+    """The gap at equal speeds is (s0 + v T) / sqrt(1 - (v/v0)^4) (Treiber, eq. 4)."""
     speed, desired = 10.0, 15.0
     gap = (STANDSTILL_GAP_M + speed * TIME_HEADWAY_S) / math.sqrt(1 - (speed / desired) ** 4)
     assert idm_acceleration(gap, speed, speed, desired) == pytest.approx(0.0, abs=1e-12)

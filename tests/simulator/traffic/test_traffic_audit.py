@@ -1,4 +1,4 @@
-"""Twelve cars for ten minutes, the own car among them or parked: nobody touches anybody."""
+"""Twelve cars drive for ten minutes, with the ego car moving or parked, without a collision."""
 
 import math
 
@@ -27,7 +27,7 @@ def test_ten_minutes_of_traffic_without_a_violation(track: str, lanes: int, park
 
 
 def test_the_audit_detects_a_collision(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Traffic that does not look ahead runs into the car that is parked before it."""
+    """With leaders ignored, traffic hits a parked car, which the audit reports."""
     monkeypatch.setattr("simulator.traffic.traffic.Traffic._update_ego", lambda *_: None)
     with pytest.raises(TrafficViolation, match=r"hit traffic|overlap"):
         audit_traffic(Road(find_track("town"), 1), 300.0, parked=True)
@@ -67,7 +67,7 @@ def test_box_overlap_agrees_with_sampled_points() -> None:
 
 
 def test_centre_line_advance_across_a_joint_of_two_bends() -> None:
-    """s advances by the way over 1 - k y on either side, k changing where the pieces meet."""
+    """s advances by distance / (1 - k y), with the curvature k of the piece on each side."""
     track = find_track("town")
     table = track.arrays()
     joint = int(np.argmax(np.abs(np.diff(track.curvature0)))) + 1

@@ -1,4 +1,4 @@
-"""The car against closed-form physics: rolling, static loads, cornering, braking, the engine."""
+"""Car dynamics against closed forms: rolling, static loads, cornering, braking, engine."""
 
 import math
 from collections.abc import Callable
@@ -85,7 +85,7 @@ def test_a_coasting_car_conserves_energy_up_a_hill() -> None:
     assert states[-1].pitch == pytest.approx(-slope, abs=0.002)  # nose up is negative
 
 
-def test_static_loads_carry_the_weight_and_balance_it() -> None:
+def test_static_loads_balance_weight_and_moments() -> None:
     front, rear = CAR.static_loads
     assert 2 * (front + rear) == pytest.approx(CAR.total_mass * GRAVITY)
     assert front * CAR.front_axle == pytest.approx(rear * CAR.rear_axle)
@@ -151,7 +151,7 @@ def test_braking_is_limited_by_friction() -> None:
     assert (30.0 - gentle[-1].speed) == pytest.approx(force / inertia, abs=0.6)
 
 
-def test_steering_turns_at_its_own_rate() -> None:
+def test_steering_is_limited_by_its_rate() -> None:
     states = drive(CAR, 0.1, lambda _: Command(steer=1.0))
     per_step = CAR.steering_rate * 0.05 / CAR.steering_lock
     assert states[1].steer == pytest.approx(per_step, rel=1e-6)
@@ -185,7 +185,7 @@ def test_physics_step_is_five_milliseconds() -> None:
     assert DT == 0.005
 
 
-def test_the_tyres_stiffness_is_that_of_the_recorded_laps() -> None:
+def test_tyre_stiffness_matches_the_recorded_laps() -> None:
     # Fitted to yaw rate and side slip of TORCS's laps: 120 to 130 kN/rad, front and rear alike.
     for front in (True, False):
         assert 115e3 < CAR.cornering_stiffness(front, ASPHALT) < 135e3

@@ -1,4 +1,4 @@
-"""The compiled mover of the free body against PyBullet's own."""
+"""The compiled motion of a free rigid body equals PyBullet's."""
 
 import math
 
@@ -91,7 +91,7 @@ def near(road: Road, world: World, other: NDArray[np.float64], goes: float, shar
     return bool(contact_possible(params, table, motion, piece, 1e3, other, move, share))
 
 
-def test_contact_is_possible_before_a_touch_but_not_in_the_next_lane() -> None:
+def test_contact_is_predicted_before_a_touch_but_not_for_the_next_lane() -> None:
     road = Road(find_track("circuit"))
     with World(road) as world:
         state = world.reset(seed=0, s=5.0, speed=20.0)

@@ -1,4 +1,4 @@
-"""`simulator watch` as a user runs it: its first line, its end, and what can go wrong."""
+"""The command `simulator watch` as a subprocess: first line, Ctrl-C, one-line errors."""
 
 import json
 import os
@@ -29,7 +29,7 @@ def first_line(process: subprocess.Popen[str]) -> str:
 
 
 @pytest.mark.slow
-def test_every_flag_and_ctrl_c(tmp_path: Path) -> None:
+def test_every_option_is_accepted_and_ctrl_c_ends_it(tmp_path: Path) -> None:
     (tmp_path / "loop.toml").write_bytes((OWN_TRACKS / "town.toml").read_bytes())
     flags = ["--track", "loop", "--tracks-dir", str(tmp_path), "--lanes", "3", "--traffic", "2"]
     flags += ["--light", "overcast", "--host", "127.0.0.1", "--port", "0", "--speed", "3"]
@@ -82,7 +82,7 @@ def run(*flags: str, **environment: str) -> subprocess.CompletedProcess[str]:
         (("--host", "256.1.1.1"), "cannot listen on 256.1.1.1"),
     ],
 )
-def test_mistakes_end_in_one_line(flags: tuple[str, ...], said: str) -> None:
+def test_errors_are_one_line(flags: tuple[str, ...], said: str) -> None:
     done = run(*flags)
     assert done.returncode == 1
     assert done.stderr.startswith("error: ")
@@ -90,7 +90,7 @@ def test_mistakes_end_in_one_line(flags: tuple[str, ...], said: str) -> None:
     assert len(done.stderr.splitlines()) == 1
 
 
-def test_a_port_in_use_is_one_line() -> None:
+def test_error_for_a_port_in_use_is_one_line() -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         done = run("--port", str(port))
@@ -99,7 +99,7 @@ def test_a_port_in_use_is_one_line() -> None:
     assert len(done.stderr.splitlines()) == 1
 
 
-def test_no_renderer_is_one_line() -> None:
+def test_error_without_a_renderer_is_one_line() -> None:
     # EGL looks for its drivers where this says: nowhere.
     done = run(__EGL_VENDOR_LIBRARY_DIRS="/nowhere", __EGL_VENDOR_LIBRARY_FILENAMES="")
     assert done.returncode == 1

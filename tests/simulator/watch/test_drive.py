@@ -1,4 +1,4 @@
-"""A watched drive over its WebSocket: pictures, true figures, keys, several browsers."""
+"""The WebSocket of `simulator watch`: images, state messages, keyboard, several browsers."""
 
 import json
 import re
@@ -30,7 +30,7 @@ ROAD = Road(find_track("oval"), 2)
 
 
 class Watched:
-    """`simulator watch` on a free port, in a process of its own."""
+    """`simulator watch` on a free port in a subprocess."""
 
     def __init__(self) -> None:
         flags = ["--track", "oval", "--lanes", "2", "--traffic", "3", "--port", "0", "--speed", "2"]
@@ -57,7 +57,7 @@ class Watched:
 
 
 class Page:
-    """What the page does: reads, answers, asks."""
+    """A client with the page's protocol: reads and acknowledges messages, sends requests."""
 
     def __init__(self, port: int) -> None:
         self._open = ExitStack()
@@ -114,7 +114,7 @@ class Page:
 
 
 def until_quiet(page: Page, quiet_s: float) -> list[str | bytes]:
-    """What comes until nothing does for so long."""
+    """All messages until none arrives for the given time."""
     found: list[str | bytes] = []
     with suppress(TimeoutError):
         while True:
@@ -123,7 +123,7 @@ def until_quiet(page: Page, quiet_s: float) -> list[str | bytes]:
 
 
 def drain(page: Page) -> None:
-    """Read what comes until the line is closed, which raises."""
+    """Read messages until the connection is closed, which raises."""
     while True:
         page.line.recv(timeout=120)
 
@@ -146,7 +146,7 @@ def test_the_page_is_self_contained(watched: Watched) -> None:
     assert "src=" not in text
 
 
-def test_the_scene_is_the_road(watched: Watched) -> None:
+def test_scene_message_matches_the_road(watched: Watched) -> None:
     with watched.browser() as page:
         scene = page.scene
     assert (scene["track"], scene["lanes"], scene["controls"]) == ("oval", 2, True)
@@ -184,7 +184,7 @@ def test_state_messages_match_the_road(watched: Watched) -> None:
     )
 
 
-def test_pictures_of_the_view_that_is_chosen(watched: Watched) -> None:
+def test_images_are_of_the_selected_view(watched: Watched) -> None:
     with watched.browser() as page:
         page.ask(view="front")
         front = page.picture_until(lambda picture: picture[:20, :, 2].mean() > 140.0)  # sky
@@ -195,7 +195,7 @@ def test_pictures_of_the_view_that_is_chosen(watched: Watched) -> None:
         assert np.abs(front.astype(int) - top).mean() > 15.0
 
 
-def test_another_light(watched: Watched) -> None:
+def test_a_light_request_changes_the_images(watched: Watched) -> None:
     """Images in flight still have the earlier light: wait for the sky of the new one."""
     with watched.browser() as page:
         page.ask(view="front")
@@ -208,7 +208,7 @@ def test_another_light(watched: Watched) -> None:
         assert clear.mean() > dusk.mean() + 10.0
 
 
-def test_keys_take_control_and_disconnecting_releases_it(watched: Watched) -> None:
+def test_keys_take_control_and_a_disconnect_releases_it(watched: Watched) -> None:
     with watched.browser() as other:
         with watched.browser() as page:
             page.ask(reset=True)
@@ -225,7 +225,7 @@ def test_keys_take_control_and_disconnecting_releases_it(watched: Watched) -> No
         other.until(lambda state: state["speed_kmh"] > 10.0)
 
 
-def test_a_silent_browser_holds_no_key(watched: Watched) -> None:
+def test_keys_are_released_when_a_browser_stops_sending(watched: Watched) -> None:
     with watched.browser() as page:
         page.ask(reset=True)
         page.until(lambda state: state["time_s"] > 2.0)
@@ -236,7 +236,7 @@ def test_a_silent_browser_holds_no_key(watched: Watched) -> None:
         page.ask(reset=True)
 
 
-def test_pause_stands_still_and_still_shows_other_views(watched: Watched) -> None:
+def test_pause_stops_the_drive_but_other_views_are_rendered(watched: Watched) -> None:
     with watched.browser() as page:
         page.ask(pause=True)
         stopped = page.until(lambda state: state["paused"])["time_s"]
@@ -251,7 +251,7 @@ def test_pause_stands_still_and_still_shows_other_views(watched: Watched) -> Non
         page.until(lambda state: state["time_s"] > stopped)
 
 
-def test_the_end_of_an_episode_is_shown_and_another_begins(watched: Watched) -> None:
+def test_a_new_episode_begins_after_the_end_is_shown(watched: Watched) -> None:
     with watched.browser() as page:
         page.ask(reset=True)
         episode = page.until(lambda state: state["time_s"] > 3.0)["episode"]
@@ -267,7 +267,7 @@ def test_the_end_of_an_episode_is_shown_and_another_begins(watched: Watched) -> 
 
 
 @pytest.mark.alone
-def test_a_browser_that_never_reads_does_not_delay_others(watched: Watched) -> None:
+def test_a_browser_that_does_not_read_does_not_delay_others(watched: Watched) -> None:
     deaf = socket.create_connection(("127.0.0.1", watched.port))
     deaf.sendall(
         b"GET /live HTTP/1.1\r\nHost: x\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"

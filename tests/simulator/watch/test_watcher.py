@@ -1,4 +1,4 @@
-"""Watching a drive of one's own: any environment, several roads, hardly any cost unwatched."""
+"""`Watcher` on a program's own drive: environments, change of road, cost without browsers."""
 
 import json
 import time
@@ -27,7 +27,7 @@ def line(watcher: Watcher) -> AbstractContextManager[ClientConnection]:
 def read(
     page: ClientConnection, step: Callable[[], object], good: Callable[[Any], bool]
 ) -> tuple[dict[str, Any], list[bytes], list[dict[str, Any]]]:
-    """Step and read till a state is `good`: it, the pictures and the scenes on the way."""
+    """Step and read until a state is `good`; returns it and the images and scenes before it."""
     pictures: list[bytes] = []
     scenes: list[dict[str, Any]] = []
     end = time.monotonic() + 240.0
@@ -50,7 +50,7 @@ def read(
     raise AssertionError("nothing good came")
 
 
-def test_an_environment_as_it_trains() -> None:
+def test_an_environment_is_shown_as_it_is_stepped() -> None:
     env = gymnasium.make("driverview/LateralControl-v0", track="town", lanes=1)
     scores: dict[float, float] = {}
 
@@ -76,7 +76,7 @@ def test_an_environment_as_it_trains() -> None:
     assert simplejpeg.decode_jpeg(pictures[-1]).shape == (SIZE[1], SIZE[0], 3)
 
 
-def test_another_road_is_another_scene() -> None:
+def test_a_change_of_road_sends_a_new_scene() -> None:
     roads = [Road(find_track(name)) for name in ("oval", "town")]
     with Watcher(port=0) as watcher, line(watcher) as page:
         for episode, road in enumerate(roads, start=1):
@@ -109,7 +109,7 @@ def test_an_update_without_browsers_costs_microseconds() -> None:
 
 
 @pytest.mark.alone
-def test_held_to_a_speed() -> None:
+def test_speed_paces_the_updates() -> None:
     with Watcher(port=0, speed=10.0) as watcher, World(Road(find_track("oval"))) as world:
         world.reset(seed=1)
         watcher.update(world)
@@ -125,7 +125,7 @@ def test_objects_without_a_world_are_refused() -> None:
         watcher.update("my env")
 
 
-def test_its_port_is_given_back_and_one_in_use_is_named() -> None:
+def test_close_frees_the_port_and_a_port_in_use_is_refused() -> None:
     with Watcher(port=0) as watcher:
         port = int(watcher.url.rsplit(":", 1)[1])
         with pytest.raises(UserError, match=f"port {port}: Address already in use"):

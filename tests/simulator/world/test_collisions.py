@@ -1,4 +1,4 @@
-"""Hits have physical effect: on traffic, which is pushed on, and on walls, which hold."""
+"""Collisions with traffic, which is pushed, and with walls, which are not crossed."""
 
 import itertools
 import math
@@ -44,7 +44,7 @@ def follow(state: CarState, throttle: float) -> Command:
 
 
 def drive_into_traffic(world: World, seed: int = 0) -> tuple[CarState, CarState, float]:
-    """From behind, on the straight: (state before the hit, after it, the other's speed before)."""
+    """Rear-end collision on the straight: (state before, state after, other car's speed before)."""
     state = world.reset(seed=seed, s=5.0, speed=28.0)
     for _ in range(40 * world.frequency_hz):
         before, other = state, float(world.traffic.speed[0])
@@ -146,7 +146,7 @@ def test_walls_hold_at_a_low_control_rate() -> None:
         assert abs(state.to_middle) < world.road.wall_offset
 
 
-def test_a_glancing_hit_turns_the_car_along_the_wall() -> None:
+def test_a_glancing_impact_turns_the_car_along_the_wall() -> None:
     with World(stadium(width=20.0)) as world:
         state = world.reset(seed=0, s=100.0, angle=-0.2, speed=45.0)
         while state.collision is None:
@@ -158,7 +158,7 @@ def test_a_glancing_hit_turns_the_car_along_the_wall() -> None:
         assert 0.9 * before.speed < state.speed < before.speed - 0.3
 
 
-def test_a_head_on_hit_takes_nearly_all_speed() -> None:
+def test_a_head_on_impact_removes_nearly_all_speed() -> None:
     with World(stadium(width=20.0)) as world:
         state = world.reset(seed=0, s=100.0, angle=-1.5, speed=20.0)
         while state.collision is None:
@@ -166,7 +166,7 @@ def test_a_head_on_hit_takes_nearly_all_speed() -> None:
         assert abs(state.speed) < 0.3 * 20.0
 
 
-def test_a_wall_ends_the_drive_where_leaving_the_track_does_not() -> None:
+def test_wall_contact_counts_as_off_track_or_else_as_collision() -> None:
     with World(stadium()) as world:
         state = world.reset(seed=0, s=100.0, angle=-0.5, speed=20.0)
         reasons = []

@@ -35,7 +35,7 @@ def stadium(width: float = 12.0, lanes: int = 2) -> Road:
 
 
 def follow(state: CarState, throttle: float = 0.2, target: float = 0.0) -> Command:
-    """The law of TORCS's drives."""
+    """The steering law of the TORCS drives."""
     th, d = -state.angle, state.to_middle - target
     wheel = -(d + 0.1 * (state.vy + state.vx * math.sin(th)) + 2.0 * th + 0.1 * state.yaw_rate)
     return Command(steer=min(max(wheel / 0.36652, -1.0), 1.0), throttle=throttle)
@@ -108,7 +108,7 @@ def test_reset_places_the_car_as_asked() -> None:
         assert (roll, pitch) == (moved.roll, moved.pitch)
 
 
-def test_features_match_the_position() -> None:
+def test_features_match_the_cars_position() -> None:
     with World(stadium()) as world:
         world.reset(seed=0, s=100.0, to_middle=1.0, angle=0.1)
         features = world.features()
@@ -144,7 +144,7 @@ def test_a_car_has_left_the_track_before_it_meets_the_wall() -> None:
             assert world.road.edge < seen[off].to_middle < world.road.edge + 0.8
 
 
-def test_running_into_traffic_is_recorded_and_slows_the_car() -> None:
+def test_a_collision_with_traffic_is_recorded_and_slows_the_car() -> None:
     with World(stadium(lanes=1), traffic=1) as world:
         world.reset(seed=3)
         gap_s = float(world.traffic.s[0]) - 30.0
@@ -226,7 +226,7 @@ def test_every_control_rate_gives_the_same_drive() -> None:
 def test_distances_on_a_bank_are_measured_from_the_foot_of_the_centre_of_gravity(
     to_middle: float,
 ) -> None:
-    """The foot found by search: the nearest of many points across the road plane."""
+    """The foot is found by brute force: the nearest of many points on the road plane."""
     road = Road(find_track("oval"), lanes=3)
     track = road.track
     banks = [abs(float(track.at(s, 1.0).z - track.at(s, -1.0).z)) for s in range(0, 1000, 10)]

@@ -1,4 +1,4 @@
-"""Worlds that are made, reset and closed leave nothing behind in memory."""
+"""Worlds that are created, reset and closed do not leak memory."""
 
 import gc
 import os

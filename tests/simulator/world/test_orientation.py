@@ -1,4 +1,4 @@
-"""Quaternions of body axes against PyBullet's own matrices, in all four branches."""
+"""Quaternions of body axes equal PyBullet's, in all four branches of the conversion."""
 
 import numpy as np
 import pybullet
@@ -11,7 +11,7 @@ from simulator.vehicle.orientation import quaternion, rotation
     "euler",
     [(0.0, 0.0, 0.0), (3.1, 0.1, 0.2), (0.1, 0.2, 3.1), (3.0, 0.2, 3.0), (0.3, -1.2, -2.0)],
 )
-def test_quaternion_and_rotation_are_pybullets(euler: tuple[float, float, float]) -> None:
+def test_quaternion_and_rotation_equal_pybullets(euler: tuple[float, float, float]) -> None:
     turn = pybullet.getQuaternionFromEuler(euler)
     matrix = np.array(pybullet.getMatrixFromQuaternion(turn)).reshape(3, 3)
     forward, left, up = matrix.T

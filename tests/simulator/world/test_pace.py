@@ -1,4 +1,4 @@
-"""Real time is kept by a clock of our own: no waiting in these tests."""
+"""Pacing by the wall clock, with a fake clock: the tests do not wait."""
 
 import pytest
 
@@ -21,7 +21,7 @@ class Clock:
 
 
 @pytest.mark.parametrize("speed", [0.5, 1.0, 4.0])
-def test_steps_pass_at_the_speed_asked_for(speed: float) -> None:
+def test_steps_are_paced_at_the_requested_speed(speed: float) -> None:
     clock = Clock()
     pacer = Pacer(0.05, speed, clock=clock, sleep=clock.sleep)
     for _ in range(100):
@@ -30,7 +30,7 @@ def test_steps_pass_at_the_speed_asked_for(speed: float) -> None:
     assert clock.now - 100.0 == pytest.approx(100 * 0.05 / speed)
 
 
-def test_a_slow_step_is_caught_up_with_but_a_long_halt_is_not() -> None:
+def test_a_short_delay_is_caught_up_but_a_long_one_is_not() -> None:
     clock = Clock()
     pacer = Pacer(0.05, clock=clock, sleep=clock.sleep)
     clock.now += 0.17
@@ -52,7 +52,7 @@ def test_bad_speeds_are_refused(speed: float) -> None:
         Pacer(0.05, speed)
 
 
-def test_a_rate_is_what_was_reached_lately() -> None:
+def test_rate_measures_the_last_seconds_only() -> None:
     clock = Clock()
     rate = Rate(clock)
     assert rate.value == 0.0

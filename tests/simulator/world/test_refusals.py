@@ -1,4 +1,4 @@
-"""What a world refuses: a clear UserError each, and nothing has happened."""
+"""Invalid arguments raise a UserError and leave the world unchanged."""
 
 import math
 from typing import Any

@@ -1,4 +1,4 @@
-"""Walls stand beside the road all along it, tight bends included, and never across it."""
+"""Walls stand along the whole road, tight bends included, and never cross it."""
 
 import math
 
@@ -28,7 +28,7 @@ def loop(radius: float, straight: float) -> Track:
 
 
 def inner_face(panel: Panel) -> NDArray[np.float64]:
-    """(7, 2) points along the face that looks at the road."""
+    """(7, 2) points along the panel's face towards the road."""
     along = np.linspace(-0.5, 0.5, 7)[:, None] * PANEL[0]
     ahead = np.array([math.cos(panel.yaw), math.sin(panel.yaw)])
     points: NDArray[np.float64] = np.array(panel.face) + along * ahead
@@ -58,7 +58,7 @@ def test_walls_follow_every_bend(radius: float, side: int) -> None:
         assert np.ptp(offsets) < 1.2 * sagitta + 1e-6 or radius < 12.0
 
 
-def test_no_panel_far_from_the_wall_or_behind_it() -> None:
+def test_no_panel_for_a_car_far_from_the_wall_or_behind_it() -> None:
     walls = Walls(Road(loop(60.0, 200.0)))
     assert walls.panel(100.0, walls.offset - 3.6, 3.5) is None
     assert walls.panel(100.0, walls.offset - 3.4, 3.5) is not None

@@ -1,4 +1,4 @@
-"""One feature of TORCS's format at a time, written into a stadium whose figures are known:
+"""Single features of the TORCS format, in a stadium with known dimensions:
 100 m straights and bends of 50 m radius, `linear` profiles, 10 m wide."""
 
 import math
@@ -34,13 +34,13 @@ def z(track: Track, s: float, y: float = 0.0) -> float:
     return float(track.at(s, y).z)
 
 
-def test_of_an_attribute_given_twice_the_first_counts(tmp_path: Path) -> None:
+def test_the_first_of_a_repeated_attribute_counts(tmp_path: Path) -> None:
     """As in ruudskogen, whose 3D model has the heights of the first."""
     track = read(tmp_path, (UP, UP + '<attnum name="grade" val="-9" unit="%"/>'))
     assert z(track, 100.0) == pytest.approx(5.0)
 
 
-def test_slopes_by_edge(tmp_path: Path) -> None:
+def test_tangents_may_be_given_by_edge(tmp_path: Path) -> None:
     slopes = "".join(
         f'<attnum name="profil {end} tangent {edge}" val="{value}" unit="%"/>'
         for end, edge, value in (
@@ -54,7 +54,7 @@ def test_slopes_by_edge(tmp_path: Path) -> None:
     assert z(track, 50.0, -5.0) == pytest.approx(-0.04 * 100.0 / 8)
 
 
-def test_heights_of_the_start_by_edge(tmp_path: Path) -> None:
+def test_start_heights_may_be_given_by_edge(tmp_path: Path) -> None:
     edges = (
         '<attnum name="z start left" val="1"/><attnum name="z start right" val="-1"/>'
         '<attnum name="z end left" val="1"/><attnum name="z end right" val="-1"/>'
@@ -79,7 +79,7 @@ def test_heights_of_the_start_by_edge(tmp_path: Path) -> None:
         ("", 6),
     ],
 )
-def test_steps(tmp_path: Path, steps: str, count: int) -> None:
+def test_number_of_profile_steps(tmp_path: Path, steps: str, count: int) -> None:
     overall = '<attnum name="profil steps length" val="18" unit="m"/>'
     width = '<attnum name="width" val="10" unit="m"/>'
     track = read(tmp_path, (width, width + overall), (LINEAR, steps))
@@ -88,8 +88,8 @@ def test_steps(tmp_path: Path, steps: str, count: int) -> None:
     )
 
 
-def test_banking_of_one_end_alone(tmp_path: Path) -> None:
-    """`banking end` leans to its angle from whatever the segment begins with."""
+def test_banking_of_one_end_only(tmp_path: Path) -> None:
+    """With `banking end` alone, the banking starts from that of the segment before."""
     lean = '<attnum name="banking end" val="6" unit="deg"/>'
     level = '<attnum name="banking end" val="0" unit="deg"/>'
     home = '<attnum name="z end" val="0" unit="m"/>'
@@ -109,7 +109,7 @@ def test_banking_of_one_end_alone(tmp_path: Path) -> None:
         ("road", "concrete", "concrete", WITHOUT_KERBS),
     ],
 )
-def test_surface_and_look(
+def test_surface_and_look_follow_the_file(
     tmp_path: Path, category: str, surface: str, kind: str, looks: tuple[str, ...]
 ) -> None:
     track = read(
@@ -132,13 +132,13 @@ def test_surface_and_look(
         ("eroad", "highway"),
     ],
 )
-def test_a_name_tells_the_look(tmp_path: Path, name: str, look: str) -> None:
+def test_look_follows_words_in_the_name(tmp_path: Path, name: str, look: str) -> None:
     path = tmp_path / f"{name}.xml"
     path.write_text(STADIUM)
     assert read_torcs(path).look == look
 
 
-def test_names_without_a_known_look_vary_in_look(tmp_path: Path) -> None:
+def test_names_without_known_words_get_various_looks(tmp_path: Path) -> None:
     looks = []
     for number in range(12):
         path = tmp_path / f"g-track-{number}.xml"
@@ -151,20 +151,20 @@ def test_names_without_a_known_look_vary_in_look(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
 @pytest.mark.parametrize("ending", ["\n", "\r\n", "\r"])
-def test_line_ends_and_encodings(tmp_path: Path, encoding: str, ending: str) -> None:
+def test_line_ends_and_encodings_do_not_matter(tmp_path: Path, encoding: str, ending: str) -> None:
     text = STADIUM.replace('encoding="UTF-8"', f'encoding="{encoding.upper()[:6].rstrip("-")}"')
     path = tmp_path / "lines.xml"
     path.write_bytes(text.replace("\n", ending).encode(encoding))
     assert read_torcs(path).length_m == pytest.approx(200.0 + 2 * BEND)
 
 
-def test_surfaces_in_the_file_itself(tmp_path: Path) -> None:
-    """Most tracks define surfaces of their own beside the standard list; both leave no trace."""
+def test_surface_definitions_in_the_file_are_ignored(tmp_path: Path) -> None:
+    """Surfaces defined in the file and the standard list do not change the track."""
     own = '&default-surfaces;<section name="dirt"><attnum name="width" val="99"/></section>'
     assert read(tmp_path, ("&default-surfaces;", own)).width == 10.0
 
 
-def test_a_version_needs_its_own_list(tmp_path: Path) -> None:
+def test_each_format_version_needs_its_segment_list(tmp_path: Path) -> None:
     with pytest.raises(TrackError, match="no section 'segments'"):
         read(tmp_path, ('name="version" val="4"', 'name="version" val="3"'))
 

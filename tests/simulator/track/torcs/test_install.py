@@ -1,5 +1,7 @@
-"""Every track of TORCS that this machine has: it imports, is a road, and lies where TORCS's own
-3D model of it lies. Looked for in $TORCS_TRACKS and /usr/share/games/torcs/tracks."""
+"""Every TORCS track on this machine is imported, closed, and coincides with TORCS's 3D model.
+
+The tracks are looked for in $TORCS_TRACKS and /usr/share/games/torcs/tracks.
+"""
 
 import math
 import os
@@ -46,7 +48,7 @@ MODELLED = [
 
 
 @pytest.mark.parametrize("path", TRACKS)
-def test_imports_as_a_closed_road(path: Path) -> None:
+def test_track_is_imported_as_a_closed_loop(path: Path) -> None:
     track = read_track(path)
     assert (track.name, track.source) == (path.stem, "torcs")
     assert 800.0 <= track.length_m <= 25_000.0
@@ -61,7 +63,7 @@ def test_imports_as_a_closed_road(path: Path) -> None:
 
 
 @pytest.mark.parametrize("path", TRACKS)
-def test_heights_have_no_steps(path: Path) -> None:
+def test_heights_are_continuous(path: Path) -> None:
     track = read_track(path)
     for end, start in ((track.z_left1, track.z_left0), (track.z_right1, track.z_right0)):
         steps = np.abs(end - np.roll(start, -1))
@@ -71,7 +73,7 @@ def test_heights_have_no_steps(path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("path", TRACKS)
-def test_carries_one_to_three_lanes(path: Path) -> None:
+def test_one_to_three_lanes_can_be_laid(path: Path) -> None:
     track = read_track(path)
     roads = [Road(track, lanes, tf.LANE_WIDTH_M) for lanes in (1, 2, 3)]
     for road in roads:
@@ -92,8 +94,8 @@ def test_carries_one_to_three_lanes(path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("model", MODELLED)
-def test_both_edges_lie_where_the_program_drew_them(model: Path) -> None:
-    """The program's 3D model of a track holds points of both edges; it lies shifted by a constant.
+def test_both_edges_coincide_with_the_3d_model(model: Path) -> None:
+    """The 3D model of a track contains points of both edges, up to a constant shift.
 
     At least 90 % of its points must be ours, and all along our edges there must be some.
     """

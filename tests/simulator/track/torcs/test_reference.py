@@ -1,4 +1,4 @@
-"""The importer against figures of TORCS 1.3.7 itself; needs $TORCS_TRACKS (see README)."""
+"""Imported tracks equal reference data of TORCS 1.3.7; needs $TORCS_TRACKS (see README)."""
 
 import csv
 import os
@@ -19,7 +19,7 @@ def _reference_folder() -> Path:
     pytest.skip("$TORCS_TRACKS names no folder with reference.csv beside the tracks")
 
 
-def test_figures_of_all_reference_tracks() -> None:
+def test_dimensions_equal_the_reference() -> None:
     folder = _reference_folder()
     rows = list(csv.DictReader((folder / "reference.csv").open()))
     assert len(rows) >= 13
@@ -37,7 +37,7 @@ def test_figures_of_all_reference_tracks() -> None:
 
 @pytest.mark.parametrize("name", ["forza", "g-track-3"])
 @pytest.mark.parametrize("edge", [0.0, 0.5, -0.5])
-def test_centre_and_edges_lie_where_the_program_has_them(name: str, edge: float) -> None:
+def test_centre_line_and_edges_equal_the_reference(name: str, edge: float) -> None:
     folder = _reference_folder()
     points = np.genfromtxt(folder / "centreline" / f"{name}.csv", delimiter=",", names=True)
     track = find_track(name, folder)

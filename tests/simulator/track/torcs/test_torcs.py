@@ -1,4 +1,4 @@
-"""The TORCS importer against hand-written files whose figures follow from the format's rules."""
+"""The TORCS importer on small hand-written files with results computed by hand."""
 
 import math
 from pathlib import Path
@@ -54,7 +54,7 @@ def test_a_grade_holds_until_another_height_is_given() -> None:
     assert track.grade_range == pytest.approx((-0.10, 0.05))
 
 
-def test_banking_lifts_the_left_edge_and_is_carried_on() -> None:
+def test_banking_lifts_the_left_edge_and_holds_for_later_segments() -> None:
     track = read("banking")
     rise = math.tan(math.radians(8.0)) * 5.0
     assert rise == pytest.approx(0.70270, abs=1e-5)
@@ -69,7 +69,7 @@ def test_banking_lifts_the_left_edge_and_is_carried_on() -> None:
     assert track.curvature(150.0) == pytest.approx(-1.0 / 50.0)
 
 
-def test_heights_by_edge_and_by_centre() -> None:
+def test_heights_may_be_given_by_edge_or_centre() -> None:
     track = read("both-heights")
     assert z(track, 100.0) == pytest.approx(2.0)
     assert z(track, 99.999999, 5.0) == pytest.approx(3.0, abs=1e-6)
@@ -95,7 +95,7 @@ def test_spline_profile_passes_through_the_cubic() -> None:
     assert int(np.sum(track.s0 > fall + 100.0 - 1e-6)) == 2
 
 
-def test_version_3_feet_and_latin_1() -> None:
+def test_version_3_files_in_feet_and_latin_1_are_read() -> None:
     track = read("version-3")
     straight = 304.801
     assert track.length_m == pytest.approx(2 * straight + 200.0 * math.pi)
