@@ -253,7 +253,8 @@ def write_worst_sheet(path: Path, frames: Frames, outputs: NDArray[np.float32]) 
     sheet = np.full(shape, 255, np.uint8)
     for number, figure in enumerate(figures):
         top, left = number // SHEET_COLUMNS * tile, number % SHEET_COLUMNS * width
-        image = cv2.resize(figure["image"], (width, height), interpolation=cv2.INTER_AREA)
+        road = figure["image"][:, : 2 * width]  # without the view from above
+        image = cv2.resize(road, (width, height), interpolation=cv2.INTER_AREA)
         sheet[top : top + height, left : left + width] = image
         texts = (f"{figure['feature']} {figure['error']}", *figure["place"].split("; "))
         for line, text in enumerate(texts):

@@ -128,7 +128,7 @@ def write_page(
     """Write `README.md` into the model's folder: its card, `notes`, and the tables of evaluations.
 
     `evaluations`: what `mtlnet evaluate --json` printed; `picture`: a JPEG of its worst frames,
-    which is copied there. Raises UserError for an evaluation of another model, or an unreadable one.
+    which is copied there. Raises UserError for an evaluation of another model or unreadable.
     """
     card = read_card(model)
     found = [_read_evaluation(path, card) for path in evaluations]
