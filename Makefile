@@ -56,7 +56,7 @@ compiled: $(READY)
 check: $(READY) ## format, lint, types, imports, links
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
-	$(BIN)/mypy $(PACKAGES) tests benchmarks
+	$(BIN)/mypy $(PACKAGES) tests benchmarks docs
 	$(BIN)/lint-imports
 	@$(MAKE) --no-print-directory docs
 

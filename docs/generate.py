@@ -52,7 +52,8 @@ def _describe(words: tuple[str, ...], command: Any) -> list[str]:
 
 
 def _name(parameter: Any) -> str:
-    return max(parameter.opts, key=len) if parameter.param_type_name == "option" else parameter.name
+    option = parameter.param_type_name == "option"
+    return str(max(parameter.opts, key=len) if option else parameter.name)
 
 
 def _default(parameter: Any) -> str:

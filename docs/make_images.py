@@ -3,6 +3,7 @@
 A drive on "coast" with a lane change; the true markings and features are drawn over the images.
 """
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +13,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 import simulator.env  # noqa: F401  (registers the names)
 from simulator.camera import overlay
-from simulator.camera.core.camera import Camera
-from simulator.camera.scene.light import Light
+from simulator.camera.core.camera import DRIVER_CAMERA, Camera, open_camera
 from trackfeatures import Heading
 
 IMAGES = Path(__file__).parent / "images"
@@ -27,8 +27,8 @@ def drive() -> list[Image.Image]:
     env: Any = gymnasium.make("driverview/LateralControl-v0", track="coast", lanes=2, traffic=3)
     _, info = env.reset(seed=4, options={"s": 250.0, "to_middle": -LANE_M, "speed": 14.0})
     world = env.unwrapped.world
-    light = Light.named("clear", np.random.default_rng(5))
-    camera = Camera(world.road, seed=5, light=light, width=WIDTH, height=HEIGHT)
+    parameters = replace(DRIVER_CAMERA, width=WIDTH, height=HEIGHT)
+    camera = open_camera(world.road, parameters, light="clear", seed=5)
     frames = []
     for step in range(STEPS):
         share = np.clip((step - 60) / 60, 0.0, 1.0)

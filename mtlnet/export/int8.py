@@ -27,7 +27,7 @@ from mtlnet.export.openvino_graph import run_graph
 from mtlnet.inference.engine import load_engine
 
 CALIBRATION_FRAMES = 300
-FLOAT_ACTIVATIONS = (0, 2)
+FLOAT_ACTIVATIONS: tuple[int, ...] = (0, 2)
 """Numbers of the convolutions whose activations are not quantised, where nothing could be chosen:
 of the paper's network the first costs more distance accuracy than all others together, the third
 more angle accuracy."""
