@@ -227,9 +227,7 @@ class Column:
 
 
 LOSSES = (
-    Column("distance_loss", "distance loss", "squared", 5, 0, ("coded", "distance")),
     Column("distance_absolute", "distance loss", "absolute", 4, 0, ("coded", "distance_absolute")),
-    Column("angle_loss", "angle loss", "squared", 5, 1, ("coded", "angle")),
     Column("angle_absolute", "angle loss", "absolute", 5, 1, ("coded", "angle_absolute")),
     Column("accuracy", "type accuracy", "%", 2, 2, ("heading_accuracy",), scale=100.0),
 )

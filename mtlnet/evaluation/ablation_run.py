@@ -198,6 +198,11 @@ def page(
         ],
         best={column.name: best(entries, column.name) for column in COLUMNS},
         losses=LOSSES,
+        trained_on=(
+            "squared errors"
+            if find_recipe(config.recipe).huber is None
+            else "Huber losses of the errors in standard deviations of their targets"
+        ),
         errors=ERRORS,
         paper_digits=PAPER_DIGITS,
         alpha_text=_alpha_text,

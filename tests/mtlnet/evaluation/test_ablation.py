@@ -22,7 +22,7 @@ from mtlnet.evaluation.ablation import (
     table,
     training_curve,
 )
-from mtlnet.evaluation.ablation_run import ablate, write_result
+from mtlnet.evaluation.ablation_run import ablate, page, write_result
 from mtlnet.inference.curves import COLUMNS as CURVE_COLUMNS
 from mtlnet.inference.model_card import CARD, ModelCard, read_card
 from mtlnet.training.config import TrainConfig
@@ -114,10 +114,10 @@ def test_figures_have_mean_and_deviation_over_the_seeds(tmp_path: Path, card: Mo
     runs = finish_all(settings(tmp_path), FakeTraining(card))
     entries = {entry["row"]["name"]: entry for entry in table(ablation_rows(), runs)}
     distance = entries["distance"]["figures"]
-    # Seeds 1 and 3: 0.01 and 0.03, sample standard deviation 0.02 / sqrt(2).
-    assert distance["distance_loss"]["mean"] == pytest.approx(0.02)
-    assert distance["distance_loss"]["std"] == pytest.approx(0.02 / 2**0.5)
-    assert distance["angle_loss"] is distance["accuracy"] is distance["angle"] is None
+    # Seeds 1 and 3: 0.1 and 0.3, sample standard deviation 0.2 / sqrt(2).
+    assert distance["distance_absolute"]["mean"] == pytest.approx(0.2)
+    assert distance["distance_absolute"]["std"] == pytest.approx(0.2 / 2**0.5)
+    assert distance["angle_absolute"] is distance["accuracy"] is distance["angle"] is None
     assert entries["deepdriving"]["figures"]["accuracy"] is None
     assert entries["mtl-1"]["figures"]["mr"]["values"] == pytest.approx([0.1, 0.3])
     assert entries["mtl-1"]["figures"]["r"] is None
@@ -177,16 +177,13 @@ def test_the_page_shows_the_table_beside_that_of_the_paper(tmp_path: Path, card:
     text = (config.out / "ablation.html").read_text()
     found = Page(text)
     rows = found.rows(0)
-    assert rows[1][:5] == [
-        "Distance alone",
-        "1, 0, 0",
-        "0.02000 ± 0.01414",
-        "0.2000 ± 0.1414",
-        "0.06771",
-    ]
-    ours = ["0.02000 ± 0.01414", "0.2000 ± 0.1414", "0.02000 ± 0.00000", "0.05000 ± 0.00000"]
-    assert [rows[6][i] for i in (2, 3, 5, 6, 8)] == [*ours, "80.00 ± 0.00"]
-    assert [rows[6][i] for i in (4, 7, 9)] == ["0.02253", "0.01150", "98.78"]
+    assert rows[1][:4] == ["Distance alone", "1, 0, 0", "0.2000 ± 0.1414", "0.06771"]
+    ours = ["0.2000 ± 0.1414", "0.05000 ± 0.00000", "80.00 ± 0.00"]
+    assert [rows[6][i] for i in (2, 4, 6)] == ours
+    assert [rows[6][i] for i in (3, 5, 7)] == ["0.02253", "0.01150", "98.78"]
+    assert "Recipe fast trains on Huber losses" in " ".join(text.split())
+    paper = page(replace(config, recipe="paper"), result["rows"], ablation_rows(), runs)
+    assert "Recipe paper trains on squared errors" in " ".join(paper.split())
     # Four alphas and the line of the single task in each of three charts.
     assert len(found.all("path", "curve")) == 12
     assert len(found.all("path", "level")) == 3
