@@ -42,11 +42,15 @@ def test_collect_train_evaluate_serve_and_drive(tmp_path: Path) -> None:
     assert {name: verified[name] for name in expected} == expected
 
     train = ("mtlnet", "train", "--data", data, "--out", run, "--alpha", "0.3,0.2,0.5")
-    command(*train, "--recipe", "fast", "--iterations", "150")
+    command(*train, "--recipe", "fast", "--iterations", "60")
     evaluated = command(
         "mtlnet", "evaluate", "--model", run, "--data", data, "--split", "all", "--json"
     )
     assert evaluated["frames"] == 300
+    # On the frames it was trained on; a run gave 0.061 m, 0.0058 rad and 100 %.
+    assert evaluated["errors"]["to_lane_centre"]["mean"] < 0.15
+    assert evaluated["errors"]["angle"]["mean"] < 0.012
+    assert evaluated["heading_accuracy"] > 0.95
 
     frames = Dataset.open(Path(data)).select("all")
     image = tmp_path / "frame.jpg"
@@ -63,12 +67,14 @@ def test_collect_train_evaluate_serve_and_drive(tmp_path: Path) -> None:
             *("controllers", "drive", "--controller", "lqr", "--track", "oval", "--lanes", "1"),
             *("--perception", url, "--steps", "400", "--log", str(log), "--json"),
         )
-    # 400 steps of 50 ms: 20 s, on the oval's straight, which a model trained on 150 batches of that
+    # 400 steps of 50 ms: 20 s, on the oval's straight, which a model trained on 60 batches of that
     # road can follow; the first bend comes later.
     rows = log.read_text().splitlines()
     assert drive["ended"] is None
     assert drive["steps"] == len(rows) - 1 == 400
     assert drive["distance_m"] > 100
+    assert drive["mean_abs_d_m"] < 0.3
+    assert drive["max_abs_d_m"] < 0.8
     steering = {row.split(",")[8] for row in rows[1:]}
     assert len(steering) > 100, "steering must vary with the answers"
 
