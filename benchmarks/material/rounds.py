@@ -32,6 +32,7 @@ def collect(folder: Path, rounds: int, frames: int) -> Path:
     """Real rounds by `datagen collect`."""
     command = [sys.executable, "-m", "datagen", "collect", "--json", "--out", str(folder)]
     command += ["--rounds", str(rounds), "--frames", str(frames), "--seed", "11"]
+    command += ["--stretch", "1"]
     done = subprocess.run(command, check=True, capture_output=True, text=True)
     print(f"collected {json.loads(done.stdout)['frames']} frames", file=sys.stderr)
     return folder
