@@ -37,7 +37,7 @@ class DemoConfig:
     """What the demo collects and how long it trains; the defaults fit 15 minutes on two cores."""
 
     out: Path = Path("demo")
-    tracks: str = "circuit,countryside,forest,highway,mountain-pass"
+    tracks: str = "circuit,forest,highway,mountain-pass,ring-road"
     rounds: int = 100
     frames: int = 200
     seed: int = 1

@@ -1,5 +1,6 @@
-"""Atomic writes: a file is replaced in one step, and the old one stays until then."""
+"""Atomic writes, by which the old file stays until the new one is complete; and locks."""
 
+import fcntl
 import json
 import os
 from pathlib import Path
@@ -63,6 +64,18 @@ def atomic_move(source: Path, target: Path) -> None:
         fsync_path(path)
     source.replace(target)
     fsync_path(target.parent)
+
+
+def try_lock(descriptor: int, *, shared: bool = False) -> bool:
+    """Lock an open file or folder until it is closed or the process ends (`flock`).
+
+    False when another process holds a lock on it (with `shared`: an exclusive one).
+    """
+    try:
+        fcntl.flock(descriptor, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
 
 
 def fsync_path(path: Path) -> None:

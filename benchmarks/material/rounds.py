@@ -16,7 +16,7 @@ from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from mcap.reader import make_reader
 
 from datagen.recording.dataset import round_files
-from datagen.recording.folder import RoundState, file_sha256, partial_path, prepare, publish
+from datagen.recording.folder import RoundState, partial_path, prepare, publish
 from datagen.recording.manifest import rebuild
 from datagen.recording.mcap.index import open_round
 from datagen.recording.mcap.writer import RoundFile
@@ -32,6 +32,7 @@ def collect(folder: Path, rounds: int, frames: int) -> Path:
     """Real rounds by `datagen collect`."""
     command = [sys.executable, "-m", "datagen", "collect", "--json", "--out", str(folder)]
     command += ["--rounds", str(rounds), "--frames", str(frames), "--seed", "11"]
+    command += ["--stretch", "1"]
     done = subprocess.run(command, check=True, capture_output=True, text=True)
     print(f"collected {json.loads(done.stdout)['frames']} frames", file=sys.stderr)
     return folder
@@ -80,13 +81,4 @@ def _write(folder: Path, header: RoundHeader, steps: Steps, first: int, frames: 
         result = RoundResult(frames, content.hexdigest())
         file.add_metadata(RESULT_METADATA, result.to_metadata())
         file.finish()
-    state = RoundState(
-        header.id,
-        f"rounds/{header.id}.mcap",
-        partial.stat().st_size,
-        file_sha256(partial),
-        frames,
-        result.content_hash,
-        header.definitions,
-    )
-    publish(folder, partial, state)
+    publish(folder, partial, RoundState.of(partial, header, result))

@@ -39,7 +39,10 @@ Out = Annotated[
 Seed = Annotated[int, typer.Option(help="Seed of everything random.")]
 Workers = Annotated[int, typer.Option(help="Recording processes; 0: one for each core.")]
 Tracks = Annotated[
-    str, typer.Option(help="Track names or files, separated by commas; empty: a selection.")
+    str,
+    typer.Option(
+        help="Track names or files, separated by commas; empty: all but the held-out ones."
+    ),
 ]
 Lanes = Annotated[str, typer.Option(help="Lane counts, separated by commas.")]
 Lights = Annotated[
@@ -50,15 +53,22 @@ Lights = Annotated[
     ),
 ]
 Stretch = Annotated[
-    int, typer.Option(help="Frames after which the scenery changes; 0: one scenery a round.")
+    int,
+    typer.Option(
+        help="Frames after which scenery, light and weather change; 0: a round is a film. "
+        "Training sets: 1."
+    ),
 ]
 Scenes = Annotated[
-    int, typer.Option(help="Sceneries that a round cycles through; 0: one for every 200 frames.")
+    int,
+    typer.Option(
+        help="Sceneries a round that --stretch cycles through; 0: one for every 200 frames."
+    ),
 ]
 TracksDir = Annotated[Path | None, typer.Option(help="Folder of TORCS tracks.")]
 TestShare = Annotated[float, typer.Option(help="Share of rounds for testing.")]
 SplitName = Annotated[
-    str, typer.Option(help="unseen: rounds on a track that no training plan contains.")
+    str, typer.Option(help="unseen: rounds on the tracks held out of training plans.")
 ]
 Codec = Annotated[str, typer.Option(help="jpeg (quality 95) or png (lossless).")]
 JitterCamera = Annotated[

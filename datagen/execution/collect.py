@@ -17,9 +17,9 @@ from typing import Any, Protocol
 
 import trackfeatures as tf
 from datagen.execution.lock import folder_lock, setup_lock
-from datagen.execution.process_pool import OnMessage, ProcessPool
+from datagen.execution.process_pool import ProcessPool
 from datagen.execution.progress import CollectProgress, CollectResult, ProgressCallback
-from datagen.execution.retry import Failure
+from datagen.execution.retry import Failure, OnMessage
 from datagen.planning.plan import Plan, RoundPlan, Shard, program
 from datagen.recorder.job import Job
 from datagen.recording.errors import DatasetError

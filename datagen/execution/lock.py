@@ -13,6 +13,7 @@ from pathlib import Path
 from datagen.planning.plan import Shard
 from datagen.recording.errors import DatasetError
 from datagen.recording.folder import LOCKS
+from runtime.files import try_lock
 
 FOLDER_LOCK, SETUP_LOCK = "folder", "setting-up"
 
@@ -22,7 +23,7 @@ def folder_lock(folder: Path, shard: Shard | None) -> Iterator[None]:
     """Lock the folder, or its part `shard`. Raises DatasetError when another collector holds it."""
     (folder / LOCKS).mkdir(exist_ok=True)
     with _open(folder, FOLDER_LOCK) as descriptor:
-        if not _try_lock(descriptor, fcntl.LOCK_EX if shard is None else fcntl.LOCK_SH):
+        if not try_lock(descriptor, shared=shard is not None):
             raise DatasetError(
                 f"another `datagen collect` is writing to {folder}; wait for it or choose another "
                 "--out"
@@ -32,7 +33,7 @@ def folder_lock(folder: Path, shard: Shard | None) -> Iterator[None]:
             return
         name = f"shard-{shard.number}-of-{shard.count}"
         with _open(folder, name) as shard_descriptor:
-            if not _try_lock(shard_descriptor, fcntl.LOCK_EX):
+            if not try_lock(shard_descriptor):
                 raise DatasetError(
                     f"shard {shard} of {folder} is being recorded by another `datagen collect`; "
                     "wait for it or give another --shard"
@@ -55,7 +56,7 @@ def _require_same_count(folder: Path, shard: Shard) -> None:
         if path.name.endswith(f"-of-{shard.count}"):
             continue
         with _open(folder, path.name) as other:
-            if not _try_lock(other, fcntl.LOCK_EX):
+            if not try_lock(other):
                 raise DatasetError(
                     f"{path.name} of {folder} is being recorded, which overlaps with shard "
                     f"{shard}; use the same number of shards, or wait for it"
@@ -69,12 +70,3 @@ def _open(folder: Path, name: str) -> Iterator[int]:
         yield descriptor
     finally:
         os.close(descriptor)
-
-
-def _try_lock(descriptor: int, kind: int) -> bool:
-    """False when another process holds the lock."""
-    try:
-        fcntl.flock(descriptor, kind | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    return True

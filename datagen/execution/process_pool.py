@@ -3,28 +3,18 @@
 import multiprocessing
 import os
 import signal
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from time import monotonic
 
-from datagen.execution.retry import Failure, RetryQueue, Timeouts
-from datagen.recorder.job import (
-    AttemptFailed,
-    FatalError,
-    FramesDone,
-    Job,
-    Message,
-    RoundDone,
-    worker_main,
-)
+from datagen.execution.retry import Failure, OnMessage, RetryQueue, Timeouts
+from datagen.recorder.job import FramesDone, Job, Message, worker_main
 
 STOP_S = 5.0  # s: for a process to end, before it is killed
 CONTEXT = multiprocessing.get_context("spawn")  # graphics contexts do not survive a fork
-
-OnMessage = Callable[[FramesDone | RoundDone], None]
 
 
 @dataclass
@@ -47,7 +37,7 @@ class ProcessPool:
         self._on_message = on_message
         self._timeouts = timeouts or Timeouts()
         self._workers: list[Worker] = []
-        self._queue = RetryQueue((), self._timeouts)
+        self._queue = RetryQueue((), self._timeouts, on_message)
 
     def run(self, jobs: Iterable[Job]) -> list[Failure]:
         """Record all rounds; returns those that failed finally or too often.
@@ -55,7 +45,7 @@ class ProcessPool:
         Raises errors that every round would meet (disk full, unknown track): UserError or OSError.
         All processes have ended when it returns or raises.
         """
-        self._queue = RetryQueue(jobs, self._timeouts)
+        self._queue = RetryQueue(jobs, self._timeouts, self._on_message)
         try:
             with _single_threaded(self._size):
                 for _ in range(min(self._size, len(self._queue))):
@@ -124,30 +114,19 @@ class ProcessPool:
             self._replace(number, f"{what} for {spent:.0f} s")
 
     def _handle(self, worker: Worker, message: Message) -> None:
-        if isinstance(message, FatalError):
-            raise message.error
-        if isinstance(message, AttemptFailed):
-            self._retry(worker, message.reason, message.final)
-            return
-        if isinstance(message, RoundDone):
-            worker.job = None
-            self._queue.record_success()
-        self._on_message(message)
+        if isinstance(message, FramesDone):
+            self._on_message(message)
+        elif worker.job is not None:
+            job, worker.job = worker.job, None
+            self._queue.record_outcome(job, message)
 
     def _replace(self, number: int, reason: str) -> None:
         """Start another worker in place of an ended one."""
         ended = self._workers[number]
         ended.connection.close()
         ended.process.join()
-        self._queue.record_death(reason)
+        self._queue.record_death(ended.job, reason)
         self._workers[number] = self._start_worker()
-        self._retry(ended, reason)
-
-    def _retry(self, worker: Worker, reason: str, final: bool = False) -> None:
-        job, worker.job = worker.job, None
-        if job is not None:
-            self._on_message(FramesDone(job.plan.id, 0))
-            self._queue.record_failure(job, reason, monotonic(), final)
 
     def _stop_workers(self) -> None:
         """Idle workers are asked to end, busy ones are killed."""

@@ -15,17 +15,9 @@ from pathlib import Path
 from time import monotonic
 from typing import Any
 
-from datagen.execution.process_pool import OnMessage, thread_limits
-from datagen.execution.retry import Failure, RetryQueue, Timeouts
-from datagen.recorder.job import (
-    AttemptFailed,
-    FatalError,
-    FramesDone,
-    Job,
-    Outcome,
-    RoundDone,
-    attempt,
-)
+from datagen.execution.process_pool import thread_limits
+from datagen.execution.retry import Failure, OnMessage, RetryQueue, Timeouts
+from datagen.recorder.job import AttemptFailed, FramesDone, Job, Outcome, RoundDone, attempt
 from datagen.recording.folder import discard_partial, partial_path, prepare, publish
 from trackfeatures.errors import UserError
 
@@ -88,14 +80,14 @@ class RayPool:
         self._on_message = on_message
         self._timeouts = timeouts or Timeouts()
         self._slots: list[ActorSlot] = []
-        self._queue = RetryQueue((), self._timeouts)
+        self._queue = RetryQueue((), self._timeouts, on_message)
 
     def run(self, jobs: Iterable[Job]) -> list[Failure]:
         """Record all rounds; returns those that failed finally or too often.
 
         Raises UserError without a Ray cluster, and errors that every round would meet.
         """
-        self._queue = RetryQueue(jobs, self._timeouts)
+        self._queue = RetryQueue(jobs, self._timeouts, self._on_message)
         if not self._queue:
             return []
         started_here = self._connect()
@@ -157,31 +149,18 @@ class RayPool:
         return bool(self._queue) or any(slot.job is not None for slot in self._slots)
 
     def _receive(self) -> None:
-        busy = [slot for slot in self._slots if slot.job is not None]
-        ready, _ = self._ray.wait([s.result for s in busy], timeout=POLL_S) if busy else ([], [])
-        for slot in busy:
-            if slot.result not in ready:
+        results = [slot.result for slot in self._slots if slot.job is not None]
+        ready, _ = self._ray.wait(results, timeout=POLL_S) if results else ([], [])
+        for slot in self._slots:
+            if slot.job is None or slot.result not in ready:
                 continue
             try:
                 ending, data = self._ray.get(slot.result)
             except self._ray.exceptions.RayError as error:
                 self._replace(slot, f"its actor ended ({_first_line(error)})")
             else:
-                self._handle(slot, ending, data)
-
-    def _handle(self, slot: ActorSlot, ending: Outcome, data: bytes) -> None:
-        if isinstance(ending, FatalError):
-            raise ending.error
-        if isinstance(ending, AttemptFailed):
-            self._retry(slot, ending.reason, ending.final)
-            return
-        if slot.job is None or hashlib.sha256(data).hexdigest() != ending.state.sha256:
-            self._retry(slot, "its bytes were damaged in transfer")
-            return
-        _publish(slot.job.folder, ending, data)
-        slot.job = None
-        self._queue.record_success()
-        self._on_message(ending)
+                job, slot.job = slot.job, None
+                self._queue.record_outcome(job, _received(job, ending, data))
 
     def _poll_heartbeats(self) -> None:
         for slot in self._slots:
@@ -216,24 +195,23 @@ class RayPool:
                 )
 
     def _replace(self, slot: ActorSlot, reason: str) -> None:
-        self._queue.record_death(reason)
-        slot.actor, slot.heartbeat = self._start_worker().actor, None
-        self._retry(slot, reason)
-
-    def _retry(self, slot: ActorSlot, reason: str, final: bool = False) -> None:
-        job, slot.job = slot.job, None
-        if job is not None:
-            self._on_message(FramesDone(job.plan.id, 0))
-            self._queue.record_failure(job, reason, monotonic(), final)
+        self._queue.record_death(slot.job, reason)
+        slot.actor, slot.job, slot.heartbeat = self._start_worker().actor, None, None
 
 
-def _publish(folder: Path, done: RoundDone, data: bytes) -> None:
-    partial = partial_path(folder, done.state.id)
+def _received(job: Job, ending: Outcome, data: bytes) -> Outcome:
+    """The outcome, once the bytes of a finished round are in the dataset folder."""
+    if not isinstance(ending, RoundDone):
+        return ending
+    if hashlib.sha256(data).hexdigest() != ending.state.sha256:
+        return AttemptFailed(job.plan.id, "its bytes were damaged in transfer")
+    partial = partial_path(job.folder, job.plan.id)
     try:
         partial.write_bytes(data)
-        publish(folder, partial, done.state)
+        publish(job.folder, partial, ending.state)
     finally:
-        discard_partial(folder, done.state.id)
+        discard_partial(job.folder, job.plan.id)
+    return ending
 
 
 def _first_line(error: Exception) -> str:

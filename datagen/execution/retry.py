@@ -1,10 +1,13 @@
 """The queue of rounds to record, with retries; used by all executors."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from time import monotonic
 
-from datagen.recorder.job import Job
+from datagen.recorder.job import AttemptFailed, FatalError, FramesDone, Job, Outcome, RoundDone
 from datagen.recording.errors import DatasetError
+
+OnMessage = Callable[[FramesDone | RoundDone], None]
 
 ATTEMPTS = 3
 DEATHS_IN_A_ROW = 12
@@ -40,11 +43,15 @@ class Failure:
 
 
 class RetryQueue:
-    """The rounds that wait, each with the earliest time of its next attempt."""
+    """The rounds that wait, each with the earliest time of its next attempt.
 
-    def __init__(self, jobs: Iterable[Job], timeouts: Timeouts) -> None:
+    `on_message` is called for each finished round, and with 0 frames for each failed attempt.
+    """
+
+    def __init__(self, jobs: Iterable[Job], timeouts: Timeouts, on_message: OnMessage) -> None:
         self._waiting = [(0.0, job) for job in jobs]
         self._timeouts = timeouts
+        self._on_message = on_message
         self._attempts: dict[str, int] = {}
         self._deaths = 0
         self.failures: list[Failure] = []
@@ -64,20 +71,33 @@ class RetryQueue:
         """Time of the next attempt; infinite when no round waits."""
         return min((not_before for not_before, _ in self._waiting), default=float("inf"))
 
-    def record_success(self) -> None:
+    def record_outcome(self, job: Job, outcome: Outcome) -> None:
+        """Take the end of an attempt. Raises an error that every round would meet."""
+        if isinstance(outcome, FatalError):
+            raise outcome.error
+        if isinstance(outcome, AttemptFailed):
+            self.record_failure(job, outcome.reason, monotonic(), outcome.final)
+            return
         self._deaths = 0
+        self._on_message(outcome)
 
-    def record_death(self, reason: str) -> None:
-        """Count an ended process. Raises DatasetError at `DEATHS_IN_A_ROW` without a success."""
+    def record_death(self, job: Job | None, reason: str) -> None:
+        """Count an ended process and schedule its round again.
+
+        Raises DatasetError at `DEATHS_IN_A_ROW` without a success.
+        """
         self._deaths += 1
         if self._deaths >= DEATHS_IN_A_ROW:
             raise DatasetError(
                 f"{self._deaths} recording processes ended one after the other without a finished "
                 f"round (the last one: {reason}); the rounds finished before can be used"
             )
+        if job is not None:
+            self.record_failure(job, reason, monotonic())
 
     def record_failure(self, job: Job, reason: str, now: float, final: bool = False) -> None:
         """Schedule another attempt, or give up after `ATTEMPTS` or when `final`."""
+        self._on_message(FramesDone(job.plan.id, 0))
         attempts = self._attempts[job.plan.id] = self._attempts.get(job.plan.id, 0) + 1
         if attempts < ATTEMPTS and not final:
             delay = self._timeouts.retry_delay_s * 4.0 ** (attempts - 1)

@@ -4,14 +4,13 @@ It is written as `.NAME.partial` beside the target and renamed when complete, so
 export is never taken for a complete one. The next export deletes what is left of it.
 """
 
-import fcntl
 import os
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from runtime.files import atomic_move
+from runtime.files import atomic_move, try_lock
 from trackfeatures.errors import UserError
 
 
@@ -49,12 +48,8 @@ def require_free(target: Path) -> None:
 
 def _lock(descriptor: int, partial: Path, target: Path) -> None:
     """Lock the folder until this process ends. If another export has renamed it, it is not ours."""
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        is_ours = partial.exists() and partial.stat().st_ino == os.fstat(descriptor).st_ino
-    except BlockingIOError:
-        is_ours = False
-    if not is_ours:
+    is_ours = try_lock(descriptor) and partial.exists()
+    if not is_ours or partial.stat().st_ino != os.fstat(descriptor).st_ino:
         raise UserError(f"another `datagen export` is writing to {target}; give another --out")
 
 

@@ -50,14 +50,15 @@ class CollectConfig:
     frequency_hz: int = 20
     """Frames per second. The car is controlled at `plan.CONTROL_HZ` or faster."""
     camera: CameraParameters = field(default_factory=CameraParameters)
-    stretch: int = 1
-    """Frames after which scenery and light change; 0: they stay the same for the whole round."""
+    stretch: int = 0
+    """Frames after which scenery and light change; 0: a round is a film in one scenery."""
     scenes: int = 0
-    """Number of sceneries that a round cycles through; 0: one for every `FRAMES_PER_SCENE`."""
+    """Number of sceneries that the stretches of a round cycle through; 0: one for every
+    `FRAMES_PER_SCENE`."""
     jitter_camera: bool = False
     """Vary height, pitch and field of view of the camera a little from round to round."""
     split: str = ""
-    """"unseen": all rounds are for tests on a track without training data. Else train and test."""
+    """"unseen": all rounds are for tests on tracks without training data. Else train and test."""
 
     def __post_init__(self) -> None:
         self._check_numbers()
@@ -80,6 +81,11 @@ class CollectConfig:
             raise UserError(
                 f"{self.scenes} scenes a round asked for; give at least 1, or 0 for one for every "
                 f"{FRAMES_PER_SCENE} frames"
+            )
+        if self.scenes > 1 and not self.stretch:
+            raise UserError(
+                f"{self.scenes} scenes a round asked for, but the scenery never changes; give "
+                "--stretch too, the number of frames until it does"
             )
         if self.seed < 0:
             raise UserError(f"the seed is {self.seed}; give a whole number from 0 up")

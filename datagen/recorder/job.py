@@ -20,7 +20,6 @@ from datagen.planning.plan import RoundPlan
 from datagen.recording.folder import (
     RoundState,
     discard_partial,
-    file_sha256,
     partial_path,
     publish,
 )
@@ -107,25 +106,17 @@ def record_and_publish(job: Job, report: Report = lambda message: None) -> Round
     try:
         record_round(job.plan, job.plan_hash, partial, job.tracks_dir, progress)
         report(FramesDone(job.plan.id, job.plan.frames))
-        state, resets = _check_recorded(job.plan.id, partial)
+        state, resets = _check_recorded(partial)
         publish(job.folder, partial, state)
     finally:
         discard_partial(job.folder, job.plan.id)
     return RoundDone(state, resets)
 
 
-def _check_recorded(round_id: str, partial: Path) -> tuple[RoundState, int]:
+def _check_recorded(partial: Path) -> tuple[RoundState, int]:
     """State of the recorded file, and number of resets. Raises RuntimeError for a damaged one."""
     index = open_round(partial)
-    state = RoundState(
-        id=round_id,
-        file=f"rounds/{round_id}.mcap",
-        bytes=partial.stat().st_size,
-        sha256=file_sha256(partial),
-        frames=index.result.frames,
-        content_hash=index.result.content_hash,
-        definitions=index.header.definitions,
-    )
+    state = RoundState.of(partial, index.header, index.result)
     _, problems = check_round(partial, "full", state)
     if problems:
         raise RuntimeError(f"the recorded file is damaged: {problems[0]}")

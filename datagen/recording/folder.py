@@ -14,6 +14,7 @@ from importlib.resources import files
 from pathlib import Path
 
 from datagen.recording.errors import DatasetError
+from datagen.recording.round_metadata import RoundHeader, RoundResult
 from datagen.recording.schema.json_schema import SCHEMA_FILE, schema_text
 from runtime.files import atomic_move, atomic_write, unfinished_path
 
@@ -35,6 +36,19 @@ class RoundState:
     frames: int
     content_hash: str
     definitions: str
+
+    @staticmethod
+    def of(path: Path, header: RoundHeader, result: RoundResult) -> "RoundState":
+        """State of the complete round file at `path`, which need not be in the dataset yet."""
+        return RoundState(
+            id=header.id,
+            file=f"rounds/{header.id}.mcap",
+            bytes=path.stat().st_size,
+            sha256=file_sha256(path),
+            frames=result.frames,
+            content_hash=result.content_hash,
+            definitions=header.definitions,
+        )
 
     @staticmethod
     def read(path: Path) -> "RoundState":

@@ -12,7 +12,7 @@ import pytest
 
 import trackfeatures as tf
 from datagen.cli import main as datagen_main
-from datagen.recording.folder import RoundState, file_sha256, partial_path, prepare, publish
+from datagen.recording.folder import RoundState, partial_path, prepare, publish
 from datagen.recording.frame import DriverCommand, EgoState, Frame, RoadPlace, SensorReadings
 from datagen.recording.manifest import rebuild
 from datagen.recording.mcap.writer import RoundWriter
@@ -66,16 +66,7 @@ class Samples:
         partial = partial_path(folder, header.id)
         seed = header.seed if content_seed is None else content_seed
         result = self.write(partial, header, self.frames(FRAMES, seed))
-        state = RoundState(
-            id=header.id,
-            file=f"rounds/{header.id}.mcap",
-            bytes=partial.stat().st_size,
-            sha256=file_sha256(partial),
-            frames=result.frames,
-            content_hash=result.content_hash,
-            definitions=header.definitions,
-        )
-        publish(folder, partial, state)
+        publish(folder, partial, RoundState.of(partial, header, result))
 
     def dataset(self, folder: Path) -> Path:
         """Two rounds to train, one to test."""

@@ -19,7 +19,7 @@ PROGRAMS = ("simulator", "datagen", "mtlnet", "serve", "controllers")
 ADDRESS = "http://127.0.0.1:8000"
 # Options that make a command of the README or the tutorial small; the last one given counts.
 SMALL = {
-    ("datagen", "collect"): ["--rounds", "4", "--frames", "30", "--tracks", "oval,coast"],
+    ("datagen", "collect"): ["--rounds", "4", "--frames", "30", "--tracks", "oval,town"],
     ("mtlnet", "train"): ["--iterations", "2"],
     ("controllers", "drive"): ["--steps", "10"],
 }

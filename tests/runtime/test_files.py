@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from runtime.files import atomic_write, check_folder
+from runtime.files import atomic_write, check_folder, try_lock
 from trackfeatures import UserError
 
 
@@ -51,3 +51,19 @@ def test_a_missing_folder_or_a_folder_as_file_is_refused(tmp_path: Path) -> None
         check_folder(tmp_path / "missing" / "file")
     with pytest.raises(UserError, match="is a folder"):
         check_folder(tmp_path)
+
+
+def test_a_lock_excludes_others_until_its_file_is_closed(tmp_path: Path) -> None:
+    """Two open files are two holders, as two processes are."""
+    first, other = (os.open(tmp_path, os.O_RDONLY) for _ in range(2))
+    try:
+        assert try_lock(first, shared=True)
+        assert try_lock(other, shared=True)
+        assert not try_lock(other)
+        os.close(first)
+        assert try_lock(other)
+        first = os.open(tmp_path, os.O_RDONLY)
+        assert not try_lock(first, shared=True)
+    finally:
+        os.close(first)
+        os.close(other)

@@ -15,7 +15,6 @@ from datagen.recording.dataset import IMAGE_DATA
 from datagen.recording.errors import DatasetError
 from datagen.recording.folder import (
     RoundState,
-    file_sha256,
     partial_path,
     publish,
     state_path,
@@ -180,15 +179,7 @@ def _write(path: Path, header: RoundHeader, intact: IntactFrames, recovery: Reco
         file.add_metadata(RECOVERY_METADATA, recovery.to_metadata())
         file.add_metadata(RESULT_METADATA, result.to_metadata())
         file.finish()
-    state = RoundState(
-        id=header.id,
-        file=f"{ROUNDS}/{header.id}.mcap",
-        bytes=path.stat().st_size,
-        sha256=file_sha256(path),
-        frames=result.frames,
-        content_hash=result.content_hash,
-        definitions=header.definitions,
-    )
+    state = RoundState.of(path, header, result)
     _, problems = check_round(path, "full", state)
     if problems:
         raise DatasetError(f"the recovered round cannot be read back: {problems[0]}")

@@ -7,7 +7,7 @@ use. Any other file is read with the official reader, message by message. Both g
 
 import errno
 import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -153,34 +153,11 @@ class RoundIndex:
     recovery: Recovery | None = None
     """Set if the round was recovered from a damaged file: frames are missing."""
 
-    @property
-    def mapped(self) -> bool:
-        return self.summary is not None
-
 
 def open_round(path: Path, topic_names: Sequence[str] = LABEL_READER_TOPICS) -> RoundIndex:
     """Index topics of a recorded round; DatasetError if it is damaged or of another format."""
-    return _with_clear_errors(
-        path, lambda: _map_round(path, topic_names) or _load_round(path, topic_names)
-    )
-
-
-def load_round(path: Path, topic_names: Sequence[str] = LABEL_READER_TOPICS) -> RoundIndex:
-    """As `open_round`, with the official reader: slow, for any MCAP file; the oracle in tests."""
-    return _with_clear_errors(path, lambda: _load_round(path, topic_names))
-
-
-class _NotARoundError(ValueError):
-    """An undamaged MCAP file that is not a round of this program."""
-
-
-class _OtherVersionError(ValueError):
-    """A round written by another version of this program."""
-
-
-def _with_clear_errors(path: Path, read: Callable[[], RoundIndex]) -> RoundIndex:
     try:
-        return read()
+        return _map_round(path, topic_names) or _load_round(path, topic_names)
     except _NotARoundError as error:
         raise DatasetError(
             f"{path} is an MCAP file but no round of driverview ({error}); move it elsewhere"
@@ -199,6 +176,14 @@ def _with_clear_errors(path: Path, read: Callable[[], RoundIndex]) -> RoundIndex
             "it and run the same `datagen collect` again, or save its undamaged frames with "
             "`datagen recover`"
         ) from error
+
+
+class _NotARoundError(ValueError):
+    """An undamaged MCAP file that is not a round of this program."""
+
+
+class _OtherVersionError(ValueError):
+    """A round written by another version of this program."""
 
 
 def _map_round(path: Path, topic_names: Sequence[str]) -> RoundIndex | None:

@@ -101,7 +101,7 @@ def test_a_finished_dataset_is_left_alone_and_a_lost_round_made_again(collected:
         (["--executor", "slurm"], "no executor 'slurm'; choose local, ray"),
         (["--shard", "3/2"], "--shard is '3/2'"),
         (["--split", "later"], "no split 'later'"),
-        (["--split", "unseen", "--tracks", "circuit"], "one of those to train on"),
+        (["--split", "unseen"], "track circuit is one of those to train on"),
         (["--jitter-camera"], "jitter_camera: False there, True asked for"),
     ],
 )

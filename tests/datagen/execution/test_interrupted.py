@@ -18,9 +18,9 @@ from datagen.execution.collect import collect
 from datagen.execution.process_pool import ProcessPool
 from datagen.execution.retry import ATTEMPTS, DEATHS_IN_A_ROW, RetryQueue, Timeouts
 from datagen.planning.plan import RoundPlan
-from datagen.recorder.job import AttemptFailed, FramesDone, RoundDone
+from datagen.recorder.job import AttemptFailed, FatalError, FramesDone, RoundDone
 from datagen.recording.errors import DatasetError
-from datagen.recording.folder import read_states
+from datagen.recording.folder import RoundState, read_states
 from datagen.recording.integrity.verify import verify
 from simulator.vehicle.state import Command
 from tests.datagen.commands import attempted, datagen, make_jobs, make_small_plan
@@ -174,7 +174,8 @@ def test_a_round_that_takes_too_long_is_tried_three_times_and_given_up(tmp_path:
 
 def test_retries_have_growing_delays_and_end_after_the_third_attempt(tmp_path: Path) -> None:
     (job, other) = make_jobs(tmp_path, rounds=2, frames=10)
-    queue = RetryQueue([job, other], Timeouts(retry_delay_s=2.0))
+    messages: list[FramesDone | RoundDone] = []
+    queue = RetryQueue([job, other], Timeouts(retry_delay_s=2.0), messages.append)
     assert queue.take(0.0) == job
     queue.record_failure(job, "first", now=10.0)
     assert (queue.next_at(), queue.take(10.0)) == (0.0, other)
@@ -189,17 +190,35 @@ def test_retries_have_growing_delays_and_end_after_the_third_attempt(tmp_path: P
     ]
     queue.record_failure(other, "for good", now=30.0, final=True)
     assert queue.failures[1].final
+    assert messages == [FramesDone(f"round-00{number}", 0) for number in (0, 0, 0, 1)]
 
 
 def test_repeated_process_deaths_end_the_collection(tmp_path: Path) -> None:
-    queue = RetryQueue(make_jobs(tmp_path, rounds=1, frames=10), Timeouts())
+    done = RoundDone(RoundState("round-000", "rounds/round-000.mcap", 1, "", 10, "", ""), resets=0)
+    (job,) = make_jobs(tmp_path, rounds=1, frames=10)
+    messages: list[FramesDone | RoundDone] = []
+    queue = RetryQueue((), Timeouts(), messages.append)
     for _ in range(DEATHS_IN_A_ROW - 1):
-        queue.record_death("code -11")
-    queue.record_success()
+        queue.record_death(None, "code -11")
+    queue.record_outcome(job, done)
+    assert messages == [done]
     for _ in range(DEATHS_IN_A_ROW - 1):
-        queue.record_death("code -11")
+        queue.record_death(None, "code -11")
+    assert len(queue) == 0
     with pytest.raises(DatasetError, match=r"ended one after the other .*code -11"):
-        queue.record_death("code -11")
+        queue.record_death(job, "code -11")
+
+
+def test_the_round_of_a_dead_process_is_queued_again(tmp_path: Path) -> None:
+    (job,) = make_jobs(tmp_path, rounds=1, frames=10)
+    queue = RetryQueue((), Timeouts(retry_delay_s=0.0), lambda message: None)
+    queue.record_death(job, "code -11")
+    assert (len(queue), queue.failures) == (1, [])
+    for outcome in (AttemptFailed("round-000", "again"), AttemptFailed("round-000", "the third")):
+        queue.record_outcome(job, outcome)
+    assert [(f.reason, f.final) for f in queue.failures] == [("the third", False)]
+    with pytest.raises(OSError, match="No space left"):
+        queue.record_outcome(job, FatalError(OSError(28, "No space left on device")))
 
 
 def test_no_worker_outlives_a_collector_that_was_killed(tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ from datagen.planning.class_balance import (
 from datagen.planning.config import CollectConfig, TrackChoice
 from datagen.planning.plan import RoundPlan
 from datagen.planning.planner import make_plan
-from datagen.planning.tracks import TORCS_TRACKS, choose_tracks
+from datagen.planning.tracks import choose_tracks
 from simulator.driving.speed import LATERAL_ACCELERATION, bend_profile, speed_profile
 from simulator.track.catalogue import find_track, track_files
 from simulator.track.road import Road
@@ -30,20 +30,26 @@ from simulator.world.world import World
 OWN = ("circuit", "countryside", "forest", "gravel-valley", "highway", "mountain-pass", "town")
 
 
-def torcs_or_own(source: str) -> tuple[TrackChoice, ...]:
+TORCS = (
+    "forza", "alpine-1", "alpine-2", "eroad", "g-track-1", "g-track-2", "g-track-3", "e-track-2",
+    "e-track-3",
+)  # fmt: skip
+
+
+def tracks_of(source: str) -> tuple[TrackChoice, ...]:
     if source == "own":
         return choose_tracks(OWN, None)
-    if not set(TORCS_TRACKS) <= set(track_files()):
+    if not set(TORCS) <= set(track_files()):
         pytest.skip("no TORCS tracks found; set TORCS_TRACKS")
-    return choose_tracks(TORCS_TRACKS, None)
+    return choose_tracks(TORCS if source == "torcs" else (), None)
 
 
-@pytest.mark.parametrize("source", ["own", "torcs"])
+@pytest.mark.parametrize("source", ["own", "torcs", "default"])
 @pytest.mark.parametrize(("rounds", "frames"), [(60, 2000), (60, 300), (16, 500)])
 def test_no_class_is_rare_on_either_side_whatever_the_seed(
     source: str, rounds: int, frames: int
 ) -> None:
-    tracks = torcs_or_own(source)
+    tracks = tracks_of(source)
     forecast = TrackForecast.of(tracks, None)
     moved, before = [], []
     for seed in range(10):

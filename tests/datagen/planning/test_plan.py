@@ -3,6 +3,7 @@
 from collections import Counter
 from dataclasses import replace
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -11,7 +12,8 @@ import trackfeatures as tf
 from datagen.driving.trajectory import TRAJECTORIES
 from datagen.planning.config import CollectConfig, TrackChoice, all_lights
 from datagen.planning.planner import CAMERA_JITTER, make_plan
-from datagen.planning.tracks import TORCS_TRACKS, choose_tracks
+from datagen.planning.tracks import HELD_OUT, choose_tracks
+from simulator.track.catalogue import track_files
 
 LIGHTS = all_lights()
 NINE = tuple(TrackChoice(f"track-{i}", f"{i}" * 64) for i in range(9))
@@ -91,14 +93,50 @@ def test_impossible_configs_are_refused(changes: dict[str, Any]) -> None:
         wanted(**changes)
 
 
+def names_of(*args: Any, **options: Any) -> list[str]:
+    return [choice.name for choice in choose_tracks(*args, **options)]
+
+
+OWN = [
+    "circuit", "forest", "gravel-valley", "highway", "mountain-pass", "oval", "ring-road", "town",
+]  # fmt: skip
+
+
 @pytest.mark.usefixtures("no_torcs_install")
 def test_without_torcs_the_projects_own_tracks_are_driven() -> None:
-    names = [choice.name for choice in choose_tracks((), None)]
-    assert len(names) >= 4
-    assert not set(names) & set(TORCS_TRACKS)
-    (one,) = choose_tracks((names[0],), None)
-    assert one.name == names[0]
+    assert names_of((), None) == OWN
+    (one,) = choose_tracks(("oval",), None)
+    assert one.name == "oval"
     assert len(one.content_hash) == 64
+
+
+@pytest.mark.usefixtures("no_torcs_install")
+def test_all_torcs_tracks_that_are_found_are_driven_except_those_held_out(
+    torcs_tracks: Path,
+) -> None:
+    assert names_of((), torcs_tracks) == sorted([*OWN, "dirt-1", "wheel-1"])
+    assert names_of((), torcs_tracks, unseen=True) == ["coast", "countryside", "dirt-3"]
+
+
+@pytest.mark.usefixtures("no_torcs_install")
+def test_tracks_of_the_users_own_are_driven_when_they_are_named(torcs_tracks: Path) -> None:
+    mine = torcs_tracks / "mine.toml"
+    mine.write_bytes(track_files()["oval"].read_bytes())
+    assert "mine" not in names_of((), torcs_tracks)
+    assert names_of(("mine",), torcs_tracks) == ["mine"]
+    assert names_of(("mine",), torcs_tracks, unseen=True) == ["mine"]
+
+
+@pytest.fixture
+def torcs_tracks(tmp_path: Path) -> Path:
+    """The folder of a TORCS installation with three tracks."""
+    sample = Path("tests/simulator/track/fixtures/version-3.xml").read_bytes()
+    folder = tmp_path / "tracks"
+    for name in ("dirt-1", "dirt-3", "wheel-1"):
+        file = folder / name.partition("-")[0] / name / f"{name}.xml"
+        file.parent.mkdir(parents=True)
+        file.write_bytes(sample.replace(b"version-3", name.encode()))
+    return folder
 
 
 def test_jittered_cameras_differ_and_stay_near_the_nominal_camera() -> None:
@@ -122,13 +160,18 @@ def test_rounds_of_an_unseen_track_share_no_seed_with_those_to_train_on() -> Non
     assert not usual & {entry.seed for entry in plan.rounds}
 
 
-def test_the_unseen_track_is_in_no_training_plan() -> None:
-    (unseen,) = choose_tracks((), None, unseen=True)
-    usual = [choice.name for choice in choose_tracks((), None)]
-    assert unseen.name not in usual
-    with pytest.raises(tf.UserError, match="one of those to train on"):
-        choose_tracks((usual[0],), None, unseen=True)
-    assert [c.name for c in choose_tracks((unseen.name,), None, unseen=True)] == [unseen.name]
+def test_the_held_out_tracks_are_in_no_training_plan() -> None:
+    usual = names_of((), None)
+    unseen = names_of((), None, unseen=True)
+    assert unseen == [name for name in HELD_OUT if name in track_files()]
+    assert {"coast", "countryside"} <= set(unseen)
+    assert not set(HELD_OUT) & set(usual)
+    for name in usual:
+        with pytest.raises(tf.UserError, match=f"track {name} is one of those to train on"):
+            choose_tracks((name,), None, unseen=True)
+    for name in unseen:
+        assert names_of((name,), None, unseen=True) == [name]
+        assert names_of((name,), None) == [name]  # in a training set by name only
 
 
 def test_the_plan_hash_depends_on_the_program_version(monkeypatch: pytest.MonkeyPatch) -> None:

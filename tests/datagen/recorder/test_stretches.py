@@ -26,9 +26,18 @@ def test_every_light_is_used_before_one_repeats() -> None:
         assert set(lights[first : first + len(LIGHTS)]) == set(LIGHTS)
 
 
-def test_without_stretches_a_round_has_one_light() -> None:
-    plan = make_plan(CollectConfig(rounds=8, frames=500, seed=3, tracks=TRACKS, stretch=0))
+def test_by_default_a_round_is_a_film_at_20_hz_in_one_scenery_and_light() -> None:
+    plan = make_plan(CollectConfig(rounds=8, frames=500, seed=3, tracks=TRACKS))
     assert [len(entry.lights) for entry in plan.rounds] == [1] * 8
+    assert {(entry.stretch, entry.frequency_hz) for entry in plan.rounds} == {(0, 20)}
+
+
+def test_scenes_without_stretches_are_refused() -> None:
+    done = datagen("collect", "--scenes", "4", "--dry-run")
+    assert done.returncode != 0
+    assert (
+        "4 scenes a round asked for, but the scenery never changes; give --stretch" in done.stderr
+    )
 
 
 def test_no_two_stretches_have_the_same_scenery() -> None:
