@@ -30,32 +30,40 @@ class NullEvent:
 class DirectRequest:
     """A request in progress, with the attributes of uvicorn's RequestResponseCycle that it uses."""
 
-    __slots__ = ("disconnected", "features", "keep_alive", "parts", "response_complete", "size")
+    __slots__ = ("body", "disconnected", "features", "keep_alive", "response_complete")
     message_event = NullEvent()
 
     def __init__(self, keep_alive: bool) -> None:
         self.keep_alive = keep_alive
         self.disconnected = self.response_complete = False
         self.features: FeaturesRequest | None = None
-        self.parts: list[bytes] = []
-        self.size = 0
+        self.body: bytes | bytearray = b""
 
     def add(self, part: bytes) -> None:
         """Add a part of the body, unless the request was refused."""
         if self.features is None:
             return
-        self.parts.append(part)
-        self.size += len(part)
+        if not self.body:
+            self.body = part
+        elif isinstance(self.body, bytes):
+            self.body = bytearray(self.body + part)
+        else:
+            self.body += part
         try:
-            check_body_size(self.size)
+            check_body_size(len(self.body))
         except Problem as problem:
             self.features.refuse(problem)
-            self.features = None
+            self.drop()
 
-    @property
-    def body(self) -> bytes:
-        """All parts received."""
-        return self.parts[0] if len(self.parts) == 1 else b"".join(self.parts)
+    def drop(self) -> None:
+        """Let go of the body, and of what would reply: that and this object hold each other."""
+        self.features, self.body = None, b""
+
+    def submit(self) -> None:
+        """Hand over the complete body, unless the request was refused."""
+        body, self.body = bytes(self.body), b""
+        if self.features is not None:
+            self.features.submit(body)
 
 
 class DirectProtocol(GuardedProtocol):
@@ -67,13 +75,19 @@ class DirectProtocol(GuardedProtocol):
         self._request: DirectRequest | None = None
 
     def on_message_begin(self) -> None:
+        self.count_request()
         self.url = b""
         self.headers = []
 
     def on_header(self, name: bytes, value: bytes) -> None:
-        self.headers.append((name.lower(), value))
+        if self._phase is Phase.BODY:
+            self.drop_trailer(name, value)
+        else:
+            self.headers.append((name.lower(), value))
 
     def on_headers_complete(self) -> None:
+        if self.begins_upgrade():
+            return
         headers = dict(self.headers)
         if not self._bypasses_asgi(headers):
             self._build_scope()
@@ -83,7 +97,7 @@ class DirectProtocol(GuardedProtocol):
         self.cycle: Any = DirectRequest(
             not self._guard.draining and self.parser.should_keep_alive()
         )
-        self._request = request = self.cycle
+        self._request = self._running = request = self.cycle
         send = partial(self._reply, request)
         request.features = self._service.open(headers, self.client[0] if self.client else "", send)
 
@@ -91,6 +105,7 @@ class DirectProtocol(GuardedProtocol):
         if self._request is None:
             super().on_body(body)
         else:
+            self._known_bytes = self._unread_bytes
             self._request.add(body)
 
     def on_message_complete(self) -> None:
@@ -99,8 +114,13 @@ class DirectProtocol(GuardedProtocol):
             super().on_message_complete()
             return
         self.on_body_complete()
-        if request.features is not None:
-            request.features.submit(request.body)
+        request.submit()
+
+    def abandon_requests(self) -> None:
+        request, self._request = self._request, None
+        if request is not None:
+            request.drop()
+        super().abandon_requests()
 
     def resume_writing(self) -> None:
         super().resume_writing()
@@ -126,7 +146,7 @@ class DirectProtocol(GuardedProtocol):
     def _reply(self, request: DirectRequest, reply: Reply) -> None:
         request.response_complete = True
         request.features = None  # breaks a reference cycle: it holds this method
-        if request.disconnected or self.transport.is_closing() or self._phase is Phase.CLOSING:
+        if request.disconnected or self.transport.is_closing():
             return
         headers = self.server_state.default_headers
         if not request.keep_alive:
@@ -134,6 +154,8 @@ class DirectProtocol(GuardedProtocol):
         self.transport.write(encode_head(reply, *headers) + reply.body)
         if not request.keep_alive:
             self.transport.close()
+        if reply.status == HTTPStatus.OK:
+            self._idle_group = self._guard.served
         self.on_response_complete()
         if self.flow.write_paused:  # a client that reads no replies may send no more requests
             self.flow.pause_reading()

@@ -30,7 +30,7 @@ from serve.api.problems import PROBLEM_TYPES
 from serve.app import Service
 from serve.config import Limits
 from serve.observability import metrics
-from serve.server import connection
+from serve.server import guard
 from serve.server.worker_server import WorkerServer
 from serve.workers import shared_memory
 from serve.workers.shared_memory import HEARTBEAT, SharedMemory, WorkerPeers
@@ -141,7 +141,7 @@ class Clock:
 @pytest.fixture(autouse=True)
 def patient_service(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let no slow test find that a worker counts as gone or that an unread problem is dropped."""
-    monkeypatch.setattr(connection, "LINGER_S", PATIENCE_S)
+    monkeypatch.setattr(guard, "LINGER_S", PATIENCE_S)
     for reader in (shared_memory, metrics):
         monkeypatch.setattr(reader, "HEARTBEAT_TIMEOUT_S", PATIENCE_S)
 
