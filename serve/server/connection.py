@@ -53,6 +53,7 @@ class GuardedProtocol(HttpToolsProtocol):
         self.group: Group = {}
         self.since_s = 0.0  # when this phase began
         self._phase = Phase.HEAD
+        self._settled: Phase | None = None  # the phase whose group and deadline it has
         self._deadline_s = inf
         self._idle_group = guard.idle
         self._served = False
@@ -72,7 +73,7 @@ class GuardedProtocol(HttpToolsProtocol):
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         super().connection_made(transport)
-        self._begin_receiving(Phase.HEAD)
+        self._settle()
         guard, limit = self._guard, self._guard.limits.connections
         count = len(self.connections) - len(guard.leaving) + guard.other_connections()
         if count > limit and not guard.make_room(count - limit):
@@ -80,40 +81,43 @@ class GuardedProtocol(HttpToolsProtocol):
             self._close_with(Problem(TOO_MANY_CONNECTIONS, detail))
 
     def data_received(self, data: bytes) -> None:
-        if self._phase is Phase.CLOSING:
+        phase = self._phase
+        if phase is Phase.CLOSING:
             return
-        if self._phase is Phase.IDLE:
+        if phase is Phase.IDLE:
             self._unread_bytes = self._known_bytes = 0
-            self._begin_receiving(Phase.HEAD)
+            self._phase = Phase.HEAD
         self._part_bytes = len(data)
         self._part_requests = 0
         self._unread_bytes += self._part_bytes
-        self._feed(data)
+        try:
+            self.parser.feed_data(data)
+        except HttpParserUpgrade as upgrade:
+            self._feed_again(data[upgrade.args[0] :])
+        except HttpParserError:
+            self.send_400_response("")
         # Headers and trailers that have not ended yet are counted as they arrive.
         excess = self._unread_bytes - self._known_bytes > MAX_HEAD_BYTES
         if excess and self._phase is not Phase.CLOSING:
             self._close_with(_head_too_large())
+        if self._settled is not self._phase:
+            self._settle()
 
-    def _feed(self, data: bytes) -> None:
-        """Parse `data`, again from its headers on where an upgrade is ignored."""
+    def _feed_again(self, rest: bytes) -> None:
+        """Parse the rest of a part after the headers of a request with an upgrade."""
         for _ in range(MAX_UPGRADES):
+            rest = self._upgrade(rest)
+            if not rest:
+                return
             try:
-                self.parser.feed_data(data)
+                self.parser.feed_data(rest)
                 return
             except HttpParserUpgrade as upgrade:
-                data = self._upgrade(data[upgrade.args[0] :])
-                if not data:
-                    return
+                rest = rest[upgrade.args[0] :]
             except HttpParserError:
                 self.send_400_response("")
                 return
-        self._close_with(_too_many_requests(f"{MAX_UPGRADES} upgrades"))
-
-    def count_request(self) -> None:
-        """Count a request of this part. Raises ValueError, for the parser, when there are many."""
-        self._part_requests += 1
-        if self._part_requests > MAX_AT_ONCE:
-            self._stop_parser(_too_many_requests(f"{MAX_AT_ONCE} requests"))
+        self._close_with(too_many_requests(f"{MAX_UPGRADES} upgrades"))
 
     def on_header(self, name: bytes, value: bytes) -> None:
         if self._phase is Phase.BODY:
@@ -125,27 +129,27 @@ class GuardedProtocol(HttpToolsProtocol):
         """Count a trailer. Raises ValueError, for the parser, when they are too large."""
         self._trailer_bytes += len(name) + len(value)
         if self._trailer_bytes > MAX_HEAD_BYTES:
-            self._stop_parser(_head_too_large())
+            self.stop_parser(_head_too_large())
 
-    def check_head(self) -> None:
-        """Begin to receive the body. Raises ValueError, for the parser, on too large headers."""
-        self._check_head_size()
-        self._trailer_bytes = 0
-        self._begin_receiving(Phase.BODY)
-
-    def begins_upgrade(self) -> bool:
-        """Whether these headers ask for an upgrade: `_feed` continues with it."""
-        self._upgrading = self.parser.should_upgrade()
-        if self._upgrading:
+    def begin_body(self) -> None:
+        """Wait for the body. Raises ValueError, for the parser, on too large headers."""
+        if self._unread_bytes > MAX_HEAD_BYTES:
             self._check_head_size()
-        return self._upgrading
+        self._trailer_bytes = 0
+        self._phase = Phase.BODY
+
+    def begin_upgrade(self) -> None:
+        """Leave a request that asks for an upgrade to `_upgrade`."""
+        self._check_head_size()
+        self._upgrading = True
 
     def on_headers_complete(self) -> None:
-        if self.begins_upgrade():
+        if self.parser.should_upgrade():
+            self.begin_upgrade()
             return
-        self.check_head()
+        self.begin_body()
         if len(self.pipeline) >= MAX_PIPELINED:
-            self._stop_parser(_too_many_requests(f"{MAX_PIPELINED} requests"))
+            self.stop_parser(too_many_requests(f"{MAX_PIPELINED} requests"))
         super().on_headers_complete()
         if self._guard.draining and self.cycle is not None:
             self.cycle.keep_alive = False
@@ -157,13 +161,11 @@ class GuardedProtocol(HttpToolsProtocol):
     def on_body_complete(self) -> None:
         """Wait for the answer, unless it was sent."""
         self._unread_bytes = self._known_bytes = self._part_bytes
-        if self.cycle is None or self.cycle.response_complete:
-            self._become_idle()
-        else:
-            self._deadline_s = self._enter(Phase.WORK, self._guard.working) + WORK_S
+        waits = not (self.cycle is None or self.cycle.response_complete)
+        self._phase = Phase.WORK if waits else Phase.IDLE
 
     def on_message_complete(self) -> None:
-        if self._upgrading:
+        if self._upgrading:  # `_feed_again` follows
             return
         self.on_body_complete()
         super().on_message_complete()
@@ -176,7 +178,8 @@ class GuardedProtocol(HttpToolsProtocol):
         self.server_state.total_requests += 1
         self.flow.resume_reading()
         if self._phase is Phase.WORK:
-            self._become_idle()
+            self._phase = Phase.IDLE
+            self._settle()
 
     def pause_writing(self) -> None:
         super().pause_writing()
@@ -207,28 +210,26 @@ class GuardedProtocol(HttpToolsProtocol):
         self._running = cycle
         super()._start_asgi_task(cycle, app)
 
-    def _enter(self, phase: Phase, group: Group) -> float:
-        self._phase = phase
-        return self._guard.place(self, group)
-
-    def _become_idle(self) -> None:
-        """Wait for the next request."""
-        now = self._enter(Phase.IDLE, self._idle_group)
-        self._deadline_s = now + self._guard.limits.idle_s
-
-    def _begin_receiving(self, phase: Phase) -> None:
-        """Wait for headers or a body, from now on."""
-        limits = self._guard.limits
-        limit_s = limits.head_s if phase is Phase.HEAD else limits.body_s
-        self._deadline_s = self._enter(phase, self._guard.receiving) + limit_s
+    def _settle(self) -> None:
+        """Join the group of this phase, and set its deadline."""
+        guard, limits, phase = self._guard, self._guard.limits, self._phase
+        self._settled = phase
+        if phase is Phase.IDLE:
+            self._deadline_s = guard.place(self, self._idle_group) + limits.idle_s
+        elif phase is Phase.WORK:
+            self._deadline_s = guard.place(self, guard.working) + WORK_S
+        elif phase is Phase.BODY:
+            self._deadline_s = guard.place(self, guard.receiving) + limits.body_s
+        elif phase is Phase.HEAD:
+            self._deadline_s = guard.place(self, guard.receiving) + limits.head_s
 
     def _check_head_size(self) -> None:
-        if self._unread_bytes > MAX_HEAD_BYTES:
-            size = len(self.url) + sum(len(k) + len(v) for k, v in self.headers)
-            if size > MAX_HEAD_BYTES:
-                self._stop_parser(_head_too_large())
+        size = len(self.url) + sum(len(k) + len(v) for k, v in self.headers)
+        if size > MAX_HEAD_BYTES:
+            self.stop_parser(_head_too_large())
 
-    def _stop_parser(self, fault: Problem) -> None:
+    def stop_parser(self, fault: Problem) -> None:
+        """Raise ValueError, for the parser: the request ends with this problem."""
         self._fault = fault
         raise ValueError(fault.detail)  # ends in `send_400_response`
 
@@ -296,8 +297,8 @@ class GuardedProtocol(HttpToolsProtocol):
         elif phase is Phase.BODY:
             self._close_with(_too_slow("body", limits.body_s))
         else:
-            self._enter(Phase.CLOSING, self._guard.leaving)
-            self._deadline_s = inf
+            self._phase, self._deadline_s = Phase.CLOSING, inf
+            self._guard.place(self, self._guard.leaving)
             # Close would wait for a client that does not read its answer.
             idle = phase is Phase.IDLE and not self.transport.get_write_buffer_size()
             (self.transport.close if idle else self.transport.abort)()
@@ -305,7 +306,8 @@ class GuardedProtocol(HttpToolsProtocol):
     def _close_with(self, problem: Problem) -> None:
         """Send a problem and close the connection; where a reply is owed, send that instead."""
         owed = self._running if self.pipeline or self._phase is Phase.WORK else None
-        now = self._enter(Phase.CLOSING, self._guard.dismissed)
+        self._phase = Phase.CLOSING
+        now = self._guard.place(self, self._guard.dismissed)
         self._deadline_s = now + guards.LINGER_S
         self._guard.count_closed(problem.type)
         if owed is not None:  # the client would take the problem for that reply
@@ -327,7 +329,8 @@ def _head_too_large() -> Problem:
     return Problem(HEAD_TOO_LARGE, f"the headers have more than {MAX_HEAD_BYTES} bytes; send fewer")
 
 
-def _too_many_requests(what: str) -> Problem:
+def too_many_requests(what: str) -> Problem:
+    """The problem of requests that do not wait for the replies to others."""
     return Problem(RATE_LIMITED, f"more than {what} arrived at once; wait for the replies")
 
 

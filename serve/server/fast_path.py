@@ -14,7 +14,7 @@ from serve.api.http_io import Header, Reply, check_body_size, encode_head
 from serve.api.problems import Problem
 from serve.api.request_options import Headers
 from serve.app import Service
-from serve.server.connection import GuardedProtocol, Phase
+from serve.server.connection import MAX_AT_ONCE, GuardedProtocol, Phase, too_many_requests
 
 CLOSE_HEADER: Header = (b"connection", b"close")
 ASGI_HEADERS = frozenset({b"expect", b"upgrade", b"x-forwarded-for"})
@@ -75,7 +75,10 @@ class DirectProtocol(GuardedProtocol):
         self._request: DirectRequest | None = None
 
     def on_message_begin(self) -> None:
-        self.count_request()
+        self._part_requests += 1
+        if self._part_requests > MAX_AT_ONCE:
+            self.stop_parser(too_many_requests(f"{MAX_AT_ONCE} requests"))
+        self._settled = None
         self.url = b""
         self.headers = []
 
@@ -86,14 +89,15 @@ class DirectProtocol(GuardedProtocol):
             self.headers.append((name.lower(), value))
 
     def on_headers_complete(self) -> None:
-        if self.begins_upgrade():
+        if self.parser.should_upgrade():
+            self.begin_upgrade()
             return
         headers = dict(self.headers)
         if not self._bypasses_asgi(headers):
             self._build_scope()
             super().on_headers_complete()
             return
-        self.check_head()
+        self.begin_body()
         self.cycle: Any = DirectRequest(
             not self._guard.draining and self.parser.should_keep_alive()
         )

@@ -48,6 +48,9 @@ class GuardedWebSocket(WebSocketsSansIOProtocol):
     def connection_lost(self, exc: Exception | None) -> None:
         self.group.pop(self, None)
         super().connection_lost(exc)
+        self.frames = []
+        self.conn.reader.discard()
+        self.conn.parser.close()  # it holds `conn`, which holds it
 
     def data_received(self, data: bytes) -> None:
         for at in range(0, len(data), SLICE_BYTES):

@@ -226,6 +226,23 @@ def test_websockets_without_messages_give_way() -> None:
             connection.close()
 
 
+def test_leaving_in_the_middle_of_a_message_leaves_nothing(service: Served, target: Target) -> None:
+    service.post(JPEG)
+    gc.collect()
+    gc.disable()
+    try:
+        before = resident_mb()
+        for _ in range(4):
+            connections = attacks.half_frames(target, 16)
+            until(lambda: sum(s._message_end_s < 1e9 for s in service.server.guard.streams) == 16)
+            for connection in connections:
+                connection.close()
+            until(lambda: not service.server.guard.streams)
+        assert resident_mb() - before < 30
+    finally:
+        gc.enable()
+
+
 def test_a_websocket_that_is_not_read_keeps_no_images(service: Served, target: Target) -> None:
     before = resident_mb()
     connections = [target.open_websocket() for _ in range(16)]
