@@ -66,8 +66,9 @@ docs: $(READY) ## build the documentation in build/docs; a broken link fails
 quick: $(READY) ## the tests that take seconds
 	$(BIN)/pytest $(PARALLEL) -m "not slow and not alone"
 
-fuzz: $(READY) ## a million damaged images through the service's gate, in process
+fuzz: $(READY) ## a million damaged images, and as many byte streams, through the service, in process
 	$(BIN)/python benchmarks/service_fuzz.py
+	$(BIN)/python benchmarks/service_stream_fuzz.py
 
 attack: $(READY) ## the attacks of the tests on a service, beside a well-behaved client; an hour
 	$(BIN)/python benchmarks/service_attack.py $(ATTACK)

@@ -117,6 +117,8 @@ class GuardedWebSocket(WebSocketsSansIOProtocol):
         if message["type"] == "websocket.accept":
             self._handshake_end_s = inf
             self.transport.resume_reading()
+        elif message["type"] == "websocket.http.response.body":
+            self.handshake_complete = True  # else uvicorn logs an error for a refusal
 
     def pause_writing(self) -> None:
         super().pause_writing()

@@ -259,29 +259,10 @@ def damaged_images(target: Target, count: int = 100) -> list[socket.socket]:
 
 def mutated_requests(target: Target, count: int = 100, seed: int = 0) -> list[socket.socket]:
     """Requests and WebSocket streams with bytes that were changed, cut or repeated."""
-    rng = random.Random(seed)
-    whole = [
-        target.post(JPEG[:500]),
-        target.handshake() + frame(TEXT, b"{}") + frame(BINARY, JPEG[:300]),
-        target.ask(Transfer_Encoding="chunked") + b"3\r\nabc\r\n0\r\nX-T: 1\r\n\r\n",
-        target.ask(Connection="Upgrade", Upgrade="h2c") * 2,
-    ]
+    rng, whole = random.Random(seed), whole_streams(target)
     connections = []
     for _ in range(count):
-        sent = bytearray(rng.choice(whole))
-        for _ in range(rng.randrange(1, 6)):
-            at, size = rng.randrange(len(sent)), rng.randrange(1, 20)
-            match rng.randrange(4):
-                case 0:
-                    sent[at] = rng.randrange(256)
-                case 1:
-                    del sent[at : at + size]
-                    sent += b"\r\n"
-                case 2:
-                    sent[at:at] = sent[at : at + size] * rng.randrange(1, 50)
-                case 3:
-                    sent[at:at] = rng.choice([b"\r\n", b"\0", b"\r\n\r\n", b"0" * 30, b"\xff"])
-        connections += _each(target, 1, bytes(sent))
+        connections += _each(target, 1, mutate(rng, whole))
     return connections[-64:]
 
 
@@ -292,6 +273,42 @@ ATTACKS: tuple[Attack, ...] = tuple(
     and getattr(found, "__module__", None) == __name__
     and not name.startswith("_")
 )
+
+
+def whole_streams(target: Target) -> list[bytes]:
+    """Streams of each kind that the service understands."""
+    chunks = b"3\r\nabc\r\n2;x=y\r\nde\r\n0\r\nX-T: 1\r\n\r\n"
+    coded = {"Transfer_Encoding": "chunked", "Content_Type": "image/png"}
+    return [
+        target.post(JPEG[:500]),
+        target.post(b"", Expect="100-continue", X_Forwarded_For="10.0.0.1") + target.ask(),
+        target.handshake(Origin="http://x") + b"\x88\x82\0\0\0\0\x03\xe8",
+        target.handshake(Sec_WebSocket_Protocol="driverview.msgpack"),
+        target.ask("POST", "/features", **coded) + chunks,
+        target.ask("POST", "/v2/models/track/infer", **coded) + chunks,
+        target.ask(Connection="Upgrade, close", Upgrade="h2c") * 2,
+        target.ask(path="/metrics?x=%41#y", Accept="text/*;q=0.5, */*;q=x"),
+    ]
+
+
+def mutate(rng: random.Random, whole: list[bytes]) -> bytes:
+    """One of the streams with bytes that were changed, cut or repeated."""
+    sent = bytearray(rng.choice(whole))
+    for _ in range(rng.randrange(6)):
+        at, size = rng.randrange(len(sent)), rng.randrange(1, 20)
+        match rng.randrange(5):
+            case 0:
+                sent[at] = rng.randrange(256)
+            case 1:
+                del sent[at : at + size]
+                sent += b"\r\n"
+            case 2:
+                sent[at:at] = sent[at : at + size] * rng.randrange(1, 50)
+            case 3:
+                sent[at:at] = rng.choice([b"\r\n", b"\0", b"\r\n\r\n", b"0" * 30, b"\xff", b":"])
+            case 4:
+                sent += rng.choice(whole)
+    return bytes(sent)
 
 
 def _each(target: Target, count: int, sent: bytes) -> list[socket.socket]:

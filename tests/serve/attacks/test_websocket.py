@@ -205,6 +205,20 @@ def test_leaving_a_busy_websocket_writes_nothing_to_the_log(
     assert [record.getMessage() for record in caplog.records] == []
 
 
+def test_refused_handshakes_write_one_line_a_second_to_the_log(
+    service: Served, target: Target, caplog: pytest.LogCaptureFixture
+) -> None:
+    with caplog.at_level(logging.INFO):
+        for _ in range(20):
+            with target.dial() as connection:
+                connection.sendall(target.handshake(Origin="http://elsewhere"))
+                assert read_rest(connection).startswith(b"HTTP/1.1 403")
+        until(lambda: not service.server.server_state.tasks)
+    assert [record.name for record in caplog.records if record.levelno >= logging.WARNING] == []
+    lines = [record for record in caplog.records if record.name == "serve.requests"]
+    assert 1 <= len(lines) < 10
+
+
 def test_websockets_without_messages_give_way() -> None:
     clock = Clock()
     engine = FakeEngine(lambda _image: outputs())
