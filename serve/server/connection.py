@@ -183,8 +183,8 @@ class GuardedProtocol(HttpToolsProtocol):
 
     def pause_writing(self) -> None:
         super().pause_writing()
-        if self._phase is Phase.WORK:  # an idle connection has this deadline already
-            self._deadline_s = self._guard.clock() + self._guard.limits.idle_s
+        # As long as an idle connection has; one that is being dismissed has less already.
+        self._deadline_s = min(self._deadline_s, self._guard.clock() + self._guard.limits.idle_s)
 
     def resume_writing(self) -> None:
         super().resume_writing()

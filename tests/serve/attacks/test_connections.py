@@ -1,6 +1,5 @@
 """Attacks on HTTP connections: each is answered or swept, and costs no memory."""
 
-import contextlib
 import gc
 import logging
 import os
@@ -108,17 +107,17 @@ def test_an_answer_that_nobody_reads_has_a_deadline() -> None:
         target = Target(service.port)
         connection = target.dial()
         connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 14)
-        connection.setblocking(False)
         until(lambda: open_count(service) == 1)
         (found,) = service.server.server_state.connections
         assert isinstance(found, DirectProtocol)
 
-        def send_until_paused() -> bool:
-            with contextlib.suppress(BlockingIOError):
-                connection.send(target.ask(path="/openapi.json"))
-            return bool(found.flow.write_paused)
-
-        until(send_until_paused)
+        state, sent = service.server.server_state, 0
+        while not found.flow.write_paused:
+            connection.sendall(target.ask(path="/openapi.json"))
+            sent += 1
+            until(lambda: state.total_requests == sent or found.flow.write_paused)  # noqa: B023
+        connection.sendall(target.ask())
+        until(lambda: found in service.server.guard.working)
         service.wait_for_tick()
         assert open_count(service) == 1
         clock.now_s += 30.1

@@ -123,6 +123,8 @@ def test_a_message_and_the_reading_of_answers_have_deadlines() -> None:
     limits = Limits(body_s=10.0, idle_s=30.0)
     with serving(gate.engine, limits=limits, clock=clock) as service:
         target = Target(service.port)
+        for option in (socket.SO_SNDBUF, socket.SO_RCVBUF):
+            service.listener.setsockopt(socket.SOL_SOCKET, option, 1 << 14)
         half, fragment = target.open_websocket(), target.open_websocket()
         half.sendall(frame(BINARY, JPEG)[:-1])
         fragment.sendall(frame(BINARY, JPEG, fin=False))
