@@ -17,6 +17,7 @@ from serve.app import Service
 from serve.server.connection import MAX_AT_ONCE, GuardedProtocol, Phase, too_many_requests
 
 CLOSE_HEADER: Header = (b"connection", b"close")
+SMALL_BYTES = 1024  # smaller parts of a body are put together: an object each would take more
 ASGI_HEADERS = frozenset({b"expect", b"upgrade", b"x-forwarded-for"})
 
 
@@ -30,40 +31,44 @@ class NullEvent:
 class DirectRequest:
     """A request in progress, with the attributes of uvicorn's RequestResponseCycle that it uses."""
 
-    __slots__ = ("body", "disconnected", "features", "keep_alive", "response_complete")
+    __slots__ = ("disconnected", "features", "keep_alive", "parts", "response_complete", "size")
     message_event = NullEvent()
 
     def __init__(self, keep_alive: bool) -> None:
         self.keep_alive = keep_alive
         self.disconnected = self.response_complete = False
         self.features: FeaturesRequest | None = None
-        self.body: bytes | bytearray = b""
+        self.parts: list[bytes | bytearray] = []
+        self.size = 0
 
     def add(self, part: bytes) -> None:
         """Add a part of the body, unless the request was refused."""
         if self.features is None:
             return
-        if not self.body:
-            self.body = part
-        elif isinstance(self.body, bytes):
-            self.body = bytearray(self.body + part)
+        last = self.parts[-1] if self.parts else None
+        if len(part) >= SMALL_BYTES:
+            self.parts.append(part)
+        elif isinstance(last, bytearray):
+            last += part
         else:
-            self.body += part
+            self.parts.append(bytearray(part))
+        self.size += len(part)
         try:
-            check_body_size(len(self.body))
+            check_body_size(self.size)
         except Problem as problem:
             self.features.refuse(problem)
             self.drop()
 
     def drop(self) -> None:
         """Let go of the body, and of what would reply: that and this object hold each other."""
-        self.features, self.body = None, b""
+        self.features = None
+        self.parts.clear()
 
     def submit(self) -> None:
         """Hand over the complete body, unless the request was refused."""
-        body, self.body = bytes(self.body), b""
+        parts, self.parts = self.parts, []
         if self.features is not None:
-            self.features.submit(body)
+            self.features.submit(bytes(parts[0]) if len(parts) == 1 else b"".join(parts))
 
 
 class DirectProtocol(GuardedProtocol):
