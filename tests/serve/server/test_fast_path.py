@@ -181,7 +181,7 @@ def test_a_client_that_reads_no_replies_is_read_no_more(service: Served) -> None
         service.listener.setsockopt(socket.SOL_SOCKET, option, 1 << 16)
     client = dial(service)
     client.setblocking(False)
-    pad = b"X-Pad: " + b"x" * 4000  # one part received then holds no more than MAX_AT_ONCE
+    pad = b"X-Pad: " + b"x" * 2100  # one part received then holds no more than MAX_AT_ONCE
     request = b"POST /features HTTP/1.1\r\nHost: x\r\n%b\r\nContent-Length: 0\r\n\r\n" % pad
     until(lambda: len(service.server.server_state.connections) == 1)
     (connection,) = service.server.server_state.connections
@@ -196,6 +196,7 @@ def test_a_client_that_reads_no_replies_is_read_no_more(service: Served) -> None
 
     until(send_until_paused)
     until(lambda: connection.flow.read_paused)
+    sent = 0
     with contextlib.suppress(BlockingIOError):
         while sent < 32 << 20:
             sent += client.send(request)
