@@ -179,6 +179,7 @@ async def run_part(seed: int, part: int, count: int) -> tuple[float, list[str]]:
     if state.connections or any((*groups, guard.dismissed, guard.leaving)):
         faults.append(f"part {part}: connections were left behind")
     app.frame_queue.close()
+    logging.getLogger().removeHandler(errors)
     return resident_mb() / early_mb - 1.0, faults
 
 
