@@ -217,7 +217,9 @@ class GuardedProtocol(HttpToolsProtocol):
         if phase is Phase.IDLE:
             self._deadline_s = guard.place(self, self._idle_group) + limits.idle_s
         elif phase is Phase.WORK:
-            self._deadline_s = guard.place(self, guard.working) + WORK_S
+            end_s = guard.place(self, guard.working) + WORK_S
+            # A client that does not read has no more time for asking again.
+            self._deadline_s = min(end_s, self._deadline_s) if self.flow.write_paused else end_s
         elif phase is Phase.BODY:
             self._deadline_s = guard.place(self, guard.receiving) + limits.body_s
         elif phase is Phase.HEAD:
