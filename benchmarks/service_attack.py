@@ -76,9 +76,11 @@ def ask(connection: http.client.HTTPConnection, token: str) -> bool:
     return False
 
 
-def behave(port: int, token: str, ended: Event, results: Any) -> None:
+def behave(port: int, token: str, begun: Event, ended: Event, results: Any) -> None:
     """Ask at a steady rate until `ended`; put (answered, time in ms) of each request."""
     connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
+    ask(connection, token)
+    begun.set()
     found, due_s = [], time.monotonic()
     while not ended.is_set():
         start_s = time.monotonic()
@@ -89,8 +91,9 @@ def behave(port: int, token: str, ended: Event, results: Any) -> None:
     results.put(found)
 
 
-def repeat(attack: Attack, target: Target, seconds: float) -> None:
+def repeat(attack: Attack, target: Target, seconds: float, begun: Event) -> None:
     """Make round after round of an attack."""
+    begun.set()
     end_s = time.monotonic() + seconds
     while time.monotonic() < end_s:
         held = []
@@ -103,13 +106,16 @@ def repeat(attack: Attack, target: Target, seconds: float) -> None:
 
 def measure(target: Target, pid: int, seconds: float, attack: Attack | None) -> Figures:
     """The figures of a well-behaved client beside an attack; None: a quiet service."""
-    ended, results = SPAWN.Event(), SPAWN.Queue()
-    client = SPAWN.Process(target=behave, args=(target.port, target.token or "", ended, results))
+    begun, attacked, ended = SPAWN.Event(), SPAWN.Event(), SPAWN.Event()
+    results, attacker = SPAWN.Queue(), None
+    arguments = (target.port, target.token or "", begun, ended, results)
+    client = SPAWN.Process(target=behave, args=arguments, daemon=True)
     client.start()
-    attacker = None
+    assert begun.wait(START_S)
     if attack is not None:
-        attacker = SPAWN.Process(target=repeat, args=(attack, target, seconds))
+        attacker = SPAWN.Process(target=repeat, args=(attack, target, seconds, attacked))
         attacker.start()
+        assert attacked.wait(START_S)
     most_mb, end_s = 0.0, time.monotonic() + seconds
     while time.monotonic() < end_s:
         most_mb = max(most_mb, memory_mb(pid))

@@ -277,7 +277,7 @@ class GuardedProtocol(HttpToolsProtocol):
         websocket.connection_made(self.transport)
         self.transport.set_protocol(websocket)
         websocket.data_received(head)
-        self.parser = None  # it holds this object
+        self.parser = None  # type: ignore[assignment]  # it holds this object
 
     def send_400_response(self, msg: str) -> None:
         detail = "the bytes received are not an HTTP/1.1 request"

@@ -31,6 +31,7 @@ from serve.app import Service
 from serve.config import Limits
 from serve.observability import metrics
 from serve.server import guard
+from serve.server.connection import GuardedProtocol
 from serve.server.worker_server import WorkerServer
 from serve.workers import shared_memory
 from serve.workers.shared_memory import HEARTBEAT, SharedMemory, WorkerPeers
@@ -198,7 +199,8 @@ class Served:
 
     def received_bytes(self) -> list[int]:
         """What has arrived of each request whose headers or body are incomplete, in order."""
-        return sorted(found._unread_bytes for found in list(self.server.guard.receiving))
+        receiving = list(self.server.guard.receiving)
+        return sorted(f._unread_bytes for f in receiving if isinstance(f, GuardedProtocol))
 
     @property
     def listener(self) -> socket.socket:

@@ -158,8 +158,8 @@ def engine() -> FakeEngine:
     """An engine that keeps no images."""
 
     def respond(_image: object) -> Any:
-        engine.images.clear()
+        found.images.clear()
         return outputs()
 
-    engine = FakeEngine(respond)
-    return engine
+    found = FakeEngine(respond)
+    return found
