@@ -7,7 +7,7 @@ PACKAGES := trackfeatures runtime simulator datagen mtlnet serve controllers
 # Debian keeps ldconfig in /sbin, which is not on every user's PATH.
 export PATH := $(CURDIR)/$(BIN):$(PATH):/usr/sbin:/sbin
 
-.PHONY: help setup system demo test check docs compiled quick fuzz api e2e bench endurance format lock clean
+.PHONY: help setup system demo test check docs compiled quick fuzz attack api e2e bench endurance format lock clean
 
 help: ## list the targets
 	@grep -hE '^[a-z0-9]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 10
@@ -66,8 +66,12 @@ docs: $(READY) ## build the documentation in build/docs; a broken link fails
 quick: $(READY) ## the tests that take seconds
 	$(BIN)/pytest $(PARALLEL) -m "not slow and not alone"
 
-fuzz: $(READY) ## a million damaged images through the service's gate, in process
+fuzz: $(READY) ## a million damaged images, and as many byte streams, through the service, in process
 	$(BIN)/python benchmarks/service_fuzz.py
+	$(BIN)/python benchmarks/service_stream_fuzz.py
+
+attack: $(READY) ## the attacks of the tests on a service, beside a well-behaved client; an hour
+	$(BIN)/python benchmarks/service_attack.py $(ATTACK)
 
 api: $(READY) ## a thousand requests an operation, made from the OpenAPI document
 	DRIVERVIEW_API_EXAMPLES=1000 $(BIN)/pytest tests/serve/api/test_openapi.py
@@ -76,9 +80,9 @@ e2e: $(READY) ## one round from the simulator to a steered car
 	$(BIN)/pytest tests/e2e
 
 # A benchmark ends with 0: claim reached, 3: not measured, anything else: missed or failed.
-bench: $(READY) ## every benchmark but the hour-long one; fails where a claim is missed
+bench: $(READY) ## every benchmark but the hour-long ones; fails where a claim is missed
 	@missed=; unmeasured=; \
-	for script in $(filter-out %_fuzz.py %/endurance.py,$(wildcard benchmarks/*.py)); do \
+	for script in $(filter-out %_fuzz.py %_attack.py %/endurance.py,$(wildcard benchmarks/*.py)); do \
 	  echo "== $$script"; $(BIN)/python $$script; \
 	  case $$? in 0) ;; 3) unmeasured="$$unmeasured $$script" ;; *) missed="$$missed $$script" ;; esac; \
 	done; \

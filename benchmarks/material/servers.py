@@ -117,7 +117,7 @@ def running(
 
 def _end(process: "subprocess.Popen[bytes]") -> None:
     """End a server in peace, by force where it does not, and whoever it leaves behind."""
-    family = _descendants(process.pid)
+    family = descendants(process.pid)
     process.terminate()
     with suppress(subprocess.TimeoutExpired):
         process.wait(END_S)
@@ -127,13 +127,13 @@ def _end(process: "subprocess.Popen[bytes]") -> None:
     process.wait()
 
 
-def _descendants(pid: int) -> list[int]:
+def descendants(pid: int) -> list[int]:
     """All processes below one. (Linux: the children of its first thread.)"""
     try:
         children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
     except OSError:  # it has ended
         return []
-    return [found for child in map(int, children) for found in (child, *_descendants(child))]
+    return [found for child in map(int, children) for found in (child, *descendants(child))]
 
 
 def _answers(port: int, process: "subprocess.Popen[bytes]") -> bool:

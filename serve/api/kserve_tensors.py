@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from serve.api.problems import INVALID_REQUEST, Problem
 
 MAX_DEPTH = 4
+MAX_DIGITS = 20  # of a length in a header; int() refuses thousands
 
 
 class RequestedOutput(msgspec.Struct):
@@ -50,7 +51,8 @@ def parse_request(body: bytes, header_length: bytes | None) -> tuple[InferReques
     """(the JSON part, the binary part) of a request. Raises Problem."""
     length = len(body)
     if header_length is not None:
-        if not header_length.isdigit() or int(header_length[:20]) > len(body):
+        usable = header_length.isdigit() and len(header_length) <= MAX_DIGITS
+        if not usable or int(header_length) > len(body):
             raise invalid_request(
                 "Inference-Header-Content-Length is not a length within this body"
             )

@@ -9,6 +9,7 @@ with its problem and its frame_id; the WebSocket stays open.
 """
 
 import asyncio
+import contextlib
 import logging
 import time
 from dataclasses import dataclass, replace
@@ -19,7 +20,7 @@ import msgspec
 
 from mtlnet.inference.image_decoding.errors import ImageError
 from serve.api.features import FrameHandler, client_address
-from serve.api.http_io import Receive, Scope, Send, problem_reply, send_reply
+from serve.api.http_io import Message, Receive, Scope, Send, problem_reply, send_reply
 from serve.api.problems import (
     FORBIDDEN_ORIGIN,
     INVALID_REQUEST,
@@ -42,6 +43,7 @@ from serve.scheduling.rate_limit import RateLimiter
 
 PATH = "/stream"
 PROTOCOLS = {"driverview.json": JSON, "driverview.msgpack": MSGPACK}
+MAX_TEXT = 1024  # characters of a text message
 MAX_PENDING = 8  # frames of one WebSocket whose answers are not sent; then no more is received
 
 logger = logging.getLogger(__name__)
@@ -87,10 +89,8 @@ class Stream:
                 continue
             number += 1
             stamp_ns = time.monotonic_ns()
-            body = message["bytes"]
-            task = asyncio.ensure_future(
-                self._answer(options, stamp_ns, str(number), metadata, body, send)
-            )
+            answer = self._answer(options, stamp_ns, str(number), metadata, message, send)
+            task = asyncio.ensure_future(answer)
             metadata = ""
             pending.add(task)
             task.add_done_callback(pending.discard)
@@ -106,9 +106,10 @@ class Stream:
         stamp_ns: int,
         number: str,
         metadata: str,
-        body: bytes,
+        message: Message,
         send: Send,
     ) -> None:
+        """Answer the image in `message`; it is let go of before the answer waits for the client."""
         request_id, frame_id = f"{stream.defaults.request_id}/{number}", number
         try:
             self._rate_limiter.check(stream.client)
@@ -120,19 +121,20 @@ class Stream:
                 frame_id=frame_id,
                 deadline_ns=parse_deadline(deadline_ms, stamp_ns),
             )
-            content = await self._frames.predict_file(options, body, stream.client)
+            content = await self._frames.predict_file(options, message["bytes"], stream.client)
         except (Problem, ImageError) as error:
             content = self._frames.record_refusal(error, request_id, stream.client).content
         except Exception:
             logger.exception("request %s failed", request_id)
             problem = internal_error()
             content = self._frames.record_refusal(problem, request_id, stream.client).content
+        message.clear()
         content["frame_id"] = frame_id
         data = stream.defaults.format.encode(content)
-        if stream.defaults.format is JSON:
-            await send({"type": "websocket.send", "text": data.decode()})
-        else:
-            await send({"type": "websocket.send", "bytes": data})
+        is_json = stream.defaults.format is JSON
+        sent = {"text": data.decode()} if is_json else {"bytes": data}
+        with contextlib.suppress(OSError):  # the client has left
+            await send({"type": "websocket.send", **sent})
 
 
 def _parse_handshake(scope: Scope, request_id: str) -> StreamOptions:
@@ -161,7 +163,11 @@ def _check_origin(headers: Headers) -> None:
     origin = headers.get(b"origin")
     if origin is None:
         return
-    if urlsplit(origin.decode("latin-1")).netloc.encode("latin-1") != headers.get(b"host"):
+    try:
+        host = urlsplit(origin.decode("latin-1")).netloc.encode("latin-1")
+    except ValueError:
+        host = None
+    if host is None or host != headers.get(b"host"):
         raise Problem(
             FORBIDDEN_ORIGIN,
             f"the page's origin is {origin[:80].decode('latin-1')!r}, not this service",
@@ -173,13 +179,14 @@ def _parse_metadata(text: str, number: str, deadline_ms: str | None) -> tuple[st
     if not text:
         return number, deadline_ms
     try:
-        metadata: Any = msgspec.json.decode(text)
-    except msgspec.DecodeError:
+        metadata: Any = msgspec.json.decode(text) if len(text) <= MAX_TEXT else None
+    except (msgspec.DecodeError, RecursionError):
         metadata = None
     if not isinstance(metadata, dict) or not metadata.keys() <= {"frame_id", "deadline_ms"}:
         raise Problem(
             INVALID_REQUEST,
-            "a text message must be a JSON object with frame_id, deadline_ms or both",
+            f"a text message must be a JSON object with frame_id, deadline_ms or both, of at most "
+            f"{MAX_TEXT} characters",
         )
     frame_id = str(metadata.get("frame_id", number))
     if not is_name(frame_id.encode()):

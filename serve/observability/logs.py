@@ -1,13 +1,16 @@
 """The service's log: one JSON object a line on stderr, with the id of the request.
 
-Refusals are logged at most ten times a second, so that a faulty client cannot fill the disk. The
-number of those left out is in the next one logged, as `untold`.
+No client can fill the disk: its refusals are logged once a second, those of all clients ten times;
+the same error, and what native libraries write to stderr, once a second. The number of those left
+out is in the next one logged, as `untold`.
 """
 
+import faulthandler
 import json
 import logging
 import os
 import sys
+import threading
 import time
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING
@@ -16,6 +19,10 @@ if TYPE_CHECKING:
     from serve.api.problems import Problem  # loads FastAPI, which the supervisor does without
 
 REFUSALS_PER_S = 10.0
+INTERVAL_S = 1.0  # between two refusals of one client, and between two equal errors
+REMEMBERED = 1024  # clients, and errors, whose last time is known
+MAX_LINE = 500  # characters kept of a native library's line
+SUPERVISION = "serve.workers"  # its lines are not limited: no client causes them
 FIELDS = ("request", "client", "problem", "status", "total_ms", "untold")
 
 logger = logging.getLogger("serve.requests")
@@ -39,21 +46,79 @@ class JsonFormatter(logging.Formatter):
         return json.dumps(content)
 
 
+class Interval:
+    """Passes each key at most once in INTERVAL_S."""
+
+    def __init__(self) -> None:
+        self._last_s: dict[str, float] = {}
+
+    def passes(self, key: str, now: float) -> bool:
+        """Whether `key` is due; then it counts as seen at `now`, s."""
+        if now - self._last_s.get(key, -INTERVAL_S) < INTERVAL_S:
+            return False
+        if len(self._last_s) >= REMEMBERED:
+            self._last_s.clear()
+        self._last_s[key] = now
+        return True
+
+
+class ErrorLimit(logging.Filter):
+    """Passes a warning or an error once in INTERVAL_S, whatever its arguments."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._interval, self._suppressed = Interval(), 0
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Whether a record is logged."""
+        if record.levelno < logging.WARNING or record.name.startswith(SUPERVISION):
+            return True
+        if not self._interval.passes(f"{record.name} {record.msg}", time.monotonic()):
+            self._suppressed += 1
+            return False
+        if self._suppressed:
+            record.untold, self._suppressed = self._suppressed, 0
+        return True
+
+
 def set_up() -> None:
     """Configure logging to stderr."""
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(JsonFormatter())
+    handler.addFilter(ErrorLimit())
     logging.basicConfig(handlers=[handler], level=logging.WARNING)
     logging.getLogger("serve").setLevel(logging.INFO)
     # Errors of clients are in the lines of this module.
     logging.getLogger("uvicorn").setLevel(logging.ERROR)
 
 
+def capture_native_lines() -> None:
+    """Log what native libraries write to this process's stderr; call it before `set_up`.
+
+    libpng writes a line of its own for each damaged image. Python's stderr, and the stack that
+    `faulthandler` writes when the process crashes, go where they went before.
+    """
+    own = os.fdopen(os.dup(2), "w", buffering=1, encoding="utf-8", errors="backslashreplace")
+    reader, writer = os.pipe()
+    os.dup2(writer, 2)
+    os.close(writer)
+    sys.stderr = own
+    faulthandler.enable(own)
+    threading.Thread(target=_log_native_lines, args=(reader,), daemon=True).start()
+
+
+def _log_native_lines(reader: int) -> None:
+    while part := os.read(reader, 65536):
+        line = part.partition(b"\n")[0].decode("utf-8", "backslashreplace")
+        logger.warning("a native library wrote: %s", line[:MAX_LINE])
+
+
 class RefusalLog:
-    """Logs refused requests, limited by a token bucket."""
+    """Logs refused requests, limited by a token bucket and by client."""
 
     def __init__(self) -> None:
         self._tokens, self._updated_s, self._suppressed = REFUSALS_PER_S, time.monotonic(), 0
+        self._clients = Interval()
 
     def log(self, request_id: str, client: str, problem: "Problem") -> None:
         """Log a refused request, or only count it when there were too many."""
@@ -61,7 +126,7 @@ class RefusalLog:
         elapsed_s = now - self._updated_s
         self._tokens = min(REFUSALS_PER_S, self._tokens + elapsed_s * REFUSALS_PER_S)
         self._updated_s = now
-        if self._tokens < 1.0:
+        if self._tokens < 1.0 or not self._clients.passes(client, now):
             self._suppressed += 1
             return
         self._tokens -= 1.0

@@ -1,35 +1,37 @@
 """HTTP connections with deadlines, a limit on their number, and a limit on the size of headers.
 
-uvicorn's protocol on httptools, with a deadline for the headers and one for the body of each
-request. `close_expired` checks them ten times a second, so that a request costs two assignments.
-A WebSocket tells its client why it is closed, also on a message that is too long.
+uvicorn's protocol on httptools, with a deadline for each phase of a connection. `close_expired`
+checks them ten times a second, so that a request costs a few assignments. Trailers count as headers
+and are dropped. An upgrade to anything but WebSocket is ignored, as RFC 9110 (7.8) allows.
 """
 
 import asyncio
-import time
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
 from enum import Enum, auto
 from math import inf
 from typing import Any
 
-from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
-from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
+from httptools import HttpParserError, HttpParserUpgrade, HttpRequestParser
+from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol, RequestResponseCycle
 
 from serve.api.http_io import encode_head, problem_reply
 from serve.api.problems import (
     HEAD_TOO_LARGE,
     MALFORMED,
+    RATE_LIMITED,
     TOO_MANY_CONNECTIONS,
     TOO_SLOW,
     Problem,
-    ProblemType,
 )
-from serve.config import MAX_HEAD_BYTES, Limits
+from serve.config import MAX_DEADLINE_MS, MAX_HEAD_BYTES
+from serve.server import guard as guards
+from serve.server.guard import ConnectionGuard, Group
+from serve.server.websocket import GuardedWebSocket
 
-LINGER_S = 0.5  # for a client to read the problem before its connection is closed
-EVICTABLE_S = 0.1  # connections in headers or a body for longer give way to new ones
-REFUSAL_PAUSE_S = 0.002  # for which refused clients are not read while the queue is full
+WORK_S = 2e-3 * MAX_DEADLINE_MS  # after which an answer that is not sent never will be
+MAX_PIPELINED = 16  # requests of one connection that wait for the reply to another
+MAX_AT_ONCE = 128  # requests received in one part: more would hold the event loop
+MAX_UPGRADES = 4  # offered in one part
+UPGRADE_HEADERS = frozenset({b"upgrade", b"http2-settings"})
 
 
 class Phase(Enum):
@@ -42,54 +44,27 @@ class Phase(Enum):
     CLOSING = auto()
 
 
-@dataclass
-class ConnectionGuard:
-    """State that the connections of one worker share."""
-
-    limits: Limits
-    other_connections: Callable[[], int] = lambda: 0
-    """Counts the connections of the other workers."""
-    count_closed: Callable[[ProblemType], None] = lambda _type: None
-    clock: Callable[[], float] = time.monotonic
-    """Time for the deadlines, s."""
-    draining: bool = False
-    receiving: dict["GuardedProtocol", None] = field(default_factory=dict)
-    """Connections in the middle of headers or a body, the one that began first at the front."""
-    paused: list["GuardedProtocol"] = field(default_factory=list)
-    """Connections that are not read because they were refused while the queue is full."""
-
-    def pause_reading(self, connection: "GuardedProtocol") -> None:
-        """Read no more from a refused client for REFUSAL_PAUSE_S.
-
-        Its next request, and those of others refused meanwhile, are then handled together. Waking
-        the loop for each of them would take the core from the engine.
-        """
-        if not self.paused:
-            connection.loop.call_later(REFUSAL_PAUSE_S, self._resume_reading)
-        connection.flow.pause_reading()
-        self.paused.append(connection)
-
-    def _resume_reading(self) -> None:
-        paused, self.paused = self.paused, []
-        for connection in paused:
-            if not (connection.transport.is_closing() or connection.flow.write_paused):
-                connection.flow.resume_reading()
-
-
 class GuardedProtocol(HttpToolsProtocol):
     """One HTTP connection."""
 
     def __init__(self, *arguments: Any, guard: ConnectionGuard, **named: Any) -> None:
         super().__init__(*arguments, **named)
         self._guard = guard
+        self.group: Group = {}
+        self.since_s = 0.0  # when this phase began
         self._phase = Phase.HEAD
+        self._settled: Phase | None = None  # the phase whose group and deadline it has
         self._deadline_s = inf
-        self._phase_start_s = 0.0  # of these headers or this body
+        self._idle_group = guard.idle
         self._served = False
-        self._head_bytes = 0  # size of headers that are too large
-        self._part_bytes = 0  # received last
+        self._upgrading = False
+        self._running: Any = None  # the request being answered; `cycle` is the last one received
+        self._fault: Problem | None = None  # with which a callback has stopped the parser
+        self._trailer_bytes = 0
+        self._part_bytes = self._part_requests = 0  # received last
         # Received since the last complete request, with the part in which that request ended.
         self._unread_bytes = 0
+        self._known_bytes = 0  # of these, up to the part with the last byte of a body
 
     @property
     def active(self) -> bool:
@@ -98,51 +73,100 @@ class GuardedProtocol(HttpToolsProtocol):
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         super().connection_made(transport)
-        self._begin_receiving(Phase.HEAD)
-        limit = self._guard.limits.connections
-        if (
-            len(self.connections) + self._guard.other_connections() > limit
-            and not self._evict_slowest()
-        ):
+        self._settle()
+        guard, limit = self._guard, self._guard.limits.connections
+        count = len(self.connections) - len(guard.leaving) + guard.other_connections()
+        if count > limit and not guard.make_room(count - limit):
             detail = f"{limit} connections are open; use one connection for all requests"
             self._close_with(Problem(TOO_MANY_CONNECTIONS, detail))
 
     def data_received(self, data: bytes) -> None:
-        if self._phase is Phase.CLOSING:
+        phase = self._phase
+        if phase is Phase.CLOSING:
             return
-        if self._phase is Phase.IDLE:
-            self._unread_bytes = 0
-            self._begin_receiving(Phase.HEAD)
+        if phase is Phase.IDLE:
+            self._unread_bytes = self._known_bytes = 0
+            self._phase = Phase.HEAD
         self._part_bytes = len(data)
+        self._part_requests = 0
         self._unread_bytes += self._part_bytes
-        super().data_received(data)
-        # Headers that have not ended yet are counted as they arrive.
-        if self._phase is Phase.HEAD and self._unread_bytes > MAX_HEAD_BYTES:
+        try:
+            self.parser.feed_data(data)
+        except HttpParserUpgrade as upgrade:
+            self._feed_again(data[upgrade.args[0] :])
+        except HttpParserError:
+            self.send_400_response("")
+        # Headers and trailers that have not ended yet are counted as they arrive.
+        excess = self._unread_bytes - self._known_bytes > MAX_HEAD_BYTES
+        if excess and self._phase is not Phase.CLOSING:
             self._close_with(_head_too_large())
+        if self._settled is not self._phase:
+            self._settle()
 
-    def check_head(self) -> None:
-        """Begin to receive the body. Raises ValueError, for the parser, on too large headers."""
+    def _feed_again(self, rest: bytes) -> None:
+        """Parse the rest of a part after the headers of a request with an upgrade."""
+        for _ in range(MAX_UPGRADES):
+            rest = self._upgrade(rest)
+            if not rest:
+                return
+            try:
+                self.parser.feed_data(rest)
+                return
+            except HttpParserUpgrade as upgrade:
+                rest = rest[upgrade.args[0] :]
+            except HttpParserError:
+                self.send_400_response("")
+                return
+        self._close_with(too_many_requests(f"{MAX_UPGRADES} upgrades"))
+
+    def on_header(self, name: bytes, value: bytes) -> None:
+        if self._phase is Phase.BODY:
+            self.drop_trailer(name, value)
+        else:
+            super().on_header(name, value)
+
+    def drop_trailer(self, name: bytes, value: bytes) -> None:
+        """Count a trailer. Raises ValueError, for the parser, when they are too large."""
+        self._trailer_bytes += len(name) + len(value)
+        if self._trailer_bytes > MAX_HEAD_BYTES:
+            self.stop_parser(_head_too_large())
+
+    def begin_body(self) -> None:
+        """Wait for the body. Raises ValueError, for the parser, on too large headers."""
         if self._unread_bytes > MAX_HEAD_BYTES:
-            self._head_bytes = len(self.url) + sum(len(k) + len(v) for k, v in self.headers)
-            if self._head_bytes > MAX_HEAD_BYTES:
-                raise ValueError("headers too large")  # ends in `send_400_response`
-        self._begin_receiving(Phase.BODY)
+            self._check_head_size()
+        self._trailer_bytes = 0
+        self._phase = Phase.BODY
+
+    def begin_upgrade(self) -> None:
+        """Leave a request that asks for an upgrade to `_upgrade`."""
+        self._check_head_size()
+        self._upgrading = True
 
     def on_headers_complete(self) -> None:
-        self.check_head()
+        if self.parser.should_upgrade():
+            self.begin_upgrade()
+            return
+        self.begin_body()
+        if len(self.pipeline) >= MAX_PIPELINED:
+            self.stop_parser(too_many_requests(f"{MAX_PIPELINED} requests"))
         super().on_headers_complete()
         if self._guard.draining and self.cycle is not None:
             self.cycle.keep_alive = False
 
+    def on_body(self, body: bytes) -> None:
+        self._known_bytes = self._unread_bytes
+        super().on_body(body)
+
     def on_body_complete(self) -> None:
         """Wait for the answer, unless it was sent."""
-        self._unread_bytes = self._part_bytes
-        if self.cycle is None or self.cycle.response_complete:
-            self._become_idle()
-        else:
-            self._stop_receiving(Phase.WORK)
+        self._unread_bytes = self._known_bytes = self._part_bytes
+        waits = not (self.cycle is None or self.cycle.response_complete)
+        self._phase = Phase.WORK if waits else Phase.IDLE
 
     def on_message_complete(self) -> None:
+        if self._upgrading:  # `_feed_again` follows
+            return
         self.on_body_complete()
         super().on_message_complete()
 
@@ -154,124 +178,163 @@ class GuardedProtocol(HttpToolsProtocol):
         self.server_state.total_requests += 1
         self.flow.resume_reading()
         if self._phase is Phase.WORK:
-            self._become_idle()
+            self._phase = Phase.IDLE
+            self._settle()
+
+    def pause_writing(self) -> None:
+        super().pause_writing()
+        # As long as an idle connection has; one that is being dismissed has less already.
+        self._deadline_s = min(self._deadline_s, self._guard.clock() + self._guard.limits.idle_s)
+
+    def resume_writing(self) -> None:
+        super().resume_writing()
+        if self._phase is Phase.WORK:
+            self._deadline_s = self._guard.clock() + WORK_S
 
     def connection_lost(self, exc: Exception | None) -> None:
-        self._stop_receiving(Phase.CLOSING)
+        self._phase, self._deadline_s = Phase.CLOSING, inf
+        self.group.pop(self, None)
+        self.abandon_requests()
         super().connection_lost(exc)
+        self.pipeline.clear()  # its requests hold this connection
+        self.cycle = self._running = None  # type: ignore[assignment]
 
-    def _become_idle(self) -> None:
-        """Wait for the next request."""
-        self._stop_receiving(Phase.IDLE)
-        self._deadline_s = self._guard.clock() + self._guard.limits.idle_s
+    def abandon_requests(self) -> None:
+        """Let go of the requests that nobody waits for any more."""
+        for cycle in (self._running, self.cycle):
+            if cycle is not None and not cycle.response_complete:
+                cycle.disconnected = True
+                cycle.message_event.set()
 
-    def _begin_receiving(self, phase: Phase) -> None:
-        """Wait for headers or a body, from now on."""
-        limits, receiving = self._guard.limits, self._guard.receiving
-        self._phase, self._phase_start_s = phase, self._guard.clock()
-        limit_s = limits.head_s if phase is Phase.HEAD else limits.body_s
-        self._deadline_s = self._phase_start_s + limit_s
-        receiving.pop(self, None)
-        receiving[self] = None
+    def _start_asgi_task(self, cycle: RequestResponseCycle, app: Any) -> None:
+        self._running = cycle
+        super()._start_asgi_task(cycle, app)
 
-    def _stop_receiving(self, phase: Phase) -> None:
-        """Go to a phase in which no headers or body are expected."""
-        self._phase, self._deadline_s = phase, inf
-        self._guard.receiving.pop(self, None)
+    def _settle(self) -> None:
+        """Join the group of this phase, and set its deadline."""
+        guard, limits, phase = self._guard, self._guard.limits, self._phase
+        self._settled = phase
+        if phase is Phase.IDLE:
+            self._deadline_s = guard.place(self, self._idle_group) + limits.idle_s
+        elif phase is Phase.WORK:
+            end_s = guard.place(self, guard.working) + WORK_S
+            # A client that does not read has no more time for asking again.
+            self._deadline_s = min(end_s, self._deadline_s) if self.flow.write_paused else end_s
+        elif phase is Phase.BODY:
+            self._deadline_s = guard.place(self, guard.receiving) + limits.body_s
+        elif phase is Phase.HEAD:
+            self._deadline_s = guard.place(self, guard.receiving) + limits.head_s
+
+    def _check_head_size(self) -> None:
+        size = len(self.url) + sum(len(k) + len(v) for k, v in self.headers)
+        if size > MAX_HEAD_BYTES:
+            self.stop_parser(_head_too_large())
+
+    def stop_parser(self, fault: Problem) -> None:
+        """Raise ValueError, for the parser: the request ends with this problem."""
+        self._fault = fault
+        raise ValueError(fault.detail)  # ends in `send_400_response`
+
+    def _upgrade(self, rest: bytes) -> bytes:
+        """Become a WebSocket; else the request without its upgrade, to be parsed again."""
+        self._upgrading = False
+        if self.parser.get_method() == b"CONNECT":
+            self.send_400_response("")
+        elif not self._should_upgrade():
+            return self._head(ignore=UPGRADE_HEADERS) + rest
+        elif rest or not (self.cycle is None or self.cycle.response_complete):
+            detail = "a WebSocket handshake must wait for its reply, and for those before it"
+            self._close_with(Problem(MALFORMED, detail))
+        else:
+            self.handle_websocket_upgrade()
+        return b""
+
+    def _head(self, ignore: frozenset[bytes] = frozenset()) -> bytes:
+        """These headers again, less those of `ignore`; for the next parser."""
+        parser = self.parser
+        version = parser.get_http_version().encode()
+        lines = [b"%b %b HTTP/%b\r\n" % (parser.get_method(), self.url, version)]
+        for name, value in self.headers:
+            if name == b"connection" and ignore:
+                options = [option.strip() for option in value.split(b",")]
+                value = b", ".join(o for o in options if o.lower() not in ignore)
+            if name not in ignore:
+                lines.append(b"%b: %b\r\n" % (name, value))
+        if ignore:
+            self.parser = HttpRequestParser(self)
+            self.parser.set_dangerous_leniencies(lenient_data_after_close=True)
+        return b"".join(lines) + b"\r\n"
 
     def handle_websocket_upgrade(self) -> None:
-        self._stop_receiving(Phase.WORK)
-        super().handle_websocket_upgrade()
+        """Hand the connection over to a WebSocket."""
+        head = self._head()
+        self.connections.discard(self)
+        self._phase, self._deadline_s = Phase.CLOSING, inf
+        self.group.pop(self, None)
+        websocket = GuardedWebSocket(
+            self.config, self.server_state, self.app_state, self.loop, guard=self._guard
+        )
+        websocket.connection_made(self.transport)
+        self.transport.set_protocol(websocket)
+        websocket.data_received(head)
+        self.parser = None  # type: ignore[assignment]  # it holds this object
 
     def send_400_response(self, msg: str) -> None:
-        if self._head_bytes > MAX_HEAD_BYTES:
-            self._close_with(_head_too_large())
-        else:
-            self._close_with(Problem(MALFORMED, "the bytes received are not an HTTP/1.1 request"))
+        detail = "the bytes received are not an HTTP/1.1 request"
+        self._close_with(self._fault or Problem(MALFORMED, detail))
 
-    def _unsupported_upgrade_warning(self) -> None:
-        """Log nothing: a request with an unsupported upgrade is answered without it."""
+    def give_way(self) -> None:
+        """Close an idle connection after what it was sent; abort any other."""
+        idle = self._phase is Phase.IDLE
+        self._phase, self._deadline_s = Phase.CLOSING, self._guard.clock() + guards.LINGER_S
+        (self.transport.close if idle else self.transport.abort)()
 
     def expire(self, now: float) -> None:
         """Close the connection when its deadline has passed."""
         if now < self._deadline_s:
             return
-        if self._phase is Phase.IDLE:
-            self._deadline_s = inf
-            # Abort when the client has not read its answer; close would wait for it.
-            unread = self.transport.get_write_buffer_size()
-            (self.transport.abort if unread else self.transport.close)()
-            return
-        part, limit_s = "headers", self._guard.limits.head_s
-        if self._phase is Phase.BODY:
-            part, limit_s = "body", self._guard.limits.body_s
-        if self._phase is Phase.HEAD and not self._unread_bytes:
-            self._stop_receiving(Phase.CLOSING)
-            self.transport.abort()  # nothing was received: there is nobody to answer
-            return
-        self._close_with(Problem(TOO_SLOW, f"the {part} did not arrive within {limit_s:g} s"))
-
-    def _evict_slowest(self) -> bool:
-        """Abort the connection that has been receiving for longest; False where there is none."""
-        oldest = next(iter(self._guard.receiving))  # this one itself, if there is no other
-        if self._guard.clock() - oldest._phase_start_s <= EVICTABLE_S:
-            return False
-        oldest._stop_receiving(Phase.CLOSING)
-        oldest.transport.abort()
-        self._guard.count_closed(TOO_MANY_CONNECTIONS)
-        return True
+        phase, limits = self._phase, self._guard.limits
+        if phase is Phase.HEAD and self._unread_bytes:
+            self._close_with(_too_slow("headers", limits.head_s))
+        elif phase is Phase.BODY:
+            self._close_with(_too_slow("body", limits.body_s))
+        else:
+            self._phase, self._deadline_s = Phase.CLOSING, inf
+            self._guard.place(self, self._guard.leaving)
+            # Close would wait for a client that does not read its answer.
+            idle = phase is Phase.IDLE and not self.transport.get_write_buffer_size()
+            (self.transport.close if idle else self.transport.abort)()
 
     def _close_with(self, problem: Problem) -> None:
-        """Send a problem and close the connection."""
-        self._stop_receiving(Phase.CLOSING)
+        """Send a problem and close the connection; where a reply is owed, send that instead."""
+        owed = self._running if self.pipeline or self._phase is Phase.WORK else None
+        self._phase = Phase.CLOSING
+        now = self._guard.place(self, self._guard.dismissed)
+        self._deadline_s = now + guards.LINGER_S
         self._guard.count_closed(problem.type)
-        if self.cycle is not None and not self.cycle.response_complete:
-            self.cycle.disconnected = True
-            self.cycle.message_event.set()
-        self._unset_keepalive_if_required()
+        if owed is not None:  # the client would take the problem for that reply
+            self.pipeline.clear()
+            self.cycle = owed
+            owed.keep_alive = False
+            self._deadline_s = now + WORK_S
+            return
+        self.abandon_requests()
         if self.transport.is_closing():
             return
         reply = problem_reply(problem, (b"connection", b"close"))
         self.transport.write(encode_head(reply) + reply.body)
         # Aborted at once, the reply would be lost to a client that is still sending.
-        if self.transport.can_write_eof():
-            self.transport.write_eof()
-        self.loop.call_later(LINGER_S, self.transport.abort)
-
-
-class GuardedWebSocket(WebSocketsSansIOProtocol):
-    """One WebSocket connection."""
-
-    _discarding = False
-
-    def data_received(self, data: bytes) -> None:
-        if not self._discarding:
-            super().data_received(data)
-
-    def handle_parser_exception(self) -> None:
-        """Send the close frame, then discard what the client still sends for LINGER_S.
-
-        A connection closed with unread bytes is reset, and the client would lose the close frame.
-        """
-        closing = self.conn.close_sent
-        assert closing is not None
-        self._discarding = self.close_sent = True
-        self.stop_keepalive()
-        self.queue.put_nowait(
-            {"type": "websocket.disconnect", "code": closing.code, "reason": closing.reason}
-        )
-        self.transport.write(b"".join(self.conn.data_to_send()))
-        if self.transport.can_write_eof():
-            self.transport.write_eof()
-        self.close_timer = self.loop.call_later(LINGER_S, self.transport.abort)
-
-
-def close_expired(connections: Iterable[object], now: float) -> None:
-    """Close the connections whose deadline has passed; `now` in s of the guard's clock."""
-    for connection in list(connections):
-        if isinstance(connection, GuardedProtocol):
-            connection.expire(now)
+        self.transport.write_eof()
 
 
 def _head_too_large() -> Problem:
     return Problem(HEAD_TOO_LARGE, f"the headers have more than {MAX_HEAD_BYTES} bytes; send fewer")
+
+
+def too_many_requests(what: str) -> Problem:
+    """The problem of requests that do not wait for the replies to others."""
+    return Problem(RATE_LIMITED, f"more than {what} arrived at once; wait for the replies")
+
+
+def _too_slow(part: str, limit_s: float) -> Problem:
+    return Problem(TOO_SLOW, f"the {part} did not arrive within {limit_s:g} s")

@@ -14,9 +14,10 @@ from serve.api.http_io import Header, Reply, check_body_size, encode_head
 from serve.api.problems import Problem
 from serve.api.request_options import Headers
 from serve.app import Service
-from serve.server.connection import GuardedProtocol, Phase
+from serve.server.connection import MAX_AT_ONCE, GuardedProtocol, Phase, too_many_requests
 
 CLOSE_HEADER: Header = (b"connection", b"close")
+SMALL_BYTES = 1024  # smaller parts of a body are put together: an object each would take more
 ASGI_HEADERS = frozenset({b"expect", b"upgrade", b"x-forwarded-for"})
 
 
@@ -37,25 +38,37 @@ class DirectRequest:
         self.keep_alive = keep_alive
         self.disconnected = self.response_complete = False
         self.features: FeaturesRequest | None = None
-        self.parts: list[bytes] = []
+        self.parts: list[bytes | bytearray] = []
         self.size = 0
 
     def add(self, part: bytes) -> None:
         """Add a part of the body, unless the request was refused."""
         if self.features is None:
             return
-        self.parts.append(part)
+        last = self.parts[-1] if self.parts else None
+        if len(part) >= SMALL_BYTES:
+            self.parts.append(part)
+        elif isinstance(last, bytearray):
+            last += part
+        else:
+            self.parts.append(bytearray(part))
         self.size += len(part)
         try:
             check_body_size(self.size)
         except Problem as problem:
             self.features.refuse(problem)
-            self.features = None
+            self.drop()
 
-    @property
-    def body(self) -> bytes:
-        """All parts received."""
-        return self.parts[0] if len(self.parts) == 1 else b"".join(self.parts)
+    def drop(self) -> None:
+        """Let go of the body, and of what would reply: that and this object hold each other."""
+        self.features = None
+        self.parts.clear()
+
+    def submit(self) -> None:
+        """Hand over the complete body, unless the request was refused."""
+        parts, self.parts = self.parts, []
+        if self.features is not None:
+            self.features.submit(bytes(parts[0]) if len(parts) == 1 else b"".join(parts))
 
 
 class DirectProtocol(GuardedProtocol):
@@ -67,23 +80,33 @@ class DirectProtocol(GuardedProtocol):
         self._request: DirectRequest | None = None
 
     def on_message_begin(self) -> None:
+        self._part_requests += 1
+        if self._part_requests > MAX_AT_ONCE:
+            self.stop_parser(too_many_requests(f"{MAX_AT_ONCE} requests"))
+        self._settled = None
         self.url = b""
         self.headers = []
 
     def on_header(self, name: bytes, value: bytes) -> None:
-        self.headers.append((name.lower(), value))
+        if self._phase is Phase.BODY:
+            self.drop_trailer(name, value)
+        else:
+            self.headers.append((name.lower(), value))
 
     def on_headers_complete(self) -> None:
+        if self.parser.should_upgrade():
+            self.begin_upgrade()
+            return
         headers = dict(self.headers)
         if not self._bypasses_asgi(headers):
             self._build_scope()
             super().on_headers_complete()
             return
-        self.check_head()
+        self.begin_body()
         self.cycle: Any = DirectRequest(
             not self._guard.draining and self.parser.should_keep_alive()
         )
-        self._request = request = self.cycle
+        self._request = self._running = request = self.cycle
         send = partial(self._reply, request)
         request.features = self._service.open(headers, self.client[0] if self.client else "", send)
 
@@ -91,6 +114,7 @@ class DirectProtocol(GuardedProtocol):
         if self._request is None:
             super().on_body(body)
         else:
+            self._known_bytes = self._unread_bytes
             self._request.add(body)
 
     def on_message_complete(self) -> None:
@@ -99,8 +123,13 @@ class DirectProtocol(GuardedProtocol):
             super().on_message_complete()
             return
         self.on_body_complete()
-        if request.features is not None:
-            request.features.submit(request.body)
+        request.submit()
+
+    def abandon_requests(self) -> None:
+        request, self._request = self._request, None
+        if request is not None:
+            request.drop()
+        super().abandon_requests()
 
     def resume_writing(self) -> None:
         super().resume_writing()
@@ -126,7 +155,7 @@ class DirectProtocol(GuardedProtocol):
     def _reply(self, request: DirectRequest, reply: Reply) -> None:
         request.response_complete = True
         request.features = None  # breaks a reference cycle: it holds this method
-        if request.disconnected or self.transport.is_closing() or self._phase is Phase.CLOSING:
+        if request.disconnected or self.transport.is_closing():
             return
         headers = self.server_state.default_headers
         if not request.keep_alive:
@@ -134,6 +163,8 @@ class DirectProtocol(GuardedProtocol):
         self.transport.write(encode_head(reply, *headers) + reply.body)
         if not request.keep_alive:
             self.transport.close()
+        if reply.status == HTTPStatus.OK:
+            self._idle_group = self._guard.served
         self.on_response_complete()
         if self.flow.write_paused:  # a client that reads no replies may send no more requests
             self.flow.pause_reading()

@@ -21,13 +21,10 @@ import uvicorn
 
 from serve.app import Service
 from serve.config import MAX_BODY_BYTES, Limits
-from serve.server.connection import (
-    ConnectionGuard,
-    GuardedProtocol,
-    GuardedWebSocket,
-    close_expired,
-)
+from serve.server.connection import GuardedProtocol
 from serve.server.fast_path import DirectProtocol
+from serve.server.guard import ConnectionGuard, close_expired
+from serve.server.websocket import GuardedWebSocket
 from serve.workers.shared_memory import WorkerPeers
 
 GRACE_S = 5  # for requests in progress when the service stops

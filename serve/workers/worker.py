@@ -67,6 +67,7 @@ class SupervisorConnection:
 
 def main() -> None:
     """Run one worker until its supervisor or SIGTERM stops it."""
+    logs.capture_native_lines()
     logs.set_up()
     supervisor = SupervisorConnection(int(sys.argv[1]))
     lines = supervisor.lines()

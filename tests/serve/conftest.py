@@ -30,7 +30,8 @@ from serve.api.problems import PROBLEM_TYPES
 from serve.app import Service
 from serve.config import Limits
 from serve.observability import metrics
-from serve.server import connection
+from serve.server import guard
+from serve.server.connection import GuardedProtocol
 from serve.server.worker_server import WorkerServer
 from serve.workers import shared_memory
 from serve.workers.shared_memory import HEARTBEAT, SharedMemory, WorkerPeers
@@ -141,7 +142,7 @@ class Clock:
 @pytest.fixture(autouse=True)
 def patient_service(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let no slow test find that a worker counts as gone or that an unread problem is dropped."""
-    monkeypatch.setattr(connection, "LINGER_S", PATIENCE_S)
+    monkeypatch.setattr(guard, "LINGER_S", PATIENCE_S)
     for reader in (shared_memory, metrics):
         monkeypatch.setattr(reader, "HEARTBEAT_TIMEOUT_S", PATIENCE_S)
 
@@ -198,7 +199,8 @@ class Served:
 
     def received_bytes(self) -> list[int]:
         """What has arrived of each request whose headers or body are incomplete, in order."""
-        return sorted(found._unread_bytes for found in list(self.server.guard.receiving))
+        receiving = list(self.server.guard.receiving)
+        return sorted(f._unread_bytes for f in receiving if isinstance(f, GuardedProtocol))
 
     @property
     def listener(self) -> socket.socket:

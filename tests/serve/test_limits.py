@@ -12,7 +12,7 @@ import pytest
 from serve.api.problems import Problem
 from serve.config import Limits, is_loopback
 from serve.scheduling.rate_limit import RateLimiter
-from serve.server.connection import EVICTABLE_S
+from serve.server.guard import EVICTABLE_S
 from serve.workers import shared_memory
 from tests.serve.conftest import (
     PATIENCE_S,
@@ -109,13 +109,17 @@ def test_single_bytes_do_not_extend_the_time_for_headers() -> None:
 
 @contextmanager
 def filled(count: int) -> Iterator[tuple[Served, list[socket.socket]]]:
-    """A service with as many connections as it takes, each of which got an answer."""
-    with limited(Limits(connections=count)) as service:
+    """A service with as many connections as it takes, each of which waits for an answer."""
+    gate = Gate()
+    with serving(gate.engine, limits=Limits(connections=count, queue=count)) as service:
         connections = [dial(service) for _ in range(count)]
         for connection in connections:
-            connection.sendall(b"GET /healthz HTTP/1.1\r\nHost: x\r\n\r\n")
-            assert connection.recv(65536).startswith(b"HTTP/1.1 200")
-        yield service, connections
+            connection.sendall(HEAD + b"Content-Length: %d\r\n\r\n" % len(JPEG) + JPEG)
+        until(lambda: len(service.server.guard.working) == count)
+        try:
+            yield service, connections
+        finally:
+            gate.open.set()
 
 
 def test_one_connection_too_many_is_refused_until_another_is_closed() -> None:
@@ -126,6 +130,30 @@ def test_one_connection_too_many_is_refused_until_another_is_closed() -> None:
         connections[0].close()
         until(lambda: len(service.server.server_state.connections) == 3)
         assert service.ask("GET", "/healthz").status == 200
+
+
+def test_idle_connections_give_way_to_new_ones_longest_idle_first_served_clients_last() -> None:
+    with limited(Limits(connections=4)) as service:
+        served, *idle = connections = [dial(service) for _ in range(4)]
+        served.sendall(HEAD + b"Content-Length: %d\r\n\r\n" % len(JPEG) + JPEG)
+        assert served.recv(65536).startswith(b"HTTP/1.1 200")
+        for connection in (*idle, idle[0]):
+            connection.sendall(b"GET /healthz HTTP/1.1\r\nHost: x\r\n\r\n")
+            received = b""
+            while not received.endswith(b'{"status":"alive"}'):
+                received += connection.recv(65536)
+        new = []
+        for expected in (idle[1], idle[2], idle[0]):
+            new.append(dial(service))
+            ended, _, _ = select.select(connections, [], [], PATIENCE_S)
+            assert ended == [expected]
+            assert is_cut(expected)
+            connections.remove(expected)
+            new[-1].sendall(b"GET /healthz HTTP/1.1\r\nHost: x\r\nContent-Length: 1\r\n\r\n")
+            until(lambda: len(service.server.guard.receiving) == len(new))  # not idle
+            assert len(service.server.server_state.connections) <= 5
+        served.sendall(HEAD + b"Content-Length: %d\r\n\r\n" % len(JPEG) + JPEG)
+        assert served.recv(65536).startswith(b"HTTP/1.1 200")
 
 
 def test_connections_without_a_request_give_way_to_new_ones() -> None:

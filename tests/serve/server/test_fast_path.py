@@ -180,21 +180,26 @@ def test_a_client_that_reads_no_replies_is_read_no_more(service: Served) -> None
     for option in (socket.SO_SNDBUF, socket.SO_RCVBUF):
         service.listener.setsockopt(socket.SOL_SOCKET, option, 1 << 16)
     client = dial(service)
+    client.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 16)
     client.setblocking(False)
-    request = b"POST /features HTTP/1.1\r\nHost: x\r\nContent-Length: 0\r\n\r\n" * 500
+    pad = b"X-Pad: " + b"x" * 2100  # one part received then holds no more than MAX_AT_ONCE
+    request = b"POST /features HTTP/1.1\r\nHost: x\r\n%b\r\nContent-Length: 0\r\n\r\n" % pad
     until(lambda: len(service.server.server_state.connections) == 1)
     (connection,) = service.server.server_state.connections
     assert isinstance(connection, DirectProtocol)
-    sent = 0
+    rest = b""
 
     def send_until_paused() -> bool:
-        nonlocal sent
+        nonlocal rest
         with contextlib.suppress(BlockingIOError):
-            sent += client.send(request)
+            for _ in range(50):
+                rest = rest or request
+                rest = rest[client.send(rest) :]
         return connection.flow.write_paused
 
     until(send_until_paused)
     until(lambda: connection.flow.read_paused)
+    sent = 0
     with contextlib.suppress(BlockingIOError):
         while sent < 32 << 20:
             sent += client.send(request)

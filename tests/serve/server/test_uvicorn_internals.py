@@ -20,8 +20,8 @@ from uvicorn.server import ServerState
 
 RELIED_ON: dict[type, tuple[str, ...]] = {
     HttpToolsProtocol: (
-        "_unset_keepalive_if_required",
-        "_unsupported_upgrade_warning",
+        "_should_upgrade",
+        "_start_asgi_task",
         "connection_lost",
         "connection_made",
         "data_received",
@@ -33,19 +33,30 @@ RELIED_ON: dict[type, tuple[str, ...]] = {
         "on_message_complete",
         "on_response_complete",
         "on_url",
+        "pause_writing",
         "resume_writing",
         "send_400_response",
     ),
     WebSocketsSansIOProtocol: (
+        "connection_lost",
+        "connection_made",
         "data_received",
+        "handle_events",
         "handle_parser_exception",
+        "handle_ping",
+        "pause_writing",
+        "resume_writing",
+        "send",
+        "send_receive_event_to_app",
         "stop_keepalive",
     ),
     FlowControl: ("pause_reading", "resume_reading"),
     uvicorn.Server: ("capture_signals", "handle_exit", "on_tick", "shutdown", "startup"),
 }
 PROTOCOL_STATE = (
+    "app_state",
     "client",
+    "config",
     "connections",
     "cycle",
     "flow",
@@ -58,10 +69,16 @@ PROTOCOL_STATE = (
 )
 WEBSOCKET_STATE = (
     "close_sent",
+    "close_timer",
     "conn",
+    "curr_msg_data_type",
+    "frames",
+    "handshake_initiated",
     "loop",
     "queue",
+    "read_paused",
     "transport",
+    "writable",
 )
 CYCLE_STATE = ("disconnected", "keep_alive", "message_event", "response_complete")
 

@@ -1,0 +1,247 @@
+"""The service under attack: what a well-behaved client still gets, and what it costs in memory.
+
+Each attack of `tests.serve.attacks.attacks` is repeated for some seconds by a process that knows
+the token, while another process asks ten times a second over one connection, as a car does. Only
+loopback addresses are attacked.
+
+    python benchmarks/service_attack.py [--address 127.0.0.1:8000 --pid PID] [--seconds 60]
+        [--settle 60] [--only NAME,NAME] [--model RUN] [--out FILE]
+    claims, in each attack: 99 of 100 requests answered, p99 at most three times that of a quiet
+    service, memory at most 60 MB above it beside the bodies' budget of 64 MiB, and at most 10 MB
+    above it after `--settle` seconds
+
+Without an address a service is started, whose token is made for it; the token of one's own service
+is read from $DRIVERVIEW_TOKEN, its `--pid` is that of the command `serve`.
+"""
+
+import argparse
+import http.client
+import json
+import multiprocessing
+import os
+import secrets
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import asdict, dataclass
+from multiprocessing.synchronize import Event
+from pathlib import Path
+from statistics import quantiles
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from benchmarks.material.outcome import exit_code
+from benchmarks.material.servers import descendants
+from runtime.sockets import bind
+from serve.config import TOKEN_VARIABLE, is_loopback
+from tests.serve.attacks.attacks import ATTACKS, JPEG, Attack
+from tests.serve.attacks.conftest import Target, resident_mb
+
+ANSWERED, SLOWER = 0.99, 3.0
+BODIES_MB, GROWTH_MB, LEFT_MB = 67.2, 60.0, 10.0
+RATE = 10.0  # requests a second of the well-behaved client
+HOLD_S = 1.0  # for which an attack keeps its connections open
+QUIET_S = 20.0
+START_S = 120.0
+SPAWN = multiprocessing.get_context("spawn")
+
+
+@dataclass(frozen=True)
+class Figures:
+    """What a client saw for some seconds, and the most memory meanwhile."""
+
+    requests: int
+    answered: float
+    p50_ms: float
+    p99_ms: float
+    most_mb: float
+
+
+def ask(connection: http.client.HTTPConnection, token: str) -> bool:
+    """One request; once more where the service closed the connection before it came."""
+    headers = {"Content-Type": "image/jpeg", "Authorization": f"Bearer {token}"}
+    for _ in range(2):
+        try:
+            connection.request("POST", "/features", JPEG, headers)
+            reply = connection.getresponse()
+            reply.read()
+        except (OSError, http.client.HTTPException):
+            connection.close()
+            continue
+        return reply.status == 200
+    return False
+
+
+def behave(port: int, token: str, begun: Event, ended: Event, results: Any) -> None:
+    """Ask at a steady rate until `ended`; put (answered, time in ms) of each request."""
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
+    ask(connection, token)
+    begun.set()
+    found, due_s = [], time.monotonic()
+    while not ended.is_set():
+        start_s = time.monotonic()
+        good = ask(connection, token)
+        found.append((good, 1e3 * (time.monotonic() - start_s)))
+        due_s = max(due_s + 1.0 / RATE, time.monotonic() - 1.0)
+        time.sleep(max(0.0, due_s - time.monotonic()))
+    results.put(found)
+
+
+def repeat(attack: Attack, target: Target, seconds: float, begun: Event) -> None:
+    """Make round after round of an attack."""
+    begun.set()
+    end_s = time.monotonic() + seconds
+    while time.monotonic() < end_s:
+        held = []
+        with suppress(OSError, AssertionError):  # it is kept out: as it should be
+            held = attack(target)
+        time.sleep(HOLD_S)
+        for connection in held:
+            connection.close()
+
+
+def measure(target: Target, pid: int, seconds: float, attack: Attack | None) -> Figures:
+    """The figures of a well-behaved client beside an attack; None: a quiet service."""
+    begun, attacked, ended = SPAWN.Event(), SPAWN.Event(), SPAWN.Event()
+    results, attacker = SPAWN.Queue(), None
+    arguments = (target.port, target.token or "", begun, ended, results)
+    client = SPAWN.Process(target=behave, args=arguments, daemon=True)
+    client.start()
+    assert begun.wait(START_S)
+    if attack is not None:
+        attacker = SPAWN.Process(target=repeat, args=(attack, target, seconds, attacked))
+        attacker.start()
+        assert attacked.wait(START_S)
+    most_mb, end_s = 0.0, time.monotonic() + seconds
+    while time.monotonic() < end_s:
+        most_mb = max(most_mb, memory_mb(pid))
+        time.sleep(0.05)
+    if attacker is not None:
+        attacker.kill()
+        attacker.join()
+    ended.set()
+    found = results.get(timeout=60)
+    client.join()
+    times = quantiles([ms for _, ms in found], n=100)
+    answered = sum(good for good, _ in found) / len(found)
+    return Figures(len(found), answered, times[49], times[98], most_mb)
+
+
+def memory_mb(pid: int) -> float:
+    """The resident memory of a process and of all below it, MB."""
+    total = 0.0
+    for found in (pid, *descendants(pid)):
+        with suppress(OSError):
+            total += resident_mb(found)
+    return total
+
+
+@contextmanager
+def own_service(model: str) -> Iterator[tuple[Target, int]]:
+    """A service with one worker and a new token: its address, and its process id."""
+    token = secrets.token_hex(16)
+    with bind("127.0.0.1", 0) as probe:
+        port = probe.getsockname()[1]
+    command = [sys.executable, "-m", "serve", "--model", model, "--port", str(port)]
+    with tempfile.TemporaryFile() as said:
+        process = subprocess.Popen(
+            command, env={**os.environ, TOKEN_VARIABLE: token}, stdout=said, stderr=said
+        )
+        try:
+            end_s = time.monotonic() + START_S
+            connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
+            while not ask(connection, token):
+                if process.poll() is not None or time.monotonic() > end_s:
+                    said.seek(0)
+                    raise RuntimeError(f"it does not answer:\n{said.read().decode()[-2000:]}")
+                time.sleep(0.2)
+            yield Target(port, token), process.pid
+            sys.stderr.write(f"lines in its log: {log_lines(said)}\n")
+        finally:
+            process.terminate()
+            process.wait(30)
+
+
+def log_lines(said: Any) -> int:
+    """How many lines the service has written."""
+    said.seek(0)
+    return int(said.read().count(b"\n"))
+
+
+def chosen(names: str | None) -> list[Attack]:
+    """The attacks with these names, or all."""
+    wanted = set(names.split(",")) if names else {attack.__name__ for attack in ATTACKS}
+    unknown = wanted - {attack.__name__ for attack in ATTACKS}
+    if unknown:
+        sys.exit(f"error: there is no attack {', '.join(sorted(unknown))}")
+    return [attack for attack in ATTACKS if attack.__name__ in wanted]
+
+
+def compare(target: Target, pid: int, options: argparse.Namespace) -> list[dict[str, Any]]:
+    """The rows of the report: a quiet service, then each attack."""
+    measure(target, pid, 5.0, None)  # its caches and pools are filled
+    quiet = measure(target, pid, max(QUIET_S, options.seconds), None)
+    rows: list[dict[str, Any]] = [{"attack": "none", **asdict(quiet)}]
+    report(rows[0])
+    for attack in chosen(options.only):
+        under = measure(target, pid, options.seconds, attack)
+        time.sleep(options.settle)
+        row = {"attack": attack.__name__, **asdict(under)}
+        row["slower"] = under.p99_ms / quiet.p99_ms
+        row["growth_mb"] = under.most_mb - quiet.most_mb
+        row["left_mb"] = memory_mb(pid) - quiet.most_mb
+        row["ok"] = (
+            under.answered >= ANSWERED
+            and row["slower"] <= SLOWER
+            and row["growth_mb"] <= GROWTH_MB + BODIES_MB
+            and row["left_mb"] <= LEFT_MB
+        )
+        rows.append(row)
+        report(row)
+    return rows
+
+
+def report(row: dict[str, Any]) -> None:
+    """Print one row."""
+    line = (
+        f"{row['attack']:28} {100 * row['answered']:6.2f} % of {row['requests']:4d} answered, "
+        f"p50 {row['p50_ms']:6.1f}, p99 {row['p99_ms']:7.1f} ms, {row['most_mb']:6.0f} MB"
+    )
+    if "ok" in row:
+        line += (
+            f", p99 x {row['slower']:.2f}, {row['growth_mb']:+.0f} MB, later "
+            f"{row['left_mb']:+.0f} MB{'' if row['ok'] else '  MISSED'}"
+        )
+    print(line, flush=True)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--address", help="HOST:PORT of a service of one's own on this machine")
+    parser.add_argument("--pid", type=int, help="its process id")
+    parser.add_argument("--seconds", type=float, default=60.0, help="for each attack")
+    parser.add_argument("--settle", type=float, default=60.0, help="after each attack")
+    parser.add_argument("--only", help="names of attacks, with commas between them")
+    parser.add_argument("--model", default="default")
+    parser.add_argument("--out", type=Path)
+    options = parser.parse_args()
+    if options.address is None:
+        with own_service(options.model) as (target, pid):
+            rows = compare(target, pid, options)
+    else:
+        host, _, port = options.address.rpartition(":")
+        if not is_loopback(host) or options.pid is None:
+            sys.exit("error: give a loopback address, and the --pid of the service there")
+        target = Target(int(port), os.environ.get(TOKEN_VARIABLE))
+        rows = compare(target, options.pid, options)
+    if options.out is not None:
+        options.out.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
+    sys.exit(exit_code(all(row.get("ok", True) for row in rows)))
+
+
+if __name__ == "__main__":
+    main()

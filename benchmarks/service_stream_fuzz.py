@@ -1,0 +1,210 @@
+"""A million mutated byte streams through the service's HTTP and WebSocket connections, in process.
+
+Each begins as a request, a handshake or both; WebSocket frames follow where the handshake was
+accepted. It arrives in parts, on a transport that behaves as uvloop's. Nothing may be raised, be
+answered with 500, be logged as an error, or be left behind; seed and number make a stream again.
+
+    python benchmarks/service_stream_fuzz.py [--count 1000000] [--seed 0] [--workers N]
+"""
+
+import argparse
+import asyncio
+import logging
+import os
+import random
+import sys
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import uvicorn
+from uvicorn.server import ServerState
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from serve.app import Service
+from serve.config import Limits
+from serve.server.fast_path import DirectProtocol
+from serve.server.guard import ConnectionGuard
+from serve.server.websocket import GuardedWebSocket
+from tests.serve.attacks.attacks import JPEG, mutate, whole_streams
+from tests.serve.attacks.conftest import Target, frame, resident_mb
+from tests.serve.conftest import FakeEngine, outputs
+
+MAX_GROWTH = 0.02
+TURNS = 8  # of the event loop for each stream
+
+
+class Transport:
+    """A transport without a socket: what it was given, and the errors of uvloop's."""
+
+    def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
+        self.loop = loop
+        self.protocol: Any = None
+        self.written = b""
+        self.closing = self.ended = self.lost = self.paused = False
+
+    def get_extra_info(self, _name: str) -> None:
+        return None
+
+    def set_protocol(self, protocol: Any) -> None:
+        self.protocol = protocol
+
+    def write(self, data: bytes) -> None:
+        if self.lost or self.ended:
+            raise RuntimeError("write after the end")
+        self.written += data
+
+    def write_eof(self) -> None:
+        if self.lost:
+            raise RuntimeError("write after the end")
+        self.ended = True
+
+    def close(self) -> None:
+        if not self.closing:
+            self.closing = True
+            self.loop.call_soon(self.lose)
+
+    abort = close
+
+    def lose(self) -> None:
+        """Tell the protocol that the connection has ended."""
+        if not self.lost:
+            self.closing = self.lost = True
+            self.protocol.connection_lost(None)
+
+    def is_closing(self) -> bool:
+        return self.closing
+
+    def get_write_buffer_size(self) -> int:
+        return 0
+
+    def pause_reading(self) -> None:
+        self.paused = True
+
+    def resume_reading(self) -> None:
+        self.paused = False
+
+
+class Errors(logging.Handler):
+    """Keeps what is logged as an error."""
+
+    def __init__(self) -> None:
+        super().__init__(logging.WARNING)
+        self.found: list[str] = []
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.found.append(f"{record.name}: {record.getMessage()[:200]}")
+
+
+def frames(rng: random.Random) -> bytes:
+    """A few WebSocket frames, mutated."""
+    whole = [
+        frame(rng.randrange(16), rng.choice([b"", b"{}", b"x" * 200, JPEG[:600], b"\x03\xe8"]),
+              bool(rng.randrange(4)))
+        for _ in range(4)
+    ]  # fmt: skip
+    return mutate(rng, whole) + mutate(rng, whole)
+
+
+async def feed(transport: Transport, rng: random.Random, sent: bytes) -> None:
+    """Let a stream arrive in parts."""
+    while sent and not transport.closing:
+        for _ in range(TURNS * TURNS):  # then the client gives up
+            if not transport.paused:
+                break
+            await asyncio.sleep(0)
+        else:
+            return
+        size = rng.choice([1, 7, 100, len(sent)])
+        transport.protocol.data_received(sent[:size])
+        sent = sent[size:]
+        if rng.randrange(3) == 0:
+            await asyncio.sleep(0)
+
+
+async def stream(make: Any, rng: random.Random, whole: list[bytes]) -> bytes:
+    """Send one mutated stream over a connection; what was answered."""
+    transport = Transport(asyncio.get_running_loop())
+    transport.protocol = make()
+    transport.protocol.connection_made(transport)
+    await feed(transport, rng, mutate(rng, whole))
+    for _ in range(rng.randrange(TURNS)):
+        await asyncio.sleep(0)
+    if isinstance(transport.protocol, GuardedWebSocket) and not transport.closing:
+        await feed(transport, rng, frames(rng))
+        for _ in range(rng.randrange(TURNS)):
+            await asyncio.sleep(0)
+    if not transport.lost:
+        transport.lose()
+    return transport.written
+
+
+async def run_part(seed: int, part: int, count: int) -> tuple[float, list[str]]:
+    """(growth of memory, faults) of one part of the streams."""
+    app = Service(FakeEngine(lambda _image: outputs()), lambda _engine: None, Limits())
+    config = uvicorn.Config(app, http="httptools", ws=GuardedWebSocket, log_config=None)
+    config.ws_per_message_deflate = False
+    config.load()
+    app.frame_queue.start()
+    errors, faults, state = Errors(), [], ServerState()
+    logging.getLogger().addHandler(errors)
+    guard = ConnectionGuard(Limits())
+    loop = asyncio.get_running_loop()
+    make = partial(
+        DirectProtocol,
+        service=app,
+        guard=guard,
+        config=config,
+        server_state=state,
+        app_state={},
+        _loop=loop,
+    )
+    whole, early_mb = whole_streams(Target(80)), 0.0
+    for number in range(count):
+        rng = random.Random(f"{seed} {part} {number}")
+        try:
+            if b"HTTP/1.1 500" in await stream(make, rng, whole):
+                faults.append(f"part {part}, number {number}: 500")
+        except Exception as error:  # noqa: BLE001  # just what is looked for
+            faults.append(f"part {part}, number {number}: {error!r}")
+        faults += [f"part {part}, number {number}: {said}" for said in errors.found]
+        errors.found.clear()
+        if number == count // 5:
+            early_mb = resident_mb()
+    while state.tasks:
+        await asyncio.sleep(0.01)
+    groups = (guard.receiving, guard.working, guard.idle, guard.served, guard.streams)
+    if state.connections or any((*groups, guard.dismissed, guard.leaving)):
+        faults.append(f"part {part}: connections were left behind")
+    app.frame_queue.close()
+    logging.getLogger().removeHandler(errors)
+    return resident_mb() / early_mb - 1.0, faults
+
+
+def run(seed: int, part: int, count: int) -> tuple[float, list[str]]:
+    """`run_part` in an event loop of its own."""
+    logging.getLogger("serve").setLevel(logging.ERROR)
+    return asyncio.run(run_part(seed, part, count))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--count", type=int, default=1_000_000)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
+    options = parser.parse_args()
+    share = options.count // options.workers
+    parts = range(options.workers)
+    with ProcessPoolExecutor(options.workers) as pool:  # a crash breaks the pool, and is told
+        found = list(pool.map(run, [options.seed] * len(parts), parts, [share] * len(parts)))
+    growth, faults = max(part[0] for part in found), [f for part in found for f in part[1]]
+    print(f"{share * len(parts)} streams, {len(faults)} faults")
+    print(f"memory grew by {100 * growth:.2f} %, claim: under {100 * MAX_GROWTH:g} %")
+    print("\n".join(faults[:20]))
+    sys.exit(bool(faults) or growth >= MAX_GROWTH)
+
+
+if __name__ == "__main__":
+    main()

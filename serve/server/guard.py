@@ -1,0 +1,124 @@
+"""What the connections of one worker share: limits, deadlines' clock, and who gives way to whom.
+
+Each connection is in one group, by what it waits for; within a group those that have waited for
+longest come first. While the service has as many connections as it takes, a new one ends another:
+one that is being dismissed, one that sends its request slowly, the one that has been idle for
+longest, a WebSocket without messages. One whose last image was answered goes after those that have
+sent none.
+"""
+
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from typing import Protocol
+
+from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
+
+from serve.api.problems import TOO_MANY_CONNECTIONS, ProblemType
+from serve.config import Limits
+
+LINGER_S = 0.5  # for a client to read the problem before its connection is closed
+EVICTABLE_S = 0.1  # connections in headers or a body for longer give way to new ones
+REFUSAL_PAUSE_S = 0.002  # for which refused clients are not read while the queue is full
+
+
+class Guarded(Protocol):
+    """A connection as its guard sees it."""
+
+    since_s: float
+    group: "Group"
+
+    def give_way(self) -> None:
+        """End the connection: a new one needs its place."""
+
+    def expire(self, now: float) -> None:
+        """End the connection if its deadline has passed."""
+
+
+Group = dict[Guarded, None]
+
+
+def _group() -> Group:
+    return {}
+
+
+@dataclass
+class ConnectionGuard:
+    """State that the connections of one worker share."""
+
+    limits: Limits
+    other_connections: Callable[[], int] = lambda: 0
+    """Counts the connections of the other workers."""
+    count_closed: Callable[[ProblemType], None] = lambda _type: None
+    clock: Callable[[], float] = time.monotonic
+    """Time for the deadlines, s."""
+    draining: bool = False
+    receiving: Group = field(default_factory=_group)
+    """In the middle of headers or a body."""
+    working: Group = field(default_factory=_group)
+    """Waiting for an answer."""
+    idle: Group = field(default_factory=_group)
+    """Between requests, without an image that was answered."""
+    served: Group = field(default_factory=_group)
+    """Between requests, after an image that was answered."""
+    streams: Group = field(default_factory=_group)
+    """WebSockets, by their last message."""
+    dismissed: Group = field(default_factory=_group)
+    """Refused, and open for LINGER_S only so that the client can read why."""
+    leaving: Group = field(default_factory=_group)
+    """Ended, but still counted by the server for a moment."""
+    paused: list[HttpToolsProtocol] = field(default_factory=list)
+    """Connections that are not read because they were refused while the queue is full."""
+
+    def place(self, connection: Guarded, group: Group) -> float:
+        """Move a connection to the end of a group; the time, s."""
+        connection.group.pop(connection, None)
+        connection.group = group
+        group[connection] = None
+        connection.since_s = now = self.clock()
+        return now
+
+    def make_room(self, excess: int) -> bool:
+        """End `excess` connections, the least useful first; False: not so many give way."""
+        now = self.clock()
+        for group, least_s in (
+            (self.dismissed, 0.0),
+            (self.receiving, EVICTABLE_S),
+            (self.idle, 0.0),
+            (self.served, 0.0),
+            (self.streams, self.limits.idle_s),
+        ):
+            while excess > 0 and group:
+                oldest = next(iter(group))
+                if now - oldest.since_s < least_s:
+                    break
+                oldest.give_way()
+                self.place(oldest, self.leaving)
+                self.count_closed(TOO_MANY_CONNECTIONS)
+                excess -= 1
+        return excess <= 0
+
+    def pause_reading(self, connection: HttpToolsProtocol) -> None:
+        """Read no more from a refused client for REFUSAL_PAUSE_S.
+
+        Its next request, and those of others refused meanwhile, are then handled together. Waking
+        the loop for each of them would take the core from the engine.
+        """
+        if not self.paused:
+            connection.loop.call_later(REFUSAL_PAUSE_S, self._resume_reading)
+        connection.flow.pause_reading()
+        self.paused.append(connection)
+
+    def _resume_reading(self) -> None:
+        paused, self.paused = self.paused, []
+        for connection in paused:
+            if not (connection.transport.is_closing() or connection.flow.write_paused):
+                connection.flow.resume_reading()
+
+
+def close_expired(connections: Iterable[object], now: float) -> None:
+    """Close the connections whose deadline has passed; `now` in s of the guard's clock."""
+    for connection in list(connections):
+        expire = getattr(connection, "expire", None)
+        if expire is not None:
+            expire(now)

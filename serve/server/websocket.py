@@ -1,0 +1,188 @@
+"""WebSockets with deadlines, and with bounds on what a client can make the service do or keep.
+
+uvicorn's protocol on the library websockets. A handshake that the library refuses is answered with
+a problem. A handshake, a message, and the reading of answers have deadlines. Small frames have a
+rate, since each costs as much as a large one: pings, fragments, messages of a few bytes. A client
+that breaks a bound is told the reason in the close frame, for LINGER_S.
+"""
+
+from asyncio import Transport
+from math import inf
+from typing import Any
+
+from uvicorn.protocols.utils import ClientDisconnected
+from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
+from websockets.exceptions import HeaderLineTooLong, RequestLineTooLong, TooManyHeaders
+from websockets.frames import CloseCode, Frame
+from websockets.protocol import State
+
+from serve.api.http_io import encode_head, problem_reply
+from serve.api.problems import HEAD_TOO_LARGE, MALFORMED, TOO_SLOW, Problem
+from serve.server import guard as guards
+from serve.server.guard import ConnectionGuard, Group
+
+SLICE_BYTES = 4096  # parsed before small frames are counted; holds hundreds of them
+SMALL_BYTES = 256  # a frame of fewer is a small one
+SMALL_FRAMES = 500  # a second, and at once
+
+
+class GuardedWebSocket(WebSocketsSansIOProtocol):
+    """One WebSocket connection."""
+
+    def __init__(self, *arguments: Any, guard: ConnectionGuard, **named: Any) -> None:
+        super().__init__(*arguments, **named)
+        self._guard = guard
+        self.group: Group = {}
+        self.since_s = 0.0  # the time of its last message
+        self._discarding = False
+        self._handshake_end_s = self._message_end_s = inf
+        self._reading_end_s = self._closing_end_s = inf
+        self._small_frames, self._counted_s = float(SMALL_FRAMES), 0.0
+
+    def connection_made(self, transport: Transport) -> None:  # type: ignore[override]
+        super().connection_made(transport)
+        now = self._guard.place(self, self._guard.streams)
+        self._counted_s, self._handshake_end_s = now, now + self._guard.limits.head_s
+        transport.pause_reading()  # frames have to wait for the reply to the handshake
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        self.group.pop(self, None)
+        super().connection_lost(exc)
+        self.frames = []
+        self.conn.reader.discard()
+        self.conn.parser.close()  # it holds `conn`, which holds it
+
+    def data_received(self, data: bytes) -> None:
+        for at in range(0, len(data), SLICE_BYTES):
+            if self._discarding:
+                return
+            super().data_received(data[at : at + SLICE_BYTES])
+        if self.conn.handshake_exc is not None and not self.handshake_initiated:
+            self._refuse_handshake(self.conn.handshake_exc)
+        elif not (self.frames or self.conn.reader.buffer):
+            self._message_end_s = inf
+        elif self._message_end_s == inf:
+            self._message_end_s = self._guard.clock() + self._guard.limits.body_s
+
+    def _refuse_handshake(self, error: Exception) -> None:
+        """Answer what websockets would leave unanswered."""
+        self.conn.data_to_send()  # its reply to some of them, in plain text
+        problem = Problem(MALFORMED, "this is not the handshake of a WebSocket (RFC 6455, 4.1)")
+        if isinstance(error, RequestLineTooLong | HeaderLineTooLong | TooManyHeaders):
+            problem = Problem(HEAD_TOO_LARGE, f"the handshake is too large: {error}")
+        self._guard.count_closed(problem.type)
+        reply = problem_reply(problem, (b"connection", b"close"))
+        self._close_after(encode_head(reply) + reply.body)
+
+    def handle_events(self) -> None:
+        small = sum(isinstance(e, Frame) and len(e.data) < SMALL_BYTES for e in self.conn.events)
+        if small and not self._allow(small):
+            self.conn.events.clear()
+            self.fail(CloseCode.POLICY_VIOLATION, f"more than {SMALL_FRAMES} small frames a second")
+            return
+        super().handle_events()
+
+    def _allow(self, small: int) -> bool:
+        """Count small frames; False: there are too many."""
+        self._small_frames -= small
+        if self._small_frames < 0:
+            now = self._guard.clock()
+            earned = (now - self._counted_s) * SMALL_FRAMES
+            self._small_frames = min(self._small_frames + earned, SMALL_FRAMES)
+            self._counted_s = now
+        return self._small_frames >= 0
+
+    def handle_ping(self) -> None:
+        """Answer, unless the client does not read: RFC 6455, 5.5.3, lets pongs be left out."""
+        output = self.conn.data_to_send()
+        if self.writable.is_set() and not self._discarding:
+            self.transport.write(b"".join(output))
+
+    def send_receive_event_to_app(self) -> None:
+        self._guard.place(self, self.group)
+        if self.curr_msg_data_type == "text":
+            try:
+                b"".join(self.frames).decode()
+            except UnicodeDecodeError:
+                self.frames = []
+                self.fail(CloseCode.INVALID_DATA, "the text is not UTF-8")
+                return
+        super().send_receive_event_to_app()
+
+    async def send(self, message: Any) -> None:
+        await self.writable.wait()
+        if self._discarding:
+            raise ClientDisconnected
+        await super().send(message)
+        if message["type"] == "websocket.accept":
+            self._handshake_end_s = inf
+            self.transport.resume_reading()
+        elif message["type"] == "websocket.http.response.body":
+            self.handshake_complete = True  # else uvicorn logs an error for a refusal
+
+    def pause_writing(self) -> None:
+        super().pause_writing()
+        self._reading_end_s = self._guard.clock() + self._guard.limits.idle_s
+
+    def resume_writing(self) -> None:
+        super().resume_writing()
+        self._reading_end_s = inf
+
+    def give_way(self) -> None:
+        """Close this WebSocket without messages: a new connection needs its place."""
+        self.fail(CloseCode.TRY_AGAIN_LATER, "closed for another client, after no message for long")
+
+    def expire(self, now: float) -> None:
+        """Close the connection when a deadline has passed."""
+        if self._discarding or self.transport.is_closing():
+            if self._closing_end_s == inf:
+                self._closing_end_s = now + guards.LINGER_S
+            elif now >= self._closing_end_s:
+                self.transport.abort()
+        elif now >= min(self._handshake_end_s, self._reading_end_s):
+            self._guard.count_closed(TOO_SLOW)
+            self.transport.abort()
+        elif now >= self._message_end_s:
+            limit_s = self._guard.limits.body_s
+            if self.read_paused:  # the service makes the client wait
+                self._message_end_s = now + limit_s
+                return
+            self._guard.count_closed(TOO_SLOW)
+            self.fail(CloseCode.POLICY_VIOLATION, f"a message took more than {limit_s:g} s")
+
+    def fail(self, code: CloseCode, reason: str) -> None:
+        """Close with a reason; discard what the client still sends."""
+        if self.conn.state is not State.OPEN:
+            self.transport.abort()
+            return
+        self.conn.fail(code, reason)
+        self.handle_parser_exception()
+
+    def handle_parser_exception(self) -> None:
+        """Send the close frame, then discard what the client still sends for LINGER_S.
+
+        A connection closed with unread bytes is reset, and the client would lose the close frame.
+        """
+        closing = self.conn.close_sent
+        if closing is None:
+            self.transport.abort()
+            return
+        self.queue.put_nowait(
+            {"type": "websocket.disconnect", "code": closing.code, "reason": closing.reason}
+        )
+        self._close_after(b"".join(self.conn.data_to_send()))
+
+    def _close_after(self, output: bytes) -> None:
+        """Send the last bytes; close after LINGER_S."""
+        self._discarding = self.close_sent = True
+        self.frames = []
+        self.stop_keepalive()
+        self._guard.place(self, self._guard.dismissed)
+        if self.transport.is_closing():
+            return
+        self.transport.write(output)
+        self.transport.write_eof()
+        if self.read_paused:
+            self.read_paused = False
+        self.transport.resume_reading()
+        self.close_timer = self.loop.call_later(guards.LINGER_S, self.transport.abort)

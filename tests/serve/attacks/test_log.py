@@ -1,0 +1,116 @@
+"""What attacks write to the log: a line a second for each client, and no traceback."""
+
+import asyncio
+import gc
+import logging
+import os
+import subprocess
+import sys
+
+import pytest
+
+from benchmarks.service_stream_fuzz import run_part
+from serve.observability.logs import ErrorLimit, Interval
+from tests.serve.attacks import attacks
+from tests.serve.attacks.conftest import Target
+from tests.serve.attacks.test_connections import open_count
+from tests.serve.conftest import PATIENCE_S, Gate, Served, jpeg, picture, serving, until
+
+JPEG = jpeg(picture())
+
+
+def test_mutated_streams_raise_nothing_and_leave_nothing() -> None:
+    _, faults = asyncio.run(run_part(seed=7, part=0, count=1000))
+    assert faults == []
+
+
+@pytest.mark.parametrize("attack", [attacks.strange_headers, attacks.mutated_requests])
+def test_no_client_causes_a_500_or_a_traceback(
+    service: Served, target: Target, attack: attacks.Attack, caplog: pytest.LogCaptureFixture
+) -> None:
+    with caplog.at_level(logging.WARNING):
+        for connection in attack(target):
+            connection.settimeout(0.5)
+            received = b""
+            try:
+                while part := connection.recv(65536):
+                    received += part
+            except OSError:
+                pass
+            assert b" 500 " not in received
+            connection.close()
+        assert service.post(JPEG).status == 200
+        gc.collect()
+    assert [record.getMessage() for record in caplog.records] == []
+
+
+def test_a_reply_to_a_client_that_has_left_writes_nothing_to_the_log(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    gate = Gate()
+    with caplog.at_level(logging.WARNING), serving(gate.engine) as service:
+        target = Target(service.port)
+        for sent in (
+            target.post(JPEG),
+            target.post(JPEG, X_Forwarded_For="10.0.0.1") + target.ask(),
+            target.post(JPEG, X_Forwarded_For="10.0.0.1") + b"no request\r\n\r\n",
+        ):
+            connection = target.dial()
+            connection.sendall(sent)
+            assert gate.busy.wait(PATIENCE_S)
+            until(lambda: bool(service.server.guard.working or service.server.guard.dismissed))
+            connection.close()
+            until(lambda: open_count(service) == 0)
+        gate.open.set()
+        until(lambda: not service.server.server_state.tasks)
+        assert service.post(JPEG).status == 200
+        gc.collect()
+    assert [record.getMessage() for record in caplog.records] == []
+
+
+def test_the_same_error_is_logged_once_a_second() -> None:
+    found = Interval()
+    assert [found.passes("a", now) for now in (0.0, 0.5, 0.99, 1.0, 1.5)] == [
+        True,
+        False,
+        False,
+        True,
+        False,
+    ]
+    limit = ErrorLimit()
+
+    def record(name: str, level: int = logging.ERROR) -> logging.LogRecord:
+        return logging.LogRecord(name, level, "", 0, "%s failed", (), None)
+
+    assert [limit.filter(record("uvicorn.error")) for _ in range(3)] == [True, False, False]
+    assert all(limit.filter(record("serve.workers.supervisor")) for _ in range(3))
+    assert all(limit.filter(record("serve.requests", logging.INFO)) for _ in range(3))
+
+
+def test_native_libraries_write_one_line_a_second() -> None:
+    """libpng writes a line for each damaged PNG."""
+    program = """
+import os, sys, time
+import cv2, numpy as np
+from serve.observability import logs
+logs.capture_native_lines()
+logs.set_up()
+whole = cv2.imencode(".png", np.zeros((8, 8, 3), np.uint8))[1].tobytes()
+for at in range(60, len(whole) - 20):
+    damaged = bytearray(whole)
+    damaged[at] ^= 255
+    cv2.imdecode(np.frombuffer(bytes(damaged), np.uint8), 1)
+os.write(2, b"a line\\n" * 1000)
+time.sleep(0.5)
+sys.stderr.write("python's own\\n")
+"""
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    done = subprocess.run(
+        [sys.executable, "-c", program], env=environment, capture_output=True, timeout=PATIENCE_S
+    )
+    lines = done.stderr.decode().splitlines()
+    assert done.returncode == 0
+    assert lines[-1] == "python's own"
+    native = [line for line in lines if "a native library wrote" in line]
+    assert len(lines) == len(native) + 1
+    assert 1 <= len(native) <= 3
