@@ -22,14 +22,26 @@ def engine_torque(p: Any, speed: float, throttle: float) -> float:
 
     As in TORCS: the full-load torque times (throttle (1 + b) - b), where the engine braking b grows
     linearly from 0 at idle. Matches the accelerations in recorded TORCS drives to 0.003 m/s2.
+    Above the limiter there is no torque, neither drive nor braking.
     """
     rpm = speed * RPM
+    if rpm > p.limiter_rpm:
+        return 0.0
     place = min(max(rpm / TORQUE_RPM_STEP, 0.0), 9.999)
     below = int(place)
     full = p.torque[below] + (p.torque[below + 1] - p.torque[below]) * (place - below)
-    opened = 0.0 if rpm > p.limiter_rpm else throttle
     braking = p.engine_braking * max(rpm - p.idle_rpm, 0.0) / (p.top_rpm - p.idle_rpm)
-    return float(full * (opened * (1.0 + braking) - braking))
+    return float(full * (throttle * (1.0 + braking) - braking))
+
+
+@compiled
+def limit_shaft_speed(p: Any, wheel_speed: float, ratio: float) -> float:
+    """Mean speed (rad/s) of the driven wheels, held where the engine turns at `top_rpm`.
+
+    As in TORCS, the engine goes no faster in gear: the tyres then slip and slow the car.
+    """
+    top = p.top_rpm / RPM
+    return float(top / ratio if wheel_speed * ratio > top else wheel_speed)
 
 
 @compiled
