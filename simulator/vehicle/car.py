@@ -109,7 +109,7 @@ class CarParameters:
     """kg m2, at the crankshaft; fitted: in gear 1 the effective mass is 6.3 % larger in TORCS."""
     idle_rpm: float = 900.0
     limiter_rpm: float = 9152.0
-    """Above this speed the engine gives no torque, neither drive nor braking."""
+    """Above this speed the engine gives no torque in gear, neither drive nor braking."""
     top_rpm: float = 10_000.0
     """End of the torque table; in gear the engine is held at this speed."""
     torque: tuple[float, ...] = (

@@ -22,16 +22,14 @@ def engine_torque(p: Any, speed: float, throttle: float) -> float:
 
     As in TORCS: the full-load torque times (throttle (1 + b) - b), where the engine braking b grows
     linearly from 0 at idle. Matches the accelerations in recorded TORCS drives to 0.003 m/s2.
-    Above the limiter there is no torque, neither drive nor braking.
     """
     rpm = speed * RPM
-    if rpm > p.limiter_rpm:
-        return 0.0
     place = min(max(rpm / TORQUE_RPM_STEP, 0.0), 9.999)
     below = int(place)
     full = p.torque[below] + (p.torque[below + 1] - p.torque[below]) * (place - below)
+    opened = 0.0 if rpm > p.limiter_rpm else throttle
     braking = p.engine_braking * max(rpm - p.idle_rpm, 0.0) / (p.top_rpm - p.idle_rpm)
-    return float(full * (throttle * (1.0 + braking) - braking))
+    return float(full * (opened * (1.0 + braking) - braking))
 
 
 @compiled
@@ -56,9 +54,12 @@ def clutch(p: Any, shaft_speed: float, throttle: float) -> tuple[float, float, f
     """(engine speed, torque, inertia) at the gearbox input shaft turning at `shaft_speed` rad/s.
 
     Below idle speed the clutch slips: the engine idles and transmits its torque, but its inertia
-    does not act on the shaft.
+    does not act on the shaft. Above the limiter the engine gives no torque, neither drive nor
+    braking, as in TORCS (forces by speed: tests/simulator/vehicle/test_dynamics.py).
     """
     idle = p.idle_rpm / RPM
+    if shaft_speed > p.limiter_rpm / RPM:
+        return shaft_speed, 0.0, p.engine_inertia
     if shaft_speed < idle:
         return idle, engine_torque(p, idle, throttle), 0.0
     return shaft_speed, engine_torque(p, shaft_speed, throttle), p.engine_inertia

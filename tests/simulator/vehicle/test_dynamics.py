@@ -13,7 +13,7 @@ from simulator.track.pieces import Piece, assemble
 from simulator.track.road import Road
 from simulator.vehicle.car import GRAVITY, RPM, CarParameters
 from simulator.vehicle.dynamics import DT, MEMORY, MOTION, PIECE, compute_forces
-from simulator.vehicle.powertrain import engine_torque
+from simulator.vehicle.powertrain import clutch
 from simulator.vehicle.state import CarState, Command
 from simulator.vehicle.surface import SURFACES, VERGE, ground
 from simulator.vehicle.tyre import peak_force
@@ -196,10 +196,16 @@ def test_the_engine_is_held_at_its_top_speed_in_gear() -> None:
 
 
 @pytest.mark.parametrize("throttle", [0.0, 0.2, 1.0])
-def test_there_is_no_torque_above_the_limiter(throttle: float) -> None:
+def test_there_is_no_torque_in_gear_above_the_limiter(throttle: float) -> None:
     p = CAR.packed()[0]
-    assert engine_torque(p, (CAR.limiter_rpm + 1.0) / RPM, throttle) == 0.0
-    assert engine_torque(p, (CAR.limiter_rpm - 1.0) / RPM, throttle) != 0.0
+    assert clutch(p, (CAR.limiter_rpm + 1.0) / RPM, throttle)[1] == 0.0
+    assert clutch(p, (CAR.limiter_rpm - 1.0) / RPM, throttle)[1] != 0.0
+
+
+def test_in_neutral_the_engine_falls_from_the_limiter() -> None:
+    states = drive(CAR, 2.0, lambda state: Command(throttle=1.0 if state.time_s < 1 else 0, gear=0))
+    assert max(state.rpm for state in states) > 0.95 * CAR.limiter_rpm
+    assert states[-1].rpm < 0.8 * CAR.limiter_rpm
 
 
 def test_reverse_gear_and_gear_range() -> None:
