@@ -11,7 +11,7 @@ THROTTLE = 0.2
 class DriveConfig:
     """One closed-loop drive. The same configuration gives the same drive."""
 
-    controller: str = "lqr"
+    controller: str = "lqr-preview"
     track: str = "oval"
     lanes: int = 1
     perception: str = "truth"
