@@ -121,15 +121,31 @@ def delay(config: DriveConfig, perceive: Perceive, unknown_s: float = 0.0) -> Pe
 
     A delay of `unknown_s` is not known to the controller: nothing is predicted over it.
     """
-    options = {"dt": 1.0 / FREQUENCY_HZ, "rng": np.random.default_rng([config.seed, 3])}
+    rng = np.random.default_rng([config.seed, 3])
     if unknown_s > 0.0:
-        perceive = LatePerception(
-            perceive, _state, latency_s=unknown_s, drop=0.0, predict=False, **options
-        )
+        perceive = _late(perceive, unknown_s, 0.0, rng, predict=False)
     if config.latency_ms == 0.0 and config.drop == 0.0:
         return perceive
-    latency_s = config.latency_ms / 1000.0
-    return LatePerception(perceive, _state, latency_s=latency_s, drop=config.drop, **options)
+    return _late(perceive, config.latency_ms / 1000.0, config.drop, rng, predict=True)
+
+
+def _late(
+    perceive: Perceive,
+    latency_s: float,
+    drop: float,
+    rng: np.random.Generator,
+    *,
+    predict: bool,
+) -> Perceive:
+    return LatePerception(
+        perceive,
+        _state,
+        dt=1.0 / FREQUENCY_HZ,
+        latency_s=latency_s,
+        drop=drop,
+        rng=rng,
+        predict=predict,
+    )
 
 
 def _state(world: World) -> CarState:
