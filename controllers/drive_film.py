@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from controllers.perception import CameraPerception, Perceived
-from mtlnet.inference.overlay import PREDICTION_COLOUR, TRUTH_COLOUR, draw_overlay
+from mtlnet.inference.overlay import PREDICTION_COLOUR, TRUTH_COLOUR, Distances, draw_overlay
 from runtime.film import Film
 
 if TYPE_CHECKING:
@@ -25,6 +25,8 @@ CURVE_S = 15.0
 CURVE_HEIGHT = 90
 OFFSET_SPAN_M, ANGLE_SPAN_RAD = 1.0, 0.1
 """Values at the upper and lower edge of the curves; larger ones are drawn at the edge."""
+NOTHING: tuple[Distances, float] = ({}, 0.0)
+"""No markings to draw: on the truth they are the green ones."""
 TEXT_COLOUR, GRID_COLOUR, BACK = (235, 235, 235), (90, 90, 96), 24
 
 
@@ -57,8 +59,9 @@ class DriveFilm:
         seen = np.nan if perceived.to_lane_centre is None else perceived.to_lane_centre
         self._curves.append((offset, seen, now.angle, perceived.angle))
         truth = (features.distances, features.angle)
+        answer: tuple[Distances, float]
         if self._perception is None or self._perception.image is None:
-            image, answer = self._render(), truth
+            image, answer = self._render(), NOTHING
         else:
             image, found = self._perception.image, self._perception.answer
             answer = (found["distances_m"], float(found["angle_rad"]))

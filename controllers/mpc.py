@@ -54,7 +54,7 @@ WEIGHTS_PAPER = MpcWeights(1.0, 1.0, 1.0)
 WEIGHTS_EXACT = MpcWeights(1.0, 3.0, 0.03)
 """Found on the four scored tracks; with three times the weight of the offset the car, which is
 slower to turn than the kinematic model, begins to swing."""
-WEIGHTS_PERCEIVED = MpcWeights(1.0, 5.0, 20.0)
+WEIGHTS_PERCEIVED = MpcWeights(1.0, 20.0, 2.0)
 
 
 def make_mpc(loop: LoopConfig, **weights: float) -> "Mpc":
