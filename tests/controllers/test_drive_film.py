@@ -5,6 +5,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from controllers.config import DriveConfig
 from controllers.drive import drive
@@ -13,14 +14,14 @@ from mtlnet.inference.overlay import PREDICTION_COLOUR, TRUTH_COLOUR
 from trackfeatures import UserError
 
 
-def frames(path: Path) -> list[np.ndarray]:  # type: ignore[type-arg]  # as cv2 gives them
+def frames(path: Path) -> list[NDArray[np.uint8]]:
     film = cv2.VideoCapture(str(path))
-    found = []
+    found: list[NDArray[np.uint8]] = []
     while True:
         more, picture = film.read()
         if not more:
             return found
-        found.append(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB))
+        found.append(np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), dtype=np.uint8))
 
 
 def test_a_drive_on_the_truth_is_filmed(tmp_path: Path) -> None:
@@ -60,7 +61,7 @@ def test_curves_rise_to_the_left_and_leave_out_what_was_not_perceived() -> None:
     values = np.array([[0.5, np.nan]] * 10 + [[-0.5, 0.9]] * 10)
     strip = curves(values, 20, 400, 1.0, "offset").astype(int)
 
-    def rows(colour: tuple[int, int, int], columns: slice) -> np.ndarray:  # type: ignore[type-arg]
+    def rows(colour: tuple[int, int, int], columns: slice) -> NDArray[np.int64]:
         near = np.abs(strip - colour).sum(axis=2) < 60
         return np.flatnonzero(near[:, columns].any(axis=1))
 
