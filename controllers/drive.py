@@ -78,10 +78,10 @@ def drive(
     not answer.
     """
     check_light(config.light)  # also without a camera: a misspelt name is an error in any case
-    if config.video is not None and config.video.suffix.lower() != FILM_SUFFIX:
-        raise UserError(f"--video {config.video}: give a file ending in {FILM_SUFFIX}")
-    for path in filter(None, (config.log, config.video)):
-        check_folder(path)
+    if config.video is not None:
+        if config.video.suffix.lower() != FILM_SUFFIX:
+            raise UserError(f"--video {config.video}: give a file ending in {FILM_SUFFIX}")
+        check_folder(config.video)
     track = find_track(config.track, config.tracks_dir)
     road = Road(track, lanes=config.lanes)
     lane = choose_lane(config, road)
