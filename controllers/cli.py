@@ -1,4 +1,4 @@
-"""The command `controllers`. Run: `controllers drive --controller lqr --track oval`."""
+"""The command `controllers`. Run: `controllers drive --controller mpc --track oval`."""
 
 import json
 from pathlib import Path
@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from controllers import compare_cli
 from controllers.config import DemoConfig, DriveConfig
 from runtime import cli as command
 
@@ -19,7 +20,11 @@ DRIVE, DEMO = DriveConfig(), DemoConfig()
 app = typer.Typer(add_completion=False, rich_markup_mode="rich", no_args_is_help=True)
 
 ControllerName = Annotated[
-    str, typer.Option(help="lqr, or torcs: the control law of the reference laps.")
+    str,
+    typer.Option(
+        help="lqr, lqr-preview, lqr-paper, mpc, mpc-preview, torcs, or your own class as "
+        "MODULE:CLASS or FILE.py:CLASS."
+    ),
 ]
 Track = Annotated[str, typer.Option(help="Its name (`simulator tracks`) or file.")]
 Lanes = Annotated[int, typer.Option(help="1, 2 or 3.")]
@@ -28,6 +33,12 @@ Perception = Annotated[
 ]
 Steps = Annotated[int | None, typer.Option(help="Control steps of 50 ms [default: about one lap]")]
 Log = Annotated[Path | None, typer.Option(help="Write the drive to this CSV file.")]
+Video = Annotated[Path | None, typer.Option(help="Film the drive (.mp4).")]
+Latency = Annotated[float, typer.Option(help="The perception's answers come this late.")]
+Drop = Annotated[float, typer.Option(help="Share of the answers that are lost.")]
+Parameters = Annotated[
+    Path | None, typer.Option(help="The controller's parameters, written by `controllers tune`.")
+]
 Model = Annotated[str, typer.Option(help="Run for perception model.")]
 StartD = Annotated[float | None, typer.Option(help="Start this far left of the track's centre, m.")]
 TargetLane = Annotated[
@@ -59,6 +70,10 @@ def drive(
     perception: Perception = DRIVE.perception,
     steps: Steps = DRIVE.steps,
     log: Log = DRIVE.log,
+    video: Video = DRIVE.video,
+    latency_ms: Latency = DRIVE.latency_ms,
+    drop: Drop = DRIVE.drop,
+    parameters: Parameters = DRIVE.parameters,
     model: Model = DRIVE.model,
     start_d: StartD = DRIVE.start_d,
     target_lane: TargetLane = DRIVE.target_lane,
@@ -82,6 +97,10 @@ def drive(
         perception=perception,
         steps=steps,
         log=log,
+        video=video,
+        latency_ms=latency_ms,
+        drop=drop,
+        parameters=parameters,
         model=model,
         start_d=start_d,
         target_lane=target_lane,
@@ -92,6 +111,12 @@ def drive(
         tracks_dir=tracks_dir,
     )
     result = _drive_with_progress(config)
+    if result.slowed_steps:
+        _stderr().print(
+            f"perception was lost for more than 1 s: the car slowed down for "
+            f"{result.slowed_steps} steps",
+            highlight=False,
+        )
     if as_json:
         typer.echo(json.dumps(result.as_json()))
     else:
@@ -134,6 +159,10 @@ def demo(
         )
 
 
+app.command()(compare_cli.compare)
+app.command()(compare_cli.tune)
+
+
 def _drive_with_progress(config: DriveConfig) -> "DriveResult":
     from rich.markup import escape
     from rich.progress import MofNCompleteColumn, Progress
@@ -164,8 +193,9 @@ def _print_table(config: DriveConfig, result: "DriveResult") -> None:
     for name, value in result.as_json().items():
         table.add_row(name, escape(_cell(value)))
     Console().print(table)
-    if config.log is not None:
-        typer.echo(f"log: {config.log}")
+    for name, path in (("log", config.log), ("film", config.video)):
+        if path is not None:
+            typer.echo(f"{name}: {path}")
 
 
 def _cell(value: object) -> str:

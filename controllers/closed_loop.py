@@ -27,6 +27,10 @@ RUN_UP_S = 15.0
 """The standing start, left out of `cruising_kmh`."""
 EASE_OFF = 1.0  # m/s2 of wanted braking at which the throttle is closed
 FULL_BRAKING = 15.0  # m/s2 at full brake on asphalt
+LOST_S = 1.0
+"""Without a perceived offset for this long the car slows down ..."""
+LOST_SPEED = 5.0  # m/s, ... to this speed, at which it goes on
+LOST_BRAKE = 0.1
 
 
 class Drivable(Protocol):
@@ -69,6 +73,8 @@ class DriveResult:
     """The same without the first 15 s; None for a shorter drive."""
     blind_steps: int
     """Steps without a perceived offset."""
+    slowed_steps: int
+    """Steps in which the car slowed down because perception was lost for more than 1 s."""
     noisy: bool
     """Whether the controller received an estimated state, with errors, instead of the true one."""
     ended: str | None
@@ -104,10 +110,15 @@ def run_lap(
     totals = _Totals(start_m=world.state.odometer_m)
     for _ in range(steps):
         now = world.state
-        steer = controller.update(_observe(now, perceive(world), memory))
+        perceived = perceive(world)
+        steer = controller.update(_observe(now, perceived, memory))
         if record is not None:
             record(now, steer)
         pedal, brake = throttle_and_brake(world.traffic, now, throttle)
+        lost_s = max(perceived.lost_s, memory.age / world.frequency_hz)
+        if lost_s > LOST_S:
+            pedal, brake = slow_down(now.vx, pedal, brake)
+            totals.slowed_steps += 1
         after = world.step(Command(steer=steer, throttle=pedal, brake=brake, gear=GEAR))
         totals.add(after, lane_centre, world.road.half_width)
         if totals.ended is not None:
@@ -127,23 +138,31 @@ def throttle_and_brake(traffic: Traffic, now: CarState, throttle: float) -> tupl
     return throttle * open_share, min(max(-wanted - EASE_OFF, 0.0) / FULL_BRAKING, 1.0)
 
 
+def slow_down(speed: float, throttle: float, brake: float) -> tuple[float, float]:
+    """Throttle and brake that slow the car to `LOST_SPEED`, from those of the drive."""
+    if speed > LOST_SPEED:
+        return 0.0, max(brake, LOST_BRAKE)
+    return throttle, brake
+
+
 class OffsetMemory:
     """Replaces the offset in steps in which no marking is perceived."""
 
     def __init__(self, hold_steps: int) -> None:
         self.blind_steps = 0
         self._hold_steps = hold_steps
-        self._age = 0
+        self.age = 0
+        """Steps since the last perceived offset."""
         self._last = 0.0
 
     def fill(self, offset: float | None) -> float:
         """The offset; while it is None the last one for `hold_steps` steps, after that 0."""
         if offset is not None:
-            self._age, self._last = 0, offset
+            self.age, self._last = 0, offset
             return offset
         self.blind_steps += 1
-        self._age += 1
-        return self._last if self._age <= self._hold_steps else 0.0
+        self.age += 1
+        return self._last if self.age <= self._hold_steps else 0.0
 
 
 def _observe(now: CarState, perceived: Perceived, memory: OffsetMemory) -> Observation:
@@ -165,6 +184,7 @@ class _Totals:
     start_m: float
     score: float = 0.0
     ended: str | None = None
+    slowed_steps: int = 0
     offsets_m: list[float] = field(default_factory=list)
     speeds_kmh: list[float] = field(default_factory=list)
 
@@ -192,6 +212,7 @@ class _Totals:
             speed_kmh=(min(speeds), max(speeds)),
             cruising_kmh=(min(speeds[run_up:]), max(speeds)) if len(speeds) > run_up else None,
             blind_steps=blind_steps,
+            slowed_steps=self.slowed_steps,
             noisy=noisy,
             ended=self.ended,
         )

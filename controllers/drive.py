@@ -4,22 +4,39 @@ controllers drive --controller lqr --track oval --perception truth --log drive.c
 """
 
 import itertools
+import json
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
 
 import trackfeatures as tf
 from controllers.closed_loop import DriveLog, DriveResult, run_lap
 from controllers.config import DriveConfig
-from controllers.perception import PerceptionSource, open_perception
-from controllers.registry import LoopConfig, make_controller
+from controllers.disturbance import Disturbance
+from controllers.interface import LoopConfig
+from controllers.late_perception import LatePerception
+from controllers.perception import (
+    CameraPerception,
+    Perceive,
+    Perceived,
+    PerceptionSource,
+    open_perception,
+)
+from controllers.registry import make_controller
+from runtime.files import check_folder
+from runtime.film import FILM_SUFFIX, Film
 from simulator.camera import check_light
 from simulator.track.catalogue import find_track
 from simulator.track.road import Road
 from simulator.vehicle.state import CarState
 from simulator.world.world import World
 from trackfeatures import UserError
+from trackfeatures.camera import CameraParameters
 
 FREQUENCY_HZ = 20
 SCORED_STEPS = {"forza": 6500, "alpine-2": 4500, "eroad": 3700, "g-track-3": 3300}
@@ -38,35 +55,130 @@ class Lane:
     centre: float
 
 
-def drive(config: DriveConfig, progress: Progress | None = None) -> DriveResult:
-    """Drive as `config` says; `progress` is called each step.
+class Observer(Protocol):
+    """Is called each control step, before the car moves."""
 
-    The log is written row by row, so an interrupted drive leaves the rows driven. Raises UserError
-    for an unknown name, a lane or start outside the road, or a service that does not answer.
+    def __call__(self, now: CarState, perceived: Perceived, steer: float) -> None: ...
+
+
+def drive(
+    config: DriveConfig,
+    progress: Progress | None = None,
+    *,
+    disturbance: Disturbance | None = None,
+    observers: Sequence[Observer] = (),
+    parameters: Mapping[str, float] | None = None,
+) -> DriveResult:
+    """Drive as `config` says; `progress` and the `observers` are called each step.
+
+    `parameters` of the controller go before those of the file in `config`.
+
+    The log and the film are written step by step, so an interrupted drive leaves the part driven.
+    Raises UserError for an unknown name, a lane or start outside the road, or a service that does
+    not answer.
     """
     check_light(config.light)  # also without a camera: a misspelt name is an error in any case
+    if config.video is not None:
+        if config.video.suffix.lower() != FILM_SUFFIX:
+            raise UserError(f"--video {config.video}: give a file ending in {FILM_SUFFIX}")
+        check_folder(config.video)
     track = find_track(config.track, config.tracks_dir)
     road = Road(track, lanes=config.lanes)
     lane = choose_lane(config, road)
     steps = steps_for(config.steps, track.name, track.length_m)
     noisy = config.perception != "truth"
-    controller = make_controller(config.controller, LoopConfig(1.0 / FREQUENCY_HZ, noisy=noisy))
+    loop = LoopConfig(1.0 / FREQUENCY_HZ, noisy=noisy)
+    if parameters is None:
+        parameters = read_parameters(config.parameters, config.controller)
+    controller = make_controller(config.controller, loop, parameters)
     if not 0.0 <= config.throttle <= 1.0:
         raise UserError(f"throttle {config.throttle} is out of range; give one from 0 to 1")
     with ExitStack() as stack:
-        world = stack.enter_context(World(road, traffic=config.traffic, frequency_hz=FREQUENCY_HZ))
+        disturbance = disturbance or Disturbance()
+        world = stack.enter_context(
+            disturbance.world(
+                road, traffic=config.traffic, frequency_hz=FREQUENCY_HZ, seed=config.seed
+            )
+        )
         world.reset(seed=config.seed, to_middle=lane.start_d)
         source = stack.enter_context(_open_perception(config, world, lane))
+        watching = [*observers, *_observers(config, stack, world, source, lane)]
+        perceive = Tap(delay(config, source.perceive, disturbance.delay_s))
         return run_lap(
             world,
-            controller,
-            source.perceive,
+            disturbance.controller(controller, config.seed),
+            perceive,
             steps,
             throttle=config.throttle,
             lane_centre=lane.centre,
             noisy=noisy,
-            record=_recorder(config, stack, steps, progress),
+            record=_recorder(perceive, watching, steps, progress),
         )
+
+
+def delay(config: DriveConfig, perceive: Perceive, unknown_s: float = 0.0) -> Perceive:
+    """`perceive`, late and with lost answers where `config` asks for it, and predicted.
+
+    A delay of `unknown_s` is not known to the controller: nothing is predicted over it.
+    """
+    rng = np.random.default_rng([config.seed, 3])
+    if unknown_s > 0.0:
+        perceive = _late(perceive, unknown_s, 0.0, rng, predict=False)
+    if config.latency_ms == 0.0 and config.drop == 0.0:
+        return perceive
+    return _late(perceive, config.latency_ms / 1000.0, config.drop, rng, predict=True)
+
+
+def _late(
+    perceive: Perceive,
+    latency_s: float,
+    drop: float,
+    rng: np.random.Generator,
+    *,
+    predict: bool,
+) -> Perceive:
+    return LatePerception(
+        perceive,
+        _state,
+        dt=1.0 / FREQUENCY_HZ,
+        latency_s=latency_s,
+        drop=drop,
+        rng=rng,
+        predict=predict,
+    )
+
+
+def _state(world: World) -> CarState:
+    return world.state
+
+
+def read_parameters(path: Path | None, controller: str) -> dict[str, float]:
+    """The parameters of `controller` in a file of `controllers tune`; none without a file.
+
+    Raises UserError where the file is none, or has no entry for the controller.
+    """
+    if path is None:
+        return {}
+    try:
+        found = json.loads(path.read_text())["controllers"][controller]["parameters"]
+        return {str(name): float(value) for name, value in found.items()}
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise UserError(
+            f"{path} has no parameters of {controller} ({error!r}); give a file that "
+            "`controllers tune` wrote for it"
+        ) from error
+
+
+class Tap:
+    """A perception that keeps its last answer, for those who watch the drive."""
+
+    def __init__(self, perceive: Perceive) -> None:
+        self._perceive = perceive
+        self.last: Perceived | None = None
+
+    def __call__(self, world: World) -> Perceived:
+        self.last = self._perceive(world)
+        return self.last
 
 
 def _open_perception(config: DriveConfig, world: World, lane: Lane) -> PerceptionSource:
@@ -80,18 +192,39 @@ def _open_perception(config: DriveConfig, world: World, lane: Lane) -> Perceptio
     )
 
 
-def _recorder(
-    config: DriveConfig, stack: ExitStack, steps: int, progress: Progress | None
-) -> Callable[[CarState, float], None]:
-    """Writes the log, which `stack` closes, and reports progress."""
-    log = None
+def _observers(
+    config: DriveConfig, stack: ExitStack, world: World, source: PerceptionSource, lane: Lane
+) -> Iterator[Observer]:
+    """The log and the film, which `stack` closes."""
     if config.log is not None:
         log = DriveLog(stack.enter_context(config.log.open("w", encoding="utf-8")))
+        yield lambda now, perceived, steer: log.write(now, steer)
+    if config.video is not None:
+        from controllers.drive_film import DriveFilm
+        from simulator.camera import open_camera
+
+        film = stack.enter_context(Film(config.video, FREQUENCY_HZ))
+        seen = source.perceive if isinstance(source.perceive, CameraPerception) else None
+        if seen is not None:
+            camera = seen.camera
+        else:
+            parameters = CameraParameters()
+            camera = open_camera(world.road, parameters, light=config.light, seed=config.seed)
+            stack.callback(camera.close)
+        drawn = DriveFilm(film, world, camera, seen, lane_centre=lane.centre)
+        yield lambda now, perceived, steer: drawn.add(perceived, steer)
+
+
+def _recorder(
+    tap: Tap, observers: list[Observer], steps: int, progress: Progress | None
+) -> Callable[[CarState, float], None]:
+    """Calls the observers and reports progress."""
     done = itertools.count()
 
     def record(state: CarState, steer: float) -> None:
-        if log is not None:
-            log.write(state, steer)
+        assert tap.last is not None
+        for observer in observers:
+            observer(state, tap.last, steer)
         if progress is not None:
             progress(next(done), steps)
 

@@ -26,8 +26,18 @@ class Observation:
 
 
 class Controller(Protocol):
-    """A lateral controller. A new one is a new file and one line in `registry`."""
+    """A lateral controller. A new one is a new file and one entry in `registry`."""
 
     def update(self, observation: Observation) -> float:
         """The steering action in [-1, 1], left positive; called once a control step."""
         ...
+
+
+@dataclass(frozen=True)
+class LoopConfig:
+    """The control loop that a controller is made for."""
+
+    dt: float
+    """s between two control steps."""
+    noisy: bool = False
+    """Whether the state is estimated by a perception, with errors, or exact."""

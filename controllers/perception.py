@@ -37,6 +37,8 @@ class Perceived:
     heading: Heading
     curvature: float | None = None
     """1/m, left positive, of the road just ahead; None where it is not estimated."""
+    lost_s: float = 0.0
+    """s since an answer was due that came; this one is predicted from an older one. 0: it came."""
 
 
 class Perceive(Protocol):
@@ -138,12 +140,17 @@ class CameraPerception:
     """Perception by a camera on the car and a network that reads its images."""
 
     def __init__(self, camera: "Camera", model: FeatureModel) -> None:
-        self._camera = camera
+        self.camera = camera
         self._model = model
+        self.image: Image | None = None
+        """The last one."""
+        self.answer: dict[str, Any] = {}
+        """The model's to it, in the format of the service's answers."""
 
     def __call__(self, world: "World") -> Perceived:
-        image = self._camera.render(world.body_pose(), world.traffic.poses())
-        return parse_prediction(self._model.predict(image))
+        self.image = self.camera.render(world.body_pose(), world.traffic.poses())
+        self.answer = self._model.predict(self.image)
+        return parse_prediction(self.answer)
 
 
 def parse_prediction(answer: dict[str, Any]) -> Perceived:

@@ -1,32 +1,141 @@
-"""The controllers by name. To add one: a new file with a class that has `update`, one line here."""
+"""The controllers by name. To add one: a new file with a class that has `update`, one entry here.
 
-from collections.abc import Callable
-from dataclasses import dataclass
+A user's own controller needs no entry: `MODULE:CLASS` names a class of any module that Python can
+import, the working folder included, and `FILE.py:CLASS` one of a file.
+"""
 
-from controllers.interface import Controller
-from controllers.lqr import WEIGHTS_EXACT, WEIGHTS_PERCEIVED, Lqr
-from controllers.torcs_feedback import StateFeedback
+import importlib
+import importlib.util
+import math
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from controllers.interface import Controller, LoopConfig
 from trackfeatures.errors import UserError
+
+__all__ = ["CONTROLLERS", "ControllerEntry", "LoopConfig", "make_controller"]
 
 
 @dataclass(frozen=True)
-class LoopConfig:
-    """The control loop that a controller is made for."""
+class ControllerEntry:
+    """A controller of this project; its module is imported when it is made."""
 
-    dt: float
-    """s between two control steps."""
-    noisy: bool = False
-    """Whether the state is estimated by a perception, with errors, or exact."""
+    factory: str
+    """MODULE:FUNCTION; called with a `LoopConfig` and, by name, the parameters that are set."""
+    about: str
+    tunable: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    """Parameters of the factory that `controllers tune` searches, with their ranges, all > 0."""
 
 
-CONTROLLERS: dict[str, Callable[[LoopConfig], Controller]] = {
-    "lqr": lambda loop: Lqr(loop.dt, WEIGHTS_PERCEIVED if loop.noisy else WEIGHTS_EXACT),
-    "torcs": lambda loop: StateFeedback(),
+_LQR_WEIGHTS = {
+    "offset": (0.1, 200.0),
+    "offset_rate": (1e-3, 2.0),
+    "heading": (0.1, 200.0),
+    "heading_rate": (1e-3, 2.0),
+    "rho": (1e-3, 10.0),
+}
+_MPC_WEIGHTS = {"offset": (0.1, 100.0), "heading": (0.1, 100.0), "wheel": (1e-3, 10.0)}
+
+CONTROLLERS: dict[str, ControllerEntry] = {
+    "lqr": ControllerEntry(
+        "controllers.lqr:make_lqr", "the paper's LQR: offset, angle, their rates", _LQR_WEIGHTS
+    ),
+    "lqr-preview": ControllerEntry(
+        "controllers.lqr:make_lqr_preview", "LQR with feed-forward of the curvature", _LQR_WEIGHTS
+    ),
+    "lqr-paper": ControllerEntry(
+        "controllers.lqr:make_lqr_paper", "LQR as the paper's released code runs it", _LQR_WEIGHTS
+    ),
+    "mpc": ControllerEntry(
+        "controllers.mpc:make_mpc", "the paper's nonlinear MPC, without preview", _MPC_WEIGHTS
+    ),
+    "mpc-preview": ControllerEntry(
+        "controllers.mpc:make_mpc_preview", "MPC that knows the curvature ahead", _MPC_WEIGHTS
+    ),
+    "torcs": ControllerEntry(
+        "controllers.torcs_feedback:make_torcs", "the control law of the reference laps"
+    ),
 }
 
 
-def make_controller(name: str, loop: LoopConfig) -> Controller:
-    """The controller `name`. Raises UserError where there is none of that name."""
+def make_controller(
+    name: str, loop: LoopConfig, parameters: Mapping[str, float] | None = None
+) -> Controller:
+    """The controller `name`, or the class that MODULE:CLASS names, with `parameters` set.
+
+    Raises UserError for a name or parameter that does not exist, a module that cannot be imported,
+    and a class that cannot be made without arguments or has no method `update`.
+    """
+    if ":" in name:
+        return _make_own(name, parameters)
     if name not in CONTROLLERS:
-        raise UserError(f"there is no controller {name!r}; use one of: {', '.join(CONTROLLERS)}")
-    return CONTROLLERS[name](loop)
+        raise UserError(
+            f"there is no controller {name!r}; use one of: {', '.join(CONTROLLERS)}, or "
+            "MODULE:CLASS of your own"
+        )
+    entry, given = CONTROLLERS[name], dict(parameters or {})
+    for parameter, value in given.items():
+        if parameter not in entry.tunable:
+            known = ", ".join(entry.tunable) or "none"
+            raise UserError(f"{name} has no parameter {parameter!r}; it has: {known}")
+        if not (math.isfinite(value) and value >= 0.0):
+            raise UserError(f"{name}: {parameter} is {value}; give a finite number of 0 or more")
+    module, _, function = entry.factory.partition(":")
+    make: Callable[..., Controller] = getattr(importlib.import_module(module), function)
+    return make(loop, **given)
+
+
+def _make_own(name: str, parameters: Mapping[str, float] | None) -> Controller:
+    """The controller of a user's own class."""
+    place, _, class_name = name.rpartition(":")
+    module = _load_file(Path(place)) if place.endswith(".py") else _import(place)
+    found = getattr(module, class_name, None)
+    if not isinstance(found, type):
+        raise UserError(f"{place} has no class {class_name!r}; give MODULE:CLASS")
+    if not callable(getattr(found, "update", None)):
+        raise UserError(
+            f"the class {class_name} of {place} has no method update(observation); it returns the "
+            "steering action in [-1, 1], left positive"
+        )
+    try:
+        controller: Controller = found(**(parameters or {}))
+    except TypeError as error:
+        raise UserError(
+            f"the class {class_name} of {place} cannot be made: {error}; give every argument a "
+            "default"
+        ) from error
+    return controller
+
+
+def _import(name: str) -> ModuleType:
+    if not name:
+        raise UserError("the controller's module is missing; give MODULE:CLASS")
+    folder = str(Path.cwd())
+    if folder not in sys.path:  # as `python -m` does
+        sys.path.insert(0, folder)
+    try:
+        return importlib.import_module(name)
+    except Exception as error:  # a user's module may raise anything
+        raise UserError(f"the module {name!r} cannot be imported: {_line(error)}") from error
+
+
+def _load_file(path: Path) -> ModuleType:
+    if not path.is_file():
+        raise UserError(f"there is no file {path}")
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    try:
+        spec.loader.exec_module(module)
+    except Exception as error:  # as above
+        raise UserError(f"{path} cannot be loaded: {_line(error)}") from error
+    return module
+
+
+def _line(error: Any) -> str:
+    return " ".join(f"{type(error).__name__}: {error}".split())

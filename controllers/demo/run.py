@@ -109,7 +109,14 @@ def _use_service(config: DemoConfig, result: DemoResult) -> None:
     ):
         result.asked = post_frames(frames, chosen, client)
         result.seconds["serve"] = time.monotonic() - started
-        drive = ["controllers", "drive", "--controller", "lqr", "--track", config.drive_track]
+        drive = [
+            "controllers",
+            "drive",
+            "--controller",
+            "lqr-preview",
+            "--track",
+            config.drive_track,
+        ]
         drive += ["--lanes", "1", "--perception", url, "--steps", str(DRIVE_STEPS), "--json"]
         drive += ["--log", str(config.out / "drive.csv")]
         result.drive = json.loads(_step(result, "drive", drive))

@@ -16,10 +16,10 @@ import trackfeatures as tf
 from mtlnet.inference.overlay import draw_overlay
 from mtlnet.inference.prediction import Prediction
 from mtlnet.predict.sources import SourceImage
+from runtime.film import FILM_SUFFIX, Film
 from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
 
-FILM_SUFFIX = ".mp4"
 TABLE_SUFFIXES = (".csv", ".jsonl")
 TEXT_HEIGHT = 64
 """Rows of pixels below a picture that hold the features as text."""
@@ -96,25 +96,16 @@ class FilmWriter:
     """Drawn frames as an MP4 film (MPEG-4), playable also when the command is interrupted."""
 
     def __init__(self, path: Path, camera: CameraParameters, fps: float) -> None:
-        self._path, self._camera, self._fps = path, camera, fps
-        self._film: cv2.VideoWriter | None = None
+        self._camera, self._film = camera, Film(path, fps)
 
     def write(self, item: SourceImage, prediction: Prediction) -> None:
-        picture = draw_prediction(item, prediction, self._camera)
-        if self._film is None:
-            code = cv2.VideoWriter.fourcc(*"mp4v")
-            size = (picture.shape[1], picture.shape[0])
-            self._film = cv2.VideoWriter(str(self._path), code, self._fps, size)
-            if not self._film.isOpened():
-                raise UserError(f"{self._path} cannot be written as a film; check folder and disk")
-        self._film.write(cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
+        self._film.write(draw_prediction(item, prediction, self._camera))
 
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, *_: object) -> None:
-        if self._film is not None:
-            self._film.release()
+    def __exit__(self, *error: object) -> None:
+        self._film.__exit__(*error)
 
 
 class PictureWriter:

@@ -3,7 +3,7 @@
 The defaults describe TORCS's car1-trb1, the car of the paper's experiments. The mass and the axle
 distances (lf, lr) are also the paper's. Two values differ from the paper: its yaw inertia
 (2000 kg m2) and cornering stiffness (80 kN/rad per tyre) belong to the model of its controllers
-(`controllers.lqr`). The recorded TORCS laps of this car show 1120 kg m2 and 125 kN/rad; with the
+(`controllers.lateral_model`). The recorded TORCS laps of this car show 1120 kg m2 and 125 kN/rad; with the
 paper's values it deviates twice as far in the kink of g-track-3.
 """
 
@@ -109,8 +109,9 @@ class CarParameters:
     """kg m2, at the crankshaft; fitted: in gear 1 the effective mass is 6.3 % larger in TORCS."""
     idle_rpm: float = 900.0
     limiter_rpm: float = 9152.0
+    """Above this speed the engine gives no torque in gear, neither drive nor braking."""
     top_rpm: float = 10_000.0
-    """End of the torque table."""
+    """End of the torque table; in gear the engine is held at this speed."""
     torque: tuple[float, ...] = (
         100.0, 160.0, 190.0, 280.0, 350.0, 405.0, 443.0, 465.0, 483.0, 415.0, 360.0,
     )  # fmt: skip

@@ -15,7 +15,12 @@ from simulator.arrays import FloatArray
 from simulator.track.piece_table import Table, locate, surface
 from simulator.vehicle.car import GRAVITY
 from simulator.vehicle.orientation import rotation
-from simulator.vehicle.powertrain import clutch, free_engine_speed, gear_ratio
+from simulator.vehicle.powertrain import (
+    clutch,
+    free_engine_speed,
+    gear_ratio,
+    limit_shaft_speed,
+)
 from simulator.vehicle.surface import Ground
 from simulator.vehicle.wheels import (
     ALONG,
@@ -94,6 +99,7 @@ def update_wheel_speeds(
     road_moment = 0.5 * r * (moment_left + moment_right)
     mean_inertia = p.wheel_inertia + inertia + DT * r * r * mean_gain
     mean = 0.5 * (spin[2] + spin[3]) + DT * (torque + road_moment) / mean_inertia
+    mean = limit_shaft_speed(p, mean, ratio)
     moment_difference = r * (moment_left - moment_right)
     difference_inertia = p.wheel_inertia + DT * (r * r * mean_gain + 2.0 * p.differential_viscosity)
     half = 0.5 * (spin[2] - spin[3])

@@ -33,6 +33,16 @@ def engine_torque(p: Any, speed: float, throttle: float) -> float:
 
 
 @compiled
+def limit_shaft_speed(p: Any, wheel_speed: float, ratio: float) -> float:
+    """Mean speed (rad/s) of the driven wheels, held where the engine turns at `top_rpm`.
+
+    As in TORCS, the engine goes no faster in gear: the tyres then slip and slow the car.
+    """
+    top = p.top_rpm / RPM
+    return float(top / ratio if wheel_speed * ratio > top else wheel_speed)
+
+
+@compiled
 def free_engine_speed(p: Any, speed: float, throttle: float, dt: float) -> float:
     """Engine speed (rad/s) after `dt` s in neutral."""
     faster = speed + dt * engine_torque(p, speed, throttle) / p.engine_inertia
@@ -44,9 +54,12 @@ def clutch(p: Any, shaft_speed: float, throttle: float) -> tuple[float, float, f
     """(engine speed, torque, inertia) at the gearbox input shaft turning at `shaft_speed` rad/s.
 
     Below idle speed the clutch slips: the engine idles and transmits its torque, but its inertia
-    does not act on the shaft.
+    does not act on the shaft. Above the limiter the engine gives no torque, neither drive nor
+    braking, as in TORCS (forces by speed: tests/simulator/vehicle/test_dynamics.py).
     """
     idle = p.idle_rpm / RPM
+    if shaft_speed > p.limiter_rpm / RPM:
+        return shaft_speed, 0.0, p.engine_inertia
     if shaft_speed < idle:
         return idle, engine_torque(p, idle, throttle), 0.0
     return shaft_speed, engine_torque(p, shaft_speed, throttle), p.engine_inertia

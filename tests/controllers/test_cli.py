@@ -32,6 +32,29 @@ def test_drive_prints_a_table() -> None:
     assert "score_per_step" in done.stdout
 
 
+def test_a_users_controller_in_one_file_drives(tmp_path: Path) -> None:
+    law = tmp_path / "law.py"
+    law.write_text(
+        "class Proportional:\n"
+        "    def update(self, observation):\n"
+        "        steer = 2 * observation.angle - 0.2 * observation.to_lane_centre\n"
+        "        return max(-1.0, min(steer, 1.0))\n"
+    )
+    done = run("drive", "--controller", f"{law}:Proportional", "--steps", "300", "--json")
+    assert done.returncode == 0, done.stderr
+    result = json.loads(done.stdout)
+    assert result["ended"] is None
+    assert result["mean_abs_d_m"] < 0.5
+
+
+def test_lost_perception_is_said() -> None:
+    done = run("drive", "--steps", "80", "--drop", "0.99", "--json")
+    assert done.returncode == 0, done.stderr
+    slowed = json.loads(done.stdout)["slowed_steps"]
+    assert slowed > 0
+    assert f"slowed down for {slowed} steps" in done.stderr
+
+
 def test_a_service_that_does_not_answer_is_one_error_line() -> None:
     url = f"http://127.0.0.1:{free_port()}"
     done = run("drive", "--steps", "20", "--perception", url)
@@ -50,7 +73,14 @@ def test_the_help_of_drive_names_every_light() -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("--controller", "mpc"), "no controller 'mpc'; use one of: lqr, torcs"),
+        (("--controller", "pid"), "no controller 'pid'; use one of: lqr, lqr-preview"),
+        (("--controller", "no_such_module:Law"), "'no_such_module' cannot be imported"),
+        (("--controller", "json:Law"), "json has no class 'Law'"),
+        (("--controller", "json:JSONDecoder"), "has no method update"),
+        (("--latency-ms", "-5"), "latency of -5 ms"),
+        (("--drop", "1.5"), "1.5 lost answers"),
+        (("--video", "drive.gif"), "ending in .mp4"),
+        (("--parameters", "pyproject.toml"), "has no parameters of lqr-preview"),
         (("--lanes", "7"), "7"),
         (("--throttle", "2"), "throttle 2.0"),
         (("--steps", "0"), "0 steps"),

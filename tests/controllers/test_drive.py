@@ -15,8 +15,9 @@ from controllers.closed_loop import COLUMNS, DriveLog, OffsetMemory, run_lap, th
 from controllers.config import DriveConfig
 from controllers.drive import choose_lane, drive, steps_for
 from controllers.interface import Observation
-from controllers.lqr import WEIGHTS_PERCEIVED, Lqr
+from controllers.lqr import WEIGHTS_PERCEIVED, LqrPreview
 from controllers.perception import Perceived, PerceptionSource, truth
+from serve.client import ServiceError
 from simulator.track.catalogue import find_track
 from simulator.track.road import Road
 from simulator.traffic.traffic import Traffic
@@ -159,7 +160,7 @@ def test_log_has_the_columns_and_signs_of_the_reference_laps() -> None:
     assert (float(values["t"]), float(values["steer"])) == (1.05, 0.75)
 
 
-def test_lqr_on_the_true_state_stays_in_the_middle(tmp_path: Path) -> None:
+def test_the_default_controller_on_the_true_state_stays_in_the_middle(tmp_path: Path) -> None:
     """15 s from rest, half a metre off at the start, through the first bend of the town."""
     log = tmp_path / "drive.csv"
     config = DriveConfig(track="town", steps=300, start_d=0.5, log=log)
@@ -195,7 +196,7 @@ def test_truth_measures_the_offset_from_the_target_lane() -> None:
     assert (measured.heading, measured.curvature) == (Heading.STRAIGHT, 0.0)
 
 
-def test_lqr_drives_on_a_noisy_perception() -> None:
+def test_lqr_preview_drives_on_a_noisy_perception() -> None:
     """Errors of a briefly trained model; the weights for it keep the car in its lane."""
     rng = np.random.default_rng(3)
 
@@ -211,7 +212,7 @@ def test_lqr_drives_on_a_noisy_perception() -> None:
 
     with World(Road(find_track("town"))) as world:
         world.reset(seed=0)
-        result = run_lap(world, Lqr(0.05, WEIGHTS_PERCEIVED), perceive, 600, noisy=True)
+        result = run_lap(world, LqrPreview(0.05, WEIGHTS_PERCEIVED), perceive, 600, noisy=True)
     assert result.ended is None
     assert result.max_abs_d_m < 0.8
     assert result.blind_steps > 20
@@ -228,6 +229,28 @@ def test_a_drive_on_perception_is_noisy(
     monkeypatch.setattr("controllers.drive.open_perception", open_perception)
     result = drive(DriveConfig(perception=perception, steps=3))
     assert result.as_json()["noisy"] is noisy
+
+
+def test_a_service_that_dies_in_the_middle_of_a_drive_leaves_the_log(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    exact, asked = truth(0.0), 0
+
+    def perceive(world: World) -> Perceived:
+        nonlocal asked
+        asked += 1
+        if asked > 7:
+            raise ServiceError("http://127.0.0.1:8000 does not answer")
+        return exact(world)
+
+    def open_perception(*_: object, **__: object) -> PerceptionSource:
+        return PerceptionSource(perceive)
+
+    monkeypatch.setattr("controllers.drive.open_perception", open_perception)
+    log = tmp_path / "drive.csv"
+    with pytest.raises(UserError, match="does not answer"):
+        drive(DriveConfig(perception="http://127.0.0.1:8000", steps=30, log=log))
+    assert len(log.read_text().splitlines()) == 1 + 7
 
 
 def test_steps_by_track() -> None:

@@ -64,7 +64,16 @@ def test_collect_train_evaluate_serve_and_drive(tmp_path: Path) -> None:
         posted = post_frames(frames, [100, 200], client)
         log = tmp_path / "drive.csv"
         drive = command(
-            *("controllers", "drive", "--controller", "lqr", "--track", "oval", "--lanes", "1"),
+            *(
+                "controllers",
+                "drive",
+                "--controller",
+                "lqr-preview",
+                "--track",
+                "oval",
+                "--lanes",
+                "1",
+            ),
             *("--perception", url, "--steps", "400", "--log", str(log), "--json"),
         )
     # 400 steps of 50 ms: 20 s, on the oval's straight, which a model trained on 60 batches of that

@@ -11,8 +11,9 @@ from simulator.track.geometry import Track
 from simulator.track.markings import MarkingStyle
 from simulator.track.pieces import Piece, assemble
 from simulator.track.road import Road
-from simulator.vehicle.car import GRAVITY, CarParameters
+from simulator.vehicle.car import GRAVITY, RPM, CarParameters
 from simulator.vehicle.dynamics import DT, MEMORY, MOTION, PIECE, compute_forces
+from simulator.vehicle.powertrain import clutch
 from simulator.vehicle.state import CarState, Command
 from simulator.vehicle.surface import SURFACES, VERGE, ground
 from simulator.vehicle.tyre import peak_force
@@ -164,6 +165,47 @@ def test_throttle_0_2_in_gear_1_gives_the_papers_speed_on_a_flat_road() -> None:
     assert start[-1].rpm == pytest.approx(394.0 * start[-1].vx, rel=0.003)  # as in TORCS's drives
     downhill = drive(CAR, 25.0, lambda _: Command(throttle=0.2), speed=18.0, grade=-0.05)
     assert 65.0 < downhill[-1].speed_kmh < 85.0  # the engine brakes
+
+
+# Acceleration plus g times slope (m/s2) in the real TORCS, medians by speed (m/s) over a lap with a
+# long descent: gear 1, throttle 0.2. The limiter is at 23.3 m/s.
+FORCE_IN_TORCS = {18: 0.0, 19: -0.31, 20: -0.49, 21: -0.63, 22: -0.80, 23: -0.39, 24: -0.43}
+
+
+def test_the_longitudinal_force_by_speed_is_that_of_torcs() -> None:
+    grade = -0.12
+    rolling = Command(throttle=0.2)
+    states = drive(CAR, 12.0, lambda _: rolling, speed=17.5, grade=grade)
+    speed = np.array([state.speed for state in states])
+    force = np.gradient(speed, 0.05) + GRAVITY * math.sin(math.atan(grade))
+    settled = np.arange(len(speed)) > 10  # the springs' swing at the start
+    for low, expected in FORCE_IN_TORCS.items():
+        here = settled & (speed >= low) & (speed < low + 1)
+        if low == 23:
+            here &= speed > 23.35  # above the limiter only, as most of that lap's steps
+        assert np.median(force[here]) == pytest.approx(expected, abs=0.12), low
+
+
+def test_the_engine_is_held_at_its_top_speed_in_gear() -> None:
+    states = drive(CAR, 20.0, lambda _: Command(throttle=0.2), speed=22.0, grade=-0.12)
+    fastest = CAR.top_rpm / 394.0  # m/s in gear 1
+    assert max(state.rpm for state in states) == pytest.approx(CAR.top_rpm)
+    # The slip of the tyres holds the car against the slope, a little above the wheels' speed.
+    assert states[-1].speed == pytest.approx(fastest, abs=0.6)
+    assert all(state.rpm <= CAR.top_rpm + 1e-6 for state in states)
+
+
+@pytest.mark.parametrize("throttle", [0.0, 0.2, 1.0])
+def test_there_is_no_torque_in_gear_above_the_limiter(throttle: float) -> None:
+    p = CAR.packed()[0]
+    assert clutch(p, (CAR.limiter_rpm + 1.0) / RPM, throttle)[1] == 0.0
+    assert clutch(p, (CAR.limiter_rpm - 1.0) / RPM, throttle)[1] != 0.0
+
+
+def test_in_neutral_the_engine_falls_from_the_limiter() -> None:
+    states = drive(CAR, 2.0, lambda state: Command(throttle=1.0 if state.time_s < 1 else 0, gear=0))
+    assert max(state.rpm for state in states) > 0.95 * CAR.limiter_rpm
+    assert states[-1].rpm < 0.8 * CAR.limiter_rpm
 
 
 def test_reverse_gear_and_gear_range() -> None:

@@ -1,0 +1,138 @@
+"""The comparison as tables, for the terminal and as an HTML page with driving curves."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from markupsafe import Markup
+
+from controllers.compare.run import REPORT, groups
+from runtime.files import atomic_write
+from runtime.html import render
+from runtime.svg_charts import Line, Plot, line_plot
+
+PAPER_SCORES = {
+    "forza": (6335.9, 6348.1, 6375.1),
+    "alpine-2": (4400.1, 4411.6, 4419.4),
+    "eroad": (3591.9, 3603.6, 3593.9),
+    "g-track-3": (3209.4, 3210.5, 3215.3),
+}
+"""The best of the paper's LQR, MPC and RL, over the numbers of steps in `SCORED_STEPS`."""
+PAPER_STEPS = {"forza": 6500, "alpine-2": 4500, "eroad": 3700, "g-track-3": 3300}
+FIGURES = (
+    "track", "controller", "score", "score a step", "quadratic a step", "mean |d| (m)",
+    "max |d| (m)", "laps", "speed (km/h)", "blind steps", "ended",
+)  # fmt: skip
+TRUTH, PERCEIVED = "#2a9d5c", "#e07a2e"
+
+
+def spread(values: list[float], digits: int) -> str:
+    """The mean, and beside it the standard deviation of several."""
+    mean = f"{np.mean(values):.{digits}f}"
+    return mean if len(values) == 1 else f"{mean} ± {np.std(values, ddof=1):.{digits}f}"
+
+
+def score_table(drives: list[dict[str, Any]]) -> tuple[list[str], list[list[str]]]:
+    """Titles and rows of the paper's table: tracks by controllers, scores a step.
+
+    The paper's own figures stand beside drives over its numbers of steps.
+    """
+    controllers = list(dict.fromkeys(entry["controller"] for entry in drives))
+    tracks = list(dict.fromkeys(entry["track"] for entry in drives))
+    asked = {entry["track"]: entry["result"]["steps_asked"] for entry in drives}
+    as_paper = [track for track in tracks if asked[track] == PAPER_STEPS.get(track)]
+    rows = []
+    for track in tracks:
+        row = [f"{track} ({asked[track]} steps)"]
+        for controller in controllers:
+            found = _of(drives, track, controller, "score_per_step")
+            ended = sum(value is not None for value in _of(drives, track, controller, "ended"))
+            note = f" ({ended} ended early)" if ended else ""
+            row.append(spread(found, 4) + note if found else "-")
+        if as_paper:
+            shown = PAPER_SCORES[track] if track in as_paper else (None, None, None)
+            row += ["-" if score is None else f"{score / asked[track]:.4f}" for score in shown]
+        rows.append(row)
+    paper = ["paper: LQR", "paper: MPC", "paper: RL"] if as_paper else []
+    return ["track", *controllers, *paper], rows
+
+
+def figure_rows(drives: list[dict[str, Any]]) -> Iterator[list[str]]:
+    """Rows of `FIGURES`, one for each track and controller: means over the seeds."""
+    pairs = dict.fromkeys((entry["track"], entry["controller"]) for entry in drives)
+    for track, controller in pairs:
+        here = [e for e in drives if (e["track"], e["controller"]) == (track, controller)]
+        results = [entry["result"] for entry in here]
+        slowest = min(result["speed_kmh"][0] for result in results)
+        fastest = max(result["speed_kmh"][1] for result in results)
+        ended = [result["ended"] for result in results if result["ended"] is not None]
+        yield [
+            track,
+            controller,
+            spread([result["score"] for result in results], 1),
+            spread([result["score_per_step"] for result in results], 4),
+            spread([entry["quadratic_per_step"] for entry in here], 5),
+            spread([result["mean_abs_d_m"] for result in results], 3),
+            f"{max(result['max_abs_d_m'] for result in results):.3f}",
+            f"{min(result['laps'] for result in results)}",
+            f"{slowest:.0f} to {fastest:.0f}",
+            f"{np.mean([result['blind_steps'] for result in results]):.0f}",
+            ", ".join(dict.fromkeys(ended)) or "-",
+        ]
+
+
+def write_report(out: Path, content: dict[str, Any]) -> Path:
+    """Write the page into the folder `out` and return its path."""
+    sections = []
+    for (perception, disturbance), drives in groups(content):
+        head, rows = score_table(drives)
+        sections.append(
+            {
+                "perception": perception,
+                "disturbance": disturbance,
+                "head": head,
+                "rows": rows,
+                "figures": list(figure_rows(drives)),
+                "curves": [
+                    (f"{entry['controller']} on {entry['track']}", *driving_curves(entry["curves"]))
+                    for entry in drives
+                    if "curves" in entry
+                ],
+            }
+        )
+    page = render(
+        "controllers.compare",
+        "report.html",
+        settings=content["settings"],
+        figure_head=FIGURES,
+        sections=sections,
+    )
+    path = out / REPORT
+    atomic_write(path, page)
+    return path
+
+
+def driving_curves(curves: dict[str, list[float | None]]) -> tuple[Markup, Markup]:
+    """Offset and angle over time, true and perceived, as in the paper's figures 12 and 13."""
+    columns = {
+        name: np.array([np.nan if value is None else value for value in values])
+        for name, values in curves.items()
+    }
+
+    def plot(title: str, true: str, perceived: str) -> Markup:
+        lines = [
+            Line("curve", columns["t"], columns[perceived], "perceived", PERCEIVED),
+            Line("curve", columns["t"], columns[true], "true", TRUTH),
+        ]
+        return line_plot(Plot(title, lines, "s"))
+
+    return plot("offset (m)", "d", "perceived_d"), plot("angle (rad)", "angle", "perceived_angle")
+
+
+def _of(drives: list[dict[str, Any]], track: str, controller: str, name: str) -> list[Any]:
+    return [
+        entry["result"][name]
+        for entry in drives
+        if (entry["track"], entry["controller"]) == (track, controller)
+    ]

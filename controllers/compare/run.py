@@ -1,0 +1,194 @@
+"""The drives of a comparison, and the file that holds their results.
+
+`results.json`: {"version", "settings", "drives": [...]}, written again after each drive. A drive
+that is in it is not driven again; a user's controller that has changed since is.
+"""
+
+import hashlib
+import json
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from controllers.compare.curves import CurveRecorder
+from controllers.config import CompareConfig, DriveConfig
+from controllers.disturbance import DISTURBANCES, UNDISTURBED
+from controllers.drive import drive, read_parameters
+from controllers.registry import LoopConfig, make_controller
+from runtime.files import write_json
+from simulator.track.catalogue import find_track
+from trackfeatures.errors import UserError
+
+VERSION = 1
+RESULTS, REPORT = "results.json", "report.html"
+GRID_SHARE = 1.0 / 6.0
+"""TORCS's first place on the grid: so much of the track's width to the right of its centre."""
+SETTINGS = ("steps", "start_d", "latency_ms", "drop", "model", "light")
+"""What must be equal for drives to be compared in one file."""
+
+Progress = Callable[[int, int, str, float], None]
+"""Called with the drives done, the drives in all, the present one and the share of it driven."""
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One drive of a comparison."""
+
+    track: str
+    controller: str
+    perception: str
+    disturbance: str
+    seed: int
+
+    @property
+    def name(self) -> str:
+        changed = "" if self.disturbance == UNDISTURBED else f", {self.disturbance}"
+        return f"{self.controller} on {self.track}, {self.perception}{changed}, seed {self.seed}"
+
+
+def cells(config: CompareConfig) -> list[Cell]:
+    """All drives, in the order of the tracks. Raises UserError for an empty list or seeds < 1."""
+    if config.seeds < 1:
+        raise UserError(f"{config.seeds} seeds; give 1 or more")
+    disturbances = list(DISTURBANCES) if config.disturb else [UNDISTURBED]
+    return [
+        Cell(track, controller, perception, disturbance, seed)
+        for track in names(config.tracks, "tracks")
+        for perception in names(config.perceptions, "perceptions")
+        for disturbance in disturbances
+        for controller in names(config.controllers, "controllers")
+        for seed in range(config.seeds)
+    ]
+
+
+def names(text: str, what: str) -> list[str]:
+    """The names in a list with commas, each once. Raises UserError for an empty list."""
+    found = list(dict.fromkeys(filter(None, (name.strip() for name in text.split(",")))))
+    if not found:
+        raise UserError(f"--{what} names nothing; give names with commas between them")
+    return found
+
+
+def compare(config: CompareConfig, progress: Progress | None = None) -> dict[str, Any]:
+    """Drive all cells that `config.out` does not hold yet; the content of `results.json`.
+
+    Raises UserError for an unknown name, before the first drive, and where the folder holds results
+    of other settings.
+    """
+    todo = cells(config)
+    for controller in dict.fromkeys(cell.controller for cell in todo):
+        make_controller(controller, LoopConfig(0.05), parameters_of(config, controller))
+    for track in dict.fromkeys(cell.track for cell in todo):
+        find_track(track, config.tracks_dir)
+    path = config.out / RESULTS
+    config.out.mkdir(parents=True, exist_ok=True)
+    content = read_results(path, config)
+    known = {_key(entry): entry for entry in content["drives"]}
+    for done, cell in enumerate(todo):
+        print_share = _print_share(progress, done, len(todo), cell)
+        print_share(0, 1)
+        code = fingerprint(config, cell.controller)
+        found = known.get(cell)
+        if found is None or found["code"] != code:
+            known[cell] = asdict(cell) | {"code": code} | drive_cell(config, cell, print_share)
+            content["drives"] = list(known.values())
+            write_json(path, content)
+    wanted = set(todo)
+    return content | {"drives": [entry for cell, entry in known.items() if cell in wanted]}
+
+
+def drive_cell(
+    config: CompareConfig, cell: Cell, progress: Callable[[int, int], None] | None = None
+) -> dict[str, Any]:
+    """The result of one drive: figures, quadratic reward and, of the first seed, its curves."""
+    track = find_track(cell.track, config.tracks_dir)
+    start = -GRID_SHARE * track.width if config.start_d is None else config.start_d
+    recorder = CurveRecorder()
+    result = drive(
+        DriveConfig(
+            controller=cell.controller,
+            track=cell.track,
+            perception=cell.perception,
+            steps=config.steps,
+            start_d=start,
+            latency_ms=config.latency_ms,
+            drop=config.drop,
+            model=config.model,
+            light=config.light,
+            seed=cell.seed,
+            parameters=config.parameters if parameters_of(config, cell.controller) else None,
+            tracks_dir=config.tracks_dir,
+        ),
+        progress,
+        disturbance=DISTURBANCES[cell.disturbance],
+        observers=[recorder],
+    )
+    found = {
+        "result": result.as_json(),
+        "quadratic_per_step": recorder.quadratic / result.steps_asked,
+    }
+    return found | ({"curves": recorder.curves()} if cell.seed == 0 else {})
+
+
+def parameters_of(config: CompareConfig, controller: str) -> dict[str, float]:
+    """The tuned parameters of a controller; none where the file has no entry for it."""
+    if config.parameters is None:
+        return {}
+    try:
+        tuned = json.loads(config.parameters.read_text())["controllers"]
+    except (ValueError, KeyError, TypeError) as error:
+        raise UserError(f"{config.parameters} is no file of `controllers tune`") from error
+    return read_parameters(config.parameters, controller) if controller in tuned else {}
+
+
+def fingerprint(config: CompareConfig, controller: str) -> str:
+    """What a drive depends on beside its cell: the user's file, and the tuned parameters."""
+    digest = hashlib.sha256(json.dumps(parameters_of(config, controller)).encode())
+    file = Path(controller.rpartition(":")[0])
+    if file.suffix == ".py":
+        digest.update(file.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def read_results(path: Path, config: CompareConfig) -> dict[str, Any]:
+    """The results so far. Raises UserError for a file of other settings or of another version."""
+    settings = {name: getattr(config, name) for name in SETTINGS}
+    if not path.exists():
+        return {"version": VERSION, "settings": settings, "drives": []}
+    try:
+        content: dict[str, Any] = json.loads(path.read_text())
+        found, version = content["settings"], content["version"]
+    except (ValueError, KeyError, TypeError) as error:
+        raise UserError(f"{path} holds no results ({error!r}); give another --out") from error
+    if version != VERSION:
+        raise UserError(f"{path} has version {version}, not {VERSION}; give another --out")
+    for name, value in settings.items():
+        if found.get(name) != value:
+            raise UserError(
+                f"{path} was made with {name} {found.get(name)}, now it is {value}; give another "
+                "--out"
+            )
+    return content
+
+
+def _key(entry: dict[str, Any]) -> Cell:
+    return Cell(**{name: entry[name] for name in Cell.__dataclass_fields__})
+
+
+def _print_share(
+    progress: Progress | None, done: int, total: int, cell: Cell
+) -> Callable[[int, int], None]:
+    def share(step: int, steps: int) -> None:
+        if progress is not None and step % 50 == 0:
+            progress(done, total, cell.name, step / steps)
+
+    return share
+
+
+def groups(content: dict[str, Any]) -> Iterator[tuple[tuple[str, str], list[dict[str, Any]]]]:
+    """The drives by (perception, disturbance), in the order in which they were driven."""
+    found: dict[tuple[str, str], list[dict[str, Any]]] = {}
+    for entry in content["drives"]:
+        found.setdefault((entry["perception"], entry["disturbance"]), []).append(entry)
+    yield from found.items()

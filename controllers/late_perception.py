@@ -1,0 +1,121 @@
+"""Perception with latency and lost answers, and the state predicted over both. SI units.
+
+An answer belongs to the moment of its image. Until it arrives the car moves on; the offset and the
+angle of that moment are carried to the present with the car's own speeds and yaw rate:
+
+    d' = vx sin(theta) + vy cos(theta), theta' = yaw rate - curvature * vx   (theta = -angle)
+"""
+
+import itertools
+import math
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Generic, TypeVar
+
+import numpy as np
+
+from controllers.interface import Observation
+from controllers.lqr import CurvatureEstimate
+from controllers.perception import Perceived
+from simulator.vehicle.state import CarState
+from trackfeatures import Heading
+from trackfeatures.errors import UserError
+
+World = TypeVar("World")
+
+LOST_S = 1.0
+"""Without an answer for this long the perception is lost: nothing is predicted any more."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Moment:
+    """One control step: the car's own sensors and the road's curvature as estimated then."""
+
+    vx: float
+    vy: float
+    yaw_rate: float
+    curvature: float
+
+
+class StatePredictor:
+    """Carries an answer over the control steps since its image."""
+
+    def __init__(self, dt: float, longest_s: float) -> None:
+        self._dt = dt
+        self._moments: deque[_Moment] = deque(maxlen=round(longest_s / dt) + 2)
+        self._curvature = CurvatureEstimate(dt)
+
+    def add(self, now: CarState, heading: Heading) -> None:
+        """Note the car's motion at this step; `heading` is the last known class of the road."""
+        seen = Observation(0.0, 0.0, heading, now.vx, now.vy, now.yaw_rate)
+        self._moments.append(_Moment(now.vx, now.vy, now.yaw_rate, self._curvature(seen)))
+
+    def predict(self, answer: Perceived, age: int) -> Perceived:
+        """The answer of `age` control steps ago as it would be now."""
+        if age == 0 or answer.to_lane_centre is None:
+            return answer
+        past = list(self._moments)[-age - 1 :]
+        offset, theta = answer.to_lane_centre, -answer.angle
+        for before, after in itertools.pairwise(past):
+            # The mean of both ends of the step: the sensors of both are known.
+            vx, vy = 0.5 * (before.vx + after.vx), 0.5 * (before.vy + after.vy)
+            curvature = before.curvature if answer.curvature is None else answer.curvature
+            turn = 0.5 * (before.yaw_rate + after.yaw_rate) - curvature * vx
+            middle = theta + 0.5 * self._dt * turn
+            offset += self._dt * (vx * math.sin(middle) + vy * math.cos(middle))
+            theta += self._dt * turn
+        return replace(answer, to_lane_centre=offset, angle=-theta)
+
+
+class LatePerception(Generic[World]):
+    """A perception whose answers come `latency_s` late, a share `drop` of them never.
+
+    Latency is rounded up to control steps: a controller acts on an answer at its next step.
+    `predict=False` gives the late answers as they are. Raises UserError for values out of range.
+    """
+
+    def __init__(
+        self,
+        perceive: Callable[[World], Perceived],
+        state: Callable[[World], CarState],
+        *,
+        dt: float,
+        latency_s: float,
+        drop: float,
+        rng: np.random.Generator,
+        predict: bool = True,
+    ) -> None:
+        if not 0.0 <= latency_s <= LOST_S:
+            raise UserError(f"a latency of {1000 * latency_s:g} ms; give 0 to 1000 ms")
+        if not 0.0 <= drop < 1.0:
+            raise UserError(f"a share of {drop} lost answers; give 0 or more, below 1")
+        self._perceive, self._state, self._dt = perceive, state, dt
+        self._delay = math.ceil(latency_s / dt - 1e-9)
+        self._drop, self._rng = drop, rng
+        self._predictor = StatePredictor(dt, LOST_S + latency_s) if predict else None
+        self._under_way: deque[Perceived | None] = deque()
+        self._last: Perceived | None = None
+        self._age = 0
+        self.lost_answers = 0
+
+    def __call__(self, world: World) -> Perceived:
+        """What the controller knows of the road now."""
+        lost = self._rng.random() < self._drop
+        answer = self._perceive(world)
+        self.lost_answers += lost
+        self._under_way.append(None if lost or answer.to_lane_centre is None else answer)
+        self._age += 1
+        if len(self._under_way) > self._delay:
+            arrived = self._under_way.popleft()
+            if arrived is not None:
+                self._last, self._age = arrived, self._delay
+        heading = Heading.STRAIGHT if self._last is None else self._last.heading
+        if self._predictor is not None:
+            self._predictor.add(self._state(world), heading)
+        waited_s = (self._age - self._delay) * self._dt
+        if self._last is None or waited_s > LOST_S:
+            return Perceived(None, 0.0, heading, None, lost_s=max(waited_s, 0.0))
+        if self._predictor is None:
+            return replace(self._last, lost_s=waited_s)
+        return replace(self._predictor.predict(self._last, self._age), lost_s=waited_s)

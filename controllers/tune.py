@@ -1,0 +1,137 @@
+"""Parameters of several controllers, searched with the same budget of drives for each.
+
+The first drive has the controller's own parameters; a third of the budget is drawn over the whole
+ranges, log-uniformly, the rest around the best so far, ever nearer. `tuned.json` is written again
+after each candidate; the same command goes on where it was stopped.
+"""
+
+import json
+import math
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from controllers.compare.curves import CurveRecorder
+from controllers.compare.run import GRID_SHARE, names
+from controllers.config import DriveConfig, TuneConfig
+from controllers.disturbance import find_disturbance
+from controllers.drive import drive
+from controllers.registry import CONTROLLERS
+from runtime.files import check_folder, write_json
+from simulator.track.catalogue import find_track
+from trackfeatures.errors import UserError
+
+VERSION = 1
+REWARDS = ("paper", "quadratic")
+EXPLORED = 1.0 / 3.0
+SETTINGS = ("tracks", "reward", "steps", "disturbance", "seed")
+
+Progress = Callable[[int, int, str], None]
+"""Called with the candidates done, those in all, and the present controller."""
+
+
+def tune(config: TuneConfig, progress: Progress | None = None) -> dict[str, Any]:
+    """Search, and return the content of `config.out`.
+
+    Raises UserError for an unknown name, or a file of other settings.
+    """
+    controllers = names(config.controllers, "controllers")
+    for controller in controllers:
+        if controller not in CONTROLLERS or not CONTROLLERS[controller].tunable:
+            able = ", ".join(name for name, entry in CONTROLLERS.items() if entry.tunable)
+            raise UserError(f"{controller!r} cannot be tuned; use some of: {able}")
+    if config.reward not in REWARDS:
+        raise UserError(f"there is no reward {config.reward!r}; use one of: {', '.join(REWARDS)}")
+    if config.budget < 1:
+        raise UserError(f"a budget of {config.budget} drives; give 1 or more")
+    find_disturbance(config.disturbance)
+    check_folder(config.out)
+    content = _read(config.out, config)
+    total = config.budget * len(controllers)
+    for number, controller in enumerate(controllers):
+        ranges = CONTROLLERS[controller].tunable
+        tried = content["controllers"].get(controller, {}).get("tried", [])
+        while len(tried) < config.budget:
+            if progress is not None:
+                progress(number * config.budget + len(tried), total, controller)
+            rng = np.random.default_rng([config.seed, len(tried)])
+            parameters = propose(ranges, tried, config.budget, rng)
+            tried.append(
+                {"parameters": parameters, "reward": evaluate(config, controller, parameters)}
+            )
+            best = max(tried, key=lambda one: float(one["reward"]))
+            content["controllers"][controller] = {
+                "parameters": best["parameters"],
+                "reward": best["reward"],
+                "untuned": tried[0]["reward"],
+                "tried": tried,
+            }
+            write_json(config.out, content)
+    return content
+
+
+def propose(
+    ranges: Mapping[str, tuple[float, float]],
+    tried: list[dict[str, Any]],
+    budget: int,
+    rng: np.random.Generator,
+) -> dict[str, float]:
+    """The next candidate after those tried; {} is the controller's own parameters."""
+    if not tried:
+        return {}
+    best = max(tried, key=lambda one: float(one["reward"]))["parameters"]
+    if len(tried) <= EXPLORED * budget or not best:
+        return {
+            name: math.exp(rng.uniform(math.log(low), math.log(high)))
+            for name, (low, high) in ranges.items()
+        }
+    left = 1.0 - len(tried) / budget
+    found = {}
+    for name, (low, high) in ranges.items():
+        step = 0.3 * left * math.log(high / low) * rng.normal()
+        found[name] = min(max(best[name] * math.exp(step), low), high)
+    return found
+
+
+def evaluate(config: TuneConfig, controller: str, parameters: Mapping[str, float]) -> float:
+    """The mean reward a step over the tracks."""
+    rewards = []
+    for name in names(config.tracks, "tracks"):
+        track = find_track(name, config.tracks_dir)
+        recorder = CurveRecorder()
+        result = drive(
+            DriveConfig(
+                controller=controller,
+                track=name,
+                steps=config.steps,
+                start_d=-GRID_SHARE * track.width,
+                seed=config.seed,
+                tracks_dir=config.tracks_dir,
+            ),
+            disturbance=find_disturbance(config.disturbance),
+            observers=[recorder],
+            parameters=parameters,
+        )
+        if config.reward == "paper":
+            rewards.append(result.score_per_step)
+        else:
+            # A drive that ends early gives -2 for each step that is missing.
+            missing = result.steps_asked - result.steps
+            rewards.append((recorder.quadratic - 2.0 * missing) / result.steps_asked)
+    return float(np.mean(rewards))
+
+
+def _read(path: Path, config: TuneConfig) -> dict[str, Any]:
+    settings = {name: getattr(config, name) for name in SETTINGS} | {"budget": config.budget}
+    if not path.exists():
+        return {"version": VERSION, "settings": settings, "controllers": {}}
+    try:
+        content: dict[str, Any] = json.loads(path.read_text())
+        found, version = content["settings"], content["version"]
+    except (ValueError, KeyError, TypeError) as error:
+        raise UserError(f"{path} holds no tuning ({error!r}); give another --out") from error
+    if version != VERSION or found != settings:
+        raise UserError(f"{path} was made with other settings, {found}; give another --out")
+    return content

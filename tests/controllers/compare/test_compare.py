@@ -1,0 +1,248 @@
+"""The comparison: its drives, its file, resuming, tables and page; the search for parameters."""
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import controllers.compare.run as comparison
+from controllers.compare.curves import CurveRecorder, quadratic_reward
+from controllers.compare.report import driving_curves, score_table, spread, write_report
+from controllers.compare.run import Cell, cells, compare
+from controllers.config import CompareConfig, TuneConfig
+from controllers.drive import read_parameters
+from controllers.perception import Perceived
+from controllers.torcs_feedback import STEERING_LOCK
+from controllers.tune import propose, tune
+from tests.controllers.test_drive import at_rest
+from tests.typed import typed
+from trackfeatures import Heading, UserError
+
+SHORT = {"tracks": "oval,town", "controllers": "lqr,torcs", "steps": 60}
+LAW = """
+class Law:
+    def update(self, observation):
+        return max(-1.0, min(2 * observation.angle - {gain} * observation.to_lane_centre, 1.0))
+"""
+
+
+def short(folder: Path, **changes: Any) -> CompareConfig:
+    return CompareConfig(out=folder / "comparison", **{**SHORT, **changes})
+
+
+class Counter:
+    """Counts the drives, which still take place."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, stop_after: int | None = None) -> None:
+        self.cells: list[Cell] = []
+        real = comparison.drive_cell
+
+        def counted(config: CompareConfig, cell: Cell, progress: Any = None) -> dict[str, Any]:
+            if len(self.cells) == stop_after:
+                raise KeyboardInterrupt
+            self.cells.append(cell)
+            return real(config, cell, progress)
+
+        monkeypatch.setattr(comparison, "drive_cell", counted)
+
+
+def test_every_controller_drives_every_track_with_every_seed_and_disturbance() -> None:
+    found = cells(CompareConfig(tracks="a,b", controllers="lqr,mpc", seeds=2, disturb=True))
+    assert len(found) == len(set(found)) == 2 * 2 * 2 * 7
+    assert {(cell.track, cell.seed) for cell in found} == {("a", 0), ("a", 1), ("b", 0), ("b", 1)}
+    with pytest.raises(UserError, match="0 seeds"):
+        cells(CompareConfig(seeds=0))
+    with pytest.raises(UserError, match="--tracks names nothing"):
+        cells(CompareConfig(tracks=" , "))
+
+
+def test_an_interrupted_comparison_goes_on_and_drives_nothing_twice(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = short(tmp_path)
+    with monkeypatch.context() as patch:
+        first = Counter(patch, stop_after=3)
+        with pytest.raises(KeyboardInterrupt):
+            compare(config)
+    assert len(first.cells) == 3
+    kept = json.loads((config.out / "results.json").read_text())
+    assert len(kept["drives"]) == 3
+    second = Counter(monkeypatch)
+    content = compare(config)
+    assert [cell.name for cell in second.cells] == ["torcs on town, truth, seed 0"]
+    assert len(content["drives"]) == 4
+    assert content["drives"][:3] == kept["drives"]
+    compare(config)
+    assert len(second.cells) == 1
+    # More controllers join the same file; the answer holds those asked for.
+    more = compare(replace(config, controllers="lqr-preview"))
+    assert [drive["controller"] for drive in more["drives"]] == ["lqr-preview"] * 2
+    assert len(json.loads((config.out / "results.json").read_text())["drives"]) == 6
+
+
+def test_a_users_controller_is_driven_again_when_its_file_has_changed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    law = tmp_path / "law.py"
+    config = short(tmp_path, tracks="oval", controllers=f"{law}:Law")
+    counter, scores = Counter(monkeypatch), []
+    for gain in (0.2, 0.2, 0.4):
+        law.write_text(LAW.format(gain=gain))
+        scores.append(compare(config)["drives"][0]["result"]["score"])
+    assert len(counter.cells) == 2
+    assert scores[0] == scores[1] != scores[2]
+
+
+def test_the_start_is_torcss_place_on_the_grid(tmp_path: Path) -> None:
+    content = compare(short(tmp_path, tracks="oval", controllers="torcs"))
+    from simulator.track.catalogue import find_track
+
+    expected = find_track("oval").width / 6
+    assert content["drives"][0]["result"]["max_abs_d_m"] == pytest.approx(expected, abs=0.01)
+    assert content["drives"][0]["curves"]["d"][0] == pytest.approx(-expected, abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"steps": 61}, "made with steps 60, now it is 61"),
+        ({"controllers": "pid"}, "no controller 'pid'"),
+        ({"tracks": "nowhere"}, "nowhere"),
+    ],
+)
+def test_other_settings_and_unknown_names_are_refused(
+    tmp_path: Path, changes: dict[str, Any], message: str
+) -> None:
+    config = short(tmp_path, tracks="oval", controllers="torcs")
+    compare(config)
+    before = (config.out / "results.json").read_bytes()
+    with pytest.raises(UserError, match=message):
+        compare(replace(config, **changes))
+    assert (config.out / "results.json").read_bytes() == before
+
+
+def test_a_damaged_file_is_refused(tmp_path: Path) -> None:
+    config = short(tmp_path)
+    config.out.mkdir()
+    (config.out / "results.json").write_text("[1, 2")
+    with pytest.raises(UserError, match="holds no results"):
+        compare(config)
+
+
+def entry(track: str, controller: str, seed: int, score: float, steps: int) -> dict[str, Any]:
+    result = {"score_per_step": score, "steps_asked": steps, "ended": None}
+    return {"track": track, "controller": controller, "seed": seed, "result": result}
+
+
+def test_the_table_has_means_spreads_and_the_papers_scores() -> None:
+    drives = [entry("forza", "lqr", seed, 0.99 + 0.002 * seed, 6500) for seed in range(3)]
+    drives += [entry("oval", "mpc", 0, 0.9, 100)]
+    head, rows = score_table(drives)
+    assert head == ["track", "lqr", "mpc", "paper: LQR", "paper: MPC", "paper: RL"]
+    assert rows[0] == ["forza (6500 steps)", "0.9920 ± 0.0020", "-", "0.9748", "0.9766", "0.9808"]
+    assert rows[1] == ["oval (100 steps)", "-", "0.9000", "-", "-", "-"]
+    other = [entry("forza", "lqr", 0, 0.99, 100)]
+    assert score_table(other)[0] == ["track", "lqr"]
+    assert spread([1.0], 1) == "1.0"
+
+
+def test_the_page_shows_the_scores_and_curves(tmp_path: Path) -> None:
+    config = short(tmp_path, seeds=2, tracks="oval")
+    content = compare(config)
+    page = write_report(config.out, content).read_text()
+    head, rows = score_table(content["drives"])
+    assert all(cell in page for cell in (*head, *rows[0]))
+    assert page.count("<svg") == 2 * 2  # offset and angle of the first seed of two controllers
+    assert "lqr on oval" in page
+
+
+def test_curves_keep_the_peak_and_the_sum_of_the_quadratic_reward() -> None:
+    recorder = CurveRecorder()
+    for step in range(2000):
+        peak = step == 777
+        state = at_rest(time_s=step * 0.05, to_middle=1.5 if peak else 0.1, angle=0.02)
+        recorder(state, Perceived(None if peak else 0.12, 0.03, Heading.LEFT), 0.5)
+    curves = recorder.curves()
+    assert len(curves["t"]) == 400
+    assert max(value for value in curves["d"] if value is not None) == 1.5
+    assert curves["perceived_d"][curves["d"].index(1.5)] is None
+    one = quadratic_reward(0.1, 0.02, 0.5)
+    assert one == pytest.approx(-(0.3 * 0.01 + 0.0004 + 0.03 * (0.5 * STEERING_LOCK) ** 2))
+    assert recorder.quadratic == pytest.approx(1999 * one + quadratic_reward(1.5, 0.02, 0.5))
+    assert driving_curves(curves)[0].count("<path") >= 2
+
+
+def test_the_commands_print_json_and_tables(tmp_path: Path) -> None:
+    options = ["--tracks", "oval", "--controllers", "torcs", "--steps", "40", "--out", tmp_path]
+    done = typed("controllers", "compare", *options)
+    assert done.returncode == 0, done.stderr
+    assert "oval (40 steps)" in done.stdout
+    content = json.loads(typed("controllers", "compare", *options, "--json").stdout)
+    assert content["drives"][0]["result"]["steps"] == 40
+    out = tmp_path / "tuned.json"
+    options = ["--tracks", "oval", "--controllers", "lqr", "--steps", "40", "--out", out]
+    done = typed("controllers", "tune", *options, "--budget", 2)
+    assert done.returncode == 0, done.stderr
+    assert "lqr: 0." in done.stdout
+
+
+# The search for parameters.
+
+
+def test_the_search_finds_better_parameters_and_goes_on_where_it_stopped(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A known optimum in place of drives: the reward falls with the distance in log space."""
+    counted = []
+
+    def evaluate(config: TuneConfig, controller: str, parameters: dict[str, float]) -> float:
+        counted.append(parameters)
+        if not parameters:
+            return -10.0
+        return -sum(abs(math.log(value)) for value in parameters.values())
+
+    monkeypatch.setattr("controllers.tune.evaluate", evaluate)
+    config = TuneConfig(out=tmp_path / "tuned.json", controllers="lqr,mpc", budget=60)
+    content = tune(config)
+    assert len(counted) == 120
+    assert tune(config) == content
+    assert len(counted) == 120
+    for name in ("lqr", "mpc"):
+        found = content["controllers"][name]
+        assert found["untuned"] == -10.0
+        explored = max(one["reward"] for one in found["tried"][:21])
+        assert found["reward"] > max(explored, -5.0)
+        assert read_parameters(config.out, name) == found["parameters"]
+    with pytest.raises(UserError, match="other settings"):
+        tune(replace(config, seed=1))
+
+
+def test_candidates_stay_within_their_ranges() -> None:
+    ranges = {"a": (0.1, 10.0)}
+    rng = np.random.default_rng(0)
+    tried: list[dict[str, Any]] = []
+    for _ in range(50):
+        parameters = propose(ranges, tried, 50, rng)
+        tried.append({"parameters": parameters, "reward": sum(parameters.values())})
+    assert tried[0]["parameters"] == {}
+    assert all(0.1 <= one["parameters"]["a"] <= 10.0 for one in tried[1:])
+    assert tried[-1]["parameters"]["a"] > 5.0  # near the best, at the end
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"controllers": "torcs"}, "'torcs' cannot be tuned; use some of: lqr"),
+        ({"reward": "speed"}, "no reward 'speed'"),
+        ({"budget": 0}, "budget of 0"),
+        ({"disturbance": "storm"}, "no disturbance 'storm'"),
+    ],
+)
+def test_a_wrong_search_is_refused(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(UserError, match=message):
+        tune(TuneConfig(out=tmp_path / "tuned.json", **changes))
+    assert not (tmp_path / "tuned.json").exists()

@@ -1,0 +1,89 @@
+"""The controllers by name, their parameters, and a user's own classes."""
+
+from pathlib import Path
+
+import pytest
+
+from controllers.interface import LoopConfig, Observation
+from controllers.registry import CONTROLLERS, make_controller
+from trackfeatures import Heading, UserError
+
+LOOP = LoopConfig(0.05)
+SEEN = Observation(0.1, 0.0, Heading.STRAIGHT, 15.0, 0.0, 0.0, 0.0)
+OWN = """
+class Good:
+    def __init__(self, gain=0.2):
+        self.gain = gain
+    def update(self, observation):
+        return -self.gain * observation.to_lane_centre
+
+class NoUpdate:
+    pass
+
+class Needy:
+    def __init__(self, something):
+        pass
+    def update(self, observation):
+        return 0.0
+
+number = 3
+"""
+
+
+@pytest.fixture
+def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with a user's modules, and the working folder."""
+    (tmp_path / "own_law.py").write_text(OWN)
+    (tmp_path / "own_broken.py").write_text("import no_such_package\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sys.path", [*__import__("sys").path])
+    return tmp_path
+
+
+@pytest.mark.parametrize("name", list(CONTROLLERS))
+def test_every_parameter_can_be_set_and_changes_the_steering(name: str) -> None:
+    for parameter, (low, high) in CONTROLLERS[name].tunable.items():
+        assert 0.0 < low < high
+        soft, hard = (make_controller(name, LOOP, {parameter: v}) for v in (low, high))
+        assert soft.update(SEEN) != hard.update(SEEN), parameter
+
+
+def test_an_unknown_parameter_or_value_is_refused() -> None:
+    with pytest.raises(UserError, match="lqr has no parameter 'gain'; it has: offset"):
+        make_controller("lqr", LOOP, {"gain": 1.0})
+    with pytest.raises(UserError, match="rho is nan"):
+        make_controller("lqr", LOOP, {"rho": float("nan")})
+    with pytest.raises(UserError, match="torcs has no parameter 'gain'; it has: none"):
+        make_controller("torcs", LOOP, {"gain": 1.0})
+
+
+@pytest.mark.parametrize("name", ["pid", "LQR", ""])
+def test_an_unknown_controller_is_refused_with_the_known_names(name: str) -> None:
+    with pytest.raises(UserError, match=f"no controller '{name}'; use one of: lqr, lqr-preview"):
+        make_controller(name, LOOP)
+
+
+@pytest.mark.parametrize("name", ["own_law:Good", "own_law.py:Good"])
+def test_a_users_class_is_made(own: Path, name: str) -> None:
+    assert make_controller(name, LOOP).update(SEEN) == pytest.approx(-0.02)
+    assert make_controller(name, LOOP, {"gain": 1.0}).update(SEEN) == pytest.approx(-0.1)
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("own_law:Missing", "own_law has no class 'Missing'"),
+        ("own_law:number", "own_law has no class 'number'"),
+        ("own_law:NoUpdate", "has no method update"),
+        ("own_law:Needy", "cannot be made: .*something"),
+        ("own_none:Good", "'own_none' cannot be imported: ModuleNotFoundError"),
+        ("own_broken:Good", "'own_broken' cannot be imported: .*no_such_package"),
+        ("own_broken.py:Good", "own_broken.py cannot be loaded: .*no_such_package"),
+        ("own_none.py:Good", "there is no file own_none.py"),
+        (":Good", "module is missing"),
+    ],
+)
+def test_an_unusable_module_or_class_is_refused(own: Path, name: str, message: str) -> None:
+    with pytest.raises(UserError, match=message) as caught:
+        make_controller(name, LOOP)
+    assert "\n" not in str(caught.value)
