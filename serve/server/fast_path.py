@@ -10,7 +10,7 @@ from http import HTTPStatus
 from typing import Any
 
 from serve.api.features import FeaturesRequest
-from serve.api.http_io import Header, Reply, check_body_size, encode_head
+from serve.api.http_io import Header, Reply, encode_head
 from serve.api.problems import Problem
 from serve.api.request_options import Headers
 from serve.app import Service
@@ -30,7 +30,7 @@ class NullEvent:
 class DirectRequest:
     """A request in progress, with the attributes of uvicorn's RequestResponseCycle that it uses."""
 
-    __slots__ = ("disconnected", "features", "keep_alive", "parts", "response_complete", "size")
+    __slots__ = ("disconnected", "features", "keep_alive", "parts", "response_complete")
     message_event = NullEvent()
 
     def __init__(self, keep_alive: bool) -> None:
@@ -38,19 +38,18 @@ class DirectRequest:
         self.disconnected = self.response_complete = False
         self.features: FeaturesRequest | None = None
         self.parts: list[bytes] = []
-        self.size = 0
 
     def add(self, part: bytes) -> None:
         """Add a part of the body, unless the request was refused."""
         if self.features is None:
             return
-        self.parts.append(part)
-        self.size += len(part)
         try:
-            check_body_size(self.size)
+            self.features.grow(len(part))
         except Problem as problem:
             self.features.refuse(problem)
             self.features = None
+        else:
+            self.parts.append(part)
 
     @property
     def body(self) -> bytes:
@@ -102,6 +101,11 @@ class DirectProtocol(GuardedProtocol):
         if request.features is not None:
             request.features.submit(request.body)
 
+    def connection_lost(self, exc: Exception | None) -> None:
+        if self._request is not None and self._request.features is not None:
+            self._request.features.abandon()
+        super().connection_lost(exc)
+
     def resume_writing(self) -> None:
         super().resume_writing()
         self.flow.resume_reading()
@@ -113,6 +117,7 @@ class DirectProtocol(GuardedProtocol):
             and (self.cycle is None or self.cycle.response_complete)
             and self.parser.get_http_version() == "1.1"
             and headers.keys().isdisjoint(ASGI_HEADERS)
+            and len(headers) == len(self.headers)  # none was sent twice
         )
 
     def _build_scope(self) -> None:

@@ -29,7 +29,7 @@ from tests.serve.conftest import (
 )
 
 JPEG = jpeg(picture())
-HEAD = b"POST /features HTTP/1.1\r\nHost: x\r\nContent-Type: image/jpeg\r\n"
+HEAD = b"POST /features HTTP/1.1\r\nHost: localhost\r\nContent-Type: image/jpeg\r\n"
 
 
 def limited(
@@ -113,7 +113,7 @@ def filled(count: int) -> Iterator[tuple[Served, list[socket.socket]]]:
     with limited(Limits(connections=count)) as service:
         connections = [dial(service) for _ in range(count)]
         for connection in connections:
-            connection.sendall(b"GET /healthz HTTP/1.1\r\nHost: x\r\n\r\n")
+            connection.sendall(b"GET /healthz HTTP/1.1\r\nHost: localhost\r\n\r\n")
             assert connection.recv(65536).startswith(b"HTTP/1.1 200")
         yield service, connections
 

@@ -5,6 +5,7 @@ end is found, so that a file appended to the image is detected.
 """
 
 import re
+from dataclasses import dataclass
 
 from mtlnet.inference.image_decoding.errors import Fault, ImageError
 
@@ -15,15 +16,28 @@ SOS, EOI = 0xDA, 0xD9
 MARKER = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")
 MAX_SCANS = 100  # a progressive JPEG has about ten; each costs a pass over all pixels
 MAX_SEGMENTS = 1_000
+WINDOW_BYTES = 1 << 18  # searched at once; between two searches other threads may run
+FILL = re.compile(rb"\xff+")
 
 
-def jpeg_length(body: bytes) -> int:
-    """Length of the JPEG at the start of `body`, with its end marker. Raises ImageError."""
+@dataclass(frozen=True, slots=True)
+class JpegStructure:
+    """Length of a JPEG with its end marker, bytes, and the number of its scans."""
+
+    length: int
+    scans: int
+
+
+def read_structure(body: bytes) -> JpegStructure:
+    """The structure of the JPEG at the start of `body`. Raises ImageError.
+
+    Takes 10 ms a MiB at worst; up to WINDOW_BYTES of that in one step.
+    """
     at, scans = len(START), 0
     for _ in range(MAX_SEGMENTS):
         at, marker = _marker(body, at)
         if marker == EOI:
-            return at
+            return JpegStructure(at, scans)
         at += _length(body, at)
         if marker != SOS:
             continue
@@ -32,10 +46,7 @@ def jpeg_length(body: bytes) -> int:
             raise ImageError(
                 Fault.UNSUPPORTED, f"the JPEG has over {MAX_SCANS} scans; save it as baseline JPEG"
             )
-        found = MARKER.search(body, at)
-        if found is None:
-            raise _ends_early(body)
-        at = found.start()
+        at = _find_marker(body, at)
     raise ImageError(Fault.UNSUPPORTED, f"the JPEG has over {MAX_SEGMENTS} parts; save it anew")
 
 
@@ -47,11 +58,21 @@ def _marker(body: bytes, at: int) -> tuple[int, int]:
         raise ImageError(
             Fault.DAMAGED, f"the JPEG holds no marker at byte {at}, where one must be; save it anew"
         )
-    while body[at + 1] == 0xFF:
-        at += 1
-        if at + 2 > len(body):
-            raise _ends_early(body)
-    return at + 2, body[at + 1]
+    while (fill := FILL.match(body, at, at + WINDOW_BYTES)) is not None:
+        at = fill.end()
+    if at >= len(body):
+        raise _ends_early(body)
+    return at + 1, body[at]
+
+
+def _find_marker(body: bytes, at: int) -> int:
+    """Offset of the marker after the entropy-coded data at offset `at`."""
+    for start in range(at, len(body), WINDOW_BYTES):
+        # One byte more: a marker may lie on both sides of the end of a window.
+        found = MARKER.search(body, start, start + WINDOW_BYTES + 1)
+        if found is not None:
+            return found.start()
+    raise _ends_early(body)
 
 
 def _length(body: bytes, at: int) -> int:
