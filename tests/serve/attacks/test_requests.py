@@ -15,7 +15,6 @@ import cv2
 import numpy as np
 import pytest
 
-from mtlnet.inference.image_decoding import jpeg_structure
 from mtlnet.inference.image_decoding.decode import MAX_SCANNED_PX, inspect
 from mtlnet.inference.image_decoding.errors import ImageError
 from mtlnet.inference.image_decoding.jpeg_structure import WINDOW_BYTES, read_structure
@@ -87,20 +86,16 @@ def test_a_marker_across_two_windows_is_found(at: int) -> None:
         body = head + data * at + b"\xff\xd9"
         found = read_structure(body)
         assert (found.length, found.scans) == (len(body), 1)
-    assert jpeg_structure.MARKER.search(head + b"\x00" * at) is None
 
 
 def test_scans_times_pixels_are_limited() -> None:
     body = jpeg(np.full((2040, 4080, 3), 90, np.uint8))
     assert inspect(body, CARD.camera, 90.0).scans == 1
     many = MAX_SCANNED_PX // (2040 * 4080) + 1
-    at = body.rindex(b"\xff\xda")
-    repeated = body[:at] + body[at:-2] * many + body[-2:]
-    view = CARD.camera
-    if len(repeated) > WINDOW_BYTES:  # the check comes with decoding
-        repeated = body[:at] + (b"\xff\xda\x00\x02" * many) + body[at:]
+    repeated = body[:-2] + b"\xff\xda\x00\x02" * many + body[-2:]
+    assert len(repeated) < WINDOW_BYTES
     with pytest.raises(ImageError, match="scans of 4080 x 2040 px"):
-        inspect(repeated, view, 90.0)
+        inspect(repeated, CARD.camera, 90.0)
 
 
 HEAD = '{"inputs":[{"name":"pixels","shape":[1,2,2,3],"datatype":"UINT8","data":'
@@ -112,6 +107,8 @@ def filled(text: str, part: str, end: str) -> bytes:
 
 HOSTILE = {
     "values": filled(HEAD + "[", "0,", "0]}]}"),
+    "allowed": filled(HEAD + "[", "10 ,", "0]}]}"),
+    "brackets": filled(HEAD + "[", "[9],", "0]}]}"),
     "lists": filled(HEAD + "[", "[],", "0]}]}"),
     "open": filled(HEAD, "[", ""),
     "inputs": filled('{"inputs":[', "0,", "0]}"),
