@@ -2,8 +2,8 @@
 
 A request is not a measure of work: a PNG of 65 KB can take 0.7 s. So a large image is admitted by
 the time that its decoding will take: in all, and for each client. A client that is alone may use
-the whole engine; beside others its large images get a quarter of it. Clients are told apart by
-their address.
+the whole engine. Beside others its large images get a quarter of it, and none may take so long that
+the others' frames do not fit into the queue meanwhile. Clients are told apart by their address.
 """
 
 from collections.abc import Callable
@@ -13,6 +13,7 @@ from serve.api.problems import OVERLOADED, Problem
 MAX_PENDING_MS = 1000.0  # of large images that wait or are processed, of all clients
 MAX_CLIENT_MS = 250.0  # the same, of one client; one image is always allowed
 SHARE = 0.25  # of the engine's time, for the large images of one client beside others
+MAX_BESIDE_MS = 200.0  # of one image beside other clients: four frames at 20 Hz
 PRESENT_NS = 1_000_000_000  # a client counts as present for so long after a frame
 MAX_CLIENTS = 1024  # whose shares are remembered
 
@@ -43,8 +44,15 @@ class Admission:
         if self._pending_ms and self._pending_ms + cost_ms > MAX_PENDING_MS:
             raise self._too_much(self._pending_ms, "of all clients")
         credit = self._credit_of(client, now_ns)
-        if credit <= 0.0 and self._contended(client, now_ns):
-            raise self._too_much(-credit / SHARE, "beyond this client's share")
+        if self._contended(client, now_ns):
+            if cost_ms > MAX_BESIDE_MS:
+                raise Problem(
+                    OVERLOADED,
+                    f"the image would take {cost_ms:.0f} ms; beside other clients at most "
+                    f"{MAX_BESIDE_MS:.0f} ms are spent on one: send a smaller one, or a JPEG",
+                )
+            if credit <= 0.0:
+                raise self._too_much(-credit / SHARE, "beyond this client's share")
         while len(self._credit) >= MAX_CLIENTS:
             self._credit.pop(next(iter(self._credit)))
         self._credit.pop(client, None)

@@ -27,17 +27,22 @@ MAX_SCANNED_PX = 100_000_000  # pixels times scans of a JPEG: ten scans of the l
 LATE_CHECK_BYTES = 1 << 18  # a JPEG file of more is checked when it is decoded, not by `inspect`
 # One 2.6 GHz core: a PNG of 64 bits a pixel 84 ns a pixel, a baseline JPEG 10, of ten scans 15.
 PNG_NS_PER_BIT, JPEG_NS, SCAN_NS, PROGRESSIVE_SCANS = 1.4, 10.0, 1.0, 10
+MAX_SEQUENTIAL_SCANS = 4  # one for each component
 MAX_TRAILING_BYTES = 64  # padding of some cameras; more could be another file
 
 
 @dataclass(frozen=True, slots=True)
 class ImageHeader:
-    """Size of an image, px; `png_header` is set for a PNG, `scans` for a small JPEG file."""
+    """Size of an image, px; `png_header` is set for a PNG.
+
+    `scans`: of a JPEG; where it was not `checked`, the usual number of such a JPEG.
+    """
 
     width: int
     height: int
     png_header: png.PngHeader | None = None
-    scans: int | None = None
+    scans: int = 1
+    checked: bool = True
 
     @property
     def decode_ms(self) -> float:
@@ -45,7 +50,7 @@ class ImageHeader:
         if self.png_header is not None:
             per_pixel_ns = PNG_NS_PER_BIT * max(8, self.png_header.pixel_bits)
         else:
-            per_pixel_ns = JPEG_NS + SCAN_NS * ((self.scans or PROGRESSIVE_SCANS) - 1)
+            per_pixel_ns = JPEG_NS + SCAN_NS * (self.scans - 1)
         return self.width * self.height * per_pixel_ns / 1e6
 
 
@@ -100,7 +105,8 @@ def _inspect_jpeg(body: bytes) -> ImageHeader:
     if colours not in ("Gray", "YCbCr", "RGB"):
         raise ImageError(Fault.UNSUPPORTED, f"the JPEG's colours are {colours}; save it in RGB")
     if len(body) > LATE_CHECK_BYTES:
-        return ImageHeader(width, height)
+        scans = PROGRESSIVE_SCANS if jpeg.is_progressive(body) else 1
+        return ImageHeader(width, height, scans=scans, checked=False)
     return ImageHeader(width, height, scans=_check_jpeg(body, width, height))
 
 
@@ -115,6 +121,17 @@ def _check_jpeg(body: bytes, width: int, height: int) -> int:
             f"{MAX_SCANNED_PX / 1e6:g} million px in all are decoded; save it as baseline JPEG",
         )
     return structure.scans
+
+
+def _check_late(body: bytes, header: ImageHeader) -> None:
+    """Check what `inspect` left. Raises ImageError, also where it costs more than was estimated."""
+    scans = _check_jpeg(body, header.width, header.height)
+    if header.scans == 1 and scans > MAX_SEQUENTIAL_SCANS:
+        raise ImageError(
+            Fault.UNSUPPORTED,
+            f"the JPEG has {scans} scans, a sequential one has {MAX_SEQUENTIAL_SCANS} at most; save "
+            "it anew",
+        )
 
 
 def check_trailing(count: int) -> None:
@@ -148,8 +165,8 @@ def decode(
     if header.png_header is not None:
         image = _decode_png(body, header.png_header)
     else:
-        if header.scans is None:
-            _check_jpeg(body, header.width, header.height)
+        if not header.checked:
+            _check_late(body, header)
         image = _decode_jpeg(body)
     if image.shape != (header.height, header.width, 3):
         raise ImageError(

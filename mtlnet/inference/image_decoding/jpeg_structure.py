@@ -12,6 +12,8 @@ from mtlnet.inference.image_decoding.errors import Fault, ImageError
 START = b"\xff\xd8"
 SIGNATURE = b"\xff\xd8\xff"
 SOS, EOI = 0xDA, 0xD9
+FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # SOF0 to SOF15
+PROGRESSIVE_FRAMES = frozenset((0xC2, 0xC6, 0xCA, 0xCE))
 # In entropy-coded data FF 00 is a byte FF, FF D0 to D7 a restart marker, FF FF a fill byte.
 MARKER = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")
 MAX_SCANS = 100  # a progressive JPEG has about ten; each costs a pass over all pixels
@@ -26,6 +28,20 @@ class JpegStructure:
 
     length: int
     scans: int
+
+
+def is_progressive(body: bytes) -> bool:
+    """Whether the frame header, before the first scan, is of a progressive JPEG.
+
+    Raises ImageError. Takes 1 ms at worst.
+    """
+    at = len(START)
+    for _ in range(MAX_SEGMENTS):
+        at, marker = _marker(body, at)
+        if marker in FRAMES or marker in (SOS, EOI):
+            return marker in PROGRESSIVE_FRAMES
+        at += _length(body, at)
+    raise _too_many_parts()
 
 
 def read_structure(body: bytes) -> JpegStructure:
@@ -47,7 +63,7 @@ def read_structure(body: bytes) -> JpegStructure:
                 Fault.UNSUPPORTED, f"the JPEG has over {MAX_SCANS} scans; save it as baseline JPEG"
             )
         at = _find_marker(body, at)
-    raise ImageError(Fault.UNSUPPORTED, f"the JPEG has over {MAX_SEGMENTS} parts; save it anew")
+    raise _too_many_parts()
 
 
 def _marker(body: bytes, at: int) -> tuple[int, int]:
@@ -80,6 +96,10 @@ def _length(body: bytes, at: int) -> int:
     if at + 2 > len(body) or length < 2 or at + length > len(body):
         raise _ends_early(body)
     return length
+
+
+def _too_many_parts() -> ImageError:
+    return ImageError(Fault.UNSUPPORTED, f"the JPEG has over {MAX_SEGMENTS} parts; save it anew")
 
 
 def _ends_early(body: bytes) -> ImageError:

@@ -4,13 +4,16 @@ import socket
 from collections.abc import Callable, Iterator
 
 import pytest
+from typer.testing import CliRunner
 
 from serve.api.hosts import host_name
 from serve.api.problems import Problem
-from serve.config import Limits, check_proxies
+from serve.cli import app
+from serve.config import Limits, ServiceConfig, check_proxies
 from serve.scheduling.rate_limit import RateLimiter, client_key, network_of
 from serve.scheduling.streams import stream_key
 from serve.workers.shared_memory import create_shared_memory
+from serve.workers.worker_process import WorkerTask
 from tests.serve.conftest import (
     PATIENCE_S,
     FakeEngine,
@@ -206,3 +209,18 @@ def test_proxies_are_addresses_or_networks() -> None:
 
 def test_streams_of_two_clients_behind_a_proxy_do_not_touch() -> None:
     assert stream_key("203.0.113.1", "cam") != stream_key("203.0.113.2", "cam")
+
+
+def test_the_options_reach_the_service(monkeypatch: pytest.MonkeyPatch) -> None:
+    configs: list[ServiceConfig] = []
+    monkeypatch.setattr("serve.launch.run", configs.append)
+    monkeypatch.delenv("DRIVERVIEW_TOKEN", raising=False)
+    words = "--allow-host a.example --allow-host b --trusted-proxy 10.0.0.0/8 --body-mib 8"
+    assert CliRunner().invoke(app, words.split()).exit_code == 0
+    limits = configs[0].limits
+    assert limits.hosts == ("127.0.0.1", "a.example", "b")
+    assert limits.trusted_proxies == ("10.0.0.0/8",)
+    assert limits.body_mib == 8
+    task = WorkerTask("run", 0, None, 3, 4, 1, 0, limits)
+    sent = WorkerTask.from_json_line(task.to_json_line().decode()).limits
+    assert (tuple(sent.hosts), tuple(sent.trusted_proxies)) == (limits.hosts, ("10.0.0.0/8",))

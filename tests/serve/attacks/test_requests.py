@@ -15,7 +15,12 @@ import cv2
 import numpy as np
 import pytest
 
-from mtlnet.inference.image_decoding.decode import MAX_SCANNED_PX, inspect
+from mtlnet.inference.image_decoding.decode import (
+    LATE_CHECK_BYTES,
+    MAX_SCANNED_PX,
+    decode,
+    inspect,
+)
 from mtlnet.inference.image_decoding.errors import ImageError
 from mtlnet.inference.image_decoding.jpeg_structure import WINDOW_BYTES, read_structure
 from serve.api.kserve_tensors import Tensor, find_pixels, parse_request, read_image_bytes
@@ -218,7 +223,8 @@ def test_a_client_has_one_large_image_at_a_time() -> None:
         gate.open.set()
         assert first.result()[0] == 200
         assert small.result().status == 200
-        assert post_from("127.0.0.4", service, LARGE)[0] == 200
+        assert post_from("127.0.0.4", service, LARGE)[0] == 503  # the others are still there
+        until(lambda: post_from("127.0.0.4", service, LARGE)[0] == 200)
 
 
 def test_shares_of_the_engine() -> None:
@@ -229,10 +235,12 @@ def test_shares_of_the_engine() -> None:
         now += 700_000_000
     admission.note("b", now)
     admission.note("a", now)
-    with pytest.raises(Problem, match="beyond this client's share") as caught:
+    with pytest.raises(Problem, match="would take 700 ms"):  # four frames of b do not fit
         admission.admit("a", 700.0, now)
+    with pytest.raises(Problem, match="beyond this client's share") as caught:
+        admission.admit("a", 100.0, now)
     assert caught.value.retry_after_ms == pytest.approx((700 - 0.25 * 700) / 0.25)
-    admission.admit("b", 700.0, now)()  # it has not had its share
+    admission.admit("b", 100.0, now)()  # it has not had its share
     later = now + PRESENT_NS
     admission.note("a", later)
     admission.admit("a", 700.0, later)()  # alone again
@@ -333,3 +341,22 @@ def test_many_large_bodies_at_once_hold_no_more_than_the_budget() -> None:
         assert 0 <= most <= 8 << 20
         assert service.app.bodies.held == 0
         gate.open.set()
+
+
+def test_the_scans_of_a_large_file_are_checked_when_it_is_decoded() -> None:
+    noise = np.random.default_rng(0).integers(0, 256, (720, 960, 3), np.uint8)
+    done, progressive = cv2.imencode(".jpg", noise, [cv2.IMWRITE_JPEG_PROGRESSIVE, 1])
+    assert done
+    for body, scans in ((jpeg(noise), 1), (progressive.tobytes(), 10)):
+        assert len(body) > LATE_CHECK_BYTES
+        header = inspect(body, CARD.camera)
+        assert (header.checked, header.scans) == (False, scans)
+        assert decode(body, header, CARD.camera).shape == (210, 280, 3)
+        with pytest.raises(ImageError, match="follow the end of the image"):
+            decode(body + b"x" * 100, header, CARD.camera)
+        with pytest.raises(ImageError, match="before its end marker"):
+            decode(body[:-2], header, CARD.camera)
+    body = jpeg(noise)
+    many = body[:-2] + b"\xff\xda\x00\x02" * 4 + body[-2:]
+    with pytest.raises(ImageError, match="5 scans, a sequential one has 4"):
+        decode(many, inspect(many, CARD.camera), CARD.camera)
