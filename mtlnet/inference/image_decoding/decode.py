@@ -124,7 +124,7 @@ def _check_jpeg(body: bytes, width: int, height: int) -> int:
 
 
 def _check_late(body: bytes, header: ImageHeader) -> None:
-    """Check what `inspect` left. Raises ImageError, also where it costs more than was estimated."""
+    """Check what `inspect` left. Raises ImageError, also where the estimate was too low."""
     scans = _check_jpeg(body, header.width, header.height)
     if header.scans == 1 and scans > MAX_SEQUENTIAL_SCANS:
         raise ImageError(
