@@ -129,8 +129,8 @@ def _check_late(body: bytes, header: ImageHeader) -> None:
     if header.scans == 1 and scans > MAX_SEQUENTIAL_SCANS:
         raise ImageError(
             Fault.UNSUPPORTED,
-            f"the JPEG has {scans} scans, a sequential one has {MAX_SEQUENTIAL_SCANS} at most; save "
-            "it anew",
+            f"the JPEG has {scans} scans, a sequential one has {MAX_SEQUENTIAL_SCANS} at most; "
+            "save it anew",
         )
 
 
