@@ -46,7 +46,8 @@ from serve.scheduling.frame_queue import (
 from serve.scheduling.streams import stream_key
 from trackfeatures.camera import CameraParameters
 
-SMALL_MS = 10.4  # estimated, of an image that may be decoded on the event loop: a VGA PNG
+SMALL_PIXELS = 640 * 480  # at most, and decoded in about
+SMALL_MS = 10.4  # at most: an image that may be decoded on the event loop
 
 logger = logging.getLogger(__name__)
 
@@ -80,8 +81,10 @@ class FrameHandler:
             self.queue.check_capacity()  # an overloaded worker does not parse images
         camera, fov = self.queue.loaded.engine.card.camera, options.fov_y_deg
         header = inspect(body, camera, fov)
+        read_ms = header.decode_ms
+        small = header.width * header.height <= SMALL_PIXELS and read_ms <= SMALL_MS
         frame = _frame(
-            options, client, lambda view: decode(body, header, view, fov), header.decode_ms
+            options, client, lambda view: decode(body, header, view, fov), read_ms, small
         )
         self.queue.submit(frame, on_result)
         return crop_px(header.width, header.height, camera, fov)
@@ -104,7 +107,7 @@ class FrameHandler:
         Raises Problem, ImageError.
         """
         future: asyncio.Future[FrameResult] = asyncio.get_running_loop().create_future()
-        self.queue.submit(_frame(options, client, read, read_ms), partial(resolve, future))
+        self.queue.submit(_frame(options, client, read, read_ms, False), partial(resolve, future))
         result = await future
         self.record_answer(options, client, result)
         return result
@@ -237,9 +240,10 @@ def resolve(future: "asyncio.Future[Any]", result: Any) -> None:
         future.set_result(result)
 
 
-def _frame(options: RequestOptions, client: str, read: PixelReader, read_ms: float) -> Frame:
+def _frame(
+    options: RequestOptions, client: str, read: PixelReader, read_ms: float, small: bool
+) -> Frame:
     stream = stream_key(client, options.stream) if options.stream else 0
-    small = read_ms <= SMALL_MS
     return Frame(read, options.stamp_ns, stream, options.deadline_ns, small, client, read_ms)
 
 
