@@ -7,10 +7,16 @@
 #
 # The processes run as user 10001: folders they write to must let it (`chown 10001 runs datasets`).
 
-FROM python:3.11-slim AS wheel
+# The base image by its digest, for images that are the same tomorrow:
+#
+#   docker build --build-arg PYTHON_IMAGE=python:3.11-slim@sha256:...
+
+ARG PYTHON_IMAGE=python:3.11-slim
+FROM ${PYTHON_IMAGE} AS wheel
 WORKDIR /src
 COPY pyproject.toml README.md LICENSE ./
 COPY trackfeatures trackfeatures
+COPY runtime runtime
 COPY simulator simulator
 COPY datagen datagen
 COPY mtlnet mtlnet
@@ -18,11 +24,14 @@ COPY serve serve
 COPY controllers controllers
 RUN pip wheel --no-cache-dir --no-deps --wheel-dir /wheels .
 
-FROM python:3.11-slim AS base
+FROM ${PYTHON_IMAGE} AS base
 ENV PYTHONUNBUFFERED=1 PIP_NO_CACHE_DIR=1 PIP_DISABLE_PIP_VERSION_CHECK=1
 RUN useradd --create-home --uid 10001 driverview && install -d -o driverview /driverview
-# The lock pins the versions; which of them an image gets is for its extras to say.
-COPY requirements.lock /wheels/
+# The lock pins the versions and the hashes of their files, which uv checks; which of them an image
+# gets is for its extras to say. (pip takes no hashes from constraints for a wheel without one.)
+COPY requirements.lock deploy/uv.txt /wheels/
+RUN pip install --require-hashes --requirement /wheels/uv.txt
+ENV UV_NO_CACHE=1 UV_SYSTEM_PYTHON=1
 COPY --from=wheel /wheels /wheels
 WORKDIR /driverview
 
@@ -31,19 +40,19 @@ FROM base AS collect
 RUN apt-get update \
     && apt-get install -y --no-install-recommends libegl1 libgl1-mesa-dri \
     && rm -rf /var/lib/apt/lists/*
-RUN pip install --constraint /wheels/requirements.lock "$(ls /wheels/*.whl)[simulation]"
+RUN uv pip install --constraint /wheels/requirements.lock "$(ls /wheels/*.whl)[simulation]"
 USER driverview
 CMD ["datagen", "collect", "--help"]
 
 # torch, no physics.
 FROM base AS train
-RUN pip install --constraint /wheels/requirements.lock "$(ls /wheels/*.whl)[training]"
+RUN uv pip install --constraint /wheels/requirements.lock "$(ls /wheels/*.whl)[training]"
 USER driverview
 CMD ["mtlnet", "train", "--help"]
 
 # Neither torch nor physics. Last, so that a plain `docker build .` makes it.
 FROM base AS serve
-RUN pip install --constraint /wheels/requirements.lock "$(ls /wheels/*.whl)"
+RUN uv pip install --constraint /wheels/requirements.lock "$(ls /wheels/*.whl)"
 USER driverview
 EXPOSE 8000
 HEALTHCHECK --interval=10s --timeout=5s --start-period=10s \

@@ -20,7 +20,7 @@ $(READY): pyproject.toml requirements.lock
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 	  { echo "error: $$($(PYTHON) --version) found, Python 3.11 or newer is needed: make PYTHON=python3.11 setup" >&2; exit 1; }
 	@$(BIN)/python -m pip --version >/dev/null 2>&1 || { rm -rf $(VENV); $(PYTHON) -m venv $(VENV); }
-	$(BIN)/python -m pip install --quiet --requirement requirements.lock
+	$(BIN)/python -m pip install --quiet --require-hashes --requirement requirements.lock
 	$(BIN)/python -m pip install --quiet --no-deps --editable .
 	@touch $@
 
@@ -96,8 +96,11 @@ format: $(READY) ## put the code in order
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
 
-lock: ## pin what is installed now, after a change of pyproject.toml
-	$(BIN)/python -m pip freeze --exclude-editable | grep -vE '^(pip|setuptools)==' > requirements.lock
+lock: ## pin what is installed now, with hashes, after a change of pyproject.toml
+	$(BIN)/python -m pip install --quiet --require-hashes --requirement deploy/uv.txt
+	$(BIN)/python -m pip freeze --exclude-editable | grep -vE '^(pip|setuptools|uv)==' | \
+	  $(BIN)/uv pip compile - --quiet --no-deps --generate-hashes --no-annotate --no-header \
+	  --python-version 3.11.9 --output-file requirements.lock
 
 clean: ## remove what was built and collected here, the environment too
 	rm -rf $(VENV) demo build dist *.egg-info

@@ -131,7 +131,7 @@ class Asker:
     def __init__(self, address: tuple[str, int], body: bytes) -> None:
         self._socket = connect(address)
         head = (
-            "POST /features HTTP/1.1\r\nHost: x\r\nContent-Type: image/jpeg\r\n"
+            "POST /features HTTP/1.1\r\nHost: localhost\r\nContent-Type: image/jpeg\r\n"
             f"Content-Length: {len(body)}\r\n\r\n"
         )
         self._request = head.encode() + body

@@ -4,44 +4,66 @@ numba's own cache only sees the file of the outermost function: after a change i
 calls from another file, the old machine code would go on being used.
 """
 
+import atexit
 import functools
 import hashlib
 import os
 import shutil
+import stat
 import sys
 import tempfile
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
 
+OWN_MODE = 0o700
 UNUSED_DAYS = 30.0  # after which the code of other sources is deleted
 
 
 def code_folder(name: str, package: Path) -> Path:
     """A folder that can be written to, for the machine code of all of a package's sources.
 
-    Below `$NUMBA_CACHE_DIR` or the user's cache folder, else a temporary one; named after `name`
-    and a hash of the sources. What was not used for a month goes.
+    Below `$NUMBA_CACHE_DIR` or the user's cache folder, else a new temporary one that goes when
+    the process ends; named after `name` and a hash of the sources. What was not used for a month
+    goes. What lies in the folder is unpickled and run: so it must be the user's own, and nobody
+    else's to write to. A temporary folder of a guessable name might be another user's.
     """
     digest = hashlib.sha256()
     for source in sorted(package.rglob("*.py")):
         digest.update(source.read_bytes())
     found = f"{name}-{digest.hexdigest()[:16]}"
     home = os.environ.get("NUMBA_CACHE_DIR") or os.environ.get("XDG_CACHE_HOME")
-    for parent in (Path(home) if home else Path.home() / ".cache", Path(tempfile.gettempdir())):
-        folder = parent / found
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
+    parent = Path(home) if home else Path.home() / ".cache"
+    folder = parent / found
+    try:
+        parent.mkdir(parents=True, exist_ok=True)
+        if _make_own(folder):
             os.utime(folder)
-        except OSError:
-            continue
-        if os.access(folder, os.W_OK):
             _forget_unused(parent, name)
             return folder
-    return Path(tempfile.mkdtemp(prefix=found))
+    except OSError:  # a read-only disk, or a folder of another user
+        pass
+    temporary = tempfile.mkdtemp(prefix=found)  # of mode 700, and a name that nobody can guess
+    atexit.register(shutil.rmtree, temporary, ignore_errors=True)
+    return Path(temporary)
+
+
+def _make_own(folder: Path) -> bool:
+    """Make a folder for this user alone, or take one; False: it is another's, or a link."""
+    with suppress(FileExistsError):
+        folder.mkdir(mode=OWN_MODE)
+    found = folder.lstat()
+    if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid():
+        return False
+    if found.st_mode & (stat.S_IWGRP | stat.S_IWOTH):  # others may have put code into it
+        shutil.rmtree(folder)
+        folder.mkdir(mode=OWN_MODE)
+    folder.chmod(OWN_MODE)
+    return os.access(folder, os.W_OK)
 
 
 def _forget_unused(parent: Path, name: str) -> None:

@@ -22,12 +22,14 @@ from serve.api.features import (
     RequestFactory,
     client_address,
 )
+from serve.api.hosts import HostCheck
 from serve.api.http_io import Receive, Reply, Scope, Send, problem_reply, send_reply
 from serve.api.problems import Problem, install_problem_handlers
 from serve.api.request_options import Headers, check_token
 from serve.api.stream import Stream
 from serve.config import Limits
 from serve.observability.metrics import MEDIA_TYPE, Metrics
+from serve.scheduling.body_budget import BodyBudget
 from serve.scheduling.frame_queue import FrameQueue
 from serve.scheduling.rate_limit import RateLimiter
 from serve.scheduling.streams import StreamTable
@@ -66,12 +68,16 @@ class Service:
         streams = StreamTable(self.shared.streams())
         self.frame_queue = FrameQueue(engine, check, streams, self.limits.queue)
         self.metrics = Metrics(self.shared, block)
-        self.frames = FrameHandler(self.frame_queue, self.metrics, self.limits.log_answers)
+        self.bodies = BodyBudget(self.shared, block, self.limits.body_mib << 20)
+        self.frames = FrameHandler(
+            self.frame_queue, self.metrics, self.limits.log_answers, self.bodies
+        )
         self._make_request: RequestFactory = FeaturesRequest
         if tracer is not None:
             self.frames, self._make_request = _traced(self, tracer)
         self.features = FeaturesEndpoint(self.frames, self._make_request)
         self.rate_limiter = RateLimiter(self.shared.clients(), self.limits.rate)
+        self._hosts = HostCheck(self.limits)
         self._token = self.limits.token
         self._stream: App = Stream(self.frames, self.rate_limiter)
         self.framework = _framework(self)
@@ -86,11 +92,10 @@ class Service:
             await self.framework(scope, receive, send)
             return
         protocol = "http" if scope["type"] == "http" else "websocket.http"
-        if not _is_public(scope["path"]):
-            refusal = self._authorize(dict(scope["headers"]), client_address(scope))
-            if refusal is not None:
-                await send_reply(send, refusal, protocol)
-                return
+        refusal = self._authorize_scope(scope)
+        if refusal is not None:
+            await send_reply(send, refusal, protocol)
+            return
         if scope["type"] == "websocket":
             await self._stream(scope, receive, send)
         elif scope["path"] == "/features" and scope["method"] == "POST":
@@ -101,7 +106,10 @@ class Service:
     def open(
         self, headers: Headers, client: str, send: Callable[[Reply], None]
     ) -> FeaturesRequest | None:
-        """Begin a POST /features; None: it was refused, and the refusal was sent."""
+        """Begin a POST /features; None: it was refused, and the refusal was sent.
+
+        No header was sent twice.
+        """
         refusal = self._authorize(headers, client)
         if refusal is not None:
             send(refusal)
@@ -110,20 +118,42 @@ class Service:
         return request if request.open(headers) else None
 
     def _authorize(self, headers: Headers, client: str) -> Reply | None:
-        """The refusal of a client over its rate or without the token, else None."""
+        """The refusal of a client over its rate, of a wrong Host or Origin, or without the token.
+
+        None: it may go on.
+        """
         try:
             self.rate_limiter.check(client)
+            self._hosts.check(headers)
             check_token(headers, self._token)
         except Problem as problem:
-            self.metrics.count_refusal(problem.type, self.frame_queue.waiting)
-            return problem_reply(problem)
+            return self._refuse(problem)
         return None
+
+    def _authorize_scope(self, scope: Scope) -> Reply | None:
+        """As `_authorize`, for a request of any path; its headers may hold a name twice."""
+        path, headers = scope["path"], dict(scope["headers"])
+        try:
+            public = _is_public(path)
+            self.rate_limiter.check(client_address(scope), public=public)
+            self._hosts.check_single([name for name, _ in scope["headers"]])
+            version = scope.get("http_version", "1.1")
+            self._hosts.check(headers, probe=path in PROBES, version=version)
+            if not public:
+                check_token(headers, self._token)
+        except Problem as problem:
+            return self._refuse(problem)
+        return None
+
+    def _refuse(self, problem: Problem) -> Reply:
+        self.metrics.count_refusal(problem.type, self.frame_queue.waiting)
+        return problem_reply(problem)
 
 
 def _traced(service: Service, tracer: "Tracer") -> tuple[FrameHandler, RequestFactory]:
     from serve.observability.tracing import TracedFeaturesRequest, TracedFrameHandler
 
-    arguments = (service.frame_queue, service.metrics, service.limits.log_answers)
+    arguments = (service.frame_queue, service.metrics, service.limits.log_answers, service.bodies)
     return TracedFrameHandler(tracer, *arguments), partial(TracedFeaturesRequest, tracer)
 
 

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from runtime import cli as command
-from serve.config import Limits, ServiceConfig, check_exposure, read_token
+from serve.config import Limits, ServiceConfig, check_exposure, check_proxies, read_token
 from trackfeatures.errors import UserError
 
 app = typer.Typer(add_completion=False, rich_markup_mode="rich")
@@ -52,6 +52,23 @@ RequestRate = Annotated[
 Connections = Annotated[
     int, typer.Option(help="Largest number of open connections.", min=1, max=65536)
 ]
+AllowHost = Annotated[
+    list[str] | None,
+    typer.Option(
+        help="Name that clients without a token may call the service by, beside localhost and "
+        "--host; may be given several times."
+    ),
+]
+TrustedProxy = Annotated[
+    list[str] | None,
+    typer.Option(
+        help="Address or network of a proxy whose X-Forwarded-For names the client; may be given "
+        "several times. Default: 127.0.0.1."
+    ),
+]
+BodyMib = Annotated[
+    int, typer.Option(help="Memory for the bodies of all requests in flight, MiB.", min=4)
+]
 LogAnswers = Annotated[
     bool, typer.Option("--log-answers", help="Log answered requests as well as refused ones.")
 ]
@@ -69,6 +86,9 @@ def serve(
     rate: RequestRate = Limits.rate,
     connections: Connections = Limits.connections,
     log_answers: LogAnswers = False,
+    allow_host: AllowHost = None,
+    trusted_proxy: TrustedProxy = None,
+    body_mib: BodyMib = Limits.body_mib,
 ) -> None:
     """Answer driver-view images over HTTP with track features.
 
@@ -82,7 +102,15 @@ def serve(
     from serve.launch import run
 
     token = read_token(token_file)
-    limits = Limits(connections=connections, rate=rate, token=token, log_answers=log_answers)
+    limits = Limits(
+        connections=connections,
+        rate=rate,
+        token=token,
+        log_answers=log_answers,
+        hosts=(host, *(allow_host or ())),
+        trusted_proxies=check_proxies(trusted_proxy or ()),
+        body_mib=body_mib,
+    )
     run(ServiceConfig(model, host, port, workers, insecure, limits))
 
 
@@ -116,6 +144,7 @@ def ray(
     replicas: Replicas = 1,
     token_file: TokenFile = None,
     insecure: Insecure = False,
+    allow_host: AllowHost = None,
 ) -> None:
     """Serve on Ray: on the cluster of $RAY_ADDRESS, or on a new local one.
 
@@ -130,7 +159,8 @@ def ray(
         raise UserError(
             f"Ray Serve is not installed ({error}): pip install 'driverview[rayserve]'"
         ) from error
-    run(RayConfig(model, host, port, replicas, Limits(token=token)))
+    limits = Limits(token=token, hosts=(host, *(allow_host or ())))
+    run(RayConfig(model, host, port, replicas, limits))
 
 
 def main() -> None:

@@ -1,8 +1,9 @@
 """Configuration of the service: limits on its clients, the token, and the address to listen on."""
 
 import os
+from collections.abc import Iterable
 from dataclasses import dataclass, field
-from ipaddress import ip_address
+from ipaddress import ip_address, ip_network
 from pathlib import Path
 
 from trackfeatures.errors import UserError
@@ -35,6 +36,12 @@ class Limits:
     """Log every answered request. Refused requests are always logged."""
     token: str | None = None
     """Required in `Authorization: Bearer`; None: no token is required."""
+    hosts: tuple[str, ...] = ()
+    """Names beside the loopback ones that a Host header may have without a token."""
+    trusted_proxies: tuple[str, ...] = ()
+    """Addresses and networks whose X-Forwarded-For is believed; empty: 127.0.0.1."""
+    body_mib: int = 64
+    """Memory for the bodies of all requests in flight, MiB."""
 
 
 @dataclass(frozen=True)
@@ -82,6 +89,20 @@ def check_exposure(host: str, token: str | None, insecure: bool) -> None:
         f"--host {host} can be reached from other machines: set a token (--token-file, or "
         f"{TOKEN_VARIABLE} in the environment), or pass --insecure if a proxy protects the service"
     )
+
+
+def check_proxies(proxies: Iterable[str]) -> tuple[str, ...]:
+    """The addresses and networks of `--trusted-proxy`. Raises UserError for anything else."""
+    found = tuple(proxies)
+    for proxy in found:
+        try:
+            ip_network(proxy)
+        except ValueError as error:
+            raise UserError(
+                f"--trusted-proxy is {proxy!r} ({error}); give an address or a network, as "
+                "10.0.0.7 or 10.0.0.0/8"
+            ) from error
+    return found
 
 
 def is_loopback(host: str) -> bool:

@@ -22,7 +22,7 @@ from ray import serve as ray_serve  # not to be confused with this package, `ser
 from mtlnet.inference.engine import load_engine
 from mtlnet.inference.model_card import resolve_run
 from serve.app import Service
-from serve.config import Limits, ServiceConfig
+from serve.config import Limits, ServiceConfig, read_token
 from serve.observability import telemetry
 from serve.scheduling.warmup import warm_up
 from trackfeatures.errors import UserError
@@ -31,6 +31,7 @@ NAME = "driverview"
 # A replica refuses what does not fit into its queue at once. Ray's own limit, below this one, would
 # let requests wait in its proxies.
 MAX_ONGOING = 100
+ARGUMENTS = {"model", "replicas", "token_file", "hosts"}  # of `build`
 
 
 @dataclass(frozen=True)
@@ -52,14 +53,22 @@ def _application(folder: str, limits: Limits) -> Service:
 
 
 def build(args: dict[str, Any]) -> ray_serve.Application:
-    """The application; `args`: `model` as for `serve`, resolved on this machine, and `replicas`."""
-    unknown = set(args) - {"model", "replicas"}
+    """The application; `args`: `model` as for `serve`, resolved on this machine, and others.
+
+    Those are `replicas`, `token_file` (else the token is $DRIVERVIEW_TOKEN) and `hosts`, the names
+    that clients may call the service by without a token. Raises UserError.
+    """
+    unknown = set(args) - ARGUMENTS
     if unknown:
         raise UserError(
-            f"unknown argument {', '.join(sorted(unknown))}; there are model and replicas"
+            f"unknown argument {', '.join(sorted(unknown))}; there are "
+            f"{', '.join(sorted(ARGUMENTS))}"
         )
+    token_file = args.get("token_file")
+    token = read_token(None if token_file is None else Path(token_file))
+    limits = Limits(token=token, hosts=tuple(args.get("hosts", ())))
     folder = resolve_run(str(args.get("model", "default"))).resolve()
-    return _bind(folder, int(args.get("replicas", 1)), Limits())
+    return _bind(folder, int(args.get("replicas", 1)), limits)
 
 
 def _bind(folder: Path, replicas: int, limits: Limits) -> ray_serve.Application:

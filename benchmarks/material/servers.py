@@ -34,7 +34,7 @@ BODY = jpeg(picture())
 
 def request(path: str = "/features") -> bytes:
     """One whole request with an image of the model's own camera."""
-    head = f"POST {path} HTTP/1.1\r\nHost: x\r\nContent-Type: image/jpeg\r\n"
+    head = f"POST {path} HTTP/1.1\r\nHost: localhost\r\nContent-Type: image/jpeg\r\n"
     return f"{head}Content-Length: {len(BODY)}\r\n\r\n".encode() + BODY
 
 

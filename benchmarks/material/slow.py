@@ -12,7 +12,7 @@ import sys
 import time
 from contextlib import suppress
 
-HEAD = b"POST /features HTTP/1.1\r\nHost: x\r\nContent-Type: image/jpeg\r\n"
+HEAD = b"POST /features HTTP/1.1\r\nHost: localhost\r\nContent-Type: image/jpeg\r\n"
 BEGINS = (HEAD + b"X-Slow: ", HEAD + b"Content-Length: 20000\r\n\r\n\xff\xd8\xff")
 PAUSE_S = 1.0
 TICK_S = 0.005

@@ -10,6 +10,7 @@ from typing import Any
 import trackfeatures as tf
 from datagen.execution.collect import PLAN_FILE
 from datagen.execution.lock import folder_lock
+from datagen.planning.plan import check_entry
 from datagen.recording.errors import DatasetError
 from datagen.recording.folder import (
     RoundState,
@@ -84,7 +85,7 @@ def _read_plan(folder: Path) -> dict[str, Any]:
     try:
         plan: dict[str, Any] = json.loads(path.read_text())
         tf.require_version(str(plan["definitions"]), str(folder))
-        _ = plan["hash"], [(entry["id"], entry["split"]) for entry in plan["rounds"]]
+        _ = plan["hash"], [(check_entry(entry), entry["split"]) for entry in plan["rounds"]]
     except FileNotFoundError as error:
         raise DatasetError(
             f"{folder} is no folder of `datagen collect` (no {PLAN_FILE})"

@@ -15,6 +15,7 @@ from datagen.planning.config import CollectConfig
 from simulator.world.control_rate import PHYSICS_HZ
 from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
+from trackfeatures.names import require_name
 
 CONTROL_HZ = 20
 """Lowest rate of control steps."""
@@ -23,6 +24,11 @@ CONTROL_HZ = 20
 def program() -> str:
     """Name and version of this program: another version may record the same round differently."""
     return f"driverview {version('driverview')}"
+
+
+def check_entry(entry: dict[str, Any]) -> str:
+    """The id of a round in a `plan.json`; BadName if it is no name, KeyError without one."""
+    return require_name(entry["id"], "round id")
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +69,8 @@ class RoundPlan:
 
     @staticmethod
     def from_json(entry: dict[str, Any]) -> "RoundPlan":
-        """Raises KeyError or TypeError if `entry` was not made by this version."""
+        """Raises KeyError, TypeError or ValueError if `entry` was not made by this version."""
+        check_entry(entry)
         cameras = {key: CameraParameters(**entry[key]) for key in ("camera", "nominal_camera")}
         return RoundPlan(**{**entry, **cameras, "lights": tuple(entry["lights"])})
 

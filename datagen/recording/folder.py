@@ -17,6 +17,7 @@ from datagen.recording.errors import DatasetError
 from datagen.recording.round_metadata import RoundHeader, RoundResult
 from datagen.recording.schema.json_schema import SCHEMA_FILE, schema_text
 from runtime.files import atomic_move, atomic_write, unfinished_path
+from trackfeatures.names import require_name
 
 PARTIAL = ".partial"
 LOCKS = ".locks"
@@ -54,7 +55,11 @@ class RoundState:
     def read(path: Path) -> "RoundState":
         """Raises DatasetError for a file that is no round state."""
         try:
-            return RoundState(**json.loads(path.read_text()))
+            state = RoundState(**json.loads(path.read_text()))
+            name = require_name(state.id, "round id")
+            if state.file != f"rounds/{name}.mcap":
+                raise ValueError(f"its file is {state.file!r}, expected rounds/{name}.mcap")
+            return state
         except (ValueError, TypeError) as error:
             raise DatasetError(f"{path} is no round state: {error}") from error
 
@@ -83,16 +88,29 @@ def is_unstarted(folder: Path, first_file: str) -> bool:
 
 
 def round_path(folder: Path, round_id: str) -> Path:
-    return folder / "rounds" / f"{round_id}.mcap"
+    """The file of a finished round. Raises BadName."""
+    return folder / "rounds" / f"{require_name(round_id, 'round id')}.mcap"
 
 
 def state_path(folder: Path, round_id: str) -> Path:
-    return folder / "state" / f"{round_id}.json"
+    """The file with the hashes of a finished round. Raises BadName."""
+    return folder / "state" / f"{require_name(round_id, 'round id')}.json"
+
+
+def _partial_home(folder: Path, round_id: str) -> Path:
+    """The folder of an unfinished round. Raises BadName, or DatasetError for a link.
+
+    What lies in it is deleted, so it must not lead out of the dataset.
+    """
+    home = folder / PARTIAL / require_name(round_id, "round id")
+    if home.parent.is_symlink():
+        raise DatasetError(f"{home.parent} is a link; remove it: unfinished rounds are deleted")
+    return home
 
 
 def partial_path(folder: Path, round_id: str) -> Path:
     """Where to write an unfinished round: `round.mcap` in a new, empty folder of its own."""
-    home = folder / PARTIAL / round_id
+    home = _partial_home(folder, round_id)
     shutil.rmtree(home, ignore_errors=True)
     home.mkdir(parents=True)
     return home / "round.mcap"
@@ -107,7 +125,7 @@ def publish(folder: Path, partial: Path, state: RoundState) -> None:
 
 def discard_partial(folder: Path, round_id: str) -> None:
     """Remove an unfinished round. `.partial/` stays: another process may be about to use it."""
-    shutil.rmtree(folder / PARTIAL / round_id, ignore_errors=True)
+    shutil.rmtree(_partial_home(folder, round_id), ignore_errors=True)
 
 
 def discard_partials(folder: Path, round_ids: Iterable[str]) -> None:

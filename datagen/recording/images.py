@@ -1,11 +1,14 @@
 """Encoding and decoding of images: JPEG of quality 95 with 4:2:0 chroma, or lossless PNG."""
 
+from struct import Struct
+
 import numpy as np
 from numpy.typing import NDArray
 
 JPEG_QUALITY = 95
 JPEG_MAGIC = b"\xff\xd8"
 PNG_MAGIC = b"\x89PNG"
+PNG_SIZE_AT, PNG_SIZE = 16, Struct(">II")  # width and height in IHDR
 
 Buffer = bytes | memoryview
 
@@ -41,6 +44,8 @@ def decode_into(data: Buffer, out: NDArray[np.uint8]) -> None:
     elif bytes(data[:4]) == PNG_MAGIC:
         import cv2
 
+        # OpenCV would allocate what the header declares, however much.
+        _require_shape(_png_size(data), out)
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
         if image is None:
             raise ValueError("the PNG cannot be decoded")
@@ -48,6 +53,14 @@ def decode_into(data: Buffer, out: NDArray[np.uint8]) -> None:
         cv2.cvtColor(image, cv2.COLOR_BGR2RGB, dst=out)
     else:
         raise ValueError(f"neither JPEG nor PNG: it starts with {bytes(data[:4])!r}")
+
+
+def _png_size(data: Buffer) -> tuple[int, int]:
+    """(height, width) in the header of a PNG. Raises ValueError."""
+    if len(data) < PNG_SIZE.size + PNG_SIZE_AT:
+        raise ValueError("the PNG ends within its header")
+    width, height = PNG_SIZE.unpack_from(data, PNG_SIZE_AT)
+    return height, width
 
 
 def _require_shape(found: tuple[int, ...], out: NDArray[np.uint8]) -> None:

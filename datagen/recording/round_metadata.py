@@ -12,11 +12,13 @@ from typing import Any
 
 import trackfeatures as tf
 from trackfeatures.camera import CameraParameters
+from trackfeatures.names import require_name
 
 ROUND_METADATA = "driverview.round"
 RESULT_METADATA = "driverview.result"
 RECOVERY_METADATA = "driverview.recovered"
 MAX_IMAGE_SIDE_PX = 65_500  # limit of JPEG
+MAX_IMAGE_PX = 100_000_000
 
 
 def summarize_lights(lights: tuple[str, ...]) -> str:
@@ -57,6 +59,7 @@ class RoundHeader:
 
     def validate(self) -> None:
         """Raise ValueError for an impossible value, before anything is computed with it."""
+        require_name(self.id, "round id")
         camera = self.camera
         if type(self.frequency_hz) is not int or self.frequency_hz < 1:
             raise ValueError(
@@ -69,6 +72,11 @@ class RoundHeader:
         for size in (camera.width, camera.height):
             if type(size) is not int or not 0 < size <= MAX_IMAGE_SIDE_PX:
                 raise ValueError(f"its header has an image size of {camera.width}x{camera.height}")
+        if camera.width * camera.height > MAX_IMAGE_PX:
+            raise ValueError(
+                f"its header has an image size of {camera.width}x{camera.height}; at most "
+                f"{MAX_IMAGE_PX / 1e6:g} million px are read"
+            )
 
     def to_metadata(self) -> dict[str, str]:
         return {name: json.dumps(value) for name, value in asdict(self).items()}

@@ -20,6 +20,7 @@ from datagen.recording.folder import write_if_changed
 from datagen.recording.mcap.index import RoundIndex
 from datagen.recording.names import SIDES
 from datagen.recording.round_metadata import RoundInfo
+from trackfeatures.names import require_name
 
 DEFAULT_SPLIT = "default"
 
@@ -58,8 +59,8 @@ def read_split(path: Path) -> Split:
         found = json.loads(path.read_text())
         tf.require_version(str(found["definitions"]), str(path))
         return Split(
-            **{side: tuple(found[side]) for side in SIDES},
-            recovered=tuple(found.get("recovered", ())),
+            **{side: _round_ids(found[side]) for side in SIDES},
+            recovered=_round_ids(found.get("recovered", ())),
         )
     except FileNotFoundError as error:
         raise DatasetError(
@@ -69,6 +70,10 @@ def read_split(path: Path) -> Split:
         raise DatasetError(
             f"{path} is no split: expected JSON with definitions, {', '.join(SIDES)} ({error!r})"
         ) from error
+
+
+def _round_ids(found: Iterable[object]) -> tuple[str, ...]:
+    return tuple(require_name(round_id, "round id") for round_id in found)
 
 
 def write_split(path: Path, split: Split) -> None:

@@ -39,7 +39,7 @@ from mtlnet.inference.model_card import (
 from mtlnet.inference.prediction import OUTPUTS
 from mtlnet.model.architecture import HEIGHT, WIDTH
 from mtlnet.model.network import Network, load_network, predict_images
-from runtime.files import write_json
+from runtime.files import atomic_move, write_json
 from trackfeatures.errors import UserError
 
 FORMATS, PRECISIONS = ("onnx", "openvino"), ("f32", "bf16", "int8")
@@ -172,7 +172,7 @@ def write_onnx(network: Network, folder: Path, *, bf16: bool) -> tuple[str, ...]
     staged = path.with_suffix(".partial")
     try:
         onnx.save_model(model, str(staged))
-        staged.replace(path)
+        atomic_move(staged, path)
     finally:
         staged.unlink(missing_ok=True)
     return (ONNX_FILE,)

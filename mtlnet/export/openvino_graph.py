@@ -18,6 +18,7 @@ from torch import nn
 from mtlnet.inference.graph import Nodes, convolution, model_of, network_nodes
 from mtlnet.inference.uncertainty import UncertaintyHead
 from mtlnet.model.network import Network
+from runtime.files import fsync_path
 
 TOLERANCE = 2e-4
 """Largest difference of any output (coded, or a probability) from torch in float32."""
@@ -56,8 +57,11 @@ def write_graph(
     staged = graph.with_name("staged.xml")
     try:
         openvino.save_model(build_graph(network, head), str(staged), compress_to_fp16=False)
+        for path in (staged, staged.with_suffix(".bin")):
+            fsync_path(path)
         staged.with_suffix(".bin").replace(weights)
         staged.replace(graph)
+        fsync_path(graph.parent)
     except RuntimeError as error:  # OpenVINO's error for a failed write; it gives no reason
         reason = "OpenVINO could not write the model's graph; is the disk full?"
         raise OSError(errno.EIO, reason, str(graph)) from error

@@ -39,6 +39,7 @@ from mtlnet.model.architecture import HEIGHT, WIDTH
 from mtlnet.model.network import Network, fold, predict_images, run_network
 from runtime.files import atomic_write
 from trackfeatures.camera import CameraParameters
+from trackfeatures.names import to_name
 
 PACKAGES = ("driverview", "torch", "openvino", "numpy")
 
@@ -83,7 +84,7 @@ def publish(
     names = MODEL_FILES if head is None else (*MODEL_FILES, UNCERTAINTY_WEIGHTS)
     origin = provenance or Provenance()
     card = ModelCard(
-        name=run.resolve().name,
+        name=to_name(run.resolve().name),
         network=folded.architecture.name,
         definitions_version=tf.VERSION,
         program_version=package_versions()["driverview"],

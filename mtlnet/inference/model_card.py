@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from runtime.files import write_json
 from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError, require_version
+from trackfeatures.names import require_name
 
 RUNS = Path("runs")
 SHIPPED = Path(__file__).parents[1] / "weights" / "default"
@@ -96,6 +97,9 @@ def read_card(run: Path) -> ModelCard:
         values["camera"] = CameraParameters(**values["camera"])
         values["alpha"] = tuple(values["alpha"])
         values["golden"] = tuple(values["golden"])
+        require_name(values["name"], "model's name")
+        for name in values["files"]:
+            require_name(name, "name of a model's file")
         card = ModelCard(**values)
     except (ValueError, KeyError, TypeError) as error:
         raise ModelError(f"{path} is damaged ({error!r}); train the model anew") from error

@@ -43,6 +43,7 @@ from mtlnet.training.recipes import Recipe, find_recipe
 from mtlnet.training.task_weighting import TaskWeighting
 from mtlnet.training.trainer import Trainer, choose_device, keep_freed_memory
 from mtlnet.uncertainty_fit.head import fit_uncertainty_head
+from runtime.files import fsync_path
 from trackfeatures.errors import UserError
 
 EXPORT_CHECK_FRAMES = 16
@@ -292,6 +293,7 @@ def link_latest(run: Path) -> None:
     link.unlink(missing_ok=True)
     link.symlink_to(run.resolve().name)
     link.replace(RUNS / "latest")
+    fsync_path(RUNS)
 
 
 def load_pretrained(network: Network, run: Path) -> None:

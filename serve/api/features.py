@@ -20,6 +20,7 @@ from serve.api.http_io import (
     Reply,
     Scope,
     Send,
+    check_body_size,
     problem_reply,
     read_body,
     send_reply,
@@ -34,6 +35,7 @@ from serve.api.request_options import (
 )
 from serve.observability.logs import RefusalLog, log_answer
 from serve.observability.metrics import Metrics
+from serve.scheduling.body_budget import BodyBudget, BodyShare
 from serve.scheduling.frame_queue import (
     Frame,
     FrameQueue,
@@ -44,7 +46,8 @@ from serve.scheduling.frame_queue import (
 from serve.scheduling.streams import stream_key
 from trackfeatures.camera import CameraParameters
 
-SMALL_PIXELS = 640 * 480  # decoded in one or two milliseconds
+SMALL_PIXELS = 640 * 480  # at most, and decoded in about
+SMALL_MS = 10.4  # at most: an image that may be decoded on the event loop
 
 logger = logging.getLogger(__name__)
 
@@ -52,11 +55,18 @@ logger = logging.getLogger(__name__)
 class FrameHandler:
     """What every endpoint does with a frame: queue it, count its result, log it."""
 
-    def __init__(self, queue: FrameQueue, metrics: Metrics, log_answers: bool) -> None:
+    def __init__(
+        self, queue: FrameQueue, metrics: Metrics, log_answers: bool, bodies: BodyBudget
+    ) -> None:
         self.queue = queue
+        self._bodies = bodies
         self._metrics = metrics
         self._refusals = RefusalLog()
         self._log_answers = log_answers
+
+    def share(self) -> BodyShare:
+        """What a new request holds of the budget of bodies: nothing yet."""
+        return BodyShare(self._bodies)
 
     def submit(
         self, options: RequestOptions, body: bytes, client: str, on_result: ResultCallback
@@ -71,8 +81,11 @@ class FrameHandler:
             self.queue.check_capacity()  # an overloaded worker does not parse images
         camera, fov = self.queue.loaded.engine.card.camera, options.fov_y_deg
         header = inspect(body, camera, fov)
-        small = header.width * header.height <= SMALL_PIXELS
-        frame = _frame(options, client, lambda view: decode(body, header, view, fov), small)
+        read_ms = header.decode_ms
+        small = header.width * header.height <= SMALL_PIXELS and read_ms <= SMALL_MS
+        frame = _frame(
+            options, client, lambda view: decode(body, header, view, fov), read_ms, small
+        )
         self.queue.submit(frame, on_result)
         return crop_px(header.width, header.height, camera, fov)
 
@@ -87,11 +100,14 @@ class FrameHandler:
         return response_content(options, result, crop)
 
     async def predict_pixels(
-        self, options: RequestOptions, client: str, read: PixelReader
+        self, options: RequestOptions, client: str, read: PixelReader, read_ms: float
     ) -> FrameResult:
-        """The result for the pixels that `read` gives. Raises Problem, ImageError."""
+        """The result for the pixels that `read` gives in about `read_ms`.
+
+        Raises Problem, ImageError.
+        """
         future: asyncio.Future[FrameResult] = asyncio.get_running_loop().create_future()
-        self.queue.submit(_frame(options, client, read, False), partial(resolve, future))
+        self.queue.submit(_frame(options, client, read, read_ms, False), partial(resolve, future))
         result = await future
         self.record_answer(options, client, result)
         return result
@@ -114,15 +130,26 @@ class FrameHandler:
 class FeaturesRequest:
     """One request, from its headers to its reply: call `open`, then `submit` with its body.
 
-    `send` is called once, unless the client disconnects before its body is complete.
+    `send` is called once, unless the client disconnects before its body is complete: then call
+    `abandon`.
     """
 
-    __slots__ = ("_client", "_crop", "_frames", "_options", "_request_id", "_send")
+    __slots__ = ("_client", "_crop", "_frames", "_options", "_request_id", "_send", "_share")
 
     def __init__(self, frames: FrameHandler, client: str, send: Callable[[Reply], None]) -> None:
         self._frames = frames
         self._client = client
         self._send = send
+        self._share = frames.share()
+
+    def grow(self, size: int) -> None:
+        """Hold `size` bytes more of the body. Raises Problem."""
+        check_body_size(self._share.size + size)
+        self._share.grow(size)
+
+    def abandon(self) -> None:
+        """Give up: the client is gone."""
+        self._share.close()
 
     def open(self, headers: Headers) -> bool:
         """Check the headers; False: the request was refused, its body is not needed."""
@@ -150,6 +177,7 @@ class FeaturesRequest:
 
     def refuse(self, error: Problem | ImageError) -> None:
         """Reply with the problem of an error."""
+        self._share.close()
         problem = self._frames.record_refusal(error, self._request_id, self._client)
         self._send(problem_reply(problem, (b"x-request-id", self._request_id.encode())))
 
@@ -164,6 +192,7 @@ class FeaturesRequest:
             logger.exception("request %s failed", self._request_id)
             self.refuse(internal_error())
         else:
+            self._share.close()
             self._send(reply)
 
     def _reply(self, result: FrameResult) -> Reply:
@@ -192,8 +221,9 @@ class FeaturesEndpoint:
         request = self._make_request(self._frames, client_address(scope), partial(resolve, reply))
         if request.open(dict(scope["headers"])):
             try:
-                request.submit(await read_body(receive))
+                request.submit(await read_body(receive, request.grow))
             except ClientDisconnectedError:
+                request.abandon()
                 return
             except Problem as problem:
                 request.refuse(problem)
@@ -210,9 +240,11 @@ def resolve(future: "asyncio.Future[Any]", result: Any) -> None:
         future.set_result(result)
 
 
-def _frame(options: RequestOptions, client: str, read: PixelReader, small: bool) -> Frame:
+def _frame(
+    options: RequestOptions, client: str, read: PixelReader, read_ms: float, small: bool
+) -> Frame:
     stream = stream_key(client, options.stream) if options.stream else 0
-    return Frame(read, options.stamp_ns, stream, options.deadline_ns, small)
+    return Frame(read, options.stamp_ns, stream, options.deadline_ns, small, client, read_ms)
 
 
 def client_address(scope: Scope) -> str:

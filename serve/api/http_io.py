@@ -37,15 +37,20 @@ class ClientDisconnectedError(Exception):
     """The client closed the connection before its body was complete."""
 
 
-async def read_body(receive: Receive) -> bytes:
-    """The whole body. Raises Problem when it is too large, ClientDisconnectedError."""
+async def read_body(receive: Receive, grow: Callable[[int], None]) -> bytes:
+    """The whole body; `grow` is called with the size of each part.
+
+    Raises Problem when it is too large, ClientDisconnectedError, and what `grow` raises.
+    """
     body, more = bytearray(), True
     while more:
         message = await receive()
         if message["type"] == "http.disconnect":
             raise ClientDisconnectedError
-        body += message.get("body", b"")
-        check_body_size(len(body))
+        part = message.get("body", b"")
+        check_body_size(len(body) + len(part))
+        grow(len(part))
+        body += part
         more = message.get("more_body", False)
     return bytes(body)
 

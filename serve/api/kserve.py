@@ -19,6 +19,7 @@ from fastapi.responses import JSONResponse, Response
 from numpy.typing import NDArray
 
 import trackfeatures as tf
+from mtlnet.inference.image_decoding.crop import crop_box
 from mtlnet.inference.image_decoding.decode import check_size, crop_and_resize, decode, inspect
 from mtlnet.inference.image_decoding.errors import ImageError
 from mtlnet.inference.prediction import Prediction
@@ -28,10 +29,10 @@ from serve.api.http_io import ClientDisconnectedError, read_body
 from serve.api.kserve_tensors import (
     InferRequest,
     encode_response,
+    find_pixels,
     invalid_request,
     parse_request,
     read_image_bytes,
-    read_pixels,
 )
 from serve.api.problems import MEDIA_TYPE, NOT_READY, Problem, internal_error
 from serve.api.request_options import (
@@ -141,11 +142,18 @@ async def _answer(
     without_accept = {k: v for k, v in headers.items() if k != b"accept"}
     options = parse_options(without_accept, stamp_ns, request_id)
     check_body_headers(headers)
-    body = await read_body(request.receive)
-    infer_request, binary = parse_request(body, headers.get(HEADER.lower().encode()))
     frames.queue.check_ready()
-    read = _pixel_reader(infer_request, binary, frames, options.fov_y_deg)
-    result = await frames.predict_pixels(options, client_address(request.scope), read)
+    if options.stream is None:
+        frames.queue.check_capacity()  # an overloaded worker reads and parses nothing
+    share = frames.share()
+    try:
+        body = await read_body(request.receive, share.grow)
+        infer_request, binary = parse_request(body, headers.get(HEADER.lower().encode()))
+        read, read_ms = _pixel_reader(infer_request, binary, frames, options.fov_y_deg)
+        client = client_address(request.scope)
+        result = await frames.predict_pixels(options, client, read, read_ms)
+    finally:
+        share.close()
     head: dict[str, Any] = {
         "model_name": NAME,
         "model_version": VERSION,
@@ -163,11 +171,16 @@ async def _answer(
 
 def _pixel_reader(
     request: InferRequest, binary: memoryview, frames: FrameHandler, fov_y_deg: float | None
-) -> PixelReader:
-    """The reader of the pixels of the one input. Raises Problem, ImageError."""
-    if len(request.inputs) != 1 or request.inputs[0].name not in ("image", "pixels"):
+) -> tuple[PixelReader, float]:
+    """The reader of the pixels of the input, and an estimate of its time, ms.
+
+    Raises Problem, ImageError.
+    """
+    tensor = request.input
+    if tensor.name not in ("image", "pixels"):
         raise invalid_request("expected one input, named image or pixels")
-    tensor = request.inputs[0]
+    if len({output.name for output in request.outputs}) < len(request.outputs):
+        raise invalid_request("an output is asked for twice; name each once")
     unknown = next((o.name for o in request.outputs if o.name not in OUTPUTS), None)
     if unknown is not None:
         raise invalid_request(f"unknown output {unknown[:80]!r}; there are {', '.join(OUTPUTS)}")
@@ -175,10 +188,11 @@ def _pixel_reader(
     if tensor.name == "image":
         body = read_image_bytes(tensor, binary)
         header = inspect(body, camera, fov_y_deg)
-        return lambda view: decode(body, header, view, fov_y_deg)
-    pixels = read_pixels(tensor, binary)
-    check_size(pixels.shape[1], pixels.shape[0])
-    return lambda view: crop_and_resize(pixels, view, fov_y_deg)
+        return lambda view: decode(body, header, view, fov_y_deg), header.decode_ms
+    pixels = find_pixels(tensor, binary)
+    check_size(pixels.width, pixels.height)
+    crop_box(pixels.width, pixels.height, camera, fov_y_deg)
+    return lambda view: crop_and_resize(pixels.read(), view, fov_y_deg), pixels.read_ms
 
 
 def _tensors(prediction: Prediction) -> dict[str, NDArray[np.float32]]:

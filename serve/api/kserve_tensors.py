@@ -5,11 +5,11 @@ Source: Open Inference Protocol, REST, and its binary tensor data extension: a J
 order, little-endian, row-major; each element of BYTES is preceded by its length as a 4-byte number.
 """
 
-import base64
 import binascii
-from collections.abc import Iterator
+from collections.abc import Callable
+from dataclasses import dataclass
 from math import prod
-from typing import Any
+from typing import Any, TypeVar
 
 import msgspec
 import numpy as np
@@ -18,7 +18,15 @@ from numpy.typing import NDArray
 from serve.api.problems import INVALID_REQUEST, Problem
 
 MAX_DEPTH = 4
-MAX_DIGITS = 20  # of a length in a header; int() refuses thousands
+MAX_VALUES = 1_300_000  # and lists, in JSON: 640 x 480 px; each takes some 10 ns of the event loop
+MAX_SMALL_BYTES = 4096  # of what is not the tensor itself, in JSON
+WINDOW_BYTES = 1 << 16  # of pixels in JSON, decoded at once; other threads may run in between
+JSON_MS_PER_BYTE = 1e-4  # to decode pixels in JSON
+PIXEL_MS = 1e-6  # to crop and scale
+COMMA, BRACKET = b",["
+MAX_LENGTH_DIGITS = 20
+BLANKS = b" \t\r\n"
+T = TypeVar("T")
 
 
 class RequestedOutput(msgspec.Struct):
@@ -29,39 +37,91 @@ class RequestedOutput(msgspec.Struct):
 
 
 class Tensor(msgspec.Struct):
-    """An input tensor."""
+    """An input tensor; `data` is JSON, or empty."""
 
     name: str
     shape: list[int]
     datatype: str
     parameters: dict[str, Any] = {}
-    data: Any = None
+    data: bytes = b""
 
 
 class InferRequest(msgspec.Struct):
     """The JSON part of a request."""
 
-    inputs: list[Tensor]
+    input: Tensor
     id: str | None = None
     outputs: list[RequestedOutput] = []
     parameters: dict[str, Any] = {}
+
+
+# What is sent is split first, which makes no objects: a list of 4 MB can become 40 MB of them.
+
+
+class _RawTensor(msgspec.Struct):
+    name: str
+    shape: msgspec.Raw
+    datatype: str
+    parameters: msgspec.Raw = msgspec.Raw(b"{}")
+    data: msgspec.Raw = msgspec.Raw(b"")
+
+
+class _RawRequest(msgspec.Struct):
+    inputs: tuple[_RawTensor]
+    id: str | None = None
+    outputs: msgspec.Raw = msgspec.Raw(b"[]")
+    parameters: msgspec.Raw = msgspec.Raw(b"{}")
 
 
 def parse_request(body: bytes, header_length: bytes | None) -> tuple[InferRequest, memoryview]:
     """(the JSON part, the binary part) of a request. Raises Problem."""
     length = len(body)
     if header_length is not None:
-        usable = header_length.isdigit() and len(header_length) <= MAX_DIGITS
+        usable = header_length.isdigit() and len(header_length) <= MAX_LENGTH_DIGITS
         if not usable or int(header_length) > len(body):
             raise invalid_request(
                 "Inference-Header-Content-Length is not a length within this body"
             )
         length = int(header_length)
+    text = np.frombuffer(body, np.uint8, length)
+    values = np.count_nonzero(text == COMMA) + np.count_nonzero(text == BRACKET)
+    if values > MAX_VALUES:
+        raise invalid_request(
+            f"the JSON part has {values} values and lists, at most {MAX_VALUES} are accepted; send "
+            "the tensor as binary data"
+        )
     try:
-        request = msgspec.json.decode(body[:length], type=InferRequest)
+        request = _parse_json(memoryview(body)[:length])
     except (msgspec.DecodeError, RecursionError) as error:
         raise invalid_request(f"the body is not an inference request: {error}") from error
     return request, memoryview(body)[length:]
+
+
+def _parse_json(text: memoryview) -> InferRequest:
+    """Raises Problem, msgspec.DecodeError, RecursionError."""
+    raw = msgspec.json.decode(text, type=_RawRequest)
+    (tensor,) = raw.inputs
+    return InferRequest(
+        Tensor(
+            tensor.name,
+            _small(tensor.shape, list[int]),
+            tensor.datatype,
+            _small(tensor.parameters, dict[str, Any]),
+            b"" if bytes(tensor.data) == b"null" else bytes(tensor.data),
+        ),
+        raw.id,
+        _small(raw.outputs, list[RequestedOutput]),
+        _small(raw.parameters, dict[str, Any]),
+    )
+
+
+def _small(raw: msgspec.Raw, kind: type[T]) -> T:
+    """A part of a request that is never large. Raises Problem, msgspec.DecodeError."""
+    if len(memoryview(raw)) > MAX_SMALL_BYTES:
+        raise invalid_request(
+            f"a shape, the outputs or the parameters have over {MAX_SMALL_BYTES} bytes; send fewer"
+        )
+    return msgspec.json.decode(raw, type=kind)
 
 
 def read_image_bytes(tensor: Tensor, binary: memoryview) -> bytes:
@@ -75,17 +135,34 @@ def read_image_bytes(tensor: Tensor, binary: memoryview) -> bytes:
         if len(raw) < 4 or int.from_bytes(raw[:4], "little") != len(raw) - 4:
             raise invalid_request(f"{tensor.name} must hold one element, preceded by its length")
         return bytes(raw[4:])
-    elements = list(_flat(tensor.data))
-    if len(elements) != 1 or not isinstance(elements[0], str):
-        raise invalid_request(f"{tensor.name} must hold one file in base64")
+    text = tensor.data
+    for _ in range(MAX_DEPTH):
+        text = text.strip(BLANKS)
+        if text.startswith(b"[") and text.endswith(b"]"):
+            text = text[1:-1]
     try:
-        return base64.b64decode(elements[0], validate=True)
+        encoded = msgspec.json.decode(text, type=str)
+    except msgspec.DecodeError as error:
+        raise invalid_request(f"{tensor.name} must hold one file in base64") from error
+    try:
+        return binascii.a2b_base64(encoded, strict_mode=True)
     except (binascii.Error, ValueError) as error:
         raise invalid_request(f"{tensor.name} is not base64: {error}") from error
 
 
-def read_pixels(tensor: Tensor, binary: memoryview) -> NDArray[np.uint8]:
-    """A UINT8 tensor as (height, width, 3); a leading 1 is removed. Raises Problem."""
+@dataclass(frozen=True, slots=True)
+class Pixels:
+    """A UINT8 tensor of a request, not yet decoded. `read_ms`: an estimate of the time for that."""
+
+    height: int
+    width: int
+    read_ms: float
+    read: Callable[[], NDArray[np.uint8]]
+    """The tensor as (height, width, 3). Raises Problem."""
+
+
+def find_pixels(tensor: Tensor, binary: memoryview) -> Pixels:
+    """The UINT8 tensor in a request; a leading 1 of its shape is removed. Raises Problem."""
     shape = tensor.shape[1:] if len(tensor.shape) == 4 and tensor.shape[0] == 1 else tensor.shape
     usable = len(shape) == 3 and shape[2] == 3 and min(shape) > 0
     if tensor.datatype != "UINT8" or not usable:
@@ -94,18 +171,44 @@ def read_pixels(tensor: Tensor, binary: memoryview) -> NDArray[np.uint8]:
             "[1, height, width, 3]"
         )
     raw = _binary(tensor, binary)
-    if raw is not None:
-        values = np.frombuffer(raw, np.uint8)
-    else:
-        elements = list(_flat(tensor.data))
-        if not all(type(value) is int and 0 <= value <= 255 for value in elements):
-            raise invalid_request(f"{tensor.name} must hold integers from 0 to 255")
-        values = np.array(elements, np.uint8)
-    if values.size != prod(shape):
-        raise invalid_request(
-            f"{tensor.name} has {values.size} values, its shape needs {prod(shape)}"
+    height, width, _ = shape
+    pixel_ms = PIXEL_MS * height * width
+    if raw is None:
+        text = tensor.data
+        read_ms = pixel_ms + JSON_MS_PER_BYTE * len(text)
+        return Pixels(
+            height, width, read_ms, lambda: _shaped(_read_json(tensor.name, text), tensor, shape)
         )
-    return values.reshape(shape)
+    values = _shaped(raw, tensor, shape)
+    return Pixels(height, width, pixel_ms, lambda: values)
+
+
+def _shaped(
+    values: bytes | bytearray | memoryview, tensor: Tensor, shape: list[int]
+) -> NDArray[np.uint8]:
+    if len(values) != prod(shape):
+        raise invalid_request(
+            f"{tensor.name} has {len(values)} values, its shape needs {prod(shape)}"
+        )
+    return np.frombuffer(values, np.uint8).reshape(shape)
+
+
+def _read_json(name: str, text: bytes) -> bytearray:
+    """The integers in nested lists, in order. Raises Problem.
+
+    Decoded in windows, so that the event loop does not wait for a long list.
+    """
+    flat = text.translate(None, b"[]" + BLANKS)
+    values, start = bytearray(), 0
+    while start < len(flat):
+        end = flat.find(b",", start + WINDOW_BYTES)
+        end = len(flat) if end < 0 else end
+        try:
+            values += bytes(msgspec.json.decode(b"[%b]" % flat[start:end], type=list[int]))
+        except (msgspec.DecodeError, ValueError) as error:
+            raise invalid_request(f"{name} must hold integers from 0 to 255") from error
+        start = end + 1
+    return values
 
 
 def _binary(tensor: Tensor, binary: memoryview) -> memoryview | None:
@@ -121,17 +224,6 @@ def _binary(tensor: Tensor, binary: memoryview) -> memoryview | None:
             f"{tensor.name} declares binary_data_size {size!r}, but {len(binary)} bytes follow"
         )
     return binary
-
-
-def _flat(data: Any, depth: int = MAX_DEPTH) -> Iterator[Any]:
-    """The elements of nested lists in order. Raises Problem where they are nested too deep."""
-    if isinstance(data, list):
-        if depth == 0:
-            raise invalid_request(f"the data is nested deeper than {MAX_DEPTH} lists")
-        for part in data:
-            yield from _flat(part, depth - 1)
-    elif data is not None:
-        yield data
 
 
 def encode_response(

@@ -40,6 +40,9 @@ UNAUTHORIZED = ProblemType("unauthorized", 401, "The token is missing or wrong")
 FORBIDDEN_ORIGIN = ProblemType(
     "forbidden-origin", 403, "Pages of other sites may not use this service"
 )
+FORBIDDEN_HOST = ProblemType(
+    "forbidden-host", 403, "Without a token this service answers to its own names only"
+)
 NOT_FOUND = ProblemType("not-found", 404, "There is nothing at this path")
 METHOD_NOT_ALLOWED = ProblemType("method-not-allowed", 405, "This path does not take this method")
 NOT_ACCEPTABLE = ProblemType(

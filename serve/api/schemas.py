@@ -117,9 +117,12 @@ SERVER_REFUSALS = (
     problems.TOO_SLOW,
     problems.HEAD_TOO_LARGE,
     problems.TOO_MANY_CONNECTIONS,
+    problems.FORBIDDEN_ORIGIN,
+    problems.FORBIDDEN_HOST,
+    problems.RATE_LIMITED,
 )
-AUTHORIZATION_REFUSALS = (problems.UNAUTHORIZED, problems.RATE_LIMITED)
-OTHER_REFUSALS = (problems.FORBIDDEN_ORIGIN, problems.NOT_FOUND, problems.METHOD_NOT_ALLOWED)
+AUTHORIZATION_REFUSALS = (problems.UNAUTHORIZED,)
+OTHER_REFUSALS = (problems.NOT_FOUND, problems.METHOD_NOT_ALLOWED)
 REFUSALS = tuple(  # of an image
     found
     for found in PROBLEM_TYPES

@@ -14,7 +14,7 @@ import logging
 import time
 from dataclasses import dataclass, replace
 from typing import Any
-from urllib.parse import parse_qs, urlsplit
+from urllib.parse import parse_qs
 
 import msgspec
 
@@ -22,7 +22,6 @@ from mtlnet.inference.image_decoding.errors import ImageError
 from serve.api.features import FrameHandler, client_address
 from serve.api.http_io import Message, Receive, Scope, Send, problem_reply, send_reply
 from serve.api.problems import (
-    FORBIDDEN_ORIGIN,
     INVALID_REQUEST,
     NOT_FOUND,
     Problem,
@@ -111,7 +110,9 @@ class Stream:
     ) -> None:
         """Answer the image in `message`; it is let go of before the answer waits for the client."""
         request_id, frame_id = f"{stream.defaults.request_id}/{number}", number
+        share = self._frames.share()
         try:
+            share.grow(len(message["bytes"]))
             self._rate_limiter.check(stream.client)
             frame_id, deadline_ms = _parse_metadata(metadata, number, stream.deadline_ms)
             options = replace(
@@ -128,7 +129,9 @@ class Stream:
             logger.exception("request %s failed", request_id)
             problem = internal_error()
             content = self._frames.record_refusal(problem, request_id, stream.client).content
-        message.clear()
+        finally:
+            message.clear()
+            share.close()
         content["frame_id"] = frame_id
         data = stream.defaults.format.encode(content)
         is_json = stream.defaults.format is JSON
@@ -142,7 +145,6 @@ def _parse_handshake(scope: Scope, request_id: str) -> StreamOptions:
     headers: Headers = dict(scope["headers"])
     if scope["path"] != PATH:
         raise Problem(NOT_FOUND, f"there is no WebSocket at {scope['path']}, only at {PATH}")
-    _check_origin(headers)
     query = parse_qs(scope["query_string"].decode("latin-1"))
     options = parse_options(headers, time.monotonic_ns(), request_id)
     if "fov_y" in query:
@@ -156,22 +158,6 @@ def _parse_handshake(scope: Scope, request_id: str) -> StreamOptions:
     stream = options.stream or f"websocket {request_id}"
     options = replace(options, stream=stream, format=response_format)
     return StreamOptions(options, protocol, deadline_ms, client_address(scope))
-
-
-def _check_origin(headers: Headers) -> None:
-    """Raise Problem for a page of another site: it could use the browser of a user in here."""
-    origin = headers.get(b"origin")
-    if origin is None:
-        return
-    try:
-        host = urlsplit(origin.decode("latin-1")).netloc.encode("latin-1")
-    except ValueError:
-        host = None
-    if host is None or host != headers.get(b"host"):
-        raise Problem(
-            FORBIDDEN_ORIGIN,
-            f"the page's origin is {origin[:80].decode('latin-1')!r}, not this service",
-        )
 
 
 def _parse_metadata(text: str, number: str, deadline_ms: str | None) -> tuple[str, str | None]:

@@ -26,11 +26,13 @@ import trackfeatures as tf
 from mtlnet.inference.engine import Engine
 from mtlnet.inference.prediction import Prediction, decode_outputs
 from serve.api.problems import DEADLINE_PASSED, NOT_READY, OVERLOADED, SUPERSEDED, Problem
+from serve.scheduling.admission import Admission
 from serve.scheduling.streams import StreamTable
 from trackfeatures.camera import CameraParameters
 
 SMOOTHING = 0.1  # weight of the latest frame in the running mean of the time per frame
 INLINE_MAX_MS = 10.0  # a frame may block the event loop for so long
+LARGE_MS = 30.0  # an image that takes longer to decode needs an admission: 3 Mpx of JPEG
 INLINE_AFTER = 8  # frames in a row within INLINE_MAX_MS before the event loop runs the engine
 logger = logging.getLogger(__name__)
 
@@ -81,7 +83,8 @@ class FrameResult:
 class Frame:
     """An image to process. Times are ns of the monotonic clock.
 
-    `stream` 0: it belongs to no stream. `small`: it is decoded in less time than the engine takes.
+    `stream` 0: it belongs to no stream. `small`: it is decoded in less time than the engine takes;
+    others are admitted by `cost_ms`, the estimated time of decoding.
     """
 
     read: PixelReader
@@ -89,6 +92,8 @@ class Frame:
     stream: int = 0
     deadline_ns: int | None = None
     small: bool = False
+    client: str = ""
+    cost_ms: float = 0.0
 
 
 class Slot:
@@ -124,6 +129,7 @@ class FrameQueue:
         self._ready = False
         self._streams = streams
         self._capacity = capacity
+        self._admission = Admission()
         self._waiting: deque[Slot] = deque()
         self._queue_lock = threading.Lock()  # guards the slots above, for a few instructions
         self._thread_busy = False  # the thread is processing a frame
@@ -203,10 +209,25 @@ class FrameQueue:
         Raises Problem at once where the queue is full or the engine is not ready.
         """
         self.check_ready()
-        superseded = None
+        self._admission.note(frame.client, frame.stamp_ns)
+        if frame.cost_ms > LARGE_MS:
+            done = self._admission.admit(frame.client, frame.cost_ms, frame.stamp_ns)
+            try:
+                superseded = self._enqueue(frame, _after(done, on_result))
+            except Problem:
+                done()
+                raise
+        else:
+            superseded = self._enqueue(frame, on_result)
+        if superseded is not None:
+            superseded(Problem(SUPERSEDED, "a newer frame of this stream arrived"))
+        if frame.stream:
+            self._streams.announce(frame.stream, frame.stamp_ns)
+
+    def _enqueue(self, frame: Frame, on_result: ResultCallback) -> ResultCallback | None:
+        """Queue a frame; the callback of a frame that is superseded, if any. Raises Problem."""
         with self._queue_lock:
-            if frame.stream:
-                superseded = self._supersede(frame, on_result)
+            superseded = self._supersede(frame, on_result) if frame.stream else None
             if superseded is None:
                 self.check_capacity()
                 self._waiting.append(Slot(frame, on_result))
@@ -214,10 +235,7 @@ class FrameQueue:
                     self._dispatched = True
                     # Not at once: first the loop reads all requests that have arrived.
                     self._loop.call_soon(self._dispatch)
-        if superseded is not None:
-            superseded(Problem(SUPERSEDED, "a newer frame of this stream arrived"))
-        if frame.stream:
-            self._streams.announce(frame.stream, frame.stamp_ns)
+        return superseded
 
     def _supersede(self, frame: Frame, on_result: ResultCallback) -> ResultCallback | None:
         """Put a frame into its stream's slot; the callback of the older of the two, if any."""
@@ -317,3 +335,13 @@ class FrameQueue:
         for frames_wait in (True, False):
             self._wake_ups.put(frames_wait)
         self._thread.join()
+
+
+def _after(done: Callable[[], None], on_result: ResultCallback) -> ResultCallback:
+    """`on_result`, called after `done`."""
+
+    def call(result: FrameResult | Exception) -> None:
+        done()
+        on_result(result)
+
+    return call

@@ -7,6 +7,7 @@ so a client may get slightly more than its rate and never less.
 import time
 from functools import lru_cache
 from hashlib import blake2b
+from ipaddress import IPv6Address, ip_address
 
 from serve.api.problems import RATE_LIMITED, Problem
 from serve.config import is_loopback
@@ -14,12 +15,30 @@ from serve.workers.shared_memory import CLIENT_ENTRIES, CLIENT_WORDS, PROBES
 
 
 @lru_cache(4096)
-def client_key(address: str) -> float:
-    """The key of a client address, never 0 and exact as a real; 0 for this machine."""
+def client_key(address: str, public: bool = False) -> float:
+    """The key of a client address, never 0 and exact as a real; 0 for this machine.
+
+    A client has the whole /64 of its IPv6 address, so that is one client. `public`: its key for
+    paths that need no token.
+    """
     if not address or is_loopback(address):
         return 0.0
-    digest = blake2b(address.encode(), digest_size=6).digest()
+    kind = "public " if public else ""
+    digest = blake2b(f"{kind}{network_of(address)}".encode(), digest_size=6).digest()
     return float(int.from_bytes(digest, "big") + 1)
+
+
+def network_of(address: str) -> str:
+    """The address, or the /64 network of an IPv6 address; an IPv4 address within IPv6 is that."""
+    try:
+        found = ip_address(address.partition("%")[0])
+    except ValueError:
+        return address
+    if not isinstance(found, IPv6Address):
+        return str(found)
+    if found.ipv4_mapped is not None:
+        return str(found.ipv4_mapped)
+    return f"{found.packed[:8].hex()}/64"
 
 
 class RateLimiter:
@@ -29,9 +48,13 @@ class RateLimiter:
         self._cells = cells
         self._rate = per_second
 
-    def check(self, address: str, now: float | None = None) -> None:
-        """Count a request of a client; raise Problem when it exceeds its rate."""
-        key = client_key(address)
+    def check(self, address: str, now: float | None = None, public: bool = False) -> None:
+        """Count a request of a client; raise Problem when it exceeds its rate.
+
+        `public`: for a path that needs no token. Those are counted apart: whoever floods /features
+        from behind the address of a probe does not make the probe fail.
+        """
+        key = client_key(address, public)
         if key == 0.0 or self._rate <= 0:
             return
         cells, now = self._cells, time.monotonic() if now is None else now

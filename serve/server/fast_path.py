@@ -10,7 +10,7 @@ from http import HTTPStatus
 from typing import Any
 
 from serve.api.features import FeaturesRequest
-from serve.api.http_io import Header, Reply, check_body_size, encode_head
+from serve.api.http_io import Header, Reply, encode_head
 from serve.api.problems import Problem
 from serve.api.request_options import Headers
 from serve.app import Service
@@ -31,7 +31,7 @@ class NullEvent:
 class DirectRequest:
     """A request in progress, with the attributes of uvicorn's RequestResponseCycle that it uses."""
 
-    __slots__ = ("disconnected", "features", "keep_alive", "parts", "response_complete", "size")
+    __slots__ = ("disconnected", "features", "keep_alive", "parts", "response_complete")
     message_event = NullEvent()
 
     def __init__(self, keep_alive: bool) -> None:
@@ -39,11 +39,16 @@ class DirectRequest:
         self.disconnected = self.response_complete = False
         self.features: FeaturesRequest | None = None
         self.parts: list[bytes | bytearray] = []
-        self.size = 0
 
     def add(self, part: bytes) -> None:
         """Add a part of the body, unless the request was refused."""
         if self.features is None:
+            return
+        try:
+            self.features.grow(len(part))
+        except Problem as problem:
+            self.features.refuse(problem)
+            self.drop()
             return
         last = self.parts[-1] if self.parts else None
         if len(part) >= SMALL_BYTES:
@@ -52,15 +57,11 @@ class DirectRequest:
             last += part
         else:
             self.parts.append(bytearray(part))
-        self.size += len(part)
-        try:
-            check_body_size(self.size)
-        except Problem as problem:
-            self.features.refuse(problem)
-            self.drop()
 
     def drop(self) -> None:
         """Let go of the body, and of what would reply: that and this object hold each other."""
+        if self.features is not None:
+            self.features.abandon()
         self.features = None
         self.parts.clear()
 
@@ -142,6 +143,7 @@ class DirectProtocol(GuardedProtocol):
             and (self.cycle is None or self.cycle.response_complete)
             and self.parser.get_http_version() == "1.1"
             and headers.keys().isdisjoint(ASGI_HEADERS)
+            and len(headers) == len(self.headers)  # none was sent twice
         )
 
     def _build_scope(self) -> None:

@@ -24,6 +24,7 @@ COMMITTED_GENERATION = 0  # head: the generation of weights that all workers ans
 
 WORKER_WORDS = 256
 HEARTBEAT, CONNECTIONS, WAITING, READY = 0, 1, 2, 3  # monotonic s; counts; 1.0 or 0.0
+BODY_BYTES = 4  # of bodies in flight
 MAX_OUTCOMES = 64
 STAGES, STAGE_WORDS = 4, 16
 FRAME_COUNTS = 8  # MAX_OUTCOMES counters: frames by outcome
@@ -106,7 +107,7 @@ class WorkerPeers:
 
     def withdraw(self) -> None:
         """Clear this worker's status: it takes no more connections."""
-        for cell in (HEARTBEAT, CONNECTIONS, WAITING, READY):
+        for cell in (HEARTBEAT, CONNECTIONS, WAITING, READY, BODY_BYTES):
             self._own[cell] = 0.0
 
     def other_connections(self) -> list[int]:

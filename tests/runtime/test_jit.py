@@ -52,3 +52,42 @@ def test_without_a_folder_to_write_to_a_temporary_one_serves(
     folder = code_folder("ours", package)
     assert folder.parent == package.parent
     assert os.access(folder, os.W_OK)
+
+
+def test_the_folder_is_the_users_alone(package: Path) -> None:
+    folder = code_folder("ours", package)
+    assert folder.stat().st_mode & 0o777 == 0o700
+    folder.chmod(0o755)  # as an older version made it
+    assert code_folder("ours", package) == folder
+    assert folder.stat().st_mode & 0o777 == 0o700
+
+
+def test_code_that_others_could_have_planted_is_not_read(package: Path) -> None:
+    folder = code_folder("ours", package)
+    (folder / "kernel.nbi").write_bytes(b"planted")
+    folder.chmod(0o777)
+    assert code_folder("ours", package) == folder
+    assert not list(folder.iterdir())
+    assert folder.stat().st_mode & 0o777 == 0o700
+
+
+@pytest.mark.parametrize("planted", ["link", "other"])
+def test_a_folder_of_another_user_or_a_link_is_not_used(
+    package: Path, monkeypatch: pytest.MonkeyPatch, planted: str
+) -> None:
+    known = code_folder("ours", package)
+    kept = package.parent / "theirs"
+    known.rename(kept)
+    (kept / "kernel.nbi").write_bytes(b"planted")
+    if planted == "link":
+        known.symlink_to(kept)
+    else:
+        kept.rename(known)
+        monkeypatch.setattr("os.getuid", lambda: known.stat().st_uid + 1)
+    found = code_folder("ours", package)
+    assert found != known
+    assert found.parent == Path(tempfile.gettempdir())
+    assert not list(found.iterdir())
+    assert found.stat().st_mode & 0o777 == 0o700
+    assert found != code_folder("ours", package)  # nobody can guess it
+    assert (known / "kernel.nbi").read_bytes() == b"planted"

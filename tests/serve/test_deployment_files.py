@@ -1,6 +1,7 @@
 """Dockerfile and manifests agree with the service: ports, paths, users, options."""
 
 import re
+import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -105,3 +106,30 @@ def test_serving_image_has_neither_torch_nor_simulator() -> None:
     )
     assert "USER driverview" in stage
     assert "HEALTHCHECK" in stage
+
+
+def test_images_get_every_package_and_only_files_of_known_hashes() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    packages = [n.rstrip("*") for n in project["tool"]["setuptools"]["packages"]["find"]["include"]]
+    sent = (ROOT / ".dockerignore").read_text().splitlines()
+    for package in packages:
+        assert f"COPY {package} {package}\n" in DOCKERFILE
+        assert f"!{package}" in sent
+    for path in re.findall(r"^COPY (?!--)(.+) \S+$", DOCKERFILE, flags=re.MULTILINE):
+        assert all(f"!{name}" in sent for name in path.split()), path
+    for name in ("requirements.lock", "deploy/uv.txt"):
+        pins = re.split(r"^(?=\S)", (ROOT / name).read_text(), flags=re.MULTILINE)[1:]
+        assert pins
+        assert all(re.match(r"\S+==\S+ \\\n +--hash=sha256:[0-9a-f]{64}", pin) for pin in pins)
+    assert DOCKERFILE.count("pip install") == DOCKERFILE.count("/wheels/requirements.lock") + 1
+    assert "--require-hashes --requirement /wheels/uv.txt" in DOCKERFILE
+    assert not re.findall(r"^FROM (?!\$\{PYTHON_IMAGE\}|base)", DOCKERFILE, flags=re.MULTILINE)
+
+
+def test_compose_bounds_memory_and_processes() -> None:
+    services = yaml.safe_load((DEPLOY / "compose.yaml").read_text())["services"]
+    for service in services.values():
+        assert service["mem_limit"]
+        assert service["pids_limit"] <= 256
+        assert service["cap_drop"] == ["ALL"]
+    assert services["serve"]["read_only"]

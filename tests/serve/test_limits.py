@@ -29,7 +29,7 @@ from tests.serve.conftest import (
 )
 
 JPEG = jpeg(picture())
-HEAD = b"POST /features HTTP/1.1\r\nHost: x\r\nContent-Type: image/jpeg\r\n"
+HEAD = b"POST /features HTTP/1.1\r\nHost: localhost\r\nContent-Type: image/jpeg\r\n"
 
 
 def limited(
@@ -138,7 +138,7 @@ def test_idle_connections_give_way_to_new_ones_longest_idle_first_served_clients
         served.sendall(HEAD + b"Content-Length: %d\r\n\r\n" % len(JPEG) + JPEG)
         assert served.recv(65536).startswith(b"HTTP/1.1 200")
         for connection in (*idle, idle[0]):
-            connection.sendall(b"GET /healthz HTTP/1.1\r\nHost: x\r\n\r\n")
+            connection.sendall(b"GET /healthz HTTP/1.1\r\nHost: localhost\r\n\r\n")
             received = b""
             while not received.endswith(b'{"status":"alive"}'):
                 received += connection.recv(65536)
@@ -149,7 +149,9 @@ def test_idle_connections_give_way_to_new_ones_longest_idle_first_served_clients
             assert ended == [expected]
             assert is_cut(expected)
             connections.remove(expected)
-            new[-1].sendall(b"GET /healthz HTTP/1.1\r\nHost: x\r\nContent-Length: 1\r\n\r\n")
+            new[-1].sendall(
+                b"GET /healthz HTTP/1.1\r\nHost: localhost\r\nContent-Length: 1\r\n\r\n"
+            )
             until(lambda: len(service.server.guard.receiving) == len(new))  # not idle
             assert len(service.server.server_state.connections) <= 5
         served.sendall(HEAD + b"Content-Length: %d\r\n\r\n" % len(JPEG) + JPEG)

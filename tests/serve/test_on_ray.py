@@ -19,6 +19,7 @@ from mtlnet.inference.model_card import golden_image, read_card
 from mtlnet.inference.prediction import decode_outputs
 from runtime.sockets import bind
 from serve.cli import main
+from serve.config import Limits
 from tests.serve.conftest import PATIENCE_S, png
 from tests.serve.test_cli import ROOT, command
 from tests.typed import typed
@@ -97,6 +98,25 @@ def answered(page: bytes) -> int:
     found = re.search(rb'frames_total{outcome="answered"} (\d+)', page)
     assert found is not None
     return int(found[1])
+
+
+def test_the_builder_asks_for_the_token(
+    published: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    on_ray_module = pytest.importorskip("serve.on_ray", reason="no ray[serve]")
+    bound: list[Limits] = []
+    monkeypatch.setattr(on_ray_module, "_bind", lambda _run, _count, limits: bound.append(limits))
+    model = {"model": str(published)}
+    on_ray_module.build(model)
+    monkeypatch.setenv("DRIVERVIEW_TOKEN", TOKEN)
+    on_ray_module.build({**model, "hosts": ["cam.example"]})
+    (tmp_path / "token").write_text(TOKEN[::-1])
+    on_ray_module.build({**model, "token_file": str(tmp_path / "token")})
+    assert [limits.token for limits in bound] == [None, TOKEN, TOKEN[::-1]]
+    assert bound[1].hosts == ("cam.example",)
+    monkeypatch.setenv("DRIVERVIEW_TOKEN", "short")
+    with pytest.raises(UserError, match="must be 16 or more"):
+        on_ray_module.build(model)
 
 
 def test_the_builder_refuses_unknown_options(published: Path) -> None:

@@ -5,25 +5,55 @@ end is found, so that a file appended to the image is detected.
 """
 
 import re
+from dataclasses import dataclass
 
 from mtlnet.inference.image_decoding.errors import Fault, ImageError
 
 START = b"\xff\xd8"
 SIGNATURE = b"\xff\xd8\xff"
 SOS, EOI = 0xDA, 0xD9
+FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # SOF0 to SOF15
+PROGRESSIVE_FRAMES = frozenset((0xC2, 0xC6, 0xCA, 0xCE))
 # In entropy-coded data FF 00 is a byte FF, FF D0 to D7 a restart marker, FF FF a fill byte.
 MARKER = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")
 MAX_SCANS = 100  # a progressive JPEG has about ten; each costs a pass over all pixels
 MAX_SEGMENTS = 1_000
+WINDOW_BYTES = 1 << 18  # searched at once; between two searches other threads may run
+FILL = re.compile(rb"\xff+")
 
 
-def jpeg_length(body: bytes) -> int:
-    """Length of the JPEG at the start of `body`, with its end marker. Raises ImageError."""
+@dataclass(frozen=True, slots=True)
+class JpegStructure:
+    """Length of a JPEG with its end marker, bytes, and the number of its scans."""
+
+    length: int
+    scans: int
+
+
+def is_progressive(body: bytes) -> bool:
+    """Whether the frame header, before the first scan, is of a progressive JPEG.
+
+    Raises ImageError. Takes 1 ms at worst.
+    """
+    at = len(START)
+    for _ in range(MAX_SEGMENTS):
+        at, marker = _marker(body, at)
+        if marker in FRAMES or marker in (SOS, EOI):
+            return marker in PROGRESSIVE_FRAMES
+        at += _length(body, at)
+    raise _too_many_parts()
+
+
+def read_structure(body: bytes) -> JpegStructure:
+    """The structure of the JPEG at the start of `body`. Raises ImageError.
+
+    Takes 10 ms a MiB at worst; up to WINDOW_BYTES of that in one step.
+    """
     at, scans = len(START), 0
     for _ in range(MAX_SEGMENTS):
         at, marker = _marker(body, at)
         if marker == EOI:
-            return at
+            return JpegStructure(at, scans)
         at += _length(body, at)
         if marker != SOS:
             continue
@@ -32,11 +62,8 @@ def jpeg_length(body: bytes) -> int:
             raise ImageError(
                 Fault.UNSUPPORTED, f"the JPEG has over {MAX_SCANS} scans; save it as baseline JPEG"
             )
-        found = MARKER.search(body, at)
-        if found is None:
-            raise _ends_early(body)
-        at = found.start()
-    raise ImageError(Fault.UNSUPPORTED, f"the JPEG has over {MAX_SEGMENTS} parts; save it anew")
+        at = _find_marker(body, at)
+    raise _too_many_parts()
 
 
 def _marker(body: bytes, at: int) -> tuple[int, int]:
@@ -47,11 +74,21 @@ def _marker(body: bytes, at: int) -> tuple[int, int]:
         raise ImageError(
             Fault.DAMAGED, f"the JPEG holds no marker at byte {at}, where one must be; save it anew"
         )
-    while body[at + 1] == 0xFF:
-        at += 1
-        if at + 2 > len(body):
-            raise _ends_early(body)
-    return at + 2, body[at + 1]
+    while (fill := FILL.match(body, at, at + WINDOW_BYTES)) is not None:
+        at = fill.end()
+    if at >= len(body):
+        raise _ends_early(body)
+    return at + 1, body[at]
+
+
+def _find_marker(body: bytes, at: int) -> int:
+    """Offset of the marker after the entropy-coded data at offset `at`."""
+    for start in range(at, len(body), WINDOW_BYTES):
+        # One byte more: a marker may lie on both sides of the end of a window.
+        found = MARKER.search(body, start, start + WINDOW_BYTES + 1)
+        if found is not None:
+            return found.start()
+    raise _ends_early(body)
 
 
 def _length(body: bytes, at: int) -> int:
@@ -59,6 +96,10 @@ def _length(body: bytes, at: int) -> int:
     if at + 2 > len(body) or length < 2 or at + length > len(body):
         raise _ends_early(body)
     return length
+
+
+def _too_many_parts() -> ImageError:
+    return ImageError(Fault.UNSUPPORTED, f"the JPEG has over {MAX_SEGMENTS} parts; save it anew")
 
 
 def _ends_early(body: bytes) -> ImageError:

@@ -1,11 +1,16 @@
 """Encoding and decoding of single images: sizes, kinds of JPEG, and damaged bytes."""
 
+import struct
+import zlib
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import simplejpeg
 from numpy.typing import NDArray
 
 from datagen.recording.images import decode_into, encode
+from datagen.recording.round_metadata import RoundHeader
 
 Image = NDArray[np.uint8]
 
@@ -89,3 +94,24 @@ def test_an_image_of_another_size_is_refused() -> None:
 def test_bytes_that_are_no_image_are_refused() -> None:
     with pytest.raises(ValueError, match="neither JPEG nor PNG: it starts with b'GIF8'"):
         decode_into(b"GIF89a", np.empty((42, 56, 3), np.uint8))
+
+
+@pytest.mark.parametrize("size", [(65534, 65534), (0, 0), (640, 479)])
+def test_a_png_is_not_decoded_unless_its_header_has_the_size_of_the_round(
+    size: tuple[int, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = np.zeros((480, 640, 3), np.uint8)
+    data = bytearray(encode(out, "png"))
+    data[16:24] = struct.pack(">II", *size)
+    data[29:33] = struct.pack(">I", zlib.crc32(data[12:29]))
+    monkeypatch.setattr("cv2.imdecode", None)  # it would allocate 12 GB
+    with pytest.raises(ValueError, match=f"it is {size[0]}x{size[1]} px, expected 640x480"):
+        decode_into(bytes(data), out)
+    with pytest.raises(ValueError, match="ends within its header"):
+        decode_into(bytes(data[:20]), out)
+    header = RoundHeader("a", 1, "oval", "", 1, 4.0, 0, "centre", ("clear",), 50.0)
+    header.validate()
+    camera = replace(header.camera, width=size[0], height=size[0])
+    if size[0] != 640:
+        with pytest.raises(ValueError, match="its header has an image size of"):
+            replace(header, camera=camera).validate()

@@ -16,7 +16,7 @@ from datagen.recording import Dataset
 from mtlnet.evaluation.tables import export_lines
 from mtlnet.export.convert import export_model
 from mtlnet.export.int8 import choose_float_activations, float_choices, gate
-from mtlnet.export.openvino_graph import TOLERANCE
+from mtlnet.export.openvino_graph import TOLERANCE, write_graph
 from mtlnet.inference.engine import EXPORT_FILE, INT8, load_engine, passed_gate
 from mtlnet.inference.model_card import (
     GRAPH,
@@ -26,7 +26,7 @@ from mtlnet.inference.model_card import (
     ModelError,
     read_card,
 )
-from mtlnet.model.network import load_network
+from mtlnet.model.network import Network, fold, load_network
 from mtlnet.training.config import TrainConfig
 from mtlnet.training.run import train
 from tests.mtlnet.conftest import require_close
@@ -203,3 +203,18 @@ def test_printed_lines_of_the_export_command() -> None:
     assert "on 64 frames: 0.0012 (coded), 0.03 (probability), computed in bf16" in lines[1]
     assert "angle +0.00120" in lines[2]
     assert lines[3] == "accuracy gate FAILED by angle: engines do not take int8 by default"
+
+
+def test_a_published_graph_is_on_the_disk_before_it_has_its_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    synced: list[tuple[str, list[str]]] = []
+
+    def record(path: Path) -> None:
+        synced.append((path.name, sorted(found.name for found in tmp_path.iterdir())))
+
+    monkeypatch.setattr("mtlnet.export.openvino_graph.fsync_path", record)
+    write_graph(fold(Network()), tmp_path / "model.xml", tmp_path / "model.bin")
+    staged, named = ["staged.bin", "staged.xml"], ["model.bin", "model.xml"]
+    assert sorted(synced[:2]) == [("staged.bin", staged), ("staged.xml", staged)]
+    assert synced[2:] == [(tmp_path.name, named)]

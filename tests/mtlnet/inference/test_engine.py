@@ -154,3 +154,12 @@ def test_a_damaged_uncertainty_head_is_refused(copy: Path) -> None:
     (copy / "doubt.safetensors").write_bytes(b"rubbish")
     with pytest.raises(ModelError, match=r"doubt\.safetensors is damaged"):
         load_engine(copy, "torch")
+
+
+@pytest.mark.parametrize("key", ["name", "files"])
+def test_names_in_a_card_lead_out_of_no_folder(copy: Path, key: str) -> None:
+    content = json.loads((copy / "card.json").read_text())
+    content[key] = "../x" if key == "name" else {**content["files"], "../../x": "0" * 64}
+    (copy / "card.json").write_text(json.dumps(content))
+    with pytest.raises(ModelError, match="expected a name of letters"):
+        load_engine(copy)

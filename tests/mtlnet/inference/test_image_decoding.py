@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from mtlnet.inference.image_decoding.crop import Box, crop_box
 from mtlnet.inference.image_decoding.decode import decode, inspect
 from mtlnet.inference.image_decoding.errors import Fault, ImageError
-from mtlnet.inference.image_decoding.jpeg_structure import jpeg_length
+from mtlnet.inference.image_decoding.jpeg_structure import read_structure
 from trackfeatures.camera import CameraParameters
 
 VIEW = CameraParameters()
@@ -162,7 +162,7 @@ def test_a_progressive_jpeg_and_fill_bytes_are_read() -> None:
     image = picture()
     options = [cv2.IMWRITE_JPEG_PROGRESSIVE, 1, cv2.IMWRITE_JPEG_RST_INTERVAL, 2]
     body = cv2.imencode(".jpg", image, options)[1].tobytes()
-    assert jpeg_length(body) == len(body)
+    assert read_structure(body).length == len(body)
     filled = body[:2] + b"\xff" * 5 + body[2:]
     assert np.array_equal(pixels(filled), pixels(body))
 

@@ -172,7 +172,7 @@ def test_a_client_that_disconnects_during_its_body_causes_no_error(
 ) -> None:
     for _ in range(3):
         with socket.create_connection(("127.0.0.1", service.port)) as connection:
-            head = "POST /features HTTP/1.1\r\nHost: x\r\nContent-Type: image/jpeg\r\n"
+            head = "POST /features HTTP/1.1\r\nHost: localhost\r\nContent-Type: image/jpeg\r\n"
             begun = f"{head}Content-Length: {len(JPEG)}\r\n\r\n".encode() + JPEG[:99]
             connection.sendall(begun)
             service.wait_received(len(begun))

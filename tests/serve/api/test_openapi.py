@@ -80,7 +80,7 @@ def test_the_document_lists_every_operation_and_refusal(running: Served) -> None
     post = document["paths"]["/features"]["post"]
     assert post["requestBody"]["required"]
     assert set(post["requestBody"]["content"]) == {"image/jpeg", "image/png"}
-    refused = {"400", "401", "406", "408", "413", "415", "422", "429", "431", "500", "503"}
+    refused = {"400", "401", "403", "406", "408", "413", "415", "422", "429", "431", "500", "503"}
     assert set(post["responses"]) == {"200"} | refused
     for status, response in post["responses"].items():
         good = {"application/json", "application/msgpack"}

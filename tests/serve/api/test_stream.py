@@ -128,7 +128,8 @@ def test_a_message_that_is_too_long_closes_its_websocket_only(service: Served) -
 def test_a_client_that_is_still_sending_receives_the_close_frame(service: Served) -> None:
     with socket.create_connection(("127.0.0.1", service.port), PATIENCE_S) as connection:
         connection.sendall(
-            b"GET /stream HTTP/1.1\r\nhost: x\r\nupgrade: websocket\r\nconnection: upgrade\r\n"
+            b"GET /stream HTTP/1.1\r\nhost: localhost\r\n"
+            b"upgrade: websocket\r\nconnection: upgrade\r\n"
             b"sec-websocket-version: 13\r\nsec-websocket-key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n"
         )
         assert connection.recv(65536).startswith(b"HTTP/1.1 101")

@@ -85,7 +85,7 @@ def silent_connections(target: Target, count: int = MANY) -> list[socket.socket]
 
 def slow_headers(target: Target, count: int = MANY) -> list[socket.socket]:
     """Connections that never end their headers."""
-    return _each(target, count, b"POST /features HTTP/1.1\r\nHost: x\r\nX-Slow: ")
+    return _each(target, count, b"POST /features HTTP/1.1\r\nHost: localhost\r\nX-Slow: ")
 
 
 def slow_bodies(target: Target, count: int = MANY) -> list[socket.socket]:
@@ -146,7 +146,7 @@ def upgrade_floods(target: Target, count: int = 8) -> list[socket.socket]:
 
 def tunnels(target: Target, count: int = 64) -> list[socket.socket]:
     """CONNECT, as to a proxy."""
-    return _each(target, count, b"CONNECT 127.0.0.1:22 HTTP/1.1\r\nHost: x\r\n\r\n" * 3)
+    return _each(target, count, b"CONNECT 127.0.0.1:22 HTTP/1.1\r\nHost: localhost\r\n\r\n" * 3)
 
 
 def frames_before_the_handshake(target: Target, count: int = 64) -> list[socket.socket]:

@@ -215,5 +215,5 @@ def test_without_tracing_no_exporter_is_loaded_or_endpoint_wrapped(service: Serv
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.stdout == "set()\n", done.stderr
     assert type(service.app.frames) is FrameHandler
-    kind = {b"content-type": b"image/jpeg"}
+    kind = {b"host": b"localhost", b"content-type": b"image/jpeg"}
     assert type(service.app.open(kind, "127.0.0.1", lambda _reply: None)) is FeaturesRequest

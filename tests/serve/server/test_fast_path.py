@@ -30,7 +30,7 @@ from tests.serve.conftest import (
 )
 
 JPEG = jpeg(picture())
-HEAD = b"POST /features HTTP/1.1\r\nHost: x\r\nContent-Type: image/jpeg\r\n"
+HEAD = b"POST /features HTTP/1.1\r\nHost: localhost\r\nContent-Type: image/jpeg\r\n"
 WHOLE = HEAD + b"Content-Length: %d\r\n\r\n" % len(JPEG) + JPEG
 
 
@@ -131,7 +131,7 @@ def test_replies_come_in_the_order_of_their_requests(service: Served) -> None:
         return HEAD + length + b"X-Frame-Id: %d\r\n\r\n" % number + image
 
     connection = dial(service)
-    probe = b"GET /healthz HTTP/1.1\r\nHost: x\r\n\r\n"
+    probe = b"GET /healthz HTTP/1.1\r\nHost: localhost\r\n\r\n"
     connection.sendall(request(1) + request(2) + probe + request(3, b"no image") + request(4))
     found = read(connection, 5)
     assert [status for status, _ in found] == [200, 200, 200, 422, 200]
@@ -183,7 +183,7 @@ def test_a_client_that_reads_no_replies_is_read_no_more(service: Served) -> None
     client.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 16)
     client.setblocking(False)
     pad = b"X-Pad: " + b"x" * 2100  # one part received then holds no more than MAX_AT_ONCE
-    request = b"POST /features HTTP/1.1\r\nHost: x\r\n%b\r\nContent-Length: 0\r\n\r\n" % pad
+    request = b"POST /features HTTP/1.1\r\nHost: localhost\r\n%b\r\nContent-Length: 0\r\n\r\n" % pad
     until(lambda: len(service.server.server_state.connections) == 1)
     (connection,) = service.server.server_state.connections
     assert isinstance(connection, DirectProtocol)

@@ -1,0 +1,362 @@
+"""Requests that cost more than they look: time of the event loop, of the engine, and memory."""
+
+import base64
+import http.client
+import json
+import socket
+import threading
+import time
+import tracemalloc
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing, suppress
+
+import cv2
+import numpy as np
+import pytest
+
+from mtlnet.inference.image_decoding.decode import (
+    LATE_CHECK_BYTES,
+    MAX_SCANNED_PX,
+    decode,
+    inspect,
+)
+from mtlnet.inference.image_decoding.errors import ImageError
+from mtlnet.inference.image_decoding.jpeg_structure import WINDOW_BYTES, read_structure
+from serve.api.kserve_tensors import Tensor, find_pixels, parse_request, read_image_bytes
+from serve.api.problems import Problem
+from serve.config import MAX_BODY_BYTES, Limits
+from serve.scheduling.admission import MAX_CLIENT_MS, MAX_PENDING_MS, PRESENT_NS, Admission
+from serve.scheduling.body_budget import BodyBudget, BodyShare
+from serve.workers.shared_memory import create_shared_memory
+from tests.serve.conftest import (
+    CARD,
+    PATIENCE_S,
+    FakeEngine,
+    Gate,
+    Served,
+    assert_problem,
+    jpeg,
+    picture,
+    png,
+    serving,
+    until,
+)
+
+JPEG = jpeg(picture())
+LOOP_S = 0.02  # for which one request may hold the event loop
+TRIES = 5  # the quickest counts: other programs run on this machine
+INFER = "/v2/models/track/infer"
+
+
+def held_s(work: Callable[[], object]) -> float:
+    """The processor time of `work`, s, which may end with a refusal."""
+    times = []
+    for _ in range(TRIES):
+        start = time.thread_time()
+        with suppress(Problem, ImageError):
+            work()
+        times.append(time.thread_time() - start)
+    return min(times)
+
+
+def scan(data: bytes, size: int = MAX_BODY_BYTES) -> bytes:
+    """A JPEG whose scan is followed by `data` again and again, `size` bytes in all."""
+    start = JPEG[:-2]
+    return start + (data * (size // len(data)))[: size - len(start)]
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        b"\xff\xd8" + b"\xff" * (MAX_BODY_BYTES - 2),
+        JPEG[:2] + b"\xff" * (MAX_BODY_BYTES - len(JPEG)) + JPEG[2:],
+        scan(b"\xff\x00"),
+        scan(b"\xff"),
+        scan(b"\xff\xd0"),
+        scan(b"\xff\x00", WINDOW_BYTES),
+        scan(b"\xff", WINDOW_BYTES),
+        JPEG[:2] + b"\xff\xfe\x00\x02" * ((MAX_BODY_BYTES - len(JPEG)) // 4) + JPEG[2:],
+    ],
+    ids=["fill", "filled", "stuffed", "ff", "restarts", "small-stuffed", "small-ff", "comments"],
+)
+def test_no_jpeg_holds_the_event_loop(body: bytes) -> None:
+    assert held_s(lambda: inspect(body, CARD.camera)) < LOOP_S
+
+
+@pytest.mark.parametrize("at", [*range(WINDOW_BYTES - 4, WINDOW_BYTES + 4), 2 * WINDOW_BYTES - 1])
+def test_a_marker_across_two_windows_is_found(at: int) -> None:
+    head = b"\xff\xd8\xff\xda\x00\x02"
+    for data in (b"\x00", b"\xff"):
+        body = head + data * at + b"\xff\xd9"
+        found = read_structure(body)
+        assert (found.length, found.scans) == (len(body), 1)
+
+
+def test_scans_times_pixels_are_limited() -> None:
+    body = jpeg(np.full((2040, 4080, 3), 90, np.uint8))
+    assert inspect(body, CARD.camera, 90.0).scans == 1
+    many = MAX_SCANNED_PX // (2040 * 4080) + 1
+    repeated = body[:-2] + b"\xff\xda\x00\x02" * many + body[-2:]
+    assert len(repeated) < WINDOW_BYTES
+    with pytest.raises(ImageError, match="scans of 4080 x 2040 px"):
+        inspect(repeated, CARD.camera, 90.0)
+
+
+HEAD = '{"inputs":[{"name":"pixels","shape":[1,2,2,3],"datatype":"UINT8","data":'
+
+
+def filled(text: str, part: str, end: str) -> bytes:
+    return (text + part * ((MAX_BODY_BYTES - len(text) - len(end)) // len(part)) + end).encode()
+
+
+HOSTILE = {
+    "values": filled(HEAD + "[", "0,", "0]}]}"),
+    "allowed": filled(HEAD + "[", "10 ,", "0]}]}"),
+    "brackets": filled(HEAD + "[", "[9],", "0]}]}"),
+    "lists": filled(HEAD + "[", "[],", "0]}]}"),
+    "open": filled(HEAD, "[", ""),
+    "inputs": filled('{"inputs":[', "0,", "0]}"),
+    "objects": filled('{"inputs":[', "{},", "{}]}"),
+    "outputs": filled(HEAD + '[1]}],"outputs":[', '{"name":"std"},', '{"name":"std"}]}'),
+    "parameters": filled(HEAD + '[1]}],"parameters":{"a":[', "0,", "0]}}"),
+    "shape": filled('{"inputs":[{"name":"pixels","shape":[', "1,", "1]}]}"),
+    "unknown": filled('{"other":[', "0,", "0]}"),
+    "spaces": filled('{"inputs":', " ", "[]}"),
+    "name": filled('{"inputs":[{"name":"', "x", '"}]}'),
+}
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_no_inference_request_holds_the_event_loop_or_memory(name: str) -> None:
+    body = HOSTILE[name]
+    assert len(body) <= MAX_BODY_BYTES
+    assert held_s(lambda: parse_request(body, None)) < LOOP_S
+    tracemalloc.start()
+    try:
+        with suppress(Problem):
+            parse_request(body, None)
+        assert tracemalloc.get_traced_memory()[1] < 3 * MAX_BODY_BYTES
+    finally:
+        tracemalloc.stop()
+
+
+def test_a_large_image_in_base64_is_read() -> None:
+    sent = np.random.default_rng(0).bytes(3 * MAX_BODY_BYTES // 4 - 3000)
+    tensor = {"name": "image", "shape": [1, 1], "datatype": "BYTES"}
+    content = {"inputs": [{**tensor, "data": [[base64.b64encode(sent).decode()]]}]}
+    request, binary = parse_request(json.dumps(content).encode(), None)
+    assert read_image_bytes(request.input, binary) == sent
+    assert held_s(lambda: read_image_bytes(request.input, binary)) < 2 * LOOP_S
+
+
+def test_pixels_in_json_are_those_that_were_sent() -> None:
+    pixels = np.random.default_rng(0).integers(0, 256, (1, 200, 300, 3), np.uint8)
+    for text in (json.dumps(pixels.tolist()), json.dumps(pixels.ravel().tolist(), indent=0)):
+        tensor = Tensor("pixels", [1, 200, 300, 3], "UINT8", {}, text.encode())
+        found = find_pixels(tensor, memoryview(b""))
+        assert (found.height, found.width) == (200, 300)
+        assert np.array_equal(found.read(), pixels[0])
+    for wrong in (
+        b"[1, 256]",
+        b"[-1]",
+        b"[true]",
+        b'["1"]',
+        b"[1.5]",
+        b"[null]",
+        b'"1,2"',
+        b"[{}]",
+    ):
+        with pytest.raises(Problem, match=r"integers from 0 to 255"):
+            find_pixels(Tensor("pixels", [1, 1, 3], "UINT8", {}, wrong), memoryview(b"")).read()
+
+
+def test_a_length_of_many_zeros_is_no_fault_of_the_service(service: Served) -> None:
+    for length in ("0" * 5000, "0" * 21, "9" * 20):
+        headers = {"Inference-Header-Content-Length": length}
+        assert service.ask("POST", INFER, b"{}", headers).status == 422
+
+
+def test_a_full_queue_reads_no_inference_request() -> None:
+    gate = Gate()
+    with serving(gate.engine, limits=Limits(queue=0)) as service, ThreadPoolExecutor(1) as pool:
+        first = pool.submit(Served(service.port).post, JPEG)
+        until(gate.busy.is_set)
+        with socket.create_connection(("127.0.0.1", service.port), PATIENCE_S) as connection:
+            head = f"POST {INFER} HTTP/1.1\r\nHost: localhost\r\nContent-Length: 1000000\r\n\r\n"
+            connection.sendall(head.encode())  # and no body
+            assert connection.recv(65536).startswith(b"HTTP/1.1 503")
+        gate.open.set()
+        assert first.result().status == 200
+
+
+LARGE = png(np.zeros((2048, 4096, 4), np.uint16), cv2.IMWRITE_PNG_COMPRESSION, 9)
+
+
+def post_from(address: str, service: Served, body: bytes) -> tuple[int, bytes]:
+    """The status and the body of the answer to an image sent from an address of this machine."""
+    with closing(
+        http.client.HTTPConnection(
+            "127.0.0.1", service.port, timeout=PATIENCE_S, source_address=(address, 0)
+        )
+    ) as connection:
+        headers = {"Content-Type": "image/png", "X-Camera-Fov-Y": "90"}
+        connection.request("POST", "/features", body, headers)
+        response = connection.getresponse()
+        return response.status, response.read()
+
+
+def test_a_client_has_one_large_image_at_a_time() -> None:
+    assert len(LARGE) < 100_000
+    assert inspect(LARGE, CARD.camera, 90.0).decode_ms > 500
+    gate = Gate()
+    with serving(gate.engine) as service, ThreadPoolExecutor(2) as pool:
+        first = pool.submit(post_from, "127.0.0.2", service, LARGE)
+        until(gate.busy.is_set)
+        status, body = post_from("127.0.0.2", service, LARGE)
+        assert status == 503
+        assert b"/problems/overloaded" in body
+        assert b"of this client" in body
+        assert post_from("127.0.0.3", service, LARGE)[0] == 503  # 1.4 s are too much in all
+        small = pool.submit(Served(service.port).post, JPEG)
+        until(lambda: service.app.frame_queue.waiting == 1)
+        gate.open.set()
+        assert first.result()[0] == 200
+        assert small.result().status == 200
+        assert post_from("127.0.0.4", service, LARGE)[0] == 503  # the others are still there
+        until(lambda: post_from("127.0.0.4", service, LARGE)[0] == 200)
+
+
+def test_shares_of_the_engine() -> None:
+    admission, now = Admission(), 10**12
+    for _ in range(20):  # alone: as much as it likes, one after the other
+        admission.note("a", now)
+        admission.admit("a", 700.0, now)()
+        now += 700_000_000
+    admission.note("b", now)
+    admission.note("a", now)
+    with pytest.raises(Problem, match="would take 700 ms"):  # four frames of b do not fit
+        admission.admit("a", 700.0, now)
+    with pytest.raises(Problem, match="beyond this client's share") as caught:
+        admission.admit("a", 100.0, now)
+    assert caught.value.retry_after_ms == pytest.approx((700 - 0.25 * 700) / 0.25)
+    admission.admit("b", 100.0, now)()  # it has not had its share
+    later = now + PRESENT_NS
+    admission.note("a", later)
+    admission.admit("a", 700.0, later)()  # alone again
+
+    full = Admission()
+    done = [
+        full.admit(f"c{n}", MAX_CLIENT_MS, now) for n in range(int(MAX_PENDING_MS // MAX_CLIENT_MS))
+    ]
+    with pytest.raises(Problem, match="of all clients"):
+        full.admit("d", 40.0, now)
+    with pytest.raises(Problem, match="of this client"):
+        full.admit("c0", 40.0, now)
+    done[0]()
+    full.admit("d", 40.0, now)
+
+
+def test_the_shares_of_many_addresses_are_bounded() -> None:
+    admission = Admission()
+    for number in range(3000):
+        admission.admit(str(number), 100.0, number)()
+    assert len(admission._credit) <= 1024
+    assert not admission._client_ms
+
+
+def test_a_refused_image_of_a_stream_gives_its_admission_back() -> None:
+    gate = Gate()
+    with serving(gate.engine, limits=Limits(queue=0)) as service, ThreadPoolExecutor(1) as pool:
+        first = pool.submit(Served(service.port).post, JPEG)
+        until(gate.busy.is_set)
+        sent = {"X_Stream_Id": "cam", "X_Camera_Fov_Y": "90"}
+        for _ in range(3):
+            reply = service.post(LARGE, "image/png", **sent)
+            assert_problem(reply, 503, "overloaded")
+            assert "frames are waiting" in reply.content["detail"]
+        gate.open.set()
+        first.result()
+        until(lambda: service.post(LARGE, "image/png", **sent).status == 200)
+
+
+def begin(service: Served, size: int, path: str = "/features") -> socket.socket:
+    """A connection that has sent `size` bytes of a body of the largest size."""
+    connection = socket.create_connection(("127.0.0.1", service.port), PATIENCE_S)
+    head = f"POST {path} HTTP/1.1\r\nHost: localhost\r\nContent-Type: image/jpeg\r\n"
+    connection.sendall(f"{head}Content-Length: {MAX_BODY_BYTES}\r\n\r\n".encode())
+    connection.sendall(b"\0" * size)
+    return connection
+
+
+@pytest.mark.parametrize("path", ["/features", INFER])
+def test_bodies_in_flight_share_a_budget(engine: FakeEngine, path: str) -> None:
+    mib = 1 << 20
+    with serving(engine, limits=Limits(body_mib=8)) as service:
+        bodies = service.app.bodies
+        held = [begin(service, 3 * mib, path) for _ in range(2)]
+        until(lambda: bodies.held == 6 * mib)
+        assert service.post(JPEG).status == 200
+        with begin(service, 3 * mib, path) as refused:
+            assert refused.recv(65536).startswith(b"HTTP/1.1 503")
+        until(lambda: bodies.held == 6 * mib)
+        for connection in held:  # clients that leave in the middle of a body
+            connection.close()
+        until(lambda: bodies.held == 0)
+        assert service.post(JPEG).status == 200
+        assert_problem(service.post(b"\0" * 3 * mib), 422, "not-an-image")
+        assert service.ask("POST", INFER, b"\0" * 3 * mib).status == 422
+        assert bodies.held == 0
+
+
+def test_workers_share_the_budget() -> None:
+    shared = create_shared_memory(2)
+    one, other = (BodyBudget(shared, block, 1000) for block in range(2))
+    share = BodyShare(one)
+    share.grow(600)
+    with pytest.raises(Problem, match="bodies in flight"):
+        BodyShare(other).grow(500)
+    assert other.held == 0
+    share.close()
+    share.close()
+    BodyShare(other).grow(500)
+    assert (one.held, other.held) == (0, 500)
+    assert BodyBudget(shared, 1, 1000).held == 0  # a new worker in the place of the other
+    BodyShare(one).grow(900)
+
+
+def test_many_large_bodies_at_once_hold_no_more_than_the_budget() -> None:
+    gate = Gate()
+    with serving(gate.engine, limits=Limits(body_mib=8, queue=64)) as service:
+        most = 0
+        threads = [
+            threading.Thread(target=post_from, args=(f"127.0.1.{n}", service, b"\0" * 4_000_000))
+            for n in range(1, 11)
+        ]
+        for thread in threads:
+            thread.start()
+        while any(thread.is_alive() for thread in threads):
+            most = max(most, service.app.bodies.held)
+            time.sleep(0.001)
+        assert 0 <= most <= 8 << 20
+        assert service.app.bodies.held == 0
+        gate.open.set()
+
+
+def test_the_scans_of_a_large_file_are_checked_when_it_is_decoded() -> None:
+    noise = np.random.default_rng(0).integers(0, 256, (720, 960, 3), np.uint8)
+    done, progressive = cv2.imencode(".jpg", noise, [cv2.IMWRITE_JPEG_PROGRESSIVE, 1])
+    assert done
+    for body, scans in ((jpeg(noise), 1), (progressive.tobytes(), 10)):
+        assert len(body) > LATE_CHECK_BYTES
+        header = inspect(body, CARD.camera)
+        assert (header.checked, header.scans) == (False, scans)
+        assert decode(body, header, CARD.camera).shape == (210, 280, 3)
+        with pytest.raises(ImageError, match="follow the end of the image"):
+            decode(body + b"x" * 100, header, CARD.camera)
+        with pytest.raises(ImageError, match="before its end marker"):
+            decode(body[:-2], header, CARD.camera)
+    body = jpeg(noise)
+    many = body[:-2] + b"\xff\xda\x00\x02" * 4 + body[-2:]
+    with pytest.raises(ImageError, match="5 scans, a sequential one has 4"):
+        decode(many, inspect(many, CARD.camera), CARD.camera)

@@ -1,0 +1,38 @@
+"""Names that come from files, such as the id of a round: safe as a part of a path.
+
+A dataset or a model may come from a stranger. A name read from it must never lead out of the
+folder in which a file of that name is written or deleted.
+"""
+
+import re
+
+from trackfeatures.errors import UserError
+
+MAX_LENGTH = 128  # characters
+NAME = re.compile(rf"[A-Za-z0-9._-]{{1,{MAX_LENGTH}}}")
+OTHER = re.compile(r"[^A-Za-z0-9._-]")
+
+
+class BadName(UserError, ValueError):
+    """A name with characters that no name may have."""
+
+
+def is_name(value: object) -> bool:
+    """Whether `value` is text of letters, digits, `.`, `_` and `-` (ASCII), not `.` or `..`."""
+    return isinstance(value, str) and NAME.fullmatch(value) is not None and value not in (".", "..")
+
+
+def require_name(value: object, what: str) -> str:
+    """`value`, if it is a name; else raises BadName. `what`: what the name is of, as "round id"."""
+    if not is_name(value):
+        raise BadName(
+            f"the {what} is {str(value)[:80]!r}; expected a name of letters, digits, '.', '_' and "
+            f"'-', {MAX_LENGTH} characters at most"
+        )
+    return str(value)
+
+
+def to_name(text: str) -> str:
+    """`text` with `-` for every character that a name may not have."""
+    found = OTHER.sub("-", text)[:MAX_LENGTH]
+    return found if is_name(found) else "unnamed"
