@@ -114,7 +114,11 @@ def test_raw_binary_in_and_out(service: Served, engine: FakeEngine) -> None:
         (BINARY, b"\xff" * len(RAW), "invalid-request"),
         ({"inputs": [image(data=["aGVsbG8="])]}, None, "not-an-image"),
         (
-            {"inputs": [{"name": "pixels", "shape": [2, 2, 3], "datatype": "UINT8", "data": [0]}]},
+            {
+                "inputs": [
+                    {"name": "pixels", "shape": [16, 16, 3], "datatype": "UINT8", "data": [0]}
+                ]
+            },
             None,
             "invalid-request",
         ),
@@ -126,7 +130,12 @@ def test_raw_binary_in_and_out(service: Served, engine: FakeEngine) -> None:
         (
             {
                 "inputs": [
-                    {"name": "pixels", "shape": [1, 1, 3], "datatype": "UINT8", "data": [256]}
+                    {
+                        "name": "pixels",
+                        "shape": [16, 16, 3],
+                        "datatype": "UINT8",
+                        "data": [256] * 768,
+                    }
                 ]
             },
             None,
