@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from controllers.config import DemoConfig, DriveConfig
+from controllers.rl.cli import train
 from runtime import cli as command
 
 if TYPE_CHECKING:
@@ -19,7 +20,7 @@ DRIVE, DEMO = DriveConfig(), DemoConfig()
 app = typer.Typer(add_completion=False, rich_markup_mode="rich", no_args_is_help=True)
 
 ControllerName = Annotated[
-    str, typer.Option(help="lqr, or torcs: the control law of the reference laps.")
+    str, typer.Option(help="lqr, torcs: the control law of the reference laps, rl, rl-stacked, or a folder of `train`.")
 ]
 Track = Annotated[str, typer.Option(help="Its name (`simulator tracks`) or file.")]
 Lanes = Annotated[int, typer.Option(help="1, 2 or 3.")]
@@ -132,6 +133,9 @@ def demo(
             f"the limit is missed for {', '.join(missed)}; a slower machine needs more --minutes "
             "(with another --out)"
         )
+
+
+app.command()(train)
 
 
 def _drive_with_progress(config: DriveConfig) -> "DriveResult":

@@ -2,9 +2,12 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
 from controllers.interface import Controller
 from controllers.lqr import WEIGHTS_EXACT, WEIGHTS_PERCEIVED, Lqr
+from controllers.rl.actor import is_actor
+from controllers.rl.controller import load_controller, shipped_controller
 from controllers.torcs_feedback import StateFeedback
 from trackfeatures.errors import UserError
 
@@ -22,11 +25,16 @@ class LoopConfig:
 CONTROLLERS: dict[str, Callable[[LoopConfig], Controller]] = {
     "lqr": lambda loop: Lqr(loop.dt, WEIGHTS_PERCEIVED if loop.noisy else WEIGHTS_EXACT),
     "torcs": lambda loop: StateFeedback(),
+    "rl": lambda loop: shipped_controller("rl"),
+    "rl-stacked": lambda loop: shipped_controller("rl-stacked"),
 }
 
 
 def make_controller(name: str, loop: LoopConfig) -> Controller:
-    """The controller `name`. Raises UserError where there is none of that name."""
+    """The controller `name`, or the trained actor in the folder `name`. Raises UserError where
+    there is none of that name."""
+    if name not in CONTROLLERS and is_actor(Path(name)):
+        return load_controller(Path(name))
     if name not in CONTROLLERS:
         raise UserError(f"there is no controller {name!r}; use one of: {', '.join(CONTROLLERS)}")
     return CONTROLLERS[name](loop)

@@ -31,8 +31,6 @@ class Progress:
     """Mean of the critics' losses over the last episode."""
     evaluated: int = 0
     """Step of the last drive."""
-    saved: int = 0
-    """Step of the last checkpoint."""
     best_score: float = float("-inf")
     best_step: int = 0
     curve: list[Row] = field(default_factory=list)
@@ -78,4 +76,8 @@ def load_checkpoint(run: Path, agent: Agent) -> Progress | None:
 
 def _parameters(agent: Agent) -> dict[str, NDArray[np.float32]]:
     """The agent's arrays by name, as they are, not copied."""
-    return dict(agent.learner._asdict())
+    return {
+        f"{name}.{part}": getattr(networks, part)
+        for name, networks in (("actor", agent.actor), ("critics", agent.critics))
+        for part in ("theta", "target", "moments")
+    }

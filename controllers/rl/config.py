@@ -102,7 +102,7 @@ class TrainConfig:
     actor_rate: float | None = None
     critic_rate: float | None = None
     evaluate_every: int = 20_000
-    checkpoint_every: int = 50_000
+    """Steps between two drives; a checkpoint is written after each."""
     tracks_dir: Path | None = None
 
 

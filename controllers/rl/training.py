@@ -40,11 +40,14 @@ from trackfeatures.errors import UserError
 
 PAPER_EPISODE_STEPS = 6500
 RANDOM_EPISODE_STEPS = 400
+PAPER_STARTS = 0.1
+"""Share of episodes from the paper's start among those from random ones."""
+BEND_CHOICE, BEND_AHEAD_M = 3, 40.0
 CONFIG, CURVE = "config.json", "curve.csv"
 COLUMNS = ("step", "seconds", "episodes", "loss", "score_per_step", "mean_abs_d_m", "max_abs_d_m")
 
-Report = Callable[[int, int, float | None], None]
-"""Called with the steps done, the steps in all, and the best score a step so far."""
+Report = Callable[[int, float], None]
+"""Called with the steps done and the best score a step so far, -inf before the first drive."""
 
 
 def train(config: TrainConfig, report: Report | None = None) -> dict[str, Any]:
@@ -55,8 +58,6 @@ def train(config: TrainConfig, report: Report | None = None) -> dict[str, Any]:
     """
     algorithm = _settings(config)
     find_state(config.state)
-    if config.steps < 1 or config.evaluate_every < 1 or config.checkpoint_every < 1:
-        raise UserError("steps, evaluate-every and checkpoint-every must be 1 or more")
     options: dict[str, Any] = {"noise": algorithm.state_noise, "tracks_dir": config.tracks_dir}
     env = gym.make(
         "driverview/LateralControl-v0", track=config.track, disable_env_checker=True, **options
@@ -109,8 +110,7 @@ class _Training:
     ) -> None:
         self._config, self._algorithm, self._env, self._report = config, algorithm, env, report
         self._state = find_state(config.state)
-        rates = (algorithm.actor_rate, algorithm.critic_rate)
-        self._agent = Agent(algorithm, self._state, rates, config.seed)
+        self._agent = Agent(algorithm, self._state, config.seed)
         self._progress = load_checkpoint(config.out, self._agent) or Progress()
         self._world: World = env.unwrapped.world  # type: ignore[attr-defined]
         self._started = time.monotonic() - self._progress.seconds
@@ -122,8 +122,6 @@ class _Training:
             last = progress.step >= config.steps
             if last or progress.step - progress.evaluated >= config.evaluate_every:
                 self._evaluate()
-            if last or progress.step - progress.saved >= config.checkpoint_every:
-                progress.saved = progress.step
                 save_checkpoint(config.out, self._agent, progress)
         return {
             "out": str(config.out),
@@ -154,7 +152,7 @@ class _Training:
             if len(agent.replay) >= algorithm.learning_starts:
                 losses.append(agent.update(rng, self._rate_share()))
             if self._report is not None and progress.step % 100 == 0:
-                self._report(progress.step, self._config.steps, progress.best_score)
+                self._report(progress.step, progress.best_score)
             if ended:
                 break
         progress.episode += 1
@@ -162,14 +160,17 @@ class _Training:
         progress.seconds = time.monotonic() - self._started
 
     def _start(self, rng: np.random.Generator) -> dict[str, float]:
-        """Reset options: none for the paper's start, else a random place and motion."""
-        if not self._algorithm.random_starts:
+        """Reset options: none for the paper's start, else a random place and motion, mostly ahead
+        of a bend: on forza the bends that leave no time are less than one step in a hundred."""
+        if not self._algorithm.random_starts or rng.random() < PAPER_STARTS:
             return {}
+        track = self._world.road.track
+        places = rng.uniform(0.0, track.length_m, BEND_CHOICE).tolist()
         return {
-            "s": rng.uniform(0.0, self._world.road.track.length_m),
-            "to_middle": float(np.clip(rng.normal(0.0, 0.7), -2.0, 2.0)),
-            "angle": float(np.clip(rng.normal(0.0, 0.08), -0.3, 0.3)),
-            "speed": rng.uniform(0.0, 26.0),
+            "s": max(places, key=lambda s: abs(track.curvature(s + BEND_AHEAD_M))),
+            "to_middle": float(np.clip(rng.normal(0.0, 0.5), -1.5, 1.5)),
+            "angle": float(np.clip(rng.normal(0.0, 0.05), -0.2, 0.2)),
+            "speed": rng.uniform(10.0, 22.0),
         }
 
     def _explore(self, action: float, rng: np.random.Generator) -> float:
@@ -210,7 +211,10 @@ class _Training:
     def _actor(self, score: float) -> Actor:
         """The target actor, an average over the last updates, which steers more evenly."""
         agent, algorithm, config = self._agent, self._algorithm, self._config
-        of = layers(agent.learner.actor_target.copy(), agent.shape)
+        weights = {
+            name: array[0].reshape(-1) if name[0] == "b" else array[0]
+            for name, array in layers(agent.actor.target.copy(), agent.shape)._asdict().items()
+        }
         card = ActorCard(
             state=config.state,
             parts=self._state.parts,
@@ -224,7 +228,7 @@ class _Training:
             step=self._progress.step,
             score_per_step=score,
         )
-        return Actor(card, {name: np.array(array) for name, array in vars(of).items()})
+        return Actor(card, weights | {"w3": weights["w3"][:, 0]})
 
 
 def _drive(actor: Actor, road: Road) -> DriveResult:

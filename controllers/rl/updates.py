@@ -1,135 +1,77 @@
-"""One update of DDPG or TD3 on a mini-batch, in place, as compiled code.
+"""One update of DDPG or TD3 on a mini-batch, in place.
 
 DDPG: Lillicrap et al. 2016 (the paper's equations of the critic's loss, its target and the actor's
 gradient). TD3 (Fujimoto et al. 2018) is the same with the smaller of two critics' targets, noise on
 the target's action, and an actor updated every second time.
 """
 
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from controllers.rl.networks import Matrix, Shape, Vector, backward, forward
-from runtime.jit import compiled
+from controllers.rl.networks import Array, Shape, backward, forward, initial, layers
 
-Moments = NDArray[np.float32]
 BETA_1, BETA_2, EPSILON = 0.9, 0.999, 1e-8  # Adam's usual ones
 
 
-class Batch(NamedTuple):
+@dataclass(frozen=True)
+class Batch:
     """B transitions. An ended one is followed by no more reward."""
 
-    states: Matrix  # (B, state)
-    actions: Vector  # (B,)
-    rewards: Vector  # (B,)
-    next_states: Matrix  # (B, state)
-    ended: Vector  # (B,), 1.0 or 0.0
+    states: Array  # (B, state)
+    actions: Array  # (B,)
+    rewards: Array  # (B,)
+    next_states: Array  # (B, state)
+    ended: Array  # (B,), 1.0 or 0.0
 
 
-class Learner(NamedTuple):
-    """The parameters of an actor and its critics, their targets, and Adam's moments."""
+class Trained:
+    """N networks of one shape, their target networks, and Adam's moments."""
 
-    actor: Vector  # (A,)
-    actor_target: Vector  # (A,)
-    actor_moments: Matrix  # (2, A)
-    critics: Matrix  # (critics, C)
-    critic_targets: Matrix  # (critics, C)
-    critic_moments: Moments  # (critics, 2, C)
+    def __init__(self, shape: Shape, count: int, rng: np.random.Generator) -> None:
+        self.theta = initial(shape, count, rng)
+        self.target = self.theta.copy()
+        self.moments = np.zeros((2, *self.theta.shape), np.float32)
+        self.layers = layers(self.theta, shape)
+        self.target_layers = layers(self.target, shape)
+        self._gradient = np.zeros_like(self.theta)
+        self.gradient = layers(self._gradient, shape)
 
+    def descend(self, rate: float, number: int) -> None:
+        """Adam's step `number` (from 1) along `gradient` with the learning rate `rate`."""
+        first, second = self.moments
+        first += (1.0 - BETA_1) * (self._gradient - first)
+        second += (1.0 - BETA_2) * (self._gradient * self._gradient - second)
+        size = np.sqrt(second / (1.0 - BETA_2**number))
+        size += EPSILON
+        self.theta -= (rate / (1.0 - BETA_1**number)) * first / size
 
-@compiled
-def adam(
-    theta: Vector, gradient: Vector, moments: Matrix, rate: float, number: int
-) -> None:
-    """Adam's step `number` (from 1) with the learning rate `rate`."""
-    one = np.float32(1.0)
-    beta_1, beta_2, epsilon = np.float32(BETA_1), np.float32(BETA_2), np.float32(EPSILON)
-    step = np.float32(rate / (1.0 - BETA_1**number))
-    correction = np.float32(1.0 / (1.0 - BETA_2**number))
-    first, second = moments[0], moments[1]
-    for i in range(theta.shape[0]):
-        g = gradient[i]
-        first[i] = beta_1 * first[i] + (one - beta_1) * g
-        second[i] = beta_2 * second[i] + (one - beta_2) * g * g
-        theta[i] -= step * first[i] / (np.sqrt(second[i] * correction) + epsilon)
+    def soft_update(self, tau: float) -> None:
+        """target <- tau theta + (1 - tau) target."""
+        self.target += tau * (self.theta - self.target)
 
 
-@compiled
-def soft_update(target: Vector, source: Vector, tau: float) -> None:
-    """target <- tau source + (1 - tau) target."""
-    share = np.float32(tau)
-    for i in range(target.shape[0]):
-        target[i] += share * (source[i] - target[i])
-
-
-@compiled
-def act(theta: Vector, shape: Shape, states: Matrix, z: Matrix, h2: Matrix) -> Vector:
-    """The actor's actions (B,) in [-1, 1]."""
-    out = np.empty(states.shape[0], np.float32)
-    forward(theta, shape, states, out, z, h2, out)
-    return np.tanh(out)
-
-
-@compiled
 def critic_update(
-    learner: Learner,
-    shape: Shape,
-    batch: Batch,
-    noise: Vector,
-    discount: float,
-    rate: float,
-    number: int,
+    actor: Trained, critics: Trained, batch: Batch, noise: Array, discount: float
 ) -> float:
-    """Move each critic towards r + discount Q'(s', mu'(s') + noise); returns the mean loss."""
-    count = batch.states.shape[0]
-    z = np.empty((count, shape[1] + 1), np.float32)
-    h2 = np.empty((count, shape[2]), np.float32)
-    q = np.empty(count, np.float32)
-    critic_shape = (shape[0], shape[1], shape[2], 1)
-    following = act(learner.actor_target, shape, batch.next_states, z[:, : shape[1]].copy(), h2)
-    for row in range(count):
-        wanted = following[row] + noise[row]
-        following[row] = min(max(wanted, np.float32(-1.0)), np.float32(1.0))
-    wanted_q = np.full(count, np.float32(np.inf))
-    for k in range(learner.critics.shape[0]):
-        forward(learner.critic_targets[k], critic_shape, batch.next_states, following, z, h2, q)
-        wanted_q = np.minimum(wanted_q, q)
-    wanted_q = (
-        batch.rewards + np.float32(discount) * (np.float32(1.0) - batch.ended) * wanted_q
-    )
-    gradient = np.empty(learner.critics.shape[1], np.float32)
-    unused = np.empty(count, np.float32)
-    loss = 0.0
-    for k in range(learner.critics.shape[0]):
-        theta = learner.critics[k]
-        forward(theta, critic_shape, batch.states, batch.actions, z, h2, q)
-        error = q - wanted_q
-        loss += float(np.mean(error * error)) / learner.critics.shape[0]
-        g_out = error * np.float32(2.0 / count)
-        backward(theta, critic_shape, batch.states, z, h2, g_out, gradient, unused)
-        adam(theta, gradient, learner.critic_moments[k], rate, number)
-    return loss
+    """Fill the critics' gradient towards r + discount min Q'(s', mu'(s') + noise); returns their
+    mean squared error."""
+    following = np.tanh(forward(actor.target_layers, batch.next_states).out[0])
+    following = np.clip(following + noise, -1.0, 1.0)
+    values = forward(critics.target_layers, batch.next_states, following).out.min(axis=0)
+    wanted = batch.rewards + discount * (1.0 - batch.ended) * values
+    seen = forward(critics.layers, batch.states, batch.actions)
+    error = seen.out - wanted
+    backward(critics.layers, seen, (2.0 / len(wanted)) * error, critics.gradient)
+    return float(np.mean(error * error))
 
 
-@compiled
-def actor_update(learner: Learner, shape: Shape, states: Matrix, rate: float, number: int) -> None:
-    """Move the actor along the gradient of the first critic's Q(s, mu(s))."""
-    count = states.shape[0]
-    critic_shape = (shape[0], shape[1], shape[2], 1)
-    z = np.empty((count, shape[1]), np.float32)
-    h2 = np.empty((count, shape[2]), np.float32)
-    actions = act(learner.actor, shape, states, z, h2)
-    critic_z = np.empty((count, shape[1] + 1), np.float32)
-    critic_h2 = np.empty((count, shape[2]), np.float32)
-    q = np.empty(count, np.float32)
-    slope = np.empty(count, np.float32)
-    critic = learner.critics[0]
-    forward(critic, critic_shape, states, actions, critic_z, critic_h2, q)
-    descent = np.full(count, np.float32(-1.0 / count))
-    unused = np.empty(critic.shape[0], np.float32)
-    backward(critic, critic_shape, states, critic_z, critic_h2, descent, unused, slope)
-    g_out = slope * (np.float32(1.0) - actions * actions)
-    gradient = np.empty(learner.actor.shape[0], np.float32)
-    backward(learner.actor, shape, states, z, h2, g_out, gradient, q)
-    adam(learner.actor, gradient, learner.actor_moments, rate, number)
+def actor_update(actor: Trained, critics: Trained, shape: Shape, states: Array) -> None:
+    """Fill the actor's gradient, down which the first critic's Q(s, mu(s)) grows."""
+    seen = forward(actor.layers, states)
+    actions = np.tanh(seen.out)
+    first = layers(critics.theta[:1], shape)
+    judged = forward(first, states, actions[0])
+    descent = np.full_like(actions, -1.0 / len(states))
+    slope = backward(first, judged, descent, None)[:, :, -1]
+    backward(actor.layers, seen, slope * (1.0 - actions * actions), actor.gradient)
