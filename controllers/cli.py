@@ -20,7 +20,10 @@ DRIVE, DEMO = DriveConfig(), DemoConfig()
 app = typer.Typer(add_completion=False, rich_markup_mode="rich", no_args_is_help=True)
 
 ControllerName = Annotated[
-    str, typer.Option(help="lqr, torcs: the control law of the reference laps, rl, rl-stacked, or a folder of `train`.")
+    str,
+    typer.Option(
+        help="lqr, torcs: the control law of the reference laps, rl, rl-stacked, or a folder of `train`."
+    ),
 ]
 Track = Annotated[str, typer.Option(help="Its name (`simulator tracks`) or file.")]
 Lanes = Annotated[int, typer.Option(help="1, 2 or 3.")]
