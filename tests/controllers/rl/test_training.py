@@ -131,7 +131,7 @@ def test_a_damaged_checkpoint_is_named(tmp_path: Path) -> None:
     train(short(tmp_path / "run", steps=200))
     path = tmp_path / "run" / "checkpoint.safetensors"
     path.write_bytes(path.read_bytes()[:1000])
-    with pytest.raises(UserError, match="checkpoint .* cannot be read"):
+    with pytest.raises(UserError, match=r"checkpoint .* cannot be read"):
         train(short(tmp_path / "run", steps=200))
 
 
