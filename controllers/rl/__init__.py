@@ -20,7 +20,7 @@ on the state; discount 0.97, tau 0.005, learning rates that fall to 2 %; a const
 from the reward (after an end, too, so the optimal policy stays the same) and the rest times 10;
 networks' inputs divided by their typical spread; left and right exchanged in half of the
 transitions and an actor that is odd by construction; episodes of 400 steps from random places and
-motions, mostly ahead of a bend.
+motions.
 
 The paper's state holds neither the curvature nor the yaw rate. With `--state stacked` (the shipped
 `rl-stacked`) the actor also sees the yaw rate, the changes since the last step and its last two

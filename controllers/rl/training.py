@@ -7,6 +7,7 @@ between episodes, so a training resumed from one gives the same actor as one nev
 """
 
 import json
+import math
 import time
 from collections.abc import Callable
 from dataclasses import asdict, replace
@@ -41,7 +42,6 @@ PAPER_EPISODE_STEPS = 6500
 RANDOM_EPISODE_STEPS = 400
 PAPER_STARTS = 0.1
 """Share of episodes from the paper's start among those from random ones."""
-BEND_CHOICE, BEND_AHEAD_M = 3, 40.0
 CONFIG, CURVE = "config.json", "curve.csv"
 COLUMNS = ("step", "seconds", "episodes", "loss", "score_per_step", "mean_abs_d_m", "max_abs_d_m")
 
@@ -71,13 +71,18 @@ def train(config: TrainConfig, report: Report | None = None) -> dict[str, Any]:
 
 def _settings(config: TrainConfig) -> Algorithm:
     """The algorithm's settings, with those that `config` changes."""
-    given = {
-        "state_noise": config.state_noise,
-        "actor_rate": config.actor_rate,
-        "critic_rate": config.critic_rate,
-    }
     algorithm = find_algorithm(config.algorithm)
-    return replace(algorithm, **{k: v for k, v in given.items() if v is not None})  # type: ignore[arg-type]
+    noise, actor, critic = config.state_noise, config.actor_rate, config.critic_rate
+    algorithm = replace(
+        algorithm,
+        state_noise=algorithm.state_noise if noise is None else noise,
+        actor_rate=algorithm.actor_rate if actor is None else actor,
+        critic_rate=algorithm.critic_rate if critic is None else critic,
+    )
+    for rate in (algorithm.actor_rate, algorithm.critic_rate):
+        if not 0.0 < rate < math.inf:
+            raise UserError(f"the learning rate {rate} is out of range; give one above 0")
+    return algorithm
 
 
 def _prepare_folder(config: TrainConfig) -> None:
@@ -159,17 +164,14 @@ class _Training:
         progress.seconds = time.monotonic() - self._started
 
     def _start(self, rng: np.random.Generator) -> dict[str, float]:
-        """Reset options: none for the paper's start, else a random place and motion, mostly ahead
-        of a bend: on forza the bends that leave no time are less than one step in a hundred."""
+        """Reset options: none for the paper's start, else a random place and motion."""
         if not self._algorithm.random_starts or rng.random() < PAPER_STARTS:
             return {}
-        track = self._world.road.track
-        places = rng.uniform(0.0, track.length_m, BEND_CHOICE).tolist()
         return {
-            "s": max(places, key=lambda s: abs(track.curvature(s + BEND_AHEAD_M))),
-            "to_middle": float(np.clip(rng.normal(0.0, 0.5), -1.5, 1.5)),
-            "angle": float(np.clip(rng.normal(0.0, 0.05), -0.2, 0.2)),
-            "speed": rng.uniform(10.0, 22.0),
+            "s": rng.uniform(0.0, self._world.road.track.length_m),
+            "to_middle": float(np.clip(rng.normal(0.0, 0.7), -2.0, 2.0)),
+            "angle": float(np.clip(rng.normal(0.0, 0.08), -0.3, 0.3)),
+            "speed": rng.uniform(0.0, 22.0),
         }
 
     def _explore(self, action: float, rng: np.random.Generator) -> float:

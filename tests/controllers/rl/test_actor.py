@@ -96,7 +96,9 @@ def test_a_mirrored_state_is_that_of_the_mirrored_road(name: str) -> None:
         for seen in (SEEN, mirrored)
     )
     assert len(definition.spread) == len(definition.odd) == definition.size == len(state)
-    assert np.array_equal(state[list(definition.order)] * np.float32(definition.odd), other)
+    assert np.array_equal(
+        state[list(definition.order)] * np.array(definition.odd, np.float32), other
+    )
 
 
 def test_an_actor_is_two_relu_layers_and_tanh() -> None:
@@ -107,7 +109,7 @@ def test_an_actor_is_two_relu_layers_and_tanh() -> None:
     assert actor.steer(state) == pytest.approx(np.tanh(hidden @ of["w3"] + of["b3"])[0], abs=1e-6)
     divided = state / np.array(PAPER.spread, np.float32)
     assert an_actor(scaled=True).steer(state) == pytest.approx(actor.steer(divided), abs=1e-4)
-    mirrored = state[list(PAPER.order)] * np.float32(PAPER.odd)
+    mirrored = state[list(PAPER.order)] * np.array(PAPER.odd, np.float32)
     half = 0.5 * (actor.steer(state) - actor.steer(mirrored))
     assert an_actor(odd=True).steer(state) == pytest.approx(half, abs=1e-6)
 

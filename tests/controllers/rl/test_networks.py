@@ -1,9 +1,11 @@
 """Networks and updates: shapes, where the action enters, gradients and Adam against torch's."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
-from controllers.rl.networks import Shape, backward, forward, initial, layers
+from controllers.rl.networks import Array, Shape, backward, forward, initial, layers
 from controllers.rl.updates import Batch, Trained, actor_update, critic_update
 
 torch = pytest.importorskip("torch")
@@ -11,11 +13,11 @@ RNG = np.random.default_rng(5)
 SHAPE = Shape(state=7, h1=6, h2=5, actions=1)
 
 
-def random(*shape: int) -> np.ndarray:
+def random(*shape: int) -> Array:
     return RNG.normal(size=shape).astype(np.float32)
 
 
-def torch_critic(of, states, actions):
+def torch_critic(of: list[Any], states: Any, actions: Any) -> Any:
     """The critic of one row, by torch."""
     w1, b1, w2, b2, w3, b3 = of
     hidden = torch.relu(states @ w1 + b1)
@@ -23,12 +25,13 @@ def torch_critic(of, states, actions):
     return (hidden @ w3 + b3)[:, 0]
 
 
-def torch_actor(of, states):
+def torch_actor(of: list[Any], states: Any) -> Any:
+    """The actor, by torch."""
     w1, b1, w2, b2, w3, b3 = of
     return torch.tanh(torch.relu(torch.relu(states @ w1 + b1) @ w2 + b2) @ w3 + b3)[:, 0]
 
 
-def as_torch(theta: np.ndarray, shape: Shape, row: int = 0):
+def as_torch(theta: Array, shape: Shape, row: int = 0) -> list[Any]:
     return [torch.tensor(a[row], requires_grad=True) for a in layers(theta, shape)]
 
 
@@ -44,7 +47,9 @@ def test_the_layers_fill_the_parameters() -> None:
 def test_the_action_enters_the_critics_last_hidden_layer() -> None:
     theta = initial(SHAPE, 1, RNG)
     states = random(3, 7)
-    low, high = (forward(layers(theta, SHAPE), states, np.full(3, a)) for a in (-1.0, 1.0))
+    low, high = (
+        forward(layers(theta, SHAPE), states, np.full(3, a, np.float32)) for a in (-1.0, 1.0)
+    )
     assert np.array_equal(low.z[:, :, :-1], high.z[:, :, :-1])
     assert np.array_equal(high.z[0, :, -1], np.ones(3))
     assert not np.array_equal(low.h2, high.h2)
@@ -100,8 +105,10 @@ def test_the_critics_target_is_the_smaller_one_and_nothing_follows_an_end() -> N
     actor = Trained(Shape(7, 6, 5), 1, RNG)
     critics = Trained(SHAPE, 2, RNG)
     critics.target[:] = RNG.normal(size=critics.target.shape)
-    batch = Batch(random(4, 7), random(4), random(4), random(4, 7), np.float32([0, 0, 0, 1]))
-    noise = np.float32([0.0, 0.1, -0.1, 5.0])
+    batch = Batch(
+        random(4, 7), random(4), random(4), random(4, 7), np.array([0, 0, 0, 1], np.float32)
+    )
+    noise = np.array([0.0, 0.1, -0.1, 5.0], np.float32)
     loss = critic_update(actor, critics, batch, noise, 0.9)
 
     follow = torch_actor(as_torch(actor.target, Shape(7, 6, 5)), torch.tensor(batch.next_states))

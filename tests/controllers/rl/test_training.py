@@ -7,6 +7,7 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,7 +20,7 @@ from tests.typed import typed
 from trackfeatures.errors import UserError
 
 
-def short(out: Path, **changes: object) -> TrainConfig:
+def short(out: Path, **changes: Any) -> TrainConfig:
     """A training of a few seconds."""
     config = TrainConfig(out=out, track="oval", steps=1500, evaluate_every=600, algorithm="td3")
     return replace(config, **changes)
@@ -163,6 +164,7 @@ def test_the_command_trains_and_drives(tmp_path: Path) -> None:
         (("--state", "pixels"), "no state 'pixels'; use one of: paper, stacked"),
         (("--track", "nowhere"), "no track 'nowhere'"),
         (("--state-noise", "-1"), "noise is -1"),
+        (("--actor-rate", "0"), "learning rate 0.0"),
     ],
 )
 def test_a_wrong_option_is_one_error_line(
