@@ -16,8 +16,8 @@ Deviations from the paper, and settings where it is silent:
   on the training track.
 
 `td3` differs further: two critics, target noise 0.02, an actor updated every second time; no noise
-on the state; discount 0.97, tau 0.005, learning rates that fall to 2 %; a constant of 1 subtracted
-from the reward (after an end, too, so the optimal policy stays the same) and the rest times 10;
+on the state; discount 0.95, tau 0.005, learning rates that fall to 5 %; a constant of 1 subtracted
+from the reward (after an end, too, so the optimal policy stays the same) and the rest times 4;
 networks' inputs divided by their typical spread; left and right exchanged in half of the
 transitions and an actor that is odd by construction; episodes of 400 steps from random places and
 motions.

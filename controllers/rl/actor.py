@@ -38,8 +38,8 @@ class ActorCard:
     """The numbers of the state, in their order."""
     half_width_m: float
     """Divides the lateral offset: half the width of the track trained on."""
-    scaled: bool
-    """The state is divided by its spread first."""
+    divisor: tuple[float, ...]
+    """Divides the numbers of the state before they enter the network."""
     odd: bool
     """The action is half the difference of those of the state and of its mirror image."""
     hidden: tuple[int, int]
@@ -61,8 +61,7 @@ class Actor:
         self.card = card
         self.weights = weights
         self.definition = find_state(card.state)
-        spread = self.definition.spread if card.scaled else (1.0,) * self.definition.size
-        self._w1 = (weights["w1"] / np.array(spread)[:, None]).astype(np.float32)
+        self._w1 = (weights["w1"] / np.array(card.divisor)[:, None]).astype(np.float32)
         self._order, self._signs = mirror_of(self.definition)
 
     def steer(self, state: Array) -> float:
@@ -121,7 +120,8 @@ def _read_card(path: Path) -> ActorCard:
                 f"{FORMAT}; train again"
             )
         tf.require_version(str(content.get("definitions_version")), f"the actor {path}")
-        content |= {"parts": tuple(content["parts"]), "hidden": tuple(content["hidden"])}
+        content |= {name: tuple(content[name]) for name in ("parts", "hidden", "divisor")}
+        content["divisor"] = tuple(map(float, content["divisor"]))
         card = ActorCard(**content)
     except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
         raise ActorError(f"the actor's card {path} cannot be read ({error!r})") from error
@@ -131,6 +131,10 @@ def _read_card(path: Path) -> ActorCard:
             f"the actor {path} was trained on the state {', '.join(card.parts)}; this program's "
             f"state {card.state!r} is {', '.join(definition.parts)}; train again"
         )
-    if not card.half_width_m > 0.0:
-        raise ActorError(f"the actor {path} has half_width_m = {card.half_width_m}; train again")
+    scales = (card.half_width_m, *card.divisor)
+    if len(scales) != 1 + definition.size or not min(scales) > 0.0:
+        raise ActorError(
+            f"the actor {path} divides by half_width_m {card.half_width_m} and {card.divisor}; it "
+            f"needs a number above 0 for each of {definition.size}; train again"
+        )
     return card

@@ -63,12 +63,12 @@ class Agent:
         self.replay = Replay(algorithm.replay, definition.size)
         self.updates = 0
         spread = np.array(definition.spread, np.float32)
-        self._divisor = spread if algorithm.scaled else np.ones_like(spread)
+        self.divisor = spread if algorithm.scaled else np.ones_like(spread)
         self._order, self._signs = mirror_of(definition)
 
     def see(self, state: Array) -> Array:
         """The networks' input for a state (size,)."""
-        return state / self._divisor
+        return state / self.divisor
 
     def act(self, seen: Array) -> float:
         """The present actor's action for a network's input."""

@@ -45,7 +45,7 @@ class StateDefinition:
 PAPER = StateDefinition(
     name="paper",
     parts=("d", "angle", "v_x", "v_y", "left", "straight", "right"),
-    spread=(0.05, 0.02, 1.0, 0.02, 1.0, 1.0, 1.0),
+    spread=(0.1, 0.04, 1.0, 0.04, 1.0, 1.0, 1.0),
     odd=(-1.0, -1.0, 1.0, -1.0, 1.0, 1.0, 1.0),
     order=(0, 1, 2, 3, 6, 5, 4),
 )
@@ -55,7 +55,7 @@ STACKED = StateDefinition(
         *("d", "angle", "v_x", "v_y", "turn", "yaw_rate"),
         *("d_change", "angle_change", "steer_1", "steer_2"),
     ),
-    spread=(0.05, 0.02, 1.0, 0.02, 1.0, 0.2, 0.01, 0.005, 0.2, 0.2),
+    spread=(0.1, 0.04, 1.0, 0.04, 1.0, 0.4, 0.02, 0.01, 0.4, 0.4),
     odd=(-1.0, -1.0, 1.0, -1.0, -1.0, -1.0, -1.0, -1.0, -1.0, -1.0),
     order=tuple(range(10)),
 )

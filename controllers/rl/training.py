@@ -220,7 +220,7 @@ class _Training:
             state=config.state,
             parts=self._state.parts,
             half_width_m=self._world.road.half_width,
-            scaled=algorithm.scaled,
+            divisor=tuple(agent.divisor.tolist()),
             odd=algorithm.mirrored,
             hidden=algorithm.hidden,
             algorithm=config.algorithm,

@@ -45,7 +45,7 @@ def an_actor(**changes: Any) -> Actor:
         state="paper",
         parts=PAPER.parts,
         half_width_m=5.0,
-        scaled=False,
+        divisor=(1.0,) * 7,
         odd=False,
         hidden=(6, 5),
         algorithm="ddpg",
@@ -108,14 +108,16 @@ def test_an_actor_is_two_relu_layers_and_tanh() -> None:
     hidden = np.maximum(np.maximum(state @ of["w1"] + of["b1"], 0) @ of["w2"] + of["b2"], 0)
     assert actor.steer(state) == pytest.approx(np.tanh(hidden @ of["w3"] + of["b3"])[0], abs=1e-6)
     divided = state / np.array(PAPER.spread, np.float32)
-    assert an_actor(scaled=True).steer(state) == pytest.approx(actor.steer(divided), abs=1e-4)
+    assert an_actor(divisor=PAPER.spread).steer(state) == pytest.approx(
+        actor.steer(divided), abs=1e-4
+    )
     mirrored = state[list(PAPER.order)] * np.array(PAPER.odd, np.float32)
     half = 0.5 * (actor.steer(state) - actor.steer(mirrored))
     assert an_actor(odd=True).steer(state) == pytest.approx(half, abs=1e-6)
 
 
 def test_an_actor_is_read_as_it_was_written(tmp_path: Path) -> None:
-    actor = an_actor(scaled=True)
+    actor = an_actor(divisor=PAPER.spread)
     save_actor(tmp_path, actor)
     read = load_actor(tmp_path)
     assert read.card == actor.card
@@ -144,7 +146,9 @@ WRONG = {
     "an unknown state": (change_card(state="pixels"), "no state 'pixels'"),
     "another version": (change_card(definitions_version="1"), "version"),
     "another format": (change_card(format=9), "format 9"),
-    "no width": (change_card(half_width_m=0.0), "half_width_m"),
+    "no width": (change_card(half_width_m=0.0), "half_width_m 0.0"),
+    "too few divisors": (change_card(divisor=(1.0, 2.0)), "each of 7"),
+    "words for numbers": (change_card(divisor=["a"] * 7), "cannot be read"),
     "a card of another program": (change_card(colour="red"), "cannot be read"),
     "no card's text": (lambda f: (f / "actor.json").write_text("[1"), "cannot be read"),
     "a list as card": (lambda f: (f / "actor.json").write_text("[1]"), "cannot be read"),
