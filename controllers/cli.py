@@ -22,7 +22,7 @@ app = typer.Typer(add_completion=False, rich_markup_mode="rich", no_args_is_help
 ControllerName = Annotated[
     str,
     typer.Option(
-        help="lqr; torcs, the control law of the reference laps; rl, rl-stacked or a folder of "
+        help="lqr; torcs, the control law of the reference laps; rl or a folder of "
         "`controllers train`, trained actors."
     ),
 ]

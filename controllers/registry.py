@@ -26,7 +26,6 @@ CONTROLLERS: dict[str, Callable[[LoopConfig], Controller]] = {
     "lqr": lambda loop: Lqr(loop.dt, WEIGHTS_PERCEIVED if loop.noisy else WEIGHTS_EXACT),
     "torcs": lambda loop: StateFeedback(),
     "rl": lambda loop: shipped_controller("rl"),
-    "rl-stacked": lambda loop: shipped_controller("rl-stacked"),
 }
 
 

@@ -68,7 +68,7 @@ class Agent:
 
     def see(self, state: Array) -> Array:
         """The networks' input for a state (size,)."""
-        return state / self.divisor
+        return np.asarray(state / self.divisor, np.float32)
 
     def act(self, seen: Array) -> float:
         """The present actor's action for a network's input."""
@@ -111,7 +111,7 @@ class Agent:
             return np.zeros(of.batch, np.float32)
         cut = TARGET_NOISE_CUT * of.target_noise
         drawn = of.target_noise * rng.standard_normal(of.batch, np.float32)
-        return np.clip(drawn, -cut, cut)
+        return np.asarray(np.clip(drawn, -cut, cut), np.float32)
 
     def _mirror(self, batch: Batch, chosen: NDArray[np.bool_]) -> None:
         """Exchange left and right in the chosen rows of `batch`."""

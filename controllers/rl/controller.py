@@ -29,5 +29,5 @@ def load_controller(folder: Path) -> RlController:
 
 
 def shipped_controller(name: str) -> RlController:
-    """One of the actors that ship with the project: `rl` or `rl-stacked`."""
+    """An actor that ships with the project: `rl`."""
     return load_controller(SHIPPED / name)

@@ -62,7 +62,8 @@ def critic_update(
     wanted = batch.rewards + discount * (1.0 - batch.ended) * values
     seen = forward(critics.layers, batch.states, batch.actions)
     error = seen.out - wanted
-    backward(critics.layers, seen, (2.0 / len(wanted)) * error, critics.gradient)
+    slope = np.asarray((2.0 / len(wanted)) * error, np.float32)
+    backward(critics.layers, seen, slope, critics.gradient)
     return float(np.mean(error * error))
 
 

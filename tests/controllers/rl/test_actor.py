@@ -28,11 +28,8 @@ from simulator.world.world import World
 from tests.typed import typed
 from trackfeatures import Heading
 
-SHA_256 = {
-    "rl": "",
-    "rl-stacked": "",
-}
-BOUNDS_M = {"rl": 0.5, "rl-stacked": 0.5}
+SHA_256 = {"rl": "52d19ea938e36c4b56a3f7ebd6cb011e64f21e9550201839ca10e2d2e05aca05"}
+BOUNDS_M = {"rl": 0.5}
 """Largest distance from the centre in the test's drive."""
 
 SEEN = Observation(0.5, -0.1, Heading.RIGHT, vx=15.0, vy=-0.2, yaw_rate=0.3)
@@ -55,8 +52,10 @@ def an_actor(**changes: Any) -> Actor:
         score_per_step=0.5,
     )
     shapes = {"w1": (7, 6), "b1": (6,), "w2": (6, 5), "b2": (5,), "w3": (5,), "b3": (1,)}
+    card = replace(card, **changes)
+    shapes["w1"] = (len(card.parts), 6)
     weights = {n: rng.normal(size=s).astype(np.float32) for n, s in shapes.items()}
-    return Actor(replace(card, **changes), weights)
+    return Actor(card, weights)
 
 
 def test_the_state_is_the_environments() -> None:
@@ -233,7 +232,7 @@ def test_an_update_takes_less_than_a_tenth_of_a_millisecond(name: str) -> None:
 
 
 def test_two_controllers_of_one_actor_do_not_share_their_past() -> None:
-    actor = load_actor(SHIPPED / "rl-stacked")
+    actor = an_actor(state="stacked", parts=STACKED.parts, divisor=STACKED.spread)
     first, second = RlController(actor), RlController(actor)
     steers = [first.update(SEEN) for _ in range(3)]
     assert steers[1] != steers[0]
