@@ -22,7 +22,6 @@ networks' inputs divided by their typical spread; left and right exchanged in ha
 transitions and an actor that is odd by construction; episodes of 400 steps from random places and
 motions.
 
-The paper's state holds neither the curvature nor the yaw rate. With `--state stacked` the actor also
-sees the yaw rate, the changes since the last step and its last two
-actions.
+The paper's state holds neither the curvature nor the yaw rate. With `--state stacked` the actor
+also sees the yaw rate, the changes since the last step and its last two actions.
 """
