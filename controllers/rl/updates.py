@@ -75,4 +75,5 @@ def actor_update(actor: Trained, critics: Trained, shape: Shape, states: Array) 
     judged = forward(first, states, actions[0])
     descent = np.full_like(actions, -1.0 / len(states))
     slope = backward(first, judged, descent, None)[:, :, -1]
-    backward(actor.layers, seen, slope * (1.0 - actions * actions), actor.gradient)
+    slope *= 1.0 - actions * actions
+    backward(actor.layers, seen, slope, actor.gradient)

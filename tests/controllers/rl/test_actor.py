@@ -19,7 +19,7 @@ import simulator.env  # noqa: F401 registers the environment
 from controllers.closed_loop import run_lap
 from controllers.interface import Observation
 from controllers.perception import truth
-from controllers.rl.actor import Actor, ActorCard, ActorError, load_actor, save_actor
+from controllers.rl.actor import Actor, ActorCard, ActorError, load_actor, mirror_of, save_actor
 from controllers.rl.controller import SHIPPED, RlController, shipped_controller
 from controllers.rl.state import PAPER, STACKED, STATES, StateBuilder, find_state, paper_state
 from simulator.track.catalogue import find_track
@@ -102,15 +102,16 @@ def test_a_mirrored_state_is_that_of_the_mirrored_road(name: str) -> None:
 
 def test_an_actor_is_two_relu_layers_and_tanh() -> None:
     actor = an_actor()
-    state = np.arange(7, dtype=np.float32) / 7
+    state = np.linspace(0.0, 0.9, 7, dtype=np.float32)
     of = {n: a.astype(np.float64) for n, a in actor.weights.items()}
     hidden = np.maximum(np.maximum(state @ of["w1"] + of["b1"], 0) @ of["w2"] + of["b2"], 0)
     assert actor.steer(state) == pytest.approx(np.tanh(hidden @ of["w3"] + of["b3"])[0], abs=1e-6)
-    divided = state / np.array(PAPER.spread, np.float32)
+    divided = np.asarray(state / np.array(PAPER.spread), np.float32)
     assert an_actor(divisor=PAPER.spread).steer(state) == pytest.approx(
         actor.steer(divided), abs=1e-4
     )
-    mirrored = state[list(PAPER.order)] * np.array(PAPER.odd, np.float32)
+    order, signs = mirror_of(PAPER)
+    mirrored = np.asarray(state[order] * signs, np.float32)
     half = 0.5 * (actor.steer(state) - actor.steer(mirrored))
     assert an_actor(odd=True).steer(state) == pytest.approx(half, abs=1e-6)
 
