@@ -8,6 +8,7 @@ import typer
 
 from controllers import compare_cli
 from controllers.config import DemoConfig, DriveConfig
+from controllers.rl.cli import train
 from runtime import cli as command
 
 if TYPE_CHECKING:
@@ -22,8 +23,8 @@ app = typer.Typer(add_completion=False, rich_markup_mode="rich", no_args_is_help
 ControllerName = Annotated[
     str,
     typer.Option(
-        help="lqr, lqr-preview, lqr-paper, mpc, mpc-preview, torcs, or your own class as "
-        "MODULE:CLASS or FILE.py:CLASS."
+        help="lqr, lqr-preview, lqr-paper, mpc, mpc-preview, rl, torcs, a folder of `controllers "
+        "train`, or your own class as MODULE:CLASS or FILE.py:CLASS."
     ),
 ]
 Track = Annotated[str, typer.Option(help="Its name (`simulator tracks`) or file.")]
@@ -161,6 +162,7 @@ def demo(
 
 app.command()(compare_cli.compare)
 app.command()(compare_cli.tune)
+app.command()(train)
 
 
 def _drive_with_progress(config: DriveConfig) -> "DriveResult":

@@ -15,6 +15,7 @@ from types import ModuleType
 from typing import Any
 
 from controllers.interface import Controller, LoopConfig
+from controllers.rl.actor import is_actor
 from trackfeatures.errors import UserError
 
 __all__ = ["CONTROLLERS", "ControllerEntry", "LoopConfig", "make_controller"]
@@ -56,6 +57,9 @@ CONTROLLERS: dict[str, ControllerEntry] = {
     "mpc-preview": ControllerEntry(
         "controllers.mpc:make_mpc_preview", "MPC that knows the curvature ahead", _MPC_WEIGHTS
     ),
+    "rl": ControllerEntry(
+        "controllers.rl.controller:make_rl", "trained by reinforcement on the paper's state"
+    ),
     "torcs": ControllerEntry(
         "controllers.torcs_feedback:make_torcs", "the control law of the reference laps"
     ),
@@ -65,11 +69,15 @@ CONTROLLERS: dict[str, ControllerEntry] = {
 def make_controller(
     name: str, loop: LoopConfig, parameters: Mapping[str, float] | None = None
 ) -> Controller:
-    """The controller `name`, or the class that MODULE:CLASS names, with `parameters` set.
+    """The controller `name`, a trained actor's folder, or a class as MODULE:CLASS, with `parameters`.
 
     Raises UserError for a name or parameter that does not exist, a module that cannot be imported,
     and a class that cannot be made without arguments or has no method `update`.
     """
+    if name not in CONTROLLERS and is_actor(Path(name)):
+        from controllers.rl.controller import load_controller
+
+        return load_controller(Path(name))
     if ":" in name:
         return _make_own(name, parameters)
     if name not in CONTROLLERS:

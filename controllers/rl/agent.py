@@ -1,0 +1,120 @@
+"""The learning agent: its actor and critics, its replay of transitions, and its updates."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from controllers.rl.actor import mirror_of
+from controllers.rl.config import Algorithm
+from controllers.rl.networks import Array, Shape, forward
+from controllers.rl.state import StateDefinition
+from controllers.rl.updates import Batch, Trained, actor_update, critic_update
+
+TARGET_NOISE_CUT = 2.5  # standard deviations, as TD3's 0.5 of 0.2
+
+
+class Replay:
+    """The last `capacity` transitions."""
+
+    def __init__(self, capacity: int, size: int) -> None:
+        self.states = np.zeros((capacity, size), np.float32)
+        self.next_states = np.zeros((capacity, size), np.float32)
+        self.results = np.zeros((capacity, 3), np.float32)
+        """Action, reward, and 1 where the episode ended."""
+        self.added = 0
+
+    def __len__(self) -> int:
+        return min(self.added, len(self.states))
+
+    def add(
+        self, state: Array, action: float, reward: float, following: Array, ended: bool
+    ) -> None:
+        place = self.added % len(self.states)
+        self.states[place], self.next_states[place] = state, following
+        self.results[place] = action, reward, ended
+        self.added += 1
+
+    def sample(self, places: NDArray[np.int64]) -> Batch:
+        """The transitions at `places` (B,), copied."""
+        results = self.results[places]
+        return Batch(
+            self.states[places],
+            results[:, 0].copy(),
+            results[:, 1].copy(),
+            self.next_states[places],
+            results[:, 2].copy(),
+        )
+
+
+class Agent:
+    """An actor and its critics; one `update` a control step."""
+
+    def __init__(
+        self,
+        algorithm: Algorithm,
+        definition: StateDefinition,
+        seed: int,
+    ) -> None:
+        rng = np.random.default_rng([seed, 0])
+        self.algorithm = algorithm
+        self.shape = Shape(definition.size, *algorithm.hidden)
+        self._critic_shape = Shape(definition.size, *algorithm.hidden, 1)
+        self.actor = Trained(self.shape, 1, rng)
+        self.critics = Trained(self._critic_shape, algorithm.critics, rng)
+        self.replay = Replay(algorithm.replay, definition.size)
+        self.updates = 0
+        spread = np.array(definition.spread, np.float32)
+        self.divisor = spread if algorithm.scaled else np.ones_like(spread)
+        self._order, self._signs = mirror_of(definition)
+
+    def see(self, state: Array) -> Array:
+        """The networks' input for a state (size,)."""
+        return np.asarray(state / self.divisor, np.float32)
+
+    def act(self, seen: Array) -> float:
+        """The present actor's action for a network's input."""
+        rows = seen[None]
+        if self.algorithm.mirrored:
+            rows = np.stack([seen, seen[self._order] * self._signs])
+        actions = np.tanh(forward(self.actor.layers, rows).out[0])
+        return float(0.5 * (actions[0] - actions[1]) if len(rows) == 2 else actions[0])
+
+    def remember(
+        self, seen: Array, action: float, reward: float, following: Array, ended: bool
+    ) -> None:
+        """Keep a transition. With a baseline, an end stands for the same rewards ever after."""
+        of = self.algorithm
+        value = reward - of.reward_baseline
+        if ended:
+            value -= of.reward_baseline * of.discount / (1.0 - of.discount)
+        self.replay.add(seen, action, of.reward_scale * value, following, ended)
+
+    def update(self, rng: np.random.Generator, rate_share: float) -> float:
+        """One update on a random mini-batch; returns the critics' loss."""
+        of = self.algorithm
+        batch = self.replay.sample(rng.integers(len(self.replay), size=of.batch))
+        if of.mirrored:
+            self._mirror(batch, rng.random(of.batch) < 0.5)
+        self.updates += 1
+        noise = self._target_noise(rng)
+        loss = critic_update(self.actor, self.critics, batch, noise, of.discount)
+        self.critics.descend(of.critic_rate * rate_share, self.updates)
+        if self.updates % of.actor_delay == 0:
+            actor_update(self.actor, self.critics, self._critic_shape, batch.states)
+            self.actor.descend(of.actor_rate * rate_share, self.updates // of.actor_delay)
+            self.actor.soft_update(of.tau)
+            self.critics.soft_update(of.tau)
+        return loss
+
+    def _target_noise(self, rng: np.random.Generator) -> Array:
+        of = self.algorithm
+        if not of.target_noise:
+            return np.zeros(of.batch, np.float32)
+        cut = TARGET_NOISE_CUT * of.target_noise
+        drawn = of.target_noise * rng.standard_normal(of.batch, np.float32)
+        return np.asarray(np.clip(drawn, -cut, cut), np.float32)
+
+    def _mirror(self, batch: Batch, chosen: NDArray[np.bool_]) -> None:
+        """Exchange left and right in the chosen rows of `batch`."""
+        for states in (batch.states, batch.next_states):
+            states[chosen] = states[chosen][:, self._order] * self._signs
+        batch.actions[chosen] *= -1.0

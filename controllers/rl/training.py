@@ -1,0 +1,243 @@
+"""Training an actor in the Gymnasium environment, with drives to judge it. Frame and units: SI.
+
+controllers train --algorithm td3 --track forza --seed 0 --out runs/rl
+
+An episode's random numbers come from the seed and its number alone, and a checkpoint is written
+between episodes, so a training resumed from one gives the same actor as one never stopped.
+"""
+
+import json
+import math
+import time
+from collections.abc import Callable
+from dataclasses import asdict, replace
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+import simulator.env  # noqa: F401 registers the environment
+from controllers.closed_loop import DriveResult, run_lap
+from controllers.drive import FREQUENCY_HZ, steps_for
+from controllers.perception import truth
+from controllers.rl.actor import Actor, ActorCard, save_actor
+from controllers.rl.agent import Agent
+from controllers.rl.checkpoint import Progress, load_checkpoint, save_checkpoint
+from controllers.rl.config import (
+    EXPLORATION_NOISE,
+    Algorithm,
+    TrainConfig,
+    exploration_share,
+    find_algorithm,
+)
+from controllers.rl.controller import RlController
+from controllers.rl.networks import layers
+from controllers.rl.state import StateBuilder, find_state
+from runtime.files import atomic_write, write_json
+from simulator.track.road import Road
+from simulator.world.world import World
+from trackfeatures.errors import UserError
+
+PAPER_EPISODE_STEPS = 6500
+RANDOM_EPISODE_STEPS = 400
+PAPER_STARTS = 0.1
+"""Share of episodes from the paper's start among those from random ones."""
+CONFIG, CURVE = "config.json", "curve.csv"
+COLUMNS = ("step", "seconds", "episodes", "loss", "score_per_step", "mean_abs_d_m", "max_abs_d_m")
+
+Report = Callable[[int, float], None]
+"""Called with the steps done and the best score a step so far, -inf before the first drive."""
+
+
+def train(config: TrainConfig, report: Report | None = None) -> dict[str, Any]:
+    """Train as `config` says, from the run's checkpoint where it has one.
+
+    Leaves the best actor (of the drives on the training track), `curve.csv` and `config.json` in
+    `config.out`. Raises UserError for an unknown name or a run of another configuration.
+    """
+    algorithm = _settings(config)
+    find_state(config.state)
+    options: dict[str, Any] = {"noise": algorithm.state_noise, "tracks_dir": config.tracks_dir}
+    env = gym.make(
+        "driverview/LateralControl-v0", track=config.track, disable_env_checker=True, **options
+    )
+    try:
+        _prepare_folder(config)
+        training = _Training(config, algorithm, env, report)
+        return training.run()
+    finally:
+        env.close()
+
+
+def _settings(config: TrainConfig) -> Algorithm:
+    """The algorithm's settings, with those that `config` changes."""
+    algorithm = find_algorithm(config.algorithm)
+    noise, actor, critic = config.state_noise, config.actor_rate, config.critic_rate
+    algorithm = replace(
+        algorithm,
+        state_noise=algorithm.state_noise if noise is None else noise,
+        actor_rate=algorithm.actor_rate if actor is None else actor,
+        critic_rate=algorithm.critic_rate if critic is None else critic,
+    )
+    for rate in (algorithm.actor_rate, algorithm.critic_rate):
+        if not 0.0 < rate < math.inf:
+            raise UserError(f"the learning rate {rate} is out of range; give one above 0")
+    return algorithm
+
+
+def _prepare_folder(config: TrainConfig) -> None:
+    """Make the run's folder, or check that it holds a run of the same configuration."""
+    path = config.out / CONFIG
+    content = json.loads(json.dumps(asdict(config), default=str))
+    if path.exists():
+        found = json.loads(path.read_text(encoding="utf-8"))
+        changed = [name for name in content if found.get(name) != content[name]]
+        if changed:
+            raise UserError(
+                f"{config.out} holds a training with another {', '.join(changed)}; give another "
+                "--out, or the same options to continue it"
+            )
+        return
+    config.out.mkdir(parents=True, exist_ok=True)
+    write_json(path, content)
+
+
+class _Training:
+    """The state of one training between episodes."""
+
+    def __init__(
+        self,
+        config: TrainConfig,
+        algorithm: Algorithm,
+        env: gym.Env[Any, Any],
+        report: Report | None,
+    ) -> None:
+        self._config, self._algorithm, self._env, self._report = config, algorithm, env, report
+        self._state = find_state(config.state)
+        self._agent = Agent(algorithm, self._state, config.seed)
+        self._progress = load_checkpoint(config.out, self._agent) or Progress()
+        self._world: World = env.unwrapped.world  # type: ignore[attr-defined]
+        self._started = time.monotonic() - self._progress.seconds
+
+    def run(self) -> dict[str, Any]:
+        progress, config = self._progress, self._config
+        while progress.step < config.steps:
+            self._episode()
+            last = progress.step >= config.steps
+            if last or progress.step - progress.evaluated >= config.evaluate_every:
+                self._evaluate()
+                save_checkpoint(config.out, self._agent, progress)
+        return {
+            "out": str(config.out),
+            "steps": progress.step,
+            "episodes": progress.episode,
+            "seconds": round(progress.seconds, 1),
+            "best_step": progress.best_step,
+            "best_score_per_step": progress.best_score,
+        }
+
+    def _episode(self) -> None:
+        """One episode, with one update a step once the replay holds enough."""
+        progress, algorithm, agent = self._progress, self._algorithm, self._agent
+        rng = np.random.default_rng([self._config.seed, 1, progress.episode])
+        paper, _ = self._env.reset(seed=int(rng.integers(2**31)), options=self._start(rng))
+        states = StateBuilder(self._state)
+        seen = agent.see(states.build(paper, self._world.state.yaw_rate))
+        limit = RANDOM_EPISODE_STEPS if algorithm.random_starts else PAPER_EPISODE_STEPS
+        losses: list[float] = []
+        for _ in range(min(limit, self._config.steps - progress.step)):
+            action = self._explore(agent.act(seen), rng)
+            paper, reward, ended, _, _ = self._env.step(np.array([action], np.float32))
+            states.steered(action)
+            following = agent.see(states.build(paper, self._world.state.yaw_rate))
+            agent.remember(seen, action, float(reward), following, ended)
+            seen = following
+            progress.step += 1
+            if len(agent.replay) >= algorithm.learning_starts:
+                losses.append(agent.update(rng, self._rate_share()))
+            if self._report is not None and progress.step % 100 == 0:
+                self._report(progress.step, progress.best_score)
+            if ended:
+                break
+        progress.episode += 1
+        progress.loss = float(np.mean(losses)) if losses else float("nan")
+        progress.seconds = time.monotonic() - self._started
+
+    def _start(self, rng: np.random.Generator) -> dict[str, float]:
+        """Reset options: none for the paper's start, else a random place and motion."""
+        if not self._algorithm.random_starts or rng.random() < PAPER_STARTS:
+            return {}
+        return {
+            "s": rng.uniform(0.0, self._world.road.track.length_m),
+            "to_middle": float(np.clip(rng.normal(0.0, 0.7), -2.0, 2.0)),
+            "angle": float(np.clip(rng.normal(0.0, 0.08), -0.3, 0.3)),
+            "speed": rng.uniform(0.0, 22.0),
+        }
+
+    def _explore(self, action: float, rng: np.random.Generator) -> float:
+        """`action`, with the paper's noise at the probability of this step."""
+        if rng.random() < exploration_share(self._progress.step):
+            action += self._algorithm.beta * EXPLORATION_NOISE * rng.standard_normal()
+        return min(max(action, -1.0), 1.0)
+
+    def _rate_share(self) -> float:
+        done = self._progress.step / self._config.steps
+        return 1.0 - (1.0 - self._algorithm.rate_end) * done
+
+    def _evaluate(self) -> None:
+        """Drive the training track without noise; keep the actor where it is the best so far."""
+        progress, config = self._progress, self._config
+        actor = self._actor(0.0)
+        result = _drive(actor, self._world.road)
+        if result.score_per_step > progress.best_score:
+            progress.best_score, progress.best_step = result.score_per_step, progress.step
+            save_actor(config.out, self._actor(result.score_per_step))
+        progress.evaluated = progress.step
+        progress.seconds = time.monotonic() - self._started
+        progress.curve.append(
+            (
+                progress.step,
+                round(progress.seconds, 1),
+                progress.episode,
+                progress.loss,
+                result.score_per_step,
+                result.mean_abs_d_m,
+                result.max_abs_d_m,
+            )
+        )
+        rows = [COLUMNS, *progress.curve]
+        text = "\n".join(",".join(map(str, row)) for row in rows)
+        atomic_write(config.out / CURVE, text + "\n")
+
+    def _actor(self, score: float) -> Actor:
+        """The target actor, an average over the last updates, which steers more evenly."""
+        agent, algorithm, config = self._agent, self._algorithm, self._config
+        weights = {
+            name: array[0].reshape(-1) if name[0] == "b" else array[0]
+            for name, array in layers(agent.actor.target.copy(), agent.shape)._asdict().items()
+        }
+        card = ActorCard(
+            state=config.state,
+            parts=self._state.parts,
+            half_width_m=self._world.road.half_width,
+            divisor=tuple(agent.divisor.tolist()),
+            odd=algorithm.mirrored,
+            hidden=algorithm.hidden,
+            algorithm=config.algorithm,
+            track=config.track,
+            seed=config.seed,
+            step=self._progress.step,
+            score_per_step=score,
+        )
+        return Actor(card, weights | {"w3": weights["w3"][:, 0]})
+
+
+def _drive(actor: Actor, road: Road) -> DriveResult:
+    """The drive of `controllers drive` on the truth."""
+    world = World(road, frequency_hz=FREQUENCY_HZ)
+    try:
+        world.reset(seed=0)
+        steps = steps_for(None, road.track.name, road.track.length_m)
+        return run_lap(world, RlController(actor), truth(0.0), steps)
+    finally:
+        world.close()
