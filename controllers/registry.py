@@ -69,7 +69,7 @@ CONTROLLERS: dict[str, ControllerEntry] = {
 def make_controller(
     name: str, loop: LoopConfig, parameters: Mapping[str, float] | None = None
 ) -> Controller:
-    """The controller `name`, a trained actor's folder, or a class as MODULE:CLASS, with `parameters`.
+    """The controller `name`, or a trained actor's folder, or MODULE:CLASS with `parameters`.
 
     Raises UserError for a name or parameter that does not exist, a module that cannot be imported,
     and a class that cannot be made without arguments or has no method `update`.

@@ -31,7 +31,7 @@ def load_controller(folder: Path) -> RlController:
 
 
 def make_rl(loop: LoopConfig) -> RlController:
-    """The actor that ships with the project, trained at 20 Hz. Raises UserError for another rate."""
+    """The actor that ships with the project, for 20 Hz; UserError for another rate."""
     if loop.dt != STEP_S:
         raise UserError(f"rl was trained for steps of {STEP_S:g} s, not {loop.dt:g}")
     return load_controller(SHIPPED / "rl")

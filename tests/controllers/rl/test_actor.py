@@ -201,7 +201,7 @@ def test_a_shipped_actor_drives_tracks_it_was_not_trained_on(name: str, track: s
 
 def test_the_shipped_actor_is_refused_at_another_rate() -> None:
     assert make_rl(LoopConfig(0.05)).update(SEEN) == load_controller(SHIPPED / "rl").update(SEEN)
-    with pytest.raises(UserError, match="trained for steps of 0.05 s, not 0.1"):
+    with pytest.raises(UserError, match=r"trained for steps of 0\.05 s, not 0\.1"):
         make_rl(LoopConfig(0.1))
 
 
@@ -217,8 +217,8 @@ def test_a_shipped_actor_gets_no_curvature() -> None:
 def test_driving_needs_no_torch_and_no_compiler() -> None:
     program = (
         "import sys; from controllers.rl.controller import make_rl; "
-        "from controllers.interface import Observation as O; "
-        "from controllers.interface import LoopConfig as L; print(make_rl(L(0.05)).update(O(.1, 0., 1, 15., 0., 0.)), "
+        "from controllers.interface import LoopConfig as L, Observation as O; "
+        "print(make_rl(L(0.05)).update(O(.1, 0., 1, 15., 0., 0.)), "
         "[m for m in ('torch', 'numba', 'gymnasium', 'pybullet') if m in sys.modules])"
     )
     done = subprocess.run(
