@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from controllers import compare_cli
+from controllers.compare import cli as compare_cli
 from controllers.config import DemoConfig, DriveConfig
 from controllers.rl.cli import train
 from runtime import cli as command

@@ -16,8 +16,8 @@ import numpy as np
 
 import trackfeatures as tf
 from controllers.closed_loop import DriveLog, DriveResult, run_lap
+from controllers.compare.disturbance import Disturbance
 from controllers.config import DriveConfig
-from controllers.disturbance import Disturbance
 from controllers.interface import LoopConfig
 from controllers.late_perception import LatePerception
 from controllers.perception import (

@@ -2,10 +2,11 @@
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import typer
 
+from mtlnet import cli_options as options
 from runtime.cli import main as run_command
 
 if TYPE_CHECKING:
@@ -17,175 +18,29 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     add_completion=False,
 )
-Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
-MODEL_HELP = 'Run folder, name in runs/, "latest", or "default" (the weights shipped).'
-Model = Annotated[str, typer.Option(help=MODEL_HELP)]
-EngineKind = Annotated[
-    str, typer.Option("--engine", help="openvino, or torch (float32, for comparison).")
-]
-Precision = Annotated[
-    str | None,
-    typer.Option(
-        help="int8 (after `mtlnet export`), bf16 or f32.  [default: int8 once it passed its gate, "
-        "else bf16 where the CPU computes in it]"
-    ),
-]
-Data = Annotated[Path, typer.Option(help="Dataset folder.")]
-
-# Options of `train`: None is the default of TrainConfig, or with --resume what the run has stored.
-TrainData = Annotated[
-    Path | None, typer.Option(help="Dataset folder.  [default: datasets/default]")
-]
-TrainOut = Annotated[Path | None, typer.Option(help="New run folder.  [default: runs/DATE-RECIPE]")]
-Alpha = Annotated[
-    str | None,
-    typer.Option(
-        help="Weights of the distance, angle and heading losses.  "
-        "[default: the network's, 0.3,0.2,0.5 for grid and mtl]"
-    ),
-]
-Network = Annotated[
-    str | None,
-    typer.Option(
-        help="grid, mtl (the paper's), deepdriving, mobilenet_v3_small, regnet_y_400mf.  "
-        "[default: grid, with recipe paper mtl]"
-    ),
-]
-Heads = Annotated[
-    str | None,
-    typer.Option(
-        help="bins (distributions) or coded (the paper's numbers).  [default: the network's]"
-    ),
-]
-Balance = Annotated[
-    str | None,
-    typer.Option(
-        help="Task weights: fixed (alpha), or found by uncertainty or dwa.  [default: fixed]"
-    ),
-]
-Init = Annotated[
-    str | None,
-    typer.Option(
-        help='Run to fine-tune, or "default"; --data may then be images with a labels.csv.'
-    ),
-]
-TrainRecipe = Annotated[
-    str | None,
-    typer.Option(
-        help="fast (minutes), paper (days), or tune (to fine-tune, with --init).  "
-        "[default: fast, with --init tune]"
-    ),
-]
-TrainIterations = Annotated[
-    int | None, typer.Option(help="Steps.  [default: the recipe's, unless --minutes is given]")
-]
-Minutes = Annotated[
-    float | None,
-    typer.Option(help="Duration of the training; the learning rate follows the time elapsed."),
-]
-Seed = Annotated[int | None, typer.Option(help="Seed of all random numbers.  [default: 0]")]
-TrainBatch = Annotated[int | None, typer.Option(help="Images a step.  [default: the recipe's]")]
-TrainDevice = Annotated[
-    str | None, typer.Option(help="auto, cpu, cuda or cuda:NUMBER.  [default: auto]")
-]
-TrainThreads = Annotated[int | None, typer.Option(help="CPU threads.  [default: one a core]")]
-SkipUndecodable = Annotated[
-    bool, typer.Option("--skip-undecodable", help="Omit images that cannot be decoded.")
-]
-Resume = Annotated[
-    bool,
-    typer.Option("--resume", help="Continue the stopped run in --out, or else the newest run."),
-]
-
-# Options of `ablate`.
-AblationOut = Annotated[
-    Path, typer.Option(help="Folder of the ablation; the same folder continues it.")
-]
-Iterations = Annotated[int, typer.Option(help="Steps of every run.")]
-Seeds = Annotated[str, typer.Option(help="Every row is trained with each of them.")]
-Recipe = Annotated[str, typer.Option(help="fast or paper.")]
-Backbone = Annotated[
-    str, typer.Option(help="Network to compare with: mobilenet_v3_small or regnet_y_400mf.")
-]
-Batch = Annotated[int, typer.Option(help="Images a step.")]
-AblationSplit = Annotated[str, typer.Option(help="Rounds to evaluate on: test or unseen.")]
-Every = Annotated[int, typer.Option(help="Evaluate every n-th frame only.", min=1)]
-Device = Annotated[str, typer.Option(help="auto, cpu, cuda or cuda:NUMBER.")]
-Threads = Annotated[int, typer.Option(help="CPU threads; 0: one a core.")]
-DryRun = Annotated[
-    bool, typer.Option("--dry-run", help="Print the plan and its estimated duration.")
-]
-
-# Options of `export` and `evaluate`.
-Format = Annotated[str, typer.Option("--format", help="onnx or openvino.")]
-ExportPrecision = Annotated[
-    str, typer.Option(help="f32, bf16 (weights in half the bytes) or int8 (openvino).")
-]
-CheckData = Annotated[
-    Path | None,
-    typer.Option(help="Dataset to check the export on.  [default: the training data]"),
-]
-ExportOut = Annotated[
-    Path | None, typer.Option(help="Folder.  [default: RUN/export/FORMAT-PRECISION]")
-]
-CheckFrames = Annotated[int, typer.Option(help="Number of frames to check the export on.")]
-Split = Annotated[str, typer.Option(help="train, test, unseen or all.")]
-ReportPage = Annotated[
-    Path | None, typer.Option("--report", help="HTML page to write: a file, or a folder.")
-]
-EveryFrame = Annotated[int, typer.Option(help="Evaluate every n-th frame only.")]
-WorstSheet = Annotated[
-    Path | None, typer.Option("--worst", help="JPEG to write: the frames of the largest errors.")
-]
-ShippedPicture = Annotated[
-    Path | None, typer.Option(help="JPEG for README.md, of `mtlnet evaluate --worst`.", exists=True)
-]
-ShipOut = Annotated[Path, typer.Option(help="Folder for the model.")]
-ShippedEvaluations = Annotated[
-    list[Path] | None,
-    typer.Option(help="Output of `mtlnet evaluate --json`, for README.md; several times."),
-]
-ShippedNotes = Annotated[
-    Path | None, typer.Option(help="Markdown for README.md, such as the commands.", exists=True)
-]
-PredictInputs = Annotated[
-    list[str],
-    typer.Argument(help="JPEG or PNG files, folders of them, patterns, films, rounds (.mcap)."),
-]
-PredictOut = Annotated[
-    list[Path] | None,
-    typer.Option(
-        help="Table (.csv, .jsonl), film (.mp4) or folder of pictures with the markings drawn in; "
-        "may be given several times."
-    ),
-]
-FieldOfView = Annotated[
-    float | None,
-    typer.Option(help="Vertical field of view of images and films, degrees.  [default: model's]"),
-]
 MAX_PRINTED = 40
 """Rows of the table that `predict` prints."""
 
 
 @app.command("train")
 def train_command(
-    data: TrainData = None,
-    out: TrainOut = None,
-    alpha: Alpha = None,
-    network: Network = None,
-    heads: Heads = None,
-    balance: Balance = None,
-    init: Init = None,
-    recipe: TrainRecipe = None,
-    iterations: TrainIterations = None,
-    minutes: Minutes = None,
-    seed: Seed = None,
-    batch: TrainBatch = None,
-    device: TrainDevice = None,
-    threads: TrainThreads = None,
-    skip_undecodable: SkipUndecodable = False,
-    resume: Resume = False,
-    as_json: Json = False,
+    data: options.TrainData = None,
+    out: options.TrainOut = None,
+    alpha: options.Alpha = None,
+    network: options.Network = None,
+    heads: options.Heads = None,
+    balance: options.Balance = None,
+    init: options.Init = None,
+    recipe: options.TrainRecipe = None,
+    iterations: options.TrainIterations = None,
+    minutes: options.Minutes = None,
+    seed: options.Seed = None,
+    batch: options.TrainBatch = None,
+    device: options.TrainDevice = None,
+    threads: options.TrainThreads = None,
+    skip_undecodable: options.SkipUndecodable = False,
+    resume: options.Resume = False,
+    as_json: options.Json = False,
 ) -> None:
     """Train the network on the train rounds of a dataset; the result is a model for `serve`."""
     from mtlnet.training.loss import parse_alpha
@@ -207,27 +62,27 @@ def train_command(
         "threads": threads,
         "skip_undecodable": skip_undecodable or None,
     }
-    options = {name: value for name, value in given.items() if value is not None}
-    result = start_training(options, out, resume=resume)
+    chosen = {name: value for name, value in given.items() if value is not None}
+    result = start_training(chosen, out, resume=resume)
     if as_json and result:
         typer.echo(json.dumps(result))
 
 
 @app.command("ablate")
 def ablate_command(
-    out: AblationOut,
-    iterations: Iterations,
-    data: Data = Path("datasets/default"),
-    seeds: Seeds = "1,2,3",
-    recipe: Recipe = "fast",
-    backbone: Backbone = "mobilenet_v3_small",
-    batch: Batch = 32,
-    split: AblationSplit = "test",
-    every: Every = 5,
-    device: Device = "auto",
-    threads: Threads = 0,
-    dry_run: DryRun = False,
-    as_json: Json = False,
+    out: options.AblationOut,
+    iterations: options.Iterations,
+    data: options.Data = Path("datasets/default"),
+    seeds: options.Seeds = "1,2,3",
+    recipe: options.Recipe = "fast",
+    backbone: options.Backbone = "mobilenet_v3_small",
+    batch: options.Batch = 32,
+    split: options.AblationSplit = "test",
+    every: options.Every = 5,
+    device: options.Device = "auto",
+    threads: options.Threads = 0,
+    dry_run: options.DryRun = False,
+    as_json: options.Json = False,
 ) -> None:
     """The ablation table of the paper: each task alone, MTL 1 to 4, and two other networks."""
     from mtlnet.evaluation.ablation import AblationConfig, ablation_rows, parse_seeds
@@ -243,13 +98,13 @@ def ablate_command(
 
 @app.command("export")
 def export_command(
-    model: Model = "default",
-    form: Format = "openvino",
-    precision: ExportPrecision = "f32",
-    data: CheckData = None,
-    out: ExportOut = None,
-    frames: CheckFrames = 64,
-    as_json: Json = False,
+    model: options.Model = "default",
+    form: options.Format = "openvino",
+    precision: options.ExportPrecision = "f32",
+    data: options.CheckData = None,
+    out: options.ExportOut = None,
+    frames: options.CheckFrames = 64,
+    as_json: options.Json = False,
 ) -> None:
     """Write a model as ONNX or OpenVINO, compared with torch; int8 must pass an accuracy gate."""
     from rich.console import Console
@@ -267,12 +122,12 @@ def export_command(
 
 @app.command("ship")
 def ship_command(
-    out: ShipOut,
-    model: Model = "default",
-    evaluation: ShippedEvaluations = None,
-    notes: ShippedNotes = None,
-    picture: ShippedPicture = None,
-    as_json: Json = False,
+    out: options.ShipOut,
+    model: options.Model = "default",
+    evaluation: options.ShippedEvaluations = None,
+    notes: options.ShippedNotes = None,
+    picture: options.ShippedPicture = None,
+    as_json: options.Json = False,
 ) -> None:
     """Write a model as weights alone, in float16: small enough for a repository.
 
@@ -295,15 +150,15 @@ def ship_command(
 
 @app.command("evaluate")
 def evaluate_command(
-    model: Model = "default",
-    data: Data = Path("datasets/default"),
-    split: Split = "test",
-    page: ReportPage = None,
-    worst: WorstSheet = None,
-    every: EveryFrame = 1,
-    engine: EngineKind = "openvino",
-    precision: Precision = None,
-    as_json: Json = False,
+    model: options.Model = "default",
+    data: options.Data = Path("datasets/default"),
+    split: options.Split = "test",
+    page: options.ReportPage = None,
+    worst: options.WorstSheet = None,
+    every: options.EveryFrame = 1,
+    engine: options.EngineKind = "openvino",
+    precision: options.Precision = None,
+    as_json: options.Json = False,
 ) -> None:
     """Errors in metres and radians on a dataset, beside those of the constant training mean."""
     import os
@@ -338,13 +193,13 @@ def evaluate_command(
 
 @app.command("predict")
 def predict_command(
-    images: PredictInputs,
-    model: Model = "default",
-    out: PredictOut = None,
-    fov_y_deg: FieldOfView = None,
-    engine: EngineKind = "openvino",
-    precision: Precision = None,
-    as_json: Json = False,
+    images: options.PredictInputs,
+    model: options.Model = "default",
+    out: options.PredictOut = None,
+    fov_y_deg: options.FieldOfView = None,
+    engine: options.EngineKind = "openvino",
+    precision: options.Precision = None,
+    as_json: options.Json = False,
 ) -> None:
     """Track features of images, films or recorded rounds; also as tables, pictures or a film."""
     from rich.console import Console

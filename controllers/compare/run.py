@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from controllers.compare.curves import CurveRecorder
+from controllers.compare.disturbance import DISTURBANCES, UNDISTURBED
 from controllers.config import CompareConfig, DriveConfig
-from controllers.disturbance import DISTURBANCES, UNDISTURBED
 from controllers.drive import drive, read_parameters
 from controllers.registry import LoopConfig, make_controller
 from runtime.files import write_json

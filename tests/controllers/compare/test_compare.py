@@ -13,11 +13,11 @@ import controllers.compare.run as comparison
 from controllers.compare.curves import CurveRecorder, quadratic_reward
 from controllers.compare.report import driving_curves, score_table, spread, write_report
 from controllers.compare.run import Cell, cells, compare
+from controllers.compare.tune import propose, tune
 from controllers.config import CompareConfig, TuneConfig
 from controllers.drive import read_parameters
 from controllers.perception import Perceived
 from controllers.torcs_feedback import STEERING_LOCK
-from controllers.tune import propose, tune
 from tests.controllers.test_drive import at_rest
 from tests.typed import typed
 from trackfeatures import Heading, UserError
@@ -205,7 +205,7 @@ def test_the_search_finds_better_parameters_and_goes_on_where_it_stopped(
             return -10.0
         return -sum(abs(math.log(value)) for value in parameters.values())
 
-    monkeypatch.setattr("controllers.tune.evaluate", evaluate)
+    monkeypatch.setattr("controllers.compare.tune.evaluate", evaluate)
     config = TuneConfig(out=tmp_path / "tuned.json", controllers="lqr,mpc", budget=60)
     content = tune(config)
     assert len(counted) == 120

@@ -136,7 +136,7 @@ def tune(
     """
     from rich.markup import escape
 
-    from controllers.tune import tune as run
+    from controllers.compare.tune import tune as run
 
     config = TuneConfig(
         out=out,

@@ -5,8 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from controllers.config import DriveConfig
-from controllers.disturbance import (
+from controllers.compare.disturbance import (
     ANGLE_NOISE_RAD,
     DISTURBANCES,
     GUST_M_S,
@@ -16,6 +15,7 @@ from controllers.disturbance import (
     NoisySensors,
     find_disturbance,
 )
+from controllers.config import DriveConfig
 from controllers.drive import drive
 from controllers.interface import Observation
 from simulator.track.catalogue import find_track

@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 
 from controllers.compare.curves import CurveRecorder
+from controllers.compare.disturbance import find_disturbance
 from controllers.compare.run import GRID_SHARE, names
 from controllers.config import DriveConfig, TuneConfig
-from controllers.disturbance import find_disturbance
 from controllers.drive import drive
 from controllers.registry import CONTROLLERS
 from runtime.files import check_folder, write_json

@@ -1,0 +1,153 @@
+"""The options of the `mtlnet` commands, in the order of the commands that have them."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
+MODEL_HELP = 'Run folder, name in runs/, "latest", or "default" (the weights shipped).'
+Model = Annotated[str, typer.Option(help=MODEL_HELP)]
+EngineKind = Annotated[
+    str, typer.Option("--engine", help="openvino, or torch (float32, for comparison).")
+]
+Precision = Annotated[
+    str | None,
+    typer.Option(
+        help="int8 (after `mtlnet export`), bf16 or f32.  [default: int8 once it passed its gate, "
+        "else bf16 where the CPU computes in it]"
+    ),
+]
+Data = Annotated[Path, typer.Option(help="Dataset folder.")]
+
+# Options of `train`: None is the default of TrainConfig, or with --resume what the run has stored.
+TrainData = Annotated[
+    Path | None, typer.Option(help="Dataset folder.  [default: datasets/default]")
+]
+TrainOut = Annotated[Path | None, typer.Option(help="New run folder.  [default: runs/DATE-RECIPE]")]
+Alpha = Annotated[
+    str | None,
+    typer.Option(
+        help="Weights of the distance, angle and heading losses.  "
+        "[default: the network's, 0.3,0.2,0.5 for grid and mtl]"
+    ),
+]
+Network = Annotated[
+    str | None,
+    typer.Option(
+        help="grid, mtl (the paper's), deepdriving, mobilenet_v3_small, regnet_y_400mf.  "
+        "[default: grid, with recipe paper mtl]"
+    ),
+]
+Heads = Annotated[
+    str | None,
+    typer.Option(
+        help="bins (distributions) or coded (the paper's numbers).  [default: the network's]"
+    ),
+]
+Balance = Annotated[
+    str | None,
+    typer.Option(
+        help="Task weights: fixed (alpha), or found by uncertainty or dwa.  [default: fixed]"
+    ),
+]
+Init = Annotated[
+    str | None,
+    typer.Option(
+        help='Run to fine-tune, or "default"; --data may then be images with a labels.csv.'
+    ),
+]
+TrainRecipe = Annotated[
+    str | None,
+    typer.Option(
+        help="fast (minutes), paper (days), or tune (to fine-tune, with --init).  "
+        "[default: fast, with --init tune]"
+    ),
+]
+TrainIterations = Annotated[
+    int | None, typer.Option(help="Steps.  [default: the recipe's, unless --minutes is given]")
+]
+Minutes = Annotated[
+    float | None,
+    typer.Option(help="Duration of the training; the learning rate follows the time elapsed."),
+]
+Seed = Annotated[int | None, typer.Option(help="Seed of all random numbers.  [default: 0]")]
+TrainBatch = Annotated[int | None, typer.Option(help="Images a step.  [default: the recipe's]")]
+TrainDevice = Annotated[
+    str | None, typer.Option(help="auto, cpu, cuda or cuda:NUMBER.  [default: auto]")
+]
+TrainThreads = Annotated[int | None, typer.Option(help="CPU threads.  [default: one a core]")]
+SkipUndecodable = Annotated[
+    bool, typer.Option("--skip-undecodable", help="Omit images that cannot be decoded.")
+]
+Resume = Annotated[
+    bool,
+    typer.Option("--resume", help="Continue the stopped run in --out, or else the newest run."),
+]
+
+# Options of `ablate`.
+AblationOut = Annotated[
+    Path, typer.Option(help="Folder of the ablation; the same folder continues it.")
+]
+Iterations = Annotated[int, typer.Option(help="Steps of every run.")]
+Seeds = Annotated[str, typer.Option(help="Every row is trained with each of them.")]
+Recipe = Annotated[str, typer.Option(help="fast or paper.")]
+Backbone = Annotated[
+    str, typer.Option(help="Network to compare with: mobilenet_v3_small or regnet_y_400mf.")
+]
+Batch = Annotated[int, typer.Option(help="Images a step.")]
+AblationSplit = Annotated[str, typer.Option(help="Rounds to evaluate on: test or unseen.")]
+Every = Annotated[int, typer.Option(help="Evaluate every n-th frame only.", min=1)]
+Device = Annotated[str, typer.Option(help="auto, cpu, cuda or cuda:NUMBER.")]
+Threads = Annotated[int, typer.Option(help="CPU threads; 0: one a core.")]
+DryRun = Annotated[
+    bool, typer.Option("--dry-run", help="Print the plan and its estimated duration.")
+]
+
+# Options of `export` and `evaluate`.
+Format = Annotated[str, typer.Option("--format", help="onnx or openvino.")]
+ExportPrecision = Annotated[
+    str, typer.Option(help="f32, bf16 (weights in half the bytes) or int8 (openvino).")
+]
+CheckData = Annotated[
+    Path | None,
+    typer.Option(help="Dataset to check the export on.  [default: the training data]"),
+]
+ExportOut = Annotated[
+    Path | None, typer.Option(help="Folder.  [default: RUN/export/FORMAT-PRECISION]")
+]
+CheckFrames = Annotated[int, typer.Option(help="Number of frames to check the export on.")]
+Split = Annotated[str, typer.Option(help="train, test, unseen or all.")]
+ReportPage = Annotated[
+    Path | None, typer.Option("--report", help="HTML page to write: a file, or a folder.")
+]
+EveryFrame = Annotated[int, typer.Option(help="Evaluate every n-th frame only.")]
+WorstSheet = Annotated[
+    Path | None, typer.Option("--worst", help="JPEG to write: the frames of the largest errors.")
+]
+ShippedPicture = Annotated[
+    Path | None, typer.Option(help="JPEG for README.md, of `mtlnet evaluate --worst`.", exists=True)
+]
+ShipOut = Annotated[Path, typer.Option(help="Folder for the model.")]
+ShippedEvaluations = Annotated[
+    list[Path] | None,
+    typer.Option(help="Output of `mtlnet evaluate --json`, for README.md; several times."),
+]
+ShippedNotes = Annotated[
+    Path | None, typer.Option(help="Markdown for README.md, such as the commands.", exists=True)
+]
+PredictInputs = Annotated[
+    list[str],
+    typer.Argument(help="JPEG or PNG files, folders of them, patterns, films, rounds (.mcap)."),
+]
+PredictOut = Annotated[
+    list[Path] | None,
+    typer.Option(
+        help="Table (.csv, .jsonl), film (.mp4) or folder of pictures with the markings drawn in; "
+        "may be given several times."
+    ),
+]
+FieldOfView = Annotated[
+    float | None,
+    typer.Option(help="Vertical field of view of images and films, degrees.  [default: model's]"),
+]
