@@ -227,7 +227,13 @@ def _caption(frames: Frames, worst: WorstFrame, prediction: Prediction) -> dict[
     info = frames.rounds[int(labels.round[worst.row])]
     note = ""
     if prediction.std is not None:
-        note = f", predicted standard deviation {prediction.std[worst.feature]:.2g} {unit}"
+        std = prediction.std[worst.feature]
+        is_absent = std is None  # the error is that of the value behind it
+        note = (
+            ", predicted absent"
+            if is_absent
+            else f", predicted standard deviation {std:.2g} {unit}"
+        )
     if prediction.out_of_distribution:
         note += ", out of distribution"
     return {

@@ -181,6 +181,15 @@ def _inside(points: NDArray[np.int32], width: int, height: int) -> Iterator[tupl
             yield u, v
 
 
+def test_a_marking_that_was_predicted_absent_has_no_deviation(
+    frames: Frames, outputs: NDArray[np.float32]
+) -> None:
+    changed = outputs.copy()
+    changed[9, :2] = 0.1, 0.9  # the inactive ends of `ml` and `mr`
+    (figure,) = worst_figures(frames, changed, [WorstFrame(9, "ml", 3.0)])
+    assert figure["note"].startswith(", predicted absent")
+
+
 def test_the_sheet_of_worst_frames_shows_each_above_its_caption(
     frames: Frames, outputs: NDArray[np.float32], tmp_path: Path
 ) -> None:
