@@ -228,12 +228,10 @@ def _caption(frames: Frames, worst: WorstFrame, prediction: Prediction) -> dict[
     note = ""
     if prediction.std is not None:
         std = prediction.std[worst.feature]
-        is_absent = std is None  # the error is that of the value behind it
-        note = (
-            ", predicted absent"
-            if is_absent
-            else f", predicted standard deviation {std:.2g} {unit}"
-        )
+        if std is None:  # the error is that of the value behind it
+            note = ", predicted absent"
+        else:
+            note = f", predicted standard deviation {std:.2g} {unit}"
     if prediction.out_of_distribution:
         note += ", out of distribution"
     return {
