@@ -24,8 +24,8 @@ SHIPPED = Path(__file__).parents[1] / "weights" / "default"
 CARD, WEIGHTS, GRAPH, GRAPH_WEIGHTS = "card.json", "model.safetensors", "model.xml", "model.bin"
 UNCERTAINTY_WEIGHTS = "doubt.safetensors"
 SHIPPED_FILES = {
-    WEIGHTS: "a1ca88a81429e08e6be491db24090dfeb8cdaa8e90153f8e2170e70d4921f2ae",
-    UNCERTAINTY_WEIGHTS: "0eadd98a0ce43401a27c00f82f082b5f89b446b049fa2ac4d6ba99edc2be7901",
+    WEIGHTS: "bcb12eca6de4e41800ca9ff21afd94f83b8c643060b5906f713a19396987ca4d",
+    UNCERTAINTY_WEIGHTS: "595234b41f29f7a8dced0b084cf527ae7f5ece5710a333552585857249a9ed3d",
 }
 """SHA-256 of the shipped model's files."""
 MODEL_FILES = (WEIGHTS, GRAPH, GRAPH_WEIGHTS)
