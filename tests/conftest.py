@@ -5,6 +5,7 @@ import signal
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
 
 
 def pytest_configure() -> None:
@@ -13,6 +14,9 @@ def pytest_configure() -> None:
     A shell without job control starts background jobs with SIGINT ignored, and children inherit it.
     """
     signal.signal(signal.SIGINT, signal.default_int_handler)
+    # How long an example takes depends on what else the machine does.
+    settings.register_profile("driverview", deadline=None)
+    settings.load_profile("driverview")
     # Torch's threads sleep while they wait, because tests run in parallel on few cores.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 

@@ -54,6 +54,10 @@ mtlnet ablate --data data --out ablation --iterations 2 --dry-run
 mtlnet ship --model run --out shipped
 controllers drive --steps 3
 controllers drive --steps 3 --perception model --model run
+controllers drive --steps 3 --controller rl
+controllers compare --tracks oval --controllers lqr,mpc --seeds 1 --steps 3 --out comparison
+controllers tune --controllers lqr --tracks oval --budget 2 --steps 3 --out tuned.json
+controllers train --track oval --steps 20 --evaluate-every 20 --out actor
 """
 SERVERS = {("simulator", "watch"), ("serve",)}
 WITHOUT = {

@@ -116,7 +116,7 @@ def test_raw_binary_in_and_out(service: Served, engine: FakeEngine) -> None:
         (
             {
                 "inputs": [
-                    {"name": "pixels", "shape": [16, 16, 3], "datatype": "UINT8", "data": [0]}
+                    {"name": "pixels", "shape": [24, 32, 3], "datatype": "UINT8", "data": [0]}
                 ]
             },
             None,
@@ -132,9 +132,9 @@ def test_raw_binary_in_and_out(service: Served, engine: FakeEngine) -> None:
                 "inputs": [
                     {
                         "name": "pixels",
-                        "shape": [16, 16, 3],
+                        "shape": [24, 32, 3],
                         "datatype": "UINT8",
-                        "data": [256] * 768,
+                        "data": [256] * 2304,
                     }
                 ]
             },

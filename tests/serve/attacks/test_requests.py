@@ -66,6 +66,7 @@ def scan(data: bytes, size: int = MAX_BODY_BYTES) -> bytes:
     return start + (data * (size // len(data)))[: size - len(start)]
 
 
+@pytest.mark.alone
 @pytest.mark.parametrize(
     "body",
     [
@@ -127,6 +128,7 @@ HOSTILE = {
 }
 
 
+@pytest.mark.alone
 @pytest.mark.parametrize("name", HOSTILE)
 def test_no_inference_request_holds_the_event_loop_or_memory(name: str) -> None:
     body = HOSTILE[name]

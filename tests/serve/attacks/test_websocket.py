@@ -219,8 +219,8 @@ def test_refused_handshakes_write_one_line_a_second_to_the_log(
     with caplog.at_level(logging.INFO):
         for _ in range(20):
             with target.dial() as connection:
-                connection.sendall(target.handshake(Origin="http://elsewhere"))
-                assert read_rest(connection).startswith(b"HTTP/1.1 403")
+                connection.sendall(target.handshake(X_Deadline_Ms="soon"))
+                assert read_rest(connection).startswith(b"HTTP/1.1 422")
         until(lambda: not service.server.server_state.tasks)
     assert [record.name for record in caplog.records if record.levelno >= logging.WARNING] == []
     lines = [record for record in caplog.records if record.name == "serve.requests"]
