@@ -22,6 +22,7 @@ from controllers.lqr import (
     WEIGHTS_EXACT,
     WEIGHTS_PAPER,
     WEIGHTS_PERCEIVED,
+    WEIGHTS_PERCEIVED_WELL,
     Lqr,
     LqrPaper,
     LqrPreview,
@@ -95,7 +96,9 @@ def test_continuous_regulator_of_an_integrator_has_the_closed_form_gain() -> Non
     assert gain[0, 0] == pytest.approx(2.0)
 
 
-@pytest.mark.parametrize("weights", [WEIGHTS_EXACT, WEIGHTS_PAPER, WEIGHTS_PERCEIVED])
+@pytest.mark.parametrize(
+    "weights", [WEIGHTS_EXACT, WEIGHTS_PAPER, WEIGHTS_PERCEIVED, WEIGHTS_PERCEIVED_WELL]
+)
 @pytest.mark.parametrize("dt", [0.02, 0.05, 0.1])
 def test_the_closed_loop_is_stable_at_every_speed(weights: LqrWeights, dt: float) -> None:
     lqr = Lqr(dt, weights)
