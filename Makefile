@@ -98,7 +98,7 @@ format: $(READY) ## put the code in order
 
 lock: ## pin what is installed now, with hashes, after a change of pyproject.toml
 	$(BIN)/python -m pip install --quiet --require-hashes --requirement deploy/uv.txt
-	$(BIN)/python -m pip freeze --exclude-editable | grep -vE '^(pip|setuptools|uv)==' | \
+	$(BIN)/python -m pip freeze --all --exclude-editable | grep -vE '^(pip|uv)==' | \
 	  $(BIN)/uv pip compile - --quiet --no-deps --generate-hashes --no-annotate --no-header \
 	  --python-version 3.11.9 --output-file requirements.lock
 

@@ -2,11 +2,14 @@
 
 import re
 import tomllib
+from importlib.metadata import PackageNotFoundError, requires
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 from typer.testing import CliRunner
 
 from serve.cli import app
@@ -133,3 +136,23 @@ def test_compose_bounds_memory_and_processes() -> None:
         assert service["pids_limit"] <= 256
         assert service["cap_drop"] == ["ALL"]
     assert services["serve"]["read_only"]
+
+
+def test_the_lock_holds_every_dependency_of_every_package_in_it() -> None:
+    """With hashes, pip refuses to install a dependency that has no line of its own."""
+    lock = (ROOT / "requirements.lock").read_text()
+    locked = {canonicalize_name(name) for name in re.findall(r"^([\w.-]+)==", lock, re.MULTILINE)}
+    missing = []
+    for package in sorted(locked):
+        try:
+            needed = [Requirement(line) for line in requires(package) or []]
+        except PackageNotFoundError:
+            continue  # for another platform
+        missing += [
+            f"{package} needs {requirement}"
+            for requirement in needed
+            if requirement.marker is None or requirement.marker.evaluate({"extra": ""})
+            if canonicalize_name(requirement.name) not in locked
+        ]
+    assert len(locked) > 100
+    assert not missing
