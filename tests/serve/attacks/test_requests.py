@@ -1,15 +1,11 @@
 """Requests that cost more than they look: time of the event loop, of the engine, and memory."""
 
-import base64
 import http.client
-import json
 import socket
 import threading
 import time
-import tracemalloc
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing, suppress
+from contextlib import closing
 
 import cv2
 import numpy as np
@@ -23,12 +19,12 @@ from mtlnet.inference.image_decoding.decode import (
 )
 from mtlnet.inference.image_decoding.errors import ImageError
 from mtlnet.inference.image_decoding.jpeg_structure import WINDOW_BYTES, read_structure
-from serve.api.kserve_tensors import Tensor, find_pixels, parse_request, read_image_bytes
 from serve.api.problems import Problem
 from serve.config import MAX_BODY_BYTES, Limits
 from serve.scheduling.admission import MAX_CLIENT_MS, MAX_PENDING_MS, PRESENT_NS, Admission
 from serve.scheduling.body_budget import BodyBudget, BodyShare
 from serve.workers.shared_memory import create_shared_memory
+from tests.serve.attacks.loop_time import LOOP_S, held_s
 from tests.serve.conftest import (
     CARD,
     PATIENCE_S,
@@ -44,20 +40,7 @@ from tests.serve.conftest import (
 )
 
 JPEG = jpeg(picture())
-LOOP_S = 0.02  # for which one request may hold the event loop
-TRIES = 5  # the quickest counts: other programs run on this machine
 INFER = "/v2/models/track/infer"
-
-
-def held_s(work: Callable[[], object]) -> float:
-    """The processor time of `work`, s, which may end with a refusal."""
-    times = []
-    for _ in range(TRIES):
-        start = time.thread_time()
-        with suppress(Problem, ImageError):
-            work()
-        times.append(time.thread_time() - start)
-    return min(times)
 
 
 def scan(data: bytes, size: int = MAX_BODY_BYTES) -> bytes:
@@ -102,81 +85,6 @@ def test_scans_times_pixels_are_limited() -> None:
     assert len(repeated) < WINDOW_BYTES
     with pytest.raises(ImageError, match="scans of 4080 x 2040 px"):
         inspect(repeated, CARD.camera, 90.0)
-
-
-HEAD = '{"inputs":[{"name":"pixels","shape":[1,2,2,3],"datatype":"UINT8","data":'
-
-
-def filled(text: str, part: str, end: str) -> bytes:
-    return (text + part * ((MAX_BODY_BYTES - len(text) - len(end)) // len(part)) + end).encode()
-
-
-HOSTILE = {
-    "values": filled(HEAD + "[", "0,", "0]}]}"),
-    "allowed": filled(HEAD + "[", "10 ,", "0]}]}"),
-    "brackets": filled(HEAD + "[", "[9],", "0]}]}"),
-    "lists": filled(HEAD + "[", "[],", "0]}]}"),
-    "open": filled(HEAD, "[", ""),
-    "inputs": filled('{"inputs":[', "0,", "0]}"),
-    "objects": filled('{"inputs":[', "{},", "{}]}"),
-    "outputs": filled(HEAD + '[1]}],"outputs":[', '{"name":"std"},', '{"name":"std"}]}'),
-    "parameters": filled(HEAD + '[1]}],"parameters":{"a":[', "0,", "0]}}"),
-    "shape": filled('{"inputs":[{"name":"pixels","shape":[', "1,", "1]}]}"),
-    "unknown": filled('{"other":[', "0,", "0]}"),
-    "spaces": filled('{"inputs":', " ", "[]}"),
-    "name": filled('{"inputs":[{"name":"', "x", '"}]}'),
-}
-
-
-@pytest.mark.alone
-@pytest.mark.parametrize("name", HOSTILE)
-def test_no_inference_request_holds_the_event_loop_or_memory(name: str) -> None:
-    body = HOSTILE[name]
-    assert len(body) <= MAX_BODY_BYTES
-    assert held_s(lambda: parse_request(body, None)) < LOOP_S
-    tracemalloc.start()
-    try:
-        with suppress(Problem):
-            parse_request(body, None)
-        assert tracemalloc.get_traced_memory()[1] < 3 * MAX_BODY_BYTES
-    finally:
-        tracemalloc.stop()
-
-
-def test_a_large_image_in_base64_is_read() -> None:
-    sent = np.random.default_rng(0).bytes(3 * MAX_BODY_BYTES // 4 - 3000)
-    tensor = {"name": "image", "shape": [1, 1], "datatype": "BYTES"}
-    content = {"inputs": [{**tensor, "data": [[base64.b64encode(sent).decode()]]}]}
-    request, binary = parse_request(json.dumps(content).encode(), None)
-    assert read_image_bytes(request.input, binary) == sent
-    assert held_s(lambda: read_image_bytes(request.input, binary)) < 2 * LOOP_S
-
-
-def test_pixels_in_json_are_those_that_were_sent() -> None:
-    pixels = np.random.default_rng(0).integers(0, 256, (1, 200, 300, 3), np.uint8)
-    for text in (json.dumps(pixels.tolist()), json.dumps(pixels.ravel().tolist(), indent=0)):
-        tensor = Tensor("pixels", [1, 200, 300, 3], "UINT8", {}, text.encode())
-        found = find_pixels(tensor, memoryview(b""))
-        assert (found.height, found.width) == (200, 300)
-        assert np.array_equal(found.read(), pixels[0])
-    for wrong in (
-        b"[1, 256]",
-        b"[-1]",
-        b"[true]",
-        b'["1"]',
-        b"[1.5]",
-        b"[null]",
-        b'"1,2"',
-        b"[{}]",
-    ):
-        with pytest.raises(Problem, match=r"integers from 0 to 255"):
-            find_pixels(Tensor("pixels", [1, 1, 3], "UINT8", {}, wrong), memoryview(b"")).read()
-
-
-def test_a_length_of_many_zeros_is_no_fault_of_the_service(service: Served) -> None:
-    for length in ("0" * 5000, "0" * 21, "9" * 20):
-        headers = {"Inference-Header-Content-Length": length}
-        assert service.ask("POST", INFER, b"{}", headers).status == 422
 
 
 def test_a_full_queue_reads_no_inference_request() -> None:
