@@ -167,12 +167,10 @@ app.command()(train)
 
 def _drive_with_progress(config: DriveConfig) -> "DriveResult":
     from rich.markup import escape
-    from rich.progress import MofNCompleteColumn, Progress
 
     from controllers.drive import drive
 
-    columns = (*Progress.get_default_columns(), MofNCompleteColumn())
-    with Progress(*columns, console=_stderr(), transient=True) as bar:
+    with command.progress_bar() as bar:
         task = bar.add_task(escape(f"{config.controller} on {config.track}"), total=None)
         return drive(config, lambda done, total: bar.update(task, completed=done, total=total))
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import typer
 
 from mtlnet import cli_options as options
-from runtime.cli import main as run_command
+from runtime import cli as command
 
 if TYPE_CHECKING:
     from mtlnet.inference.engine import Engine
@@ -164,7 +164,6 @@ def evaluate_command(
     import os
 
     from rich.console import Console
-    from rich.progress import Progress
 
     from mtlnet.evaluation.evaluate import evaluate
     from mtlnet.evaluation.tables import evaluation_table, group_table, uncertainty_table
@@ -172,8 +171,8 @@ def evaluate_command(
     _print_model(model)
     # Several engines of one thread each take more frames a second than one engine on all cores.
     engines = [_load(model, engine, precision) for _ in range(os.cpu_count() or 1)]
-    with Progress(console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task("evaluating")
+    with command.progress_bar() as bar:
+        task = bar.add_task("evaluating", total=None)
 
         def report(done: int, total: int) -> None:
             bar.update(task, completed=done, total=total)
@@ -203,15 +202,14 @@ def predict_command(
 ) -> None:
     """Track features of images, films or recorded rounds; also as tables, pictures or a film."""
     from rich.console import Console
-    from rich.progress import Progress
 
     from mtlnet.evaluation.tables import prediction_table
     from mtlnet.predict.run import predict_files
 
     _print_model(model)
     loaded = _load(model, engine, precision)
-    with Progress(console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task("predicting")
+    with command.progress_bar() as bar:
+        task = bar.add_task("predicting", total=None)
 
         def report(done: int, total: int) -> None:
             bar.update(task, completed=done, total=total)
@@ -245,4 +243,4 @@ def _load(model: str, kind: str, precision: str | None) -> "Engine":
 
 def main() -> None:
     """Entry point."""
-    run_command(app)
+    command.main(app)

@@ -8,11 +8,14 @@ import json
 import os
 import sys
 from collections.abc import Callable
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from trackfeatures.errors import UserError
+
+if TYPE_CHECKING:
+    from rich.progress import Progress
 
 FAILED = 1  # a UserError or OSError; typer ends with 2 for a wrong option
 INTERRUPTED = 130  # the shell's code for a process ended by Ctrl-C
@@ -46,6 +49,15 @@ def fail(message: str) -> None:
 def print_result(content: dict[str, Any], as_json: bool, line: str) -> None:
     """Print `content` as JSON, or `line`."""
     sys.stdout.write(f"{json.dumps(content, indent=1) if as_json else line}\n")
+
+
+def progress_bar() -> "Progress":
+    """A bar on stderr with "done/total", which goes when its `with` block ends."""
+    from rich.console import Console
+    from rich.progress import MofNCompleteColumn, Progress
+
+    columns = (*Progress.get_default_columns(), MofNCompleteColumn())
+    return Progress(*columns, console=Console(stderr=True), transient=True)
 
 
 def counted(count: int, noun: str) -> str:

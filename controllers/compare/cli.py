@@ -1,18 +1,13 @@
 """The commands `controllers compare` and `controllers tune`."""
 
 import json
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
 from controllers.config import CompareConfig, TuneConfig
 from runtime import cli as command
-
-if TYPE_CHECKING:
-    from rich.progress import Progress
 
 COMPARE, TUNE = CompareConfig(), TuneConfig()
 TERMINAL_WIDTH = 120  # columns that the tables need
@@ -101,7 +96,7 @@ def compare(
         parameters=parameters,
         tracks_dir=tracks_dir,
     )
-    with _progress_bar() as bar:
+    with command.progress_bar() as bar:
         task = bar.add_task("", total=None)
         content = run(
             config,
@@ -149,7 +144,7 @@ def tune(
         seed=seed,
         tracks_dir=tracks_dir,
     )
-    with _progress_bar() as bar:
+    with command.progress_bar() as bar:
         task = bar.add_task("", total=None)
         content = run(
             config,
@@ -167,16 +162,6 @@ def tune(
             f"{values or 'its own parameters'}"
         )
     typer.echo(f"parameters: {out}")
-
-
-@contextmanager
-def _progress_bar() -> "Iterator[Progress]":
-    from rich.console import Console
-    from rich.progress import MofNCompleteColumn, Progress
-
-    columns = (*Progress.get_default_columns(), MofNCompleteColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        yield bar
 
 
 def _print_scores(content: dict[str, Any]) -> None:

@@ -66,15 +66,12 @@ def train(
 
 
 def _train_with_progress(config: TrainConfig) -> dict[str, Any]:
-    from rich.console import Console
     from rich.markup import escape
-    from rich.progress import MofNCompleteColumn, Progress
 
     from controllers.rl.training import train as train_actor
 
     name = escape(f"{config.algorithm} on {config.track}")
-    columns = (*Progress.get_default_columns(), MofNCompleteColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+    with command.progress_bar() as bar:
         task = bar.add_task(name, total=config.steps)
 
         def report(step: int, best: float) -> None:
