@@ -125,14 +125,23 @@ def test_every_command_is_used_here() -> None:
     assert set(COMMANDS) - groups == (used - groups) | SERVERS | WITHOUT
 
 
-def test_every_command_works_from_the_wheel(commands: Path, tmp_path: Path) -> None:
-    for line in USES.strip().split("\n"):
-        run(commands, tmp_path, *line.split())
-    image = save_frame(commands, tmp_path)
-    run(commands, tmp_path, "mtlnet", "predict", "--model", "run", image.name)
-    with serving(commands, tmp_path, "simulator", "watch", "--track", "oval") as url:
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The working folder of all commands: later ones read what earlier ones wrote."""
+    return tmp_path_factory.mktemp("used")
+
+
+@pytest.mark.parametrize("line", USES.strip().split("\n"))
+def test_a_command_works_from_the_wheel(commands: Path, folder: Path, line: str) -> None:
+    run(commands, folder, *line.split())
+
+
+def test_prediction_and_servers_work_from_the_wheel(commands: Path, folder: Path) -> None:
+    image = save_frame(commands, folder)
+    run(commands, folder, "mtlnet", "predict", "--model", "run", image.name)
+    with serving(commands, folder, "simulator", "watch", "--track", "oval") as url:
         assert b"<html" in get(url)
-    with serving(commands, tmp_path, "serve", "--model", "run") as url, Client(url) as client:
+    with serving(commands, folder, "serve", "--model", "run") as url, Client(url) as client:
         client.wait_until_ready(120.0)
         assert list(client.features(image.read_bytes())["distances_m"]) == list(MARKINGS)
         for page in ("/", "/docs", "/openapi.json"):

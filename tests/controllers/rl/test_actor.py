@@ -29,7 +29,7 @@ from tests.typed import typed
 from trackfeatures import Heading
 from trackfeatures.errors import UserError
 
-SHA_256 = {"rl": "52d19ea938e36c4b56a3f7ebd6cb011e64f21e9550201839ca10e2d2e05aca05"}
+SHA_256 = {"rl": "0f656b930004243b8ad97dd491bef52675cc545708a8c11a9a46f34d190bcda5"}
 BOUNDS_M = {"rl": 0.5}
 """Largest distance from the centre in the test's drive."""
 
