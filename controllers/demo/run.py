@@ -14,7 +14,9 @@ from rich.console import Console
 from controllers.config import DemoConfig
 from controllers.demo.frames import PostedFrame, post_frames, spread
 from controllers.demo.process import run_module, running_service
+from controllers.lqr import WEIGHTS_BRIEFLY_TRAINED
 from datagen.recording import Dataset
+from runtime.files import write_json
 from serve.client import Client
 from trackfeatures import UserError
 
@@ -119,7 +121,15 @@ def _use_service(config: DemoConfig, result: DemoResult) -> None:
         ]
         drive += ["--lanes", "1", "--perception", url, "--steps", str(DRIVE_STEPS), "--json"]
         drive += ["--log", str(config.out / "drive.csv")]
+        drive += ["--parameters", str(write_soft_parameters(config.out / "soft-weights.json"))]
         result.drive = json.loads(_step(result, "drive", drive))
+
+
+def write_soft_parameters(path: Path) -> Path:
+    """Write weights of `lqr-preview` for a briefly trained model, for `--parameters`; the path."""
+    parameters = asdict(WEIGHTS_BRIEFLY_TRAINED)
+    write_json(path, {"controllers": {"lqr-preview": {"parameters": parameters}}})
+    return path
 
 
 def _step(result: DemoResult, name: str, command: list[str]) -> str:

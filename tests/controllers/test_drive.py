@@ -15,7 +15,7 @@ from controllers.closed_loop import COLUMNS, DriveLog, OffsetMemory, run_lap, th
 from controllers.config import DriveConfig
 from controllers.drive import choose_lane, drive, steps_for
 from controllers.interface import Observation
-from controllers.lqr import WEIGHTS_PERCEIVED, LqrPreview
+from controllers.lqr import WEIGHTS_BRIEFLY_TRAINED, LqrPreview
 from controllers.perception import Perceived, PerceptionSource, truth
 from serve.client import ServiceError
 from simulator.track.catalogue import find_track
@@ -212,7 +212,9 @@ def test_lqr_preview_drives_on_a_noisy_perception() -> None:
 
     with World(Road(find_track("town"))) as world:
         world.reset(seed=0)
-        result = run_lap(world, LqrPreview(0.05, WEIGHTS_PERCEIVED), perceive, 600, noisy=True)
+        result = run_lap(
+            world, LqrPreview(0.05, WEIGHTS_BRIEFLY_TRAINED), perceive, 600, noisy=True
+        )
     assert result.ended is None
     assert result.max_abs_d_m < 0.8
     assert result.blind_steps > 20

@@ -19,10 +19,10 @@ from controllers.lateral_model import (
     dlqr,
 )
 from controllers.lqr import (
+    WEIGHTS_BRIEFLY_TRAINED,
     WEIGHTS_EXACT,
     WEIGHTS_PAPER,
     WEIGHTS_PERCEIVED,
-    WEIGHTS_PERCEIVED_WELL,
     Lqr,
     LqrPaper,
     LqrPreview,
@@ -97,7 +97,7 @@ def test_continuous_regulator_of_an_integrator_has_the_closed_form_gain() -> Non
 
 
 @pytest.mark.parametrize(
-    "weights", [WEIGHTS_EXACT, WEIGHTS_PAPER, WEIGHTS_PERCEIVED, WEIGHTS_PERCEIVED_WELL]
+    "weights", [WEIGHTS_EXACT, WEIGHTS_PAPER, WEIGHTS_BRIEFLY_TRAINED, WEIGHTS_PERCEIVED]
 )
 @pytest.mark.parametrize("dt", [0.02, 0.05, 0.1])
 def test_the_closed_loop_is_stable_at_every_speed(weights: LqrWeights, dt: float) -> None:
@@ -182,7 +182,7 @@ def response(controller: Controller, speed: float, curvature: float = 0.0) -> Ma
 
 
 @pytest.mark.parametrize("speed", [8.0, 15.0, 22.0])
-@pytest.mark.parametrize("weights", [WEIGHTS_EXACT, WEIGHTS_PAPER, WEIGHTS_PERCEIVED])
+@pytest.mark.parametrize("weights", [WEIGHTS_EXACT, WEIGHTS_PAPER, WEIGHTS_BRIEFLY_TRAINED])
 @pytest.mark.parametrize("form", [Lqr, LqrPreview])
 def test_step_response(
     speed: float, weights: LqrWeights, form: type[Lqr] | type[LqrPreview]
@@ -194,7 +194,7 @@ def test_step_response(
 
 
 def test_no_steady_offset_in_a_bend_of_unmeasured_curvature() -> None:
-    for weights in (WEIGHTS_PAPER, WEIGHTS_PERCEIVED):
+    for weights in (WEIGHTS_PAPER, WEIGHTS_BRIEFLY_TRAINED):
         assert abs(response(LqrPreview(0.05, weights), 15.0, 1 / 80)[-1]) < 0.02
 
 

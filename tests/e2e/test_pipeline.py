@@ -12,7 +12,7 @@ from controllers.config import DemoConfig
 from controllers.demo.frames import post_frames
 from controllers.demo.process import running_service
 from controllers.demo.report import write_report
-from controllers.demo.run import DemoResult
+from controllers.demo.run import DemoResult, write_soft_parameters
 from datagen.recording import Dataset
 from serve.client import Client
 from trackfeatures import MARKINGS
@@ -75,6 +75,7 @@ def test_collect_train_evaluate_serve_and_drive(tmp_path: Path) -> None:
                 "1",
             ),
             *("--perception", url, "--steps", "400", "--log", str(log), "--json"),
+            *("--parameters", str(write_soft_parameters(tmp_path / "soft.json"))),
         )
     # 400 steps of 50 ms: 20 s, on the oval's straight, which a model trained on 60 batches of that
     # road can follow; the first bend comes later.
