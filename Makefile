@@ -39,8 +39,9 @@ demo: $(READY) ## collect, train, evaluate, serve, ask, report: in 15 minutes on
 	$(BIN)/controllers demo --out demo
 
 # One process a core, four at most: each takes about 1 GB. A file's tests stay in one process, for
-# they share what is costly to make. What measures time comes after them, when the cores are free.
-PARALLEL := --numprocesses logical --maxprocesses 4 --dist loadfile
+# they share what is costly to make; xdist keeps their order (tests/conftest.py). What measures time comes
+# after them, when the cores are free.
+PARALLEL := --numprocesses logical --maxprocesses 4 --dist loadfile --no-loadscope-reorder
 
 test: $(READY) ## all checks and tests
 	@$(MAKE) --no-print-directory --jobs 2 check compiled

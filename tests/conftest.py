@@ -21,6 +21,12 @@ def pytest_configure() -> None:
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Files with slow tests first, so that no process is left with one at the end."""
+    slow = {item.path for item in items if item.get_closest_marker("slow")}
+    items.sort(key=lambda item: ("e2e" not in item.path.parts, item.path not in slow))
+
+
 @pytest.fixture
 def no_torcs_install(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Hide the TORCS tracks of this machine: only the project's own tracks are found."""
