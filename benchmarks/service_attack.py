@@ -34,6 +34,7 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
+from benchmarks.material.bad_clients import ADDRESS
 from benchmarks.material.outcome import exit_code
 from benchmarks.material.servers import descendants
 from runtime.sockets import bind
@@ -46,7 +47,6 @@ ANSWERED, SLOWER = 0.99, 3.0
 BODIES_MB, GROWTH_MB, LEFT_MB = 67.2, 60.0, 10.0
 RATE = 10.0  # requests a second of the well-behaved client
 HOLD_S = 1.0  # for which an attack keeps its connections open
-ATTACKER = "127.0.0.2"
 QUIET_S = 20.0
 START_S = 120.0
 SPAWN = multiprocessing.get_context("spawn")
@@ -115,7 +115,7 @@ def measure(target: Target, pid: int, seconds: float, attack: Attack | None) -> 
     client.start()
     assert begun.wait(START_S)
     if attack is not None:
-        hostile = replace(target, source=ATTACKER)
+        hostile = replace(target, source=ADDRESS)
         attacker = SPAWN.Process(target=repeat, args=(attack, hostile, seconds, attacked))
         attacker.start()
         assert attacked.wait(START_S)

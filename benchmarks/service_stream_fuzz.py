@@ -150,7 +150,8 @@ async def run_part(seed: int, part: int, count: int) -> tuple[float, list[str]]:
     app.frame_queue.start()
     errors, faults, state = Errors(), [], ServerState()
     logging.getLogger().addHandler(errors)
-    guard = ConnectionGuard(Limits())
+    guard = ConnectionGuard(Limits(), bodies=app.bodies)
+    app.bodies.end_slow_bodies = guard.end_slow_bodies
     loop = asyncio.get_running_loop()
     make = partial(
         DirectProtocol,
@@ -178,6 +179,8 @@ async def run_part(seed: int, part: int, count: int) -> tuple[float, list[str]]:
     groups = (guard.receiving, guard.working, guard.idle, guard.served, guard.streams)
     if state.connections or any((*groups, guard.dismissed, guard.leaving)):
         faults.append(f"part {part}: connections were left behind")
+    if app.bodies.held:
+        faults.append(f"part {part}: {app.bodies.held} bytes of bodies were left behind")
     app.frame_queue.close()
     logging.getLogger().removeHandler(errors)
     return resident_mb() / early_mb - 1.0, faults

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from runtime.files import atomic_write, check_folder, try_lock
+from runtime.files import STAGED, atomic_write, check_folder, replaced_files, try_lock
 from trackfeatures import UserError
 
 
@@ -67,3 +67,55 @@ def test_a_lock_excludes_others_until_its_file_is_closed(tmp_path: Path) -> None
     finally:
         os.close(first)
         os.close(other)
+
+
+def contents(folder: Path) -> dict[str, str]:
+    return {path.name: path.read_text() for path in sorted(folder.iterdir())}
+
+
+def test_files_that_belong_together_are_replaced_together(tmp_path: Path) -> None:
+    (tmp_path / STAGED).mkdir()
+    (tmp_path / STAGED / "left").write_text("by a kill")
+    (tmp_path / "other").write_text("kept")
+    for version in ("old", "new"):
+        with replaced_files(tmp_path, last="card") as staged:
+            for name in ("card", "a", "z"):
+                (staged / name).write_text(version)
+            if version == "new":
+                assert (tmp_path / "card").read_text() == "old"
+    expected = dict.fromkeys(("a", "card", "z"), "new")
+    assert contents(tmp_path) == {**expected, "other": "kept"}
+
+
+def test_files_stay_after_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "card").write_text("old")
+    with pytest.raises(ValueError, match="wrong"), replaced_files(tmp_path, last="card") as staged:
+        (staged / "card").write_text("new")
+        raise ValueError("wrong")
+
+    def disk_full(_: Path) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("runtime.files.fsync_path", disk_full)
+    with pytest.raises(OSError, match="No space"), replaced_files(tmp_path, last="card") as staged:
+        (staged / "card").write_text("new")
+    assert contents(tmp_path) == {"card": "old"}
+
+
+def test_without_its_last_file_a_part_is_never_taken(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("card", "a"):
+        (tmp_path / name).write_text("old")
+
+    def fail(self: Path, _target: Path) -> Path:
+        raise OSError(errno.EIO, "broken")
+
+    with (
+        pytest.raises(OSError, match="broken"),
+        replaced_files(tmp_path, last="card") as staged,
+    ):
+        for name in ("card", "a"):
+            (staged / name).write_text("new")
+        monkeypatch.setattr(Path, "replace", fail)
+    assert contents(tmp_path) == {"a": "old"}

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from tests.serve.attacks.attacks import JPEG, MANY, MB
-from tests.serve.attacks.conftest import Target, read_head, send_all
+from tests.serve.attacks.conftest import BINARY, Target, frame, read_head, send_all
 from tests.serve.conftest import jpeg, picture, png
 
 INFER = "/v2/models/track/infer"
@@ -83,6 +83,18 @@ def large_bodies(target: Target, count: int = MANY) -> list[socket.socket]:
     """Bodies of 4 MB whose last byte is held back."""
     sent = target.post(bytes(BODY))[:-1]
     return [found for _ in range(count) for found in _send(target, sent)]
+
+
+def half_messages(target: Target, count: int = MANY) -> list[socket.socket]:
+    """WebSockets that hold back the last byte of the largest message."""
+    sent, connections = frame(BINARY, bytes(BODY - 64))[:-1], []
+    for _ in range(count):
+        with suppress(OSError, AssertionError):
+            connection = target.open_websocket()
+            connection.settimeout(1.0)
+            send_all(connection, sent)
+            connections.append(connection)
+    return connections
 
 
 def promised_bodies(target: Target, count: int = MANY) -> list[socket.socket]:
@@ -166,9 +178,9 @@ def reset_requests(target: Target, count: int = 200) -> list[socket.socket]:
 
 REQUESTS = (
     *(fill_bytes, stuffed_scans, repeated_outputs, nested_inputs, encoded_garbage),
-    *(costly_images, many_costly_images, large_photographs, large_bodies, promised_bodies),
+    *(costly_images, many_costly_images, large_photographs, large_bodies, half_messages),
+    *(promised_bodies, unread_pages, half_closed, reset_requests),
     *(rebound_names, guessed_tokens, forged_addresses, conflicting_lengths),
-    *(unread_pages, half_closed, reset_requests),
 )
 
 
