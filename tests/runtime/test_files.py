@@ -3,6 +3,7 @@
 import errno
 import os
 import threading
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -73,49 +74,43 @@ def contents(folder: Path) -> dict[str, str]:
     return {path.name: path.read_text() for path in sorted(folder.iterdir())}
 
 
+def replace_with(folder: Path, content: str, then: Callable[[], object] = lambda: None) -> None:
+    """Replace three files, the card last; `then` is called once they are written."""
+    with replaced_files(folder, last="card") as staged:
+        for name in ("card", "a", "z"):
+            (staged / name).write_text(content)
+        then()
+
+
+def fail(*_: object) -> Path:
+    raise OSError(errno.ENOSPC, "No space left on device")
+
+
 def test_files_that_belong_together_are_replaced_together(tmp_path: Path) -> None:
     (tmp_path / STAGED).mkdir()
     (tmp_path / STAGED / "left").write_text("by a kill")
     (tmp_path / "other").write_text("kept")
-    for version in ("old", "new"):
-        with replaced_files(tmp_path, last="card") as staged:
-            for name in ("card", "a", "z"):
-                (staged / name).write_text(version)
-            if version == "new":
-                assert (tmp_path / "card").read_text() == "old"
+    replace_with(tmp_path, "old")
+    replace_with(tmp_path, "new", lambda: (tmp_path / "card").read_text() == "old")
     expected = dict.fromkeys(("a", "card", "z"), "new")
     assert contents(tmp_path) == {**expected, "other": "kept"}
 
 
 def test_files_stay_after_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "card").write_text("old")
-    with pytest.raises(ValueError, match="wrong"), replaced_files(tmp_path, last="card") as staged:
-        (staged / "card").write_text("new")
-        raise ValueError("wrong")
-
-    def disk_full(_: Path) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr("runtime.files.fsync_path", disk_full)
-    with pytest.raises(OSError, match="No space"), replaced_files(tmp_path, last="card") as staged:
-        (staged / "card").write_text("new")
-    assert contents(tmp_path) == {"card": "old"}
+    replace_with(tmp_path, "old")
+    before = contents(tmp_path)
+    with pytest.raises(OSError, match="No space"):
+        replace_with(tmp_path, "new", fail)
+    monkeypatch.setattr("runtime.files.fsync_path", fail)
+    with pytest.raises(OSError, match="No space"):
+        replace_with(tmp_path, "new")
+    assert contents(tmp_path) == before
 
 
 def test_without_its_last_file_a_part_is_never_taken(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for name in ("card", "a"):
-        (tmp_path / name).write_text("old")
-
-    def fail(self: Path, _target: Path) -> Path:
-        raise OSError(errno.EIO, "broken")
-
-    with (
-        pytest.raises(OSError, match="broken"),
-        replaced_files(tmp_path, last="card") as staged,
-    ):
-        for name in ("card", "a"):
-            (staged / name).write_text("new")
-        monkeypatch.setattr(Path, "replace", fail)
-    assert contents(tmp_path) == {"a": "old"}
+    replace_with(tmp_path, "old")
+    with pytest.raises(OSError, match="No space"):
+        replace_with(tmp_path, "new", lambda: monkeypatch.setattr(Path, "replace", fail))
+    assert contents(tmp_path) == {"a": "old", "z": "old"}
