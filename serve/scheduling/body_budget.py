@@ -25,7 +25,7 @@ class BodyBudget:
         self._others = [cells for number, cells in enumerate(blocks) if number != block]
         self._limit = limit
         self.held = 0
-        self.end_slow_bodies: Callable[[int], None] = lambda _size: None
+        self.end_slow_bodies: Callable[[float], None] = lambda _size: None
         """Ends requests of this worker whose bodies arrive slowly, until so many bytes are free."""
 
     def take(self, size: int, small: bool) -> None:

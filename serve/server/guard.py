@@ -112,7 +112,7 @@ class ConnectionGuard:
                 excess -= 1
         return excess <= 0
 
-    def end_slow_bodies(self, size: int) -> None:
+    def end_slow_bodies(self, size: float) -> None:
         """End connections whose bodies arrive slowly, until they have held `size` bytes."""
         now = self.clock()
         for connection in (*self.receiving, *self.streams):

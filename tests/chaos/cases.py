@@ -34,7 +34,7 @@ from trackfeatures.errors import UserError
 
 ROUNDS = {"r000": "train", "r001": "train", "r002": "test", "r003": "test"}
 IMAGE = golden_image(280, 210)
-RUN = ["--batch", "2", "--device", "cpu", "--threads", "1"]
+RUN = ["--recipe", "paper", "--batch", "2", "--device", "cpu", "--threads", "1"]
 UNFINISHED = (".partial", "staged", ".merging")
 """Parts of the names of files that are not complete."""
 

@@ -177,8 +177,7 @@ def make_small() -> None:
             replace(spec, filters=8) if isinstance(spec, Conv) else spec for spec in full.features
         )
         ARCHITECTURES[full.name] = replace(full, features=few, shared=(32, 16, 16))
-    for module in (head, ood):
-        module.FIT = replace(module.FIT, steps=3)
+    head.FIT, ood.FIT = replace(head.FIT, steps=3), replace(ood.FIT, steps=3)
     head.MAX_TRAIN_FRAMES, ood.PITCH_FRAMES = 12, 6
 
 
