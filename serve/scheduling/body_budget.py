@@ -25,17 +25,17 @@ class BodyBudget:
         self._others = [cells for number, cells in enumerate(blocks) if number != block]
         self._limit = limit
         self.held = 0
-        self.end_slow_bodies: Callable[[float], None] = lambda _size: None
-        """Ends requests of this worker whose bodies arrive slowly, until so many bytes are free."""
+        self.end_slow_bodies: Callable[[float], float] = lambda _size: 0.0
+        """Ends requests of this worker whose bodies arrive slowly, until so many bytes are free, or
+        soon will be; how many."""
 
     def take(self, size: int, small: bool) -> None:
         """Hold `size` bytes more. Raises Problem when that is over the budget.
 
         `small`: slow bodies give way to this one.
         """
-        if small and (excess := self._excess(size)) > 0:
-            self.end_slow_bodies(excess)
-        if self._excess(size) > 0:
+        excess = self._excess(size)
+        if excess > 0 and not (small and self.end_slow_bodies(excess) >= excess):
             raise Problem(
                 OVERLOADED,
                 f"the bodies in flight need more than {self._limit >> 20} MiB; send this one later",

@@ -295,7 +295,7 @@ class GuardedProtocol(HttpToolsProtocol):
         """Refuse a body that has been arriving for long; the bytes that it held."""
         if self._phase is not Phase.BODY or now - self.since_s < guards.EVICTABLE_S:
             return 0
-        held = self._unread_bytes
+        held = 0 if self.cycle is None or self.cycle.response_complete else self._unread_bytes
         self._close_with(Problem(OVERLOADED, "the bodies in flight need too much memory"))
         return held
 

@@ -112,14 +112,18 @@ class ConnectionGuard:
                 excess -= 1
         return excess <= 0
 
-    def end_slow_bodies(self, size: float) -> None:
-        """End connections whose bodies arrive slowly, until they have held `size` bytes."""
-        now = self.clock()
+    def end_slow_bodies(self, size: float) -> float:
+        """End connections whose bodies arrive slowly, until these held `size` bytes; how many.
+
+        Those of an ASGI request are free only when its task has noticed.
+        """
+        now, freed = self.clock(), 0
         for connection in (*self.receiving, *self.streams):
-            if size <= 0:
+            if freed >= size:
                 break
             if connection is not self.reading:
-                size -= connection.end_slow_body(now)
+                freed += connection.end_slow_body(now)
+        return freed
 
     def pause_reading(self, connection: HttpToolsProtocol) -> None:
         """Read no more from a refused client for REFUSAL_PAUSE_S.

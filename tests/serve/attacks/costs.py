@@ -80,9 +80,12 @@ def large_photographs(target: Target, count: int = 16) -> list[socket.socket]:
 
 
 def large_bodies(target: Target, count: int = MANY) -> list[socket.socket]:
-    """Bodies of 4 MB whose last byte is held back."""
-    sent = target.post(bytes(BODY))[:-1]
-    return [found for _ in range(count) for found in _send(target, sent)]
+    """Bodies of 4 MB whose last byte is held back, of images and of inference requests."""
+    connections = []
+    for number in range(count):
+        sent = target.post(bytes(BODY), ("/features", INFER)[number % 2])[:-1]
+        connections += _send(target, sent)
+    return connections
 
 
 def half_messages(target: Target, count: int = MANY) -> list[socket.socket]:
