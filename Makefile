@@ -7,7 +7,7 @@ PACKAGES := trackfeatures runtime simulator datagen mtlnet serve controllers
 # Debian keeps ldconfig in /sbin, which is not on every user's PATH.
 export PATH := $(CURDIR)/$(BIN):$(PATH):/usr/sbin:/sbin
 
-.PHONY: help setup system demo test check docs compiled quick fuzz attack api e2e bench endurance format lock clean
+.PHONY: help setup system demo test check docs compiled quick fuzz attack chaos api e2e bench endurance format lock clean
 
 help: ## list the targets
 	@grep -hE '^[a-z0-9]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 10
@@ -74,6 +74,9 @@ fuzz: $(READY) ## a million damaged images, and as many byte streams, through th
 attack: $(READY) ## the attacks of the tests on a service, beside a well-behaved client; an hour
 	$(BIN)/python benchmarks/service_attack.py $(ATTACK)
 
+chaos: $(READY) ## commands killed 200 times, on full and read-only disks, with clocks that jump
+	DRIVERVIEW_CHAOS_KILLS=200 DRIVERVIEW_CHAOS_SEED=$$(date +%s) $(BIN)/pytest tests/chaos
+
 api: $(READY) ## a thousand requests an operation, made from the OpenAPI document
 	DRIVERVIEW_API_EXAMPLES=1000 $(BIN)/pytest tests/serve/api/test_openapi.py
 
@@ -90,8 +93,9 @@ bench: $(READY) ## every benchmark but the hour-long ones; fails where a claim i
 	if [ -n "$$unmeasured" ]; then echo "not measured:$$unmeasured"; fi; \
 	if [ -n "$$missed" ]; then echo "missed or failed:$$missed"; exit 1; fi
 
-endurance: $(READY) ## an hour of controllers, with restarts and new models under them
+endurance: $(READY) ## an hour of controllers with restarts and new models, two beside bad clients
 	$(BIN)/python benchmarks/endurance.py
+	$(BIN)/python benchmarks/endurance.py --attacks --minutes 120
 
 format: $(READY) ## put the code in order
 	$(BIN)/ruff format .

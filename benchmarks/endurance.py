@@ -1,16 +1,22 @@
 """Controllers for an hour, while the service is restarted and given other models under them.
 
-    python benchmarks/endurance.py [--minutes 60] [--out FILE]
+    python benchmarks/endurance.py [--minutes 60] [--attacks] [--out FILE]
 
 Eight clients ask at 20 Hz each; a rolling restart every five minutes and a reload every minute, of
 two models by turns. Claims: no admitted request is lost (every request is answered or refused, and
 the clients have all answers that the service counts), and no answer is of the wrong model: each is
 bit-equal to what the model that it names says of that image, and that model was, while the request
 was under way, the one to answer.
+
+`--attacks`: no restarts, no reloads, but bad clients beside the good ones, which make all attacks
+of the tests in every minute (two hours: --minutes 120). Claims: nothing is lost and no answer is
+wrong, the service's memory in the last minute is at most 1 % over that in the first, and p99 after
+the first minute is at most 1.2 times that in it. A minute before the first is not counted.
 """
 
 import argparse
 import json
+import os
 import re
 import sys
 import tempfile
@@ -28,18 +34,22 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from benchmarks.material.servers import OURS, running
+from benchmarks.material.bad_clients import bad_clients
+from benchmarks.material.servers import OURS, descendants, running
 from mtlnet.inference.engine import load_engine
 from mtlnet.inference.image_decoding.decode import decode, inspect
 from mtlnet.inference.model_card import read_card
 from mtlnet.inference.prediction import decode_outputs
 from serve.client import Client, ServiceError
 from serve.workers.control_socket import send_command
+from tests.serve.attacks.conftest import resident_mb
 from tests.serve.conftest import jpeg, picture, publish_untrained
 
 CLIENTS, HERTZ, WORKERS = 8, 20.0, 2
 RELOAD_S, RESTART_S = 60.0, 300.0
 IMAGES = 16
+GROWTH, SLOWER = 0.01, 1.2
+MINUTE_S = 60.0
 COUNTED = re.compile(r'^driverview_frames_total\{.*outcome="answered".*\} ([0-9.e+]+)$', re.M)
 
 Known = dict[str, list[dict[str, Any]]]  # model hash -> its answers to the images
@@ -153,7 +163,7 @@ def measure(minutes: float, folder: Path) -> dict[str, Any]:
     told = [Told() for _ in range(CLIENTS)]
     with running(OURS, Path(sys.executable), runs[0], WORKERS) as port:
         before = counted(port)
-        end = time.monotonic() + 60 * minutes
+        end = time.monotonic() + MINUTE_S * minutes
         clients = [
             threading.Thread(target=drive, args=(port, number, images, end, told[number]))
             for number in range(CLIENTS)
@@ -182,6 +192,84 @@ def measure(minutes: float, folder: Path) -> dict[str, Any]:
     }
 
 
+@dataclass
+class Memory:
+    """The resident memory of some processes, MB, by time; a process that has ended is a fault."""
+
+    pids: list[int]
+    samples: list[tuple[float, float]] = field(default_factory=list)
+    fault: str = ""
+
+    def watch(self, end: float) -> None:
+        """Look once a second until `end`."""
+        while time.monotonic() < end and not self.fault:
+            try:
+                found = sum(resident_mb(pid) for pid in self.pids)
+            except OSError as error:
+                self.fault = f"a process of the service has ended ({error.filename})"
+                return
+            self.samples.append((time.monotonic(), found))
+            time.sleep(1.0)
+
+    def median(self, begin: float, end: float) -> float:
+        """Of the samples in a part of the time, MB."""
+        return median(mb for when, mb in self.samples if begin <= when < end)
+
+
+def measure_attacked(minutes: float, folder: Path) -> dict[str, Any]:
+    """The figures of a run beside bad clients."""
+    images = [jpeg(np.roll(picture(), 17 * number, axis=1)) for number in range(IMAGES)]
+    run = folder / "run"
+    publish_untrained(run, seed=3)
+    model = read_card(run).model_hash
+    known, reign = {model: answers_of(run, images)}, Reign(model)
+    told = [Told() for _ in range(CLIENTS)]
+    with running(OURS, Path(sys.executable), run, WORKERS) as port:
+        memory = Memory(descendants(os.getpid()))
+        with bad_clients(port):
+            begin = time.monotonic() + MINUTE_S
+            end = begin + MINUTE_S * minutes
+            threads = [
+                threading.Thread(target=drive, args=(port, number, images, end, told[number]))
+                for number in range(CLIENTS)
+            ]
+            for thread in threads:
+                thread.start()
+            memory.watch(end)
+            for thread in threads:
+                thread.join()
+    return {"minutes": minutes, **judge_attacked(told, memory, known, reign, begin, end)}
+
+
+def judge_attacked(
+    told: list[Told], memory: Memory, known: Known, reign: Reign, begin: float, end: float
+) -> dict[str, Any]:
+    """The figures from `begin` to `end`, and whether they are as claimed."""
+    faults = [fault for one in told for fault in [*one.lost, *wrong(one, known, reign)]]
+    faults += [memory.fault] if memory.fault else []
+    answers = [(sent, 1e3 * (done - sent)) for one in told for sent, done, _, _ in one.answers]
+    refused = sum((one.refused for one in told), Counter())
+    first = [ms for sent, ms in answers if begin <= sent < begin + MINUTE_S]
+    later = [ms for sent, ms in answers if sent >= begin + MINUTE_S]
+    p99s = [quantiles(part, n=100)[98] for part in (first, later)]
+    megabytes = [memory.median(begin, begin + MINUTE_S), memory.median(end - MINUTE_S, end)]
+    growth, slower = megabytes[1] / megabytes[0] - 1.0, p99s[1] / p99s[0]
+    return {
+        "answers": len(answers),
+        "answered_share": round(len(answers) / (len(answers) + refused.total()), 5),
+        "refused": dict(refused),
+        "turns_missed": sum(one.missed for one in told),
+        "p99_ms_first_minute": round(p99s[0], 2),
+        "p99_ms_later": round(p99s[1], 2),
+        "slower": round(slower, 3),
+        "memory_mb_first_minute": round(megabytes[0], 1),
+        "memory_mb_last_minute": round(megabytes[1], 1),
+        "growth": round(growth, 4),
+        "faults": faults[:10],
+        "reached": not faults and growth <= GROWTH and slower <= SLOWER,
+    }
+
+
 def counted(port: int) -> int:
     """The frames that the service says it answered, in all workers."""
     with urlopen(f"http://127.0.0.1:{port}/metrics") as page:
@@ -192,10 +280,14 @@ def counted(port: int) -> int:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--minutes", type=float, default=60.0)
+    parser.add_argument("--attacks", action="store_true", help="beside bad clients")
     parser.add_argument("--out", type=Path, help="write the figures here, too")
     options = parser.parse_args()
+    if options.attacks and options.minutes < 2:
+        parser.error("the last minute is compared with the first: give --minutes 2 or more")
     with tempfile.TemporaryDirectory() as folder:
-        result = measure(options.minutes, Path(folder))
+        made = measure_attacked if options.attacks else measure
+        result = made(options.minutes, Path(folder))
     text = json.dumps(result, indent=1)
     print(text)
     if options.out:

@@ -1,11 +1,11 @@
 """The service under attack: what a well-behaved client still gets, and what it costs in memory.
 
-Each attack of `tests.serve.attacks.attacks` is repeated for some seconds by a process that knows
+Each attack of `tests.serve.attacks.registry` is repeated for some seconds by a process that knows
 the token, while another process asks ten times a second over one connection, as a car does. Only
-loopback addresses are attacked.
+loopback addresses are attacked; the attacker has another one of them than the client.
 
     python benchmarks/service_attack.py [--address 127.0.0.1:8000 --pid PID] [--seconds 60]
-        [--settle 60] [--only NAME,NAME] [--model RUN] [--out FILE]
+        [--settle 60] [--only NAME,NAME] [--model RUN] [--json] [--out FILE]
     claims, in each attack: 99 of 100 requests answered, p99 at most three times that of a quiet
     service, memory at most 60 MB above it beside the bodies' budget of 64 MiB, and at most 10 MB
     above it after `--settle` seconds
@@ -26,7 +26,7 @@ import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from multiprocessing.synchronize import Event
 from pathlib import Path
 from statistics import quantiles
@@ -34,12 +34,14 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
+from benchmarks.material.bad_clients import ADDRESS
 from benchmarks.material.outcome import exit_code
 from benchmarks.material.servers import descendants
 from runtime.sockets import bind
 from serve.config import TOKEN_VARIABLE, is_loopback
-from tests.serve.attacks.attacks import ATTACKS, JPEG, Attack
+from tests.serve.attacks.attacks import JPEG, Attack
 from tests.serve.attacks.conftest import Target, resident_mb
+from tests.serve.attacks.registry import ATTACKS
 
 ANSWERED, SLOWER = 0.99, 3.0
 BODIES_MB, GROWTH_MB, LEFT_MB = 67.2, 60.0, 10.0
@@ -113,7 +115,8 @@ def measure(target: Target, pid: int, seconds: float, attack: Attack | None) -> 
     client.start()
     assert begun.wait(START_S)
     if attack is not None:
-        attacker = SPAWN.Process(target=repeat, args=(attack, target, seconds, attacked))
+        hostile = replace(target, source=ADDRESS)
+        attacker = SPAWN.Process(target=repeat, args=(attack, hostile, seconds, attacked))
         attacker.start()
         assert attacked.wait(START_S)
     most_mb, end_s = 0.0, time.monotonic() + seconds
@@ -186,7 +189,7 @@ def compare(target: Target, pid: int, options: argparse.Namespace) -> list[dict[
     measure(target, pid, 5.0, None)  # its caches and pools are filled
     quiet = measure(target, pid, max(QUIET_S, options.seconds), None)
     rows: list[dict[str, Any]] = [{"attack": "none", **asdict(quiet)}]
-    report(rows[0])
+    report(rows[0], options.json)
     for attack in chosen(options.only):
         under = measure(target, pid, options.seconds, attack)
         time.sleep(options.settle)
@@ -201,12 +204,12 @@ def compare(target: Target, pid: int, options: argparse.Namespace) -> list[dict[
             and row["left_mb"] <= LEFT_MB
         )
         rows.append(row)
-        report(row)
+        report(row, options.json)
     return rows
 
 
-def report(row: dict[str, Any]) -> None:
-    """Print one row."""
+def report(row: dict[str, Any], as_json: bool) -> None:
+    """Print one row of the table; on stderr where stdout is for JSON."""
     line = (
         f"{row['attack']:28} {100 * row['answered']:6.2f} % of {row['requests']:4d} answered, "
         f"p50 {row['p50_ms']:6.1f}, p99 {row['p99_ms']:7.1f} ms, {row['most_mb']:6.0f} MB"
@@ -216,7 +219,7 @@ def report(row: dict[str, Any]) -> None:
             f", p99 x {row['slower']:.2f}, {row['growth_mb']:+.0f} MB, later "
             f"{row['left_mb']:+.0f} MB{'' if row['ok'] else '  MISSED'}"
         )
-    print(line, flush=True)
+    print(line, flush=True, file=sys.stderr if as_json else sys.stdout)
 
 
 def main() -> None:
@@ -227,7 +230,8 @@ def main() -> None:
     parser.add_argument("--settle", type=float, default=60.0, help="after each attack")
     parser.add_argument("--only", help="names of attacks, with commas between them")
     parser.add_argument("--model", default="default")
-    parser.add_argument("--out", type=Path)
+    parser.add_argument("--json", action="store_true", help="print the rows as JSON on stdout")
+    parser.add_argument("--out", type=Path, help="write them as JSON to this file, too")
     options = parser.parse_args()
     if options.address is None:
         with own_service(options.model) as (target, pid):
@@ -238,9 +242,14 @@ def main() -> None:
             sys.exit("error: give a loopback address, and the --pid of the service there")
         target = Target(int(port), os.environ.get(TOKEN_VARIABLE))
         rows = compare(target, options.pid, options)
+    text = json.dumps(rows, indent=1)
+    if options.json:
+        print(text)
     if options.out is not None:
-        options.out.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
-    sys.exit(exit_code(all(row.get("ok", True) for row in rows)))
+        options.out.write_text(text + "\n", encoding="utf-8")
+    missed = [row["attack"] for row in rows if not row.get("ok", True)]
+    print(f"{len(rows) - 1} attacks, missed: {', '.join(missed) or 'none'}", file=sys.stderr)
+    sys.exit(exit_code(not missed))
 
 
 if __name__ == "__main__":

@@ -1,8 +1,9 @@
 """A million mutated byte streams through the service's HTTP and WebSocket connections, in process.
 
-Each begins as a request, a handshake or both; WebSocket frames follow where the handshake was
-accepted. It arrives in parts, on a transport that behaves as uvloop's. Nothing may be raised, be
-answered with 500, be logged as an error, or be left behind; seed and number make a stream again.
+Each begins as a request, a handshake or both, from a grammar (`material.stream_grammar`) or from
+the attacks of the tests; WebSocket frames follow where the handshake was accepted. It arrives in
+parts, on a transport that behaves as uvloop's. Nothing may be raised, hang, be answered with 500,
+be logged as an error, or be left behind; seed, part and number make a stream again.
 
     python benchmarks/service_stream_fuzz.py [--count 1000000] [--seed 0] [--workers N]
 """
@@ -13,6 +14,7 @@ import logging
 import os
 import random
 import sys
+import time
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from pathlib import Path
@@ -23,16 +25,18 @@ from uvicorn.server import ServerState
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
+from benchmarks.material import stream_grammar
 from serve.app import Service
 from serve.config import Limits
 from serve.server.fast_path import DirectProtocol
 from serve.server.guard import ConnectionGuard
 from serve.server.websocket import GuardedWebSocket
-from tests.serve.attacks.attacks import JPEG, mutate, whole_streams
-from tests.serve.attacks.conftest import Target, frame, resident_mb
+from tests.serve.attacks.attacks import mutate, whole_streams
+from tests.serve.attacks.conftest import Target, resident_mb
 from tests.serve.conftest import FakeEngine, outputs
 
 MAX_GROWTH = 0.02
+HANG_S = 1.0  # of processor time for one stream
 TURNS = 8  # of the event loop for each stream
 
 
@@ -98,14 +102,18 @@ class Errors(logging.Handler):
         self.found.append(f"{record.name}: {record.getMessage()[:200]}")
 
 
+def opening(rng: random.Random, known: list[bytes]) -> bytes:
+    """A stream of the grammar, or one of the tests; most are mutated."""
+    made = [stream_grammar.message(rng) for _ in range(rng.choice([1, 1, 2]))]
+    if rng.random() < 0.3:
+        return b"".join(made)
+    return mutate(rng, made if rng.random() < 0.6 else known)
+
+
 def frames(rng: random.Random) -> bytes:
-    """A few WebSocket frames, mutated."""
-    whole = [
-        frame(rng.randrange(16), rng.choice([b"", b"{}", b"x" * 200, JPEG[:600], b"\x03\xe8"]),
-              bool(rng.randrange(4)))
-        for _ in range(4)
-    ]  # fmt: skip
-    return mutate(rng, whole) + mutate(rng, whole)
+    """WebSocket frames, half of them mutated."""
+    made = stream_grammar.frames(rng)
+    return made if rng.random() < 0.5 else mutate(rng, [made])
 
 
 async def feed(transport: Transport, rng: random.Random, sent: bytes) -> None:
@@ -129,7 +137,7 @@ async def stream(make: Any, rng: random.Random, whole: list[bytes]) -> bytes:
     transport = Transport(asyncio.get_running_loop())
     transport.protocol = make()
     transport.protocol.connection_made(transport)
-    await feed(transport, rng, mutate(rng, whole))
+    await feed(transport, rng, opening(rng, whole))
     for _ in range(rng.randrange(TURNS)):
         await asyncio.sleep(0)
     if isinstance(transport.protocol, GuardedWebSocket) and not transport.closing:
@@ -150,7 +158,8 @@ async def run_part(seed: int, part: int, count: int) -> tuple[float, list[str]]:
     app.frame_queue.start()
     errors, faults, state = Errors(), [], ServerState()
     logging.getLogger().addHandler(errors)
-    guard = ConnectionGuard(Limits())
+    guard = ConnectionGuard(Limits(), bodies=app.bodies)
+    app.bodies.end_slow_bodies = guard.end_slow_bodies
     loop = asyncio.get_running_loop()
     make = partial(
         DirectProtocol,
@@ -165,8 +174,11 @@ async def run_part(seed: int, part: int, count: int) -> tuple[float, list[str]]:
     for number in range(count):
         rng = random.Random(f"{seed} {part} {number}")
         try:
+            begin = time.thread_time()
             if b"HTTP/1.1 500" in await stream(make, rng, whole):
                 faults.append(f"part {part}, number {number}: 500")
+            if time.thread_time() - begin > HANG_S:
+                faults.append(f"part {part}, number {number}: {HANG_S:g} s")
         except Exception as error:  # noqa: BLE001  # just what is looked for
             faults.append(f"part {part}, number {number}: {error!r}")
         faults += [f"part {part}, number {number}: {said}" for said in errors.found]
@@ -178,6 +190,8 @@ async def run_part(seed: int, part: int, count: int) -> tuple[float, list[str]]:
     groups = (guard.receiving, guard.working, guard.idle, guard.served, guard.streams)
     if state.connections or any((*groups, guard.dismissed, guard.leaving)):
         faults.append(f"part {part}: connections were left behind")
+    if app.bodies.held:
+        faults.append(f"part {part}: {app.bodies.held} bytes of bodies were left behind")
     app.frame_queue.close()
     logging.getLogger().removeHandler(errors)
     return resident_mb() / early_mb - 1.0, faults
@@ -197,10 +211,14 @@ def main() -> None:
     options = parser.parse_args()
     share = options.count // options.workers
     parts = range(options.workers)
+    begin = time.monotonic()
     with ProcessPoolExecutor(options.workers) as pool:  # a crash breaks the pool, and is told
         found = list(pool.map(run, [options.seed] * len(parts), parts, [share] * len(parts)))
     growth, faults = max(part[0] for part in found), [f for part in found for f in part[1]]
-    print(f"{share * len(parts)} streams, {len(faults)} faults")
+    count, seconds = share * len(parts), time.monotonic() - begin
+    print(
+        f"{count} streams in {seconds:.0f} s, {count / seconds:.0f} a second; {len(faults)} faults"
+    )
     print(f"memory grew by {100 * growth:.2f} %, claim: under {100 * MAX_GROWTH:g} %")
     print("\n".join(faults[:20]))
     sys.exit(bool(faults) or growth >= MAX_GROWTH)

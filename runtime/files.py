@@ -3,9 +3,14 @@
 import fcntl
 import json
 import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from trackfeatures.errors import UserError
+
+STAGED = ".staged"  # where `replaced_files` keeps new files
 
 
 def check_folder(path: Path) -> None:
@@ -64,6 +69,29 @@ def atomic_move(source: Path, target: Path) -> None:
         fsync_path(path)
     source.replace(target)
     fsync_path(target.parent)
+
+
+@contextmanager
+def replaced_files(folder: Path, last: str) -> Iterator[Path]:
+    """Yield a folder; its files replace those in `folder` when the block ends without an error.
+
+    The file `last` describes the others. It is removed before the first of them is replaced, and
+    comes after all of them: who finds it finds files that belong together. Raises OSError.
+    """
+    staged = folder / STAGED
+    shutil.rmtree(staged, ignore_errors=True)  # left by a kill
+    staged.mkdir(parents=True)
+    try:
+        yield staged
+        paths = sorted(staged.iterdir(), key=lambda path: path.name == last)
+        for path in paths:
+            fsync_path(path)
+        (folder / last).unlink(missing_ok=True)
+        for path in paths:
+            path.replace(folder / path.name)
+        fsync_path(folder)
+    finally:
+        shutil.rmtree(staged, ignore_errors=True)
 
 
 def try_lock(descriptor: int, *, shared: bool = False) -> bool:

@@ -25,7 +25,7 @@ from serve.api.features import (
 from serve.api.hosts import HostCheck
 from serve.api.http_io import Receive, Reply, Scope, Send, problem_reply, send_reply
 from serve.api.problems import Problem, install_problem_handlers
-from serve.api.request_options import Headers, check_token
+from serve.api.request_options import Headers, check_token, request_id_of
 from serve.api.stream import Stream
 from serve.config import Limits
 from serve.observability.metrics import MEDIA_TYPE, Metrics
@@ -127,25 +127,26 @@ class Service:
             self._hosts.check(headers)
             check_token(headers, self._token)
         except Problem as problem:
-            return self._refuse(problem)
+            return self._refuse(problem, headers, client)
         return None
 
     def _authorize_scope(self, scope: Scope) -> Reply | None:
         """As `_authorize`, for a request of any path; its headers may hold a name twice."""
-        path, headers = scope["path"], dict(scope["headers"])
+        path, headers, client = scope["path"], dict(scope["headers"]), client_address(scope)
         try:
             public = _is_public(path)
-            self.rate_limiter.check(client_address(scope), public=public)
+            self.rate_limiter.check(client, public=public)
             self._hosts.check_single([name for name, _ in scope["headers"]])
             version = scope.get("http_version", "1.1")
             self._hosts.check(headers, probe=path in PROBES, version=version)
             if not public:
                 check_token(headers, self._token)
         except Problem as problem:
-            return self._refuse(problem)
+            return self._refuse(problem, headers, client)
         return None
 
-    def _refuse(self, problem: Problem) -> Reply:
+    def _refuse(self, problem: Problem, headers: Headers, client: str) -> Reply:
+        self.frames.refusals.log(request_id_of(headers), client, problem)
         self.metrics.count_refusal(problem.type, self.frame_queue.waiting)
         return problem_reply(problem)
 

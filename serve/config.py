@@ -3,7 +3,8 @@
 import os
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from ipaddress import ip_address, ip_network
+from functools import lru_cache
+from ipaddress import IPv6Address, ip_address, ip_network
 from pathlib import Path
 
 from trackfeatures.errors import UserError
@@ -113,3 +114,17 @@ def is_loopback(host: str) -> bool:
         return host == "localhost"
     mapped = getattr(found, "ipv4_mapped", None)
     return (mapped or found).is_loopback
+
+
+@lru_cache(4096)
+def network_of(address: str) -> str:
+    """The address, or the /64 network of an IPv6 address; an IPv4 address within IPv6 is that."""
+    try:
+        found = ip_address(address.partition("%")[0])
+    except ValueError:
+        return address
+    if not isinstance(found, IPv6Address):
+        return str(found)
+    if found.ipv4_mapped is not None:
+        return str(found.ipv4_mapped)
+    return f"{found.packed[:8].hex()}/64"

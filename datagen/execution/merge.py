@@ -2,7 +2,8 @@
 
 import json
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -14,13 +15,17 @@ from datagen.planning.plan import check_entry
 from datagen.recording.errors import DatasetError
 from datagen.recording.folder import (
     RoundState,
+    begin_merge,
     discard_partial,
     discard_partials,
+    end_merge,
     file_sha256,
+    is_unstarted,
     partial_path,
     prepare,
     publish,
     read_states,
+    round_path,
     write_if_changed,
 )
 from datagen.recording.manifest import rebuild
@@ -51,7 +56,7 @@ def merge(folders: Sequence[Path], out: Path) -> MergeResult:
     plans = [_read_plan(folder) for folder in folders]
     if (out / PLAN_FILE).is_file():
         plans.append(_read_plan(out))
-    elif out.exists() and (not out.is_dir() or any(out.iterdir())):
+    elif out.exists() and not (out.is_dir() and is_unstarted(out, PLAN_FILE)):
         raise DatasetError(f"{out} exists and is not a dataset; choose another --out")
     _require_one_plan(plans, [*folders, out])
     plan = plans[0]
@@ -62,14 +67,15 @@ def merge(folders: Sequence[Path], out: Path) -> MergeResult:
         present = read_states(out).keys()
         found = {s.id: (folder, s) for folder in folders for s in read_states(folder).values()}
         planned = {entry["id"]: entry["split"] for entry in plan["rounds"]}
-        for round_id in sorted(found.keys() & planned.keys() - present):
-            _copy_round(*found[round_id], out)
+        try:
+            _copy_rounds(found, sorted(found.keys() & planned.keys() - present), out)
+        except BaseException:
+            with suppress(OSError, tf.UserError):  # the first error is reported, not a later one
+                discard_partials(out, planned)
+                _derive(out, planned)
+            raise
         discard_partials(out, planned)
-        states = {i: state for i, state in read_states(out).items() if i in planned}
-        if not states:
-            raise DatasetError("no folder has a finished round of the plan; record a shard first")
-        sides = {side: tuple(i for i in states if planned[i] == side) for side in SIDES}
-        statistics = rebuild(out, Split(**sides))
+        states, statistics = _derive(out, planned)
     return MergeResult(
         rounds=len(states),
         planned=len(planned),
@@ -78,6 +84,26 @@ def merge(folders: Sequence[Path], out: Path) -> MergeResult:
         content_hash=str(statistics["content_hash"]),
         out=str(out),
     )
+
+
+def _copy_rounds(
+    found: Mapping[str, tuple[Path, RoundState]], round_ids: Sequence[str], out: Path
+) -> None:
+    """Copy these rounds. Until the split knows them, no reader takes the dataset."""
+    if round_ids:
+        begin_merge(out)
+    for round_id in round_ids:
+        _copy_round(*found[round_id], out)
+
+
+def _derive(out: Path, planned: Mapping[str, str]) -> tuple[dict[str, RoundState], dict[str, Any]]:
+    """Write split, statistics, card and manifest of the finished rounds: these, and statistics."""
+    states = {i: state for i, state in read_states(out).items() if i in planned}
+    if not states:
+        end_merge(out)
+        raise DatasetError("no folder has a finished round of the plan; record a shard first")
+    sides = {side: tuple(i for i in states if planned[i] == side) for side in SIDES}
+    return states, rebuild(out, Split(**sides))
 
 
 def _read_plan(folder: Path) -> dict[str, Any]:
@@ -114,5 +140,9 @@ def _copy_round(folder: Path, state: RoundState, out: Path) -> None:
                 "delete it and record that shard again"
             )
         publish(out, partial, state)
+    except BaseException:
+        if not partial.exists() and state.id not in read_states(out):
+            round_path(out, state.id).unlink(missing_ok=True)  # moved, but without its state
+        raise
     finally:
         discard_partial(out, state.id)

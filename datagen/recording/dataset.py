@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 import trackfeatures as tf
 from datagen.recording.errors import DatasetError, UndecodableImage
+from datagen.recording.folder import require_merged
 from datagen.recording.images import decode_into
 from datagen.recording.labels import Labels, concatenate, read_labels
 from datagen.recording.mcap.index import RoundIndex, open_round
@@ -178,8 +179,9 @@ class Dataset:
     def open(path: str | Path, split: str = DEFAULT_SPLIT) -> "Dataset":
         """Open the rounds of a folder.
 
-        Raises DatasetError if there are none, a round is damaged, cameras differ or the split
-        leaks, and DefinitionsMismatch if a round was recorded under other label definitions.
+        Raises DatasetError if there are none, a round is damaged, a merge has not ended, cameras
+        differ or the split leaks, and DefinitionsMismatch if a round was recorded under other
+        label definitions.
         """
         folder = Path(path)
         indexes = [open_round(file) for file in round_files(folder)]
@@ -212,7 +214,11 @@ class Dataset:
 
 
 def round_files(folder: Path) -> list[Path]:
-    """The finished rounds of a dataset folder, sorted by name; DatasetError if there are none."""
+    """The finished rounds of a dataset folder, sorted by name.
+
+    Raises DatasetError if there are none, or a merge has not ended.
+    """
+    require_merged(folder)
     files = sorted((folder / "rounds").glob("*.mcap"))
     if not files:
         raise DatasetError(

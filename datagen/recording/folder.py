@@ -21,6 +21,7 @@ from trackfeatures.names import require_name
 
 PARTIAL = ".partial"
 LOCKS = ".locks"
+MERGING = ".merging"  # is there from the first round of a merge to its last
 SUBFOLDERS = ("rounds", "state", "splits", "layouts", "proto", "schemas")
 PUBLISHED_FILES = ("proto/driverview.proto", "layouts/foxglove.json", SCHEMA_FILE)
 READ_BYTES = 1 << 20
@@ -87,6 +88,25 @@ def is_unstarted(folder: Path, first_file: str) -> bool:
     )
 
 
+def begin_merge(folder: Path) -> None:
+    """Mark that rounds are being added, of which the split does not know yet."""
+    atomic_write(folder / MERGING, "", fsync=True)
+
+
+def end_merge(folder: Path) -> None:
+    """Remove the mark: split and rounds fit."""
+    (folder / MERGING).unlink(missing_ok=True)
+
+
+def require_merged(folder: Path) -> None:
+    """Raise DatasetError if a merge into the dataset has not ended."""
+    if (folder / MERGING).exists():
+        raise DatasetError(
+            f"a merge into {folder} was interrupted, or is under way; end it by running the same "
+            "`datagen merge` again"
+        )
+
+
 def round_path(folder: Path, round_id: str) -> Path:
     """The file of a finished round. Raises BadName."""
     return folder / "rounds" / f"{require_name(round_id, 'round id')}.mcap"
@@ -119,8 +139,13 @@ def partial_path(folder: Path, round_id: str) -> Path:
 def publish(folder: Path, partial: Path, state: RoundState) -> None:
     """Move a checked round into `rounds/` and write its state; safe against a power cut."""
     atomic_move(partial, round_path(folder, state.id))
-    write_if_changed(state_path(folder, state.id), json.dumps(asdict(state), indent=1) + "\n")
+    write_state(folder, state)
     discard_partial(folder, state.id)
+
+
+def write_state(folder: Path, state: RoundState) -> None:
+    """Write the state of a round, synced."""
+    write_if_changed(state_path(folder, state.id), json.dumps(asdict(state), indent=1) + "\n")
 
 
 def discard_partial(folder: Path, round_id: str) -> None:

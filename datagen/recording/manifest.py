@@ -13,7 +13,13 @@ from typing import Any
 import trackfeatures as tf
 from datagen.recording.card import render_card
 from datagen.recording.dataset import Dataset
-from datagen.recording.folder import PUBLISHED_FILES, file_sha256, read_states, write_if_changed
+from datagen.recording.folder import (
+    PUBLISHED_FILES,
+    end_merge,
+    file_sha256,
+    read_states,
+    write_if_changed,
+)
 from datagen.recording.splits import Split, split_path, write_split
 from datagen.recording.statistics import describe
 
@@ -79,6 +85,7 @@ def manifest_problems(folder: Path) -> Iterator[str]:
 def rebuild(folder: Path, split: Split) -> dict[str, Any]:
     """Write manifest, split, statistics and card from the rounds; returns the statistics."""
     write_split(split_path(folder), split)
+    end_merge(folder)
     dataset = Dataset.open(folder)
     statistics = describe(dataset)
     write_if_changed(folder / "stats.json", to_json(statistics))

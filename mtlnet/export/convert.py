@@ -39,7 +39,7 @@ from mtlnet.inference.model_card import (
 from mtlnet.inference.prediction import OUTPUTS
 from mtlnet.model.architecture import HEIGHT, WIDTH
 from mtlnet.model.network import Network, load_network, predict_images
-from runtime.files import atomic_move, write_json
+from runtime.files import atomic_move, replaced_files, write_json
 from trackfeatures.errors import UserError
 
 FORMATS, PRECISIONS = ("onnx", "openvino"), ("f32", "bf16", "int8")
@@ -69,33 +69,33 @@ def export_model(
     require_fit(card, shown, "all")
     chosen = np.linspace(0, len(shown) - 1, min(frames, len(shown))).astype(np.int64)
     folder = out or run / "export" / f"{kind}-{precision}"
-    folder.mkdir(parents=True, exist_ok=True)
-    (folder / EXPORT_FILE).unlink(missing_ok=True)  # an interrupted export is then no export
     network = load_network(run / WEIGHTS, card.network)
     images = shown.read_batch(chosen)
     about: dict[str, Any] = {"format": kind, "precision": precision}
-    try:
-        if kind == "onnx":
-            names = write_onnx(network, folder, bf16=precision == "bf16")
-        else:
-            graph = read_graph(run, card)
-            if precision == "int8":
-                graph, about["float_activations"] = _quantised(graph, card, dataset)
-            names = write_openvino(graph, folder, precision)
-    except RuntimeError as error:  # OpenVINO's error for a failed write
-        reason = str(error).strip().splitlines()[-1]
-        raise UserError(f"{folder} could not be written ({reason}); is the disk full?") from error
-    check = check_export(network, folder / names[0], precision, images)
-    about["check"] = check
-    write_export(folder, card, names, **about)
+    with replaced_files(folder, last=EXPORT_FILE) as staged:
+        try:
+            if kind == "onnx":
+                names = write_onnx(network, staged, bf16=precision == "bf16")
+            else:
+                graph = read_graph(run, card)
+                if precision == "int8":
+                    graph, about["float_activations"] = _quantised(graph, card, dataset)
+                names = write_openvino(graph, staged, precision)
+        except RuntimeError as error:  # OpenVINO's error for a failed write
+            reason = str(error).strip().splitlines()[-1]
+            raise UserError(
+                f"{folder} could not be written ({reason}); is the disk full?"
+            ) from error
+        about["check"] = check = check_export(network, staged / names[0], precision, images)
+        if precision == "f32" and not check["largest"] <= TOLERANCE:
+            raise ModelError(
+                f"{folder / names[0]} would differ from torch by {check['largest']:.2g}, at most "
+                f"{TOLERANCE:g} is expected; report this as a fault"
+            )
+        write_export(staged, card, names, **about)
     if precision == "int8":
         about["gate"] = judge(run, dataset.path)
         write_export(folder, card, names, **about)
-    if precision == "f32" and not check["largest"] <= TOLERANCE:
-        raise ModelError(
-            f"{folder / names[0]} differs from torch by {check['largest']:.2g}, at most "
-            f"{TOLERANCE:g} is expected; report this as a fault"
-        )
     return {"model": card.name, "out": str(folder), "files": list(names), **about}
 
 

@@ -1,7 +1,7 @@
 """The model in a run's own folder, written when training ends: weights, OpenVINO graph, card.
 
-The card is written last, after the graph has been compared with torch on real frames: a run without
-a card holds no finished model.
+All files are put in place together, after the graph has been compared with torch on real frames,
+and the card last: a run without a card holds no finished model.
 """
 
 import platform
@@ -18,6 +18,7 @@ import trackfeatures as tf
 from mtlnet.export.openvino_graph import TOLERANCE, UNCERTAINTY_TOLERANCE, run_graph, write_graph
 from mtlnet.inference.engine import best_precision
 from mtlnet.inference.model_card import (
+    CARD,
     GRAPH,
     GRAPH_WEIGHTS,
     MODEL_FILES,
@@ -37,7 +38,7 @@ from mtlnet.inference.uncertainty import (
 )
 from mtlnet.model.architecture import HEIGHT, WIDTH
 from mtlnet.model.network import Network, fold, predict_images, run_network
-from runtime.files import atomic_write
+from runtime.files import atomic_write, replaced_files
 from trackfeatures.camera import CameraParameters
 from trackfeatures.names import to_name
 
@@ -68,34 +69,35 @@ def publish(
 
     `images` (N, 210, 280, 3): frames on which the graph is compared with torch. Without
     `uncertainty` the model predicts no standard deviations. Raises ModelError when the graph
-    differs by more than the tolerances of `mtlnet.export.openvino_graph`; the run then has no card.
+    differs by more than the tolerances of `mtlnet.export.openvino_graph`. After an error the run
+    has the model that it had.
     """
-    run.mkdir(parents=True, exist_ok=True)
     folded = fold(network)
     weights = {name: t.contiguous() for name, t in folded.state_dict().items()}
-    atomic_write(run / WEIGHTS, save(weights), fsync=True)
     head = None if uncertainty is None else uncertainty.head
-    if head is not None:
-        write_uncertainty_head(run, head)
-    write_graph(folded, run / GRAPH, run / GRAPH_WEIGHTS, head)
-    check = compare_graph(folded, run, images, head)
-    _require_equal(run, check)
     golden = golden_image(WIDTH, HEIGHT)
     names = MODEL_FILES if head is None else (*MODEL_FILES, UNCERTAINTY_WEIGHTS)
     origin = provenance or Provenance()
-    card = ModelCard(
-        name=to_name(run.resolve().name),
-        network=folded.architecture.name,
-        definitions_version=tf.VERSION,
-        program_version=package_versions()["driverview"],
-        **{field.name: getattr(origin, field.name) for field in fields(origin)},
-        versions=package_versions(),
-        files={name: file_hash(run / name) for name in names},
-        export_check=check,
-        golden=tuple(float(v) for v in predict_images(folded, golden[None])[0]),
-        doubt=None if uncertainty is None else uncertainty.about,
-    )
-    card.write(run)
+    with replaced_files(run, last=CARD) as staged:
+        atomic_write(staged / WEIGHTS, save(weights), fsync=True)
+        if head is not None:
+            write_uncertainty_head(staged, head)
+        write_graph(folded, staged / GRAPH, staged / GRAPH_WEIGHTS, head)
+        check = compare_graph(folded, staged, images, head)
+        _require_equal(run, check)
+        card = ModelCard(
+            name=to_name(run.resolve().name),
+            network=folded.architecture.name,
+            definitions_version=tf.VERSION,
+            program_version=package_versions()["driverview"],
+            **{field.name: getattr(origin, field.name) for field in fields(origin)},
+            versions=package_versions(),
+            files={name: file_hash(staged / name) for name in names},
+            export_check=check,
+            golden=tuple(float(v) for v in predict_images(folded, golden[None])[0]),
+            doubt=None if uncertainty is None else uncertainty.about,
+        )
+        card.write(staged)
     return card
 
 

@@ -30,6 +30,7 @@ from mtlnet.model.architecture import HEIGHT, WIDTH, find_architecture
 from mtlnet.model.network import CODED_HEADS, Network, fold, load_network
 from mtlnet.training.checkpoint import list_checkpoints, load_checkpoint
 from mtlnet.training.config import (
+    CONFIG,
     TrainConfig,
     new_config,
     newest_run,
@@ -43,7 +44,7 @@ from mtlnet.training.recipes import Recipe, find_recipe
 from mtlnet.training.task_weighting import TaskWeighting
 from mtlnet.training.trainer import Trainer, choose_device, keep_freed_memory
 from mtlnet.uncertainty_fit.head import fit_uncertainty_head
-from runtime.files import fsync_path
+from runtime.files import fsync_path, unfinished_path
 from trackfeatures.errors import UserError
 
 EXPORT_CHECK_FRAMES = 16
@@ -198,8 +199,9 @@ def _train(
 
 
 def require_new(out: Path) -> None:
-    """Raise UserError when the folder of a new run exists."""
-    if out.exists():
+    """Raise UserError when the folder of a new run exists; a kill may have left it empty."""
+    empty = out.is_dir() and {*out.iterdir()} <= {unfinished_path(out / CONFIG)}
+    if out.exists() and not empty:
         raise UserError(
             f"{out} already exists; continue that run with --resume, or choose another --out"
         )
@@ -207,7 +209,7 @@ def require_new(out: Path) -> None:
 
 def create_run(config: TrainConfig, recipe: Recipe, data: dict[str, Any]) -> None:
     """Make the folder of a new run with its `config.json`."""
-    config.out.mkdir(parents=True)
+    config.out.mkdir(parents=True, exist_ok=True)
     try:
         write_config(config, recipe, data)
     except OSError:

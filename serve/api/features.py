@@ -61,7 +61,7 @@ class FrameHandler:
         self.queue = queue
         self._bodies = bodies
         self._metrics = metrics
-        self._refusals = RefusalLog()
+        self.refusals = RefusalLog()
         self._log_answers = log_answers
 
     def share(self) -> BodyShare:
@@ -122,7 +122,7 @@ class FrameHandler:
     def record_refusal(self, error: Problem | ImageError, request_id: str, client: str) -> Problem:
         """Count and log an error; the problem to answer with."""
         problem = as_problem(error)
-        self._refusals.log(request_id, client, problem)
+        self.refusals.log(request_id, client, problem)
         self._metrics.count_refusal(problem.type, self.queue.waiting)
         return problem
 

@@ -1,8 +1,8 @@
 """The service's log: one JSON object a line on stderr, with the id of the request.
 
-No client can fill the disk: its refusals are logged once a second, those of all clients ten times;
-the same error, and what native libraries write to stderr, once a second. The number of those left
-out is in the next one logged, as `untold`.
+No client can fill the disk: its refusals, for its token, Host, Origin or rate too, are logged once
+a second, those of all clients ten times; the same error, and what native libraries write to
+stderr, once a second. The number of those left out is in the next one logged, as `untold`.
 """
 
 import faulthandler
@@ -14,6 +14,8 @@ import threading
 import time
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING
+
+from serve.config import network_of
 
 if TYPE_CHECKING:
     from serve.api.problems import Problem  # loads FastAPI, which the supervisor does without
@@ -126,7 +128,7 @@ class RefusalLog:
         elapsed_s = now - self._updated_s
         self._tokens = min(REFUSALS_PER_S, self._tokens + elapsed_s * REFUSALS_PER_S)
         self._updated_s = now
-        if self._tokens < 1.0 or not self._clients.passes(client, now):
+        if self._tokens < 1.0 or not self._clients.passes(network_of(client), now):
             self._suppressed += 1
             return
         self._tokens -= 1.0

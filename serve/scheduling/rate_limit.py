@@ -7,10 +7,10 @@ so a client may get slightly more than its rate and never less.
 import time
 from functools import lru_cache
 from hashlib import blake2b
-from ipaddress import IPv6Address, ip_address
 
 from serve.api.problems import RATE_LIMITED, Problem
 from serve.config import is_loopback
+from serve.config import network_of as network_of
 from serve.workers.shared_memory import CLIENT_ENTRIES, CLIENT_WORDS, PROBES
 
 
@@ -26,19 +26,6 @@ def client_key(address: str, public: bool = False) -> float:
     kind = "public " if public else ""
     digest = blake2b(f"{kind}{network_of(address)}".encode(), digest_size=6).digest()
     return float(int.from_bytes(digest, "big") + 1)
-
-
-def network_of(address: str) -> str:
-    """The address, or the /64 network of an IPv6 address; an IPv4 address within IPv6 is that."""
-    try:
-        found = ip_address(address.partition("%")[0])
-    except ValueError:
-        return address
-    if not isinstance(found, IPv6Address):
-        return str(found)
-    if found.ipv4_mapped is not None:
-        return str(found.ipv4_mapped)
-    return f"{found.packed[:8].hex()}/64"
 
 
 class RateLimiter:

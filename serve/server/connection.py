@@ -17,6 +17,7 @@ from serve.api.http_io import encode_head, problem_reply
 from serve.api.problems import (
     HEAD_TOO_LARGE,
     MALFORMED,
+    OVERLOADED,
     RATE_LIMITED,
     TOO_MANY_CONNECTIONS,
     TOO_SLOW,
@@ -87,6 +88,7 @@ class GuardedProtocol(HttpToolsProtocol):
         if phase is Phase.IDLE:
             self._unread_bytes = self._known_bytes = 0
             self._phase = Phase.HEAD
+        self._guard.reading = self
         self._part_bytes = len(data)
         self._part_requests = 0
         self._unread_bytes += self._part_bytes
@@ -193,7 +195,7 @@ class GuardedProtocol(HttpToolsProtocol):
 
     def connection_lost(self, exc: Exception | None) -> None:
         self._phase, self._deadline_s = Phase.CLOSING, inf
-        self.group.pop(self, None)
+        self._guard.forget(self)
         self.abandon_requests()
         super().connection_lost(exc)
         self.pipeline.clear()  # its requests hold this connection
@@ -288,6 +290,14 @@ class GuardedProtocol(HttpToolsProtocol):
         idle = self._phase is Phase.IDLE
         self._phase, self._deadline_s = Phase.CLOSING, self._guard.clock() + guards.LINGER_S
         (self.transport.close if idle else self.transport.abort)()
+
+    def end_slow_body(self, now: float) -> int:
+        """Refuse a body that has been arriving for long; the bytes that it held."""
+        if self._phase is not Phase.BODY or now - self.since_s < guards.EVICTABLE_S:
+            return 0
+        held = 0 if self.cycle is None or self.cycle.response_complete else self._unread_bytes
+        self._close_with(Problem(OVERLOADED, "the bodies in flight need too much memory"))
+        return held
 
     def expire(self, now: float) -> None:
         """Close the connection when its deadline has passed."""

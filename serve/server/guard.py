@@ -16,6 +16,7 @@ from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
 from serve.api.problems import TOO_MANY_CONNECTIONS, ProblemType
 from serve.config import Limits
+from serve.scheduling.body_budget import BodyBudget
 
 LINGER_S = 0.5  # for a client to read the problem before its connection is closed
 EVICTABLE_S = 0.1  # connections in headers or a body for longer give way to new ones
@@ -34,6 +35,9 @@ class Guarded(Protocol):
     def expire(self, now: float) -> None:
         """End the connection if its deadline has passed."""
 
+    def end_slow_body(self, now: float) -> int:
+        """End the connection if a body has been arriving for EVICTABLE_S; the bytes it held."""
+
 
 Group = dict[Guarded, None]
 
@@ -50,6 +54,10 @@ class ConnectionGuard:
     other_connections: Callable[[], int] = lambda: 0
     """Counts the connections of the other workers."""
     count_closed: Callable[[ProblemType], None] = lambda _type: None
+    bodies: BodyBudget | None = None
+    """The budget for messages of WebSockets that are incomplete; None: there is none."""
+    reading: Guarded | None = None
+    """The connection that received something last."""
     clock: Callable[[], float] = time.monotonic
     """Time for the deadlines, s."""
     draining: bool = False
@@ -78,6 +86,12 @@ class ConnectionGuard:
         connection.since_s = now = self.clock()
         return now
 
+    def forget(self, connection: Guarded) -> None:
+        """Let go of a connection that has ended."""
+        connection.group.pop(connection, None)
+        if self.reading is connection:
+            self.reading = None
+
     def make_room(self, excess: int) -> bool:
         """End `excess` connections, the least useful first; False: not so many give way."""
         now = self.clock()
@@ -97,6 +111,19 @@ class ConnectionGuard:
                 self.count_closed(TOO_MANY_CONNECTIONS)
                 excess -= 1
         return excess <= 0
+
+    def end_slow_bodies(self, size: float) -> float:
+        """End connections whose bodies arrive slowly, until these held `size` bytes; how many.
+
+        Those of an ASGI request are free only when its task has noticed.
+        """
+        now, freed = self.clock(), 0
+        for connection in (*self.receiving, *self.streams):
+            if freed >= size:
+                break
+            if connection is not self.reading:
+                freed += connection.end_slow_body(now)
+        return freed
 
     def pause_reading(self, connection: HttpToolsProtocol) -> None:
         """Read no more from a refused client for REFUSAL_PAUSE_S.

@@ -18,6 +18,7 @@ from websockets.protocol import State
 
 from serve.api.http_io import encode_head, problem_reply
 from serve.api.problems import HEAD_TOO_LARGE, MALFORMED, TOO_SLOW, Problem
+from serve.scheduling.body_budget import BodyShare
 from serve.server import guard as guards
 from serve.server.guard import ConnectionGuard, Group
 
@@ -38,6 +39,8 @@ class GuardedWebSocket(WebSocketsSansIOProtocol):
         self._handshake_end_s = self._message_end_s = inf
         self._reading_end_s = self._closing_end_s = inf
         self._small_frames, self._counted_s = float(SMALL_FRAMES), 0.0
+        self._share = None if guard.bodies is None else BodyShare(guard.bodies)
+        self._frame_bytes = 0  # of the frames of a message that is incomplete
 
     def connection_made(self, transport: Transport) -> None:  # type: ignore[override]
         super().connection_made(transport)
@@ -46,13 +49,13 @@ class GuardedWebSocket(WebSocketsSansIOProtocol):
         transport.pause_reading()  # frames have to wait for the reply to the handshake
 
     def connection_lost(self, exc: Exception | None) -> None:
-        self.group.pop(self, None)
+        self._guard.forget(self)
         super().connection_lost(exc)
-        self.frames = []
-        self.conn.reader.discard()
+        self._drop_message()
         self.conn.parser.close()  # it holds `conn`, which holds it
 
     def data_received(self, data: bytes) -> None:
+        self._guard.reading = self
         for at in range(0, len(data), SLICE_BYTES):
             if self._discarding:
                 return
@@ -63,6 +66,37 @@ class GuardedWebSocket(WebSocketsSansIOProtocol):
             self._message_end_s = inf
         elif self._message_end_s == inf:
             self._message_end_s = self._guard.clock() + self._guard.limits.body_s
+        if not self._discarding:
+            self._count_message()
+
+    def _count_message(self) -> None:
+        """Hold of the budget for bodies what has arrived of a message."""
+        if self._share is None:
+            return
+        try:
+            frames = self._frame_bytes if self.frames else 0
+            self._share.hold(frames + len(self.conn.reader.buffer))
+        except Problem as problem:
+            self.fail(CloseCode.TRY_AGAIN_LATER, problem.detail)
+
+    def _drop_message(self) -> None:
+        """Let go of what has arrived of a message."""
+        self.frames = []
+        self.conn.reader.discard()
+        if self._share is not None:
+            self._share.close()
+
+    def handle_text(self, event: Frame) -> None:
+        self._frame_bytes = len(event.data)
+        super().handle_text(event)
+
+    def handle_bytes(self, event: Frame) -> None:
+        self._frame_bytes = len(event.data)
+        super().handle_bytes(event)
+
+    def handle_cont(self, event: Frame) -> None:
+        self._frame_bytes += len(event.data)
+        super().handle_cont(event)
 
     def _refuse_handshake(self, error: Exception) -> None:
         """Answer what websockets would leave unanswered."""
@@ -132,6 +166,15 @@ class GuardedWebSocket(WebSocketsSansIOProtocol):
         """Close this WebSocket without messages: a new connection needs its place."""
         self.fail(CloseCode.TRY_AGAIN_LATER, "closed for another client, after no message for long")
 
+    def end_slow_body(self, now: float) -> int:
+        """Close when a message has been arriving for long; the bytes that it held."""
+        held = 0 if self._share is None else self._share.size
+        since_s = self._message_end_s - self._guard.limits.body_s
+        if not held or self._discarding or now - since_s < guards.EVICTABLE_S:
+            return 0
+        self.fail(CloseCode.TRY_AGAIN_LATER, "the bodies in flight need too much memory")
+        return held
+
     def expire(self, now: float) -> None:
         """Close the connection when a deadline has passed."""
         if self._discarding or self.transport.is_closing():
@@ -175,7 +218,7 @@ class GuardedWebSocket(WebSocketsSansIOProtocol):
     def _close_after(self, output: bytes) -> None:
         """Send the last bytes; close after LINGER_S."""
         self._discarding = self.close_sent = True
-        self.frames = []
+        self._drop_message()
         self.stop_keepalive()
         self._guard.place(self, self._guard.dismissed)
         if self.transport.is_closing():

@@ -43,7 +43,9 @@ class WorkerServer(uvicorn.Server):
             limits,
             other_connections=lambda: sum(self._peers.other_connections()),
             count_closed=app.metrics.count_closed,
+            bodies=app.bodies,
         )
+        app.bodies.end_slow_bodies = self.guard.end_slow_bodies
         super().__init__(_uvicorn_config(app))
         self.app = app
         self._peers = peers or WorkerPeers(app.shared, 0)

@@ -3,11 +3,12 @@
 import errno
 import os
 import threading
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from runtime.files import atomic_write, check_folder, try_lock
+from runtime.files import STAGED, atomic_write, check_folder, replaced_files, try_lock
 from trackfeatures import UserError
 
 
@@ -67,3 +68,49 @@ def test_a_lock_excludes_others_until_its_file_is_closed(tmp_path: Path) -> None
     finally:
         os.close(first)
         os.close(other)
+
+
+def contents(folder: Path) -> dict[str, str]:
+    return {path.name: path.read_text() for path in sorted(folder.iterdir())}
+
+
+def replace_with(folder: Path, content: str, then: Callable[[], object] = lambda: None) -> None:
+    """Replace three files, the card last; `then` is called once they are written."""
+    with replaced_files(folder, last="card") as staged:
+        for name in ("card", "a", "z"):
+            (staged / name).write_text(content)
+        then()
+
+
+def fail(*_: object) -> Path:
+    raise OSError(errno.ENOSPC, "No space left on device")
+
+
+def test_files_that_belong_together_are_replaced_together(tmp_path: Path) -> None:
+    (tmp_path / STAGED).mkdir()
+    (tmp_path / STAGED / "left").write_text("by a kill")
+    (tmp_path / "other").write_text("kept")
+    replace_with(tmp_path, "old")
+    replace_with(tmp_path, "new", lambda: (tmp_path / "card").read_text() == "old")
+    expected = dict.fromkeys(("a", "card", "z"), "new")
+    assert contents(tmp_path) == {**expected, "other": "kept"}
+
+
+def test_files_stay_after_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    replace_with(tmp_path, "old")
+    before = contents(tmp_path)
+    with pytest.raises(OSError, match="No space"):
+        replace_with(tmp_path, "new", fail)
+    monkeypatch.setattr("runtime.files.fsync_path", fail)
+    with pytest.raises(OSError, match="No space"):
+        replace_with(tmp_path, "new")
+    assert contents(tmp_path) == before
+
+
+def test_without_its_last_file_a_part_is_never_taken(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    replace_with(tmp_path, "old")
+    with pytest.raises(OSError, match="No space"):
+        replace_with(tmp_path, "new", lambda: monkeypatch.setattr(Path, "replace", fail))
+    assert contents(tmp_path) == {"a": "old", "z": "old"}

@@ -15,9 +15,10 @@ from datagen.recording.dataset import IMAGE_DATA
 from datagen.recording.errors import DatasetError
 from datagen.recording.folder import (
     RoundState,
+    discard_partials,
     partial_path,
-    publish,
     state_path,
+    write_state,
 )
 from datagen.recording.integrity.round_checks import check_round
 from datagen.recording.mcap.fragments import (
@@ -90,11 +91,13 @@ def recover(file: Path, out: Path | None = None) -> Recovered:
     try:
         state = _write(partial, header, intact, recovery)
         if in_dataset:
-            publish(folder, partial, state)
-        else:
-            atomic_move(partial, target)
+            # The state first: the file is what readers look for, and what may not exist before.
+            write_state(folder, state)
+        atomic_move(partial, target)
     finally:
         partial.unlink(missing_ok=True)
+        if in_dataset:
+            discard_partials(folder, [header.id])
     return Recovered(str(target), recovery.saved, recovery.lost, recovery.at_least)
 
 

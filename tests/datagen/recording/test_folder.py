@@ -4,7 +4,12 @@ from pathlib import Path
 
 import pytest
 
-from datagen.recording.folder import write_if_changed
+from datagen.recording.dataset import Dataset
+from datagen.recording.errors import DatasetError
+from datagen.recording.folder import begin_merge, write_if_changed
+from datagen.recording.integrity.verify import verify
+from datagen.recording.manifest import rebuild
+from datagen.recording.split_report import SplitConfig, make_split
 from datagen.recording.splits import Split, read_split, split_path, write_split
 
 
@@ -37,3 +42,15 @@ def test_a_failed_write_keeps_the_old_file(tmp_path: Path, monkeypatch: pytest.M
         write_if_changed(path, "new")
     assert path.read_text() == "old"
     assert [p.name for p in tmp_path.iterdir()] == ["a.json"]
+
+
+def test_a_merge_that_has_not_ended_is_refused_by_every_reader(dataset: Path) -> None:
+    begin_merge(dataset)
+    with pytest.raises(DatasetError, match="running the same `datagen merge` again"):
+        Dataset.open(dataset)
+    (problem,) = verify(dataset, "quick").problems
+    assert "was interrupted" in problem
+    with pytest.raises(DatasetError, match="was interrupted"):
+        make_split(dataset, "mine", SplitConfig())
+    rebuild(dataset, read_split(split_path(dataset)))
+    assert verify(dataset, "full").ok

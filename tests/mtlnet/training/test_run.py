@@ -25,7 +25,7 @@ from mtlnet.training.checkpoint import list_checkpoints
 from mtlnet.training.config import TrainConfig, resume_config
 from mtlnet.training.loop import Stopped, TrainProgress
 from mtlnet.training.recipes import RECIPES, learning_rate
-from mtlnet.training.run import train
+from mtlnet.training.run import require_new, train
 from mtlnet.training.trainer import Trainer
 from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
@@ -239,6 +239,18 @@ def test_a_run_limited_by_time_ends(dataset: Path, tmp_path: Path) -> None:
     card = train(run, None)
     assert card.iterations >= 1
     assert 1.0 <= time.monotonic() - started < 60.0  # a second of steps; then it is published
+
+
+def test_a_folder_that_a_kill_has_left_empty_is_new(tmp_path: Path) -> None:
+    """Killed before config.json, neither the same command nor --resume would go on."""
+    run = tmp_path / "run"
+    run.mkdir()
+    require_new(run)
+    (run / "config.json.partial").write_text("{")
+    require_new(run)
+    (run / "config.json").write_text("{}")
+    with pytest.raises(UserError, match="already exists"):
+        require_new(run)
 
 
 @pytest.mark.usefixtures("small_network")

@@ -1,7 +1,7 @@
 """Attacks on the life of a connection, each bounded in count and time, on this machine only.
 
 Each takes the service's address and returns the connections that it leaves open. The tests make one
-round of each; `make attack` repeats them beside a well-behaved client.
+round of each; `make attack` repeats them beside a well-behaved client, with those of `costs`.
 """
 
 import random
@@ -266,7 +266,7 @@ def mutated_requests(target: Target, count: int = 100, seed: int = 0) -> list[so
     return connections[-64:]
 
 
-ATTACKS: tuple[Attack, ...] = tuple(
+CONNECTIONS: tuple[Attack, ...] = tuple(
     found
     for name, found in list(vars().items())
     if callable(found)

@@ -24,18 +24,20 @@ class Target:
 
     port: int
     token: str | None = None
+    source: str = "127.0.0.1"
+    """The address from which it is called."""
 
     def headers(self, **more: str) -> bytes:
         """Host, the token, and `more`, with the end of the line of each."""
         sent = {"Host": f"127.0.0.1:{self.port}", **more}
         if self.token is not None:
-            sent["Authorization"] = f"Bearer {self.token}"
+            sent.setdefault("Authorization", f"Bearer {self.token}")
         lines = (f"{name.replace('_', '-')}: {value}\r\n" for name, value in sent.items())
         return "".join(lines).encode()
 
     def dial(self) -> socket.socket:
         """A new connection."""
-        return socket.create_connection(("127.0.0.1", self.port), WAIT_S)
+        return socket.create_connection(("127.0.0.1", self.port), WAIT_S, (self.source, 0))
 
     def open_websocket(self, **headers: str) -> socket.socket:
         """A connection whose handshake was accepted."""

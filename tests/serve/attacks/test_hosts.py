@@ -9,8 +9,8 @@ from typer.testing import CliRunner
 from serve.api.hosts import host_name
 from serve.api.problems import Problem
 from serve.cli import app
-from serve.config import Limits, ServiceConfig, check_proxies
-from serve.scheduling.rate_limit import RateLimiter, client_key, network_of
+from serve.config import Limits, ServiceConfig, check_proxies, network_of
+from serve.scheduling.rate_limit import RateLimiter, client_key
 from serve.scheduling.streams import stream_key
 from serve.workers.shared_memory import create_shared_memory
 from serve.workers.worker_process import WorkerTask

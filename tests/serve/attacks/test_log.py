@@ -2,19 +2,32 @@
 
 import asyncio
 import gc
+import json
 import logging
 import os
 import subprocess
 import sys
+import time
 
 import pytest
 
 from benchmarks.service_stream_fuzz import run_part
-from serve.observability.logs import ErrorLimit, Interval
+from serve.api.problems import UNAUTHORIZED, Problem
+from serve.config import Limits
+from serve.observability.logs import ErrorLimit, Interval, JsonFormatter, RefusalLog
 from tests.serve.attacks import attacks
 from tests.serve.attacks.conftest import Target
 from tests.serve.attacks.test_connections import open_count
-from tests.serve.conftest import PATIENCE_S, Gate, Served, jpeg, picture, serving, until
+from tests.serve.conftest import (
+    PATIENCE_S,
+    FakeEngine,
+    Gate,
+    Served,
+    jpeg,
+    picture,
+    serving,
+    until,
+)
 
 JPEG = jpeg(picture())
 
@@ -66,6 +79,55 @@ def test_a_reply_to_a_client_that_has_left_writes_nothing_to_the_log(
         assert service.post(JPEG).status == 200
         gc.collect()
     assert [record.getMessage() for record in caplog.records] == []
+
+
+HOSTILE = "\x80\x9b31m{\"a\": 1}, 'x\u2028'"
+
+
+@pytest.mark.parametrize(
+    ("path", "headers", "problem"),
+    [
+        ("/features", {"Authorization": HOSTILE}, "unauthorized"),
+        ("/model", {"Authorization": "Bearer no"}, "unauthorized"),
+        ("/features", {"Origin": f"http://{HOSTILE}"}, "forbidden-origin"),
+        ("/", {"Origin": f"http://{HOSTILE}"}, "forbidden-origin"),
+        ("/features", {"Host": HOSTILE}, "forbidden-host"),
+        ("/healthz", {"Origin": HOSTILE, "X-Request-Id": HOSTILE}, "forbidden-origin"),
+    ],
+)
+def test_refusals_of_token_host_and_origin_are_logged_once_a_second(
+    engine: FakeEngine,
+    path: str,
+    headers: dict[str, str],
+    problem: str,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """With their number, and with nothing of the client's that is not escaped."""
+    token = None if problem == "forbidden-host" else "0123456789abcdef"
+    with serving(engine, limits=Limits(token=token)) as service:
+        sent = {name: value.encode("utf-8").decode("latin-1") for name, value in headers.items()}
+        with caplog.at_level(logging.INFO):
+            begin = time.monotonic()
+            for _ in range(20):
+                service.ask("POST", path, JPEG, sent)
+            seconds = time.monotonic() - begin
+            service.app.frames.refusals._clients = Interval()
+            service.ask("POST", path, JPEG, sent)
+    lines = [JsonFormatter().format(r) for r in caplog.records if r.name == "serve.requests"]
+    assert 2 <= len(lines) <= seconds + 2
+    found = [json.loads(line) for line in lines]
+    assert {line["problem"] for line in found} == {f"/problems/{problem}"}
+    assert {line["client"] for line in found} == {"127.0.0.1"}
+    assert sum(line.get("untold", 0) + 1 for line in found) == 21
+    assert all(line.isascii() and line.isprintable() for line in lines)
+
+
+def test_the_addresses_of_one_client_share_its_line(caplog: pytest.LogCaptureFixture) -> None:
+    refusals = RefusalLog()
+    with caplog.at_level(logging.INFO):
+        for number in range(50):
+            refusals.log("1", f"2001:db8::{number:x}", Problem(UNAUTHORIZED, "no token"))
+    assert len(caplog.records) == 1
 
 
 def test_the_same_error_is_logged_once_a_second() -> None:

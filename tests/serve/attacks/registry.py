@@ -1,0 +1,14 @@
+"""All attacks, in the order in which `make attack` makes them."""
+
+from tests.serve.attacks.attacks import CONNECTIONS, Attack
+from tests.serve.attacks.costs import REQUESTS
+
+ATTACKS: tuple[Attack, ...] = (*CONNECTIONS, *REQUESTS)
+REPORTED = (
+    *("long_upgrades", "crowded_upgrades", "endless_trailers", "idle_connections"),
+    *("left_uploads", "dismissed_uploads", "unread_pings", "empty_fragments", "deep_texts"),
+    *("fill_bytes", "repeated_outputs", "costly_images", "large_bodies", "h2c_in_two_segments"),
+    *("rebound_names", "guessed_tokens", "forged_addresses"),
+    *("left_websockets", "damaged_images", "strange_headers"),
+)
+"""By which a service of ours once fell; the others were thought of since."""
