@@ -103,7 +103,7 @@ def drive(
         world.reset(seed=config.seed, to_middle=lane.start_d)
         source = stack.enter_context(_open_perception(config, world, lane))
         watching = [*observers, *_observers(config, stack, world, source, lane)]
-        perceive = Tap(delay(config, source.perceive, disturbance.delay_s))
+        perceive = LastAnswer(delay(config, source.perceive, disturbance.delay_s))
         return run_lap(
             world,
             disturbance.controller(controller, config.seed),
@@ -169,7 +169,7 @@ def read_parameters(path: Path | None, controller: str) -> dict[str, float]:
         ) from error
 
 
-class Tap:
+class LastAnswer:
     """A perception that keeps its last answer, for those who watch the drive."""
 
     def __init__(self, perceive: Perceive) -> None:
@@ -216,15 +216,15 @@ def _observers(
 
 
 def _recorder(
-    tap: Tap, observers: list[Observer], steps: int, progress: Progress | None
+    perceive: LastAnswer, observers: list[Observer], steps: int, progress: Progress | None
 ) -> Callable[[CarState, float], None]:
     """Calls the observers and reports progress."""
     done = itertools.count()
 
     def record(state: CarState, steer: float) -> None:
-        assert tap.last is not None
+        assert perceive.last is not None
         for observer in observers:
-            observer(state, tap.last, steer)
+            observer(state, perceive.last, steer)
         if progress is not None:
             progress(next(done), steps)
 
