@@ -37,6 +37,14 @@ Log = Annotated[Path | None, typer.Option(help="Write the drive to this CSV file
 Video = Annotated[Path | None, typer.Option(help="Film the drive (.mp4).")]
 Latency = Annotated[float, typer.Option(help="The perception's answers come this late.")]
 Drop = Annotated[float, typer.Option(help="Share of the answers that are lost.")]
+Realtime = Annotated[
+    bool,
+    typer.Option(
+        "--realtime",
+        help="Drive on the wall clock: perception is asked without waiting, late answers are late. "
+        "No two such drives are the same.",
+    ),
+]
 Parameters = Annotated[
     Path | None, typer.Option(help="The controller's parameters, written by `controllers tune`.")
 ]
@@ -74,6 +82,7 @@ def drive(
     video: Video = DRIVE.video,
     latency_ms: Latency = DRIVE.latency_ms,
     drop: Drop = DRIVE.drop,
+    realtime: Realtime = DRIVE.realtime,
     parameters: Parameters = DRIVE.parameters,
     model: Model = DRIVE.model,
     start_d: StartD = DRIVE.start_d,
@@ -101,6 +110,7 @@ def drive(
         video=video,
         latency_ms=latency_ms,
         drop=drop,
+        realtime=realtime,
         parameters=parameters,
         model=model,
         start_d=start_d,

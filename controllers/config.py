@@ -9,7 +9,7 @@ THROTTLE = 0.2
 
 @dataclass(frozen=True)
 class DriveConfig:
-    """One closed-loop drive. The same configuration gives the same drive."""
+    """One closed-loop drive. The same configuration gives the same drive, but for `realtime`."""
 
     controller: str = "lqr-preview"
     track: str = "oval"
@@ -25,6 +25,8 @@ class DriveConfig:
     """Of the perception's answers; the state is predicted over it."""
     drop: float = 0.0
     """Share of the answers that are lost."""
+    realtime: bool = False
+    """On the wall clock, without waiting for the perception's answers."""
     parameters: Path | None = None
     """A file of `controllers tune`, whose parameters the controller gets."""
     model: str = "default"
