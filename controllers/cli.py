@@ -35,6 +35,15 @@ Perception = Annotated[
 Steps = Annotated[int | None, typer.Option(help="Control steps of 50 ms [default: about one lap]")]
 Log = Annotated[Path | None, typer.Option(help="Write the drive to this CSV file.")]
 Video = Annotated[Path | None, typer.Option(help="Film the drive (.mp4).")]
+Watch = Annotated[
+    int | None,
+    typer.Option(
+        metavar="PORT",
+        min=0,
+        max=65535,
+        help="Show the drive live in the browser, at its real pace. 0: any free port.",
+    ),
+]
 Latency = Annotated[float, typer.Option(help="The perception's answers come this late.")]
 Drop = Annotated[float, typer.Option(help="Share of the answers that are lost.")]
 Realtime = Annotated[
@@ -80,6 +89,7 @@ def drive(
     steps: Steps = DRIVE.steps,
     log: Log = DRIVE.log,
     video: Video = DRIVE.video,
+    watch: Watch = DRIVE.watch,
     latency_ms: Latency = DRIVE.latency_ms,
     drop: Drop = DRIVE.drop,
     realtime: Realtime = DRIVE.realtime,
@@ -108,6 +118,7 @@ def drive(
         steps=steps,
         log=log,
         video=video,
+        watch=watch,
         latency_ms=latency_ms,
         drop=drop,
         realtime=realtime,

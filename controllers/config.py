@@ -21,6 +21,8 @@ class DriveConfig:
     log: Path | None = None
     video: Path | None = None
     """A film of the drive (.mp4)."""
+    watch: int | None = None
+    """Port of the page that shows the drive live; 0: any free one."""
     latency_ms: float = 0.0
     """Of the perception's answers; the state is predicted over it."""
     drop: float = 0.0

@@ -219,7 +219,7 @@ def _open_perception(config: DriveConfig, world: World, lane: Lane) -> Perceptio
 def _observers(
     config: DriveConfig, stack: ExitStack, world: World, source: PerceptionSource, lane: Lane
 ) -> Iterator[Observer]:
-    """The log and the film, which `stack` closes."""
+    """The log, the film and the page, which `stack` closes."""
     if config.log is not None:
         log = DriveLog(stack.enter_context(config.log.open("w", encoding="utf-8")))
         yield lambda now, perceived, steer: log.write(now, steer)
@@ -237,6 +237,11 @@ def _observers(
             stack.callback(camera.close)
         drawn = DriveFilm(film, world, camera, seen, lane_centre=lane.centre)
         yield lambda now, perceived, steer: drawn.add(perceived, steer)
+    if config.watch is not None:
+        from controllers.drive_watch import watch
+
+        show = stack.enter_context(watch(config, world, lane.centre))
+        yield lambda now, perceived, steer: show(perceived)
 
 
 def _recorder(
