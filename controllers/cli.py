@@ -35,8 +35,25 @@ Perception = Annotated[
 Steps = Annotated[int | None, typer.Option(help="Control steps of 50 ms [default: about one lap]")]
 Log = Annotated[Path | None, typer.Option(help="Write the drive to this CSV file.")]
 Video = Annotated[Path | None, typer.Option(help="Film the drive (.mp4).")]
+Watch = Annotated[
+    int | None,
+    typer.Option(
+        metavar="PORT",
+        min=0,
+        max=65535,
+        help="Show the drive live in the browser, at its real pace. 0: any free port.",
+    ),
+]
 Latency = Annotated[float, typer.Option(help="The perception's answers come this late.")]
 Drop = Annotated[float, typer.Option(help="Share of the answers that are lost.")]
+Realtime = Annotated[
+    bool,
+    typer.Option(
+        "--realtime",
+        help="Drive on the wall clock: perception is asked without waiting, late answers are late. "
+        "No two such drives are the same.",
+    ),
+]
 Parameters = Annotated[
     Path | None, typer.Option(help="The controller's parameters, written by `controllers tune`.")
 ]
@@ -72,8 +89,10 @@ def drive(
     steps: Steps = DRIVE.steps,
     log: Log = DRIVE.log,
     video: Video = DRIVE.video,
+    watch: Watch = DRIVE.watch,
     latency_ms: Latency = DRIVE.latency_ms,
     drop: Drop = DRIVE.drop,
+    realtime: Realtime = DRIVE.realtime,
     parameters: Parameters = DRIVE.parameters,
     model: Model = DRIVE.model,
     start_d: StartD = DRIVE.start_d,
@@ -99,8 +118,10 @@ def drive(
         steps=steps,
         log=log,
         video=video,
+        watch=watch,
         latency_ms=latency_ms,
         drop=drop,
+        realtime=realtime,
         parameters=parameters,
         model=model,
         start_d=start_d,

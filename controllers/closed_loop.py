@@ -50,6 +50,23 @@ World = TypeVar("World", bound=Drivable)
 
 
 @dataclass(frozen=True, slots=True)
+class RealTimeFigures:
+    """How a drive kept to the wall clock."""
+
+    late_answers: int
+    """Answers that took longer than a control step."""
+    lost_answers: int
+    answer_ms_median: float
+    """Time from an image to its answer."""
+    answer_ms_p99: float
+    age_ms_median: float
+    """Age of the newest answer at a control step."""
+    age_ms_p99: float
+    missed_steps: int
+    """Control steps that took longer than their 50 ms, or began late because of it."""
+
+
+@dataclass(frozen=True, slots=True)
 class DriveResult:
     """The score of a drive and the figures that belong beside it."""
 
@@ -79,6 +96,8 @@ class DriveResult:
     """Whether the controller received an estimated state, with errors, instead of the true one."""
     ended: str | None
     """Why it ended early: off_track (or touching a wall), backwards, or collision (with a car)."""
+    real_time: RealTimeFigures | None = None
+    """Of a drive on the wall clock only; in JSON its fields are those of the result."""
 
     def as_json(self) -> dict[str, Any]:
         """The fields as JSON values."""
@@ -86,7 +105,7 @@ class DriveResult:
         values["speed_kmh"] = list(self.speed_kmh)
         if self.cruising_kmh is not None:
             values["cruising_kmh"] = list(self.cruising_kmh)
-        return values
+        return values | (values.pop("real_time") or {})
 
 
 def run_lap(

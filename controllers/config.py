@@ -9,7 +9,7 @@ THROTTLE = 0.2
 
 @dataclass(frozen=True)
 class DriveConfig:
-    """One closed-loop drive. The same configuration gives the same drive."""
+    """One closed-loop drive. The same configuration gives the same drive, but for `realtime`."""
 
     controller: str = "lqr-preview"
     track: str = "oval"
@@ -21,10 +21,14 @@ class DriveConfig:
     log: Path | None = None
     video: Path | None = None
     """A film of the drive (.mp4)."""
+    watch: int | None = None
+    """Port of the page that shows the drive live; 0: any free one."""
     latency_ms: float = 0.0
     """Of the perception's answers; the state is predicted over it."""
     drop: float = 0.0
     """Share of the answers that are lost."""
+    realtime: bool = False
+    """On the wall clock, without waiting for the perception's answers."""
     parameters: Path | None = None
     """A file of `controllers tune`, whose parameters the controller gets."""
     model: str = "default"

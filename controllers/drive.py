@@ -8,9 +8,9 @@ import json
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from controllers.closed_loop import DriveLog, DriveResult, run_lap
 from controllers.compare.disturbance import Disturbance
 from controllers.config import DriveConfig
 from controllers.interface import LoopConfig
-from controllers.late_perception import LatePerception
+from controllers.late_perception import LatePerception, TrustedPerception
 from controllers.perception import (
     CameraPerception,
     Perceive,
@@ -37,6 +37,9 @@ from simulator.vehicle.state import CarState
 from simulator.world.world import World
 from trackfeatures import UserError
 from trackfeatures.camera import CameraParameters
+
+if TYPE_CHECKING:
+    from controllers.real_time import RealTimePerception
 
 FREQUENCY_HZ = 20
 SCORED_STEPS = {"forza": 6500, "alpine-2": 4500, "eroad": 3700, "g-track-3": 3300}
@@ -103,8 +106,11 @@ def drive(
         world.reset(seed=config.seed, to_middle=lane.start_d)
         source = stack.enter_context(_open_perception(config, world, lane))
         watching = [*observers, *_observers(config, stack, world, source, lane)]
-        perceive = Tap(delay(config, source.perceive, disturbance.delay_s))
-        return run_lap(
+        live = _real_time(config, source.perceive, disturbance) if config.realtime else None
+        if live is not None:
+            stack.enter_context(live)
+        perceive = LastAnswer(live or delay(config, source.perceive, disturbance.delay_s))
+        result = run_lap(
             world,
             disturbance.controller(controller, config.seed),
             perceive,
@@ -114,10 +120,26 @@ def drive(
             noisy=noisy,
             record=_recorder(perceive, watching, steps, progress),
         )
+        return result if live is None else replace(result, real_time=live.figures())
+
+
+def _real_time(
+    config: DriveConfig, perceive: Perceive, disturbance: Disturbance
+) -> "RealTimePerception[World, Any, Any]":
+    """`perceive` on the wall clock. Raises UserError where a simulated delay is asked for, too."""
+    from controllers.real_time import real_time
+
+    if config.latency_ms or disturbance.delay_s:
+        raise UserError(
+            "--realtime measures the delay of the answers; leave it out, or --latency-ms"
+        )
+    rng = np.random.default_rng([config.seed, 3])
+    return real_time(perceive, dt=1.0 / FREQUENCY_HZ, drop=config.drop, rng=rng)
 
 
 def delay(config: DriveConfig, perceive: Perceive, unknown_s: float = 0.0) -> Perceive:
-    """`perceive`, late and with lost answers where `config` asks for it, and predicted.
+    """`perceive`, late and with lost answers where `config` asks for it, and predicted; doubtful
+    answers are trusted less.
 
     A delay of `unknown_s` is not known to the controller: nothing is predicted over it.
     """
@@ -125,7 +147,9 @@ def delay(config: DriveConfig, perceive: Perceive, unknown_s: float = 0.0) -> Pe
     if unknown_s > 0.0:
         perceive = _late(perceive, unknown_s, 0.0, rng, predict=False)
     if config.latency_ms == 0.0 and config.drop == 0.0:
-        return perceive
+        if config.perception == "truth":
+            return perceive
+        return TrustedPerception(perceive, _state, dt=1.0 / FREQUENCY_HZ)
     return _late(perceive, config.latency_ms / 1000.0, config.drop, rng, predict=True)
 
 
@@ -169,7 +193,7 @@ def read_parameters(path: Path | None, controller: str) -> dict[str, float]:
         ) from error
 
 
-class Tap:
+class LastAnswer:
     """A perception that keeps its last answer, for those who watch the drive."""
 
     def __init__(self, perceive: Perceive) -> None:
@@ -195,7 +219,7 @@ def _open_perception(config: DriveConfig, world: World, lane: Lane) -> Perceptio
 def _observers(
     config: DriveConfig, stack: ExitStack, world: World, source: PerceptionSource, lane: Lane
 ) -> Iterator[Observer]:
-    """The log and the film, which `stack` closes."""
+    """The log, the film and the page, which `stack` closes."""
     if config.log is not None:
         log = DriveLog(stack.enter_context(config.log.open("w", encoding="utf-8")))
         yield lambda now, perceived, steer: log.write(now, steer)
@@ -213,18 +237,23 @@ def _observers(
             stack.callback(camera.close)
         drawn = DriveFilm(film, world, camera, seen, lane_centre=lane.centre)
         yield lambda now, perceived, steer: drawn.add(perceived, steer)
+    if config.watch is not None:
+        from controllers.drive_watch import watch
+
+        show = stack.enter_context(watch(config, world, lane.centre))
+        yield lambda now, perceived, steer: show(perceived)
 
 
 def _recorder(
-    tap: Tap, observers: list[Observer], steps: int, progress: Progress | None
+    perceive: LastAnswer, observers: list[Observer], steps: int, progress: Progress | None
 ) -> Callable[[CarState, float], None]:
     """Calls the observers and reports progress."""
     done = itertools.count()
 
     def record(state: CarState, steer: float) -> None:
-        assert tap.last is not None
+        assert perceive.last is not None
         for observer in observers:
-            observer(state, tap.last, steer)
+            observer(state, perceive.last, steer)
         if progress is not None:
             progress(next(done), steps)
 

@@ -18,6 +18,7 @@ import numpy as np
 from controllers.interface import Observation
 from controllers.lqr import CurvatureEstimate
 from controllers.perception import Perceived
+from controllers.trust import Trust
 from simulator.vehicle.state import CarState
 from trackfeatures import Heading
 from trackfeatures.errors import UserError
@@ -51,11 +52,12 @@ class StatePredictor:
         seen = Observation(0.0, 0.0, heading, now.vx, now.vy, now.yaw_rate)
         self._moments.append(_Moment(now.vx, now.vy, now.yaw_rate, self._curvature(seen)))
 
-    def predict(self, answer: Perceived, age: int) -> Perceived:
-        """The answer of `age` control steps ago as it would be now."""
-        if age == 0 or answer.to_lane_centre is None:
+    def predict(self, answer: Perceived, age: int, until: int = 0) -> Perceived:
+        """The answer of `age` control steps ago as it would be `until` steps ago."""
+        if age == until or answer.to_lane_centre is None:
             return answer
-        past = list(self._moments)[-age - 1 :]
+        moments = list(self._moments)
+        past = moments[-age - 1 : len(moments) - until]
         offset, theta = answer.to_lane_centre, -answer.angle
         for before, after in itertools.pairwise(past):
             # The mean of both ends of the step: the sensors of both are known.
@@ -66,6 +68,81 @@ class StatePredictor:
             offset += self._dt * (vx * math.sin(middle) + vy * math.cos(middle))
             theta += self._dt * turn
         return replace(answer, to_lane_centre=offset, angle=-theta)
+
+
+class RoadEstimate:
+    """What is known of the road: the answers that came, corrected by each other (see `trust`) and
+    carried to the present; `predict=False`: the newest answer as it is.
+
+    One `update` a control step, then `present`.
+    """
+
+    def __init__(self, dt: float, latency_s: float = 0.0, *, predict: bool = True) -> None:
+        self.dt = dt
+        self._predictor = StatePredictor(dt, LOST_S + latency_s) if predict else None
+        self._trust = Trust()
+        self._last: Perceived | None = None
+        self._age = 0
+        """Control steps since the image of `_last`."""
+        self._heading = Heading.STRAIGHT
+
+    def update(self, now: CarState, arrived: Perceived | None, age: int) -> None:
+        """One control step on; `arrived` is an answer to the image of `age` control steps ago."""
+        self._age += 1
+        if arrived is not None:
+            self._heading = arrived.heading
+        if self._predictor is not None:
+            self._predictor.add(now, self._heading)
+        if arrived is not None:
+            self._last, self._age = self._corrected(arrived, age, now.vx), age
+
+    def _corrected(self, arrived: Perceived, age: int, speed: float) -> Perceived:
+        if self._predictor is None:
+            return arrived
+        steps, known = self._age - age, None
+        if self._last is not None and steps * self.dt <= LOST_S:
+            known = self._predictor.predict(self._last, self._age, until=age)
+        return self._trust.correct(known, arrived, steps, steps * self.dt * speed)
+
+    def present(self, due: int) -> Perceived:
+        """The road now, where answers are due `due` control steps after their image."""
+        waited_s = max(self._age - due, 0) * self.dt
+        if self._last is None or waited_s > LOST_S:
+            return Perceived(None, 0.0, self._heading, None, lost_s=waited_s)
+        if self._predictor is None:
+            return replace(self._last, lost_s=waited_s)
+        lost_s = waited_s + self._trust.doubted * self.dt
+        return replace(self._predictor.predict(self._last, self._age), lost_s=lost_s)
+
+
+class TrustedPerception(Generic[World]):
+    """A perception whose answers come at once, corrected by what is known already.
+
+    Answers without a standard deviation, and those without an offset, are as they are.
+    """
+
+    def __init__(
+        self,
+        perceive: Callable[[World], Perceived],
+        state: Callable[[World], CarState],
+        *,
+        dt: float,
+    ) -> None:
+        self._perceive, self._state = perceive, state
+        self._estimate = RoadEstimate(dt)
+
+    def __call__(self, world: World) -> Perceived:
+        """What the controller knows of the road now."""
+        answer = self._perceive(world)
+        blind = answer.to_lane_centre is None
+        self._estimate.update(self._state(world), None if blind else answer, 0)
+        return answer if blind or answer.offset_std_m is None else self._estimate.present(0)
+
+
+def check_drop(drop: float) -> None:
+    """Raises UserError unless `drop` is a share of answers that leaves some."""
+    if not 0.0 <= drop < 1.0:
+        raise UserError(f"a share of {drop} lost answers; give 0 or more, below 1")
 
 
 class LatePerception(Generic[World]):
@@ -88,15 +165,12 @@ class LatePerception(Generic[World]):
     ) -> None:
         if not 0.0 <= latency_s <= LOST_S:
             raise UserError(f"a latency of {1000 * latency_s:g} ms; give 0 to 1000 ms")
-        if not 0.0 <= drop < 1.0:
-            raise UserError(f"a share of {drop} lost answers; give 0 or more, below 1")
-        self._perceive, self._state, self._dt = perceive, state, dt
+        check_drop(drop)
+        self._perceive, self._state = perceive, state
         self._delay = math.ceil(latency_s / dt - 1e-9)
         self._drop, self._rng = drop, rng
-        self._predictor = StatePredictor(dt, LOST_S + latency_s) if predict else None
+        self._estimate = RoadEstimate(dt, latency_s, predict=predict)
         self._under_way: deque[Perceived | None] = deque()
-        self._last: Perceived | None = None
-        self._age = 0
         self.lost_answers = 0
 
     def __call__(self, world: World) -> Perceived:
@@ -105,17 +179,6 @@ class LatePerception(Generic[World]):
         answer = self._perceive(world)
         self.lost_answers += lost
         self._under_way.append(None if lost or answer.to_lane_centre is None else answer)
-        self._age += 1
-        if len(self._under_way) > self._delay:
-            arrived = self._under_way.popleft()
-            if arrived is not None:
-                self._last, self._age = arrived, self._delay
-        heading = Heading.STRAIGHT if self._last is None else self._last.heading
-        if self._predictor is not None:
-            self._predictor.add(self._state(world), heading)
-        waited_s = (self._age - self._delay) * self._dt
-        if self._last is None or waited_s > LOST_S:
-            return Perceived(None, 0.0, heading, None, lost_s=max(waited_s, 0.0))
-        if self._predictor is None:
-            return replace(self._last, lost_s=waited_s)
-        return replace(self._predictor.predict(self._last, self._age), lost_s=waited_s)
+        arrived = self._under_way.popleft() if len(self._under_way) > self._delay else None
+        self._estimate.update(self._state(world), arrived, self._delay)
+        return self._estimate.present(self._delay)

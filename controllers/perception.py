@@ -39,6 +39,11 @@ class Perceived:
     """1/m, left positive, of the road just ahead; None where it is not estimated."""
     lost_s: float = 0.0
     """s since an answer was due that came; this one is predicted from an older one. 0: it came."""
+    offset_std_m: float | None = None
+    """Standard deviation of the error of the answer's offset; None where it is not estimated."""
+    angle_std_rad: float | None = None
+    out_of_distribution: bool = False
+    """Whether the image is unlike those that the model was trained on."""
 
 
 class Perceive(Protocol):
@@ -148,9 +153,22 @@ class CameraPerception:
         """The model's to it, in the format of the service's answers."""
 
     def __call__(self, world: "World") -> Perceived:
-        self.image = self.camera.render(world.body_pose(), world.traffic.poses())
-        self.answer = self._model.predict(self.image)
-        return parse_prediction(self.answer)
+        return self.read(self.ask(self.capture(world)))
+
+    def capture(self, world: "World") -> Image:
+        """The image of the present state; in the thread that opened the camera."""
+        image: Image = self.camera.render(world.body_pose(), world.traffic.poses())
+        self.image = image
+        return image
+
+    def ask(self, image: Image) -> dict[str, Any]:
+        """The model's answer; in any one thread at a time."""
+        return self._model.predict(image)
+
+    def read(self, answer: dict[str, Any]) -> Perceived:
+        """The quantities of an answer that steering needs."""
+        self.answer = answer
+        return parse_prediction(answer)
 
 
 def parse_prediction(answer: dict[str, Any]) -> Perceived:
@@ -159,13 +177,24 @@ def parse_prediction(answer: dict[str, Any]) -> Perceived:
         offset, angle = answer["to_lane_centre_m"], float(answer["angle_rad"])
         probabilities = [float(answer["heading"][heading.name.lower()]) for heading in Heading]
         to_lane_centre = None if offset is None else float(offset)
-        _require_finite(angle, to_lane_centre or 0.0, *probabilities)
-    except (KeyError, TypeError, ValueError) as error:
+        std = answer.get("std") or {}
+        offset_std, angle_std = std.get("to_lane_centre"), std.get("angle")
+        _require_finite(
+            angle, to_lane_centre or 0.0, *probabilities, offset_std or 0.0, angle_std or 0.0
+        )
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise UserError(
             "the service's answer lacks to_lane_centre_m, angle_rad or heading in finite numbers "
             f"({error!r}); is it a perception service of this version?"
         ) from error
-    return Perceived(to_lane_centre, angle, Heading(int(np.argmax(probabilities))))
+    return Perceived(
+        to_lane_centre,
+        angle,
+        Heading(int(np.argmax(probabilities))),
+        offset_std_m=offset_std,
+        angle_std_rad=angle_std,
+        out_of_distribution=bool(answer.get("out_of_distribution")),
+    )
 
 
 def _require_finite(*values: float) -> None:

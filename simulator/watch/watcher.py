@@ -2,6 +2,7 @@
 
 import sys
 import time
+from dataclasses import dataclass
 from typing import Any, Final, Self
 
 from runtime.sockets import address, bind
@@ -19,12 +20,28 @@ SHOW_S: Final = 1.0 / 20.0
 """Least interval between updates of the browsers (s of wall-clock time)."""
 
 
+@dataclass(frozen=True, slots=True)
+class Perceived:
+    """What a driver knows of the road; drawn beside the truth."""
+
+    to_middle: float | None
+    """m, left positive; None where it knows nothing."""
+    angle: float
+    """rad, track tangent minus yaw."""
+
+    def as_dict(self) -> dict[str, float | None]:
+        """For the state message."""
+        offset = None if self.to_middle is None else round(self.to_middle, 3)
+        return {"to_middle": offset, "angle": round(self.angle, 5)}
+
+
 class Watcher:
     """Shows the world of whatever is passed to `update`; `url` is where.
 
     While no browser looks, an update costs microseconds; while one does, a picture is taken at most
-    20 times a second. `speed` holds the drive to so many times real time, None lets it run. Use it
-    from the thread that steps the environment. Raises UserError when the port is in use.
+    20 times a second. `speed` holds the drive to so many times real time, None lets it run; `seed`
+    fixes the scenery. Use it from the thread that steps the environment. Raises UserError when the
+    port is in use.
     """
 
     def __init__(
@@ -34,12 +51,13 @@ class Watcher:
         port: int = 8765,
         light: str = "clear",
         speed: float | None = None,
+        seed: int = 0,
     ) -> None:
         listener = bind(host, port)
         listener.listen()
         self.url = address(listener, host)
         self._hub = Hub()
-        self._light, self._speed = light, speed
+        self._light, self._speed, self._seed = light, speed, seed
         self._score, self._rate, self._shown = Score(), Rate(), Rate()
         self._road: Road | None = None
         self._renderer: JpegRenderer | None = None
@@ -49,8 +67,9 @@ class Watcher:
         self._server.start()
         sys.stderr.write(f"watch at {self.url}\n")
 
-    def update(self, drive: Any) -> None:
-        """Show `drive` as it is now: a World, or an environment of this package, wrapped or not.
+    def update(self, drive: Any, perceived: Perceived | None = None) -> None:
+        """Show `drive` as it is now: a World, or an environment of this package, wrapped or not;
+        `perceived` is what its driver knows of the road.
 
         Call it after every reset and step. Raises UserError for something else, NoRendererError
         where nothing can draw.
@@ -64,7 +83,7 @@ class Watcher:
         now = time.monotonic()
         if self._hub.watching and now - self._last_show >= SHOW_S:
             self._last_show = now
-            self._show(world)
+            self._show(world, perceived)
         if self._pacer is not None and passed > 0.0:
             self._pacer.wait()
 
@@ -84,7 +103,7 @@ class Watcher:
         if self._renderer is not None:
             self._renderer.close()
         self._road = world.road
-        self._renderer = JpegRenderer(world.road, self._light)
+        self._renderer = JpegRenderer(world.road, self._light, self._seed)
         self._scene = scene_message(world.road, controls=False)
         if self._speed is not None:
             self._pacer = Pacer(1.0 / world.frequency_hz, self._speed)
@@ -97,7 +116,7 @@ class Watcher:
                 self._light = str(request.value)
                 self._renderer.set_light(self._light)
 
-    def _show(self, world: World) -> None:
+    def _show(self, world: World, perceived: Perceived | None) -> None:
         assert self._renderer is not None
         pictures = self._renderer.render(world, self._hub.wanted_views())
         self._shown.add(1.0)
@@ -113,6 +132,7 @@ class Watcher:
             asked_rate=self._speed,
             pictures_per_s=round(self._shown.value, 1),
             watching=self._hub.watching,
+            **({} if perceived is None else {"perceived": perceived.as_dict()}),
         )
         self._hub.publish(self._number, self._scene, state, pictures)
 

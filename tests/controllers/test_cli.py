@@ -2,6 +2,7 @@
 
 import json
 import subprocess
+import time
 from pathlib import Path
 
 import pytest
@@ -55,6 +56,17 @@ def test_lost_perception_is_said() -> None:
     assert f"slowed down for {slowed} steps" in done.stderr
 
 
+def test_a_drive_on_the_wall_clock_says_how_it_kept_to_it() -> None:
+    began = time.monotonic()
+    done = run("drive", "--steps", "10", "--realtime", "--json")
+    assert done.returncode == 0, done.stderr
+    assert time.monotonic() - began > 9 * 0.05
+    result = json.loads(done.stdout)
+    assert (result["steps"], result["late_answers"], result["lost_answers"]) == (10, 0, 0)
+    assert 0 <= result["missed_steps"] < 10
+    assert "No two such drives" in " ".join(run("drive", "--help").stdout.split())
+
+
 def test_a_service_that_does_not_answer_is_one_error_line() -> None:
     url = f"http://127.0.0.1:{free_port()}"
     done = run("drive", "--steps", "20", "--perception", url)
@@ -79,6 +91,8 @@ def test_the_help_of_drive_names_every_light() -> None:
         (("--controller", "json:JSONDecoder"), "has no method update"),
         (("--latency-ms", "-5"), "latency of -5 ms"),
         (("--drop", "1.5"), "1.5 lost answers"),
+        (("--realtime", "--latency-ms", "50"), "leave it out, or --latency-ms"),
+        (("--realtime", "--drop", "1.5"), "1.5 lost answers"),
         (("--video", "drive.gif"), "ending in .mp4"),
         (("--parameters", "pyproject.toml"), "has no parameters of lqr-preview"),
         (("--lanes", "7"), "7"),

@@ -64,10 +64,24 @@ def test_a_prediction_is_parsed() -> None:
     assert parse_prediction({**ANSWER, "to_lane_centre_m": None}).to_lane_centre is None
 
 
+def test_standard_deviations_are_parsed() -> None:
+    std = {"ml": 0.1, "to_lane_centre": 0.04, "angle": 0.01}
+    doubtful = parse_prediction({**ANSWER, "std": std, "out_of_distribution": True})
+    assert (doubtful.offset_std_m, doubtful.angle_std_rad) == (0.04, 0.01)
+    assert doubtful.out_of_distribution is True
+    plain = parse_prediction({**ANSWER, "std": None, "out_of_distribution": None})
+    assert plain == Perceived(0.5, -0.03, Heading.RIGHT)
+    blind = {**ANSWER, "to_lane_centre_m": None, "std": {**std, "to_lane_centre": None}}
+    assert parse_prediction(blind).offset_std_m is None
+
+
 @pytest.mark.parametrize(
     "answer",
     [
         {},
+        {**ANSWER, "std": [0.1]},
+        {**ANSWER, "std": {"to_lane_centre": "wide", "angle": 0.1}},
+        {**ANSWER, "std": {"to_lane_centre": 0.1, "angle": float("nan")}},
         {**ANSWER, "heading": {"left": 1.0}},
         {**ANSWER, "angle_rad": "north"},
         {**ANSWER, "heading": None},

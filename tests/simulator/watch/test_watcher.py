@@ -16,6 +16,7 @@ from simulator.track.catalogue import find_track
 from simulator.track.road import Road
 from simulator.watch import Watcher
 from simulator.watch.pictures import SIZE
+from simulator.watch.watcher import Perceived
 from simulator.world.world import Command, World
 from trackfeatures.errors import UserError
 
@@ -92,6 +93,27 @@ def test_a_change_of_road_sends_a_new_scene() -> None:
 
                 _, _, scenes = read(page, step, good)
                 assert [scene["track"] for scene in scenes] == [road.track.name]
+
+
+def test_what_the_driver_knows_is_sent_beside_the_truth() -> None:
+    offsets: list[float | None] = []
+    with (
+        Watcher(port=0, seed=3) as watcher,
+        line(watcher) as page,
+        World(Road(find_track("oval"))) as world,
+    ):
+        world.reset(seed=1)
+        for known in (Perceived(0.12345, -0.0123456), Perceived(None, 0.0)):
+
+            def step(known: Perceived = known) -> None:
+                watcher.update(world, known)
+
+            state, _, _ = read(page, step, lambda m: "perceived" in m)
+            while state["perceived"]["angle"] != round(known.angle, 5):
+                state, _, _ = read(page, step, lambda m: "perceived" in m)
+            offsets.append(state["perceived"]["to_middle"])
+        read(page, lambda: watcher.update(world), lambda m: "perceived" not in m)
+    assert offsets == [0.123, None]
 
 
 @pytest.mark.alone
