@@ -45,7 +45,13 @@ StartD = Annotated[float | None, typer.Option(help="Start this far left of the t
 TargetLane = Annotated[
     int | None, typer.Option(help="Lane to follow, 0 the leftmost [default: the nearest]")
 ]
-Throttle = Annotated[float, typer.Option(help="Held open loop, 0 to 1.")]
+Throttle = Annotated[
+    float | None, typer.Option(help="Held open loop, 0 to 1 [default: 0.2]", show_default=False)
+]
+Speed = Annotated[
+    float | None,
+    typer.Option(help="Drive at this speed, m/s, slower in bends [default: hold the throttle]"),
+]
 Traffic = Annotated[int, typer.Option(help="Other cars, 0 to 12.")]
 Light = Annotated[str, typer.Option(help="clear, overcast, dusk, fog, heavy-shadow, rain or snow.")]
 DriveSeed = Annotated[int, typer.Option(help="Of traffic, light and scenery.", min=0)]
@@ -79,6 +85,7 @@ def drive(
     start_d: StartD = DRIVE.start_d,
     target_lane: TargetLane = DRIVE.target_lane,
     throttle: Throttle = DRIVE.throttle,
+    speed: Speed = DRIVE.speed,
     traffic: Traffic = DRIVE.traffic,
     light: Light = DRIVE.light,
     seed: DriveSeed = DRIVE.seed,
@@ -87,7 +94,8 @@ def drive(
 ) -> None:
     """Drive closed loop from 25 m before the line, at rest, and print the score.
 
-    Gear 1 and the throttle are held, except behind slower traffic. The score is the sum of the
+    Gear 1 and the throttle are held, except behind slower traffic; with --speed, the speed. The
+    score is the sum of the
     rewards over the steps requested; leaving the track, turning round or a collision ends the
     drive.
     """
@@ -106,6 +114,7 @@ def drive(
         start_d=start_d,
         target_lane=target_lane,
         throttle=throttle,
+        speed=speed,
         traffic=traffic,
         light=light,
         seed=seed,
@@ -169,12 +178,14 @@ def _drive_with_progress(config: DriveConfig) -> "DriveResult":
     from rich.markup import escape
     from rich.progress import MofNCompleteColumn, Progress
 
-    from controllers.drive import drive
+    from controllers.drive import check_started, drive
 
     columns = (*Progress.get_default_columns(), MofNCompleteColumn())
     with Progress(*columns, console=_stderr(), transient=True) as bar:
         task = bar.add_task(escape(f"{config.controller} on {config.track}"), total=None)
-        return drive(config, lambda done, total: bar.update(task, completed=done, total=total))
+        result = drive(config, lambda done, total: bar.update(task, completed=done, total=total))
+    check_started(config, result)
+    return result
 
 
 def _stderr() -> "Console":
