@@ -62,7 +62,13 @@ StartD = Annotated[float | None, typer.Option(help="Start this far left of the t
 TargetLane = Annotated[
     int | None, typer.Option(help="Lane to follow, 0 the leftmost [default: the nearest]")
 ]
-Throttle = Annotated[float, typer.Option(help="Held open loop, 0 to 1.")]
+Throttle = Annotated[
+    float | None, typer.Option(help="Held open loop, 0 to 1 [default: 0.2]", show_default=False)
+]
+Speed = Annotated[
+    float | None,
+    typer.Option(help="Drive at this speed, m/s, slower in bends [default: hold the throttle]"),
+]
 Traffic = Annotated[int, typer.Option(help="Other cars, 0 to 12.")]
 Light = Annotated[str, typer.Option(help="clear, overcast, dusk, fog, heavy-shadow, rain or snow.")]
 DriveSeed = Annotated[int, typer.Option(help="Of traffic, light and scenery.", min=0)]
@@ -98,6 +104,7 @@ def drive(
     start_d: StartD = DRIVE.start_d,
     target_lane: TargetLane = DRIVE.target_lane,
     throttle: Throttle = DRIVE.throttle,
+    speed: Speed = DRIVE.speed,
     traffic: Traffic = DRIVE.traffic,
     light: Light = DRIVE.light,
     seed: DriveSeed = DRIVE.seed,
@@ -106,7 +113,8 @@ def drive(
 ) -> None:
     """Drive closed loop from 25 m before the line, at rest, and print the score.
 
-    Gear 1 and the throttle are held, except behind slower traffic. The score is the sum of the
+    Gear 1 and the throttle are held, except behind slower traffic; with --speed, the speed. The
+    score is the sum of the
     rewards over the steps requested; leaving the track, turning round or a collision ends the
     drive.
     """
@@ -127,6 +135,7 @@ def drive(
         start_d=start_d,
         target_lane=target_lane,
         throttle=throttle,
+        speed=speed,
         traffic=traffic,
         light=light,
         seed=seed,
@@ -189,11 +198,13 @@ app.command()(train)
 def _drive_with_progress(config: DriveConfig) -> "DriveResult":
     from rich.markup import escape
 
-    from controllers.drive import drive
+    from controllers.drive import check_started, drive
 
     with command.progress_bar() as bar:
         task = bar.add_task(escape(f"{config.controller} on {config.track}"), total=None)
-        return drive(config, lambda done, total: bar.update(task, completed=done, total=total))
+        result = drive(config, lambda done, total: bar.update(task, completed=done, total=total))
+    check_started(config, result)
+    return result
 
 
 def _stderr() -> "Console":

@@ -1,12 +1,12 @@
 """Closed-loop driving: perceive, steer, step, score. SI units, track frame, left positive.
 
-Throttle is held open loop, as in the paper. A run of `run_lap` depends on the world's reset, the
-controller and the perception alone.
+Throttle is held open loop, as in the paper, unless other `Pedals` are given. A run of `run_lap`
+depends on the world's reset, the controller, the pedals and the perception alone.
 """
 
 import math
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Protocol, TextIO, TypeVar
 
 import numpy as np
@@ -47,6 +47,32 @@ class Drivable(Protocol):
 
 
 World = TypeVar("World", bound=Drivable)
+
+
+class Pedals(Protocol):
+    """Throttle, brake and gear of a drive."""
+
+    @property
+    def mean_error(self) -> float | None:
+        """m/s from the set-point; None where there is none."""
+        ...
+
+    def __call__(
+        self, now: CarState, traffic: Traffic, perceived: Perceived
+    ) -> tuple[float, float, int]: ...
+
+
+@dataclass(frozen=True)
+class HeldThrottle:
+    """The paper's: gear 1 and a throttle, less behind a slower car."""
+
+    throttle: float = THROTTLE
+    mean_error: None = None
+
+    def __call__(
+        self, now: CarState, traffic: Traffic, perceived: Perceived
+    ) -> tuple[float, float, int]:
+        return *throttle_and_brake(traffic, now, self.throttle), GEAR
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,10 +124,14 @@ class DriveResult:
     """Why it ended early: off_track (or touching a wall), backwards, or collision (with a car)."""
     real_time: RealTimeFigures | None = None
     """Of a drive on the wall clock only; in JSON its fields are those of the result."""
+    speed_error_m_s: float | None = None
+    """Mean distance from the set-point of `--speed` on free straights; only there in JSON."""
 
     def as_json(self) -> dict[str, Any]:
         """The fields as JSON values."""
         values = asdict(self)
+        if self.speed_error_m_s is None:
+            del values["speed_error_m_s"]
         values["speed_kmh"] = list(self.speed_kmh)
         if self.cruising_kmh is not None:
             values["cruising_kmh"] = list(self.cruising_kmh)
@@ -114,7 +144,7 @@ def run_lap(
     perceive: Callable[[World], Perceived],
     steps: int,
     *,
-    throttle: float = THROTTLE,
+    pedals: Pedals = HeldThrottle(),
     lane_centre: float = 0.0,
     noisy: bool = False,
     record: Callable[[CarState, float], None] | None = None,
@@ -133,17 +163,18 @@ def run_lap(
         steer = controller.update(_observe(now, perceived, memory))
         if record is not None:
             record(now, steer)
-        pedal, brake = throttle_and_brake(world.traffic, now, throttle)
+        throttle, brake, gear = pedals(now, world.traffic, perceived)
         lost_s = max(perceived.lost_s, memory.age / world.frequency_hz)
         if lost_s > LOST_S:
-            pedal, brake = slow_down(now.vx, pedal, brake)
+            throttle, brake = slow_down(now.vx, throttle, brake)
             totals.slowed_steps += 1
-        after = world.step(Command(steer=steer, throttle=pedal, brake=brake, gear=GEAR))
+        after = world.step(Command(steer=steer, throttle=throttle, brake=brake, gear=gear))
         totals.add(after, lane_centre, world.road.half_width)
         if totals.ended is not None:
             break
     run_up = round(RUN_UP_S * world.frequency_hz)
-    return totals.result(world.state, steps, run_up, memory.blind_steps, noisy=noisy)
+    result = totals.result(world.state, steps, run_up, memory.blind_steps, noisy=noisy)
+    return replace(result, speed_error_m_s=pedals.mean_error)
 
 
 def throttle_and_brake(traffic: Traffic, now: CarState, throttle: float) -> tuple[float, float]:

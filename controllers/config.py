@@ -37,7 +37,10 @@ class DriveConfig:
     """m left of the track's centre; None: the middle of the target lane, or 0 without one."""
     target_lane: int | None = None
     """0 is the leftmost; None: the lane nearest to the start."""
-    throttle: float = THROTTLE
+    throttle: float | None = None
+    """Held in gear 1; None: 0.2, or what `speed` needs."""
+    speed: float | None = None
+    """m/s to drive at, slower in bends and behind traffic; None: the throttle is held."""
     traffic: int = 0
     light: str = "clear"
     seed: int = 0

@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 import trackfeatures as tf
-from controllers.closed_loop import DriveLog, DriveResult, run_lap
+from controllers.closed_loop import DriveLog, DriveResult, HeldThrottle, Pedals, run_lap
 from controllers.compare.disturbance import Disturbance
-from controllers.config import DriveConfig
+from controllers.config import THROTTLE, DriveConfig
 from controllers.interface import LoopConfig
 from controllers.late_perception import LatePerception, TrustedPerception
 from controllers.perception import (
@@ -28,6 +28,7 @@ from controllers.perception import (
     open_perception,
 )
 from controllers.registry import make_controller
+from controllers.speed import on_perception, on_the_truth
 from runtime.files import check_folder
 from runtime.film import FILM_SUFFIX, Film
 from simulator.camera import check_light
@@ -45,6 +46,9 @@ FREQUENCY_HZ = 20
 SCORED_STEPS = {"forza": 6500, "alpine-2": 4500, "eroad": 3700, "g-track-3": 3300}
 """Numbers of steps by track at which scores are compared with the paper's."""
 TYPICAL_SPEED = 15.0  # m/s, a little less than gear 1 and the default throttle give on a flat road
+
+START_M, START_S = 5.0, 10.0
+"""A car that ends within so many metres, or stands for so long, did not start."""
 
 Progress = Callable[[int, int], None]
 """Called with the steps done and the steps in all."""
@@ -94,8 +98,7 @@ def drive(
     if parameters is None:
         parameters = read_parameters(config.parameters, config.controller)
     controller = make_controller(config.controller, loop, parameters)
-    if not 0.0 <= config.throttle <= 1.0:
-        raise UserError(f"throttle {config.throttle} is out of range; give one from 0 to 1")
+    pedals = choose_pedals(config, road, lane)
     with ExitStack() as stack:
         disturbance = disturbance or Disturbance()
         world = stack.enter_context(
@@ -115,7 +118,7 @@ def drive(
             disturbance.controller(controller, config.seed),
             perceive,
             steps,
-            throttle=config.throttle,
+            pedals=pedals,
             lane_centre=lane.centre,
             noisy=noisy,
             record=_recorder(perceive, watching, steps, progress),
@@ -135,6 +138,35 @@ def _real_time(
         )
     rng = np.random.default_rng([config.seed, 3])
     return real_time(perceive, dt=1.0 / FREQUENCY_HZ, drop=config.drop, rng=rng)
+
+
+def check_started(config: DriveConfig, result: DriveResult) -> None:
+    """Raise UserError where the car did not get away from its start."""
+    seconds = result.steps / FREQUENCY_HZ
+    if result.distance_m >= START_M or (result.ended is None and seconds < START_S):
+        return
+    what = f"ended with {result.ended}" if result.ended else "stood"
+    raise UserError(
+        f"the car did not start on {config.track}: it {what} after {seconds:g} s, "
+        f"{result.distance_m:.1f} m driven; give another --throttle, --speed, --start-d or track"
+    )
+
+
+def choose_pedals(config: DriveConfig, road: Road, lane: Lane) -> Pedals:
+    """A held throttle, or the speed of `config`. Raises UserError for both, and out of range."""
+    if config.speed is not None:
+        if config.throttle is not None:
+            raise UserError(
+                f"--speed {config.speed:g} and --throttle {config.throttle:g} contradict each "
+                "other; give one of them"
+            )
+        if config.perception == "truth":
+            return on_the_truth(config.speed, road, lane.centre, 1.0 / FREQUENCY_HZ)
+        return on_perception(config.speed, 1.0 / FREQUENCY_HZ)
+    throttle = THROTTLE if config.throttle is None else config.throttle
+    if not 0.0 <= throttle <= 1.0:
+        raise UserError(f"throttle {throttle} is out of range; give one from 0 to 1")
+    return HeldThrottle(throttle)
 
 
 def delay(config: DriveConfig, perceive: Perceive, unknown_s: float = 0.0) -> Perceive:

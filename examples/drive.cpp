@@ -42,27 +42,24 @@ static std::string request_for(const drvlink_header &camera, const std::string &
         R"({"name":"angle_rad","parameters":{"binary_data":true}}]})";
     return "POST /v2/models/track/infer HTTP/1.1\r\nHost: " + host +
            "\r\nContent-Type: application/octet-stream\r\nInference-Header-Content-Length: " +
-           std::to_string(json.size()) + "\r\nContent-Length: " + std::to_string(json.size() + bytes) +
-           "\r\n\r\n" + json;
+           std::to_string(json.size()) + "\r\nContent-Length: " +
+           std::to_string(json.size() + bytes) + "\r\nConnection: close\r\n\r\n" + json;
 }
 
-static Road ask(int connection, const std::string &request) {
+// A connection for each image: one that is kept would be closed by the service when the car waits.
+static Road ask(const char *host, const char *port, const std::string &request) {
+    const int connection = dial(host, port);
     for (size_t sent = 0; sent < request.size();) {
         const ssize_t more = send(connection, &request[sent], request.size() - sent, MSG_NOSIGNAL);
         if (more <= 0) throw std::runtime_error("the service closed the connection");
         sent += static_cast<size_t>(more);
     }
     std::string reply;
-    for (size_t end = std::string::npos; reply.size() < end;) {
-        char part[4096];
-        const ssize_t more = recv(connection, part, sizeof part, 0);
-        if (more <= 0) throw std::runtime_error("the service closed the connection");
+    char part[4096];
+    for (ssize_t more; (more = recv(connection, part, sizeof part, 0)) > 0;)
         reply.append(part, static_cast<size_t>(more));
-        const char *length = strcasestr(reply.c_str(), "\r\ncontent-length:");
-        if (const size_t head = reply.find("\r\n\r\n"); head != std::string::npos && length)
-            end = head + 4 + std::stoul(length + 17);
-    }
-    if (reply.compare(0, 12, "HTTP/1.1 200")) throw std::runtime_error(reply);
+    close(connection);
+    if (reply.compare(0, 12, "HTTP/1.1 200")) throw std::runtime_error("no answer: " + reply);
     Road road;  // the two tensors asked for are the last bytes, little-endian
     memcpy(&road, &reply[reply.size() - sizeof road], sizeof road);
     return road;
@@ -75,7 +72,6 @@ int main(int count, char **words) try {
     check(drvlink_attach(&link, words[1], 180.0)), link.timeout_s = 30.0;
     const drvlink_header &world = link.header;
     const drvlink_state &car = link.state;
-    const int service = dial(words[2], words[3]);
     const std::string request = request_for(world, words[2] + std::string(":") + words[3]);
     const size_t bytes = size_t{3} * world.image_width * world.image_height;
     std::string image(world.image_bytes, 0);  // the bytes of the pixels, and up to 7 more
@@ -83,7 +79,7 @@ int main(int count, char **words) try {
     double sum = 0.0, largest = 0.0, offset = 0.0;
     check(drvlink_reset(&link, 1));
     while (car.lap < 2) {  // from 25 m before the line, at rest, to the end of the first lap
-        const Road road = ask(service, request + image.substr(0, bytes));
+        const Road road = ask(words[2], words[3], request + image.substr(0, bytes));
         if (std::isfinite(road.offset)) offset = road.offset;  // otherwise the last one is held
         const double theta = -road.angle, rate = car.vy + car.vx * std::sin(theta);
         const double wheel = -(0.4 * offset + 0.1 * rate + 1.5 * theta + 0.1 * car.yaw_rate);

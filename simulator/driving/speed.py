@@ -17,6 +17,7 @@ from simulator.vehicle.state import CarState
 
 LATERAL_ACCELERATION = 4.0  # m/s2 in bends
 BRAKING = 2.5  # m/s2 before bends
+PREVIEW_S = 0.5
 CELL_M = 1.0
 SHIFT_UP_RPM, SHIFT_DOWN_RPM = 5500.0, 2600.0
 TOP_GEAR = 4
@@ -116,8 +117,39 @@ class Pedals:
         return torque * self._ratio(gear) * car.driveline_efficiency / car.wheel_radius
 
 
+class TargetSpeed:
+    """Throttle, brake and gear that reach a speed and keep the distance to a leader."""
+
+    def __init__(self, car: CarParameters, step_s: float) -> None:
+        """`step_s` is the time between two commands."""
+        self._pedals = Pedals(car)
+        self._step_s = step_s
+        self.following = False
+        """Whether the last command kept the distance to a leader."""
+
+    def reset(self) -> None:
+        self._pedals.reset()
+
+    def command(
+        self, state: CarState, traffic: Traffic, target: float, slope: float
+    ) -> tuple[float, float, int]:
+        """Throttle, brake, gear for one control step towards `target` (m/s) on a road of `slope`
+        (rise per m)."""
+        speed = max(state.speed, 0.0)
+        follow = inf
+        leader = traffic.leader(state.s, state.to_middle) if traffic.count else None
+        if leader is not None:
+            follow = float(idm_acceleration(leader[0], speed, leader[1], max(target, 1.0)))
+        acceleration = target_acceleration(speed, target, follow)
+        # The trim is for a free road: behind a car, the target speed is not reached on purpose.
+        self.following = follow <= acceleration
+        error = 0.0 if self.following else target - speed
+        error = error if abs(error) < BRAKING else 0.0
+        return self._pedals.press(acceleration, speed, error, slope, self._step_s)
+
+
 class SpeedControl:
-    """Throttle, brake and gear that follow a speed profile and keep the distance to a leader."""
+    """`TargetSpeed` along a speed profile."""
 
     def __init__(
         self, profile: SpeedProfile, track: Track, car: CarParameters, step_s: float
@@ -125,26 +157,16 @@ class SpeedControl:
         """`step_s` is the time between two commands."""
         self._profile = profile
         self._track = track
-        self._pedals = Pedals(car)
-        self._step_s = step_s
+        self._follower = TargetSpeed(car, step_s)
 
     def reset(self) -> None:
-        self._pedals.reset()
+        self._follower.reset()
 
     def command(self, state: CarState, traffic: Traffic) -> tuple[float, float, int]:
         """Throttle, brake, gear for one control step."""
-        speed = max(state.speed, 0.0)
-        target = self._profile.at(state.s + 0.5 * speed)
-        follow = inf
-        leader = traffic.leader(state.s, state.to_middle) if traffic.count else None
-        if leader is not None:
-            follow = float(idm_acceleration(leader[0], speed, leader[1], max(target, 1.0)))
-        acceleration = target_acceleration(speed, target, follow)
-        # The trim is for a free road: behind a car, the target speed is not reached on purpose.
-        error = target - speed if follow > acceleration else 0.0
-        error = error if abs(error) < BRAKING else 0.0
+        target = self._profile.at(state.s + PREVIEW_S * max(state.speed, 0.0))
         slope = float(self._track.slope(state.s))
-        return self._pedals.press(acceleration, speed, error, slope, self._step_s)
+        return self._follower.command(state, traffic, target, slope)
 
 
 def target_acceleration(speed: float, target: float, follow: float = inf) -> float:

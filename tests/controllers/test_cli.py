@@ -3,10 +3,12 @@
 import json
 import subprocess
 import time
+import sys
 from pathlib import Path
 
 import pytest
 
+import trackfeatures as tf
 from controllers.demo.process import free_port
 from simulator.camera import KINDS
 from tests.typed import typed
@@ -97,6 +99,10 @@ def test_the_help_of_drive_names_every_light() -> None:
         (("--parameters", "pyproject.toml"), "has no parameters of lqr-preview"),
         (("--lanes", "7"), "7"),
         (("--throttle", "2"), "throttle 2.0"),
+        (("--speed", "15", "--throttle", "0.2"), "--speed 15 and --throttle 0.2 contradict"),
+        (("--speed", "0"), "a speed of 0 m/s"),
+        (("--speed", "nan"), "a speed of nan m/s"),
+        (("--speed", "41"), "a speed of 41 m/s is out of range; give 1 to 40"),
         (("--steps", "0"), "0 steps"),
         (("--traffic", "99"), "99 traffic cars"),
         (("--light", "bogus"), "unknown light 'bogus'"),
@@ -113,3 +119,91 @@ def test_a_wrong_option_is_one_error_line(arguments: tuple[str, ...], message: s
     errors = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
     assert len(errors) == 1, done.stderr
     assert message in errors[0]
+
+
+DYING_SERVICE = """
+import http.server, json, os, sys
+CAMERA = dict(width=56, height=42, fov_y_deg=67.5, x=0.75, y=0.0, z=0.95, pitch_deg=0.0)
+HEADING = dict(left=0.0, straight=1.0, right=0.0)
+FEATURES = dict(to_lane_centre_m=0.0, angle_rad=0.0, heading=HEADING)
+asked = 0
+
+class Handler(http.server.BaseHTTPRequestHandler):
+    protocol_version = "HTTP/1.1"
+
+    def answer(self, content):
+        body = json.dumps(content).encode()
+        self.send_response(200)
+        self.send_header("Content-Length", str(len(body)))
+        self.end_headers()
+        self.wfile.write(body)
+
+    def do_GET(self):
+        self.answer(dict(definitions_version=sys.argv[1], camera=CAMERA))
+
+    def do_POST(self):
+        global asked
+        asked += 1
+        if asked > 5:
+            os._exit(9)
+        self.rfile.read(int(self.headers["Content-Length"]))
+        self.answer(FEATURES)
+
+    def log_message(self, *words):
+        pass
+
+server = http.server.HTTPServer(("127.0.0.1", 0), Handler)
+print(server.server_port, flush=True)
+server.serve_forever()
+"""
+
+
+def test_a_service_that_dies_in_a_drive_is_one_error_line_and_the_log_is_kept(
+    tmp_path: Path,
+) -> None:
+    log = tmp_path / "drive.csv"
+    command = [sys.executable, "-c", DYING_SERVICE, tf.VERSION]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as service:
+        assert service.stdout is not None
+        url = f"http://127.0.0.1:{service.stdout.readline().strip()}"
+        done = run("drive", "--steps", "50", "--perception", url, "--log", str(log))
+        assert service.wait(10) == 9
+    assert done.returncode == 1, done.stdout
+    errors = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
+    assert len(errors) == 1, done.stderr
+    assert url in errors[0]
+    assert len(log.read_text().splitlines()) == 1 + 5
+
+
+def test_a_track_where_the_car_cannot_start_is_one_error_line(tmp_path: Path) -> None:
+    """A climb of 29 % at the start: gear 1 and a fifth of the throttle do not hold the car."""
+    straight = '[[segment]]\ntype = "straight"\nlength = 80.0\ngrade = {}\n'
+    bend = '[[segment]]\ntype = "bend"\nradius = 45.0\nangle = 90.0\nspiral = 20.0\n'
+    grades = (29.0, -29.0, -29.0, 29.0)
+    track, log = tmp_path / "climb.toml", tmp_path / "drive.csv"
+    head = 'look = "mountain"\nsurface = "asphalt"\nwidth = 10.0\nvertical_curve = 20.0\n'
+    track.write_text(head + "".join(straight.format(grade) + bend for grade in grades))
+    done = run("drive", "--track", str(track), "--steps", "200", "--log", str(log), "--json")
+    assert (done.returncode, done.stdout) == (1, "")
+    errors = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
+    assert len(errors) == 1, done.stderr
+    assert "the car did not start" in errors[0]
+    assert "backwards" in errors[0]
+    assert len(log.read_text().splitlines()) > 2
+
+
+def test_a_car_that_stands_did_not_start() -> None:
+    done = run("drive", "--throttle", "0", "--steps", "250")
+    assert done.returncode == 1
+    assert "error: the car did not start" in done.stderr
+    assert "stood" in done.stderr
+
+
+def test_a_set_speed_is_driven_and_its_error_is_told() -> None:
+    done = run("drive", "--speed", "12", "--steps", "500", "--json")
+    assert done.returncode == 0, done.stderr
+    result = json.loads(done.stdout)
+    assert result["speed_error_m_s"] < 0.2
+    assert result["speed_kmh"][1] == pytest.approx(12 * 3.6, abs=2.0)
+    held = json.loads(run("drive", "--steps", "20", "--json").stdout)
+    assert "speed_error_m_s" not in held
