@@ -10,7 +10,8 @@ angle that a network reads from an image turns into a bend before the car is the
 correlates by -0.76 with the change of the curvature over the next 0.4 s, and a controller without
 preview is better off with it. As it is, drives on ordinary images keep their scores (0.9894), and a
 camera that fails for 15 % of the time, half a second each, no longer throws the car off the road:
-none of three drives on g-track-3 instead of all three.
+none of three drives on g-track-3 (72 km/h) instead of all three. In `town` (50 km/h) it helps
+little: 0.956 a step in place of 0.951.
 """
 
 from dataclasses import dataclass, replace

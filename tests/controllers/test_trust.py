@@ -1,19 +1,14 @@
 """The Kalman gains on answers with a standard deviation, and drives on them."""
 
-import itertools
-from collections.abc import Callable, Iterator
 from dataclasses import replace
 
-import cv2
 import numpy as np
 import pytest
 
 from controllers.closed_loop import run_lap
-from controllers.config import DriveConfig
-from controllers.drive import drive
 from controllers.late_perception import LatePerception, RoadEstimate, TrustedPerception
 from controllers.lqr import Lqr
-from controllers.perception import CameraPerception, Image, Perceived, truth
+from controllers.perception import Perceived, truth
 from controllers.trust import (
     ANGLE_NOISE_RAD,
     OFFSET_NOISE_M,
@@ -182,46 +177,3 @@ def test_the_car_keeps_nearer_to_its_lane_when_doubtful_answers_are_trusted_less
             found[trusted] = run_lap(world, Lqr(DT), state if trusted else perceive, 500)
     assert found[True].ended is None
     assert found[True].mean_abs_d_m < 0.5 * found[False].mean_abs_d_m
-
-
-def faulty(image: Image, rng: np.random.Generator) -> Image:
-    """An image as of a broken camera: noise, black, white, out of focus, or rows out of place."""
-    kinds: list[Callable[[], Image]] = [
-        lambda: rng.integers(0, 256, image.shape, dtype=np.uint8),
-        lambda: np.zeros_like(image),
-        lambda: np.full_like(image, 255),
-        lambda: np.asarray(cv2.GaussianBlur(image, (0, 0), 0.06 * image.shape[1]), np.uint8),
-        lambda: np.roll(image, int(rng.integers(1, len(image) // 2)), axis=0),
-    ]
-    return kinds[int(rng.integers(len(kinds)))]()
-
-
-@pytest.mark.slow
-def test_a_drive_on_a_faulty_camera_stays_in_its_lane(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The shipped model; every three seconds the camera fails for half a second."""
-    found = {}
-    for trusted in (False, True):
-        rng, images = np.random.default_rng(1), itertools.count()
-        with monkeypatch.context() as patch:
-            if not trusted:
-                patch.setattr(
-                    "controllers.drive.TrustedPerception", lambda perceive, *_, **__: perceive
-                )
-            capture = CameraPerception.capture
-
-            def fails(
-                self: CameraPerception,
-                world: World,
-                rng: np.random.Generator = rng,
-                images: Iterator[int] = images,
-                capture: Callable[[CameraPerception, World], Image] = capture,
-            ) -> Image:
-                image = capture(self, world)
-                return faulty(image, rng) if next(images) % 60 >= 50 else image
-
-            patch.setattr(CameraPerception, "capture", fails)
-            config = DriveConfig(controller="lqr", track="town", perception="model", steps=400)
-            found[trusted] = drive(config)
-    assert found[True].ended is None
-    assert found[True].max_abs_d_m < 1.0
-    assert found[True].score > found[False].score + 10.0
