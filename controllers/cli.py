@@ -8,6 +8,7 @@ import typer
 
 from controllers.compare import cli as compare_cli
 from controllers.config import DemoConfig, DriveConfig
+from controllers.record.cli import record
 from controllers.rl.cli import train
 from runtime import cli as command
 
@@ -37,6 +38,9 @@ Log = Annotated[Path | None, typer.Option(help="Write the drive to this CSV file
 Video = Annotated[Path | None, typer.Option(help="Film the drive (.mp4).")]
 Latency = Annotated[float, typer.Option(help="The perception's answers come this late.")]
 Drop = Annotated[float, typer.Option(help="Share of the answers that are lost.")]
+Filter = Annotated[
+    bool, typer.Option("--filter", help="Filter the perception's answers over time.")
+]
 Parameters = Annotated[
     Path | None, typer.Option(help="The controller's parameters, written by `controllers tune`.")
 ]
@@ -74,6 +78,7 @@ def drive(
     video: Video = DRIVE.video,
     latency_ms: Latency = DRIVE.latency_ms,
     drop: Drop = DRIVE.drop,
+    filter: Filter = DRIVE.filter,
     parameters: Parameters = DRIVE.parameters,
     model: Model = DRIVE.model,
     start_d: StartD = DRIVE.start_d,
@@ -101,6 +106,7 @@ def drive(
         video=video,
         latency_ms=latency_ms,
         drop=drop,
+        filter=filter,
         parameters=parameters,
         model=model,
         start_d=start_d,
@@ -163,6 +169,7 @@ def demo(
 app.command()(compare_cli.compare)
 app.command()(compare_cli.tune)
 app.command()(train)
+app.command()(record)
 
 
 def _drive_with_progress(config: DriveConfig) -> "DriveResult":
