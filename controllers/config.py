@@ -25,6 +25,8 @@ class DriveConfig:
     """Of the perception's answers; the state is predicted over it."""
     drop: float = 0.0
     """Share of the answers that are lost."""
+    filter: bool = False
+    """Filter the answers over time, with the car's own speeds and yaw rate."""
     parameters: Path | None = None
     """A file of `controllers tune`, whose parameters the controller gets."""
     model: str = "default"

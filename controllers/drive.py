@@ -103,7 +103,7 @@ def drive(
         world.reset(seed=config.seed, to_middle=lane.start_d)
         source = stack.enter_context(_open_perception(config, world, lane))
         watching = [*observers, *_observers(config, stack, world, source, lane)]
-        perceive = Tap(delay(config, source.perceive, disturbance.delay_s))
+        perceive = Tap(delay(config, _filtered(config, source.perceive), disturbance.delay_s))
         return run_lap(
             world,
             disturbance.controller(controller, config.seed),
@@ -127,6 +127,17 @@ def delay(config: DriveConfig, perceive: Perceive, unknown_s: float = 0.0) -> Pe
     if config.latency_ms == 0.0 and config.drop == 0.0:
         return perceive
     return _late(perceive, config.latency_ms / 1000.0, config.drop, rng, predict=True)
+
+
+def _filtered(config: DriveConfig, perceive: Perceive) -> Perceive:
+    """`perceive`, filtered over time where `config` asks for it. UserError on the truth."""
+    if not config.filter:
+        return perceive
+    if not isinstance(perceive, CameraPerception):
+        raise UserError("--filter is for answers to images; give --perception model or a service")
+    from controllers.filtered_perception import FilteredPerception
+
+    return FilteredPerception(perceive)
 
 
 def _late(
