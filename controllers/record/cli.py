@@ -29,7 +29,7 @@ from datagen.cli.collect import (
     record_plan,
 )
 from datagen.planning.config import CollectConfig, all_lights
-from datagen.recording.names import UNSEEN
+from datagen.recording.names import DRIVEN, UNSEEN
 from runtime.cli import AsJson
 from trackfeatures import UserError
 
@@ -122,7 +122,7 @@ def _plan(
     plan = make_plan(config, forecast)
     # Names of their own, so that they can be merged with the rounds of other plans.
     rounds = tuple(
-        replace(entry, id=f"driven-{config.seed}-{entry.id.removeprefix('round-')}")
+        replace(entry, id=f"{DRIVEN}{config.seed}-{entry.id.removeprefix('round-')}")
         for entry in plan.rounds
     )
     plan = replace(plan, rounds=rounds, driver={"controller": controller, "model": card.model_hash})

@@ -16,7 +16,7 @@ from controllers.perception import Perceived
 from controllers.record.law import PerceivedLaw
 from datagen.execution.merge import merge
 from datagen.recorder.replay import replay
-from datagen.recording import Dataset
+from datagen.recording import Dataset, Labels
 from datagen.recording.errors import DatasetError
 from datagen.recording.integrity.verify import verify
 from mtlnet.data.sources import open_training_dataset, recorded_training_data
@@ -61,9 +61,11 @@ def test_a_recording_is_an_ordinary_dataset(recorded: Path) -> None:
         "driven-1000-000",
         "driven-1000-001",
     ]
+    assert "In 2 of 2 rounds (`driven-...`" in (recorded / "README.md").read_text()
     data = recorded_training_data(open_training_dataset(recorded))
     assert len(data.frames) == 60
     labels = data.frames.labels
+    assert isinstance(labels, Labels)
     assert labels.speed.min() > 5.0
     assert 0.2 < abs(labels.to_middle).max() < 4.5  # it sways, and stays near its lane of 4 m
 
@@ -91,6 +93,7 @@ def test_recordings_are_merged_with_rounds_of_another_plan(recorded: Path, tmp_p
     merged = merge([other, recorded], tmp_path / "both")
     assert (merged.rounds, merged.planned, merged.frames) == (4, 4, 240)
     assert verify(tmp_path / "both", "full").ok
+    assert "In 2 of 4 rounds" in (tmp_path / "both" / "README.md").read_text()
     splits = {info.id: info.split for info in Dataset.open(tmp_path / "both").rounds}
     assert splits.keys() == {"round-000", "round-001", "driven-1000-000", "driven-1000-001"}
     assert merge([recorded, other], tmp_path / "both").added == 0
