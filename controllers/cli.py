@@ -8,6 +8,7 @@ import typer
 
 from controllers.compare import cli as compare_cli
 from controllers.config import DemoConfig, DriveConfig
+from controllers.record.cli import record
 from controllers.rl.cli import train
 from runtime import cli as command
 
@@ -54,6 +55,9 @@ Realtime = Annotated[
         "No two such drives are the same.",
     ),
 ]
+Filter = Annotated[
+    bool, typer.Option("--filter", help="Filter the perception's answers over time.")
+]
 Parameters = Annotated[
     Path | None, typer.Option(help="The controller's parameters, written by `controllers tune`.")
 ]
@@ -99,6 +103,7 @@ def drive(
     latency_ms: Latency = DRIVE.latency_ms,
     drop: Drop = DRIVE.drop,
     realtime: Realtime = DRIVE.realtime,
+    filter: Filter = DRIVE.filter,
     parameters: Parameters = DRIVE.parameters,
     model: Model = DRIVE.model,
     start_d: StartD = DRIVE.start_d,
@@ -130,6 +135,7 @@ def drive(
         latency_ms=latency_ms,
         drop=drop,
         realtime=realtime,
+        filter=filter,
         parameters=parameters,
         model=model,
         start_d=start_d,
@@ -193,6 +199,7 @@ def demo(
 app.command()(compare_cli.compare)
 app.command()(compare_cli.tune)
 app.command()(train)
+app.command()(record)
 
 
 def _drive_with_progress(config: DriveConfig) -> "DriveResult":

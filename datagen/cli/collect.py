@@ -18,6 +18,7 @@ from trackfeatures.errors import UserError
 if TYPE_CHECKING:
     from datagen.execution.progress import CollectResult
     from datagen.planning.plan import Plan, Shard
+    from datagen.recorder.record import MakeLaw
 
     ClassShares = dict[str, dict[str, float]]
 
@@ -121,9 +122,9 @@ def collect(
         frames=frames,
         seed=seed,
         frequency_hz=frequency,
-        tracks=choose_tracks(_names(tracks), tracks_dir, unseen=split == UNSEEN),
-        lanes=_numbers(lanes),
-        lights=_names(lights) or all_lights(),
+        tracks=choose_tracks(names(tracks), tracks_dir, unseen=split == UNSEEN),
+        lanes=numbers(lanes),
+        lights=names(lights) or all_lights(),
         stretch=stretch,
         scenes=scenes,
         test_share=split_test_share,
@@ -139,7 +140,12 @@ def collect(
         _print_plan(plan, classes, as_json)
         return
     folder = out or (UNSEEN_FOLDER if split else DATASET_FOLDER)
-    result = _record(plan, classes, folder, workers, tracks_dir, executor, part)
+    result = record_plan(plan, classes, folder, workers, tracks_dir, executor, part)
+    print_recorded(result, as_json)
+
+
+def print_recorded(result: "CollectResult", as_json: bool) -> None:
+    """What was recorded, as a line or as JSON."""
     line = (
         f"{result.out}: {counted(result.rounds, 'round')}, "
         f"{counted(result.frames, 'frame')}; recorded "
@@ -161,7 +167,7 @@ def _print_plan(plan: "Plan", classes: "ClassShares", as_json: bool) -> None:
     console.print(listing(plan), overview(plan, classes))
 
 
-def _record(
+def record_plan(
     plan: "Plan",
     classes: "ClassShares",
     folder: Path,
@@ -169,6 +175,7 @@ def _record(
     tracks_dir: Path | None,
     executor: str,
     shard: "Shard | None",
+    make_law: "MakeLaw | None" = None,
 ) -> "CollectResult":
     """Record with a progress bar; exits with code 130 after Ctrl-C."""
     from datagen.execution.collect import collect as run
@@ -179,7 +186,16 @@ def _record(
     frames = len(rounds) * plan.config.frames
     try:
         with progress_bar(len(rounds), frames, overview(plan, classes)) as progress:
-            return run(plan, folder, workers, tracks_dir, progress, executor=executor, shard=shard)
+            return run(
+                plan,
+                folder,
+                workers,
+                tracks_dir,
+                progress,
+                executor=executor,
+                shard=shard,
+                make_law=make_law,
+            )
     except KeyboardInterrupt:
         sys.stderr.write("interrupted: finished rounds are kept; the same command continues\n")
         raise typer.Exit(command.INTERRUPTED) from None
@@ -190,7 +206,7 @@ def merge(
     out: Annotated[Path, typer.Option(help="Dataset folder to create or to add to.")],
     as_json: AsJson = False,
 ) -> None:
-    """Merge the rounds that shards recorded into folders of their own."""
+    """Merge the rounds of shards, or of other plans, into one dataset."""
     from datagen.execution.merge import merge as run
 
     merged = run(folders, out)
@@ -198,13 +214,15 @@ def merge(
     print_result(merged.as_json(), as_json, line)
 
 
-def _names(text: str) -> tuple[str, ...]:
+def names(text: str) -> tuple[str, ...]:
+    """The names in a list separated by commas."""
     return tuple(name.strip() for name in text.split(",") if name.strip())
 
 
-def _numbers(text: str) -> tuple[int, ...]:
+def numbers(text: str) -> tuple[int, ...]:
+    """The numbers of --lanes. Raises UserError."""
     try:
-        return tuple(sorted({int(part) for part in _names(text)}))
+        return tuple(sorted({int(part) for part in names(text)}))
     except ValueError as error:
         raise UserError(
             f"--lanes is {text!r}; give numbers separated by commas, such as 1,2,3"

@@ -4,6 +4,7 @@ Steering by `simulator.driving.lateral_law` along the course. Track frame, left 
 """
 
 from math import atan
+from typing import Protocol
 
 import trackfeatures as tf
 from datagen.driving.trajectory import Course, max_offset
@@ -25,6 +26,31 @@ LANE_CHANGE_PAUSE_S = 4.0
 SLOWER_BY = 1.5  # m/s: a leader this much slower is overtaken
 
 
+class SteeringLaw(Protocol):
+    """What turns the driver's path into steering; `LateralLaw` by default."""
+
+    def road_curvature(self, state: CarState) -> float:
+        """Curvature (1/m) of the car's path along the road just ahead."""
+        ...
+
+    def steer(
+        self, state: CarState, offset: float, curvature: float, path_angle: float = 0.0
+    ) -> float:
+        """The steering action in [-1, 1] towards a path, as `LateralLaw.steer`."""
+        ...
+
+    def restart(self) -> None:
+        """The car was put back onto the road: forget what was before."""
+        ...
+
+
+class _ScriptedLaw(LateralLaw):
+    """The law by default. It has no state, so that a restart changes nothing."""
+
+    def restart(self) -> None:
+        """Do nothing."""
+
+
 class ScriptedDriver:
     """The driver of one round. Deterministic: everything random is in the course."""
 
@@ -35,14 +61,18 @@ class ScriptedDriver:
         speed: float,
         frequency_hz: int = 20,
         car: CarParameters | None = None,
+        *,
+        law: SteeringLaw | None = None,
     ) -> None:
-        """`speed` in m/s, where road and traffic allow it."""
+        """`speed` in m/s, where road and traffic allow it. `law` steers in place of the usual."""
         car = car or CarParameters()
         self._road = road
         self._course = course
         self._dt = 1.0 / frequency_hz
         self._max_offset = max_offset(road)
-        self._law = LateralLaw(car, road, natural_frequency=NATURAL_FREQUENCY, damping=DAMPING)
+        self._law = law or _ScriptedLaw(
+            car, road, natural_frequency=NATURAL_FREQUENCY, damping=DAMPING
+        )
         self._profile = speed_profile(road.track, speed, self._max_offset)
         self._speed_control = SpeedControl(self._profile, road.track, car, self._dt)
         self.restart()
@@ -50,6 +80,7 @@ class ScriptedDriver:
     def restart(self) -> None:
         """Clear the state of the controllers. The course continues where it was."""
         self._speed_control.reset()
+        self._law.restart()
         self._shift = 0.0  # m: lane change, added to the course's offset
         self._shift_target = 0.0
         self._pause_s = 0.0

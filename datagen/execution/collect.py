@@ -8,12 +8,12 @@ datagen collect --rounds 60 --out datasets/default
 import json
 import signal
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict
 from pathlib import Path
 from types import FrameType
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import trackfeatures as tf
 from datagen.execution.lock import folder_lock, setup_lock
@@ -34,6 +34,9 @@ from datagen.recording.folder import (
 from datagen.recording.manifest import rebuild
 from datagen.recording.names import SIDES
 from datagen.recording.splits import Split, split_path, write_split
+
+if TYPE_CHECKING:
+    from datagen.recorder.record import MakeLaw
 
 EXECUTORS = ("local", "ray")
 PLAN_FILE = "plan.json"
@@ -67,8 +70,11 @@ def collect(
     *,
     executor: str = "local",
     shard: Shard | None = None,
+    make_law: "MakeLaw | None" = None,
 ) -> CollectResult:
     """Record the missing rounds of the plan, or of its part `shard`, into `folder`.
+
+    `make_law` makes what steers in place of the scripted driver; the plan's `driver` names it.
 
     Raises DatasetError when the folder has other contents or rounds failed, and UserError or
     OSError of the recording. In all cases finished rounds stay and unfinished ones are removed.
@@ -86,7 +92,7 @@ def collect(
         missing = [entry for entry in rounds if entry.id not in counter.finished]
         pool = make_pool(executor, workers, counter.on_message)
         try:
-            failures = pool.run(Job(e, plan.hash, folder, tracks_dir) for e in missing)
+            failures = pool.run(Job(e, plan.hash, folder, tracks_dir, make_law) for e in missing)
         except BaseException:
             with suppress(OSError, tf.UserError):  # the first error is reported, not a later one
                 _remove_leftovers(folder, rounds)
@@ -166,7 +172,7 @@ def require_matching_folder(folder: Path, plan: Plan) -> None:
     try:
         found = json.loads(path.read_text())
         found_hash, definitions, options = found["hash"], found["definitions"], found["wanted"]
-        maker = found["program"]
+        maker, driver = found["program"], found.get("driver", {})
     except (ValueError, KeyError, TypeError) as error:
         raise DatasetError(
             f"{path} cannot be read ({error!r}); choose another folder with --out"
@@ -179,8 +185,8 @@ def require_matching_folder(folder: Path, plan: Plan) -> None:
         )
     if found_hash != plan.hash:
         raise DatasetError(
-            f"{folder} was begun with another plan ({_differences(options, plan)}); give the same "
-            "options to finish it, or choose another folder with --out"
+            f"{folder} was begun with another plan ({_differences(options, driver, plan)}); give "
+            "the same options to finish it, or choose another folder with --out"
         )
 
     if foreign := foreign_files(folder, plan):
@@ -196,7 +202,7 @@ def foreign_files(folder: Path, plan: Plan) -> list[Path]:
     return [path for path in sorted(folder.glob("rounds/*.mcap")) if path.name not in names]
 
 
-def _differences(found: dict[str, Any], plan: Plan) -> str:
+def _differences(found: dict[str, Any], driver: Mapping[str, str], plan: Plan) -> str:
     """The options that differ, as text."""
     wanted = json.loads(json.dumps(asdict(plan.config)))
     named = [
@@ -204,7 +210,13 @@ def _differences(found: dict[str, Any], plan: Plan) -> str:
         for name, value in wanted.items()
         if found.get(name) != value
     ]
+    if plan.driver != driver:
+        named.append(f"driver: {_named(driver)} there, {_named(plan.driver)} asked for")
     return "; ".join(named) or "the same options, other rounds"
+
+
+def _named(driver: Mapping[str, str]) -> str:
+    return ", ".join(driver.values()) or "the scripted one"
 
 
 def _short(value: Any) -> str:

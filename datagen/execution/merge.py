@@ -1,5 +1,6 @@
-"""Merges the folders that the shards of one plan were recorded into."""
+"""Merges folders of recorded rounds: shards of one plan, or plans whose rounds have other names."""
 
+import hashlib
 import json
 import shutil
 from collections.abc import Mapping, Sequence
@@ -51,15 +52,14 @@ class MergeResult:
 def merge(folders: Sequence[Path], out: Path) -> MergeResult:
     """Copy the finished rounds of `folders` into `out`; rounds already in `out` stay.
 
-    Raises DatasetError for a folder without a plan or with another plan, and for a damaged round.
+    Raises DatasetError for a folder without a plan, for plans that share rounds, and for a damaged
+    round.
     """
-    plans = [_read_plan(folder) for folder in folders]
+    plan = _merge_plans([_read_plan(folder) for folder in folders], folders)
     if (out / PLAN_FILE).is_file():
-        plans.append(_read_plan(out))
+        _require_one_plan([plan, _read_plan(out)], [folders[0], out])
     elif out.exists() and not (out.is_dir() and is_unstarted(out, PLAN_FILE)):
         raise DatasetError(f"{out} exists and is not a dataset; choose another --out")
-    _require_one_plan(plans, [*folders, out])
-    plan = plans[0]
     out.mkdir(parents=True, exist_ok=True)
     with folder_lock(out, None):
         write_if_changed(out / PLAN_FILE, json.dumps(plan, indent=1) + "\n")
@@ -121,12 +121,36 @@ def _read_plan(folder: Path) -> dict[str, Any]:
     return plan
 
 
+def _merge_plans(plans: Sequence[dict[str, Any]], folders: Sequence[Path]) -> dict[str, Any]:
+    """The plan of shards; or one of all rounds, where plans share no name and no seed of a round.
+
+    With a shared seed, the same road in the same scenery could be in training and in test.
+    """
+    parts = {plan["hash"]: plan for plan in plans}
+    if len(parts) == 1:
+        return plans[0]
+    parts = dict(sorted(parts.items()))
+    entries = [entry for plan in parts.values() for entry in plan["rounds"]]
+    if any(len({e[name] for e in entries}) < len(entries) for name in ("id", "seed")):
+        _require_one_plan(plans, folders)
+    drivers = {tuple(plan["driver"].values()) for plan in parts.values() if "driver" in plan}
+    joined = {"driver": {"drivers": "; ".join(", ".join(d) for d in sorted(drivers))}}
+    return {
+        "hash": hashlib.sha256("".join(parts).encode()).hexdigest(),
+        "definitions": tf.VERSION,
+        "program": "; ".join(sorted({plan["program"] for plan in parts.values()})),
+        "wanted": {name: plan["wanted"] for name, plan in parts.items()},
+        **(joined if drivers else {}),
+        "rounds": entries,
+    }
+
+
 def _require_one_plan(plans: Sequence[dict[str, Any]], folders: Sequence[Path]) -> None:
     for plan, folder in zip(plans, folders, strict=False):
         if plan["hash"] != plans[0]["hash"]:
             raise DatasetError(
                 f"{folder} was begun with another plan than {folders[0]}; merge shards that were "
-                "started with the same options"
+                "started with the same options, or rounds of other names and another --seed"
             )
 
 

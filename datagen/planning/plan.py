@@ -6,7 +6,8 @@ A round is a pure function of its entry. `datagen.planning.planner` makes the en
 import hashlib
 import json
 import re
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
 from importlib.metadata import version
 from typing import Any
 
@@ -81,20 +82,26 @@ class Plan:
 
     config: CollectConfig
     rounds: tuple[RoundPlan, ...]
+    driver: Mapping[str, str] = field(default_factory=dict)
+    """What drives, where it is not the scripted driver: such rounds depend on it, too."""
 
     @property
     def hash(self) -> str:
         """SHA-256 (hex) of all entries, the program and the version of the definitions."""
-        content = [tf.VERSION, program(), [asdict(entry) for entry in self.rounds]]
+        content: list[Any] = [tf.VERSION, program(), [asdict(entry) for entry in self.rounds]]
+        if self.driver:
+            content.append(dict(self.driver))
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
     def as_json(self) -> dict[str, Any]:
         """Content of `plan.json`; the options are under "wanted"."""
+        driver = {"driver": dict(self.driver)} if self.driver else {}
         return {
             "hash": self.hash,
             "definitions": tf.VERSION,
             "program": program(),
             "wanted": asdict(self.config),
+            **driver,
             "rounds": [asdict(entry) for entry in self.rounds],
         }
 

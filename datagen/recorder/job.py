@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from importlib import import_module
 from multiprocessing.connection import Connection
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from datagen.errors import RoundFailed
 from datagen.planning.plan import RoundPlan
@@ -27,6 +28,9 @@ from datagen.recording.integrity.round_checks import check_round
 from datagen.recording.mcap.index import open_round
 from trackfeatures.errors import UserError
 
+if TYPE_CHECKING:
+    from datagen.recorder.record import MakeLaw
+
 REPORT_EVERY = 10  # frames
 PR_SET_PDEATHSIG = 1  # <linux/prctl.h>
 
@@ -39,6 +43,8 @@ class Job:
     plan_hash: str
     folder: Path
     tracks_dir: Path | None
+    make_law: "MakeLaw | None" = None
+    """Of what steers, in place of the scripted driver; it is sent to the recording processes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,7 +110,7 @@ def record_and_publish(job: Job, report: Report = lambda message: None) -> Round
 
     partial = partial_path(job.folder, job.plan.id)
     try:
-        record_round(job.plan, job.plan_hash, partial, job.tracks_dir, progress)
+        record_round(job.plan, job.plan_hash, partial, job.tracks_dir, progress, job.make_law)
         report(FramesDone(job.plan.id, job.plan.frames))
         state, resets = _check_recorded(partial)
         publish(job.folder, partial, state)

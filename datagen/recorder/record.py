@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import trackfeatures as tf
-from datagen.driving.scripted_driver import ScriptedDriver
+from datagen.driving.scripted_driver import ScriptedDriver, SteeringLaw
 from datagen.driving.trajectory import make_course
 from datagen.errors import RoundFailed
 from datagen.planning.plan import RoundPlan, program
@@ -39,6 +39,11 @@ MAX_RESETS = 20  # times control steps per frame: at low frame rates a round is 
 BATCH_FRAMES = 20
 CACHED_SCENES = BATCH_FRAMES  # scenes kept by the camera: none is built twice in a batch
 SCENERY_SEED_STRIDE = 2**40  # between the seeds of a round's sceneries: above all round seeds
+
+
+MakeLaw = Callable[[RoundPlan, World, Camera], SteeringLaw]
+"""Makes what steers in a round in place of the scripted driver's law, from the round's plan, its
+world and the camera on the car, which shows the scenery of the current frame."""
 
 
 @dataclass
@@ -139,9 +144,10 @@ def record_round(
     path: Path,
     tracks_dir: Path | None,
     progress: Callable[[int], None] = lambda frames: None,
+    make_law: MakeLaw | None = None,
 ) -> None:
     """Record the round to `path`; `progress` is called with the number of frames written."""
-    with open_simulation(plan, tracks_dir) as (simulation, camera):
+    with open_simulation(plan, tracks_dir, make_law) as (simulation, camera):
         road = simulation.world.road
         header = _header(plan, plan_hash, road)
         with RoundWriter(path, header, track_lines(road)) as writer:
@@ -182,7 +188,7 @@ def _track(name: str, tracks_dir: Path | None) -> Track:
 
 @contextmanager
 def open_simulation(
-    plan: RoundPlan, tracks_dir: Path | None
+    plan: RoundPlan, tracks_dir: Path | None, make_law: MakeLaw | None = None
 ) -> Iterator[tuple[RoundSimulation, Camera]]:
     """Create the simulation of a round at its start, and its camera.
 
@@ -204,7 +210,8 @@ def open_simulation(
         World(road, traffic=plan.traffic, frequency_hz=control_hz) as world,
         Camera(road, plan.camera, seed=seed, light=light, scenes=CACHED_SCENES) as camera,
     ):
-        driver = ScriptedDriver(road, course, speed, control_hz)
+        law = None if make_law is None else make_law(plan, world, camera)
+        driver = ScriptedDriver(road, course, speed, control_hz, law=law)
         yield RoundSimulation(plan, world, driver), camera
 
 

@@ -97,7 +97,13 @@ def _recorded(folder: Path) -> list[RoundPlan]:
     path = folder / PLAN_FILE
     states = read_states(folder)
     try:
-        entries = json.loads(path.read_text())["rounds"]
+        plan = json.loads(path.read_text())
+        if "driver" in plan:
+            raise DatasetError(
+                f"{folder} was driven by {', '.join(plan['driver'].values())}, not by the scripted "
+                "driver; only rounds of `datagen collect` can be simulated again"
+            )
+        entries = plan["rounds"]
         return [RoundPlan.from_json(entry) for entry in entries if entry["id"] in states]
     except FileNotFoundError as error:
         raise DatasetError(

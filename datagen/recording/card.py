@@ -9,7 +9,7 @@ from typing import Any
 import trackfeatures as tf
 from datagen.recording.dataset import Dataset
 from datagen.recording.images import JPEG_QUALITY
-from datagen.recording.names import SIDES
+from datagen.recording.names import DRIVEN, SIDES
 from datagen.recording.schema.fields import FIELDS, Field
 from datagen.recording.schema.json_schema import SCHEMA_FILE
 from datagen.recording.schema.topics import MESSAGE_TYPES
@@ -100,7 +100,7 @@ Absent means unset, not zero. Definitions of the labels: version {definitions}.
 By `datagen collect` of {program}: a simulated car (rigid body, tyres, suspension at 200 Hz) is
 driven by a scripted driver; trajectory and speed differ by round; the other cars follow a
 car-following model. The labels are computed from the geometry of the road. One seed determines all.
-{stretches}Camera: {camera}{jitter}. Images: {codecs}.
+{driven}{stretches}Camera: {camera}{jitter}. Images: {codecs}.
 
 Frames by
 
@@ -157,6 +157,7 @@ def render_card(dataset: Dataset, statistics: dict[str, Any]) -> str:
         ),
         fields="\n\n".join(_field_table(message) for message in FIELDS),
         program=_join({header.program or "driverview" for header in headers}),
+        driven=_describe_driven([header.id for header in headers]),
         stretches=_describe_stretches({header.stretch for header in headers} - {0}),
         camera=_describe_camera(dataset.camera),
         jitter=", varied a little from round to round (see the metadata of a round)"
@@ -189,6 +190,16 @@ def _describe_camera(camera: CameraParameters) -> str:
         f"{camera.fov_y_deg:g} degrees of vertical field of view, at ({camera.x:g}, {camera.y:g}, "
         f"{camera.z:g}) m ahead, left and above of the centre of gravity, pitch "
         f"{camera.pitch_deg:g} degrees"
+    )
+
+
+def _describe_driven(ids: list[str]) -> str:
+    count = sum(name.startswith(DRIVEN) for name in ids)
+    if not count:
+        return ""
+    return (
+        f"In {count} of {len(ids)} rounds (`{DRIVEN}...`, by `controllers record`) a\n"
+        "controller steers on a model's answers instead; `plan.json` names both.\n"
     )
 
 

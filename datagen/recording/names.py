@@ -4,3 +4,5 @@ CODECS = ("jpeg", "png")
 UNSEEN = "unseen"
 SIDES = ("train", "test", UNSEEN)
 """`unseen`: rounds of tracks that no model is trained on."""
+DRIVEN = "driven-"
+"""Begins the ids of rounds that a controller drove on a model's answers."""

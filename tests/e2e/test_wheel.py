@@ -58,6 +58,7 @@ controllers drive --steps 3 --controller rl
 controllers compare --tracks oval --controllers lqr,mpc --seeds 1 --steps 3 --out comparison
 controllers tune --controllers lqr --tracks oval --budget 2 --steps 3 --out tuned.json
 controllers train --track oval --steps 20 --evaluate-every 20 --out actor
+controllers record --model run --rounds 2 --frames 8 --tracks oval --workers 1 --out driven
 """
 SERVERS = {("simulator", "watch"), ("serve",)}
 WITHOUT = {
