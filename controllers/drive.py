@@ -139,7 +139,7 @@ def _real_time(
         )
     if config.filter:
         raise UserError(
-            "--filter needs an answer at every control step; leave it out, or --realtime"
+            "--filter needs an answer at every step; leave it out, or --realtime"
         )
     rng = np.random.default_rng([config.seed, 3])
     return real_time(perceive, dt=1.0 / FREQUENCY_HZ, drop=config.drop, rng=rng)

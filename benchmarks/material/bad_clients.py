@@ -16,7 +16,8 @@ from tests.serve.attacks.registry import ATTACKS
 ADDRESS = "127.0.0.2"
 ROUND_S = 60.0
 START_S = 120.0
-SPAWN, FORK = (multiprocessing.get_context(name) for name in ("spawn", "fork"))
+SPAWN = multiprocessing.get_context("spawn")
+FORK = multiprocessing.get_context("fork")
 
 
 @contextmanager
