@@ -138,9 +138,7 @@ def _real_time(
             "--realtime measures the delay of the answers; leave it out, or --latency-ms"
         )
     if config.filter:
-        raise UserError(
-            "--filter needs an answer at every step; leave it out, or --realtime"
-        )
+        raise UserError("--filter needs an answer at every step; leave it out, or --realtime")
     rng = np.random.default_rng([config.seed, 3])
     return real_time(perceive, dt=1.0 / FREQUENCY_HZ, drop=config.drop, rng=rng)
 
