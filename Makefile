@@ -7,7 +7,7 @@ PACKAGES := trackfeatures runtime simulator datagen mtlnet serve controllers
 # Debian keeps ldconfig in /sbin, which is not on every user's PATH.
 export PATH := $(CURDIR)/$(BIN):$(PATH):/usr/sbin:/sbin
 
-.PHONY: help setup system demo test check docs compiled quick fuzz attack chaos api e2e bench endurance format lock clean
+.PHONY: help setup system demo test parallel-tests extended check docs compiled quick fuzz attack chaos api e2e bench endurance format lock clean
 
 help: ## list the targets
 	@grep -hE '^[a-z0-9]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 10
@@ -44,9 +44,14 @@ demo: $(READY) ## collect, train, evaluate, serve, ask, report: in 15 minutes on
 PARALLEL := --numprocesses logical --maxprocesses 4 --dist loadfile --no-loadscope-reorder
 
 test: $(READY) ## all checks and tests
-	@$(MAKE) --no-print-directory --jobs 2 check compiled
-	$(BIN)/pytest $(PARALLEL) -m "not alone"
-	$(BIN)/pytest -m alone
+	@$(MAKE) --no-print-directory --jobs 2 check parallel-tests
+	$(BIN)/pytest -m "alone and not extended"
+
+parallel-tests: compiled
+	$(BIN)/pytest $(PARALLEL) -m "not alone and not extended"
+
+extended: $(READY) ## the long tests that `make test` leaves out
+	$(BIN)/pytest $(PARALLEL) -m extended
 
 # The simulator compiles its numeric code when it first runs; once, before many processes need it.
 compiled: $(READY)
@@ -65,7 +70,7 @@ docs: $(READY) ## build the documentation in build/docs; a broken link fails
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict
 
 quick: $(READY) ## the tests that take seconds
-	$(BIN)/pytest $(PARALLEL) -m "not slow and not alone"
+	$(BIN)/pytest $(PARALLEL) -m "not slow and not alone and not extended"
 
 fuzz: $(READY) ## a million damaged images, and as many byte streams, through the service, in process
 	$(BIN)/python benchmarks/service_fuzz.py

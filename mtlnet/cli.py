@@ -40,6 +40,7 @@ def train_command(
     threads: options.TrainThreads = None,
     skip_undecodable: options.SkipUndecodable = False,
     resume: options.Resume = False,
+    change_data: options.ChangeData = False,
     as_json: options.Json = False,
 ) -> None:
     """Train the network on the train rounds of a dataset; the result is a model for `serve`."""
@@ -61,6 +62,7 @@ def train_command(
         "device": device,
         "threads": threads,
         "skip_undecodable": skip_undecodable or None,
+        "change_data": change_data or None,
     }
     chosen = {name: value for name, value in given.items() if value is not None}
     result = start_training(chosen, out, resume=resume)

@@ -84,6 +84,9 @@ Resume = Annotated[
     bool,
     typer.Option("--resume", help="Continue the stopped run in --out, or else the newest run."),
 ]
+ChangeData = Annotated[
+    bool, typer.Option("--change-data", help="With --resume: continue on another dataset.")
+]
 
 # Options of `ablate`.
 AblationOut = Annotated[

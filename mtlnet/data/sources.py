@@ -141,10 +141,30 @@ def continue_from_model(data: TrainingData, card: ModelCard) -> TrainingData:
             f"the camera of the data is {data.camera}, that of model {card.name} "
             f"{card.camera}; a model keeps the camera it was trained for"
         )
-    about = {**data.about, "init": {"name": card.name, "model_hash": card.model_hash}}
-    for name in ("seeds", "tracks"):
-        about[name] = sorted({*about[name], *card.data.get(name, ())})
-    return replace(data, about=about)
+    init = {"name": card.name, "model_hash": card.model_hash}
+    return replace(data, about={**_with_seen(data.about, card.data), "init": init})
+
+
+def resume_data(config: TrainConfig, data: TrainingData, earlier: dict[str, Any]) -> TrainingData:
+    """The data of a resumed run; that of its past is added to `about` when it was another.
+
+    `earlier`: the description of the run's data so far. Raises ModelError when `data` is other data
+    and `config.change_data` is not set.
+    """
+    history = list(earlier.get("earlier", ()))
+    if config.change_data and data.about["content_hash"] != earlier.get("content_hash"):
+        history.append({name: earlier.get(name) for name in ("path", "content_hash", "frames")})
+    else:
+        require_same_data(config, earlier, data.about)
+    if not history:
+        return data
+    return replace(data, about={**_with_seen(data.about, earlier), "earlier": history})
+
+
+def _with_seen(about: dict[str, Any], earlier: dict[str, Any]) -> dict[str, Any]:
+    """The description `about` with the rounds and tracks of `earlier` as seen, too."""
+    seen = {name: sorted({*about[name], *earlier.get(name, ())}) for name in ("seeds", "tracks")}
+    return {**about, **seen}
 
 
 def require_same_data(config: TrainConfig, resumed: dict[str, Any], data: dict[str, Any]) -> None:
@@ -153,7 +173,8 @@ def require_same_data(config: TrainConfig, resumed: dict[str, Any], data: dict[s
         if resumed.get(name) != data.get(name):
             raise ModelError(
                 f"the {name.replace('_', ' ')} of {config.data} is not the one {config.out} was "
-                "started with; give that dataset with --data, or start a new run"
+                "started with; give that dataset with --data, add --change-data to continue on "
+                "this one, or start a new run"
             )
 
 

@@ -91,10 +91,18 @@ def _card_of(out: Path, card: ModelCard, names: tuple[str, ...]) -> ModelCard:
     return replace(
         card,
         name=out.resolve().name,
-        data={**card.data, "path": Path(card.data["path"]).name},  # not this machine's folders
+        data=_without_folders(card.data),
         files={name: file_hash(out / name) for name in names},
         golden=tuple(float(value) for value in golden),
     )
+
+
+def _without_folders(data: dict[str, Any]) -> dict[str, Any]:
+    """The description of training data with the names of datasets, not this machine's folders."""
+    named = {**data, "path": Path(data["path"]).name}
+    if "earlier" in data:
+        named["earlier"] = [{**one, "path": Path(one["path"]).name} for one in data["earlier"]]
+    return named
 
 
 def _check(run: Path, out: Path) -> dict[str, float]:

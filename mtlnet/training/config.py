@@ -29,7 +29,7 @@ CONFIG = "config.json"
 DATASET = Path("datasets/default")
 MAX_THREADS = 1024
 # Fields that may change when a run is resumed; any other would make it a different run.
-RESUMABLE_WITH = ("iterations", "minutes", "device", "threads", "data")
+RESUMABLE_WITH = ("iterations", "minutes", "device", "threads", "data", "change_data")
 
 
 @dataclass(frozen=True)
@@ -59,6 +59,8 @@ class TrainConfig:
     """CPU threads; 0: one a core."""
     skip_undecodable: bool = False
     """Omit frames whose image cannot be decoded; the model's card lists them."""
+    change_data: bool = False
+    """A resumed run continues on `data`, which is not the dataset it was started with."""
 
     def __post_init__(self) -> None:
         if not self.network:
@@ -71,6 +73,8 @@ class TrainConfig:
             raise UserError(
                 f"recipe {self.recipe} starts from new weights; with --init give --recipe tune"
             )
+        if self.change_data and self.init is not None:
+            raise UserError("a fine-tuned run keeps its data; leave --change-data out")
         if self.iterations is not None and self.iterations < 1:
             raise UserError(f"--iterations is {self.iterations}; give at least 1")
         if self.minutes is not None and not self.minutes > 0:
@@ -115,10 +119,11 @@ def open_pretrained(name: str | Path) -> tuple[Path, ModelCard]:
 
 
 def write_config(config: TrainConfig, recipe: Recipe, data: Mapping[str, Any]) -> None:
-    """Write `config.json` of a new run."""
+    """Write `config.json` of a run."""
+    values = {**asdict(config), "data": str(config.data), "out": str(config.out)}
     content = {
         "definitions": tf.VERSION,
-        "config": {**asdict(config), "data": str(config.data), "out": str(config.out)},
+        "config": {**values, "change_data": False},  # once: later the data is the run's own
         "recipe": asdict(recipe),
         "data": dict(data),
     }

@@ -23,7 +23,7 @@ from datagen.recording import Frames
 from mtlnet.data.gpu_cache import cache_if_it_fits
 from mtlnet.data.loader import Loader
 from mtlnet.data.road_ahead import RoadAhead
-from mtlnet.data.sources import TrainingData, open_training_data, require_same_data
+from mtlnet.data.sources import TrainingData, open_training_data, resume_data
 from mtlnet.export.publish import Provenance, publish
 from mtlnet.inference.model_card import RUNS, WEIGHTS, ModelCard, read_card
 from mtlnet.model.architecture import HEIGHT, WIDTH, find_architecture
@@ -61,6 +61,8 @@ def start_training(options: Mapping[str, Any], out: Path | None, *, resume: bool
     resumed = None
     if resume:
         config, resumed = resume_config(out or newest_run(), options)
+    elif options.get("change_data"):
+        raise UserError("--change-data continues a run on other data; give --resume, too")
     else:
         config = new_config(options, out)
     is_first = read_rank().is_first
@@ -176,12 +178,14 @@ def _train(
     if resumed is None and rank.is_first:
         create_run(config, find_recipe(config.recipe), data.about)
     if resumed is not None:
-        require_same_data(config, resumed, data.about)
+        data = resume_data(config, data, resumed)
     configure_cpu(config, rank)
     trainer, loader = prepare(config, data, init[0] if init else None, device, rank)
     checkpoints = list_checkpoints(config.out) if resumed is not None else []
     elapsed_s = load_checkpoint(checkpoints[-1], trainer) if checkpoints else 0.0
     barrier()  # the first process writes nothing until all have read the checkpoint
+    if config.change_data and rank.is_first:
+        write_config(config, find_recipe(config.recipe), data.about)
     try:
         first_row = trainer.network.architecture.first_row
         batches = cache_if_it_fits(loader, device, first_row=first_row)

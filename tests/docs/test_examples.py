@@ -112,7 +112,7 @@ def test_a_python_example_runs(page: Path, number: int, project: tuple[Path, str
         assert list(folder.glob("videos/*.mp4"))
 
 
-@pytest.mark.slow
+@pytest.mark.extended
 def test_the_tutorial_runs(tmp_path: Path) -> None:
     text = (ROOT / "docs" / "tutorial.md").read_text()
     chain = re.findall(r"<!-- run -->\n```sh\n(.*?)```", text, flags=re.DOTALL)

@@ -132,11 +132,13 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("used")
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("line", USES.strip().split("\n"))
 def test_a_command_works_from_the_wheel(commands: Path, folder: Path, line: str) -> None:
     run(commands, folder, *line.split())
 
 
+@pytest.mark.extended
 def test_prediction_and_servers_work_from_the_wheel(commands: Path, folder: Path) -> None:
     image = save_frame(commands, folder)
     run(commands, folder, "mtlnet", "predict", "--model", "run", image.name)

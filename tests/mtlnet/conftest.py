@@ -75,6 +75,16 @@ def write_round(folder: Path, name: str, number: int, **changes: Any) -> None:
         writer.finish()
 
 
+def write_dataset(folder: Path, first_seed: int = 0) -> Path:
+    """Three train rounds and a test round in an existing, empty folder, which is returned."""
+    (folder / "rounds").mkdir()
+    for number, name in enumerate(TRAIN + TEST):
+        write_round(folder, name, first_seed + number)
+    (folder / "splits").mkdir()
+    write_split(split_path(folder), Split(TRAIN, TEST))
+    return folder
+
+
 def require_close(
     outputs: NDArray[np.float32], expected: NDArray[np.float32], *, metres: float, radians: float
 ) -> None:
@@ -93,13 +103,7 @@ def require_close(
 @pytest.fixture(scope="session")
 def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Three train rounds and a test round of `FRAMES` frames each."""
-    folder = tmp_path_factory.mktemp("data")
-    (folder / "rounds").mkdir()
-    for number, name in enumerate(TRAIN + TEST):
-        write_round(folder, name, number)
-    (folder / "splits").mkdir()
-    write_split(split_path(folder), Split(TRAIN, TEST))
-    return folder
+    return write_dataset(tmp_path_factory.mktemp("data"))
 
 
 @pytest.fixture(scope="session")

@@ -241,7 +241,7 @@ def _children(process: int) -> list[int]:
     return [int(child) for child in tasks.split()]
 
 
-@pytest.mark.slow
+@pytest.mark.extended
 def test_kills_of_the_whole_tree_at_random_moments_lose_nothing() -> None:
     """A short run of the benchmark that kills collections."""
     script = Path(__file__).parents[3] / "benchmarks" / "killed.py"

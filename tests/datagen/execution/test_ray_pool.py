@@ -17,6 +17,7 @@ from trackfeatures.errors import UserError
 pytestmark = pytest.mark.slow
 
 
+@pytest.mark.extended
 def test_two_ray_workers_give_the_same_dataset(collected: Path, tmp_path: Path) -> None:
     pytest.importorskip("ray")
     folder = tmp_path / "data"
@@ -32,6 +33,7 @@ def test_two_ray_workers_give_the_same_dataset(collected: Path, tmp_path: Path) 
     assert not (folder / ".partial").exists()
 
 
+@pytest.mark.extended
 def test_the_round_of_a_dead_actor_is_retried(tmp_path: Path) -> None:
     ray = pytest.importorskip("ray")
     done: list[str] = []

@@ -222,7 +222,7 @@ def test_steps_are_timed(dataset: Path, tmp_path: Path) -> None:
     )
 
 
-@pytest.mark.slow
+@pytest.mark.extended
 def test_two_rows_are_trained_and_evaluated(dataset: Path, tmp_path: Path) -> None:
     config = replace(settings(tmp_path, iterations=10, seeds=(1,)), data=dataset, batch=2)
     result = ablate(config, [ablation_rows()[0], ablation_rows()[5]])

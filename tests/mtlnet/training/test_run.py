@@ -18,6 +18,7 @@ from safetensors.numpy import load_file
 import mtlnet.training.loop
 from datagen.recording import Dataset
 from mtlnet.data.loader import Loader
+from mtlnet.export.ship import _without_folders
 from mtlnet.inference.curves import read_curves
 from mtlnet.inference.model_card import GRAPH, UNCERTAINTY_WEIGHTS, WEIGHTS, ModelError, read_card
 from mtlnet.model.cpu_kernels.forward import training_outputs
@@ -27,6 +28,7 @@ from mtlnet.training.loop import Stopped, TrainProgress
 from mtlnet.training.recipes import RECIPES, learning_rate
 from mtlnet.training.run import require_new, train
 from mtlnet.training.trainer import Trainer
+from tests.mtlnet.conftest import write_dataset
 from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
 
@@ -287,6 +289,28 @@ def test_a_run_is_not_resumed_with_another_seed_or_other_data(
     list_checkpoints(run.out)[-1].write_bytes(b"rubbish")
     with pytest.raises(ModelError, match="cannot be read"):
         train(resumed, data)
+
+
+@pytest.mark.usefixtures("small_network")
+def test_a_run_continues_on_other_data_if_told_to(dataset: Path, tmp_path: Path) -> None:
+    (tmp_path / "other").mkdir()
+    other_dataset = write_dataset(tmp_path / "other", first_seed=100)
+    run = config(dataset, tmp_path / "run", iterations=1)
+    first = train(run, None).data
+    given = {"iterations": 2, "data": other_dataset, "change_data": True}
+    changed = train(*resume_config(run.out, given)).data
+    kept = {name: first[name] for name in ("path", "content_hash", "frames")}
+    assert changed["earlier"] == [kept]
+    assert changed["content_hash"] == Dataset.open(other_dataset).content_hash
+    assert set(changed["seeds"]) > set(first["seeds"])
+    # From now on the run's data is the other dataset, and its past is not forgotten.
+    resumed, data = resume_config(run.out, {"iterations": 3})
+    assert resumed.data == other_dataset
+    assert not resumed.change_data
+    card = train(resumed, data)
+    assert card.data == changed
+    assert card.iterations == 3
+    assert _without_folders(card.data)["earlier"][0]["path"] == dataset.name
 
 
 def test_learning_rate_schedules() -> None:
