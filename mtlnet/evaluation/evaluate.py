@@ -72,7 +72,7 @@ def predict_frames(
     frames: Images,
     report: Callable[[int, int], None] = lambda *_: None,
 ) -> NDArray[np.float32]:
-    """Outputs (N, 9 or 17) for all frames, one at a time as in the service, a thread an engine."""
+    """Outputs (N, 9 to 22) for all frames, one at a time as in the service, a thread an engine."""
     idle: SimpleQueue[tuple[Engine, NDArray[np.uint8]]] = SimpleQueue()
     for engine in engines:
         camera = engine.card.camera

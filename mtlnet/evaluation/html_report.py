@@ -16,7 +16,7 @@ from datagen.recording import Frames
 from mtlnet.evaluation.metrics import GROUPS, Numbers, signed_errors
 from mtlnet.evaluation.tables import error_cells, mean_error_cells
 from mtlnet.inference.overlay import draw_overlay
-from mtlnet.inference.prediction import OUTPUTS, Prediction, decode_outputs
+from mtlnet.inference.prediction import Prediction, decode_outputs, split_outputs
 from mtlnet.inference.uncertainty import FEATURES
 from runtime.files import atomic_write
 from runtime.html import embed_jpeg, format_percent, render
@@ -43,7 +43,7 @@ def write_page(path: Path, report: dict[str, Any], frames: Frames, outputs: Any)
 
 
 def page(report: dict[str, Any], frames: Frames, outputs: NDArray[np.float32]) -> str:
-    """HTML of `report` on `outputs` (N, 9 or 17) for `frames`."""
+    """HTML of `report` on `outputs` (N, 9 to 22) for `frames`."""
     errors = signed_errors(outputs, frames.labels.distances, frames.labels.angle)
     return render(
         "mtlnet.evaluation",
@@ -129,16 +129,16 @@ def _drive_charts(
     labels = frames.labels.take(rows)
     metres = _distance_driven(labels.s.astype(np.float64))
     offset = tf.localise(tf.decode(outputs[:, :6])[0])
-    angle = tf.decode_values(outputs[:, :6])[:, 5]
+    angle, std = tf.decode_values(outputs[:, :6])[:, 5], split_outputs(outputs).std
     thinned = slice(None, None, -(-len(rows) // MAX_POINTS))
     shaded = _intervals(metres, labels.shadow_fraction >= HEAVY_SHADOW)
     for title, unit, true, predicted, column in (
-        ("offset from the lane centre", "m", tf.localise(labels.distances), offset, -3),
-        ("angle", "rad", labels.angle.astype(np.float64), angle, -2),
+        ("offset from the lane centre", "m", tf.localise(labels.distances), offset, -2),
+        ("angle", "rad", labels.angle.astype(np.float64), angle, -1),
     ):
         band = None
-        if outputs.shape[1] > OUTPUTS:
-            width = 2 * outputs[:, column].astype(np.float64)
+        if std is not None:
+            width = 2 * std[:, column].astype(np.float64)
             band = (predicted - width)[thinned], (predicted + width)[thinned]
         x = metres[thinned]
         lines = [

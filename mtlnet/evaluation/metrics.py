@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 import trackfeatures as tf
 from datagen.recording import Dataset, Frames, Labels
 from mtlnet.data.loader import LabelArrays
-from mtlnet.inference.prediction import OUTPUTS
+from mtlnet.inference.prediction import OUTPUTS, split_outputs
 from mtlnet.inference.uncertainty import FEATURES
 
 Numbers = NDArray[np.float64]
@@ -195,7 +195,7 @@ def _by_range(
 def evaluate_outputs(
     outputs: NDArray[np.float32], labels: Labels, mean: dict[str, Any]
 ) -> dict[str, Any]:
-    """The report (DESIGN §9) on `outputs` (N, 9 or 17) for `labels`; `mean`: of `mean_labels`.
+    """The report (DESIGN §9) on `outputs` (N, 9 to 22) for `labels`; `mean`: of `mean_labels`.
 
     It has `doubt` when the model predicts standard deviations.
     """
@@ -213,10 +213,10 @@ def evaluate_outputs(
         "baseline": baseline,
         "ratio": _ratios(model, baseline),
     }
-    if outputs.shape[1] > OUTPUTS:
-        std, ood_score = outputs[:, OUTPUTS:-1], outputs[:, -1]
-        share = float((~(ood_score <= 1)).mean())
-        report["doubt"] = {"coverage": coverage(std, errors), "out_of_distribution": share}
+    parts = split_outputs(outputs)
+    if parts.std is not None and parts.ood_score is not None:
+        share = float((~(parts.ood_score <= 1)).mean())
+        report["doubt"] = {"coverage": coverage(parts.std, errors), "out_of_distribution": share}
     return report
 
 
@@ -226,9 +226,10 @@ def evaluate_by_groups(
     """The report on all frames, and on the groups of frames: `by_track`, ..."""
     labels = frames.labels
     report = evaluate_outputs(outputs, labels, mean)
-    if outputs.shape[1] > OUTPUTS:
+    std = split_outputs(outputs).std
+    if std is not None:
         errors = signed_errors(outputs, labels.distances, labels.angle)
-        report["doubt"]["calibration"] = calibration(outputs[:, OUTPUTS:-1], errors)
+        report["doubt"]["calibration"] = calibration(std, errors)
     for name, parts in groups(frames):
         report[name] = {
             key: evaluate_outputs(outputs[rows], labels.take(rows), mean)

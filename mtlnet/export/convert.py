@@ -136,16 +136,23 @@ def write_export(folder: Path, card: ModelCard, names: tuple[str, ...], **about:
 
 
 class WithProbabilities(torch.nn.Module):
-    """A network with a softmax on its class scores: images (1, H, W, 3) uint8 -> (1, 9)."""
+    """A network with a softmax on its class scores: images (1, H, W, 3) uint8 -> (1, 9).
+
+    Of heads over bins a second result (1, 5): probabilities that markings are absent.
+    """
 
     def __init__(self, network: Network) -> None:
         super().__init__()
         self.network = network
 
-    def forward(self, images: torch.Tensor) -> torch.Tensor:
-        """The nine outputs."""
-        outputs = self.network(images)
-        return torch.cat([outputs[:, :6], torch.softmax(outputs[:, 6:], 1)], 1)
+    def forward(self, images: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        """The nine outputs, and probabilities of absence where the heads give them."""
+        x = self.network.forward_features(images)
+        outputs = self.network.forward_heads(x)
+        outputs = torch.cat([outputs[:, :6], torch.softmax(outputs[:, 6:], 1)], 1)
+        if not self.network.architecture.bins:
+            return (outputs,)
+        return outputs, self.network.absent_probabilities(x)
 
 
 def write_onnx(network: Network, folder: Path, *, bf16: bool) -> tuple[str, ...]:
@@ -161,7 +168,7 @@ def write_onnx(network: Network, folder: Path, *, bf16: bool) -> tuple[str, ...]
         dynamo=True,
         opset_version=OPSET,
         input_names=["images"],
-        output_names=["outputs"],
+        output_names=["outputs", "absent"][: 1 + network.architecture.bins],
         verbose=False,
     )
     assert program is not None

@@ -27,9 +27,9 @@ UNCERTAINTY_TOLERANCE = 5e-3
 
 
 def build_graph(network: Network, head: UncertaintyHead | None = None) -> Any:
-    """OpenVINO model of a folded network: uint8 images (1, 210, 280, 3) -> float32 (1, 9).
+    """OpenVINO model of a folded network: uint8 images (1, 210, 280, 3) -> float32 (1, 9 to 22).
 
-    With an uncertainty head (1, 17); see `mtlnet.inference.prediction`.
+    The columns are those of `mtlnet.inference.prediction.split_outputs`.
     """
     return model_of(_nodes(network), head)
 
@@ -71,7 +71,7 @@ def write_graph(
 
 
 def run_graph(graph: Any, precision: str, images: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Outputs (N, 9 or 17) of a model or of that in a file for images (N, 210, 280, 3).
+    """Outputs (N, 9 to 22) of a model or of that in a file for images (N, 210, 280, 3).
 
     `graph`: an OpenVINO model, or a path. Raises RuntimeError when OpenVINO cannot load it.
     """

@@ -117,14 +117,14 @@ def compare_graph(
 ) -> dict[str, float]:
     """Largest difference between torch in float32 and the run's graph, by precision.
 
-    `openvino_PRECISION_max`: absolute, of the nine outputs; `openvino_PRECISION_doubt`: relative,
-    of the uncertainty head's outputs.
+    `openvino_PRECISION_max`: absolute, of the nine outputs and the probabilities of absence;
+    `openvino_PRECISION_doubt`: relative, of the uncertainty head's outputs.
     """
     import openvino
 
-    x, expected = run_network(network, images)
+    answers = run_network(network, images)
     textures = np.stack([texture_features(image) for image in images])
-    uncertainty = None if head is None else head.predict(x, textures)
+    uncertainty = None if head is None else head.predict(answers.uncertainty_inputs, textures)
     differences = {"frames": float(len(images))}
     for precision in dict.fromkeys(("f32", best_precision(openvino.Core()))):
         try:
@@ -135,10 +135,13 @@ def compare_graph(
                 f"OpenVINO cannot load {run / GRAPH}, just written ({reason}): the model is not "
                 "published; is the disk full?"
             ) from error
-        difference = np.abs(outputs[:, :OUTPUTS] - expected)
-        differences[f"openvino_{precision}_max"] = float(difference.max())
+        expected = np.concatenate([answers.outputs, answers.absent], 1)
+        absent = outputs[:, outputs.shape[1] - answers.absent.shape[1] :]
+        found = np.concatenate([outputs[:, :OUTPUTS], absent], 1)
+        differences[f"openvino_{precision}_max"] = float(np.abs(found - expected).max())
         if uncertainty is not None:
-            relative = np.abs(outputs[:, OUTPUTS:] / uncertainty - 1)
+            columns = slice(OUTPUTS, OUTPUTS + uncertainty.shape[1])
+            relative = np.abs(outputs[:, columns] / uncertainty - 1)
             differences[f"openvino_{precision}_doubt"] = float(relative.max())
     return differences
 

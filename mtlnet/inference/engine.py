@@ -45,7 +45,7 @@ class Engine(Protocol):
         """The precision it computes in: "f32", "bf16" or "int8"."""
 
     def __call__(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """Image (H, W, 3) RGB of `card.camera`'s size -> outputs (9,) or (17,).
+        """Image (H, W, 3) RGB of `card.camera`'s size -> outputs (9,) to (22,).
 
         `mtlnet.inference.prediction.decode_outputs` converts them to metres and radians. Raises
         ModelError for an image of another size or type.

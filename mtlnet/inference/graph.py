@@ -53,6 +53,7 @@ class Nodes:
     pixels: Any  # (1, 3, H, W) in [-1, 1]
     uncertainty_inputs: Any  # (1, F): the last shared features and, of bins, the log spreads
     outputs: Any  # (1, 9): see `mtlnet.inference.prediction`
+    absent: Any = None  # (1, 5), of heads over bins: probabilities that markings are absent
 
 
 def network_nodes(
@@ -81,16 +82,23 @@ def network_nodes(
         linear_float32(ops, x, weights[f"heads.{name}.weight"], weights[f"heads.{name}.bias"])
         for name, _ in architecture.heads
     )
-    coded, inputs = [distance, angle], x
+    coded, inputs, absent = [distance, angle], x, None
     if architecture.bins:
         scores = ops.reshape(distance, np.array([MARKINGS, PLACES + 1]), special_zero=False)
-        coded = [read_bins(ops, scores, angle)]
+        absent = absent_probabilities(ops, scores)
+        coded = [read_bins(ops, scores, angle, absent)]
         inputs = ops.concat([x, *_log_spreads(ops, scores, angle)], 1)
-    return Nodes(images, pixels, inputs, ops.concat([*coded, ops.softmax(kind, 1)], 1))
+    outputs = ops.concat([*coded, ops.softmax(kind, 1)], 1)
+    if absent is not None:
+        absent = _row(ops, absent)
+    return Nodes(images, pixels, inputs, outputs, absent)
 
 
 def model_of(nodes: Nodes, head: UncertaintyHead | None = None) -> Any:
-    """The OpenVINO model uint8 (1, 210, 280, 3) -> float32 (1, 9); with `head` (1, 17)."""
+    """The OpenVINO model uint8 (1, 210, 280, 3) -> float32 (1, 9).
+
+    With `head` 8 columns more; then, of heads over bins, 5 more.
+    """
     import openvino
     from openvino import opset13 as ops
 
@@ -99,7 +107,8 @@ def model_of(nodes: Nodes, head: UncertaintyHead | None = None) -> Any:
         if head is None
         else uncertainty_outputs(ops, nodes.uncertainty_inputs, nodes.pixels, head)
     )
-    outputs = ops.concat([nodes.outputs, *second], 1)
+    third = [] if nodes.absent is None else [nodes.absent]
+    outputs = ops.concat([nodes.outputs, *second, *third], 1)
     return openvino.Model([ops.result(outputs)], [nodes.images], "mtlnet")
 
 
@@ -162,24 +171,32 @@ def _linear(ops: Any, x: Any, weights: Weights, name: str) -> Any:
     return ops.add(product, weights[f"{name}.bias"][None])
 
 
-def read_bins(ops: Any, scores: Any, angle: Any) -> Any:
-    """Coded answers (1, 6) of the scores of distances (5, PLACES + 1) and angle (1, ANGLES)."""
-    absent = _columns(ops, ops.softmax(scores, 1), PLACES, PLACES + 1)  # (5, 1)
+def absent_probabilities(ops: Any, scores: Any) -> Any:
+    """Probabilities (5, 1) that markings are absent, of the scores (5, PLACES + 1)."""
+    absent = _columns(ops, ops.softmax(scores, 1), PLACES, PLACES + 1)
     # `ml` and `mr` are absent together.
     share = np.eye(MARKINGS, dtype=np.float32)
     share[PAIR, PAIR] = 0.5
-    absent = ops.reduce_sum(
-        ops.multiply(ops.reshape(absent, np.array([1, MARKINGS]), special_zero=False), share),
-        np.array([1]),
-        keep_dims=True,
-    )
+    shared = ops.multiply(_row(ops, absent), share)
+    return ops.reduce_sum(shared, np.array([1]), keep_dims=True)
+
+
+def read_bins(ops: Any, scores: Any, angle: Any, absent: Any) -> Any:
+    """Coded answers (1, 6) of the scores of distances (5, PLACES + 1) and angle (1, ANGLES).
+
+    `absent` (5, 1): probabilities that markings are absent.
+    """
     found = _expectation(ops, _columns(ops, scores, 0, PLACES), PLACES)
     spans = [tf.RANGES[name] for name in tf.MARKINGS]
     ends = np.array([[float(span.inactive != span.lo)] for span in spans], np.float32)
     shares = ops.select(ops.greater(absent, np.float32(0.5)), ends, found)
-    row = ops.reshape(shares, np.array([1, MARKINGS]), special_zero=False)
-    row = ops.concat([row, _expectation(ops, angle, ANGLES)], 1)
+    row = ops.concat([_row(ops, shares), _expectation(ops, angle, ANGLES)], 1)
     return ops.add(ops.multiply(row, np.float32(SPAN)), np.float32(OFFSET))
+
+
+def _row(ops: Any, column: Any) -> Any:
+    """(5, 1) -> (1, 5)."""
+    return ops.reshape(column, np.array([1, MARKINGS]), special_zero=False)
 
 
 def _columns(ops: Any, x: Any, first: int, last: int) -> Any:
@@ -205,8 +222,7 @@ def _expectation(ops: Any, scores: Any, count: int) -> Any:
 def _log_spreads(ops: Any, scores: Any, angle: Any) -> list[Any]:
     """As `mtlnet.model.bins.log_spreads`: (1, 5) of the distances and (1, 1) of the angle."""
     distances = _log_spread(ops, _columns(ops, scores, 0, PLACES), PLACES)
-    row = ops.reshape(distances, np.array([1, MARKINGS]), special_zero=False)
-    return [row, _log_spread(ops, angle, ANGLES)]
+    return [_row(ops, distances), _log_spread(ops, angle, ANGLES)]
 
 
 def _log_spread(ops: Any, scores: Any, count: int) -> Any:

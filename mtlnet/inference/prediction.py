@@ -14,7 +14,53 @@ import trackfeatures as tf
 from mtlnet.inference.uncertainty import COLUMNS, FEATURES
 
 OUTPUTS = 9  # five coded distances, the coded angle, three class probabilities
-WITH_UNCERTAINTY = OUTPUTS + COLUMNS  # and the columns of `mtlnet.inference.uncertainty`
+MARKINGS = len(tf.MARKINGS)
+# Each optional part, and whether an image's outputs have it, by their number.
+_HAS = {
+    OUTPUTS + with_uncertainty * COLUMNS + with_absent * MARKINGS: (with_uncertainty, with_absent)
+    for with_uncertainty in (False, True)
+    for with_absent in (False, True)
+}
+Numbers = NDArray[np.float32]
+
+
+@dataclass(frozen=True, slots=True)
+class OutputParts:
+    """The parts of a model's outputs; of N images, all have a first axis (N, ...)."""
+
+    coded: Numbers
+    """(..., 6): five distances and the angle."""
+    heading: Numbers
+    """(..., 3): probability of each class."""
+    std: Numbers | None
+    """(..., 7): standard deviations; None for a model without an uncertainty head."""
+    ood_score: Numbers | None
+    """(...): above 1 out of distribution; None as `std`."""
+    absent: Numbers | None
+    """(..., 5): probabilities that markings are absent; None for heads of coded values."""
+
+
+def split_outputs(outputs: Numbers) -> OutputParts:
+    """The parts of outputs (..., 9 to 22): the nine, then the optional ones in this order.
+
+    Columns of `mtlnet.inference.uncertainty`; probabilities that markings are absent. ValueError
+    for another number of columns.
+    """
+    width = outputs.shape[-1] if outputs.ndim else 0
+    if width not in _HAS:
+        raise ValueError(
+            f"a model gives {', '.join(map(str, sorted(_HAS)))} numbers an image, "
+            f"not shape {outputs.shape}"
+        )
+    with_uncertainty, with_absent = _HAS[width]
+    end = OUTPUTS + COLUMNS
+    return OutputParts(
+        outputs[..., :6],
+        outputs[..., 6:OUTPUTS],
+        outputs[..., OUTPUTS : end - 1] if with_uncertainty else None,
+        outputs[..., end - 1] if with_uncertainty else None,
+        outputs[..., -MARKINGS:] if with_absent else None,
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,6 +82,8 @@ class Prediction:
     None for an absent feature."""
     out_of_distribution: bool | None = None
     """Whether the image differs from the training images more than those from each other."""
+    absent: dict[str, float] | None = None
+    """Probability that each marking is absent; None for a model with heads of coded values."""
 
     def as_json(self) -> dict[str, Any]:
         """The prediction as the service returns it (DESIGN §9)."""
@@ -46,33 +94,34 @@ class Prediction:
             "heading": dict(self.heading),
             "std": None if self.std is None else dict(self.std),
             "out_of_distribution": self.out_of_distribution,
+            "absent": None if self.absent is None else dict(self.absent),
         }
 
 
-def decode_outputs(outputs: NDArray[np.float32]) -> Prediction:
-    """Decode one image's outputs, of shape (`OUTPUTS`,) or (`WITH_UNCERTAINTY`,)."""
-    if outputs.shape not in ((OUTPUTS,), (WITH_UNCERTAINTY,)):
-        raise ValueError(
-            f"a model gives {OUTPUTS} or {WITH_UNCERTAINTY} numbers an image, "
-            f"not shape {outputs.shape}"
-        )
-    coded, probabilities, uncertainty = outputs[:6], outputs[6:OUTPUTS], outputs[OUTPUTS:]
-    distances, angle = tf.decode(coded[None])
+def decode_outputs(outputs: Numbers) -> Prediction:
+    """Decode one image's outputs, (9,) to (22,); ValueError as `split_outputs`."""
+    if outputs.ndim != 1:
+        raise ValueError(f"the outputs of one image have one axis, not shape {outputs.shape}")
+    parts = split_outputs(outputs)
+    distances, angle = tf.decode(parts.coded[None])
     decoded = [*distances[0], tf.localise(distances)[0]]
     values = [None if np.isnan(value) else float(value) for value in decoded]
-    std = None
-    if len(uncertainty):
+    std = absent = None
+    if parts.std is not None:
         present = [value is not None for value in values] + [True]  # the angle is never absent
-        columns = zip(FEATURES, uncertainty[:-1].tolist(), present, strict=True)
+        columns = zip(FEATURES, parts.std.tolist(), present, strict=True)
         std = {name: value if found else None for name, value, found in columns}
+    if parts.absent is not None:
+        absent = dict(zip(tf.MARKINGS, parts.absent.tolist(), strict=True))
     return Prediction(
         distances_m=dict(zip(tf.MARKINGS, values[:5], strict=True)),
         to_lane_centre_m=values[5],
         angle_rad=float(angle[0]),
         heading={
-            name.name.lower(): float(p) for name, p in zip(tf.Heading, probabilities, strict=True)
+            name.name.lower(): float(p) for name, p in zip(tf.Heading, parts.heading, strict=True)
         },
         std=std,
         # Written so that a NaN counts as out of distribution too.
-        out_of_distribution=not uncertainty[-1] <= 1.0 if len(uncertainty) else None,
+        out_of_distribution=None if parts.ood_score is None else not parts.ood_score <= 1.0,
+        absent=absent,
     )

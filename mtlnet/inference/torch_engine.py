@@ -32,9 +32,10 @@ class TorchEngine:
 
     def __call__(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
         check_image(image, self._shape)
-        features, outputs = run_network(self._network, image[None])
+        answers = run_network(self._network, image[None])
+        parts = [answers.outputs]
         if self._head is not None:
-            uncertainty = self._head.predict(features, texture_features(image)[None])
-            outputs = np.concatenate([outputs, uncertainty], 1)
-        result: NDArray[np.float32] = outputs[0]
+            textures = texture_features(image)[None]
+            parts.append(self._head.predict(answers.uncertainty_inputs, textures))
+        result: NDArray[np.float32] = np.concatenate([*parts, answers.absent], 1)[0]
         return result

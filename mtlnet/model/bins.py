@@ -90,9 +90,7 @@ def read_scores(distance: Tensor, angle: Tensor) -> Tensor:
 
     An absent distance is coded as the inactive end of its range, as in a label.
     """
-    absent = torch.softmax(distance, 2)[:, :, -1]
-    pair = absent[:, PAIR].mean(1, keepdim=True).expand(-1, 2)
-    absent = torch.cat([pair, absent[:, PAIR.stop :]], 1)
+    absent = absent_probabilities(distance)
     found = expectation(distance[:, :, :-1])  # in bins' places, [0, 1] of the range
     ends = torch.tensor(
         [0.0 if span.inactive == span.lo else 1.0 for span in _SPANS[:-1]],
@@ -102,6 +100,16 @@ def read_scores(distance: Tensor, angle: Tensor) -> Tensor:
     shares = torch.where(absent > 0.5, ends.expand_as(found), found)
     shares = torch.cat([shares, expectation(angle)[:, None]], 1)
     return OFFSET + SPAN * shares
+
+
+def absent_probabilities(distance: Tensor) -> Tensor:
+    """Probabilities (B, 5) that markings are absent, of scores (B, 5, PLACES + 1).
+
+    `ml` and `mr` are absent together: both have the mean of their two probabilities.
+    """
+    absent = torch.softmax(distance, 2)[:, :, -1]
+    pair = absent[:, PAIR].mean(1, keepdim=True).expand(-1, 2)
+    return torch.cat([pair, absent[:, PAIR.stop :]], 1)
 
 
 def expectation(scores: Tensor) -> Tensor:

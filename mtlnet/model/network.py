@@ -8,6 +8,7 @@ targets; `fold` converts it to the paper's network, exactly.
 """
 
 import copy
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 
@@ -31,7 +32,13 @@ from mtlnet.model.architecture import (
     same_padding,
 )
 from mtlnet.model.auxiliary import AuxiliaryHeads
-from mtlnet.model.bins import Scores, log_spreads, read_scores, split_scores
+from mtlnet.model.bins import (
+    Scores,
+    absent_probabilities,
+    log_spreads,
+    read_scores,
+    split_scores,
+)
 
 NORM_EPS = 1e-5
 NORM_MOMENTUM = 0.1
@@ -106,6 +113,15 @@ class Network(nn.Module):
         scores = self.forward_scores(x)
         return torch.cat([x.float(), log_spreads(scores.distance, scores.angle)], 1)
 
+    def absent_probabilities(self, x: Tensor) -> Tensor:
+        """Probabilities (B, 5) that markings are absent; (B, 0) for heads of coded values.
+
+        `x` (B, 256): the last shared features.
+        """
+        if not self.architecture.bins:
+            return x.new_empty(len(x), 0)
+        return absent_probabilities(self.forward_scores(x).distance)
+
     def forward_scores(self, x: Tensor) -> Scores:
         """The scores of heads over bins for last shared features (B, 256)."""
         with torch.autocast(x.device.type, enabled=False):
@@ -140,26 +156,33 @@ def load_network(path: Path, name: str = MTL.name) -> Network:
     return network.eval()
 
 
-def run_network(
-    network: Network, images: NDArray[np.uint8]
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Images (B, 210, 280, 3) -> inputs of the uncertainty head (B, F) and outputs (B, 9).
+@dataclass(frozen=True)
+class Answers:
+    """What a network answers for B images."""
 
-    The outputs are coded distances, coded angle and class probabilities.
-    """
+    uncertainty_inputs: NDArray[np.float32]
+    """(B, F), read by the uncertainty head."""
+    outputs: NDArray[np.float32]
+    """(B, 9): coded distances, coded angle and class probabilities."""
+    absent: NDArray[np.float32]
+    """(B, 5) probabilities that markings are absent; (B, 0) for heads of coded values."""
+
+
+def run_network(network: Network, images: NDArray[np.uint8]) -> Answers:
+    """The answers for images (B, 210, 280, 3)."""
     device = next(network.parameters()).device
     network.eval()
     with torch.inference_mode():
         x = network.forward_features(torch.from_numpy(images).to(device)).float()
         outputs = network.forward_heads(x)
         outputs[:, 6:] = torch.softmax(outputs[:, 6:], 1)
-        inputs = network.uncertainty_inputs(x)
-    return inputs.cpu().numpy(), outputs.cpu().numpy()
+        inputs, absent = network.uncertainty_inputs(x), network.absent_probabilities(x)
+    return Answers(inputs.cpu().numpy(), outputs.cpu().numpy(), absent.cpu().numpy())
 
 
 def predict_images(network: Network, images: NDArray[np.uint8]) -> NDArray[np.float32]:
     """The outputs (B, 9) of `run_network`."""
-    return run_network(network, images)[1]
+    return run_network(network, images).outputs
 
 
 # Layers.

@@ -63,7 +63,9 @@ def table_row(name: str, prediction: Prediction) -> dict[str, Any]:
     row |= {f"p_{name}": probability for name, probability in prediction.heading.items()}
     for name in (*tf.MARKINGS, "to_lane_centre", "angle"):
         row[f"std_{name}"] = std.get(name)
-    return row | {"out_of_distribution": prediction.out_of_distribution}
+    row["out_of_distribution"] = prediction.out_of_distribution
+    absent = prediction.absent or {}
+    return row | {f"p_absent_{marking}": absent.get(marking) for marking in tf.MARKINGS}
 
 
 class TableWriter:

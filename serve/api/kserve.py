@@ -2,8 +2,9 @@
 
 Inputs: `image` (BYTES [1, 1], the bytes of a JPEG or PNG file) or `pixels` (UINT8 [1, height,
 width, 3], RGB). Outputs, float32: `distances_m` (1, 5) in the order ml, mr, l, m, r, NaN where
-absent; `std` in the order of `mtlnet.inference.uncertainty`; `out_of_distribution` 0 or 1; the
-others as in POST /features, whose request headers apply here too.
+absent; `std` in the order of `mtlnet.inference.uncertainty`; `out_of_distribution` 0 or 1;
+`absent` in the order of the distances; the others as in POST /features,
+whose request headers apply here too.
 """
 
 import json
@@ -60,6 +61,7 @@ OUTPUTS = {
     "heading": 3,
     "std": len(FEATURES),
     "out_of_distribution": 1,
+    "absent": len(tf.MARKINGS),
 }
 # The OpenAPI operation of an inference request, without the headers of every image.
 OPERATION: dict[str, Any] = json.loads(
@@ -204,5 +206,6 @@ def _tensors(prediction: Prediction) -> dict[str, NDArray[np.float32]]:
         "heading": [prediction.heading[name] for name in ("left", "straight", "right")],
         "std": [(prediction.std or {}).get(name) for name in FEATURES],
         "out_of_distribution": [prediction.out_of_distribution],
+        "absent": [(prediction.absent or {}).get(name) for name in tf.MARKINGS],
     }
     return {k: np.array([row], np.float32) for k, row in rows.items()}  # None becomes NaN

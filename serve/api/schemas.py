@@ -50,6 +50,16 @@ class Deviations(Distances):
     angle: float = Field(description="of angle_rad, rad")
 
 
+class AbsentProbabilities(BaseModel):
+    """Probability that each marking is absent; above 0.5 its distance is null."""
+
+    ml: float = Field(description="equal to that of mr: a lane has both or none")
+    mr: float
+    l: float
+    m: float
+    r: float
+
+
 class Timing(BaseModel):
     """Time of each stage, ms. `queue` and `total` include receiving the body."""
 
@@ -75,6 +85,9 @@ class Features(BaseModel):
     out_of_distribution: bool | None = Field(
         description="the image is unlike the training images: do not drive by the prediction; "
         "null where the model cannot detect it"
+    )
+    absent: AbsentProbabilities | None = Field(
+        description="null where the model answers in the paper's coded numbers"
     )
     model: str = Field(description="hash of the weights that were used")
     definitions_version: str = Field(description="version of the definitions of the features")

@@ -69,10 +69,11 @@ function fillTable(said, truth) {
     [name, said.distances_m[name], said.std?.[name], truth?.distances_m[name], "m", 2]);
   rows.push(["to lane centre", said.to_lane_centre_m, said.std?.to_lane_centre, truth?.to_lane_centre_m, "m", 2]);
   rows.push(["angle", said.angle_rad, said.std?.angle, truth?.angle_rad, "rad", 4]);
+  const absent = (name) => said.absent?.[name] > 0.5 ? `absent, ${(100 * said.absent[name]).toFixed(0)} %` : null;
   const text = (value, digits) => (value == null ? "–" : value.toFixed(digits));
   $("features").replaceChildren(...rows.map(([name, read, std, true_, unit, digits]) => {
     const row = document.createElement("tr");
-    for (const [content, kind] of [[name], [text(read, digits)], [text(std, digits), "doubt"], [text(true_, digits), "truth"]]) {
+    for (const [content, kind] of [[name], [absent(name) ?? text(read, digits)], [text(std, digits), "doubt"], [text(true_, digits), "truth"]]) {
       const cell = document.createElement("td");
       cell.textContent = content;
       if (kind) cell.className = kind;
@@ -80,7 +81,7 @@ function fillTable(said, truth) {
     }
     const small = document.createElement("small");
     small.textContent = ` ${unit}`;
-    row.children[1].append(small);
+    if (!absent(name)) row.children[1].append(small);
     return row;
   }));
   const table = $("features").parentElement;

@@ -26,7 +26,10 @@ from trackfeatures.camera import CameraParameters
 
 JPEG = jpeg(picture())
 INFER = "/v2/models/track/infer"
-FEATURES = ("distances_m", "to_lane_centre_m", "angle_rad", "heading", "std", "out_of_distribution")
+FEATURES = (
+    "distances_m", "to_lane_centre_m", "angle_rad", "heading",
+    "std", "out_of_distribution", "absent",
+)  # fmt: skip
 PROVENANCE = ("model", "engine", "precision", "definitions_version")
 
 Connection = http.client.HTTPConnection
@@ -94,6 +97,7 @@ def as_features(tensors: dict[str, list[float | None]]) -> dict[str, Any]:
     """Output tensors in the form of an answer of POST /features."""
     stds = ("ml", "mr", "l", "m", "r", "to_lane_centre", "angle")
     spread = dict(zip(stds, tensors["std"], strict=True))
+    absent = dict(zip(tf.MARKINGS, tensors["absent"], strict=True))
     (out,) = tensors["out_of_distribution"]
     return {
         "distances_m": dict(zip(tf.MARKINGS, tensors["distances_m"], strict=True)),
@@ -102,6 +106,7 @@ def as_features(tensors: dict[str, list[float | None]]) -> dict[str, Any]:
         "heading": dict(zip(("left", "straight", "right"), tensors["heading"], strict=True)),
         "std": None if spread["angle"] is None else spread,
         "out_of_distribution": None if out is None else bool(out),
+        "absent": None if absent["ml"] is None else absent,
     }
 
 

@@ -120,11 +120,13 @@ def test_decoding_nine_outputs() -> None:
     assert prediction.angle_rad == pytest.approx(0.05, abs=1e-6)
     assert prediction.heading == pytest.approx({"left": 0.7, "straight": 0.2, "right": 0.1})
     assert list(prediction.as_json()) == [
-        "distances_m", "to_lane_centre_m", "angle_rad", "heading", "std", "out_of_distribution",
+        "distances_m", "to_lane_centre_m", "angle_rad", "heading",
+        "std", "out_of_distribution", "absent",
     ]  # fmt: skip
     assert prediction.std is None
     assert prediction.out_of_distribution is None
-    with pytest.raises(ValueError, match="9 or 17 numbers"):
+    assert prediction.absent is None
+    with pytest.raises(ValueError, match="9, 14, 17, 22 numbers"):
         decode_outputs(coded)
 
 
@@ -140,6 +142,16 @@ def test_decoding_uncertainty() -> None:
             "r": pytest.approx(0.5), "to_lane_centre": pytest.approx(0.6),
             "angle": pytest.approx(0.01),
         }  # fmt: skip
+
+
+@pytest.mark.parametrize("uncertainty", [(), (0.1,) * 7 + (1.5,)], ids=["alone", "with-std"])
+def test_decoding_probabilities_of_absence(uncertainty: tuple[float, ...]) -> None:
+    absent = [0.1, 0.1, 0.99, 0.7, 0.2]
+    outputs = np.array([*[0.5] * 6, 0.7, 0.2, 0.1, *uncertainty, *absent], np.float32)
+    prediction = decode_outputs(outputs)
+    assert prediction.absent == pytest.approx(dict(zip(tf.MARKINGS, absent, strict=True)))
+    assert (prediction.std is None) == (not uncertainty)
+    assert prediction.out_of_distribution is (True if uncertainty else None)
 
 
 def test_a_model_of_another_format_version_is_refused(copy: Path) -> None:

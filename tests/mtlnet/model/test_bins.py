@@ -3,12 +3,14 @@
 from pathlib import Path
 
 import numpy as np
+import openvino
 import pytest
 import torch
 
 import trackfeatures as tf
 from mtlnet.export.convert import ONNX_FILE, check_export, write_onnx
-from mtlnet.export.openvino_graph import TOLERANCE, build_feature_graph
+from mtlnet.export.openvino_graph import TOLERANCE, build_feature_graph, build_graph, run_graph
+from mtlnet.inference.prediction import OUTPUTS, decode_outputs, split_outputs
 from mtlnet.model.architecture import ANGLES, GRID, PLACES, grid_size
 from mtlnet.model.bins import (
     Scores,
@@ -157,17 +159,42 @@ def test_what_is_for_training_only_is_gone_when_folded() -> None:
 def test_an_onnx_model_reads_bins_as_torch_does(tmp_path: Path) -> None:
     network = fold(made())
     write_onnx(network, tmp_path, bf16=False)
-    found = check_export(network, tmp_path / ONNX_FILE, "f32", images(4, 6))
+    frames = images(4, 6)
+    found = check_export(network, tmp_path / ONNX_FILE, "f32", frames)
     assert found["largest"] < TOLERANCE
+    model = openvino.Core().compile_model(str(tmp_path / ONNX_FILE), "CPU")
+    assert [result.any_name for result in model.outputs] == ["outputs", "absent"]
+    absent = [model(frame[None])["absent"][0] for frame in frames]
+    np.testing.assert_allclose(absent, run_network(network, frames).absent, atol=TOLERANCE)
+
+
+def test_the_graph_gives_the_probabilities_of_absence() -> None:
+    network, frames = fold(made()), images(6, 7)
+    with torch.no_grad():  # scores of "absent" large enough to matter, other for each image
+        rows = network.get_parameter("heads.distance.weight")
+        rows.view(len(tf.MARKINGS), PLACES + 1, -1)[:, -1] *= 5.0
+    answers = run_network(network, frames)
+    found = run_graph(build_graph(network), "f32", frames)
+    assert found.shape == (6, OUTPUTS + len(tf.MARKINGS))
+    parts = split_outputs(found)
+    assert parts.absent is not None
+    np.testing.assert_allclose(parts.absent, answers.absent, atol=TOLERANCE)
+    np.testing.assert_array_equal(parts.absent[:, 0], parts.absent[:, 1])  # ml and mr
+    assert np.ptp(parts.absent, axis=0).max() > 0.1
+    assert parts.absent.max() > 0.5
+    for row in found:
+        prediction = decode_outputs(row)
+        assert prediction.absent is not None
+        for name, distance in prediction.distances_m.items():
+            assert distance is None or prediction.absent[name] <= 0.5
 
 
 def test_the_graph_reads_bins_as_torch_does() -> None:
-    import openvino
-
     network, frames = fold(made()), images(12, 5)
     options = {"INFERENCE_PRECISION_HINT": "f32"}
     graph = openvino.Core().compile_model(build_feature_graph(network), "CPU", options)
-    inputs, expected = run_network(network, frames)
+    answers = run_network(network, frames)
+    inputs, expected = answers.uncertainty_inputs, answers.outputs
     found = [graph(frame[None]) for frame in frames]
     assert np.ptp(expected[:, :6], axis=0).max() > 0.05
     np.testing.assert_allclose([row[0][0] for row in found], expected, atol=TOLERANCE)

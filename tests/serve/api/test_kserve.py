@@ -86,7 +86,7 @@ def test_raw_binary_in_and_out(service: Served, engine: FakeEngine) -> None:
     assert values == pytest.approx([0.1, -2, 2, np.nan, np.nan, np.nan], abs=1e-5, nan_ok=True)
     everything = infer(service, {**BINARY, "parameters": {"binary_data_output": True}}, RAW)
     length = int(everything.headers["inference-header-content-length"])
-    assert len(everything.content) - length == 4 * 18
+    assert len(everything.content) - length == 4 * 23
 
     pixels = picture()
     tensor = {"name": "pixels", "shape": [1, 210, 280, 3], "datatype": "UINT8"}
