@@ -26,6 +26,11 @@ def short(out: Path, **changes: Any) -> TrainConfig:
     return replace(config, **changes)
 
 
+def read_curve(run: Path) -> Any:
+    """The columns of a training's curve, by name."""
+    return np.genfromtxt(run / "curve.csv", delimiter=",", names=True)
+
+
 def test_exploration_falls_to_a_tenth_over_400000_steps() -> None:
     assert exploration_share(0) == 1.0
     assert exploration_share(200_000) == pytest.approx(0.55)
@@ -107,12 +112,18 @@ def test_a_stopped_training_resumes_to_the_same_bits(tmp_path: Path, state: str)
     for name in ("actor.safetensors", "actor.json"):
         first, second = (tmp_path / run / name for run in ("whole", "parts"))
         assert first.read_bytes() == second.read_bytes()
-    curves = [
-        np.genfromtxt(tmp_path / run / "curve.csv", delimiter=",", names=True)
-        for run in ("whole", "parts")
-    ]
+    curves = [read_curve(tmp_path / run) for run in ("whole", "parts")]
     for column in ("step", "loss", "score_per_step", "max_abs_d_m"):
         np.testing.assert_array_equal(curves[0][column], curves[1][column])
+
+
+@pytest.mark.extended
+def test_a_training_learns_to_stay_on_the_road(tmp_path: Path) -> None:
+    """From leaving the road after a fifth of the drive to the lane's middle (seeds 0 to 3: 0.94)."""
+    train(short(tmp_path, steps=16_000, seed=2, evaluate_every=1000))
+    scores = read_curve(tmp_path)["score_per_step"]
+    assert scores[0] < 0.3
+    assert scores.max() > 0.9
 
 
 def test_another_seed_gives_another_actor(tmp_path: Path) -> None:
