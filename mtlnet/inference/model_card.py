@@ -24,8 +24,8 @@ SHIPPED = Path(__file__).parents[1] / "weights" / "default"
 CARD, WEIGHTS, GRAPH, GRAPH_WEIGHTS = "card.json", "model.safetensors", "model.xml", "model.bin"
 UNCERTAINTY_WEIGHTS = "doubt.safetensors"
 SHIPPED_FILES = {
-    WEIGHTS: "bcb12eca6de4e41800ca9ff21afd94f83b8c643060b5906f713a19396987ca4d",
-    UNCERTAINTY_WEIGHTS: "595234b41f29f7a8dced0b084cf527ae7f5ece5710a333552585857249a9ed3d",
+    WEIGHTS: "79ae29963d747bf44f92d9c052d691a6584f6f74c30a87b0d50b0c9b2cea7ff7",
+    UNCERTAINTY_WEIGHTS: "e201912265828ce322fe7b98faa99875f8bb2e003f3665e8370916609dd5f26e",
 }
 """SHA-256 of the shipped model's files."""
 MODEL_FILES = (WEIGHTS, GRAPH, GRAPH_WEIGHTS)
