@@ -167,6 +167,14 @@ def test_the_page_of_a_shipped_model_has_the_figures_of_its_evaluations(
     rows = [line for line in page.splitlines() if line.startswith("|")]
     assert {line.count("|") for line in rows} == {10, 11}, "every row has all its cells"
 
+    assert "Before on" not in page
+    data = {**engine.card.data, "earlier": [{"frames": 250000, "content_hash": "c0ffee"}]}
+    continued = tmp_path / "continued"
+    shutil.copytree(shipped, continued)
+    replace(engine.card, data=data).write(continued)
+    page = write_page(continued, [file]).read_text()
+    assert "Before on 250000 other frames (content hash `c0ffee`)." in page
+
     file.write_text(json.dumps({**found, "model_hash": "0" * 64}))
     with pytest.raises(UserError, match="other weights than these"):
         write_page(shipped, [file])
