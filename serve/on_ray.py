@@ -10,6 +10,7 @@ Ray handles restarts, scaling and the port. Streams and rate limits are therefor
 the limits on slow clients are those of Ray's proxies.
 """
 
+import os
 import signal
 import sys
 import threading
@@ -99,16 +100,16 @@ def run(config: RayConfig) -> None:
 
 
 def _connect() -> bool:
-    """Connect to the Ray cluster, or start a local one; whether it was started here."""
+    """Join the cluster at $RAY_ADDRESS, or start one here; whether it was started here."""
     import ray
 
     quiet: dict[str, Any] = {"logging_level": "ERROR", "log_to_driver": False}
+    address = os.environ.get("RAY_ADDRESS", "local")
     try:
-        ray.init(address="auto", **quiet)
-    except ConnectionError:
-        ray.init(address="local", include_dashboard=False, **quiet)
-        return True
-    return False
+        ray.init(address=address, include_dashboard=False, **quiet)
+    except (ConnectionError, RuntimeError, ValueError, OSError) as error:
+        raise UserError(f"no Ray cluster could be joined or started ({error})") from error
+    return address == "local"
 
 
 def _shut_down() -> None:

@@ -7,6 +7,7 @@ Every machine needs this program, and the track files unless they are the projec
 """
 
 import hashlib
+import os
 import tempfile
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -111,17 +112,17 @@ class RayPool:
         """Join the cluster, or start one here; False if this process is connected already."""
         if self._ray.is_initialized():
             return False
+        # Never a cluster that is found by chance: it may be another collection's, and end with it.
+        address = os.environ.get("RAY_ADDRESS", "local")
+        cores = {"num_cpus": max(self._size, cpu_count() or 1)} if address == "local" else {}
         try:
-            try:
-                self._ray.init(address="auto", logging_level="ERROR", log_to_driver=False)
-            except ConnectionError:
-                self._ray.init(
-                    address="local",
-                    num_cpus=max(self._size, cpu_count() or 1),
-                    include_dashboard=False,
-                    logging_level="ERROR",
-                    log_to_driver=False,
-                )
+            self._ray.init(
+                address=address,
+                **cores,
+                include_dashboard=False,
+                logging_level="ERROR",
+                log_to_driver=False,
+            )
         except (ConnectionError, RuntimeError, ValueError, OSError) as error:
             raise UserError(
                 f"no Ray cluster could be joined or started ({error}); set RAY_ADDRESS to one, or "

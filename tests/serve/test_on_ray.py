@@ -128,6 +128,28 @@ def test_the_builder_refuses_unknown_options(published: Path) -> None:
         on_ray_module.build({"model": "/none"})
 
 
+@pytest.mark.parametrize("address", [None, "ray.example:6379"])
+def test_only_a_cluster_that_is_named_is_joined(
+    published: Path, monkeypatch: pytest.MonkeyPatch, address: str | None
+) -> None:
+    ray = pytest.importorskip("ray")
+    on_ray = pytest.importorskip("serve.on_ray")
+    asked: list[str] = []
+
+    def init(*, address: str, **_: object) -> None:
+        asked.append(address)
+        raise ConnectionError("no answer")
+
+    monkeypatch.setattr(ray, "init", init)
+    monkeypatch.delenv("RAY_ADDRESS", raising=False)
+    if address is not None:
+        monkeypatch.setenv("RAY_ADDRESS", address)
+    config = on_ray.RayConfig(model=str(published))
+    with pytest.raises(UserError, match="no Ray cluster could be joined or started"):
+        on_ray.run(config)
+    assert asked == [address or "local"]
+
+
 def test_error_without_ray_serve_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "serve.on_ray", None)
     done = typed("serve", "ray")

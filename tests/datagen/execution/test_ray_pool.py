@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -50,6 +51,28 @@ def test_the_round_of_a_dead_actor_is_retried(tmp_path: Path) -> None:
     assert pool.run(make_jobs(tmp_path, rounds=1, frames=600)) == []
     assert killed == done == ["round-000"] == list(read_states(tmp_path))
     assert not ray.is_initialized()
+
+
+@pytest.mark.parametrize("address", [None, "ray.example:6379"])
+def test_only_a_cluster_that_is_named_is_joined(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, address: str | None
+) -> None:
+    """Another collection's cluster on this machine would end with it."""
+    ray = pytest.importorskip("ray")
+    asked: list[dict[str, Any]] = []
+
+    def init(**options: Any) -> None:
+        asked.append(options)
+        raise ConnectionError("no answer")
+
+    monkeypatch.setattr(ray, "init", init)
+    monkeypatch.delenv("RAY_ADDRESS", raising=False)
+    if address is not None:
+        monkeypatch.setenv("RAY_ADDRESS", address)
+    with pytest.raises(UserError, match=r"no Ray cluster could be joined or started \(no answer\)"):
+        RayPool(1, lambda message: None).run(make_jobs(tmp_path, rounds=1, frames=10))
+    assert [options["address"] for options in asked] == [address or "local"]
+    assert all("num_cpus" not in options for options in asked if address)
 
 
 def test_a_changed_track_ends_the_collection_at_once(tmp_path: Path) -> None:
