@@ -91,3 +91,17 @@ def test_a_folder_of_another_user_or_a_link_is_not_used(
     assert found.stat().st_mode & 0o777 == 0o700
     assert found != code_folder("ours", package)  # nobody can guess it
     assert (known / "kernel.nbi").read_bytes() == b"planted"
+
+
+def test_a_user_without_a_home_folder_gets_a_temporary_folder(
+    package: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As in a container that runs under a number that /etc/passwd lacks."""
+
+    def fail() -> Path:
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.delenv("NUMBA_CACHE_DIR")
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    monkeypatch.setattr(Path, "home", fail)
+    assert os.access(code_folder("ours", package), os.W_OK)
