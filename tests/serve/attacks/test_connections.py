@@ -230,7 +230,7 @@ def test_an_upload_that_ends_early_leaves_nothing(
         close(attack(target, 40))
         until(lambda: open_count(service) == 1)
         assert service.post(JPEG).status == 200
-        left = [o for o in gc.get_objects() if isinstance(o, DirectRequest | FeaturesRequest)]
+        left = [o for o in gc.get_objects() if type(o) in (DirectRequest, FeaturesRequest)]
         assert len(left) <= 1  # that of the connection above
         assert resident_mb() - before < 30
     finally:
