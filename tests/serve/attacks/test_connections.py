@@ -69,7 +69,7 @@ def test_refused_upgrades_are_answered_and_swept(
         until(lambda: open_count(service) == 1)
 
 
-def test_a_handshake_that_is_none_is_answered(target: Target) -> None:
+def test_an_invalid_websocket_handshake_is_answered(target: Target) -> None:
     for sent, status in (
         (target.handshake(Content_Length="5") + b"hello", 400),
         (target.handshake(Content_Length="5"), 400),
@@ -82,7 +82,7 @@ def test_a_handshake_that_is_none_is_answered(target: Target) -> None:
             assert status_of(read_rest(connection)) == status
 
 
-def test_what_is_said_with_the_handshake_closes_the_connection(target: Target) -> None:
+def test_bytes_sent_with_the_handshake_close_the_connection(target: Target) -> None:
     for connection in attacks.frames_before_the_handshake(target, 4):
         assert status_of(read_rest(connection)) == 400
     with target.dial() as connection:

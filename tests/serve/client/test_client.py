@@ -152,7 +152,7 @@ def test_a_refusal_carries_the_problem(service: Served) -> None:
         assert client.features(JPEG)
 
 
-def test_waiting_in_vain_raises_the_reason_of_the_service() -> None:
+def test_a_wait_that_times_out_raises_the_reason_of_the_service() -> None:
     gate = threading.Event()
     engine = FakeEngine(lambda _image: outputs())
     with serving(engine, lambda _engine: gate.wait(PATIENCE_S)) as served:
