@@ -37,15 +37,15 @@ def code_folder(name: str, package: Path) -> Path:
         digest.update(source.read_bytes())
     found = f"{name}-{digest.hexdigest()[:16]}"
     home = os.environ.get("NUMBA_CACHE_DIR") or os.environ.get("XDG_CACHE_HOME")
-    parent = Path(home) if home else Path.home() / ".cache"
-    folder = parent / found
     try:
+        parent = Path(home) if home else Path.home() / ".cache"
+        folder = parent / found
         parent.mkdir(parents=True, exist_ok=True)
         if _make_own(folder):
             os.utime(folder)
             _forget_unused(parent, name)
             return folder
-    except OSError:  # a read-only disk, or a folder of another user
+    except (OSError, RuntimeError):  # a read-only disk, another user's folder, no home at all
         pass
     temporary = tempfile.mkdtemp(prefix=found)  # of mode 700, and a name that nobody can guess
     atexit.register(shutil.rmtree, temporary, ignore_errors=True)

@@ -67,7 +67,8 @@ TrustedProxy = Annotated[
     ),
 ]
 BodyMib = Annotated[
-    int, typer.Option(help="Memory for the bodies of all requests in flight, MiB.", min=4)
+    int,
+    typer.Option(help="Memory for the bodies of all requests in flight, MiB.", min=4, max=1 << 20),
 ]
 LogAnswers = Annotated[
     bool, typer.Option("--log-answers", help="Log answered requests as well as refused ones.")
@@ -98,6 +99,7 @@ def serve(
     model.
     """
     if context.invoked_subcommand is not None:
+        _check_no_options(context)
         return
     from serve.launch import run
 
@@ -112,6 +114,19 @@ def serve(
         body_mib=body_mib,
     )
     run(ServiceConfig(model, host, port, workers, insecure, limits))
+
+
+def _check_no_options(context: typer.Context) -> None:
+    """Raise UserError for options before the name of a subcommand, which would have no effect."""
+    for name in context.params:
+        source = context.get_parameter_source(name)
+        if source is not None and source.name == "COMMANDLINE":
+            option = "--" + name.replace("_", "-")
+            command_name = context.invoked_subcommand
+            raise UserError(
+                f"{option} before `{command_name}` has no effect; give the options of "
+                f"`serve {command_name}` after it"
+            )
 
 
 @app.command()

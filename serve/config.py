@@ -66,7 +66,7 @@ def read_token(path: Path | None) -> str | None:
         token = os.environ.get(TOKEN_VARIABLE, "").strip()
         source = f"${TOKEN_VARIABLE}"
     elif path.is_file():
-        token, source = path.read_text(encoding="utf-8").strip(), str(path)
+        token, source = path.read_text(encoding="utf-8", errors="replace").strip(), str(path)
     else:
         raise UserError(f"there is no token file {path}; create one with `openssl rand -hex 32`")
     if not token:

@@ -22,6 +22,7 @@ from ray import serve as ray_serve  # not to be confused with this package, `ser
 
 from mtlnet.inference.engine import load_engine
 from mtlnet.inference.model_card import resolve_run
+from runtime.cli import counted
 from serve.app import Service
 from serve.config import Limits, ServiceConfig, read_token
 from serve.observability import telemetry
@@ -67,9 +68,13 @@ def build(args: dict[str, Any]) -> ray_serve.Application:
         )
     token_file = args.get("token_file")
     token = read_token(None if token_file is None else Path(token_file))
-    limits = Limits(token=token, hosts=tuple(args.get("hosts", ())))
+    hosts = args.get("hosts", ())
+    limits = Limits(token=token, hosts=(hosts,) if isinstance(hosts, str) else tuple(hosts))
+    replicas = str(args.get("replicas", 1))  # text where it comes from Ray's command line
+    if not replicas.isdecimal() or int(replicas) < 1:
+        raise UserError(f"replicas is {replicas[:40]}; expected a whole number from 1")
     folder = resolve_run(str(args.get("model", "default"))).resolve()
-    return _bind(folder, int(args.get("replicas", 1)), limits)
+    return _bind(folder, int(replicas), limits)
 
 
 def _bind(folder: Path, replicas: int, limits: Limits) -> ray_serve.Application:
@@ -89,8 +94,9 @@ def run(config: RayConfig) -> None:
     try:
         ray_serve.start(http_options={"host": config.host, "port": config.port})
         ray_serve.run(_bind(folder, config.replicas, config.limits), name=NAME)
-        url = f"http://{config.host}:{config.port}"
-        sys.stderr.write(f"serving {folder} on Ray at {url}, {config.replicas} replicas\n")
+        host = f"[{config.host}]" if ":" in config.host else config.host
+        replicas = counted(config.replicas, "replica")
+        sys.stderr.write(f"serving {folder} on Ray at http://{host}:{config.port}, {replicas}\n")
         sys.stderr.flush()
         _wait_for_signal()
         ray_serve.delete(NAME)

@@ -19,8 +19,8 @@ class HostCheck:
     """Checks the Host and the Origin of every request."""
 
     def __init__(self, limits: Limits) -> None:
-        names = {name.lower().strip("[]") for name in limits.hosts}
-        self._names = names
+        found = (host_name(name.encode("latin-1", "replace")) for name in limits.hosts)
+        self._names = names = {name for name in found if name is not None}
         self._any_name = limits.token is not None
         # A service that listens on all addresses is called by any of them: a rebound name is none.
         self._any_address = any(_is_unspecified(name) for name in names)
@@ -32,10 +32,10 @@ class HostCheck:
         `probe`: any Host will do, as probes come by the address of a pod.
         """
         host, origin = headers.get(b"host"), headers.get(b"origin")
-        if (host, origin) in self._known:
-            return
         if host is None and (version != HTTP_1_0 or not self._any_name):
             raise Problem(MALFORMED, "the request has no Host header; send one")
+        if (host, origin) in self._known:
+            return
         if not (probe or self._any_name or self._allows(host or b"")):
             raise Problem(
                 FORBIDDEN_HOST,

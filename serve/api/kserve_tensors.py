@@ -23,6 +23,7 @@ MAX_SMALL_BYTES = 4096  # of what is not the tensor itself, in JSON
 WINDOW_BYTES = 1 << 16  # of pixels in JSON, decoded at once; other threads may run in between
 JSON_MS_PER_BYTE = 1e-4  # to decode pixels in JSON
 PIXEL_MS = 1e-6  # to crop and scale
+MAX_SIDE = 1 << 31  # of a shape; a larger number may not fit into a float
 COMMA, BRACKET = b",["
 MAX_LENGTH_DIGITS = 20
 BLANKS = b" \t\r\n"
@@ -164,7 +165,7 @@ class Pixels:
 def find_pixels(tensor: Tensor, binary: memoryview) -> Pixels:
     """The UINT8 tensor in a request; a leading 1 of its shape is removed. Raises Problem."""
     shape = tensor.shape[1:] if len(tensor.shape) == 4 and tensor.shape[0] == 1 else tensor.shape
-    usable = len(shape) == 3 and shape[2] == 3 and min(shape) > 0
+    usable = len(shape) == 3 and shape[2] == 3 and min(shape) > 0 and max(shape) < MAX_SIDE
     if tensor.datatype != "UINT8" or not usable:
         raise invalid_request(
             f"{tensor.name} is {tensor.datatype[:20]} {tensor.shape[:8]}; it takes UINT8 "

@@ -84,7 +84,8 @@ class Stream:
         number, metadata = 0, ""
         while (message := await receive())["type"] == "websocket.receive":
             if message.get("bytes") is None:
-                metadata = message["text"]
+                metadata = message["text"][: MAX_TEXT + 1]  # an idle client may not keep megabytes
+                message.clear()
                 continue
             number += 1
             stamp_ns = time.monotonic_ns()
@@ -155,7 +156,7 @@ def _parse_handshake(scope: Scope, request_id: str) -> StreamOptions:
     protocol = next((p for p in scope["subprotocols"] if p in PROTOCOLS), None)
     response_format = PROTOCOLS[protocol] if protocol else options.format
     # Each WebSocket is a stream of its own, unless it names a stream.
-    stream = options.stream or f"websocket {request_id}"
+    stream = options.stream or f"websocket {request_id_of({})}"
     options = replace(options, stream=stream, format=response_format)
     return StreamOptions(options, protocol, deadline_ms, client_address(scope))
 

@@ -19,9 +19,11 @@ from serve.config import MAX_DEADLINE_MS, TOKEN_VARIABLE
 from trackfeatures.errors import UserError
 
 RETRY_S = 0.1
+MAX_TIMEOUT_S = 1e6  # the operating system takes no much longer one
 # Refusals of a frame for which a retry is useless.
 NOT_RETRIED = ("/problems/superseded", "/problems/deadline-passed")
 UNSENDABLE = re.compile("[^!-~]")  # characters that the path of an HTTP request cannot contain
+UNSENDABLE_IN_HEADER = re.compile(r"[\r\n\0]|[^\x00-\xff]")
 PNG_SIGNATURE = b"\x89PNG"
 # Errors on a connection that the service has closed while it was idle.
 DROPPED = (http.client.RemoteDisconnected, ConnectionResetError, BrokenPipeError)
@@ -68,7 +70,7 @@ class Client:
         timeout_s: float = 5.0,
         token: str | None = None,
     ) -> None:
-        """Raises ServiceError when `url` is not valid. Connects at the first request."""
+        """Raises ServiceError when `url` or `token` is not valid. Connects at the first request."""
         parts = _parse_url(url)
         self.url = parts.geturl().rstrip("/")
         self._path = parts.path.rstrip("/")
@@ -78,6 +80,7 @@ class Client:
         self._timeout_s = timeout_s
         token = os.environ.get(TOKEN_VARIABLE, "").strip() if token is None else token
         self._auth_headers = {"Authorization": f"Bearer {token}"} if token else {}
+        _check_headers(self._auth_headers)
 
     def features(
         self,
@@ -102,6 +105,7 @@ class Client:
             headers["X-Frame-Id"] = frame_id
         if stream is not None:
             headers["X-Stream-Id"] = stream
+        _check_headers(headers)
         if deadline_s is None:
             return self._request("POST", "/features", image, headers)
         return self._request_until(time.monotonic() + deadline_s, image, headers)
@@ -111,7 +115,7 @@ class Client:
         while True:
             left_s = max(0.0, end - time.monotonic())
             headers["X-Deadline-Ms"] = f"{min(1e3 * left_s, MAX_DEADLINE_MS):.1f}"
-            self._set_timeout(max(left_s, 0.001))
+            self._set_timeout(min(max(left_s, 0.001), MAX_TIMEOUT_S))
             try:
                 return self._request("POST", "/features", image, headers)
             except ServiceError as error:
@@ -193,28 +197,31 @@ class Client:
         self, method: str, path: str, body: bytes | None, headers: dict[str, str]
     ) -> tuple[int, bytes]:
         try:
-            all_headers = {**self._auth_headers, **headers}
-            self._connection.request(method, self._path + path, body, all_headers)
-            response = self._connection.getresponse()
-            return response.status, response.read()
+            return self._exchange(method, path, body, {**self._auth_headers, **headers})
         except DROPPED:
-            self.close()
             raise
         except ConnectionRefusedError as error:
-            self.close()
             raise ServiceError(
                 f"no service listens at {self.url}; start one with `serve`, or give its address"
             ) from error
         except TimeoutError as error:
-            self.close()
             limit_s = self._connection.timeout  # a deadline shortens it
             raise ServiceError(f"{self.url} did not reply within {limit_s:.3g} s") from error
         except OSError as error:
-            self.close()
             raise ServiceError(f"cannot reach {self.url}: {error.strerror or error}") from error
         except http.client.HTTPException as error:
-            self.close()
             raise ServiceError(f"{self.url} does not answer as HTTP: {error!r}") from error
+
+    def _exchange(
+        self, method: str, path: str, body: bytes | None, headers: dict[str, str]
+    ) -> tuple[int, bytes]:
+        try:
+            self._connection.request(method, self._path + path, body, headers)
+            response = self._connection.getresponse()
+            return response.status, response.read()
+        except BaseException:  # half a request, or a reply that nobody has read
+            self.close()
+            raise
 
 
 def _plain_connection(host: str, port: int | None, *, timeout: float) -> http.client.HTTPConnection:
@@ -238,6 +245,13 @@ def _parse_url(url: str) -> SplitResult:
             f"{url!r} is not the address of a service; expected one like http://127.0.0.1:8000"
         )
     return parts
+
+
+def _check_headers(headers: dict[str, str]) -> None:
+    """Raise ServiceError for what `http.client` would refuse with a request half written."""
+    for name, value in headers.items():
+        if UNSENDABLE_IN_HEADER.search(value):
+            raise ServiceError(f"{name} has characters that a header cannot contain")
 
 
 def _parse_reply(status: int, content: bytes, url: str) -> dict[str, Any]:

@@ -3,12 +3,14 @@
 A request is not a measure of work: a PNG of 65 KB can take 0.7 s. So a large image is admitted by
 the time that its decoding will take: in all, and for each client. A client that is alone may use
 the whole engine. Beside others its large images get a quarter of it, and none may take so long that
-the others' frames do not fit into the queue meanwhile. Clients are told apart by their address.
+the others' frames do not fit into the queue meanwhile. Clients are told apart by their address, of
+IPv6 by its /64 network.
 """
 
 from collections.abc import Callable
 
 from serve.api.problems import OVERLOADED, Problem
+from serve.config import network_of
 
 MAX_PENDING_MS = 1000.0  # of large images that wait or are processed, of all clients
 MAX_CLIENT_MS = 250.0  # the same, of one client; one image is always allowed
@@ -32,12 +34,14 @@ class Admission:
 
     def note(self, client: Client, now_ns: int) -> None:
         """A client has sent a frame of any size."""
+        client = network_of(client)
         if client != self._newest[0]:
             self._other = self._newest
         self._newest = (client, now_ns)
 
     def admit(self, client: Client, cost_ms: float, now_ns: int) -> Callable[[], None]:
         """Admit a large image; the function to call when it is done. Raises Problem."""
+        client = network_of(client)
         own = self._client_ms.get(client, 0.0)
         if own and own + cost_ms > MAX_CLIENT_MS:
             raise self._too_much(own, "of this client")

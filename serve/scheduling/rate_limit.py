@@ -34,6 +34,7 @@ class RateLimiter:
     def __init__(self, cells: "memoryview[float]", per_second: float) -> None:
         self._cells = cells
         self._rate = per_second
+        self._burst = max(1.0, per_second)  # below one a second, a bucket still holds a request
 
     def check(self, address: str, now: float | None = None, public: bool = False) -> None:
         """Count a request of a client; raise Problem when it exceeds its rate.
@@ -46,7 +47,7 @@ class RateLimiter:
             return
         cells, now = self._cells, time.monotonic() if now is None else now
         at = self._bucket(key, now)
-        left = min(self._rate, cells[at + 1] + (now - cells[at + 2]) * self._rate)
+        left = min(self._burst, cells[at + 1] + (now - cells[at + 2]) * self._rate)
         cells[at + 2] = now
         if left < 1.0:
             cells[at + 1] = left
@@ -67,5 +68,5 @@ class RateLimiter:
             if cells[at] == key:
                 return at
         oldest = min(indices, key=lambda at: cells[at + 2])
-        cells[oldest], cells[oldest + 1], cells[oldest + 2] = key, self._rate, now
+        cells[oldest], cells[oldest + 1], cells[oldest + 2] = key, self._burst, now
         return oldest

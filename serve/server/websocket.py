@@ -17,7 +17,14 @@ from websockets.frames import CloseCode, Frame
 from websockets.protocol import State
 
 from serve.api.http_io import encode_head, problem_reply
-from serve.api.problems import HEAD_TOO_LARGE, MALFORMED, TOO_SLOW, Problem
+from serve.api.problems import (
+    HEAD_TOO_LARGE,
+    MALFORMED,
+    OVERLOADED,
+    RATE_LIMITED,
+    TOO_SLOW,
+    Problem,
+)
 from serve.scheduling.body_budget import BodyShare
 from serve.server import guard as guards
 from serve.server.guard import ConnectionGuard, Group
@@ -77,6 +84,7 @@ class GuardedWebSocket(WebSocketsSansIOProtocol):
             frames = self._frame_bytes if self.frames else 0
             self._share.hold(frames + len(self.conn.reader.buffer))
         except Problem as problem:
+            self._guard.count_closed(problem.type)
             self.fail(CloseCode.TRY_AGAIN_LATER, problem.detail)
 
     def _drop_message(self) -> None:
@@ -112,6 +120,7 @@ class GuardedWebSocket(WebSocketsSansIOProtocol):
         small = sum(isinstance(e, Frame) and len(e.data) < SMALL_BYTES for e in self.conn.events)
         if small and not self._allow(small):
             self.conn.events.clear()
+            self._guard.count_closed(RATE_LIMITED)
             self.fail(CloseCode.POLICY_VIOLATION, f"more than {SMALL_FRAMES} small frames a second")
             return
         super().handle_events()
@@ -172,6 +181,7 @@ class GuardedWebSocket(WebSocketsSansIOProtocol):
         since_s = self._message_end_s - self._guard.limits.body_s
         if not held or self._discarding or now - since_s < guards.EVICTABLE_S:
             return 0
+        self._guard.count_closed(OVERLOADED)
         self.fail(CloseCode.TRY_AGAIN_LATER, "the bodies in flight need too much memory")
         return held
 

@@ -162,5 +162,6 @@ def _uvicorn_config(app: Any) -> uvicorn.Config:
         access_log=False,
         server_header=False,
         timeout_graceful_shutdown=GRACE_S,
-        forwarded_allow_ips=list(app.limits.trusted_proxies) or None,
+        # Never None: uvicorn would read an environment variable.
+        forwarded_allow_ips=list(app.limits.trusted_proxies) or ["127.0.0.1"],
     )

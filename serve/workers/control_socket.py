@@ -36,6 +36,7 @@ def send_command(port: int, command: str, model: str | None = None) -> str:
     with socket.socket(socket.AF_UNIX) as connection:
         connection.settimeout(ANSWER_TIMEOUT_S)
         try:
+            _check_owner(path.parent)
             connection.connect(str(path))
             connection.sendall(json.dumps({"command": command, "model": model}).encode() + b"\n")
             with connection.makefile("r") as file:
@@ -68,8 +69,7 @@ async def listen_for_commands(port: int, commands: dict[str, Command]) -> asynci
 
     try:
         path.parent.mkdir(mode=0o700, exist_ok=True)
-        if path.parent.stat().st_uid != os.getuid():
-            raise PermissionError(f"{path.parent} belongs to another user")
+        _check_owner(path.parent)
         path.unlink(missing_ok=True)
         server = await asyncio.start_unix_server(handle, str(path))
         path.chmod(0o600)
@@ -82,8 +82,19 @@ async def listen_for_commands(port: int, commands: dict[str, Command]) -> asynci
 async def _execute(line: bytes, commands: dict[str, Command]) -> dict[str, Any]:
     try:
         message = json.loads(line)
-        return {"ok": True, "text": await commands[message["command"]](message["model"])}
-    except UserError as error:
-        return {"ok": False, "text": str(error)}
+        command, model = commands[message["command"]], message["model"]
     except (ValueError, KeyError, TypeError):
         return {"ok": False, "text": f"unknown command; there are {', '.join(commands)}"}
+    try:
+        return {"ok": True, "text": await command(model)}
+    except (UserError, OSError) as error:
+        return {"ok": False, "text": str(error)}
+    except Exception as error:  # the service goes on
+        logger.exception("a command failed")
+        return {"ok": False, "text": f"the service failed ({error!r}); see its log"}
+
+
+def _check_owner(folder: Path) -> None:
+    """Raise PermissionError for a folder of another user, who may have guessed its name."""
+    if folder.stat().st_uid != os.getuid():
+        raise PermissionError(f"{folder} belongs to another user")

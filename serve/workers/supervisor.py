@@ -19,6 +19,7 @@ from serve.config import Limits
 from serve.workers.shared_memory import (
     COMMITTED_GENERATION,
     SharedMemory,
+    WorkerPeers,
     create_shared_memory,
 )
 from serve.workers.worker_process import WorkerProcess, WorkerTask, start_worker
@@ -167,6 +168,8 @@ class Supervisor:
         while True:
             worker = self._workers[position]
             await worker.wait_exit()
+            # Killed, it could not do this itself: its bodies would stay in the common budget.
+            WorkerPeers(self._shared, worker.task.block).withdraw()
             if self._workers[position] is not worker:
                 backoff_s = MIN_BACKOFF_S
                 continue
@@ -175,9 +178,15 @@ class Supervisor:
             logger.error("worker %d ended (%s); starting another", worker.pid, worker.exit_reason())
             await asyncio.sleep(backoff_s)
             async with self._change_lock:
-                if self._workers[position] is worker:
-                    block = self._free_block(without=worker)
+                if self._workers[position] is not worker:
+                    continue
+                block = self._free_block(without=worker)
+                try:
                     self._workers[position] = await self._start_worker(block)
+                except OSError as error:  # out of processes or memory: tried again
+                    logger.error("cannot start a worker: %s", error)
+                else:
+                    await worker.stop(STOP_TIMEOUT_S)  # closes the connection to it
 
     async def _start_worker(self, block: int) -> WorkerProcess:
         task = WorkerTask(
@@ -220,5 +229,5 @@ async def _log_errors(action: Callable[[], Any]) -> None:
     """Run what a signal asked for; errors go to the log only."""
     try:
         await action()
-    except UserError as error:
+    except (UserError, OSError) as error:
         logger.error("%s", error)

@@ -108,6 +108,8 @@ class WorkerProcess:
         await asyncio.wait(waits, timeout=timeout_s, return_when=asyncio.FIRST_COMPLETED)
         for wait in waits:
             wait.cancel()
+        if not self.alive:
+            raise UserError(f"worker {self.pid} ended before it was ready ({self.exit_reason()})")
         if not self._ready.is_set():
             raise UserError(f"worker {self.pid} was not ready within {timeout_s:g} s")
 
@@ -155,18 +157,22 @@ class WorkerProcess:
 
 
 async def start_worker(task: WorkerTask) -> WorkerProcess:
-    """Start a worker process with its task."""
+    """Start a worker process with its task. Raises OSError where the system refuses."""
     ours, theirs = socket.socketpair()
     with theirs:
-        process = await asyncio.create_subprocess_exec(
-            sys.executable,
-            "-m",
-            "serve.workers.worker",
-            str(theirs.fileno()),
-            pass_fds=(theirs.fileno(), task.listener, task.memory),
-            start_new_session=True,  # Ctrl-C goes to the supervisor only
-            stdin=asyncio.subprocess.DEVNULL,
-        )
+        try:
+            process = await asyncio.create_subprocess_exec(
+                sys.executable,
+                "-m",
+                "serve.workers.worker",
+                str(theirs.fileno()),
+                pass_fds=(theirs.fileno(), task.listener, task.memory),
+                start_new_session=True,  # Ctrl-C goes to the supervisor only
+                stdin=asyncio.subprocess.DEVNULL,
+            )
+        except BaseException:
+            ours.close()
+            raise
     ours.setblocking(False)
     reader, writer = await asyncio.open_connection(sock=ours)
     writer.write(task.to_json_line())

@@ -1,4 +1,4 @@
-"""Compiled code is found again for the same sources only, and what nobody uses goes."""
+"""The folder of compiled code: one for each state of the sources; unused ones are deleted."""
 
 import os
 import tempfile
@@ -28,7 +28,7 @@ def test_other_sources_have_another_folder(package: Path) -> None:
     assert first.is_dir()  # a run that began before goes on using it
 
 
-def test_what_nobody_used_for_a_month_goes(package: Path) -> None:
+def test_code_unused_for_a_month_is_deleted(package: Path) -> None:
     used = code_folder("ours", package)
     others = [code_folder(name, package) for name in ("ours-too", "theirs")]
     (used / "kernel.nbc").write_bytes(b"code")
@@ -43,7 +43,7 @@ def test_what_nobody_used_for_a_month_goes(package: Path) -> None:
     assert all(folder.is_dir() for folder in others)
 
 
-def test_without_a_folder_to_write_to_a_temporary_one_serves(
+def test_without_a_writable_folder_a_temporary_one_is_used(
     package: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (package.parent / "file").write_text("")
@@ -91,3 +91,17 @@ def test_a_folder_of_another_user_or_a_link_is_not_used(
     assert found.stat().st_mode & 0o777 == 0o700
     assert found != code_folder("ours", package)  # nobody can guess it
     assert (known / "kernel.nbi").read_bytes() == b"planted"
+
+
+def test_a_user_without_a_home_folder_gets_a_temporary_folder(
+    package: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As in a container that runs under a number that /etc/passwd lacks."""
+
+    def fail() -> Path:
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.delenv("NUMBA_CACHE_DIR")
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    monkeypatch.setattr(Path, "home", fail)
+    assert os.access(code_folder("ours", package), os.W_OK)

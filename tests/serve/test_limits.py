@@ -254,6 +254,14 @@ def test_a_client_over_its_rate_is_refused_with_a_retry_time() -> None:
         RateLimiter(memory.clients(), 0.0).check("10.0.0.1", now)  # no limit
 
 
+def test_a_rate_below_one_a_second_lets_a_request_pass_now_and_then() -> None:
+    limiter = RateLimiter(shared_memory.create_shared_memory(blocks=1).clients(), 0.5)
+    limiter.check("10.0.0.1", 100.0)
+    with pytest.raises(Problem, match=r"more than 0\.5 requests a second"):
+        limiter.check("10.0.0.1", 101.0)
+    limiter.check("10.0.0.1", 103.0)
+
+
 def test_loopback_addresses() -> None:
     assert all(map(is_loopback, ["127.0.0.1", "127.8.8.8", "::1", "localhost", "::ffff:127.0.0.1"]))
     assert not any(

@@ -114,6 +114,8 @@ def test_the_builder_asks_for_the_token(
     on_ray_module.build({**model, "token_file": str(tmp_path / "token")})
     assert [limits.token for limits in bound] == [None, TOKEN, TOKEN[::-1]]
     assert bound[1].hosts == ("cam.example",)
+    on_ray_module.build({**model, "hosts": "cam.example", "replicas": "2"})
+    assert bound.pop().hosts == ("cam.example",)
     monkeypatch.setenv("DRIVERVIEW_TOKEN", "short")
     with pytest.raises(UserError, match="must be 16 or more"):
         on_ray_module.build(model)
@@ -126,6 +128,9 @@ def test_the_builder_refuses_unknown_options(published: Path) -> None:
         on_ray_module.build({"speed": 9})
     with pytest.raises(UserError, match="no run"):
         on_ray_module.build({"model": "/none"})
+    for wrong in (0, -1, 1.5, "two", None):
+        with pytest.raises(UserError, match="replicas is"):
+            on_ray_module.build({"model": str(published), "replicas": wrong})
 
 
 @pytest.mark.parametrize("address", [None, "ray.example:6379"])

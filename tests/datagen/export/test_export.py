@@ -193,7 +193,7 @@ def test_lerobots_statistics_are_those_of_the_frames(dataset: Path, tmp_path: Pa
     assert episodes[2]["stats/labels/min"][0] == pytest.approx(float(np.nanmin(ml[90:])))
 
 
-def test_a_distance_that_is_nowhere_has_statistics_of_zero() -> None:
+def test_a_distance_absent_in_all_frames_has_statistics_of_zero() -> None:
     stats = column_stats({"labels": np.array([[1.0, np.nan], [3.0, np.nan]], np.float32)})["labels"]
     assert (stats["mean"], stats["std"], stats["count"]) == ([2.0, 0.0], [1.0, 0.0], [2])
 

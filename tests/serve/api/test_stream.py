@@ -1,7 +1,9 @@
 """Frames over a WebSocket: the answers, the problems and the rules of POST /features."""
 
+import asyncio
 import json
 import socket
+import tracemalloc
 from typing import Any
 
 import msgspec
@@ -10,6 +12,8 @@ from websockets.exceptions import ConnectionClosedError, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Subprotocol
 
+from serve.api.stream import Stream
+from serve.app import Service
 from serve.config import MAX_BODY_BYTES, Limits
 from tests.serve.conftest import (
     PATIENCE_S,
@@ -141,3 +145,48 @@ def test_a_client_that_is_still_sending_receives_the_close_frame(service: Served
         said += b"".join(iter(lambda: connection.recv(65536), b""))
     assert said[:1] == b"\x88"
     assert int.from_bytes(said[2:4], "big") == 1009
+
+
+def test_a_long_text_is_not_kept_while_the_websocket_is_idle() -> None:
+    """It is no longer in the budget for bodies once it is complete."""
+    held: list[int] = []
+    service = Service(FakeEngine(lambda _image: outputs()))
+    messages = iter(({"type": "websocket.connect"}, {"type": "websocket.receive"}))
+    scope = {"headers": [], "path": "/stream", "query_string": b"", "subprotocols": []}
+
+    async def receive() -> dict[str, Any]:
+        message: dict[str, Any] | None = next(messages, None)
+        if message is None:
+            held.append(tracemalloc.get_traced_memory()[0])
+            return {"type": "websocket.disconnect"}
+        if message["type"] == "websocket.receive":
+            message["text"] = "x" * MAX_BODY_BYTES
+        return message
+
+    async def send(_message: Any) -> None:
+        pass
+
+    tracemalloc.start()
+    try:
+        asyncio.run(Stream(service.frames, service.rate_limiter)(scope, receive, send))
+    finally:
+        tracemalloc.stop()
+    assert held[0] < MAX_BODY_BYTES // 4
+
+
+def test_websockets_with_the_same_request_id_are_two_streams() -> None:
+    gate = Gate()
+    sent = {"X-Request-Id": "same"}
+    with (
+        serving(gate.engine) as service,
+        dial(service, additional_headers=sent) as one,
+        dial(service, additional_headers=sent) as two,
+    ):
+        one.send(JPEG)
+        until(gate.busy.is_set)
+        one.send(JPEG)
+        until(lambda: service.app.frame_queue.waiting == 1)
+        two.send(JPEG)
+        until(lambda: service.app.frame_queue.waiting == 2)
+        gate.open.set()
+        assert all("angle_rad" in read(socket) for socket in (one, one, two))

@@ -69,7 +69,7 @@ def test_refused_upgrades_are_answered_and_swept(
         until(lambda: open_count(service) == 1)
 
 
-def test_a_handshake_that_is_none_is_answered(target: Target) -> None:
+def test_an_invalid_websocket_handshake_is_answered(target: Target) -> None:
     for sent, status in (
         (target.handshake(Content_Length="5") + b"hello", 400),
         (target.handshake(Content_Length="5"), 400),
@@ -82,7 +82,7 @@ def test_a_handshake_that_is_none_is_answered(target: Target) -> None:
             assert status_of(read_rest(connection)) == status
 
 
-def test_what_is_said_with_the_handshake_closes_the_connection(target: Target) -> None:
+def test_bytes_sent_with_the_handshake_close_the_connection(target: Target) -> None:
     for connection in attacks.frames_before_the_handshake(target, 4):
         assert status_of(read_rest(connection)) == 400
     with target.dial() as connection:
@@ -230,7 +230,7 @@ def test_an_upload_that_ends_early_leaves_nothing(
         close(attack(target, 40))
         until(lambda: open_count(service) == 1)
         assert service.post(JPEG).status == 200
-        left = [o for o in gc.get_objects() if isinstance(o, DirectRequest | FeaturesRequest)]
+        left = [o for o in gc.get_objects() if type(o) in (DirectRequest, FeaturesRequest)]
         assert len(left) <= 1  # that of the connection above
         assert resident_mb() - before < 30
     finally:

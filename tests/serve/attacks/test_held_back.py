@@ -52,7 +52,7 @@ def test_bodies_that_are_held_back_give_way_to_small_ones(
         until(lambda: bodies.held == 0)
 
 
-def test_whoever_gives_way_is_told_so(engine: FakeEngine) -> None:
+def test_a_client_that_is_closed_for_another_gets_a_problem(engine: FakeEngine) -> None:
     with serving(engine, limits=Limits(body_mib=4)) as service:
         (slow,) = costs.large_bodies(Target(service.port), 1)
         settle(service.app.bodies)
@@ -82,4 +82,6 @@ def test_a_message_of_a_websocket_counts_as_it_arrives(engine: FakeEngine) -> No
                 code, reason = read_close(third)
                 assert code == 1013
                 assert "8 MiB" in reason
+            page = service.app.metrics.page(time.monotonic(), {})
+            assert 'dismissed_connections_total{problem="overloaded"} 1\n' in page
         until(lambda: bodies.held == 0)

@@ -2,14 +2,16 @@
 
 import socket
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
 
-from serve.api.hosts import host_name
+from serve.api.hosts import HostCheck, host_name
 from serve.api.problems import Problem
 from serve.cli import app
-from serve.config import Limits, ServiceConfig, check_proxies, network_of
+from serve.config import Limits, ServiceConfig, check_proxies, network_of, read_token
+from serve.scheduling.admission import MAX_CLIENT_MS, Admission
 from serve.scheduling.rate_limit import RateLimiter, client_key
 from serve.scheduling.streams import stream_key
 from serve.workers.shared_memory import create_shared_memory
@@ -137,6 +139,21 @@ def test_a_page_behind_a_proxy_that_changes_the_host(engine: FakeEngine) -> None
         assert_problem(reply, 403, "forbidden-origin")
 
 
+def test_allowed_hosts_may_be_given_with_a_port_a_final_dot_or_brackets() -> None:
+    check = HostCheck(Limits(hosts=("Cam.example:8443", "other.example.", "[fd00::1]:80", "")))
+    for host in (b"cam.example", b"cam.example:80", b"other.example", b"[fd00::1]"):
+        check.check({b"host": host})
+    with pytest.raises(Problem, match="does not answer to"):
+        check.check({b"host": b"evil.example"})
+
+
+def test_a_missing_host_is_refused_also_after_http_1_0_sent_none() -> None:
+    check = HostCheck(Limits(token=TOKEN))
+    check.check({}, version="1.0")
+    with pytest.raises(Problem, match="no Host header"):
+        check.check({})
+
+
 def test_names_of_hosts() -> None:
     found = {host: host_name(host) for host in (b"A:1", b"[::1]:2", b"::1", b"a.", b"10.0.0.1")}
     assert list(found.values()) == ["a", "::1", "::1", "a", "10.0.0.1"]
@@ -156,6 +173,18 @@ def test_a_64_is_one_client_and_ipv4_in_ipv6_is_ipv4() -> None:
         limiter.check(f"2001:db8::{number:x}", 100.0)
     with pytest.raises(Problem, match="more than 10 requests"):
         limiter.check("2001:db8::a", 100.0)
+
+
+def test_large_images_from_a_64_count_as_one_clients() -> None:
+    admission = Admission()
+    admission.admit("2001:db8::1", MAX_CLIENT_MS, 0)
+    with pytest.raises(Problem, match="of this client"):
+        admission.admit("2001:db8::2", MAX_CLIENT_MS, 0)
+    admission.admit("2001:db8:0:1::1", MAX_CLIENT_MS, 0)
+    alone = Admission()
+    for number in range(9):
+        alone.note(f"2001:db8::{number}", number)
+    alone.admit("2001:db8::a", 2 * MAX_CLIENT_MS, 9)()  # no other client is there
 
 
 @pytest.fixture
@@ -200,6 +229,14 @@ def test_a_proxy_that_is_not_trusted_names_no_client(engine: FakeEngine) -> None
         assert replies == {200}
 
 
+def test_the_environment_makes_no_proxy_trusted(
+    engine: FakeEngine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("FORWARDED_ALLOW_IPS", "*")  # read by uvicorn
+    with serving(engine) as service:
+        assert service.server.config.forwarded_allow_ips == ["127.0.0.1"]
+
+
 def test_proxies_are_addresses_or_networks() -> None:
     assert check_proxies(["10.0.0.1", "fd00::/8"]) == ("10.0.0.1", "fd00::/8")
     for wrong in ("proxy.example", "10.0.0.1/8", "*", ""):
@@ -224,3 +261,19 @@ def test_the_options_reach_the_service(monkeypatch: pytest.MonkeyPatch) -> None:
     task = WorkerTask("run", 0, None, 3, 4, 1, 0, limits)
     sent = WorkerTask.from_json_line(task.to_json_line().decode()).limits
     assert (tuple(sent.hosts), tuple(sent.trusted_proxies)) == (limits.hosts, ("10.0.0.0/8",))
+
+
+@pytest.mark.parametrize(
+    "words",
+    ["--port 9000 reload", "--model new reload", "--insecure ray", "--token-file t restart"],
+)
+def test_options_before_a_subcommand_are_refused(words: str) -> None:
+    error = CliRunner().invoke(app, words.split()).exception
+    assert isinstance(error, UserError)
+    assert str(error).startswith(f"{words.split()[0]} before `{words.split()[-1]}` has no effect")
+
+
+def test_a_token_file_that_is_no_text_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "token").write_bytes(b"\xff" * 32)
+    with pytest.raises(UserError, match="printable ASCII"):
+        read_token(tmp_path / "token")

@@ -65,6 +65,8 @@ def test_small_frames_are_bounded(
     code, reason = read_close(connection)
     assert code == POLICY
     assert "small frames" in reason
+    page = service.app.metrics.page(time.monotonic(), {})
+    assert 'dismissed_connections_total{problem="rate-limited"} 1\n' in page
     assert time.monotonic() - started_s < PATIENCE_S
     connection.close()
     gc.collect()

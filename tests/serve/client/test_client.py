@@ -94,6 +94,39 @@ def test_answers_are_those_of_the_service(service: Served) -> None:
     assert Client(f"127.0.0.1:{service.port}").ready()
 
 
+def test_a_header_that_cannot_be_sent_is_an_error_and_the_next_request_works(
+    service: Served,
+) -> None:
+    with Client(service.url) as client:
+        for name in ("line\nbreak", "\N{SNOWMAN}"):
+            with pytest.raises(ServiceError, match="X-Frame-Id has characters"):
+                client.features(JPEG, frame_id=name, deadline_s=PATIENCE_S)
+            assert client.features(JPEG)["frame_id"] is None
+    with pytest.raises(ServiceError, match="Authorization has characters"):
+        Client(service.url, token="a\nb")
+
+
+def test_a_request_that_was_interrupted_does_not_spoil_the_next(
+    service: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupt(_connection: object) -> None:
+        raise KeyboardInterrupt
+
+    with Client(service.url) as client:
+        client.ready()
+        monkeypatch.setattr("http.client.HTTPConnection.getresponse", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            client.features(JPEG)
+        monkeypatch.undo()
+        assert client.features(JPEG)["model"] == CARD.model_hash
+
+
+def test_a_deadline_may_be_far_away(service: Served) -> None:
+    with Client(service.url) as client:
+        for deadline_s in (1e15, float("inf")):
+            assert client.features(JPEG, deadline_s=deadline_s)["model"] == CARD.model_hash
+
+
 def test_asyncio_clients_ask_concurrently(service: Served) -> None:
     async def ask(number: int) -> dict[str, Any]:
         async with AsyncClient(service.url) as client:
@@ -119,7 +152,7 @@ def test_a_refusal_carries_the_problem(service: Served) -> None:
         assert client.features(JPEG)
 
 
-def test_waiting_in_vain_raises_the_reason_of_the_service() -> None:
+def test_a_wait_that_times_out_raises_the_reason_of_the_service() -> None:
     gate = threading.Event()
     engine = FakeEngine(lambda _image: outputs())
     with serving(engine, lambda _engine: gate.wait(PATIENCE_S)) as served:

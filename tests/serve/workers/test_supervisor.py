@@ -11,6 +11,7 @@ import pytest
 from runtime.sockets import bind
 from serve.config import Limits
 from serve.workers import supervisor as module
+from serve.workers.shared_memory import BODY_BYTES
 from serve.workers.supervisor import ServicePlan, Supervisor
 from serve.workers.worker_process import WorkerProcess, WorkerTask
 from tests.serve.conftest import PATIENCE_S
@@ -140,3 +141,77 @@ def test_a_worker_that_failed_a_reload_and_died_later_reports_how_it_died(
         return workers.started[0].exit_reason()
 
     assert asyncio.run(scenario()) == "exit code 0"
+
+
+async def until_started(workers: FakeWorkers, count: int) -> None:
+    async with asyncio.timeout(PATIENCE_S):
+        while len(workers.started) < count:
+            await asyncio.sleep(0.01)
+
+
+def test_a_killed_worker_leaves_no_bodies_in_the_budget(
+    workers: FakeWorkers, tmp_path: Path
+) -> None:
+    """Its replacement may use another block of the shared memory."""
+
+    async def scenario() -> None:
+        supervisor = make_supervisor(tmp_path)
+        await supervisor.start()
+        running = asyncio.ensure_future(supervisor.run())
+        await supervisor.restart()
+        killed = max(workers.started[2:], key=lambda worker: worker.task.block)
+        cells = supervisor._shared.worker(killed.task.block)
+        cells[BODY_BYTES] = 60e6
+        killed._process.terminate()
+        await until_started(workers, 5)
+        assert workers.started[-1].task.block != killed.task.block
+        assert cells[BODY_BYTES] == 0.0
+        supervisor._stopping.set()
+        await running
+
+    asyncio.run(scenario())
+
+
+def test_a_worker_that_cannot_be_started_is_tried_again(
+    workers: FakeWorkers, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "MIN_BACKOFF_S", 0.01)
+    failures: list[OSError] = []
+
+    async def fail_twice(task: WorkerTask) -> WorkerProcess:
+        if len(failures) < 2:
+            failures.append(BlockingIOError("Resource temporarily unavailable"))
+            raise failures[-1]
+        return await workers.start(task)
+
+    async def scenario() -> None:
+        supervisor = make_supervisor(tmp_path)
+        await supervisor.start()
+        monkeypatch.setattr(module, "start_worker", fail_twice)
+        running = asyncio.ensure_future(supervisor.run())
+        await asyncio.sleep(0)
+        dead = workers.started[0]
+        dead._process.terminate()
+        await until_started(workers, 3)
+        supervisor._stopping.set()
+        await running
+        assert dead._writer.is_closing()
+
+    asyncio.run(scenario())
+    assert len(failures) == 2
+
+
+def test_a_replacement_that_ends_is_reported_with_its_end(
+    workers: FakeWorkers, tmp_path: Path
+) -> None:
+    async def scenario() -> None:
+        supervisor = make_supervisor(tmp_path)
+        await supervisor.start()
+        workers.is_ready = False
+        restart = asyncio.ensure_future(supervisor.restart())
+        await until_started(workers, 3)
+        workers.started[-1]._process.terminate()
+        with pytest.raises(UserError, match=r"ended before it was ready \(exit code 0\)"):
+            await restart
+
+    asyncio.run(scenario())

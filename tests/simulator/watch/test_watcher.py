@@ -95,7 +95,7 @@ def test_a_change_of_road_sends_a_new_scene() -> None:
                 assert [scene["track"] for scene in scenes] == [road.track.name]
 
 
-def test_what_the_driver_knows_is_sent_beside_the_truth() -> None:
+def test_the_drivers_estimate_is_sent_beside_the_true_state() -> None:
     offsets: list[float | None] = []
     with (
         Watcher(port=0, seed=3) as watcher,

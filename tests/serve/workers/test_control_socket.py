@@ -1,0 +1,55 @@
+"""Commands over the control socket: what a user is told when one fails."""
+
+import asyncio
+import os
+from pathlib import Path
+
+import pytest
+
+from serve.workers.control_socket import listen_for_commands, send_command
+from trackfeatures.errors import UserError
+
+PORT = 8000
+
+
+@pytest.fixture(autouse=True)
+def socket_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+
+
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [
+        (UserError("the weights are damaged"), "^the weights are damaged$"),
+        (PermissionError(13, "Permission denied", "/model"), "Permission denied: '/model'"),
+        (ValueError("bad card"), "the service failed .*bad card.*see its log"),
+    ],
+)
+def test_the_reason_of_a_failed_command_is_told(error: Exception, said: str) -> None:
+    async def fail(_model: str | None) -> str:
+        raise error
+
+    async def scenario() -> str:
+        server = await listen_for_commands(PORT, {"reload": fail})
+        assert server is not None
+        async with server:
+            return await asyncio.to_thread(send_command, PORT, "reload")
+
+    with pytest.raises(UserError, match=said):
+        asyncio.run(scenario())
+
+
+def test_a_folder_of_another_user_is_not_trusted(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def answer(_model: str | None) -> str:
+        return "done"
+
+    async def scenario() -> None:
+        server = await listen_for_commands(PORT, {"reload": answer})
+        assert server is not None
+        async with server:
+            assert await asyncio.to_thread(send_command, PORT, "reload") == "done"
+            monkeypatch.setattr(os, "getuid", lambda: os.geteuid() + 1)
+            with pytest.raises(UserError, match="no service of yours"):
+                await asyncio.to_thread(send_command, PORT, "reload")
+
+    asyncio.run(scenario())
