@@ -12,7 +12,7 @@ export PATH := $(CURDIR)/$(BIN):$(PATH):/usr/sbin:/sbin
 help: ## list the targets
 	@grep -hE '^[a-z0-9]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 10
 
-setup: $(READY) ## make .venv with everything in it (about 6 GB, minutes)
+setup: $(READY) ## make .venv with everything in it (about 8 GB, minutes)
 
 # The lock pins every version; torch and torchvision come together, from one index. Python compiles
 # what it imports: of 21,000 modules a seventh, so that pip need not take a minute to compile all.
@@ -44,7 +44,7 @@ demo: $(READY) ## collect, train, evaluate, serve, ask, report: in 15 minutes on
 # after them, when the cores are free.
 PARALLEL := --numprocesses logical --maxprocesses 4 --dist loadfile --no-loadscope-reorder
 
-test: $(READY) ## all checks and tests
+test: $(READY) ## all checks and tests but the extended ones
 	@$(MAKE) --no-print-directory --jobs 2 check parallel-tests
 	$(BIN)/pytest -m "alone and not extended"
 

@@ -19,7 +19,7 @@ MIN_TOKEN_LENGTH = 16
 
 @dataclass(frozen=True)
 class Limits:
-    """Limits on clients. The README documents these defaults."""
+    """Limits on clients. `docs/how-to/deploy.md` documents these defaults."""
 
     connections: int = 256
     """Open connections of all workers together."""
