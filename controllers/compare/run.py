@@ -126,7 +126,7 @@ def drive_cell(
     )
     found = {
         "result": result.as_json(),
-        "quadratic_per_step": recorder.quadratic / result.steps_asked,
+        "quadratic_per_step": recorder.quadratic_per_step(result),
     }
     return found | ({"curves": recorder.curves()} if cell.seed == 0 else {})
 

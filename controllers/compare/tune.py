@@ -117,9 +117,7 @@ def evaluate(config: TuneConfig, controller: str, parameters: Mapping[str, float
         if config.reward == "paper":
             rewards.append(result.score_per_step)
         else:
-            # A drive that ends early gives -2 for each step that is missing.
-            missing = result.steps_asked - result.steps
-            rewards.append((recorder.quadratic - 2.0 * missing) / result.steps_asked)
+            rewards.append(recorder.quadratic_per_step(result))
     return float(np.mean(rewards))
 
 

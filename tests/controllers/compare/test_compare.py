@@ -106,6 +106,46 @@ def test_the_start_is_torcss_place_on_the_grid(tmp_path: Path) -> None:
     assert content["drives"][0]["curves"]["d"][0] == pytest.approx(-expected, abs=0.01)
 
 
+def test_a_trained_actor_is_driven_again_when_it_was_trained_further(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    actor = tmp_path / "rl"
+    shutil.copytree(SHIPPED / "rl", actor)
+    config = short(tmp_path, tracks="oval", controllers=str(actor))
+    counter = Counter(monkeypatch)
+    compare(config)
+    compare(config)
+    assert len(counter.cells) == 1
+    weights = load_actor(actor).weights
+    weights["b3"] = weights["b3"] + np.float32(0.1)
+    (actor / WEIGHTS).write_bytes(save(weights))
+    compare(config)
+    assert len(counter.cells) == 2
+
+
+def test_a_drive_on_a_model_depends_on_its_weights(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = short(tmp_path, perceptions="truth,model")
+    codes = []
+    for weights in ("one", "other"):
+        monkeypatch.setattr(comparison, "model_hash", lambda run, weights=weights: weights)
+        codes.append([fingerprint(config, "lqr", name) for name in ("truth", "model")])
+    assert codes[0][0] == codes[1][0]
+    assert len({codes[0][0], codes[0][1], codes[1][1]}) == 3
+
+
+def test_a_drive_that_ends_early_has_no_better_quadratic_reward_for_it(tmp_path: Path) -> None:
+    law = tmp_path / "law.py"
+    law.write_text("class Law:\n    def update(self, observation):\n        return 1.0\n")
+    content = compare(short(tmp_path, tracks="oval", controllers=f"{law}:Law", steps=400))
+    drive = content["drives"][0]
+    missing = 400 - drive["result"]["steps"]
+    assert missing > 100
+    # Each missing step counts -2, as in `controllers tune`.
+    assert drive["quadratic_per_step"] < -2.0 * missing / 400
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
