@@ -16,9 +16,11 @@ from controllers.compare.disturbance import DISTURBANCES, UNDISTURBED
 from controllers.config import CompareConfig, DriveConfig
 from controllers.drive import drive, read_parameters
 from controllers.registry import LoopConfig, make_controller
+from controllers.perception import check_perception
 from runtime.files import write_json
 from simulator.track.catalogue import find_track
 from trackfeatures.errors import UserError
+from simulator.camera import check_light
 
 VERSION = 1
 RESULTS, REPORT = "results.json", "report.html"
@@ -83,6 +85,9 @@ def compare(config: CompareConfig, progress: Progress | None = None) -> dict[str
         find_track(track, config.tracks_dir)
     path = config.out / RESULTS
     config.out.mkdir(parents=True, exist_ok=True)
+    check_light(config.light)
+    for perception in dict.fromkeys(cell.perception for cell in todo):
+        check_perception(perception, config.model)
     content = read_results(path, config)
     known = {_key(entry): entry for entry in content["drives"]}
     for done, cell in enumerate(todo):

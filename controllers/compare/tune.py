@@ -47,6 +47,8 @@ def tune(config: TuneConfig, progress: Progress | None = None) -> dict[str, Any]
     if config.budget < 1:
         raise UserError(f"a budget of {config.budget} drives; give 1 or more")
     find_disturbance(config.disturbance)
+    for track in names(config.tracks, "tracks"):
+        find_track(track, config.tracks_dir)
     check_folder(config.out)
     content = _read(config.out, config)
     total = config.budget * len(controllers)

@@ -161,6 +161,7 @@ def test_other_settings_and_unknown_names_are_refused(
     compare(config)
     before = (config.out / "results.json").read_bytes()
     with pytest.raises(UserError, match=message):
+        ({"controllers": "lqr", "perceptions": "truth,modle"}, "perception 'modle' is unknown"),
         compare(replace(config, **changes))
     assert (config.out / "results.json").read_bytes() == before
 
@@ -282,7 +283,11 @@ def test_candidates_stay_within_their_ranges() -> None:
         ({"disturbance": "storm"}, "no disturbance 'storm'"),
     ],
 )
-def test_a_wrong_search_is_refused(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
+def test_a_wrong_search_is_refused_before_its_first_drive(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, changes: dict[str, Any], message: str
+) -> None:
+    monkeypatch.setattr("controllers.compare.tune.drive", lambda *_, **__: pytest.fail("driven"))
     with pytest.raises(UserError, match=message):
         tune(TuneConfig(out=tmp_path / "tuned.json", **changes))
     assert not (tmp_path / "tuned.json").exists()
+        ({"tracks": "oval,nowhere", "budget": 1, "steps": 20, "controllers": "lqr"}, "nowhere"),
