@@ -185,6 +185,7 @@ def _print_share(
     progress: Progress | None, done: int, total: int, cell: Cell
 ) -> Callable[[int, int], None]:
     def share(step: int, steps: int) -> None:
+        _ = [(_key(entry), entry["code"]) for entry in content["drives"]]
         if progress is not None and step % 50 == 0:
             progress(done, total, cell.name, step / steps)
 

@@ -129,7 +129,7 @@ def _read(path: Path, config: TuneConfig) -> dict[str, Any]:
         return {"version": VERSION, "settings": settings, "controllers": {}}
     try:
         content: dict[str, Any] = json.loads(path.read_text())
-        found, version = content["settings"], content["version"]
+        found, version, _ = content["settings"], content["version"], content["controllers"]
     except (ValueError, KeyError, TypeError) as error:
         raise UserError(f"{path} holds no tuning ({error!r}); give another --out") from error
     if version != VERSION or found != settings:

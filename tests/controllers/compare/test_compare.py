@@ -166,10 +166,14 @@ def test_other_settings_and_unknown_names_are_refused(
     assert (config.out / "results.json").read_bytes() == before
 
 
-def test_a_damaged_file_is_refused(tmp_path: Path) -> None:
+@pytest.mark.parametrize("drives", [None, {"drives": [{"track": "oval"}]}, {}])
+def test_a_damaged_file_is_refused(tmp_path: Path, drives: dict[str, Any] | None) -> None:
     config = short(tmp_path)
     config.out.mkdir()
-    (config.out / "results.json").write_text("[1, 2")
+    settings = {name: getattr(config, name) for name in comparison.SETTINGS}
+    content = {"version": comparison.VERSION, "settings": settings}
+    text = "[1, 2" if drives is None else json.dumps(content | drives)
+    (config.out / "results.json").write_text(text)
     with pytest.raises(UserError, match="holds no results"):
         compare(config)
 
