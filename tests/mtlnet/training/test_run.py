@@ -338,3 +338,5 @@ def test_learning_rate_schedules() -> None:
 def test_numbers_out_of_range_are_refused(changes: dict[str, Any], seen: str) -> None:
     with pytest.raises(UserError, match=seen):
         config(Path("data"), Path("out"), **changes)
+        ({"minutes": float("inf")}, "--minutes is inf"),
+        ({"minutes": float("nan")}, "--minutes is nan"),
