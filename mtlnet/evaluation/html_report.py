@@ -113,10 +113,10 @@ def _drives(frames: Frames, outputs: NDArray[np.float32]) -> Iterator[dict[str, 
     """The first round of each track: true and predicted offset and angle."""
     shown: set[str] = set()
     for number, info in enumerate(frames.rounds):
-        if info.track in shown or len(shown) == MAX_ROUNDS:
+        rows = np.flatnonzero(frames.labels.round == number)
+        if info.track in shown or len(shown) == MAX_ROUNDS or not len(rows):
             continue
         shown.add(info.track)
-        rows = np.flatnonzero(frames.labels.round == number)
         yield {
             "about": f"{info.track}, {info.lanes} lane(s), {info.light} ({info.id})",
             "charts": _drive_charts(frames, rows, outputs[rows]),
