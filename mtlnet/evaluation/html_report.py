@@ -33,11 +33,17 @@ TITLES = {name: f"{name} ({unit})" for name, unit in UNITS.items()}
 Rows = list[list[str]]
 
 
-def write_page(path: Path, report: dict[str, Any], frames: Frames, outputs: Any) -> Path:
-    """Write the page of `mtlnet.evaluation.evaluate`'s report to `path`, a file or a folder."""
+def page_file(path: Path) -> Path:
+    """The file of the page for `path`, a file or a folder; makes its folder."""
     if path.is_dir():
         path = path / FILE_NAME
     path.parent.mkdir(parents=True, exist_ok=True)
+    return path
+
+
+def write_page(path: Path, report: dict[str, Any], frames: Frames, outputs: Any) -> Path:
+    """Write the page of `mtlnet.evaluation.evaluate`'s report to `path`, a file or a folder."""
+    path = page_file(path)
     atomic_write(path, page(report, frames, outputs), fsync=True)
     return path
 
