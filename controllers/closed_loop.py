@@ -250,6 +250,7 @@ class _Totals:
         self, last: CarState, steps: int, run_up: int, blind_steps: int, *, noisy: bool
     ) -> DriveResult:
         speeds = self.speeds_kmh
+        cruising = speeds[run_up:]
         return DriveResult(
             steps=len(speeds),
             steps_asked=steps,
@@ -260,7 +261,7 @@ class _Totals:
             mean_abs_d_m=float(np.mean(self.offsets_m)),
             max_abs_d_m=max(self.offsets_m),
             speed_kmh=(min(speeds), max(speeds)),
-            cruising_kmh=(min(speeds[run_up:]), max(speeds)) if len(speeds) > run_up else None,
+            cruising_kmh=(min(cruising), max(cruising)) if cruising else None,
             blind_steps=blind_steps,
             slowed_steps=self.slowed_steps,
             noisy=noisy,

@@ -219,6 +219,19 @@ class PerceptionSource:
         self._stack.close()
 
 
+def check_perception(name: str, model: str) -> None:
+    """Raise UserError for a perception of an unknown name, or a run `model` that is missing."""
+    if name == "model":
+        from mtlnet.inference.model_card import resolve_run
+
+        resolve_run(model)
+    elif name != "truth" and ":" not in name:
+        raise UserError(
+            f"perception {name!r} is unknown; give truth, model, or the address of a "
+            "service such as http://127.0.0.1:8000"
+        )
+
+
 def open_perception(
     name: str, world: "World", *, model: str, lane_centre: float, light: str, seed: int
 ) -> PerceptionSource:
@@ -226,17 +239,10 @@ def open_perception(
 
     Raises UserError for any other name, a missing model, or a service that does not answer.
     """
+    check_perception(name, model)
     if name == "truth":
         return PerceptionSource(truth(lane_centre))
-    if name == "model":
-        network: FeatureModel = LocalModel(model)
-    elif ":" in name:
-        network = ServiceModel(name)
-    else:
-        raise UserError(
-            f"perception {name!r} is unknown; give truth, model, or the address of a "
-            "service such as http://127.0.0.1:8000"
-        )
+    network: FeatureModel = LocalModel(model) if name == "model" else ServiceModel(name)
     from simulator.camera import open_camera
 
     camera = open_camera(world.road, network.camera, light=light, seed=seed)

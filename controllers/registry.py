@@ -20,6 +20,9 @@ from trackfeatures.errors import UserError
 
 __all__ = ["CONTROLLERS", "ControllerEntry", "LoopConfig", "make_controller"]
 
+OWN_FILE = "controller_of_"
+"""Before the name of a user's file in `sys.modules`, so that it hides no other module."""
+
 
 @dataclass(frozen=True)
 class ControllerEntry:
@@ -111,10 +114,10 @@ def _make_own(name: str, parameters: Mapping[str, float] | None) -> Controller:
         )
     try:
         controller: Controller = found(**(parameters or {}))
-    except TypeError as error:
+    except Exception as error:  # a user's class may raise anything
         raise UserError(
-            f"the class {class_name} of {place} cannot be made: {error}; give every argument a "
-            "default"
+            f"the class {class_name} of {place} cannot be made: {_line(error)}; give every "
+            "argument a default"
         ) from error
     return controller
 
@@ -134,10 +137,11 @@ def _import(name: str) -> ModuleType:
 def _load_file(path: Path) -> ModuleType:
     if not path.is_file():
         raise UserError(f"there is no file {path}")
-    spec = importlib.util.spec_from_file_location(path.stem, path)
+    spec = importlib.util.spec_from_file_location(f"{OWN_FILE}{path.stem}", path)
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module  # where dataclasses look up postponed annotations
     try:
         spec.loader.exec_module(module)
     except Exception as error:  # as above

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from controllers.closed_loop import DriveResult
 from controllers.perception import Perceived
 from controllers.torcs_feedback import STEERING_LOCK
 from simulator.vehicle.state import CarState
@@ -28,6 +29,11 @@ class CurveRecorder:
         self.quadratic += quadratic_reward(now.to_middle, now.angle, steer)
         seen = np.nan if perceived.to_lane_centre is None else perceived.to_lane_centre
         self._rows.append((now.time_s, now.to_middle, now.angle, seen, perceived.angle))
+
+    def quadratic_per_step(self, result: DriveResult) -> float:
+        """The quadratic reward over the steps asked for; each that an early end left out: -2."""
+        missing = result.steps_asked - result.steps
+        return (self.quadratic - 2.0 * missing) / result.steps_asked
 
     def curves(self) -> dict[str, list[float | None]]:
         """The columns, at most `MAX_POINTS` points long; None where nothing was perceived.

@@ -1,11 +1,12 @@
 """The drives of a comparison, and the file that holds their results.
 
 `results.json`: {"version", "settings", "drives": [...]}, written again after each drive. A drive
-that is in it is not driven again; a user's controller that has changed since is.
+that is in it is not driven again, unless its controller or its model has changed since.
 """
 
 import hashlib
 import json
+import sys
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -15,8 +16,11 @@ from controllers.compare.curves import CurveRecorder
 from controllers.compare.disturbance import DISTURBANCES, UNDISTURBED
 from controllers.config import CompareConfig, DriveConfig
 from controllers.drive import drive, read_parameters
+from controllers.perception import check_perception
 from controllers.registry import LoopConfig, make_controller
+from controllers.rl.actor import WEIGHTS, is_actor
 from runtime.files import write_json
+from simulator.camera import check_light
 from simulator.track.catalogue import find_track
 from trackfeatures.errors import UserError
 
@@ -81,6 +85,9 @@ def compare(config: CompareConfig, progress: Progress | None = None) -> dict[str
         make_controller(controller, LoopConfig(0.05), parameters_of(config, controller))
     for track in dict.fromkeys(cell.track for cell in todo):
         find_track(track, config.tracks_dir)
+    check_light(config.light)
+    for perception in dict.fromkeys(cell.perception for cell in todo):
+        check_perception(perception, config.model)
     path = config.out / RESULTS
     config.out.mkdir(parents=True, exist_ok=True)
     content = read_results(path, config)
@@ -88,7 +95,7 @@ def compare(config: CompareConfig, progress: Progress | None = None) -> dict[str
     for done, cell in enumerate(todo):
         print_share = _print_share(progress, done, len(todo), cell)
         print_share(0, 1)
-        code = fingerprint(config, cell.controller)
+        code = fingerprint(config, cell.controller, cell.perception)
         found = known.get(cell)
         if found is None or found["code"] != code:
             known[cell] = asdict(cell) | {"code": code} | drive_cell(config, cell, print_share)
@@ -126,7 +133,7 @@ def drive_cell(
     )
     found = {
         "result": result.as_json(),
-        "quadratic_per_step": recorder.quadratic / result.steps_asked,
+        "quadratic_per_step": recorder.quadratic_per_step(result),
     }
     return found | ({"curves": recorder.curves()} if cell.seed == 0 else {})
 
@@ -142,13 +149,32 @@ def parameters_of(config: CompareConfig, controller: str) -> dict[str, float]:
     return read_parameters(config.parameters, controller) if controller in tuned else {}
 
 
-def fingerprint(config: CompareConfig, controller: str) -> str:
-    """What a drive depends on beside its cell: the user's file, and the tuned parameters."""
+def fingerprint(config: CompareConfig, controller: str, perception: str) -> str:
+    """What a drive depends on beside its cell: the tuned parameters, the user's file or trained
+    actor, and the weights of the model."""
     digest = hashlib.sha256(json.dumps(parameters_of(config, controller)).encode())
-    file = Path(controller.rpartition(":")[0])
-    if file.suffix == ".py":
+    file = _file_of(controller)
+    if file is not None:
         digest.update(file.read_bytes())
+    if perception == "model":
+        digest.update(model_hash(config.model).encode())
     return digest.hexdigest()[:16]
+
+
+def _file_of(controller: str) -> Path | None:
+    """The weights of a trained actor, or the file of a user's class, which was made before."""
+    if is_actor(Path(controller)):
+        return Path(controller) / WEIGHTS
+    place = controller.rpartition(":")[0]
+    file = place if place.endswith(".py") else getattr(sys.modules.get(place), "__file__", None)
+    return None if file is None else Path(file)
+
+
+def model_hash(run: str) -> str:
+    """SHA-256 of the weights of a run's model."""
+    from mtlnet.inference.model_card import read_card, resolve_run
+
+    return read_card(resolve_run(run)).model_hash
 
 
 def read_results(path: Path, config: CompareConfig) -> dict[str, Any]:
@@ -159,6 +185,7 @@ def read_results(path: Path, config: CompareConfig) -> dict[str, Any]:
     try:
         content: dict[str, Any] = json.loads(path.read_text())
         found, version = content["settings"], content["version"]
+        _ = [(_key(entry), entry["code"]) for entry in content["drives"]]
     except (ValueError, KeyError, TypeError) as error:
         raise UserError(f"{path} holds no results ({error!r}); give another --out") from error
     if version != VERSION:

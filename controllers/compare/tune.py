@@ -47,6 +47,8 @@ def tune(config: TuneConfig, progress: Progress | None = None) -> dict[str, Any]
     if config.budget < 1:
         raise UserError(f"a budget of {config.budget} drives; give 1 or more")
     find_disturbance(config.disturbance)
+    for track in names(config.tracks, "tracks"):
+        find_track(track, config.tracks_dir)
     check_folder(config.out)
     content = _read(config.out, config)
     total = config.budget * len(controllers)
@@ -117,9 +119,7 @@ def evaluate(config: TuneConfig, controller: str, parameters: Mapping[str, float
         if config.reward == "paper":
             rewards.append(result.score_per_step)
         else:
-            # A drive that ends early gives -2 for each step that is missing.
-            missing = result.steps_asked - result.steps
-            rewards.append((recorder.quadratic - 2.0 * missing) / result.steps_asked)
+            rewards.append(recorder.quadratic_per_step(result))
     return float(np.mean(rewards))
 
 
@@ -129,7 +129,7 @@ def _read(path: Path, config: TuneConfig) -> dict[str, Any]:
         return {"version": VERSION, "settings": settings, "controllers": {}}
     try:
         content: dict[str, Any] = json.loads(path.read_text())
-        found, version = content["settings"], content["version"]
+        found, version, _ = content["settings"], content["version"], content["controllers"]
     except (ValueError, KeyError, TypeError) as error:
         raise UserError(f"{path} holds no tuning ({error!r}); give another --out") from error
     if version != VERSION or found != settings:

@@ -90,8 +90,12 @@ def _prepare_folder(config: TrainConfig) -> None:
     path = config.out / CONFIG
     content = json.loads(json.dumps(asdict(config), default=str))
     if path.exists():
-        found = json.loads(path.read_text(encoding="utf-8"))
-        changed = [name for name in content if found.get(name) != content[name]]
+        try:
+            found = dict(json.loads(path.read_text(encoding="utf-8")))
+        except (ValueError, TypeError) as error:
+            raise UserError(f"{path} cannot be read ({error}); give another --out") from error
+        # The folder may have been moved.
+        changed = [n for n in content if n != "out" and found.get(n) != content[n]]
         if changed:
             raise UserError(
                 f"{config.out} holds a training with another {', '.join(changed)}; give another "

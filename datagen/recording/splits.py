@@ -131,6 +131,8 @@ def split_rounds(rounds: Sequence[RoundInfo], by: str, test_share: float, seed: 
         raise DatasetError(f"rounds cannot be divided by {by!r}; choose {' or '.join(SPLIT_BY)}")
     if not 0.0 < test_share < 1.0:
         raise DatasetError(f"--test-share is {test_share:g}; give a number between 0 and 1")
+    if seed < 0:
+        raise DatasetError(f"--seed is {seed}; give 0 or more")
     rng = np.random.default_rng(seed)
     groups = _inseparable_groups(rounds, by)
     if by == "track":

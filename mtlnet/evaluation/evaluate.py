@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 from datagen.recording import Dataset, Frames, UndecodableImage
 from mtlnet.data.loader import Images
 from mtlnet.data.sources import require_decodable
-from mtlnet.evaluation.html_report import write_page, write_worst_sheet
+from mtlnet.evaluation.html_report import page_file, write_page, write_worst_sheet
 from mtlnet.evaluation.metrics import evaluate_by_groups
 from mtlnet.inference.engine import Engine
 from mtlnet.inference.model_card import ModelCard, ModelError
+from runtime.files import check_folder
 from trackfeatures.errors import UserError
 
 CHUNK = 32  # frames that a thread reads at a time
@@ -39,6 +40,11 @@ def evaluate(
     """
     if every < 1:
         raise UserError(f"--every is {every}; give 1 for all frames, 5 for every fifth")
+    # Before the long computation: whether the files can be written.
+    if page is not None:
+        page = page_file(page)
+    if worst is not None:
+        check_folder(worst)
     engine = engines[0]
     dataset = Dataset.open(data)
     frames = dataset.select(split).every(every)

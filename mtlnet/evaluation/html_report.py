@@ -33,11 +33,17 @@ TITLES = {name: f"{name} ({unit})" for name, unit in UNITS.items()}
 Rows = list[list[str]]
 
 
-def write_page(path: Path, report: dict[str, Any], frames: Frames, outputs: Any) -> Path:
-    """Write the page of `mtlnet.evaluation.evaluate`'s report to `path`, a file or a folder."""
+def page_file(path: Path) -> Path:
+    """The file of the page for `path`, a file or a folder; makes its folder."""
     if path.is_dir():
         path = path / FILE_NAME
     path.parent.mkdir(parents=True, exist_ok=True)
+    return path
+
+
+def write_page(path: Path, report: dict[str, Any], frames: Frames, outputs: Any) -> Path:
+    """Write the page of `mtlnet.evaluation.evaluate`'s report to `path`, a file or a folder."""
+    path = page_file(path)
     atomic_write(path, page(report, frames, outputs), fsync=True)
     return path
 
@@ -113,10 +119,10 @@ def _drives(frames: Frames, outputs: NDArray[np.float32]) -> Iterator[dict[str, 
     """The first round of each track: true and predicted offset and angle."""
     shown: set[str] = set()
     for number, info in enumerate(frames.rounds):
-        if info.track in shown or len(shown) == MAX_ROUNDS:
+        rows = np.flatnonzero(frames.labels.round == number)
+        if info.track in shown or len(shown) == MAX_ROUNDS or not len(rows):
             continue
         shown.add(info.track)
-        rows = np.flatnonzero(frames.labels.round == number)
         yield {
             "about": f"{info.track}, {info.lanes} lane(s), {info.light} ({info.id})",
             "charts": _drive_charts(frames, rows, outputs[rows]),

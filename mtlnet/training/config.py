@@ -1,6 +1,7 @@
 """The configuration of a training run, from its options or from the `config.json` of a run."""
 
 import json
+import math
 import time
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
@@ -77,8 +78,8 @@ class TrainConfig:
             raise UserError("a fine-tuned run keeps its data; leave --change-data out")
         if self.iterations is not None and self.iterations < 1:
             raise UserError(f"--iterations is {self.iterations}; give at least 1")
-        if self.minutes is not None and not self.minutes > 0:
-            raise UserError(f"--minutes is {self.minutes}; give more than 0")
+        if self.minutes is not None and not 0 < self.minutes < math.inf:
+            raise UserError(f"--minutes is {self.minutes}; give a number above 0")
         if self.batch < 2:
             raise UserError(f"--batch is {self.batch}; batch normalisation needs at least 2")
         if self.seed < 0:

@@ -35,6 +35,7 @@ from mtlnet.training.config import (
     new_config,
     newest_run,
     open_pretrained,
+    read_config,
     resume_config,
     write_config,
 )
@@ -184,7 +185,8 @@ def _train(
     checkpoints = list_checkpoints(config.out) if resumed is not None else []
     elapsed_s = load_checkpoint(checkpoints[-1], trainer) if checkpoints else 0.0
     barrier()  # the first process writes nothing until all have read the checkpoint
-    if config.change_data and rank.is_first:
+    if resumed is not None and rank.is_first and read_config(config.out)[0] != config:
+        # Else a run that is stopped again would go on with the options it was started with.
         write_config(config, find_recipe(config.recipe), data.about)
     try:
         first_row = trainer.network.architecture.first_row

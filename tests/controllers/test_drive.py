@@ -83,6 +83,14 @@ def test_the_score_is_the_sum_of_the_rewards_after_each_step() -> None:
     assert world.commands == [Command(steer=0.25, throttle=0.2, brake=0.0, gear=1)] * 2
 
 
+def test_the_cruising_speeds_leave_out_the_first_15_s() -> None:
+    speeds = [20.0] * 300 + [10.0, 12.0]
+    world = FakeWorld(*(at_rest(vx=speed) for speed in speeds))
+    result = run_lap(world, FunctionController(lambda observation: 0.0), perceiving(), len(speeds))
+    assert list(result.speed_kmh) == pytest.approx([36.0, 72.0])
+    assert result.cruising_kmh == pytest.approx((36.0, 43.2))
+
+
 @pytest.mark.parametrize(
     ("change", "ended"),
     [

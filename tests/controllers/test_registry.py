@@ -1,5 +1,6 @@
 """The controllers by name, their parameters, and a user's own classes."""
 
+import importlib
 from pathlib import Path
 
 import pytest
@@ -26,7 +27,23 @@ class Needy:
     def update(self, observation):
         return 0.0
 
+class Broken:
+    def __init__(self):
+        raise OSError("no weights\\nhere")
+    def update(self, observation):
+        return 0.0
+
 number = 3
+"""
+OWN_DATACLASS = """
+from __future__ import annotations
+from dataclasses import dataclass
+
+@dataclass
+class Law:
+    gain: float = 0.2
+    def update(self, observation):
+        return -self.gain * observation.to_lane_centre
 """
 
 
@@ -69,6 +86,13 @@ def test_a_users_class_is_made(own: Path, name: str) -> None:
     assert make_controller(name, LOOP, {"gain": 1.0}).update(SEEN) == pytest.approx(-0.1)
 
 
+@pytest.mark.parametrize("name", ["own_data", "json"])  # no module is hidden by its name
+def test_a_users_file_may_hold_a_dataclass_with_postponed_annotations(own: Path, name: str) -> None:
+    (own / f"{name}.py").write_text(OWN_DATACLASS)
+    assert make_controller(f"{name}.py:Law", LOOP).update(SEEN) == pytest.approx(-0.02)
+    assert importlib.import_module("json").loads("1") == 1
+
+
 @pytest.mark.parametrize(
     ("name", "message"),
     [
@@ -76,6 +100,7 @@ def test_a_users_class_is_made(own: Path, name: str) -> None:
         ("own_law:number", "own_law has no class 'number'"),
         ("own_law:NoUpdate", "has no method update"),
         ("own_law:Needy", "cannot be made: .*something"),
+        ("own_law:Broken", "cannot be made: OSError: no weights here"),
         ("own_none:Good", "'own_none' cannot be imported: ModuleNotFoundError"),
         ("own_broken:Good", "'own_broken' cannot be imported: .*no_such_package"),
         ("own_broken.py:Good", "own_broken.py cannot be loaded: .*no_such_package"),

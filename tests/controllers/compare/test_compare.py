@@ -2,21 +2,26 @@
 
 import json
 import math
+import shutil
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from safetensors.numpy import save
 
 import controllers.compare.run as comparison
 from controllers.compare.curves import CurveRecorder, quadratic_reward
 from controllers.compare.report import driving_curves, score_table, spread, write_report
-from controllers.compare.run import Cell, cells, compare
+from controllers.compare.run import Cell, cells, compare, fingerprint
 from controllers.compare.tune import propose, tune
 from controllers.config import CompareConfig, TuneConfig
 from controllers.drive import read_parameters
 from controllers.perception import Perceived
+from controllers.rl.actor import WEIGHTS, load_actor
+from controllers.rl.controller import SHIPPED
 from controllers.torcs_feedback import STEERING_LOCK
 from tests.controllers.test_drive import at_rest
 from tests.typed import typed
@@ -84,17 +89,61 @@ def test_an_interrupted_comparison_goes_on_and_drives_nothing_twice(
     assert len(json.loads((config.out / "results.json").read_text())["drives"]) == 6
 
 
+@pytest.mark.parametrize("place", ["{}/changing_law.py", "changing_law"])
 def test_a_users_controller_is_driven_again_when_its_file_has_changed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, place: str
 ) -> None:
-    law = tmp_path / "law.py"
-    config = short(tmp_path, tracks="oval", controllers=f"{law}:Law")
+    law = tmp_path / "changing_law.py"
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr("sys.dont_write_bytecode", True)
+    config = short(tmp_path, tracks="oval", controllers=f"{place.format(tmp_path)}:Law")
     counter, scores = Counter(monkeypatch), []
     for gain in (0.2, 0.2, 0.4):
         law.write_text(LAW.format(gain=gain))
+        sys.modules.pop("changing_law", None)  # as in a new process
         scores.append(compare(config)["drives"][0]["result"]["score"])
     assert len(counter.cells) == 2
     assert scores[0] == scores[1] != scores[2]
+
+
+def test_a_trained_actor_is_driven_again_when_it_was_trained_further(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    actor = tmp_path / "rl"
+    shutil.copytree(SHIPPED / "rl", actor)
+    config = short(tmp_path, tracks="oval", controllers=str(actor))
+    counter = Counter(monkeypatch)
+    compare(config)
+    compare(config)
+    assert len(counter.cells) == 1
+    weights = load_actor(actor).weights
+    weights["b3"] = weights["b3"] + np.float32(0.1)
+    (actor / WEIGHTS).write_bytes(save(weights))
+    compare(config)
+    assert len(counter.cells) == 2
+
+
+def test_a_drive_on_a_model_depends_on_its_weights(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = short(tmp_path, perceptions="truth,model")
+    codes = []
+    for weights in ("one", "other"):
+        monkeypatch.setattr(comparison, "model_hash", lambda run, weights=weights: weights)
+        codes.append([fingerprint(config, "lqr", name) for name in ("truth", "model")])
+    assert codes[0][0] == codes[1][0]
+    assert len({codes[0][0], codes[0][1], codes[1][1]}) == 3
+
+
+def test_a_drive_that_ends_early_has_no_better_quadratic_reward_for_it(tmp_path: Path) -> None:
+    law = tmp_path / "law.py"
+    law.write_text("class Law:\n    def update(self, observation):\n        return 1.0\n")
+    content = compare(short(tmp_path, tracks="oval", controllers=f"{law}:Law", steps=400))
+    drive = content["drives"][0]
+    missing = 400 - drive["result"]["steps"]
+    assert missing > 100
+    # Each missing step counts -2, as in `controllers tune`.
+    assert drive["quadratic_per_step"] < -2.0 * missing / 400
 
 
 def test_the_start_is_torcss_place_on_the_grid(tmp_path: Path) -> None:
@@ -112,6 +161,7 @@ def test_the_start_is_torcss_place_on_the_grid(tmp_path: Path) -> None:
         ({"steps": 61}, "made with steps 60, now it is 61"),
         ({"controllers": "pid"}, "no controller 'pid'"),
         ({"tracks": "nowhere"}, "nowhere"),
+        ({"controllers": "lqr", "perceptions": "truth,modle"}, "perception 'modle' is unknown"),
     ],
 )
 def test_other_settings_and_unknown_names_are_refused(
@@ -125,10 +175,14 @@ def test_other_settings_and_unknown_names_are_refused(
     assert (config.out / "results.json").read_bytes() == before
 
 
-def test_a_damaged_file_is_refused(tmp_path: Path) -> None:
+@pytest.mark.parametrize("drives", [None, {"drives": [{"track": "oval"}]}, {}])
+def test_a_damaged_file_is_refused(tmp_path: Path, drives: dict[str, Any] | None) -> None:
     config = short(tmp_path)
     config.out.mkdir()
-    (config.out / "results.json").write_text("[1, 2")
+    settings = {name: getattr(config, name) for name in comparison.SETTINGS}
+    content = {"version": comparison.VERSION, "settings": settings}
+    text = "[1, 2" if drives is None else json.dumps(content | drives)
+    (config.out / "results.json").write_text(text)
     with pytest.raises(UserError, match="holds no results"):
         compare(config)
 
@@ -240,9 +294,13 @@ def test_candidates_stay_within_their_ranges() -> None:
         ({"reward": "speed"}, "no reward 'speed'"),
         ({"budget": 0}, "budget of 0"),
         ({"disturbance": "storm"}, "no disturbance 'storm'"),
+        ({"tracks": "oval,nowhere", "budget": 1, "steps": 20, "controllers": "lqr"}, "nowhere"),
     ],
 )
-def test_a_wrong_search_is_refused(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
+def test_a_wrong_search_is_refused_before_its_first_drive(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, changes: dict[str, Any], message: str
+) -> None:
+    monkeypatch.setattr("controllers.compare.tune.drive", lambda *_, **__: pytest.fail("driven"))
     with pytest.raises(UserError, match=message):
         tune(TuneConfig(out=tmp_path / "tuned.json", **changes))
     assert not (tmp_path / "tuned.json").exists()

@@ -139,6 +139,21 @@ def test_a_run_of_other_options_is_not_continued(tmp_path: Path) -> None:
         train(short(tmp_path / "run", steps=300, seed=7))
 
 
+def test_a_moved_run_is_continued_and_keeps_its_file(tmp_path: Path) -> None:
+    train(short(tmp_path / "run", steps=200))
+    kept = (tmp_path / "run" / "config.json").read_bytes()
+    (tmp_path / "run").rename(tmp_path / "moved")
+    assert train(short(tmp_path / "moved", steps=200))["steps"] == 200
+    assert (tmp_path / "moved" / "config.json").read_bytes() == kept
+
+
+@pytest.mark.parametrize("text", ["{", "[1]"])
+def test_a_damaged_configuration_is_named(tmp_path: Path, text: str) -> None:
+    (tmp_path / "config.json").write_text(text)
+    with pytest.raises(UserError, match=r"config.json cannot be read"):
+        train(short(tmp_path, steps=200))
+
+
 def test_a_damaged_checkpoint_is_named(tmp_path: Path) -> None:
     train(short(tmp_path / "run", steps=200))
     path = tmp_path / "run" / "checkpoint.safetensors"

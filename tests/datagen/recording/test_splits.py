@@ -230,6 +230,7 @@ def test_the_command_refuses_a_leak_with_a_one_line_error(dataset: Path) -> None
         ({"near": "1,0,2"}, "give numbers above 0"),
         ({"by": "frame", "name": "x"}, "cannot be divided by 'frame'"),
         ({"by": "round", "name": "x", "test_share": 2.0}, "--test-share is 2; give a number"),
+        ({"by": "round", "name": "x", "seed": -1}, "--seed is -1; give 0 or more"),
     ],
 )
 def test_bad_options_are_refused(dataset: Path, options: dict[str, Any], what: str) -> None:

@@ -104,6 +104,14 @@ def test_its_tables_are_those_of_the_report(shown: Page, report: dict[str, Any])
     assert tracks[0][-1] == "out of distribution"
 
 
+def test_rounds_that_every_leaves_without_frames_are_not_drawn(
+    frames: Frames, outputs: NDArray[np.float32], report: dict[str, Any]
+) -> None:
+    few, found = frames.every(len(frames)), outputs[:1]
+    figures = {**report, **evaluate_by_groups(found, few, mean_labels(few.labels))}
+    assert len(Page(page(figures, few, found)).all("h3")) == 1
+
+
 def test_a_round_of_each_track_is_drawn_with_its_band(shown: Page, frames: Frames) -> None:
     tracks = {info.track for info in frames.rounds}
     assert len(shown.all("h3")) == len(tracks) <= MAX_ROUNDS

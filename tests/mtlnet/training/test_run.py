@@ -275,6 +275,22 @@ def test_wrong_configurations_are_refused_before_anything_is_written(
 
 
 @pytest.mark.usefixtures("small_network")
+def test_a_run_resumed_with_more_iterations_and_stopped_again_goes_on_to_them(
+    dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = config(dataset, tmp_path / "run", iterations=2)
+    with monkeypatch.context() as patch:
+        patch.setattr(mtlnet.training.loop, "StopRequest", lambda: StopAt(1))
+        with pytest.raises(Stopped):
+            train(run, None)
+        with pytest.raises(Stopped):
+            train(*resume_config(run.out, {"iterations": 4}))
+    resumed, data = resume_config(run.out, {})  # as the message of a stopped run says
+    assert resumed == replace(run, iterations=4)
+    assert train(resumed, data).iterations == 4
+
+
+@pytest.mark.usefixtures("small_network")
 def test_a_run_is_not_resumed_with_another_seed_or_other_data(
     dataset: Path, tmp_path: Path
 ) -> None:
@@ -329,6 +345,8 @@ def test_learning_rate_schedules() -> None:
     [
         ({"iterations": 0}, "--iterations is 0"),
         ({"minutes": 0.0}, "--minutes is 0"),
+        ({"minutes": float("inf")}, "--minutes is inf"),
+        ({"minutes": float("nan")}, "--minutes is nan"),
         ({"batch": 1}, "--batch is 1"),
         ({"seed": -1}, "--seed is -1"),
         ({"threads": -1}, "--threads is -1"),
