@@ -30,7 +30,7 @@ MARKING_LIMITS_M = {
     "m": (-2.0, 2.75),
     "r": (1.5, 7.0),
 }
-"""Range of the network's coding (DESIGN section 2); labels beyond it would be clipped."""
+"""Range of the network's coding; labels beyond it would be clipped."""
 ANGLE_LIMIT_RAD = 0.5
 ASPECT_TOLERANCE = 0.01
 

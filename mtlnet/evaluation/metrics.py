@@ -195,7 +195,7 @@ def _by_range(
 def evaluate_outputs(
     outputs: NDArray[np.float32], labels: Labels, mean: dict[str, Any]
 ) -> dict[str, Any]:
-    """The report (DESIGN §9) on `outputs` (N, 9 to 22) for `labels`; `mean`: of `mean_labels`.
+    """The report on `outputs` (N, 9 to 22) for `labels`; `mean`: of `mean_labels`.
 
     It has `doubt` when the model predicts standard deviations.
     """
@@ -239,7 +239,7 @@ def evaluate_by_groups(
 
 
 def _means(errors: Numbers, right: NDArray[np.bool_]) -> dict[str, Any]:
-    """Mean absolute errors and the accuracy of the class, under the names of DESIGN §9."""
+    """Mean absolute errors and the accuracy of the class."""
     sizes = [_mean(np.abs(column)) for column in errors.T]
     by_name = dict(zip(FEATURES, sizes, strict=True))
     return {

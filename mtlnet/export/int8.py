@@ -1,4 +1,4 @@
-"""The int8 form of a graph (by NNCF), and the accuracy gate it must pass (DESIGN §7).
+"""The int8 form of a graph (by NNCF), and the accuracy gate it must pass.
 
 Quantised are the weights of all convolutions and of the shared layers except the last, and the
 activations of most convolutions, calibrated on training frames. Which convolutions keep float

@@ -141,7 +141,7 @@ def read_graph(run: Path, card: ModelCard) -> Any:
 
 
 # The exports of a run, each with an `export.json` that `mtlnet export` writes. An int8 graph is
-# used by default only if it passed its accuracy gate (`mtlnet.export.int8`; DESIGN §7).
+# used by default only if it passed its accuracy gate (`mtlnet.export.int8`).
 
 
 def read_export(folder: Path) -> dict[str, Any] | None:

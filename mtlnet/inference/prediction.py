@@ -86,7 +86,7 @@ class Prediction:
     """Probability that each marking is absent; None for a model with heads of coded values."""
 
     def as_json(self) -> dict[str, Any]:
-        """The prediction as the service returns it (DESIGN §9)."""
+        """The prediction as the service returns it."""
         return {
             "distances_m": dict(self.distances_m),
             "to_lane_centre_m": self.to_lane_centre_m,
