@@ -39,10 +39,11 @@ system:
 demo: $(READY) ## collect, train, evaluate, serve, ask, report: in 15 minutes on two cores
 	$(BIN)/controllers demo --out demo
 
-# One process a core, four at most: each takes about 1 GB. A file's tests stay in one process, for
-# they share what is costly to make; xdist keeps their order (tests/conftest.py). What measures time comes
-# after them, when the cores are free.
-PARALLEL := --numprocesses logical --maxprocesses 4 --dist loadfile --no-loadscope-reorder
+# One process more than cores, for many tests wait; four at most: each takes about 1 GB. A file's tests
+# stay in one process, for they share what is costly to make; xdist keeps their order (tests/conftest.py).
+# What measures time comes after them, when the cores are free.
+PROCESSES := $(shell $(PYTHON) -c 'import os; print(min(len(os.sched_getaffinity(0)) + 1, 4))')
+PARALLEL := --numprocesses $(PROCESSES) --dist loadfile --no-loadscope-reorder
 
 test: $(READY) ## all checks and tests but the extended ones
 	@$(MAKE) --no-print-directory --jobs 2 check parallel-tests
