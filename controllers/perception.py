@@ -109,6 +109,7 @@ class ServiceModel:
         card = self._client.model()
         tf.require_version(str(card.get("definitions_version")), f"the service at {url}")
         self.camera: CameraParameters = parse_camera(card.get("camera"))
+        self.model_hash = str(card.get("model_hash"))
 
     def predict(self, image: Image) -> dict[str, Any]:
         import simplejpeg

@@ -8,13 +8,14 @@ import importlib
 import importlib.util
 import math
 import sys
+import traceback
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from controllers.interface import Controller, LoopConfig
+from controllers.interface import Controller, LoopConfig, Observation
 from controllers.rl.actor import is_actor
 from trackfeatures.errors import UserError
 
@@ -113,13 +114,38 @@ def _make_own(name: str, parameters: Mapping[str, float] | None) -> Controller:
             "steering action in [-1, 1], left positive"
         )
     try:
-        controller: Controller = found(**(parameters or {}))
+        return _OwnController(f"the class {class_name} of {place}", found(**(parameters or {})))
     except Exception as error:  # a user's class may raise anything
         raise UserError(
             f"the class {class_name} of {place} cannot be made: {_line(error)}; give every "
             "argument a default"
         ) from error
-    return controller
+
+
+class _OwnController:
+    """A user's controller; what its `update` raises or wrongly returns is a UserError."""
+
+    def __init__(self, name: str, controller: Controller) -> None:
+        self._name, self._controller = name, controller
+
+    def update(self, observation: Observation) -> float:
+        try:
+            action = self._controller.update(observation)
+        except Exception as error:  # a user's method may raise anything
+            place = traceback.extract_tb(error.__traceback__)[-1]
+            raise UserError(
+                f"update(observation) of {self._name} failed: {_line(error)} "
+                f"({place.filename}, line {place.lineno})"
+            ) from error
+        try:
+            if math.isfinite(action):
+                return float(action)
+        except (TypeError, ValueError):
+            pass
+        raise UserError(
+            f"update(observation) of {self._name} returned {action!r}; it must return the steering "
+            "action, a number in [-1, 1]"
+        )
 
 
 def _import(name: str) -> ModuleType:

@@ -222,10 +222,7 @@ def predict_command(
     else:
         Console().print(prediction_table(predictions[:MAX_PRINTED]))
         if len(predictions) > MAX_PRINTED:
-            typer.echo(
-                f"the first {MAX_PRINTED} of {len(predictions)}; --out features.csv has all",
-                err=True,
-            )
+            typer.echo(f"the first {MAX_PRINTED} images; --out features.csv has all", err=True)
 
 
 def _print_model(name: str) -> None:

@@ -106,6 +106,23 @@ def try_lock(descriptor: int, *, shared: bool = False) -> bool:
     return True
 
 
+@contextmanager
+def locked_folder(folder: Path) -> Iterator[None]:
+    """Keep other processes from the folder within the context; a lock ends with its process.
+
+    Raises UserError while another process holds it.
+    """
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        if not try_lock(descriptor):
+            raise UserError(
+                f"another process is writing to {folder}; wait for its end, or give another --out"
+            )
+        yield
+    finally:
+        os.close(descriptor)
+
+
 def fsync_path(path: Path) -> None:
     """Wait until a file, or the names in a folder, are on the disk."""
     descriptor = os.open(path, os.O_RDONLY)

@@ -35,6 +35,8 @@ async def _serve(config: ServiceConfig, listener: socket.socket) -> None:
     supervisor = Supervisor(plan, listener)
     listener.listen(BACKLOG)
     first = await supervisor.start()
+    if first is None:
+        return
     sys.stderr.write(
         f"serving {_model_label(config.model, supervisor.folder)}, model {first['model'][:12]}, "
         f"with {first['engine']} {first['precision']} at {address(listener, config.host)}"

@@ -80,9 +80,14 @@ def _command(name: str, python: Path, port: int, workers: int, run: Path) -> lis
 
 @contextmanager
 def running(
-    name: str, python: Path, run: Path, workers: int, cores: set[int] | None = None
+    name: str,
+    python: Path,
+    run: Path,
+    workers: int,
+    cores: set[int] | None = None,
+    root: Path = ROOT,
 ) -> Iterator[int]:
-    """The port of a server that answers; `cores`: all that it may use.
+    """The port of a server that answers; `cores`: all that it may use, `root`: its source tree.
 
     SIGTERM ends this process in order from now on, and the server with it.
     """
@@ -93,14 +98,14 @@ def running(
     environment = {
         **os.environ,
         **settings,
-        "PYTHONPATH": str(ROOT),
+        "PYTHONPATH": str(root),
         "BENTOML_DO_NOT_TRACK": "True",
     }
     with tempfile.TemporaryFile() as said:
         process = subprocess.Popen(
             _command(name, python, port, workers, run),
             env=environment,
-            cwd=ROOT,
+            cwd=root,
             stdout=said,
             stderr=said,
             start_new_session=True,

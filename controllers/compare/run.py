@@ -19,7 +19,7 @@ from controllers.drive import drive, read_parameters
 from controllers.perception import check_perception
 from controllers.registry import LoopConfig, make_controller
 from controllers.rl.actor import WEIGHTS, is_actor
-from runtime.files import write_json
+from runtime.files import locked_folder, write_json
 from simulator.camera import check_light
 from simulator.track.catalogue import find_track
 from trackfeatures.errors import UserError
@@ -78,7 +78,7 @@ def compare(config: CompareConfig, progress: Progress | None = None) -> dict[str
     """Drive all cells that `config.out` does not hold yet; the content of `results.json`.
 
     Raises UserError for an unknown name, before the first drive, and where the folder holds results
-    of other settings.
+    of other settings or another process drives for it.
     """
     todo = cells(config)
     for controller in dict.fromkeys(cell.controller for cell in todo):
@@ -88,14 +88,22 @@ def compare(config: CompareConfig, progress: Progress | None = None) -> dict[str
     check_light(config.light)
     for perception in dict.fromkeys(cell.perception for cell in todo):
         check_perception(perception, config.model)
-    path = config.out / RESULTS
     config.out.mkdir(parents=True, exist_ok=True)
+    with locked_folder(config.out):
+        return _drive_missing(config, todo, progress)
+
+
+def _drive_missing(
+    config: CompareConfig, todo: list[Cell], progress: Progress | None
+) -> dict[str, Any]:
+    """Drive those of `todo` whose results the folder does not hold; write each when it is done."""
+    path = config.out / RESULTS
     content = read_results(path, config)
     known = {_key(entry): entry for entry in content["drives"]}
     for done, cell in enumerate(todo):
         print_share = _print_share(progress, done, len(todo), cell)
         print_share(0, 1)
-        code = fingerprint(config, cell.controller, cell.perception)
+        code = fingerprint(config, cell)
         found = known.get(cell)
         if found is None or found["code"] != code:
             known[cell] = asdict(cell) | {"code": code} | drive_cell(config, cell, print_share)
@@ -149,15 +157,18 @@ def parameters_of(config: CompareConfig, controller: str) -> dict[str, float]:
     return read_parameters(config.parameters, controller) if controller in tuned else {}
 
 
-def fingerprint(config: CompareConfig, controller: str, perception: str) -> str:
-    """What a drive depends on beside its cell: the tuned parameters, the user's file or trained
-    actor, and the weights of the model."""
-    digest = hashlib.sha256(json.dumps(parameters_of(config, controller)).encode())
-    file = _file_of(controller)
+def fingerprint(config: CompareConfig, cell: Cell) -> str:
+    """What a drive depends on beside its cell: the road, the tuned parameters, the user's file or
+    trained actor, and the weights of the model, also of a service's."""
+    digest = hashlib.sha256(json.dumps(parameters_of(config, cell.controller)).encode())
+    digest.update(find_track(cell.track, config.tracks_dir).content_hash.encode())
+    file = _file_of(cell.controller)
     if file is not None:
         digest.update(file.read_bytes())
-    if perception == "model":
+    if cell.perception == "model":
         digest.update(model_hash(config.model).encode())
+    elif cell.perception != "truth":
+        digest.update(service_model_hash(cell.perception).encode())
     return digest.hexdigest()[:16]
 
 
@@ -175,6 +186,15 @@ def model_hash(run: str) -> str:
     from mtlnet.inference.model_card import read_card, resolve_run
 
     return read_card(resolve_run(run)).model_hash
+
+
+def service_model_hash(url: str) -> str:
+    """SHA-256 of the weights of the model at `url`. Raises UserError when it does not answer."""
+    from controllers.perception import ServiceModel
+
+    service = ServiceModel(url)
+    service.close()
+    return service.model_hash
 
 
 def read_results(path: Path, config: CompareConfig) -> dict[str, Any]:

@@ -33,7 +33,7 @@ from controllers.rl.config import (
 from controllers.rl.controller import RlController
 from controllers.rl.networks import layers
 from controllers.rl.state import StateBuilder, find_state
-from runtime.files import atomic_write, write_json
+from runtime.files import atomic_write, locked_folder, write_json
 from simulator.track.road import Road
 from simulator.world.world import World
 from trackfeatures.errors import UserError
@@ -63,8 +63,8 @@ def train(config: TrainConfig, report: Report | None = None) -> dict[str, Any]:
     )
     try:
         _prepare_folder(config)
-        training = _Training(config, algorithm, env, report)
-        return training.run()
+        with locked_folder(config.out):
+            return _Training(config, algorithm, env, report).run()
     finally:
         env.close()
 

@@ -47,6 +47,8 @@ def verify(
 
     if level not in LEVELS:
         raise UserError(f"there is no level {level!r}; choose {', '.join(LEVELS)}")
+    if pixels and not replay:
+        raise UserError("--pixels compares images that are rendered again; give --replay N, too")
     with Console(stderr=True).status(f"checking {folder}") as status:
         report = run(folder, level, lambda name: status.update(f"checked {name}"))
         replayed: list[str] = []

@@ -78,6 +78,9 @@ def differences(
                 ):
                     first.setdefault(topics.CAMERA, number)
                 number += 1
+    for topic, messages_of_topic in recorded.items():
+        if len(messages_of_topic.log_time) > number:
+            first.setdefault(topic, number)
     for topic, at in sorted(first.items()):
         yield (
             f"{path.name}: simulated again, {topic} differs from frame {at} on (recorded by "

@@ -9,7 +9,7 @@ from typing import Any
 from mtlnet.inference.engine import Engine
 from mtlnet.inference.prediction import decode_outputs
 from mtlnet.predict.sources import find_sources, read_sources
-from mtlnet.predict.writers import open_writer
+from mtlnet.predict.writers import open_writer, require_other_file
 from trackfeatures.errors import UserError
 
 KEPT_ROWS = 10_000
@@ -25,15 +25,19 @@ def predict_files(
 ) -> list[dict[str, Any]]:
     """The features of all images that `inputs` name (`mtlnet.predict.sources.find_sources`).
 
-    They are also written to each of `outputs` (`mtlnet.predict.writers.open_writer`), one image at
-    a time. `report`: takes the numbers of images done and in all. Raises UserError, after all
-    others were done, when an image could not be used; at once for outputs that cannot be written.
+    Those of the first `KEPT_ROWS` are returned, all are written to each of `outputs`
+    (`mtlnet.predict.writers.open_writer`), one image at a time. `report`: takes the numbers of
+    images done and in all. Raises UserError, after all others were done, when an image could not be
+    used; at once for outputs that cannot be written or are among the files to read.
     """
     sources = find_sources(list(inputs))
     total = sum(source.count for source in sources)
     camera, name = engine.card.camera, engine.card.name
     results: list[dict[str, Any]] = []
     unusable: list[str] = []
+    used = 0
+    for path in outputs:
+        require_other_file(path, [source.path for source in sources])
     with ExitStack() as stack:
         fps = sources[0].fps
         writers = [stack.enter_context(open_writer(path, camera, fps)) for path in outputs]
@@ -47,11 +51,12 @@ def predict_files(
             latency_ms = round(1e3 * (time.perf_counter() - begin), 3)
             for writer in writers:
                 writer.write(item, prediction)
+            used += 1
             if len(results) < KEPT_ROWS:
                 about = {"model": name, "latency_ms": latency_ms}
                 results.append({"image": item.name, **prediction.as_json(), **about})
     if unusable:
         more = f" (and {len(unusable) - 1} more like it)" if len(unusable) > 1 else ""
-        others = f"; {len(results)} others were done" if results else ""
+        others = f"; {used} others were done" if used else ""
         raise UserError(f"{unusable[0]}{more}{others}")
     return results

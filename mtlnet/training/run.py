@@ -9,7 +9,7 @@ import os
 import shutil
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -45,7 +45,7 @@ from mtlnet.training.recipes import Recipe, find_recipe
 from mtlnet.training.task_weighting import TaskWeighting
 from mtlnet.training.trainer import Trainer, choose_device, keep_freed_memory
 from mtlnet.uncertainty_fit.head import fit_uncertainty_head
-from runtime.files import fsync_path, unfinished_path
+from runtime.files import fsync_path, locked_folder, unfinished_path
 from trackfeatures.errors import UserError
 
 EXPORT_CHECK_FRAMES = 16
@@ -148,7 +148,7 @@ def train(
 
     `resumed`: the description of the data stored by the run to resume; None starts a new run.
     `checked`: all images are known to be decodable. Raises UserError (data, an existing folder,
-    memory, disk), Stopped after Ctrl-C.
+    memory, disk, a run that is being trained), Stopped after Ctrl-C.
     """
     find_recipe(config.recipe)  # raises when there is none
     rank = read_rank()
@@ -181,18 +181,32 @@ def _train(
     if resumed is not None:
         data = resume_data(config, data, resumed)
     configure_cpu(config, rank)
-    trainer, loader = prepare(config, data, init[0] if init else None, device, rank)
+    with locked_folder(config.out) if rank.is_first else nullcontext():
+        trainer, loader = prepare(config, data, init[0] if init else None, device, rank)
+        return _train_and_publish(config, resumed, report, data, trainer, loader)
+
+
+def _train_and_publish(
+    config: TrainConfig,
+    resumed: dict[str, Any] | None,
+    report: Report,
+    data: TrainingData,
+    trainer: Trainer,
+    loader: Loader,
+) -> ModelCard:
+    """Train in the folder of the run, from its newest checkpoint if it is resumed."""
+    is_first = read_rank().is_first
     checkpoints = list_checkpoints(config.out) if resumed is not None else []
     elapsed_s = load_checkpoint(checkpoints[-1], trainer) if checkpoints else 0.0
     barrier()  # the first process writes nothing until all have read the checkpoint
-    if resumed is not None and rank.is_first and read_config(config.out)[0] != config:
+    if resumed is not None and is_first and read_config(config.out)[0] != config:
         # Else a run that is stopped again would go on with the options it was started with.
         write_config(config, find_recipe(config.recipe), data.about)
     try:
         first_row = trainer.network.architecture.first_row
-        batches = cache_if_it_fits(loader, device, first_row=first_row)
+        batches = cache_if_it_fits(loader, trainer.device, first_row=first_row)
         train_loop(config, trainer, batches, elapsed_s, report)
-        if rank.is_first:
+        if is_first:
             finish(config, trainer, data)
         barrier()
         return read_card(config.out)

@@ -175,7 +175,9 @@ def _parse_metadata(text: str, number: str, deadline_ms: str | None) -> tuple[st
             f"a text message must be a JSON object with frame_id, deadline_ms or both, of at most "
             f"{MAX_TEXT} characters",
         )
-    frame_id = str(metadata.get("frame_id", number))
-    if not is_name(frame_id.encode()):
-        raise Problem(INVALID_REQUEST, "frame_id must be printable ASCII, 128 characters at most")
-    return frame_id, str(metadata["deadline_ms"]) if "deadline_ms" in metadata else deadline_ms
+    frame_id = metadata.get("frame_id", number)
+    if not isinstance(frame_id, str | int) or not is_name(str(frame_id).encode()):
+        raise Problem(
+            INVALID_REQUEST, "frame_id must be a string of printable ASCII, 128 characters at most"
+        )
+    return str(frame_id), str(metadata["deadline_ms"]) if "deadline_ms" in metadata else deadline_ms

@@ -30,6 +30,7 @@ class AsyncClient:
         """Raises ServiceError when `url` is not valid. Connects at the first request."""
         self._client = Client(url, timeout_s, token)
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="driverview-client")
+        self._closed = False
 
     async def features(
         self,
@@ -53,9 +54,11 @@ class AsyncClient:
         return await self._in_thread(self._client.ready)
 
     async def close(self) -> None:
-        """Close the connection and stop the thread."""
-        await self._in_thread(self._client.close)
-        self._thread.shutdown(wait=False)
+        """Close the connection and stop the thread; a second call does nothing."""
+        if not self._closed:
+            self._closed = True
+            await self._in_thread(self._client.close)
+            self._thread.shutdown(wait=False)
 
     async def __aenter__(self) -> "AsyncClient":
         return self

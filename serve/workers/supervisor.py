@@ -66,15 +66,31 @@ class Supervisor:
         """The folder of the model that is served."""
         return self._folder
 
-    async def start(self) -> dict[str, Any]:
-        """Start all workers; the first one's report of its engine. Raises UserError."""
+    async def start(self) -> dict[str, Any] | None:
+        """Start all workers; the first one's report of its engine, None if stopped meanwhile.
+
+        Raises UserError.
+        """
         loop = asyncio.get_running_loop()
         for number in (signal.SIGTERM, signal.SIGINT):
             loop.add_signal_handler(number, self._stopping.set)
+        # What is loaded now is new: there is nothing to reload or to replace.
+        loop.add_signal_handler(signal.SIGHUP, self._on_hangup, lambda: None)
+        loop.add_signal_handler(signal.SIGUSR2, lambda: None)
         for position in range(self._plan.workers):
             self._workers[position] = await self._start_worker(self._free_block())
+        loading = asyncio.gather(
+            *(worker.wait_loaded(0, LOAD_TIMEOUT_S) for worker in self._workers.values())
+        )
+        stopping = asyncio.ensure_future(self._stopping.wait())
+        await asyncio.wait((loading, stopping), return_when=asyncio.FIRST_COMPLETED)
+        stopping.cancel()
+        if not loading.done():
+            loading.cancel()
+            await self._stop_workers()
+            return None
         try:
-            reports = [await w.wait_loaded(0, LOAD_TIMEOUT_S) for w in self._workers.values()]
+            reports = await loading
         except UserError:
             await self._stop_workers()
             raise

@@ -33,6 +33,22 @@ class Broken:
     def update(self, observation):
         return 0.0
 
+class Forgetful:
+    def update(self, observation):
+        observation.to_lane_centre
+
+class Wordy:
+    def update(self, observation):
+        return "left"
+
+class Unstable:
+    def update(self, observation):
+        return float("nan")
+
+class Dividing:
+    def update(self, observation):
+        return 1 / 0
+
 number = 3
 """
 OWN_DATACLASS = """
@@ -111,4 +127,19 @@ def test_a_users_file_may_hold_a_dataclass_with_postponed_annotations(own: Path,
 def test_an_unusable_module_or_class_is_refused(own: Path, name: str, message: str) -> None:
     with pytest.raises(UserError, match=message) as caught:
         make_controller(name, LOOP)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("Forgetful", "returned None; it must return the steering action"),
+        ("Wordy", "returned 'left'"),
+        ("Unstable", "returned nan"),
+        ("Dividing", r"failed: ZeroDivisionError: .*own_law.py, line \d+"),
+    ],
+)
+def test_a_users_update_that_fails_is_one_line(own: Path, name: str, message: str) -> None:
+    with pytest.raises(UserError, match=message) as caught:
+        make_controller(f"own_law.py:{name}", LOOP).update(SEEN)
     assert "\n" not in str(caught.value)

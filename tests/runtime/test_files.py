@@ -8,7 +8,14 @@ from pathlib import Path
 
 import pytest
 
-from runtime.files import STAGED, atomic_write, check_folder, replaced_files, try_lock
+from runtime.files import (
+    STAGED,
+    atomic_write,
+    check_folder,
+    locked_folder,
+    replaced_files,
+    try_lock,
+)
 from trackfeatures import UserError
 
 
@@ -114,3 +121,12 @@ def test_without_its_last_file_a_part_is_never_taken(
     with pytest.raises(OSError, match="No space"):
         replace_with(tmp_path, "new", lambda: monkeypatch.setattr(Path, "replace", fail))
     assert contents(tmp_path) == {"a": "old", "z": "old"}
+
+
+def test_a_locked_folder_is_refused_to_others_until_the_context_ends(tmp_path: Path) -> None:
+    with locked_folder(tmp_path):
+        other = pytest.raises(UserError, match="another process is writing to")
+        with other, locked_folder(tmp_path):
+            pass
+    with locked_folder(tmp_path):
+        pass

@@ -23,6 +23,8 @@ from controllers.perception import Perceived
 from controllers.rl.actor import WEIGHTS, load_actor
 from controllers.rl.controller import SHIPPED
 from controllers.torcs_feedback import STEERING_LOCK
+from runtime.files import locked_folder
+from simulator.track.catalogue import OWN_TRACKS
 from tests.controllers.test_drive import at_rest
 from tests.typed import typed
 from trackfeatures import Heading, UserError
@@ -126,13 +128,35 @@ def test_a_trained_actor_is_driven_again_when_it_was_trained_further(
 def test_a_drive_on_a_model_depends_on_its_weights(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    config = short(tmp_path, perceptions="truth,model")
+    config = short(
+        tmp_path, tracks="oval", controllers="lqr", perceptions="truth,model,http://service"
+    )
     codes = []
     for weights in ("one", "other"):
         monkeypatch.setattr(comparison, "model_hash", lambda run, weights=weights: weights)
-        codes.append([fingerprint(config, "lqr", name) for name in ("truth", "model")])
+        monkeypatch.setattr(comparison, "service_model_hash", lambda url, weights=weights: weights)
+        codes.append([fingerprint(config, cell) for cell in cells(config)])
     assert codes[0][0] == codes[1][0]
     assert len({codes[0][0], codes[0][1], codes[1][1]}) == 3
+    assert codes[0][2] != codes[1][2]
+
+
+def test_a_drive_on_a_track_that_has_changed_is_driven_again(tmp_path: Path) -> None:
+    tracks = tmp_path / "tracks"
+    tracks.mkdir()
+    codes = set()
+    for name in ("oval", "town"):
+        shutil.copy(OWN_TRACKS / f"{name}.toml", tracks / "mine.toml")
+        config = short(tmp_path, tracks=str(tracks / "mine.toml"), controllers="lqr")
+        codes |= {fingerprint(config, cell) for cell in cells(config)}
+    assert len(codes) == 2
+
+
+def test_two_comparisons_do_not_write_to_one_folder(tmp_path: Path) -> None:
+    config = short(tmp_path, tracks="oval")
+    config.out.mkdir()
+    with locked_folder(config.out), pytest.raises(UserError, match="another process is writing to"):
+        compare(config)
 
 
 def test_a_drive_that_ends_early_has_no_better_quadratic_reward_for_it(tmp_path: Path) -> None:

@@ -55,5 +55,19 @@ def test_a_replay_finds_one_changed_bit_of_one_state(
     assert "/ego/state differs from frame 20 on" in problem
 
 
+def test_a_replay_finds_that_a_round_holds_more_frames(collected: Path, tmp_path: Path) -> None:
+    folder = shutil.copytree(collected, tmp_path / "data")
+    plan = json.loads((folder / "plan.json").read_text())
+    plan["rounds"][0]["frames"] -= 5
+    frames = plan["rounds"][0]["frames"]
+    (folder / "plan.json").write_text(json.dumps(plan))
+    _, problems = replay(folder, 1)
+    assert [f"differs from frame {frames} on" in problem for problem in problems] == [True, True]
+
+
+def test_pixels_without_a_replay_are_refused(collected: Path, refused: Callable[..., str]) -> None:
+    assert "give --replay N, too" in refused("verify", collected, "--level", "quick", "--pixels")
+
+
 def test_a_round_count_below_one_is_refused(collected: Path, refused: Callable[..., str]) -> None:
     assert "--replay is -1" in refused("verify", collected, "--level", "quick", "--replay", "-1")

@@ -191,3 +191,13 @@ def test_wrong_inputs_and_outputs_are_refused(
     write_jpeg(tmp_path / "a.jpg", 10)
     with pytest.raises(UserError, match=message):
         predict_files(engine, inputs, [Path(name) for name in outputs])
+
+
+def test_a_file_to_read_is_not_overwritten(tmp_path: Path, engine: BrightnessEngine) -> None:
+    film = write_film(tmp_path / "film.mp4", [10, 200])
+    before = film.read_bytes()
+    (tmp_path / "link").symlink_to(tmp_path)
+    for out in (film, tmp_path / "link" / "film.mp4"):
+        with pytest.raises(UserError, match=r"film.mp4 is a file to read; give another one"):
+            predict_files(engine, [str(film)], [out])
+    assert film.read_bytes() == before

@@ -28,6 +28,7 @@ from mtlnet.training.loop import Stopped, TrainProgress
 from mtlnet.training.recipes import RECIPES, learning_rate
 from mtlnet.training.run import require_new, train
 from mtlnet.training.trainer import Trainer
+from runtime.files import locked_folder
 from tests.mtlnet.conftest import write_dataset
 from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
@@ -305,6 +306,16 @@ def test_a_run_is_not_resumed_with_another_seed_or_other_data(
     list_checkpoints(run.out)[-1].write_bytes(b"rubbish")
     with pytest.raises(ModelError, match="cannot be read"):
         train(resumed, data)
+
+
+@pytest.mark.usefixtures("small_network")
+def test_a_run_is_not_trained_by_two_processes(dataset: Path, tmp_path: Path) -> None:
+    run = config(dataset, tmp_path / "run", iterations=1)
+    train(run, None)
+    resumed, data = resume_config(run.out, {"iterations": 2})
+    with locked_folder(run.out), pytest.raises(UserError, match="another process is writing to"):
+        train(resumed, data)
+    assert train(resumed, data).iterations == 2
 
 
 @pytest.mark.usefixtures("small_network")

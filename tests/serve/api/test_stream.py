@@ -58,12 +58,14 @@ def test_each_frame_is_answered_as_over_http(service: Served) -> None:
         socket.send(json.dumps({"frame_id": "mine"}))
         socket.send(JPEG)
         assert read(socket)["frame_id"] == "mine"
-        for text in ("[]", "{", '{"other": 1}', json.dumps({"frame_id": "x" * 129})):
+        unusable = ("x" * 129, None, 1.5)
+        names = [json.dumps({"frame_id": name}) for name in unusable]
+        for text in ("[]", "{", '{"other": 1}', *names):
             socket.send(text)
             socket.send(JPEG)
             assert read(socket)["type"] == "/problems/invalid-request"
         socket.send(JPEG)
-        assert read(socket)["frame_id"] == "9"
+        assert read(socket)["frame_id"] == "11"
 
 
 def test_messagepack_by_subprotocol_and_options_by_query(service: Served) -> None:

@@ -143,6 +143,15 @@ def test_asyncio_clients_ask_concurrently(service: Served) -> None:
     assert [answer["frame_id"] for answer in answers] == ["0", "1", "2", "3"]
 
 
+def test_an_asyncio_client_may_be_closed_twice(service: Served) -> None:
+    async def close_early() -> None:
+        async with AsyncClient(service.url) as client:
+            assert await client.ready()
+            await client.close()
+
+    asyncio.run(close_early())
+
+
 def test_a_refusal_carries_the_problem(service: Served) -> None:
     with Client(service.url) as client:
         with pytest.raises(ServiceError, match="4 bytes that begin with b'text'") as caught:

@@ -2,6 +2,8 @@
 
 import asyncio
 import json
+import os
+import signal
 import socket
 from pathlib import Path
 from typing import Any
@@ -42,6 +44,8 @@ class FakeWorkers:
         self.started: list[WorkerProcess] = []
         self.failing_folders: set[str] = set()
         self.is_ready = True
+        self.is_loading = False
+        """Whether workers load for ever."""
         self._tasks: set[asyncio.Task[None]] = set()
 
     async def start(self, task: WorkerTask) -> WorkerProcess:
@@ -52,7 +56,8 @@ class FakeWorkers:
         self.started.append(worker)
         run = asyncio.ensure_future(self._run(task, theirs))
         self._tasks.add(run)
-        await worker.wait_loaded(task.generation, PATIENCE_S)
+        if not self.is_loading:
+            await worker.wait_loaded(task.generation, PATIENCE_S)
         return worker
 
     async def _run(self, task: WorkerTask, connection: socket.socket) -> None:
@@ -61,6 +66,8 @@ class FakeWorkers:
         def send(**message: object) -> None:
             writer.write(json.dumps(message).encode() + b"\n")
 
+        if self.is_loading:
+            return
         send(loaded=task.generation, model="a" * 64, engine="fake", precision="f32")
         if self.is_ready:
             send(ready=True)
@@ -84,6 +91,26 @@ def workers(monkeypatch: pytest.MonkeyPatch) -> FakeWorkers:
 def make_supervisor(folder: Path) -> Supervisor:
     plan = ServicePlan("run", lambda name: folder / name, 2, Limits())
     return Supervisor(plan, bind("127.0.0.1", 0))
+
+
+def test_a_stop_is_obeyed_while_the_model_is_loaded_and_a_reload_is_not_needed(
+    workers: FakeWorkers, tmp_path: Path
+) -> None:
+    workers.is_loading = True
+
+    async def start_and_stop() -> object:
+        supervisor = make_supervisor(tmp_path)
+        starting = asyncio.ensure_future(supervisor.start())
+        while len(workers.started) < 2:
+            await asyncio.sleep(0.01)
+        for number in (signal.SIGHUP, signal.SIGUSR2, signal.SIGTERM):
+            assert not starting.done()
+            os.kill(os.getpid(), number)
+            await asyncio.sleep(0.05)
+        return await asyncio.wait_for(starting, PATIENCE_S)
+
+    assert asyncio.run(start_and_stop()) is None
+    assert not any(worker.alive for worker in workers.started)
 
 
 def test_a_reload_after_a_failed_reload_loads_the_model(
