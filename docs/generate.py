@@ -85,12 +85,24 @@ def operations() -> str:
 
 
 def answer() -> str:
-    """The fields of the answer of `POST /features`."""
+    """The fields of the answer of `POST /features`, those of its objects too."""
     schemas = _openapi()["components"]["schemas"]
     rows = ["| field | |", "|---|---|"]
     for name, field in schemas["Features"]["properties"].items():
-        rows.append(f"| `{name}` | {_cell(field.get('description'))} |")
+        schema = _object(schemas, field)
+        about = (schema.get("description", "").rstrip("."), field.get("description"))
+        rows.append(f"| `{name}` | {_cell('; '.join(filter(None, about)))} |")
+        for part, found in schema.get("properties", {}).items():
+            rows.append(f"| `{name}.{part}` | {_cell(found.get('description'))} |")
     return "\n".join(rows)
+
+
+def _object(schemas: dict[str, Any], field: dict[str, Any]) -> dict[str, Any]:
+    """The schema of the object that a field holds, {} where it holds none."""
+    for kind in (field, *field.get("anyOf", ())):
+        if "$ref" in kind:
+            return dict(schemas[kind["$ref"].rpartition("/")[2]])
+    return {}
 
 
 def problems() -> str:

@@ -38,9 +38,9 @@ class Distances(BaseModel):
 class HeadingProbabilities(BaseModel):
     """Probabilities that the road bends left, goes straight, bends right; they sum to 1."""
 
-    left: float
-    straight: float
-    right: float
+    left: float = Field(description="of a bend to the left")
+    straight: float = Field(description="of a straight road")
+    right: float = Field(description="of a bend to the right")
 
 
 class Deviations(Distances):
@@ -54,19 +54,19 @@ class AbsentProbabilities(BaseModel):
     """Probability that each marking is absent; above 0.5 its distance is null."""
 
     ml: float = Field(description="equal to that of mr: a lane has both or none")
-    mr: float
-    l: float
-    m: float
-    r: float
+    mr: float = Field(description="right marking of the car's lane")
+    l: float = Field(description="next marking left of the one driven on")
+    m: float = Field(description="marking the car is driving on")
+    r: float = Field(description="next marking right of the one driven on")
 
 
 class Timing(BaseModel):
     """Time of each stage, ms. `queue` and `total` include receiving the body."""
 
     queue: float = Field(description="from the start of the request to the start of decoding")
-    decode: float
-    forward: float
-    total: float
+    decode: float = Field(description="of the image, with cropping and resizing")
+    forward: float = Field(description="of the network")
+    total: float = Field(description="from the start of the request to the answer")
 
 
 class Features(BaseModel):
@@ -91,8 +91,8 @@ class Features(BaseModel):
     )
     model: str = Field(description="hash of the weights that were used")
     definitions_version: str = Field(description="version of the definitions of the features")
-    engine: str
-    precision: str
+    engine: str = Field(description="openvino or torch")
+    precision: str = Field(description="f32, bf16 or int8")
     crop_px: list[int] | None = Field(
         description="left, top, width, height of the part of the image that is used, px; null: all",
         min_length=4,
