@@ -64,7 +64,7 @@ def on_ray(model: Path, token_file: Path, replicas: int) -> Iterator[int]:
 
 
 @pytest.mark.slow
-@pytest.mark.alone
+@pytest.mark.extended
 def test_answers_of_two_replicas_equal_the_engines(published: Path, tmp_path: Path) -> None:
     pytest.importorskip("ray.serve", reason="no ray[serve]")
     (tmp_path / "token").write_text(TOKEN)

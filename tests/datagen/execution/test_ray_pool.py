@@ -75,6 +75,7 @@ def test_only_a_cluster_that_is_named_is_joined(
     assert all("num_cpus" not in options for options in asked if address)
 
 
+@pytest.mark.extended
 def test_a_changed_track_ends_the_collection_at_once(tmp_path: Path) -> None:
     pytest.importorskip("ray")
     (job,) = make_jobs(tmp_path, rounds=1, frames=10)

@@ -31,6 +31,7 @@ COMMAND = [*TORCHRUN, "-m", "mtlnet", "train"]
 
 
 @pytest.mark.slow
+@pytest.mark.extended
 def test_two_processes_take_the_steps_of_one(dataset: Path, tmp_path: Path) -> None:
     one, two = tmp_path / "one", tmp_path / "two"
     given = {"recipe": "paper", "iterations": 10, "batch": 8, "seed": 3, "threads": 1}
