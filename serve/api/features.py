@@ -36,13 +36,8 @@ from serve.api.request_options import (
 from serve.observability.logs import RefusalLog, log_answer
 from serve.observability.metrics import Metrics
 from serve.scheduling.body_budget import BodyBudget, BodyShare
-from serve.scheduling.frame_queue import (
-    Frame,
-    FrameQueue,
-    FrameResult,
-    PixelReader,
-    ResultCallback,
-)
+from serve.scheduling.fair_queue import Frame, FrameResult, PixelReader, ResultCallback
+from serve.scheduling.frame_queue import FrameQueue
 from serve.scheduling.streams import stream_key
 from trackfeatures.camera import CameraParameters
 
@@ -78,7 +73,7 @@ class FrameHandler:
         """
         self.queue.check_ready()
         if options.stream is None:
-            self.queue.check_capacity()  # an overloaded worker does not parse images
+            self.queue.check_capacity(client)  # an overloaded worker does not parse images
         camera, fov = self.queue.loaded.engine.card.camera, options.fov_y_deg
         header = inspect(body, camera, fov)
         read_ms = header.decode_ms
@@ -157,7 +152,8 @@ class FeaturesRequest:
         self._request_id = request_id_of(headers)
         try:
             if b"x-stream-id" not in headers:
-                self._frames.queue.check_capacity()  # an overloaded worker reads no bodies
+                # An overloaded worker reads no bodies.
+                self._frames.queue.check_capacity(self._client)
             self._options = parse_options(headers, stamp_ns, self._request_id)
             check_image_headers(headers)
         except Problem as problem:

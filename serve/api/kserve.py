@@ -43,7 +43,7 @@ from serve.api.request_options import (
     request_id_of,
 )
 from serve.api.schemas import REFUSALS, header_parameters, problem_responses
-from serve.scheduling.frame_queue import PixelReader
+from serve.scheduling.fair_queue import PixelReader
 
 NAME, VERSION = "track", "1"
 HEADER = "Inference-Header-Content-Length"
@@ -145,14 +145,14 @@ async def _answer(
     options = parse_options(without_accept, stamp_ns, request_id)
     check_body_headers(headers)
     frames.queue.check_ready()
+    client = client_address(request.scope)
     if options.stream is None:
-        frames.queue.check_capacity()  # an overloaded worker reads and parses nothing
+        frames.queue.check_capacity(client)  # an overloaded worker reads and parses nothing
     share = frames.share()
     try:
         body = await read_body(request.receive, share.grow)
         infer_request, binary = parse_request(body, headers.get(HEADER.lower().encode()))
         read, read_ms = _pixel_reader(infer_request, binary, frames, options.fov_y_deg)
-        client = client_address(request.scope)
         result = await frames.predict_pixels(options, client, read, read_ms)
     finally:
         share.close()

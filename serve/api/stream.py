@@ -13,6 +13,7 @@ import contextlib
 import logging
 import time
 from dataclasses import dataclass, replace
+from http import HTTPStatus
 from typing import Any
 from urllib.parse import parse_qs
 
@@ -42,13 +43,15 @@ from serve.scheduling.rate_limit import RateLimiter
 
 PATH = "/stream"
 PROTOCOLS = {"driverview.json": JSON, "driverview.msgpack": MSGPACK}
+# Else a client that floods the service with refused messages would delay all others.
+REFUSAL_PAUSE_S, BUSY_PAUSE_S = 0.01, 0.002
 MAX_TEXT = 1024  # characters of a text message
 MAX_PENDING = 8  # frames of one WebSocket whose answers are not sent; then no more is received
 
 logger = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class StreamOptions:
     """The options of a WebSocket, from its handshake; `deadline_ms` as the client sent it."""
 
@@ -56,6 +59,8 @@ class StreamOptions:
     protocol: str | None
     deadline_ms: str | None
     client: str
+    pause_s: float = 0.0
+    """Before the next message is received: the last one was refused."""
 
 
 class Stream:
@@ -95,6 +100,9 @@ class Stream:
             pending.add(task)
             task.add_done_callback(pending.discard)
             await asyncio.sleep(0)  # queue this frame before the next one is received
+            if options.pause_s:
+                await asyncio.sleep(options.pause_s)
+                options.pause_s = 0.0
             if len(pending) >= MAX_PENDING:
                 await asyncio.wait(pending, return_when=asyncio.FIRST_COMPLETED)
         for task in pending:
@@ -125,7 +133,10 @@ class Stream:
             )
             content = await self._frames.predict_file(options, message["bytes"], stream.client)
         except (Problem, ImageError) as error:
-            content = self._frames.record_refusal(error, request_id, stream.client).content
+            problem = self._frames.record_refusal(error, request_id, stream.client)
+            content = problem.content
+            is_busy = problem.type.status == HTTPStatus.SERVICE_UNAVAILABLE
+            stream.pause_s = BUSY_PAUSE_S if is_busy else REFUSAL_PAUSE_S
         except Exception:
             logger.exception("request %s failed", request_id)
             problem = internal_error()

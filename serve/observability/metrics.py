@@ -9,7 +9,7 @@ from bisect import bisect_left
 from collections.abc import Iterator
 
 from serve.api.problems import PROBLEM_TYPES, ProblemType
-from serve.scheduling.frame_queue import FrameResult
+from serve.scheduling.fair_queue import FrameResult
 from serve.workers.shared_memory import (
     CLOSED_COUNTS,
     CONNECTIONS,

@@ -21,7 +21,7 @@ from serve.api.http_io import Message, Receive, Reply, Scope, Send
 from serve.api.kserve import MODELS
 from serve.api.problems import Problem
 from serve.api.request_options import Headers, RequestOptions
-from serve.scheduling.frame_queue import FrameResult
+from serve.scheduling.fair_queue import FrameResult
 
 App = Callable[[Scope, Receive, Send], Awaitable[None]]
 INFER_PATHS = {f"{model}/infer" for model in MODELS}

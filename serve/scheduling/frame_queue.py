@@ -3,6 +3,7 @@
 An engine is neither re-entrant nor thread-safe, and a frame that waits for long is of no use to a
 controller, so a frame that does not fit into the queue is refused at once. A newer frame of a
 stream replaces the queued one; a frame whose deadline has passed is dropped before it is decoded.
+Clients take turns (`serve.scheduling.fair_queue`).
 
 A small frame that arrives alone at a fast engine is processed on the event loop itself: handing it
 to another thread and back costs more than everything else beside the model. Frames that arrive
@@ -13,32 +14,25 @@ import asyncio
 import logging
 import threading
 import time
-from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import dataclass
+from functools import partial
 from queue import SimpleQueue
-
-import numpy as np
-from numpy.typing import NDArray
 
 import trackfeatures as tf
 from mtlnet.inference.engine import Engine
-from mtlnet.inference.prediction import Prediction, decode_outputs
+from mtlnet.inference.prediction import decode_outputs
 from serve.api.problems import DEADLINE_PASSED, NOT_READY, OVERLOADED, SUPERSEDED, Problem
 from serve.scheduling.admission import Admission
+from serve.scheduling.fair_queue import FairQueue, Frame, FrameResult, ResultCallback, Slot
 from serve.scheduling.streams import StreamTable
-from trackfeatures.camera import CameraParameters
 
 SMOOTHING = 0.1  # weight of the latest frame in the running mean of the time per frame
 INLINE_MAX_MS = 10.0  # a frame may block the event loop for so long
 LARGE_MS = 30.0  # an image that takes longer to decode needs an admission: 3 Mpx of JPEG
 INLINE_AFTER = 8  # frames in a row within INLINE_MAX_MS before the event loop runs the engine
 logger = logging.getLogger(__name__)
-
-PixelReader = Callable[[CameraParameters], NDArray[np.uint8]]
-"""Gives the pixels (height, width, 3), RGB, as the model's camera sees them."""
-ResultCallback = Callable[["FrameResult | Exception"], None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,44 +62,6 @@ class StagedEngine:
     is_committed: Callable[[], bool]
 
 
-@dataclass(frozen=True, slots=True)
-class FrameResult:
-    """The prediction for a frame, the engine it came from, and the time of each stage, ms."""
-
-    prediction: Prediction
-    provenance: dict[str, str]
-    queue_ms: float
-    decode_ms: float
-    forward_ms: float
-
-
-@dataclass(frozen=True, slots=True)
-class Frame:
-    """An image to process. Times are ns of the monotonic clock.
-
-    `stream` 0: it belongs to no stream. `small`: it is decoded in less time than the engine takes;
-    others are admitted by `cost_ms`, the estimated time of decoding.
-    """
-
-    read: PixelReader
-    stamp_ns: int
-    stream: int = 0
-    deadline_ns: int | None = None
-    small: bool = False
-    client: str = ""
-    cost_ms: float = 0.0
-
-
-class Slot:
-    """A place in the queue: the frame that holds it, and the callback for its result."""
-
-    __slots__ = ("frame", "on_result")
-
-    def __init__(self, frame: Frame, on_result: ResultCallback) -> None:
-        self.frame = frame
-        self.on_result = on_result
-
-
 class FrameQueue:
     """Processes frames with one engine, one at a time. Start it in a running event loop.
 
@@ -130,7 +86,7 @@ class FrameQueue:
         self._streams = streams
         self._capacity = capacity
         self._admission = Admission()
-        self._waiting: deque[Slot] = deque()
+        self._waiting = FairQueue()
         self._queue_lock = threading.Lock()  # guards the slots above, for a few instructions
         self._thread_busy = False  # the thread is processing a frame
         self._dispatched = False  # the loop or the thread is about to look at the queue
@@ -198,10 +154,12 @@ class FrameQueue:
         """Whether a frame that replaces no other would be refused."""
         return len(self._waiting) + self._thread_busy > self._capacity
 
-    def check_capacity(self) -> None:
-        """Raise Problem when the queue is full."""
+    def check_capacity(self, client: str) -> None:
+        """Raise Problem when the queue is full and none of it gives way to a client's frame."""
         if self.full:
-            raise self._overloaded()
+            with self._queue_lock:
+                if self._waiting.giving_way_to(client) is None:
+                    raise self._overloaded()
 
     def submit(self, frame: Frame, on_result: ResultCallback) -> None:
         """Queue a frame; `on_result` is called on the loop with its result or its error.
@@ -213,50 +171,56 @@ class FrameQueue:
         if frame.cost_ms > LARGE_MS:
             done = self._admission.admit(frame.client, frame.cost_ms, frame.stamp_ns)
             try:
-                superseded = self._enqueue(frame, _after(done, on_result))
+                refuse = self._enqueue(frame, _after(done, on_result))
             except Problem:
                 done()
                 raise
         else:
-            superseded = self._enqueue(frame, on_result)
-        if superseded is not None:
-            superseded(Problem(SUPERSEDED, "a newer frame of this stream arrived"))
+            refuse = self._enqueue(frame, on_result)
+        if refuse is not None:
+            refuse()
         if frame.stream:
             self._streams.announce(frame.stream, frame.stamp_ns)
 
-    def _enqueue(self, frame: Frame, on_result: ResultCallback) -> ResultCallback | None:
-        """Queue a frame; the callback of a frame that is superseded, if any. Raises Problem."""
+    def _enqueue(self, frame: Frame, on_result: ResultCallback) -> Callable[[], None] | None:
+        """Queue a frame; what refuses the one in whose place it is, if any. Raises Problem."""
         with self._queue_lock:
             superseded = self._supersede(frame, on_result) if frame.stream else None
-            if superseded is None:
-                self.check_capacity()
-                self._waiting.append(Slot(frame, on_result))
-                if not self._dispatched:
-                    self._dispatched = True
-                    # Not at once: first the loop reads all requests that have arrived.
-                    self._loop.call_soon(self._dispatch)
-        return superseded
+            if superseded is not None:
+                problem = Problem(SUPERSEDED, "a newer frame of this stream arrived")
+                return partial(superseded, problem)
+            slot = Slot(frame, on_result)
+            last = self._waiting.giving_way_to(frame.client) if self.full else None
+            if last is not None:
+                self._waiting.remove(last)
+            elif self.full:
+                raise self._overloaded()
+            self._waiting.append(slot)
+            if not self._dispatched:
+                self._dispatched = True
+                # Not at once: first the loop reads all requests that have arrived.
+                self._loop.call_soon(self._dispatch)
+            return None if last is None else partial(last.on_result, self._overloaded())
 
     def _supersede(self, frame: Frame, on_result: ResultCallback) -> ResultCallback | None:
         """Put a frame into its stream's slot; the callback of the older of the two, if any."""
-        for slot in self._waiting:
-            if slot.frame.stream != frame.stream:
-                continue
-            if slot.frame.stamp_ns > frame.stamp_ns:
-                return on_result
-            superseded = slot.on_result
-            slot.frame, slot.on_result = frame, on_result
-            return superseded
-        return None
+        slot = self._waiting.of_stream(frame.stream)
+        if slot is None:
+            return None
+        if slot.frame.stamp_ns > frame.stamp_ns:
+            return on_result
+        superseded = slot.on_result
+        slot.frame, slot.on_result = frame, on_result
+        return superseded
 
     def _dispatch(self) -> None:
         """Process a single small frame here, on the loop; leave everything else to the thread."""
-        alone = len(self._waiting) == 1 and self._waiting[0].frame.small
         fast = self._fast_frames >= INLINE_AFTER and self.loaded is self._fast_engine
-        if not (alone and fast):
+        if not (self._waiting.only_small and fast):
             self._wake_ups.put(True)
             return
-        slot = self._waiting.popleft()
+        with self._queue_lock:
+            slot = self._waiting.take()
         result = self._process(slot.frame)
         self._dispatched = False
         slot.on_result(result)
@@ -292,7 +256,7 @@ class FrameQueue:
         """The next slot for the thread; None: the queue is empty."""
         with self._queue_lock:
             self._thread_busy = self._dispatched = bool(self._waiting)
-            return self._waiting.popleft() if self._waiting else None
+            return self._waiting.take() if self._waiting else None
 
     def _process(self, frame: Frame) -> "FrameResult | Exception":
         try:

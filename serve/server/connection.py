@@ -15,6 +15,7 @@ from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol, RequestResp
 
 from serve.api.http_io import encode_head, problem_reply
 from serve.api.problems import (
+    BODY_TOO_LARGE,
     HEAD_TOO_LARGE,
     MALFORMED,
     OVERLOADED,
@@ -32,6 +33,8 @@ WORK_S = 2e-3 * MAX_DEADLINE_MS  # after which an answer that is not sent never 
 MAX_PIPELINED = 16  # requests of one connection that wait for the reply to another
 MAX_AT_ONCE = 128  # requests received in one part: more would hold the event loop
 MAX_UPGRADES = 4  # offered in one part
+# A body may have so many chunks, and one more for each CHUNK_BYTES: small ones take as much time.
+FREE_CHUNKS, CHUNK_BYTES = 512, 512
 UPGRADE_HEADERS = frozenset({b"upgrade", b"http2-settings"})
 
 
@@ -52,6 +55,7 @@ class GuardedProtocol(HttpToolsProtocol):
         super().__init__(*arguments, **named)
         self._guard = guard
         self.group: Group = {}
+        self.network = ""
         self.since_s = 0.0  # when this phase began
         self._phase = Phase.HEAD
         self._settled: Phase | None = None  # the phase whose group and deadline it has
@@ -61,7 +65,7 @@ class GuardedProtocol(HttpToolsProtocol):
         self._upgrading = False
         self._running: Any = None  # the request being answered; `cycle` is the last one received
         self._fault: Problem | None = None  # with which a callback has stopped the parser
-        self._trailer_bytes = 0
+        self._trailer_bytes = self._chunks = 0
         self._part_bytes = self._part_requests = 0  # received last
         # Received since the last complete request, with the part in which that request ended.
         self._unread_bytes = 0
@@ -74,10 +78,11 @@ class GuardedProtocol(HttpToolsProtocol):
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         super().connection_made(transport)
+        self._guard.admit(self, self.client[0] if self.client else "")
         self._settle()
         guard, limit = self._guard, self._guard.limits.connections
         count = len(self.connections) - len(guard.leaving) + guard.other_connections()
-        if count > limit and not guard.make_room(count - limit):
+        if count > limit and not guard.make_room(count - limit, self):
             detail = f"{limit} connections are open; use one connection for all requests"
             self._close_with(Problem(TOO_MANY_CONNECTIONS, detail))
 
@@ -93,9 +98,9 @@ class GuardedProtocol(HttpToolsProtocol):
         self._part_requests = 0
         self._unread_bytes += self._part_bytes
         try:
-            self.parser.feed_data(data)
-        except HttpParserUpgrade as upgrade:
-            self._feed_again(data[upgrade.args[0] :])
+            upgrade_at = self._feed(data)
+            if upgrade_at is not None:
+                self._feed_again(data[upgrade_at:])
         except HttpParserError:
             self.send_400_response("")
         # Headers and trailers that have not ended yet are counted as they arrive.
@@ -105,20 +110,22 @@ class GuardedProtocol(HttpToolsProtocol):
         if self._settled is not self._phase:
             self._settle()
 
+    def _feed(self, data: bytes) -> int | None:
+        """Parse; the offset of what follows the headers of a request with an upgrade, or None."""
+        try:
+            self.parser.feed_data(data)
+        except HttpParserUpgrade as upgrade:
+            return int(upgrade.args[0])
+        return None
+
     def _feed_again(self, rest: bytes) -> None:
         """Parse the rest of a part after the headers of a request with an upgrade."""
         for _ in range(MAX_UPGRADES):
             rest = self._upgrade(rest)
-            if not rest:
+            upgrade_at = self._feed(rest) if rest else None
+            if upgrade_at is None:
                 return
-            try:
-                self.parser.feed_data(rest)
-                return
-            except HttpParserUpgrade as upgrade:
-                rest = rest[upgrade.args[0] :]
-            except HttpParserError:
-                self.send_400_response("")
-                return
+            rest = rest[upgrade_at:]
         self._close_with(too_many_requests(f"{MAX_UPGRADES} upgrades"))
 
     def on_header(self, name: bytes, value: bytes) -> None:
@@ -137,7 +144,7 @@ class GuardedProtocol(HttpToolsProtocol):
         """Wait for the body. Raises ValueError, for the parser, on too large headers."""
         if self._unread_bytes > MAX_HEAD_BYTES:
             self._check_head_size()
-        self._trailer_bytes = 0
+        self._trailer_bytes = self._chunks = 0
         self._phase = Phase.BODY
 
     def begin_upgrade(self) -> None:
@@ -155,6 +162,13 @@ class GuardedProtocol(HttpToolsProtocol):
         super().on_headers_complete()
         if self._guard.draining and self.cycle is not None:
             self.cycle.keep_alive = False
+
+    def on_chunk_header(self) -> None:
+        """Count the chunks of a body. Raises ValueError, for the parser, when they are too many."""
+        self._chunks += 1
+        if self._chunks > FREE_CHUNKS + self._unread_bytes // CHUNK_BYTES:
+            detail = f"the body comes in chunks of under {CHUNK_BYTES} bytes; send larger ones"
+            self.stop_parser(Problem(BODY_TOO_LARGE, detail))
 
     def on_body(self, body: bytes) -> None:
         self._known_bytes = self._unread_bytes
@@ -276,6 +290,7 @@ class GuardedProtocol(HttpToolsProtocol):
         websocket = GuardedWebSocket(
             self.config, self.server_state, self.app_state, self.loop, guard=self._guard
         )
+        websocket.network = self.network
         websocket.connection_made(self.transport)
         self.transport.set_protocol(websocket)
         websocket.data_received(head)

@@ -4,18 +4,20 @@ Each connection is in one group, by what it waits for; within a group those that
 longest come first. While the service has as many connections as it takes, a new one ends another:
 one that is being dismissed, one that sends its request slowly, the one that has been idle for
 longest, a WebSocket without messages. One whose last image was answered goes after those that have
-sent none.
+sent none. A client with many connections cannot end those of one with fewer; it gives way to it.
 """
 
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
+from ipaddress import ip_address, ip_network
 from typing import Protocol
 
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
 from serve.api.problems import TOO_MANY_CONNECTIONS, ProblemType
-from serve.config import Limits
+from serve.config import Limits, network_of
 from serve.scheduling.body_budget import BodyBudget
 
 LINGER_S = 0.5  # for a client to read the problem before its connection is closed
@@ -28,6 +30,8 @@ class Guarded(Protocol):
 
     since_s: float
     group: "Group"
+    network: str
+    """Of its client; empty for a trusted proxy, which has many clients."""
 
     def give_way(self) -> None:
         """End the connection: a new one needs its place."""
@@ -75,8 +79,16 @@ class ConnectionGuard:
     """Refused, and open for LINGER_S only so that the client can read why."""
     leaving: Group = field(default_factory=_group)
     """Ended, but still counted by the server for a moment."""
+    open: Counter[str] = field(default_factory=Counter)
+    """Connections by the network of their client."""
     paused: list[HttpToolsProtocol] = field(default_factory=list)
     """Connections that are not read because they were refused while the queue is full."""
+
+    def admit(self, connection: Guarded, address: str) -> None:
+        """Count a new connection from an address."""
+        if not _is_any_of(address, self.limits.trusted_proxies):
+            connection.network = network_of(address)
+            self.open[connection.network] += 1
 
     def place(self, connection: Guarded, group: Group) -> float:
         """Move a connection to the end of a group; the time, s."""
@@ -91,26 +103,48 @@ class ConnectionGuard:
         connection.group.pop(connection, None)
         if self.reading is connection:
             self.reading = None
+        if connection.network:
+            self.open[connection.network] -= 1
+            if not self.open[connection.network]:
+                del self.open[connection.network]
 
-    def make_room(self, excess: int) -> bool:
-        """End `excess` connections, the least useful first; False: not so many give way."""
-        now = self.clock()
-        for group, least_s in (
-            (self.dismissed, 0.0),
-            (self.receiving, EVICTABLE_S),
-            (self.idle, 0.0),
-            (self.served, 0.0),
-            (self.streams, self.limits.idle_s),
+    def make_room(self, excess: int, newcomer: Guarded) -> bool:
+        """End `excess` connections, the least useful first; False: not so many give way.
+
+        Those of clients with fewer connections than the newcomer's stay; when all others are too
+        young, those of clients with more are ended.
+        """
+        least = self._count(newcomer)
+        for group, age_s, count in (
+            (self.dismissed, 0.0, 0),
+            (self.receiving, EVICTABLE_S, least),
+            (self.idle, 0.0, least),
+            (self.served, 0.0, least),
+            (self.streams, self.limits.idle_s, least),
+            (self.receiving, 0.0, least + 1),
+            (self.streams, 0.0, least + 1),
         ):
-            while excess > 0 and group:
-                oldest = next(iter(group))
-                if now - oldest.since_s < least_s:
-                    break
-                oldest.give_way()
-                self.place(oldest, self.leaving)
-                self.count_closed(TOO_MANY_CONNECTIONS)
-                excess -= 1
+            if excess > 0:
+                excess -= self._end_oldest(group, excess, age_s, count)
         return excess <= 0
+
+    def _end_oldest(self, group: Group, most: int, age_s: float, count: int) -> int:
+        """End up to `most` connections of an age, and of clients with `count` or more; how many."""
+        now, ended = self.clock(), 0
+        for connection in list(group):
+            if ended == most or now - connection.since_s < age_s:
+                break
+            if self._count(connection) < count:
+                continue
+            connection.give_way()
+            self.place(connection, self.leaving)
+            self.count_closed(TOO_MANY_CONNECTIONS)
+            ended += 1
+        return ended
+
+    def _count(self, connection: Guarded) -> int:
+        """How many connections its client has; a trusted proxy counts as many clients."""
+        return self.open[connection.network] if connection.network else 1
 
     def end_slow_bodies(self, size: float) -> float:
         """End connections whose bodies arrive slowly, until these held `size` bytes; how many.
@@ -141,6 +175,14 @@ class ConnectionGuard:
         for connection in paused:
             if not (connection.transport.is_closing() or connection.flow.write_paused):
                 connection.flow.resume_reading()
+
+
+def _is_any_of(address: str, networks: Iterable[str]) -> bool:
+    try:
+        found = ip_address(address.partition("%")[0])
+    except ValueError:  # no address, as that of a Unix socket
+        return False
+    return any(found in ip_network(network, strict=False) for network in networks)
 
 
 def close_expired(connections: Iterable[object], now: float) -> None:

@@ -30,7 +30,7 @@ from serve.server import guard as guards
 from serve.server.guard import ConnectionGuard, Group
 
 SLICE_BYTES = 4096  # parsed before small frames are counted; holds hundreds of them
-SMALL_BYTES = 256  # a frame of fewer is a small one
+SMALL_BYTES = 1024  # a frame of fewer is a small one
 SMALL_FRAMES = 500  # a second, and at once
 
 
@@ -41,6 +41,7 @@ class GuardedWebSocket(WebSocketsSansIOProtocol):
         super().__init__(*arguments, **named)
         self._guard = guard
         self.group: Group = {}
+        self.network = ""
         self.since_s = 0.0  # the time of its last message
         self._discarding = False
         self._handshake_end_s = self._message_end_s = inf
@@ -109,6 +110,7 @@ class GuardedWebSocket(WebSocketsSansIOProtocol):
     def _refuse_handshake(self, error: Exception) -> None:
         """Answer what websockets would leave unanswered."""
         self.conn.data_to_send()  # its reply to some of them, in plain text
+        self.conn.handshake_exc = None  # its traceback holds this object
         problem = Problem(MALFORMED, "this is not the handshake of a WebSocket (RFC 6455, 4.1)")
         if isinstance(error, RequestLineTooLong | HeaderLineTooLong | TooManyHeaders):
             problem = Problem(HEAD_TOO_LARGE, f"the handshake is too large: {error}")

@@ -24,12 +24,16 @@ from serve.config import MAX_BODY_BYTES, Limits
 from serve.server.connection import GuardedProtocol
 from serve.server.fast_path import DirectProtocol
 from serve.server.guard import ConnectionGuard, close_expired
+from serve.server.heap import HeapTrimmer
 from serve.server.websocket import GuardedWebSocket
 from serve.workers.shared_memory import WorkerPeers
 
 GRACE_S = 5  # for requests in progress when the service stops
 DRAIN_S = 1.0  # for active clients to send one more request, answered with Connection: close
 YIELD_S = 0.002  # for which a worker leaves a connection to one that has fewer
+ACCEPTS_AT_ONCE, ACCEPTS_PER_S = 32, 1_000  # more would delay the requests of other clients
+ACCEPT_PAUSE_S = 0.004  # for which no connection is accepted when there were too many
+TRIM_TICKS = 50  # every 5 s free memory is given back to the system
 NO_DESCRIPTOR_PAUSE_S = 0.1  # after the system has run out of file descriptors
 
 logger = logging.getLogger(__name__)
@@ -50,6 +54,8 @@ class WorkerServer(uvicorn.Server):
         self.app = app
         self._peers = peers or WorkerPeers(app.shared, 0)
         self._yielded = False
+        self._accepts, self._accepts_counted_s = float(ACCEPTS_AT_ONCE), 0.0
+        self._trim_heap = HeapTrimmer()
 
     @contextmanager
     def capture_signals(self) -> Iterator[None]:
@@ -86,6 +92,8 @@ class WorkerServer(uvicorn.Server):
         """Close expired connections and publish the status; called ten times a second."""
         close_expired(self.server_state.connections, self.guard.clock())
         self._publish_status()
+        if counter % TRIM_TICKS == 0:
+            self._loop.run_in_executor(None, self._trim_heap)
         return await super().on_tick(counter)
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
@@ -126,6 +134,9 @@ class WorkerServer(uvicorn.Server):
             self._pause_accepting(YIELD_S)
             return
         self._yielded = False
+        if not self._may_accept():
+            self._pause_accepting(ACCEPT_PAUSE_S)
+            return
         try:
             connection, _ = self._listener.accept()
         except (BlockingIOError, InterruptedError, ConnectionAbortedError):
@@ -140,6 +151,17 @@ class WorkerServer(uvicorn.Server):
         task = self._loop.create_task(self._serve_connection(connection))
         self.server_state.tasks.add(task)
         task.add_done_callback(self.server_state.tasks.discard)
+
+    def _may_accept(self) -> bool:
+        """Count a new connection; False: there are too many at once."""
+        now = self._loop.time()
+        earned = (now - self._accepts_counted_s) * ACCEPTS_PER_S
+        self._accepts = min(self._accepts + earned, ACCEPTS_AT_ONCE)
+        self._accepts_counted_s = now
+        if self._accepts < 1.0:
+            return False
+        self._accepts -= 1.0
+        return True
 
     async def _serve_connection(self, connection: socket.socket) -> None:
         await self._loop.connect_accepted_socket(self._make_protocol, connection)

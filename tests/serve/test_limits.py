@@ -12,7 +12,7 @@ import pytest
 from serve.api.problems import Problem
 from serve.config import Limits, is_loopback
 from serve.scheduling.rate_limit import RateLimiter
-from serve.server.guard import EVICTABLE_S
+from serve.server.guard import EVICTABLE_S, ConnectionGuard, Group
 from serve.workers import shared_memory
 from tests.serve.conftest import (
     PATIENCE_S,
@@ -38,8 +38,8 @@ def limited(
     return serving(FakeEngine(lambda _image: outputs()), limits=limits, clock=clock)
 
 
-def dial(service: Served) -> socket.socket:
-    return socket.create_connection(("127.0.0.1", service.port), PATIENCE_S)
+def dial(service: Served, source: str = "127.0.0.1") -> socket.socket:
+    return socket.create_connection(("127.0.0.1", service.port), PATIENCE_S, (source, 0))
 
 
 def read_refusal(connection: socket.socket) -> tuple[int, dict[str, object]]:
@@ -166,6 +166,63 @@ def test_connections_without_a_request_give_way_to_new_ones() -> None:
         clock.now_s += 1.01 * EVICTABLE_S
         assert service.post(JPEG).status == 200
         assert is_cut(silent[0])
+
+
+def test_a_client_with_many_connections_gives_way_to_one_with_few() -> None:
+    clock = Clock()
+    whole = HEAD + b"Content-Length: %d\r\n\r\n" % len(JPEG) + JPEG
+    with limited(Limits(connections=8), clock) as service:
+        steady = dial(service)
+        steady.sendall(whole)
+        assert steady.recv(65536).startswith(b"HTTP/1.1 200")
+        many = [dial(service, "127.0.0.2") for _ in range(7)]
+        service.wait_received(*[0] * 7)
+        assert read_refusal(dial(service, "127.0.0.2"))[0] == 503  # they are too young to be ended
+        steady.sendall(whole)
+        assert steady.recv(65536).startswith(b"HTTP/1.1 200")
+        others = [dial(service) for _ in range(2)]  # in place of the refused one, and another
+        for other in others:
+            other.sendall(whole)
+            assert other.recv(65536).startswith(b"HTTP/1.1 200")
+        ended, _, _ = select.select(many, [], [], PATIENCE_S)
+        assert [is_cut(connection) for connection in ended] == [True]
+
+
+def test_the_clients_of_a_trusted_proxy_are_many() -> None:
+    guard = ConnectionGuard(Limits(trusted_proxies=("10.0.0.0/8",)))
+    proxied, direct = (Connection(guard, address) for address in ("10.0.0.7", "192.0.2.1"))
+    others = [Connection(guard, "10.0.0.7") for _ in range(9)]
+    guard.place(proxied, guard.served)
+    assert guard.make_room(1, direct)
+    assert proxied.ended
+    for connection in (proxied, direct, *others):
+        guard.forget(connection)
+    assert not guard.open
+
+
+def test_the_networks_of_ipv6_are_clients() -> None:
+    guard = ConnectionGuard(Limits())
+    for address in ("2001:db8::1", "2001:db8::2", "2001:db8:1::1", "::ffff:192.0.2.1", "192.0.2.1"):
+        Connection(guard, address)
+    assert sorted(guard.open.values()) == [1, 2, 2]
+
+
+class Connection:
+    """A connection of a guard, from an address."""
+
+    def __init__(self, guard: ConnectionGuard, address: str) -> None:
+        self.since_s, self.network, self.ended = 0.0, "", False
+        self.group: Group = {}
+        guard.admit(self, address)
+
+    def give_way(self) -> None:
+        self.ended = True
+
+    def expire(self, now: float) -> None:
+        raise NotImplementedError
+
+    def end_slow_body(self, now: float) -> int:
+        raise NotImplementedError
 
 
 def test_slow_requests_give_way_to_new_connections_but_served_clients_stay() -> None:

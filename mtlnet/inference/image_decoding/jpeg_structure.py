@@ -7,6 +7,8 @@ end is found, so that a file appended to the image is detected.
 import re
 from dataclasses import dataclass
 
+import numpy as np
+
 from mtlnet.inference.image_decoding.errors import Fault, ImageError
 
 START = b"\xff\xd8"
@@ -15,7 +17,8 @@ SOS, EOI = 0xDA, 0xD9
 FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # SOF0 to SOF15
 PROGRESSIVE_FRAMES = frozenset((0xC2, 0xC6, 0xCA, 0xCE))
 # In entropy-coded data FF 00 is a byte FF, FF D0 to D7 a restart marker, FF FF a fill byte.
-MARKER = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")
+ENDS_DATA = np.ones(256, np.bool_)
+ENDS_DATA[[0x00, *range(0xD0, 0xD8), 0xFF]] = False
 MAX_SCANS = 100  # a progressive JPEG has about ten; each costs a pass over all pixels
 MAX_SEGMENTS = 1_000
 WINDOW_BYTES = 1 << 18  # searched at once; between two searches other threads may run
@@ -47,7 +50,7 @@ def is_progressive(body: bytes) -> bool:
 def read_structure(body: bytes) -> JpegStructure:
     """The structure of the JPEG at the start of `body`. Raises ImageError.
 
-    Takes 10 ms a MiB at worst; up to WINDOW_BYTES of that in one step.
+    Takes 3 ms a MiB at worst; up to WINDOW_BYTES of that in one step.
     """
     at, scans = len(START), 0
     for _ in range(MAX_SEGMENTS):
@@ -85,9 +88,12 @@ def _find_marker(body: bytes, at: int) -> int:
     """Offset of the marker after the entropy-coded data at offset `at`."""
     for start in range(at, len(body), WINDOW_BYTES):
         # One byte more: a marker may lie on both sides of the end of a window.
-        found = MARKER.search(body, start, start + WINDOW_BYTES + 1)
-        if found is not None:
-            return found.start()
+        count = min(WINDOW_BYTES + 1, len(body) - start)
+        window = np.frombuffer(body, np.uint8, count, start)
+        escapes = np.flatnonzero(window[:-1] == 0xFF)
+        found = escapes[ENDS_DATA[window[escapes + 1]]]
+        if len(found):
+            return start + int(found[0])
     raise _ends_early(body)
 
 

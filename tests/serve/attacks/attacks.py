@@ -161,7 +161,7 @@ def unread_pings(target: Target, megabytes: int = 16) -> list[socket.socket]:
 
 
 def large_unread_pings(target: Target, megabytes: int = 16) -> list[socket.socket]:
-    """Pings between frames that are not small, whose answers nobody reads."""
+    """Pings between frames of a few hundred bytes, whose answers nobody reads."""
     part = frame(BINARY, bytes(300), fin=False) + frame(CONTINUATION, bytes(300))
     return _stream(target, part + frame(PING, bytes(125)), megabytes)
 
@@ -208,7 +208,7 @@ def unread_answers(target: Target, count: int = 16) -> list[socket.socket]:
     connections = [target.open_websocket() for _ in range(count)]
     for connection in connections:
         connection.settimeout(0.2)
-        send_all(connection, frame(BINARY, b"no image" * 64), 2000)
+        send_all(connection, frame(BINARY, b"no image" * 128), 2000)
     return connections
 
 

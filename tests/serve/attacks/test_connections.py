@@ -10,8 +10,9 @@ import pytest
 
 from serve.api.features import FeaturesRequest
 from serve.config import MAX_HEAD_BYTES, Limits
-from serve.server.connection import MAX_AT_ONCE, MAX_PIPELINED, WORK_S
+from serve.server.connection import FREE_CHUNKS, MAX_AT_ONCE, MAX_PIPELINED, WORK_S
 from serve.server.fast_path import DirectProtocol, DirectRequest
+from serve.server.websocket import GuardedWebSocket
 from tests.serve.attacks import attacks
 from tests.serve.attacks.conftest import (
     Target,
@@ -183,7 +184,8 @@ def test_large_chunked_bodies_are_no_trailers(service: Served, target: Target) -
     head = b"POST /features HTTP/1.1\r\n" + target.headers(
         Content_Type="image/jpeg", Transfer_Encoding="chunked"
     )
-    body = b"".join(b"1;%b\r\n%c\r\n" % (b"x" * 200, byte) for byte in image)
+    parts = [image[at : at + 4] for at in range(0, len(image), 4)]
+    body = b"".join(b"%x;%b\r\n%b\r\n" % (len(part), b"x" * 900, part) for part in parts)
     assert len(body) > 100 * MAX_HEAD_BYTES
     with target.dial() as connection:
         connection.sendall(head + b"\r\n" + body + b"0\r\n\r\n")
@@ -237,6 +239,22 @@ def test_an_upload_that_ends_early_leaves_nothing(
         gc.enable()
 
 
+@pytest.mark.parametrize("attack", [attacks.long_upgrades, attacks.crowded_upgrades])
+def test_a_refused_handshake_leaves_no_reference_cycle(
+    service: Served, target: Target, attack: Callable[[Target, int], list[socket.socket]]
+) -> None:
+    service.post(JPEG)
+    gc.collect()
+    gc.disable()
+    try:
+        close(attack(target, 10))
+        until(lambda: open_count(service) == 1)
+        until(lambda: not any(isinstance(o, GuardedWebSocket) for o in gc.get_objects()))
+        assert sum(isinstance(o, DirectProtocol) for o in gc.get_objects()) == 1
+    finally:
+        gc.enable()
+
+
 def test_an_idle_connection_keeps_no_body(service: Served, target: Target) -> None:
     before = resident_mb()
     connections = [target.dial() for _ in range(30)]
@@ -252,6 +270,24 @@ def test_small_chunks_take_no_more_memory_than_their_bytes(target: Target) -> No
     connections = attacks.small_chunks(target, 4)
     assert resident_mb() - before < 40
     close(connections)
+
+
+def test_a_body_in_many_small_chunks_is_refused(service: Served, target: Target) -> None:
+    head = b"POST /features HTTP/1.1\r\n" + target.headers(
+        Content_Type="image/jpeg", Transfer_Encoding="chunked"
+    )
+    with target.dial() as connection:
+        connection.sendall(head + b"\r\n" + b"2\r\nxy\r\n" * 2 * FREE_CHUNKS)
+        received = read_rest(connection)
+        assert received.startswith(b"HTTP/1.1 413")
+        assert b"send larger ones" in received
+    size = len(JPEG) // (FREE_CHUNKS - 1) + 1
+    parts = [JPEG[at : at + size] for at in range(0, len(JPEG), size)]
+    with target.dial() as connection:
+        body = b"".join(b"%x\r\n%b\r\n" % (len(part), part) for part in parts)
+        connection.sendall(head + b"\r\n" + body + b"0\r\n\r\n")
+        assert read_reply(connection)[0] == 200
+    assert 0.9 * FREE_CHUNKS < len(parts) < FREE_CHUNKS
 
 
 def test_pipelined_requests_are_bounded(service: Served, target: Target) -> None:

@@ -2,6 +2,7 @@
 
 import asyncio
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -9,7 +10,8 @@ import pytest
 
 from mtlnet.inference.engine import Engine
 from serve.api.problems import Problem
-from serve.scheduling.frame_queue import Frame, FrameQueue, FrameResult
+from serve.scheduling.fair_queue import MAX_CLIENTS, FairQueue, Frame, FrameResult, Slot
+from serve.scheduling.frame_queue import FrameQueue
 from serve.scheduling.streams import StreamTable
 from serve.workers.shared_memory import create_shared_memory
 from tests.serve.conftest import FakeEngine, Gate, outputs, picture, until
@@ -75,3 +77,74 @@ def test_a_refusal_schedules_nothing_on_the_event_loop(monkeypatch: pytest.Monke
         return scheduled
 
     assert asyncio.run(scenario()) == []
+
+
+def slot(client: str) -> Slot:
+    frame = replace(make_frame(), client=client)
+    return Slot(frame, lambda _result: None)
+
+
+def test_clients_take_turns() -> None:
+    queue = FairQueue()
+    many, few = [slot("10.0.0.1") for _ in range(4)], [slot("10.0.0.2") for _ in range(2)]
+    for each in (*many[:3], *few, many[3]):
+        queue.append(each)
+    taken = [queue.take() for _ in range(6)]
+    assert taken == [many[0], few[0], many[1], few[1], many[2], many[3]]
+    assert not queue
+
+
+def test_the_last_frame_of_the_client_with_most_gives_way_to_one_with_fewer() -> None:
+    queue = FairQueue()
+    slots = [slot("10.0.0.1"), slot("10.0.0.2"), slot("10.0.0.1"), slot("10.0.0.1")]
+    for each in slots:
+        queue.append(each)
+    assert queue.giving_way_to("10.0.0.3") is slots[3]
+    assert queue.giving_way_to("10.0.0.2") is slots[3]
+    assert queue.giving_way_to("10.0.0.1") is None
+    queue.remove(slots[3])
+    assert queue.giving_way_to("10.0.0.2") is None  # it would have more than the other then
+    assert queue.giving_way_to("2001:db8::1") is slots[2]
+
+
+def test_the_turns_of_a_limited_number_of_clients_are_kept() -> None:
+    queue = FairQueue()
+    for number in range(MAX_CLIENTS + 10):
+        queue.append(slot(f"10.0.{number // 256}.{number % 256}"))
+        queue.take()
+    assert len(queue._turns) == MAX_CLIENTS
+
+
+def test_a_full_queue_takes_a_frame_of_another_client() -> None:
+    gate = Gate()
+    queue = make_queue(gate.engine, capacity=2)
+
+    async def scenario() -> list[object]:
+        queue.start()
+        until(lambda: queue.ready)
+        results: dict[str, asyncio.Future[FrameResult | Exception]] = {}
+
+        async def submit(name: str, client: str) -> None:
+            results[name] = asyncio.get_running_loop().create_future()
+            queue.check_capacity(client)
+            queue.submit(replace(make_frame(), client=client), results[name].set_result)
+            await asyncio.sleep(0)
+
+        await submit("first", "10.0.0.1")
+        until(gate.busy.is_set)
+        await submit("second", "10.0.0.1")
+        await submit("third", "10.0.0.1")
+        await submit("other", "10.0.0.2")
+        with pytest.raises(Problem, match="frames are waiting"):
+            queue.check_capacity("10.0.0.1")
+        gate.open.set()
+        found: list[object] = [
+            await results[name] for name in ("first", "other", "second", "third")
+        ]
+        queue.close()
+        return found
+
+    *answered, refused = asyncio.run(scenario())
+    assert all(isinstance(result, FrameResult) for result in answered)
+    assert isinstance(refused, Problem)
+    assert refused.type.name == "overloaded"

@@ -1,10 +1,12 @@
 """Which of the workers on one port accepts a connection."""
 
 import threading
+import time
 
 import pytest
 
 from serve.server import worker_server
+from serve.server.worker_server import WorkerServer
 from serve.workers import shared_memory
 from serve.workers.shared_memory import WorkerPeers
 from tests.serve.conftest import (
@@ -65,3 +67,24 @@ def test_while_no_worker_is_ready_requests_are_refused() -> None:
     ):
         assert ask_each(make_clients(one.port)) == [503] * 8
         warm.set()
+
+
+def test_many_connections_at_once_are_accepted_one_after_the_other(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    pauses: list[float] = []
+    real = WorkerServer._pause_accepting
+
+    def pause(server: WorkerServer, seconds: float) -> None:
+        pauses.append(seconds)
+        real(server, seconds)
+
+    monkeypatch.setattr(WorkerServer, "_pause_accepting", pause)
+    monkeypatch.setattr(worker_server, "ACCEPTS_AT_ONCE", 4)
+    monkeypatch.setattr(worker_server, "ACCEPTS_PER_S", 100)
+    with serving(FakeEngine(lambda _image: outputs())) as service:
+        begin = time.monotonic()
+        clients = [Served(service.port) for _ in range(24)]
+        assert ask_each(clients) == [200] * 24
+        assert time.monotonic() - begin >= 0.19  # (24 - 4 - 1) / 100
+        assert pauses

@@ -1,0 +1,109 @@
+"""Frames that wait for the engine, and whose turn it is.
+
+Clients take turns, and when the queue is full, a frame of the client that has most in it gives way
+to one of a client with fewer. Clients are told apart by their address, of IPv6 by its /64 network.
+"""
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mtlnet.inference.prediction import Prediction
+from serve.config import network_of
+from trackfeatures.camera import CameraParameters
+
+MAX_CLIENTS = 1024  # whose turns are remembered
+
+PixelReader = Callable[[CameraParameters], NDArray[np.uint8]]
+"""Gives the pixels (height, width, 3), RGB, as the model's camera sees them."""
+ResultCallback = Callable[["FrameResult | Exception"], None]
+
+
+@dataclass(frozen=True, slots=True)
+class FrameResult:
+    """The prediction for a frame, the engine it came from, and the time of each stage, ms."""
+
+    prediction: Prediction
+    provenance: dict[str, str]
+    queue_ms: float
+    decode_ms: float
+    forward_ms: float
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """An image to process. Times are ns of the monotonic clock.
+
+    `stream` 0: it belongs to no stream. `small`: it is decoded in less time than the engine takes;
+    others are admitted by `cost_ms`, the estimated time of decoding.
+    """
+
+    read: PixelReader
+    stamp_ns: int
+    stream: int = 0
+    deadline_ns: int | None = None
+    small: bool = False
+    client: str = ""
+    cost_ms: float = 0.0
+
+
+class Slot:
+    """A place in the queue: the frame that holds it, and the callback for its result."""
+
+    __slots__ = ("client", "frame", "on_result")
+
+    def __init__(self, frame: Frame, on_result: ResultCallback) -> None:
+        self.client = network_of(frame.client)
+        self.frame = frame
+        self.on_result = on_result
+
+
+class FairQueue:
+    """Slots in the order of their arrival; for one thread at a time."""
+
+    def __init__(self) -> None:
+        self._slots: list[Slot] = []
+        self._turns: dict[str, int] = {}  # number of the latest slot that was taken, by client
+        self._turn = 0
+
+    def __len__(self) -> int:
+        return len(self._slots)
+
+    @property
+    def only_small(self) -> bool:
+        """Whether one slot waits, with a small frame."""
+        return len(self._slots) == 1 and self._slots[0].frame.small
+
+    def append(self, slot: Slot) -> None:
+        """Add a slot."""
+        self._slots.append(slot)
+
+    def remove(self, slot: Slot) -> None:
+        """Remove a slot."""
+        self._slots.remove(slot)
+
+    def of_stream(self, stream: int) -> Slot | None:
+        """The slot of a stream."""
+        return next((slot for slot in self._slots if slot.frame.stream == stream), None)
+
+    def giving_way_to(self, client: str) -> Slot | None:
+        """The last slot of the client with most of the queue, if it has two more than `client`."""
+        counts = Counter(slot.client for slot in self._slots)
+        most = max(counts.values(), default=0)
+        if most < counts[network_of(client)] + 2:
+            return None
+        return next(slot for slot in reversed(self._slots) if counts[slot.client] == most)
+
+    def take(self) -> Slot:
+        """Remove the slot whose turn it is: the oldest of the client that waited longest."""
+        slots, turns = self._slots, self._turns
+        slot = slots.pop(min(range(len(slots)), key=lambda n: turns.get(slots[n].client, 0)))
+        self._turn += 1
+        turns.pop(slot.client, None)
+        while len(turns) >= MAX_CLIENTS:
+            turns.pop(next(iter(turns)))
+        turns[slot.client] = self._turn
+        return slot
