@@ -90,7 +90,11 @@ class FrameHandler:
         """The answer for an image file, as in `serve.api.schemas`. Raises Problem, ImageError."""
         future: asyncio.Future[FrameResult] = asyncio.get_running_loop().create_future()
         crop = self.submit(options, body, client, partial(resolve, future))
-        result = await future
+        del body
+        try:
+            result = await future
+        finally:
+            del future  # its error, whose traceback holds this frame, would be in a cycle
         self.record_answer(options, client, result)
         return response_content(options, result, crop)
 
@@ -103,7 +107,11 @@ class FrameHandler:
         """
         future: asyncio.Future[FrameResult] = asyncio.get_running_loop().create_future()
         self.queue.submit(_frame(options, client, read, read_ms, False), partial(resolve, future))
-        result = await future
+        del read
+        try:
+            result = await future
+        finally:
+            del future  # as above
         self.record_answer(options, client, result)
         return result
 
@@ -178,12 +186,13 @@ class FeaturesRequest:
         self._send(problem_reply(problem, (b"x-request-id", self._request_id.encode())))
 
     def _on_result(self, result: FrameResult | Exception) -> None:
+        if isinstance(result, Problem | ImageError):
+            self.refuse(result)
+            return
         try:
             if isinstance(result, Exception):
                 raise result
             reply = self._reply(result)
-        except (Problem, ImageError) as error:
-            self.refuse(error)
         except Exception:
             logger.exception("request %s failed", self._request_id)
             self.refuse(internal_error())

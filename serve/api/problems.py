@@ -16,6 +16,7 @@ from starlette.exceptions import HTTPException
 from starlette.responses import Response
 
 from mtlnet.inference.image_decoding.errors import Fault, ImageError
+from serve.config import MAX_HEAD_BYTES
 from trackfeatures.errors import UserError
 
 MEDIA_TYPE = "application/problem+json"
@@ -138,6 +139,28 @@ def as_problem(error: Problem | ImageError) -> Problem:
 def internal_error() -> Problem:
     """The problem of an unexpected exception; it reveals nothing about the exception."""
     return Problem(INTERNAL, "the request could not be answered; see the service's log")
+
+
+def head_too_large() -> Problem:
+    """The problem of headers or trailers over the limit."""
+    return Problem(HEAD_TOO_LARGE, f"the headers have more than {MAX_HEAD_BYTES} bytes; send fewer")
+
+
+def small_chunks(size: int) -> Problem:
+    """The problem of a body in hundreds of chunks of fewer bytes."""
+    return Problem(
+        BODY_TOO_LARGE, f"the body comes in chunks of under {size} bytes; send larger ones"
+    )
+
+
+def too_many_requests(what: str) -> Problem:
+    """The problem of requests that do not wait for the replies to others."""
+    return Problem(RATE_LIMITED, f"more than {what} arrived at once; wait for the replies")
+
+
+def too_slow(part: str, limit_s: float) -> Problem:
+    """The problem of a part of a request that has a deadline."""
+    return Problem(TOO_SLOW, f"the {part} did not arrive within {limit_s:g} s")
 
 
 def _members(type_uri: str, title: str, status: int, detail: str) -> dict[str, Any]:

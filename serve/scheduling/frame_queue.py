@@ -262,7 +262,7 @@ class FrameQueue:
         try:
             return self._infer(frame)
         except tf.UserError as error:
-            return error
+            return error.with_traceback(None)  # its frames hold the body of the request
         except Exception as error:  # reported to the client; the thread goes on
             logger.exception("a frame failed")
             return error

@@ -15,14 +15,14 @@ from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol, RequestResp
 
 from serve.api.http_io import encode_head, problem_reply
 from serve.api.problems import (
-    BODY_TOO_LARGE,
-    HEAD_TOO_LARGE,
     MALFORMED,
     OVERLOADED,
-    RATE_LIMITED,
     TOO_MANY_CONNECTIONS,
-    TOO_SLOW,
     Problem,
+    head_too_large,
+    small_chunks,
+    too_many_requests,
+    too_slow,
 )
 from serve.config import MAX_DEADLINE_MS, MAX_HEAD_BYTES
 from serve.server import guard as guards
@@ -31,10 +31,9 @@ from serve.server.websocket import GuardedWebSocket
 
 WORK_S = 2e-3 * MAX_DEADLINE_MS  # after which an answer that is not sent never will be
 MAX_PIPELINED = 16  # requests of one connection that wait for the reply to another
-MAX_AT_ONCE = 128  # requests received in one part: more would hold the event loop
+MAX_AT_ONCE = 32  # requests received in one part: more would hold the event loop
 MAX_UPGRADES = 4  # offered in one part
-# A body may have so many chunks, and one more for each CHUNK_BYTES: small ones take as much time.
-FREE_CHUNKS, CHUNK_BYTES = 512, 512
+FREE_CHUNKS, CHUNK_BYTES = 512, 512  # of a body; one chunk more for each CHUNK_BYTES received
 UPGRADE_HEADERS = frozenset({b"upgrade", b"http2-settings"})
 
 
@@ -106,7 +105,7 @@ class GuardedProtocol(HttpToolsProtocol):
         # Headers and trailers that have not ended yet are counted as they arrive.
         excess = self._unread_bytes - self._known_bytes > MAX_HEAD_BYTES
         if excess and self._phase is not Phase.CLOSING:
-            self._close_with(_head_too_large())
+            self._close_with(head_too_large())
         if self._settled is not self._phase:
             self._settle()
 
@@ -138,7 +137,7 @@ class GuardedProtocol(HttpToolsProtocol):
         """Count a trailer. Raises ValueError, for the parser, when they are too large."""
         self._trailer_bytes += len(name) + len(value)
         if self._trailer_bytes > MAX_HEAD_BYTES:
-            self.stop_parser(_head_too_large())
+            self.stop_parser(head_too_large())
 
     def begin_body(self) -> None:
         """Wait for the body. Raises ValueError, for the parser, on too large headers."""
@@ -167,8 +166,7 @@ class GuardedProtocol(HttpToolsProtocol):
         """Count the chunks of a body. Raises ValueError, for the parser, when they are too many."""
         self._chunks += 1
         if self._chunks > FREE_CHUNKS + self._unread_bytes // CHUNK_BYTES:
-            detail = f"the body comes in chunks of under {CHUNK_BYTES} bytes; send larger ones"
-            self.stop_parser(Problem(BODY_TOO_LARGE, detail))
+            self.stop_parser(small_chunks(CHUNK_BYTES))
 
     def on_body(self, body: bytes) -> None:
         self._known_bytes = self._unread_bytes
@@ -244,7 +242,7 @@ class GuardedProtocol(HttpToolsProtocol):
     def _check_head_size(self) -> None:
         size = len(self.url) + sum(len(k) + len(v) for k, v in self.headers)
         if size > MAX_HEAD_BYTES:
-            self.stop_parser(_head_too_large())
+            self.stop_parser(head_too_large())
 
     def stop_parser(self, fault: Problem) -> None:
         """Raise ValueError, for the parser: the request ends with this problem."""
@@ -320,9 +318,9 @@ class GuardedProtocol(HttpToolsProtocol):
             return
         phase, limits = self._phase, self._guard.limits
         if phase is Phase.HEAD and self._unread_bytes:
-            self._close_with(_too_slow("headers", limits.head_s))
+            self._close_with(too_slow("headers", limits.head_s))
         elif phase is Phase.BODY:
-            self._close_with(_too_slow("body", limits.body_s))
+            self._close_with(too_slow("body", limits.body_s))
         else:
             self._phase, self._deadline_s = Phase.CLOSING, inf
             self._guard.place(self, self._guard.leaving)
@@ -350,16 +348,3 @@ class GuardedProtocol(HttpToolsProtocol):
         self.transport.write(encode_head(reply) + reply.body)
         # Aborted at once, the reply would be lost to a client that is still sending.
         self.transport.write_eof()
-
-
-def _head_too_large() -> Problem:
-    return Problem(HEAD_TOO_LARGE, f"the headers have more than {MAX_HEAD_BYTES} bytes; send fewer")
-
-
-def too_many_requests(what: str) -> Problem:
-    """The problem of requests that do not wait for the replies to others."""
-    return Problem(RATE_LIMITED, f"more than {what} arrived at once; wait for the replies")
-
-
-def _too_slow(part: str, limit_s: float) -> Problem:
-    return Problem(TOO_SLOW, f"the {part} did not arrive within {limit_s:g} s")

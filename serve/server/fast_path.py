@@ -11,10 +11,10 @@ from typing import Any
 
 from serve.api.features import FeaturesRequest
 from serve.api.http_io import Header, Reply, encode_head
-from serve.api.problems import Problem
+from serve.api.problems import Problem, too_many_requests
 from serve.api.request_options import Headers
 from serve.app import Service
-from serve.server.connection import MAX_AT_ONCE, GuardedProtocol, Phase, too_many_requests
+from serve.server.connection import MAX_AT_ONCE, GuardedProtocol, Phase
 
 CLOSE_HEADER: Header = (b"connection", b"close")
 SMALL_BYTES = 1024  # smaller parts of a body are put together: an object each would take more
