@@ -36,6 +36,7 @@ P99_MS = {
     "lqr-preview": 0.1,
     "lqr-paper": 0.1,
     "rl": 0.1,
+    "rl-residual": 0.1,
     "mpc": 1.0,
     "mpc-preview": 1.0,
 }

@@ -64,6 +64,9 @@ CONTROLLERS: dict[str, ControllerEntry] = {
     "rl": ControllerEntry(
         "controllers.rl.controller:make_rl", "trained by reinforcement on the paper's state"
     ),
+    "rl-residual": ControllerEntry(
+        "controllers.rl.controller:make_rl_residual", "LQR, and what was learned to add to it"
+    ),
     "torcs": ControllerEntry(
         "controllers.torcs_feedback:make_torcs", "the control law of the reference laps"
     ),

@@ -23,5 +23,6 @@ transitions and an actor that is odd by construction; episodes of 400 steps from
 motions.
 
 The paper's state holds neither the curvature nor the yaw rate. With `--state stacked` the actor
-also sees the yaw rate, the changes since the last step and its last two actions.
+also sees the yaw rate, the changes since the last step and its last two actions; with `--state
+residual` it also sees the steering of the controller `lqr`, and its own action is added to that.
 """

@@ -4,6 +4,7 @@ A folder holds `actor.safetensors` (float32 w1, b1, w2, b2, w3, b3) and `actor.j
 """
 
 import json
+import math
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -61,19 +62,25 @@ class Actor:
         self.card = card
         self.weights = weights
         self.definition = find_state(card.state)
-        self._w1 = (weights["w1"] / np.array(card.divisor)[:, None]).astype(np.float32)
-        self._order, self._signs = mirror_of(self.definition)
+        first = (weights["w1"] / np.array(card.divisor)[:, None]).astype(np.float32)
+        if card.odd:  # beside it, the same layer for the mirror image of the state
+            order, signs = mirror_of(self.definition)
+            mirrored = np.empty_like(first)
+            mirrored[order] = first * signs[:, None]
+            first = np.hstack((first, mirrored))
+        self._w1 = first
+        self._rows = 2 if card.odd else 1
 
     def steer(self, state: Array) -> float:
         """The steering action in [-1, 1] for a state (size,)."""
-        rows = state[None]
-        if self.card.odd:
-            rows = np.stack([state, state[self._order] * self._signs])
         of = self.weights
-        hidden = np.maximum(rows @ self._w1 + of["b1"], 0.0)
+        hidden = (state @ self._w1).reshape(self._rows, -1)
+        hidden = np.maximum(hidden + of["b1"], 0.0)
         hidden = np.maximum(hidden @ of["w2"] + of["b2"], 0.0)
-        actions = np.tanh(hidden @ of["w3"] + of["b3"][0])
-        return float(0.5 * (actions[0] - actions[1]) if self.card.odd else actions[0])
+        actions = (hidden @ of["w3"] + of["b3"]).tolist()
+        if self._rows == 1:
+            return math.tanh(actions[0])
+        return 0.5 * (math.tanh(actions[0]) - math.tanh(actions[1]))
 
 
 def mirror_of(definition: StateDefinition) -> tuple[NDArray[np.intp], Array]:

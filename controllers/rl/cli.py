@@ -15,7 +15,7 @@ Track = Annotated[str, typer.Option(help="Its name (`simulator tracks`) or file.
 Seed = Annotated[int, typer.Option(help="Fixes the whole training.", min=0)]
 Out = Annotated[Path, typer.Option(help="Folder for the actor, its curve and its checkpoint.")]
 Steps = Annotated[int, typer.Option(help="Control steps of 50 ms, with one update each.", min=1)]
-State = Annotated[str, typer.Option(help="What the actor sees: paper or stacked.")]
+State = Annotated[str, typer.Option(help="What the actor sees: paper, stacked or residual.")]
 Noise = Annotated[
     float | None,
     typer.Option(help="Standard deviation of the noise on the state [default: the algorithm's]"),

@@ -4,10 +4,9 @@ from pathlib import Path
 
 from controllers.interface import LoopConfig, Observation
 from controllers.rl.actor import Actor, load_actor
-from controllers.rl.state import StateBuilder, paper_state
+from controllers.rl.state import STEP_S, StateBuilder, paper_state
 from trackfeatures.errors import UserError
 
-STEP_S = 0.05
 SHIPPED = Path(__file__).parent.parent / "weights"
 
 
@@ -20,9 +19,7 @@ class RlController:
 
     def update(self, observation: Observation) -> float:
         paper = paper_state(observation, self._actor.card.half_width_m)
-        steer = self._actor.steer(self._states.build(paper, observation.yaw_rate))
-        self._states.steered(steer)
-        return steer
+        return self._states.steer(self._actor.steer(self._states.build(paper, observation)))
 
 
 def load_controller(folder: Path) -> RlController:
@@ -31,7 +28,16 @@ def load_controller(folder: Path) -> RlController:
 
 
 def make_rl(loop: LoopConfig) -> RlController:
-    """The actor that ships with the project, for 20 Hz; UserError for another rate."""
+    """The actor of the paper's state that ships with the project; UserError for another rate."""
+    return _shipped("rl", loop)
+
+
+def make_rl_residual(loop: LoopConfig) -> RlController:
+    """The actor that ships with the project and adds to LQR; UserError for another rate."""
+    return _shipped("rl-residual", loop)
+
+
+def _shipped(name: str, loop: LoopConfig) -> RlController:
     if loop.dt != STEP_S:
-        raise UserError(f"rl was trained for steps of {STEP_S:g} s, not {loop.dt:g}")
-    return load_controller(SHIPPED / "rl")
+        raise UserError(f"{name} was trained for steps of {STEP_S:g} s, not {loop.dt:g}")
+    return load_controller(SHIPPED / name)

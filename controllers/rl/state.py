@@ -5,6 +5,8 @@ class one-hot (left, straight, right).
 `stacked`: d/w, angle/pi, v_x, v_y, left minus right, and the yaw rate (rad/s), which LQR gets too;
 the changes of the first two since the step before, and the last two steering actions. From
 these the curvature of the road can be inferred, which the paper's state does not hold.
+`residual`: as `stacked`, and the steering of the controller `lqr`, to which 0.3 times the actor's
+action is added (Johannink et al. 2019, residual reinforcement learning).
 
 The lateral offset is divided by half the width of the track trained on, in every drive: a
 controller does not know the width of the road, and its gains are per metre.
@@ -16,12 +18,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from controllers.interface import Observation
+from controllers.interface import Controller, Observation
 from trackfeatures.errors import UserError
 
 Vector = NDArray[np.float32]
 SPEED_SCALE_M_S = 75.0 / 3.6
 PAPER_SIZE = 7
+STEP_S = 0.05
+RESIDUAL_REACH = 0.3
+"""What the action 1 adds to the steering of LQR, in [-1, 1]. A bend of 25 m takes about 0.3."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +64,14 @@ STACKED = StateDefinition(
     odd=(-1.0, -1.0, 1.0, -1.0, -1.0, -1.0, -1.0, -1.0, -1.0, -1.0),
     order=tuple(range(10)),
 )
-STATES = {state.name: state for state in (PAPER, STACKED)}
+RESIDUAL = StateDefinition(
+    name="residual",
+    parts=(*STACKED.parts, "lqr"),
+    spread=(*STACKED.spread, 0.4),
+    odd=(*STACKED.odd, -1.0),
+    order=tuple(range(11)),
+)
+STATES = {state.name: state for state in (PAPER, STACKED, RESIDUAL)}
 
 
 def find_state(name: str) -> StateDefinition:
@@ -84,28 +96,35 @@ class StateBuilder:
     """Builds the state of each step of one drive; keeps what it needs of earlier steps."""
 
     def __init__(self, definition: StateDefinition) -> None:
-        self._stacked = definition.name == STACKED.name
-        self._before: Vector | None = None
+        self._plain = definition.name == PAPER.name
+        self._lqr: Controller | None = None
+        if definition.name == RESIDUAL.name:
+            from controllers.lqr import Lqr  # needs scipy; the other states do not
+
+            self._lqr = Lqr(STEP_S)
+        self._lqr_steer = 0.0
+        self._before: tuple[float, float] | None = None
         self._steers = (0.0, 0.0)
 
-    def build(self, paper: Vector, yaw_rate: float) -> Vector:
-        """The state from the environment's (7,) and the yaw rate (rad/s)."""
-        if not self._stacked:
+    def build(self, paper: Vector, observation: Observation) -> Vector:
+        """The state from the environment's (7,) and what a controller observes."""
+        if self._plain:
             return paper
-        before = paper if self._before is None else self._before
-        self._before = paper
-        return np.array(
-            [
-                *paper[:4],
-                paper[4] - paper[6],
-                yaw_rate,
-                paper[0] - before[0],
-                paper[1] - before[1],
-                *self._steers,
-            ],
-            np.float32,
-        )
+        d, angle, v_x, v_y, left, _, right = paper.tolist()
+        d_before, angle_before = self._before or (d, angle)
+        self._before = (d, angle)
+        numbers = [
+            *(d, angle, v_x, v_y, left - right, observation.yaw_rate),
+            *(d - d_before, angle - angle_before, *self._steers),
+        ]
+        if self._lqr is not None:
+            self._lqr_steer = self._lqr.update(observation)
+            numbers.append(self._lqr_steer)
+        return np.array(numbers, np.float32)
 
-    def steered(self, steer: float) -> None:
-        """Tell the steering action that followed the last state."""
-        self._steers = (steer, self._steers[0])
+    def steer(self, action: float) -> float:
+        """The steering in [-1, 1] for the actor's action after the last state."""
+        if self._lqr is not None:
+            action = min(max(self._lqr_steer + RESIDUAL_REACH * action, -1.0), 1.0)
+        self._steers = (action, self._steers[0])
+        return action

@@ -19,6 +19,7 @@ import numpy as np
 import simulator.env  # noqa: F401 registers the environment
 from controllers.closed_loop import DriveResult, run_lap
 from controllers.drive import FREQUENCY_HZ, steps_for
+from controllers.interface import Observation
 from controllers.perception import truth
 from controllers.rl.actor import Actor, ActorCard, save_actor
 from controllers.rl.agent import Agent
@@ -146,14 +147,14 @@ class _Training:
         rng = np.random.default_rng([self._config.seed, 1, progress.episode])
         paper, _ = self._env.reset(seed=int(rng.integers(2**31)), options=self._start(rng))
         states = StateBuilder(self._state)
-        seen = agent.see(states.build(paper, self._world.state.yaw_rate))
+        seen = agent.see(states.build(paper, self._observe()))
         limit = RANDOM_EPISODE_STEPS if algorithm.random_starts else PAPER_EPISODE_STEPS
         losses: list[float] = []
         for _ in range(min(limit, self._config.steps - progress.step)):
             action = self._explore(agent.act(seen), rng)
-            paper, reward, ended, _, _ = self._env.step(np.array([action], np.float32))
-            states.steered(action)
-            following = agent.see(states.build(paper, self._world.state.yaw_rate))
+            steer = np.array([states.steer(action)], np.float32)
+            paper, reward, ended, _, _ = self._env.step(steer)
+            following = agent.see(states.build(paper, self._observe()))
             agent.remember(seen, action, float(reward), following, ended)
             seen = following
             progress.step += 1
@@ -166,6 +167,12 @@ class _Training:
         progress.episode += 1
         progress.loss = float(np.mean(losses)) if losses else float("nan")
         progress.seconds = time.monotonic() - self._started
+
+    def _observe(self) -> Observation:
+        """What a controller observes of the truth; the noise on the state is not in it."""
+        now = self._world.state
+        heading = self._world.features().heading
+        return Observation(now.to_middle, now.angle, heading, now.vx, now.vy, now.yaw_rate)
 
     def _start(self, rng: np.random.Generator) -> dict[str, float]:
         """Reset options: none for the paper's start, else a random place and motion."""

@@ -181,7 +181,7 @@ def test_the_command_trains_and_drives(tmp_path: Path) -> None:
     ("words", "message"),
     [
         (("--algorithm", "sarsa"), "no algorithm 'sarsa'; use one of: ddpg, td3"),
-        (("--state", "pixels"), "no state 'pixels'; use one of: paper, stacked"),
+        (("--state", "pixels"), "no state 'pixels'; use one of: paper, stacked, residual"),
         (("--track", "nowhere"), "no track 'nowhere'"),
         (("--state-noise", "-1"), "noise is -1"),
         (("--actor-rate", "0"), "learning rate 0.0"),
