@@ -124,6 +124,7 @@ class FrameHandler:
 
     def record_refusal(self, error: Problem | ImageError, request_id: str, client: str) -> Problem:
         """Count and log an error; the problem to answer with."""
+        error.__traceback__ = None  # its frames may hold the body, and the problem: a cycle
         problem = as_problem(error)
         self.refusals.log(request_id, client, problem)
         self._metrics.count_refusal(problem.type, self.queue.waiting)

@@ -7,9 +7,11 @@ absent; `std` in the order of `mtlnet.inference.uncertainty`; `out_of_distributi
 whose request headers apply here too.
 """
 
+import asyncio
 import json
 import logging
 import time
+from contextlib import nullcontext
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -28,12 +30,15 @@ from mtlnet.inference.uncertainty import FEATURES
 from serve.api.features import FrameHandler, client_address
 from serve.api.http_io import ClientDisconnectedError, read_body
 from serve.api.kserve_tensors import (
+    PAUSE_S,
+    WINDOW_BYTES,
     InferRequest,
     encode_response,
     find_pixels,
     invalid_request,
     parse_request,
     read_image_bytes,
+    read_json_length,
 )
 from serve.api.problems import MEDIA_TYPE, NOT_READY, Problem, internal_error
 from serve.api.request_options import (
@@ -118,12 +123,14 @@ def _metadata(frames: FrameHandler) -> Any:
 
 
 def _infer(frames: FrameHandler) -> Any:
+    one_large = asyncio.Lock()  # of the large JSON parts is parsed at a time: others have turns
+
     async def infer(request: Request) -> Response:
         stamp_ns = time.monotonic_ns()
         headers: Headers = dict(request.scope["headers"])
         request_id, client = request_id_of(headers), client_address(request.scope)
         try:
-            return await _answer(frames, request, headers, stamp_ns, request_id)
+            return await _answer(frames, request, headers, stamp_ns, request_id, one_large)
         except ClientDisconnectedError:
             return Response(status_code=400)  # never sent
         except (Problem, ImageError) as error:
@@ -139,7 +146,12 @@ def _infer(frames: FrameHandler) -> Any:
 
 
 async def _answer(
-    frames: FrameHandler, request: Request, headers: Headers, stamp_ns: int, request_id: str
+    frames: FrameHandler,
+    request: Request,
+    headers: Headers,
+    stamp_ns: int,
+    request_id: str,
+    one_large: asyncio.Lock,
 ) -> Response:
     without_accept = {k: v for k, v in headers.items() if k != b"accept"}
     options = parse_options(without_accept, stamp_ns, request_id)
@@ -151,8 +163,16 @@ async def _answer(
     share = frames.share()
     try:
         body = await read_body(request.receive, share.grow)
-        infer_request, binary = parse_request(body, headers.get(HEADER.lower().encode()))
-        read, read_ms = _pixel_reader(infer_request, binary, frames, options.fov_y_deg)
+        length = read_json_length(body, headers.get(HEADER.lower().encode()))
+        large = length > WINDOW_BYTES
+        async with one_large if large else nullcontext():
+            if large:
+                await asyncio.sleep(PAUSE_S)
+            infer_request, binary = parse_request(body, length)
+            share.grow(len(infer_request.input.data))  # a copy, until it is decoded
+            read, read_ms = await _pixel_reader(infer_request, binary, frames, options.fov_y_deg)
+            infer_request.input.data = b""
+            del body, binary
         result = await frames.predict_pixels(options, client, read, read_ms)
     finally:
         share.close()
@@ -171,7 +191,7 @@ async def _answer(
     return Response(content, media_type="application/octet-stream", headers=sent)
 
 
-def _pixel_reader(
+async def _pixel_reader(
     request: InferRequest, binary: memoryview, frames: FrameHandler, fov_y_deg: float | None
 ) -> tuple[PixelReader, float]:
     """The reader of the pixels of the input, and an estimate of its time, ms.
@@ -188,7 +208,7 @@ def _pixel_reader(
         raise invalid_request(f"unknown output {unknown[:80]!r}; there are {', '.join(OUTPUTS)}")
     camera = frames.queue.loaded.engine.card.camera
     if tensor.name == "image":
-        body = read_image_bytes(tensor, binary)
+        body = await read_image_bytes(tensor, binary)
         header = inspect(body, camera, fov_y_deg)
         return lambda view: decode(body, header, view, fov_y_deg), header.decode_ms
     pixels = find_pixels(tensor, binary)

@@ -5,6 +5,7 @@ Source: Open Inference Protocol, REST, and its binary tensor data extension: a J
 order, little-endian, row-major; each element of BYTES is preceded by its length as a 4-byte number.
 """
 
+import asyncio
 import binascii
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -20,12 +21,15 @@ from serve.api.problems import INVALID_REQUEST, Problem
 MAX_DEPTH = 4
 MAX_VALUES = 1_300_000  # and lists, in JSON: 640 x 480 px; each takes some 10 ns of the event loop
 MAX_SMALL_BYTES = 4096  # of what is not the tensor itself, in JSON
-WINDOW_BYTES = 1 << 16  # of pixels in JSON, decoded at once; other threads may run in between
+WINDOW_BYTES = 1 << 16  # of JSON or base64, decoded at once; others may run in between
+PAUSE_S = 0.001  # between windows: without it, the engine's thread waits for the interpreter's lock
+COUNT_BYTES = 1 << 18  # of JSON whose values are counted at once, in little memory
 JSON_MS_PER_BYTE = 1e-4  # to decode pixels in JSON
 PIXEL_MS = 1e-6  # to crop and scale
 MAX_SIDE = 1 << 31  # of a shape; a larger number may not fit into a float
 COMMA, BRACKET = b",["
 MAX_LENGTH_DIGITS = 20
+NULL = memoryview(b"null")
 BLANKS = b" \t\r\n"
 T = TypeVar("T")
 
@@ -74,18 +78,22 @@ class _RawRequest(msgspec.Struct):
     parameters: msgspec.Raw = msgspec.Raw(b"{}")
 
 
-def parse_request(body: bytes, header_length: bytes | None) -> tuple[InferRequest, memoryview]:
-    """(the JSON part, the binary part) of a request. Raises Problem."""
-    length = len(body)
-    if header_length is not None:
-        usable = header_length.isdigit() and len(header_length) <= MAX_LENGTH_DIGITS
-        if not usable or int(header_length) > len(body):
-            raise invalid_request(
-                "Inference-Header-Content-Length is not a length within this body"
-            )
-        length = int(header_length)
-    text = np.frombuffer(body, np.uint8, length)
-    values = np.count_nonzero(text == COMMA) + np.count_nonzero(text == BRACKET)
+def read_json_length(body: bytes, header: bytes | None) -> int:
+    """How many bytes of a body are its JSON part. Raises Problem."""
+    if header is None:
+        return len(body)
+    usable = header.isdigit() and len(header) <= MAX_LENGTH_DIGITS
+    if not usable or int(header) > len(body):
+        raise invalid_request("Inference-Header-Content-Length is not a length within this body")
+    return int(header)
+
+
+def parse_request(body: bytes, length: int) -> tuple[InferRequest, memoryview]:
+    """(the JSON part of `length` bytes, the binary part) of a request. Raises Problem."""
+    text, values = np.frombuffer(body, np.uint8, length), 0
+    for start in range(0, length, COUNT_BYTES):
+        part = text[start : start + COUNT_BYTES]
+        values += int(np.count_nonzero(part == COMMA) + np.count_nonzero(part == BRACKET))
     if values > MAX_VALUES:
         raise invalid_request(
             f"the JSON part has {values} values and lists, at most {MAX_VALUES} are accepted; send "
@@ -108,7 +116,7 @@ def _parse_json(text: memoryview) -> InferRequest:
             _small(tensor.shape, list[int]),
             tensor.datatype,
             _small(tensor.parameters, dict[str, Any]),
-            b"" if bytes(tensor.data) == b"null" else bytes(tensor.data),
+            b"" if memoryview(tensor.data) == NULL else bytes(tensor.data),
         ),
         raw.id,
         _small(raw.outputs, list[RequestedOutput]),
@@ -125,8 +133,11 @@ def _small(raw: msgspec.Raw, kind: type[T]) -> T:
     return msgspec.json.decode(raw, type=kind)
 
 
-def read_image_bytes(tensor: Tensor, binary: memoryview) -> bytes:
-    """The file in a BYTES tensor of one element; in JSON it is base64. Raises Problem."""
+async def read_image_bytes(tensor: Tensor, binary: memoryview) -> bytes:
+    """The file in a BYTES tensor of one element; in JSON it is base64.
+
+    Raises Problem.
+    """
     if tensor.datatype != "BYTES" or tensor.shape not in ([1], [1, 1]):
         raise invalid_request(
             f"{tensor.name} is {tensor.datatype[:20]} {tensor.shape[:8]}; it takes BYTES [1, 1]"
@@ -136,19 +147,35 @@ def read_image_bytes(tensor: Tensor, binary: memoryview) -> bytes:
         if len(raw) < 4 or int.from_bytes(raw[:4], "little") != len(raw) - 4:
             raise invalid_request(f"{tensor.name} must hold one element, preceded by its length")
         return bytes(raw[4:])
-    text = tensor.data
-    for _ in range(MAX_DEPTH):
-        text = text.strip(BLANKS)
-        if text.startswith(b"[") and text.endswith(b"]"):
-            text = text[1:-1]
+    return await _read_base64(tensor)
+
+
+async def _read_base64(tensor: Tensor) -> bytes:
+    """The bytes in a string, which may be in lists. Raises Problem.
+
+    Decoded in windows, between which others run.
+    """
+    data, start = tensor.data, tensor.data.find(b'"')
+    end = data.rfind(b'"') + 1
+    before, after = data[:start].translate(None, BLANKS), data[end:].translate(None, BLANKS)
+    depth = min(len(before), MAX_DEPTH)
+    if not end or before != b"[" * depth or after != b"]" * depth:
+        raise invalid_request(f"{tensor.name} must hold one file in base64")
+    text = memoryview(data)[start + 1 : end - 1]
+    parts = []
     try:
-        encoded = msgspec.json.decode(text, type=str)
-    except msgspec.DecodeError as error:
-        raise invalid_request(f"{tensor.name} must hold one file in base64") from error
-    try:
-        return binascii.a2b_base64(encoded, strict_mode=True)
-    except (binascii.Error, ValueError) as error:
+        if data.find(b"\\", start) >= 0:
+            text = memoryview(msgspec.json.decode(data[start:end], type=str).encode())
+        for window in range(0, len(text), WINDOW_BYTES):
+            if window:
+                await asyncio.sleep(PAUSE_S)
+            part = text[window : window + WINDOW_BYTES]
+            parts.append(binascii.a2b_base64(part, strict_mode=True))
+    except (msgspec.DecodeError, ValueError) as error:  # binascii.Error is a ValueError
         raise invalid_request(f"{tensor.name} is not base64: {error}") from error
+    if any(len(part) < WINDOW_BYTES // 4 * 3 for part in parts[:-1]):
+        raise invalid_request(f"{tensor.name} is not base64: it goes on after its padding")
+    return b"".join(parts)
 
 
 @dataclass(frozen=True, slots=True)

@@ -70,6 +70,8 @@ async def listen_for_commands(port: int, commands: dict[str, Command]) -> asynci
     try:
         path.parent.mkdir(mode=0o700, exist_ok=True)
         _check_owner(path.parent)
+        if _accepts(path):
+            raise FileExistsError(f"{path} is that of another service on port {port}")
         path.unlink(missing_ok=True)
         server = await asyncio.start_unix_server(handle, str(path))
         path.chmod(0o600)
@@ -92,6 +94,17 @@ async def _execute(line: bytes, commands: dict[str, Command]) -> dict[str, Any]:
     except Exception as error:  # the service goes on
         logger.exception("a command failed")
         return {"ok": False, "text": f"the service failed ({error!r}); see its log"}
+
+
+def _accepts(path: Path) -> bool:
+    """Whether a process listens at a socket."""
+    with socket.socket(socket.AF_UNIX) as connection:
+        connection.settimeout(1.0)
+        try:
+            connection.connect(str(path))
+        except OSError:
+            return False
+    return True
 
 
 def _check_owner(folder: Path) -> None:

@@ -4,6 +4,7 @@ A test waits for an event, never for a time: for `PATIENCE_S` at most, which is 
 machine that is busy. Where a time limit is tested, the test sets the service's clock (`Clock`).
 """
 
+import gc
 import http.client
 import json
 import socket
@@ -300,3 +301,19 @@ def publish_untrained(run: Path, seed: int) -> None:
 
     torch.manual_seed(seed)
     publish(Network(), run, golden_image(280, 210)[None])
+
+
+def types_in_cycles(work: Callable[[], object]) -> list[type]:
+    """The types of all objects that `work` leaves in reference cycles: in memory until a collection
+    of garbage, which delays all clients."""
+    gc.collect()
+    gc.disable()
+    gc.set_debug(gc.DEBUG_SAVEALL)
+    try:
+        work()
+        gc.collect()
+        return [type(found) for found in gc.garbage]
+    finally:
+        gc.set_debug(0)
+        gc.garbage.clear()
+        gc.enable()

@@ -53,3 +53,25 @@ def test_a_folder_of_another_user_is_not_trusted(monkeypatch: pytest.MonkeyPatch
                 await asyncio.to_thread(send_command, PORT, "reload")
 
     asyncio.run(scenario())
+
+
+def test_two_services_with_one_port_do_not_take_each_others_commands(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """They may listen at different addresses."""
+
+    async def answer(_model: str | None) -> str:
+        return "first"
+
+    async def scenario() -> None:
+        server = await listen_for_commands(PORT, {"reload": answer})
+        assert server is not None
+        async with server:
+            assert await listen_for_commands(PORT, {}) is None
+            assert await asyncio.to_thread(send_command, PORT, "reload") == "first"
+        again = await listen_for_commands(PORT, {"reload": answer})  # its path was left behind
+        assert again is not None
+        again.close()
+
+    asyncio.run(scenario())
+    assert "another service on port 8000" in caplog.text

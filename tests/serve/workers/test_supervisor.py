@@ -67,6 +67,7 @@ class FakeWorkers:
             writer.write(json.dumps(message).encode() + b"\n")
 
         if self.is_loading:
+            await reader.read()  # until the supervisor closes; the worker holds its end open
             return
         send(loaded=task.generation, model="a" * 64, engine="fake", precision="f32")
         if self.is_ready:
