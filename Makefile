@@ -112,7 +112,7 @@ lock: ## pin what is installed now, with hashes, after a change of pyproject.tom
 	$(BIN)/python -m pip install --quiet --require-hashes --requirement deploy/uv.txt
 	$(BIN)/python -m pip freeze --all --exclude-editable | grep -vE '^(pip|uv)==' | \
 	  $(BIN)/uv pip compile - --quiet --no-deps --generate-hashes --no-annotate --no-header \
-	  --python-version 3.11.9 --output-file requirements.lock
+	  --python-version 3.11.0 --output-file requirements.lock
 
 clean: ## remove what was built and collected here, the environment too
 	rm -rf $(VENV) demo build dist *.egg-info
