@@ -19,6 +19,7 @@ from mtlnet.export.publish import Provenance, publish
 from mtlnet.inference.prediction import decode_outputs
 from mtlnet.model.architecture import ARCHITECTURES, GRID, HEIGHT, MTL, WIDTH, Conv
 from mtlnet.model.network import Network, initialise
+from mtlnet.training.config import TrainConfig
 from mtlnet.uncertainty_fit.head import fit_uncertainty_head
 
 FRAMES = 24
@@ -130,3 +131,9 @@ def small_network(monkeypatch: pytest.MonkeyPatch) -> None:
         )
         small = replace(full, features=few, shared=(32, 16, 16))
         monkeypatch.setitem(ARCHITECTURES, full.name, small)
+
+
+def training_config(dataset: Path, out: Path, **changes: Any) -> TrainConfig:
+    """Of a run of four steps, for a dataset of `write_dataset`."""
+    values = {"iterations": 4, "batch": 4, "seed": 7, "device": "cpu", "threads": 1, **changes}
+    return TrainConfig(dataset, out, **values)

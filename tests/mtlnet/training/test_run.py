@@ -1,9 +1,6 @@
-"""Training reduces the loss, and a resumed run has the same weights as an uninterrupted one."""
+"""A training run: its steps, what it stores, and what it refuses."""
 
 import json
-import signal
-import subprocess
-import sys
 import time
 from dataclasses import replace
 from itertools import pairwise
@@ -15,48 +12,21 @@ import pytest
 import torch
 from safetensors.numpy import load_file
 
-import mtlnet.training.loop
 from datagen.recording import Dataset
 from mtlnet.data.loader import Loader
-from mtlnet.export.ship import _without_folders
 from mtlnet.inference.curves import read_curves
-from mtlnet.inference.model_card import GRAPH, UNCERTAINTY_WEIGHTS, WEIGHTS, ModelError, read_card
+from mtlnet.inference.model_card import GRAPH, UNCERTAINTY_WEIGHTS, WEIGHTS, read_card
 from mtlnet.model.cpu_kernels.forward import training_outputs
 from mtlnet.training.checkpoint import list_checkpoints
-from mtlnet.training.config import TrainConfig, resume_config
-from mtlnet.training.loop import Stopped, TrainProgress
+from mtlnet.training.loop import TrainProgress
 from mtlnet.training.recipes import RECIPES, learning_rate
 from mtlnet.training.run import require_new, train
 from mtlnet.training.trainer import Trainer
-from runtime.files import locked_folder
-from tests.mtlnet.conftest import write_dataset
+from tests.mtlnet.conftest import training_config
 from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
 
 CPU = torch.device("cpu")
-
-
-def config(dataset: Path, out: Path, **changes: Any) -> TrainConfig:
-    values = {"iterations": 4, "batch": 4, "seed": 7, "device": "cpu", "threads": 1, **changes}
-    return TrainConfig(dataset, out, **values)
-
-
-class StopAt:
-    """A stop request after so many steps: `requested` is read once before each of them."""
-
-    def __init__(self, steps: int) -> None:
-        self.steps = steps
-
-    @property
-    def requested(self) -> bool:
-        self.steps -= 1
-        return self.steps < 0
-
-    def __enter__(self) -> "StopAt":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        return
 
 
 def test_one_batch_is_overfitted(dataset: Path) -> None:
@@ -114,41 +84,6 @@ def test_the_first_convolutions_are_frozen_after_a_part_of_the_run(dataset: Path
         assert still == set(network.architecture.convolutions[:count])
 
 
-@pytest.mark.parametrize(("recipe", "balance"), [("fast", "dwa"), ("paper", "uncertainty")])
-def test_a_resumed_run_equals_an_uninterrupted_one(
-    dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, recipe: str, balance: str
-) -> None:
-    monkeypatch.setattr("mtlnet.training.task_weighting.WINDOW_STEPS", 1)
-    monkeypatch.setattr("mtlnet.training.loop.LOG_EVERY", 1)
-    train(config(dataset, tmp_path / "whole", recipe=recipe, balance=balance), None)
-    broken = config(dataset, tmp_path / "broken", recipe=recipe, balance=balance)
-    with monkeypatch.context() as patch:
-        patch.setattr(mtlnet.training.loop, "StopRequest", lambda: StopAt(2))
-        with pytest.raises(Stopped, match="step-00000002"):
-            train(broken, None)
-    with pytest.raises(ModelError, match="no finished model"):
-        read_card(broken.out)
-    resumed, data = resume_config(broken.out, {})
-    assert resumed == broken
-    train(resumed, data)
-    assert differing_weights(tmp_path / "whole", broken.out) == []
-    weights = [weights_in(tmp_path / run) for run in ("whole", "broken")]
-    assert weights[0] == weights[1]
-    assert len({tuple(row) for row in weights[0]}) > 1  # they move
-
-
-def differing_weights(one: Path, other: Path) -> list[str]:
-    """Names of the weights that are not bit-equal in two runs."""
-    a, b = load_file(one / WEIGHTS), load_file(other / WEIGHTS)
-    return [name for name in a if not np.array_equal(a[name], b[name])]
-
-
-def weights_in(run: Path) -> list[list[float]]:
-    """The tasks' weights along a run."""
-    names = ("distance_weight", "angle_weight", "type_weight")
-    return [[point[name] for name in names] for point in read_curves(run / "curves.csv")]
-
-
 def test_a_full_gpu_is_reported_in_one_line(
     dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -157,38 +92,7 @@ def test_a_full_gpu_is_reported_in_one_line(
 
     monkeypatch.setattr("mtlnet.training.run.train_loop", full)
     with pytest.raises(UserError, match="memory of cpu is used up; give a smaller --batch than 4"):
-        train(config(dataset, tmp_path / "run"), None)
-
-
-KILLED = """
-import os, signal, sys
-from pathlib import Path
-import mtlnet.training.loop, mtlnet.training.run, runtime.files
-from mtlnet.training.config import TrainConfig
-sync, seen = os.fsync, []
-def die(file):
-    if os.readlink(f"/proc/self/fd/{file}").endswith("00000004.safetensors.partial"):
-        os.kill(os.getpid(), signal.SIGKILL)
-    sync(file)
-runtime.files.os.fsync = die
-mtlnet.training.loop.CHECKPOINT_SECONDS = 0.0
-data, out = map(Path, sys.argv[1:])
-given = {"iterations": 6, "batch": 4, "seed": 7, "device": "cpu", "threads": 1}
-mtlnet.training.run.train(TrainConfig(data, out, **given), None)
-"""
-
-
-def test_a_run_killed_while_saving_resumes_from_the_checkpoint_before(
-    dataset: Path, tmp_path: Path
-) -> None:
-    killed = tmp_path / "killed"
-    done = subprocess.run([sys.executable, "-c", KILLED, dataset, killed], capture_output=True)
-    assert done.returncode == -signal.SIGKILL, done.stderr
-    assert [path.name for path in list_checkpoints(killed)][-1] == "step-00000003.safetensors"
-    resumed, data = resume_config(killed, {})
-    train(resumed, data)
-    train(config(dataset, tmp_path / "whole", iterations=6), None)
-    assert differing_weights(tmp_path / "whole", killed) == []
+        train(training_config(dataset, tmp_path / "run"), None)
 
 
 def test_a_loss_that_is_not_finite_stops_the_run_at_its_batch(
@@ -204,7 +108,7 @@ def test_a_loss_that_is_not_finite_stops_the_run_at_its_batch(
 
     monkeypatch.setattr("mtlnet.training.trainer.training_outputs", outputs)
     with pytest.raises(UserError, match="the loss of batch 3 is not a finite number") as caught:
-        train(config(dataset, tmp_path / "run", network="mtl"), None)
+        train(training_config(dataset, tmp_path / "run", network="mtl"), None)
     assert "\n" not in str(caught.value)
     (*_, last) = list_checkpoints(tmp_path / "run")
     assert last.name == "step-00000002.safetensors"
@@ -213,7 +117,7 @@ def test_a_loss_that_is_not_finite_stops_the_run_at_its_batch(
 
 def test_a_run_stores_its_configuration_data_and_curves(dataset: Path, tmp_path: Path) -> None:
     points: list[TrainProgress] = []
-    done = train(config(dataset, tmp_path / "run", iterations=10), None, points.append)
+    done = train(training_config(dataset, tmp_path / "run", iterations=10), None, points.append)
     run = tmp_path / "run"
     assert read_card(run) == done
     assert done.iterations == 10
@@ -237,7 +141,7 @@ def test_a_run_stores_its_configuration_data_and_curves(dataset: Path, tmp_path:
 
 @pytest.mark.usefixtures("small_network")
 def test_a_run_limited_by_time_ends(dataset: Path, tmp_path: Path) -> None:
-    run = config(dataset, tmp_path / "timed", iterations=None, minutes=1 / 60)
+    run = training_config(dataset, tmp_path / "timed", iterations=None, minutes=1 / 60)
     started = time.monotonic()
     card = train(run, None)
     assert card.iterations >= 1
@@ -263,81 +167,16 @@ def test_wrong_configurations_are_refused_before_anything_is_written(
     (tmp_path / "kept").mkdir()
     (tmp_path / "kept" / "mine").write_text("precious")
     with pytest.raises(UserError, match=r"kept already exists.*--resume"):
-        train(config(dataset, tmp_path / "kept"), None)
+        train(training_config(dataset, tmp_path / "kept"), None)
     assert (tmp_path / "kept" / "mine").read_text() == "precious"
     with pytest.raises(UserError, match="no recorded rounds"):
-        train(config(tmp_path / "kept", tmp_path / "new"), None)
+        train(training_config(tmp_path / "kept", tmp_path / "new"), None)
     with pytest.raises(UserError, match="no recipe 'slow'"):
-        train(config(dataset, tmp_path / "new", recipe="slow"), None)
+        train(training_config(dataset, tmp_path / "new", recipe="slow"), None)
     for device in ("gpu", "cpu:x", "cuda:x", "cuda:99", ""):
         with pytest.raises(UserError, match="--device"):
-            train(config(dataset, tmp_path / "new", device=device), None)
+            train(training_config(dataset, tmp_path / "new", device=device), None)
     assert not (tmp_path / "new").exists()
-
-
-@pytest.mark.usefixtures("small_network")
-def test_a_run_resumed_with_more_iterations_and_stopped_again_goes_on_to_them(
-    dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    run = config(dataset, tmp_path / "run", iterations=2)
-    with monkeypatch.context() as patch:
-        patch.setattr(mtlnet.training.loop, "StopRequest", lambda: StopAt(1))
-        with pytest.raises(Stopped):
-            train(run, None)
-        with pytest.raises(Stopped):
-            train(*resume_config(run.out, {"iterations": 4}))
-    resumed, data = resume_config(run.out, {})  # as the message of a stopped run says
-    assert resumed == replace(run, iterations=4)
-    assert train(resumed, data).iterations == 4
-
-
-@pytest.mark.usefixtures("small_network")
-def test_a_run_is_not_resumed_with_another_seed_or_other_data(
-    dataset: Path, tmp_path: Path
-) -> None:
-    run = config(dataset, tmp_path / "run", iterations=1)
-    train(run, None)
-    with pytest.raises(UserError, match="started with seed 7, now 8"):
-        resume_config(run.out, {"seed": 8})
-    resumed, data = resume_config(run.out, {"iterations": 2, "seed": 7})
-    assert resumed.iterations == 2
-    with pytest.raises(ModelError, match=r"content hash .* is not the one"):
-        train(resumed, {**data, "content_hash": "other"})
-    list_checkpoints(run.out)[-1].write_bytes(b"rubbish")
-    with pytest.raises(ModelError, match="cannot be read"):
-        train(resumed, data)
-
-
-@pytest.mark.usefixtures("small_network")
-def test_a_run_is_not_trained_by_two_processes(dataset: Path, tmp_path: Path) -> None:
-    run = config(dataset, tmp_path / "run", iterations=1)
-    train(run, None)
-    resumed, data = resume_config(run.out, {"iterations": 2})
-    with locked_folder(run.out), pytest.raises(UserError, match="another process is writing to"):
-        train(resumed, data)
-    assert train(resumed, data).iterations == 2
-
-
-@pytest.mark.usefixtures("small_network")
-def test_a_run_continues_on_other_data_if_told_to(dataset: Path, tmp_path: Path) -> None:
-    (tmp_path / "other").mkdir()
-    other_dataset = write_dataset(tmp_path / "other", first_seed=100)
-    run = config(dataset, tmp_path / "run", iterations=1)
-    first = train(run, None).data
-    given = {"iterations": 2, "data": other_dataset, "change_data": True}
-    changed = train(*resume_config(run.out, given)).data
-    kept = {name: first[name] for name in ("path", "content_hash", "frames")}
-    assert changed["earlier"] == [kept]
-    assert changed["content_hash"] == Dataset.open(other_dataset).content_hash
-    assert set(changed["seeds"]) > set(first["seeds"])
-    # From now on the run's data is the other dataset, and its past is not forgotten.
-    resumed, data = resume_config(run.out, {"iterations": 3})
-    assert resumed.data == other_dataset
-    assert not resumed.change_data
-    card = train(resumed, data)
-    assert card.data == changed
-    assert card.iterations == 3
-    assert _without_folders(card.data)["earlier"][0]["path"] == dataset.name
 
 
 def test_learning_rate_schedules() -> None:
@@ -366,4 +205,4 @@ def test_learning_rate_schedules() -> None:
 )
 def test_numbers_out_of_range_are_refused(changes: dict[str, Any], seen: str) -> None:
     with pytest.raises(UserError, match=seen):
-        config(Path("data"), Path("out"), **changes)
+        training_config(Path("data"), Path("out"), **changes)

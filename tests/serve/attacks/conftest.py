@@ -165,3 +165,16 @@ def engine() -> FakeEngine:
 
     found = FakeEngine(respond)
     return found
+
+
+def close(connections: list[socket.socket]) -> None:
+    for connection in connections:
+        connection.close()
+
+
+def open_count(service: Served) -> int:
+    return len(service.server.server_state.connections)
+
+
+def status_of(received: bytes) -> int:
+    return int(received.split()[1])

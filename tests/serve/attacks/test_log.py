@@ -16,8 +16,7 @@ from serve.api.problems import UNAUTHORIZED, Problem
 from serve.config import Limits
 from serve.observability.logs import ErrorLimit, Interval, JsonFormatter, RefusalLog
 from tests.serve.attacks import attacks
-from tests.serve.attacks.conftest import Target
-from tests.serve.attacks.test_connections import open_count
+from tests.serve.attacks.conftest import Target, open_count
 from tests.serve.conftest import (
     PATIENCE_S,
     FakeEngine,
