@@ -23,7 +23,7 @@ pytestmark = pytest.mark.slow
 def command(*arguments: str) -> Any:
     """Run one of the project's commands; its result with --json."""
     done = subprocess.run(
-        [sys.executable, "-m", *arguments], capture_output=True, text=True, timeout=600
+        [sys.executable, "-m", *arguments], capture_output=True, text=True, timeout=1200
     )
     assert done.returncode == 0, done.stderr[-3000:]
     return json.loads(done.stdout) if "--json" in arguments else None
