@@ -84,7 +84,7 @@ def make_controller(
     if name not in CONTROLLERS and is_actor(Path(name)):
         from controllers.rl.controller import load_controller
 
-        return load_controller(Path(name))
+        return load_controller(Path(name), loop)
     if ":" in name:
         return _make_own(name, parameters)
     if name not in CONTROLLERS:

@@ -18,13 +18,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from controllers.interface import Controller, Observation
+from controllers.interface import Controller, LoopConfig, Observation
 from trackfeatures.errors import UserError
 
 Vector = NDArray[np.float32]
 SPEED_SCALE_M_S = 75.0 / 3.6
 PAPER_SIZE = 7
 STEP_S = 0.05
+EXACT = LoopConfig(STEP_S)
 RESIDUAL_REACH = 0.3
 """What the action 1 adds to the steering of LQR, in [-1, 1]. A bend of 25 m takes about 0.3."""
 
@@ -95,13 +96,13 @@ def paper_state(observation: Observation, half_width: float) -> Vector:
 class StateBuilder:
     """Builds the state of each step of one drive; keeps what it needs of earlier steps."""
 
-    def __init__(self, definition: StateDefinition) -> None:
+    def __init__(self, definition: StateDefinition, loop: LoopConfig = EXACT) -> None:
         self._plain = definition.name == PAPER.name
         self._lqr: Controller | None = None
         if definition.name == RESIDUAL.name:
-            from controllers.lqr import Lqr  # needs scipy; the other states do not
+            from controllers.lqr import Lqr, approach_limit  # scipy; the other states need none
 
-            self._lqr = Lqr(STEP_S)
+            self._lqr = Lqr(STEP_S, approach_rad=approach_limit(loop))
         self._lqr_steer = 0.0
         self._before: tuple[float, float] | None = None
         self._steers = (0.0, 0.0)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.linalg import solve_discrete_are
 
+from controllers.closed_loop import run_lap
 from controllers.interface import Controller, LoopConfig, Observation
 from controllers.lateral_model import (
     FASTEST_M_S,
@@ -28,8 +29,12 @@ from controllers.lqr import (
     LqrPreview,
     RateEstimate,
 )
+from controllers.perception import truth
 from controllers.registry import make_controller
 from controllers.torcs_feedback import STEERING_LOCK, StateFeedback
+from simulator.track.catalogue import find_track
+from simulator.track.road import Road
+from simulator.world.world import World
 from trackfeatures import Heading
 
 STRAIGHT_AT_20 = Observation(
@@ -250,3 +255,20 @@ def test_rates_are_differences_and_can_be_filtered() -> None:
     assert [rate(x) for x in (1.0, 1.1, 1.1)] == pytest.approx([0.0, 2.0, 0.0])
     smooth = RateEstimate(0.05, 0.05)
     assert [smooth(x) for x in (1.0, 1.1, 1.2)] == pytest.approx([0.0, 1.0, 1.5])
+
+
+@pytest.mark.parametrize("name", ["lqr", "lqr-preview", "mpc", "mpc-preview", "rl", "rl-residual"])
+def test_a_return_from_far_beside_the_line_stays_within_what_a_model_answers(name: str) -> None:
+    """From TORCS's place on a wide grid, at rest; the model that ships answers 0.25 rad at most."""
+    controller = make_controller(name, LoopConfig(0.05, noisy=True))
+    angles = []
+    with World(Road(find_track("highway"), lanes=1), frequency_hz=20) as world:
+        world.reset(seed=0, to_middle=-2.67)
+        result = run_lap(
+            *(world, controller, truth(0.0), 240),
+            noisy=True,
+            record=lambda state, _steer: angles.append(state.angle),
+        )
+        assert result.ended is None
+        assert abs(world.state.to_middle) < 0.1
+    assert 0.08 < max(map(abs, angles)) < 0.25
