@@ -5,10 +5,10 @@ layout. The variants run in turns, so that other load on the machine affects all
 graph is calibrated on noise: its outputs are useless, its time is that of any int8 graph.
 
 All compute the network's nine outputs. For a model with an uncertainty head
-(`mtlnet.inference.uncertainty`) the passes `with uncertainty` are reported too, without a claim.
+(`mtlnet.inference.uncertainty`) the passes `with uncertainty` compute all that `serve` answers.
 
     python benchmarks/forward.py [--model RUN] [--rounds 200] [--out FILE]
-    claims: bf16 at most 0.40 of torch's time, int8 at most 0.20
+    claims: bf16 at most 0.40 of torch's time, int8 at most 0.20; with uncertainty 0.40 and 0.25
 """
 
 import argparse
@@ -33,11 +33,16 @@ from numpy.typing import NDArray
 from benchmarks.material.servers import model
 from mtlnet.export.int8 import quantise
 from mtlnet.export.openvino_graph import build_graph
-from mtlnet.inference.engine import best_precision
-from mtlnet.inference.model_card import GRAPH, WEIGHTS, read_card
+from mtlnet.inference.engine import best_precision, read_graph
+from mtlnet.inference.model_card import WEIGHTS, read_card
 from mtlnet.model.network import load_network
 
-CLAIMS = {"bf16": 0.40, "int8": 0.20}
+CLAIMS = {
+    "bf16": 0.40,
+    "int8": 0.20,
+    "bf16 with uncertainty": 0.40,
+    "int8 with uncertainty": 0.25,
+}
 WARM_UP = 20
 Forward = Callable[[NDArray[np.uint8]], Any]
 
@@ -63,7 +68,7 @@ def openvino_pass(
 
     core = openvino.Core()
     if uncertainty:
-        graph = core.read_model(str(run / GRAPH))
+        graph = read_graph(run, read_card(run))
     else:
         graph = build_graph(load_network(run / WEIGHTS, read_card(run).network))
     if images is not None:
@@ -99,7 +104,7 @@ def measure(run: Path, rounds: int) -> dict[str, Any]:
             times[name].append(1e3 * (perf_counter() - start))
     medians = {name: median(found[WARM_UP:]) for name, found in times.items()}
     ratios = {name: found / medians["torch f32"] for name, found in medians.items()}
-    held = all(ratios[name] <= claim for name, claim in CLAIMS.items())
+    held = all(ratio <= CLAIMS[name] for name, ratio in ratios.items() if name in CLAIMS)
     return {"median_ms": medians, "ratios": ratios, "claims": CLAIMS, "held": held}
 
 
