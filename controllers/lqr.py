@@ -55,6 +55,7 @@ WEIGHTS_BRIEFLY_TRAINED = LqrWeights(1.0, 1.0, 5.0, 1.0, 10.0)
 APPROACH_RAD = 0.15
 """Largest heading error at which `Lqr` and `LqrPreview` return to the line on perception."""
 UNLIMITED_RAD = 1e6
+"""`approach_rad` on the exact state: no limit."""
 LOCK_DEG = 21.0
 
 

@@ -10,8 +10,8 @@ from controllers.rl.state import EXACT, STEP_S, StateBuilder, paper_state
 from trackfeatures.errors import UserError
 
 FARTHEST_M = 1.0
-"""On perception an offset beyond this is taken for it: from further away an actor returns at an
-angle of 0.3 rad, and the model that ships answers 0.25 rad at most."""
+"""Limit of the offset on perception: from further away an actor returns at an angle of 0.3 rad, and
+the model that ships answers 0.25 rad at most."""
 SHIPPED = Path(__file__).parent.parent / "weights"
 
 

@@ -274,7 +274,7 @@ def test_a_websocket_that_is_not_read_keeps_no_images(service: Served, target: T
         connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 14)
         connection.settimeout(0.2)
         send_all(connection, frame(BINARY, b"no image" * (1 << 15)), 40)
-    until(lambda: resident_mb() - before < 60)
+    assert resident_mb() - before < 60
     for connection in connections:
         connection.close()
     assert service.post(JPEG).status == 200
