@@ -1,5 +1,6 @@
 """The service as one ASGI application: POST /features and /stream directly, the rest by FastAPI."""
 
+import os
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
@@ -66,7 +67,10 @@ class Service:
         self.limits = limits or Limits()
         self.shared = shared or create_shared_memory(1)
         streams = StreamTable(self.shared.streams())
-        self.frame_queue = FrameQueue(engine, check, streams, self.limits.queue)
+        workers = max(1, self.shared.blocks - 1)  # the last block is for a worker that replaces one
+        self.frame_queue = FrameQueue(
+            engine, check, streams, self.limits.queue, single_core=_cores() < 2 * workers
+        )
         self.metrics = Metrics(self.shared, block)
         self.bodies = BodyBudget(self.shared, block, self.limits.body_mib << 20)
         self.frames = FrameHandler(
@@ -110,7 +114,7 @@ class Service:
 
         No header was sent twice.
         """
-        refusal = self._authorize(headers, client)
+        refusal = self._authorize(headers, client) or self.frames.refuse_early(headers, client)
         if refusal is not None:
             send(refusal)
             return None
@@ -162,6 +166,13 @@ def _traced_apps(tracer: "Tracer", *apps: App) -> list[App]:
     from serve.observability.tracing import TracedApp
 
     return [TracedApp(tracer, app) for app in apps]
+
+
+def _cores() -> int:
+    """The number of cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 def _is_public(path: str) -> bool:

@@ -84,6 +84,20 @@ class FrameHandler:
         self.queue.submit(frame, on_result)
         return crop_px(header.width, header.height, camera, fov)
 
+    def refuse_early(self, headers: Headers, client: str) -> Reply | None:
+        """The refusal of a frame for which there is no room, by its headers; None: there is room.
+
+        An overloaded worker does no more for it than this. A frame of a stream may replace another.
+        """
+        if b"x-stream-id" in headers:
+            return None
+        problem = self.queue.refusal(client)
+        if problem is None:
+            return None
+        request_id = request_id_of(headers)
+        self._count_refusal(problem, request_id, client)
+        return problem_reply(problem, (b"x-request-id", request_id.encode()))
+
     async def predict_file(
         self, options: RequestOptions, body: bytes, client: str
     ) -> dict[str, Any]:
@@ -126,9 +140,12 @@ class FrameHandler:
         """Count and log an error; the problem to answer with."""
         error.__traceback__ = None  # its frames may hold the body, and the problem: a cycle
         problem = as_problem(error)
+        self._count_refusal(problem, request_id, client)
+        return problem
+
+    def _count_refusal(self, problem: Problem, request_id: str, client: str) -> None:
         self.refusals.log(request_id, client, problem)
         self._metrics.count_refusal(problem.type, self.queue.waiting)
-        return problem
 
 
 class FeaturesRequest:

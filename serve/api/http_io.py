@@ -22,6 +22,7 @@ STATUS_LINES: dict[int, bytes] = {
 }
 PROBLEM_HEADER: Header = (b"content-type", MEDIA_TYPE.encode())
 CACHED_PROBLEMS = 128  # encoded problems that are kept
+_format_header = b"%b: %b\r\n".__mod__
 _encode_json = msgspec.json.Encoder().encode
 
 
@@ -86,10 +87,9 @@ def _encode_problem(
 
 def encode_head(reply: Reply, *extra: Header) -> bytes:
     """The bytes of a reply before its body, in HTTP/1.1."""
-    lines = [
+    return b"%b%b%bcontent-length: %d\r\n\r\n" % (
         STATUS_LINES[reply.status],
-        *[b"%b: %b\r\n" % header for header in extra],
-        *[b"%b: %b\r\n" % header for header in reply.headers],
-        b"content-length: %d\r\n\r\n" % len(reply.body),
-    ]
-    return b"".join(lines)
+        b"".join(map(_format_header, extra)),
+        b"".join(map(_format_header, reply.headers)),
+        len(reply.body),
+    )

@@ -22,7 +22,7 @@ from trackfeatures.errors import UserError
 MEDIA_TYPE = "application/problem+json"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)  # each is the only one of its kind
 class ProblemType:
     """A type of problem: its name in the type URI, its HTTP status, its title."""
 

@@ -34,6 +34,10 @@ class TracedFrameHandler(FrameHandler):
         super().__init__(*arguments)
         self._tracer = tracer
 
+    def refuse_early(self, headers: Headers, client: str) -> Reply | None:
+        """None: `TracedFeaturesRequest` refuses the frame, in a span."""
+        return None
+
     def record_answer(self, options: RequestOptions, client: str, result: FrameResult) -> None:
         super().record_answer(options, client, result)
         start_ns = options.stamp_ns + time.time_ns() - time.monotonic_ns()  # since 1970

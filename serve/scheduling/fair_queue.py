@@ -66,24 +66,27 @@ class FairQueue:
 
     def __init__(self) -> None:
         self._slots: list[Slot] = []
+        self._counts: Counter[str] = Counter()  # of slots, by client
         self._turns: dict[str, int] = {}  # number of the latest slot that was taken, by client
         self._turn = 0
-
-    def __len__(self) -> int:
-        return len(self._slots)
+        self.count = 0
+        """Number of slots."""
 
     @property
-    def only_small(self) -> bool:
-        """Whether one slot waits, with a small frame."""
-        return len(self._slots) == 1 and self._slots[0].frame.small
+    def all_small(self) -> bool:
+        """Whether all slots hold small frames."""
+        return all(slot.frame.small for slot in self._slots)
 
     def append(self, slot: Slot) -> None:
         """Add a slot."""
         self._slots.append(slot)
+        self._counts[slot.client] += 1
+        self.count += 1
 
     def remove(self, slot: Slot) -> None:
         """Remove a slot."""
         self._slots.remove(slot)
+        self._discount(slot)
 
     def of_stream(self, stream: int) -> Slot | None:
         """The slot of a stream."""
@@ -91,7 +94,7 @@ class FairQueue:
 
     def giving_way_to(self, client: str) -> Slot | None:
         """The last slot of the client with most of the queue, if it has two more than `client`."""
-        counts = Counter(slot.client for slot in self._slots)
+        counts = self._counts
         most = max(counts.values(), default=0)
         if most < counts[network_of(client)] + 2:
             return None
@@ -101,9 +104,16 @@ class FairQueue:
         """Remove the slot whose turn it is: the oldest of the client that waited longest."""
         slots, turns = self._slots, self._turns
         slot = slots.pop(min(range(len(slots)), key=lambda n: turns.get(slots[n].client, 0)))
+        self._discount(slot)
         self._turn += 1
         turns.pop(slot.client, None)
         while len(turns) >= MAX_CLIENTS:
             turns.pop(next(iter(turns)))
         turns[slot.client] = self._turn
         return slot
+
+    def _discount(self, slot: Slot) -> None:
+        self.count -= 1
+        self._counts[slot.client] -= 1
+        if not self._counts[slot.client]:
+            del self._counts[slot.client]

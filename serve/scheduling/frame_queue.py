@@ -7,7 +7,9 @@ Clients take turns (`serve.scheduling.fair_queue`).
 
 A small frame that arrives alone at a fast engine is processed on the event loop itself: handing it
 to another thread and back costs more than everything else beside the model. Frames that arrive
-meanwhile would have had to wait for that frame anyway. Two or more go to the thread.
+meanwhile would have had to wait for that frame anyway. Two or more go to the thread, unless the
+worker has no second core: there the thread would only take turns with the loop, in the middle of
+frames. Between two frames the loop handles all requests that have arrived.
 """
 
 import asyncio
@@ -17,7 +19,7 @@ import time
 from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache, partial
 from queue import SimpleQueue
 
 import trackfeatures as tf
@@ -75,8 +77,12 @@ class FrameQueue:
         warm_up: Callable[[Engine], None],
         streams: StreamTable,
         capacity: int,
+        single_core: bool = False,
     ) -> None:
-        """`capacity`: frames that may wait while one is processed."""
+        """`capacity`: frames that may wait while one is processed.
+
+        `single_core`: the worker has no second core for the thread.
+        """
         self._current = LoadedEngine.of(engine)
         self._staged: StagedEngine | None = None
         self._model_lock = threading.Lock()  # guards the two above, for a few instructions
@@ -85,6 +91,7 @@ class FrameQueue:
         self._ready = False
         self._streams = streams
         self._capacity = capacity
+        self.single_core = single_core
         self._admission = Admission()
         self._waiting = FairQueue()
         self._queue_lock = threading.Lock()  # guards the slots above, for a few instructions
@@ -111,7 +118,7 @@ class FrameQueue:
     @property
     def waiting(self) -> int:
         """Number of frames in the queue."""
-        return len(self._waiting)
+        return self._waiting.count
 
     def start(self) -> None:
         """Warm up the engine in the thread; `check_ready` reports when that is done."""
@@ -152,14 +159,33 @@ class FrameQueue:
     @property
     def full(self) -> bool:
         """Whether a frame that replaces no other would be refused."""
-        return len(self._waiting) + self._thread_busy > self._capacity
+        return self._waiting.count + self._thread_busy > self._capacity
+
+    @property
+    def is_thread_behind(self) -> bool:
+        """Whether the queue is full, and the thread processes it."""
+        return self._thread_busy and self.full
+
+    def refusal(self, client: str) -> Problem | None:
+        """The problem of a client's frame for which there is no room; None: there is room.
+
+        The same object for many frames: it must not be raised.
+        """
+        if not self._has_no_room(client):
+            return None
+        return _shared_overloaded(*self._load())
 
     def check_capacity(self, client: str) -> None:
-        """Raise Problem when the queue is full and none of it gives way to a client's frame."""
-        if self.full:
-            with self._queue_lock:
-                if self._waiting.giving_way_to(client) is None:
-                    raise self._overloaded()
+        """Raise Problem when there is no room for a client's frame."""
+        if self._has_no_room(client):
+            raise _overloaded(*self._load())
+
+    def _has_no_room(self, client: str) -> bool:
+        """Whether the queue is full, and none of it gives way to a client's frame."""
+        if not self.full:
+            return False
+        with self._queue_lock:
+            return self._waiting.giving_way_to(client) is None
 
     def submit(self, frame: Frame, on_result: ResultCallback) -> None:
         """Queue a frame; `on_result` is called on the loop with its result or its error.
@@ -194,13 +220,13 @@ class FrameQueue:
             if last is not None:
                 self._waiting.remove(last)
             elif self.full:
-                raise self._overloaded()
+                raise _overloaded(*self._load())
             self._waiting.append(slot)
             if not self._dispatched:
                 self._dispatched = True
                 # Not at once: first the loop reads all requests that have arrived.
                 self._loop.call_soon(self._dispatch)
-            return None if last is None else partial(last.on_result, self._overloaded())
+            return None if last is None else partial(last.on_result, _overloaded(*self._load()))
 
     def _supersede(self, frame: Frame, on_result: ResultCallback) -> ResultCallback | None:
         """Put a frame into its stream's slot; the callback of the older of the two, if any."""
@@ -214,25 +240,24 @@ class FrameQueue:
         return superseded
 
     def _dispatch(self) -> None:
-        """Process a single small frame here, on the loop; leave everything else to the thread."""
+        """Process a small frame here, on the loop, if it may be; leave all else to the thread."""
         fast = self._fast_frames >= INLINE_AFTER and self.loaded is self._fast_engine
-        if not (self._waiting.only_small and fast):
+        inline = 0 < self._waiting.count <= (self._capacity + 1 if self.single_core else 1)
+        if not (fast and inline and self._waiting.all_small):
             self._wake_ups.put(True)
             return
         with self._queue_lock:
             slot = self._waiting.take()
         result = self._process(slot.frame)
-        self._dispatched = False
+        self._dispatched = self._waiting.count > 0
+        if self._dispatched:
+            self._loop.call_soon(self._dispatch)
         slot.on_result(result)
 
-    def _overloaded(self) -> Problem:
-        waiting = len(self._waiting)
-        return Problem(
-            OVERLOADED,
-            f"{waiting} frames are waiting; send this one or a newer one later, or start the "
-            "service with more --workers",
-            self._mean_frame_ms * (waiting + 1),
-        )
+    def _load(self) -> tuple[int, int]:
+        """How many frames wait, and the time in which they will be processed, ms."""
+        waiting = self._waiting.count
+        return waiting, max(1, round(self._mean_frame_ms * (waiting + 1)))
 
     def _run_thread(self) -> None:
         try:
@@ -255,8 +280,8 @@ class FrameQueue:
     def _take_slot(self) -> Slot | None:
         """The next slot for the thread; None: the queue is empty."""
         with self._queue_lock:
-            self._thread_busy = self._dispatched = bool(self._waiting)
-            return self._waiting.take() if self._waiting else None
+            self._thread_busy = self._dispatched = self._waiting.count > 0
+            return self._waiting.take() if self._dispatched else None
 
     def _process(self, frame: Frame) -> "FrameResult | Exception":
         try:
@@ -299,6 +324,18 @@ class FrameQueue:
         for frames_wait in (True, False):
             self._wake_ups.put(frames_wait)
         self._thread.join()
+
+
+def _overloaded(waiting: int, wait_ms: int) -> Problem:
+    return Problem(
+        OVERLOADED,
+        f"{waiting} frames are waiting; send this one or a newer one later, or start the "
+        "service with more --workers",
+        wait_ms,
+    )
+
+
+_shared_overloaded = lru_cache(64)(_overloaded)
 
 
 def _after(done: Callable[[], None], on_result: ResultCallback) -> ResultCallback:

@@ -18,6 +18,8 @@ from serve.server.connection import MAX_AT_ONCE, GuardedProtocol, Phase
 
 CLOSE_HEADER: Header = (b"connection", b"close")
 SMALL_BYTES = 1024  # smaller parts of a body are put together: an object each would take more
+BODY = Phase.BODY
+OK, UNAVAILABLE = HTTPStatus.OK.value, HTTPStatus.SERVICE_UNAVAILABLE.value
 ASGI_HEADERS = frozenset({b"expect", b"upgrade", b"x-forwarded-for"})
 
 
@@ -89,7 +91,7 @@ class DirectProtocol(GuardedProtocol):
         self.headers = []
 
     def on_header(self, name: bytes, value: bytes) -> None:
-        if self._phase is Phase.BODY:
+        if self._phase is BODY:
             self.drop_trailer(name, value)
         else:
             self.headers.append((name.lower(), value))
@@ -165,10 +167,10 @@ class DirectProtocol(GuardedProtocol):
         self.transport.write(encode_head(reply, *headers) + reply.body)
         if not request.keep_alive:
             self.transport.close()
-        if reply.status == HTTPStatus.OK:
+        if reply.status == OK:
             self._idle_group = self._guard.served
         self.on_response_complete()
         if self.flow.write_paused:  # a client that reads no replies may send no more requests
             self.flow.pause_reading()
-        elif reply.status == HTTPStatus.SERVICE_UNAVAILABLE and self._service.frame_queue.full:
+        elif reply.status == UNAVAILABLE and self._service.frame_queue.is_thread_behind:
             self._guard.pause_reading(self)

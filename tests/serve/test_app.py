@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from serve.app import Service
+from serve.workers.shared_memory import create_shared_memory
 from tests.serve.conftest import (
     CARD,
     PATIENCE_S,
@@ -126,3 +128,15 @@ def test_the_service_imports_neither_torch_nor_physics() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize(
+    ("cores", "workers", "single"), [(1, 1, True), (2, 1, False), (3, 2, True), (4, 2, False)]
+)
+def test_a_worker_without_a_second_core_uses_its_loop_alone(
+    monkeypatch: pytest.MonkeyPatch, cores: int, workers: int, single: bool
+) -> None:
+    monkeypatch.setattr("os.sched_getaffinity", lambda _pid: set(range(cores)))
+    shared = create_shared_memory(workers + 1)  # as the supervisor does
+    app = Service(FakeEngine(lambda _image: outputs()), shared=shared)
+    assert app.frame_queue.single_core is single

@@ -1,6 +1,7 @@
 """The frame queue's model and its behaviour when it is full, without a server."""
 
 import asyncio
+import threading
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -11,7 +12,7 @@ import pytest
 from mtlnet.inference.engine import Engine
 from serve.api.problems import Problem
 from serve.scheduling.fair_queue import MAX_CLIENTS, FairQueue, Frame, FrameResult, Slot
-from serve.scheduling.frame_queue import FrameQueue
+from serve.scheduling.frame_queue import INLINE_AFTER, FrameQueue
 from serve.scheduling.streams import StreamTable
 from serve.workers.shared_memory import create_shared_memory
 from tests.serve.conftest import FakeEngine, Gate, outputs, picture, until
@@ -79,6 +80,93 @@ def test_a_refusal_schedules_nothing_on_the_event_loop(monkeypatch: pytest.Monke
     assert asyncio.run(scenario()) == []
 
 
+@pytest.mark.parametrize("single_core", [False, True])
+def test_frames_that_wait_together_are_processed_on_the_loop_by_a_worker_with_one_core(
+    single_core: bool,
+) -> None:
+    """Its thread would take turns with the loop. Between two frames the loop does other work."""
+    events: list[str] = []
+    engine = make_engine()
+    streams = StreamTable(create_shared_memory(1).streams())
+    queue = FrameQueue(engine, lambda _engine: None, streams, 4, single_core)
+
+    def read(_camera: object) -> Any:
+        events.append(threading.current_thread().name)
+        return np.ascontiguousarray(picture())
+
+    frame = Frame(read, stamp_ns=0, small=True)
+
+    async def submit(count: int) -> None:
+        loop = asyncio.get_running_loop()
+        results = [loop.create_future() for _ in range(count)]
+        for result in results:
+            queue.submit(frame, result.set_result)
+        while not results[-1].done():
+            await asyncio.sleep(0)
+            events.append("other work")
+
+    async def scenario() -> None:
+        queue.start()
+        until(lambda: queue.ready)
+        for _ in range(INLINE_AFTER):
+            await submit(1)
+        events.clear()
+        await submit(3)
+        queue.close()
+
+    asyncio.run(scenario())
+    if single_core:
+        assert events == ["MainThread", "other work"] * 3
+    else:
+        assert [event for event in events if event != "other work"] == ["forward"] * 3
+
+
+def test_a_worker_that_stops_while_frames_wait_for_its_loop_answers_them() -> None:
+    queue = FrameQueue(
+        make_engine(),
+        lambda _engine: None,
+        StreamTable(create_shared_memory(1).streams()),
+        capacity=4,
+        single_core=True,
+    )
+    frame = replace(make_frame(), small=True)
+
+    async def scenario() -> list[FrameResult | Exception]:
+        queue.start()
+        until(lambda: queue.ready)
+        loop = asyncio.get_running_loop()
+        errors: list[dict[str, Any]] = []
+        loop.set_exception_handler(lambda _loop, context: errors.append(context))
+        for _ in range(INLINE_AFTER):
+            result = loop.create_future()
+            queue.submit(frame, result.set_result)
+            await result
+        results = [loop.create_future() for _ in range(3)]
+        for result in results:
+            queue.submit(frame, result.set_result)
+        queue.close()
+        found = [await result for result in results]
+        assert errors == []
+        return found
+
+    assert all(isinstance(result, FrameResult) for result in asyncio.run(scenario()))
+
+
+def test_a_refusal_of_many_frames_holds_none_of_their_bodies() -> None:
+    queue = make_queue(make_engine(), capacity=1)
+    for _ in range(2):
+        queue._waiting.append(slot("10.0.0.1"))
+    first = queue.refusal("10.0.0.1")
+    assert first is not None
+    assert queue.refusal("10.0.0.1") is first
+    with pytest.raises(Problem, match="frames are waiting") as raised:
+        queue.check_capacity("10.0.0.1")
+    assert raised.value is not first
+    assert first.__traceback__ is None
+    queue._waiting.append(slot("10.0.0.1"))
+    assert queue.refusal("10.0.0.2") is None  # one of the other client gives way
+
+
 def slot(client: str) -> Slot:
     frame = replace(make_frame(), client=client)
     return Slot(frame, lambda _result: None)
@@ -91,7 +179,7 @@ def test_clients_take_turns() -> None:
         queue.append(each)
     taken = [queue.take() for _ in range(6)]
     assert taken == [many[0], few[0], many[1], few[1], many[2], many[3]]
-    assert not queue
+    assert queue.count == 0
 
 
 def test_the_last_frame_of_the_client_with_most_gives_way_to_one_with_fewer() -> None:
