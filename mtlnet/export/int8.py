@@ -110,7 +110,7 @@ def quantise(
         return nncf.compress_weights(
             quantised,
             mode=nncf.CompressWeightsMode.INT8_SYM,
-            ignored_scope=nncf.IgnoredScope(names=operation_names(model, "MatMul")[-1:]),
+            ignored_scope=nncf.IgnoredScope(names=float_weights(model)),
         )
 
 
@@ -118,6 +118,21 @@ def operation_names(model: Any, kind: str) -> list[str]:
     """Names of a model's operations of that type, in topological order."""
     operations = model.get_ordered_ops()
     return [op.get_friendly_name() for op in operations if op.get_type_name() == kind]
+
+
+def float_weights(model: Any) -> list[str]:
+    """Names of the MatMuls whose weights are not quantised.
+
+    These are the last shared layer, and those of the texture, which depend on no convolution.
+    """
+    after: set[str] = set()
+    for op in model.get_ordered_ops():
+        inputs = (value.get_node().get_friendly_name() for value in op.input_values())
+        if op.get_type_name() == "Convolution" or not after.isdisjoint(inputs):
+            after.add(op.get_friendly_name())
+    products = operation_names(model, "MatMul")
+    shared = [name for name in products if name in after]
+    return [name for name in products if name not in shared[:-1]]
 
 
 def float_operations(model: Any, chosen: Sequence[int]) -> list[str]:

@@ -15,9 +15,15 @@ import mtlnet.export.int8
 from datagen.recording import Dataset
 from mtlnet.evaluation.tables import export_lines
 from mtlnet.export.convert import export_model
-from mtlnet.export.int8 import choose_float_activations, float_choices, gate
+from mtlnet.export.int8 import (
+    choose_float_activations,
+    float_choices,
+    float_weights,
+    gate,
+    operation_names,
+)
 from mtlnet.export.openvino_graph import TOLERANCE, write_graph
-from mtlnet.inference.engine import EXPORT_FILE, INT8, load_engine, passed_gate
+from mtlnet.inference.engine import EXPORT_FILE, INT8, load_engine, passed_gate, read_graph
 from mtlnet.inference.model_card import (
     GRAPH,
     GRAPH_WEIGHTS,
@@ -25,6 +31,7 @@ from mtlnet.inference.model_card import (
     WEIGHTS,
     ModelError,
     read_card,
+    resolve_run,
 )
 from mtlnet.model.network import Network, fold, load_network
 from mtlnet.training.config import TrainConfig
@@ -100,6 +107,20 @@ def test_onnx_bf16_halves_the_weights(trained: Path, dataset: Path, tmp_path: Pa
 def consumers(operation: Any) -> Any:
     """The inputs that read an operation's output."""
     return operation.output(0).get_target_inputs()
+
+
+def test_weights_that_stay_float_are_the_last_shared_layers_and_the_textures() -> None:
+    run = resolve_run("default")
+    graph = read_graph(run, read_card(run))
+    products = operation_names(graph, "MatMul")
+    sizes = {
+        op.get_friendly_name(): list(op.get_output_shape(0))
+        for op in graph.get_ordered_ops()
+        if op.get_friendly_name() in products
+    }
+    kept = sorted(sizes.pop(name) for name in float_weights(graph))
+    assert kept == [[1, 256], [1, 560]]
+    assert sorted(sizes.values()) == [[1, 256], [1, 512]]
 
 
 @pytest.mark.slow

@@ -9,8 +9,9 @@ import pytest
 
 from datagen.recording import Dataset
 from mtlnet.evaluation.metrics import calibration, coverage
-from mtlnet.inference.engine import load_engine
-from mtlnet.inference.prediction import OUTPUTS, decode_outputs
+from mtlnet.inference.engine import Precision, load_engine
+from mtlnet.inference.model_card import resolve_run
+from mtlnet.inference.prediction import OUTPUTS, decode_outputs, split_outputs
 from mtlnet.inference.uncertainty import (
     CELL_VALUES,
     FEATURES,
@@ -24,6 +25,7 @@ from tests.mtlnet.ood_images import images_without_road, seen_by
 from trackfeatures.camera import CameraParameters
 
 OOD_IMAGES = 1000
+ROOT = Path(__file__).parents[3]
 
 
 def zero_pitch_layers() -> dict[str, np.ndarray]:
@@ -141,6 +143,24 @@ def test_images_without_a_road_are_out_of_distribution(published: Path) -> None:
     found = head.predict(np.zeros((OOD_IMAGES, 256), np.float32), np.stack(textures))[:, -1] > 1
     by_kind = Counter(kind for kind, ood in zip(kinds, found, strict=True) if ood)
     assert found.mean() > 0.98, by_kind
+
+
+@pytest.mark.parametrize(("precision", "tolerance"), [("f32", 1e-4), ("bf16", 0.02)])
+def test_the_graph_computes_the_score_of_the_texture(
+    precision: Precision, tolerance: float
+) -> None:
+    run = resolve_run("default")
+    head, engine = read_uncertainty_head(run), load_engine(run, precision=precision)
+    images = [
+        np.asarray(cv2.imread(str(path))[..., ::-1], np.uint8)
+        for path in sorted((ROOT / "serve" / "console").glob("sample-*.jpg"))
+    ]
+    images += [image for _, image in images_without_road(6, 3)]
+    assert len(images) > 10
+    x = np.zeros((len(images), len(head.centre)), np.float32)
+    expected = head.predict(x, np.stack([texture_features(image) for image in images]))[:, -1]
+    outputs = np.stack([engine(image) for image in images])
+    assert split_outputs(outputs).ood_score == pytest.approx(expected, rel=tolerance)
 
 
 def test_roads_are_in_distribution_and_other_cameras_are_not(
