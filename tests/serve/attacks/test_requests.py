@@ -18,7 +18,13 @@ from mtlnet.inference.image_decoding.decode import (
     inspect,
 )
 from mtlnet.inference.image_decoding.errors import ImageError
-from mtlnet.inference.image_decoding.jpeg_structure import WINDOW_BYTES, read_structure
+from mtlnet.inference.image_decoding.jpeg_structure import (
+    END_OF_DATA,
+    ENDS_DATA,
+    FIRST_BYTES,
+    WINDOW_BYTES,
+    read_structure,
+)
 from serve.api.problems import Problem
 from serve.config import MAX_BODY_BYTES, Limits
 from serve.scheduling.admission import MAX_CLIENT_MS, MAX_PENDING_MS, PRESENT_NS, Admission
@@ -68,13 +74,20 @@ def test_no_jpeg_holds_the_event_loop(body: bytes) -> None:
     assert held_s(lambda: inspect(body, CARD.camera)) < LOOP_S
 
 
-@pytest.mark.parametrize("at", [*range(WINDOW_BYTES - 4, WINDOW_BYTES + 4), 2 * WINDOW_BYTES - 1])
-def test_a_marker_across_two_windows_is_found(at: int) -> None:
+@pytest.mark.parametrize("size", [FIRST_BYTES, FIRST_BYTES + WINDOW_BYTES, 2 * WINDOW_BYTES])
+@pytest.mark.parametrize("beyond", range(-4, 4))
+def test_a_marker_across_two_windows_is_found(size: int, beyond: int) -> None:
+    at = size + beyond
     head = b"\xff\xd8\xff\xda\x00\x02"
     for data in (b"\x00", b"\xff"):
         body = head + data * at + b"\xff\xd9"
         found = read_structure(body)
         assert (found.length, found.scans) == (len(body), 1)
+
+
+def test_both_searches_agree_on_what_ends_entropy_coded_data() -> None:
+    found = [END_OF_DATA.match(bytes((0xFF, code))) is not None for code in range(256)]
+    assert found == ENDS_DATA.tolist()
 
 
 def test_scans_times_pixels_are_limited() -> None:
