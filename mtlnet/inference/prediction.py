@@ -5,6 +5,7 @@ is positive to the left, the angle is positive when the car points to the right 
 """
 
 from dataclasses import dataclass
+from math import isnan
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from mtlnet.inference.uncertainty import COLUMNS, FEATURES
 
 OUTPUTS = 9  # five coded distances, the coded angle, three class probabilities
 MARKINGS = len(tf.MARKINGS)
+HEADINGS = tuple(heading.name.lower() for heading in tf.Heading)
 # Each optional part, and whether an image's outputs have it, by their number.
 _HAS = {
     OUTPUTS + with_uncertainty * COLUMNS + with_absent * MARKINGS: (with_uncertainty, with_absent)
@@ -104,8 +106,8 @@ def decode_outputs(outputs: Numbers) -> Prediction:
         raise ValueError(f"the outputs of one image have one axis, not shape {outputs.shape}")
     parts = split_outputs(outputs)
     distances, angle = tf.decode(parts.coded[None])
-    decoded = [*distances[0], tf.localise(distances)[0]]
-    values = [None if np.isnan(value) else float(value) for value in decoded]
+    decoded = [*distances[0].tolist(), *tf.localise(distances).tolist()]
+    values = [None if isnan(value) else value for value in decoded]
     std = absent = None
     if parts.std is not None:
         present = [value is not None for value in values] + [True]  # the angle is never absent
@@ -117,9 +119,7 @@ def decode_outputs(outputs: Numbers) -> Prediction:
         distances_m=dict(zip(tf.MARKINGS, values[:5], strict=True)),
         to_lane_centre_m=values[5],
         angle_rad=float(angle[0]),
-        heading={
-            name.name.lower(): float(p) for name, p in zip(tf.Heading, parts.heading, strict=True)
-        },
+        heading=dict(zip(HEADINGS, parts.heading.tolist(), strict=True)),
         std=std,
         # Written so that a NaN counts as out of distribution too.
         out_of_distribution=None if parts.ood_score is None else not parts.ood_score <= 1.0,

@@ -103,7 +103,10 @@ class FairQueue:
     def take(self) -> Slot:
         """Remove the slot whose turn it is: the oldest of the client that waited longest."""
         slots, turns = self._slots, self._turns
-        slot = slots.pop(min(range(len(slots)), key=lambda n: turns.get(slots[n].client, 0)))
+        one_client = len(self._counts) == 1
+        slot = slots.pop(
+            0 if one_client else min(range(len(slots)), key=lambda n: turns.get(slots[n].client, 0))
+        )
         self._discount(slot)
         self._turn += 1
         turns.pop(slot.client, None)
