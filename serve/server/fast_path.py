@@ -33,12 +33,19 @@ class NullEvent:
 class DirectRequest:
     """A request in progress, with the attributes of uvicorn's RequestResponseCycle that it uses."""
 
-    __slots__ = ("disconnected", "features", "keep_alive", "parts", "response_complete")
+    __slots__ = (
+        "disconnected",
+        "features",
+        "keep_alive",
+        "parts",
+        "response_complete",
+        "waiting_for_100_continue",
+    )
     message_event = NullEvent()
 
     def __init__(self, keep_alive: bool) -> None:
         self.keep_alive = keep_alive
-        self.disconnected = self.response_complete = False
+        self.disconnected = self.response_complete = self.waiting_for_100_continue = False
         self.features: FeaturesRequest | None = None
         self.parts: list[bytes | bytearray] = []
 

@@ -1,6 +1,7 @@
 """Attacks on the bodies of HTTP requests: trailers, chunks, uploads that end early."""
 
 import gc
+import logging
 import socket
 from collections.abc import Callable
 
@@ -179,3 +180,22 @@ def test_a_body_in_many_small_chunks_is_refused(service: Served, target: Target)
         connection.sendall(head + b"\r\n" + body + b"0\r\n\r\n")
         assert read_reply(connection)[0] == 200
     assert 0.9 * FREE_CHUNKS < len(parts) < FREE_CHUNKS
+
+
+@pytest.mark.parametrize("path", ["/features", "/v2/models/track/infer"])
+def test_a_damaged_body_after_an_expectation_is_one_refusal(
+    service: Served, target: Target, path: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The interim reply that the client expects must not follow the refusal: that was an error."""
+    headers = {
+        "Expect": "100-continue",
+        "Content_Type": "application/json",
+        "Transfer_Encoding": "chunked",
+    }
+    head = b"POST %b HTTP/1.1\r\n%b\r\n" % (path.encode(), target.headers(**headers))
+    with target.dial() as connection:
+        connection.sendall(head + b"no number\r\n")
+        assert read_reply(connection)[0] == 400
+        assert read_rest(connection) == b""
+    assert service.ask("GET", "/healthz").status == 200  # the event loop has gone on
+    assert [record for record in caplog.records if record.levelno >= logging.ERROR] == []
