@@ -152,7 +152,7 @@ def test_the_graph_computes_the_score_of_the_texture(
     run = resolve_run("default")
     head, engine = read_uncertainty_head(run), load_engine(run, precision=precision)
     images = [
-        np.asarray(cv2.cvtColor(cv2.imread(str(path)), cv2.COLOR_BGR2RGB), np.uint8)
+        np.asarray(cv2.imread(str(path), cv2.IMREAD_COLOR_RGB), np.uint8)
         for path in sorted((ROOT / "serve" / "console").glob("sample-*.jpg"))
     ]
     images += [image for _, image in images_without_road(6, 3)]
