@@ -96,7 +96,7 @@ def _write_header(path: Path) -> None:
 def _serve(config: LinkConfig, as_json: bool) -> None:
     from simulator.link.process import run
 
-    signal.signal(signal.SIGTERM, _interrupt)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     summary = run(config, lambda text: typer.echo(text, err=True))
     if as_json:
         typer.echo(json.dumps(asdict(summary)))
@@ -115,8 +115,3 @@ def picture_size(text: str) -> tuple[int, int]:
     if not (width.isdecimal() and height.isdecimal() and int(width) and int(height)):
         raise UserError(f"--camera is {text!r}; give a size such as 280x210, or none")
     return int(width), int(height)
-
-
-def _interrupt(number: int, frame: object) -> None:
-    """Handle SIGTERM like Ctrl-C."""
-    raise KeyboardInterrupt

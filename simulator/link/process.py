@@ -1,6 +1,7 @@
 """Runs a link server from its options: builds the world, warms it up, serves until the end."""
 
 import os
+import signal
 from collections.abc import Callable
 from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any
@@ -8,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from runtime.signals import interrupts
 from simulator.link.config import LinkConfig
 from simulator.link.handshake import ServerInfo
 from simulator.link.layout import COMMAND, STATE, Mode, Request, image_bytes
@@ -27,7 +29,7 @@ if TYPE_CHECKING:
 
 
 def run(config: LinkConfig, report: Callable[[str], None]) -> Summary:
-    """Serve until a client's QUIT request or a KeyboardInterrupt; `report` receives log lines.
+    """Serve until a client's QUIT request, SIGINT or SIGTERM; `report` receives log lines.
 
     Raises UserError for bad options, ClientLost as `LinkServer.serve` does.
     """
@@ -57,10 +59,10 @@ def run(config: LinkConfig, report: Callable[[str], None]) -> Summary:
             )
         )
         report(f"{config.name}: {road.track.name} is ready for a client")
-        try:
-            server.serve()
-        except KeyboardInterrupt:
-            report(f"{config.name}: stopped")
+        with interrupts(signal.SIGINT, signal.SIGTERM) as interrupted:
+            server.serve(interrupted)
+            if interrupted():
+                report(f"{config.name}: stopped")
         return server.summary
 
 

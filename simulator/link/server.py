@@ -78,12 +78,12 @@ class LinkServer:
         write_header(self._segment, info)
         self._segment.publish()
 
-    def serve(self) -> None:
-        """Answer requests until a client sends QUIT, or leaves with `once`.
+    def serve(self, interrupted: Callable[[], bool] = lambda: False) -> None:
+        """Answer requests until a client sends QUIT or leaves with `once`, or until `interrupted`.
 
         Raises ClientLost when a client dies with `once`, or sends nothing for `patience_s`.
         """
-        while not self._done:
+        while not (self._done or interrupted()):
             if self._wait_for_command():
                 self._handle(self._inbox.record)
             elif self._session:

@@ -6,11 +6,9 @@ simulator watch --track coast --lanes 2 --traffic 6 --port 8765
 import signal
 import socket
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from types import FrameType
 from typing import Final
 
+from runtime.signals import interrupts
 from runtime.sockets import address, bind
 from simulator.camera import check_light
 from simulator.camera.core.context import graphics
@@ -48,30 +46,10 @@ def _drive(road: Road, config: WatchConfig, listener: socket.socket) -> None:
             url = address(listener, config.host)
             sys.stderr.write(f"watch {road.track.name} at {url} (Ctrl-C ends it)\n")
             sys.stderr.flush()
-            with _interrupts() as interrupted:
+            with interrupts(signal.SIGINT) as interrupted:
                 while not interrupted():
                     drive.advance()
         finally:
             server.stop()
             drive.close()
     raise KeyboardInterrupt
-
-
-@contextmanager
-def _interrupts() -> Iterator[Callable[[], bool]]:
-    """A function that returns whether Ctrl-C was pressed.
-
-    A KeyboardInterrupt raised inside a callback or finaliser would only be printed and lost. A
-    second Ctrl-C is raised as usual.
-    """
-    seen: list[int] = []
-
-    def note(number: int, _frame: FrameType | None) -> None:
-        seen.append(number)
-        signal.signal(number, signal.default_int_handler)
-
-    before = signal.signal(signal.SIGINT, note)
-    try:
-        yield lambda: bool(seen)
-    finally:
-        signal.signal(signal.SIGINT, before)

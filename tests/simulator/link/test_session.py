@@ -8,7 +8,7 @@ import subprocess
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -26,9 +26,10 @@ from simulator.link.errors import (
     Refused,
     ServerDied,
 )
-from simulator.link.layout import Mode, Refusal
+from simulator.link.layout import Mode, Refusal, Request
 from simulator.link.process import run
 from simulator.link.server import Summary
+from simulator.link.simulation import Simulation
 from simulator.vehicle.state import Command
 from tests.typed import typed
 from trackfeatures.errors import UserError
@@ -191,6 +192,37 @@ def test_sigterm_notifies_the_client_and_prints_json(server: Start, name: str, n
     assert process.returncode == 0
     expected = {"clients": 1, "clients_lost": 0, "episodes": 1, "steps": 0, "refused": 0}
     assert json.loads(out) == expected
+    assert f"{name}: stopped" in said
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_ends_the_server_where_an_exception_would_be_lost(
+    name: str, monkeypatch: pytest.MonkeyPatch, number: int
+) -> None:
+    """As numpy loses one raised while it compares a scalar with an IntEnum."""
+
+    def answer(simulation: Simulation, request: Any) -> None:
+        original(simulation, request)
+        if request["request"] == Request.STEP:
+            with suppress(BaseException):
+                signal.raise_signal(signal.Signals(number))
+
+    def drive() -> None:
+        with Link(name, wait_s=WAIT_S) as link:
+            link.reset(seed=1)
+            link.step(Command())
+
+    original = Simulation.answer
+    said: list[str] = []
+    with ThreadPoolExecutor(1) as pool:
+        config = LinkConfig(
+            name=name, track="oval", once=True
+        )  # ends with its client at the latest
+        monkeypatch.setattr("simulator.link.process._warm_up", lambda *_: None)
+        monkeypatch.setattr(Simulation, "answer", answer)
+        client = pool.submit(drive)
+        run(config, said.append)
+        client.result(WAIT_S)
     assert f"{name}: stopped" in said
 
 
