@@ -50,6 +50,8 @@ RELOAD_S, RESTART_S = 60.0, 300.0
 IMAGES = 16
 GROWTH, SLOWER = 0.01, 1.2
 MINUTE_S = 60.0
+PART_S = 10 * MINUTE_S
+"""A long run is also told in parts."""
 COUNTED = re.compile(r'^driverview_frames_total\{.*outcome="answered".*\} ([0-9.e+]+)$', re.M)
 
 Known = dict[str, list[dict[str, Any]]]  # model hash -> its answers to the images
@@ -201,8 +203,13 @@ class Memory:
     fault: str = ""
 
     def watch(self, end: float) -> None:
-        """Look once a second until `end`."""
-        while time.monotonic() < end and not self.fault:
+        """Look once a second until `end`; tell every ten minutes."""
+        tell = time.monotonic() + PART_S
+        while (now := time.monotonic()) < end and not self.fault:
+            if now >= tell:
+                tell += PART_S
+                megabytes = self.median(now - MINUTE_S, now)
+                print(f"{(end - now) / MINUTE_S:.0f} min left: {megabytes:.1f} MB", file=sys.stderr)
             try:
                 found = sum(resident_mb(pid) for pid in self.pids)
             except OSError as error:
@@ -254,6 +261,7 @@ def judge_attacked(
     p99s = [quantiles(part, n=100)[98] for part in (first, later)]
     megabytes = [memory.median(begin, begin + MINUTE_S), memory.median(end - MINUTE_S, end)]
     growth, slower = megabytes[1] / megabytes[0] - 1.0, p99s[1] / p99s[0]
+    parts = [begin + PART_S * number for number in range(int((end - begin) / PART_S))]
     return {
         "answers": len(answers),
         "answered_share": round(len(answers) / (len(answers) + refused.total()), 5),
@@ -265,6 +273,11 @@ def judge_attacked(
         "memory_mb_first_minute": round(megabytes[0], 1),
         "memory_mb_last_minute": round(megabytes[1], 1),
         "growth": round(growth, 4),
+        "memory_mb_of_ten_minutes": [round(memory.median(p, p + PART_S), 1) for p in parts],
+        "p99_ms_of_ten_minutes": [
+            round(quantiles([ms for sent, ms in answers if p <= sent < p + PART_S], n=100)[98], 1)
+            for p in parts
+        ],
         "faults": faults[:10],
         "reached": not faults and growth <= GROWTH and slower <= SLOWER,
     }
