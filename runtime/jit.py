@@ -92,5 +92,15 @@ def compiled(function: Function) -> Function:
     Without fast-math: it would let the compiler reorder sums, and two builds of the same kernel
     could then differ in the last bit. Every recording and replay relies on them being equal.
     """
+    return _compiled(function, nogil=False)
+
+
+def compiled_for_threads(function: Function) -> Function:
+    """Like `compiled`; the function releases the GIL, so that threads run it at the same time."""
+    return _compiled(function, nogil=True)
+
+
+def _compiled(function: Function, *, nogil: bool) -> Function:
     vars(numba.config)["CACHE_DIR"] = _cache_folder(function.__module__.partition(".")[0])
-    return cast(Function, numba.njit(cache=True, fastmath=False, error_model="numpy")(function))
+    decorate = numba.njit(cache=True, fastmath=False, error_model="numpy", nogil=nogil)
+    return cast(Function, decorate(function))

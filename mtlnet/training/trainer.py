@@ -4,8 +4,6 @@ import ctypes
 import re
 import sys
 from collections.abc import Callable, Sequence
-from functools import cache
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -16,6 +14,7 @@ from mtlnet.data.loader import Batch, Loader
 from mtlnet.model.architecture import MTL, Architecture
 from mtlnet.model.auxiliary import auxiliary_loss
 from mtlnet.model.bins import Scores
+from mtlnet.model.cpu_kernels.bf16 import cpu_has_bf16
 from mtlnet.model.cpu_kernels.forward import FAST, forward_grid, forward_shared, training_outputs
 from mtlnet.model.network import Network, initialise
 from mtlnet.training.bins_loss import bins_loss
@@ -245,13 +244,3 @@ def choose_device(name: str, rank: Rank = SINGLE_PROCESS) -> torch.device:
     if device.type == "cuda" and (device.index or 0) >= torch.cuda.device_count():
         raise UserError(f"--device {name}: torch finds {torch.cuda.device_count()} GPU(s)")
     return device
-
-
-@cache
-def cpu_has_bf16() -> bool:
-    """Whether the CPU multiplies bf16 natively (AVX512-BF16 or AMX); others are slower in it."""
-    info = Path("/proc/cpuinfo")
-    if not info.is_file():
-        return False
-    text = info.read_text()
-    return "avx512_bf16" in text or "amx_bf16" in text

@@ -18,6 +18,7 @@ from torch import Tensor
 from torch.nn.functional import conv2d, pad
 
 from mtlnet.model.architecture import same_padding
+from mtlnet.model.cpu_kernels.elementwise import as_rows, centre, in_threads
 
 BLOCK = 4
 ROW_BYTES = 12  # of one row of a block: four pixels of three colours
@@ -41,10 +42,13 @@ def space_to_depth(images: Tensor, dtype: torch.dtype) -> Tensor:
     if rest:
         last = words[:, whole:].view(count, rest, columns, ROW_BYTES // 4)
         blocks[:, -1, :, :rest] = last.transpose(1, 2)
-    x = blocks.view(torch.uint8).to(dtype).sub_(COLOUR_OFFSET)
+    x = torch.empty((count, rows, columns, BLOCK * ROW_BYTES), dtype=dtype).permute(0, 3, 1, 2)
+    pixels = blocks.view(torch.uint8).view(-1, BLOCK * ROW_BYTES).numpy()
+    values = as_rows(x)
+    in_threads(lambda part, _: centre(pixels[part], COLOUR_OFFSET, values[part]), len(values))
     if rest:
-        x[:, -1, :, rest:] = 0
-    return x.view(count, rows, columns, BLOCK * ROW_BYTES).permute(0, 3, 1, 2)
+        x[:, rest * ROW_BYTES :, -1] = 0
+    return x
 
 
 def space_to_depth_convolution(

@@ -76,16 +76,25 @@ def forward_shared(
 def _layer(x: Tensor, number: int, spec: Conv, pool: Pool | None, block: nn.Module) -> Tensor:
     layer, norm = block.get_submodule("layer"), dict(block.named_children()).get("norm")
     assert isinstance(layer, nn.Conv2d)
-    if norm is None:
-        y = _convolve(x, number, spec, layer.weight, layer.bias)
+    assert norm is None or isinstance(norm, nn.BatchNorm2d)
+    if norm is None or not norm.training:
+        weight, bias = (layer.weight, layer.bias) if norm is None else _folded(layer, norm)
+        y = _convolve(x, number, spec, weight, bias)
         pooled = (
             y if pool is None else max_pool2d(y, **pool_arguments(y.shape[2], y.shape[3], pool))
         )
         return relu(pooled)
-    assert isinstance(norm, nn.BatchNorm2d)
     sign = torch.where(norm.weight.detach() < 0, -1.0, 1.0)
     y = _convolve(x, number, spec, layer.weight * sign[:, None, None, None], None)
     return norm_pool_relu(y, sign, norm, pool)
+
+
+def _folded(layer: nn.Conv2d, norm: nn.BatchNorm2d) -> tuple[Tensor, Tensor]:
+    """Filters and biases of a convolution with its normalisation by frozen statistics."""
+    assert norm.running_mean is not None
+    assert norm.running_var is not None
+    scale = norm.weight / torch.sqrt(norm.running_var + norm.eps)
+    return layer.weight * scale[:, None, None, None], norm.bias - norm.running_mean * scale
 
 
 def _convolve(x: Tensor, number: int, spec: Conv, weight: Tensor, bias: Tensor | None) -> Tensor:

@@ -7,12 +7,23 @@ batch over all processes (Ioffe and Szegedy 2015, algorithm 1).
 
 from typing import Any
 
+import numpy as np
 import torch
 import torch.distributed as dist
 from torch import Tensor, nn
-from torch.nn.functional import batch_norm, max_pool2d, relu
+from torch.nn.functional import max_pool2d
 
 from mtlnet.model.architecture import Pool, same_padding
+from mtlnet.model.cpu_kernels.elementwise import (
+    add_affine,
+    add_gradient_sums,
+    add_moments,
+    affine_relu,
+    as_rows,
+    in_threads,
+    input_gradient,
+    part_count,
+)
 
 native = torch.ops.aten
 
@@ -36,17 +47,27 @@ def statistics(x: Tensor) -> tuple[Tensor, Tensor, int]:
 
     float32 for x in bf16.
     """
-    unused = torch.zeros(2, x.shape[1], dtype=torch.promote_types(x.dtype, torch.float32))
-    mean, variance = native.batch_norm_update_stats(x, unused[0], unused[1], 0.0)
-    count = x.numel() // x.shape[1]
+    values = as_rows(x.detach())
+    count = len(values)
+    dtype = torch.promote_types(x.dtype, torch.float32)
+    origin = x.detach()[0, :, 0, 0].to(dtype)  # subtracted, so that no digits of the squares cancel
+    parts = torch.zeros(part_count(), 2, x.shape[1], dtype=torch.float64)
+
+    def work(part: slice, number: int) -> None:
+        add_moments(values[part], origin.numpy(), *parts[number].numpy())
+
+    in_threads(work, count)
+    mean, square = parts.sum(0) / count
+    variance = (square - mean.square()).clamp_min(0.0)
+    mean = mean + origin
     if not dist.is_initialized() or dist.get_world_size() == 1:
-        return mean, variance, count
+        return mean.to(dtype), variance.to(dtype), count
     world = dist.get_world_size()  # each process has the same number of images
-    moments = torch.stack([mean, variance + mean.square()]).double()
+    moments = torch.stack([mean, variance + mean.square()])
     dist.all_reduce(moments)
     moments /= world
     mean = moments[0]
-    return mean.to(unused), (moments[1] - mean.square()).to(unused), count * world
+    return mean.to(dtype), (moments[1] - mean.square()).to(dtype), count * world
 
 
 class _NormPoolRelu(torch.autograd.Function):
@@ -61,42 +82,60 @@ class _NormPoolRelu(torch.autograd.Function):
         pool: Pool | None,
     ) -> Tensor:
         mean, variance, ctx.count = moments
-        ctx.eps, ctx.pool = eps, None
-        pooled, places = x, None
+        inverse = torch.rsqrt(variance + eps)
+        a = gain * inverse
+        b = shift - mean * a
+        ctx.pool, pooled, places = None, x, None
         if pool is not None:
             ctx.pool = pool_arguments(x.shape[2], x.shape[3], pool)
             pooled, places = max_pool2d(x, **ctx.pool, return_indices=True)
-        y = relu(batch_norm(pooled, mean, variance, gain, shift, False, 0.0, eps))
-        ctx.save_for_backward(x, pooled, y, gain, mean, variance, places)
+        y = torch.empty_like(pooled, memory_format=torch.channels_last)
+        inputs, outputs = as_rows(pooled), as_rows(y)
+
+        def work(part: slice, _: int) -> None:
+            affine_relu(inputs[part], a.numpy(), b.numpy(), outputs[part])
+
+        in_threads(work, len(inputs))
+        ctx.save_for_backward(x, pooled, a, b, mean, inverse, places)
         return y
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, Tensor, Tensor, None, None, None]:
-        x, pooled, y, gain, mean, variance, places = ctx.saved_tensors
-        relu_gradient = native.threshold_backward(gradients[0], y, 0)
-        deviation = torch.sqrt(variance + ctx.eps)
-        direct, gain_gradient, shift_gradient = native.native_batch_norm_backward(
-            relu_gradient,
-            pooled,
-            gain,
-            mean,
-            variance,
-            None,
-            None,
-            False,
-            ctx.eps,
-            [True, True, True],
-        )
-        if ctx.pool is not None:
-            direct = _unpool(direct, x, ctx.pool, places)
-        sums = torch.stack([gain_gradient, shift_gradient])
+        x, pooled, a, b, mean, inverse, places = ctx.saved_tensors
+        given, values, affine = as_rows(gradients[0]), as_rows(pooled), (a.numpy(), b.numpy())
+        parts = torch.zeros(part_count(), 2, len(a), dtype=torch.float64)
+
+        def sum_part(part: slice, number: int) -> None:
+            sums = parts[number].numpy()
+            add_gradient_sums(given[part], values[part], *affine, mean.numpy(), *sums)
+
+        in_threads(sum_part, len(values))
+        sums = parts.sum(0)
+        sums[1] *= inverse
+        shift_gradient, gain_gradient = sums.to(a.dtype)
         if dist.is_initialized() and dist.get_world_size() > 1:
             dist.all_reduce(sums)
         # Gradient through the mean and the variance: -(a / n) (sum(g) + z sum(g z)), where
-        # a = gain / deviation and z = (x - mean) / deviation: an affine function of x.
-        a = -gain / deviation / ctx.count
-        through = batch_norm(x, mean, variance, a * sums[0], a * sums[1], False, 0.0, ctx.eps)
-        return direct.add_(through), gain_gradient, shift_gradient, None, None, None
+        # z = (x - mean) * inverse: an affine function of x.
+        slope = -a / ctx.count * inverse * sums[1]
+        offset = -a / ctx.count * sums[0] - slope * mean
+        through = slope.to(a.dtype).numpy(), offset.to(a.dtype).numpy()
+        pooled_through = through if ctx.pool is None else (np.zeros_like(affine[0]),) * 2
+        direct = torch.empty_like(pooled, memory_format=torch.channels_last)
+        out = as_rows(direct)
+
+        def differentiate(part: slice, _: int) -> None:
+            input_gradient(given[part], values[part], *affine, *pooled_through, out[part])
+
+        in_threads(differentiate, len(values))
+        if ctx.pool is not None:
+            direct = _unpool(direct, x, ctx.pool, places)
+            direct = direct.contiguous(memory_format=torch.channels_last)
+            all_values, whole = as_rows(x), as_rows(direct)
+            in_threads(
+                lambda part, _: add_affine(all_values[part], *through, whole[part]), len(whole)
+            )
+        return direct, gain_gradient, shift_gradient, None, None, None
 
 
 def _unpool(gradient: Tensor, x: Tensor, pool: dict[str, Any], places: Tensor) -> Tensor:
@@ -117,10 +156,8 @@ def norm_pool_relu(x: Tensor, sign: Tensor, norm: nn.BatchNorm2d, pool: Pool | N
     """Batch normalisation, max pooling and ReLU of x (B, C, H, W).
 
     x is the convolution's output times `sign` (C,), the sign of the normalisation's gain. Updates
-    the running statistics of `norm` like torch, or uses them if `norm` is in evaluation mode.
+    the running statistics of `norm` like torch.
     """
-    if not norm.training:
-        return _frozen_norm_pool_relu(x, sign, norm, pool)
     with torch.no_grad():
         mean, variance, count = statistics(x)
         momentum = norm.momentum or 0.0
@@ -134,12 +171,3 @@ def norm_pool_relu(x: Tensor, sign: Tensor, norm: nn.BatchNorm2d, pool: Pool | N
         x, norm.weight * sign, norm.bias, (mean, variance, count), norm.eps, pool
     )
     return out
-
-
-def _frozen_norm_pool_relu(
-    x: Tensor, sign: Tensor, norm: nn.BatchNorm2d, pool: Pool | None
-) -> Tensor:
-    assert norm.running_mean is not None
-    pooled = x if pool is None else max_pool2d(x, **pool_arguments(x.shape[2], x.shape[3], pool))
-    mean, gain = norm.running_mean * sign, norm.weight * sign
-    return relu(batch_norm(pooled, mean, norm.running_var, gain, norm.bias, False, 0.0, norm.eps))

@@ -6,14 +6,15 @@ import numpy as np
 import pytest
 import torch
 
-from mtlnet.model.architecture import GRID, MTL, SHARED, Architecture
+from mtlnet.model.architecture import GRID, MTL, SHARED, Architecture, Pool
 from mtlnet.model.cpu_kernels.convolutions import (
     im2col_convolution,
     space_to_depth,
     space_to_depth_convolution,
 )
+from mtlnet.model.cpu_kernels.elementwise import affine_relu, as_rows, in_threads
 from mtlnet.model.cpu_kernels.forward import forward_features, training_outputs
-from mtlnet.model.cpu_kernels.norm_pool_relu import statistics
+from mtlnet.model.cpu_kernels.norm_pool_relu import norm_pool_relu, statistics
 from mtlnet.model.network import Network, initialise
 from mtlnet.training.trainer import dropout_masks, freeze_batch_norm
 
@@ -117,6 +118,64 @@ def test_batch_statistics_of_bf16_are_float32() -> None:
     torch.testing.assert_close(mean.double(), x.double().mean((0, 2, 3)), rtol=1e-5, atol=1e-5)
     expected = x.double().var((0, 2, 3), correction=0)
     torch.testing.assert_close(variance.double(), expected, rtol=1e-4, atol=1e-4)
+
+
+def test_the_variance_of_values_far_from_zero_loses_no_digits() -> None:
+    x = torch.randn((4, 8, 20, 30), generator=torch.Generator().manual_seed(0)) * 0.01 + 1000
+    x = x.contiguous(memory_format=torch.channels_last)
+    _, variance, _ = statistics(x)
+    expected = x.double().var((0, 2, 3), correction=0)
+    torch.testing.assert_close(variance.double(), expected, rtol=1e-3, atol=0.0)
+
+
+def test_elementwise_passes_round_to_bf16_like_torch() -> None:
+    values = torch.arange(1 << 16, dtype=torch.int32).to(torch.uint16).view(torch.bfloat16)
+    x = values[values.isfinite()].view(1, -1, 1, 32).permute(0, 3, 1, 2)
+    a = torch.linspace(0.1, 3.0, 32)
+    out = torch.empty_like(x, memory_format=torch.channels_last)
+    affine_relu(as_rows(x), a.numpy(), torch.zeros(32).numpy(), as_rows(out))
+    expected = torch.relu(x.float() * a[:, None, None]).bfloat16()
+    assert torch.equal(out, expected)
+
+
+@pytest.mark.parametrize("pool", [None, Pool()], ids=["no pool", "pool"])
+def test_gradients_of_batch_norm_in_bf16_are_those_of_float64_rounded(pool: Pool | None) -> None:
+    generator = torch.Generator().manual_seed(0)
+    x = (torch.randn((6, 16, 9, 13), generator=generator) * 2 + 1).bfloat16()
+    x = x.contiguous(memory_format=torch.channels_last)
+    gradient = torch.randn((6, 16, 5, 7) if pool else x.shape, generator=generator).bfloat16()
+    found = []
+    for dtype in (torch.float64, torch.bfloat16):
+        norm = torch.nn.BatchNorm2d(16, dtype=torch.promote_types(dtype, torch.float32))
+        with torch.no_grad():
+            norm.weight.copy_(torch.linspace(0.5, 1.5, 16))
+        values = x.to(dtype).requires_grad_()
+        y = norm_pool_relu(values, torch.ones(16, dtype=norm.weight.dtype), norm, pool)
+        assert y.dtype == dtype
+        torch.autograd.backward(y, gradient.to(dtype))
+        found.append((y.detach(), values.grad, norm.weight.grad, norm.bias.grad))
+    for exact, rounded in zip(*found, strict=True):
+        assert exact is not None
+        assert rounded is not None
+        difference = (rounded.double() - exact).norm() / exact.norm()
+        assert float(difference) < 0.005
+
+
+def test_parts_of_a_pass_cover_all_rows_and_raise_what_a_thread_raises() -> None:
+    rows = np.zeros(1001)
+
+    def count(part: slice, _: int) -> None:
+        rows[part] += 1
+
+    in_threads(count, len(rows))
+    assert bool((rows == 1).all())
+
+    def fail(part: slice, _: int) -> None:
+        if part.stop == len(rows):
+            raise ValueError("last part")
+
+    with pytest.raises(ValueError, match="last part"):
+        in_threads(fail, len(rows))
 
 
 def test_dropout_masks_depend_on_the_seed_and_not_on_the_number_of_processes() -> None:

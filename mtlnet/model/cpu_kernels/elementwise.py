@@ -1,0 +1,194 @@
+"""Compiled passes over values (N, C) with channels last: input of the network, batch norm, ReLU.
+
+torch takes several times as long for bf16 with channels last, and more passes. Values are bf16,
+given as uint16, float32 or float64. Parameters of a channel (C,) and what is computed are float32,
+or float64 for values in float64. Sums are in that type over `BLOCK_ROWS` rows and in float64 over
+the blocks. `in_threads` runs a pass on all threads that torch uses.
+"""
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import lru_cache
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import torch
+from llvmlite import ir
+from numba import types
+from numba.extending import intrinsic
+from numpy.typing import NDArray
+from torch import Tensor
+
+from runtime.jit import compiled_for_threads
+
+BLOCK_ROWS = 256
+BF16 = types.uint16
+BF16_SHIFT = 16  # bf16 is the upper half of a float32
+
+Values = NDArray[Any]
+Sums = NDArray[np.float64]
+
+
+def _int32(value: int) -> Any:
+    return ir.Constant(ir.IntType(32), value)
+
+
+def _typed_widen(typing_context: Any, value: Any) -> Any:
+    def build(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        if signature.args[0] != BF16:
+            return arguments[0]
+        bits = builder.zext(arguments[0], ir.IntType(32))
+        return builder.bitcast(builder.shl(bits, _int32(BF16_SHIFT)), ir.FloatType())
+
+    return (types.float32 if value == BF16 else value)(value), build
+
+
+def _typed_narrow(typing_context: Any, value: Any, like: Any) -> Any:
+    def build(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        if signature.args[1] != BF16:
+            return arguments[0]
+        bits = builder.bitcast(arguments[0], ir.IntType(32))  # rounded to nearest, ties to even
+        odd = builder.and_(builder.lshr(bits, _int32(BF16_SHIFT)), _int32(1))
+        rounded = builder.add(builder.add(bits, odd), _int32((1 << (BF16_SHIFT - 1)) - 1))
+        return builder.trunc(builder.lshr(rounded, _int32(BF16_SHIFT)), ir.IntType(16))
+
+    return like(types.float32 if like == BF16 else like, like), build
+
+
+widen: Any = intrinsic(_typed_widen)
+"""A stored value as float32 or float64."""
+narrow: Any = intrinsic(_typed_narrow)
+"""`narrow(value, like)`: a computed value in the type that the stored value `like` has."""
+
+
+@compiled_for_threads
+def add_moments(x: Values, origin: Values, total: Sums, squares: Sums) -> None:
+    """Add the sums over N of x - `origin` (C,), and of its squares, to `total` and `squares`."""
+    rows, channels = x.shape
+    sums, products = np.zeros_like(origin), np.zeros_like(origin)
+    for start in range(0, rows, BLOCK_ROWS):
+        stop = min(start + BLOCK_ROWS, rows)
+        sums[:] = 0
+        products[:] = 0
+        fours = stop - (stop - start) % 4
+        for n in range(start, fours, 4):
+            for c in range(channels):
+                d0, d1 = widen(x[n, c]) - origin[c], widen(x[n + 1, c]) - origin[c]
+                d2, d3 = widen(x[n + 2, c]) - origin[c], widen(x[n + 3, c]) - origin[c]
+                sums[c] += (d0 + d1) + (d2 + d3)
+                products[c] += (d0 * d0 + d1 * d1) + (d2 * d2 + d3 * d3)
+        for n in range(fours, stop):
+            for c in range(channels):
+                d = widen(x[n, c]) - origin[c]
+                sums[c] += d
+                products[c] += d * d
+        total += sums
+        squares += products
+
+
+@compiled_for_threads
+def affine_relu(x: Values, a: Values, b: Values, out: Values) -> None:
+    """Set `out` (N, C) to relu(a x + b)."""
+    zero = a.dtype.type(0)
+    for n in range(x.shape[0]):
+        for c in range(x.shape[1]):
+            y = widen(x[n, c]) * a[c] + b[c]
+            out[n, c] = narrow(y if y > zero else zero, out[n, c])
+
+
+@compiled_for_threads
+def add_gradient_sums(
+    gradient: Values,
+    x: Values,
+    a: Values,
+    b: Values,
+    mean: Values,
+    sums: Sums,
+    products: Sums,
+) -> None:
+    """Add to `sums` and `products` (C,) those of g and of g (x - mean).
+
+    g: the gradient of a x + b, from `gradient` (N, C), that of relu(a x + b).
+    """
+    zero = a.dtype.type(0)
+    block_sums, block_products = np.zeros_like(a), np.zeros_like(a)
+    for start in range(0, x.shape[0], BLOCK_ROWS):
+        block_sums[:] = 0
+        block_products[:] = 0
+        for n in range(start, min(start + BLOCK_ROWS, x.shape[0])):
+            for c in range(x.shape[1]):
+                value, g = widen(x[n, c]), widen(gradient[n, c])
+                g = g if value * a[c] + b[c] > zero else zero
+                block_sums[c] += g
+                block_products[c] += g * (value - mean[c])
+        sums += block_sums
+        products += block_products
+
+
+@compiled_for_threads
+def input_gradient(
+    gradient: Values, x: Values, a: Values, b: Values, slope: Values, offset: Values, out: Values
+) -> None:
+    """Set `out` (N, C) to a g + slope x + offset, with g as in `add_gradient_sums`."""
+    zero = a.dtype.type(0)
+    for n in range(x.shape[0]):
+        for c in range(x.shape[1]):
+            value, g = widen(x[n, c]), widen(gradient[n, c])
+            g = g if value * a[c] + b[c] > zero else zero
+            out[n, c] = narrow(g * a[c] + (value * slope[c] + offset[c]), out[n, c])
+
+
+@compiled_for_threads
+def add_affine(x: Values, slope: Values, offset: Values, out: Values) -> None:
+    """Add slope x + offset to `out` (N, C)."""
+    for n in range(x.shape[0]):
+        for c in range(x.shape[1]):
+            sum_ = widen(out[n, c]) + (widen(x[n, c]) * slope[c] + offset[c])
+            out[n, c] = narrow(sum_, out[n, c])
+
+
+@compiled_for_threads
+def centre(pixels: NDArray[np.uint8], offset: float, out: Values) -> None:
+    """Set `out` (N, C) to `pixels` (N, C) - `offset`."""
+    for n in range(pixels.shape[0]):
+        for c in range(pixels.shape[1]):
+            out[n, c] = narrow(np.float32(pixels[n, c]) - np.float32(offset), out[n, c])
+
+
+def as_rows(x: Tensor) -> Values:
+    """Values (B, C, H, W) as an array (B H W, C).
+
+    It shares their memory if they are channels-last.
+    """
+    last = x.permute(0, 2, 3, 1).contiguous()
+    stored = last.view(torch.uint16) if x.dtype == torch.bfloat16 else last
+    return stored.view(-1, x.shape[1]).numpy()
+
+
+@lru_cache(1)
+def _pool(threads: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(threads, "elementwise")
+
+
+def in_threads(work: Callable[[slice, int], None], rows: int) -> None:
+    """Call `work(part, number)` for each of `part_count()` parts of so many rows, each on a thread.
+
+    Raises what `work` raises.
+    """
+    parts = part_count()
+    bounds = [rows * number // parts for number in range(parts + 1)]
+    slices = [slice(low, high) for low, high in pairwise(bounds)]
+    others = [
+        _pool(parts).submit(work, part, number) for number, part in enumerate(slices[1:], start=1)
+    ]
+    try:
+        work(slices[0], 0)
+    finally:
+        for other in others:
+            other.result()
+
+
+def part_count() -> int:
+    """The number of threads that torch uses."""
+    return torch.get_num_threads()
