@@ -35,7 +35,8 @@ Alpha = Annotated[
 Network = Annotated[
     str | None,
     typer.Option(
-        help="grid, mtl (the paper's), deepdriving, mobilenet_v3_small, regnet_y_400mf.  "
+        help="grid, grid_residual, mtl (the paper's), deepdriving, mobilenet_v3_small, "
+        "regnet_y_400mf.  "
         "[default: grid, with recipe paper mtl]"
     ),
 ]

@@ -131,8 +131,9 @@ def convolutions(ops: Any, x: Any, architecture: Architecture, weights: Weights)
             x = _pool(ops, x, spec)
         else:
             name = f"features.conv{number}.layer"
-            x = _convolution(ops, x, spec, weights[f"{name}.weight"])
-            x = ops.relu(ops.add(x, weights[f"{name}.bias"].reshape(1, -1, 1, 1)))
+            y = _convolution(ops, x, spec, weights[f"{name}.weight"])
+            y = ops.relu(ops.add(y, weights[f"{name}.bias"].reshape(1, -1, 1, 1)))
+            x = ops.add(x, y) if spec.skip else y
     return x
 
 

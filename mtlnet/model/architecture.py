@@ -14,6 +14,8 @@ answers are distributions over bins (`mtlnet.model.bins`). The rows of the sky a
 training the grid also tells where the lane's markings are, and the shared features how the road
 bends ahead (`mtlnet.model.auxiliary`).
 
+`grid_residual`: `grid` with six convolutions more, which add to their inputs, for long trainings.
+
 `mobilenet_v3_small`, `regnet_y_400mf`: small modern backbones of torchvision with random initial
 weights, for comparison: their pooled features, one layer of 256 units, the same nine outputs.
 """
@@ -27,13 +29,17 @@ HEIGHT, WIDTH = 210, 280
 
 @dataclass(frozen=True)
 class Conv:
-    """Conv(n, k, s) of the paper: n filters of k x k, stride s, ReLU; `pad` None: SAME padding."""
+    """Conv(n, k, s) of the paper: n filters of k x k, stride s, ReLU; `pad` None: SAME padding.
+
+    `skip`: its input is added to its output (a residual connection, He et al. 2015).
+    """
 
     filters: int
     kernel: int
     stride: int
     pad: int | None = None
     groups: int = 1
+    skip: bool = False
 
 
 @dataclass(frozen=True)
@@ -139,8 +145,17 @@ GRID_FEATURES = (
     Conv(192, 3, 1, pad=1),
     Conv(32, 1, 1, pad=0),
 )
+RESIDUAL_FEATURES = (
+    Conv(64, 12, 4, pad=4),
+    Conv(128, 3, 2, pad=1),
+    *(Conv(128, 3, 1, pad=1, skip=True),) * 2,
+    Conv(192, 3, 2, pad=1),
+    *(Conv(192, 3, 1, pad=1, skip=True),) * 4,
+    Conv(32, 1, 1, pad=0),
+)
 MTL = Architecture("mtl", FEATURES, SHARED)
 GRID = Architecture("grid", GRID_FEATURES, (512, 256, 256), bins=True, first_row=66)
+GRID_RESIDUAL = replace(GRID, name="grid_residual", features=RESIDUAL_FEATURES)
 ARCHITECTURES = {
     architecture.name: architecture
     for architecture in (
@@ -149,6 +164,7 @@ ARCHITECTURES = {
         Architecture("mobilenet_v3_small", (), (256,), backbone="mobilenet_v3_small"),
         Architecture("regnet_y_400mf", (), (256,), backbone="regnet_y_400mf"),
         GRID,
+        GRID_RESIDUAL,
     )
 }
 HEAD_KINDS = ("coded", "bins")

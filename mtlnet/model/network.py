@@ -202,15 +202,25 @@ class SamePad(nn.Module):
         return nn.functional.pad(x, self.pads) if any(self.pads) else x
 
 
-def block(layer: nn.Module, norm: nn.Module | None, dropout: float = 0.0) -> nn.Sequential:
-    """layer - [batch normalisation] - ReLU - [dropout]."""
+class Residual(nn.Sequential):
+    """Layers whose input is added to their output."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        y: Tensor = super().forward(x)
+        return x + y
+
+
+def block(
+    layer: nn.Module, norm: nn.Module | None, dropout: float = 0.0, *, skip: bool = False
+) -> nn.Sequential:
+    """layer - [batch normalisation] - ReLU - [dropout], with `skip` a `Residual`."""
     parts: list[tuple[str, nn.Module]] = [("layer", layer)]
     if norm is not None:
         parts.append(("norm", norm))
     parts.append(("relu", nn.ReLU()))
     if dropout:
         parts.append(("dropout", nn.Dropout(dropout)))
-    sequence = nn.Sequential()
+    sequence = Residual() if skip else nn.Sequential()
     for name, part in parts:
         sequence.add_module(name, part)
     return sequence
@@ -249,7 +259,8 @@ def _convolution(channels: int, spec: Conv, batch_norm: bool) -> nn.Sequential:
         groups=spec.groups,
         bias=not batch_norm,
     )
-    return block(conv, nn.BatchNorm2d(spec.filters, eps=NORM_EPS) if batch_norm else None)
+    norm = nn.BatchNorm2d(spec.filters, eps=NORM_EPS) if batch_norm else None
+    return block(conv, norm, skip=spec.skip)
 
 
 def build_backbone(name: str, *, batch_norm: bool) -> tuple[nn.Module, int]:

@@ -13,7 +13,6 @@ import torch
 from torch import Tensor, nn
 from torch.optim import SGD, AdamW, Muon, Optimizer
 
-from mtlnet.model.cpu_kernels.bf16 import cpu_has_bf16
 from mtlnet.model.network import Network
 from mtlnet.training.recipes import MOMENTUM, Recipe
 
@@ -111,9 +110,7 @@ def _groups(
 # singular values made (nearly) equal, by five Newton-Schulz iterations. torch's Muon iterates on
 # the whole matrix in bf16, which suits a GPU; on a CPU without bf16 that takes longer than the rest
 # of a training step. Each iteration multiplies by a polynomial of the Gram matrix, so that it can
-# run on the Gram matrix, which is small: the large matrix is read twice instead of ten times. The
-# last product is in bf16 where the CPU multiplies it natively. The Gram matrix is not: rounded to
-# bf16 it has negative eigenvalues, which the iterations magnify.
+# run on the Gram matrix, which is small: the large matrix is read twice instead of ten times.
 
 
 RMS_OF_ADAMW = 0.2
@@ -143,22 +140,18 @@ class GramMuon(Muon):
         mean.lerp_(gradient, 1 - momentum)
         direction = gradient.lerp(mean, momentum)
         length = rate * RMS_OF_ADAMW * max(weight.shape) ** 0.5
-        settings = group["ns_coefficients"], group["ns_steps"], group["eps"]
-        dtype = torch.bfloat16 if weight.device.type == "cpu" and cpu_has_bf16() else None
         weight.mul_(1 - rate * group["weight_decay"])
-        weight.add_(orthogonalize(direction, *settings, dtype), alpha=-length)
+        weight.add_(
+            orthogonalize(direction, group["ns_coefficients"], group["ns_steps"], group["eps"]),
+            alpha=-length,
+        )
 
 
 def orthogonalize(
-    matrix: Tensor,
-    coefficients: tuple[float, float, float],
-    steps: int,
-    min_norm: float,
-    dtype: torch.dtype | None = None,
+    matrix: Tensor, coefficients: tuple[float, float, float], steps: int, min_norm: float
 ) -> Tensor:
     """`matrix` (F, C) with its singular values brought near 1; its norm is taken as >= `min_norm`.
 
-    `dtype`: of the last product; None: the matrix's.
     Newton-Schulz iterations with a quintic polynomial (Jordan et al. 2024).
     """
     wide = matrix if matrix.shape[0] <= matrix.shape[1] else matrix.T
@@ -173,6 +166,5 @@ def orthogonalize(
         if left:
             gram = factor @ gram @ factor
     assert product is not None
-    dtype = dtype or matrix.dtype
-    result: Tensor = (product.to(dtype) @ wide.to(dtype)).to(matrix.dtype)
+    result: Tensor = product @ wide
     return result if matrix.shape[0] <= matrix.shape[1] else result.T

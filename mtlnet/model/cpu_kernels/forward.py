@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import conv2d, linear, max_pool2d, relu
 
-from mtlnet.model.architecture import GRID, HEIGHT, MTL, Conv, Pool, same_padding
+from mtlnet.model.architecture import GRID, GRID_RESIDUAL, HEIGHT, MTL, Conv, Pool, same_padding
 from mtlnet.model.cpu_kernels.convolutions import (
     im2col_convolution,
     space_to_depth,
@@ -22,7 +22,7 @@ MAX_IM2COL_PIXELS = 64
 """Feature maps of at most so many pixels are convolved by `im2col_convolution`."""
 
 
-FAST = (MTL.features, GRID.features)
+FAST = (MTL.features, GRID.features, GRID_RESIDUAL.features)
 """The convolutions that this module has, as `Architecture.features`."""
 
 
@@ -55,7 +55,8 @@ def forward_grid(network: Network, images: Tensor, dtype: torch.dtype) -> Tensor
         if isinstance(spec, Conv):
             after = layers[number + 1] if number + 1 < len(layers) else None
             pool = after if isinstance(after, Pool) else None
-            x = _layer(x, number, spec, pool, network.features.get_submodule(f"conv{number}"))
+            y = _layer(x, number, spec, pool, network.features.get_submodule(f"conv{number}"))
+            x = x + y if spec.skip else y
     return x
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from mtlnet.model.architecture import GRID, MTL, SHARED, Architecture, Pool
+from mtlnet.model.architecture import GRID, GRID_RESIDUAL, MTL, SHARED, Architecture, Pool
 from mtlnet.model.cpu_kernels.convolutions import (
     im2col_convolution,
     space_to_depth,
@@ -37,7 +37,9 @@ def some_network(*, batch_norm: bool, architecture: Architecture = MTL) -> Netwo
     return network.to(memory_format=torch.channels_last).train()
 
 
-@pytest.mark.parametrize("architecture", [MTL, GRID], ids=lambda architecture: architecture.name)
+@pytest.mark.parametrize(
+    "architecture", [MTL, GRID, GRID_RESIDUAL], ids=lambda architecture: architecture.name
+)
 @pytest.mark.parametrize("norm", ["training", "frozen", "none"])
 def test_features_and_gradients_match_the_plain_network(
     norm: str, architecture: Architecture
