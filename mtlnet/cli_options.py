@@ -55,13 +55,14 @@ Balance = Annotated[
 Init = Annotated[
     str | None,
     typer.Option(
-        help='Run to fine-tune, or "default"; --data may then be images with a labels.csv.'
+        help='Model to start from, "default" or a run; --data may then be images with labels.csv.'
     ),
 ]
 TrainRecipe = Annotated[
     str | None,
     typer.Option(
-        help="fast (minutes), paper (days), or tune (to fine-tune, with --init).  "
+        help="fast (minutes), paper (days), or with --init tune (to fine-tune) or continue "
+        "(hours on new frames).  "
         "[default: fast, with --init tune]"
     ),
 ]

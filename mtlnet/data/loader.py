@@ -98,7 +98,8 @@ class Loader:
     """Endless batches from `frames`, shuffled anew in each epoch.
 
     `part` (index, count): makes only that part of each batch of `batch` images, for one of several
-    processes; the images are those of the whole batch.
+    processes; the images are those of the whole batch. `repeats` (N,): how often each frame occurs
+    in an epoch; without it once.
     """
 
     def __init__(
@@ -111,6 +112,7 @@ class Loader:
         augment: bool,
         part: tuple[int, int] = (0, 1),
         ahead: AheadLabels | None = None,
+        repeats: NDArray[np.int64] | None = None,
     ) -> None:
         self.frames = frames
         self.batch = batch
@@ -125,15 +127,17 @@ class Loader:
         labels = frames.labels
         self.coded = tf.encode(labels.distances, labels.angle)
         self.heading = np.asarray(labels.heading, dtype=np.int64)
+        each = np.arange(len(self.heading))
+        self._epoch = each if repeats is None else np.repeat(each, repeats)
         self._permutation = lru_cache(maxsize=2)(self._shuffle)
 
     def _shuffle(self, epoch: int) -> NDArray[np.int64]:
-        return np.random.default_rng([self.seed, 1, epoch]).permutation(len(self.heading))
+        return np.random.default_rng([self.seed, 1, epoch]).permutation(self._epoch)
 
     def indices(self, step: int) -> NDArray[np.int64]:
-        """Rows of `frames` in the whole batch `step`; each frame occurs once an epoch."""
+        """Rows of `frames` in the whole batch `step`."""
         places = np.arange(step * self.batch, (step + 1) * self.batch)
-        epochs, rows = np.divmod(places, len(self.heading))
+        epochs, rows = np.divmod(places, len(self._epoch))
         parts = [self._permutation(e)[rows[epochs == e]] for e in np.unique(epochs).tolist()]
         return np.concatenate(parts)
 

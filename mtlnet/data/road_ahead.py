@@ -40,6 +40,10 @@ CHUNK = 20_000  # frames read by a process at once
 KNOWN_M = 2.0
 """A curvature is known where a frame was recorded so near."""
 
+HARD_CURVATURE = 1 / 80
+HARD_NEAR_CHANGE_M = 8.0
+"""Of a model's wrong classes, 80 % were so near a change of class, where 53 % were within 4 m."""
+
 Numbers = NDArray[np.float32]
 
 
@@ -206,4 +210,27 @@ def curvature_ahead(s: Numbers, curvature: Numbers, tracks: NDArray[np.str_]) ->
         nearest = np.where(wanted - places[before] < places[after] - wanted, before, after)
         near = np.abs(places[nearest] - wanted) <= KNOWN_M
         found[here] = np.where(near, curvature[order][nearest], np.nan)
+    return found
+
+
+def hard_frames(
+    s: Numbers, curvature: Numbers, heading: NDArray[np.int64], tracks: NDArray[np.str_]
+) -> NDArray[np.bool_]:
+    """Frames (N,) in sharp bends, or near a place where the road's class changes.
+
+    `s` m, `curvature` 1/m and `heading` (N,) are the labels; the frames of a track tell together
+    where its class changes. Most of a network's errors are there.
+    """
+    found = np.abs(curvature) > HARD_CURVATURE
+    for track in np.unique(tracks).tolist():
+        here = np.flatnonzero(tracks == track)
+        order = here[np.argsort(s[here], kind="stable")]
+        places = s[order].astype(np.float64)
+        changes = np.flatnonzero(np.diff(heading[order]))
+        if len(changes):
+            between = (places[changes] + places[changes + 1]) / 2
+            after = np.searchsorted(between, s[here]).clip(max=len(between) - 1)
+            before = np.maximum(after - 1, 0)
+            away = np.minimum(np.abs(between[after] - s[here]), np.abs(between[before] - s[here]))
+            found[here] |= away <= HARD_NEAR_CHANGE_M
     return found

@@ -12,8 +12,10 @@ from datagen.recording import Dataset, DatasetError, Frames, UndecodableImage
 from mtlnet.data.custom_images import CustomImages, has_labels_file, open_custom_images
 from mtlnet.evaluation.metrics import describe_data, mean_labels
 from mtlnet.inference.model_card import ModelCard, ModelError
-from mtlnet.model.architecture import HEIGHT, WIDTH
+from mtlnet.model.architecture import HEIGHT, WIDTH, find_architecture
+from mtlnet.model.pretrained import match_convolutions
 from mtlnet.training.config import TrainConfig
+from mtlnet.training.recipes import find_recipe
 from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
 
@@ -45,7 +47,12 @@ def open_training_data(
     was done before. Raises UserError for data that does not fit the network or the model.
     """
     if init is not None and init.network != config.network:
-        raise UserError(f"--init is a {init.network}, not a {config.network}; leave out --network")
+        if not find_recipe(config.recipe).batch_norm:
+            raise UserError(
+                f"--init is a {init.network}, not a {config.network}; leave out --network, or give "
+                "--recipe continue"
+            )
+        match_convolutions(find_architecture(init.network), find_architecture(config.network))
     if has_labels_file(config.data):
         data = custom_training_data(config.data, init)
     else:

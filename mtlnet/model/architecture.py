@@ -14,7 +14,8 @@ answers are distributions over bins (`mtlnet.model.bins`). The rows of the sky a
 training the grid also tells where the lane's markings are, and the shared features how the road
 bends ahead (`mtlnet.model.auxiliary`).
 
-`grid_residual`: `grid` with six convolutions more, which add to their inputs, for long trainings.
+`grid_residual`: `grid` with six convolutions more, which add to their inputs, for long trainings;
+it can start from a trained `grid` (`mtlnet.model.pretrained`).
 
 `mobilenet_v3_small`, `regnet_y_400mf`: small modern backbones of torchvision with random initial
 weights, for comparison: their pooled features, one layer of 256 units, the same nine outputs.
@@ -150,6 +151,7 @@ RESIDUAL_FEATURES = (
     Conv(128, 3, 2, pad=1),
     *(Conv(128, 3, 1, pad=1, skip=True),) * 2,
     Conv(192, 3, 2, pad=1),
+    Conv(192, 3, 1, pad=1),
     *(Conv(192, 3, 1, pad=1, skip=True),) * 4,
     Conv(32, 1, 1, pad=0),
 )

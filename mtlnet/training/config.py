@@ -70,9 +70,12 @@ class TrainConfig:
         require_method(self.balance)
         if self.batch == 0:
             object.__setattr__(self, "batch", find_recipe(self.recipe).batch)
-        if self.init is not None and find_recipe(self.recipe).batch_norm:
+        if (self.init is not None) != find_recipe(self.recipe).from_model:
             raise UserError(
-                f"recipe {self.recipe} starts from new weights; with --init give --recipe tune"
+                f"recipe {self.recipe} starts from new weights; with --init give --recipe tune or "
+                "continue"
+                if self.init is not None
+                else f"recipe {self.recipe} starts from a finished model; give it with --init"
             )
         if self.change_data and self.init is not None:
             raise UserError("a fine-tuned run keeps its data; leave --change-data out")

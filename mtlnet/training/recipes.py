@@ -1,4 +1,5 @@
-"""Training recipes: `paper` as published, `fast` for a good model in minutes, `tune` to fine-tune.
+"""Training recipes: `paper` as published, `fast` for a good model in minutes, `continue` to train a
+finished model on for hours, `tune` to fine-tune one on few images.
 
 `paper`: SGD with momentum 0.9, batch 32, learning rate 0.001 times 0.9 every 10,000 steps, 150,000
 steps. Dropout 0.5 and L2 5e-4 are our choice: the paper states neither.
@@ -23,12 +24,16 @@ steps. Dropout 0.5 and L2 5e-4 are our choice: the paper states neither.
   that follow (`mtlnet.data.augment.pipeline`): rounds are few, and a network overfits to their
   scenery.
 
+`continue`: `fast` from a finished model (`--init`), for hours on new frames; batch normalisation is
+put back first, and the network may get more residual convolutions (`mtlnet.model.pretrained`). The
+first convolution stays as it is.
+
 `tune`: `fast` from a finished model (`--init`), with AdamW, a tenth of the learning rate, 500 steps
 and no batch normalisation.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from mtlnet.model.architecture import GRID, MTL
 from mtlnet.training.loss import HuberLoss
@@ -59,30 +64,54 @@ class Recipe:
     """None: squared errors, without gains."""
     freeze_schedule: tuple[tuple[float, int], ...] = ()
     """(share, count): after this share of the run the first `count` convolutions are frozen."""
+    hard_repeats: int = 1
+    """How often frames of `mtlnet.data.road_ahead.hard_frames` are drawn in an epoch."""
+    from_model: bool = False
+    """Whether it starts from a finished model (`--init`)."""
 
 
 HUBER = HuberLoss(distance_beta=0.05)
+FAST = Recipe(
+    "fast",
+    GRID.name,
+    "muon",
+    learning_rate=1e-3,
+    batch=64,
+    iterations=3_000,
+    dropout=0.0,
+    l2=2e-2,
+    batch_norm=True,
+    standardise=True,
+    augment=True,
+    freeze_bn_at=0.6,
+    huber=HUBER,
+    freeze_schedule=((0.3, 1), (0.6, 2)),
+)
+CONTINUE = replace(
+    FAST,
+    name="continue",
+    iterations=30_000,
+    freeze_schedule=((0.0, 1), (0.6, 2)),
+    from_model=True,
+)
+TUNE = Recipe(
+    "tune",
+    GRID.name,
+    "adamw",
+    learning_rate=1e-4,
+    batch=32,
+    iterations=500,
+    dropout=0.0,
+    l2=2e-2,
+    batch_norm=False,
+    standardise=True,
+    augment=True,
+    huber=HUBER,
+    from_model=True,
+)
 RECIPES = {
     "paper": Recipe("paper", MTL.name, "sgd", 1e-3, 32, 150_000, 0.5, 5e-4, False, False, False),
-    "tune": Recipe(
-        "tune", GRID.name, "adamw", 1e-4, 32, 500, 0.0, 2e-2, False, True, True, huber=HUBER
-    ),
-    "fast": Recipe(
-        "fast",
-        GRID.name,
-        "muon",
-        learning_rate=1e-3,
-        batch=64,
-        iterations=3_000,
-        dropout=0.0,
-        l2=2e-2,
-        batch_norm=True,
-        standardise=True,
-        augment=True,
-        freeze_bn_at=0.6,
-        huber=HUBER,
-        freeze_schedule=((0.3, 1), (0.6, 2)),
-    ),
+    **{recipe.name: recipe for recipe in (FAST, CONTINUE, TUNE)},
 }
 MOMENTUM = 0.9
 WARM_UP = 0.05

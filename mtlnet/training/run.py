@@ -1,8 +1,8 @@
 """A training run from its configuration to a published model: `mtlnet train --data DIR --out RUN`.
 
 Ends with the finished model in the run's folder (see `mtlnet.export.publish`). Stopped by Ctrl-C it
-leaves a checkpoint, from which `--resume` continues. With `--init` it fine-tunes a finished model,
-which keeps its network and its camera.
+leaves a checkpoint, from which `--resume` continues. With `--init` it starts from a finished model,
+which keeps its camera.
 """
 
 import os
@@ -16,18 +16,20 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 
 from datagen.recording import Frames
 from mtlnet.data.gpu_cache import cache_if_it_fits
 from mtlnet.data.loader import Loader
-from mtlnet.data.road_ahead import RoadAhead
+from mtlnet.data.road_ahead import RoadAhead, hard_frames
 from mtlnet.data.sources import TrainingData, open_training_data, resume_data
 from mtlnet.export.publish import Provenance, publish
-from mtlnet.inference.model_card import RUNS, WEIGHTS, ModelCard, read_card
+from mtlnet.inference.model_card import RUNS, ModelCard, read_card
 from mtlnet.model.architecture import HEIGHT, WIDTH, find_architecture
-from mtlnet.model.network import CODED_HEADS, Network, fold, load_network
+from mtlnet.model.network import fold
+from mtlnet.model.pretrained import load_pretrained
 from mtlnet.training.checkpoint import list_checkpoints, load_checkpoint
 from mtlnet.training.config import (
     CONFIG,
@@ -50,6 +52,8 @@ from trackfeatures.errors import UserError
 
 EXPORT_CHECK_FRAMES = 16
 """Frames on which the exported graph is compared with torch."""
+PRETRAINED_FRAMES = 128
+"""Frames that measure the statistics of batch normalisation for a finished model."""
 FINE_TUNE_MIN_STD = (0.15,) * 5 + (0.03,)
 """Lower bounds of the heads' units (6,), those of varied driving: a few images may be all alike."""
 
@@ -182,7 +186,7 @@ def _train(
         data = resume_data(config, data, resumed)
     configure_cpu(config, rank)
     with locked_folder(config.out) if rank.is_first else nullcontext():
-        trainer, loader = prepare(config, data, init[0] if init else None, device, rank)
+        trainer, loader = prepare(config, data, init, device, rank)
         return _train_and_publish(config, resumed, report, data, trainer, loader)
 
 
@@ -245,9 +249,13 @@ def configure_cpu(config: TrainConfig, rank: Rank) -> None:
 
 
 def prepare(
-    config: TrainConfig, data: TrainingData, init: Path | None, device: torch.device, rank: Rank
+    config: TrainConfig,
+    data: TrainingData,
+    init: tuple[Path, ModelCard] | None,
+    device: torch.device,
+    rank: Rank,
 ) -> tuple[Trainer, Loader]:
-    """The trainer before its first step, with the weights of the run `init`, and the batches."""
+    """The trainer before its first step, with the weights of the model `init`, and the batches."""
     recipe = find_recipe(config.recipe)
     steps_per_epoch = max(len(data.frames) // config.batch, 1)
     trainer = Trainer(
@@ -258,7 +266,7 @@ def prepare(
         find_architecture(config.network),
         task_weighting=TaskWeighting(config.balance, config.alpha, device, steps_per_epoch),
         rank=rank,
-        folded=init is not None,
+        folded=init is not None and not recipe.batch_norm,
     )
     loader = Loader(
         data.frames,
@@ -268,12 +276,15 @@ def prepare(
         augment=recipe.augment,
         part=(rank.index, rank.world_size),
         ahead=None if trainer.network.auxiliary is None else road_ahead(data, device),
+        repeats=hard_frame_repeats(data, recipe.hard_repeats),
     )
     if init is None:
         trainer.standardise(loader)
     else:
+        run, card = init
         trainer.standardise(loader, FINE_TUNE_MIN_STD)
-        load_pretrained(trainer.network, init)
+        images = spread_images(data, PRETRAINED_FRAMES) if recipe.batch_norm else None
+        load_pretrained(trainer.network, run, images, card.network)
     return trainer, loader
 
 
@@ -284,12 +295,26 @@ def road_ahead(data: TrainingData, device: torch.device) -> RoadAhead | None:
     return RoadAhead(data.frames, data.camera, keep=device.type != "cpu")
 
 
+def hard_frame_repeats(data: TrainingData, repeats: int) -> NDArray[np.int64] | None:
+    """How often each frame is drawn in an epoch, if hard ones are drawn more than once."""
+    if repeats == 1 or not isinstance(data.frames, Frames):
+        return None
+    labels = data.frames.labels
+    tracks = np.array([info.track for info in data.frames.rounds])[labels.round]
+    hard = hard_frames(labels.s, labels.curvature, labels.heading, tracks)
+    return np.where(hard, repeats, 1)
+
+
+def spread_images(data: TrainingData, count: int) -> NDArray[np.uint8]:
+    """At most `count` images (B, 210, 280, 3), evenly spread over the training data."""
+    count = min(count, len(data.frames))
+    rows = np.linspace(0, len(data.frames) - 1, count).astype(np.int64)
+    return data.frames.read_batch(rows, np.empty((count, HEIGHT, WIDTH, 3), np.uint8))
+
+
 def finish(config: TrainConfig, trainer: Trainer, data: TrainingData) -> ModelCard:
     """Publish the trained network in the run's folder."""
-    frames = data.frames
-    count = min(EXPORT_CHECK_FRAMES, len(frames))
-    rows = np.linspace(0, len(frames) - 1, count).astype(np.int64)
-    images = frames.read_batch(rows, np.empty((count, HEIGHT, WIDTH, 3), np.uint8))
+    images = spread_images(data, EXPORT_CHECK_FRAMES)
     provenance = Provenance(
         camera=data.camera,
         alpha=config.alpha,
@@ -300,7 +325,7 @@ def finish(config: TrainConfig, trainer: Trainer, data: TrainingData) -> ModelCa
         data=data.about,
     )
     uncertainty = fit_uncertainty_head(
-        fold(trainer.network), frames, data.held_out, config.seed, data.camera
+        fold(trainer.network), data.frames, data.held_out, config.seed, data.camera
     )
     card = publish(trainer.network, config.out, images, provenance, uncertainty=uncertainty)
     link_latest(config.out)
@@ -316,16 +341,3 @@ def link_latest(run: Path) -> None:
     link.symlink_to(run.resolve().name)
     link.replace(RUNS / "latest")
     fsync_path(RUNS)
-
-
-def load_pretrained(network: Network, run: Path) -> None:
-    """Make `network` compute the outputs of the model of `run`, in the units of its own heads."""
-    state = load_network(run / WEIGHTS, network.architecture.name).state_dict()
-    mean, std = network.target_mean.cpu(), network.target_std.cpu()
-    for name, rows in () if network.architecture.bins else CODED_HEADS:
-        weight, bias = (f"heads.{name}.{kind}" for kind in ("weight", "bias"))
-        state[weight] = state[weight] / std[rows, None]
-        state[bias] = (state[bias] - mean[rows]) / std[rows]
-    with torch.no_grad():
-        for name, parameter in network.named_parameters():
-            parameter.copy_(state[name])

@@ -19,7 +19,7 @@ from mtlnet.data.augment.geometric import (
     rotations,
     shear_per_metre,
 )
-from mtlnet.data.augment.pipeline import AugmentParams
+from mtlnet.data.augment.pipeline import BORDER_LEVEL, AugmentParams
 from mtlnet.data.augment.shadows import shadow_masks
 from trackfeatures.camera import CameraParameters
 
@@ -52,6 +52,7 @@ class DeviceAugment:
         x = torch.einsum("bij,bjhw->bihw", colour[:, :, :3], x) + colour[:, :, 3, None, None]
         self._blur(x, params.blur_std)
         self._add_noise(x, params.noise_std, seed)
+        x = self._with_border(x, params.border)
         return x.round_().clamp_(0, 255).to(torch.uint8).permute(0, 2, 3, 1)
 
     def _on(self, values: NDArray[np.generic]) -> Tensor:
@@ -88,6 +89,16 @@ class DeviceAugment:
         across = (column >= left[:, None]) & (column < (left + columns)[:, None])
         inside = down[:, None, :, None] & across[:, None, None, :]
         return torch.where(inside, torch.stack(colour, 1).float()[:, :, None, None], x)
+
+    def _with_border(self, x: Tensor, border: NDArray[np.int64]) -> Tensor:
+        top, bottom, left, right = self._on(border).unbind(1)
+        rows, columns = x.shape[2:]
+        row = torch.arange(rows, device=x.device)
+        column = torch.arange(columns, device=x.device)
+        down = (row >= (top - self._first_row)[:, None]) & (row < (rows - bottom)[:, None])
+        across = (column >= left[:, None]) & (column < (columns - right)[:, None])
+        shown = down[:, None, :, None] & across[:, None, None, :]
+        return torch.where(shown, x, float(BORDER_LEVEL))
 
     def _blur(self, x: Tensor, deviation: NDArray[np.float64]) -> None:
         chosen = np.flatnonzero(deviation)

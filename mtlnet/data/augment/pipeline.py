@@ -28,7 +28,13 @@ from trackfeatures.camera import CameraParameters
 # with twice these shares its errors were larger, on its own test frames as well as on others.
 SHIFT_SHARE, ROTATION_SHARE, SHADOW_SHARE, PATCH_SHARE = 0.3, 0.3, 0.15, 0.125
 BLUR_SHARE, NOISE_SHARE, JPEG_SHARE = 0.08, 0.12, 0.0625
+BORDER_SHARE = 0.5
 MAX_PATCH_SIDE = 0.3  # relative to the image's sides
+MAX_BORDER = np.array([0.3, 0.3, 0.25, 0.25])
+"""Largest borders at the top, bottom, left and right, relative to the image's height and width: a
+camera with half of the field of view leaves a quarter of the image at each side empty."""
+BORDER_LEVEL = 128
+"""Grey level of a border: nearly 0 to the network, as the padding of its convolutions."""
 BLUR_STD_PX, NOISE_STD, JPEG_QUALITY = (0.4, 1.4), (2.0, 12.0), (25, 90)
 
 
@@ -46,6 +52,7 @@ class AugmentParams:
     noise_std: NDArray[np.float64]  # (B,) of 255
     noise_start: NDArray[np.int64]  # (B,) index in the stored noise
     jpeg_quality: NDArray[np.int64]  # (B,)
+    border: NDArray[np.int64]  # (B, 4) px without a picture at the top, bottom, left, right
 
     def take(self, rows: slice) -> "AugmentParams":
         """Those of some of the images."""
@@ -66,6 +73,7 @@ def draw_params(count: int, height: int, width: int, rng: np.random.Generator) -
         noise_start=rng.integers(0, height * width * 3 + 1, count),
         jpeg_quality=rng.integers(*JPEG_QUALITY, count, endpoint=True)
         * (rng.random(count) < JPEG_SHARE),
+        border=_draw_border(count, height, width, rng),
     )
 
 
@@ -75,6 +83,14 @@ def _draw_patch(count: int, height: int, width: int, rng: np.random.Generator) -
     rows[rng.random(count) >= PATCH_SHARE] = 0
     corner = rng.integers(0, (height, width), (count, 2))
     return np.column_stack([corner, rows, columns, rng.integers(0, 256, (count, 3))])
+
+
+def _draw_border(
+    count: int, height: int, width: int, rng: np.random.Generator
+) -> NDArray[np.int64]:
+    """Borders (B, 4) px that a camera with a narrower field of view does not show."""
+    share = rng.uniform(0.0, MAX_BORDER, (count, 4)) * (rng.random((count, 1)) < BORDER_SHARE)
+    return (share * (height, height, width, width)).round().astype(np.int64)
 
 
 def resolve_lateral_shift(params: AugmentParams, distances: NDArray[np.float32]) -> AugmentParams:
@@ -104,6 +120,16 @@ def apply_params(
             add_noise(image, float(params.noise_std[row]), int(params.noise_start[row]))
         if params.jpeg_quality[row]:
             compress(image, int(params.jpeg_quality[row]))
+        _clear_border(image, params.border[row].tolist())
+
+
+def _clear_border(image: NDArray[np.uint8], border: list[int]) -> None:
+    """Fill the border (top, bottom, left, right) of an image, px, in place."""
+    top, bottom, left, right = border
+    image[:top] = BORDER_LEVEL
+    image[image.shape[0] - bottom :] = BORDER_LEVEL
+    image[:, :left] = BORDER_LEVEL
+    image[:, image.shape[1] - right :] = BORDER_LEVEL
 
 
 def augment_labels(

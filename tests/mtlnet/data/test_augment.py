@@ -29,7 +29,10 @@ from mtlnet.data.augment.photometric import (
     compress,
 )
 from mtlnet.data.augment.pipeline import (
+    BORDER_LEVEL,
+    BORDER_SHARE,
     JPEG_SHARE,
+    MAX_BORDER,
     MAX_PATCH_SIDE,
     PATCH_SHARE,
     ROTATION_SHARE,
@@ -218,6 +221,24 @@ def test_share_and_size_of_erased_patches() -> None:
     assert share.max() <= (MAX_PATCH_SIDE + 0.02) ** 2
     assert (share > 0).mean() == pytest.approx(PATCH_SHARE, abs=0.06)
     assert share[share > 0].mean() > 0.01
+
+
+def test_half_of_the_images_show_what_a_narrower_camera_shows() -> None:
+    border = draw_params(4000, 210, 280, np.random.default_rng(2)).border
+    chosen = border.any(1)
+    assert chosen.mean() == pytest.approx(BORDER_SHARE, abs=0.03)
+    limits = MAX_BORDER * (210, 210, 280, 280)
+    assert (border <= limits.round()).all()
+    np.testing.assert_allclose(border[chosen].mean(0), limits / 2, rtol=0.05)
+    images = np.stack([picture(), picture(1)])
+    before = images.copy()
+    cut = np.array([[0, 0, 0, 0], [10, 40, 20, 30]])
+    apply_params(images, replace(unchanged(2), border=cut), CameraParameters())
+    np.testing.assert_array_equal(images[0], before[0])
+    np.testing.assert_array_equal(images[1, 10:170, 20:250], before[1, 10:170, 20:250])
+    shown = np.zeros((210, 280), bool)
+    shown[10:170, 20:250] = True
+    assert (images[1][~shown] == BORDER_LEVEL).all()
 
 
 def colour(

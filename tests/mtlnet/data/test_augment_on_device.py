@@ -27,6 +27,7 @@ ONE_BY_ONE: dict[str, Callable[[AugmentParams, AugmentParams], AugmentParams]] =
     "patch": lambda none, drawn: replace(none, patch=drawn.patch),
     "colour": lambda none, drawn: replace(none, colour=drawn.colour),
     "blur_std": lambda none, drawn: replace(none, blur_std=drawn.blur_std),
+    "border": lambda none, drawn: replace(none, border=drawn.border),
 }
 
 
@@ -45,7 +46,7 @@ def drawn(count: int) -> tuple[AugmentParams, AugmentParams]:
         params,
         **{
             f: getattr(params, f) * 0
-            for f in ("shift", "rotation", "shadow", "patch", "blur_std", "noise_std")
+            for f in ("shift", "rotation", "shadow", "patch", "blur_std", "noise_std", "border")
         },
         mirrored=np.zeros(count, np.bool_),
         jpeg_quality=np.zeros(count, np.int64),

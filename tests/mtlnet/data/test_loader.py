@@ -44,6 +44,15 @@ def test_each_frame_occurs_once_an_epoch() -> None:
     assert order[:20].tolist() != order[20:].tolist()
 
 
+def test_frames_that_are_repeated_occur_so_often_an_epoch() -> None:
+    repeats = np.where(np.arange(20) % 4 == 0, 3, 1)
+    camera = CameraParameters(width=24, height=16)
+    source = Loader(FakeFrames(20), camera, 10, 0, augment=False, repeats=repeats)
+    for epoch in (0, 1):
+        order = np.concatenate([source.indices(3 * epoch + step) for step in range(3)])
+        assert np.bincount(order, minlength=20).tolist() == repeats.tolist()
+
+
 def test_batches_carry_the_labels_of_their_frames() -> None:
     source = loader()
     batches = source.batches(3)

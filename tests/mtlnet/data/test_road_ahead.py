@@ -14,6 +14,7 @@ from mtlnet.data.road_ahead import (
     changed_points,
     crossings,
     curvature_ahead,
+    hard_frames,
     own_markings,
 )
 from mtlnet.model.architecture import GRID
@@ -147,3 +148,18 @@ def test_curvature_ahead_comes_from_all_rounds_of_a_track() -> None:
     np.testing.assert_allclose(found[0], [0, 0, 0, 0, 0.02, 0.02, 0.02, NAN])
     np.testing.assert_allclose(found[12], [0, 0, 0.02, 0.02, 0.02, NAN, NAN, NAN])
     np.testing.assert_allclose(found[32], [0, 0, 0, 0, 0, 0, 0, NAN])
+
+
+def test_hard_frames_lie_in_sharp_bends_and_near_a_change_of_class() -> None:
+    s = np.arange(0.0, 200.0, 5.0, dtype=np.float32)
+    heading = np.where(s < 101, 1, 0)  # straight, then left; seen to change at 102.5 m
+    curvature = np.where(s < 180, 0.0, 1 / 50).astype(np.float32)
+    tracks = np.array(["a"] * len(s))
+    mixed = np.random.default_rng(0).permutation(len(s))
+    found = hard_frames(s[mixed], curvature[mixed], heading[mixed], tracks)
+    assert sorted(s[mixed][found]) == [95, 100, 105, 110, 180, 185, 190, 195]
+    # Of another track, where nothing changes, none is hard.
+    assert not hard_frames(s, np.zeros_like(s), np.ones_like(heading), tracks).any()
+    both = np.array(["a", "b"] * (len(s) // 2))
+    alternating = np.where(both == "a", 0, 2)
+    assert not hard_frames(s, np.zeros_like(s), alternating, both).any()

@@ -23,7 +23,7 @@ from trackfeatures.errors import UserError
 
 BACKBONES = ["mobilenet_v3_small", "regnet_y_400mf"]
 KINDS: tuple[EngineKind, EngineKind] = ("openvino", "torch")
-OTHERS = [*BACKBONES, "deepdriving", "grid", "grid-residual", "grid-coded", "mtl-bins"]
+OTHERS = [*BACKBONES, "deepdriving", "grid", "grid_residual", "grid-coded", "mtl-bins"]
 
 
 def build(name: str, *, batch_norm: bool = False, seed: int = 1) -> Network:

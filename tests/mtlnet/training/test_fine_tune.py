@@ -14,8 +14,9 @@ from mtlnet.data.sources import continue_from_model, custom_training_data
 from mtlnet.inference.model_card import WEIGHTS, read_card
 from mtlnet.model.architecture import GRID
 from mtlnet.model.network import Network, initialise, load_network, predict_images
+from mtlnet.model.pretrained import load_pretrained
 from mtlnet.training.config import TrainConfig, open_pretrained
-from mtlnet.training.run import load_pretrained, start_training
+from mtlnet.training.run import start_training
 from trackfeatures.errors import UserError
 
 
@@ -77,6 +78,25 @@ def test_fine_tuning_on_custom_images_lowers_their_error(
     assert errors[1] < 0.8 * errors[0]
 
 
+def test_a_model_is_trained_on_with_batch_normalisation(
+    published: Path, dataset: Path, tmp_path: Path
+) -> None:
+    options = {"data": dataset, "init": str(published), "recipe": "continue", "batch": 8}
+    options.update(iterations=12, device="cpu", threads=1)
+    start_training(options, tmp_path / "run", resume=False)
+    before, card = read_card(published), read_card(tmp_path / "run")
+    assert (card.recipe, card.network, card.iterations) == ("continue", before.network, 12)
+    assert card.data["init"]["model_hash"] == before.model_hash
+    old, new = (load_network(run / WEIGHTS).state_dict() for run in (published, tmp_path / "run"))
+    # The first convolution stays, but for the batch statistics it is folded with.
+    changed = {name for name in old if not torch.equal(old[name], new[name])}
+    assert "features.conv2.layer.weight" in changed
+    slopes = new["features.conv0.layer.weight"].flatten(1) / old[
+        "features.conv0.layer.weight"
+    ].flatten(1)
+    assert float((slopes.std(1) / slopes.mean(1).abs()).median()) < 1e-3
+
+
 def test_wrong_options_are_refused(
     published: Path, custom_images: Path, dataset: Path, tmp_path: Path
 ) -> None:
@@ -87,6 +107,11 @@ def test_wrong_options_are_refused(
         start_training({**options, "alpha": (1.0, 1.0, 0.0)}, tmp_path / "a", resume=False)
     with pytest.raises(UserError, match="recipe fast starts from new weights"):
         TrainConfig(dataset, tmp_path / "b", init=str(published), recipe="fast")
+    with pytest.raises(UserError, match="recipe continue starts from a finished model"):
+        TrainConfig(dataset, tmp_path / "b", recipe="continue")
+    grown = {"data": dataset, "init": str(published), "recipe": "continue", "network": "grid"}
+    with pytest.raises(UserError, match="from which a grid cannot start"):
+        start_training(grown, tmp_path / "c", resume=False)
     _, card = open_pretrained(published)
     material = custom_training_data(custom_images, card)
     other = replace(material, camera=replace(card.camera, z=1.4))

@@ -1,0 +1,114 @@
+"""Start a network from a finished model, whose batch normalisation was folded away.
+
+A network trained without batch normalisation gets the model's weights. One trained with it gets
+statistics measured on images, and scales and biases that undo them, so that it computes the same.
+Its architecture may have more residual convolutions than the model; they begin near the identity
+(as in Chen et al. 2016, Net2Net).
+"""
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from mtlnet.inference.model_card import WEIGHTS
+from mtlnet.model.architecture import Architecture, Conv
+from mtlnet.model.network import CODED_HEADS, HEIGHT, Network, load_network, normalise
+from trackfeatures.errors import UserError
+
+NEW_SCALE = 0.02
+"""Scale of the normalised outputs of a new residual convolution. At 0, none would get a gradient
+through its ReLU."""
+
+
+def load_pretrained(
+    network: Network, run: Path, images: NDArray[np.uint8] | None = None, name: str = ""
+) -> None:
+    """Make `network` compute the outputs of the model of `run`, in the units of its own heads.
+
+    `images` (B, 210, 280, 3): measure the statistics of batch normalisation, if it has any.
+    `name`: the model's architecture, if it is another. Raises UserError when the network does not
+    contain it.
+    """
+    source = load_network(run / WEIGHTS, name or network.architecture.name)
+    state = source.state_dict()
+    mean, std = network.target_mean.cpu(), network.target_std.cpu()
+    for head, rows in () if network.architecture.bins else CODED_HEADS:
+        weight, bias = (f"heads.{head}.{kind}" for kind in ("weight", "bias"))
+        state[weight] = state[weight] / std[rows, None]
+        state[bias] = (state[bias] - mean[rows]) / std[rows]
+    renamed = match_convolutions(source.architecture, network.architecture)
+    for old, new in renamed.items():
+        for kind in ("weight", "bias"):
+            state[f"new.{new}.layer.{kind}"] = state.pop(f"features.{old}.layer.{kind}")
+    state = {key.replace("new.", "features.", 1): tensor for key, tensor in state.items()}
+    with torch.no_grad():
+        for key, parameter in network.named_parameters():
+            if key in state:
+                parameter.copy_(state[key])
+        if any(isinstance(m, nn.BatchNorm2d) for m in network.features.modules()):
+            assert images is not None
+            biases = {new: state[f"features.{new}.layer.bias"] for new in renamed.values()}
+            restore_batch_norm(network, biases, images)
+
+
+def match_convolutions(old: Architecture, new: Architecture) -> dict[str, str]:
+    """Submodule names of the convolutions of `old`, and of the same ones in `new`.
+
+    `new` may have more residual ones. Raises UserError when it differs in anything else.
+    """
+    left = list(enumerate(old.features))
+    names: dict[str, str] = {}
+    for number, layer in enumerate(new.features):
+        if left and layer == left[0][1]:
+            if isinstance(layer, Conv):
+                names[f"conv{left[0][0]}"] = f"conv{number}"
+            left.pop(0)
+        elif not (isinstance(layer, Conv) and layer.skip):
+            left = [(number, layer)]
+            break
+    heads = (old.shared, old.heads, old.first_row, old.backbone)
+    if left or heads != (new.shared, new.heads, new.first_row, new.backbone):
+        raise UserError(
+            f"--init is a {old.name}, from which a {new.name} cannot start: it may only have more "
+            "residual convolutions; leave out --network"
+        )
+    return names
+
+
+def restore_batch_norm(
+    network: Network, biases: dict[str, Tensor], images: NDArray[np.uint8]
+) -> None:
+    """Set the batch normalisations of a network whose filters are those of a folded model.
+
+    `biases`: those of the model's convolutions, by submodule name; others are new. The filters get
+    the size of new ones, which batch normalisation undoes: the optimizer's steps suit that size.
+    """
+    network.eval()
+    device = network.target_mean.device
+    x = normalise(torch.from_numpy(images[:, -HEIGHT + network.architecture.first_row :]))
+    x = x.permute(0, 3, 1, 2).to(device)
+    for name, module in network.features.named_children():
+        norm = dict(module.named_children()).get("norm")
+        if isinstance(norm, nn.BatchNorm2d):
+            layer = module.get_submodule("layer")
+            assert isinstance(layer, nn.Conv2d)
+            assert norm.running_mean is not None
+            assert norm.running_var is not None
+            filters = layer.weight.flatten(1)
+            rms = filters.square().mean(1).sqrt().clamp_min(1e-12)
+            factor = (2 / filters.shape[1]) ** 0.5 / rms
+            layer.weight.mul_(factor[:, None, None, None])
+            y = layer(x)
+            mean, variance = y.mean((0, 2, 3)), y.var((0, 2, 3), correction=0)
+            norm.running_mean.copy_(mean)
+            norm.running_var.copy_(variance)
+            if name in biases:
+                norm.weight.copy_(torch.sqrt(variance + norm.eps) / factor)
+                norm.bias.copy_(biases[name].to(device) + mean / factor)
+            else:
+                norm.weight.fill_(NEW_SCALE)
+                norm.bias.zero_()
+        x = module(x)
