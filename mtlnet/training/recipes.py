@@ -26,7 +26,9 @@ steps. Dropout 0.5 and L2 5e-4 are our choice: the paper states neither.
 
 `continue`: `fast` from a finished model (`--init`), for hours on new frames; batch normalisation is
 put back first, and the network may get more residual convolutions (`mtlnet.model.pretrained`). The
-first convolution stays as it is.
+first convolution stays as it is; frames in sharp bends and near a change of class, where most
+errors are, are drawn twice as often (in a pilot of 5 minutes 0.89 of the wrong classes, 0.97 of the
+angle's error). With the learning rate of `fast` the model forgot more than it learned.
 
 `tune`: `fast` from a finished model (`--init`), with AdamW, a tenth of the learning rate, 500 steps
 and no batch normalisation.
@@ -90,7 +92,9 @@ FAST = Recipe(
 CONTINUE = replace(
     FAST,
     name="continue",
+    learning_rate=3e-4,
     iterations=30_000,
+    hard_repeats=2,
     freeze_schedule=((0.0, 1), (0.6, 2)),
     from_model=True,
 )
