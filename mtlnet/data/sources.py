@@ -148,8 +148,12 @@ def continue_from_model(data: TrainingData, card: ModelCard) -> TrainingData:
             f"the camera of the data is {data.camera}, that of model {card.name} "
             f"{card.camera}; a model keeps the camera it was trained for"
         )
-    init = {"name": card.name, "model_hash": card.model_hash}
-    return replace(data, about={**_with_seen(data.about, card.data), "init": init})
+    about = {
+        **_with_seen(data.about, card.data),
+        "init": {"name": card.name, "model_hash": card.model_hash},
+        "earlier": [*card.data.get("earlier", ()), _summary(card.data)],
+    }
+    return replace(data, about=about)
 
 
 def resume_data(config: TrainConfig, data: TrainingData, earlier: dict[str, Any]) -> TrainingData:
@@ -160,12 +164,17 @@ def resume_data(config: TrainConfig, data: TrainingData, earlier: dict[str, Any]
     """
     history = list(earlier.get("earlier", ()))
     if config.change_data and data.about["content_hash"] != earlier.get("content_hash"):
-        history.append({name: earlier.get(name) for name in ("path", "content_hash", "frames")})
+        history.append(_summary(earlier))
     else:
         require_same_data(config, earlier, data.about)
     if not history:
         return data
     return replace(data, about={**_with_seen(data.about, earlier), "earlier": history})
+
+
+def _summary(data: dict[str, Any]) -> dict[str, Any]:
+    """What a model's card says of a dataset that it was trained on before."""
+    return {name: data.get(name) for name in ("path", "content_hash", "frames")}
 
 
 def _with_seen(about: dict[str, Any], earlier: dict[str, Any]) -> dict[str, Any]:

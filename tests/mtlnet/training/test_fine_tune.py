@@ -123,6 +123,10 @@ def test_the_card_lists_the_seeds_and_tracks_of_both_trainings(
     published: Path, custom_images: Path
 ) -> None:
     _, card = open_pretrained(published)
-    seen = replace(card, data={"seeds": [3, 1], "tracks": ["coast"]})
+    first = {"path": "datasets/a", "content_hash": "1669", "frames": 10}
+    then = {"path": "datasets/b", "content_hash": "28e3", "frames": 20}
+    data = {**then, "seeds": [3, 1], "tracks": ["coast"], "earlier": [first]}
+    seen = replace(card, data=data)
     about = continue_from_model(custom_training_data(custom_images, card), seen).about
     assert (about["seeds"], about["tracks"]) == ([1, 3], ["coast"])
+    assert about["earlier"] == [first, then]
