@@ -158,7 +158,7 @@ def ship_command(
 @app.command("evaluate")
 def evaluate_command(
     model: options.Model = "default",
-    data: options.Data = Path("datasets/default"),
+    data: options.EvaluationData = Path("datasets/default"),
     split: options.Split = "test",
     page: options.ReportPage = None,
     worst: options.WorstSheet = None,
@@ -192,7 +192,8 @@ def evaluate_command(
         return
     console = Console()
     console.print(evaluation_table(result))
-    console.print(group_table(result))
+    if "by_track" in result:
+        console.print(group_table(result))
     if "doubt" in result:
         console.print(uncertainty_table(result))
 
@@ -203,6 +204,7 @@ def predict_command(
     model: options.Model = "default",
     out: options.PredictOut = None,
     fov_y_deg: options.FieldOfView = None,
+    camera: options.PredictCamera = None,
     engine: options.EngineKind = "openvino",
     precision: options.Precision = None,
     as_json: options.Json = False,
@@ -211,17 +213,23 @@ def predict_command(
     from rich.console import Console
 
     from mtlnet.evaluation.tables import prediction_table
+    from mtlnet.inference.rectification import Rectification, read_camera
     from mtlnet.predict.run import predict_files
+    from trackfeatures.errors import UserError
 
+    if camera is not None and fov_y_deg is not None:
+        raise UserError("--camera holds the field of view; leave --fov-y-deg out")
     _print_model(model)
     loaded = _load(model, engine, precision)
+    known = loaded.card.camera
+    lens = fov_y_deg if camera is None else Rectification(read_camera(camera, known), known)
     with command.progress_bar() as bar:
         task = bar.add_task("predicting", total=None)
 
         def report(done: int, total: int) -> None:
             bar.update(task, completed=done, total=total)
 
-        predictions = predict_files(loaded, images, out or (), fov_y_deg, report)
+        predictions = predict_files(loaded, images, out or (), lens, report)
     if as_json:
         typer.echo(json.dumps(predictions))
     else:

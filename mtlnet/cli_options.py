@@ -19,6 +19,10 @@ Precision = Annotated[
     ),
 ]
 Data = Annotated[Path, typer.Option(help="Dataset folder.")]
+EvaluationData = Annotated[
+    Path,
+    typer.Option(help="Dataset folder, or one with images, labels.csv and perhaps camera.yaml."),
+]
 
 # Options of `train`: None is the default of TrainConfig, or with --resume what the run has stored.
 TrainData = Annotated[
@@ -151,6 +155,10 @@ PredictOut = Annotated[
         help="Table (.csv, .jsonl), film (.mp4) or folder of pictures with the markings drawn in; "
         "may be given several times."
     ),
+]
+PredictCamera = Annotated[
+    Path | None,
+    typer.Option(help="YAML file with the camera of images and films.  [default: the model's]"),
 ]
 FieldOfView = Annotated[
     float | None,

@@ -1,23 +1,25 @@
-"""A user's own images with a `labels.csv`, for fine-tuning: `mtlnet train --init RUN`.
+"""A user's own images with a `labels.csv`: `mtlnet train --init RUN`, `mtlnet evaluate`.
 
 Columns (named by a header, in any order): `file`, a path within the folder; `ml`, `mr`, `l`, `m`,
 `r`, in m, left negative, empty where there is no such marking; `angle`, rad, positive when the car
 points to the right of the track; `heading`: left, straight or right. The images must be of the
-camera of the model to fine-tune, in any size of the same aspect ratio.
+model's camera, in any size of the same aspect ratio; for an evaluation also of the camera that a
+`camera.yaml` in the folder describes.
 """
 
 import csv
 import hashlib
 import math
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 import trackfeatures as tf
-from mtlnet.inference.image_decoding.decode import inspect, read_image
+from mtlnet.inference.image_decoding.decode import inspect, read_image, read_whole_image
+from mtlnet.inference.rectification import Rectification
 from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
 
@@ -43,6 +45,9 @@ class CustomLabels:
     angle: NDArray[np.float32]
     heading: NDArray[np.int64]
 
+    def __len__(self) -> int:
+        return len(self.angle)
+
 
 @dataclass(frozen=True)
 class CustomImages:
@@ -56,6 +61,14 @@ class CustomImages:
     def __len__(self) -> int:
         return len(self.images)
 
+    def every(self, count: int) -> "CustomImages":
+        """Every `count`-th image."""
+        labels = self.labels
+        kept = CustomLabels(
+            labels.distances[::count], labels.angle[::count], labels.heading[::count]
+        )
+        return replace(self, labels=kept, images=self.images[::count])
+
     def read_batch(
         self, indices: NDArray[np.int64], out: NDArray[np.uint8] | None = None
     ) -> NDArray[np.uint8]:
@@ -68,8 +81,10 @@ def has_labels_file(folder: Path) -> bool:
     return (folder / LABELS).is_file()
 
 
-def open_custom_images(folder: Path, camera: CameraParameters) -> CustomImages:
-    """Read labels and images of a folder; images are scaled to the camera's size.
+def open_custom_images(
+    folder: Path, camera: CameraParameters, rectification: Rectification | None = None
+) -> CustomImages:
+    """Read labels and images of a folder; images are scaled to the camera's size, or rectified.
 
     Raises UserError that names the faulty line of `labels.csv`, also for an image that is missing,
     damaged, or of another aspect ratio than the camera's.
@@ -80,7 +95,10 @@ def open_custom_images(folder: Path, camera: CameraParameters) -> CustomImages:
     def decode(number: int) -> bytes:
         path = folder / files[number][1]
         try:
-            images[number] = _read_uncropped(path, camera)
+            if rectification is None:
+                images[number] = _read_uncropped(path, camera)
+            else:
+                images[number] = rectification.image(read_whole_image(path))
         except UserError as error:
             error.args = (f"{folder / LABELS}, line {files[number][0]}: {error}",)
             raise

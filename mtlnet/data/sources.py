@@ -12,6 +12,7 @@ from datagen.recording import Dataset, DatasetError, Frames, UndecodableImage
 from mtlnet.data.custom_images import CustomImages, has_labels_file, open_custom_images
 from mtlnet.evaluation.metrics import describe_data, mean_labels
 from mtlnet.inference.model_card import ModelCard, ModelError
+from mtlnet.inference.rectification import CAMERA_FILE
 from mtlnet.model.architecture import HEIGHT, WIDTH, find_architecture
 from mtlnet.model.pretrained import match_convolutions
 from mtlnet.training.config import TrainConfig
@@ -82,6 +83,11 @@ def custom_training_data(folder: Path, card: ModelCard | None) -> TrainingData:
         raise UserError(
             f"{folder} holds images of your own, without a description of their camera; give the "
             "model to fine-tune with --init RUN, or --init default"
+        )
+    if (folder / CAMERA_FILE).exists():
+        raise UserError(
+            f"{folder / CAMERA_FILE}: training takes images of the model's own camera only; delete "
+            "the file if they are, else evaluate or predict"
         )
     images = open_custom_images(folder, card.camera)
     about = {

@@ -1,4 +1,5 @@
-"""Evaluates a model on the rounds of a dataset: `mtlnet evaluate --model RUN --data DIR --json`."""
+"""Evaluates a model on the rounds of a dataset, or on a user's own labelled images:
+`mtlnet evaluate --model RUN --data DIR --json`."""
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -10,12 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datagen.recording import Dataset, Frames, UndecodableImage
+from mtlnet.data.custom_images import has_labels_file, open_custom_images
 from mtlnet.data.loader import Images
 from mtlnet.data.sources import require_decodable
 from mtlnet.evaluation.html_report import page_file, write_page, write_worst_sheet
-from mtlnet.evaluation.metrics import evaluate_by_groups
+from mtlnet.evaluation.metrics import evaluate_by_groups, evaluate_outputs
 from mtlnet.inference.engine import Engine
 from mtlnet.inference.model_card import ModelCard, ModelError
+from mtlnet.inference.rectification import CAMERA_FILE, Rectification, read_camera
 from runtime.files import check_folder
 from trackfeatures.errors import UserError
 
@@ -46,6 +49,10 @@ def evaluate(
     if worst is not None:
         check_folder(worst)
     engine = engines[0]
+    if has_labels_file(data):
+        if page is not None or worst is not None:
+            raise UserError("--report and --worst show recorded rounds, not images of your own")
+        return evaluate_custom_images(engines, data, report, every)
     dataset = Dataset.open(data)
     frames = dataset.select(split).every(every)
     require_fit(engine.card, frames, split)
@@ -56,10 +63,7 @@ def evaluate(
         raise
     mean = engine.card.data["mean"]
     found = {
-        "model": engine.card.name,
-        "model_hash": engine.card.model_hash,
-        "engine": engine.kind,
-        "precision": engine.precision,
+        **_about(engine),
         "data": str(data),
         "split": split,
         "every": every,
@@ -71,6 +75,44 @@ def evaluate(
     if worst is not None:
         write_worst_sheet(worst, frames, outputs)
     return found
+
+
+def evaluate_custom_images(
+    engines: Sequence[Engine],
+    folder: Path,
+    report: Callable[[int, int], None] = lambda *_: None,
+    every: int = 1,
+) -> dict[str, Any]:
+    """The report on a user's own images with a `labels.csv`, without groups of frames.
+
+    They are of the model's camera, or of that which a `camera.yaml` beside them describes. Raises
+    UserError for faulty files.
+    """
+    engine, camera = engines[0], engines[0].card.camera
+    path = folder / CAMERA_FILE
+    rectification = Rectification(read_camera(path, camera), camera) if path.exists() else None
+    images = open_custom_images(folder, camera, rectification).every(every)
+    outputs = predict_frames(engines, images, report)
+    if rectification is not None:
+        outputs = rectification.outputs(outputs)
+    return {
+        **_about(engine),
+        "data": str(folder),
+        "split": "all",
+        "every": every,
+        "rounds": 0,
+        **evaluate_outputs(outputs, images.labels, engine.card.data["mean"]),
+    }
+
+
+def _about(engine: Engine) -> dict[str, Any]:
+    """What a report says of the model."""
+    return {
+        "model": engine.card.name,
+        "model_hash": engine.card.model_hash,
+        "engine": engine.kind,
+        "precision": engine.precision,
+    }
 
 
 def predict_frames(

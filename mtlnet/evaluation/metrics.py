@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import trackfeatures as tf
-from datagen.recording import Dataset, Frames, Labels
+from datagen.recording import Dataset, Frames
 from mtlnet.data.loader import LabelArrays
 from mtlnet.inference.prediction import OUTPUTS, split_outputs
 from mtlnet.inference.uncertainty import FEATURES
@@ -193,7 +193,7 @@ def _by_range(
 
 
 def evaluate_outputs(
-    outputs: NDArray[np.float32], labels: Labels, mean: dict[str, Any]
+    outputs: NDArray[np.float32], labels: LabelArrays, mean: dict[str, Any]
 ) -> dict[str, Any]:
     """The report on `outputs` (N, 9 to 22) for `labels`; `mean`: of `mean_labels`.
 
@@ -204,7 +204,7 @@ def evaluate_outputs(
     model = _means(errors, heading == labels.heading)
     baseline = _means(_baseline_errors(mean, labels), labels.heading == mean["heading"])
     report = {
-        "frames": len(labels),
+        "frames": len(labels.angle),
         **model,
         "errors": error_percentiles(errors),
         "confusion": confusion(labels.heading, heading),
@@ -264,7 +264,7 @@ def _ratios(model: dict[str, Any], baseline: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def coded_losses(outputs: NDArray[np.float32], labels: Labels) -> dict[str, float]:
+def coded_losses(outputs: NDArray[np.float32], labels: LabelArrays) -> dict[str, float]:
     """The losses of the paper's table on coded values, inactive ones included.
 
     `distance`, `angle`: mean over the frames of the squared error, summed over the five distances,
@@ -274,7 +274,7 @@ def coded_losses(outputs: NDArray[np.float32], labels: Labels) -> dict[str, floa
     target = tf.encode(labels.distances, labels.angle).astype(np.float64)
     difference = outputs[:, :6] - target
     squared, absolute = difference**2, np.abs(difference)
-    likelihood = outputs[np.arange(len(labels)), 6 + labels.heading].astype(np.float64)
+    likelihood = outputs[np.arange(len(labels.angle)), 6 + labels.heading].astype(np.float64)
     return {
         "distance": float(squared[:, :5].sum(1).mean()),
         "angle": float(squared[:, 5].mean()),
@@ -284,7 +284,9 @@ def coded_losses(outputs: NDArray[np.float32], labels: Labels) -> dict[str, floa
     }
 
 
-def presence(outputs: NDArray[np.float32], labels: Labels) -> dict[str, dict[str, float | None]]:
+def presence(
+    outputs: NDArray[np.float32], labels: LabelArrays
+) -> dict[str, dict[str, float | None]]:
     """Per distance: share of active labels predicted inactive, and of inactive ones as active."""
     distances, _ = tf.decode(outputs[:, :6])
     truth = labels.distances
@@ -299,7 +301,7 @@ def presence(outputs: NDArray[np.float32], labels: Labels) -> dict[str, dict[str
     }
 
 
-def _baseline_errors(mean: dict[str, Any], labels: Labels) -> Numbers:
+def _baseline_errors(mean: dict[str, Any], labels: LabelArrays) -> Numbers:
     """Errors (N, 7) of always predicting the training mean."""
     distances = [np.nan if d is None else d for d in mean["distances_m"]]
     offset = mean["to_lane_centre_m"] - tf.localise(labels.distances)

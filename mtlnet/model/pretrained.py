@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from mtlnet.inference.model_card import WEIGHTS
-from mtlnet.model.architecture import Architecture, Conv
-from mtlnet.model.network import CODED_HEADS, HEIGHT, Network, load_network, normalise
+from mtlnet.model.architecture import HEIGHT, Architecture, Conv
+from mtlnet.model.network import CODED_HEADS, Network, load_network, normalise
 from trackfeatures.errors import UserError
 
 NEW_SCALE = 0.02

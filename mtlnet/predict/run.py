@@ -8,7 +8,8 @@ from typing import Any
 
 from mtlnet.inference.engine import Engine
 from mtlnet.inference.prediction import decode_outputs
-from mtlnet.predict.sources import find_sources, read_sources
+from mtlnet.inference.rectification import Rectification
+from mtlnet.predict.sources import ROUND, Lens, find_sources, read_sources
 from mtlnet.predict.writers import open_writer, require_other_file
 from trackfeatures.errors import UserError
 
@@ -20,19 +21,24 @@ def predict_files(
     engine: Engine,
     inputs: Sequence[str],
     outputs: Sequence[Path] = (),
-    fov_y_deg: float | None = None,
+    lens: Lens = None,
     report: Callable[[int, int], None] = lambda done, total: None,
 ) -> list[dict[str, Any]]:
     """The features of all images that `inputs` name (`mtlnet.predict.sources.find_sources`).
 
     Those of the first `KEPT_ROWS` are returned, all are written to each of `outputs`
-    (`mtlnet.predict.writers.open_writer`), one image at a time. `report`: takes the numbers of
-    images done and in all. Raises UserError, after all others were done, when an image could not be
-    used; at once for outputs that cannot be written or are among the files to read.
+    (`mtlnet.predict.writers.open_writer`), one image at a time. `lens`: of images and films; a
+    recorded round must be of the model's camera. `report`: takes the numbers of images done and in
+    all. Raises UserError, after all others were done, when an image could not be used; at once for
+    outputs that cannot be written or are among the files to read.
     """
     sources = find_sources(list(inputs))
-    total = sum(source.count for source in sources)
+    other = lens if isinstance(lens, Rectification) else None
+    if other is not None and any(source.path.suffix.lower() == ROUND for source in sources):
+        raise UserError("--camera is for images and films; a recorded round has its own camera")
     camera, name = engine.card.camera, engine.card.name
+    total = sum(source.count for source in sources)
+    drawn = camera if other is None else other.view
     results: list[dict[str, Any]] = []
     unusable: list[str] = []
     used = 0
@@ -40,14 +46,17 @@ def predict_files(
         require_other_file(path, [source.path for source in sources])
     with ExitStack() as stack:
         fps = sources[0].fps
-        writers = [stack.enter_context(open_writer(path, camera, fps)) for path in outputs]
-        for done, item in enumerate(read_sources(sources, camera, fov_y_deg), start=1):
+        writers = [stack.enter_context(open_writer(path, drawn, fps)) for path in outputs]
+        for done, item in enumerate(read_sources(sources, camera, lens), start=1):
             report(done, max(total, done))
             if item.image is None:
                 unusable.append(item.error)
                 continue
             begin = time.perf_counter()
-            prediction = decode_outputs(engine(item.image))
+            answers = engine(item.image)
+            if other is not None:
+                answers = other.outputs(answers[None])[0]
+            prediction = decode_outputs(answers)
             latency_ms = round(1e3 * (time.perf_counter() - begin), 3)
             for writer in writers:
                 writer.write(item, prediction)

@@ -12,8 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 import trackfeatures as tf
-from mtlnet.inference.image_decoding.decode import crop_and_resize, read_image
+from mtlnet.inference.image_decoding.decode import (
+    crop_and_resize,
+    read_image,
+    read_whole_image,
+)
 from mtlnet.inference.image_decoding.errors import ImageError
+from mtlnet.inference.rectification import Rectification
 from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
 
@@ -25,6 +30,9 @@ READ_AHEAD = 16
 """Decoded images that wait for the network at most."""
 
 Image = NDArray[np.uint8]
+Lens = Rectification | float | None
+"""Of images and films: their camera, or its vertical field of view in degrees; None: the model's.
+"""
 
 
 @dataclass(frozen=True)
@@ -97,13 +105,10 @@ def _source(path: Path) -> Source:
 
 
 def read_sources(
-    sources: list[Source], camera: CameraParameters, fov_y_deg: float | None = None
+    sources: list[Source], camera: CameraParameters, lens: Lens = None
 ) -> Iterator[SourceImage]:
-    """The images of all sources in order, decoded on a thread of its own, in the size of `camera`.
-
-    `fov_y_deg`: vertical field of view of images and films, None: that of `camera`.
-    """
-    items = (item for source in sources for item in _read(source, camera, fov_y_deg))
+    """The images of all sources in order, in the size of `camera`, decoded on another thread."""
+    items = (item for source in sources for item in _read(source, camera, lens))
     with ThreadPoolExecutor(1) as decoder:  # one thread: the order stays
         waiting = deque(decoder.submit(next, items, None) for _ in range(READ_AHEAD))
         while (item := waiting.popleft().result()) is not None:
@@ -111,29 +116,27 @@ def read_sources(
             yield item
 
 
-def _read(
-    source: Source, camera: CameraParameters, fov_y_deg: float | None
-) -> Iterator[SourceImage]:
+def _read(source: Source, camera: CameraParameters, lens: Lens) -> Iterator[SourceImage]:
     kind = source.path.suffix.lower()
     if kind in FILMS:
-        return _read_film(source, camera, fov_y_deg)
+        return _read_film(source, camera, lens)
     if kind == ROUND:
         return _read_round(source.path, camera)
-    return _read_file(source.path, camera, fov_y_deg)
+    return _read_file(source.path, camera, lens)
 
 
-def _read_file(
-    path: Path, camera: CameraParameters, fov_y_deg: float | None
-) -> Iterator[SourceImage]:
+def _read_file(path: Path, camera: CameraParameters, lens: Lens) -> Iterator[SourceImage]:
     try:
-        yield SourceImage(str(path), read_image(path, camera, fov_y_deg))
+        if isinstance(lens, Rectification):
+            image = lens.image(read_whole_image(path))
+        else:
+            image = read_image(path, camera, lens)
+        yield SourceImage(str(path), image)
     except (ImageError, UserError) as error:
         yield SourceImage(str(path), None, str(error))
 
 
-def _read_film(
-    source: Source, camera: CameraParameters, fov_y_deg: float | None
-) -> Iterator[SourceImage]:
+def _read_film(source: Source, camera: CameraParameters, lens: Lens) -> Iterator[SourceImage]:
     film = _open_film(source.path)
     number = 0
     try:
@@ -143,12 +146,12 @@ def _read_film(
                 break
             name = f"{source.path}#{number}"
             number += 1
+            picture = cv2.cvtColor(frame, cv2.COLOR_BGR2RGB).astype(np.uint8, copy=False)
             try:
-                image = crop_and_resize(
-                    cv2.cvtColor(frame, cv2.COLOR_BGR2RGB).astype(np.uint8, copy=False),
-                    camera,
-                    fov_y_deg,
-                )
+                if isinstance(lens, Rectification):
+                    image = lens.image(picture)
+                else:
+                    image = crop_and_resize(picture, camera, lens)
             except ImageError as error:  # all frames are alike
                 yield SourceImage(str(source.path), None, f"{source.path}: {error}")
                 return

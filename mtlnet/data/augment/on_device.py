@@ -19,8 +19,9 @@ from mtlnet.data.augment.geometric import (
     rotations,
     shear_per_metre,
 )
-from mtlnet.data.augment.pipeline import BORDER_LEVEL, AugmentParams
+from mtlnet.data.augment.pipeline import AugmentParams
 from mtlnet.data.augment.shadows import shadow_masks
+from mtlnet.inference.rectification import BORDER_LEVEL
 from trackfeatures.camera import CameraParameters
 
 BLUR_RADIUS = 3

@@ -22,6 +22,7 @@ from mtlnet.data.augment.geometric import (
 )
 from mtlnet.data.augment.photometric import add_noise, blur, compress, draw_colour_transforms
 from mtlnet.data.augment.shadows import SHADOWS, add_shadow
+from mtlnet.inference.rectification import BORDER_LEVEL, MAX_BORDER
 from trackfeatures.camera import CameraParameters
 
 # Shares of the images. Small: in a run of an hour the network sees each frame about five times, and
@@ -30,11 +31,6 @@ SHIFT_SHARE, ROTATION_SHARE, SHADOW_SHARE, PATCH_SHARE = 0.3, 0.3, 0.15, 0.125
 BLUR_SHARE, NOISE_SHARE, JPEG_SHARE = 0.08, 0.12, 0.0625
 BORDER_SHARE = 0.5
 MAX_PATCH_SIDE = 0.3  # relative to the image's sides
-MAX_BORDER = np.array([0.3, 0.3, 0.25, 0.25])
-"""Largest borders at the top, bottom, left and right, relative to the image's height and width: a
-camera with half of the field of view leaves a quarter of the image at each side empty."""
-BORDER_LEVEL = 128
-"""Grey level of a border: nearly 0 to the network, as the padding of its convolutions."""
 BLUR_STD_PX, NOISE_STD, JPEG_QUALITY = (0.4, 1.4), (2.0, 12.0), (25, 90)
 
 

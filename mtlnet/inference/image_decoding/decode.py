@@ -62,6 +62,26 @@ def read_image(
     It is scaled, and cropped if wider than the view; `fov_y_deg` as in `inspect`. Raises ImageError
     for an image that cannot be used, UserError for a missing or too large file.
     """
+    body = _read_file(path)
+    try:
+        return decode(body, inspect(body, view, fov_y_deg), view, fov_y_deg)
+    except ImageError as error:
+        raise ImageError(error.fault, f"{path}: {error}") from error
+
+
+def read_whole_image(path: Path) -> NDArray[np.uint8]:
+    """The JPEG or PNG at `path` as uint8 RGB (H, W, 3), of any size within the limits.
+
+    Raises as `read_image`.
+    """
+    body = _read_file(path)
+    try:
+        return _decode_whole(body, _read_header(body))
+    except ImageError as error:
+        raise ImageError(error.fault, f"{path}: {error}") from error
+
+
+def _read_file(path: Path) -> bytes:
     if not path.is_file():
         raise UserError(f"there is no image file {path}")
     if path.stat().st_size > MAX_FILE_BYTES:
@@ -69,11 +89,7 @@ def read_image(
             f"{path} has {path.stat().st_size} bytes, at most {MAX_FILE_BYTES} are read; save a "
             "smaller image"
         )
-    body = path.read_bytes()
-    try:
-        return decode(body, inspect(body, view, fov_y_deg), view, fov_y_deg)
-    except ImageError as error:
-        raise ImageError(error.fault, f"{path}: {error}") from error
+    return path.read_bytes()
 
 
 def inspect(body: bytes, view: CameraParameters, fov_y_deg: float | None = None) -> ImageHeader:
@@ -83,6 +99,13 @@ def inspect(body: bytes, view: CameraParameters, fov_y_deg: float | None = None)
 
     `fov_y_deg`: the image's vertical field of view, None: that of `view`. Raises ImageError.
     """
+    header = _read_header(body)
+    crop_box(header.width, header.height, view, fov_y_deg)
+    return header
+
+
+def _read_header(body: bytes) -> ImageHeader:
+    """The header of an image within the limits. Raises ImageError."""
     if body.startswith(png.SIGNATURE):
         found = png.read_header(body)
         header = ImageHeader(found.width, found.height, found)
@@ -92,7 +115,6 @@ def inspect(body: bytes, view: CameraParameters, fov_y_deg: float | None = None)
         seen = f"{len(body)} bytes that begin with {body[:8]!r}" if body else "nothing at all"
         raise ImageError(Fault.NOT_AN_IMAGE, f"no JPEG or PNG file, but {seen}")
     check_size(header.width, header.height)
-    crop_box(header.width, header.height, view, fov_y_deg)
     return header
 
 
@@ -165,6 +187,10 @@ def decode(
 
     `header` and `fov_y_deg` as in `inspect`. Raises ImageError.
     """
+    return crop_and_resize(_decode_whole(body, header), view, fov_y_deg)
+
+
+def _decode_whole(body: bytes, header: ImageHeader) -> NDArray[np.uint8]:
     if header.png_header is not None:
         image = _decode_png(body, header.png_header)
     else:
@@ -177,7 +203,7 @@ def decode(
             f"the image decodes to {image.shape[1]} x {image.shape[0]} px, its header declares "
             f"{header.width} x {header.height}; save it anew",
         )
-    return crop_and_resize(image, view, fov_y_deg)
+    return image
 
 
 def crop_and_resize(

@@ -29,10 +29,8 @@ from mtlnet.data.augment.photometric import (
     compress,
 )
 from mtlnet.data.augment.pipeline import (
-    BORDER_LEVEL,
     BORDER_SHARE,
     JPEG_SHARE,
-    MAX_BORDER,
     MAX_PATCH_SIDE,
     PATCH_SHARE,
     ROTATION_SHARE,
@@ -42,6 +40,7 @@ from mtlnet.data.augment.pipeline import (
     draw_params,
 )
 from mtlnet.data.augment.shadows import SHADOWS, add_shadow, road_points
+from mtlnet.inference.rectification import BORDER_LEVEL, MAX_BORDER
 from trackfeatures.camera import CameraParameters
 
 SMALL = CameraParameters(width=70, height=52)
@@ -227,7 +226,7 @@ def test_half_of_the_images_show_what_a_narrower_camera_shows() -> None:
     border = draw_params(4000, 210, 280, np.random.default_rng(2)).border
     chosen = border.any(1)
     assert chosen.mean() == pytest.approx(BORDER_SHARE, abs=0.03)
-    limits = MAX_BORDER * (210, 210, 280, 280)
+    limits = np.array(MAX_BORDER) * (210, 210, 280, 280)
     assert (border <= limits.round()).all()
     np.testing.assert_allclose(border[chosen].mean(0), limits / 2, rtol=0.05)
     images = np.stack([picture(), picture(1)])

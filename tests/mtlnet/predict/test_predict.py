@@ -2,7 +2,7 @@
 
 import csv
 import json
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import cv2
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 import trackfeatures as tf
 from mtlnet.inference.model_card import ModelCard, read_card
+from mtlnet.inference.rectification import Rectification
 from mtlnet.predict.run import predict_files
 from mtlnet.predict.sources import find_sources
 from mtlnet.predict.writers import TEXT_HEIGHT
@@ -51,6 +52,29 @@ def write_film(path: Path, levels: list[int]) -> Path:
         film.write(np.full((420, 560, 3), level, np.uint8))
     film.release()
     return path
+
+
+def test_images_and_films_of_another_camera(engine: BrightnessEngine, tmp_path: Path) -> None:
+    """Half of the focal length: the middle half of the image is what the model's camera sees."""
+    image = np.zeros((420, 560, 3), np.uint8)
+    image[105:315, 140:420] = 200
+    wide = replace(CameraParameters(), fov_y_deg=106.36, z=1.55)
+    lens = Rectification(wide, CameraParameters())
+    name = str(tmp_path / "a.png")
+    cv2.imwrite(name, image)
+    film = write_film(tmp_path / "film.mp4", [100, 100])
+    rows = predict_files(engine, [name, str(film)], [tmp_path / "all.csv"], lens)
+    assert [row["image"] for row in rows] == [name, f"{film}#0", f"{film}#1"]
+    assert rows[0]["angle_rad"] == pytest.approx(200 / 255 - 0.5, abs=0.01)
+    # 1.8 in place of 1.2 m above the road: half as far again, but for what the camera's place adds.
+    angle = rows[0]["angle_rad"]
+    seen = float(tf.decode(np.full((1, 6), 0.5))[0][0, 3]) - 0.75 * np.sin(angle)
+    assert rows[0]["distances_m"]["m"] == pytest.approx(1.5 * seen + 0.75 * np.sin(angle))
+    with (tmp_path / "all.csv").open(newline="") as file:
+        assert float(next(csv.DictReader(file))["m_m"]) == rows[0]["distances_m"]["m"]
+    (tmp_path / "round.mcap").write_bytes(b"")
+    with pytest.raises(UserError, match=r"round\.mcap|has its own camera"):
+        predict_files(engine, [str(tmp_path / "round.mcap")], (), lens)
 
 
 def test_a_folder_and_a_pattern_name_all_their_images(

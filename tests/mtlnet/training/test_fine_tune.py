@@ -11,12 +11,15 @@ from safetensors.torch import save_file
 
 from datagen.recording import Dataset
 from mtlnet.data.sources import continue_from_model, custom_training_data
+from mtlnet.evaluation.evaluate import evaluate
+from mtlnet.inference.engine import load_engine
 from mtlnet.inference.model_card import WEIGHTS, read_card
 from mtlnet.model.architecture import GRID
 from mtlnet.model.network import Network, initialise, load_network, predict_images
 from mtlnet.model.pretrained import load_pretrained
 from mtlnet.training.config import TrainConfig, open_pretrained
-from mtlnet.training.run import start_training
+from mtlnet.training.distributed import read_rank
+from mtlnet.training.run import configure_cpu, start_training
 from trackfeatures.errors import UserError
 
 
@@ -97,6 +100,30 @@ def test_a_model_is_trained_on_with_batch_normalisation(
     assert float((slopes.std(1) / slopes.mean(1).abs()).median()) < 1e-3
 
 
+def test_images_of_another_camera_are_evaluated_not_trained_on(
+    published: Path, custom_images: Path, tmp_path: Path
+) -> None:
+    engine = load_engine(published, precision="f32")
+    plain = evaluate([engine], custom_images, "all")
+    assert (plain["frames"], plain["rounds"], plain["split"]) == (6, 0, "all")
+    assert plain["mae_m"]["ml"] > 0
+    assert plain["mae_m"]["l"] is None
+    assert "by_track" not in plain
+    (custom_images / "camera.yaml").write_text("x: 0.75\n")  # the model's own
+    same = evaluate([engine], custom_images, "all")
+    assert same["mae_m"]["ml"] == pytest.approx(plain["mae_m"]["ml"], abs=1e-4)
+    assert same["angle_mae_rad"] == pytest.approx(plain["angle_mae_rad"], abs=1e-6)
+    (custom_images / "camera.yaml").write_text("height_above_road_m: 2.4\n")
+    higher = evaluate([engine], custom_images, "all", every=2)
+    assert higher["frames"] == 3
+    assert higher["mae_m"]["ml"] != plain["mae_m"]["ml"]
+    with pytest.raises(UserError, match="show recorded rounds"):
+        evaluate([engine], custom_images, "all", page=tmp_path / "report.html")
+    options = {"data": custom_images, "init": str(published)}
+    with pytest.raises(UserError, match=r"camera\.yaml: training takes images of the model's own"):
+        start_training(options, tmp_path / "run", resume=False)
+
+
 def test_wrong_options_are_refused(
     published: Path, custom_images: Path, dataset: Path, tmp_path: Path
 ) -> None:
@@ -130,3 +157,14 @@ def test_the_card_lists_the_seeds_and_tracks_of_both_trainings(
     about = continue_from_model(custom_training_data(custom_images, card), seen).about
     assert (about["seeds"], about["tracks"]) == ([1, 3], ["coast"])
     assert about["earlier"] == [first, then]
+
+
+def test_training_takes_tiny_numbers_as_zero(tmp_path: Path) -> None:
+    """Else the momenta of units that seldom learn make a step take twice as long."""
+    torch.set_flush_denormal(False)
+    assert float((torch.full((8,), 1e-37) * 1e-3).max()) > 0
+    try:
+        configure_cpu(TrainConfig(tmp_path, tmp_path / "run", threads=1), read_rank())
+        assert float((torch.full((8,), 1e-37) * 1e-3).max()) == 0
+    finally:
+        torch.set_flush_denormal(False)
