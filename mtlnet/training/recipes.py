@@ -98,19 +98,16 @@ CONTINUE = replace(
     freeze_schedule=((0.0, 1), (0.6, 2)),
     from_model=True,
 )
-TUNE = Recipe(
-    "tune",
-    GRID.name,
-    "adamw",
+TUNE = replace(
+    FAST,
+    name="tune",
+    optimizer="adamw",
     learning_rate=1e-4,
     batch=32,
     iterations=500,
-    dropout=0.0,
-    l2=2e-2,
     batch_norm=False,
-    standardise=True,
-    augment=True,
-    huber=HUBER,
+    freeze_bn_at=1.0,
+    freeze_schedule=(),
     from_model=True,
 )
 RECIPES = {

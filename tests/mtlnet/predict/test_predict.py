@@ -190,7 +190,7 @@ def test_a_wider_lens_is_cropped_to_the_models_view(
     cv2.imwrite(str(path), image)
     camera: CameraParameters = engine.card.camera
     wide = float(np.degrees(2 * np.arctan(2 * np.tan(np.radians(camera.fov_y_deg) / 2))))
-    own, cropped = (predict_files(engine, [str(path)], fov_y_deg=fov)[0] for fov in (None, wide))
+    own, cropped = (predict_files(engine, [str(path)], lens=fov)[0] for fov in (None, wide))
     assert cropped["angle_rad"] > own["angle_rad"]
 
 
