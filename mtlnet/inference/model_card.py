@@ -24,8 +24,8 @@ SHIPPED = Path(__file__).parents[1] / "weights" / "default"
 CARD, WEIGHTS, GRAPH, GRAPH_WEIGHTS = "card.json", "model.safetensors", "model.xml", "model.bin"
 UNCERTAINTY_WEIGHTS = "doubt.safetensors"
 SHIPPED_FILES = {
-    WEIGHTS: "79ae29963d747bf44f92d9c052d691a6584f6f74c30a87b0d50b0c9b2cea7ff7",
-    UNCERTAINTY_WEIGHTS: "e201912265828ce322fe7b98faa99875f8bb2e003f3665e8370916609dd5f26e",
+    WEIGHTS: "940ac736f19679fe90e229471d605cea52ecc1c95fed99001129b14c97505099",
+    UNCERTAINTY_WEIGHTS: "f3a2a49805dfc625d63c2e45d9d777e8938602ada5c2cf00dca358e1722f2cb3",
 }
 """SHA-256 of the shipped model's files."""
 MODEL_FILES = (WEIGHTS, GRAPH, GRAPH_WEIGHTS)
