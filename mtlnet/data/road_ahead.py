@@ -29,6 +29,7 @@ from mtlnet.data.augment.geometric import (
     shear_per_metre,
 )
 from mtlnet.data.augment.pipeline import AugmentParams
+from mtlnet.data.loader import Images
 from mtlnet.model.auxiliary import AHEAD_M, ROWS, SIDES
 from trackfeatures.camera import CameraParameters
 
@@ -234,3 +235,13 @@ def hard_frames(
             away = np.minimum(np.abs(between[after] - s[here]), np.abs(between[before] - s[here]))
             found[here] |= away <= HARD_NEAR_CHANGE_M
     return found
+
+
+def hard_frame_repeats(frames: Images, repeats: int) -> NDArray[np.int64] | None:
+    """How often each of recorded frames is drawn in an epoch; None: each once."""
+    if repeats == 1 or not isinstance(frames, Frames):
+        return None
+    labels = frames.labels
+    tracks = np.array([info.track for info in frames.rounds])[labels.round]
+    hard = hard_frames(labels.s, labels.curvature, labels.heading, tracks)
+    return np.where(hard, repeats, 1)

@@ -47,8 +47,14 @@ def open_training_data(
     All images are decoded once, so that a damaged one ends the run at its start; `checked`: this
     was done before. Raises UserError for data that does not fit the network or the model.
     """
+    normalised = find_recipe(config.recipe).batch_norm
+    if init is not None and normalised and find_architecture(init.network).backbone:
+        raise UserError(
+            f"--init is a {init.network}: the batch normalisation of torchvision's networks cannot "
+            "be put back; fine-tune it with --recipe tune"
+        )
     if init is not None and init.network != config.network:
-        if not find_recipe(config.recipe).batch_norm:
+        if not normalised:
             raise UserError(
                 f"--init is a {init.network}, not a {config.network}; leave out --network, or give "
                 "--recipe continue"

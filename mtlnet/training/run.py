@@ -23,7 +23,7 @@ from rich.progress import BarColumn, Progress, TextColumn
 from datagen.recording import Frames
 from mtlnet.data.gpu_cache import cache_if_it_fits
 from mtlnet.data.loader import Loader
-from mtlnet.data.road_ahead import RoadAhead, hard_frames
+from mtlnet.data.road_ahead import RoadAhead, hard_frame_repeats
 from mtlnet.data.sources import TrainingData, open_training_data, resume_data
 from mtlnet.export.publish import Provenance, publish
 from mtlnet.inference.model_card import RUNS, ModelCard, read_card
@@ -290,7 +290,7 @@ def prepare(
         augment=recipe.augment,
         part=(rank.index, rank.world_size),
         ahead=None if trainer.network.auxiliary is None else road_ahead(data, device),
-        repeats=hard_frame_repeats(data, recipe.hard_repeats),
+        repeats=hard_frame_repeats(data.frames, recipe.hard_repeats),
     )
     if init is None:
         trainer.standardise(loader)
@@ -307,16 +307,6 @@ def road_ahead(data: TrainingData, device: torch.device) -> RoadAhead | None:
     if not isinstance(data.frames, Frames):
         return None
     return RoadAhead(data.frames, data.camera, keep=device.type != "cpu")
-
-
-def hard_frame_repeats(data: TrainingData, repeats: int) -> NDArray[np.int64] | None:
-    """How often each frame is drawn in an epoch, if hard ones are drawn more than once."""
-    if repeats == 1 or not isinstance(data.frames, Frames):
-        return None
-    labels = data.frames.labels
-    tracks = np.array([info.track for info in data.frames.rounds])[labels.round]
-    hard = hard_frames(labels.s, labels.curvature, labels.heading, tracks)
-    return np.where(hard, repeats, 1)
 
 
 def spread_images(data: TrainingData, count: int) -> NDArray[np.uint8]:

@@ -10,7 +10,11 @@ import torch
 from safetensors.torch import save_file
 
 from datagen.recording import Dataset
-from mtlnet.data.sources import continue_from_model, custom_training_data
+from mtlnet.data.sources import (
+    continue_from_model,
+    custom_training_data,
+    open_training_data,
+)
 from mtlnet.evaluation.evaluate import evaluate
 from mtlnet.inference.engine import load_engine
 from mtlnet.inference.model_card import WEIGHTS, read_card
@@ -139,6 +143,11 @@ def test_wrong_options_are_refused(
     with pytest.raises(UserError, match="from which a grid cannot start"):
         start_training(grown, tmp_path / "c", resume=False)
     _, card = open_pretrained(published)
+    pooled = TrainConfig(
+        dataset, tmp_path / "d", recipe="continue", init="x", network="regnet_y_400mf"
+    )
+    with pytest.raises(UserError, match="torchvision's networks cannot be put back"):
+        open_training_data(pooled, replace(card, network="regnet_y_400mf"))
     material = custom_training_data(custom_images, card)
     other = replace(material, camera=replace(card.camera, z=1.4))
     with pytest.raises(UserError, match=r"0, 1\.4\) m.*keeps the camera"):
