@@ -181,7 +181,10 @@ def resume_data(config: TrainConfig, data: TrainingData, earlier: dict[str, Any]
         require_same_data(config, earlier, data.about)
     if not history:
         return data
-    return replace(data, about={**_with_seen(data.about, earlier), "earlier": history})
+    about = {**_with_seen(data.about, earlier), "earlier": history}
+    if "init" in earlier:  # the model that this name meant when the run was started
+        about["init"] = earlier["init"]
+    return replace(data, about=about)
 
 
 def _summary(data: dict[str, Any]) -> dict[str, Any]:

@@ -77,8 +77,6 @@ class TrainConfig:
                 if self.init is not None
                 else f"recipe {self.recipe} starts from a finished model; give it with --init"
             )
-        if self.change_data and self.init is not None:
-            raise UserError("a fine-tuned run keeps its data; leave --change-data out")
         if self.iterations is not None and self.iterations < 1:
             raise UserError(f"--iterations is {self.iterations}; give at least 1")
         if self.minutes is not None and not 0 < self.minutes < math.inf:

@@ -171,3 +171,22 @@ def test_a_run_continues_on_other_data_if_told_to(dataset: Path, tmp_path: Path)
     assert card.data == changed
     assert card.iterations == 3
     assert _without_folders(card.data)["earlier"][0]["path"] == dataset.name
+
+
+@pytest.mark.usefixtures("small_network")
+def test_a_run_from_a_model_continues_on_other_data_and_names_that_model(
+    dataset: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "other").mkdir()
+    other_dataset = write_dataset(tmp_path / "other", first_seed=100)
+    model = train(training_config(dataset, tmp_path / "model", iterations=1), None)
+    options = {"recipe": "continue", "init": str(tmp_path / "model"), "iterations": 1}
+    run = training_config(dataset, tmp_path / "run", **options)
+    first = train(run, None).data
+    assert first["init"]["model_hash"] == model.model_hash
+    given = {"iterations": 2, "data": other_dataset, "change_data": True}
+    changed = train(*resume_config(run.out, given)).data
+    assert changed["init"] == first["init"]
+    hashes = [data["content_hash"] for data in changed["earlier"]]
+    assert hashes == [model.data["content_hash"], first["content_hash"]]
+    assert changed["content_hash"] == Dataset.open(other_dataset).content_hash
