@@ -27,6 +27,7 @@ from mtlnet.inference.uncertainty import (
     UncertaintyHead,
 )
 from mtlnet.model.architecture import (
+    ABSENT_ABOVE,
     ANGLES,
     BIN_VARIANCE,
     HEIGHT,
@@ -190,7 +191,8 @@ def read_bins(ops: Any, scores: Any, angle: Any, absent: Any) -> Any:
     found = _expectation(ops, _columns(ops, scores, 0, PLACES), PLACES)
     spans = [tf.RANGES[name] for name in tf.MARKINGS]
     ends = np.array([[float(span.inactive != span.lo)] for span in spans], np.float32)
-    shares = ops.select(ops.greater(absent, np.float32(0.5)), ends, found)
+    limits = np.array(ABSENT_ABOVE, np.float32)[:, None]
+    shares = ops.select(ops.greater(absent, limits), ends, found)
     row = ops.concat([_row(ops, shares), _expectation(ops, angle, ANGLES)], 1)
     return ops.add(ops.multiply(row, np.float32(SPAN)), np.float32(OFFSET))
 

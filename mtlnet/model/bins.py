@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.nn.functional import log_softmax
 
 import trackfeatures as tf
-from mtlnet.model.architecture import ANGLES, BIN_VARIANCE, NEAR, PAIR, PLACES
+from mtlnet.model.architecture import ABSENT_ABOVE, ANGLES, BIN_VARIANCE, NEAR, PAIR, PLACES
 from trackfeatures.coding import OFFSET, SPAN
 
 SPREAD = 1.0
@@ -88,7 +88,8 @@ _SAME = 1e-4
 def read_scores(distance: Tensor, angle: Tensor) -> Tensor:
     """Coded answers (B, 6) of scores (B, 5, PLACES + 1) and (B, ANGLES).
 
-    An absent distance is coded as the inactive end of its range, as in a label.
+    A distance is absent where that is more probable than `ABSENT_ABOVE`; it is coded as the
+    inactive end of its range, as in a label.
     """
     absent = absent_probabilities(distance)
     found = expectation(distance[:, :, :-1])  # in bins' places, [0, 1] of the range
@@ -97,7 +98,8 @@ def read_scores(distance: Tensor, angle: Tensor) -> Tensor:
         dtype=found.dtype,
         device=found.device,
     )
-    shares = torch.where(absent > 0.5, ends.expand_as(found), found)
+    limits = torch.tensor(ABSENT_ABOVE, dtype=absent.dtype, device=absent.device)
+    shares = torch.where(absent > limits, ends.expand_as(found), found)
     shares = torch.cat([shares, expectation(angle)[:, None]], 1)
     return OFFSET + SPAN * shares
 

@@ -43,9 +43,9 @@ from trackfeatures.camera import CameraParameters
 
 FALSE_ALARM_RATE = 0.01
 """Share of known frames classified as out of distribution: half by texture, half by pitch."""
-MAX_TRAIN_FRAMES, MAX_HELD_OUT_FRAMES = 3_000, 8_000
+MAX_TRAIN_FRAMES, MAX_HELD_OUT_FRAMES = 3_000, 24_000
 HIDDEN = 32
-FIT = FitSettings(steps=250, batch=256, learning_rate=1e-2, weight_decay=3e-2)
+FIT = FitSettings(steps=1_000, batch=256, learning_rate=1e-2, weight_decay=3e-2)
 FOLDS = 3
 MIN_PRESENT_FRAMES = 30  # frames from which a feature has a temperature of its own
 CHUNK = 32  # images read at once
@@ -269,7 +269,7 @@ def _train(z: Tensor, error: Tensor, seed: int) -> "_StdLayers":
         return mean
 
     # Fewer steps for a few frames, against overfitting.
-    settings = replace(FIT, steps=min(FIT.steps, len(z) // 4))
+    settings = replace(FIT, steps=min(FIT.steps, len(z) // 12))
     minimise(loss, layers.parameters(), len(z), settings, generator)
     return layers
 

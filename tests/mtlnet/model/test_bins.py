@@ -101,6 +101,26 @@ def test_both_markings_of_the_lane_are_absent_together() -> None:
     assert np.isnan(distances[:, :2]).tolist() == [[False, False], [True, True]]
 
 
+@pytest.mark.parametrize(
+    ("probability", "absent"),
+    [
+        (0.45, [False, False, False, False, False]),
+        (0.6, [True, True, False, True, False]),
+        (0.75, [True, True, True, True, True]),
+    ],
+)
+def test_the_outer_markings_are_absent_above_a_higher_probability(
+    probability: float, absent: list[bool]
+) -> None:
+    scores = torch.full((1, 5, PLACES + 1), -20.0)
+    scores[0, :, 35] = np.log(1 - probability)
+    scores[0, :, PLACES] = np.log(probability)
+    coded = read_scores(scores, torch.zeros(1, ANGLES))
+    ends = [tf.RANGES[name].inactive for name in tf.MARKINGS]
+    answered = tf.decode_values(coded.numpy())[0, :5]
+    assert np.isclose(answered, ends, atol=1e-4).tolist() == absent
+
+
 def test_the_loss_is_least_at_the_target_and_follows_alpha() -> None:
     coded, heading = coded_cases(), torch.tensor([0, 1, 2, 1])
     exact = [part.clamp_min(1e-9).log() for part in bin_targets(coded)]
