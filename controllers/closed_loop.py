@@ -110,6 +110,8 @@ class DriveResult:
     mean_abs_d_m: float
     """Mean distance from the centre of the lane to follow."""
     max_abs_d_m: float
+    in_lane_share: float
+    """Share of the steps with the car's centre between the markings of the lane to follow."""
     speed_kmh: tuple[float, float]
     """Slowest and fastest, the standing start included."""
     cruising_kmh: tuple[float, float] | None
@@ -169,7 +171,7 @@ def run_lap(
             throttle, brake = slow_down(now.vx, throttle, brake)
             totals.slowed_steps += 1
         after = world.step(Command(steer=steer, throttle=throttle, brake=brake, gear=gear))
-        totals.add(after, lane_centre, world.road.half_width)
+        totals.add(after, lane_centre, world.road)
         if totals.ended is not None:
             break
     run_up = round(RUN_UP_S * world.frequency_hz)
@@ -235,15 +237,17 @@ class _Totals:
     score: float = 0.0
     ended: str | None = None
     slowed_steps: int = 0
+    in_lane_steps: int = 0
     offsets_m: list[float] = field(default_factory=list)
     speeds_kmh: list[float] = field(default_factory=list)
 
-    def add(self, after: CarState, lane_centre: float, half_width: float) -> None:
+    def add(self, after: CarState, lane_centre: float, road: Road) -> None:
         self.offsets_m.append(abs(after.to_middle - lane_centre))
+        self.in_lane_steps += self.offsets_m[-1] <= road.lane_width / 2
         self.speeds_kmh.append(after.speed_kmh)
         self.ended = ending(after)
         self.score += step_reward(
-            after.angle, after.to_middle, half_width, ended=self.ended is not None
+            after.angle, after.to_middle, road.half_width, ended=self.ended is not None
         )
 
     def result(
@@ -260,6 +264,7 @@ class _Totals:
             distance_m=last.odometer_m - self.start_m,
             mean_abs_d_m=float(np.mean(self.offsets_m)),
             max_abs_d_m=max(self.offsets_m),
+            in_lane_share=self.in_lane_steps / len(speeds),
             speed_kmh=(min(speeds), max(speeds)),
             cruising_kmh=(min(cruising), max(cruising)) if cruising else None,
             blind_steps=blind_steps,

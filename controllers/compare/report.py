@@ -22,7 +22,7 @@ PAPER_SCORES = {
 PAPER_STEPS = {"forza": 6500, "alpine-2": 4500, "eroad": 3700, "g-track-3": 3300}
 FIGURES = (
     "track", "controller", "score", "score a step", "quadratic a step", "mean |d| (m)",
-    "max |d| (m)", "laps", "speed (km/h)", "blind steps", "ended",
+    "max |d| (m)", "in the lane", "laps", "speed (km/h)", "blind steps", "ended",
 )  # fmt: skip
 TRUTH, PERCEIVED = "#2a9d5c", "#e07a2e"
 
@@ -75,6 +75,7 @@ def figure_rows(drives: list[dict[str, Any]]) -> Iterator[list[str]]:
             spread([entry["quadratic_per_step"] for entry in here], 5),
             spread([result["mean_abs_d_m"] for result in results], 3),
             f"{max(result['max_abs_d_m'] for result in results):.3f}",
+            f"{min(result['in_lane_share'] for result in results):.2%}",
             f"{min(result['laps'] for result in results)}",
             f"{slowest:.0f} to {fastest:.0f}",
             f"{np.mean([result['blind_steps'] for result in results]):.0f}",

@@ -24,7 +24,7 @@ from simulator.camera import check_light
 from simulator.track.catalogue import find_track
 from trackfeatures.errors import UserError
 
-VERSION = 1
+VERSION = 2  # 2: `in_lane_share`
 RESULTS, REPORT = "results.json", "report.html"
 GRID_SHARE = 1.0 / 6.0
 """TORCS's first place on the grid: so much of the track's width to the right of its centre."""

@@ -80,7 +80,17 @@ def test_the_score_is_the_sum_of_the_rewards_after_each_step() -> None:
     assert result.mean_abs_d_m == pytest.approx(0.75)
     assert result.max_abs_d_m == 1.0
     assert list(result.speed_kmh) == pytest.approx([36.0, 72.0])
+    assert result.in_lane_share == 1.0
     assert world.commands == [Command(steer=0.25, throttle=0.2, brake=0.0, gear=1)] * 2
+
+
+def test_the_share_of_steps_between_the_markings_of_the_lane() -> None:
+    # A lane of 4 m about 1 m to the left of the middle: from -1 to 3 m.
+    places = (-1.1, -0.9, 2.9, 3.1)
+    world = FakeWorld(*(at_rest(to_middle=place) for place in places))
+    law = FunctionController(lambda observation: 0.0)
+    result = run_lap(world, law, perceiving(), len(places), lane_centre=1.0)
+    assert result.in_lane_share == 0.5
 
 
 def test_the_cruising_speeds_leave_out_the_first_15_s() -> None:

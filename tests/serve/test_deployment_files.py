@@ -86,6 +86,16 @@ def test_every_passed_option_exists(container: dict[str, Any]) -> None:
             assert re.search(rf"{option}\b", shown), option
 
 
+def test_the_shipped_model_is_served_without_a_mounted_folder(
+    pod: dict[str, Any], container: dict[str, Any]
+) -> None:
+    compose = yaml.safe_load((DEPLOY / "compose.yaml").read_text())["services"]["serve"]
+    for command in (container["args"], compose["command"]):
+        assert command[command.index("--model") + 1] == "default"
+    assert "volumes" not in compose
+    assert [volume["name"] for volume in pod["volumes"]] == ["scratch"]
+
+
 def test_references_between_manifests_resolve() -> None:
     files = manifest("kustomization.yaml")["resources"]
     assert {path.name for path in (DEPLOY / "kubernetes").iterdir()} == {

@@ -11,7 +11,7 @@ import trackfeatures as tf
 from mtlnet.export.convert import ONNX_FILE, check_export, write_onnx
 from mtlnet.export.openvino_graph import TOLERANCE, build_feature_graph, build_graph, run_graph
 from mtlnet.inference.prediction import OUTPUTS, decode_outputs, split_outputs
-from mtlnet.model.architecture import ANGLES, GRID, PLACES, grid_size
+from mtlnet.model.architecture import ABSENT_ABOVE, ANGLES, GRID, PLACES, grid_size
 from mtlnet.model.bins import (
     Scores,
     absent_in,
@@ -206,8 +206,8 @@ def test_the_graph_gives_the_probabilities_of_absence() -> None:
     for row in found:
         prediction = decode_outputs(row)
         assert prediction.absent is not None
-        for name, distance in prediction.distances_m.items():
-            assert distance is None or prediction.absent[name] <= 0.5
+        for name, limit in zip(tf.MARKINGS, ABSENT_ABOVE, strict=True):
+            assert prediction.distances_m[name] is None or prediction.absent[name] <= limit
 
 
 def test_the_graph_reads_bins_as_torch_does() -> None:
