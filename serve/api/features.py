@@ -42,7 +42,7 @@ from serve.scheduling.streams import stream_key
 from trackfeatures.camera import CameraParameters
 
 SMALL_PIXELS = 640 * 480  # at most, and decoded in about
-SMALL_MS = 10.4  # at most: an image that may be decoded on the event loop
+SMALL_MS = 12.0  # at most: an image that may be decoded on the event loop
 
 logger = logging.getLogger(__name__)
 

@@ -28,6 +28,7 @@ DEADLINE, FIELD_OF_VIEW = "X-Deadline-Ms", "X-Camera-Fov-Y"
 MEDIA_TYPES = ("image/jpeg", "image/png")
 IMAGE_MEDIA_TYPES = frozenset(name.encode() for name in MEDIA_TYPES)
 MIN_FOV_DEG, MAX_FOV_DEG = 1.0, 179.0
+MAX_ACCEPT = 1024  # characters of an Accept header: browsers send fewer than 200
 
 Headers = dict[bytes, bytes]  # by lower-case name
 
@@ -126,6 +127,9 @@ def parse_format(accept: bytes | None) -> ResponseFormat:
     """The format of the answer. Raises Problem."""
     if accept is None or accept == b"*/*":
         return JSON
+    if len(accept) > MAX_ACCEPT:
+        seen = f"Accept has {len(accept)} characters, at most {MAX_ACCEPT} are read"
+        raise Problem(INVALID_REQUEST, seen)
     return negotiate(accept.decode("latin-1"))
 
 

@@ -1,24 +1,27 @@
 """WebSockets with deadlines, and with bounds on what a client can make the service do or keep.
 
 uvicorn's protocol on the library websockets. A handshake that the library refuses is answered with
-a problem. A handshake, a message, and the reading of answers have deadlines. Small frames have a
-rate, since each costs as much as a large one: pings, fragments, messages of a few bytes. A client
-that breaks a bound is told the reason in the close frame, for LINGER_S.
+a problem. A handshake, a message, and the reading of answers have deadlines. Small frames and text
+have a rate, since each costs as much as a large one: pings, fragments, messages of a few bytes.
+Messages count in the budget for bodies until the service takes them. A client that breaks a bound
+is told the reason in the close frame, for LINGER_S.
 """
 
 from asyncio import Transport
+from collections import deque
 from math import inf
 from typing import Any
 
 from uvicorn.protocols.utils import ClientDisconnected
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 from websockets.exceptions import HeaderLineTooLong, RequestLineTooLong, TooManyHeaders
-from websockets.frames import CloseCode, Frame
+from websockets.frames import CloseCode, Frame, Opcode
 from websockets.protocol import State
 
 from serve.api.http_io import encode_head, problem_reply
 from serve.api.problems import (
     HEAD_TOO_LARGE,
+    INVALID_REQUEST,
     MALFORMED,
     OVERLOADED,
     RATE_LIMITED,
@@ -31,7 +34,9 @@ from serve.server.guard import ConnectionGuard, Group
 
 SLICE_BYTES = 4096  # parsed before small frames are counted; holds hundreds of them
 SMALL_BYTES = 1024  # a frame of fewer is a small one
-SMALL_FRAMES = 500  # a second, and at once
+SMALL_FRAMES = 500  # of these and of text, a second, and at once
+MAX_TEXT_BYTES = 4096  # of a text message: 1,024 characters in UTF-8
+TEXT_COST = 4  # bytes of memory of a text by byte, where one character is an emoji
 
 
 class GuardedWebSocket(WebSocketsSansIOProtocol):
@@ -49,6 +54,7 @@ class GuardedWebSocket(WebSocketsSansIOProtocol):
         self._small_frames, self._counted_s = float(SMALL_FRAMES), 0.0
         self._share = None if guard.bodies is None else BodyShare(guard.bodies)
         self._frame_bytes = 0  # of the frames of a message that is incomplete
+        self._queued_bytes: deque[int] = deque()  # of complete messages, not yet received
 
     def connection_made(self, transport: Transport) -> None:  # type: ignore[override]
         super().connection_made(transport)
@@ -58,8 +64,8 @@ class GuardedWebSocket(WebSocketsSansIOProtocol):
 
     def connection_lost(self, exc: Exception | None) -> None:
         self._guard.forget(self)
+        self._drop_messages()
         super().connection_lost(exc)
-        self._drop_message()
         self.conn.parser.close()  # it holds `conn`, which holds it
 
     def data_received(self, data: bytes) -> None:
@@ -78,18 +84,23 @@ class GuardedWebSocket(WebSocketsSansIOProtocol):
             self._count_message()
 
     def _count_message(self) -> None:
-        """Hold of the budget for bodies what has arrived of a message."""
+        """Hold of the budget for bodies what has arrived of messages."""
         if self._share is None:
             return
         try:
             frames = self._frame_bytes if self.frames else 0
-            self._share.hold(frames + len(self.conn.reader.buffer))
+            self._share.hold(sum(self._queued_bytes) + frames + len(self.conn.reader.buffer))
         except Problem as problem:
             self._guard.count_closed(problem.type)
             self.fail(CloseCode.TRY_AGAIN_LATER, problem.detail)
 
-    def _drop_message(self) -> None:
-        """Let go of what has arrived of a message."""
+    def _drop_messages(self) -> None:
+        """Let go of what has arrived of messages."""
+        queued = [self.queue.get_nowait() for _ in range(self.queue.qsize())]
+        for message in queued:
+            if message["type"] != "websocket.receive":
+                self.queue.put_nowait(message)
+        self._queued_bytes.clear()
         self.frames = []
         self.conn.reader.discard()
         if self._share is not None:
@@ -97,7 +108,8 @@ class GuardedWebSocket(WebSocketsSansIOProtocol):
 
     def handle_text(self, event: Frame) -> None:
         self._frame_bytes = len(event.data)
-        super().handle_text(event)
+        if not self._refuse_long_text("text"):
+            super().handle_text(event)
 
     def handle_bytes(self, event: Frame) -> None:
         self._frame_bytes = len(event.data)
@@ -105,7 +117,16 @@ class GuardedWebSocket(WebSocketsSansIOProtocol):
 
     def handle_cont(self, event: Frame) -> None:
         self._frame_bytes += len(event.data)
-        super().handle_cont(event)
+        if not self._refuse_long_text(self.curr_msg_data_type):
+            super().handle_cont(event)
+
+    def _refuse_long_text(self, kind: str) -> bool:
+        """Close when a message of that kind is a long text, before it is decoded."""
+        if kind != "text" or self._frame_bytes <= MAX_TEXT_BYTES:
+            return False
+        self._guard.count_closed(INVALID_REQUEST)
+        self.fail(CloseCode.MESSAGE_TOO_BIG, f"a text has at most {MAX_TEXT_BYTES} bytes")
+        return True
 
     def _refuse_handshake(self, error: Exception) -> None:
         """Answer what websockets would leave unanswered."""
@@ -115,15 +136,21 @@ class GuardedWebSocket(WebSocketsSansIOProtocol):
         if isinstance(error, RequestLineTooLong | HeaderLineTooLong | TooManyHeaders):
             problem = Problem(HEAD_TOO_LARGE, f"the handshake is too large: {error}")
         self._guard.count_closed(problem.type)
+        self._drop_messages()
         reply = problem_reply(problem, (b"connection", b"close"))
         self._close_after(encode_head(reply) + reply.body)
 
     def handle_events(self) -> None:
-        small = sum(isinstance(e, Frame) and len(e.data) < SMALL_BYTES for e in self.conn.events)
+        small = sum(
+            isinstance(event, Frame)
+            and (len(event.data) < SMALL_BYTES or event.opcode is Opcode.TEXT)
+            for event in self.conn.events
+        )
         if small and not self._allow(small):
             self.conn.events.clear()
             self._guard.count_closed(RATE_LIMITED)
-            self.fail(CloseCode.POLICY_VIOLATION, f"more than {SMALL_FRAMES} small frames a second")
+            reason = f"more than {SMALL_FRAMES} small frames and texts a second"
+            self.fail(CloseCode.POLICY_VIOLATION, reason)
             return
         super().handle_events()
 
@@ -152,7 +179,17 @@ class GuardedWebSocket(WebSocketsSansIOProtocol):
                 self.frames = []
                 self.fail(CloseCode.INVALID_DATA, "the text is not UTF-8")
                 return
+        if not self.close_sent:  # else the message is dropped
+            cost = TEXT_COST if self.curr_msg_data_type == "text" else 1
+            self._queued_bytes.append(cost * self._frame_bytes)
         super().send_receive_event_to_app()
+
+    async def receive(self) -> Any:
+        message = await super().receive()
+        if message["type"] == "websocket.receive" and self._queued_bytes:
+            self._queued_bytes.popleft()
+            self._count_message()
+        return message
 
     async def send(self, message: Any) -> None:
         await self.writable.wait()
@@ -222,6 +259,7 @@ class GuardedWebSocket(WebSocketsSansIOProtocol):
         if closing is None:
             self.transport.abort()
             return
+        self._drop_messages()
         self.queue.put_nowait(
             {"type": "websocket.disconnect", "code": closing.code, "reason": closing.reason}
         )
@@ -230,7 +268,6 @@ class GuardedWebSocket(WebSocketsSansIOProtocol):
     def _close_after(self, output: bytes) -> None:
         """Send the last bytes; close after LINGER_S."""
         self._discarding = self.close_sent = True
-        self._drop_message()
         self.stop_keepalive()
         self._guard.place(self, self._guard.dismissed)
         if self.transport.is_closing():

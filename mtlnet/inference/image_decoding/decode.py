@@ -26,7 +26,7 @@ MIN_SIDE_PX, MAX_SIDE_PX, MAX_PIXELS = 16, 4096, 8_400_000
 MAX_SCANNED_PX = 100_000_000  # pixels times scans of a JPEG: ten scans of the largest image
 LATE_CHECK_BYTES = 1 << 18  # a JPEG file of more is checked when it is decoded, not by `inspect`
 # One 2.6 GHz core: a PNG of 64 bits a pixel 84 ns a pixel, a baseline JPEG 10, of ten scans 15.
-PNG_NS_PER_BIT, JPEG_NS, SCAN_NS, PROGRESSIVE_SCANS = 1.4, 10.0, 1.0, 10
+PNG_NS_PER_BIT, PNG_NS_PER_BYTE, JPEG_NS, SCAN_NS, PROGRESSIVE_SCANS = 1.4, 2.0, 10.0, 1.0, 10
 MAX_SEQUENTIAL_SCANS = 4  # one for each component
 MAX_TRAILING_BYTES = 64  # padding of some cameras; more could be another file
 
@@ -47,8 +47,9 @@ class ImageHeader:
     @property
     def decode_ms(self) -> float:
         """An estimate of the time to decode it on one core, ms."""
-        if self.png_header is not None:
-            per_pixel_ns = PNG_NS_PER_BIT * max(8, self.png_header.pixel_bits)
+        if (found := self.png_header) is not None:
+            per_pixel_ns = PNG_NS_PER_BIT * max(8, found.pixel_bits)
+            per_pixel_ns += PNG_NS_PER_BYTE * found.file_bytes / (self.width * self.height)
         else:
             per_pixel_ns = JPEG_NS + SCAN_NS * (self.scans - 1)
         return self.width * self.height * per_pixel_ns / 1e6

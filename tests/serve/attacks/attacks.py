@@ -187,6 +187,28 @@ def deep_texts(target: Target, count: int = 50) -> list[socket.socket]:
     return [connection]
 
 
+def long_texts(target: Target, count: int = 32) -> list[socket.socket]:
+    """Texts of 4 MB that take four times as much memory once they are decoded."""
+    connections = [target.open_websocket() for _ in range(count)]
+    for connection in connections:
+        connection.settimeout(1.0)
+        send_all(connection, frame(TEXT, "\N{AUTOMOBILE}".encode() + b"x" * (4 * MB - 100)))
+    return connections
+
+
+def text_floods(target: Target, megabytes: int = 16) -> list[socket.socket]:
+    """Texts of 2 KB, without an image."""
+    return _stream(target, frame(TEXT, b"[" * 2048), megabytes)
+
+
+def kept_messages(target: Target, count: int = 32) -> list[socket.socket]:
+    """Messages of 4 MB of clients that do not read the answers to those before."""
+    connections = unread_answers(target, count)
+    for connection in connections:
+        send_all(connection, frame(BINARY, bytes(4 * MB - 64)))
+    return connections
+
+
 def broken_texts(target: Target, count: int = 50) -> list[socket.socket]:
     """Text that is not UTF-8, on a WebSocket each."""
     connections = [target.open_websocket() for _ in range(count)]

@@ -5,6 +5,7 @@ Each is bounded in count, on this machine only, and returns the connections that
 
 import base64
 import socket
+import zlib
 from contextlib import suppress
 from functools import cache
 
@@ -61,6 +62,23 @@ def costly_images(target: Target, count: int = 4) -> list[socket.socket]:
     """PNG files of 65 KB that take 0.7 s each."""
     sent = target.post(_costly_png(), Content_Type="image/png", X_Camera_Fov_Y="90")
     return [found for _ in range(count) for found in _ask(target, sent, 1)]
+
+
+def chunky_images(target: Target, count: int = 64) -> list[socket.socket]:
+    """Small PNG files of thousands of chunks without content."""
+    body = png(picture())
+    chunk = bytes(4) + b"tEXt" + zlib.crc32(b"tEXt").to_bytes(4, "big")
+    body = body[:33] + chunk * 9_000 + body[33:]
+    return _ask(target, target.post(body, Content_Type="image/png"), count)
+
+
+def long_accepts(target: Target, count: int = 200) -> list[socket.socket]:
+    """Requests that accept 30,000 formats, in another order each."""
+    connections: list[socket.socket] = []
+    for number in range(count):
+        accept = "," * (30_000 - number) + "x/y"
+        connections += _ask(target, target.post(JPEG, Accept=accept), 1)
+    return connections
 
 
 def many_costly_images(target: Target, count: int = 64) -> list[socket.socket]:
@@ -181,7 +199,8 @@ def reset_requests(target: Target, count: int = 200) -> list[socket.socket]:
 
 REQUESTS = (
     *(fill_bytes, stuffed_scans, repeated_outputs, nested_inputs, encoded_garbage),
-    *(costly_images, many_costly_images, large_photographs, large_bodies, half_messages),
+    *(costly_images, chunky_images, long_accepts, many_costly_images),
+    *(large_photographs, large_bodies, half_messages),
     *(promised_bodies, unread_pages, half_closed, reset_requests),
     *(rebound_names, guessed_tokens, forged_addresses, conflicting_lengths),
 )

@@ -14,7 +14,8 @@ JPEG = jpeg(picture())
 OWN = 20
 OTHERS = (
     *(attacks.pipelined_floods, attacks.refused_floods, attacks.deep_texts),
-    *(attacks.unread_answers, attacks.quiet_websockets, attacks.damaged_images),
+    *(attacks.long_texts, attacks.unread_answers, attacks.kept_messages),
+    *(attacks.quiet_websockets, attacks.damaged_images),
 )
 
 

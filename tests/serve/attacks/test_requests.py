@@ -4,6 +4,7 @@ import http.client
 import socket
 import threading
 import time
+import zlib
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 
@@ -14,6 +15,8 @@ import pytest
 from mtlnet.inference.image_decoding.decode import (
     LATE_CHECK_BYTES,
     MAX_SCANNED_PX,
+    PNG_NS_PER_BIT,
+    PNG_NS_PER_BYTE,
     decode,
     inspect,
 )
@@ -25,7 +28,9 @@ from mtlnet.inference.image_decoding.jpeg_structure import (
     WINDOW_BYTES,
     read_structure,
 )
+from serve.api.features import SMALL_MS
 from serve.api.problems import Problem
+from serve.api.request_options import MAX_ACCEPT, negotiate
 from serve.config import MAX_BODY_BYTES, Limits
 from serve.scheduling.admission import MAX_CLIENT_MS, MAX_PENDING_MS, PRESENT_NS, Admission
 from serve.scheduling.body_budget import BodyBudget, BodyShare
@@ -72,6 +77,40 @@ def scan(data: bytes, size: int = MAX_BODY_BYTES) -> bytes:
 )
 def test_no_jpeg_holds_the_event_loop(body: bytes) -> None:
     assert held_s(lambda: inspect(body, CARD.camera)) < LOOP_S
+
+
+def with_chunks(body: bytes, chunk: bytes, count: int) -> bytes:
+    """A PNG with ancillary chunks of this content behind its header."""
+    whole = len(chunk).to_bytes(4, "big") + b"teXt" + chunk
+    whole += zlib.crc32(whole[4:]).to_bytes(4, "big")
+    return body[:33] + whole * count + body[33:]
+
+
+def test_a_png_of_many_chunks_is_refused_and_its_bytes_have_a_cost() -> None:
+    small = png(picture())
+    body = with_chunks(small, b"", 300)
+    with pytest.raises(ImageError, match=r"the PNG has over \d+ chunks"):
+        decode(body, inspect(body, CARD.camera), CARD.camera)
+    padded = with_chunks(small, bytes(1000), 1000)
+    header = inspect(padded, CARD.camera)
+    assert decode(padded, header, CARD.camera).shape == (210, 280, 3)
+    more_ms = header.decode_ms - inspect(small, CARD.camera).decode_ms
+    assert more_ms == pytest.approx(2e-6 * (len(padded) - len(small)), rel=1e-6)
+
+
+@pytest.mark.alone
+def test_no_png_that_is_decoded_on_the_event_loop_holds_it() -> None:
+    pixels = png(picture(640, 480))
+    chunks = (SMALL_MS * 1e6 - 640 * 480 * 24 * PNG_NS_PER_BIT) / PNG_NS_PER_BYTE - len(pixels)
+    body = with_chunks(pixels, bytes(1012), int(chunks / 1024))
+    header = inspect(body, CARD.camera)
+    assert SMALL_MS - 0.1 < header.decode_ms <= SMALL_MS
+    assert held_s(lambda: decode(body, header, CARD.camera)) < LOOP_S
+
+
+def test_a_long_accept_header_is_refused_unread(service: Served) -> None:
+    assert_problem(service.post(JPEG, Accept="," * (MAX_ACCEPT + 1)), 400, "invalid-request")
+    assert held_s(lambda: negotiate("," * (MAX_ACCEPT - 8) + "text/css")) < LOOP_S / 4
 
 
 @pytest.mark.parametrize("size", [FIRST_BYTES, FIRST_BYTES + WINDOW_BYTES, 2 * WINDOW_BYTES])

@@ -1,9 +1,12 @@
 """Attacks on WebSockets: queues are bounded, and the close frame says why."""
 
+import asyncio
 import gc
 import logging
 import socket
+import threading
 import time
+from typing import Any
 
 import pytest
 
@@ -37,7 +40,7 @@ from tests.serve.conftest import (
 )
 
 JPEG = jpeg(picture())
-POLICY, INVALID, TRY_LATER = 1008, 1007, 1013
+POLICY, INVALID, TOO_BIG, TRY_LATER = 1008, 1007, 1009, 1013
 
 
 def streams(service: Served) -> list[GuardedWebSocket]:
@@ -52,6 +55,7 @@ def streams(service: Served) -> list[GuardedWebSocket]:
         attacks.large_unread_pings,
         attacks.empty_fragments,
         attacks.small_messages,
+        attacks.text_floods,
     ],
 )
 def test_small_frames_are_bounded(
@@ -183,7 +187,7 @@ def test_a_handshake_has_a_deadline(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_deep_and_broken_texts_are_refused(service: Served, target: Target) -> None:
     with target.open_websocket() as connection:
-        for text in (b"[" * 900, b"[" * 100_000, b'"\\ud800"', b'{"deadline_ms": 1e999}'):
+        for text in (b"[" * 900, b"[" * 4000, b'"\\ud800"', b'{"deadline_ms": 1e999}'):
             connection.sendall(frame(TEXT, text) + frame(BINARY, JPEG))
             assert b"/problems/invalid-request" in connection.recv(65536)
         connection.sendall(frame(TEXT, b'{"frame_id": "7"}') + frame(BINARY, JPEG))
@@ -191,6 +195,46 @@ def test_deep_and_broken_texts_are_refused(service: Served, target: Target) -> N
     for connection in attacks.broken_texts(target, 3):
         assert read_close(connection) == (INVALID, "the text is not UTF-8")
     assert service.post(JPEG).status == 200
+
+
+def test_a_long_text_is_refused_before_it_is_decoded(service: Served, target: Target) -> None:
+    whole = frame(TEXT, b"x" * 5000)
+    parts = frame(TEXT, b"x" * 4000, fin=False) + frame(CONTINUATION, b"x" * 1000, fin=False)
+    for sent in (whole, parts):
+        with target.open_websocket() as connection:
+            connection.sendall(sent)
+            assert read_close(connection) == (TOO_BIG, "a text has at most 4096 bytes")
+    assert service.post(JPEG).status == 200
+
+
+def test_a_message_counts_in_the_budget_until_the_service_takes_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    size, taken = 2 << 20, threading.Event()
+    with serving(FakeEngine(lambda _image: outputs())) as service:
+
+        async def busy(_scope: object, receive: Any, send: Any) -> None:
+            await receive()
+            await send({"type": "websocket.accept"})
+            for _ in range(2):
+                while not taken.is_set():
+                    await asyncio.sleep(0.01)
+                taken.clear()
+                await receive()
+
+        monkeypatch.setattr(service.app, "_stream", busy)
+        bodies = service.server.guard.bodies
+        assert bodies is not None
+        target = Target(service.port)
+        with target.open_websocket() as connection:
+            connection.sendall(frame(BINARY, bytes(size)))
+            until(lambda: bodies.held == size)
+            taken.set()
+            until(lambda: bodies.held == 0)
+            connection.sendall(frame(BINARY, bytes(size)))
+            until(lambda: bodies.held == size)
+        until(lambda: bodies.held == 0)  # the client has left
+        taken.set()
 
 
 def test_leaving_a_busy_websocket_writes_nothing_to_the_log(
