@@ -63,7 +63,7 @@ class Source:
 
     path: Path
     count: int
-    """Number of images; of a film what its header declares."""
+    """Number of images; of a film what its header declares. 0: it cannot be opened."""
     fps: float = DEFAULT_FPS
 
 
@@ -92,7 +92,10 @@ def find_sources(inputs: list[str]) -> list[Source]:
 def _source(path: Path) -> Source:
     kind = path.suffix.lower()
     if kind in FILMS:
-        film = _open_film(path)
+        try:
+            film = _open_film(path)
+        except UserError:  # said where it is read: the other files are not lost
+            return Source(path, 0)
         count, fps = film.get(cv2.CAP_PROP_FRAME_COUNT), film.get(cv2.CAP_PROP_FPS)
         film.release()
         return Source(path, max(int(count), 0), fps if 0 < fps < 1000 else DEFAULT_FPS)
@@ -137,7 +140,11 @@ def _read_file(path: Path, camera: CameraParameters, lens: Lens) -> Iterator[Sou
 
 
 def _read_film(source: Source, camera: CameraParameters, lens: Lens) -> Iterator[SourceImage]:
-    film = _open_film(source.path)
+    try:
+        film = _open_film(source.path)
+    except UserError as error:
+        yield SourceImage(str(source.path), None, str(error))
+        return
     number = 0
     try:
         while True:

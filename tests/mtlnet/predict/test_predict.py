@@ -141,6 +141,17 @@ def test_a_cut_film_keeps_what_was_read(engine: BrightnessEngine, tmp_path: Path
     assert 2 <= len(rows) < 10
 
 
+def test_a_film_that_cannot_be_opened_loses_no_other_file(
+    engine: BrightnessEngine, tmp_path: Path
+) -> None:
+    broken, table = tmp_path / "broken.mp4", tmp_path / "rows.jsonl"
+    broken.write_bytes(b"no film")
+    film = write_film(tmp_path / "film.mp4", [10, 200])
+    with pytest.raises(UserError, match=r"broken.mp4 cannot be opened as a film.*2 others"):
+        predict_files(engine, [str(broken), str(film)], [table])
+    assert len(table.read_text().splitlines()) == 2
+
+
 def test_pictures_of_a_recorded_round_show_its_labels(
     engine: BrightnessEngine, dataset: Path, tmp_path: Path
 ) -> None:
