@@ -14,7 +14,7 @@
 ARG PYTHON_IMAGE=python:3.11-slim
 FROM ${PYTHON_IMAGE} AS wheel
 WORKDIR /src
-COPY pyproject.toml README.md LICENSE ./
+COPY pyproject.toml README.md LICENSE requirements.lock ./
 COPY trackfeatures trackfeatures
 COPY runtime runtime
 COPY simulator simulator
@@ -22,7 +22,10 @@ COPY datagen datagen
 COPY mtlnet mtlnet
 COPY serve serve
 COPY controllers controllers
-RUN pip wheel --no-cache-dir --no-deps --wheel-dir /wheels .
+# What builds the wheel is of a known hash, too: an isolated build would take the newest.
+RUN sed -n '/^setuptools==/,/[^\\]$/p' requirements.lock > build.txt \
+    && pip install --no-cache-dir --require-hashes --requirement build.txt \
+    && pip wheel --no-cache-dir --no-deps --no-build-isolation --wheel-dir /wheels .
 
 FROM ${PYTHON_IMAGE} AS base
 ENV PYTHONUNBUFFERED=1 PIP_NO_CACHE_DIR=1 PIP_DISABLE_PIP_VERSION_CHECK=1
