@@ -83,6 +83,7 @@ def ablate_command(
     seeds: options.Seeds = "1,2,3",
     recipe: options.Recipe = "fast",
     backbone: options.Backbone = "mobilenet_v3_small",
+    rows: options.Rows = "",
     batch: options.Batch = 32,
     split: options.AblationSplit = "test",
     every: options.Every = 5,
@@ -98,7 +99,7 @@ def ablate_command(
     config = AblationConfig(
         data, out, iterations, parse_seeds(seeds), recipe, batch, split, every, device, threads
     )
-    result = ablate(config, ablation_rows(backbone), dry_run=dry_run)
+    result = ablate(config, ablation_rows(backbone, rows), dry_run=dry_run)
     if as_json:
         typer.echo(json.dumps(result))
 

@@ -104,6 +104,9 @@ Recipe = Annotated[str, typer.Option(help="fast or paper.")]
 Backbone = Annotated[
     str, typer.Option(help="Network to compare with: mobilenet_v3_small or regnet_y_400mf.")
 ]
+Rows = Annotated[
+    str, typer.Option(help="Rows of the table by name, as in --dry-run; the default is all.")
+]
 Batch = Annotated[int, typer.Option(help="Images a step.")]
 AblationSplit = Annotated[str, typer.Option(help="Rounds to evaluate on: test or unseen.")]
 Every = Annotated[int, typer.Option(help="Evaluate every n-th frame only.", min=1)]

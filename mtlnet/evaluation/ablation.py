@@ -58,16 +58,25 @@ PAPER_ROWS = (
 )
 
 
-def ablation_rows(backbone: str = BACKBONE) -> tuple[Row, ...]:
-    """The paper's seven rows, DeepDriving and `backbone`; UserError when it is no backbone."""
+def ablation_rows(backbone: str = BACKBONE, only: str = "") -> tuple[Row, ...]:
+    """The paper's seven rows, DeepDriving and `backbone`; of these the rows named in `only`.
+
+    `only`: names, separated by commas; empty: all. Raises UserError for an unknown name, and when
+    `backbone` is none.
+    """
     plan = find_architecture(backbone)
     if not plan.backbone:
         raise UserError(f"{backbone} is not a backbone of torchvision; give {BACKBONE} or another")
     others = (find_architecture("deepdriving"), plan)
     titles = ("DeepDriving (Chen et al.)", backbone)
-    return PAPER_ROWS + tuple(
+    rows = PAPER_ROWS + tuple(
         Row(p.name, title, p.name, p.default_alpha) for p, title in zip(others, titles, strict=True)
     )
+    names = [name.strip() for name in only.split(",")] if only else [row.name for row in rows]
+    if unknown := [name for name in names if name not in {row.name for row in rows}]:
+        known = ", ".join(row.name for row in rows)
+        raise UserError(f"there is no row {unknown[0]!r} in the ablation; choose of {known}")
+    return tuple(row for row in rows if row.name in names)
 
 
 @dataclass(frozen=True)

@@ -108,6 +108,10 @@ def test_the_rows_are_those_of_the_paper() -> None:
     assert ablation_rows("regnet_y_400mf")[7].alpha == (1, 1, 0)
     with pytest.raises(UserError, match="mtl is not a backbone"):
         ablation_rows("mtl")
+    chosen = ablation_rows(only="mtl-3, distance,deepdriving")
+    assert [row.name for row in chosen] == ["distance", "mtl-3", "deepdriving"]
+    with pytest.raises(UserError, match="there is no row 'all' in the ablation; choose of dist"):
+        ablation_rows(only="all")
 
 
 def test_figures_have_mean_and_deviation_over_the_seeds(tmp_path: Path, card: ModelCard) -> None:
