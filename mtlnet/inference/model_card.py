@@ -24,8 +24,8 @@ SHIPPED = Path(__file__).parents[1] / "weights" / "default"
 CARD, WEIGHTS, GRAPH, GRAPH_WEIGHTS = "card.json", "model.safetensors", "model.xml", "model.bin"
 UNCERTAINTY_WEIGHTS = "doubt.safetensors"
 SHIPPED_FILES = {
-    WEIGHTS: "940ac736f19679fe90e229471d605cea52ecc1c95fed99001129b14c97505099",
-    UNCERTAINTY_WEIGHTS: "f3a2a49805dfc625d63c2e45d9d777e8938602ada5c2cf00dca358e1722f2cb3",
+    WEIGHTS: "6894e11c0211330c33c3018ce9479bcd39e5d4151237dd6a2c46c5a07e35ef8b",
+    UNCERTAINTY_WEIGHTS: "bf05a73d756850e87a309996793b613109b30aeaba594af76bfc869a3e4fcdd7",
 }
 """SHA-256 of the shipped model's files."""
 MODEL_FILES = (WEIGHTS, GRAPH, GRAPH_WEIGHTS)
