@@ -116,7 +116,7 @@ def test_the_outer_markings_are_absent_above_a_higher_probability(
     scores[0, :, 35] = np.log(1 - probability)
     scores[0, :, PLACES] = np.log(probability)
     coded = read_scores(scores, torch.zeros(1, ANGLES))
-    ends = [tf.RANGES[name].inactive for name in tf.MARKINGS]
+    ends = np.array([tf.RANGES[name].inactive for name in tf.MARKINGS], float)
     answered = tf.decode_values(coded.numpy())[0, :5]
     assert np.isclose(answered, ends, atol=1e-4).tolist() == absent
 
