@@ -269,7 +269,7 @@ def _train(z: Tensor, error: Tensor, seed: int) -> "_StdLayers":
         return mean
 
     # Fewer steps for a few frames, against overfitting.
-    settings = replace(FIT, steps=min(FIT.steps, len(z) // 12))
+    settings = replace(FIT, steps=min(FIT.steps, len(z) // 4))
     minimise(loss, layers.parameters(), len(z), settings, generator)
     return layers
 

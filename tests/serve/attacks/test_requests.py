@@ -109,7 +109,7 @@ def test_no_png_that_is_decoded_on_the_event_loop_holds_it() -> None:
 
 
 def test_a_long_accept_header_is_refused_unread(service: Served) -> None:
-    assert_problem(service.post(JPEG, Accept="," * (MAX_ACCEPT + 1)), 400, "invalid-request")
+    assert_problem(service.post(JPEG, Accept="," * (MAX_ACCEPT + 1)), 422, "invalid-request")
     assert held_s(lambda: negotiate("," * (MAX_ACCEPT - 8) + "text/css")) < LOOP_S / 4
 
 
