@@ -105,7 +105,10 @@ Backbone = Annotated[
     str, typer.Option(help="Network to compare with: mobilenet_v3_small or regnet_y_400mf.")
 ]
 Rows = Annotated[
-    str, typer.Option(help="Rows of the table by name, as in --dry-run; the default is all.")
+    str,
+    typer.Option(
+        help="Rows to train: distance, angle, type, mtl-1 to mtl-4, deepdriving, or the backbone; all by default."
+    ),
 ]
 Batch = Annotated[int, typer.Option(help="Images a step.")]
 AblationSplit = Annotated[str, typer.Option(help="Rounds to evaluate on: test or unseen.")]

@@ -41,8 +41,9 @@ from serve.scheduling.frame_queue import FrameQueue
 from serve.scheduling.streams import stream_key
 from trackfeatures.camera import CameraParameters
 
-SMALL_PIXELS = 640 * 480  # at most, and decoded in about
-SMALL_MS = 12.0  # at most: an image that may be decoded on the event loop
+# An image of at most so many pixels, estimated to be decoded in so many ms, may be decoded on the
+# event loop.
+SMALL_PIXELS, SMALL_MS = 640 * 480, 12.0
 
 logger = logging.getLogger(__name__)
 

@@ -1,7 +1,8 @@
 """Attacks on the life of a connection, each bounded in count and time, on this machine only.
 
 Each takes the service's address and returns the connections that it leaves open. The tests make one
-round of each; `make attack` repeats them beside a well-behaved client, with those of `costs`.
+round of each; `make attack` repeats them beside a well-behaved client, with those of `websockets`
+and `costs`.
 """
 
 import random
@@ -12,16 +13,7 @@ from contextlib import suppress
 import cv2
 import numpy as np
 
-from tests.serve.attacks.conftest import (
-    BINARY,
-    CONTINUATION,
-    PING,
-    TEXT,
-    Target,
-    frame,
-    read_head,
-    send_all,
-)
+from tests.serve.attacks.conftest import Target, read_head, send_all
 from tests.serve.conftest import jpeg, picture
 
 MANY = 256  # connections that the service takes
@@ -33,12 +25,12 @@ Attack = Callable[[Target], list[socket.socket]]
 
 def long_upgrades(target: Target, count: int = MANY) -> list[socket.socket]:
     """Handshakes with a header line of 9 KB, which the WebSocket library refuses."""
-    return _each(target, count, target.handshake(X_Pad="x" * 9000))
+    return dial_each(target, count, target.handshake(X_Pad="x" * 9000))
 
 
 def crowded_upgrades(target: Target, count: int = MANY) -> list[socket.socket]:
     """Handshakes with 200 headers, which the WebSocket library refuses."""
-    return _each(target, count, target.handshake(**{f"X-{n}": "y" for n in range(200)}))
+    return dial_each(target, count, target.handshake(**{f"X-{n}": "y" for n in range(200)}))
 
 
 def endless_trailers(target: Target, megabytes: int = 16) -> list[socket.socket]:
@@ -75,27 +67,27 @@ def small_chunks(target: Target, count: int = 4) -> list[socket.socket]:
 
 def idle_connections(target: Target, count: int = MANY) -> list[socket.socket]:
     """Connections that keep quiet after one request that needs no token."""
-    return _each(target, count, target.ask())
+    return dial_each(target, count, target.ask())
 
 
 def silent_connections(target: Target, count: int = MANY) -> list[socket.socket]:
     """Connections that send nothing."""
-    return _each(target, count, b"")
+    return dial_each(target, count, b"")
 
 
 def slow_headers(target: Target, count: int = MANY) -> list[socket.socket]:
     """Connections that never end their headers."""
-    return _each(target, count, b"POST /features HTTP/1.1\r\nHost: localhost\r\nX-Slow: ")
+    return dial_each(target, count, b"POST /features HTTP/1.1\r\nHost: localhost\r\nX-Slow: ")
 
 
 def slow_bodies(target: Target, count: int = MANY) -> list[socket.socket]:
     """Connections that never end their bodies."""
-    return _each(target, count, target.post(JPEG)[:-100])
+    return dial_each(target, count, target.post(JPEG)[:-100])
 
 
 def churn(target: Target, count: int = 2 * MANY) -> list[socket.socket]:
     """More connections than the service takes, one after the other, each with a request."""
-    connections = _each(target, count, target.ask(path="/nothing"))
+    connections = dial_each(target, count, target.ask(path="/nothing"))
     return connections[-MANY:]
 
 
@@ -119,12 +111,12 @@ def dismissed_uploads(target: Target, count: int = 60) -> list[socket.socket]:
 
 def pipelined_floods(target: Target, count: int = 8) -> list[socket.socket]:
     """Thousands of small requests at once, which need no token."""
-    return _each(target, count, target.ask() * 4000)
+    return dial_each(target, count, target.ask() * 4000)
 
 
 def refused_floods(target: Target, count: int = 8) -> list[socket.socket]:
     """Thousands of frames at once that are refused."""
-    return _each(target, count, target.post(b"") * 4000)
+    return dial_each(target, count, target.post(b"") * 4000)
 
 
 def h2c_in_two_segments(target: Target, count: int = 64) -> list[socket.socket]:
@@ -133,7 +125,7 @@ def h2c_in_two_segments(target: Target, count: int = 64) -> list[socket.socket]:
     whole = target.post(
         inner, Connection="Upgrade, HTTP2-Settings", Upgrade="h2c", HTTP2_Settings=""
     )
-    connections = _each(target, count, whole[: -len(inner)])
+    connections = dial_each(target, count, whole[: -len(inner)])
     for connection in connections:
         send_all(connection, inner)
     return connections
@@ -141,111 +133,12 @@ def h2c_in_two_segments(target: Target, count: int = 64) -> list[socket.socket]:
 
 def upgrade_floods(target: Target, count: int = 8) -> list[socket.socket]:
     """Thousands of requests at once that offer HTTP/2."""
-    return _each(target, count, target.ask(Connection="Upgrade", Upgrade="h2c") * 2000)
+    return dial_each(target, count, target.ask(Connection="Upgrade", Upgrade="h2c") * 2000)
 
 
 def tunnels(target: Target, count: int = 64) -> list[socket.socket]:
     """CONNECT, as to a proxy."""
-    return _each(target, count, b"CONNECT 127.0.0.1:22 HTTP/1.1\r\nHost: localhost\r\n\r\n" * 3)
-
-
-def frames_before_the_handshake(target: Target, count: int = 64) -> list[socket.socket]:
-    """WebSocket frames in one segment with the handshake."""
-    early = frame(PING) + frame(8, b"\x03\xe8")
-    return _each(target, count, target.handshake() + early)
-
-
-def unread_pings(target: Target, megabytes: int = 16) -> list[socket.socket]:
-    """Pings whose answers nobody reads."""
-    return _stream(target, frame(PING, bytes(125)), megabytes)
-
-
-def large_unread_pings(target: Target, megabytes: int = 16) -> list[socket.socket]:
-    """Pings between frames of a few hundred bytes, whose answers nobody reads."""
-    part = frame(BINARY, bytes(300), fin=False) + frame(CONTINUATION, bytes(300))
-    return _stream(target, part + frame(PING, bytes(125)), megabytes)
-
-
-def empty_fragments(target: Target, megabytes: int = 16) -> list[socket.socket]:
-    """One message in fragments without content."""
-    connection = target.open_websocket()
-    send_all(connection, frame(BINARY, fin=False))
-    _pour(connection, frame(CONTINUATION, fin=False), megabytes)
-    return [connection]
-
-
-def small_messages(target: Target, megabytes: int = 16) -> list[socket.socket]:
-    """Messages of one byte, each of which is refused."""
-    return _stream(target, frame(BINARY, b"x"), megabytes)
-
-
-def deep_texts(target: Target, count: int = 50) -> list[socket.socket]:
-    """Options of deep nesting."""
-    connection = target.open_websocket()
-    for text in (b"[" * 900, b"[" * 100_000, b'{"a":' * 200):
-        send_all(connection, (frame(TEXT, text) + frame(BINARY, b"no image")), count)
-    return [connection]
-
-
-def long_texts(target: Target, count: int = 32) -> list[socket.socket]:
-    """Texts of 4 MB that take four times as much memory once they are decoded."""
-    connections = [target.open_websocket() for _ in range(count)]
-    for connection in connections:
-        connection.settimeout(1.0)
-        send_all(connection, frame(TEXT, "\N{AUTOMOBILE}".encode() + b"x" * (4 * MB - 100)))
-    return connections
-
-
-def text_floods(target: Target, megabytes: int = 16) -> list[socket.socket]:
-    """Texts of 2 KB, without an image."""
-    return _stream(target, frame(TEXT, b"[" * 2048), megabytes)
-
-
-def kept_messages(target: Target, count: int = 32) -> list[socket.socket]:
-    """Messages of 4 MB of clients that do not read the answers to those before."""
-    connections = unread_answers(target, count)
-    for connection in connections:
-        send_all(connection, frame(BINARY, bytes(4 * MB - 64)))
-    return connections
-
-
-def broken_texts(target: Target, count: int = 50) -> list[socket.socket]:
-    """Text that is not UTF-8, on a WebSocket each."""
-    connections = [target.open_websocket() for _ in range(count)]
-    for connection in connections:
-        send_all(connection, frame(TEXT, b"\xff\xfe"))
-    return connections
-
-
-def half_frames(target: Target, count: int = 32) -> list[socket.socket]:
-    """WebSockets that hold back the last byte of a message of 1 MB."""
-    connections = [target.open_websocket() for _ in range(count)]
-    for connection in connections:
-        send_all(connection, frame(BINARY, bytes(MB))[:-1])
-    return connections
-
-
-def unread_answers(target: Target, count: int = 16) -> list[socket.socket]:
-    """WebSockets whose answers nobody reads."""
-    connections = [target.open_websocket() for _ in range(count)]
-    for connection in connections:
-        connection.settimeout(0.2)
-        send_all(connection, frame(BINARY, b"no image" * 128), 2000)
-    return connections
-
-
-def left_websockets(target: Target, count: int = 32) -> list[socket.socket]:
-    """Clients that leave a WebSocket while their frames wait."""
-    for _ in range(count):
-        with target.open_websocket() as connection:
-            send_all(connection, frame(BINARY, JPEG), 16)
-            connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, bytes([1, *bytes(7)]))
-    return []
-
-
-def quiet_websockets(target: Target, count: int = MANY) -> list[socket.socket]:
-    """WebSockets without messages."""
-    return [target.open_websocket() for _ in range(count)]
+    return dial_each(target, count, b"CONNECT 127.0.0.1:22 HTTP/1.1\r\nHost: localhost\r\n\r\n" * 3)
 
 
 def strange_headers(target: Target, count: int = 40) -> list[socket.socket]:
@@ -261,7 +154,9 @@ def strange_headers(target: Target, count: int = 40) -> list[socket.socket]:
         target.ask(path="/%ff%00?fov_y=%ff"),
     ]
     return [
-        connection for body in bodies for connection in _each(target, count // len(bodies), body)
+        connection
+        for body in bodies
+        for connection in dial_each(target, count // len(bodies), body)
     ]
 
 
@@ -284,7 +179,7 @@ def mutated_requests(target: Target, count: int = 100, seed: int = 0) -> list[so
     rng, whole = random.Random(seed), whole_streams(target)
     connections = []
     for _ in range(count):
-        connections += _each(target, 1, mutate(rng, whole))
+        connections += dial_each(target, 1, mutate(rng, whole))
     return connections[-64:]
 
 
@@ -333,7 +228,7 @@ def mutate(rng: random.Random, whole: list[bytes]) -> bytes:
     return bytes(sent)
 
 
-def _each(target: Target, count: int, sent: bytes) -> list[socket.socket]:
+def dial_each(target: Target, count: int, sent: bytes) -> list[socket.socket]:
     """Connections that have sent the same."""
     connections = []
     for _ in range(count):
@@ -350,16 +245,3 @@ def _begin_chunked(target: Target) -> socket.socket:
     headers = target.headers(Content_Type="image/jpeg", Transfer_Encoding="chunked")
     send_all(connection, b"POST /features HTTP/1.1\r\n" + headers + b"\r\n")
     return connection
-
-
-def _stream(target: Target, sent: bytes, megabytes: int) -> list[socket.socket]:
-    connection = target.open_websocket()
-    _pour(connection, sent, megabytes)
-    return [connection]
-
-
-def _pour(connection: socket.socket, sent: bytes, megabytes: int) -> None:
-    """Send the same for some megabytes, or until the service reads no more."""
-    connection.settimeout(1.0)
-    part = sent * ((256 << 10) // len(sent))
-    send_all(connection, part, 4 * megabytes)

@@ -2,8 +2,9 @@
 
 from tests.serve.attacks.attacks import CONNECTIONS, Attack
 from tests.serve.attacks.costs import REQUESTS
+from tests.serve.attacks.websockets import WEBSOCKETS
 
-ATTACKS: tuple[Attack, ...] = (*CONNECTIONS, *REQUESTS)
+ATTACKS: tuple[Attack, ...] = (*CONNECTIONS, *WEBSOCKETS, *REQUESTS)
 REPORTED = (
     *("long_upgrades", "crowded_upgrades", "endless_trailers", "idle_connections"),
     *("left_uploads", "dismissed_uploads", "unread_pings", "empty_fragments", "deep_texts"),

@@ -12,7 +12,7 @@ from serve.config import Limits
 from serve.server.connection import MAX_AT_ONCE, MAX_PIPELINED, WORK_S
 from serve.server.fast_path import DirectProtocol
 from serve.server.websocket import GuardedWebSocket
-from tests.serve.attacks import attacks
+from tests.serve.attacks import attacks, websockets
 from tests.serve.attacks.conftest import (
     Target,
     close,
@@ -71,7 +71,7 @@ def test_an_invalid_websocket_handshake_is_answered(target: Target) -> None:
 
 
 def test_bytes_sent_with_the_handshake_close_the_connection(target: Target) -> None:
-    for connection in attacks.frames_before_the_handshake(target, 4):
+    for connection in websockets.frames_before_the_handshake(target, 4):
         assert status_of(read_rest(connection)) == 400
     with target.dial() as connection:
         connection.sendall(target.post(JPEG) + target.handshake())

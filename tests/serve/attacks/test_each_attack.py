@@ -4,7 +4,7 @@ import inspect
 
 import pytest
 
-from tests.serve.attacks import attacks
+from tests.serve.attacks import attacks, websockets
 from tests.serve.attacks.conftest import Target, read_rest, resident_mb
 from tests.serve.attacks.costs import REQUESTS, conflicting_lengths
 from tests.serve.attacks.registry import ATTACKS, REPORTED
@@ -13,9 +13,9 @@ from tests.serve.conftest import Served, jpeg, picture, until
 JPEG = jpeg(picture())
 OWN = 20
 OTHERS = (
-    *(attacks.pipelined_floods, attacks.refused_floods, attacks.deep_texts),
-    *(attacks.long_texts, attacks.unread_answers, attacks.kept_messages),
-    *(attacks.quiet_websockets, attacks.damaged_images),
+    *(attacks.pipelined_floods, attacks.refused_floods, websockets.deep_texts),
+    *(websockets.long_texts, websockets.unread_answers, websockets.kept_messages),
+    *(websockets.quiet_websockets, attacks.damaged_images),
 )
 
 

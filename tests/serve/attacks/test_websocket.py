@@ -13,7 +13,7 @@ import pytest
 from serve.config import Limits
 from serve.server.guard import EVICTABLE_S
 from serve.server.websocket import GuardedWebSocket
-from tests.serve.attacks import attacks
+from tests.serve.attacks import attacks, websockets
 from tests.serve.attacks.conftest import (
     BINARY,
     CONTINUATION,
@@ -51,11 +51,11 @@ def streams(service: Served) -> list[GuardedWebSocket]:
 @pytest.mark.parametrize(
     "attack",
     [
-        attacks.unread_pings,
-        attacks.large_unread_pings,
-        attacks.empty_fragments,
-        attacks.small_messages,
-        attacks.text_floods,
+        websockets.unread_pings,
+        websockets.large_unread_pings,
+        websockets.empty_fragments,
+        websockets.small_messages,
+        websockets.text_floods,
     ],
 )
 def test_small_frames_are_bounded(
@@ -123,7 +123,7 @@ def test_pings_that_nobody_reads_the_answers_of_take_no_memory() -> None:
     limits = Limits(head_s=1e9, body_s=1e9, idle_s=1e9)
     with serving(engine, limits=limits, clock=clock) as service:
         before = resident_mb()
-        (connection,) = attacks.unread_pings(Target(service.port), megabytes=32)
+        (connection,) = websockets.unread_pings(Target(service.port), megabytes=32)
         assert resident_mb() - before < 30
         assert service.post(JPEG).status == 200
         connection.close()
@@ -192,7 +192,7 @@ def test_deep_and_broken_texts_are_refused(service: Served, target: Target) -> N
             assert b"/problems/invalid-request" in connection.recv(65536)
         connection.sendall(frame(TEXT, b'{"frame_id": "7"}') + frame(BINARY, JPEG))
         assert b'"frame_id":"7"' in connection.recv(65536)
-    for connection in attacks.broken_texts(target, 3):
+    for connection in websockets.broken_texts(target, 3):
         assert read_close(connection) == (INVALID, "the text is not UTF-8")
     assert service.post(JPEG).status == 200
 
@@ -244,7 +244,7 @@ def test_leaving_a_busy_websocket_writes_nothing_to_the_log(
     with caplog.at_level(logging.WARNING), serving(gate.engine, limits=Limits(queue=4)) as service:
         target = Target(service.port)
         for _ in range(3):
-            attacks.left_websockets(target, 8)
+            websockets.left_websockets(target, 8)
             connections = [target.open_websocket() for _ in range(8)]
             for connection in connections:  # dismissed while its frames wait
                 send_all(connection, frame(BINARY, JPEG) * 6 + frame(TEXT, b"\xff"))
@@ -301,7 +301,7 @@ def test_leaving_in_the_middle_of_a_message_leaves_nothing(service: Served, targ
     try:
         before = resident_mb()
         for _ in range(4):
-            connections = attacks.half_frames(target, 16)
+            connections = websockets.half_frames(target, 16)
             until(lambda: sum(s._message_end_s < 1e9 for s in streams(service)) == 16)
             for connection in connections:
                 connection.close()

@@ -1,0 +1,147 @@
+"""Attacks on WebSockets, bounded as those of `attacks`."""
+
+import socket
+
+from tests.serve.attacks.attacks import JPEG, MANY, MB, Attack, dial_each
+from tests.serve.attacks.conftest import (
+    BINARY,
+    CONTINUATION,
+    PING,
+    TEXT,
+    Target,
+    frame,
+    send_all,
+)
+
+
+def frames_before_the_handshake(target: Target, count: int = 64) -> list[socket.socket]:
+    """WebSocket frames in one segment with the handshake."""
+    early = frame(PING) + frame(8, b"\x03\xe8")
+    return dial_each(target, count, target.handshake() + early)
+
+
+def unread_pings(target: Target, megabytes: int = 16) -> list[socket.socket]:
+    """Pings whose answers nobody reads."""
+    return _stream(target, frame(PING, bytes(125)), megabytes)
+
+
+def large_unread_pings(target: Target, megabytes: int = 16) -> list[socket.socket]:
+    """Pings between frames of a few hundred bytes, whose answers nobody reads."""
+    part = frame(BINARY, bytes(300), fin=False) + frame(CONTINUATION, bytes(300))
+    return _stream(target, part + frame(PING, bytes(125)), megabytes)
+
+
+def empty_fragments(target: Target, megabytes: int = 16) -> list[socket.socket]:
+    """One message in fragments without content."""
+    connection = target.open_websocket()
+    send_all(connection, frame(BINARY, fin=False))
+    _pour(connection, frame(CONTINUATION, fin=False), megabytes)
+    return [connection]
+
+
+def small_messages(target: Target, megabytes: int = 16) -> list[socket.socket]:
+    """Messages of one byte, each of which is refused."""
+    return _stream(target, frame(BINARY, b"x"), megabytes)
+
+
+def deep_texts(target: Target, count: int = 50) -> list[socket.socket]:
+    """Options of deep nesting."""
+    connection = target.open_websocket()
+    for text in (b"[" * 900, b"[" * 4000, b'{"a":' * 200):
+        send_all(connection, (frame(TEXT, text) + frame(BINARY, b"no image")), count)
+    return [connection]
+
+
+def long_texts(target: Target, count: int = 32) -> list[socket.socket]:
+    """Texts of 4 MB that take four times as much memory once they are decoded."""
+    connections = [target.open_websocket() for _ in range(count)]
+    for connection in connections:
+        connection.settimeout(1.0)
+        send_all(connection, frame(TEXT, "\N{AUTOMOBILE}".encode() + b"x" * (4 * MB - 100)))
+    return connections
+
+
+def text_floods(target: Target, megabytes: int = 16) -> list[socket.socket]:
+    """Texts of 2 KB, without an image."""
+    return _stream(target, frame(TEXT, b"[" * 2048), megabytes)
+
+
+def kept_messages(target: Target, count: int = 32) -> list[socket.socket]:
+    """Messages of 4 MB of clients that do not read the answers to those before."""
+    connections = [target.open_websocket() for _ in range(count)]
+    small, large = frame(BINARY, b"no image" * 128), frame(BINARY, bytes(4 * MB - 64))
+    for connection in connections:
+        connection.settimeout(0.2)
+        sent = _send_until_full(connection, small * 2000)
+        send_all(connection, small[sent % len(small) :] + large)  # the cut frame is completed
+    return connections
+
+
+def broken_texts(target: Target, count: int = 50) -> list[socket.socket]:
+    """Text that is not UTF-8, on a WebSocket each."""
+    connections = [target.open_websocket() for _ in range(count)]
+    for connection in connections:
+        send_all(connection, frame(TEXT, b"\xff\xfe"))
+    return connections
+
+
+def half_frames(target: Target, count: int = 32) -> list[socket.socket]:
+    """WebSockets that hold back the last byte of a message of 1 MB."""
+    connections = [target.open_websocket() for _ in range(count)]
+    for connection in connections:
+        send_all(connection, frame(BINARY, bytes(MB))[:-1])
+    return connections
+
+
+def unread_answers(target: Target, count: int = 16) -> list[socket.socket]:
+    """WebSockets whose answers nobody reads."""
+    connections = [target.open_websocket() for _ in range(count)]
+    for connection in connections:
+        connection.settimeout(0.2)
+        send_all(connection, frame(BINARY, b"no image" * 128), 2000)
+    return connections
+
+
+def left_websockets(target: Target, count: int = 32) -> list[socket.socket]:
+    """Clients that leave a WebSocket while their frames wait."""
+    for _ in range(count):
+        with target.open_websocket() as connection:
+            send_all(connection, frame(BINARY, JPEG), 16)
+            connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, bytes([1, *bytes(7)]))
+    return []
+
+
+def quiet_websockets(target: Target, count: int = MANY) -> list[socket.socket]:
+    """WebSockets without messages."""
+    return [target.open_websocket() for _ in range(count)]
+
+
+WEBSOCKETS: tuple[Attack, ...] = (
+    *(frames_before_the_handshake, unread_pings, large_unread_pings, empty_fragments),
+    *(small_messages, deep_texts, long_texts, text_floods, broken_texts, half_frames),
+    *(unread_answers, kept_messages, left_websockets, quiet_websockets),
+)
+
+
+def _send_until_full(connection: socket.socket, data: bytes) -> int:
+    """Send until the service reads no more; how many bytes were sent."""
+    sent = 0
+    try:
+        while sent < len(data):
+            sent += connection.send(data[sent : sent + (64 << 10)])
+    except OSError:
+        pass
+    return sent
+
+
+def _stream(target: Target, sent: bytes, megabytes: int) -> list[socket.socket]:
+    connection = target.open_websocket()
+    _pour(connection, sent, megabytes)
+    return [connection]
+
+
+def _pour(connection: socket.socket, sent: bytes, megabytes: int) -> None:
+    """Send the same for some megabytes, or until the service reads no more."""
+    connection.settimeout(1.0)
+    part = sent * ((256 << 10) // len(sent))
+    send_all(connection, part, 4 * megabytes)
