@@ -106,9 +106,7 @@ Backbone = Annotated[
 ]
 Rows = Annotated[
     str,
-    typer.Option(
-        help="Rows to train: distance, angle, type, mtl-1 to mtl-4, deepdriving, or the backbone; all by default."
-    ),
+    typer.Option(help="Rows: distance, angle, type, mtl-1 to mtl-4, deepdriving, the backbone."),
 ]
 Batch = Annotated[int, typer.Option(help="Images a step.")]
 AblationSplit = Annotated[str, typer.Option(help="Rounds to evaluate on: test or unseen.")]
