@@ -159,7 +159,7 @@ def convolution(
         outputs, inputs, *kernel = weight.shape
         weight = weight.reshape(groups, outputs // groups, inputs, *kernel)
         convolve = ops.group_convolution
-    return convolve(x, weight, stride, pads, pads, [1, 1], **how)
+    return convolve(x, ops.constant(weight), stride, pads, pads, [1, 1], **how)
 
 
 def _pool(ops: Any, x: Any, spec: Pool) -> Any:
@@ -169,7 +169,8 @@ def _pool(ops: Any, x: Any, spec: Pool) -> Any:
 
 
 def _linear(ops: Any, x: Any, weights: Weights, name: str) -> Any:
-    product = ops.matmul(x, weights[f"{name}.weight"], False, True)
+    # Given as an array, it would be made a list of numbers first, which takes longer than the rest.
+    product = ops.matmul(x, ops.constant(weights[f"{name}.weight"]), False, True)
     return ops.add(product, weights[f"{name}.bias"][None])
 
 
@@ -244,7 +245,7 @@ def _log_spread(ops: Any, scores: Any, count: int) -> Any:
 def product_float32(ops: Any, x: Any, weight: NDArray[np.float32]) -> Any:
     """x (1, F) times weight (N, F) transposed: (1, N)."""
     # In two dimensions: OpenVINO would lay out three as the channels of an image, and back.
-    sums = ops.reduce_sum(ops.multiply(x, weight), np.array([1]))
+    sums = ops.reduce_sum(ops.multiply(x, ops.constant(weight)), np.array([1]))
     return ops.unsqueeze(sums, np.array([0]))
 
 
@@ -262,7 +263,7 @@ def uncertainty_outputs(ops: Any, x: Any, images: Any, head: UncertaintyHead) ->
     limited = ops.minimum(ops.maximum(log_std, head.low[None]), head.high[None])
     cells, centre = texture_graph(ops, images)
     deviation = ops.subtract(cells, head.texture_mean[None])
-    projected = ops.matmul(deviation, head.texture_directions, False, True)
+    projected = ops.matmul(deviation, ops.constant(head.texture_directions), False, True)
     z = ops.multiply(ops.subtract(centre, head.pitch_centre[None]), head.pitch_scale[None])
     hidden = ops.relu(linear_float32(ops, z, head.pitch_hidden_weight, head.pitch_hidden_bias))
     pitch = linear_float32(ops, hidden, head.pitch_weight, head.pitch_bias)
