@@ -36,7 +36,7 @@ system:
 	elif sudo -n true 2>/dev/null; then sudo apt-get update -qq && sudo apt-get install -y -qq $(EGL_PACKAGES); \
 	else echo "error: EGL and Mesa are missing; type: sudo apt-get install $(EGL_PACKAGES)" >&2; exit 1; fi
 
-demo: $(READY) ## collect, train, evaluate, serve, ask, report: in 15 minutes on two cores
+demo: $(READY) ## collect, train, evaluate, serve, ask, report: in 17 minutes on two cores
 	$(BIN)/controllers demo --out demo
 
 # One process more than cores, for many tests wait; four at most: each takes about 1 GB. A file's tests

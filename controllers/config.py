@@ -93,11 +93,11 @@ class TuneConfig:
 
 @dataclass(frozen=True, slots=True)
 class DemoConfig:
-    """What the demo collects and how long it trains; the defaults fit 15 minutes on two cores."""
+    """What the demo collects and how long it trains; the defaults fit 17 minutes on two cores."""
 
     out: Path = Path("demo")
     tracks: str = "circuit,forest,highway,mountain-pass,ring-road"
-    rounds: int = 100
+    rounds: int = 300
     frames: int = 200
     seed: int = 1
     minutes: float = 8.5

@@ -24,6 +24,8 @@ LOG = Console(stderr=True, highlight=False)
 FIRST_TRACK = "coast"
 """No model is trained on it."""
 FIRST_FRAMES, FIRST_POSTED = 60, 4
+TEST_SHARE = 0.1
+"""Of the rounds collected: most of the time is for frames to train on."""
 DRIVE_STEPS = 800
 """Of 50 ms: 40 s from a standing start."""
 
@@ -64,6 +66,7 @@ def run_demo(config: DemoConfig) -> DemoResult:
     # Another scenery in every frame trains best in so short a time; of four a round, since one is
     # the default for rounds of this length.
     collect += ["--stretch", "1", "--scenes", "4"]
+    collect += ["--split-test-share", f"{TEST_SHARE:g}"]
     collect += ["--tracks", config.tracks, "--seed", str(config.seed)]
     train = ["mtlnet", "train", "--data", data, "--out", run, "--alpha", config.alpha]
     train += ["--recipe", "fast", "--minutes", f"{config.minutes:g}", "--seed", str(config.seed)]
