@@ -4,6 +4,7 @@ Each is a template in its own frame (x along the road, y away from it, z up, met
 many times in the world frame (metres).
 """
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -36,6 +37,9 @@ SMALL_M2, SMALL_REACH_M = 14.0, 130.0
 only flicker."""
 BUILDING_M = 3.9
 """A prop that extends farther from its middle is a building."""
+BUILDING_CLEAR_M = 1.0
+"""Between a building and the wall line, at least."""
+OUTLINE_STEP_M = 2.0
 POST_STEP_M, LAMP_STEP_M, POLE_STEP_M = 50.0, 42.0, 40.0
 _WALLS: tuple[Point, ...] = (
     (0.62, 0.58, 0.50), (0.66, 0.64, 0.60), (0.42, 0.22, 0.15), (0.58, 0.47, 0.30),
@@ -154,7 +158,7 @@ class _Placer:
 
     def place(self) -> None:
         """Place the candidates in order; skip those within `clear_m` of a wall line, near a bridge,
-        below the sea level or, for buildings, overlapping another one."""
+        below the sea level or, for buildings, overlapping the road or another one."""
         if not self.candidates:
             return
         templates, *numbers = zip(*self.candidates, strict=True)
@@ -169,16 +173,20 @@ class _Placer:
         taken: list[tuple[float, float, float]] = []
         for k in np.flatnonzero(free).tolist():
             template = templates[k]
+            place = np.array([x[k], y[k]])
+            rotate = np.array([[cos[k], sin[k]], [-sin[k], cos[k]]])
             reach = float(np.abs(template[:, :2]).max())
             if reach > BUILDING_M:
                 if any(
                     np.hypot(x[k] - u, y[k] - v) < 0.9 * (reach + other) for u, v, other in taken
                 ):
                     continue
+                # In a bend, or where the track comes back, its ends are nearer than its middle.
+                if not self.ground.is_clear(_outline(template) @ rotate + place, BUILDING_CLEAR_M):
+                    continue
                 taken.append((x[k], y[k], reach))
             placed = template.copy()
-            rotate = np.array([[cos[k], sin[k]], [-sin[k], cos[k]]])
-            placed[:, :2] = template[:, :2] @ rotate + np.array([x[k], y[k]])
+            placed[:, :2] = template[:, :2] @ rotate + place
             placed[:, 2] += z[k]
             placed[:, 3:5] = template[:, 3:5] @ rotate
             self.add_placed(s[k], placed)
@@ -187,6 +195,18 @@ class _Placer:
         """Add triangles (n, 12) in the world frame, near `s`."""
         self.s.append(s)
         self.parts.append(triangles)
+
+
+def _outline(template: FloatArray) -> FloatArray:
+    """Points (n, 2) on the bounding rectangle of `template`, at most OUTLINE_STEP_M apart."""
+    low, high = template[:, :2].min(axis=0), template[:, :2].max(axis=0)
+    x, y = (
+        np.linspace(a, b, math.ceil((b - a) / OUTLINE_STEP_M) + 1)
+        for a, b in zip(low, high, strict=True)
+    )
+    along = [np.stack([x, np.full_like(x, edge)], axis=1) for edge in (low[1], high[1])]
+    across = [np.stack([np.full_like(y, edge), y], axis=1) for edge in (low[0], high[0])]
+    return np.concatenate([*along, *across])
 
 
 def build(

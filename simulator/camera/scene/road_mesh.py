@@ -198,6 +198,11 @@ class Ground:
         free = near > self.road.wall_offset + clear_m
         return free, pose.x, pose.y
 
+    def is_clear(self, points: FloatArray, clear_m: float) -> bool:
+        """Whether all points (n, 2) are `clear_m` outside every wall line."""
+        near = self.line.distance(points[:, 0], points[:, 1])
+        return bool((near > self.road.wall_offset + clear_m).all())
+
     def height(self, s: FloatArray, offset: FloatArray, x: FloatArray, y: FloatArray) -> FloatArray:
         """Visible height at places: the terrain, or the road mesh's skirt where it is higher."""
         mesh = self.mesh
