@@ -55,9 +55,6 @@ Realtime = Annotated[
         "No two such drives are the same.",
     ),
 ]
-Filter = Annotated[
-    bool, typer.Option("--filter", help="Filter the perception's answers over time.")
-]
 Parameters = Annotated[
     Path | None, typer.Option(help="The controller's parameters, written by `controllers tune`.")
 ]
@@ -103,7 +100,6 @@ def drive(
     latency_ms: Latency = DRIVE.latency_ms,
     drop: Drop = DRIVE.drop,
     realtime: Realtime = DRIVE.realtime,
-    filter: Filter = DRIVE.filter,
     parameters: Parameters = DRIVE.parameters,
     model: Model = DRIVE.model,
     start_d: StartD = DRIVE.start_d,
@@ -134,7 +130,6 @@ def drive(
         latency_ms=latency_ms,
         drop=drop,
         realtime=realtime,
-        filter=filter,
         parameters=parameters,
         model=model,
         start_d=start_d,

@@ -14,11 +14,12 @@ import numpy as np
 from controllers.config import THROTTLE
 from controllers.interface import Controller, Observation
 from controllers.perception import Perceived
-from simulator.env.reward import ending, step_reward
+from simulator.env.reward import OFF_TRACK_REWARD, ending, quadratic_reward, step_reward
 from simulator.track.road import Road
 from simulator.traffic.idm import idm_acceleration
 from simulator.traffic.traffic import Traffic
 from simulator.vehicle.state import CarState, Command
+from trackfeatures.errors import UserError
 
 GEAR = 1
 HOLD_S = 0.5
@@ -31,6 +32,8 @@ LOST_S = 1.0
 """Without a perceived offset for this long the car slows down ..."""
 LOST_SPEED = 5.0  # m/s, ... to this speed, at which it goes on
 LOST_BRAKE = 0.1
+REWARDS = ("paper", "quadratic")
+"""`step_reward` and `quadratic_reward` of `simulator.env.reward`."""
 
 
 class Drivable(Protocol):
@@ -103,6 +106,8 @@ class DriveResult:
     """Sum of the reward over the steps requested; an ending step gives -2, those after it 0."""
     score_per_step: float
     """`score` over `steps_asked`."""
+    quadratic_per_step: float
+    """The paper's quadratic reward over `steps_asked`; an ending step and those after it: -2."""
     laps: int
     """Complete laps, from one crossing of the line to the next."""
     distance_m: float
@@ -128,6 +133,10 @@ class DriveResult:
     """Of a drive on the wall clock only; in JSON its fields are those of the result."""
     speed_error_m_s: float | None = None
     """Mean distance from the set-point of `--speed` on free straights; only there in JSON."""
+
+    def per_step(self, reward: str) -> float:
+        """The mean over `steps_asked` of a reward of `REWARDS`."""
+        return self.score_per_step if reward == "paper" else self.quadratic_per_step
 
     def as_json(self) -> dict[str, Any]:
         """The fields as JSON values."""
@@ -171,12 +180,18 @@ def run_lap(
             throttle, brake = slow_down(now.vx, throttle, brake)
             totals.slowed_steps += 1
         after = world.step(Command(steer=steer, throttle=throttle, brake=brake, gear=gear))
-        totals.add(after, lane_centre, world.road)
+        totals.add(after, steer, lane_centre, world.road)
         if totals.ended is not None:
             break
     run_up = round(RUN_UP_S * world.frequency_hz)
     result = totals.result(world.state, steps, run_up, memory.blind_steps, noisy=noisy)
     return replace(result, speed_error_m_s=pedals.mean_error)
+
+
+def check_reward(name: str) -> None:
+    """Raise UserError unless `name` is one of `REWARDS`."""
+    if name not in REWARDS:
+        raise UserError(f"there is no reward {name!r}; use one of: {', '.join(REWARDS)}")
 
 
 def throttle_and_brake(traffic: Traffic, now: CarState, throttle: float) -> tuple[float, float]:
@@ -235,31 +250,34 @@ class _Totals:
 
     start_m: float
     score: float = 0.0
+    quadratic: float = 0.0
     ended: str | None = None
     slowed_steps: int = 0
     in_lane_steps: int = 0
     offsets_m: list[float] = field(default_factory=list)
     speeds_kmh: list[float] = field(default_factory=list)
 
-    def add(self, after: CarState, lane_centre: float, road: Road) -> None:
+    def add(self, after: CarState, steer: float, lane_centre: float, road: Road) -> None:
         self.offsets_m.append(abs(after.to_middle - lane_centre))
         self.in_lane_steps += self.offsets_m[-1] <= road.lane_width / 2
         self.speeds_kmh.append(after.speed_kmh)
         self.ended = ending(after)
-        self.score += step_reward(
-            after.angle, after.to_middle, road.half_width, ended=self.ended is not None
-        )
+        ended = self.ended is not None
+        self.score += step_reward(after.angle, after.to_middle, road.half_width, ended)
+        self.quadratic += quadratic_reward(self.offsets_m[-1], after.angle, steer, ended)
 
     def result(
         self, last: CarState, steps: int, run_up: int, blind_steps: int, *, noisy: bool
     ) -> DriveResult:
         speeds = self.speeds_kmh
         cruising = speeds[run_up:]
+        missing = steps - len(speeds)
         return DriveResult(
             steps=len(speeds),
             steps_asked=steps,
             score=self.score,
             score_per_step=self.score / steps,
+            quadratic_per_step=(self.quadratic + OFF_TRACK_REWARD * missing) / steps,
             laps=max(last.lap - 1, 0),
             distance_m=last.odometer_m - self.start_m,
             mean_abs_d_m=float(np.mean(self.offsets_m)),

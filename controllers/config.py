@@ -29,8 +29,6 @@ class DriveConfig:
     """Share of the answers that are lost."""
     realtime: bool = False
     """On the wall clock, without waiting for the perception's answers."""
-    filter: bool = False
-    """Filter the answers over time, with the car's own speeds and yaw rate."""
     parameters: Path | None = None
     """A file of `controllers tune`, whose parameters the controller gets."""
     model: str = "default"

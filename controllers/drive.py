@@ -109,11 +109,10 @@ def drive(
         world.reset(seed=config.seed, to_middle=lane.start_d)
         source = stack.enter_context(_open_perception(config, world, lane))
         watching = [*observers, *_observers(config, stack, world, source, lane)]
-        seen = _filtered(config, source.perceive)
-        live = _real_time(config, seen, disturbance) if config.realtime else None
+        live = _real_time(config, source.perceive, disturbance) if config.realtime else None
         if live is not None:
             stack.enter_context(live)
-        perceive = LastAnswer(live or delay(config, seen, disturbance.delay_s))
+        perceive = LastAnswer(live or delay(config, source.perceive, disturbance.delay_s))
         result = run_lap(
             world,
             disturbance.controller(controller, config.seed),
@@ -137,8 +136,6 @@ def _real_time(
         raise UserError(
             "--realtime measures the delay of the answers; leave it out, or --latency-ms"
         )
-    if config.filter:
-        raise UserError("--filter needs an answer at every step; leave it out, or --realtime")
     rng = np.random.default_rng([config.seed, 3])
     return real_time(perceive, dt=1.0 / FREQUENCY_HZ, drop=config.drop, rng=rng)
 
@@ -186,17 +183,6 @@ def delay(config: DriveConfig, perceive: Perceive, unknown_s: float = 0.0) -> Pe
             return perceive
         return TrustedPerception(perceive, _state, dt=1.0 / FREQUENCY_HZ)
     return _late(perceive, config.latency_ms / 1000.0, config.drop, rng, predict=True)
-
-
-def _filtered(config: DriveConfig, perceive: Perceive) -> Perceive:
-    """`perceive`, filtered over time where `config` asks for it. UserError on the truth."""
-    if not config.filter:
-        return perceive
-    if not isinstance(perceive, CameraPerception):
-        raise UserError("--filter is for answers to images; give --perception model or a service")
-    from controllers.filtered_perception import FilteredPerception
-
-    return FilteredPerception(perceive)
 
 
 def _late(

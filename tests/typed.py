@@ -26,3 +26,11 @@ def typed(*words: object, folder: Path | None = None) -> subprocess.CompletedPro
         except SystemExit as end:
             code = end.code if isinstance(end.code, int) else 0
     return subprocess.CompletedProcess(arguments, code, out.getvalue(), err.getvalue())
+
+
+def error_line(done: subprocess.CompletedProcess[str]) -> str:
+    """The one line with which a command refused; AssertionError for several, or a traceback."""
+    assert "Traceback" not in done.stderr
+    errors = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
+    assert len(errors) == 1, done.stderr
+    return errors[0]

@@ -72,7 +72,7 @@ def figure_rows(drives: list[dict[str, Any]]) -> Iterator[list[str]]:
             controller,
             spread([result["score"] for result in results], 1),
             spread([result["score_per_step"] for result in results], 4),
-            spread([entry["quadratic_per_step"] for entry in here], 5),
+            spread([entry["result"]["quadratic_per_step"] for entry in here], 5),
             spread([result["mean_abs_d_m"] for result in results], 3),
             f"{max(result['max_abs_d_m'] for result in results):.3f}",
             f"{min(result['in_lane_share'] for result in results):.2%}",

@@ -24,7 +24,7 @@ from simulator.camera import check_light
 from simulator.track.catalogue import find_track
 from trackfeatures.errors import UserError
 
-VERSION = 2  # 2: `in_lane_share`
+VERSION = 3  # 2: `in_lane_share`; 3: `quadratic_per_step` in the result
 RESULTS, REPORT = "results.json", "report.html"
 GRID_SHARE = 1.0 / 6.0
 """TORCS's first place on the grid: so much of the track's width to the right of its centre."""
@@ -116,7 +116,7 @@ def _drive_missing(
 def drive_cell(
     config: CompareConfig, cell: Cell, progress: Callable[[int, int], None] | None = None
 ) -> dict[str, Any]:
-    """The result of one drive: figures, quadratic reward and, of the first seed, its curves."""
+    """The result of one drive: figures and, of the first seed, its curves."""
     track = find_track(cell.track, config.tracks_dir)
     start = -GRID_SHARE * track.width if config.start_d is None else config.start_d
     recorder = CurveRecorder()
@@ -139,11 +139,8 @@ def drive_cell(
         disturbance=DISTURBANCES[cell.disturbance],
         observers=[recorder],
     )
-    found = {
-        "result": result.as_json(),
-        "quadratic_per_step": recorder.quadratic_per_step(result),
-    }
-    return found | ({"curves": recorder.curves()} if cell.seed == 0 else {})
+    curves = {"curves": recorder.curves()} if cell.seed == 0 else {}
+    return {"result": result.as_json()} | curves
 
 
 def parameters_of(config: CompareConfig, controller: str) -> dict[str, float]:

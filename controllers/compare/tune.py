@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from controllers.compare.curves import CurveRecorder
+from controllers.closed_loop import check_reward
 from controllers.compare.disturbance import find_disturbance
 from controllers.compare.run import GRID_SHARE, names
 from controllers.config import DriveConfig, TuneConfig
@@ -24,7 +24,6 @@ from simulator.track.catalogue import find_track
 from trackfeatures.errors import UserError
 
 VERSION = 1
-REWARDS = ("paper", "quadratic")
 EXPLORED = 1.0 / 3.0
 SETTINGS = ("tracks", "reward", "steps", "disturbance", "seed")
 
@@ -42,8 +41,7 @@ def tune(config: TuneConfig, progress: Progress | None = None) -> dict[str, Any]
         if controller not in CONTROLLERS or not CONTROLLERS[controller].tunable:
             able = ", ".join(name for name, entry in CONTROLLERS.items() if entry.tunable)
             raise UserError(f"{controller!r} cannot be tuned; use some of: {able}")
-    if config.reward not in REWARDS:
-        raise UserError(f"there is no reward {config.reward!r}; use one of: {', '.join(REWARDS)}")
+    check_reward(config.reward)
     if config.budget < 1:
         raise UserError(f"a budget of {config.budget} drives; give 1 or more")
     find_disturbance(config.disturbance)
@@ -102,7 +100,6 @@ def evaluate(config: TuneConfig, controller: str, parameters: Mapping[str, float
     rewards = []
     for name in names(config.tracks, "tracks"):
         track = find_track(name, config.tracks_dir)
-        recorder = CurveRecorder()
         result = drive(
             DriveConfig(
                 controller=controller,
@@ -113,13 +110,9 @@ def evaluate(config: TuneConfig, controller: str, parameters: Mapping[str, float
                 tracks_dir=config.tracks_dir,
             ),
             disturbance=find_disturbance(config.disturbance),
-            observers=[recorder],
             parameters=parameters,
         )
-        if config.reward == "paper":
-            rewards.append(result.score_per_step)
-        else:
-            rewards.append(recorder.quadratic_per_step(result))
+        rewards.append(result.per_step(config.reward))
     return float(np.mean(rewards))
 
 

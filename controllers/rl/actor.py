@@ -50,7 +50,9 @@ class ActorCard:
     step: int
     """Of the training, at which this actor was taken."""
     score_per_step: float
-    """Of the drive on the training track by which it was chosen."""
+    """The mean reward of the drive on the training track by which it was chosen."""
+    reward: str = "paper"
+    """The reward it was trained on."""
     format: int = FORMAT
     definitions_version: str = tf.VERSION
 

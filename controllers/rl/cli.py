@@ -21,6 +21,7 @@ Noise = Annotated[
     typer.Option(help="Standard deviation of the noise on the state [default: the algorithm's]"),
 ]
 Rate = Annotated[float | None, typer.Option(help="Learning rate [default: the algorithm's]")]
+Reward = Annotated[str, typer.Option(help="paper, or quadratic: the paper's second reward.")]
 Every = Annotated[int, typer.Option(help="Steps between two drives, and checkpoints.", min=1)]
 TracksDir = Annotated[Path | None, typer.Option(help="Folder of TORCS tracks.")]
 
@@ -35,6 +36,7 @@ def train(
     state_noise: Noise = DEFAULT.state_noise,
     actor_rate: Rate = DEFAULT.actor_rate,
     critic_rate: Rate = DEFAULT.critic_rate,
+    reward: Reward = DEFAULT.reward,
     evaluate_every: Every = DEFAULT.evaluate_every,
     tracks_dir: TracksDir = DEFAULT.tracks_dir,
     as_json: command.AsJson = False,
@@ -54,12 +56,13 @@ def train(
         state_noise=state_noise,
         actor_rate=actor_rate,
         critic_rate=critic_rate,
+        reward=reward,
         evaluate_every=evaluate_every,
         tracks_dir=tracks_dir,
     )
     result = _train_with_progress(config)
     line = (
-        f"best score a step on {track}: {result['best_score_per_step']:.4f} at step "
+        f"best {reward} reward a step on {track}: {result['best_score_per_step']:.4f} at step "
         f"{result['best_step']}; drive it with: controllers drive --controller {out}"
     )
     command.print_result(result, as_json, line)

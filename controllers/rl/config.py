@@ -8,6 +8,8 @@ from trackfeatures.errors import UserError
 EXPLORATION_STEPS = 400_000
 """The paper's T_epsilon: the probability of noise on an action falls to its least over these."""
 EXPLORATION_FIRST, EXPLORATION_LEAST = 1.0, 0.1
+QUADRATIC_SCALE = 5.0
+"""Times an algorithm's `reward_scale`, for the quadratic reward, which is that much smaller."""
 EXPLORATION_NOISE = 0.05
 """Standard deviation of the paper's noise on an action, which beta multiplies."""
 
@@ -101,6 +103,8 @@ class TrainConfig:
     """None: the algorithm's own."""
     actor_rate: float | None = None
     critic_rate: float | None = None
+    reward: str = "paper"
+    """paper, or quadratic: -(0.3 d^2 + angle^2 + 0.03 delta^2)."""
     evaluate_every: int = 20_000
     """Steps between two drives; a checkpoint is written after each."""
     tracks_dir: Path | None = None

@@ -17,7 +17,7 @@ import gymnasium as gym
 import numpy as np
 
 import simulator.env  # noqa: F401 registers the environment
-from controllers.closed_loop import DriveResult, run_lap
+from controllers.closed_loop import DriveResult, check_reward, run_lap
 from controllers.drive import FREQUENCY_HZ, steps_for
 from controllers.interface import Observation
 from controllers.perception import truth
@@ -26,6 +26,7 @@ from controllers.rl.agent import Agent
 from controllers.rl.checkpoint import Progress, load_checkpoint, save_checkpoint
 from controllers.rl.config import (
     EXPLORATION_NOISE,
+    QUADRATIC_SCALE,
     Algorithm,
     TrainConfig,
     exploration_share,
@@ -35,6 +36,7 @@ from controllers.rl.controller import RlController
 from controllers.rl.networks import layers
 from controllers.rl.state import StateBuilder, find_state
 from runtime.files import atomic_write, locked_folder, write_json
+from simulator.env.reward import quadratic_reward
 from simulator.track.road import Road
 from simulator.world.world import World
 from trackfeatures.errors import UserError
@@ -72,7 +74,11 @@ def train(config: TrainConfig, report: Report | None = None) -> dict[str, Any]:
 
 def _settings(config: TrainConfig) -> Algorithm:
     """The algorithm's settings, with those that `config` changes."""
+    check_reward(config.reward)
     algorithm = find_algorithm(config.algorithm)
+    if config.reward == "quadratic":
+        scale = QUADRATIC_SCALE * algorithm.reward_scale
+        algorithm = replace(algorithm, reward_baseline=0.0, reward_scale=scale)
     noise, actor, critic = config.state_noise, config.actor_rate, config.critic_rate
     algorithm = replace(
         algorithm,
@@ -95,6 +101,7 @@ def _prepare_folder(config: TrainConfig) -> None:
             found = dict(json.loads(path.read_text(encoding="utf-8")))
         except (ValueError, TypeError) as error:
             raise UserError(f"{path} cannot be read ({error}); give another --out") from error
+        found = asdict(TrainConfig()) | found  # runs of before `reward` have none
         # The folder may have been moved.
         changed = [n for n in content if n != "out" and found.get(n) != content[n]]
         if changed:
@@ -154,6 +161,9 @@ class _Training:
             action = self._explore(agent.act(seen), rng)
             steer = np.array([states.steer(action)], np.float32)
             paper, reward, ended, _, _ = self._env.step(steer)
+            if self._config.reward == "quadratic":
+                now = self._world.state
+                reward = quadratic_reward(now.to_middle, now.angle, float(steer[0]), ended)
             following = agent.see(states.build(paper, self._observe()))
             agent.remember(seen, action, float(reward), following, ended)
             seen = following
@@ -200,9 +210,10 @@ class _Training:
         progress, config = self._progress, self._config
         actor = self._actor(0.0)
         result = _drive(actor, self._world.road)
-        if result.score_per_step > progress.best_score:
-            progress.best_score, progress.best_step = result.score_per_step, progress.step
-            save_actor(config.out, self._actor(result.score_per_step))
+        score = result.per_step(config.reward)
+        if score > progress.best_score:
+            progress.best_score, progress.best_step = score, progress.step
+            save_actor(config.out, self._actor(score))
         progress.evaluated = progress.step
         progress.seconds = time.monotonic() - self._started
         progress.curve.append(
@@ -211,7 +222,7 @@ class _Training:
                 round(progress.seconds, 1),
                 progress.episode,
                 progress.loss,
-                result.score_per_step,
+                score,
                 result.mean_abs_d_m,
                 result.max_abs_d_m,
             )
@@ -239,6 +250,7 @@ class _Training:
             seed=config.seed,
             step=self._progress.step,
             score_per_step=score,
+            reward=config.reward,
         )
         return Actor(card, weights | {"w3": weights["w3"][:, 0]})
 

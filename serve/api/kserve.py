@@ -48,7 +48,7 @@ from serve.api.request_options import (
     request_id_of,
 )
 from serve.api.schemas import REFUSALS, header_parameters, problem_responses
-from serve.scheduling.fair_queue import PixelReader
+from serve.scheduling.fair_queue import FairLock, PixelReader
 
 NAME, VERSION = "track", "1"
 HEADER = "Inference-Header-Content-Length"
@@ -123,7 +123,7 @@ def _metadata(frames: FrameHandler) -> Any:
 
 
 def _infer(frames: FrameHandler) -> Any:
-    one_large = asyncio.Lock()  # of the large JSON parts is parsed at a time: others have turns
+    one_large = FairLock()  # of the large JSON parts is parsed at a time: others have turns
 
     async def infer(request: Request) -> Response:
         stamp_ns = time.monotonic_ns()
@@ -151,7 +151,7 @@ async def _answer(
     headers: Headers,
     stamp_ns: int,
     request_id: str,
-    one_large: asyncio.Lock,
+    one_large: FairLock,
 ) -> Response:
     without_accept = {k: v for k, v in headers.items() if k != b"accept"}
     options = parse_options(without_accept, stamp_ns, request_id)
@@ -165,7 +165,7 @@ async def _answer(
         body = await read_body(request.receive, share.grow)
         length = read_json_length(body, headers.get(HEADER.lower().encode()))
         large = length > WINDOW_BYTES
-        async with one_large if large else nullcontext():
+        async with one_large.held(client) if large else nullcontext():
             if large:
                 await asyncio.sleep(PAUSE_S)
             infer_request, binary = parse_request(body, length)

@@ -1,11 +1,13 @@
-"""Frames that wait for the engine, and whose turn it is.
+"""Frames that wait for the engine, and whose turn it is; a lock for which clients take turns.
 
 Clients take turns, and when the queue is full, a frame of the client that has most in it gives way
 to one of a client with fewer. Clients are told apart by their address, of IPv6 by its /64 network.
 """
 
-from collections import Counter
-from collections.abc import Callable
+import asyncio
+from collections import Counter, deque
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
 from dataclasses import dataclass
 
 import numpy as np
@@ -120,3 +122,46 @@ class FairQueue:
         self._counts[slot.client] -= 1
         if not self._counts[slot.client]:
             del self._counts[slot.client]
+
+
+class FairLock:
+    """A lock of coroutines of one event loop, for which clients take turns."""
+
+    def __init__(self) -> None:
+        self._locked = False
+        # By client, the one whose turn is next first.
+        self._waiting: dict[str, deque[asyncio.Future[None]]] = {}
+
+    @asynccontextmanager
+    async def held(self, client: str) -> AsyncIterator[None]:
+        """Wait for the lock, and hold it."""
+        if self._locked:
+            await self._wait(network_of(client))
+        self._locked = True
+        try:
+            yield
+        finally:
+            self._release()
+
+    async def _wait(self, client: str) -> None:
+        turn = asyncio.get_running_loop().create_future()
+        self._waiting.setdefault(client, deque()).append(turn)
+        try:
+            await turn
+        except asyncio.CancelledError:
+            if not turn.cancelled():  # cancelled after its turn had come
+                self._release()
+            raise
+
+    def _release(self) -> None:
+        """Give the lock to the next client that waits."""
+        while self._waiting:
+            client, turns = next(iter(self._waiting.items()))
+            del self._waiting[client]
+            turn = turns.popleft()
+            if turns:
+                self._waiting[client] = turns
+            if not turn.done():
+                turn.set_result(None)
+                return
+        self._locked = False

@@ -347,5 +347,4 @@ class GuardedProtocol(HttpToolsProtocol):
             return
         reply = problem_reply(problem, (b"connection", b"close"))
         self.transport.write(encode_head(reply) + reply.body)
-        # Aborted at once, the reply would be lost to a client that is still sending.
-        self.transport.write_eof()
+        self.transport.write_eof()  # aborted at once, a client still sending would lose the reply

@@ -1,7 +1,8 @@
 """The reward of a control step, what ends an episode, and the options of both.
 
-The formula is that of the paper's section on the RL control module, with one difference: the paper
-divides the lateral offset by half the width of the lane, this code by half the width of the track.
+`step_reward` is the formula of the paper's section on the RL control module, with one difference:
+the paper divides the lateral offset by half the width of the lane, this code by half the width of
+the track. `quadratic_reward` is the paper's second one.
 """
 
 import math
@@ -10,6 +11,7 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 from simulator.track.road import Road
+from simulator.vehicle.car import CarParameters
 from simulator.vehicle.state import CarState
 from trackfeatures.errors import UserError
 
@@ -17,6 +19,7 @@ Ending = Literal["off_track", "backwards", "collision"]
 
 ENDINGS: tuple[Ending, ...] = get_args(Ending)
 OFF_TRACK_REWARD = -2.0
+STEERING_LOCK = CarParameters.steering_lock  # rad of the front wheels at steer = 1
 
 Reward = Callable[[CarState, Road, Ending | None], float]
 """Reward function of (state after the step, road, why the episode ends or None)."""
@@ -52,6 +55,18 @@ def step_reward(
     if ended or abs(angle) >= 0.5 * math.pi:
         return OFF_TRACK_REWARD
     return math.cos(angle) - weight * abs(math.sin(angle)) - abs(to_middle) / half_width
+
+
+def quadratic_reward(offset: float, angle: float, steer: float, ended: bool) -> float:
+    """-(0.3 offset^2 + angle^2 + 0.03 delta^2), or -2 when the episode ends.
+
+    offset in m from the line to follow, angle in rad, delta the front wheels' angle in rad at the
+    steering action `steer` in [-1, 1].
+    """
+    if ended:
+        return OFF_TRACK_REWARD
+    delta = steer * STEERING_LOCK
+    return -(0.3 * offset * offset + angle * angle + 0.03 * delta * delta)
 
 
 @dataclass(frozen=True)

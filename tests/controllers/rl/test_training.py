@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from controllers.rl.actor import load_actor
 from controllers.rl.agent import Agent, Replay
 from controllers.rl.config import ALGORITHMS, TrainConfig, exploration_share
 from controllers.rl.state import PAPER, STACKED, STATES
@@ -124,6 +125,28 @@ def test_a_training_learns_to_stay_on_the_road(tmp_path: Path) -> None:
     scores = read_curve(tmp_path)["score_per_step"]
     assert scores[0] < 0.3
     assert scores.max() > 0.9
+
+
+def test_the_quadratic_reward_chooses_and_trains(tmp_path: Path) -> None:
+    runs = {
+        reward: train(short(tmp_path / reward, reward=reward)) for reward in ("paper", "quadratic")
+    }
+    actors = [(tmp_path / reward / "actor.safetensors").read_bytes() for reward in runs]
+    assert actors[0] != actors[1]
+    scores = read_curve(tmp_path / "quadratic")["score_per_step"]
+    assert runs["quadratic"]["best_score_per_step"] == max(scores) < 0.0
+    assert load_actor(tmp_path / "quadratic").card.reward == "quadratic"
+    with pytest.raises(UserError, match="there is no reward 'cubic'"):
+        train(short(tmp_path / "cubic", reward="cubic"))
+
+
+def test_a_run_of_before_the_rewards_is_continued(tmp_path: Path) -> None:
+    train(short(tmp_path, steps=200))
+    path = tmp_path / "config.json"
+    content = json.loads(path.read_text())
+    del content["reward"]
+    path.write_text(json.dumps(content))
+    assert train(short(tmp_path, steps=200))["steps"] == 200
 
 
 def test_another_seed_gives_another_actor(tmp_path: Path) -> None:

@@ -104,9 +104,9 @@ def test_both_markings_of_the_lane_are_absent_together() -> None:
 @pytest.mark.parametrize(
     ("probability", "absent"),
     [
-        (0.45, [False, False, False, False, False]),
-        (0.6, [True, True, False, True, False]),
-        (0.75, [True, True, True, True, True]),
+        (0.5, [False, False, False, False, False]),
+        (0.7, [True, True, False, True, False]),
+        (0.95, [True, True, True, True, True]),
     ],
 )
 def test_the_outer_markings_are_absent_above_a_higher_probability(

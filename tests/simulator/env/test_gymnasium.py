@@ -13,7 +13,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import simulator.env  # registers the names
-from simulator.env.reward import step_reward
+from simulator.env.reward import STEERING_LOCK, quadratic_reward, step_reward
 from simulator.sensors import Sensor
 from trackfeatures.errors import UserError
 
@@ -99,6 +99,12 @@ def test_reward_equals_hand_computed_values() -> None:
     )
     assert step_reward(1.6, 0.0, 5.0, ended=False) == -2.0
     assert step_reward(0.0, 0.0, 5.0, ended=True) == -2.0
+
+
+def test_the_papers_quadratic_reward() -> None:
+    expected = -(0.3 * 0.01 + 0.0004 + 0.03 * (0.5 * STEERING_LOCK) ** 2)
+    assert quadratic_reward(-0.1, 0.02, -0.5, ended=False) == pytest.approx(expected)
+    assert quadratic_reward(0.0, 0.0, 0.0, ended=True) == -2.0
 
 
 def test_leaving_the_track_ends_the_episode_with_minus_two() -> None:

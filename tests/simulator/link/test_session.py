@@ -10,13 +10,11 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import asdict
-from pathlib import Path
 from typing import Any
 
 import pytest
 
 from simulator.link.client import Link
-from simulator.link.command import picture_size
 from simulator.link.config import LinkConfig
 from simulator.link.errors import (
     ClientLost,
@@ -31,8 +29,7 @@ from simulator.link.process import run
 from simulator.link.server import Summary
 from simulator.link.simulation import Simulation
 from simulator.vehicle.state import Command
-from tests.typed import typed
-from trackfeatures.errors import UserError
+from tests.typed import error_line, typed
 
 WAIT_S = 180.0
 BOUND_S = 2.0
@@ -157,9 +154,9 @@ def test_a_closed_link_raises(oval: str) -> None:
 
 def test_a_second_server_with_the_same_name_is_refused(oval: str) -> None:
     with Link(oval, wait_s=WAIT_S):
-        done = run_server("--name", oval, "--track", "oval")
+        done = typed("simulator", "link", "--name", oval, "--track", "oval")
     assert done.returncode == 1
-    assert one_error(done).startswith(f"error: a server of the link {oval} is running")
+    assert error_line(done).startswith(f"error: a server of the link {oval} is running")
 
 
 def test_quit_ends_the_server_and_prints_its_summary(name: str) -> None:
@@ -301,51 +298,6 @@ def test_in_real_time_the_car_stands_until_a_command_arrives(name: str) -> None:
         link.quit()
 
 
-@pytest.mark.parametrize(
-    ("options", "said"),
-    [
-        ({"name": "driverview"}, "begins with a slash"),
-        ({"name": "/" + "x" * 300}, "has 301 bytes"),
-        ({"track": "no-such-track"}, "no track 'no-such-track'"),
-        ({"frequency_hz": 30}, "30 Hz does not divide"),
-        ({"frequency_hz": 0}, "0 Hz does not divide"),
-        ({"lanes": 4}, "4"),
-        ({"lane_width": 9.0}, "9"),
-        ({"picture": (9999, 10)}, "9999 x 10"),
-        ({"picture": (64, 48), "light": "noon"}, "unknown light 'noon'"),
-        ({"patience_s": -1.0}, "--patience is -1"),
-        ({"patience_s": math.nan}, "--patience is nan"),
-        ({"tracks_dir": Path("/no/such/folder")}, "/no/such/folder"),
-    ],
-    ids=str,
-)
-def test_bad_server_options_are_refused(name: str, options: dict[str, Any], said: str) -> None:
-    with pytest.raises(UserError, match=said):
-        run(LinkConfig(**{"name": name, **options}), lambda text: None)
-
-
-@pytest.mark.parametrize("text", ["280", "0x10", "10x0", "ax10", "10x10x3", "-3x4", ""])
-def test_bad_image_sizes_are_refused(text: str) -> None:
-    with pytest.raises(UserError, match="give a size such as 280x210, or none"):
-        picture_size(text)
-    assert (picture_size("280x210"), picture_size("none")) == ((280, 210), (0, 0))
-
-
-@pytest.mark.parametrize(
-    ("options", "said"),
-    [
-        (("--name", "driverview"), "begins with a slash"),
-        (("--frequency", "30"), "30 Hz does not divide"),
-        (("--camera", "280"), "--camera is '280'"),
-        (("--header", "/no/such/folder/x.h"), "/no/such/folder"),
-    ],
-)
-def test_errors_of_the_link_command_are_one_line(options: tuple[str, ...], said: str) -> None:
-    done = run_server(*options)
-    assert done.returncode == 1
-    assert said in one_error(done)
-
-
 class Served:
     """A server in a thread of this process."""
 
@@ -365,14 +317,3 @@ def serving(config: LinkConfig) -> Iterator[Served]:
         yield served
     finally:
         served._pool.shutdown(wait=True)
-
-
-def run_server(*options: str) -> "subprocess.CompletedProcess[str]":
-    return typed("simulator", "link", *options)
-
-
-def one_error(done: "subprocess.CompletedProcess[str]") -> str:
-    assert "Traceback" not in done.stderr
-    errors = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
-    assert len(errors) == 1, done.stderr
-    return errors[0]
