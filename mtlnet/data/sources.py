@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from datagen.recording import Dataset, DatasetError, Frames, UndecodableImage
 from mtlnet.data.custom_images import CustomImages, has_labels_file, open_custom_images
@@ -38,6 +39,12 @@ class TrainingData:
     about: dict[str, Any]
     """The `data` field of the model card."""
 
+    def spread_images(self, count: int) -> NDArray[np.uint8]:
+        """At most `count` images (B, 210, 280, 3), evenly spread over the frames."""
+        count = min(count, len(self.frames))
+        rows = np.linspace(0, len(self.frames) - 1, count).astype(np.int64)
+        return self.frames.read_batch(rows, np.empty((count, HEIGHT, WIDTH, 3), np.uint8))
+
 
 def open_training_data(
     config: TrainConfig, init: ModelCard | None, *, checked: bool = False
@@ -67,7 +74,12 @@ def open_training_data(
         if not (checked or config.skip_undecodable):
             require_decodable(dataset.select("train"), config.data, skippable=True)
         data = recorded_training_data(dataset, skip_undecodable=config.skip_undecodable)
-    return data if init is None else continue_from_model(data, init)
+    if init is not None and data.camera != init.camera:
+        raise ModelError(
+            f"the camera of the data is {data.camera}, that of model {init.name} "
+            f"{init.camera}; a model keeps the camera it was trained for"
+        )
+    return data
 
 
 def open_training_dataset(path: Path) -> Dataset:
@@ -151,29 +163,32 @@ def select_rounds(dataset: Dataset, names: list[str]) -> Frames:
 
 
 def continue_from_model(data: TrainingData, card: ModelCard) -> TrainingData:
-    """The data for fine-tuning the model of `card`, whose training data is added to `about`.
-
-    Raises ModelError for data of another camera.
-    """
-    if data.camera != card.camera:
-        raise ModelError(
-            f"the camera of the data is {data.camera}, that of model {card.name} "
-            f"{card.camera}; a model keeps the camera it was trained for"
-        )
+    """The data for training the model of `card` on; its training data is added to `about`."""
     about = {
         **_with_seen(data.about, card.data),
-        "init": {"name": card.name, "model_hash": card.model_hash},
+        "init": _origin(card),
         "earlier": [*card.data.get("earlier", ()), _summary(card.data)],
     }
     return replace(data, about=about)
 
 
-def resume_data(config: TrainConfig, data: TrainingData, earlier: dict[str, Any]) -> TrainingData:
+def resume_data(
+    config: TrainConfig,
+    data: TrainingData,
+    earlier: dict[str, Any],
+    start: ModelCard | None = None,
+) -> TrainingData:
     """The data of a resumed run; that of its past is added to `about` when it was another.
 
-    `earlier`: the description of the run's data so far. Raises ModelError when `data` is other data
-    and `config.change_data` is not set.
+    `earlier`: the description of the run's data so far. `start`: the model whose weights the run
+    needs again, since it has no checkpoint. Raises ModelError when that is another model than at
+    first, or when `data` is other data and `config.change_data` is not set.
     """
+    if start is not None and earlier.get("init") != _origin(start):
+        raise ModelError(
+            f"{config.out} has no checkpoint, and the model {config.init} is not the one it was "
+            "started from; start a new run"
+        )
     history = list(earlier.get("earlier", ()))
     if config.change_data and data.about["content_hash"] != earlier.get("content_hash"):
         history.append(_summary(earlier))
@@ -185,6 +200,11 @@ def resume_data(config: TrainConfig, data: TrainingData, earlier: dict[str, Any]
     if "init" in earlier:  # the model that this name meant when the run was started
         about["init"] = earlier["init"]
     return replace(data, about=about)
+
+
+def _origin(card: ModelCard) -> dict[str, Any]:
+    """What a description of data says of the model that a run starts from."""
+    return {"name": card.name, "model_hash": card.model_hash}
 
 
 def _summary(data: dict[str, Any]) -> dict[str, Any]:
@@ -200,7 +220,7 @@ def _with_seen(about: dict[str, Any], earlier: dict[str, Any]) -> dict[str, Any]
 
 def require_same_data(config: TrainConfig, resumed: dict[str, Any], data: dict[str, Any]) -> None:
     """Raise ModelError unless a resumed run's data is that of its start."""
-    for name in ("content_hash", "split", "init"):
+    for name in ("content_hash", "split"):
         if resumed.get(name) != data.get(name):
             raise ModelError(
                 f"the {name.replace('_', ' ')} of {config.data} is not the one {config.out} was "

@@ -14,9 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import cv2
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 
@@ -24,10 +22,15 @@ from datagen.recording import Frames
 from mtlnet.data.gpu_cache import cache_if_it_fits
 from mtlnet.data.loader import Loader
 from mtlnet.data.road_ahead import RoadAhead, hard_frame_repeats
-from mtlnet.data.sources import TrainingData, open_training_data, resume_data
+from mtlnet.data.sources import (
+    TrainingData,
+    continue_from_model,
+    open_training_data,
+    resume_data,
+)
 from mtlnet.export.publish import Provenance, publish
 from mtlnet.inference.model_card import RUNS, ModelCard, read_card
-from mtlnet.model.architecture import HEIGHT, WIDTH, find_architecture
+from mtlnet.model.architecture import find_architecture
 from mtlnet.model.network import fold
 from mtlnet.model.pretrained import load_pretrained
 from mtlnet.training.checkpoint import list_checkpoints, load_checkpoint
@@ -54,8 +57,6 @@ EXPORT_CHECK_FRAMES = 16
 """Frames on which the exported graph is compared with torch."""
 PRETRAINED_FRAMES = 128
 """Frames that measure the statistics of batch normalisation for a finished model."""
-FINE_TUNE_MIN_STD = (0.15,) * 5 + (0.03,)
-"""Lower bounds of the heads' units (6,), those of varied driving: a few images may be all alike."""
 
 
 def start_training(options: Mapping[str, Any], out: Path | None, *, resume: bool) -> dict[str, Any]:
@@ -180,10 +181,14 @@ def _train(
         require_new(config.out)
     init = None if config.init is None else open_pretrained(config.init)
     data = open_training_data(config, init[1] if init else None, checked=checked)
+    if resumed is not None and list_checkpoints(config.out):
+        init = None  # its weights have been replaced since
+    if resumed is not None:
+        data = resume_data(config, data, resumed, init[1] if init else None)
+    elif init is not None:
+        data = continue_from_model(data, init[1])
     if resumed is None and rank.is_first:
         create_run(config, find_recipe(config.recipe), data.about)
-    if resumed is not None:
-        data = resume_data(config, data, resumed)
     configure_cpu(config, rank)
     with locked_folder(config.out) if rank.is_first else nullcontext():
         trainer, loader = prepare(config, data, init, device, rank)
@@ -269,7 +274,10 @@ def prepare(
     device: torch.device,
     rank: Rank,
 ) -> tuple[Trainer, Loader]:
-    """The trainer before its first step, with the weights of the model `init`, and the batches."""
+    """The trainer before its first step, with the weights of the model `init`, and the batches.
+
+    `init` None: new weights, or those of a checkpoint, which is yet to be read.
+    """
     recipe = find_recipe(config.recipe)
     steps_per_epoch = max(len(data.frames) // config.batch, 1)
     trainer = Trainer(
@@ -280,7 +288,7 @@ def prepare(
         find_architecture(config.network),
         task_weighting=TaskWeighting(config.balance, config.alpha, device, steps_per_epoch),
         rank=rank,
-        folded=init is not None and not recipe.batch_norm,
+        folded=config.init is not None and not recipe.batch_norm,
     )
     loader = Loader(
         data.frames,
@@ -292,12 +300,10 @@ def prepare(
         ahead=None if trainer.network.auxiliary is None else road_ahead(data, device),
         repeats=hard_frame_repeats(data.frames, recipe.hard_repeats),
     )
-    if init is None:
-        trainer.standardise(loader)
-    else:
+    trainer.standardise(loader, fine_tune=config.init is not None)
+    if init is not None:
         run, card = init
-        trainer.standardise(loader, FINE_TUNE_MIN_STD)
-        images = spread_images(data, PRETRAINED_FRAMES) if recipe.batch_norm else None
+        images = data.spread_images(PRETRAINED_FRAMES) if recipe.batch_norm else None
         load_pretrained(trainer.network, run, images, card.network)
     return trainer, loader
 
@@ -309,16 +315,9 @@ def road_ahead(data: TrainingData, device: torch.device) -> RoadAhead | None:
     return RoadAhead(data.frames, data.camera, keep=device.type != "cpu")
 
 
-def spread_images(data: TrainingData, count: int) -> NDArray[np.uint8]:
-    """At most `count` images (B, 210, 280, 3), evenly spread over the training data."""
-    count = min(count, len(data.frames))
-    rows = np.linspace(0, len(data.frames) - 1, count).astype(np.int64)
-    return data.frames.read_batch(rows, np.empty((count, HEIGHT, WIDTH, 3), np.uint8))
-
-
 def finish(config: TrainConfig, trainer: Trainer, data: TrainingData) -> ModelCard:
     """Publish the trained network in the run's folder."""
-    images = spread_images(data, EXPORT_CHECK_FRAMES)
+    images = data.spread_images(EXPORT_CHECK_FRAMES)
     provenance = Provenance(
         camera=data.camera,
         alpha=config.alpha,

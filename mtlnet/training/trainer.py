@@ -27,6 +27,9 @@ from mtlnet.training.task_weighting import TaskWeighting
 from trackfeatures.errors import UserError
 
 MIN_TARGET_STD = (0.01,) * 6
+FINE_TUNE_MIN_STD = (0.15,) * 5 + (0.03,)
+"""Lower bounds of the heads' units (6,); to fine-tune, those of varied driving: a few images may be
+all alike."""
 MIN_STEPS_BEFORE_BN_FREEZE = 100
 """Steps until the running statistics of batch normalisation no longer depend on the first weights.
 """
@@ -88,16 +91,17 @@ class Trainer:
         if self.recipe.dropout:
             torch.manual_seed(dropout_seed(self.seed, self.rank.index, self.step_number))
 
-    def standardise(self, loader: Loader, min_std: Sequence[float] = MIN_TARGET_STD) -> None:
+    def standardise(self, loader: Loader, *, fine_tune: bool = False) -> None:
         """Set the heads' units to the mean and standard deviation of the training targets.
 
-        `min_std` (6,): lower bounds of the standard deviations.
+        `fine_tune`: the training starts from a finished model, perhaps on few images.
         """
         if not self.recipe.standardise:
             return
         coded = torch.from_numpy(loader.coded).double()
         mean, std = coded.mean(0), coded.std(0, correction=0)
-        std = std.clamp_min(torch.tensor(min_std, dtype=std.dtype))
+        least = FINE_TUNE_MIN_STD if fine_tune else MIN_TARGET_STD
+        std = std.clamp_min(torch.tensor(least, dtype=std.dtype))
         self.network.target_mean.copy_(mean)
         self.network.target_std.copy_(std)
         self.target_variance = (std**2).float().to(self.device)

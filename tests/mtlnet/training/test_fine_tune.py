@@ -148,10 +148,10 @@ def test_wrong_options_are_refused(
     )
     with pytest.raises(UserError, match="torchvision's networks cannot be put back"):
         open_training_data(pooled, replace(card, network="regnet_y_400mf"))
-    material = custom_training_data(custom_images, card)
-    other = replace(material, camera=replace(card.camera, z=1.4))
+    other = replace(card, camera=replace(card.camera, z=1.4))
+    tuned = TrainConfig(dataset, tmp_path / "e", recipe="tune", init="x", network=card.network)
     with pytest.raises(UserError, match=r"0, 1\.4\) m.*keeps the camera"):
-        continue_from_model(other, card)
+        open_training_data(tuned, other)
 
 
 def test_the_card_lists_the_seeds_and_tracks_of_both_trainings(

@@ -1,5 +1,6 @@
 """A run that was stopped or killed goes on, and its weights are those of an uninterrupted one."""
 
+import shutil
 import signal
 import subprocess
 import sys
@@ -190,3 +191,20 @@ def test_a_run_from_a_model_continues_on_other_data_and_names_that_model(
     hashes = [data["content_hash"] for data in changed["earlier"]]
     assert hashes == [model.data["content_hash"], first["content_hash"]]
     assert changed["content_hash"] == Dataset.open(other_dataset).content_hash
+
+
+@pytest.mark.usefixtures("small_network")
+def test_a_run_is_resumed_though_its_model_has_been_replaced(dataset: Path, tmp_path: Path) -> None:
+    """As `default` is by a new version. Without a checkpoint the run would need the old weights."""
+    train(training_config(dataset, tmp_path / "model", iterations=1), None)
+    options = {"recipe": "continue", "init": str(tmp_path / "model"), "iterations": 1}
+    run = training_config(dataset, tmp_path / "run", **options)
+    first = train(run, None).data
+    shutil.rmtree(tmp_path / "model")
+    train(training_config(dataset, tmp_path / "model", iterations=1, seed=8), None)
+    card = train(*resume_config(run.out, {"iterations": 2}))
+    assert (card.iterations, card.data) == (2, first)
+    for checkpoint in list_checkpoints(run.out):
+        checkpoint.unlink()
+    with pytest.raises(ModelError, match=r"has no checkpoint, and the model .* is not the one"):
+        train(*resume_config(run.out, {"iterations": 3}))
