@@ -51,7 +51,7 @@ class Deviations(Distances):
 
 
 class AbsentProbabilities(BaseModel):
-    """Probability that each marking is absent; above 0.54 (`l`, `r`: 0.9) its distance is null."""
+    """Probability that each marking is absent; above 0.54 (`l`, `r`: 0.75) a distance is null."""
 
     ml: float = Field(description="equal to that of mr: a lane has both or none")
     mr: float = Field(description="right marking of the car's lane")

@@ -106,7 +106,7 @@ def test_both_markings_of_the_lane_are_absent_together() -> None:
     [
         (0.5, [False, False, False, False, False]),
         (0.7, [True, True, False, True, False]),
-        (0.95, [True, True, True, True, True]),
+        (0.8, [True, True, True, True, True]),
     ],
 )
 def test_the_outer_markings_are_absent_above_a_higher_probability(
