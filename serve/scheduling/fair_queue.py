@@ -125,7 +125,7 @@ class FairQueue:
 
 
 class FairLock:
-    """A lock of coroutines of one event loop, for which clients take turns."""
+    """A lock for the coroutines of one event loop; clients that wait take turns."""
 
     def __init__(self) -> None:
         self._locked = False

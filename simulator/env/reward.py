@@ -19,7 +19,6 @@ Ending = Literal["off_track", "backwards", "collision"]
 
 ENDINGS: tuple[Ending, ...] = get_args(Ending)
 OFF_TRACK_REWARD = -2.0
-STEERING_LOCK = CarParameters.steering_lock  # rad of the front wheels at steer = 1
 
 Reward = Callable[[CarState, Road, Ending | None], float]
 """Reward function of (state after the step, road, why the episode ends or None)."""
@@ -65,7 +64,7 @@ def quadratic_reward(offset: float, angle: float, steer: float, ended: bool) -> 
     """
     if ended:
         return OFF_TRACK_REWARD
-    delta = steer * STEERING_LOCK
+    delta = steer * CarParameters.steering_lock
     return -(0.3 * offset * offset + angle * angle + 0.03 * delta * delta)
 
 

@@ -45,12 +45,12 @@ def test_one_that_gives_up_is_passed_over() -> None:
 
 
 def test_a_turn_that_comes_to_one_that_was_cancelled_goes_on() -> None:
-    async def run() -> None:
+    async def run() -> bool:
         lock = FairLock()
 
         async def hold() -> None:
             async with lock.held("10.0.0.1"):
-                pass
+                raise AssertionError
 
         async with lock.held("10.0.0.2"):
             task = asyncio.create_task(hold())
@@ -59,6 +59,6 @@ def test_a_turn_that_comes_to_one_that_was_cancelled_goes_on() -> None:
         with suppress(asyncio.CancelledError):
             await task
         async with asyncio.timeout(5), lock.held("10.0.0.3"):
-            pass
+            return task.cancelled()
 
-    asyncio.run(run())
+    assert asyncio.run(run())

@@ -13,8 +13,9 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import simulator.env  # registers the names
-from simulator.env.reward import STEERING_LOCK, quadratic_reward, step_reward
+from simulator.env.reward import quadratic_reward, step_reward
 from simulator.sensors import Sensor
+from simulator.vehicle.car import CarParameters
 from trackfeatures.errors import UserError
 
 STATE_ID = "driverview/LateralControl-v0"
@@ -102,7 +103,7 @@ def test_reward_equals_hand_computed_values() -> None:
 
 
 def test_the_papers_quadratic_reward() -> None:
-    expected = -(0.3 * 0.01 + 0.0004 + 0.03 * (0.5 * STEERING_LOCK) ** 2)
+    expected = -(0.3 * 0.01 + 0.0004 + 0.03 * (0.5 * CarParameters.steering_lock) ** 2)
     assert quadratic_reward(-0.1, 0.02, -0.5, ended=False) == pytest.approx(expected)
     assert quadratic_reward(0.0, 0.0, 0.0, ended=True) == -2.0
 
