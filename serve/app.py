@@ -29,6 +29,7 @@ from serve.api.problems import Problem, install_problem_handlers
 from serve.api.request_options import Headers, check_token, request_id_of
 from serve.api.stream import Stream
 from serve.config import Limits
+from serve.observability.logs import RefusalLog
 from serve.observability.metrics import MEDIA_TYPE, Metrics
 from serve.scheduling.body_budget import BodyBudget
 from serve.scheduling.frame_queue import FrameQueue
@@ -67,18 +68,18 @@ class Service:
         self.limits = limits or Limits()
         self.shared = shared or create_shared_memory(1)
         streams = StreamTable(self.shared.streams())
-        workers = max(1, self.shared.blocks - 1)  # the last block is for a worker that replaces one
+        workers = self.shared.workers
         self.frame_queue = FrameQueue(
             engine, check, streams, self.limits.queue, single_core=_cores() < 2 * workers
         )
         self.metrics = Metrics(self.shared, block)
         self.bodies = BodyBudget(self.shared, block, self.limits.body_mib << 20)
-        self.frames = FrameHandler(
-            self.frame_queue, self.metrics, self.limits.log_answers, self.bodies
-        )
+        refusals, log_answers = RefusalLog(workers), self.limits.log_answers
+        parts = (self.frame_queue, self.metrics, self.bodies, refusals, log_answers)
+        self.frames = FrameHandler(*parts)
         self._make_request: RequestFactory = FeaturesRequest
         if tracer is not None:
-            self.frames, self._make_request = _traced(self, tracer)
+            self.frames, self._make_request = _traced(tracer, parts)
         self.features = FeaturesEndpoint(self.frames, self._make_request)
         self.rate_limiter = RateLimiter(self.shared.clients(), self.limits.rate)
         self._hosts = HostCheck(self.limits)
@@ -155,11 +156,10 @@ class Service:
         return problem_reply(problem)
 
 
-def _traced(service: Service, tracer: "Tracer") -> tuple[FrameHandler, RequestFactory]:
+def _traced(tracer: "Tracer", parts: tuple[Any, ...]) -> tuple[FrameHandler, RequestFactory]:
     from serve.observability.tracing import TracedFeaturesRequest, TracedFrameHandler
 
-    arguments = (service.frame_queue, service.metrics, service.limits.log_answers, service.bodies)
-    return TracedFrameHandler(tracer, *arguments), partial(TracedFeaturesRequest, tracer)
+    return TracedFrameHandler(tracer, *parts), partial(TracedFeaturesRequest, tracer)
 
 
 def _traced_apps(tracer: "Tracer", *apps: App) -> list[App]:

@@ -52,12 +52,17 @@ class FrameHandler:
     """What every endpoint does with a frame: queue it, count its result, log it."""
 
     def __init__(
-        self, queue: FrameQueue, metrics: Metrics, log_answers: bool, bodies: BodyBudget
+        self,
+        queue: FrameQueue,
+        metrics: Metrics,
+        bodies: BodyBudget,
+        refusals: RefusalLog,
+        log_answers: bool,
     ) -> None:
         self.queue = queue
         self._bodies = bodies
         self._metrics = metrics
-        self.refusals = RefusalLog()
+        self.refusals = refusals
         self._log_answers = log_answers
 
     def share(self) -> BodyShare:

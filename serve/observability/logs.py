@@ -2,7 +2,8 @@
 
 No client can fill the disk: its refusals, for its token, Host, Origin or rate too, are logged once
 a second, those of all clients ten times; the same error, and what native libraries write to
-stderr, once a second. The number of those left out is in the next one logged, as `untold`.
+stderr, once a second. Each of several workers has its share of these rates. The number of those
+left out is in the next one logged, as `untold`.
 """
 
 import faulthandler
@@ -49,14 +50,15 @@ class JsonFormatter(logging.Formatter):
 
 
 class Interval:
-    """Passes each key at most once in INTERVAL_S."""
+    """Passes each key at most once in INTERVAL_S, in each of `workers` processes more seldom."""
 
-    def __init__(self) -> None:
+    def __init__(self, workers: int = 1) -> None:
+        self._interval_s = INTERVAL_S * workers
         self._last_s: dict[str, float] = {}
 
     def passes(self, key: str, now: float) -> bool:
         """Whether `key` is due; then it counts as seen at `now`, s."""
-        if now - self._last_s.get(key, -INTERVAL_S) < INTERVAL_S:
+        if now - self._last_s.get(key, -self._interval_s) < self._interval_s:
             return False
         if len(self._last_s) >= REMEMBERED:
             self._last_s.clear()
@@ -67,9 +69,9 @@ class Interval:
 class ErrorLimit(logging.Filter):
     """Passes a warning or an error once in INTERVAL_S, whatever its arguments."""
 
-    def __init__(self) -> None:
+    def __init__(self, workers: int = 1) -> None:
         super().__init__()
-        self._interval, self._suppressed = Interval(), 0
+        self._interval, self._suppressed = Interval(workers), 0
 
     def filter(self, record: logging.LogRecord) -> bool:
         """Whether a record is logged."""
@@ -83,11 +85,11 @@ class ErrorLimit(logging.Filter):
         return True
 
 
-def set_up() -> None:
-    """Configure logging to stderr."""
+def set_up(workers: int = 1) -> None:
+    """Configure logging to stderr, of one of `workers` processes."""
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(JsonFormatter())
-    handler.addFilter(ErrorLimit())
+    handler.addFilter(ErrorLimit(workers))
     logging.basicConfig(handlers=[handler], level=logging.WARNING)
     logging.getLogger("serve").setLevel(logging.INFO)
     # Errors of clients are in the lines of this module.
@@ -118,15 +120,17 @@ def _log_native_lines(reader: int) -> None:
 class RefusalLog:
     """Logs refused requests, limited by a token bucket and by client."""
 
-    def __init__(self) -> None:
-        self._tokens, self._updated_s, self._suppressed = REFUSALS_PER_S, time.monotonic(), 0
-        self._clients = Interval()
+    def __init__(self, workers: int = 1) -> None:
+        self._rate = REFUSALS_PER_S / workers
+        self._most = max(self._rate, 1.0)
+        self._tokens, self._updated_s, self._suppressed = self._most, time.monotonic(), 0
+        self._clients = Interval(workers)
 
     def log(self, request_id: str, client: str, problem: "Problem") -> None:
         """Log a refused request, or only count it when there were too many."""
         now = time.monotonic()
         elapsed_s = now - self._updated_s
-        self._tokens = min(REFUSALS_PER_S, self._tokens + elapsed_s * REFUSALS_PER_S)
+        self._tokens = min(self._most, self._tokens + elapsed_s * self._rate)
         self._updated_s = now
         if self._tokens < 1.0 or not self._clients.passes(network_of(client), now):
             self._suppressed += 1

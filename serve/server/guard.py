@@ -57,6 +57,8 @@ class ConnectionGuard:
     limits: Limits
     other_connections: Callable[[], int] = lambda: 0
     """Counts the connections of the other workers."""
+    ask_for_room: Callable[[int, int], None] = lambda _excess, _least: None
+    """Asks another worker to end connections; arguments as of `make_room`."""
     count_closed: Callable[[ProblemType], None] = lambda _type: None
     bodies: BodyBudget | None = None
     """The budget for messages of WebSockets that are incomplete; None: there is none."""
@@ -108,13 +110,12 @@ class ConnectionGuard:
             if not self.open[connection.network]:
                 del self.open[connection.network]
 
-    def make_room(self, excess: int, newcomer: Guarded) -> bool:
+    def make_room(self, excess: int, least: int) -> bool:
         """End `excess` connections, the least useful first; False: not so many give way.
 
-        Those of clients with fewer connections than the newcomer's stay; when all others are too
-        young, those of clients with more are ended.
+        `least`: how many connections the newcomer's client has. Those of clients with fewer stay;
+        when all others are too young, those of clients with more are ended.
         """
-        least = self._count(newcomer)
         for group, age_s, count in (
             (self.dismissed, 0.0, 0),
             (self.receiving, EVICTABLE_S, least),
@@ -134,7 +135,7 @@ class ConnectionGuard:
         for connection in list(group):
             if ended == most or now - connection.since_s < age_s:
                 break
-            if self._count(connection) < count:
+            if self.count(connection) < count:
                 continue
             connection.give_way()
             self.place(connection, self.leaving)
@@ -142,7 +143,7 @@ class ConnectionGuard:
             ended += 1
         return ended
 
-    def _count(self, connection: Guarded) -> int:
+    def count(self, connection: Guarded) -> int:
         """How many connections its client has; a trusted proxy counts as many clients."""
         return self.open[connection.network] if connection.network else 1
 

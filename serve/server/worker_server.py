@@ -46,6 +46,7 @@ class WorkerServer(uvicorn.Server):
         self.guard = ConnectionGuard(
             limits,
             other_connections=lambda: sum(self._peers.other_connections()),
+            ask_for_room=lambda excess, least: self._peers.ask_for_room(excess, least),
             count_closed=app.metrics.count_closed,
             bodies=app.bodies,
         )
@@ -89,8 +90,11 @@ class WorkerServer(uvicorn.Server):
         self.started = True
 
     async def on_tick(self, counter: int) -> bool:
-        """Close expired connections and publish the status; called ten times a second."""
+        """Close expired connections, and those in whose place another worker needs room; publish
+        the status; called ten times a second."""
         close_expired(self.server_state.connections, self.guard.clock())
+        for excess, least in self._peers.room_asked():
+            self.guard.make_room(excess, least)
         self._publish_status()
         if counter % TRIM_TICKS == 0:
             self._loop.run_in_executor(None, self._trim_heap)

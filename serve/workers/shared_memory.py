@@ -25,6 +25,7 @@ COMMITTED_GENERATION = 0  # head: the generation of weights that all workers ans
 WORKER_WORDS = 256
 HEARTBEAT, CONNECTIONS, WAITING, READY = 0, 1, 2, 3  # monotonic s; counts; 1.0 or 0.0
 BODY_BYTES = 4  # of bodies in flight
+ROOM_ASKED, ROOM_FOR = 5, 6  # connections that others were asked to end; those of the newcomer
 MAX_OUTCOMES = 64
 STAGES, STAGE_WORDS = 4, 16
 FRAME_COUNTS = 8  # MAX_OUTCOMES counters: frames by outcome
@@ -45,6 +46,11 @@ class SharedMemory:
     fd: int
     blocks: int
     memory: mmap.mmap
+
+    @property
+    def workers(self) -> int:
+        """How many workers run, but for the moment in which a new one replaces another."""
+        return max(1, self.blocks - 1)
 
     def head(self) -> "memoryview[int]":
         """The head, unsigned integers (HEAD_WORDS,)."""
@@ -98,6 +104,7 @@ class WorkerPeers:
         blocks = [shared.worker(number) for number in range(shared.blocks)]
         self._own = blocks[block]
         self._others = [cells for number, cells in enumerate(blocks) if number != block]
+        self._room_asked = [cells[ROOM_ASKED] for cells in self._others]
 
     def publish(self, connections: int, ready: bool) -> None:
         """Write this worker's status and heartbeat."""
@@ -113,6 +120,20 @@ class WorkerPeers:
     def other_connections(self) -> list[int]:
         """The number of open connections of each other live worker."""
         return [int(cells[CONNECTIONS]) for cells in self._live()]
+
+    def ask_for_room(self, excess: int, least: int) -> None:
+        """Ask the worker with the most connections to end `excess` of them, of clients that have
+        `least` or more there."""
+        self._own[ROOM_FOR] = least
+        self._own[ROOM_ASKED] += excess
+
+    def room_asked(self) -> list[tuple[int, int]]:
+        """What others asked of this worker since the last call, as (excess, least)."""
+        before, self._room_asked = self._room_asked, [cells[ROOM_ASKED] for cells in self._others]
+        if self._own[CONNECTIONS] < max(self.other_connections(), default=0):
+            return []
+        each = zip(self._others, before, self._room_asked, strict=True)
+        return [(int(now - old), int(cells[ROOM_FOR])) for cells, old, now in each if now > old]
 
     def other_is_ready(self) -> bool:
         """Whether another live worker can answer images."""

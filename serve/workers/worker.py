@@ -68,20 +68,20 @@ class SupervisorConnection:
 def main() -> None:
     """Run one worker until its supervisor or SIGTERM stops it."""
     logs.capture_native_lines()
-    logs.set_up()
     supervisor = SupervisorConnection(int(sys.argv[1]))
     lines = supervisor.lines()
     line = next(lines, None)
     if line is None:
         return
     task = WorkerTask.from_json_line(line)
+    shared = attach_shared_memory(task.memory, task.blocks)
+    logs.set_up(shared.workers)
     try:
         engine = load(Path(task.folder), task.expected)
     except UserError as error:
         supervisor.send(failed=task.generation, why=str(error))
         return
     supervisor.send_loaded(task.generation, engine)
-    shared = attach_shared_memory(task.memory, task.blocks)
     app = Service(engine, warm_up, task.limits, shared, task.block, telemetry.tracer())
     app.frame_queue.on_warm(lambda: send_ready(supervisor))
     peers = WorkerPeers(shared, task.block)

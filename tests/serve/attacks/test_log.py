@@ -129,6 +129,27 @@ def test_the_addresses_of_one_client_share_its_line(caplog: pytest.LogCaptureFix
     assert len(caplog.records) == 1
 
 
+def test_several_workers_share_the_rates_of_the_log(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = [0.0]
+    monkeypatch.setattr(time, "monotonic", lambda: now[0])
+    workers = [RefusalLog(4) for _ in range(4)]
+    with caplog.at_level(logging.INFO):
+        for step in range(800):  # 8 s
+            now[0] = step / 100
+            for refusals in workers:
+                refusals.log("1", "192.0.2.1", Problem(UNAUTHORIZED, "no token"))
+        assert len(caplog.records) == 8
+        caplog.clear()
+        for step in range(800, 1600):
+            now[0] = step / 100
+            for number, refusals in enumerate(workers):
+                client = f"10.{step // 250}.{step % 250}.{number}"
+                refusals.log("1", client, Problem(UNAUTHORIZED, "no token"))
+        assert 72 <= len(caplog.records) <= 90  # ten a second, and what had been saved up
+
+
 def test_the_same_error_is_logged_once_a_second() -> None:
     found = Interval()
     assert [found.passes("a", now) for now in (0.0, 0.5, 0.99, 1.0, 1.5)] == [

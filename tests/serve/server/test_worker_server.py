@@ -5,6 +5,7 @@ import time
 
 import pytest
 
+from serve.config import Limits
 from serve.server import worker_server
 from serve.server.worker_server import WorkerServer
 from serve.workers import shared_memory
@@ -13,6 +14,7 @@ from tests.serve.conftest import (
     PATIENCE_S,
     FakeEngine,
     Served,
+    assert_problem,
     jpeg,
     outputs,
     picture,
@@ -67,6 +69,34 @@ def test_while_no_worker_is_ready_requests_are_refused() -> None:
     ):
         assert ask_each(make_clients(one.port)) == [503] * 8
         warm.set()
+
+
+def test_a_worker_with_the_most_connections_ends_idle_ones_for_another() -> None:
+    memory = shared_memory.create_shared_memory(blocks=2)
+    engine = FakeEngine(lambda _image: outputs())
+    limits = Limits(connections=4)
+    with serving(engine, limits=limits, shared=memory) as one:
+        idle = [Served(one.port) for _ in range(4)]
+        assert ask_each(idle) == [200] * 4
+        with serving(engine, limits=limits, shared=memory, block=1, beside=one) as two:
+            until(lambda: WorkerPeers(memory, 1).other_connections() == [4])
+            refused = Served(two.port).post(JPEG)  # accepted by two, which has none to end
+            assert_problem(refused, 503, "too-many-connections")
+            until(lambda: WorkerPeers(memory, 1).other_connections() == [3])
+            assert Served(two.port).post(JPEG).status == 200
+            assert ask_each(idle[1:]) == [200] * 3
+
+
+def test_room_is_asked_of_the_worker_with_the_most_connections_once() -> None:
+    memory = shared_memory.create_shared_memory(blocks=3)
+    few, many, full = (WorkerPeers(memory, block) for block in range(3))
+    for peers, connections in ((few, 1), (many, 5), (full, 3)):
+        peers.publish(connections, ready=True)
+    full.ask_for_room(2, least=4)
+    assert (few.room_asked(), many.room_asked()) == ([], [(2, 4)])
+    few.publish(9, ready=True)
+    assert (few.room_asked(), many.room_asked()) == ([], [])
+    assert WorkerPeers(memory, 0).room_asked() == []  # restarted in its block
 
 
 def test_many_connections_at_once_are_accepted_one_after_the_other(
