@@ -82,7 +82,7 @@ class GuardedProtocol(HttpToolsProtocol):
         guard, limit = self._guard, self._guard.limits.connections
         count = len(self.connections) - len(guard.leaving) + guard.other_connections()
         if count > limit and not guard.make_room(count - limit, guard.count(self)):
-            guard.ask_for_room(count - limit, guard.count(self))
+            guard.ask_for_room(guard.count(self))
             detail = f"{limit} connections are open; use one connection for all requests"
             self._close_with(Problem(TOO_MANY_CONNECTIONS, detail))
 

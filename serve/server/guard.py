@@ -57,8 +57,8 @@ class ConnectionGuard:
     limits: Limits
     other_connections: Callable[[], int] = lambda: 0
     """Counts the connections of the other workers."""
-    ask_for_room: Callable[[int, int], None] = lambda _excess, _least: None
-    """Asks another worker to end connections; arguments as of `make_room`."""
+    ask_for_room: Callable[[int], None] = lambda _least: None
+    """Asks another worker to end a connection; `least` as in `make_room`."""
     count_closed: Callable[[ProblemType], None] = lambda _type: None
     bodies: BodyBudget | None = None
     """The budget for messages of WebSockets that are incomplete; None: there is none."""

@@ -46,7 +46,7 @@ class WorkerServer(uvicorn.Server):
         self.guard = ConnectionGuard(
             limits,
             other_connections=lambda: sum(self._peers.other_connections()),
-            ask_for_room=lambda excess, least: self._peers.ask_for_room(excess, least),
+            ask_for_room=lambda least: self._peers.ask_for_room(least),
             count_closed=app.metrics.count_closed,
             bodies=app.bodies,
         )
@@ -90,11 +90,10 @@ class WorkerServer(uvicorn.Server):
         self.started = True
 
     async def on_tick(self, counter: int) -> bool:
-        """Close expired connections, and those in whose place another worker needs room; publish
+        """Close expired connections, and one if another worker had no room for a client; publish
         the status; called ten times a second."""
         close_expired(self.server_state.connections, self.guard.clock())
-        for excess, least in self._peers.room_asked():
-            self.guard.make_room(excess, least)
+        self._make_room_for_others()
         self._publish_status()
         if counter % TRIM_TICKS == 0:
             self._loop.run_in_executor(None, self._trim_heap)
@@ -116,6 +115,13 @@ class WorkerServer(uvicorn.Server):
             isinstance(connection, GuardedProtocol) and connection.active
             for connection in self.server_state.connections
         )
+
+    def _make_room_for_others(self) -> None:
+        least = self._peers.room_asked()
+        count = len(self.server_state.connections) + self.guard.other_connections()
+        if least is not None and count >= self.guard.limits.connections:
+            # One at a time, however many ask: refused clients must not end all idle ones at once.
+            self.guard.make_room(1, least)
 
     def _start_accepting(self) -> None:
         self._loop.add_reader(self._listener.fileno(), self._accept)

@@ -25,7 +25,7 @@ COMMITTED_GENERATION = 0  # head: the generation of weights that all workers ans
 WORKER_WORDS = 256
 HEARTBEAT, CONNECTIONS, WAITING, READY = 0, 1, 2, 3  # monotonic s; counts; 1.0 or 0.0
 BODY_BYTES = 4  # of bodies in flight
-ROOM_ASKED, ROOM_FOR = 5, 6  # connections that others were asked to end; those of the newcomer
+ROOM_ASKED, ROOM_FOR = 5, 6  # how often others were asked for room; the newcomer's connections
 MAX_OUTCOMES = 64
 STAGES, STAGE_WORDS = 4, 16
 FRAME_COUNTS = 8  # MAX_OUTCOMES counters: frames by outcome
@@ -121,19 +121,19 @@ class WorkerPeers:
         """The number of open connections of each other live worker."""
         return [int(cells[CONNECTIONS]) for cells in self._live()]
 
-    def ask_for_room(self, excess: int, least: int) -> None:
-        """Ask the worker with the most connections to end `excess` of them, of clients that have
-        `least` or more there."""
+    def ask_for_room(self, least: int) -> None:
+        """Ask the worker with the most connections to end one, of a client that has `least`."""
         self._own[ROOM_FOR] = least
-        self._own[ROOM_ASKED] += excess
+        self._own[ROOM_ASKED] += 1
 
-    def room_asked(self) -> list[tuple[int, int]]:
-        """What others asked of this worker since the last call, as (excess, least)."""
+    def room_asked(self) -> int | None:
+        """`least`, if another has asked this worker for room since the last call."""
         before, self._room_asked = self._room_asked, [cells[ROOM_ASKED] for cells in self._others]
         if self._own[CONNECTIONS] < max(self.other_connections(), default=0):
-            return []
+            return None
         each = zip(self._others, before, self._room_asked, strict=True)
-        return [(int(now - old), int(cells[ROOM_FOR])) for cells, old, now in each if now > old]
+        asked = (int(cells[ROOM_FOR]) for cells, old, now in each if now > old)
+        return min(asked, default=None)
 
     def other_is_ready(self) -> bool:
         """Whether another live worker can answer images."""

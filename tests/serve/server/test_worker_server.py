@@ -71,7 +71,9 @@ def test_while_no_worker_is_ready_requests_are_refused() -> None:
         warm.set()
 
 
-def test_a_worker_with_the_most_connections_ends_idle_ones_for_another() -> None:
+def test_a_worker_with_the_most_connections_ends_idle_ones_for_another(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     memory = shared_memory.create_shared_memory(blocks=2)
     engine = FakeEngine(lambda _image: outputs())
     limits = Limits(connections=4)
@@ -80,6 +82,7 @@ def test_a_worker_with_the_most_connections_ends_idle_ones_for_another() -> None
         assert ask_each(idle) == [200] * 4
         with serving(engine, limits=limits, shared=memory, block=1, beside=one) as two:
             until(lambda: WorkerPeers(memory, 1).other_connections() == [4])
+            monkeypatch.setattr(worker_server, "YIELD_S", PATIENCE_S)  # one leaves clients to two
             refused = Served(two.port).post(JPEG)  # accepted by two, which has none to end
             assert_problem(refused, 503, "too-many-connections")
             until(lambda: WorkerPeers(memory, 1).other_connections() == [3])
@@ -87,16 +90,34 @@ def test_a_worker_with_the_most_connections_ends_idle_ones_for_another() -> None
             assert ask_each(idle[1:]) == [200] * 3
 
 
+def test_refused_clients_end_one_idle_connection_at_a_time() -> None:
+    memory = shared_memory.create_shared_memory(blocks=2)
+    engine = FakeEngine(lambda _image: outputs())
+    with serving(engine, limits=Limits(connections=4), shared=memory) as one:
+        idle = [Served(one.port) for _ in range(4)]
+        assert ask_each(idle) == [200] * 4
+        other = WorkerPeers(memory, 1)
+        until(lambda: other.other_connections() == [4])
+        for _ in range(3):
+            other.ask_for_room(least=1)
+        until(lambda: other.other_connections() == [3])
+        other.ask_for_room(least=1)  # there is room now
+        one.wait_for_tick()
+        assert other.other_connections() == [3]
+        assert ask_each(idle[1:]) == [200] * 3
+
+
 def test_room_is_asked_of_the_worker_with_the_most_connections_once() -> None:
     memory = shared_memory.create_shared_memory(blocks=3)
     few, many, full = (WorkerPeers(memory, block) for block in range(3))
     for peers, connections in ((few, 1), (many, 5), (full, 3)):
         peers.publish(connections, ready=True)
-    full.ask_for_room(2, least=4)
-    assert (few.room_asked(), many.room_asked()) == ([], [(2, 4)])
+    full.ask_for_room(least=4)
+    few.ask_for_room(least=2)
+    assert (few.room_asked(), many.room_asked()) == (None, 2)
     few.publish(9, ready=True)
-    assert (few.room_asked(), many.room_asked()) == ([], [])
-    assert WorkerPeers(memory, 0).room_asked() == []  # restarted in its block
+    assert (few.room_asked(), many.room_asked()) == (None, None)
+    assert WorkerPeers(memory, 0).room_asked() is None  # restarted in its block
 
 
 def test_many_connections_at_once_are_accepted_one_after_the_other(
