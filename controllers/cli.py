@@ -115,8 +115,8 @@ def drive(
     """Drive closed loop from 25 m before the line, at rest, and print the score.
 
     Gear 1 and the throttle are held, except behind slower traffic; with --speed, the speed. The
-    score is the sum of the rewards over the steps requested; leaving the track, turning round or a
-    collision ends the drive.
+    score is the sum of the rewards over the steps requested; leaving the track, turning round,
+    rolling backwards or a collision ends the drive.
     """
     config = DriveConfig(
         controller=controller,
