@@ -63,9 +63,9 @@ def run_demo(config: DemoConfig) -> DemoResult:
     data, run = str(config.out / "data"), str(config.out / "run")
     collect = ["datagen", "collect", "--out", data, "--json"]
     collect += ["--rounds", str(config.rounds), "--frames", str(config.frames)]
-    # Another scenery in every frame trains best in so short a time; of four a round, since one is
-    # the default for rounds of this length.
-    collect += ["--stretch", "1", "--scenes", "4"]
+    # Another scenery in every frame, and frames far apart, train best in so short a time
+    # (EXPERIMENTS); four sceneries a round, since one is the default for rounds of this length.
+    collect += ["--frequency", "4", "--stretch", "1", "--scenes", "4"]
     collect += ["--split-test-share", f"{TEST_SHARE:g}"]
     collect += ["--tracks", config.tracks, "--seed", str(config.seed)]
     train = ["mtlnet", "train", "--data", data, "--out", run, "--alpha", config.alpha]
