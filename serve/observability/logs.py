@@ -50,7 +50,7 @@ class JsonFormatter(logging.Formatter):
 
 
 class Interval:
-    """Passes each key at most once in INTERVAL_S, in each of `workers` processes more seldom."""
+    """Passes each key at most once in INTERVAL_S, counted over `workers` processes."""
 
     def __init__(self, workers: int = 1) -> None:
         self._interval_s = INTERVAL_S * workers
