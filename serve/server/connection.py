@@ -81,8 +81,7 @@ class GuardedProtocol(HttpToolsProtocol):
         self._settle()
         guard, limit = self._guard, self._guard.limits.connections
         count = len(self.connections) - len(guard.leaving) + guard.other_connections()
-        if count > limit and not guard.make_room(count - limit, guard.count(self)):
-            guard.ask_for_room(guard.count(self))
+        if count > limit and not guard.make_room_for(self, count - limit):
             detail = f"{limit} connections are open; use one connection for all requests"
             self._close_with(Problem(TOO_MANY_CONNECTIONS, detail))
 

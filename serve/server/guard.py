@@ -110,6 +110,14 @@ class ConnectionGuard:
             if not self.open[connection.network]:
                 del self.open[connection.network]
 
+    def make_room_for(self, newcomer: Guarded, excess: int) -> bool:
+        """End `excess` connections; False: not so many give way, and another worker is asked."""
+        least = self._count(newcomer)
+        made = self.make_room(excess, least)
+        if not made:
+            self.ask_for_room(least)
+        return made
+
     def make_room(self, excess: int, least: int) -> bool:
         """End `excess` connections, the least useful first; False: not so many give way.
 
@@ -135,7 +143,7 @@ class ConnectionGuard:
         for connection in list(group):
             if ended == most or now - connection.since_s < age_s:
                 break
-            if self.count(connection) < count:
+            if self._count(connection) < count:
                 continue
             connection.give_way()
             self.place(connection, self.leaving)
@@ -143,7 +151,7 @@ class ConnectionGuard:
             ended += 1
         return ended
 
-    def count(self, connection: Guarded) -> int:
+    def _count(self, connection: Guarded) -> int:
         """How many connections its client has; a trusted proxy counts as many clients."""
         return self.open[connection.network] if connection.network else 1
 

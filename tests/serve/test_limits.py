@@ -193,7 +193,7 @@ def test_the_clients_of_a_trusted_proxy_are_many() -> None:
     proxied, direct = (Connection(guard, address) for address in ("10.0.0.7", "192.0.2.1"))
     others = [Connection(guard, "10.0.0.7") for _ in range(9)]
     guard.place(proxied, guard.served)
-    assert guard.make_room(1, guard.count(direct))
+    assert guard.make_room_for(direct, 1)
     assert proxied.ended
     for connection in (proxied, direct, *others):
         guard.forget(connection)
