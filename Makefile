@@ -41,9 +41,10 @@ demo: $(READY) ## collect, train, evaluate, serve, ask, report: in 17 minutes on
 
 # One process more than cores, for many tests wait; four at most: each takes about 1 GB. A file's tests
 # stay in one process, for they share what is costly to make; xdist keeps their order (tests/conftest.py).
-# What measures time comes after them, when the cores are free.
+# What measures time comes after them, when the cores are free. A process that dies ends the run: xdist
+# 3.8 would start another, hand out the dead one's finished files again, and wait for ever (its issue 1378).
 PROCESSES := $(shell $(PYTHON) -c 'import os; print(min(len(os.sched_getaffinity(0)) + 1, 4))')
-PARALLEL := --numprocesses $(PROCESSES) --dist loadfile --no-loadscope-reorder
+PARALLEL := --numprocesses $(PROCESSES) --dist loadfile --no-loadscope-reorder --max-worker-restart 0
 
 test: $(READY) ## all checks and tests but the extended ones
 	@$(MAKE) --no-print-directory --jobs 2 check parallel-tests

@@ -2,7 +2,6 @@
 
 import asyncio
 import json
-import os
 import signal
 import socket
 from pathlib import Path
@@ -106,7 +105,7 @@ def test_a_stop_is_obeyed_while_the_model_is_loaded_and_a_reload_is_not_needed(
             await asyncio.sleep(0.01)
         for number in (signal.SIGHUP, signal.SIGUSR2, signal.SIGTERM):
             assert not starting.done()
-            os.kill(os.getpid(), number)
+            signal.raise_signal(number)
             await asyncio.sleep(0.05)
         return await asyncio.wait_for(starting, PATIENCE_S)
 
