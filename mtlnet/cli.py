@@ -132,6 +132,7 @@ def export_command(
 def ship_command(
     out: options.ShipOut,
     model: options.Model = "default",
+    data: options.RefitData = None,
     evaluation: options.ShippedEvaluations = None,
     notes: options.ShippedNotes = None,
     picture: options.ShippedPicture = None,
@@ -148,7 +149,7 @@ def ship_command(
         text = "" if notes is None else notes.read_text(encoding="utf-8")
         typer.echo(write_page(out, evaluation, text, picture))
         return
-    result = ship_model(resolve_run(model), out)
+    result = ship_model(resolve_run(model), out, data)
     if as_json:
         typer.echo(json.dumps(result))
     else:

@@ -142,6 +142,13 @@ ShippedPicture = Annotated[
     Path | None, typer.Option(help="JPEG for README.md, of `mtlnet evaluate --worst`.", exists=True)
 ]
 ShipOut = Annotated[Path, typer.Option(help="Folder for the model.")]
+RefitData = Annotated[
+    Path | None,
+    typer.Option(
+        help="Dataset that the model was not trained on: its train rounds set the standard "
+        "deviations and the limit of out_of_distribution anew."
+    ),
+]
 ShippedEvaluations = Annotated[
     list[Path] | None,
     typer.Option(help="Output of `mtlnet evaluate --json`, for README.md; several times."),

@@ -74,11 +74,8 @@ def open_training_data(
         if not (checked or config.skip_undecodable):
             require_decodable(dataset.select("train"), config.data, skippable=True)
         data = recorded_training_data(dataset, skip_undecodable=config.skip_undecodable)
-    if init is not None and data.camera != init.camera:
-        raise ModelError(
-            f"the camera of the data is {data.camera}, that of model {init.name} "
-            f"{init.camera}; a model keeps the camera it was trained for"
-        )
+    if init is not None:
+        require_camera(init, data.camera)
     return data
 
 
@@ -227,6 +224,21 @@ def require_same_data(config: TrainConfig, resumed: dict[str, Any], data: dict[s
                 "started with; give that dataset with --data, add --change-data to continue on "
                 "this one, or start a new run"
             )
+
+
+def require_camera(card: ModelCard, camera: CameraParameters) -> None:
+    """Raise ModelError when data of `camera` is not of the model's camera."""
+    found, expected = camera.as_dict(), card.camera.as_dict()
+    if found != expected:
+        differing = ", ".join(
+            f"{k} {found[k]:g} instead of {expected[k]:g}"
+            for k in expected
+            if found[k] != expected[k]
+        )
+        raise ModelError(
+            f"the camera of the data is not that of model {card.name}: {differing}; collect with "
+            "the model's camera, or train a model for this one"
+        )
 
 
 def find_undecodable(frames: Frames) -> dict[int, UndecodableImage]:

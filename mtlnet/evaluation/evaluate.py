@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from datagen.recording import Dataset, Frames, UndecodableImage
 from mtlnet.data.custom_images import has_labels_file, open_custom_images
 from mtlnet.data.loader import Images
-from mtlnet.data.sources import require_decodable
+from mtlnet.data.sources import require_camera, require_decodable
 from mtlnet.evaluation.html_report import page_file, write_page, write_worst_sheet
 from mtlnet.evaluation.metrics import evaluate_by_groups, evaluate_outputs
 from mtlnet.inference.engine import Engine
@@ -144,17 +144,7 @@ def predict_frames(
 
 def require_fit(card: ModelCard, frames: Frames, split: str) -> None:
     """Raise ModelError when the camera differs, or when the model was trained on these rounds."""
-    found, expected = frames.camera.as_dict(), card.camera.as_dict()
-    if found != expected:
-        differing = ", ".join(
-            f"{k} {found[k]:g} instead of {expected[k]:g}"
-            for k in expected
-            if found[k] != expected[k]
-        )
-        raise ModelError(
-            f"the camera of the data is not that of model {card.name}: {differing}; collect with "
-            "the model's camera, or train a model for this one"
-        )
+    require_camera(card, frames.camera)
     if "mean" not in card.data:
         raise ModelError(
             f"model {card.name} has no description of its training data; train a new one"

@@ -31,9 +31,11 @@ from mtlnet.inference.model_card import (
     read_card,
 )
 from mtlnet.inference.prediction import OUTPUTS
+from mtlnet.inference.uncertainty import write_uncertainty_head
 from mtlnet.inference.weights_file import read_weights
 from mtlnet.model.architecture import HEIGHT, WIDTH, find_architecture
 from mtlnet.model.network import load_network, predict_images
+from mtlnet.uncertainty_fit.head import refit_uncertainty_head
 from runtime.files import atomic_write
 from runtime.html import format_number, format_percent
 from trackfeatures.errors import UserError
@@ -42,9 +44,10 @@ PICTURE = "worst.jpg"
 CHECK_IMAGES = 4
 
 
-def ship_model(run: Path, out: Path) -> dict[str, Any]:
+def ship_model(run: Path, out: Path, data: Path | None = None) -> dict[str, Any]:
     """Write the model of `run` into the new folder `out`; what `--json` prints.
 
+    `data`: a dataset on which its uncertainty head is fitted anew (`refit_uncertainty_head`).
     Raises UserError when it cannot be made of weights alone or `out` has a model, ModelError when
     the result does not answer as the run does, but for what rounding the weights makes of it.
     """
@@ -56,12 +59,18 @@ def ship_model(run: Path, out: Path) -> dict[str, Any]:
         )
     if (out / CARD).exists():
         raise UserError(f"{out} already holds a model; give another --out or delete it")
+    refitted = None if data is None else refit_uncertainty_head(run, data)
+    if refitted is not None:
+        seeds = sorted({*card.data["seeds"], *refitted.about["seeds"]})
+        card = replace(card, doubt=refitted.about, data={**card.data, "seeds": seeds})
     names = (WEIGHTS,) if card.doubt is None else (WEIGHTS, UNCERTAINTY_WEIGHTS)
-    check_files(run, card, names)
+    check_files(run, card, names if refitted is None else (WEIGHTS,))
     out.mkdir(parents=True, exist_ok=True)
     halves = {name: half(name, values) for name, values in read_weights(run / WEIGHTS).items()}
     atomic_write(out / WEIGHTS, save(halves), fsync=True)
-    if card.doubt is not None:
+    if refitted is not None:
+        write_uncertainty_head(out, refitted.head)
+    elif card.doubt is not None:
         atomic_write(
             out / UNCERTAINTY_WEIGHTS, (run / UNCERTAINTY_WEIGHTS).read_bytes(), fsync=True
         )

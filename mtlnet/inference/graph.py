@@ -23,6 +23,7 @@ from mtlnet.inference.uncertainty import (
     CELL_ROWS,
     CENTRE_BANDS,
     CENTRE_COLUMNS,
+    LIGHT_VALUES,
     SQRT_EPSILON,
     UncertaintyHead,
 )
@@ -255,13 +256,15 @@ def linear_float32(ops: Any, x: Any, weight: NDArray[np.float32], bias: NDArray[
 
 
 def uncertainty_outputs(ops: Any, x: Any, images: Any, head: UncertaintyHead) -> list[Any]:
-    """`UncertaintyHead.predict` of inputs x (1, F) and images (1, H, W, 3), uint8."""
+    """`UncertaintyHead.predict` of inputs x (1, X) and images (1, H, W, 3), uint8."""
+    cells, centre = texture_graph(ops, images)
+    if len(head.centre) > x.shape[1]:
+        x = ops.concat([x, light_graph(ops, cells)], 1)
     x = _columns(ops, x, 0, len(head.centre))
     z = ops.multiply(ops.subtract(x, head.centre[None]), head.scale[None])
     hidden = ops.relu(linear_float32(ops, z, head.hidden_weight, head.hidden_bias))
     log_std = linear_float32(ops, hidden, head.weight, head.bias)
     limited = ops.minimum(ops.maximum(log_std, head.low[None]), head.high[None])
-    cells, centre = texture_graph(ops, images)
     deviation = ops.subtract(cells, head.texture_mean[None])
     projected = ops.matmul(deviation, ops.constant(head.texture_directions), False, True)
     z = ops.multiply(ops.subtract(centre, head.pitch_centre[None]), head.pitch_scale[None])
@@ -269,6 +272,12 @@ def uncertainty_outputs(ops: Any, x: Any, images: Any, head: UncertaintyHead) ->
     pitch = linear_float32(ops, hidden, head.pitch_weight, head.pitch_bias)
     distance = ops.reduce_sum(ops.multiply(projected, projected), np.array([1]), keep_dims=True)
     return [ops.exp(limited), ops.maximum(distance, ops.multiply(pitch, pitch))]
+
+
+def light_graph(ops: Any, cells: Any) -> Any:
+    """`mtlnet.inference.uncertainty.light_features` (1, LIGHT_VALUES) of cells (1, C)."""
+    halves = ops.reshape(cells, np.array([1, LIGHT_VALUES, -1]), special_zero=False)
+    return ops.reduce_mean(halves, np.array([2]))
 
 
 def texture_graph(ops: Any, images: Any) -> tuple[Any, Any]:

@@ -1,9 +1,10 @@
 """The uncertainty head: a standard deviation for each feature, and an out-of-distribution score.
 
-Standard deviations: two layers on the network's last shared features (256,) and, where its heads
-are distributions over bins, the logarithms of their spreads (6,), all standardised, predict the
-logarithm of the standard deviation of the error of each of `FEATURES` (Nix and Weigend 1994). The
-network's nine outputs do not change.
+Standard deviations: two layers on the network's last shared features (256,), on the logarithms of
+the spreads (6,) where its heads are distributions over bins, and on the light of the image (10,)
+(`light_features`), all standardised, predict the logarithm of the standard deviation of the error
+of each of `FEATURES` (Nix and Weigend 1994). Without the light they are too large in dusk and fog
+and too small in snow and heavy shadow. The network's nine outputs do not change.
 
 Out-of-distribution (OOD) score: the larger of two values, each scaled so that 1 is the limit of
 what counts as known.
@@ -40,6 +41,8 @@ PLANES = 5
 CELL_VALUES = PLANES * CELL_ROWS * CELL_COLUMNS
 CENTRE_VALUES = PLANES * 24 * 4
 TEXTURE_VALUES = CELL_VALUES + CENTRE_VALUES
+HALVES = 2  # the rows of an image above and below its middle
+LIGHT_VALUES = PLANES * HALVES
 SQRT_EPSILON = 1e-6
 """Added to a mean difference before its square root; the difference is 0 in a flat cell."""
 
@@ -70,9 +73,11 @@ class UncertaintyHead:
     def predict(self, x: Numbers, textures: Numbers) -> Numbers:
         """Standard deviations and the OOD score, (N, D + 1).
 
-        `x` (N, F or more): the network's inputs of this head, of which a head fitted on the shared
-        features alone reads the first; `textures` (N, C + M): see `texture_features`.
+        `x` (N, X): the network's inputs of this head; `textures` (N, C + M): see
+        `texture_features`. A head fitted on fewer inputs reads the first ones.
         """
+        if len(self.centre) > x.shape[1]:
+            x = np.concatenate([x, light_features(textures)], 1)
         z = (x[:, : len(self.centre)] - self.centre) * self.scale
         hidden = np.maximum(z @ self.hidden_weight.T + self.hidden_bias, 0)
         log_std = (hidden @ self.weight.T + self.bias).clip(self.low, self.high)
@@ -122,6 +127,14 @@ def texture_features(image: NDArray[np.uint8]) -> Numbers:
     return np.concatenate([part.transpose(2, 0, 1).reshape(-1) for part in parts]).astype(
         np.float32
     )
+
+
+def light_features(textures: Numbers) -> Numbers:
+    """Means (N, LIGHT_VALUES) over the cells of each half of an image, of textures (N, C + M): of
+    each texture plane above the middle, then below it."""
+    cells = textures[:, :CELL_VALUES].reshape(len(textures), PLANES, HALVES, -1)
+    light: Numbers = cells.mean(3).reshape(len(textures), LIGHT_VALUES)
+    return light
 
 
 @dataclass(frozen=True)

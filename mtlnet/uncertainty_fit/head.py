@@ -8,6 +8,7 @@ the standard deviations and the limit of the out-of-distribution score.
 import math
 import os
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,9 +19,16 @@ from torch import Tensor, nn
 import trackfeatures as tf
 from datagen.recording import Frames
 from mtlnet.data.loader import Images
+from mtlnet.data.sources import (
+    MIN_ROUNDS_TO_HOLD_OUT,
+    hold_out_rounds,
+    open_training_dataset,
+    require_camera,
+)
 from mtlnet.evaluation.metrics import coverage, signed_errors
 from mtlnet.export.openvino_graph import build_feature_graph
 from mtlnet.inference.engine import best_precision
+from mtlnet.inference.model_card import WEIGHTS, ModelError, read_card
 from mtlnet.inference.prediction import OUTPUTS
 from mtlnet.inference.uncertainty import (
     CELL_VALUES,
@@ -28,10 +36,11 @@ from mtlnet.inference.uncertainty import (
     TEXTURE_VALUES,
     FittedUncertainty,
     UncertaintyHead,
+    light_features,
     texture_features,
 )
 from mtlnet.model.architecture import HEIGHT, WIDTH
-from mtlnet.model.network import Network
+from mtlnet.model.network import Network, load_network
 from mtlnet.uncertainty_fit.ood import (
     FitSettings,
     fit_pitch_offset,
@@ -40,13 +49,14 @@ from mtlnet.uncertainty_fit.ood import (
     pitched_views,
 )
 from trackfeatures.camera import CameraParameters
+from trackfeatures.errors import UserError
 
 FALSE_ALARM_RATE = 0.01
 """Share of known frames classified as out of distribution: half by texture, half by pitch."""
 MAX_TRAIN_FRAMES, MAX_HELD_OUT_FRAMES = 3_000, 24_000
 HIDDEN = 32
 FIT = FitSettings(steps=1_000, batch=256, learning_rate=1e-2, weight_decay=3e-2)
-FOLDS = 3
+FOLDS = 8
 MIN_PRESENT_FRAMES = 30  # frames from which a feature has a temperature of its own
 CHUNK = 32  # images read at once
 MIN_STD_SHARE, MAX_STD_SHARE = 0.01, 20.0
@@ -71,7 +81,7 @@ class FrameOutputs:
     An error is NaN where the label or, for `to_lane_centre`, the prediction is absent.
     """
 
-    x: Numbers  # (N, F) inputs of the uncertainty head
+    x: Numbers  # (N, F) what the standard deviations are predicted from, the light included
     error: Numbers  # (N, D) m and rad
     texture: Numbers  # (N, T)
 
@@ -90,7 +100,11 @@ def fit_uncertainty_head(
     """
     known = run_on_frames(network, train, MAX_TRAIN_FRAMES)
     unseen = None if held_out is None else run_on_frames(network, held_out, MAX_HELD_OUT_FRAMES)
-    centre, scale = standardisation(known.x)
+    # Each on its own: the light varies by a tenth of what the features do.
+    parts = np.split(known.x, [network.architecture.uncertainty_inputs], 1)
+    centre, scale = (
+        np.concatenate(each) for each in zip(*map(standardisation, parts), strict=True)
+    )
     threads = torch.get_num_threads()
     torch.set_num_threads(1)  # the head is small: more threads take longer
     standardised = None if unseen is None else replace(unseen, x=(unseen.x - centre) * scale)
@@ -129,6 +143,35 @@ def fit_uncertainty_head(
     return FittedUncertainty(head, about)
 
 
+def refit_uncertainty_head(run: Path, data: Path) -> FittedUncertainty:
+    """Fit the uncertainty head of the model in `run` anew on the train rounds of a dataset.
+
+    Its `about` also names the dataset and the seeds of these rounds. Raises ModelError for images
+    of another camera and for rounds that the model was trained on, where its errors are too small;
+    UserError for a dataset of too few rounds.
+    """
+    card, dataset = read_card(run), open_training_dataset(data)
+    # All are new to the model: the larger part determines the standard deviations.
+    many, few = hold_out_rounds(dataset)
+    if few is None:
+        raise UserError(
+            f"{data} has {len(many.rounds)} train rounds; standard deviations are fitted on "
+            f"{MIN_ROUNDS_TO_HOLD_OUT} or more"
+        )
+    require_camera(card, dataset.camera)
+    seeds = [info.seed for info in (*many.rounds, *few.rounds)]
+    seen = set(seeds) & set(card.data["seeds"])
+    if seen:
+        raise ModelError(
+            f"model {card.name} was trained on the round of seed {min(seen)} of {data}; collect "
+            "rounds with another --seed"
+        )
+    network = load_network(run / WEIGHTS, card.network)
+    fitted = fit_uncertainty_head(network, few, many, card.seed, card.camera)
+    origin = {"data": dataset.path.name, "content_hash": dataset.content_hash, "seeds": seeds}
+    return replace(fitted, about={**fitted.about, **origin})
+
+
 def standardisation(x: Numbers) -> tuple[Numbers, Numbers]:
     """Mean (F,) and inverse standard deviation (F,) of features (N, F), for `UncertaintyHead`.
 
@@ -165,6 +208,7 @@ def run_on_frames(network: Network, frames: Images, limit: int) -> FrameOutputs:
         queue.wait_all()
     labels = frames.labels
     error = signed_errors(outputs, labels.distances[chosen], labels.angle[chosen])
+    x = np.concatenate([x, light_features(textures)], 1)
     return FrameOutputs(x, error.astype(np.float32), textures)
 
 

@@ -76,13 +76,19 @@ def write_round(folder: Path, name: str, number: int, **changes: Any) -> None:
         writer.finish()
 
 
-def write_dataset(folder: Path, first_seed: int = 0) -> Path:
-    """Three train rounds and a test round in an existing, empty folder, which is returned."""
+def write_dataset(
+    folder: Path, first_seed: int = 0, train_rounds: int = len(TRAIN), **changes: Any
+) -> Path:
+    """Train rounds and a test round in an existing, empty folder, which is returned.
+
+    `changes`: to the headers of the rounds.
+    """
     (folder / "rounds").mkdir()
-    for number, name in enumerate(TRAIN + TEST):
-        write_round(folder, name, first_seed + number)
+    *train, test = (f"r{number:03}" for number in range(train_rounds + 1))
+    for number, name in enumerate((*train, test)):
+        write_round(folder, name, first_seed + number, **changes)
     (folder / "splits").mkdir()
-    write_split(split_path(folder), Split(TRAIN, TEST))
+    write_split(split_path(folder), Split(tuple(train), (test,)))
     return folder
 
 

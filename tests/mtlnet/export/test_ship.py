@@ -27,6 +27,8 @@ from mtlnet.inference.model_card import (
 from mtlnet.inference.weights_file import read_weights
 from mtlnet.model.architecture import HEIGHT, WIDTH
 from serve.scheduling.warmup import warm_up
+from tests.mtlnet.conftest import write_dataset
+from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
 
 
@@ -85,6 +87,47 @@ def test_what_cannot_be_shipped(published: Path, shipped: Path, tmp_path: Path) 
         ship_model(other, tmp_path / "out")
     with pytest.raises(ModelError, match="fc0 holds a weight beyond float16"):
         half("fc0", np.array([1.0, 7e4], np.float32))
+
+
+@pytest.fixture(scope="module")
+def later(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A dataset with nine train rounds that the model was not trained on."""
+    return write_dataset(tmp_path_factory.mktemp("later"), 100, train_rounds=9)
+
+
+def test_its_standard_deviations_are_fitted_anew_on_other_rounds(
+    published: Path, shipped: Path, later: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "refitted"
+    ship_model(published, out, later)
+    card, earlier = read_card(out), read_card(shipped)
+    assert card.files[WEIGHTS] == earlier.files[WEIGHTS]
+    assert card.files[UNCERTAINTY_WEIGHTS] != earlier.files[UNCERTAINTY_WEIGHTS]
+    assert card.doubt is not None
+    assert (card.doubt["data"], len(card.doubt["held_out"])) == (later.name, 8)
+    assert sorted(card.doubt["seeds"]) == list(range(100, 109))
+    assert card.data == {**earlier.data, "seeds": [*earlier.data["seeds"], *range(100, 109)]}
+    frame = Dataset.open(later).select("test").image(0)
+    found, before = (load_engine(run, "openvino", "f32")(frame) for run in (out, shipped))
+    np.testing.assert_allclose(found[9:], load_engine(out, "torch")(frame)[9:], rtol=5e-3)
+    assert np.abs(found[9:] / before[9:] - 1).max() > 0.05
+    with pytest.raises(
+        ModelError, match=r"refitted was trained on the round of seed 100 of .*--seed"
+    ):
+        ship_model(out, tmp_path / "again", later)
+
+
+def test_rounds_on_which_no_standard_deviations_are_fitted(
+    published: Path, dataset: Path, tmp_path: Path
+) -> None:
+    with pytest.raises(UserError, match="has 3 train rounds; standard deviations are fitted on 8"):
+        ship_model(published, tmp_path / "few", dataset)
+    (tmp_path / "high").mkdir()
+    camera = CameraParameters(z=1.4)
+    high = write_dataset(tmp_path / "high", 200, train_rounds=8, camera=camera)
+    with pytest.raises(ModelError, match=r"z 1\.4 instead of 0\.95"):
+        ship_model(published, tmp_path / "other", high)
+    assert not list(tmp_path.glob("*/model.safetensors"))
 
 
 def test_damage_is_found(shipped: Path, tmp_path: Path) -> None:

@@ -150,7 +150,7 @@ def test_wrong_options_are_refused(
         open_training_data(pooled, replace(card, network="regnet_y_400mf"))
     other = replace(card, camera=replace(card.camera, z=1.4))
     tuned = TrainConfig(dataset, tmp_path / "e", recipe="tune", init="x", network=card.network)
-    with pytest.raises(UserError, match=r"0, 1\.4\) m.*keeps the camera"):
+    with pytest.raises(UserError, match=r"z 0\.95 instead of 1\.4"):
         open_training_data(tuned, other)
 
 

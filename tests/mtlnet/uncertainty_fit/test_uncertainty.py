@@ -1,6 +1,7 @@
 """The uncertainty head: standard deviations that match errors, and the OOD score."""
 
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -15,7 +16,9 @@ from mtlnet.inference.prediction import OUTPUTS, decode_outputs, split_outputs
 from mtlnet.inference.uncertainty import (
     CELL_VALUES,
     FEATURES,
+    LIGHT_VALUES,
     UncertaintyHead,
+    light_features,
     read_uncertainty_head,
     texture_features,
 )
@@ -132,6 +135,35 @@ def test_texture_features_of_a_step_edge() -> None:
     assert centre[0, 1:] == pytest.approx(1)
     assert centre[4, 0] == pytest.approx((2 / 5) ** 0.5, rel=1e-3)
     assert centre[4, 1:] == pytest.approx(1e-3)
+
+
+def test_the_light_of_an_image_is_told_of_each_half() -> None:
+    image = np.full((210, 280, 3), 255, np.uint8)
+    image[105:] = (0, 51, 102)
+    light = light_features(texture_features(image)[None]).reshape(5, 2)
+    assert light[:3, 0] == pytest.approx(1)
+    assert light[:3, 1] == pytest.approx([-1, -0.6, -0.2], abs=1e-5)
+    assert light[3] == pytest.approx(1e-3)  # no edge across
+    step = (1.6 / 15) ** 0.5  # in one of seven rows of cells, of 15 pixels each
+    assert light[4] == pytest.approx([(step + 6e-3) / 7, 1e-3], rel=1e-3)
+
+
+def test_standard_deviations_follow_the_light(published: Path) -> None:
+    head = read_uncertainty_head(published)
+    features = len(head.centre) - LIGHT_VALUES
+    image = np.random.default_rng(0).integers(90, 160, (210, 280, 3), dtype=np.uint8)
+    textures = np.stack([texture_features(i) for i in (image, (image // 2).astype(np.uint8))])
+    x = np.tile(head.centre[:features], (2, 1))
+    day, night = head.predict(x, textures)[:, :-1]
+    assert np.abs(np.log(day / night)).max() > 0.01
+    blind = replace(
+        head,
+        centre=head.centre[:features],
+        scale=head.scale[:features],
+        hidden_weight=head.hidden_weight[:, :features],
+    )
+    day, night = blind.predict(x, textures)[:, :-1]  # as models before were fitted
+    np.testing.assert_array_equal(day, night)
 
 
 def test_images_without_a_road_are_out_of_distribution(published: Path) -> None:
