@@ -19,8 +19,8 @@ from dataclasses import dataclass, replace
 from controllers.perception import Perceived
 
 ORDINARY_M, ORDINARY_RAD = 0.1, 0.03
-"""Standard deviations up to which an answer counts in full: more than 99 % of those of the shipped
-model in clear light, heavy shadow, fog and rain."""
+"""Standard deviations up to which an answer counts in full: those of 95 to 98 % of the test frames
+with the shipped model, by light."""
 UNFAMILIAR_SCALE = 3.0
 """The standard deviation of an answer that is out of distribution counts this many times."""
 OFFSET_NOISE_M, ANGLE_NOISE_RAD = 0.01, 0.01
