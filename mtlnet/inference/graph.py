@@ -23,6 +23,7 @@ from mtlnet.inference.uncertainty import (
     CELL_ROWS,
     CENTRE_BANDS,
     CENTRE_COLUMNS,
+    LIGHT_LIMIT,
     LIGHT_VALUES,
     SQRT_EPSILON,
     UncertaintyHead,
@@ -258,10 +259,12 @@ def linear_float32(ops: Any, x: Any, weight: NDArray[np.float32], bias: NDArray[
 def uncertainty_outputs(ops: Any, x: Any, images: Any, head: UncertaintyHead) -> list[Any]:
     """`UncertaintyHead.predict` of inputs x (1, X) and images (1, H, W, 3), uint8."""
     cells, centre = texture_graph(ops, images)
-    if len(head.centre) > x.shape[1]:
-        x = ops.concat([x, light_graph(ops, cells)], 1)
-    x = _columns(ops, x, 0, len(head.centre))
-    z = ops.multiply(ops.subtract(x, head.centre[None]), head.scale[None])
+    count = min(x.shape[1], len(head.centre))
+    z = _standardise(ops, _columns(ops, x, 0, count), head, slice(0, count))
+    if len(head.centre) > count:
+        light = _standardise(ops, light_graph(ops, cells), head, slice(count, None))
+        limit = np.float32(LIGHT_LIMIT)
+        z = ops.concat([z, ops.minimum(ops.maximum(light, -limit), limit)], 1)
     hidden = ops.relu(linear_float32(ops, z, head.hidden_weight, head.hidden_bias))
     log_std = linear_float32(ops, hidden, head.weight, head.bias)
     limited = ops.minimum(ops.maximum(log_std, head.low[None]), head.high[None])
@@ -272,6 +275,10 @@ def uncertainty_outputs(ops: Any, x: Any, images: Any, head: UncertaintyHead) ->
     pitch = linear_float32(ops, hidden, head.pitch_weight, head.pitch_bias)
     distance = ops.reduce_sum(ops.multiply(projected, projected), np.array([1]), keep_dims=True)
     return [ops.exp(limited), ops.maximum(distance, ops.multiply(pitch, pitch))]
+
+
+def _standardise(ops: Any, x: Any, head: UncertaintyHead, part: slice) -> Any:
+    return ops.multiply(ops.subtract(x, head.centre[None, part]), head.scale[None, part])
 
 
 def light_graph(ops: Any, cells: Any) -> Any:

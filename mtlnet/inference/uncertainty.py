@@ -43,6 +43,9 @@ CENTRE_VALUES = PLANES * 24 * 4
 TEXTURE_VALUES = CELL_VALUES + CENTRE_VALUES
 HALVES = 2  # the rows of an image above and below its middle
 LIGHT_VALUES = PLANES * HALVES
+LIGHT_LIMIT = 3.0
+"""Light that is more standard deviations from the usual one counts as so many: nothing is known of
+the errors there, above all by a model of one scene."""
 SQRT_EPSILON = 1e-6
 """Added to a mean difference before its square root; the difference is 0 in a flat cell."""
 
@@ -76,9 +79,10 @@ class UncertaintyHead:
         `x` (N, X): the network's inputs of this head; `textures` (N, C + M): see
         `texture_features`. A head fitted on fewer inputs reads the first ones.
         """
-        if len(self.centre) > x.shape[1]:
+        count = x.shape[1]
+        if len(self.centre) > count:
             x = np.concatenate([x, light_features(textures)], 1)
-        z = (x[:, : len(self.centre)] - self.centre) * self.scale
+        z = standardise(x[:, : len(self.centre)], self.centre, self.scale, count)
         hidden = np.maximum(z @ self.hidden_weight.T + self.hidden_bias, 0)
         log_std = (hidden @ self.weight.T + self.bias).clip(self.low, self.high)
         cells, centre = np.split(textures, [len(self.texture_mean)], 1)
@@ -127,6 +131,16 @@ def texture_features(image: NDArray[np.uint8]) -> Numbers:
     return np.concatenate([part.transpose(2, 0, 1).reshape(-1) for part in parts]).astype(
         np.float32
     )
+
+
+def standardise(x: Numbers, centre: Numbers, scale: Numbers, count: int) -> Numbers:
+    """What the standard deviations are predicted from, x (N, F), standardised.
+
+    The first `count` values are the network's, the others the light, which is limited.
+    """
+    z: Numbers = (x - centre) * scale
+    z[:, count:] = z[:, count:].clip(-LIGHT_LIMIT, LIGHT_LIMIT)
+    return z
 
 
 def light_features(textures: Numbers) -> Numbers:

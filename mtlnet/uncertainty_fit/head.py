@@ -33,10 +33,12 @@ from mtlnet.inference.prediction import OUTPUTS
 from mtlnet.inference.uncertainty import (
     CELL_VALUES,
     FEATURES,
+    HALVES,
     TEXTURE_VALUES,
     FittedUncertainty,
     UncertaintyHead,
     light_features,
+    standardise,
     texture_features,
 )
 from mtlnet.model.architecture import HEIGHT, WIDTH
@@ -62,6 +64,9 @@ CHUNK = 32  # images read at once
 MIN_STD_SHARE, MAX_STD_SHARE = 0.01, 20.0
 """Limits of a standard deviation, relative to the RMS error, which a few large errors determine."""
 MIN_FEATURE_STD_SHARE = 0.1
+MIN_LIGHT_STD = np.repeat([0.1, 0.1, 0.1, 0.02, 0.02], HALVES)
+"""About half of what the colours and contrasts of `light_features` vary by over all lights: a model
+of one scene sees less, and another scene must not be far away for it."""
 LOG_STD_LIMITS = (math.log(MIN_STD_SHARE), math.log(MAX_STD_SHARE))
 COVERED = (0.6827, 0.9545)
 """Shares of a normal distribution within one and two standard deviations."""
@@ -96,19 +101,22 @@ def fit_uncertainty_head(
     """Fit the uncertainty head of `network` (folded) on its train frames and held-out ones.
 
     Without held-out frames it is fitted on the train frames alone, and its standard deviations are
-    too small; the model card then lists no held-out rounds.
+    too small; the model card then lists no held-out rounds. It does not read the light then: so few
+    rounds show too few sceneries.
     """
+    count = network.architecture.uncertainty_inputs
     known = run_on_frames(network, train, MAX_TRAIN_FRAMES)
+    if held_out is None:
+        known = replace(known, x=known.x[:, :count])
     unseen = None if held_out is None else run_on_frames(network, held_out, MAX_HELD_OUT_FRAMES)
-    # Each on its own: the light varies by a tenth of what the features do.
-    parts = np.split(known.x, [network.architecture.uncertainty_inputs], 1)
-    centre, scale = (
-        np.concatenate(each) for each in zip(*map(standardisation, parts), strict=True)
-    )
+    centre, scale = standardisation(known.x, count)
     threads = torch.get_num_threads()
     torch.set_num_threads(1)  # the head is small: more threads take longer
-    standardised = None if unseen is None else replace(unseen, x=(unseen.x - centre) * scale)
-    std_layers = fit_std_layers((known.x - centre) * scale, known.error, seed, standardised)
+    known_z = standardise(known.x, centre, scale, count)
+    held_out_z = (
+        None if unseen is None else replace(unseen, x=standardise(unseen.x, centre, scale, count))
+    )
+    std_layers = fit_std_layers(known_z, known.error, seed, held_out_z)
     # Without held-out frames, every second train frame sets the limits.
     textures, limiting = (
         (known.texture[::2], known.texture[1::2])
@@ -172,15 +180,17 @@ def refit_uncertainty_head(run: Path, data: Path) -> FittedUncertainty:
     return replace(fitted, about={**fitted.about, **origin})
 
 
-def standardisation(x: Numbers) -> tuple[Numbers, Numbers]:
-    """Mean (F,) and inverse standard deviation (F,) of features (N, F), for `UncertaintyHead`.
+def standardisation(x: Numbers, count: int) -> tuple[Numbers, Numbers]:
+    """Mean (F,) and inverse standard deviation (F,) of inputs (N, F), for `UncertaintyHead`.
 
-    A feature that hardly varies counts as varying by `MIN_FEATURE_STD_SHARE` of the mean: a unit
-    that is silent on these frames would be thousands of deviations away on others.
+    The first `count` are the network's, the others the light. A feature that hardly varies counts
+    as varying by `MIN_FEATURE_STD_SHARE` of the mean: a unit that is silent on these frames would
+    be thousands of deviations away on others. Light varies by `MIN_LIGHT_STD` at least.
     """
     std = x.std(0)
-    floor = max(MIN_FEATURE_STD_SHARE * float(std.mean()), 1e-3)
-    return x.mean(0), (1 / np.maximum(std, floor)).astype(np.float32)
+    floor = max(MIN_FEATURE_STD_SHARE * float(std[:count].mean()), 1e-3)
+    least = np.concatenate([np.full(count, floor), MIN_LIGHT_STD[: x.shape[1] - count]])
+    return x.mean(0), (1 / np.maximum(std, least)).astype(np.float32)
 
 
 def run_on_frames(network: Network, frames: Images, limit: int) -> FrameOutputs:

@@ -1,7 +1,6 @@
 """The uncertainty head: standard deviations that match errors, and the OOD score."""
 
 from collections import Counter
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -11,19 +10,28 @@ import pytest
 from datagen.recording import Dataset
 from mtlnet.evaluation.metrics import calibration, coverage
 from mtlnet.inference.engine import Precision, load_engine
-from mtlnet.inference.model_card import resolve_run
+from mtlnet.inference.model_card import WEIGHTS, resolve_run
 from mtlnet.inference.prediction import OUTPUTS, decode_outputs, split_outputs
 from mtlnet.inference.uncertainty import (
     CELL_VALUES,
     FEATURES,
+    LIGHT_LIMIT,
     LIGHT_VALUES,
     UncertaintyHead,
     light_features,
     read_uncertainty_head,
+    standardise,
     texture_features,
 )
-from mtlnet.uncertainty_fit.head import FrameOutputs, fit_std_layers, standardisation
+from mtlnet.model.network import load_network
+from mtlnet.uncertainty_fit.head import (
+    FrameOutputs,
+    fit_std_layers,
+    fit_uncertainty_head,
+    standardisation,
+)
 from mtlnet.uncertainty_fit.ood import draw_view, fit_texture_distance, view_homography
+from tests.mtlnet.conftest import write_dataset
 from tests.mtlnet.ood_images import images_without_road, seen_by
 from trackfeatures.camera import CameraParameters
 
@@ -98,7 +106,7 @@ def test_a_feature_that_is_silent_in_training_does_not_make_the_fit_diverge() ->
     unseen = x[:400].copy()
     unseen[::2, 0] = 60.0
     error = rng.normal(0.0, 0.1, (900, 7)).astype(np.float32)
-    centre, scale = standardisation(x)
+    centre, scale = standardisation(x, 8)
     held_out = FrameOutputs((unseen - centre) * scale, error[:400], np.zeros((400, 1), np.float32))
     layers = fit_std_layers((x - centre) * scale, error, 0, held_out)
     assert all(np.isfinite(values).all() for values in layers.values())
@@ -148,22 +156,33 @@ def test_the_light_of_an_image_is_told_of_each_half() -> None:
     assert light[4] == pytest.approx([(step + 6e-3) / 7, 1e-3], rel=1e-3)
 
 
-def test_standard_deviations_follow_the_light(published: Path) -> None:
-    head = read_uncertainty_head(published)
-    features = len(head.centre) - LIGHT_VALUES
-    image = np.random.default_rng(0).integers(90, 160, (210, 280, 3), dtype=np.uint8)
-    textures = np.stack([texture_features(i) for i in (image, (image // 2).astype(np.uint8))])
-    x = np.tile(head.centre[:features], (2, 1))
-    day, night = head.predict(x, textures)[:, :-1]
-    assert np.abs(np.log(day / night)).max() > 0.01
-    blind = replace(
-        head,
-        centre=head.centre[:features],
-        scale=head.scale[:features],
-        hidden_weight=head.hidden_weight[:, :features],
+def test_standard_deviations_follow_the_light_within_limits(
+    dataset: Path, published: Path, tmp_path: Path
+) -> None:
+    few = read_uncertainty_head(published)  # no rounds were held out
+    network = load_network(published / WEIGHTS)
+    features = network.architecture.uncertainty_inputs
+    assert len(few.centre) == features
+    (tmp_path / "held").mkdir()
+    frames, held_out = (
+        Dataset.open(folder).select("train")
+        for folder in (dataset, write_dataset(tmp_path / "held", 50))
     )
-    day, night = blind.predict(x, textures)[:, :-1]  # as models before were fitted
-    np.testing.assert_array_equal(day, night)
+    head = fit_uncertainty_head(network, frames, held_out, 0).head
+    assert len(head.centre) == features + LIGHT_VALUES
+    image = frames.image(0)
+    dimmed = [(image * factor).astype(np.uint8) for factor in (1.0, 0.9, 0.1)]
+    textures = np.stack([texture_features(each) for each in dimmed])
+    x = np.tile(head.centre[:features], (len(dimmed), 1))
+    day, dusk, night = np.log(head.predict(x, textures)[:, :-1])
+    assert np.abs(day - dusk).max() > 1e-3
+    assert np.abs(night - dusk).max() > 1e-3
+    far = standardise(
+        np.concatenate([x, 1e3 * light_features(textures)], 1), head.centre, head.scale, features
+    )
+    assert np.abs(far[:, features:]).max() == LIGHT_LIMIT
+    alike = few.predict(x, textures)[:, :-1]
+    np.testing.assert_array_equal(alike, alike[:1].repeat(len(dimmed), 0))
 
 
 def test_images_without_a_road_are_out_of_distribution(published: Path) -> None:
