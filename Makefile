@@ -39,7 +39,7 @@ system:
 demo: $(READY) ## collect, train, evaluate, serve, ask, report: in 17 minutes on two cores
 	$(BIN)/controllers demo --out demo
 
-# One process more than cores, for many tests wait; four at most: each takes about 1 GB. A file's tests
+# One process more than cores, for many tests wait; four at most: each takes 1 to 2 GB. A file's tests
 # stay in one process, for they share what is costly to make; xdist keeps their order (tests/conftest.py).
 # What measures time comes after them, when the cores are free. A process that dies ends the run: xdist
 # 3.8 would start another, hand out the dead one's finished files again, and wait for ever (its issue 1378).
