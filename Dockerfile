@@ -7,11 +7,13 @@
 #
 # The processes run as user 10001: folders they write to must let it (`chown 10001 runs datasets`).
 
-# The base image by its digest, for images that are the same tomorrow:
+# The base image is pinned by the digest of its index for all platforms, of September 2026, so that
+# images are the same tomorrow. Renew it for security updates of Debian and Python:
 #
+#   docker buildx imagetools inspect python:3.11-slim
 #   docker build --build-arg PYTHON_IMAGE=python:3.11-slim@sha256:...
 
-ARG PYTHON_IMAGE=python:3.11-slim
+ARG PYTHON_IMAGE=python:3.11-slim@sha256:9534e5a8e315485d4061ed659af0fd78a284c015f9b73661b41d6bab25604534
 FROM ${PYTHON_IMAGE} AS wheel
 WORKDIR /src
 COPY pyproject.toml README.md LICENSE requirements.lock ./

@@ -20,10 +20,11 @@ import os
 import re
 import sys
 import tempfile
-import threading
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from statistics import median, quantiles
@@ -77,15 +78,22 @@ class Reign:
 
 @dataclass
 class Told:
-    """What one client was told."""
+    """What one client was told.
 
-    answers: list[tuple[float, float, int, dict[str, Any]]] = field(default_factory=list)
+    An answer is kept as the times at which its request was sent and it came, the model that it
+    names, and whether it is bit-equal to what that model says of the image. The answers of two
+    hours as they came would fill gigabytes.
+    """
+
+    answers: list[tuple[float, float, str, bool]] = field(default_factory=list)
     refused: Counter[str] = field(default_factory=Counter)
     lost: list[str] = field(default_factory=list)
     missed: int = 0
 
 
-def drive(port: int, number: int, images: list[bytes], end: float, told: Told) -> None:
+def drive(
+    port: int, number: int, images: list[bytes], known: Known, end: float, told: Told
+) -> None:
     """Ask at 20 Hz until `end`; clients begin spread over a period."""
     begin = time.monotonic() + number / CLIENTS / HERTZ
     with Client(f"127.0.0.1:{port}", timeout_s=10.0) as client:
@@ -96,7 +104,8 @@ def drive(port: int, number: int, images: list[bytes], end: float, told: Told) -
             sent = time.monotonic()
             try:
                 answer = client.features(images[which])
-                told.answers.append((sent, time.monotonic(), which, answer))
+                came = time.monotonic()
+                told.answers.append((sent, came, answer["model"], is_right(answer, which, known)))
             except ServiceError as error:
                 if error.status is None:
                     told.lost.append(str(error))
@@ -106,6 +115,21 @@ def drive(port: int, number: int, images: list[bytes], end: float, told: Told) -
             now = max(turn + 1, int((time.monotonic() - begin) * HERTZ))
             told.missed += now - turn - 1
             turn = now
+
+
+@contextmanager
+def clients(
+    port: int, images: list[bytes], known: Known, end: float, told: list[Told]
+) -> Iterator[None]:
+    """A client for each of `told`, asking until `end`, which is waited for; raises what they do."""
+    with ThreadPoolExecutor(len(told)) as pool:
+        asking = [
+            pool.submit(drive, port, number, images, known, end, one)
+            for number, one in enumerate(told)
+        ]
+        yield
+        for client in asking:
+            client.result()
 
 
 def disturb(port: int, runs: list[Path], reign: Reign, end: float) -> Counter[str]:
@@ -141,16 +165,22 @@ def answers_of(run: Path, images: list[bytes]) -> list[dict[str, Any]]:
     ]
 
 
-def wrong(told: Told, known: Known, reign: Reign) -> list[str]:
+def is_right(answer: dict[str, Any], which: int, known: Known) -> bool:
+    """Whether an answer is what the model that it names says of the image by itself."""
+    if answer["model"] not in known:
+        return False
+    right = known[answer["model"]][which]
+    return {key: answer[key] for key in right} == right
+
+
+def wrong(told: Told, reign: Reign) -> list[str]:
     """The answers that are not what they ought to be."""
     found = []
-    for sent, answered, which, answer in told.answers:
-        model = answer["model"]
+    for sent, answered, model, right in told.answers:
         if model not in reign.allowed(sent, answered):
             found.append(f"model {model[:12]} answered at {sent:.3f} s out of its time")
-        right = known[model][which]
-        if {key: answer[key] for key in right} != right:
-            found.append(f"model {model[:12]} answered image {which} otherwise than by itself")
+        if not right:
+            found.append(f"model {model[:12]} answered at {sent:.3f} s otherwise than by itself")
     return found
 
 
@@ -166,26 +196,19 @@ def measure(minutes: float, folder: Path) -> dict[str, Any]:
     with running(OURS, Path(sys.executable), runs[0], WORKERS) as port:
         before = counted(port)
         end = time.monotonic() + MINUTE_S * minutes
-        clients = [
-            threading.Thread(target=drive, args=(port, number, images, end, told[number]))
-            for number in range(CLIENTS)
-        ]
-        for client in clients:
-            client.start()
-        done = disturb(port, runs, reign, end)
-        for client in clients:
-            client.join()
+        with clients(port, images, known, end, told):
+            done = disturb(port, runs, reign, end)
         after = counted(port)
     answers = sum(len(one.answers) for one in told)
     times_ms = [1e3 * (b - a) for one in told for a, b, _, _ in one.answers]
-    faults = [fault for one in told for fault in [*one.lost, *wrong(one, known, reign)]]
+    faults = [fault for one in told for fault in [*one.lost, *wrong(one, reign)]]
     return {
         "minutes": minutes,
         **done,
         "answers": answers,
         "answers_counted_by_the_service": after - before,
         "refused": dict(sum((one.refused for one in told), Counter())),
-        "models": dict(Counter(answer["model"] for one in told for *_, answer in one.answers)),
+        "models": dict(Counter(model for one in told for _, _, model, _ in one.answers)),
         "turns_missed": sum(one.missed for one in told),
         "p50_ms": round(median(times_ms), 2),
         "p99_ms": round(quantiles(times_ms, n=100)[98], 2),
@@ -236,23 +259,16 @@ def measure_attacked(minutes: float, folder: Path) -> dict[str, Any]:
         with bad_clients(port):
             begin = time.monotonic() + MINUTE_S
             end = begin + MINUTE_S * minutes
-            threads = [
-                threading.Thread(target=drive, args=(port, number, images, end, told[number]))
-                for number in range(CLIENTS)
-            ]
-            for thread in threads:
-                thread.start()
-            memory.watch(end)
-            for thread in threads:
-                thread.join()
-    return {"minutes": minutes, **judge_attacked(told, memory, known, reign, begin, end)}
+            with clients(port, images, known, end, told):
+                memory.watch(end)
+    return {"minutes": minutes, **judge_attacked(told, memory, reign, begin, end)}
 
 
 def judge_attacked(
-    told: list[Told], memory: Memory, known: Known, reign: Reign, begin: float, end: float
+    told: list[Told], memory: Memory, reign: Reign, begin: float, end: float
 ) -> dict[str, Any]:
     """The figures from `begin` to `end`, and whether they are as claimed."""
-    faults = [fault for one in told for fault in [*one.lost, *wrong(one, known, reign)]]
+    faults = [fault for one in told for fault in [*one.lost, *wrong(one, reign)]]
     faults += [memory.fault] if memory.fault else []
     answers = [(sent, 1e3 * (done - sent)) for one in told for sent, done, _, _ in one.answers]
     refused = sum((one.refused for one in told), Counter())

@@ -141,6 +141,15 @@ def test_images_get_every_package_and_only_files_of_known_hashes() -> None:
     assert not re.findall(r"^FROM (?!\$\{PYTHON_IMAGE\}|base)", DOCKERFILE, flags=re.MULTILINE)
 
 
+def test_images_of_others_are_pinned_by_digest() -> None:
+    services = yaml.safe_load((DEPLOY / "compose.yaml").read_text())["services"]
+    (base,) = re.findall(r"^ARG PYTHON_IMAGE=(.+)$", DOCKERFILE, flags=re.MULTILINE)
+    images = [base, *(service["image"] for service in services.values() if "image" in service)]
+    assert len(images) == 2
+    for image in images:
+        assert re.search(r"[\w/]+:[\w.-]+@sha256:[0-9a-f]{64}\b", image), image
+
+
 def test_compose_bounds_memory_and_processes() -> None:
     services = yaml.safe_load((DEPLOY / "compose.yaml").read_text())["services"]
     for service in services.values():
