@@ -1,17 +1,17 @@
-"""Controllers for an hour, while the service is restarted and given other models under them.
+"""Controllers for an hour, while the service is restarted and its model is replaced.
 
     python benchmarks/endurance.py [--minutes 60] [--attacks] [--out FILE]
 
-Eight clients ask at 20 Hz each; a rolling restart every five minutes and a reload every minute, of
-two models by turns. Claims: no admitted request is lost (every request is answered or refused, and
-the clients have all answers that the service counts), and no answer is of the wrong model: each is
-bit-equal to what the model that it names says of that image, and that model was, while the request
-was under way, the one to answer.
+Eight clients send 20 requests a second each. Every five minutes there is a rolling restart, every
+minute a reload, which alternates between two models. Claims: no admitted request is lost (every
+request is answered or refused, and the clients received as many answers as the service counted),
+and no answer is of the wrong model: it is bit-equal to what the model that it names predicts for
+that image, and this model was loaded at some moment of the request.
 
-`--attacks`: no restarts, no reloads, but bad clients beside the good ones, which make all attacks
-of the tests in every minute (two hours: --minutes 120). Claims: nothing is lost and no answer is
-wrong, the service's memory in the last minute is at most 1 % over that in the first, and p99 after
-the first minute is at most 1.2 times that in it. A minute before the first is not counted.
+`--attacks`: no restarts and no reloads, but malicious clients, which make all attacks of the tests
+in every minute (two hours: --minutes 120). Claims: no request is lost and no answer is wrong, the
+service's memory in the last minute is at most 1 % above that in the first, and p99 after the first
+minute is at most 1.2 times that of the first. The minute before the first is a warm-up.
 """
 
 import argparse
@@ -52,37 +52,36 @@ IMAGES = 16
 GROWTH, SLOWER = 0.01, 1.2
 MINUTE_S = 60.0
 PART_S = 10 * MINUTE_S
-"""A long run is also told in parts."""
+"""A long run is also reported in parts of this length."""
 COUNTED = re.compile(r'^driverview_frames_total\{.*outcome="answered".*\} ([0-9.e+]+)$', re.M)
 
-Known = dict[str, list[dict[str, Any]]]  # model hash -> its answers to the images
+ExpectedAnswers = dict[str, list[dict[str, Any]]]  # model hash -> its answers to the images
 
 
 @dataclass
-class Reign:
-    """Which models may have answered when: `begun` and `ended` are those of each reload."""
+class ModelHistory:
+    """Which model was loaded when: the first one, and the begin, end and model of each reload."""
 
     first: str
-    changes: list[tuple[float, float, str]] = field(default_factory=list)
+    reloads: list[tuple[float, float, str]] = field(default_factory=list)
 
-    def allowed(self, sent: float, answered: float) -> set[str]:
-        """The models that may answer a request under way from `sent` to `answered`."""
-        now, models = self.first, set()
+    def allowed(self, sent: float, received: float) -> set[str]:
+        """The models that may answer a request of which these are the times."""
+        model, models = self.first, set()
         since = -1.0
-        for begun, ended, model in [*self.changes, (float("inf"), float("inf"), "")]:
-            if sent < ended and answered > since:
-                models.add(now)
-            now, since = model, begun
+        for begin, end, next_model in [*self.reloads, (float("inf"), float("inf"), "")]:
+            if sent < end and received > since:
+                models.add(model)
+            model, since = next_model, begin
         return models
 
 
 @dataclass
-class Told:
-    """What one client was told.
+class ClientLog:
+    """What one client received.
 
-    An answer is kept as the times at which its request was sent and it came, the model that it
-    names, and whether it is bit-equal to what that model says of the image. The answers of two
-    hours as they came would fill gigabytes.
+    Of an answer: when its request was sent, when it was received, its model, and whether it is
+    bit-equal to what that model predicts. (Two hours of whole answers would take gigabytes.)
     """
 
     answers: list[tuple[float, float, str, bool]] = field(default_factory=list)
@@ -91,10 +90,15 @@ class Told:
     missed: int = 0
 
 
-def drive(
-    port: int, number: int, images: list[bytes], known: Known, end: float, told: Told
+def send_requests(
+    port: int,
+    number: int,
+    images: list[bytes],
+    expected: ExpectedAnswers,
+    end: float,
+    log: ClientLog,
 ) -> None:
-    """Ask at 20 Hz until `end`; clients begin spread over a period."""
+    """Send requests at 20 Hz until `end`; the clients' phases are spread over a period."""
     begin = time.monotonic() + number / CLIENTS / HERTZ
     with Client(f"127.0.0.1:{port}", timeout_s=10.0) as client:
         turn = 0
@@ -104,40 +108,43 @@ def drive(
             sent = time.monotonic()
             try:
                 answer = client.features(images[which])
-                came = time.monotonic()
-                told.answers.append((sent, came, answer["model"], is_right(answer, which, known)))
+                received = time.monotonic()
+                correct = is_correct(answer, which, expected)
+                log.answers.append((sent, received, answer["model"], correct))
             except ServiceError as error:
                 if error.status is None:
-                    told.lost.append(str(error))
+                    log.lost.append(str(error))
                 else:
-                    told.refused[str(error.problem)] += 1
-            # What it could not ask in time it asks no more, as a camera takes no frame twice.
+                    log.refused[str(error.problem)] += 1
+            # Requests that could not be sent in time are left out, as a camera drops frames.
             now = max(turn + 1, int((time.monotonic() - begin) * HERTZ))
-            told.missed += now - turn - 1
+            log.missed += now - turn - 1
             turn = now
 
 
 @contextmanager
 def clients(
-    port: int, images: list[bytes], known: Known, end: float, told: list[Told]
+    port: int, images: list[bytes], expected: ExpectedAnswers, end: float, logs: list[ClientLog]
 ) -> Iterator[None]:
-    """A client for each of `told`, asking until `end`, which is waited for; raises what they do."""
-    with ThreadPoolExecutor(len(told)) as pool:
-        asking = [
-            pool.submit(drive, port, number, images, known, end, one)
-            for number, one in enumerate(told)
+    """A client for each log, sending requests until `end`. Waits for them; raises what they do."""
+    with ThreadPoolExecutor(len(logs)) as pool:
+        running_clients = [
+            pool.submit(send_requests, port, number, images, expected, end, log)
+            for number, log in enumerate(logs)
         ]
         yield
-        for client in asking:
+        for client in running_clients:
             client.result()
 
 
-def disturb(port: int, runs: list[Path], reign: Reign, end: float) -> Counter[str]:
-    """Reload and restart on time until `end`; how often."""
+def reload_and_restart(
+    port: int, runs: list[Path], history: ModelHistory, end: float
+) -> Counter[str]:
+    """Reload and restart at their intervals until `end`. Returns how often each was done."""
     done: Counter[str] = Counter()
     begin = time.monotonic()
     plans: dict[str, tuple[float, Callable[[], object]]] = {
-        "reload": (RELOAD_S, lambda: _reload(port, runs[(done["reload"] + 1) % 2], reign)),
+        "reload": (RELOAD_S, lambda: _reload(port, runs[(done["reload"] + 1) % 2], history)),
         "restart": (RESTART_S, lambda: send_command(port, "restart")),
     }
     while True:
@@ -149,14 +156,14 @@ def disturb(port: int, runs: list[Path], reign: Reign, end: float) -> Counter[st
         done[name] += 1
 
 
-def _reload(port: int, run: Path, reign: Reign) -> None:
-    begun = time.monotonic()
+def _reload(port: int, run: Path, history: ModelHistory) -> None:
+    begin = time.monotonic()
     send_command(port, "reload", str(run))
-    reign.changes.append((begun, time.monotonic(), read_card(run).model_hash))
+    history.reloads.append((begin, time.monotonic(), read_card(run).model_hash))
 
 
-def answers_of(run: Path, images: list[bytes]) -> list[dict[str, Any]]:
-    """What the model of `run` says of the images, asked without a service."""
+def expected_answers(run: Path, images: list[bytes]) -> list[dict[str, Any]]:
+    """What the model of `run` predicts for the images, in this process."""
     engine = load_engine(run)
     camera = engine.card.camera
     return [
@@ -165,22 +172,22 @@ def answers_of(run: Path, images: list[bytes]) -> list[dict[str, Any]]:
     ]
 
 
-def is_right(answer: dict[str, Any], which: int, known: Known) -> bool:
-    """Whether an answer is what the model that it names says of the image by itself."""
-    if answer["model"] not in known:
+def is_correct(answer: dict[str, Any], which: int, expected: ExpectedAnswers) -> bool:
+    """Whether an answer is bit-equal to what the model that it names predicts."""
+    if answer["model"] not in expected:
         return False
-    right = known[answer["model"]][which]
-    return {key: answer[key] for key in right} == right
+    prediction = expected[answer["model"]][which]
+    return {key: answer[key] for key in prediction} == prediction
 
 
-def wrong(told: Told, reign: Reign) -> list[str]:
-    """The answers that are not what they ought to be."""
+def wrong_answers(log: ClientLog, history: ModelHistory) -> list[str]:
+    """A line for each answer of a model that was not loaded, or that its model does not predict."""
     found = []
-    for sent, answered, model, right in told.answers:
-        if model not in reign.allowed(sent, answered):
-            found.append(f"model {model[:12]} answered at {sent:.3f} s out of its time")
-        if not right:
-            found.append(f"model {model[:12]} answered at {sent:.3f} s otherwise than by itself")
+    for sent, received, model, correct in log.answers:
+        if model not in history.allowed(sent, received):
+            found.append(f"at {sent:.3f} s: answered by model {model[:12]}, which was not loaded")
+        if not correct:
+            found.append(f"at {sent:.3f} s: not what model {model[:12]} predicts")
     return found
 
 
@@ -190,26 +197,26 @@ def measure(minutes: float, folder: Path) -> dict[str, Any]:
     runs = [folder / "one", folder / "other"]
     for seed, run in enumerate(runs):
         publish_untrained(run, seed=seed + 3)
-    known = {read_card(run).model_hash: answers_of(run, images) for run in runs}
-    reign = Reign(read_card(runs[0]).model_hash)
-    told = [Told() for _ in range(CLIENTS)]
+    expected = {read_card(run).model_hash: expected_answers(run, images) for run in runs}
+    history = ModelHistory(read_card(runs[0]).model_hash)
+    logs = [ClientLog() for _ in range(CLIENTS)]
     with running(OURS, Path(sys.executable), runs[0], WORKERS) as port:
         before = counted(port)
         end = time.monotonic() + MINUTE_S * minutes
-        with clients(port, images, known, end, told):
-            done = disturb(port, runs, reign, end)
+        with clients(port, images, expected, end, logs):
+            done = reload_and_restart(port, runs, history, end)
         after = counted(port)
-    answers = sum(len(one.answers) for one in told)
-    times_ms = [1e3 * (b - a) for one in told for a, b, _, _ in one.answers]
-    faults = [fault for one in told for fault in [*one.lost, *wrong(one, reign)]]
+    answers = sum(len(log.answers) for log in logs)
+    times_ms = [1e3 * (b - a) for log in logs for a, b, _, _ in log.answers]
+    faults = [fault for log in logs for fault in [*log.lost, *wrong_answers(log, history)]]
     return {
         "minutes": minutes,
         **done,
         "answers": answers,
         "answers_counted_by_the_service": after - before,
-        "refused": dict(sum((one.refused for one in told), Counter())),
-        "models": dict(Counter(model for one in told for _, _, model, _ in one.answers)),
-        "turns_missed": sum(one.missed for one in told),
+        "refused": dict(sum((log.refused for log in logs), Counter())),
+        "models": dict(Counter(model for log in logs for _, _, model, _ in log.answers)),
+        "turns_missed": sum(log.missed for log in logs),
         "p50_ms": round(median(times_ms), 2),
         "p99_ms": round(quantiles(times_ms, n=100)[98], 2),
         "faults": faults[:10],
@@ -226,11 +233,11 @@ class Memory:
     fault: str = ""
 
     def watch(self, end: float) -> None:
-        """Look once a second until `end`; tell every ten minutes."""
-        tell = time.monotonic() + PART_S
+        """Sample once a second until `end`; report every ten minutes."""
+        report = time.monotonic() + PART_S
         while (now := time.monotonic()) < end and not self.fault:
-            if now >= tell:
-                tell += PART_S
+            if now >= report:
+                report += PART_S
                 megabytes = self.median(now - MINUTE_S, now)
                 print(f"{(end - now) / MINUTE_S:.0f} min left: {megabytes:.1f} MB", file=sys.stderr)
             try:
@@ -247,31 +254,31 @@ class Memory:
 
 
 def measure_attacked(minutes: float, folder: Path) -> dict[str, Any]:
-    """The figures of a run beside bad clients."""
+    """The figures of a run beside malicious clients."""
     images = [jpeg(np.roll(picture(), 17 * number, axis=1)) for number in range(IMAGES)]
     run = folder / "run"
     publish_untrained(run, seed=3)
     model = read_card(run).model_hash
-    known, reign = {model: answers_of(run, images)}, Reign(model)
-    told = [Told() for _ in range(CLIENTS)]
+    expected, history = {model: expected_answers(run, images)}, ModelHistory(model)
+    logs = [ClientLog() for _ in range(CLIENTS)]
     with running(OURS, Path(sys.executable), run, WORKERS) as port:
         memory = Memory(descendants(os.getpid()))
         with bad_clients(port):
             begin = time.monotonic() + MINUTE_S
             end = begin + MINUTE_S * minutes
-            with clients(port, images, known, end, told):
+            with clients(port, images, expected, end, logs):
                 memory.watch(end)
-    return {"minutes": minutes, **judge_attacked(told, memory, reign, begin, end)}
+    return {"minutes": minutes, **attacked_figures(logs, memory, history, begin, end)}
 
 
-def judge_attacked(
-    told: list[Told], memory: Memory, reign: Reign, begin: float, end: float
+def attacked_figures(
+    logs: list[ClientLog], memory: Memory, history: ModelHistory, begin: float, end: float
 ) -> dict[str, Any]:
-    """The figures from `begin` to `end`, and whether they are as claimed."""
-    faults = [fault for one in told for fault in [*one.lost, *wrong(one, reign)]]
+    """The figures from `begin` to `end`, and whether the claims are reached."""
+    faults = [fault for log in logs for fault in [*log.lost, *wrong_answers(log, history)]]
     faults += [memory.fault] if memory.fault else []
-    answers = [(sent, 1e3 * (done - sent)) for one in told for sent, done, _, _ in one.answers]
-    refused = sum((one.refused for one in told), Counter())
+    answers = [(sent, 1e3 * (done - sent)) for log in logs for sent, done, _, _ in log.answers]
+    refused = sum((log.refused for log in logs), Counter())
     first = [ms for sent, ms in answers if begin <= sent < begin + MINUTE_S]
     later = [ms for sent, ms in answers if sent >= begin + MINUTE_S]
     p99s = [quantiles(part, n=100)[98] for part in (first, later)]
@@ -282,7 +289,7 @@ def judge_attacked(
         "answers": len(answers),
         "answered_share": round(len(answers) / (len(answers) + refused.total()), 5),
         "refused": dict(refused),
-        "turns_missed": sum(one.missed for one in told),
+        "turns_missed": sum(log.missed for log in logs),
         "p99_ms_first_minute": round(p99s[0], 2),
         "p99_ms_later": round(p99s[1], 2),
         "slower": round(slower, 3),
@@ -300,7 +307,7 @@ def judge_attacked(
 
 
 def counted(port: int) -> int:
-    """The frames that the service says it answered, in all workers."""
+    """The frames that the service counts as answered, in all workers."""
     with urlopen(f"http://127.0.0.1:{port}/metrics") as page:
         found = COUNTED.findall(page.read().decode())
     return round(sum(map(float, found)))
@@ -309,7 +316,7 @@ def counted(port: int) -> int:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--minutes", type=float, default=60.0)
-    parser.add_argument("--attacks", action="store_true", help="beside bad clients")
+    parser.add_argument("--attacks", action="store_true", help="beside malicious clients")
     parser.add_argument("--out", type=Path, help="write the figures here, too")
     options = parser.parse_args()
     if options.attacks and options.minutes < 2:
