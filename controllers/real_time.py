@@ -1,10 +1,10 @@
-"""Perception on the wall clock: asked without waiting, used when its answer has come. SI units.
+"""Asynchronous perception in real time: an answer is used once it has been received. SI units.
 
-The thread that steps the world also renders (an OpenGL context belongs to one thread); another one
-asks the model or the service. While a question is under way the newest image waits for it, and
-replaces one that waits. At each control step the newest answer that has come is carried to the
-present with the car's own motion. The world keeps to the wall clock: after a control step that took
-too long the next ones do not wait until the time is made up.
+The thread that steps the world also renders (an OpenGL context belongs to one thread); a second
+thread sends requests to the model or the service, one at a time. Only the newest image waits for
+the request before it. At each control step the newest answer is predicted to the present with the
+car's own motion. The world follows the wall clock: after a control step that took too long the
+next steps do not wait until the delay is made up.
 """
 
 import math
@@ -28,63 +28,63 @@ if TYPE_CHECKING:
 
 World = TypeVar("World")
 Frame = TypeVar("Frame")
-Asked = TypeVar("Asked", contravariant=True)
+Request = TypeVar("Request", contravariant=True)
 Answer = TypeVar("Answer")
 Clock = Callable[[], float]
 
 
 @dataclass(frozen=True, slots=True)
-class Arrived(Generic[Answer]):
-    """An answer, and the control step and the times (s, wall clock) of its question."""
+class TimedAnswer(Generic[Answer]):
+    """An answer, the control step of its image, and the times (s) of request and receipt."""
 
     answer: Answer
     step: int
-    asked_s: float
-    came_s: float
+    requested_s: float
+    received_s: float
 
 
-class Asking(Protocol[Asked, Answer]):
-    """What asks for frames: `Asker`, or `AtOnce`."""
+class AnswerSource(Protocol[Request, Answer]):
+    """Where the answers for frames come from: `RequestThread` or `ImmediateAnswers`."""
 
-    def ask(self, frame: Asked) -> Answer:
-        """The answer, waited for."""
+    def ask(self, frame: Request) -> Answer:
+        """Wait for the answer."""
         ...
 
-    def put(self, frame: Asked, step: int) -> None:
-        """Ask for the frame of a control step, without waiting."""
+    def put(self, frame: Request, step: int) -> None:
+        """Request the answer for the frame of a control step, without waiting."""
         ...
 
-    def take(self) -> list[Arrived[Answer]]:
-        """The answers that have come since the last call, oldest first."""
+    def take(self) -> list[TimedAnswer[Answer]]:
+        """The answers received since the last call, oldest first."""
         ...
 
     def close(self) -> None: ...
 
 
-class AtOnce(Generic[Answer]):
-    """For what is known without asking: the frame is the answer."""
+class ImmediateAnswers(Generic[Answer]):
+    """For perceptions that need no request: the frame is the answer."""
 
     def __init__(self, clock: Clock = time.monotonic) -> None:
         self._clock = clock
-        self._arrived: list[Arrived[Answer]] = []
+        self._answers: list[TimedAnswer[Answer]] = []
 
     def ask(self, frame: Answer) -> Answer:
         return frame
 
     def put(self, frame: Answer, step: int) -> None:
         now = self._clock()
-        self._arrived.append(Arrived(frame, step, now, now))
+        self._answers.append(TimedAnswer(frame, step, now, now))
 
-    def take(self) -> list[Arrived[Answer]]:
-        arrived, self._arrived = self._arrived, []
-        return arrived
+    def take(self) -> list[TimedAnswer[Answer]]:
+        answers, self._answers = self._answers, []
+        return answers
 
     def close(self) -> None:
         """Nothing is held open."""
 
 
-class Asker(Generic[Frame, Answer]):
-    """Asks in a thread of its own, one question at a time; a newer frame replaces a waiting one.
+class RequestThread(Generic[Frame, Answer]):
+    """Requests from a thread, one at a time; a newer frame replaces the one that waits.
 
     An error of `ask` is raised by the next `take`.
     """
@@ -93,43 +93,43 @@ class Asker(Generic[Frame, Answer]):
         self.ask, self._clock = ask, clock
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="perception")
         self._waiting: deque[tuple[Frame, int, float]] = deque(maxlen=1)
-        self._jobs: deque[Future[Arrived[Answer] | None]] = deque()
+        self._jobs: deque[Future[TimedAnswer[Answer] | None]] = deque()
 
     def put(self, frame: Frame, step: int) -> None:
         self._waiting.append((frame, step, self._clock()))
         self._jobs.append(self._pool.submit(self._ask_waiting))
 
-    def take(self) -> list[Arrived[Answer]]:
-        arrived = []
+    def take(self) -> list[TimedAnswer[Answer]]:
+        answers = []
         while self._jobs and self._jobs[0].done():
             found = self._jobs.popleft().result()
             if found is not None:
-                arrived.append(found)
-        return arrived
+                answers.append(found)
+        return answers
 
     def close(self) -> None:
-        """End the thread, after the question that is under way."""
+        """End the thread, after the request that is under way."""
         self._pool.shutdown(cancel_futures=True)
 
-    def _ask_waiting(self) -> Arrived[Answer] | None:
+    def _ask_waiting(self) -> TimedAnswer[Answer] | None:
         if not self._waiting:  # this job's frame was replaced, and the newer one is answered
             return None
-        frame, step, asked_s = self._waiting.popleft()
-        return Arrived(self.ask(frame), step, asked_s, self._clock())
+        frame, step, requested_s = self._waiting.popleft()
+        return TimedAnswer(self.ask(frame), step, requested_s, self._clock())
 
 
 class RealTimePerception(Generic[World, Frame, Answer]):
-    """A perception for `run_lap` that holds the drive to the wall clock. A context manager.
+    """A perception for `run_lap` that keeps the drive in real time. A context manager.
 
-    `capture` takes the frame of the present state, `asking` gets its answer, `read` makes of it
-    what the controller receives; `drop` is the share of answers that are lost. The first frame's
-    answer is waited for: the clock starts when it is there.
+    `capture` renders the frame of the present state, `source` answers it, `read` converts the
+    answer for the controller; `lost` says of each answer whether it is lost. The clock starts with
+    the answer to the first frame.
     """
 
     def __init__(
         self,
         capture: Callable[[World], Frame],
-        asking: Asking[Frame, Answer],
+        source: AnswerSource[Frame, Answer],
         read: Callable[[Answer], Perceived],
         estimate: RoadEstimate,
         *,
@@ -138,13 +138,13 @@ class RealTimePerception(Generic[World, Frame, Answer]):
         clock: Clock = time.monotonic,
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
-        self._capture, self._asking, self._read = capture, asking, read
+        self._capture, self._source, self._read = capture, source, read
         self._estimate, self._state, self._lost = estimate, state, lost
         self._clock = clock
         self._pacer = Pacer(estimate.dt, catch_up_s=math.inf, clock=clock, sleep=sleep)
         self._step = -1
-        self._asked_s = 0.0
-        """When the newest answer that came was asked for."""
+        self._requested_s = 0.0
+        """When the newest received answer was requested."""
         self._waits_s: list[float] = []
         self._ages_s: list[float] = []
         self._missed = self._lost_answers = 0
@@ -156,29 +156,29 @@ class RealTimePerception(Generic[World, Frame, Answer]):
             return self._begin(world)
         self._missed += self._pacer.late
         self._pacer.wait()
-        self._asking.put(self._capture(world), self._step)
+        self._source.put(self._capture(world), self._step)
         newest: Perceived | None = None
         age = 0
-        for arrived in self._asking.take():
-            self._waits_s.append(arrived.came_s - arrived.asked_s)
+        for received in self._source.take():
+            self._waits_s.append(received.received_s - received.requested_s)
             if self._lost():
                 self._lost_answers += 1
                 continue
-            answer = self._read(arrived.answer)
+            answer = self._read(received.answer)
             if answer.to_lane_centre is not None:
-                newest, age = answer, self._step - arrived.step
-                self._asked_s = arrived.asked_s
+                newest, age = answer, self._step - received.step
+                self._requested_s = received.requested_s
         return self._know(world, newest, age)
 
     def _begin(self, world: World) -> Perceived:
-        answer = self._read(self._asking.ask(self._capture(world)))
+        answer = self._read(self._source.ask(self._capture(world)))
         self._pacer.restart()
-        self._asked_s = self._clock()
+        self._requested_s = self._clock()
         return self._know(world, None if answer.to_lane_centre is None else answer, 0)
 
     def _know(self, world: World, newest: Perceived | None, age: int) -> Perceived:
         self._estimate.update(self._state(world), newest, age)
-        self._ages_s.append(self._clock() - self._asked_s)
+        self._ages_s.append(self._clock() - self._requested_s)
         # An answer to the last step's image is in time.
         return self._estimate.present(due=1)
 
@@ -200,13 +200,13 @@ class RealTimePerception(Generic[World, Frame, Answer]):
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._asking.close()
+        self._source.close()
 
 
 def real_time(
     perceive: Perceive, *, dt: float, drop: float, rng: np.random.Generator
 ) -> RealTimePerception["SimulatedWorld", Any, Any]:
-    """`perceive` on the wall clock; what is no camera and model answers at once."""
+    """`perceive` in real time. Only perceptions with a camera take time to answer."""
     check_drop(drop)
 
     def lost() -> bool:
@@ -215,9 +215,16 @@ def real_time(
     estimate = RoadEstimate(dt)
     if isinstance(perceive, CameraPerception):
         return RealTimePerception(
-            perceive.capture, Asker(perceive.ask), perceive.read, estimate, state=_state, lost=lost
+            perceive.capture,
+            RequestThread(perceive.ask),
+            perceive.read,
+            estimate,
+            state=_state,
+            lost=lost,
         )
-    return RealTimePerception(perceive, AtOnce(), _as_it_is, estimate, state=_state, lost=lost)
+    return RealTimePerception(
+        perceive, ImmediateAnswers(), _as_it_is, estimate, state=_state, lost=lost
+    )
 
 
 def _state(world: "SimulatedWorld") -> CarState:

@@ -89,15 +89,15 @@ def on_the_truth(speed: float, road: Road, lane_centre: float, dt: float) -> Spe
 
 
 def on_perception(speed: float, dt: float) -> SpeedHold:
-    """Slows in the bends that the car feels and the perception announces.
+    """Slows down in bends, which the car's yaw rate and the perceived road class show.
 
     The slope is that of the body: an inclination sensor.
     """
-    return SpeedHold(speed, dt, BendsFelt(dt), lambda now: math.tan(-now.pitch))
+    return SpeedHold(speed, dt, CornerSpeed(dt), lambda now: math.tan(-now.pitch))
 
 
-class BendsFelt:
-    """The speed for a road that is known only by its class and the car's own yaw rate."""
+class CornerSpeed:
+    """The speed limit (m/s) in bends, from the perceived road class and the car's yaw rate."""
 
     def __init__(self, dt: float) -> None:
         self._dt = dt

@@ -1,4 +1,4 @@
-"""Drives on the wall clock: answers that come when they come, on a clock that the test moves."""
+"""Drives in real time with delayed answers, on a clock that the test moves."""
 
 import math
 import threading
@@ -10,7 +10,7 @@ from controllers.config import DriveConfig
 from controllers.drive import drive
 from controllers.late_perception import RoadEstimate
 from controllers.perception import Perceived, PerceptionSource, truth
-from controllers.real_time import Arrived, Asker, AtOnce, RealTimePerception
+from controllers.real_time import ImmediateAnswers, RealTimePerception, RequestThread, TimedAnswer
 from simulator.vehicle.state import CarState
 from simulator.world.world import World
 from tests.controllers.test_drive import at_rest
@@ -35,11 +35,11 @@ class Clock:
 
 
 class SlowModel:
-    """Answers each question `seconds` after it was put, one at a time, the newest first."""
+    """Answers each request after `seconds`, one at a time, the newest first."""
 
     def __init__(self, clock: Clock, *seconds: float) -> None:
         self._clock, self._seconds = clock, list(seconds)
-        self._under_way: list[tuple[float, Arrived[Perceived]]] = []
+        self._under_way: list[tuple[float, TimedAnswer[Perceived]]] = []
         self._waiting: tuple[Perceived, int, float] | None = None
         self._free_s = 0.0
         self.closed = False
@@ -51,7 +51,7 @@ class SlowModel:
         self._start()
         self._waiting = (frame, step, self._clock())
 
-    def take(self) -> list[Arrived[Perceived]]:
+    def take(self) -> list[TimedAnswer[Perceived]]:
         self._start()
         due = [one for at, one in self._under_way if at <= self._clock()]
         self._under_way = [pair for pair in self._under_way if pair[1] not in due]
@@ -66,7 +66,7 @@ class SlowModel:
         (frame, step, asked), self._waiting = self._waiting, None
         takes = self._seconds.pop(0) if len(self._seconds) > 1 else self._seconds[0]
         self._free_s = max(asked, self._free_s) + takes
-        self._under_way.append((self._free_s, Arrived(frame, step, asked, self._free_s)))
+        self._under_way.append((self._free_s, TimedAnswer(frame, step, asked, self._free_s)))
 
 
 def state(car: Straight) -> CarState:
@@ -134,7 +134,7 @@ def test_lost_answers_stay_lost() -> None:
 
     perceive = RealTimePerception(
         lambda car: car.perceive(),
-        AtOnce[Perceived](clock),
+        ImmediateAnswers[Perceived](clock),
         lambda answer: answer,
         RoadEstimate(DT),
         state=state,
@@ -170,29 +170,29 @@ def test_an_asker_asks_for_the_newest_waiting_frame_only() -> None:
         assert go_on.acquire(timeout=60)
         return frame.upper()
 
-    asker = Asker(ask)
-    asker.put("a", 0)
+    requests = RequestThread(ask)
+    requests.put("a", 0)
     assert begun.acquire(timeout=60)  # "a" is under way
     for step, frame in enumerate("bcd", start=1):
-        asker.put(frame, step)
-    assert asker.take() == []
+        requests.put(frame, step)
+    assert requests.take() == []
     go_on.release(2)
     assert begun.acquire(timeout=60)
-    asker._pool.submit(int).result(timeout=60)  # all jobs before this one are done
-    assert [(one.answer, one.step) for one in asker.take()] == [("A", 0), ("D", 3)]
-    asker.close()
+    requests._pool.submit(int).result(timeout=60)  # all jobs before this one are done
+    assert [(one.answer, one.step) for one in requests.take()] == [("A", 0), ("D", 3)]
+    requests.close()
 
 
 def test_an_error_of_the_question_is_raised_in_the_drive() -> None:
     def ask(frame: int) -> int:
         raise UserError("the service does not answer")
 
-    asker = Asker(ask)
-    asker.put(1, 0)
-    asker._pool.submit(int).result(timeout=60)
+    requests = RequestThread(ask)
+    requests.put(1, 0)
+    requests._pool.submit(int).result(timeout=60)
     with pytest.raises(UserError, match="does not answer"):
-        asker.take()
-    asker.close()
+        requests.take()
+    requests.close()
 
 
 def test_a_drive_on_the_truth_in_real_time_is_that_without(
@@ -234,7 +234,7 @@ def test_a_blind_answer_is_no_answer() -> None:
     blind = Perceived(None, 0.0, Heading.STRAIGHT)
     perceive = RealTimePerception(
         lambda car: blind if car.step == 5 else car.perceive(),
-        AtOnce[Perceived](clock),
+        ImmediateAnswers[Perceived](clock),
         lambda answer: answer,
         RoadEstimate(DT),
         state=state,

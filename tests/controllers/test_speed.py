@@ -7,7 +7,7 @@ import pytest
 from controllers.config import DriveConfig
 from controllers.drive import drive
 from controllers.perception import Perceived, PerceptionSource, truth
-from controllers.speed import BendsFelt, on_perception, on_the_truth
+from controllers.speed import CornerSpeed, on_perception, on_the_truth
 from simulator.driving.speed import LATERAL_ACCELERATION
 from simulator.track.catalogue import find_track
 from simulator.track.road import Road
@@ -24,12 +24,12 @@ def seen(heading: Heading) -> Perceived:
 
 
 def test_a_straight_road_has_no_limit() -> None:
-    bends = BendsFelt(DT)
+    bends = CornerSpeed(DT)
     assert min(bends(at_rest(vx=20.0), seen(Heading.STRAIGHT)) for _ in range(50)) > 100.0
 
 
 def test_a_bend_ahead_is_taken_for_one_of_60_m_until_it_is_felt() -> None:
-    bends, straight = BendsFelt(DT), at_rest(vx=10.0)
+    bends, straight = CornerSpeed(DT), at_rest(vx=10.0)
     bends(straight, seen(Heading.STRAIGHT))
     limits = [bends(straight, seen(Heading.RIGHT)) for _ in range(100)]
     assert limits[0] > 100.0  # a single answer does not brake
@@ -41,7 +41,7 @@ def test_a_bend_ahead_is_taken_for_one_of_60_m_until_it_is_felt() -> None:
 
 
 def test_the_next_bend_to_the_other_side_is_a_new_one() -> None:
-    bends, now = BendsFelt(DT), at_rest(vx=10.0)
+    bends, now = CornerSpeed(DT), at_rest(vx=10.0)
     for _ in range(100):
         bends(now, seen(Heading.LEFT))
     limits = [bends(now, seen(Heading.RIGHT)) for _ in range(20)]
