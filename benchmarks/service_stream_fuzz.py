@@ -190,7 +190,7 @@ async def run_part(seed: int, part: int, count: int) -> tuple[float, list[str]]:
     while state.tasks:
         await asyncio.sleep(0.01)
     groups = (guard.receiving, guard.working, guard.idle, guard.served, guard.streams)
-    if state.connections or any((*groups, guard.dismissed, guard.leaving)):
+    if state.connections or any((*groups, guard.refused, guard.closing)):
         faults.append(f"part {part}: connections were left behind")
     if app.bodies.held:
         faults.append(f"part {part}: {app.bodies.held} bytes of bodies were left behind")

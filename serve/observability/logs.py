@@ -3,7 +3,7 @@
 No client can fill the disk: its refusals, for its token, Host, Origin or rate too, are logged once
 a second, those of all clients ten times; the same error, and what native libraries write to
 stderr, once a second. Each of several workers has its share of these rates. The number of those
-left out is in the next one logged, as `untold`.
+left out is in the next one logged, as `suppressed`.
 """
 
 import faulthandler
@@ -26,7 +26,7 @@ INTERVAL_S = 1.0  # between two refusals of one client, and between two equal er
 REMEMBERED = 1024  # clients, and errors, whose last time is known
 MAX_LINE = 500  # characters kept of a native library's line
 SUPERVISION = "serve.workers"  # its lines are not limited: no client causes them
-FIELDS = ("request", "client", "problem", "status", "total_ms", "untold")
+FIELDS = ("request", "client", "problem", "status", "total_ms", "suppressed")
 
 logger = logging.getLogger("serve.requests")
 
@@ -81,7 +81,7 @@ class ErrorLimit(logging.Filter):
             self._suppressed += 1
             return False
         if self._suppressed:
-            record.untold, self._suppressed = self._suppressed, 0
+            record.suppressed, self._suppressed = self._suppressed, 0
         return True
 
 
@@ -143,7 +143,7 @@ class RefusalLog:
             "status": problem.type.status,
         }
         if self._suppressed:
-            fields["untold"] = self._suppressed
+            fields["suppressed"] = self._suppressed
         self._suppressed = 0
         logger.info("refused: %s", problem.detail, extra=fields)
 

@@ -82,7 +82,7 @@ class Metrics:
         for number, outcome in enumerate(OUTCOMES):
             count = self._sum(FRAME_COUNTS + number)
             yield f'driverview_frames_total{{outcome="{outcome}"}} {count:.0f}'
-        name = "dismissed_connections_total"
+        name = "closed_connections_total"
         yield from _header(name, "counter", "Connections closed by the service, by problem.")
         for number, outcome in enumerate(OUTCOMES[1:], start=1):
             count = self._sum(CLOSED_COUNTS + number)

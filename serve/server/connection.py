@@ -80,7 +80,7 @@ class GuardedProtocol(HttpToolsProtocol):
         self._guard.admit(self, self.client[0] if self.client else "")
         self._settle()
         guard, limit = self._guard, self._guard.limits.connections
-        count = len(self.connections) - len(guard.leaving) + guard.other_connections()
+        count = len(self.connections) - len(guard.closing) + guard.other_connections()
         if count > limit and not guard.make_room_for(self, count - limit):
             detail = f"{limit} connections are open; use one connection for all requests"
             self._close_with(Problem(TOO_MANY_CONNECTIONS, detail))
@@ -197,7 +197,7 @@ class GuardedProtocol(HttpToolsProtocol):
 
     def pause_writing(self) -> None:
         super().pause_writing()
-        # As long as an idle connection has; one that is being dismissed has less already.
+        # As long as an idle connection has; one that was refused has less already.
         self._deadline_s = min(self._deadline_s, self._guard.clock() + self._guard.limits.idle_s)
 
     def resume_writing(self) -> None:
@@ -324,7 +324,7 @@ class GuardedProtocol(HttpToolsProtocol):
             self._close_with(too_slow("body", limits.body_s))
         else:
             self._phase, self._deadline_s = Phase.CLOSING, inf
-            self._guard.place(self, self._guard.leaving)
+            self._guard.place(self, self._guard.closing)
             # Close would wait for a client that does not read its answer.
             idle = phase is Phase.IDLE and not self.transport.get_write_buffer_size()
             (self.transport.close if idle else self.transport.abort)()
@@ -333,7 +333,7 @@ class GuardedProtocol(HttpToolsProtocol):
         """Send a problem and close the connection; where a reply is owed, send that instead."""
         owed = self._running if self.pipeline or self._phase is Phase.WORK else None
         self._phase = Phase.CLOSING
-        now = self._guard.place(self, self._guard.dismissed)
+        now = self._guard.place(self, self._guard.refused)
         self._deadline_s = now + guards.LINGER_S
         self._guard.count_closed(problem.type)
         if owed is not None:  # the client would take the problem for that reply

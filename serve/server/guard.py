@@ -2,7 +2,7 @@
 
 Each connection is in one group, by what it waits for; within a group those that have waited for
 longest come first. While the service has as many connections as it takes, a new one ends another:
-one that is being dismissed, one that sends its request slowly, the one that has been idle for
+one that was refused and lingers, one that sends its request slowly, the one that has been idle for
 longest, a WebSocket without messages. One whose last image was answered goes after those that have
 sent none. A client with many connections cannot end those of one with fewer; it gives way to it.
 """
@@ -77,9 +77,9 @@ class ConnectionGuard:
     """Between requests, after an image that was answered."""
     streams: Group = field(default_factory=_group)
     """WebSockets, by their last message."""
-    dismissed: Group = field(default_factory=_group)
+    refused: Group = field(default_factory=_group)
     """Refused, and open for LINGER_S only so that the client can read why."""
-    leaving: Group = field(default_factory=_group)
+    closing: Group = field(default_factory=_group)
     """Ended, but still counted by the server for a moment."""
     open: Counter[str] = field(default_factory=Counter)
     """Connections by the network of their client."""
@@ -125,7 +125,7 @@ class ConnectionGuard:
         when all others are too young, those of clients with more are ended.
         """
         for group, age_s, count in (
-            (self.dismissed, 0.0, 0),
+            (self.refused, 0.0, 0),
             (self.receiving, EVICTABLE_S, least),
             (self.idle, 0.0, least),
             (self.served, 0.0, least),
@@ -146,7 +146,7 @@ class ConnectionGuard:
             if self._count(connection) < count:
                 continue
             connection.give_way()
-            self.place(connection, self.leaving)
+            self.place(connection, self.closing)
             self.count_closed(TOO_MANY_CONNECTIONS)
             ended += 1
         return ended

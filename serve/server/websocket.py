@@ -269,7 +269,7 @@ class GuardedWebSocket(WebSocketsSansIOProtocol):
         """Send the last bytes; close after LINGER_S."""
         self._discarding = self.close_sent = True
         self.stop_keepalive()
-        self._guard.place(self, self._guard.dismissed)
+        self._guard.place(self, self._guard.refused)
         if self.transport.is_closing():
             return
         self.transport.write(output)

@@ -99,8 +99,8 @@ def left_uploads(target: Target, count: int = 120) -> list[socket.socket]:
     return []
 
 
-def dismissed_uploads(target: Target, count: int = 60) -> list[socket.socket]:
-    """Bodies that are dismissed in their middle, for a chunk that is none."""
+def refused_uploads(target: Target, count: int = 60) -> list[socket.socket]:
+    """Bodies that are refused in their middle, for an invalid chunk."""
     connections = []
     for _ in range(count):
         connection = _begin_chunked(target)

@@ -7,7 +7,7 @@ from tests.serve.attacks.websockets import WEBSOCKETS
 ATTACKS: tuple[Attack, ...] = (*CONNECTIONS, *WEBSOCKETS, *REQUESTS)
 REPORTED = (
     *("long_upgrades", "crowded_upgrades", "endless_trailers", "idle_connections"),
-    *("left_uploads", "dismissed_uploads", "unread_pings", "empty_fragments", "deep_texts"),
+    *("left_uploads", "refused_uploads", "unread_pings", "empty_fragments", "deep_texts"),
     *("fill_bytes", "repeated_outputs", "costly_images", "large_bodies", "h2c_in_two_segments"),
     *("rebound_names", "guessed_tokens", "forged_addresses"),
     *("left_websockets", "damaged_images", "strange_headers"),

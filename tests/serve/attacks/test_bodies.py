@@ -102,7 +102,7 @@ def test_large_chunked_bodies_are_no_trailers(service: Served, target: Target) -
         assert read_reply(connection)[0] == 200
 
 
-@pytest.mark.parametrize("attack", [attacks.left_uploads, attacks.dismissed_uploads])
+@pytest.mark.parametrize("attack", [attacks.left_uploads, attacks.refused_uploads])
 def test_an_upload_that_ends_early_leaves_nothing(
     service: Served, target: Target, attack: Callable[[Target, int], list[socket.socket]]
 ) -> None:

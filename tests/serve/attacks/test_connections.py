@@ -51,7 +51,7 @@ def test_refused_upgrades_are_answered_and_swept(
             received = read_rest(connection)
             assert status_of(received) == 431
             assert b"/problems/headers-too-large" in received
-        until(lambda: len(service.server.guard.dismissed) == 8)
+        until(lambda: len(service.server.guard.refused) == 8)
         assert service.ask("GET", "/healthz").status == 200
         close(connections)
         until(lambda: open_count(service) == 1)

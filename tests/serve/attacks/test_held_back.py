@@ -83,5 +83,5 @@ def test_a_message_of_a_websocket_counts_as_it_arrives(engine: FakeEngine) -> No
                 assert code == 1013
                 assert "8 MiB" in reason
             page = service.app.metrics.page(time.monotonic(), {})
-            assert 'dismissed_connections_total{problem="overloaded"} 1\n' in page
+            assert 'closed_connections_total{problem="overloaded"} 1\n' in page
         until(lambda: bodies.held == 0)

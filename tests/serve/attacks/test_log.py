@@ -70,7 +70,7 @@ def test_a_reply_to_a_client_that_has_left_writes_nothing_to_the_log(
             connection = target.dial()
             connection.sendall(sent)
             assert gate.busy.wait(PATIENCE_S)
-            until(lambda: bool(service.server.guard.working or service.server.guard.dismissed))
+            until(lambda: bool(service.server.guard.working or service.server.guard.refused))
             connection.close()
             until(lambda: open_count(service) == 0)
         gate.open.set()
@@ -117,7 +117,7 @@ def test_refusals_of_token_host_and_origin_are_logged_once_a_second(
     found = [json.loads(line) for line in lines]
     assert {line["problem"] for line in found} == {f"/problems/{problem}"}
     assert {line["client"] for line in found} == {"127.0.0.1"}
-    assert sum(line.get("untold", 0) + 1 for line in found) == 21
+    assert sum(line.get("suppressed", 0) + 1 for line in found) == 21
     assert all(line.isascii() and line.isprintable() for line in lines)
 
 

@@ -70,7 +70,7 @@ def test_small_frames_are_bounded(
     assert code == POLICY
     assert "small frames" in reason
     page = service.app.metrics.page(time.monotonic(), {})
-    assert 'dismissed_connections_total{problem="rate-limited"} 1\n' in page
+    assert 'closed_connections_total{problem="rate-limited"} 1\n' in page
     assert time.monotonic() - started_s < PATIENCE_S
     connection.close()
     gc.collect()
@@ -246,7 +246,7 @@ def test_leaving_a_busy_websocket_writes_nothing_to_the_log(
         for _ in range(3):
             websockets.left_websockets(target, 8)
             connections = [target.open_websocket() for _ in range(8)]
-            for connection in connections:  # dismissed while its frames wait
+            for connection in connections:  # closed while its frames wait
                 send_all(connection, frame(BINARY, JPEG) * 6 + frame(TEXT, b"\xff"))
             until(lambda: not service.server.guard.streams)
             for connection in connections:

@@ -95,7 +95,7 @@ def test_refusals_are_logged_with_their_request_and_at_a_limited_rate(
     assert len(lines.records) == 1  # a client has a line a second
     clock.now_s += 1.0
     service.post(b"")
-    assert json.loads(JsonFormatter().format(lines.records[-1]))["untold"] == 200
+    assert json.loads(JsonFormatter().format(lines.records[-1]))["suppressed"] == 200
     for number in range(200):
         service.post(b"", X_Forwarded_For=f"10.0.0.{number}")
     refusals = [record for record in lines.records if record.name == "serve.requests"]
