@@ -93,7 +93,7 @@ def measure(run: Path, rounds: int) -> dict[str, Any]:
         "bf16": openvino_pass(run, None),
         "int8": openvino_pass(run, images),
     }
-    if read_card(run).doubt is not None:
+    if read_card(run).uncertainty is not None:
         passes["bf16 with uncertainty"] = openvino_pass(run, None, uncertainty=True)
         passes["int8 with uncertainty"] = openvino_pass(run, images, uncertainty=True)
     times: dict[str, list[float]] = {name: [] for name in passes}

@@ -170,7 +170,7 @@ def choose_pedals(config: DriveConfig, road: Road, lane: Lane) -> Pedals:
 
 
 def delay(config: DriveConfig, perceive: Perceive, unknown_s: float = 0.0) -> Perceive:
-    """`perceive`, late and with lost answers where `config` asks for it, and predicted; doubtful
+    """`perceive`, late and with lost answers where `config` asks for it, and predicted; uncertain
     answers are trusted less.
 
     A delay of `unknown_s` is not known to the controller: nothing is predicted over it.

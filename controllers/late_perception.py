@@ -111,7 +111,7 @@ class RoadEstimate:
             return Perceived(None, 0.0, self._heading, None, lost_s=waited_s)
         if self._predictor is None:
             return replace(self._last, lost_s=waited_s)
-        lost_s = waited_s + self._trust.doubted * self.dt
+        lost_s = waited_s + self._trust.untrusted_steps * self.dt
         return replace(self._predictor.predict(self._last, self._age), lost_s=lost_s)
 
 

@@ -1,4 +1,4 @@
-"""Doubtful answers trusted less: a Kalman filter on the offset and the angle. SI units.
+"""Uncertain answers are trusted less: a Kalman filter on the offset and the angle. SI units.
 
 What is known of the road is carried to the moment of an answer with the car's own motion, and the
 answer corrects it. An answer of ordinary standard deviation counts in full; beyond that the gain
@@ -36,7 +36,7 @@ class Trust:
 
     offset_m2: float = 0.0
     angle_rad2: float = 0.0
-    doubted: int = 0
+    untrusted_steps: int = 0
     """Control steps since the last answer that was trusted, at the moment of the last one."""
 
     def correct(
@@ -50,7 +50,7 @@ class Trust:
         if answer.out_of_distribution:
             offset_std, angle_std = UNFAMILIAR_SCALE * offset_std, UNFAMILIAR_SCALE * angle_std
         if known is None or known.to_lane_centre is None or answer.to_lane_centre is None:
-            self.offset_m2, self.angle_rad2, self.doubted = offset_std**2, angle_std**2, 0
+            self.offset_m2, self.angle_rad2, self.untrusted_steps = offset_std**2, angle_std**2, 0
             return answer
         # An error of the angle has become one of the offset on the way.
         offset_m2 = self.offset_m2 + moved_m**2 * self.angle_rad2 + steps * OFFSET_NOISE_M**2
@@ -59,7 +59,7 @@ class Trust:
         angle_gain = angle_rad2 / (angle_rad2 + max(angle_std**2 - ORDINARY_RAD**2, 0.0))
         self.offset_m2 = _joseph(offset_m2, gain, offset_std)
         self.angle_rad2 = _joseph(angle_rad2, angle_gain, angle_std)
-        self.doubted = 0 if gain >= TRUSTED_GAIN else self.doubted + steps
+        self.untrusted_steps = 0 if gain >= TRUSTED_GAIN else self.untrusted_steps + steps
         if gain == angle_gain == 1.0:
             return answer
         return replace(

@@ -196,7 +196,7 @@ def evaluate_command(
     console.print(evaluation_table(result))
     if "by_track" in result:
         console.print(group_table(result))
-    if "doubt" in result:
+    if "uncertainty" in result:
         console.print(uncertainty_table(result))
 
 

@@ -68,9 +68,9 @@ def page(report: dict[str, Any], frames: Frames, outputs: NDArray[np.float32]) -
         drives=_drives(frames, outputs),
         coverage_rows=[
             [name, *map(format_percent, shares)]
-            for name, shares in report.get("doubt", {}).get("coverage", {}).items()
+            for name, shares in report.get("uncertainty", {}).get("coverage", {}).items()
         ],
-        reliability=_reliability(report.get("doubt", {})),
+        reliability=_reliability(report.get("uncertainty", {})),
         worst=(
             {**figure, "jpeg": embed_jpeg(figure["image"])}
             for figure in worst_figures(frames, outputs, worst_frames(errors, frames.labels.round))
@@ -88,8 +88,8 @@ def _confusion_rows(confusion: dict[str, dict[str, int]]) -> Rows:
     return rows
 
 
-def _reliability(doubt: dict[str, Any]) -> Iterator[Markup]:
-    for name, bins in doubt.get("calibration", {}).items():
+def _reliability(uncertainty: dict[str, Any]) -> Iterator[Markup]:
+    for name, bins in uncertainty.get("calibration", {}).items():
         if bins:
             predicted = np.array([part["said"] for part in bins])
             observed = np.array([part["found"] for part in bins])
@@ -100,14 +100,14 @@ def _groups(report: dict[str, Any]) -> Iterator[dict[str, Any]]:
     """A table for each grouping: its title, mean errors by feature and accuracy of the class."""
     for grouping, label in GROUPS.items():
         head = [label, "frames", *TITLES.values(), "class"]
-        if "doubt" in report:
+        if "uncertainty" in report:
             head.append("out of distribution")
         rows = []
         for key, part in report[grouping].items():
             accuracy = format_percent(part["heading_accuracy"])
             row = [key, f"{part['frames']:,}", *mean_error_cells(part), accuracy]
-            if "doubt" in report:
-                row.append(format_percent(part["doubt"]["out_of_distribution"]))
+            if "uncertainty" in report:
+                row.append(format_percent(part["uncertainty"]["out_of_distribution"]))
             rows.append(row)
         yield {"head": head, "rows": rows}
 

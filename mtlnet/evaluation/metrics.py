@@ -197,7 +197,7 @@ def evaluate_outputs(
 ) -> dict[str, Any]:
     """The report on `outputs` (N, 9 to 22) for `labels`; `mean`: of `mean_labels`.
 
-    It has `doubt` when the model predicts standard deviations.
+    It has `uncertainty` when the model predicts standard deviations.
     """
     errors = signed_errors(outputs, labels.distances, labels.angle)
     heading = outputs[:, 6:OUTPUTS].argmax(1)
@@ -216,7 +216,10 @@ def evaluate_outputs(
     parts = split_outputs(outputs)
     if parts.std is not None and parts.ood_score is not None:
         share = float((~(parts.ood_score <= 1)).mean())
-        report["doubt"] = {"coverage": coverage(parts.std, errors), "out_of_distribution": share}
+        report["uncertainty"] = {
+            "coverage": coverage(parts.std, errors),
+            "out_of_distribution": share,
+        }
     return report
 
 
@@ -229,7 +232,7 @@ def evaluate_by_groups(
     std = split_outputs(outputs).std
     if std is not None:
         errors = signed_errors(outputs, labels.distances, labels.angle)
-        report["doubt"]["calibration"] = calibration(std, errors)
+        report["uncertainty"]["calibration"] = calibration(std, errors)
     for name, parts in groups(frames):
         report[name] = {
             key: evaluate_outputs(outputs[rows], labels.take(rows), mean)

@@ -60,12 +60,14 @@ def group_table(result: dict[str, Any]) -> Table:
 def uncertainty_table(result: dict[str, Any]) -> Table:
     """Shares of errors within one and two predicted standard deviations, and of frames that are
     classified as out of distribution."""
-    doubt = result["doubt"]
-    share = f"{doubt['out_of_distribution']:.1%} of the frames classified as out of distribution"
+    uncertainty = result["uncertainty"]
+    share = (
+        f"{uncertainty['out_of_distribution']:.1%} of the frames classified as out of distribution"
+    )
     table = Table(title=f"standard deviations; {share}")
     for column in ("", "within 1 (68.3 %)", "within 2 (95.4 %)"):
         table.add_column(column, justify="left" if not column else "right")
-    for name, shares in doubt["coverage"].items():
+    for name, shares in uncertainty["coverage"].items():
         table.add_row(name, *(format_percent(share) for share in shares))
     return table
 

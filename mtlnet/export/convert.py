@@ -106,7 +106,7 @@ def _quantised(graph: Any, card: ModelCard, dataset: Dataset) -> tuple[Any, tupl
     """
     train = dataset.select("train")
     images, chosen = calibration_images(train), FLOAT_ACTIVATIONS
-    names = (card.doubt or {}).get("held_out", [])
+    names = (card.uncertainty or {}).get("held_out", [])
     if names and card.data.get("content_hash") == dataset.content_hash:
         held_out = select_rounds(dataset, names)
         chosen = choose_float_activations(graph, images, held_out, card.data["mean"])

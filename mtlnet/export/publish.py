@@ -95,14 +95,14 @@ def publish(
             files={name: file_hash(staged / name) for name in names},
             export_check=check,
             golden=tuple(float(v) for v in predict_images(folded, golden[None])[0]),
-            doubt=None if uncertainty is None else uncertainty.about,
+            uncertainty=None if uncertainty is None else uncertainty.about,
         )
         card.write(staged)
     return card
 
 
 def _require_equal(run: Path, check: dict[str, float]) -> None:
-    limits = {"openvino_f32_max": TOLERANCE, "openvino_f32_doubt": UNCERTAINTY_TOLERANCE}
+    limits = {"openvino_f32_max": TOLERANCE, "openvino_f32_uncertainty": UNCERTAINTY_TOLERANCE}
     for name, limit in limits.items():
         if not check.get(name, 0.0) <= limit:  # written so that a NaN fails too
             raise ModelError(
@@ -118,7 +118,7 @@ def compare_graph(
     """Largest difference between torch in float32 and the run's graph, by precision.
 
     `openvino_PRECISION_max`: absolute, of the nine outputs and the probabilities of absence;
-    `openvino_PRECISION_doubt`: relative, of the uncertainty head's outputs.
+    `openvino_PRECISION_uncertainty`: relative, of the uncertainty head's outputs.
     """
     import openvino
 
@@ -142,7 +142,7 @@ def compare_graph(
         if uncertainty is not None:
             columns = slice(OUTPUTS, OUTPUTS + uncertainty.shape[1])
             relative = np.abs(outputs[:, columns] / uncertainty - 1)
-            differences[f"openvino_{precision}_doubt"] = float(relative.max())
+            differences[f"openvino_{precision}_uncertainty"] = float(relative.max())
     return differences
 
 

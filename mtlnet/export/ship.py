@@ -62,15 +62,15 @@ def ship_model(run: Path, out: Path, data: Path | None = None) -> dict[str, Any]
     refitted = None if data is None else refit_uncertainty_head(run, data)
     if refitted is not None:
         seeds = sorted({*card.data["seeds"], *refitted.about["seeds"]})
-        card = replace(card, doubt=refitted.about, data={**card.data, "seeds": seeds})
-    names = (WEIGHTS,) if card.doubt is None else (WEIGHTS, UNCERTAINTY_WEIGHTS)
+        card = replace(card, uncertainty=refitted.about, data={**card.data, "seeds": seeds})
+    names = (WEIGHTS,) if card.uncertainty is None else (WEIGHTS, UNCERTAINTY_WEIGHTS)
     check_files(run, card, names if refitted is None else (WEIGHTS,))
     out.mkdir(parents=True, exist_ok=True)
     halves = {name: half(name, values) for name, values in read_weights(run / WEIGHTS).items()}
     atomic_write(out / WEIGHTS, save(halves), fsync=True)
     if refitted is not None:
         write_uncertainty_head(out, refitted.head)
-    elif card.doubt is not None:
+    elif card.uncertainty is not None:
         atomic_write(
             out / UNCERTAINTY_WEIGHTS, (run / UNCERTAINTY_WEIGHTS).read_bytes(), fsync=True
         )

@@ -134,7 +134,7 @@ def read_graph(run: Path, card: ModelCard) -> Any:
     from mtlnet.inference.uncertainty import read_uncertainty_head
     from mtlnet.inference.weights_file import read_weights
 
-    has_head = card.doubt is not None
+    has_head = card.uncertainty is not None
     check_files(run, card, (WEIGHTS, UNCERTAINTY_WEIGHTS) if has_head else (WEIGHTS,))
     head = read_uncertainty_head(run) if has_head else None
     return model_from_weights(card.network, read_weights(run / WEIGHTS), head)

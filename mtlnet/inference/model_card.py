@@ -1,8 +1,8 @@
 """The card of a trained model (`card.json`), and how a run's folder is found and checked.
 
 A run's folder holds `card.json`, `config.json`, `model.safetensors` (the network's weights, batch
-normalisation folded), `doubt.safetensors` (the uncertainty head), `model.xml` and `model.bin` (the
-OpenVINO graph), `curves.csv`, `checkpoints/` and `tensorboard/`.
+normalisation folded), `uncertainty.safetensors` (the uncertainty head), `model.xml` and `model.bin`
+(the OpenVINO graph), `curves.csv`, `checkpoints/` and `tensorboard/`.
 """
 
 import hashlib
@@ -22,14 +22,14 @@ from trackfeatures.names import require_name
 RUNS = Path("runs")
 SHIPPED = Path(__file__).parents[1] / "weights" / "default"
 CARD, WEIGHTS, GRAPH, GRAPH_WEIGHTS = "card.json", "model.safetensors", "model.xml", "model.bin"
-UNCERTAINTY_WEIGHTS = "doubt.safetensors"
+UNCERTAINTY_WEIGHTS = "uncertainty.safetensors"
 SHIPPED_FILES = {
     WEIGHTS: "6894e11c0211330c33c3018ce9479bcd39e5d4151237dd6a2c46c5a07e35ef8b",
     UNCERTAINTY_WEIGHTS: "3a4e5a467545445e2e87eb5b96cf414b38ed8bbaa8ceb8d384218d6f628a8717",
 }
 """SHA-256 of the shipped model's files."""
 MODEL_FILES = (WEIGHTS, GRAPH, GRAPH_WEIGHTS)
-FORMAT = 4  # 2: `network`; 3: `doubt`; 4: the camera's pitch
+FORMAT = 5  # 2: `network`; 3: the uncertainty head; 4: the camera's pitch; 5: `uncertainty`
 SKY, GRASS, ASPHALT, PAINT = (150, 180, 220), (70, 110, 60), (95, 95, 100), (230, 230, 225)
 
 
@@ -60,7 +60,7 @@ class ModelCard:
     export_check: dict[str, float]
     golden: tuple[float, ...]
     """Outputs (9,) of torch in float32 for `golden_image`."""
-    doubt: dict[str, Any] | None
+    uncertainty: dict[str, Any] | None
     """How the uncertainty head was fitted; None for a model without one."""
 
     @property

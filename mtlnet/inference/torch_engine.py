@@ -21,7 +21,7 @@ class TorchEngine:
     kind = "torch"
 
     def __init__(self, run: Path, card: ModelCard, threads: int = 1) -> None:
-        has_head = card.doubt is not None
+        has_head = card.uncertainty is not None
         check_files(run, card, (WEIGHTS, UNCERTAINTY_WEIGHTS) if has_head else (WEIGHTS,))
         torch.set_num_threads(threads)
         self.card = card

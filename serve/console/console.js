@@ -24,12 +24,12 @@ async function ask() {
     const headers = { "Content-Type": body.type };
     if ($("token").value) headers.Authorization = `Bearer ${$("token").value}`;
     const reply = await fetch("features", { method: "POST", headers, body });
-    const said = await reply.json();
+    const answer = await reply.json();
     if (reply.status === 401) $("locked").hidden = false;
-    if (!reply.ok) return refuse(`${said.title ?? reply.statusText}: ${said.detail ?? ""}`, image);
-    latencies.push({ trip: performance.now() - started, total: said.timing_ms.total, ...said.timing_ms });
+    if (!reply.ok) return refuse(`${answer.title ?? reply.statusText}: ${answer.detail ?? ""}`, image);
+    latencies.push({ trip: performance.now() - started, total: answer.timing_ms.total, ...answer.timing_ms });
     latencies.splice(0, latencies.length - KEPT);
-    show(image, said, truth);
+    show(image, answer, truth);
   } catch (error) {
     refuse(`no answer: ${error.message}`, image);
   } finally {
@@ -38,24 +38,24 @@ async function ask() {
 }
 
 function refuse(text, image) {
-  $("said").textContent = text;
-  $("said").className = "bad";
+  $("status").textContent = text;
+  $("status").className = "bad";
   $("picture").getContext("2d").drawImage(image, 0, 0, $("picture").width, $("picture").height);
 }
 
-function show(image, said, truth) {
-  drawPicture($("picture"), image, said, truth, model.camera);
-  drawAbove($("above"), said, truth);
+function show(image, answer, truth) {
+  drawPicture($("picture"), image, answer, truth, model.camera);
+  drawAbove($("above"), answer, truth);
   drawLatency($("latency"), latencies, KEPT);
-  const offset = said.to_lane_centre_m;
-  $("said").className = "";
-  $("said").textContent = offset == null
+  const offset = answer.to_lane_centre_m;
+  $("status").className = "";
+  $("status").textContent = offset == null
     ? "No lane is near."
     : `${Math.abs(offset).toFixed(2)} m ${offset >= 0 ? "left" : "right"} of the lane's centre, ` +
-      `pointing ${Math.abs(said.angle_rad * 180 / Math.PI).toFixed(1)}° to the ${said.angle_rad >= 0 ? "right" : "left"}.`;
-  fillTable(said, truth);
-  fillHeading(said.heading);
-  $("foreign").hidden = !said.out_of_distribution;
+      `pointing ${Math.abs(answer.angle_rad * 180 / Math.PI).toFixed(1)}° to the ${answer.angle_rad >= 0 ? "right" : "left"}.`;
+  fillTable(answer, truth);
+  fillHeading(answer.heading);
+  $("foreign").hidden = !answer.out_of_distribution;
   const sorted = latencies.map((row) => row.trip).sort((a, b) => a - b);
   const at = (share) => sorted[Math.min(sorted.length - 1, Math.floor(share * sorted.length))].toFixed(1);
   const last = latencies.at(-1);
@@ -64,16 +64,18 @@ function show(image, said, truth) {
     `with the network p50 ${at(0.5)}, p99 ${at(0.99)} ms over ${sorted.length}`;
 }
 
-function fillTable(said, truth) {
+function fillTable(answer, truth) {
   const rows = [...IN_LANE, ...ON_MARKING].map((name) =>
-    [name, said.distances_m[name], said.std?.[name], truth?.distances_m[name], "m", 2]);
-  rows.push(["to lane centre", said.to_lane_centre_m, said.std?.to_lane_centre, truth?.to_lane_centre_m, "m", 2]);
-  rows.push(["angle", said.angle_rad, said.std?.angle, truth?.angle_rad, "rad", 4]);
-  const absent = (name) => said.absent?.[name] > 0.5 ? `absent, ${(100 * said.absent[name]).toFixed(0)} %` : null;
+    [name, answer.distances_m[name], answer.std?.[name], truth?.distances_m[name], "m", 2]);
+  rows.push(["to lane centre", answer.to_lane_centre_m, answer.std?.to_lane_centre, truth?.to_lane_centre_m, "m", 2]);
+  rows.push(["angle", answer.angle_rad, answer.std?.angle, truth?.angle_rad, "rad", 4]);
+  // The service's own limit decides: it is not the same for all markings.
+  const absent = (name) => answer.absent && answer.distances_m[name] === null
+    ? `absent, ${(100 * answer.absent[name]).toFixed(0)} %` : null;
   const text = (value, digits) => (value == null ? "–" : value.toFixed(digits));
   $("features").replaceChildren(...rows.map(([name, read, std, true_, unit, digits]) => {
     const row = document.createElement("tr");
-    for (const [content, kind] of [[name], [absent(name) ?? text(read, digits)], [text(std, digits), "doubt"], [text(true_, digits), "truth"]]) {
+    for (const [content, kind] of [[name], [absent(name) ?? text(read, digits)], [text(std, digits), "std"], [text(true_, digits), "truth"]]) {
       const cell = document.createElement("td");
       cell.textContent = content;
       if (kind) cell.className = kind;
@@ -85,7 +87,7 @@ function fillTable(said, truth) {
     return row;
   }));
   const table = $("features").parentElement;
-  table.classList.toggle("no-doubt", !said.std);
+  table.classList.toggle("no-std", !answer.std);
   table.classList.toggle("no-truth", !truth);
 }
 
@@ -108,8 +110,8 @@ async function take(body, truth = null) {
     current = { body, image, truth };
     await ask();
   } catch {
-    $("said").textContent = "The browser cannot read this file as an image.";
-    $("said").className = "bad";
+    $("status").textContent = "The browser cannot read this file as an image.";
+    $("status").className = "bad";
   }
 }
 

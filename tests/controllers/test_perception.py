@@ -66,9 +66,9 @@ def test_a_prediction_is_parsed() -> None:
 
 def test_standard_deviations_are_parsed() -> None:
     std = {"ml": 0.1, "to_lane_centre": 0.04, "angle": 0.01}
-    doubtful = parse_prediction({**ANSWER, "std": std, "out_of_distribution": True})
-    assert (doubtful.offset_std_m, doubtful.angle_std_rad) == (0.04, 0.01)
-    assert doubtful.out_of_distribution is True
+    uncertain = parse_prediction({**ANSWER, "std": std, "out_of_distribution": True})
+    assert (uncertain.offset_std_m, uncertain.angle_std_rad) == (0.04, 0.01)
+    assert uncertain.out_of_distribution is True
     plain = parse_prediction({**ANSWER, "std": None, "out_of_distribution": None})
     assert plain == Perceived(0.5, -0.03, Heading.RIGHT)
     blind = {**ANSWER, "to_lane_centre_m": None, "std": {**std, "to_lane_centre": None}}

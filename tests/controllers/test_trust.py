@@ -56,7 +56,7 @@ def test_an_ordinary_answer_counts_in_full() -> None:
     assert corrected(ordinary) is ordinary
 
 
-def test_the_gain_on_a_doubtful_answer_is_that_of_a_kalman_filter() -> None:
+def test_the_gain_on_a_uncertain_answer_is_that_of_a_kalman_filter() -> None:
     found = corrected(answer(1.0, 0.1, std=0.5, angle_std=0.05))
     prior = 0.05**2 + OFFSET_NOISE_M**2
     assert found.to_lane_centre == pytest.approx(prior / (prior + 0.5**2 - ORDINARY_M**2))
@@ -64,7 +64,7 @@ def test_the_gain_on_a_doubtful_answer_is_that_of_a_kalman_filter() -> None:
     assert found.angle == pytest.approx(0.1 * prior / (prior + 0.05**2 - ORDINARY_RAD**2))
 
 
-def test_doubt_lowers_the_gain_and_the_way_since_raises_it() -> None:
+def test_uncertainty_lowers_the_gain_and_the_way_since_raises_it() -> None:
     def moved(std: float, *, unfamiliar: bool = False, **way: float) -> float:
         second = answer(1.0, std=std, unfamiliar=unfamiliar)
         offset = corrected(
@@ -111,7 +111,7 @@ def test_an_answer_without_std_is_taken_as_it_is() -> None:
         assert all(perceive(world) is exact for _ in range(3))
 
 
-def test_a_wild_doubtful_answer_hardly_moves_the_estimate_and_a_blind_one_stays_blind() -> None:
+def test_a_wild_uncertain_answer_hardly_moves_the_estimate_and_a_blind_one_stays_blind() -> None:
     car = Straight()
 
     def perceive(car: Straight) -> Perceived:
@@ -151,7 +151,7 @@ def test_after_a_long_loss_the_first_answer_counts_in_full() -> None:
             assert estimate.present(0).to_lane_centre == -0.5
 
 
-def test_the_car_keeps_nearer_to_its_lane_when_doubtful_answers_are_trusted_less() -> None:
+def test_the_car_keeps_nearer_to_its_lane_when_uncertain_answers_are_trusted_less() -> None:
     """One answer in five is wild and says so."""
     found = {}
     for trusted in (False, True):

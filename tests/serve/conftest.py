@@ -59,7 +59,7 @@ CARD = ModelCard(
     files={WEIGHTS: "ab" * 32},
     export_check={},
     golden=tuple([0.5] * 6 + [0.2, 0.5, 0.3]),
-    doubt=None,
+    uncertainty=None,
 )
 
 

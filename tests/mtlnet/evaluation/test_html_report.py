@@ -48,9 +48,9 @@ def outputs(frames: Frames) -> NDArray[np.float32]:
         predicted[row, 0] = labels.distances[row, 0] + error
     coded = tf.encode(predicted, labels.angle + 0.002)
     classes = np.eye(3)[labels.heading] * 0.7 + 0.1
-    doubt = np.full((len(frames), 8), 0.25)
-    doubt[: len(frames) // 4, -1] = 2.0  # a quarter is out of distribution
-    return np.concatenate([coded, classes, doubt], 1).astype(np.float32)
+    uncertainty = np.full((len(frames), 8), 0.25)
+    uncertainty[: len(frames) // 4, -1] = 2.0  # a quarter is out of distribution
+    return np.concatenate([coded, classes, uncertainty], 1).astype(np.float32)
 
 
 @pytest.fixture(scope="module")

@@ -126,8 +126,8 @@ def many(count: int) -> tuple[np.ndarray, Labels]:
     predicted = distances.astype(np.float64)
     predicted[:, :2] += error
     coded = tf.encode(predicted, angle + 0.01)
-    doubt = np.tile([0.05] * 5 + [0.05 / 2**0.5, 0.02, 0.5], (count, 1))
-    outputs = np.concatenate([coded, np.tile([0.2, 0.5, 0.3], (count, 1)), doubt], 1)
+    uncertainty = np.tile([0.05] * 5 + [0.05 / 2**0.5, 0.02, 0.5], (count, 1))
+    outputs = np.concatenate([coded, np.tile([0.2, 0.5, 0.3], (count, 1)), uncertainty], 1)
     lanes, zeros = rng.integers(1, 4, count), np.zeros(count, np.float32)
     found = Labels(
         distances=distances,
@@ -187,12 +187,12 @@ def test_groups_sum_to_the_whole() -> None:
 
 def test_coverage_and_calibration_of_the_standard_deviations() -> None:
     outputs, found = many(2000)
-    doubt = evaluate_by_groups(outputs, FakeFrames(found), MEAN)["doubt"]  # type: ignore[arg-type]
-    assert doubt["coverage"]["ml"][0] == pytest.approx(0.683, abs=0.03)
-    assert doubt["coverage"]["to_lane_centre"][1] == pytest.approx(0.954, abs=0.02)
-    assert doubt["coverage"]["angle"] == [1.0, 1.0]
-    assert doubt["coverage"]["l"] == [None, None]
-    assert doubt["out_of_distribution"] == 0.0
-    assert sum(part["frames"] for part in doubt["calibration"]["ml"]) == 2000
+    uncertainty = evaluate_by_groups(outputs, FakeFrames(found), MEAN)["uncertainty"]  # type: ignore[arg-type]
+    assert uncertainty["coverage"]["ml"][0] == pytest.approx(0.683, abs=0.03)
+    assert uncertainty["coverage"]["to_lane_centre"][1] == pytest.approx(0.954, abs=0.02)
+    assert uncertainty["coverage"]["angle"] == [1.0, 1.0]
+    assert uncertainty["coverage"]["l"] == [None, None]
+    assert uncertainty["out_of_distribution"] == 0.0
+    assert sum(part["frames"] for part in uncertainty["calibration"]["ml"]) == 2000
     outputs[:500, -1] = 1.5
-    assert evaluate_outputs(outputs, found, MEAN)["doubt"]["out_of_distribution"] == 0.25
+    assert evaluate_outputs(outputs, found, MEAN)["uncertainty"]["out_of_distribution"] == 0.25

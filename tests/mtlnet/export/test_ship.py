@@ -103,9 +103,9 @@ def test_its_standard_deviations_are_fitted_anew_on_other_rounds(
     card, earlier = read_card(out), read_card(shipped)
     assert card.files[WEIGHTS] == earlier.files[WEIGHTS]
     assert card.files[UNCERTAINTY_WEIGHTS] != earlier.files[UNCERTAINTY_WEIGHTS]
-    assert card.doubt is not None
-    assert (card.doubt["data"], len(card.doubt["held_out"])) == (later.name, 8)
-    assert sorted(card.doubt["seeds"]) == list(range(100, 109))
+    assert card.uncertainty is not None
+    assert (card.uncertainty["data"], len(card.uncertainty["held_out"])) == (later.name, 8)
+    assert sorted(card.uncertainty["seeds"]) == list(range(100, 109))
     assert card.data == {**earlier.data, "seeds": [*earlier.data["seeds"], *range(100, 109)]}
     frame = Dataset.open(later).select("test").image(0)
     found, before = (load_engine(run, "openvino", "f32")(frame) for run in (out, shipped))

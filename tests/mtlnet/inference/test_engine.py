@@ -163,8 +163,8 @@ def test_a_model_of_another_format_version_is_refused(copy: Path) -> None:
 
 
 def test_a_damaged_uncertainty_head_is_refused(copy: Path) -> None:
-    (copy / "doubt.safetensors").write_bytes(b"rubbish")
-    with pytest.raises(ModelError, match=r"doubt\.safetensors is damaged"):
+    (copy / "uncertainty.safetensors").write_bytes(b"rubbish")
+    with pytest.raises(ModelError, match=r"uncertainty\.safetensors is damaged"):
         load_engine(copy, "torch")
 
 
