@@ -1,14 +1,16 @@
-"""Bad clients beside good ones: each attack of the tests in turn, all of them in every minute.
+"""Malicious clients beside well-behaved ones: all attacks of the tests in turn, once a minute.
 
 They come from an address of their own, on this machine.
 """
 
 import multiprocessing
+import os
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from multiprocessing.synchronize import Event
 
+from datagen.recorder.job import exit_with_parent
 from tests.serve.attacks.attacks import Attack
 from tests.serve.attacks.conftest import Target
 from tests.serve.attacks.registry import ATTACKS
@@ -40,7 +42,7 @@ def attack_in_turn(port: int, begun: Event) -> None:
     target = Target(port, source=ADDRESS)
     while True:
         for attack in ATTACKS:
-            attacker = FORK.Process(target=make_and_hold, args=(attack, target), daemon=True)
+            attacker = FORK.Process(target=make_and_hold, args=(attack, target, os.getpid()))
             attacker.start()
             begun.set()
             time.sleep(ROUND_S / len(ATTACKS))
@@ -48,8 +50,9 @@ def attack_in_turn(port: int, begun: Event) -> None:
             attacker.join()
 
 
-def make_and_hold(attack: Attack, target: Target) -> None:
-    """Make an attack, and keep its connections open."""
+def make_and_hold(attack: Attack, target: Target, parent: int) -> None:
+    """Make an attack, and keep its connections open, at most as long as the parent lives."""
+    exit_with_parent(parent)
     held = []
     with suppress(OSError, AssertionError):  # it is kept out: as it should be
         held = attack(target)
