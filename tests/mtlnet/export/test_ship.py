@@ -41,7 +41,7 @@ def shipped(published: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_it_is_half_the_bytes_and_all_an_engine_needs(published: Path, shipped: Path) -> None:
-    assert sorted(p.name for p in shipped.iterdir()) == ["card.json", UNCERTAINTY_WEIGHTS, WEIGHTS]
+    assert sorted(p.name for p in shipped.iterdir()) == ["card.json", WEIGHTS, UNCERTAINTY_WEIGHTS]
     sizes = [(folder / WEIGHTS).stat().st_size for folder in (published, shipped)]
     assert sizes[1] / sizes[0] == pytest.approx(0.5, abs=0.01)
     card = read_card(shipped)
