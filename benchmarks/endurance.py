@@ -284,7 +284,7 @@ def attacked_figures(
     p99s = [quantiles(part, n=100)[98] for part in (first, later)]
     megabytes = [memory.median(begin, begin + MINUTE_S), memory.median(end - MINUTE_S, end)]
     growth, slower = megabytes[1] / megabytes[0] - 1.0, p99s[1] / p99s[0]
-    parts = [begin + PART_S * number for number in range(int((end - begin) / PART_S))]
+    parts = [begin + PART_S * number for number in range(int(round(end - begin) // PART_S))]
     return {
         "answers": len(answers),
         "answered_share": round(len(answers) / (len(answers) + refused.total()), 5),

@@ -1,7 +1,7 @@
 // The console: sends images to the service and shows its answers.
 
 import { IN_LANE, ON_MARKING } from "./geometry.js";
-import { drawAbove, drawLatency, drawPicture } from "./drawing.js";
+import { absence, drawAbove, drawLatency, drawPicture } from "./drawing.js";
 
 const KEPT = 120, EVERY_MS = 100;
 const $ = (id) => document.getElementById(id);
@@ -69,9 +69,7 @@ function fillTable(answer, truth) {
     [name, answer.distances_m[name], answer.std?.[name], truth?.distances_m[name], "m", 2]);
   rows.push(["to lane centre", answer.to_lane_centre_m, answer.std?.to_lane_centre, truth?.to_lane_centre_m, "m", 2]);
   rows.push(["angle", answer.angle_rad, answer.std?.angle, truth?.angle_rad, "rad", 4]);
-  // The service's own limit decides: it is not the same for all markings.
-  const absent = (name) => answer.absent && answer.distances_m[name] === null
-    ? `absent, ${(100 * answer.absent[name]).toFixed(0)} %` : null;
+  const absent = (name) => absence(answer, name);
   const text = (value, digits) => (value == null ? "–" : value.toFixed(digits));
   $("features").replaceChildren(...rows.map(([name, read, std, true_, unit, digits]) => {
     const row = document.createElement("tr");

@@ -15,6 +15,13 @@ function present(answer) {
     .map((name) => [name, answer.distances_m[name], answer.std?.[name] ?? null]);
 }
 
+// What the table says of a marking that is absent; null where it is not. The service decides, whose
+// limit of the probability is not the same for all markings.
+export function absence(answer, name) {
+  if (!answer.absent || answer.distances_m[name] !== null) return null;
+  return `absent, ${(100 * answer.absent[name]).toFixed(0)} %`;
+}
+
 function paintOf(name) {
   return colour(IN_LANE.includes(name) ? "lane" : "marking");
 }

@@ -78,6 +78,26 @@ def test_a_browser_shows_the_answer(service: Served, tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(shutil.which("node") is None, reason="no node")
+def test_a_marking_is_absent_where_the_service_says_so(tmp_path: Path) -> None:
+    """`l` is answered up to a probability of 0.75 that it is absent."""
+    answer = {
+        "distances_m": {"ml": None, "l": -3.5},
+        "absent": {"ml": 0.9, "l": 0.7},
+    }
+    script = tmp_path / "absent.mjs"
+    module = (FOLDER / "drawing.js").as_uri()
+    script.write_text(
+        f"import {{ absence }} from '{module}';\n"
+        f"const answer = {json.dumps(answer)};\n"
+        "const coded = { ...answer, absent: null };\n"
+        "console.log(JSON.stringify([absence(answer, 'ml'), absence(answer, 'l'),"
+        " absence(answer, 'angle'), absence(coded, 'ml')]));\n"
+    )
+    done = subprocess.run(["node", str(script)], capture_output=True, text=True, check=True)
+    assert json.loads(done.stdout) == ["absent, 90 %", None, None, None]
+
+
+@pytest.mark.skipif(shutil.which("node") is None, reason="no node")
 def test_console_geometry_equals_the_pinhole_camera(tmp_path: Path) -> None:
     """A marking 2 m right and 5 m ahead is drawn at its projection by the camera matrix."""
     script = tmp_path / "ask.mjs"
