@@ -12,7 +12,7 @@ let asking = false;
 
 $("model").textContent =
   `model ${model.model.slice(0, 12)}, ${model.engine} ${model.precision}, ` +
-  `camera ${model.camera.width} × ${model.camera.height}, ${model.camera.fov_y_deg}° upright`;
+  `camera ${model.camera.width} × ${model.camera.height}, ${model.camera.fov_y_deg}° vertical`;
 $("base").textContent = location.origin;
 
 async function ask() {
