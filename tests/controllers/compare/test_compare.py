@@ -280,7 +280,9 @@ def test_the_search_finds_better_parameters_and_goes_on_where_it_stopped(
         return -sum(abs(math.log(value)) for value in parameters.values())
 
     monkeypatch.setattr("controllers.compare.tune.evaluate", evaluate)
-    config = TuneConfig(out=tmp_path / "tuned.json", controllers="lqr,mpc", budget=60)
+    config = TuneConfig(
+        out=tmp_path / "tuned.json", controllers="lqr,mpc", tracks="oval", budget=60
+    )
     content = tune(config)
     assert len(counted) == 120
     assert tune(config) == content
