@@ -8,15 +8,19 @@ over one connection, answers a second over eight, and the processor time of an a
         [--seconds 8] [--out FILE]          claim: no median of the pairs is over 3 % worse
 
 CHECKOUT is a clone of this repository at another commit; it runs in this environment. Without
---model the weights are untrained.
+--model the weights are untrained, and each of the two writes them in its own format, from the same
+seed. A model that is given must be in a format that both read.
 """
 
 import argparse
 import json
 import os
+import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from statistics import median
 
@@ -28,6 +32,11 @@ from benchmarks.material.servers import OURS, ROOT, Loader, descendants, model, 
 CLAIM = 1.03
 CONNECTIONS = 8
 TICKS = os.sysconf("SC_CLK_TCK")
+PUBLISH = """
+import pathlib, sys
+from tests.serve.conftest import publish_untrained
+publish_untrained(pathlib.Path(sys.argv[1]), seed=3)
+"""
 
 
 def processor_s(pids: list[int]) -> float:
@@ -37,6 +46,21 @@ def processor_s(pids: list[int]) -> float:
         fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
         total += int(fields[11]) + int(fields[12])
     return total / TICKS
+
+
+@contextmanager
+def models(run: Path | None, trees: Mapping[str, Path]) -> Iterator[dict[str, Path]]:
+    """The model that each source tree serves: `run`, or None: untrained weights in its format."""
+    if run is not None:
+        with model(run) as copy:
+            yield dict.fromkeys(trees, copy)
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        found = {name: Path(folder) / name for name in trees}
+        for name, root in trees.items():
+            # "-c" looks for modules in the working folder first.
+            subprocess.run([sys.executable, "-c", PUBLISH, found[name]], cwd=root, check=True)
+        yield found
 
 
 def measure(root: Path, run: Path, loader: Loader, seconds: float) -> dict[str, float]:
@@ -71,11 +95,11 @@ def main() -> None:
         sys.exit(not_measured("give --before, a clone at another commit"))
     trees = {"before": options.before.resolve(), "after": ROOT}
     pairs = []
-    with tempfile.TemporaryDirectory() as folder, model(options.model) as run:
+    with tempfile.TemporaryDirectory() as folder, models(options.model, trees) as runs:
         loader = Loader(Path(folder))
         for number in range(options.pairs):
             order = list(trees) if number % 2 else list(trees)[::-1]
-            found = {name: measure(trees[name], run, loader, options.seconds) for name in order}
+            found = {n: measure(trees[n], runs[n], loader, options.seconds) for n in order}
             pairs.append(found)
             print(json.dumps(found), file=sys.stderr, flush=True)
     result = {}
