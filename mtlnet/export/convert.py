@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 
 from datagen.recording import Dataset
-from mtlnet.data.sources import select_rounds
+from mtlnet.data.sources import hold_out_rounds, select_rounds
 from mtlnet.evaluation.evaluate import require_fit
 from mtlnet.export.int8 import (
     FLOAT_ACTIVATIONS,
@@ -102,13 +102,16 @@ def export_model(
 def _quantised(graph: Any, card: ModelCard, dataset: Dataset) -> tuple[Any, tuple[int, ...]]:
     """The int8 form of a graph, and the numbers of the convolutions with float activations.
 
-    They are chosen on the rounds held out of the training, if `dataset` is that of the training.
+    They are chosen on the rounds held out of the training, if `dataset` is that of the training;
+    else on a part of its train rounds, which the calibration then does not use.
     """
-    train = dataset.select("train")
-    images, chosen = calibration_images(train), FLOAT_ACTIVATIONS
     names = (card.uncertainty or {}).get("held_out", [])
-    if names and card.data.get("content_hash") == dataset.content_hash:
-        held_out = select_rounds(dataset, names)
+    if card.data.get("content_hash") == dataset.content_hash:
+        train, held_out = dataset.select("train"), select_rounds(dataset, names) if names else None
+    else:
+        train, held_out = hold_out_rounds(dataset)
+    images, chosen = calibration_images(train), FLOAT_ACTIVATIONS
+    if held_out is not None:
         chosen = choose_float_activations(graph, images, held_out, card.data["mean"])
     return quantise(graph, images, chosen), chosen
 

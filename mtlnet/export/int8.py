@@ -2,10 +2,10 @@
 
 Quantised are the weights of all convolutions and of the shared layers except the last, and the
 activations of most convolutions, calibrated on training frames. Which convolutions keep float
-activations is chosen on train rounds that were held out of the training, by greedy forward
-selection until the gate is passed there. The gate itself judges on test rounds, which chose
-nothing. Shared layers take as long as reading their weights takes; the last is small, and
-costs as much accuracy as the other two.
+activations is chosen on train rounds that were held out of the training, or of another dataset on
+a twelfth of its train rounds, by greedy forward selection until the gate is passed there. The gate
+itself judges on test rounds, which chose nothing. Shared layers take as long as reading their
+weights takes; the last is small, and costs as much accuracy as the other two.
 """
 
 import logging

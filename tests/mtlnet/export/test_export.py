@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +12,9 @@ import pytest
 import torch
 from safetensors.numpy import load_file
 
+import mtlnet.export.convert
 import mtlnet.export.int8
-from datagen.recording import Dataset
+from datagen.recording import Dataset, Frames
 from mtlnet.evaluation.tables import export_lines
 from mtlnet.export.convert import export_model
 from mtlnet.export.int8 import (
@@ -197,6 +199,25 @@ def test_float_activations_are_chosen_on_held_out_rounds(
     assert choose_float_activations(*arguments, card.data["mean"]) == (best, order[1])
     pairs = [(best, order[0]), (best, order[1])]
     assert tried == [(), *((number,) for number in order), *pairs]
+
+
+def test_float_activations_are_chosen_on_data_of_another_training_too(
+    trained: Path, dataset: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    card, data = read_card(trained), Dataset.open(dataset)
+    rounds = data.select("train")
+    other = replace(card, data={**card.data, "content_hash": "of other rounds"})
+    seen: list[Frames] = []
+
+    def choose(_graph: Any, _images: Any, held_out: Frames, _mean: Any) -> tuple[int, ...]:
+        seen.append(held_out)
+        return (1,)
+
+    monkeypatch.setattr(mtlnet.export.convert, "hold_out_rounds", lambda _: (rounds, rounds))
+    monkeypatch.setattr(mtlnet.export.convert, "choose_float_activations", choose)
+    monkeypatch.setattr(mtlnet.export.convert, "quantise", lambda graph, _, chosen: (graph, chosen))
+    found = mtlnet.export.convert._quantised("graph", other, data)
+    assert (found, seen) == ((("graph", (1,)), (1,)), [rounds])
 
 
 def test_unsupported_exports_are_refused(trained: Path, dataset: Path, tmp_path: Path) -> None:
