@@ -102,11 +102,12 @@ def export_model(
 def _quantised(graph: Any, card: ModelCard, dataset: Dataset) -> tuple[Any, tuple[int, ...]]:
     """The int8 form of a graph, and the numbers of the convolutions with float activations.
 
-    They are chosen on the rounds held out of the training, if `dataset` is that of the training;
-    else on a part of its train rounds, which the calibration then does not use.
+    They are chosen on the rounds that fitted the uncertainty head, if they are of `dataset`; else
+    on a part of its train rounds, which the calibration then does not use.
     """
-    names = (card.uncertainty or {}).get("held_out", [])
-    if card.data.get("content_hash") == dataset.content_hash:
+    fitted = card.uncertainty or {}
+    names = fitted.get("held_out", [])
+    if fitted.get("content_hash", card.data.get("content_hash")) == dataset.content_hash:
         train, held_out = dataset.select("train"), select_rounds(dataset, names) if names else None
     else:
         train, held_out = hold_out_rounds(dataset)

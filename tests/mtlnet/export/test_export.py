@@ -207,6 +207,7 @@ def test_float_activations_are_chosen_on_data_of_another_training_too(
     card, data = read_card(trained), Dataset.open(dataset)
     rounds = data.select("train")
     other = replace(card, data={**card.data, "content_hash": "of other rounds"})
+    later = {"held_out": ["round-0000"], "content_hash": "of later rounds"}
     seen: list[Frames] = []
 
     def choose(_graph: Any, _images: Any, held_out: Frames, _mean: Any) -> tuple[int, ...]:
@@ -216,8 +217,10 @@ def test_float_activations_are_chosen_on_data_of_another_training_too(
     monkeypatch.setattr(mtlnet.export.convert, "hold_out_rounds", lambda _: (rounds, rounds))
     monkeypatch.setattr(mtlnet.export.convert, "choose_float_activations", choose)
     monkeypatch.setattr(mtlnet.export.convert, "quantise", lambda graph, _, chosen: (graph, chosen))
-    found = mtlnet.export.convert._quantised("graph", other, data)
-    assert (found, seen) == ((("graph", (1,)), (1,)), [rounds])
+    for model in (other, replace(card, uncertainty=later)):
+        found = mtlnet.export.convert._quantised("graph", model, data)
+        assert found == (("graph", (1,)), (1,))
+    assert seen == [rounds, rounds]
 
 
 def test_unsupported_exports_are_refused(trained: Path, dataset: Path, tmp_path: Path) -> None:
