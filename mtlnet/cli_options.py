@@ -129,7 +129,9 @@ CheckData = Annotated[
 ExportOut = Annotated[
     Path | None, typer.Option(help="Folder.  [default: RUN/export/FORMAT-PRECISION]")
 ]
-CheckFrames = Annotated[int, typer.Option(help="Number of frames to check the export on.")]
+CheckFrames = Annotated[
+    int, typer.Option(help="Frames, at most 10,000, on which the export is compared with torch.")
+]
 Split = Annotated[str, typer.Option(help="train, test, unseen or all.")]
 ReportPage = Annotated[
     Path | None, typer.Option("--report", help="HTML page to write: a file, or a folder.")

@@ -46,6 +46,8 @@ FORMATS, PRECISIONS = ("onnx", "openvino"), ("f32", "bf16", "int8")
 ONNX_FILE = "model.onnx"
 OPSET = 18
 MIN_BF16_VALUES = 256  # smaller constants stay in float32
+MAX_CHECK_FRAMES = 10_000
+"""Their images are held in memory: 1.8 GB."""
 
 
 def export_model(
@@ -126,8 +128,8 @@ def _require_supported(kind: str, precision: str, out: Path | None, frames: int)
         )
     if kind == "onnx" and precision == "int8":
         raise UserError("int8 needs --format openvino; give that, or --precision bf16")
-    if frames < 1:
-        raise UserError(f"--frames is {frames}; give at least 1")
+    if not 1 <= frames <= MAX_CHECK_FRAMES:
+        raise UserError(f"--frames is {frames}; give 1 to {MAX_CHECK_FRAMES}")
     if precision == "int8" and out is not None:
         raise UserError("the engine looks for an int8 graph in the run's folder; leave out --out")
 

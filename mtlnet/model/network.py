@@ -42,6 +42,8 @@ from mtlnet.model.bins import (
 
 NORM_EPS = 1e-5
 NORM_MOMENTUM = 0.1
+RUN_BATCH = 32
+"""Images that `run_network` computes at a time: their features take some MB each."""
 CODED_HEADS = (("distance", slice(0, 5)), ("angle", slice(5, 6)))
 """The heads of coded values and their columns of the outputs."""
 
@@ -169,15 +171,20 @@ class Answers:
 
 
 def run_network(network: Network, images: NDArray[np.uint8]) -> Answers:
-    """The answers for images (B, 210, 280, 3)."""
-    device = next(network.parameters()).device
+    """The answers for images (B, 210, 280, 3), computed `RUN_BATCH` at a time."""
     network.eval()
+    starts = range(0, max(len(images), 1), RUN_BATCH)
+    parts = [_run_batch(network, torch.from_numpy(images[i : i + RUN_BATCH])) for i in starts]
+    return Answers(*(torch.cat(each).cpu().numpy() for each in zip(*parts, strict=True)))
+
+
+def _run_batch(network: Network, images: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """The fields of `Answers` for one batch."""
     with torch.inference_mode():
-        x = network.forward_features(torch.from_numpy(images).to(device)).float()
+        x = network.forward_features(images.to(next(network.parameters()).device)).float()
         outputs = network.forward_heads(x)
         outputs[:, 6:] = torch.softmax(outputs[:, 6:], 1)
-        inputs, absent = network.uncertainty_inputs(x), network.absent_probabilities(x)
-    return Answers(inputs.cpu().numpy(), outputs.cpu().numpy(), absent.cpu().numpy())
+        return network.uncertainty_inputs(x), outputs, network.absent_probabilities(x)
 
 
 def predict_images(network: Network, images: NDArray[np.uint8]) -> NDArray[np.float32]:

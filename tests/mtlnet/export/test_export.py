@@ -231,8 +231,9 @@ def test_unsupported_exports_are_refused(trained: Path, dataset: Path, tmp_path:
     ):
         with pytest.raises(UserError, match=seen):
             export_model(trained, kind, precision, dataset)
-    with pytest.raises(UserError, match="--frames is 0"):
-        export_model(trained, "onnx", "f32", dataset, frames=0)
+    for frames in (0, 10_001):
+        with pytest.raises(UserError, match=f"--frames is {frames}; give 1 to 10000"):
+            export_model(trained, "onnx", "f32", dataset, frames=frames)
     with pytest.raises(UserError, match="leave out --out"):
         export_model(trained, "openvino", "int8", dataset, tmp_path)
 
