@@ -42,7 +42,7 @@ def test_collect_train_evaluate_serve_and_drive(tmp_path: Path) -> None:
     assert {name: verified[name] for name in expected} == expected
 
     train = ("mtlnet", "train", "--data", data, "--out", run, "--alpha", "0.3,0.2,0.5")
-    command(*train, "--recipe", "fast", "--iterations", "60")
+    command(*train, "--recipe", "fast", "--iterations", "120")
     evaluated = command(
         "mtlnet", "evaluate", "--model", run, "--data", data, "--split", "all", "--json"
     )
