@@ -16,8 +16,8 @@ steps. Dropout 0.5 and L2 5e-4 are our choice: the paper states neither.
   coded angle varies by 0.03 and a coded distance by 0.2, so that the angle would hardly be learned.
 - Muon for the large layers (`mtlnet.training.optimizers`): in short trials half as many images for
   the same errors. The learning rate warms up, then falls to zero as a cosine; at twice the rate the
-  distances are worse by 3 % after 5 minutes and by 8 to 30 % after 17. Batches of 64, since Muon's
-  own cost does not grow with the batch.
+  distances are worse by 2 to 28 % after 5 minutes of a core and by 9 to 43 % after 17. Batches of
+  64, since Muon's own cost does not grow with the batch.
 - Huber losses with a gain (`mtlnet.training.loss.HuberLoss`): `l`, `m` and `r` jump where they
   become inactive, and a squared error asks for a value in between.
 - No dropout: it adds noise to outputs that must be accurate to a few per cent.
