@@ -2,7 +2,10 @@
 
 import os
 import signal
+import subprocess
+from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import settings
@@ -25,6 +28,17 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Files with slow tests first, so that no process is left with one at the end."""
     slow = {item.path for item in items if item.get_closest_marker("slow")}
     items.sort(key=lambda item: ("e2e" not in item.path.parts, item.path not in slow))
+
+
+@pytest.hookimpl(optionalhook=True)  # of pytest-xdist
+def pytest_testnodedown(node: Any, error: Any) -> None:
+    """Print the exit status of a test process that died: a negative one is a signal's number."""
+    if error:
+        process = node.gateway._io.popen  # execnet's subprocess.Popen
+        with suppress(subprocess.TimeoutExpired):
+            process.wait(10.0)
+        said = f"\n{node.gateway.id} ended with status {process.returncode}"
+        node.config.get_terminal_writer().line(said)
 
 
 @pytest.fixture

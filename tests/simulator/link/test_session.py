@@ -5,12 +5,12 @@ import math
 import os
 import signal
 import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import asdict
-from typing import Any
 
 import pytest
 
@@ -24,10 +24,9 @@ from simulator.link.errors import (
     Refused,
     ServerDied,
 )
-from simulator.link.layout import Mode, Refusal, Request
+from simulator.link.layout import Mode, Refusal
 from simulator.link.process import run
 from simulator.link.server import Summary
-from simulator.link.simulation import Simulation
 from simulator.vehicle.state import Command
 from tests.typed import error_line, typed
 
@@ -36,6 +35,27 @@ BOUND_S = 2.0
 """No survivor waits longer."""
 
 Start = Callable[..., "subprocess.Popen[str]"]
+
+SIGNALLED_SERVER = """
+import signal, sys
+from contextlib import suppress
+from simulator.link import process
+from simulator.link.layout import Request
+from simulator.link.simulation import Simulation
+
+original = Simulation.answer
+
+def answer(simulation, request):
+    original(simulation, request)
+    if request["request"] == Request.STEP:
+        with suppress(BaseException):
+            signal.raise_signal(int(sys.argv[2]))
+
+process._warm_up = lambda *_: None  # it asks for steps, too
+Simulation.answer = answer
+process.run(process.LinkConfig(name=sys.argv[1], track="oval"), print)
+"""
+"""A server that receives a signal within each step, where an exception is lost."""
 
 
 @pytest.mark.parametrize(
@@ -193,33 +213,23 @@ def test_sigterm_notifies_the_client_and_prints_json(server: Start, name: str, n
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_a_signal_ends_the_server_where_an_exception_would_be_lost(
-    name: str, monkeypatch: pytest.MonkeyPatch, number: int
-) -> None:
-    """As numpy loses one raised while it compares a scalar with an IntEnum."""
+def test_a_signal_ends_the_server_where_an_exception_would_be_lost(name: str, number: int) -> None:
+    """As numpy loses one raised while it compares a scalar with an IntEnum.
 
-    def answer(simulation: Simulation, request: Any) -> None:
-        original(simulation, request)
-        if request["request"] == Request.STEP:
-            with suppress(BaseException):
-                signal.raise_signal(signal.Signals(number))
-
-    def drive() -> None:
+    The server has a process of its own, for SIGTERM would end the one that runs the tests.
+    """
+    command = [sys.executable, "-c", SIGNALLED_SERVER, name, str(int(number))]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    try:
         with Link(name, wait_s=WAIT_S) as link:
             link.reset(seed=1)
             link.step(Command())
-
-    original = Simulation.answer
-    said: list[str] = []
-    with ThreadPoolExecutor(1) as pool:
-        config = LinkConfig(
-            name=name, track="oval", once=True
-        )  # ends with its client at the latest
-        monkeypatch.setattr("simulator.link.process._warm_up", lambda *_: None)
-        monkeypatch.setattr(Simulation, "answer", answer)
-        client = pool.submit(drive)
-        run(config, said.append)
-        client.result(WAIT_S)
+            said, _ = process.communicate(timeout=WAIT_S)
+            with pytest.raises(ServerDied, match="has ended"):
+                link.step(Command())
+    finally:
+        process.kill()
+    assert process.returncode == 0
     assert f"{name}: stopped" in said
 
 
