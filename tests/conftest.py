@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 from contextlib import suppress
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,15 @@ def pytest_configure() -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Files with slow tests first, so that no process is left with one at the end."""
+    """Files with slow tests first, so that no process is left with one at the end.
+
+    Tests of contacts are skipped where PyBullet is not installed.
+    """
+    if find_spec("pybullet") is None:
+        skip = pytest.mark.skip(reason="PyBullet is not installed: contacts cannot be computed")
+        for item in items:
+            if item.get_closest_marker("contacts"):
+                item.add_marker(skip)
     slow = {item.path for item in items if item.get_closest_marker("slow")}
     items.sort(key=lambda item: ("e2e" not in item.path.parts, item.path not in slow))
 

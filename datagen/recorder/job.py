@@ -8,8 +8,7 @@ import os
 import signal
 import sys
 import traceback
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import import_module
 from multiprocessing.connection import Connection
@@ -170,19 +169,4 @@ def exit_with_parent(parent: int) -> None:
 
 def warm_up() -> None:
     """Import the modules that take long to load."""
-    with _stderr_silenced():
-        import_module("simulator.world.physics")
-
-
-@contextmanager
-def _stderr_silenced() -> Iterator[None]:
-    """Hide PyBullet's greeting, which it prints to stderr when it is imported."""
-    kept = os.dup(2)
-    nothing = os.open(os.devnull, os.O_WRONLY)
-    os.dup2(nothing, 2)
-    try:
-        yield
-    finally:
-        os.dup2(kept, 2)
-        os.close(kept)
-        os.close(nothing)
+    import_module("simulator.world.world")

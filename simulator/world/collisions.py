@@ -1,9 +1,15 @@
 """Physics steps with contacts: PyBullet moves the ego car, wrecks and nearby traffic.
 
-Used while the ego car may touch something or a wreck is moving; otherwise the compiled code of
-`vehicle.rigid_body` moves the ego car. A traffic car that is hit becomes a wreck: it leaves traffic
-and moves as a rigid body. World frame, SI units.
+Used while the ego car touches something or a wreck is moving; otherwise the compiled code of
+`free_motion` moves the ego car. A traffic car that is hit becomes a wreck: it leaves traffic and
+moves as a rigid body. PyBullet is imported at the first contact of the process. World frame, SI
+units.
 """
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,31 +20,41 @@ from simulator.traffic.traffic import Traffic
 from simulator.traffic.wreck import TRAFFIC_CAR, Wreck, lane_motion
 from simulator.vehicle.car import CarParameters
 from simulator.vehicle.dynamics import MOTION, PIECE, compute_forces
-from simulator.vehicle.rigid_body import CAR_RANGE_M, WALL_RANGE_M
 from simulator.vehicle.state import Collision
 from simulator.vehicle.surface import ground
-from simulator.world.physics import PhysicsClient
+from simulator.world.boxes import box_radius
 from simulator.world.walls import Walls
+from trackfeatures.errors import UserError
+
+if TYPE_CHECKING:
+    from simulator.world.physics import PhysicsClient
+
+CONTACT_MARGIN_M = 0.02
+"""PyBullet's contact threshold: bodies with a larger gap do not act on each other."""
+STEP_MARGIN_M = 1.0
+"""Largest motion (m) of two bodies towards each other in one physics step, for the choice of the
+bodies that take part in it."""
 
 
 class ContactPhysics:
     """Contact physics of one world; `start` begins an episode."""
 
     def __init__(self, road: Road, car: CarParameters) -> None:
-        self._physics = PhysicsClient()
-        self._walls = Walls(road)
+        self.walls = Walls(road)
+        self._client: PhysicsClient | None = None
         self._table, self._ground = road.track.arrays(), ground(road)
         self._car = car
         self._params, self._other = car.packed(), TRAFFIC_CAR.packed()
+        self._wall_range = box_radius(self._params[0]) + STEP_MARGIN_M
+        self._car_range = self._wall_range + box_radius(self._other[0])
         self._wrench, self._lane_motion = np.zeros(6), np.zeros(MOTION)
-        self._active: list[int] = []
-        self._wrecks: dict[int, Wreck] = {}
 
     def start(self, traffic: Traffic) -> None:
         """Begin an episode with `traffic`; all state of the one before is discarded."""
-        self._physics.rebuild([self._car] + [TRAFFIC_CAR] * traffic.count)
         self._traffic = traffic
-        self._active, self._wrecks = [], {}
+        self._has_bodies = False
+        self._active: list[int] = []
+        self._wrecks: dict[int, Wreck] = {}
 
     @property
     def has_moving_wrecks(self) -> bool:
@@ -59,63 +75,81 @@ class ContactPhysics:
 
         others (n, 6) and move (n, 6): ground poses of the traffic at the start of the control step
         of `dt` s, and their change over it; share: fraction of the control step already done.
-        Returns what the ego car touched; if both, "traffic" rather than "wall".
+        Returns what the ego car touched; if both, "traffic" rather than "wall". Raises UserError
+        without PyBullet.
         """
-        physics = self._physics
+        physics = self._bodies()
         compute_forces(
             self._params, self._table, self._ground, motion, memory, controls, self._wrench
         )
-        self._load_body(0, motion, memory, self._wrench)
-        self._select_nearby(motion, others + share * move)
+        self._load_body(physics, 0, motion, memory, self._wrench)
+        self._select_nearby(physics, motion, others + share * move)
         for row in self._active:
             wreck = self._wrecks.get(row)
             if wreck is not None:
                 wrench = wreck.forces(self._other, self._table, self._ground)
-                self._load_body(row + 1, wreck.motion, wreck.memory, wrench)
+                self._load_body(physics, row + 1, wreck.motion, wreck.memory, wrench)
             else:
                 lane_motion(others[row], move[row], share, dt, self._lane_motion)
                 physics.set_motion(physics.cars[row + 1], self._lane_motion)
         physics.step()
         physics.read(physics.cars[0], motion)
-        touched = self._process_contacts()
-        self._publish_wrecks()
+        touched = self._process_contacts(physics)
+        self._publish_wrecks(physics)
         return touched
 
     def close(self) -> None:
-        self._physics.close()
+        if self._client is not None:
+            self._client.close()
+            self._client = None
+
+    def _bodies(self) -> "PhysicsClient":
+        """The PyBullet client with the bodies of this episode."""
+        if self._client is None:
+            self._client = _connect()
+        if not self._has_bodies:
+            self._client.rebuild([self._car] + [TRAFFIC_CAR] * self._traffic.count)
+            self._has_bodies = True
+        return self._client
 
     def _load_body(
-        self, index: int, motion: FloatArray, memory: FloatArray, wrench: FloatArray
+        self,
+        physics: "PhysicsClient",
+        index: int,
+        motion: FloatArray,
+        memory: FloatArray,
+        wrench: FloatArray,
     ) -> None:
         """Pass a car's motion, the wrench on it and the wall panel beside it to PyBullet."""
-        physics = self._physics
         physics.set_motion(physics.cars[index], motion)
         physics.apply_wrench(physics.cars[index], wrench, motion)
         _, s, d = locate(self._table, motion[0], motion[1], int(memory[PIECE]))
-        panel = self._walls.panel(s, d, WALL_RANGE_M)
+        panel = self.walls.panel(s, d, self._wall_range)
         if panel is None:
             physics.park(physics.walls[index])
         else:
             physics.place_wall(physics.walls[index], panel)
 
-    def _select_nearby(self, motion: FloatArray, places: FloatArray) -> None:
+    def _select_nearby(
+        self, physics: "PhysicsClient", motion: FloatArray, places: FloatArray
+    ) -> None:
         """Select the traffic in the next step: moving wrecks, and cars near them or the ego car."""
         moving = [row for row, wreck in self._wrecks.items() if wreck.moving]
         centres = [motion[:2], *(self._wrecks[row].motion[:2] for row in moving)]
         near = set(moving)
         for centre in centres:
             distance = np.hypot(places[:, 0] - centre[0], places[:, 1] - centre[1])
-            near.update(np.flatnonzero(distance < CAR_RANGE_M).tolist())
+            near.update(np.flatnonzero(distance < self._car_range).tolist())
         for row in self._active:
             if row not in near:
-                self._physics.park(self._physics.cars[row + 1])
+                physics.park(physics.cars[row + 1])
         self._active = sorted(near)
 
-    def _process_contacts(self) -> Collision | None:
+    def _process_contacts(self, physics: "PhysicsClient") -> Collision | None:
         """Turn touched traffic cars into wrecks; returns what the ego car touched."""
-        cars = self._physics.cars
+        cars = physics.cars
         touched: set[int] = set()
-        for pair in self._physics.contacts():
+        for pair in physics.contacts():
             for body in pair:
                 if body in cars[1:]:
                     self._make_wreck(cars.index(body) - 1)
@@ -134,11 +168,39 @@ class ContactPhysics:
         self._wrecks[row] = Wreck.from_traffic(row, np.zeros(MOTION), s, speed, self._table)
         self._traffic.mark_struck(row)
 
-    def _publish_wrecks(self) -> None:
+    def _publish_wrecks(self, physics: "PhysicsClient") -> None:
         """Read the wrecks' motions back and publish their poses to the traffic."""
         for row in self._active:
             wreck = self._wrecks.get(row)
             if wreck is not None:
-                self._physics.read(self._physics.cars[row + 1], wreck.motion)
+                physics.read(physics.cars[row + 1], wreck.motion)
                 wreck.update_rest()
                 self._traffic.set_struck_pose(row, *wreck.pose_for_traffic(self._table))
+
+
+def _connect() -> "PhysicsClient":
+    """A new PyBullet client. Raises UserError where PyBullet is not installed or fails to load."""
+    try:
+        with _stderr_silenced():
+            from simulator.world.physics import PhysicsClient
+    except ImportError as error:
+        raise UserError(
+            f"the car touched a wall or another car, and contacts need PyBullet ({error}); "
+            "pip install 'driverview[contacts]': a package for Python 3.11, compiled from source "
+            "on later ones"
+        ) from None
+    return PhysicsClient()
+
+
+@contextmanager
+def _stderr_silenced() -> Iterator[None]:
+    """Hide PyBullet's greeting, which it prints to stderr when it is imported."""
+    kept = os.dup(2)
+    nothing = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nothing, 2)
+    try:
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(nothing)

@@ -1,5 +1,6 @@
 """Cars and wall panels as rigid bodies in PyBullet, one DIRECT client per world.
 
+Import this module only where a contact has to be computed: PyBullet is an optional package.
 Positions in m, world frame, z up; quaternions (x, y, z, w). A body's origin is its centre of
 gravity.
 """
@@ -13,11 +14,11 @@ import pybullet
 from numpy.typing import NDArray
 
 from simulator.vehicle.car import CarParameters
+from simulator.world.boxes import box_height
 from simulator.world.control_rate import PHYSICS_HZ
 from simulator.world.walls import PANEL, Panel
 from trackfeatures.errors import UserError
 
-GROUND_CLEARANCE_M = 0.12  # from the road to the underside of a car's box
 CONTACT_FRICTION = 0.3  # of car bodies on walls and on each other
 RESTITUTION = 0.1
 SOLVER_ITERATIONS = 20
@@ -44,9 +45,7 @@ class PhysicsClient:
 
     def rebuild(self, cars: Sequence[CarParameters]) -> None:
         """Remove all bodies and create these cars, so that no state of an earlier episode (such as
-        cached contacts) remains. Raises UserError after `close`."""
-        if not self._release.alive:
-            raise UserError("this world is closed; make a new one")
+        cached contacts) remains."""
         client = self._client
         pybullet.resetSimulation(physicsClientId=client)
         pybullet.setPhysicsEngineParameter(
@@ -124,11 +123,11 @@ class PhysicsClient:
 
     def _add_car(self, car: CarParameters) -> int:
         client = self._client
-        tall = car.height - GROUND_CLEARANCE_M
+        half, above = box_height(car.height, car.cg_height)
         shape = pybullet.createCollisionShape(
             pybullet.GEOM_BOX,
-            halfExtents=[0.5 * car.length, 0.5 * car.width, 0.5 * tall],
-            collisionFramePosition=[0.0, 0.0, GROUND_CLEARANCE_M + 0.5 * tall - car.cg_height],
+            halfExtents=[0.5 * car.length, 0.5 * car.width, half],
+            collisionFramePosition=[0.0, 0.0, above],
             physicsClientId=client,
         )
         body = int(

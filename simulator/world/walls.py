@@ -13,8 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runtime.jit import compiled
-from simulator.track.piece_table import Table, index_at, pose_at, surface
+from simulator.arrays import FloatArray
+from simulator.track.piece_table import TRACK_LENGTH, Table, index_at, pose_at, surface
 from simulator.track.road import Road
+from simulator.world.boxes import AXES, CENTRE, HALF
 
 PANEL = (6.0, 3.0, 8.0)
 """Length, thickness and height of a panel."""
@@ -24,6 +26,12 @@ MIN_BRIDGE_HEIGHT_M = 4.0  # above this height difference, one road is a bridge 
 _STEP_M = 1.0
 _CENTRE_STEP_M = 2.0
 _MIN_RADIUS_M = 1.0  # no wall this near to the centre of a bend
+_ROW = 6
+
+
+WallTable = tuple[float, NDArray[np.bool_], NDArray[np.bool_]]
+"""Walls for compiled code: their distance (m) from the track's centre, and whether the left and the
+right one stand in each of the equal cells (N,) along s."""
 
 
 @dataclass(frozen=True)
@@ -42,30 +50,71 @@ class Walls:
     """Both walls of a road, with openings where they would stand on another part of the track."""
 
     def __init__(self, road: Road) -> None:
-        self.offset = road.wall_offset
         self._table: Table = road.track.arrays()
-        self._length = road.track.length_m
-        cells = math.ceil(self._length / _STEP_M)
-        stations = (np.arange(cells) + 0.5) * (self._length / cells)
-        self._present = {side: _wall_present(road, stations, side) for side in (1, -1)}
+        length = road.track.length_m
+        cells = math.ceil(length / _STEP_M)
+        stations = (np.arange(cells) + 0.5) * (length / cells)
+        left, right = (_wall_present(road, stations, side) for side in (1, -1))
+        self.arrays: WallTable = (road.wall_offset, left, right)
+
+    @property
+    def offset(self) -> float:
+        """Distance (m) of the walls from the track's centre."""
+        return self.arrays[0]
 
     def panel(self, s: float, to_middle: float, reach: float) -> Panel | None:
         """The panel of the wall within `reach` m of a car at (s, to_middle), None if there is none.
 
         A car behind the wall (it passed through an opening) gets no panel.
         """
-        side = 1 if to_middle > 0.0 else -1
-        if not self.offset - reach < abs(to_middle) < self.offset:
+        row = np.empty(_ROW)
+        if not panel_beside(self._table, self.arrays, s, to_middle, reach, row):
             return None
-        present = self._present[side]
-        if not present[int(s / self._length * len(present)) % len(present)]:
-            return None
-        x, y, _, heading, _ = pose_at(self._table, s)
-        z, _, _, _ = surface(self._table, index_at(self._table, s), s, side * self.offset)
-        out, left = side * self.offset, (-math.sin(heading), math.cos(heading))
-        face = (x + out * left[0], y + out * left[1])
-        behind, up = side * 0.5 * PANEL[1], 0.5 * PANEL[2] - FOOT_M
-        return Panel(face[0] + behind * left[0], face[1] + behind * left[1], z + up, heading, face)
+        x, y, z, yaw, *face = row.tolist()
+        return Panel(x, y, z, yaw, (face[0], face[1]))
+
+
+@compiled
+def panel_beside(
+    table: Table, walls: WallTable, s: float, to_middle: float, reach: float, row: FloatArray
+) -> bool:
+    """Fill `row` (x, y, z, yaw of the panel's centre; x, y of its face) for a car at (s, to_middle)
+    within `reach` m of a wall; False if there is none."""
+    offset = walls[0]
+    if not offset - reach < abs(to_middle) < offset:
+        return False
+    side = 1.0 if to_middle > 0.0 else -1.0
+    present = walls[1] if to_middle > 0.0 else walls[2]
+    if not present[int(s / table[0, TRACK_LENGTH] * len(present)) % len(present)]:
+        return False
+    x, y, _, heading, _ = pose_at(table, s)
+    z, _, _, _ = surface(table, index_at(table, s), s, side * offset)
+    left_x, left_y = -math.sin(heading), math.cos(heading)
+    row[4], row[5] = x + side * offset * left_x, y + side * offset * left_y
+    behind = 0.5 * side * PANEL[1]
+    row[0], row[1] = row[4] + behind * left_x, row[5] + behind * left_y
+    row[2], row[3] = z + 0.5 * PANEL[2] - FOOT_M, heading
+    return True
+
+
+@compiled
+def fill_panel_box(
+    table: Table, walls: WallTable, s: float, to_middle: float, reach: float, box: FloatArray
+) -> bool:
+    """Fill the `box` (`boxes.BOX`,) of the panel beside a car at (s, to_middle); False if there is
+    none within `reach` m."""
+    row = np.empty(_ROW)
+    if not panel_beside(table, walls, s, to_middle, reach, row):
+        return False
+    cos, sin = math.cos(row[3]), math.sin(row[3])
+    box[:] = 0.0
+    box[CENTRE : CENTRE + 3] = row[:3]
+    box[AXES], box[AXES + 1] = cos, sin
+    box[AXES + 3], box[AXES + 4] = -sin, cos
+    box[AXES + 8] = 1.0
+    for i in range(3):
+        box[HALF + i] = 0.5 * PANEL[i]
+    return True
 
 
 def _wall_present(road: Road, stations: NDArray[Any], side: int) -> NDArray[np.bool_]:

@@ -1,8 +1,8 @@
 """The simulated world: one ego car on one road with walls and traffic, stepped at 200 Hz.
 
-Compiled code moves the ego car while nothing can touch it (`vehicle.rigid_body`); near walls, other
-cars and moving wrecks PyBullet computes the contacts (`collisions`). World frame: x, y in the
-plane, z up, yaw counter-clockwise; s and to_middle in the track frame.
+Compiled code moves the ego car until it touches a wall or another car (`free_motion`); then, and
+while wrecks move, PyBullet computes the contacts (`collisions`). World frame: x, y in the plane, z
+up, yaw counter-clockwise; s and to_middle in the track frame.
 """
 
 import math
@@ -15,11 +15,11 @@ from simulator.arrays import FloatArray
 from simulator.track.piece_table import foot_offset, index_at, surface
 from simulator.track.road import START_BEFORE_LINE_M, Road
 from simulator.traffic.traffic import Traffic
+from simulator.traffic.wreck import TRAFFIC_CAR
 from simulator.vehicle.car import HIGHEST_GEAR, LOWEST_GEAR, RPM, CarParameters
 from simulator.vehicle.dynamics import ENGINE, MEMORY, MOTION, ODOMETER, PIECE, SPIN, STEER
 from simulator.vehicle.orientation import quaternion
 from simulator.vehicle.powertrain import gear_ratio
-from simulator.vehicle.rigid_body import advance_free
 from simulator.vehicle.state import CarState, Collision, Command
 from simulator.vehicle.surface import ground
 from simulator.vehicle.track_state import (
@@ -37,8 +37,9 @@ from simulator.vehicle.track_state import (
     YAW_RATE,
     measure_track_state,
 )
-from simulator.world.collisions import ContactPhysics
+from simulator.world.collisions import CONTACT_MARGIN_M, ContactPhysics
 from simulator.world.control_rate import PHYSICS_HZ, check_frequency
+from simulator.world.free_motion import advance_free
 from trackfeatures.errors import UserError
 
 __all__ = ["CarState", "Command", "World"]
@@ -66,7 +67,7 @@ class World:
         self.car = car or CarParameters()
         self._traffic_count = traffic
         self.traffic = Traffic(road, traffic, np.random.default_rng(0))
-        self._params = self.car.packed()
+        self._params, self._other = self.car.packed(), TRAFFIC_CAR.packed()
         self._table = road.track.arrays()
         self._ground = ground(road)
         self._motion = np.zeros(MOTION)
@@ -75,6 +76,7 @@ class World:
         self._controls = np.zeros(4)
         self._contacts = ContactPhysics(road, self.car)
         self._state: CarState | None = None
+        self._closed = False
 
     @property
     def state(self) -> CarState:
@@ -98,6 +100,8 @@ class World:
         The episode depends on the arguments only, not on earlier episodes. Raises UserError for a
         value out of range.
         """
+        if self._closed:
+            raise UserError("this world is closed; make a new one")
         start = -START_BEFORE_LINE_M if s is None else float(s)
         check_seed(seed)
         for name, value in (("s", start), ("to_middle", to_middle), ("angle", angle)):
@@ -114,6 +118,7 @@ class World:
             self.road, self._traffic_count, np.random.default_rng([seed, 1]), ego_s=start
         )
         self._contacts.start(self.traffic)
+        self._in_contact = False
         self._place(start, to_middle, angle, speed)
         self._lap, self._steps, self._lap_start = 0, 0, 0
         self._s = float(start % self.road.track.length_m)
@@ -147,7 +152,7 @@ class World:
     def close(self) -> None:
         """Release the physics client; afterwards `reset` and `step` raise UserError."""
         self._contacts.close()
-        self._state = None
+        self._state, self._closed = None, True
 
     def __enter__(self) -> Self:
         return self
@@ -196,30 +201,34 @@ class World:
         collision: Collision | None = None
         while done < steps:
             if not self._contacts.has_moving_wrecks:
-                done = self._advance_free(others, move, done, steps)
+                before, done = done, self._advance_free(others, move, done, steps)
+                self._in_contact = self._in_contact and done == before
             if done < steps:
                 share, dt = done / steps, 1.0 / self.frequency_hz
                 touched = self._contacts.step(
                     self._motion, self._memory, self._controls, others, move, share, dt
                 )
                 collision, done = collision or touched, done + 1
+                self._in_contact = True
         return collision
 
     def _advance_free(self, others: FloatArray, move: FloatArray, done: int, steps: int) -> int:
-        """Advance without contacts from physics step `done` until something is near; returns the
-        number of physics steps then done."""
+        """Advance from physics step `done` until the car touches something; returns the number of
+        physics steps then done. A contact ends when the gap exceeds PyBullet's threshold."""
         return advance_free(
             self._params,
+            self._other,
             self._table,
             self._ground,
+            self._contacts.walls.arrays,
             self._motion,
             self._memory,
             self._controls,
-            self.road.wall_offset,
             others,
             move,
             done,
             steps,
+            CONTACT_MARGIN_M if self._in_contact else 0.0,
         )
 
     def _build_state(self, gear: int, collision: Collision | None) -> CarState:

@@ -13,8 +13,8 @@ from runtime.jit import compiled
 from simulator.driving.cruise import Cruise
 from simulator.track.road import Road
 from simulator.traffic.traffic import DESIRED_KMH, EGO_CAR_SIZE, MAX_CARS, TRAFFIC_CAR_SIZE, Traffic
-from simulator.vehicle.rigid_body import boxes_overlap
 from simulator.vehicle.state import CarState, Command
+from simulator.world.boxes import AXES, BOX, HALF, boxes_overlap
 from simulator.world.world import World
 
 FREQUENCY_HZ = 20
@@ -110,12 +110,27 @@ def _check(road: Road, state: CarState, before: _Moment, now: _Moment) -> None:
 
 
 @compiled
+def rectangles_overlap(a: NDArray[np.float64], b: NDArray[np.float64]) -> bool:
+    """Whether two rectangles (x, y, yaw, length, width) overlap."""
+    both = np.zeros((2, BOX))
+    for row, rectangle in enumerate((a, b)):
+        cos, sin = math.cos(rectangle[2]), math.sin(rectangle[2])
+        both[row, 0], both[row, 1] = rectangle[0], rectangle[1]
+        both[row, AXES], both[row, AXES + 1] = cos, sin
+        both[row, AXES + 3], both[row, AXES + 4] = -sin, cos
+        both[row, AXES + 8] = 1.0
+        both[row, HALF], both[row, HALF + 1] = 0.5 * rectangle[3], 0.5 * rectangle[4]
+        both[row, HALF + 2] = 1.0
+    return boxes_overlap(both[0], both[1], 0.0)
+
+
+@compiled
 def first_overlap(boxes: NDArray[np.float64]) -> tuple[int, int]:
     """Indices of the first pair of `boxes` (n, 5) that overlap, (-1, -1) if none do."""
     for i in range(boxes.shape[0]):
         for j in range(i + 1, boxes.shape[0]):
             reach = boxes[i, 3] + boxes[j, 3]
             near = abs(boxes[i, 0] - boxes[j, 0]) < reach and abs(boxes[i, 1] - boxes[j, 1]) < reach
-            if near and boxes_overlap(boxes[i], boxes[j]):
+            if near and rectangles_overlap(boxes[i], boxes[j]):
                 return i, j
     return -1, -1

@@ -8,8 +8,12 @@ import pytest
 from simulator.track.catalogue import find_track
 from simulator.track.road import Road
 from simulator.traffic.car_table import centre_line_advance
-from simulator.vehicle.rigid_body import boxes_overlap
-from tests.simulator.traffic_audit import TrafficViolation, audit_traffic, first_overlap
+from tests.simulator.traffic_audit import (
+    TrafficViolation,
+    audit_traffic,
+    first_overlap,
+    rectangles_overlap,
+)
 
 
 @pytest.mark.slow
@@ -58,11 +62,11 @@ def test_box_overlap_agrees_with_sampled_points() -> None:
         inside = bool(np.any((abs(along) < 2.25) & (abs(across) < 0.95)))
         # Edges are dense: only a corner that just pokes in could be missed.
         deep = bool(np.any((abs(along) < 2.2) & (abs(across) < 0.9)))
-        assert boxes_overlap(a, b) >= deep
-        assert boxes_overlap(b, a) == boxes_overlap(a, b)
-        assert inside or not boxes_overlap(a, b) or not deep
-        seen.append(boxes_overlap(a, b))
-        assert (first_overlap(np.array([a, b])) == (0, 1)) == boxes_overlap(a, b)
+        assert rectangles_overlap(a, b) >= deep
+        assert rectangles_overlap(b, a) == rectangles_overlap(a, b)
+        assert inside or not rectangles_overlap(a, b) or not deep
+        seen.append(rectangles_overlap(a, b))
+        assert (first_overlap(np.array([a, b])) == (0, 1)) == rectangles_overlap(a, b)
     assert 50 < sum(seen) < 350
 
 

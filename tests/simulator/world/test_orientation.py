@@ -1,10 +1,11 @@
 """Quaternions of body axes equal PyBullet's, in all four branches of the conversion."""
 
 import numpy as np
-import pybullet
 import pytest
 
 from simulator.vehicle.orientation import quaternion, rotation
+
+pytestmark = pytest.mark.contacts  # PyBullet is the oracle
 
 
 @pytest.mark.parametrize(
@@ -12,6 +13,8 @@ from simulator.vehicle.orientation import quaternion, rotation
     [(0.0, 0.0, 0.0), (3.1, 0.1, 0.2), (0.1, 0.2, 3.1), (3.0, 0.2, 3.0), (0.3, -1.2, -2.0)],
 )
 def test_quaternion_and_rotation_equal_pybullets(euler: tuple[float, float, float]) -> None:
+    import pybullet
+
     turn = pybullet.getQuaternionFromEuler(euler)
     matrix = np.array(pybullet.getMatrixFromQuaternion(turn)).reshape(3, 3)
     forward, left, up = matrix.T

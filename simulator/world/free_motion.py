@@ -1,0 +1,100 @@
+"""Motion of the ego car until its box overlaps a wall or a traffic car, in one compiled call.
+
+World frame, SI units.
+"""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from runtime.jit import compiled
+from simulator.arrays import FloatArray
+from simulator.track.piece_table import Table, locate
+from simulator.traffic.wreck import lane_motion
+from simulator.vehicle.dynamics import DT, MOTION, PIECE, compute_forces
+from simulator.vehicle.rigid_body import integrate
+from simulator.vehicle.surface import Ground
+from simulator.world.boxes import BOX, box_radius, boxes_overlap, fill_car_box
+from simulator.world.walls import WallTable, fill_panel_box
+
+
+@compiled
+def touches(
+    params: NDArray[Any],
+    other: NDArray[Any],
+    table: Table,
+    walls: WallTable,
+    motion: FloatArray,
+    piece: int,
+    others: FloatArray,
+    move: FloatArray,
+    share: float,
+    dt: float,
+    margin: float,
+) -> bool:
+    """Whether the ego car's box is within `margin` m of a wall or a traffic car.
+
+    params, other: `CarParameters.packed()` of the ego car and of a traffic car; others (n, 6):
+    ground poses of the traffic at the start of the control step of `dt` s; move (n, 6): their
+    change over it; share: fraction of the control step already done.
+    """
+    radius = box_radius(params[0]) + margin
+    _, s, d = locate(table, motion[0], motion[1], piece)
+    beside_wall = abs(d) > walls[0] - radius
+    if not beside_wall and others.shape[0] == 0:
+        return False
+    own, their = np.empty(BOX), np.empty(BOX)
+    fill_car_box(params[0], motion, own)
+    if (
+        beside_wall
+        and fill_panel_box(table, walls, s, d, radius, their)
+        and boxes_overlap(own, their, margin)
+    ):
+        return True
+    reach = radius + box_radius(other[0])
+    there = np.empty(MOTION)
+    for i in range(others.shape[0]):
+        dx = others[i, 0] + share * move[i, 0] - motion[0]
+        dy = others[i, 1] + share * move[i, 1] - motion[1]
+        if dx * dx + dy * dy < reach * reach:
+            lane_motion(others[i], move[i], share, dt, there)
+            fill_car_box(other[0], there, their)
+            if boxes_overlap(own, their, margin):
+                return True
+    return False
+
+
+@compiled
+def advance_free(
+    params: NDArray[Any],
+    other: NDArray[Any],
+    table: Table,
+    ground: Ground,
+    walls: WallTable,
+    motion: FloatArray,
+    memory: FloatArray,
+    command: FloatArray,
+    others: FloatArray,
+    move: FloatArray,
+    done: int,
+    steps: int,
+    margin: float,
+) -> int:
+    """Advance the ego car from physics step `done` of `steps` until it touches something.
+
+    `margin` (m) as in `touches`, before the first of these steps; 0 from then on. Returns the
+    number of steps then done.
+    """
+    wrench = np.empty(6)
+    while done < steps:
+        share, piece = done / steps, int(memory[PIECE])
+        if touches(
+            params, other, table, walls, motion, piece, others, move, share, steps * DT, margin
+        ):
+            return done
+        compute_forces(params, table, ground, motion, memory, command, wrench)
+        integrate(params[0], motion, wrench)
+        margin = 0.0
+        done += 1
+    return done
