@@ -1,5 +1,12 @@
 # driverview: `make demo` shows the whole pipeline, `make test` checks it. `make help` lists the rest.
-PYTHON ?= python3
+# Python 3.11 first: PyBullet has no wheels for later versions. Then the default one, then others.
+SUPPORTED := sys.version_info[:2] in [(3, minor) for minor in (11, 12, 13, 14)]
+FIND_PYTHON := for python in python3.11 python3 python3.14 python3.13 python3.12; do \
+  "$$python" -c 'import sys, venv, ensurepip; sys.exit(not $(SUPPORTED))' 2>/dev/null && { echo "$$python"; break; }; \
+  done
+ifndef PYTHON
+PYTHON := $(shell $(FIND_PYTHON))
+endif
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
@@ -18,12 +25,21 @@ setup: $(READY) ## make .venv with everything in it (about 8 GB, minutes)
 # what it imports: of 21,000 modules a seventh, so that pip need not take a minute to compile all.
 $(READY): pyproject.toml requirements.lock
 	@$(MAKE) --no-print-directory system
-	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
-	  { echo "error: $$($(PYTHON) --version) found, Python 3.11 or newer is needed: make PYTHON=python3.11 setup" >&2; exit 1; }
+	@"$(PYTHON)" -c 'import sys, venv, ensurepip; sys.exit(not $(SUPPORTED))' 2>/dev/null || \
+	  { echo "error: Python 3.11, 3.12, 3.13 or 3.14 with venv is needed, found: $$("$(or $(PYTHON),python3)" --version 2>&1 | head -n 1); install one" \
+	  "(python3-venv on Debian), or name it: make PYTHON=/path/to/python3.11 setup" >&2; exit 1; }
+	@"$(PYTHON)" -c '$(DESCRIBE_PYTHON)'
 	@$(BIN)/python -m pip --version >/dev/null 2>&1 || { rm -rf $(VENV); $(PYTHON) -m venv $(VENV); }
 	$(BIN)/python -m pip install --quiet --no-compile --require-hashes --requirement requirements.lock
 	$(BIN)/python -m pip install --quiet --no-deps --no-build-isolation --editable .
 	@touch $@
+
+define DESCRIBE_PYTHON
+import sys; \
+here = ".".join(map(str, sys.version_info[:3])); \
+without = "without PyBullet, which has no wheels for it: all works but contacts of the car with walls and other cars"; \
+print(f"Python {here} ({sys.executable}):", "with PyBullet" if sys.version_info < (3, 12) else without)
+endef
 
 # The camera renders through EGL; with no GPU, Mesa's llvmpipe does the work.
 EGL_PACKAGES := libegl1 libgl1-mesa-dri
@@ -43,7 +59,7 @@ demo: $(READY) ## collect, train, evaluate, serve, ask, report: in 17 minutes on
 # stay in one process, for they share what is costly to make; xdist keeps their order (tests/conftest.py).
 # What measures time comes after them, when the cores are free. A process that dies ends the run: xdist
 # 3.8 would start another, hand out the dead one's finished files again, and wait for ever (its issue 1378).
-PROCESSES := $(shell $(PYTHON) -c 'import os; print(min(len(os.sched_getaffinity(0)) + 1, 4))')
+PROCESSES := $(shell cores=$$(nproc 2>/dev/null || echo 1); echo $$((cores < 3 ? cores + 1 : 4)))
 PARALLEL := --numprocesses $(PROCESSES) --dist loadfile --no-loadscope-reorder --max-worker-restart 0
 
 test: $(READY) ## all checks and tests but the extended ones
@@ -109,11 +125,16 @@ format: $(READY) ## put the code in order
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
 
-lock: ## pin what is installed now, with hashes, after a change of pyproject.toml
+lock: $(READY) ## resolve and pin all versions, with hashes, after a change of pyproject.toml
 	$(BIN)/python -m pip install --quiet --require-hashes --requirement deploy/uv.txt
-	$(BIN)/python -m pip freeze --all --exclude-editable | grep -vE '^(pip|uv)==' | \
-	  $(BIN)/uv pip compile - --quiet --no-deps --generate-hashes --no-annotate --no-header \
-	  --python-version 3.11.0 --output-file requirements.lock
+	echo 'setuptools>=77' | $(BIN)/uv pip compile pyproject.toml - --quiet --extra dev --universal --python-version 3.11 \
+	  --generate-hashes --no-annotate --no-header --output-file requirements.lock $(LOCK)
+	sed -i "s/ ; python_full_version < '3.15' and platform_python_implementation == 'CPython' and sys_platform == 'linux'//" requirements.lock
+	@for version in 3.11 3.12 3.13 3.14; do \
+	  $(BIN)/uv pip compile requirements.lock --quiet --no-deps --only-binary :all: --python-version $$version \
+	    --python-platform x86_64-manylinux_2_28 --output-file /dev/null || exit 1; \
+	  echo "Python $$version: wheels of all packages"; \
+	done
 
 clean: ## remove what was built and collected here, the environment too
 	rm -rf $(VENV) demo build dist *.egg-info

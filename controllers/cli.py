@@ -79,6 +79,10 @@ DemoFolder = Annotated[Path, typer.Option(help="Folder for all results.")]
 Rounds = Annotated[int, typer.Option(help="Rounds to collect.", min=12)]
 FramesARound = Annotated[int, typer.Option(help="Frames a round.", min=20)]
 Minutes = Annotated[float, typer.Option(help="Training time.", min=0.1)]
+FirstDrive = Annotated[
+    bool,
+    typer.Option("--first-drive", help="Stop after the first drive, a film of the shipped model."),
+]
 DemoSeed = Annotated[int, typer.Option(help="Of the collection and the training.", min=0)]
 
 
@@ -161,6 +165,7 @@ def demo(
     frames: FramesARound = DEMO.frames,
     minutes: Minutes = DEMO.minutes,
     seed: DemoSeed = DEMO.seed,
+    first_drive: FirstDrive = DEMO.first_drive,
     as_json: command.AsJson = False,
 ) -> None:
     """The shipped model on a first drive, then the whole pipeline: collect, train, evaluate, serve,
@@ -170,11 +175,18 @@ def demo(
     """
     from controllers.demo.process import stop_on_sigterm
     from controllers.demo.report import check_limits, print_tables, write_report
-    from controllers.demo.run import run_demo
+    from controllers.demo.run import announce, run_demo
 
     stop_on_sigterm()
-    config = DemoConfig(out=out, rounds=rounds, frames=frames, seed=seed, minutes=minutes)
+    config = DemoConfig(
+        out=out, rounds=rounds, frames=frames, seed=seed, minutes=minutes, first_drive=first_drive
+    )
+    announce(config)
     result = run_demo(config)
+    if first_drive:
+        if as_json:
+            typer.echo(json.dumps(result.as_json()))
+        return
     found = check_limits(result)
     report = write_report(config, result)
     if as_json:

@@ -105,3 +105,5 @@ class DemoConfig:
     asked: int = 12
     """Held-out frames that are posted to the service."""
     drive_track: str = "highway"
+    first_drive: bool = False
+    """Stop after the first drive, which the shipped model answers."""

@@ -30,6 +30,10 @@ DRIVE_STEPS = 800
 """Of 50 ms: 40 s from a standing start."""
 
 
+COLLECTED_PER_S, CHECKED_PER_S = 250, 2_000
+"""Frames collected and verified in a second on two cores, for the plan that `announce` prints."""
+
+
 @dataclass(slots=True)
 class DemoResult:
     """The output of every step, for the report."""
@@ -51,10 +55,33 @@ class DemoResult:
         return content
 
 
+def announce(config: DemoConfig) -> None:
+    """Print what the demo will do, and about how long each part takes on two cores."""
+    frames = config.rounds * config.frames
+    parts = [
+        (0.5, f"first drive: a film of the shipped model's answers, {config.out / 'first.mp4'}"),
+        (frames / COLLECTED_PER_S / 60, f"collect {config.rounds} rounds, {frames} frames"),
+        (frames / CHECKED_PER_S / 60, "verify them"),
+        (config.minutes + 0.7, "train a network on them, and fit its standard deviations"),
+        (0.4, "evaluate it on the test rounds"),
+        (0.7, f"serve it, ask it, drive a car on its answers, {config.out / 'report.html'}"),
+    ]
+    if config.first_drive:
+        parts = parts[:1]
+    whole = _duration(sum(part[0] for part in parts))
+    LOG.print(f"the demo takes about {whole} on two cores:")
+    for number, (minutes, what) in enumerate(parts, start=1):
+        LOG.print(f"  {number}. {what} ({_duration(minutes)})", markup=False)
+
+
+def _duration(minutes: float) -> str:
+    return f"{minutes:.0f} min" if minutes >= 1.5 else f"{max(round(6 * minutes), 1) * 10} s"
+
+
 def run_demo(config: DemoConfig) -> DemoResult:
     """Try the shipped model; collect, verify, train, evaluate, serve, predict, drive.
 
-    All results go to `config.out`.
+    All results go to `config.out`. With `config.first_drive` it ends after the shipped model.
 
     Raises UserError when `config.out` holds other files than an earlier demo's, or a step fails.
     """
@@ -75,6 +102,8 @@ def run_demo(config: DemoConfig) -> DemoResult:
     evaluate = ["mtlnet", "evaluate", "--model", run, "--data", data, "--split", "test", "--json"]
 
     _try_shipped_model(config, result)
+    if config.first_drive:
+        return result
     result.collected = json.loads(_step(result, "collect", collect))
     _step(result, "verify", ["datagen", "verify", data, "--level", "full"])
     _step(result, "train", train)
