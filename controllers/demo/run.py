@@ -71,7 +71,7 @@ def announce(config: DemoConfig) -> None:
     whole = _duration(sum(part[0] for part in parts))
     LOG.print(f"the demo takes about {whole} on two cores:")
     for number, (minutes, what) in enumerate(parts, start=1):
-        LOG.print(f"  {number}. {what} ({_duration(minutes)})", markup=False)
+        LOG.print(f"  {number}. {what} ({_duration(minutes)})", markup=False, soft_wrap=True)
 
 
 def _duration(minutes: float) -> str:

@@ -133,7 +133,9 @@ def test_images_get_every_package_and_only_files_of_known_hashes() -> None:
     for name in ("requirements.lock", "deploy/uv.txt"):
         pins = re.split(r"^(?=\S)", (ROOT / name).read_text(), flags=re.MULTILINE)[1:]
         assert pins
-        assert all(re.match(r"\S+==\S+( ; .+)? \\\n +--hash=sha256:[0-9a-f]{64}", pin) for pin in pins)
+        assert all(
+            re.match(r"\S+==\S+( ; .+)? \\\n +--hash=sha256:[0-9a-f]{64}", pin) for pin in pins
+        )
     assert DOCKERFILE.count("pip install") == DOCKERFILE.count("/wheels/requirements.lock") + 2
     assert "--require-hashes --requirement build.txt" in DOCKERFILE
     assert "pip wheel --no-cache-dir --no-deps --no-build-isolation" in DOCKERFILE

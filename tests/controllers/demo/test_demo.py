@@ -1,5 +1,6 @@
 """The demo: overlays at hand-computed pixels, choice of frames, limit checks, child processes."""
 
+import json
 import os
 import signal
 import subprocess
@@ -8,6 +9,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
@@ -15,8 +17,9 @@ from controllers.config import DemoConfig
 from controllers.demo.frames import PostedFrame, spread
 from controllers.demo.process import run_module
 from controllers.demo.report import check_drive, check_evaluation, check_posted, print_tables
-from controllers.demo.run import run_demo
+from controllers.demo.run import announce, run_demo
 from mtlnet.inference.overlay import SCALE, draw_overlay, marking_line, to_pixels
+from tests.typed import typed
 from trackfeatures import UserError
 from trackfeatures.camera import CameraParameters
 
@@ -142,6 +145,33 @@ def test_posted_answers_must_be_as_good_as_the_evaluation_says() -> None:
     assert all(one.reached for one in good)
     bad = check_posted([posted(0.05, 0.7)], limits)
     assert [one.reached for one in bad] == [False, False]
+
+
+def test_the_plan_scales_with_what_is_asked_for(capsys: pytest.CaptureFixture[str]) -> None:
+    announce(DemoConfig())
+    announce(DemoConfig(rounds=600, minutes=30.0))
+    announce(DemoConfig(first_drive=True))
+    usual, longer, first = capsys.readouterr().err.split("the demo takes about ")[1:]
+    assert usual.startswith("15 min on two cores:\n  1. first drive")
+    assert "collect 300 rounds, 60000 frames (4 min)" in usual
+    assert "collect 600 rounds, 120000 frames (8 min)" in longer
+    assert "(31 min)" in longer
+    assert usual.count("\n") == 7
+    assert first.startswith("30 s on two cores")
+    assert first.count("\n") == 2
+
+
+@pytest.mark.slow
+def test_the_first_drive_alone_leaves_a_film_of_the_shipped_models_answers(tmp_path: Path) -> None:
+    done = typed("controllers", "demo", "--first-drive", "--out", tmp_path / "demo", "--json")
+    assert done.returncode == 0, done.stderr
+    result = json.loads(done.stdout)
+    assert [len(result[name]) for name in ("shipped", "asked", "drive")] == [4, 0, 0]
+    assert list(result["seconds"]) == ["first round", "first film"]
+    made = {path.name for path in (tmp_path / "demo").iterdir()}
+    assert made == {"driverview-demo", "first", "first.csv", "first.log", "first.mp4"}
+    film = cv2.VideoCapture(str(tmp_path / "demo" / "first.mp4"))
+    assert film.get(cv2.CAP_PROP_FRAME_COUNT) == 60
 
 
 def test_a_folder_with_other_files_is_refused(tmp_path: Path) -> None:
