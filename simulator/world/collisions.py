@@ -185,9 +185,9 @@ def _connect() -> "PhysicsClient":
             from simulator.world.physics import PhysicsClient
     except ImportError as error:
         raise UserError(
-            f"the car touched a wall or another car, and contacts need PyBullet ({error}); "
-            "pip install 'driverview[contacts]': a package for Python 3.11, compiled from source "
-            "on later ones"
+            f"the car touched a wall or another car; contacts need PyBullet ({error}): "
+            "pip install 'driverview[contacts]' (from Python 3.12 on pip compiles it, with g++, in "
+            "half an hour)"
         ) from None
     return PhysicsClient()
 
