@@ -30,6 +30,7 @@ def test_ten_minutes_of_traffic_without_a_violation(track: str, lanes: int, park
     assert seen.own_laps == 0 if parked else seen.own_laps > 1
 
 
+@pytest.mark.contacts
 def test_the_audit_detects_a_collision(monkeypatch: pytest.MonkeyPatch) -> None:
     """With leaders ignored, traffic hits a parked car, which the audit reports."""
     monkeypatch.setattr("simulator.traffic.traffic.Traffic._update_ego", lambda *_: None)

@@ -15,8 +15,9 @@ from simulator.traffic.traffic import TRAFFIC_CAR_SIZE
 from simulator.traffic.wreck import TRAFFIC_CAR
 from simulator.vehicle.car import CarParameters
 from simulator.vehicle.state import CarState, Command
-from simulator.world.walls import Walls
 from simulator.world.world import World
+
+pytestmark = pytest.mark.contacts
 
 COAST = Command(gear=0)
 FULL_BRAKE = Command(brake=1.0, gear=0)
@@ -175,27 +176,3 @@ def test_wall_contact_counts_as_off_track_or_else_as_collision() -> None:
             reasons.append((ending(state), ending(state, ("backwards", "collision"))))
         assert ("off_track", None) in reasons
         assert reasons[-1] == ("off_track", "collision")
-
-
-def test_a_wall_is_open_where_another_part_of_the_track_lies() -> None:
-    # A hairpin whose two straights are 12 m apart: walls 8.5 m out would stand on the other one.
-    tight = Piece(math.pi * 6.0, 1 / 6.0, 0, 0, 0, 0)
-    wide = Piece(math.pi * 6.0, 1 / 6.0, 0, 0, 0, 0)
-    straight = Piece(200.0, 0.0, 0, 0, 0, 0)
-    track = Track.from_placed(
-        assemble([straight, tight, straight, wide]),
-        name="hairpin",
-        source="own",
-        width=12.0,
-        surface="asphalt",
-        look="circuit",
-        markings=MarkingStyle(),
-    )
-    walls = Walls(Road(track))
-    assert walls.panel(100.0, 6.5, 3.5) is None
-    outer = walls.panel(100.0, -6.5, 3.5)
-    assert outer is not None
-    assert (outer.x, outer.yaw) == pytest.approx((100.0, 0.0))
-    assert outer.y == pytest.approx(-walls.offset - 1.5)
-    assert walls.panel(100.0, -3.0, 3.5) is None  # too far
-    assert walls.panel(100.0, -9.0, 3.5) is None  # behind it

@@ -58,6 +58,7 @@ def fingerprint(seed: int, *, rehearse: bool) -> str:
     return digest.hexdigest()
 
 
+@pytest.mark.contacts
 def test_the_same_seed_in_two_processes_is_bit_identical() -> None:
     here = fingerprint(5, rehearse=True)
     assert fingerprint(6, rehearse=False) != here
@@ -118,6 +119,7 @@ def test_features_match_the_cars_position() -> None:
         assert features.mr == pytest.approx(1.0, abs=1e-6)
 
 
+@pytest.mark.contacts
 def test_a_wall_stops_the_car_and_is_recorded() -> None:
     with World(stadium()) as world:
         state = world.reset(seed=0, s=100.0, angle=-0.5, speed=20.0)
@@ -133,6 +135,7 @@ def test_a_wall_stops_the_car_and_is_recorded() -> None:
         assert abs(state.roll) < 0.3
 
 
+@pytest.mark.contacts
 def test_a_car_has_left_the_track_before_it_meets_the_wall() -> None:
     with World(stadium()) as world:
         for angle in (-0.1, -0.7, -1.4):
@@ -144,6 +147,7 @@ def test_a_car_has_left_the_track_before_it_meets_the_wall() -> None:
             assert world.road.edge < seen[off].to_middle < world.road.edge + 0.8
 
 
+@pytest.mark.contacts
 def test_a_collision_with_traffic_is_recorded_and_slows_the_car() -> None:
     with World(stadium(lanes=1), traffic=1) as world:
         world.reset(seed=3)

@@ -63,3 +63,27 @@ def test_no_panel_for_a_car_far_from_the_wall_or_behind_it() -> None:
     assert walls.panel(100.0, walls.offset - 3.6, 3.5) is None
     assert walls.panel(100.0, walls.offset - 3.4, 3.5) is not None
     assert walls.panel(100.0, walls.offset + 0.1, 3.5) is None
+
+
+def test_a_wall_is_open_where_another_part_of_the_track_lies() -> None:
+    # A hairpin whose two straights are 12 m apart: walls 8.5 m out would stand on the other one.
+    tight = Piece(math.pi * 6.0, 1 / 6.0, 0, 0, 0, 0)
+    wide = Piece(math.pi * 6.0, 1 / 6.0, 0, 0, 0, 0)
+    straight = Piece(200.0, 0.0, 0, 0, 0, 0)
+    track = Track.from_placed(
+        assemble([straight, tight, straight, wide]),
+        name="hairpin",
+        source="own",
+        width=12.0,
+        surface="asphalt",
+        look="circuit",
+        markings=MarkingStyle(),
+    )
+    walls = Walls(Road(track))
+    assert walls.panel(100.0, 6.5, 3.5) is None
+    outer = walls.panel(100.0, -6.5, 3.5)
+    assert outer is not None
+    assert (outer.x, outer.yaw) == pytest.approx((100.0, 0.0))
+    assert outer.y == pytest.approx(-walls.offset - 1.5)
+    assert walls.panel(100.0, -3.0, 3.5) is None  # too far
+    assert walls.panel(100.0, -9.0, 3.5) is None  # behind it
