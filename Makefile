@@ -2,7 +2,7 @@
 # Python 3.11 first: PyBullet has no wheels for later versions. Then the default one, then others.
 SUPPORTED := sys.version_info[:2] in [(3, minor) for minor in (11, 12, 13, 14)]
 FIND_PYTHON := for python in python3.11 python3 python3.14 python3.13 python3.12; do \
-  "$$python" -c 'import sys, venv, ensurepip; sys.exit(not $(SUPPORTED))' 2>/dev/null && { echo "$$python"; break; }; \
+  "$$python" -c 'import sys, venv, ensurepip; sys.exit(not $(SUPPORTED))' >/dev/null 2>&1 && { echo "$$python"; break; }; \
   done
 ifndef PYTHON
 PYTHON := $(shell $(FIND_PYTHON))

@@ -1,0 +1,76 @@
+"""`make setup` picks a Python that the lock serves; the lock serves Python 3.11 to 3.14."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+
+
+def made(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
+    """Run `make` in this checkout, with only the programs of `folder` on the PATH."""
+    for program in ("sh", "nproc", "dirname", "echo"):
+        for parent in ("/usr/bin", "/bin"):
+            if (found := Path(parent) / program).exists() and not (folder / program).exists():
+                (folder / program).symlink_to(found)
+    command = ["/usr/bin/make", "--no-print-directory", "-C", str(ROOT), *words]
+    environment = {"PATH": str(folder), "HOME": str(folder)}
+    return subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+
+
+def put_python(folder: Path, name: str, version: tuple[int, int]) -> None:
+    """A program that behaves as Python `version`, for the question that the Makefile asks."""
+    code = f"import sys; sys.version_info = (*{version}, 0); exec(sys.argv[2])"
+    put_program(folder / name, f'exec {sys.executable} -c "{code}" "$@"')
+
+
+def put_program(path: Path, line: str) -> None:
+    path.write_text(f"#!/bin/sh\n{line}\n")
+    path.chmod(0o755)
+
+
+@pytest.mark.parametrize(
+    ("installed", "chosen"),
+    [
+        ({"python3": (3, 13)}, "python3"),
+        ({"python3": (3, 13), "python3.11": (3, 11)}, "python3.11"),
+        ({"python3": (3, 10), "python3.12": (3, 12)}, "python3.12"),
+        ({"python3": (3, 15), "python3.14": (3, 14), "python3.12": (3, 12)}, "python3.14"),
+        ({"python3": (3, 10)}, ""),
+        ({}, ""),
+    ],
+)
+def test_setup_chooses_a_supported_python(
+    installed: dict[str, tuple[int, int]], chosen: str, tmp_path: Path
+) -> None:
+    for name, version in installed.items():
+        put_python(tmp_path, name, version)
+    show = "show: ; @echo chosen=$(PYTHON)"
+    done = made(tmp_path, "--eval", show, "show")
+    assert done.stdout == f"chosen={chosen}\n", done.stderr
+
+
+def test_a_python_without_venv_is_passed_over(tmp_path: Path) -> None:
+    put_program(tmp_path / "python3.11", "echo no module named venv; exit 1")
+    put_python(tmp_path, "python3.13", (3, 13))
+    done = made(tmp_path, "--eval", "show: ; @echo chosen=$(PYTHON)", "show")
+    assert done.stdout == "chosen=python3.13\n"
+
+
+def test_the_lock_pins_one_version_of_each_package_for_every_python() -> None:
+    """Only packages without wheels for a version are left out of it."""
+    pins = re.findall(
+        r"^(\S+)==(\S+)(?: ; (.+?))? \\$", (ROOT / "requirements.lock").read_text(), re.M
+    )
+    names = [name for name, _, _ in pins]
+    assert len(names) == len(set(names)) > 200
+    limited = {
+        name: limit
+        for name, _, marker in pins
+        if (limit := "".join(re.findall(r"python_full_version < '([\d.]+)'", marker)))
+        not in ("", "3.15")
+    }
+    assert limited == {"pybullet": "3.12", "box2d": "3.14"}
