@@ -43,7 +43,7 @@ WORKDIR /driverview
 # Physics and rendering; with no GPU, Mesa renders.
 FROM base AS collect
 RUN apt-get update \
-    && apt-get install -y --no-install-recommends libegl1 libgl1-mesa-dri \
+    && apt-get install -y --no-install-recommends libegl1 libgl1 libgl1-mesa-dri \
     && rm -rf /var/lib/apt/lists/*
 RUN uv pip install --constraint /wheels/requirements.lock "$(ls /wheels/*.whl)[simulation]"
 USER driverview

@@ -42,9 +42,9 @@ print(f"Python {here} ({sys.executable}):", "with PyBullet" if sys.version_info 
 endef
 
 # The camera renders through EGL; with no GPU, Mesa's llvmpipe does the work.
-EGL_PACKAGES := libegl1 libgl1-mesa-dri
+EGL_PACKAGES := libegl1 libgl1 libgl1-mesa-dri
 system:
-	@if ldconfig -p 2>/dev/null | grep -q 'libEGL\.so\.1' && \
+	@if ldconfig -p 2>/dev/null | grep -q 'libEGL\.so\.1' && ldconfig -p | grep -q 'libGL\.so\.1' && \
 	  { ldconfig -p | grep -q 'libEGL_nvidia' || find /usr/lib* -name 'swrast_dri.so' -o -name 'libgallium*' 2>/dev/null | grep -q .; }; then :; \
 	elif ! command -v apt-get >/dev/null; then \
 	  echo "error: EGL and Mesa are missing; install your system's packages for them ($(EGL_PACKAGES) on Debian)" >&2; exit 1; \
