@@ -5,6 +5,7 @@ imported only when the torch engine is requested: the serving image does not con
 """
 
 import json
+import os
 from pathlib import Path
 from typing import Any, Literal, Protocol, cast, get_args
 
@@ -85,6 +86,8 @@ class OpenVinoEngine:
     def __init__(
         self, run: Path, card: ModelCard, precision: Precision | None = None, threads: int = 1
     ) -> None:
+        # hwloc, which OpenVINO loads, writes to stderr where a container hides /sys.
+        os.environ.setdefault("HWLOC_HIDE_ERRORS", "2")
         import openvino
 
         core = openvino.Core()
