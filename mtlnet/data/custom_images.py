@@ -35,6 +35,7 @@ MARKING_LIMITS_M = {
 """Range of the network's coding; labels beyond it would be clipped."""
 ANGLE_LIMIT_RAD = 0.5
 ASPECT_TOLERANCE = 0.01
+MAX_READERS = 8  # threads; each may hold a photo of 0.8 GB
 
 
 @dataclass(frozen=True)
@@ -105,7 +106,7 @@ def open_custom_images(
         return hashlib.sha256(path.read_bytes()).digest()
 
     digest = hashlib.sha256((folder / LABELS).read_bytes())
-    with ThreadPoolExecutor() as pool:
+    with ThreadPoolExecutor(MAX_READERS) as pool:
         for part in pool.map(decode, range(len(files))):
             digest.update(part)
     return CustomImages(folder, labels, images, digest.hexdigest())

@@ -41,6 +41,7 @@ MAX_SCANNED_PX = 100_000_000  # pixels times scans of a JPEG: ten scans of the l
 LATE_CHECK_BYTES = 1 << 18  # a JPEG file of more is checked when it is decoded, not by `inspect`
 # One 2.6 GHz core: a PNG of 64 bits a pixel 84 ns a pixel, a baseline JPEG 10, of ten scans 15.
 PNG_NS_PER_BIT, PNG_NS_PER_BYTE, JPEG_NS, SCAN_NS, PROGRESSIVE_SCANS = 1.4, 2.0, 10.0, 1.0, 10
+TURN_NS = 6.0  # to turn a pixel upright
 MAX_SEQUENTIAL_SCANS = 4  # one for each component
 MAX_TRAILING_BYTES = 64  # padding of some cameras; more could be another file
 
@@ -68,6 +69,8 @@ class ImageHeader:
             per_pixel_ns += PNG_NS_PER_BYTE * found.file_bytes / (self.width * self.height)
         else:
             per_pixel_ns = JPEG_NS + SCAN_NS * (self.scans - 1)
+        if self.orientation != NONE:
+            per_pixel_ns += TURN_NS
         return self.width * self.height * per_pixel_ns / 1e6
 
 
@@ -318,4 +321,6 @@ def _decode_png(body: bytes, header: png.PngHeader, *, limited: bool = True) -> 
 
 
 def _damaged_jpeg(error: ValueError) -> ImageError:
-    return ImageError(Fault.DAMAGED, f"the JPEG cannot be decoded ({error}); give the whole file")
+    return ImageError(
+        Fault.DAMAGED, f"the JPEG cannot be decoded ({error}); give the whole file, or save it anew"
+    )

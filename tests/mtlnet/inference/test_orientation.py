@@ -170,6 +170,7 @@ def test_a_large_jpeg_is_turned_too() -> None:
     assert len(body) > LATE_CHECK_BYTES
     header = inspect(body, VIEW)
     assert (header.width, header.height, header.orientation) == (800, 600, 6)
+    assert header.decode_ms == pytest.approx(800 * 600 * (10 + 6) / 1e6)
     whole = np.rot90(simplejpeg.decode_jpeg(body), -1)
     assert np.array_equal(by_service(body), crop_and_resize(whole, VIEW))
 
