@@ -120,9 +120,8 @@ def _decode_file(body: bytes) -> NDArray[np.uint8]:
         image = _decode_png(body, header, limited=False)
         return upright(image, exif_orientation(png.find_exif(body, limited=False)))
     if body.startswith(jpeg.SIGNATURE):
-        head = jpeg.read_head(body)
         _check_file_size(*_jpeg_size(body)[:2])
-        return upright(_decode_padded_jpeg(body), head.orientation)
+        return upright(_decode_padded_jpeg(body), jpeg.read_head(body).orientation)
     kind = other_kinds.find_kind(body)
     if kind is None:
         raise ImageError(

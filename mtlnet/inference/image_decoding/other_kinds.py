@@ -87,8 +87,8 @@ def decode(body: bytes, kind: Kind, orientation: int) -> NDArray[np.uint8]:
             raise ImageError(Fault.UNSUPPORTED, f"{reason}; {SAVE}")
         raise ImageError(
             Fault.DAMAGED,
-            f"the {kind.name} cannot be decoded: it is damaged, incomplete or of an unusual kind, "
-            f"such as floating-point; give the whole file, or {SAVE}",
+            f"the {kind.name} cannot be decoded: it is damaged, incomplete or in a coding that "
+            f"OpenCV does not read; give the whole file, or {SAVE}",
         )
     return upright(cv2.cvtColor(image, cv2.COLOR_BGR2RGB).astype(np.uint8, copy=False), orientation)
 
