@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import trackfeatures as tf
-from mtlnet.inference.image_decoding.decode import inspect, read_image, read_whole_image
+from mtlnet.inference.image_decoding.decode import crop_and_resize, read_whole_image
 from mtlnet.inference.rectification import Rectification
 from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
@@ -35,6 +35,7 @@ MARKING_LIMITS_M = {
 """Range of the network's coding; labels beyond it would be clipped."""
 ANGLE_LIMIT_RAD = 0.5
 ASPECT_TOLERANCE = 0.01
+MAX_READERS = 8  # threads; each may hold a photo of 0.8 GB
 
 
 @dataclass(frozen=True)
@@ -105,7 +106,7 @@ def open_custom_images(
         return hashlib.sha256(path.read_bytes()).digest()
 
     digest = hashlib.sha256((folder / LABELS).read_bytes())
-    with ThreadPoolExecutor() as pool:
+    with ThreadPoolExecutor(MAX_READERS) as pool:
         for part in pool.map(decode, range(len(files))):
             digest.update(part)
     return CustomImages(folder, labels, images, digest.hexdigest())
@@ -116,26 +117,26 @@ def _read_uncropped(path: Path, camera: CameraParameters) -> NDArray[np.uint8]:
 
     Unlike images for prediction it is not cropped: its labels belong to the whole image.
     """
-    image = read_image(path, camera)
-    header = inspect(path.read_bytes(), camera)
-    stretch = header.width * camera.height / (header.height * camera.width)
-    if abs(stretch - 1) > ASPECT_TOLERANCE:
+    image = read_whole_image(path)
+    height, width = image.shape[:2]
+    if abs(width * camera.height / (height * camera.width) - 1) > ASPECT_TOLERANCE:
         raise UserError(
-            f"{path} is {header.width} x {header.height} px, the camera of the model gives "
+            f"{path} is {width} x {height} px, the camera of the model gives "
             f"{camera.width} x {camera.height}: give images of that aspect ratio (within 1 "
             "percent), of any size"
         )
-    return image
+    return crop_and_resize(image, camera)
 
 
 def read_labels(path: Path) -> tuple[list[tuple[int, str]], CustomLabels]:
     """(line, file) of each row of a `labels.csv`, and the labels.
 
-    Raises UserError that names the faulty line.
+    File names may have bytes that are not UTF-8, as the file system's. Raises UserError that names
+    the faulty line.
     """
     files: list[tuple[int, str]] = []
     rows: list[tuple[list[float], float, int]] = []
-    with path.open(newline="", encoding="utf-8-sig") as file:
+    with path.open(newline="", encoding="utf-8-sig", errors="surrogateescape") as file:
         reader = csv.DictReader(file, strict=True)
         try:
             names = [name.strip() for name in reader.fieldnames or ()]
@@ -143,7 +144,7 @@ def read_labels(path: Path) -> tuple[list[tuple[int, str]], CustomLabels]:
             if sorted(names) != sorted(COLUMNS):
                 raise UserError(
                     f"{path} has the columns {', '.join(names) or 'none'}; its first line must "
-                    f"name {', '.join(COLUMNS)}"
+                    f"name {', '.join(COLUMNS)}, with commas between them, in UTF-8"
                 )
             for row in reader:
                 try:
@@ -152,7 +153,7 @@ def read_labels(path: Path) -> tuple[list[tuple[int, str]], CustomLabels]:
                     raise UserError(f"{path}, line {reader.line_num}: {error}") from None
                 files.append((reader.line_num, name))
                 rows.append(values)  # type: ignore[arg-type]  # as `_parse` gives them
-        except (csv.Error, UnicodeDecodeError) as error:
+        except csv.Error as error:
             raise UserError(f"{path}, after line {reader.line_num}: {error}") from error
     if not files:
         raise UserError(f"{path} names no images")

@@ -43,6 +43,8 @@ from trackfeatures.camera import CameraParameters
 from trackfeatures.names import to_name
 
 PACKAGES = ("driverview", "torch", "openvino", "numpy")
+LEAST_OOD_SCORE = 1e-3
+"""That of a model's only image is 0, but for rounding; from 1 on an image counts as unfamiliar."""
 
 
 @dataclass(frozen=True)
@@ -118,7 +120,8 @@ def compare_graph(
     """Largest difference between torch in float32 and the run's graph, by precision.
 
     `openvino_PRECISION_max`: absolute, of the nine outputs and the probabilities of absence;
-    `openvino_PRECISION_uncertainty`: relative, of the uncertainty head's outputs.
+    `openvino_PRECISION_uncertainty`: relative, of the uncertainty head's outputs; of an
+    out-of-distribution score to `LEAST_OOD_SCORE` at least.
     """
     import openvino
 
@@ -141,7 +144,9 @@ def compare_graph(
         differences[f"openvino_{precision}_max"] = float(np.abs(found - expected).max())
         if uncertainty is not None:
             columns = slice(OUTPUTS, OUTPUTS + uncertainty.shape[1])
-            relative = np.abs(outputs[:, columns] / uncertainty - 1)
+            reference = uncertainty.copy()
+            reference[:, -1] = np.maximum(reference[:, -1], LEAST_OOD_SCORE)
+            relative = np.abs(outputs[:, columns] - uncertainty) / reference
             differences[f"openvino_{precision}_uncertainty"] = float(relative.max())
     return differences
 

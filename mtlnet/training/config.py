@@ -81,14 +81,21 @@ class TrainConfig:
             raise UserError(f"--iterations is {self.iterations}; give at least 1")
         if self.minutes is not None and not 0 < self.minutes < math.inf:
             raise UserError(f"--minutes is {self.minutes}; give a number above 0")
-        if self.batch < 2:
-            raise UserError(f"--batch is {self.batch}; batch normalisation needs at least 2")
+        least = 2 if self._has_batch_norm() else 1
+        if self.batch < least:
+            reason = "batch normalisation needs" if least == 2 else "give"
+            raise UserError(f"--batch is {self.batch}; {reason} at least {least}")
         if self.seed < 0:
             raise UserError(f"--seed is {self.seed}; give 0 or more")
         if not 0 <= self.threads <= MAX_THREADS:
             raise UserError(
                 f"--threads is {self.threads}; give 0 (one a core) or at most {MAX_THREADS}"
             )
+
+    def _has_batch_norm(self) -> bool:
+        """Whether the network is trained with batch normalisation."""
+        backbone = find_architecture(self.network).backbone
+        return find_recipe(self.recipe).batch_norm or (bool(backbone) and self.init is None)
 
 
 def new_config(options: Mapping[str, Any], out: Path | None) -> TrainConfig:

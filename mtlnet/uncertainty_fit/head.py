@@ -59,6 +59,9 @@ MAX_TRAIN_FRAMES, MAX_HELD_OUT_FRAMES = 3_000, 24_000
 HIDDEN = 32
 FIT = FitSettings(steps=1_000, batch=256, learning_rate=1e-2, weight_decay=3e-2)
 FOLDS = 8
+MIN_FRAMES_TO_DIVIDE = 8
+"""Without held-out frames, every second of so many train frames sets the limits of what counts as
+known; all of fewer, else half of them would count as unfamiliar."""
 MIN_PRESENT_FRAMES = 30  # frames from which a feature has a temperature of its own
 CHUNK = 32  # images read at once
 MIN_STD_SHARE, MAX_STD_SHARE = 0.01, 20.0
@@ -117,12 +120,11 @@ def fit_uncertainty_head(
         None if unseen is None else replace(unseen, x=standardise(unseen.x, centre, scale, count))
     )
     std_layers = fit_std_layers(known_z, known.error, seed, held_out_z)
-    # Without held-out frames, every second train frame sets the limits.
-    textures, limiting = (
-        (known.texture[::2], known.texture[1::2])
-        if unseen is None
-        else (known.texture, unseen.texture)
-    )
+    textures = limiting = known.texture
+    if unseen is not None:
+        limiting = unseen.texture
+    elif len(textures) >= MIN_FRAMES_TO_DIVIDE:
+        textures, limiting = textures[::2], textures[1::2]
     views = pitched_views(train, camera or CameraParameters(), seed)
     rate = FALSE_ALARM_RATE / 2
     pitch_layers = fit_pitch_offset(

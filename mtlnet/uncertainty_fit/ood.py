@@ -39,6 +39,9 @@ RIDGE = 0.02
 MAX_PITCH_RAD, MAX_LOG_ZOOM = 0.26, 0.5
 """15 degrees; and the logarithm of the ratio of the tangents of half the field of view."""
 PITCH_FRAMES, VIEWS_PER_FRAME = 1_500, 2
+CELL_NOISE = 1 / 255
+"""Half a grey level, for images that are all alike: an image that differs from them by so much in
+each cell is not out of distribution."""
 PITCH_UNIT_RAD = 0.1  # unit of the regression target
 MIN_PITCH_LIMIT_RAD = 0.02
 """Lower limit of the pitch that counts as out of distribution, for datasets of a few frames."""
@@ -69,10 +72,13 @@ def fit_texture_distance(
     1.
     """
     mean, spread = known.mean(0), np.maximum(known.std(0), MIN_SPREAD)
-    variance, axes = np.linalg.eigh(np.cov((known - mean) / spread, rowvar=False))
+    covariance = np.cov((known - mean) / spread, rowvar=False, ddof=min(1, len(known) - 1))
+    variance, axes = np.linalg.eigh(covariance)
     directions = (axes / np.sqrt(np.maximum(variance, 0) + RIDGE)).T / spread
     squared = (((held_out - mean) @ directions.T) ** 2).sum(1)
-    limit = max(float(np.quantile(squared, 1 - false_alarm_rate)), 1e-6)
+    limit = max(
+        float(np.quantile(squared, 1 - false_alarm_rate)), CELL_NOISE**2 * (directions**2).sum()
+    )
     return mean, np.asarray(directions / np.sqrt(limit), np.float32)
 
 

@@ -101,7 +101,7 @@ def test_files_that_are_no_images_are_refused(published: Path, tmp_path: Path) -
     narrow.write_bytes(simplejpeg.encode_jpeg(np.zeros((210, 100, 3), np.uint8)))
     for path, seen in [
         (tmp_path / "none.jpg", "there is no image file"),
-        (text, "a.jpg: no JPEG or PNG file, but 19 bytes"),
+        (text, "a.jpg: no image file"),
         (cut, "b.jpg: the JPEG cannot be decoded"),
         (narrow, "c.jpg: the image is 100 x 210 px"),
     ]:

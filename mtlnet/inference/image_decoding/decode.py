@@ -1,11 +1,17 @@
 """From an image file's bytes to the model's input: limits, header, strict decoding, scaling.
 
-Used by `mtlnet predict` and `serve`, which so get the same pixels. The size is read from the header
-before decoding: a PNG of 31 KB can need 1.5 GB. A wider image is cropped to the model's field of
-view (`mtlnet.inference.image_decoding.crop`). EXIF orientation is ignored, alpha is dropped, grey
-becomes RGB, 16 bits become 8.
+Used by `mtlnet predict`, `train`, `evaluate` and `serve`, which so get the same pixels. The size is
+read from the header before decoding: a PNG of 31 KB can need 1.5 GB. The image is turned upright as
+its orientation says (EXIF, of a PNG `eXIf`); every size and crop is of the upright image. A wider
+image is cropped to the model's field of view (`mtlnet.inference.image_decoding.crop`). Alpha is
+dropped, grey becomes RGB, 16 bits become 8.
+
+A service takes JPEG and PNG (`inspect`, `decode`). A file of this machine may be of another kind
+and is under no limits but that of memory (`read_image`, `read_whole_image`).
 """
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,27 +21,37 @@ import simplejpeg
 from numpy.typing import NDArray
 
 from mtlnet.inference.image_decoding import jpeg_structure as jpeg
+from mtlnet.inference.image_decoding import other_kinds
 from mtlnet.inference.image_decoding import png_structure as png
 from mtlnet.inference.image_decoding.crop import crop_box
 from mtlnet.inference.image_decoding.errors import Fault, ImageError
+from mtlnet.inference.image_decoding.orientation import (
+    NONE,
+    exif_orientation,
+    swaps_sides,
+    upright,
+)
 from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
 
-MAX_FILE_BYTES = 32 << 20
+MAX_FILE_BYTES = 1 << 30
+MAX_FILE_PIXELS = 256_000_000  # of a file of this machine: 0.8 GB; the largest sensors have 200
 MIN_SIDE_PX, MAX_SIDE_PX, MAX_PIXELS = 16, 4096, 8_400_000
 MAX_SCANNED_PX = 100_000_000  # pixels times scans of a JPEG: ten scans of the largest image
 LATE_CHECK_BYTES = 1 << 18  # a JPEG file of more is checked when it is decoded, not by `inspect`
 # One 2.6 GHz core: a PNG of 64 bits a pixel 84 ns a pixel, a baseline JPEG 10, of ten scans 15.
 PNG_NS_PER_BIT, PNG_NS_PER_BYTE, JPEG_NS, SCAN_NS, PROGRESSIVE_SCANS = 1.4, 2.0, 10.0, 1.0, 10
+TURN_NS = 6.0  # to turn a pixel upright
 MAX_SEQUENTIAL_SCANS = 4  # one for each component
 MAX_TRAILING_BYTES = 64  # padding of some cameras; more could be another file
 
 
 @dataclass(frozen=True, slots=True)
 class ImageHeader:
-    """Size of an image, px; `png_header` is set for a PNG.
+    """Size of an upright image, px; `png_header` is set for a PNG.
 
-    `scans`: of a JPEG; where it was not `checked`, the usual number of such a JPEG.
+    `scans`: of a JPEG; where it was not `checked`, the usual number of such a JPEG. `orientation`:
+    how it must be turned to stand upright, as in EXIF.
     """
 
     width: int
@@ -43,6 +59,7 @@ class ImageHeader:
     png_header: png.PngHeader | None = None
     scans: int = 1
     checked: bool = True
+    orientation: int = NONE
 
     @property
     def decode_ms(self) -> float:
@@ -52,32 +69,34 @@ class ImageHeader:
             per_pixel_ns += PNG_NS_PER_BYTE * found.file_bytes / (self.width * self.height)
         else:
             per_pixel_ns = JPEG_NS + SCAN_NS * (self.scans - 1)
+        if self.orientation != NONE:
+            per_pixel_ns += TURN_NS
         return self.width * self.height * per_pixel_ns / 1e6
 
 
 def read_image(
     path: Path, view: CameraParameters, fov_y_deg: float | None = None
 ) -> NDArray[np.uint8]:
-    """The JPEG or PNG at `path` as uint8 RGB (view.height, view.width, 3).
+    """The image file at `path` as uint8 RGB (view.height, view.width, 3).
 
     It is scaled, and cropped if wider than the view; `fov_y_deg` as in `inspect`. Raises ImageError
     for an image that cannot be used, UserError for a missing or too large file.
     """
-    body = _read_file(path)
-    try:
-        return decode(body, inspect(body, view, fov_y_deg), view, fov_y_deg)
-    except ImageError as error:
-        raise ImageError(error.fault, f"{path}: {error}") from error
+    with _named(path):
+        return crop_and_resize(_decode_file(_read_file(path)), view, fov_y_deg)
 
 
 def read_whole_image(path: Path) -> NDArray[np.uint8]:
-    """The JPEG or PNG at `path` as uint8 RGB (H, W, 3), of any size within the limits.
+    """The image file at `path` as uint8 RGB (H, W, 3). Raises as `read_image`."""
+    with _named(path):
+        return _decode_file(_read_file(path))
 
-    Raises as `read_image`.
-    """
-    body = _read_file(path)
+
+@contextmanager
+def _named(path: Path) -> Iterator[None]:
+    """Names the file in an ImageError."""
     try:
-        return _decode_whole(body, _read_header(body))
+        yield
     except ImageError as error:
         raise ImageError(error.fault, f"{path}: {error}") from error
 
@@ -91,6 +110,36 @@ def _read_file(path: Path) -> bytes:
             "smaller image"
         )
     return path.read_bytes()
+
+
+def _decode_file(body: bytes) -> NDArray[np.uint8]:
+    """The image in a file of this machine, upright (H, W, 3). Raises ImageError."""
+    if body.startswith(png.SIGNATURE):
+        header = png.read_header(body)
+        _check_file_size(header.width, header.height)
+        image = _decode_png(body, header, limited=False)
+        return upright(image, exif_orientation(png.find_exif(body, limited=False)))
+    if body.startswith(jpeg.SIGNATURE):
+        _check_file_size(*_jpeg_size(body)[:2])
+        return upright(_decode_padded_jpeg(body), jpeg.read_head(body).orientation)
+    kind = other_kinds.find_kind(body)
+    if kind is None:
+        raise ImageError(
+            Fault.NOT_AN_IMAGE,
+            f"no image file ({other_kinds.READ} are read), but {other_kinds.describe(body)}",
+        )
+    width, height, orientation = other_kinds.read_header(body, kind)
+    _check_file_size(width, height)
+    return other_kinds.decode(body, kind, orientation)
+
+
+def _check_file_size(width: int, height: int) -> None:
+    if min(width, height) < MIN_SIDE_PX or width * height > MAX_FILE_PIXELS:
+        raise ImageError(
+            Fault.SIZE,
+            f"the image is {width} x {height} px; {MIN_SIDE_PX} px a side at least and "
+            f"{MAX_FILE_PIXELS / 1e6:.0f} million px at most are read: give it in another size",
+        )
 
 
 def inspect(body: bytes, view: CameraParameters, fov_y_deg: float | None = None) -> ImageHeader:
@@ -109,35 +158,53 @@ def _read_header(body: bytes) -> ImageHeader:
     """The header of an image within the limits. Raises ImageError."""
     if body.startswith(png.SIGNATURE):
         found = png.read_header(body)
-        header = ImageHeader(found.width, found.height, found)
+        orientation = exif_orientation(png.find_exif(body))
+        width, height = _upright_size(found.width, found.height, orientation)
+        header = ImageHeader(width, height, found, orientation=orientation)
     elif body.startswith(jpeg.SIGNATURE):
         header = _inspect_jpeg(body)
     else:
-        seen = f"{len(body)} bytes that begin with {body[:8]!r}" if body else "nothing at all"
-        raise ImageError(Fault.NOT_AN_IMAGE, f"no JPEG or PNG file, but {seen}")
+        raise ImageError(
+            Fault.NOT_AN_IMAGE, f"no JPEG or PNG file, but {other_kinds.describe(body)}"
+        )
     check_size(header.width, header.height)
     return header
+
+
+def _upright_size(width: int, height: int, orientation: int) -> tuple[int, int]:
+    """Width and height of the upright image."""
+    return (height, width) if swaps_sides(orientation) else (width, height)
 
 
 def _inspect_jpeg(body: bytes) -> ImageHeader:
     is_large = len(body) > LATE_CHECK_BYTES
     # First, as it refuses many segments, over which the decoder's reader would take 20 ms.
-    is_progressive = is_large and jpeg.is_progressive(body)
+    head = jpeg.read_head(body) if is_large else None
+    width, height, colours = _jpeg_size(body)
+    if colours not in ("Gray", "YCbCr", "RGB"):
+        raise ImageError(Fault.UNSUPPORTED, f"the JPEG's colours are {colours}; save it in RGB")
+    if head is not None:
+        orientation, checked = head.orientation, False
+        scans = PROGRESSIVE_SCANS if head.is_progressive else 1
+    else:
+        structure = _check_jpeg(body, width, height)
+        orientation, checked, scans = structure.orientation, True, structure.scans
+    width, height = _upright_size(width, height, orientation)
+    return ImageHeader(width, height, None, scans, checked, orientation)
+
+
+def _jpeg_size(body: bytes) -> tuple[int, int, str]:
+    """Width and height as stored, px, and the colours. Raises ImageError."""
     try:
         # The decoder's own header reader, so that sizes cannot differ from the decoded image.
         height, width, colours, _ = simplejpeg.decode_jpeg_header(body)
     except ValueError as error:
         raise _damaged_jpeg(error) from error
-    if colours not in ("Gray", "YCbCr", "RGB"):
-        raise ImageError(Fault.UNSUPPORTED, f"the JPEG's colours are {colours}; save it in RGB")
-    if is_large:
-        scans = PROGRESSIVE_SCANS if is_progressive else 1
-        return ImageHeader(width, height, scans=scans, checked=False)
-    return ImageHeader(width, height, scans=_check_jpeg(body, width, height))
+    return width, height, colours
 
 
-def _check_jpeg(body: bytes, width: int, height: int) -> int:
-    """The number of scans of a JPEG whose structure is sound. Raises ImageError."""
+def _check_jpeg(body: bytes, width: int, height: int) -> jpeg.JpegStructure:
+    """The structure of a JPEG, if it is sound. Raises ImageError."""
     structure = jpeg.read_structure(body)
     check_trailing(len(body) - structure.length)
     if structure.scans * width * height > MAX_SCANNED_PX:
@@ -146,12 +213,12 @@ def _check_jpeg(body: bytes, width: int, height: int) -> int:
             f"the JPEG has {structure.scans} scans of {width} x {height} px, at most "
             f"{MAX_SCANNED_PX / 1e6:g} million px in all are decoded; save it as baseline JPEG",
         )
-    return structure.scans
+    return structure
 
 
 def _check_late(body: bytes, header: ImageHeader) -> None:
     """Check what `inspect` left. Raises ImageError, also where the estimate was too low."""
-    scans = _check_jpeg(body, header.width, header.height)
+    scans = _check_jpeg(body, header.width, header.height).scans
     if header.scans == 1 and scans > MAX_SEQUENTIAL_SCANS:
         raise ImageError(
             Fault.UNSUPPORTED,
@@ -198,6 +265,7 @@ def _decode_whole(body: bytes, header: ImageHeader) -> NDArray[np.uint8]:
         if not header.checked:
             _check_late(body, header)
         image = _decode_jpeg(body)
+    image = upright(image, header.orientation)
     if image.shape != (header.height, header.width, 3):
         raise ImageError(
             Fault.DAMAGED,
@@ -229,9 +297,22 @@ def _decode_jpeg(body: bytes) -> NDArray[np.uint8]:
     return image
 
 
-def _decode_png(body: bytes, header: png.PngHeader) -> NDArray[np.uint8]:
-    checked, end = png.critical_chunks(body, header)
-    check_trailing(len(body) - end)
+def _decode_padded_jpeg(body: bytes) -> NDArray[np.uint8]:
+    """As `_decode_jpeg`, also where a webcam's driver put zeros before the end marker."""
+    try:
+        return _decode_jpeg(body)
+    except ImageError:
+        image = body.rstrip(b"\0").removesuffix(jpeg.END)
+        if not image.endswith(b"\0"):
+            raise
+        return _decode_jpeg(image.rstrip(b"\0") + jpeg.END)
+
+
+def _decode_png(body: bytes, header: png.PngHeader, *, limited: bool = True) -> NDArray[np.uint8]:
+    """`limited`: refuse very many chunks, and bytes behind the image. Raises ImageError."""
+    checked, end = png.critical_chunks(body, header, limited=limited)
+    if limited:
+        check_trailing(len(body) - end)
     image = cv2.imdecode(np.frombuffer(checked, np.uint8), cv2.IMREAD_COLOR)
     if image is None:
         raise ImageError(Fault.DAMAGED, "the PNG cannot be decoded; save it anew")
@@ -239,4 +320,6 @@ def _decode_png(body: bytes, header: png.PngHeader) -> NDArray[np.uint8]:
 
 
 def _damaged_jpeg(error: ValueError) -> ImageError:
-    return ImageError(Fault.DAMAGED, f"the JPEG cannot be decoded ({error}); give the whole file")
+    return ImageError(
+        Fault.DAMAGED, f"the JPEG cannot be decoded ({error}); give the whole file, or save it anew"
+    )

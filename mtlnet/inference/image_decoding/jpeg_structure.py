@@ -1,7 +1,7 @@
-"""The structure of a JPEG, checked before decoding: its end and its number of scans.
+"""The structure of a JPEG, read before decoding: its end, number of scans and orientation.
 
-Source: ITU-T T.81, annex B. The decoder stops at the end marker and ignores what follows; here the
-end is found, so that a file appended to the image is detected.
+Sources: ITU-T T.81, annex B; CIPA DC-008 (Exif 3.0). The decoder stops at the end marker and
+ignores what follows; here the end is found, so that a file appended to the image is detected.
 """
 
 import re
@@ -10,10 +10,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from mtlnet.inference.image_decoding.errors import Fault, ImageError
+from mtlnet.inference.image_decoding.orientation import EXIF_MARK, NONE, exif_orientation
 
 START = b"\xff\xd8"
 SIGNATURE = b"\xff\xd8\xff"
-SOS, EOI = 0xDA, 0xD9
+END = b"\xff\xd9"
+SOS, EOI, APP1 = 0xDA, 0xD9, 0xE1
 FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # SOF0 to SOF15
 PROGRESSIVE_FRAMES = frozenset((0xC2, 0xC6, 0xCA, 0xCE))
 # In entropy-coded data FF 00 is a byte FF, FF D0 to D7 a restart marker, FF FF a fill byte.
@@ -29,23 +31,35 @@ END_OF_DATA = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")  # as `ENDS_DATA`
 
 @dataclass(frozen=True, slots=True)
 class JpegStructure:
-    """Length of a JPEG with its end marker, bytes, and the number of its scans."""
+    """Length of a JPEG with its end marker, bytes, the number of its scans and its orientation."""
 
     length: int
     scans: int
+    orientation: int = NONE
 
 
-def is_progressive(body: bytes) -> bool:
-    """Whether the frame header, before the first scan, is of a progressive JPEG.
+@dataclass(frozen=True, slots=True)
+class JpegHead:
+    """What stands before the first scan: whether it is progressive, and the orientation, 1 to 8."""
 
-    Raises ImageError. Takes 3 ms at worst.
-    """
-    at = len(START)
+    is_progressive: bool
+    orientation: int
+
+
+def read_head(body: bytes) -> JpegHead:
+    """What stands before the first scan. Raises ImageError. Takes 3 ms at worst."""
+    at, frame, exif = len(START), 0, None
     for _ in range(MAX_SEGMENTS):
         at, marker = _marker(body, at)
-        if marker in FRAMES or marker in (SOS, EOI):
-            return marker in PROGRESSIVE_FRAMES
-        at += _length(body, at)
+        if marker in (SOS, EOI):
+            orientation = NONE if exif is None else exif_orientation(exif)
+            return JpegHead(frame in PROGRESSIVE_FRAMES, orientation)
+        length = _length(body, at)
+        if marker in FRAMES:
+            frame = frame or marker
+        elif marker == APP1 and exif is None:
+            exif = _exif(body, at, length)
+        at += length
     raise _too_many_parts()
 
 
@@ -54,12 +68,15 @@ def read_structure(body: bytes) -> JpegStructure:
 
     Takes 3 ms a MiB at worst; up to WINDOW_BYTES of that in one step.
     """
-    at, scans = len(START), 0
+    at, scans, exif = len(START), 0, None
     for _ in range(MAX_SEGMENTS):
         at, marker = _marker(body, at)
         if marker == EOI:
-            return JpegStructure(at, scans)
-        at += _length(body, at)
+            return JpegStructure(at, scans, NONE if exif is None else exif_orientation(exif))
+        length = _length(body, at)
+        if marker == APP1 and exif is None and not scans:
+            exif = _exif(body, at, length)
+        at += length
         if marker != SOS:
             continue
         scans += 1
@@ -110,6 +127,12 @@ def _length(body: bytes, at: int) -> int:
     if at + 2 > len(body) or length < 2 or at + length > len(body):
         raise _ends_early(body)
     return length
+
+
+def _exif(body: bytes, at: int, length: int) -> bytes | None:
+    """The Exif block in an APP1 segment, whose length lies at offset `at`; None: of other use."""
+    is_exif = body.startswith(EXIF_MARK[:-1], at + 2)  # the byte behind the mark is padding
+    return body[at + 2 + len(EXIF_MARK) : at + length] if is_exif else None
 
 
 def _too_many_parts() -> ImageError:

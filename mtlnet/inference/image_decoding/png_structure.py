@@ -2,7 +2,7 @@
 
 Source: PNG specification, third edition (W3C). Decoders differ in the damage they accept and in
 their use of ancillary chunks (orientation, animation, colour profiles). `critical_chunks` checks
-the former and removes the latter.
+the former and removes the latter; the orientation is read by `find_exif`.
 """
 
 import struct
@@ -74,16 +74,37 @@ def read_header(body: bytes) -> PngHeader:
     return PngHeader(width, height, colour, pixel_bits, bool(interlace), len(body))
 
 
-def critical_chunks(body: bytes, header: PngHeader) -> tuple[bytes, int]:
+def find_exif(body: bytes, *, limited: bool = True) -> bytes:
+    """The content of the first `eXIf` chunk, empty without one; its checksum is not verified.
+
+    `limited`: only among so many chunks as `critical_chunks` allows.
+    """
+    at = len(SIGNATURE)
+    for _ in range(_most_chunks(body, limited)):
+        kind = body[at + 4 : at + 8]
+        end = at + 12 + int.from_bytes(body[at : at + 4], "big")
+        if kind == b"eXIf":
+            return body[at + 8 : end - 4]
+        if kind == b"IEND" or end > len(body):
+            break
+        at = end
+    return b""
+
+
+def _most_chunks(body: bytes, limited: bool) -> int:
+    return FREE_CHUNKS + len(body) // (BYTES_A_CHUNK if limited else 1)
+
+
+def critical_chunks(body: bytes, header: PngHeader, *, limited: bool = True) -> tuple[bytes, int]:
     """(The PNG with only header, palette and pixel chunks, all checked; its end in `body`).
 
-    Raises ImageError.
+    `limited`: refuse a PNG of very many chunks. Raises ImageError.
     """
     kept: list[bytes | memoryview] = [SIGNATURE]
     pixels: list[memoryview] = []
     view = memoryview(body)
     at = len(SIGNATURE)
-    most = FREE_CHUNKS + len(body) // BYTES_A_CHUNK
+    most = _most_chunks(body, limited)
     for _ in range(most):
         end, kind = _check_chunk(view, at)
         if kind in (b"IHDR", b"PLTE", b"IDAT", b"IEND"):

@@ -1,5 +1,6 @@
 """A user's own images: valid `labels.csv` files, and error messages that name the faulty line."""
 
+import os
 from pathlib import Path
 
 import cv2
@@ -13,6 +14,7 @@ from mtlnet.data.custom_images import (
     open_custom_images,
     read_labels,
 )
+from mtlnet.inference.rectification import Rectification
 from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
 
@@ -103,3 +105,37 @@ def test_images_of_any_size_with_the_cameras_aspect_ratio(tmp_path: Path) -> Non
     before = found.content_hash
     picture(tmp_path / "a.png", 280, 210, 91)
     assert open_custom_images(tmp_path, CameraParameters()).content_hash != before
+
+
+def test_a_table_of_a_windows_program_and_names_that_are_not_utf8_are_read(tmp_path: Path) -> None:
+    """A byte order mark, CRLF, quotes; and a name in the bytes of the file system."""
+    picture(tmp_path / "a.png", 280, 210)
+    (tmp_path / "a.png").rename(tmp_path / os.fsdecode(b"caf\xe9, 1.png"))
+    row = GOOD.encode().replace(b"a.png", b'"caf\xe9, 1.png"')
+    (tmp_path / "labels.csv").write_bytes(b"\xef\xbb\xbf" + HEAD.encode() + b"\r\n" + row + b"\r\n")
+    assert len(open_custom_images(tmp_path, CameraParameters())) == 1
+    with pytest.raises(UserError, match=r"columns file;ml;mr;.* with commas between them"):
+        read_labels(write(tmp_path, GOOD, head=HEAD.replace(",", ";")))
+
+
+@pytest.mark.parametrize("rectified", [False, True])
+def test_labelled_images_are_turned_upright(rectified: bool, tmp_path: Path) -> None:
+    """A PNG that is stored upside down, and a lossless WebP stored on its side."""
+    image = np.arange(280 * 210 * 3, dtype=np.uint32).reshape(210, 280, 3).astype(np.uint8)
+    stored = {3: (".png", image[::-1, ::-1]), 6: (".webp", np.rot90(image))}
+    for orientation, (suffix, pixels) in stored.items():
+        exif = b"II*\0\x08\0\0\0\1\0\x12\1\3\0\1\0\0\0" + bytes((orientation, 0, 0, 0)) + bytes(4)
+        done, body = cv2.imencodeWithMetadata(
+            suffix,
+            np.ascontiguousarray(pixels[:, :, ::-1]),
+            [cv2.IMAGE_METADATA_EXIF],
+            [np.frombuffer(exif, np.uint8)],
+            [cv2.IMWRITE_WEBP_QUALITY, 101] if suffix == ".webp" else [],
+        )
+        assert done
+        (tmp_path / f"{orientation}{suffix}").write_bytes(body.tobytes())
+    write(tmp_path, GOOD.replace("a.png", "3.png"), GOOD.replace("a.png", "6.webp"))
+    camera = CameraParameters()
+    lens = Rectification(camera, camera) if rectified else None
+    found = open_custom_images(tmp_path, camera, lens).images
+    assert np.array_equal(found, np.stack([image, image]))

@@ -18,6 +18,7 @@ from mtlnet.data.sources import (
 from mtlnet.evaluation.evaluate import evaluate
 from mtlnet.inference.engine import load_engine
 from mtlnet.inference.model_card import WEIGHTS, read_card
+from mtlnet.inference.prediction import decode_outputs, split_outputs
 from mtlnet.model.architecture import GRID
 from mtlnet.model.network import Network, initialise, load_network, predict_images
 from mtlnet.model.pretrained import load_pretrained
@@ -139,6 +140,10 @@ def test_wrong_options_are_refused(
         TrainConfig(dataset, tmp_path / "b", init=str(published), recipe="fast")
     with pytest.raises(UserError, match="recipe continue starts from a finished model"):
         TrainConfig(dataset, tmp_path / "b", recipe="continue")
+    with pytest.raises(UserError, match="--batch is 1; batch normalisation needs at least 2"):
+        TrainConfig(dataset, tmp_path / "b", batch=1)
+    with pytest.raises(UserError, match="--batch is -1; give at least 1"):
+        TrainConfig(dataset, tmp_path / "b", init=str(published), recipe="tune", batch=-1)
     grown = {"data": dataset, "init": str(published), "recipe": "continue", "network": "grid"}
     with pytest.raises(UserError, match="from which a grid cannot start"):
         start_training(grown, tmp_path / "c", resume=False)
@@ -177,3 +182,27 @@ def test_numbers_too_small_for_the_processor_are_zero_in_training_alone() -> Non
     with subnormals_as_zero():
         assert product() == 0
     assert product() > 0
+
+
+@pytest.mark.parametrize(("count", "alike"), [(1, False), (2, False), (3, True)])
+def test_a_single_image_is_enough(
+    count: int, alike: bool, published: Path, custom_images: Path, tmp_path: Path
+) -> None:
+    """Also two, and three copies of one; in batches of one, which `tune` allows."""
+    table = custom_images / "labels.csv"
+    table.write_text("\n".join(table.read_text().splitlines()[: count + 1]) + "\n")
+    for number in range(1, count if alike else 1):
+        (custom_images / f"{number}.png").write_bytes((custom_images / "0.png").read_bytes())
+    options = {"data": custom_images, "init": str(published), "iterations": 1, "batch": 1}
+    start_training({**options, "device": "cpu", "threads": 1}, tmp_path / "run", resume=False)
+    engine = load_engine(tmp_path / "run")
+    found = evaluate([engine], custom_images, "all")
+    assert (found["frames"], found["errors"]["ml"]["frames"]) == (count, count)
+    [image] = custom_training_data(custom_images, read_card(published)).frames.read_batch(
+        np.array([0]), np.empty((1, 210, 280, 3), np.uint8)
+    )
+    answer = decode_outputs(engine(image))
+    assert answer.std is not None
+    assert all(value is None or 0 < value < 10 for value in answer.std.values())
+    scores = [split_outputs(engine(each)).ood_score for each in (image, 255 - image)]
+    assert float(scores[0]) < 1.01 < float(scores[1])  # type: ignore[arg-type]
