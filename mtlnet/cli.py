@@ -125,7 +125,7 @@ def export_command(
     if as_json:
         typer.echo(json.dumps(result))
     else:
-        Console().print(export_lines(result))
+        Console(markup=False).print(export_lines(result))
 
 
 @app.command("ship")
