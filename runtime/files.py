@@ -1,8 +1,14 @@
-"""Atomic writes, by which the old file stays until the new one is complete; and locks."""
+"""Atomic writes, by which the old file stays until the new one is complete; locks; and an order of
+names.
+
+A name can hold any bytes. Those that are not UTF-8 are kept as Python keeps them (`os.fsdecode`),
+and a text file gets them as an escape: `caf\\xe9.jpg` of Latin-1 stands as `caf\\udce9.jpg`.
+"""
 
 import fcntl
 import json
 import os
+import re
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -11,6 +17,18 @@ from pathlib import Path
 from trackfeatures.errors import UserError
 
 STAGED = ".staged"  # where `replaced_files` keeps new files
+
+
+def natural_key(name: str) -> tuple[list[str | tuple[int, str]], str]:
+    """Sorts names as people count: `frame2` before `frame10`, `b1` after `A1`.
+
+    A run of ASCII digits counts as a number; other digits, signs and points are text.
+    """
+    parts: list[str | tuple[int, str]] = list(re.split("([0-9]+)", name.casefold()))
+    for place in range(1, len(parts), 2):  # every second part is a number, of any length
+        digits = str(parts[place]).lstrip("0")
+        parts[place] = (len(digits), digits)
+    return parts, name
 
 
 def check_folder(path: Path) -> None:
@@ -29,7 +47,7 @@ def atomic_write(path: Path, content: str | bytes, *, fsync: bool = False) -> No
     the file's name.
     """
     check_folder(path)
-    data = content.encode() if isinstance(content, str) else content
+    data = content.encode(errors="backslashreplace") if isinstance(content, str) else content
     if path.exists() and not path.is_file():
         # A pipe or /dev/stdout must not be replaced.
         path.write_bytes(data)

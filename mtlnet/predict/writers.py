@@ -1,10 +1,12 @@
 """Files that `mtlnet predict --out` writes: tables (.csv, .jsonl), a film (.mp4) or pictures.
 
-Each row and frame is written when it is known: an interrupted command keeps what was done.
+Each row and frame is written when it is known: an interrupted command keeps what was done. A name
+that is not UTF-8 stands in tables as `runtime.files` describes.
 """
 
 import csv
 import json
+import os
 from pathlib import Path
 from typing import Any, Protocol, Self
 
@@ -24,6 +26,8 @@ TABLE_SUFFIXES = (".csv", ".jsonl")
 TEXT_HEIGHT = 64
 """Rows of pixels below a picture that hold the features as text."""
 TEXT_COLOUR = (235, 235, 235)
+MAX_STEM_BYTES = 200
+"""Of a picture's name, from its image: a name has 255 bytes at most."""
 
 
 class Writer(Protocol):
@@ -79,7 +83,7 @@ class TableWriter:
 
     def __init__(self, path: Path) -> None:
         self._as_csv = path.suffix.lower() == ".csv"
-        self._file = path.open("w", encoding="utf-8", newline="")
+        self._file = path.open("w", encoding="utf-8", errors="backslashreplace", newline="")
         self._csv: csv.DictWriter[str] | None = None
 
     def write(self, item: SourceImage, prediction: Prediction) -> None:
@@ -125,11 +129,14 @@ class PictureWriter:
 
     def write(self, item: SourceImage, prediction: Prediction) -> None:
         picture = draw_prediction(item, prediction, self._camera)
-        file, _, frame = item.name.partition("#")
-        name = "-".join((f"{self._count:04d}", Path(file).stem, *([frame] if frame else [])))
-        path = self._folder / f"{name}.png"
-        if not cv2.imwrite(str(path), cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)):
-            raise UserError(f"{path} cannot be written; check the disk")
+        stem = os.fsdecode(os.fsencode(item.file.stem)[:MAX_STEM_BYTES])
+        frame = [] if item.frame is None else [str(item.frame)]
+        name = "-".join((f"{self._count:04d}", stem, *frame))
+        done, data = cv2.imencode(".png", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
+        if not done:
+            raise UserError(f"{name}.png: a picture of {picture.shape} cannot be written as PNG")
+        # Not with OpenCV, which takes UTF-8 names only, and does not say why it fails.
+        (self._folder / f"{name}.png").write_bytes(data.tobytes())
         self._count += 1
 
     def __enter__(self) -> Self:
