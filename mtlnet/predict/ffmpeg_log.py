@@ -6,6 +6,7 @@ where they are told is the log of FFmpeg, which else goes to stderr.
 
 import atexit
 import ctypes
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -15,7 +16,9 @@ from pathlib import Path
 AV_LOG_ERROR = 16
 LINE_BYTES = 512
 # They are about data beside the picture, which dash cameras write as they like.
-HARMLESS = ("SEI", "APP fields", "timescale not set", "DTS", "Packet corrupt")
+HARMLESS = ("SEI", "APP fields", "timescale not set")
+PREFIX = re.compile(r"^(?:\[(\S+) @ [^]]+\] )+")  # e.g. "[h264 @ 0x55d0] "
+CONVERTER = "swscaler"
 LogCallback = ctypes.CFUNCTYPE(
     None, ctypes.c_void_p, ctypes.c_int, ctypes.c_char_p, ctypes.c_void_p
 )
@@ -23,18 +26,25 @@ LogCallback = ctypes.CFUNCTYPE(
 
 @dataclass
 class DecodingErrors:
-    """The number of errors so far, and the text of the first."""
+    """The number of errors so far, and the text of the first. `unconverted`: that of an error in
+    the conversion to RGB, after which OpenCV gives a black picture."""
 
     count: int = 0
     first: str = ""
+    unconverted: str = ""
 
     def forget(self) -> None:
         """Forget the errors so far."""
-        self.count, self.first = 0, ""
+        self.count, self.first, self.unconverted = 0, "", ""
 
-    def add(self, text: str) -> None:
+    def add(self, line: str) -> None:
+        """Count a line of the log, e.g. "[h264 @ 0x55d0] Reference 2 >= 2"."""
+        found = PREFIX.match(line)
+        text = " ".join(line[found.end() if found else 0 :].split())
         if any(part in text for part in HARMLESS):
             return
+        if found and found[1] == CONVERTER:
+            self.unconverted = text
         self.first = self.first or text
         self.count += 1
 
@@ -56,9 +66,9 @@ def decoding_errors() -> Iterator[DecodingErrors]:
             line = ctypes.create_string_buffer(LINE_BYTES)
             library.av_log_format_line(
                 ctypes.c_void_p(context), level, text, ctypes.c_void_p(arguments), line, LINE_BYTES,
-                ctypes.byref(ctypes.c_int(0)),
+                ctypes.byref(ctypes.c_int(1)),
             )  # fmt: skip
-            found.add(line.value.decode(errors="replace").strip())
+            found.add(line.value.decode(errors="replace"))
 
     callback = LogCallback(add)  # must outlive its use
     library.av_log_set_callback(callback)

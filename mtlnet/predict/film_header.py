@@ -57,14 +57,18 @@ def unsupported_picture(path: Path) -> str:
     return ""
 
 
-def stated_frames(path: Path) -> int:
-    """The number of frames in the index of an AVI, without the empty ones; 0 where none is told.
+def stated_frames(path: Path, counted: int) -> int:
+    """The number of frames in the index of an AVI, without the empty ones, and `counted` of a Y4M,
+    whose size gives it; 0 where none is told.
 
-    In other containers the decoder reports what is missing.
+    In other containers the number is an estimate, and the decoder reports what is missing.
     """
     size = path.stat().st_size
     with path.open("rb") as file:
-        if file.read(4) != b"RIFF":
+        head = file.read(9)
+        if head == b"YUV4MPEG2":
+            return counted
+        if head[:4] != b"RIFF":
             return 0
         riffs = list(_chunks(file, 0, size))
         if len(riffs) != 1:

@@ -82,6 +82,8 @@ class Film:
             if not found:
                 lost += 1
                 continue
+            if errors.unconverted:
+                raise UserError(f"{self.path}: frame {number}: {_unconverted(errors)}")
             number += lost
             lost = 0
             picture = cv2.cvtColor(frame, cv2.COLOR_BGR2RGB).astype(np.uint8, copy=False)
@@ -101,13 +103,13 @@ class Film:
             return (
                 f"{self.path} ends after {share} frames; those were used (it breaks off: {reason})"
             )
-        lost = max(lost, stated_frames(self.path) - used)
+        lost = max(lost, stated_frames(self.path, int(film.get(cv2.CAP_PROP_FRAME_COUNT))) - used)
         if damaged_at < 0 and not lost:
             return ""
         told = f" ({errors.first})" if errors.first else ""
         near = f" near frame {damaged_at}" if damaged_at >= 0 else ""
-        missing = f"; {lost} frames are lost" if lost else "; pictures after it may be wrong"
-        return f"{self.path} is damaged{near}{told}: {used} frames were used{missing}"
+        missing = f"{lost} could not be" if lost else "those after it may be wrong"
+        return f"{self.path} is damaged{near}{told}: {used} frames were used, {missing}"
 
 
 def _open(path: Path, errors: DecodingErrors) -> cv2.VideoCapture:
@@ -115,7 +117,7 @@ def _open(path: Path, errors: DecodingErrors) -> cv2.VideoCapture:
 
     A name that is not UTF-8 ends its process, one with a colon is a protocol to FFmpeg.
     """
-    with _opened(path) as name:
+    with _opened(path) as name, _silent_opencv():
         film = cv2.VideoCapture(name, cv2.CAP_FFMPEG)
     if not film.isOpened():
         told = f" ({errors.first})" if errors.first else ""
@@ -129,6 +131,17 @@ def _open(path: Path, errors: DecodingErrors) -> cv2.VideoCapture:
         film.release()
         raise UserError(f"{path}: {reason}; {CONVERT}, which makes pictures as they are shown")
     return film
+
+
+@contextmanager
+def _silent_opencv() -> Iterator[None]:
+    """OpenCV warns on stderr of a film that it cannot open; the error says more."""
+    level = cv2.utils.logging.getLogLevel()
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)
+    try:
+        yield
+    finally:
+        cv2.utils.logging.setLogLevel(level)
 
 
 @contextmanager
@@ -161,6 +174,15 @@ def _stretched(picture: Image, stretch: tuple[float, float]) -> Image:
     height, width = picture.shape[:2]
     size = (round(width * stretch[0]), round(height * stretch[1]))
     return cv2.resize(picture, size, interpolation=cv2.INTER_LINEAR).astype(np.uint8, copy=False)
+
+
+def _unconverted(errors: DecodingErrors) -> str:
+    if "interlaced" in errors.unconverted:
+        return (
+            "its pictures are interlaced, which this build of OpenCV does not convert; make whole "
+            "ones, e.g. with `ffmpeg -i FILM -vf yadif -c:v libx264 new.mp4`"
+        )
+    return f"its colours cannot be converted ({errors.unconverted}); {CONVERT}"
 
 
 def _no_frame(film: cv2.VideoCapture, errors: DecodingErrors) -> str:

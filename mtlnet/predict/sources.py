@@ -20,7 +20,7 @@ from mtlnet.inference.image_decoding.decode import (
 )
 from mtlnet.inference.rectification import Rectification
 from mtlnet.predict.films import Film, read_film_header
-from mtlnet.predict.kinds import FILMS, IMAGES, ROUND, Kind, kind_of
+from mtlnet.predict.kinds import Kind, kind_of
 from runtime.files import natural_key
 from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
@@ -137,9 +137,7 @@ def _known(files: list[Path], given: str, note: Note) -> list[Source]:
         note(f"{given}: left out, neither image nor film nor round: {_named(others)}")
     if sources:
         return sources
-    kinds_read = ", ".join((*IMAGES, *FILMS, ROUND))
-    return [Source(Path(given), problem=f"there is no image in {given}, nor a film or round "
-                   f"({kinds_read})")]  # fmt: skip
+    return [Source(Path(given), problem=f"there is no image in {given}, nor a film or round")]
 
 
 def _is_unremarkable(path: Path) -> bool:
