@@ -7,6 +7,7 @@ that is not UTF-8 stands in tables as `runtime.files` describes.
 import csv
 import json
 import os
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Protocol, Self
 
@@ -82,26 +83,35 @@ class TableWriter:
     """Rows of `table_row` as CSV with a header, or as one JSON object a line."""
 
     def __init__(self, path: Path) -> None:
+        self._path = path
         self._as_csv = path.suffix.lower() == ".csv"
         self._file = path.open("w", encoding="utf-8", errors="backslashreplace", newline="")
         self._csv: csv.DictWriter[str] | None = None
 
     def write(self, item: SourceImage, prediction: Prediction) -> None:
         row = table_row(item.name, prediction)
+        try:
+            self._write_row(row)
+            self._file.flush()
+        except OSError as error:
+            error.filename = str(self._path)  # a failed write lacks it
+            raise
+
+    def _write_row(self, row: dict[str, Any]) -> None:
         if not self._as_csv:
             self._file.write(json.dumps(row) + "\n")
-        else:
-            if self._csv is None:
-                self._csv = csv.DictWriter(self._file, list(row))
-                self._csv.writeheader()
-            self._csv.writerow(row)
-        self._file.flush()
+            return
+        if self._csv is None:
+            self._csv = csv.DictWriter(self._file, list(row))
+            self._csv.writeheader()
+        self._csv.writerow(row)
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._file.close()
+        with suppress(OSError):  # told by `write`: what a full disk did not take is still there
+            self._file.close()
 
 
 class FilmWriter:

@@ -111,16 +111,15 @@ def test_a_flipped_byte_of_a_chunk_costs_its_frames_only(path: Path, place: str)
     path.unlink()
     path.write_bytes(data)
     index = open_round(path)
-    bad = []
-    for i, expected in enumerate(good):
-        try:
-            assert index.messages[topics.CAMERA].payload(i) == expected
-        except ValueError as error:
-            assert str(error) == f"the chunk at byte {first.start} is damaged (its CRC)"
-            bad.append(i)
-    places = index.messages[topics.CAMERA]._table[1]  # type: ignore[attr-defined]
-    assert bad == np.flatnonzero((places > first.start) & (places < second.start)).tolist()
+    camera = index.messages[topics.CAMERA]
+    places = camera._table[1]  # type: ignore[attr-defined]
+    bad = np.flatnonzero((places > first.start) & (places < second.start)).tolist()
     assert 10 < len(bad) < 90
+    for i in bad:
+        with pytest.raises(ValueError, match=rf"the chunk at byte {first.start} is damaged"):
+            camera.payload(i)
+    for i in set(range(90)) - set(bad):
+        assert camera.payload(i) == good[i]
     with pytest.raises(DatasetError, match=r"a label is damaged \(the chunk at byte"):
         read_labels(index, 0)
     kept = np.setdiff1d(np.arange(90), [*bad, bad[-1] + 1])
