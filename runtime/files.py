@@ -10,6 +10,7 @@ import json
 import os
 import re
 import shutil
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -29,6 +30,28 @@ def natural_key(name: str) -> tuple[list[str | tuple[int, str]], str]:
         digits = str(parts[place]).lstrip("0")
         parts[place] = (len(digits), digits)
     return parts, name
+
+
+@contextmanager
+def utf8_path(path: Path) -> Iterator[Path]:
+    """`path` for a library that takes UTF-8 names only; else a link to it that has one.
+
+    The path is absolute: to FFmpeg a name like `a:b` has a protocol. Beside the link stands what is
+    beside the file, where the name of the file itself is UTF-8.
+    """
+    whole = Path.cwd() / path
+    if str(whole).isprintable():
+        yield whole
+        return
+    with tempfile.TemporaryDirectory(prefix="driverview-") as folder:
+        link = Path(folder) / "link"
+        if whole.name.isprintable():
+            link.symlink_to(whole.parent)
+            yield link / whole.name
+        else:
+            link = link.with_suffix(whole.suffix)
+            link.symlink_to(whole)
+            yield link
 
 
 def check_folder(path: Path) -> None:

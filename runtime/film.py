@@ -1,8 +1,6 @@
 """Films: pictures written one after the other as MPEG-4 (.mp4)."""
 
-import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO, Self
 
@@ -10,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from runtime.files import utf8_path
 from trackfeatures.errors import UserError
 
 FILM_SUFFIX = ".mp4"
@@ -32,8 +31,8 @@ class Film:
         if self._film is None:
             code = cv2.VideoWriter.fourcc(*"mp4v")
             size = (picture.shape[1], picture.shape[0])
-            with _plain_name(self._path) as name:
-                self._film = cv2.VideoWriter(name, cv2.CAP_FFMPEG, code, self._fps, size)
+            with utf8_path(self._path) as path:
+                self._film = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, code, self._fps, size)
             if not self._film.isOpened():
                 raise UserError(f"{self._path} cannot be written as a film; check folder and disk")
         self._film.write(cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
@@ -51,19 +50,6 @@ class Film:
                 f"{self._path} could not be written to its end; free some space and run the same "
                 "command again"
             )
-
-
-@contextmanager
-def _plain_name(path: Path) -> Iterator[str]:
-    """A name of `path` that OpenCV takes: absolute, for `a:b` is a protocol, and UTF-8."""
-    name = str(Path.cwd() / path)
-    if name.isprintable():
-        yield name
-        return
-    with tempfile.TemporaryDirectory(prefix="driverview-") as folder:
-        link = Path(folder) / f"film{path.suffix}"
-        link.symlink_to(name)
-        yield str(link)
 
 
 def _is_complete(path: Path) -> bool:

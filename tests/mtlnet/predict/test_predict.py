@@ -201,7 +201,8 @@ def test_one_input_that_cannot_be_read_costs_no_other(
     good = write_jpeg(tmp_path / "good.jpg", 90)
     given = [*(str(tmp_path / name) for name in bad), str(good)]
     given.append(str(sorted((tmp_path / "other" / "rounds").glob("*.mcap"))[0]))
-    table, notes = tmp_path / "rows.csv", []
+    table = tmp_path / "rows.csv"
+    notes: list[str] = []
     with pytest.raises(UserError, match=r"cut\.mcap is damaged .* \(and 7 more\); 1 others were"):
         predict_files(engine, given, [table], note=notes.append)
     with table.open(newline="") as file:
