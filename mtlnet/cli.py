@@ -125,7 +125,7 @@ def export_command(
     if as_json:
         typer.echo(json.dumps(result))
     else:
-        Console().print(export_lines(result))
+        Console(markup=False).print(export_lines(result))
 
 
 @app.command("ship")
@@ -231,7 +231,12 @@ def predict_command(
         def report(done: int, total: int) -> None:
             bar.update(task, completed=done, total=total)
 
-        predictions = predict_files(loaded, images, out or (), lens, report)
+        def note(line: str) -> None:
+            bar.console.print(
+                command.printable(line), markup=False, highlight=False, soft_wrap=True
+            )
+
+        predictions = predict_files(loaded, images, out or (), lens, report, note)
     if as_json:
         typer.echo(json.dumps(predictions))
     else:

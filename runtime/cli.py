@@ -1,9 +1,11 @@
 """What all commands share: exit codes, the error line, the option `--json`.
 
-Results go to stdout; errors, progress and logs go to stderr.
+Results go to stdout; errors, progress and logs go to stderr. Any name of a file can be printed on
+any terminal: what it cannot show is written as an escape, e.g. `caf\\udce9.jpg`.
 """
 
 import errno
+import io
 import json
 import os
 import sys
@@ -25,6 +27,9 @@ AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON o
 
 def main(app: Callable[[], object]) -> None:
     """Run `app`. A UserError or OSError becomes one line `error: ...` on stderr and exit code 1."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # not one that a test or a notebook has put there
+            stream.reconfigure(errors="backslashreplace")
     try:
         app()
     except UserError as error:
@@ -42,7 +47,7 @@ def main(app: Callable[[], object]) -> None:
 
 def fail(message: str) -> None:
     """Write the error line and exit."""
-    sys.stderr.write(f"error: {message}\n")
+    sys.stderr.write(f"error: {printable(message)}\n")
     sys.exit(FAILED)
 
 
@@ -58,6 +63,16 @@ def progress_bar() -> "Progress":
 
     columns = (*Progress.get_default_columns(), MofNCompleteColumn())
     return Progress(*columns, console=Console(stderr=True), transient=True)
+
+
+def printable(text: str) -> str:
+    """`text` on one line and without control characters, which a file's name may hold."""
+    return text if text.isprintable() else "".join(map(_printable, text))
+
+
+def _printable(character: str) -> str:
+    control = ord(character) < 32 or 127 <= ord(character) < 160
+    return character.encode("unicode_escape").decode() if control else character
 
 
 def counted(count: int, noun: str) -> str:

@@ -1,9 +1,16 @@
-"""Atomic writes, by which the old file stays until the new one is complete; and locks."""
+"""Atomic writes, by which the old file stays until the new one is complete; locks; and an order of
+names.
+
+A name can hold any bytes. Those that are not UTF-8 are kept as Python keeps them (`os.fsdecode`),
+and a text file gets them as an escape: `caf\\xe9.jpg` of Latin-1 stands as `caf\\udce9.jpg`.
+"""
 
 import fcntl
 import json
 import os
+import re
 import shutil
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,6 +18,40 @@ from pathlib import Path
 from trackfeatures.errors import UserError
 
 STAGED = ".staged"  # where `replaced_files` keeps new files
+
+
+def natural_key(name: str) -> tuple[list[str | tuple[int, str]], str]:
+    """Sorts names as people count: `frame2` before `frame10`, `b1` after `A1`.
+
+    A run of ASCII digits counts as a number; other digits, signs and points are text.
+    """
+    parts: list[str | tuple[int, str]] = list(re.split("([0-9]+)", name.casefold()))
+    for place in range(1, len(parts), 2):  # every second part is a number, of any length
+        digits = str(parts[place]).lstrip("0")
+        parts[place] = (len(digits), digits)
+    return parts, name
+
+
+@contextmanager
+def utf8_path(path: Path) -> Iterator[Path]:
+    """`path` for a library that takes UTF-8 names only; else a link to it that has one.
+
+    The path is absolute: to FFmpeg a name like `a:b` has a protocol. Beside the link stands what is
+    beside the file, where the name of the file itself is UTF-8.
+    """
+    whole = Path.cwd() / path
+    if str(whole).isprintable():
+        yield whole
+        return
+    with tempfile.TemporaryDirectory(prefix="driverview-") as folder:
+        link = Path(folder) / "link"
+        if whole.name.isprintable():
+            link.symlink_to(whole.parent)
+            yield link / whole.name
+        else:
+            link = link.with_suffix(whole.suffix)
+            link.symlink_to(whole)
+            yield link
 
 
 def check_folder(path: Path) -> None:
@@ -29,7 +70,7 @@ def atomic_write(path: Path, content: str | bytes, *, fsync: bool = False) -> No
     the file's name.
     """
     check_folder(path)
-    data = content.encode() if isinstance(content, str) else content
+    data = content.encode(errors="backslashreplace") if isinstance(content, str) else content
     if path.exists() and not path.is_file():
         # A pipe or /dev/stdout must not be replaced.
         path.write_bytes(data)

@@ -20,7 +20,7 @@ from runtime.files import write_json
 from serve.client import Client
 from trackfeatures import UserError
 
-LOG = Console(stderr=True, highlight=False)
+LOG = Console(stderr=True, highlight=False, markup=False)
 FIRST_TRACK = "coast"
 """No model is trained on it."""
 FIRST_FRAMES, FIRST_POSTED = 60, 4
@@ -179,7 +179,7 @@ def _step(result: DemoResult, name: str, command: list[str]) -> str:
 
 def _log_command(result: DemoResult, command: str) -> None:
     result.commands.append(command)
-    LOG.print(f"$ {command}", style="bold", markup=False)
+    LOG.print(f"$ {command}", style="bold")
 
 
 def _check_folder(out: Path) -> None:

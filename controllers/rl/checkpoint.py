@@ -13,7 +13,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
 from controllers.rl.agent import Agent
-from runtime.files import atomic_write
+from runtime.files import atomic_write, utf8_path
 from trackfeatures.errors import UserError
 
 FILE = "checkpoint.safetensors"
@@ -56,7 +56,7 @@ def load_checkpoint(run: Path, agent: Agent) -> Progress | None:
     if not path.exists():
         return None
     try:
-        with safe_open(path, framework="np") as file:
+        with utf8_path(path) as plain, safe_open(plain, framework="np") as file:
             metadata = file.metadata()
             progress = Progress(**json.loads(metadata["progress"]))
             progress.curve = [tuple(row) for row in progress.curve]

@@ -78,13 +78,14 @@ def export(
 ) -> None:
     """Convert a dataset to WebDataset or LeRobot; images are copied, not encoded again."""
     from rich.console import Console
+    from rich.markup import escape
 
     from datagen.export.run import ExportConfig
     from datagen.export.run import export as run
 
     target = out or folder.resolve().with_name(f"{folder.resolve().name}-{kind}")
     config = ExportConfig(kind, split, shard_size, shuffle)
-    with Console(stderr=True).status(f"reading {folder}") as status:
+    with Console(stderr=True).status(f"reading {escape(str(folder))}") as status:
         done = run(folder, target, config, lambda n: status.update(f"{n:,} frames written"))
     megabytes = f"{done.bytes / 1e6:.1f} MB in {counted(done.files, 'file')}"
     line = (

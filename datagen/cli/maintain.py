@@ -41,6 +41,7 @@ def verify(
 ) -> None:
     """Check that a dataset is unchanged since it was recorded; exit 1 if it is not."""
     from rich.console import Console
+    from rich.markup import escape
 
     from datagen.recording.integrity.round_checks import LEVELS
     from datagen.recording.integrity.verify import verify as run
@@ -49,7 +50,7 @@ def verify(
         raise UserError(f"there is no level {level!r}; choose {', '.join(LEVELS)}")
     if pixels and not replay:
         raise UserError("--pixels compares images that are rendered again; give --replay N, too")
-    with Console(stderr=True).status(f"checking {folder}") as status:
+    with Console(stderr=True).status(f"checking {escape(str(folder))}") as status:
         report = run(folder, level, lambda name: status.update(f"checked {name}"))
         replayed: list[str] = []
         if replay and report.ok:

@@ -10,6 +10,7 @@ from datagen.export.card import card
 from datagen.export.output_folder import new_folder, require_free
 from datagen.export.split_sides import Progress, Side, sides
 from datagen.recording.dataset import Dataset
+from runtime.files import utf8_path
 from trackfeatures.errors import UserError
 
 FORMATS = ("webdataset", "lerobot")
@@ -89,4 +90,5 @@ def _write(
         return
     from datagen.export import lerobot
 
-    lerobot.write(partial, parts, dataset.camera, progress)
+    with utf8_path(partial / "data") as inside:  # pyarrow takes UTF-8 names only
+        lerobot.write(inside.parent, parts, dataset.camera, progress)

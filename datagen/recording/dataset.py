@@ -26,7 +26,7 @@ from datagen.recording.mcap.index import RoundIndex, open_round
 from datagen.recording.mcap.protobuf_wire import bytes_field
 from datagen.recording.names import SIDES
 from datagen.recording.round_metadata import RoundInfo
-from datagen.recording.schema.topics import CAMERA
+from datagen.recording.schema.topics import CAMERA, EGO_STATE, LABELS
 from datagen.recording.splits import (
     DEFAULT_SPLIT,
     RoundKey,
@@ -68,10 +68,25 @@ class Frames:
 
     @cached_property
     def labels(self) -> Labels:
-        """The labels of these frames. Raises DatasetError for a damaged round."""
-        parts = [read_labels(index, number) for number, index in enumerate(self._indexes)]
-        labels = concatenate(parts)
-        return labels if len(self) == self._first[-1] else labels.take(self._rows)
+        """The labels of these frames. Raises DatasetError if one of them is damaged."""
+        if len(self) == self._first[-1]:
+            return concatenate([read_labels(ix, n) for n, ix in enumerate(self._indexes)])
+        places = self.places()
+        return concatenate(
+            [
+                read_labels(index, number, places[places[:, 0] == number, 1])
+                for number, index in enumerate(self._indexes)
+            ]
+        )
+
+    def require_label(self, i: int) -> None:
+        """Raise UndecodableImage unless the label and the state of frame `i` can be read."""
+        number, frame = self._locate(i)
+        for topic in (LABELS, EGO_STATE):
+            try:
+                self._indexes[number].messages[topic].payload(frame)
+            except (ValueError, IndexError) as error:
+                raise self._undecodable(i, error) from error
 
     def every(self, step: int) -> "Frames":
         """Every `step`-th of these frames, starting with the first."""

@@ -15,6 +15,7 @@ class UndecodableImage(DatasetError):
     def __init__(self, round_id: str, path: Path, frame: int, reason: str) -> None:
         super().__init__(
             f"image {frame} of {path} cannot be read: {reason}; run `datagen verify --level deep` "
-            "on the dataset and record the round again"
+            "on the dataset, and record the round again or save its undamaged frames with "
+            "`datagen recover`"
         )
         self.round_id, self.frame, self.reason = round_id, frame, reason

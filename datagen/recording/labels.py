@@ -12,6 +12,7 @@ from datagen.recording.schema.proto.driverview_pb2 import TrackFeatures, Vehicle
 from datagen.recording.schema.topics import CAMERA, EGO_STATE, LABELS, steps_at
 
 NAN = float("nan")
+LABEL_VALUES, MOTION_VALUES = 13, 2  # of `_label_row`, `_motion_row`
 
 
 @dataclass(frozen=True)
@@ -39,13 +40,16 @@ class Labels:
         return Labels(**{f.name: getattr(self, f.name)[indices] for f in fields(self)})
 
 
-def read_labels(index: RoundIndex, round_number: int) -> Labels:
-    """Labels of all frames of a round; `round_number` fills the column `round`.
+def read_labels(
+    index: RoundIndex, round_number: int, frames: NDArray[np.int64] | None = None
+) -> Labels:
+    """Labels of `frames` of a round, None: of all; `round_number` fills the column `round`.
 
-    Raises DatasetError if an image has no label or state, or a label is damaged.
+    Raises DatasetError if an image has no label or state, or a label of `frames` is damaged.
     """
     camera, labels, states = (index.messages[t] for t in (CAMERA, LABELS, EGO_STATE))
     count = len(camera)
+    chosen = range(count) if frames is None else frames.tolist()
     try:
         for name, other in (("labels", labels), ("ego states", states)):
             if not np.array_equal(camera.log_time, other.log_time):
@@ -53,12 +57,18 @@ def read_labels(index: RoundIndex, round_number: int) -> Labels:
                     f"{index.path.name}: {count} images do not pair with its {len(other)} {name}; "
                     "run `datagen verify` on the dataset and record the round again"
                 )
-        rows = np.array([_label_row(labels.payload(i)) for i in range(count)], dtype=np.float64)
-        motion = np.array([_motion_row(states.payload(i)) for i in range(count)], dtype=np.float64)
+        rows = np.array([_label_row(labels.payload(i)) for i in chosen], np.float64)
+        motion = np.array([_motion_row(states.payload(i)) for i in chosen], np.float64)
     except (DecodeError, ValueError) as error:
-        raise DatasetError(f"{index.path.name}: a label is damaged ({error})") from error
+        raise DatasetError(
+            f"{index.path.name}: a label is damaged ({error}); run `datagen verify` on the "
+            "dataset, and record the round again or save its undamaged frames with "
+            "`datagen recover`"
+        ) from error
     if not count:
         raise DatasetError(f"{index.path.name} has no frames; record the round again")
+    rows, motion = rows.reshape(-1, LABEL_VALUES), motion.reshape(-1, MOTION_VALUES)
+    light = light_per_frame(index)
     return Labels(
         distances=_to_float32(rows[:, :5]),
         to_lane_centre=_to_float32(rows[:, 5]),
@@ -71,8 +81,8 @@ def read_labels(index: RoundIndex, round_number: int) -> Labels:
         s=_to_float32(rows[:, 12]),
         speed=_to_float32(motion[:, 0]),
         shadow_fraction=_to_float32(motion[:, 1]),
-        light=light_per_frame(index),
-        round=np.full(count, round_number, dtype=np.int64),
+        light=light if frames is None else light[frames],
+        round=np.full(len(chosen), round_number, dtype=np.int64),
     )
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from urllib.parse import quote
 
 from datagen.view.contents import Contents
-from runtime.files import atomic_write, check_folder
+from runtime.files import atomic_write, check_folder, utf8_path
 from trackfeatures.errors import UserError
 
 OnShown = Callable[[str], None]
@@ -71,11 +71,12 @@ def save(contents: Contents, path: Path) -> None:
     partial = path.with_name(path.name + ".partial")
     try:
         recording = rr.RecordingStream(APPLICATION, recording_id=contents.header.id)
-        recording.save(partial)
-        log(contents, recording)
-        recording.flush()
-        recording.disconnect()
-        _require_all_images(partial, len(contents.steps))
+        with utf8_path(partial) as plain:
+            recording.save(plain)
+            log(contents, recording)
+            recording.flush()
+            recording.disconnect()
+            _require_all_images(plain, len(contents.steps))
         partial.replace(path)
     except (RuntimeError, ValueError) as error:
         raise UserError(

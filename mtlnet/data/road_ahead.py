@@ -84,7 +84,13 @@ class RoadAhead:
             number, frame = self._places[i].tolist()
             if number not in self._lines:
                 self._lines[number] = _annotations(self._paths[number])
-            lines = read_polylines(self._lines[number].payload(frame))
+            try:
+                lines = read_polylines(self._lines[number].payload(frame))
+            except ValueError as error:
+                raise DatasetError(
+                    f"{self._paths[number]}: the annotations of frame {frame} are damaged "
+                    f"({error}); run `datagen verify` on the dataset and record the round again"
+                ) from error
             own_markings(lines, self._beside[i], self._camera, points[row])
         return points
 

@@ -242,17 +242,20 @@ def require_camera(card: ModelCard, camera: CameraParameters) -> None:
 
 
 def find_undecodable(frames: Frames) -> dict[int, UndecodableImage]:
-    """Decode all frames; the errors of those that cannot be decoded, by row."""
+    """Decode all frames; the errors of those whose image or label is damaged, by row."""
     images = np.empty((CHUNK, frames.camera.height, frames.camera.width, 3), np.uint8)
     found: dict[int, UndecodableImage] = {}
     for first in range(0, len(frames), CHUNK):
         rows = np.arange(first, min(first + CHUNK, len(frames)))
         with suppress(UndecodableImage):
             frames.read_batch(rows, images[: len(rows)])
+            for row in rows.tolist():
+                frames.require_label(row)
             continue
         for row in rows.tolist():
             try:
                 frames.image(row)
+                frames.require_label(row)
             except UndecodableImage as error:
                 found[row] = error
     return found

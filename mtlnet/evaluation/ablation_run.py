@@ -57,7 +57,7 @@ def ablate(config: AblationConfig, rows: Sequence[Row], *, dry_run: bool = False
 
     Raises UserError when the folder was made with other settings, or a run fails.
     """
-    console = Console(stderr=True)
+    console = Console(stderr=True, markup=False)
     dataset = open_training_dataset(config.data)
     dataset.select(config.split)  # raises where there are no such rounds
     runs = plan_runs(config, rows)

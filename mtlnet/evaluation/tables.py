@@ -2,11 +2,13 @@
 
 from typing import Any
 
+from rich.markup import escape
 from rich.table import Table
 
 import trackfeatures as tf
 from mtlnet.evaluation.metrics import GROUPS, feature_mean
 from mtlnet.inference.uncertainty import FEATURES
+from runtime.cli import printable
 from runtime.html import format_number, format_percent
 
 TITLES = {
@@ -32,7 +34,7 @@ def mean_error_cells(result: dict[str, Any]) -> list[str]:
 def evaluation_table(result: dict[str, Any]) -> Table:
     """Errors of a model on active labels, beside those of the constant training mean."""
     title = f"{result['model']} on {result['frames']} {result['split']} frames of {result['data']}"
-    table = Table(title=title)
+    table = Table(title=escape(printable(title)))
     for column in ("", "mean", "median", "95 %", "99 %", "training mean", "ratio"):
         table.add_column(column, justify="left" if not column else "right", no_wrap=not column)
     for name, title in TITLES.items():
@@ -75,15 +77,15 @@ def uncertainty_table(result: dict[str, Any]) -> Table:
 def prediction_table(predictions: list[dict[str, Any]]) -> Table:
     """The track features predicted for images."""
     table = Table(title="track features")
-    table.add_column("image")
+    table.add_column("image", overflow="fold")
     for m in tf.MARKINGS:
         table.add_column(f"{m} (m)", justify="right")
     for column in ("to lane centre (m)", "angle (rad)", "heading"):
-        table.add_column(column, justify="right")
+        table.add_column(column, justify="right", min_width=7)
     for prediction in predictions:
         heading = max(prediction["heading"], key=prediction["heading"].__getitem__)
         table.add_row(
-            prediction["image"],
+            escape(printable(prediction["image"])),
             *(format_number(prediction["distances_m"][m], 2) for m in tf.MARKINGS),
             format_number(prediction["to_lane_centre_m"], 2),
             format_number(prediction["angle_rad"], 4),

@@ -39,7 +39,7 @@ from mtlnet.inference.model_card import (
 from mtlnet.inference.prediction import OUTPUTS
 from mtlnet.model.architecture import HEIGHT, WIDTH
 from mtlnet.model.network import Network, load_network, predict_images
-from runtime.files import atomic_move, replaced_files, write_json
+from runtime.files import atomic_move, replaced_files, utf8_path, write_json
 from trackfeatures.errors import UserError
 
 FORMATS, PRECISIONS = ("onnx", "openvino"), ("f32", "bf16", "int8")
@@ -184,7 +184,8 @@ def write_onnx(network: Network, folder: Path, *, bf16: bool) -> tuple[str, ...]
     onnx.checker.check_model(model)
     staged = path.with_suffix(".partial")
     try:
-        onnx.save_model(model, str(staged))
+        with utf8_path(staged) as plain:
+            onnx.save_model(model, str(plain))
         atomic_move(staged, path)
     finally:
         staged.unlink(missing_ok=True)
@@ -216,7 +217,8 @@ def write_openvino(model: Any, folder: Path, precision: str) -> tuple[str, ...]:
 
     if precision == "bf16":
         store_openvino_bf16(model)
-    openvino.save_model(model, str(folder / GRAPH), compress_to_fp16=False)
+    with utf8_path(folder / GRAPH) as plain:
+        openvino.save_model(model, str(plain), compress_to_fp16=False)
     return (GRAPH, GRAPH_WEIGHTS)
 
 

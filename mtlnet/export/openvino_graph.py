@@ -18,7 +18,7 @@ from torch import nn
 from mtlnet.inference.graph import Nodes, convolution, model_of, network_nodes
 from mtlnet.inference.uncertainty import UncertaintyHead
 from mtlnet.model.network import Network
-from runtime.files import fsync_path
+from runtime.files import fsync_path, utf8_path
 
 TOLERANCE = 2e-4
 """Largest difference of any output (coded, or a probability) from torch in float32."""
@@ -56,7 +56,8 @@ def write_graph(
     # OpenVINO names the weights after the graph, so both are first written under another stem.
     staged = graph.with_name("staged.xml")
     try:
-        openvino.save_model(build_graph(network, head), str(staged), compress_to_fp16=False)
+        with utf8_path(staged) as plain:
+            openvino.save_model(build_graph(network, head), str(plain), compress_to_fp16=False)
         for path in (staged, staged.with_suffix(".bin")):
             fsync_path(path)
         staged.with_suffix(".bin").replace(weights)

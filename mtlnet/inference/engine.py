@@ -23,6 +23,7 @@ from mtlnet.inference.model_card import (
     file_hash,
     read_card,
 )
+from runtime.files import utf8_path
 
 EngineKind = Literal["openvino", "torch"]
 Precision = Literal["bf16", "f32", "int8"]
@@ -104,7 +105,7 @@ class OpenVinoEngine:
         }
         try:
             graph = int8_graph(run, card) if quantised else None
-            model = read_graph(run, card) if graph is None else core.read_model(str(graph))
+            model = read_graph(run, card) if graph is None else _read_model(graph)
             compiled = core.compile_model(model, "CPU", options)
         except RuntimeError as error:
             reason = str(error).strip().splitlines()[-1]
@@ -123,16 +124,23 @@ class OpenVinoEngine:
         return outputs
 
 
+def _read_model(graph: Path) -> Any:
+    """Raises RuntimeError when OpenVINO cannot read it."""
+    import openvino
+
+    with utf8_path(graph) as plain:
+        return openvino.Core().read_model(str(plain))
+
+
 def read_graph(run: Path, card: ModelCard) -> Any:
     """The OpenVINO model of a run: its graph or, if it holds weights alone, one built from these.
 
     Raises ModelError when a file is missing or damaged, RuntimeError when OpenVINO cannot read it.
     """
-    import openvino
 
     if GRAPH in card.files:
         check_files(run, card, (GRAPH, GRAPH_WEIGHTS))
-        return openvino.Core().read_model(str(run / GRAPH))
+        return _read_model(run / GRAPH)
     from mtlnet.inference.graph import model_from_weights
     from mtlnet.inference.uncertainty import read_uncertainty_head
     from mtlnet.inference.weights_file import read_weights

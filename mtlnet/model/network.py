@@ -39,6 +39,7 @@ from mtlnet.model.bins import (
     read_scores,
     split_scores,
 )
+from runtime.files import utf8_path
 
 NORM_EPS = 1e-5
 NORM_MOMENTUM = 0.1
@@ -154,7 +155,8 @@ def initialise(network: Network, seed: int) -> None:
 def load_network(path: Path, name: str = MTL.name) -> Network:
     """The network called `name` with the weights of a `model.safetensors`."""
     network = Network(architecture=find_architecture(name))
-    network.load_state_dict(load_file(path))
+    with utf8_path(path) as plain:
+        network.load_state_dict(load_file(plain))
     return network.eval()
 
 

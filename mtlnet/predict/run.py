@@ -9,7 +9,7 @@ from typing import Any
 from mtlnet.inference.engine import Engine
 from mtlnet.inference.prediction import decode_outputs
 from mtlnet.inference.rectification import Rectification
-from mtlnet.predict.sources import ROUND, Lens, find_sources, read_sources
+from mtlnet.predict.sources import DEFAULT_FPS, Lens, Note, find_sources, read_sources
 from mtlnet.predict.writers import open_writer, require_other_file
 from trackfeatures.errors import UserError
 
@@ -23,19 +23,19 @@ def predict_files(
     outputs: Sequence[Path] = (),
     lens: Lens = None,
     report: Callable[[int, int], None] = lambda done, total: None,
+    note: Note = lambda line: None,
 ) -> list[dict[str, Any]]:
     """The features of all images that `inputs` name (`mtlnet.predict.sources.find_sources`).
 
     Those of the first `KEPT_ROWS` are returned, all are written to each of `outputs`
     (`mtlnet.predict.writers.open_writer`), one image at a time. `lens`: of images and films; a
     recorded round must be of the model's camera. `report`: takes the numbers of images done and in
-    all. Raises UserError, after all others were done, when an image could not be used; at once for
-    outputs that cannot be written or are among the files to read.
+    all. `note`: takes a line on what is left out, before the first image. Raises UserError, after
+    all others were done, when an input or an image could not be used; at once for outputs that
+    cannot be written or are among the files to read.
     """
-    sources = find_sources(list(inputs))
+    sources = find_sources(list(inputs), note)
     other = lens if isinstance(lens, Rectification) else None
-    if other is not None and any(source.path.suffix.lower() == ROUND for source in sources):
-        raise UserError("--camera is for images and films; a recorded round has its own camera")
     camera, name = engine.card.camera, engine.card.name
     total = sum(source.count for source in sources)
     drawn = camera if other is None else other.view
@@ -43,9 +43,12 @@ def predict_files(
     unusable: list[str] = []
     used = 0
     for path in outputs:
-        require_other_file(path, [source.path for source in sources])
+        require_other_file(path, [source.path for source in sources if not source.problem])
+    for source in sources:
+        if source.problem:
+            note(source.problem)
     with ExitStack() as stack:
-        fps = sources[0].fps
+        fps = next((source.fps for source in sources if not source.problem), DEFAULT_FPS)
         writers = [stack.enter_context(open_writer(path, drawn, fps)) for path in outputs]
         for done, item in enumerate(read_sources(sources, camera, lens), start=1):
             report(done, max(total, done))
@@ -65,7 +68,7 @@ def predict_files(
                 about = {"model": name, "latency_ms": latency_ms}
                 results.append({"image": item.name, **prediction.as_json(), **about})
     if unusable:
-        more = f" (and {len(unusable) - 1} more like it)" if len(unusable) > 1 else ""
+        more = f" (and {len(unusable) - 1} more)" if len(unusable) > 1 else ""
         others = f"; {used} others were done" if used else ""
         raise UserError(f"{unusable[0]}{more}{others}")
     return results

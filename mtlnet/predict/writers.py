@@ -1,10 +1,13 @@
 """Files that `mtlnet predict --out` writes: tables (.csv, .jsonl), a film (.mp4) or pictures.
 
-Each row and frame is written when it is known: an interrupted command keeps what was done.
+Each row and frame is written when it is known: an interrupted command keeps what was done. A name
+that is not UTF-8 stands in tables as `runtime.files` describes.
 """
 
 import csv
 import json
+import os
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Protocol, Self
 
@@ -24,6 +27,8 @@ TABLE_SUFFIXES = (".csv", ".jsonl")
 TEXT_HEIGHT = 64
 """Rows of pixels below a picture that hold the features as text."""
 TEXT_COLOUR = (235, 235, 235)
+MAX_STEM_BYTES = 200
+"""Of a picture's name, from its image: a name has 255 bytes at most."""
 
 
 class Writer(Protocol):
@@ -78,26 +83,35 @@ class TableWriter:
     """Rows of `table_row` as CSV with a header, or as one JSON object a line."""
 
     def __init__(self, path: Path) -> None:
+        self._path = path
         self._as_csv = path.suffix.lower() == ".csv"
-        self._file = path.open("w", encoding="utf-8", newline="")
+        self._file = path.open("w", encoding="utf-8", errors="backslashreplace", newline="")
         self._csv: csv.DictWriter[str] | None = None
 
     def write(self, item: SourceImage, prediction: Prediction) -> None:
         row = table_row(item.name, prediction)
+        try:
+            self._write_row(row)
+            self._file.flush()
+        except OSError as error:
+            error.filename = str(self._path)  # a failed write lacks it
+            raise
+
+    def _write_row(self, row: dict[str, Any]) -> None:
         if not self._as_csv:
             self._file.write(json.dumps(row) + "\n")
-        else:
-            if self._csv is None:
-                self._csv = csv.DictWriter(self._file, list(row))
-                self._csv.writeheader()
-            self._csv.writerow(row)
-        self._file.flush()
+            return
+        if self._csv is None:
+            self._csv = csv.DictWriter(self._file, list(row))
+            self._csv.writeheader()
+        self._csv.writerow(row)
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._file.close()
+        with suppress(OSError):  # told by `write`: what a full disk did not take is still there
+            self._file.close()
 
 
 class FilmWriter:
@@ -125,11 +139,14 @@ class PictureWriter:
 
     def write(self, item: SourceImage, prediction: Prediction) -> None:
         picture = draw_prediction(item, prediction, self._camera)
-        file, _, frame = item.name.partition("#")
-        name = "-".join((f"{self._count:04d}", Path(file).stem, *([frame] if frame else [])))
-        path = self._folder / f"{name}.png"
-        if not cv2.imwrite(str(path), cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)):
-            raise UserError(f"{path} cannot be written; check the disk")
+        stem = os.fsdecode(os.fsencode(item.file.stem)[:MAX_STEM_BYTES])
+        frame = [] if item.frame is None else [str(item.frame)]
+        name = "-".join((f"{self._count:04d}", stem, *frame))
+        done, data = cv2.imencode(".png", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
+        if not done:
+            raise UserError(f"{name}.png: a picture of {picture.shape} cannot be written as PNG")
+        # Not with OpenCV, which takes UTF-8 names only, and does not say why it fails.
+        (self._folder / f"{name}.png").write_bytes(data.tobytes())
         self._count += 1
 
     def __enter__(self) -> Self:

@@ -15,7 +15,7 @@ from torch.optim import Optimizer
 
 from mtlnet.inference.model_card import ModelError
 from mtlnet.training.trainer import Trainer
-from runtime.files import atomic_write
+from runtime.files import atomic_write, utf8_path
 
 FOLDER = "checkpoints"
 MAX_CHECKPOINTS = 2
@@ -39,7 +39,7 @@ def load_checkpoint(path: Path, trainer: Trainer) -> float:
     Raises ModelError when the file is damaged or of another network.
     """
     try:
-        with safe_open(path, framework="pt") as file:
+        with utf8_path(path) as plain, safe_open(plain, framework="pt") as file:
             metadata = file.metadata()
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 no dict
         trainer.step_number = int(metadata["step"])

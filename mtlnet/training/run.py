@@ -72,7 +72,7 @@ def start_training(options: Mapping[str, Any], out: Path | None, *, resume: bool
     else:
         config = new_config(options, out)
     is_first = read_rank().is_first
-    console = Console(stderr=True, quiet=not is_first)
+    console = Console(stderr=True, quiet=not is_first, markup=False)
     console.print(
         f"training {config.network} in {config.out} on {config.data}, recipe {config.recipe}"
     )

@@ -2,11 +2,12 @@
 
 An uncompressed, indexed file is memory-mapped, and a message index is read as an array on first
 use. Any other file is read with the official reader, message by message. Both give the same
-`RoundIndex`.
+`RoundIndex`, and both check the CRC of a chunk before a message of it is used.
 """
 
 import errno
 import struct
+import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -23,7 +24,9 @@ from datagen.recording.errors import DatasetError
 from datagen.recording.mcap.footer import Summary, read_metadata, read_summary
 from datagen.recording.mcap.mmap import map_file
 from datagen.recording.mcap.records import (
+    CHUNK,
     CHUNK_HEAD,
+    LONG_LENGTH,
     MESSAGE,
     MESSAGE_FIELDS,
     MESSAGE_INDEX,
@@ -58,7 +61,43 @@ class Messages(Protocol):
         """(N,) ns; simulated time plus `topics.EPOCH_NS`."""
 
     def payload(self, i: int) -> memoryview:
-        """The serialised message `i`; ValueError if the index points at something else."""
+        """The serialised message `i`.
+
+        Raises ValueError if its chunk is damaged, or the index points at something else.
+        """
+
+
+class CheckedChunks:
+    """Which chunks of a memory-mapped file were found undamaged; each is read once a process.
+
+    A CRC of 0 means that the writer computed none (mcap.dev/spec): such a chunk is taken as it is.
+    """
+
+    def __init__(self, view: memoryview, summary: Summary) -> None:
+        self._view, self._chunks = view, summary.chunks
+        self._is_good = bytearray(len(summary.chunks))
+
+    def require(self, number: int) -> None:
+        """Raise ValueError if chunk `number` is damaged."""
+        if self._is_good[number]:
+            return
+        start = self._chunks[number].start
+        if not _chunk_is_good(self._view, start):
+            raise ValueError(f"the chunk at byte {start} is damaged (its CRC)")
+        self._is_good[number] = 1
+
+
+def _chunk_is_good(view: memoryview, start: int) -> bool:
+    """Whether sizes and CRC of the uncompressed chunk at `start` fit its messages."""
+    if start + CHUNK_HEAD > len(view):
+        return False
+    opcode, length = RECORD.unpack_from(view, start)
+    _, _, size, crc, name_length = CHUNK.unpack_from(view, start + RECORD.size)
+    (inner,) = LONG_LENGTH.unpack_from(view, start + RECORD.size + CHUNK.size)
+    messages = view[start + CHUNK_HEAD : start + CHUNK_HEAD + size]
+    if (opcode, name_length, inner, len(messages)) != (Opcode.CHUNK, 0, size, size):
+        return False
+    return length == CHUNK_HEAD - RECORD.size + size and (not crc or zlib.crc32(messages) == crc)
 
 
 @dataclass(frozen=True)
@@ -68,6 +107,7 @@ class MappedMessages:
     view: memoryview
     summary: Summary
     channel: int
+    chunks: CheckedChunks
 
     def __len__(self) -> int:
         count = self.summary.counts.get(self.channel)
@@ -78,7 +118,8 @@ class MappedMessages:
         return self._table[0]
 
     def payload(self, i: int) -> memoryview:
-        times, places = self._table
+        times, places, chunks = self._table
+        self.chunks.require(int(chunks[i]))
         start = int(places[i])
         opcode, length, channel, _, log_time, _ = self._unpack(MESSAGE, start)
         if (opcode, channel, log_time) != (Opcode.MESSAGE, self.channel, times[i]):
@@ -89,23 +130,25 @@ class MappedMessages:
         return self.view[start + MESSAGE.size : end]
 
     @cached_property
-    def _table(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Log times and file offsets, read from the message index after each chunk."""
-        parts, starts, sizes = [], [], []
-        for chunk in self.summary.chunks:
+    def _table(self) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+        """Log times, file offsets and numbers of chunks, from the message index after each."""
+        parts, starts, numbers, sizes = [], [], [], []
+        for number, chunk in enumerate(self.summary.chunks):
             at = chunk.indexes.get(self.channel)
             if at is not None:
                 parts.append(self._entries(at))
                 starts.append(chunk.start + CHUNK_HEAD)
+                numbers.append(number)
                 sizes.append(len(parts[-1]))
         if not parts:
-            return np.zeros(0, np.int64), np.zeros(0, np.int64)
+            return np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0, np.int64)
         entries = np.concatenate(parts)
         if len(entries) != self.summary.counts.get(self.channel, len(entries)):
             raise ValueError(
                 f"{len(entries)} messages are indexed, but the summary counts another number"
             )
-        return entries[:, 0], entries[:, 1] + np.repeat(np.array(starts, np.int64), sizes)
+        offsets = entries[:, 1] + np.repeat(np.array(starts, np.int64), sizes)
+        return entries[:, 0], offsets, np.repeat(np.array(numbers, np.int64), sizes)
 
     def _entries(self, at: int) -> NDArray[np.int64]:
         opcode, _ = self._unpack(RECORD, at)
@@ -194,8 +237,10 @@ def _map_round(path: Path, topic_names: Sequence[str]) -> RoundIndex | None:
         return None
     metadata = {n: read_metadata(view, place) for n, place in summary.metadata.items()}
     header, result, recovery = _parse_metadata(metadata)
+    chunks = CheckedChunks(view, summary)
     found: dict[str, Messages] = {
-        topic: MappedMessages(view, summary, _channel(summary, topic)) for topic in topic_names
+        topic: MappedMessages(view, summary, _channel(summary, topic), chunks)
+        for topic in topic_names
     }
     return RoundIndex(path, header, result, found, summary, recovery)
 
@@ -228,7 +273,7 @@ def _load_round(path: Path, topic_names: Sequence[str]) -> RoundIndex:
     times: dict[str, list[int]] = {topic: [] for topic in topic_names}
     payloads: dict[str, list[bytes]] = {topic: [] for topic in topic_names}
     with path.open("rb") as stream:
-        reader = make_reader(stream)
+        reader = make_reader(stream, validate_crcs=True)
         metadata = {record.name: record.metadata for record in reader.iter_metadata()}
         header, result, recovery = _parse_metadata(metadata)
         for _, channel, message in reader.iter_messages(topic_names, log_time_order=False):

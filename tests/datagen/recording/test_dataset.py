@@ -18,6 +18,7 @@ from datagen.recording.images import decode_into
 from datagen.recording.manifest import rebuild
 from datagen.recording.round_metadata import RoundHeader, RoundResult
 from datagen.recording.splits import Split, split_path, write_split
+from tests.datagen.chunk_crcs import with_right_crcs
 from tests.datagen.conftest import Samples
 
 
@@ -84,7 +85,7 @@ def test_the_first_damaged_image_of_a_batch_is_named(dataset: Path) -> None:
     for i in (50, 55, 60):
         image = bytes(good.jpeg(i))
         data = data.replace(image, b"\0\0" + image[2:])
-    path.write_bytes(data)
+    path.write_bytes(with_right_crcs(data))
     frames = Dataset.open(dataset).select("all")
     with pytest.raises(DatasetError, match=r"image 5 of .*r001\.mcap cannot be read: neither JPEG"):
         frames.read_batch(np.arange(40, 72))

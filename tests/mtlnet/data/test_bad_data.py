@@ -9,15 +9,17 @@ import numpy as np
 import pytest
 
 import trackfeatures as tf
-from datagen.recording import Dataset, UndecodableImage
+from datagen.recording import Dataset, DatasetError, UndecodableImage
+from datagen.recording.mcap.footer import read_summary
 from datagen.recording.splits import Split, split_path, write_split
-from mtlnet.data.sources import find_undecodable
+from mtlnet.data.sources import find_undecodable, recorded_training_data
 from mtlnet.evaluation.ablation import AblationConfig, ablation_rows
 from mtlnet.evaluation.ablation_run import ablate
 from mtlnet.evaluation.evaluate import evaluate
 from mtlnet.inference.engine import load_engine
 from mtlnet.training.config import TrainConfig
 from mtlnet.training.run import train
+from tests.datagen.chunk_crcs import with_right_crcs
 from tests.mtlnet.conftest import FRAMES, TRAIN, write_round
 from tests.typed import typed
 from trackfeatures.errors import UserError
@@ -34,7 +36,7 @@ def damage(folder: Path, name: str, frame: int) -> None:
     at, middle = content.index(jpeg), len(jpeg) // 2
     damaged_content = content[: at + middle] + b"\xff\xd9" * 40 + content[at + middle + 80 :]
     path.unlink()  # the old file may be memory-mapped
-    path.write_bytes(damaged_content)
+    path.write_bytes(with_right_crcs(damaged_content))
 
 
 @pytest.fixture
@@ -74,6 +76,28 @@ def test_undecodable_images_are_found_by_round_and_frame(damaged: Path) -> None:
     np.testing.assert_array_equal(rest.labels.distances, kept)
     with pytest.raises(UndecodableImage, match=r"image 20 of .*r002\.mcap cannot be read"):
         frames.image(2 * FRAMES + 20)
+
+
+def test_frames_of_a_damaged_chunk_are_left_out_with_their_labels(
+    dataset: Path, tmp_path: Path
+) -> None:
+    folder = shutil.copytree(dataset, tmp_path / "damaged")
+    path = folder / "rounds" / "r000.mcap"
+    content = bytearray(path.read_bytes())
+    start = read_summary(memoryview(path.read_bytes())).chunks[0].start
+    content[start + 20_000] ^= 0x10
+    path.unlink()
+    path.write_bytes(content)
+    frames = Dataset.open(folder).select("train")
+    found = find_undecodable(frames)
+    assert sorted(found) == list(range(FRAMES))  # a round of 24 frames is one chunk
+    with pytest.raises(DatasetError, match=r"a label is damaged .the chunk at byte"):
+        _ = frames.labels
+    rest = frames.without(found)
+    whole = Dataset.open(dataset).select("train").labels.distances
+    np.testing.assert_array_equal(rest.labels.distances, whole[FRAMES:])
+    data = recorded_training_data(Dataset.open(folder), skip_undecodable=True)
+    assert data.about["frames"] == 2 * FRAMES
 
 
 @pytest.mark.usefixtures("small_network")

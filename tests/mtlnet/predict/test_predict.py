@@ -2,6 +2,7 @@
 
 import csv
 import json
+import os
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -14,9 +15,11 @@ from numpy.typing import NDArray
 import trackfeatures as tf
 from mtlnet.inference.model_card import ModelCard, read_card
 from mtlnet.inference.rectification import Rectification
+from mtlnet.predict.films import read_film_header
 from mtlnet.predict.run import predict_files
 from mtlnet.predict.sources import find_sources
 from mtlnet.predict.writers import TEXT_HEIGHT
+from tests.mtlnet.conftest import write_dataset, write_round
 from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
 
@@ -135,7 +138,9 @@ def test_a_cut_film_keeps_what_was_read(engine: BrightnessEngine, tmp_path: Path
     cut = tmp_path / "cut.avi"
     cut.write_bytes(whole.read_bytes()[: whole.stat().st_size // 2])
     table = tmp_path / "rows.jsonl"
-    with pytest.raises(UserError, match=r"cut\.avi ends after \d of 10 frames; those were used"):
+    with pytest.raises(
+        UserError, match=r"cut\.avi ends after \d of 10 frames; those were used .it breaks"
+    ):
         predict_files(engine, [str(cut)], [table])
     rows = table.read_text().splitlines()
     assert 2 <= len(rows) < 10
@@ -179,6 +184,108 @@ def test_a_damaged_image_does_not_stop_the_others(engine: BrightnessEngine, tmp_
         "a.jpg",
         "c.jpg",
     ]
+
+
+def test_one_input_that_cannot_be_read_costs_no_other(
+    engine: BrightnessEngine, dataset: Path, tmp_path: Path
+) -> None:
+    """A damaged, a cut, a foreign and another camera's round, a missing file, a wrong pattern."""
+    source = sorted((dataset / "rounds").glob("*.mcap"))[0]
+    (tmp_path / "cut.mcap").write_bytes(source.read_bytes()[:5000])
+    (tmp_path / "none.mcap").write_bytes(b"no round")
+    (tmp_path / "other").mkdir()
+    write_dataset(tmp_path / "other", camera=replace(CameraParameters(), z=2.0))
+    bad = ["cut.mcap", "none.mcap", "missing.jpg", "*.tif", "**x", "pipe.jpg", "broken.mp4"]
+    os.mkfifo(tmp_path / "pipe.jpg")
+    (tmp_path / "broken.mp4").write_bytes(b"no film")
+    good = write_jpeg(tmp_path / "good.jpg", 90)
+    given = [*(str(tmp_path / name) for name in bad), str(good)]
+    given.append(str(sorted((tmp_path / "other" / "rounds").glob("*.mcap"))[0]))
+    table = tmp_path / "rows.csv"
+    notes: list[str] = []
+    with pytest.raises(UserError, match=r"cut\.mcap is damaged .* \(and 7 more\); 1 others were"):
+        predict_files(engine, given, [table], note=notes.append)
+    with table.open(newline="") as file:
+        assert [row["image"] for row in csv.DictReader(file)] == [str(good)]
+    assert len(notes) == len(bad)  # the other camera is found when the round is read
+    assert "there is no image file" in notes[2]
+
+
+def test_a_damaged_chunk_of_a_round_costs_its_frames_only(
+    engine: BrightnessEngine, tmp_path: Path
+) -> None:
+    (tmp_path / "rounds").mkdir()
+    for number in range(2):  # each is one chunk of 24 frames
+        write_round(tmp_path, f"r00{number}", number)
+    bad, good = sorted((tmp_path / "rounds").glob("*.mcap"))
+    content = bytearray(bad.read_bytes())
+    content[len(content) // 2] ^= 1
+    bad.write_bytes(content)
+    table = tmp_path / "rows.jsonl"
+    message = rf"image 0 of .*{bad.name} cannot be read: the chunk at byte \d+ is damaged"
+    with pytest.raises(UserError, match=rf"{message}.*and 23 more\); 24 others were done"):
+        predict_files(engine, [str(bad), str(good)], [table])
+    rows = [json.loads(line) for line in table.read_text().splitlines()]
+    assert [row["image"] for row in rows] == [f"{good}#{n}" for n in range(24)]
+
+
+def test_a_folder_gives_all_that_is_read_and_names_the_rest(
+    engine: BrightnessEngine, tmp_path: Path
+) -> None:
+    for number in (1, 2, 10, 11):
+        write_jpeg(tmp_path / f"frame{number}.JPG", 10 * number)
+    write_film(tmp_path / "frame3.mp4", [50, 60])
+    write_film(tmp_path / "frame4.mp4", [50]).rename(tmp_path / "frame4.bin")
+    for name in ("a.heic", "b.txt", "labels.csv", "camera.yaml", "Thumbs.db", ".hidden"):
+        (tmp_path / name).write_text("?")
+    (tmp_path / "more").mkdir()
+    notes: list[str] = []
+    results = predict_files(engine, [str(tmp_path)], note=notes.append)
+    names = [Path(row["image"]).name for row in results]
+    films = ["frame3.mp4#0", "frame3.mp4#1", "frame4.bin#0"]
+    assert names == ["frame1.JPG", "frame2.JPG", *films, "frame10.JPG", "frame11.JPG"]
+    assert notes == [
+        f"{tmp_path}: its folders are not searched: more; give them by name",
+        f"{tmp_path}: left out, neither image nor film nor round: a.heic, b.txt",
+    ]
+    matched = predict_files(engine, [str(tmp_path / "frame*.JPG")])
+    assert [Path(row["image"]).name for row in matched] == [n for n in names if n.endswith("JPG")]
+
+
+def test_a_name_of_any_bytes_is_read_and_written(engine: BrightnessEngine, tmp_path: Path) -> None:
+    folder = tmp_path / os.fsdecode(b"caf\xe9 [x] %d\n:")
+    folder.mkdir()
+    image = write_jpeg(folder / os.fsdecode(b"\xff#1.jpg"), 90)
+    long = write_jpeg(folder / f"{'l' * 251}.jpg", 90)
+    film = write_film(tmp_path / "film.mp4", [50, 60]).rename(folder / os.fsdecode(b"-a:b\xe9.mp4"))
+    outputs = [folder / os.fsdecode(b"\xe9" + end) for end in (b".csv", b".jsonl", b".mp4", b"")]
+    names = [str(image), str(long), f"{film}#0", f"{film}#1"]
+    results = predict_files(engine, [str(image), str(long), str(film)], outputs)
+    assert [row["image"] for row in results] == names
+    lines = outputs[1].read_text(encoding="utf-8").splitlines()
+    assert [json.loads(line)["image"] for line in lines] == names
+    with outputs[0].open(newline="", encoding="utf-8") as file:
+        rows = [row["image"] for row in csv.DictReader(file)]
+    assert rows == [name.encode(errors="backslashreplace").decode() for name in names]
+    assert read_film_header(outputs[2]).count == 4
+    pictures = sorted(path.name for path in outputs[3].iterdir())
+    assert pictures == [
+        os.fsdecode(b"0000-\xff#1.png"),
+        f"0001-{'l' * 200}.png",
+        os.fsdecode(b"0002--a:b\xe9-0.png"),
+        os.fsdecode(b"0003--a:b\xe9-1.png"),
+    ]
+
+
+def test_a_full_disk_keeps_what_is_done_and_is_told(
+    engine: BrightnessEngine, tmp_path: Path
+) -> None:
+    image = write_jpeg(tmp_path / "a.jpg", 10)
+    for name in ("rows.csv", "rows.jsonl"):
+        (tmp_path / name).symlink_to("/dev/full")
+        with pytest.raises(OSError, match="No space left") as raised:
+            predict_files(engine, [str(image)], [tmp_path / name])
+        assert raised.value.filename == str(tmp_path / name)
 
 
 def test_an_interrupted_film_is_playable(engine: BrightnessEngine, tmp_path: Path) -> None:

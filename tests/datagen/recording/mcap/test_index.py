@@ -14,7 +14,7 @@ from datagen.recording.labels import read_labels
 from datagen.recording.mcap.footer import read_metadata, read_summary
 from datagen.recording.mcap.index import open_round
 from datagen.recording.mcap.mmap import map_file
-from datagen.recording.mcap.records import MESSAGE_INDEX, RECORD
+from datagen.recording.mcap.records import CHUNK_HEAD, MESSAGE_INDEX, RECORD
 from datagen.recording.schema import topics
 from tests.datagen.conftest import Samples
 
@@ -93,6 +93,47 @@ def test_a_damaged_message_index_is_refused_on_reading(dataset: Path, entry: str
     path.write_bytes(data)
     with pytest.raises(DatasetError):
         _read_all(dataset)
+
+
+@pytest.mark.parametrize("place", ["image", "last byte", "size", "crc", "inner size"])
+def test_a_flipped_byte_of_a_chunk_costs_its_frames_only(path: Path, place: str) -> None:
+    good = [bytes(open_round(path).messages[topics.CAMERA].payload(i)) for i in range(90)]
+    data = bytearray(path.read_bytes())
+    first, second = read_summary(memoryview(bytes(data))).chunks[:2]
+    at = {
+        "image": first.start + CHUNK_HEAD + 5000,
+        "last byte": min(first.indexes.values()) - 1,
+        "size": first.start + RECORD.size + 16,
+        "crc": first.start + RECORD.size + 24,
+        "inner size": first.start + CHUNK_HEAD - 8,
+    }[place]
+    data[at] ^= 0x04
+    path.unlink()
+    path.write_bytes(data)
+    index = open_round(path)
+    camera = index.messages[topics.CAMERA]
+    places = camera._table[1]  # type: ignore[attr-defined]
+    bad = np.flatnonzero((places > first.start) & (places < second.start)).tolist()
+    assert 10 < len(bad) < 90
+    for i in bad:
+        with pytest.raises(ValueError, match=rf"the chunk at byte {first.start} is damaged"):
+            camera.payload(i)
+    for i in set(range(90)) - set(bad):
+        assert camera.payload(i) == good[i]
+    with pytest.raises(DatasetError, match=r"a label is damaged \(the chunk at byte"):
+        read_labels(index, 0)
+    kept = np.setdiff1d(np.arange(90), [*bad, bad[-1] + 1])
+    assert len(read_labels(index, 0, kept)) == len(kept)
+
+
+def test_a_chunk_whose_crc_was_not_computed_is_read(path: Path) -> None:
+    """A CRC of 0 means that there is none (mcap.dev/spec)."""
+    data = bytearray(path.read_bytes())
+    for chunk in read_summary(memoryview(bytes(data))).chunks:
+        data[chunk.start + RECORD.size + 24 : chunk.start + RECORD.size + 28] = bytes(4)
+    path.unlink()
+    path.write_bytes(data)
+    assert len(read_labels(open_round(path), 0)) == 90
 
 
 def test_a_round_without_frames_is_refused(samples: Samples, tmp_path: Path) -> None:

@@ -1,0 +1,67 @@
+"""What a file is: an image, a film or a recorded round, told by its first bytes, else its name."""
+
+from enum import Enum
+from pathlib import Path
+
+from mtlnet.inference.image_decoding.other_kinds import SUFFIXES
+
+
+class Kind(Enum):
+    """Kind of a file to take images from."""
+
+    IMAGE = "image"
+    FILM = "film"
+    ROUND = "round"
+
+
+IMAGES = tuple(suffix for suffix in SUFFIXES if suffix != ".gif")  # its pictures are a film
+# fmt: off
+FILMS = (
+    ".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".ts", ".m2ts", ".mts", ".mpg", ".mpeg",
+    ".vob", ".wmv", ".asf", ".flv", ".3gp", ".3g2", ".ogv", ".gif", ".y4m", ".mjpeg", ".mjpg",
+    ".h264", ".264", ".avc", ".h265", ".265", ".hevc", ".qcamera",
+)
+# fmt: on
+MJPEG = (".mjpeg", ".mjpg")  # begin as a JPEG image does
+ROUND = ".mcap"
+HEAD_BYTES = 400
+IMAGE_STARTS = (
+    b"\xff\xd8\xff", b"\x89PNG", b"BM", b"II*\0", b"MM\0*", b"\0\0\0\x0cjP  ",
+    b"P4\n", b"P5\n", b"P6\n",
+)  # fmt: skip
+IMAGE_BRANDS = (b"avif", b"avis", b"heic", b"heix", b"mif1", b"msf1")
+FILM_STARTS = (
+    b"\x1aE\xdf\xa3", b"OggS", b"FLV\x01", b"GIF8", b"YUV4MPEG2", b"\0\0\x01\xba", b"\0\0\0\x01",
+    b"\0\0\x01", bytes.fromhex("3026b2758e66cf11"),
+)  # fmt: skip
+MP4_BOXES = (b"ftyp", b"moov", b"mdat", b"wide")
+TS_SYNC, TS_PACKETS = 0x47, ((0, 188), (4, 192))  # MPEG-TS, and with the times of Blu-ray
+
+
+def kind_of(path: Path) -> Kind | None:
+    """What `path` holds, if it cannot be read by its name; None for another kind."""
+    suffix = path.suffix.lower()
+    try:
+        with path.open("rb") as file:
+            head = file.read(HEAD_BYTES)
+    except OSError:
+        head = b""
+    if suffix == ROUND or head.startswith(b"\x89MCAP"):
+        return Kind.ROUND
+    found = _kind_of_content(head)
+    if found is Kind.IMAGE and suffix in MJPEG:
+        return Kind.FILM
+    if found is None and suffix in IMAGES:
+        return Kind.IMAGE
+    return Kind.FILM if found is None and suffix in FILMS else found
+
+
+def _kind_of_content(head: bytes) -> Kind | None:
+    if head[:4] == b"RIFF":
+        return {b"WEBP": Kind.IMAGE, b"AVI ": Kind.FILM}.get(head[8:12])
+    if head[4:8] in MP4_BOXES:
+        return Kind.IMAGE if head[8:12] in IMAGE_BRANDS else Kind.FILM
+    if head.startswith(IMAGE_STARTS):
+        return Kind.IMAGE
+    is_ts = any(head[first : first + 2 * step : step] == b"GG" for first, step in TS_PACKETS)
+    return Kind.FILM if is_ts or head.startswith(FILM_STARTS) else None
