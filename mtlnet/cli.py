@@ -216,7 +216,7 @@ def predict_command(
 
     from mtlnet.evaluation.tables import prediction_table
     from mtlnet.inference.rectification import Rectification, read_camera
-    from mtlnet.predict.run import predict_files
+    from mtlnet.predict.run import InputsLeftOut, predict_files
     from trackfeatures.errors import UserError
 
     if camera is not None and fov_y_deg is not None:
@@ -236,13 +236,19 @@ def predict_command(
                 command.printable(line), markup=False, highlight=False, soft_wrap=True
             )
 
-        predictions = predict_files(loaded, images, out or (), lens, report, note)
-    if as_json:
+        left_out: InputsLeftOut | None = None
+        try:
+            predictions = predict_files(loaded, images, out or (), lens, report, note)
+        except InputsLeftOut as error:
+            predictions, left_out = error.results, error
+    if as_json and predictions:
         typer.echo(json.dumps(predictions))
-    else:
+    elif predictions:
         Console().print(prediction_table(predictions[:MAX_PRINTED]))
         if len(predictions) > MAX_PRINTED:
             typer.echo(f"the first {MAX_PRINTED} images; --out features.csv has all", err=True)
+    if left_out is not None:
+        raise left_out
 
 
 def _print_model(name: str) -> None:

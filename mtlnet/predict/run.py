@@ -17,6 +17,14 @@ KEPT_ROWS = 10_000
 """Results returned at most; files get all."""
 
 
+class InputsLeftOut(UserError):
+    """Inputs or images that could not be used; `results` are those of all others."""
+
+    def __init__(self, message: str, results: list[dict[str, Any]]) -> None:
+        super().__init__(message)
+        self.results = results
+
+
 def predict_files(
     engine: Engine,
     inputs: Sequence[str],
@@ -30,9 +38,9 @@ def predict_files(
     Those of the first `KEPT_ROWS` are returned, all are written to each of `outputs`
     (`mtlnet.predict.writers.open_writer`), one image at a time. `lens`: of images and films; a
     recorded round must be of the model's camera. `report`: takes the numbers of images done and in
-    all. `note`: takes a line on what is left out, before the first image. Raises UserError, after
-    all others were done, when an input or an image could not be used; at once for outputs that
-    cannot be written or are among the files to read.
+    all. `note`: takes a line on what is left out, before the first image. Raises InputsLeftOut,
+    after all others were done, when an input or an image could not be used; UserError at once for
+    outputs that cannot be written or are among the files to read.
     """
     sources = find_sources(list(inputs), note)
     other = lens if isinstance(lens, Rectification) else None
@@ -70,5 +78,5 @@ def predict_files(
     if unusable:
         more = f" (and {len(unusable) - 1} more)" if len(unusable) > 1 else ""
         others = f"; {used} others were done" if used else ""
-        raise UserError(f"{unusable[0]}{more}{others}")
+        raise InputsLeftOut(f"{unusable[0]}{more}{others}", results)
     return results

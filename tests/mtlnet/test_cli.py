@@ -14,7 +14,7 @@ import simplejpeg
 
 from datagen.recording.splits import Split, split_path, write_split
 from mtlnet.inference.curves import read_curves
-from tests.typed import typed
+from tests.typed import error_line, typed
 
 
 def mtlnet(*arguments: object, folder: Path | None = None) -> subprocess.CompletedProcess[str]:
@@ -106,6 +106,27 @@ def test_files_that_are_no_images_are_refused(published: Path, tmp_path: Path) -
         (narrow, "c.jpg: the image is 100 x 210 px"),
     ]:
         assert seen in refused("predict", "--model", published, path)
+
+
+def test_images_beside_one_that_cannot_be_used_are_answered(
+    published: Path, tmp_path: Path
+) -> None:
+    good, bad, table = (tmp_path / name for name in ("good.jpg", "bad.jpg", "all.csv"))
+    good.write_bytes(simplejpeg.encode_jpeg(np.full((210, 280, 3), 90, np.uint8)))
+    bad.write_text("not an image at all")
+    given = ("predict", "--model", published, bad, good, tmp_path / "none.mp4")
+    done = mtlnet(*given, "--json", "--out", table)
+    assert done.returncode == 1
+    line = error_line(done)
+    assert "bad.jpg: no image file" in line
+    assert line.endswith("(and 1 more); 1 others were done")
+    (row,) = json.loads(done.stdout)
+    assert row["image"] == str(good)
+    assert [line.partition(",")[0] for line in table.read_text().splitlines()] == [
+        "image",
+        str(good),
+    ]
+    assert "heading" in mtlnet(*given).stdout  # of the table
 
 
 def test_wrong_options_of_training_are_refused(dataset: Path, tmp_path: Path) -> None:
