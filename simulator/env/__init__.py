@@ -19,7 +19,7 @@ import difflib
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NoReturn
 
 import gymnasium as gym
 import numpy as np
@@ -43,6 +43,10 @@ START_OPTIONS = ("s", "to_middle", "angle", "speed")
 
 class ResetNeeded(UserError, gym.error.ResetNeeded):
     """`step` was called before `reset` or after the end of an episode."""
+
+
+class NotCopyable(UserError, TypeError):
+    """An environment was to be copied or pickled."""
 
 
 @dataclass(frozen=True)
@@ -158,6 +162,13 @@ class LateralControl(gym.Env[Any, Any]):
         self._running = False
         self._renderer.close()
         self.world.close()
+
+    def __getstate__(self) -> NoReturn:
+        # A copy would share the physics and graphics of the original.
+        raise NotCopyable(
+            "an environment cannot be copied or pickled; make another one with the same options, "
+            "or pass a function that makes it"
+        )
 
     def _observe(
         self, state: CarState, ending: Ending | None

@@ -6,6 +6,7 @@ On llvmpipe the environment variable LP_NUM_THREADS, read by Mesa when the conte
 the drawing threads: 0 draws in the calling thread, which suits one worker process a core.
 """
 
+import atexit
 import ctypes
 import importlib.util
 import os
@@ -181,10 +182,12 @@ def _make(process: int) -> None:
         raise ForkedRendererError(FORKED)
     _begun.add(process)
     try:
-        _shared[process] = Graphics()
+        made = Graphics()
     except NoRendererError:
         _begun.discard(process)
         raise
+    atexit.register(made.turns.end)
+    _shared[process] = made
 
 
 def _renew_lock() -> None:

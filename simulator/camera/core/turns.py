@@ -15,6 +15,8 @@ from trackfeatures.errors import UserError
 Current = tuple[int | None, int | None, int | None, int | None]
 """What is current in a thread: display, surface drawn to, surface read from, context."""
 
+END_S: Final = 5.0
+"""The longest wait for another thread's picture at the end of the process."""
 _DRAW, _READ = 0x3059, 0x305A
 _LIBRARY: Final = os.environ.get("GLCONTEXT_LINUX_LIBEGL") or "libEGL.so.1"
 """The library that moderngl's backend loads."""
@@ -114,6 +116,12 @@ class Turns:
                         pass
             finally:
                 self._lock.release()
+
+    def end(self) -> None:
+        """At the end of the process, let no other thread draw any more: CPython aborts where it
+        stops a daemon thread inside OpenCV."""
+        if not self._inherited:
+            self._lock.acquire(timeout=END_S)
 
     @property
     def _inherited(self) -> bool:
