@@ -30,6 +30,7 @@ from simulator import register_environments
 from simulator.env.action import Controls, action_space, check_controls, to_command
 from simulator.env.observation import Kind, Observation, ObservationOptions, Observer
 from simulator.env.reward import Ending, EpisodeOptions
+from simulator.env.start import check_start
 from simulator.env.view_renderer import RenderOptions, ViewRenderer
 from simulator.track.catalogue import find_track
 from simulator.track.road import Road
@@ -38,7 +39,6 @@ from simulator.world.world import World
 from trackfeatures.errors import UserError
 
 RENDERING = {"render_modes": ["rgb_array"], "render_fps": 20}
-START_OPTIONS = ("s", "to_middle", "angle", "speed")
 
 
 class ResetNeeded(UserError, gym.error.ResetNeeded):
@@ -121,10 +121,7 @@ class LateralControl(gym.Env[Any, Any]):
         self, *, seed: int | None = None, options: Mapping[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
         super().reset(seed=seed)
-        start = dict(options or {})
-        unknown = sorted(set(start) - set(START_OPTIONS))
-        if unknown:
-            raise UserError(f"reset does not know the options {unknown}; it takes {START_OPTIONS}")
+        start = check_start(options or {}, self.world.road)
         episode = int(self.np_random.integers(2**31))
         state = self.world.reset(seed=episode, **start)
         self._observer.restart(episode)
