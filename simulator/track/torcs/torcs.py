@@ -29,7 +29,7 @@ def read_torcs(path: Path) -> Track:
     version = int(header.number("version") or 0) if header else 0
     if version not in SEGMENT_LISTS:
         raise TrackError(f"{path}: track format version {version}; versions 3 and 4 can be read")
-    width = main.number("width")
+    width = main.length("width")
     width = DEFAULT_WIDTH_M if width is None else width
     if not 1.0 <= width <= 100.0:
         raise TrackError(f"{path}: the track is {width:g} m wide, expected 1 to 100 m")
