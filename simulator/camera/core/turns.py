@@ -14,6 +14,7 @@ from trackfeatures.errors import UserError
 
 Current = tuple[int | None, int | None, int | None, int | None]
 """What is current in a thread: display, surface drawn to, surface read from, context."""
+NOTHING: Final[Current] = (None, None, None, None)
 
 END_S: Final = 5.0
 """The longest wait for another thread's picture at the end of the process."""
@@ -54,12 +55,14 @@ class Egl:
 
     def current(self) -> Current:
         """What is current in this thread."""
-        surfaces = self._surface(_DRAW), self._surface(_READ)
-        return self._display(), *surfaces, self._context()
+        context = self._context()
+        if context is None:
+            return NOTHING
+        return self._display(), self._surface(_DRAW), self._surface(_READ), context
 
     def give_back(self, own: Current, before: Current) -> None:
         """Make `before` current again, or nothing if nothing was, in place of `own`."""
-        self.make_current(before if before[3] else (own[0], None, None, None))
+        self.make_current(before if before is not NOTHING else (own[0], None, None, None))
 
     def make_current(self, wanted: Current) -> None:
         """Raises ContextError where EGL refuses."""
@@ -75,12 +78,12 @@ class Turns:
     """A `with` block makes the context current in its thread; other threads wait for its end.
 
     Blocks may be nested. At the end of the outermost, `free` is called, and what was current before
-    is so again, as another library expects it. A block costs 0.05 ms on llvmpipe.
+    is so again, as another library expects it. A block costs 0.03 ms on llvmpipe.
     """
 
     def __init__(self, egl: Egl, own: Current, free: Callable[[], object]) -> None:
         self._egl, self._own, self._free = egl, own, free
-        self._before: Current = (None, None, None, None)
+        self._before = NOTHING
         self._process = os.getpid()
         self._lock, self._depth = threading.RLock(), 0
 
