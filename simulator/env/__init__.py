@@ -19,7 +19,7 @@ import difflib
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NoReturn
 
 import gymnasium as gym
 import numpy as np
@@ -30,6 +30,7 @@ from simulator import register_environments
 from simulator.env.action import Controls, action_space, check_controls, to_command
 from simulator.env.observation import Kind, Observation, ObservationOptions, Observer
 from simulator.env.reward import Ending, EpisodeOptions
+from simulator.env.start import check_start
 from simulator.env.view_renderer import RenderOptions, ViewRenderer
 from simulator.track.catalogue import find_track
 from simulator.track.road import Road
@@ -38,11 +39,14 @@ from simulator.world.world import World
 from trackfeatures.errors import UserError
 
 RENDERING = {"render_modes": ["rgb_array"], "render_fps": 20}
-START_OPTIONS = ("s", "to_middle", "angle", "speed")
 
 
 class ResetNeeded(UserError, gym.error.ResetNeeded):
     """`step` was called before `reset` or after the end of an episode."""
+
+
+class NotCopyable(UserError, TypeError):
+    """An environment was to be copied or pickled."""
 
 
 @dataclass(frozen=True)
@@ -117,10 +121,7 @@ class LateralControl(gym.Env[Any, Any]):
         self, *, seed: int | None = None, options: Mapping[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
         super().reset(seed=seed)
-        start = dict(options or {})
-        unknown = sorted(set(start) - set(START_OPTIONS))
-        if unknown:
-            raise UserError(f"reset does not know the options {unknown}; it takes {START_OPTIONS}")
+        start = check_start(options or {}, self.world.road)
         episode = int(self.np_random.integers(2**31))
         state = self.world.reset(seed=episode, **start)
         self._observer.restart(episode)
@@ -158,6 +159,13 @@ class LateralControl(gym.Env[Any, Any]):
         self._running = False
         self._renderer.close()
         self.world.close()
+
+    def __getstate__(self) -> NoReturn:
+        # A copy would share the physics and graphics of the original.
+        raise NotCopyable(
+            "an environment cannot be copied or pickled; make another one with the same options, "
+            "or pass a function that makes it"
+        )
 
     def _observe(
         self, state: CarState, ending: Ending | None

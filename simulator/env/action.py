@@ -5,6 +5,7 @@ from typing import Any, Literal
 import gymnasium as gym
 import numpy as np
 
+from simulator.bounds import clip_rounding
 from simulator.vehicle.car import HIGHEST_GEAR, LOWEST_GEAR
 from simulator.vehicle.state import Command
 from trackfeatures.errors import UserError
@@ -36,23 +37,34 @@ def action_space(controls: Controls) -> gym.spaces.Box:
 
 
 def to_command(action: Any, controls: Controls) -> Command:
-    """The command for `action`; the gear is rounded. Raises UserError outside the action space."""
-    values = np.asarray(action, dtype=np.float64)
+    """The command for `action`; the gear is rounded. Values beyond their bounds by the rounding of
+    float32 are clipped. Raises UserError for what lies further outside the action space."""
     names = NAMES[controls]
+    try:
+        values = np.asarray(action, dtype=np.float64)
+    except (TypeError, ValueError, RuntimeError) as error:  # RuntimeError: of torch
+        raise UserError(f"the action {action!r} is no array of numbers: {error}") from error
     if values.shape != (len(names),):
         raise UserError(
             f"the action is {action!r}; give {len(names)} number(s), shape ({len(names)},): "
             f"{', '.join(names)}"
         )
     numbers = values.tolist()
-    for name, value in zip(names, numbers, strict=True):
+    for k, name in enumerate(names):
         low, high = LIMITS[name]
-        if not low <= value <= high:  # false for NaN too
-            raise UserError(
-                f"the action has {name} = {value:g}; give a finite number from {low:g} to "
-                f"{high:g} (gymnasium.wrappers.ClipAction clips for you)"
-            )
+        if not low <= numbers[k] <= high:  # false for NaN too
+            numbers[k] = _clip(name, numbers[k], low, high)
     if controls == "steer":
         return Command(steer=numbers[0], throttle=THROTTLE, gear=GEAR)
     steer, throttle, brake, gear = numbers
     return Command(steer=steer, throttle=throttle, brake=brake, gear=round(gear))
+
+
+def _clip(name: str, value: float, low: float, high: float) -> float:
+    clipped = clip_rounding(value, low, high)
+    if not low <= clipped <= high:
+        raise UserError(
+            f"the action has {name} = {value:.9g}; give a finite number from {low:g} to {high:g} "
+            "(gymnasium.wrappers.ClipAction clips for you)"
+        )
+    return clipped

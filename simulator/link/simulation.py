@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from simulator.env.reward import ending, step_reward
+from simulator.env.start import check_start
 from simulator.link.layout import ERROR_BYTES, Refusal, Request
 from simulator.link.message import read_command, write_ending, write_features, write_state
 from simulator.sensors.standard import read_range, read_track_range
@@ -87,13 +88,13 @@ class Simulation:
         seed, s = int(request["seed"]), float(request["start_s"])
         chosen = seed if seed >= 0 else self._seed + episode
         try:
-            state = self._world.reset(
-                seed=chosen,
-                s=None if math.isnan(s) else s,
-                to_middle=float(request["start_to_middle"]),
-                angle=float(request["start_angle"]),
-                speed=float(request["start_speed"]),
-            )
+            asked = {
+                "s": None if math.isnan(s) else s,
+                "to_middle": request["start_to_middle"],
+                "angle": request["start_angle"],
+                "speed": request["start_speed"],
+            }
+            state = self._world.reset(seed=chosen, **check_start(asked, self._world.road))
         except UserError as error:
             self._refuse(Refusal.BAD_RESET, str(error))
             return

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Final
 
 from simulator.track.errors import UnknownTrack
-from simulator.track.geometry import Track
+from simulator.track.geometry import Track, readable_name
 from trackfeatures.errors import UserError
 
 OWN_TRACKS: Final = Path(__file__).parent.parent / "tracks"
@@ -32,9 +32,10 @@ def find_track(name: str, tracks_dir: Path | None = None) -> Track:
             raise UnknownTrack(f"there is no track file {name}; check the path")
         return read_track(path)
     files = track_files(tracks_dir)
-    if name not in files:
-        raise UnknownTrack(_unknown(name, list(files)))
-    return read_track(files[name])
+    readable = readable_name(name)
+    if readable not in files:
+        raise UnknownTrack(_unknown(readable, list(files)))
+    return read_track(files[readable])
 
 
 def list_tracks(tracks_dir: Path | None = None) -> list[Track]:
@@ -66,7 +67,7 @@ def track_files(tracks_dir: Path | None = None) -> dict[str, Path]:
     files: dict[str, Path] = {}
     for folder in _folders(tracks_dir):
         for path in _files_in(folder):
-            files.setdefault(path.stem, path)
+            files.setdefault(readable_name(path.stem), path)
     return files
 
 

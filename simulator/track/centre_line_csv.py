@@ -14,7 +14,7 @@ from scipy.interpolate import splev, splprep
 from runtime.files import atomic_write
 from simulator.arrays import FloatArray
 from simulator.track.errors import TrackError
-from simulator.track.geometry import Track
+from simulator.track.geometry import Track, readable_name
 from simulator.track.markings import imported_style
 from simulator.track.pieces import Piece, Placed, assemble, check_closes
 from trackfeatures.errors import UserError
@@ -56,12 +56,12 @@ def read_centre_line(path: Path) -> Track:
         )
     return Track.from_placed(
         placed,
-        name=path.stem,
+        name=readable_name(path.stem),
         source="csv",
         width=width,
         surface="asphalt",
         look="circuit",
-        markings=imported_style(path.stem, kerbs=True),
+        markings=imported_style(readable_name(path.stem), kerbs=True),
     )
 
 

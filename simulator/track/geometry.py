@@ -5,6 +5,7 @@ y and to_middle in metres, left positive; headings in radians, counter-clockwise
 """
 
 import hashlib
+import re
 from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Literal, Self
@@ -19,6 +20,14 @@ from simulator.track.pieces import Placed
 
 Source = Literal["own", "torcs", "csv"]
 Surface = Literal["asphalt", "gravel", "concrete"]
+_UNDECODABLE = re.compile(r"[\ud800-\udfff]")
+"""What Python makes of bytes of a file name that are no UTF-8."""
+
+
+def readable_name(name: str) -> str:
+    """The name of a track whose file is called `name`: bytes that are no UTF-8 become U+FFFD, since
+    names are drawn, recorded and sent as text."""
+    return _UNDECODABLE.sub("\N{REPLACEMENT CHARACTER}", name)
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any, Final, cast, get_args
 
 from simulator.track.errors import TrackError
-from simulator.track.geometry import Surface, Track
+from simulator.track.geometry import Surface, Track, readable_name
 from simulator.track.layout import Bend, Segment, Straight, close, lay
 from simulator.track.markings import LineColour, MarkingStyle
 from simulator.track.pieces import assemble, check_closes
@@ -80,7 +80,7 @@ def read_toml_track(path: Path) -> Track:
     check_closes(placed, str(path), MAX_GAP_M)
     return Track.from_placed(
         placed,
-        name=path.stem,
+        name=readable_name(path.stem),
         source="own",
         width=width,
         surface=cast(Surface, table.choice("surface", get_args(Surface), "asphalt")),

@@ -1,6 +1,6 @@
 """The web server of a watched drive: one page, and one WebSocket a browser.
 
-A thread of its own, so that the drive keeps the main thread (and its OpenGL context).
+A thread of its own, so that the drive keeps the main thread.
 """
 
 import asyncio

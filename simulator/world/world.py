@@ -12,6 +12,7 @@ import numpy as np
 
 import trackfeatures as tf
 from simulator.arrays import FloatArray
+from simulator.bounds import clip_rounding
 from simulator.track.piece_table import foot_offset, index_at, surface
 from simulator.track.road import START_BEFORE_LINE_M, Road
 from simulator.traffic.traffic import Traffic
@@ -288,9 +289,12 @@ def _fill_controls(command: Command, controls: FloatArray) -> None:
     steer, throttle, brake, gear = command.steer, command.throttle, command.brake, command.gear
     # Comparisons with NaN are false, so these hold for it as well.
     if not (-1.0 <= steer <= 1.0 and 0.0 <= throttle <= 1.0 and 0.0 <= brake <= 1.0):
+        steer = clip_rounding(steer, -1.0, 1.0)
+        throttle, brake = clip_rounding(throttle, 0.0, 1.0), clip_rounding(brake, 0.0, 1.0)
+    if not (-1.0 <= steer <= 1.0 and 0.0 <= throttle <= 1.0 and 0.0 <= brake <= 1.0):
         raise UserError(
-            f"the command has steer = {steer}, throttle = {throttle}, brake = {brake}; "
-            "steer goes from -1 to 1, the others go from 0 to 1"
+            f"the command has steer = {steer:.9g}, throttle = {throttle:.9g}, "
+            f"brake = {brake:.9g}; steer goes from -1 to 1, the others go from 0 to 1"
         )
     if not LOWEST_GEAR <= gear <= HIGHEST_GEAR or gear != int(gear):
         raise UserError(f"the command has gear = {gear}; gears are -1, 0 and 1 to 6")

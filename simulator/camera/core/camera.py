@@ -64,9 +64,10 @@ class Camera:
     """Draws one scene: `road` with the scenery of `seed` under `light`.
 
     It keeps the last `scenes` scenes in graphics memory. Cameras of a process share one OpenGL
-    context (see `context`); use them from one thread. The same road, seed, light, pose and
-    cars give the same bytes on the same renderer.
-    Raises UserError for a picture size out of range, NoRendererError without EGL.
+    context (see `context`); any thread may use them, and they draw one after the other. The same
+    road, seed, light, pose and cars give the same bytes on the same renderer.
+    Raises UserError for a picture size out of range, NoRendererError without EGL, and
+    ForkedRendererError in a process that was forked from one with a camera.
     """
 
     def __init__(
@@ -83,12 +84,13 @@ class Camera:
         self.width, self.height = parameters.width, parameters.height
         self.intrinsics: FloatArray = parameters.intrinsics()
         self._graphics: Graphics = graphics()
-        self._cars = shared_cars(self._graphics)
         self._survey = Survey.of(road)
         self._cache_size = scenes
         self._cache: dict[tuple[int, Light], _LoadedScene] = {}
         self._current: _LoadedScene | None = None
         self._last_s: float | None = None
+        with self._graphics.turns:
+            self._cars = shared_cars(self._graphics)
         self.change_scene(seed, light)
 
     @property
@@ -98,15 +100,16 @@ class Camera:
 
     def change_scene(self, seed: int, light: Light) -> None:
         """Switch to the scenery of `seed` under `light`, on the same road."""
-        self._current = None
-        found = self._cache.pop((seed, light), None)
-        if found is None:
-            while len(self._cache) >= self._cache_size:
-                del self._cache[next(iter(self._cache))]
-            self._graphics.free_unused()
-            found = self._load_scene(seed, light)
-        # Least recently used first: that one is released next.
-        self._cache[seed, light] = self._current = found
+        with self._graphics.turns:
+            self._current = None
+            found = self._cache.pop((seed, light), None)
+            if found is None:
+                while len(self._cache) >= self._cache_size:
+                    del self._cache[next(iter(self._cache))]
+                self._graphics.free_unused()
+                found = self._load_scene(seed, light)
+            # Least recently used first: that one is released next.
+            self._cache[seed, light] = self._current = found
 
     def _load_scene(self, seed: int, light: Light) -> _LoadedScene:
         graphics = self._graphics
@@ -150,6 +153,12 @@ class Camera:
         return self._views(body_pose, others, {name: ViewRequest.of(name) for name in views})
 
     def _views(
+        self, body_pose: ArrayLike, others: ArrayLike | None, wanted: dict[str, ViewRequest]
+    ) -> dict[str, Picture]:
+        with self._graphics.turns:
+            return self._draw_views(body_pose, others, wanted)
+
+    def _draw_views(
         self, body_pose: ArrayLike, others: ArrayLike | None, wanted: dict[str, ViewRequest]
     ) -> dict[str, Picture]:
         taken: dict[ViewRequest, Picture] = {}
@@ -216,9 +225,10 @@ class Camera:
         )
 
     def close(self) -> None:
-        """Free the graphics memory; a closed camera cannot render."""
+        """Free the graphics memory, or leave it to the thread that is drawing; a closed camera
+        cannot render."""
         self._cache, self._current = {}, None
-        self._graphics.free_unused()
+        self._graphics.turns.free_if_idle()
 
     def __enter__(self) -> Self:
         return self

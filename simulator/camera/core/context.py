@@ -1,13 +1,17 @@
 """The one OpenGL context of a process: EGL without a window, on a GPU or on Mesa's llvmpipe.
 
+Every thread may draw, each in its turn (see `turns`).
+
 On llvmpipe the environment variable LP_NUM_THREADS, read by Mesa when the context is made, sets
 the drawing threads: 0 draws in the calling thread, which suits one worker process a core.
 """
 
+import atexit
 import ctypes
 import importlib.util
 import os
 import sys
+import threading
 from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,6 +21,7 @@ from numpy.typing import NDArray
 
 from simulator.camera.core.render_modes import CLASSES
 from simulator.camera.core.targets import GPU_SAMPLES, Target, Targets
+from simulator.camera.core.turns import FORKED, Egl, ForkedRendererError, Turns
 from simulator.camera.vegetation import foliage
 from trackfeatures.errors import UserError
 
@@ -56,11 +61,18 @@ class NoRendererError(UserError):
 
 
 class Graphics:
-    """Context, programs and textures that every camera of the process shares."""
+    """Context, programs and textures that every camera of the process shares.
+
+    All but `turns` is to be used inside a `with` block of `turns` only."""
 
     def __init__(self) -> None:
-        self.context = _create_context()
-        self.context.gc_mode = "context_gc"  # see `free_unused`
+        self.context, self.turns = _create_context()
+        with self.turns:
+            self._fill()
+
+    def _fill(self) -> None:
+        self.renderer = str(self.context.info["GL_RENDERER"])
+        """Name of the OpenGL renderer, such as "llvmpipe (LLVM 15.0.6, 256 bits)"."""
         self.programs = {name: self._program(name) for name in PROGRAMS}
         self.noise = self.texture(noise_tile())
         self.atlas = self.texture(foliage.atlas())
@@ -68,11 +80,6 @@ class Graphics:
         self.frame = self.context.buffer(reserve=FRAME_FLOATS * 4, dynamic=True)
         samples = 0 if "llvmpipe" in self.renderer else min(GPU_SAMPLES, self.context.max_samples)
         self.targets = Targets(self.context, samples)
-
-    @property
-    def renderer(self) -> str:
-        """Name of the OpenGL renderer, such as "llvmpipe (LLVM 15.0.6, 256 bits)"."""
-        return str(self.context.info["GL_RENDERER"])
 
     def begin(self, target: Target, labels: bool = False) -> None:
         """Clear `target` and make it the one that is drawn to."""
@@ -146,41 +153,76 @@ class Graphics:
         return texture
 
     def free_unused(self) -> None:
-        """Free the graphics memory of all objects that nothing refers to any more.
-
-        Not when Python drops them: a thread without the context, or a forked child, might."""
+        """Free the graphics memory of all objects that nothing refers to any more."""
         self.context.gc()
 
 
 _shared: dict[int, Graphics] = {}
+_begun: set[int] = set()
+"""Process ids, also of processes that this one was forked from, that have made a context."""
+_making = [threading.Lock()]
 
 
 def graphics() -> Graphics:
-    """This process's graphics, made on first use. Raises NoRendererError without EGL."""
-    # A forked child must not use its parent's context, hence the process id.
+    """This process's graphics, made on first use.
+
+    Raises NoRendererError without EGL, ForkedRendererError in a process that was forked from one
+    with graphics: Mesa's drawing threads are missing there, so that it would wait for ever.
+    """
     process = os.getpid()
     if process not in _shared:
-        _shared.clear()
-        _shared[process] = Graphics()
+        with _making[0]:
+            if process not in _shared:
+                _make(process)
     return _shared[process]
+
+
+def _make(process: int) -> None:
+    if _begun - {process}:
+        raise ForkedRendererError(FORKED)
+    _begun.add(process)
+    try:
+        made = Graphics()
+    except NoRendererError:
+        _begun.discard(process)
+        raise
+    atexit.register(made.turns.end)
+    _shared[process] = made
+
+
+def _renew_lock() -> None:
+    """A thread that was not forked may have held the lock."""
+    _making[0] = threading.Lock()
+
+
+os.register_at_fork(after_in_child=_renew_lock)
 
 
 def _source(name: str) -> str:
     return (resources.files("simulator.camera") / "shaders" / name).read_text()
 
 
-def _create_context() -> "moderngl.Context":
+def _create_context() -> "tuple[moderngl.Context, Turns]":
+    """A new context and its turns; what is current in this thread does not change."""
     import moderngl
 
     settings: dict[str, Any] = {"backend": "egl"}
     _load_triton_first()
     try:
-        return moderngl.create_context(require=330, standalone=True, **settings)
+        egl = Egl()
+        before = egl.current()
+        context = moderngl.create_context(require=330, standalone=True, **settings)
     except Exception as error:  # moderngl and glcontext raise bare Exception, ImportError, ...
         raise NoRendererError(
             f"no OpenGL 3.3 through EGL on this machine ({error}); "
             "install it with: apt-get install libegl1 libgl1-mesa-dri"
         ) from error
+    # Objects that Python drops are freed in a turn: another thread, or a forked child, might drop
+    # them.
+    context.gc_mode = "context_gc"
+    own = egl.current()
+    egl.give_back(own, before)
+    return context, Turns(egl, own, free=context.gc)
 
 
 def _load_triton_first() -> None:

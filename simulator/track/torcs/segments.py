@@ -5,7 +5,7 @@ one (`profil`). Attributes that TORCS does not know (misspelt ones, too) have no
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Final
 
@@ -36,7 +36,7 @@ class Profile:
 
 def read_pieces(segments: Section, main: Section, width: float) -> Iterator[Piece]:
     """The pieces of all segments in order, each segment cut into its profile steps."""
-    global_step = main.number("profil steps length") or 0.0
+    global_step = main.length("profil steps length") or 0.0
     profile = Profile(end=np.zeros(2), tangent=np.zeros(2))
     for segment in segments.sections():
         if segment.text("type") is not None:
@@ -66,7 +66,7 @@ def _plan(segment: Section) -> tuple[int, float, float, float]:
     """Turning sign (1 left, 0 straight, -1 right), start and end radius, centre-line length."""
     kind = segment.text("type")
     if kind == "str":
-        length = segment.number("lg") or 0.0
+        length = segment.length("lg") or 0.0
         _check_length(segment, "lg", length)
         return 0, math.inf, math.inf, length
     if kind not in ("lft", "rgt"):
@@ -74,8 +74,8 @@ def _plan(segment: Section) -> tuple[int, float, float, float]:
             f"{segment.file}: segment {segment.name!r} has the type {kind!r}, "
             "expected str, lft or rgt"
         )
-    radius = segment.number("radius") or 0.0
-    radius_end = segment.number("end radius")
+    radius = segment.length("radius") or 0.0
+    radius_end = segment.length("end radius")
     radius_end = radius if radius_end is None else radius_end
     arc = segment.number("arc") or 0.0
     for name, value in (("radius", radius), ("end radius", radius_end), ("arc", arc)):
@@ -102,13 +102,13 @@ def _end_heights(
     segment: Section, profile: Profile, width: float, length: float
 ) -> tuple[Edges, Edges]:
     """Heights of both edges at the start and at the end of a segment."""
-    start = _edges(segment, "z start", profile.end)
-    end = _edges(segment, "z end", profile.end)
+    start = _edges(segment.length, "z start", profile.end)
+    end = _edges(segment.length, "z end", profile.end)
     grade = segment.number("grade")
     if grade is not None:
         profile.grade = grade
     middle_start, middle_end = _mean(start), _mean(end)
-    if segment.number("z end") is None and profile.grade is not None:
+    if segment.length("z end") is None and profile.grade is not None:
         middle_end = middle_start + length * profile.grade
     return (
         _banked(middle_start, start, segment.number("banking start"), width),
@@ -116,10 +116,10 @@ def _end_heights(
     )
 
 
-def _edges(segment: Section, name: str, default: Edges) -> Edges:
+def _edges(read: Callable[[str], float | None], name: str, default: Edges) -> Edges:
     """The attribute `name`, for both edges or for one by one, else `default`."""
-    left, right = (segment.number(f"{name} {side}") for side in ("left", "right"))
-    both = segment.number(name)
+    left, right = (read(f"{name} {side}") for side in ("left", "right"))
+    both = read(name)
     if both is not None:
         return np.array([both, both])
     return np.array([_or(left, default[0]), _or(right, default[1])])
@@ -138,7 +138,7 @@ def _banked(middle: float, edges: Edges, banking: float | None, width: float) ->
 def _step_count(segment: Section, length: float, global_step: float) -> int:
     steps = int(_or(segment.number("profil steps"), 1.0))
     if steps == 1:
-        step_length = _or(segment.number("profil steps length"), global_step)
+        step_length = _or(segment.length("profil steps length"), global_step)
         if step_length > 0.0:
             steps = int(min(length / step_length, MAX_STEPS)) + 1
     if not 1 <= steps <= MAX_STEPS:
@@ -158,8 +158,8 @@ def _tangents(
         return chord, chord
     previous = profile.tangent
     return (
-        _edges(segment, "profil start tangent", previous),
-        _edges(segment, "profil end tangent", previous),
+        _edges(segment.number, "profil start tangent", previous),
+        _edges(segment.number, "profil end tangent", previous),
     )
 
 

@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Final
 
 from simulator.track.errors import TrackError
-from simulator.track.geometry import Track
+from simulator.track.geometry import Track, readable_name
 from simulator.track.markings import imported_style
 from simulator.track.pieces import Piece, assemble, check_closes
 from simulator.track.torcs.appearance import has_kerbs, surface_and_look
@@ -29,7 +29,7 @@ def read_torcs(path: Path) -> Track:
     version = int(header.number("version") or 0) if header else 0
     if version not in SEGMENT_LISTS:
         raise TrackError(f"{path}: track format version {version}; versions 3 and 4 can be read")
-    width = main.number("width")
+    width = main.length("width")
     width = DEFAULT_WIDTH_M if width is None else width
     if not 1.0 <= width <= 100.0:
         raise TrackError(f"{path}: the track is {width:g} m wide, expected 1 to 100 m")
@@ -42,15 +42,15 @@ def read_torcs(path: Path) -> Track:
         raise TrackError(f"{path}: no segments, so the track has no length")
     placed = assemble(pieces, y=width / 2.0)
     check_closes(placed, str(path))
-    surface, look = surface_and_look(path.stem, root, main, placed)
+    surface, look = surface_and_look(readable_name(path.stem), root, main, placed)
     return Track.from_placed(
         placed,
-        name=path.stem,
+        name=readable_name(path.stem),
         source="torcs",
         width=width,
         surface=surface,
         look=look,
-        markings=imported_style(path.stem, kerbs=has_kerbs(main)),
+        markings=imported_style(readable_name(path.stem), kerbs=has_kerbs(main)),
     )
 
 

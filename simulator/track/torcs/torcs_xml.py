@@ -16,21 +16,14 @@ from defusedxml import DefusedXmlException
 from defusedxml.ElementTree import DefusedXMLParser
 
 from simulator.track.errors import TrackError
+from simulator.track.torcs.units import LENGTH, RATIO, UNITS, Dimension, parse_unit
 
 MAX_BYTES: Final = 4 * 2**20
 """The largest track of TORCS 1.3.7 has 180 kB."""
 
-UNITS: Final = {
-    "": 1.0,
-    "none": 1.0,
-    "SI": 1.0,
-    "m": 1.0,
-    "rad": 1.0,
-    "ft": 0.304801,  # as the program has it, not 0.3048
-    "deg": math.pi / 180.0,
-    "%": 0.01,
-}
-
+_NUMBER = re.compile(
+    r"\s*(0[xX][0-9a-fA-F]+|[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*", re.ASCII
+)
 _STANDARD = r"default-(?:surfaces|objects)"
 _DECLARATION = re.compile(rf"<!ENTITY\s+{_STANDARD}\s+SYSTEM\s+(?:\"[^\"]*\"|'[^']*')\s*>")
 _REFERENCE = re.compile(rf"&{_STANDARD};")
@@ -57,27 +50,36 @@ class Section:
         """The first direct subsection of that name."""
         return next((child for child in self.sections() if child.name == name), None)
 
+    def length(self, name: str) -> float | None:
+        """An `attnum` in m, None where absent; TrackError unless it is a finite number in a unit of
+        length, or without a unit."""
+        return self._number(name, LENGTH, "a length")
+
     def number(self, name: str) -> float | None:
-        """An `attnum` in SI units, None where absent; TrackError unless it is a finite number."""
+        """An `attnum` that is an angle (rad), a slope or a plain number, as `length`."""
+        return self._number(name, RATIO, "an angle, a ratio or a plain number")
+
+    def _number(self, name: str, dimension: Dimension, expected: str) -> float | None:
         attribute = self._attribute("attnum", name)
         if attribute is None:
             return None
         text, unit = attribute.get("val", ""), attribute.get("unit", "")
-        try:
-            value = float(text)
-        except ValueError:
-            value = math.nan
+        where = f"{self.file}: section {self.name!r}: {name}"
+        value = _number_in(text)
         if not math.isfinite(value):
+            raise TrackError(f"{where} is {text!r}, expected a finite number such as 12.5")
+        try:
+            read = parse_unit(unit)
+        except KeyError as error:
             raise TrackError(
-                f"{self.file}: section {self.name!r}: {name} is {text!r}, expected a finite number"
-            )
-        if unit not in UNITS:
-            known = ", ".join(repr(u) for u in UNITS if u)
-            raise TrackError(
-                f"{self.file}: section {self.name!r}: {name} has the unit {unit!r}, "
-                f"expected one of {known}"
-            )
-        return value * UNITS[unit]
+                f"{where} has the unit {unit!r}, and TORCS has no {error}; "
+                f"it has {', '.join(UNITS)}, and products of them as in 'kg.m/s2'"
+            ) from None
+        if read is None:
+            return value
+        if read.dimension != dimension:
+            raise TrackError(f"{where} has the unit {unit!r}, expected {expected}")
+        return value * read.factor
 
     def text(self, name: str) -> str | None:
         """An `attstr`, None where absent."""
@@ -87,6 +89,17 @@ class Section:
     def _attribute(self, kind: str, name: str) -> Element | None:
         # The first one wins where a name is given twice: so the program has ruudskogen's heights.
         return next((c for c in self.element.findall(kind) if c.get("name") == name), None)
+
+
+def _number_in(text: str) -> float:
+    """The number, decimal or hexadecimal ("0x1f"), that is all of `text`; NaN if it is none.
+
+    TORCS reads "1,5" and "1.5.2" as far as it can, and an empty text as 0; these are refused."""
+    found = _NUMBER.fullmatch(text)
+    if found is None:
+        return math.nan
+    digits = found[1]
+    return float(int(digits, 16)) if digits[:2] in ("0x", "0X") else float(digits)
 
 
 def read_parameter_file(path: Path) -> Section:

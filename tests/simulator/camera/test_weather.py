@@ -205,9 +205,11 @@ def test_dry_lights_use_shaders_without_weather() -> None:
     from simulator.camera.core.context import WEATHER_PROGRAMS, graphics
 
     shared = graphics()
-    for name in WEATHER_PROGRAMS:
-        assert shared.weather_program(name, "") == name
-        for kind in WEATHERS:
-            assert shared.weather_program(name, kind) != name
-            assert shared.programs[shared.weather_program(name, kind)] is not shared.programs[name]
+    with shared.turns:
+        for name in WEATHER_PROGRAMS:
+            assert shared.weather_program(name, "") == name
+            for kind in WEATHERS:
+                variant = shared.weather_program(name, kind)
+                assert variant != name
+                assert shared.programs[variant] is not shared.programs[name]
     assert light("clear").falling == 0.0

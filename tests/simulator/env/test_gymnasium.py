@@ -13,6 +13,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import simulator.env  # registers the names
+from simulator.env.action import Controls, to_command
 from simulator.env.reward import quadratic_reward, step_reward
 from simulator.sensors import Sensor
 from simulator.vehicle.car import CarParameters
@@ -199,6 +200,9 @@ def test_a_vector_environment_equals_two_single_environments() -> None:
         ([0.0, 1.1, 0.0, 1.0], "throttle = 1.1"),
         ([0.0, 0.0, -0.5, 1.0], "brake = -0.5"),
         ([0.0, 0.0, 0.0, 7.0], "gear = 7"),
+        ([1.00001], "steer = 1.00001001; give a finite number from -1 to 1"),
+        ([0.0, -0.00001, 0.0, 1.0], "throttle = -9.9999997"),
+        ([0.0, 0.0, 0.0, 6.0001], "gear = 6.0001"),
     ],
 )
 def test_bad_actions_are_refused(action: list[float], message: str) -> None:
@@ -206,6 +210,84 @@ def test_bad_actions_are_refused(action: list[float], message: str) -> None:
     env.reset(seed=0)
     with pytest.raises(UserError, match=message):
         env.unwrapped.step(np.array(action, np.float32))
+    env.close()
+
+
+@pytest.mark.parametrize(
+    ("action", "bound"),
+    [
+        (np.array([1.0000001], np.float32), [1.0]),
+        (np.nextafter(np.array([-1.0], np.float32), np.float32(-2.0)), [-1.0]),
+        ([-1.0 - 1e-6], [-1.0]),
+        (np.array([0.0, -1e-8, 1.0000001, 6.0000005], np.float32), [0.0, 0.0, 1.0, 6.0]),
+        (np.array([-1.0000002, 1.0000004, -1e-7, -1.0000001], np.float32), [-1.0, 1.0, 0.0, -1.0]),
+        ([1], [1.0]),
+        (np.array([True]), [1.0]),
+    ],
+)
+def test_actions_beyond_a_bound_by_rounding_are_clipped(action: Any, bound: list[float]) -> None:
+    controls: Controls = "full" if len(bound) == 4 else "steer"
+    command = to_command(action, controls)
+    assert command == to_command(np.array(bound), controls)
+    env = make(controls=controls)
+    env.reset(seed=0)
+    assert env.action_space.contains(np.array(bound, np.float32))
+    observation, *_ = env.step(action)
+    assert env.observation_space.contains(observation)
+    env.close()
+
+
+@pytest.mark.parametrize(
+    ("action", "message"),
+    [
+        (0.5, r"the action is 0.5; give 1 number\(s\), shape \(1,\): steer"),
+        (np.zeros((1, 1), np.float32), "shape"),
+        ([], "shape"),
+        (None, "shape"),
+        ("left", "'left' is no array of numbers"),
+        (["left"], "no array of numbers"),
+        ([[0.0], [0.0, 1.0]], "no array of numbers"),
+        ({"steer": 0.0}, "no array of numbers"),
+        ([1.00000212], "steer = 1.00000212"),
+    ],
+)
+def test_actions_of_another_kind_are_refused(action: Any, message: str) -> None:
+    with pytest.raises(UserError, match=message):
+        to_command(action, "steer")
+
+
+def test_start_options_at_their_bounds_and_of_other_kinds() -> None:
+    env = make(lane_width=4.1)
+    world = env.unwrapped.world  # type: ignore[attr-defined]
+    edge = world.road.edge
+    for given in (np.nextafter(np.float32(edge), np.float32(99.0)), -edge - 1e-6, edge):
+        env.reset(seed=0, options={"to_middle": given})
+        assert abs(world.state.to_middle) == pytest.approx(edge, abs=1e-9)
+    given_starts: list[dict[str, Any]] = [
+        {"s": np.float32(world.road.track.length_m), "speed": np.float32(150.00001)},
+        {"s": None, "angle": np.float64(math.pi), "to_middle": 1},
+    ]
+    for options in given_starts:
+        observation, _ = env.reset(seed=0, options=options)
+        assert env.observation_space.contains(observation)
+    # Rounded to float32 once, not in each formula.
+    env.reset(seed=0, options={"angle": np.float32(0.1), "to_middle": np.float32(0.3)})
+    taken = world.state
+    env.reset(
+        seed=0, options={"angle": float(np.float32(0.1)), "to_middle": float(np.float32(0.3))}
+    )
+    assert world.state == taken
+    refused: list[tuple[dict[Any, Any], str]] = [
+        ({"to_middle": edge + 1e-3}, "the road ends"),
+        ({"speed": 150.001}, "give m/s between"),
+        ({"angle": "left"}, "reset got angle = 'left'; give a number"),
+        ({"to_middle": math.nan}, "give a finite number"),
+        ({"s": math.inf}, "give a finite number"),
+        ({1: 2.0}, "does not know"),
+    ]
+    for bad, message in refused:
+        with pytest.raises(UserError, match=message):
+            env.reset(seed=0, options=bad)
     env.close()
 
 

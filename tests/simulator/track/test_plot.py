@@ -1,5 +1,6 @@
 """The command `simulator tracks plot`: contents of the figure, and one-line errors."""
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -76,6 +77,29 @@ def test_a_name_with_dollar_signs_is_not_a_formula(tmp_path: Path) -> None:
     path.write_bytes((OWN_TRACKS / "oval.toml").read_bytes())
     write_plot(Road(find_track(str(path))), tmp_path / "odd.png")
     assert (tmp_path / "odd.png").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize(
+    ("file", "name"),
+    [
+        (b"caf\xe9.xml", "caf\ufffd"),  # Latin-1
+        (b"\xff\xfe one.xml", "\ufffd\ufffd one"),
+        ("Ångström 日.xml".encode(), "Ångström 日"),
+    ],
+)
+@pytest.mark.filterwarnings("ignore:Glyph")
+def test_tracks_in_files_of_any_name_are_found_and_drawn(
+    tmp_path: Path, file: bytes, name: str
+) -> None:
+    folder = Path(os.fsdecode(bytes(tmp_path) + b"/my tr\xe9cks"))
+    folder.mkdir()
+    path = folder / os.fsdecode(file)
+    path.write_text((Path(__file__).parent / "fixtures" / "sticky-grade.xml").read_text())
+    for given in (path.stem, name, str(path)):
+        track = find_track(given, folder)
+        assert track.name == name
+    write_plot(Road(track, 1), path.with_suffix(".png"))
+    assert path.with_suffix(".png").read_bytes()[1:4] == b"PNG"
 
 
 def test_the_command_writes_a_png(tmp_path: Path) -> None:

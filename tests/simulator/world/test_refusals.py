@@ -107,3 +107,17 @@ def test_use_before_the_first_reset_is_refused() -> None:
         for use in (world.features, world.body_pose, lambda: world.state):
             with pytest.raises(UserError, match="call reset"):
                 use()
+
+
+def test_commands_beyond_a_bound_by_the_rounding_of_float32_are_clipped() -> None:
+    states = []
+    for beyond in (0.0, 1e-6):
+        with World(road()) as world:
+            world.reset(seed=0, speed=10.0)
+            world.step(Command(-1.0 - beyond, 1.0 + beyond, -beyond, 2))
+            states.append(world.step(Command(1.0 + beyond, -beyond, 1.0 + beyond, 2)))
+    assert states[0] == states[1]
+    with World(road()) as world:
+        world.reset(seed=0)
+        with pytest.raises(UserError, match=r"steer = 1\.00001, throttle = 0"):
+            world.step(Command(steer=1.00001))

@@ -1,0 +1,131 @@
+"""Which thread may use the process's one OpenGL context: each in its turn, a forked child never.
+
+OpenGL acts on the context that is current in the calling thread. Without one it does nothing and
+reports nothing: a picture drawn in another thread would be black, or the one before.
+"""
+
+import ctypes
+import os
+import threading
+from collections.abc import Callable
+from typing import Final
+
+from trackfeatures.errors import UserError
+
+Current = tuple[int | None, int | None, int | None, int | None]
+"""What is current in a thread: display, surface drawn to, surface read from, context."""
+NOTHING: Final[Current] = (None, None, None, None)
+
+END_S: Final = 5.0
+"""The longest wait for another thread's picture at the end of the process."""
+_DRAW, _READ = 0x3059, 0x305A
+_LIBRARY: Final = os.environ.get("GLCONTEXT_LINUX_LIBEGL") or "libEGL.so.1"
+"""The library that moderngl's backend loads."""
+
+
+class ForkedRendererError(UserError):
+    """This process was forked from one that had used OpenGL already, so it cannot draw."""
+
+
+FORKED: Final = (
+    "this process was forked after its parent had drawn a picture, and OpenGL does not survive a "
+    'fork; start it with the method "spawn" or "forkserver", such as AsyncVectorEnv(..., '
+    'context="spawn"), SubprocVecEnv(..., start_method="spawn") or '
+    'multiprocessing.get_context("spawn"), or start it before the first picture'
+)
+
+
+class ContextError(UserError):
+    """The OpenGL context cannot be made current in this thread."""
+
+
+class Egl:
+    """The calls of EGL that ask and set what is current. Raises OSError without the library."""
+
+    def __init__(self) -> None:
+        library = ctypes.CDLL(_LIBRARY)
+        pointer = ctypes.c_void_p
+        self._display = library.eglGetCurrentDisplay
+        self._surface = library.eglGetCurrentSurface
+        self._context = library.eglGetCurrentContext
+        self._make_current, self._error = library.eglMakeCurrent, library.eglGetError
+        for ask in (self._display, self._surface, self._context):
+            ask.restype = pointer
+        self._make_current.argtypes = [pointer] * 4
+
+    def current(self) -> Current:
+        """What is current in this thread."""
+        context = self._context()
+        if context is None:
+            return NOTHING
+        return self._display(), self._surface(_DRAW), self._surface(_READ), context
+
+    def give_back(self, own: Current, before: Current) -> None:
+        """Make `before` current again, or nothing if nothing was, in place of `own`."""
+        self.make_current(before if before is not NOTHING else (own[0], None, None, None))
+
+    def make_current(self, wanted: Current) -> None:
+        """Raises ContextError where EGL refuses."""
+        if not self._make_current(*wanted):
+            raise ContextError(
+                "the OpenGL context cannot be made current in this thread (EGL error "
+                f"{self._error():#06x}); if another library has a window's context here, draw in "
+                "a thread of its own"
+            )
+
+
+class Turns:
+    """A `with` block makes the context current in its thread; other threads wait for its end.
+
+    Blocks may be nested. At the end of the outermost, `free` is called, and what was current before
+    is so again, as another library expects it. A block costs 0.03 ms on llvmpipe.
+    """
+
+    def __init__(self, egl: Egl, own: Current, free: Callable[[], object]) -> None:
+        self._egl, self._own, self._free = egl, own, free
+        self._before = NOTHING
+        self._process = os.getpid()
+        self._lock, self._depth = threading.RLock(), 0
+
+    def __enter__(self) -> None:
+        if self._inherited:  # a thread that was not forked may hold the lock
+            raise ForkedRendererError(FORKED)
+        self._lock.acquire()
+        try:
+            if self._depth == 0:
+                self._before = self._egl.current()
+                self._egl.make_current(self._own)
+        except BaseException:
+            self._lock.release()
+            raise
+        self._depth += 1
+
+    def __exit__(self, *_: object) -> None:
+        self._depth -= 1
+        try:
+            if self._depth == 0:
+                self._free()
+                self._egl.give_back(self._own, self._before)
+        finally:
+            self._lock.release()
+
+    def free_if_idle(self) -> None:
+        """Call `free` now, or leave it to the block that is open. It never waits, so that the
+        garbage collector can call it in any thread; in a forked child it does nothing."""
+        if not self._inherited and self._lock.acquire(blocking=False):
+            try:
+                if self._depth == 0:
+                    with self:
+                        pass
+            finally:
+                self._lock.release()
+
+    def end(self) -> None:
+        """At the end of the process, let no other thread draw any more: CPython aborts where it
+        stops a daemon thread inside OpenCV."""
+        if not self._inherited:
+            self._lock.acquire(timeout=END_S)
+
+    @property
+    def _inherited(self) -> bool:
+        return self._process != os.getpid()

@@ -1,0 +1,34 @@
+"""Where an episode starts: the options of `reset`."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from simulator.bounds import clip_rounding
+from simulator.track.road import Road
+from simulator.world.world import MAX_START_SPEED_M_S
+from trackfeatures.errors import UserError
+
+OPTIONS = ("s", "to_middle", "angle", "speed")
+
+
+def check_start(options: Mapping[str, Any], road: Road) -> dict[str, float]:
+    """The arguments of `World.reset` for `options`: floats, clipped where they exceed a bound by
+    the rounding of float32. An option that is None is left out.
+
+    Raises UserError for an unknown option, and for what is no number.
+    """
+    unknown = sorted(str(name) for name in options if name not in OPTIONS)
+    if unknown:
+        raise UserError(f"reset does not know the options {unknown}; it takes {OPTIONS}")
+    start = {name: _number(name, value) for name, value in options.items() if value is not None}
+    for name, bound in (("to_middle", road.edge), ("speed", MAX_START_SPEED_M_S)):
+        if name in start:
+            start[name] = clip_rounding(start[name], -bound, bound)
+    return start
+
+
+def _number(name: str, value: Any) -> float:
+    try:
+        return float(value)
+    except (TypeError, ValueError):
+        raise UserError(f"reset got {name} = {value!r}; give a number") from None
