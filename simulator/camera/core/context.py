@@ -215,7 +215,7 @@ def _create_context() -> "tuple[moderngl.Context, Turns]":
     except Exception as error:  # moderngl and glcontext raise bare Exception, ImportError, ...
         raise NoRendererError(
             f"no OpenGL 3.3 through EGL on this machine ({error}); "
-            "install it with: apt-get install libegl1 libgl1-mesa-dri"
+            "install it with: apt-get install libegl1 libgl1 libgl1-mesa-dri"
         ) from error
     # Objects that Python drops are freed in a turn: another thread, or a forked child, might drop
     # them.

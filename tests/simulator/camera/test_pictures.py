@@ -205,7 +205,7 @@ def test_error_without_egl_names_the_packages_to_install(monkeypatch: pytest.Mon
         raise ImportError("libEGL.so not loaded")
 
     monkeypatch.setattr(moderngl, "create_context", refuse)
-    with pytest.raises(UserError, match="apt-get install libegl1 libgl1-mesa-dri"):
+    with pytest.raises(UserError, match="apt-get install libegl1 libgl1 libgl1-mesa-dri"):
         camera_context.Graphics()
 
 

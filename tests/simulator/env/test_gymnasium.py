@@ -122,6 +122,7 @@ def test_leaving_the_track_ends_the_episode_with_minus_two() -> None:
     env.close()
 
 
+@pytest.mark.contacts
 def test_a_collision_ends_the_episode_with_minus_two() -> None:
     env = make(track="oval", traffic=1, controls="full")
     _, info = env.reset(seed=0, options={"speed": 20.0})

@@ -185,8 +185,9 @@ def test_a_reward_that_is_not_finite_is_refused() -> None:
     ("ends", "expected"),
     [
         (("off_track", "backwards", "collision"), "off_track"),
-        (("collision",), "collision"),  # with the wall behind the verge
-        ((), ""),
+        # With the wall behind the verge.
+        pytest.param(("collision",), "collision", marks=pytest.mark.contacts),
+        pytest.param((), "", marks=pytest.mark.contacts),
     ],
 )
 def test_only_events_in_ends_terminate_an_episode(ends: tuple[str, ...], expected: str) -> None:

@@ -110,6 +110,7 @@ def test_a_bad_start_is_refused_and_the_episode_goes_on(
         assert link.step(Command()).step == 2
 
 
+@pytest.mark.contacts  # in the step that ends it
 def test_a_step_needs_an_episode_that_has_not_ended(oval: str) -> None:
     with Link(oval, wait_s=WAIT_S) as link:
         with pytest.raises(LinkError, match="ask for a reset first"):
