@@ -90,11 +90,13 @@ class Client:
         *,
         stream: str | None = None,
         deadline_s: float | None = None,
+        fov_y_deg: float | None = None,
     ) -> dict[str, Any]:
         """The track features of a JPEG or PNG file, `image` being its bytes.
 
         The members are those of POST /features. `content_type` None: detected from the first bytes.
-        `stream`: a newer frame of this stream replaces this one. With `deadline_s` (from now) the
+        `stream`: a newer frame of this stream replaces this one. `fov_y_deg`: the vertical field of
+        view of the image; None: that of the model's camera. With `deadline_s` (from now) the
         service drops the frame when it is late, and the request is retried until then where that
         may help (the service is overloaded, not ready, or restarting). Raises ServiceError.
         """
@@ -105,6 +107,8 @@ class Client:
             headers["X-Frame-Id"] = frame_id
         if stream is not None:
             headers["X-Stream-Id"] = stream
+        if fov_y_deg is not None:
+            headers["X-Camera-Fov-Y"] = str(float(fov_y_deg))
         _check_headers(headers)
         if deadline_s is None:
             return self._request("POST", "/features", image, headers)

@@ -345,6 +345,7 @@ class GuardedProtocol(HttpToolsProtocol):
         self.abandon_requests()
         if self.transport.is_closing():
             return
-        reply = problem_reply(problem, (b"connection", b"close"))
+        url = getattr(self, "url", b"").decode("latin-1")  # none before the first request
+        reply = problem_reply(problem, (b"connection", b"close"), path=url)
         self.transport.write(encode_head(reply) + reply.body)
         self.transport.write_eof()  # aborted at once, a client still sending would lose the reply

@@ -228,7 +228,7 @@ class Served:
         content = response.read()
         found = {name.lower(): value for name, value in response.getheaders()}
         is_json = "json" in found.get("content-type", "")
-        return Reply(response.status, found, json.loads(content) if is_json else content)
+        return Reply(response.status, found, json.loads(content or b"null") if is_json else content)
 
     def post(self, body: Any, kind: str | None = "image/jpeg", **headers: str) -> Reply:
         sent = {name.replace("_", "-"): value for name, value in headers.items()}

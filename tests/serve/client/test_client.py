@@ -90,6 +90,9 @@ def test_answers_are_those_of_the_service(service: Served) -> None:
         assert answer["distances_m"]["ml"] == pytest.approx(-2.0, abs=1e-5)
         assert answer["frame_id"] == "17"
         assert client.features(PNG)["model"] == CARD.model_hash
+        assert client.features(JPEG, fov_y_deg=90)["crop_px"] is not None
+        with pytest.raises(ServiceError, match="field of view"):
+            client.features(JPEG, fov_y_deg=20.5)
         assert client.model()["camera"]["width"] == 280
     assert Client(f"127.0.0.1:{service.port}").ready()
 
@@ -134,6 +137,7 @@ def test_asyncio_clients_ask_concurrently(service: Served) -> None:
             assert (await client.model())["model"] == CARD.model_hash
             with pytest.raises(ServiceError, match="4 bytes"):
                 await client.features(b"text")
+            assert (await client.features(JPEG, fov_y_deg=90))["crop_px"] is not None
             return await client.features(JPEG, frame_id=str(number), deadline_s=60)
 
     async def crowd() -> list[dict[str, Any]]:
