@@ -139,6 +139,11 @@ def head_too_large() -> Problem:
     return Problem(HEAD_TOO_LARGE, f"the headers have more than {MAX_HEAD_BYTES} bytes; send fewer")
 
 
+def stopping() -> Problem:
+    """The problem of a request that arrives while the service stops."""
+    return Problem(NOT_READY, "the service stops or restarts; ask again on a new connection")
+
+
 def small_chunks(size: int) -> Problem:
     """The problem of a body in hundreds of chunks of fewer bytes."""
     return Problem(
