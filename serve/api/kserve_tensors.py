@@ -206,6 +206,8 @@ async def _read_base64(tensor: Tensor) -> bytes:
     parts = []
     try:
         if data.find(b"\\", start) >= 0:
+            if len(text) > WINDOW_BYTES:
+                await asyncio.sleep(PAUSE_S)  # to read the escapes of 4 MiB takes 10 ms
             text = memoryview(msgspec.json.decode(data[start:end], type=str).encode())
         for window in range(0, len(text), WINDOW_BYTES):
             if window:

@@ -33,7 +33,7 @@ from serve.server import guard as guards
 from serve.server.guard import ConnectionGuard, Group
 
 SLICE_BYTES = 4096  # parsed before small frames are counted; holds hundreds of them
-SMALL_BYTES = 1024  # a frame of fewer is a small one
+SMALL_BYTES = 2048  # a frame of fewer is a small one
 SMALL_FRAMES = 500  # of these and of text, a second, and at once
 MAX_TEXT_BYTES = 4096  # of a text message: 1,024 characters in UTF-8
 TEXT_COST = 4  # bytes of memory of a text by byte, where one character is an emoji
