@@ -192,8 +192,7 @@ def check_names(options: Mapping[str, Any], known: Mapping[str, Any], where: str
     if unknown is not None:
         raise Problem(
             INVALID_REQUEST,
-            f"{where} has an unknown option {unknown[:40]!r}; there are {', '.join(known)}, in "
-            "lower case",
+            f"{where} has an unknown option {unknown[:40]!r}; there are {', '.join(known)}",
         )
 
 
