@@ -56,9 +56,10 @@ def _on_http_exception(request: Request, error: Exception) -> Response:
         detail = f"there is nothing at {path}; send images to POST /features, see /docs"
         return _response(request, Problem(NOT_FOUND, detail), headers)
     if error.status_code == 405:
-        methods = headers.get("Allow", "another method")
-        if "GET" in methods and "HEAD" not in methods:
-            methods = headers["Allow"] = methods.replace("GET", "GET, HEAD")
+        allowed = set(headers.get("Allow", "").split(", "))
+        if "GET" in allowed:
+            allowed.add("HEAD")
+        methods = headers["Allow"] = ", ".join(sorted(allowed))
         detail = f"{path} takes {methods}, not {request.method}; see /docs"
         return _response(request, Problem(METHOD_NOT_ALLOWED, detail), headers)
     title = http.HTTPStatus(error.status_code).phrase
