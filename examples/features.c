@@ -32,30 +32,44 @@ struct answer {
     char bytes[MAX_ANSWER + 1];
 };
 
-static int dial(const char *host, const char *port)
+/* A connection to the first address of `host` that answers; -1: none does, -2: there is no such host. */
+static int dial_host(const char *host, const char *port)
 {
     struct addrinfo hints = {.ai_socktype = SOCK_STREAM}, *found = NULL;
-    int fault = getaddrinfo(host, port, &hints, &found);
-    if (fault != 0) {
-        fprintf(stderr, "%s: %s\n", host, gai_strerror(fault));
-        exit(2);
-    }
-    int connection = -1;
+    if (getaddrinfo(host, port, &hints, &found) != 0)
+        return -2;
+    struct timeval wait = {.tv_sec = WAIT_S};
+    int connection = -1, yes = 1;
     for (struct addrinfo *at = found; at != NULL && connection < 0; at = at->ai_next) {
         connection = socket(at->ai_family, at->ai_socktype, at->ai_protocol);
-        if (connection >= 0 && connect(connection, at->ai_addr, at->ai_addrlen) != 0) {
+        if (connection < 0)
+            continue; /* a family that this kernel lacks */
+        setsockopt(connection, SOL_SOCKET, SO_RCVTIMEO, &wait, sizeof wait);
+        setsockopt(connection, SOL_SOCKET, SO_SNDTIMEO, &wait, sizeof wait); /* of connect, too */
+        setsockopt(connection, IPPROTO_TCP, TCP_NODELAY, &yes, sizeof yes);
+        if (connect(connection, at->ai_addr, at->ai_addrlen) != 0) {
             close(connection);
             connection = -1;
         }
     }
     freeaddrinfo(found);
-    if (connection < 0)
-        return -1;
-    struct timeval wait = {.tv_sec = WAIT_S};
-    int yes = 1;
-    setsockopt(connection, SOL_SOCKET, SO_RCVTIMEO, &wait, sizeof wait);
-    setsockopt(connection, SOL_SOCKET, SO_SNDTIMEO, &wait, sizeof wait);
-    setsockopt(connection, IPPROTO_TCP, TCP_NODELAY, &yes, sizeof yes);
+    return connection;
+}
+
+/* "localhost" is both loopback addresses, whichever of them /etc/hosts names. */
+static int dial(const char *host, const char *port)
+{
+    const char *const names[] = {host, "127.0.0.1", "::1"};
+    const int count = strcasecmp(host, "localhost") == 0 ? 3 : 1;
+    int connection = -2;
+    for (int k = 0; k < count && connection < 0; k++) {
+        int dialled = dial_host(names[k], port);
+        connection = dialled == -2 ? connection : dialled;
+    }
+    if (connection == -2) {
+        fprintf(stderr, "%s: there is no such host\n", host);
+        exit(2);
+    }
     return connection;
 }
 
@@ -136,11 +150,13 @@ static void ask(int connection, const char *host, const char *image, size_t leng
 {
     const char *token = getenv("DRIVERVIEW_TOKEN");
     const int png = length > 4 && memcmp(image, "\x89PNG", 4) == 0;
+    const int ipv6 = strchr(host, ':') != NULL; /* in brackets, without its zone */
     char head[1024];
     int size = snprintf(head, sizeof head,
-                        "POST /features HTTP/1.1\r\nHost: %s\r\nContent-Type: image/%s\r\n"
+                        "POST /features HTTP/1.1\r\nHost: %s%.*s%s\r\nContent-Type: image/%s\r\n"
                         "Accept: application/json\r\nContent-Length: %zu\r\n%s%s%s\r\n",
-                        host, png ? "png" : "jpeg", length, token ? "Authorization: Bearer " : "",
+                        ipv6 ? "[" : "", (int)(ipv6 ? strcspn(host, "%") : strlen(host)), host,
+                        ipv6 ? "]" : "", png ? "png" : "jpeg", length, token ? "Authorization: Bearer " : "",
                         token ? token : "", token ? "\r\n" : "");
     answer->status = 0;
     if (size < 0 || (size_t)size >= sizeof head) {

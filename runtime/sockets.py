@@ -1,37 +1,195 @@
-"""Listening sockets of the commands that serve.
+"""Listening sockets of the commands that serve, and connections to a host of several addresses.
 
 A socket is bound before anything else is loaded, so that a port in use is reported at once.
 """
 
+import ctypes
+import errno
 import socket
+import struct
+import time
+from collections.abc import Iterable
+from contextlib import suppress
+from typing import Any
 
 from trackfeatures.errors import UserError
+
+LOOPBACKS = {socket.AF_INET: "127.0.0.1", socket.AF_INET6: "::1"}
+CONNECT_S = 0.25  # that an address gets where the time is short
+PORT_TRIES = 8  # for a free port of every address of a host
+# A kernel without a family, a host without an address of it: the other family serves.
+NO_FAMILY = (errno.EAFNOSUPPORT, errno.EADDRNOTAVAIL, errno.EPROTONOSUPPORT)
+SO_ATTACH_FILTER = 26  # of Linux; not in Python's `socket`
+# Classic BPF on a TCP header: drop (return 0) what has SYN, the bit 2 of byte 13; pass the rest.
+NO_SYN = ((0x30, 0, 0, 13), (0x45, 0, 1, 2), (0x06, 0, 0, 0), (0x06, 0, 0, 0xFFFFFFFF))
+
+Address = tuple[int, int, int, str, Any]  # as `socket.getaddrinfo` gives it
 
 
 def bind(host: str, port: int) -> socket.socket:
     """A bound TCP socket. Raises UserError when the address is taken, unknown or forbidden."""
     try:
-        family, kind, protocol, _, address = socket.getaddrinfo(
-            host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
-        )[0]
-        listener = socket.socket(family, kind, protocol)
-        try:
-            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            listener.bind(address)
-        except OSError:
-            listener.close()
-            raise
+        return _bind(_addresses(host, port, socket.AI_PASSIVE)[0])
     except (OSError, UnicodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else str(error)
-        raise UserError(
-            f"cannot listen on {host} port {port}: {reason}; choose another with --host or --port "
-            "(--port 0 takes any free one)"
-        ) from error
-    listener.set_inheritable(True)
+        raise _cannot_listen(host, port, error) from error
+
+
+def bind_all(host: str, port: int) -> list[socket.socket]:
+    """Bound TCP sockets, of the same port, for all addresses of a host: "localhost" has two.
+
+    `::` takes IPv4 too. Raises as `bind`; an address of a family that this machine lacks is left
+    out where there is another.
+    """
+    for _ in range(PORT_TRIES):
+        try:
+            return _bind_all(host, port)
+        except OSError as error:
+            if port or error.errno != errno.EADDRINUSE:
+                raise _cannot_listen(host, port, error) from error
+        except UnicodeError as error:
+            raise _cannot_listen(host, port, error) from error
+    raise UserError(
+        f"found no port that is free on all addresses of {host}; choose one with --port"
+    )
+
+
+def _bind_all(host: str, port: int) -> list[socket.socket]:
+    bound: list[socket.socket] = []
+    missing: OSError | None = None
+    try:
+        for address in _addresses(host, port, socket.AI_PASSIVE):
+            try:
+                bound.append(_bind(_at_port(address, bound)))
+            except OSError as error:
+                if error.errno not in NO_FAMILY:
+                    raise
+                missing = error
+        if not bound:
+            raise missing or OSError(errno.EADDRNOTAVAIL, "it has no address")
+    except BaseException:
+        for listener in bound:
+            listener.close()
+        raise
+    return bound
+
+
+def _at_port(address: Address, bound: list[socket.socket]) -> Address:
+    """`address`, at the port of the first socket that is bound."""
+    if not bound:
+        return address
+    *rest, place = address
+    return (*rest, (place[0], bound[0].getsockname()[1], *place[2:]))  # type: ignore[return-value]
+
+
+def _bind(address: Address) -> socket.socket:
+    family, kind, protocol, _, place = address
+    listener = socket.socket(family, kind, protocol)
+    try:
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        if family == socket.AF_INET6:
+            only = place[0] != "::"
+            listener.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, only)
+        listener.bind(place)
+        listener.set_inheritable(True)
+    except BaseException:
+        listener.close()
+        raise
     return listener
+
+
+def _addresses(host: str, port: int, flags: int = 0) -> list[Address]:
+    """The TCP addresses of a host, without repetition.
+
+    "localhost" has both loopback addresses (RFC 6761, 6.3), whatever /etc/hosts names.
+    """
+    hosts = [host]
+    if is_localhost(host):
+        hosts += LOOPBACKS.values()
+    found: dict[Any, Address] = {}
+    for name in hosts:
+        try:
+            for address in socket.getaddrinfo(name, port, type=socket.SOCK_STREAM, flags=flags):
+                found.setdefault(address[4], address)
+        except OSError:
+            if name == host and len(hosts) == 1:
+                raise
+    return list(found.values())
+
+
+def is_localhost(host: str) -> bool:
+    """Whether a name is one of this machine's loopback addresses."""
+    name = host.lower().removesuffix(".")
+    return name == "localhost" or name.endswith(".localhost")
+
+
+def connect(
+    place: tuple[str, int], timeout_s: float | None, source: tuple[str, int] | None = None
+) -> socket.socket:
+    """A connection to the first address of (host, port) that answers, within `timeout_s` in all.
+
+    Each address gets an equal part of the time that is left, or CONNECT_S of it. Raises OSError:
+    the first refusal. Arguments as of `socket.create_connection`.
+    """
+    host, port = place
+    addresses = _addresses(host, port)
+    end_s = None if timeout_s is None else time.monotonic() + timeout_s
+    errors: list[OSError] = []
+    for number, (family, kind, protocol, _, at) in enumerate(addresses):
+        try:
+            connection = socket.socket(family, kind, protocol)
+        except OSError as error:
+            errors.append(error)
+            continue
+        try:
+            if end_s is not None:
+                left_s = max(0.001, end_s - time.monotonic())
+                share_s = left_s / (len(addresses) - number)
+                connection.settimeout(max(share_s, min(left_s, CONNECT_S)))
+            if source is not None:
+                connection.bind(source)
+            connection.connect(at)
+            connection.settimeout(timeout_s)
+        except OSError as error:
+            connection.close()
+            errors.append(error)
+        else:
+            return connection
+    raise min(errors, key=lambda error: error.errno in NO_FAMILY)
+
+
+def refuse_connections(listener: socket.socket) -> None:
+    """Let no more connections begin at a listening socket; those that have begun can be accepted.
+
+    A listening socket that is closed resets what waits in its queue, and between the last accept
+    and the close there is always time for one more. So the kernel drops what asks for a connection
+    from now on: such a client asks again after a second, and is refused then. Does nothing where
+    the system has no such filter (Linux has).
+    """
+    program = ctypes.create_string_buffer(b"".join(struct.pack("HBBI", *step) for step in NO_SYN))
+    head = struct.pack("HP", len(NO_SYN), ctypes.addressof(program))
+    with suppress(OSError):
+        listener.setsockopt(socket.SOL_SOCKET, SO_ATTACH_FILTER, head)
 
 
 def address(listener: socket.socket, host: str) -> str:
     """The URL of a bound socket, with the port that the system chose for port 0."""
-    shown = f"[{host}]" if ":" in host else host
-    return f"http://{shown}:{listener.getsockname()[1]}"
+    return url(host, listener.getsockname()[1])
+
+
+def url(host: str, port: int) -> str:
+    """The URL of a service; a zone of IPv6 is written as RFC 6874 says."""
+    shown = f"[{host.replace('%', '%25')}]" if ":" in host else host
+    return f"http://{shown}:{port}"
+
+
+def shown_addresses(listeners: Iterable[socket.socket]) -> str:
+    """The addresses of bound sockets, as "127.0.0.1 and ::1"."""
+    return " and ".join(str(listener.getsockname()[0]) for listener in listeners)
+
+
+def _cannot_listen(host: str, port: int, error: OSError | UnicodeError) -> UserError:
+    reason = error.strerror if isinstance(error, OSError) else str(error)
+    return UserError(
+        f"cannot listen on {host} port {port}: {reason}; choose another with --host or --port "
+        "(--port 0 takes any free one)"
+    )

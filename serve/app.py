@@ -24,8 +24,17 @@ from serve.api.features import (
     client_address,
 )
 from serve.api.hosts import HostCheck
-from serve.api.http_io import Receive, Reply, Scope, Send, problem_reply, send_reply
-from serve.api.problems import Problem, install_problem_handlers
+from serve.api.http_io import (
+    Receive,
+    Reply,
+    Scope,
+    Send,
+    problem_reply,
+    send_reply,
+    without_body,
+)
+from serve.api.problem_handlers import install_problem_handlers
+from serve.api.problems import Problem
 from serve.api.request_options import Headers, check_token, request_id_of
 from serve.api.stream import Stream
 from serve.config import Limits
@@ -97,6 +106,8 @@ class Service:
             await self.framework(scope, receive, send)
             return
         protocol = "http" if scope["type"] == "http" else "websocket.http"
+        if scope.get("method") == "HEAD":
+            scope, send = {**scope, "method": "GET"}, without_body(send)
         refusal = self._authorize_scope(scope)
         if refusal is not None:
             await send_reply(send, refusal, protocol)
@@ -147,13 +158,13 @@ class Service:
             if not public:
                 check_token(headers, self._token)
         except Problem as problem:
-            return self._refuse(problem, headers, client)
+            return self._refuse(problem, headers, client, path)
         return None
 
-    def _refuse(self, problem: Problem, headers: Headers, client: str) -> Reply:
+    def _refuse(self, problem: Problem, headers: Headers, client: str, path: str = "") -> Reply:
         self.frames.refusals.log(request_id_of(headers), client, problem)
         self.metrics.count_refusal(problem.type, self.frame_queue.waiting)
-        return problem_reply(problem)
+        return problem_reply(problem, path=path)
 
 
 def _traced(tracer: "Tracer", parts: tuple[Any, ...]) -> tuple[FrameHandler, RequestFactory]:

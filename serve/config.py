@@ -111,7 +111,7 @@ def is_loopback(host: str) -> bool:
     try:
         found = ip_address(host.partition("%")[0])
     except ValueError:
-        return host == "localhost"
+        return host.lower().removesuffix(".") == "localhost"
     mapped = getattr(found, "ipv4_mapped", None)
     return (mapped or found).is_loopback
 

@@ -10,13 +10,11 @@ import sys
 from pathlib import Path
 
 from mtlnet.inference.model_card import resolve_run
-from runtime.sockets import address, bind
+from runtime.sockets import address, bind_all, shown_addresses
 from serve.config import ServiceConfig, check_exposure
 from serve.observability import logs, telemetry
 from serve.workers.control_socket import listen_for_commands, socket_path
 from serve.workers.supervisor import ServicePlan, Supervisor
-
-BACKLOG = 2048
 
 
 def run(config: ServiceConfig) -> None:
@@ -26,20 +24,21 @@ def run(config: ServiceConfig) -> None:
     # Fail on a missing exporter or model before any process is started.
     telemetry.exporter_name()
     resolve_run(config.model)
-    listener = bind(config.host, config.port)
-    asyncio.run(_serve(config, listener))
+    listeners = bind_all(config.host, config.port)
+    asyncio.run(_serve(config, listeners))
 
 
-async def _serve(config: ServiceConfig, listener: socket.socket) -> None:
+async def _serve(config: ServiceConfig, listeners: list[socket.socket]) -> None:
     plan = ServicePlan(config.model, resolve_run, config.workers, config.limits)
-    supervisor = Supervisor(plan, listener)
-    listener.listen(BACKLOG)
+    supervisor = Supervisor(plan, listeners)
+    port = listeners[0].getsockname()[1]
     first = await supervisor.start()
     if first is None:
         return
     sys.stderr.write(
         f"serving {_model_label(config.model, supervisor.folder)}, model {first['model'][:12]}, "
-        f"with {first['engine']} {first['precision']} at {address(listener, config.host)}"
+        f"with {first['engine']} {first['precision']} at {address(listeners[0], config.host)}"
+        f"{f' ({shown_addresses(listeners)})' if len(listeners) > 1 else ''}"
         f"{f', {config.workers} workers' if config.workers > 1 else ''}\n"
     )
     sys.stderr.flush()
@@ -51,7 +50,6 @@ async def _serve(config: ServiceConfig, listener: socket.socket) -> None:
         await supervisor.restart()
         return "all workers were replaced"
 
-    port = listener.getsockname()[1]
     command_server = await listen_for_commands(port, {"reload": reload, "restart": restart})
     await supervisor.run()
     if command_server is not None:

@@ -3,6 +3,9 @@
 f32: as trained. bf16: large weights stored in bf16, converted to float32 where they are read. int8:
 OpenVINO only, see `mtlnet.export.int8`; the engine uses it by default once it has passed its
 accuracy gate on the test rounds. Each export is compared with torch on frames of a dataset.
+
+ONNX and OpenVINO models take any number of images at once (the first axis, "batch"), and answer
+each as alone. The int8 graph takes one, as the engine does: a graph for one image is quicker.
 """
 
 import logging
@@ -23,7 +26,7 @@ from mtlnet.export.int8 import (
     judge,
     quantise,
 )
-from mtlnet.export.openvino_graph import TOLERANCE, run_graph
+from mtlnet.export.openvino_graph import TOLERANCE, build_graph, run_graph
 from mtlnet.inference.engine import EXPORT_FILE, best_precision, read_graph
 from mtlnet.inference.model_card import (
     GRAPH,
@@ -37,6 +40,7 @@ from mtlnet.inference.model_card import (
     read_card,
 )
 from mtlnet.inference.prediction import OUTPUTS
+from mtlnet.inference.uncertainty import read_uncertainty_head
 from mtlnet.model.architecture import HEIGHT, WIDTH
 from mtlnet.model.network import Network, load_network, predict_images
 from runtime.files import atomic_move, replaced_files, utf8_path, write_json
@@ -46,6 +50,7 @@ FORMATS, PRECISIONS = ("onnx", "openvino"), ("f32", "bf16", "int8")
 ONNX_FILE = "model.onnx"
 OPSET = 18
 MIN_BF16_VALUES = 256  # smaller constants stay in float32
+CHECK_BATCH = 3  # images at once
 MAX_CHECK_FRAMES = 10_000
 """Their images are held in memory: 1.8 GB."""
 
@@ -79,9 +84,12 @@ def export_model(
             if kind == "onnx":
                 names = write_onnx(network, staged, bf16=precision == "bf16")
             else:
-                graph = read_graph(run, card)
                 if precision == "int8":
+                    graph = read_graph(run, card)
                     graph, about["float_activations"] = _quantised(graph, card, dataset)
+                else:
+                    head = None if card.uncertainty is None else read_uncertainty_head(run)
+                    graph = build_graph(network, head, batch=-1)
                 names = write_openvino(graph, staged, precision)
         except RuntimeError as error:  # OpenVINO's error for a failed write
             reason = str(error).strip().splitlines()[-1]
@@ -142,9 +150,9 @@ def write_export(folder: Path, card: ModelCard, names: tuple[str, ...], **about:
 
 
 class WithProbabilities(torch.nn.Module):
-    """A network with a softmax on its class scores: images (1, H, W, 3) uint8 -> (1, 9).
+    """A network with a softmax on its class scores: images (B, H, W, 3) uint8 -> (B, 9).
 
-    Of heads over bins a second result (1, 5): probabilities that markings are absent.
+    Of heads over bins a second result (B, 5): probabilities that markings are absent.
     """
 
     def __init__(self, network: Network) -> None:
@@ -165,7 +173,7 @@ def write_onnx(network: Network, folder: Path, *, bf16: bool) -> tuple[str, ...]
     """Write `model.onnx`, one file; `bf16`: large weights in bf16. Returns the file names."""
     import onnx
 
-    images = torch.zeros((1, HEIGHT, WIDTH, 3), dtype=torch.uint8)
+    images = torch.zeros((2, HEIGHT, WIDTH, 3), dtype=torch.uint8)  # with 1, torch fixes it
     path = folder / ONNX_FILE
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)
     program = torch.onnx.export(
@@ -175,6 +183,7 @@ def write_onnx(network: Network, folder: Path, *, bf16: bool) -> tuple[str, ...]
         opset_version=OPSET,
         input_names=["images"],
         output_names=["outputs", "absent"][: 1 + network.architecture.bins],
+        dynamic_shapes=({0: torch.export.Dim("batch", min=0)},),
         verbose=False,
     )
     assert program is not None
@@ -215,6 +224,9 @@ def write_openvino(model: Any, folder: Path, precision: str) -> tuple[str, ...]:
     """Write `model.xml` and `model.bin`; `precision` bf16: large weights in bf16."""
     import openvino
 
+    model.inputs[0].get_node().set_layout(openvino.Layout("[batch,height,width,colour]"))
+    model.inputs[0].get_tensor().set_names({"images"})
+    model.outputs[0].get_tensor().set_names({"outputs"})
     if precision == "bf16":
         store_openvino_bf16(model)
     with utf8_path(folder / GRAPH) as plain:
@@ -243,11 +255,14 @@ def store_openvino_bf16(model: Any) -> None:
 def check_export(
     network: Network, path: Path, precision: str, images: NDArray[np.uint8]
 ) -> dict[str, Any]:
-    """Largest differences of the nine outputs, run by OpenVINO, from torch in float32."""
+    """Largest differences of the nine outputs, run by OpenVINO, from torch in float32.
+
+    The images are run in batches, but for int8, whose graph takes one.
+    """
     import openvino
 
     computed = "f32" if precision == "f32" else best_precision(openvino.Core())
-    found = run_graph(path, computed, images)
+    found = run_graph(path, computed, images, 1 if precision == "int8" else CHECK_BATCH)
     difference = np.abs(found[:, :OUTPUTS] - predict_images(network, images))
     return {
         "frames": len(images),

@@ -26,12 +26,13 @@ UNCERTAINTY_TOLERANCE = 5e-3
 """Largest relative difference of a standard deviation or the OOD score."""
 
 
-def build_graph(network: Network, head: UncertaintyHead | None = None) -> Any:
-    """OpenVINO model of a folded network: uint8 images (1, 210, 280, 3) -> float32 (1, 9 to 22).
+def build_graph(network: Network, head: UncertaintyHead | None = None, batch: int = 1) -> Any:
+    """OpenVINO model of a folded network: uint8 images (B, 210, 280, 3) -> float32 (B, 9 to 22).
 
-    The columns are those of `mtlnet.inference.prediction.split_outputs`.
+    The columns are those of `mtlnet.inference.prediction.split_outputs`. `batch` -1: of any number
+    of images, which takes longer for one.
     """
-    return model_of(_nodes(network), head)
+    return model_of(_nodes(network, batch), head)
 
 
 def build_feature_graph(network: Network) -> Any:
@@ -71,20 +72,24 @@ def write_graph(
         staged.with_suffix(".bin").unlink(missing_ok=True)
 
 
-def run_graph(graph: Any, precision: str, images: NDArray[np.uint8]) -> NDArray[np.float32]:
+def run_graph(
+    graph: Any, precision: str, images: NDArray[np.uint8], batch: int = 1
+) -> NDArray[np.float32]:
     """Outputs (N, 9 to 22) of a model or of that in a file for images (N, 210, 280, 3).
 
-    `graph`: an OpenVINO model, or a path. Raises RuntimeError when OpenVINO cannot load it.
+    `graph`: an OpenVINO model, or a path; `batch`: images at once. Raises RuntimeError when
+    OpenVINO cannot load it.
     """
     import openvino
 
     options = {"INFERENCE_PRECISION_HINT": precision, "NUM_STREAMS": 1}
     source = str(graph) if isinstance(graph, Path) else graph
     request = openvino.Core().compile_model(source, "CPU", options).create_infer_request()
-    return np.concatenate([request.infer([image[None]])[0].copy() for image in images])
+    parts = (images[first : first + batch] for first in range(0, len(images), batch))
+    return np.concatenate([request.infer([part])[0].copy() for part in parts])
 
 
-def _nodes(network: Network) -> Nodes:
+def _nodes(network: Network, batch: int = 1) -> Nodes:
     from openvino import opset13 as ops
 
     def backbone(pixels: Any) -> Any:
@@ -92,11 +97,12 @@ def _nodes(network: Network) -> Nodes:
 
     architecture = network.architecture
     weights = {name: _array(tensor) for name, tensor in network.state_dict().items()}
-    return network_nodes(ops, architecture, weights, backbone if architecture.backbone else None)
+    features = backbone if architecture.backbone else None
+    return network_nodes(ops, architecture, weights, features, batch)
 
 
 def backbone_graph(ops: Any, x: Any, backbone: nn.Module) -> Any:
-    """A torchvision backbone without batch normalisation (folded), (1, 3, H, W) -> (1, F, 1, 1).
+    """A torchvision backbone without batch normalisation (folded), (B, 3, H, W) -> (B, F, 1, 1).
 
     Raises NotImplementedError for a layer that no backbone of `mtlnet.model.architecture` uses.
     """

@@ -53,10 +53,10 @@ Weights = Mapping[str, NDArray[np.float32]]
 class Nodes:
     """A network's nodes that others build on."""
 
-    images: Any  # uint8 (1, H, W, 3)
-    uncertainty_inputs: Any  # (1, F): the last shared features and, of bins, the log spreads
-    outputs: Any  # (1, 9): see `mtlnet.inference.prediction`
-    absent: Any = None  # (1, 5), of heads over bins: probabilities that markings are absent
+    images: Any  # uint8 (B, H, W, 3)
+    uncertainty_inputs: Any  # (B, F): the last shared features and, of bins, the log spreads
+    outputs: Any  # (B, 9): see `mtlnet.inference.prediction`
+    absent: Any = None  # (B, 5), of heads over bins: probabilities that markings are absent
 
 
 def network_nodes(
@@ -64,12 +64,14 @@ def network_nodes(
     architecture: Architecture,
     weights: Weights,
     features: Callable[[Any], Any] | None = None,
+    batch: int = 1,
 ) -> Nodes:
     """The nodes of a folded network with these `weights`, named as in torch.
 
     `features`: what makes features of pixels, where these layers are none of the architecture's.
+    `batch`: images at once, -1: any number, which is slower for one.
     """
-    images = ops.parameter([1, HEIGHT, WIDTH, 3], np.uint8, name="images")
+    images = ops.parameter([batch, HEIGHT, WIDTH, 3], np.uint8, name="images")
     first_row = architecture.first_row
     # Before the transpose, which OpenVINO then leaves to the first convolution.
     x = _part(ops, images, 1, first_row, HEIGHT) if first_row else images
@@ -81,7 +83,7 @@ def network_nodes(
         if features is not None
         else convolutions(ops, pixels, architecture, weights)
     )
-    x = ops.reshape(x, np.array([1, -1]), special_zero=False)
+    x = ops.reshape(x, np.array([-1, _count(x)]), special_zero=False)
     for number in range(len(architecture.shared)):
         x = ops.relu(_linear(ops, x, weights, f"shared.fc{number}.layer"))
     distance, angle, kind = (
@@ -90,18 +92,16 @@ def network_nodes(
     )
     coded, inputs, absent = [distance, angle], x, None
     if architecture.bins:
-        scores = ops.reshape(distance, np.array([MARKINGS, PLACES + 1]), special_zero=False)
+        scores = ops.reshape(distance, np.array([-1, PLACES + 1]), special_zero=False)
         absent = absent_probabilities(ops, scores)
         coded = [read_bins(ops, scores, angle, absent)]
         inputs = ops.concat([x, *_log_spreads(ops, scores, angle)], 1)
     outputs = ops.concat([*coded, ops.softmax(kind, 1)], 1)
-    if absent is not None:
-        absent = _row(ops, absent)
     return Nodes(images, inputs, outputs, absent)
 
 
 def model_of(nodes: Nodes, head: UncertaintyHead | None = None) -> Any:
-    """The OpenVINO model uint8 (1, 210, 280, 3) -> float32 (1, 9).
+    """The OpenVINO model uint8 (B, 210, 280, 3) -> float32 (B, 9).
 
     With `head` 8 columns more; then, of heads over bins, 5 more.
     """
@@ -126,7 +126,7 @@ def model_from_weights(network: str, weights: Weights, head: UncertaintyHead | N
 
 
 def convolutions(ops: Any, x: Any, architecture: Architecture, weights: Weights) -> Any:
-    """The layers before the shared ones, (1, 3, H - first_row, W) -> (1, C, h, w)."""
+    """The layers before the shared ones, (B, 3, H - first_row, W) -> (B, C, h, w)."""
     for number, spec in enumerate(architecture.features):
         if isinstance(spec, LocalNorm):
             x = ops.lrn(x, np.array([1]), spec.alpha, spec.beta, 1.0, spec.size)
@@ -177,32 +177,47 @@ def _linear(ops: Any, x: Any, weights: Weights, name: str) -> Any:
 
 
 def absent_probabilities(ops: Any, scores: Any) -> Any:
-    """Probabilities (5, 1) that markings are absent, of the scores (5, PLACES + 1)."""
-    absent = _columns(ops, ops.softmax(scores, 1), PLACES, PLACES + 1)
+    """Probabilities (B, 5) that markings are absent, of the scores (5 B, PLACES + 1)."""
+    absent = _rows(ops, _columns(ops, ops.softmax(scores, 1), PLACES, PLACES + 1))
     # `ml` and `mr` are absent together.
-    share = np.eye(MARKINGS, dtype=np.float32)
-    share[PAIR, PAIR] = 0.5
-    shared = ops.multiply(_row(ops, absent), share)
-    return ops.reduce_sum(shared, np.array([1]), keep_dims=True)
+    pair = ops.reduce_mean(_columns(ops, absent, 0, PAIR.stop), np.array([1]), keep_dims=True)
+    return ops.concat([pair] * PAIR.stop + [_columns(ops, absent, PAIR.stop, MARKINGS)], 1)
 
 
 def read_bins(ops: Any, scores: Any, angle: Any, absent: Any) -> Any:
-    """Coded answers (1, 6) of the scores of distances (5, PLACES + 1) and angle (1, ANGLES).
+    """Coded answers (B, 6) of the scores of distances (5 B, PLACES + 1) and angle (B, ANGLES).
 
-    `absent` (5, 1): probabilities that markings are absent.
+    `absent` (B, 5): probabilities that markings are absent.
     """
-    found = _expectation(ops, _columns(ops, scores, 0, PLACES), PLACES)
+    found = _rows(ops, _expectation(ops, _columns(ops, scores, 0, PLACES), PLACES))
     spans = [tf.RANGES[name] for name in tf.MARKINGS]
-    ends = np.array([[float(span.inactive != span.lo)] for span in spans], np.float32)
-    limits = np.array(ABSENT_ABOVE, np.float32)[:, None]
+    ends = np.array([[float(span.inactive != span.lo) for span in spans]], np.float32)
+    limits = np.array(ABSENT_ABOVE, np.float32)[None]
     shares = ops.select(ops.greater(absent, limits), ends, found)
-    row = ops.concat([_row(ops, shares), _expectation(ops, angle, ANGLES)], 1)
+    row = ops.concat([shares, _expectation(ops, angle, ANGLES)], 1)
     return ops.add(ops.multiply(row, np.float32(SPAN)), np.float32(OFFSET))
 
 
-def _row(ops: Any, column: Any) -> Any:
-    """(5, 1) -> (1, 5)."""
-    return ops.reshape(column, np.array([1, MARKINGS]), special_zero=False)
+def _rows(ops: Any, column: Any) -> Any:
+    """(5 B, 1) -> (B, 5)."""
+    return ops.reshape(column, np.array([-1, MARKINGS]), special_zero=False)
+
+
+def _sizes(x: Any) -> list[int]:
+    """The sizes of a node's result but for the first, the number of images."""
+    shape = x.get_partial_shape() if hasattr(x, "get_partial_shape") else None
+    shape = x.get_output_partial_shape(0) if shape is None else shape
+    return [size.get_length() for size in list(shape)[1:]]
+
+
+def _count(x: Any) -> int:
+    """How many numbers a node's result has for each image."""
+    return int(np.prod(_sizes(x)))
+
+
+def _one_image(x: Any) -> bool:
+    """Whether the number of images is fixed: a graph for that one is quicker."""
+    return bool(x.get_output_partial_shape(0)[0].is_static)
 
 
 def _columns(ops: Any, x: Any, first: int, last: int) -> Any:
@@ -226,9 +241,9 @@ def _expectation(ops: Any, scores: Any, count: int) -> Any:
 
 
 def _log_spreads(ops: Any, scores: Any, angle: Any) -> list[Any]:
-    """As `mtlnet.model.bins.log_spreads`: (1, 5) of the distances and (1, 1) of the angle."""
+    """As `mtlnet.model.bins.log_spreads`: (B, 5) of the distances and (B, 1) of the angle."""
     distances = _log_spread(ops, _columns(ops, scores, 0, PLACES), PLACES)
-    return [_row(ops, distances), _log_spread(ops, angle, ANGLES)]
+    return [_rows(ops, distances), _log_spread(ops, angle, ANGLES)]
 
 
 def _log_spread(ops: Any, scores: Any, count: int) -> Any:
@@ -245,21 +260,24 @@ def _log_spread(ops: Any, scores: Any, count: int) -> Any:
 
 
 def product_float32(ops: Any, x: Any, weight: NDArray[np.float32]) -> Any:
-    """x (1, F) times weight (N, F) transposed: (1, N)."""
+    """x (B, F) times weight (N, F) transposed: (B, N)."""
+    if not _one_image(x):
+        each = ops.multiply(ops.unsqueeze(x, np.array([1])), ops.constant(weight[None]))
+        return _without_last(ops, ops.reduce_sum(each, np.array([2]), keep_dims=True))
     # In two dimensions: OpenVINO would lay out three as the channels of an image, and back.
     sums = ops.reduce_sum(ops.multiply(x, ops.constant(weight)), np.array([1]))
     return ops.unsqueeze(sums, np.array([0]))
 
 
 def linear_float32(ops: Any, x: Any, weight: NDArray[np.float32], bias: NDArray[np.float32]) -> Any:
-    """Linear layer with weight (N, F) and bias (N,) on x (1, F): (1, N)."""
+    """Linear layer with weight (N, F) and bias (N,) on x (B, F): (B, N)."""
     return ops.add(product_float32(ops, x, weight), bias[None])
 
 
 def uncertainty_outputs(ops: Any, x: Any, images: Any, head: UncertaintyHead) -> list[Any]:
-    """`UncertaintyHead.predict` of inputs x (1, X) and images (1, H, W, 3), uint8."""
+    """`UncertaintyHead.predict` of inputs x (B, X) and images (B, H, W, 3), uint8."""
     cells, centre = texture_graph(ops, images)
-    count = min(x.shape[1], len(head.centre))
+    count = min(_count(x), len(head.centre))
     z = _standardise(ops, _columns(ops, x, 0, count), head, slice(0, count))
     if len(head.centre) > count:
         light = _standardise(ops, light_graph(ops, cells), head, slice(count, None))
@@ -282,14 +300,25 @@ def _standardise(ops: Any, x: Any, head: UncertaintyHead, part: slice) -> Any:
 
 
 def light_graph(ops: Any, cells: Any) -> Any:
-    """`mtlnet.inference.uncertainty.light_features` (1, LIGHT_VALUES) of cells (1, C)."""
-    halves = ops.reshape(cells, np.array([1, LIGHT_VALUES, -1]), special_zero=False)
+    """`mtlnet.inference.uncertainty.light_features` (B, LIGHT_VALUES) of cells (B, C)."""
+    shape = np.array([-1, LIGHT_VALUES, _count(cells) // LIGHT_VALUES])
+    halves = ops.reshape(cells, shape, special_zero=False)
+    if not _one_image(cells):
+        return _without_last(ops, ops.reduce_mean(halves, np.array([2]), keep_dims=True))
     return ops.reduce_mean(halves, np.array([2]))
 
 
+def _without_last(ops: Any, x: Any) -> Any:
+    """(B, N, 1) -> (B, N), of a sum or mean of several images.
+
+    Not by the sum itself: OpenVINO 2026.4 adds a bias (1, N) after it to the wrong numbers then.
+    """
+    return ops.squeeze(x, np.array([2]))
+
+
 def texture_graph(ops: Any, images: Any) -> tuple[Any, Any]:
-    """`mtlnet.inference.uncertainty.texture_features` of images (1, H, W, 3): (1, C) and (1, M)."""
-    _, height, width, _ = images.shape
+    """`mtlnet.inference.uncertainty.texture_features` of images (B, H, W, 3): (B, C) and (B, M)."""
+    height, width, _ = _sizes(images)
     colours = ops.transpose(images, np.array([0, 3, 1, 2]))  # of bytes: quicker than of floats
     red, green, blue = (
         ops.convert(_part(ops, colours, 1, number, number + 1), np.float32) for number in range(3)
@@ -317,24 +346,25 @@ def _part(ops: Any, x: Any, axis: int, first: int, last: int) -> Any:
 
 
 def _band_means(ops: Any, planes: Any) -> Any:
-    """Means (1, N, bands, columns) of planes (1, N, H, W)."""
+    """Means (B, N, bands, columns) of planes (B, N, H, W)."""
     # Not by a pool, which lays planes out in blocks of 16 first.
-    _, count, height, width = planes.shape
+    count, height, width = _sizes(planes)
     bands = CELL_ROWS * BANDS
     rows = _row_means(ops, planes, height // bands)
-    shape = np.array([1, count, bands, CELL_COLUMNS, width // CELL_COLUMNS])
+    shape = np.array([-1, count, bands, CELL_COLUMNS, width // CELL_COLUMNS])
     return ops.reduce_mean(ops.reshape(rows, shape, special_zero=False), np.array([4]))
 
 
 def _row_means(ops: Any, planes: Any, rows: int) -> Any:
-    """Means (1, N, H / rows, W) of each so many rows of planes (1, N, H, W)."""
-    _, count, height, width = planes.shape
-    shape = np.array([1, count, height // rows, rows, width])
+    """Means (B, N, H / rows, W) of each so many rows of planes (B, N, H, W)."""
+    count, height, width = _sizes(planes)
+    shape = np.array([-1, count, height // rows, rows, width])
     return ops.reduce_mean(ops.reshape(planes, shape, special_zero=False), np.array([3]))
 
 
 def _flat(ops: Any, planes: list[Any]) -> Any:
-    """One row: the colours, and the square roots of the differences."""
+    """One row an image: the colours, and the square roots of the differences."""
     colours, *others = planes
     roots = [ops.sqrt(ops.add(plane, np.float32(SQRT_EPSILON))) for plane in others]
-    return ops.reshape(ops.concat([colours, *roots], 1), np.array([1, -1]), special_zero=False)
+    together = ops.concat([colours, *roots], 1)
+    return ops.reshape(together, np.array([-1, _count(together)]), special_zero=False)

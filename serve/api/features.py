@@ -12,7 +12,7 @@ from functools import partial
 from typing import Any
 
 from mtlnet.inference.image_decoding.crop import crop_box
-from mtlnet.inference.image_decoding.decode import decode, inspect
+from mtlnet.inference.image_decoding.decode import LATE_CHECK_BYTES, decode, inspect
 from mtlnet.inference.image_decoding.errors import ImageError
 from serve.api.http_io import (
     ClientDisconnectedError,
@@ -31,6 +31,7 @@ from serve.api.request_options import (
     RequestOptions,
     check_image_headers,
     parse_options,
+    read_options,
     request_id_of,
 )
 from serve.observability.logs import RefusalLog, log_answer
@@ -42,8 +43,8 @@ from serve.scheduling.streams import stream_key
 from trackfeatures.camera import CameraParameters
 
 # An image of at most so many pixels, estimated to be decoded in so many ms, may be decoded on the
-# event loop.
-SMALL_PIXELS, SMALL_MS = 640 * 480, 12.0
+# event loop; but not a JPEG file of more bytes: the estimate is one of its pixels.
+SMALL_PIXELS, SMALL_MS, SMALL_BYTES = 640 * 480, 12.0, LATE_CHECK_BYTES
 
 logger = logging.getLogger(__name__)
 
@@ -84,6 +85,7 @@ class FrameHandler:
         header = inspect(body, camera, fov)
         read_ms = header.decode_ms
         small = header.width * header.height <= SMALL_PIXELS and read_ms <= SMALL_MS
+        small = small and (len(body) <= SMALL_BYTES or header.png_header is not None)
         frame = _frame(
             options, client, lambda view: decode(body, header, view, fov), read_ms, small
         )
@@ -247,8 +249,17 @@ class FeaturesEndpoint:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         reply: asyncio.Future[Reply] = asyncio.get_running_loop().create_future()
-        request = self._make_request(self._frames, client_address(scope), partial(resolve, reply))
-        if request.open(dict(scope["headers"])):
+        client = client_address(scope)
+        try:
+            headers = read_options(scope)
+        except Problem as problem:
+            request_id = request_id_of(dict(scope["headers"]))
+            problem = self._frames.record_refusal(problem, request_id, client)
+            sent = (b"x-request-id", request_id.encode())
+            await send_reply(send, problem_reply(problem, sent))
+            return
+        request = self._make_request(self._frames, client, partial(resolve, reply))
+        if request.open(headers):
             try:
                 request.submit(await read_body(receive, request.grow))
             except ClientDisconnectedError:

@@ -71,7 +71,11 @@ class HostCheck:
 
 
 def host_name(host: bytes) -> str | None:
-    """The name in `name:port`, in lower case, without the brackets of IPv6; None if malformed."""
+    """The name in `name:port`, in lower case; None if malformed.
+
+    Of IPv6 the shortest form of the address, without brackets and without a zone, which has a
+    meaning on one machine only.
+    """
     text = host.decode("latin-1").lower()
     name, port = text, ""
     if text.startswith("["):
@@ -83,6 +87,9 @@ def host_name(host: bytes) -> str | None:
         name, _, port = text.partition(":")
     if not name or (port and not (port.isascii() and port.isdigit())):
         return None
+    if ":" in name:
+        address = name.partition("%")[0]
+        return str(ip_address(address)) if _is_ip(address) else None
     return name.removesuffix(".")
 
 

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from serve.api.problems import MEDIA_TYPE, Problem, ProblemType
+from serve.api.problems import MEDIA_TYPE, Problem, ProblemType, with_error
 from serve.api.request_options import body_too_large
 from serve.config import MAX_BODY_BYTES
 
@@ -69,20 +69,30 @@ async def send_reply(send: Send, reply: Reply, protocol: str = "http") -> None:
     await send({"type": f"{protocol}.response.body", "body": reply.body})
 
 
-def problem_reply(problem: Problem, *headers: Header) -> Reply:
-    """The reply for a problem."""
-    own_headers, body = _encode_problem(problem.type, problem.detail, problem.retry_after_ms)
+def without_body(send: Send) -> Send:
+    """`send` for the answer to HEAD: the headers of GET, which name its length, and no body."""
+
+    async def send_head(message: Message) -> None:
+        await send({**message, "body": b""} if "body" in message else message)
+
+    return send_head
+
+
+def problem_reply(problem: Problem, *headers: Header, path: str = "") -> Reply:
+    """The reply for a problem of a request for `path`."""
+    fields = (problem.type, problem.detail, problem.retry_after_ms)
+    own_headers, body = _encode_problem(*fields, path[:4])
     return Reply(problem.type.status, [*own_headers, *headers], body)
 
 
 @lru_cache(CACHED_PROBLEMS)
 def _encode_problem(
-    problem_type: ProblemType, detail: str, retry_after_ms: int | None
+    problem_type: ProblemType, detail: str, retry_after_ms: int | None, path: str
 ) -> tuple[list[Header], bytes]:
     """The headers and the body of a problem; an overloaded service repeats a few of them."""
     problem = Problem(problem_type, detail, retry_after_ms)
     headers = [(k.lower().encode(), v.encode()) for k, v in problem.headers.items()]
-    return [PROBLEM_HEADER, *headers], _encode_json(problem.content)
+    return [PROBLEM_HEADER, *headers], _encode_json(with_error(problem.content, path))
 
 
 def encode_head(reply: Reply, *extra: Header) -> bytes:

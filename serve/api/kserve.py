@@ -3,8 +3,8 @@
 Inputs: `image` (BYTES [1, 1], the bytes of a JPEG or PNG file) or `pixels` (UINT8 [1, height,
 width, 3], RGB). Outputs, float32: `distances_m` (1, 5) in the order ml, mr, l, m, r, NaN where
 absent; `std` in the order of `mtlnet.inference.uncertainty`; `out_of_distribution` 0 or 1;
-`absent` in the order of the distances; the others as in POST /features,
-whose request headers apply here too.
+`absent` in the order of the distances; the others as in POST /features. The options of an image are
+those of POST /features: headers, the query, or `parameters` of the request.
 """
 
 import asyncio
@@ -39,15 +39,18 @@ from serve.api.kserve_tensors import (
     parse_request,
     read_image_bytes,
     read_json_length,
+    take_options,
 )
-from serve.api.problems import MEDIA_TYPE, NOT_READY, Problem, internal_error
+from serve.api.problems import MEDIA_TYPE, NOT_READY, Problem, internal_error, with_error
 from serve.api.request_options import (
-    Headers,
+    KSERVE_FORMATS,
     check_body_headers,
+    merge_options,
     parse_options,
+    read_options,
     request_id_of,
 )
-from serve.api.schemas import REFUSALS, header_parameters, problem_responses
+from serve.api.schemas import REFUSALS, image_parameters, problem_responses
 from serve.scheduling.fair_queue import FairLock, PixelReader
 
 NAME, VERSION = "track", "1"
@@ -81,7 +84,7 @@ def add_kserve(app: FastAPI, frames: FrameHandler) -> None:
     not_ready = problem_responses(NOT_READY)
     responses = {**OPERATION["responses"], **problem_responses(*REFUSALS)}
     extra = {
-        "parameters": [*OPERATION["parameters"], *header_parameters()],
+        "parameters": [*OPERATION["parameters"], *image_parameters()],
         "requestBody": OPERATION["requestBody"],
     }
 
@@ -94,6 +97,10 @@ def add_kserve(app: FastAPI, frames: FrameHandler) -> None:
         frames.queue.check_ready()
         return {"ready": True}
 
+    async def model_ready() -> dict[str, Any]:
+        frames.queue.check_ready()
+        return {"name": NAME, "ready": True}
+
     @app.get("/v2", summary="The service, as the Open Inference Protocol describes it")
     async def server() -> dict[str, Any]:
         extensions = ["binary_tensor_data"]
@@ -102,7 +109,9 @@ def add_kserve(app: FastAPI, frames: FrameHandler) -> None:
     for model in MODELS:
         add: dict[str, Any] = {"include_in_schema": model == MODEL}
         app.get(model, summary="The model's inputs and outputs", **add)(_metadata(frames))
-        app.get(f"{model}/ready", summary="Is the model ready?", responses=not_ready, **add)(ready)
+        app.get(f"{model}/ready", summary="Is the model ready?", responses=not_ready, **add)(
+            model_ready
+        )
         app.post(
             f"{model}/infer",
             summary="Track features of one image, as tensors",
@@ -127,10 +136,10 @@ def _infer(frames: FrameHandler) -> Any:
 
     async def infer(request: Request) -> Response:
         stamp_ns = time.monotonic_ns()
-        headers: Headers = dict(request.scope["headers"])
-        request_id, client = request_id_of(headers), client_address(request.scope)
+        request_id = request_id_of(dict(request.scope["headers"]))
+        client = client_address(request.scope)
         try:
-            return await _answer(frames, request, headers, stamp_ns, request_id, one_large)
+            return await _answer(frames, request, stamp_ns, request_id, one_large)
         except ClientDisconnectedError:
             return Response(status_code=400)  # never sent
         except (Problem, ImageError) as error:
@@ -138,9 +147,9 @@ def _infer(frames: FrameHandler) -> Any:
         except Exception:
             logger.exception("request %s failed", request_id)
             problem = frames.record_refusal(internal_error(), request_id, client)
-        # `error` is the protocol's own member.
-        content = {**problem.content, "error": problem.detail}
-        return JSONResponse(content, problem.type.status, problem.headers, MEDIA_TYPE)
+        content = with_error(problem.content, MODEL)
+        sent = {**problem.headers, "X-Request-Id": request_id}
+        return JSONResponse(content, problem.type.status, sent, MEDIA_TYPE)
 
     return infer
 
@@ -148,13 +157,12 @@ def _infer(frames: FrameHandler) -> Any:
 async def _answer(
     frames: FrameHandler,
     request: Request,
-    headers: Headers,
     stamp_ns: int,
     request_id: str,
     one_large: FairLock,
 ) -> Response:
-    without_accept = {k: v for k, v in headers.items() if k != b"accept"}
-    options = parse_options(without_accept, stamp_ns, request_id)
+    headers = read_options(request.scope)
+    options = parse_options(headers, stamp_ns, request_id, KSERVE_FORMATS)
     check_body_headers(headers)
     frames.queue.check_ready()
     client = client_address(request.scope)
@@ -169,6 +177,10 @@ async def _answer(
             if large:
                 await asyncio.sleep(PAUSE_S)
             infer_request, binary = parse_request(body, length)
+            more = take_options(infer_request)
+            if more:
+                headers = merge_options(headers, more, "parameters")
+                options = parse_options(headers, stamp_ns, request_id, KSERVE_FORMATS)
             share.grow(len(infer_request.input.data))  # a copy, until it is decoded
             read, read_ms = await _pixel_reader(infer_request, binary, frames, options.fov_y_deg)
             infer_request.input.data = b""
@@ -176,11 +188,10 @@ async def _answer(
         result = await frames.predict_pixels(options, client, read, read_ms)
     finally:
         share.close()
-    head: dict[str, Any] = {
-        "model_name": NAME,
-        "model_version": VERSION,
-        "parameters": result.provenance,
-    }
+    about = result.provenance
+    if options.frame_id is not None:
+        about = {**about, "frame_id": options.frame_id}
+    head: dict[str, Any] = {"model_name": NAME, "model_version": VERSION, "parameters": about}
     if infer_request.id is not None:
         head["id"] = infer_request.id
     content, json_length = encode_response(head, _tensors(result.prediction), infer_request)

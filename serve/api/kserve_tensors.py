@@ -17,11 +17,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from serve.api.problems import INVALID_REQUEST, Problem
+from serve.api.request_options import OPTIONS, check_names, parse_json_object
 
 MAX_DEPTH = 4
 MAX_VALUES = 1_300_000  # and lists, in JSON: 640 x 480 px; each takes some 10 ns of the event loop
 MAX_SMALL_BYTES = 4096  # of what is not the tensor itself, in JSON
 WINDOW_BYTES = 1 << 16  # of JSON or base64, decoded at once; others may run in between
+SIZE, BINARY, ALL_BINARY = "binary_data_size", "binary_data", "binary_data_output"
+# The parameters of an input, of an output and of a request; OPTIONS are those of every image.
+INPUT_PARAMETERS, OUTPUT_PARAMETERS = {SIZE: "int"}, {BINARY: "bool"}
+REQUEST_PARAMETERS = {ALL_BINARY: "bool", **OPTIONS}
 PAUSE_S = 0.001  # between windows: without it, the engine's thread waits for the interpreter's lock
 COUNT_BYTES = 1 << 18  # of JSON whose values are counted at once, in little memory
 JSON_MS_PER_BYTE = 1e-4  # to decode pixels in JSON
@@ -115,21 +120,57 @@ def _parse_json(text: memoryview) -> InferRequest:
             tensor.name,
             _small(tensor.shape, list[int]),
             tensor.datatype,
-            _small(tensor.parameters, dict[str, Any]),
+            _parameters(tensor.parameters, INPUT_PARAMETERS, f"parameters of {tensor.name[:40]}"),
             b"" if memoryview(tensor.data) == NULL else bytes(tensor.data),
         ),
         raw.id,
-        _small(raw.outputs, list[RequestedOutput]),
-        _small(raw.parameters, dict[str, Any]),
+        _outputs(raw.outputs),
+        _parameters(raw.parameters, REQUEST_PARAMETERS, "parameters"),
+    )
+
+
+def _outputs(raw: msgspec.Raw) -> list[RequestedOutput]:
+    """The requested outputs. Raises Problem, msgspec.DecodeError."""
+    outputs = _small(raw, list[RequestedOutput])
+    for output in outputs:
+        where = f"parameters of {output.name[:40]}"
+        check_names(output.parameters, OUTPUT_PARAMETERS, where)
+        _check_flag(output.parameters, BINARY, where)
+    return outputs
+
+
+def _parameters(raw: msgspec.Raw, known: dict[str, str], where: str) -> dict[str, Any]:
+    """The parameters in `where`. Raises Problem, also for one that is not `known`."""
+    if len(memoryview(raw)) > MAX_SMALL_BYTES:
+        raise _too_large()
+    found = parse_json_object(bytes(raw), where)
+    if found is None:
+        raise invalid_request(f"{where} must be a JSON object; send one, or leave it out")
+    check_names(found, known, where)
+    _check_flag(found, ALL_BINARY, where)
+    return found
+
+
+def _check_flag(parameters: dict[str, Any], name: str, where: str) -> None:
+    if not isinstance(parameters.get(name, False), bool):
+        raise invalid_request(f"{name} in {where} must be true or false")
+
+
+def take_options(request: InferRequest) -> dict[str, Any]:
+    """The options of the image among the parameters of a request."""
+    return {name: value for name, value in request.parameters.items() if name in OPTIONS}
+
+
+def _too_large() -> Problem:
+    return invalid_request(
+        f"a shape, the outputs or the parameters have over {MAX_SMALL_BYTES} bytes; send fewer"
     )
 
 
 def _small(raw: msgspec.Raw, kind: type[T]) -> T:
     """A part of a request that is never large. Raises Problem, msgspec.DecodeError."""
     if len(memoryview(raw)) > MAX_SMALL_BYTES:
-        raise invalid_request(
-            f"a shape, the outputs or the parameters have over {MAX_SMALL_BYTES} bytes; send fewer"
-        )
+        raise _too_large()
     return msgspec.json.decode(raw, type=kind)
 
 
@@ -165,6 +206,8 @@ async def _read_base64(tensor: Tensor) -> bytes:
     parts = []
     try:
         if data.find(b"\\", start) >= 0:
+            if len(text) > WINDOW_BYTES:
+                await asyncio.sleep(PAUSE_S)  # to read the escapes of 4 MiB takes 10 ms
             text = memoryview(msgspec.json.decode(data[start:end], type=str).encode())
         for window in range(0, len(text), WINDOW_BYTES):
             if window:
@@ -240,7 +283,7 @@ def _read_json(name: str, text: bytes) -> bytearray:
 
 
 def _binary(tensor: Tensor, binary: memoryview) -> memoryview | None:
-    size = tensor.parameters.get("binary_data_size")
+    size = tensor.parameters.get(SIZE)
     if size is None:
         if len(binary):
             raise invalid_request(
@@ -259,7 +302,7 @@ def encode_response(
 ) -> tuple[bytes, int | None]:
     """(body of the answer, length of its JSON part or None where all is JSON). Raises Problem."""
     requested = request.outputs or [RequestedOutput(name) for name in tensors]
-    default = bool(request.parameters.get("binary_data_output", False))
+    default = request.parameters.get(ALL_BINARY, False)
     outputs, parts = [], []
     for output_request in requested:
         if output_request.name not in tensors:
@@ -272,9 +315,9 @@ def encode_response(
             "datatype": "FP32",
             "shape": list(values.shape),
         }
-        if output_request.parameters.get("binary_data", default):
+        if output_request.parameters.get(BINARY, default):
             parts.append(values.astype("<f4").tobytes())
-            output["parameters"] = {"binary_data_size": len(parts[-1])}
+            output["parameters"] = {SIZE: len(parts[-1])}
         else:
             output["data"] = values.ravel().tolist()  # NaN, for absent, becomes null
         outputs.append(output)

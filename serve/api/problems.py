@@ -1,19 +1,12 @@
-"""Error answers of the service: RFC 9457 problems, each with a stable type, and the handlers that
-turn every error of the FastAPI application into one.
+"""Error answers of the service: RFC 9457 problems, each with a stable type.
 
-`type` never changes; `detail` says what was seen, what was expected and what to do.
+`type` never changes; `detail` says what was seen, what was expected and what to do. Below /v2 a
+problem has the member `error` too, which the Open Inference Protocol requires.
 """
 
-import http
-import json
 from dataclasses import dataclass
 from math import ceil
 from typing import Any
-
-from fastapi import FastAPI, Request
-from fastapi.exceptions import RequestValidationError
-from starlette.exceptions import HTTPException
-from starlette.responses import Response
 
 from mtlnet.inference.image_decoding.errors import Fault, ImageError
 from serve.config import MAX_HEAD_BYTES
@@ -114,7 +107,7 @@ class Problem(UserError):
     @property
     def content(self) -> dict[str, Any]:
         """The members of the JSON object; `retry_after_ms` only where it is known."""
-        content = _members(self.type.uri, self.type.title, self.type.status, self.detail)
+        content = members(self.type.uri, self.type.title, self.type.status, self.detail)
         if self.retry_after_ms is not None:
             content["retry_after_ms"] = self.retry_after_ms
         return content
@@ -146,6 +139,11 @@ def head_too_large() -> Problem:
     return Problem(HEAD_TOO_LARGE, f"the headers have more than {MAX_HEAD_BYTES} bytes; send fewer")
 
 
+def stopping() -> Problem:
+    """The problem of a request that arrives while the service stops."""
+    return Problem(NOT_READY, "the service stops or restarts; ask again on a new connection")
+
+
 def small_chunks(size: int) -> Problem:
     """The problem of a body in hundreds of chunks of fewer bytes."""
     return Problem(
@@ -163,54 +161,13 @@ def too_slow(part: str, limit_s: float) -> Problem:
     return Problem(TOO_SLOW, f"the {part} did not arrive within {limit_s:g} s")
 
 
-def _members(type_uri: str, title: str, status: int, detail: str) -> dict[str, Any]:
+def members(type_uri: str, title: str, status: int, detail: str) -> dict[str, Any]:
+    """The members that every problem has."""
     return {"type": type_uri, "title": title, "status": status, "detail": detail}
 
 
-def install_problem_handlers(app: FastAPI) -> None:
-    """Answer every error that leaves `app`, also those of the framework, with a problem."""
-    app.add_exception_handler(Problem, _on_expected)
-    app.add_exception_handler(ImageError, _on_expected)
-    app.add_exception_handler(HTTPException, _on_http_exception)
-    app.add_exception_handler(RequestValidationError, _on_validation_error)
-    app.add_exception_handler(Exception, _on_unexpected)
-
-
-def _response(problem: Problem, headers: dict[str, str] | None = None) -> Response:
-    return _json_response(problem.content, {**problem.headers, **(headers or {})})
-
-
-def _json_response(content: dict[str, Any], headers: dict[str, str] | None) -> Response:
-    return Response(json.dumps(content), content["status"], headers, MEDIA_TYPE)
-
-
-def _on_expected(_request: Request, error: Exception) -> Response:
-    assert isinstance(error, Problem | ImageError)
-    return _response(as_problem(error))
-
-
-def _on_http_exception(request: Request, error: Exception) -> Response:
-    assert isinstance(error, HTTPException)
-    headers = dict(error.headers or {})
-    path = request.url.path
-    if error.status_code == 404:
-        detail = f"there is nothing at {path}; send images to POST /features, see /docs"
-        return _response(Problem(NOT_FOUND, detail), headers)
-    if error.status_code == 405:
-        allowed = headers.get("allow") or headers.get("Allow") or "another method"
-        detail = f"{path} takes {allowed}, not {request.method}; see /docs"
-        return _response(Problem(METHOD_NOT_ALLOWED, detail), headers)
-    title = http.HTTPStatus(error.status_code).phrase
-    content = _members("about:blank", title, error.status_code, str(error.detail))
-    return _json_response(content, headers)
-
-
-def _on_validation_error(_request: Request, error: Exception) -> Response:
-    assert isinstance(error, RequestValidationError)
-    seen = "; ".join(f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors())
-    return _response(Problem(INVALID_REQUEST, f"{seen}; see /docs"))
-
-
-def _on_unexpected(_request: Request, _error: Exception) -> Response:
-    # The server logs the error, and closes the connection after it.
-    return _response(internal_error(), {"Connection": "close"})
+def with_error(content: dict[str, Any], path: str) -> dict[str, Any]:
+    """The members of a problem at `path`: below /v2 with `error`, as that protocol names it."""
+    if path == "/v2" or path.startswith(("/v2/", "/v2?")):
+        return {**content, "error": content["detail"]}
+    return content

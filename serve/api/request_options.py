@@ -1,15 +1,20 @@
-"""The options of one request, read and checked from its headers: ids, stream, deadline, field of
-view, the format of the answer (JSON or MessagePack), the token, and the declared body.
+"""The options of one request, read and checked: ids, stream, deadline, field of view, the format of
+the answer (JSON or MessagePack), the token, and the declared body.
+
+All endpoints that take images have the same options, as headers or in the query; the Open Inference
+Protocol also has them as `parameters`, and /stream in a text message.
 """
 
 import itertools
+import json
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, MutableMapping
 from dataclasses import dataclass
 from functools import lru_cache
 from hmac import compare_digest
 from math import isfinite
 from typing import Any
+from urllib.parse import parse_qsl
 
 import msgspec
 
@@ -25,6 +30,16 @@ from serve.config import MAX_BODY_BYTES, MAX_DEADLINE_MS, MAX_NAME
 
 FRAME_ID, REQUEST_ID, STREAM_ID = "X-Frame-Id", "X-Request-Id", "X-Stream-Id"
 DEADLINE, FIELD_OF_VIEW = "X-Deadline-Ms", "X-Camera-Fov-Y"
+OPTIONS = {
+    "frame_id": FRAME_ID,
+    "stream_id": STREAM_ID,
+    "deadline_ms": DEADLINE,
+    "fov_y": FIELD_OF_VIEW,
+}
+"""The options of an image by their names in a query or in JSON, with the headers they stand for."""
+KEYS = {name: header.lower().encode() for name, header in OPTIONS.items()}
+MAX_QUERY_FIELDS = 16  # of a query: more are not read
+SINGLE_HEADERS = (*OPTIONS.values(), REQUEST_ID, "Content-Type", "Content-Encoding")
 MEDIA_TYPES = ("image/jpeg", "image/png")
 IMAGE_MEDIA_TYPES = frozenset(name.encode() for name in MEDIA_TYPES)
 MIN_FOV_DEG, MAX_FOV_DEG = 1.0, 179.0
@@ -56,23 +71,24 @@ MSGPACK = ResponseFormat(
     ("application/msgpack", "application/vnd.msgpack", "application/x-msgpack"),
     msgspec.msgpack.Encoder().encode,
 )
-FORMATS = (JSON, MSGPACK)  # the first is preferred where the client has no preference
+TENSORS = ResponseFormat("application/octet-stream", ("application/octet-stream",), JSON.encode)
+Formats = tuple[ResponseFormat, ...]
+FORMATS: Formats = (JSON, MSGPACK)  # the first is preferred where the client has no preference
+KSERVE_FORMATS: Formats = (JSON, TENSORS)
 
 
 @lru_cache(256)
-def negotiate(accept: str) -> ResponseFormat:
+def negotiate(accept: str, formats: Formats = FORMATS) -> ResponseFormat:
     """The format that an `Accept` header prefers (RFC 9110, 12.5.1). Raises Problem."""
     if not accept.strip():
-        return JSON
+        return formats[0]
     ranges = [_parse_media_range(item) for item in accept.split(",")]
-    weights = [_quality(choice, ranges) for choice in FORMATS]
+    weights = [_quality(choice, ranges) for choice in formats]
     best = max(weights)
     if best <= 0:
-        raise Problem(
-            NOT_ACCEPTABLE,
-            f"Accept is {accept[:80]!r}; available are {JSON.media_type} and {MSGPACK.media_type}",
-        )
-    return FORMATS[weights.index(best)]
+        available = " and ".join(choice.media_type for choice in formats)
+        raise Problem(NOT_ACCEPTABLE, f"Accept is {accept[:80]!r}; available are {available}")
+    return formats[weights.index(best)]
 
 
 def _parse_media_range(item: str) -> tuple[str, float]:
@@ -110,7 +126,88 @@ class RequestOptions:
     format: ResponseFormat = JSON
 
 
-def parse_options(headers: Headers, stamp_ns: int, request_id: str) -> RequestOptions:
+def read_options(scope: MutableMapping[str, Any]) -> Headers:
+    """The headers of an ASGI scope, with the options of its query. Raises Problem.
+
+    An option may be given once: one that is given twice would be ignored once.
+    """
+    headers: Headers = {}
+    for name, value in scope["headers"]:
+        if name in headers and name == b"accept":
+            value = headers[name] + b"," + value
+        headers[name] = value
+    names = [name for name, _ in scope["headers"]]
+    for header in SINGLE_HEADERS:
+        if names.count(header.lower().encode()) > 1:
+            raise Problem(INVALID_REQUEST, f"the request has more than one {header}; send one")
+    return merge_options(headers, parse_query(scope["query_string"]), "the query")
+
+
+def parse_query(query: bytes) -> dict[str, str]:
+    """The options in a query. Raises Problem for one that is unknown or given twice."""
+    if not query:
+        return {}
+    try:
+        text = query.decode("latin-1")
+        pairs = parse_qsl(text, keep_blank_values=True, max_num_fields=MAX_QUERY_FIELDS)
+    except ValueError as error:
+        raise Problem(INVALID_REQUEST, f"the query has over {MAX_QUERY_FIELDS} fields") from error
+    return single_options(pairs, "the query")
+
+
+def single_options(pairs: list[tuple[str, Any]], where: str) -> dict[str, Any]:
+    """Pairs as a dictionary. Raises Problem where a name is there twice."""
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        names = [name for name, _ in pairs]
+        twice = next(name for name in names if names.count(name) > 1)
+        raise Problem(INVALID_REQUEST, f"{twice[:40]!r} is twice in {where}; send it once")
+    return found
+
+
+def merge_options(headers: Headers, options: Mapping[str, Any], where: str) -> Headers:
+    """`headers` with `options` by name, found in `where`: a query, or `parameters`.
+
+    Raises Problem for one that is unknown, is also a header, or is not of its type.
+    """
+    if not options:
+        return headers
+    check_names(options, OPTIONS, where)
+    merged = dict(headers)
+    for name, value in options.items():
+        if KEYS[name] in headers:
+            seen = f"{name} is in {where}, and again in {OPTIONS[name]} or the query"
+            raise Problem(INVALID_REQUEST, f"{seen}; send it once")
+        kinds = str | int if name.endswith("_id") else str | int | float
+        if isinstance(value, bool) or not isinstance(value, kinds):
+            expected = "text or a whole number" if name.endswith("_id") else "a number"
+            raise Problem(INVALID_REQUEST, f"{name} in {where} must be {expected}")
+        merged[KEYS[name]] = str(value).encode("utf-8", "replace")
+    return merged
+
+
+def check_names(options: Mapping[str, Any], known: Mapping[str, Any], where: str) -> None:
+    """Raise Problem for options in `where` that are not `known`."""
+    unknown = next((name for name in options if name not in known), None)
+    if unknown is not None:
+        raise Problem(
+            INVALID_REQUEST,
+            f"{where} has an unknown option {unknown[:40]!r}; there are {', '.join(known)}",
+        )
+
+
+def parse_json_object(text: str | bytes, where: str) -> dict[str, Any] | None:
+    """A JSON object, None for anything else. Raises Problem where a name is in it twice."""
+    try:
+        content = json.loads(text, object_pairs_hook=lambda pairs: single_options(pairs, where))
+    except (ValueError, RecursionError):
+        return None
+    return content if isinstance(content, dict) else None
+
+
+def parse_options(
+    headers: Headers, stamp_ns: int, request_id: str, formats: Formats = FORMATS
+) -> RequestOptions:
     """The options in the headers of a request. Raises Problem."""
     return RequestOptions(
         stamp_ns,
@@ -119,18 +216,18 @@ def parse_options(headers: Headers, stamp_ns: int, request_id: str) -> RequestOp
         parse_name(headers.get(b"x-stream-id"), STREAM_ID),
         parse_deadline(headers.get(b"x-deadline-ms"), stamp_ns),
         parse_fov_deg(headers.get(b"x-camera-fov-y")),
-        parse_format(headers.get(b"accept")),
+        parse_format(headers.get(b"accept"), formats),
     )
 
 
-def parse_format(accept: bytes | None) -> ResponseFormat:
+def parse_format(accept: bytes | None, formats: Formats = FORMATS) -> ResponseFormat:
     """The format of the answer. Raises Problem."""
     if accept is None or accept == b"*/*":
-        return JSON
+        return formats[0]
     if len(accept) > MAX_ACCEPT:
         seen = f"Accept has {len(accept)} characters, at most {MAX_ACCEPT} are read"
         raise Problem(INVALID_REQUEST, seen)
-    return negotiate(accept.decode("latin-1"))
+    return negotiate(accept.decode("latin-1"), formats)
 
 
 def parse_name(sent: bytes | None, header: str) -> str | None:
@@ -140,14 +237,14 @@ def parse_name(sent: bytes | None, header: str) -> str | None:
     if not is_name(sent):
         raise Problem(
             INVALID_REQUEST,
-            f"{header} has {len(sent)} characters; expected at most {MAX_NAME}, printable ASCII",
+            f"{header} has {len(sent)} characters; expected 1 to {MAX_NAME}, printable ASCII",
         )
     return sent.decode("ascii")
 
 
 def is_name(sent: bytes) -> bool:
     """Whether `sent` is short and printable ASCII."""
-    return len(sent) <= MAX_NAME and sent.isascii() and sent.decode("ascii").isprintable()
+    return 0 < len(sent) <= MAX_NAME and sent.isascii() and sent.decode("ascii").isprintable()
 
 
 def request_id_of(headers: Headers) -> str:
@@ -174,7 +271,8 @@ def parse_fov_deg(sent: bytes | str | None) -> float | None:
 def _parse_number(sent: bytes | str, header: str, low: float, high: float) -> float:
     text = sent.decode("latin-1") if isinstance(sent, bytes) else sent
     try:
-        value = float(text) if text.isascii() else float("nan")
+        # Python alone takes 1_000 for a number.
+        value = float(text) if text.isascii() and "_" not in text else float("nan")
     except ValueError:
         value = float("nan")
     if not (isfinite(value) and low <= value <= high):

@@ -17,6 +17,7 @@ from serve.api.request_options import (
     MAX_FOV_DEG,
     MEDIA_TYPES,
     MIN_FOV_DEG,
+    OPTIONS,
     REQUEST_ID,
     STREAM_ID,
 )
@@ -141,7 +142,12 @@ REFUSALS = tuple(  # of an image
     for found in PROBLEM_TYPES
     if found not in (*SERVER_REFUSALS, *AUTHORIZATION_REFUSALS, *OTHER_REFUSALS)
 )
-NAME: dict[str, Any] = {"type": "string", "maxLength": MAX_NAME, "pattern": "^[ -~]*$"}
+NAME: dict[str, Any] = {
+    "type": "string",
+    "minLength": 1,
+    "maxLength": MAX_NAME,
+    "pattern": "^[ -~]*$",
+}
 HEADERS: dict[str, tuple[str, dict[str, Any]]] = {
     FRAME_ID: ("Returned as `frame_id`. Printable ASCII.", NAME),
     STREAM_ID: (
@@ -167,12 +173,18 @@ HEADERS: dict[str, tuple[str, dict[str, Any]]] = {
 }
 
 
-def header_parameters() -> list[dict[str, Any]]:
-    """OpenAPI parameters: the request headers of an image."""
-    return [
-        {"name": name, "in": "header", "required": False, "description": text, "schema": schema}
+def image_parameters() -> list[dict[str, Any]]:
+    """OpenAPI parameters: the request headers of an image, and the same options in the query."""
+    common = {"in": "header", "required": False}
+    found = [
+        {"name": name, **common, "description": text, "schema": schema}
         for name, (text, schema) in HEADERS.items()
     ]
+    for name, header in OPTIONS.items():
+        text = f"As the header {header}, which may not be sent then."
+        schema = HEADERS[header][1]
+        found.append({**common, "in": "query", "name": name, "description": text, "schema": schema})
+    return found
 
 
 def features_operation() -> dict[str, Any]:
@@ -181,7 +193,7 @@ def features_operation() -> dict[str, Any]:
     return {
         "summary": "Track features of one driver-view image",
         "operationId": "features",
-        "parameters": header_parameters(),
+        "parameters": image_parameters(),
         "requestBody": {
             "required": True,
             "description": "The bytes of one JPEG or PNG file: no form, no base64. At most 4 MiB, "

@@ -3,9 +3,9 @@
 A binary message is one image; its answer is a text message of JSON, or with the subprotocol
 `driverview.msgpack` a binary message of MessagePack. A new frame replaces a frame of the same
 WebSocket that is still queued. A text message before an image is a JSON object with options of that
-image: `frame_id`, `deadline_ms`. Options of all images are sent with the handshake: X-Camera-Fov-Y,
-X-Deadline-Ms, X-Stream-Id, or, from a browser, ?fov_y=&deadline_ms=. A refused frame is answered
-with its problem and its frame_id; the WebSocket stays open.
+image: `frame_id`, `deadline_ms`, `fov_y`. Options of all images are sent with the handshake, as
+headers (X-Camera-Fov-Y and the others) or, from a browser, in the query. A refused frame is
+answered with its problem and its frame_id; the WebSocket stays open.
 """
 
 import asyncio
@@ -14,10 +14,6 @@ import logging
 import time
 from dataclasses import dataclass, replace
 from http import HTTPStatus
-from typing import Any
-from urllib.parse import parse_qs
-
-import msgspec
 
 from mtlnet.inference.image_decoding.errors import ImageError
 from serve.api.features import FrameHandler, client_address
@@ -29,14 +25,21 @@ from serve.api.problems import (
     internal_error,
 )
 from serve.api.request_options import (
+    FRAME_ID,
     JSON,
+    KEYS,
     MSGPACK,
+    OPTIONS,
     Headers,
     RequestOptions,
-    is_name,
+    check_names,
+    merge_options,
     parse_deadline,
     parse_fov_deg,
+    parse_json_object,
+    parse_name,
     parse_options,
+    read_options,
     request_id_of,
 )
 from serve.scheduling.rate_limit import RateLimiter
@@ -46,6 +49,7 @@ PROTOCOLS = {"driverview.json": JSON, "driverview.msgpack": MSGPACK}
 # Else a client that floods the service with refused messages would delay all others.
 REFUSAL_PAUSE_S, BUSY_PAUSE_S = 0.01, 0.002
 MAX_TEXT = 1024  # characters of a text message
+FRAME_OPTIONS = {name: OPTIONS[name] for name in ("frame_id", "deadline_ms", "fov_y")}
 MAX_PENDING = 8  # frames of one WebSocket whose answers are not sent; then no more is received
 
 logger = logging.getLogger(__name__)
@@ -57,7 +61,7 @@ class StreamOptions:
 
     defaults: RequestOptions
     protocol: str | None
-    deadline_ms: str | None
+    deadline_ms: bytes | None
     client: str
     pause_s: float = 0.0
     """Before the next message is received: the last one was refused."""
@@ -118,18 +122,23 @@ class Stream:
         send: Send,
     ) -> None:
         """Answer the image in `message`; it is let go of before the answer waits for the client."""
-        request_id, frame_id = f"{stream.defaults.request_id}/{number}", number
+        request_id = f"{stream.defaults.request_id}/{number}"
+        frame_id = stream.defaults.frame_id or number
         share = self._frames.share()
         try:
             share.grow(len(message["bytes"]))
             self._rate_limiter.check(stream.client)
-            frame_id, deadline_ms = _parse_metadata(metadata, number, stream.deadline_ms)
+            headers = _parse_metadata(metadata)
+            frame_id = parse_name(headers.get(KEYS["frame_id"]), FRAME_ID) or frame_id
+            deadline_ms = headers.get(KEYS["deadline_ms"], stream.deadline_ms)
+            fov_deg = parse_fov_deg(headers.get(KEYS["fov_y"]))
             options = replace(
                 stream.defaults,
                 stamp_ns=stamp_ns,
                 request_id=request_id,
                 frame_id=frame_id,
                 deadline_ns=parse_deadline(deadline_ms, stamp_ns),
+                fov_y_deg=stream.defaults.fov_y_deg if fov_deg is None else fov_deg,
             )
             content = await self._frames.predict_file(options, message["bytes"], stream.client)
         except (Problem, ImageError) as error:
@@ -154,41 +163,28 @@ class Stream:
 
 def _parse_handshake(scope: Scope, request_id: str) -> StreamOptions:
     """The options in a handshake. Raises Problem."""
-    headers: Headers = dict(scope["headers"])
     if scope["path"] != PATH:
         raise Problem(NOT_FOUND, f"there is no WebSocket at {scope['path']}, only at {PATH}")
-    query = parse_qs(scope["query_string"].decode("latin-1"))
+    headers = read_options(scope)
     options = parse_options(headers, time.monotonic_ns(), request_id)
-    if "fov_y" in query:
-        options = replace(options, fov_y_deg=parse_fov_deg(query["fov_y"][0]))
-    deadline_ms = headers.get(b"x-deadline-ms", b"").decode("latin-1") or None
-    deadline_ms = query.get("deadline_ms", [deadline_ms])[0]
-    parse_deadline(deadline_ms, 0)
     protocol = next((p for p in scope["subprotocols"] if p in PROTOCOLS), None)
     response_format = PROTOCOLS[protocol] if protocol else options.format
     # Each WebSocket is a stream of its own, unless it names a stream.
     stream = options.stream or f"websocket {request_id_of({})}"
     options = replace(options, stream=stream, format=response_format)
-    return StreamOptions(options, protocol, deadline_ms, client_address(scope))
+    return StreamOptions(options, protocol, headers.get(KEYS["deadline_ms"]), client_address(scope))
 
 
-def _parse_metadata(text: str, number: str, deadline_ms: str | None) -> tuple[str, str | None]:
-    """(frame_id, deadline_ms) of a frame from its text message. Raises Problem."""
+def _parse_metadata(text: str) -> Headers:
+    """The options in a text message, as headers. Raises Problem."""
     if not text:
-        return number, deadline_ms
-    try:
-        metadata: Any = msgspec.json.decode(text) if len(text) <= MAX_TEXT else None
-    except (msgspec.DecodeError, RecursionError):
-        metadata = None
-    if not isinstance(metadata, dict) or not metadata.keys() <= {"frame_id", "deadline_ms"}:
+        return {}
+    metadata = parse_json_object(text, "a text message") if len(text) <= MAX_TEXT else None
+    if metadata is None:
         raise Problem(
             INVALID_REQUEST,
-            f"a text message must be a JSON object with frame_id, deadline_ms or both, of at most "
-            f"{MAX_TEXT} characters",
+            f"a text message must be a JSON object with {', '.join(FRAME_OPTIONS)} or some of "
+            f"these, of at most {MAX_TEXT} characters",
         )
-    frame_id = metadata.get("frame_id", number)
-    if not isinstance(frame_id, str | int) or not is_name(str(frame_id).encode()):
-        raise Problem(
-            INVALID_REQUEST, "frame_id must be a string of printable ASCII, 128 characters at most"
-        )
-    return str(frame_id), str(metadata["deadline_ms"]) if "deadline_ms" in metadata else deadline_ms
+    check_names(metadata, FRAME_OPTIONS, "a text message")
+    return merge_options({}, metadata, "a text message")

@@ -40,10 +40,16 @@ class AsyncClient:
         *,
         stream: str | None = None,
         deadline_s: float | None = None,
+        fov_y_deg: float | None = None,
     ) -> dict[str, Any]:
         """The track features of a JPEG or PNG file. Raises ServiceError."""
-        send = partial(self._client.features, stream=stream, deadline_s=deadline_s)
-        return await self._in_thread(partial(send, image, content_type, frame_id))
+        options: dict[str, Any] = {
+            "stream": stream,
+            "deadline_s": deadline_s,
+            "fov_y_deg": fov_y_deg,
+        }
+        send = partial(self._client.features, image, content_type, frame_id, **options)
+        return await self._in_thread(send)
 
     async def model(self) -> dict[str, Any]:
         """The card of the model that is served. Raises ServiceError."""

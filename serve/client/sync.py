@@ -15,6 +15,7 @@ import time
 from typing import Any
 from urllib.parse import SplitResult, urlsplit
 
+from runtime.sockets import connect
 from serve.config import MAX_DEADLINE_MS, TOKEN_VARIABLE
 from trackfeatures.errors import UserError
 
@@ -75,8 +76,9 @@ class Client:
         self.url = parts.geturl().rstrip("/")
         self._path = parts.path.rstrip("/")
         kind = http.client.HTTPSConnection if parts.scheme == "https" else _plain_connection
-        assert parts.hostname is not None
-        self._connection = kind(parts.hostname, parts.port, timeout=timeout_s)
+        self._connection = kind(_host(parts), parts.port, timeout=timeout_s)
+        # Both families of "localhost" are tried, whatever /etc/hosts names, within the timeout.
+        self._connection._create_connection = connect  # type: ignore[attr-defined]
         self._timeout_s = timeout_s
         token = os.environ.get(TOKEN_VARIABLE, "").strip() if token is None else token
         self._auth_headers = {"Authorization": f"Bearer {token}"} if token else {}
@@ -90,11 +92,13 @@ class Client:
         *,
         stream: str | None = None,
         deadline_s: float | None = None,
+        fov_y_deg: float | None = None,
     ) -> dict[str, Any]:
         """The track features of a JPEG or PNG file, `image` being its bytes.
 
         The members are those of POST /features. `content_type` None: detected from the first bytes.
-        `stream`: a newer frame of this stream replaces this one. With `deadline_s` (from now) the
+        `stream`: a newer frame of this stream replaces this one. `fov_y_deg`: the vertical field of
+        view of the image; None: that of the model's camera. With `deadline_s` (from now) the
         service drops the frame when it is late, and the request is retried until then where that
         may help (the service is overloaded, not ready, or restarting). Raises ServiceError.
         """
@@ -105,6 +109,8 @@ class Client:
             headers["X-Frame-Id"] = frame_id
         if stream is not None:
             headers["X-Stream-Id"] = stream
+        if fov_y_deg is not None:
+            headers["X-Camera-Fov-Y"] = str(float(fov_y_deg))
         _check_headers(headers)
         if deadline_s is None:
             return self._request("POST", "/features", image, headers)
@@ -231,7 +237,7 @@ def _plain_connection(host: str, port: int | None, *, timeout: float) -> http.cl
 def _parse_url(url: str) -> SplitResult:
     try:
         parts = urlsplit(url if "://" in url else f"http://{url}")
-        host = parts.hostname or ""
+        host = _host(parts)
         host.encode("idna")  # as the name lookup does
         usable = host and parts.scheme in ("http", "https") and parts.port != 0
         usable = usable and host.isprintable() and " " not in host
@@ -245,6 +251,11 @@ def _parse_url(url: str) -> SplitResult:
             f"{url!r} is not the address of a service; expected one like http://127.0.0.1:8000"
         )
     return parts
+
+
+def _host(parts: SplitResult) -> str:
+    """The host of a URL; a zone of IPv6 is written [fe80::1%25eth0] there (RFC 6874)."""
+    return (parts.hostname or "").replace("%25", "%")
 
 
 def _check_headers(headers: dict[str, str]) -> None:

@@ -21,6 +21,7 @@ from serve.api.problems import (
     Problem,
     head_too_large,
     small_chunks,
+    stopping,
     too_many_requests,
     too_slow,
 )
@@ -60,7 +61,6 @@ class GuardedProtocol(HttpToolsProtocol):
         self._settled: Phase | None = None  # the phase whose group and deadline it has
         self._deadline_s = inf
         self._idle_group = guard.idle
-        self._served = False
         self._upgrading = False
         self._running: Any = None  # the request being answered; `cycle` is the last one received
         self._fault: Problem | None = None  # with which a callback has stopped the parser
@@ -71,9 +71,46 @@ class GuardedProtocol(HttpToolsProtocol):
         self._known_bytes = 0  # of these, up to the part with the last byte of a body
 
     @property
-    def active(self) -> bool:
-        """Whether it has sent a request before, or is sending one, and may soon send another."""
-        return self._served or self._phase in (Phase.BODY, Phase.WORK)
+    def lingers(self) -> bool:
+        """Whether its last reply is sent, and the client has still to close it."""
+        return self._phase is Phase.CLOSING and not self.transport.is_closing()
+
+    def begin_draining(self) -> None:
+        """Make the reply to the last request received the last one."""
+        if self.cycle is not None and not self.cycle.response_complete:
+            self.close_after_reply()
+
+    def drain(self, elapsed_s: float) -> bool:
+        """Close it once it has been idle until DRAIN_S; whether nothing is owed to its client."""
+        idle = self._phase is Phase.IDLE or (self._phase is Phase.HEAD and not self._unread_bytes)
+        if idle and elapsed_s >= guards.DRAIN_S:
+            self.transport.close()
+            return True
+        return self._phase is Phase.CLOSING
+
+    def end_draining(self) -> None:
+        """Refuse a request that is incomplete or unanswered."""
+        if self._phase is not Phase.CLOSING:
+            self._close_with(stopping())
+
+    def close_after_reply(self) -> None:
+        """Make the reply to the last request received the last one of this connection."""
+        self.cycle.keep_alive = False
+        if isinstance(self.cycle, RequestResponseCycle):
+            self.cycle.transport = LingeringTransport(self)  # type: ignore[assignment]
+
+    def linger(self) -> None:
+        """Send no more, and read until the client closes the connection.
+
+        A connection that is closed with unread bytes is reset, and the client loses the reply.
+        """
+        self._phase = Phase.CLOSING
+        self.pipeline.clear()  # the client knows by "Connection: close" that they are not answered
+        now = self._guard.place(self, self._guard.refused)
+        unsent = self.transport.get_write_buffer_size()
+        self._deadline_s = now + (self._guard.limits.idle_s if unsent else guards.LINGER_S)
+        if not self.transport.is_closing():
+            self.transport.write_eof()
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         super().connection_made(transport)
@@ -160,7 +197,7 @@ class GuardedProtocol(HttpToolsProtocol):
             self.stop_parser(too_many_requests(f"{MAX_PIPELINED} requests"))
         super().on_headers_complete()
         if self._guard.draining and self.cycle is not None:
-            self.cycle.keep_alive = False
+            self.close_after_reply()
 
     def on_chunk_header(self) -> None:
         """Count the chunks of a body. Raises ValueError, for the parser, when they are too many."""
@@ -185,7 +222,6 @@ class GuardedProtocol(HttpToolsProtocol):
         super().on_message_complete()
 
     def on_response_complete(self) -> None:
-        self._served = True
         if self.pipeline:
             super().on_response_complete()
             return
@@ -260,6 +296,8 @@ class GuardedProtocol(HttpToolsProtocol):
         elif rest or not (self.cycle is None or self.cycle.response_complete):
             detail = "a WebSocket handshake must wait for its reply, and for those before it"
             self._close_with(Problem(MALFORMED, detail))
+        elif self._guard.draining:
+            self._close_with(stopping())
         else:
             self.handle_websocket_upgrade()
         return b""
@@ -345,6 +383,26 @@ class GuardedProtocol(HttpToolsProtocol):
         self.abandon_requests()
         if self.transport.is_closing():
             return
-        reply = problem_reply(problem, (b"connection", b"close"))
+        url = getattr(self, "url", b"").decode("latin-1")  # none before the first request
+        reply = problem_reply(problem, (b"connection", b"close"), path=url)
         self.transport.write(encode_head(reply) + reply.body)
         self.transport.write_eof()  # aborted at once, a client still sending would lose the reply
+
+
+class LingeringTransport:
+    """The transport of a connection for its last reply: `close` lets the client close first."""
+
+    def __init__(self, connection: GuardedProtocol) -> None:
+        self._connection = connection
+
+    def write(self, data: bytes) -> None:
+        """Send."""
+        self._connection.transport.write(data)
+
+    def is_closing(self) -> bool:
+        """Whether the connection is closed or lost."""
+        return self._connection.transport.is_closing()
+
+    def close(self) -> None:
+        """Send no more."""
+        self._connection.linger()

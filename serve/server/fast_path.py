@@ -18,6 +18,7 @@ from serve.server.connection import MAX_AT_ONCE, GuardedProtocol, Phase
 
 CLOSE_HEADER: Header = (b"connection", b"close")
 SMALL_BYTES = 1024  # smaller parts of a body are put together: an object each would take more
+TOGETHER_BYTES = 1 << 16  # of them in one object: a longer one is moved as it grows
 BODY = Phase.BODY
 OK, UNAVAILABLE = HTTPStatus.OK.value, HTTPStatus.SERVICE_UNAVAILABLE.value
 ASGI_HEADERS = frozenset({b"expect", b"upgrade", b"x-forwarded-for"})
@@ -62,7 +63,7 @@ class DirectRequest:
         last = self.parts[-1] if self.parts else None
         if len(part) >= SMALL_BYTES:
             self.parts.append(part)
-        elif isinstance(last, bytearray):
+        elif isinstance(last, bytearray) and len(last) < TOGETHER_BYTES:
             last += part
         else:
             self.parts.append(bytearray(part))
@@ -173,7 +174,7 @@ class DirectProtocol(GuardedProtocol):
             headers = [*headers, CLOSE_HEADER]
         self.transport.write(encode_head(reply, *headers) + reply.body)
         if not request.keep_alive:
-            self.transport.close()
+            (self.linger if self._guard.draining else self.transport.close)()
         if reply.status == OK:
             self._idle_group = self._guard.served
         self.on_response_complete()

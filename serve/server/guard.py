@@ -12,7 +12,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from ipaddress import ip_address, ip_network
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
@@ -21,6 +21,7 @@ from serve.config import Limits, network_of
 from serve.scheduling.body_budget import BodyBudget
 
 LINGER_S = 0.5  # for a client to read the problem before its connection is closed
+DRAIN_S = 1.0  # for clients to send one more request, answered with Connection: close
 EVICTABLE_S = 0.1  # connections in headers or a body for longer give way to new ones
 REFUSAL_PAUSE_S = 0.002  # for which refused clients are not read while the queue is full
 
@@ -41,6 +42,23 @@ class Guarded(Protocol):
 
     def end_slow_body(self, now: float) -> int:
         """End the connection if a body has been arriving for EVICTABLE_S; the bytes it held."""
+
+
+@runtime_checkable
+class Drained(Protocol):
+    """A connection as a worker that stops sees it."""
+
+    lingers: bool
+    """Its last bytes are sent; the client has still to close it."""
+
+    def begin_draining(self) -> None:
+        """Say with the next reply that it is the last one."""
+
+    def drain(self, elapsed_s: float) -> bool:
+        """Close it if nothing is owed to the client, `elapsed_s` after that; whether that is so."""
+
+    def end_draining(self) -> None:
+        """End it, with a reply to what is still owed."""
 
 
 Group = dict[Guarded, None]

@@ -33,7 +33,7 @@ from serve.server import guard as guards
 from serve.server.guard import ConnectionGuard, Group
 
 SLICE_BYTES = 4096  # parsed before small frames are counted; holds hundreds of them
-SMALL_BYTES = 1024  # a frame of fewer is a small one
+SMALL_BYTES = 2048  # a frame of fewer is a small one
 SMALL_FRAMES = 500  # of these and of text, a second, and at once
 MAX_TEXT_BYTES = 4096  # of a text message: 1,024 characters in UTF-8
 TEXT_COST = 4  # bytes of memory of a text by byte, where one character is an emoji
@@ -55,6 +55,8 @@ class GuardedWebSocket(WebSocketsSansIOProtocol):
         self._share = None if guard.bodies is None else BodyShare(guard.bodies)
         self._frame_bytes = 0  # of the frames of a message that is incomplete
         self._queued_bytes: deque[int] = deque()  # of complete messages, not yet received
+        self._draining = False
+        self._owed = 0  # answers to images that the service has taken
 
     def connection_made(self, transport: Transport) -> None:  # type: ignore[override]
         super().connection_made(transport)
@@ -68,7 +70,29 @@ class GuardedWebSocket(WebSocketsSansIOProtocol):
         super().connection_lost(exc)
         self.conn.parser.close()  # it holds `conn`, which holds it
 
+    @property
+    def lingers(self) -> bool:
+        """Whether its close frame is sent, and the client has still to close it."""
+        return self._discarding and not self.transport.is_closing()
+
+    def begin_draining(self) -> None:
+        """Take no more images: those that have not arrived as a whole are not answered."""
+        self._draining = True
+
+    def drain(self, elapsed_s: float) -> bool:
+        """Close it once all images are answered; whether that is so."""
+        if self.handshake_complete and not (self._owed or self._queued_bytes):
+            self.end_draining()
+        return self._discarding or self.transport.is_closing()
+
+    def end_draining(self) -> None:
+        """Close it."""
+        if not (self._discarding or self.transport.is_closing()):
+            self.fail(CloseCode.SERVICE_RESTART, "the service stops or restarts; connect again")
+
     def data_received(self, data: bytes) -> None:
+        if self._draining and not self._discarding:
+            return
         self._guard.reading = self
         for at in range(0, len(data), SLICE_BYTES):
             if self._discarding:
@@ -189,6 +213,7 @@ class GuardedWebSocket(WebSocketsSansIOProtocol):
         if message["type"] == "websocket.receive" and self._queued_bytes:
             self._queued_bytes.popleft()
             self._count_message()
+            self._owed += message.get("bytes") is not None
         return message
 
     async def send(self, message: Any) -> None:
@@ -196,7 +221,9 @@ class GuardedWebSocket(WebSocketsSansIOProtocol):
         if self._discarding:
             raise ClientDisconnected
         await super().send(message)
-        if message["type"] == "websocket.accept":
+        if message["type"] == "websocket.send":
+            self._owed -= 1
+        elif message["type"] == "websocket.accept":
             self._handshake_end_s = inf
             self.transport.resume_reading()
         elif message["type"] == "websocket.http.response.body":

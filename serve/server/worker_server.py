@@ -1,9 +1,10 @@
 """The server of one worker: it shares new connections with the other workers, and drains them when
 it stops.
 
-All workers listen on one socket and all are woken by a new connection; the one with the fewest
-connections accepts it. (If the kernel chose, one of two workers could get six of eight clients and
-keep them for hours.) A worker that is warming up leaves connections to those that are ready.
+All workers listen on the same sockets and all are woken by a new connection; the one with the
+fewest connections accepts it. (If the kernel chose, one of two workers could get six of eight
+clients and keep them for hours.) A worker that is warming up leaves connections to those that are
+ready.
 """
 
 import asyncio
@@ -12,7 +13,7 @@ import logging
 import signal
 import socket
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from typing import Any
@@ -21,15 +22,15 @@ import uvicorn
 
 from serve.app import Service
 from serve.config import MAX_BODY_BYTES, Limits
-from serve.server.connection import GuardedProtocol
 from serve.server.fast_path import DirectProtocol
-from serve.server.guard import ConnectionGuard, close_expired
+from serve.server.guard import ConnectionGuard, Drained, close_expired
 from serve.server.heap import HeapTrimmer
 from serve.server.websocket import GuardedWebSocket
 from serve.workers.shared_memory import WorkerPeers
 
 GRACE_S = 5  # for requests in progress when the service stops
-DRAIN_S = 1.0  # for active clients to send one more request, answered with Connection: close
+LAST_S = 1.0  # then for clients to read why they got no answer
+DRAIN_STEP_S = 0.02
 YIELD_S = 0.002  # for which a worker leaves a connection to one that has fewer
 ACCEPTS_AT_ONCE, ACCEPTS_PER_S = 32, 1_000  # more would delay the requests of other clients
 ACCEPT_PAUSE_S = 0.004  # for which no connection is accepted when there were too many
@@ -68,14 +69,15 @@ class WorkerServer(uvicorn.Server):
         yield
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
-        """Start the application, then accept connections from the one listening socket."""
+        """Start the application, then accept connections from the listening sockets."""
         assert sockets is not None
         await self.lifespan.startup()
         if self.lifespan.should_exit:
             raise SystemExit(1)
         self.servers = []
-        self._listener = sockets[0]
-        self._listener.setblocking(False)
+        self._listeners = sockets
+        for listener in sockets:
+            listener.setblocking(False)
         self._loop = asyncio.get_running_loop()
         self._make_protocol = partial(
             DirectProtocol,
@@ -100,21 +102,33 @@ class WorkerServer(uvicorn.Server):
         return await super().on_tick(counter)
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
-        """Accept no more connections, drain the active ones, finish requests in progress."""
-        self._loop.remove_reader(self._listener.fileno())
+        """Accept no more connections; finish the requests of those that are open.
+
+        Other workers, or the supervisor of a service that stops, accept the new ones.
+        """
+        self._remove_readers()
         self.guard.draining = True
         self._peers.withdraw()
-        end = self._loop.time() + DRAIN_S
-        while self._has_active_clients() and self._loop.time() < end and not self.force_exit:
-            await asyncio.sleep(0.02)
+        for connection in self._connections():
+            connection.begin_draining()
+        await self._wait_for(lambda c, elapsed_s: c.drain(elapsed_s), GRACE_S)
+        for connection in self._connections():
+            connection.end_draining()
+        await self._wait_for(lambda c, _elapsed_s: not c.lingers, LAST_S)
         await super().shutdown(sockets)
 
-    def _has_active_clients(self) -> bool:
-        """Whether a client is connected that may soon send another request."""
-        return any(
-            isinstance(connection, GuardedProtocol) and connection.active
-            for connection in self.server_state.connections
-        )
+    async def _wait_for(self, is_done: Callable[[Drained, float], bool], limit_s: float) -> None:
+        """Wait until each connection is done."""
+        start_s = self._loop.time()
+        while not self.force_exit and (elapsed_s := self._loop.time() - start_s) < limit_s:
+            await asyncio.sleep(DRAIN_STEP_S)  # first: one may have been accepted just now
+            close_expired(self.server_state.connections, self.guard.clock())
+            done = [is_done(connection, elapsed_s) for connection in self._connections()]
+            if all(done):
+                break
+
+    def _connections(self) -> list[Drained]:
+        return [c for c in self.server_state.connections if isinstance(c, Drained)]
 
     def _make_room_for_others(self) -> None:
         least = self._peers.room_asked()
@@ -124,17 +138,22 @@ class WorkerServer(uvicorn.Server):
             self.guard.make_room(1, least)
 
     def _start_accepting(self) -> None:
-        self._loop.add_reader(self._listener.fileno(), self._accept)
+        for listener in self._listeners:
+            self._loop.add_reader(listener.fileno(), self._accept, listener)
+
+    def _remove_readers(self) -> None:
+        for listener in self._listeners:
+            self._loop.remove_reader(listener.fileno())
 
     def _pause_accepting(self, seconds: float) -> None:
-        self._loop.remove_reader(self._listener.fileno())
+        self._remove_readers()
         self._loop.call_later(seconds, self._resume_accepting)
 
     def _resume_accepting(self) -> None:
         if not self.guard.draining:
             self._start_accepting()
 
-    def _accept(self) -> None:
+    def _accept(self, listener: socket.socket) -> None:
         if not self.app.frame_queue.ready and self._peers.other_is_ready():
             self._pause_accepting(YIELD_S)
             return
@@ -148,7 +167,7 @@ class WorkerServer(uvicorn.Server):
             self._pause_accepting(ACCEPT_PAUSE_S)
             return
         try:
-            connection, _ = self._listener.accept()
+            connection, _ = listener.accept()
         except (BlockingIOError, InterruptedError, ConnectionAbortedError):
             return
         except OSError as error:

@@ -10,12 +10,13 @@ import logging
 import os
 import signal
 import socket
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from serve.config import Limits
+from serve.workers.last_answers import LastAnswers
 from serve.workers.shared_memory import (
     COMMITTED_GENERATION,
     SharedMemory,
@@ -25,6 +26,7 @@ from serve.workers.shared_memory import (
 from serve.workers.worker_process import WorkerProcess, WorkerTask, start_worker
 from trackfeatures.errors import UserError
 
+BACKLOG = 2048
 LOAD_TIMEOUT_S = 120.0  # for a worker to load a model on a busy machine
 STOP_TIMEOUT_S = 15.0  # for a worker to stop on SIGTERM; then it is killed
 MIN_BACKOFF_S, MAX_BACKOFF_S = 0.5, 30.0  # before a worker that died is replaced
@@ -46,9 +48,9 @@ class ServicePlan:
 class Supervisor:
     """The workers of one service."""
 
-    def __init__(self, plan: ServicePlan, listener: socket.socket) -> None:
+    def __init__(self, plan: ServicePlan, listeners: Sequence[socket.socket]) -> None:
         self._plan = plan
-        self._listener = listener
+        self._listeners = listeners
         # One block more than workers: a replacement runs beside the worker that it replaces.
         self._shared: SharedMemory = create_shared_memory(plan.workers + 1)
         self._head = self._shared.head()
@@ -67,9 +69,9 @@ class Supervisor:
         return self._folder
 
     async def start(self) -> dict[str, Any] | None:
-        """Start all workers; the first one's report of its engine, None if stopped meanwhile.
+        """Listen, and start all workers.
 
-        Raises UserError.
+        Returns the first one's report of its engine, None if stopped meanwhile. Raises UserError.
         """
         loop = asyncio.get_running_loop()
         for number in (signal.SIGTERM, signal.SIGINT):
@@ -77,6 +79,8 @@ class Supervisor:
         # What is loaded now is new: there is nothing to reload or to replace.
         loop.add_signal_handler(signal.SIGHUP, self._on_hangup, lambda: None)
         loop.add_signal_handler(signal.SIGUSR2, lambda: None)
+        for listener in self._listeners:  # not before: a signal would reset whoever connects
+            listener.listen(BACKLOG)
         for position in range(self._plan.workers):
             self._workers[position] = await self._start_worker(self._free_block())
         loading = asyncio.gather(
@@ -87,6 +91,7 @@ class Supervisor:
         stopping.cancel()
         if not loading.done():
             loading.cancel()
+            await asyncio.gather(loading, return_exceptions=True)  # else the end is logged
             await self._stop_workers()
             return None
         try:
@@ -119,7 +124,11 @@ class Supervisor:
         await self._stop_workers()
 
     async def _stop_workers(self) -> None:
+        """Stop all workers, then listening; connections that arrive meanwhile are answered 503."""
+        last_answers = LastAnswers(self._listeners)
+        last_answers.start()
         await asyncio.gather(*(worker.stop(STOP_TIMEOUT_S) for worker in self._workers.values()))
+        await last_answers.finish()
 
     async def reload(self, model: str | None = None) -> str:
         """Load `model` (None: the current one, again) in all workers, then answer with it.
@@ -209,7 +218,7 @@ class Supervisor:
             folder=str(self._folder.resolve()),
             generation=self._head[COMMITTED_GENERATION],
             expected=self._model_hash,
-            listener=self._listener.fileno(),
+            listeners=tuple(listener.fileno() for listener in self._listeners),
             memory=self._shared.fd,
             blocks=self._shared.blocks,
             block=block,

@@ -88,7 +88,7 @@ def main() -> None:
     server = WorkerServer(app, task.limits, peers)
     arguments = (supervisor, lines, server, app)
     threading.Thread(target=handle_commands, args=arguments, daemon=True).start()
-    server.run(sockets=[socket.socket(fileno=task.listener)])
+    server.run(sockets=[socket.socket(fileno=number) for number in task.listeners])
     peers.withdraw()
 
 

@@ -23,14 +23,14 @@ logger = logging.getLogger(__name__)
 class WorkerTask:
     """What a new worker is to do, sent as its first message.
 
-    `expected`: the hash its weights must have, None: any. `listener`, `memory`: inherited file
+    `expected`: the hash its weights must have, None: any. `listeners`, `memory`: inherited file
     descriptors. `block`: its own block of the shared memory, which has `blocks` of them.
     """
 
     folder: str
     generation: int
     expected: str | None
-    listener: int
+    listeners: tuple[int, ...]
     memory: int
     blocks: int
     block: int
@@ -166,7 +166,7 @@ async def start_worker(task: WorkerTask) -> WorkerProcess:
                 "-m",
                 "serve.workers.worker",
                 str(theirs.fileno()),
-                pass_fds=(theirs.fileno(), task.listener, task.memory),
+                pass_fds=(theirs.fileno(), *task.listeners, task.memory),
                 start_new_session=True,  # Ctrl-C goes to the supervisor only
                 stdin=asyncio.subprocess.DEVNULL,
             )

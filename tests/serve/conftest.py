@@ -167,7 +167,8 @@ def assert_problem(reply: Reply, status: int, name: str) -> None:
     assert reply.headers["content-type"] == "application/problem+json"
     content = reply.content
     hint = {"retry_after_ms"} if status in (429, 503) else set()
-    assert set(content) == {"type", "title", "status", "detail"} | hint
+    assert set(content) - {"error"} == {"type", "title", "status", "detail"} | hint
+    assert content.get("error", content["detail"]) == content["detail"]
     assert content["type"] == f"/problems/{name}"
     assert content["status"] == status
     assert content["title"] == next(k.title for k in PROBLEM_TYPES if k.name == name)
@@ -228,7 +229,7 @@ class Served:
         content = response.read()
         found = {name.lower(): value for name, value in response.getheaders()}
         is_json = "json" in found.get("content-type", "")
-        return Reply(response.status, found, json.loads(content) if is_json else content)
+        return Reply(response.status, found, json.loads(content or b"null") if is_json else content)
 
     def post(self, body: Any, kind: str | None = "image/jpeg", **headers: str) -> Reply:
         sent = {name.replace("_", "-"): value for name, value in headers.items()}
@@ -245,18 +246,19 @@ def serving(
     tracer: "Tracer | None" = None,
     beside: Served | None = None,
     clock: Callable[[], float] | None = None,
+    host: str = "127.0.0.1",
 ) -> Iterator[Served]:
     """The service around `engine` on a free port, as `serve` runs it, in a thread of this process.
 
     Ready when entered, unless there is a `check`. `beside`: on its port, as another worker.
-    `clock`: of the deadlines of its connections, s.
+    `clock`: of the deadlines of its connections, s. `host`: where it listens.
     """
 
     def checked(engine: Engine) -> None:
         if check is not None:
             check(engine)
 
-    listener = beside.listener.dup() if beside is not None else bind("127.0.0.1", 0)
+    listener = beside.listener.dup() if beside is not None else bind(host, 0)
     listener.listen(2048)
     app = Service(engine, checked, limits, shared, block, tracer)
     server = WorkerServer(app, limits or Limits(), WorkerPeers(app.shared, block))

@@ -16,7 +16,7 @@ import mtlnet.export.convert
 import mtlnet.export.int8
 from datagen.recording import Dataset, Frames
 from mtlnet.evaluation.tables import export_lines
-from mtlnet.export.convert import export_model
+from mtlnet.export.convert import export_model, write_openvino
 from mtlnet.export.int8 import (
     choose_float_activations,
     convolutions_by_work,
@@ -24,7 +24,7 @@ from mtlnet.export.int8 import (
     gate,
     operation_names,
 )
-from mtlnet.export.openvino_graph import TOLERANCE, write_graph
+from mtlnet.export.openvino_graph import TOLERANCE, build_graph, run_graph, write_graph
 from mtlnet.inference.engine import EXPORT_FILE, INT8, load_engine, passed_gate, read_graph
 from mtlnet.inference.model_card import (
     GRAPH,
@@ -35,6 +35,7 @@ from mtlnet.inference.model_card import (
     read_card,
     resolve_run,
 )
+from mtlnet.inference.uncertainty import read_uncertainty_head
 from mtlnet.model.network import Network, fold, load_network
 from mtlnet.training.config import TrainConfig
 from mtlnet.training.run import train
@@ -94,6 +95,39 @@ def test_openvino_bf16_halves_the_weights(trained: Path, dataset: Path, tmp_path
     sizes = [(tmp_path / p / GRAPH_WEIGHTS).stat().st_size for p in ("f32", "bf16")]
     assert sizes[1] / sizes[0] == pytest.approx(0.5, abs=0.01)
     assert json.loads((tmp_path / "bf16" / EXPORT_FILE).read_text())["check"] == half["check"]
+
+
+@pytest.mark.parametrize("precision", ["f32", "bf16"])
+def test_an_openvino_model_answers_any_number_of_images_each_as_alone(
+    precision: str, tmp_path: Path
+) -> None:
+    """The shipped model, with its standard deviations and its score."""
+    run = resolve_run("default")
+    card = read_card(run)
+    network = load_network(run / WEIGHTS, card.network)
+    graph = build_graph(network, read_uncertainty_head(run), batch=-1)
+    write_openvino(graph, tmp_path, precision)
+    options = {"INFERENCE_PRECISION_HINT": "f32"}
+    model = openvino.Core().compile_model(str(tmp_path / GRAPH), "CPU", options)
+    (batch, *sizes) = model.input("images").partial_shape
+    assert (batch.is_dynamic, sizes) == (True, [210, 280, 3])
+    frames = np.random.default_rng(0).integers(0, 256, (17, 210, 280, 3), np.uint8)
+    alone = np.concatenate([model(frame[None])["outputs"].copy() for frame in frames])
+    for count in (0, 1, 3, 17):
+        found = model(frames[:count])["outputs"]
+        assert found.shape == (count, 22)
+        np.testing.assert_allclose(found, alone[:count], rtol=1e-5, atol=1e-6)
+    if precision == "f32":
+        served = run_graph(read_graph(run, card), "f32", frames[:3])
+        np.testing.assert_allclose(alone[:3], served, rtol=1e-4, atol=TOLERANCE)
+    with pytest.raises(RuntimeError):
+        model(frames[:, :200])
+
+
+def test_the_served_graph_is_one_of_one_image() -> None:
+    """A graph for any number of images takes longer for one."""
+    run = resolve_run("default")
+    assert list(read_graph(run, read_card(run)).input(0).shape) == [1, 210, 280, 3]
 
 
 @pytest.mark.slow

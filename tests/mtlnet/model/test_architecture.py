@@ -101,6 +101,8 @@ def test_the_openvino_graph_matches_torch(name: str) -> None:
     found = np.concatenate([request(frame[None])[0] for frame in frames])
     assert np.ptp(expected[:, :5], axis=0).max() > 10 * TOLERANCE
     np.testing.assert_allclose(found, expected, atol=TOLERANCE)
+    several = openvino.Core().compile_model(build_graph(network, batch=-1), "CPU", options)
+    np.testing.assert_allclose(several(frames)[0], expected, atol=TOLERANCE)
 
 
 @pytest.mark.parametrize("name", ["mobilenet_v3_small", "deepdriving"])

@@ -185,7 +185,12 @@ def test_an_onnx_model_reads_bins_as_torch_does(tmp_path: Path) -> None:
     options = {"INFERENCE_PRECISION_HINT": "f32"}  # on some processors the default is bf16
     model = openvino.Core().compile_model(str(tmp_path / ONNX_FILE), "CPU", options)
     assert [result.any_name for result in model.outputs] == ["outputs", "absent"]
+    (batch, *sizes) = model.input("images").partial_shape
+    assert (batch.is_dynamic, sizes) == (True, [210, 280, 3])
     absent = [model(frame[None])["absent"][0] for frame in frames]
+    for count in (0, 3, 4):  # each as alone
+        together = model(frames[:count])["absent"]
+        np.testing.assert_allclose(together, absent[:count] or np.empty((0, 5)), atol=TOLERANCE)
     np.testing.assert_allclose(absent, run_network(network, frames).absent, atol=TOLERANCE)
 
 

@@ -1,14 +1,29 @@
 """The Open Inference Protocol v2, by requests built from its specification."""
 
 import base64
+import http.client
 import json
+import socket
 import struct
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
 import pytest
 
-from tests.serve.conftest import FakeEngine, Reply, Served, jpeg, outputs, picture, serving
+from serve.config import Limits
+from tests.serve.conftest import (
+    PATIENCE_S,
+    FakeEngine,
+    Gate,
+    Reply,
+    Served,
+    jpeg,
+    outputs,
+    picture,
+    serving,
+    until,
+)
 
 JPEG = jpeg(picture())
 INFER = "/v2/models/track/infer"
@@ -40,7 +55,9 @@ def test_health_and_metadata(service: Served) -> None:
     model = service.ask("GET", "/v2/models/track").content
     assert model == service.ask("GET", "/v2/models/track/versions/1").content
     assert {tensor["name"] for tensor in model["inputs"]} == {"image", "pixels"}
-    assert service.ask("GET", "/v2/models/other").status == 404
+    assert service.ask("GET", "/v2/health/ready").content == {"ready": True}
+    for path in ("/v2/models/track/ready", "/v2/models/track/versions/1/ready"):
+        assert service.ask("GET", path).content == {"name": "track", "ready": True}
 
 
 def test_not_ready_before_the_model_is_warm() -> None:
@@ -170,3 +187,70 @@ def test_a_wrong_header_length_and_deep_nesting_are_refused(service: Served) -> 
     head = b'{"inputs": [{"name": "pixels", "shape": [1, 1, 3], "datatype": "UINT8", "data": '
     assert service.ask("POST", INFER, head + deep + b"}]}").status == 422
     assert service.ask("POST", INFER, head + b"[" * 100_000).status == 422
+
+
+def post_raw(service: Served, *lines: str, path: str = INFER) -> dict[str, Any]:
+    """The JSON of the reply to a request with these header lines and no body."""
+    with socket.create_connection(("127.0.0.1", service.port), PATIENCE_S) as connection:
+        text = "".join(f"{line}\r\n" for line in (f"POST {path} HTTP/1.1", *lines, ""))
+        connection.sendall(text.encode("latin-1"))
+        found = http.client.HTTPResponse(connection)
+        found.begin()
+        content: dict[str, Any] = {**json.loads(found.read()), "status": found.status}
+        return content
+
+
+HOST = "Host: localhost"
+
+
+@pytest.mark.parametrize(
+    ("status", "lines", "path"),
+    [
+        (404, [HOST, "Content-Length: 0"], "/v2/models/other/infer"),
+        (404, [HOST, "Content-Length: 0"], "/v2/models/track/versions/2/infer"),
+        (404, [HOST, "Content-Length: 0"], "/v2/repository/index"),
+        (405, [HOST, "Content-Length: 0"], "/v2/health/live"),
+        (405, [HOST, "Content-Length: 0"], "/v2"),
+        (413, [HOST, "Content-Length: 99999999"], INFER),
+        (415, [HOST, "Content-Length: 9", "Content-Encoding: gzip"], INFER),
+        (422, [HOST, "Content-Length: 0"], INFER),
+        (403, ["Host: evil.example", "Content-Length: 0"], INFER),
+        (403, [HOST, "Origin: http://evil.example", "Content-Length: 0"], "/v2"),
+        (400, [HOST, HOST, "Content-Length: 0"], INFER),
+        (400, ["Content-Length: 0"], INFER),
+        (400, [HOST, "Content-Length: x"], INFER),
+        (431, [HOST, "X-Long: " + 33_000 * "x"], INFER),
+        (400, [HOST, "Transfer-Encoding: chunked", "", "zz"], INFER),
+        (413, [HOST, "Transfer-Encoding: chunked", "", *["1", "x"] * 1000], INFER),
+    ],
+)
+def test_every_error_below_v2_has_the_member_error(
+    service: Served, status: int, lines: list[str], path: str
+) -> None:
+    content = post_raw(service, *lines, path=path)
+    assert content["status"] == status
+    assert content["error"] == content["detail"]
+    assert "error" not in post_raw(service, *lines, path=path.replace("/v2", "/v3"))
+
+
+def test_errors_below_v2_without_a_token_over_the_rate_or_when_full_have_it_too() -> None:
+    engine = FakeEngine(lambda _image: outputs())
+    with serving(engine, limits=Limits(token="a-token-of-some-length")) as service:
+        reply = service.ask("GET", "/v2")
+        assert (reply.status, reply.content["error"]) == (401, reply.content["detail"])
+    with serving(engine, limits=Limits(rate=1)) as service:
+        other = {"X-Forwarded-For": "192.0.2.1"}
+        assert service.ask("GET", "/v2", headers=other).status == 200
+        reply = service.ask("GET", "/v2", headers=other)
+        assert (reply.status, reply.content["error"]) == (429, reply.content["detail"])
+    with serving(FakeEngine(lambda _image: 1 / 0)) as service:  # type: ignore[arg-type,return-value]
+        reply = infer(service, {"inputs": [BASE64]})
+        assert (reply.status, reply.content["error"]) == (500, reply.content["detail"])
+    gate = Gate()
+    with serving(gate.engine, limits=Limits(queue=0)) as service, ThreadPoolExecutor(1) as pool:
+        first = pool.submit(Served(service.port).post, JPEG)
+        until(gate.busy.is_set)
+        reply = infer(service, {"inputs": [BASE64]})
+        assert (reply.status, reply.content["error"]) == (503, reply.content["detail"])
+        gate.open.set()
+        assert first.result().status == 200

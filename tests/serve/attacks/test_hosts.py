@@ -258,7 +258,7 @@ def test_the_options_reach_the_service(monkeypatch: pytest.MonkeyPatch) -> None:
     assert limits.hosts == ("127.0.0.1", "a.example", "b")
     assert limits.trusted_proxies == ("10.0.0.0/8",)
     assert limits.body_mib == 8
-    task = WorkerTask("run", 0, None, 3, 4, 1, 0, limits)
+    task = WorkerTask("run", 0, None, (3,), 4, 1, 0, limits)
     sent = WorkerTask.from_json_line(task.to_json_line().decode()).limits
     assert (tuple(sent.hosts), tuple(sent.trusted_proxies)) == (limits.hosts, ("10.0.0.0/8",))
 

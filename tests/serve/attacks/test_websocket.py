@@ -154,7 +154,7 @@ def test_a_message_and_the_reading_of_answers_have_deadlines() -> None:
         (found,) = streams(service)
 
         def flood() -> bool:
-            send_all(unread, frame(BINARY, b"no image" * 128), 100)
+            send_all(unread, frame(BINARY, b"no image" * 256), 100)
             return not found.writable.is_set()
 
         until(flood)

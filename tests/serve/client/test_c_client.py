@@ -51,9 +51,9 @@ def image(tmp_path: Path) -> Path:
 
 
 def ask(
-    program: Path, port: int, *images: Path, token: str | None = None
+    program: Path, port: int, *images: Path, token: str | None = None, host: str = "127.0.0.1"
 ) -> subprocess.CompletedProcess[str]:
-    words = [str(program), "127.0.0.1", str(port), *map(str, images)]
+    words = [str(program), host, str(port), *map(str, images)]
     environment = {} if token is None else {"DRIVERVIEW_TOKEN": token}
     return subprocess.run(
         words, capture_output=True, text=True, timeout=PATIENCE_S, env=environment
@@ -176,3 +176,13 @@ def test_an_unreadable_image_and_an_invalid_reply_are_errors(
     ):
         assert "ml -1.500" in ask(program, port, image).stdout  # a reply of that length is not read
     assert subprocess.run([program], capture_output=True).returncode == 2
+
+
+@pytest.mark.parametrize("listens", ["127.0.0.1", "::1"])
+def test_localhost_is_both_loopback_addresses(program: Path, image: Path, listens: str) -> None:
+    with serving(FakeEngine(lambda _image: outputs()), host=listens) as service:
+        for host in ("localhost", "LOCALHOST", listens):
+            done = ask(program, service.port, image, host=host)
+            assert (done.returncode, "straight" in done.stdout) == (0, True), done.stderr
+    done = ask(program, 1, image, host="no.such.host")
+    assert (done.returncode, done.stderr) == (2, "no.such.host: there is no such host\n")

@@ -90,6 +90,9 @@ def test_answers_are_those_of_the_service(service: Served) -> None:
         assert answer["distances_m"]["ml"] == pytest.approx(-2.0, abs=1e-5)
         assert answer["frame_id"] == "17"
         assert client.features(PNG)["model"] == CARD.model_hash
+        assert client.features(JPEG, fov_y_deg=90)["crop_px"] is not None
+        with pytest.raises(ServiceError, match="field of view"):
+            client.features(JPEG, fov_y_deg=20.5)
         assert client.model()["camera"]["width"] == 280
     assert Client(f"127.0.0.1:{service.port}").ready()
 
@@ -134,6 +137,7 @@ def test_asyncio_clients_ask_concurrently(service: Served) -> None:
             assert (await client.model())["model"] == CARD.model_hash
             with pytest.raises(ServiceError, match="4 bytes"):
                 await client.features(b"text")
+            assert (await client.features(JPEG, fov_y_deg=90))["crop_px"] is not None
             return await client.features(JPEG, frame_id=str(number), deadline_s=60)
 
     async def crowd() -> list[dict[str, Any]]:
@@ -287,3 +291,44 @@ def test_a_server_that_is_not_this_service(sent: bytes, message: str) -> None:
 def test_invalid_addresses(url: str) -> None:
     with pytest.raises(ServiceError, match="is not the address of a service"):
         Client(url)
+
+
+@pytest.mark.parametrize("listens", ["127.0.0.1", "::1"])
+def test_localhost_is_both_loopback_addresses(listens: str) -> None:
+    with serving(FakeEngine(lambda _image: outputs()), host=listens) as service:
+        literal = f"[{listens}]" if ":" in listens else listens
+        for host in ("localhost", "LOCALHOST", literal):
+            with Client(f"http://{host}:{service.port}") as client:
+                assert client.ready()
+                assert client.features(JPEG)["model"] == CARD.model_hash
+
+        async def ask() -> bool:
+            async with AsyncClient(f"localhost:{service.port}") as client:
+                return await client.ready()
+
+        assert asyncio.run(ask())
+        with pytest.raises(ServiceError, match="no service listens at http://localhost:1;"):
+            Client("localhost:1").model()
+
+
+def test_a_zone_of_an_ipv6_address_is_used_and_ignored_by_the_service(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    asked: list[str] = []
+
+    def connect(place: tuple[str, int], *_: Any) -> socket.socket:
+        asked.append(place[0])
+        return socket.create_connection(("::1", place[1]), PATIENCE_S)
+
+    monkeypatch.setattr(sync, "connect", connect)
+    limits = Limits(hosts=("fe80::1%eth0",))
+    with serving(FakeEngine(lambda _image: outputs()), limits=limits, host="::1") as service:
+        for zone in ("%25eth0", "%eth0"):
+            with Client(f"http://[fe80::1{zone}]:{service.port}") as client:
+                assert client.model()["model"] == CARD.model_hash
+        with (
+            Client(f"http://[fe80::2]:{service.port}") as client,
+            pytest.raises(ServiceError, match="the Host is"),
+        ):
+            client.model()
+    assert asked == ["fe80::1%eth0", "fe80::1%eth0", "fe80::2"]

@@ -90,7 +90,7 @@ def workers(monkeypatch: pytest.MonkeyPatch) -> FakeWorkers:
 
 def make_supervisor(folder: Path) -> Supervisor:
     plan = ServicePlan("run", lambda name: folder / name, 2, Limits())
-    return Supervisor(plan, bind("127.0.0.1", 0))
+    return Supervisor(plan, [bind("127.0.0.1", 0)])
 
 
 def test_a_stop_is_obeyed_while_the_model_is_loaded_and_a_reload_is_not_needed(

@@ -1,0 +1,98 @@
+"""Connections that arrive while the service stops: each request is answered 503, and closed.
+
+The workers finish the requests of their own connections meanwhile. A connection that nobody accepts
+is reset when the listening socket is closed, and so is one that is closed with unread bytes.
+"""
+
+import asyncio
+import socket
+from collections.abc import Sequence
+from contextlib import suppress
+
+from runtime.sockets import refuse_connections
+from serve.api.http_io import encode_head, problem_reply
+from serve.api.problems import stopping
+
+REQUEST_S = 1.0  # for a new connection to send its request
+READ_S = 2.0  # for a client to send the rest of its request and read the answer
+HANDSHAKE_S = 0.1  # for the handshakes of connections that began before the last
+MAX_LINE = 1 << 16  # bytes of a request line
+MAX_OPEN = 512  # connections at once
+
+
+class LastAnswers:
+    """Accepts the connections of a service that stops. Call `start`, then `finish`."""
+
+    def __init__(self, listeners: Sequence[socket.socket]) -> None:
+        self._listeners = listeners
+        self._open: dict[LastAnswer, None] = {}
+        self._loop = asyncio.get_running_loop()
+        self._tasks: set[asyncio.Task[object]] = set()
+
+    def start(self) -> None:
+        """Accept connections, beside workers that may still do so."""
+        for listener in self._listeners:
+            listener.setblocking(False)
+            self._loop.add_reader(listener, self._accept, listener)
+
+    async def finish(self) -> None:
+        """Take no more connections, answer those that are there, close the listening sockets."""
+        for listener in self._listeners:
+            refuse_connections(listener)
+        await asyncio.sleep(HANDSHAKE_S)
+        while self._open or self._tasks:
+            await asyncio.sleep(0.01)
+        for listener in self._listeners:
+            self._loop.remove_reader(listener)
+            listener.close()
+
+    def _accept(self, listener: socket.socket) -> None:
+        with suppress(OSError):  # a worker, or another client that has left, was quicker
+            connection, _ = listener.accept()
+            connection.setblocking(False)
+            make = self._loop.connect_accepted_socket(lambda: LastAnswer(self._open), connection)
+            task: asyncio.Task[object] = self._loop.create_task(make)
+            self._tasks.add(task)
+            task.add_done_callback(self._tasks.discard)
+
+
+class LastAnswer(asyncio.Protocol):
+    """One connection: it waits for a request, answers, and reads until the client closes."""
+
+    def __init__(self, others: "dict[LastAnswer, None]") -> None:
+        self._open = others
+        self._head = b""
+        self._answered = False
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        assert isinstance(transport, asyncio.Transport)
+        self._transport = transport
+        if len(self._open) >= MAX_OPEN:
+            next(iter(self._open))._transport.abort()
+        self._open[self] = None
+        self._limit(REQUEST_S)
+
+    def data_received(self, data: bytes) -> None:
+        if self._answered:
+            return
+        self._head += data
+        line, end, _ = self._head.partition(b"\r\n")
+        if end or len(self._head) > MAX_LINE:
+            self._answer(*line[:MAX_LINE].split(b" ")[:2])
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        self._timer.cancel()
+        self._open.pop(self, None)
+
+    def _answer(self, method: bytes = b"", path: bytes = b"") -> None:
+        self._answered, self._head = True, b""
+        reply = problem_reply(stopping(), (b"connection", b"close"), path=path.decode("latin-1"))
+        body = b"" if method == b"HEAD" else reply.body
+        self._transport.write(encode_head(reply) + body)
+        self._transport.write_eof()
+        self._timer.cancel()
+        self._limit(READ_S)
+
+    def _limit(self, seconds: float) -> None:
+        loop = asyncio.get_running_loop()
+        self._timer = loop.call_later(seconds, self._transport.abort)
