@@ -146,7 +146,7 @@ class FrameHandler:
 
     def record_refusal(self, error: Problem | ImageError, request_id: str, client: str) -> Problem:
         """Count and log an error; the problem to answer with."""
-        error.__traceback__ = None  # its frames may hold the body, and the problem: a cycle
+        forget_frames(error)
         problem = as_problem(error)
         self._count_refusal(problem, request_id, client)
         return problem
@@ -154,6 +154,15 @@ class FrameHandler:
     def _count_refusal(self, problem: Problem, request_id: str, client: str) -> None:
         self.refusals.log(request_id, client, problem)
         self._metrics.count_refusal(problem.type, self.queue.waiting)
+
+
+def forget_frames(error: BaseException) -> None:
+    """Drop the tracebacks of an error and of those it came from: their frames may hold the body of
+    the request, and the error itself, which makes a cycle."""
+    found: BaseException | None = error
+    while found is not None:
+        found.__traceback__ = None
+        found = found.__cause__ or found.__context__
 
 
 class FeaturesRequest:
