@@ -3,12 +3,16 @@
 `<!-- generated: NAME -->` in a page is replaced by the Markdown that `GENERATORS[NAME]` returns.
 """
 
+import ast
 import inspect
 import re
 from collections.abc import Iterator
 from importlib import import_module
+from pathlib import Path
 from typing import Any
 
+ROOT = Path(__file__).parents[1]
+PACKAGES = ("trackfeatures", "runtime", "simulator", "datagen", "mtlnet", "serve", "controllers")
 PROGRAMS = ("simulator", "datagen", "mtlnet", "serve", "controllers")
 MARKER = re.compile(r"<!-- generated: (\w+) -->")
 
@@ -137,7 +141,37 @@ def header() -> str:
     return f"```c\n{c_header()}\n```"
 
 
+def errors() -> str:
+    """The classes of errors that users meet, by package."""
+    rows = ["| class | kind of | |", "|---|---|---|"]
+    for name, (module, bases, about) in sorted(error_classes().items()):
+        rows.append(
+            f"| `{module}.{name}` | {', '.join(f'`{b}`' for b in bases)} | {_cell(about)} |"
+        )
+    return "\n".join(rows)
+
+
+def error_classes() -> dict[str, tuple[str, tuple[str, ...], str]]:
+    """UserError and its subclasses by name: module, bases, first sentence of the docstring.
+
+    Read from the sources, because an import of all modules takes a minute.
+    """
+    defined: dict[str, tuple[str, tuple[str, ...], str]] = {}
+    for path in (path for package in PACKAGES for path in (ROOT / package).rglob("*.py")):
+        module = ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+        for node in ast.parse(path.read_text(encoding="utf-8")).body:
+            if isinstance(node, ast.ClassDef):
+                bases = tuple(ast.unparse(base) for base in node.bases)
+                about = (ast.get_docstring(node) or "").partition("\n\n")[0]
+                defined[node.name] = (module, bases, about)
+    found = {"UserError"}
+    while more := {n for n, (_, bases, _) in defined.items() if found & set(bases)} - found:
+        found |= more
+    return {name: about for name, about in defined.items() if name in found}
+
+
 GENERATORS = {
+    "errors": errors,
     "commands": commands,
     "operations": operations,
     "answer": answer,

@@ -1,0 +1,320 @@
+"""The page "What is refused, and why": each of its rows is tried, with its class and message."""
+
+import copy
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from unittest import mock
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import simplejpeg
+
+import simulator.env  # noqa: F401  # registers the environments
+from datagen.recording import Dataset
+from datagen.recording.mcap.footer import read_summary
+from datagen.recording.mcap.index import open_round
+from docs.generate import error_classes
+from mtlnet.data.custom_images import COLUMNS, open_custom_images
+from mtlnet.inference.engine import Engine, load_engine
+from mtlnet.inference.image_decoding.decode import inspect, read_image
+from mtlnet.inference.model_card import resolve_run
+from mtlnet.predict.films import Film, read_film_header
+from mtlnet.predict.run import predict_files
+from mtlnet.training.loss import parse_alpha
+from simulator.camera.core.context import Graphics
+from simulator.camera.core.turns import Turns
+from simulator.track.catalogue import find_track
+from simulator.track.road import Road
+from simulator.track.torcs.torcs import read_torcs
+from simulator.vehicle.state import Command
+from simulator.world.world import World
+from tests.mtlnet.conftest import write_dataset
+from trackfeatures.camera import CameraParameters
+from trackfeatures.errors import UserError
+
+PAGE = (Path(__file__).parents[2] / "docs" / "reference" / "errors.md").read_text()
+ROWS = [
+    [cell.strip().strip("`") for cell in line.strip("|").split("|")]
+    for line in PAGE.splitlines()
+    if line.startswith("| ") and not line.startswith("| input")
+]
+VIEW = CameraParameters()
+Try = Callable[[Path], object]
+TRIES: dict[str, Try] = {}
+"""What makes the program refuse, by the first words of the row."""
+
+
+def row(words: str) -> Callable[[Try], Try]:
+    def add(function: Try) -> Try:
+        TRIES[words] = function
+        return function
+
+    return add
+
+
+def jpeg(width: int = 280, height: int = 210) -> bytes:
+    return bytes(simplejpeg.encode_jpeg(np.full((height, width, 3), 90, np.uint8)))
+
+
+def written(folder: Path, name: str, content: bytes) -> Path:
+    path = folder / name
+    path.write_bytes(content)
+    return path
+
+
+@cache
+def engine() -> Engine:
+    return load_engine(resolve_run("default"))
+
+
+def predict(path: Path) -> object:
+    return predict_files(engine(), [str(path)])
+
+
+def film(folder: Path, *arguments: str, name: str = "a.mp4") -> Path:
+    """A film of 20 frames that FFmpeg makes with these arguments."""
+    program = pytest.importorskip("imageio_ffmpeg").get_ffmpeg_exe()
+    source = ["-f", "lavfi", "-i", "testsrc2=size=280x210:rate=10:duration=2"]
+    command = [program, "-v", "error", *source, *arguments, str(folder / name)]
+    subprocess.run(command, check=True, stderr=subprocess.DEVNULL)
+    return folder / name
+
+
+@row("no image, or a kind")
+def _(folder: Path) -> object:
+    return read_image(written(folder, "a.jpg", b"\0\0\0\x18ftypheic" + bytes(40)), VIEW)
+
+
+@row("a damaged or incomplete image")
+def _(folder: Path) -> object:
+    return read_image(written(folder, "a.jpg", jpeg()[:-300]), VIEW)
+
+
+@row("an image of under 16 px")
+def _(folder: Path) -> object:
+    return read_image(written(folder, "a.jpg", jpeg(12, 9)), VIEW)
+
+
+@row("an image that shows less")
+def _(folder: Path) -> object:
+    return read_image(written(folder, "a.jpg", jpeg(100, 210)), VIEW)
+
+
+@row("to the service: another kind")
+def _(folder: Path) -> object:
+    return inspect(b"BM" + bytes(100), VIEW)
+
+
+@row("to the service: bytes behind")
+def _(folder: Path) -> object:
+    return inspect(jpeg() + bytes(100), VIEW)
+
+
+@row("to the service: over")
+def _(folder: Path) -> object:
+    return inspect(jpeg(4000, 3000), VIEW)
+
+
+@row("a missing file")
+def _(folder: Path) -> object:
+    return read_image(folder / "none.jpg", VIEW)
+
+
+@row("no film")
+def _(folder: Path) -> object:
+    return read_film_header(written(folder, "a.mp4", b"no film at all"))
+
+
+@row("a film that breaks off")
+def _(folder: Path) -> object:
+    path = film(folder, "-c:v", "mpeg4", "-movflags", "faststart")
+    return predict(written(folder, "cut.mp4", path.read_bytes()[: path.stat().st_size // 2]))
+
+
+@row("a film in which FFmpeg")
+def _(folder: Path) -> object:
+    content = bytearray(film(folder, "-c:v", "libx264", "-movflags", "faststart").read_bytes())
+    middle = len(content) // 2
+    content[middle : middle + 1500] = np.random.default_rng(0).bytes(1500)
+    return predict(written(folder, "damaged.mp4", bytes(content)))
+
+
+@row("a codec without a decoder")
+def _(folder: Path) -> object:
+    path = film(folder, "-c:v", "libsvtav1", "-preset", "12", "-pix_fmt", "yuv420p")
+    if list(Film(path).frames()):
+        pytest.skip("this build of OpenCV decodes AV1")
+    return predict(path)
+
+
+@row("a header that mirrors")
+def _(folder: Path) -> object:
+    program = pytest.importorskip("imageio_ffmpeg").get_ffmpeg_exe()
+    plain, mirrored = film(folder, "-c:v", "mpeg4"), folder / "mirrored.mp4"
+    command = [program, "-v", "error", "-display_hflip", "-i", plain, "-c", "copy", mirrored]
+    subprocess.run(command, check=True, stderr=subprocess.DEVNULL)
+    return predict(mirrored)
+
+
+@row("interlaced pictures")
+def _(folder: Path) -> object:
+    tags = ("-vf", "tinterlace=interleave_top", "-flags", "+ilme+ildct", "-c:v", "mpeg2video")
+    path = film(folder, *tags, name="a.mpg")
+    try:
+        shown = [picture.mean() for _, picture in Film(path).frames()]
+    except UserError:
+        return predict(path)
+    assert min(shown) > 50
+    return pytest.skip("this build of OpenCV shows interlaced pictures")
+
+
+@row("a pipe or a device")
+def _(folder: Path) -> object:
+    os.mkfifo(folder / "a.mp4")
+    return predict(folder / "a.mp4")
+
+
+def damaged_round(folder: Path) -> Dataset:
+    data = write_dataset(folder)
+    path = data / "rounds" / "r000.mcap"
+    content = bytearray(path.read_bytes())
+    content[read_summary(memoryview(bytes(content))).chunks[0].start + 20_000] ^= 0x10
+    path.unlink()  # other tests may have mapped it
+    path.write_bytes(content)
+    return Dataset.open(data)
+
+
+@row("a frame in a chunk")
+def _(folder: Path) -> object:
+    return damaged_round(folder).select("train").image(0)
+
+
+@row("a label in a chunk")
+def _(folder: Path) -> object:
+    return damaged_round(folder).select("train").labels
+
+
+@row("a file that is no round")
+def _(folder: Path) -> object:
+    return open_round(written(folder, "a.mcap", jpeg()))
+
+
+@row("another version of the definitions")
+def _(folder: Path) -> object:
+    return Dataset.open(write_dataset(folder, definitions="1")).select("train")
+
+
+def labelled(folder: Path, ml: str, width: int) -> object:
+    written(folder, "a.jpg", jpeg(width))
+    rows = f"{','.join(COLUMNS)}\na.jpg,{ml},2.0,,,,0.0,straight\n"
+    written(folder, "labels.csv", rows.encode())
+    return open_custom_images(folder, VIEW)
+
+
+@row("a faulty row")
+def _(folder: Path) -> object:
+    return labelled(folder, "2.0", 280)
+
+
+@row("an image of another aspect ratio")
+def _(folder: Path) -> object:
+    return labelled(folder, "-2.0", 400)
+
+
+@row("a contact without PyBullet")
+def _(folder: Path) -> object:
+    with pytest.MonkeyPatch.context() as patch, World(Road(find_track("oval"))) as world:
+        patch.setitem(sys.modules, "pybullet", None)
+        patch.delitem(sys.modules, "simulator.world.physics", raising=False)
+        world.reset(seed=0, angle=-1.2, speed=20.0)
+        return [world.step(Command(gear=0)) for _ in range(40)]
+
+
+@row("an action or command")
+def _(folder: Path) -> object:
+    with World(Road(find_track("oval"))) as world:
+        world.reset(seed=0)
+        return world.step(Command(steer=1.00001))
+
+
+@row("a start outside")
+def _(folder: Path) -> object:
+    with World(Road(find_track("oval"))) as world:
+        return world.reset(seed=0, to_middle=40.0)
+
+
+def environment() -> gym.Env[object, object]:
+    return gym.make("driverview/LateralControl-v0", track="oval").unwrapped
+
+
+@row("a step before the first reset")
+def _(folder: Path) -> object:
+    return environment().step([0.0])
+
+
+@row("a picture in a process")
+def _(folder: Path) -> object:
+    turns = Turns(mock.Mock(), (1, 2, 2, 3), free=lambda: None)
+    with mock.patch("os.getpid", return_value=0), turns:  # as a forked child finds it
+        return None
+
+
+@row("a copy of an environment")
+def _(folder: Path) -> object:
+    return copy.deepcopy(environment())
+
+
+@row("EGL is missing")
+def _(folder: Path) -> object:
+    with mock.patch("moderngl.create_context", side_effect=ImportError("libEGL.so not loaded")):
+        return Graphics()
+
+
+@row("an unknown track")
+def _(folder: Path) -> object:
+    return find_track("no-such-track")
+
+
+@row("a TORCS track")
+def _(folder: Path) -> object:
+    length = '<attnum name="lg" unit="yard" val="9"/>'
+    segment = f'<section name="a"><attstr name="type" val="str"/>{length}</section>'
+    text = (
+        '<params name="t"><section name="Header"><attnum name="version" val="4"/></section>'
+        '<section name="Main Track"><attnum name="width" unit="m" val="12"/>'
+        f'<section name="Track Segments">{segment}</section></section></params>'
+    )
+    return read_torcs(written(folder, "t.xml", text.encode()))
+
+
+@row("a run that does not exist")
+def _(folder: Path) -> object:
+    return resolve_run("no-such-run", folder)
+
+
+@row("weights of the loss")
+def _(folder: Path) -> object:
+    return parse_alpha("0.3,-1,0.5")
+
+
+@pytest.mark.parametrize("row", ROWS, ids=lambda cells: cells[0][:40])
+def test_each_row_is_refused_with_its_class_and_message(row: list[str], tmp_path: Path) -> None:
+    words, name, message, _ = row
+    (attempt,) = (made for start, made in TRIES.items() if words.startswith(start))
+    with pytest.raises(UserError, match=re.escape(message)) as refused:
+        attempt(tmp_path)
+    assert type(refused.value).__name__ == name
+
+
+def test_the_page_holds_every_case_and_no_class_that_does_not_exist() -> None:
+    assert len(ROWS) == len(TRIES) > 30
+    classes = error_classes()
+    assert {name for _, name, _, _ in ROWS} <= set(classes)
+    assert all(about for _, _, about in classes.values())
+    assert "<!-- generated: errors -->" in PAGE
