@@ -39,7 +39,7 @@ OPTIONS = {
 """The options of an image by their names in a query or in JSON, with the headers they stand for."""
 KEYS = {name: header.lower().encode() for name, header in OPTIONS.items()}
 HEADER_KEYS = frozenset(KEYS.values())
-# A header that begins so is meant as an option: misspelt, it would be ignored, and the answer wrong.
+# What begins so is meant as an option: ignored where it is misspelt, the answer would be wrong.
 OPTION_HEADERS = (
     *(b"x-camera", b"x-deadline", b"x-fov", b"x-frame-id", b"x-stream"),
     *(b"deadline", b"fov", b"frame-id", b"frame_id", b"stream-id", b"stream_id"),

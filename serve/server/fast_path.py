@@ -174,7 +174,7 @@ class DirectProtocol(GuardedProtocol):
             headers = [*headers, CLOSE_HEADER]
         self.transport.write(encode_head(reply, *headers) + reply.body)
         if not request.keep_alive:
-            (self.linger if self._guard.draining else self.transport.close)()
+            self.end()
         if reply.status == OK:
             self._idle_group = self._guard.served
         self.on_response_complete()

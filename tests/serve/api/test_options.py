@@ -145,7 +145,8 @@ def test_a_header_that_is_sent_twice_or_beside_the_query_is_refused(
 
 
 @pytest.mark.parametrize(
-    "name", ["X-Camera-Fov", "X-Camera-Fov-X", "X-Fov-Y", "fov_y", "Fov-Y", "X-Deadline", "Frame-Id"]
+    "name",
+    ["X-Camera-Fov", "X-Camera-Fov-X", "X-Fov-Y", "fov_y", "Fov-Y", "X-Deadline", "Frame-Id"],
 )
 def test_a_misspelt_header_is_refused(service: Served, name: str) -> None:
     for ask in (features, infer):
