@@ -84,9 +84,9 @@ class GuardedProtocol(HttpToolsProtocol):
     def drain(self, elapsed_s: float) -> bool:
         """Close it once it has been idle until DRAIN_S; whether nothing is owed to its client."""
         idle = self._phase is Phase.IDLE or (self._phase is Phase.HEAD and not self._unread_bytes)
-        if idle and elapsed_s >= guards.DRAIN_S:
-            self.transport.close()
-            return True
+        # An answer that was sent before this began did not say that it was the last one.
+        if idle and min(elapsed_s, self._guard.clock() - self.since_s) >= guards.DRAIN_S:
+            self.linger()
         return self._phase is Phase.CLOSING and not (self._body_lingers and self.lingers)
 
     def end_draining(self) -> None:
@@ -147,7 +147,8 @@ class GuardedProtocol(HttpToolsProtocol):
             if upgrade_at is not None:
                 self._feed_again(data[upgrade_at:])
         except HttpParserError:
-            self.send_400_response("")
+            if self._phase is not Phase.CLOSING:
+                self.send_400_response("")
         # Headers and trailers that have not ended yet are counted as they arrive.
         excess = self._unread_bytes - self._known_bytes > MAX_HEAD_BYTES
         if excess and self._phase is not Phase.CLOSING:
@@ -220,6 +221,10 @@ class GuardedProtocol(HttpToolsProtocol):
 
     def on_body_complete(self) -> None:
         """Wait for the answer, unless it was sent."""
+        if self._phase is Phase.CLOSING:
+            self._body_lingers = False
+            self._deadline_s = min(self._deadline_s, self._guard.clock() + guards.LINGER_S)
+            return
         self._unread_bytes = self._known_bytes = self._part_bytes
         waits = not (self.cycle is None or self.cycle.response_complete)
         self._phase = Phase.WORK if waits else Phase.IDLE

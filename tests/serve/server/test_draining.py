@@ -1,5 +1,6 @@
 """The end of one worker: what its clients have sent is answered, and no answer is lost."""
 
+import logging
 import socket
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -91,6 +92,21 @@ def test_a_refusal_before_the_end_of_a_slow_body_is_not_lost(
             reply = read_all(connection)
         assert (reply[:12], reply.count(b"HTTP/1.1")) == (b"HTTP/1.1 415", 1)
         assert b"connection: close" in reply.lower()
+
+
+def test_requests_behind_a_refusal_that_ends_the_connection_are_dropped(
+    engine: FakeEngine, caplog: pytest.LogCaptureFixture
+) -> None:
+    with caplog.at_level(logging.ERROR), serving(engine) as service:
+        target = Target(service.port)
+        connection = target.dial()
+        until(lambda: len(service.server.server_state.connections) == 1)
+        service.server.should_exit = True
+        until(lambda: service.server.guard.draining)
+        connection.sendall(target.post(JPEG, Content_Encoding="gzip") * 3)
+        with connection:
+            assert read_all(connection).count(b"HTTP/1.1 415") == 1
+    assert not caplog.records
 
 
 def test_what_is_not_complete_in_time_is_refused(
