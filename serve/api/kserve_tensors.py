@@ -39,6 +39,25 @@ BLANKS = b" \t\r\n"
 T = TypeVar("T")
 
 
+class _Misplaced(msgspec.Struct, kw_only=True):
+    """Options beside `parameters` instead of in it; empty where there are none."""
+
+    frame_id: msgspec.Raw = msgspec.Raw()
+    stream_id: msgspec.Raw = msgspec.Raw()
+    deadline_ms: msgspec.Raw = msgspec.Raw()
+    fov_y: msgspec.Raw = msgspec.Raw()
+    binary_data_output: msgspec.Raw = msgspec.Raw()
+
+    def check(self) -> None:
+        """Raise Problem if there is one: it would be ignored."""
+        for name in self.__struct_fields__:
+            value = getattr(self, name)
+            if name in REQUEST_PARAMETERS and len(memoryview(value)):
+                raise invalid_request(
+                    f"{name} is not a member of its own; put it into the parameters of the request"
+                )
+
+
 class RequestedOutput(msgspec.Struct):
     """A requested output."""
 
@@ -68,7 +87,7 @@ class InferRequest(msgspec.Struct):
 # What is sent is split first, which makes no objects: a list of 4 MB can become 40 MB of them.
 
 
-class _RawTensor(msgspec.Struct):
+class _RawTensor(_Misplaced):
     name: str
     shape: msgspec.Raw
     datatype: str
@@ -76,7 +95,7 @@ class _RawTensor(msgspec.Struct):
     data: msgspec.Raw = msgspec.Raw(b"")
 
 
-class _RawRequest(msgspec.Struct):
+class _RawRequest(_Misplaced):
     inputs: tuple[_RawTensor]
     id: str | None = None
     outputs: msgspec.Raw = msgspec.Raw(b"[]")
@@ -115,6 +134,8 @@ def _parse_json(text: memoryview) -> InferRequest:
     """Raises Problem, msgspec.DecodeError, RecursionError."""
     raw = msgspec.json.decode(text, type=_RawRequest)
     (tensor,) = raw.inputs
+    raw.check()
+    tensor.check()
     return InferRequest(
         Tensor(
             tensor.name,

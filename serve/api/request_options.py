@@ -38,6 +38,12 @@ OPTIONS = {
 }
 """The options of an image by their names in a query or in JSON, with the headers they stand for."""
 KEYS = {name: header.lower().encode() for name, header in OPTIONS.items()}
+HEADER_KEYS = frozenset(KEYS.values())
+# What begins so is meant as an option: ignored where it is misspelt, the answer would be wrong.
+OPTION_HEADERS = (
+    *(b"x-camera", b"x-deadline", b"x-fov", b"x-frame-id", b"x-stream"),
+    *(b"deadline", b"fov", b"frame-id", b"frame_id", b"stream-id", b"stream_id"),
+)
 MAX_QUERY_FIELDS = 16  # of a query: more are not read
 SINGLE_HEADERS = (*OPTIONS.values(), REQUEST_ID, "Content-Type", "Content-Encoding")
 MEDIA_TYPES = ("image/jpeg", "image/png")
@@ -209,6 +215,10 @@ def parse_options(
     headers: Headers, stamp_ns: int, request_id: str, formats: Formats = FORMATS
 ) -> RequestOptions:
     """The options in the headers of a request. Raises Problem."""
+    for name in headers:
+        if name.startswith(OPTION_HEADERS) and name not in HEADER_KEYS:
+            seen = f"the request has an unknown header {name[:40].decode('latin-1')!r}"
+            raise Problem(INVALID_REQUEST, f"{seen}; there are {', '.join(OPTIONS.values())}")
     return RequestOptions(
         stamp_ns,
         request_id,

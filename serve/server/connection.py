@@ -64,6 +64,7 @@ class GuardedProtocol(HttpToolsProtocol):
         self._upgrading = False
         self._running: Any = None  # the request being answered; `cycle` is the last one received
         self._fault: Problem | None = None  # with which a callback has stopped the parser
+        self._body_lingers = False  # its last reply was sent before the end of the request
         self._trailer_bytes = self._chunks = 0
         self._part_bytes = self._part_requests = 0  # received last
         # Received since the last complete request, with the part in which that request ended.
@@ -83,10 +84,10 @@ class GuardedProtocol(HttpToolsProtocol):
     def drain(self, elapsed_s: float) -> bool:
         """Close it once it has been idle until DRAIN_S; whether nothing is owed to its client."""
         idle = self._phase is Phase.IDLE or (self._phase is Phase.HEAD and not self._unread_bytes)
-        if idle and elapsed_s >= guards.DRAIN_S:
-            self.transport.close()
-            return True
-        return self._phase is Phase.CLOSING
+        # An answer that was sent before this began did not say that it was the last one.
+        if idle and min(elapsed_s, self._guard.clock() - self.since_s) >= guards.DRAIN_S:
+            self.linger()
+        return self._phase is Phase.CLOSING and not (self._body_lingers and self.lingers)
 
     def end_draining(self) -> None:
         """Refuse a request that is incomplete or unanswered."""
@@ -99,16 +100,24 @@ class GuardedProtocol(HttpToolsProtocol):
         if isinstance(self.cycle, RequestResponseCycle):
             self.cycle.transport = LingeringTransport(self)  # type: ignore[assignment]
 
+    def end(self) -> None:
+        """Close it after its last reply; the client closes first where it may still be sending."""
+        lingers = self._guard.draining or self._phase is Phase.BODY
+        (self.linger if lingers else self.transport.close)()
+
     def linger(self) -> None:
         """Send no more, and read until the client closes the connection.
 
         A connection that is closed with unread bytes is reset, and the client loses the reply.
         """
+        self._body_lingers = self._phase is Phase.BODY  # the client may first send all of it
         self._phase = Phase.CLOSING
         self.pipeline.clear()  # the client knows by "Connection: close" that they are not answered
         now = self._guard.place(self, self._guard.refused)
         unsent = self.transport.get_write_buffer_size()
-        self._deadline_s = now + (self._guard.limits.idle_s if unsent else guards.LINGER_S)
+        limits = self._guard.limits
+        linger_s = limits.body_s if self._body_lingers else guards.LINGER_S
+        self._deadline_s = now + (limits.idle_s if unsent else linger_s)
         if not self.transport.is_closing():
             self.transport.write_eof()
 
@@ -138,7 +147,8 @@ class GuardedProtocol(HttpToolsProtocol):
             if upgrade_at is not None:
                 self._feed_again(data[upgrade_at:])
         except HttpParserError:
-            self.send_400_response("")
+            if self._phase is not Phase.CLOSING:
+                self.send_400_response("")
         # Headers and trailers that have not ended yet are counted as they arrive.
         excess = self._unread_bytes - self._known_bytes > MAX_HEAD_BYTES
         if excess and self._phase is not Phase.CLOSING:
@@ -196,7 +206,7 @@ class GuardedProtocol(HttpToolsProtocol):
         if len(self.pipeline) >= MAX_PIPELINED:
             self.stop_parser(too_many_requests(f"{MAX_PIPELINED} requests"))
         super().on_headers_complete()
-        if self._guard.draining and self.cycle is not None:
+        if self.cycle is not None and (self._guard.draining or not self.cycle.keep_alive):
             self.close_after_reply()
 
     def on_chunk_header(self) -> None:
@@ -211,6 +221,10 @@ class GuardedProtocol(HttpToolsProtocol):
 
     def on_body_complete(self) -> None:
         """Wait for the answer, unless it was sent."""
+        if self._phase is Phase.CLOSING:
+            self._body_lingers = False
+            self._deadline_s = min(self._deadline_s, self._guard.clock() + guards.LINGER_S)
+            return
         self._unread_bytes = self._known_bytes = self._part_bytes
         waits = not (self.cycle is None or self.cycle.response_complete)
         self._phase = Phase.WORK if waits else Phase.IDLE
@@ -390,7 +404,7 @@ class GuardedProtocol(HttpToolsProtocol):
 
 
 class LingeringTransport:
-    """The transport of a connection for its last reply: `close` lets the client close first."""
+    """The transport of a connection for its last reply: `close` may let the client close first."""
 
     def __init__(self, connection: GuardedProtocol) -> None:
         self._connection = connection
@@ -405,4 +419,4 @@ class LingeringTransport:
 
     def close(self) -> None:
         """Send no more."""
-        self._connection.linger()
+        self._connection.end()

@@ -19,7 +19,7 @@ from serve.server.connection import MAX_AT_ONCE, GuardedProtocol, Phase
 CLOSE_HEADER: Header = (b"connection", b"close")
 SMALL_BYTES = 1024  # smaller parts of a body are put together: an object each would take more
 TOGETHER_BYTES = 1 << 16  # of them in one object: a longer one is moved as it grows
-BODY = Phase.BODY
+BODY, CLOSING = Phase.BODY, Phase.CLOSING
 OK, UNAVAILABLE = HTTPStatus.OK.value, HTTPStatus.SERVICE_UNAVAILABLE.value
 ASGI_HEADERS = frozenset({b"expect", b"upgrade", b"x-forwarded-for"})
 
@@ -91,6 +91,8 @@ class DirectProtocol(GuardedProtocol):
         self._request: DirectRequest | None = None
 
     def on_message_begin(self) -> None:
+        if self._phase is CLOSING:  # the last reply was sent while a part was parsed
+            raise ValueError
         self._part_requests += 1
         if self._part_requests > MAX_AT_ONCE:
             self.stop_parser(too_many_requests(f"{MAX_AT_ONCE} requests"))
@@ -174,7 +176,7 @@ class DirectProtocol(GuardedProtocol):
             headers = [*headers, CLOSE_HEADER]
         self.transport.write(encode_head(reply, *headers) + reply.body)
         if not request.keep_alive:
-            (self.linger if self._guard.draining else self.transport.close)()
+            self.end()
         if reply.status == OK:
             self._idle_group = self._guard.served
         self.on_response_complete()

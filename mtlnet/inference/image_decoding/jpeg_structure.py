@@ -15,8 +15,9 @@ from mtlnet.inference.image_decoding.orientation import EXIF_MARK, NONE, exif_or
 START = b"\xff\xd8"
 SIGNATURE = b"\xff\xd8\xff"
 END = b"\xff\xd9"
-SOS, EOI, APP1 = 0xDA, 0xD9, 0xE1
+SOS, EOI, APP0, APP1, APP14 = 0xDA, 0xD9, 0xE0, 0xE1, 0xEE
 FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # SOF0 to SOF15
+DESCRIBING = FRAMES | {SOS, EOI, APP0, APP14}  # all that say size and colours
 PROGRESSIVE_FRAMES = frozenset((0xC2, 0xC6, 0xCA, 0xCE))
 # In entropy-coded data FF 00 is a byte FF, FF D0 to D7 a restart marker, FF FF a fill byte.
 ENDS_DATA = np.ones(256, np.bool_)
@@ -40,21 +41,27 @@ class JpegStructure:
 
 @dataclass(frozen=True, slots=True)
 class JpegHead:
-    """What stands before the first scan: whether it is progressive, and the orientation, 1 to 8."""
+    """What stands before the first scan: whether it is progressive, and the orientation, 1 to 8.
+
+    `description` is a JPEG of the segments alone that say its size and colours, up to that scan.
+    """
 
     is_progressive: bool
     orientation: int
+    description: bytes
 
 
 def read_head(body: bytes) -> JpegHead:
     """What stands before the first scan. Raises ImageError. Takes 3 ms at worst."""
-    at, frame, exif = len(START), 0, None
+    at, frame, exif, kept = len(START), 0, None, [START]
     for _ in range(MAX_SEGMENTS):
         at, marker = _marker(body, at)
+        length = 0 if marker == EOI else _length(body, at)
+        if marker in DESCRIBING:
+            kept.append(body[at - 2 : at + length])
         if marker in (SOS, EOI):
             orientation = NONE if exif is None else exif_orientation(exif)
-            return JpegHead(frame in PROGRESSIVE_FRAMES, orientation)
-        length = _length(body, at)
+            return JpegHead(frame in PROGRESSIVE_FRAMES, orientation, b"".join(kept))
         if marker in FRAMES:
             frame = frame or marker
         elif marker == APP1 and exif is None:

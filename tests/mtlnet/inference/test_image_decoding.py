@@ -11,9 +11,9 @@ import simplejpeg
 from numpy.typing import NDArray
 
 from mtlnet.inference.image_decoding.crop import Box, crop_box
-from mtlnet.inference.image_decoding.decode import decode, inspect
+from mtlnet.inference.image_decoding.decode import LATE_CHECK_BYTES, decode, inspect
 from mtlnet.inference.image_decoding.errors import Fault, ImageError
-from mtlnet.inference.image_decoding.jpeg_structure import read_structure
+from mtlnet.inference.image_decoding.jpeg_structure import read_head, read_structure
 from trackfeatures.camera import CameraParameters
 
 VIEW = CameraParameters()
@@ -163,6 +163,22 @@ def test_a_progressive_jpeg_and_fill_bytes_are_read() -> None:
     assert read_structure(body).length == len(body)
     filled = body[:2] + b"\xff" * 5 + body[2:]
     assert np.array_equal(pixels(filled), pixels(body))
+
+
+def test_the_size_of_a_large_jpeg_is_read_without_its_profile_and_tables() -> None:
+    body = jpeg(picture(400, 210))
+    more = b"".join(
+        struct.pack(">BBH", 0xFF, marker, 60_002) + bytes(60_000)
+        for marker in (0xE1, 0xE2, 0xED, 0xFE, 0xC4, 0xDB)
+    )
+    large = body[:2] + more + b"\xff\xff" + body[2:]
+    assert len(large) > LATE_CHECK_BYTES
+    description = read_head(large).description
+    assert len(description) < 100
+    assert simplejpeg.decode_jpeg_header(description) == simplejpeg.decode_jpeg_header(body)
+    header = inspect(large, VIEW)
+    assert (header.width, header.height, header.checked) == (400, 210, False)
+    assert read_head(body[:2] + b"\xff\xd9").description == b"\xff\xd8\xff\xd9"
 
 
 JPEG, PNG = jpeg(picture()), png(picture())

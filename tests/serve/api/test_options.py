@@ -144,6 +144,34 @@ def test_a_header_that_is_sent_twice_or_beside_the_query_is_refused(
     assert (reply.status, "parameters" in reply.content["detail"]) == (422, True)
 
 
+@pytest.mark.parametrize(
+    "name",
+    ["X-Camera-Fov", "X-Camera-Fov-X", "X-Fov-Y", "fov_y", "Fov-Y", "X-Deadline", "Frame-Id"],
+)
+def test_a_misspelt_header_is_refused(service: Served, name: str) -> None:
+    for ask in (features, infer):
+        reply = ask(service, headers=[(name, "60")])
+        assert (reply.status, reply.content["type"]) == (422, "/problems/invalid-request")
+        assert f"unknown header {name.lower()!r}; there are X-Frame-Id" in reply.content["detail"]
+
+
+def test_headers_of_clients_and_proxies_are_ignored(service: Served) -> None:
+    names = ["X-Forwarded-For", "Forwarded", "X-Real-IP", "Via", "Cookie", "Range", "Priority"]
+    for name in (*names, "traceparent", "X-Frame-Options", "X-Forwarded-Host", "If-None-Match"):
+        for ask in (features, infer):
+            assert ask(service, headers=[(name, "60"), (name, "60")]).status == 200
+
+
+@pytest.mark.parametrize("name", [*HEADERS, "binary_data_output"])
+def test_an_option_beside_the_parameters_is_refused(service: Served, name: str) -> None:
+    tensor = {"name": "image", "shape": [1], "datatype": "BYTES", "data": ["AAAA"]}
+    contents: list[Any] = [{"inputs": [tensor], name: 60}, {"inputs": [{**tensor, name: None}]}]
+    for content in contents:
+        reply = service.ask("POST", INFER, json.dumps(content).encode())
+        assert reply.status == 422
+        assert f"{name} is not a member of its own" in reply.content["error"]
+
+
 def test_unknown_parameters_of_the_inference_protocol_are_refused(service: Served) -> None:
     known = "there are binary_data_output, frame_id, stream_id, deadline_ms, fov_y"
     unknown: list[dict[str, Any]] = [{"sequence_id": 1}, {"timeout": 5}, {"Fov_Y": 60}]

@@ -212,6 +212,8 @@ def test_a_message_counts_in_the_budget_until_the_service_takes_it(
 ) -> None:
     size, taken = 2 << 20, threading.Event()
     with serving(FakeEngine(lambda _image: outputs())) as service:
+        config = service.server.config  # while it is not read, only a ping shows that a client left
+        config.ws_ping_interval = config.ws_ping_timeout = 0.5
 
         async def busy(_scope: object, receive: Any, send: Any) -> None:
             await receive()

@@ -1,6 +1,8 @@
 """The end of one worker: what its clients have sent is answered, and no answer is lost."""
 
+import logging
 import socket
+import time
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
@@ -65,6 +67,46 @@ def test_a_reply_that_was_begun_is_the_last_one_and_later_bytes_do_not_reset_it(
             assert read_head(connection).startswith(b"HTTP/1.1 200")
             connection.sendall(target.post(JPEG) * 4)  # unread bytes at a close would reset
             read_all(connection)
+
+
+@pytest.mark.parametrize("path", ["/features", "/v2/models/track/infer"])
+@pytest.mark.parametrize("stops", [True, False])
+def test_a_refusal_before_the_end_of_a_slow_body_is_not_lost(
+    engine: FakeEngine, monkeypatch: pytest.MonkeyPatch, path: str, *, stops: bool
+) -> None:
+    monkeypatch.setattr(guard, "LINGER_S", 0.02)
+    monkeypatch.setattr(worker_server, "LAST_S", 0.02)
+    with serving(engine) as service:
+        target = Target(service.port)
+        headers = {} if stops else {"Connection": "close"}
+        request = target.post(bytes(80_000), path, **{"Content_Encoding": "gzip", **headers})
+        connection = target.dial()
+        until(lambda: len(service.server.server_state.connections) == 1)
+        if stops:
+            service.server.should_exit = True
+            until(lambda: service.server.guard.draining)
+        with connection:
+            for start in range(0, len(request), 20_000):
+                connection.sendall(request[start : start + 20_000])
+                time.sleep(0.1)
+            reply = read_all(connection)
+        assert (reply[:12], reply.count(b"HTTP/1.1")) == (b"HTTP/1.1 415", 1)
+        assert b"connection: close" in reply.lower()
+
+
+def test_requests_behind_a_refusal_that_ends_the_connection_are_dropped(
+    engine: FakeEngine, caplog: pytest.LogCaptureFixture
+) -> None:
+    with caplog.at_level(logging.ERROR), serving(engine) as service:
+        target = Target(service.port)
+        connection = target.dial()
+        until(lambda: len(service.server.server_state.connections) == 1)
+        service.server.should_exit = True
+        until(lambda: service.server.guard.draining)
+        connection.sendall(target.post(JPEG, Content_Encoding="gzip") * 3)
+        with connection:
+            assert read_all(connection).count(b"HTTP/1.1 415") == 1
+    assert not caplog.records
 
 
 def test_what_is_not_complete_in_time_is_refused(
