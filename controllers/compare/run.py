@@ -22,6 +22,7 @@ from controllers.rl.actor import WEIGHTS, is_actor
 from runtime.files import locked_folder, write_json
 from simulator.camera import check_light
 from simulator.track.catalogue import find_track
+from simulator.world.errors import ContactsUnavailable
 from trackfeatures.errors import UserError
 
 VERSION = 3  # 2: `in_lane_share`; 3: `quadratic_per_step` in the result
@@ -78,7 +79,8 @@ def compare(config: CompareConfig, progress: Progress | None = None) -> dict[str
     """Drive all cells that `config.out` does not hold yet; the content of `results.json`.
 
     Raises UserError for an unknown name, before the first drive, and where the folder holds results
-    of other settings or another process drives for it.
+    of other settings or another process drives for it. Raises ContactsUnavailable after the last
+    drive where some of them touched something; the others are in `results.json`.
     """
     todo = cells(config)
     for controller in dict.fromkeys(cell.controller for cell in todo):
@@ -100,15 +102,26 @@ def _drive_missing(
     path = config.out / RESULTS
     content = read_results(path, config)
     known = {_key(entry): entry for entry in content["drives"]}
+    lost: list[str] = []
     for done, cell in enumerate(todo):
         print_share = _print_share(progress, done, len(todo), cell)
         print_share(0, 1)
         code = fingerprint(config, cell)
         found = known.get(cell)
         if found is None or found["code"] != code:
-            known[cell] = asdict(cell) | {"code": code} | drive_cell(config, cell, print_share)
+            try:
+                driven = drive_cell(config, cell, print_share)
+            except ContactsUnavailable as error:
+                lost.append(f"{cell.name}: {error}")
+                continue
+            known[cell] = asdict(cell) | {"code": code} | driven
             content["drives"] = list(known.values())
             write_json(path, content)
+    if lost:
+        raise ContactsUnavailable(
+            f"{len(lost)} of {len(todo)} drives have no result; those of the others are in {path}, "
+            f"and the same command drives the missing ones. First {lost[0]}"
+        )
     wanted = set(todo)
     return content | {"drives": [entry for cell, entry in known.items() if cell in wanted]}
 

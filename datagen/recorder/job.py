@@ -25,6 +25,7 @@ from datagen.recording.folder import (
 )
 from datagen.recording.integrity.round_checks import check_round
 from datagen.recording.mcap.index import open_round
+from simulator.world.errors import ContactsUnavailable
 from trackfeatures.errors import UserError
 
 if TYPE_CHECKING:
@@ -89,7 +90,7 @@ def attempt(job: Job, report: Report) -> Outcome:
         return record_and_publish(job, report)
     except BrokenPipeError:
         raise
-    except RoundFailed as error:
+    except (RoundFailed, ContactsUnavailable) as error:
         return AttemptFailed(job.plan.id, str(error), final=True)
     except (UserError, OSError) as error:
         return FatalError(_portable(error, job.folder))

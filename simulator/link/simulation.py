@@ -16,11 +16,14 @@ from simulator.link.layout import ERROR_BYTES, Refusal, Request
 from simulator.link.message import read_command, write_ending, write_features, write_state
 from simulator.sensors.standard import read_range, read_track_range
 from simulator.vehicle.state import CarState, Command
+from simulator.world.errors import ContactsUnavailable
 from simulator.world.world import World
 from trackfeatures.errors import UserError
 
 if TYPE_CHECKING:
     from simulator.camera import Camera
+
+_NOT_OPEN = "there is no episode yet; ask for a reset first"
 
 
 class Simulation:
@@ -40,7 +43,7 @@ class Simulation:
     ) -> None:
         self._world, self._record, self._image = world, record, image
         self._seed, self._camera = seed, camera
-        self._open = False
+        self._open, self._why_closed = False, _NOT_OPEN
         self._held = Command()
         self.steps, self.refused = 0, 0
 
@@ -60,7 +63,7 @@ class Simulation:
 
     def end_episode(self) -> None:
         """End the episode because its client has left."""
-        self._open = False
+        self._open, self._why_closed = False, _NOT_OPEN
 
     def answer(self, request: Any) -> None:
         """Execute `request`, a row of the layout's COMMAND, and fill the record."""
@@ -80,8 +83,16 @@ class Simulation:
         self._refuse(Refusal.BAD_CHECKSUM, text)
 
     def advance(self) -> None:
-        """Step with the last command, without a request (real-time mode)."""
-        self._measure(self._world.step(self._held), stepped=True)
+        """Step with the last command, without a request (real-time mode).
+
+        Where contacts cannot be computed, the episode is closed, and the next step is refused.
+        """
+        try:
+            state = self._world.step(self._held)
+        except ContactsUnavailable as error:
+            self._open, self._why_closed = False, str(error)
+        else:
+            self._measure(state, stepped=True)
 
     def _reset(self, request: Any) -> None:
         episode = self.episodes + 1
@@ -106,7 +117,7 @@ class Simulation:
 
     def _step(self, command: Command) -> None:
         if not self._open:
-            self._refuse(Refusal.NO_EPISODE, "there is no episode yet; ask for a reset first")
+            self._refuse(Refusal.NO_EPISODE, self._why_closed)
         elif self._record["ended"]:
             why = ending(self._world.state)
             self._refuse(
@@ -117,6 +128,10 @@ class Simulation:
         else:
             try:
                 state = self._world.step(command)
+            except ContactsUnavailable as error:
+                self._open, self._why_closed = False, str(error)
+                self._refuse(Refusal.NO_EPISODE, self._why_closed)
+                return
             except UserError as error:
                 self._refuse(Refusal.BAD_COMMAND, str(error))
                 return

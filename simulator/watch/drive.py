@@ -1,5 +1,6 @@
 """The drive that `simulator watch` shows: by the built-in driver, or by a browser's keys."""
 
+import sys
 import time
 from typing import Final
 
@@ -13,6 +14,7 @@ from simulator.watch.messages import scene_message, state_message
 from simulator.watch.pictures import JpegRenderer
 from simulator.watch.requests import BrowserRequest
 from simulator.watch.server import FIRST_VIEW
+from simulator.world.errors import ContactsUnavailable
 from simulator.world.pace import Pacer, Rate
 from simulator.world.world import World
 
@@ -92,7 +94,12 @@ class Drive:
         self._taken.clear()
 
     def _step(self) -> None:
-        self.world.step(self._command(self.world.state))
+        try:
+            self.world.step(self._command(self.world.state))
+        except ContactsUnavailable as error:
+            sys.stderr.write(f"{error}; the next episode begins\n")
+            self._ended_at = time.monotonic()
+            return
         self._rate.add(self._score.count(self.world))
         self._taken.clear()
         if self._score.ended is not None:

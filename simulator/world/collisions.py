@@ -23,8 +23,8 @@ from simulator.vehicle.dynamics import MOTION, PIECE, compute_forces
 from simulator.vehicle.state import Collision
 from simulator.vehicle.surface import ground
 from simulator.world.boxes import box_radius
+from simulator.world.errors import ContactsUnavailable
 from simulator.world.walls import Walls
-from trackfeatures.errors import UserError
 
 if TYPE_CHECKING:
     from simulator.world.physics import PhysicsClient
@@ -75,8 +75,8 @@ class ContactPhysics:
 
         others (n, 6) and move (n, 6): ground poses of the traffic at the start of the control step
         of `dt` s, and their change over it; share: fraction of the control step already done.
-        Returns what the ego car touched; if both, "traffic" rather than "wall". Raises UserError
-        without PyBullet.
+        Returns what the ego car touched; if both, "traffic" rather than "wall". Raises
+        ContactsUnavailable without PyBullet.
         """
         physics = self._bodies()
         compute_forces(
@@ -179,12 +179,13 @@ class ContactPhysics:
 
 
 def _connect() -> "PhysicsClient":
-    """A new PyBullet client. Raises UserError where PyBullet is not installed or fails to load."""
+    """A new PyBullet client. Raises ContactsUnavailable where PyBullet is not installed or fails to
+    load."""
     try:
         with _stderr_silenced():
             from simulator.world.physics import PhysicsClient
     except ImportError as error:
-        raise UserError(
+        raise ContactsUnavailable(
             f"the car touched a wall or another car; contacts need PyBullet ({error}): "
             "pip install 'driverview[contacts]' (from Python 3.12 on pip compiles it, with g++, in "
             "half an hour)"

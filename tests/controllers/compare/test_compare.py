@@ -24,6 +24,7 @@ from controllers.rl.actor import WEIGHTS, load_actor
 from controllers.rl.controller import SHIPPED
 from runtime.files import locked_folder
 from simulator.track.catalogue import OWN_TRACKS
+from simulator.world.errors import ContactsUnavailable
 from tests.controllers.test_drive import at_rest
 from tests.typed import typed
 from trackfeatures import Heading, UserError
@@ -326,3 +327,20 @@ def test_a_wrong_search_is_refused_before_its_first_drive(
     with pytest.raises(UserError, match=message):
         tune(TuneConfig(out=tmp_path / "tuned.json", **changes))
     assert not (tmp_path / "tuned.json").exists()
+
+
+def test_a_contact_without_pybullet_costs_only_its_own_drive(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "left.py").write_text(
+        "class Left:\n    def update(self, observation):\n        return 0.3\n"
+    )
+    crash = f"{tmp_path / 'left.py'}:Left"
+    config = short(tmp_path, tracks="oval", controllers=f"{crash},torcs", steps=300)
+    with monkeypatch.context() as patch:
+        patch.setitem(sys.modules, "pybullet", None)
+        patch.delitem(sys.modules, "simulator.world.physics", raising=False)
+        with pytest.raises(ContactsUnavailable, match=r"1 of 2 drives .*contacts need PyBullet"):
+            compare(config)
+    kept = json.loads((config.out / "results.json").read_text())["drives"]
+    assert [drive["controller"] for drive in kept] == ["torcs"]

@@ -23,6 +23,7 @@ from datagen.recording.errors import DatasetError
 from datagen.recording.folder import RoundState, read_states
 from datagen.recording.integrity.verify import verify
 from simulator.vehicle.state import Command
+from simulator.world.errors import ContactsUnavailable
 from tests.datagen.commands import attempted, datagen, make_jobs, make_small_plan
 from tests.datagen.conftest import Samples
 from trackfeatures.camera import CameraParameters
@@ -103,6 +104,18 @@ def test_a_round_that_cannot_be_driven_is_tried_once_and_reported_in_one_line(
     assert capfd.readouterr().err == ""
     assert list(read_states(tmp_path / "data")) == ["round-001"]
     assert verify(tmp_path / "data", "full").ok
+
+
+def test_a_contact_without_pybullet_ends_only_its_round(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def touch(*args: object) -> None:
+        raise ContactsUnavailable("contacts need PyBullet")
+
+    (job,) = make_jobs(tmp_path, rounds=1, frames=10)
+    job = replace(job, plan=replace(job.plan, camera=CameraParameters(width=56, height=42)))
+    monkeypatch.setattr("simulator.world.world.World.step", touch)
+    assert attempted(job) == AttemptFailed(job.plan.id, "contacts need PyBullet", final=True)
 
 
 def test_a_car_that_is_reset_too_often_ends_its_round(

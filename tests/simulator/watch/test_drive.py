@@ -23,8 +23,11 @@ from simulator.camera import VIEWS
 from simulator.sensors.beams import RANGE_M
 from simulator.track.catalogue import find_track
 from simulator.track.road import Road
-from simulator.watch.hub import MAX_BROWSERS
+from simulator.vehicle.state import Command
+from simulator.watch.drive import Drive
+from simulator.watch.hub import MAX_BROWSERS, Hub
 from simulator.watch.pictures import SIZE
+from simulator.world.world import World
 
 ROAD = Road(find_track("oval"), 2)
 
@@ -324,3 +327,22 @@ def test_the_number_of_browsers_is_limited(watched: Watched) -> None:
             late.recv(timeout=120)
     with watched.browser() as page:
         page.until(lambda state: state["watching"] == 1)
+
+
+def test_a_contact_without_pybullet_ends_the_episode_not_the_drive(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "pybullet", None)
+    monkeypatch.delitem(sys.modules, "simulator.world.physics", raising=False)
+    with World(ROAD) as world:
+        drive = Drive(world, Hub(), speed=100.0)
+        monkeypatch.setattr(drive, "_command", lambda state: Command(gear=0))
+        world.reset(seed=0, angle=-1.2, speed=20.0)
+        for _ in range(40):
+            drive.advance()
+        assert capsys.readouterr().err.count("contacts need PyBullet") == 1
+        monkeypatch.setattr("simulator.watch.drive.ENDED_S", 0.0)
+        for _ in range(5):
+            drive.advance()
+        assert 0.0 < world.state.time_s < 1.0
+        drive.close()
