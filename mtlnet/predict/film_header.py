@@ -2,9 +2,10 @@
 and pictures that must not be taken as they are stored.
 
 Sources: ISO 14496-12 and QuickTime (MP4), RFC 9559 (Matroska), Microsoft's RIFF (AVI) and ASF (WMV)
-specifications, RFC 3533 (Ogg).
+specifications, RFC 3533 (Ogg), yuv4mpeg(5).
 """
 
+import re
 import struct
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,8 +18,11 @@ from runtime.film import boxes
 MAX_INDEX_BYTES = 256 << 20
 EBML, SEGMENT, TRACKS, TRACK, VIDEO = 0x1A45DFA3, 0x18538067, 0x1654AE6B, 0xAE, 0xE0
 STEREO_MODE, CROPS = 0x53B8, (0x54AA, 0x54BB, 0x54CC, 0x54DD)
+PROJECTION, YAW, PITCH = 0x7670, 0x7673, 0x7674  # a mirrored picture has a yaw or a pitch
 ASF_HEADER = bytes.fromhex("3026b2758e66cf11a6d900aa0062ce6c")
 ASF_PROPERTIES = bytes.fromhex("a1dcab8c47a9cf118ee400c00c205365")
+Y4M, Y4M_FRAME, Y4M_LINE_BYTES = b"YUV4MPEG2", b"FRAME\n", 1024
+Y4M_CHROMA = {b"420": (2, 2), b"411": (4, 1), b"422": (2, 1), b"444": (1, 1)}  # pixels a sample
 OGG_PAGE, OGG_LAST, OGG_TAIL_BYTES = b"OggS", 4, 1 << 17
 MP4_FIRST = (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip", b"pnot", b"styp")
 
@@ -35,6 +39,8 @@ def missing_end(path: Path) -> str:
             return _missing_in_avi(file, size)
         if head[:4] == OGG_PAGE:
             return _missing_in_ogg(file, size)
+        if head[:9] == Y4M:
+            return _missing_in_y4m(file, size)
         if head == ASF_HEADER:
             stated = _asf_size(file)
         elif head[:4] == EBML.to_bytes(4, "big"):
@@ -66,7 +72,7 @@ def stated_frames(path: Path, counted: int) -> int:
     size = path.stat().st_size
     with path.open("rb") as file:
         head = file.read(9)
-        if head == b"YUV4MPEG2":
+        if head == Y4M:
             return counted
         if head[:4] != b"RIFF":
             return 0
@@ -158,6 +164,19 @@ def _matroska_track(file: BinaryIO, start: int, end: int) -> Iterator[str]:
                 yield "its header shows a part of the picture only (PixelCrop)"
             if name == STEREO_MODE and value:
                 yield "it holds pictures for two eyes (StereoMode)"
+            if name == PROJECTION and any(
+                kind in (YAW, PITCH) and _float(file, value_at, value_end)
+                for kind, value_at, value_end in list(_elements(file, at, after))
+            ):
+                yield "its header mirrors or tilts the picture (ProjectionPose)"
+
+
+def _float(file: BinaryIO, start: int, end: int) -> float:
+    """The float of an EBML element; 0 where it is none."""
+    file.seek(start)
+    data = file.read(end - start)
+    form = {4: ">f", 8: ">d"}.get(len(data))
+    return float(struct.unpack(form, data)[0]) if form else 0.0
 
 
 def _elements(
@@ -211,6 +230,24 @@ def _missing_in_ogg(file: BinaryIO, size: int) -> str:
     at = tail.rfind(OGG_PAGE)
     if at < 0 or at + 6 > len(tail) or not tail[at + 5] & OGG_LAST:
         return "its last page is missing"
+    return ""
+
+
+def _missing_in_y4m(file: BinaryIO, size: int) -> str:
+    """Told where frames have no parameters of their own, as all writers have it."""
+    file.seek(0)
+    fields = file.readline(Y4M_LINE_BYTES).split()
+    start = file.tell()
+    sizes = {field[:1]: int(field[1:]) for field in fields[1:] if field[1:].isdigit()}
+    colours = next((field[1:] for field in fields[1:] if field[:1] == b"C"), b"420")
+    width, height = sizes.get(b"W", 0), sizes.get(b"H", 0)
+    across, down = next((s for name, s in Y4M_CHROMA.items() if colours.startswith(name)), (0, 0))
+    samples = width * height + (2 * -(-width // across) * -(-height // down) if across else 0)
+    is_known = across or colours.startswith(b"mono")
+    frame = len(Y4M_FRAME) + samples * (2 if re.search(rb"[po]1[0-6]$", colours) else 1)
+    rest = (size - start) % frame
+    if is_known and b"alpha" not in colours and rest and file.readline(8) == Y4M_FRAME:
+        return f"its last frame has {rest} of {frame} bytes"
     return ""
 
 

@@ -20,6 +20,7 @@ FILMS = (
     ".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".ts", ".m2ts", ".mts", ".mpg", ".mpeg",
     ".vob", ".wmv", ".asf", ".flv", ".3gp", ".3g2", ".ogv", ".gif", ".y4m", ".mjpeg", ".mjpg",
     ".h264", ".264", ".avc", ".h265", ".265", ".hevc", ".qcamera",
+    ".mxf", ".nut", ".ivf", ".dv", ".gxf", ".wtv", ".rm",
 )
 # fmt: on
 MJPEG = (".mjpeg", ".mjpg")  # begin as a JPEG image does

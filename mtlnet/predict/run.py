@@ -40,8 +40,10 @@ def predict_files(
     recorded round must be of the model's camera. `report`: takes the numbers of images done and in
     all. `note`: takes a line on what is left out, before the first image. Raises InputsLeftOut,
     after all others were done, when an input or an image could not be used; UserError at once for
-    outputs that cannot be written or are among the files to read.
+    outputs that cannot be written or are among the files to read, or an impossible `lens`.
     """
+    if isinstance(lens, float | int) and not 0 < lens < 180:  # NaN too
+        raise UserError(f"--fov-y-deg {lens:g}: a field of view is above 0 and below 180 degrees")
     sources = find_sources(list(inputs), note)
     other = lens if isinstance(lens, Rectification) else None
     camera, name = engine.card.camera, engine.card.name

@@ -94,6 +94,8 @@ def find_sources(inputs: list[str], note: Note = lambda line: None) -> list[Sour
 
 def _find(given: str, note: Note) -> list[Source]:
     path = Path(given)
+    if not given:  # Path takes it for the present folder
+        return [Source(path, problem="the name of an input is empty; give a file or a folder")]
     try:
         if path.is_dir():
             return _in_folder(path, note)

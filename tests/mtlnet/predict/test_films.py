@@ -60,6 +60,8 @@ def read(path: Path) -> tuple[list[int], str, list[NDArray[np.uint8]]]:
         (["-c:v", "libvpx-vp9", "-deadline", "realtime"], "a.webm"),
         (["-c:v", "libtheora"], "a.ogv"),
         (["-pix_fmt", "yuv420p"], "a.y4m"),
+        (["-pix_fmt", "yuv411p", "-vf", "scale=281:211"], "odd.y4m"),
+        (["-pix_fmt", "gray16", "-strict", "-1"], "grey.y4m"),
         (["-c:v", "mjpeg"], "a.mjpeg"),
         (["-c:v", "mjpeg"], "a.avi"),
         ([], "a.gif"),
@@ -95,6 +97,7 @@ def test_frames_of_varying_duration_are_all_that_there_are(make: Make) -> None:
         (["-c:v", "mjpeg"], "a.avi", r"ends after \d+ of 20 frames"),
         (["-c:v", "wmv2"], "a.wmv", r"ends after \d+ frames.*bytes and has"),
         (["-c:v", "libtheora"], "a.ogv", r"its last page is missing"),
+        (["-pix_fmt", "yuv420p10", "-strict", "-1"], "a.y4m", r"its last frame has \d+ of 176406"),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
@@ -166,18 +169,31 @@ def test_range_and_matrix_of_the_colours_are_those_of_the_header(
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"),
+    ("arguments", "name", "message"),
     [
-        (["-display_hflip"], "its header mirrors the picture; convert it"),
-        (["-display_rotation", "45"], "its header turns the picture by"),
+        (["-display_hflip"], "a.mp4", "its header mirrors the picture; convert it"),
+        (["-display_hflip"], "a.mkv", "its header mirrors or tilts the picture"),
+        (["-display_vflip"], "a.mkv", "its header mirrors or tilts the picture"),
+        (["-display_rotation", "45"], "a.mp4", "its header turns the picture by"),
     ],
 )
 def test_what_cannot_be_shown_as_the_header_says_is_refused(
-    make: Make, arguments: list[str], message: str
+    make: Make, arguments: list[str], name: str, message: str
 ) -> None:
     plain = make(*PICTURES, *H264, "plain.mp4")
     with pytest.raises(UserError, match=message):
-        read_film_header(make(*arguments, "-i", str(plain), "-c", "copy", "a.mp4"))
+        read_film_header(make(*arguments, "-i", str(plain), "-c", "copy", name))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "name"),
+    [(H264, "a.nut"), (["-c:v", "mpeg2video", "-r", "25"], "a.mxf"), (["-c:v", "vp8"], "a.ivf")],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_rare_containers_are_known_by_name(make: Make, arguments: list[str], name: str) -> None:
+    film = make(*PICTURES, *arguments, name)
+    assert kind_of(film) is Kind.FILM
+    assert len(read(film)[0]) >= FRAMES
 
 
 def test_interlaced_pictures_are_not_taken_for_black_ones(make: Make) -> None:

@@ -313,10 +313,20 @@ def test_a_wider_lens_is_cropped_to_the_models_view(
     assert cropped["angle_rad"] > own["angle_rad"]
 
 
+@pytest.mark.parametrize("fov", [0.0, -10.0, 180.0, 400.0, np.nan, np.inf])
+def test_an_impossible_field_of_view_is_refused(
+    tmp_path: Path, engine: BrightnessEngine, fov: float
+) -> None:
+    image = write_jpeg(tmp_path / "a.jpg", 90)
+    with pytest.raises(UserError, match="above 0 and below 180 degrees"):
+        predict_files(engine, [str(image)], lens=fov)
+
+
 @pytest.mark.parametrize(
     ("inputs", "outputs", "message"),
     [
         (["none.jpg"], [], "there is no image file none.jpg"),
+        ([""], [], "the name of an input is empty"),
         (["*.gif"], [], "there is no image file"),
         (["a.jpg"], ["x.txt"], r"x\.txt: give a file ending in \.csv, \.jsonl, \.mp4"),
         (["a.jpg"], ["none/x.csv"], "there is no folder"),
