@@ -160,7 +160,7 @@ ShippedNotes = Annotated[
 ]
 PredictInputs = Annotated[
     list[str],
-    typer.Argument(help="JPEG or PNG files, folders of them, patterns, films, rounds (.mcap)."),
+    typer.Argument(help="Images, films, rounds (.mcap), folders of them, patterns."),
 ]
 PredictOut = Annotated[
     list[Path] | None,

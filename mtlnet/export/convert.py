@@ -17,6 +17,7 @@ import torch
 from numpy.typing import NDArray
 
 from datagen.recording import Dataset
+from mtlnet.data.custom_images import LABELS, has_labels_file
 from mtlnet.data.sources import hold_out_rounds, select_rounds
 from mtlnet.evaluation.evaluate import require_fit
 from mtlnet.export.int8 import (
@@ -71,7 +72,13 @@ def export_model(
     _require_supported(kind, precision, out, frames)
     card = read_card(run)
     check_files(run, card, tuple(name for name in MODEL_FILES if name in card.files))
-    dataset = Dataset.open(data or Path(card.data.get("path", "datasets/default")))
+    source = data or Path(card.data.get("path", "datasets/default"))
+    if has_labels_file(source):
+        raise UserError(
+            f"{source} holds images with a {LABELS}; an export is checked on recorded rounds: give "
+            "a dataset of `datagen collect` with --data"
+        )
+    dataset = Dataset.open(source)
     shown = dataset.select("all" if precision != "int8" else "test")
     require_fit(card, shown, "all")
     chosen = np.linspace(0, len(shown) - 1, min(frames, len(shown))).astype(np.int64)

@@ -123,6 +123,8 @@ def _in_folder(folder: Path, note: Note) -> list[Source]:
 
 
 def _matches(pattern: Path) -> Iterable[Path]:
+    if pattern.name == "**":  # before Python 3.13 it matches folders only
+        pattern /= "*"
     return Path(pattern.anchor).glob(str(pattern.relative_to(pattern.anchor)))
 
 

@@ -270,6 +270,9 @@ def test_unsupported_exports_are_refused(trained: Path, dataset: Path, tmp_path:
             export_model(trained, "onnx", "f32", dataset, frames=frames)
     with pytest.raises(UserError, match="leave out --out"):
         export_model(trained, "openvino", "int8", dataset, tmp_path)
+    (tmp_path / "labels.csv").touch()
+    with pytest.raises(UserError, match=r"labels.csv; an export is checked on recorded rounds"):
+        export_model(trained, "onnx", "f32", tmp_path)
 
 
 def test_a_published_network_is_the_papers(trained: Path) -> None:

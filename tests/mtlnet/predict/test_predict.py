@@ -92,6 +92,12 @@ def test_a_folder_and_a_pattern_name_all_their_images(
     matched = predict_files(engine, [str(tmp_path / "*.jpg")])
     assert [row["angle_rad"] for row in matched] == [row["angle_rad"] for row in results[:2]]
     assert results[0]["angle_rad"] < results[2]["angle_rad"]
+    (tmp_path / "below").mkdir()
+    write_jpeg(tmp_path / "below" / "d.jpg", 50)
+    for pattern in ("**", "**/*"):
+        whole = predict_files(engine, [str(tmp_path / pattern)])
+        names = [Path(row["image"]).name for row in whole]
+        assert names == ["a.jpg", "b.jpg", "d.jpg", "c.jpeg"]
 
 
 def test_tables_hold_every_image(engine: BrightnessEngine, tmp_path: Path) -> None:
