@@ -27,7 +27,7 @@ DISKS = ("full", "full once", "read-only")
 ANEW = 0.2  # how often a killed command is completed at once, and not killed again
 YEAR_S = 365 * 24 * 3600
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.extended]
 
 
 @pytest.fixture(scope="module")

@@ -63,6 +63,7 @@ def drive(program: Path, *words: object) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True, timeout=LAP_LIMIT_S)
 
 
+@pytest.mark.extended
 @pytest.mark.slow
 def test_a_controller_in_cpp_drives_a_lap_over_http_and_shared_memory(
     program: Path, track: Path, link: str, tmp_path: Path

@@ -43,7 +43,10 @@ class StopAt:
         return
 
 
-@pytest.mark.parametrize(("recipe", "balance"), [("fast", "dwa"), ("paper", "uncertainty")])
+@pytest.mark.parametrize(
+    ("recipe", "balance"),
+    [("fast", "dwa"), pytest.param("paper", "uncertainty", marks=pytest.mark.extended)],
+)
 def test_a_resumed_run_equals_an_uninterrupted_one(
     dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, recipe: str, balance: str
 ) -> None:

@@ -131,6 +131,7 @@ def test_no_client_sees_a_reset_when_the_service_stops(published: Path, workers:
     assert min(counts["200"], counts["503"]) > 0
 
 
+@pytest.mark.extended
 @pytest.mark.slow
 def test_no_client_sees_a_reset_when_workers_are_replaced(published: Path) -> None:
     with running(published, "--workers", "2") as (process, port):
