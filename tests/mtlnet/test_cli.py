@@ -142,6 +142,7 @@ def test_wrong_options_of_training_are_refused(dataset: Path, tmp_path: Path) ->
     )
 
 
+@pytest.mark.extended
 def test_ctrl_c_leaves_a_checkpoint_to_resume_from(dataset: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
     command = ["train", "--data", dataset, "--out", run, "--batch", 2, "--iterations", 2000]

@@ -81,6 +81,7 @@ def test_the_plan_names_the_driver_and_another_one_is_refused(recorded: Path) ->
         replay(recorded, 1)
 
 
+@pytest.mark.extended
 def test_recordings_are_merged_with_rounds_of_another_plan(recorded: Path, tmp_path: Path) -> None:
     other = tmp_path / "collected"
     done = subprocess.run(

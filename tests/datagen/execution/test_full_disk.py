@@ -110,6 +110,7 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
     subprocess.run(["umount", disk], check=True)
 
 
+@pytest.mark.extended
 @pytest.mark.skipif(shutil.which("mount") is None, reason="there is no mount command")
 def test_a_small_file_system_that_fills_up_keeps_finished_rounds(small_disk: Path) -> None:
     args = ["--rounds", "3", "--frames", "40", "--tracks", "circuit", "--workers", "1"]

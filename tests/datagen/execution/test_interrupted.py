@@ -29,7 +29,9 @@ from tests.datagen.conftest import Samples
 from trackfeatures.camera import CameraParameters
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize(
+    "number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.extended)]
+)
 def test_an_interruption_leaves_whole_rounds_only_and_is_resumed(
     tmp_path: Path, number: signal.Signals
 ) -> None:

@@ -48,6 +48,7 @@ def test_invalid_shard_options_are_refused(text: str) -> None:
         Shard.parse(text)
 
 
+@pytest.mark.extended
 @pytest.mark.slow
 def test_parallel_shards_give_the_same_dataset_as_one_collector(
     whole: Path, tmp_path: Path
