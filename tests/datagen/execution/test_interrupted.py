@@ -120,6 +120,7 @@ def test_a_contact_without_pybullet_ends_only_its_round(
     assert attempted(job) == AttemptFailed(job.plan.id, "contacts need PyBullet", final=True)
 
 
+@pytest.mark.contacts
 def test_a_car_that_is_reset_too_often_ends_its_round(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
