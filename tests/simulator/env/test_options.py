@@ -145,6 +145,7 @@ def test_a_custom_sensor_is_in_the_observation() -> None:
     env.close()
 
 
+@pytest.mark.contacts
 def test_standard_sensor_readings_stay_in_their_spaces() -> None:
     names = [sensor.name for sensor in STANDARD]
     env = gym.make(STATE_ID, track="oval", traffic=3, sensors=names, ends=())
