@@ -137,7 +137,6 @@ def read_graph(run: Path, card: ModelCard) -> Any:
 
     Raises ModelError when a file is missing or damaged, RuntimeError when OpenVINO cannot read it.
     """
-
     if GRAPH in card.files:
         check_files(run, card, (GRAPH, GRAPH_WEIGHTS))
         return _read_model(run / GRAPH)

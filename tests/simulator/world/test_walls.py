@@ -13,14 +13,14 @@ from simulator.track.road import Road
 from simulator.world.walls import PANEL, Panel, Walls
 
 
-def loop(radius: float, straight: float) -> Track:
+def loop(radius: float, straight: float, width: float = 9.0) -> Track:
     bend = Piece(math.pi * radius, 1.0 / radius, 0.0, 0.0, 0.0, 0.0)
     pieces = [Piece(straight, 0.0, 0.0, 0.0, 0.0, 0.0), bend] * 2
     return Track.from_placed(
         assemble(pieces),
         name="loop",
         source="own",
-        width=9.0,
+        width=width,
         surface="asphalt",
         look="town",
         markings=MarkingStyle(),
@@ -67,19 +67,7 @@ def test_no_panel_for_a_car_far_from_the_wall_or_behind_it() -> None:
 
 def test_a_wall_is_open_where_another_part_of_the_track_lies() -> None:
     # A hairpin whose two straights are 12 m apart: walls 8.5 m out would stand on the other one.
-    tight = Piece(math.pi * 6.0, 1 / 6.0, 0, 0, 0, 0)
-    wide = Piece(math.pi * 6.0, 1 / 6.0, 0, 0, 0, 0)
-    straight = Piece(200.0, 0.0, 0, 0, 0, 0)
-    track = Track.from_placed(
-        assemble([straight, tight, straight, wide]),
-        name="hairpin",
-        source="own",
-        width=12.0,
-        surface="asphalt",
-        look="circuit",
-        markings=MarkingStyle(),
-    )
-    walls = Walls(Road(track))
+    walls = Walls(Road(loop(6.0, 200.0, width=12.0)))
     assert walls.panel(100.0, 6.5, 3.5) is None
     outer = walls.panel(100.0, -6.5, 3.5)
     assert outer is not None
