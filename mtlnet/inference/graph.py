@@ -17,17 +17,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 import trackfeatures as tf
-from mtlnet.inference.uncertainty import (
-    BANDS,
-    CELL_COLUMNS,
-    CELL_ROWS,
-    CENTRE_BANDS,
-    CENTRE_COLUMNS,
-    LIGHT_LIMIT,
-    LIGHT_VALUES,
-    SQRT_EPSILON,
-    UncertaintyHead,
+from mtlnet.inference.graph_operations import (
+    columns,
+    count_values,
+    linear_float32,
+    part_of,
 )
+from mtlnet.inference.uncertainty import UncertaintyHead
+from mtlnet.inference.uncertainty_graph import uncertainty_outputs
 from mtlnet.model.architecture import (
     ABSENT_ABOVE,
     ANGLES,
@@ -74,7 +71,7 @@ def network_nodes(
     images = ops.parameter([batch, HEIGHT, WIDTH, 3], np.uint8, name="images")
     first_row = architecture.first_row
     # Before the transpose, which OpenVINO then leaves to the first convolution.
-    x = _part(ops, images, 1, first_row, HEIGHT) if first_row else images
+    x = part_of(ops, images, 1, first_row, HEIGHT) if first_row else images
     x = ops.convert(x, np.float32)
     x = ops.subtract(ops.multiply(x, np.float32(1 / 127.5)), np.float32(1))
     pixels = ops.transpose(x, np.array([0, 3, 1, 2]))
@@ -83,7 +80,7 @@ def network_nodes(
         if features is not None
         else convolutions(ops, pixels, architecture, weights)
     )
-    x = ops.reshape(x, np.array([-1, _count(x)]), special_zero=False)
+    x = ops.reshape(x, np.array([-1, count_values(x)]), special_zero=False)
     for number in range(len(architecture.shared)):
         x = ops.relu(_linear(ops, x, weights, f"shared.fc{number}.layer"))
     distance, angle, kind = (
@@ -178,10 +175,10 @@ def _linear(ops: Any, x: Any, weights: Weights, name: str) -> Any:
 
 def absent_probabilities(ops: Any, scores: Any) -> Any:
     """Probabilities (B, 5) that markings are absent, of the scores (5 B, PLACES + 1)."""
-    absent = _rows(ops, _columns(ops, ops.softmax(scores, 1), PLACES, PLACES + 1))
+    absent = _rows(ops, columns(ops, ops.softmax(scores, 1), PLACES, PLACES + 1))
     # `ml` and `mr` are absent together.
-    pair = ops.reduce_mean(_columns(ops, absent, 0, PAIR.stop), np.array([1]), keep_dims=True)
-    return ops.concat([pair] * PAIR.stop + [_columns(ops, absent, PAIR.stop, MARKINGS)], 1)
+    pair = ops.reduce_mean(columns(ops, absent, 0, PAIR.stop), np.array([1]), keep_dims=True)
+    return ops.concat([pair] * PAIR.stop + [columns(ops, absent, PAIR.stop, MARKINGS)], 1)
 
 
 def read_bins(ops: Any, scores: Any, angle: Any, absent: Any) -> Any:
@@ -189,7 +186,7 @@ def read_bins(ops: Any, scores: Any, angle: Any, absent: Any) -> Any:
 
     `absent` (B, 5): probabilities that markings are absent.
     """
-    found = _rows(ops, _expectation(ops, _columns(ops, scores, 0, PLACES), PLACES))
+    found = _rows(ops, _expectation(ops, columns(ops, scores, 0, PLACES), PLACES))
     spans = [tf.RANGES[name] for name in tf.MARKINGS]
     ends = np.array([[float(span.inactive != span.lo) for span in spans]], np.float32)
     limits = np.array(ABSENT_ABOVE, np.float32)[None]
@@ -201,27 +198,6 @@ def read_bins(ops: Any, scores: Any, angle: Any, absent: Any) -> Any:
 def _rows(ops: Any, column: Any) -> Any:
     """(5 B, 1) -> (B, 5)."""
     return ops.reshape(column, np.array([-1, MARKINGS]), special_zero=False)
-
-
-def _sizes(x: Any) -> list[int]:
-    """The sizes of a node's result but for the first, the number of images."""
-    shape = x.get_partial_shape() if hasattr(x, "get_partial_shape") else None
-    shape = x.get_output_partial_shape(0) if shape is None else shape
-    return [size.get_length() for size in list(shape)[1:]]
-
-
-def _count(x: Any) -> int:
-    """How many numbers a node's result has for each image."""
-    return int(np.prod(_sizes(x)))
-
-
-def _one_image(x: Any) -> bool:
-    """Whether the number of images is fixed: a graph for that one is quicker."""
-    return bool(x.get_output_partial_shape(0)[0].is_static)
-
-
-def _columns(ops: Any, x: Any, first: int, last: int) -> Any:
-    return _part(ops, x, 1, first, last)
 
 
 def _expectation(ops: Any, scores: Any, count: int) -> Any:
@@ -242,7 +218,7 @@ def _expectation(ops: Any, scores: Any, count: int) -> Any:
 
 def _log_spreads(ops: Any, scores: Any, angle: Any) -> list[Any]:
     """As `mtlnet.model.bins.log_spreads`: (B, 5) of the distances and (B, 1) of the angle."""
-    distances = _log_spread(ops, _columns(ops, scores, 0, PLACES), PLACES)
+    distances = _log_spread(ops, columns(ops, scores, 0, PLACES), PLACES)
     return [_rows(ops, distances), _log_spread(ops, angle, ANGLES)]
 
 
@@ -257,114 +233,3 @@ def _log_spread(ops: Any, scores: Any, count: int) -> Any:
     variance = ops.reduce_sum(squares, axis, keep_dims=True)
     half = np.float32(0.5)
     return ops.multiply(ops.log(ops.add(variance, np.float32(BIN_VARIANCE))), half)
-
-
-def product_float32(ops: Any, x: Any, weight: NDArray[np.float32]) -> Any:
-    """x (B, F) times weight (N, F) transposed: (B, N)."""
-    if not _one_image(x):
-        each = ops.multiply(ops.unsqueeze(x, np.array([1])), ops.constant(weight[None]))
-        return _without_last(ops, ops.reduce_sum(each, np.array([2]), keep_dims=True))
-    # In two dimensions: OpenVINO would lay out three as the channels of an image, and back.
-    sums = ops.reduce_sum(ops.multiply(x, ops.constant(weight)), np.array([1]))
-    return ops.unsqueeze(sums, np.array([0]))
-
-
-def linear_float32(ops: Any, x: Any, weight: NDArray[np.float32], bias: NDArray[np.float32]) -> Any:
-    """Linear layer with weight (N, F) and bias (N,) on x (B, F): (B, N)."""
-    return ops.add(product_float32(ops, x, weight), bias[None])
-
-
-def uncertainty_outputs(ops: Any, x: Any, images: Any, head: UncertaintyHead) -> list[Any]:
-    """`UncertaintyHead.predict` of inputs x (B, X) and images (B, H, W, 3), uint8."""
-    cells, centre = texture_graph(ops, images)
-    count = min(_count(x), len(head.centre))
-    z = _standardise(ops, _columns(ops, x, 0, count), head, slice(0, count))
-    if len(head.centre) > count:
-        light = _standardise(ops, light_graph(ops, cells), head, slice(count, None))
-        limit = np.float32(LIGHT_LIMIT)
-        z = ops.concat([z, ops.minimum(ops.maximum(light, -limit), limit)], 1)
-    hidden = ops.relu(linear_float32(ops, z, head.hidden_weight, head.hidden_bias))
-    log_std = linear_float32(ops, hidden, head.weight, head.bias)
-    limited = ops.minimum(ops.maximum(log_std, head.low[None]), head.high[None])
-    deviation = ops.subtract(cells, head.texture_mean[None])
-    projected = ops.matmul(deviation, ops.constant(head.texture_directions), False, True)
-    z = ops.multiply(ops.subtract(centre, head.pitch_centre[None]), head.pitch_scale[None])
-    hidden = ops.relu(linear_float32(ops, z, head.pitch_hidden_weight, head.pitch_hidden_bias))
-    pitch = linear_float32(ops, hidden, head.pitch_weight, head.pitch_bias)
-    distance = ops.reduce_sum(ops.multiply(projected, projected), np.array([1]), keep_dims=True)
-    return [ops.exp(limited), ops.maximum(distance, ops.multiply(pitch, pitch))]
-
-
-def _standardise(ops: Any, x: Any, head: UncertaintyHead, part: slice) -> Any:
-    return ops.multiply(ops.subtract(x, head.centre[None, part]), head.scale[None, part])
-
-
-def light_graph(ops: Any, cells: Any) -> Any:
-    """`mtlnet.inference.uncertainty.light_features` (B, LIGHT_VALUES) of cells (B, C)."""
-    shape = np.array([-1, LIGHT_VALUES, _count(cells) // LIGHT_VALUES])
-    halves = ops.reshape(cells, shape, special_zero=False)
-    if not _one_image(cells):
-        return _without_last(ops, ops.reduce_mean(halves, np.array([2]), keep_dims=True))
-    return ops.reduce_mean(halves, np.array([2]))
-
-
-def _without_last(ops: Any, x: Any) -> Any:
-    """(B, N, 1) -> (B, N), of a sum or mean of several images.
-
-    Not by the sum itself: OpenVINO 2026.4 adds a bias (1, N) after it to the wrong numbers then.
-    """
-    return ops.squeeze(x, np.array([2]))
-
-
-def texture_graph(ops: Any, images: Any) -> tuple[Any, Any]:
-    """`mtlnet.inference.uncertainty.texture_features` of images (B, H, W, 3): (B, C) and (B, M)."""
-    height, width, _ = _sizes(images)
-    colours = ops.transpose(images, np.array([0, 3, 1, 2]))  # of bytes: quicker than of floats
-    red, green, blue = (
-        ops.convert(_part(ops, colours, 1, number, number + 1), np.float32) for number in range(3)
-    )
-    total = ops.add(ops.add(red, green), blue)
-    planes = [ops.convert(colours, np.float32)]
-    for axis, size in ((3, width), (2, height)):
-        ends = np.array([0] * axis + [1] + [0] * (3 - axis))
-        longer = ops.pad(total, np.zeros(4, int), ends, "edge")
-        following = _part(ops, longer, axis, 1, size + 1)
-        planes.append(ops.abs(ops.subtract(following, total)))
-    colour, *differences = (_band_means(ops, plane) for plane in planes)
-    narrow = [ops.subtract(ops.multiply(colour, np.float32(1 / 127.5)), np.float32(1))]
-    narrow += [ops.multiply(plane, np.float32(1 / (3 * 127.5))) for plane in differences]
-    cells = [_row_means(ops, plane, BANDS) for plane in narrow]
-    first = np.array([CENTRE_BANDS.start, CENTRE_COLUMNS.start])
-    last = np.array([CENTRE_BANDS.stop, CENTRE_COLUMNS.stop])
-    steps, axes = np.array([1, 1]), np.array([2, 3])
-    centre = [ops.slice(plane, first, last, steps, axes) for plane in narrow]
-    return _flat(ops, cells), _flat(ops, centre)
-
-
-def _part(ops: Any, x: Any, axis: int, first: int, last: int) -> Any:
-    return ops.slice(x, np.array([first]), np.array([last]), np.array([1]), np.array([axis]))
-
-
-def _band_means(ops: Any, planes: Any) -> Any:
-    """Means (B, N, bands, columns) of planes (B, N, H, W)."""
-    # Not by a pool, which lays planes out in blocks of 16 first.
-    count, height, width = _sizes(planes)
-    bands = CELL_ROWS * BANDS
-    rows = _row_means(ops, planes, height // bands)
-    shape = np.array([-1, count, bands, CELL_COLUMNS, width // CELL_COLUMNS])
-    return ops.reduce_mean(ops.reshape(rows, shape, special_zero=False), np.array([4]))
-
-
-def _row_means(ops: Any, planes: Any, rows: int) -> Any:
-    """Means (B, N, H / rows, W) of each so many rows of planes (B, N, H, W)."""
-    count, height, width = _sizes(planes)
-    shape = np.array([-1, count, height // rows, rows, width])
-    return ops.reduce_mean(ops.reshape(planes, shape, special_zero=False), np.array([3]))
-
-
-def _flat(ops: Any, planes: list[Any]) -> Any:
-    """One row an image: the colours, and the square roots of the differences."""
-    colours, *others = planes
-    roots = [ops.sqrt(ops.add(plane, np.float32(SQRT_EPSILON))) for plane in others]
-    together = ops.concat([colours, *roots], 1)
-    return ops.reshape(together, np.array([-1, _count(together)]), special_zero=False)
