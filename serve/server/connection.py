@@ -28,6 +28,8 @@ from serve.api.problems import (
 from serve.config import MAX_DEADLINE_MS, MAX_HEAD_BYTES
 from serve.server import guard as guards
 from serve.server.guard import ConnectionGuard, Group
+from serve.server.lingering_close import LingeringTransport
+from serve.server.upgrade import UPGRADE_HEADERS, repeat_head
 from serve.server.websocket import GuardedWebSocket
 
 WORK_S = 2e-3 * MAX_DEADLINE_MS  # after which an answer that is not sent never will be
@@ -35,7 +37,6 @@ MAX_PIPELINED = 16  # requests of one connection that wait for the reply to anot
 MAX_AT_ONCE = 32  # requests received in one part: more would hold the event loop
 MAX_UPGRADES = 4  # offered in one part
 FREE_CHUNKS, CHUNK_BYTES = 512, 512  # of a body; one chunk more for each CHUNK_BYTES received
-UPGRADE_HEADERS = frozenset({b"upgrade", b"http2-settings"})
 
 
 class Phase(Enum):
@@ -306,7 +307,10 @@ class GuardedProtocol(HttpToolsProtocol):
         if self.parser.get_method() == b"CONNECT":
             self.send_400_response("")
         elif not self._should_upgrade():
-            return self._head(ignore=UPGRADE_HEADERS) + rest
+            head = self._repeated_head(ignore=UPGRADE_HEADERS)
+            self.parser = HttpRequestParser(self)
+            self.parser.set_dangerous_leniencies(lenient_data_after_close=True)
+            return head + rest
         elif rest or not (self.cycle is None or self.cycle.response_complete):
             detail = "a WebSocket handshake must wait for its reply, and for those before it"
             self._close_with(Problem(MALFORMED, detail))
@@ -316,25 +320,15 @@ class GuardedProtocol(HttpToolsProtocol):
             self.handle_websocket_upgrade()
         return b""
 
-    def _head(self, ignore: frozenset[bytes] = frozenset()) -> bytes:
-        """These headers again, less those of `ignore`; for the next parser."""
+    def _repeated_head(self, ignore: frozenset[bytes] = frozenset()) -> bytes:
         parser = self.parser
-        version = parser.get_http_version().encode()
-        lines = [b"%b %b HTTP/%b\r\n" % (parser.get_method(), self.url, version)]
-        for name, value in self.headers:
-            if name == b"connection" and ignore:
-                options = [option.strip() for option in value.split(b",")]
-                value = b", ".join(o for o in options if o.lower() not in ignore)
-            if name not in ignore:
-                lines.append(b"%b: %b\r\n" % (name, value))
-        if ignore:
-            self.parser = HttpRequestParser(self)
-            self.parser.set_dangerous_leniencies(lenient_data_after_close=True)
-        return b"".join(lines) + b"\r\n"
+        return repeat_head(
+            parser.get_method(), self.url, parser.get_http_version(), self.headers, ignore
+        )
 
     def handle_websocket_upgrade(self) -> None:
         """Hand the connection over to a WebSocket."""
-        head = self._head()
+        head = self._repeated_head()
         self.connections.discard(self)
         self._phase, self._deadline_s = Phase.CLOSING, inf
         self.group.pop(self, None)
@@ -401,22 +395,3 @@ class GuardedProtocol(HttpToolsProtocol):
         reply = problem_reply(problem, (b"connection", b"close"), path=url)
         self.transport.write(encode_head(reply) + reply.body)
         self.transport.write_eof()  # aborted at once, a client still sending would lose the reply
-
-
-class LingeringTransport:
-    """The transport of a connection for its last reply: `close` may let the client close first."""
-
-    def __init__(self, connection: GuardedProtocol) -> None:
-        self._connection = connection
-
-    def write(self, data: bytes) -> None:
-        """Send."""
-        self._connection.transport.write(data)
-
-    def is_closing(self) -> bool:
-        """Whether the connection is closed or lost."""
-        return self._connection.transport.is_closing()
-
-    def close(self) -> None:
-        """Send no more."""
-        self._connection.end()
