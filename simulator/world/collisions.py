@@ -196,7 +196,11 @@ def _connect() -> "PhysicsClient":
 @contextmanager
 def _stderr_silenced() -> Iterator[None]:
     """Hide PyBullet's greeting, which it prints to stderr when it is imported."""
-    kept = os.dup(2)
+    try:
+        kept = os.dup(2)
+    except OSError:  # it is closed: nothing to hide
+        yield
+        return
     nothing = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nothing, 2)
     try:

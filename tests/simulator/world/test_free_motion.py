@@ -197,6 +197,24 @@ def test_pybullet_moves_the_car_from_the_touch_until_the_gap_exceeds_its_thresho
     assert gaps[calls[-1]] == pytest.approx(CONTACT_MARGIN_M, abs=0.01)
 
 
+@pytest.mark.contacts
+def test_a_contact_needs_no_stderr() -> None:
+    """PyBullet greets on stderr when it is imported, which is hidden; a daemon has it closed."""
+    code = """
+from simulator.track.catalogue import find_track
+from simulator.track.road import Road
+from simulator.vehicle.state import Command
+from simulator.world.world import World
+with World(Road(find_track("oval"))) as world:
+    world.reset(seed=0, angle=-1.2, speed=20.0)
+    print("wall" in [world.step(Command(gear=0)).collision for _ in range(40)])
+"""
+    for end in ("2>&-", ""):
+        command = ["sh", "-c", f'exec "$0" -c "$1" {end}', sys.executable, code]
+        done = subprocess.run(command, capture_output=True, text=True)
+        assert (done.stdout, done.stderr) == ("True\n", "")
+
+
 def test_driving_imports_no_pybullet() -> None:
     """In a process of its own: a world with traffic, an environment, and a contact at the end."""
     code = """
