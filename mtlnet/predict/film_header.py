@@ -44,7 +44,8 @@ def missing_end(path: Path) -> str:
         if head == ASF_HEADER:
             stated = _asf_size(file)
         elif head[:4] == EBML.to_bytes(4, "big"):
-            stated = max((end for kind, _, end in _elements(file, 0, size) if kind == SEGMENT))
+            ends = (end for kind, _, end in _elements(file, 0, size) if kind == SEGMENT)
+            stated = max(ends, default=0)
         else:
             stated = 0
     return f"it states {stated} bytes and has {size}" if stated > size else ""
