@@ -69,10 +69,10 @@ def write_contact_sheet(
     All pictures are of `view`, or without it driver views, one chase and one top view; in the light
     of kind `light`, or without it in each kind by turns, every other one clear. Of `kind` "colour"
     the right half has the true markings drawn thinly over the painted ones; "depth" and "class" are
-    in false colours. `camera`: through that lens, scaled to
-    WIDTH; without it the driver camera's. An older file stays as it is until the new one is complete. Raises UserError
-    if the file cannot be written as PNG or has no folder, or light, view or kind is unknown;
-    OSError if it cannot be written.
+    in false colours. `camera`: seen through that lens, scaled to WIDTH; without it as the driver
+    camera. An older file stays as it is until the new one is complete. Raises UserError if the file
+    cannot be written as PNG or has no folder, or light, view or kind is unknown; OSError if it
+    cannot be written.
     """
     if out.suffix.lower() != ".png":
         raise UserError(f"{out}: the contact sheet is a PNG file; give a name that ends in .png")
