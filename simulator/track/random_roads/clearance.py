@@ -5,6 +5,7 @@ from typing import Final
 
 import numpy as np
 
+from simulator.arrays import FloatArray
 from simulator.track.layout import Segment, cut, place
 
 CLEARANCE_M: Final = 24.0
@@ -12,8 +13,7 @@ CLEARANCE_M: Final = 24.0
 the centre line never meet, the inner walls of the tightest bend (12 m) included. A road of
 three lanes of 4.3 m with shoulders of 3 m has its walls at 11.95 m."""
 STEP_M: Final = 3.0
-MARGIN_M: Final = 0.2
-"""Two lines at `CLEARANCE_M` may be sampled this much farther apart: half a step sideways."""
+MOST_SAMPLES: Final = 500
 
 
 def keeps_clear(segments: list[Segment]) -> bool:
@@ -24,18 +24,24 @@ def keeps_clear(segments: list[Segment]) -> bool:
     """
     placed = place(cut(segments))
     total = float(placed.s0[-1] + placed.length[-1])
-    count = math.ceil(total / STEP_M)
-    s = np.arange(count) * (total / count)
+    count = min(math.ceil(total / STEP_M), MOST_SAMPLES)
+    step = total / count
+    s = np.arange(count) * step
     # Pieces are at most 5 m long: the chord between their ends is near enough to the road.
     nodes = np.append(placed.s0, total)
     x = np.interp(s, nodes, np.append(placed.x0, placed.end[0]))
     y = np.interp(s, nodes, np.append(placed.y0, placed.end[1]))
-    near = math.ceil(math.pi / 2.0 * CLEARANCE_M / (total / count))
-    least = (CLEARANCE_M + MARGIN_M) ** 2
+    near = math.ceil(math.pi / 2.0 * CLEARANCE_M / step)
+    # Two lines at `CLEARANCE_M` may be sampled half a step apart along them, round a tight bend.
+    least = CLEARANCE_M + step * step / 64.0
     # Every pair once: each sample with those up to half a lap ahead.
-    x2, y2 = np.concatenate((x, x)), np.concatenate((y, y))
-    ahead = np.lib.stride_tricks.sliding_window_view
-    width = count // 2 + 1
-    dx = ahead(x2, width)[:count, near:] - x[:, None]
-    dy = ahead(y2, width)[:count, near:] - y[:, None]
-    return bool((dx * dx + dy * dy).min() >= least)
+    ahead_x, ahead_y = (_ahead(values, near, count // 2 + 1) for values in (x, y))
+    dx, dy = ahead_x - x[:, None], ahead_y - y[:, None]
+    return bool((dx * dx + dy * dy).min() >= least * least)
+
+
+def _ahead(values: FloatArray, first: int, last: int) -> FloatArray:
+    """The values (N, last - first) that come `first` to `last` places after each of `values` (N,),
+    round the lap."""
+    lap = np.concatenate((values, values))
+    return np.lib.stride_tricks.sliding_window_view(lap, last)[: len(values), first:]

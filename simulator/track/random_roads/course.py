@@ -14,8 +14,6 @@ from simulator.arrays import FloatArray
 from simulator.track.layout import Bend, Segment, Straight, close, cut, place
 from simulator.track.random_roads.kinds import Kind
 
-MIN_RADIUS_M: Final = 12.0
-MAX_RADIUS_M: Final = 5000.0
 MIN_STRAIGHT_M: Final = 1.0
 MIN_BEND_M: Final = 8.0
 """Shorter bends than this would be kinks."""
@@ -72,7 +70,7 @@ def draw_course(kind: Kind, unevenness: float, rng: np.random.Generator) -> Cour
     if np.abs(turns).min() < MIN_TURN_DEG or np.abs(turns).max() > 165.0:
         raise DoesNotFit
     room = (np.minimum(lengths, np.roll(lengths, 1)) - MIN_STRAIGHT_M) / 2.0
-    corners = _fitted(_corners(kind, turns, room, rng), room)
+    corners = _fitted(kind, _corners(kind, turns, room, rng), room)
     t_in, t_out = _tangents(corners)
     before = np.roll(lengths, 1) - t_in - np.roll(t_out, 1)
     return _closed(before, corners)
@@ -115,16 +113,21 @@ def _corners(
     radius = np.empty(count)
     radius[order] = radii
     return tuple(
-        _corner(kind, turn, max(r, MIN_BEND_M / math.radians(abs(turn))), rng)
+        _corner(kind, turn, min(max(r, _least_radius(turn)), kind.radius_m[1]), rng)
         for turn, r in zip(turns.tolist(), radius.tolist(), strict=True)
     )
+
+
+def _least_radius(turn: float) -> float:
+    """Radius at which a bend of `turn` degrees is just long enough."""
+    return MIN_BEND_M / math.radians(abs(turn))
 
 
 def _corner(kind: Kind, turn: float, radius: float, rng: np.random.Generator) -> Corner:
     """One corner that turns by `turn` degrees, `radius` its smallest."""
     abrupt, compound, spiral, banking = rng.uniform(size=4).tolist()
     if compound < kind.compound and abs(turn) > SHARP_DEG:
-        return _compound(turn, radius, rng)
+        return _compound(kind, turn, radius, rng)
     if abrupt < kind.abrupt:
         return (Arc(radius, turn, 0.0, 0.0),)
     share = kind.spiral[0] + (kind.spiral[1] - kind.spiral[0]) * spiral
@@ -133,7 +136,7 @@ def _corner(kind: Kind, turn: float, radius: float, rng: np.random.Generator) ->
     return (Arc(radius, turn, length, round(degrees, 1)),)
 
 
-def _compound(turn: float, radius: float, rng: np.random.Generator) -> Corner:
+def _compound(kind: Kind, turn: float, radius: float, rng: np.random.Generator) -> Corner:
     """Two or three arcs that follow each other abruptly, the tightest of them of `radius`."""
     count = int(rng.integers(2, 4))
     shares = rng.uniform(0.6, 1.4, count)
@@ -142,21 +145,22 @@ def _compound(turn: float, radius: float, rng: np.random.Generator) -> Corner:
     factors = rng.uniform(1.5, 4.0, count)
     factors[rng.integers(count)] = 1.0
     return tuple(
-        Arc(radius * factor, angle, 0.0, 0.0)
+        Arc(min(radius * factor, kind.radius_m[1]), angle, 0.0, 0.0)
         for factor, angle in zip(factors.tolist(), angles, strict=True)
     )
 
 
-def _fitted(corners: tuple[Corner, ...], room: FloatArray) -> tuple[Corner, ...]:
-    """The corners, made smaller where they need more than `room` of an edge."""
+def _fitted(
+    kind: Kind, corners: tuple[Corner, ...], room: FloatArray
+) -> tuple[Corner, ...]:
+    """The corners, made smaller where they need more than `room` of an edge. Raises DoesNotFit."""
     need = np.maximum(*_tangents(corners))
     factors = np.minimum(1.0, 0.995 * room / need).tolist()
     fitted = []
     for corner, factor in zip(corners, factors, strict=True):
         arcs = tuple(_without_short_banking(arc.scaled(factor)) for arc in corner)
         bend_m = sum(arc.radius * math.radians(abs(arc.angle)) for arc in arcs)
-        radii = [arc.radius for arc in arcs]
-        if min(radii) < MIN_RADIUS_M or max(radii) > MAX_RADIUS_M or bend_m < 0.9 * MIN_BEND_M:
+        if min(arc.radius for arc in arcs) < kind.radius_m[0] or bend_m < 0.9 * MIN_BEND_M:
             raise DoesNotFit
         fitted.append(arcs)
     return tuple(fitted)

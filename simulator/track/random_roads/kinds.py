@@ -31,7 +31,8 @@ class Kind:
     unevenness: float
     """How much the corners' distance from the middle varies; 0: a round course."""
     radius_m: Range
-    """Of the bends, log-even. A bend that does not fit between its neighbours becomes tighter."""
+    """Of the bends, log-even. A bend that does not fit between its neighbours becomes tighter, but
+    not tighter than the least."""
     abrupt: float
     """Share of the bends that begin and end without a spiral."""
     compound: float
