@@ -70,7 +70,10 @@ def draw_course(kind: Kind, unevenness: float, rng: np.random.Generator) -> Cour
     if np.abs(turns).min() < MIN_TURN_DEG or np.abs(turns).max() > 165.0:
         raise DoesNotFit
     room = (np.minimum(lengths, np.roll(lengths, 1)) - MIN_STRAIGHT_M) / 2.0
-    corners = _fitted(kind, _corners(kind, turns, room, rng), room)
+    largest = room / np.tan(np.radians(np.abs(turns)) / 2.0)
+    if largest.min() < kind.radius_m[0]:
+        raise DoesNotFit
+    corners = _fitted(kind, _corners(kind, turns, largest, rng), room)
     t_in, t_out = _tangents(corners)
     before = np.roll(lengths, 1) - t_in - np.roll(t_out, 1)
     return _closed(before, corners)
@@ -102,13 +105,13 @@ def _turns(edges: FloatArray) -> FloatArray:
 
 
 def _corners(
-    kind: Kind, turns: FloatArray, room: FloatArray, rng: np.random.Generator
+    kind: Kind, turns: FloatArray, largest: FloatArray, rng: np.random.Generator
 ) -> tuple[Corner, ...]:
-    """A bend for each turn; the radii are log-even, and the small ones go where room is little."""
+    """A bend for each turn, of radii that are log-even over all; the small ones go where the
+    `largest` that fits is small."""
     count = len(turns)
     low, high = np.log(kind.radius_m)
     radii = np.exp(low + (high - low) * (np.arange(count) + rng.uniform(size=count)) / count)
-    largest = room / np.tan(np.radians(np.abs(turns)) / 2.0)
     order = np.argsort(np.log(largest) + rng.normal(0.0, RANK_NOISE, count))
     radius = np.empty(count)
     radius[order] = radii

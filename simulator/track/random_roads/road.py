@@ -11,6 +11,7 @@ rounding to decimals), and the hash is that of the decimals.
 import math
 import re
 from dataclasses import asdict
+from functools import lru_cache
 from typing import Any, Final
 
 import numpy as np
@@ -43,9 +44,11 @@ def random_name(seed: int) -> str:
     return f"{RANDOM}:{seed}"
 
 
+@lru_cache(maxsize=1024)
 def random_track(name: str) -> Track:
     """The track called `random:SEED`. Raises UnknownTrack for another name."""
-    return build_track(Table(road_file(seed_of(name)), name), name)
+    seed = seed_of(name)
+    return build_track(Table(road_file(seed), name), random_name(seed))
 
 
 def seed_of(name: str) -> int:
