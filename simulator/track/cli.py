@@ -14,7 +14,9 @@ import typer
 if TYPE_CHECKING:
     from simulator.track.geometry import Track
 
-TrackName = Annotated[str, typer.Argument(help="Name of a track, random:SEED, or a .xml, .toml or .csv file.")]
+TrackName = Annotated[
+    str, typer.Argument(help="Name of a track, random:SEED, or a .xml, .toml or .csv file.")
+]
 TracksDir = Annotated[
     Path | None, typer.Option(help="Folder of TORCS (or .toml, .csv) tracks to look in as well.")
 ]
@@ -43,9 +45,7 @@ def list_all(
         typer.echo(json.dumps(found, indent=2))
     else:
         _print_table(found)
-        typer.echo(
-            "random:SEED, e.g. random:7, is a random road: a function of SEED", err=True
-        )
+        typer.echo("random:SEED, e.g. random:7, is a random road: a function of SEED", err=True)
 
 
 @tracks.command()

@@ -111,7 +111,10 @@ class Track:
     @cached_property
     def content_hash(self) -> str:
         """SHA-256 (hex) of the geometry: the same for the same road, whatever its name."""
-        return self.definition_hash or hashlib.sha256(self.arrays().astype("<f8").tobytes()).hexdigest()
+        return (
+            self.definition_hash
+            or hashlib.sha256(self.arrays().astype("<f8").tobytes()).hexdigest()
+        )
 
     @cached_property
     def _table(self) -> FloatArray:

@@ -9,8 +9,8 @@ from simulator.arrays import FloatArray
 from simulator.track.layout import Segment, cut, place
 
 CLEARANCE_M: Final = 24.0
-"""Least distance between the centre lines of two parts of the road: walls that stand up to 12 m from
-the centre line never meet, the inner walls of the tightest bend (12 m) included. A road of
+"""Least distance between the centre lines of two parts of the road: walls that stand up to 12 m
+from the centre line never meet, the inner walls of the tightest bend (12 m) included. A road of
 three lanes of 4.3 m with shoulders of 3 m has its walls at 11.95 m."""
 STEP_M: Final = 3.0
 MOST_SAMPLES: Final = 500

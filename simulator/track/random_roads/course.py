@@ -21,7 +21,7 @@ MIN_TURN_DEG: Final = 0.5
 SHARP_DEG: Final = 35.0
 """A corner that turns by this may be of several arcs."""
 MIN_BANKED_SPIRAL_M: Final = 8.0
-RANK_NOISE: Final = 0.35
+RANK_NOISE: Final = 0.6
 """Of the logarithm of the room for a bend: small radii go to narrow corners, but not always."""
 
 
@@ -112,7 +112,7 @@ def _corners(
     count = len(turns)
     low, high = np.log(kind.radius_m)
     radii = np.exp(low + (high - low) * (np.arange(count) + rng.uniform(size=count)) / count)
-    order = np.argsort(np.log(largest) + rng.normal(0.0, RANK_NOISE, count))
+    order = np.argsort(np.log(largest) + rng.uniform(-RANK_NOISE, RANK_NOISE, count))
     radius = np.empty(count)
     radius[order] = radii
     return tuple(
@@ -153,9 +153,7 @@ def _compound(kind: Kind, turn: float, radius: float, rng: np.random.Generator) 
     )
 
 
-def _fitted(
-    kind: Kind, corners: tuple[Corner, ...], room: FloatArray
-) -> tuple[Corner, ...]:
+def _fitted(kind: Kind, corners: tuple[Corner, ...], room: FloatArray) -> tuple[Corner, ...]:
     """The corners, made smaller where they need more than `room` of an edge. Raises DoesNotFit."""
     need = np.maximum(*_tangents(corners))
     factors = np.minimum(1.0, 0.995 * room / need).tolist()

@@ -62,7 +62,10 @@ def kinds() -> tuple[Kind, ...]:
     return tuple(
         Kind(
             name=name,
-            **{key: tuple(value) if isinstance(value, list) else value for key, value in row.items()},
+            **{
+                key: tuple(value) if isinstance(value, list) else value
+                for key, value in row.items()
+            },
         )
         for name, row in tomllib.loads(text).items()
     )

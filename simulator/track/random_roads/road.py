@@ -56,8 +56,9 @@ def seed_of(name: str) -> int:
     seed = name.removeprefix(f"{RANDOM}:")
     if not _SEED.fullmatch(seed) or int(seed) > MAX_SEED:
         raise UnknownTrack(
-            f"{name!r} names no random road; give random:SEED with a whole number from 0 to 2^63 - 1, "
-            "e.g. random:7 (`datagen collect` takes random alone: each round its own road)"
+            f"{name!r} names no random road; give random:SEED with a whole number from 0 to "
+            "2^63 - 1, e.g. random:7 (`datagen collect` takes random alone: each round its own "
+            "road)"
         )
     return int(seed)
 
@@ -76,7 +77,7 @@ def road_file(seed: int) -> dict[str, Any]:
 def _about(kind: Kind, rng: np.random.Generator) -> dict[str, Any]:
     """What is no segment: look, surface, paint."""
     gravel = bool(rng.uniform() < kind.gravel)
-    look = "gravel" if gravel else str(rng.choice(kind.looks))
+    look = "gravel" if gravel else kind.looks[rng.integers(len(kind.looks))]
     surface = "gravel" if gravel else "concrete" if rng.uniform() < 0.1 else "asphalt"
     dash_length, dash_gap = DASHES[rng.integers(len(DASHES))]
     return {
