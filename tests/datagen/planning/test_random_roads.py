@@ -30,7 +30,7 @@ def planned(**options: Any) -> Plan:
 
 def test_each_round_has_the_road_of_its_seed() -> None:
     plan = planned()
-    assert RANDOM == (TrackChoice("random", ""),)
+    assert (TrackChoice("random", ""),) == RANDOM
     assert [entry.track for entry in plan.rounds] == [f"random:{e.seed}" for e in plan.rounds]
     assert all(e.track_hash == find_track(e.track).content_hash for e in plan.rounds)
     assert Counter(entry.lanes for entry in plan.rounds) == {1: 2, 2: 2, 3: 2}
