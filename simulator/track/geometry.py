@@ -6,7 +6,7 @@ y and to_middle in metres, left positive; headings in radians, counter-clockwise
 
 import hashlib
 import re
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Literal, Self
 
@@ -82,7 +82,8 @@ class Track:
     ) -> Self:
         """Build a track from pieces put end to end."""
         arrays = [getattr(placed, field.name) for field in fields(Placed) if field.name != "end"]
-        return cls(name, source, width, surface, look, markings, *arrays, definition_hash)
+        track = cls(name, source, width, surface, look, markings, *arrays)
+        return replace(track, definition_hash=definition_hash)
 
     @property
     def length_m(self) -> float:

@@ -7,7 +7,7 @@ import tomllib
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -59,16 +59,13 @@ class Kind:
 def kinds() -> tuple[Kind, ...]:
     """All kinds, from kinds.toml."""
     text = files(__package__).joinpath("kinds.toml").read_text(encoding="utf-8")
-    return tuple(
-        Kind(
-            name=name,
-            **{
-                key: tuple(value) if isinstance(value, list) else value
-                for key, value in row.items()
-            },
-        )
-        for name, row in tomllib.loads(text).items()
-    )
+    return tuple(_kind(name, row) for name, row in tomllib.loads(text).items())
+
+
+def _kind(name: str, row: dict[str, Any]) -> Kind:
+    """A kind from its table, whose lists become tuples."""
+    fields: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in row.items()}
+    return Kind(name=name, **fields)
 
 
 def kind_of(seed: int) -> Kind:

@@ -1,6 +1,7 @@
 """`--tracks random`: each round drives on a road of its own, mostly where labels are hard."""
 
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,7 @@ OVAL = choose_tracks(("oval",), None)
 
 
 def planned(**options: Any) -> Plan:
-    return make_plan(CollectConfig(**{"tracks": RANDOM, "frames": 100, "rounds": 6} | options))
+    return make_plan(replace(CollectConfig(rounds=6, frames=100, tracks=RANDOM), **options))
 
 
 def test_each_round_has_the_road_of_its_seed() -> None:
@@ -88,8 +89,8 @@ def test_half_of_the_frames_are_in_tight_bends_or_near_changes_log_evenly(rounds
 
 @pytest.mark.extended
 def test_a_collection_on_random_roads_resumes_and_counts_them_together(tmp_path: Path) -> None:
-    command = ("collect", "--rounds", 2, "--frames", 2, "--tracks", "random", "--workers", 1)
-    command = (*command, "--lights", "clear", "--out", tmp_path / "d", "--json")
+    options = "--rounds 2 --frames 2 --tracks random --workers 1 --lights clear --json"
+    command = ("collect", *options.split(), "--out", tmp_path / "d")
     first = datagen_here(*command)
     assert first.returncode == 0, first.stderr
     [removed, _] = sorted((tmp_path / "d").glob("**/*.mcap"))

@@ -88,16 +88,10 @@ def test_roads_reach_from_12_m_to_5_km_and_stay_drivable(
 
 def crossings(x: FloatArray, y: FloatArray, lap: int) -> int:
     """Number of pairs of segments that cross, of closed lines of `lap` points each, end to end."""
-    nxt = np.arange(len(x)).reshape(-1, lap)
-    nxt = np.roll(nxt, -1, axis=1).ravel()
-
-    def side(a: int | NDArray[Any], b: NDArray[Any]) -> FloatArray:
-        """On which side of segment i (rows) the point b (columns) lies."""
-        dx, dy = (x[nxt] - x)[:, None], (y[nxt] - y)[:, None]
-        return np.asarray(dx * (y[b] - y[:, None]) - dy * (x[b] - x[:, None]))
-
-    here = side(0, np.arange(len(x)))
-    apart = here * here[:, nxt] < 0.0
+    nxt = np.roll(np.arange(len(x)).reshape(-1, lap), -1, axis=1).ravel()
+    dx, dy = (x[nxt] - x)[:, None], (y[nxt] - y)[:, None]
+    side = dx * (y - y[:, None]) - dy * (x - x[:, None])  # of segment (row): of each point (column)
+    apart = side * side[:, nxt] < 0.0
     return int((apart & apart.T).sum() // 2)
 
 
