@@ -87,6 +87,16 @@ def test_half_of_the_frames_are_in_tight_bends_or_near_changes_log_evenly(rounds
     assert octaves.max() < 1.5 * octaves.min()
 
 
+def test_a_dry_run_counts_random_roads_together() -> None:
+    options = "--rounds 6 --frames 50 --tracks random,oval --dry-run"
+    shown = datagen_here("collect", *options.split())
+    assert shown.returncode == 0, shown.stderr
+    [counts] = [line for line in shown.stdout.splitlines() if line.startswith(" track")]
+    assert "random 3" in counts
+    assert "random:" not in counts
+    assert shown.stdout.count("random:") == 3
+
+
 @pytest.mark.extended
 def test_a_collection_on_random_roads_resumes_and_counts_them_together(tmp_path: Path) -> None:
     options = "--rounds 2 --frames 2 --tracks random --workers 1 --lights clear --json"
