@@ -42,7 +42,8 @@ Workers = Annotated[int, typer.Option(help="Recording processes; 0: one for each
 Tracks = Annotated[
     str,
     typer.Option(
-        help="Track names or files, separated by commas; empty: all but the held-out ones."
+        help="Track names or files, separated by commas; random: each round its own random road; "
+        "empty: all but the held-out ones."
     ),
 ]
 Lanes = Annotated[str, typer.Option(help="Lane counts, separated by commas.")]

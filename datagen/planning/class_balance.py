@@ -21,6 +21,7 @@ from datagen.planning.plan import RoundPlan
 from simulator.driving.speed import bend_profile
 from simulator.track.catalogue import find_track
 from simulator.track.geometry import Track
+from simulator.track.random_roads.road import RANDOM, random_track
 from simulator.track.road import Road
 from simulator.traffic.traffic import DESIRED_KMH
 
@@ -63,8 +64,9 @@ class TrackForecast:
 
     @staticmethod
     def of(choices: tuple[TrackChoice, ...], tracks_dir: Path | None) -> "TrackForecast":
-        """Read the chosen tracks."""
-        return TrackForecast({c.name: find_track(c.name, tracks_dir) for c in choices})
+        """Read the chosen tracks; random roads of rounds are drawn when they are forecast."""
+        named = (c.name for c in choices if c.name != RANDOM)
+        return TrackForecast({name: find_track(name, tracks_dir) for name in named})
 
     def __call__(self, entry: RoundPlan, starts: FloatArray) -> FloatArray:
         lap = self._lap(entry.track, entry.lanes, entry.lane_width_m)
@@ -86,7 +88,7 @@ class TrackForecast:
         return np.asarray(spent / spent.sum(axis=1, keepdims=True))
 
     def _lap_profile(self, name: str, lanes: int, lane_width_m: float) -> _LapProfile:
-        track = self._tracks[name]
+        track = self._tracks[name] if name in self._tracks else random_track(name)
         profile = bend_profile(track, max_offset(Road(track, lanes, lane_width_m)))
         s = (np.arange(len(profile.limit)) + 0.5) * profile.cell_m
         here, ahead = track.at(s).curvature, track.at(s + tf.LOOK_AHEAD_M).curvature

@@ -27,7 +27,8 @@ def all_lights() -> tuple[str, ...]:
 
 @dataclass(frozen=True, slots=True)
 class TrackChoice:
-    """Name of a track, and the hash of its geometry when the plan was made."""
+    """Name of a track, and the hash of its geometry when the plan was made; or `random`, without a
+    hash: a random road for each round."""
 
     name: str
     content_hash: str

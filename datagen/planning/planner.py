@@ -16,6 +16,7 @@ from datagen.planning.config import FRAMES_PER_SCENE, SEEDS_PER_PLAN, CollectCon
 from datagen.planning.plan import Plan, RoundPlan
 from datagen.planning.split import choose_test_rounds
 from datagen.recording.names import UNSEEN
+from simulator.track.random_roads.road import RANDOM, random_name, random_track
 from trackfeatures.camera import CameraParameters
 
 MAX_TRAFFIC = 8
@@ -123,9 +124,17 @@ def _tracks_and_lanes(
     tracks, lanes = [], []
     for number in range(config.rounds):
         cycle, place = divmod(number, len(order))
-        tracks.append(config.tracks[order[place]])
+        tracks.append(_track(config.tracks[order[place]], _first_seed(config) + number))
         lanes.append(config.lanes[(cycle + int(first[place])) % len(config.lanes)])
     return tracks, lanes
+
+
+def _track(choice: TrackChoice, round_seed: int) -> TrackChoice:
+    """The chosen track, or the random road of the round's seed."""
+    if choice.name != RANDOM:
+        return choice
+    track = random_track(random_name(round_seed))
+    return TrackChoice(track.name, track.content_hash)
 
 
 def _lights(config: CollectConfig, rng: np.random.Generator) -> list[tuple[str, ...]]:

@@ -12,6 +12,7 @@ from datagen.planning.class_balance import MIN_SHARE, Forecast, expected_shares
 from datagen.planning.plan import Plan, RoundPlan
 from datagen.recording.names import SIDES
 from datagen.recording.round_metadata import summarize_lights
+from simulator.track.random_roads.road import RANDOM, is_random
 
 
 def expected_classes(plan: Plan, forecast: Forecast) -> dict[str, dict[str, float]]:
@@ -34,7 +35,9 @@ def overview(plan: Plan, classes: dict[str, dict[str, float]]) -> RenderableType
     for side in sides:
         table.add_column(side)
     table.add_row("rounds", *(str(len(rounds)) for rounds in sides.values()))
-    for name in ("track", "lanes", "trajectory", "traffic"):
+    tracks = ([_track_group(entry.track) for entry in part] for part in sides.values())
+    table.add_row("track", *(_counts(each) for each in tracks))
+    for name in ("lanes", "trajectory", "traffic"):
         table.add_row(name, *(_counts([getattr(e, name) for e in part]) for part in sides.values()))
     lights = ([light for e in part for light in e.lights] for part in sides.values())
     table.add_row("light", *(_counts(each) for each in lights))
@@ -74,6 +77,11 @@ def _notes_on_rare_classes(classes: dict[str, dict[str, float]]) -> list[str]:
 def _sides(plan: Plan) -> dict[str, list[RoundPlan]]:
     by_side = {side: [entry for entry in plan.rounds if entry.split == side] for side in SIDES}
     return {side: rounds for side, rounds in by_side.items() if rounds}
+
+
+def _track_group(name: str) -> str:
+    """Random roads are counted together: there is one for each round."""
+    return RANDOM if is_random(name) else name
 
 
 def _counts(values: Sequence[Any]) -> str:

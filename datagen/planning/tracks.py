@@ -4,6 +4,7 @@ from pathlib import Path
 
 from datagen.planning.config import TrackChoice
 from simulator.track.catalogue import OWN_TRACKS, find_track, track_files
+from simulator.track.random_roads.road import RANDOM
 from trackfeatures.errors import UserError
 
 HELD_OUT = ("coast", "countryside", "dirt-3", "e-track-4")
@@ -17,6 +18,7 @@ def choose_tracks(
     """The named tracks. Without names: our own and all of TORCS that are found, not `HELD_OUT`.
 
     With `unseen`: those of `HELD_OUT` that are found, or named ones that are not trained on.
+    `random` is kept as it is: each round will have a random road of its own, unseen by all others.
     Raises UnknownTrack for a name that is not found, TrackError for a bad file, UserError for a
     training track given as unseen.
     """
@@ -26,8 +28,13 @@ def choose_tracks(
     if unseen and (seen := set(names) & set(usual)):
         raise UserError(f"track {min(seen)} is one of those to train on; choose another as unseen")
     chosen = names or (held_out if unseen else usual)
-    tracks = [(name, find_track(name, tracks_dir)) for name in chosen]
-    return tuple(TrackChoice(name, track.content_hash) for name, track in tracks)
+    return tuple(_choice(name, tracks_dir) for name in chosen)
+
+
+def _choice(name: str, tracks_dir: Path | None) -> TrackChoice:
+    if name == RANDOM:
+        return TrackChoice(name, content_hash="")
+    return TrackChoice(name, find_track(name, tracks_dir).content_hash)
 
 
 def _trained_on(file: Path) -> bool:

@@ -161,9 +161,16 @@ class RoundInfo:
         """The round's light in one word."""
         return summarize_lights(self.lights)
 
+    @property
+    def track_group(self) -> str:
+        """What frames are counted by: the track, or `random` for all random roads (`random:7`)."""
+        return "random" if self.track.startswith("random:") else self.track
+
     def values_of(self, name: str) -> tuple[str, ...]:
         """The values of attribute `name` in this round: one track, but several lights."""
-        return self.lights if name == "light" else (str(getattr(self, name)),)
+        if name == "light":
+            return self.lights
+        return (self.track_group if name == "track" else str(getattr(self, name)),)
 
     @staticmethod
     def of(path: Path, header: RoundHeader, result: RoundResult, split: str) -> "RoundInfo":

@@ -25,7 +25,7 @@ def describe(dataset: Dataset) -> dict[str, Any]:
         "frames": len(labels),
         "camera": dataset.camera.as_dict(),
         "seeds": sorted({info.seed for info in rounds}),
-        "by_track": _frames_by(rounds, "track"),
+        "by_track": _frames_by(rounds, "track_group"),
         "by_lanes": _frames_by(rounds, "lanes"),
         "by_light": dict(sorted(Counter(labels.light.tolist()).items())),
         "by_traffic": _frames_by(rounds, "traffic"),

@@ -58,7 +58,7 @@ def _balance(dataset: Dataset, by_split: dict[str, Labels]) -> Iterator[Markup]:
     for name in BALANCED_BY:
         frames: dict[str, list[int]] = {}
         for info in dataset.rounds:
-            row = frames.setdefault(str(getattr(info, name)), [0] * len(splits))
+            row = frames.setdefault(info.values_of(name)[0], [0] * len(splits))
             if info.split in splits:
                 row[splits.index(info.split)] += info.frames
         yield bars(name, dict(sorted(frames.items(), key=_numbers_in_order)))

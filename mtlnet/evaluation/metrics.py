@@ -165,7 +165,7 @@ def groups(frames: Frames) -> Iterator[tuple[str, dict[str, NDArray[np.int64]]]]
     """
     labels = frames.labels
     of_round = labels.round
-    yield "by_track", _by_value(np.array([info.track for info in frames.rounds])[of_round])
+    yield "by_track", _by_value(np.array([info.track_group for info in frames.rounds])[of_round])
     yield "by_lanes", _by_value(labels.lanes.astype(str))
     yield "by_light", _by_value(labels.light)
     yield "by_shadow", _by_range(labels.shadow_fraction, SHADOW, "")

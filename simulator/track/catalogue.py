@@ -1,7 +1,8 @@
 """Finds tracks by name: the project's own, then TORCS and CSV tracks in the folders we look in.
 
 Looked in, in this order: `simulator/tracks`, the folder given (`--tracks-dir`), `$TORCS_TRACKS`,
-`/usr/share/games/torcs/tracks`. The first track of a name wins.
+`/usr/share/games/torcs/tracks`. The first track of a name wins. `random:SEED` is no file: see
+`random_roads`.
 """
 
 import difflib
@@ -13,6 +14,7 @@ from typing import Final
 
 from simulator.track.errors import UnknownTrack
 from simulator.track.geometry import Track, readable_name
+from simulator.track.random_roads.road import is_random, random_track
 from trackfeatures.errors import UserError
 
 OWN_TRACKS: Final = Path(__file__).parent.parent / "tracks"
@@ -22,10 +24,12 @@ SUFFIXES: Final = (".xml", ".toml", ".csv")
 
 
 def find_track(name: str, tracks_dir: Path | None = None) -> Track:
-    """The track of that name, or of that file (.xml, .toml or .csv).
+    """The track of that name, `random:SEED`, or of that file (.xml, .toml or .csv).
 
     Raises UnknownTrack with names close to it, TrackError when its file is bad.
     """
+    if is_random(name):
+        return random_track(name)
     path = Path(name)
     if path.suffix.lower() in SUFFIXES:
         if not path.is_file():

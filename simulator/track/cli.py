@@ -2,6 +2,7 @@
 
 simulator tracks --tracks-dir FOLDER --json
 simulator tracks plot forza --out forza.png --lanes 2
+simulator tracks export random:7 --out random-7.toml
 """
 
 import json
@@ -13,7 +14,9 @@ import typer
 if TYPE_CHECKING:
     from simulator.track.geometry import Track
 
-TrackName = Annotated[str, typer.Argument(help="Name of a track, or a .xml, .toml or .csv file.")]
+TrackName = Annotated[
+    str, typer.Argument(help="Name of a track, random:SEED, or a .xml, .toml or .csv file.")
+]
 TracksDir = Annotated[
     Path | None, typer.Option(help="Folder of TORCS (or .toml, .csv) tracks to look in as well.")
 ]
@@ -31,7 +34,7 @@ def list_all(
     tracks_dir: TracksDir = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
-    """List all tracks that can be driven, or plot one."""
+    """List all tracks that can be driven, plot one, or export a random road."""
     if context.invoked_subcommand is not None:
         context.obj = tracks_dir
         return
@@ -42,6 +45,7 @@ def list_all(
         typer.echo(json.dumps(found, indent=2))
     else:
         _print_table(found)
+        typer.echo("random:SEED, e.g. random:7, is a random road: a function of SEED", err=True)
 
 
 @tracks.command()
@@ -60,6 +64,23 @@ def plot(
     road = Road(find_track(track, tracks_dir or context.obj), lanes)
     out = out or Path(f"{road.track.name}.png")
     write_plot(road, out)
+    typer.echo(str(out), err=True)
+
+
+@tracks.command()
+def export(
+    road: Annotated[str, typer.Argument(metavar="random:SEED", help="Which random road.")],
+    out: Annotated[
+        Path | None, typer.Option(help="TOML file; random-SEED.toml here if not given.")
+    ] = None,
+) -> None:
+    """Write a random road as TOML: a track to read, to change, and to name by its path."""
+    from simulator.track.random_roads.export import write_road
+    from simulator.track.random_roads.road import seed_of
+
+    seed = seed_of(road)
+    out = out or Path(f"random-{seed}.toml")
+    write_road(seed, out)
     typer.echo(str(out), err=True)
 
 

@@ -6,7 +6,7 @@ y and to_middle in metres, left positive; headings in radians, counter-clockwise
 
 import hashlib
 import re
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Literal, Self
 
@@ -64,6 +64,8 @@ class Track:
     z_right0: FloatArray
     z_left1: FloatArray
     z_right1: FloatArray
+    definition_hash: str = ""
+    """Hash of the definition that the geometry was computed from, where it counts instead."""
 
     @classmethod
     def from_placed(
@@ -76,10 +78,12 @@ class Track:
         surface: Surface,
         look: str,
         markings: MarkingStyle,
+        definition_hash: str = "",
     ) -> Self:
         """Build a track from pieces put end to end."""
         arrays = [getattr(placed, field.name) for field in fields(Placed) if field.name != "end"]
-        return cls(name, source, width, surface, look, markings, *arrays)
+        track = cls(name, source, width, surface, look, markings, *arrays)
+        return replace(track, definition_hash=definition_hash)
 
     @property
     def length_m(self) -> float:
@@ -108,7 +112,10 @@ class Track:
     @cached_property
     def content_hash(self) -> str:
         """SHA-256 (hex) of the geometry: the same for the same road, whatever its name."""
-        return hashlib.sha256(self.arrays().astype("<f8").tobytes()).hexdigest()
+        return (
+            self.definition_hash
+            or hashlib.sha256(self.arrays().astype("<f8").tobytes()).hexdigest()
+        )
 
     @cached_property
     def _table(self) -> FloatArray:

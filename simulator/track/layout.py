@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from simulator.arrays import FloatArray
 from simulator.track.errors import TrackError
-from simulator.track.pieces import Piece, Placed, assemble
+from simulator.track.pieces import Piece, Placed, put
 
 MAX_STEP_M: Final = 5.0
 SPIRAL_STEP_M: Final = 2.0
@@ -99,8 +99,8 @@ def _spiral(bend: Bend, sign: float, number: int) -> list[Row]:
 
 
 def place(steps: Steps) -> Placed:
-    """The steps in the plane, without heights."""
-    return assemble([Piece(*step) for step in zip(steps.length, steps.curvature, strict=True)])
+    """The steps in the plane, without heights. No step is long enough to have to be split."""
+    return put(steps.length, steps.curvature, np.zeros((len(steps.length), 4)))
 
 
 def close(segments: list[Segment]) -> tuple[list[Segment], float]:

@@ -55,6 +55,9 @@ def split_turns(pieces: list[Piece]) -> list[Piece]:
     cut: list[Piece] = []
     for piece in pieces:
         parts = max(1, math.ceil(abs(piece.curvature) * piece.length / MAX_TURN - 1e-9))
+        if parts == 1:
+            cut.append(piece)
+            continue
         for i in range(parts):
             a, b = i / parts, (i + 1) / parts
             cut.append(
@@ -79,6 +82,20 @@ def assemble(pieces: list[Piece], x: float = 0.0, y: float = 0.0, heading: float
     cut = split_turns(pieces)
     length = np.array([piece.length for piece in cut], dtype=np.float64)
     curvature = np.array([piece.curvature for piece in cut], dtype=np.float64)
+    heights = np.array([[p.z_left0, p.z_right0, p.z_left1, p.z_right1] for p in cut])
+    return put(length, curvature, heights, x, y, heading)
+
+
+def put(
+    length: FloatArray,
+    curvature: FloatArray,
+    heights: FloatArray,
+    x: float = 0.0,
+    y: float = 0.0,
+    heading: float = 0.0,
+) -> Placed:
+    """Pieces (P,) that turn by at most `MAX_TURN` put end to end from the pose (x, y, heading);
+    `heights` (P, 4) of the left and right edge at the start, and at the end."""
     turn = curvature * length
     headings = heading + np.concatenate(([0.0], np.cumsum(turn)))
     # np.sinc(t) = sin(pi t)/(pi t): the chord of an arc that turns by `turn`.
@@ -86,7 +103,6 @@ def assemble(pieces: list[Piece], x: float = 0.0, y: float = 0.0, heading: float
     middle = headings[:-1] + turn / 2.0
     xs = x + np.concatenate(([0.0], np.cumsum(chord * np.cos(middle))))
     ys = y + np.concatenate(([0.0], np.cumsum(chord * np.sin(middle))))
-    heights = np.array([[p.z_left0, p.z_right0, p.z_left1, p.z_right1] for p in cut])
     return Placed(
         s0=np.concatenate(([0.0], np.cumsum(length)[:-1])),
         length=length,

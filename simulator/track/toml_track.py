@@ -6,17 +6,22 @@
     [[segment]]  type = "bend", radius (m), angle (deg, left positive, spirals included),
                  spiral (m, each end), banking (deg, outer edge up)
     grade (%, uphill positive) on a segment holds until another one is given.
+    hash         "segments": the track's hash is that of the numbers in the file, which are the same
+                 on every machine; "geometry" (default): that of the pieces computed from them
 
 The bends must turn by +-360 degrees in all. Straights are adjusted by up to a metre so that the
 loop closes exactly, and the mean grade is taken out so that the heights close too.
 """
 
+import hashlib
 import math
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Final, cast, get_args
+
+import numpy as np
 
 from simulator.track.errors import TrackError
 from simulator.track.geometry import Surface, Track, readable_name
@@ -72,36 +77,60 @@ class Table:
 
 def read_toml_track(path: Path) -> Track:
     """The track of one TOML file, named after the file. Raises TrackError when it is not one."""
-    table = Table(_load(path), str(path))
-    table.only("look", "surface", "width", "vertical_curve", "markings", "segment")
+    return build_track(Table(_load(path), str(path)), readable_name(path.stem))
+
+
+def build_track(table: Table, name: str) -> Track:
+    """The track that the content of a TOML file describes. Raises TrackError when it does not."""
+    table.only("look", "surface", "width", "vertical_curve", "hash", "markings", "segment")
     width = table.number("width", 6.0, 40.0)
-    segments = _closed(read_segments(table), path)
-    placed = assemble(lay(segments, width, table.number("vertical_curve", 1.0, 200.0, 50.0)))
-    check_closes(placed, str(path), MAX_GAP_M)
+    vertical_curve = table.number("vertical_curve", 1.0, 200.0, 50.0)
+    written = read_segments(table)
+    placed = assemble(lay(_closed(written, table.where), width, vertical_curve))
+    check_closes(placed, table.where, MAX_GAP_M)
+    hashed = table.choice("hash", ("geometry", "segments"), "geometry")
+    markings = Table(table.values.get("markings", {}), f"{table.where}: [markings]")
     return Track.from_placed(
         placed,
-        name=readable_name(path.stem),
+        name=name,
         source="own",
         width=width,
         surface=cast(Surface, table.choice("surface", get_args(Surface), "asphalt")),
         look=table.choice("look", LOOKS),
-        markings=_markings(Table(table.values.get("markings", {}), f"{path}: [markings]")),
+        markings=_markings(markings),
+        definition_hash=_hash(written, width, vertical_curve) if hashed == "segments" else "",
     )
 
 
-def _closed(written: list[Segment], path: Path) -> list[Segment]:
+def _hash(written: list[Segment], width: float, vertical_curve: float) -> str:
+    """SHA-256 (hex) of the numbers of a definition.
+
+    The computed geometry differs by 1e-12 m between machines, whose libraries round sines
+    differently; parsed decimals and products of them do not.
+    """
+    rows = [
+        (segment.length, 0.0, 0.0, 0.0, segment.grade)
+        if isinstance(segment, Straight)
+        else (segment.radius, segment.angle, segment.spiral, segment.banking, segment.grade)
+        for segment in written
+    ]
+    numbers = np.array([(width, vertical_curve, 0.0, 0.0, 0.0), *rows], dtype="<f8")
+    return hashlib.sha256(b"segments 1" + numbers.tobytes()).hexdigest()
+
+
+def _closed(written: list[Segment], where: str) -> list[Segment]:
     """The segments of a closed loop; TrackError where closing changes a straight too much."""
     try:
         segments, correction = close(written)
     except TrackError as error:
-        raise TrackError(f"{path}: {error}") from None
+        raise TrackError(f"{where}: {error}") from None
     if correction > MAX_CORRECTION_M:
         raise TrackError(
-            f"{path}: to close the loop a straight would have to change by {correction:.2f} m, "
+            f"{where}: to close the loop a straight would have to change by {correction:.2f} m, "
             f"allowed are {MAX_CORRECTION_M:g} m; correct the lengths or angles"
         )
     if any(isinstance(s, Straight) and s.length <= 0.0 for s in segments):
-        raise TrackError(f"{path}: closing the loop leaves a straight no length; lengthen it")
+        raise TrackError(f"{where}: closing the loop leaves a straight no length; lengthen it")
     return segments
 
 

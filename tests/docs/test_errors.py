@@ -330,6 +330,11 @@ def _(folder: Path) -> object:
     return find_track("no-such-track")
 
 
+@row("a random road")
+def _(folder: Path) -> object:
+    return find_track("random:x")
+
+
 @row("a TORCS track")
 def _(folder: Path) -> object:
     length = '<attnum name="lg" unit="yard" val="9"/>'

@@ -22,6 +22,17 @@ from tests.datagen.chunk_crcs import with_right_crcs
 from tests.datagen.conftest import Samples
 
 
+def test_random_roads_are_counted_as_one_track(samples: Samples, tmp_path: Path) -> None:
+    prepare(tmp_path)
+    for number, track in enumerate(("random:4", "random:15", "a-track")):
+        samples.add_round(tmp_path, samples.header(f"r{number:03d}", track=track))
+    statistics = rebuild(tmp_path, Split(train=("r000", "r002"), test=("r001",)))
+    assert statistics["by_track"] == {"a-track": 45, "random": 90}
+    rounds = Dataset.open(tmp_path).rounds
+    assert [info.track for info in rounds] == ["random:4", "random:15", "a-track"]
+    assert [info.values_of("track") for info in rounds] == [("random",), ("random",), ("a-track",)]
+
+
 def test_rounds_sides_and_labels_are_read_back(samples: Samples, dataset: Path) -> None:
     opened = Dataset.open(dataset)
     assert [(info.id, info.split, info.frames) for info in opened.rounds] == [

@@ -1,0 +1,47 @@
+"""Whether a closed course keeps clear of itself. Metres."""
+
+import math
+from typing import Final
+
+import numpy as np
+
+from simulator.arrays import FloatArray
+from simulator.track.layout import Segment, cut, place
+
+CLEARANCE_M: Final = 24.0
+"""Least distance between the centre lines of two parts of the road: walls that stand up to 12 m
+from the centre line never meet, the inner walls of the tightest bend (12 m) included. A road of
+three lanes of 4.3 m with shoulders of 3 m has its walls at 11.95 m."""
+STEP_M: Final = 3.0
+MOST_SAMPLES: Final = 500
+
+
+def keeps_clear(segments: list[Segment]) -> bool:
+    """Whether no two parts of a closed course are nearer than `CLEARANCE_M`.
+
+    Parts closer along the road than half the circle of that diameter need no check: where no radius
+    is below half of it, they are on no sharper bend than that circle.
+    """
+    placed = place(cut(segments))
+    total = float(placed.s0[-1] + placed.length[-1])
+    count = min(math.ceil(total / STEP_M), MOST_SAMPLES)
+    step = total / count
+    s = np.arange(count) * step
+    # Pieces are at most 5 m long: the chord between their ends is near enough to the road.
+    nodes = np.append(placed.s0, total)
+    x = np.interp(s, nodes, np.append(placed.x0, placed.end[0]))
+    y = np.interp(s, nodes, np.append(placed.y0, placed.end[1]))
+    near = math.ceil(math.pi / 2.0 * CLEARANCE_M / step)
+    # Two lines at `CLEARANCE_M` may be sampled half a step apart along them, round a tight bend.
+    least = CLEARANCE_M + step * step / 64.0
+    # Every pair once: each sample with those up to half a lap ahead.
+    ahead_x, ahead_y = (_ahead(values, near, count // 2 + 1) for values in (x, y))
+    dx, dy = ahead_x - x[:, None], ahead_y - y[:, None]
+    return bool((dx * dx + dy * dy).min() >= least * least)
+
+
+def _ahead(values: FloatArray, first: int, last: int) -> FloatArray:
+    """The values (N, last - first) that come `first` to `last` places after each of `values` (N,),
+    round the lap."""
+    lap = np.concatenate((values, values))
+    return np.lib.stride_tricks.sliding_window_view(lap, last)[: len(values), first:]

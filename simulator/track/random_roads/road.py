@@ -1,0 +1,153 @@
+"""Random roads: the track `random:SEED`, a function of its seed.
+
+Errors of the heading are largest, and biased, in tight bends and at changes of curvature, which
+other tracks show in few frames; half of the frames of a random road's drive show one of the two.
+
+The road is drawn as the content of a TOML file (see `toml_track`), in decimals: the same seed gives
+the same decimals on every machine (numpy's PCG64; what sines are rounded to disappears in the
+rounding to decimals), and the hash is that of the decimals.
+"""
+
+import math
+import re
+from dataclasses import asdict
+from functools import lru_cache
+from typing import Any, Final
+
+import numpy as np
+
+from simulator.arrays import FloatArray
+from simulator.track.errors import UnknownTrack
+from simulator.track.geometry import Track
+from simulator.track.layout import Segment, cut, place, segment_length
+from simulator.track.random_roads.clearance import keeps_clear
+from simulator.track.random_roads.course import Course, DoesNotFit, draw_course
+from simulator.track.random_roads.kinds import Kind, kind_of
+from simulator.track.toml_track import Table, build_track, read_segments
+
+RANDOM: Final = "random"
+MAX_SEED: Final = 2**63 - 1
+CALMER: Final = 0.98
+"""Each course that does not fit makes the next one rounder, so that one is found at last."""
+DASHES: Final = ((3.0, 6.0), (4.0, 8.0), (6.0, 12.0), (3.0, 9.0))
+Row = dict[str, Any]
+_SEED: Final = re.compile(r"[0-9]{1,19}")
+
+
+def is_random(name: str) -> bool:
+    """Whether `name` means a random road, a misspelt one included."""
+    return name == RANDOM or name.startswith(f"{RANDOM}:")
+
+
+def random_name(seed: int) -> str:
+    """The name of the road of `seed`."""
+    return f"{RANDOM}:{seed}"
+
+
+@lru_cache(maxsize=1024)
+def random_track(name: str) -> Track:
+    """The track called `random:SEED`. Raises UnknownTrack for another name."""
+    seed = seed_of(name)
+    return build_track(Table(road_file(seed), name), random_name(seed))
+
+
+def seed_of(name: str) -> int:
+    """SEED of `random:SEED`. Raises UnknownTrack."""
+    seed = name.removeprefix(f"{RANDOM}:")
+    if not _SEED.fullmatch(seed) or int(seed) > MAX_SEED:
+        raise UnknownTrack(
+            f"{name!r} names no random road; give random:SEED with a whole number from 0 to "
+            "2^63 - 1, e.g. random:7 (`datagen collect` takes random alone: each round its own "
+            "road)"
+        )
+    return int(seed)
+
+
+def road_file(seed: int) -> dict[str, Any]:
+    """Content of the TOML file of the road of `seed`."""
+    kind = kind_of(seed)
+    rng = np.random.default_rng([seed, 0])
+    about = _about(kind, rng)
+    rows = _course_rows(kind, rng)
+    for row, grade in zip(rows, _grades(kind, _read(rows), rng), strict=True):
+        row["grade"] = grade
+    return {**about, "hash": "segments", "segment": rows}
+
+
+def _about(kind: Kind, rng: np.random.Generator) -> dict[str, Any]:
+    """What is no segment: look, surface, paint."""
+    gravel = bool(rng.uniform() < kind.gravel)
+    look = "gravel" if gravel else kind.looks[rng.integers(len(kind.looks))]
+    surface = "gravel" if gravel else "concrete" if rng.uniform() < 0.1 else "asphalt"
+    dash_length, dash_gap = DASHES[rng.integers(len(DASHES))]
+    return {
+        "look": look,
+        "surface": surface,
+        "width": _decimal(kind.width_m, 1, rng),
+        "vertical_curve": _decimal(kind.vertical_curve_m, 0, rng),
+        "markings": {
+            "line_width": _decimal((0.11, 0.15), 2, rng),
+            "dash_length": dash_length,
+            "dash_gap": dash_gap,
+            "left_colour": "yellow" if rng.uniform() < 0.25 else "white",
+            "kerbs": bool(rng.uniform() < kind.kerbs) and not gravel,
+            "wear": _decimal(kind.wear, 2, rng),
+        },
+    }
+
+
+def _decimal(limits: tuple[float, float], digits: int, rng: np.random.Generator) -> float:
+    return round(float(rng.uniform(*limits)), digits)
+
+
+def _course_rows(kind: Kind, rng: np.random.Generator) -> list[Row]:
+    """Rows without grades of a course that keeps clear of itself."""
+    unevenness = kind.unevenness
+    while True:
+        try:
+            rows = _rows(draw_course(kind, unevenness, rng))
+        except DoesNotFit:
+            pass
+        else:
+            if keeps_clear(_read(rows)):
+                return rows
+        unevenness *= CALMER
+
+
+def _rows(course: Course) -> list[Row]:
+    """From the middle of the first straight to the middle of it."""
+    half = round(course.straights[0] / 2.0, 3)
+    rows: list[Row] = []
+    for length, corner in zip((half, *course.straights[1:]), course.corners, strict=True):
+        rows.append({"type": "straight", "length": length})
+        rows += [{"type": "bend", **asdict(arc)} for arc in corner]
+    return [*rows, {"type": "straight", "length": round(course.straights[0] - half, 3)}]
+
+
+def _read(rows: list[Row]) -> list[Segment]:
+    return read_segments(Table({"segment": rows}, RANDOM))
+
+
+def _grades(kind: Kind, segments: list[Segment], rng: np.random.Generator) -> list[float]:
+    """Grade of each segment, percent: the road lies on hills, so that parts of it that are near
+    each other are about as high, and the lap ends as high as it began."""
+    placed = place(cut(segments))
+    lengths = np.array([segment_length(segment) for segment in segments])
+    at = np.concatenate(([0.0], np.cumsum(lengths)))[:-1]
+    first = np.searchsorted(placed.s0, at + 1e-6, side="right") - 1
+    height = _hills(kind, placed.x0[first], placed.y0[first], rng)
+    grades = (np.roll(height, -1) - height) / lengths
+    steepest = float(rng.uniform(*kind.grade_percent))
+    grades = grades * (steepest / np.abs(grades).max())
+    return [round(float(grade), 2) for grade in grades]
+
+
+def _hills(kind: Kind, x: FloatArray, y: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Heights (n,) at (x, y) of hills of unit size: three waves, each in a direction of its own."""
+    height = np.zeros(len(x))
+    for _ in range(3):
+        wave = 2.0 * math.pi / float(rng.uniform(*kind.hill_m))
+        direction, phase = rng.uniform(0.0, 2.0 * math.pi, 2).tolist()
+        along = x * math.cos(direction) + y * math.sin(direction)
+        height = height + np.sin(along * wave + phase) / wave
+    return height
