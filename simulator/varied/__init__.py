@@ -1,0 +1,1 @@
+"""Roads as they are: what a round or a scene of `--roads varied` is drawn with; see ranges.toml."""
