@@ -30,7 +30,7 @@ def _side_rows(road: Road) -> list[Row]:
 def _line_rows(road: Road, paint: Paint) -> list[Row]:
     """Places and patterns of the lines of all markings, then their colours."""
     assert road.carriageway is not None
-    places: list[Row] = [(0.0, -1.0, 0.0, 0.0)] * (MARKINGS * LINES)
+    places: list[Row] = [(0.0, -1.0, 0.0, 1.0)] * (MARKINGS * LINES)
     colours: list[Row] = [(0.0, 0.0, 0.0, 0.0)] * (MARKINGS * LINES)
     for number, marking in enumerate(road.carriageway.markings):
         for k, line in enumerate(marking.lines):
