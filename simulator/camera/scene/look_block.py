@@ -5,7 +5,6 @@ from numpy.typing import NDArray
 
 from simulator.camera.scene.themes import Colour
 from simulator.track.road import Road
-from simulator.varied.carriageway import Line, Marking
 from simulator.varied.look import RoadLook
 from simulator.varied.paint import Paint
 
