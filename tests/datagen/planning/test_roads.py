@@ -18,6 +18,8 @@ from datagen.planning.tracks import choose_tracks
 from datagen.recorder.record import record_round, scenery
 from datagen.recording.mcap.index import open_round
 from simulator.camera.core.context import graphics
+from simulator.track.catalogue import find_track
+from simulator.track.road import Road
 from simulator.varied.look import RoadLook
 from trackfeatures.errors import UserError
 
@@ -41,7 +43,9 @@ def _version_of_before(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_plans_of_the_papers_roads_keep_their_hash(tmp_path: Path) -> None:
     plan = make_plan(config())
     assert plan.hash == BEFORE["plan_hash"]
-    jittered = make_plan(config(rounds=5, frames=30, seed=1, stretch=0, scenes=0, jitter_camera=True))
+    jittered = make_plan(
+        config(rounds=5, frames=30, seed=1, stretch=0, scenes=0, jitter_camera=True)
+    )
     assert jittered.hash == BEFORE["jittered_plan_hash"]
     # A plan of before says nothing of roads; it resumes.
     initialise_folder(tmp_path, plan)
@@ -100,12 +104,23 @@ def test_unknown_roads_are_refused() -> None:
         config(roads="wild")
 
 
+def double(entry: RoundPlan) -> bool:
+    """Whether the road of a round has a double line between two lanes."""
+    assert entry.varied is not None
+    return any(len(marking.lines) > 1 for marking in entry.varied.carriageway.markings[1:-1])
+
+
 def test_a_varied_round_holds_what_it_was_drawn_with(tmp_path: Path) -> None:
-    entry = make_plan(config(frames=4, roads="varied")).rounds[0]
+    entry = next(
+        e for e in make_plan(config(rounds=9, frames=4, roads="varied")).rounds if double(e)
+    )
     path = tmp_path / "round.mcap"
     record_round(entry, "", path, None)
     header = open_round(path).header
     assert header.varied == json.loads(json.dumps(entry.as_dict()["varied"]))
     assert header.label_camera == entry.camera
     assert entry.varied is not None
+    road = Road.varied(find_track(entry.track), entry.varied.carriageway)
+    assert any(left != right for left, right in road.line_offsets)
+    assert header.line_offsets == road.line_offsets
     assert scenery(entry, 2)[2] == entry.varied.scenes[2]
