@@ -6,7 +6,7 @@ from typing import Any
 
 import trackfeatures as tf
 from datagen.recording.names import CODECS, UNSEEN
-from trackfeatures.camera import CameraParameters
+from trackfeatures.camera import CameraParameters, stored
 from trackfeatures.errors import UserError
 
 DATASET_FOLDER = Path("datasets/default")
@@ -66,7 +66,7 @@ class CollectConfig:
 
     def as_dict(self) -> dict[str, Any]:
         """The options by name; those of the paper's roads as before there were others."""
-        options = asdict(self)
+        options = asdict(self, dict_factory=stored)
         if self.roads == "paper":
             del options["roads"]
         return options

@@ -57,15 +57,12 @@ def classes_along(
     ahead = road.track.at(at + np.arange(4.0, 14.0, 0.37), to_middle - distance)
     pixels, _ = camera.project(np.stack([ahead.x, ahead.y, ahead.z], axis=1), pose)
     picture = camera.render_views(pose, None, ["front:class"])["front:class"]
-    rows = np.floor(pixels[:, 1]).astype(int)
+    rows = np.rint(pixels[:, 1]).astype(int)
     inside = (rows < camera.height) & (pixels[:, 0] > 3) & (pixels[:, 0] < camera.width - 3)
     # A row's pixels show the road at the height of their centres.
-    return [
-        (u + (row + 0.5 - v) * slope, picture[row])
-        for (u, v), row, slope in zip(
-            pixels[inside], rows[inside], np.gradient(pixels[:, 0], pixels[:, 1])[inside], strict=True
-        )
-    ]
+    slopes = np.gradient(pixels[:, 0], pixels[:, 1])[inside]
+    seen = zip(pixels[inside], rows[inside], slopes, strict=True)
+    return [(u + (row - v) * slope, picture[row]) for (u, v), row, slope in seen]
 
 
 def off_the_paint(camera: Camera, to_middle: float, side: str) -> NDArray[np.float64]:
@@ -74,8 +71,8 @@ def off_the_paint(camera: Camera, to_middle: float, side: str) -> NDArray[np.flo
     for column, row in classes_along(camera, to_middle, side):
         painted = np.concatenate([[False], row == MARKING, [False]])
         first, last = np.flatnonzero(np.diff(painted.astype(int))).reshape(-1, 2).T
-        on = np.flatnonzero((first <= column) & (column <= last))
-        found.append(abs((first[on[0]] + last[on[0]]) / 2 - column) if len(on) else np.nan)
+        on = np.flatnonzero((first - 0.5 <= column) & (column <= last - 0.5))
+        found.append(abs((first[on[0]] + last[on[0]] - 1) / 2 - column) if len(on) else np.nan)
     return np.array(found)
 
 
@@ -114,8 +111,8 @@ def test_without_paint_the_edge_of_the_asphalt_is_labelled() -> None:
             seen = classes_along(camera, to_middle, side)
             assert len(seen) > 10
             for column, row in seen:
-                assert row[int(column - outer * 1.5)] == ROAD
-                assert row[int(column + outer * 1.5)] == GROUND
+                assert row[round(column - outer * 1.5)] == ROAD
+                assert row[round(column + outer * 1.5)] == GROUND
 
 
 def test_missing_paint_keeps_its_label() -> None:
