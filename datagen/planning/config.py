@@ -17,7 +17,6 @@ FRAMES_PER_SCENE = 200
 SEEDS_PER_PLAN = 1_000_000
 MAX_ROUNDS = SEEDS_PER_PLAN // 2
 """With more rounds the seeds would overlap those of another plan."""
-ROADS = ("paper", "varied")
 
 
 def all_lights() -> tuple[str, ...]:
@@ -105,6 +104,8 @@ class CollectConfig:
         check_frequency(self.frequency_hz)
 
     def _check_choices(self) -> None:
+        from simulator.varied import ROADS
+
         for lanes in self.lanes:
             tf.check_lanes(lanes, tf.LANE_WIDTH_M)
         if not (self.lanes and self.tracks and self.lights):
