@@ -24,7 +24,7 @@ TARGETS: Final = (*MARKINGS, "angle")
 
 LANES: Final = (1, 2, 3)
 LANE_WIDTH_M: Final = 4.0
-LANE_WIDTH_LIMITS_M: Final = (3.0, 4.5)
+LANE_WIDTH_LIMITS_M: Final = (2.7, 4.5)
 
 IN_LANE_MARGIN_M: Final = 0.5
 """The in-lane system is active at least this far from both markings of the lane."""

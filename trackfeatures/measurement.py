@@ -4,6 +4,7 @@ SI units; `to_middle` is the distance from the centre line of the road, left pos
 """
 
 import math
+from collections.abc import Sequence
 from typing import Protocol
 
 import numpy as np
@@ -22,6 +23,12 @@ from trackfeatures.definitions import (
     lane_offset,
 )
 from trackfeatures.errors import UserError
+
+LineOffsets = Sequence[tuple[float, float]]
+"""Of each marking, in m from its place, left positive: of the line that bounds the lane on its left
+and of the one that bounds the lane on its right."""
+LEFT_LANE, RIGHT_LANE = range(2)
+_ONE_LINE: LineOffsets = ((0.0, 0.0),) * (max(LANES) + 1)
 
 
 class CentreLine(Protocol):
@@ -81,10 +88,17 @@ def measure(
     curvature_ahead: float,
     lanes: int,
     lane_width_m: float,
+    line_offsets: LineOffsets = (),
 ) -> TrackFeatures:
-    """The features of a car `to_middle` m left of the centre of a road, heading `angle` (rad)."""
-    ml, mr = _in_lane(to_middle, lanes, lane_width_m)
-    l, m, r = _on_marking(to_middle, lanes, lane_width_m)
+    """The features of a car `to_middle` m left of the centre of a road, heading `angle` (rad).
+
+    `line_offsets`: of each marking, where the lines lie that bound the lane on its left and on its
+    right, in m from the marking's place, left positive: of a double line the one nearer to a lane
+    counts. Without it every line lies at its marking's place.
+    """
+    offsets = line_offsets or _ONE_LINE
+    ml, mr = _in_lane(to_middle, lanes, lane_width_m, offsets)
+    l, m, r = _on_marking(to_middle, lanes, lane_width_m, offsets)
     heading = classify_heading(curvature, curvature_ahead)
     return TrackFeatures(ml, mr, l, m, r, angle, heading)
 
@@ -101,26 +115,29 @@ def measure_pose(
 
 
 def _in_lane(
-    to_middle: float, lanes: int, lane_width_m: float
+    to_middle: float, lanes: int, lane_width_m: float, offsets: LineOffsets
 ) -> tuple[float, float] | tuple[None, None]:
-    centre = lane_centre(lane_index(to_middle, lanes, lane_width_m), lanes, lane_width_m)
-    ml = to_middle - centre - lane_width_m / 2
-    mr = to_middle - centre + lane_width_m / 2
+    lane = lane_index(to_middle, lanes, lane_width_m)
+    beside = to_middle - lane_centre(lane, lanes, lane_width_m)
+    ml = beside - lane_width_m / 2 - offsets[lane][RIGHT_LANE]
+    mr = beside + lane_width_m / 2 - offsets[lane + 1][LEFT_LANE]
     active = -ml >= IN_LANE_MARGIN_M and mr >= IN_LANE_MARGIN_M
     return (ml, mr) if active else (None, None)
 
 
 def _on_marking(
-    to_middle: float, lanes: int, lane_width_m: float
+    to_middle: float, lanes: int, lane_width_m: float, offsets: LineOffsets
 ) -> tuple[float | None, float | None, float | None]:
     # Markings are counted from the leftmost, 0, to the rightmost, `lanes`.
     nearest = min(max(round(lanes / 2 - to_middle / lane_width_m), 0), lanes)
-    m = to_middle - lane_width_m * (lanes / 2 - nearest)
-    outside = (nearest == 0 and m > 0) or (nearest == lanes and m < 0)
+    place = to_middle - lane_width_m * (lanes / 2 - nearest)
+    outside = (nearest == 0 and place > 0) or (nearest == lanes and place < 0)
+    # Outside the road the nearest lane is on the other side of the marking.
+    m = place - offsets[nearest][LEFT_LANE if (place > 0) != outside else RIGHT_LANE]
     if abs(m) > (OUTSIDE_REACH_M if outside else ON_MARKING_REACH_M):
         return None, None, None
-    left = m - lane_width_m if nearest > 0 else None
-    right = m + lane_width_m if nearest < lanes else None
+    left = place - lane_width_m - offsets[nearest - 1][RIGHT_LANE] if nearest > 0 else None
+    right = place + lane_width_m - offsets[nearest + 1][LEFT_LANE] if nearest < lanes else None
     return left, m, right
 
 

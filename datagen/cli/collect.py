@@ -86,6 +86,13 @@ CameraFile = Annotated[
         help="camera.yaml (ours, OpenCV's, ROS's or Kalibr's): record through that lens and mount.",
     ),
 ]
+Roads = Annotated[
+    str,
+    typer.Option(
+        help="paper: lanes of 4.0 m and the tracks' own paint; varied: lanes, shoulders, paint, "
+        "surface, light and camera height are drawn for each round or scene."
+    ),
+]
 ShardOf = Annotated[
     str, typer.Option(help="2/4: only the second of four parts, for batch systems.")
 ]
@@ -114,6 +121,7 @@ def collect(
     codec: Codec = CollectConfig.codec,
     camera: CameraFile = None,
     jitter_camera: JitterCamera = CollectConfig.jitter_camera,
+    roads: Roads = CollectConfig.roads,
     shard: ShardOf = "",
     executor: ExecutorName = "local",
     dry_run: DryRun = False,
@@ -142,6 +150,7 @@ def collect(
         codec=codec,
         camera=CameraParameters() if camera is None else read_camera(camera, CameraParameters()),
         jitter_camera=jitter_camera,
+        roads=roads,
         split=split,
     )
     part = Shard.parse(shard) if shard else None

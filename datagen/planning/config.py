@@ -1,11 +1,12 @@
 """The options of a collection, with the default of each."""
 
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import Any
 
 import trackfeatures as tf
 from datagen.recording.names import CODECS, UNSEEN
-from trackfeatures.camera import CameraParameters
+from trackfeatures.camera import CameraParameters, stored
 from trackfeatures.errors import UserError
 
 DATASET_FOLDER = Path("datasets/default")
@@ -58,8 +59,17 @@ class CollectConfig:
     `FRAMES_PER_SCENE`."""
     jitter_camera: bool = False
     """Vary height, pitch and field of view of the camera a little from round to round."""
+    roads: str = "paper"
+    """"paper": lanes of 4.0 m and the paint of the tracks; "varied": drawn for each round."""
     split: str = ""
     """"unseen": all rounds are for tests on tracks without training data. Else train and test."""
+
+    def as_dict(self) -> dict[str, Any]:
+        """The options by name; those of the paper's roads as before there were others."""
+        options = asdict(self, dict_factory=stored)
+        if self.roads == "paper":
+            del options["roads"]
+        return options
 
     def __post_init__(self) -> None:
         self._check_numbers()
@@ -100,6 +110,8 @@ class CollectConfig:
         check_frequency(self.frequency_hz)
 
     def _check_choices(self) -> None:
+        from simulator.varied import ROADS
+
         for lanes in self.lanes:
             tf.check_lanes(lanes, tf.LANE_WIDTH_M)
         if not (self.lanes and self.tracks and self.lights):
@@ -107,6 +119,7 @@ class CollectConfig:
         for name, given, known in (
             ("light", self.lights, all_lights()),
             ("codec", (self.codec,), CODECS),
+            ("roads", (self.roads,), ROADS),
         ):
             if unknown := set(given) - set(known):
                 raise UserError(f"unknown {name} {min(unknown)!r}; choose {', '.join(known)}")

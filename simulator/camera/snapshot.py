@@ -17,6 +17,7 @@ from simulator.camera.core.camera import Camera
 from simulator.camera.core.render_modes import CLASS, CLASSES, COLOUR, DEPTH, ViewRequest
 from simulator.camera.scene.light import KINDS, Light, check_light
 from simulator.track.road import Road
+from simulator.varied.look import RoadLook
 from simulator.vehicle.car import CarParameters
 from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
@@ -70,9 +71,10 @@ def write_contact_sheet(
     of kind `light`, or without it in each kind by turns, every other one clear. Of `kind` "colour"
     the right half has the true markings drawn thinly over the painted ones; "depth" and "class" are
     in false colours. `camera`: seen through that lens, scaled to WIDTH; without it as the driver
-    camera. An older file stays as it is until the new one is complete. Raises UserError if the file
-    cannot be written as PNG or has no folder, or light, view or kind is unknown; OSError if it
-    cannot be written.
+    camera, on a varied road at the height that was drawn for it. On a varied road each light has a
+    look of its own. An older file stays as it is until the new one is complete. Raises UserError if
+    the file cannot be written as PNG or has no folder, or light, view or kind is unknown; OSError
+    if it cannot be written.
     """
     if out.suffix.lower() != ".png":
         raise UserError(f"{out}: the contact sheet is a PNG file; give a name that ends in .png")
@@ -80,18 +82,16 @@ def write_contact_sheet(
     if light is not None:
         check_light(light)
     ViewRequest.of(f"{view or 'front'}:{kind}")
-    if camera is None:
-        lens = CameraParameters(WIDTH, HEIGHT)
-    else:
-        lens = camera.resized(WIDTH, round(WIDTH * camera.height / camera.width))
+    lens = _lens(road, camera)
     shots = [
         replace(shot, kind=kind, view=view or shot.view)
         for shot in _shots(road, light, np.random.default_rng([seed, 10]))
     ]
     pictures: list[Picture | None] = [None] * len(shots)
-    for kind in dict.fromkeys(shot.light for shot in shots):
+    for number, kind in enumerate(dict.fromkeys(shot.light for shot in shots)):
         drawn = Light.named(kind, np.random.default_rng([seed, 11]))
-        with Camera(road, lens, seed=seed, light=drawn) as renderer:
+        look = RoadLook.drawn(seed, number) if road.carriageway else None
+        with Camera(road, lens, seed=seed, light=drawn, look=look) as renderer:
             for k, shot in enumerate(shots):
                 if shot.light == kind:
                     rng = np.random.default_rng([seed, 12, k])
@@ -102,6 +102,17 @@ def write_contact_sheet(
     if not done:
         raise UserError(f"{out}: the contact sheet could not be encoded as PNG")
     atomic_write(out, png.tobytes())
+
+
+def _lens(road: Road, camera: CameraParameters | None) -> CameraParameters:
+    """The camera of a sheet: `camera` scaled to WIDTH, or the driver camera, on a varied road at
+    its height."""
+    if camera is not None:
+        return camera.resized(WIDTH, round(WIDTH * camera.height / camera.width))
+    lens = CameraParameters(WIDTH, HEIGHT)
+    if road.carriageway is None:
+        return lens
+    return replace(lens, z=road.carriageway.camera_height_m - CameraParameters.cg_height_m)
 
 
 def render_shot(

@@ -22,7 +22,7 @@ TracksDir = Annotated[
 ]
 
 Lanes = Annotated[int, typer.Option(help="Number of lanes, 1 to 3.")]
-LaneWidth = Annotated[float, typer.Option(help="Metres, 3.0 to 4.5.")]
+LaneWidth = Annotated[float, typer.Option(help="Metres, 2.7 to 4.5.")]
 Traffic = Annotated[int, typer.Option(help="Number of other cars.", min=0, max=12)]
 
 tracks = typer.Typer(rich_markup_mode="rich")

@@ -7,6 +7,8 @@ from numpy.typing import NDArray
 
 import trackfeatures as tf
 from simulator.track.geometry import Track
+from simulator.varied.carriageway import Carriageway
+from trackfeatures.errors import UserError
 
 START_BEFORE_LINE_M = 25.0
 """A drive starts this far before the line."""
@@ -21,15 +23,30 @@ has left the track before any part of it meets a wall."""
 class Road:
     """`lanes` lanes of `lane_width`, centred on `track`; a track too narrow is widened.
 
-    Raises UserError for a number or width of lanes outside the definitions.
+    `carriageway`: the lines and shoulders of a varied road; None: those of the paper's roads, one
+    line a marking. Raises UserError for a number or width of lanes outside the definitions, or for
+    another carriageway.
     """
 
     track: Track
     lanes: int = 1
     lane_width: float = tf.LANE_WIDTH_M
+    carriageway: Carriageway | None = None
 
     def __post_init__(self) -> None:
         tf.check_lanes(self.lanes, self.lane_width)
+        given = self.carriageway
+        if given and (given.lane_width_m, len(given.markings)) != (self.lane_width, self.lanes + 1):
+            raise UserError(
+                f"a road of {self.lanes} lanes of {self.lane_width:g} m has a carriageway of "
+                f"{len(given.markings) - 1} lanes of {given.lane_width_m:g} m; give its own"
+            )
+
+    @staticmethod
+    def varied(track: Track, carriageway: Carriageway) -> "Road":
+        """The road of a carriageway on `track`."""
+        lanes = len(carriageway.markings) - 1
+        return Road(track, lanes, carriageway.lane_width_m, carriageway)
 
     @property
     def half_width(self) -> float:
@@ -37,9 +54,16 @@ class Road:
         return self.track.width / 2
 
     @property
+    def asphalt(self) -> tuple[float, float]:
+        """From the centre to the left and to the right end of the asphalt."""
+        half = self.lanes * self.lane_width / 2
+        left, right = self.carriageway.shoulders_m if self.carriageway else (SHOULDER_M,) * 2
+        return half + left, half + right
+
+    @property
     def half_asphalt(self) -> float:
-        """From the centre to the end of the asphalt."""
-        return self.lanes * self.lane_width / 2 + SHOULDER_M
+        """From the centre to the end of the asphalt, on the side where it is wider."""
+        return max(self.asphalt)
 
     @property
     def edge(self) -> float:
@@ -56,8 +80,28 @@ class Road:
         """Lateral places (lanes + 1,) of the markings, from the leftmost to the rightmost."""
         return tf.marking_offsets(self.lanes, self.lane_width)
 
+    def lines_y(self, to_middle: float) -> NDArray[np.float64]:
+        """Lateral places (lanes + 1,) of the lines that count for a car at `to_middle`: of a
+        double line the one nearer to the car's lane."""
+        if not self.line_offsets:
+            return self.markings_y
+        lane = tf.lane_index(to_middle, self.lanes, self.lane_width)
+        right_of = np.arange(self.lanes + 1) > lane
+        offsets = np.array(self.line_offsets)
+        return self.markings_y + np.where(right_of, offsets[:, 0], offsets[:, 1])
+
     def measure(self, s: float, to_middle: float, angle: float) -> tf.TrackFeatures:
         """True track features of a car at (s, to_middle) with heading angle `angle` (rad)."""
         curvature = self.track.curvature(s)
         ahead = self.track.curvature(s + tf.LOOK_AHEAD_M)
-        return tf.measure(to_middle, angle, curvature, ahead, self.lanes, self.lane_width)
+        return tf.measure(
+            to_middle, angle, curvature, ahead, self.lanes, self.lane_width, self.line_offsets
+        )
+
+    @property
+    def line_offsets(self) -> tuple[tuple[float, float], ...]:
+        """Where the lines of each marking lie that bound the lane on its left and on its right,
+        from the marking's place, left positive; empty: all of them there."""
+        if self.carriageway is None:
+            return ()
+        return tuple((marking.left_m, marking.right_m) for marking in self.carriageway.markings)

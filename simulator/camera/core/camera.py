@@ -20,6 +20,7 @@ from simulator.camera.scene.scene import Scene, VisibleScene
 from simulator.camera.scene.sky import Sky
 from simulator.camera.scene.terrain import Survey
 from simulator.track.road import Road
+from simulator.varied.look import RoadLook
 from simulator.vehicle.car import CarParameters
 from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
@@ -62,7 +63,8 @@ class _Shot:
 
 
 class Camera:
-    """Draws one scene: `road` with the scenery of `seed` under `light`.
+    """Draws one scene: `road` with the scenery of `seed` under `light`, and its `look` on varied
+    roads (None: as the paper's).
 
     It keeps the last `scenes` scenes in graphics memory. Cameras of a process share one OpenGL
     context (see `context`); any thread may use them, and they draw one after the other. The same
@@ -78,6 +80,7 @@ class Camera:
         *,
         seed: int,
         light: Light,
+        look: RoadLook | None = None,
         scenes: int = 1,
     ) -> None:
         check_size(parameters.width, parameters.height)
@@ -91,38 +94,38 @@ class Camera:
         self._graphics: Graphics = graphics()
         self._survey = Survey.of(road)
         self._cache_size = scenes
-        self._cache: dict[tuple[int, Light], _LoadedScene] = {}
+        self._cache: dict[tuple[int, Light, RoadLook | None], _LoadedScene] = {}
         self._current: _LoadedScene | None = None
         self._last_s: float | None = None
         with self._graphics.turns:
             self._cars = shared_cars(self._graphics)
-        self.change_scene(seed, light)
+        self.change_scene(seed, light, look)
 
     @property
     def light(self) -> Light:
         """The light of the current scene."""
         return self._loaded.light
 
-    def change_scene(self, seed: int, light: Light) -> None:
-        """Switch to the scenery of `seed` under `light`, on the same road."""
+    def change_scene(self, seed: int, light: Light, look: RoadLook | None = None) -> None:
+        """Switch to the scenery of `seed` under `light`, on the same road with another `look`."""
         with self._graphics.turns:
             self._current = None
-            found = self._cache.pop((seed, light), None)
+            found = self._cache.pop((seed, light, look), None)
             if found is None:
                 while len(self._cache) >= self._cache_size:
                     del self._cache[next(iter(self._cache))]
                 self._graphics.free_unused()
-                found = self._load_scene(seed, light)
+                found = self._load_scene(seed, light, look)
             # Least recently used first: that one is released next.
-            self._cache[seed, light] = self._current = found
+            self._cache[seed, light, look] = self._current = found
 
-    def _load_scene(self, seed: int, light: Light) -> _LoadedScene:
+    def _load_scene(self, seed: int, light: Light, look: RoadLook | None) -> _LoadedScene:
         graphics = self._graphics
         frame = np.concatenate([np.zeros(24), *_light_rows(light)]).astype(np.float32)
         self._set_frame(frame, optics.eye_of(self.parameters, np.zeros(6), "front"))
         return _LoadedScene(
             light,
-            Scene(graphics, self.road, self._survey, seed, light),
+            Scene(graphics, self.road, self._survey, seed, light, look),
             # Rendered with the light of the frame that is bound.
             Sky(graphics, light.weather, float(self._drawn_intrinsics[0, 0])),
             Precipitation(graphics, light, seed) if light.falling > 0.0 else None,
@@ -280,9 +283,11 @@ class Camera:
 
 
 def open_camera(road: Road, parameters: CameraParameters, *, light: str, seed: int) -> Camera:
-    """A camera by the name of a light; `seed` draws the scenery and the light's parameters."""
+    """A camera by the name of a light; `seed` draws the scenery, the light's parameters and, on a
+    varied road, the look."""
     drawn = Light.named(light, np.random.default_rng([seed, 2]))
-    return Camera(road, parameters, seed=seed, light=drawn)
+    look = RoadLook.drawn(seed) if road.carriageway else None
+    return Camera(road, parameters, seed=seed, light=drawn, look=look)
 
 
 def _light_rows(light: Light) -> list[tuple[float, ...]]:

@@ -41,12 +41,16 @@ PROGRAMS = (
     "spot",
     "precipitation",
 )
-FRAME_BINDING, SCENE_BINDING = 0, 1
+FRAME_BINDING, SCENE_BINDING, LOOK_BINDING = 0, 1, 2
 VERTEX_SHADERS = {"paved": "road", "verge": "road"}
 """Programs that use the vertex shader of another name."""
 LIBRARIES = ("output.glsl", "weather.glsl", "road.glsl", "sea.glsl")
 """Functions for fragment shaders."""
-BLOCKS = {"Frame": FRAME_BINDING, "Scene": SCENE_BINDING}
+BLOCKS = {"Frame": FRAME_BINDING, "Scene": SCENE_BINDING, "Look": LOOK_BINDING}
+VARIED = "varied"
+"""Feature of the programs of varied roads: they read the uniform block `Look` of look.glsl."""
+VARIED_LIBRARIES = ("paint.glsl",)
+"""Functions for their fragment shaders."""
 WEATHER_PROGRAMS = ("sky", "land", "paved", "verge", "barrier", "prop", "tree")
 """Programs with variants for rain and snow, so that dry scenes cost no more."""
 FRAME_FLOATS = 48
@@ -117,9 +121,11 @@ class Graphics:
 
     def label_program(self, name: str) -> str:
         """Name in `programs` of the program that draws what `name` draws as depth and class."""
-        key = f"{name.split()[0]} labels"
+        program, *features = name.split()
+        kept = [VARIED] if VARIED in features else []
+        key = " ".join([program, *kept, "labels"])
         if key not in self.programs:
-            self.programs[key] = self._program(name.split()[0], "labels")
+            self.programs[key] = self._program(program, *kept, "labels")
         return key
 
     def _program(self, name: str, *defines: str) -> "moderngl.Program":
@@ -129,8 +135,13 @@ class Graphics:
         for define in defines:
             head += f"#define {define.upper()}\n"
         head += _source("frame.glsl")
+        varied = VARIED in defines
+        if varied:
+            head += _source("look.glsl")
         classes = "".join(f"#define {name.upper()} {k}\n" for k, name in enumerate(CLASSES))
-        libraries = "".join(_source(library) for library in LIBRARIES)
+        libraries = "".join(
+            _source(library) for library in (*LIBRARIES, *VARIED_LIBRARIES * varied)
+        )
         program = self.context.program(
             vertex_shader=head + _source(f"{VERTEX_SHADERS.get(name, name)}.vert.glsl"),
             fragment_shader=head + classes + libraries + _source(f"{name}.frag.glsl"),

@@ -9,10 +9,10 @@ import tomllib
 from dataclasses import dataclass, fields
 from functools import cache
 from importlib.resources import files
-from typing import Any
 
 import numpy as np
 
+from simulator.varied.draw import Tables, draw
 from trackfeatures.errors import UserError
 
 Colour = tuple[float, float, float]
@@ -58,7 +58,7 @@ class Light:
     def named(kind: str, rng: np.random.Generator) -> "Light":
         """A light of `kind`, its random parameters drawn from `rng`. UserError if unknown."""
         check_light(kind)
-        drawn = _draw(kind, rng)
+        drawn = draw(_tables(), kind, rng)
         elevation = drawn["sun_elevation"] = math.radians(drawn["sun_elevation_deg"])
         if isinstance(drawn["sun"], list):
             drawn["sun"] = _tinted_sun(kind, drawn["sun"], drawn["sun_strength"], elevation)
@@ -83,34 +83,10 @@ def check_light(kind: str) -> None:
 
 
 @cache
-def _tables() -> dict[str, dict[str, Any]]:
+def _tables() -> Tables:
     """The table of each kind, from light.toml, which says what its entries mean."""
     text = files("simulator.camera.scene").joinpath("light.toml").read_text(encoding="utf-8")
     return tomllib.loads(text)
-
-
-def _draw(kind: str, rng: np.random.Generator) -> dict[str, Any]:
-    """The entries of the table of `kind`, drawn in their order."""
-    table = _tables()[kind]
-    drawn: dict[str, Any] = _draw(table["like"], rng) if "like" in table else {}
-    for name, value in table.items():
-        scale = drawn["brightness"] if name in table.get("scaled", ()) else 1.0
-        match value:
-            case [float(least), float(most)]:
-                drawn[name] = rng.uniform(least, most)
-            case {"colour": colour, "spread": spread}:
-                drawn[name] = tuple(
-                    c * scale * (1.0 + rng.uniform(-spread, spread)) for c in colour
-                )
-            case {"colour": colour}:
-                drawn[name] = tuple(c * scale for c in colour)
-            case {"at_least": least, "gain": gain}:
-                drawn[name] = least + gain * drawn["density"]
-            case str() if name != "like":
-                drawn[name] = drawn[value]
-            case _:
-                drawn[name] = value
-    return drawn
 
 
 def _tinted_sun(kind: str, colour: list[float], strength: float, elevation: float) -> Colour:

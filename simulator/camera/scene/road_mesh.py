@@ -83,7 +83,8 @@ def build(road: Road, line: CentreLine, terrain: Terrain) -> RoadMesh:
     wall = road.wall_offset
     left = _skirt(road, line, s, pose.curvature, 1.0)
     right = _skirt(road, line, s, pose.curvature, -1.0)
-    middle = np.array([wall, road.half_asphalt, -road.half_asphalt, -wall])
+    ends = road.asphalt
+    middle = np.array([wall, ends[0], -ends[1], -wall])
     y = np.empty((len(s), len(middle) + 4))
     y[:, 2:-2] = middle
     y[:, 0], y[:, 1] = wall + left, wall + 0.35 * left

@@ -8,17 +8,25 @@ from numpy.typing import NDArray
 
 from simulator.arrays import FloatArray
 from simulator.camera.bridges import bridges
-from simulator.camera.core.context import SCENE_BINDING, SHADOW_UNIT, Graphics
+from simulator.camera.core.context import (
+    LOOK_BINDING,
+    SCENE_BINDING,
+    SHADOW_UNIT,
+    VARIED,
+    Graphics,
+)
 from simulator.camera.core.mesh import Mesh, Surface
 from simulator.camera.core.optics import Eye
 from simulator.camera.scene import barriers, land, props, road_mesh, shadow_mask
 from simulator.camera.scene.light import Light
+from simulator.camera.scene.look_block import LINE_COLOURS, look_block
 from simulator.camera.scene.terrain import COARSEST, Survey
 from simulator.camera.scene.terrain import build as build_terrain
 from simulator.camera.scene.themes import Colour, Theme, find_theme
 from simulator.camera.vegetation import scenery
 from simulator.camera.vegetation.trees import TreeMesh, VisibleTrees
 from simulator.track.road import Road
+from simulator.varied.look import RoadLook
 
 LAND = (
     land.Span(1, 0.0, 40.0, bare=False),
@@ -27,7 +35,6 @@ LAND = (
     land.Span(COARSEST, 350.0, 2500.0, bare=True),
 )
 _CONCRETE: Colour = (0.21, 0.205, 0.19)
-_LINE = {"white": (0.78, 0.78, 0.75), "yellow": (0.75, 0.50, 0.06)}
 
 
 @dataclass(frozen=True)
@@ -43,7 +50,13 @@ class Scene:
     """The static scene of one road, seed and light. `draw` uses the bound frame uniforms."""
 
     def __init__(
-        self, graphics: Graphics, road: Road, survey: Survey, seed: int, light: Light
+        self,
+        graphics: Graphics,
+        road: Road,
+        survey: Survey,
+        seed: int,
+        light: Light,
+        look: RoadLook | None = None,
     ) -> None:
         def rng(part: int) -> np.random.Generator:
             return np.random.default_rng([seed, part])
@@ -64,16 +77,18 @@ class Scene:
             variant = graphics.weather_program(program, light.weather, *features)
             return Mesh(graphics, variant, surface, layout)
 
+        varied = [VARIED] if look else []
         surfaces = road_mesh.surfaces(ground.mesh, road)
         lands = [land.surface(tree_shade, covered, span) for span in LAND]
         self._barriers = mesh("barrier", rails, barriers.LAYOUT)
         self._solid = (
-            *(mesh(program, each, road_mesh.LAYOUT) for program, each in surfaces.items()),
+            *(mesh(name, each, road_mesh.LAYOUT, *varied) for name, each in surfaces.items()),
             *(mesh("prop", each, props.LAYOUT, name) for name, each in built.items()),
             *(mesh("land", each, land.LAYOUT, *(["sea"] if theme.sea else [])) for each in lands),
         )
         palette = scene_block(road, theme, rng(2), self.mask, terrain.sea)
         self._block = graphics.context.buffer(palette.tobytes())
+        self._look = graphics.context.buffer(look_block(road, look).tobytes()) if look else None
         self._shadow_texture = graphics.texture(self.mask.texels)
 
     def visible(self, eye: Eye, planes: FloatArray) -> VisibleScene:
@@ -87,6 +102,8 @@ class Scene:
     def draw(self, seen: VisibleScene, labels: bool) -> None:
         """Draw all opaque parts but the sky, the nearest first, for the depth test."""
         self._block.bind_to_uniform_block(SCENE_BINDING)
+        if self._look is not None:
+            self._look.bind_to_uniform_block(LOOK_BINDING)
         self._shadow_texture.use(SHADOW_UNIT)
         self._trees.draw(seen.trees, "labels" if labels else "core")
         for mesh, runs in seen.solid:
@@ -118,8 +135,8 @@ def scene_block(
         (*_jitter(theme.grass, rng, 0.2, rng.uniform(0.75, 1.25)), max(sea, -1e6)),
         (*_jitter(theme.dry, rng, 0.15, rng.uniform(0.75, 1.2)), 0.0),
         (*_jitter(theme.soil, rng, 0.12, 1.0), 0.0 if road.track.surface == "gravel" else worn),
-        (*_jitter(_LINE[marks.left_colour], rng, 0.03, fade), marks.line_width / 2),
-        (*_jitter(_LINE["white"], rng, 0.03, fade), marks.wear),
+        (*_jitter(LINE_COLOURS[marks.left_colour], rng, 0.03, fade), marks.line_width / 2),
+        (*_jitter(LINE_COLOURS["white"], rng, 0.03, fade), marks.wear),
         (float(road.lanes), road.lane_width, road.half_asphalt, paved_to),
         (marks.dash_length, marks.dash_length + marks.dash_gap, missing, road.track.length_m),
         (

@@ -31,17 +31,26 @@ void main() {
 
     // Paint: coverage by the nearest line, reduced by wear.
     float number = clamp(floor((lane_left - y) / lanes.y + 0.5), 0.0, lanes.x);
+#ifdef VARIED
+    vec4 drawn = paint_of_lines(s, y, ws, wy, number);
+    if (paint_signs.x + paint_signs.z > 0.0)
+        drawn = mix(drawn, vec4(sign_colour.rgb, 1.0), paint_of_signs(s, y, ws, wy, in_lane) * step(away, lane_left));
+    float paint = drawn.a, wear = paint_state.x, missing = paint_state.y;
+    vec3 paint_colour = drawn.rgb;
+#else
     float line_y = lane_left - number * lanes.y;
     float paint = covered(y, wy, line_y - left_line.w, line_y + left_line.w);
     bool divider = number > 0.5 && number < lanes.x - 0.5;
     if (divider) paint *= repeated(s, ws, dashes.x, dashes.y);
-    float grit = fine.g * 0.55 + broad.g * 0.45;
-    float left_over = 1.0 - line.w * (0.35 + 0.65 * smoothstep(0.40, 0.62, grit));
-    // No paint on the most repaired patches.
-    float gap = smoothstep(1.0 - dashes.z - 0.03, 1.0 - dashes.z + 0.03, broad.b);
-    gap *= step(0.001, dashes.z);
-    paint *= left_over * (1.0 - 0.92 * gap);
+    float wear = line.w, missing = dashes.z;
     vec3 paint_colour = number < 0.5 ? left_line.rgb : line.rgb;
+#endif
+    float grit = fine.g * 0.55 + broad.g * 0.45;
+    float left_over = 1.0 - wear * (0.35 + 0.65 * smoothstep(0.40, 0.62, grit));
+    // No paint on the most repaired patches.
+    float gap = smoothstep(1.0 - missing - 0.03, 1.0 - missing + 0.03, broad.b);
+    gap *= step(0.001, missing);
+    paint *= left_over * (1.0 - 0.92 * gap);
     colour = mix(colour, paint_colour * (0.88 + 0.24 * fine.r), paint);
 
 #ifdef RAIN
@@ -63,11 +72,15 @@ void main() {
 
 #ifdef LABELS
     // The class at the pixel's centre: classes cannot be blended.
+#ifdef VARIED
+    bool painted = paint_of_lines(s, y, 1e-4, 1e-4, number).a > 0.5 && gap < 0.5;
+#else
     bool painted = abs(y - line_y) < left_line.w && gap < 0.5;
     if (divider && fract(s / dashes.y) * dashes.y > dashes.x) painted = false;
+#endif
     OUTPUT(pixel, painted ? MARKING : ROAD);
 #else
-    float inside = covered(y, wy, -lanes.z, lanes.z);
+    float inside = on_asphalt(y, wy);
     colour = mix(plain_verge, colour, inside);
 #ifdef RAIN
     vec3 ripple = vec3((fine.rg - 0.5) * 0.05, 0.0);

@@ -10,3 +10,21 @@ float sunshine(vec2 at) {
     vec2 size = vec2(textureSize(shade, 0));
     return mix(1.0, sun.w, smoothstep(0.30, 0.70, texture(shade, texel / size, -1.2).r));
 }
+
+// Distance from the centre to the end of the asphalt on the side of y.
+float asphalt_end(float y) {
+#ifdef VARIED
+    return y < 0.0 ? -sides.y : sides.x;
+#else
+    return lanes.z;
+#endif
+}
+
+// Share of the footprint [y - wy/2, y + wy/2] that is asphalt.
+float on_asphalt(float y, float wy) {
+#ifdef VARIED
+    return covered(y, wy, sides.y, sides.x);
+#else
+    return covered(y, wy, -lanes.z, lanes.z);
+#endif
+}

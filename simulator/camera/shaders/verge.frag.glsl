@@ -19,13 +19,13 @@ void main() {
     vec3 stones = verge.rgb * (0.6 + 0.5 * fine.r + 0.3 * broad.g);
     float ragged = lanes.w + 0.5 * (fine.g - 0.5);
     vec3 side = mix(green, mix(stones, green, verge.w), covered(y, wy + 0.25, -ragged, ragged));
-    float on_kerb = kerb_tufts.x * covered(away, wy, lanes.z, lanes.z + 0.9);
+    float on_kerb = kerb_tufts.x * covered(away, wy, asphalt_end(y), asphalt_end(y) + 0.9);
     vec3 block = mix(vec3(0.62, 0.60, 0.57), vec3(0.50, 0.035, 0.03), repeated(s, ws, 1.0, 2.0));
     side = mix(side, block * (0.8 + 0.3 * fine.r), on_kerb);
 #ifdef SNOW
-    side = snowed(side, 0.55 + 0.5 * horizon.w - 0.5 * fine.g + 0.3 * smoothstep(0.3, 1.5, away - lanes.z) - 0.5 * on_kerb);
+    side = snowed(side, 0.55 + 0.5 * horizon.w - 0.5 * fine.g + 0.3 * smoothstep(0.3, 1.5, away - asphalt_end(y)) - 0.5 * on_kerb);
 #endif
-    side = mix(side, plain_asphalt, covered(y, wy, -lanes.z, lanes.z));
+    side = mix(side, plain_asphalt, on_asphalt(y, wy));
 #if defined(RAIN) || defined(SNOW)
     OUTPUT(display_values(light_at_eye(side, light_shares, 1.0), air_light), GROUND);
 #else

@@ -1,0 +1,60 @@
+"""The uniform block `Look` of look.glsl: what a varied road's shaders read beside its scene."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from simulator.camera.scene.themes import Colour
+from simulator.track.road import Road
+from simulator.varied.look import RoadLook
+from simulator.varied.paint import Paint
+
+MARKINGS, LINES = 4, 2
+"""Most markings of a road, and most lines of a marking."""
+LINE_COLOURS: dict[str, Colour] = {"white": (0.78, 0.78, 0.75), "yellow": (0.75, 0.50, 0.06)}
+ARROWS = {"ahead": 0.0, "left": 1.0, "right": -1.0}
+Row = tuple[float, ...]
+
+
+def look_block(road: Road, look: RoadLook) -> NDArray[np.float32]:
+    """The block (rows, 4) of `look` on `road`, in the order of look.glsl."""
+    rows = [*_side_rows(road), *_line_rows(road, look.paint), *_paint_rows(look.paint)]
+    return np.array(rows, dtype=np.float32)
+
+
+def _side_rows(road: Road) -> list[Row]:
+    left, right = road.asphalt
+    return [(left, -right, 0.0, 0.0)]
+
+
+def _line_rows(road: Road, paint: Paint) -> list[Row]:
+    """Places and patterns of the lines of all markings, then their colours."""
+    assert road.carriageway is not None
+    places: list[Row] = [(0.0, -1.0, 0.0, 1.0)] * (MARKINGS * LINES)
+    colours: list[Row] = [(0.0, 0.0, 0.0, 0.0)] * (MARKINGS * LINES)
+    for number, marking in enumerate(road.carriageway.markings):
+        for k, line in enumerate(marking.lines):
+            at = LINES * number + k
+            middle = float(road.markings_y[number]) + line.offset_m
+            solid = 0.0 if line.dots_m and not line.gap_m else 1.0
+            period = line.dash_m + line.gap_m
+            places[at] = (middle, line.width_m / 2, line.dash_m if period else solid, period or 1.0)
+            colours[at] = (*_toned(line.colour, paint), line.dots_m)
+    return [*places, *colours]
+
+
+def _toned(colour: str, paint: Paint) -> Row:
+    return tuple(c * paint.tone for c in LINE_COLOURS[colour])
+
+
+def _paint_rows(paint: Paint) -> list[Row]:
+    return [
+        (paint.wear, paint.missing, paint.phase, 0.0),
+        (paint.gap_m, paint.gap_every_m, float(paint.gap_marking), 0.0),
+        (*_toned("white", paint), 0.0),
+        (
+            paint.arrow_every_m,
+            ARROWS[paint.arrow_kind],
+            paint.crosswalk_every_m,
+            0.0,
+        ),
+    ]

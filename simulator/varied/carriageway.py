@@ -1,0 +1,147 @@
+"""Lanes, shoulders, camera height and lines of one round. Metres; the leftmost line comes first.
+
+The markings stand as far apart as the lanes are wide, for every lane. Of a double line between two
+lanes the two lie on both sides of that place; of a double line at an edge the inner one lies there.
+"""
+
+import math
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+from simulator.varied.draw import draw, generator, ranges, rebuilt
+from trackfeatures.camera import CameraParameters
+from trackfeatures.definitions import LANE_WIDTH_LIMITS_M
+
+APPARENT_WIDTH_M = (2.75, 4.4)
+"""Least and greatest width of a lane in the model's pictures: a camera at another height than the
+model's shows a road enlarged by the ratio of the heights."""
+MODEL_HEIGHT_M = CameraParameters().height_above_road_m
+CAMERA_HEIGHT_M = (0.9, 2.2)
+
+
+@dataclass(frozen=True, slots=True)
+class Line:
+    """One line of paint, or row of dots: its middle is `offset_m` left of its marking's place."""
+
+    offset_m: float
+    width_m: float
+    colour: str
+    dash_m: float = 0.0
+    """Length of a dash."""
+    gap_m: float = 0.0
+    """From dash to dash; 0: the line is solid, or nothing but dots."""
+    dots_m: float = 0.0
+    """From one of Botts' dots to the next, where there is no paint; 0: there are none."""
+
+
+@dataclass(frozen=True, slots=True)
+class Marking:
+    """One marking: no line, one line, or two, the left one first."""
+
+    lines: tuple[Line, ...] = ()
+
+    @property
+    def left_m(self) -> float:
+        """Offset of the line that bounds the lane on the left of the marking."""
+        return self.lines[0].offset_m if self.lines else 0.0
+
+    @property
+    def right_m(self) -> float:
+        """Offset of the line that bounds the lane on the right of the marking."""
+        return self.lines[-1].offset_m if self.lines else 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Carriageway:
+    """What one round's road is drawn with, beside its track."""
+
+    lane_width_m: float
+    shoulders_m: tuple[float, float]
+    """Left and right: asphalt beyond the outermost markings."""
+    camera_height_m: float
+    """Of the camera above the road."""
+    markings: tuple[Marking, ...]
+    """From the leftmost to the rightmost, one more than lanes."""
+
+    @staticmethod
+    def drawn(seed: int, lanes: int, model_height_m: float = MODEL_HEIGHT_M) -> "Carriageway":
+        """The road of the round with `seed`; `model_height_m`: of the model's camera."""
+        size = draw(ranges(), "lanes", generator(seed, "lanes"))
+        place = draw(ranges(), "camera", generator(seed, "camera"))["place"]
+        width = round(float(size["width_m"]), 3)
+        markings = _markings(draw(ranges(), "lines", generator(seed, "lines")), lanes, width)
+        taken = max(right.left_m - left.right_m for left, right in pairwise(markings))
+        low, high = camera_heights(width, width - taken, model_height_m)
+        shoulders = [
+            round(float(size[f"shoulder_{side}_m"]), 3) if marking.lines else 0.0
+            for side, marking in (("left", markings[0]), ("right", markings[-1]))
+        ]
+        return Carriageway(
+            lane_width_m=width,
+            shoulders_m=(shoulders[0], shoulders[1]),
+            camera_height_m=round(low + (high - low) * float(place), 4),
+            markings=markings,
+        )
+
+    @staticmethod
+    def from_dict(values: dict[str, Any]) -> "Carriageway":
+        """That with these values; raises KeyError, TypeError or ValueError for others."""
+        found: Carriageway = rebuilt(Carriageway, values)
+        return found
+
+
+def camera_heights(
+    lane_width_m: float, narrowest_m: float = math.inf, model_height_m: float = MODEL_HEIGHT_M
+) -> tuple[float, float]:
+    """The least and the greatest camera height in m from which a lane so wide is understood.
+
+    `narrowest_m`: the narrowest lane, where a double line takes some of the width.
+    """
+    apparent_low, apparent_high = APPARENT_WIDTH_M
+    low, high = CAMERA_HEIGHT_M
+    narrow = min(lane_width_m, narrowest_m)
+    low = max(low, model_height_m * lane_width_m / apparent_high)
+    return low, max(low, min(high, model_height_m * narrow / apparent_low))
+
+
+def _markings(drawn: dict[str, Any], lanes: int, lane_width_m: float) -> tuple[Marking, ...]:
+    """The markings of a road, from the values of section [lines]."""
+    # A lane beside double lines must not become narrower than the definitions allow.
+    room = lane_width_m - LANE_WIDTH_LIMITS_M[0]
+    left = _marking(drawn, "left", drawn["edge_width_m"], drawn["edge_dash_m"], 0.5)
+    right = _marking(drawn, "right", drawn["edge_width_m"], drawn["edge_dash_m"], -0.5)
+    between = _marking(drawn, "divider", drawn["divider_width_m"], drawn["dash_m"], 0.0, room)
+    return (left, *[between] * (lanes - 1), right)
+
+
+def _marking(
+    drawn: dict[str, Any],
+    name: str,
+    width_m: float,
+    dash: list[float],
+    inner: float,
+    room_m: float = math.inf,
+) -> Marking:
+    """The marking `name` of one of the kinds in ranges.toml.
+
+    `inner` shifts a double line by that share of the distance of its lines, to the left. Where they
+    lie more than `room_m` apart, the first one is alone.
+    """
+    kind, colour = str(drawn[name]), str(drawn[f"{name}_colour"])
+    apart = width_m + float(drawn["apart_m"])
+    solid, dashed = (0.0, 0.0), (dash[0], dash[1])
+
+    def line(pattern: str, place: float = 0.0) -> Line:
+        length, gap = dashed if "dashed" in pattern else solid
+        dots = float(drawn["dots_m"]) if "dots" in pattern else 0.0
+        return Line(round(place * apart, 4), round(width_m, 4), colour, length, gap, dots)
+
+    if kind == "none":
+        return Marking()
+    if kind in ("solid", "dashed", "dots", "dots-dashed"):
+        return Marking((line(kind),))
+    first, second = kind.split("-") if "-" in kind else ("solid", "solid")
+    if apart > room_m:
+        return Marking((line(first),))
+    return Marking((line(first, inner + 0.5), line(second, inner - 0.5)))

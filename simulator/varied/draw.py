@@ -1,0 +1,96 @@
+"""Draws values from the tables of a TOML file of ranges; `ranges.toml` explains the notation.
+
+A section's values are drawn in the order of the file, so the same generator gives the same values.
+"""
+
+import tomllib
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
+from functools import cache
+from importlib.resources import files
+from typing import Any, TypeVar, get_args, get_origin, get_type_hints
+
+import numpy as np
+
+Tables = Mapping[str, Mapping[str, Any]]
+Values = dict[str, Any]
+Kind = TypeVar("Kind")
+
+SECTIONS = ("lanes", "camera", "lines", "paint", "surface", "roadside", "light", "lens", "cabin")
+"""Of ranges.toml. The place here is part of a section's generator: append, do not reorder."""
+STREAM = 20
+"""Of the generators of a seed that draw varied roads; smaller numbers draw scenery and drives."""
+
+
+def generator(seed: int, section: str, scene: int = 0) -> np.random.Generator:
+    """The generator of one section for scene number `scene` of the round with `seed`."""
+    return np.random.default_rng([seed, STREAM + SECTIONS.index(section), scene])
+
+
+@cache
+def ranges() -> Tables:
+    """The sections of ranges.toml."""
+    text = files("simulator.varied").joinpath("ranges.toml").read_text(encoding="utf-8")
+    return tomllib.loads(text)
+
+
+def drawn_as(kind: type[Kind], section: str, rng: np.random.Generator) -> Kind:
+    """An object of the dataclass `kind`, its fields drawn from the section of that name."""
+    values = draw(ranges(), section, rng)
+    return kind(**{f.name: values[f.name] for f in fields(kind) if f.name in values})  # type: ignore[arg-type]
+
+
+def draw(tables: Tables, name: str, rng: np.random.Generator) -> Values:
+    """The values of the table `name`, after those of the table that it is `like`."""
+    table = tables[name]
+    drawn: Values = draw(tables, table["like"], rng) if "like" in table else {}
+    for entry, value in table.items():
+        if entry != "like":
+            scale = drawn["brightness"] if entry in table.get("scaled", ()) else 1.0
+            drawn[entry] = _value(value, drawn, scale, rng)
+    return drawn
+
+
+def _value(value: Any, drawn: Values, scale: float, rng: np.random.Generator) -> Any:
+    match value:
+        case [float(least), float(most)]:
+            return rng.uniform(least, most)
+        case [int(least), int(most)]:
+            return int(rng.integers(least, most, endpoint=True))
+        case {"colour": colour, "spread": spread}:
+            return tuple(c * scale * (1.0 + rng.uniform(-spread, spread)) for c in colour)
+        case {"colour": colour}:
+            return tuple(c * scale for c in colour)
+        case {"at_least": least, "gain": gain}:
+            return least + gain * drawn["density"]
+        case {"one_of": choices, **rest}:
+            chances = np.array(rest.get("weights", [1.0] * len(choices)), dtype=np.float64)
+            return choices[int(rng.choice(len(choices), p=chances / chances.sum()))]
+        case {"sometimes": share, "value": inner, **rest}:
+            if rng.uniform() < share:
+                return _value(inner, drawn, scale, rng)
+            return rest.get("otherwise", 0.0)
+        case {"share": share}:
+            return bool(rng.uniform() < share)
+        case str() if value in drawn:
+            return drawn[value]
+        case _:
+            return value
+
+
+def rebuilt(kind: Any, value: Any) -> Any:
+    """The object of type `kind` whose `dataclasses.asdict`, through JSON or not, is `value`.
+
+    Raises KeyError, TypeError or ValueError for the values of another type.
+    """
+    if is_dataclass(kind):
+        hints = get_type_hints(kind)
+        unknown = set(value) - {field.name for field in fields(kind)}
+        if unknown:
+            raise ValueError(f"unknown value {min(unknown)!r} of a {getattr(kind, '__name__', '')}")
+        return kind(**{name: rebuilt(hints[name], part) for name, part in value.items()})  # type: ignore[operator]
+    if get_origin(kind) is tuple:
+        kinds = get_args(kind)
+        parts = (kinds[0],) * len(value) if kinds[-1] is Ellipsis else kinds
+        return tuple(rebuilt(k, part) for k, part in zip(parts, value, strict=True))
+    return value
