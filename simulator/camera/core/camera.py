@@ -10,14 +10,16 @@ from numpy.typing import ArrayLike, NDArray
 
 from simulator.arrays import FloatArray
 from simulator.camera.core import optics
-from simulator.camera.core.context import FRAME_BINDING, Graphics, graphics
+from simulator.camera.core.context import FRAME_BINDING, NIGHT, Graphics, graphics
 from simulator.camera.core.render_modes import CLASS, COLOUR, DEPTH, ViewRequest
-from simulator.camera.scene.cars import shared_cars
+from simulator.camera.lens.imaging import Imaging
+from simulator.camera.scene.cars import Cars, shared_cars
 from simulator.camera.scene.light import Light
 from simulator.camera.scene.precipitation import Precipitation
 from simulator.camera.scene.scene import Scene, VisibleScene
 from simulator.camera.scene.sky import Sky
 from simulator.camera.scene.terrain import Survey
+from simulator.camera.scene.varied_light import lit_as
 from simulator.track.road import Road
 from simulator.varied.look import RoadLook
 from simulator.vehicle.car import CarParameters
@@ -29,6 +31,8 @@ Picture = NDArray[Any]
 MAX_SIZE = 4096
 DRIVER_CAMERA = CameraParameters()
 _OWN_PAINT = 0
+HEADLIGHT_AT = (2.1, 0.0, 0.4)
+"""Of both headlights, in the body frame, metres."""
 
 
 def check_size(width: int, height: int) -> None:
@@ -49,6 +53,9 @@ class _LoadedScene:
     precipitation: Precipitation | None
     frame: NDArray[np.float32]
     first_paint: int
+    cars: Cars
+    imaging: Imaging | None
+    """None: the rendered picture is the recorded one."""
 
 
 @dataclass(frozen=True)
@@ -92,8 +99,6 @@ class Camera:
         self._cache: dict[tuple[int, Light, RoadLook | None], _LoadedScene] = {}
         self._current: _LoadedScene | None = None
         self._last_s: float | None = None
-        with self._graphics.turns:
-            self._cars = shared_cars(self._graphics)
         self.change_scene(seed, light, look)
 
     @property
@@ -116,7 +121,9 @@ class Camera:
 
     def _load_scene(self, seed: int, light: Light, look: RoadLook | None) -> _LoadedScene:
         graphics = self._graphics
-        frame = np.concatenate([np.zeros(24), *_light_rows(light)]).astype(np.float32)
+        if look:
+            light = lit_as(light, look.light)
+        frame = np.concatenate([np.zeros(24), *_light_rows(light), np.zeros(8)]).astype(np.float32)
         self._set_frame(frame, optics.eye_of(self.parameters, np.zeros(6), "front"))
         return _LoadedScene(
             light,
@@ -127,6 +134,8 @@ class Camera:
             frame,
             # Cars of different rounds differ in colour; index 0 is that of our own car.
             first_paint=1 + seed % 5,
+            cars=shared_cars(graphics, *([NIGHT] if look and look.light.night else [])),
+            imaging=Imaging(look, light, self.parameters) if look else None,
         )
 
     def render(
@@ -169,7 +178,7 @@ class Camera:
             kinds = {each.kind for each in wanted.values() if each.view == view}
             shot = self._prepare(body_pose, others, view)
             if COLOUR in kinds:
-                taken[ViewRequest(view)] = self._draw_colours(shot)
+                taken[ViewRequest(view)] = self._recorded(self._draw_colours(shot), shot, view)
             if kinds - {COLOUR}:
                 labels = self._draw_labels(shot)
                 taken[ViewRequest(view, DEPTH)] = np.ascontiguousarray(labels[..., 0])
@@ -180,10 +189,11 @@ class Camera:
         """Bind the frame of a view and cull what it does not show."""
         loaded = self._loaded
         eye = optics.eye_of(self.parameters, body_pose, view)
+        self._set_headlights(loaded.frame, np.asarray(body_pose, dtype=np.float64), eye)
         self._set_frame(loaded.frame, eye)
         planes = optics.frustum(eye, self.intrinsics)
         cars, paints = self._cars_in_view(body_pose, others, view)
-        chosen = self._cars.visible(cars, eye.place, planes)
+        chosen = loaded.cars.visible(cars, eye.place, planes)
         return _Shot(
             eye, loaded.scene.visible(eye, planes), cars[chosen], [paints[k] for k in chosen]
         )
@@ -192,21 +202,28 @@ class Camera:
         loaded, place = self._loaded, shot.eye.place
         target = self._graphics.targets.of(self.width, self.height, labels=False)
         self._graphics.begin(target)
-        self._cars.draw(shot.cars, shot.paints, place, labels=False)
+        loaded.cars.draw(shot.cars, shot.paints, place, labels=False)
         loaded.scene.draw(shot.seen, labels=False)
         loaded.sky.draw()
         self._graphics.blend()
-        self._cars.draw_shadows(shot.cars, place, loaded.light)
+        loaded.cars.draw_shadows(shot.cars, place, loaded.light)
         loaded.scene.draw_blended(shot.seen)
         if loaded.precipitation is not None:
             loaded.precipitation.draw(shot.eye, self.intrinsics[0, 0])
         return target.colours()
 
+    def _recorded(self, picture: NDArray[np.uint8], shot: _Shot, view: str) -> NDArray[np.uint8]:
+        """What the sensor makes of a rendered picture; of the driver view only."""
+        imaging = self._loaded.imaging
+        if imaging is None or view != "front":
+            return picture
+        return imaging.developed(picture, shot.eye, self._s_of(*shot.eye.place[:2].tolist()))
+
     def _draw_labels(self, shot: _Shot) -> NDArray[np.float32]:
         """Depth and class (height, width, 2) of what `_draw_colours` draws, rain and snow apart."""
         target = self._graphics.targets.of(self.width, self.height, labels=True)
         self._graphics.begin(target, labels=True)
-        self._cars.draw(shot.cars, shot.paints, shot.eye.place, labels=True)
+        self._loaded.cars.draw(shot.cars, shot.paints, shot.eye.place, labels=True)
         self._loaded.scene.draw(shot.seen, labels=True)
         return target.labels()
 
@@ -242,9 +259,13 @@ class Camera:
     def shadow_fraction(self, body_pose: ArrayLike) -> float:
         """Share (0 to 1) of the road within 30 m ahead of the car that lies in hard shadow."""
         pose = np.asarray(body_pose, dtype=np.float64)
-        s, _ = self.road.track.project(float(pose[0]), float(pose[1]), self._last_s)
-        self._last_s = s
+        s = self._s_of(float(pose[0]), float(pose[1]))
         return self._loaded.scene.mask.fraction(s, self.road.half_asphalt)
+
+    def _s_of(self, x: float, y: float) -> float:
+        """Place along the road of (x, y)."""
+        self._last_s, _ = self.road.track.project(x, y, self._last_s)
+        return self._last_s
 
     def _cars_in_view(
         self, body_pose: ArrayLike, others: ArrayLike | None, view: str
@@ -264,6 +285,14 @@ class Camera:
         if self._current is None:
             raise RuntimeError("this camera is closed; make a new one")
         return self._current
+
+    def _set_headlights(
+        self, block: NDArray[np.float32], body_pose: FloatArray, eye: optics.Eye
+    ) -> None:
+        """Fill the rows of the uniform block `Frame` that say where the car's headlights are."""
+        turn = optics.rotation(*body_pose[3:].tolist())
+        block[48:51] = body_pose[:3] + turn @ np.array(HEADLIGHT_AT) - eye.place
+        block[52:55] = turn[:, 0]
 
     def _set_frame(self, block: NDArray[np.float32], eye: optics.Eye) -> None:
         """Fill the uniform block `Frame` of frame.glsl, which `block` keeps."""

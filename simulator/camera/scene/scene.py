@@ -10,6 +10,7 @@ from simulator.arrays import FloatArray
 from simulator.camera.bridges import bridges
 from simulator.camera.core.context import (
     LOOK_BINDING,
+    NIGHT,
     SCENE_BINDING,
     SHADOW_UNIT,
     VARIED,
@@ -71,10 +72,11 @@ class Scene:
         built = props.build(ground, theme, scene_bridges, rng(6))
         covered = road_mesh.covers(ground.mesh, survey, margin_m=2.0)
         self.mask = shadow_mask.build(road, trees, scene_bridges, tree_shade, light, rng(4))
-        self._trees = TreeMesh(graphics, trees, light.weather)
+        night = [NIGHT] if look and look.light.night else []
+        self._trees = TreeMesh(graphics, trees, light.weather, *night)
 
         def mesh(program: str, surface: Surface, layout: Sequence[str], *features: str) -> Mesh:
-            variant = graphics.weather_program(program, light.weather, *features)
+            variant = graphics.weather_program(program, light.weather, *features, *night)
             return Mesh(graphics, variant, surface, layout)
 
         varied = [VARIED] if look else []
@@ -87,6 +89,9 @@ class Scene:
             *(mesh("land", each, land.LAYOUT, *(["sea"] if theme.sea else [])) for each in lands),
         )
         palette = scene_block(road, theme, rng(2), self.mask, terrain.sea)
+        if look and look.surface.tone:
+            warm = look.surface.warmth
+            palette[0, :3] = look.surface.tone * np.array([1.0 + warm / 2, 1.0, 1.0 - warm / 2])
         self._block = graphics.context.buffer(palette.tobytes())
         self._look = graphics.context.buffer(look_block(road, look).tobytes()) if look else None
         self._shadow_texture = graphics.texture(self.mask.texels)

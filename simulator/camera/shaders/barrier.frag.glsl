@@ -48,5 +48,5 @@ void main() {
     colour = snowed(colour, smoothstep(top - 0.03, top + 0.02, h + 0.12 * (fine.g - 0.5)) + smoothstep(0.12, -0.08, h + 0.15 * (fine.g - 0.5)));
 #endif
     if (solid < max(0.12, LEAST_ALPHA)) discard;
-    OUTPUT(vec4(to_display(lit(colour, facing, 0.9), place).rgb, solid), OBJECT);
+    OUTPUT(vec4(to_display(lit(colour, facing, 0.9, place), place).rgb, solid), OBJECT);
 }
