@@ -78,6 +78,13 @@ JitterCamera = Annotated[
         "--jitter-camera", help="Vary height, pitch and field of view from round to round."
     ),
 ]
+Roads = Annotated[
+    str,
+    typer.Option(
+        help="paper: lanes of 4.0 m and the tracks' own paint; varied: lanes, shoulders, paint, "
+        "surface, light and camera height are drawn for each round or scene."
+    ),
+]
 ShardOf = Annotated[
     str, typer.Option(help="2/4: only the second of four parts, for batch systems.")
 ]
@@ -105,6 +112,7 @@ def collect(
     split: SplitName = CollectConfig.split,
     codec: Codec = CollectConfig.codec,
     jitter_camera: JitterCamera = CollectConfig.jitter_camera,
+    roads: Roads = CollectConfig.roads,
     shard: ShardOf = "",
     executor: ExecutorName = "local",
     dry_run: DryRun = False,
@@ -130,6 +138,7 @@ def collect(
         test_share=split_test_share,
         codec=codec,
         jitter_camera=jitter_camera,
+        roads=roads,
         split=split,
     )
     part = Shard.parse(shard) if shard else None

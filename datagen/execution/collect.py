@@ -10,7 +10,6 @@ import signal
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import asdict
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any, Protocol
@@ -204,7 +203,7 @@ def foreign_files(folder: Path, plan: Plan) -> list[Path]:
 
 def _differences(found: dict[str, Any], driver: Mapping[str, str], plan: Plan) -> str:
     """The options that differ, as text."""
-    wanted = json.loads(json.dumps(asdict(plan.config)))
+    wanted = json.loads(json.dumps(plan.config.as_dict()))
     named = [
         f"{name}: {_short(found.get(name))} there, {_short(value)} asked for"
         for name, value in wanted.items()

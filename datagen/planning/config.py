@@ -1,7 +1,8 @@
 """The options of a collection, with the default of each."""
 
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import Any
 
 import trackfeatures as tf
 from datagen.recording.names import CODECS, UNSEEN
@@ -16,6 +17,7 @@ FRAMES_PER_SCENE = 200
 SEEDS_PER_PLAN = 1_000_000
 MAX_ROUNDS = SEEDS_PER_PLAN // 2
 """With more rounds the seeds would overlap those of another plan."""
+ROADS = ("paper", "varied")
 
 
 def all_lights() -> tuple[str, ...]:
@@ -57,8 +59,17 @@ class CollectConfig:
     `FRAMES_PER_SCENE`."""
     jitter_camera: bool = False
     """Vary height, pitch and field of view of the camera a little from round to round."""
+    roads: str = "paper"
+    """"paper": lanes of 4.0 m and the paint of the tracks; "varied": drawn for each round."""
     split: str = ""
     """"unseen": all rounds are for tests on tracks without training data. Else train and test."""
+
+    def as_dict(self) -> dict[str, Any]:
+        """The options by name; those of the paper's roads as before there were others."""
+        options = asdict(self)
+        if self.roads == "paper":
+            del options["roads"]
+        return options
 
     def __post_init__(self) -> None:
         self._check_numbers()
@@ -101,6 +112,7 @@ class CollectConfig:
         for name, given, known in (
             ("light", self.lights, all_lights()),
             ("codec", (self.codec,), CODECS),
+            ("roads", (self.roads,), ROADS),
         ):
             if unknown := set(given) - set(known):
                 raise UserError(f"unknown {name} {min(unknown)!r}; choose {', '.join(known)}")

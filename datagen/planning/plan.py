@@ -13,6 +13,7 @@ from typing import Any
 
 import trackfeatures as tf
 from datagen.planning.config import CollectConfig
+from simulator.varied.round import VariedRound
 from simulator.world.control_rate import PHYSICS_HZ
 from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
@@ -59,6 +60,15 @@ class RoundPlan:
     nominal_camera: CameraParameters
     """The dataset's camera; `camera` may be a jittered copy of it."""
     lane_width_m: float = tf.LANE_WIDTH_M
+    varied: VariedRound | None = None
+    """What the road is drawn with; None: as the paper's roads."""
+
+    def as_dict(self) -> dict[str, Any]:
+        """The entry of `plan.json`; that of a paper's road is the same as before there were others."""
+        entry = asdict(self)
+        if self.varied is None:
+            del entry["varied"]
+        return entry
 
     @property
     def steps_per_frame(self) -> int:
@@ -73,7 +83,9 @@ class RoundPlan:
         """Raises KeyError, TypeError or ValueError if `entry` was not made by this version."""
         check_entry(entry)
         cameras = {key: CameraParameters(**entry[key]) for key in ("camera", "nominal_camera")}
-        return RoundPlan(**{**entry, **cameras, "lights": tuple(entry["lights"])})
+        varied = VariedRound.from_dict(entry["varied"]) if "varied" in entry else None
+        lights = tuple(entry["lights"])
+        return RoundPlan(**{**entry, **cameras, "lights": lights, "varied": varied})
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,7 +100,7 @@ class Plan:
     @property
     def hash(self) -> str:
         """SHA-256 (hex) of all entries, the program and the version of the definitions."""
-        content: list[Any] = [tf.VERSION, program(), [asdict(entry) for entry in self.rounds]]
+        content: list[Any] = [tf.VERSION, program(), [entry.as_dict() for entry in self.rounds]]
         if self.driver:
             content.append(dict(self.driver))
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
@@ -100,9 +112,9 @@ class Plan:
             "hash": self.hash,
             "definitions": tf.VERSION,
             "program": program(),
-            "wanted": asdict(self.config),
+            "wanted": self.config.as_dict(),
             **driver,
-            "rounds": [asdict(entry) for entry in self.rounds],
+            "rounds": [entry.as_dict() for entry in self.rounds],
         }
 
 

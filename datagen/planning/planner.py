@@ -10,12 +10,14 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+import trackfeatures as tf
 from datagen.driving.trajectory import TRAJECTORIES
 from datagen.planning.class_balance import Forecast, balance_starts
 from datagen.planning.config import FRAMES_PER_SCENE, SEEDS_PER_PLAN, CollectConfig, TrackChoice
 from datagen.planning.plan import Plan, RoundPlan
 from datagen.planning.split import choose_test_rounds
 from datagen.recording.names import UNSEEN
+from simulator.varied.round import VariedRound
 from trackfeatures.camera import CameraParameters
 
 MAX_TRAFFIC = 8
@@ -46,6 +48,7 @@ def make_plan(config: CollectConfig, forecast: Forecast | None = None) -> Plan:
         test = choose_test_rounds(config.test_share, names, lanes, (trajectories, lights), rng)
         splits = ["test" if number in test else "train" for number in range(count)]
     cameras = _cameras(config, rng)
+    roads = _roads(config, lanes, lights)
     digits = max(3, len(str(count - 1)))
     rounds = tuple(
         RoundPlan(
@@ -64,8 +67,10 @@ def make_plan(config: CollectConfig, forecast: Forecast | None = None) -> Plan:
             frames=config.frames,
             frequency_hz=config.frequency_hz,
             codec=config.codec,
-            camera=cameras[number],
+            camera=_mounted(cameras[number], roads[number]),
             nominal_camera=config.camera,
+            lane_width_m=_lane_width(roads[number]),
+            varied=roads[number],
         )
         for number in range(count)
     )
@@ -112,6 +117,31 @@ def _cameras(config: CollectConfig, rng: np.random.Generator) -> list[CameraPara
         )
         for k in range(config.rounds)
     ]
+
+
+def _roads(
+    config: CollectConfig, lanes: Sequence[int], lights: Sequence[tuple[str, ...]]
+) -> list[VariedRound | None]:
+    """What the road of each round is drawn with, from the round's own seed."""
+    if config.roads == "paper":
+        return [None] * config.rounds
+    first, height_m = _first_seed(config), config.camera.height_above_road_m
+    return [
+        VariedRound.drawn(first + k, lanes[k], len(lights[k]), height_m)
+        for k in range(config.rounds)
+    ]
+
+
+def _mounted(camera: CameraParameters, road: VariedRound | None) -> CameraParameters:
+    """The camera at the height of a varied road."""
+    if road is None:
+        return camera
+    height = road.carriageway.camera_height_m
+    return replace(camera, z=round(height - CameraParameters.cg_height_m, 4))
+
+
+def _lane_width(road: VariedRound | None) -> float:
+    return tf.LANE_WIDTH_M if road is None else road.carriageway.lane_width_m
 
 
 def _tracks_and_lanes(

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import lru_cache
 from itertools import count
 from pathlib import Path
@@ -26,6 +26,7 @@ from simulator.sensors.standard import STANDARD
 from simulator.track.catalogue import find_track
 from simulator.track.geometry import Track
 from simulator.track.road import Road
+from simulator.varied.look import RoadLook
 from simulator.vehicle.state import CarState, Command
 from simulator.world.world import World
 
@@ -40,6 +41,9 @@ BATCH_FRAMES = 20
 CACHED_SCENES = BATCH_FRAMES  # scenes kept by the camera: none is built twice in a batch
 SCENERY_SEED_STRIDE = 2**40  # between the seeds of a round's sceneries: above all round seeds
 
+
+Scenery = tuple[int, Light, RoadLook | None]
+"""Seed of the scenery, light, and look of a varied road."""
 
 MakeLaw = Callable[[RoundPlan, World, Camera], SteeringLaw]
 """Makes what steers in a round in place of the scripted driver's law, from the round's plan, its
@@ -59,15 +63,15 @@ class RoundSimulation:
     steps: int = 0
     speed_sum: float = 0.0
     state: CarState = field(init=False)
-    sceneries: list[tuple[int, Light]] = field(init=False)
+    sceneries: list[Scenery] = field(init=False)
 
     def __post_init__(self) -> None:
         self.sceneries = [scenery(self.plan, k) for k in range(len(self.plan.lights))]
         start = self.plan.start * self.world.road.track.length_m
         self._start(start, self.driver.offset_at(0.0))
 
-    def scenery_at(self, frame: int) -> tuple[int, Light]:
-        """Seed of the scenery, and light, at a frame."""
+    def scenery_at(self, frame: int) -> Scenery:
+        """The scenery at a frame."""
         return self.sceneries[
             frame // (self.plan.stretch or self.plan.frames) % len(self.sceneries)
         ]
@@ -110,7 +114,7 @@ class RoundSimulation:
 class FrameTruth:
     """Truth of a frame, before its image is rendered."""
 
-    scenery: tuple[int, Light]
+    scenery: Scenery
     pose: NDArray[np.float64]
     traffic: NDArray[np.float64]
     features: tf.TrackFeatures
@@ -174,10 +178,11 @@ def simulate(simulation: RoundSimulation, camera: Camera) -> Iterator[list[Frame
         yield [_next_frame(simulation, camera, suite, frame) for frame in batch]
 
 
-def scenery(plan: RoundPlan, number: int) -> tuple[int, Light]:
-    """Seed and light of scene `number` (from 0) of a round; no two rounds share one."""
-    rng = np.random.default_rng([plan.seed, 2, number])
-    return plan.seed + number * SCENERY_SEED_STRIDE, Light.named(plan.lights[number], rng)
+def scenery(plan: RoundPlan, number: int) -> Scenery:
+    """Seed, light and look of scene `number` (from 0) of a round; no two rounds share one."""
+    light = Light.named(plan.lights[number], np.random.default_rng([plan.seed, 2, number]))
+    look = plan.varied.scenes[number] if plan.varied else None
+    return plan.seed + number * SCENERY_SEED_STRIDE, light, look
 
 
 @lru_cache(maxsize=16)
@@ -200,15 +205,18 @@ def open_simulation(
             f"track {plan.track} is not the one this dataset was planned with (its geometry has "
             "changed); collect into another folder"
         )
-    road = Road(track, plan.lanes, plan.lane_width_m)
+    carriageway = plan.varied.carriageway if plan.varied else None
+    road = Road(track, plan.lanes, plan.lane_width_m, carriageway)
     speed = plan.speed_kmh / 3.6
     longest = plan.frames / plan.frequency_hz * speed * 1.1 + 50.0
     course = make_course(plan.trajectory, road, longest, np.random.default_rng([plan.seed, 3]))
     control_hz = plan.frequency_hz * plan.steps_per_frame
-    seed, light = scenery(plan, 0)
+    seed, light, look = scenery(plan, 0)
     with (
         World(road, traffic=plan.traffic, frequency_hz=control_hz) as world,
-        Camera(road, plan.camera, seed=seed, light=light, scenes=CACHED_SCENES) as camera,
+        Camera(
+            road, plan.camera, seed=seed, light=light, look=look, scenes=CACHED_SCENES
+        ) as camera,
     ):
         law = None if make_law is None else make_law(plan, world, camera)
         driver = ScriptedDriver(road, course, speed, control_hz, law=law)
@@ -234,6 +242,7 @@ def _header(plan: RoundPlan, plan_hash: str, road: Road) -> RoundHeader:
         program=program(),
         camera=plan.camera,
         nominal_camera=None if plan.camera == plan.nominal_camera else plan.nominal_camera,
+        varied=asdict(plan.varied) if plan.varied else None,
     )
 
 
@@ -298,7 +307,7 @@ def track_lines(road: Road) -> dict[str, NDArray[np.float64]]:
     count = int(np.ceil(road.track.length_m / TRACK_LINE_STEP_M))
     s = np.linspace(0.0, road.track.length_m, count + 1)
     places = {f"marking {i}": y for i, y in enumerate(road.markings_y.tolist())}
-    places |= {"left edge": road.half_asphalt, "right edge": -road.half_asphalt}
+    places |= {"left edge": road.asphalt[0], "right edge": -road.asphalt[1]}
     lines = {}
     for name, y in places.items():
         pose = road.track.at(s, y)

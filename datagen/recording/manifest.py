@@ -33,10 +33,12 @@ def build_manifest(dataset: Dataset) -> dict[str, Any]:
     states = read_states(dataset.path)
     rounds = []
     for info, index in zip(dataset.rounds, dataset.indexes, strict=True):
+        header = asdict(index.header)
+        del header["varied"]  # some kB for each scene, in the plan and in the round's file
         state = states.get(info.id)
         rounds.append(
             {
-                **asdict(index.header),
+                **header,
                 **asdict(index.result),
                 "split": info.split,
                 "file": f"rounds/{info.path.name}",

@@ -12,6 +12,7 @@ from typing import Any
 
 import trackfeatures as tf
 from trackfeatures.camera import CameraParameters
+from trackfeatures.measurement import LineOffsets
 from trackfeatures.names import require_name
 
 ROUND_METADATA = "driverview.round"
@@ -51,11 +52,32 @@ class RoundHeader:
     camera: CameraParameters = field(default_factory=CameraParameters)
     """The camera of this round's images; with camera jitter it differs from round to round."""
     nominal_camera: CameraParameters | None = None
-    """The camera of the dataset, which was jittered; None without camera jitter."""
+    """The camera of the dataset, where `camera` differs from it: jittered, or at the height of a
+    varied road."""
+    varied: dict[str, Any] | None = None
+    """What the round of `--roads varied` was drawn with; None: as the paper's roads."""
 
     @property
     def dataset_camera(self) -> CameraParameters:
         return self.nominal_camera or self.camera
+
+    @property
+    def label_camera(self) -> CameraParameters:
+        """The camera whose pictures the round's are taken for when a network is trained with them.
+
+        Of varied roads it stands where `camera` does: the network's metres are those beside the
+        dataset's camera, and the labels are scaled. A jittered camera is taken for the dataset's.
+        """
+        return self.camera if self.varied is not None else self.dataset_camera
+
+    @property
+    def line_offsets(self) -> LineOffsets:
+        """Of varied roads: where the lines of each marking lie, see `trackfeatures.measure`."""
+        if self.varied is None:
+            return ()
+        lines = [each["lines"] for each in self.varied["carriageway"]["markings"]]
+        ends = [(each[0], each[-1]) if each else ({"offset_m": 0.0},) * 2 for each in lines]
+        return tuple((float(left["offset_m"]), float(right["offset_m"])) for left, right in ends)
 
     def validate(self) -> None:
         """Raise ValueError for an impossible value, before anything is computed with it."""
@@ -79,7 +101,10 @@ class RoundHeader:
             )
 
     def to_metadata(self) -> dict[str, str]:
-        return {name: json.dumps(value) for name, value in asdict(self).items()}
+        values = asdict(self)
+        if self.varied is None:  # the paper's roads are recorded as before there were others
+            del values["varied"]
+        return {name: json.dumps(value) for name, value in values.items()}
 
     @staticmethod
     def from_metadata(metadata: Mapping[str, str]) -> "RoundHeader":
@@ -154,6 +179,10 @@ class RoundInfo:
     lane_width_m: float
     content_hash: str
     path: Path
+    label_camera: CameraParameters = field(default_factory=CameraParameters)
+    """See `RoundHeader.label_camera`."""
+    line_offsets: LineOffsets = ()
+    """See `RoundHeader.line_offsets`."""
 
     @property
     def light(self) -> str:
@@ -180,4 +209,6 @@ class RoundInfo:
             lane_width_m=header.lane_width_m,
             content_hash=result.content_hash,
             path=path,
+            label_camera=header.label_camera,
+            line_offsets=header.line_offsets,
         )

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import trackfeatures as tf
+from datagen.recording import Frames
 from mtlnet.data.augment.pipeline import (
     AugmentParams,
     apply_params,
@@ -25,6 +26,7 @@ from mtlnet.data.augment.pipeline import (
     draw_params,
     resolve_lateral_shift,
 )
+from mtlnet.data.model_labels import model_labels
 from trackfeatures.camera import CameraParameters
 
 PREFETCH = 3  # batches made or waiting
@@ -124,7 +126,9 @@ class Loader:
         self.rows = slice(index * batch // parts, (index + 1) * batch // parts)
         shape = (self.rows.stop - self.rows.start, camera.height, camera.width, 3)
         self._buffers = BufferPool(shape)
-        labels = frames.labels
+        # Of varied roads the camera's height differs from round to round.
+        labels = model_labels(frames) if isinstance(frames, Frames) else frames.labels
+        self._labels = labels
         self.coded = tf.encode(labels.distances, labels.angle)
         self.heading = np.asarray(labels.heading, dtype=np.int64)
         each = np.arange(len(self.heading))
@@ -158,7 +162,7 @@ class Loader:
             return BatchLabels(chosen, None, self.coded[chosen], heading, self.read_ahead(chosen))
         rng = np.random.default_rng([self.seed, 2, step])
         size = (self.camera.height, self.camera.width)
-        labels = self.frames.labels
+        labels = self._labels
         distances, angle = labels.distances[chosen], labels.angle[chosen]
         drawn = draw_params(self.batch, *size, rng).take(self.rows)
         params = resolve_lateral_shift(drawn, distances)

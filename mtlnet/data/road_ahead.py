@@ -30,6 +30,7 @@ from mtlnet.data.augment.geometric import (
 )
 from mtlnet.data.augment.pipeline import AugmentParams
 from mtlnet.data.loader import Images
+from mtlnet.data.model_labels import camera_scales
 from mtlnet.model.auxiliary import AHEAD_M, ROWS, SIDES
 from trackfeatures.camera import CameraParameters
 
@@ -63,7 +64,8 @@ class RoadAhead:
         self._kept = self._read_all() if keep else None
         labels = frames.labels
         tracks = np.array([info.track for info in frames.rounds])[labels.round]
-        self._curvature = curvature_ahead(labels.s, labels.curvature, tracks)
+        scale = camera_scales(frames)
+        self._curvature = curvature_ahead(labels.s, labels.curvature, tracks, scale)
 
     def labels(self, indices: NDArray[np.int64], params: AugmentParams | None = None) -> Numbers:
         """Columns and curvatures of frames as one row each (B, `mtlnet.model.auxiliary.LABELS`)."""
@@ -119,13 +121,13 @@ def _annotations(path: Path) -> Messages:
 
 
 def lane_beside(frames: Frames) -> NDArray[np.float64]:
-    """Distances (N, 2) in m, left negative, to both markings of the lane that each car is in or
-    nearest to, whether or not they are active."""
+    """Distances (N, 2) in m beside the model's camera, left negative, to both markings of the lane
+    that each car is in or nearest to, whether or not they are active."""
     labels, rounds = frames.labels, frames.rounds
     width = np.array([info.lane_width_m for info in rounds])[labels.round]
     centre = width * (labels.lanes / 2 - labels.lane_index - 0.5)
     left = labels.to_middle - centre - width / 2
-    return np.column_stack([left, left + width])
+    return np.column_stack([left, left + width]) * camera_scales(frames)[:, None]
 
 
 def own_markings(
@@ -136,8 +138,8 @@ def own_markings(
 ) -> None:
     """Put the polylines of the lane's markings, `beside` (2,) m, into `out` (2, POINTS, 2).
 
-    Which is which is told at a polyline's near end, as if the road were level there: lanes are 3 m
-    wide at least.
+    Which is which is told at a polyline's near end, as if the road were level there: lanes are
+    2.7 m wide at least.
     """
     horizon = horizon_row(camera) + 0.5  # from the image's upper border
     nearest = np.full(SIDES, APART_M)
@@ -200,8 +202,12 @@ def crossings(points: NDArray[np.floating[Any]], width: int) -> Numbers:
     return np.where(found, column, np.nan).astype(np.float32)
 
 
-def curvature_ahead(s: Numbers, curvature: Numbers, tracks: NDArray[np.str_]) -> Numbers:
+def curvature_ahead(
+    s: Numbers, curvature: Numbers, tracks: NDArray[np.str_], scale: NDArray[np.float64]
+) -> Numbers:
     """Curvatures (N, AHEAD_M) in 1/m in front of cars at `s` (N,) m, where it is `curvature` (N,).
+
+    `scale` (N,): metres beside the model's camera, in which the answer is, per metre of the car.
 
     A track is the same in all its rounds, so that the frames of all of them tell of it; NaN where
     none was near.
@@ -211,13 +217,14 @@ def curvature_ahead(s: Numbers, curvature: Numbers, tracks: NDArray[np.str_]) ->
         here = np.flatnonzero(tracks == track)
         order = here[np.argsort(s[here], kind="stable")]
         places = s[order]
-        wanted = s[here][:, None] + np.array(AHEAD_M, np.float32)
+        ahead = np.array(AHEAD_M, np.float32) / scale[here, None].astype(np.float32)
+        wanted = s[here][:, None] + ahead
         after = np.searchsorted(places, wanted).clip(max=len(places) - 1)
         before = np.maximum(after - 1, 0)
         nearest = np.where(wanted - places[before] < places[after] - wanted, before, after)
         near = np.abs(places[nearest] - wanted) <= KNOWN_M
         found[here] = np.where(near, curvature[order][nearest], np.nan)
-    return found
+    return (found / scale[:, None]).astype(np.float32)
 
 
 def hard_frames(

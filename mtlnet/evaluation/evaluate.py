@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from datagen.recording import Dataset, Frames, UndecodableImage
 from mtlnet.data.custom_images import has_labels_file, open_custom_images
 from mtlnet.data.loader import Images
+from mtlnet.data.model_labels import car_outputs
 from mtlnet.data.sources import require_camera, require_decodable
 from mtlnet.evaluation.html_report import page_file, write_page, write_worst_sheet
 from mtlnet.evaluation.metrics import evaluate_by_groups, evaluate_outputs
@@ -61,6 +62,7 @@ def evaluate(
     except UndecodableImage:
         require_decodable(frames, data)  # to name and count all of them
         raise
+    outputs = car_outputs(outputs, frames)
     mean = engine.card.data["mean"]
     found = {
         **_about(engine),

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datagen.recording import Frames
+from mtlnet.data.model_labels import model_labels
 from mtlnet.evaluation.evaluate import evaluate
 from mtlnet.evaluation.metrics import evaluate_outputs
 from mtlnet.export.openvino_graph import run_graph
@@ -57,7 +58,7 @@ def choose_float_activations(
     these with each other one, and so on; of a network with very many, `FLOAT_ACTIVATIONS`.
     """
     rows = np.linspace(0, len(held_out) - 1, min(HELD_OUT_FRAMES, len(held_out))).astype(np.int64)
-    frames, labels = held_out.read_batch(rows), held_out.labels.take(rows)
+    frames, labels = held_out.read_batch(rows), model_labels(held_out).take(rows)
 
     def judged(graph: Any) -> dict[str, Any]:
         outputs = run_graph(graph, "f32", frames)

@@ -19,6 +19,7 @@ from torch import Tensor, nn
 import trackfeatures as tf
 from datagen.recording import Frames
 from mtlnet.data.loader import Images
+from mtlnet.data.model_labels import model_labels
 from mtlnet.data.sources import (
     MIN_ROUNDS_TO_HOLD_OUT,
     hold_out_rounds,
@@ -218,7 +219,7 @@ def run_on_frames(network: Network, frames: Images, limit: int) -> FrameOutputs:
             queue.start_async([image[None].copy()], first + row)
             textures[first + row] = texture_features(image)
         queue.wait_all()
-    labels = frames.labels
+    labels = model_labels(frames) if isinstance(frames, Frames) else frames.labels
     error = signed_errors(outputs, labels.distances[chosen], labels.angle[chosen])
     x = np.concatenate([x, light_features(textures)], 1)
     return FrameOutputs(x, error.astype(np.float32), textures)

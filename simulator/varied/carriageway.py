@@ -14,8 +14,8 @@ from trackfeatures.camera import CameraParameters
 from trackfeatures.definitions import LANE_WIDTH_LIMITS_M
 
 APPARENT_WIDTH_M = (2.75, 4.4)
-"""Least and greatest width of a lane in pictures of the model's camera, which is `MODEL_HEIGHT_M`
-above the road; one at another height shows a road enlarged by the ratio of the heights."""
+"""Least and greatest width of a lane in the model's pictures: a camera at another height than the
+model's shows a road enlarged by the ratio of the heights."""
 MODEL_HEIGHT_M = CameraParameters().height_above_road_m
 CAMERA_HEIGHT_M = (0.9, 2.2)
 
@@ -65,14 +65,14 @@ class Carriageway:
     """From the leftmost to the rightmost, one more than lanes."""
 
     @staticmethod
-    def drawn(seed: int, lanes: int) -> "Carriageway":
-        """The road of the round with `seed`."""
+    def drawn(seed: int, lanes: int, model_height_m: float = MODEL_HEIGHT_M) -> "Carriageway":
+        """The road of the round with `seed`; `model_height_m`: of the model's camera."""
         size = draw(ranges(), "lanes", generator(seed, "lanes"))
         place = draw(ranges(), "camera", generator(seed, "camera"))["place"]
         width = round(float(size["width_m"]), 3)
         markings = _markings(draw(ranges(), "lines", generator(seed, "lines")), lanes, width)
         taken = max(right.left_m - left.right_m for left, right in pairwise(markings))
-        low, high = camera_heights(width, width - taken)
+        low, high = camera_heights(width, width - taken, model_height_m)
         shoulders = [
             round(float(size[f"shoulder_{side}_m"]), 3) if marking.lines else 0.0
             for side, marking in (("left", markings[0]), ("right", markings[-1]))
@@ -91,7 +91,9 @@ class Carriageway:
         return found
 
 
-def camera_heights(lane_width_m: float, narrowest_m: float = math.inf) -> tuple[float, float]:
+def camera_heights(
+    lane_width_m: float, narrowest_m: float = math.inf, model_height_m: float = MODEL_HEIGHT_M
+) -> tuple[float, float]:
     """The least and the greatest camera height in m from which a lane so wide is understood.
 
     `narrowest_m`: the narrowest lane, where a double line takes some of the width.
@@ -99,8 +101,8 @@ def camera_heights(lane_width_m: float, narrowest_m: float = math.inf) -> tuple[
     apparent_low, apparent_high = APPARENT_WIDTH_M
     low, high = CAMERA_HEIGHT_M
     narrow = min(lane_width_m, narrowest_m)
-    low = max(low, MODEL_HEIGHT_M * lane_width_m / apparent_high)
-    return low, max(low, min(high, MODEL_HEIGHT_M * narrow / apparent_low))
+    low = max(low, model_height_m * lane_width_m / apparent_high)
+    return low, max(low, min(high, model_height_m * narrow / apparent_low))
 
 
 def _markings(drawn: dict[str, Any], lanes: int, lane_width_m: float) -> tuple[Marking, ...]:

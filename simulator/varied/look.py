@@ -1,6 +1,6 @@
 """What one scene of `--roads varied` is drawn with; no look at all is `--roads paper`."""
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from simulator.varied.cabin import Cabin
@@ -16,12 +16,12 @@ from simulator.varied.surface import Surface
 class RoadLook:
     """The look of one scene. The defaults of every part are today's pictures."""
 
-    paint: Paint = Paint()
-    surface: Surface = Surface()
-    roadside: Roadside = Roadside()
-    light: Lighting = Lighting()
-    lens: Lens = Lens()
-    cabin: Cabin = Cabin()
+    paint: Paint = field(default_factory=Paint)
+    surface: Surface = field(default_factory=Surface)
+    roadside: Roadside = field(default_factory=Roadside)
+    light: Lighting = field(default_factory=Lighting)
+    lens: Lens = field(default_factory=Lens)
+    cabin: Cabin = field(default_factory=Cabin)
 
     @staticmethod
     def drawn(seed: int, scene: int = 0) -> "RoadLook":

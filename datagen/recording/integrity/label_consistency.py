@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 import trackfeatures as tf
 from datagen.recording.labels import Labels
+from trackfeatures.measurement import LineOffsets
 
 TOLERANCE_M = 1e-4
 SHIFTS_M = (0.0, -TOLERANCE_M, TOLERANCE_M)
@@ -21,9 +22,16 @@ recorded vertically below it. They are apart by the height times the tangent of 
 the roll angle shows; the suspension adds to the roll, and a jump to the height."""
 FOOT_SLACK_M = 0.005
 
+_Lines = tuple[int, float, LineOffsets]
+"""Number of lanes, their width in m, and offsets of the lines, as `trackfeatures.measure` has them."""
+
 
 def label_problems(
-    labels: Labels, roll: NDArray[np.float64], lanes: int, lane_width_m: float
+    labels: Labels,
+    roll: NDArray[np.float64],
+    lanes: int,
+    lane_width_m: float,
+    line_offsets: LineOffsets = (),
 ) -> Iterator[str]:
     """Contradictions to the definitions in the labels of one round, one line per kind.
 
@@ -38,9 +46,8 @@ def label_problems(
     if wrong := int((labels.lanes != lanes).sum()):
         yield f"{wrong} of {count} labels do not have the {lanes} lanes of the round"
     reach = MAX_HEIGHT_M * np.tan(np.abs(roll)) + FOOT_SLACK_M
-    wrong = sum(
-        not _distances_follow(labels, i, reach[i], lanes, lane_width_m) for i in range(count)
-    )
+    road = lanes, lane_width_m, line_offsets
+    wrong = sum(not _distances_follow(labels, i, reach[i], road) for i in range(count))
     if wrong:
         yield f"{wrong} of {count} labels do not follow from the offset recorded beside them"
     if wrong := sum(not _lane_follows(labels, i, lanes, lane_width_m) for i in range(count)):
@@ -49,28 +56,26 @@ def label_problems(
         yield f"{wrong} of {count} lane-centre offsets do not follow from the distances"
 
 
-def _distances_follow(
-    labels: Labels, i: int, reach_m: float, lanes: int, lane_width_m: float
-) -> bool:
+def _distances_follow(labels: Labels, i: int, reach_m: float, road: _Lines) -> bool:
     """Whether all distances of a frame belong to one foot within reach of the recorded offset."""
     offset, found = float(labels.to_middle[i]), labels.distances[i].astype(np.float64)
     if not np.isfinite(offset):
         return False
-    gaps = found - _expected(offset, lanes, lane_width_m)
+    gaps = found - _expected(offset, road)
     if np.isnan(gaps).all():  # a limit of the measuring systems may lie between the two
         feet = np.linspace(-reach_m, reach_m, 41)
     else:
         feet = np.array([0.0, np.nanmedian(gaps)])
     return any(
-        _close(_expected(offset + foot + shift, lanes, lane_width_m), found, 2 * TOLERANCE_M).all()
+        _close(_expected(offset + foot + shift, road), found, 2 * TOLERANCE_M).all()
         for foot in feet[np.abs(feet) <= reach_m]
         for shift in SHIFTS_M
     )
 
 
-def _expected(offset: float, lanes: int, lane_width_m: float) -> NDArray[np.float64]:
+def _expected(offset: float, road: _Lines) -> NDArray[np.float64]:
     """The distances (5,) at an offset from the track's centre (m), NaN where absent."""
-    values = tf.measure(offset, 0.0, 0.0, 0.0, lanes, lane_width_m).distances.values()
+    values = tf.measure(offset, 0.0, 0.0, 0.0, *road).distances.values()
     return np.array([np.nan if d is None else d for d in values])
 
 

@@ -126,7 +126,8 @@ def _labels(index: RoundIndex) -> Iterator[str]:
     roll = np.array(
         [VehicleState.FromString(bytes(states.payload(i))).roll for i in range(len(labels))]
     )
-    yield from label_problems(labels, roll, index.header.lanes, index.header.lane_width_m)
+    header = index.header
+    yield from label_problems(labels, roll, header.lanes, header.lane_width_m, header.line_offsets)
 
 
 class _MessageChecker:

@@ -143,7 +143,9 @@ class Graphics:
         if NIGHT in defines:
             head += _source("night.glsl")
         classes = "".join(f"#define {name.upper()} {k}\n" for k, name in enumerate(CLASSES))
-        libraries = "".join(_source(library) for library in (*LIBRARIES, *VARIED_LIBRARIES * varied))
+        libraries = "".join(
+            _source(library) for library in (*LIBRARIES, *VARIED_LIBRARIES * varied)
+        )
         program = self.context.program(
             vertex_shader=head + _source(f"{VERTEX_SHADERS.get(name, name)}.vert.glsl"),
             fragment_shader=head + classes + libraries + _source(f"{name}.frag.glsl"),

@@ -6,7 +6,6 @@ from numpy.typing import NDArray
 from simulator.camera.scene.themes import Colour
 from simulator.camera.scene.varied_light import lamp_colour
 from simulator.track.road import Road
-from simulator.varied.carriageway import Line, Marking
 from simulator.varied.look import RoadLook
 from simulator.varied.lighting import Lighting
 from simulator.varied.paint import Paint

@@ -144,7 +144,7 @@ def test_curvature_ahead_comes_from_all_rounds_of_a_track() -> None:
     s = np.concatenate([np.arange(0, 32), np.arange(0, 32)]).astype(np.float32)
     number = np.repeat([0, 1], 32)
     curvature = np.where((s >= 20) & (number == 0), 0.02, 0.0).astype(np.float32)
-    found = curvature_ahead(s, curvature, np.array(["bent", "straight"])[number])
+    found = curvature_ahead(s, curvature, np.array(["bent", "straight"])[number], np.ones(len(s)))
     np.testing.assert_allclose(found[0], [0, 0, 0, 0, 0.02, 0.02, 0.02, NAN])
     np.testing.assert_allclose(found[12], [0, 0, 0.02, 0.02, 0.02, NAN, NAN, NAN])
     np.testing.assert_allclose(found[32], [0, 0, 0, 0, 0, 0, 0, NAN])

@@ -1,0 +1,28 @@
+"""What one round of `--roads varied` is drawn with: its road, and the look of each scene."""
+
+from dataclasses import dataclass
+from typing import Any
+
+from simulator.varied.carriageway import Carriageway
+from simulator.varied.draw import rebuilt
+from simulator.varied.look import RoadLook
+
+
+@dataclass(frozen=True, slots=True)
+class VariedRound:
+    """One round's road, and the look of each of its scenes, in order."""
+
+    carriageway: Carriageway
+    scenes: tuple[RoadLook, ...]
+
+    @staticmethod
+    def drawn(seed: int, lanes: int, scenes: int, model_height_m: float) -> "VariedRound":
+        """The round with `seed`, in pictures for a model whose camera is `model_height_m` high."""
+        looks = tuple(RoadLook.drawn(seed, scene) for scene in range(scenes))
+        return VariedRound(Carriageway.drawn(seed, lanes, model_height_m), looks)
+
+    @staticmethod
+    def from_dict(values: dict[str, Any]) -> "VariedRound":
+        """That with these values; raises KeyError, TypeError or ValueError for others."""
+        found: VariedRound = rebuilt(VariedRound, values)
+        return found
