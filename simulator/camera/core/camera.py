@@ -31,6 +31,8 @@ Picture = NDArray[Any]
 MAX_SIZE = 4096
 DRIVER_CAMERA = CameraParameters()
 _OWN_PAINT = 0
+PARKED_REACH_M = 110.0
+"""Parked cars farther off are not drawn."""
 HEADLIGHT_AT = (2.1, 0.0, 0.4)
 """Of both headlights, in the body frame, metres."""
 
@@ -125,9 +127,10 @@ class Camera:
             light = lit_as(light, look.light)
         frame = np.concatenate([np.zeros(24), *_light_rows(light), np.zeros(8)]).astype(np.float32)
         self._set_frame(frame, optics.eye_of(self.parameters, np.zeros(6), "front"))
+        scene = Scene(graphics, self.road, self._survey, seed, light, look)
         return _LoadedScene(
             light,
-            Scene(graphics, self.road, self._survey, seed, light, look),
+            scene,
             # Rendered with the light of the frame that is bound.
             Sky(graphics, light.weather, float(self.intrinsics[0, 0])),
             Precipitation(graphics, light, seed) if light.falling > 0.0 else None,
@@ -135,7 +138,7 @@ class Camera:
             # Cars of different rounds differ in colour; index 0 is that of our own car.
             first_paint=1 + seed % 5,
             cars=shared_cars(graphics, *([NIGHT] if look and look.light.night else [])),
-            imaging=Imaging(look, light, self.parameters) if look else None,
+            imaging=Imaging(look, light, self.parameters, scene.bridges) if look else None,
         )
 
     def render(
@@ -274,6 +277,12 @@ class Camera:
         poses = np.asarray(() if others is None else others, dtype=np.float64).reshape(-1, 6)
         first = self._loaded.first_paint
         paints = [first + k for k in range(len(poses))]
+        parked = self._loaded.scene.parked
+        if len(parked):
+            place = np.asarray(body_pose, dtype=np.float64)[:2]
+            near = np.hypot(*(parked[:, :2] - place).T) < PARKED_REACH_M
+            poses = np.vstack([poses, parked[near]])
+            paints += np.flatnonzero(near).tolist()
         if view in ("chase", "top"):
             own = np.asarray(body_pose, dtype=np.float64).copy()
             own[:3] -= optics.rotation(*own[3:])[:, 2] * CarParameters.cg_height

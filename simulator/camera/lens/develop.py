@@ -32,6 +32,7 @@ def develop(
     picture: Picture,
     gain: Plane,
     add: Plane,
+    exposure: float,
     motion: tuple[float, float, float, float],
     glare: tuple[float, float, float],
     noise: tuple[float, int],
@@ -40,7 +41,8 @@ def develop(
 ) -> Picture:
     """The developed picture (H, W, 3) of `picture` (H, W, 3).
 
-    `gain` and `add` (H, W, 3) apply to linear light, 1 the brightest that is displayed. `motion`:
+    `gain` and `add` (H, W, 3), then the factor `exposure`, apply to linear light, 1 the brightest
+    that is displayed. `motion`:
     u, v of the point the car moves to, height of the camera times focal length (m px), and way
     during the exposure (m). `glare`: u, v of the sun and strength. `noise`: standard deviation in
     display values of 0 to 255, and the seed of this picture. `normal`: see `noise_table`; `tone`
@@ -52,7 +54,7 @@ def develop(
     sigma = np.float32(noise[0] / 255.0 / NOISE_STEPS)
     state = np.uint64(noise[1])
     light = np.empty(3 * width, np.float32)
-    top = np.float32(TONES - 1)
+    top, factor = np.float32(TONES - 1), np.float32(exposure)
     for v in range(height):
         _exposed_row(picture, v, motion, linear, light)
         if glare[2] > 0.0:
@@ -62,7 +64,7 @@ def develop(
         row_gain, row_add = gain[v].reshape(3 * width), add[v].reshape(3 * width)
         grain, row = normal[first : first + 3 * width], out[v].reshape(3 * width)
         for k in range(3 * width):
-            value = np.sqrt(max(light[k] * row_gain[k] + row_add[k], np.float32(0.0)))
+            value = np.sqrt(max(light[k] * row_gain[k] + row_add[k], np.float32(0.0)) * factor)
             value = (value + sigma * np.float32(grain[k])) * top + np.float32(0.5)
             light[k] = min(max(value, np.float32(0.0)), top)
         for k in range(3 * width):

@@ -1,10 +1,14 @@
 """From the rendered picture to the recorded one: rain on the glass, blur, noise, tone and JPEG."""
 
+import math
+from collections.abc import Sequence
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from simulator.arrays import FloatArray
+from simulator.camera.bridges.bridges import Bridge
 from simulator.camera.core.optics import Eye
 from simulator.camera.lens.cabin import REFERENCE_WIDTH, glass_of
 from simulator.camera.lens.develop import TONES, develop, noise_table
@@ -20,6 +24,8 @@ RAIN_DROPS = 0.08
 look has no drops of its own."""
 DAZZLED = 245
 """Display value from which a pixel shows the sun itself."""
+ADAPTING_M = 10.0
+"""Way that the exposure needs to follow a change of brightness."""
 DARK_NOISE = 1.8
 """Factor on the noise by night."""
 
@@ -27,13 +33,18 @@ DARK_NOISE = 1.8
 class Imaging:
     """Cabin, lens and sensor of one look, in one light, for one camera."""
 
-    def __init__(self, look: RoadLook, light: Light, camera: CameraParameters) -> None:
+    def __init__(
+        self, look: RoadLook, light: Light, camera: CameraParameters, bridges: Sequence[Bridge]
+    ) -> None:
         width, height = camera.width, camera.height
         self._lens, self._light, self._flare = look.lens, light, look.light.flare
         self._size = width, height
         self._matrix: FloatArray = camera.intrinsics()
         self._camera = camera
         self._glass = glass_of(look, light, width, height)
+        adapts = look.light.adaptation_stops if light.shade < 0.5 else 0.0
+        self._adaptation = adapts, [(bridge.s, bridge.half_along) for bridge in bridges]
+        self._night = look.light.night
         self._tone = tone_curve(look.lens.contrast)
         self._normal = noise_table()
         self._noise = look.lens.noise * (DARK_NOISE if look.light.night else 1.0)
@@ -47,6 +58,8 @@ class Imaging:
     def developed(self, picture: Picture, eye: Eye, s: float) -> Picture:
         """The recorded picture of the rendered one (H, W, 3), from `eye`, at `s` m of the road."""
         lens = self._lens
+        if self._night:
+            picture = _with_glow(picture)
         if self._windscreen is not None:
             picture = self._windscreen.applied(picture, s)
         if lens.softness_px > 0.0:
@@ -56,6 +69,7 @@ class Imaging:
             picture,
             self._glass.gain,
             self._glass.add,
+            2.0 ** adaptation(s, *self._adaptation),
             self._motion(),
             self._glare(picture, eye),
             (self._noise, _seed_of(eye)),
@@ -89,6 +103,28 @@ class Imaging:
             part = picture[max(int(v) - 2, 0) : int(v) + 3, max(int(u) - 2, 0) : int(u) + 3]
             strength *= 0.1 + 0.9 * float((part.min(axis=2) >= DAZZLED).mean()) if part.size else 1.0
         return u, v, strength
+
+
+def adaptation(s: float, stops: float, bridges: Sequence[tuple[float, float]]) -> float:
+    """By how many stops the exposure has opened at `s`: up to `stops` on the way through a bridge's
+    shadow, and back to none after it. `bridges`: place along the road and half length, in m."""
+    most = 0.0
+    for place, half in bridges:
+        begin = place - half
+        into = (s - begin) / max(2.0 * half, ADAPTING_M)
+        behind = s - max(place + half, begin + ADAPTING_M)
+        most = max(most, min(into, 1.0) if behind < 0.0 else math.exp(-behind / ADAPTING_M))
+    return stops * most
+
+
+def _with_glow(picture: Picture) -> Picture:
+    """The picture with a glow round what is brighter than the display shows."""
+    width, height = picture.shape[1], picture.shape[0]
+    bright = cv2.resize(cv2.subtract(picture, (200, 200, 200, 0)), (width // 4, height // 4))
+    glow = cv2.GaussianBlur(bright, (0, 0), 0.008 * width)
+    return np.asarray(
+        cv2.addWeighted(picture, 1.0, cv2.resize(glow, (width, height)), 2.5, 0.0), np.uint8
+    )
 
 
 def tone_curve(contrast: float) -> Picture:

@@ -3,6 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from simulator.camera.scene.roadside import seen_road
 from simulator.camera.scene.themes import Colour
 from simulator.camera.scene.varied_light import lamp_colour
 from simulator.track.road import Road
@@ -27,7 +28,8 @@ def look_block(road: Road, look: RoadLook) -> NDArray[np.float32]:
         *_line_rows(road, look.paint),
         *_paint_rows(look.paint),
         *_surface_rows(look.surface),
-        *_lamp_rows(road, look.light),
+        (look.roadside.height, look.surface.phase, 0.0, 0.0),
+        *_lamp_rows(seen_road(road, look), look.light),
     ]
     return np.array(rows, dtype=np.float32)
 

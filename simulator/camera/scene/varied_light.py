@@ -8,7 +8,7 @@ from simulator.varied.lighting import Lighting
 
 SUNNY = ("clear", "dusk", "heavy-shadow")
 """Kinds of light in which the sun may stand low."""
-HEADLIGHT: Colour = (1.9, 1.78, 1.5)
+HEADLIGHT: Colour = (3.4, 3.2, 2.75)
 _NIGHT_SKY: Colour = (0.006, 0.007, 0.010)
 _GLOW: Colour = (0.010, 0.009, 0.010)
 _SODIUM: Colour = (1.0, 0.62, 0.25)

@@ -13,6 +13,7 @@ layout(std140) uniform Look {
     vec4 surface_repair;             // tar, patches, their tone, phase
     vec4 surface_wear;               // wheel tracks, grain, puddles, ragged edge
     vec4 surface_edge;               // widths of gravel and of kerb stones
+    vec4 barrier_shape;              // factor on heights, ripeness of crops
     vec4 lamp_place;                 // from one street lamp to the next along s, y
     vec4 lamp_light;                 // on the road below a lamp
 };

@@ -11,7 +11,7 @@ float headlights_on(vec3 place, vec3 normal) {
     // A low beam: wide below its cut-off, which rises to the right; a little stray light above.
     float cut = 0.012 + 0.03 * clamp(side * 4.0, 0.0, 1.0);
     float below = smoothstep(cut + 0.02, cut - 0.03, up);
-    float wide = exp2(-5.0 * side * side) * (0.6 + 0.4 * exp2(-30.0 * side * side));
+    float wide = exp2(-5.0 * side * side) * (0.8 + 0.2 * exp2(-30.0 * side * side));
     float low = 0.25 + 0.75 * exp2(-70.0 * up * up);
     float ahead_of = smoothstep(0.05, 0.55, dot(ray, beam.xyz));
     float facing = mix(max(-dot(ray, normal), 0.0), 0.55, step(0.8, normal.z));
