@@ -124,7 +124,7 @@ class Camera:
     def _load_scene(self, seed: int, light: Light, look: RoadLook | None) -> _LoadedScene:
         graphics = self._graphics
         if look:
-            light = lit_as(light, look.light)
+            light = lit_as(light, look.light, look.surface.tone)
         frame = np.concatenate([np.zeros(24), *_light_rows(light), np.zeros(8)]).astype(np.float32)
         self._set_frame(frame, optics.eye_of(self.parameters, np.zeros(6), "front"))
         scene = Scene(graphics, self.road, self._survey, seed, light, look)

@@ -1,7 +1,7 @@
 """The pass over a rendered picture that applies motion blur, glass, glare, sensor noise and tone.
 
 The rendered picture holds square roots of linear light, 0 to 255. Each pixel becomes
-tone(sqrt(mean of light over the exposure * gain + add + glare) + noise).
+tone(sqrt((mean of light over the exposure * gain + add + glare) * exposure) + noise).
 """
 
 import numpy as np
@@ -9,12 +9,11 @@ from numpy.typing import NDArray
 
 from runtime.jit import compiled
 
-TONES = 1024
-"""Entries of a tone curve."""
 NOISE_SIZE = 2**17
 NOISE_STEPS = 32.0
 """Steps of the noise table a standard deviation."""
 MOST_TAPS = 6
+LEAST_BLUR_PX = 0.75
 
 Picture = NDArray[np.uint8]
 Plane = NDArray[np.float32]
@@ -37,26 +36,26 @@ def develop(
     glare: tuple[float, float, float],
     noise: tuple[float, int],
     normal: NDArray[np.int8],
-    tone: Picture,
+    contrast: float,
 ) -> Picture:
     """The developed picture (H, W, 3) of `picture` (H, W, 3).
 
     `gain` and `add` (H, W, 3), then the factor `exposure`, apply to linear light, 1 the brightest
-    that is displayed. `motion`:
-    u, v of the point the car moves to, height of the camera times focal length (m px), and way
-    during the exposure (m). `glare`: u, v of the sun and strength. `noise`: standard deviation in
-    display values of 0 to 255, and the seed of this picture. `normal`: see `noise_table`; `tone`
-    (TONES,): display value of each share of the brightest.
+    that is displayed. `motion`: u, v of the point the car moves to, height of the camera times
+    focal length (m px), and way during the exposure (m). `glare`: u, v of the sun and strength.
+    `noise`: standard deviation in display values of 0 to 255, and the seed of this picture.
+    `normal`: see `noise_table`. The tone curve is an S through 0, 0.5 and 1 of the display's range,
+    with the slope 1 + `contrast` in the middle.
     """
     height, width = picture.shape[0], picture.shape[1]
     out = np.empty_like(picture)
-    linear = ((np.arange(256) / 255.0) ** 2).astype(np.float32)
+    one, half, bend = np.float32(1.0), np.float32(0.5), np.float32(4.0 * contrast)
     sigma = np.float32(noise[0] / 255.0 / NOISE_STEPS)
+    factor = np.float32(exposure)
     state = np.uint64(noise[1])
     light = np.empty(3 * width, np.float32)
-    top, factor = np.float32(TONES - 1), np.float32(exposure)
     for v in range(height):
-        _exposed_row(picture, v, motion, linear, light)
+        _exposed_row(picture, v, motion, light)
         if glare[2] > 0.0:
             _add_glare(light, v, glare)
         state = state * np.uint64(6364136223846793005) + np.uint64(1442695040888963407)
@@ -64,21 +63,16 @@ def develop(
         row_gain, row_add = gain[v].reshape(3 * width), add[v].reshape(3 * width)
         grain, row = normal[first : first + 3 * width], out[v].reshape(3 * width)
         for k in range(3 * width):
-            value = np.sqrt(max(light[k] * row_gain[k] + row_add[k], np.float32(0.0)) * factor)
-            value = (value + sigma * np.float32(grain[k])) * top + np.float32(0.5)
-            light[k] = min(max(value, np.float32(0.0)), top)
-        for k in range(3 * width):
-            row[k] = tone[np.int32(light[k])]
+            value = np.sqrt((light[k] * row_gain[k] + row_add[k]) * factor)
+            value = min(max(value + sigma * np.float32(grain[k]), np.float32(0.0)), one)
+            value += bend * (value - half) * value * (one - value)
+            row[k] = np.uint8(min(max(value, np.float32(0.0)), one) * np.float32(255.0) + half)
     return out
 
 
 @compiled
 def _exposed_row(
-    picture: Picture,
-    v: int,
-    motion: tuple[float, float, float, float],
-    linear: Plane,
-    light: Plane,
+    picture: Picture, v: int, motion: tuple[float, float, float, float], light: Plane
 ) -> None:
     """Linear light (3 W,) of row `v`, the mean over the exposure.
 
@@ -87,24 +81,27 @@ def _exposed_row(
     """
     height, width = picture.shape[0], picture.shape[1]
     u0, v0, reach, travel = motion
+    full = np.float32(1.0 / 255.0**2)
+    row = picture[v].reshape(3 * width)
+    for k in range(3 * width):
+        light[k] = np.float32(row[k]) * np.float32(row[k]) * full
     share = travel * max(v - v0, 0.0) / reach  # of the place's distance that the car moves
-    for u in range(width):
-        apart = share * max(abs(u - u0), v - v0)
-        if apart < 0.75:
+    apart = share * max(0.5 * width, v - v0)
+    if apart < LEAST_BLUR_PX:
+        return
+    taps = min(MOST_TAPS, int(apart / 2.0) + 2)
+    light[:] = np.float32(0.0)
+    full /= np.float32(taps)
+    for tap in range(taps):
+        scale = 1.0 / (1.0 - share * ((tap + 0.5) / taps - 0.5))
+        seen = picture[min(max(int(v0 + (v - v0) * scale + 0.5), 0), height - 1)]
+        at = u0 - u0 * scale + 0.5
+        for u in range(width):
+            column = min(max(int(at), 0), width - 1)
+            at += scale
             for c in range(3):
-                light[3 * u + c] = linear[picture[v, u, c]]
-            continue
-        taps = min(MOST_TAPS, int(apart / 2.0) + 2)
-        for c in range(3):
-            light[3 * u + c] = np.float32(0.0)
-        for k in range(taps):
-            scale = 1.0 / (1.0 - share * ((k + 0.5) / taps - 0.5))
-            a = min(max(int(u0 + (u - u0) * scale + 0.5), 0), width - 1)
-            b = min(max(int(v0 + (v - v0) * scale + 0.5), 0), height - 1)
-            for c in range(3):
-                light[3 * u + c] += linear[picture[b, a, c]]
-        for c in range(3):
-            light[3 * u + c] /= np.float32(taps)
+                value = np.float32(seen[column, c])
+                light[3 * u + c] += value * value * full
 
 
 @compiled

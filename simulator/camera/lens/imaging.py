@@ -11,7 +11,7 @@ from simulator.arrays import FloatArray
 from simulator.camera.bridges.bridges import Bridge
 from simulator.camera.core.optics import Eye
 from simulator.camera.lens.cabin import REFERENCE_WIDTH, glass_of
-from simulator.camera.lens.develop import TONES, develop, noise_table
+from simulator.camera.lens.develop import develop, noise_table
 from simulator.camera.lens.drops import Windscreen
 from simulator.camera.scene.light import Light
 from simulator.varied.look import RoadLook
@@ -45,7 +45,6 @@ class Imaging:
         adapts = look.light.adaptation_stops if light.shade < 0.5 else 0.0
         self._adaptation = adapts, [(bridge.s, bridge.half_along) for bridge in bridges]
         self._night = look.light.night
-        self._tone = tone_curve(look.lens.contrast)
         self._normal = noise_table()
         self._noise = look.lens.noise * (DARK_NOISE if look.light.night else 1.0)
         self._windscreen: Windscreen | None = None
@@ -74,7 +73,7 @@ class Imaging:
             self._glare(picture, eye),
             (self._noise, _seed_of(eye)),
             self._normal,
-            self._tone,
+            lens.contrast,
         )
         if lens.sharpening > 0.0:
             soft = cv2.GaussianBlur(picture, (3, 3), 0.0)
@@ -125,14 +124,6 @@ def _with_glow(picture: Picture) -> Picture:
     return np.asarray(
         cv2.addWeighted(picture, 1.0, cv2.resize(glow, (width, height)), 2.5, 0.0), np.uint8
     )
-
-
-def tone_curve(contrast: float) -> Picture:
-    """Display value (TONES,) of each share of the brightest: an S through 0, 0.5 and 1, whose
-    slope in the middle is 1 + `contrast`."""
-    x = np.linspace(0.0, 1.0, TONES)
-    y = x + contrast * (x - 0.5) * 4.0 * x * (1.0 - x)
-    return np.rint(255.0 * np.clip(y, 0.0, 1.0)).astype(np.uint8)
 
 
 def _seed_of(eye: Eye) -> int:

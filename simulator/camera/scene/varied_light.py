@@ -8,6 +8,8 @@ from simulator.varied.lighting import Lighting
 
 SUNNY = ("clear", "dusk", "heavy-shadow")
 """Kinds of light in which the sun may stand low."""
+USUAL_ALBEDO, COMPENSATED = 0.13, 0.45
+"""Of a road for which the kinds of light are right; exponent of the automatic exposure."""
 HEADLIGHT: Colour = (3.4, 3.2, 2.75)
 _NIGHT_SKY: Colour = (0.006, 0.007, 0.010)
 _GLOW: Colour = (0.010, 0.009, 0.010)
@@ -17,13 +19,15 @@ LAMP_GLOW = 0.035
 """Scattered light on a lit road, as a share of that below a lamp."""
 
 
-def lit_as(light: Light, look: Lighting) -> Light:
-    """`light` as `look` has it."""
+def lit_as(light: Light, look: Lighting, albedo: float = 0.0) -> Light:
+    """`light` as `look` has it, on a road of this albedo (0: the scenery's own), for which the
+    exposure makes up in part, as a camera's automatic does."""
+    automatic = (USUAL_ALBEDO / albedo) ** COMPENSATED if albedo else 1.0
     if look.night:
         light = _by_night(light, look)
     elif look.low_sun_deg > 0.0 and light.kind in SUNNY:
         light = _with_low_sun(light, look.low_sun_deg)
-    return replace(light, exposure=light.exposure * 2.0**look.exposure_stops)
+    return replace(light, exposure=light.exposure * automatic * 2.0**look.exposure_stops)
 
 
 def lamp_colour(look: Lighting) -> Colour:

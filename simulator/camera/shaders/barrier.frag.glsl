@@ -46,8 +46,8 @@ void main() {
         facing = normalize(facing + vec3(0.0, 0.0, 0.7 + fine.g));
         solid = clamp(1.2 + (0.55 - h) * 8.0 - 2.5 * broad.r * step(h, 0.7), 0.0, 1.0);
     } else if (sort > 5.5) {     // crops, as high as they are dense
-        vec4 stalk = texture(noise, vec2(s * 1.1, h * 0.13));
-        colour = mix(grass.rgb, vec3(0.40, 0.31, 0.12), barrier_shape.y) * (0.35 + 0.9 * stalk.g) * (0.45 + 0.55 * smoothstep(0.0, 1.0, h));
+        vec4 stalk = texture(noise, vec2(s * 0.37 + 0.02 * broad.g, h * 0.17));
+        colour = mix(grass.rgb, vec3(0.40, 0.31, 0.12), barrier_shape.y) * (0.5 + 0.4 * stalk.g + 0.35 * fine.r) * (0.5 + 0.5 * smoothstep(0.0, 1.0, h));
         facing = normalize(facing + vec3(0.0, 0.0, 1.0));
         solid = clamp(1.3 + (1.1 - h) * 6.0 - 3.0 * stalk.r * step(h, 1.12), 0.0, 1.0);
 #endif
