@@ -64,7 +64,7 @@ class RoundPlan:
     """What the road is drawn with; None: as the paper's roads."""
 
     def as_dict(self) -> dict[str, Any]:
-        """The entry of `plan.json`; that of a paper's road is the same as before there were others."""
+        """The entry of `plan.json`; a paper's road has none of `varied`, as in earlier versions."""
         entry = asdict(self)
         if self.varied is None:
             del entry["varied"]

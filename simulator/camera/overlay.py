@@ -40,7 +40,8 @@ def marking_polylines(
     ahead_m: float = 60.0,
     view: str = "front",
 ) -> list[FloatArray]:
-    """Pixel polylines (n, 2) of the centres of the true markings, leftmost first.
+    """Pixel polylines (n, 2) of the centres of the true markings, leftmost first; of a double line
+    the one nearer to the car's lane.
 
     `at` is (s, body pose) of the car, or its state. Each line runs from just behind the eye to
     `ahead_m`; points behind the camera or far outside the image are cut off. Occlusion by hills is
@@ -52,7 +53,11 @@ def marking_polylines(
     if view in ("top", "left", "right"):
         start = -ahead_m
     distances = s + np.arange(start, end + STEP_M / 2, STEP_M)
-    points = road_points(road.track.arrays(), distances, road.markings_y)
+    lines = road.markings_y
+    if road.line_offsets:
+        pose = np.asarray(body_pose, dtype=np.float64)
+        lines = road.lines_y(road.track.project(float(pose[0]), float(pose[1]), s)[1])
+    points = road_points(road.track.arrays(), distances, lines)
     pixels, depth = camera.project(points.reshape(-1, 3), body_pose, view)
     good = _near_picture(camera, pixels, depth).reshape(points.shape[:2])
     return _runs(pixels.reshape(*points.shape[:2], 2), good)

@@ -39,7 +39,7 @@ class Road:
         if given and (given.lane_width_m, len(given.markings)) != (self.lane_width, self.lanes + 1):
             raise UserError(
                 f"a road of {self.lanes} lanes of {self.lane_width:g} m has a carriageway of "
-                f"{len(given.markings) - 1} lanes of {given.lane_width_m:g} m; give one of this road"
+                f"{len(given.markings) - 1} lanes of {given.lane_width_m:g} m; give its own"
             )
 
     @staticmethod
@@ -79,6 +79,16 @@ class Road:
     def markings_y(self) -> NDArray[np.float64]:
         """Lateral places (lanes + 1,) of the markings, from the leftmost to the rightmost."""
         return tf.marking_offsets(self.lanes, self.lane_width)
+
+    def lines_y(self, to_middle: float) -> NDArray[np.float64]:
+        """Lateral places (lanes + 1,) of the lines that count for a car at `to_middle`: of a
+        double line the one nearer to the car's lane."""
+        if not self.line_offsets:
+            return self.markings_y
+        lane = tf.lane_index(to_middle, self.lanes, self.lane_width)
+        right_of = np.arange(self.lanes + 1) > lane
+        offsets = np.array(self.line_offsets)
+        return self.markings_y + np.where(right_of, offsets[:, 0], offsets[:, 1])
 
     def measure(self, s: float, to_middle: float, angle: float) -> tf.TrackFeatures:
         """True track features of a car at (s, to_middle) with heading angle `angle` (rad)."""

@@ -23,7 +23,7 @@ the roll angle shows; the suspension adds to the roll, and a jump to the height.
 FOOT_SLACK_M = 0.005
 
 _Lines = tuple[int, float, LineOffsets]
-"""Number of lanes, their width in m, and offsets of the lines, as `trackfeatures.measure` has them."""
+"""Number of lanes, their width in m, and offsets of the lines as of `trackfeatures.measure`."""
 
 
 def label_problems(
