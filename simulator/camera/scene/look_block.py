@@ -79,6 +79,16 @@ def _surface_rows(surface: Surface) -> list[Row]:
     ]
 
 
+def surface_features(surface: Surface) -> tuple[str, ...]:
+    """What of surface.glsl the road's program compiles in: the rest would cost time in vain."""
+    wanted = {
+        "slabs": surface.other_tone > 0.0 or surface.concrete > 0.0,
+        "repairs": surface.tar > 0.0 or surface.patches > 0.0,
+        "puddles": surface.puddles > 0.0,
+    }
+    return tuple(name for name, used in wanted.items() if used)
+
+
 def _lamp_rows(road: Road, light: Lighting) -> list[Row]:
     every = light.lamp_every_m if light.night else 0.0
     return [(every, LAMP_SIDE * (road.wall_offset - 1.2), 0.0, 0.0), (*lamp_colour(light), 0.0)]

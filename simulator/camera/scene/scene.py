@@ -20,7 +20,7 @@ from simulator.camera.core.mesh import Mesh, Surface
 from simulator.camera.core.optics import Eye
 from simulator.camera.scene import barriers, land, props, road_mesh, shadow_mask
 from simulator.camera.scene.light import Light
-from simulator.camera.scene.look_block import LINE_COLOURS, look_block
+from simulator.camera.scene.look_block import LINE_COLOURS, look_block, surface_features
 from simulator.camera.scene.roadside import parked_cars, seen_road, seen_theme
 from simulator.camera.scene.terrain import COARSEST, Survey
 from simulator.camera.scene.terrain import build as build_terrain
@@ -88,11 +88,12 @@ class Scene:
             return Mesh(graphics, variant, surface, layout)
 
         varied = [VARIED] if look else []
+        features = {"paved": surface_features(look.surface) if look else (), "verge": ()}
         surfaces = road_mesh.surfaces(ground.mesh, road)
         lands = [land.surface(tree_shade, covered, span) for span in LAND]
         self._barriers = mesh("barrier", rails, barriers.LAYOUT, *varied)
         self._solid = (
-            *(mesh(name, each, road_mesh.LAYOUT, *varied) for name, each in surfaces.items()),
+            *(mesh(name, each, road_mesh.LAYOUT, *varied, *features[name]) for name, each in surfaces.items()),
             *(mesh("prop", each, props.LAYOUT, name) for name, each in built.items()),
             *(mesh("land", each, land.LAYOUT, *(["sea"] if theme.sea else [])) for each in lands),
         )

@@ -84,8 +84,10 @@ void main() {
 #else
 #ifdef VARIED
     float inside = on_asphalt(y + sign(y) * surface_wear.w * (fine.g + broad.g - 1.0), wy);
+#ifdef PUDDLES
     float water = puddle_at(fine, broad) * inside;
     colour *= 1.0 - 0.5 * water;
+#endif
 #else
     float inside = on_asphalt(y, wy);
 #endif
@@ -104,7 +106,7 @@ void main() {
     pixel = display_values(light_at_eye(colour, light_shares, 1.0), air_light);
 #else
     vec3 light = light_at_eye(colour, light_shares, sunshine(track));
-#ifdef VARIED
+#ifdef PUDDLES
     light += mirrored_sky(place) * water * light_shares.y;
 #endif
     pixel = display_values(light, air_light);

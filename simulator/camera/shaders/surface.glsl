@@ -42,9 +42,13 @@ float patch_at(float s, float y, float ws, float wy) {
 // Albedo of the road. `track_off`: distance from the nearest wheel track; `lane_side`: from the
 // nearest side of a lane.
 vec3 surface_at(float s, float y, float ws, float wy, vec4 fine, vec4 broad, float track_off, float lane_side) {
+    vec3 colour = asphalt.rgb;
+    float concrete = 0.0;
+#ifdef SLABS
     float other = other_material(s, ws);
-    vec3 colour = asphalt.rgb * mix(1.0, surface_tone.x, other);
-    float concrete = surface_joint.x > 0.5 ? 1.0 : surface_joint.x < -0.5 ? other : 0.0;
+    colour *= mix(1.0, surface_tone.x, other);
+    concrete = surface_joint.x > 0.5 ? 1.0 : surface_joint.x < -0.5 ? other : 0.0;
+#endif
     float side = clamp((y - surface_joint.w) / wy + 0.5, 0.0, 1.0);
     colour *= 1.0 + surface_joint.z * (side - 0.5);
 
@@ -55,13 +59,17 @@ vec3 surface_at(float s, float y, float ws, float wy, vec4 fine, vec4 broad, flo
     tone *= 1.0 - 0.45 * soil.w * crack * (1.0 - 0.6 * concrete);
     colour *= max(tone, 0.2);
 
+#ifdef SLABS
     // Slabs of concrete differ a little in tone; dirt lies in the joints between them.
     float slab = random_of(floor(s / surface_joint.y) + 50.0 * floor(lane_side + 20.0));
     float joint = max(repeated(s, ws, 0.025, surface_joint.y), covered(lane_side - floor(lane_side + 0.5), wy / lanes.y, -0.004, 0.004));
     colour *= mix(1.0, (0.92 + 0.16 * slab) * (1.0 - 0.55 * joint), concrete);
-
+#endif
+#ifdef REPAIRS
     colour *= mix(1.0, surface_repair.z, patch_at(s, y, ws, wy));
-    return mix(colour, vec3(0.022), 0.9 * tar_at(s, y, ws, wy, broad.g - 0.5));
+    colour = mix(colour, vec3(0.022), 0.9 * tar_at(s, y, ws, wy, broad.g - 0.5));
+#endif
+    return colour;
 }
 
 // Share of the footprint under water: hollows, most of them beside the wheel tracks.
