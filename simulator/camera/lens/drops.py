@@ -21,16 +21,22 @@ SMALL = 4
 """A drop shows a wide view so small that this coarser picture of it is sharp enough."""
 SWEEP = 0.3
 """Share of a wiper's period that its stroke takes."""
+MOST_DROPS = 400
+OPACITY = 235
+"""Of a drop, of 255."""
+BLADE = 14
+"""Display value of the wiper."""
 VIEW = 0.16
 """How far about itself a drop shows the picture, as a share of the width."""
 
 
 @dataclass(frozen=True)
 class _Drops:
-    """Where each pixel looks in the small picture, and how much of a drop covers it (0 to 255)."""
+    """N pixels that drops cover: the number of each, counted along the rows, that of the pixel
+    which it shows of the small picture, and how much of a drop covers it (0 to 255)."""
 
-    source_u: NDArray[np.float32]
-    source_v: NDArray[np.float32]
+    pixel: NDArray[np.int32]
+    source: NDArray[np.int32]
     cover: Picture
 
 
@@ -51,18 +57,14 @@ class Windscreen:
         turns, phase = divmod(s / self._period_m, 1.0)
         stroke, stage = (int(turns), int(phase * STAGES)) if self._wipes else (0, STAGES - 1)
         drops = self._drops(stroke, stage)
-        width, height = self._size
-        small = cv2.resize(
-            picture, (-(-width // SMALL), -(-height // SMALL)), interpolation=cv2.INTER_AREA
-        )
-        seen = cv2.remap(
-            small, drops.source_u, drops.source_v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT
-        )
-        wet = _blended(picture, np.asarray(seen, dtype=np.uint8), drops.cover)
-        return self._wiped(wet, phase / SWEEP) if self._wipes and phase < SWEEP else wet
+        small = cv2.resize(picture, _small(self._size), interpolation=cv2.INTER_AREA)
+        wet = _through(picture, np.asarray(small, np.uint8), drops.pixel, drops.source, drops.cover)
+        if self._wipes and phase < SWEEP:
+            self._wipe(wet, phase / SWEEP)
+        return wet
 
-    def _wiped(self, picture: Picture, share: float) -> Picture:
-        """The wiper's blade over `picture`, at `share` (0 to 1) of its stroke there and back."""
+    def _wipe(self, picture: Picture, share: float) -> None:
+        """Draw the wiper's blade over `picture`, at `share` (0 to 1) of its stroke and back."""
         width, height = self._size
         angle = math.radians(-85.0 + 170.0 * (1.0 - abs(2.0 * share - 1.0)))
         reach = 1.15 * height
@@ -71,8 +73,8 @@ class Windscreen:
         mask = np.zeros((height, width), np.uint8)
         thick = max(1, round(0.018 * width))
         cv2.line(mask, (round(u), round(v)), tip, 235, thick, cv2.LINE_AA)
-        mask = np.asarray(cv2.GaussianBlur(mask, (0, 0), 1.4 * width / REFERENCE_WIDTH), np.uint8)
-        return _blended(picture, np.full_like(picture, 14), mask)
+        soft = 2 * round(1.5 * width / REFERENCE_WIDTH) + 1
+        _darken(picture, np.asarray(cv2.blur(mask, (soft, soft)), np.uint8), BLADE)
 
     def _drops(self, stroke: int, stage: int) -> _Drops:
         """The drops of one stroke at a stage; those of an earlier stage are among them."""
@@ -83,60 +85,82 @@ class Windscreen:
         return self._kept[1]
 
 
+def _small(size: tuple[int, int]) -> tuple[int, int]:
+    """Width and height of the small picture."""
+    return -(-size[0] // SMALL), -(-size[1] // SMALL)
+
+
 def _fallen(
     cover: float, share: float, size: tuple[int, int], rng: np.random.Generator
 ) -> _Drops:
     """The first `share` of drops that would cover about the share `cover` of a picture."""
     width, height = size
     scale = width / REFERENCE_WIDTH
-    most = 400
-    radius = np.clip(np.exp(rng.normal(0.7, 0.45, most)), 1.1, 9.0) * scale
-    middle = rng.uniform(0.0, 1.0, (most, 2)) * (width, height)
-    stretch = rng.uniform(1.0, 1.5, most)
-    area = np.cumsum(np.pi * radius**2 * stretch)
+    radius = np.clip(np.exp(rng.normal(0.7, 0.45, MOST_DROPS)), 1.1, 9.0) * scale
+    middle = rng.uniform(0.0, 1.0, (MOST_DROPS, 2)) * (width, height)
+    tall = radius * rng.uniform(1.0, 1.5, MOST_DROPS)
+    area = np.cumsum(np.pi * radius * tall)
     count = int(np.searchsorted(area, cover * share * width * height))
-    v, u = np.mgrid[0:height, 0:width].astype(np.float32)
-    mask: FloatArray = np.zeros((height, width))
-    for k in range(min(count, most)):
-        _stamp((u, v), mask, middle[k], radius[k], radius[k] * stretch[k], VIEW * width)
-    soft = cv2.GaussianBlur(mask, (0, 0), float(rng.uniform(0.4, 1.4)) * scale)
-    return _Drops(u / SMALL, v / SMALL, np.rint(255.0 * soft).astype(np.uint8))
-
-
-def _stamp(
-    source: tuple[NDArray[np.float32], NDArray[np.float32]],
-    mask: FloatArray,
-    middle: FloatArray,
-    half_u: float,
-    half_v: float,
-    view: float,
-) -> None:
-    """Write one drop: upside down, it shows the picture `view` pixels about it."""
-    height, width = mask.shape
-    left, right = max(int(middle[0] - half_u), 0), min(int(middle[0] + half_u) + 2, width)
-    top, bottom = max(int(middle[1] - half_v), 0), min(int(middle[1] + half_v) + 2, height)
-    if left >= right or top >= bottom:
-        return
-    x = (np.arange(left, right)[None, :] - middle[0]) / half_u
-    y = (np.arange(top, bottom)[:, None] - middle[1]) / half_v
-    off = x**2 + y**2
-    inside = off < 1.0
-    part = slice(top, bottom), slice(left, right)
-    bent = 0.4 + 0.6 * off
-    source[0][part] = np.where(inside, middle[0] - view * x * bent, source[0][part])
-    source[1][part] = np.where(inside, middle[1] - view * y * bent, source[1][part])
-    mask[part] = np.where(inside, 0.92, mask[part])
+    shape = np.column_stack([middle, radius, tall])[:count]
+    mask, source = _stamped(shape, width, height, VIEW * width)
+    soft = cv2.GaussianBlur(mask, (0, 0), float(rng.uniform(0.4, 1.0)) * scale)
+    # Where a drop's soft edge lies beside it, the pixel shows no drop: only inside is kept.
+    pixel = np.flatnonzero(mask).astype(np.int32)
+    return _Drops(pixel, source.reshape(-1)[pixel], np.asarray(soft, np.uint8).reshape(-1)[pixel])
 
 
 @compiled
-def _blended(picture: Picture, other: Picture, cover: Picture) -> Picture:
-    """`other` over `picture` where `cover` (H, W), 0 to 255, says how much."""
+def _stamped(
+    shape: FloatArray, width: int, height: int, view: float
+) -> tuple[Picture, NDArray[np.int32]]:
+    """Where drops lie (H, W), and the pixel of the small picture that each pixel of them shows.
+
+    `shape` (N, 4): middle and half axes of each drop. It shows the picture `view` pixels about it,
+    upside down.
+    """
+    mask = np.zeros((height, width), np.uint8)
+    source = np.zeros((height, width), np.int32)
+    across, down = (width + SMALL - 1) // SMALL, (height + SMALL - 1) // SMALL
+    for k in range(len(shape)):
+        u0, v0, half_u, half_v = shape[k]
+        for v in range(max(int(v0 - half_v), 0), min(int(v0 + half_v) + 2, height)):
+            for u in range(max(int(u0 - half_u), 0), min(int(u0 + half_u) + 2, width)):
+                x, y = (u - u0) / half_u, (v - v0) / half_v
+                off = x * x + y * y
+                if off < 1.0:
+                    bent = view * (0.4 + 0.6 * off) / SMALL
+                    a = min(max(int(u0 / SMALL - x * bent), 0), across - 1)
+                    b = min(max(int(v0 / SMALL - y * bent), 0), down - 1)
+                    mask[v, u], source[v, u] = OPACITY, b * across + a
+    return mask, source
+
+
+@compiled
+def _through(
+    picture: Picture,
+    small: Picture,
+    pixel: NDArray[np.int32],
+    source: NDArray[np.int32],
+    cover: Picture,
+) -> Picture:
+    """A copy of `picture` with the drops in it: see `_Drops`."""
     out = picture.copy()
-    for v in range(out.shape[0]):
-        for u in range(out.shape[1]):
+    flat, seen = out.reshape(-1, 3), small.reshape(-1, 3)
+    for k in range(len(pixel)):
+        weight = np.int32(cover[k])
+        for c in range(3):
+            old, new = np.int32(flat[pixel[k], c]), np.int32(seen[source[k], c])
+            flat[pixel[k], c] = old + (new - old) * weight // 255
+    return out
+
+
+@compiled
+def _darken(picture: Picture, cover: Picture, value: int) -> None:
+    """Draw the grey `value` over `picture` where `cover` (H, W), 0 to 255, says how much."""
+    for v in range(picture.shape[0]):
+        for u in range(picture.shape[1]):
             weight = np.int32(cover[v, u])
             if weight > 0:
                 for c in range(3):
-                    old, new = np.int32(out[v, u, c]), np.int32(other[v, u, c])
-                    out[v, u, c] = old + (new - old) * weight // 255
-    return out
+                    old = np.int32(picture[v, u, c])
+                    picture[v, u, c] = old + (value - old) * weight // 255
