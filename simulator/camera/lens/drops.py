@@ -90,9 +90,7 @@ def _small(size: tuple[int, int]) -> tuple[int, int]:
     return -(-size[0] // SMALL), -(-size[1] // SMALL)
 
 
-def _fallen(
-    cover: float, share: float, size: tuple[int, int], rng: np.random.Generator
-) -> _Drops:
+def _fallen(cover: float, share: float, size: tuple[int, int], rng: np.random.Generator) -> _Drops:
     """The first `share` of drops that would cover about the share `cover` of a picture."""
     width, height = size
     scale = width / REFERENCE_WIDTH

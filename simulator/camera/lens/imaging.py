@@ -100,7 +100,9 @@ class Imaging:
         strength = self._flare * float(np.exp(-beyond / (0.2 * width)))
         if beyond == 0.0:
             part = picture[max(int(v) - 2, 0) : int(v) + 3, max(int(u) - 2, 0) : int(u) + 3]
-            strength *= 0.1 + 0.9 * float((part.min(axis=2) >= DAZZLED).mean()) if part.size else 1.0
+            strength *= (
+                0.1 + 0.9 * float((part.min(axis=2) >= DAZZLED).mean()) if part.size else 1.0
+            )
         return u, v, strength
 
 

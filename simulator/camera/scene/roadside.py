@@ -35,9 +35,7 @@ def seen_road(road: Road, look: RoadLook | None) -> Road:
     """The road as it is drawn."""
     if look is None or look.roadside.gap_m < 0.0:
         return road
-    return NearRoad(
-        road.track, road.lanes, road.lane_width, road.carriageway, look.roadside.gap_m
-    )
+    return NearRoad(road.track, road.lanes, road.lane_width, road.carriageway, look.roadside.gap_m)
 
 
 def seen_theme(theme: Theme, look: RoadLook | None) -> Theme:

@@ -93,7 +93,10 @@ class Scene:
         lands = [land.surface(tree_shade, covered, span) for span in LAND]
         self._barriers = mesh("barrier", rails, barriers.LAYOUT, *varied)
         self._solid = (
-            *(mesh(name, each, road_mesh.LAYOUT, *varied, *features[name]) for name, each in surfaces.items()),
+            *(
+                mesh(name, each, road_mesh.LAYOUT, *varied, *features[name])
+                for name, each in surfaces.items()
+            ),
             *(mesh("prop", each, props.LAYOUT, name) for name, each in built.items()),
             *(mesh("land", each, land.LAYOUT, *(["sea"] if theme.sea else [])) for each in lands),
         )
