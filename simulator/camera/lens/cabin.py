@@ -86,7 +86,7 @@ def _bonnet(
     below = np.arange(height)[:, None] + 0.5 - (height - edge[None, :])
     cover = np.clip(below + 0.5, 0.0, 1.0)
     blur = rng.uniform(0.4, 2.0) * width / REFERENCE_WIDTH
-    cover = cv2.GaussianBlur(cover, (0, 0), blur, borderType=cv2.BORDER_REPLICATE)
+    soft = cv2.GaussianBlur(cover, (0, 0), blur, borderType=cv2.BORDER_REPLICATE)
     share = np.clip(below / max(cabin.bonnet * height, 1.0), 0.0, 1.0)
     # At a flat angle the far end of the bonnet mirrors the sky over the horizon.
     mirror = (0.0 if dashboard else rng.uniform(0.1, 0.45)) * np.exp(-share * rng.uniform(2.0, 7.0))
@@ -94,7 +94,7 @@ def _bonnet(
     mirror = mirror * (1.0 + 1.5 * streaks / max(float(streaks.std()), 1e-9) * 0.2)
     sky = np.array(light.horizon) * light.exposure
     colour = paint * 1.6 * scene + np.maximum(mirror, 0.0)[..., None] * sky
-    return np.asarray(cover, dtype=np.float64), np.asarray(colour, dtype=np.float64)
+    return np.asarray(soft, dtype=np.float64), np.asarray(colour, dtype=np.float64)
 
 
 def _dirt(width: int, height: int, rng: np.random.Generator) -> FloatArray:
@@ -114,15 +114,15 @@ def _reflections(width: int, height: int, rng: np.random.Generator) -> FloatArra
         middle = rng.uniform([-0.1, 0.35], [1.1, 1.1]) * (width, height)
         size = rng.uniform([0.05, 0.02], [0.5, 0.2]) * (width, height)
         lean = rng.uniform(-0.5, 0.5) * size[0]
-        corners = [[-1, -1], [1, -1], [1, 1], [-1, 1]] * size / 2.0 + middle
+        corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * size / 2.0 + middle
         corners[:2, 0] += lean
         shape = np.zeros_like(layer)
         cv2.fillPoly(shape, [np.rint(corners).astype(np.int32)], float(rng.uniform(0.2, 1.0)))
         blur = float(np.exp(rng.uniform(np.log(0.8), np.log(9.0)))) * width / REFERENCE_WIDTH
         layer += cv2.GaussianBlur(shape, (0, 0), blur)
     rise = np.clip(np.linspace(-0.3, 1.0, height), 0.0, 1.0)[:, None]
-    layer = 0.7 * layer + 0.45 * rng.uniform() * rise
-    return np.asarray(np.clip(layer, 0.0, 1.0), dtype=np.float64)
+    lit = 0.7 * layer + 0.45 * rng.uniform() * rise
+    return np.asarray(np.clip(lit, 0.0, 1.0), dtype=np.float64)
 
 
 def _field(

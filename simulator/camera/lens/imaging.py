@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from simulator.arrays import FloatArray
 from simulator.camera.bridges.bridges import Bridge
+from simulator.camera.core import optics
 from simulator.camera.core.optics import Eye
 from simulator.camera.lens.cabin import REFERENCE_WIDTH, glass_of
 from simulator.camera.lens.develop import develop, noise_table
@@ -24,6 +25,8 @@ RAIN_DROPS = 0.08
 look has no drops of its own."""
 DAZZLED = 245
 """Display value from which a pixel shows the sun itself."""
+GLOWS = np.uint8(200)
+"""Display value from which light glows by night."""
 ADAPTING_M = 10.0
 """Way that the exposure needs to follow a change of brightness."""
 DARK_NOISE = 1.8
@@ -40,7 +43,7 @@ class Imaging:
         self._lens, self._light, self._flare = look.lens, light, look.light.flare
         self._size = width, height
         self._matrix: FloatArray = camera.intrinsics()
-        self._camera = camera
+        self._motion = _motion_of(camera, look.lens.travel_m)
         self._glass = glass_of(look, light, width, height)
         adapts = look.light.adaptation_stops if light.shade < 0.5 else 0.0
         self._adaptation = adapts, [(bridge.s, bridge.half_along) for bridge in bridges]
@@ -69,7 +72,7 @@ class Imaging:
             self._glass.gain,
             self._glass.add,
             2.0 ** adaptation(s, *self._adaptation),
-            self._motion(),
+            self._motion,
             self._glare(picture, eye),
             (self._noise, _seed_of(eye)),
             self._normal,
@@ -80,13 +83,6 @@ class Imaging:
             mixed = cv2.addWeighted(picture, 1.0 + lens.sharpening, soft, -lens.sharpening, 0.0)
             picture = np.asarray(mixed, np.uint8)
         return _compressed(picture, lens.jpeg_quality) if lens.jpeg_quality else picture
-
-    def _motion(self) -> tuple[float, float, float, float]:
-        """Where the car drives to in the picture, height times focal length, way: see `develop`."""
-        (fx, _, u0), (_, fy, v0) = self._matrix[:2]
-        v0 -= fy * np.tan(np.radians(self._camera.pitch_deg))
-        reach = self._camera.height_above_road_m * fy
-        return float(u0), float(v0), float(reach), self._lens.travel_m
 
     def _glare(self, picture: Picture, eye: Eye) -> tuple[float, float, float]:
         """Place of the sun in the picture and strength of its glare: see `develop`."""
@@ -106,6 +102,14 @@ class Imaging:
         return u, v, strength
 
 
+def _motion_of(camera: CameraParameters, travel_m: float) -> tuple[float, float, float, float]:
+    """Where the car drives to in the picture, height times focal length, way: see `develop`."""
+    matrix = camera.intrinsics()
+    ahead = optics.extrinsics(camera, np.zeros(6), "front")[:3, 0]
+    u, v, _ = matrix @ ahead / ahead[2]
+    return float(u), float(v), float(camera.height_above_road_m * matrix[1, 1]), travel_m
+
+
 def adaptation(s: float, stops: float, bridges: Sequence[tuple[float, float]]) -> float:
     """By how many stops the exposure has opened at `s`: up to `stops` on the way through a bridge's
     shadow, and back to none after it. `bridges`: place along the road and half length, in m."""
@@ -121,7 +125,7 @@ def adaptation(s: float, stops: float, bridges: Sequence[tuple[float, float]]) -
 def _with_glow(picture: Picture) -> Picture:
     """The picture with a glow round what is brighter than the display shows."""
     width, height = picture.shape[1], picture.shape[0]
-    bright = cv2.resize(cv2.subtract(picture, (200, 200, 200, 0)), (width // 4, height // 4))
+    bright = cv2.resize(np.maximum(picture, GLOWS) - GLOWS, (width // 4, height // 4))
     glow = cv2.GaussianBlur(bright, (0, 0), 0.008 * width)
     return np.asarray(
         cv2.addWeighted(picture, 1.0, cv2.resize(glow, (width, height)), 2.5, 0.0), np.uint8
@@ -140,5 +144,5 @@ def _compressed(picture: Picture, quality: int) -> Picture:
     done, data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])
     if not done:
         raise RuntimeError(f"cv2 did not encode a picture of {picture.shape} as JPEG")
-    read = cv2.imdecode(data, cv2.IMREAD_COLOR)
+    read = np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR))
     return np.asarray(cv2.cvtColor(read, cv2.COLOR_BGR2RGB), np.uint8)

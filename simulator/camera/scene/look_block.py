@@ -7,8 +7,8 @@ from simulator.camera.scene.roadside import seen_road
 from simulator.camera.scene.themes import Colour
 from simulator.camera.scene.varied_light import lamp_colour
 from simulator.track.road import Road
-from simulator.varied.look import RoadLook
 from simulator.varied.lighting import Lighting
+from simulator.varied.look import RoadLook
 from simulator.varied.paint import Paint
 from simulator.varied.surface import Surface
 

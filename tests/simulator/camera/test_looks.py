@@ -47,7 +47,7 @@ def view(camera: Camera, look: RoadLook, light: Light = OVERCAST) -> NDArray[np.
 
 def road_pixels(camera: Camera) -> NDArray[np.bool_]:
     pose = standing_pose(camera.road, 300.0, 0.0)
-    return camera.render_views(pose, views=["front:class"])["front:class"] == 0
+    return np.asarray(camera.render_views(pose, views=["front:class"])["front:class"] == 0)
 
 
 def test_a_stop_more_doubles_the_light(camera: Camera) -> None:

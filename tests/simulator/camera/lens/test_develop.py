@@ -83,7 +83,7 @@ def test_motion_blur_mixes_light_along_the_way_and_spares_the_horizon() -> None:
     still = developed(picture)
     assert np.array_equal(blurred[:21], still[:21])
     middle = linear(blurred[:, 40, 0])
-    # At row 46 the road is 100 / 26 = 3.8 m away: 0.9 m of way sweep over 26 * 0.9 / 3.8 = 6.1 rows.
+    # At row 46 the road is 100 / 26 = 3.8 m away: 0.9 m sweep over 26 * 0.9 / 3.8 = 6.1 rows.
     assert 5 <= np.count_nonzero(middle > 0.02) <= 10
     assert middle.max() < 0.6
     assert abs(middle.sum() - 2.0) < 1.0
