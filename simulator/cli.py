@@ -15,9 +15,8 @@ import typer
 
 from runtime import cli as command
 from simulator.link.command import link
-from simulator.track.cli import Lanes, LaneWidth, TrackName, TracksDir, Traffic, tracks
+from simulator.track.cli import Lanes, TrackName, TracksDir, Traffic, tracks
 from simulator.watch.cli import watch
-from trackfeatures import LANE_WIDTH_M
 
 app = typer.Typer(
     help="VTORCS: tracks, physics, traffic, sensors and camera.",
@@ -49,7 +48,12 @@ def snapshot(
     track: TrackName,
     out: Annotated[Path, typer.Option(help="PNG file to write.")],
     lanes: Lanes = 2,
-    lane_width: LaneWidth = LANE_WIDTH_M,
+    lane_width: Annotated[
+        float | None, typer.Option(help="Metres, 2.7 to 4.5; without it 4.0, or as drawn.")
+    ] = None,
+    roads: Annotated[
+        str, typer.Option(help="paper, or varied: lanes, paint and look are drawn from the seed.")
+    ] = "paper",
     seed: Annotated[int, typer.Option(help="Fixes scenery, light and places.", min=0)] = 0,
     traffic: Traffic = 3,
     light: Annotated[
@@ -65,9 +69,9 @@ def snapshot(
     """Write a contact sheet of views, the true markings drawn over them; or depth or classes."""
     from simulator.camera.snapshot import write_contact_sheet
     from simulator.track.catalogue import find_track
-    from simulator.track.road import Road
+    from simulator.varied.road import make_road
 
-    road = Road(find_track(track, tracks_dir), lanes, lane_width)
+    road = make_road(find_track(track, tracks_dir), lanes, lane_width, roads, seed)
     write_contact_sheet(road, out, seed=seed, traffic=traffic, light=light, view=view, kind=kind)
     typer.echo(str(out), err=True)
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import trackfeatures as tf
 from datagen.recording.names import CODECS, UNSEEN
-from trackfeatures.camera import CameraParameters
+from trackfeatures.camera import CameraParameters, stored
 from trackfeatures.errors import UserError
 
 DATASET_FOLDER = Path("datasets/default")
@@ -17,7 +17,6 @@ FRAMES_PER_SCENE = 200
 SEEDS_PER_PLAN = 1_000_000
 MAX_ROUNDS = SEEDS_PER_PLAN // 2
 """With more rounds the seeds would overlap those of another plan."""
-ROADS = ("paper", "varied")
 
 
 def all_lights() -> tuple[str, ...]:
@@ -66,7 +65,7 @@ class CollectConfig:
 
     def as_dict(self) -> dict[str, Any]:
         """The options by name; those of the paper's roads as before there were others."""
-        options = asdict(self)
+        options = asdict(self, dict_factory=stored)
         if self.roads == "paper":
             del options["roads"]
         return options
@@ -105,6 +104,8 @@ class CollectConfig:
         check_frequency(self.frequency_hz)
 
     def _check_choices(self) -> None:
+        from simulator.varied import ROADS
+
         for lanes in self.lanes:
             tf.check_lanes(lanes, tf.LANE_WIDTH_M)
         if not (self.lanes and self.tracks and self.lights):

@@ -15,7 +15,7 @@ import trackfeatures as tf
 from datagen.planning.config import CollectConfig
 from simulator.varied.round import VariedRound
 from simulator.world.control_rate import PHYSICS_HZ
-from trackfeatures.camera import CameraParameters
+from trackfeatures.camera import CameraParameters, stored
 from trackfeatures.errors import UserError
 from trackfeatures.names import require_name
 
@@ -65,7 +65,7 @@ class RoundPlan:
 
     def as_dict(self) -> dict[str, Any]:
         """The entry of `plan.json`; a paper's road has none of `varied`, as in earlier versions."""
-        entry = asdict(self)
+        entry = asdict(self, dict_factory=stored)
         if self.varied is None:
             del entry["varied"]
         return entry

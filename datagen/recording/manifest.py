@@ -22,6 +22,7 @@ from datagen.recording.folder import (
 )
 from datagen.recording.splits import Split, split_path, write_split
 from datagen.recording.statistics import describe
+from trackfeatures.camera import stored
 
 MANIFEST = "manifest.json"
 # Not the dataset card: people edit it.
@@ -33,7 +34,7 @@ def build_manifest(dataset: Dataset) -> dict[str, Any]:
     states = read_states(dataset.path)
     rounds = []
     for info, index in zip(dataset.rounds, dataset.indexes, strict=True):
-        header = asdict(index.header)
+        header = asdict(index.header, dict_factory=stored)
         del header["varied"]  # some kB for each scene, in the plan and in the round's file
         state = states.get(info.id)
         rounds.append(

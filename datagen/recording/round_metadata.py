@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import trackfeatures as tf
-from trackfeatures.camera import CameraParameters
+from trackfeatures.camera import CameraParameters, stored
 from trackfeatures.measurement import LineOffsets
 from trackfeatures.names import require_name
 
@@ -101,7 +101,7 @@ class RoundHeader:
             )
 
     def to_metadata(self) -> dict[str, str]:
-        values = asdict(self)
+        values = asdict(self, dict_factory=stored)
         if self.varied is None:  # the paper's roads are recorded as before there were others
             del values["varied"]
         return {name: json.dumps(value) for name, value in values.items()}

@@ -17,7 +17,6 @@ from datagen.recording.round_metadata import RoundInfo
 from mtlnet.inference.rectification import Rectification
 from trackfeatures.camera import CameraParameters
 from trackfeatures.measurement import LineOffsets
-from trackfeatures.mounting import scale_between, shift_between
 
 
 def model_labels(frames: Frames) -> Labels:
@@ -53,8 +52,8 @@ def moved_rounds(frames: Frames) -> list[tuple[int, RoundInfo]]:
 
 def camera_scales(frames: Frames) -> NDArray[np.float64]:
     """Metres beside the model's camera per metre of the car, of each of `frames` (N,)."""
-    scales = [scale_between(info.label_camera, frames.camera) for info in frames.rounds]
-    return np.array(scales)[frames.labels.round]
+    rounds = (Rectification(info.label_camera, frames.camera) for info in frames.rounds)
+    return np.array([1 / each.scale for each in rounds])[frames.labels.round]
 
 
 def _as_mounted(camera: CameraParameters, other: CameraParameters) -> bool:
@@ -63,8 +62,11 @@ def _as_mounted(camera: CameraParameters, other: CameraParameters) -> bool:
 
 def _beside(labels: Labels, info: RoundInfo, camera: CameraParameters) -> NDArray[np.float32]:
     """Distances (N, 5) of a round's frames beside `camera`, NaN where absent there."""
-    scale = scale_between(info.label_camera, camera)
-    shift = shift_between(labels.angle.astype(np.float64), info.label_camera, camera)
+    rectification = Rectification(info.label_camera, camera)
+    scale = 1 / rectification.scale
+    # Distances are measured at the centre of gravity, not at the camera.
+    beside = np.zeros((len(labels), len(tf.MARKINGS)), np.float32)
+    shift = rectification.labels(beside, labels.angle)[:, 0]
     place = labels.to_middle + _foot(labels, info)
     offsets = [(left * scale, right * scale) for left, right in info.line_offsets]
     return _measured(place * scale + shift, info.lanes, info.lane_width_m * scale, offsets)

@@ -17,6 +17,7 @@ from simulator.camera.core.camera import Camera
 from simulator.camera.core.render_modes import CLASS, CLASSES, COLOUR, DEPTH, ViewRequest
 from simulator.camera.scene.light import KINDS, Light, check_light
 from simulator.track.road import Road
+from simulator.varied.look import RoadLook
 from simulator.vehicle.car import CarParameters
 from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
@@ -68,9 +69,9 @@ def write_contact_sheet(
     All pictures are of `view`, or without it driver views, one chase and one top view; in the light
     of kind `light`, or without it in each kind by turns, every other one clear. Of `kind` "colour"
     the right half has the true markings drawn thinly over the painted ones; "depth" and "class" are
-    in false colours. An older file stays as it is until the new one is complete. Raises UserError
-    if the file cannot be written as PNG or has no folder, or light, view or kind is unknown;
-    OSError if it cannot be written.
+    in false colours. On a varied road each light has a look of its own. An older file stays as it
+    is until the new one is complete. Raises UserError if the file cannot be written as PNG or has
+    no folder, or light, view or kind is unknown; OSError if it cannot be written.
     """
     if out.suffix.lower() != ".png":
         raise UserError(f"{out}: the contact sheet is a PNG file; give a name that ends in .png")
@@ -83,9 +84,14 @@ def write_contact_sheet(
         for shot in _shots(road, light, np.random.default_rng([seed, 10]))
     ]
     pictures: list[Picture | None] = [None] * len(shots)
-    for kind in dict.fromkeys(shot.light for shot in shots):
+    varied, parameters = road.carriageway, CameraParameters(WIDTH, HEIGHT)
+    if varied is not None:
+        height = varied.camera_height_m - CameraParameters.cg_height_m
+        parameters = replace(parameters, z=height)
+    for number, kind in enumerate(dict.fromkeys(shot.light for shot in shots)):
         drawn = Light.named(kind, np.random.default_rng([seed, 11]))
-        with Camera(road, CameraParameters(WIDTH, HEIGHT), seed=seed, light=drawn) as camera:
+        look = RoadLook.drawn(seed, number) if varied else None
+        with Camera(road, parameters, seed=seed, light=drawn, look=look) as camera:
             for k, shot in enumerate(shots):
                 if shot.light == kind:
                     rng = np.random.default_rng([seed, 12, k])

@@ -33,7 +33,7 @@ from simulator.env.reward import Ending, EpisodeOptions
 from simulator.env.start import check_start
 from simulator.env.view_renderer import RenderOptions, ViewRenderer
 from simulator.track.catalogue import find_track
-from simulator.track.road import Road
+from simulator.varied.road import make_road
 from simulator.vehicle.state import CarState
 from simulator.world.world import World
 from trackfeatures.errors import UserError
@@ -55,7 +55,11 @@ class DriveOptions:
 
     track: str = "circuit"
     lanes: int = 1
-    lane_width: float = tf.LANE_WIDTH_M
+    lane_width: float | None = None
+    """Metres; None: 4.0, or as drawn on varied roads."""
+    roads: str = "paper"
+    """"varied": lane width, shoulders, lines and look are drawn, from `road_seed`."""
+    road_seed: int = 0
     traffic: int = 0
     """Other cars, 0 to 12."""
 
@@ -105,7 +109,8 @@ class LateralControl(gym.Env[Any, Any]):
             {"track": track, "lanes": lanes} | options
         )
         tracks_dir = None if drive.tracks_dir is None else Path(drive.tracks_dir)
-        road = Road(find_track(drive.track, tracks_dir), drive.lanes, drive.lane_width)
+        track = find_track(drive.track, tracks_dir)
+        road = make_road(track, drive.lanes, drive.lane_width, drive.roads, drive.road_seed)
         self._renderer, self._render_view = ViewRenderer(road, picture), picture.render_view
         self._observer = Observer(observation.resolved(self.kind), self._renderer)
         self.world = World(road, traffic=drive.traffic, frequency_hz=drive.frequency_hz)

@@ -32,6 +32,7 @@ from simulator.camera.core.turns import Turns
 from simulator.track.catalogue import find_track
 from simulator.track.road import Road
 from simulator.track.torcs.torcs import read_torcs
+from simulator.varied.road import make_road
 from simulator.vehicle.state import Command
 from simulator.world.world import World
 from tests.mtlnet.conftest import write_dataset
@@ -234,6 +235,11 @@ def _(folder: Path) -> object:
         patch.delitem(sys.modules, "simulator.world.physics", raising=False)
         world.reset(seed=0, angle=-1.2, speed=20.0)
         return [world.step(Command(gear=0)) for _ in range(40)]
+
+
+@row("a lane width for varied")
+def _(folder: Path) -> object:
+    return make_road(find_track("oval"), 1, 3.5, "varied")
 
 
 @row("an action or command")

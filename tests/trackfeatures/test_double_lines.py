@@ -4,8 +4,6 @@ import numpy as np
 import pytest
 
 import trackfeatures as tf
-from trackfeatures.camera import CameraParameters
-from trackfeatures.mounting import move_distances, scale_between
 
 GAP = 0.3
 # Three lanes of 3.4 m; the second of four markings is a double line, 0.3 m from line to line.
@@ -48,25 +46,3 @@ def test_single_lines_are_measured_as_without_offsets() -> None:
         assert tf.measure(y, 0.1, 0.0, 0.0, 3, WIDTH, single) == tf.measure(
             y, 0.1, 0.0, 0.0, 3, WIDTH
         )
-
-
-def test_a_higher_camera_sees_a_narrower_road() -> None:
-    low, high = CameraParameters(z=0.95), CameraParameters(z=1.55)  # 1.2 m and 1.8 m up
-    assert scale_between(high, low) == pytest.approx(1.2 / 1.8)
-    there = np.array([[-1.8, 1.8, np.nan, np.nan, np.nan]])
-    seen = move_distances(there, [0.0], high, low)
-    assert seen[0, :2] == pytest.approx([-1.2, 1.2])
-    assert np.isnan(seen[0, 2:]).all()
-    back = move_distances(move_distances(there, [0.2], high, low), [0.2], low, high)
-    assert back == pytest.approx(there, nan_ok=True)
-
-
-def test_distances_are_measured_at_the_centre_of_gravity() -> None:
-    """Closed form: a car turned by 0.1 rad to the right; the eye is 0.75 m ahead of its centre."""
-    near, far = CameraParameters(x=0.75, z=0.95), CameraParameters(x=1.5, y=0.4, z=1.55)
-    angle = 0.1
-    # A marking 1.5 m right of the far camera's car; the eye is 1.5 m ahead and 0.4 m left of it,
-    # so sin(a) * 1.5 - cos(a) * 0.4 nearer to the marking.
-    from_eye = 1.5 - 1.5 * np.sin(angle) + 0.4 * np.cos(angle)
-    expected = from_eye * 1.2 / 1.8 + 0.75 * np.sin(angle)
-    assert move_distances(np.array([[1.5]]), [angle], far, near)[0, 0] == pytest.approx(expected)

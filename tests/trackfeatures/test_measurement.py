@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 import trackfeatures as tf
 
 LANES = st.integers(1, 3)
-WIDTHS = st.floats(3.0, 4.5)
+WIDTHS = st.floats(2.7, 4.5)
 OFFSETS = st.floats(-9.0, 9.0)
 
 

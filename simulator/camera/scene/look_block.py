@@ -51,14 +51,19 @@ def _line_rows(road: Road, paint: Paint) -> list[Row]:
             solid = 0.0 if line.dots_m and not line.gap_m else 1.0
             period = line.dash_m + line.gap_m
             places[at] = (middle, line.width_m / 2, line.dash_m if period else solid, period or 1.0)
-            colours[at] = (*(c * paint.tone for c in LINE_COLOURS[line.colour]), line.dots_m)
+            colours[at] = (*_toned(line.colour, paint), line.dots_m)
     return [*places, *colours]
+
+
+def _toned(colour: str, paint: Paint) -> Row:
+    return tuple(c * paint.tone for c in LINE_COLOURS[colour])
 
 
 def _paint_rows(paint: Paint) -> list[Row]:
     return [
         (paint.wear, paint.missing, paint.phase, 0.0),
         (paint.gap_m, paint.gap_every_m, float(paint.gap_marking), 0.0),
+        (*_toned("white", paint), 0.0),
         (
             paint.arrow_every_m,
             ARROWS[paint.arrow_kind],

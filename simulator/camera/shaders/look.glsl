@@ -7,6 +7,7 @@ layout(std140) uniform Look {
     vec4 line_paint[MARKINGS * LINES];  // colour; w: from one dot to the next, 0: no dots
     vec4 paint_state;                // wear, share of missing paint, phase
     vec4 paint_gap;                  // length, period, marking (9: all)
+    vec4 sign_colour;                // of arrows and crosswalks
     vec4 paint_signs;                // from arrow to arrow, turn of arrows, from crosswalk to crosswalk
     vec4 surface_tone;               // of the other material against the first, mean section
     vec4 surface_joint;              // concrete (1: all, -1: the other), joints, halves, seam

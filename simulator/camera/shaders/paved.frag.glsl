@@ -36,7 +36,9 @@ void main() {
     // Paint: coverage by the nearest line, reduced by wear.
     float number = clamp(floor((lane_left - y) / lanes.y + 0.5), 0.0, lanes.x);
 #ifdef VARIED
-    vec4 drawn = paint_at(s, y, ws, wy, number);
+    vec4 drawn = paint_of_lines(s, y, ws, wy, number);
+    if (paint_signs.x + paint_signs.z > 0.0)
+        drawn = mix(drawn, vec4(sign_colour.rgb, 1.0), paint_of_signs(s, y, ws, wy, in_lane) * step(away, lane_left));
     float paint = drawn.a, wear = paint_state.x, missing = paint_state.y;
     vec3 paint_colour = drawn.rgb;
 #else
@@ -75,7 +77,7 @@ void main() {
 #ifdef LABELS
     // The class at the pixel's centre: classes cannot be blended.
 #ifdef VARIED
-    bool painted = paint_at(s, y, 1e-4, 1e-4, number).a > 0.5 && gap < 0.5;
+    bool painted = paint_of_lines(s, y, 1e-4, 1e-4, number).a > 0.5 && gap < 0.5;
 #else
     bool painted = abs(y - line_y) < left_line.w && gap < 0.5;
     if (divider && fract(s / dashes.y) * dashes.y > dashes.x) painted = false;

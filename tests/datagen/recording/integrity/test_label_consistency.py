@@ -36,7 +36,7 @@ def _labels(offsets: np.ndarray, lanes: int, width: float = WIDTH) -> Labels:
 
 
 @pytest.mark.parametrize("lanes", tf.LANES)
-@pytest.mark.parametrize("width", [3.0, 3.7, 4.5])
+@pytest.mark.parametrize("width", [2.7, 3.7, 4.5])
 def test_correct_labels_near_range_borders_have_no_problems(lanes: int, width: float) -> None:
     markings = tf.marking_offsets(lanes, width)
     reaches = [0.0, 0.5, 1.2, 2.0, width / 2]
