@@ -10,15 +10,17 @@ from numpy.typing import ArrayLike, NDArray
 
 from simulator.arrays import FloatArray
 from simulator.camera.core import optics
-from simulator.camera.core.context import FRAME_BINDING, Graphics, graphics
+from simulator.camera.core.context import FRAME_BINDING, NIGHT, Graphics, graphics
 from simulator.camera.core.lens_view import LensView
 from simulator.camera.core.render_modes import CLASS, COLOUR, DEPTH, ViewRequest
-from simulator.camera.scene.cars import shared_cars
+from simulator.camera.lens.imaging import Imaging
+from simulator.camera.scene.cars import Cars, shared_cars
 from simulator.camera.scene.light import Light
 from simulator.camera.scene.precipitation import Precipitation
 from simulator.camera.scene.scene import Scene, VisibleScene
 from simulator.camera.scene.sky import Sky
 from simulator.camera.scene.terrain import Survey
+from simulator.camera.scene.varied_light import lit_as
 from simulator.track.road import Road
 from simulator.varied.look import RoadLook
 from simulator.vehicle.car import CarParameters
@@ -30,6 +32,10 @@ Picture = NDArray[Any]
 MAX_SIZE = 4096
 DRIVER_CAMERA = CameraParameters()
 _OWN_PAINT = 0
+PARKED_REACH_M = 110.0
+"""Parked cars farther off are not drawn."""
+HEADLIGHT_AT = (2.1, 0.0, 0.4)
+"""Of both headlights, in the body frame, metres."""
 
 
 def check_size(width: int, height: int) -> None:
@@ -50,6 +56,9 @@ class _LoadedScene:
     precipitation: Precipitation | None
     frame: NDArray[np.float32]
     first_paint: int
+    cars: Cars
+    imaging: Imaging | None
+    """None: the rendered picture is the recorded one."""
 
 
 @dataclass(frozen=True)
@@ -97,8 +106,6 @@ class Camera:
         self._cache: dict[tuple[int, Light, RoadLook | None], _LoadedScene] = {}
         self._current: _LoadedScene | None = None
         self._last_s: float | None = None
-        with self._graphics.turns:
-            self._cars = shared_cars(self._graphics)
         self.change_scene(seed, light, look)
 
     @property
@@ -121,17 +128,22 @@ class Camera:
 
     def _load_scene(self, seed: int, light: Light, look: RoadLook | None) -> _LoadedScene:
         graphics = self._graphics
-        frame = np.concatenate([np.zeros(24), *_light_rows(light)]).astype(np.float32)
+        if look:
+            light = lit_as(light, look.light, look.surface.tone)
+        frame = np.concatenate([np.zeros(24), *_light_rows(light), np.zeros(8)]).astype(np.float32)
         self._set_frame(frame, optics.eye_of(self.parameters, np.zeros(6), "front"))
+        scene = Scene(graphics, self.road, self._survey, seed, light, look)
         return _LoadedScene(
             light,
-            Scene(graphics, self.road, self._survey, seed, light, look),
+            scene,
             # Rendered with the light of the frame that is bound.
             Sky(graphics, light.weather, float(self._drawn_intrinsics[0, 0])),
             Precipitation(graphics, light, seed) if light.falling > 0.0 else None,
             frame,
             # Cars of different rounds differ in colour; index 0 is that of our own car.
             first_paint=1 + seed % 5,
+            cars=shared_cars(graphics, *([NIGHT] if look and look.light.night else [])),
+            imaging=Imaging(look, light, self.parameters, scene.bridges) if look else None,
         )
 
     def render(
@@ -174,7 +186,7 @@ class Camera:
             kinds = {each.kind for each in wanted.values() if each.view == view}
             shot = self._prepare(body_pose, others, view)
             if COLOUR in kinds:
-                taken[ViewRequest(view)] = self._draw_colours(shot)
+                taken[ViewRequest(view)] = self._recorded(self._draw_colours(shot), shot, view)
             if kinds - {COLOUR}:
                 labels = self._draw_labels(shot)
                 taken[ViewRequest(view, DEPTH)] = np.ascontiguousarray(labels[..., 0])
@@ -185,10 +197,11 @@ class Camera:
         """Bind the frame of a view and cull what it does not show."""
         loaded = self._loaded
         eye = optics.eye_of(self.parameters, body_pose, view)
+        self._set_headlights(loaded.frame, np.asarray(body_pose, dtype=np.float64), eye)
         self._set_frame(loaded.frame, eye)
         planes = optics.frustum(eye, self._drawn_intrinsics, self._drawn.width, self._drawn.height)
         cars, paints = self._cars_in_view(body_pose, others, view)
-        chosen = self._cars.visible(cars, eye.place, planes)
+        chosen = loaded.cars.visible(cars, eye.place, planes)
         return _Shot(
             eye, loaded.scene.visible(eye, planes), cars[chosen], [paints[k] for k in chosen]
         )
@@ -197,22 +210,29 @@ class Camera:
         loaded, place = self._loaded, shot.eye.place
         target = self._graphics.targets.of(self._drawn.width, self._drawn.height, labels=False)
         self._graphics.begin(target)
-        self._cars.draw(shot.cars, shot.paints, place, labels=False)
+        loaded.cars.draw(shot.cars, shot.paints, place, labels=False)
         loaded.scene.draw(shot.seen, labels=False)
         loaded.sky.draw()
         self._graphics.blend()
-        self._cars.draw_shadows(shot.cars, place, loaded.light)
+        loaded.cars.draw_shadows(shot.cars, place, loaded.light)
         loaded.scene.draw_blended(shot.seen)
         if loaded.precipitation is not None:
             loaded.precipitation.draw(shot.eye, self._drawn_intrinsics[0, 0])
         drawn = target.colours()
         return drawn if self._lens is None else self._lens.colours(drawn)
 
+    def _recorded(self, picture: NDArray[np.uint8], shot: _Shot, view: str) -> NDArray[np.uint8]:
+        """What the sensor makes of a rendered picture; of the driver view only."""
+        imaging = self._loaded.imaging
+        if imaging is None or view != "front":
+            return picture
+        return imaging.developed(picture, shot.eye, self._s_of(*shot.eye.place[:2].tolist()))
+
     def _draw_labels(self, shot: _Shot) -> NDArray[np.float32]:
         """Depth and class (height, width, 2) of what `_draw_colours` draws, rain and snow apart."""
         target = self._graphics.targets.of(self._drawn.width, self._drawn.height, labels=True)
         self._graphics.begin(target, labels=True)
-        self._cars.draw(shot.cars, shot.paints, shot.eye.place, labels=True)
+        self._loaded.cars.draw(shot.cars, shot.paints, shot.eye.place, labels=True)
         self._loaded.scene.draw(shot.seen, labels=True)
         drawn = target.labels()
         return drawn if self._lens is None else self._lens.labels(drawn)
@@ -249,9 +269,13 @@ class Camera:
     def shadow_fraction(self, body_pose: ArrayLike) -> float:
         """Share (0 to 1) of the road within 30 m ahead of the car that lies in hard shadow."""
         pose = np.asarray(body_pose, dtype=np.float64)
-        s, _ = self.road.track.project(float(pose[0]), float(pose[1]), self._last_s)
-        self._last_s = s
+        s = self._s_of(float(pose[0]), float(pose[1]))
         return self._loaded.scene.mask.fraction(s, self.road.half_asphalt)
+
+    def _s_of(self, x: float, y: float) -> float:
+        """Place along the road of (x, y)."""
+        self._last_s, _ = self.road.track.project(x, y, self._last_s)
+        return self._last_s
 
     def _cars_in_view(
         self, body_pose: ArrayLike, others: ArrayLike | None, view: str
@@ -260,6 +284,12 @@ class Camera:
         poses = np.asarray(() if others is None else others, dtype=np.float64).reshape(-1, 6)
         first = self._loaded.first_paint
         paints = [first + k for k in range(len(poses))]
+        parked = self._loaded.scene.parked
+        if len(parked):
+            place = np.asarray(body_pose, dtype=np.float64)[:2]
+            near = np.hypot(*(parked[:, :2] - place).T) < PARKED_REACH_M
+            poses = np.vstack([poses, parked[near]])
+            paints += np.flatnonzero(near).tolist()
         if view in ("chase", "top"):
             own = np.asarray(body_pose, dtype=np.float64).copy()
             own[:3] -= optics.rotation(*own[3:])[:, 2] * CarParameters.cg_height
@@ -271,6 +301,14 @@ class Camera:
         if self._current is None:
             raise RuntimeError("this camera is closed; make a new one")
         return self._current
+
+    def _set_headlights(
+        self, block: NDArray[np.float32], body_pose: FloatArray, eye: optics.Eye
+    ) -> None:
+        """Fill the rows of the uniform block `Frame` that say where the car's headlights are."""
+        turn = optics.rotation(*body_pose[3:].tolist())
+        block[48:51] = body_pose[:3] + turn @ np.array(HEADLIGHT_AT) - eye.place
+        block[52:55] = turn[:, 0]
 
     def _set_frame(self, block: NDArray[np.float32], eye: optics.Eye) -> None:
         """Fill the uniform block `Frame` of frame.glsl, which `block` keeps."""

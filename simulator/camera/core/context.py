@@ -49,11 +49,13 @@ LIBRARIES = ("output.glsl", "weather.glsl", "road.glsl", "sea.glsl")
 BLOCKS = {"Frame": FRAME_BINDING, "Scene": SCENE_BINDING, "Look": LOOK_BINDING}
 VARIED = "varied"
 """Feature of the programs of varied roads: they read the uniform block `Look` of look.glsl."""
-VARIED_LIBRARIES = ("paint.glsl",)
+NIGHT = "night"
+"""Feature of the programs by night: their light is that of night.glsl."""
+VARIED_LIBRARIES = ("paint.glsl", "surface.glsl")
 """Functions for their fragment shaders."""
 WEATHER_PROGRAMS = ("sky", "land", "paved", "verge", "barrier", "prop", "tree")
 """Programs with variants for rain and snow, so that dry scenes cost no more."""
-FRAME_FLOATS = 48
+FRAME_FLOATS = 56
 NOISE_SIZE = 256
 NOISE_UNIT, SHADOW_UNIT, ATLAS_UNIT, SKY_UNIT = range(4)
 UNITS = {"noise": NOISE_UNIT, "shade": SHADOW_UNIT, "atlas": ATLAS_UNIT, "panorama": SKY_UNIT}
@@ -138,6 +140,8 @@ class Graphics:
         varied = VARIED in defines
         if varied:
             head += _source("look.glsl")
+        if NIGHT in defines:
+            head += _source("night.glsl")
         classes = "".join(f"#define {name.upper()} {k}\n" for k, name in enumerate(CLASSES))
         libraries = "".join(
             _source(library) for library in (*LIBRARIES, *VARIED_LIBRARIES * varied)

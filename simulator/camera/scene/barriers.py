@@ -12,23 +12,34 @@ from simulator.camera.scene.road_mesh import RoadMesh
 from simulator.camera.scene.strips import Level, strip
 from simulator.camera.scene.themes import Theme
 from simulator.track.road import Road
+from simulator.varied.roadside import Roadside
 
-KINDS: tuple[str, ...] = ("rail", "wall", "hedge", "fence", "stones", "tyres")
+KINDS: tuple[str, ...] = (
+    "rail", "wall", "hedge", "fence", "stones", "tyres", "crops", "bank", "none",
+)  # fmt: skip
 """In the order in which barrier.frag.glsl numbers them."""
-HEIGHT_M = np.array([0.8, 0.9, 1.25, 1.05, 0.75, 0.95])
-THICK_M = np.array([0.06, 0.25, 0.9, 0.06, 0.5, 0.7])
+HEIGHT_M = np.array([0.8, 0.9, 1.25, 1.05, 0.75, 0.95, 1.1, 0.6, 0.0])
+THICK_M = np.array([0.06, 0.25, 0.9, 0.06, 0.5, 0.7, 3.0, 0.8, 0.0])
+GROWS = np.isin(KINDS, ("wall", "crops", "bank"))
+"""Which kinds a varied road's look makes higher."""
 SECTION_M = (90.0, 420.0)
 LAYOUT = ("3f 2f 1f 3f", "at", "along", "kind", "facing")
 """Of a vertex: x, y, z, s, height, kind, normal (3)."""
 LEVELS = (Level(35.0, 0.005, 16.0), Level(120.0, 0.03, 32.0), Level(300.0, 0.1, 64.0))
 
 
-def build(road: Road, mesh: RoadMesh, theme: Theme, rng: np.random.Generator) -> Surface:
-    """Both sides' barriers."""
+def build(
+    road: Road, mesh: RoadMesh, theme: Theme, rng: np.random.Generator, roadside: Roadside
+) -> Surface:
+    """Both sides' barriers, of the theme's kinds or of the one that `roadside` names."""
     grids, profiles = [], []
-    for side, column in zip((1.0, -1.0), mesh.wall, strict=True):
-        kind = _sections(mesh.s, road.track.length_m, theme, rng)
-        grid = _one_side(mesh, road, side, column, kind)
+    heights = np.where(GROWS, roadside.height, 1.0) * HEIGHT_M
+    for side, column, only in zip(
+        (1.0, -1.0), mesh.wall, (roadside.left, roadside.right), strict=True
+    ):
+        kinds = (only,) if only else theme.barriers
+        kind = _sections(mesh.s, road.track.length_m, kinds, rng)
+        grid = _one_side(mesh, road, side, column, (kind, heights[kind]))
         grids.append(grid)
         # The large weight keeps every row at which the kind changes.
         profiles.append(np.column_stack([mesh.points[:, column], 100.0 * kind]))
@@ -50,23 +61,29 @@ def build(road: Road, mesh: RoadMesh, theme: Theme, rng: np.random.Generator) ->
 
 
 def _sections(
-    s: FloatArray, length: float, theme: Theme, rng: np.random.Generator
+    s: FloatArray, length: float, kinds: tuple[str, ...], rng: np.random.Generator
 ) -> NDArray[np.intp]:
     """Kind of barrier of each row."""
     count = int(length / SECTION_M[0]) + 2
     ends = np.cumsum(rng.uniform(*SECTION_M, count))
-    choice = rng.choice(np.array([KINDS.index(kind) for kind in theme.barriers]), count)
+    choice = rng.choice(np.array([KINDS.index(kind) for kind in kinds]), count)
     return np.asarray(choice[np.searchsorted(ends, np.minimum(s, ends[-2]))], dtype=np.intp)
 
 
 def _one_side(
-    mesh: RoadMesh, road: Road, side: float, column: int, kind: NDArray[np.intp]
+    mesh: RoadMesh,
+    road: Road,
+    side: float,
+    column: int,
+    build: tuple[NDArray[np.intp], FloatArray],
 ) -> NDArray[np.float32]:
-    """Vertices (R, 3, 9): the foot, the upper edge, and the far edge of the top."""
+    """Vertices (R, 3, 9): the foot, the upper edge, and the far edge of the top; `build` is the
+    kind and the height (R,)."""
+    kind, height = build
     foot = mesh.points[:, column].copy()
     heading = road.track.at(mesh.s).heading
     outwards = side * np.stack([-np.sin(heading), np.cos(heading), np.zeros_like(heading)], axis=1)
-    height, thick = HEIGHT_M[kind], THICK_M[kind]
+    thick = THICK_M[kind]
     up = np.array([0.0, 0.0, 1.0])
     edge = foot + height[:, None] * up
     far = edge + thick[:, None] * outwards

@@ -167,12 +167,13 @@ def _fittings() -> list[FloatArray]:
 class Cars:
     """The car mesh, shared by all cameras of a process, and its drawing."""
 
-    def __init__(self, graphics: Graphics) -> None:
+    def __init__(self, graphics: Graphics, *features: str) -> None:
         context = graphics.context
+        program = graphics.weather_program("car", "", *features)
         self._stands = [
-            graphics.uniform(name, "stand") for name in ("car", graphics.label_program("car"))
+            graphics.uniform(name, "stand") for name in (program, graphics.label_program("car"))
         ]
-        self._paint = graphics.uniform("car", "paint")
+        self._paint = graphics.uniform(program, "paint")
         self._spot = {
             name: graphics.uniform("spot", name) for name in ("stand", "shadow_extent", "middle")
         }
@@ -181,7 +182,7 @@ class Cars:
         triangles = context.buffer(mesh.vertices.tobytes())
         self._near, self._far = (0, mesh.near), (mesh.far, len(mesh.vertices) - mesh.far)
         self._meshes = vertex_arrays(
-            graphics, "car", triangles, None, ("3f 3f 3f", "at", "facing", "colour")
+            graphics, program, triangles, None, ("3f 3f 3f", "at", "facing", "colour")
         )
         corners = np.array([-1, -1, 1, -1, -1, 1, 1, 1], dtype=np.float32)
         patch = context.buffer(corners.tobytes())
@@ -221,10 +222,10 @@ class Cars:
             self._patch.render(self._context.TRIANGLE_STRIP)
 
 
-@lru_cache(maxsize=1)
-def shared_cars(graphics: Graphics) -> Cars:
-    """The cars of this graphics, made on first use."""
-    return Cars(graphics)
+@lru_cache(maxsize=2)
+def shared_cars(graphics: Graphics, *features: str) -> Cars:
+    """The cars of this graphics, made on first use; `features` as of `weather_program`."""
+    return Cars(graphics, *features)
 
 
 def _model_matrix(pose: FloatArray, eye: FloatArray) -> NDArray[np.float32]:

@@ -3,21 +3,34 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from simulator.camera.scene.roadside import seen_road
 from simulator.camera.scene.themes import Colour
+from simulator.camera.scene.varied_light import lamp_colour
 from simulator.track.road import Road
+from simulator.varied.lighting import Lighting
 from simulator.varied.look import RoadLook
 from simulator.varied.paint import Paint
+from simulator.varied.surface import Surface
 
 MARKINGS, LINES = 4, 2
 """Most markings of a road, and most lines of a marking."""
 LINE_COLOURS: dict[str, Colour] = {"white": (0.78, 0.78, 0.75), "yellow": (0.75, 0.50, 0.06)}
 ARROWS = {"ahead": 0.0, "left": 1.0, "right": -1.0}
+LAMP_SIDE = -1.0
+"""Street lamps stand on the right of a varied road."""
 Row = tuple[float, ...]
 
 
 def look_block(road: Road, look: RoadLook) -> NDArray[np.float32]:
     """The block (rows, 4) of `look` on `road`, in the order of look.glsl."""
-    rows = [*_side_rows(road), *_line_rows(road, look.paint), *_paint_rows(look.paint)]
+    rows = [
+        *_side_rows(road),
+        *_line_rows(road, look.paint),
+        *_paint_rows(look.paint),
+        *_surface_rows(look.surface),
+        (look.roadside.height, look.surface.phase, 0.0, 0.0),
+        *_lamp_rows(seen_road(road, look), look.light),
+    ]
     return np.array(rows, dtype=np.float32)
 
 
@@ -58,3 +71,29 @@ def _paint_rows(paint: Paint) -> list[Row]:
             0.0,
         ),
     ]
+
+
+def _surface_rows(surface: Surface) -> list[Row]:
+    ratio = surface.other_tone / surface.tone if surface.tone else 0.0
+    return [
+        (ratio, surface.section_m, 0.0, 0.0),
+        (surface.concrete, surface.joint_m, surface.halves, surface.seam_m),
+        (surface.tar, surface.patches, surface.patch_tone, surface.phase),
+        (surface.tracks, surface.grain, surface.puddles, surface.ragged_m),
+        (surface.gravel_m, surface.kerb_m, 0.0, 0.0),
+    ]
+
+
+def surface_features(surface: Surface) -> tuple[str, ...]:
+    """What of surface.glsl the road's program compiles in: the rest would cost time in vain."""
+    wanted = {
+        "slabs": surface.other_tone > 0.0 or surface.concrete > 0.0,
+        "repairs": surface.tar > 0.0 or surface.patches > 0.0,
+        "puddles": surface.puddles > 0.0,
+    }
+    return tuple(name for name, used in wanted.items() if used)
+
+
+def _lamp_rows(road: Road, light: Lighting) -> list[Row]:
+    every = light.lamp_every_m if light.night else 0.0
+    return [(every, LAMP_SIDE * (road.wall_offset - 1.2), 0.0, 0.0), (*lamp_colour(light), 0.0)]

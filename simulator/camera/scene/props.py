@@ -18,6 +18,7 @@ from simulator.camera.scene.solids import (
     BOARD,
     CROWD,
     FACADE,
+    LIT,
     MATERIALS,
     PLAIN,
     STRIPED,
@@ -131,14 +132,14 @@ def pole() -> FloatArray:
     return np.concatenate([box(mast, (0.0, 0.0, -0.9), wood), *arms])
 
 
-def lamp() -> FloatArray:
-    """A lamp on a tall mast, its arm over the road (-y)."""
+def lamp(head: float = PLAIN) -> FloatArray:
+    """A lamp on a tall mast, its arm over the road (-y); its head is of that material."""
     grey = (0.24, 0.25, 0.25)
     return np.concatenate(
         [
             box((0.16, 0.16, 9.0), (0.0, 0.0, -0.8), grey),
             box((0.1, 2.2, 0.1), (0.0, -1.0, 8.1), grey),
-            box((0.25, 0.8, 0.14), (0.0, -2.2, 8.0), (0.45, 0.45, 0.43)),
+            box((0.25, 0.8, 0.14), (0.0, -2.2, 8.0), (0.45, 0.45, 0.43), head, floor=head == LIT),
         ]
     )
 
@@ -210,9 +211,13 @@ def _outline(template: FloatArray) -> FloatArray:
 
 
 def build(
-    ground: Ground, theme: Theme, bridges: Sequence[Bridge], rng: np.random.Generator
+    ground: Ground,
+    theme: Theme,
+    bridges: Sequence[Bridge],
+    rng: np.random.Generator,
+    lit_every_m: float = 0.0,
 ) -> dict[str, Surface]:
-    """All props and bridges of a scene by material."""
+    """All props and bridges of a scene by material; a lit lamp on the right every `lit_every_m`."""
     placer = _Placer(ground, bridges)
     for bridge in bridges:
         placer.add_placed(bridge.s, bridge.triangles)
@@ -239,6 +244,8 @@ def build(
         side = rng.choice([-1.0, 1.0])
         for s in np.arange(0.0, length, LAMP_STEP_M):
             placer.add(lamp(), float(s), side * (wall + 1.0), 0.6)
+    for s in np.arange(0.0, length, lit_every_m) if lit_every_m > 0.0 else ():
+        placer.add(lamp(LIT), float(s), -(wall + 1.0), 0.6)
     placer.place()
     return _gathered(placer)
 

@@ -10,6 +10,7 @@ from simulator.arrays import FloatArray
 from simulator.camera.bridges import bridges
 from simulator.camera.core.context import (
     LOOK_BINDING,
+    NIGHT,
     SCENE_BINDING,
     SHADOW_UNIT,
     VARIED,
@@ -19,7 +20,8 @@ from simulator.camera.core.mesh import Mesh, Surface
 from simulator.camera.core.optics import Eye
 from simulator.camera.scene import barriers, land, props, road_mesh, shadow_mask
 from simulator.camera.scene.light import Light
-from simulator.camera.scene.look_block import LINE_COLOURS, look_block
+from simulator.camera.scene.look_block import LINE_COLOURS, look_block, surface_features
+from simulator.camera.scene.roadside import parked_cars, seen_road, seen_theme
 from simulator.camera.scene.terrain import COARSEST, Survey
 from simulator.camera.scene.terrain import build as build_terrain
 from simulator.camera.scene.themes import Colour, Theme, find_theme
@@ -27,6 +29,7 @@ from simulator.camera.vegetation import scenery
 from simulator.camera.vegetation.trees import TreeMesh, VisibleTrees
 from simulator.track.road import Road
 from simulator.varied.look import RoadLook
+from simulator.varied.roadside import Roadside
 
 LAND = (
     land.Span(1, 0.0, 40.0, bare=False),
@@ -61,32 +64,46 @@ class Scene:
         def rng(part: int) -> np.random.Generator:
             return np.random.default_rng([seed, part])
 
-        theme = find_theme(road.track.look)
+        road = seen_road(road, look)
+        theme = seen_theme(find_theme(road.track.look), look)
         terrain = build_terrain(road, survey, theme, rng(1))
         ground = road_mesh.Ground.of(road, survey.line, terrain)
         scene_bridges = bridges.build(ground, theme, rng(8))
-        trees = scenery.plant(ground, theme, scene_bridges, rng(3), avenue=light.canopy)
+        roadside = look.roadside if look else Roadside()
+        avenue = light.canopy or roadside.avenue
+        trees = scenery.plant(ground, theme, scene_bridges, rng(3), avenue=avenue)
         tree_shade = land.TreeShade.of(terrain, survey.line, trees, light)
-        rails = barriers.build(road, ground.mesh, theme, rng(5))
-        built = props.build(ground, theme, scene_bridges, rng(6))
+        rails = barriers.build(road, ground.mesh, theme, rng(5), roadside)
+        lamps = look.light.lamp_every_m if look and look.light.night else 0.0
+        built = props.build(ground, theme, scene_bridges, rng(6), lamps)
         covered = road_mesh.covers(ground.mesh, survey, margin_m=2.0)
         self.mask = shadow_mask.build(road, trees, scene_bridges, tree_shade, light, rng(4))
-        self._trees = TreeMesh(graphics, trees, light.weather)
+        night = [NIGHT] if look and look.light.night else []
+        self.bridges = scene_bridges
+        self.parked = parked_cars(road, roadside.parked_every_m, rng(9))
+        self._trees = TreeMesh(graphics, trees, light.weather, *night)
 
         def mesh(program: str, surface: Surface, layout: Sequence[str], *features: str) -> Mesh:
-            variant = graphics.weather_program(program, light.weather, *features)
+            variant = graphics.weather_program(program, light.weather, *features, *night)
             return Mesh(graphics, variant, surface, layout)
 
         varied = [VARIED] if look else []
+        features = {"paved": surface_features(look.surface) if look else (), "verge": ()}
         surfaces = road_mesh.surfaces(ground.mesh, road)
         lands = [land.surface(tree_shade, covered, span) for span in LAND]
-        self._barriers = mesh("barrier", rails, barriers.LAYOUT)
+        self._barriers = mesh("barrier", rails, barriers.LAYOUT, *varied)
         self._solid = (
-            *(mesh(name, each, road_mesh.LAYOUT, *varied) for name, each in surfaces.items()),
+            *(
+                mesh(name, each, road_mesh.LAYOUT, *varied, *features[name])
+                for name, each in surfaces.items()
+            ),
             *(mesh("prop", each, props.LAYOUT, name) for name, each in built.items()),
             *(mesh("land", each, land.LAYOUT, *(["sea"] if theme.sea else [])) for each in lands),
         )
         palette = scene_block(road, theme, rng(2), self.mask, terrain.sea)
+        if look and look.surface.tone:
+            warm = look.surface.warmth
+            palette[0, :3] = look.surface.tone * np.array([1.0 + warm / 2, 1.0, 1.0 - warm / 2])
         self._block = graphics.context.buffer(palette.tobytes())
         self._look = graphics.context.buffer(look_block(road, look).tobytes()) if look else None
         self._shadow_texture = graphics.texture(self.mask.texels)

@@ -13,9 +13,9 @@ from simulator.arrays import FloatArray
 
 Point = tuple[float, float, float]
 
-MATERIALS = ("plain", "facade", "crowd", "board", "striped", "tiles", "masonry", "earth")
+MATERIALS = ("plain", "facade", "crowd", "board", "striped", "tiles", "masonry", "earth", "lit")
 """Index is the material number; prop.frag.glsl uses the names."""
-PLAIN, FACADE, CROWD, BOARD, STRIPED, TILES, MASONRY, EARTH = map(float, range(len(MATERIALS)))
+PLAIN, FACADE, CROWD, BOARD, STRIPED, TILES, MASONRY, EARTH, LIT = map(float, range(len(MATERIALS)))
 
 
 def box(

@@ -9,6 +9,8 @@ layout(std140) uniform Frame {
     vec4 zenith;      // sky colours; w: share of cloud
     vec4 horizon;     // w: how wet or white the ground is
     vec4 haze;
+    vec4 headlight;   // place of the car's headlights, eye-relative
+    vec4 beam;        // unit vector along the car
 };
 layout(std140) uniform Scene {
     vec4 asphalt;     // w: how worn the surface is
@@ -27,8 +29,16 @@ const vec3 WHITE = vec3(0.80, 0.82, 0.85);
 #endif
 uniform sampler2D noise; // r: grain, g: patches of some centimetres, b: broad patches, a: cracks
 
-vec3 lit(vec3 albedo, vec3 normal, float sun_share) {
+#ifdef NIGHT
+float headlights_on(vec3 place, vec3 normal);
+#endif
+
+vec3 lit(vec3 albedo, vec3 normal, float sun_share, vec3 place) {
+#ifdef NIGHT
+    float direct = headlights_on(place, normal);
+#else
     float direct = max(dot(normal, sun.xyz), 0.0) * sun_share;
+#endif
     return albedo * (sunlight.rgb * direct + skylight.rgb * (0.62 + 0.38 * normal.z));
 }
 
@@ -48,7 +58,12 @@ void light_at_vertex(vec3 place, vec3 normal, float sun_share, out vec2 light_sh
     float left = exp2(-skylight.w * distance) * sunlight.w;
     float toward = max(dot(place, sun.xyz) / distance, 0.0);
     toward *= toward;
-    light_shares = vec2(max(dot(normal, sun.xyz), 0.0) * sun_share, 0.62 + 0.38 * normal.z) * left;
+#ifdef NIGHT
+    float direct = headlights_on(place, normal);
+#else
+    float direct = max(dot(normal, sun.xyz), 0.0) * sun_share;
+#endif
+    light_shares = vec2(direct, 0.62 + 0.38 * normal.z) * left;
     air_light = haze.rgb * (1.0 + 0.35 * sunlight.rgb * toward * toward) * (sunlight.w - left);
 }
 

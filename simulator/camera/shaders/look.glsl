@@ -9,4 +9,12 @@ layout(std140) uniform Look {
     vec4 paint_gap;                  // length, period, marking (9: all)
     vec4 sign_colour;                // of arrows and crosswalks
     vec4 paint_signs;                // from arrow to arrow, turn of arrows, from crosswalk to crosswalk
+    vec4 surface_tone;               // of the other material against the first, mean section
+    vec4 surface_joint;              // concrete (1: all, -1: the other), joints, halves, seam
+    vec4 surface_repair;             // tar, patches, their tone, phase
+    vec4 surface_wear;               // wheel tracks, grain, puddles, ragged edge
+    vec4 surface_edge;               // widths of gravel and of kerb stones
+    vec4 barrier_shape;              // factor on heights, ripeness of crops
+    vec4 lamp_place;                 // from one street lamp to the next along s, y
+    vec4 lamp_light;                 // on the road below a lamp
 };

@@ -4,7 +4,7 @@ in vec2 world;
 in vec2 light_shares;
 in vec3 air_light;
 in vec3 plain_verge;
-#ifdef RAIN
+#if defined(RAIN) || defined(VARIED)
 in vec3 place;
 in vec3 normal;
 #endif
@@ -19,6 +19,9 @@ void main() {
     float lane_left = lanes.x * 0.5 * lanes.y;
     float in_lane = mod(lane_left - y, lanes.y) - 0.5 * lanes.y;
     float track_off = abs(abs(in_lane) - 0.8);
+#ifdef VARIED
+    vec3 colour = surface_at(s, y, ws, wy, fine, broad, track_off, (lane_left - y) / lanes.y);
+#else
     float worn = asphalt.w;
     float tone = 0.86 + 0.34 * (fine.r - 0.5) + (0.25 + 0.5 * worn) * (broad.g - 0.5) + 0.2 * (fine.g - 0.5);
     tone *= 1.0 - 0.14 * exp2(-8.0 * track_off * track_off) * step(away, lane_left);
@@ -28,6 +31,7 @@ void main() {
     vec3 colour = asphalt.rgb * max(tone, 0.2);
     float repair = smoothstep(0.66, 0.67 + 0.02 * ws, broad.b + 0.03 * fine.g) * worn;
     colour *= 1.0 - 0.28 * repair;
+#endif
 
     // Paint: coverage by the nearest line, reduced by wear.
     float number = clamp(floor((lane_left - y) / lanes.y + 0.5), 0.0, lanes.x);
@@ -80,16 +84,34 @@ void main() {
 #endif
     OUTPUT(pixel, painted ? MARKING : ROAD);
 #else
+#ifdef VARIED
+    float inside = on_asphalt(y + sign(y) * surface_wear.w * (fine.g + broad.g - 1.0), wy);
+#ifdef PUDDLES
+    float water = puddle_at(fine, broad) * inside;
+    colour *= 1.0 - 0.5 * water;
+#endif
+#else
     float inside = on_asphalt(y, wy);
+#endif
     colour = mix(plain_verge, colour, inside);
 #ifdef RAIN
     vec3 ripple = vec3((fine.rg - 0.5) * 0.05, 0.0);
+#ifdef NIGHT
+    vec3 light = light_by_night(colour * (1.0 + 1.3 * paint), track, place, normal, light_shares.y);
+#else
     vec3 light = light_at_eye(colour, light_shares, 1.0);
+#endif
     pixel = display_values(light + mirrored(normalize(normal + ripple), place, film * inside, fine.g) * light_shares.y, air_light);
+#elif defined(NIGHT)
+    pixel = display_values(light_by_night(colour * (1.0 + 1.3 * paint), track, place, normal, light_shares.y), air_light);
 #elif defined(SNOW)
     pixel = display_values(light_at_eye(colour, light_shares, 1.0), air_light);
 #else
-    pixel = display_values(light_at_eye(colour, light_shares, sunshine(track)), air_light);
+    vec3 light = light_at_eye(colour, light_shares, sunshine(track));
+#ifdef PUDDLES
+    light += mirrored_sky(place) * water * light_shares.y;
+#endif
+    pixel = display_values(light, air_light);
 #endif
 #endif
 }

@@ -45,6 +45,10 @@ void main() {
 #ifdef EARTH     // what lies round it
     colour = ground(world, texture(noise, world * 0.0083), texture(noise, world * 0.137), 0.5 + 0.5 * abs(upward), 1.0);
 #endif
+#ifdef LIT
+    OUTPUT(display_values(vec3(2.0) * sunlight.w, air_light), OBJECT);
+    return;
+#endif
 #if defined(SNOW) && !defined(FACADE) && !defined(CROWD)
     colour = snowed(colour, smoothstep(0.35, 0.6, upward + 0.1 * (rough.g - 0.5)));
 #endif

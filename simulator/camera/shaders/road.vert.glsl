@@ -10,7 +10,7 @@ out vec3 air_light;
 // What asphalt and verge take each other's colour for in the pixels that both cover.
 out vec3 plain_asphalt;
 out vec3 plain_verge;
-#ifdef RAIN
+#if defined(RAIN) || defined(VARIED)
 out vec3 place;
 out vec3 normal;
 #else

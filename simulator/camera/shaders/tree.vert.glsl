@@ -22,7 +22,11 @@ void main() {
     picture = (vec2(mod(cell, 4.0), floor(cell / 4.0)) + vec2(corner.x + 0.5, 1.0 - corner.y)) / vec2(4.0, 2.0);
     float side = dot(sun.xy, right) * corner.x;
     float front = 0.5 - 0.5 * dot(sun.xy, away);
+#ifdef NIGHT
+    light = skylight.rgb * (0.45 + 0.4 * corner.y) + sunlight.rgb * 0.8 * headlights_on(place, vec3(-away, 0.0));
+#else
     light = skylight.rgb * (0.45 + 0.4 * corner.y) + sunlight.rgb * (0.22 + 0.42 * front + 0.6 * side) * (0.6 + 0.4 * corner.y);
+#endif
     light *= tint * sunlight.w;
     float distance = length(place);
     float left = exp2(-skylight.w * distance);

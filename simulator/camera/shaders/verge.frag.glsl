@@ -5,7 +5,7 @@ in vec2 kerb_tufts;
 in vec2 light_shares;
 in vec3 air_light;
 in vec3 plain_asphalt;
-#ifdef RAIN
+#if defined(RAIN) || defined(VARIED)
 in vec3 place;
 in vec3 normal;
 #endif
@@ -19,6 +19,9 @@ void main() {
     vec3 stones = verge.rgb * (0.6 + 0.5 * fine.r + 0.3 * broad.g);
     float ragged = lanes.w + 0.5 * (fine.g - 0.5);
     vec3 side = mix(green, mix(stones, green, verge.w), covered(y, wy + 0.25, -ragged, ragged));
+#ifdef VARIED
+    side = mix(side, edge_albedo(s, ws, away, fine), beside_asphalt(away, wy, y));
+#endif
     float on_kerb = kerb_tufts.x * covered(away, wy, asphalt_end(y), asphalt_end(y) + 0.9);
     vec3 block = mix(vec3(0.62, 0.60, 0.57), vec3(0.50, 0.035, 0.03), repeated(s, ws, 1.0, 2.0));
     side = mix(side, block * (0.8 + 0.3 * fine.r), on_kerb);
@@ -26,7 +29,9 @@ void main() {
     side = snowed(side, 0.55 + 0.5 * horizon.w - 0.5 * fine.g + 0.3 * smoothstep(0.3, 1.5, away - asphalt_end(y)) - 0.5 * on_kerb);
 #endif
     side = mix(side, plain_asphalt, on_asphalt(y, wy));
-#if defined(RAIN) || defined(SNOW)
+#ifdef NIGHT
+    OUTPUT(display_values(light_by_night(side, track, place, normal, light_shares.y), air_light), GROUND);
+#elif defined(RAIN) || defined(SNOW)
     OUTPUT(display_values(light_at_eye(side, light_shares, 1.0), air_light), GROUND);
 #else
     OUTPUT(display_values(light_at_eye(side, light_shares, sunshine(track)), air_light), GROUND);

@@ -42,7 +42,7 @@ class VisibleTrees:
 class TreeMesh:
     """All trees of a scene."""
 
-    def __init__(self, graphics: Graphics, trees: Trees, weather: str) -> None:
+    def __init__(self, graphics: Graphics, trees: Trees, weather: str, *features: str) -> None:
         self._feet = trees.feet
         self._size = np.maximum(trees.width, trees.height)
         count = len(trees.feet)
@@ -59,8 +59,8 @@ class TreeMesh:
         corners = context.buffer(vertices.tobytes() or bytes(4))
         self._indices = context.buffer(reserve=MOST * _OUTLINE_FAN.size * 4, dynamic=True)
         programs: dict[Part, str] = {
-            "core": graphics.weather_program("tree", weather, "core"),
-            "fringe": graphics.weather_program("tree", weather),
+            "core": graphics.weather_program("tree", weather, "core", *features),
+            "fringe": graphics.weather_program("tree", weather, *features),
             "labels": graphics.label_program("tree"),
         }
         self._arrays = {

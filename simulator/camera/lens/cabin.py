@@ -1,0 +1,134 @@
+"""The fixed part of what stands before the sensor: bonnet, windscreen dirt and reflections, and
+the lens's vignette, as a gain and an addition to each pixel's linear light."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from simulator.arrays import FloatArray
+from simulator.camera.scene.light import Light
+from simulator.varied.cabin import Cabin
+from simulator.varied.look import RoadLook
+
+REFERENCE_WIDTH = 280.0
+"""Picture width (pixels) for which blurs and sizes are stated."""
+PAINTS = (
+    (0.02, 0.02, 0.022), (0.34, 0.34, 0.33), (0.11, 0.115, 0.12), (0.16, 0.015, 0.012),
+    (0.012, 0.03, 0.09), (0.09, 0.04, 0.03), (0.05, 0.052, 0.055), (0.02, 0.05, 0.035),
+)  # fmt: skip
+DASHBOARD = (0.012, 0.012, 0.013)
+
+
+@dataclass(frozen=True)
+class Glass:
+    """Linear light (1 is the brightest displayed) becomes light * `gain` + `add`, (H, W, 3)."""
+
+    gain: NDArray[np.float32]
+    add: NDArray[np.float32]
+
+
+def glass_of(look: RoadLook, light: Light, width: int, height: int) -> Glass:
+    """What cabin and lens of `look` do to a picture of `width` x `height` in `light`."""
+    cabin, lens = look.cabin, look.lens
+    rng = np.random.default_rng([cabin.shape, 1])
+    scene = surrounding_light(light, night=look.light.night)
+    cover, bonnet = _bonnet(cabin, light, scene, width, height)
+    dirt = cabin.dirt * _dirt(width, height, rng)
+    mirrored = cabin.reflection * _reflections(width, height, rng)
+    through = 1.0 - 0.55 * dirt - 0.3 * mirrored
+    veil = (0.16 * dirt + mirrored)[..., None] * scene
+    white = vignette(lens.vignette, width, height)[..., None] * np.array(
+        [lens.red_gain, 1.0, lens.blue_gain]
+    )
+    gain = ((1.0 - cover) * through)[..., None] * white
+    add = ((cover * through)[..., None] * bonnet + veil) * white
+    return Glass(gain.astype(np.float32), add.astype(np.float32))
+
+
+def surrounding_light(light: Light, night: bool) -> FloatArray:
+    """Linear RGB of a grey surface in the open, as displayed; by night the sky alone lights it."""
+    sun = 0.0 if night else np.array(light.sun) * np.sin(light.sun_elevation)
+    return np.asarray(0.5 * light.exposure * (np.array(light.sky) + sun))
+
+
+def vignette(loss: float, width: int, height: int) -> FloatArray:
+    """Share of light (H, W) that arrives: 1 in the middle, 1 - `loss` in the corners."""
+    v, u = np.mgrid[0:height, 0:width]
+    off = np.hypot(2.0 * u / (width - 1) - 1.0, (2.0 * v / (height - 1) - 1.0) * height / width)
+    return np.asarray(1.0 - loss * (off / off.max()) ** 2.4)
+
+
+def bonnet_edge(cabin: Cabin, width: int, height: int) -> FloatArray:
+    """Rows (W,) from the bottom that the bonnet covers; the highest of them is its share."""
+    rng = np.random.default_rng([cabin.shape, 2])
+    x = (np.arange(width) + 0.5) / width * 2.0 - 1.0 - rng.normal(0.0, 0.15)
+    drop = rng.uniform(0.05, 0.9) * np.abs(x) ** rng.uniform(1.6, 4.5)
+    edge = 1.0 - drop + rng.normal(0.0, 0.08) * x
+    if rng.uniform() < 0.4:  # a dome in the middle or two ridges
+        ridge = rng.choice([0.0, rng.uniform(0.25, 0.6)])
+        edge += rng.uniform(0.05, 0.2) * np.exp(-(((np.abs(x) - ridge) / 0.16) ** 2))
+    edge = np.maximum(edge, 0.0)
+    return np.asarray(edge / edge.max() * cabin.bonnet * height)
+
+
+def _bonnet(
+    cabin: Cabin, light: Light, scene: FloatArray, width: int, height: int
+) -> tuple[FloatArray, FloatArray]:
+    """Cover (H, W) of the bonnet, 0 to 1, and its colour (H, W, 3) in linear light."""
+    if cabin.bonnet == 0.0:
+        return np.zeros((height, width)), np.zeros((height, width, 3))
+    edge = bonnet_edge(cabin, width, height)
+    rng = np.random.default_rng([cabin.shape, 3])
+    dashboard = rng.uniform() < 0.2
+    paint = np.array(DASHBOARD if dashboard else PAINTS[rng.integers(len(PAINTS))])
+    below = np.arange(height)[:, None] + 0.5 - (height - edge[None, :])
+    cover = np.clip(below + 0.5, 0.0, 1.0)
+    blur = rng.uniform(0.4, 2.0) * width / REFERENCE_WIDTH
+    soft = cv2.GaussianBlur(cover, (0, 0), blur, borderType=cv2.BORDER_REPLICATE)
+    share = np.clip(below / max(cabin.bonnet * height, 1.0), 0.0, 1.0)
+    # At a flat angle the far end of the bonnet mirrors the sky over the horizon.
+    mirror = (0.0 if dashboard else rng.uniform(0.1, 0.45)) * np.exp(-share * rng.uniform(2.0, 7.0))
+    streaks = cv2.GaussianBlur(rng.standard_normal((height, width)), (0, 0), 9.0, sigmaY=2.0)
+    mirror = mirror * (1.0 + 1.5 * streaks / max(float(streaks.std()), 1e-9) * 0.2)
+    sky = np.array(light.horizon) * light.exposure
+    colour = paint * 1.6 * scene + np.maximum(mirror, 0.0)[..., None] * sky
+    return np.asarray(soft, dtype=np.float64), np.asarray(colour, dtype=np.float64)
+
+
+def _dirt(width: int, height: int, rng: np.random.Generator) -> FloatArray:
+    """Dirt on the windscreen (H, W), 0 to 1: a film, smears of the wiper, specks."""
+    scale = width / REFERENCE_WIDTH
+    film = _field(width, height, 26.0 * scale, 18.0 * scale, rng)
+    smear = _field(width, height, 9.0 * scale, 4.0 * scale, rng)
+    speck = _field(width, height, 1.1 * scale, 1.1 * scale, rng)
+    dirt = 0.35 * np.clip(0.4 + 0.5 * film, 0.0, 1.0) + 0.2 * np.clip(smear - 0.6, 0.0, 1.0)
+    return np.asarray(np.clip(dirt + 0.6 * np.clip(1.6 * (speck - 2.3), 0.0, 1.0), 0.0, 1.0))
+
+
+def _reflections(width: int, height: int, rng: np.random.Generator) -> FloatArray:
+    """What of the dashboard the windscreen mirrors (H, W), 0 to 1, mostly in its lower part."""
+    layer = np.zeros((height, width), dtype=np.float32)
+    for _ in range(rng.integers(2, 7)):
+        middle = rng.uniform([-0.1, 0.35], [1.1, 1.1]) * (width, height)
+        size = rng.uniform([0.05, 0.02], [0.5, 0.2]) * (width, height)
+        lean = rng.uniform(-0.5, 0.5) * size[0]
+        corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * size / 2.0 + middle
+        corners[:2, 0] += lean
+        shape = np.zeros_like(layer)
+        cv2.fillPoly(shape, [np.rint(corners).astype(np.int32)], float(rng.uniform(0.2, 1.0)))
+        blur = float(np.exp(rng.uniform(np.log(0.8), np.log(9.0)))) * width / REFERENCE_WIDTH
+        layer += cv2.GaussianBlur(shape, (0, 0), blur)
+    rise = np.clip(np.linspace(-0.3, 1.0, height), 0.0, 1.0)[:, None]
+    lit = 0.7 * layer + 0.45 * rng.uniform() * rise
+    return np.asarray(np.clip(lit, 0.0, 1.0), dtype=np.float64)
+
+
+def _field(
+    width: int, height: int, sigma_u: float, sigma_v: float, rng: np.random.Generator
+) -> FloatArray:
+    """Smooth noise (H, W) with standard deviation 1."""
+    noise = rng.standard_normal((height, width)).astype(np.float32)
+    field = cv2.GaussianBlur(noise, (0, 0), sigma_u, sigmaY=sigma_v)
+    return np.asarray(field / max(float(field.std()), 1e-9), dtype=np.float64)

@@ -1,0 +1,164 @@
+"""Rain drops on the windscreen, and the wiper that clears them. Pixels; no clock: the place along
+the road sets how far the wiper is and how many drops have fallen since."""
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from runtime.jit import compiled
+from simulator.arrays import FloatArray
+from simulator.camera.lens.cabin import REFERENCE_WIDTH
+from simulator.varied.cabin import Cabin
+
+Picture = NDArray[np.uint8]
+
+STAGES = 3
+"""Steps in which drops gather between two strokes of the wiper."""
+SMALL = 4
+"""A drop shows a wide view so small that this coarser picture of it is sharp enough."""
+SWEEP = 0.3
+"""Share of a wiper's period that its stroke takes."""
+MOST_DROPS = 400
+OPACITY = 235
+"""Of a drop, of 255."""
+BLADE = 14
+"""Display value of the wiper."""
+VIEW = 0.16
+"""How far about itself a drop shows the picture, as a share of the width."""
+
+
+@dataclass(frozen=True)
+class _Drops:
+    """N pixels that drops cover: the number of each, counted along the rows, that of the pixel
+    which it shows of the small picture, and how much of a drop covers it (0 to 255)."""
+
+    pixel: NDArray[np.int32]
+    source: NDArray[np.int32]
+    cover: Picture
+
+
+class Windscreen:
+    """Drops and wiper of one cabin before pictures of one size."""
+
+    def __init__(self, cabin: Cabin, cover: float, wipes: bool, size: tuple[int, int]) -> None:
+        """`cover`: share of the glass that drops cover at most; `size`: of pictures, (W, H)."""
+        self._cabin, self._cover, self._wipes, self._size = cabin, cover, wipes, size
+        width, height = size
+        rng = np.random.default_rng([cabin.shape, 4])
+        self._period_m = float(rng.uniform(14.0, 45.0))
+        self._pivot = float(rng.uniform(0.1, 0.75)) * width, float(rng.uniform(1.15, 1.5)) * height
+        self._kept: tuple[tuple[int, int], _Drops] | None = None
+
+    def applied(self, picture: Picture, s: float) -> Picture:
+        """`picture` seen through the wet glass at `s` (m) along the road."""
+        turns, phase = divmod(s / self._period_m, 1.0)
+        stroke, stage = (int(turns), int(phase * STAGES)) if self._wipes else (0, STAGES - 1)
+        drops = self._drops(stroke, stage)
+        small = cv2.resize(picture, _small(self._size), interpolation=cv2.INTER_AREA)
+        wet = _through(picture, np.asarray(small, np.uint8), drops.pixel, drops.source, drops.cover)
+        if self._wipes and phase < SWEEP:
+            self._wipe(wet, phase / SWEEP)
+        return wet
+
+    def _wipe(self, picture: Picture, share: float) -> None:
+        """Draw the wiper's blade over `picture`, at `share` (0 to 1) of its stroke and back."""
+        width, height = self._size
+        angle = math.radians(-85.0 + 170.0 * (1.0 - abs(2.0 * share - 1.0)))
+        reach = 1.15 * height
+        u, v = self._pivot
+        tip = (round(u + reach * math.sin(angle)), round(v - reach * math.cos(angle)))
+        mask = np.zeros((height, width), np.uint8)
+        thick = max(1, round(0.018 * width))
+        cv2.line(mask, (round(u), round(v)), tip, 235, thick, cv2.LINE_AA)
+        soft = 2 * round(1.5 * width / REFERENCE_WIDTH) + 1
+        _darken(picture, np.asarray(cv2.blur(mask, (soft, soft)), np.uint8), BLADE)
+
+    def _drops(self, stroke: int, stage: int) -> _Drops:
+        """The drops of one stroke at a stage; those of an earlier stage are among them."""
+        if self._kept is None or self._kept[0] != (stroke, stage):
+            rng = np.random.default_rng([self._cabin.shape, 5, stroke])
+            share = (stage + 1) / STAGES
+            self._kept = (stroke, stage), _fallen(self._cover, share, self._size, rng)
+        return self._kept[1]
+
+
+def _small(size: tuple[int, int]) -> tuple[int, int]:
+    """Width and height of the small picture."""
+    return -(-size[0] // SMALL), -(-size[1] // SMALL)
+
+
+def _fallen(cover: float, share: float, size: tuple[int, int], rng: np.random.Generator) -> _Drops:
+    """The first `share` of drops that would cover about the share `cover` of a picture."""
+    width, height = size
+    scale = width / REFERENCE_WIDTH
+    radius = np.clip(np.exp(rng.normal(0.7, 0.45, MOST_DROPS)), 1.1, 9.0) * scale
+    middle = rng.uniform(0.0, 1.0, (MOST_DROPS, 2)) * (width, height)
+    tall = radius * rng.uniform(1.0, 1.5, MOST_DROPS)
+    area = np.cumsum(np.pi * radius * tall)
+    count = int(np.searchsorted(area, cover * share * width * height))
+    shape = np.column_stack([middle, radius, tall])[:count]
+    mask, source = _stamped(shape, width, height, VIEW * width)
+    soft = cv2.GaussianBlur(mask, (0, 0), float(rng.uniform(0.4, 1.0)) * scale)
+    # Where a drop's soft edge lies beside it, the pixel shows no drop: only inside is kept.
+    pixel = np.flatnonzero(mask).astype(np.int32)
+    return _Drops(pixel, source.reshape(-1)[pixel], np.asarray(soft, np.uint8).reshape(-1)[pixel])
+
+
+@compiled
+def _stamped(
+    shape: FloatArray, width: int, height: int, view: float
+) -> tuple[Picture, NDArray[np.int32]]:
+    """Where drops lie (H, W), and the pixel of the small picture that each pixel of them shows.
+
+    `shape` (N, 4): middle and half axes of each drop. It shows the picture `view` pixels about it,
+    upside down.
+    """
+    mask = np.zeros((height, width), np.uint8)
+    source = np.zeros((height, width), np.int32)
+    across, down = (width + SMALL - 1) // SMALL, (height + SMALL - 1) // SMALL
+    for k in range(len(shape)):
+        u0, v0, half_u, half_v = shape[k]
+        for v in range(max(int(v0 - half_v), 0), min(int(v0 + half_v) + 2, height)):
+            for u in range(max(int(u0 - half_u), 0), min(int(u0 + half_u) + 2, width)):
+                x, y = (u - u0) / half_u, (v - v0) / half_v
+                off = x * x + y * y
+                if off < 1.0:
+                    bent = view * (0.4 + 0.6 * off) / SMALL
+                    a = min(max(int(u0 / SMALL - x * bent), 0), across - 1)
+                    b = min(max(int(v0 / SMALL - y * bent), 0), down - 1)
+                    mask[v, u], source[v, u] = OPACITY, b * across + a
+    return mask, source
+
+
+@compiled
+def _through(
+    picture: Picture,
+    small: Picture,
+    pixel: NDArray[np.int32],
+    source: NDArray[np.int32],
+    cover: Picture,
+) -> Picture:
+    """A copy of `picture` with the drops in it: see `_Drops`."""
+    out = picture.copy()
+    flat, seen = out.reshape(-1, 3), small.reshape(-1, 3)
+    for k in range(len(pixel)):
+        weight = np.int32(cover[k])
+        for c in range(3):
+            old, new = np.int32(flat[pixel[k], c]), np.int32(seen[source[k], c])
+            flat[pixel[k], c] = old + (new - old) * weight // 255
+    return out
+
+
+@compiled
+def _darken(picture: Picture, cover: Picture, value: int) -> None:
+    """Draw the grey `value` over `picture` where `cover` (H, W), 0 to 255, says how much."""
+    for v in range(picture.shape[0]):
+        for u in range(picture.shape[1]):
+            weight = np.int32(cover[v, u])
+            if weight > 0:
+                for c in range(3):
+                    old = np.int32(picture[v, u, c])
+                    picture[v, u, c] = old + (value - old) * weight // 255

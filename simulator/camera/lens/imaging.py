@@ -1,0 +1,148 @@
+"""From the rendered picture to the recorded one: rain on the glass, blur, noise, tone and JPEG."""
+
+import math
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from simulator.arrays import FloatArray
+from simulator.camera.bridges.bridges import Bridge
+from simulator.camera.core import optics
+from simulator.camera.core.optics import Eye
+from simulator.camera.lens.cabin import REFERENCE_WIDTH, glass_of
+from simulator.camera.lens.develop import develop, noise_table
+from simulator.camera.lens.drops import Windscreen
+from simulator.camera.scene.light import Light
+from simulator.varied.look import RoadLook
+from trackfeatures.camera import CameraParameters
+
+Picture = NDArray[np.uint8]
+
+RAIN_DROPS = 0.08
+"""Share of the windscreen that drops cover between two strokes of the wiper in rain, where the
+look has no drops of its own."""
+DAZZLED = 245
+"""Display value from which a pixel shows the sun itself."""
+GLOWS = np.uint8(200)
+"""Display value from which light glows by night."""
+ADAPTING_M = 10.0
+"""Way that the exposure needs to follow a change of brightness."""
+DARK_NOISE = 1.8
+"""Factor on the noise by night."""
+
+
+class Imaging:
+    """Cabin, lens and sensor of one look, in one light, for one camera."""
+
+    def __init__(
+        self, look: RoadLook, light: Light, camera: CameraParameters, bridges: Sequence[Bridge]
+    ) -> None:
+        width, height = camera.width, camera.height
+        self._lens, self._light, self._flare = look.lens, light, look.light.flare
+        self._size = width, height
+        self._matrix: FloatArray = camera.intrinsics()
+        self._motion = _motion_of(camera, look.lens.travel_m)
+        self._glass = glass_of(look, light, width, height)
+        adapts = look.light.adaptation_stops if light.shade < 0.5 else 0.0
+        self._adaptation = adapts, [(bridge.s, bridge.half_along) for bridge in bridges]
+        self._night = look.light.night
+        self._normal = noise_table()
+        self._noise = look.lens.noise * (DARK_NOISE if look.light.night else 1.0)
+        self._windscreen: Windscreen | None = None
+        wet = look.cabin.drops or (RAIN_DROPS if light.weather == "rain" else 0.0)
+        if wet > 0.0:
+            self._windscreen = Windscreen(
+                look.cabin, wet, wipes=look.cabin.wipers or light.weather == "rain", size=self._size
+            )
+
+    def developed(self, picture: Picture, eye: Eye, s: float) -> Picture:
+        """The recorded picture of the rendered one (H, W, 3), from `eye`, at `s` m of the road."""
+        lens = self._lens
+        if self._night:
+            picture = _with_glow(picture)
+        if self._windscreen is not None:
+            picture = self._windscreen.applied(picture, s)
+        if lens.softness_px > 0.0:
+            blur = lens.softness_px * self._size[0] / REFERENCE_WIDTH
+            picture = np.asarray(cv2.GaussianBlur(picture, (0, 0), blur), np.uint8)
+        picture = develop(
+            picture,
+            self._glass.gain,
+            self._glass.add,
+            2.0 ** adaptation(s, *self._adaptation),
+            self._motion,
+            self._glare(picture, eye),
+            (self._noise, _seed_of(eye)),
+            self._normal,
+            lens.contrast,
+        )
+        if lens.sharpening > 0.0:
+            soft = cv2.GaussianBlur(picture, (3, 3), 0.0)
+            mixed = cv2.addWeighted(picture, 1.0 + lens.sharpening, soft, -lens.sharpening, 0.0)
+            picture = np.asarray(mixed, np.uint8)
+        return _compressed(picture, lens.jpeg_quality) if lens.jpeg_quality else picture
+
+    def _glare(self, picture: Picture, eye: Eye) -> tuple[float, float, float]:
+        """Place of the sun in the picture and strength of its glare: see `develop`."""
+        right, up, ahead = eye.axes @ np.array(self._light.sun_direction)
+        if self._flare == 0.0 or ahead < 0.05 or self._light.shade > 0.5:
+            return 0.0, 0.0, 0.0
+        u = float(self._matrix[0, 2] + self._matrix[0, 0] * right / ahead)
+        v = float(self._matrix[1, 2] - self._matrix[1, 1] * up / ahead)
+        width, height = self._size
+        beyond = max(-u, u - width, -v, v - height, 0.0)
+        strength = self._flare * float(np.exp(-beyond / (0.2 * width)))
+        if beyond == 0.0:
+            part = picture[max(int(v) - 2, 0) : int(v) + 3, max(int(u) - 2, 0) : int(u) + 3]
+            strength *= (
+                0.1 + 0.9 * float((part.min(axis=2) >= DAZZLED).mean()) if part.size else 1.0
+            )
+        return u, v, strength
+
+
+def _motion_of(camera: CameraParameters, travel_m: float) -> tuple[float, float, float, float]:
+    """Where the car drives to in the picture, height times focal length, way: see `develop`."""
+    matrix = camera.intrinsics()
+    ahead = optics.extrinsics(camera, np.zeros(6), "front")[:3, 0]
+    u, v, _ = matrix @ ahead / ahead[2]
+    return float(u), float(v), float(camera.height_above_road_m * matrix[1, 1]), travel_m
+
+
+def adaptation(s: float, stops: float, bridges: Sequence[tuple[float, float]]) -> float:
+    """By how many stops the exposure has opened at `s`: up to `stops` on the way through a bridge's
+    shadow, and back to none after it. `bridges`: place along the road and half length, in m."""
+    most = 0.0
+    for place, half in bridges:
+        begin = place - half
+        into = (s - begin) / max(2.0 * half, ADAPTING_M)
+        behind = s - max(place + half, begin + ADAPTING_M)
+        most = max(most, min(into, 1.0) if behind < 0.0 else math.exp(-behind / ADAPTING_M))
+    return stops * most
+
+
+def _with_glow(picture: Picture) -> Picture:
+    """The picture with a glow round what is brighter than the display shows."""
+    width, height = picture.shape[1], picture.shape[0]
+    bright = cv2.resize(np.maximum(picture, GLOWS) - GLOWS, (width // 4, height // 4))
+    glow = cv2.GaussianBlur(bright, (0, 0), 0.008 * width)
+    return np.asarray(
+        cv2.addWeighted(picture, 1.0, cv2.resize(glow, (width, height)), 2.5, 0.0), np.uint8
+    )
+
+
+def _seed_of(eye: Eye) -> int:
+    """Seed of a picture's noise: a hash of the place it is taken from, so no clock is needed."""
+    x, y, z = (round(float(part) * 1e4) for part in eye.place)
+    return ((x * 73_856_093) ^ (y * 19_349_663) ^ (z * 83_492_791)) % 2**62
+
+
+def _compressed(picture: Picture, quality: int) -> Picture:
+    """The picture after JPEG compression with 4:2:0 colours."""
+    bgr = cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)
+    done, data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])
+    if not done:
+        raise RuntimeError(f"cv2 did not encode a picture of {picture.shape} as JPEG")
+    read = np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR))
+    return np.asarray(cv2.cvtColor(read, cv2.COLOR_BGR2RGB), np.uint8)

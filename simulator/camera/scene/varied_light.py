@@ -1,0 +1,83 @@
+"""A light as a scene's look changes it: exposure, a low sun, or night with headlights."""
+
+import math
+from dataclasses import replace
+
+from simulator.camera.scene.light import Colour, Light
+from simulator.varied.lighting import Lighting
+
+SUNNY = ("clear", "dusk", "heavy-shadow")
+"""Kinds of light in which the sun may stand low."""
+USUAL_ALBEDO, COMPENSATED = 0.13, 0.45
+"""Of a road for which the kinds of light are right; exponent of the automatic exposure."""
+HEADLIGHT: Colour = (3.4, 3.2, 2.75)
+_NIGHT_SKY: Colour = (0.006, 0.007, 0.010)
+_GLOW: Colour = (0.010, 0.009, 0.010)
+_SODIUM: Colour = (1.0, 0.62, 0.25)
+_WHITE: Colour = (0.92, 0.97, 1.0)
+LAMP_GLOW = 0.035
+"""Scattered light on a lit road, as a share of that below a lamp."""
+
+
+def lit_as(light: Light, look: Lighting, albedo: float = 0.0) -> Light:
+    """`light` as `look` has it, on a road of this albedo (0: the scenery's own), for which the
+    exposure makes up in part, as a camera's automatic does."""
+    automatic = (USUAL_ALBEDO / albedo) ** COMPENSATED if albedo else 1.0
+    if look.night:
+        light = _by_night(light, look)
+    elif look.low_sun_deg > 0.0 and light.kind in SUNNY:
+        light = _with_low_sun(light, look.low_sun_deg)
+    return replace(light, exposure=light.exposure * automatic * 2.0**look.exposure_stops)
+
+
+def lamp_colour(look: Lighting) -> Colour:
+    """Light of a street lamp on the road below it; black where none is lit."""
+    if not (look.night and look.lamp_every_m > 0.0):
+        return 0.0, 0.0, 0.0
+    red, green, blue = (
+        0.55 * (white + look.lamp_warmth * (sodium - white))
+        for white, sodium in zip(_WHITE, _SODIUM, strict=True)
+    )
+    return red, green, blue
+
+
+def _by_night(light: Light, look: Lighting) -> Light:
+    """Only the headlights, the lamps and a glow over the horizon are left. The headlights take the
+    sun's place (see night.glsl), which then stands at the zenith, out of sight."""
+    lamps = lamp_colour(look)
+
+    def mixed(dark: Colour, share: float) -> Colour:
+        red, green, blue = (d + share * lamp for d, lamp in zip(dark, lamps, strict=True))
+        return red, green, blue
+
+    red, green, blue = (look.headlights * part for part in HEADLIGHT)
+    return replace(
+        light,
+        sun_azimuth=0.0,
+        sun_elevation=math.pi / 2,
+        sun=(red, green, blue),
+        sky=mixed(_NIGHT_SKY, LAMP_GLOW),
+        zenith=mixed((0.0015, 0.002, 0.004), 0.004),
+        horizon=mixed(_GLOW, 0.03),
+        haze=mixed((0.004, 0.004, 0.005), 0.02),
+        clouds=0.0,
+        shade=0.95,
+        canopy=False,
+    )
+
+
+def _with_low_sun(light: Light, elevation_deg: float) -> Light:
+    """The sun lower, and so redder and dimmer, than the kind of light has it."""
+    elevation = min(math.radians(elevation_deg), light.sun_elevation)
+    clear = math.sin(elevation) / math.sin(max(light.sun_elevation, elevation))
+    red, green, blue = light.sun
+    warm: Colour = (red, green * (0.72 + 0.28 * clear), blue * (0.45 + 0.55 * clear))
+    dim = 0.75 + 0.25 * clear
+    hazy = [h * t for h, t in zip(light.horizon, (1.12, 1.0, 0.88), strict=True)]
+    return replace(
+        light,
+        sun_elevation=elevation,
+        sun=(warm[0] * dim, warm[1] * dim, warm[2] * dim),
+        sky=(light.sky[0] * dim, light.sky[1] * dim, light.sky[2] * dim),
+        horizon=(hazy[0], hazy[1], hazy[2]),
+    )
