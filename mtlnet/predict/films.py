@@ -96,7 +96,7 @@ class Film:
         self, film: cv2.VideoCapture, errors: DecodingErrors, used: int, lost: int, damaged_at: int
     ) -> str:
         if not used:
-            return f"{self.path}: {_no_frame(film, errors)}"
+            return f"{self.path}: {no_frame(film, errors)}"
         reason = missing_end(self.path)
         if reason:
             stated = int(film.get(cv2.CAP_PROP_FRAME_COUNT))
@@ -186,7 +186,7 @@ def _unconverted(errors: DecodingErrors) -> str:
     return f"its colours cannot be converted ({errors.unconverted}); {CONVERT}"
 
 
-def _no_frame(film: cv2.VideoCapture, errors: DecodingErrors) -> str:
+def no_frame(film: cv2.VideoCapture, errors: DecodingErrors) -> str:
     """Why a film that could be opened has no frame."""
     packed = int(film.get(cv2.CAP_PROP_FOURCC)) & 0xFFFFFFFF
     code = packed.to_bytes(4, "little").decode("latin-1").strip("\0 ")

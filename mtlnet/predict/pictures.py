@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import cv2
 import numpy as np
@@ -29,6 +29,14 @@ class Picture:
     """Since 1970; of a film since its start. None: unknown."""
     bgr: bool = False
     error: str = ""
+
+
+@runtime_checkable
+class LensFinder(Protocol):
+    """Finds the camera of a stream while it runs."""
+
+    def at(self, picture: Picture) -> Lens:
+        """The lens for this picture, which is the next one: None until it is known."""
 
 
 class Pictures(Protocol):
