@@ -7,21 +7,17 @@ road enlarged: what is answered for it in metres is scaled by the ratio of the h
 """
 
 from dataclasses import dataclass, fields, replace
-from math import cos, isfinite, radians, sin
-from pathlib import Path
-from typing import Any
+from math import cos, radians, sin
 
 import cv2
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
 import trackfeatures as tf
 from mtlnet.inference.image_decoding.errors import Fault, ImageError
 from mtlnet.inference.prediction import split_outputs
-from trackfeatures.camera import CameraError, CameraParameters
+from trackfeatures.camera import CameraParameters
 from trackfeatures.coding import OFFSET, SPAN
-from trackfeatures.errors import UserError
 
 CAMERA_FILE = "camera.yaml"
 HEIGHT = "height_above_road_m"
@@ -151,43 +147,3 @@ class Rectification:
         if parts.std is not None:
             parts.std[:, :-1] *= np.float32(self.scale)
         return changed
-
-
-def read_camera(path: Path, model: CameraParameters) -> CameraParameters:
-    """The camera that a YAML file describes; what it leaves out is as in the model's camera.
-
-    Keys: those of `CameraParameters`, and `height_above_road_m` in place of `z`. Raises UserError.
-    """
-    try:
-        found: Any = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        reason = getattr(error, "strerror", None) or " ".join(str(error).split())
-        raise UserError(f"{path} cannot be read as a camera: {reason}") from error
-    if not isinstance(found, dict) or not found:
-        raise UserError(f"{path} describes no camera; give some of {', '.join(KEYS)}")
-    unknown = [str(key) for key in found if key not in KEYS]
-    if unknown:
-        raise UserError(f"{path} has the unknown key {unknown[0]!r}; known are {', '.join(KEYS)}")
-    if HEIGHT in found and "z" in found:
-        raise UserError(f"{path} gives both z and {HEIGHT}; leave one out")
-    for key, value in found.items():
-        whole = key in ("width", "height")
-        if isinstance(value, bool) or not isinstance(value, int if whole else int | float):
-            kind = "a whole number of pixels" if whole else "a number"
-            raise UserError(f"{path}: {key} is {value!r}; give {kind}")
-    values: dict[str, Any] = dict(found)
-    if (height := values.pop(HEIGHT, None)) is not None:
-        values["z"] = height - CameraParameters.cg_height_m
-    try:
-        camera = replace(model, **values)
-    except CameraError as error:
-        raise UserError(f"{path}: {error}") from error
-    finite = all(map(isfinite, (camera.x, camera.y, camera.z)))
-    if min(camera.width, camera.height) < 1 or not (finite and camera.height_above_road_m > 0):
-        raise UserError(f"{path}: a camera of {camera} is impossible; give sizes above 0")
-    if not abs(camera.pitch_deg) <= MAX_PITCH_DEG:
-        raise UserError(
-            f"{path}: pitch_deg is {camera.pitch_deg:g}; give "
-            f"{-MAX_PITCH_DEG:g} to {MAX_PITCH_DEG:g}"
-        )
-    return camera
