@@ -15,8 +15,9 @@ from pathlib import Path
 
 AV_LOG_ERROR = 16
 LINE_BYTES = 512
-# They are about data beside the picture, which dash cameras write as they like.
-HARMLESS = ("SEI", "APP fields", "timescale not set")
+# About data beside the picture, which dash cameras write as they like, and the end of a stream that
+# states no size.
+HARMLESS = ("SEI", "APP fields", "timescale not set", f"should be {2**64 - 1}")
 SIZES = (b"Reinit context to %dx%d", b"sof0: picture: %dx%d")
 SIZE = re.compile(r"(?:to|picture:) (\d+)x(\d+)")
 BLOCK_PX = 16

@@ -24,13 +24,15 @@ from mcap.writer import Writer as Mcap
 import trackfeatures as tf
 from datagen.recording.images import encode
 from datagen.recording.schema import messages, topics
-from mtlnet.inference.overlay import PREDICTION_COLOUR, SCALE, marking_line, to_pixels
+from datagen.recording.schema.polylines import CORNER_PX
+from mtlnet.inference.overlay import PREDICTION_COLOUR, Distances, marking_line
 from mtlnet.inference.prediction import HEADINGS, Prediction
 from mtlnet.predict.sources import SourceImage
 from mtlnet.predict.writers import feature_lines, table_row, view_of
 from trackfeatures.camera import CameraParameters
 
 LAYOUT = "foxglove_layout.json"
+TOPICS = (topics.CAMERA, topics.CALIBRATION, topics.ANNOTATIONS)
 FEATURES = "/features"
 SCHEMA = "driverview.Prediction"
 CODEC = "jpeg"
@@ -75,7 +77,7 @@ class McapWriter:
             name: value for name, value in table_row(item, prediction).items() if value is not None
         }
         self._add(topics.CAMERA, time, image)
-        self._add(topics.ANNOTATIONS, time, annotations(prediction, view, stamp))
+        self._add(topics.ANNOTATIONS, time, annotations(item, prediction, view, stamp))
         self._add(FEATURES, time, json.dumps(row).encode())
         self._count += 1
 
@@ -125,26 +127,29 @@ class McapWriter:
         return self._mcap.register_channel(topic, MessageEncoding.Protobuf, schema)
 
 
-TOPICS = (topics.CAMERA, topics.CALIBRATION, topics.ANNOTATIONS)
-
-
-def annotations(prediction: Prediction, view: CameraParameters, time: Any) -> bytes:
-    """The predicted markings as polylines (pixels of the view) and the features as text.
-
-    They are straight: the curvature is not predicted.
-    """
+def annotations(
+    item: SourceImage, prediction: Prediction, view: CameraParameters, time: Any
+) -> bytes:
+    """The predicted markings as polylines over the image, a round's labels too, and the features as
+    text. Without labels the lines are straight: the curvature is not predicted."""
     message = ImageAnnotations(timestamp=time)
-    for distance in prediction.distances_m.values():
-        if distance is None:
-            continue
-        points = marking_line(distance, prediction.angle_rad, 0.0)
-        line = message.points.add(type=PointsAnnotation.LINE_STRIP, thickness=1.5)
-        line.timestamp.CopyFrom(time)
-        line.outline_color.CopyFrom(ORANGE)
-        for u, v in (
-            to_pixels(points, view, view.height_above_road_m) / np.float64(SCALE)
-        ).tolist():
-            line.points.add(x=u, y=v)
+    truth, curvature = item.truth, item.truth.curvature if item.truth else 0.0
+    styles: list[tuple[Distances, float, Any]] = [
+        (prediction.distances_m, prediction.angle_rad, ORANGE)
+    ]
+    if truth is not None:
+        styles.insert(0, (truth.distances_m, truth.angle_rad, messages.GREEN))
+    for distances, angle, colour in styles:
+        for distance in distances.values():
+            if distance is None:
+                continue
+            points = marking_line(distance, angle, curvature)
+            on_road = np.full(len(points), -CameraParameters.cg_height_m)
+            line = message.points.add(type=PointsAnnotation.LINE_STRIP, thickness=1.5)
+            line.timestamp.CopyFrom(time)
+            line.outline_color.CopyFrom(colour)
+            for u, v in (view.project(np.column_stack([points, on_road])) + CORNER_PX).tolist():
+                line.points.add(x=u, y=v)
     for row, text in enumerate(feature_lines(prediction)):
         label = message.texts.add(text=text, font_size=9.0)
         label.timestamp.CopyFrom(time)

@@ -81,13 +81,15 @@ class Source:
     fps: float = DEFAULT_FPS
     problem: str = ""
     """Why no image can be taken from it."""
+    address: str = ""
+    """Of a webcam or stream, without a password."""
     opened: "Stream | Recording | None" = None
     lens: Lens | LensFinder = None
 
     @property
     def name(self) -> str:
         """As it stands in tables and messages."""
-        return self.opened.name if isinstance(self.opened, Stream) else str(self.path)
+        return self.address or str(self.path)
 
     @property
     def files(self) -> list[Path]:
@@ -176,11 +178,12 @@ def _named(paths: list[Path]) -> str:
 
 
 def _stream(given: str) -> Source:
+    path, name = Path(given), shown_name(given)
     try:
-        stream = open_stream(given)
+        opened = open_stream(given)
     except UserError as error:
-        return Source(Path(shown_name(given)), Kind.STREAM, 0, problem=str(error))
-    return Source(Path(given), Kind.STREAM, 0, stream.fps or DEFAULT_FPS, opened=stream)
+        return Source(path, Kind.STREAM, 0, problem=str(error), address=name)
+    return Source(path, Kind.STREAM, 0, opened.fps or DEFAULT_FPS, address=name, opened=opened)
 
 
 def _source(path: Path, kind: Kind, topic: str) -> Source:

@@ -25,8 +25,6 @@ ADDRESS = re.compile(r"([a-z][a-z0-9+.-]*)://", re.IGNORECASE)
 OPEN_S, STALL_S = 10.0, 10.0
 """Time for the first picture, and for each one after it: a camera behind a slow link sends some
 pictures a second; the longest key frame interval in use is about 10 s."""
-UNSTATED_END = str(2**64 - 1)
-"""The size that FFmpeg expects of a stream that states none; its end is no error."""
 DEVICES = Path("/dev")
 
 
@@ -79,8 +77,7 @@ class Stream:
                 number += 1
 
     def _end(self, number: int, waited_s: float) -> None:
-        is_end = not self.errors.first or UNSTATED_END in self.errors.first
-        told = "" if is_end else f" ({self.errors.first})"
+        told = f" ({self.errors.first})" if self.errors.first else ""
         if waited_s > 0.9 * STALL_S:
             self.fault = (
                 f"{self.name} sent nothing for {waited_s:.0f} s after {number} pictures{told}; "

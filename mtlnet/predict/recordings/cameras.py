@@ -79,7 +79,8 @@ def is_models(camera: CameraParameters, model: CameraParameters) -> bool:
 def _lens(model: str, distortion: Any) -> dict[str, Any]:
     if not distortion.any():
         return {"distortion": "none", "coefficients": ()}
-    coefficients = tuple(distortion.tolist())
+    used = distortion[:8] if not distortion[8:].any() else distortion
+    coefficients = tuple(used.tolist())
     if model in PINHOLE:
         return {"distortion": "opencv", "coefficients": coefficients}
     if model in FISHEYE:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from rosbags.rosbag2 import CompressionMode, StoragePlugin
 
 from mtlnet.inference.image_decoding.errors import ImageError
-from mtlnet.inference.model_card import read_card
+from mtlnet.inference.model_card import read_card, resolve_run
 from mtlnet.predict.recordings.raw import decode_raw
 from mtlnet.predict.run import InputsLeftOut, predict_files
 from mtlnet.predict.sources import find_sources
@@ -33,8 +33,8 @@ CAMERA = "/camera/image_raw"
 
 
 @pytest.fixture
-def engine(published: Path) -> BrightnessEngine:
-    return BrightnessEngine(read_card(published))
+def engine() -> BrightnessEngine:
+    return BrightnessEngine(read_card(resolve_run("default")))
 
 
 def pictures(size: tuple[int, int] = (420, 560)) -> list[NDArray[np.uint8]]:
