@@ -86,9 +86,10 @@ class Film:
                 first = (frame.shape[1], frame.shape[0])
                 self.fault = other_size(str(self.path), number, size, first)
                 return
-            image = frame if stretch == (1.0, 1.0) else _stretched(frame, stretch)
-            time_s = film.get(cv2.CAP_PROP_POS_MSEC) / 1e3
-            yield Picture(number, image.astype(np.uint8, copy=False), time_s, bgr=True)
+            image = frame.astype(np.uint8, copy=False)
+            if stretch != (1.0, 1.0):
+                image = _stretched(image, stretch)
+            yield Picture(number, image, film.get(cv2.CAP_PROP_POS_MSEC) / 1e3, bgr=True)
             number, used = number + 1, used + 1
         self.fault = self._find_fault(film, errors, used, number - used, damaged_at)
 

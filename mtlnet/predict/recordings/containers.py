@@ -217,9 +217,9 @@ class RosBag:
 
 def _bag_errors() -> tuple[type[Exception], ...]:
     import apsw
-    from rosbags.rosbag2 import ReaderError
-    from rosbags.rosbag2.reader import zstd
+    from rosbags.rosbag2 import ReaderError, reader
 
+    zstd: Any = vars(reader)["zstd"]  # of Python from 3.14 on, before that a package
     return (ReaderError, apsw.Error, zstd.ZstdError, OSError, *DAMAGE)
 
 

@@ -1,7 +1,8 @@
-"""Foxglove `CompressedVideo`: a picture a message, decoded by OpenCV's FFmpeg from an IVF file.
+"""Foxglove `CompressedVideo`: a picture a message, decoded by OpenCV's FFmpeg from a file.
 
-In IVF each message keeps its number as its time, so that a picture that cannot be decoded moves no
-other. Source: the IVF header of libvpx; all four codecs of Foxglove's schema have a code in it.
+In an IVF file each message keeps its number as its time, so that a picture that cannot be decoded
+moves no other. FFmpeg knows no H.265 in it: that is a plain stream, whose pictures are counted.
+Source: the IVF header of libvpx.
 """
 
 import struct
@@ -17,7 +18,7 @@ from mtlnet.predict.films import no_frame, silent_opencv
 from mtlnet.predict.pictures import Picture, other_size
 from trackfeatures.errors import UserError
 
-CODES = {"h264": b"H264", "h265": b"HEVC", "vp9": b"VP90", "av1": b"AV01"}
+CODES = {"h264": b"H264", "h265": b"", "vp9": b"VP90", "av1": b"AV01"}
 HEADER = struct.Struct("<4sHH4sHHIIII")
 FRAME = struct.Struct("<IQ")
 RATE = 1000
@@ -30,6 +31,7 @@ class Video:
         self._name = name
         self.fault = ""
         self._times: list[float] = []
+        self._in_ivf = True
 
     def pictures(self, packets: Iterator[tuple[float, str, bytes]]) -> Iterator[Picture]:
         """The pictures of messages: time in s, format, data.
@@ -37,23 +39,24 @@ class Video:
         Raises UserError for a format that is not read.
         """
         with TemporaryDirectory(prefix="driverview-") as folder:
-            file = Path(folder) / "video.ivf"
+            file = Path(folder) / "video"
             self._write(file, packets)
             yield from self._decoded(file)
 
     def _write(self, path: Path, packets: Iterator[tuple[float, str, bytes]]) -> None:
-        form = ""
         with path.open("wb") as file:
-            for time_s, found, data in packets:
-                if not form:
-                    form = found
-                    if form not in CODES:
-                        raise UserError(
-                            f"{self._name}: its format {form!r} is not read; known are "
-                            f"{', '.join(CODES)}"
-                        )
+            for number, (time_s, form, data) in enumerate(packets):
+                if form not in CODES:
+                    raise UserError(
+                        f"{self._name}: its format {form!r} is not read; known are "
+                        f"{', '.join(CODES)}"
+                    )
+                self._in_ivf = bool(CODES[form])
+                if self._in_ivf and not number:
                     file.write(HEADER.pack(b"DKIF", 0, 32, CODES[form], 16, 16, RATE, 1, 0, 0))
-                file.write(FRAME.pack(len(data), len(self._times)) + data)
+                if self._in_ivf:
+                    file.write(FRAME.pack(len(data), number))
+                file.write(data)
                 self._times.append(time_s)
 
     def _decoded(self, path: Path) -> Iterator[Picture]:
@@ -67,7 +70,8 @@ class Video:
                     found, frame = film.read()
                     if not found:
                         break
-                    number = min(max(round(film.get(cv2.CAP_PROP_PTS)), used), len(self._times) - 1)
+                    number = round(film.get(cv2.CAP_PROP_PTS)) if self._in_ivf else used
+                    number = min(max(number, used), len(self._times) - 1)
                     if size := errors.new_size(frame.shape):
                         first = (frame.shape[1], frame.shape[0])
                         self.fault = other_size(self._name, number, size, first)

@@ -128,7 +128,7 @@ def write_foxglove(
             time = START_S * 10**9 + number * STEP_NS + LOG_DELAY_NS
             writer.add_message(channels[topic], time, content, time)
         if finish:
-            writer.finish()
+            writer.finish()  # type: ignore[no-untyped-call]  # mcap leaves it untyped
     return path
 
 
