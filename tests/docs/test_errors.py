@@ -35,6 +35,7 @@ from simulator.track.torcs.torcs import read_torcs
 from simulator.vehicle.state import Command
 from simulator.world.world import World
 from tests.mtlnet.conftest import write_dataset
+from tests.mtlnet.predict import recorded
 from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
 
@@ -180,6 +181,58 @@ def _(folder: Path) -> object:
 def _(folder: Path) -> object:
     os.mkfifo(folder / "a.mp4")
     return predict(folder / "a.mp4")
+
+
+GREY = recorded.ros_image(np.full((210, 280), 90, np.uint8), "mono8")
+
+
+@row("a recording without pictures")
+def _(folder: Path) -> object:
+    camera = recorded.ros_camera((280, 210), (150, 150, 140, 105))
+    return predict(recorded.write_bag(folder / "bag", [("/info", "CameraInfo", camera)]))
+
+
+@row("a recording with several cameras")
+def _(folder: Path) -> object:
+    images = [("/left", "Image", GREY), ("/right", "Image", GREY)]
+    return predict(recorded.write_bag(folder / "bag", images))
+
+
+@row("a topic that is not there")
+def _(folder: Path) -> object:
+    bag = recorded.write_bag(folder / "bag", [("/left", "Image", GREY)])
+    return predict_files(engine(), [str(bag)], topic="/right")
+
+
+@row("a recording that is cut")
+def _(folder: Path) -> object:
+    bag = recorded.write_bag(folder / "bag", [("/left", "Image", GREY)] * 3)
+    file = next(bag.glob("*.mcap"))
+    file.write_bytes(file.read_bytes()[:-100])
+    return predict(bag)
+
+
+@row("a picture that holds depths")
+def _(folder: Path) -> object:
+    depths = recorded.ros_image(np.ones((210, 280), np.float32), "32FC1")
+    return predict(recorded.write_bag(folder / "bag", [("/depth", "Image", depths)]))
+
+
+@row("pictures that change their size")
+def _(folder: Path) -> object:
+    other = recorded.ros_image(np.full((420, 560), 90, np.uint8), "mono8")
+    images = [("/left", "Image", GREY), ("/left", "Image", other)]
+    return predict(recorded.write_bag(folder / "bag", images))
+
+
+@row("a stream that cannot be opened")
+def _(folder: Path) -> object:
+    return predict_files(engine(), ["http://127.0.0.1:9/a"])
+
+
+@row("a webcam that is not there")
+def _(folder: Path) -> object:
+    return predict_files(engine(), ["63"])
 
 
 def damaged_round(folder: Path) -> Dataset:
