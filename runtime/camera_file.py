@@ -197,10 +197,8 @@ def _distortion(model: Any, given: list[float]) -> dict[str, Any]:
     kind = MODELS[model.lower()]
     if kind == "opencv" and len(given) in (12, 14) and not any(given[8:]):
         given = given[:8]  # no thin prism, no tilt
-    if not given or (
-        kind != "fisheye" and not any(given) and len(given) in (*COEFFICIENTS[kind], 8, 5)
-    ):
-        return {}
+    if kind != "fisheye" and not any(given) and len(given) in (0, *COEFFICIENTS[kind]):
+        return {}  # a pinhole
     return {"distortion": kind, "coefficients": tuple(given)}
 
 
