@@ -24,8 +24,10 @@ def with_lens(source: Source, model: CameraParameters, given: Lens, note: Note) 
 
     assert isinstance(source.opened, Recording)
     camera, about = source.opened.camera(model)
+    if camera is not None and is_models(camera, model):
+        return source
     if about:
         note(about)
-    if camera is None or is_models(camera, model):
+    if camera is None:
         return source
     return replace(source, lens=Rectification(camera, model))
