@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from mtlnet.predict.recordings.containers import Topic
 from mtlnet.predict.recordings.images import CALIBRATION, ROS_CALIBRATION
+from mtlnet.predict.recordings.topic import Topic
 from trackfeatures.camera import CameraError, CameraParameters
 from trackfeatures.errors import UserError
 

@@ -227,6 +227,24 @@ def test_a_cut_recording_gives_what_is_left(engine: BrightnessEngine, tmp_path: 
         assert 1 <= len(rows) == len(raised.value.results) < COUNT + 1
 
 
+def test_a_cut_database_gives_what_is_left(engine: BrightnessEngine, tmp_path: Path) -> None:
+    """`rosbags` and SQLite refuse it; the folder and its file are read alike."""
+    images = [(CAMERA, "Image", ros_image(image, "rgb8")) for image in pictures((210, 280))]
+    bag = write_bag(tmp_path / "bag é", images, StoragePlugin.SQLITE3)
+    whole = answers(predict_files(engine, [str(bag)]))
+    file = next(bag.glob("*.db3"))
+    content = file.read_bytes()
+    for path in (bag, file):
+        file.write_bytes(content[: len(content) * 6 // 10])
+        message = r"é.db3 is cut or damaged after 1 pictures of .*used .database disk image is malf"
+        with pytest.raises(InputsLeftOut, match=message) as raised:
+            predict_files(engine, [str(path)])
+        assert answers(raised.value.results) == whole[:1]
+    file.write_bytes(content[:5000])  # without its topics
+    with pytest.raises(UserError, match="cannot be read as a ROS 2 bag"):
+        predict_files(engine, [str(bag)])
+
+
 def test_one_bad_message_costs_no_other(engine: BrightnessEngine, tmp_path: Path) -> None:
     messages = [(CAMERA, "CompressedImage", ros_compressed(data)) for data in jpegs()]
     messages[1] = (CAMERA, "CompressedImage", ros_compressed(b"no picture"))
