@@ -29,6 +29,7 @@ from tests.mtlnet.predict.recorded import (
     write_foxglove,
 )
 from tests.mtlnet.predict.test_predict import BrightnessEngine
+from tests.typed import typed
 from trackfeatures.errors import UserError
 
 COUNT = 5
@@ -317,3 +318,22 @@ def access_units(stream: bytes, form: str) -> list[bytes]:
             units.append(pending)
             pending = b""
     return units
+
+
+def test_the_command_takes_a_topic_and_tells_of_the_camera(tmp_path: Path) -> None:
+    """Of two cameras the dark one; standard output has the answers alone."""
+    dark, bright = (ros_image(np.full((210, 280), level, np.uint8), "mono8") for level in (9, 200))
+    info = ros_camera((280, 210), (150, 150, 139.5, 104.5))
+    messages: list[Message] = [
+        ("/left/image", "Image", dark), ("/right/image", "Image", bright),
+        ("/left/camera_info", "CameraInfo", info),
+    ]  # fmt: skip
+    bag = write_bag(tmp_path / "bag", messages)
+    done = typed("mtlnet", "predict", bag, "--topic", "/left/image", "--json")
+    assert done.returncode == 0, done.stderr
+    (row,) = json.loads(done.stdout)
+    assert (row["image"], row["time_s"]) == (f"{bag}#0", START_S)
+    assert f"{bag}: matrix and distortion are those of /left/camera_info" in done.stderr
+    done = typed("mtlnet", "predict", bag)
+    assert done.returncode == 1
+    assert done.stderr.strip().splitlines()[-1].startswith(f"error: {bag} has several topics")
