@@ -21,9 +21,10 @@ from mtlnet.predict.recordings.cut_database import CutDatabase
 from mtlnet.predict.recordings.topic import Topic
 from trackfeatures.errors import UserError
 
-# The MCAP reader raises these for damaged records, beside its own.
+# The readers raise these for damaged records, beside their own.
 DAMAGE = (
-    McapError, struct.error, zstandard.ZstdError, ValueError, EOFError, RuntimeError, KeyError,
+    McapError, struct.error, zstandard.ZstdError, ValueError, EOFError, RuntimeError, LookupError,
+    OverflowError, MemoryError, TypeError, AttributeError, AssertionError,
 )  # fmt: skip
 
 
@@ -141,7 +142,7 @@ class McapFiles:
                     counts[record.channel_id] = counts.get(record.channel_id, 0) + 1
         if not channels:
             raise UserError(f"{file} is no MCAP file, or is cut before its first message")
-        return [_topic(channels[key], schemas, count) for key, count in counts.items()]
+        return [_topic(channels[k], schemas, count) for k, count in counts.items() if k in channels]
 
     def _messages_of(self, file: Path, topic: str) -> Iterator[tuple[int, bytes]]:
         with file.open("rb") as stream:

@@ -24,9 +24,9 @@ class CutDatabase:
 
     def topics(self) -> list[Topic]:
         """Those of the file; none where their table is missing."""
-        with closing(self._open()) as file, suppress(sqlite3.Error):
+        with suppress(sqlite3.Error), closing(self._open()) as file:
             rows = file.execute("SELECT name, type FROM topics ORDER BY name").fetchall()
-            return [Topic(name, kind, "cdr") for name, kind in rows]
+            return [Topic(str(name), str(kind), "cdr") for name, kind in rows]
         return []
 
     def messages(self, topic: str) -> Iterator[tuple[int, bytes]]:
@@ -35,12 +35,10 @@ class CutDatabase:
             "SELECT timestamp, data FROM messages WHERE topic_id IN "
             "(SELECT id FROM topics WHERE name = ?) ORDER BY messages.id"
         )
-        with closing(self._open()) as file:
-            rows = file.execute(query, (topic,))
-            with suppress(sqlite3.Error):
-                for time, data in rows:
-                    yield time, data
-                    used += 1
+        with suppress(sqlite3.Error), closing(self._open()) as file:
+            for time, data in file.execute(query, (topic,)):
+                yield time, data
+                used += 1
         self.fault = (
             f"{self._path} is cut or damaged after {used} pictures of {topic}; those were used "
             f"({self._reason})"

@@ -33,6 +33,7 @@ from tests.typed import typed
 from trackfeatures.errors import UserError
 
 COUNT = 5
+DISTORTED = (0.1, 0.0, 0.0, 0.0, 0.0)
 CAMERA = "/camera/image_raw"
 
 
@@ -320,6 +321,7 @@ def access_units(stream: bytes, form: str) -> list[bytes]:
     return units
 
 
+@pytest.mark.slow
 def test_the_command_takes_a_topic_and_tells_of_the_camera(tmp_path: Path) -> None:
     """Of two cameras the dark one; standard output has the answers alone."""
     dark, bright = (ros_image(np.full((210, 280), level, np.uint8), "mono8") for level in (9, 200))
@@ -337,3 +339,40 @@ def test_the_command_takes_a_topic_and_tells_of_the_camera(tmp_path: Path) -> No
     done = typed("mtlnet", "predict", bag)
     assert done.returncode == 1
     assert done.stderr.strip().splitlines()[-1].startswith(f"error: {bag} has several topics")
+
+
+@pytest.mark.parametrize("kind", ["mcap", "db3", "json", "metadata.yaml"])
+def test_no_damage_ends_in_a_traceback(engine: BrightnessEngine, tmp_path: Path, kind: str) -> None:
+    """Flipped bits, wrong bytes and cuts anywhere: answers or a UserError."""
+    small = [bytes(simplejpeg.encode_jpeg(image[:21, :28], quality=60)) for image in pictures()[:3]]
+    camera = ros_camera((28, 21), (20, 20, 13.5, 10), "plumb_bob", DISTORTED)
+    ros: list[Message] = [("/c/image", "CompressedImage", ros_compressed(data)) for data in small]
+    ros.append(("/c/camera_info", "CameraInfo", camera))
+    if kind == "json":
+        plain: list[Message] = [
+            ("/c", "CompressedImage", {"data": d, "format": "jpeg"}) for d in small
+        ]
+        target = file = write_foxglove(tmp_path / "a.mcap", plain, as_json=True)
+    else:
+        storage = StoragePlugin.SQLITE3 if kind == "db3" else StoragePlugin.MCAP
+        target = write_bag(tmp_path / "bag", ros, storage)
+        file = next(path for path in target.iterdir() if path.name.endswith(kind))
+    whole = file.read_bytes()
+    rng = np.random.default_rng(1)
+    refused = 0
+    for _ in range(20):
+        content = bytearray(whole)
+        at = int(rng.integers(len(content)))
+        change = int(rng.integers(3))
+        if change == 0:
+            content[at] ^= 1 << int(rng.integers(8))
+        elif change == 1:
+            content[at : at + 8] = rng.bytes(8)
+        else:
+            del content[at:]
+        file.write_bytes(content)
+        try:
+            predict_files(engine, [str(target)])
+        except UserError:
+            refused += 1
+    assert refused
