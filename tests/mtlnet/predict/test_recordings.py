@@ -376,3 +376,12 @@ def test_no_damage_ends_in_a_traceback(engine: BrightnessEngine, tmp_path: Path,
         except UserError:
             refused += 1
     assert refused
+
+
+def test_a_file_of_the_bag_is_not_overwritten(engine: BrightnessEngine, tmp_path: Path) -> None:
+    bag = write_bag(tmp_path / "bag", [(CAMERA, "CompressedImage", ros_compressed(jpegs()[0]))])
+    file = next(bag.glob("*.mcap"))
+    before = file.read_bytes()
+    with pytest.raises(UserError, match="is a file to read; give another one"):
+        predict_files(engine, [str(bag)], [file])
+    assert file.read_bytes() == before
