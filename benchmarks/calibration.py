@@ -108,7 +108,9 @@ def _euler(turn: np.ndarray) -> tuple[float, float, float]:
 
 if __name__ == "__main__":
     import time
-    folder = Path(sys.argv[1]); folder.mkdir(exist_ok=True)
+
+    folder = Path(sys.argv[1])
+    folder.mkdir(exist_ok=True)
     for seed in range(int(sys.argv[2]), int(sys.argv[3])):
         m = random_mount(seed)
         t = time.time()

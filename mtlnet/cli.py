@@ -251,6 +251,34 @@ def predict_command(
         raise left_out
 
 
+@app.command("calibrate")
+def calibrate_command(
+    inputs: options.CalibrateInputs,
+    out: options.CalibrateOut = Path("camera.yaml"),
+    board: options.Board = "",
+    fisheye: options.Fisheye = False,
+    drive: options.Drive = False,
+    camera: options.LensFile = None,
+    fov_y_deg: options.LensFieldOfView = None,
+    photo: options.Photo = None,
+    lane_width: options.LaneWidth = None,
+    page: options.CalibrationPage = None,
+    as_json: options.Json = False,
+) -> None:
+    """A camera file from a film of a drive (the mount), or from pictures of a board (the lens)."""
+    from mtlnet.calibration.run import CalibrateConfig, calibrate
+
+    config = CalibrateConfig(
+        inputs, out, board, fisheye, drive, camera, fov_y_deg, photo, lane_width, page
+    )
+    with command.progress_bar() as bar:
+        task = bar.add_task("calibrating", total=None)
+        result, line = calibrate(
+            config, lambda done, total: bar.update(task, completed=int(done), total=int(total))
+        )
+    command.print_result(result, as_json, f"{out}: {line}")
+
+
 def _print_model(name: str) -> None:
     """Print on stderr the run folder that a model's name stands for."""
     from mtlnet.inference.model_card import resolve_run

@@ -1,29 +1,33 @@
 """A camera's mount from the pictures of a drive, one after the other: films and streams alike.
 
-    calibration = DriveCalibration(lens)
-    for picture, time_s in pictures:
-        calibration.add(picture, time_s)
-    found = calibration.estimate()      # at any time; raises NotCalibrated
+calibration = DriveCalibration(lens)
+for picture, time_s in pictures:
+    calibration.add(picture, time_s)
+found = calibration.estimate()      # at any time; raises NotCalibrated
 """
 
 from collections import deque
 from dataclasses import dataclass, replace
-from math import degrees
+from math import degrees, hypot
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mtlnet.calibration.lens import Lens
 from mtlnet.calibration.markings import Segments, find_segments
 from mtlnet.calibration.motion import find_motion, follow
 from mtlnet.calibration.mount import Mount, NotCalibrated, Sample, TimedMotion, find_mount
 from mtlnet.calibration.road_fit import Lines
 from mtlnet.calibration.vanishing_point import find_vanishing_point
 from trackfeatures.camera import CameraParameters
+from trackfeatures.errors import UserError
 
 LANE_WIDTH_M = 3.6
 """Assumed where none is given."""
 LANE_WIDTH_STD_M = 0.25
+LANE_WIDTHS_M = (2.0, 6.0)
 SAMPLE_S = 0.2
 """Between the pictures whose markings are used."""
 FOLLOW_S = (0.06, 0.25)
@@ -42,35 +46,63 @@ class DriveEstimate:
     """The camera, and how sure its mount is: standard deviations in degrees and m."""
 
     camera: CameraParameters
-    mount: Mount
+    pitch_std_deg: float
+    yaw_std_deg: float
+    roll_std_deg: float
+    height_std_m: float
+    lens: Lens
     lane_width_m: float
     lane_width_given: bool
+    pictures: int
+    """That show the lane's markings on straight road."""
 
     def about(self) -> str:
         """One line for people."""
-        m, camera = self.mount, self.camera
-        assumed = "" if self.lane_width_given else ", assumed"
+        camera = self.camera
+        assumed = "given" if self.lane_width_given else "assumed"
         return (
-            f"pitch {camera.pitch_deg:.2f} +- {degrees(m.pitch_std):.2f} deg, "
-            f"yaw {camera.yaw_deg:.2f} +- {degrees(m.yaw_std):.2f} deg, "
-            f"roll {camera.roll_deg:.2f} +- {degrees(m.roll_std):.2f} deg, "
-            f"height {m.height_m:.2f} +- {m.height_std_m:.2f} m "
-            f"(lane {self.lane_width_m:g} m{assumed}), from {m.pictures} pictures"
+            f"pitch {camera.pitch_deg:.2f} +- {self.pitch_std_deg:.2f} deg, "
+            f"yaw {camera.yaw_deg:.2f} +- {self.yaw_std_deg:.2f} deg, "
+            f"roll {camera.roll_deg:.2f} +- {self.roll_std_deg:.2f} deg, "
+            f"height {camera.height_above_road_m:.2f} +- {self.height_std_m:.2f} m, from "
+            f"{self.pictures} pictures (lane width {self.lane_width_m:g} m, {assumed}; "
+            f"{self.lens.about})"
         )
+
+    def as_json(self) -> dict[str, Any]:
+        """What was found with its standard deviations, by name and unit."""
+        camera = self.camera
+        return {
+            "pitch_deg": camera.pitch_deg,
+            "yaw_deg": camera.yaw_deg,
+            "roll_deg": camera.roll_deg,
+            "height_m": camera.height_above_road_m,
+            "std": {
+                "pitch_deg": self.pitch_std_deg,
+                "yaw_deg": self.yaw_std_deg,
+                "roll_deg": self.roll_std_deg,
+                "height_m": self.height_std_m,
+            },
+            "fov_y_deg": camera.fov_y_deg,
+            "lens": self.lens.about,
+            "lane_width_m": self.lane_width_m,
+            "pictures": self.pictures,
+        }
 
 
 class DriveCalibration:
     """Takes pictures of a drive and estimates the mount of the camera that took them.
 
-    `lens`: size and lens; its place x, y in the car is kept, its height and angles are found. A
-    lane width that is not given is assumed.
+    `lens`: its place x, y in the car is kept, its height and angles are found. A lane width that is
+    not given is assumed.
     """
 
-    def __init__(self, lens: CameraParameters, lane_width_m: float | None = None) -> None:
+    def __init__(self, lens: Lens, lane_width_m: float | None = None) -> None:
+        check_lane_width(lane_width_m)
         self._lens = lens
-        scale = min(1.0, WORKING_WIDTH / lens.width)
-        size = (round(lens.width * scale), round(lens.height * scale))
-        self._view = lens.resized(*size)
+        camera = lens.camera
+        scale = min(1.0, WORKING_WIDTH / camera.width)
+        self._view = camera.resized(round(camera.width * scale), round(camera.height * scale))
         self._lane_width_m = lane_width_m
         self._samples: deque[Sample] = deque(maxlen=KEPT)
         self._tracks: deque[tuple[float, float, NDArray[np.float64]]] = deque(maxlen=KEPT)
@@ -124,15 +156,30 @@ class DriveCalibration:
             LANE_WIDTH_M if width is None else width,
             LANE_WIDTH_STD_M if width is None else 0.0,
         )
+        return self._estimate(mount)
+
+    def _estimate(self, mount: Mount) -> DriveEstimate:
+        """The mount as a camera's. An error of the focal length scales angles."""
+        lens, given = self._lens, self._lane_width_m is not None
         camera = replace(
-            self._lens,
-            z=mount.height_m - self._lens.cg_height_m,
+            lens.camera,
+            z=mount.height_m - lens.camera.cg_height_m,
             pitch_deg=degrees(mount.pitch),
             yaw_deg=degrees(mount.yaw),
             roll_deg=degrees(mount.roll),
             height_std=mount.height_std_m / mount.height_m,
         )
-        return DriveEstimate(camera, mount, width or LANE_WIDTH_M, width is not None)
+        return DriveEstimate(
+            camera,
+            hypot(degrees(mount.pitch_std), lens.std * camera.pitch_deg),
+            hypot(degrees(mount.yaw_std), lens.std * camera.yaw_deg),
+            degrees(mount.roll_std),
+            mount.height_std_m,
+            lens,
+            self._lane_width_m or LANE_WIDTH_M,
+            given,
+            mount.pictures,
+        )
 
     def _resized(self, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
         size = (self._view.width, self._view.height)
@@ -155,11 +202,20 @@ class DriveCalibration:
         return rays[np.isfinite(rays).all(axis=1)]
 
 
+def check_lane_width(lane_width_m: float | None) -> None:
+    """Raises UserError for a width that no lane has."""
+    low, high = LANE_WIDTHS_M
+    if lane_width_m is not None and not low <= lane_width_m <= high:
+        raise UserError(f"--lane-width {lane_width_m:g} m; give {low:g} to {high:g} m")
+
+
 def normalised(segments: Segments, view: CameraParameters) -> Lines:
     """`segments` as the straight lines between the rays of their ends."""
     half = 0.5 * segments.rows
     ends = [
-        view.rays(np.column_stack([segments.u + sign * half * segments.slope, segments.v + sign * half]))
+        view.rays(
+            np.column_stack([segments.u + sign * half * segments.slope, segments.v + sign * half])
+        )
         for sign in (-1.0, 1.0)
     ]
     (x1, y1), (x2, y2) = ends[0][:, :2].T, ends[1][:, :2].T

@@ -90,9 +90,7 @@ def _fit_lines(piece: NDArray[np.int64], v: NDArray[np.int64], u: FloatArray) ->
     du, dv = u - mean_u[piece], v - mean_v[piece]
     spread = np.bincount(piece, dv * dv)
     slope = np.bincount(piece, du * dv) / np.maximum(spread, 1e-9)
-    residual = np.sqrt(
-        np.bincount(piece, (du - slope[piece] * dv) ** 2) / np.maximum(n - 2.0, 1.0)
-    )
+    residual = np.sqrt(np.bincount(piece, (du - slope[piece] * dv) ** 2) / np.maximum(n - 2.0, 1.0))
     good = (n >= MIN_ROWS) & (residual < MAX_RESIDUAL_PX)
     error = np.maximum(residual, 0.3) / np.sqrt(np.maximum(spread, 1e-9))
     return Segments(mean_u[good], mean_v[good], slope[good], error[good], n[good])
