@@ -3,6 +3,7 @@
 Board frame in squares; pixels with centres at whole numbers.
 """
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,8 +17,8 @@ from mtlnet.inference.image_decoding.errors import ImageError
 from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
 
-COMMON = ((9, 6), (8, 6), (7, 6), (8, 5), (7, 5), (6, 5), (6, 4), (10, 7), (9, 7), (11, 8), (7, 4))
-"""Inner corners of the chessboards that are tried when none is named."""
+SMALLEST = (3, 3)
+"""Inner corners of the chessboards that are recognised."""
 DICTIONARY, MARKER = "4X4_50", 0.75
 MIN_PICTURES = 3
 FEW = 8
@@ -25,9 +26,6 @@ FEW = 8
 MIN_CHARUCO = 8
 OUTLIER = 4.0
 """A picture is left out when its error is so many times the median's, and above 1 px."""
-SEARCH_PX = 1000
-"""Boards are first looked for in pictures of this size."""
-
 Picture = NDArray[np.uint8]
 Corners = NDArray[np.float32]
 Finder = Callable[[Picture], tuple[Corners, Corners] | None]
@@ -73,7 +71,7 @@ def calibrate_board(
 
     `board`: inner corners of a chessboard, as "9x6"; "charuco:5x7", squares of a ChArUco board,
     with ":DICTIONARY" and ":MARKER", the marker's side in squares, if they are not
-    "4X4_50" and 0.75; empty: one of `COMMON`. The mount is that of `model`. Raises NoBoard.
+    "4X4_50" and 0.75; empty: the chessboard that most pictures show. The mount is that of `model`. Raises NoBoard.
     """
     pictures = [(path, *_read(path)) for path in paths]
     sizes = {grey.shape for _, grey, _ in pictures if grey is not None}
@@ -136,16 +134,20 @@ def _find(
 
 
 def _recognised(greys: Sequence[Picture]) -> str:
-    """The first of the common chessboards that one of the pictures shows."""
+    """The chessboard that most pictures show; a part of it may be hidden in some."""
+    flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_LARGER
+    counts: Counter[tuple[int, int]] = Counter()
     for grey in greys:
-        for columns, rows in COMMON:
-            if _has_chessboard(grey, (columns, rows)):
-                return f"{columns}x{rows}"
-    tried = ", ".join(f"{columns}x{rows}" for columns, rows in COMMON)
-    raise NoBoard(
-        f"no chessboard of {tried} inner corners in {len(greys)} pictures; name the board with "
-        "--board, or give --drive for pictures of a drive"
-    )
+        seen, _, meta = cv2.findChessboardCornersSBWithMeta(grey, SMALLEST, flags)
+        if seen:
+            counts[max(meta.shape), min(meta.shape)] += 1
+    if not counts:
+        raise NoBoard(
+            f"no chessboard in {len(greys)} pictures; name another board with --board, or give "
+            "--drive for pictures of a drive"
+        )
+    columns, rows = max(counts, key=lambda shape: (counts[shape], shape))
+    return f"{columns}x{rows}"
 
 
 def _no_board(board: str, found: int, pictures: Sequence[object]) -> NoBoard:
@@ -177,16 +179,9 @@ def _finder(board: str) -> Finder:
     return lambda grey: _charuco(grey, printed, detector)
 
 
-def _has_chessboard(grey: Picture, shape: tuple[int, int]) -> bool:
-    scale = min(1.0, SEARCH_PX / max(grey.shape))
-    small = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
-    return bool(cv2.findChessboardCorners(small, shape, flags=flags)[0])
-
-
 def _chessboard(grey: Picture, shape: tuple[int, int]) -> tuple[Corners, Corners] | None:
     """By OpenCV's detector of sectors (Duda and Frese 2018), subpixel-exact."""
-    flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
+    flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_ACCURACY
     seen, corners = cv2.findChessboardCornersSB(grey, shape, flags=flags)
     if not seen:
         return None
@@ -224,7 +219,8 @@ def _solve(
     focal_std = 0.0
     try:
         if fisheye:
-            flags = cv2.fisheye.CALIB_RECOMPUTE_EXTRINSIC | cv2.fisheye.CALIB_FIX_SKEW
+            names = cv2.fisheye if hasattr(cv2.fisheye, "CALIB_FIX_SKEW") else cv2  # OpenCV 4, 5
+            flags = names.CALIB_RECOMPUTE_EXTRINSIC | names.CALIB_FIX_SKEW
             error, matrix, bent, turns, moves = cv2.fisheye.calibrate(
                 [b.reshape(1, -1, 3).astype(np.float64) for b in boards],
                 [c.reshape(1, -1, 2).astype(np.float64) for c in corners],

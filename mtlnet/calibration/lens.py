@@ -10,7 +10,7 @@ from trackfeatures.camera import CameraError, CameraParameters
 from trackfeatures.errors import UserError
 
 GUESSED_FOV_DEG = 65.0
-"""Along the longer side: between a phone's usual lens when it films (55 to 70) and a dash camera's (70 and more)."""
+"""Along the longer side: a phone's usual lens films 55 to 70, a dash camera 70 and more."""
 GUESSED_STD, PHOTO_STD = 0.2, 0.05
 """Standard deviations of the focal length, as shares; a phone crops its films a little."""
 FILM_DIAGONAL_MM = 43.27
@@ -21,7 +21,7 @@ HEAD_BYTES = 1 << 17
 
 @dataclass(frozen=True)
 class Lens:
-    """`camera`: size and lens. `std`: of the focal length, as a share. `about`: where it is from."""
+    """Size and lens; `std`: of the focal length, as a share; `about`: where it is from."""
 
     camera: CameraParameters
     std: float

@@ -40,7 +40,7 @@ class Segments:
 
 def find_segments(picture: NDArray[np.uint8], horizon_px: float) -> Segments:
     """The segments of bars below `horizon_px` (a guess, for their width) in an RGB picture."""
-    height, width = picture.shape[:2]
+    height = len(picture)
     top = int(np.clip(horizon_px + 0.02 * height, 0, height - MIN_ROWS))
     below = cv2.GaussianBlur(picture[top:], (3, 3), 0.0).astype(np.float32)
     bright = 0.5 * (below[..., 0] + below[..., 1])
@@ -52,7 +52,7 @@ def find_segments(picture: NDArray[np.uint8], horizon_px: float) -> Segments:
 
 def _bars(level: NDArray[np.float32], reach: FloatArray) -> NDArray[np.float32]:
     """How much brighter a pixel is than the brighter one of those `reach` (rows,) px beside it."""
-    rows, width = level.shape
+    width = level.shape[1]
     columns = np.arange(width)
     shift = np.rint(reach).astype(np.int64)[:, None]
     left = np.take_along_axis(level, np.maximum(columns - shift, 0), axis=1)
@@ -66,7 +66,7 @@ def _segments(response: NDArray[np.float32], top: int, reach: FloatArray) -> Seg
     """Bars of `response` that continue over rows, one straight line each."""
     noise = 1.4826 * float(np.median(np.abs(response[response != 0.0]))) if response.any() else 0.0
     mask = response > max(MIN_CONTRAST, 2.0 * noise)
-    count, labels = cv2.connectedComponents(mask.astype(np.uint8), connectivity=8)
+    _, labels = cv2.connectedComponents(mask.astype(np.uint8), connectivity=8)
     v, u = np.nonzero(mask)
     weight = response[v, u].astype(np.float64)
     # One centre a row and component: sums over its pixels.

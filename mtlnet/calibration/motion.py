@@ -1,4 +1,4 @@
-"""The camera's rotation and direction of travel between two pictures, from points that are followed.
+"""The camera's rotation and direction of travel between two pictures, from followed points.
 
 Camera frame: x right, y down, z ahead. With a small rotation `w` and travel along T, the ray
 p = (x, y, 1) of a point at rest moves by v so that (T x p) . (v + w x p) = 0, whatever its distance

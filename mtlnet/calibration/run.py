@@ -71,8 +71,8 @@ def _calibrate_board(config: CalibrateConfig, paths: list[Path]) -> tuple[dict[s
     found = calibrate_board(paths, config.board, CameraParameters(), config.fisheye)
     camera = found.camera
     line = (
-        f"focal length {camera.focal_px:.2f} px, error {found.error_px:.3f} px over {found.used} of "
-        f"{len(paths)} pictures of the board {found.board}"
+        f"focal length {camera.focal_px:.2f} px, error {found.error_px:.3f} px over {found.used} "
+        f"of {len(paths)} pictures of the board {found.board}"
     )
     comment = (
         f"mtlnet calibrate: {line}\nThe mount is assumed; with this file as --camera, "
