@@ -64,7 +64,7 @@ def _bars(level: NDArray[np.float32], reach: FloatArray) -> NDArray[np.float32]:
 
 def _segments(response: NDArray[np.float32], top: int, reach: FloatArray) -> Segments:
     """Bars of `response` that continue over rows, one straight line each."""
-    noise = 1.4826 * float(np.median(np.abs(response[response != 0.0]))) if response.any() else 0.0
+    noise = 1.4826 * float(np.median(np.abs(response)))
     mask = response > max(MIN_CONTRAST, 2.0 * noise)
     _, labels = cv2.connectedComponents(mask.astype(np.uint8), connectivity=8)
     v, u = np.nonzero(mask)
