@@ -207,11 +207,12 @@ def predict_command(
     out: options.PredictOut = None,
     fov_y_deg: options.FieldOfView = None,
     camera: options.PredictCamera = None,
+    topic: options.Topic = "",
     engine: options.EngineKind = "openvino",
     precision: options.Precision = None,
     as_json: options.Json = False,
 ) -> None:
-    """Track features of images, films or recorded rounds; also as tables, pictures or a film."""
+    """Track features of images, films, webcams, streams, rounds, Foxglove files or ROS 2 bags."""
     from rich.console import Console
 
     from mtlnet.evaluation.tables import prediction_table
@@ -238,7 +239,7 @@ def predict_command(
 
         left_out: InputsLeftOut | None = None
         try:
-            predictions = predict_files(loaded, images, out or (), lens, report, note)
+            predictions = predict_files(loaded, images, out or (), lens, report, note, topic)
         except InputsLeftOut as error:
             predictions, left_out = error.results, error
     if as_json and predictions:

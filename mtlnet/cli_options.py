@@ -160,18 +160,28 @@ ShippedNotes = Annotated[
 ]
 PredictInputs = Annotated[
     list[str],
-    typer.Argument(help="Images, films, rounds (.mcap), folders of them, patterns."),
+    typer.Argument(
+        help="Images, films, rounds, Foxglove files, ROS 2 bags, folders or patterns of them; a "
+        "webcam by its number; a stream by its address (rtsp://, http://)."
+    ),
 ]
 PredictOut = Annotated[
     list[Path] | None,
     typer.Option(
-        help="Table (.csv, .jsonl), film (.mp4) or folder of pictures with the markings drawn in; "
-        "may be given several times."
+        help="Table (.csv, .jsonl), film (.mp4), Foxglove file (.mcap) or folder of pictures with "
+        "the markings drawn in; may be given several times."
     ),
+]
+Topic = Annotated[
+    str,
+    typer.Option(help="Of a Foxglove file or ROS 2 bag.  [default: the only one with pictures]"),
 ]
 PredictCamera = Annotated[
     Path | None,
-    typer.Option(help="YAML file with the camera of images and films.  [default: the model's]"),
+    typer.Option(
+        help="YAML file with the camera of the pictures.  [default: what a recording states, else "
+        "the model's]"
+    ),
 ]
 FieldOfView = Annotated[
     float | None,

@@ -39,8 +39,9 @@ def make(tmp_path: Path) -> Make:
 
 def read(path: Path) -> tuple[list[int], str, list[NDArray[np.uint8]]]:
     film = Film(path)
-    frames = list(film.frames())
-    return [number for number, _ in frames], film.fault, [picture for _, picture in frames]
+    frames = list(film.pictures())
+    pictures = [picture.image[..., ::-1] for picture in frames if picture.image is not None]
+    return [picture.number for picture in frames], film.fault, pictures
 
 
 @pytest.mark.parametrize(
