@@ -217,15 +217,19 @@ def predict_command(
 
     from mtlnet.evaluation.tables import prediction_table
     from mtlnet.inference.rectification import Rectification, read_camera
+    from mtlnet.predict.pictures import Lens
     from mtlnet.predict.run import InputsLeftOut, predict_files
     from trackfeatures.errors import UserError
 
-    if camera is not None and fov_y_deg is not None:
+    own = str(camera) == "model"
+    if camera is not None and fov_y_deg is not None and not own:
         raise UserError("--camera holds the field of view; leave --fov-y-deg out")
     _print_model(model)
     loaded = _load(model, engine, precision)
     known = loaded.card.camera
-    lens = fov_y_deg if camera is None else Rectification(read_camera(camera, known), known)
+    lens: Lens = fov_y_deg
+    if camera is not None and not own:
+        lens = Rectification(read_camera(camera, known), known)
     with command.progress_bar() as bar:
         task = bar.add_task("predicting", total=None)
 
@@ -239,7 +243,9 @@ def predict_command(
 
         left_out: InputsLeftOut | None = None
         try:
-            predictions = predict_files(loaded, images, out or (), lens, report, note, topic)
+            predictions = predict_files(
+                loaded, images, out or (), lens, report, note, topic, calibrate=not own
+            )
         except InputsLeftOut as error:
             predictions, left_out = error.results, error
     if as_json and predictions:

@@ -179,8 +179,8 @@ Topic = Annotated[
 PredictCamera = Annotated[
     Path | None,
     typer.Option(
-        help="YAML file with the camera of the pictures.  [default: what a recording states, else "
-        "the model's]"
+        help="YAML file with the camera of the pictures, or `model`: they are as the model's.  "
+        "[default: what a recording states or a film or stream shows, else the model's]"
     ),
 ]
 FieldOfView = Annotated[

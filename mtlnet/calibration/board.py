@@ -70,8 +70,8 @@ def calibrate_board(
     """The lens of the camera that took `paths`, which show one board.
 
     `board`: inner corners of a chessboard, as "9x6"; "charuco:5x7", squares of a ChArUco board,
-    with ":DICTIONARY" and ":MARKER", the marker's side in squares, if they are not
-    "4X4_50" and 0.75; empty: the chessboard that most pictures show. The mount is that of `model`. Raises NoBoard.
+    with ":DICTIONARY:MARKER" (the marker's side in squares) if they are not 4X4_50 and 0.75; empty:
+    the chessboard that most pictures show. The mount is that of `model`. Raises NoBoard.
     """
     pictures = [(path, *_read(path)) for path in paths]
     sizes = {grey.shape for _, grey, _ in pictures if grey is not None}

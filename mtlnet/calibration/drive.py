@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -54,12 +55,14 @@ def calibrate_film(
     film = Film(path)
 
     def timed() -> Iterator[tuple[float, Picture]]:
-        for number, picture in film.frames():
-            time_s = number / fps
+        for picture in film.pictures():
+            if picture.image is None:
+                continue
+            time_s = picture.number / fps
             if time_s >= longest_s:
                 return
             report(time_s, total)
-            yield time_s, picture
+            yield time_s, cv2.cvtColor(picture.image, cv2.COLOR_BGR2RGB).astype(np.uint8)
 
     try:
         found, shown = _calibrate(timed(), make_lens, lane_width_m, total / SHOWN)

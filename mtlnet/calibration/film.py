@@ -27,6 +27,8 @@ from trackfeatures.errors import UserError
 LANE_WIDTH_M = 3.6
 """Assumed where none is given."""
 LANE_WIDTH_STD_M = 0.25
+MAX_STD_DEG = 1.0
+"""Of pitch and yaw, the lens apart: a drive that shows them less well shows none."""
 LANE_WIDTHS_M = (2.0, 6.0)
 SAMPLE_S = 0.2
 """Between the pictures whose markings are used."""
@@ -116,12 +118,12 @@ class DriveCalibration:
         """Number of pictures that count so far."""
         return len(self._samples)
 
-    def add(self, picture: NDArray[np.uint8], time_s: float) -> None:
-        """Take a picture (H, W, 3) RGB of the lens, at any size of its aspect; most are passed
-        over. Times rise."""
+    def add(self, picture: NDArray[np.uint8], time_s: float, *, bgr: bool = False) -> None:
+        """Take a picture (H, W, 3), RGB or BGR, of the lens, at any size of its aspect; most are
+        passed over. Times rise."""
         if time_s >= self._next_s:
             self._next_s = max(self._next_s + SAMPLE_S, time_s + SAMPLE_S / 2)
-            small = self._resized(picture)
+            small = self._resized(picture, bgr)
             self._samples.append(Sample(time_s, self._lines(small)))
             self._taken += 1
             # Points are followed from every second one.
@@ -132,7 +134,7 @@ class DriveCalibration:
             begin, before = self._before
             self._before = None
             if time_s - begin <= FOLLOW_S[1]:
-                tracks = follow(before, _grey(self._resized(picture)))
+                tracks = follow(before, _grey(self._resized(picture, bgr)))
                 if tracks is not None:
                     self._tracks.append((begin, time_s - begin, self._normalised_tracks(tracks)))
 
@@ -156,6 +158,12 @@ class DriveCalibration:
             LANE_WIDTH_M if width is None else width,
             LANE_WIDTH_STD_M if width is None else 0.0,
         )
+        spread = degrees(max(mount.pitch_std, mount.yaw_std))
+        if not spread <= MAX_STD_DEG:
+            raise NotCalibrated(
+                f"its pictures disagree by {spread:.1f} deg on where the road leads; at most "
+                f"{MAX_STD_DEG:g} is of use: take a minute of steady driving on a marked road"
+            )
         return self._estimate(mount)
 
     def _estimate(self, mount: Mount) -> DriveEstimate:
@@ -181,11 +189,12 @@ class DriveCalibration:
             mount.pictures,
         )
 
-    def _resized(self, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    def _resized(self, picture: NDArray[np.uint8], bgr: bool) -> NDArray[np.uint8]:
+        """RGB, in the size that is worked on."""
         size = (self._view.width, self._view.height)
-        if picture.shape[1::-1] == size:
-            return picture
-        return cv2.resize(picture, size, interpolation=cv2.INTER_AREA).astype(np.uint8, copy=False)
+        if picture.shape[1::-1] != size:
+            picture = cv2.resize(picture, size, interpolation=cv2.INTER_AREA).astype(np.uint8)
+        return picture[..., ::-1] if bgr else picture
 
     def _look(self) -> None:
         found = find_vanishing_point(sample.lines for sample in self._samples)
@@ -228,4 +237,6 @@ def normalised(segments: Segments, view: CameraParameters) -> Lines:
 
 
 def _grey(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    return cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY).astype(np.uint8, copy=False)
+    return cv2.cvtColor(np.ascontiguousarray(picture), cv2.COLOR_RGB2GRAY).astype(
+        np.uint8, copy=False
+    )

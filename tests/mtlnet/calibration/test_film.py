@@ -102,7 +102,7 @@ def test_few_pictures_and_pictures_without_markings_are_refused() -> None:
     for number in range(30):
         noise = rng.normal(110, 6, (270, 480, 3)).clip(0, 255).astype(np.uint8)
         calibration.add(noise, 0.2 * number)
-    with pytest.raises(NotCalibrated, match="in 30 pictures|of 30 pictures show"):
+    with pytest.raises(NotCalibrated, match=r"in 30 pictures|of 30 pictures show"):
         calibration.estimate()
 
 
