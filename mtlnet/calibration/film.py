@@ -41,6 +41,7 @@ FIRST_LOOK = 25
 known roughly."""
 WORKING_WIDTH = 640
 TRACK_NOISE_PX = 0.2
+MOTION_ROUNDS = 2
 
 
 @dataclass(frozen=True)
@@ -147,10 +148,7 @@ class DriveCalibration:
                 f"no markings of a road can be seen in {len(self._samples)} pictures; take a "
                 "minute of driving on a marked road by day"
             )
-        noise = TRACK_NOISE_PX / self._view.focal_px
-        towards = np.array(start)
-        found = [(t, dt, find_motion(tracks, towards, noise)) for t, dt, tracks in self._tracks]
-        motions = [TimedMotion(t, dt, motion) for t, dt, motion in found if motion is not None]
+        motions = self._motions(start)
         mount = find_mount(
             self._samples,
             motions,
@@ -165,6 +163,17 @@ class DriveCalibration:
                 f"{MAX_STD_DEG:g} is of use: take a minute of steady driving on a marked road"
             )
         return self._estimate(mount)
+
+    def _motions(self, start: tuple[float, float]) -> list[TimedMotion]:
+        """All motions, each from the guess that it goes where most of them go."""
+        noise, towards = TRACK_NOISE_PX / self._view.focal_px, np.array(start)
+        motions: list[TimedMotion] = []
+        for _ in range(MOTION_ROUNDS):
+            found = [(t, dt, find_motion(tracks, towards, noise)) for t, dt, tracks in self._tracks]
+            motions = [TimedMotion(t, dt, motion) for t, dt, motion in found if motion is not None]
+            if motions:
+                towards = np.median([each.motion.towards for each in motions], axis=0)
+        return motions
 
     def _estimate(self, mount: Mount) -> DriveEstimate:
         """The mount as a camera's. An error of the focal length scales angles."""

@@ -210,9 +210,9 @@ def _vanishing_point(roads: _Roads, rows: NDArray[np.int64]) -> tuple[float, flo
     speeds = np.isfinite(roads.sideways[rows])
     if speeds.sum() < MIN_SPEEDS:
         return robust.mean(roads.x0[rows]), y0
-    # A car that points to the right of the road moves to the right.
-    side = roads.sideways[rows][speeds]
-    design = np.column_stack([np.ones(len(side)), side])
+    # A car that points to the right of the road moves to the right; in a bend it points inwards.
+    side, bend = roads.sideways[rows][speeds], roads.bend[rows][speeds] / STRAIGHT
+    design = np.column_stack([np.ones(len(side)), side, bend])
     return float(robust.fit(design, roads.x0[rows][speeds], np.ones(len(side)))[0]), y0
 
 
@@ -272,8 +272,13 @@ def _travel(
     c, s = np.cos(roll), np.sin(roll)
     towards = towards @ np.array([[c, s], [-s, c]])
 
+    # In a bend the camera, ahead of the rear axle, travels outwards of where the car points.
+    turn = np.array([m.motion.rotation[1] / m.seconds for m in level]) / MAX_TURN
+    design = np.column_stack([np.ones(len(turn)), turn])
+
     def mean(rows: NDArray[np.int64]) -> FloatArray:
-        return np.array([robust.mean(towards[rows, k], weight[rows]) for k in range(2)])
+        x = robust.fit(design[rows], towards[rows, 0], weight[rows])[0]
+        return np.array([x, robust.mean(towards[rows, 1], weight[rows])])
 
     block = np.array([m.time_s for m in level]).astype(np.int64)
     x, y = mean(np.arange(len(level)))

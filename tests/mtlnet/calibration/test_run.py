@@ -22,7 +22,7 @@ from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
 
 MODEL = CameraParameters()
-CAMERA = CameraParameters(320, 240, fov_y_deg=60.0, z=1.0, pitch_deg=2.0, yaw_deg=1.5)
+CAMERA = CameraParameters(480, 360, fov_y_deg=60.0, z=1.0, pitch_deg=2.0, yaw_deg=1.5)
 MARKINGS_M = [-1.6, 1.7]
 
 
@@ -43,7 +43,7 @@ def test_a_film_becomes_a_camera_file(film: Path, tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     result = json.loads(done.stdout)
     camera = read_camera(out, MODEL)
-    assert (camera.width, camera.height, camera.fov_y_deg) == (320, 240, 60.0)
+    assert (camera.width, camera.height, camera.fov_y_deg) == (480, 360, 60.0)
     assert camera.pitch_deg == pytest.approx(2.0, abs=0.15)
     assert camera.yaw_deg == pytest.approx(1.5, abs=0.15)
     assert camera.height_above_road_m == pytest.approx(1.25, rel=0.02)
