@@ -65,7 +65,9 @@ class Mount:
 def random_mount(seed: int) -> Mount:
     rng = np.random.default_rng([seed, 35])
     return Mount(
-        *(float(rng.uniform(-most, most)) for most in (6.0, 4.0, 2.0)),
+        pitch_deg=float(rng.uniform(-6.0, 6.0)),
+        yaw_deg=float(rng.uniform(-4.0, 4.0)),
+        roll_deg=float(rng.uniform(-2.0, 2.0)),
         height_m=float(rng.uniform(1.0, 1.8)),
         fov_y_deg=float(rng.uniform(40.0, 80.0)),
         track=TRACKS[seed % len(TRACKS)],

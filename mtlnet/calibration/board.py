@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -214,27 +215,10 @@ class _Solved:
 def _solve(
     found: dict[Path, tuple[Corners, Corners]], size: tuple[int, int], fisheye: bool
 ) -> _Solved:
-    boards = [board for board, _ in found.values()]
-    corners = [seen for _, seen in found.values()]
-    focal_std = 0.0
+    """OpenCV's least squares over all corners. Raises NoBoard where it finds no lens."""
+    solve, project = _fisheye if fisheye else _usual, _projection(fisheye)
     try:
-        if fisheye:
-            names = cv2.fisheye if hasattr(cv2.fisheye, "CALIB_FIX_SKEW") else cv2  # OpenCV 4, 5
-            flags = names.CALIB_RECOMPUTE_EXTRINSIC | names.CALIB_FIX_SKEW
-            error, matrix, bent, turns, moves = cv2.fisheye.calibrate(
-                [b.reshape(1, -1, 3).astype(np.float64) for b in boards],
-                [c.reshape(1, -1, 2).astype(np.float64) for c in corners],
-                size,
-                None,
-                None,
-                flags=flags,
-            )
-        else:
-            flags = cv2.CALIB_FIX_K3 if len(found) < FEW else 0
-            error, matrix, bent, turns, moves, deviations, *_ = cv2.calibrateCameraExtended(
-                boards, corners, size, None, None, flags=flags
-            )
-            focal_std = float(np.ravel(deviations)[1])
+        error, matrix, bent, turns, moves, focal_std = solve(list(found.values()), size)
     except cv2.error as problem:
         reason = " ".join(str(problem).split())
         raise NoBoard(
@@ -243,13 +227,40 @@ def _solve(
         ) from problem
     bent = np.ravel(bent)[: 4 if fisheye else 5]
     errors, projected = {}, {}
-    for path, board, seen, turn, move in zip(found, boards, corners, turns, moves, strict=True):
+    for (path, (board, seen)), turn, move in zip(found.items(), turns, moves, strict=True):
         places = board.reshape(-1, 1, 3).astype(np.float64)
-        project = cv2.fisheye.projectPoints if fisheye else cv2.projectPoints
-        projected[path] = project(places, turn, move, matrix, bent)[0].reshape(-1, 2)
-        miss = projected[path] - seen
-        errors[path] = float(np.sqrt((miss**2).sum(axis=1).mean()))
-    return _Solved(matrix, bent, float(error), focal_std, errors, projected)
+        at = np.asarray(project(places, turn, move, matrix, bent)[0], np.float64).reshape(-1, 2)
+        projected[path] = at
+        errors[path] = float(np.sqrt(((at - seen) ** 2).sum(axis=1).mean()))
+    return _Solved(matrix, bent, error, focal_std, errors, projected)
+
+
+def _projection(fisheye: bool) -> Callable[..., Any]:
+    return cv2.fisheye.projectPoints if fisheye else cv2.projectPoints
+
+
+def _usual(pairs: list[tuple[Corners, Corners]], size: tuple[int, int]) -> Any:
+    """Error px, matrix, coefficients, turns and moves of the boards, deviation of fy."""
+    flags = cv2.CALIB_FIX_K3 if len(pairs) < FEW else 0
+    boards, corners = ([pair[k] for pair in pairs] for k in range(2))
+    *found, deviations, _, _ = cv2.calibrateCameraExtended(
+        boards, corners, size, np.eye(3), np.zeros(5), flags=flags
+    )
+    return *found, float(np.ravel(deviations)[1])
+
+
+def _fisheye(pairs: list[tuple[Corners, Corners]], size: tuple[int, int]) -> Any:
+    """As `_usual`; OpenCV gives no deviations, 0 stands for them."""
+    names: Any = cv2.fisheye if hasattr(cv2.fisheye, "CALIB_FIX_SKEW") else cv2  # OpenCV 4, 5
+    found = cv2.fisheye.calibrate(
+        [board.reshape(1, -1, 3).astype(np.float64) for board, _ in pairs],
+        [corners.reshape(1, -1, 2).astype(np.float64) for _, corners in pairs],
+        size,
+        np.eye(3),
+        np.zeros(4),
+        flags=names.CALIB_RECOMPUTE_EXTRINSIC | names.CALIB_FIX_SKEW,
+    )
+    return *found, 0.0
 
 
 def _outliers(errors: dict[Path, float]) -> dict[Path, float]:

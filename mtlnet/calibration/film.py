@@ -32,7 +32,7 @@ MAX_STD_DEG = 1.0
 LANE_WIDTHS_M = (2.0, 6.0)
 SAMPLE_S = 0.2
 """Between the pictures whose markings are used."""
-FOLLOW_S = (0.06, 0.25)
+FOLLOW_S = (0.09, 0.25)
 """Between two pictures in which points are followed."""
 KEPT = 600
 """Pictures that count: of a stream the latest two minutes."""

@@ -73,12 +73,12 @@ def photo_focal_share(path: Path) -> float:
     _, offset = read_tags(block).get(EXIF_DIRECTORY, (0, -1))
     focal_mm = 0
     if offset >= 0:
-        order = "little" if block.startswith(b"II") else "big"
-        moved = block[:4] + offset.to_bytes(4, order) + block[8:]
+        little = block.startswith(b"II")
+        moved = block[:4] + offset.to_bytes(4, "little" if little else "big") + block[8:]
         _, focal_mm = read_tags(moved).get(FOCAL_35MM, (0, 0))
     if focal_mm <= 0:
         raise UserError(
             f"{path} states no focal length (EXIF FocalLengthIn35mmFilm); give --fov-y-deg"
         )
     height, width = picture.shape[:2]
-    return focal_mm / FILM_DIAGONAL_MM * hypot(width, height) / max(width, height)
+    return float(focal_mm / FILM_DIAGONAL_MM * hypot(width, height) / max(width, height))

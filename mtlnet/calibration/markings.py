@@ -45,7 +45,7 @@ def find_segments(picture: NDArray[np.uint8], horizon_px: float) -> Segments:
     below = cv2.GaussianBlur(picture[top:], (3, 3), 0.0).astype(np.float32)
     bright = 0.5 * (below[..., 0] + below[..., 1])
     yellow = 1.5 * (bright - below[..., 2])
-    reach = MAX_WIDTH * (np.arange(top, height) - horizon_px) + MARGIN_PX
+    reach = MAX_WIDTH * (np.arange(top, height, dtype=np.float64) - horizon_px) + MARGIN_PX
     response = np.maximum(_bars(bright, reach), _bars(yellow, reach))
     return _segments(response, top, reach)
 

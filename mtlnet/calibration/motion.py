@@ -6,6 +6,7 @@ p = (x, y, 1) of a point at rest moves by v so that (T x p) . (v + w x p) = 0, w
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -44,9 +45,8 @@ def follow(before: NDArray[np.uint8], after: NDArray[np.uint8]) -> FloatArray | 
     found = cv2.goodFeaturesToTrack(before, POINTS, 0.005, MIN_SPREAD_PX, mask=seen)
     if found is None or len(found) < MIN_POINTS:
         return None
-    options = {"winSize": WINDOW, "maxLevel": LEVELS}
-    there, good, _ = cv2.calcOpticalFlowPyrLK(before, after, found, None, **options)
-    back, good_back, _ = cv2.calcOpticalFlowPyrLK(after, before, there, None, **options)
+    there, good = _flow(before, after, found)
+    back, good_back = _flow(after, before, there)
     steady = np.abs(back - found).max(axis=(1, 2)) < MAX_RETURN_PX
     chosen = (good.ravel() == 1) & (good_back.ravel() == 1) & steady
     tracks = np.concatenate([found[chosen, 0], there[chosen, 0]], axis=1).astype(np.float64)
@@ -54,6 +54,14 @@ def follow(before: NDArray[np.uint8], after: NDArray[np.uint8]) -> FloatArray | 
     if len(tracks) < MIN_POINTS or np.percentile(moved, 75) < MIN_MOTION_PX:
         return None
     return tracks
+
+
+def _flow(before: NDArray[np.uint8], after: NDArray[np.uint8], points: Any) -> tuple[Any, Any]:
+    """Where points (N, 1, 2) are in `after`, and which were found (N, 1), by Lucas and Kanade."""
+    there, found, _ = cv2.calcOpticalFlowPyrLK(
+        before, after, points, np.empty_like(points), winSize=WINDOW, maxLevel=LEVELS
+    )
+    return there, found
 
 
 def find_motion(tracks: FloatArray, towards: FloatArray, noise: float) -> Motion | None:

@@ -128,8 +128,8 @@ def _fit_roads(
     lane, centre = np.full(len(fits), np.nan), np.full(len(fits), np.nan)
     own = widths[widths[:, 3] == 1]
     lane[own[:, 0].astype(int)], centre[own[:, 0].astype(int)] = own[:, 1], own[:, 2]
-    columns = np.array([(f.x0, f.y0, f.y0_std, f.bend) for f in fits])
-    roads = _Roads(time, *columns.T, lane, _sideways(time, -centre), widths)
+    x0, y0, y0_std, bend = np.array([(f.x0, f.y0, f.y0_std, f.bend) for f in fits]).T
+    roads = _Roads(time, x0, y0, y0_std, bend, lane, _sideways(time, -centre), widths)
     seen = int(_straight(roads).sum())
     if seen < MIN_PICTURES:
         raise _too_few(seen, len(samples))

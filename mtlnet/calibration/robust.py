@@ -15,16 +15,16 @@ TUNING = 1.5
 def fit(design: FloatArray, values: FloatArray, weight: FloatArray) -> FloatArray:
     """Coefficients (P,) of `values` (N,) = `design` (N, P) @ coefficients, by Huber's weights."""
     root = np.sqrt(weight)
-    found = np.zeros(design.shape[1])
+    found: FloatArray = np.zeros(design.shape[1])
     scale = root
     for step in range(ROUNDS):
         rows = (root * scale if step else root)[:, None] * design
         target = (root * scale if step else root) * values
-        found = np.linalg.lstsq(rows, target, rcond=None)[0]
+        found = np.asarray(np.linalg.lstsq(rows, target, rcond=None)[0], np.float64)
         error = np.abs(values - design @ found) * root
         limit = TUNING * 1.4826 * float(np.median(error)) + 1e-12
         scale = 1.0 / np.sqrt(np.maximum(1.0, error / limit))
-    return np.asarray(found, np.float64)
+    return found
 
 
 def mean(values: FloatArray, weight: FloatArray | None = None) -> float:

@@ -33,8 +33,8 @@ def find_vanishing_point(pictures: Iterable[Lines]) -> tuple[float, float] | Non
         weight = (lines.size[:, None] / std)[usable]
         cells = np.bincount(row * len(across) + place, weight, votes.size)
         votes += cells.reshape(votes.shape)
-    votes = cv2.GaussianBlur(votes, (0, 0), SMOOTHING_CELLS)
-    if not votes.any():
+    smooth = cv2.GaussianBlur(votes, (0, 0), SMOOTHING_CELLS)
+    if not smooth.any():
         return None
-    row, place = np.unravel_index(int(np.argmax(votes)), votes.shape)
-    return float(np.tan(np.radians(across[place]))), float(y0[row])
+    best_row, best_place = divmod(int(np.argmax(smooth)), len(across))
+    return float(np.tan(np.radians(across[best_place]))), float(y0[best_row])

@@ -17,7 +17,7 @@ def chessboard(columns: int, rows: int) -> Picture:
     """A texture of a chessboard with so many inner corners and a white rim of one square."""
     squares = np.indices((rows + 1, columns + 1)).sum(axis=0) % 2 == 0
     board = np.where(squares, 0, 255).astype(np.uint8).repeat(BOARD_PX, 0).repeat(BOARD_PX, 1)
-    return cv2.copyMakeBorder(board, *(4 * [BOARD_PX]), cv2.BORDER_CONSTANT, value=[255])
+    return np.pad(board, BOARD_PX, constant_values=255)
 
 
 def board_pictures(

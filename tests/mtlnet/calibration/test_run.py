@@ -88,7 +88,7 @@ def test_what_cannot_be_calibrated_is_one_line(film: Path, tmp_path: Path) -> No
     cv2.imwrite(str(picture), road_picture(CAMERA, MARKINGS_M))
     cut.write_bytes(film.read_bytes()[: film.stat().st_size // 2])
     out = tmp_path / "camera.yaml"
-    for given, seen in [
+    cases: list[tuple[list[object], str]] = [
         ([_no_markings(tmp_path / "none.mp4")], "none.mp4: "),
         ([picture], "no chessboard in 1 pictures"),
         ([picture, "--drive"], "1 of 1 pictures show both markings of a lane"),
@@ -97,7 +97,8 @@ def test_what_cannot_be_calibrated_is_one_line(film: Path, tmp_path: Path) -> No
         ([tmp_path / "nothing.mp4"], "there is no image file"),
         ([film, "--lane-width", 36], "--lane-width 36 m; give 2 to 6 m"),
         ([film, "--fov", 0], "--fov-y-deg: "),
-    ]:
+    ]
+    for given, seen in cases:
         done = typed("mtlnet", "calibrate", *given, "--out", out)
         assert done.returncode == 1, given
         assert seen in error_line(done)
