@@ -49,6 +49,8 @@ def predict_files(
     report: Callable[[int, int], None] = lambda done, total: None,
     note: Note = lambda line: None,
     topic: str = "",
+    *,
+    calibrate: bool = False,
 ) -> list[dict[str, Any]]:
     """The features of all images that `inputs` name (`mtlnet.predict.sources.find_sources`).
 
@@ -56,9 +58,10 @@ def predict_files(
     (`mtlnet.predict.writers.open_writer`), one image at a time. `lens`: of all but recorded rounds,
     which must be of the model's camera; None: what is known of the source, else the model's.
     `report`: takes the numbers of images done and in all. `note`: takes a line on what is left out
-    or was found. `topic`: of recordings. A stream ends also by Ctrl-C. Raises InputsLeftOut, after
-    all others were done, when an input or an image could not be used; UserError at once for outputs
-    that cannot be written or are among the files to read, or an impossible `lens`.
+    or was found. `topic`: of recordings. `calibrate`: the camera of films and streams is found from
+    what they show. A stream ends also by Ctrl-C. Raises InputsLeftOut, after all others were done,
+    when an input or an image could not be used; UserError at once for outputs that cannot be
+    written or are among the files to read, or an impossible `lens`.
     """
     if isinstance(lens, float | int) and not 0 < lens < 180:  # NaN too
         raise UserError(f"--fov-y-deg {lens:g}: a field of view is above 0 and below 180 degrees")
@@ -70,7 +73,7 @@ def predict_files(
     for source in sources:
         if source.problem:
             note(source.problem)
-    sources = [with_lens(source, camera, lens, note) for source in sources]
+    sources = [with_lens(source, camera, lens, note, calibrate=calibrate) for source in sources]
     answers = _Answers(engine, sum(source.count for source in sources), report)
     with ExitStack() as stack:
         fps = usable[0].fps if usable else DEFAULT_FPS

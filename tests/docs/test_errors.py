@@ -20,6 +20,7 @@ from datagen.recording import Dataset
 from datagen.recording.mcap.footer import read_summary
 from datagen.recording.mcap.index import open_round
 from docs.generate import error_classes
+from mtlnet.calibration.run import CalibrateConfig, calibrate
 from mtlnet.data.custom_images import COLUMNS, open_custom_images
 from mtlnet.inference.engine import Engine, load_engine
 from mtlnet.inference.image_decoding.decode import inspect, read_image
@@ -243,6 +244,24 @@ def damaged_round(folder: Path) -> Dataset:
     path.unlink()  # other tests may have mapped it
     path.write_bytes(content)
     return Dataset.open(data)
+
+
+@row("a film that shows no marked road")
+def _(folder: Path) -> object:
+    path = film(folder, "-vf", "boxblur=30", "-c:v", "mpeg4")
+    return calibrate(CalibrateConfig([str(path)], folder / "camera.yaml"))
+
+
+@row("pictures without a board")
+def _(folder: Path) -> object:
+    path = written(folder, "a.jpg", jpeg())
+    return calibrate(CalibrateConfig([str(path)], folder / "camera.yaml"))
+
+
+@row("a lane width that no lane has")
+def _(folder: Path) -> object:
+    path = written(folder, "a.jpg", jpeg())
+    return calibrate(CalibrateConfig([str(path)], folder / "camera.yaml", lane_width_m=0.3))
 
 
 @row("a frame in a chunk")
