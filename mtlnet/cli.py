@@ -207,24 +207,29 @@ def predict_command(
     out: options.PredictOut = None,
     fov_y_deg: options.FieldOfView = None,
     camera: options.PredictCamera = None,
+    topic: options.Topic = "",
     engine: options.EngineKind = "openvino",
     precision: options.Precision = None,
     as_json: options.Json = False,
 ) -> None:
-    """Track features of images, films or recorded rounds; also as tables, pictures or a film."""
+    """Track features of images, films, webcams, streams, rounds, Foxglove files or ROS 2 bags."""
     from rich.console import Console
 
     from mtlnet.evaluation.tables import prediction_table
     from mtlnet.inference.rectification import Rectification, read_camera
+    from mtlnet.predict.pictures import Lens
     from mtlnet.predict.run import InputsLeftOut, predict_files
     from trackfeatures.errors import UserError
 
-    if camera is not None and fov_y_deg is not None:
+    own = str(camera) == "model"
+    if camera is not None and fov_y_deg is not None and not own:
         raise UserError("--camera holds the field of view; leave --fov-y-deg out")
     _print_model(model)
     loaded = _load(model, engine, precision)
     known = loaded.card.camera
-    lens = fov_y_deg if camera is None else Rectification(read_camera(camera, known), known)
+    lens: Lens = fov_y_deg
+    if camera is not None and not own:
+        lens = Rectification(read_camera(camera, known), known)
     with command.progress_bar() as bar:
         task = bar.add_task("predicting", total=None)
 
@@ -238,7 +243,9 @@ def predict_command(
 
         left_out: InputsLeftOut | None = None
         try:
-            predictions = predict_files(loaded, images, out or (), lens, report, note)
+            predictions = predict_files(
+                loaded, images, out or (), lens, report, note, topic, calibrate=not own
+            )
         except InputsLeftOut as error:
             predictions, left_out = error.results, error
     if as_json and predictions:
@@ -249,6 +256,34 @@ def predict_command(
             typer.echo(f"the first {MAX_PRINTED} images; --out features.csv has all", err=True)
     if left_out is not None:
         raise left_out
+
+
+@app.command("calibrate")
+def calibrate_command(
+    inputs: options.CalibrateInputs,
+    out: options.CalibrateOut = Path("camera.yaml"),
+    board: options.Board = "",
+    fisheye: options.Fisheye = False,
+    drive: options.Drive = False,
+    camera: options.LensFile = None,
+    fov_y_deg: options.LensFieldOfView = None,
+    photo: options.Photo = None,
+    lane_width: options.LaneWidth = None,
+    page: options.CalibrationPage = None,
+    as_json: options.Json = False,
+) -> None:
+    """A camera file from a film of a drive (the mount), or from pictures of a board (the lens)."""
+    from mtlnet.calibration.run import CalibrateConfig, calibrate
+
+    config = CalibrateConfig(
+        inputs, out, board, fisheye, drive, camera, fov_y_deg, photo, lane_width, page
+    )
+    with command.progress_bar() as bar:
+        task = bar.add_task("calibrating", total=None)
+        result, line = calibrate(
+            config, lambda done, total: bar.update(task, completed=int(done), total=int(total))
+        )
+    command.print_result(result, as_json, f"{out}: {line}")
 
 
 def _print_model(name: str) -> None:

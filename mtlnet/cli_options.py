@@ -160,20 +160,69 @@ ShippedNotes = Annotated[
 ]
 PredictInputs = Annotated[
     list[str],
-    typer.Argument(help="Images, films, rounds (.mcap), folders of them, patterns."),
+    typer.Argument(
+        help="Images, films, rounds, Foxglove files, ROS 2 bags, folders or patterns of them; a "
+        "webcam by its number; a stream by its address (rtsp://, http://)."
+    ),
 ]
 PredictOut = Annotated[
     list[Path] | None,
     typer.Option(
-        help="Table (.csv, .jsonl), film (.mp4) or folder of pictures with the markings drawn in; "
-        "may be given several times."
+        help="Table (.csv, .jsonl), film (.mp4), Foxglove file (.mcap) or folder of pictures with "
+        "the markings drawn in; may be given several times."
     ),
+]
+Topic = Annotated[
+    str,
+    typer.Option(help="Of a Foxglove file or ROS 2 bag.  [default: the only one with pictures]"),
 ]
 PredictCamera = Annotated[
     Path | None,
-    typer.Option(help="YAML file with the camera of images and films.  [default: the model's]"),
+    typer.Option(
+        help="YAML file with the camera of the pictures, or `model`: they are as the model's.  "
+        "[default: what a recording states or a film or stream shows, else the model's]"
+    ),
 ]
 FieldOfView = Annotated[
     float | None,
     typer.Option(help="Vertical field of view of images and films, degrees.  [default: model's]"),
+]
+
+# Options of `calibrate`.
+CalibrateInputs = Annotated[
+    list[str],
+    typer.Argument(help="A film of a drive, or pictures of a board (files, folders, patterns)."),
+]
+CalibrateOut = Annotated[Path, typer.Option(help="Camera file to write.")]
+Board = Annotated[
+    str,
+    typer.Option(
+        help="Inner corners of the chessboard, as 9x6, or charuco:5x7:4X4_50:0.75 (squares, "
+        "dictionary, marker's side in squares).  [default: a common chessboard]"
+    ),
+]
+Fisheye = Annotated[bool, typer.Option("--fisheye", help="A fisheye lens (of a board).")]
+Drive = Annotated[
+    bool, typer.Option("--drive", help="The pictures are of a drive, in their order.")
+]
+LensFile = Annotated[
+    Path | None, typer.Option("--camera", help="Camera file with the lens, as of a board.")
+]
+LensFieldOfView = Annotated[
+    float | None,
+    typer.Option(
+        "--fov-y-deg",
+        "--fov",
+        help="Vertical field of view of film or pictures, degrees.  [default: 65 along the longer "
+        "side, a guess]",
+    ),
+]
+Photo = Annotated[
+    Path | None, typer.Option(help="Photo of the same camera, whose EXIF states the focal length.")
+]
+LaneWidth = Annotated[
+    float | None, typer.Option(help="Width of the lane driven in, m.  [default: 3.6, assumed]")
+]
+CalibrationPage = Annotated[
+    Path | None, typer.Option("--report", help="HTML page to write, with what was found drawn in.")
 ]

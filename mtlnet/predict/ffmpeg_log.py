@@ -15,8 +15,12 @@ from pathlib import Path
 
 AV_LOG_ERROR = 16
 LINE_BYTES = 512
-# They are about data beside the picture, which dash cameras write as they like.
-HARMLESS = ("SEI", "APP fields", "timescale not set")
+# About data beside the picture, which dash cameras write as they like, and the end of a stream that
+# states no size.
+HARMLESS = ("SEI", "APP fields", "timescale not set", f"should be {2**64 - 1}")
+SIZES = (b"Reinit context to %dx%d", b"sof0: picture: %dx%d")
+SIZE = re.compile(r"(?:to|picture:) (\d+)x(\d+)")
+BLOCK_PX = 16
 PREFIX = re.compile(r"^(?:\[(\S+) @ [^]]+\] )+")  # e.g. "[h264 @ 0x55d0] "
 CONVERTER = "swscaler"
 LogCallback = ctypes.CFUNCTYPE(
@@ -27,15 +31,30 @@ LogCallback = ctypes.CFUNCTYPE(
 @dataclass
 class DecodingErrors:
     """The number of errors so far, and the text of the first. `unconverted`: that of an error in
-    the conversion to RGB, after which OpenCV gives a black picture."""
+    the conversion to RGB, after which OpenCV gives a black picture. `size`: the coded size of later
+    pictures (width, height) where a decoder of H.264 or MJPEG reports one: OpenCV scales them to
+    that of the first."""
 
     count: int = 0
     first: str = ""
     unconverted: str = ""
+    size: tuple[int, int] | None = None
 
     def forget(self) -> None:
         """Forget the errors so far."""
-        self.count, self.first, self.unconverted = 0, "", ""
+        self.count, self.first, self.unconverted, self.size = 0, "", "", None
+
+    def new_size(self, shape: tuple[int, ...]) -> tuple[int, int] | None:
+        """The other size (width, height) that pictures have now; `shape` (H, W, 3) is the first's.
+
+        A coded size is a multiple of `BLOCK_PX`, that of a turned film is turned.
+        """
+        if self.size is None:
+            return None
+        fits = (
+            0 <= c - s < BLOCK_PX for c, s in zip(sorted(self.size), sorted(shape[:2]), strict=True)
+        )
+        return None if all(fits) else self.size
 
     def add(self, line: str) -> None:
         """Count a line of the log, e.g. "[h264 @ 0x55d0] Reference 2 >= 2"."""
@@ -62,13 +81,18 @@ def decoding_errors() -> Iterator[DecodingErrors]:
         return
 
     def add(context: int, level: int, text: bytes, arguments: int) -> None:
-        if level <= AV_LOG_ERROR:
+        is_size = level > AV_LOG_ERROR and text.startswith(SIZES)
+        if level <= AV_LOG_ERROR or is_size:
             line = ctypes.create_string_buffer(LINE_BYTES)
             library.av_log_format_line(
                 ctypes.c_void_p(context), level, text, ctypes.c_void_p(arguments), line, LINE_BYTES,
                 ctypes.byref(ctypes.c_int(1)),
             )  # fmt: skip
-            found.add(line.value.decode(errors="replace"))
+            told = line.value.decode(errors="replace")
+            if not is_size:
+                found.add(told)
+            elif size := SIZE.search(told):
+                found.size = (int(size[1]), int(size[2]))
 
     callback = LogCallback(add)  # must outlive its use
     library.av_log_set_callback(callback)

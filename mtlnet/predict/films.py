@@ -15,10 +15,10 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from mtlnet.predict.ffmpeg_log import DecodingErrors, decoding_errors
 from mtlnet.predict.film_header import missing_end, stated_frames, unsupported_picture
+from mtlnet.predict.pictures import Image, Picture, other_size
 from trackfeatures.errors import UserError
 
 MAX_LOST = 100
@@ -26,8 +26,6 @@ MAX_LOST = 100
 MAX_STRETCH = 10.0
 CODECS = {"AV01": "AV1", "av01": "AV1", "h264": "H.264", "avc1": "H.264", "hevc": "H.265"}
 CONVERT = "convert it, e.g. with `ffmpeg -i FILM -c:v libx264 new.mp4`"
-
-Image = NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
@@ -56,8 +54,8 @@ class Film:
     path: Path
     fault: str = ""
 
-    def frames(self) -> Iterator[tuple[int, Image]]:
-        """The number of each frame, from 0, and its picture, uint8 RGB (H, W, 3).
+    def pictures(self) -> Iterator[Picture]:
+        """Its frames, numbered from 0.
 
         A frame that cannot be decoded is left out, but counted. Raises as `read_film_header`.
         """
@@ -68,9 +66,7 @@ class Film:
             finally:
                 film.release()
 
-    def _frames(
-        self, film: cv2.VideoCapture, errors: DecodingErrors
-    ) -> Iterator[tuple[int, Image]]:
+    def _frames(self, film: cv2.VideoCapture, errors: DecodingErrors) -> Iterator[Picture]:
         stretch = _stretch(self.path, film)
         errors.forget()  # FFmpeg guesses while it opens a film
         number = used = lost = 0
@@ -86,8 +82,14 @@ class Film:
                 raise UserError(f"{self.path}: frame {number}: {_unconverted(errors)}")
             number += lost
             lost = 0
-            picture = cv2.cvtColor(frame, cv2.COLOR_BGR2RGB).astype(np.uint8, copy=False)
-            yield number, picture if stretch == (1.0, 1.0) else _stretched(picture, stretch)
+            if size := errors.new_size(frame.shape):
+                first = (frame.shape[1], frame.shape[0])
+                self.fault = other_size(str(self.path), number, size, first)
+                return
+            image = frame.astype(np.uint8, copy=False)
+            if stretch != (1.0, 1.0):
+                image = _stretched(image, stretch)
+            yield Picture(number, image, film.get(cv2.CAP_PROP_POS_MSEC) / 1e3, bgr=True)
             number, used = number + 1, used + 1
         self.fault = self._find_fault(film, errors, used, number - used, damaged_at)
 
@@ -95,7 +97,7 @@ class Film:
         self, film: cv2.VideoCapture, errors: DecodingErrors, used: int, lost: int, damaged_at: int
     ) -> str:
         if not used:
-            return f"{self.path}: {_no_frame(film, errors)}"
+            return f"{self.path}: {no_frame(film, errors)}"
         reason = missing_end(self.path)
         if reason:
             stated = int(film.get(cv2.CAP_PROP_FRAME_COUNT))
@@ -117,7 +119,7 @@ def _open(path: Path, errors: DecodingErrors) -> cv2.VideoCapture:
 
     A name that is not UTF-8 ends its process, one with a colon is a protocol to FFmpeg.
     """
-    with _opened(path) as name, _silent_opencv():
+    with _opened(path) as name, silent_opencv():
         film = cv2.VideoCapture(name, cv2.CAP_FFMPEG)
     if not film.isOpened():
         told = f" ({errors.first})" if errors.first else ""
@@ -134,7 +136,7 @@ def _open(path: Path, errors: DecodingErrors) -> cv2.VideoCapture:
 
 
 @contextmanager
-def _silent_opencv() -> Iterator[None]:
+def silent_opencv() -> Iterator[None]:
     """OpenCV warns on stderr of a film that it cannot open; the error says more."""
     level = cv2.utils.logging.getLogLevel()
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)
@@ -185,7 +187,7 @@ def _unconverted(errors: DecodingErrors) -> str:
     return f"its colours cannot be converted ({errors.unconverted}); {CONVERT}"
 
 
-def _no_frame(film: cv2.VideoCapture, errors: DecodingErrors) -> str:
+def no_frame(film: cv2.VideoCapture, errors: DecodingErrors) -> str:
     """Why a film that could be opened has no frame."""
     packed = int(film.get(cv2.CAP_PROP_FOURCC)) & 0xFFFFFFFF
     code = packed.to_bytes(4, "little").decode("latin-1").strip("\0 ")

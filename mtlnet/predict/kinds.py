@@ -1,7 +1,14 @@
-"""What a file is: an image, a film or a recorded round, told by its first bytes, else its name."""
+"""What a file is: an image, a film, a recorded round or another recording.
 
+Told by its first bytes, else its name.
+"""
+
+from contextlib import suppress
 from enum import Enum
 from pathlib import Path
+from typing import Any
+
+import yaml
 
 from mtlnet.inference.image_decoding.other_kinds import SUFFIXES
 
@@ -12,6 +19,10 @@ class Kind(Enum):
     IMAGE = "image"
     FILM = "film"
     ROUND = "round"
+    RECORDING = "recording"
+    """Of another program: an MCAP file of Foxglove or ROS 2, a ROS 2 bag."""
+    STREAM = "stream"
+    """No file: a webcam or an address."""
 
 
 IMAGES = tuple(suffix for suffix in SUFFIXES if suffix != ".gif")  # its pictures are a film
@@ -24,7 +35,10 @@ FILMS = (
 )
 # fmt: on
 MJPEG = (".mjpeg", ".mjpg")  # begin as a JPEG image does
-ROUND = ".mcap"
+ROUND, MCAP_START = ".mcap", b"\x89MCAP"
+ROUND_NAME, TAIL_BYTES = b"driverview.round", 1 << 16  # its metadata, in the head or the index
+SQLITE_START = b"SQLite format 3\0"
+BAG_METADATA, BAG = "metadata.yaml", "rosbag2_bagfile_information"
 HEAD_BYTES = 400
 IMAGE_STARTS = (
     b"\xff\xd8\xff", b"\x89PNG", b"BM", b"II*\0", b"MM\0*", b"\0\0\0\x0cjP  ",
@@ -47,14 +61,23 @@ def kind_of(path: Path) -> Kind | None:
             head = file.read(HEAD_BYTES)
     except OSError:
         head = b""
-    if suffix == ROUND or head.startswith(b"\x89MCAP"):
-        return Kind.ROUND
+    if suffix == ROUND or head.startswith(MCAP_START):
+        is_round = not head.startswith(MCAP_START) or ROUND_NAME in head + _tail(path)
+        return Kind.ROUND if is_round else Kind.RECORDING
+    if head.startswith(SQLITE_START):
+        return Kind.RECORDING
     found = _kind_of_content(head)
     if found is Kind.IMAGE and suffix in MJPEG:
         return Kind.FILM
     if found is None and suffix in IMAGES:
         return Kind.IMAGE
     return Kind.FILM if found is None and suffix in FILMS else found
+
+
+def _tail(path: Path) -> bytes:
+    with path.open("rb") as file:
+        file.seek(max(path.stat().st_size - TAIL_BYTES, 0))
+        return file.read()
 
 
 def _kind_of_content(head: bytes) -> Kind | None:
@@ -66,3 +89,12 @@ def _kind_of_content(head: bytes) -> Kind | None:
         return Kind.IMAGE
     is_ts = any(head[first : first + 2 * step : step] == b"GG" for first, step in TS_PACKETS)
     return Kind.FILM if is_ts or head.startswith(FILM_STARTS) else None
+
+
+def bag_metadata(folder: Path) -> dict[str, Any] | None:
+    """What the `metadata.yaml` of a ROS 2 bag states; None where a folder is none."""
+    with suppress(OSError, UnicodeDecodeError, yaml.YAMLError):
+        found = yaml.safe_load((folder / BAG_METADATA).read_text(encoding="utf-8"))
+        if isinstance(found, dict) and isinstance(found.get(BAG), dict):
+            return dict(found[BAG])
+    return None

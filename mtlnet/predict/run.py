@@ -1,16 +1,32 @@
-"""`mtlnet predict`: the features of images, films and recorded rounds, yielded and written."""
+"""`mtlnet predict`: the features of images of any source, yielded and written.
+
+Three threads share the work: one decodes, one runs the network, one draws and writes. Each keeps
+the order, so answers and files do not depend on them.
+"""
 
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 from mtlnet.inference.engine import Engine
-from mtlnet.inference.prediction import decode_outputs
-from mtlnet.inference.rectification import Rectification
-from mtlnet.predict.sources import DEFAULT_FPS, Lens, Note, find_sources, read_sources
-from mtlnet.predict.writers import open_writer, require_other_file
+from mtlnet.inference.prediction import Prediction, decode_outputs
+from mtlnet.predict.kinds import Kind
+from mtlnet.predict.lenses import with_lens
+from mtlnet.predict.pictures import Lens
+from mtlnet.predict.sources import (
+    DEFAULT_FPS,
+    READ_AHEAD,
+    Note,
+    SourceImage,
+    find_sources,
+    read_sources,
+)
+from mtlnet.predict.streams import Stream
+from mtlnet.predict.writers import Writer, open_writer, require_other_file
 from trackfeatures.errors import UserError
 
 KEPT_ROWS = 10_000
@@ -32,53 +48,122 @@ def predict_files(
     lens: Lens = None,
     report: Callable[[int, int], None] = lambda done, total: None,
     note: Note = lambda line: None,
+    topic: str = "",
+    *,
+    calibrate: bool = False,
 ) -> list[dict[str, Any]]:
     """The features of all images that `inputs` name (`mtlnet.predict.sources.find_sources`).
 
     Those of the first `KEPT_ROWS` are returned, all are written to each of `outputs`
-    (`mtlnet.predict.writers.open_writer`), one image at a time. `lens`: of images and films; a
-    recorded round must be of the model's camera. `report`: takes the numbers of images done and in
-    all. `note`: takes a line on what is left out, before the first image. Raises InputsLeftOut,
-    after all others were done, when an input or an image could not be used; UserError at once for
-    outputs that cannot be written or are among the files to read, or an impossible `lens`.
+    (`mtlnet.predict.writers.open_writer`), one image at a time. `lens`: of all but recorded rounds,
+    which must be of the model's camera; None: what is known of the source, else the model's.
+    `report`: takes the numbers of images done and in all. `note`: takes a line on what is left out
+    or was found. `topic`: of recordings. `calibrate`: the camera of films and streams is found from
+    what they show. A stream ends also by Ctrl-C. Raises InputsLeftOut, after all others were done,
+    when an input or an image could not be used; UserError at once for outputs that cannot be
+    written or are among the files to read, or an impossible `lens`.
     """
     if isinstance(lens, float | int) and not 0 < lens < 180:  # NaN too
         raise UserError(f"--fov-y-deg {lens:g}: a field of view is above 0 and below 180 degrees")
-    sources = find_sources(list(inputs), note)
-    other = lens if isinstance(lens, Rectification) else None
-    camera, name = engine.card.camera, engine.card.name
-    total = sum(source.count for source in sources)
-    drawn = camera if other is None else other.view
-    results: list[dict[str, Any]] = []
-    unusable: list[str] = []
-    used = 0
+    camera = engine.card.camera
+    sources = find_sources(list(inputs), note, topic)
+    usable = [source for source in sources if not source.problem]
     for path in outputs:
-        require_other_file(path, [source.path for source in sources if not source.problem])
+        require_other_file(path, [file for source in usable for file in source.files])
     for source in sources:
         if source.problem:
             note(source.problem)
+    sources = [with_lens(source, camera, lens, note, calibrate=calibrate) for source in sources]
+    answers = _Answers(engine, sum(source.count for source in sources), report)
     with ExitStack() as stack:
-        fps = next((source.fps for source in sources if not source.problem), DEFAULT_FPS)
-        writers = [stack.enter_context(open_writer(path, drawn, fps)) for path in outputs]
-        for done, item in enumerate(read_sources(sources, camera, lens), start=1):
-            report(done, max(total, done))
-            if item.image is None:
-                unusable.append(item.error)
-                continue
-            begin = time.perf_counter()
-            answers = engine(item.image)
-            if other is not None:
-                answers = other.outputs(answers[None])[0]
-            prediction = decode_outputs(answers)
-            latency_ms = round(1e3 * (time.perf_counter() - begin), 3)
-            for writer in writers:
+        fps = usable[0].fps if usable else DEFAULT_FPS
+        writers = [stack.enter_context(open_writer(path, camera, fps)) for path in outputs]
+        writing = stack.enter_context(_Writing(writers))
+        items = read_sources(sources, camera)
+        stack.callback(items.close)
+        try:
+            for item in items:
+                answers.add(item, writing)
+        except KeyboardInterrupt:
+            if not any(source.kind is Kind.STREAM for source in usable):
+                raise
+            note(f"stopped after {answers.used} images")
+    for source in sources:
+        if isinstance(source.opened, Stream) and source.opened.note:
+            note(source.opened.note)
+    return answers.finish()
+
+
+class _Answers:
+    """The answers so far, and what could not be used."""
+
+    def __init__(self, engine: Engine, total: int, report: Callable[[int, int], None]) -> None:
+        self._engine, self._total, self._report = engine, total, report
+        self._done = self.used = 0
+        self._results: list[dict[str, Any]] = []
+        self._unusable: list[str] = []
+
+    def add(self, item: SourceImage, writing: "_Writing") -> None:
+        self._done += 1
+        self._report(self._done, max(self._total, self._done))
+        if item.image is None:
+            self._unusable.append(item.error)
+            return
+        begin = time.perf_counter()
+        outputs = self._engine(item.image)
+        if item.lens is not None:
+            outputs = item.lens.outputs(outputs[None])[0]
+        prediction = decode_outputs(outputs)
+        latency_ms = round(1e3 * (time.perf_counter() - begin), 3)
+        writing.write(item, prediction)
+        self.used += 1
+        if len(self._results) < KEPT_ROWS:
+            about = {"model": self._engine.card.name, "latency_ms": latency_ms}
+            row = {"image": item.name, "time_s": item.time_s, **prediction.as_json(), **about}
+            self._results.append(row)
+
+    def finish(self) -> list[dict[str, Any]]:
+        """All answers. Raises InputsLeftOut."""
+        if not self._unusable:
+            return self._results
+        more = f" (and {len(self._unusable) - 1} more)" if len(self._unusable) > 1 else ""
+        others = f"; {self.used} others were done" if self.used else ""
+        raise InputsLeftOut(f"{self._unusable[0]}{more}{others}", self._results)
+
+
+class _Writing:
+    """Writes answers on a thread of its own, in their order.
+
+    What fails there is raised by the next `write`, or at the end; nothing is written after it.
+    """
+
+    def __init__(self, writers: list[Writer]) -> None:
+        self._writers = writers
+        self._thread = ThreadPoolExecutor(1)
+        self._waiting: deque[Future[None]] = deque()
+        self._failed = False
+
+    def write(self, item: SourceImage, prediction: Prediction) -> None:
+        """Write one answer soon; waits while `READ_AHEAD` others wait."""
+        if self._writers:
+            self._waiting.append(self._thread.submit(self._write, item, prediction))
+        while self._waiting and (len(self._waiting) > READ_AHEAD or self._waiting[0].done()):
+            self._waiting.popleft().result()
+
+    def _write(self, item: SourceImage, prediction: Prediction) -> None:
+        if self._failed:
+            return
+        try:
+            for writer in self._writers:
                 writer.write(item, prediction)
-            used += 1
-            if len(results) < KEPT_ROWS:
-                about = {"model": name, "latency_ms": latency_ms}
-                results.append({"image": item.name, **prediction.as_json(), **about})
-    if unusable:
-        more = f" (and {len(unusable) - 1} more)" if len(unusable) > 1 else ""
-        others = f"; {used} others were done" if used else ""
-        raise InputsLeftOut(f"{unusable[0]}{more}{others}", results)
-    return results
+        except BaseException:
+            self._failed = True
+            raise
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: object, *_: object) -> None:
+        self._thread.shutdown()
+        while self._waiting and kind is None:
+            self._waiting.popleft().result()

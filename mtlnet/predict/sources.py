@@ -1,8 +1,9 @@
-"""Where `mtlnet predict` takes images from: files, folders, glob patterns, films and rounds."""
+"""Where `mtlnet predict` takes images from: files, folders, patterns, films, rounds, recordings of
+other programs, webcams and streams."""
 
 import os
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
@@ -10,23 +11,21 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 import trackfeatures as tf
-from mtlnet.inference.image_decoding.decode import (
-    crop_and_resize,
-    read_image,
-    read_whole_image,
-)
+from mtlnet.inference.image_decoding.decode import read_whole_image
 from mtlnet.inference.rectification import Rectification
 from mtlnet.predict.films import Film, read_film_header
-from mtlnet.predict.kinds import Kind, kind_of
+from mtlnet.predict.kinds import Kind, bag_metadata, kind_of
+from mtlnet.predict.pictures import Image, Lens, LensFinder, Picture, Pictures, fit
+from mtlnet.predict.streams import Stream, is_live, open_stream, shown_name
 from runtime.files import natural_key
 from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
 
 if TYPE_CHECKING:
     from datagen.recording import Frames, Labels
+    from mtlnet.predict.recordings.recording import Recording
 
 DEFAULT_FPS = 20.0
 READ_AHEAD = 16
@@ -35,10 +34,6 @@ UNREMARKABLE = ("thumbs.db", "desktop.ini", "labels.csv", "camera.yaml")
 MAX_NAMED = 5
 """Files named in a note."""
 
-Image = NDArray[np.uint8]
-Lens = Rectification | float | None
-"""Of images and films: their camera, or its vertical field of view in degrees; None: the model's.
-"""
 Note = Callable[[str], None]
 
 
@@ -56,23 +51,28 @@ class Truth:
 class SourceImage:
     """One image in the model's size, or why it cannot be used."""
 
-    file: Path
+    source: str
+    """The file, webcam or address."""
     frame: int | None
-    """Of a film or a round: the number of the frame, from 0."""
+    """Of a film, stream, round or recording: the number of the frame, from 0."""
     image: Image | None
     """uint8 RGB (210, 280, 3)."""
     error: str = ""
     truth: Truth | None = None
+    time_s: float | None = None
+    """When it was taken, s: of a film or round since its start, else since 1970. None: unknown."""
+    lens: Rectification | None = None
+    """From its camera to the model's; None where it is the model's."""
 
     @property
     def name(self) -> str:
-        """The file; for a film or a round with the number of the frame: `film.mp4#12`."""
-        return f"{self.file}" if self.frame is None else f"{self.file}#{self.frame}"
+        """The source; where it has several images with the number of this one: `film.mp4#12`."""
+        return self.source if self.frame is None else f"{self.source}#{self.frame}"
 
 
 @dataclass(frozen=True)
 class Source:
-    """One file to take images from."""
+    """One file, webcam or address to take images from."""
 
     path: Path
     kind: Kind = Kind.IMAGE
@@ -81,26 +81,50 @@ class Source:
     fps: float = DEFAULT_FPS
     problem: str = ""
     """Why no image can be taken from it."""
+    address: str = ""
+    """Of a webcam or stream, without a password."""
+    opened: "Stream | Recording | None" = None
+    lens: Lens | LensFinder = None
+
+    @property
+    def name(self) -> str:
+        """As it stands in tables and messages."""
+        return self.address or str(self.path)
+
+    @property
+    def files(self) -> list[Path]:
+        """What is read, and so must not be written to."""
+        return list(self.path.iterdir()) if self.path.is_dir() else [self.path]
 
 
-def find_sources(inputs: list[str], note: Note = lambda line: None) -> list[Source]:
-    """The files that arguments name: a file, those of a folder, or those a pattern matches.
+def find_sources(
+    inputs: list[str], note: Note = lambda line: None, topic: str = ""
+) -> list[Source]:
+    """What arguments name: a file, those of a folder, those a pattern matches, a webcam by its
+    number, a stream by its address.
 
     In natural order (`frame2` before `frame10`). What names nothing is a source with a problem.
-    `note`: takes a line on what is left out: a folder's other files, and its subfolders.
+    `note`: takes a line on what is left out: a folder's other files, and its subfolders. `topic`:
+    of recordings; empty: the only one with pictures.
     """
-    return [source for given in inputs for source in _find(given, note)]
+    return [source for given in inputs for source in _find(given, note, topic)]
 
 
-def _find(given: str, note: Note) -> list[Source]:
+def _find(given: str, note: Note, topic: str) -> list[Source]:
     path = Path(given)
+    if is_live(given):
+        return [_stream(given)]
     if not given:  # Path takes it for the present folder
         return [Source(path, problem="the name of an input is empty; give a file or a folder")]
     try:
         if path.is_dir():
-            return _in_folder(path, note)
+            if bag_metadata(path) is not None:
+                return [_source(path, Kind.RECORDING, topic)]
+            return _in_folder(path, note, topic)
         if path.is_file():
-            return [_source(path, kind_of(path) or Kind.IMAGE)]  # says what its first bytes are
+            return [
+                _source(path, kind_of(path) or Kind.IMAGE, topic)
+            ]  # says what its first bytes are
         if os.path.lexists(path):
             reason = "its target is missing" if path.is_symlink() else "a pipe or a device"
             return [Source(path, problem=f"{path} is no file ({reason}); give a file")]
@@ -110,16 +134,16 @@ def _find(given: str, note: Note) -> list[Source]:
         return [Source(path, problem=f"{given} cannot be read ({reason}); check name and mode")]
     if not found:
         return [Source(path, problem=f"there is no image file {given}, nor a film or round")]
-    return _known(found, given, note)
+    return _known(found, given, note, topic)
 
 
-def _in_folder(folder: Path, note: Note) -> list[Source]:
+def _in_folder(folder: Path, note: Note, topic: str) -> list[Source]:
     entries = _in_order(folder.iterdir())
     files = [path for path in entries if path.is_file()]
     folders = [path for path in entries if path.is_dir() and not path.name.startswith(".")]
     if folders:
         note(f"{folder}: its folders are not searched: {_named(folders)}; give them by name")
-    return _known(files, str(folder), note)
+    return _known(files, str(folder), note, topic)
 
 
 def _matches(pattern: Path) -> Iterable[Path]:
@@ -132,10 +156,10 @@ def _in_order(paths: Iterable[Path]) -> list[Path]:
     return sorted(paths, key=lambda path: [natural_key(part) for part in path.parts])
 
 
-def _known(files: list[Path], given: str, note: Note) -> list[Source]:
+def _known(files: list[Path], given: str, note: Note, topic: str) -> list[Source]:
     """The sources among `files`; the others are noted, but for what is found beside images."""
     kinds = {path: kind_of(path) for path in files}
-    sources = [_source(path, kind) for path, kind in kinds.items() if kind is not None]
+    sources = [_source(path, kind, topic) for path, kind in kinds.items() if kind is not None]
     others = [path for path, kind in kinds.items() if kind is None and not _is_unremarkable(path)]
     if others:
         note(f"{given}: left out, neither image nor film nor round: {_named(others)}")
@@ -153,8 +177,22 @@ def _named(paths: list[Path]) -> str:
     return ", ".join(path.name for path in paths[:MAX_NAMED]) + more
 
 
-def _source(path: Path, kind: Kind) -> Source:
+def _stream(given: str) -> Source:
+    path, name = Path(given), shown_name(given)
     try:
+        opened = open_stream(given)
+    except UserError as error:
+        return Source(path, Kind.STREAM, 0, problem=str(error), address=name)
+    return Source(path, Kind.STREAM, 0, opened.fps or DEFAULT_FPS, address=name, opened=opened)
+
+
+def _source(path: Path, kind: Kind, topic: str) -> Source:
+    try:
+        if kind is Kind.RECORDING:
+            from mtlnet.predict.recordings.recording import open_recording
+
+            found = open_recording(path, topic)
+            return Source(path, kind, found.count, opened=found)
         if kind is Kind.FILM:
             header = read_film_header(path)
             return Source(path, kind, header.count, header.fps or DEFAULT_FPS)
@@ -167,6 +205,9 @@ def _source(path: Path, kind: Kind) -> Source:
         return Source(path, kind, 0, problem=str(error))
     except OSError as error:
         return Source(path, kind, 0, problem=_unreadable(path, error))
+    except ModuleNotFoundError as error:
+        needed = f"the package {error.name}, in `pip install driverview[recording]`"
+        return Source(path, kind, 0, problem=f"{path} needs {needed}")
     return Source(path)
 
 
@@ -175,56 +216,74 @@ def _unreadable(path: Path, error: OSError) -> str:
 
 
 def read_sources(
-    sources: list[Source], camera: CameraParameters, lens: Lens = None
-) -> Iterator[SourceImage]:
-    """The images of all sources in order, in the size of `camera`, decoded on another thread."""
-    items = (item for source in sources for item in _read(source, camera, lens))
-    with ThreadPoolExecutor(1) as decoder:  # one thread: the order stays
+    sources: list[Source], camera: CameraParameters
+) -> Generator[SourceImage, None, None]:
+    """The images of all sources in order, in the size of `camera`, decoded on another thread.
+
+    Close it to end a stream.
+    """
+    items = (item for source in sources for item in _read(source, camera))
+    decoder = ThreadPoolExecutor(1)  # one thread: the order stays
+    try:
         waiting = deque(decoder.submit(next, items, None) for _ in range(READ_AHEAD))
         while (item := waiting.popleft().result()) is not None:
             waiting.append(decoder.submit(next, items, None))
             yield item
+    finally:
+        decoder.shutdown(cancel_futures=True)  # a stream is not read on
+        items.close()
 
 
-def _read(source: Source, camera: CameraParameters, lens: Lens) -> Iterator[SourceImage]:
+def _read(source: Source, camera: CameraParameters) -> Iterator[SourceImage]:
     """The images of a source; what goes wrong is an item of its own, and ends that source only."""
-    path = source.path
-    read = {Kind.FILM: _read_film, Kind.ROUND: _read_round, Kind.IMAGE: _read_file}[source.kind]
+    name = source.name
+    read = {Kind.ROUND: _read_round, Kind.IMAGE: _read_file}.get(source.kind, _read_pictures)
     try:
         if source.problem:
             raise UserError(source.problem)
-        yield from read(path, camera, lens)
+        yield from read(source, camera)
     except UserError as error:
         message = str(error)
-        told = message if str(path) in message else f"{path}: {message}"
-        yield SourceImage(path, None, None, told)
+        told = message if name in message else f"{name}: {message}"
+        yield SourceImage(name, None, None, told)
     except OSError as error:
-        yield SourceImage(path, None, None, _unreadable(path, error))
+        yield SourceImage(name, None, None, _unreadable(source.path, error))
 
 
-def _read_file(path: Path, camera: CameraParameters, lens: Lens) -> Iterator[SourceImage]:
-    if isinstance(lens, Rectification):
-        yield SourceImage(path, None, lens.image(read_whole_image(path)))
-    else:
-        yield SourceImage(path, None, read_image(path, camera, lens))
+def _read_file(source: Source, camera: CameraParameters) -> Iterator[SourceImage]:
+    lens = source.lens
+    assert not isinstance(lens, LensFinder), "a file is one picture"
+    image = fit(Picture(0, read_whole_image(source.path)), camera, lens)
+    yield SourceImage(source.name, None, image, lens=_rectification(lens))
 
 
-def _read_film(path: Path, camera: CameraParameters, lens: Lens) -> Iterator[SourceImage]:
-    film = Film(path)
-    for number, picture in film.frames():
-        if isinstance(lens, Rectification):
-            image = lens.image(picture)
-        else:
-            image = crop_and_resize(picture, camera, lens)  # an error ends the film: all are alike
-        yield SourceImage(path, number, image)
-    if film.fault:
-        yield SourceImage(path, None, None, film.fault)
+def _read_pictures(source: Source, camera: CameraParameters) -> Iterator[SourceImage]:
+    """Of a film, a stream or a recording. An ImageError ends it: its pictures are all alike."""
+    reader: Pictures = Film(source.path) if source.opened is None else source.opened
+    for picture in reader.pictures():
+        if picture.image is None:
+            yield SourceImage(source.name, picture.number, None, picture.error)
+            continue
+        lens = source.lens
+        if isinstance(lens, LensFinder):
+            lens = lens.at(picture)
+        yield SourceImage(
+            source.name, picture.number, fit(picture, camera, lens), time_s=picture.time_s,
+            lens=_rectification(lens),
+        )  # fmt: skip
+    if reader.fault:
+        yield SourceImage(source.name, None, None, reader.fault)
 
 
-def _read_round(path: Path, camera: CameraParameters, lens: Lens) -> Iterator[SourceImage]:
+def _rectification(lens: Lens) -> Rectification | None:
+    return lens if isinstance(lens, Rectification) else None
+
+
+def _read_round(source: Source, camera: CameraParameters) -> Iterator[SourceImage]:
     from datagen.recording import DatasetError, Frames, RoundInfo, UndecodableImage, open_round
 
-    if isinstance(lens, Rectification):
+    path = source.path
+    if isinstance(source.lens, Rectification):
         raise UserError(f"{path}: --camera is for images and films; a round has its own camera")
     index = open_round(path)
     tf.require_version(index.header.definitions, str(path))
@@ -240,14 +299,15 @@ def _read_round(path: Path, camera: CameraParameters, lens: Lens) -> Iterator[So
         try:
             image = frames.image(number)
         except UndecodableImage as error:
-            yield SourceImage(path, number, None, str(error))
+            yield SourceImage(source.name, number, None, str(error))
             continue
         if labels is not None:
             truth: Truth | None = _truth(labels, number)
         else:
             one = Frames([info], [index], recorded, np.array([number]))
             truth = _truth_of_one(one)
-        yield SourceImage(path, number, image, truth=truth)
+        time_s = number / index.header.frequency_hz
+        yield SourceImage(source.name, number, image, truth=truth, time_s=time_s)
 
 
 def _truth_of_one(frame: "Frames") -> Truth | None:

@@ -1,4 +1,5 @@
-"""Files that `mtlnet predict --out` writes: tables (.csv, .jsonl), a film (.mp4) or pictures.
+"""Files that `mtlnet predict --out` writes: tables (.csv, .jsonl), a film (.mp4), a recording for
+Foxglove (.mcap) or pictures.
 
 Each row and frame is written when it is known: an interrupted command keeps what was done. A name
 that is not UTF-8 stands in tables as `runtime.files` describes.
@@ -23,6 +24,7 @@ from runtime.film import FILM_SUFFIX, Film
 from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
 
+MCAP_SUFFIX = ".mcap"
 TABLE_SUFFIXES = (".csv", ".jsonl")
 TEXT_HEIGHT = 64
 """Rows of pixels below a picture that hold the features as text."""
@@ -47,13 +49,17 @@ def open_writer(path: Path, camera: CameraParameters, fps: float) -> Writer:
     Raises UserError for another suffix, or a folder that does not exist.
     """
     kind = path.suffix.lower()
-    if kind not in (*TABLE_SUFFIXES, FILM_SUFFIX, ""):
-        kinds = ", ".join((*TABLE_SUFFIXES, FILM_SUFFIX))
+    if kind not in (*TABLE_SUFFIXES, FILM_SUFFIX, MCAP_SUFFIX, ""):
+        kinds = ", ".join((*TABLE_SUFFIXES, FILM_SUFFIX, MCAP_SUFFIX))
         raise UserError(f"--out {path}: give a file ending in {kinds}, or a folder for pictures")
     if not path.parent.is_dir():
         raise UserError(f"--out {path}: there is no folder {path.parent}; make it first")
     if kind in TABLE_SUFFIXES:
         return TableWriter(path)
+    if kind == MCAP_SUFFIX:
+        from mtlnet.predict.mcap_writer import McapWriter
+
+        return McapWriter(path, camera, fps)
     return FilmWriter(path, camera, fps) if kind == FILM_SUFFIX else PictureWriter(path, camera)
 
 
@@ -63,10 +69,10 @@ def require_other_file(path: Path, inputs: list[Path]) -> None:
         raise UserError(f"--out {path} is a file to read; give another one")
 
 
-def table_row(name: str, prediction: Prediction) -> dict[str, Any]:
-    """One image's features as a flat row; None for what is absent or not predicted."""
+def table_row(item: SourceImage, prediction: Prediction) -> dict[str, Any]:
+    """One image's features as a flat row; None for what is absent, unknown or not predicted."""
     std = prediction.std or {}
-    row: dict[str, Any] = {"image": name}
+    row: dict[str, Any] = {"image": item.name, "time_s": item.time_s}
     for marking in tf.MARKINGS:
         row[f"{marking}_m"] = prediction.distances_m[marking]
     row["to_lane_centre_m"] = prediction.to_lane_centre_m
@@ -89,7 +95,7 @@ class TableWriter:
         self._csv: csv.DictWriter[str] | None = None
 
     def write(self, item: SourceImage, prediction: Prediction) -> None:
-        row = table_row(item.name, prediction)
+        row = table_row(item, prediction)
         try:
             self._write_row(row)
             self._file.flush()
@@ -139,7 +145,7 @@ class PictureWriter:
 
     def write(self, item: SourceImage, prediction: Prediction) -> None:
         picture = draw_prediction(item, prediction, self._camera)
-        stem = os.fsdecode(os.fsencode(item.file.stem)[:MAX_STEM_BYTES])
+        stem = os.fsdecode(os.fsencode(Path(item.source).stem)[:MAX_STEM_BYTES])
         frame = [] if item.frame is None else [str(item.frame)]
         name = "-".join((f"{self._count:04d}", stem, *frame))
         done, data = cv2.imencode(".png", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
@@ -156,16 +162,22 @@ class PictureWriter:
         pass
 
 
+def view_of(item: SourceImage, model: CameraParameters) -> CameraParameters:
+    """The camera that takes the image as the model sees it, from where the real one is."""
+    return model if item.lens is None else item.lens.view
+
+
 def draw_prediction(
-    item: SourceImage, prediction: Prediction, camera: CameraParameters
+    item: SourceImage, prediction: Prediction, model: CameraParameters
 ) -> NDArray[np.uint8]:
-    """The image with its markings drawn (prediction orange, a round's labels green) beside a view
-    from above, and the features as text below: uint8 RGB.
+    """The image in the model's view with its markings drawn (prediction orange, a round's labels
+    green) beside a view from above, and the features as text below: uint8 RGB.
 
     Of an image without labels the markings are drawn straight: the curvature is not predicted.
     """
     assert item.image is not None
     truth = item.truth
+    camera = view_of(item, model)
     picture = draw_overlay(
         item.image,
         camera,

@@ -1,7 +1,8 @@
-// The console: sends images to the service and shows its answers.
+// The console: sends images, a film or a webcam to the service and shows its answers.
 
 import { IN_LANE, ON_MARKING } from "./geometry.js";
 import { absence, drawAbove, drawLatency, drawPicture } from "./drawing.js";
+import { createLive } from "./live.js";
 
 const KEPT = 120, EVERY_MS = 100;
 const $ = (id) => document.getElementById(id);
@@ -123,10 +124,34 @@ function press(button) {
 function takeFile(file) {
   if (!file) return;
   press(null);
+  if (file.type.startsWith("video/")) return live.film(file);
+  live.stop();
   take(file);
 }
 
-$("file").addEventListener("change", (event) => takeFile(event.target.files[0]));
+const live = createLive($("video"), async (next) => {
+  current = next;
+  await ask();
+}, (text) => {
+  $("status").textContent = text;
+  $("status").className = "bad";
+});
+for (const [event, running] of [["started", true], ["stopped", false]]) {
+  $("video").addEventListener(event, () => {
+    $("stop").hidden = !running;
+    $("webcam").hidden = running;
+  });
+}
+$("webcam").addEventListener("click", () => {
+  press(null);
+  live.webcam();
+});
+$("stop").addEventListener("click", live.stop);
+
+$("file").addEventListener("change", (event) => {
+  takeFile(event.target.files[0]);
+  event.target.value = ""; // the same file can be chosen again
+});
 const stage = document.querySelector(".picture");
 for (const kind of ["dragover", "dragleave", "drop"]) {
   stage.addEventListener(kind, (event) => {
@@ -151,6 +176,7 @@ for (const { file, about, truth } of samples) {
   button.append(picture);
   button.addEventListener("click", async () => {
     press(button);
+    live.stop();
     take(await (await fetch(picture.src)).blob(), truth);
   });
   $("samples").append(button);

@@ -20,6 +20,7 @@ from datagen.recording import Dataset
 from datagen.recording.mcap.footer import read_summary
 from datagen.recording.mcap.index import open_round
 from docs.generate import error_classes
+from mtlnet.calibration.run import CalibrateConfig, calibrate
 from mtlnet.data.custom_images import COLUMNS, open_custom_images
 from mtlnet.inference.engine import Engine, load_engine
 from mtlnet.inference.image_decoding.decode import inspect, read_image
@@ -39,6 +40,7 @@ from simulator.varied.road import make_road
 from simulator.vehicle.state import Command
 from simulator.world.world import World
 from tests.mtlnet.conftest import write_dataset
+from tests.mtlnet.predict import recorded
 from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
 
@@ -198,7 +200,7 @@ def _(folder: Path) -> object:
 @row("a codec without a decoder")
 def _(folder: Path) -> object:
     path = film(folder, "-c:v", "libsvtav1", "-preset", "12", "-pix_fmt", "yuv420p")
-    if list(Film(path).frames()):
+    if list(Film(path).pictures()):
         pytest.skip("this build of OpenCV decodes AV1")
     return predict(path)
 
@@ -217,7 +219,9 @@ def _(folder: Path) -> object:
     tags = ("-vf", "tinterlace=interleave_top", "-flags", "+ilme+ildct", "-c:v", "mpeg2video")
     path = film(folder, *tags, name="a.mpg")
     try:
-        shown = [picture.mean() for _, picture in Film(path).frames()]
+        shown = [
+            np.mean(picture.image) for picture in Film(path).pictures() if picture.image is not None
+        ]
     except UserError:
         return predict(path)
     assert min(shown) > 50
@@ -230,6 +234,58 @@ def _(folder: Path) -> object:
     return predict(folder / "a.mp4")
 
 
+GREY = recorded.ros_image(np.full((210, 280), 90, np.uint8), "mono8")
+
+
+@row("a recording without pictures")
+def _(folder: Path) -> object:
+    camera = recorded.ros_camera((280, 210), (150, 150, 140, 105))
+    return predict(recorded.write_bag(folder / "bag", [("/info", "CameraInfo", camera)]))
+
+
+@row("a recording with several cameras")
+def _(folder: Path) -> object:
+    images = [("/left", "Image", GREY), ("/right", "Image", GREY)]
+    return predict(recorded.write_bag(folder / "bag", images))
+
+
+@row("a topic that is not there")
+def _(folder: Path) -> object:
+    bag = recorded.write_bag(folder / "bag", [("/left", "Image", GREY)])
+    return predict_files(engine(), [str(bag)], topic="/right")
+
+
+@row("a recording that is cut")
+def _(folder: Path) -> object:
+    bag = recorded.write_bag(folder / "bag", [("/left", "Image", GREY)] * 3)
+    file = next(bag.glob("*.mcap"))
+    file.write_bytes(file.read_bytes()[:-100])
+    return predict(bag)
+
+
+@row("a picture that holds depths")
+def _(folder: Path) -> object:
+    depths = recorded.ros_image(np.ones((210, 280), np.float32), "32FC1")
+    return predict(recorded.write_bag(folder / "bag", [("/depth", "Image", depths)]))
+
+
+@row("pictures that change their size")
+def _(folder: Path) -> object:
+    other = recorded.ros_image(np.full((420, 560), 90, np.uint8), "mono8")
+    images = [("/left", "Image", GREY), ("/left", "Image", other)]
+    return predict(recorded.write_bag(folder / "bag", images))
+
+
+@row("a stream that cannot be opened")
+def _(folder: Path) -> object:
+    return predict_files(engine(), ["http://127.0.0.1:9/a"])
+
+
+@row("a webcam that is not there")
+def _(folder: Path) -> object:
+    return predict_files(engine(), ["63"])
+
+
 def damaged_round(folder: Path) -> Dataset:
     data = write_dataset(folder)
     path = data / "rounds" / "r000.mcap"
@@ -238,6 +294,24 @@ def damaged_round(folder: Path) -> Dataset:
     path.unlink()  # other tests may have mapped it
     path.write_bytes(content)
     return Dataset.open(data)
+
+
+@row("a film that shows no marked road")
+def _(folder: Path) -> object:
+    path = film(folder, "-vf", "boxblur=30", "-c:v", "mpeg4")
+    return calibrate(CalibrateConfig([str(path)], folder / "camera.yaml"))
+
+
+@row("pictures without a board")
+def _(folder: Path) -> object:
+    path = written(folder, "a.jpg", jpeg())
+    return calibrate(CalibrateConfig([str(path)], folder / "camera.yaml"))
+
+
+@row("a lane width that no lane has")
+def _(folder: Path) -> object:
+    path = written(folder, "a.jpg", jpeg())
+    return calibrate(CalibrateConfig([str(path)], folder / "camera.yaml", lane_width_m=0.3))
 
 
 @row("a frame in a chunk")

@@ -7,7 +7,7 @@ image is cropped to the model's field of view (`mtlnet.inference.image_decoding.
 dropped, grey becomes RGB, 16 bits become 8.
 
 A service takes JPEG and PNG (`inspect`, `decode`). A file of this machine may be of another kind
-and is under no limits but that of memory (`read_image`, `read_whole_image`).
+and is under no limits but that of memory (`read_image`, `read_whole_image`, `decode_file`).
 """
 
 from collections.abc import Iterator
@@ -83,13 +83,13 @@ def read_image(
     for an image that cannot be used, UserError for a missing or too large file.
     """
     with _named(path):
-        return crop_and_resize(_decode_file(_read_file(path)), view, fov_y_deg)
+        return crop_and_resize(decode_file(_read_file(path)), view, fov_y_deg)
 
 
 def read_whole_image(path: Path) -> NDArray[np.uint8]:
     """The image file at `path` as uint8 RGB (H, W, 3). Raises as `read_image`."""
     with _named(path):
-        return _decode_file(_read_file(path))
+        return decode_file(_read_file(path))
 
 
 @contextmanager
@@ -112,15 +112,18 @@ def _read_file(path: Path) -> bytes:
     return path.read_bytes()
 
 
-def _decode_file(body: bytes) -> NDArray[np.uint8]:
-    """The image in a file of this machine, upright (H, W, 3). Raises ImageError."""
+def decode_file(body: bytes) -> NDArray[np.uint8]:
+    """The image in a file or recording of this machine, uint8 RGB, upright (H, W, 3).
+
+    Raises ImageError.
+    """
     if body.startswith(png.SIGNATURE):
         header = png.read_header(body)
-        _check_file_size(header.width, header.height)
+        check_file_size(header.width, header.height)
         image = _decode_png(body, header, limited=False)
         return upright(image, exif_orientation(png.find_exif(body, limited=False)))
     if body.startswith(jpeg.SIGNATURE):
-        _check_file_size(*_jpeg_size(body)[:2])
+        check_file_size(*_jpeg_size(body)[:2])
         return upright(_decode_padded_jpeg(body), jpeg.read_head(body).orientation)
     kind = other_kinds.find_kind(body)
     if kind is None:
@@ -129,11 +132,12 @@ def _decode_file(body: bytes) -> NDArray[np.uint8]:
             f"no image file ({other_kinds.READ} are read), but {other_kinds.describe(body)}",
         )
     width, height, orientation = other_kinds.read_header(body, kind)
-    _check_file_size(width, height)
+    check_file_size(width, height)
     return other_kinds.decode(body, kind, orientation)
 
 
-def _check_file_size(width: int, height: int) -> None:
+def check_file_size(width: int, height: int) -> None:
+    """Raise ImageError unless an image of that size (px) can be read from this machine."""
     if min(width, height) < MIN_SIDE_PX or width * height > MAX_FILE_PIXELS:
         raise ImageError(
             Fault.SIZE,

@@ -5,6 +5,7 @@ import math
 import re
 import shutil
 import subprocess
+from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
 
@@ -13,10 +14,12 @@ import numpy as np
 import pytest
 
 from serve.api.console import FOLDER
+from tests.serve.browser import CHROMIUM, DRIVER, MISSING, Browser, open_browser
 from tests.serve.conftest import Served
 from trackfeatures.camera import CameraParameters
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+COUNT = "Number(/over (\\d+)/.exec(document.getElementById('times').textContent)?.[1] ?? 0)"
+"""The number of latencies in the page."""
 
 
 def test_the_page_loads_files_of_the_service_only(service: Served) -> None:
@@ -75,6 +78,65 @@ def test_a_browser_shows_the_answer(service: Served, tmp_path: Path) -> None:
     assert picture.shape == (1000, 1360, 3)
     blue = np.abs(picture.astype(int) - (214, 132, 10)).sum(axis=2) < 60
     assert blue[:, :900].sum() > 800
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    with open_browser(tmp_path_factory.mktemp("profile")) as found:
+        yield found
+
+
+def green_share(browser: Browser) -> float:
+    """Share of the shown picture that is the fake webcam's green."""
+    pixels = browser.run(
+        "const c = document.getElementById('picture');"
+        "return [...c.getContext('2d').getImageData(0, 0, c.width, 60).data];"
+    )
+    colours = np.array(pixels).reshape(-1, 4)
+    return float(np.mean((colours[:, 1] > 150) & (colours[:, 0] < 100) & (colours[:, 2] < 120)))
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(None in (CHROMIUM, DRIVER), reason=MISSING)
+def test_a_webcam_is_answered_picture_by_picture(service: Served, browser: Browser) -> None:
+    browser.open(service.url)
+    browser.wait(f"{COUNT} === 1")  # the first sample
+    browser.run("document.getElementById('webcam').click()")
+    browser.wait(f"{COUNT} >= 6")
+    status = browser.run("return document.getElementById('status').textContent")
+    assert status == "0.00 m left of the lane's centre, pointing 5.7° to the right."
+    size = browser.run("const c = document.getElementById('picture'); return c.width / c.height")
+    camera = browser.run(
+        "const v = document.getElementById('video'); return v.videoWidth / v.videoHeight"
+    )
+    assert size == pytest.approx(camera, abs=0.01)
+    assert green_share(browser) > 0.1
+    browser.run("document.getElementById('stop').click()")
+    browser.wait("document.getElementById('stop').hidden")
+    assert not browser.run("return document.getElementById('webcam').hidden")
+    assert browser.run("return document.getElementById('video').srcObject") is None
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(None in (CHROMIUM, DRIVER), reason=MISSING)
+def test_a_film_is_answered_while_it_plays(
+    service: Served, browser: Browser, tmp_path: Path
+) -> None:
+    film = tmp_path / "green.webm"
+    writer = cv2.VideoWriter(str(film), cv2.VideoWriter.fourcc(*"VP80"), 20.0, (640, 480))
+    for _ in range(20):
+        writer.write(np.full((480, 640, 3), (40, 200, 40), np.uint8))
+    writer.release()
+    browser.open(service.url)
+    browser.wait(f"{COUNT} === 1")
+    browser.choose_file("#file", film)
+    browser.wait(f"{COUNT} >= 4")
+    browser.wait("document.getElementById('stop').hidden")  # it ends by itself
+    assert green_share(browser) > 0.9
+    (tmp_path / "none.webm").write_bytes(b"no film")
+    browser.choose_file("#file", tmp_path / "none.webm")
+    text = browser.wait("document.querySelector('#status.bad')?.textContent")
+    assert text.startswith("the browser cannot play this film: ")
 
 
 @pytest.mark.skipif(shutil.which("node") is None, reason="no node")

@@ -1,0 +1,1 @@
+"""Cameras from what people have: pictures of a board, or a film of a drive."""

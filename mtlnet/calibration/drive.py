@@ -1,0 +1,112 @@
+"""`mtlnet calibrate drive.mp4`: the camera of a film, or of pictures of a drive in a row."""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import chain
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mtlnet.calibration.film import DriveCalibration, DriveEstimate
+from mtlnet.calibration.lens import Lens
+from mtlnet.calibration.mount import NotCalibrated
+from mtlnet.inference.image_decoding.decode import read_whole_image
+from mtlnet.predict.films import Film, read_film_header
+from trackfeatures.errors import UserError
+
+LONGEST_S = 120.0
+"""Of a film; the rest is not read."""
+DEFAULT_FPS = 25.0
+PICTURE_S = 1.0
+"""Between pictures in a row whose times are not known: no motion is followed."""
+SHOWN = 6
+"""Pictures kept for the page."""
+
+Picture = NDArray[np.uint8]
+MakeLens = Callable[[tuple[int, int]], Lens]
+"""The lens of pictures of this width and height."""
+Report = Callable[[float, float], None]
+"""Takes the seconds done and in all."""
+
+
+@dataclass(frozen=True)
+class Drive:
+    """What was found, some of the pictures, and what was wrong with the film, if anything."""
+
+    found: DriveEstimate
+    shown: list[Picture]
+    fault: str = ""
+
+
+def calibrate_film(
+    path: Path,
+    make_lens: MakeLens,
+    lane_width_m: float | None = None,
+    report: Report = lambda done, total: None,
+    longest_s: float = LONGEST_S,
+) -> Drive:
+    """The camera that filmed `path`, from its first two minutes. Raises NotCalibrated; UserError
+    for a file that is no film."""
+    header = read_film_header(path)
+    fps = header.fps or DEFAULT_FPS
+    total = min(header.count / fps, longest_s) if header.count else longest_s
+    film = Film(path)
+
+    def timed() -> Iterator[tuple[float, Picture]]:
+        for picture in film.pictures():
+            if picture.image is None:
+                continue
+            time_s = picture.number / fps
+            if time_s >= longest_s:
+                return
+            report(time_s, total)
+            yield time_s, cv2.cvtColor(picture.image, cv2.COLOR_BGR2RGB).astype(np.uint8)
+
+    try:
+        found, shown = _calibrate(timed(), make_lens, lane_width_m, total / SHOWN)
+    except NotCalibrated as error:
+        told = f"; {film.fault}" if film.fault else ""
+        raise NotCalibrated(f"{path}: {error}{told}") from error
+    return Drive(found, shown, film.fault)
+
+
+def calibrate_pictures(
+    paths: Sequence[Path],
+    make_lens: MakeLens,
+    lane_width_m: float | None = None,
+    report: Report = lambda done, total: None,
+) -> Drive:
+    """The camera that took these pictures of a drive, in their order. Raises NotCalibrated."""
+
+    def timed() -> Iterator[tuple[float, Picture]]:
+        for number, path in enumerate(paths):
+            report(float(number), float(len(paths)))
+            yield PICTURE_S * number, read_whole_image(path)
+
+    return Drive(*_calibrate(timed(), make_lens, lane_width_m, len(paths) / SHOWN))
+
+
+def _calibrate(
+    timed: Iterator[tuple[float, Picture]],
+    make_lens: MakeLens,
+    lane_width_m: float | None,
+    show_every_s: float,
+) -> tuple[DriveEstimate, list[Picture]]:
+    first = next(timed, None)
+    if first is None:
+        raise NotCalibrated("it has no picture")
+    size = (first[1].shape[1], first[1].shape[0])
+    calibration = DriveCalibration(make_lens(size), lane_width_m)
+    shown: list[Picture] = []
+    for time_s, picture in chain([first], timed):
+        if (picture.shape[1], picture.shape[0]) != size:
+            raise UserError(
+                f"the pictures are of different sizes ({size[0]} x {size[1]}, then "
+                f"{picture.shape[1]} x {picture.shape[0]} px); give those of one camera"
+            )
+        calibration.add(picture, time_s)
+        if time_s >= (len(shown) + 0.5) * show_every_s and len(shown) < SHOWN:
+            shown.append(picture)
+    return calibration.estimate(), shown

@@ -1,0 +1,251 @@
+"""A camera's mount from the pictures of a drive, one after the other: films and streams alike.
+
+calibration = DriveCalibration(lens)
+for picture, time_s in pictures:
+    calibration.add(picture, time_s)
+found = calibration.estimate()      # at any time; raises NotCalibrated
+"""
+
+from collections import deque
+from dataclasses import dataclass, replace
+from math import degrees, hypot
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mtlnet.calibration.lens import Lens
+from mtlnet.calibration.markings import Segments, find_segments
+from mtlnet.calibration.motion import find_motion, follow
+from mtlnet.calibration.mount import Mount, NotCalibrated, Sample, TimedMotion, find_mount
+from mtlnet.calibration.road_fit import Lines
+from mtlnet.calibration.vanishing_point import find_vanishing_point
+from trackfeatures.camera import CameraParameters
+from trackfeatures.errors import UserError
+
+LANE_WIDTH_M = 3.6
+"""Assumed where none is given."""
+LANE_WIDTH_STD_M = 0.25
+MAX_STD_DEG = 1.0
+"""Of pitch and yaw, the lens apart: a drive that shows them less well shows none."""
+LANE_WIDTHS_M = (2.0, 6.0)
+SAMPLE_S = 0.2
+"""Between the pictures whose markings are used."""
+FOLLOW_S = (0.09, 0.25)
+"""Between two pictures in which points are followed."""
+KEPT = 600
+"""Pictures that count: of a stream the latest two minutes."""
+FIRST_LOOK = 25
+"""Pictures after which the horizon, of which the markings' width in the picture depends, is
+known roughly."""
+WORKING_WIDTH = 640
+TRACK_NOISE_PX = 0.2
+MOTION_ROUNDS = 2
+
+
+@dataclass(frozen=True)
+class DriveEstimate:
+    """The camera, and how sure its mount is: standard deviations in degrees and m."""
+
+    camera: CameraParameters
+    pitch_std_deg: float
+    yaw_std_deg: float
+    roll_std_deg: float
+    height_std_m: float
+    lens: Lens
+    lane_width_m: float
+    lane_width_given: bool
+    pictures: int
+    """That show the lane's markings on straight road."""
+
+    def about(self) -> str:
+        """One line for people."""
+        camera = self.camera
+        assumed = "given" if self.lane_width_given else "assumed"
+        return (
+            f"pitch {camera.pitch_deg:.2f} +- {self.pitch_std_deg:.2f} deg, "
+            f"yaw {camera.yaw_deg:.2f} +- {self.yaw_std_deg:.2f} deg, "
+            f"roll {camera.roll_deg:.2f} +- {self.roll_std_deg:.2f} deg, "
+            f"height {camera.height_above_road_m:.2f} +- {self.height_std_m:.2f} m, from "
+            f"{self.pictures} pictures (lane width {self.lane_width_m:g} m, {assumed}; "
+            f"{self.lens.about})"
+        )
+
+    def as_json(self) -> dict[str, Any]:
+        """What was found with its standard deviations, by name and unit."""
+        camera = self.camera
+        return {
+            "pitch_deg": camera.pitch_deg,
+            "yaw_deg": camera.yaw_deg,
+            "roll_deg": camera.roll_deg,
+            "height_m": camera.height_above_road_m,
+            "std": {
+                "pitch_deg": self.pitch_std_deg,
+                "yaw_deg": self.yaw_std_deg,
+                "roll_deg": self.roll_std_deg,
+                "height_m": self.height_std_m,
+            },
+            "fov_y_deg": camera.fov_y_deg,
+            "lens": self.lens.about,
+            "lane_width_m": self.lane_width_m,
+            "pictures": self.pictures,
+        }
+
+
+class DriveCalibration:
+    """Takes pictures of a drive and estimates the mount of the camera that took them.
+
+    `lens`: its place x, y in the car is kept, its height and angles are found. A lane width that is
+    not given is assumed.
+    """
+
+    def __init__(self, lens: Lens, lane_width_m: float | None = None) -> None:
+        check_lane_width(lane_width_m)
+        self._lens = lens
+        camera = lens.camera
+        scale = min(1.0, WORKING_WIDTH / camera.width)
+        self._view = camera.resized(round(camera.width * scale), round(camera.height * scale))
+        self._lane_width_m = lane_width_m
+        self._samples: deque[Sample] = deque(maxlen=KEPT)
+        self._tracks: deque[tuple[float, float, NDArray[np.float64]]] = deque(maxlen=KEPT)
+        self._before: tuple[float, NDArray[np.uint8]] | None = None
+        self._next_s = -np.inf
+        self._taken = 0
+        self._horizon_px = float(self._view.intrinsics()[1, 2])
+
+    @property
+    def pictures(self) -> int:
+        """Number of pictures that count so far."""
+        return len(self._samples)
+
+    def add(self, picture: NDArray[np.uint8], time_s: float, *, bgr: bool = False) -> None:
+        """Take a picture (H, W, 3), RGB or BGR, of the lens, at any size of its aspect; most are
+        passed over. Times rise."""
+        if time_s >= self._next_s:
+            self._next_s = max(self._next_s + SAMPLE_S, time_s + SAMPLE_S / 2)
+            small = self._resized(picture, bgr)
+            self._samples.append(Sample(time_s, self._lines(small)))
+            self._taken += 1
+            # Points are followed from every second one.
+            self._before = (time_s, _grey(small)) if self._taken % 2 else None
+            if self._taken == FIRST_LOOK:
+                self._look()
+        elif self._before is not None and time_s - self._before[0] >= FOLLOW_S[0]:
+            begin, before = self._before
+            self._before = None
+            if time_s - begin <= FOLLOW_S[1]:
+                tracks = follow(before, _grey(self._resized(picture, bgr)))
+                if tracks is not None:
+                    self._tracks.append((begin, time_s - begin, self._normalised_tracks(tracks)))
+
+    def estimate(self) -> DriveEstimate:
+        """The camera as the pictures so far show it. Raises NotCalibrated."""
+        width = self._lane_width_m
+        start = find_vanishing_point(sample.lines for sample in self._samples)
+        if start is None:
+            raise NotCalibrated(
+                f"no markings of a road can be seen in {len(self._samples)} pictures; take a "
+                "minute of driving on a marked road by day"
+            )
+        motions = self._motions(start)
+        mount = find_mount(
+            self._samples,
+            motions,
+            start,
+            LANE_WIDTH_M if width is None else width,
+            LANE_WIDTH_STD_M if width is None else 0.0,
+        )
+        spread = degrees(max(mount.pitch_std, mount.yaw_std))
+        if not spread <= MAX_STD_DEG:
+            raise NotCalibrated(
+                f"its pictures disagree by {spread:.1f} deg on where the road leads; at most "
+                f"{MAX_STD_DEG:g} is of use: take a minute of steady driving on a marked road"
+            )
+        return self._estimate(mount)
+
+    def _motions(self, start: tuple[float, float]) -> list[TimedMotion]:
+        """All motions, each from the guess that it goes where most of them go."""
+        noise, towards = TRACK_NOISE_PX / self._view.focal_px, np.array(start)
+        motions: list[TimedMotion] = []
+        for _ in range(MOTION_ROUNDS):
+            found = [(t, dt, find_motion(tracks, towards, noise)) for t, dt, tracks in self._tracks]
+            motions = [TimedMotion(t, dt, motion) for t, dt, motion in found if motion is not None]
+            if motions:
+                towards = np.median([each.motion.towards for each in motions], axis=0)
+        return motions
+
+    def _estimate(self, mount: Mount) -> DriveEstimate:
+        """The mount as a camera's. An error of the focal length scales angles."""
+        lens, given = self._lens, self._lane_width_m is not None
+        camera = replace(
+            lens.camera,
+            z=mount.height_m - lens.camera.cg_height_m,
+            pitch_deg=degrees(mount.pitch),
+            yaw_deg=degrees(mount.yaw),
+            roll_deg=degrees(mount.roll),
+            height_std=mount.height_std_m / mount.height_m,
+        )
+        return DriveEstimate(
+            camera,
+            hypot(degrees(mount.pitch_std), lens.std * camera.pitch_deg),
+            hypot(degrees(mount.yaw_std), lens.std * camera.yaw_deg),
+            degrees(mount.roll_std),
+            mount.height_std_m,
+            lens,
+            self._lane_width_m or LANE_WIDTH_M,
+            given,
+            mount.pictures,
+        )
+
+    def _resized(self, picture: NDArray[np.uint8], bgr: bool) -> NDArray[np.uint8]:
+        """RGB, in the size that is worked on."""
+        size = (self._view.width, self._view.height)
+        if picture.shape[1::-1] != size:
+            picture = cv2.resize(picture, size, interpolation=cv2.INTER_AREA).astype(np.uint8)
+        return picture[..., ::-1] if bgr else picture
+
+    def _look(self) -> None:
+        found = find_vanishing_point(sample.lines for sample in self._samples)
+        if found is not None:
+            k = self._view.intrinsics()
+            self._horizon_px = float(k[1, 2] + k[1, 1] * found[1])
+
+    def _lines(self, picture: NDArray[np.uint8]) -> Lines:
+        """The picture's segments in normalised coordinates, without the lens's distortion."""
+        return normalised(find_segments(picture, self._horizon_px), self._view)
+
+    def _normalised_tracks(self, tracks: NDArray[np.float64]) -> NDArray[np.float64]:
+        rays = self._view.rays(tracks.reshape(-1, 2))[:, :2].reshape(-1, 4)
+        return rays[np.isfinite(rays).all(axis=1)]
+
+
+def check_lane_width(lane_width_m: float | None) -> None:
+    """Raises UserError for a width that no lane has."""
+    low, high = LANE_WIDTHS_M
+    if lane_width_m is not None and not low <= lane_width_m <= high:
+        raise UserError(f"--lane-width {lane_width_m:g} m; give {low:g} to {high:g} m")
+
+
+def normalised(segments: Segments, view: CameraParameters) -> Lines:
+    """`segments` as the straight lines between the rays of their ends."""
+    half = 0.5 * segments.rows
+    ends = [
+        view.rays(
+            np.column_stack([segments.u + sign * half * segments.slope, segments.v + sign * half])
+        )
+        for sign in (-1.0, 1.0)
+    ]
+    (x1, y1), (x2, y2) = ends[0][:, :2].T, ends[1][:, :2].T
+    size = y2 - y1
+    with np.errstate(invalid="ignore", divide="ignore"):
+        slope = (x2 - x1) / size
+    seen = np.isfinite(slope) & (size > 0)
+    lines = Lines(0.5 * (x1 + x2), 0.5 * (y1 + y2), slope, segments.slope_std, size)
+    return lines.chosen(seen)
+
+
+def _grey(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    return cv2.cvtColor(np.ascontiguousarray(picture), cv2.COLOR_RGB2GRAY).astype(
+        np.uint8, copy=False
+    )

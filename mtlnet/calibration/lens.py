@@ -1,0 +1,84 @@
+"""The lens of a camera before its mount is found: given, from a photo's EXIF, or guessed."""
+
+from dataclasses import dataclass, replace
+from math import atan, degrees, hypot, radians, tan
+from pathlib import Path
+
+from mtlnet.inference.image_decoding.decode import read_whole_image
+from mtlnet.inference.image_decoding.orientation import EXIF_MARK, read_tags
+from trackfeatures.camera import CameraError, CameraParameters
+from trackfeatures.errors import UserError
+
+GUESSED_FOV_DEG = 65.0
+"""Along the longer side: a phone's usual lens films 55 to 70, a dash camera 70 and more."""
+GUESSED_STD, PHOTO_STD = 0.2, 0.05
+"""Standard deviations of the focal length, as shares; a phone crops its films a little."""
+FILM_DIAGONAL_MM = 43.27
+"""Of 36 x 24 mm, which EXIF's focal length in 35 mm film is measured by (CIPA DC-008)."""
+EXIF_DIRECTORY, FOCAL_35MM = 0x8769, 0xA405
+HEAD_BYTES = 1 << 17
+
+
+@dataclass(frozen=True)
+class Lens:
+    """Size and lens; `std`: of the focal length, as a share; `about`: where it is from."""
+
+    camera: CameraParameters
+    std: float
+    about: str
+
+
+def find_lens(
+    size: tuple[int, int],
+    model: CameraParameters,
+    given: CameraParameters | None = None,
+    fov_y_deg: float | None = None,
+    photo: Path | None = None,
+) -> Lens:
+    """The lens of pictures of `size` (width, height): `given`, of this field of view, as wide as
+    that of `photo`, or a guess. Its place in the car is the model's. Raises UserError."""
+    width, height = size
+    if given is not None:
+        if abs(given.width * height - given.height * width) > 0.01 * given.width * height:
+            raise UserError(
+                f"the pictures are {width} x {height} px, those of the camera file "
+                f"{given.width} x {given.height}: give the file of this camera"
+            )
+        return Lens(given.resized(width, height), 0.0, "its lens is given")
+    plain = CameraParameters(width, height, x=model.x, y=model.y)
+    if fov_y_deg is not None:
+        try:
+            found = replace(plain, fov_y_deg=fov_y_deg)
+        except CameraError as error:
+            raise UserError(f"--fov-y-deg: {error}") from error
+        return Lens(found, 0.0, f"field of view {fov_y_deg:g} deg, given")
+    if photo is not None:
+        focal_px = photo_focal_share(photo) * max(size)
+        fov = degrees(2 * atan(height / 2 / focal_px))
+        return Lens(replace(plain, fov_y_deg=fov), PHOTO_STD, f"field of view {fov:.1f} deg, EXIF")
+    focal_px = max(size) / 2 / tan(radians(GUESSED_FOV_DEG) / 2)
+    fov = degrees(2 * atan(height / 2 / focal_px))
+    about = f"field of view {fov:.1f} deg, guessed: give --fov-y-deg"
+    return Lens(replace(plain, fov_y_deg=fov), GUESSED_STD, about)
+
+
+def photo_focal_share(path: Path) -> float:
+    """The focal length of a JPEG photo's lens as a share of the picture's longer side, from its
+    EXIF. Raises UserError."""
+    picture = read_whole_image(path)
+    with path.open("rb") as file:
+        head = file.read(HEAD_BYTES)
+    at = head.find(EXIF_MARK)
+    block = head[at + len(EXIF_MARK) :] if at >= 0 else b""
+    _, offset = read_tags(block).get(EXIF_DIRECTORY, (0, -1))
+    focal_mm = 0
+    if offset >= 0:
+        little = block.startswith(b"II")
+        moved = block[:4] + offset.to_bytes(4, "little" if little else "big") + block[8:]
+        _, focal_mm = read_tags(moved).get(FOCAL_35MM, (0, 0))
+    if focal_mm <= 0:
+        raise UserError(
+            f"{path} states no focal length (EXIF FocalLengthIn35mmFilm); give --fov-y-deg"
+        )
+    height, width = picture.shape[:2]
+    return float(focal_mm / FILM_DIAGONAL_MM * hypot(width, height) / max(width, height))

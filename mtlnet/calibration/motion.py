@@ -1,0 +1,95 @@
+"""The camera's rotation and direction of travel between two pictures, from followed points.
+
+Camera frame: x right, y down, z ahead. With a small rotation `w` and travel along T, the ray
+p = (x, y, 1) of a point at rest moves by v so that (T x p) . (v + w x p) = 0, whatever its distance
+(Longuet-Higgins and Prazdny 1980).
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+
+POINTS = 250
+MIN_POINTS = 40
+MIN_SPREAD_PX = 8
+WINDOW = (21, 21)
+LEVELS = 4
+MAX_RETURN_PX = 0.5
+"""A point followed forth and back comes back to its place."""
+BONNET = 0.12
+"""Share of rows at the bottom that are not looked at."""
+ROUNDS = 8
+MIN_MOTION_PX = 0.5
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Between two pictures: rotation of the camera (3,) rad, and where it travels to, x and y in
+    normalised coordinates."""
+
+    rotation: FloatArray
+    towards: FloatArray
+    towards_std: float
+
+
+def follow(before: NDArray[np.uint8], after: NDArray[np.uint8]) -> FloatArray | None:
+    """Places u, v in both of two grey pictures (N, 4); None where too few points can be followed
+    or nothing moves."""
+    seen = np.full(before.shape, 255, np.uint8)
+    seen[round((1 - BONNET) * len(seen)) :] = 0
+    found = cv2.goodFeaturesToTrack(before, POINTS, 0.005, MIN_SPREAD_PX, mask=seen)
+    if found is None or len(found) < MIN_POINTS:
+        return None
+    there, good = _flow(before, after, found)
+    back, good_back = _flow(after, before, there)
+    steady = np.abs(back - found).max(axis=(1, 2)) < MAX_RETURN_PX
+    chosen = (good.ravel() == 1) & (good_back.ravel() == 1) & steady
+    tracks = np.concatenate([found[chosen, 0], there[chosen, 0]], axis=1).astype(np.float64)
+    moved = np.hypot(*(tracks[:, 2:] - tracks[:, :2]).T)
+    if len(tracks) < MIN_POINTS or np.percentile(moved, 75) < MIN_MOTION_PX:
+        return None
+    return tracks
+
+
+def _flow(before: NDArray[np.uint8], after: NDArray[np.uint8], points: Any) -> tuple[Any, Any]:
+    """Where points (N, 1, 2) are in `after`, and which were found (N, 1), by Lucas and Kanade."""
+    there, found, _ = cv2.calcOpticalFlowPyrLK(
+        before, after, points, np.empty_like(points), winSize=WINDOW, maxLevel=LEVELS
+    )
+    return there, found
+
+
+def find_motion(tracks: FloatArray, towards: FloatArray, noise: float) -> Motion | None:
+    """Motion from normalised `tracks` (N, 4), starting from a guess of where the camera travels
+    to (2,); `noise`: of a track, in normalised coordinates."""
+    n = len(tracks)
+    p = np.column_stack([0.5 * (tracks[:, :2] + tracks[:, 2:]), np.ones(n)])
+    v = np.column_stack([tracks[:, 2:] - tracks[:, :2], np.zeros(n)])
+    rotation, heading = np.zeros(3), np.array([*towards, 1.0])
+    across = np.eye(3)[:2]
+    scale = 20 * noise
+    for step in range(ROUNDS):
+        normal = np.cross(heading, p)
+        length = np.maximum(np.hypot(normal[:, 0], normal[:, 1]), 0.02)
+        left = v + np.cross(rotation, p)
+        error = np.einsum("ni,ni->n", normal, left) / length
+        by_rotation = heading * np.sum(p * p, axis=1)[:, None] - p * (p @ heading)[:, None]
+        by_heading = np.cross(p, left) @ across.T  # (dT x p) . left = dT . (p x left)
+        design = np.concatenate([by_rotation, by_heading], axis=1) / length[:, None]
+        scale = max(1.4826 * float(np.median(np.abs(error))), noise) if step else scale
+        weight = 1.0 / (1.0 + (error / (2.0 * scale)) ** 2) ** 2
+        held = np.diag([0.0, 0.0, 0.0, *(2 * [(scale / 0.05) ** 2])])  # a guess to 3 degrees
+        system = design.T @ (weight[:, None] * design) + held
+        pull = held[3:, 3:] @ (heading[:2] - towards)
+        right = -design.T @ (weight * error) - np.concatenate([np.zeros(3), pull])
+        change = np.linalg.solve(system, right)
+        rotation += change[:3]
+        heading[:2] += change[3:]
+    covariance = scale**2 * np.linalg.inv(system)
+    std = float(np.sqrt(max(covariance[3, 3], covariance[4, 4])))
+    return Motion(rotation, heading[:2].copy(), std) if np.isfinite(std) else None

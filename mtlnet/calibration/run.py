@@ -1,0 +1,138 @@
+"""`mtlnet calibrate`: a camera file from pictures of a board, from a film, or from pictures of a
+drive in a row."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from mtlnet.calibration.board import calibrate_board
+from mtlnet.calibration.drive import Drive, Report, calibrate_film, calibrate_pictures
+from mtlnet.calibration.film import check_lane_width
+from mtlnet.calibration.lens import Lens, find_lens
+from mtlnet.predict.kinds import Kind, kind_of
+from mtlnet.predict.sources import find_sources
+from runtime.camera_file import read_camera, write_camera
+from runtime.files import check_folder
+from trackfeatures.camera import CameraParameters
+from trackfeatures.errors import UserError
+
+
+@dataclass(frozen=True)
+class CalibrateConfig:
+    """What `mtlnet calibrate` is given; None and empty where it is not."""
+
+    inputs: Sequence[str]
+    out: Path
+    board: str = ""
+    fisheye: bool = False
+    drive: bool = False
+    """The pictures are of a drive, in their order."""
+    camera: Path | None = None
+    """A file with the lens."""
+    fov_y_deg: float | None = None
+    photo: Path | None = None
+    lane_width_m: float | None = None
+    page: Path | None = None
+
+
+def calibrate(
+    config: CalibrateConfig, report: Report = lambda done, total: None
+) -> tuple[dict[str, Any], str]:
+    """Write the camera file; returns the result, and it in one line.
+
+    Raises UserError, also for a film that breaks off or is damaged: the camera was written then, if
+    what could be read was enough.
+    """
+    check_folder(config.out)
+    if config.page is not None:
+        check_folder(config.page)
+    check_lane_width(config.lane_width_m)
+    paths = _files(config.inputs)
+    films = [path for path in paths if kind_of(path) is Kind.FILM]
+    if films or config.drive:
+        return _calibrate_drive(config, paths, films, report)
+    return _calibrate_board(config, paths)
+
+
+def _files(inputs: Sequence[str]) -> list[Path]:
+    sources = find_sources(list(inputs))
+    for source in sources:
+        if source.problem:
+            raise UserError(source.problem)
+        if source.kind is Kind.ROUND:
+            raise UserError(
+                f"{source.path} is a recorded round, which states its camera; give a film"
+            )
+    return [source.path for source in sources]
+
+
+def _calibrate_board(config: CalibrateConfig, paths: list[Path]) -> tuple[dict[str, Any], str]:
+    found = calibrate_board(paths, config.board, CameraParameters(), config.fisheye)
+    camera = found.camera
+    line = (
+        f"focal length {camera.focal_px:.2f} px, error {found.error_px:.3f} px over {found.used} "
+        f"of {len(paths)} pictures of the board {found.board}"
+    )
+    comment = (
+        f"mtlnet calibrate: {line}\nThe mount is assumed; with this file as --camera, "
+        "`mtlnet calibrate drive.mp4` finds it."
+    )
+    write_camera(config.out, camera, comment)
+    if config.page is not None:
+        from mtlnet.calibration.page import write_board_page
+
+        write_board_page(config.page, found)
+    result = {
+        "camera": camera.as_dict(),
+        "board": found.board,
+        "error_px": found.error_px,
+        "focal_std_px": found.focal_std_px,
+        "pictures": [
+            {"file": str(p.path), "error_px": None if p.problem else p.error_px, "note": p.problem}
+            for p in found.pictures
+        ],
+    }
+    return result, line
+
+
+def _calibrate_drive(
+    config: CalibrateConfig, paths: list[Path], films: list[Path], report: Report
+) -> tuple[dict[str, Any], str]:
+    if films and len(paths) > 1:
+        raise UserError(f"{films[0]} is a film; give it alone: a film is of one camera and mount")
+    model = CameraParameters()
+    given = None if config.camera is None else read_camera(config.camera, model)
+
+    def make_lens(size: tuple[int, int]) -> Lens:
+        photo = config.photo or (None if films else _with_exif(paths[0]))
+        return find_lens(size, model, given, config.fov_y_deg, photo)
+
+    if films:
+        drive = calibrate_film(films[0], make_lens, config.lane_width_m, report)
+    else:
+        drive = calibrate_pictures(paths, make_lens, config.lane_width_m, report)
+    return _write_drive(config, drive)
+
+
+def _with_exif(path: Path) -> Path | None:
+    """The picture, if it states its focal length."""
+    from mtlnet.calibration.lens import photo_focal_share
+
+    try:
+        photo_focal_share(path)
+    except UserError:
+        return None
+    return path
+
+
+def _write_drive(config: CalibrateConfig, drive: Drive) -> tuple[dict[str, Any], str]:
+    line = drive.found.about()
+    write_camera(config.out, drive.found.camera, f"mtlnet calibrate: {line}")
+    if config.page is not None:
+        from mtlnet.calibration.page import write_drive_page
+
+        write_drive_page(config.page, drive, str(config.inputs[0]))
+    if drive.fault:
+        raise UserError(f"{drive.fault}; {config.out} was written from them: {line}")
+    return drive.found.as_json(), line

@@ -1,0 +1,155 @@
+"""Which camera took the pictures of a source: the one given, else what is known of the source.
+
+Here a camera is found for `mtlnet predict` where the user gives none: the one that a recording
+states, else the one that the drive itself shows (`mtlnet.calibration`).
+"""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mtlnet.calibration.drive import calibrate_film
+from mtlnet.calibration.film import DriveCalibration, DriveEstimate
+from mtlnet.calibration.lens import Lens as KnownLens
+from mtlnet.calibration.lens import find_lens
+from mtlnet.calibration.mount import NotCalibrated
+from mtlnet.inference.image_decoding.errors import ImageError
+from mtlnet.inference.rectification import Rectification
+from mtlnet.predict.kinds import Kind
+from mtlnet.predict.pictures import Lens, Picture
+from mtlnet.predict.sources import Note, Source
+from trackfeatures.camera import CameraParameters
+from trackfeatures.errors import UserError
+
+FILM_S = 60.0
+"""Of a film, from its start, that its camera is found from."""
+FIRST_S, AGAIN = 15.0, 2.0
+"""A stream's camera is looked for after so long, and again after twice the time each."""
+
+
+class _ModelsOwn(Exception):
+    """The pictures are of the size of the model's own."""
+
+
+def with_lens(
+    source: Source, model: CameraParameters, given: Lens, note: Note, *, calibrate: bool = False
+) -> Source:
+    """The source with its lens: the one given, else that of the camera that a recording states,
+    else with `calibrate` the one that the drive shows.
+
+    Of a field of view that is given `calibrate` finds the mount. `note`: takes a line on what was
+    found.
+    """
+    if isinstance(given, Rectification) or source.problem or source.kind is Kind.ROUND:
+        return replace(source, lens=given)
+    if given is None and source.kind is Kind.RECORDING and source.opened is not None:
+        stated = _stated(source, model, note)
+        if stated is not None:
+            return stated
+    if calibrate and source.kind is Kind.FILM:
+        return replace(source, lens=_of_film(source, model, given, note))
+    if calibrate and source.kind in (Kind.STREAM, Kind.RECORDING):
+        return replace(source, lens=DriveLens(source.name, model, given, note))
+    return replace(source, lens=given)
+
+
+def _stated(source: Source, model: CameraParameters, note: Note) -> Source | None:
+    """A recording with the camera that it states; None where it states none."""
+    from mtlnet.predict.recordings.cameras import is_models
+    from mtlnet.predict.recordings.recording import Recording
+
+    assert isinstance(source.opened, Recording)
+    camera, about = source.opened.camera(model)
+    if camera is not None and is_models(camera, model):
+        return source
+    if about:
+        note(about)
+    if camera is None:
+        return None
+    return replace(source, lens=Rectification(camera, model))
+
+
+def _lens(size: tuple[int, int], model: CameraParameters, fov_y_deg: float | None) -> KnownLens:
+    if size == (model.width, model.height):
+        raise _ModelsOwn
+    return find_lens(size, model, fov_y_deg=fov_y_deg)
+
+
+def _of_film(source: Source, model: CameraParameters, given: float | None, note: Note) -> Lens:
+    """The film's camera as its first minute shows it, else the model's or the one `given`."""
+    try:
+        drive = calibrate_film(
+            source.path, lambda size: _lens(size, model, given), longest_s=FILM_S
+        )
+        return _rectification(drive.found, model, drive.shown, source.name, note)
+    except _ModelsOwn:
+        return given
+    except (NotCalibrated, ImageError) as error:
+        note(_failed(source.name, error))
+    except (UserError, OSError):  # told where the film is read
+        pass
+    return given
+
+
+def _rectification(
+    found: DriveEstimate,
+    model: CameraParameters,
+    shown: list[NDArray[np.uint8]],
+    name: str,
+    note: Note,
+) -> Rectification:
+    """Raises ImageError where the camera shows too little of the model's view."""
+    lens = Rectification(found.camera, model)
+    for picture in shown[:1]:
+        lens.image(picture)
+    note(f"{name}: camera found: {found.about()}")
+    return lens
+
+
+def _failed(name: str, error: Exception) -> str:
+    reason = str(error).removeprefix(f"{name}: ")
+    return f"{name}: no camera found ({reason}); the model's own is assumed; --camera gives another"
+
+
+class DriveLens:
+    """Finds the camera of a stream while it runs: the model's or the one `given` until then."""
+
+    def __init__(self, name: str, model: CameraParameters, given: float | None, note: Note) -> None:
+        self._name, self._model, self._given, self._note = name, model, given, note
+        self._lens: Lens = given
+        self._calibration: DriveCalibration | None = None
+        self._start_s = 0.0
+        self._wait_s = FIRST_S
+        self._done = False
+
+    def at(self, picture: Picture) -> Lens:
+        """The lens for this picture, which is the next one."""
+        if not self._done and picture.image is not None and picture.time_s is not None:
+            self._take(picture.image, picture.time_s, picture.bgr)
+        return self._lens
+
+    def _take(self, image: NDArray[np.uint8], time_s: float, bgr: bool) -> None:
+        if self._calibration is None:
+            try:
+                lens = _lens((image.shape[1], image.shape[0]), self._model, self._given)
+            except _ModelsOwn:
+                self._done = True
+                return
+            self._calibration = DriveCalibration(lens)
+            self._start_s = time_s
+        self._calibration.add(image, time_s, bgr=bgr)
+        if time_s - self._start_s >= self._wait_s:
+            self._wait_s *= AGAIN
+            self._look(self._calibration, image, bgr)
+
+    def _look(self, calibration: DriveCalibration, image: NDArray[np.uint8], bgr: bool) -> None:
+        if bgr:
+            image = cv2.cvtColor(image, cv2.COLOR_BGR2RGB).astype(np.uint8, copy=False)
+        try:
+            found = calibration.estimate()
+            self._lens = _rectification(found, self._model, [image], self._name, self._note)
+        except (NotCalibrated, ImageError) as error:
+            if not isinstance(self._lens, Rectification):
+                self._note(_failed(self._name, error) + "; looked for again later")

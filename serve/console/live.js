@@ -1,0 +1,79 @@
+// Pictures of a webcam or a film, one at a time: the next is taken when the last one is answered.
+
+const ROWS = 420; // twice those of the model, which scales the rest away
+const QUALITY = 0.92, WAIT_MS = 30;
+
+// `answer`: takes {body, image} and returns when it is answered; `told`: takes a line of text.
+export function createLive(video, answer, told) {
+  const canvas = document.createElement("canvas");
+  let running = 0; // number of the present run, so that an older one ends
+
+  // The picture that the video shows as a JPEG of at most `ROWS` rows.
+  async function take() {
+    const scale = Math.min(1, ROWS / video.videoHeight);
+    canvas.width = Math.round(video.videoWidth * scale);
+    canvas.height = Math.round(video.videoHeight * scale);
+    canvas.getContext("2d").drawImage(video, 0, 0, canvas.width, canvas.height);
+    return new Promise((resolve) => canvas.toBlob(resolve, "image/jpeg", QUALITY));
+  }
+
+  const nextFrame = () => new Promise((resolve) => {
+    if (video.requestVideoFrameCallback) video.requestVideoFrameCallback(resolve);
+    setTimeout(resolve, 10 * WAIT_MS); // a video that is paused or over shows no other frame
+    if (!video.requestVideoFrameCallback) setTimeout(resolve, WAIT_MS);
+  });
+
+  async function run() {
+    const own = ++running;
+    await video.play();
+    while (own === running && !video.ended) {
+      if (video.videoHeight) {
+        const body = await take();
+        if (own !== running) return;
+        await answer({ body, image: canvas, truth: null });
+      }
+      if (video.ended) break;
+      await nextFrame();
+    }
+    if (own === running) stop();
+  }
+
+  function stop() {
+    running += 1;
+    video.pause();
+    video.srcObject?.getTracks().forEach((track) => track.stop());
+    video.srcObject = null;
+    if (video.src) URL.revokeObjectURL(video.src);
+    video.removeAttribute("src");
+    video.dispatchEvent(new Event("stopped"));
+  }
+
+  async function begin(open, failed) {
+    stop();
+    try {
+      await open();
+      video.dispatchEvent(new Event("started"));
+      await run();
+    } catch (error) {
+      stop();
+      told(`${failed}: ${error.message}`);
+    }
+  }
+
+  return {
+    stop,
+    webcam: () => begin(async () => {
+      if (!navigator.mediaDevices) throw new Error("browsers give it to pages of localhost or HTTPS only");
+      const wanted = { width: { ideal: 1280 }, height: { ideal: 720 }, facingMode: "environment" };
+      video.srcObject = await navigator.mediaDevices.getUserMedia({ video: wanted, audio: false });
+    }, "no webcam"),
+    film: (file) => begin(async () => {
+      video.src = URL.createObjectURL(file);
+      await new Promise((resolve, reject) => {
+        video.onloadeddata = resolve;
+        video.onerror = () => reject(new Error(video.error?.message || "unknown format"));
+      });
+      video.onerror = null;
+    }, "the browser cannot play this film"),
+  };
+}

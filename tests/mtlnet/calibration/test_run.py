@@ -1,0 +1,157 @@
+"""`mtlnet calibrate` and the cameras that `mtlnet predict` finds by itself."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from mtlnet.calibration.run import CalibrateConfig, calibrate
+from mtlnet.inference.rectification import Rectification
+from mtlnet.predict.kinds import Kind
+from mtlnet.predict.lenses import DriveLens, with_lens
+from mtlnet.predict.pictures import Picture
+from mtlnet.predict.sources import Source
+from runtime.camera_file import read_camera
+from runtime.film import Film
+from tests.mtlnet.calibration.drawn import board_pictures, chessboard, road_picture
+from tests.typed import error_line, typed
+from trackfeatures.camera import CameraParameters
+from trackfeatures.errors import UserError
+
+MODEL = CameraParameters()
+CAMERA = CameraParameters(480, 360, fov_y_deg=60.0, z=1.0, pitch_deg=2.0, yaw_deg=1.5)
+MARKINGS_M = [-1.6, 1.7]
+
+
+@pytest.fixture(scope="module")
+def film(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Six seconds of a straight road."""
+    path = tmp_path_factory.mktemp("films") / "drive.mp4"
+    with Film(path, 5.0) as made:
+        for number in range(30):
+            made.write(road_picture(CAMERA, [left + 0.02 * (-1) ** number for left in MARKINGS_M]))
+    return path
+
+
+def test_a_film_becomes_a_camera_file(film: Path, tmp_path: Path) -> None:
+    out, page = tmp_path / "camera.yaml", tmp_path / "page.html"
+    given = ("--fov", 60, "--lane-width", 3.3, "--out", out, "--report", page, "--json")
+    done = typed("mtlnet", "calibrate", film, *given)
+    assert done.returncode == 0, done.stderr
+    result = json.loads(done.stdout)
+    camera = read_camera(out, MODEL)
+    assert (camera.width, camera.height, camera.fov_y_deg) == (480, 360, 60.0)
+    assert camera.pitch_deg == pytest.approx(2.0, abs=0.15)
+    assert camera.yaw_deg == pytest.approx(1.5, abs=0.15)
+    assert camera.height_above_road_m == pytest.approx(1.25, rel=0.02)
+    assert result["pitch_deg"] == camera.pitch_deg
+    assert result["std"]["height_m"] == pytest.approx(camera.height_std * 1.25, rel=0.05)
+    assert out.read_text().startswith("# mtlnet calibrate: pitch ")
+    assert page.read_text().count("data:image/jpeg") == 6
+
+
+def test_pictures_of_a_drive_in_a_row(tmp_path: Path) -> None:
+    for number in range(15):
+        cv2.imwrite(str(tmp_path / f"{number}.png"), road_picture(CAMERA, MARKINGS_M))
+    config = CalibrateConfig([str(tmp_path)], tmp_path / "c.yaml", drive=True, fov_y_deg=60.0)
+    result, line = calibrate(config)
+    assert result["pitch_deg"] == pytest.approx(2.0, abs=0.15)
+    assert "lane width 3.6 m, assumed; field of view 60 deg, given" in line
+
+
+def test_a_board_becomes_a_camera_file(tmp_path: Path) -> None:
+    lens = CameraParameters(400, 300, matrix=(330.0, 330.0, 200.0, 150.0))
+    board_pictures(chessboard(6, 4), lens, tmp_path, 5, seed=4)
+    out, page = tmp_path / "camera.yaml", tmp_path / "page.html"
+    done = typed("mtlnet", "calibrate", tmp_path, "--out", out, "--report", page)
+    assert done.returncode == 0, done.stderr
+    assert "of 5 pictures of the board 6x4" in done.stdout
+    camera = read_camera(out, MODEL)
+    assert camera.focal_px == pytest.approx(330.0, rel=0.01)
+    assert (camera.z, camera.distortion) == (MODEL.z, "opencv")
+    assert page.read_text().count("data:image/jpeg") >= 4
+
+
+def _no_markings(path: Path) -> Path:
+    rng = np.random.default_rng(0)
+    with Film(path, 5.0) as made:
+        for _ in range(20):
+            made.write(rng.normal(110, 5, (240, 320, 3)).clip(0, 255).astype(np.uint8))
+    return path
+
+
+def test_what_cannot_be_calibrated_is_one_line(film: Path, tmp_path: Path) -> None:
+    picture, cut = tmp_path / "one.png", tmp_path / "cut.mp4"
+    cv2.imwrite(str(picture), road_picture(CAMERA, MARKINGS_M))
+    cut.write_bytes(film.read_bytes()[: film.stat().st_size // 2])
+    out = tmp_path / "camera.yaml"
+    cases: list[tuple[list[object], str]] = [
+        ([_no_markings(tmp_path / "none.mp4")], "none.mp4: "),
+        ([picture], "no chessboard in 1 pictures"),
+        ([picture, "--drive"], "1 of 1 pictures show both markings of a lane"),
+        ([cut], "cut.mp4 cannot be opened as a film"),
+        ([film, film], "give it alone"),
+        ([tmp_path / "nothing.mp4"], "there is no image file"),
+        ([film, "--lane-width", 36], "--lane-width 36 m; give 2 to 6 m"),
+        ([film, "--fov", 0], "--fov-y-deg: "),
+    ]
+    for given, seen in cases:
+        done = typed("mtlnet", "calibrate", *given, "--out", out)
+        assert done.returncode == 1, given
+        assert seen in error_line(done)
+        assert "Traceback" not in done.stderr
+    assert not out.exists()
+
+
+def test_a_film_that_breaks_off_is_told_and_used(
+    film: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("mtlnet.predict.films.missing_end", lambda path: "no end")
+    out = tmp_path / "camera.yaml"
+    config = CalibrateConfig([str(film)], out, fov_y_deg=60.0)
+    with pytest.raises(UserError, match=r"it breaks off: no end.* was written from them: pitch"):
+        calibrate(config)
+    assert read_camera(out, MODEL).pitch_deg == pytest.approx(2.0, abs=0.15)
+
+
+def test_predict_finds_the_camera_of_a_film(film: Path, tmp_path: Path) -> None:
+    lines: list[str] = []
+    source = Source(film, Kind.FILM)
+    lens = with_lens(source, MODEL, 60.0, lines.append, calibrate=True).lens
+    assert isinstance(lens, Rectification)
+    assert lens.source.pitch_deg == pytest.approx(2.0, abs=0.15)
+    assert lens.target == MODEL
+    assert len(lines) == 1
+    assert lines[0].startswith(f"{film}: camera found: pitch ")
+    assert with_lens(source, MODEL, 60.0, lines.append).lens == 60.0  # --camera model
+    none = Source(_no_markings(tmp_path / "none.mp4"), Kind.FILM)
+    assert with_lens(none, MODEL, None, lines.append, calibrate=True).lens is None
+    assert "no camera found (" in lines[1]
+    assert "the model's own is assumed" in lines[1]
+    assert len(lines) == 2
+
+
+def test_a_film_of_the_models_size_is_not_calibrated(tmp_path: Path) -> None:
+    path, lines = tmp_path / "own.mp4", list[str]()
+    with Film(path, 5.0) as made:
+        made.write(road_picture(MODEL, MARKINGS_M))
+    source = with_lens(Source(path, Kind.FILM), MODEL, None, lines.append, calibrate=True)
+    assert (source.lens, lines) == (None, [])
+
+
+def test_a_stream_is_calibrated_while_it_runs() -> None:
+    lines: list[str] = []
+    finder = DriveLens("webcam 0", MODEL, 60.0, lines.append)
+    picture = road_picture(CAMERA, MARKINGS_M)
+    lenses = [finder.at(Picture(k, picture, 1e9 + 0.2 * k, bgr=True)) for k in range(80)]
+    assert lenses[74] == 60.0
+    assert isinstance(lenses[75], Rectification)
+    assert lenses[75].source.pitch_deg == pytest.approx(2.0, abs=0.15)
+    assert len(lines) == 1
+    own = DriveLens("webcam 0", MODEL, None, lines.append)
+    wanted = road_picture(replace(MODEL, pitch_deg=3.0), MARKINGS_M)
+    assert {own.at(Picture(k, wanted, 0.2 * k)) for k in range(80)} == {None}
+    assert len(lines) == 1
