@@ -43,6 +43,7 @@ def train_command(
     device: options.TrainDevice = None,
     threads: options.TrainThreads = None,
     skip_undecodable: options.SkipUndecodable = False,
+    hold_out_drives: options.HoldOutDrives = None,
     resume: options.Resume = False,
     change_data: options.ChangeData = False,
     as_json: options.Json = False,
@@ -67,6 +68,7 @@ def train_command(
         "device": device,
         "threads": threads,
         "skip_undecodable": skip_undecodable or None,
+        "hold_out_drives": hold_out_drives,
         "change_data": change_data or None,
     }
     chosen = {name: value for name, value in given.items() if value is not None}

@@ -86,6 +86,13 @@ TrainThreads = Annotated[int | None, typer.Option(help="CPU threads.  [default: 
 SkipUndecodable = Annotated[
     bool, typer.Option("--skip-undecodable", help="Omit images that cannot be decoded.")
 ]
+HoldOutDrives = Annotated[
+    str | None,
+    typer.Option(
+        help="Drives of labels.csv to leave out, with commas between them: `evaluate` then shows "
+        "them apart."
+    ),
+]
 Resume = Annotated[
     bool,
     typer.Option("--resume", help="Continue the stopped run in --out, or else the newest run."),
