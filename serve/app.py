@@ -46,6 +46,7 @@ from serve.scheduling.rate_limit import RateLimiter
 from serve.scheduling.streams import StreamTable
 from serve.scheduling.warmup import warm_up
 from serve.workers.shared_memory import SharedMemory, create_shared_memory
+from trackfeatures.camera import stored
 
 if TYPE_CHECKING:
     from opentelemetry.trace import Tracer
@@ -237,7 +238,7 @@ def _add_status(app: FastAPI, frame_queue: FrameQueue) -> None:
     @app.get("/model", summary="The model card: training, data and camera")
     async def model() -> dict[str, Any]:
         loaded = frame_queue.loaded
-        return {**loaded.provenance, **asdict(loaded.engine.card)}
+        return {**loaded.provenance, **asdict(loaded.engine.card, dict_factory=stored)}
 
 
 def _add_metrics(app: FastAPI, service: Service) -> None:

@@ -1,20 +1,23 @@
 """The driver camera: size in pixels, lens, and mounting place in the body frame (SI units).
 
-Body frame: x ahead, y left, z up, origin at the car's centre of gravity. Image frame: u right,
-v down, square pixels, principal point in the middle.
+Body frame: x ahead, y left, z up, origin at the car's centre of gravity. Camera frame: x right,
+y down, z ahead along the optical axis. Image frame: pixels, u right, v down; a pixel's centre has
+whole coordinates, so a centred principal point is ((width - 1) / 2, (height - 1) / 2).
 """
 
-from dataclasses import asdict, dataclass
-from math import radians, tan
+from dataclasses import asdict, dataclass, fields, replace
+from math import atan, degrees, isfinite, radians, tan
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from trackfeatures.errors import UserError
 
 if TYPE_CHECKING:
     import numpy as np
-    from numpy.typing import NDArray
+    from numpy.typing import ArrayLike, NDArray
 
 FOV_LIMITS_DEG = (1.0, 150.0)
+COEFFICIENTS: dict[str, tuple[int, ...]] = {"none": (0,), "opencv": (4, 5, 8), "fisheye": (4,)}
+"""Kinds of distortion, and how many coefficients each takes."""
 
 
 class CameraError(UserError, ValueError):
@@ -23,35 +26,70 @@ class CameraError(UserError, ValueError):
 
 @dataclass(frozen=True, slots=True)
 class CameraParameters:
-    """A pinhole camera on the car. A model understands only images of the camera it was trained
-    with.
+    """A camera on the car: size, lens and mount. A model understands only images of the camera it
+    was trained with, or images that were warped into it.
 
-    Raises CameraError for a vertical field of view outside `FOV_LIMITS_DEG`.
+    The mount turns the body by Rz(yaw) Ry(pitch) Rx(roll). Raises CameraError for an impossible
+    lens, such as a vertical field of view outside `FOV_LIMITS_DEG`.
     """
 
     width: int = 280
     height: int = 210
     fov_y_deg: float = 67.5
+    """Of the lens without its distortion; follows from `matrix` where that is given."""
     x: float = 0.75
     y: float = 0.0
     z: float = 0.95
     pitch_deg: float = 0.0
     """Positive looks down."""
+    roll_deg: float = 0.0
+    """Positive lowers the right side."""
+    yaw_deg: float = 0.0
+    """Positive turns to the left."""
+    matrix: tuple[float, float, float, float] | None = None
+    """fx, fy, cx, cy in px; None: square pixels of `fov_y_deg`, principal point in the middle."""
+    distortion: str = "none"
+    """"none"; "opencv": k1, k2, p1, p2 [, k3 [, k4, k5, k6]]; or "fisheye": k1 to k4."""
+    coefficients: tuple[float, ...] = ()
+    height_std: float = 0.0
+    """Standard deviation of the height above the road, as a share of it."""
 
     cg_height_m: ClassVar[float] = 0.25
     """Height of the car's centre of gravity above the road."""
 
     def __post_init__(self) -> None:
+        if self.matrix is not None:
+            matrix = _numbers("matrix", self.matrix, (4,))
+            if min(matrix[:2]) <= 0:
+                raise CameraError(
+                    f"the focal lengths {matrix[0]:g} and {matrix[1]:g} px of a camera must be "
+                    "above 0: its matrix is singular"
+                )
+            object.__setattr__(self, "matrix", matrix)
+            fov_y_deg = degrees(2 * atan(self.height / 2 / matrix[1]))
+            object.__setattr__(self, "fov_y_deg", fov_y_deg)
+        if self.distortion not in COEFFICIENTS:
+            kinds = ", ".join(COEFFICIENTS)
+            raise CameraError(f"the distortion is {self.distortion!r}; give one of {kinds}")
+        counts = COEFFICIENTS[self.distortion]
+        coefficients = _numbers(f"{self.distortion} distortion", self.coefficients, counts)
+        object.__setattr__(self, "coefficients", coefficients)
         lo, hi = FOV_LIMITS_DEG
         if not lo <= self.fov_y_deg <= hi:
             raise CameraError(
                 f"vertical field of view {self.fov_y_deg} deg; give one between {lo:g} and "
                 f"{hi:g} deg"
             )
+        if not 0.0 <= self.height_std < 1.0:
+            raise CameraError(
+                f"height_std is {self.height_std}; give a share of the height from 0 to below 1"
+            )
 
     @property
     def focal_px(self) -> float:
-        """Focal length in pixels, the same for both image axes."""
+        """Focal length in pixels along the rows' axis (fy); without a matrix that of both axes."""
+        if self.matrix is not None:
+            return self.matrix[1]
         return self.height / 2 / tan(radians(self.fov_y_deg) / 2)
 
     @property
@@ -59,19 +97,123 @@ class CameraParameters:
         """Of the camera, on a car that stands level."""
         return self.z + self.cg_height_m
 
+    @property
+    def is_plain(self) -> bool:
+        """Whether pictures are those of a pinhole with square pixels, centred, without roll and
+        yaw: a level road's horizon is a row."""
+        return (
+            self.matrix is None
+            and self.distortion == "none"
+            and self.roll_deg == 0.0
+            and self.yaw_deg == 0.0
+        )
+
     def intrinsics(self) -> "NDArray[np.float64]":
-        """Pinhole matrix K (3, 3) in pixels, measured from the image's top left corner."""
+        """Pinhole matrix K (3, 3) in pixels."""
         import numpy as np  # a command's help needs no numpy
 
         focal = self.focal_px
-        return np.array([[focal, 0.0, self.width / 2], [0.0, focal, self.height / 2], [0, 0, 1]])
+        centre = ((self.width - 1) / 2, (self.height - 1) / 2)
+        fx, fy, cx, cy = self.matrix or (focal, focal, *centre)
+        return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+
+    def rotation(self) -> "NDArray[np.float64]":
+        """From the car's frame to the camera's (3, 3)."""
+        from trackfeatures.lens import mount_rotation
+
+        return mount_rotation(
+            radians(self.roll_deg), radians(self.pitch_deg), radians(self.yaw_deg)
+        )
+
+    def project(self, points: "ArrayLike") -> "NDArray[np.float64]":
+        """Pixels (N, 2) of points (N, 3) of the car's frame, m; NaN behind the camera and where
+        the lens model folds."""
+        import numpy as np
+
+        from trackfeatures.lens import project
+
+        away = np.asarray(points, dtype=np.float64).reshape(-1, 3) - (self.x, self.y, self.z)
+        return project(self, away @ self.rotation().T)
+
+    def rays(self, pixels: "ArrayLike") -> "NDArray[np.float64]":
+        """Directions (N, 3) in the camera's frame, z = 1, of pixels (N, 2); NaN where the lens
+        sees nothing."""
+        from trackfeatures.lens import rays
+
+        return rays(self, pixels)
+
+    def road_points(self, pixels: "ArrayLike") -> "NDArray[np.float64]":
+        """Points (N, 2) of the flat road, x ahead and y left of the foot of the centre of gravity,
+        m, of pixels (N, 2); NaN at and above the horizon."""
+        import numpy as np
+
+        ahead, left, up = (self.rays(pixels) @ self.rotation()).T
+        with np.errstate(divide="ignore", invalid="ignore"):
+            far = np.where(up < 0, -self.height_above_road_m / up, np.nan)
+        return np.column_stack([self.x + far * ahead, self.y + far * left])
+
+    def homography(self, other: "CameraParameters") -> "NDArray[np.float64]":
+        """From pixels of this camera to those of `other` (3, 3), from the same place, for lenses
+        without distortion: exact for any scene (Hartley and Zisserman 2004, section 8.4)."""
+        import numpy as np
+
+        turn = other.rotation() @ self.rotation().T
+        found: NDArray[np.float64] = other.intrinsics() @ turn @ np.linalg.inv(self.intrinsics())
+        return found
+
+    def undistorted(self) -> "CameraParameters":
+        """The same camera with a lens without distortion."""
+        return replace(self, distortion="none", coefficients=())
+
+    def resized(self, width: int, height: int) -> "CameraParameters":
+        """The camera of its pictures scaled to `width` x `height` px, also to another aspect."""
+        if self.matrix is None and width * self.height == height * self.width:
+            return replace(self, width=width, height=height)
+        x, y = width / self.width, height / self.height
+        k = self.intrinsics()
+        centre = (k[0, 2] + 0.5) * x - 0.5, (k[1, 2] + 0.5) * y - 0.5
+        matrix = (float(k[0, 0] * x), float(k[1, 1] * y), float(centre[0]), float(centre[1]))
+        return replace(self, width=width, height=height, matrix=matrix)
 
     def as_dict(self) -> dict[str, Any]:
-        """The fields by name, as they are written to files."""
-        return asdict(self)
+        """The fields by name, as they are written to files; see `stored`."""
+        return asdict(self, dict_factory=stored)
 
     def __str__(self) -> str:
+        turned = "".join(
+            f", {name} {angle:g} deg"
+            for name, angle in (("roll", self.roll_deg), ("yaw", self.yaw_deg))
+            if angle
+        )
+        lens = "" if self.distortion == "none" else f", {self.distortion} distortion"
         return (
             f"{self.width}x{self.height}, {self.fov_y_deg:g} deg, at ({self.x:g}, {self.y:g}, "
-            f"{self.z:g}) m, pitch {self.pitch_deg:g} deg"
+            f"{self.z:g}) m, pitch {self.pitch_deg:g} deg{turned}{lens}"
         )
+
+
+_NAMES = tuple(field.name for field in fields(CameraParameters))
+_LATER = {field.name: field.default for field in fields(CameraParameters)[7:]}
+"""Fields that older files do not have, with their defaults."""
+
+
+def stored(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """A `dict_factory` for `dataclasses.asdict`: leaves out those fields of a camera, at any depth,
+    that older files do not have and that are at their default, so that hashes stay the same."""
+    values = dict(pairs)
+    if tuple(values) == _NAMES:
+        return {k: v for k, v in values.items() if k not in _LATER or v != _LATER[k]}
+    return values
+
+
+def _numbers(what: str, values: Any, counts: tuple[int, ...]) -> tuple[Any, ...]:
+    """`values` as finite floats, of one of these counts; else CameraError."""
+    listed = tuple(values) if isinstance(values, list | tuple) else None
+    wanted = " or ".join(map(str, counts))
+    if listed is None or len(listed) not in counts:
+        seen = repr(values) if listed is None else f"{len(listed)} numbers"
+        raise CameraError(f"the {what} of a camera has {seen}; give {wanted} numbers")
+    for value in listed:
+        if isinstance(value, bool) or not isinstance(value, int | float) or not isfinite(value):
+            raise CameraError(f"the {what} of a camera holds {value!r}; give finite numbers")
+    return tuple(map(float, listed))

@@ -34,6 +34,7 @@ from datagen.recording.folder import (
 from datagen.recording.manifest import rebuild
 from datagen.recording.names import SIDES
 from datagen.recording.splits import Split, split_path, write_split
+from trackfeatures.camera import stored
 
 if TYPE_CHECKING:
     from datagen.recorder.record import MakeLaw
@@ -204,7 +205,7 @@ def foreign_files(folder: Path, plan: Plan) -> list[Path]:
 
 def _differences(found: dict[str, Any], driver: Mapping[str, str], plan: Plan) -> str:
     """The options that differ, as text."""
-    wanted = json.loads(json.dumps(asdict(plan.config)))
+    wanted = json.loads(json.dumps(asdict(plan.config, dict_factory=stored)))
     named = [
         f"{name}: {_short(found.get(name))} there, {_short(value)} asked for"
         for name, value in wanted.items()

@@ -14,7 +14,7 @@ from typing import Any
 import trackfeatures as tf
 from datagen.planning.config import CollectConfig
 from simulator.world.control_rate import PHYSICS_HZ
-from trackfeatures.camera import CameraParameters
+from trackfeatures.camera import CameraParameters, stored
 from trackfeatures.errors import UserError
 from trackfeatures.names import require_name
 
@@ -88,7 +88,11 @@ class Plan:
     @property
     def hash(self) -> str:
         """SHA-256 (hex) of all entries, the program and the version of the definitions."""
-        content: list[Any] = [tf.VERSION, program(), [asdict(entry) for entry in self.rounds]]
+        content: list[Any] = [
+            tf.VERSION,
+            program(),
+            [asdict(entry, dict_factory=stored) for entry in self.rounds],
+        ]
         if self.driver:
             content.append(dict(self.driver))
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
@@ -100,9 +104,9 @@ class Plan:
             "hash": self.hash,
             "definitions": tf.VERSION,
             "program": program(),
-            "wanted": asdict(self.config),
+            "wanted": asdict(self.config, dict_factory=stored),
             **driver,
-            "rounds": [asdict(entry) for entry in self.rounds],
+            "rounds": [asdict(entry, dict_factory=stored) for entry in self.rounds],
         }
 
 

@@ -22,6 +22,7 @@ from datagen.recording.folder import (
 )
 from datagen.recording.splits import Split, split_path, write_split
 from datagen.recording.statistics import describe
+from trackfeatures.camera import stored
 
 MANIFEST = "manifest.json"
 # Not the dataset card: people edit it.
@@ -36,7 +37,7 @@ def build_manifest(dataset: Dataset) -> dict[str, Any]:
         state = states.get(info.id)
         rounds.append(
             {
-                **asdict(index.header),
+                **asdict(index.header, dict_factory=stored),
                 **asdict(index.result),
                 "split": info.split,
                 "file": f"rounds/{info.path.name}",

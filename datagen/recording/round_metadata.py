@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import trackfeatures as tf
-from trackfeatures.camera import CameraParameters
+from trackfeatures.camera import CameraParameters, stored
 from trackfeatures.names import require_name
 
 ROUND_METADATA = "driverview.round"
@@ -79,7 +79,8 @@ class RoundHeader:
             )
 
     def to_metadata(self) -> dict[str, str]:
-        return {name: json.dumps(value) for name, value in asdict(self).items()}
+        values = asdict(self, dict_factory=stored)
+        return {name: json.dumps(value) for name, value in values.items()}
 
     @staticmethod
     def from_metadata(metadata: Mapping[str, str]) -> "RoundHeader":

@@ -69,7 +69,7 @@ def _card(info: RoundInfo, frame: int, size: tuple[int, int]) -> Card:
     decode_into(step.image, image)
     big = cv2.resize(image, None, fx=SCALE, fy=SCALE, interpolation=cv2.INTER_LINEAR)
     for line in contents.markings(frame):
-        points = np.round(line * SCALE).astype(np.int32)
+        points = np.round(line * SCALE - 0.5).astype(np.int32)  # OpenCV's pixel centres
         cv2.polylines(big, [points], False, _GREEN, 1, cv2.LINE_AA)
     lanes = f"{info.lanes} lane{'s' if info.lanes > 1 else ''}"
     about = f"{info.id} #{frame} ({info.split or 'no side'}): {info.track}, {lanes}, {step.light}"

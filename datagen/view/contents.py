@@ -94,7 +94,7 @@ class Contents:
         return _plots(list(self.steps))
 
     def markings(self, number: int) -> list[Points]:
-        """True markings in the image, (k, 2) px each."""
+        """True markings in the image, (k, 2) px each from its upper left corner."""
         lines = self.steps.message(ANNOTATIONS, number).points
         return [np.array([(p.x, p.y) for p in line.points]).reshape(-1, 2) for line in lines]
 

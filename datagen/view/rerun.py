@@ -21,6 +21,8 @@ IMAGE, MARKINGS = f"{CAMERA}/image", f"{CAMERA}/markings"
 TRAFFIC, TRACK, PLOTS = "world/traffic", "world/track", "plots"
 ABOUT, CAPTION = "about", "caption"
 GREEN, BLUE, GREY = (40, 255, 80), (51, 102, 255), (140, 140, 140)
+FROM_CORNER = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])
+"""Rerun counts pixels from the upper left corner of the image."""
 SERIES = ((59, 111, 212), (224, 122, 46), (47, 158, 92), (176, 64, 154), (136, 112, 32))
 
 
@@ -44,7 +46,7 @@ def _camera(contents: Contents, recording: rr.RecordingStream, time: rr.TimeColu
     )
     recording.log(CAMERA, mounting, static=True)
     pinhole = rr.Pinhole(
-        image_from_camera=camera.intrinsics(),
+        image_from_camera=FROM_CORNER @ camera.intrinsics(),
         width=camera.width,
         height=camera.height,
         image_plane_distance=3.0,

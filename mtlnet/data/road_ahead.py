@@ -1,9 +1,9 @@
 """What of the road ahead a network may learn beside its answers, from recorded rounds.
 
-Columns: where the two markings of the car's lane cross the image rows `ROWS`, in px, from the
-polylines recorded with every image. Curvature: that of the road `AHEAD_M` in front of the car, in
-1/m, left positive, from the labels of all frames of the same track. NaN where it is not known: out
-of the image, or where no frame was recorded.
+Columns: where the two markings of the car's lane cross the image rows `ROWS`, from the polylines
+recorded with every image; rows and columns count from its upper left corner, px. Curvature: that
+of the road `AHEAD_M` in front of the car, in 1/m, left positive, from the labels of all frames of
+the same track. NaN where it is not known: out of the image, or where no frame was recorded.
 
 For training only (`mtlnet.model.auxiliary`); answering needs none of it.
 """
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from datagen.recording import DatasetError, Frames
 from datagen.recording.mcap.index import Messages, open_round
-from datagen.recording.schema.polylines import read_polylines
+from datagen.recording.schema.polylines import CORNER_PX, read_polylines
 from datagen.recording.schema.topics import ANNOTATIONS, CAMERA
 from mtlnet.data.augment.geometric import (
     horizon_row,
@@ -139,15 +139,14 @@ def own_markings(
     Which is which is told at a polyline's near end, as if the road were level there: lanes are 3 m
     wide at least.
     """
-    horizon = horizon_row(camera) + 0.5  # from the image's upper border
     nearest = np.full(SIDES, APART_M)
-    for line in lines:
-        u, below = line[0] - (camera.width / 2, horizon) if len(line) else (0.0, 0.0)
-        if below * NEAREST_M < camera.focal_px * camera.height_above_road_m:
+    drawn = [line for line in lines if len(line)]
+    ends = camera.road_points([line[0] for line in drawn])
+    for line, (ahead, left) in zip(drawn, ends, strict=True):
+        if not ahead - camera.x <= NEAREST_M:  # NaN: above the horizon
             continue
-        aside = u * camera.height_above_road_m / below
-        side = int(np.abs(beside - aside).argmin())
-        off = abs(beside[side] - aside)
+        side = int(np.abs(beside + left).argmin())
+        off = abs(beside[side] + left)
         if off < nearest[side]:
             nearest[side] = off
             out[side] = np.nan
@@ -158,8 +157,7 @@ def changed_points(
     points: NDArray[np.floating[Any]], params: AugmentParams, camera: CameraParameters
 ) -> NDArray[np.float64]:
     """Where points (B, 2, POINTS, 2) of images lie after `params` to these."""
-    # Images are changed in coordinates that count from the centre of the first pixel.
-    moved = points.astype(np.float64) - 0.5
+    moved = points.astype(np.float64)
     below = np.maximum(moved[..., 1] - horizon_row(camera), 0.0)
     moved[..., 0] += params.shift[:, None, None] * shear_per_metre(camera) * below
     ways = _turned(camera)[params.rotation][:, None, None]
@@ -168,9 +166,9 @@ def changed_points(
         -1,
         0,
     )
-    moved = np.stack([u / scale, v / scale], -1) + 0.5
+    moved = np.stack([u / scale, v / scale], -1)
     flipped = moved[:, ::-1].copy()
-    flipped[..., 0] = camera.width - flipped[..., 0]
+    flipped[..., 0] = camera.width - 1 - flipped[..., 0]
     return np.where(params.mirrored[:, None, None, None], flipped, moved)
 
 
@@ -181,11 +179,12 @@ def _turned(camera: CameraParameters) -> NDArray[np.float64]:
 
 
 def crossings(points: NDArray[np.floating[Any]], width: int) -> Numbers:
-    """The columns (B, 2, ROWS) in px at which polylines (B, 2, POINTS, 2) first cross `ROWS`.
+    """The columns (B, 2, ROWS) at which polylines (B, 2, POINTS, 2) first cross `ROWS`, in px from
+    the image's corner.
 
     NaN where one does not, or out of an image so many px wide.
     """
-    u, v = points[..., 0], points[..., 1]
+    u, v = points[..., 0] + CORNER_PX, points[..., 1] + CORNER_PX
     rows = np.array(ROWS)
     v0, v1 = v[..., :-1, None], v[..., 1:, None]
     # From the near end on a line goes up in the image; comparisons with NaN are false.

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runtime.files import write_json
-from trackfeatures.camera import CameraParameters
+from trackfeatures.camera import CameraParameters, stored
 from trackfeatures.errors import UserError, require_version
 from trackfeatures.names import require_name
 
@@ -70,7 +70,8 @@ class ModelCard:
 
     def write(self, run: Path) -> None:
         """Write `card.json`, atomically."""
-        content = {"format": FORMAT, "model_hash": self.model_hash, **asdict(self)}
+        content = {"format": FORMAT, "model_hash": self.model_hash}
+        content |= asdict(self, dict_factory=stored)
         write_json(run / CARD, content)
 
 

@@ -1,6 +1,6 @@
 """Overlay of predicted and true markings on a frame, beside a view of the car from above.
 
-Flat road. Car frame: x ahead, y left (m). Pixels from the top left corner.
+Flat road. Car frame: x ahead, y left (m).
 """
 
 import math
@@ -41,14 +41,10 @@ def to_pixels(
 
     `height_m`: height of the camera above the road.
     """
-    focal = camera.focal_px
-    ahead, left = points[:, 0] - camera.x, points[:, 1] - camera.y
-    pitch = math.radians(camera.pitch_deg)  # positive looks down
-    depth = ahead * math.cos(pitch) + height_m * math.sin(pitch)
-    down = height_m * math.cos(pitch) - ahead * math.sin(pitch)
-    u = camera.width / 2 - focal * left / depth
-    v = camera.height / 2 + focal * down / depth
-    return np.round(np.column_stack([u, v]) * SCALE).astype(np.int32)
+    road = np.column_stack([points, np.full(len(points), camera.z - height_m)])
+    pixels = camera.project(road)
+    enlarged = (pixels + 0.5) * SCALE - 0.5  # about the picture's corner, as cv2.resize does
+    return np.round(enlarged).astype(np.int32)
 
 
 def draw_overlay(

@@ -1,4 +1,4 @@
-"""Projection of the true lane markings into an image, and drawing them. Pixels, origin top left."""
+"""Projection of the true lane markings into an image, and drawing them. Pixels."""
 
 from typing import TYPE_CHECKING, Protocol
 
@@ -70,8 +70,8 @@ def draw(
 ) -> NDArray[np.uint8]:
     """A copy of `image` (H, W, 3) with thin antialiased lines over it."""
     drawn = image.copy()
-    # cv2 counts from the centre of the first pixel and takes 1/16 pixels as integers.
-    fixed = [np.rint((line - 0.5) * 16.0).astype(np.int32) for line in polylines]
+    # cv2 takes 1/16 pixels as integers.
+    fixed = [np.rint(line * 16.0).astype(np.int32) for line in polylines]
     cv2.polylines(drawn, fixed, False, colour, 1, cv2.LINE_AA, shift=4)
     return drawn
 
@@ -82,8 +82,8 @@ def _near_picture(camera: Projector, pixels: FloatArray, depth: FloatArray) -> N
     u, v = pixels[:, 0], pixels[:, 1]
     return np.asarray(
         (depth > 2.0 * NEAR_M)
-        & (np.abs(u - 0.5 * camera.width) < 0.5 * camera.width + margin)
-        & (np.abs(v - 0.5 * camera.height) < 0.5 * camera.height + margin)
+        & (np.abs(u - 0.5 * (camera.width - 1)) < 0.5 * camera.width + margin)
+        & (np.abs(v - 0.5 * (camera.height - 1)) < 0.5 * camera.height + margin)
     )
 
 

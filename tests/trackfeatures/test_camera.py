@@ -1,5 +1,7 @@
 """Camera parameters: pinhole matrix, height above the road, refused values, stored form."""
 
+import json
+
 import numpy as np
 import pytest
 
@@ -11,7 +13,7 @@ def test_intrinsics_of_a_lens_of_90_degrees() -> None:
     """tan(45 deg) = 1: the focal length is half of the height."""
     camera = CameraParameters(width=280, height=210, fov_y_deg=90.0)
     assert camera.focal_px == pytest.approx(105.0)
-    expected = [[105.0, 0.0, 140.0], [0.0, 105.0, 105.0], [0.0, 0.0, 1.0]]
+    expected = [[105.0, 0.0, 139.5], [0.0, 105.0, 104.5], [0.0, 0.0, 1.0]]
     assert np.allclose(camera.intrinsics(), expected)
 
 
@@ -31,3 +33,14 @@ def test_the_stored_form_has_the_names_of_recordings_and_model_cards() -> None:
     stored = CameraParameters(pitch_deg=3.0).as_dict()
     assert list(stored) == ["width", "height", "fov_y_deg", "x", "y", "z", "pitch_deg"]
     assert CameraParameters(**stored) == CameraParameters(pitch_deg=3.0)
+
+
+def test_new_fields_are_stored_where_they_are_not_the_default() -> None:
+    camera = CameraParameters(
+        1280, 720, matrix=(700, 700, 640, 360), distortion="fisheye", coefficients=(0.1, 0, 0, 0)
+    )
+    stored = camera.as_dict()
+    assert list(stored)[7:] == ["matrix", "distortion", "coefficients"]
+    assert CameraParameters(**json.loads(json.dumps(stored))) == camera
+    assert hash(CameraParameters(**json.loads(json.dumps(stored)))) == hash(camera)
+    assert camera.fov_y_deg == pytest.approx(np.degrees(2 * np.arctan(360 / 700)))

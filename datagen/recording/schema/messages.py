@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 import trackfeatures as tf
 from datagen.recording.frame import DriverCommand, EgoState, Frame, SensorReadings
 from datagen.recording.mcap.protobuf_wire import points_field
+from datagen.recording.schema.polylines import CORNER_PX
 from datagen.recording.schema.proto.driverview_pb2 import (
     Command,
     Sensors,
@@ -82,7 +83,9 @@ def annotations(frame: Frame, time: Timestamp) -> bytes:
         line.type = PointsAnnotation.LINE_STRIP
         line.thickness = 1.0
         line.outline_color.CopyFrom(GREEN)
-        line.MergeFromString(points_field(PointsAnnotation.POINTS_FIELD_NUMBER, polyline))
+        line.MergeFromString(
+            points_field(PointsAnnotation.POINTS_FIELD_NUMBER, polyline + CORNER_PX)
+        )
     text = message.texts.add()
     text.timestamp.CopyFrom(time)
     text.position.x, text.position.y = 4.0, 12.0

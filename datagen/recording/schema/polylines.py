@@ -1,6 +1,7 @@
 """The markings recorded over an image: pixel polylines read back from its annotations.
 
-Frame: pixels, origin in the top left corner, a pixel's centre at half-integers.
+Frame: pixels, a pixel's centre at whole numbers. Foxglove's annotations count from the upper left
+corner of the image instead: `CORNER_PX` is between the two.
 """
 
 import numpy as np
@@ -14,6 +15,7 @@ from ..mcap.protobuf_wire import POINT2, bytes_fields
 LINES = ImageAnnotations.POINTS_FIELD_NUMBER
 POINTS = PointsAnnotation.POINTS_FIELD_NUMBER
 TAG = POINTS << 3 | 2
+CORNER_PX = 0.5
 
 
 def read_polylines(message: memoryview) -> list[NDArray[np.float64]]:
@@ -36,7 +38,7 @@ def _points(line: memoryview) -> NDArray[np.float64]:
     after = start + count * POINT2.itemsize
     if after < len(line) and line[after] == TAG:  # a coordinate of 0 is left out by protobuf
         return _slowly(line)
-    return np.column_stack([found["x"][:count], found["y"][:count]])
+    return np.column_stack([found["x"][:count], found["y"][:count]]) - CORNER_PX
 
 
 def _slowly(line: memoryview) -> NDArray[np.float64]:
@@ -44,4 +46,4 @@ def _slowly(line: memoryview) -> NDArray[np.float64]:
         points = PointsAnnotation.FromString(bytes(line)).points
     except DecodeError as error:
         raise ValueError(f"a polyline is damaged ({error})") from error
-    return np.array([(point.x, point.y) for point in points]).reshape(-1, 2)
+    return np.array([(point.x, point.y) for point in points]).reshape(-1, 2) - CORNER_PX

@@ -9,6 +9,7 @@ Rotation: exact for any scene, except at the border, because a rotation about th
 a homography (Hartley and Zisserman 2004, section 8.4).
 """
 
+from dataclasses import replace
 from functools import lru_cache
 from statistics import NormalDist
 
@@ -40,7 +41,8 @@ def shift_lateral(image: NDArray[np.uint8], camera: CameraParameters, metres: fl
 
 def horizon_row(camera: CameraParameters) -> float:
     """Row of a level road's horizon, px from the centre of the first row."""
-    return float((camera.height - 1) / 2 - camera.focal_px * np.tan(np.radians(camera.pitch_deg)))
+    middle = camera.intrinsics()[1, 2]
+    return float(middle - camera.focal_px * np.tan(np.radians(camera.pitch_deg)))
 
 
 def shear_per_metre(camera: CameraParameters) -> float:
@@ -118,23 +120,13 @@ def rotation_homography(
     camera: CameraParameters, yaw: float, pitch: float = 0.0
 ) -> NDArray[np.float64]:
     """Homography (3, 3) of pixels when the car turns left by `yaw`, the camera down by `pitch`."""
-    focal = camera.focal_px
-    # Pixel centres have whole coordinates here, unlike in `CameraParameters.intrinsics`.
-    intrinsics = np.array(
-        [[focal, 0, (camera.width - 1) / 2], [0, focal, (camera.height - 1) / 2], [0, 0, 1]]
+    return camera.homography(
+        replace(
+            camera,
+            pitch_deg=camera.pitch_deg + float(np.degrees(pitch)),
+            yaw_deg=camera.yaw_deg + float(np.degrees(yaw)),
+        )
     )
-    cosine, sine = np.cos(yaw), np.sin(yaw)
-    # Camera frame: x right, y down, z ahead. After a turn to the left, what was ahead is right.
-    about_vertical = np.array([[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]])
-    tilt = np.radians(camera.pitch_deg)
-    rotation = _pitch_rotation(tilt + pitch) @ about_vertical @ _pitch_rotation(-tilt)
-    homography: NDArray[np.float64] = intrinsics @ rotation @ np.linalg.inv(intrinsics)
-    return homography
-
-
-def _pitch_rotation(down: float) -> NDArray[np.float64]:
-    cosine, sine = np.cos(down), np.sin(down)
-    return np.array([[1, 0, 0], [0, cosine, -sine], [0, sine, cosine]])
 
 
 def rotate_labels(

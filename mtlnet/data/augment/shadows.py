@@ -46,17 +46,17 @@ def shadow_masks(camera: CameraParameters) -> NDArray[np.uint8]:
 
 
 def road_points(camera: CameraParameters) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Point of a flat road that each pixel shows, (H, W) each: m ahead, m to the left.
+    """Point of a flat road that each pixel shows, (H, W) each: m ahead, m left of the camera.
 
     Pixels above the horizon or far away are more than `MAX_DISTANCE_M` ahead.
     """
-    focal = camera.focal_px
-    tilt = np.radians(camera.pitch_deg)
     rows, columns = np.mgrid[: camera.height, : camera.width].astype(np.float64)
-    down = (rows - (camera.height - 1) / 2) * np.cos(tilt) + focal * np.sin(tilt)
-    height = camera.height_above_road_m
-    depth = focal * height / np.maximum(down, focal * height / (2 * MAX_DISTANCE_M))
-    return depth, -(columns - (camera.width - 1) / 2) * depth / focal
+    pixels = np.column_stack([columns.ravel(), rows.ravel()])
+    ahead, left = (camera.road_points(pixels) - (camera.x, camera.y)).T
+    near = ahead < 2 * MAX_DISTANCE_M  # not NaN
+    ahead, left = np.where(near, ahead, 2 * MAX_DISTANCE_M), np.where(near, left, 0.0)
+    shape = rows.shape
+    return ahead.reshape(shape), left.reshape(shape)
 
 
 def _field(rng: np.random.Generator) -> NDArray[np.float32]:

@@ -2,8 +2,8 @@
 
 Body frame: x ahead, y to the left, z up, origin at the centre of gravity; a body pose is
 (x, y, z, roll, pitch, yaw) as PyBullet's Euler angles (R = Rz Ry Rx, pitch positive nose down).
-Image frame: pixels, origin at the top left corner, u to the right, v down; a pixel's centre is at
-half-integers. Square pixels, principal point in the middle.
+Image frame: pixels, u to the right, v down; a pixel's centre has whole coordinates. Pictures are
+drawn by a pinhole with square pixels and its principal point in the middle.
 """
 
 import math
@@ -65,7 +65,11 @@ def eye_of(camera: CameraParameters, body_pose: ArrayLike, view: str) -> Eye:
     if view not in _YAW_DEG:
         raise UserError(f"unknown camera view '{view}'; the views are {', '.join(VIEWS)}")
     body = rotation(float(pose[3]), float(pose[4]), yaw)
-    turn = rotation(0.0, math.radians(camera.pitch_deg), math.radians(_YAW_DEG[view]))
+    turn = rotation(
+        math.radians(camera.roll_deg),
+        math.radians(camera.pitch_deg),
+        math.radians(camera.yaw_deg + _YAW_DEG[view]),
+    )
     return _eye(pose[:3] + body @ np.array([camera.x, camera.y, camera.z]), body @ turn)
 
 
@@ -131,8 +135,8 @@ def clip_matrix(eye: Eye, matrix: FloatArray, width: int, height: int) -> FloatA
 
 def frustum(eye: Eye, matrix: FloatArray) -> FloatArray:
     """Inward unit normals (4, 3) of the side planes through the eye."""
-    half_x = matrix[0, 2] / matrix[0, 0]
-    half_y = matrix[1, 2] / matrix[1, 1]
+    half_x = (matrix[0, 2] + 0.5) / matrix[0, 0]
+    half_y = (matrix[1, 2] + 0.5) / matrix[1, 1]
     long_x, long_y = math.hypot(half_x, 1.0), math.hypot(half_y, 1.0)
     sides = np.array(
         [

@@ -32,7 +32,7 @@ def line(aside: float, angle: float = 0.0) -> NDArray[np.float64]:
     the road sees it from 1.2 m: pixels (n, 2), from near to far."""
     ahead = np.arange(1.0, 60.0)
     right = (aside - ahead * np.sin(angle)) / np.cos(angle)
-    return np.column_stack([140 + FOCAL * right / ahead, 105 + FOCAL * 1.2 / ahead])
+    return np.column_stack([139.5 + FOCAL * right / ahead, 104.5 + FOCAL * 1.2 / ahead])
 
 
 def marked(aside: float, angle: float) -> NDArray[np.uint8]:

@@ -52,7 +52,7 @@ def test_polylines_consist_of_consecutive_visible_points(view: str, angle: float
         for s in np.arange(start, end + STEP_M / 2, STEP_M):
             at = road.track.at(150.0 + s, y)
             ((u, v),), (depth,) = eye.project([[at.x, at.y, at.z]], pose, view)
-            if depth > 0.24 and -140.0 < u < 420.0 and -140.0 < v < 350.0:
+            if depth > 0.24 and -140.5 < u < 419.5 and -140.5 < v < 349.5:
                 run.append((u, v))
                 continue
             expected += [run] if len(run) >= 2 else []
