@@ -167,6 +167,7 @@ def evaluate_command(
     page: options.ReportPage = None,
     worst: options.WorstSheet = None,
     every: options.EveryFrame = 1,
+    copies: options.Copies = "",
     engine: options.EngineKind = "openvino",
     precision: options.Precision = None,
     as_json: options.Json = False,
@@ -177,7 +178,12 @@ def evaluate_command(
     from rich.console import Console
 
     from mtlnet.evaluation.evaluate import evaluate
-    from mtlnet.evaluation.tables import evaluation_table, group_table, uncertainty_table
+    from mtlnet.evaluation.tables import (
+        evaluation_table,
+        group_table,
+        picture_table,
+        uncertainty_table,
+    )
 
     _print_model(model)
     # Several engines of one thread each take more frames a second than one engine on all cores.
@@ -188,7 +194,7 @@ def evaluate_command(
         def report(done: int, total: int) -> None:
             bar.update(task, completed=done, total=total)
 
-        result = evaluate(engines, data, split, report, page, every, worst)
+        result = evaluate(engines, data, split, report, page, every, worst, copies)
     if page is not None:
         typer.echo(f"report: {result['page']}", err=True)
     if as_json:
@@ -196,6 +202,8 @@ def evaluate_command(
         return
     console = Console()
     console.print(evaluation_table(result))
+    if "pictures" in result:
+        console.print(picture_table(result))
     if "by_track" in result:
         console.print(group_table(result))
     if "uncertainty" in result:

@@ -144,6 +144,13 @@ ReportPage = Annotated[
     Path | None, typer.Option("--report", help="HTML page to write: a file, or a folder.")
 ]
 EveryFrame = Annotated[int, typer.Option(help="Evaluate every n-th frame only.")]
+Copies = Annotated[
+    str,
+    typer.Option(
+        help="Judge each picture of labels.csv also as copies: mirrored, turned (by 0.06 rad to "
+        "either side), or both with a comma between them."
+    ),
+]
 WorstSheet = Annotated[
     Path | None, typer.Option("--worst", help="JPEG to write: the frames of the largest errors.")
 ]

@@ -52,6 +52,8 @@ class CustomImages:
     """Of `mtlnet.data.picture_copies.COPIES`."""
     hashes: tuple[str, ...]
     """SHA-256 of each picture's file."""
+    camera: CameraParameters
+    """The model's."""
     refused: tuple[tuple[LabelledPicture, str, str], ...] = ()
     """Picture, copy and reason of each that shows too little of the model's view."""
 
@@ -68,6 +70,7 @@ class CustomImages:
             self.images[rows],
             self.content_hash,
             *(tuple(column[i] for i in chosen) for column in columns),  # type: ignore[arg-type]
+            self.camera,
             self.refused,
         )
 
@@ -168,6 +171,7 @@ def open_custom_images(
         tuple(lenses),
         tuple(copy for _, copy, _ in kept),
         tuple(found for _, _, found in kept),
+        camera,
         tuple(refused),
     )
 
