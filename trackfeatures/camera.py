@@ -68,7 +68,7 @@ class CameraParameters:
             object.__setattr__(self, "matrix", matrix)
             fov_y_deg = degrees(2 * atan(self.height / 2 / matrix[1]))
             object.__setattr__(self, "fov_y_deg", fov_y_deg)
-        if self.distortion not in COEFFICIENTS:
+        if self.distortion not in tuple(COEFFICIENTS):  # it may be of any type
             kinds = ", ".join(COEFFICIENTS)
             raise CameraError(f"the distortion is {self.distortion!r}; give one of {kinds}")
         counts = COEFFICIENTS[self.distortion]

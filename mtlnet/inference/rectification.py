@@ -1,48 +1,47 @@
 """Images of another camera as the model's camera would take them, and answers in metres again.
 
-A homography turns an image to the pitch and the focal length of the model's camera: exact for any
-scene, since the eye stays where it is (Hartley and Zisserman 2004, section 8.4). What the image
-does not show is grey, as in half of the training images. A camera at another height sees a flat
-road enlarged: what is answered for it in metres is scaled by the ratio of the heights.
+Each pixel of the model's view is looked up where the other camera, with its lens and its mount,
+sees the same direction of the car's frame: exact for any scene, since the eye stays where it is
+(Hartley and Zisserman 2004, section 8.4). So the picture has the heading of the car, however the
+camera is turned in it. What the camera does not show is grey, as in training. A camera at another
+height sees a flat road enlarged: what is answered for it in metres is scaled by the ratio of the
+heights.
 """
 
-from dataclasses import dataclass, fields, replace
-from math import cos, isfinite, radians, sin
-from pathlib import Path
-from typing import Any
+from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import cv2
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
 import trackfeatures as tf
 from mtlnet.inference.image_decoding.errors import Fault, ImageError
 from mtlnet.inference.prediction import split_outputs
-from trackfeatures.camera import CameraError, CameraParameters
+from runtime.camera_file import read_camera as read_camera  # scripts import it from here
+from trackfeatures.camera import CameraParameters
 from trackfeatures.coding import OFFSET, SPAN
-from trackfeatures.errors import UserError
 
 CAMERA_FILE = "camera.yaml"
-HEIGHT = "height_above_road_m"
-KEYS = (*(field.name for field in fields(CameraParameters)), HEIGHT)
-SIDES = ("top", "bottom", "left", "right")
-MAX_BORDER = (0.3, 0.3, 0.25, 0.25)
-"""Shares of the model's rows and columns that an image need not show, at each of `SIDES`.
-
-In half of the training images as much is hidden at most. A camera with half of the field of view
-leaves a quarter of the width empty on each side."""
+LEAST_SHOWN = 0.25
+"""Share of the model's rows, and of its columns, that an image must show."""
+LEAST_ROAD = 0.1
+"""Share of the model's rows below the horizon that an image must show."""
 BORDER_LEVEL = 128
 """Grey level of what an image does not show: nearly 0 to the network, as its padding."""
 TOLERANCE = 0.01
-MAX_PITCH_DEG = 30.0
+OUTSIDE = -1e4  # of every image, px
+KEPT_MAPS = 16
+
+Metres = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Rectification:
     """From the images of one camera to those of another, at the same place of the car or not.
 
-    `source` took the images, at any size of its aspect ratio; `target` is the model's camera.
+    `source` took the images, at any size of its aspect ratio; `target`, without distortion, is the
+    model's camera.
     """
 
     source: CameraParameters
@@ -77,117 +76,106 @@ class Rectification:
         if ratio < 1:  # averaged first: sampling alone would leave out pixels
             size = (max(round(width * ratio), 1), max(round(height * ratio), 1))
             image = cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.uint8)
-        to_source = self._homography(image.shape[1], image.shape[0])
-        self._require_shown(to_source, image.shape[1], image.shape[0])
-        grey = (BORDER_LEVEL,) * 3
-        found = cv2.warpPerspective(
-            image,
-            to_source,
-            (target.width, target.height),
-            flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
-            borderMode=cv2.BORDER_CONSTANT,
-            borderValue=grey,
-        )
+        seen = source.resized(image.shape[1], image.shape[0])
+        self._require_shown(seen)
+        border = {"borderMode": cv2.BORDER_CONSTANT, "borderValue": (BORDER_LEVEL,) * 3}
+        if seen.distortion == "none":
+            found = cv2.warpPerspective(
+                image,
+                target.homography(seen),
+                (target.width, target.height),
+                flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+                **border,
+            )
+        else:
+            coarse, fine = _fixed_maps(seen, target)
+            found = cv2.remap(image, coarse, fine, cv2.INTER_LINEAR, **border)
         return found.astype(np.uint8, copy=False)
 
-    def _homography(self, width: int, height: int) -> NDArray[np.float64]:
-        """From pixels of the target to those of a source image so large (3, 3)."""
-        source, target = self.source, self.target
-        # Pixel centres have whole coordinates.
-        focal = np.array([width / source.width, height / source.height]) * source.focal_px
-        seen = np.array(
-            [[focal[0], 0, (width - 1) / 2], [0, focal[1], (height - 1) / 2], [0, 0, 1]]
-        )
-        given = np.array(
-            [
-                [target.focal_px, 0, (target.width - 1) / 2],
-                [0, target.focal_px, (target.height - 1) / 2],
-                [0, 0, 1],
-            ]
-        )
-        down = radians(source.pitch_deg - target.pitch_deg)
-        turn = np.array([[1, 0, 0], [0, cos(down), -sin(down)], [0, sin(down), cos(down)]])
-        homography: NDArray[np.float64] = seen @ turn @ np.linalg.inv(given)
-        return homography
-
-    def _require_shown(self, to_source: NDArray[np.float64], width: int, height: int) -> None:
-        """Raise ImageError when too much of the target's middle row or column is not shown."""
-        rows, columns = self.target.height, self.target.width
-        down = np.stack([np.full(rows, (columns - 1) / 2), np.arange(rows), np.ones(rows)])
-        across = np.stack([np.arange(columns), np.full(columns, (rows - 1) / 2), np.ones(columns)])
-        hidden: list[float] = []
-        for points in (down, across):
-            u, v, depth = to_source @ points
-            inside = (depth > 0) & (np.abs(u / depth - (width - 1) / 2) <= width / 2)
-            inside &= np.abs(v / depth - (height - 1) / 2) <= height / 2
-            shown = np.flatnonzero(inside) if inside.any() else np.array([len(inside)])
-            hidden += [shown[0] / len(inside), 1 - (shown[-1] + 1) / len(inside)]
-        for share, most, side in zip(hidden, MAX_BORDER, SIDES, strict=True):
-            if share > most + TOLERANCE:
+    def _require_shown(self, seen: CameraParameters) -> None:
+        """Raise ImageError when too little of the target's view is shown."""
+        rows, columns, road = shown_shares(seen, self.target)
+        for share, least, what in (
+            (rows, LEAST_SHOWN, "rows"),
+            (columns, LEAST_SHOWN, "columns"),
+            (road, LEAST_ROAD, "rows below the horizon"),
+        ):
+            if share < least - TOLERANCE:
                 raise ImageError(
                     Fault.FIELD_OF_VIEW,
-                    f"the image does not show {share:.0%} of the model's view ({self.target}) at "
-                    f"the {side}, at most {most:.0%} may be missing; use a wider lens, or one that "
-                    "looks along the road",
+                    f"the image shows {share:.0%} of the {what} of the model's view "
+                    f"({self.target}), at least {least:.0%} must be shown; use a wider lens, or "
+                    "one that looks along the road",
                 )
 
     def outputs(self, outputs: NDArray[np.float32]) -> NDArray[np.float32]:
         """A model's outputs (N, 9 to 22) for rectified images, for the car of the source.
 
-        Distances and their standard deviations change; what is absent stays so.
+        Distances and their standard deviations change, which hold that of the source's height too;
+        what is absent stays so. The angle needs no change: the rectified view looks along the car.
         """
         changed = outputs.copy()
         parts = split_outputs(changed)
         distances, angle = tf.decode(parts.coded)
-        beside_camera = distances - self.target.x * np.sin(angle)[:, None]
-        beside_camera += self.target.y * np.cos(angle)[:, None]
-        moved = self.scale * beside_camera + self.source.x * np.sin(angle)[:, None]
-        moved -= self.source.y * np.cos(angle)[:, None]
-        spans = [tf.RANGES[name] for name in tf.MARKINGS]
-        low = np.array([span.lo for span in spans])
-        width = np.array([span.hi for span in spans]) - low
-        coded = OFFSET + SPAN * (moved - low) / width
+        beside_camera = self.scale * (distances + _aside(self.target, angle))
+        moved = beside_camera - _aside(self.source, angle)
+        coded = OFFSET + SPAN * (moved - _LOW) / _WIDTH
         parts.coded[:, :-1] = np.where(np.isnan(moved), parts.coded[:, :-1], coded)
         if parts.std is not None:
-            parts.std[:, :-1] *= np.float32(self.scale)
+            # d(distance) / d(log height) is the distance beside the camera.
+            from_height = self.source.height_std * np.column_stack(
+                [beside_camera, tf.localise(beside_camera)]
+            )
+            own = self.scale * parts.std[:, :-1]
+            parts.std[:, :-1] = np.hypot(own, np.nan_to_num(from_height))
         return changed
 
+    def labels(self, distances: NDArray[np.float32], angle: NDArray[np.float32]) -> Metres:
+        """Distances (N, 5) in m as the model has to answer them for rectified images, NaN where
+        absent, of cars of the source with `distances` and `angle` (N,) rad: `outputs` turned
+        round."""
+        beside_camera = distances + _aside(self.source, angle)
+        found: Metres = beside_camera / self.scale - _aside(self.target, angle)
+        return found
 
-def read_camera(path: Path, model: CameraParameters) -> CameraParameters:
-    """The camera that a YAML file describes; what it leaves out is as in the model's camera.
 
-    Keys: those of `CameraParameters`, and `height_above_road_m` in place of `z`. Raises UserError.
-    """
-    try:
-        found: Any = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        reason = getattr(error, "strerror", None) or " ".join(str(error).split())
-        raise UserError(f"{path} cannot be read as a camera: {reason}") from error
-    if not isinstance(found, dict) or not found:
-        raise UserError(f"{path} describes no camera; give some of {', '.join(KEYS)}")
-    unknown = [str(key) for key in found if key not in KEYS]
-    if unknown:
-        raise UserError(f"{path} has the unknown key {unknown[0]!r}; known are {', '.join(KEYS)}")
-    if HEIGHT in found and "z" in found:
-        raise UserError(f"{path} gives both z and {HEIGHT}; leave one out")
-    for key, value in found.items():
-        whole = key in ("width", "height")
-        if isinstance(value, bool) or not isinstance(value, int if whole else int | float):
-            kind = "a whole number of pixels" if whole else "a number"
-            raise UserError(f"{path}: {key} is {value!r}; give {kind}")
-    values: dict[str, Any] = dict(found)
-    if (height := values.pop(HEIGHT, None)) is not None:
-        values["z"] = height - CameraParameters.cg_height_m
-    try:
-        camera = replace(model, **values)
-    except CameraError as error:
-        raise UserError(f"{path}: {error}") from error
-    finite = all(map(isfinite, (camera.x, camera.y, camera.z)))
-    if min(camera.width, camera.height) < 1 or not (finite and camera.height_above_road_m > 0):
-        raise UserError(f"{path}: a camera of {camera} is impossible; give sizes above 0")
-    if not abs(camera.pitch_deg) <= MAX_PITCH_DEG:
-        raise UserError(
-            f"{path}: pitch_deg is {camera.pitch_deg:g}; give "
-            f"{-MAX_PITCH_DEG:g} to {MAX_PITCH_DEG:g}"
-        )
-    return camera
+_LOW = np.array([tf.RANGES[name].lo for name in tf.MARKINGS])
+_WIDTH = np.array([tf.RANGES[name].hi for name in tf.MARKINGS]) - _LOW
+
+
+def _aside(camera: CameraParameters, angle: NDArray[np.floating]) -> Metres:
+    """How far left of the centre of gravity, across the road, a camera is (N, 1), m, on cars that
+    point `angle` (N,) rad to the right of the road."""
+    left: Metres = camera.y * np.cos(angle) - camera.x * np.sin(angle)
+    return left[:, None]
+
+
+@lru_cache(maxsize=KEPT_MAPS)
+def _maps(source: CameraParameters, target: CameraParameters) -> NDArray[np.float32]:
+    """The source's pixel (2, H, W) of each pixel of the target; `OUTSIDE` where it sees nothing."""
+    columns, rows = np.meshgrid(np.arange(target.width), np.arange(target.height))
+    rays = target.rays(np.column_stack([columns.ravel(), rows.ravel()]))
+    places = rays @ target.rotation() + (source.x, source.y, source.z)
+    found = source.project(places).T.reshape(2, target.height, target.width)
+    return np.nan_to_num(found, nan=OUTSIDE).astype(np.float32)
+
+
+@lru_cache(maxsize=KEPT_MAPS)
+def _fixed_maps(
+    source: CameraParameters, target: CameraParameters
+) -> tuple[NDArray[np.int16], NDArray[np.uint16]]:
+    """`_maps` as OpenCV's fixed-point maps."""
+    coarse, fine = cv2.convertMaps(*_maps(source, target), cv2.CV_16SC2)
+    return coarse.astype(np.int16, copy=False), fine.astype(np.uint16, copy=False)
+
+
+@lru_cache(maxsize=KEPT_MAPS)
+def shown_shares(source: CameraParameters, target: CameraParameters) -> tuple[float, float, float]:
+    """Shares of the target's rows, its columns, and its rows below a level road's horizon of which
+    the source shows anything."""
+    u, v = _maps(source, target)
+    inside = (u >= -0.5) & (u <= source.width - 0.5) & (v >= -0.5) & (v <= source.height - 0.5)
+    rows, columns = inside.any(1), inside.any(0)
+    middle = [[(target.width - 1) / 2, row] for row in range(target.height)]
+    below = ~np.isnan(target.road_points(middle)[:, 0])
+    return float(rows.mean()), float(columns.mean()), float(rows[below].mean())

@@ -22,7 +22,7 @@ from mtlnet.data.augment.geometric import (
 )
 from mtlnet.data.augment.photometric import add_noise, blur, compress, draw_colour_transforms
 from mtlnet.data.augment.shadows import SHADOWS, add_shadow
-from mtlnet.inference.rectification import BORDER_LEVEL, MAX_BORDER
+from mtlnet.inference.rectification import BORDER_LEVEL
 from trackfeatures.camera import CameraParameters
 
 # Shares of the images. Small: in a run of an hour the network sees each frame about five times, and
@@ -30,6 +30,8 @@ from trackfeatures.camera import CameraParameters
 SHIFT_SHARE, ROTATION_SHARE, SHADOW_SHARE, PATCH_SHARE = 0.3, 0.3, 0.15, 0.125
 BLUR_SHARE, NOISE_SHARE, JPEG_SHARE = 0.08, 0.12, 0.0625
 BORDER_SHARE = 0.5
+MAX_BORDER = (0.3, 0.3, 0.25, 0.25)
+"""Shares of rows and columns without a picture at the top, bottom, left and right, at most."""
 MAX_PATCH_SIDE = 0.3  # relative to the image's sides
 BLUR_STD_PX, NOISE_STD, JPEG_QUALITY = (0.4, 1.4), (2.0, 12.0), (25, 90)
 

@@ -98,12 +98,122 @@ def test_answers_are_metres_beside_the_car_of_the_other_camera() -> None:
     np.testing.assert_allclose(answered[0, 9], 0.1)  # unchanged
 
 
-def test_an_image_that_shows_too_little_or_has_another_shape_is_refused() -> None:
-    narrow = Rectification(replace(MODEL, fov_y_deg=20.0), MODEL)
-    with pytest.raises(ImageError, match=r"does not show 3[67]% .* at the top, at most 30%"):
-        narrow.image(np.zeros((420, 560, 3), np.uint8))
-    upwards = Rectification(replace(MODEL, pitch_deg=-29.0), MODEL)
-    with pytest.raises(ImageError, match=r"at the bottom, .*looks along the road"):
+LENSES = {
+    "barrel": {"distortion": "opencv", "coefficients": (-0.3, 0.1, 0.001, -0.0005)},
+    "fisheye": {"distortion": "fisheye", "coefficients": (-0.02, 0.004, -0.001, 0.0)},
+    "pinhole": {},
+}
+
+
+def mounted(lens: str) -> CameraParameters:
+    """A camera off the middle, turned about all axes, principal point and pixels off square."""
+    return CameraParameters(
+        960, 600, matrix=(520.0, 500.0, 500.0, 280.0), x=1.4, y=0.3, z=1.15, pitch_deg=3.0,
+        roll_deg=-4.0, yaw_deg=8.0, **LENSES[lens],
+    )  # fmt: skip
+
+
+def lane_picture(
+    camera: CameraParameters, markings: tuple[float, float], angle: float
+) -> NDArray[np.uint8]:
+    """A picture of two markings 0.2 m wide, m to the right of a car that points `angle` rad to the
+    right of a straight flat road."""
+    columns, rows = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
+    ahead, left = camera.road_points(np.column_stack([columns.ravel(), rows.ravel()])).T
+    right = ahead * np.sin(angle) - left * np.cos(angle)  # of the car, across the road
+    near = np.min([np.abs(right - each) for each in markings], axis=0) < 0.1
+    picture = np.where(near & (ahead < 40), 250, 20).astype(np.uint8)
+    return np.repeat(picture.reshape(camera.height, camera.width, 1), 3, 2)
+
+
+def answered_lane(picture: NDArray[np.uint8]) -> tuple[list[float], float]:
+    """Distances and angle as a model answers them that takes every picture for one of its own."""
+    weight = np.clip(picture[..., 0].astype(float) - 130.0, 0.0, None)
+    weight[MODEL.height // 2 + 60 :] = 0.0
+    rows, columns = np.nonzero(weight > 60)
+    ahead, left = MODEL.road_points(np.column_stack([columns, rows])).T
+    chosen = ahead < 12
+    lines = []
+    for side in (left > 0, left < 0):
+        slope, offset = np.polyfit(ahead[chosen & side], left[chosen & side], 1)
+        lines.append((-offset / np.hypot(1, slope), np.arctan(slope)))
+    return [lines[0][0], lines[1][0]], float(np.mean([angle for _, angle in lines]))
+
+
+@pytest.mark.parametrize("lens", LENSES)
+@pytest.mark.parametrize("angle", [0.0, 0.06])
+def test_a_turned_camera_gives_distances_and_angle_of_the_car(lens: str, angle: float) -> None:
+    """The picture is of a camera 8 degrees to the left; the answer is the car's all the same."""
+    camera = mounted(lens)
+    picture = Rectification(camera, MODEL).image(lane_picture(camera, (-1.6, 2.1), angle))
+    distances, found = answered_lane(picture)
+    assert found == pytest.approx(angle, abs=0.003)
+    answer = Rectification(camera, MODEL).outputs(outputs([*distances, *[np.nan] * 3], found))
+    np.testing.assert_allclose(tf.decode(answer[:, :6])[0][0, :2], [-1.6, 2.1], atol=0.02)
+
+
+@pytest.mark.parametrize("lens", LENSES)
+@pytest.mark.parametrize("size", [(960, 600), (480, 300)])
+def test_a_spot_is_where_the_rectified_view_sees_it(lens: str, size: tuple[int, int]) -> None:
+    camera = mounted(lens)
+    lens_of_size = camera.resized(*size)
+    rectification = Rectification(camera, MODEL)
+    columns, rows = np.meshgrid(np.arange(size[0]), np.arange(size[1]))
+    for place in ((9.0, 1.5, -0.25), (14.0, -2.0, 0.5), (25.0, 0.0, -0.25)):
+        u, v = lens_of_size.project([place])[0]
+        image = np.full((size[1], size[0], 3), 10, np.uint8)
+        image[(columns - u) ** 2 + (rows - v) ** 2 < (0.012 * size[0]) ** 2] = 250
+        weight = rectification.image(image)[..., 0].astype(float)
+        weight[(weight < 40) | (weight == BORDER_LEVEL)] = 0
+        weight[np.abs(weight - BORDER_LEVEL) < 30] = 0
+        found_rows, found_columns = np.indices(weight.shape)
+        expected = rectification.view.project([place])[0]
+        near = np.hypot(found_columns - expected[0], found_rows - expected[1]) < 12
+        weight *= near
+        assert weight.sum() > 200
+        centre = [(weight * found_columns).sum(), (weight * found_rows).sum()] / weight.sum()
+        np.testing.assert_allclose(centre, expected, atol=0.5)
+
+
+def test_the_heights_uncertainty_widens_distances() -> None:
+    """A height 5 % off puts a marking 2 m beside the camera 0.1 m off."""
+    other = CameraParameters(x=0.0, y=0.5, z=1.25, height_std=0.05)
+    target = replace(MODEL, x=0.0)
+    answered = outputs([-2.0 / 1.25, 1.0 / 1.25, np.nan, np.nan, np.nan], 0.0)
+    std = split_outputs(Rectification(other, target).outputs(answered)).std
+    assert std is not None
+    own = 0.125
+    beside = np.array(
+        [2.0, 1.0, 0.0, 0.0, 0.0, 0.5]
+    )  # m; the last: lane centre
+    np.testing.assert_allclose(std[0, :6], np.hypot(own, 0.05 * beside), rtol=1e-5)
+    assert std[0, 6] == pytest.approx(0.01)
+
+
+def test_labels_for_the_model_are_the_answers_turned_round() -> None:
+    lens = Rectification(mounted("barrel"), MODEL)
+    distances = np.array([[-1.7, 1.9, np.nan, np.nan, np.nan]], np.float32)
+    angle = np.array([0.07], np.float32)
+    wanted = lens.labels(distances, angle)
+    assert np.isnan(wanted[0, 2:]).all()
+    back = lens.outputs(outputs(wanted[0].tolist(), 0.07))
+    np.testing.assert_allclose(tf.decode(back[:, :6])[0][0, :2], [-1.7, 1.9], atol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["fov_y_deg", "yaw_deg"])
+def test_a_quarter_of_rows_or_columns_is_answered_less_is_refused(name: str) -> None:
+    """tan(9.6 deg) is a quarter of tan(33.75 deg). Turned aside by 25 degrees, a picture of 44.7
+    degrees to each side shows the model's 41.7 on one side and 19.7 on the other."""
+    values = {"fov_y_deg": (19.2, 17.0), "yaw_deg": (20.0, 75.0)}[name]
+    image = np.zeros((420, 560, 3), np.uint8)
+    assert Rectification(replace(MODEL, **{name: values[0]}), MODEL).image(image).shape[0] == 210
+    with pytest.raises(ImageError, match=r"shows \d+% of the (rows|columns) of .* at least 25%"):
+        Rectification(replace(MODEL, **{name: values[1]}), MODEL).image(image)
+
+
+def test_an_image_without_road_or_of_another_shape_is_refused() -> None:
+    upwards = Rectification(replace(MODEL, fov_y_deg=30.0, pitch_deg=-14.0), MODEL)
+    with pytest.raises(ImageError, match=r"rows below the horizon .*looks along the road"):
         upwards.image(np.zeros((210, 280, 3), np.uint8))
     with pytest.raises(ImageError, match="560 x 400 px, its camera gives 280 x 210"):
         Rectification(MODEL, MODEL).image(np.zeros((400, 560, 3), np.uint8))
