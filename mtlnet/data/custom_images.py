@@ -101,8 +101,8 @@ class CustomImages:
         distances = self.labels.distances.astype(np.float64)
         for row, lens in enumerate(self.lenses):
             if lens is not None:
-                angle = float(self.labels.angle[row])
-                distances[row] = beside_target(lens, distances[row], angle)
+                rows = slice(row, row + 1)
+                distances[rows] = lens.labels(distances[rows], self.labels.angle[rows])
                 _require_range(self.path / LABELS, self.pictures[row], lens, distances[row])
         labels = replace(self.labels, distances=distances.astype(np.float32))
         return replace(self, labels=labels)
@@ -195,17 +195,6 @@ def picture_cameras(
             camera = replace(camera or model, pitch_deg=picture.pitch_deg)
         found.append(camera)
     return found
-
-
-def beside_target(lens: Rectification, distances: Any, angle: float) -> NDArray[np.float64]:
-    """Distances (5,) in m as the model's camera sees them: `Rectification.outputs` undone.
-
-    Absent and unknown ones stay so.
-    """
-    source, target = lens.source, lens.target
-    at_camera = distances - source.x * np.sin(angle) + source.y * np.cos(angle)
-    moved = at_camera / lens.scale + target.x * np.sin(angle) - target.y * np.cos(angle)
-    return np.asarray(moved, np.float64)
 
 
 def _require_range(

@@ -25,6 +25,8 @@ from runtime.html import embed_jpeg, format_number, format_percent, render
 from trackfeatures.camera import CameraParameters
 
 WIDTH_PX = 400
+ALONG_M = np.geomspace(2.0, 35.0, 40)
+"""Where along the road markings are drawn."""
 TITLES = {
     "ml": "left (m)",
     "mr": "right (m)",
@@ -100,7 +102,8 @@ def _share_rows(figures: dict[str, Any]) -> Rows:
 
 def _within_rows(figures: dict[str, Any]) -> Iterator[list[str]]:
     for name, share in figures.get("within_std", {}).items():
-        yield [name, format_percent(share)]
+        if share is not None:
+            yield [name, format_percent(share)]
 
 
 def _groups(figures: dict[str, Any]) -> Iterator[dict[str, Any]]:
@@ -189,12 +192,12 @@ def _drawn(answers: Answers, case: Case) -> Image:
     answered, angle = tf.decode(answers.outputs[row : row + 1, :6])
     labels = images.labels
     for distances, heading, colour, thickness in (
-        (labels.distances[row], float(labels.angle[row]), TRUTH_COLOUR, 3),
-        (answered[0], float(angle[0]), PREDICTION_COLOUR, 1),
+        (labels.distances[row], float(labels.angle[row]), TRUTH_COLOUR, 2),
+        (answered[0], float(angle[0]), PREDICTION_COLOUR, 2),
     ):
         for distance in distances.tolist():
             if np.isfinite(distance):
-                line = marking_line(distance, heading, curvature)
+                line = marking_line(distance, heading, curvature, ALONG_M)
                 _draw_line(canvas, camera, line, colour, thickness)
     return canvas
 

@@ -6,6 +6,7 @@ Lengths in m, the angle in rad. Errors are those of answers that are there: what
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 import trackfeatures as tf
 from mtlnet.data.custom_images import CustomImages
 from mtlnet.data.labels_file import LabelledPicture
+from mtlnet.data.picture_copies import COPIES
 from mtlnet.evaluation.metrics import coverage, evaluate_outputs, signed_errors
 from mtlnet.inference.prediction import split_outputs
 
@@ -39,6 +41,12 @@ class Answers:
     """(N, 5), NaN where answered absent."""
     trained: frozenset[str]
     """SHA-256 of the files that the model was trained on."""
+
+    @cached_property
+    def trained_files(self) -> frozenset[str]:
+        """The files that the model was trained on."""
+        pairs = zip(self.images.pictures, self.images.hashes, strict=True)
+        return frozenset(picture.file for picture, found in pairs if found in self.trained)
 
     @property
     def errors(self) -> Numbers:
@@ -120,10 +128,7 @@ def group_of(answers: Answers, name: str, picture: LabelledPicture, copy: str) -
     if name == "by_copy":
         return copy
     if name == "by_training":
-        numbers = {p.file: i for i, p in enumerate(answers.images.pictures)}
-        row = numbers.get(picture.file)
-        seen = row is not None and answers.images.hashes[row] in answers.trained
-        return TRAINED if seen else NOT_TRAINED
+        return TRAINED if picture.file in answers.trained_files else NOT_TRAINED
     return (picture.drive if name == "by_drive" else picture.light) or UNNAMED
 
 
@@ -133,7 +138,8 @@ def _groups(answers: Answers, name: str) -> Iterator[tuple[str, dict[str, Any]]]
     of_case = {
         (picture.file, copy): group_of(answers, name, picture, copy) for picture, copy in cases
     }
-    for group in sorted({*of_case.values()}):
+    names = sorted({*of_case.values()})
+    for group in [copy for copy in COPIES if copy in names] or names:
 
         def within(picture: LabelledPicture, copy: str, group: str = group) -> bool:
             return of_case[picture.file, copy] == group

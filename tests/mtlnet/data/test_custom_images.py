@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import trackfeatures as tf
-from mtlnet.data.custom_images import CustomImages, beside_target, open_custom_images
+from mtlnet.data.custom_images import CustomImages, open_custom_images
 from mtlnet.data.labels_file import (
     MARKING_LIMITS_M,
     lane_cells,
@@ -239,9 +239,9 @@ def test_cameras_that_do_not_fit_are_refused(tmp_path: Path) -> None:
     write(tmp_path, GOOD + ",none.yaml", head=head)
     with pytest.raises(UserError, match=r"line 2: .*none\.yaml cannot be read as a camera"):
         open_custom_images(tmp_path, CameraParameters())
-    (tmp_path / "narrow.yaml").write_text("{width: 640, height: 360, fov_y_deg: 6}\n")
+    (tmp_path / "narrow.yaml").write_text("{width: 640, height: 360, fov_y_deg: 4}\n")
     write(tmp_path, GOOD + ",narrow.yaml", head=head)
-    with pytest.raises(UserError, match=r"line 2: .*does not show"):
+    with pytest.raises(UserError, match=r"line 2: .*the image shows"):
         open_custom_images(tmp_path, CameraParameters())
     (tmp_path / "low.yaml").write_text("{width: 640, height: 360, z: 0.15}\n")
     write(tmp_path, GOOD + ",low.yaml", head=head)
@@ -253,7 +253,7 @@ def test_cameras_that_do_not_fit_are_refused(tmp_path: Path) -> None:
 def test_refused_pictures_are_listed_where_they_are_counted(tmp_path: Path) -> None:
     picture(tmp_path / "a.png", 640, 360)
     picture(tmp_path / "b.png", 640, 360)
-    (tmp_path / "narrow.yaml").write_text("{width: 640, height: 360, fov_y_deg: 6}\n")
+    (tmp_path / "narrow.yaml").write_text("{width: 640, height: 360, fov_y_deg: 4}\n")
     (tmp_path / "wide.yaml").write_text("{width: 640, height: 360}\n")
     rows = (GOOD + ",narrow.yaml", GOOD.replace("a.png", "b.png") + ",wide.yaml")
     write(tmp_path, *rows, head=HEAD + ",camera")
