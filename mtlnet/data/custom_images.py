@@ -245,9 +245,7 @@ def _prepared(
         return error
 
 
-def _uncropped(
-    path: Path, image: NDArray[np.uint8], camera: CameraParameters
-) -> NDArray[np.uint8]:
+def _uncropped(path: Path, image: NDArray[np.uint8], camera: CameraParameters) -> NDArray[np.uint8]:
     """An image of the camera's aspect ratio, at its size.
 
     Unlike images for prediction it is not cropped: its labels belong to the whole image.

@@ -65,9 +65,7 @@ def copied_picture(
     return _turned(image, camera.resized(image.shape[1], image.shape[0]), TURNS_RAD[copy])
 
 
-def _turned(
-    image: NDArray[np.uint8], camera: CameraParameters, right: float
-) -> NDArray[np.uint8]:
+def _turned(image: NDArray[np.uint8], camera: CameraParameters, right: float) -> NDArray[np.uint8]:
     """The picture of a camera that is turned to its right about its own vertical, rad."""
     cosine, sine = np.cos(right), np.sin(right)
     turn = np.array([[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]])  # to the old directions

@@ -97,9 +97,7 @@ def open_training_dataset(path: Path) -> Dataset:
     return dataset
 
 
-def custom_training_data(
-    folder: Path, card: ModelCard | None, drives: str = ""
-) -> TrainingData:
+def custom_training_data(folder: Path, card: ModelCard | None, drives: str = "") -> TrainingData:
     """A user's own images, as the camera of the model `card` would take them; UserError without a
     model. `drives`: those to leave out, names with commas between them."""
     if card is None:

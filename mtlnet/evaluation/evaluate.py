@@ -43,7 +43,8 @@ def evaluate(
     `engines`: the same model, once for each thread. `report(done, all)` is called after each chunk
     of frames. `page`: an HTML file to write too, or its folder; `worst`: a JPEG of the frames with
     the largest errors. `every`: evaluate every n-th frame only; frames next to each other are much
-    alike. `copies`: of a user's own pictures, as `--copies`. Raises UserError when data and model do not fit.
+    alike. `copies`: of a user's own pictures, as `--copies`. Raises UserError when data and model
+    do not fit.
     """
     if every < 1:
         raise UserError(f"--every is {every}; give 1 for all frames, 5 for every fifth")

@@ -29,8 +29,7 @@ Numbers = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Answers:
-    """A model's answers on N labelled pictures; rows with an error or NaN for each of `FEATURES`.
-    """
+    """A model's answers on N labelled pictures."""
 
     images: CustomImages
     outputs: NDArray[np.float32]

@@ -64,12 +64,12 @@ def fit_markings(
     free = np.array([True, True, True, curvature is None, pitch_deg is None])
     sides = np.repeat([0, 1], [len(side) for side in points])
     pixels = np.concatenate(points)
-    pitches = [pitch_deg]
+    pitches: list[float]
     if pitch_deg is None:
         pitches = (_meeting_pitch(camera, *points) + PITCHES_DEG).tolist()
-    starts = [
-        np.array([-1.8, 1.8, 0.0, curvature or 0.0, pitch]) for pitch in pitches if pitch is not None
-    ]
+    else:
+        pitches = [pitch_deg]
+    starts = [np.array([-1.8, 1.8, 0.0, curvature or 0.0, pitch]) for pitch in pitches]
     # At one pitch the others follow almost linearly: so the search begins at the best pitch.
     inner = free & [True, True, True, True, False]
     found = [_refine(camera, pixels, sides, start, inner, steps=3) for start in starts]

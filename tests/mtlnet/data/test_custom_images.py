@@ -17,7 +17,6 @@ from mtlnet.data.labels_file import (
     write_cells,
 )
 from mtlnet.data.picture_copies import COPIES, copied_camera, copied_label, copied_picture
-from mtlnet.inference.rectification import Rectification
 from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
 
@@ -264,7 +263,7 @@ def test_refused_pictures_are_listed_where_they_are_counted(tmp_path: Path) -> N
 
 
 def test_copies_show_what_their_labels_say(tmp_path: Path) -> None:
-    """A painted point of the road, seen by the camera of each copy, lies where the copy shows it."""
+    """A painted point of the road lies in each copy where its camera and label say."""
     camera = CameraParameters(width=641, height=361, fov_y_deg=40, x=0.5, y=0.2, z=1.0, pitch_deg=2)
     write(tmp_path, GOOD)
     _, labels = read_labels(tmp_path / "labels.csv")

@@ -37,8 +37,8 @@ STD = 0.081
 @pytest.fixture
 def images(tmp_path: Path) -> CustomImages:
     (tmp_path / "labels.csv").write_text("\n".join([HEAD, *ROWS]) + "\n")
-    for name in "abc":
-        cv2.imwrite(str(tmp_path / f"{name}.png"), np.full((420, 560, 3), 90, np.uint8))
+    for level, name in enumerate("abc"):
+        cv2.imwrite(str(tmp_path / f"{name}.png"), np.full((420, 560, 3), 90 + level, np.uint8))
     return open_custom_images(tmp_path, CameraParameters())
 
 
@@ -99,7 +99,7 @@ def test_refused_pictures_count_in_their_groups(images: CustomImages) -> None:
     assert (figures["cases"], figures["refused"], figures["files"]) == (3, 1, 3)
     assert figures["by_drive"]["two"]["refused"] == figures["by_drive"]["two"]["cases"] == 1
     assert figures["by_drive"]["two"]["mean"]["ml"] is None
-    assert [case.verdict for case in cases(answers)][0] == "refused: too narrow"
+    assert next(case.verdict for case in cases(answers)) == "refused: too narrow"
 
 
 def test_the_page_shows_each_picture_failures_first(images: CustomImages, tmp_path: Path) -> None:

@@ -41,9 +41,7 @@ def test_markings_that_are_projected_are_read_back(camera: CameraParameters) -> 
     left, _ = marking_pixels(camera, MARKINGS, [7.0, 20.0])
     _, right = marking_pixels(camera, MARKINGS, [9.0, 33.0])
     found = fit_markings(camera, left, right, MARKINGS.curvature)
-    np.testing.assert_allclose(
-        [found.ml, found.mr, found.angle], [-1.62, 1.95, 0.031], atol=1e-3
-    )
+    np.testing.assert_allclose([found.ml, found.mr, found.angle], [-1.62, 1.95, 0.031], atol=1e-3)
     # ... and a third point of one side gives the curvature.
     left, _ = marking_pixels(camera, MARKINGS, [7.0, 20.0, 12.0])
     found = fit_markings(camera, left, right, None)
@@ -94,5 +92,5 @@ def test_points_that_are_no_markings_are_refused() -> None:
         fit_markings(camera, left[:1], right)
     with pytest.raises(MarkingsError, match="at or above the horizon"):
         fit_markings(camera, [[100.0, 300.0], [200.0, 20.0]], right, pitch_deg=1.5)
-    with pytest.raises(MarkingsError, match="do not meet ahead|meet where a|above the horizon"):
+    with pytest.raises(MarkingsError, match=r"do not meet ahead|meet where a|above the horizon"):
         fit_markings(camera, [[300.0, 300.0], [100.0, 250.0]], [[310.0, 300.0], [600.0, 250.0]])

@@ -147,7 +147,7 @@ def test_unknown_labels_are_trained_on_and_whole_drives_left_out(
         "not trained on": 4,
         "trained on": 2,
     }
-    with pytest.raises(UserError, match="--hold-out-drives has 'x'; the drives in .* 'drive 0', "):
+    with pytest.raises(UserError, match=r"--hold-out-drives has 'x'; the drives in .* 'drive 0', "):
         custom_training_data(custom_images, read_card(published), "drive 0,x")
     with pytest.raises(UserError, match="names all drives"):
         custom_training_data(custom_images, read_card(published), "drive 0,drive 1,drive 2")

@@ -131,7 +131,7 @@ def test_unknown_labels_have_no_loss_and_are_not_counted() -> None:
     losses.total.backward()  # type: ignore[no-untyped-call]  # torch leaves it untyped
     gradient = outputs.grad
     assert gradient is not None
-    assert gradient[0, 2:5].tolist() == gradient[1, :2].tolist() + [0.0] == [0.0] * 3
+    assert gradient[0, 2:5].tolist() == [*gradient[1, :2].tolist(), 0.0] == [0.0] * 3
     assert gradient[0, 6:].tolist() == [0.0] * 3
     assert float(gradient[0, 0]) == pytest.approx(2 * 0.1 * 10 / 5 / 2)
     # Known to nobody: 0, not NaN.
