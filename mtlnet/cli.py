@@ -261,6 +261,47 @@ def predict_command(
         raise left_out
 
 
+@app.command("label")
+def label_command(
+    folder: options.LabelFolderName,
+    camera: options.LabelCamera = None,
+    model: options.Model = "default",
+    no_model: options.NoModel = False,
+    host: options.LabelHost = "127.0.0.1",
+    port: options.LabelPort = 8010,
+    token_file: options.LabelToken = None,
+    insecure: options.LabelInsecure = False,
+    table: options.ImportTable = None,
+    label_std: options.LabelStdGiven = None,
+    as_json: options.Json = False,
+) -> None:
+    """Label pictures in the browser: drag the lane's two markings, metres and heading follow.
+
+    With --import: convert a table of labels, and copy its pictures to FOLDER.
+    """
+    from mtlnet.label.import_table import import_labels, parse_label_std
+    from runtime.access import check_exposure, read_token
+    from trackfeatures.errors import UserError
+
+    if table is not None:
+        found = import_labels(table, folder, parse_label_std(label_std or ()))
+        told = f"{found['pictures']} pictures of {found['cameras']} cameras in {folder}"
+        command.print_result(found, as_json, f"{told}; `mtlnet evaluate --data {folder}`")
+        return
+    if label_std:
+        raise UserError("--label-std belongs to --import; give both, or none")
+    token = read_token(token_file)
+    check_exposure(host, token, insecure)
+    from mtlnet.inference.model_card import read_card, resolve_run
+    from mtlnet.label.folder import LabelFolder
+    from mtlnet.label.server import Labeller, serve_folder
+
+    known = read_card(resolve_run(model)).camera
+    opened = LabelFolder(folder, camera, known)
+    engine = None if no_model else _load(model, "openvino", None)
+    serve_folder(Labeller(opened, engine), host, port, token)
+
+
 def _print_model(name: str) -> None:
     """Print on stderr the run folder that a model's name stands for."""
     from mtlnet.inference.model_card import resolve_run

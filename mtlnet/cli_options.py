@@ -191,3 +191,47 @@ FieldOfView = Annotated[
     float | None,
     typer.Option(help="Vertical field of view of images and films, degrees.  [default: model's]"),
 ]
+
+# Options of `label`.
+LabelFolderName = Annotated[
+    Path, typer.Argument(metavar="FOLDER", help="Folder with the pictures, and with labels.csv.")
+]
+LabelCamera = Annotated[
+    Path | None,
+    typer.Option(
+        "--camera",
+        help="The pictures' camera; copied to FOLDER/camera.yaml.  [default: FOLDER/camera.yaml]",
+    ),
+]
+NoModel = Annotated[
+    bool, typer.Option("--no-model", help="Begin with the middle of a lane, not with an answer.")
+]
+LabelHost = Annotated[
+    str, typer.Option("--host", help="Address to listen on; another than this machine's: a token.")
+]
+LabelPort = Annotated[
+    int, typer.Option("--port", help="Port to listen on; 0: any free one.", min=0, max=65535)
+]
+LabelToken = Annotated[
+    Path | None,
+    typer.Option(
+        "--token-file",
+        help="File with the token that the page asks for.  [default: $DRIVERVIEW_TOKEN]",
+    ),
+]
+LabelInsecure = Annotated[
+    bool,
+    typer.Option("--insecure", help="Allow a --host that other machines reach, without a token."),
+]
+ImportTable = Annotated[
+    Path | None,
+    typer.Option("--import", help="Table with x_left_m, x_right_m, heading_rad, ... to convert."),
+]
+LabelStdGiven = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--label-std",
+        help="With --import: standard deviation of the labels, METRES,RADIANS or "
+        "PATTERN=METRES,RADIANS of the files that match; may be given several times.",
+    ),
+]
