@@ -111,6 +111,7 @@ function draw() {
       ink.stroke();
     });
   }
+  canvas.dataset.handles = JSON.stringify(shown.handles); // for programs that drive the page
   if (drag) magnify(shown.handles[drag.side][drag.which]);
   const m = shown.markings, sign = (x, digits) => (x < 0 ? "" : "+") + x.toFixed(digits);
   $("numbers").textContent =
@@ -162,9 +163,10 @@ canvas.addEventListener("pointermove", (event) => {
 });
 
 for (const kind of ["pointerup", "pointercancel"]) canvas.addEventListener(kind, async () => {
-  if (!drag) return;
+  const held = drag;
+  if (!held) return;
   await fit();
-  drag = null;
+  if (drag === held) drag = null; // else the next one has begun
   draw();
 });
 
@@ -172,10 +174,11 @@ for (const kind of ["pointerup", "pointercancel"]) canvas.addEventListener(kind,
 async function fit() {
   if (busy) { again = true; return waiting; }
   busy = true;
+  document.body.dataset.busy = "1";
   waiting = (async () => {
     try {
       do { again = false; await fitOnce(); } while (again);
-    } finally { busy = false; }
+    } finally { busy = false; document.body.dataset.busy = ""; }
   })();
   return waiting;
 }
