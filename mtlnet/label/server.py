@@ -294,6 +294,8 @@ def serve_folder(labeller: Labeller, host: str, port: int, token: str | None) ->
     app = create_app(labeller, names, token)
     with locked_folder(labeller.folder.folder):
         listeners = bind_all(host, port)
+        for listener in listeners:  # the address is printed: from now on it answers
+            listener.listen()
         where = address(listeners[0], host)
         hint = "" if token is None else "#TOKEN"
         sys.stderr.write(
