@@ -63,15 +63,14 @@ class CustomImages:
     def take(self, rows: Any) -> "CustomImages":
         """Some of the pictures, by their numbers or a slice."""
         chosen = np.arange(len(self))[rows].tolist()
-        columns = (self.pictures, self.lenses, self.copies, self.hashes)
-        return CustomImages(
-            self.path,
-            self.labels.take(chosen),
-            self.images[rows],
-            self.content_hash,
-            *(tuple(column[i] for i in chosen) for column in columns),  # type: ignore[arg-type]
-            self.camera,
-            self.refused,
+        return replace(
+            self,
+            labels=self.labels.take(chosen),
+            images=self.images[rows],
+            pictures=tuple(self.pictures[i] for i in chosen),
+            lenses=tuple(self.lenses[i] for i in chosen),
+            copies=tuple(self.copies[i] for i in chosen),
+            hashes=tuple(self.hashes[i] for i in chosen),
         )
 
     def every(self, count: int) -> "CustomImages":
@@ -98,13 +97,13 @@ class CustomImages:
 
         Raises UserError that names the line of a label that the network cannot express there.
         """
-        distances = self.labels.distances.astype(np.float64)
+        distances = self.labels.distances.copy()
         for row, lens in enumerate(self.lenses):
             if lens is not None:
                 rows = slice(row, row + 1)
                 distances[rows] = lens.labels(distances[rows], self.labels.angle[rows])
                 _require_range(self.path / LABELS, self.pictures[row], lens, distances[row])
-        labels = replace(self.labels, distances=distances.astype(np.float32))
+        labels = replace(self.labels, distances=distances)
         return replace(self, labels=labels)
 
 
@@ -198,7 +197,7 @@ def picture_cameras(
 
 
 def _require_range(
-    path: Path, picture: LabelledPicture, lens: Rectification, distances: NDArray[np.float64]
+    path: Path, picture: LabelledPicture, lens: Rectification, distances: NDArray[np.float32]
 ) -> None:
     for marking, value in zip(tf.MARKINGS, distances.tolist(), strict=True):
         low, high = tf.RANGES[marking].lo, tf.RANGES[marking].hi

@@ -241,7 +241,9 @@ def _summary(data: dict[str, Any]) -> dict[str, Any]:
 def _with_seen(about: dict[str, Any], earlier: dict[str, Any]) -> dict[str, Any]:
     """The description `about` with the rounds and tracks of `earlier` as seen, too."""
     names = [name for name in ("seeds", "tracks", "pictures") if name in about or name in earlier]
-    seen = {name: sorted({*about.get(name, ()), *earlier.get(name, ())}) for name in names}
+    seen: dict[str, Any] = {
+        name: sorted({*about.get(name, ()), *earlier.get(name, ())}) for name in names
+    }
     return {**about, **seen}
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 import trackfeatures as tf
 from mtlnet.data.custom_images import CustomImages, open_custom_images
@@ -283,12 +284,13 @@ def test_copies_show_what_their_labels_say(tmp_path: Path) -> None:
 
 def _marking_pixel(
     camera: CameraParameters, distance: float, angle: float, along: float
-) -> np.ndarray:
+) -> NDArray[np.float64]:
     """Where a straight marking `distance` m to the right lies `along` m ahead of the camera."""
     along += camera.x * np.cos(angle) - camera.y * np.sin(angle)
     ahead = along * np.cos(angle) + distance * np.sin(angle)
     left = along * np.sin(angle) - distance * np.cos(angle)
-    return camera.project([[ahead, left, -camera.cg_height_m]])[0]
+    found: NDArray[np.float64] = camera.project([[ahead, left, -camera.cg_height_m]])[0]
+    return found
 
 
 @pytest.mark.parametrize("rectified", [False, True])

@@ -77,5 +77,5 @@ def test_faulty_tables_and_options_are_refused(tmp_path: Path) -> None:
         import_labels(path, tmp_path / "mine")
     with pytest.raises(UserError, match="names no pictures"):
         import_labels(table(tmp_path / "theirs", head=HEAD), tmp_path / "mine")
-    with pytest.raises(UserError, match="--label-std is '0.06'; give METRES,RADIANS"):
+    with pytest.raises(UserError, match=r"--label-std is '0.06'; give METRES,RADIANS"):
         parse_label_std(["0.06"])
