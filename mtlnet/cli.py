@@ -43,6 +43,7 @@ def train_command(
     device: options.TrainDevice = None,
     threads: options.TrainThreads = None,
     skip_undecodable: options.SkipUndecodable = False,
+    hold_out_drives: options.HoldOutDrives = None,
     resume: options.Resume = False,
     change_data: options.ChangeData = False,
     as_json: options.Json = False,
@@ -67,6 +68,7 @@ def train_command(
         "device": device,
         "threads": threads,
         "skip_undecodable": skip_undecodable or None,
+        "hold_out_drives": hold_out_drives,
         "change_data": change_data or None,
     }
     chosen = {name: value for name, value in given.items() if value is not None}
@@ -165,6 +167,7 @@ def evaluate_command(
     page: options.ReportPage = None,
     worst: options.WorstSheet = None,
     every: options.EveryFrame = 1,
+    copies: options.Copies = "",
     engine: options.EngineKind = "openvino",
     precision: options.Precision = None,
     as_json: options.Json = False,
@@ -175,7 +178,12 @@ def evaluate_command(
     from rich.console import Console
 
     from mtlnet.evaluation.evaluate import evaluate
-    from mtlnet.evaluation.tables import evaluation_table, group_table, uncertainty_table
+    from mtlnet.evaluation.tables import (
+        evaluation_table,
+        group_table,
+        picture_table,
+        uncertainty_table,
+    )
 
     _print_model(model)
     # Several engines of one thread each take more frames a second than one engine on all cores.
@@ -186,7 +194,7 @@ def evaluate_command(
         def report(done: int, total: int) -> None:
             bar.update(task, completed=done, total=total)
 
-        result = evaluate(engines, data, split, report, page, every, worst)
+        result = evaluate(engines, data, split, report, page, every, worst, copies)
     if page is not None:
         typer.echo(f"report: {result['page']}", err=True)
     if as_json:
@@ -194,6 +202,8 @@ def evaluate_command(
         return
     console = Console()
     console.print(evaluation_table(result))
+    if "pictures" in result:
+        console.print(picture_table(result))
     if "by_track" in result:
         console.print(group_table(result))
     if "uncertainty" in result:
@@ -284,6 +294,47 @@ def calibrate_command(
             config, lambda done, total: bar.update(task, completed=int(done), total=int(total))
         )
     command.print_result(result, as_json, f"{out}: {line}")
+
+
+@app.command("label")
+def label_command(
+    folder: options.LabelFolderName,
+    camera: options.LabelCamera = None,
+    model: options.Model = "default",
+    no_model: options.NoModel = False,
+    host: options.LabelHost = "127.0.0.1",
+    port: options.LabelPort = 8010,
+    token_file: options.LabelToken = None,
+    insecure: options.LabelInsecure = False,
+    table: options.ImportTable = None,
+    label_std: options.LabelStdGiven = None,
+    as_json: options.Json = False,
+) -> None:
+    """Label pictures in the browser: drag the lane's two markings, metres and heading follow.
+
+    With --import: convert a table of labels, and copy its pictures to FOLDER.
+    """
+    from mtlnet.label.import_table import import_labels, parse_label_std
+    from runtime.access import check_exposure, read_token
+    from trackfeatures.errors import UserError
+
+    if table is not None:
+        found = import_labels(table, folder, parse_label_std(label_std or ()))
+        told = f"{found['pictures']} pictures of {found['cameras']} cameras in {folder}"
+        command.print_result(found, as_json, f"{told}; `mtlnet evaluate --data {folder}`")
+        return
+    if label_std:
+        raise UserError("--label-std belongs to --import; give both, or none")
+    token = read_token(token_file)
+    check_exposure(host, token, insecure)
+    from mtlnet.inference.model_card import read_card, resolve_run
+    from mtlnet.label.folder import LabelFolder
+    from mtlnet.label.server import Labeller, serve_folder
+
+    known = read_card(resolve_run(model)).camera
+    opened = LabelFolder(folder, camera, known)
+    engine = None if no_model else _load(model, "openvino", None)
+    serve_folder(Labeller(opened, engine), host, port, token)
 
 
 def _print_model(name: str) -> None:

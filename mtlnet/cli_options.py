@@ -86,6 +86,13 @@ TrainThreads = Annotated[int | None, typer.Option(help="CPU threads.  [default: 
 SkipUndecodable = Annotated[
     bool, typer.Option("--skip-undecodable", help="Omit images that cannot be decoded.")
 ]
+HoldOutDrives = Annotated[
+    str | None,
+    typer.Option(
+        help="Drives of labels.csv to leave out, with commas between them: `evaluate` then shows "
+        "them apart."
+    ),
+]
 Resume = Annotated[
     bool,
     typer.Option("--resume", help="Continue the stopped run in --out, or else the newest run."),
@@ -137,6 +144,13 @@ ReportPage = Annotated[
     Path | None, typer.Option("--report", help="HTML page to write: a file, or a folder.")
 ]
 EveryFrame = Annotated[int, typer.Option(help="Evaluate every n-th frame only.")]
+Copies = Annotated[
+    str,
+    typer.Option(
+        help="Judge each picture of labels.csv also as copies: mirrored, turned (by 0.06 rad to "
+        "either side), or both with a comma between them."
+    ),
+]
 WorstSheet = Annotated[
     Path | None, typer.Option("--worst", help="JPEG to write: the frames of the largest errors.")
 ]
@@ -225,4 +239,47 @@ LaneWidth = Annotated[
 ]
 CalibrationPage = Annotated[
     Path | None, typer.Option("--report", help="HTML page to write, with what was found drawn in.")
+]
+# Options of `label`.
+LabelFolderName = Annotated[
+    Path, typer.Argument(metavar="FOLDER", help="Folder with the pictures, and with labels.csv.")
+]
+LabelCamera = Annotated[
+    Path | None,
+    typer.Option(
+        "--camera",
+        help="The pictures' camera; copied to FOLDER/camera.yaml.  [default: FOLDER/camera.yaml]",
+    ),
+]
+NoModel = Annotated[
+    bool, typer.Option("--no-model", help="Begin with the middle of a lane, not with an answer.")
+]
+LabelHost = Annotated[
+    str, typer.Option("--host", help="Address to listen on; another than this machine's: a token.")
+]
+LabelPort = Annotated[
+    int, typer.Option("--port", help="Port to listen on; 0: any free one.", min=0, max=65535)
+]
+LabelToken = Annotated[
+    Path | None,
+    typer.Option(
+        "--token-file",
+        help="File with the token that the page asks for.  [default: $DRIVERVIEW_TOKEN]",
+    ),
+]
+LabelInsecure = Annotated[
+    bool,
+    typer.Option("--insecure", help="Allow a --host that other machines reach, without a token."),
+]
+ImportTable = Annotated[
+    Path | None,
+    typer.Option("--import", help="Table with x_left_m, x_right_m, heading_rad, ... to convert."),
+]
+LabelStdGiven = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--label-std",
+        help="With --import: standard deviation of the labels, METRES,RADIANS or "
+        "PATTERN=METRES,RADIANS of the files that match; may be given several times.",
+    ),
 ]

@@ -1,20 +1,20 @@
 """Configuration of the service: limits on its clients, the token, and the address to listen on."""
 
-import os
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from functools import lru_cache
 from ipaddress import IPv6Address, ip_address, ip_network
-from pathlib import Path
 
+from runtime.access import TOKEN_VARIABLE as TOKEN_VARIABLE
+from runtime.access import check_exposure as check_exposure
+from runtime.access import is_loopback as is_loopback
+from runtime.access import read_token as read_token
 from trackfeatures.errors import UserError
 
 MAX_BODY_BYTES = 4 << 20
 MAX_HEAD_BYTES = 32 << 10
 MAX_NAME = 128  # characters of a frame id, a request id or a stream id
 MAX_DEADLINE_MS = 60_000  # the longest deadline that a client may set
-TOKEN_VARIABLE = "DRIVERVIEW_TOKEN"
-MIN_TOKEN_LENGTH = 16
 
 
 @dataclass(frozen=True)
@@ -62,38 +62,6 @@ class ServiceConfig:
     """NAME=FILE of each camera that requests may name."""
 
 
-def read_token(path: Path | None) -> str | None:
-    """The token in a file, else in $DRIVERVIEW_TOKEN, else None. Raises UserError."""
-    if path is None:
-        token = os.environ.get(TOKEN_VARIABLE, "").strip()
-        source = f"${TOKEN_VARIABLE}"
-    elif path.is_file():
-        token, source = path.read_text(encoding="utf-8", errors="replace").strip(), str(path)
-    else:
-        raise UserError(f"there is no token file {path}; create one with `openssl rand -hex 32`")
-    if not token:
-        if path is not None:
-            raise UserError(f"{source} is empty; `openssl rand -hex 32` creates a token")
-        return None
-    printable = token.isascii() and token.isprintable() and " " not in token
-    if len(token) < MIN_TOKEN_LENGTH or not printable:
-        raise UserError(
-            f"the token in {source} must be {MIN_TOKEN_LENGTH} or more printable ASCII characters "
-            "without a space; `openssl rand -hex 32` creates one"
-        )
-    return token
-
-
-def check_exposure(host: str, token: str | None, insecure: bool) -> None:
-    """Raise UserError when other machines could use the service without a token."""
-    if is_loopback(host) or token is not None or insecure:
-        return
-    raise UserError(
-        f"--host {host} can be reached from other machines: set a token (--token-file, or "
-        f"{TOKEN_VARIABLE} in the environment), or pass --insecure if a proxy protects the service"
-    )
-
-
 def check_proxies(proxies: Iterable[str]) -> tuple[str, ...]:
     """The addresses and networks of `--trusted-proxy`. Raises UserError for anything else."""
     found = tuple(proxies)
@@ -106,16 +74,6 @@ def check_proxies(proxies: Iterable[str]) -> tuple[str, ...]:
                 "10.0.0.7 or 10.0.0.0/8"
             ) from error
     return found
-
-
-def is_loopback(host: str) -> bool:
-    """Whether an address, or the name "localhost", can be reached from this machine only."""
-    try:
-        found = ip_address(host.partition("%")[0])
-    except ValueError:
-        return host.lower().removesuffix(".") == "localhost"
-    mapped = getattr(found, "ipv4_mapped", None)
-    return (mapped or found).is_loopback
 
 
 @lru_cache(4096)

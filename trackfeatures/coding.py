@@ -1,15 +1,28 @@
 """Encodes features in metres and radians as the six values a network is trained on, and back.
 
 `y = 0.1 + 0.8 (x - lo) / (hi - lo)`, clipped to [0, 1]; the columns are those of `TARGETS`. An
-absent distance is NaN in metres, and the outer end of its range when coded.
+absent distance is NaN in metres, and the outer end of its range when coded; an unknown one is
+infinite in metres, and NaN when coded.
 """
+
+import math
+from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from trackfeatures.definitions import MARKINGS, RANGES, TARGETS, Heading, TrackFeatures
+from trackfeatures.definitions import (
+    MARKINGS,
+    RANGES,
+    TARGETS,
+    UNKNOWN_HEADING,
+    Heading,
+    TrackFeatures,
+)
 
 OFFSET, SPAN = 0.1, 0.8
+UNKNOWN_M: Final = math.inf
+"""In arrays of distances: a label that does not tell it. It has no loss and is not counted."""
 IN_LANE_WIDTH_LIMIT_M = 5.5
 """Decoding: `ml` and `mr` are present when they are nearer to each other than this."""
 ON_MARKING_LIMIT_M = 2.75
@@ -24,9 +37,13 @@ _ML, _MR, _L, _M, _R, _ANGLE = range(len(TARGETS))
 
 
 def encode(distances: ArrayLike, angle: ArrayLike) -> NDArray[np.float32]:
-    """Coded targets (N, 6) of distances (N, 5) in m, NaN where absent, and angles (N,) in rad."""
+    """Coded targets (N, 6) of distances (N, 5) in m, NaN where absent, and angles (N,) in rad.
+
+    A distance that is unknown (`UNKNOWN_M`) is NaN when coded.
+    """
     metres = np.atleast_2d(np.asarray(distances, dtype=np.float64))
     present = np.where(np.isnan(metres), _INACTIVE, metres)
+    present = np.where(np.isinf(metres), np.nan, present)
     values = np.column_stack([present, np.atleast_1d(np.asarray(angle, dtype=np.float64))])
     return _clip(OFFSET + SPAN * (values - _LO) / _WIDTH)
 
@@ -78,7 +95,8 @@ def mirror_coded(coded: ArrayLike) -> NDArray[np.float32]:
 
 def mirror_heading(heading: ArrayLike) -> NDArray[np.int64]:
     """The classes (N,) of the mirrored scenes: left and right change places."""
-    return Heading.RIGHT - np.asarray(heading, dtype=np.int64)
+    classes = np.asarray(heading, dtype=np.int64)
+    return np.where(classes == UNKNOWN_HEADING, classes, Heading.RIGHT - classes)
 
 
 def _clip(coded: NDArray[np.float64]) -> NDArray[np.float32]:

@@ -47,6 +47,10 @@ class Heading(IntEnum):
     RIGHT = 2
 
 
+UNKNOWN_HEADING: Final = -1
+"""In arrays of classes: a label that does not tell it. It has no loss and is not counted."""
+
+
 @dataclass(frozen=True, slots=True)
 class Range:
     """The values [lo, hi] of a network output, and the value that encodes "absent"."""

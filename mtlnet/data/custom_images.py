@@ -1,80 +1,110 @@
-"""A user's own images with a `labels.csv`: `mtlnet train --init RUN`, `mtlnet evaluate`.
+"""A user's own pictures with a `labels.csv` in memory, as the model's camera would take them:
+`mtlnet train --init RUN`, `mtlnet evaluate`.
 
-Columns (named by a header, in any order): `file`, a path within the folder; `ml`, `mr`, `l`, `m`,
-`r`, in m, left negative, empty where there is no such marking; `angle`, rad, positive when the car
-points to the right of the track; `heading`: left, straight or right. The images must be of the
-model's camera, in any size of the same aspect ratio; for an evaluation also of the camera that a
-`camera.yaml` in the folder describes.
+A picture's camera is the file that its row names, else `camera.yaml` in the folder, else the
+model's own. Pictures of another camera are rectified (`mtlnet.inference.rectification`).
 """
 
-import csv
 import hashlib
-import math
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 import trackfeatures as tf
+from mtlnet.data.labels_file import COLUMNS as COLUMNS
+from mtlnet.data.labels_file import LABELS as LABELS
+from mtlnet.data.labels_file import MARKING_LIMITS_M as MARKING_LIMITS_M
+from mtlnet.data.labels_file import CustomLabels, LabelledPicture, read_labels
+from mtlnet.data.picture_copies import PLAIN, copied_camera, copied_label, copied_picture
 from mtlnet.inference.image_decoding.decode import crop_and_resize, read_whole_image
-from mtlnet.inference.rectification import Rectification
+from mtlnet.inference.image_decoding.errors import Fault, ImageError
+from mtlnet.inference.rectification import CAMERA_FILE, Rectification, read_camera
 from trackfeatures.camera import CameraParameters
+from trackfeatures.coding import UNKNOWN_M
 from trackfeatures.errors import UserError
 
-LABELS = "labels.csv"
-COLUMNS = ("file", *tf.MARKINGS, "angle", "heading")
-MARKING_LIMITS_M = {
-    "ml": (-5.5, -0.5),
-    "mr": (0.5, 5.5),
-    "l": (-7.0, -1.5),
-    "m": (-2.0, 2.75),
-    "r": (1.5, 7.0),
-}
-"""Range of the network's coding; labels beyond it would be clipped."""
-ANGLE_LIMIT_RAD = 0.5
 ASPECT_TOLERANCE = 0.01
 MAX_READERS = 8  # threads; each may hold a photo of 0.8 GB
 
 
 @dataclass(frozen=True)
-class CustomLabels:
-    """`distances` (N, 5) m, NaN where absent; `angle` (N,) rad; `heading` (N,) classes."""
-
-    distances: NDArray[np.float32]
-    angle: NDArray[np.float32]
-    heading: NDArray[np.int64]
-
-    def __len__(self) -> int:
-        return len(self.angle)
-
-
-@dataclass(frozen=True)
 class CustomImages:
-    """Labelled images in memory, (N, H, W, 3) uint8 of the camera's size (0.18 MB each)."""
+    """Labelled pictures, (N, H, W, 3) uint8 of the model camera's size (0.18 MB each).
+
+    All sequences have N entries: the pictures, each as it is and as its copies.
+    """
 
     path: Path
     labels: CustomLabels
+    """As in the file: beside the camera that took the picture."""
     images: NDArray[np.uint8]
     content_hash: str
+    pictures: tuple[LabelledPicture, ...]
+    lenses: tuple[Rectification | None, ...]
+    """How each was rectified; None: it is of the model's own camera."""
+    copies: tuple[str, ...]
+    """Of `mtlnet.data.picture_copies.COPIES`."""
+    hashes: tuple[str, ...]
+    """SHA-256 of each picture's file."""
+    camera: CameraParameters
+    """The model's."""
+    refused: tuple[tuple[LabelledPicture, str, str], ...] = ()
+    """Picture, copy and reason of each that shows too little of the model's view."""
 
     def __len__(self) -> int:
         return len(self.images)
 
+    def take(self, rows: Any) -> "CustomImages":
+        """Some of the pictures, by their numbers or a slice."""
+        chosen = np.arange(len(self))[rows].tolist()
+        return replace(
+            self,
+            labels=self.labels.take(chosen),
+            images=self.images[rows],
+            pictures=tuple(self.pictures[i] for i in chosen),
+            lenses=tuple(self.lenses[i] for i in chosen),
+            copies=tuple(self.copies[i] for i in chosen),
+            hashes=tuple(self.hashes[i] for i in chosen),
+        )
+
     def every(self, count: int) -> "CustomImages":
         """Every `count`-th image."""
-        labels = self.labels
-        kept = CustomLabels(
-            labels.distances[::count], labels.angle[::count], labels.heading[::count]
-        )
-        return replace(self, labels=kept, images=self.images[::count])
+        return self.take(slice(None, None, count))
 
     def read_batch(
         self, indices: NDArray[np.int64], out: NDArray[np.uint8] | None = None
     ) -> NDArray[np.uint8]:
         """The images of `indices`, (B, H, W, 3), in `out` where one is given."""
         return np.take(self.images, indices, axis=0, out=out)
+
+    def outputs(self, outputs: NDArray[np.float32]) -> NDArray[np.float32]:
+        """A model's outputs (N, 9 to 22) for the images, in metres beside the pictures' cameras."""
+        found = outputs.copy()
+        for lens in {lens for lens in self.lenses if lens is not None}:
+            rows = [i for i, each in enumerate(self.lenses) if each == lens]
+            found[rows] = lens.outputs(outputs[rows])
+        return found
+
+    @cached_property
+    def for_training(self) -> "CustomImages":
+        """The same with labels in metres beside the model's camera.
+
+        Raises UserError that names the line of a label that the network cannot express there.
+        """
+        distances = self.labels.distances.copy()
+        for row, lens in enumerate(self.lenses):
+            if lens is not None:
+                rows = slice(row, row + 1)
+                distances[rows] = lens.labels(distances[rows], self.labels.angle[rows])
+                _require_range(self.path / LABELS, self.pictures[row], lens, distances[row])
+        labels = replace(self.labels, distances=distances)
+        return replace(self, labels=labels)
 
 
 def has_labels_file(folder: Path) -> bool:
@@ -83,135 +113,147 @@ def has_labels_file(folder: Path) -> bool:
 
 
 def open_custom_images(
-    folder: Path, camera: CameraParameters, rectification: Rectification | None = None
+    folder: Path,
+    camera: CameraParameters,
+    copies: Sequence[str] = (PLAIN,),
+    *,
+    skip_refused: bool = False,
 ) -> CustomImages:
-    """Read labels and images of a folder; images are scaled to the camera's size, or rectified.
+    """Read the labels and pictures of a folder, each as its `copies`, for a model of `camera`.
 
-    Raises UserError that names the faulty line of `labels.csv`, also for an image that is missing,
-    damaged, or of another aspect ratio than the camera's.
+    Raises UserError that names the faulty line of `labels.csv`, also for a picture that is missing,
+    damaged, or not of its camera's aspect ratio, and for one that shows too little of the model's
+    view: with `skip_refused` these are listed instead.
     """
-    files, labels = read_labels(folder / LABELS)
-    images = np.empty((len(files), camera.height, camera.width, 3), np.uint8)
+    path = folder / LABELS
+    pictures, labels = read_labels(path)
+    cameras = picture_cameras(folder, pictures, camera)
+    digest = hashlib.sha256(path.read_bytes())
+    for name in sorted({*_camera_files(folder, pictures)}):
+        digest.update((folder / name).read_bytes())
 
-    def decode(number: int) -> bytes:
-        path = folder / files[number][1]
+    def prepare(row: int) -> tuple[str, list[NDArray[np.uint8] | ImageError]]:
+        file = folder / pictures[row].file
         try:
-            if rectification is None:
-                images[number] = _read_uncropped(path, camera)
-            else:
-                images[number] = rectification.image(read_whole_image(path))
+            whole = read_whole_image(file)
+            made = [_prepared(file, whole, cameras[row], camera, copy) for copy in copies]
+            faults = [each for each in made if isinstance(each, ImageError)]
+            if faults and not skip_refused:
+                raise faults[0]
         except UserError as error:
-            error.args = (f"{folder / LABELS}, line {files[number][0]}: {error}",)
+            error.args = (f"{path}, line {pictures[row].line}: {error}",)
             raise
-        return hashlib.sha256(path.read_bytes()).digest()
+        return hashlib.sha256(file.read_bytes()).hexdigest(), made
 
-    digest = hashlib.sha256((folder / LABELS).read_bytes())
+    kept: list[tuple[int, str, str]] = []
+    images: list[NDArray[np.uint8]] = []
+    refused: list[tuple[LabelledPicture, str, str]] = []
     with ThreadPoolExecutor(MAX_READERS) as pool:
-        for part in pool.map(decode, range(len(files))):
-            digest.update(part)
-    return CustomImages(folder, labels, images, digest.hexdigest())
+        for row, (found, made) in enumerate(pool.map(prepare, range(len(pictures)))):
+            digest.update(bytes.fromhex(found))
+            for copy, image in zip(copies, made, strict=True):
+                if isinstance(image, ImageError):
+                    refused.append((pictures[row], copy, str(image)))
+                else:
+                    kept.append((row, copy, found))
+                    images.append(image)
+    if not kept:
+        raise UserError(f"{path}: no picture shows enough of the model's view; {refused[0][2]}")
+    chosen = [copied_label(labels, row, cameras[row] or camera, copy) for row, copy, _ in kept]
+    lenses = [_lens(cameras[row], camera, copy) for row, copy, _ in kept]
+    return CustomImages(
+        folder,
+        CustomLabels(*(np.concatenate(column) for column in zip(*chosen, strict=True))),
+        np.stack(images),
+        digest.hexdigest(),
+        tuple(pictures[row] for row, _, _ in kept),
+        tuple(lenses),
+        tuple(copy for _, copy, _ in kept),
+        tuple(found for _, _, found in kept),
+        camera,
+        tuple(refused),
+    )
 
 
-def _read_uncropped(path: Path, camera: CameraParameters) -> NDArray[np.uint8]:
+def picture_cameras(
+    folder: Path, pictures: Sequence[LabelledPicture], model: CameraParameters
+) -> list[CameraParameters | None]:
+    """The camera of each picture; None: the model's own. Raises UserError for a faulty file."""
+    known: dict[str, CameraParameters] = {}
+    found: list[CameraParameters | None] = []
+    for picture in pictures:
+        name = picture.camera or (CAMERA_FILE if (folder / CAMERA_FILE).exists() else "")
+        if name and name not in known:
+            try:
+                known[name] = read_camera(folder / name, model)
+            except UserError as error:
+                where = f"{folder / LABELS}, line {picture.line}: " if picture.camera else ""
+                raise UserError(f"{where}{error}") from error
+        camera = known[name] if name else None
+        if picture.pitch_deg is not None:
+            camera = replace(camera or model, pitch_deg=picture.pitch_deg)
+        found.append(camera)
+    return found
+
+
+def _require_range(
+    path: Path, picture: LabelledPicture, lens: Rectification, distances: NDArray[np.float32]
+) -> None:
+    for marking, value in zip(tf.MARKINGS, distances.tolist(), strict=True):
+        low, high = tf.RANGES[marking].lo, tf.RANGES[marking].hi
+        if not np.isnan(value) and value != UNKNOWN_M and not low <= value <= high:
+            raise UserError(
+                f"{path}, line {picture.line}: from the height of the model's camera "
+                f"({lens.target.height_above_road_m:g} m, the picture's "
+                f"{lens.source.height_above_road_m:g} m) {marking} is {value:.2f} m, which the "
+                f"network cannot express ({low:g} to {high:g}); leave the picture out"
+            )
+
+
+def _camera_files(folder: Path, pictures: Sequence[LabelledPicture]) -> list[str]:
+    named = [picture.camera for picture in pictures if picture.camera]
+    return [*named, CAMERA_FILE] if (folder / CAMERA_FILE).exists() else named
+
+
+def _lens(
+    source: CameraParameters | None, target: CameraParameters, copy: str
+) -> Rectification | None:
+    if source is None:
+        return None
+    return Rectification(copied_camera(source, copy), target)
+
+
+def _prepared(
+    path: Path,
+    image: NDArray[np.uint8],
+    source: CameraParameters | None,
+    target: CameraParameters,
+    copy: str,
+) -> NDArray[np.uint8] | ImageError:
+    """A copy of a picture as the model's camera would take it, or why it shows too little."""
+    if copy != PLAIN:
+        image = copied_picture(image, source or target, copy)
+    if source is None:
+        return _uncropped(path, image, target)
+    lens = Rectification(copied_camera(source, copy), target)
+    try:
+        return lens.image(image)
+    except ImageError as error:
+        if error.fault is not Fault.FIELD_OF_VIEW:
+            raise
+        return error
+
+
+def _uncropped(path: Path, image: NDArray[np.uint8], camera: CameraParameters) -> NDArray[np.uint8]:
     """An image of the camera's aspect ratio, at its size.
 
     Unlike images for prediction it is not cropped: its labels belong to the whole image.
     """
-    image = read_whole_image(path)
     height, width = image.shape[:2]
     if abs(width * camera.height / (height * camera.width) - 1) > ASPECT_TOLERANCE:
         raise UserError(
             f"{path} is {width} x {height} px, the camera of the model gives "
             f"{camera.width} x {camera.height}: give images of that aspect ratio (within 1 "
-            "percent), of any size"
+            f"percent), of any size, or describe their camera in {CAMERA_FILE}"
         )
     return crop_and_resize(image, camera)
-
-
-def read_labels(path: Path) -> tuple[list[tuple[int, str]], CustomLabels]:
-    """(line, file) of each row of a `labels.csv`, and the labels.
-
-    File names may have bytes that are not UTF-8, as the file system's. Raises UserError that names
-    the faulty line.
-    """
-    files: list[tuple[int, str]] = []
-    rows: list[tuple[list[float], float, int]] = []
-    with path.open(newline="", encoding="utf-8-sig", errors="surrogateescape") as file:
-        reader = csv.DictReader(file, strict=True)
-        try:
-            names = [name.strip() for name in reader.fieldnames or ()]
-            reader.fieldnames = names
-            if sorted(names) != sorted(COLUMNS):
-                raise UserError(
-                    f"{path} has the columns {', '.join(names) or 'none'}; its first line must "
-                    f"name {', '.join(COLUMNS)}, with commas between them, in UTF-8"
-                )
-            for row in reader:
-                try:
-                    name, *values = _parse(row)
-                except ValueError as error:
-                    raise UserError(f"{path}, line {reader.line_num}: {error}") from None
-                files.append((reader.line_num, name))
-                rows.append(values)  # type: ignore[arg-type]  # as `_parse` gives them
-        except csv.Error as error:
-            raise UserError(f"{path}, after line {reader.line_num}: {error}") from error
-    if not files:
-        raise UserError(f"{path} names no images")
-    seen: dict[str, int] = {}
-    for line, name in files:
-        if name in seen:
-            raise UserError(f"{path}, line {line}: {name} stands in line {seen[name]} already")
-        seen[name] = line
-    labels = CustomLabels(
-        np.array([row[0] for row in rows], np.float32),
-        np.array([row[1] for row in rows], np.float32),
-        np.array([row[2] for row in rows], np.int64),
-    )
-    return files, labels
-
-
-def _parse(row: dict[str, str | None]) -> tuple[str, list[float], float, int]:
-    """File, distances in m (NaN absent), angle in rad and class of a row.
-
-    Raises ValueError that describes the fault.
-    """
-    if None in row or None in row.values():
-        raise ValueError(f"it has not {len(COLUMNS)} values")
-    cells = {name: (text or "").strip() for name, text in row.items()}
-    name = cells["file"]
-    if not name or Path(name).is_absolute() or ".." in Path(name).parts:
-        raise ValueError(f"the file {name!r} is no path within the folder")
-    found = {marking: _distance(marking, cells[marking]) for marking in tf.MARKINGS}
-    if math.isnan(found["ml"]) != math.isnan(found["mr"]):
-        raise ValueError("ml and mr are the two sides of one lane: give both or none")
-    if math.isnan(found["m"]) and not (math.isnan(found["l"]) and math.isnan(found["r"])):
-        raise ValueError("l and r stand beside m: without m they must be empty")
-    angle = _number("angle", cells["angle"])
-    if not abs(angle) <= ANGLE_LIMIT_RAD:
-        raise ValueError(
-            f"angle is {angle:g}; it must be within {ANGLE_LIMIT_RAD} rad (radians, not degrees)"
-        )
-    headings = {kind.name.lower(): int(kind) for kind in tf.Heading}
-    if cells["heading"] not in headings:
-        raise ValueError(f"heading is {cells['heading']!r}; give {', '.join(headings)}")
-    return name, [found[m] for m in tf.MARKINGS], angle, headings[cells["heading"]]
-
-
-def _distance(marking: str, text: str) -> float:
-    if not text:
-        return math.nan
-    value = _number(marking, text)
-    low, high = MARKING_LIMITS_M[marking]
-    if not low <= value <= high:
-        raise ValueError(
-            f"{marking} is {value:g} m; it must be from {low:g} to {high:g} (left negative), or "
-            "empty where there is none"
-        )
-    return value
-
-
-def _number(name: str, text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        raise ValueError(f"{name} is {text!r}, not a number") from None

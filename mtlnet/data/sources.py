@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from datagen.recording import Dataset, DatasetError, Frames, UndecodableImage
 from mtlnet.data.custom_images import CustomImages, has_labels_file, open_custom_images
+from mtlnet.data.labels_file import LABELS
 from mtlnet.evaluation.metrics import describe_data, mean_labels
 from mtlnet.inference.model_card import ModelCard, ModelError
-from mtlnet.inference.rectification import CAMERA_FILE
 from mtlnet.model.architecture import HEIGHT, WIDTH, find_architecture
 from mtlnet.model.pretrained import match_convolutions
 from mtlnet.training.config import TrainConfig
@@ -67,8 +67,13 @@ def open_training_data(
                 "--recipe continue"
             )
         match_convolutions(find_architecture(init.network), find_architecture(config.network))
+    if config.hold_out_drives and not has_labels_file(config.data):
+        raise UserError(
+            f"--hold-out-drives is for pictures with a {LABELS}; {config.data} holds recorded "
+            "rounds, whose splits say what is held out"
+        )
     if has_labels_file(config.data):
-        data = custom_training_data(config.data, init)
+        data = custom_training_data(config.data, init, config.hold_out_drives)
     else:
         dataset = open_training_dataset(config.data)
         if not (checked or config.skip_undecodable):
@@ -98,19 +103,15 @@ def open_training_dataset(path: Path) -> Dataset:
     return dataset
 
 
-def custom_training_data(folder: Path, card: ModelCard | None) -> TrainingData:
-    """A user's own images, taken by the camera of the model `card`; UserError without a model."""
+def custom_training_data(folder: Path, card: ModelCard | None, drives: str = "") -> TrainingData:
+    """A user's own images, as the camera of the model `card` would take them; UserError without a
+    model. `drives`: those to leave out, names with commas between them."""
     if card is None:
         raise UserError(
             f"{folder} holds images of your own, without a description of their camera; give the "
             "model to fine-tune with --init RUN, or --init default"
         )
-    if (folder / CAMERA_FILE).exists():
-        raise UserError(
-            f"{folder / CAMERA_FILE}: training takes images of the model's own camera only; delete "
-            "the file if they are, else evaluate or predict"
-        )
-    images = open_custom_images(folder, card.camera)
+    images, held_out = hold_out_drives(open_custom_images(folder, card.camera).for_training, drives)
     about = {
         "path": str(folder),
         "content_hash": images.content_hash,
@@ -120,8 +121,30 @@ def custom_training_data(folder: Path, card: ModelCard | None) -> TrainingData:
         "seeds": [],
         "tracks": [],
         "mean": mean_labels(images.labels),
+        "held_out_drives": held_out,
+        "pictures": sorted({*images.hashes}),
     }
     return TrainingData(images, None, card.camera, about)
+
+
+def hold_out_drives(images: CustomImages, drives: str) -> tuple[CustomImages, list[str]]:
+    """The images without those of the drives that are named, and the drives' names.
+
+    They are not used at all: neither for the weights nor for the standard deviations. Raises
+    UserError for a drive that has no picture, and when none is left.
+    """
+    names = [name.strip() for name in drives.split(",") if name.strip()]
+    known = sorted({picture.drive for picture in images.pictures})
+    for name in names:
+        if name not in known:
+            raise UserError(
+                f"--hold-out-drives has {name!r}; the drives in {images.path / LABELS} are "
+                f"{', '.join(repr(drive) for drive in known)}"
+            )
+    kept = [i for i, picture in enumerate(images.pictures) if picture.drive not in names]
+    if not kept:
+        raise UserError("--hold-out-drives names all drives; leave one to train on")
+    return images.take(kept), names
 
 
 def recorded_training_data(dataset: Dataset, *, skip_undecodable: bool = False) -> TrainingData:
@@ -217,7 +240,10 @@ def _summary(data: dict[str, Any]) -> dict[str, Any]:
 
 def _with_seen(about: dict[str, Any], earlier: dict[str, Any]) -> dict[str, Any]:
     """The description `about` with the rounds and tracks of `earlier` as seen, too."""
-    seen = {name: sorted({*about[name], *earlier.get(name, ())}) for name in ("seeds", "tracks")}
+    names = [name for name in ("seeds", "tracks", "pictures") if name in about or name in earlier]
+    seen: dict[str, Any] = {
+        name: sorted({*about.get(name, ()), *earlier.get(name, ())}) for name in names
+    }
     return {**about, **seen}
 
 

@@ -12,14 +12,17 @@ from numpy.typing import NDArray
 
 from datagen.recording import Dataset, Frames, UndecodableImage
 from mtlnet.data.custom_images import has_labels_file, open_custom_images
+from mtlnet.data.labels_file import LABELS
 from mtlnet.data.loader import Images
 from mtlnet.data.model_labels import car_outputs
+from mtlnet.data.picture_copies import PLAIN, parse_copies
 from mtlnet.data.sources import require_camera, require_decodable
 from mtlnet.evaluation.html_report import page_file, write_page, write_worst_sheet
-from mtlnet.evaluation.metrics import evaluate_by_groups, evaluate_outputs
+from mtlnet.evaluation.metrics import evaluate_by_groups
+from mtlnet.evaluation.picture_page import write_picture_page
+from mtlnet.evaluation.pictures import judge, picture_report
 from mtlnet.inference.engine import Engine
 from mtlnet.inference.model_card import ModelCard, ModelError
-from mtlnet.inference.rectification import CAMERA_FILE, Rectification, read_camera
 from runtime.files import check_folder
 from trackfeatures.errors import UserError
 
@@ -34,13 +37,15 @@ def evaluate(
     page: Path | None = None,
     every: int = 1,
     worst: Path | None = None,
+    copies: str = "",
 ) -> dict[str, Any]:
     """The report of `mtlnet.evaluation.metrics` on one split of a dataset, as a whole and by group.
 
     `engines`: the same model, once for each thread. `report(done, all)` is called after each chunk
     of frames. `page`: an HTML file to write too, or its folder; `worst`: a JPEG of the frames with
     the largest errors. `every`: evaluate every n-th frame only; frames next to each other are much
-    alike. Raises UserError when data and model do not fit.
+    alike. `copies`: of a user's own pictures, as `--copies`. Raises UserError when data and model
+    do not fit.
     """
     if every < 1:
         raise UserError(f"--every is {every}; give 1 for all frames, 5 for every fifth")
@@ -51,9 +56,14 @@ def evaluate(
         check_folder(worst)
     engine = engines[0]
     if has_labels_file(data):
-        if page is not None or worst is not None:
-            raise UserError("--report and --worst show recorded rounds, not images of your own")
-        return evaluate_custom_images(engines, data, report, every)
+        if worst is not None:
+            raise UserError(
+                "--worst shows recorded rounds; --report shows all pictures of your own, failures "
+                "first"
+            )
+        return evaluate_custom_images(engines, data, report, every, parse_copies(copies), page)
+    if copies:
+        raise UserError(f"--copies is for pictures with a {LABELS}; {data} holds recorded rounds")
     dataset = Dataset.open(data)
     frames = dataset.select(split).every(every)
     require_fit(engine.card, frames, split)
@@ -84,27 +94,30 @@ def evaluate_custom_images(
     folder: Path,
     report: Callable[[int, int], None] = lambda *_: None,
     every: int = 1,
+    copies: Sequence[str] = (PLAIN,),
+    page: Path | None = None,
 ) -> dict[str, Any]:
-    """The report on a user's own images with a `labels.csv`, without groups of frames.
+    """The report on a user's own pictures with a `labels.csv` (`mtlnet.evaluation.pictures`).
 
-    They are of the model's camera, or of that which a `camera.yaml` beside them describes. Raises
-    UserError for faulty files.
+    `copies`: of `mtlnet.data.picture_copies`. `page`: an HTML file to write too. Pictures that show
+    too little of the model's view are counted. Raises UserError for faulty files.
     """
-    engine, camera = engines[0], engines[0].card.camera
-    path = folder / CAMERA_FILE
-    rectification = Rectification(read_camera(path, camera), camera) if path.exists() else None
-    images = open_custom_images(folder, camera, rectification).every(every)
-    outputs = predict_frames(engines, images, report)
-    if rectification is not None:
-        outputs = rectification.outputs(outputs)
-    return {
+    engine = engines[0]
+    images = open_custom_images(folder, engine.card.camera, copies, skip_refused=True)
+    images = images.every(every)
+    trained = engine.card.data.get("pictures", ())
+    answers = judge(images, predict_frames(engines, images, report), trained)
+    found = {
         **_about(engine),
         "data": str(folder),
         "split": "all",
         "every": every,
         "rounds": 0,
-        **evaluate_outputs(outputs, images.labels, engine.card.data["mean"]),
+        **picture_report(answers, engine.card.data["mean"]),
     }
+    if page is not None:
+        found["page"] = str(write_picture_page(page, found, answers))
+    return found
 
 
 def _about(engine: Engine) -> dict[str, Any]:

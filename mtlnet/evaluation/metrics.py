@@ -1,7 +1,8 @@
 """Metrics of a model's outputs on labelled frames: errors in m and rad, by feature.
 
 A feature is one of `mtlnet.inference.uncertainty.FEATURES`: the five markings, `to_lane_centre` and
-`angle`. Errors are predicted minus true, and NaN (not counted) where the label is inactive.
+`angle`. Errors are predicted minus true, and NaN (not counted) where the label is inactive or
+unknown.
 The baseline is a constant prediction, the mean of the training labels.
 """
 
@@ -17,6 +18,7 @@ from datagen.recording import Dataset, Frames
 from mtlnet.data.loader import LabelArrays
 from mtlnet.inference.prediction import OUTPUTS, split_outputs
 from mtlnet.inference.uncertainty import FEATURES
+from trackfeatures.definitions import UNKNOWN_HEADING
 
 Numbers = NDArray[np.float64]
 PERCENTILES = {"median": 50, "p95": 95, "p99": 99}
@@ -32,7 +34,12 @@ def signed_errors(outputs: NDArray[np.float32], distances: Any, angle: Any) -> N
     values = tf.decode_values(outputs[:, :6])
     offset = tf.localise(tf.decode(outputs[:, :6])[0]) - tf.localise(distances)
     columns = [values[:, :5] - distances, offset[:, None], (values[:, 5] - angle)[:, None]]
-    return np.concatenate(columns, axis=1)
+    return _known(np.concatenate(columns, axis=1))
+
+
+def _known(errors: Numbers) -> Numbers:
+    """The errors, NaN where the label is unknown: infinite in metres."""
+    return np.where(np.isinf(errors), np.nan, errors)
 
 
 def error_percentiles(errors: Numbers) -> dict[str, dict[str, float | None]]:
@@ -53,6 +60,8 @@ def confusion(
     heading: NDArray[np.int64], predicted: NDArray[np.int64]
 ) -> dict[str, dict[str, int]]:
     """Number of frames by true class, then by predicted class."""
+    known = heading != UNKNOWN_HEADING
+    heading, predicted = heading[known], predicted[known]
     names = [kind.name.lower() for kind in tf.Heading]
     counts = np.zeros((len(names), len(names)), np.int64)
     np.add.at(counts, (heading, predicted), 1)
@@ -126,17 +135,18 @@ def describe_data(
 
 def mean_labels(labels: LabelArrays) -> dict[str, Any]:
     """The mean of labels and their most frequent class; None for markings that are never active."""
-    distances = labels.distances.astype(np.float64)
+    distances = _known(labels.distances.astype(np.float64))
     counts = (~np.isnan(distances)).sum(0)
     sums = np.nansum(distances, axis=0)
-    offset = tf.localise(distances)
-    classes = np.bincount(labels.heading, minlength=len(tf.Heading))
+    offset = _known(tf.localise(distances))
+    known = labels.heading[labels.heading != UNKNOWN_HEADING]
+    classes = np.bincount(known, minlength=len(tf.Heading))
     return {
         "distances_m": [float(s / n) if n else None for s, n in zip(sums, counts, strict=True)],
         "to_lane_centre_m": float(np.nanmean(offset)) if not np.isnan(offset).all() else 0.0,
         "angle_rad": float(labels.angle.astype(np.float64).mean()),
         "heading": int(classes.argmax()),
-        "heading_share": [float(share) for share in classes / classes.sum()],
+        "heading_share": [float(share) for share in classes / max(classes.sum(), 1)],
     }
 
 
@@ -201,8 +211,10 @@ def evaluate_outputs(
     """
     errors = signed_errors(outputs, labels.distances, labels.angle)
     heading = outputs[:, 6:OUTPUTS].argmax(1)
-    model = _means(errors, heading == labels.heading)
-    baseline = _means(_baseline_errors(mean, labels), labels.heading == mean["heading"])
+    known = labels.heading != UNKNOWN_HEADING
+    model = _means(errors, (heading == labels.heading)[known])
+    right = (labels.heading == mean["heading"])[known]
+    baseline = _means(_baseline_errors(mean, labels), right)
     report = {
         "frames": len(labels.angle),
         **model,
@@ -267,22 +279,26 @@ def _ratios(model: dict[str, Any], baseline: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def coded_losses(outputs: NDArray[np.float32], labels: LabelArrays) -> dict[str, float]:
+def coded_losses(outputs: NDArray[np.float32], labels: LabelArrays) -> dict[str, float | None]:
     """The losses of the paper's table on coded values, inactive ones included.
 
     `distance`, `angle`: mean over the frames of the squared error, summed over the five distances,
     as trained; `distance_absolute`, `angle_absolute`: of the absolute error; `type`: cross-entropy
-    of the heading class.
+    of the heading class, None where no frame tells it.
     """
     target = tf.encode(labels.distances, labels.angle).astype(np.float64)
-    difference = outputs[:, :6] - target
+    known = ~np.isnan(target)
+    difference = np.where(known, outputs[:, :6] - target, 0.0)
     squared, absolute = difference**2, np.abs(difference)
-    likelihood = outputs[np.arange(len(labels.angle)), 6 + labels.heading].astype(np.float64)
+    weight = known[:, :5].size / max(known[:, :5].sum(), 1)  # the mean over the known ones
+    told = np.flatnonzero(labels.heading != UNKNOWN_HEADING)
+    likelihood = outputs[told, 6 + labels.heading[told]].astype(np.float64)
+    type_loss = _mean(-np.log(np.maximum(likelihood, 1e-12)))
     return {
-        "distance": float(squared[:, :5].sum(1).mean()),
+        "distance": float(weight * squared[:, :5].sum(1).mean()),
         "angle": float(squared[:, 5].mean()),
-        "type": float(-np.log(np.maximum(likelihood, 1e-12)).mean()),
-        "distance_absolute": float(absolute[:, :5].sum(1).mean()),
+        "type": type_loss,
+        "distance_absolute": float(weight * absolute[:, :5].sum(1).mean()),
         "angle_absolute": float(absolute[:, 5].mean()),
     }
 
@@ -294,10 +310,11 @@ def presence(
     distances, _ = tf.decode(outputs[:, :6])
     truth = labels.distances
     inactive = np.isnan(np.column_stack([distances, tf.localise(distances)]))
-    truly_inactive = np.isnan(np.column_stack([truth, tf.localise(truth)]))
+    true = np.column_stack([truth, tf.localise(truth)])
+    truly_inactive, truly_active = np.isnan(true), np.isfinite(true)
     return {
         name: {
-            "false_inactive": _mean(inactive[~truly_inactive[:, i], i].astype(np.float64)),
+            "false_inactive": _mean(inactive[truly_active[:, i], i].astype(np.float64)),
             "false_active": _mean(1.0 - inactive[truly_inactive[:, i], i]),
         }
         for i, name in enumerate(FEATURES[:-1])
@@ -309,7 +326,7 @@ def _baseline_errors(mean: dict[str, Any], labels: LabelArrays) -> Numbers:
     distances = [np.nan if d is None else d for d in mean["distances_m"]]
     offset = mean["to_lane_centre_m"] - tf.localise(labels.distances)
     angle = mean["angle_rad"] - labels.angle
-    return np.column_stack([np.array(distances) - labels.distances, offset, angle])
+    return _known(np.column_stack([np.array(distances) - labels.distances, offset, angle]))
 
 
 def _mean(values: Numbers) -> float | None:

@@ -39,8 +39,10 @@ def evaluation_table(result: dict[str, Any]) -> Table:
         table.add_column(column, justify="left" if not column else "right", no_wrap=not column)
     for name, title in TITLES.items():
         table.add_row(title, *error_cells(result, name))
-    accuracy, base = (result["heading_accuracy"], result["baseline"]["heading_accuracy"])
-    table.add_row("class right", f"{100 * accuracy:.1f} %", "", "", "", f"{100 * base:.1f} %", "")
+    accuracy, base = (
+        format_percent(part["heading_accuracy"]) for part in (result, result["baseline"])
+    )
+    table.add_row("class right", accuracy, "", "", "", base, "")
     return table
 
 
@@ -56,6 +58,28 @@ def group_table(result: dict[str, Any]) -> Table:
         for key, part in result[group].items():
             accuracy = f"{100 * part['heading_accuracy']:.1f}%"
             table.add_row(key, str(part["frames"]), *mean_error_cells(part), accuracy)
+    return table
+
+
+def picture_table(result: dict[str, Any]) -> Table:
+    """Mean absolute errors on a user's own pictures, by drive and light."""
+    figures = result["pictures"]
+    title = (
+        f"{figures['cases']} pictures: {figures['refused']} refused, {figures['absent']} absent, "
+        f"{figures['out_of_distribution'] or 0} out of distribution"
+    )
+    table = Table(title=title, box=None, padding=(0, 0, 0, 1))
+    for column in ("", "pictures", "left (m)", "right", "width", "centre", "heading (rad)"):
+        table.add_column(column, justify="left" if not column else "right", no_wrap=True)
+    parts = {"all": figures}
+    for grouping in ("by_training", "by_drive", "by_light", "by_copy"):
+        parts.update(figures.get(grouping, {}))
+    for name, part in parts.items():
+        cells = [format_number(v, 4 if k == "angle" else 3) for k, v in part["mean"].items()]
+        table.add_row(escape(printable(name)), str(part["cases"]), *cells)
+    median = figures["always_median"]
+    cells = [format_number(v, 4 if k == "angle" else 3) for k, v in median.items()]
+    table.add_row("always the labels' median", "", *cells)
     return table
 
 

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from trackfeatures.camera import CameraParameters
 
@@ -23,12 +23,15 @@ SCALE = 2
 TOP_VIEW_WIDTH, TOP_VIEW_METRES = 160, 16.0
 
 
-def marking_line(distance: float, angle: float, curvature: float) -> NDArray[np.float64]:
+def marking_line(
+    distance: float, angle: float, curvature: float, at: ArrayLike | None = None
+) -> NDArray[np.float64]:
     """Points (N, 2) of a marking `distance` m to the right of the car, m in the car frame.
 
-    `angle`: of the car to the track, rad; `curvature` of the track: 1/m, left positive.
+    `angle`: of the car to the track, rad; `curvature` of the track: 1/m, left positive; `at` (N,):
+    where along the track, m; None: 24 points ahead of the car.
     """
-    along = np.linspace(NEAR_M, FAR_M, 24)
+    along = np.linspace(NEAR_M, FAR_M, 24) if at is None else np.asarray(at, np.float64)
     left = curvature * along**2 / 2 - distance
     cos, sin = math.cos(angle), math.sin(angle)
     return np.column_stack([along * cos - left * sin, along * sin + left * cos])

@@ -11,10 +11,11 @@ from collections.abc import Callable
 
 import torch
 from torch import Tensor
-from torch.nn.functional import cross_entropy, smooth_l1_loss
+from torch.nn.functional import smooth_l1_loss
 
 from mtlnet.model.bins import Scores, bin_targets, read_scores, soft_cross_entropy
-from mtlnet.training.loss import Alpha, Losses, weighted_sum
+from mtlnet.training.loss import Alpha, Losses, heading_loss, known_targets, weighted_sum
+from trackfeatures.coding import OFFSET
 
 
 def bins_loss(
@@ -26,20 +27,24 @@ def bins_loss(
 ) -> Losses:
     """Losses of scores for targets coded (B, 6) and heading (B,); `auxiliary` joins their sum.
 
-    Reported are the squared errors of the coded answers, as of any other network.
+    Reported are the squared errors of the coded answers, as of any other network. A label that is
+    unknown has no loss, as in `mtlnet.training.loss`.
     """
-    distances, angles = bin_targets(coded)
+    known, weight = known_targets(coded)
+    distances, angles = bin_targets(torch.where(known, coded, OFFSET))
+    crosses = torch.where(known[:, :5], soft_cross_entropy(scores.distance, distances), 0.0)
     terms = (
-        soft_cross_entropy(scores.distance, distances).mean(),
+        (crosses * weight).mean(),
         soft_cross_entropy(scores.angle, angles).mean() + mean_error(scores.angle, angles),
-        cross_entropy(scores.heading, heading),
+        heading_loss(scores.heading, heading),
     )
     total = weighted_sum(terms, combine)
     with torch.no_grad():
-        squared = (read_scores(scores.distance, scores.angle) - coded) ** 2
+        answers = read_scores(scores.distance, scores.angle)
+        squared = torch.where(known, answers - coded, 0.0) ** 2
     kept = torch.stack(terms).detach()
     return Losses(
-        distance=squared[:, :5].sum(1).mean(),
+        distance=(squared[:, :5] * weight).sum(1).mean(),
         angle=squared[:, 5].mean(),
         heading=kept[2],
         total=total if auxiliary is None else total + auxiliary,

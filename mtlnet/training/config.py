@@ -60,6 +60,8 @@ class TrainConfig:
     """CPU threads; 0: one a core."""
     skip_undecodable: bool = False
     """Omit frames whose image cannot be decoded; the model's card lists them."""
+    hold_out_drives: str = ""
+    """Of pictures with a `labels.csv`: the drives to leave out, with commas between them."""
     change_data: bool = False
     """A resumed run continues on `data`, which is not the dataset it was started with."""
 

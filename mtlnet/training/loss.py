@@ -4,6 +4,9 @@ Distance: squared error, summed over the five coded distances, mean over the bat
 error of the coded angle, mean over the batch. Heading (the paper's "type"): cross-entropy of the
 class, mean over the batch. The L2 term is part of the optimizer: a weight decay of 2 lambda is the
 gradient of lambda |w|^2.
+
+A label that is unknown (a coded target of NaN, the class `UNKNOWN_HEADING`) has no loss: means are
+over the known ones.
 """
 
 import math
@@ -14,6 +17,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import cross_entropy, smooth_l1_loss
 
+from trackfeatures.definitions import UNKNOWN_HEADING
 from trackfeatures.errors import UserError
 
 TASKS = ("distance", "angle", "heading")
@@ -102,21 +106,36 @@ def multi_task_loss(
     task then costs about 1 when its mean is predicted, whatever its range. `huber`: with
     `target_variance`, Huber losses in place of squares.
     """
-    errors = outputs[:, :6].float() - coded
+    known, weight = known_targets(coded)
+    errors = torch.where(known, outputs[:, :6].float() - coded, 0.0)
     squared = errors**2
-    distance = squared[:, :5].sum(1).mean()
+    distance = (squared[:, :5] * weight).sum(1).mean()
     angle = squared[:, 5].mean()
-    cross = cross_entropy(outputs[:, 6:].float(), heading)
+    cross = heading_loss(outputs[:, 6:].float(), heading)
     if target_variance is None:
         terms = (distance, angle, cross)
     else:
         scaled = (
             squared / target_variance if huber is None else _huber(errors, target_variance, huber)
         )
-        terms = (scaled[:, :5].mean(), scaled[:, 5].mean(), cross)
+        terms = ((scaled[:, :5] * weight).mean(), scaled[:, 5].mean(), cross)
     total = weighted_sum(terms, combine)
     detached = torch.stack(terms).detach()
     return Losses(distance.detach(), angle.detach(), cross.detach(), total, detached)
+
+
+def known_targets(coded: Tensor) -> tuple[Tensor, Tensor]:
+    """Which coded targets (B, 6) are known, and the weight () by which the mean over all distances
+    becomes that over the known ones: 1 where all are."""
+    known = ~coded.isnan()
+    each = known[:, :5]
+    return known, each.numel() / each.sum().clamp_min(1)
+
+
+def heading_loss(scores: Tensor, heading: Tensor) -> Tensor:
+    """Cross-entropy of scores (B, 3) for classes (B,), mean over the known ones; 0 without any."""
+    total = cross_entropy(scores, heading, ignore_index=UNKNOWN_HEADING, reduction="sum")
+    return total / (heading != UNKNOWN_HEADING).sum().clamp_min(1)
 
 
 def weighted_sum(

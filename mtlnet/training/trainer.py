@@ -99,7 +99,10 @@ class Trainer:
         if not self.recipe.standardise:
             return
         coded = torch.from_numpy(loader.coded).double()
-        mean, std = coded.mean(0), coded.std(0, correction=0)
+        known = coded.isfinite()
+        mean = torch.where(known.any(0), coded.nanmean(0), coded.new_tensor(0.5))
+        std = (torch.where(known, coded - mean, 0.0) ** 2).sum(0) / known.sum(0).clamp_min(1)
+        std = std.sqrt()
         least = FINE_TUNE_MIN_STD if fine_tune else MIN_TARGET_STD
         std = std.clamp_min(torch.tensor(least, dtype=std.dtype))
         self.network.target_mean.copy_(mean)

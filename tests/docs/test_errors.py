@@ -26,6 +26,9 @@ from mtlnet.inference.engine import Engine, load_engine
 from mtlnet.inference.image_decoding.decode import inspect, read_image
 from mtlnet.inference.model_card import resolve_run
 from mtlnet.inference.rectification import Rectification
+from mtlnet.label.folder import LabelFolder
+from mtlnet.label.geometry import fit_markings
+from mtlnet.label.import_table import import_labels
 from mtlnet.predict.films import Film, read_film_header
 from mtlnet.predict.run import predict_files
 from mtlnet.training.loss import parse_alpha
@@ -349,6 +352,27 @@ def _(folder: Path) -> object:
 @row("an image of another aspect ratio")
 def _(folder: Path) -> object:
     return labelled(folder, "-2.0", 400)
+
+
+@row("a `?` where none may be")
+def _(folder: Path) -> object:
+    return labelled(folder, "?", 280)
+
+
+@row("a table to import")
+def _(folder: Path) -> object:
+    return import_labels(written(folder, "a.csv", b"file\n"), folder / "new")
+
+
+@row("pictures to label without their camera")
+def _(folder: Path) -> object:
+    written(folder, "a.jpg", jpeg())
+    return LabelFolder(folder, None, VIEW)
+
+
+@row("handles above the horizon")
+def _(folder: Path) -> object:
+    return fit_markings(VIEW, [[9, 9], [20, 8]], [[200, 180], [150, 120]], pitch_deg=0.0)
 
 
 @row("a contact without PyBullet")

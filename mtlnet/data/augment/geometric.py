@@ -54,21 +54,24 @@ def shift_limits_m(distances: NDArray[np.float32]) -> NDArray[np.float64]:
     """Limits (N, 2) of a shift to the right (negative) and left, m, within which labels are known.
 
     `distances` (N, 5) in m, NaN where absent. Beyond the limits another marking would be measured,
-    whose distance, or presence, is not known.
+    whose distance, or presence, is not known. A marking that the label calls unknown sets no limit
+    within a lane, and allows no shift elsewhere.
     """
-    ml, mr, l, m, r = distances.astype(np.float64).T
+    unknown = np.isinf(distances)
+    ml, mr, l, m, r = np.where(unknown, np.nan, distances).astype(np.float64).T
     margin, reach = tf.IN_LANE_MARGIN_M, tf.ON_MARKING_REACH_M
     in_lane, on_marking = ~np.isnan(ml), ~np.isnan(m)
     low, high = np.full(len(m), -MAX_SHIFT_M), np.full(len(m), MAX_SHIFT_M)
     # In a lane: at least `margin` from both markings, or `reach` if not also on a marking.
-    least = np.where(on_marking, margin, reach)
+    least = np.where(on_marking | unknown[:, 3], margin, reach)
     low = np.where(in_lane, np.maximum(low, least - mr), low)
     high = np.where(in_lane, np.minimum(high, -least - ml), high)
     most = np.where(in_lane, reach, margin)
     low = np.where(on_marking, np.maximum(low, -most - m), low)
     high = np.where(on_marking, np.minimum(high, most - m), high)
     outside = on_marking & ((np.isnan(l) & (m > 0)) | (np.isnan(r) & (m < 0)))
-    low[outside] = high[outside] = 0.0
+    nowhere = ~in_lane & unknown.any(1)
+    low[outside | nowhere] = high[outside | nowhere] = 0.0
     return np.column_stack([low.clip(max=0.0), high.clip(min=0.0)])
 
 

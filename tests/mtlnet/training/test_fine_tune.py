@@ -104,7 +104,7 @@ def test_a_model_is_trained_on_with_batch_normalisation(
     assert float((slopes.std(1) / slopes.mean(1).abs()).median()) < 1e-3
 
 
-def test_images_of_another_camera_are_evaluated_not_trained_on(
+def test_images_of_another_camera_are_evaluated_and_trained_on(
     published: Path, custom_images: Path, tmp_path: Path
 ) -> None:
     engine = load_engine(published, precision="f32")
@@ -117,15 +117,40 @@ def test_images_of_another_camera_are_evaluated_not_trained_on(
     same = evaluate([engine], custom_images, "all")
     assert same["mae_m"]["ml"] == pytest.approx(plain["mae_m"]["ml"], abs=1e-4)
     assert same["angle_mae_rad"] == pytest.approx(plain["angle_mae_rad"], abs=1e-6)
-    (custom_images / "camera.yaml").write_text("height_above_road_m: 2.4\n")
+    (custom_images / "camera.yaml").write_text("height_above_road_m: 1.5\n")
     higher = evaluate([engine], custom_images, "all", every=2)
     assert higher["frames"] == 3
     assert higher["mae_m"]["ml"] != plain["mae_m"]["ml"]
-    with pytest.raises(UserError, match="show recorded rounds"):
-        evaluate([engine], custom_images, "all", page=tmp_path / "report.html")
-    options = {"data": custom_images, "init": str(published)}
-    with pytest.raises(UserError, match=r"camera\.yaml: training takes images of the model's own"):
-        start_training(options, tmp_path / "run", resume=False)
+    card = read_card(published)
+    frames = custom_training_data(custom_images, card).frames
+    assert frames.labels.distances[0, 0] == pytest.approx(-1.0 * 1.2 / 1.5, abs=1e-3)
+
+
+def test_unknown_labels_are_trained_on_and_whole_drives_left_out(
+    published: Path, custom_images: Path, tmp_path: Path
+) -> None:
+    lines = ["file,ml,mr,l,m,r,angle,heading,drive"]
+    lines += [f"{i}.png,-1.{i},2.{9 - i},?,?,?,0.01,?,drive {i % 3}" for i in range(6)]
+    (custom_images / "labels.csv").write_text("\n".join(lines) + "\n")
+    options = {"data": custom_images, "init": str(published), "iterations": 12, "batch": 4}
+    options.update(device="cpu", threads=1, hold_out_drives="drive 1, drive 0")
+    start_training(options, tmp_path / "run", resume=False)
+    card = read_card(tmp_path / "run")
+    assert (card.data["frames"], card.data["held_out_drives"]) == (2, ["drive 1", "drive 0"])
+    assert len(card.data["pictures"]) == 2
+    weights = load_network(tmp_path / "run" / WEIGHTS).state_dict()
+    assert all(bool(torch.isfinite(value).all()) for value in weights.values())
+    found = evaluate([load_engine(tmp_path / "run")], custom_images, "all")
+    assert found["heading_accuracy"] is None
+    seen = found["pictures"]["by_training"]
+    assert {name: part["cases"] for name, part in seen.items()} == {
+        "not trained on": 4,
+        "trained on": 2,
+    }
+    with pytest.raises(UserError, match=r"--hold-out-drives has 'x'; the drives in .* 'drive 0', "):
+        custom_training_data(custom_images, read_card(published), "drive 0,x")
+    with pytest.raises(UserError, match="names all drives"):
+        custom_training_data(custom_images, read_card(published), "drive 0,drive 1,drive 2")
 
 
 def test_wrong_options_are_refused(

@@ -6,6 +6,9 @@ from dataclasses import replace
 import pytest
 import torch
 
+from mtlnet.model.architecture import ANGLES, PLACES
+from mtlnet.model.bins import bin_targets, soft_cross_entropy, split_scores
+from mtlnet.training.bins_loss import bins_loss
 from mtlnet.training.loss import AlphaError, HuberLoss, multi_task_loss, parse_alpha
 from mtlnet.training.recipes import RECIPES
 
@@ -113,3 +116,51 @@ def test_alpha_may_have_any_sum() -> None:
 def test_wrong_alpha_is_refused(text: str, seen: str) -> None:
     with pytest.raises(AlphaError, match=seen):
         parse_alpha(text)
+
+
+def test_unknown_labels_have_no_loss_and_are_not_counted() -> None:
+    nan = math.nan
+    targets = torch.tensor([[0.4, 0.5, nan, nan, nan, 0.5], [nan, nan, 0.1, 0.9, 0.7, 0.7]])
+    outputs = OUTPUTS.clone().requires_grad_()
+    losses = multi_task_loss(outputs, targets, torch.tensor([-1, 1]), (1.0, 1.0, 1.0))
+    # Five of ten distances are known; two of them err, by 0.1 and 0.2. One class is known.
+    distance = (0.1**2 + 0.2**2) * 10 / 5 / 2
+    assert float(losses.distance.detach()) == pytest.approx(distance)
+    assert float(losses.heading.detach()) == pytest.approx(math.log(2))
+    assert float(losses.total.detach()) == pytest.approx(distance + ANGLE + math.log(2))
+    losses.total.backward()  # type: ignore[no-untyped-call]  # torch leaves it untyped
+    gradient = outputs.grad
+    assert gradient is not None
+    assert gradient[0, 2:5].tolist() == [*gradient[1, :2].tolist(), 0.0] == [0.0] * 3
+    assert gradient[0, 6:].tolist() == [0.0] * 3
+    assert float(gradient[0, 0]) == pytest.approx(2 * 0.1 * 10 / 5 / 2)
+    # Known to nobody: 0, not NaN.
+    none = torch.full((2, 6), nan)
+    none[:, 5] = 0.5
+    nothing = multi_task_loss(OUTPUTS, none, torch.tensor([-1, -1]), (1.0, 0.0, 1.0))
+    assert float(nothing.total) == 0.0
+
+
+def test_unknown_labels_have_no_loss_in_bins() -> None:
+    generator = torch.Generator().manual_seed(0)
+    scores = split_scores(
+        torch.randn(2, 5 * (PLACES + 1), generator=generator),
+        torch.randn(2, ANGLES, generator=generator),
+        torch.randn(2, 3, generator=generator),
+    )
+    combine = (1.0, 1.0, 1.0)
+    # Of two images that differ in what is known, the loss is that of the known columns.
+    coded = torch.tensor([[0.3, 0.6, 0.1, 0.9, 0.9, 0.5]] * 2)
+    full = bins_loss(scores, coded, torch.tensor([0, 1]), combine)
+    hidden = coded.clone()
+    hidden[0, 2:5] = math.nan
+    part = bins_loss(scores, hidden, torch.tensor([-1, 1]), combine)
+    targets, _ = bin_targets(coded)
+    each = soft_cross_entropy(scores.distance, targets)
+    known = torch.cat([each[0, :2], each[1]])
+    assert float(part.terms[0]) == pytest.approx(float(known.mean()))
+    assert float(full.terms[0]) == pytest.approx(float(each.mean()))
+    assert float(part.terms[1]) == float(full.terms[1])
+    likely = torch.log_softmax(scores.heading, 1)
+    assert float(part.terms[2]) == pytest.approx(-float(likely[1, 1]))
+    assert math.isfinite(float(part.distance))

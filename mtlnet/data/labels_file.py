@@ -1,0 +1,280 @@
+"""`labels.csv`: the labels of a user's own pictures, one row a picture.
+
+Columns (named by a header, in any order): `file`, a path within the folder; `ml`, `mr`, `l`, `m`,
+`r`, in m, left negative, empty where there is no such marking; `angle`, rad, positive when the car
+points to the right of the track; `heading`: left, straight or right. `l`, `m`, `r` and `heading`
+may be `?`: unknown, without a loss and not counted. The columns of `OPTIONAL` may be left out, and
+their cells may be empty.
+"""
+
+import csv
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from io import StringIO
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+import trackfeatures as tf
+from runtime.files import atomic_write
+from trackfeatures.coding import UNKNOWN_M
+from trackfeatures.definitions import UNKNOWN_HEADING
+from trackfeatures.errors import UserError
+
+LABELS = "labels.csv"
+COLUMNS = ("file", *tf.MARKINGS, "angle", "heading")
+OPTIONAL = ("drive", "light", "camera", "pitch_deg", "curvature_1pm", "std_m", "std_rad")
+UNKNOWN = "?"
+MAY_BE_UNKNOWN = ("l", "m", "r", "heading")
+MARKING_LIMITS_M = {
+    "ml": (-5.5, -0.5),
+    "mr": (0.5, 5.5),
+    "l": (-7.0, -1.5),
+    "m": (-2.0, 2.75),
+    "r": (1.5, 7.0),
+}
+"""Range of the network's coding; labels beyond it would be clipped."""
+ANGLE_LIMIT_RAD = 0.5
+HEADINGS = {kind.name.lower(): int(kind) for kind in tf.Heading}
+
+Cells = dict[str, str]
+
+
+@dataclass(frozen=True)
+class CustomLabels:
+    """`distances` (N, 5) m, NaN where absent, `UNKNOWN_M` where unknown; `angle` (N,) rad;
+    `heading` (N,) classes, or `UNKNOWN_HEADING`."""
+
+    distances: NDArray[np.float32]
+    angle: NDArray[np.float32]
+    heading: NDArray[np.int64]
+
+    def __len__(self) -> int:
+        return len(self.angle)
+
+    def take(self, rows: Any) -> "CustomLabels":
+        """Those of some of the pictures."""
+        return CustomLabels(self.distances[rows], self.angle[rows], self.heading[rows])
+
+
+@dataclass(frozen=True)
+class LabelledPicture:
+    """What a row gives beside the label."""
+
+    line: int
+    file: str
+    """A path within the folder."""
+    drive: str = ""
+    """Pictures of one drive are alike: they are weighed and held out together."""
+    light: str = ""
+    camera: str = ""
+    """The file of the picture's own camera, a path within the folder; empty: the folder's."""
+    pitch_deg: float | None = None
+    """Of that camera in this picture, positive when it looks down; None: as the camera's file."""
+    curvature: float = 0.0
+    """Of the road, 1/m, left positive: the markings are drawn with it."""
+    std_m: float = 0.0
+    """Standard deviation of the label's distances, m."""
+    std_rad: float = 0.0
+    """Standard deviation of the label's angle, rad."""
+
+
+def read_labels(path: Path) -> tuple[list[LabelledPicture], CustomLabels]:
+    """The rows of a `labels.csv`, at least one, and their labels.
+
+    File names may have bytes that are not UTF-8, as the file system's. Raises UserError that names
+    the faulty line.
+    """
+    pictures: list[LabelledPicture] = []
+    rows: list[tuple[list[float], float, int]] = []
+    for line, cells in read_cells(path):
+        try:
+            picture, *values = _parse(line, cells)
+        except ValueError as error:
+            raise UserError(f"{path}, line {line}: {error}") from None
+        pictures.append(picture)
+        rows.append(values)  # type: ignore[arg-type]  # as `_parse` gives them
+    if not pictures:
+        raise UserError(f"{path} names no images")
+    labels = CustomLabels(
+        np.array([row[0] for row in rows], np.float32),
+        np.array([row[1] for row in rows], np.float32),
+        np.array([row[2] for row in rows], np.int64),
+    )
+    return pictures, labels
+
+
+def read_cells(path: Path) -> list[tuple[int, Cells]]:
+    """(line, cells by column) of each row, stripped; UserError as `read_labels`."""
+    found: list[tuple[int, Cells]] = []
+    seen: dict[str, int] = {}
+    with path.open(newline="", encoding="utf-8-sig", errors="surrogateescape") as file:
+        reader = csv.DictReader(file, strict=True)
+        try:
+            names = [name.strip() for name in reader.fieldnames or ()]
+            reader.fieldnames = names
+            _check_head(path, names)
+            for row in reader:
+                if None in row or None in row.values():
+                    raise UserError(
+                        f"{path}, line {reader.line_num}: it has not {len(names)} values"
+                    )
+                cells = {name: text.strip() for name, text in row.items()}
+                name = cells["file"]
+                if name in seen:
+                    raise UserError(
+                        f"{path}, line {reader.line_num}: {name} stands in line {seen[name]} "
+                        "already"
+                    )
+                seen[name] = reader.line_num
+                found.append((reader.line_num, cells))
+        except csv.Error as error:
+            raise UserError(f"{path}, after line {reader.line_num}: {error}") from error
+    return found
+
+
+def write_cells(path: Path, rows: list[Cells]) -> None:
+    """Replace a `labels.csv` by these rows, in one step and on the disk when it returns."""
+    used = [name for name in OPTIONAL if any(row.get(name) for row in rows)]
+    text = StringIO()
+    writer = csv.DictWriter(text, (*COLUMNS, *used), restval="", lineterminator="\n")
+    writer.writeheader()
+    writer.writerows({name: row.get(name, "") for name in (*COLUMNS, *used)} for row in rows)
+    atomic_write(path, text.getvalue().encode("utf-8", "surrogateescape"), fsync=True)
+
+
+def check_cells(cells: Cells) -> None:
+    """Raise UserError that describes the fault of a row that is to be written."""
+    try:
+        _parse(0, {name: cells.get(name, "") for name in (*COLUMNS, *OPTIONAL)})
+    except ValueError as error:
+        raise UserError(str(error)) from None
+
+
+def path_within(name: str) -> bool:
+    """Whether a name in a table is a path within the table's folder."""
+    path = PurePosixPath(name)
+    return bool(name) and name != UNKNOWN and not path.is_absolute() and ".." not in path.parts
+
+
+def _check_head(path: Path, names: list[str]) -> None:
+    missing = [name for name in COLUMNS if name not in names]
+    unknown = [name for name in names if name not in (*COLUMNS, *OPTIONAL)]
+    twice = [name for name in names if names.count(name) > 1]
+    if missing or unknown or twice:
+        raise UserError(
+            f"{path} has the columns {', '.join(names) or 'none'}; its first line must "
+            f"name {', '.join(COLUMNS)}, each once, and may name {', '.join(OPTIONAL)}, with "
+            "commas between them, in UTF-8"
+        )
+
+
+def _parse(line: int, cells: Cells) -> tuple[LabelledPicture, list[float], float, int]:
+    """The picture, distances in m (NaN absent), angle in rad and class of a row.
+
+    Raises ValueError that describes the fault.
+    """
+    for column, text in cells.items():
+        if text == UNKNOWN and column not in MAY_BE_UNKNOWN:
+            raise ValueError(
+                f"{column} is `?`, which only {', '.join(MAY_BE_UNKNOWN)} may be: give its value, "
+                "or leave the picture out"
+            )
+    name = cells["file"]
+    if not path_within(name):
+        raise ValueError(f"the file {name!r} is no path within the folder")
+    found = {marking: _distance(marking, cells[marking]) for marking in tf.MARKINGS}
+    _check_pairs(found)
+    angle = _number("angle", cells["angle"])
+    if not abs(angle) <= ANGLE_LIMIT_RAD:
+        raise ValueError(
+            f"angle is {angle:g}; it must be within {ANGLE_LIMIT_RAD} rad (radians, not degrees)"
+        )
+    heading = UNKNOWN_HEADING
+    if cells["heading"] != UNKNOWN:
+        if cells["heading"] not in HEADINGS:
+            raise ValueError(f"heading is {cells['heading']!r}; give {', '.join(HEADINGS)} or ?")
+        heading = HEADINGS[cells["heading"]]
+    return _picture(line, cells), [found[m] for m in tf.MARKINGS], angle, heading
+
+
+def _check_pairs(found: dict[str, float]) -> None:
+    if math.isnan(found["ml"]) != math.isnan(found["mr"]):
+        raise ValueError("ml and mr are the two sides of one lane: give both or none")
+    beside = (found["l"], found["r"])
+    if math.isnan(found["m"]) and not all(map(math.isnan, beside)):
+        raise ValueError("l and r stand beside m: without m they must be empty")
+    if found["m"] == UNKNOWN_M and not all(value == UNKNOWN_M for value in beside):
+        raise ValueError("l and r stand beside m: where m is `?`, they must be, too")
+
+
+def _picture(line: int, cells: Cells) -> LabelledPicture:
+    """The optional cells of a row; ValueError that describes a fault."""
+    camera = cells.get("camera", "")
+    if camera and not path_within(camera):
+        raise ValueError(f"the camera {camera!r} is no path within the folder")
+    pitch = _optional(cells, "pitch_deg", lambda value: abs(value) <= 30, "within 30 degrees")
+    curvature = _optional(cells, "curvature_1pm", lambda value: abs(value) <= 0.2, "within 0.2 1/m")
+    std = [
+        _optional(cells, name, lambda value: 0 <= value < 10, "0 or more, and under 10")
+        for name in ("std_m", "std_rad")
+    ]
+    texts = (cells["file"], cells.get("drive", ""), cells.get("light", ""), camera)
+    return LabelledPicture(line, *texts, pitch, curvature or 0.0, std[0] or 0.0, std[1] or 0.0)
+
+
+def _optional(
+    cells: Cells, name: str, holds: Callable[[float], bool], expected: str
+) -> float | None:
+    text = cells.get(name, "")
+    if not text:
+        return None
+    value = _number(name, text)
+    if not holds(value):
+        raise ValueError(f"{name} is {value:g}; it must be {expected}")
+    return value
+
+
+def _distance(marking: str, text: str) -> float:
+    if not text:
+        return math.nan
+    if text == UNKNOWN:
+        return UNKNOWN_M
+    value = _number(marking, text)
+    low, high = MARKING_LIMITS_M[marking]
+    if not low <= value <= high:
+        raise ValueError(
+            f"{marking} is {value:g} m; it must be from {low:g} to {high:g} (left negative), or "
+            "empty where there is none"
+        )
+    return value
+
+
+def _number(name: str, text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise ValueError(f"{name} is {text!r}, not a number") from None
+
+
+def lane_cells(ml: float, mr: float) -> Cells:
+    """The cells of the five distances of a car of whose lane both markings (m) are known.
+
+    By the definitions: `ml` and `mr` are there from 0.5 m to both markings on; over 1.2 m from both
+    there is no `m`, else it is the nearer one, and what lies beyond that is unknown.
+    """
+    near = min(-ml, mr)
+    in_lane = near >= tf.IN_LANE_MARGIN_M
+    cells = {"ml": _metres(ml) if in_lane else "", "mr": _metres(mr) if in_lane else ""}
+    if near > tf.ON_MARKING_REACH_M:
+        return {**cells, "l": "", "m": "", "r": ""}
+    if -ml < mr:
+        return {**cells, "l": UNKNOWN, "m": _metres(ml), "r": _metres(mr)}
+    return {**cells, "l": _metres(ml), "m": _metres(mr), "r": UNKNOWN}
+
+
+def _metres(value: float) -> str:
+    return f"{value:.3f}"

@@ -1,0 +1,106 @@
+"""Copies of a labelled picture for its evaluation: mirrored, and turned about the vertical.
+
+A few drives show few headings and offsets, and the answer that never changes scores well on them.
+Copies widen both. A mirrored picture is exact. A camera that turns about its own eye sees an exact
+homography of the picture; what it did not show is grey.
+"""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+import trackfeatures as tf
+from mtlnet.data.labels_file import CustomLabels
+from mtlnet.inference.rectification import BORDER_LEVEL
+from trackfeatures.camera import CameraParameters
+from trackfeatures.coding import UNKNOWN_M
+from trackfeatures.errors import UserError
+
+PLAIN, MIRRORED = "plain", "mirrored"
+TURNS_RAD = {"turned left": -0.06, "turned right": 0.06}
+"""What a turned copy adds to the angle, rad."""
+COPIES = (PLAIN, MIRRORED, *TURNS_RAD)
+KINDS = {"mirrored": (MIRRORED,), "turned": tuple(TURNS_RAD)}
+"""The copies that each word of `--copies` asks for."""
+
+
+def parse_copies(text: str) -> tuple[str, ...]:
+    """The pictures themselves, and the copies of `--copies mirrored,turned`. Raises UserError."""
+    words = [word.strip() for word in text.split(",") if word.strip()]
+    unknown = [word for word in words if word not in KINDS]
+    if unknown:
+        raise UserError(f"--copies has {unknown[0]!r}; give some of {', '.join(KINDS)}")
+    return (PLAIN, *(copy for word in KINDS if word in words for copy in KINDS[word]))
+
+
+def copied_camera(camera: CameraParameters, copy: str) -> CameraParameters:
+    """The camera that would have taken the copy of a picture."""
+    if copy != MIRRORED:
+        return camera
+    matrix, coefficients = camera.matrix, list(camera.coefficients)
+    if matrix is not None:
+        matrix = (matrix[0], matrix[1], camera.width - 1 - matrix[2], matrix[3])
+    if camera.distortion == "opencv":
+        coefficients[3] = -coefficients[3]  # p2, the tangential part across
+    return replace(
+        camera,
+        y=-camera.y,
+        roll_deg=-camera.roll_deg,
+        yaw_deg=-camera.yaw_deg,
+        matrix=matrix,
+        coefficients=tuple(coefficients),
+    )
+
+
+def copied_picture(
+    image: NDArray[np.uint8], camera: CameraParameters, copy: str
+) -> NDArray[np.uint8]:
+    """The copy of a picture (H, W, 3) that `camera` took, at any size of its aspect ratio."""
+    if copy == PLAIN:
+        return image
+    if copy == MIRRORED:
+        return np.ascontiguousarray(image[:, ::-1])
+    return _turned(image, camera.resized(image.shape[1], image.shape[0]), TURNS_RAD[copy])
+
+
+def _turned(image: NDArray[np.uint8], camera: CameraParameters, right: float) -> NDArray[np.uint8]:
+    """The picture of a camera that is turned to its right about its own vertical, rad."""
+    cosine, sine = np.cos(right), np.sin(right)
+    turn = np.array([[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]])  # to the old directions
+    size = (camera.width, camera.height)
+    grey = (BORDER_LEVEL,) * 3
+    if camera.distortion == "none":
+        k = camera.intrinsics()
+        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        way = k @ turn @ np.linalg.inv(k)
+        found = cv2.warpPerspective(image, way, size, flags=flags, borderValue=grey)
+        return found.astype(np.uint8, copy=False)
+    columns, rows = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
+    seen = camera.rays(np.column_stack([columns.ravel(), rows.ravel()])) @ turn.T
+    at_place = replace(camera, x=0.0, y=0.0, z=0.0)
+    maps = at_place.project(seen @ at_place.rotation()).reshape(*columns.shape, 2)
+    across, down = (np.nan_to_num(maps[..., i], nan=-1e4).astype(np.float32) for i in (0, 1))
+    found = cv2.remap(image, across, down, cv2.INTER_LINEAR, borderValue=grey)
+    return found.astype(np.uint8, copy=False)
+
+
+def copied_label(
+    labels: CustomLabels, row: int, camera: CameraParameters, copy: str
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.int64]]:
+    """Distances (1, 5), angle (1,) and class (1,) of the copy of the picture `row`."""
+    one = labels.take([row])
+    distances, angle, heading = one.distances, one.angle, one.heading
+    if copy == MIRRORED:
+        swapped = -distances[:, [1, 0, 4, 3, 2]]
+        distances = np.where(np.isinf(swapped), np.float32(UNKNOWN_M), swapped)
+        return distances, -angle, tf.mirror_heading(heading)
+    if copy in TURNS_RAD:
+        # The camera stays where it is; the centre of gravity moves about it.
+        turned = angle + np.float32(TURNS_RAD[copy])
+        ahead = np.sin(turned) - np.sin(angle)
+        aside = np.cos(turned) - np.cos(angle)
+        moved = distances + (camera.x * ahead - camera.y * aside)[:, None]
+        return moved.astype(np.float32), turned.astype(np.float32), heading
+    return distances, angle, heading

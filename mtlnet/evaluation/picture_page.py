@@ -1,0 +1,223 @@
+"""The evaluation on a user's own pictures as one HTML page: `mtlnet evaluate --data FOLDER --report
+FILE`. Each picture has its label (green) and the model's answer (orange) drawn in, the failures
+first."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+import trackfeatures as tf
+from mtlnet.data.custom_images import CustomImages
+from mtlnet.data.labels_file import LabelledPicture
+from mtlnet.data.picture_copies import copied_camera, copied_picture
+from mtlnet.evaluation.pictures import FEATURES, GROUPS, Answers
+from mtlnet.inference.image_decoding.decode import read_whole_image
+from mtlnet.inference.overlay import PREDICTION_COLOUR, TRUTH_COLOUR, marking_line
+from mtlnet.inference.prediction import split_outputs
+from mtlnet.inference.uncertainty import FEATURES as ANSWERS
+from runtime.files import atomic_write
+from runtime.html import embed_jpeg, format_number, format_percent, render
+from trackfeatures.camera import CameraParameters
+
+WIDTH_PX = 400
+ALONG_M = np.geomspace(2.0, 35.0, 40)
+"""Where along the road markings are drawn."""
+TITLES = {
+    "ml": "left (m)",
+    "mr": "right (m)",
+    "lane_width": "lane width (m)",
+    "to_lane_centre": "centre (m)",
+    "angle": "heading (rad)",
+}
+DIGITS = {name: 4 if name == "angle" else 3 for name in FEATURES}
+
+Rows = list[list[str]]
+Image = NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class Case:
+    """One picture or copy of the page: `row` in the answers, or the reason why it has none."""
+
+    picture: LabelledPicture
+    copy: str
+    row: int | None
+    verdict: str
+    """What went wrong in words; empty where nothing did."""
+
+
+def write_picture_page(path: Path, report: dict[str, Any], answers: Answers) -> Path:
+    """Write the page of `mtlnet.evaluation.pictures.picture_report`'s report to the file `path`."""
+    figures = report["pictures"]
+    page = render(
+        "mtlnet.evaluation",
+        "pictures.html",
+        report=report,
+        figures=figures,
+        error_head=["", *TITLES.values()],
+        error_rows=list(_error_rows(figures)),
+        share_rows=_share_rows(figures),
+        within_rows=list(_within_rows(figures)),
+        groups=list(_groups(figures)),
+        cases=[_figure(answers, case) for case in cases(answers)],
+    )
+    atomic_write(path, page, fsync=True)
+    return path
+
+
+def _error_rows(figures: dict[str, Any]) -> Iterator[list[str]]:
+    for title, key in (
+        ("mean", "mean"),
+        ("median", "median"),
+        ("mean of the drives' means", "mean_of_drives"),
+        ("always answering the labels' median", "always_median"),
+    ):
+        yield [title, *_cells(figures[key])]
+    std = figures["label_std"]
+    lengths = [format_number(std["m"], 3)] * 2 + ["-"] + [format_number(std["m"], 3)]
+    yield ["the labels' own standard deviation", *lengths, format_number(std["rad"], 4)]
+
+
+def _cells(values: dict[str, float | None]) -> list[str]:
+    return [format_number(values[name], DIGITS[name]) for name in FEATURES]
+
+
+def _share_rows(figures: dict[str, Any]) -> Rows:
+    names = {
+        "refused": "refused: it shows too little of the model's view",
+        "absent": "answered absent: the lane is labelled",
+        "out_of_distribution": "called out of distribution",
+    }
+    return [
+        [title, f"{figures[key]}", format_percent(figures[key] / figures["cases"])]
+        for key, title in names.items()
+        if figures[key] is not None
+    ]
+
+
+def _within_rows(figures: dict[str, Any]) -> Iterator[list[str]]:
+    for name, share in figures.get("within_std", {}).items():
+        if share is not None:
+            yield [name, format_percent(share)]
+
+
+def _groups(figures: dict[str, Any]) -> Iterator[dict[str, Any]]:
+    for grouping, label in GROUPS.items():
+        if grouping not in figures:
+            continue
+        head = [label, "pictures", "refused", "absent", "out of distr.", *TITLES.values()]
+        rows = []
+        for name, part in figures[grouping].items():
+            counts = [part[key] for key in ("cases", "refused", "absent", "out_of_distribution")]
+            texts = ["-" if count is None else f"{count}" for count in counts]
+            rows.append([name, *texts, *_cells(part["mean"])])
+        yield {"head": head, "rows": rows}
+
+
+def cases(answers: Answers) -> list[Case]:
+    """All pictures and copies, the failures first.
+
+    Refused ones, then those answered absent, then by the largest of their errors, each in units of
+    its feature's mean.
+    """
+    images = answers.images
+    sizes = np.abs(answers.errors)
+    with np.errstate(invalid="ignore"):
+        ratio = sizes / np.maximum(np.nanmean(sizes, axis=0, keepdims=True), 1e-9)
+    badness = np.nan_to_num(ratio).max(1)
+    foreign = answers.foreign
+    found = [
+        Case(picture, copy, None, f"refused: {reason}") for picture, copy, reason in images.refused
+    ]
+    order = np.lexsort([-badness, ~answers.absent])
+    for row in order.tolist():
+        words = ["answered absent"] if answers.absent[row] else []
+        if foreign is not None and foreign[row]:
+            words.append("out of distribution")
+        picture, copy = images.pictures[row], images.copies[row]
+        found.append(Case(picture, copy, row, ", ".join(words)))
+    return found
+
+
+def _figure(answers: Answers, case: Case) -> dict[str, Any]:
+    """Of a case: its picture with label and answer, and the texts of its caption."""
+    picture, row = case.picture, case.row
+    place = ", ".join(text for text in (picture.drive, picture.light) if text)
+    name = picture.file if case.copy == "plain" else f"{picture.file}, {case.copy}"
+    texts: Rows = []
+    if row is not None:
+        std = split_outputs(answers.outputs[row]).std
+        by_name = {} if std is None else dict(zip(ANSWERS, std.tolist(), strict=True))
+        for i, feature in enumerate(FEATURES):
+            true, found = answers.true[row, i], answers.found[row, i]
+            numbers = ["-" if np.isnan(v) else f"{v:+.{DIGITS[feature]}f}" for v in (true, found)]
+            error = found - true
+            numbers.append("-" if np.isnan(error) else f"{error:+.{DIGITS[feature]}f}")
+            numbers.append(format_number(by_name.get(feature), DIGITS[feature]))
+            texts.append([TITLES[feature], *numbers])
+    image = _drawn(answers, case)
+    return {
+        "jpeg": embed_jpeg(image),
+        "name": _printable(name),
+        "place": place,
+        "verdict": case.verdict,
+        "rows": texts,
+    }
+
+
+def _printable(name: str) -> str:
+    """A file's name as text: bytes that are not UTF-8 as escapes."""
+    return name.encode("utf-8", "backslashreplace").decode()
+
+
+def _drawn(answers: Answers, case: Case) -> Image:
+    """The picture or copy, `WIDTH_PX` wide at most, with the label and the answer drawn in."""
+    images, picture = answers.images, case.picture
+    whole = read_whole_image(images.path / picture.file)
+    scale = min(1.0, WIDTH_PX / whole.shape[1])
+    size = (round(whole.shape[1] * scale), round(whole.shape[0] * scale))
+    small = cv2.resize(whole, size, interpolation=cv2.INTER_AREA).astype(np.uint8)
+    row = case.row
+    if row is None:
+        return small
+    camera = source_camera(images, row).resized(*size)
+    taken = copied_camera(camera, case.copy)  # undoes the mirror, or does nothing
+    canvas = copied_picture(small, taken, case.copy).copy()
+    curvature = -picture.curvature if case.copy == "mirrored" else picture.curvature
+    answered, angle = tf.decode(answers.outputs[row : row + 1, :6])
+    labels = images.labels
+    for distances, heading, colour, thickness in (
+        (labels.distances[row], float(labels.angle[row]), TRUTH_COLOUR, 2),
+        (answered[0], float(angle[0]), PREDICTION_COLOUR, 2),
+    ):
+        for distance in distances.tolist():
+            if np.isfinite(distance):
+                line = marking_line(distance, heading, curvature, ALONG_M)
+                _draw_line(canvas, camera, line, colour, thickness)
+    return canvas
+
+
+def source_camera(images: CustomImages, row: int) -> CameraParameters:
+    """The camera that took the picture or copy in a row, at its own size."""
+    lens = images.lenses[row]
+    return images.camera if lens is None else lens.source
+
+
+def _draw_line(
+    canvas: Image,
+    camera: CameraParameters,
+    points: NDArray[np.float64],
+    colour: tuple[int, int, int],
+    thickness: int,
+) -> None:
+    """Draw points (N, 2) of the road, m, as far as the camera sees them."""
+    road = np.column_stack([points, np.full(len(points), -camera.cg_height_m)])
+    pixels = camera.project(road)
+    pixels = pixels[np.isfinite(pixels).all(1) & (np.abs(pixels) < 1e4).all(1)]
+    line = np.round(pixels).astype(np.int32)
+    cv2.polylines(canvas, [line], False, colour, thickness, cv2.LINE_AA)

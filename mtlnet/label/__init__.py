@@ -1,0 +1,1 @@
+"""Labelling pictures by hand: `mtlnet label FOLDER`."""

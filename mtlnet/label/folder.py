@@ -1,0 +1,168 @@
+"""The folder that is being labelled: its pictures, their cameras, and the rows of `labels.csv`.
+
+Each change rewrites `labels.csv` in one step, from the file as it is then: rows of other pictures
+and columns that the page does not show stay. Only files within the folder are read.
+"""
+
+from dataclasses import replace
+from pathlib import Path
+from threading import Lock
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mtlnet.data.labels_file import (
+    LABELS,
+    UNKNOWN,
+    Cells,
+    check_cells,
+    lane_cells,
+    read_cells,
+    write_cells,
+)
+from mtlnet.inference.image_decoding.decode import read_whole_image
+from mtlnet.inference.rectification import CAMERA_FILE, TOLERANCE, read_camera
+from mtlnet.label.geometry import Markings
+from mtlnet.predict.kinds import Kind, kind_of
+from runtime.camera_file import write_camera
+from runtime.files import natural_key
+from trackfeatures.camera import CameraParameters
+from trackfeatures.definitions import BEND_CURVATURE
+from trackfeatures.errors import UserError
+
+KEPT = ("drive", "light", "camera", "std_m", "std_rad")
+"""Columns of a row that saving a label does not change, unless the page gives them."""
+
+
+class LabelFolder:
+    """Pictures are addressed by their number in `files`, the order at the start."""
+
+    def __init__(self, folder: Path, camera_file: Path | None, model: CameraParameters) -> None:
+        """`camera_file`: of pictures without a camera of their own; it is copied into the folder
+        where that has none. `model`: what a camera's file leaves out. Raises UserError."""
+        if not folder.is_dir():
+            raise UserError(f"there is no folder {folder}; give one with pictures")
+        self.folder = folder.resolve()
+        self._model = model
+        self._lock = Lock()
+        self.files = self._find()
+        if not self.files:
+            raise UserError(f"there is no picture in {folder}")
+        self.rows()  # raises for a faulty file before the first label is drawn
+        own = self.folder / CAMERA_FILE
+        if camera_file is not None:
+            camera = read_camera(camera_file, model)
+            if own.exists() and read_camera(own, model) != camera:
+                raise UserError(
+                    f"{own} describes another camera than {camera_file}; leave --camera out, or "
+                    "delete the former"
+                )
+            if not own.exists():
+                write_camera(own, camera, f"From {camera_file.name}, by `mtlnet label`.")
+        missing = [row["file"] for row in self.rows().values() if not row.get("camera")]
+        named = len(self.rows()) == len(self.files) and not missing
+        if not own.exists() and not named:
+            raise UserError(
+                f"{folder} has no {CAMERA_FILE}, without which no metres follow from a picture: "
+                "give --camera FILE (`mtlnet calibrate` makes one)"
+            )
+
+    def _find(self) -> list[str]:
+        found = []
+        for path in self.folder.rglob("*"):
+            name = path.relative_to(self.folder).as_posix()
+            if any(part.startswith(".") for part in path.relative_to(self.folder).parts):
+                continue
+            within = path.resolve().is_relative_to(self.folder)
+            if within and path.is_file() and kind_of(path) is Kind.IMAGE:
+                found.append(name)
+        return sorted(found, key=natural_key)
+
+    def rows(self) -> dict[str, Cells]:
+        """The rows of `labels.csv` by file; none where there is no such file."""
+        path = self.folder / LABELS
+        if not path.is_file():
+            return {}
+        return {cells["file"]: cells for _, cells in read_cells(path)}
+
+    def picture(self, number: int) -> NDArray[np.uint8]:
+        """The whole picture, uint8 RGB (H, W, 3). Raises UserError."""
+        path = self.folder / self.files[number]
+        if not path.resolve().is_relative_to(self.folder):
+            raise UserError(f"{self.files[number]} leads out of the folder")
+        return read_whole_image(path)
+
+    def camera(self, number: int, width: int, height: int) -> CameraParameters:
+        """The camera of a picture, at the picture's size. Raises UserError."""
+        row = self.rows().get(self.files[number], {})
+        name = row.get("camera") or CAMERA_FILE
+        path = self.folder / name
+        if not path.resolve().is_relative_to(self.folder):
+            raise UserError(f"the camera {name} leads out of the folder")
+        camera = read_camera(path, self._model)
+        if abs(width * camera.height / (height * camera.width) - 1) > TOLERANCE:
+            raise UserError(
+                f"{self.files[number]} is {width} x {height} px, its camera gives {camera.width} x "
+                f"{camera.height}: label the camera's whole pictures, at any size"
+            )
+        if row.get("pitch_deg"):
+            camera = replace(camera, pitch_deg=float(row["pitch_deg"]))
+        return camera.resized(width, height)
+
+    def markings(self, number: int, camera: CameraParameters) -> Markings | None:
+        """The label of a picture; None where it has none, or none of a lane."""
+        row = self.rows().get(self.files[number])
+        sides = None if row is None else _sides(row)
+        if row is None or sides is None:
+            return None
+        curvature = float(row.get("curvature_1pm") or 0.0)
+        return Markings(*sides, float(row["angle"]), curvature, camera.pitch_deg)
+
+    def save(self, number: int, markings: Markings, heading: str, texts: Cells) -> Cells:
+        """Write the label of a picture; returns its row. `texts`: `drive` and `light`, where given.
+
+        `heading` empty: from the curvature, which holds as far as the markings were drawn: over the
+        20 m that the class looks ahead. Raises UserError for a label out of range.
+        """
+        if not heading:
+            bend = "left" if markings.curvature > 0 else "right"
+            heading = bend if abs(markings.curvature) >= BEND_CURVATURE else "straight"
+        with self._lock:
+            rows = self.rows()
+            name = self.files[number]
+            old = {k: v for k, v in rows.get(name, {}).items() if k in KEPT}
+            row = {
+                **old,
+                **{k: v for k, v in texts.items() if k in ("drive", "light")},
+                "file": name,
+                **lane_cells(markings.ml, markings.mr),
+                "angle": f"{markings.angle:.5f}",
+                "heading": heading,
+                "pitch_deg": f"{markings.pitch_deg:.3f}",
+                "curvature_1pm": f"{markings.curvature:.6f}",
+            }
+            check_cells(row)
+            self._write({**rows, name: row})
+        return row
+
+    def remove(self, number: int) -> None:
+        """Take the label of a picture away, where it has one."""
+        with self._lock:
+            rows = self.rows()
+            if rows.pop(self.files[number], None) is not None:
+                self._write(rows)
+
+    def _write(self, rows: dict[str, Cells]) -> None:
+        if rows:
+            write_cells(self.folder / LABELS, [rows[k] for k in sorted(rows, key=natural_key)])
+        else:
+            (self.folder / LABELS).unlink(missing_ok=True)
+
+
+def _sides(row: Cells) -> tuple[float, float] | None:
+    """`ml` and `mr` of a row, or where the car is too near to a marking, of that and the next."""
+    for left, right in (("ml", "mr"), ("m", "r"), ("l", "m")):
+        cells = row[left], row[right]
+        if all(cell and cell != UNKNOWN for cell in cells):
+            return float(cells[0]), float(cells[1])
+    return None

@@ -1,0 +1,159 @@
+"""Converts a table of lane labels in the picture's own terms into a folder with a `labels.csv`:
+`mtlnet label FOLDER --import FILE`.
+
+Columns that are read: `file` (beside the table); `x_left_m`, `x_right_m`, where the lane's markings
+lie at the camera, left positive; `heading_rad`, of the camera against the road, positive to the
+right; `fov_y_deg` and `camera_height_m` of the camera; perhaps `focal_px` and `horizon_y_px`, which
+give the pitch, `curvature_1pm`, left positive, `drive` and `light`. Others are left out. The
+cameras are pinholes, and metres are measured at the camera.
+"""
+
+import csv
+import math
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import Any
+
+from mtlnet.data.labels_file import (
+    LABELS,
+    UNKNOWN,
+    Cells,
+    check_cells,
+    lane_cells,
+    path_within,
+    write_cells,
+)
+from mtlnet.inference.image_decoding.decode import read_whole_image
+from runtime.camera_file import write_camera
+from trackfeatures.camera import CameraParameters
+from trackfeatures.definitions import BEND_CURVATURE
+from trackfeatures.errors import UserError
+
+NEEDED = ("file", "x_left_m", "x_right_m", "heading_rad", "fov_y_deg", "camera_height_m")
+CAMERAS = "cameras"
+
+
+@dataclass(frozen=True)
+class LabelStd:
+    """Standard deviations of the labels of files that match `pattern`."""
+
+    pattern: str
+    metres: float
+    radians: float
+
+
+def parse_label_std(texts: Sequence[str]) -> list[LabelStd]:
+    """Of `--label-std 0.06,0.006 --label-std 'night_*=0.16,0.012'`. Raises UserError."""
+    found = []
+    for text in texts:
+        pattern, _, numbers = text.rpartition("=")
+        try:
+            metres, radians = (float(part) for part in numbers.split(","))
+        except ValueError:
+            raise UserError(
+                f"--label-std is {text!r}; give METRES,RADIANS or PATTERN=METRES,RADIANS, such as "
+                "0.06,0.006"
+            ) from None
+        found.append(LabelStd(pattern or "*", metres, radians))
+    return found
+
+
+def import_labels(table: Path, folder: Path, stds: Sequence[LabelStd] = ()) -> dict[str, Any]:
+    """Copy the pictures of a table to `folder`, with `labels.csv` and their cameras' files.
+
+    Of `stds` the last one that matches a file holds. Returns `folder`, `pictures` and `cameras`.
+    Raises UserError for a faulty row, and where `folder` has labels already.
+    """
+    if (folder / LABELS).exists():
+        raise UserError(f"{folder / LABELS} exists; give a new folder")
+    folder.mkdir(parents=True, exist_ok=True)
+    cameras: dict[CameraParameters, str] = {}
+    rows: list[Cells] = []
+    for line, row in _rows(table):
+        try:
+            camera, cells = _converted(table.parent, row, stds)
+            check_cells(cells)
+        except (UserError, ValueError) as error:
+            raise UserError(f"{table}, line {line}: {error}") from None
+        if camera not in cameras:
+            cameras[camera] = _write_camera(folder, camera, {*cameras.values()})
+        rows.append({**cells, "camera": cameras[camera]})
+        target = folder / row["file"]
+        target.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(table.parent / row["file"], target)
+    write_cells(folder / LABELS, rows)
+    return {"folder": str(folder), "pictures": len(rows), "cameras": len(cameras)}
+
+
+def _rows(table: Path) -> list[tuple[int, dict[str, str]]]:
+    with table.open(newline="", encoding="utf-8-sig") as file:
+        reader = csv.DictReader(file, strict=True)
+        names = reader.fieldnames or ()
+        missing = [name for name in NEEDED if name not in names]
+        if missing:
+            raise UserError(
+                f"{table} has no column {', '.join(missing)}; it must have {', '.join(NEEDED)}"
+            )
+        rows = [(reader.line_num, row) for row in reader]
+    if not rows:
+        raise UserError(f"{table} names no pictures")
+    return rows
+
+
+def _converted(
+    folder: Path, row: dict[str, str], stds: Sequence[LabelStd]
+) -> tuple[CameraParameters, Cells]:
+    """The camera, level, and the cells of a row. Raises UserError or ValueError."""
+    if not path_within(row["file"]):
+        raise UserError(f"the file {row['file']!r} is no path beside the table")
+    height, width = read_whole_image(folder / row["file"]).shape[:2]
+    camera = CameraParameters(
+        width=width,
+        height=height,
+        fov_y_deg=_number(row, "fov_y_deg"),
+        x=0.0,
+        z=_number(row, "camera_height_m") - CameraParameters.cg_height_m,
+    )
+    curvature = _number(row, "curvature_1pm") if row.get("curvature_1pm") else 0.0
+    bend = "left" if curvature > 0 else "right"
+    cells = {
+        "file": row["file"],
+        **lane_cells(-_number(row, "x_left_m"), -_number(row, "x_right_m")),
+        "angle": f"{_number(row, 'heading_rad'):.6g}",
+        # A gentler bend may be the beginning of one: the class looks 20 m ahead.
+        "heading": bend if abs(curvature) >= BEND_CURVATURE else UNKNOWN,
+        "drive": row.get("drive") or "",
+        "light": row.get("light") or "",
+        "curvature_1pm": f"{curvature:.6g}",
+    }
+    if row.get("focal_px") and row.get("horizon_y_px"):
+        down = (height - 1) / 2 - _number(row, "horizon_y_px")
+        cells["pitch_deg"] = f"{math.degrees(math.atan2(down, _number(row, 'focal_px'))):.6g}"
+    for std in stds:
+        if fnmatchcase(row["file"], std.pattern):
+            cells.update(std_m=f"{std.metres:g}", std_rad=f"{std.radians:g}")
+    return camera, cells
+
+
+def _number(row: dict[str, str], name: str) -> float:
+    try:
+        value = float(row[name])
+    except (TypeError, ValueError):
+        value = math.nan
+    if not math.isfinite(value):
+        raise UserError(f"{name} is {row[name]!r}, not a number")
+    return value
+
+
+def _write_camera(folder: Path, camera: CameraParameters, taken: set[str]) -> str:
+    """Write the file of a camera; its name within `folder`."""
+    base = f"{CAMERAS}/{camera.width}x{camera.height}-{camera.fov_y_deg:g}deg"
+    name, number = f"{base}.yaml", 2
+    while name in taken:  # another height
+        name, number = f"{base}-{number}.yaml", number + 1
+    (folder / CAMERAS).mkdir(exist_ok=True)
+    write_camera(folder / name, camera, "The pitch of each picture is in labels.csv.")
+    return name

@@ -1,0 +1,288 @@
+// Labels pictures: the geometry is the server's (POST fit), the page draws and drags. Pixels are
+// those of the whole picture; `view.scale` is canvas pixels for each of them.
+
+const $ = (id) => document.getElementById(id);
+const canvas = $("picture"), ink = canvas.getContext("2d");
+const SIDES = ["left", "right"], NEAR = 0, BEND = 1, FAR = 2;
+const REACH = 34; // CSS px from a handle within which a touch takes it
+const COLOURS = { left: "#ffd23e", right: "#5ad1ff" };
+
+let token = decodeURIComponent(location.hash.slice(1)) || sessionStorage.getItem("token") || "";
+let pictures = [], number = 0, shown = null, image = null, view = { scale: 1 };
+let drag = null, steps = [], saves = [], busy = false, again = false;
+const ahead = new Map(); // pictures that were fetched in advance
+
+async function call(path, method = "GET", body) {
+  const headers = token ? { Authorization: `Bearer ${token}` } : {};
+  if (body !== undefined) headers["Content-Type"] = "application/json";
+  const answer = await fetch(path, { method, headers, body: body === undefined ? undefined : JSON.stringify(body) });
+  if (answer.status === 401) $("locked").hidden = false;
+  if (!answer.ok) {
+    const told = await answer.json().catch(() => ({}));
+    throw new Error(typeof told.detail === "string" ? told.detail : `the server answered ${answer.status}`);
+  }
+  return answer;
+}
+
+function say(text) { $("status").textContent = text; }
+
+async function start() {
+  try {
+    const listing = await (await call("api/pictures")).json();
+    pictures = listing.pictures;
+    $("locked").hidden = true;
+    const first = pictures.findIndex((one) => !one.labelled);
+    await open(first < 0 ? 0 : first);
+  } catch (error) { say(error.message); }
+}
+
+function fetched(n) {
+  if (!ahead.has(n)) {
+    const both = Promise.all([
+      call(`api/pictures/${n}`).then((answer) => answer.json()),
+      call(`api/pictures/${n}/image`).then((answer) => answer.blob()).then((blob) => createImageBitmap(blob)),
+    ]);
+    both.catch(() => ahead.delete(n));
+    ahead.set(n, both);
+  }
+  return ahead.get(n);
+}
+
+async function open(n) {
+  number = n;
+  document.body.dataset.ready = "";
+  say("");
+  try {
+    const [data, bitmap] = await fetched(n);
+    if (n !== number) return;
+    shown = structuredClone(data);
+    image = bitmap;
+    steps = [];
+    $("heading").value = shown.source === "label" ? shown.row.heading : "";
+    if (shown.row) { $("drive").value = shown.row.drive || ""; $("light").value = shown.row.light || ""; }
+    say(shown.note);
+  } catch (error) { shown = image = null; say(error.message); }
+  resize();
+  if (n + 1 < pictures.length) fetched(n + 1).catch(() => {});
+  for (const old of ahead.keys()) if (Math.abs(old - n) > 2) ahead.delete(old);
+  document.body.dataset.ready = String(n);
+}
+
+function resize() {
+  const width = document.body.clientWidth - 4, height = window.innerHeight * 0.72;
+  const size = shown || { width: 4, height: 3 };
+  const css = Math.min(width / size.width, height / size.height);
+  const dense = window.devicePixelRatio || 1;
+  canvas.style.width = `${size.width * css}px`;
+  canvas.style.height = `${size.height * css}px`;
+  canvas.width = Math.round(size.width * css * dense);
+  canvas.height = Math.round(size.height * css * dense);
+  view = { scale: canvas.width / size.width, css };
+  draw();
+}
+
+// A picture's pixel centres are whole numbers: its left edge is at -0.5.
+const place = ([u, v]) => [(u + 0.5) * view.scale, (v + 0.5) * view.scale];
+const pixel = (event) => {
+  const box = canvas.getBoundingClientRect();
+  return [(event.clientX - box.left) / view.css - 0.5, (event.clientY - box.top) / view.css - 0.5];
+};
+
+function draw() {
+  ink.clearRect(0, 0, canvas.width, canvas.height);
+  const done = pictures.filter((one) => one.labelled).length;
+  $("progress").textContent = pictures.length ? `${number + 1} of ${pictures.length}, ${done} labelled` : "";
+  $("name").textContent = pictures.length ? pictures[number].file + (pictures[number].labelled ? " ✓" : "") : "";
+  if (!shown) { $("numbers").textContent = ""; return; }
+  ink.drawImage(image, 0, 0, canvas.width, canvas.height);
+  const dense = window.devicePixelRatio || 1;
+  for (const side of SIDES) {
+    ink.strokeStyle = COLOURS[side];
+    ink.lineWidth = 2 * dense;
+    ink.beginPath();
+    shown.lines[side].forEach((point, i) => (i ? ink.lineTo(...place(point)) : ink.moveTo(...place(point))));
+    ink.stroke();
+    shown.handles[side].forEach((point, which) => {
+      const [x, y] = place(point), r = (which === BEND ? 6 : 9) * dense;
+      ink.beginPath();
+      if (which === BEND) ink.rect(x - r, y - r, 2 * r, 2 * r); else ink.arc(x, y, r, 0, 2 * Math.PI);
+      ink.fillStyle = "rgba(0, 0, 0, .25)";
+      ink.fill();
+      ink.stroke();
+    });
+  }
+  canvas.dataset.handles = JSON.stringify(shown.handles); // for programs that drive the page
+  if (drag) magnify(shown.handles[drag.side][drag.which]);
+  const m = shown.markings, sign = (x, digits) => (x < 0 ? "" : "+") + x.toFixed(digits);
+  $("numbers").textContent =
+    `left ${sign(m.ml, 2)} m, right ${sign(m.mr, 2)} m, width ${(m.mr - m.ml).toFixed(2)} m, ` +
+    `heading ${sign(m.angle, 4)} rad, pitch ${sign(m.pitch_deg, 2)}°, ` +
+    (Math.abs(m.curvature) < 1e-4 ? "straight" : `radius ${Math.round(1 / Math.abs(m.curvature))} m ${m.curvature > 0 ? "left" : "right"}`);
+}
+
+function magnify([u, v]) {
+  const side = Math.min(canvas.width, canvas.height) * 0.36, zoom = 3;
+  const left = place([u, v])[0] > canvas.width / 2 ? 0 : canvas.width - side;
+  const fx = image.width / shown.width, half = side / zoom / 2 / view.scale;
+  ink.drawImage(image, (u + 0.5 - half) * fx, (v + 0.5 - half) * fx, 2 * half * fx, 2 * half * fx, left, 0, side, side);
+  ink.strokeStyle = COLOURS[drag.side];
+  ink.lineWidth = 1;
+  ink.strokeRect(left, 0, side, side);
+  ink.beginPath();
+  ink.moveTo(left + side / 2, side * 0.3); ink.lineTo(left + side / 2, side * 0.7);
+  ink.moveTo(left + side * 0.3, side / 2); ink.lineTo(left + side * 0.7, side / 2);
+  ink.stroke();
+}
+
+function nearest(point) {
+  let best = null, least = REACH / view.css;
+  for (const side of SIDES) shown.handles[side].forEach((at, which) => {
+    const away = Math.hypot(at[0] - point[0], at[1] - point[1]);
+    if (away < least) { least = away; best = { side, which, from: [at[0] - point[0], at[1] - point[1]] }; }
+  });
+  return best;
+}
+
+canvas.addEventListener("pointerdown", (event) => {
+  if (!shown) return;
+  const point = pixel(event);
+  drag = nearest(point);
+  if (!drag) return;
+  canvas.setPointerCapture(event.pointerId);
+  steps.push(structuredClone({ markings: shown.markings, lines: shown.lines, handles: shown.handles }));
+  draw();
+});
+
+canvas.addEventListener("pointermove", (event) => {
+  if (!drag) return;
+  const [u, v] = pixel(event);
+  const inside = (x, size) => Math.min(Math.max(x, 0), size - 1);
+  shown.handles[drag.side][drag.which] = [inside(u + drag.from[0], shown.width), inside(v + drag.from[1], shown.height)];
+  draw();
+  fit();
+});
+
+for (const kind of ["pointerup", "pointercancel"]) canvas.addEventListener(kind, async () => {
+  const held = drag;
+  if (!held) return;
+  await fit();
+  if (drag === held) drag = null; // else the next one has begun
+  draw();
+});
+
+// One request at a time; the last position counts.
+async function fit() {
+  if (busy) { again = true; return waiting; }
+  busy = true;
+  document.body.dataset.busy = "1";
+  waiting = (async () => {
+    try {
+      do { again = false; await fitOnce(); } while (again);
+    } finally { busy = false; document.body.dataset.busy = ""; }
+  })();
+  return waiting;
+}
+let waiting = Promise.resolve();
+
+async function fitOnce() {
+  const held = drag, of = number;
+  const body = { curvature: shown.markings.curvature, pitch_deg: $("fixed").checked ? shown.camera_pitch_deg : null };
+  for (const side of SIDES) {
+    const [near, bend, far] = shown.handles[side];
+    body[side] = held && held.which === BEND && held.side === side ? [near, bend, far] : [near, far];
+  }
+  if (held && held.which === BEND) body.curvature = null;
+  try {
+    const found = await (await call(`api/pictures/${of}/fit`, "POST", body)).json();
+    if (of !== number) return;
+    shown.markings = found.markings;
+    shown.lines = found.lines;
+    for (const side of SIDES) shown.handles[side] = shown.handles[side].map((at, which) => {
+      if (drag && drag.side === side && drag.which === which) return at;
+      const u = across(found.lines[side], at[1]);
+      return u === null || u < 0 || u > shown.width - 1 ? found.handles[side][which] : [u, at[1]];
+    });
+    say("");
+  } catch (error) { say(error.message); }
+  draw();
+}
+
+function across(line, row) {
+  for (let i = 1; i < line.length; i++) {
+    const [a, b] = [line[i - 1], line[i]];
+    if ((a[1] - row) * (b[1] - row) <= 0 && a[1] !== b[1]) return a[0] + ((row - a[1]) / (b[1] - a[1])) * (b[0] - a[0]);
+  }
+  return null;
+}
+
+const label = (markings, heading, drive, light) => ({ ...markings, heading, drive, light });
+
+async function save() {
+  if (!shown) return;
+  await waiting;
+  const old = shown.source === "label" ? [await (await call(`api/pictures/${number}`)).json()] : [];
+  try {
+    const row = await (await call(`api/pictures/${number}/label`, "PUT",
+      label(shown.markings, $("heading").value, $("drive").value, $("light").value))).json();
+    saves.push({ number, before: old.length ? old[0] : null });
+    pictures[number].labelled = true;
+    ahead.delete(number);
+    document.body.dataset.saved = row.file;
+    if (number + 1 < pictures.length) await open(number + 1);
+    else { await open(number); say("this was the last picture"); }
+  } catch (error) { say(error.message); }
+}
+
+async function undo() {
+  await waiting;
+  if (steps.length) { Object.assign(shown, steps.pop()); draw(); return; }
+  const last = saves.pop();
+  if (!last) { say("nothing to take back"); return; }
+  try {
+    const { before } = last;
+    if (before) await call(`api/pictures/${last.number}/label`, "PUT",
+      label(before.markings, before.row.heading, before.row.drive || "", before.row.light || ""));
+    else await call(`api/pictures/${last.number}/label`, "DELETE");
+    pictures[last.number].labelled = Boolean(before);
+    ahead.delete(last.number);
+    await open(last.number);
+  } catch (error) { say(error.message); }
+}
+
+async function remove() {
+  if (!pictures[number].labelled) { await go(1); return; }
+  try {
+    const before = await (await call(`api/pictures/${number}`)).json();
+    await call(`api/pictures/${number}/label`, "DELETE");
+    saves.push({ number, before: before.source === "label" ? before : null });
+    pictures[number].labelled = false;
+    ahead.delete(number);
+    await open(number);
+  } catch (error) { say(error.message); }
+}
+
+async function go(by) {
+  const n = number + by;
+  if (n >= 0 && n < pictures.length) await open(n); else say(by < 0 ? "this is the first picture" : "this is the last picture");
+}
+
+const KEYS = {
+  Enter: save, n: save, N: save, u: undo, U: undo, ArrowLeft: () => go(-1), ArrowRight: () => go(1), x: remove, X: remove,
+  0: () => { $("heading").value = "?"; }, 1: () => { $("heading").value = "left"; },
+  2: () => { $("heading").value = "straight"; }, 3: () => { $("heading").value = "right"; },
+};
+window.addEventListener("keydown", (event) => {
+  if (/^(INPUT|SELECT|TEXTAREA)$/.test(event.target.tagName) && event.target.type !== "checkbox") return;
+  if ((event.ctrlKey || event.metaKey) && event.key === "z") { event.preventDefault(); undo(); return; }
+  if (event.ctrlKey || event.metaKey || event.altKey || !(event.key in KEYS)) return;
+  if (event.key === "Enter" && event.target.tagName === "BUTTON") return;
+  event.preventDefault();
+  KEYS[event.key]();
+});
+for (const [id, work] of [["next", save], ["undo", undo], ["remove", remove], ["previous", () => go(-1)], ["skip", () => go(1)]])
+  $(id).addEventListener("click", (event) => { event.currentTarget.blur(); work(); });
+$("fixed").addEventListener("change", () => { if (shown) fit(); });
+$("token").addEventListener("change", () => { token = $("token").value.trim(); sessionStorage.setItem("token", token); start(); });
+window.addEventListener("resize", resize);
+if (location.hash) { sessionStorage.setItem("token", token); history.replaceState(null, "", location.pathname); }
+start();

@@ -1,0 +1,306 @@
+"""The page of `mtlnet label FOLDER` and its JSON interface, on one local port.
+
+Pictures are addressed by number: a request names no file. Every request is checked as the service
+checks its own (`runtime.access`): Host, Origin, and the token where there is one. The page itself
+holds no data and needs no token.
+"""
+
+import sys
+from collections.abc import Awaitable, Callable, MutableMapping
+from dataclasses import asdict
+from hmac import compare_digest
+from pathlib import Path
+from threading import Lock
+from typing import Annotated, Any, Literal
+
+import cv2
+import numpy as np
+import simplejpeg
+import uvicorn
+from fastapi import FastAPI
+from fastapi import Path as PathNumber
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import JSONResponse, Response
+from pydantic import BaseModel, ConfigDict, Field
+
+from mtlnet.inference.engine import Engine
+from mtlnet.inference.image_decoding.errors import ImageError
+from mtlnet.inference.prediction import Prediction, decode_outputs
+from mtlnet.inference.rectification import Rectification
+from mtlnet.label.folder import LabelFolder
+from mtlnet.label.geometry import Markings, fit_markings, handles, marking_pixels
+from runtime.access import HostNames
+from runtime.files import locked_folder
+from runtime.sockets import address, bind_all
+from trackfeatures.camera import CameraParameters
+from trackfeatures.errors import UserError
+
+PAGE = Path(__file__).parent / "page"
+MEDIA_TYPES = {".html": "text/html", ".js": "text/javascript", ".css": "text/css"}
+HEADERS = {
+    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; "
+    "connect-src 'self'; img-src 'self' blob:; base-uri 'none'; form-action 'none'; "
+    "frame-ancestors 'none'",
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cache-Control": "no-store",
+}
+MAX_BODY_BYTES = 64 << 10
+MAX_SHOWN_PX = 1600
+"""Longer side of a picture as it is sent to the page."""
+USUAL_LANE = -1.8, 1.8, 0.0, 0.0
+"""Where the lines begin without an answer of the model: in the middle of a lane of 3.6 m."""
+
+Scope = MutableMapping[str, Any]
+Receive = Callable[[], Awaitable[MutableMapping[str, Any]]]
+Send = Callable[[MutableMapping[str, Any]], Awaitable[None]]
+Asgi = Callable[[Scope, Receive, Send], Awaitable[None]]
+Number = Annotated[float, Field(allow_inf_nan=False)]
+Pixel = Annotated[list[Number], Field(min_length=2, max_length=2)]
+Pixels = Annotated[list[Pixel], Field(min_length=2, max_length=8)]
+Text = Annotated[str, Field(max_length=200, pattern=r"^[^\x00-\x1f]*$")]
+
+
+class Drag(BaseModel):
+    """Handles of both markings, px of the whole picture."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    left: Pixels
+    right: Pixels
+    curvature: Number | None = 0.0
+    """1/m; None: found from a third point."""
+    pitch_deg: Number | None = None
+    """None: found from where the markings meet."""
+
+
+class Label(BaseModel):
+    """What is saved for a picture."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    ml: Number
+    mr: Number
+    angle: Number
+    curvature: Number = 0.0
+    pitch_deg: Number = 0.0
+    heading: Literal["", "left", "straight", "right", "?"] = ""
+    drive: Text | None = None
+    light: Text | None = None
+
+
+class Labeller:
+    """Answers of a model and labels by hand, of the pictures of a folder."""
+
+    def __init__(self, folder: LabelFolder, engine: Engine | None) -> None:
+        """`engine` None: without answers of a model."""
+        self.folder = folder
+        self._engine = engine
+        self._lock = Lock()  # an engine takes one picture at a time
+
+    def listing(self) -> dict[str, Any]:
+        """The pictures by number: name, and whether they are labelled."""
+        rows = self.folder.rows()
+        files = [{"file": _text(name), "labelled": name in rows} for name in self.folder.files]
+        return {"folder": _text(self.folder.folder.name), "pictures": files}
+
+    def picture(self, number: int) -> dict[str, Any]:
+        """Size, row, lines and handles of a picture: of its label, else of the model's answer."""
+        image = self.folder.picture(number)
+        height, width = image.shape[:2]
+        camera = self.folder.camera(number, width, height)
+        row = self.folder.rows().get(self.folder.files[number])
+        label = self.folder.markings(number, camera)
+        answer, note = (None, "") if label else self._answer(image, camera)
+        usual = Markings(*USUAL_LANE, camera.pitch_deg)
+        return {
+            "file": _text(self.folder.files[number]),
+            "width": width,
+            "height": height,
+            "camera_pitch_deg": camera.pitch_deg,
+            "row": None if row is None else {k: _text(v) for k, v in row.items()},
+            "source": "label" if label else "model" if answer else "usual",
+            "note": note,
+            **shown(camera, label or answer or usual),
+        }
+
+    def _answer(
+        self, image: np.ndarray[Any, Any], camera: CameraParameters
+    ) -> tuple[Markings | None, str]:
+        """The model's answer, and a note on it."""
+        if self._engine is None:
+            return None, ""
+        lens = Rectification(camera, self._engine.card.camera)
+        try:
+            seen = lens.image(image)
+        except ImageError as error:
+            return None, str(error)
+        with self._lock:
+            outputs = self._engine(seen)
+        found = decode_outputs(lens.outputs(outputs[None])[0])
+        note = "unlike the training images" if found.out_of_distribution else ""
+        sides = _lane(found)
+        if sides is None:
+            return None, "the model sees no lane"
+        return Markings(*sides, found.angle_rad, 0.0, camera.pitch_deg), note
+
+    def shown_jpeg(self, number: int) -> bytes:
+        """The picture as JPEG, its longer side at most `MAX_SHOWN_PX`."""
+        image = self.folder.picture(number)
+        scale = min(1.0, MAX_SHOWN_PX / max(image.shape[:2]))
+        if scale < 1:
+            size = (round(image.shape[1] * scale), round(image.shape[0] * scale))
+            image = cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.uint8)
+        return bytes(simplejpeg.encode_jpeg(np.ascontiguousarray(image), quality=90))
+
+    def fit(self, number: int, drag: Drag) -> dict[str, Any]:
+        """The markings through dragged handles. Raises UserError."""
+        height, width = self.folder.picture(number).shape[:2]
+        camera = self.folder.camera(number, width, height)
+        found = fit_markings(camera, drag.left, drag.right, drag.curvature, drag.pitch_deg)
+        return shown(camera, found)
+
+
+def _lane(found: Prediction) -> tuple[float, float] | None:
+    """`ml` and `mr` of an answer, or where the car is on a marking, that one and the next."""
+    metres = found.distances_m
+    for left, right in (("ml", "mr"), ("m", "r"), ("l", "m")):
+        pair = metres[left], metres[right]
+        if pair[0] is not None and pair[1] is not None:
+            return pair[0], pair[1]
+    return None
+
+
+def _text(name: str) -> str:
+    """A file's name as text: bytes that are not UTF-8 as escapes."""
+    return name.encode("utf-8", "backslashreplace").decode()
+
+
+def shown(camera: CameraParameters, markings: Markings) -> dict[str, Any]:
+    """Markings as JSON: their numbers, and lines and handles in px of the picture."""
+    lines = {}
+    for side, pixels in zip(("left", "right"), marking_pixels(camera, markings), strict=True):
+        seen = pixels[np.isfinite(pixels).all(1) & (np.abs(pixels) < 1e5).all(1)]
+        lines[side] = np.round(seen, 2).tolist()
+    return {"markings": asdict(markings), "lines": lines, "handles": handles(camera, markings)}
+
+
+def create_app(labeller: Labeller, names: HostNames, token: str | None) -> Asgi:
+    """The page and its interface as an ASGI application."""
+    app = FastAPI(openapi_url=None, docs_url=None, redoc_url=None)
+    last = len(labeller.folder.files) - 1
+    number_type = Annotated[int, PathNumber(ge=0, le=last)]
+
+    @app.exception_handler(UserError)
+    async def refuse(_request: Any, error: UserError) -> Response:
+        return JSONResponse({"detail": str(error)}, 422, HEADERS)
+
+    @app.exception_handler(RequestValidationError)
+    async def refuse_form(_request: Any, error: RequestValidationError) -> Response:
+        first = error.errors()[0]
+        where = ".".join(map(str, first["loc"]))
+        return JSONResponse({"detail": f"{where}: {first['msg']}"}, 422, HEADERS)
+
+    def get_pictures() -> Response:
+        return JSONResponse(labeller.listing(), headers=HEADERS)
+
+    def get_picture(number: int) -> Response:
+        return JSONResponse(labeller.picture(number), headers=HEADERS)
+
+    def get_image(number: int) -> Response:
+        return Response(labeller.shown_jpeg(number), media_type="image/jpeg", headers=HEADERS)
+
+    def post_fit(number: int, drag: Drag) -> Response:
+        return JSONResponse(labeller.fit(number, drag), headers=HEADERS)
+
+    def put_label(number: int, label: Label) -> Response:
+        markings = Markings(label.ml, label.mr, label.angle, label.curvature, label.pitch_deg)
+        texts = {"drive": label.drive, "light": label.light}
+        given = {name: text.strip() for name, text in texts.items() if text is not None}
+        row = labeller.folder.save(number, markings, label.heading, given)
+        return JSONResponse({k: _text(v) for k, v in row.items()}, headers=HEADERS)
+
+    def delete_label(number: int) -> Response:
+        labeller.folder.remove(number)
+        return JSONResponse({}, headers=HEADERS)
+
+    for work in (get_picture, get_image, post_fit, put_label, delete_label):
+        work.__annotations__["number"] = number_type
+    app.get("/api/pictures")(get_pictures)
+    app.get("/api/pictures/{number}")(get_picture)
+    app.get("/api/pictures/{number}/image")(get_image)
+    app.post("/api/pictures/{number}/fit")(post_fit)
+    app.put("/api/pictures/{number}/label")(put_label)
+    app.delete("/api/pictures/{number}/label")(delete_label)
+    for path in sorted(PAGE.iterdir()):
+        route = "/" if path.name == "index.html" else f"/{path.name}"
+        app.get(route)(_page_file(path))
+    return _checked(app, names, token)
+
+
+def _page_file(path: Path) -> Callable[[], Response]:
+    def send() -> Response:
+        return Response(path.read_bytes(), media_type=MEDIA_TYPES[path.suffix], headers=HEADERS)
+
+    return send
+
+
+def _checked(app: Asgi, names: HostNames, token: str | None) -> Asgi:
+    """`app` behind the checks of every request."""
+
+    async def run(scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] == "http":
+            refusal = _refusal(scope, names, token)
+            if refusal is not None:
+                await refusal(scope, receive, send)
+                return
+        elif scope["type"] != "lifespan":
+            return  # no WebSocket here: uvicorn answers 403
+        await app(scope, receive, send)
+
+    return run
+
+
+def _refusal(scope: Scope, names: HostNames, token: str | None) -> Response | None:
+    headers = dict(scope["headers"])
+    count = sum(name == b"host" for name, _ in scope["headers"])
+    host, origin = headers.get(b"host", b""), headers.get(b"origin")
+    if count != 1:
+        return _refused(400, "send one Host header")
+    if not names.allow_host(host):
+        return _refused(421, "this name is none of this page's; use its address, or a token")
+    if origin is not None and not names.allow_origin(origin, host):
+        return _refused(403, "a page of another site may not use this one")
+    if token is not None and scope["path"].startswith("/api/"):
+        given = headers.get(b"authorization", b"")
+        if not compare_digest(given, b"Bearer " + token.encode()):
+            return _refused(401, "the token is missing or wrong")
+    if scope["method"] in ("POST", "PUT"):
+        if headers.get(b"content-type", b"").partition(b";")[0].strip() != b"application/json":
+            return _refused(415, "send application/json")
+        length = headers.get(b"content-length", b"")
+        if not (length.isdigit() and int(length) <= MAX_BODY_BYTES):
+            return _refused(413, f"send a body of at most {MAX_BODY_BYTES} bytes, with its length")
+    return None
+
+
+def _refused(status: int, detail: str) -> Response:
+    return JSONResponse({"detail": detail}, status, HEADERS)
+
+
+def serve_folder(labeller: Labeller, host: str, port: int, token: str | None) -> None:
+    """Serve the page until Ctrl-C. Raises UserError where the address cannot be listened on."""
+    names = HostNames([host], any_name=token is not None)
+    app = create_app(labeller, names, token)
+    with locked_folder(labeller.folder.folder):
+        listeners = bind_all(host, port)
+        for listener in listeners:  # the address is printed: from now on it answers
+            listener.listen()
+        where = address(listeners[0], host)
+        hint = "" if token is None else "#TOKEN"
+        sys.stderr.write(
+            f"{len(labeller.folder.files)} pictures; open {where}/{hint} and end with Ctrl-C\n"
+        )
+        sys.stderr.flush()
+        config = uvicorn.Config(app, log_level="warning", access_log=False, ws="none")
+        uvicorn.Server(config).run(sockets=listeners)

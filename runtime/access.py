@@ -1,0 +1,128 @@
+"""Who may use a service of this machine: the token, the addresses it listens on, and the names and
+pages that a request may come by.
+
+A web page can point a name of its own at this machine (DNS rebinding), or post to it without asking
+(a "simple" request). Without a token nothing else tells such a page from a client of the user's.
+Source: RFC 9112, 3.2 (Host); RFC 6454 (Origin).
+"""
+
+import os
+from collections.abc import Iterable
+from ipaddress import ip_address
+from pathlib import Path
+
+from trackfeatures.errors import UserError
+
+TOKEN_VARIABLE = "DRIVERVIEW_TOKEN"
+MIN_TOKEN_LENGTH = 16
+
+
+def read_token(path: Path | None) -> str | None:
+    """The token in a file, else in $DRIVERVIEW_TOKEN, else None. Raises UserError."""
+    if path is None:
+        token = os.environ.get(TOKEN_VARIABLE, "").strip()
+        source = f"${TOKEN_VARIABLE}"
+    elif path.is_file():
+        token, source = path.read_text(encoding="utf-8", errors="replace").strip(), str(path)
+    else:
+        raise UserError(f"there is no token file {path}; create one with `openssl rand -hex 32`")
+    if not token:
+        if path is not None:
+            raise UserError(f"{source} is empty; `openssl rand -hex 32` creates a token")
+        return None
+    printable = token.isascii() and token.isprintable() and " " not in token
+    if len(token) < MIN_TOKEN_LENGTH or not printable:
+        raise UserError(
+            f"the token in {source} must be {MIN_TOKEN_LENGTH} or more printable ASCII characters "
+            "without a space; `openssl rand -hex 32` creates one"
+        )
+    return token
+
+
+def check_exposure(host: str, token: str | None, insecure: bool) -> None:
+    """Raise UserError when other machines could use the service without a token."""
+    if is_loopback(host) or token is not None or insecure:
+        return
+    raise UserError(
+        f"--host {host} can be reached from other machines: set a token (--token-file, or "
+        f"{TOKEN_VARIABLE} in the environment), or pass --insecure if a proxy protects the service"
+    )
+
+
+def is_loopback(host: str) -> bool:
+    """Whether an address, or the name "localhost", can be reached from this machine only."""
+    try:
+        found = ip_address(host.partition("%")[0])
+    except ValueError:
+        return host.lower().removesuffix(".") == "localhost"
+    mapped = getattr(found, "ipv4_mapped", None)
+    return (mapped or found).is_loopback
+
+
+class HostNames:
+    """The names that a service is called by: loopback ones, and those given."""
+
+    def __init__(self, names: Iterable[str], *, any_name: bool) -> None:
+        """`any_name`: any Host will do, since a token is required."""
+        found = (host_name(name.encode("latin-1", "replace")) for name in names)
+        self._names = {name for name in found if name is not None}
+        self._any_name = any_name
+        # A service that listens on all addresses is called by any of them: a rebound name is none.
+        self._any_address = any(_is_unspecified(name) for name in self._names)
+
+    def allow_host(self, host: bytes) -> bool:
+        """Whether a request with this Host may use the service."""
+        if self._any_name:
+            return True
+        name = host_name(host)
+        if name is None:
+            return False
+        return is_loopback(name) or name in self._names or (self._any_address and _is_ip(name))
+
+    def allow_origin(self, origin: bytes, host: bytes) -> bool:
+        """Whether a page of this Origin may: its own, or one that a proxy calls by a known name.
+
+        A page of another site could use the browser of a user in here.
+        """
+        scheme, separator, place = origin.lower().partition(b"://")
+        if not (separator and scheme in (b"http", b"https") and place):
+            return False
+        if place == host.lower():
+            return True
+        name = host_name(place)
+        return name is not None and name in self._names and not _is_unspecified(name)
+
+
+def host_name(host: bytes) -> str | None:
+    """The name in `name:port`, in lower case; None if malformed.
+
+    Of IPv6 the shortest form of the address, without brackets and without a zone, which has a
+    meaning on one machine only.
+    """
+    text = host.decode("latin-1").lower()
+    name, port = text, ""
+    if text.startswith("["):
+        name, bracket, port = text[1:].partition("]")
+        if not bracket or (port and not port.startswith(":")):
+            return None
+        port = port[1:]
+    elif text.count(":") <= 1:
+        name, _, port = text.partition(":")
+    if not name or (port and not (port.isascii() and port.isdigit())):
+        return None
+    if ":" in name:
+        address = name.partition("%")[0]
+        return str(ip_address(address)) if _is_ip(address) else None
+    return name.removesuffix(".")
+
+
+def _is_ip(name: str) -> bool:
+    try:
+        ip_address(name)
+    except ValueError:
+        return False
+    return True
+
+
+def _is_unspecified(name: str) -> bool:
+    return _is_ip(name) and ip_address(name).is_unspecified

@@ -1,0 +1,89 @@
+"""`mtlnet label` as it is typed, and the model's answer with which a picture begins."""
+
+import re
+import signal
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import trackfeatures as tf
+from mtlnet.label.folder import LabelFolder
+from mtlnet.label.server import Labeller
+from tests.mtlnet.label.conftest import Site
+from tests.mtlnet.test_cli import refused
+from trackfeatures.camera import CameraParameters
+
+
+class FakeEngine:
+    """Answers what it is told, in metres beside the model's camera."""
+
+    def __init__(self, distances: list[float], angle: float) -> None:
+        self.card = SimpleNamespace(camera=CameraParameters())
+        self._coded = tf.encode([distances], [angle])[0]
+
+    def __call__(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
+        assert image.shape == (210, 280, 3)
+        return np.concatenate([self._coded, [0.1, 0.8, 0.1]]).astype(np.float32)
+
+
+def first(pictures: Path, engine: Any) -> dict[str, Any]:
+    folder = LabelFolder(pictures, None, CameraParameters())
+    return Labeller(folder, engine).picture(0)
+
+
+def test_a_picture_begins_with_the_models_answer(pictures: Path) -> None:
+    nan = np.nan
+    shown = first(pictures, FakeEngine([-1.2, 2.4, nan, nan, nan], 0.02))
+    assert (shown["source"], shown["note"]) == ("model", "")
+    scale, aside = 1.22 / 1.2, 0.75 * np.sin(0.02)  # of the heights; the model's camera is ahead
+    assert shown["markings"]["ml"] == pytest.approx(scale * (-1.2 - aside), abs=1e-3)
+    assert shown["markings"]["mr"] == pytest.approx(scale * (2.4 - aside), abs=1e-3)
+    assert shown["markings"]["angle"] == pytest.approx(0.02, abs=1e-5)
+    on_marking = first(pictures, FakeEngine([nan, nan, -4.0, -0.2, 3.6], 0.0))
+    assert on_marking["markings"]["mr"] == pytest.approx(scale * 3.6, abs=1e-3)
+    nothing = first(pictures, FakeEngine([nan] * 5, 0.0))
+    assert (nothing["source"], nothing["note"]) == ("usual", "the model sees no lane")
+    (pictures / "camera.yaml").write_text("{width: 640, height: 360, fov_y_deg: 3}\n")
+    narrow = first(pictures, FakeEngine([nan] * 5, 0.0))
+    assert narrow["source"] == "usual"
+    assert "the image shows" in narrow["note"]
+
+
+def test_the_command_serves_and_ends_with_ctrl_c(pictures: Path) -> None:
+    command = [sys.executable, "-m", "mtlnet", "label", str(pictures), "--no-model", "--port", "0"]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stderr is not None
+            line = process.stderr.readline()
+            found = re.search(r"3 pictures; open http://127\.0\.0\.1:(\d+)/ ", line)
+            assert found is not None, line
+            assert Site(pictures, int(found[1])).ask("GET", "/api/pictures")[0] == 200
+            assert "another process is writing to" in refused("label", pictures, "--no-model")
+        finally:
+            process.send_signal(signal.SIGINT)
+    assert process.returncode in (0, 130)
+
+
+def test_mistakes_are_one_line(pictures: Path, tmp_path: Path) -> None:
+    seen = refused("label", pictures, "--no-model", "--host", "0.0.0.0")
+    assert "--host 0.0.0.0 can be reached from other machines: set a token" in seen
+    assert "--label-std belongs to --import" in refused("label", pictures, "--label-std", "1,1")
+    assert "there is no folder" in refused("label", tmp_path / "none", "--no-model")
+
+
+def test_the_label_of_a_picture_survives_another_size(pictures: Path) -> None:
+    """The camera's file may be of another size than the pictures."""
+    (pictures / "camera.yaml").write_text(
+        "{width: 1280, height: 720, fov_y_deg: 40, x: 0.0, height_above_road_m: 1.22}\n"
+    )
+    folder = LabelFolder(pictures, None, CameraParameters())
+    camera = folder.camera(0, 640, 360)
+    same = CameraParameters(width=640, height=360, fov_y_deg=40, x=0.0, z=0.97)
+    assert replace(camera, z=0.97) == same

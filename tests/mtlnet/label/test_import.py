@@ -1,0 +1,81 @@
+"""Tables of other terms become a folder that `evaluate` reads; faulty ones are one clear line."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from mtlnet.data.custom_images import open_custom_images
+from mtlnet.data.labels_file import read_labels
+from mtlnet.label.import_table import import_labels, parse_label_std
+from trackfeatures.camera import CameraParameters
+from trackfeatures.errors import UserError
+
+HEAD = "file,x_left_m,x_right_m,heading_rad,fov_y_deg,camera_height_m"
+MORE = ",light,drive,curvature_1pm,focal_px,horizon_y_px,quality"
+
+
+def table(folder: Path, *rows: str, head: str = HEAD + MORE) -> Path:
+    folder.mkdir(exist_ok=True)
+    for name in ("a.png", "b.png"):
+        cv2.imwrite(str(folder / name), np.full((360, 640, 3), 90, np.uint8))
+    (folder / "table.csv").write_text("\n".join([head, *rows]) + "\n")
+    return folder / "table.csv"
+
+
+def test_a_table_becomes_labels_and_cameras(tmp_path: Path) -> None:
+    path = table(
+        tmp_path / "theirs",
+        'a.png,1.7,-1.9,0.03,40,1.22,"day, shade",drive 1,0.001,500,189.5,A',
+        "b.png,0.9,-2.6,-0.01,40,1.5,night,drive 2,-0.01,500,169.5,B",
+    )
+    stds = parse_label_std(["0.06,0.006", "b*=0.16,0.012"])
+    found = import_labels(path, tmp_path / "mine", stds)
+    assert (found["pictures"], found["cameras"]) == (2, 2)
+    pictures, labels = read_labels(tmp_path / "mine" / "labels.csv")
+    np.testing.assert_allclose(labels.distances[0, :2], [-1.7, 1.9], rtol=1e-6)
+    # Within 1.2 m of the left marking, which is the one it drives on; beyond it nothing is known.
+    np.testing.assert_allclose(labels.distances[1], [-0.9, 2.6, np.inf, -0.9, 2.6], rtol=1e-6)
+    assert labels.heading.tolist() == [-1, 2]  # gentle: not known 20 m ahead; 100 m to the right
+    assert [p.std_m for p in pictures] == [0.06, 0.16]
+    assert [(p.light, p.drive) for p in pictures] == [
+        ("day, shade", "drive 1"),
+        ("night", "drive 2"),
+    ]
+    # Horizon 10 px below the middle: the camera looks up by atan(10 / 500).
+    assert pictures[0].pitch_deg == pytest.approx(-np.degrees(np.arctan(10 / 500)), abs=1e-4)
+    assert pictures[1].pitch_deg == pytest.approx(np.degrees(np.arctan(10 / 500)), abs=1e-4)
+    opened = open_custom_images(tmp_path / "mine", CameraParameters())
+    heights = [lens.source.height_above_road_m for lens in opened.lenses if lens is not None]
+    assert heights == pytest.approx([1.22, 1.5])
+    with pytest.raises(UserError, match=r"labels\.csv exists; give a new folder"):
+        import_labels(path, tmp_path / "mine")
+
+
+@pytest.mark.parametrize(
+    ("row", "seen"),
+    [
+        ("a.png,x,-1.9,0,40,1.22", "line 2: x_left_m is 'x', not a number"),
+        ("../a.png,1.7,-1.9,0,40,1.22", r"line 2: the file '\.\./a\.png' is no path beside"),
+        ("c.png,1.7,-1.9,0,40,1.22", r"line 2: there is no image file .*c\.png"),
+        ("a.png,1.7,-7,0,40,1.22", "line 2: mr is 7 m; it must be from 0.5 to 5.5"),
+        ("a.png,1.7,-1.9,2,40,1.22", "line 2: angle is 2; it must be within 0.5 rad"),
+        ("a.png,1.7,-1.9,0,400,1.22", r"line 2: vertical field of view 400\.0 deg"),
+    ],
+)
+def test_a_faulty_row_is_refused(tmp_path: Path, row: str, seen: str) -> None:
+    path = table(tmp_path / "theirs", row, head=HEAD)
+    with pytest.raises(UserError, match=seen):
+        import_labels(path, tmp_path / "mine")
+    assert not (tmp_path / "mine" / "labels.csv").exists()
+
+
+def test_faulty_tables_and_options_are_refused(tmp_path: Path) -> None:
+    path = table(tmp_path / "theirs", "a.png,1", head="file,x_left_m")
+    with pytest.raises(UserError, match="has no column x_right_m, heading_rad, fov_y_deg"):
+        import_labels(path, tmp_path / "mine")
+    with pytest.raises(UserError, match="names no pictures"):
+        import_labels(table(tmp_path / "theirs", head=HEAD), tmp_path / "mine")
+    with pytest.raises(UserError, match=r"--label-std is '0.06'; give METRES,RADIANS"):
+        parse_label_std(["0.06"])

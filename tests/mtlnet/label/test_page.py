@@ -1,0 +1,89 @@
+"""The label page in a browser: handles dragged by the mouse, keys, and what is saved meanwhile."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mtlnet.data.labels_file import read_labels
+from mtlnet.label.geometry import marking_pixels
+from tests.mtlnet.label.browser import CHROMIUM, Browser, open_page
+from tests.mtlnet.label.conftest import TRUE, Site
+from trackfeatures.camera import CameraParameters
+
+pytestmark = [
+    pytest.mark.extended,
+    pytest.mark.skipif(CHROMIUM is None, reason="no chromium (Debian: apt-get install chromium)"),
+]
+VIEW = CameraParameters(width=640, height=360, fov_y_deg=40, x=0.0, z=0.97)
+
+
+def drag_onto_markings(browser: Browser) -> None:
+    """All four round handles onto the drawn markings."""
+    targets = dict(zip(("left", "right"), marking_pixels(VIEW, TRUE, [6.0, 25.0]), strict=True))
+    for side, which, target in (
+        ("left", 0, 0),
+        ("right", 0, 0),
+        ("left", 2, 1),
+        ("right", 2, 1),
+    ):
+        box = browser.evaluate(
+            "(() => { const b = document.getElementById('picture').getBoundingClientRect(); "
+            "return [b.left, b.top, b.width / 640]; })()"
+        )
+        shown = browser.evaluate("document.getElementById('picture').dataset.handles")
+        start = np.array(json.loads(shown)[side][which])
+        places = [
+            tuple(((at + 0.5) * box[2] + box[:2]).tolist()) for at in (start, targets[side][target])
+        ]
+        browser.drag(places[0], places[1])
+        browser.wait("!document.body.dataset.busy")
+        assert browser.evaluate("document.getElementById('status').textContent") == ""
+
+
+@pytest.mark.parametrize(("width", "height"), [(1280, 900), (390, 800)])
+def test_pictures_are_labelled_by_mouse_and_keys(
+    site: Site, tmp_path: Path, width: int, height: int
+) -> None:
+    table = site.folder / "labels.csv"
+    with open_page(f"http://127.0.0.1:{site.port}/", tmp_path / "p", width, height) as browser:
+        browser.wait("document.body.dataset.ready === '0'")
+        drag_onto_markings(browser)
+        browser.press("Enter")
+        browser.wait("document.body.dataset.ready === '1'")
+        # The page takes a handle where the mouse takes it: to a pixel of the screen.
+        [picture], labels = read_labels(table)
+        assert picture.file == "1.png"
+        tolerance = 0.02 if width > 600 else 0.05
+        np.testing.assert_allclose(labels.distances[0, :2], [-1.5, 2.1], atol=tolerance)
+        assert labels.angle[0] == pytest.approx(0.03, abs=0.003)
+        assert picture.pitch_deg == pytest.approx(0.5, abs=0.1)
+        drag_onto_markings(browser)
+        browser.press("3")
+        browser.press("n")
+        browser.wait("document.body.dataset.ready === '2'")
+        _, labels = read_labels(table)
+        assert labels.heading.tolist() == [1, 2]
+        # Undo takes the last label back, then the one before.
+        browser.press("u")
+        browser.wait("document.body.dataset.ready === '1'")
+        assert [p.file for p in read_labels(table)[0]] == ["1.png"]
+        browser.press("u")
+        browser.wait("document.body.dataset.ready === '0'")
+        assert not table.exists()
+
+
+def test_the_page_asks_for_the_token(guarded: Site, tmp_path: Path) -> None:
+    url = f"http://127.0.0.1:{guarded.port}/"
+    with open_page(url, tmp_path / "p", 800, 700) as browser:
+        browser.wait("document.getElementById('locked').hidden === false")
+        browser.evaluate(
+            "(() => { const t = document.getElementById('token'); "
+            "t.value = 'a-token-of-sixteen'; t.dispatchEvent(new Event('change')); })()"
+        )
+        browser.wait("document.body.dataset.ready === '0'")
+        assert browser.evaluate("document.getElementById('locked').hidden") is True
+    with open_page(url + "#a-token-of-sixteen", tmp_path / "q", 800, 700) as browser:
+        browser.wait("document.body.dataset.ready === '0'")
+        assert browser.evaluate("location.hash") == ""

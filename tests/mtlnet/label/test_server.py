@@ -1,0 +1,154 @@
+"""The label page's interface: drag, save, undo; and what a request may not do."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mtlnet.data.custom_images import open_custom_images
+from mtlnet.data.labels_file import read_labels
+from mtlnet.label.folder import LabelFolder
+from mtlnet.label.geometry import marking_pixels
+from tests.mtlnet.label.conftest import TRUE, Site
+from trackfeatures.camera import CameraParameters
+from trackfeatures.errors import UserError
+
+LABEL = {"ml": -1.5, "mr": 2.1, "angle": 0.03, "curvature": 0.0, "pitch_deg": 0.5}
+VIEW = CameraParameters(width=640, height=360, fov_y_deg=40, x=0.0, z=0.97)
+
+
+def test_markings_are_dragged_saved_and_read_by_evaluate(site: Site) -> None:
+    status, listing, headers = site.ask("GET", "/api/pictures")
+    assert (status, headers["x-content-type-options"]) == (200, "nosniff")
+    names = [one["file"] for one in listing["pictures"]]
+    assert names == ["1.png", "10.png", "sub/2.png"]
+    _, shown, _ = site.ask("GET", "/api/pictures/2")
+    assert (shown["width"], shown["height"], shown["source"]) == (640, 360, "usual")
+    assert shown["markings"]["mr"] - shown["markings"]["ml"] == 3.6
+    left, right = (each.tolist() for each in marking_pixels(VIEW, TRUE, [6.0, 25.0]))
+    status, found, _ = site.ask("POST", "/api/pictures/2/fit", {"left": left, "right": right})
+    assert status == 200
+    for name, value in LABEL.items():
+        assert found["markings"][name] == pytest.approx(value, abs=1e-3), name
+    line = np.array(found["lines"]["left"])
+    row = float(np.interp(-left[0][1], -line[:, 1], line[:, 0]))
+    assert row == pytest.approx(left[0][0], abs=1.0)
+    body = {**found["markings"], "drive": " one ", "light": "dusk"}
+    status, row_cells, _ = site.ask("PUT", "/api/pictures/2/label", body)
+    assert (status, row_cells["heading"], row_cells["drive"]) == (200, "straight", "one")
+    pictures, labels = read_labels(site.folder / "labels.csv")
+    assert [(p.file, p.light, p.pitch_deg) for p in pictures] == [("sub/2.png", "dusk", 0.5)]
+    np.testing.assert_allclose(labels.distances[0, :2], [-1.5, 2.1], atol=1e-3)
+    assert np.isnan(labels.distances[0, 2:]).all()
+    opened = open_custom_images(site.folder, CameraParameters())
+    assert opened.lenses[0] is not None
+    assert opened.lenses[0].source.pitch_deg == 0.5
+    _, shown, _ = site.ask("GET", "/api/pictures/2")
+    assert (shown["source"], shown["markings"]["pitch_deg"]) == ("label", 0.5)
+    assert shown["markings"]["ml"] == pytest.approx(-1.5, abs=1e-3)
+
+
+def test_each_change_is_saved_and_other_rows_stay(site: Site) -> None:
+    table = site.folder / "labels.csv"
+    head = "file,ml,mr,l,m,r,angle,heading,camera,std_m"
+    table.write_text(f"{head}\nelse.png,-1,2.5,?,?,?,0,?,,0.06\n1.png,-1,2.5,?,?,?,0,?,,0.07\n")
+    site.ask("PUT", "/api/pictures/0/label", {**LABEL, "curvature": 0.01})
+    site.ask("PUT", "/api/pictures/1/label", {**LABEL, "ml": -0.8, "heading": "?"})
+    pictures, labels = read_labels(table)
+    assert [p.file for p in pictures] == ["1.png", "10.png", "else.png"]
+    assert [p.std_m for p in pictures] == [0.07, 0.0, 0.06]
+    assert labels.heading.tolist() == [0, -1, -1]  # a bend of 100 m to the left
+    np.testing.assert_allclose(labels.distances[1], [-0.8, 2.1, np.inf, -0.8, 2.1], rtol=1e-6)
+    assert site.ask("DELETE", "/api/pictures/0/label")[0] == 200
+    assert [p.file for p in read_labels(table)[0]] == ["10.png", "else.png"]
+    assert not list(site.folder.glob("*.partial"))
+    status, told, _ = site.ask("PUT", "/api/pictures/0/label", {**LABEL, "ml": -6.0})
+    assert (status, told["detail"][:12]) == (422, "ml is -6 m; ")
+    assert [p.file for p in read_labels(table)[0]] == ["10.png", "else.png"]
+
+
+def test_what_is_no_marking_is_one_line(site: Site) -> None:
+    body = {"left": [[10, 300], [20, 5]], "right": [[600, 300], [500, 200]], "pitch_deg": 0.0}
+    status, told, _ = site.ask("POST", "/api/pictures/0/fit", body)
+    assert (status, "above the horizon" in told["detail"]) == (422, True)
+    assert site.ask("POST", "/api/pictures/0/fit", {"left": [[1, 2]], "right": []})[0] == 422
+    assert site.ask("PUT", "/api/pictures/0/label", {**LABEL, "file": "/etc/passwd"})[0] == 422
+    assert site.ask("PUT", "/api/pictures/0/label", b'{"ml": NaN}')[0] == 422
+    assert site.ask("GET", "/api/pictures/3")[0] == 422
+    assert site.ask("GET", "/api/pictures/-1/image")[0] == 422
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "/api/pictures/..%2f..%2fsecret.png/image",
+        "/../camera.yaml",
+        "/camera.yaml",
+        "/1.png",
+        "/%2e%2e/%2e%2e/etc/passwd",
+        "/docs",
+        "/openapi.json",
+    ],
+)
+def test_no_file_is_named_by_a_request(site: Site, path: str) -> None:
+    assert site.ask("GET", path)[0] in (404, 422)
+
+
+def test_other_names_and_pages_are_refused(site: Site) -> None:
+    assert site.ask("GET", "/api/pictures", Host="evil.example")[0] == 421
+    assert site.ask("GET", "/", Host="evil.example")[0] == 421
+    assert site.ask("GET", "/api/pictures", Host="localhost:1")[0] == 200
+    body = LABEL
+    origin = {"Origin": "http://evil.example"}
+    assert site.ask("PUT", "/api/pictures/0/label", body, **origin)[0] == 403
+    own = {"Origin": f"http://127.0.0.1:{site.port}"}
+    assert site.ask("PUT", "/api/pictures/0/label", body, **own)[0] == 200
+    # A form of another page sends no JSON.
+    assert site.ask("PUT", "/api/pictures/0/label", b"{}", Content_Type="text/plain")[0] == 415
+    assert site.ask("PUT", "/api/pictures/0/label", b" " * (65 << 10))[0] == 413
+
+
+def test_the_token_guards_all_data(guarded: Site) -> None:
+    assert guarded.ask("GET", "/")[0] == 200  # asks for the token
+    for method, path in (
+        ("GET", "/api/pictures"),
+        ("GET", "/api/pictures/0/image"),
+        ("DELETE", "/api/pictures/0/label"),
+    ):
+        assert guarded.ask(method, path)[0] == 401
+        assert guarded.ask(method, path, Authorization="Bearer another")[0] == 401
+    guarded.headers = {"Authorization": "Bearer a-token-of-sixteen"}
+    assert guarded.ask("GET", "/api/pictures", Host="phone.example")[0] == 200
+    status, image, headers = guarded.ask("GET", "/api/pictures/0/image")
+    assert (status, headers["content-type"], image[:2]) == (200, "image/jpeg", b"\xff\xd8")
+
+
+def test_links_out_of_the_folder_are_left_out(pictures: Path) -> None:
+    outside = pictures.parent / "outside"
+    outside.mkdir()
+    (pictures / "1.png").rename(outside / "1.png")
+    (pictures / "1.png").symlink_to(outside / "1.png")
+    (pictures / "away").symlink_to(outside)
+    folder = LabelFolder(pictures, None, CameraParameters())
+    assert folder.files == ["10.png", "sub/2.png"]
+    # One that is put there afterwards.
+    (pictures / "10.png").unlink()
+    (pictures / "10.png").symlink_to(outside / "1.png")
+    with pytest.raises(UserError, match="leads out of the folder"):
+        folder.picture(0)
+
+
+def test_a_folder_without_a_camera_is_refused(pictures: Path) -> None:
+    (pictures / "camera.yaml").rename(pictures.parent / "dashcam.yaml")
+    with pytest.raises(UserError, match=r"has no camera\.yaml, without which no metres follow"):
+        LabelFolder(pictures, None, CameraParameters())
+    folder = LabelFolder(pictures, pictures.parent / "dashcam.yaml", CameraParameters())
+    assert folder.camera(0, 1280, 720).height_above_road_m == pytest.approx(1.22)
+    with pytest.raises(UserError, match="is 640 x 480 px, its camera gives 640 x 360"):
+        folder.camera(0, 640, 480)
+    (pictures.parent / "other.yaml").write_text("{width: 640, height: 360, z: 0.3}\n")
+    with pytest.raises(UserError, match="describes another camera than"):
+        LabelFolder(pictures, pictures.parent / "other.yaml", CameraParameters())
+    (pictures / "none").mkdir()
+    with pytest.raises(UserError, match="there is no picture in"):
+        LabelFolder(pictures / "none", None, CameraParameters())
