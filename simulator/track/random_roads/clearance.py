@@ -14,6 +14,8 @@ from the centre line never meet, the inner walls of the tightest bend (12 m) inc
 three lanes of 4.3 m with shoulders of 3 m has its walls at 11.95 m."""
 STEP_M: Final = 3.0
 MOST_SAMPLES: Final = 500
+BULGE_M: Final = 0.3
+"""Most by which a bend leaves the chord of a piece (5 m long, radius 12 m: 0.26 m)."""
 
 
 def keeps_clear(segments: list[Segment]) -> bool:
@@ -27,13 +29,12 @@ def keeps_clear(segments: list[Segment]) -> bool:
     count = min(math.ceil(total / STEP_M), MOST_SAMPLES)
     step = total / count
     s = np.arange(count) * step
-    # Pieces are at most 5 m long: the chord between their ends is near enough to the road.
     nodes = np.append(placed.s0, total)
     x = np.interp(s, nodes, np.append(placed.x0, placed.end[0]))
     y = np.interp(s, nodes, np.append(placed.y0, placed.end[1]))
     near = math.ceil(math.pi / 2.0 * CLEARANCE_M / step)
     # Two lines at `CLEARANCE_M` may be sampled half a step apart along them, round a tight bend.
-    least = CLEARANCE_M + step * step / 64.0
+    least = CLEARANCE_M + BULGE_M + step * step / 64.0
     # Every pair once: each sample with those up to half a lap ahead.
     ahead_x, ahead_y = (_ahead(values, near, count // 2 + 1) for values in (x, y))
     dx, dy = ahead_x - x[:, None], ahead_y - y[:, None]
