@@ -7,7 +7,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
+from datagen.cli import app
 from datagen.execution.collect import PLAN_FILE, initialise_folder, require_matching_folder
 from datagen.planning import plan as plan_module
 from datagen.planning.config import CollectConfig
@@ -97,6 +99,18 @@ def test_another_kind_of_roads_does_not_resume(tmp_path: Path) -> None:
     initialise_folder(tmp_path, make_plan(config(roads="varied")))
     with pytest.raises(UserError, match="roads: varied there, paper asked for"):
         require_matching_folder(tmp_path, make_plan(config()))
+
+
+def test_the_command_takes_the_kind_of_roads() -> None:
+    command = ["collect", "--dry-run", "--json", "--rounds", "3", "--tracks", "oval"]
+    runner = CliRunner()
+    plans = {
+        roads: json.loads(runner.invoke(app, [*command, "--roads", roads]).stdout)
+        for roads in ("paper", "varied")
+    }
+    assert [entry["lane_width_m"] for entry in plans["paper"]["rounds"]] == [4.0] * 3
+    assert len({entry["lane_width_m"] for entry in plans["varied"]["rounds"]}) == 3
+    assert plans["varied"]["wanted"]["roads"] == "varied"
 
 
 def test_unknown_roads_are_refused() -> None:

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import asdict
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ SEEDS = range(300)
 
 
 def test_values_are_drawn_in_the_order_of_the_file() -> None:
-    tables = {
+    tables: dict[str, dict[str, Any]] = {
         "a": {"x": [0.0, 2.0], "n": [1, 3], "y": "x", "z": {"sometimes": 0.0, "value": [5.0, 6.0]}},
         "b": {"like": "a", "c": {"one_of": ["p", "q"], "weights": [0.0, 1.0]}, "d": {"share": 1.0}},
     }
