@@ -70,8 +70,9 @@ class Scene:
         ground = road_mesh.Ground.of(road, survey.line, terrain)
         scene_bridges = bridges.build(ground, theme, rng(8))
         roadside = look.roadside if look else Roadside()
-        avenue = light.canopy or roadside.avenue
-        trees = scenery.plant(ground, theme, scene_bridges, rng(3), avenue=avenue)
+        trees = scenery.plant(
+            ground, theme, scene_bridges, rng(3), avenue=light.canopy, tunnel=roadside.tunnel
+        )
         tree_shade = land.TreeShade.of(terrain, survey.line, trees, light)
         rails = barriers.build(road, ground.mesh, theme, rng(5), roadside)
         lamps = look.light.lamp_every_m if look and look.light.night else 0.0
