@@ -42,8 +42,7 @@ Workers = Annotated[int, typer.Option(help="Recording processes; 0: one for each
 Tracks = Annotated[
     str,
     typer.Option(
-        help="Track names or files, separated by commas; random: each round its own random road; "
-        "empty: all but the held-out ones."
+        help="Track names or files, separated by commas; empty: all but the held-out ones."
     ),
 ]
 Lanes = Annotated[str, typer.Option(help="Lane counts, separated by commas.")]
@@ -79,18 +78,18 @@ JitterCamera = Annotated[
         "--jitter-camera", help="Vary height, pitch and field of view from round to round."
     ),
 ]
-CameraFile = Annotated[
-    Path | None,
-    typer.Option(
-        "--camera",
-        help="camera.yaml (ours, OpenCV's, ROS's or Kalibr's): record through that lens and mount.",
-    ),
-]
 Roads = Annotated[
     str,
     typer.Option(
         help="paper: lanes of 4.0 m and the tracks' own paint; varied: lanes, shoulders, paint, "
         "surface, light and camera height are drawn for each round or scene."
+    ),
+]
+CameraFile = Annotated[
+    Path | None,
+    typer.Option(
+        "--camera",
+        help="camera.yaml (ours, OpenCV's, ROS's or Kalibr's): record through that lens and mount.",
     ),
 ]
 ShardOf = Annotated[

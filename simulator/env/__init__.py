@@ -109,8 +109,8 @@ class LateralControl(gym.Env[Any, Any]):
             {"track": track, "lanes": lanes} | options
         )
         tracks_dir = None if drive.tracks_dir is None else Path(drive.tracks_dir)
-        track = find_track(drive.track, tracks_dir)
-        road = make_road(track, drive.lanes, drive.lane_width, drive.roads, drive.road_seed)
+        found = find_track(drive.track, tracks_dir)
+        road = make_road(found, drive.lanes, drive.lane_width, drive.roads, drive.road_seed)
         self._renderer, self._render_view = ViewRenderer(road, picture), picture.render_view
         self._observer = Observer(observation.resolved(self.kind), self._renderer)
         self.world = World(road, traffic=drive.traffic, frequency_hz=drive.frequency_hz)

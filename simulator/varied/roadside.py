@@ -17,8 +17,8 @@ class Roadside:
     """Factor on the height of walls, crops and snow banks."""
     trees: float = 1.0
     """Factor on the number of trees."""
-    avenue: bool = False
-    """Trees stand in rows behind the barriers and meet over the road."""
+    tunnel: bool = False
+    """Trees stand in dense rows behind the barriers, and their crowns close over the road."""
     parked_every_m: float = 0.0
     """Distance of cars parked beside the asphalt, on the average; 0: none."""
     bridge_every_m: float = 0.0

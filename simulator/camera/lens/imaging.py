@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from simulator.arrays import FloatArray
-from simulator.camera.bridges.bridges import Bridge
+from simulator.camera.bridges.bridges import HEADROOM_M, Bridge
 from simulator.camera.core import optics
 from simulator.camera.core.optics import Eye
 from simulator.camera.lens.cabin import REFERENCE_WIDTH, glass_of
@@ -45,8 +45,8 @@ class Imaging:
         self._matrix: FloatArray = camera.intrinsics()
         self._motion = _motion_of(camera, look.lens.travel_m)
         self._glass = glass_of(look, light, width, height)
-        adapts = look.light.adaptation_stops if light.shade < 0.5 else 0.0
-        self._adaptation = adapts, [(bridge.s, bridge.half_along) for bridge in bridges]
+        adapts = 0.0 if look.light.night else look.light.adaptation_stops
+        self._adaptation = adapts, [_deck(bridge) for bridge in bridges]
         self._night = look.light.night
         self._normal = noise_table()
         self._noise = look.lens.noise * (DARK_NOISE if look.light.night else 1.0)
@@ -110,16 +110,23 @@ def _motion_of(camera: CameraParameters, travel_m: float) -> tuple[float, float,
     return float(u), float(v), float(camera.height_above_road_m * matrix[1, 1]), travel_m
 
 
-def adaptation(s: float, stops: float, bridges: Sequence[tuple[float, float]]) -> float:
-    """By how many stops the exposure has opened at `s`: up to `stops` on the way through a bridge's
-    shadow, and back to none after it. `bridges`: place along the road and half length, in m."""
+def adaptation(s: float, stops: float, decks: Sequence[tuple[float, float]]) -> float:
+    """By how many stops the exposure has opened at `s`: up to `stops` below a bridge, and back to
+    none behind it. `decks`: place along the road and half length of each bridge's deck, in m."""
     most = 0.0
-    for place, half in bridges:
-        begin = place - half
-        into = (s - begin) / max(2.0 * half, ADAPTING_M)
-        behind = s - max(place + half, begin + ADAPTING_M)
-        most = max(most, min(into, 1.0) if behind < 0.0 else math.exp(-behind / ADAPTING_M))
+    for place, half in decks:
+        into = min(s - (place - half), 2.0 * half)
+        behind = max(s - (place + half), 0.0)
+        if into > 0.0:
+            opened = 1.0 - math.exp(-into / ADAPTING_M)
+            most = max(most, opened * math.exp(-behind / ADAPTING_M))
     return stops * most
+
+
+def _deck(bridge: Bridge) -> tuple[float, float]:
+    """Place along the road and half length of what of `bridge` is over it."""
+    over = bridge.boxes[bridge.boxes[:, 0, 2] > HEADROOM_M]
+    return bridge.s, float(np.abs(over[..., 0]).max()) if len(over) else bridge.half_along
 
 
 def _with_glow(picture: Picture) -> Picture:

@@ -70,14 +70,17 @@ class Scene:
         ground = road_mesh.Ground.of(road, survey.line, terrain)
         scene_bridges = bridges.build(ground, theme, rng(8))
         roadside = look.roadside if look else Roadside()
-        avenue = light.canopy or roadside.avenue
-        trees = scenery.plant(ground, theme, scene_bridges, rng(3), avenue=avenue)
+        trees = scenery.plant(
+            ground, theme, scene_bridges, rng(3), avenue=light.canopy, tunnel=roadside.tunnel
+        )
         tree_shade = land.TreeShade.of(terrain, survey.line, trees, light)
         rails = barriers.build(road, ground.mesh, theme, rng(5), roadside)
         lamps = look.light.lamp_every_m if look and look.light.night else 0.0
         built = props.build(ground, theme, scene_bridges, rng(6), lamps)
         covered = road_mesh.covers(ground.mesh, survey, margin_m=2.0)
-        self.mask = shadow_mask.build(road, trees, scene_bridges, tree_shade, light, rng(4))
+        self.mask = shadow_mask.build(
+            road, trees, scene_bridges, tree_shade, light, rng(4), sky=look is not None
+        )
         night = [NIGHT] if look and look.light.night else []
         self.bridges = scene_bridges
         self.parked = parked_cars(road, roadside.parked_every_m, rng(9))

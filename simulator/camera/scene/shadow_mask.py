@@ -4,8 +4,9 @@ The mask is as wide as the road mesh and centred on y = 0. It is folded into ban
 along s, each with `GUARD` more texels on both sides, so that a long track fits one texture.
 """
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -41,11 +42,14 @@ FINE = 2
 ROAD_Z_M = 2.5
 """Largest difference in height between the road near a bridge and the road below it."""
 FARTHEST_M = 70.0
+SKY_BLUR_M = 3.0
+"""How far beyond a bridge's edges it hides a part of the sky."""
 
 
 @dataclass(frozen=True)
 class ShadowMask:
-    """The mask `strip` and the same folded into `texels` (bands * rows, BAND_TEXELS + ...)."""
+    """The mask `strip` and the same folded into `texels` (bands * rows, BAND_TEXELS + ...); on
+    varied roads these have a second component, the share of the sky that bridges hide."""
 
     strip: Strip
     texels: NDArray[np.uint8]
@@ -77,8 +81,11 @@ def build(
     land: TreeShade,
     light: Light,
     rng: np.random.Generator,
+    *,
+    sky: bool = False,
 ) -> ShadowMask:
-    """The shadows of `light` on `road`: those of bridges, and of trees or of a closed canopy.
+    """The shadows of `light` on `road`: those of bridges, and of trees or of a closed canopy; with
+    `sky` also how much of the sky bridges hide.
 
     Towards its sides the mask fades into the shade of the `land`, so that no edge shows.
     """
@@ -93,7 +100,22 @@ def build(
         else:
             _cast_trees(strip, road, along_m, trees, light)
         _run_out(strip, road, along_m, land)
-    return ShadowMask(strip, _folded(strip), along_m)
+    texels = _folded(strip)
+    if sky:
+        hidden = _folded(_hidden_sky(strip.shape, road, along_m, bridges, light))
+        texels = np.dstack([texels, hidden])
+    return ShadowMask(strip, texels, along_m)
+
+
+def _hidden_sky(
+    shape: tuple[int, ...], road: Road, along_m: float, bridges: Sequence[Bridge], light: Light
+) -> Strip:
+    """Share (rows, columns) of the sky that bridges hide, 0 to 255: what lies below them, spread by
+    a bridge's height."""
+    below: Strip = np.zeros(shape, dtype=np.uint8)
+    cast_bridges(below, road, along_m, bridges, replace(light, sun_elevation=math.pi / 2))
+    size = (2 * round(SKY_BLUR_M / along_m) + 1, 2 * round(SKY_BLUR_M / TEXEL_M) + 1)
+    return np.asarray(cv2.blur(below, size, borderType=cv2.BORDER_REPLICATE), dtype=np.uint8)
 
 
 def _run_out(strip: Strip, road: Road, along_m: float, land: TreeShade) -> None:

@@ -94,22 +94,29 @@ void main() {
     float inside = on_asphalt(y, wy);
 #endif
     colour = mix(plain_verge, colour, inside);
+#if defined(VARIED) && !defined(NIGHT)
+    vec2 shares = light_shares * light_left(track);
+#define SUNNY 1.0
+#else
+    vec2 shares = light_shares;
+#define SUNNY sunshine(track)
+#endif
 #ifdef RAIN
     vec3 ripple = vec3((fine.rg - 0.5) * 0.05, 0.0);
 #ifdef NIGHT
     vec3 light = light_by_night(colour * (1.0 + 1.3 * paint), track, place, normal, light_shares.y);
 #else
-    vec3 light = light_at_eye(colour, light_shares, 1.0);
+    vec3 light = light_at_eye(colour, shares, 1.0);
 #endif
-    pixel = display_values(light + mirrored(normalize(normal + ripple), place, film * inside, fine.g) * light_shares.y, air_light);
+    pixel = display_values(light + mirrored(normalize(normal + ripple), place, film * inside, fine.g) * shares.y, air_light);
 #elif defined(NIGHT)
     pixel = display_values(light_by_night(colour * (1.0 + 1.3 * paint), track, place, normal, light_shares.y), air_light);
 #elif defined(SNOW)
-    pixel = display_values(light_at_eye(colour, light_shares, 1.0), air_light);
+    pixel = display_values(light_at_eye(colour, shares, 1.0), air_light);
 #else
-    vec3 light = light_at_eye(colour, light_shares, sunshine(track));
+    vec3 light = light_at_eye(colour, shares, SUNNY);
 #ifdef PUDDLES
-    light += mirrored_sky(place) * water * light_shares.y;
+    light += mirrored_sky(place) * water * shares.y;
 #endif
     pixel = display_values(light, air_light);
 #endif

@@ -29,11 +29,18 @@ void main() {
     side = snowed(side, 0.55 + 0.5 * horizon.w - 0.5 * fine.g + 0.3 * smoothstep(0.3, 1.5, away - asphalt_end(y)) - 0.5 * on_kerb);
 #endif
     side = mix(side, plain_asphalt, on_asphalt(y, wy));
+#if defined(VARIED) && !defined(NIGHT)
+    vec2 shares = light_shares * light_left(track);
+#define SUNNY 1.0
+#else
+    vec2 shares = light_shares;
+#define SUNNY sunshine(track)
+#endif
 #ifdef NIGHT
     OUTPUT(display_values(light_by_night(side, track, place, normal, light_shares.y), air_light), GROUND);
 #elif defined(RAIN) || defined(SNOW)
-    OUTPUT(display_values(light_at_eye(side, light_shares, 1.0), air_light), GROUND);
+    OUTPUT(display_values(light_at_eye(side, shares, 1.0), air_light), GROUND);
 #else
-    OUTPUT(display_values(light_at_eye(side, light_shares, sunshine(track)), air_light), GROUND);
+    OUTPUT(display_values(light_at_eye(side, shares, SUNNY), air_light), GROUND);
 #endif
 }

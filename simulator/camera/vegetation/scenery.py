@@ -26,6 +26,8 @@ LEAF_SHEDDING = ("oak", "poplar", "birch", "bush")
 """Trees that turn yellow and red in autumn."""
 SHADY = ("oak", "birch", "pine", "fir")
 AVENUE_STEP_M, OVERHANG_M = 18.0, 2.5
+TUNNEL_STEP_M, TUNNEL_OVERHANG_M = 9.0, 4.5
+"""Of an avenue whose crowns close over the road."""
 
 
 @dataclass(frozen=True)
@@ -49,15 +51,18 @@ def plant(
     rng: np.random.Generator,
     *,
     avenue: bool,
+    tunnel: bool = False,
 ) -> Trees:
     """The trees of a scene, in groves, denser near the road.
 
-    `avenue` adds a row of tall trees behind each wall line that meet over the road.
+    `avenue` adds a row of tall trees behind each wall line that meet over the road, `tunnel` a
+    denser one, whose crowns close over it.
     """
     road = ground.road
     sites = [_groves(road, theme, rng)]
-    if avenue:
-        sites.append(_avenue(road, theme, np.random.default_rng(rng.integers(2**32))))
+    if avenue or tunnel:
+        own = np.random.default_rng(rng.integers(2**32))
+        sites.append(_avenue(road, theme, own, tunnel=tunnel))
     s, offset, kinds, size, overhang = (
         np.concatenate(column) for column in zip(*sites, strict=True)
     )
@@ -102,16 +107,17 @@ def _groves(road: Road, theme: Theme, rng: np.random.Generator) -> Sites:
     return s[stay], offset[stay], kinds[stay], size[stay], np.zeros(int(stay.sum()))
 
 
-def _avenue(road: Road, theme: Theme, rng: np.random.Generator) -> Sites:
+def _avenue(road: Road, theme: Theme, rng: np.random.Generator, *, tunnel: bool) -> Sites:
     """Tall trees along both wall lines; the kinds that grow here and give shade, else pines."""
     shady = [kind for kind in theme.trees if kind in SHADY] or ["pine"]
-    step = road.track.length_m / max(1, round(road.track.length_m / AVENUE_STEP_M))
+    step_m, overhang = (TUNNEL_STEP_M, TUNNEL_OVERHANG_M) if tunnel else (AVENUE_STEP_M, OVERHANG_M)
+    step = road.track.length_m / max(1, round(road.track.length_m / step_m))
     s = np.tile(np.arange(0.0, road.track.length_m - 0.5 * step, step), 2)
     side = np.repeat([1.0, -1.0], len(s) // 2)
     s = s + step * (rng.uniform(-0.35, 0.35, len(s)) + 0.25 * side)
     offset = side * (road.wall_offset + CLEAR_M + rng.uniform(0.0, 2.5, len(s)))
     size = rng.uniform(0.65, 1.0, len(s))
-    return s, offset, rng.choice(np.array(shady), len(s)), size, np.full(len(s), OVERHANG_M)
+    return s, offset, rng.choice(np.array(shady), len(s)), size, np.full(len(s), overhang)
 
 
 def _tints(rng: np.random.Generator, sheds: NDArray[np.bool_], autumn: float) -> FloatArray:

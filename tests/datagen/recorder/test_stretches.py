@@ -46,8 +46,8 @@ def test_no_two_stretches_have_the_same_scenery() -> None:
         CollectConfig(rounds=40, frames=100, seed=3, tracks=TRACKS, stretch=10, scenes=10)
     )
     seen = [scenery(entry, k) for entry in plan.rounds for k in range(10)]
-    assert len({seed for seed, _ in seen}) == 400
-    assert len({(light.exposure, light.haze_per_km) for _, light in seen}) == 400
+    assert len({seed for seed, _, _ in seen}) == 400
+    assert len({(light.exposure, light.haze_per_km) for _, light, _ in seen}) == 400
 
 
 def test_scenery_and_light_change_where_a_stretch_ends(tmp_path: Path) -> None:

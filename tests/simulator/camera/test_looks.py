@@ -126,6 +126,19 @@ def test_lamps_light_the_whole_road(camera: Camera) -> None:
     assert lit[170:, :15].mean() > 2.0 * dark[170:, :15].mean()
 
 
+def test_it_is_darker_below_a_bridge_under_an_overcast_sky(camera: Camera) -> None:
+    look = RoadLook(roadside=Roadside(bridge_every_m=200.0))
+    camera.change_scene(3, OVERCAST, look)
+    scene = camera._loaded.scene
+    assert scene.mask.texels.shape[2] == 2
+    bridge = scene.bridges[0]
+    seen = []
+    for s in (bridge.s - 2.0, bridge.s + 40.0):
+        picture = camera.render(standing_pose(camera.road, s, 0.0)).astype(np.float64)
+        seen.append(((picture[175:] / 255.0) ** 2).mean())
+    assert 0.2 < seen[0] / seen[1] < 0.75
+
+
 def test_barriers_come_near_but_leave_room_to_drive(road: Road) -> None:
     near = seen_road(road, RoadLook(roadside=Roadside(gap_m=0.2)))
     assert isinstance(near, NearRoad)

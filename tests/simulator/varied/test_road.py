@@ -74,6 +74,6 @@ def test_a_snapshot_shows_a_varied_road(tmp_path: Path, monkeypatch: pytest.Monk
             app, ["snapshot", "oval", "--light", "clear", "--roads", roads, "--out", str(out)]
         )
         assert run.exit_code == 0
-        sheets[roads] = cv2.imread(str(out))
+        sheets[roads] = np.asarray(cv2.imread(str(out)))
     assert sheets["paper"].shape == sheets["varied"].shape
     assert np.mean(sheets["paper"] != sheets["varied"]) > 0.1

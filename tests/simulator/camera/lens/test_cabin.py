@@ -73,9 +73,10 @@ def test_drops_cover_their_share_and_the_wiper_comes_back() -> None:
 def test_exposure_opens_under_a_bridge_and_closes_behind_it() -> None:
     bridge = [(100.0, 6.0)]
     assert adaptation(90.0, 1.5, bridge) == 0.0
-    assert abs(adaptation(100.0, 1.5, bridge) - 0.75) < 1e-9
-    assert abs(adaptation(106.0, 1.5, bridge) - 1.5) < 1e-9
-    assert abs(adaptation(106.0 + ADAPTING_M, 1.5, bridge) - 1.5 / np.e) < 1e-9
+    opened = [1.5 * (1.0 - np.exp(-way / ADAPTING_M)) for way in (6.0, 12.0)]
+    assert abs(adaptation(100.0, 1.5, bridge) - opened[0]) < 1e-9
+    assert abs(adaptation(106.0, 1.5, bridge) - opened[1]) < 1e-9
+    assert abs(adaptation(106.0 + ADAPTING_M, 1.5, bridge) - opened[1] / np.e) < 1e-9
 
 
 def test_exposure_stops_night_and_a_low_sun_change_the_light() -> None:
