@@ -25,8 +25,9 @@ RAIN_DROPS = 0.08
 look has no drops of its own."""
 DAZZLED = 245
 """Display value from which a pixel shows the sun itself."""
-GLOWS = np.uint8(200)
+GLOWS = np.uint8(215)
 """Display value from which light glows by night."""
+GLOW_GAIN = 12.0
 ADAPTING_M = 10.0
 """Way that the exposure needs to follow a change of brightness."""
 DARK_NOISE = 1.8
@@ -132,10 +133,11 @@ def _deck(bridge: Bridge) -> tuple[float, float]:
 def _with_glow(picture: Picture) -> Picture:
     """The picture with a glow round what is brighter than the display shows."""
     width, height = picture.shape[1], picture.shape[0]
-    bright = cv2.resize(np.maximum(picture, GLOWS) - GLOWS, (width // 4, height // 4))
-    glow = cv2.GaussianBlur(bright, (0, 0), 0.008 * width)
+    bright = np.maximum(picture, GLOWS) - GLOWS
+    small = cv2.resize(bright, (width // 4, height // 4), interpolation=cv2.INTER_AREA)
+    glow = cv2.GaussianBlur(small, (0, 0), 0.007 * width)
     return np.asarray(
-        cv2.addWeighted(picture, 1.0, cv2.resize(glow, (width, height)), 2.5, 0.0), np.uint8
+        cv2.addWeighted(picture, 1.0, cv2.resize(glow, (width, height)), GLOW_GAIN, 0.0), np.uint8
     )
 
 

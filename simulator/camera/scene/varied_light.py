@@ -10,6 +10,8 @@ SUNNY = ("clear", "dusk", "heavy-shadow")
 """Kinds of light in which the sun may stand low."""
 USUAL_ALBEDO, COMPENSATED = 0.13, 0.45
 """Of a road for which the kinds of light are right; exponent of the automatic exposure."""
+DARKEST_NIGHT_STOPS = -0.5
+"""By night a picture exposed for less would be black."""
 HEADLIGHT: Colour = (3.4, 3.2, 2.75)
 _NIGHT_SKY: Colour = (0.006, 0.007, 0.010)
 _GLOW: Colour = (0.010, 0.009, 0.010)
@@ -23,11 +25,12 @@ def lit_as(light: Light, look: Lighting, albedo: float = 0.0) -> Light:
     """`light` as `look` has it, on a road of this albedo (0: the scenery's own), for which the
     exposure makes up in part, as a camera's automatic does."""
     automatic = (USUAL_ALBEDO / albedo) ** COMPENSATED if albedo else 1.0
+    stops = look.exposure_stops
     if look.night:
-        light = _by_night(light, look)
+        light, stops = _by_night(light, look), max(stops, DARKEST_NIGHT_STOPS)
     elif look.low_sun_deg > 0.0 and light.kind in SUNNY:
         light = _with_low_sun(light, look.low_sun_deg)
-    return replace(light, exposure=light.exposure * automatic * 2.0**look.exposure_stops)
+    return replace(light, exposure=light.exposure * automatic * 2.0**stops)
 
 
 def lamp_colour(look: Lighting) -> Colour:
