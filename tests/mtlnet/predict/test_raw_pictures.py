@@ -1,4 +1,4 @@
-"""Raw pictures of ROS and Foxglove: every encoding has its colours, what is no picture is refused."""
+"""Raw pictures of ROS and Foxglove: each encoding has its colours, others are refused."""
 
 from typing import Any
 
