@@ -77,9 +77,14 @@ def parts(film: Path, model: str, folder: Path) -> dict[str, float]:
     items = [SourceImage(str(film), number, image) for number, image in enumerate(images)]
     both = list(zip(items, answers, strict=True))
     found["draw"] = cpu_ms(lambda: len([draw_prediction(*pair, camera) for pair in both]))
-    with FilmWriter(folder / "part.mp4", camera, 30.0) as writer:
-        written = cpu_ms(lambda: len([writer.write(*pair) for pair in both]))
-    found["encode"] = written - found["draw"]
+
+    def encode() -> int:
+        with FilmWriter(folder / "part.mp4", camera, 30.0) as writer:
+            for pair in both:
+                writer.write(*pair)
+        return len(both)
+
+    found["encode"] = cpu_ms(encode) - found["draw"]
     return found
 
 

@@ -78,6 +78,13 @@ JitterCamera = Annotated[
         "--jitter-camera", help="Vary height, pitch and field of view from round to round."
     ),
 ]
+CameraFile = Annotated[
+    Path | None,
+    typer.Option(
+        "--camera",
+        help="camera.yaml (ours, OpenCV's, ROS's or Kalibr's): record through that lens and mount.",
+    ),
+]
 ShardOf = Annotated[
     str, typer.Option(help="2/4: only the second of four parts, for batch systems.")
 ]
@@ -104,6 +111,7 @@ def collect(
     split_test_share: TestShare = CollectConfig.test_share,
     split: SplitName = CollectConfig.split,
     codec: Codec = CollectConfig.codec,
+    camera: CameraFile = None,
     jitter_camera: JitterCamera = CollectConfig.jitter_camera,
     shard: ShardOf = "",
     executor: ExecutorName = "local",
@@ -116,6 +124,8 @@ def collect(
     from datagen.planning.planner import make_plan
     from datagen.planning.summary import expected_classes
     from datagen.planning.tracks import choose_tracks
+    from runtime.camera_file import read_camera
+    from trackfeatures.camera import CameraParameters
 
     config = CollectConfig(
         rounds=rounds,
@@ -129,6 +139,7 @@ def collect(
         scenes=scenes,
         test_share=split_test_share,
         codec=codec,
+        camera=CameraParameters() if camera is None else read_camera(camera, CameraParameters()),
         jitter_camera=jitter_camera,
         split=split,
     )

@@ -37,12 +37,12 @@ def marking_line(distance: float, angle: float, curvature: float) -> NDArray[np.
 def to_pixels(
     points: NDArray[np.float64], camera: CameraParameters, height_m: float
 ) -> NDArray[np.int32]:
-    """Pixels (N, 2), enlarged by `SCALE`, of road points (N, 2) in the car frame.
-
-    `height_m`: height of the camera above the road.
+    """Pixels (M, 2), enlarged by `SCALE`, of those road points (N, 2) in the car frame that the
+    camera sees. `height_m`: its height above the road.
     """
     road = np.column_stack([points, np.full(len(points), camera.z - height_m)])
     pixels = camera.project(road)
+    pixels = pixels[np.isfinite(pixels).all(axis=1)]
     enlarged = (pixels + 0.5) * SCALE - 0.5  # about the picture's corner, as cv2.resize does
     return np.round(enlarged).astype(np.int32)
 

@@ -62,12 +62,12 @@ def _stated(source: Source, model: CameraParameters, note: Note) -> Source | Non
 
     assert isinstance(source.opened, Recording)
     camera, about = source.opened.camera(model)
+    if camera is not None and is_models(camera, model):
+        return source
     if about:
         note(about)
     if camera is None:
         return None
-    if is_models(camera, model):
-        return source
     return replace(source, lens=Rectification(camera, model))
 
 

@@ -148,7 +148,8 @@ def annotations(
             line = message.points.add(type=PointsAnnotation.LINE_STRIP, thickness=1.5)
             line.timestamp.CopyFrom(time)
             line.outline_color.CopyFrom(colour)
-            for u, v in (view.project(np.column_stack([points, on_road])) + CORNER_PX).tolist():
+            pixels = view.project(np.column_stack([points, on_road])) + CORNER_PX
+            for u, v in pixels[np.isfinite(pixels).all(axis=1)].tolist():
                 line.points.add(x=u, y=v)
     for row, text in enumerate(feature_lines(prediction)):
         label = message.texts.add(text=text, font_size=9.0)

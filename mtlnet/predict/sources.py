@@ -3,7 +3,7 @@ other programs, webcams and streams."""
 
 import os
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
@@ -215,8 +215,13 @@ def _unreadable(path: Path, error: OSError) -> str:
     return f"{path} cannot be read ({error.strerror or error})"
 
 
-def read_sources(sources: list[Source], camera: CameraParameters) -> Iterator[SourceImage]:
-    """The images of all sources in order, in the size of `camera`, decoded on another thread."""
+def read_sources(
+    sources: list[Source], camera: CameraParameters
+) -> Generator[SourceImage, None, None]:
+    """The images of all sources in order, in the size of `camera`, decoded on another thread.
+
+    Close it to end a stream.
+    """
     items = (item for source in sources for item in _read(source, camera))
     decoder = ThreadPoolExecutor(1)  # one thread: the order stays
     try:

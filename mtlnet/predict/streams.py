@@ -8,7 +8,7 @@ import re
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -25,6 +25,7 @@ ADDRESS = re.compile(r"([a-z][a-z0-9+.-]*)://", re.IGNORECASE)
 OPEN_S, STALL_S = 10.0, 10.0
 """Time for the first picture, and for each one after it: a camera behind a slow link sends some
 pictures a second; the longest key frame interval in use is about 10 s."""
+AT_ONCE_S = 0.05
 DEVICES = Path("/dev")
 
 
@@ -55,26 +56,40 @@ class Stream:
     opened: ExitStack
     fault: str = ""
     note: str = ""
-    fps: float = field(default=0.0)
+    fps: float = 0.0
+    damaged: int = 0
+    """Number of pictures in which FFmpeg met an error."""
+    first_error: str = ""
 
     def pictures(self) -> Iterator[Picture]:
         """The pictures as they come, each with the time of its arrival."""
         self.errors.forget()
         with self.opened, silent_opencv():
-            number = 0
+            number, waited_s = 0, 0.0
             while True:
                 begin = time.monotonic()
                 found, frame = self.film.read()
+                took_s = time.monotonic() - begin
+                # After a stall the decoder gives at once what it has kept.
+                waited_s = took_s if took_s > AT_ONCE_S else max(waited_s, took_s)
                 if not found:
-                    self._end(number, time.monotonic() - begin)
+                    self._end(number, waited_s)
                     return
                 image = frame.astype(np.uint8, copy=False)
                 if size := self.errors.new_size(image.shape):
                     first = (image.shape[1], image.shape[0])
                     self.fault = other_size(self.name, number, size, first)
                     return
+                self._note_damage(number)
                 yield Picture(number, image, time.time(), bgr=True)
                 number += 1
+
+    def _note_damage(self, number: int) -> None:
+        """Of picture `number`; a stream that is joined between key frames begins with errors."""
+        if self.errors.count and number:
+            self.damaged += 1
+            self.first_error = self.first_error or self.errors.first
+        self.errors.forget()
 
     def _end(self, number: int, waited_s: float) -> None:
         told = f" ({self.errors.first})" if self.errors.first else ""
@@ -87,6 +102,11 @@ class Stream:
             self.fault = (
                 f"{self.name} broke off after {number} pictures{told}; those were used: check "
                 "camera and network"
+            )
+        elif self.damaged:
+            self.fault = (
+                f"{self.name} ended after {number} pictures; {self.damaged} came damaged and may "
+                f"be wrong ({self.first_error})"
             )
         else:
             self.note = f"{self.name} ended after {number} pictures"

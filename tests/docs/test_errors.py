@@ -25,9 +25,12 @@ from mtlnet.data.custom_images import COLUMNS, open_custom_images
 from mtlnet.inference.engine import Engine, load_engine
 from mtlnet.inference.image_decoding.decode import inspect, read_image
 from mtlnet.inference.model_card import resolve_run
+from mtlnet.inference.rectification import Rectification
 from mtlnet.predict.films import Film, read_film_header
 from mtlnet.predict.run import predict_files
 from mtlnet.training.loss import parse_alpha
+from runtime.camera_file import read_camera
+from serve.cameras import read_cameras
 from simulator.camera.core.context import Graphics
 from simulator.camera.core.turns import Turns
 from simulator.track.catalogue import find_track
@@ -36,6 +39,7 @@ from simulator.track.torcs.torcs import read_torcs
 from simulator.vehicle.state import Command
 from simulator.world.world import World
 from tests.mtlnet.conftest import write_dataset
+from tests.mtlnet.predict import recorded
 from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
 
@@ -105,6 +109,52 @@ def _(folder: Path) -> object:
 @row("an image that shows less")
 def _(folder: Path) -> object:
     return read_image(written(folder, "a.jpg", jpeg(100, 210)), VIEW)
+
+
+@row("an image of a camera file")
+def _(folder: Path) -> object:
+    return Rectification(CameraParameters(fov_y_deg=12.0), VIEW).image(
+        np.zeros((210, 280, 3), np.uint8)
+    )
+
+
+def camera_file(folder: Path, text: str) -> object:
+    return read_camera(written(folder, "camera.yaml", text.encode()), VIEW)
+
+
+SIZED = "image_width: 640\nimage_height: 480\ndist_coeffs: [0.1, 0, 0, 0]\n"
+
+
+@row("a camera file without numbers")
+def _(folder: Path) -> object:
+    return camera_file(folder, SIZED + "camera_matrix:\n")
+
+
+@row("a singular camera matrix")
+def _(folder: Path) -> object:
+    return camera_file(folder, SIZED + "camera_matrix: [[0, 0, 9], [0, 5, 9], [0, 0, 1]]\n")
+
+
+@row("coefficients of another number")
+def _(folder: Path) -> object:
+    text = SIZED.replace("0, 0, 0]", "0]")
+    return camera_file(folder, text + "camera_matrix: [[500, 0, 9], [0, 500, 9], [0, 0, 1]]\n")
+
+
+@row("a number that is not finite")
+def _(folder: Path) -> object:
+    return camera_file(folder, SIZED + "camera_matrix: [[.nan, 0, 9], [0, 5, 9], [0, 0, 1]]\n")
+
+
+@row("a camera matrix without")
+def _(folder: Path) -> object:
+    return camera_file(folder, "K: [500, 0, 9, 0, 500, 9, 0, 0, 1]\nD: [0, 0, 0, 0]\n")
+
+
+@row("to the service: two cameras")
+def _(folder: Path) -> object:
+    path = written(folder, "camera.yaml", b"fov_y_deg: 60\n")
+    return read_cameras([f"a={path}", f"a={path}"], VIEW)
 
 
 @row("to the service: another kind")
@@ -181,6 +231,58 @@ def _(folder: Path) -> object:
 def _(folder: Path) -> object:
     os.mkfifo(folder / "a.mp4")
     return predict(folder / "a.mp4")
+
+
+GREY = recorded.ros_image(np.full((210, 280), 90, np.uint8), "mono8")
+
+
+@row("a recording without pictures")
+def _(folder: Path) -> object:
+    camera = recorded.ros_camera((280, 210), (150, 150, 140, 105))
+    return predict(recorded.write_bag(folder / "bag", [("/info", "CameraInfo", camera)]))
+
+
+@row("a recording with several cameras")
+def _(folder: Path) -> object:
+    images = [("/left", "Image", GREY), ("/right", "Image", GREY)]
+    return predict(recorded.write_bag(folder / "bag", images))
+
+
+@row("a topic that is not there")
+def _(folder: Path) -> object:
+    bag = recorded.write_bag(folder / "bag", [("/left", "Image", GREY)])
+    return predict_files(engine(), [str(bag)], topic="/right")
+
+
+@row("a recording that is cut")
+def _(folder: Path) -> object:
+    bag = recorded.write_bag(folder / "bag", [("/left", "Image", GREY)] * 3)
+    file = next(bag.glob("*.mcap"))
+    file.write_bytes(file.read_bytes()[:-100])
+    return predict(bag)
+
+
+@row("a picture that holds depths")
+def _(folder: Path) -> object:
+    depths = recorded.ros_image(np.ones((210, 280), np.float32), "32FC1")
+    return predict(recorded.write_bag(folder / "bag", [("/depth", "Image", depths)]))
+
+
+@row("pictures that change their size")
+def _(folder: Path) -> object:
+    other = recorded.ros_image(np.full((420, 560), 90, np.uint8), "mono8")
+    images = [("/left", "Image", GREY), ("/left", "Image", other)]
+    return predict(recorded.write_bag(folder / "bag", images))
+
+
+@row("a stream that cannot be opened")
+def _(folder: Path) -> object:
+    return predict_files(engine(), ["http://127.0.0.1:9/a"])
+
+
+@row("a webcam that is not there")
+def _(folder: Path) -> object:
+    return predict_files(engine(), ["63"])
 
 
 def damaged_round(folder: Path) -> Dataset:

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from mtlnet.predict.recordings.containers import Topic
 from mtlnet.predict.recordings.images import CALIBRATION, ROS_CALIBRATION
+from mtlnet.predict.recordings.topic import Topic
 from trackfeatures.camera import CameraError, CameraParameters
 from trackfeatures.errors import UserError
 
@@ -22,6 +22,7 @@ RECTIFIED = "image_rect"
 """In the name of a topic: its pictures are of the projection matrix, without distortion (REP 104).
 """
 SAME_PX = 0.01
+MAX_NUMBER = 1e6  # of a matrix (px) or a distortion; damaged files have others
 
 
 def calibration_topic(image_topic: str, topics: list[Topic]) -> Topic | None:
@@ -55,6 +56,8 @@ def camera_of(message: Any, image_topic: str, mount: CameraParameters) -> Camera
         raise UserError("it is not calibrated: its matrix K has no focal length")
     if is_ros and (message.roi.width or message.roi.height or max(_binning(message)) > 1):
         raise UserError("its pictures are a part (roi) or are binned, which is not read")
+    if not max(map(np.abs, (*matrix.ravel(), *distortion))) <= MAX_NUMBER:
+        raise UserError(f"one of its numbers is no number, or above {MAX_NUMBER:g}")
     fx, _, cx, _, fy, cy, *_ = matrix.ravel().tolist()
     try:
         return replace(

@@ -7,7 +7,6 @@ cut is read as far as it goes; `rosbags` reads the others (sqlite3, compressed f
 import struct
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -18,27 +17,15 @@ from mcap.records import Channel, Message, Schema
 from mcap.stream_reader import StreamReader
 
 from mtlnet.predict.kinds import BAG_METADATA, SQLITE_START, bag_metadata
+from mtlnet.predict.recordings.cut_database import CutDatabase
+from mtlnet.predict.recordings.topic import Topic
 from trackfeatures.errors import UserError
 
-# The MCAP reader raises these for damaged records, beside its own.
+# The readers raise these for damaged records, beside their own.
 DAMAGE = (
-    McapError, struct.error, zstandard.ZstdError, ValueError, EOFError, RuntimeError, KeyError,
+    McapError, struct.error, zstandard.ZstdError, ValueError, EOFError, RuntimeError, LookupError,
+    OverflowError, MemoryError, TypeError, AttributeError, AssertionError,
 )  # fmt: skip
-
-
-@dataclass(frozen=True, slots=True)
-class Topic:
-    """`count`: number of messages, None where it is unknown."""
-
-    name: str
-    schema: str
-    encoding: str
-    """Of its messages: "cdr", "protobuf", "json", ..."""
-    count: int | None = None
-
-    def __str__(self) -> str:
-        messages = "" if self.count is None else f", {self.count} messages"
-        return f"{self.name} ({self.schema}{messages})"
 
 
 class Container(Protocol):
@@ -58,13 +45,27 @@ def open_container(path: Path) -> Container:
     if path.is_dir():
         about = bag_metadata(path) or {}
         if about.get("storage_identifier") != "mcap" or about.get("compression_mode"):
-            return RosBag(path)
+            return _rosbags(path, sorted(path.glob("*.db3")))
         # Before version 4 the paths had the folder's name before them.
         names = [Path(str(name)).name for name in about.get("relative_file_paths", [])]
         return McapFiles(path, [path / name for name in names])
     with path.open("rb") as file:
         is_sqlite = file.read(len(SQLITE_START)) == SQLITE_START
-    return RosBag(path) if is_sqlite else McapFiles(path, [path])
+    return _rosbags(path, [path]) if is_sqlite else McapFiles(path, [path])
+
+
+def _rosbags(path: Path, databases: list[Path]) -> Container:
+    bag = RosBag(path)
+    try:
+        bag.topics()
+    except UserError as error:
+        if len(databases) != 1:
+            raise
+        cut = CutDatabase(databases[0], str(error.__cause__).rpartition(": ")[2])
+        if cut.topics():
+            return cut
+        raise
+    return bag
 
 
 class McapFiles:
@@ -141,7 +142,7 @@ class McapFiles:
                     counts[record.channel_id] = counts.get(record.channel_id, 0) + 1
         if not channels:
             raise UserError(f"{file} is no MCAP file, or is cut before its first message")
-        return [_topic(channels[key], schemas, count) for key, count in counts.items()]
+        return [_topic(channels[k], schemas, count) for k, count in counts.items() if k in channels]
 
     def _messages_of(self, file: Path, topic: str) -> Iterator[tuple[int, bytes]]:
         with file.open("rb") as stream:
@@ -169,14 +170,17 @@ class RosBag:
     def __init__(self, path: Path) -> None:
         self._path = path
         self.fault = ""
+        self._topics: list[Topic] | None = None  # to count messages takes a while
 
     def topics(self) -> list[Topic]:
-        with self._opened() as reader:
-            return [
-                Topic(name, found.msgtype or "several types", "cdr", found.msgcount)
-                for name, found in sorted(reader.topics.items())
-                if found.msgcount
-            ]
+        if self._topics is None:
+            with self._opened() as reader:
+                self._topics = [
+                    Topic(name, found.msgtype or "several types", "cdr", found.msgcount)
+                    for name, found in sorted(reader.topics.items())
+                    if found.msgcount
+                ]
+        return self._topics
 
     def messages(self, topic: str) -> Iterator[tuple[int, bytes]]:
         used = 0
@@ -206,8 +210,7 @@ class RosBag:
             reader.open()
         except _bag_errors() as error:
             raise UserError(
-                f"{self._path} cannot be read as a ROS 2 bag ({error}); `sqlite3 FILE .recover` "
-                "saves what is left of a .db3 file that is cut"
+                f"{self._path} cannot be read as a ROS 2 bag: {' '.join(str(error).split())}"
             ) from error
         try:
             yield reader

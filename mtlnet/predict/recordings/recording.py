@@ -8,8 +8,9 @@ from typing import Any
 from mtlnet.inference.image_decoding.errors import ImageError
 from mtlnet.predict.pictures import Picture, other_size
 from mtlnet.predict.recordings.cameras import calibration_topic, camera_of
-from mtlnet.predict.recordings.containers import Container, Topic, names_of, open_container
+from mtlnet.predict.recordings.containers import Container, names_of, open_container
 from mtlnet.predict.recordings.images import IMAGES, VIDEO, picture_of, reader_of, time_of
+from mtlnet.predict.recordings.topic import Topic
 from mtlnet.predict.recordings.video import Video
 from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError

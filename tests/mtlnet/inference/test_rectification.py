@@ -183,9 +183,7 @@ def test_the_heights_uncertainty_widens_distances() -> None:
     std = split_outputs(Rectification(other, target).outputs(answered)).std
     assert std is not None
     own = 0.125
-    beside = np.array(
-        [2.0, 1.0, 0.0, 0.0, 0.0, 0.5]
-    )  # m; the last: lane centre
+    beside = np.array([2.0, 1.0, 0.0, 0.0, 0.0, 0.5])  # m; the last: lane centre
     np.testing.assert_allclose(std[0, :6], np.hypot(own, 0.05 * beside), rtol=1e-5)
     assert std[0, 6] == pytest.approx(0.01)
 

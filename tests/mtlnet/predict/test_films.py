@@ -112,6 +112,27 @@ def test_a_film_that_breaks_off_says_so(
     assert re.search(fault, found)
 
 
+@pytest.mark.parametrize(("arguments", "name"), [(H264, "a.ts"), (["-c:v", "mjpeg"], "a.mjpeg")])
+def test_a_film_that_changes_its_size_ends_there(
+    make: Make, arguments: list[str], name: str
+) -> None:
+    """OpenCV scales the others to the size of the first, and so would cut and stretch the view."""
+    whole, small = (
+        make(*PICTURES, *arguments, name),
+        make(*PICTURES, "-s", "160x90", *arguments, f"s{name}"),
+    )
+    both = whole.with_name(f"both{name}")
+    both.write_bytes(whole.read_bytes() + small.read_bytes())
+    numbers, fault, _ = read(both)
+    assert numbers == list(range(len(numbers)))
+    assert FRAMES - 4 < len(numbers) <= FRAMES  # a decoder of several threads knows it earlier
+    size = r"160 x (90|96) px, those before it are 280 x 210 px and were used"
+    assert re.search(rf"both{name}: picture {len(numbers)} is {size}", fault)
+    again = whole.with_name(f"twice{name}")
+    again.write_bytes(whole.read_bytes() * 2)
+    assert read(again)[:2] == (list(range(2 * FRAMES)), "")
+
+
 @pytest.mark.parametrize("name", ["a.mp4", "a.ts", "a.mkv", "a.mjpeg.avi"])
 def test_damage_within_a_film_is_told_and_the_rest_is_read(make: Make, name: str) -> None:
     codec = ["-c:v", "mjpeg"] if "mjpeg" in name else H264

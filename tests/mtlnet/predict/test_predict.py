@@ -5,6 +5,7 @@ import json
 import os
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from unittest import mock
 
 import cv2
 import numpy as np
@@ -292,6 +293,18 @@ def test_a_full_disk_keeps_what_is_done_and_is_told(
         with pytest.raises(OSError, match="No space left") as raised:
             predict_files(engine, [str(image)], [tmp_path / name])
         assert raised.value.filename == str(tmp_path / name)
+
+
+def test_nothing_is_written_after_an_error(engine: BrightnessEngine, tmp_path: Path) -> None:
+    """Answers are written on a thread of their own, while the next ones are made."""
+    film = write_film(tmp_path / "in.mp4", [30] * 60)
+    with (
+        mock.patch("mtlnet.predict.writers.draw_prediction", side_effect=OSError("no more")),
+        pytest.raises(OSError, match="no more"),
+    ):
+        predict_files(engine, [str(film)], [tmp_path / "out.mp4", tmp_path / "rows.csv"])
+    assert not (tmp_path / "rows.csv").read_text()
+    assert len(engine.seen) < 60
 
 
 def test_an_interrupted_film_is_playable(engine: BrightnessEngine, tmp_path: Path) -> None:

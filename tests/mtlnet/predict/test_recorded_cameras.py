@@ -11,9 +11,9 @@ import pytest
 from mtlnet.inference.model_card import read_card, resolve_run
 from mtlnet.inference.rectification import Rectification
 from mtlnet.predict.recordings.cameras import calibration_topic
-from mtlnet.predict.recordings.containers import Topic
 from mtlnet.predict.recordings.images import CALIBRATION, ROS_CALIBRATION
 from mtlnet.predict.recordings.recording import open_recording
+from mtlnet.predict.recordings.topic import Topic
 from mtlnet.predict.run import predict_files
 from tests.mtlnet.predict.recorded import (
     Message,

@@ -3,6 +3,7 @@
 import json
 import re
 import subprocess
+import sys
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -14,9 +15,7 @@ import simplejpeg
 from numpy.typing import NDArray
 from rosbags.rosbag2 import CompressionMode, StoragePlugin
 
-from mtlnet.inference.image_decoding.errors import ImageError
 from mtlnet.inference.model_card import read_card, resolve_run
-from mtlnet.predict.recordings.raw import decode_raw
 from mtlnet.predict.run import InputsLeftOut, predict_files
 from mtlnet.predict.sources import find_sources
 from tests.mtlnet.predict.recorded import (
@@ -29,9 +28,11 @@ from tests.mtlnet.predict.recorded import (
     write_foxglove,
 )
 from tests.mtlnet.predict.test_predict import BrightnessEngine
+from tests.typed import typed
 from trackfeatures.errors import UserError
 
 COUNT = 5
+DISTORTED = (0.1, 0.0, 0.0, 0.0, 0.0)
 CAMERA = "/camera/image_raw"
 
 
@@ -118,71 +119,6 @@ def test_raw_pictures_give_the_answers_of_lossless_files(
         assert answers(predict_files(engine, [str(path)])) == expected
 
 
-GRADIENT = np.add.outer(np.arange(32), 2 * np.arange(40)).astype(np.uint8)
-COLOURS = np.stack([GRADIENT, GRADIENT // 2, 255 - GRADIENT], axis=-1)
-
-
-@pytest.mark.parametrize(
-    ("encoding", "data", "shown"),
-    [
-        ("rgb8", COLOURS, COLOURS),
-        ("bgr8", COLOURS[..., ::-1], COLOURS),
-        ("8UC3", COLOURS[..., ::-1], COLOURS),
-        ("rgba8", np.dstack([COLOURS, GRADIENT]), COLOURS),
-        ("bgra8", np.dstack([COLOURS[..., ::-1], GRADIENT]), COLOURS),
-        ("mono8", GRADIENT, np.dstack([GRADIENT] * 3)),
-        ("mono16", GRADIENT.astype("<u2") * 256 + 7, np.dstack([GRADIENT] * 3)),
-        ("mono16", GRADIENT.astype(">u2") * 256 + 7, np.dstack([GRADIENT] * 3)),
-        ("rgb16", COLOURS.astype("<u2") * 256 + 7, COLOURS),
-    ],
-)
-def test_encodings_are_read_to_the_same_colours(
-    encoding: str, data: NDArray[Any], shown: NDArray[np.uint8]
-) -> None:
-    fields = ros_image(np.ascontiguousarray(data), encoding, padding=5)
-    found = decode_raw(
-        fields["data"], encoding, 40, 32, fields["step"], big_endian=bool(fields["is_bigendian"])
-    )
-    assert np.array_equal(found, shown)
-
-
-@pytest.mark.parametrize("order", ["rggb", "bggr", "gbrg", "grbg"])
-@pytest.mark.parametrize("bits", [8, 16])
-def test_a_bayer_pattern_has_its_colours(order: str, bits: int) -> None:
-    """Of a plain colour each sample is that of its pixel's filter."""
-    colour = {"r": 200, "g": 120, "b": 40}
-    tile = np.array([colour[name] for name in order], np.uint8).reshape(2, 2)
-    data = np.tile(tile, (16, 20))
-    if bits == 16:
-        data = (data.astype("<u2") * 256).view(np.uint8)
-    found = decode_raw(data.ravel(), f"bayer_{order}{bits}", 40, 32, 0, big_endian=False)
-    assert np.array_equal(np.unique(found.reshape(-1, 3), axis=0), [[200, 120, 40]])
-
-
-@pytest.mark.parametrize(("encoding", "order"), [("yuyv", "YUYV"), ("yuv422", "UYVY")])
-def test_yuv_of_a_grey_and_a_red_picture(encoding: str, order: str) -> None:
-    """Studio range of BT.601: Y 16 to 235; red is Y 82, U 90, V 240."""
-    for yuv, rgb in (((126, 128, 128), (128, 128, 128)), ((82, 90, 240), (255, 1, 0))):
-        sample = dict(zip("YUV", yuv, strict=True))
-        row = np.array([sample[name] for name in order], np.uint8)
-        found = decode_raw(np.tile(row, 32 * 20), encoding, 40, 32, 0, big_endian=False)
-        assert np.abs(found.astype(int) - rgb).max() <= 2
-
-
-@pytest.mark.parametrize(
-    ("encoding", "length", "message"),
-    [
-        ("32FC1", 5120, r"'32FC1' .of depths or measurements. is no picture"),
-        ("16UC1", 2560, r"'16UC1' .of depths"),
-        ("jpeg", 100, "'jpeg' is no picture that is read; known are 8UC1"),
-        ("rgb8", 3839, r"3839 bytes in rows of 120 are no 40 x 32 px of rgb8; 3840 bytes"),
-    ],
-)
-def test_what_is_no_picture_is_refused(encoding: str, length: int, message: str) -> None:
-    with pytest.raises(ImageError, match=message):
-        decode_raw(np.zeros(length, np.uint8), encoding, 40, 32, 0, big_endian=False)
-
-
 def test_a_topic_is_chosen_or_the_line_lists_them(engine: BrightnessEngine, tmp_path: Path) -> None:
     dark, bright = (ros_image(np.full((210, 280), level, np.uint8), "mono8") for level in (9, 200))
     camera = ros_camera((280, 210), (150, 150, 139.5, 104.5))
@@ -225,6 +161,24 @@ def test_a_cut_recording_gives_what_is_left(engine: BrightnessEngine, tmp_path: 
             predict_files(engine, [str(path)], [table])
         rows = [json.loads(line) for line in table.read_text().splitlines()]
         assert 1 <= len(rows) == len(raised.value.results) < COUNT + 1
+
+
+def test_a_cut_database_gives_what_is_left(engine: BrightnessEngine, tmp_path: Path) -> None:
+    """`rosbags` and SQLite refuse it; the folder and its file are read alike."""
+    images = [(CAMERA, "Image", ros_image(image, "rgb8")) for image in pictures((210, 280))]
+    bag = write_bag(tmp_path / "bag é", images, StoragePlugin.SQLITE3)
+    whole = answers(predict_files(engine, [str(bag)]))
+    file = next(bag.glob("*.db3"))
+    content = file.read_bytes()
+    for path in (bag, file):
+        file.write_bytes(content[: len(content) * 6 // 10])
+        message = r"é.db3 is cut or damaged after 1 pictures of .*used .database disk image is malf"
+        with pytest.raises(InputsLeftOut, match=message) as raised:
+            predict_files(engine, [str(path)])
+        assert answers(raised.value.results) == whole[:1]
+    file.write_bytes(content[:5000])  # without its topics
+    with pytest.raises(UserError, match="cannot be read as a ROS 2 bag"):
+        predict_files(engine, [str(bag)])
 
 
 def test_one_bad_message_costs_no_other(engine: BrightnessEngine, tmp_path: Path) -> None:
@@ -299,3 +253,80 @@ def access_units(stream: bytes, form: str) -> list[bytes]:
             units.append(pending)
             pending = b""
     return units
+
+
+@pytest.mark.slow
+def test_the_command_takes_a_topic_and_tells_of_the_camera(tmp_path: Path) -> None:
+    """Of two cameras the dark one; standard output has the answers alone."""
+    dark, bright = (ros_image(np.full((210, 280), level, np.uint8), "mono8") for level in (9, 200))
+    info = ros_camera((280, 210), (150, 150, 139.5, 104.5))
+    messages: list[Message] = [
+        ("/left/image", "Image", dark), ("/right/image", "Image", bright),
+        ("/left/camera_info", "CameraInfo", info),
+    ]  # fmt: skip
+    bag = write_bag(tmp_path / "bag", messages)
+    done = typed("mtlnet", "predict", bag, "--topic", "/left/image", "--json")
+    assert done.returncode == 0, done.stderr
+    (row,) = json.loads(done.stdout)
+    assert (row["image"], row["time_s"]) == (f"{bag}#0", START_S)
+    assert f"{bag}: matrix and distortion are those of /left/camera_info" in done.stderr
+    done = typed("mtlnet", "predict", bag)
+    assert done.returncode == 1
+    assert done.stderr.strip().splitlines()[-1].startswith(f"error: {bag} has several topics")
+
+
+@pytest.mark.parametrize("kind", ["mcap", "db3", "json", "metadata.yaml"])
+def test_no_damage_ends_in_a_traceback(engine: BrightnessEngine, tmp_path: Path, kind: str) -> None:
+    """Flipped bits, wrong bytes and cuts anywhere: answers or a UserError."""
+    small = [bytes(simplejpeg.encode_jpeg(image[:21, :28], quality=60)) for image in pictures()[:3]]
+    camera = ros_camera((28, 21), (20, 20, 13.5, 10), "plumb_bob", DISTORTED)
+    ros: list[Message] = [("/c/image", "CompressedImage", ros_compressed(data)) for data in small]
+    ros.append(("/c/camera_info", "CameraInfo", camera))
+    if kind == "json":
+        plain: list[Message] = [
+            ("/c", "CompressedImage", {"data": d, "format": "jpeg"}) for d in small
+        ]
+        target = file = write_foxglove(tmp_path / "a.mcap", plain, as_json=True)
+    else:
+        storage = StoragePlugin.SQLITE3 if kind == "db3" else StoragePlugin.MCAP
+        target = write_bag(tmp_path / "bag", ros, storage)
+        file = next(path for path in target.iterdir() if path.name.endswith(kind))
+    whole = file.read_bytes()
+    rng = np.random.default_rng(1)
+    refused = 0
+    for _ in range(20):
+        content = bytearray(whole)
+        at = int(rng.integers(len(content)))
+        change = int(rng.integers(3))
+        if change == 0:
+            content[at] ^= 1 << int(rng.integers(8))
+        elif change == 1:
+            content[at : at + 8] = rng.bytes(8)
+        else:
+            del content[at:]
+        file.write_bytes(content)
+        try:
+            predict_files(engine, [str(target)])
+        except UserError:
+            refused += 1
+    assert refused
+
+
+def test_a_file_of_the_bag_is_not_overwritten(engine: BrightnessEngine, tmp_path: Path) -> None:
+    bag = write_bag(tmp_path / "bag", [(CAMERA, "CompressedImage", ros_compressed(jpegs()[0]))])
+    file = next(bag.glob("*.mcap"))
+    before = file.read_bytes()
+    with pytest.raises(UserError, match="is a file to read; give another one"):
+        predict_files(engine, [str(bag)], [file])
+    assert file.read_bytes() == before
+
+
+def test_a_missing_package_is_named(
+    engine: BrightnessEngine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    image: list[Message] = [(CAMERA, "CompressedImage", ros_compressed(jpegs()[0]))]
+    bag = write_bag(tmp_path / "bag", image, StoragePlugin.SQLITE3)
+    monkeypatch.setitem(sys.modules, "rosbags.rosbag2", None)
+    needed = r"needs the package rosbags.*, in `pip install driverview\[recording\]`"
+    with pytest.raises(UserError, match=needed):
+        predict_files(engine, [str(bag)])

@@ -2,6 +2,8 @@
 
 import json
 import re
+import socket
+import subprocess
 import threading
 import time
 from collections.abc import Iterator
@@ -84,7 +86,7 @@ def test_a_stream_is_answered_to_its_end(
     ("mode", "message"),
     [
         ("stall", r"sent nothing for 1 s after 5 pictures; those were used"),
-        ("cut", r"broke off after 6 pictures \(.+\); those were used"),
+        ("cut", r"ended after 6 pictures; 1 came damaged and may be wrong \(.+\)"),
         ("smaller", r"picture 5 is 280 x 210 px, those before it are 560 x 420 px and were used"),
     ],
 )
@@ -104,6 +106,27 @@ def test_a_stream_that_fails_keeps_its_answers(
     assert len(rows) == len(raised.value.results) >= 5
     found = [row["angle_rad"] for row in rows[:5]]
     assert found == pytest.approx([30 * n / 255 - 0.5 for n in range(5)], abs=5e-3)
+
+
+@pytest.mark.slow
+def test_a_stream_without_connection_that_stops_is_told(
+    engine: BrightnessEngine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """H.264 in MPEG-TS over UDP: after the stall the decoder still gives what it has kept."""
+    monkeypatch.setattr(streams, "STALL_S", STALL_S)
+    program = pytest.importorskip("imageio_ffmpeg").get_ffmpeg_exe()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+        free.bind(("127.0.0.1", 0))
+        name = f"udp://127.0.0.1:{free.getsockname()[1]}"
+    source = ["-re", "-f", "lavfi", "-i", "testsrc2=size=280x210:rate=20:duration=3"]
+    codec = ["-c:v", "libx264", "-preset", "ultrafast", "-g", "5", "-pix_fmt", "yuv420p"]
+    command = [program, "-v", "error", *source, *codec, "-f", "mpegts", f"{name}?pkt_size=1316"]
+    with (
+        subprocess.Popen(command),
+        pytest.raises(InputsLeftOut, match=r"sent nothing for 1 s after \d+ pictures") as raised,
+    ):
+        predict_files(engine, [name])
+    assert 20 < len(raised.value.results) <= 60
 
 
 def test_ctrl_c_ends_a_stream_and_keeps_its_answers(engine: BrightnessEngine, address: str) -> None:
