@@ -71,18 +71,26 @@ class Rectification:
             size = (max(round(width * ratio), 1), max(round(height * ratio), 1))
             image = cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.uint8)
         seen = source.resized(image.shape[1], image.shape[0])
-        border = {"borderMode": cv2.BORDER_CONSTANT, "borderValue": (BORDER_LEVEL,) * 3}
+        grey = (BORDER_LEVEL,) * 3
         if seen.distortion == "none":
             found = cv2.warpPerspective(
                 image,
                 target.homography(seen),
                 (target.width, target.height),
                 flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
-                **border,
+                borderMode=cv2.BORDER_CONSTANT,
+                borderValue=grey,
             )
         else:
             coarse, fine = _fixed_maps(seen, target)
-            found = cv2.remap(image, coarse, fine, cv2.INTER_LINEAR, **border)
+            found = cv2.remap(
+                image,
+                coarse,
+                fine,
+                cv2.INTER_LINEAR,
+                borderMode=cv2.BORDER_CONSTANT,
+                borderValue=grey,
+            )
         return found.astype(np.uint8, copy=False)
 
     def check(self, width: int, height: int) -> None:
@@ -167,7 +175,8 @@ def _fixed_maps(
     source: CameraParameters, target: CameraParameters
 ) -> tuple[NDArray[np.int16], NDArray[np.uint16]]:
     """`_maps` as OpenCV's fixed-point maps."""
-    coarse, fine = cv2.convertMaps(*_maps(source, target), cv2.CV_16SC2)
+    u, v = _maps(source, target)
+    coarse, fine = cv2.convertMaps(u, v, cv2.CV_16SC2)
     return coarse.astype(np.int16, copy=False), fine.astype(np.uint16, copy=False)
 
 

@@ -191,7 +191,7 @@ def test_console_geometry_equals_the_projection_of_any_camera(tmp_path: Path) ->
         ("opencv", (-0.5, 0.0, 0.0, 0.0)),  # folds
     ]
     cameras = [
-        CameraParameters(1280, 720, matrix=matrix, distortion=kind, coefficients=k, **mount)  # type: ignore[arg-type]
+        CameraParameters(1280, 720, matrix=matrix, distortion=kind, coefficients=k, **mount)
         for kind, k in lenses
     ]
     places = [(4.0, -2.5), (8.0, 1.5), (30.0, -4.0), (-3.0, 0.0), (2.4, 2.4)]

@@ -35,8 +35,8 @@ def rays(camera: Camera, pose: FloatArray, view: str = "front") -> tuple[FloatAr
     """The eye (3,), and each pixel's ray vector per metre of depth (height, width, 3)."""
     eye = eye_of(camera.parameters, pose, view)
     matrix = camera.intrinsics
-    u = (np.arange(camera.width) + 0.5 - matrix[0, 2]) / matrix[0, 0]
-    v = (np.arange(camera.height) + 0.5 - matrix[1, 2]) / matrix[1, 1]
+    u = (np.arange(camera.width) - matrix[0, 2]) / matrix[0, 0]
+    v = (np.arange(camera.height) - matrix[1, 2]) / matrix[1, 1]
     right, up, ahead = eye.axes
     return eye.place, ahead + u[None, :, None] * right - v[:, None, None] * up
 

@@ -106,7 +106,7 @@ def test_calibration_projects_a_point_of_the_body_to_its_pixel() -> None:
     # 10 m before and 1.2 m below the eye: in the middle column, below the horizon.
     point = np.array([11.0, 0.0, 0.0, 1.0])
     u, v, depth = calibration["intrinsics"] @ (calibration["front"] @ point)[:3]
-    assert (u / depth, v / depth, depth) == pytest.approx((32.0, 24.0 + focal * 0.12, 10.0))
+    assert (u / depth, v / depth, depth) == pytest.approx((31.5, 23.5 + focal * 0.12, 10.0))
     assert (calibration["rear:depth"] @ point)[2] == pytest.approx(-10.0)
 
 
