@@ -123,7 +123,8 @@ def _cluster(slope: FloatArray, std: FloatArray, size: FloatArray) -> FloatArray
 
 def _refine(lines: Lines, x0: float, y0: float, slopes: FloatArray) -> RoadFit | None:
     """Gauss-Newton over (x0, y0, b, slopes); segments join the marking that they lie on."""
-    state, covariance = np.array([x0, y0, 0.0, *slopes]), np.zeros((0, 0))
+    state: FloatArray = np.array([x0, y0, 0.0, *slopes])
+    covariance: FloatArray = np.zeros((0, 0))
     for step in range(ROUNDS):
         on, marking, held = _members(lines, state, 2.0 if step == 0 else 1.0)
         if held.sum() < 2:
