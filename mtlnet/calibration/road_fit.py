@@ -29,7 +29,7 @@ MAX_FIT_STD = 0.02
 ROUNDS = 5
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Lines:
     """Segments (N,) in normalised level coordinates; `size` is the height of each."""
 
@@ -123,47 +123,69 @@ def _cluster(slope: FloatArray, std: FloatArray, size: FloatArray) -> FloatArray
 
 def _refine(lines: Lines, x0: float, y0: float, slopes: FloatArray) -> RoadFit | None:
     """Gauss-Newton over (x0, y0, b, slopes); segments join the marking that they lie on."""
-    bend, covariance = 0.0, np.zeros((0, 0))
+    state: FloatArray = np.array([x0, y0, 0.0, *slopes])
+    covariance: FloatArray = np.zeros((0, 0))
     for step in range(ROUNDS):
-        below = np.maximum(lines.y - y0, 0.5 * MIN_BELOW)
-        along = x0 + slopes * below[:, None] + bend / below[:, None]
-        off = lines.x[:, None] - along
-        marking = np.argmin(np.abs(off), axis=1)
-        off = off[np.arange(len(marking)), marking]
-        turn = lines.slope - (slopes[marking] - bend / below**2)
-        wide = 2.0 if step == 0 else 1.0
-        slope_std = np.hypot(lines.slope_std, 0.02 + 0.004 / below)
-        on = (np.abs(off) < wide * (0.006 + 0.06 * below)) & (np.abs(turn) < 4.0 * wide * slope_std)
-        held = np.bincount(marking[on], lines.size[on], minlength=len(slopes)) > MIN_LINE_WEIGHT
+        on, marking, held = _members(lines, state, 2.0 if step == 0 else 1.0)
         if held.sum() < 2:
             return None
-        on &= held[marking]
-        marking = (np.cumsum(held) - 1)[marking]
-        slopes = slopes[held]
-        s, j, a = below[on], marking[on], slopes[marking[on]]
-        place = np.zeros((len(s), 3 + len(slopes)))
-        place[:, 0], place[:, 1], place[:, 2] = 1.0, -a + bend / s**2, 1.0 / s
-        place[np.arange(len(s)), 3 + j] = s
-        tilt = np.zeros_like(place)
-        tilt[:, 1], tilt[:, 2] = -2.0 * bend / s**3, -1.0 / s**2
-        tilt[np.arange(len(s)), 3 + j] = 1.0
-        std = np.concatenate([0.002 + 0.01 * s, slope_std[on]])
-        error = np.concatenate([off[on], turn[on]]) / std
-        design = np.concatenate([place, tilt]) / std[:, None]
-        huber = np.sqrt(1.0 / np.maximum(1.0, np.abs(error) / 1.5))
-        design, error = design * huber[:, None], error * huber
-        normal = design.T @ design
-        normal[2, 2] += BEND_STD**-2
-        right = design.T @ error
-        right[2] -= bend * BEND_STD**-2
+        state = np.concatenate([state[:3], state[3:][held]])
+        design, error = _equations(lines.chosen(on), marking[on], state)
+        design[-1, 2], error[-1] = 1.0 / BEND_STD, -state[2] / BEND_STD
         try:
-            covariance = np.linalg.inv(normal)
+            covariance = np.linalg.inv(design.T @ design)
         except np.linalg.LinAlgError:
             return None
-        change = covariance @ right
-        x0, y0, bend = x0 + change[0], y0 + change[1], bend + change[2]
-        slopes = slopes + change[3:]
+        state = state + covariance @ design.T @ error
     x0_std, y0_std = np.sqrt(np.diag(covariance)[:2])
     if not (x0_std < MAX_FIT_STD and y0_std < MAX_FIT_STD):
         return None
-    return RoadFit(x0, y0, bend, x0_std, y0_std, tuple(np.sort(slopes).tolist()))
+    x0, y0, bend = map(float, state[:3])
+    return RoadFit(x0, y0, bend, float(x0_std), float(y0_std), tuple(np.sort(state[3:]).tolist()))
+
+
+def _below(lines: Lines, y0: float) -> FloatArray:
+    return np.asarray(np.maximum(lines.y - y0, 0.5 * MIN_BELOW), np.float64)
+
+
+def _slope_std(lines: Lines, below: FloatArray) -> FloatArray:
+    """Of a segment against its marking: of the segment, and of a road that is not quite flat."""
+    return np.asarray(np.hypot(lines.slope_std, 0.02 + 0.004 / below), np.float64)
+
+
+def _members(
+    lines: Lines, state: FloatArray, wide: float
+) -> tuple[NDArray[np.bool_], NDArray[np.int64], NDArray[np.bool_]]:
+    """Which segments lie on a marking, on which of those that are held, and which are held."""
+    x0, y0, bend = state[:3]
+    slopes, below = state[3:], _below(lines, y0)
+    away = lines.x[:, None] - (x0 + slopes * below[:, None] + bend / below[:, None])
+    marking = np.argmin(np.abs(away), axis=1)
+    off = np.abs(away).min(axis=1)
+    turn = np.abs(lines.slope - slopes[marking] + bend / below**2)
+    on = (off < wide * (0.006 + 0.06 * below)) & (turn < 4.0 * wide * _slope_std(lines, below))
+    size = np.bincount(marking[on], lines.size[on], minlength=len(slopes))
+    held = size > MIN_LINE_WEIGHT
+    return on & held[marking], (np.cumsum(held) - 1)[marking], held
+
+
+def _equations(
+    lines: Lines, marking: NDArray[np.int64], state: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Design (2 N + 1, P) and errors of the places and slopes of segments, by their standard
+    deviations and Huber's weights; the last row is free."""
+    x0, y0, bend = state[:3]
+    s, a, n = _below(lines, y0), state[3:][marking], len(lines.x)
+    own = 3 + marking
+    design, std = np.zeros((2 * n + 1, len(state))), np.ones(2 * n + 1)
+    place, slope = design[:n], design[n:-1]
+    place[:, 0], place[:, 1], place[:, 2] = 1.0, -a + bend / s**2, 1.0 / s
+    place[np.arange(n), own] = s
+    slope[:, 1], slope[:, 2] = -2.0 * bend / s**3, -1.0 / s**2
+    slope[np.arange(n), own] = 1.0
+    std[:n], std[n:-1] = 0.002 + 0.01 * s, _slope_std(lines, s)
+    off = lines.x - (x0 + a * s + bend / s)
+    turn = lines.slope - (a - bend / s**2)
+    error = np.concatenate([off, turn, [0.0]]) / std
+    weight = np.sqrt(1.0 / np.maximum(1.0, np.abs(error) / 1.5)) / std
+    return design * weight[:, None], error * weight * std

@@ -60,9 +60,9 @@ def _files(inputs: Sequence[str]) -> list[Path]:
     for source in sources:
         if source.problem:
             raise UserError(source.problem)
-        if source.kind is Kind.ROUND:
+        if source.kind not in (Kind.IMAGE, Kind.FILM):
             raise UserError(
-                f"{source.path} is a recorded round, which states its camera; give a film"
+                f"{source.name} is a {source.kind.value}; give a film of a drive, or pictures"
             )
     return [source.path for source in sources]
 

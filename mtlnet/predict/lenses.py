@@ -37,7 +37,7 @@ def with_lens(
     source: Source, model: CameraParameters, given: Lens, note: Note, *, calibrate: bool = False
 ) -> Source:
     """The source with its lens: the one given, else that of the camera that a recording states,
-    else with `calibrate` the one that the drive shows.
+    else with `calibrate` the one that a film or a stream shows.
 
     Of a field of view that is given `calibrate` finds the mount. `note`: takes a line on what was
     found.
@@ -50,7 +50,7 @@ def with_lens(
             return stated
     if calibrate and source.kind is Kind.FILM:
         return replace(source, lens=_of_film(source, model, given, note))
-    if calibrate and source.kind in (Kind.STREAM, Kind.RECORDING):
+    if calibrate and source.kind is Kind.STREAM:
         return replace(source, lens=DriveLens(source.name, model, given, note))
     return replace(source, lens=given)
 

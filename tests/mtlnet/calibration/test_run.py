@@ -1,6 +1,7 @@
 """`mtlnet calibrate` and the cameras that `mtlnet predict` finds by itself."""
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from mtlnet.predict.sources import Source
 from runtime.camera_file import read_camera
 from runtime.film import Film
 from tests.mtlnet.calibration.drawn import board_pictures, chessboard, road_picture
+from tests.mtlnet.conftest import write_dataset
 from tests.typed import error_line, typed
 from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
@@ -87,7 +89,10 @@ def test_what_cannot_be_calibrated_is_one_line(film: Path, tmp_path: Path) -> No
     picture, cut = tmp_path / "one.png", tmp_path / "cut.mp4"
     cv2.imwrite(str(picture), road_picture(CAMERA, MARKINGS_M))
     cut.write_bytes(film.read_bytes()[: film.stat().st_size // 2])
-    out = tmp_path / "camera.yaml"
+    out, round_file = tmp_path / "camera.yaml", tmp_path / "r.mcap"
+    data = tmp_path / "data"
+    data.mkdir()
+    round_file.write_bytes((write_dataset(data) / "rounds" / "r000.mcap").read_bytes())
     cases: list[tuple[list[object], str]] = [
         ([_no_markings(tmp_path / "none.mp4")], "none.mp4: "),
         ([picture], "no chessboard in 1 pictures"),
@@ -97,6 +102,7 @@ def test_what_cannot_be_calibrated_is_one_line(film: Path, tmp_path: Path) -> No
         ([tmp_path / "nothing.mp4"], "there is no image file"),
         ([film, "--lane-width", 36], "--lane-width 36 m; give 2 to 6 m"),
         ([film, "--fov", 0], "--fov-y-deg: "),
+        ([round_file], "r.mcap is a round; give a film"),
     ]
     for given, seen in cases:
         done = typed("mtlnet", "calibrate", *given, "--out", out)
@@ -132,6 +138,20 @@ def test_predict_finds_the_camera_of_a_film(film: Path, tmp_path: Path) -> None:
     assert "no camera found (" in lines[1]
     assert "the model's own is assumed" in lines[1]
     assert len(lines) == 2
+
+
+def test_the_command_finds_it_unless_the_camera_is_the_models(film: Path) -> None:
+    found = typed("mtlnet", "predict", film, "--fov-y-deg", 60, "--json")
+    own = typed("mtlnet", "predict", film, "--camera", "model", "--json")
+    assert (found.returncode, own.returncode) == (0, 0)
+    assert re.search(r"drive\.mp4: camera found: pitch (1\.9|2\.0)", found.stderr)
+    assert "camera found" not in own.stderr
+    # The car points along the road, and its camera 1.5 degrees to the left of it.
+    angles = [
+        np.mean([row["angle_rad"] for row in json.loads(done.stdout)]) for done in (found, own)
+    ]
+    assert abs(angles[0]) < 0.012
+    assert angles[1] - angles[0] == pytest.approx(-np.radians(1.5), abs=0.012)
 
 
 def test_a_film_of_the_models_size_is_not_calibrated(tmp_path: Path) -> None:
