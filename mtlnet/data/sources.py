@@ -95,9 +95,9 @@ def open_training_dataset(path: Path) -> Dataset:
         )
     if not camera.is_plain:
         raise UserError(
-            f"the images of {path} are of a camera ({camera}) with distortion, roll, yaw or a matrix "
-            "of its own, which a network is not trained on; collect without --camera, or with one "
-            "of fov_y_deg alone: pictures of any lens are warped into the model's camera"
+            f"the images of {path} are of a camera ({camera}) with distortion, roll, yaw or a "
+            "matrix of its own, which a network is not trained on; collect without --camera, or "
+            "with a fov_y_deg alone: pictures of any lens are warped into the model's camera"
         )
     dataset.select("train")  # raises where there are none
     return dataset

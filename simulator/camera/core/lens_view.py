@@ -49,7 +49,8 @@ class LensView:
 
     def colours(self, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """The lens's picture (H, W, 3) from the drawn one."""
-        found = cv2.remap(picture, *self.colour_places, cv2.INTER_LINEAR)
+        u, v = self.colour_places
+        found = cv2.remap(picture, u, v, cv2.INTER_LINEAR)
         height, width = self.label_places.shape[1:]
         return np.asarray(
             cv2.resize(found, (width, height), interpolation=cv2.INTER_AREA), np.uint8
@@ -57,9 +58,11 @@ class LensView:
 
     def labels(self, labels: NDArray[np.float32]) -> NDArray[np.float32]:
         """Depth and class (H, W, 2) from the drawn ones; infinite and sky where nothing is seen."""
+        u, v = self.label_places
         found = cv2.remap(
             labels,
-            *self.label_places,
+            u,
+            v,
             cv2.INTER_NEAREST,
             borderMode=cv2.BORDER_CONSTANT,
             borderValue=(float("inf"), float(CLASSES.index("sky"))),
