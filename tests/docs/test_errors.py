@@ -24,13 +24,10 @@ from mtlnet.data.custom_images import COLUMNS, open_custom_images
 from mtlnet.inference.engine import Engine, load_engine
 from mtlnet.inference.image_decoding.decode import inspect, read_image
 from mtlnet.inference.model_card import resolve_run
-<<<<<<< HEAD
+from mtlnet.inference.rectification import Rectification
 from mtlnet.label.folder import LabelFolder
 from mtlnet.label.geometry import fit_markings
 from mtlnet.label.import_table import import_labels
-=======
-from mtlnet.inference.rectification import Rectification
->>>>>>> 7a93438c7fe29d446041232f477d78819deab1b6
 from mtlnet.predict.films import Film, read_film_header
 from mtlnet.predict.run import predict_files
 from mtlnet.training.loss import parse_alpha
