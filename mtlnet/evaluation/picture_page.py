@@ -127,9 +127,10 @@ def cases(answers: Answers) -> list[Case]:
     """
     images = answers.images
     sizes = np.abs(answers.errors)
-    with np.errstate(invalid="ignore"):
-        ratio = sizes / np.maximum(np.nanmean(sizes, axis=0, keepdims=True), 1e-9)
-    badness = np.nan_to_num(ratio).max(1)
+    known = np.isfinite(sizes)
+    sizes = np.where(known, sizes, 0.0)
+    means = sizes.sum(0) / np.maximum(known.sum(0), 1)
+    badness = (sizes / np.maximum(means, 1e-9)).max(1)
     foreign = answers.foreign
     found = [
         Case(picture, copy, None, f"refused: {reason}") for picture, copy, reason in images.refused

@@ -105,8 +105,8 @@ def picture_report(answers: Answers, mean: dict[str, Any]) -> dict[str, Any]:
         report["uncertainty"]["coverage"] = _coverage(answers, slice(None))
     everything = part_report(answers, lambda picture, copy: True)
     groups = {name: dict(_groups(answers, name)) for name in GROUPS}
-    if NOT_TRAINED in groups["by_training"] and len(groups["by_training"]) == 1:
-        del groups["by_training"]
+    # A grouping of which nothing is told has no place in the report.
+    groups = {k: v for k, v in groups.items() if [*v] not in ([UNNAMED], [NOT_TRAINED])}
     label_std = answers.label_std
     about = {
         "files": len({p.file for p in _pictures(answers)}),

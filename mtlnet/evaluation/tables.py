@@ -71,16 +71,20 @@ def picture_table(result: dict[str, Any]) -> Table:
     table = Table(title=title, box=None, padding=(0, 0, 0, 1))
     for column in ("", "pictures", "left (m)", "right", "width", "centre", "heading (rad)"):
         table.add_column(column, justify="left" if not column else "right", no_wrap=True)
-    parts = {"all": figures}
+    _add_picture_row(table, "all", figures["cases"], figures["mean"])
+    _add_picture_row(table, "always the labels' median", "", figures["always_median"])
     for grouping in ("by_training", "by_drive", "by_light", "by_copy"):
-        parts.update(figures.get(grouping, {}))
-    for name, part in parts.items():
-        cells = [format_number(v, 4 if k == "angle" else 3) for k, v in part["mean"].items()]
-        table.add_row(escape(printable(name)), str(part["cases"]), *cells)
-    median = figures["always_median"]
-    cells = [format_number(v, 4 if k == "angle" else 3) for k, v in median.items()]
-    table.add_row("always the labels' median", "", *cells)
+        table.add_section()
+        for name, part in figures.get(grouping, {}).items():
+            _add_picture_row(table, printable(name), part["cases"], part["mean"])
     return table
+
+
+def _add_picture_row(
+    table: Table, name: str, count: int | str, means: dict[str, float | None]
+) -> None:
+    cells = [format_number(v, 4 if k == "angle" else 3) for k, v in means.items()]
+    table.add_row(escape(name), str(count), *cells)
 
 
 def uncertainty_table(result: dict[str, Any]) -> Table:

@@ -193,7 +193,9 @@ def create_app(labeller: Labeller, names: HostNames, token: str | None) -> Asgi:
 
     @app.exception_handler(UserError)
     async def refuse(_request: Any, error: UserError) -> Response:
-        return JSONResponse({"detail": str(error)}, 422, HEADERS)
+        # The page knows its files without the folder's place on this machine.
+        told = str(error).replace(f"{labeller.folder.folder}/", "")
+        return JSONResponse({"detail": told}, 422, HEADERS)
 
     @app.exception_handler(RequestValidationError)
     async def refuse_form(_request: Any, error: RequestValidationError) -> Response:

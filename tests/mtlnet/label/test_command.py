@@ -1,5 +1,6 @@
 """`mtlnet label` as it is typed, and the model's answer with which a picture begins."""
 
+import json
 import re
 import signal
 import subprocess
@@ -14,10 +15,13 @@ import pytest
 from numpy.typing import NDArray
 
 import trackfeatures as tf
+from mtlnet.data.labels_file import read_labels
 from mtlnet.label.folder import LabelFolder
 from mtlnet.label.server import Labeller
 from tests.mtlnet.label.conftest import Site
+from tests.mtlnet.label.test_import import HEAD, table
 from tests.mtlnet.test_cli import refused
+from tests.typed import typed
 from trackfeatures.camera import CameraParameters
 
 
@@ -76,6 +80,18 @@ def test_mistakes_are_one_line(pictures: Path, tmp_path: Path) -> None:
     assert "--host 0.0.0.0 can be reached from other machines: set a token" in seen
     assert "--label-std belongs to --import" in refused("label", pictures, "--label-std", "1,1")
     assert "there is no folder" in refused("label", tmp_path / "none", "--no-model")
+
+
+def test_a_table_is_imported_by_the_command(tmp_path: Path) -> None:
+    rows = ("a.png,1.7,-1.9,0.03,40,1.22", "b.png,1.6,-2.0,0.02,40,1.22")
+    path = table(tmp_path / "theirs", *rows, head=HEAD)
+    done = typed(
+        *("mtlnet", "label", tmp_path / "mine", "--import", path, "--json"),
+        *("--label-std", "0.06,0.006", "--label-std", "b*=0.1,0.01"),
+    )
+    assert json.loads(done.stdout)["pictures"] == 2
+    pictures, _ = read_labels(tmp_path / "mine" / "labels.csv")
+    assert [(p.std_m, p.std_rad) for p in pictures] == [(0.06, 0.006), (0.1, 0.01)]
 
 
 def test_the_label_of_a_picture_survives_another_size(pictures: Path) -> None:

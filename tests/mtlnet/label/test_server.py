@@ -75,6 +75,9 @@ def test_what_is_no_marking_is_one_line(site: Site) -> None:
     assert site.ask("PUT", "/api/pictures/0/label", {**LABEL, "file": "/etc/passwd"})[0] == 422
     assert site.ask("PUT", "/api/pictures/0/label", b'{"ml": NaN}')[0] == 422
     assert site.ask("GET", "/api/pictures/3")[0] == 422
+    (site.folder / "1.png").write_bytes(b"\x89PNG\r\n\x1a\n")
+    status, told, _ = site.ask("GET", "/api/pictures/0")
+    assert (status, told["detail"][:6]) == (422, "1.png:")
     assert site.ask("GET", "/api/pictures/-1/image")[0] == 422
 
 

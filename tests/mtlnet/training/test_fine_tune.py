@@ -105,7 +105,7 @@ def test_a_model_is_trained_on_with_batch_normalisation(
 
 
 def test_images_of_another_camera_are_evaluated_and_trained_on(
-    published: Path, custom_images: Path, tmp_path: Path
+    published: Path, custom_images: Path, dataset: Path, tmp_path: Path
 ) -> None:
     engine = load_engine(published, precision="f32")
     plain = evaluate([engine], custom_images, "all")
@@ -121,6 +121,15 @@ def test_images_of_another_camera_are_evaluated_and_trained_on(
     higher = evaluate([engine], custom_images, "all", every=2)
     assert higher["frames"] == 3
     assert higher["mae_m"]["ml"] != plain["mae_m"]["ml"]
+    copies = evaluate(
+        [engine], custom_images, "all", copies="mirrored,turned", page=tmp_path / "page.html"
+    )
+    assert copies["frames"] == copies["pictures"]["cases"] == 24
+    assert (tmp_path / "page.html").read_text().count("<figure>") == 24
+    with pytest.raises(UserError, match="--worst shows recorded rounds; --report shows all"):
+        evaluate([engine], custom_images, "all", worst=tmp_path / "worst.jpg")
+    with pytest.raises(UserError, match=r"--copies is for pictures with a labels\.csv"):
+        evaluate([engine], dataset, "all", copies="mirrored")
     card = read_card(published)
     frames = custom_training_data(custom_images, card).frames
     assert frames.labels.distances[0, 0] == pytest.approx(-1.0 * 1.2 / 1.5, abs=1e-3)
@@ -178,6 +187,11 @@ def test_wrong_options_are_refused(
     )
     with pytest.raises(UserError, match="torchvision's networks cannot be put back"):
         open_training_data(pooled, replace(card, network="regnet_y_400mf"))
+    drives = TrainConfig(
+        dataset, tmp_path / "f", recipe="tune", init="x", network=card.network, hold_out_drives="a"
+    )
+    with pytest.raises(UserError, match=r"--hold-out-drives is for pictures with a labels\.csv"):
+        open_training_data(drives, card)
     other = replace(card, camera=replace(card.camera, z=1.4))
     tuned = TrainConfig(dataset, tmp_path / "e", recipe="tune", init="x", network=card.network)
     with pytest.raises(UserError, match=r"z 0\.95 instead of 1\.4"):
