@@ -19,6 +19,7 @@ from mtlnet.data.augment.geometric import (
     rotation_homography,
     rotations,
     shift_lateral,
+    shift_limits_m,
 )
 from mtlnet.data.augment.photometric import (
     BRIGHTNESS,
@@ -312,3 +313,36 @@ def test_a_part_of_a_batch_is_changed_like_the_whole() -> None:
     apply_params(images, params, SMALL)
     apply_params(part, params.take(slice(2, 4)), SMALL)
     np.testing.assert_array_equal(part, images[2:4])
+
+
+def test_unknown_markings_stay_unknown_and_stop_no_shift_within_the_lane() -> None:
+    inf, nan = np.inf, np.nan
+    distances = np.array(
+        [
+            [-1.7, 1.9, inf, inf, inf],  # in the lane: to half a metre from either marking
+            [nan, nan, inf, inf, inf],  # nothing known: the lane could come into reach
+            [nan, nan, inf, -0.3, 3.3],  # on the left marking of the lane
+        ],
+        np.float32,
+    )
+    limits = shift_limits_m(distances)
+    np.testing.assert_allclose(limits[0], [-0.6, 0.6])  # the largest shift at all
+    np.testing.assert_allclose(limits[1:], 0.0)
+    near = shift_limits_m(np.array([[-0.8, 2.8, inf, inf, inf]], np.float32))
+    np.testing.assert_allclose(near, [[-0.6, 0.3]], atol=1e-6)
+    angle, heading = np.zeros(3, np.float32), np.array([-1, -1, 0])
+    params = draw_params(3, 210, 280, np.random.default_rng(0))
+    params = replace(
+        params,
+        shift=np.array([0.2, 0.0, 0.0]),
+        rotation=np.zeros(3, np.int64),
+        mirrored=np.array([False, True, True]),
+    )
+    coded, classes = augment_labels(distances, angle, heading, params, CameraParameters())
+    assert np.isnan(coded).tolist() == [
+        [False, False, True, True, True, False],
+        [False, False, True, True, True, False],
+        [False, False, False, False, True, False],
+    ]
+    assert classes.tolist() == [-1, -1, 2]
+    np.testing.assert_allclose(tf.decode_values(coded)[0, :2], [-1.5, 2.1], atol=1e-5)
