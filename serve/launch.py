@@ -11,7 +11,6 @@ from pathlib import Path
 
 from mtlnet.inference.model_card import read_card, resolve_run
 from runtime.sockets import address, bind_all, shown_addresses
-from serve.cameras import read_cameras
 from serve.config import ServiceConfig, check_exposure
 from serve.observability import logs, telemetry
 from serve.workers.control_socket import listen_for_commands, socket_path
@@ -25,7 +24,7 @@ def run(config: ServiceConfig) -> None:
     check_exposure(config.host, config.limits.token, config.insecure)
     # Fail on a missing exporter or model before any process is started.
     telemetry.exporter_name()
-    cameras = read_cameras(config.cameras, read_card(resolve_run(config.model)).camera)
+    cameras = _cameras(config.cameras, resolve_run(config.model))
     listeners = bind_all(config.host, config.port)
     asyncio.run(_serve(config, listeners, cameras))
 
@@ -59,6 +58,15 @@ async def _serve(
     if command_server is not None:
         command_server.close()
         socket_path(port).unlink(missing_ok=True)
+
+
+def _cameras(options: tuple[str, ...], run: Path) -> dict[str, CameraParameters]:
+    """The cameras of `--camera`, checked against the model in folder `run`."""
+    if not options:
+        return {}
+    from serve.cameras import read_cameras  # loads OpenCV, for which every worker would wait
+
+    return read_cameras(options, read_card(run).camera)
 
 
 def _model_label(model: str, folder: Path) -> str:

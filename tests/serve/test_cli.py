@@ -193,6 +193,13 @@ def test_help_loads_nothing_heavy() -> None:
     assert done.stdout.splitlines()[-1] == "set()"
 
 
+def test_a_faulty_camera_ends_the_command(tmp_path: Path) -> None:
+    assert "give NAME=FILE" in refused("--camera", "roof", "--port", "0")
+    path = tmp_path / "roof.yaml"
+    path.write_text("K: [1, 0, 0, 0, 0, 0, 0, 0, 1]\nD: []\n")
+    assert "K is singular" in refused("--camera", f"roof={path}", "--port", "0")
+
+
 def test_the_supervisor_loads_neither_framework_nor_engine() -> None:
     """It answers no request, and every worker waits for its start."""
     code = "import sys, serve.launch; print({'fastapi', 'cv2', 'openvino'} & set(sys.modules))"
