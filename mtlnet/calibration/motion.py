@@ -25,6 +25,7 @@ BONNET = 0.12
 """Share of rows at the bottom that are not looked at."""
 ROUNDS = 8
 MIN_MOTION_PX = 0.5
+MAX_CONDITION = 1e12
 
 
 @dataclass(frozen=True)
@@ -87,6 +88,8 @@ def find_motion(tracks: FloatArray, towards: FloatArray, noise: float) -> Motion
         system = design.T @ (weight[:, None] * design) + held
         pull = held[3:, 3:] @ (heading[:2] - towards)
         right = -design.T @ (weight * error) - np.concatenate([np.zeros(3), pull])
+        if not np.linalg.cond(system) < MAX_CONDITION:  # as of points all in one place
+            return None
         change = np.linalg.solve(system, right)
         rotation += change[:3]
         heading[:2] += change[3:]

@@ -133,7 +133,7 @@ def _refine(lines: Lines, x0: float, y0: float, slopes: FloatArray) -> RoadFit |
         design, error = _equations(lines.chosen(on), marking[on], state)
         design[-1, 2], error[-1] = 1.0 / BEND_STD, -state[2] / BEND_STD
         try:
-            covariance = np.linalg.inv(design.T @ design)
+            covariance = np.asarray(np.linalg.inv(design.T @ design), np.float64)
         except np.linalg.LinAlgError:
             return None
         state = state + covariance @ design.T @ error

@@ -24,6 +24,11 @@ def test_motion_of_a_known_scene() -> None:
     assert motion.towards_std < 0.01
 
 
+def test_points_in_one_place_show_no_motion() -> None:
+    tracks = np.tile([0.1, 0.2, 0.11, 0.21], (50, 1))
+    assert find_motion(tracks, np.array([0.0, 0.0]), 2e-4) is None
+
+
 def test_points_are_followed() -> None:
     noise = np.random.default_rng(0).integers(0, 255, (240, 320), np.uint8)
     before = cv2.GaussianBlur(noise, (0, 0), 2.0).astype(np.uint8)

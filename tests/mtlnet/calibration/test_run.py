@@ -140,6 +140,7 @@ def test_predict_finds_the_camera_of_a_film(film: Path, tmp_path: Path) -> None:
     assert len(lines) == 2
 
 
+@pytest.mark.slow
 def test_the_command_finds_it_unless_the_camera_is_the_models(film: Path) -> None:
     found = typed("mtlnet", "predict", film, "--fov-y-deg", 60, "--json")
     own = typed("mtlnet", "predict", film, "--camera", "model", "--json")
