@@ -49,7 +49,7 @@ MAX_SKEW = 1e-3  # of the focal length
 Note = Callable[[str], None]
 
 
-class _Loader(yaml.SafeLoader):
+class _Loader(yaml.SafeLoader):  # type: ignore[misc]  # yaml has no types
     """YAML with OpenCV's matrices, as mappings."""
 
 
@@ -242,10 +242,11 @@ def _numbers(name: str, value: Any) -> list[float]:
         if data is None:
             raise CameraError(f"{name} has no data; give its numbers")
         found = _numbers(name, data)
-        shape = [value.get("rows"), value.get("cols")]
-        if all(isinstance(side, int) for side in shape) and shape[0] * shape[1] != len(found):
-            raise CameraError(f"{name} has {len(found)} numbers; its rows and cols make "
-                              f"{shape[0] * shape[1]}")  # fmt: skip
+        rows, columns = value.get("rows"), value.get("cols")
+        if isinstance(rows, int) and isinstance(columns, int) and rows * columns != len(found):
+            raise CameraError(
+                f"{name} has {len(found)} numbers; its rows and cols make {rows * columns}"
+            )
         return found
     if not isinstance(value, list):
         raise CameraError(f"{name} is {value!r}; give a list of numbers")

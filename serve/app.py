@@ -37,6 +37,7 @@ from serve.api.problem_handlers import install_problem_handlers
 from serve.api.problems import Problem
 from serve.api.request_options import Headers, check_token, request_id_of
 from serve.api.stream import Stream
+from serve.cameras import Cameras
 from serve.config import Limits
 from serve.observability.logs import RefusalLog
 from serve.observability.metrics import MEDIA_TYPE, Metrics
@@ -54,6 +55,7 @@ if TYPE_CHECKING:
 App = Callable[[Scope, Receive, Send], Awaitable[None]]
 
 PROBES = {"/healthz", "/readyz", *kserve.PROBES}  # load balancers need no token for these
+NO_CAMERAS: Cameras = {}
 DESCRIPTION = "One driver-view image in, track features out. Angles in rad, distances in m."
 
 
@@ -68,12 +70,13 @@ class Service:
         shared: SharedMemory | None = None,
         block: int = 0,
         tracer: "Tracer | None" = None,
+        cameras: Cameras = NO_CAMERAS,
     ) -> None:
         """`check` warms up an engine and raises when its outputs are wrong.
 
         It runs when the application starts (its lifespan); until it has returned, /readyz and
         /features answer 503. `shared` None: this is the only worker; else `block` is its block.
-        `tracer` None: no traces.
+        `tracer` None: no traces. `cameras`: what requests may name.
         """
         self.limits = limits or Limits()
         self.shared = shared or create_shared_memory(1)
@@ -85,7 +88,7 @@ class Service:
         self.metrics = Metrics(self.shared, block)
         self.bodies = BodyBudget(self.shared, block, self.limits.body_mib << 20)
         refusals, log_answers = RefusalLog(workers), self.limits.log_answers
-        parts = (self.frame_queue, self.metrics, self.bodies, refusals, log_answers)
+        parts = (self.frame_queue, self.metrics, self.bodies, refusals, log_answers, cameras)
         self.frames = FrameHandler(*parts)
         self._make_request: RequestFactory = FeaturesRequest
         if tracer is not None:
@@ -212,14 +215,16 @@ def _framework(service: Service) -> FastAPI:
     schemas.install_openapi(app, PROBES, token_required=service.limits.token is not None)
     # Reached with other methods than POST only; answers 405 with the allowed method.
     app.router.routes.append(Route("/features", service.features, methods=["POST"]))
-    _add_status(app, service.frame_queue)
+    _add_status(app, service.frames)
     _add_metrics(app, service)
     kserve.add_kserve(app, service.frames)
     add_console(app)
     return app
 
 
-def _add_status(app: FastAPI, frame_queue: FrameQueue) -> None:
+def _add_status(app: FastAPI, frames: FrameHandler) -> None:
+    frame_queue = frames.queue
+
     @app.get("/healthz", summary="Is the process alive?", response_model=schemas.Status)
     async def healthz() -> Response:
         return JSONResponse({"status": "alive"})
@@ -238,7 +243,9 @@ def _add_status(app: FastAPI, frame_queue: FrameQueue) -> None:
     @app.get("/model", summary="The model card: training, data and camera")
     async def model() -> dict[str, Any]:
         loaded = frame_queue.loaded
-        return {**loaded.provenance, **asdict(loaded.engine.card, dict_factory=stored)}
+        card = asdict(loaded.engine.card, dict_factory=stored)
+        known = {name: camera.as_dict() for name, camera in frames.cameras.items()}
+        return {**loaded.provenance, **card, "cameras": known}
 
 
 def _add_metrics(app: FastAPI, service: Service) -> None:

@@ -70,6 +70,15 @@ BodyMib = Annotated[
     int,
     typer.Option(help="Memory for the bodies of all requests in flight, MiB.", min=4, max=1 << 20),
 ]
+CameraFiles = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--camera",
+        metavar="NAME=FILE",
+        help="Camera that requests may name (X-Camera: NAME), described by a camera.yaml; may be "
+        "given several times.",
+    ),
+]
 LogAnswers = Annotated[
     bool, typer.Option("--log-answers", help="Log answered requests as well as refused ones.")
 ]
@@ -90,6 +99,7 @@ def serve(
     allow_host: AllowHost = None,
     trusted_proxy: TrustedProxy = None,
     body_mib: BodyMib = Limits.body_mib,
+    camera: CameraFiles = None,
 ) -> None:
     """Answer driver-view images over HTTP with track features.
 
@@ -113,7 +123,7 @@ def serve(
         trusted_proxies=check_proxies(trusted_proxy or ()),
         body_mib=body_mib,
     )
-    run(ServiceConfig(model, host, port, workers, insecure, limits))
+    run(ServiceConfig(model, host, port, workers, insecure, limits, tuple(camera or ())))
 
 
 def _check_no_options(context: typer.Context) -> None:

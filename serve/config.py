@@ -58,6 +58,8 @@ class ServiceConfig:
     insecure: bool = False
     """Listen on addresses that other machines can reach, without a token."""
     limits: Limits = field(default_factory=Limits)
+    cameras: tuple[str, ...] = ()
+    """NAME=FILE of each camera that requests may name."""
 
 
 def read_token(path: Path | None) -> str | None:

@@ -9,12 +9,14 @@ import socket
 import sys
 from pathlib import Path
 
-from mtlnet.inference.model_card import resolve_run
+from mtlnet.inference.model_card import read_card, resolve_run
 from runtime.sockets import address, bind_all, shown_addresses
+from serve.cameras import read_cameras
 from serve.config import ServiceConfig, check_exposure
 from serve.observability import logs, telemetry
 from serve.workers.control_socket import listen_for_commands, socket_path
 from serve.workers.supervisor import ServicePlan, Supervisor
+from trackfeatures.camera import CameraParameters
 
 
 def run(config: ServiceConfig) -> None:
@@ -23,13 +25,15 @@ def run(config: ServiceConfig) -> None:
     check_exposure(config.host, config.limits.token, config.insecure)
     # Fail on a missing exporter or model before any process is started.
     telemetry.exporter_name()
-    resolve_run(config.model)
+    cameras = read_cameras(config.cameras, read_card(resolve_run(config.model)).camera)
     listeners = bind_all(config.host, config.port)
-    asyncio.run(_serve(config, listeners))
+    asyncio.run(_serve(config, listeners, cameras))
 
 
-async def _serve(config: ServiceConfig, listeners: list[socket.socket]) -> None:
-    plan = ServicePlan(config.model, resolve_run, config.workers, config.limits)
+async def _serve(
+    config: ServiceConfig, listeners: list[socket.socket], cameras: dict[str, CameraParameters]
+) -> None:
+    plan = ServicePlan(config.model, resolve_run, config.workers, config.limits, cameras)
     supervisor = Supervisor(plan, listeners)
     port = listeners[0].getsockname()[1]
     first = await supervisor.start()

@@ -64,15 +64,26 @@ def snapshot(
         typer.Option(help="front, left, right, rear, chase or top; without it, mostly front."),
     ] = None,
     kind: Annotated[str, typer.Option(help="What to show: colour, depth or class.")] = "colour",
+    camera: Annotated[
+        Path | None,
+        typer.Option(
+            help="camera.yaml (ours, OpenCV's, ROS's or Kalibr's): views through that lens."
+        ),
+    ] = None,
     tracks_dir: TracksDir = None,
 ) -> None:
     """Write a contact sheet of views, the true markings drawn over them; or depth or classes."""
+    from runtime.camera_file import read_camera
     from simulator.camera.snapshot import write_contact_sheet
     from simulator.track.catalogue import find_track
     from simulator.varied.road import make_road
+    from trackfeatures.camera import CameraParameters
 
+    seen_by = None if camera is None else read_camera(camera, CameraParameters())
     road = make_road(find_track(track, tracks_dir), lanes, lane_width, roads, seed)
-    write_contact_sheet(road, out, seed=seed, traffic=traffic, light=light, view=view, kind=kind)
+    write_contact_sheet(
+        road, out, seed=seed, traffic=traffic, light=light, view=view, kind=kind, camera=seen_by
+    )
     typer.echo(str(out), err=True)
 
 

@@ -85,6 +85,13 @@ Roads = Annotated[
         "surface, light and camera height are drawn for each round or scene."
     ),
 ]
+CameraFile = Annotated[
+    Path | None,
+    typer.Option(
+        "--camera",
+        help="camera.yaml (ours, OpenCV's, ROS's or Kalibr's): record through that lens and mount.",
+    ),
+]
 ShardOf = Annotated[
     str, typer.Option(help="2/4: only the second of four parts, for batch systems.")
 ]
@@ -111,6 +118,7 @@ def collect(
     split_test_share: TestShare = CollectConfig.test_share,
     split: SplitName = CollectConfig.split,
     codec: Codec = CollectConfig.codec,
+    camera: CameraFile = None,
     jitter_camera: JitterCamera = CollectConfig.jitter_camera,
     roads: Roads = CollectConfig.roads,
     shard: ShardOf = "",
@@ -124,6 +132,8 @@ def collect(
     from datagen.planning.planner import make_plan
     from datagen.planning.summary import expected_classes
     from datagen.planning.tracks import choose_tracks
+    from runtime.camera_file import read_camera
+    from trackfeatures.camera import CameraParameters
 
     config = CollectConfig(
         rounds=rounds,
@@ -137,6 +147,7 @@ def collect(
         scenes=scenes,
         test_share=split_test_share,
         codec=codec,
+        camera=CameraParameters() if camera is None else read_camera(camera, CameraParameters()),
         jitter_camera=jitter_camera,
         roads=roads,
         split=split,

@@ -99,6 +99,11 @@ class CollectConfig:
             )
         if self.seed < 0:
             raise UserError(f"the seed is {self.seed}; give a whole number from 0 up")
+        if self.jitter_camera and self.camera.matrix is not None:
+            raise UserError(
+                "--jitter-camera varies the field of view, which the camera file's matrix fixes; "
+                "leave one out"
+            )
         if not 0.0 <= self.test_share < 1.0:
             raise UserError(f"the test share is {self.test_share}; give 0 to below 1, e.g. 0.25")
         check_frequency(self.frequency_hz)

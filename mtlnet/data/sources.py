@@ -88,6 +88,12 @@ def open_training_dataset(path: Path) -> Dataset:
             f"the images of {path} are {camera.width} x {camera.height}, the network takes "
             f"{WIDTH} x {HEIGHT}; collect with the default camera size"
         )
+    if not camera.is_plain:
+        raise UserError(
+            f"the images of {path} are of a camera ({camera}) with distortion, roll, yaw or a "
+            "matrix of its own, which a network is not trained on; collect without --camera, or "
+            "with a fov_y_deg alone: pictures of any lens are warped into the model's camera"
+        )
     dataset.select("train")  # raises where there are none
     return dataset
 

@@ -65,6 +65,38 @@ class Rectification:
         """
         height, width = image.shape[:2]
         source, target = self.source, self.target
+        self.check(width, height)
+        ratio = target.focal_px / (source.focal_px * height / source.height)
+        if ratio < 1:  # averaged first: sampling alone would leave out pixels
+            size = (max(round(width * ratio), 1), max(round(height * ratio), 1))
+            image = cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.uint8)
+        seen = source.resized(image.shape[1], image.shape[0])
+        grey = (BORDER_LEVEL,) * 3
+        if seen.distortion == "none":
+            found = cv2.warpPerspective(
+                image,
+                target.homography(seen),
+                (target.width, target.height),
+                flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+                borderMode=cv2.BORDER_CONSTANT,
+                borderValue=grey,
+            )
+        else:
+            coarse, fine = _fixed_maps(seen, target)
+            found = cv2.remap(
+                image,
+                coarse,
+                fine,
+                cv2.INTER_LINEAR,
+                borderMode=cv2.BORDER_CONSTANT,
+                borderValue=grey,
+            )
+        return found.astype(np.uint8, copy=False)
+
+    def check(self, width: int, height: int) -> None:
+        """Raise ImageError unless images of that size, px, are the source's and show enough of the
+        target's view."""
+        source = self.source
         stretch = width * source.height / (height * source.width)
         if abs(stretch - 1) > TOLERANCE:
             raise ImageError(
@@ -72,29 +104,7 @@ class Rectification:
                 f"the image is {width} x {height} px, its camera gives {source.width} x "
                 f"{source.height}: give the camera's whole images, at any size",
             )
-        ratio = target.focal_px / (source.focal_px * height / source.height)
-        if ratio < 1:  # averaged first: sampling alone would leave out pixels
-            size = (max(round(width * ratio), 1), max(round(height * ratio), 1))
-            image = cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.uint8)
-        seen = source.resized(image.shape[1], image.shape[0])
-        self._require_shown(seen)
-        border = {"borderMode": cv2.BORDER_CONSTANT, "borderValue": (BORDER_LEVEL,) * 3}
-        if seen.distortion == "none":
-            found = cv2.warpPerspective(
-                image,
-                target.homography(seen),
-                (target.width, target.height),
-                flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
-                **border,
-            )
-        else:
-            coarse, fine = _fixed_maps(seen, target)
-            found = cv2.remap(image, coarse, fine, cv2.INTER_LINEAR, **border)
-        return found.astype(np.uint8, copy=False)
-
-    def _require_shown(self, seen: CameraParameters) -> None:
-        """Raise ImageError when too little of the target's view is shown."""
-        rows, columns, road = shown_shares(seen, self.target)
+        rows, columns, road = shown_shares(source, self.target)
         for share, least, what in (
             (rows, LEAST_SHOWN, "rows"),
             (columns, LEAST_SHOWN, "columns"),
@@ -165,7 +175,8 @@ def _fixed_maps(
     source: CameraParameters, target: CameraParameters
 ) -> tuple[NDArray[np.int16], NDArray[np.uint16]]:
     """`_maps` as OpenCV's fixed-point maps."""
-    coarse, fine = cv2.convertMaps(*_maps(source, target), cv2.CV_16SC2)
+    u, v = _maps(source, target)
+    coarse, fine = cv2.convertMaps(u, v, cv2.CV_16SC2)
     return coarse.astype(np.int16, copy=False), fine.astype(np.uint16, copy=False)
 
 

@@ -11,8 +11,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-from mtlnet.inference.image_decoding.crop import crop_box
-from mtlnet.inference.image_decoding.decode import LATE_CHECK_BYTES, decode, inspect
+from mtlnet.inference.image_decoding.decode import LATE_CHECK_BYTES, decode_whole, read_header
 from mtlnet.inference.image_decoding.errors import ImageError
 from serve.api.http_io import (
     ClientDisconnectedError,
@@ -25,8 +24,10 @@ from serve.api.http_io import (
     read_body,
     send_reply,
 )
-from serve.api.problems import Problem, as_problem, internal_error
+from serve.api.problems import INVALID_REQUEST, Problem, as_problem, internal_error
 from serve.api.request_options import (
+    CAMERA,
+    FIELD_OF_VIEW,
     Headers,
     RequestOptions,
     check_image_headers,
@@ -34,13 +35,13 @@ from serve.api.request_options import (
     read_options,
     request_id_of,
 )
+from serve.cameras import Cameras, Sight
 from serve.observability.logs import RefusalLog, log_answer
 from serve.observability.metrics import Metrics
 from serve.scheduling.body_budget import BodyBudget, BodyShare
 from serve.scheduling.fair_queue import Frame, FrameResult, PixelReader, ResultCallback
 from serve.scheduling.frame_queue import FrameQueue
 from serve.scheduling.streams import stream_key
-from trackfeatures.camera import CameraParameters
 
 # An image of at most so many pixels, estimated to be decoded in so many ms, may be decoded on the
 # event loop; but not a JPEG file of more bytes: the estimate is one of its pixels.
@@ -59,8 +60,10 @@ class FrameHandler:
         bodies: BodyBudget,
         refusals: RefusalLog,
         log_answers: bool,
+        cameras: Cameras,
     ) -> None:
         self.queue = queue
+        self.cameras = cameras
         self._bodies = bodies
         self._metrics = metrics
         self.refusals = refusals
@@ -81,16 +84,35 @@ class FrameHandler:
         self.queue.check_ready()
         if options.stream is None:
             self.queue.check_capacity(client)  # an overloaded worker does not parse images
-        camera, fov = self.queue.loaded.engine.card.camera, options.fov_y_deg
-        header = inspect(body, camera, fov)
+        camera, sight = self.queue.loaded.engine.card.camera, self.sight(options)
+        header = read_header(body)
+        sight.check(header.width, header.height, camera)
         read_ms = header.decode_ms
         small = header.width * header.height <= SMALL_PIXELS and read_ms <= SMALL_MS
         small = small and (len(body) <= SMALL_BYTES or header.png_header is not None)
         frame = _frame(
-            options, client, lambda view: decode(body, header, view, fov), read_ms, small
+            options,
+            client,
+            lambda view: sight.through(decode_whole(body, header), view),
+            read_ms,
+            small,
+            sight,
         )
         self.queue.submit(frame, on_result)
-        return crop_px(header.width, header.height, camera, fov)
+        return sight.crop_px(header.width, header.height, camera)
+
+    def sight(self, options: RequestOptions) -> Sight:
+        """How the image of a request is seen. Raises Problem for a camera that is not known."""
+        name = options.camera
+        if name is None:
+            return Sight(options.fov_y_deg)
+        if options.fov_y_deg is not None:
+            seen = f"{CAMERA} and {FIELD_OF_VIEW} are both given"
+            raise Problem(INVALID_REQUEST, f"{seen}; the camera holds its field of view, send one")
+        if name not in self.cameras:
+            known = ", ".join(self.cameras) or "none (serve --camera NAME=FILE gives it one)"
+            raise Problem(INVALID_REQUEST, f"{CAMERA} is {name[:80]!r}; the service knows {known}")
+        return Sight(None, self.cameras[name])
 
     def refuse_early(self, headers: Headers, client: str) -> Reply | None:
         """The refusal of a frame for which there is no room, by its headers; None: there is room.
@@ -128,8 +150,9 @@ class FrameHandler:
         Raises Problem, ImageError.
         """
         future: asyncio.Future[FrameResult] = asyncio.get_running_loop().create_future()
-        self.queue.submit(_frame(options, client, read, read_ms, False), partial(resolve, future))
-        del read
+        frame = _frame(options, client, read, read_ms, False, self.sight(options))
+        self.queue.submit(frame, partial(resolve, future))
+        del read, frame
         try:
             result = await future
         finally:
@@ -290,24 +313,23 @@ def resolve(future: "asyncio.Future[Any]", result: Any) -> None:
 
 
 def _frame(
-    options: RequestOptions, client: str, read: PixelReader, read_ms: float, small: bool
+    options: RequestOptions,
+    client: str,
+    read: PixelReader,
+    read_ms: float,
+    small: bool,
+    sight: Sight,
 ) -> Frame:
     stream = stream_key(client, options.stream) if options.stream else 0
-    return Frame(read, options.stamp_ns, stream, options.deadline_ns, small, client, read_ms)
+    return Frame(
+        read, options.stamp_ns, stream, options.deadline_ns, small, client, read_ms, sight.camera
+    )
 
 
 def client_address(scope: Scope) -> str:
     """The client's address, empty where it is unknown."""
     client = scope.get("client")
     return client[0] if client else ""
-
-
-def crop_px(
-    width: int, height: int, view: CameraParameters, fov_y_deg: float | None
-) -> list[int] | None:
-    """[left, top, width, height] of the part the model sees, px; None: the whole image."""
-    box = crop_box(width, height, view, fov_y_deg)
-    return None if box is None else [box.left, box.top, box.width, box.height]
 
 
 def response_content(

@@ -22,8 +22,7 @@ from fastapi.responses import JSONResponse, Response
 from numpy.typing import NDArray
 
 import trackfeatures as tf
-from mtlnet.inference.image_decoding.crop import crop_box
-from mtlnet.inference.image_decoding.decode import check_size, crop_and_resize, decode, inspect
+from mtlnet.inference.image_decoding.decode import check_size, decode_whole, read_header
 from mtlnet.inference.image_decoding.errors import ImageError
 from mtlnet.inference.prediction import Prediction
 from mtlnet.inference.uncertainty import FEATURES
@@ -51,6 +50,7 @@ from serve.api.request_options import (
     request_id_of,
 )
 from serve.api.schemas import REFUSALS, image_parameters, problem_responses
+from serve.cameras import Sight
 from serve.scheduling.fair_queue import FairLock, PixelReader
 
 NAME, VERSION = "track", "1"
@@ -182,7 +182,9 @@ async def _answer(
                 headers = merge_options(headers, more, "parameters")
                 options = parse_options(headers, stamp_ns, request_id, KSERVE_FORMATS)
             share.grow(len(infer_request.input.data))  # a copy, until it is decoded
-            read, read_ms = await _pixel_reader(infer_request, binary, frames, options.fov_y_deg)
+            read, read_ms = await _pixel_reader(
+                infer_request, binary, frames, frames.sight(options)
+            )
             infer_request.input.data = b""
             del body, binary
         result = await frames.predict_pixels(options, client, read, read_ms)
@@ -203,7 +205,7 @@ async def _answer(
 
 
 async def _pixel_reader(
-    request: InferRequest, binary: memoryview, frames: FrameHandler, fov_y_deg: float | None
+    request: InferRequest, binary: memoryview, frames: FrameHandler, sight: Sight
 ) -> tuple[PixelReader, float]:
     """The reader of the pixels of the input, and an estimate of its time, ms.
 
@@ -220,12 +222,13 @@ async def _pixel_reader(
     camera = frames.queue.loaded.engine.card.camera
     if tensor.name == "image":
         body = await read_image_bytes(tensor, binary)
-        header = inspect(body, camera, fov_y_deg)
-        return lambda view: decode(body, header, view, fov_y_deg), header.decode_ms
+        header = read_header(body)
+        sight.check(header.width, header.height, camera)
+        return lambda view: sight.through(decode_whole(body, header), view), header.decode_ms
     pixels = find_pixels(tensor, binary)
     check_size(pixels.width, pixels.height)
-    crop_box(pixels.width, pixels.height, camera, fov_y_deg)
-    return lambda view: crop_and_resize(pixels.read(), view, fov_y_deg), pixels.read_ms
+    sight.check(pixels.width, pixels.height, camera)
+    return lambda view: sight.through(pixels.read(), view), pixels.read_ms
 
 
 def _tensors(prediction: Prediction) -> dict[str, NDArray[np.float32]]:

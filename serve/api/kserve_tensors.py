@@ -46,6 +46,7 @@ class _Misplaced(msgspec.Struct, kw_only=True):
     stream_id: msgspec.Raw = msgspec.Raw()
     deadline_ms: msgspec.Raw = msgspec.Raw()
     fov_y: msgspec.Raw = msgspec.Raw()
+    camera: msgspec.Raw = msgspec.Raw()
     binary_data_output: msgspec.Raw = msgspec.Raw()
 
     def check(self) -> None:

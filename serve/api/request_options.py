@@ -1,5 +1,5 @@
-"""The options of one request, read and checked: ids, stream, deadline, field of view, the format of
-the answer (JSON or MessagePack), the token, and the declared body.
+"""The options of one request, read and checked: ids, stream, deadline, camera, field of view, the
+format of the answer (JSON or MessagePack), the token, and the declared body.
 
 All endpoints that take images have the same options, as headers or in the query; the Open Inference
 Protocol also has them as `parameters`, and /stream in a text message.
@@ -29,12 +29,13 @@ from serve.api.problems import (
 from serve.config import MAX_BODY_BYTES, MAX_DEADLINE_MS, MAX_NAME
 
 FRAME_ID, REQUEST_ID, STREAM_ID = "X-Frame-Id", "X-Request-Id", "X-Stream-Id"
-DEADLINE, FIELD_OF_VIEW = "X-Deadline-Ms", "X-Camera-Fov-Y"
+DEADLINE, FIELD_OF_VIEW, CAMERA = "X-Deadline-Ms", "X-Camera-Fov-Y", "X-Camera"
 OPTIONS = {
     "frame_id": FRAME_ID,
     "stream_id": STREAM_ID,
     "deadline_ms": DEADLINE,
     "fov_y": FIELD_OF_VIEW,
+    "camera": CAMERA,
 }
 """The options of an image by their names in a query or in JSON, with the headers they stand for."""
 KEYS = {name: header.lower().encode() for name, header in OPTIONS.items()}
@@ -44,6 +45,12 @@ OPTION_HEADERS = (
     *(b"x-camera", b"x-deadline", b"x-fov", b"x-frame-id", b"x-stream"),
     *(b"deadline", b"fov", b"frame-id", b"frame_id", b"stream-id", b"stream_id"),
 )
+KINDS = {
+    "frame_id": (str | int, "text or a whole number"),
+    "stream_id": (str | int, "text or a whole number"),
+    "camera": (str, "text"),
+}
+"""Types of the options that are no numbers, and their names."""
 MAX_QUERY_FIELDS = 16  # of a query: more are not read
 SINGLE_HEADERS = (*OPTIONS.values(), REQUEST_ID, "Content-Type", "Content-Encoding")
 MEDIA_TYPES = ("image/jpeg", "image/png")
@@ -129,6 +136,7 @@ class RequestOptions:
     stream: str | None = None
     deadline_ns: int | None = None
     fov_y_deg: float | None = None
+    camera: str | None = None
     format: ResponseFormat = JSON
 
 
@@ -184,9 +192,8 @@ def merge_options(headers: Headers, options: Mapping[str, Any], where: str) -> H
         if KEYS[name] in headers:
             seen = f"{name} is in {where}, and again in {OPTIONS[name]} or the query"
             raise Problem(INVALID_REQUEST, f"{seen}; send it once")
-        kinds = str | int if name.endswith("_id") else str | int | float
+        kinds, expected = KINDS.get(name, (str | int | float, "a number"))
         if isinstance(value, bool) or not isinstance(value, kinds):
-            expected = "text or a whole number" if name.endswith("_id") else "a number"
             raise Problem(INVALID_REQUEST, f"{name} in {where} must be {expected}")
         merged[KEYS[name]] = str(value).encode("utf-8", "replace")
     return merged
@@ -226,6 +233,7 @@ def parse_options(
         parse_name(headers.get(b"x-stream-id"), STREAM_ID),
         parse_deadline(headers.get(b"x-deadline-ms"), stamp_ns),
         parse_fov_deg(headers.get(b"x-camera-fov-y")),
+        parse_name(headers.get(b"x-camera"), CAMERA),
         parse_format(headers.get(b"accept"), formats),
     )
 

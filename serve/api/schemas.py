@@ -10,6 +10,7 @@ from pydantic import BaseModel, Field, JsonValue
 from serve.api import problems
 from serve.api.problems import MEDIA_TYPE, PROBLEM_TYPES, ProblemType
 from serve.api.request_options import (
+    CAMERA,
     DEADLINE,
     FIELD_OF_VIEW,
     FORMATS,
@@ -95,7 +96,8 @@ class Features(BaseModel):
     engine: str = Field(description="openvino or torch")
     precision: str = Field(description="f32, bf16 or int8")
     crop_px: list[int] | None = Field(
-        description="left, top, width, height of the part of the image that is used, px; null: all",
+        description="left, top, width, height of the part of the image that is used, px; null: "
+        "all, or it was warped (X-Camera)",
         min_length=4,
         max_length=4,
     )
@@ -159,6 +161,12 @@ HEADERS: dict[str, tuple[str, dict[str, Any]]] = {
         "A frame that is not processed within this time after its request began, ms, is answered "
         "with 503, `deadline-passed`.",
         {"type": "number", "minimum": 0, "maximum": MAX_DEADLINE_MS},
+    ),
+    CAMERA: (
+        "Name of a camera that the service was started with (`serve --camera NAME=FILE`; GET "
+        "/model has them under `cameras`): the image is warped into the model's camera, and the "
+        "distances are those of its car. Not together with X-Camera-Fov-Y.",
+        NAME,
     ),
     FIELD_OF_VIEW: (
         "Vertical field of view of the image, degrees; default: that of the model's camera. A "

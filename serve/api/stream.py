@@ -3,9 +3,9 @@
 A binary message is one image; its answer is a text message of JSON, or with the subprotocol
 `driverview.msgpack` a binary message of MessagePack. A new frame replaces a frame of the same
 WebSocket that is still queued. A text message before an image is a JSON object with options of that
-image: `frame_id`, `deadline_ms`, `fov_y`. Options of all images are sent with the handshake, as
-headers (X-Camera-Fov-Y and the others) or, from a browser, in the query. A refused frame is
-answered with its problem and its frame_id; the WebSocket stays open.
+image: `frame_id`, `deadline_ms`, `fov_y`, `camera`. Options of all images are sent with the
+handshake, as headers (X-Camera-Fov-Y and the others) or, from a browser, in the query. A refused
+frame is answered with its problem and its frame_id; the WebSocket stays open.
 """
 
 import asyncio
@@ -25,6 +25,7 @@ from serve.api.problems import (
     internal_error,
 )
 from serve.api.request_options import (
+    CAMERA,
     FRAME_ID,
     JSON,
     KEYS,
@@ -49,7 +50,7 @@ PROTOCOLS = {"driverview.json": JSON, "driverview.msgpack": MSGPACK}
 # Else a client that floods the service with refused messages would delay all others.
 REFUSAL_PAUSE_S, BUSY_PAUSE_S = 0.01, 0.002
 MAX_TEXT = 1024  # characters of a text message
-FRAME_OPTIONS = {name: OPTIONS[name] for name in ("frame_id", "deadline_ms", "fov_y")}
+FRAME_OPTIONS = {name: OPTIONS[name] for name in ("frame_id", "deadline_ms", "fov_y", "camera")}
 MAX_PENDING = 8  # frames of one WebSocket whose answers are not sent; then no more is received
 
 logger = logging.getLogger(__name__)
@@ -132,13 +133,17 @@ class Stream:
             frame_id = parse_name(headers.get(KEYS["frame_id"]), FRAME_ID) or frame_id
             deadline_ms = headers.get(KEYS["deadline_ms"], stream.deadline_ms)
             fov_deg = parse_fov_deg(headers.get(KEYS["fov_y"]))
+            camera = parse_name(headers.get(KEYS["camera"]), CAMERA)
+            if fov_deg is None and camera is None:
+                fov_deg, camera = stream.defaults.fov_y_deg, stream.defaults.camera
             options = replace(
                 stream.defaults,
                 stamp_ns=stamp_ns,
                 request_id=request_id,
                 frame_id=frame_id,
                 deadline_ns=parse_deadline(deadline_ms, stamp_ns),
-                fov_y_deg=stream.defaults.fov_y_deg if fov_deg is None else fov_deg,
+                fov_y_deg=fov_deg,
+                camera=camera,
             )
             content = await self._frames.predict_file(options, message["bytes"], stream.client)
         except (Problem, ImageError) as error:

@@ -41,12 +41,14 @@ class AsyncClient:
         stream: str | None = None,
         deadline_s: float | None = None,
         fov_y_deg: float | None = None,
+        camera: str | None = None,
     ) -> dict[str, Any]:
         """The track features of a JPEG or PNG file. Raises ServiceError."""
         options: dict[str, Any] = {
             "stream": stream,
             "deadline_s": deadline_s,
             "fov_y_deg": fov_y_deg,
+            "camera": camera,
         }
         send = partial(self._client.features, image, content_type, frame_id, **options)
         return await self._in_thread(send)

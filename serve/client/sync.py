@@ -93,12 +93,14 @@ class Client:
         stream: str | None = None,
         deadline_s: float | None = None,
         fov_y_deg: float | None = None,
+        camera: str | None = None,
     ) -> dict[str, Any]:
         """The track features of a JPEG or PNG file, `image` being its bytes.
 
         The members are those of POST /features. `content_type` None: detected from the first bytes.
         `stream`: a newer frame of this stream replaces this one. `fov_y_deg`: the vertical field of
-        view of the image; None: that of the model's camera. With `deadline_s` (from now) the
+        view of the image; None: that of the model's camera. `camera`: the name of a camera that the
+        service was started with. With `deadline_s` (from now) the
         service drops the frame when it is late, and the request is retried until then where that
         may help (the service is overloaded, not ready, or restarting). Raises ServiceError.
         """
@@ -111,6 +113,8 @@ class Client:
             headers["X-Stream-Id"] = stream
         if fov_y_deg is not None:
             headers["X-Camera-Fov-Y"] = str(float(fov_y_deg))
+        if camera is not None:
+            headers["X-Camera"] = camera
         _check_headers(headers)
         if deadline_s is None:
             return self._request("POST", "/features", image, headers)

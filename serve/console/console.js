@@ -22,6 +22,8 @@ async function ask() {
   const started = performance.now();
   try {
     const headers = { "Content-Type": body.type };
+    const named = $("camera").value;
+    if (named) headers["X-Camera"] = named;
     if ($("token").value) headers.Authorization = `Bearer ${$("token").value}`;
     const reply = await fetch("features", { method: "POST", headers, body });
     const answer = await reply.json();
@@ -29,7 +31,7 @@ async function ask() {
     if (!reply.ok) return refuse(`${answer.title ?? reply.statusText}: ${answer.detail ?? ""}`, image);
     latencies.push({ trip: performance.now() - started, total: answer.timing_ms.total, ...answer.timing_ms });
     latencies.splice(0, latencies.length - KEPT);
-    show(image, answer, truth);
+    show(image, answer, truth, named);
   } catch (error) {
     refuse(`no answer: ${error.message}`, image);
   } finally {
@@ -43,8 +45,9 @@ function refuse(text, image) {
   $("picture").getContext("2d").drawImage(image, 0, 0, $("picture").width, $("picture").height);
 }
 
-function show(image, answer, truth) {
-  drawPicture($("picture"), image, answer, truth, model.camera);
+function show(image, answer, truth, named) {
+  const camera = model.cameras?.[named] ?? model.camera;
+  drawPicture($("picture"), image, answer, truth, camera, Boolean(named));
   drawAbove($("above"), answer, truth);
   drawLatency($("latency"), latencies, KEPT);
   const offset = answer.to_lane_centre_m;
@@ -133,6 +136,9 @@ for (const kind of ["dragover", "dragleave", "drop"]) {
   });
 }
 $("token").addEventListener("change", ask);
+for (const name of Object.keys(model.cameras ?? {})) $("camera").add(new Option(name, name));
+$("cameras").hidden = !Object.keys(model.cameras ?? {}).length;
+$("camera").addEventListener("change", ask);
 setInterval(() => $("repeat").checked && ask(), EVERY_MS);
 
 const samples = await (await fetch("console/samples.json")).json();

@@ -26,12 +26,14 @@ function paintOf(name) {
   return colour(IN_LANE.includes(name) ? "lane" : "marking");
 }
 
-export function drawPicture(canvas, image, answer, truth, camera) {
+// `whole`: the image is all that `camera` sees; else the service uses its middle.
+export function drawPicture(canvas, image, answer, truth, camera, whole = false) {
   const context = canvas.getContext("2d");
   canvas.height = Math.round(canvas.width * image.height / image.width);
   canvas.style.aspectRatio = `${image.width} / ${image.height}`;
   context.drawImage(image, 0, 0, canvas.width, canvas.height);
-  const part = seenPart(canvas.width, canvas.height, camera), scale = part.w / camera.width;
+  const part = whole ? { x: 0, w: canvas.width } : seenPart(canvas.width, canvas.height, camera);
+  const scale = part.w / camera.width;
   const line = (distance, angle) => {
     const points = [];
     for (let x = AHEAD_M[0]; x <= AHEAD_M[1]; x += 0.5) {

@@ -1,5 +1,5 @@
 // From track features to points on the road, in the car frame (x ahead, y to the left, m, from the
-// centre of gravity), and from there to pixels through the model's camera.
+// centre of gravity), and from there to pixels through a camera.
 
 export const CG_HEIGHT_M = 0.25; // of the simulated car; the camera's position is relative to it
 export const IN_LANE = ["ml", "mr"], ON_MARKING = ["l", "m", "r"];
@@ -11,15 +11,48 @@ export function onMarking(distance, angle, ahead) {
   return [ahead * cos - left * sin, ahead * sin + left * cos];
 }
 
-// Pixel [u, v] of a point on the road, null behind the camera. `camera` is that of /model.
+// Place [u, v] of a point on the road in a picture, px from its upper left corner, null where the
+// camera does not see it. `camera` is one of /model; see trackfeatures/camera.py.
 export function project([x, y], camera) {
-  const focal = camera.height / 2 / Math.tan(camera.fov_y_deg * Math.PI / 360);
-  const pitch = camera.pitch_deg * Math.PI / 180; // positive: the camera looks down
-  const ahead = x - camera.x, left = y - camera.y, up = -CG_HEIGHT_M - camera.z;
-  const depth = ahead * Math.cos(pitch) - up * Math.sin(pitch);
-  const above = ahead * Math.sin(pitch) + up * Math.cos(pitch);
+  const [cr, cp, cy] = ANGLES.map((name) => Math.cos((camera[name] ?? 0) * Math.PI / 180));
+  const [sr, sp, sy] = ANGLES.map((name) => Math.sin((camera[name] ?? 0) * Math.PI / 180));
+  const away = [x - camera.x, y - camera.y, -CG_HEIGHT_M - camera.z];
+  const along = (axis) => axis[0] * away[0] + axis[1] * away[1] + axis[2] * away[2];
+  const depth = along([cy * cp, sy * cp, -sp]);
   if (depth < 0.3) return null;
-  return [camera.width / 2 - focal * left / depth, camera.height / 2 - focal * above / depth];
+  const right = -along([cy * sp * sr - sy * cr, sy * sp * sr + cy * cr, cp * sr]) / depth;
+  const down = -along([cy * sp * cr + sy * sr, sy * sp * cr - cy * sr, cp * cr]) / depth;
+  const seen = distort(right, down, camera);
+  if (!seen) return null;
+  const focal = camera.height / 2 / Math.tan(camera.fov_y_deg * Math.PI / 360);
+  const [fx, fy, u, v] = camera.matrix ?? [focal, focal, (camera.width - 1) / 2, (camera.height - 1) / 2];
+  return [u + fx * seen[0] + 0.5, v + fy * seen[1] + 0.5];
+}
+
+const ANGLES = ["roll_deg", "pitch_deg", "yaw_deg"];
+
+// A point on the plane one focal length ahead after the lens's distortion; null where it folds.
+function distort(x, y, camera) {
+  const k = camera.coefficients ?? [];
+  const r = Math.hypot(x, y);
+  const radius = (r) => {
+    if (camera.distortion === "fisheye") {
+      const t = Math.atan(r), s = t * t;
+      return t * (1 + s * (k[0] + s * (k[1] + s * (k[2] + s * k[3]))));
+    }
+    const [k1, k2, , , k3 = 0, k4 = 0, k5 = 0, k6 = 0] = k, s = r * r;
+    return r * (1 + s * (k1 + s * (k2 + s * k3))) / (1 + s * (k4 + s * (k5 + s * k6)));
+  };
+  if (!k.length || r < 1e-9) return [x, y];
+  for (let share = 0; share < 1; share += 0.02) {
+    if (radius(r * (share + 0.02)) <= radius(r * share)) return null;
+  }
+  const scale = radius(r) / r;
+  const [p1, p2] = camera.distortion === "fisheye" ? [0, 0] : [k[2], k[3]];
+  return [
+    x * scale + 2 * p1 * x * y + p2 * (r * r + 2 * x * x),
+    y * scale + p1 * (r * r + 2 * y * y) + 2 * p2 * x * y,
+  ];
 }
 
 // The part of an image of `width` x `height` that the service uses: the middle, as high as the image

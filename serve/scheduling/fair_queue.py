@@ -40,7 +40,8 @@ class Frame:
     """An image to process. Times are ns of the monotonic clock.
 
     `stream` 0: it belongs to no stream. `small`: it is decoded in less time than the engine takes;
-    others are admitted by `cost_ms`, the estimated time of decoding.
+    others are admitted by `cost_ms`, the estimated time of decoding. `source`: its camera, where
+    its pixels are warped into the model's.
     """
 
     read: PixelReader
@@ -50,6 +51,7 @@ class Frame:
     small: bool = False
     client: str = ""
     cost_ms: float = 0.0
+    source: CameraParameters | None = None
 
 
 class Slot:

@@ -25,6 +25,7 @@ from queue import SimpleQueue
 import trackfeatures as tf
 from mtlnet.inference.engine import Engine
 from mtlnet.inference.prediction import decode_outputs
+from mtlnet.inference.rectification import Rectification
 from serve.api.problems import DEADLINE_PASSED, NOT_READY, OVERLOADED, SUPERSEDED, Problem
 from serve.scheduling.admission import Admission
 from serve.scheduling.fair_queue import FairQueue, Frame, FrameResult, ResultCallback, Slot
@@ -304,9 +305,13 @@ class FrameQueue:
             loaded = self._current
         if loaded is not self._fast_engine:
             self._fast_engine, self._fast_frames = loaded, 0
-        image = frame.read(loaded.engine.card.camera)
+        camera = loaded.engine.card.camera
+        image = frame.read(camera)
         decoded = time.monotonic_ns()
-        prediction = decode_outputs(loaded.engine(image))
+        outputs = loaded.engine(image)
+        if frame.source is not None:
+            outputs = Rectification(frame.source, camera).outputs(outputs[None])[0]
+        prediction = decode_outputs(outputs)
         end = time.monotonic_ns()
         frame_ms = (end - start) / 1e6
         self._mean_frame_ms += SMOOTHING * (frame_ms - self._mean_frame_ms)

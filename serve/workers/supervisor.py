@@ -11,7 +11,7 @@ import os
 import signal
 import socket
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,7 @@ from serve.workers.shared_memory import (
     create_shared_memory,
 )
 from serve.workers.worker_process import WorkerProcess, WorkerTask, start_worker
+from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
 
 BACKLOG = 2048
@@ -43,6 +44,7 @@ class ServicePlan:
     resolve: Callable[[str], Path]
     workers: int
     limits: Limits
+    cameras: dict[str, CameraParameters] = field(default_factory=dict)
 
 
 class Supervisor:
@@ -223,6 +225,7 @@ class Supervisor:
             blocks=self._shared.blocks,
             block=block,
             limits=self._plan.limits,
+            cameras=self._plan.cameras,
         )
         return await start_worker(task)
 

@@ -82,7 +82,9 @@ def main() -> None:
         supervisor.send(failed=task.generation, why=str(error))
         return
     supervisor.send_loaded(task.generation, engine)
-    app = Service(engine, warm_up, task.limits, shared, task.block, telemetry.tracer())
+    app = Service(
+        engine, warm_up, task.limits, shared, task.block, telemetry.tracer(), task.cameras
+    )
     app.frame_queue.on_warm(lambda: send_ready(supervisor))
     peers = WorkerPeers(shared, task.block)
     server = WorkerServer(app, task.limits, peers)

@@ -10,10 +10,11 @@ import socket
 import sys
 import time
 from asyncio.subprocess import Process
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from serve.config import Limits
+from trackfeatures.camera import CameraParameters, stored
 from trackfeatures.errors import UserError
 
 logger = logging.getLogger(__name__)
@@ -35,16 +36,19 @@ class WorkerTask:
     blocks: int
     block: int
     limits: Limits
+    cameras: dict[str, CameraParameters] = field(default_factory=dict)
 
     def to_json_line(self) -> bytes:
         """The task as one line of JSON."""
-        return json.dumps(asdict(self)).encode() + b"\n"
+        return json.dumps(asdict(self, dict_factory=stored)).encode() + b"\n"
 
     @classmethod
     def from_json_line(cls, line: str) -> "WorkerTask":
         """The task in a line of JSON."""
         content = json.loads(line)
-        return cls(**{**content, "limits": Limits(**content["limits"])})
+        cameras = {name: CameraParameters(**each) for name, each in content["cameras"].items()}
+        limits = Limits(**content["limits"])
+        return cls(**{**content, "limits": limits, "cameras": cameras})
 
 
 class WorkerProcess:

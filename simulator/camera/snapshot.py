@@ -63,15 +63,18 @@ def write_contact_sheet(
     light: str | None = None,
     view: str | None = None,
     kind: str = COLOUR,
+    camera: CameraParameters | None = None,
 ) -> None:
     """Write a PNG of views at places all round `road`.
 
     All pictures are of `view`, or without it driver views, one chase and one top view; in the light
     of kind `light`, or without it in each kind by turns, every other one clear. Of `kind` "colour"
     the right half has the true markings drawn thinly over the painted ones; "depth" and "class" are
-    in false colours. On a varied road each light has a look of its own. An older file stays as it
-    is until the new one is complete. Raises UserError if the file cannot be written as PNG or has
-    no folder, or light, view or kind is unknown; OSError if it cannot be written.
+    in false colours. `camera`: seen through that lens, scaled to WIDTH; without it as the driver
+    camera, on a varied road at the height that was drawn with it. There each light has a look of
+    its own. An older file stays as it is until the new one is complete. Raises UserError if the
+    file cannot be written as PNG or has no folder, or light, view or kind is unknown; OSError if it
+    cannot be written.
     """
     if out.suffix.lower() != ".png":
         raise UserError(f"{out}: the contact sheet is a PNG file; give a name that ends in .png")
@@ -79,23 +82,26 @@ def write_contact_sheet(
     if light is not None:
         check_light(light)
     ViewRequest.of(f"{view or 'front'}:{kind}")
+    if camera is None:
+        lens = CameraParameters(WIDTH, HEIGHT)
+    else:
+        lens = camera.resized(WIDTH, round(WIDTH * camera.height / camera.width))
     shots = [
         replace(shot, kind=kind, view=view or shot.view)
         for shot in _shots(road, light, np.random.default_rng([seed, 10]))
     ]
     pictures: list[Picture | None] = [None] * len(shots)
-    varied, parameters = road.carriageway, CameraParameters(WIDTH, HEIGHT)
-    if varied is not None:
-        height = varied.camera_height_m - CameraParameters.cg_height_m
-        parameters = replace(parameters, z=height)
+    varied = road.carriageway
+    if varied is not None and camera is None:
+        lens = replace(lens, z=varied.camera_height_m - CameraParameters.cg_height_m)
     for number, kind in enumerate(dict.fromkeys(shot.light for shot in shots)):
         drawn = Light.named(kind, np.random.default_rng([seed, 11]))
         look = RoadLook.drawn(seed, number) if varied else None
-        with Camera(road, parameters, seed=seed, light=drawn, look=look) as camera:
+        with Camera(road, lens, seed=seed, light=drawn, look=look) as renderer:
             for k, shot in enumerate(shots):
                 if shot.light == kind:
                     rng = np.random.default_rng([seed, 12, k])
-                    pictures[k] = render_shot(camera, road, shot, traffic, rng)
+                    pictures[k] = render_shot(renderer, road, shot, traffic, rng)
     made = [picture for picture in pictures if picture is not None]
     rows = [np.hstack(made[k : k + COLUMNS]) for k in range(0, len(made), COLUMNS)]
     done, png = cv2.imencode(".png", cv2.cvtColor(np.vstack(rows), cv2.COLOR_RGB2BGR))

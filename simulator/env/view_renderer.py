@@ -49,6 +49,8 @@ class RenderOptions:
     @property
     def camera(self) -> CameraParameters:
         mount = self.mount or CameraParameters()
+        if mount.matrix is not None:
+            return mount.resized(self.width, self.height)
         return replace(mount, width=self.width, height=self.height)
 
 

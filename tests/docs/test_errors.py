@@ -24,9 +24,12 @@ from mtlnet.data.custom_images import COLUMNS, open_custom_images
 from mtlnet.inference.engine import Engine, load_engine
 from mtlnet.inference.image_decoding.decode import inspect, read_image
 from mtlnet.inference.model_card import resolve_run
+from mtlnet.inference.rectification import Rectification
 from mtlnet.predict.films import Film, read_film_header
 from mtlnet.predict.run import predict_files
 from mtlnet.training.loss import parse_alpha
+from runtime.camera_file import read_camera
+from serve.cameras import read_cameras
 from simulator.camera.core.context import Graphics
 from simulator.camera.core.turns import Turns
 from simulator.track.catalogue import find_track
@@ -105,6 +108,52 @@ def _(folder: Path) -> object:
 @row("an image that shows less")
 def _(folder: Path) -> object:
     return read_image(written(folder, "a.jpg", jpeg(100, 210)), VIEW)
+
+
+@row("an image of a camera file")
+def _(folder: Path) -> object:
+    return Rectification(CameraParameters(fov_y_deg=12.0), VIEW).image(
+        np.zeros((210, 280, 3), np.uint8)
+    )
+
+
+def camera_file(folder: Path, text: str) -> object:
+    return read_camera(written(folder, "camera.yaml", text.encode()), VIEW)
+
+
+SIZED = "image_width: 640\nimage_height: 480\ndist_coeffs: [0.1, 0, 0, 0]\n"
+
+
+@row("a camera file without numbers")
+def _(folder: Path) -> object:
+    return camera_file(folder, SIZED + "camera_matrix:\n")
+
+
+@row("a singular camera matrix")
+def _(folder: Path) -> object:
+    return camera_file(folder, SIZED + "camera_matrix: [[0, 0, 9], [0, 5, 9], [0, 0, 1]]\n")
+
+
+@row("coefficients of another number")
+def _(folder: Path) -> object:
+    text = SIZED.replace("0, 0, 0]", "0]")
+    return camera_file(folder, text + "camera_matrix: [[500, 0, 9], [0, 500, 9], [0, 0, 1]]\n")
+
+
+@row("a number that is not finite")
+def _(folder: Path) -> object:
+    return camera_file(folder, SIZED + "camera_matrix: [[.nan, 0, 9], [0, 5, 9], [0, 0, 1]]\n")
+
+
+@row("a camera matrix without")
+def _(folder: Path) -> object:
+    return camera_file(folder, "K: [500, 0, 9, 0, 500, 9, 0, 0, 1]\nD: [0, 0, 0, 0]\n")
+
+
+@row("to the service: two cameras")
+def _(folder: Path) -> object:
+    path = written(folder, "camera.yaml", b"fov_y_deg: 60\n")
+    return read_cameras([f"a={path}", f"a={path}"], VIEW)
 
 
 @row("to the service: another kind")

@@ -29,6 +29,7 @@ from mtlnet.inference.model_card import WEIGHTS, ModelCard, golden_image
 from runtime.sockets import bind
 from serve.api.problems import PROBLEM_TYPES
 from serve.app import Service
+from serve.cameras import Cameras
 from serve.config import Limits
 from serve.observability import metrics
 from serve.server import guard
@@ -247,11 +248,12 @@ def serving(
     beside: Served | None = None,
     clock: Callable[[], float] | None = None,
     host: str = "127.0.0.1",
+    cameras: Cameras | None = None,
 ) -> Iterator[Served]:
     """The service around `engine` on a free port, as `serve` runs it, in a thread of this process.
 
     Ready when entered, unless there is a `check`. `beside`: on its port, as another worker.
-    `clock`: of the deadlines of its connections, s. `host`: where it listens.
+    `clock`: of the deadlines of its connections, s. `host`: where it listens. `cameras`: by name.
     """
 
     def checked(engine: Engine) -> None:
@@ -260,7 +262,7 @@ def serving(
 
     listener = beside.listener.dup() if beside is not None else bind(host, 0)
     listener.listen(2048)
-    app = Service(engine, checked, limits, shared, block, tracer)
+    app = Service(engine, checked, limits, shared, block, tracer, cameras or {})
     server = WorkerServer(app, limits or Limits(), WorkerPeers(app.shared, block))
     if clock is not None:
         server.guard.clock = clock

@@ -5,7 +5,7 @@ World frame: x, y in the plane, z up; SI units, angles in rad, counter-clockwise
 
 from collections.abc import Mapping
 from dataclasses import asdict
-from math import cos, sin
+from math import asin, atan2, cos, sin
 from typing import Any
 
 import numpy as np
@@ -57,6 +57,7 @@ def compressed_image(data: bytes, codec: str, time: Timestamp) -> bytes:
 
 
 def calibration(camera: CameraParameters, time: Timestamp) -> bytes:
+    model, coefficients = lens_parameters(camera)
     k = camera.intrinsics()
     projection = np.hstack([k, np.zeros((3, 1))])
     return _serialize(
@@ -65,13 +66,22 @@ def calibration(camera: CameraParameters, time: Timestamp) -> bytes:
             frame_id=CAMERA_FRAME,
             width=camera.width,
             height=camera.height,
-            distortion_model="plumb_bob",
-            D=[0.0] * 5,
+            distortion_model=model,
+            D=coefficients,
             K=k.ravel().tolist(),
             R=np.eye(3).ravel().tolist(),
             P=projection.ravel().tolist(),
         )
     )
+
+
+def lens_parameters(camera: CameraParameters) -> tuple[str, list[float]]:
+    """Foxglove's name of the camera's distortion model, and its coefficients."""
+    if camera.distortion == "fisheye":
+        return "kannala_brandt", list(camera.coefficients)
+    count = 8 if len(camera.coefficients) > 5 else 5
+    padded = [*camera.coefficients, *[0.0] * (count - len(camera.coefficients))]
+    return "rational_polynomial" if count == 8 else "plumb_bob", padded
 
 
 def annotations(frame: Frame, time: Timestamp) -> bytes:
@@ -168,8 +178,10 @@ def transforms(ego: EgoState, camera: CameraParameters, time: Timestamp) -> byte
     _add_transform(
         message, WORLD, EGO, (ego.x, ego.y, ego.z), quaternion(ego.roll, ego.pitch, ego.yaw), time
     )
-    # The optical frame has z along the view, x to the right and y down.
-    optical = quaternion(-np.pi / 2.0 - np.radians(camera.pitch_deg), 0.0, -np.pi / 2.0)
+    turn = camera.rotation().T  # its columns: x to the right, y down, z along the view
+    optical = quaternion(
+        atan2(turn[2, 1], turn[2, 2]), -asin(turn[2, 0]), atan2(turn[1, 0], turn[0, 0])
+    )
     _add_transform(message, EGO, CAMERA_FRAME, (camera.x, camera.y, camera.z), optical, time)
     return _serialize(message)
 

@@ -22,7 +22,7 @@ from mtlnet.data.augment.geometric import (
 )
 from mtlnet.data.augment.photometric import add_noise, blur, compress, draw_colour_transforms
 from mtlnet.data.augment.shadows import SHADOWS, add_shadow
-from mtlnet.inference.rectification import BORDER_LEVEL
+from mtlnet.inference.rectification import BORDER_LEVEL, LEAST_SHOWN
 from trackfeatures.camera import CameraParameters
 
 # Shares of the images. Small: in a run of an hour the network sees each frame about five times, and
@@ -32,6 +32,10 @@ BLUR_SHARE, NOISE_SHARE, JPEG_SHARE = 0.08, 0.12, 0.0625
 BORDER_SHARE = 0.5
 MAX_BORDER = (0.3, 0.3, 0.25, 0.25)
 """Shares of rows and columns without a picture at the top, bottom, left and right, at most."""
+NARROW_SHARE = 0.15
+"""Of the images: with a border like that of a lens that shows as little as can be answered."""
+LOWEST_EDGE = 0.55
+"""Share of the rows at which such a picture ends at the earliest: it shows some road."""
 MAX_PATCH_SIDE = 0.3  # relative to the image's sides
 BLUR_STD_PX, NOISE_STD, JPEG_QUALITY = (0.4, 1.4), (2.0, 12.0), (25, 90)
 
@@ -88,6 +92,11 @@ def _draw_border(
 ) -> NDArray[np.int64]:
     """Borders (B, 4) px that a camera with a narrower field of view does not show."""
     share = rng.uniform(0.0, MAX_BORDER, (count, 4)) * (rng.random((count, 1)) < BORDER_SHARE)
+    shown = rng.uniform(LEAST_SHOWN, 1.0, (count, 2))  # of rows and columns
+    first = np.column_stack([np.maximum(LOWEST_EDGE - shown[:, 0], 0.0), np.zeros(count)])
+    start = first + rng.random((count, 2)) * (1.0 - shown - first)
+    narrow = np.stack([start, 1.0 - shown - start], 2).reshape(count, 4)
+    share = np.where(rng.random((count, 1)) < NARROW_SHARE, narrow, share)
     return (share * (height, height, width, width)).round().astype(np.int64)
 
 

@@ -149,13 +149,14 @@ def inspect(body: bytes, view: CameraParameters, fov_y_deg: float | None = None)
 
     `fov_y_deg`: the image's vertical field of view, None: that of `view`. Raises ImageError.
     """
-    header = _read_header(body)
+    header = read_header(body)
     crop_box(header.width, header.height, view, fov_y_deg)
     return header
 
 
-def _read_header(body: bytes) -> ImageHeader:
-    """The header of an image within the limits. Raises ImageError."""
+def read_header(body: bytes) -> ImageHeader:
+    """The header of an image, checked against the limits that hold for every camera; as `inspect`
+    otherwise. Raises ImageError."""
     if body.startswith(png.SIGNATURE):
         found = png.read_header(body)
         orientation = exif_orientation(png.find_exif(body))
@@ -255,10 +256,11 @@ def decode(
 
     `header` and `fov_y_deg` as in `inspect`. Raises ImageError.
     """
-    return crop_and_resize(_decode_whole(body, header), view, fov_y_deg)
+    return crop_and_resize(decode_whole(body, header), view, fov_y_deg)
 
 
-def _decode_whole(body: bytes, header: ImageHeader) -> NDArray[np.uint8]:
+def decode_whole(body: bytes, header: ImageHeader) -> NDArray[np.uint8]:
+    """The image as uint8 RGB (header.height, header.width, 3). Raises ImageError."""
     if header.png_header is not None:
         image = _decode_png(body, header.png_header)
     else:

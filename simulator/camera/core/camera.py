@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from simulator.arrays import FloatArray
 from simulator.camera.core import optics
 from simulator.camera.core.context import FRAME_BINDING, NIGHT, Graphics, graphics
+from simulator.camera.core.lens_view import LensView
 from simulator.camera.core.render_modes import CLASS, COLOUR, DEPTH, ViewRequest
 from simulator.camera.lens.imaging import Imaging
 from simulator.camera.scene.cars import Cars, shared_cars
@@ -95,6 +96,10 @@ class Camera:
         self.road, self.parameters = road, parameters
         self.width, self.height = parameters.width, parameters.height
         self.intrinsics: FloatArray = parameters.intrinsics()
+        distorted = parameters.distortion != "none"
+        self._lens = LensView.of(parameters, MAX_SIZE) if distorted else None
+        self._drawn = parameters if self._lens is None else self._lens.drawn
+        self._drawn_intrinsics: FloatArray = self._drawn.intrinsics()
         self._graphics: Graphics = graphics()
         self._survey = Survey.of(road)
         self._cache_size = scenes
@@ -132,7 +137,7 @@ class Camera:
             light,
             scene,
             # Rendered with the light of the frame that is bound.
-            Sky(graphics, light.weather, float(self.intrinsics[0, 0])),
+            Sky(graphics, light.weather, float(self._drawn_intrinsics[0, 0])),
             Precipitation(graphics, light, seed) if light.falling > 0.0 else None,
             frame,
             # Cars of different rounds differ in colour; index 0 is that of our own car.
@@ -194,7 +199,7 @@ class Camera:
         eye = optics.eye_of(self.parameters, body_pose, view)
         self._set_headlights(loaded.frame, np.asarray(body_pose, dtype=np.float64), eye)
         self._set_frame(loaded.frame, eye)
-        planes = optics.frustum(eye, self.intrinsics)
+        planes = optics.frustum(eye, self._drawn_intrinsics, self._drawn.width, self._drawn.height)
         cars, paints = self._cars_in_view(body_pose, others, view)
         chosen = loaded.cars.visible(cars, eye.place, planes)
         return _Shot(
@@ -203,7 +208,7 @@ class Camera:
 
     def _draw_colours(self, shot: _Shot) -> NDArray[np.uint8]:
         loaded, place = self._loaded, shot.eye.place
-        target = self._graphics.targets.of(self.width, self.height, labels=False)
+        target = self._graphics.targets.of(self._drawn.width, self._drawn.height, labels=False)
         self._graphics.begin(target)
         loaded.cars.draw(shot.cars, shot.paints, place, labels=False)
         loaded.scene.draw(shot.seen, labels=False)
@@ -212,8 +217,9 @@ class Camera:
         loaded.cars.draw_shadows(shot.cars, place, loaded.light)
         loaded.scene.draw_blended(shot.seen)
         if loaded.precipitation is not None:
-            loaded.precipitation.draw(shot.eye, self.intrinsics[0, 0])
-        return target.colours()
+            loaded.precipitation.draw(shot.eye, self._drawn_intrinsics[0, 0])
+        drawn = target.colours()
+        return drawn if self._lens is None else self._lens.colours(drawn)
 
     def _recorded(self, picture: NDArray[np.uint8], shot: _Shot, view: str) -> NDArray[np.uint8]:
         """What the sensor makes of a rendered picture; of the driver view only."""
@@ -224,28 +230,29 @@ class Camera:
 
     def _draw_labels(self, shot: _Shot) -> NDArray[np.float32]:
         """Depth and class (height, width, 2) of what `_draw_colours` draws, rain and snow apart."""
-        target = self._graphics.targets.of(self.width, self.height, labels=True)
+        target = self._graphics.targets.of(self._drawn.width, self._drawn.height, labels=True)
         self._graphics.begin(target, labels=True)
         self._loaded.cars.draw(shot.cars, shot.paints, shot.eye.place, labels=True)
         self._loaded.scene.draw(shot.seen, labels=True)
-        return target.labels()
+        drawn = target.labels()
+        return drawn if self._lens is None else self._lens.labels(drawn)
 
     def extrinsics(self, view: str = "front", body_pose: ArrayLike = (0.0,) * 6) -> FloatArray:
         """Body frame to camera frame (4, 4): x right, y down, z ahead (the optical axis), metres.
 
         Fixed for views mounted on the car; `chase` and `top` stay level, so theirs depend on the
         roll and pitch of `body_pose`. With `intrinsics` K, K @ (E @ point)[:3] is (u, v, 1) times
-        the depth. Raises UserError for an unknown view.
+        the depth, before a lens's distortion. Raises UserError for an unknown view.
         """
         return optics.extrinsics(self.parameters, body_pose, view)
 
     def project(
         self, points: ArrayLike, body_pose: ArrayLike, view: str = "front"
     ) -> tuple[FloatArray, FloatArray]:
-        """Pixels (N, 2) (u right, v down; NaN behind the eye) and depth (N,) m of world points."""
-        return optics.project(
-            optics.eye_of(self.parameters, body_pose, view), self.intrinsics, points
-        )
+        """Pixels (N, 2) (u right, v down) and depth (N,) m of world points; pixels are NaN behind
+        the eye and outside the lens."""
+        eye = optics.eye_of(self.parameters, body_pose, view)
+        return optics.project(eye, self.parameters, points)
 
     def close(self) -> None:
         """Free the graphics memory, or leave it to the thread that is drawing; a closed camera
@@ -305,7 +312,8 @@ class Camera:
 
     def _set_frame(self, block: NDArray[np.float32], eye: optics.Eye) -> None:
         """Fill the uniform block `Frame` of frame.glsl, which `block` keeps."""
-        clip = optics.clip_matrix(eye, self.intrinsics, self.width, self.height)
+        drawn = self._drawn
+        clip = optics.clip_matrix(eye, self._drawn_intrinsics, drawn.width, drawn.height)
         block[:16] = clip.T.reshape(-1)
         block[16:19], block[20:23] = eye.place, eye.axes[2]
         self._graphics.frame.write(block.tobytes())

@@ -3,7 +3,7 @@
 Body frame: x ahead, y to the left, z up, origin at the centre of gravity; a body pose is
 (x, y, z, roll, pitch, yaw) as PyBullet's Euler angles (R = Rz Ry Rx, pitch positive nose down).
 Image frame: pixels, u to the right, v down; a pixel's centre has whole coordinates. Pictures are
-drawn by a pinhole with square pixels and its principal point in the middle.
+drawn by a pinhole; `lens_view` adds a lens's distortion.
 """
 
 import math
@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 
 from runtime.jit import compiled
 from simulator.arrays import FloatArray
+from trackfeatures import lens
 from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
 
@@ -91,10 +92,14 @@ def extrinsics(camera: CameraParameters, body_pose: ArrayLike, view: str) -> Flo
     return matrix
 
 
-def project(eye: Eye, matrix: FloatArray, points: ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """Pixels (N, 2) and depth (N,) m along the optical axis; behind the eye pixels are NaN."""
+def project(eye: Eye, camera: CameraParameters, points: ArrayLike) -> tuple[FloatArray, FloatArray]:
+    """Pixels (N, 2) and depth (N,) m along the optical axis; pixels are NaN behind the eye and
+    where the lens does not see."""
     places = np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 3)
-    return _pixels(places, eye.place, eye.axes, matrix)
+    if camera.distortion == "none":
+        return _pixels(places, eye.place, eye.axes, camera.intrinsics())
+    right, up, ahead = eye.axes @ (places - eye.place).T
+    return lens.project(camera, np.column_stack([right, -up, ahead])), ahead
 
 
 @compiled
@@ -125,25 +130,20 @@ def clip_matrix(eye: Eye, matrix: FloatArray, width: int, height: int) -> FloatA
     x_scale = 2.0 * matrix[0, 0] / width
     y_scale = 2.0 * matrix[1, 1] / height
     clip = np.zeros((4, 4))
-    clip[0, :3] = eye.axes[0] * x_scale
-    clip[1, :3] = -eye.axes[1] * y_scale
+    # How far the principal point is off the middle, in half sides; 0 for a centred one.
+    aside, below = ((2.0 * matrix[k, 2] + 1.0) / (width, height)[k] - 1.0 for k in (0, 1))
+    clip[0, :3] = eye.axes[0] * x_scale + eye.axes[2] * aside
+    clip[1, :3] = -eye.axes[1] * y_scale + eye.axes[2] * below
     clip[2, :3] = eye.axes[2] * (FAR_M + NEAR_M) / (FAR_M - NEAR_M)
     clip[2, 3] = -2.0 * FAR_M * NEAR_M / (FAR_M - NEAR_M)
     clip[3, :3] = eye.axes[2]
     return clip
 
 
-def frustum(eye: Eye, matrix: FloatArray) -> FloatArray:
+def frustum(eye: Eye, matrix: FloatArray, width: int, height: int) -> FloatArray:
     """Inward unit normals (4, 3) of the side planes through the eye."""
-    half_x = (matrix[0, 2] + 0.5) / matrix[0, 0]
-    half_y = (matrix[1, 2] + 0.5) / matrix[1, 1]
-    long_x, long_y = math.hypot(half_x, 1.0), math.hypot(half_y, 1.0)
-    sides = np.array(
-        [
-            [-1.0 / long_x, 0.0, half_x / long_x],
-            [1.0 / long_x, 0.0, half_x / long_x],
-            [0.0, -1.0 / long_y, half_y / long_y],
-            [0.0, 1.0 / long_y, half_y / long_y],
-        ]
-    )
+    left, up = ((matrix[k, 2] + 0.5) / matrix[k, k] for k in (0, 1))
+    right, down = width / matrix[0, 0] - left, height / matrix[1, 1] - up
+    sides = np.array([[-1.0, 0.0, right], [1.0, 0.0, left], [0.0, -1.0, up], [0.0, 1.0, down]])
+    sides /= np.linalg.norm(sides, axis=1, keepdims=True)
     return np.asarray(sides @ eye.axes)

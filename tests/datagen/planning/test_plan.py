@@ -1,5 +1,7 @@
 """The plan: deterministic, balanced, and split without leaks."""
 
+import hashlib
+import json
 from collections import Counter
 from dataclasses import replace
 from itertools import pairwise
@@ -11,9 +13,12 @@ import pytest
 import trackfeatures as tf
 from datagen.driving.trajectory import TRAJECTORIES
 from datagen.planning.config import CollectConfig, TrackChoice, all_lights
+from datagen.planning.plan import RoundPlan
 from datagen.planning.planner import CAMERA_JITTER, make_plan
 from datagen.planning.tracks import HELD_OUT, choose_tracks
 from simulator.track.catalogue import track_files
+from trackfeatures import UserError
+from trackfeatures.camera import CameraParameters
 
 LIGHTS = all_lights()
 NINE = tuple(TrackChoice(f"track-{i}", f"{i}" * 64) for i in range(9))
@@ -179,3 +184,35 @@ def test_the_plan_hash_depends_on_the_program_version(monkeypatch: pytest.Monkey
     before = plan.hash
     monkeypatch.setattr("datagen.planning.plan.program", lambda: "driverview 99")
     assert plan.hash != before
+
+
+@pytest.mark.parametrize(
+    ("jitter", "expected"),
+    [
+        (False, "ad30b5c19bf71d8922a422f8483efaac163778e46324e917067236352a025861"),
+        (True, "12972512819618551191104cb6edc1cca0ca85d0a043f986f14f3e73ec9d9203"),
+    ],
+)
+def test_a_plan_of_the_default_camera_is_stored_as_before_cameras_had_lenses(
+    jitter: bool, expected: str
+) -> None:
+    """Hashes of what the program of before wrote, so that an unfinished dataset is continued."""
+    tracks = TrackChoice("oval", "0" * 64), TrackChoice("town", "1" * 64)
+    config = CollectConfig(
+        rounds=4, frames=300, seed=3, tracks=tracks, stretch=50, jitter_camera=jitter,
+        lights=("clear", "rain"),
+    )  # fmt: skip
+    plan = make_plan(config).as_json()
+    content = json.dumps([plan["wanted"], plan["rounds"]], sort_keys=True)
+    assert hashlib.sha256(content.encode()).hexdigest() == expected
+
+
+def test_a_plan_with_a_lens_is_read_back() -> None:
+    lens = CameraParameters(
+        matrix=(150.0, 150.0, 140.0, 100.0), distortion="opencv", coefficients=(-0.1, 0.0, 0.0, 0.0)
+    )
+    plan = make_plan(wanted(camera=lens))
+    entry = json.loads(json.dumps(plan.as_json()))["rounds"][0]
+    assert RoundPlan.from_json(entry) == plan.rounds[0]
+    with pytest.raises(UserError, match="--jitter-camera varies the field of view"):
+        wanted(camera=lens, jitter_camera=True)

@@ -56,6 +56,7 @@ def test_plans_of_the_papers_roads_keep_their_hash(tmp_path: Path) -> None:
     require_matching_folder(tmp_path, plan)
 
 
+@pytest.mark.slow
 def test_the_papers_roads_are_recorded_as_before(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -115,3 +115,39 @@ def test_console_geometry_equals_the_pinhole_camera(tmp_path: Path) -> None:
     assert pixel == pytest.approx([140 + focal * 2 / 5, 105 + focal * 1.2 / 5])
     assert beside == pytest.approx([2 * math.sin(0.1), -2 * math.cos(0.1)])
     assert ahead == pytest.approx([10 * math.cos(0.1), 10 * math.sin(0.1)])
+
+
+@pytest.mark.skipif(shutil.which("node") is None, reason="no node")
+def test_console_geometry_equals_the_projection_of_any_camera(tmp_path: Path) -> None:
+    mount = {"x": 1.2, "y": 0.1, "z": 1.1, "pitch_deg": 5.0, "roll_deg": 3.0, "yaw_deg": -4.0}
+    matrix = (700.0, 720.0, 655.0, 340.0)
+    lenses: list[tuple[str, tuple[float, ...]]] = [
+        ("none", ()),
+        ("opencv", (-0.3, 0.1, 0.001, -0.002)),
+        ("opencv", (0.9, 0.3, 0.0003, -0.0004, 0.02, 1.2, 0.5, 0.05)),
+        ("fisheye", (-0.02, 0.005, -0.003, 0.0006)),
+        ("opencv", (-0.5, 0.0, 0.0, 0.0)),  # folds
+    ]
+    cameras = [
+        CameraParameters(1280, 720, matrix=matrix, distortion=kind, coefficients=k, **mount)
+        for kind, k in lenses
+    ]
+    places = [(4.0, -2.5), (8.0, 1.5), (30.0, -4.0), (-3.0, 0.0), (2.4, 2.4)]
+    script = tmp_path / "ask.mjs"
+    script.write_text(
+        f"import {{ project }} from '{(FOLDER / 'geometry.js').as_uri()}';\n"
+        f"const cameras = {json.dumps([camera.as_dict() for camera in cameras])};\n"
+        f"const places = {json.dumps(places)};\n"
+        "const found = cameras.map((camera) => places.map((place) => project(place, camera)));\n"
+        "console.log(JSON.stringify(found));\n"
+    )
+    done = subprocess.run(["node", str(script)], capture_output=True, text=True, check=True)
+    unseen = 0
+    for camera, found in zip(cameras, json.loads(done.stdout), strict=True):
+        expected = camera.project([(*place, -camera.cg_height_m) for place in places]) + 0.5
+        for pixel, wanted in zip(found, expected.tolist(), strict=True):
+            assert (pixel is None) == math.isnan(wanted[0])
+            unseen += pixel is None
+            if pixel is not None:
+                assert pixel == pytest.approx(wanted, abs=1e-6)
+    assert unseen >= 6

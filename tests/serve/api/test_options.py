@@ -18,6 +18,7 @@ HEADERS = {
     "stream_id": "X-Stream-Id",
     "deadline_ms": "X-Deadline-Ms",
     "fov_y": "X-Camera-Fov-Y",
+    "camera": "X-Camera",
 }
 Pairs = Sequence[tuple[str, str]]
 
@@ -95,7 +96,7 @@ def test_a_websocket_takes_them_for_all_images_or_for_one(service: Served) -> No
 @pytest.mark.parametrize(
     ("query", "seen"),
     [
-        ("?fov=60", "'fov'; there are frame_id, stream_id, deadline_ms, fov_y"),
+        ("?fov=60", "'fov'; there are frame_id, stream_id, deadline_ms, fov_y, camera"),
         ("?Fov_Y=60", "'Fov_Y'"),
         ("?x-camera-fov-y=60", "'x-camera-fov-y'"),
         ("?deadline=5", "'deadline'"),
@@ -173,7 +174,7 @@ def test_an_option_beside_the_parameters_is_refused(service: Served, name: str) 
 
 
 def test_unknown_parameters_of_the_inference_protocol_are_refused(service: Served) -> None:
-    known = "there are binary_data_output, frame_id, stream_id, deadline_ms, fov_y"
+    known = "there are binary_data_output, frame_id, stream_id, deadline_ms, fov_y, camera"
     unknown: list[dict[str, Any]] = [{"sequence_id": 1}, {"timeout": 5}, {"Fov_Y": 60}]
     for one in unknown:
         reply = infer(service, **one)
@@ -199,7 +200,7 @@ def test_unknown_parameters_of_the_inference_protocol_are_refused(service: Serve
 
 def test_text_messages_name_what_is_unknown(service: Served) -> None:
     for text, seen in (
-        ('{"fov": 60}', "frame_id, deadline_ms, fov_y"),
+        ('{"fov": 60}', "frame_id, deadline_ms, fov_y, camera"),
         ('{"stream_id": "a"}', "'stream_id'"),
         ('{"fov_y": 60, "fov_y": 70}', "is twice"),
         ('{"deadline_ms": true}', "must be a number"),

@@ -23,8 +23,8 @@ class Eye:
     def project(
         self, points: ArrayLike, body_pose: ArrayLike, view: str = "front"
     ) -> tuple[FloatArray, FloatArray]:
-        matrix = self.parameters.intrinsics()
-        return optics.project(optics.eye_of(self.parameters, body_pose, view), matrix, points)
+        eye = optics.eye_of(self.parameters, body_pose, view)
+        return optics.project(eye, self.parameters, points)
 
 
 @pytest.mark.parametrize("name", ["mountain-pass", "ring-road", "oval"])

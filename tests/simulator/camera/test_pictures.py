@@ -68,7 +68,7 @@ def test_images_of_any_size_show_sky_above_asphalt(road: Road, size: tuple[int, 
     assert picture.shape == (height, width, 3)
     assert picture.dtype == np.uint8
     assert matrix[0, 0] == matrix[1, 1]
-    assert (matrix[0, 2], matrix[1, 2]) == (width / 2, height / 2)
+    assert (matrix[0, 2], matrix[1, 2]) == ((width - 1) / 2, (height - 1) / 2)
     assert 2 * np.degrees(np.arctan(height / 2 / matrix[1, 1])) == pytest.approx(67.5)
     # Blue above, grey asphalt below.
     sky = picture[: height // 8].reshape(-1, 3).mean(axis=0)
@@ -99,9 +99,9 @@ def test_projection_follows_the_mount(road: Road) -> None:
         pixels, depth = camera.project(points, pose)
         focal = camera.intrinsics[0, 0]
     assert depth == pytest.approx([10.0, 10.0, 10.0, -21.0])
-    assert pixels[0] == pytest.approx([140.0, 105.0])
-    assert pixels[1] == pytest.approx([140.0 - focal / 10, 105.0])
-    assert pixels[2] == pytest.approx([140.0, 105.0 - focal / 10])
+    assert pixels[0] == pytest.approx([139.5, 104.5])
+    assert pixels[1] == pytest.approx([139.5 - focal / 10, 104.5])
+    assert pixels[2] == pytest.approx([139.5, 104.5 - focal / 10])
     assert np.isnan(pixels[3]).all()
 
 

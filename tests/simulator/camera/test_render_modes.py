@@ -35,8 +35,8 @@ def rays(camera: Camera, pose: FloatArray, view: str = "front") -> tuple[FloatAr
     """The eye (3,), and each pixel's ray vector per metre of depth (height, width, 3)."""
     eye = eye_of(camera.parameters, pose, view)
     matrix = camera.intrinsics
-    u = (np.arange(camera.width) + 0.5 - matrix[0, 2]) / matrix[0, 0]
-    v = (np.arange(camera.height) + 0.5 - matrix[1, 2]) / matrix[1, 1]
+    u = (np.arange(camera.width) - matrix[0, 2]) / matrix[0, 0]
+    v = (np.arange(camera.height) - matrix[1, 2]) / matrix[1, 1]
     right, up, ahead = eye.axes
     return eye.place, ahead + u[None, :, None] * right - v[:, None, None] * up
 
@@ -265,9 +265,10 @@ def test_calibration_matches_the_projection(road: Road, view: str) -> None:
 def test_intrinsics_follow_size_and_field_of_view(size: tuple[int, int], fov: float) -> None:
     width, height = size
     matrix = CameraParameters(width, height, fov).intrinsics()
-    up, down = (np.arctan((v - matrix[1, 2]) / matrix[1, 1]) for v in (0.0, height))
+    up, down = (np.arctan((v - matrix[1, 2]) / matrix[1, 1]) for v in (-0.5, height - 0.5))
     assert np.degrees(down - up) == pytest.approx(fov)
-    assert (matrix[0, 2], matrix[1, 2], matrix[0, 0]) == (width / 2, height / 2, matrix[1, 1])
+    centre = ((width - 1) / 2, (height - 1) / 2)
+    assert (matrix[0, 2], matrix[1, 2], matrix[0, 0]) == (*centre, matrix[1, 1])
 
 
 def test_colourise_maps_depth_and_class_to_colours(road: Road) -> None:

@@ -101,12 +101,12 @@ def test_calibration_projects_a_point_of_the_body_to_its_pixel() -> None:
     env.close()
     focal = 24.0 / math.tan(math.radians(67.5 / 2))
     np.testing.assert_allclose(
-        calibration["intrinsics"], [[focal, 0.0, 32.0], [0.0, focal, 24.0], [0.0, 0.0, 1.0]]
+        calibration["intrinsics"], [[focal, 0.0, 31.5], [0.0, focal, 23.5], [0.0, 0.0, 1.0]]
     )
     # 10 m before and 1.2 m below the eye: in the middle column, below the horizon.
     point = np.array([11.0, 0.0, 0.0, 1.0])
     u, v, depth = calibration["intrinsics"] @ (calibration["front"] @ point)[:3]
-    assert (u / depth, v / depth, depth) == pytest.approx((32.0, 24.0 + focal * 0.12, 10.0))
+    assert (u / depth, v / depth, depth) == pytest.approx((31.5, 23.5 + focal * 0.12, 10.0))
     assert (calibration["rear:depth"] @ point)[2] == pytest.approx(-10.0)
 
 

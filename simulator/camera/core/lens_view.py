@@ -1,0 +1,102 @@
+"""Pictures through a lens with distortion: a pinhole view that covers the lens is drawn, and each
+pixel of the picture looked up in it. Pixels, centres at whole numbers.
+"""
+
+from dataclasses import dataclass, replace
+from math import ceil, cos, radians
+from typing import Any, Self
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from simulator.arrays import FloatArray
+from simulator.camera.core.render_modes import CLASSES
+from trackfeatures.camera import CameraParameters
+
+MAX_ANGLE_DEG = 72.0
+"""From the optical axis. One pinhole view covers no more; beyond it a picture is black."""
+SHARPNESS = 1.5
+"""Pixels of the drawn view per pixel of the picture, along a line, where the lens enlarges most."""
+SAMPLES = 2  # looked up along each side of a pixel and averaged: a lens makes some places smaller
+MARGIN_PX = 2.0
+_OUTSIDE = -1e4  # of every view, px
+
+Picture = NDArray[Any]
+
+
+@dataclass(frozen=True)
+class LensView:
+    """The view to draw for a camera with distortion, and where each of the camera's pixels is in
+    it: for colours (2, SAMPLES H, SAMPLES W), for depth and class (2, H, W), px."""
+
+    drawn: CameraParameters
+    colour_places: NDArray[np.float32]
+    label_places: NDArray[np.float32]
+
+    @classmethod
+    def of(cls, camera: CameraParameters, max_size: int) -> Self:
+        """For a view of at most `max_size` px a side."""
+        rays, fine = (_seen(camera.rays(_grid(camera, samples))) for samples in (1, SAMPLES))
+        drawn = _cover(camera, fine, max_size)
+        k = drawn.intrinsics()
+        shapes = (camera.height * SAMPLES, camera.width * SAMPLES), (camera.height, camera.width)
+        places = [
+            np.nan_to_num((each @ k.T)[:, :2].T.reshape(2, *shape), nan=_OUTSIDE).astype(np.float32)
+            for each, shape in zip((fine, rays), shapes, strict=True)
+        ]
+        return cls(drawn, *places)
+
+    def colours(self, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """The lens's picture (H, W, 3) from the drawn one."""
+        u, v = self.colour_places
+        found = cv2.remap(picture, u, v, cv2.INTER_LINEAR)
+        height, width = self.label_places.shape[1:]
+        return np.asarray(
+            cv2.resize(found, (width, height), interpolation=cv2.INTER_AREA), np.uint8
+        )
+
+    def labels(self, labels: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Depth and class (H, W, 2) from the drawn ones; infinite and sky where nothing is seen."""
+        u, v = self.label_places
+        found = cv2.remap(
+            labels,
+            u,
+            v,
+            cv2.INTER_NEAREST,
+            borderMode=cv2.BORDER_CONSTANT,
+            borderValue=(float("inf"), float(CLASSES.index("sky"))),
+        )
+        return np.asarray(found, np.float32)
+
+
+def _grid(camera: CameraParameters, samples: int) -> FloatArray:
+    """Places (N, 2) of `samples` times `samples` points a pixel, row by row."""
+    columns, rows = (
+        (np.arange(size * samples) + 0.5) / samples - 0.5 for size in (camera.width, camera.height)
+    )
+    return np.stack(np.meshgrid(columns, rows), -1).reshape(-1, 2)
+
+
+def _seen(rays: FloatArray) -> FloatArray:
+    """`rays` (N, 3) with z = 1, NaN beyond `MAX_ANGLE_DEG`."""
+    limit = 1.0 / cos(radians(MAX_ANGLE_DEG))
+    return np.where(np.linalg.norm(rays, axis=1, keepdims=True) <= limit, rays, np.nan)
+
+
+def _cover(camera: CameraParameters, rays: FloatArray, max_size: int) -> CameraParameters:
+    """The camera without distortion that sees all of `rays`, of the places of
+    `_grid` with SAMPLES, no coarser than the lens."""
+    low, high = np.nanmin(rays[:, :2], axis=0), np.nanmax(rays[:, :2], axis=0)
+    flat = rays[:, :2].reshape(camera.height * SAMPLES, camera.width * SAMPLES, 2)
+    steps = [np.linalg.norm(np.diff(flat, axis=axis), axis=-1) for axis in (0, 1)]
+    focal = SHARPNESS / (SAMPLES * min(np.nanmin(step) for step in steps))
+    focal = min(focal, float((max_size - 2 * MARGIN_PX - 1) / (high - low).max()))
+    width, height = (ceil(size * focal + 2 * MARGIN_PX) for size in (high - low))
+    centre = MARGIN_PX - low * focal
+    return replace(
+        camera.undistorted(),
+        width=width,
+        height=height,
+        matrix=(focal, focal, float(centre[0]), float(centre[1])),
+    )
