@@ -29,6 +29,7 @@ def command(*arguments: str) -> Any:
     return json.loads(done.stdout) if "--json" in arguments else None
 
 
+@pytest.mark.extended
 def test_collect_train_evaluate_serve_and_drive(tmp_path: Path) -> None:
     data, run = str(tmp_path / "data"), str(tmp_path / "run")
     collected = command(

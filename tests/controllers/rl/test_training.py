@@ -221,6 +221,7 @@ def test_a_wrong_option_is_one_error_line(
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.extended
 @pytest.mark.slow
 def test_ctrl_c_leaves_a_run_that_continues(tmp_path: Path) -> None:
     out = tmp_path / "run"

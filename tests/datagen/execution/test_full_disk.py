@@ -78,6 +78,7 @@ def test_a_full_disk_leaves_no_file_of_the_round(
     assert not list(tmp_path.glob("rounds/*"))
 
 
+@pytest.mark.extended
 def test_a_write_error_gives_one_line_and_keeps_finished_rounds(collected: Path) -> None:
     """A limit on the file size stands in for a full disk: the same write fails."""
     lost = collected / "rounds" / "round-001.mcap"

@@ -147,6 +147,7 @@ def wait_for(found: Callable[[], object], process: subprocess.Popen[str]) -> Non
         time.sleep(0.02)
 
 
+@pytest.mark.extended
 def test_a_process_without_heartbeat_is_replaced(tmp_path: Path) -> None:
     """A process stopped by SIGSTOP is alive but sends no messages."""
     stopped: list[int] = []

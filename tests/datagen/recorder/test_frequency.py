@@ -27,6 +27,7 @@ def test_the_control_rate_is_at_least_20_hz(hertz: int) -> None:
     assert (entry.steps_per_frame == 1) == (hertz >= CONTROL_HZ)
 
 
+@pytest.mark.extended
 def test_frames_at_4_hz_equal_every_fifth_frame_at_20_hz(tmp_path: Path) -> None:
     """The frame rate changes which steps are recorded, not how the car drives."""
     for name, options in {"all": ("--frames", "50"), "few": ("--frames", "10")}.items():

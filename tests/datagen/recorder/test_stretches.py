@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from datagen.planning.config import CollectConfig, TrackChoice, all_lights
 from datagen.planning.planner import make_plan
@@ -66,6 +67,7 @@ def test_scenery_and_light_change_where_a_stretch_ends(tmp_path: Path) -> None:
     assert replay(folder, 1)[1] == []
 
 
+@pytest.mark.extended
 def test_scenes_repeat_in_order(tmp_path: Path) -> None:
     folder = tmp_path / "data"
     options = ("--rounds", "1", "--frames", "24", "--tracks", "oval", "--lights", "clear,fog")

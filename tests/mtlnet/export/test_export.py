@@ -130,6 +130,7 @@ def test_the_served_graph_is_one_of_one_image() -> None:
     assert list(read_graph(run, read_card(run)).input(0).shape) == [1, 210, 280, 3]
 
 
+@pytest.mark.extended
 @pytest.mark.slow
 def test_onnx_bf16_halves_the_weights(trained: Path, dataset: Path, tmp_path: Path) -> None:
     exact = export_model(trained, "onnx", "f32", dataset, tmp_path / "f32", frames=4)

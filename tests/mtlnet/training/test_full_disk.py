@@ -87,7 +87,16 @@ def fail_writing(monkeypatch: pytest.MonkeyPatch, what: str) -> None:
         monkeypatch.setattr(f"mtlnet.{module}.atomic_write", write)
 
 
-@pytest.mark.parametrize("what", ["curves", "checkpoint", "publish", "graph"])
+@pytest.mark.parametrize(
+    "what",
+    [
+        "checkpoint",
+        *(
+            pytest.param(each, marks=pytest.mark.extended)
+            for each in ("curves", "publish", "graph")
+        ),
+    ],
+)
 def test_a_run_can_be_resumed_after_the_disk_was_full(
     dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, what: str
 ) -> None:

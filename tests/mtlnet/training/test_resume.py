@@ -99,6 +99,7 @@ mtlnet.training.run.train(TrainConfig(data, out, **given), None)
 """
 
 
+@pytest.mark.extended
 def test_a_run_killed_while_saving_resumes_from_the_checkpoint_before(
     dataset: Path, tmp_path: Path
 ) -> None:

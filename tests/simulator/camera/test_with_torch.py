@@ -3,6 +3,8 @@
 import subprocess
 import sys
 
+import pytest
+
 RENDER_THEN_TRAIN = """
 from simulator.camera import Camera, Light
 from trackfeatures.camera import CameraParameters
@@ -22,6 +24,7 @@ print(picture.shape, bool((weight < 1).all()))
 """
 
 
+@pytest.mark.extended
 def test_torch_trains_in_a_process_that_has_rendered() -> None:
     done = subprocess.run(
         [sys.executable, "-c", RENDER_THEN_TRAIN], capture_output=True, text=True, timeout=600

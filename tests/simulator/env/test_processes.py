@@ -123,6 +123,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.extended
 @pytest.mark.slow
 def test_vector_environments_draw_the_same_in_every_kind_of_process(tmp_path: Path) -> None:
     script = tmp_path / "vectors.py"

@@ -10,6 +10,7 @@ import pytest
 BENCHMARK = Path(__file__).parents[3] / "benchmarks" / "replay.py"
 
 
+@pytest.mark.extended
 @pytest.mark.slow
 def test_random_episodes_are_bit_identical_in_another_process_and_vectorised(
     tmp_path: Path,
