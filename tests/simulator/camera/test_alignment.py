@@ -41,8 +41,14 @@ def _errors(camera: Camera, bare: Camera, pose: FloatArray, s: float) -> FloatAr
     difference = camera.render(pose).astype(np.float64) - bare.render(pose)
     grey = np.abs(difference).sum(axis=2)
     distances = s + np.arange(NEAREST_M, FARTHEST_M + 2.0, 0.5)
+    lines = []
+    for y in road.markings_y:
+        place = road.track.at(s + np.arange(0.0, 3 * FARTHEST_M, 0.5), y)
+        lines.append(camera.project(np.stack([place.x, place.y, place.z], axis=1), pose)[0])
     found = []
-    for y in (road.markings_y[0], road.markings_y[-1]):
+    for line in (0, len(lines) - 1):
+        y = road.markings_y[line]
+        others = np.concatenate([each for k, each in enumerate(lines) if k != line])
         place = road.track.at(distances, y)
         points = np.stack([place.x, place.y, place.z], axis=1)
         pixels, depth = camera.project(points, pose)
@@ -56,6 +62,10 @@ def _errors(camera: Camera, bare: Camera, pose: FloatArray, s: float) -> FloatAr
             inside = high[0] < camera.width and high[1] < camera.height
             if not (low.min() > 0 and inside):
                 continue
+            own = np.abs(np.arange(len(lines[line])) - (k + NEAREST_M / 0.5)) > 8
+            beside = np.concatenate([others, lines[line][own]])
+            if np.nanmin(np.hypot(*(beside - pixels[k]).T)) < reach + 1.5:
+                continue  # the profile would hold the paint of another place
             profile = _profile(grey, pixels[k], normal, reach)
             offset, paint = profile.T
             seen = paint.max() > 12.0
