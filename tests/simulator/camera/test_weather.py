@@ -188,7 +188,7 @@ def marking_contrast(kind: str, seed: int) -> float:
 def _along(camera: Camera, grey: FloatArray, pose: FloatArray, s: float, y: float) -> FloatArray:
     place = road().track.at(s + np.arange(4.0, 25.0, 0.25), y)
     pixels, _ = camera.project(np.stack([place.x, place.y, place.z], axis=1), pose)
-    u, v = np.floor(pixels).astype(int).T
+    u, v = np.rint(pixels).astype(int).T
     shown = (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
     return np.asarray(grey[v[shown], u[shown]])
 
