@@ -18,6 +18,7 @@ from datagen.recording.labels import read_labels
 from datagen.recording.mcap.index import MappedMessages, RoundIndex, open_round
 from datagen.recording.mcap.protobuf_wire import points_field
 from datagen.recording.schema import topics
+from datagen.recording.schema.polylines import CORNER_PX
 from tests.datagen.conftest import Samples
 
 SCHEMAS = {
@@ -61,7 +62,8 @@ def test_the_official_reader_finds_every_topic_at_its_rate(
     assert list(seen["/sensors"][5].range) == list(frames[5].sensors.range)
     assert len(seen["/traffic"][0].entities) == 3  # the ego car and two others
     line = seen["/camera/front/annotations"][2].points[0]
-    assert np.allclose([(p.x, p.y) for p in line.points], frames[2].markings[0])
+    from_corner = np.asarray(frames[2].markings[0]) + CORNER_PX
+    assert np.allclose([(p.x, p.y) for p in line.points], from_corner)
 
 
 def test_labels_are_exact_and_absent_ones_unset(samples: Samples, tmp_path: Path) -> None:
