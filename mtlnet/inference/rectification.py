@@ -27,9 +27,15 @@ LEAST_SHOWN = 0.25
 """Share of the model's rows, and of its columns, that an image must show."""
 LEAST_ROAD = 0.1
 """Share of the model's rows below the horizon that an image must show."""
+COMMON_LANE_M = 3.6
+SEEN_LANES_M = (2.75, 4.4)
+"""Widths of lanes in training, m beside the model's camera. A camera at a height from which a
+common lane looks wider or narrower is out of distribution."""
 BORDER_LEVEL = 128
 """Grey level of what an image does not show: nearly 0 to the network, as its padding."""
 TOLERANCE = 0.01
+HEIGHT_SCORE = 2.0
+"""Least `ood_score` of an image of a camera that is too high or too low."""
 OUTSIDE = -1e4  # of every image, px
 KEPT_MAPS = 16
 
@@ -123,6 +129,7 @@ class Rectification:
 
         Distances and their standard deviations change, which hold that of the source's height too;
         what is absent stays so. The angle needs no change: the rectified view looks along the car.
+        All images of a camera too high or too low (`SEEN_LANES_M`) are out of distribution.
         """
         changed = outputs.copy()
         parts = split_outputs(changed)
@@ -138,6 +145,9 @@ class Rectification:
             )
             own = self.scale * parts.std[:, :-1]
             parts.std[:, :-1] = np.hypot(own, np.nan_to_num(from_height))
+        narrowest, widest = SEEN_LANES_M
+        if parts.ood_score is not None and not narrowest <= COMMON_LANE_M / self.scale <= widest:
+            parts.ood_score[:] = np.maximum(parts.ood_score, HEIGHT_SCORE)
         return changed
 
     def labels(self, distances: NDArray[np.float32], angle: NDArray[np.float32]) -> Metres:

@@ -33,6 +33,7 @@ pytestmark = pytest.mark.slow
 USES = """
 simulator tracks
 simulator tracks plot oval
+simulator tracks export random:7 --out road.toml
 simulator centreline oval --out oval.csv
 simulator snapshot oval --light clear --out sheet.png
 simulator link --header link.h
@@ -60,9 +61,10 @@ controllers tune --controllers lqr --tracks oval --budget 2 --steps 3 --out tune
 controllers train --track oval --steps 20 --evaluate-every 20 --out actor
 controllers record --model run --rounds 2 --frames 8 --tracks oval --workers 1 --out driven
 """
-SERVERS = {("simulator", "watch"), ("serve",)}
+SERVERS = {("simulator", "watch"), ("mtlnet", "label"), ("serve",)}
 WITHOUT = {
     ("mtlnet", "predict"),  # below, on an image
+    ("mtlnet", "calibrate"),  # needs a film of a drive
     ("serve", "reload"), ("serve", "restart"),  # of a running service with workers
     ("serve", "ray"),  # needs Ray
     ("controllers", "demo"),  # runs the commands above, for minutes
@@ -143,6 +145,11 @@ def test_prediction_and_servers_work_from_the_wheel(commands: Path, folder: Path
     image = save_frame(commands, folder)
     run(commands, folder, "mtlnet", "predict", "--model", "run", image.name)
     with serving(commands, folder, "simulator", "watch", "--track", "oval") as url:
+        assert b"<html" in get(url)
+    (folder / "pictures").mkdir()
+    shutil.copy(image, folder / "pictures")
+    (folder / "pictures" / "camera.yaml").write_text("width: 280\nheight: 210\n")
+    with serving(commands, folder, "mtlnet", "label", "pictures", "--no-model") as url:
         assert b"<html" in get(url)
     with serving(commands, folder, "serve", "--model", "run") as url, Client(url) as client:
         client.wait_until_ready(120.0)

@@ -152,7 +152,9 @@ class FakeFrames:
 
     def __init__(self, labels: Labels) -> None:
         self.labels = labels
-        self.rounds = [SimpleNamespace(track=track, track_group=track) for track in ("oval", "town")]
+        self.rounds = [
+            SimpleNamespace(track=track, track_group=track) for track in ("oval", "town")
+        ]
 
 
 def test_percentiles_equal_those_of_numpy() -> None:

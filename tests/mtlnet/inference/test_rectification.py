@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 import trackfeatures as tf
 from mtlnet.inference.image_decoding.errors import ImageError
-from mtlnet.inference.prediction import split_outputs
+from mtlnet.inference.prediction import decode_outputs, split_outputs
 from mtlnet.inference.rectification import BORDER_LEVEL, Rectification, read_camera
 from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
@@ -186,6 +186,20 @@ def test_the_heights_uncertainty_widens_distances() -> None:
     beside = np.array([2.0, 1.0, 0.0, 0.0, 0.0, 0.5])  # m; the last: lane centre
     np.testing.assert_allclose(std[0, :6], np.hypot(own, 0.05 * beside), rtol=1e-5)
     assert std[0, 6] == pytest.approx(0.01)
+
+
+@pytest.mark.parametrize(
+    ("height_m", "outside"), [(0.97, True), (1.0, False), (1.22, False), (1.56, False), (1.6, True)]
+)
+def test_a_camera_too_high_or_too_low_is_out_of_distribution(
+    height_m: float, outside: bool
+) -> None:
+    """A lane of 3.6 m must look 2.75 to 4.4 m wide from 1.2 m: from 0.98 to 1.57 m it does."""
+    other = CameraParameters(z=height_m - CameraParameters.cg_height_m)
+    answered = Rectification(other, MODEL).outputs(
+        outputs([-1.8, 1.8, np.nan, np.nan, np.nan], 0.0)
+    )
+    assert decode_outputs(answered[0]).out_of_distribution is outside
 
 
 def test_labels_for_the_model_are_the_answers_turned_round() -> None:
