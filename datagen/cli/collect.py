@@ -92,6 +92,13 @@ CameraFile = Annotated[
         help="camera.yaml (ours, OpenCV's, ROS's or Kalibr's): record through that lens and mount.",
     ),
 ]
+Prefix = Annotated[
+    str,
+    typer.Option(
+        help="First part of the rounds' names; give each of several collections its own, and "
+        "another seed, to merge them."
+    ),
+]
 ShardOf = Annotated[
     str, typer.Option(help="2/4: only the second of four parts, for batch systems.")
 ]
@@ -121,6 +128,7 @@ def collect(
     camera: CameraFile = None,
     jitter_camera: JitterCamera = CollectConfig.jitter_camera,
     roads: Roads = CollectConfig.roads,
+    prefix: Prefix = CollectConfig.prefix,
     shard: ShardOf = "",
     executor: ExecutorName = "local",
     dry_run: DryRun = False,
@@ -150,6 +158,7 @@ def collect(
         camera=CameraParameters() if camera is None else read_camera(camera, CameraParameters()),
         jitter_camera=jitter_camera,
         roads=roads,
+        prefix=prefix,
         split=split,
     )
     part = Shard.parse(shard) if shard else None

@@ -19,7 +19,7 @@ from datagen.execution.lock import folder_lock, setup_lock
 from datagen.execution.process_pool import ProcessPool
 from datagen.execution.progress import CollectProgress, CollectResult, ProgressCallback
 from datagen.execution.retry import Failure, OnMessage
-from datagen.planning.config import CollectConfig
+from datagen.planning.config import LATER
 from datagen.planning.plan import Plan, RoundPlan, Shard, program
 from datagen.recorder.job import Job
 from datagen.recording.errors import DatasetError
@@ -204,9 +204,8 @@ def foreign_files(folder: Path, plan: Plan) -> list[Path]:
 
 def _differences(found: dict[str, Any], driver: Mapping[str, str], plan: Plan) -> str:
     """The options that differ, as text."""
-    # A plan of before there were other roads says nothing of them.
-    found = {"roads": CollectConfig.roads, **found}
-    wanted = json.loads(json.dumps({"roads": CollectConfig.roads, **plan.config.as_dict()}))
+    found = LATER | found
+    wanted = json.loads(json.dumps(LATER | plan.config.as_dict()))
     named = [
         f"{name}: {_short(found.get(name))} there, {_short(value)} asked for"
         for name, value in wanted.items()

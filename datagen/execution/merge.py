@@ -150,7 +150,7 @@ def _require_one_plan(plans: Sequence[dict[str, Any]], folders: Sequence[Path]) 
         if plan["hash"] != plans[0]["hash"]:
             raise DatasetError(
                 f"{folder} was begun with another plan than {folders[0]}; merge shards that were "
-                "started with the same options, or rounds of other names and another --seed"
+                "started with the same options, or collections of another --prefix and --seed"
             )
 
 

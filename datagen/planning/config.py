@@ -8,6 +8,7 @@ import trackfeatures as tf
 from datagen.recording.names import CODECS, UNSEEN
 from trackfeatures.camera import CameraParameters, stored
 from trackfeatures.errors import UserError
+from trackfeatures.names import require_name
 
 DATASET_FOLDER = Path("datasets/default")
 UNSEEN_FOLDER = Path("datasets/unseen")
@@ -61,15 +62,15 @@ class CollectConfig:
     """Vary height, pitch and field of view of the camera a little from round to round."""
     roads: str = "paper"
     """"paper": lanes of 4.0 m and the paint of the tracks; "varied": drawn for each round."""
+    prefix: str = "round"
+    """First part of the rounds' names: collections of different ones can be merged."""
     split: str = ""
     """"unseen": all rounds are for tests on tracks without training data. Else train and test."""
 
     def as_dict(self) -> dict[str, Any]:
-        """The options by name; those of the paper's roads as before there were others."""
+        """The options by name; `LATER` ones only where they are not at their default."""
         options = asdict(self, dict_factory=stored)
-        if self.roads == "paper":
-            del options["roads"]
-        return options
+        return {k: v for k, v in options.items() if k not in LATER or v != LATER[k]}
 
     def __post_init__(self) -> None:
         self._check_numbers()
@@ -123,5 +124,10 @@ class CollectConfig:
         ):
             if unknown := set(given) - set(known):
                 raise UserError(f"unknown {name} {min(unknown)!r}; choose {', '.join(known)}")
+        require_name(self.prefix, "prefix of the rounds' names")
         if self.split not in ("", UNSEEN):
             raise UserError(f"there is no split {self.split!r} to collect; give {UNSEEN} or none")
+
+
+LATER = {"roads": CollectConfig.roads, "prefix": CollectConfig.prefix}
+"""Options that older plans do not have, with their defaults."""

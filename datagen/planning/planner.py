@@ -53,7 +53,7 @@ def make_plan(config: CollectConfig, forecast: Forecast | None = None) -> Plan:
     digits = max(3, len(str(count - 1)))
     rounds = tuple(
         RoundPlan(
-            id=f"round-{number:0{digits}d}",
+            id=f"{config.prefix}-{number:0{digits}d}",
             seed=_first_seed(config) + number,
             split=splits[number],
             track=tracks[number].name,

@@ -13,10 +13,13 @@ import pytest
 import trackfeatures as tf
 from datagen.execution.lock import folder_lock
 from datagen.execution.merge import merge
+from datagen.planning.config import CollectConfig
 from datagen.planning.plan import Shard
+from datagen.planning.planner import make_plan
+from datagen.planning.tracks import choose_tracks
 from datagen.recording import Dataset
 from datagen.recording.errors import DatasetError
-from datagen.recording.folder import read_states
+from datagen.recording.folder import prepare, read_states
 from datagen.recording.integrity.verify import verify
 from tests.datagen.commands import datagen, datagen_here, make_small_plan
 
@@ -89,6 +92,23 @@ def test_folders_of_shards_are_merged(
     assert (out / "manifest.json").read_text() == (whole / "manifest.json").read_text()
     assert verify(out, "full").ok
     assert not (out / ".partial").exists()
+
+
+def test_collections_of_another_prefix_and_seed_are_one_plan(tmp_path: Path) -> None:
+    tracks = choose_tracks(("oval",), None)
+    for seed, prefix in ((1, "a"), (2, "b"), (3, "a")):
+        config = CollectConfig(2, 3, seed=seed, prefix=prefix, tracks=tracks)
+        prepare(tmp_path / prefix / str(seed))
+        plan = json.dumps(make_plan(config).as_json())
+        (tmp_path / prefix / str(seed) / "plan.json").write_text(plan)
+    with pytest.raises(DatasetError, match="no folder has a finished round"):
+        merge([tmp_path / "a" / "1", tmp_path / "b" / "2"], tmp_path / "both")
+    entries = json.loads((tmp_path / "both" / "plan.json").read_text())["rounds"]
+    assert sorted(entry["id"] for entry in entries) == ["a-000", "a-001", "b-000", "b-001"]
+    with pytest.raises(DatasetError, match="another --prefix and --seed"):
+        merge([tmp_path / "a" / "1", tmp_path / "a" / "3"], tmp_path / "same")
+    with pytest.raises(tf.UserError, match="prefix of the rounds' names"):
+        CollectConfig(prefix="../a", tracks=tracks)
 
 
 def test_merge_refuses_folders_of_other_plans_and_damaged_rounds(
