@@ -237,9 +237,6 @@ def predict_command(
     _print_model(model)
     loaded = _load(model, engine, precision)
     known = loaded.card.camera
-    lens: Lens = fov_y_deg
-    if camera is not None and not own:
-        lens = Rectification(read_camera(camera, known), known)
     with command.progress_bar() as bar:
         task = bar.add_task("predicting", total=None)
 
@@ -251,6 +248,9 @@ def predict_command(
                 command.printable(line), markup=False, highlight=False, soft_wrap=True
             )
 
+        lens: Lens = fov_y_deg
+        if camera is not None and not own:
+            lens = Rectification(read_camera(camera, known, note), known)
         left_out: InputsLeftOut | None = None
         try:
             predictions = predict_files(
