@@ -55,11 +55,11 @@ system:
 demo: $(READY) ## collect, train, evaluate, serve, ask, report: in 17 minutes on two cores
 	$(BIN)/controllers demo --out demo
 
-# One process more than cores, for many tests wait; four at most: each takes 1 to 2 GB. A file's tests
+# Two processes a core, for many tests wait; four at most: each takes 1 to 2 GB. A file's tests
 # stay in one process, for they share what is costly to make; xdist keeps their order (tests/conftest.py).
 # What measures time comes after them, when the cores are free. A process that dies ends the run: xdist
 # 3.8 would start another, hand out the dead one's finished files again, and wait for ever (its issue 1378).
-PROCESSES := $(shell cores=$$(nproc 2>/dev/null || echo 1); echo $$((cores < 3 ? cores + 1 : 4)))
+PROCESSES := $(shell cores=$$(nproc 2>/dev/null || echo 1); echo $$((cores < 2 ? 2 : 4)))
 PARALLEL := --numprocesses $(PROCESSES) --dist loadfile --no-loadscope-reorder --max-worker-restart 0
 
 test: $(READY) ## all checks and tests but the extended ones

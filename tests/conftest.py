@@ -5,6 +5,7 @@ import signal
 import subprocess
 from contextlib import suppress
 from importlib.util import find_spec
+from math import inf
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +27,8 @@ def pytest_configure() -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Files with slow tests first, so that no process is left with one at the end.
+    """Files with slow tests first, so that no process is left with one at the end. They compute,
+    and the service's tests mostly wait: the two kinds take turns, so that the cores stay busy.
 
     Tests of contacts are skipped where PyBullet is not installed.
     """
@@ -35,8 +37,13 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         for item in items:
             if item.get_closest_marker("contacts"):
                 item.add_marker(skip)
-    slow = {item.path for item in items if item.get_closest_marker("slow")}
-    items.sort(key=lambda item: ("e2e" not in item.path.parts, item.path not in slow))
+    slow = list(dict.fromkeys(item.path for item in items if item.get_closest_marker("slow")))
+    slow.sort(key=lambda path: "e2e" not in path.parts)
+    paths = dict.fromkeys(item.path for item in items if item.path not in slow)
+    waiting = [path for path in paths if "serve" in path.parts]
+    place = {path: 2 * number for number, path in enumerate(slow)}
+    place |= {path: 2 * number + 1 for number, path in enumerate(waiting)}
+    items.sort(key=lambda item: place.get(item.path, inf))
 
 
 @pytest.hookimpl(optionalhook=True)  # of pytest-xdist

@@ -14,6 +14,7 @@ import trackfeatures as tf
 from datagen.recording import Frames
 from datagen.recording.labels import Labels
 from datagen.recording.round_metadata import RoundInfo
+from mtlnet.inference.prediction import split_outputs
 from mtlnet.inference.rectification import Rectification
 from trackfeatures.camera import CameraParameters
 from trackfeatures.measurement import LineOffsets
@@ -35,12 +36,19 @@ def model_labels(frames: Frames) -> Labels:
 
 
 def car_outputs(outputs: NDArray[np.float32], frames: Frames) -> NDArray[np.float32]:
-    """A model's outputs (N, 9 to 22) for `frames` in metres of the cars that the rounds show."""
+    """A model's outputs (N, 9 to 22) for `frames` in metres of the cars that the rounds show.
+
+    The height of a round's camera makes no frame out of distribution: it was drawn together with
+    the width of the lanes.
+    """
     changed, of_round = outputs.copy(), frames.labels.round
     for number, info in moved_rounds(frames):
         rows = np.flatnonzero(of_round == number)
         rectification = Rectification(info.label_camera, frames.camera)
         changed[rows] = rectification.outputs(outputs[rows])
+    score = split_outputs(outputs).ood_score
+    if score is not None:
+        split_outputs(changed).ood_score[:] = score  # type: ignore[index]  # both have it
     return changed
 
 
