@@ -11,6 +11,8 @@ from datagen.recording import Dataset, Frames
 from mtlnet.data.loader import Loader
 from mtlnet.data.model_labels import camera_scales, car_outputs, model_labels
 from mtlnet.data.road_ahead import lane_beside
+from mtlnet.inference.prediction import split_outputs
+from mtlnet.inference.uncertainty import COLUMNS
 from tests.mtlnet.conftest import write_dataset
 from trackfeatures.camera import CameraParameters
 
@@ -62,6 +64,14 @@ def test_training_and_answering_are_inverse(high: Frames) -> None:
     # Coded values are float32: 1e-7 of a range of 5.5 m.
     assert distances[both] == pytest.approx(truth[both], abs=2e-5)
     assert angle == pytest.approx(high.labels.angle, abs=1e-6)
+
+
+def test_a_recorded_rounds_height_is_no_reason_for_doubt(high: Frames) -> None:
+    """A camera file of this height, 1.8 m, would be: a lane of 3.6 m looks 2.4 m wide."""
+    outputs = np.full((len(high), 9 + COLUMNS), 0.5, np.float32)
+    score = split_outputs(car_outputs(outputs, high)).ood_score
+    assert score is not None
+    assert score == pytest.approx(np.full(len(high), 0.5))
 
 
 def test_the_lane_beside_is_as_wide_as_it_looks(high: Frames) -> None:
