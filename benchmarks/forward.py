@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 from benchmarks.material.servers import model
 from mtlnet.export.int8 import quantise
 from mtlnet.export.openvino_graph import build_graph
-from mtlnet.inference.engine import best_precision, read_graph
+from mtlnet.inference.engine import best_precision, openvino_core, read_graph
 from mtlnet.inference.model_card import WEIGHTS, read_card
 from mtlnet.model.network import load_network
 
@@ -64,9 +64,6 @@ def openvino_pass(
     run: Path, images: NDArray[np.uint8] | None, *, uncertainty: bool = False
 ) -> Forward:
     """The OpenVINO graph in bf16, or in int8 calibrated on `images`."""
-    import openvino
-
-    core = openvino.Core()
     if uncertainty:
         graph = read_graph(run, read_card(run))
     else:
@@ -74,12 +71,12 @@ def openvino_pass(
     if images is not None:
         graph = quantise(graph, images)
     options = {
-        "INFERENCE_PRECISION_HINT": best_precision(core),
+        "INFERENCE_PRECISION_HINT": best_precision(),
         "INFERENCE_NUM_THREADS": 1,
         "NUM_STREAMS": 1,
         "ENABLE_CPU_PINNING": False,
     }
-    request = core.compile_model(graph, "CPU", options).create_infer_request()
+    request = openvino_core().compile_model(graph, "CPU", options).create_infer_request()
     return lambda image: request.infer([image[None]])
 
 

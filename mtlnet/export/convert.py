@@ -266,9 +266,7 @@ def check_export(
 
     The images are run in batches, but for int8, whose graph takes one.
     """
-    import openvino
-
-    computed = "f32" if precision == "f32" else best_precision(openvino.Core())
+    computed = "f32" if precision == "f32" else best_precision()
     found = run_graph(path, computed, images, 1 if precision == "int8" else CHECK_BATCH)
     difference = np.abs(found[:, :OUTPUTS] - predict_images(network, images))
     return {

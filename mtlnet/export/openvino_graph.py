@@ -15,6 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import nn
 
+from mtlnet.inference.engine import openvino_core
 from mtlnet.inference.graph import Nodes, convolution, model_of, network_nodes
 from mtlnet.inference.uncertainty import UncertaintyHead
 from mtlnet.model.network import Network
@@ -80,11 +81,9 @@ def run_graph(
     `graph`: an OpenVINO model, or a path; `batch`: images at once. Raises RuntimeError when
     OpenVINO cannot load it.
     """
-    import openvino
-
     options = {"INFERENCE_PRECISION_HINT": precision, "NUM_STREAMS": 1}
     source = str(graph) if isinstance(graph, Path) else graph
-    request = openvino.Core().compile_model(source, "CPU", options).create_infer_request()
+    request = openvino_core().compile_model(source, "CPU", options).create_infer_request()
     parts = (images[first : first + batch] for first in range(0, len(images), batch))
     return np.concatenate([request.infer([part])[0].copy() for part in parts])
 

@@ -123,13 +123,11 @@ def compare_graph(
     `openvino_PRECISION_uncertainty`: relative, of the uncertainty head's outputs; of an
     out-of-distribution score to `LEAST_OOD_SCORE` at least.
     """
-    import openvino
-
     answers = run_network(network, images)
     textures = np.stack([texture_features(image) for image in images])
     uncertainty = None if head is None else head.predict(answers.uncertainty_inputs, textures)
     differences = {"frames": float(len(images))}
-    for precision in dict.fromkeys(("f32", best_precision(openvino.Core()))):
+    for precision in dict.fromkeys(("f32", best_precision())):
         try:
             outputs = run_graph(run / GRAPH, precision, images)
         except RuntimeError as error:

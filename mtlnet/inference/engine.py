@@ -6,7 +6,9 @@ imported only when the torch engine is requested: the serving image does not con
 
 import json
 import os
+from functools import cache
 from pathlib import Path
+from threading import Lock
 from typing import Any, Literal, Protocol, cast, get_args
 
 import numpy as np
@@ -87,13 +89,10 @@ class OpenVinoEngine:
     def __init__(
         self, run: Path, card: ModelCard, precision: Precision | None = None, threads: int = 1
     ) -> None:
-        # hwloc, which OpenVINO loads, writes to stderr where a container hides /sys.
-        os.environ.setdefault("HWLOC_HIDE_ERRORS", "2")
         import openvino
 
-        core = openvino.Core()
         self.card = card
-        best = best_precision(core)
+        best = best_precision()
         self.precision: Precision = precision or ("int8" if passed_gate(run, card) else best)
         quantised = self.precision == "int8"
         options = {
@@ -106,7 +105,7 @@ class OpenVinoEngine:
         try:
             graph = int8_graph(run, card) if quantised else None
             model = read_graph(run, card) if graph is None else _read_model(graph)
-            compiled = core.compile_model(model, "CPU", options)
+            compiled = openvino_core().compile_model(model, "CPU", options)
         except RuntimeError as error:
             reason = str(error).strip().splitlines()[-1]
             raise ModelError(f"OpenVINO cannot load the graph of {run}: {reason}") from error
@@ -126,10 +125,8 @@ class OpenVinoEngine:
 
 def _read_model(graph: Path) -> Any:
     """Raises RuntimeError when OpenVINO cannot read it."""
-    import openvino
-
     with utf8_path(graph) as plain:
-        return openvino.Core().read_model(str(plain))
+        return openvino_core().read_model(str(plain))
 
 
 def read_graph(run: Path, card: ModelCard) -> Any:
@@ -206,9 +203,33 @@ def parse_precision(text: str | None) -> Precision | None:
     return cast(Precision | None, text)
 
 
-def best_precision(core: Any) -> Precision:
+def openvino_core() -> Any:
+    """The `openvino.Core` of this process; use no other one.
+
+    OpenVINO's CPU plugin gives the thread that loads it an alternate signal stack (`sigaltstack`).
+    It unmaps that stack when its last user is dropped, in whichever thread; a later signal then
+    ends the process with SIGSEGV. This core keeps the plugin loaded.
+    """
+    with _core_lock:
+        return _make_core()
+
+
+@cache
+def _make_core() -> Any:
+    # hwloc, which OpenVINO loads, writes to stderr where a container hides /sys.
+    os.environ.setdefault("HWLOC_HIDE_ERRORS", "2")
+    import openvino
+
+    return openvino.Core()  # noqa: TID251
+
+
+_core_lock = Lock()
+
+
+def best_precision() -> Precision:
     """bf16 if this CPU supports it natively (AVX512-BF16 or AMX), else float32."""
-    return "bf16" if "BF16" in core.get_property("CPU", "OPTIMIZATION_CAPABILITIES") else "f32"
+    capabilities = openvino_core().get_property("CPU", "OPTIMIZATION_CAPABILITIES")
+    return "bf16" if "BF16" in capabilities else "f32"
 
 
 def check_image(image: NDArray[np.uint8], shape: tuple[int, ...]) -> None:

@@ -28,7 +28,7 @@ from mtlnet.data.sources import (
 )
 from mtlnet.evaluation.metrics import coverage, signed_errors
 from mtlnet.export.openvino_graph import build_feature_graph
-from mtlnet.inference.engine import best_precision
+from mtlnet.inference.engine import best_precision, openvino_core
 from mtlnet.inference.model_card import WEIGHTS, ModelError, read_card
 from mtlnet.inference.prediction import OUTPUTS
 from mtlnet.inference.uncertainty import (
@@ -229,15 +229,14 @@ def _infer_queue(network: Network) -> Any:
     """As many parallel requests as there are cores, of one thread each."""
     import openvino
 
-    core = openvino.Core()
     cores = os.cpu_count() or 1
     options = {
-        "INFERENCE_PRECISION_HINT": best_precision(core),
+        "INFERENCE_PRECISION_HINT": best_precision(),
         "INFERENCE_NUM_THREADS": cores,
         "NUM_STREAMS": cores,
         "ENABLE_CPU_PINNING": False,
     }
-    compiled = core.compile_model(build_feature_graph(network), "CPU", options)
+    compiled = openvino_core().compile_model(build_feature_graph(network), "CPU", options)
     return openvino.AsyncInferQueue(compiled)
 
 

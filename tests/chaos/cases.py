@@ -8,8 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import openvino
-
 import trackfeatures as tf
 from datagen.recording import Dataset
 from datagen.recording.folder import prepare, read_states, round_path
@@ -17,7 +15,7 @@ from datagen.recording.integrity.round_checks import check_round
 from datagen.recording.integrity.verify import verify
 from datagen.recording.splits import Split, read_split, split_path, write_split
 from mtlnet.export.openvino_graph import run_graph
-from mtlnet.inference.engine import load_engine, read_export
+from mtlnet.inference.engine import load_engine, openvino_core, read_export
 from mtlnet.inference.model_card import (
     GRAPH,
     MODEL_FILES,
@@ -171,7 +169,7 @@ def look_at_export(home: Path) -> Any:
         return None
     for name, expected in about["files"].items():
         assert file_hash(home / "out" / name) == expected
-    graph = openvino.Core().read_model(str(home / "out" / GRAPH))
+    graph = openvino_core().read_model(str(home / "out" / GRAPH))
     return about["files"], about["model_hash"], run_graph(graph, "f32", IMAGE[None]).tolist()
 
 

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import openvino
 import pytest
 import torch
 from safetensors.numpy import load_file
@@ -25,7 +24,14 @@ from mtlnet.export.int8 import (
     operation_names,
 )
 from mtlnet.export.openvino_graph import TOLERANCE, build_graph, run_graph, write_graph
-from mtlnet.inference.engine import EXPORT_FILE, INT8, load_engine, passed_gate, read_graph
+from mtlnet.inference.engine import (
+    EXPORT_FILE,
+    INT8,
+    load_engine,
+    openvino_core,
+    passed_gate,
+    read_graph,
+)
 from mtlnet.inference.model_card import (
     GRAPH,
     GRAPH_WEIGHTS,
@@ -108,7 +114,7 @@ def test_an_openvino_model_answers_any_number_of_images_each_as_alone(
     graph = build_graph(network, read_uncertainty_head(run), batch=-1)
     write_openvino(graph, tmp_path, precision)
     options = {"INFERENCE_PRECISION_HINT": "f32"}
-    model = openvino.Core().compile_model(str(tmp_path / GRAPH), "CPU", options)
+    model = openvino_core().compile_model(str(tmp_path / GRAPH), "CPU", options)
     (batch, *sizes) = model.input("images").partial_shape
     assert (batch.is_dynamic, sizes) == (True, [210, 280, 3])
     frames = np.random.default_rng(0).integers(0, 256, (17, 210, 280, 3), np.uint8)
@@ -177,7 +183,7 @@ def test_int8_is_the_default_once_it_passed_its_gate(
     last = load_file(run / WEIGHTS)["shared.fc2.layer.weight"].nbytes
     kept = last + (run / UNCERTAINTY_WEIGHTS).stat().st_size  # and the uncertainty head
     assert weights[1] == pytest.approx((weights[0] - kept) / 4 + kept, rel=0.01)
-    rounded_to = openvino.Core().read_model(run / INT8 / GRAPH).get_ordered_ops()
+    rounded_to = openvino_core().read_model(run / INT8 / GRAPH).get_ordered_ops()
     rounding = [op for op in rounded_to if op.get_type_name() == "FakeQuantize"]
     readers = {i.get_node().get_type_name() for op in rounding for i in consumers(op)}
     assert len(rounding) == 3
@@ -209,7 +215,7 @@ def test_float_activations_are_chosen_on_held_out_rounds(
     trained: Path, dataset: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     card, data = read_card(trained), Dataset.open(dataset)
-    graph = openvino.Core().read_model(trained / GRAPH)
+    graph = openvino_core().read_model(trained / GRAPH)
     order = convolutions_by_work(graph)
     assert sorted(order) == [0, 1, 2, 3, 4]
     tried: list[tuple[int, ...]] = []

@@ -2,6 +2,8 @@
 
 import json
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -175,3 +177,22 @@ def test_names_in_a_card_lead_out_of_no_folder(copy: Path, key: str) -> None:
     (copy / "card.json").write_text(json.dumps(content))
     with pytest.raises(ModelError, match="expected a name of letters"):
         load_engine(copy)
+
+
+def test_a_signal_after_an_engine_was_dropped_in_another_thread(published: Path) -> None:
+    """OpenVINO gives the thread that loads its CPU plugin a signal stack and takes its memory back
+    with the last reference: a signal then ended the process with SIGSEGV."""
+    program = (
+        "import signal, sys, threading\n"
+        "from pathlib import Path\n"
+        "from mtlnet.inference.engine import load_engine\n"
+        "engines = [load_engine(Path(sys.argv[1]), 'openvino')]\n"
+        "thread = threading.Thread(target=engines.clear)\n"
+        "thread.start()\n"
+        "thread.join()\n"
+        "signal.signal(signal.SIGTERM, lambda *_: print('seen'))\n"
+        "signal.raise_signal(signal.SIGTERM)\n"
+    )
+    command = [sys.executable, "-c", program, str(published)]
+    ended = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (ended.returncode, ended.stdout) == (0, "seen\n"), ended.stderr

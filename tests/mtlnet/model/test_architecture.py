@@ -10,7 +10,7 @@ import torch
 from datagen.recording import Dataset
 from mtlnet.data.loader import Loader
 from mtlnet.export.openvino_graph import TOLERANCE, build_graph
-from mtlnet.inference.engine import EngineKind, load_engine
+from mtlnet.inference.engine import EngineKind, load_engine, openvino_core
 from mtlnet.inference.model_card import read_card
 from mtlnet.model.architecture import ARCHITECTURES, Architecture, find_architecture, with_heads
 from mtlnet.model.network import Network, fold, initialise, predict_images, run_network
@@ -90,18 +90,16 @@ def test_folding_a_backbone_keeps_its_outputs(name: str) -> None:
 
 @pytest.mark.parametrize("name", OTHERS)
 def test_the_openvino_graph_matches_torch(name: str) -> None:
-    import openvino
-
     network = fold(build(name))
     options = {"INFERENCE_PRECISION_HINT": "f32"}
-    request = openvino.Core().compile_model(build_graph(network), "CPU", options)
+    request = openvino_core().compile_model(build_graph(network), "CPU", options)
     frames = images(2, seed=3)
     answers = run_network(network, frames)
     expected = np.hstack([answers.outputs, answers.absent])
     found = np.concatenate([request(frame[None])[0] for frame in frames])
     assert np.ptp(expected[:, :5], axis=0).max() > 10 * TOLERANCE
     np.testing.assert_allclose(found, expected, atol=TOLERANCE)
-    several = openvino.Core().compile_model(build_graph(network, batch=-1), "CPU", options)
+    several = openvino_core().compile_model(build_graph(network, batch=-1), "CPU", options)
     np.testing.assert_allclose(several(frames)[0], expected, atol=TOLERANCE)
 
 

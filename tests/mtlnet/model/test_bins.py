@@ -3,13 +3,13 @@
 from pathlib import Path
 
 import numpy as np
-import openvino
 import pytest
 import torch
 
 import trackfeatures as tf
 from mtlnet.export.convert import ONNX_FILE, check_export, write_onnx
 from mtlnet.export.openvino_graph import TOLERANCE, build_feature_graph, build_graph, run_graph
+from mtlnet.inference.engine import openvino_core
 from mtlnet.inference.prediction import OUTPUTS, decode_outputs, split_outputs
 from mtlnet.model.architecture import ABSENT_ABOVE, ANGLES, GRID, PLACES, grid_size
 from mtlnet.model.bins import (
@@ -183,7 +183,7 @@ def test_an_onnx_model_reads_bins_as_torch_does(tmp_path: Path) -> None:
     found = check_export(network, tmp_path / ONNX_FILE, "f32", frames)
     assert found["largest"] < TOLERANCE
     options = {"INFERENCE_PRECISION_HINT": "f32"}  # on some processors the default is bf16
-    model = openvino.Core().compile_model(str(tmp_path / ONNX_FILE), "CPU", options)
+    model = openvino_core().compile_model(str(tmp_path / ONNX_FILE), "CPU", options)
     assert [result.any_name for result in model.outputs] == ["outputs", "absent"]
     (batch, *sizes) = model.input("images").partial_shape
     assert (batch.is_dynamic, sizes) == (True, [210, 280, 3])
@@ -218,7 +218,7 @@ def test_the_graph_gives_the_probabilities_of_absence() -> None:
 def test_the_graph_reads_bins_as_torch_does() -> None:
     network, frames = fold(made()), images(12, 5)
     options = {"INFERENCE_PRECISION_HINT": "f32"}
-    graph = openvino.Core().compile_model(build_feature_graph(network), "CPU", options)
+    graph = openvino_core().compile_model(build_feature_graph(network), "CPU", options)
     answers = run_network(network, frames)
     inputs, expected = answers.uncertainty_inputs, answers.outputs
     found = [graph(frame[None]) for frame in frames]
