@@ -14,7 +14,6 @@ import trackfeatures as tf
 from datagen.recording import Frames
 from datagen.recording.labels import Labels
 from datagen.recording.round_metadata import RoundInfo
-from mtlnet.inference.prediction import split_outputs
 from mtlnet.inference.rectification import Rectification
 from trackfeatures.camera import CameraParameters
 from trackfeatures.measurement import LineOffsets
@@ -36,19 +35,11 @@ def model_labels(frames: Frames) -> Labels:
 
 
 def car_outputs(outputs: NDArray[np.float32], frames: Frames) -> NDArray[np.float32]:
-    """A model's outputs (N, 9 to 22) for `frames` in metres of the cars that the rounds show.
-
-    The height of a round's camera makes no frame out of distribution: it was drawn together with
-    the width of the lanes.
-    """
+    """A model's outputs (N, 9 to 22) for `frames` in metres of the cars that the rounds show."""
     changed, of_round = outputs.copy(), frames.labels.round
     for number, info in moved_rounds(frames):
         rows = np.flatnonzero(of_round == number)
-        rectification = Rectification(info.label_camera, frames.camera)
-        changed[rows] = rectification.outputs(outputs[rows])
-    score = split_outputs(outputs).ood_score
-    if score is not None:
-        split_outputs(changed).ood_score[:] = score  # type: ignore[index]  # both have it
+        changed[rows] = round_rectification(info, frames.camera).outputs(outputs[rows])
     return changed
 
 
@@ -58,9 +49,14 @@ def moved_rounds(frames: Frames) -> list[tuple[int, RoundInfo]]:
     return [(n, info) for n, info in rounds if not _as_mounted(info.label_camera, frames.camera)]
 
 
+def round_rectification(info: RoundInfo, camera: CameraParameters) -> Rectification:
+    """Between the camera that a round's labels were measured with and `camera`, the model's."""
+    return Rectification(info.label_camera, camera, any_height=True)
+
+
 def camera_scales(frames: Frames) -> NDArray[np.float64]:
     """Metres beside the model's camera per metre of the car, of each of `frames` (N,)."""
-    rounds = (Rectification(info.label_camera, frames.camera) for info in frames.rounds)
+    rounds = (round_rectification(info, frames.camera) for info in frames.rounds)
     return np.array([1 / each.scale for each in rounds])[frames.labels.round]
 
 
@@ -70,7 +66,7 @@ def _as_mounted(camera: CameraParameters, other: CameraParameters) -> bool:
 
 def _beside(labels: Labels, info: RoundInfo, camera: CameraParameters) -> NDArray[np.float32]:
     """Distances (N, 5) of a round's frames beside `camera`, NaN where absent there."""
-    rectification = Rectification(info.label_camera, camera)
+    rectification = round_rectification(info, camera)
     scale = 1 / rectification.scale
     # Distances are measured at the centre of gravity, not at the camera.
     beside = np.zeros((len(labels), len(tf.MARKINGS)), np.float32)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 import trackfeatures as tf
 from datagen.recording import Frames
+from mtlnet.data.model_labels import round_rectification
 from mtlnet.evaluation.metrics import GROUPS, Numbers, signed_errors
 from mtlnet.evaluation.tables import error_cells, mean_error_cells
 from mtlnet.inference.overlay import draw_overlay
@@ -212,15 +213,17 @@ def worst_figures(
 
     Each has `image`, RGB of twice the frame's size, and texts: `feature`, `error`, `note`, `place`.
     """
-    labels, camera = frames.labels, frames.camera
+    labels = frames.labels
     for worst in chosen:
         row = worst.row
         prediction = decode_outputs(outputs[row])
         truth = [None if np.isnan(d) else float(d) for d in labels.distances[row]]
+        info = frames.rounds[labels.round[row]]
+        view = round_rectification(info, frames.camera).view
         image = draw_overlay(
             frames.image(row),
-            camera,
-            camera.height_above_road_m,
+            view,
+            view.height_above_road_m,
             float(labels.curvature[row]),
             (dict(zip(tf.MARKINGS, truth, strict=True)), float(labels.angle[row])),
             (prediction.distances_m, prediction.angle_rad),

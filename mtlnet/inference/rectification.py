@@ -52,6 +52,9 @@ class Rectification:
 
     source: CameraParameters
     target: CameraParameters
+    any_height: bool = False
+    """Whether no height is out of distribution: a recorded round's was drawn together with the
+    width of its lanes."""
 
     @property
     def scale(self) -> float:
@@ -146,7 +149,8 @@ class Rectification:
             own = self.scale * parts.std[:, :-1]
             parts.std[:, :-1] = np.hypot(own, np.nan_to_num(from_height))
         narrowest, widest = SEEN_LANES_M
-        if parts.ood_score is not None and not narrowest <= COMMON_LANE_M / self.scale <= widest:
+        seen = self.any_height or narrowest <= COMMON_LANE_M / self.scale <= widest
+        if parts.ood_score is not None and not seen:
             parts.ood_score[:] = np.maximum(parts.ood_score, HEIGHT_SCORE)
         return changed
 

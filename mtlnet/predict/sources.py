@@ -281,6 +281,7 @@ def _rectification(lens: Lens) -> Rectification | None:
 
 def _read_round(source: Source, camera: CameraParameters) -> Iterator[SourceImage]:
     from datagen.recording import DatasetError, Frames, RoundInfo, UndecodableImage, open_round
+    from mtlnet.data.model_labels import moved_rounds, round_rectification
 
     path = source.path
     if isinstance(source.lens, Rectification):
@@ -292,6 +293,7 @@ def _read_round(source: Source, camera: CameraParameters) -> Iterator[SourceImag
         raise UserError(f"{path} was recorded with {recorded}, the model's camera is {camera}")
     info = RoundInfo.of(path, index.header, index.result, "test")
     frames = Frames([info], [index], recorded)
+    lens = round_rectification(info, camera) if moved_rounds(frames) else None
     labels: Labels | None = None
     with suppress(DatasetError):  # some are damaged: they are read one by one
         labels = frames.labels
@@ -307,7 +309,7 @@ def _read_round(source: Source, camera: CameraParameters) -> Iterator[SourceImag
             one = Frames([info], [index], recorded, np.array([number]))
             truth = _truth_of_one(one)
         time_s = number / index.header.frequency_hz
-        yield SourceImage(source.name, number, image, truth=truth, time_s=time_s)
+        yield SourceImage(source.name, number, image, truth=truth, time_s=time_s, lens=lens)
 
 
 def _truth_of_one(frame: "Frames") -> Truth | None:

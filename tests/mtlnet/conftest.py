@@ -21,6 +21,7 @@ from mtlnet.model.architecture import ARCHITECTURES, GRID, HEIGHT, MTL, WIDTH, C
 from mtlnet.model.network import Network, initialise
 from mtlnet.training.config import TrainConfig
 from mtlnet.uncertainty_fit.head import fit_uncertainty_head
+from trackfeatures.camera import CameraParameters
 
 FRAMES = 24
 TRAIN, TEST = ("r000", "r001", "r002"), ("r003",)
@@ -74,6 +75,16 @@ def write_round(folder: Path, name: str, number: int, **changes: Any) -> None:
         for _ in range(FRAMES):
             writer.add(drawn_frame(rng))
         writer.finish()
+
+
+HIGH_CAMERA = CameraParameters(z=1.55)
+"""1.8 m above the road, half as high again as the model's."""
+HIGH_ROUNDS: dict[str, Any] = {
+    "camera": HIGH_CAMERA,
+    "nominal_camera": CameraParameters(),
+    "varied": {"carriageway": {"markings": [{"lines": [{"offset_m": 0.0}]}, {"lines": []}]}},
+}
+"""What the headers of such rounds of varied roads have; one lane, without paint on its right."""
 
 
 def write_dataset(

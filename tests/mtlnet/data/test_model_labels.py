@@ -13,11 +13,10 @@ from mtlnet.data.model_labels import camera_scales, car_outputs, model_labels
 from mtlnet.data.road_ahead import lane_beside
 from mtlnet.inference.prediction import split_outputs
 from mtlnet.inference.uncertainty import COLUMNS
-from tests.mtlnet.conftest import write_dataset
+from tests.mtlnet.conftest import HIGH_ROUNDS, write_dataset
 from trackfeatures.camera import CameraParameters
 
 MODEL = CameraParameters()  # 1.2 m above the road
-HIGH = CameraParameters(z=1.55)  # 1.8 m: a road looks two thirds as wide
 
 
 def dataset(folder: Path, **changes: Any) -> Frames:
@@ -25,14 +24,10 @@ def dataset(folder: Path, **changes: Any) -> Frames:
     return Dataset.open(write_dataset(folder, **changes)).select("all")
 
 
-VARIED = {"carriageway": {"markings": [{"lines": [{"offset_m": 0.0}]}, {"lines": []}]}}
-"""What a header has of a road of one lane, without paint on its right."""
-
-
 @pytest.fixture
 def high(tmp_path: Path) -> Frames:
-    """Rounds of lanes of 4.0 m, from a camera 1.8 m above the road."""
-    return dataset(tmp_path / "high", camera=HIGH, nominal_camera=MODEL, varied=VARIED)
+    """Rounds of lanes of 4.0 m, from a camera 1.8 m above the road: it looks two thirds as wide."""
+    return dataset(tmp_path / "high", **HIGH_ROUNDS)
 
 
 def test_labels_are_those_of_a_road_two_thirds_as_wide(high: Frames) -> None:

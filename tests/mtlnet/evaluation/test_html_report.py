@@ -26,7 +26,9 @@ from mtlnet.evaluation.html_report import (
 from mtlnet.evaluation.metrics import evaluate_by_groups, mean_labels, signed_errors
 from mtlnet.inference.overlay import PREDICTION_COLOUR, TRUTH_COLOUR, marking_line, to_pixels
 from mtlnet.inference.uncertainty import FEATURES
+from tests.mtlnet.conftest import HIGH_CAMERA, HIGH_ROUNDS, write_dataset
 from tests.mtlnet.page import Page
+from trackfeatures.camera import CameraParameters
 
 ORDER = ("to_lane_centre", "angle", "ml", "mr", "m", "l", "r")
 ERRORS_M = {9: 1.0, 30: -0.8, 60: 0.3}
@@ -165,10 +167,15 @@ def test_the_worst_frames_are_shown_with_their_errors(
     assert "r000, beta, s = 7 m" in captions[0]
 
 
-def test_markings_are_drawn_where_they_are(frames: Frames, outputs: NDArray[np.float32]) -> None:
+@pytest.mark.parametrize("camera", [CameraParameters(), HIGH_CAMERA])
+def test_markings_are_drawn_where_they_are(
+    outputs: NDArray[np.float32], tmp_path: Path, camera: CameraParameters
+) -> None:
+    rounds = HIGH_ROUNDS if camera == HIGH_CAMERA else {}
+    frames = Dataset.open(write_dataset(tmp_path, **rounds)).select("all")
     (figure,) = worst_figures(frames, outputs, [WorstFrame(9, "ml", 1.0)])
     pixels = figure["image"].astype(int)
-    camera, labels = frames.camera, frames.labels
+    labels = frames.labels
     assert pixels.shape[0] == 2 * camera.height
     for distance, angle, colour in (
         (labels.distances[9, 0], labels.angle[9], TRUTH_COLOUR),

@@ -20,7 +20,7 @@ from mtlnet.predict.films import read_film_header
 from mtlnet.predict.run import predict_files
 from mtlnet.predict.sources import find_sources
 from mtlnet.predict.writers import TEXT_HEIGHT
-from tests.mtlnet.conftest import write_dataset, write_round
+from tests.mtlnet.conftest import HIGH_ROUNDS, write_dataset, write_round
 from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
 
@@ -162,6 +162,17 @@ def test_a_film_that_cannot_be_opened_loses_no_other_file(
     with pytest.raises(UserError, match=r"broken.mp4 cannot be opened as a film.*2 others"):
         predict_files(engine, [str(broken), str(film)], [table])
     assert len(table.read_text().splitlines()) == 2
+
+
+def test_a_round_of_a_higher_camera_is_answered_in_metres_of_its_car(
+    engine: BrightnessEngine, tmp_path: Path
+) -> None:
+    write_dataset(tmp_path, **HIGH_ROUNDS)
+    path = sorted((tmp_path / "rounds").glob("*.mcap"))[0]
+    row = predict_files(engine, [str(path)])[0]
+    seen = float(tf.decode(np.full((1, 6), 0.5))[0][0, 3])
+    aside = 0.75 * np.sin(row["angle_rad"])
+    assert row["distances_m"]["m"] == pytest.approx(1.5 * (seen - aside) + aside)
 
 
 def test_pictures_of_a_recorded_round_show_its_labels(
