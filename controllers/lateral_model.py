@@ -6,6 +6,7 @@ Rajamani, "Vehicle Dynamics and Control", 2.5. The state is (e1, e1', e2, e2'): 
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -132,3 +133,15 @@ class SpeedTable:
         share = place - low
         row: Matrix = (1.0 - share) * self._rows[low] + share * self._rows[low + 1]
         return row
+
+
+@lru_cache(maxsize=64)
+def discrete_gains(model: LateralModel, weights: LqrWeights, dt: float) -> SpeedTable:
+    """`discrete_gain` by speed. Kept: commands make many controllers of one kind."""
+    return SpeedTable(lambda speed: discrete_gain(model, weights, speed, dt))
+
+
+@lru_cache(maxsize=64)
+def continuous_gains(model: LateralModel, weights: LqrWeights) -> SpeedTable:
+    """`continuous_gain` by speed."""
+    return SpeedTable(lambda speed: continuous_gain(model, weights, speed))

@@ -36,8 +36,8 @@ from controllers.lateral_model import (
     LqrWeights,
     Matrix,
     SpeedTable,
-    continuous_gain,
-    discrete_gain,
+    continuous_gains,
+    discrete_gains,
 )
 from controllers.torcs_feedback import steer_for
 from trackfeatures import Heading
@@ -87,7 +87,7 @@ def approach_limit(loop: LoopConfig) -> float:
 
 
 class Lqr:
-    """The paper's regulator at a control step of `dt` s; the constructor computes all gains."""
+    """The paper's regulator at a control step of `dt` s; the gains of all speeds are computed once."""
 
     def __init__(
         self,
@@ -99,7 +99,7 @@ class Lqr:
         approach_rad: float = UNLIMITED_RAD,
     ) -> None:
         self.dt, self.weights, self.model = dt, weights, model or LateralModel()
-        self._gains = SpeedTable(lambda speed: discrete_gain(self.model, weights, speed, dt))
+        self._gains = discrete_gains(self.model, weights, dt)
         self._heading_rate = RateEstimate(dt, rate_filter_s)
         self._approach_rad = approach_rad
 
@@ -135,7 +135,7 @@ class LqrPreview:
         approach_rad: float = UNLIMITED_RAD,
     ) -> None:
         self.dt, self.weights, self.model = dt, weights, model or LateralModel()
-        self._gains = SpeedTable(lambda speed: discrete_gain(self.model, weights, speed, dt))
+        self._gains = discrete_gains(self.model, weights, dt)
         self._steady_bends = SpeedTable(self.model.cornering)
         self._estimate = CurvatureEstimate(dt, curvature_filter_s)
         self._approach_rad = approach_rad
@@ -171,7 +171,7 @@ class LqrPaper:
         model: LateralModel | None = None,
     ) -> None:
         self.weights, self.model = weights, model or LateralModel()
-        self._gains = SpeedTable(lambda speed: continuous_gain(self.model, weights, speed))
+        self._gains = continuous_gains(self.model, weights)
         self._offset_rate, self._heading_rate = RateEstimate(dt), RateEstimate(dt)
 
     def update(self, observation: Observation) -> float:

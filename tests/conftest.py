@@ -22,7 +22,10 @@ def pytest_configure() -> None:
     # How long an example takes depends on what else the machine does.
     settings.register_profile("driverview", deadline=None)
     settings.load_profile("driverview")
-    # Torch's threads sleep while they wait, because tests run in parallel on few cores.
+    # Tests run in parallel on few cores: one thread each, and what asks for more lets them sleep.
+    # OpenBLAS's threads spin: two of them take 36 times the processor time for an LQR's gains.
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+        os.environ.setdefault(name, "1")
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 
