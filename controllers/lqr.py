@@ -87,7 +87,7 @@ def approach_limit(loop: LoopConfig) -> float:
 
 
 class Lqr:
-    """The paper's regulator at a control step of `dt` s; the gains of all speeds are computed once."""
+    """The paper's regulator at a control step of `dt` s; all gains are known from the start."""
 
     def __init__(
         self,

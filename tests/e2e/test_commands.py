@@ -15,6 +15,8 @@ from typing import Any
 import pytest
 import typer
 
+from tests.typed import error_line, typed
+
 ROOT = Path(__file__).parents[2]
 BIN = Path(sys.executable).parent
 PROGRAMS = ("simulator", "datagen", "mtlnet", "serve", "controllers")
@@ -130,36 +132,44 @@ def test_help_imports_nothing_heavy(program: str) -> None:
     assert done.returncode == 0, done.stderr
 
 
+WRONG = [
+    (("simulator", "centreline", "no-such-track", "--out", "x.csv"), "no-such-track"),
+    (("simulator", "snapshot", "no-such-track", "--out", "x.png"), "no-such-track"),
+    (("simulator", "link", "--track", "no-such-track"), "no-such-track"),
+    (("datagen", "info", "no-such-folder"), "no-such-folder"),
+    (("datagen", "verify", "x", "--level", "thorough"), "thorough"),
+    (("datagen", "split", "no-such-folder"), "no-such-folder"),
+    (("datagen", "recover", "no-such.mcap"), "no-such.mcap"),
+    (("datagen", "collect", "--tracks", "no-such-track", "--out", "OUT"), "no-such-track"),
+    (("mtlnet", "train", "--alpha", "0.3,0.2", "--data", "x", "--out", "OUT"), "0.3,0.2"),
+    (("mtlnet", "train", "--alpha", "1,1,1", "--data", "no-such-data"), "no-such-data"),
+    (("mtlnet", "evaluate", "--model", "no-such-run", "--data", "x"), "no-such-run"),
+    (("mtlnet", "predict", "--model", "no-such-run", "x.png"), "no-such-run"),
+    (("serve", "--model", "no-such-run"), "no-such-run"),
+    (("controllers", "drive", "--track", "no-such-track"), "no-such-track"),
+]
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
-    [
-        (("simulator", "centreline", "no-such-track", "--out", "x.csv"), "no-such-track"),
-        (("simulator", "snapshot", "no-such-track", "--out", "x.png"), "no-such-track"),
-        (("simulator", "link", "--track", "no-such-track"), "no-such-track"),
-        (("datagen", "info", "no-such-folder"), "no-such-folder"),
-        (("datagen", "verify", "x", "--level", "thorough"), "thorough"),
-        (("datagen", "split", "no-such-folder"), "no-such-folder"),
-        (("datagen", "recover", "no-such.mcap"), "no-such.mcap"),
-        (("datagen", "collect", "--tracks", "no-such-track", "--out", "OUT"), "no-such-track"),
-        (("mtlnet", "train", "--alpha", "0.3,0.2", "--data", "x", "--out", "OUT"), "0.3,0.2"),
-        (("mtlnet", "train", "--alpha", "1,1,1", "--data", "no-such-data"), "no-such-data"),
-        (("mtlnet", "evaluate", "--model", "no-such-run", "--data", "x"), "no-such-run"),
-        (("mtlnet", "predict", "--model", "no-such-run", "x.png"), "no-such-run"),
-        (("serve", "--model", "no-such-run"), "no-such-run"),
-        (("controllers", "drive", "--track", "no-such-track"), "no-such-track"),
-    ],
+    WRONG,
     ids=lambda value: " ".join(value) if isinstance(value, tuple) else None,
 )
 def test_wrong_input_is_one_error_line_that_names_it(
     arguments: tuple[str, ...], message: str, tmp_path: Path
 ) -> None:
     filled = [str(tmp_path / "out") if a == "OUT" else a for a in arguments]
-    done = run(*filled)
+    done = typed(*filled)
     assert done.returncode == 1, done.stdout + done.stderr
-    assert "Traceback" not in done.stderr
-    errors = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
-    assert len(errors) == 1, done.stderr
-    assert message in errors[0]
+    assert message in error_line(done)
+
+
+@pytest.mark.parametrize("program", PROGRAMS)
+def test_wrong_input_of_a_process_is_the_line_of_a_call(program: str) -> None:
+    """What `typed` shows in this process is what a user sees."""
+    arguments, _ = next(case for case in WRONG if case[0][0] == program)
+    done, here = run(*arguments), typed(*arguments)
+    assert (done.returncode, done.stdout, done.stderr) == (1, here.stdout, here.stderr)
 
 
 def options_of(program: str, *subcommands: str) -> set[str]:

@@ -20,6 +20,7 @@ from mtlnet.inference.prediction import decode_outputs
 from mtlnet.model.architecture import ARCHITECTURES, GRID, HEIGHT, MTL, WIDTH, Conv
 from mtlnet.model.network import Network, initialise
 from mtlnet.training.config import TrainConfig
+from mtlnet.uncertainty_fit import ood
 from mtlnet.uncertainty_fit.head import fit_uncertainty_head
 from trackfeatures.camera import CameraParameters
 
@@ -148,6 +149,12 @@ def small_network(monkeypatch: pytest.MonkeyPatch) -> None:
         )
         small = replace(full, features=few, shared=(32, 16, 16))
         monkeypatch.setitem(ARCHITECTURES, full.name, small)
+
+
+@pytest.fixture
+def short_fit(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fit the pitch of a trained model in 40 steps, not 800, which take a second a training."""
+    monkeypatch.setattr(ood, "FIT", replace(ood.FIT, steps=40))
 
 
 def training_config(dataset: Path, out: Path, **changes: Any) -> TrainConfig:

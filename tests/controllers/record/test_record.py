@@ -23,6 +23,7 @@ from mtlnet.data.sources import open_training_dataset, recorded_training_data
 from simulator.track.catalogue import find_track
 from simulator.track.road import Road
 from simulator.world.world import World
+from tests.typed import typed
 from trackfeatures import Heading
 
 SHORT = ["--rounds", "2", "--frames", "60", "--tracks", "oval", "--lanes", "1", "--workers", "1"]
@@ -32,6 +33,11 @@ COMMAND = [sys.executable, "-m", "controllers", "record", *SHORT, "--lights", "c
 def record(out: Path, *more: str) -> subprocess.CompletedProcess[str]:
     command = [*COMMAND, "--out", str(out), *more]
     return subprocess.run(command, capture_output=True, text=True, timeout=600)
+
+
+def record_here(out: Path, *more: str) -> subprocess.CompletedProcess[str]:
+    """The command in this process: for what is refused before a round."""
+    return typed(*COMMAND[2:], "--out", out, *more)
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +80,7 @@ def test_the_plan_names_the_driver_and_another_one_is_refused(recorded: Path) ->
     driver = json.loads((recorded / "plan.json").read_text())["driver"]
     assert driver["controller"] == "lqr"
     assert len(driver["model"]) == 64
-    refused = record(recorded, "--controller", "lqr-preview")
+    refused = record_here(recorded, "--controller", "lqr-preview")
     assert refused.returncode != 0
     assert "driver: lqr, " in refused.stderr.replace("\n", " ")
     with pytest.raises(DatasetError, match="not by the scripted driver"):
@@ -111,7 +117,7 @@ def test_recordings_are_merged_with_rounds_of_another_plan(recorded: Path, tmp_p
     ],
 )
 def test_impossible_options_are_refused(tmp_path: Path, args: list[str], message: str) -> None:
-    done = record(tmp_path / "out", *args)
+    done = record_here(tmp_path / "out", *args)
     assert done.returncode != 0
     assert message in done.stderr.replace("\n", " ")
     assert "Traceback" not in done.stderr

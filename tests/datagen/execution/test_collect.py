@@ -85,7 +85,7 @@ def test_a_finished_dataset_is_left_alone_and_a_lost_round_made_again(collected:
     assert json.loads(done.stdout)["recorded_frames"] == 30
     assert lost.read_bytes() == before
     assert kept.stat().st_mtime_ns == written
-    done = datagen("collect", *SHORT, "--out", collected, "--json")
+    done = datagen_here("collect", *SHORT, "--out", collected, "--json")
     assert (done.returncode, json.loads(done.stdout)["recorded_frames"]) == (0, 0)
 
 

@@ -12,11 +12,13 @@ from datagen.recorder.record import simulate
 from datagen.recorder.replay import replay
 from datagen.recording.frame import EgoState
 from datagen.recording.schema import messages
-from tests.datagen.commands import datagen
+from tests.datagen.commands import datagen_here
 
 
 def test_a_replay_gives_the_same_labels_states_and_pixels(collected: Path) -> None:
-    done = datagen("verify", collected, "--level", "quick", "--replay", "5", "--pixels", "--json")
+    done = datagen_here(
+        "verify", collected, "--level", "quick", "--replay", "5", "--pixels", "--json"
+    )
     report = json.loads(done.stdout)
     assert (done.returncode, report["problems"]) == (0, [])
     assert report["replayed"] == ["round-000", "round-001"]

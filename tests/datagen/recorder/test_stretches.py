@@ -11,7 +11,7 @@ from datagen.recorder.record import scenery
 from datagen.recorder.replay import replay
 from datagen.recording import Dataset
 from datagen.view.steps import Steps
-from tests.datagen.commands import datagen
+from tests.datagen.commands import datagen, datagen_here
 
 LIGHTS = all_lights()
 TRACKS = (TrackChoice("oval", "0"),)
@@ -34,7 +34,7 @@ def test_by_default_a_round_is_a_film_at_20_hz_in_one_scenery_and_light() -> Non
 
 
 def test_scenes_without_stretches_are_refused() -> None:
-    done = datagen("collect", "--scenes", "4", "--dry-run")
+    done = datagen_here("collect", "--scenes", "4", "--dry-run")
     assert done.returncode != 0
     assert (
         "4 scenes a round asked for, but the scenery never changes; give --stretch" in done.stderr
@@ -52,16 +52,16 @@ def test_no_two_stretches_have_the_same_scenery() -> None:
 
 def test_scenery_and_light_change_where_a_stretch_ends(tmp_path: Path) -> None:
     folder = tmp_path / "data"
-    options = ("--rounds", "1", "--frames", "70", "--tracks", "oval", "--lights", "clear,fog")
-    done = datagen("collect", "--out", folder, *options, "--stretch", "25", "--scenes", "3")
+    options = ("--rounds", "1", "--frames", "28", "--tracks", "oval", "--lights", "clear,fog")
+    done = datagen("collect", "--out", folder, *options, "--stretch", "10", "--scenes", "3")
     assert done.returncode == 0, done.stderr
     frames = Dataset.open(folder).select("all")
     assert set(frames.rounds[0].lights) == {"clear", "fog"}
     light = frames.labels.light.tolist()
-    assert light == [frames.rounds[0].lights[k // 25] for k in range(70)]
-    images = frames.read_batch(range(70)).astype(np.int16)
+    assert light == [frames.rounds[0].lights[k // 10] for k in range(28)]
+    images = frames.read_batch(range(28)).astype(np.int16)
     change = np.abs(np.diff(images, axis=0)).mean((1, 2, 3))
-    assert set(np.argsort(change)[-2:].tolist()) == {24, 49}
+    assert set(np.argsort(change)[-2:].tolist()) == {9, 19}
     path = frames.rounds[0].path
     assert [step.light for step in Steps.open(path)] == light
     assert replay(folder, 1)[1] == []
@@ -97,12 +97,12 @@ def test_the_number_of_scenes_is_limited_by_scenes_and_by_stretches() -> None:
 
 
 def test_a_negative_number_of_scenes_is_refused() -> None:
-    done = datagen("collect", "--scenes", "-1", "--dry-run")
+    done = datagen_here("collect", "--scenes", "-1", "--dry-run")
     assert done.returncode != 0
     assert "-1 scenes a round" in done.stderr
 
 
 def test_a_negative_stretch_is_refused() -> None:
-    done = datagen("collect", "--stretch", "-1", "--dry-run")
+    done = datagen_here("collect", "--stretch", "-1", "--dry-run")
     assert done.returncode != 0
     assert "a stretch of -1 frames" in done.stderr

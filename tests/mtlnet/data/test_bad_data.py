@@ -24,6 +24,8 @@ from tests.mtlnet.conftest import FRAMES, TRAIN, write_round
 from tests.typed import typed
 from trackfeatures.errors import UserError
 
+pytestmark = pytest.mark.usefixtures("short_fit")
+
 
 def damage(folder: Path, name: str, frame: int) -> None:
     """Overwrite part of the JPEG data of one image in a round's file."""

@@ -233,6 +233,7 @@ def test_float_activations_are_chosen_on_held_out_rounds(
         passed, worse = next(verdicts)
         return {"passed": passed, "worse": {"ml": worse}}
 
+    monkeypatch.setattr(mtlnet.export.int8, "HELD_OUT_FRAMES", 4)
     monkeypatch.setattr(mtlnet.export.int8, "quantise", int8)
     monkeypatch.setattr(mtlnet.export.int8, "gate", verdict)
     arguments = (graph, data.select("train").read_batch(np.arange(2)), data.select("train"))

@@ -20,7 +20,7 @@ from mtlnet.training.run import train
 from runtime.files import atomic_write
 from trackfeatures.errors import UserError
 
-pytestmark = pytest.mark.usefixtures("small_network")
+pytestmark = pytest.mark.usefixtures("small_network", "short_fit")
 
 
 def config(dataset: Path, out: Path, **changes: Any) -> TrainConfig:

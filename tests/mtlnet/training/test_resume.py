@@ -24,6 +24,8 @@ from runtime.files import locked_folder
 from tests.mtlnet.conftest import training_config, write_dataset
 from trackfeatures.errors import UserError
 
+pytestmark = pytest.mark.usefixtures("short_fit")
+
 
 class StopAt:
     """A stop request after so many steps: `requested` is read once before each of them."""

@@ -28,6 +28,8 @@ from trackfeatures.errors import UserError
 
 CPU = torch.device("cpu")
 
+pytestmark = pytest.mark.usefixtures("short_fit")
+
 
 def test_one_batch_is_overfitted(dataset: Path) -> None:
     frames = Dataset.open(dataset).select("train")

@@ -20,6 +20,7 @@ from serve.client import Client
 from tests.serve.conftest import PATIENCE_S, png, publish_untrained, until
 from tests.serve.test_cli import address, command, started
 
+PAUSE_S = 0.02  # asking all the time takes the cores from the workers that start
 BODY = png(golden_image(280, 210)[:, :, ::-1])
 
 
@@ -39,7 +40,7 @@ def expected(run: Path) -> tuple[str, dict[str, Any]]:
 
 
 class Traffic:
-    """Clients that ask without a pause, and the answers and errors they got."""
+    """Clients that ask every `PAUSE_S`, and the answers and errors they got."""
 
     def __init__(self, url: str, clients: int) -> None:
         self._url = url
@@ -52,7 +53,7 @@ class Traffic:
 
     def _drive(self) -> None:
         with Client(self._url, timeout_s=PATIENCE_S) as client:
-            while not self._stop.is_set():
+            while not self._stop.wait(PAUSE_S):
                 try:
                     self.answers.append(client.features(BODY))
                 except Exception as fault:  # noqa: BLE001  # the test looks at them
