@@ -1,8 +1,6 @@
 """The model that ships with the project: its files, and its errors on a track it has never seen."""
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -17,15 +15,14 @@ from mtlnet.inference.model_card import (
     read_card,
     resolve_run,
 )
+from tests.typed import typed
 
 MAX_BYTES = 18_000_000
 
 
 def command(*arguments: str) -> Any:
     """The result of one of the project's commands with --json."""
-    done = subprocess.run(
-        [sys.executable, "-m", *arguments, "--json"], capture_output=True, text=True, timeout=900
-    )
+    done = typed(*arguments, "--json")
     assert done.returncode == 0, done.stderr[-3000:]
     return json.loads(done.stdout)
 
@@ -57,7 +54,17 @@ def test_other_weights_in_the_place_of_the_shipped_ones_are_refused(
 @pytest.mark.slow
 def test_the_shipped_model_reads_a_track_it_has_never_seen(tmp_path: Path) -> None:
     data = str(tmp_path / "data")
-    rounds = ("--rounds", "3", "--frames", "40", "--frequency", "4", "--stretch", "0")
+    rounds = (
+        "--rounds",
+        "3",
+        "--frames",
+        "40",
+        "--frequency",
+        "4",
+        "--stretch",
+        "0",
+        "--workers=1",
+    )
     where = ("--split", "unseen", "--tracks", "coast", "--lights", "clear,overcast", "--seed", "9")
     command("datagen", "collect", "--out", data, *rounds, *where)
     found = command("mtlnet", "evaluate", "--data", data, "--split", "unseen")

@@ -3,7 +3,9 @@
 A network trained on few shaded places mistakes the edges of shadows for markings.
 """
 
+from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import cv2
 import numpy as np
@@ -22,29 +24,36 @@ FIELD = 1024  # cells a side
 
 def add_shadow(image: NDArray[np.uint8], camera: CameraParameters, number: int) -> None:
     """Darken an image (H, W, 3) by shadow `number`, in place."""
-    cv2.multiply(image, shadow_masks(camera)[number], dst=image, scale=1 / 255)
+    cv2.multiply(image, shadow_mask(camera, number), dst=image, scale=1 / 255)
+
+
+def shadow_masks(camera: CameraParameters) -> NDArray[np.uint8]:
+    """Remaining light (SHADOWS, H, W, 3), 255 where there is no shadow."""
+    return np.stack([shadow_mask(camera, number) for number in range(SHADOWS)])
+
+
+@lru_cache(maxsize=2 * SHADOWS)
+def shadow_mask(camera: CameraParameters, number: int) -> NDArray[np.uint8]:
+    """Remaining light (H, W, 3) of one shadow, made when it is first asked for: all take 6 s."""
+    if number == 0:
+        return np.full((camera.height, camera.width, 3), 255, np.uint8)
+    rng = np.random.default_rng()
+    rng.bit_generator.state = _state_before(number)
+    drawn = _draw(rng)
+    field = _field(drawn)
+    ahead, left = road_points(camera)
+    cosine, sine = np.cos(drawn.rotation), np.sin(drawn.rotation)
+    u = (ahead * cosine - left * sine) / CELL_M + drawn.u
+    v = (ahead * sine + left * cosine) / CELL_M + drawn.v
+    shadow = field[u.astype(int) % FIELD, v.astype(int) % FIELD]
+    far = ahead > MAX_DISTANCE_M
+    shadow[far] = field.mean()
+    shadow = cv2.GaussianBlur(shadow, (3, 3), 0.8)
+    light = (255 * (1.0 - drawn.darkness * shadow) + 0.5).astype(np.uint8)
+    return np.repeat(light[..., None], 3, axis=2)
 
 
 @lru_cache(maxsize=2)
-def shadow_masks(camera: CameraParameters) -> NDArray[np.uint8]:
-    """Remaining light (SHADOWS, H, W, 3), 255 where there is no shadow."""
-    rng = np.random.default_rng(0)
-    ahead, left = road_points(camera)
-    masks = np.full((SHADOWS, camera.height, camera.width, 3), 255, np.uint8)
-    for number in range(1, SHADOWS):
-        field = _field(rng)
-        rotation = rng.uniform(0, 2 * np.pi)
-        u = (ahead * np.cos(rotation) - left * np.sin(rotation)) / CELL_M + rng.uniform(0, FIELD)
-        v = (ahead * np.sin(rotation) + left * np.cos(rotation)) / CELL_M + rng.uniform(0, FIELD)
-        shadow = field[u.astype(int) % FIELD, v.astype(int) % FIELD]
-        far = ahead > MAX_DISTANCE_M
-        shadow[far] = field.mean()
-        shadow = cv2.GaussianBlur(shadow, (3, 3), 0.8)
-        light = 1.0 - rng.uniform(*DARKNESS) * shadow
-        masks[number] = (255 * light + 0.5).astype(np.uint8)[..., None]
-    return masks
-
-
 def road_points(camera: CameraParameters) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Point of a flat road that each pixel shows, (H, W) each: m ahead, m left of the camera.
 
@@ -59,14 +68,43 @@ def road_points(camera: CameraParameters) -> tuple[NDArray[np.float64], NDArray[
     return ahead.reshape(shape), left.reshape(shape)
 
 
-def _field(rng: np.random.Generator) -> NDArray[np.float32]:
-    """Shadow density (FIELD, FIELD) in [0, 1], periodic in both directions."""
+@dataclass(frozen=True)
+class Drawn:
+    """The random numbers of a shadow."""
+
+    noise: NDArray[np.float32]  # (FIELD, FIELD)
+    leaves: float  # weight of the leaves; that of the crowns is 1
+    covered: float  # one of `COVERED`
+    rotation: float  # rad, of the field on the road
+    u: float  # cells, the camera's place in the field
+    v: float
+    darkness: float  # one of `DARKNESS`
+
+
+def _draw(rng: np.random.Generator) -> Drawn:
     noise = rng.standard_normal((FIELD, FIELD)).astype(np.float32)
-    total = np.zeros_like(noise)
-    for deviation, weight in ((CROWN_CELLS, 1.0), (LEAF_CELLS, rng.uniform(0.1, 0.9))):
-        wide = np.pad(noise, 64, mode="wrap")
+    leaves, covered = rng.uniform(0.1, 0.9), rng.uniform(*COVERED)
+    rotation, u, v = rng.uniform(0, 2 * np.pi), rng.uniform(0, FIELD), rng.uniform(0, FIELD)
+    return Drawn(noise, leaves, covered, rotation, u, v, rng.uniform(*DARKNESS))
+
+
+@lru_cache(maxsize=SHADOWS)
+def _state_before(number: int) -> Any:
+    """The generator's state once the shadows before `number` are drawn: one generator draws all."""
+    rng = np.random.default_rng(0)
+    if number > 1:
+        rng.bit_generator.state = _state_before(number - 1)
+        _draw(rng)
+    return rng.bit_generator.state
+
+
+def _field(drawn: Drawn) -> NDArray[np.float32]:
+    """Shadow density (FIELD, FIELD) in [0, 1], periodic in both directions."""
+    total = np.zeros_like(drawn.noise)
+    wide = np.pad(drawn.noise, 64, mode="wrap")
+    for deviation, weight in ((CROWN_CELLS, 1.0), (LEAF_CELLS, drawn.leaves)):
         smooth = cv2.GaussianBlur(wide, (0, 0), deviation)[64:-64, 64:-64]
         total += weight * smooth / smooth.std()
-    edge = np.quantile(total, 1.0 - rng.uniform(*COVERED))
+    edge = np.quantile(total, 1.0 - drawn.covered)
     soft: NDArray[np.float32] = ((total - edge) / 0.15 + 0.5).clip(0.0, 1.0)
     return soft

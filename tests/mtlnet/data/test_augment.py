@@ -41,7 +41,7 @@ from mtlnet.data.augment.pipeline import (
     augment_labels,
     draw_params,
 )
-from mtlnet.data.augment.shadows import SHADOWS, add_shadow, road_points
+from mtlnet.data.augment.shadows import SHADOWS, add_shadow, road_points, shadow_mask
 from mtlnet.inference.rectification import BORDER_LEVEL
 from trackfeatures.camera import CameraParameters
 
@@ -148,6 +148,15 @@ def test_shifted_labels_are_those_measured_at_the_shifted_position() -> None:
             after = np.array([measured(at) for at in positions + metres])
             np.testing.assert_allclose(before + metres[:, None], after, atol=1e-5)
     assert moved > 400  # of about 600: most can be shifted
+
+
+def test_a_shadow_is_the_same_whichever_was_drawn_before_it() -> None:
+    shadow_mask.cache_clear()
+    third = shadow_mask(SMALL, 3)
+    shadow_mask.cache_clear()
+    in_order = [shadow_mask(SMALL, number) for number in range(4)]
+    assert [bool((mask == third).all()) for mask in in_order] == [False, False, False, True]
+    assert (in_order[0] == 255).all()
 
 
 def test_shadows_darken_only_the_road() -> None:
