@@ -4,6 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 import torch
 
 from datagen.recording import Dataset
@@ -38,6 +39,7 @@ def test_one_batch_is_learned_by_heart(dataset: Path) -> None:
     assert losses[-1].distance.item() < 0.3 * losses[0].distance.item()
 
 
+@pytest.mark.usefixtures("short_fit")
 def test_it_is_trained_published_and_run_like_any_other(dataset: Path, tmp_path: Path) -> None:
     options = {"data": dataset, "network": "grid", "iterations": 2, "batch": 4, "device": "cpu"}
     result = start_training(options, tmp_path / "run", resume=False)

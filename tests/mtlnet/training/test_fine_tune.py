@@ -26,6 +26,8 @@ from mtlnet.training.config import TrainConfig, open_pretrained
 from mtlnet.training.run import start_training, subnormals_as_zero
 from trackfeatures.errors import UserError
 
+pytestmark = pytest.mark.usefixtures("short_fit")
+
 
 @pytest.fixture
 def custom_images(dataset: Path, tmp_path: Path) -> Path:
