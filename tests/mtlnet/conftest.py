@@ -153,8 +153,9 @@ def small_network(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def short_fit(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Fit the pitch of a trained model in 40 steps, not 800, which take a second a training."""
+    """Fit the pitch of a trained model in 40 steps to 8 frames; else it takes 2 s a training."""
     monkeypatch.setattr(ood, "FIT", replace(ood.FIT, steps=40))
+    monkeypatch.setattr(ood, "PITCH_FRAMES", 8)
 
 
 def training_config(dataset: Path, out: Path, **changes: Any) -> TrainConfig:
