@@ -62,6 +62,7 @@ demo: $(READY) ## collect, train, evaluate, serve, ask, report: in 17 minutes on
 # What measures time comes after them, when the cores are free. A process that dies ends the run: xdist
 # 3.8 would start another, hand out the dead one's finished files again, and wait for ever (its issue 1378).
 PROCESSES := $(shell cores=$$(nproc 2>/dev/null || echo 1); echo $$((cores < 2 ? 2 : 4)))
+ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1
 PARALLEL := --numprocesses $(PROCESSES) --dist loadfile --no-loadscope-reorder --max-worker-restart 0
 
 test: $(READY) ## all checks and tests but the extended ones
@@ -69,10 +70,10 @@ test: $(READY) ## all checks and tests but the extended ones
 	$(BIN)/pytest -m "alone and not extended"
 
 parallel-tests: compiled
-	$(BIN)/pytest $(PARALLEL) -m "not alone and not extended"
+	$(ONE_THREAD) $(BIN)/pytest $(PARALLEL) -m "not alone and not extended"
 
 extended: $(READY) ## the long tests that `make test` leaves out
-	$(BIN)/pytest $(PARALLEL) -m extended
+	$(ONE_THREAD) $(BIN)/pytest $(PARALLEL) -m extended
 
 # The simulator compiles its numeric code when it first runs; once, before many processes need it.
 compiled: $(READY)
@@ -91,7 +92,7 @@ docs: $(READY) ## build the documentation in build/docs; a broken link fails
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict
 
 quick: $(READY) ## the tests that take seconds
-	$(BIN)/pytest $(PARALLEL) -m "not slow and not alone and not extended"
+	$(ONE_THREAD) $(BIN)/pytest $(PARALLEL) -m "not slow and not alone and not extended"
 
 fuzz: $(READY) ## a million damaged images, and as many byte streams, through the service, in process
 	$(BIN)/python benchmarks/service_fuzz.py
