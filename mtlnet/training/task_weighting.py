@@ -61,9 +61,11 @@ class TaskWeighting:
         """The sum to minimise of the tasks' terms (3,)."""
         if self.method != "uncertainty":
             # A weight of 0 takes the task out of the graph: a true single-task network.
-            return (terms[self._chosen] * self.weights[self._chosen]).sum()
-        s = self.log_variance[self._chosen]
-        return (self._factors * torch.exp(-s) * terms[self._chosen] + 0.5 * s).sum()
+            chosen = terms.index_select(0, self._chosen)
+            return (chosen * self.weights.index_select(0, self._chosen)).sum()
+        s = self.log_variance.index_select(0, self._chosen)
+        chosen = terms.index_select(0, self._chosen)
+        return (self._factors * torch.exp(-s) * chosen + 0.5 * s).sum()
 
     @torch.no_grad()
     def current_weights(self) -> list[float]:
