@@ -148,7 +148,7 @@ def _ranges(like: Tensor) -> tuple[Tensor, Tensor]:
     return low, _numbers([span.hi for span in _SPANS], like) - low
 
 
-def _numbers(values: Sequence[float], like: Tensor) -> Tensor:
+def _numbers(values: Sequence[float | None], like: Tensor) -> Tensor:
     """Constants as a tensor of the type and on the device of `like`.
 
     On a GPU it is kept: while a CUDA graph is recorded, nothing may be copied from the host's
@@ -160,7 +160,9 @@ def _numbers(values: Sequence[float], like: Tensor) -> Tensor:
 
 
 @lru_cache
-def _kept_numbers(values: tuple[float, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
+def _kept_numbers(
+    values: tuple[float | None, ...], dtype: torch.dtype, device: torch.device
+) -> Tensor:
     return torch.tensor(values, dtype=dtype, device=device)
 
 

@@ -175,7 +175,8 @@ class GramMuon(Muon):
             state["momentum_buffer"] = torch.zeros_like(weight.grad)
         mean = state["momentum_buffer"]
         mean.lerp_(weight.grad, 1 - momentum)
-        return weight.grad.lerp(mean, momentum)
+        direction: Tensor = weight.grad.lerp(mean, momentum)
+        return direction
 
 
 def _move(weight: Tensor, change: Tensor, rate: float | Tensor, decay: float) -> None:
