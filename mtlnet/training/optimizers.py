@@ -246,7 +246,8 @@ def gram_polynomial(gram: Tensor, coefficients: Coefficients, steps: int) -> Ten
 def _wide(matrix: Tensor, min_norm: float) -> Tensor:
     """The matrix with the shorter side first, of norm 1."""
     wide = matrix if matrix.shape[0] <= matrix.shape[1] else matrix.T
-    return wide / wide.norm().clamp(min=min_norm)
+    unit: Tensor = wide / wide.norm().clamp(min=min_norm)
+    return unit
 
 
 def _as_before(wide: Tensor, matrix: Tensor) -> Tensor:
