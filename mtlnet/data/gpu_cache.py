@@ -15,12 +15,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mtlnet.data.augment.on_device import DeviceAugment
+from mtlnet.data.augment.on_device import DeviceAugment, to_device
 from mtlnet.data.loader import Batch, BatchLabels, Loader, make_ahead
 
 MEMORY_SHARE = 0.6
 """Largest share of the free GPU memory for the images; the rest is for training."""
 CHUNK = 256  # images decoded at once
+DECODED_AHEAD = 3  # chunks decoded or waiting, while one is copied to the device
 PREFETCH = 4  # batches whose labels are made in advance
 
 
@@ -40,7 +41,7 @@ def on_device(batch: Batch | DeviceBatch, device: torch.device) -> DeviceBatch:
     if isinstance(batch, DeviceBatch):
         return batch
     arrays = (batch.images, batch.coded, batch.heading, batch.ahead)
-    return DeviceBatch(*(torch.from_numpy(a).to(device, non_blocking=True) for a in arrays))
+    return DeviceBatch(*(to_device(each, device) for each in arrays))
 
 
 class GpuDataset:
@@ -90,7 +91,7 @@ class GpuDataset:
         return DeviceBatch(images, *(self._to_device(each) for each in arrays))
 
     def _to_device(self, values: NDArray[Any]) -> Tensor:
-        return torch.from_numpy(values).to(self._device, non_blocking=True)
+        return to_device(values, self._device)
 
 
 def _decode(loader: Loader, device: torch.device, first_row: int) -> Tensor:
@@ -98,11 +99,17 @@ def _decode(loader: Loader, device: torch.device, first_row: int) -> Tensor:
     size = (camera.height, camera.width, 3)
     kept = (number, camera.height - first_row, *size[1:])
     images = torch.empty(kept, dtype=torch.uint8, device=device)
-    chunk = np.empty((min(CHUNK, number), *size), np.uint8)
-    for first in range(0, number, CHUNK):
-        rows = np.arange(first, min(first + CHUNK, number))
-        loader.frames.read_batch(rows, chunk[: len(rows)])
-        images[first : first + len(rows)] = torch.from_numpy(chunk[: len(rows), first_row:])
+
+    def decode(chunk: int) -> NDArray[np.uint8]:
+        rows = np.arange(number)[chunk * CHUNK : (chunk + 1) * CHUNK]
+        return loader.frames.read_batch(rows, np.empty((len(rows), *size), np.uint8))
+
+    firsts = range(0, number, CHUNK)
+    # Two chunks at a time keep every core busy to the end of each.
+    chunks = make_ahead(decode, 0, DECODED_AHEAD, 2)
+    for first, chunk in zip(firsts, chunks, strict=False):
+        images[first : first + len(chunk)] = torch.from_numpy(chunk[:, first_row:])
+    chunks.close()
     return images
 
 

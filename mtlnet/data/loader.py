@@ -7,7 +7,7 @@ interruption.
 import ctypes
 import weakref
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache
@@ -182,7 +182,9 @@ class Loader:
         return make_ahead(self.make, first, PREFETCH, WORKERS)
 
 
-def make_ahead(make: Callable[[int], Made], first: int, ahead: int, workers: int) -> Iterator[Made]:
+def make_ahead(
+    make: Callable[[int], Made], first: int, ahead: int, workers: int
+) -> Generator[Made, None, None]:
     """make(first), make(first + 1), ... without end, on threads, `ahead` made or waiting."""
     with ThreadPoolExecutor(workers, thread_name_prefix="loader") as pool:
         waiting = deque(pool.submit(make, first + i) for i in range(ahead))

@@ -9,7 +9,9 @@ next marking's, a regression answers in between, two peaks do not.
 All in torch operations without branches, so that a network ends with them when it is exported.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import torch
 from torch import Tensor
@@ -76,7 +78,7 @@ def absent_in(coded: Tensor) -> Tensor:
     """Which distances coded targets (B, 6) call absent: (B, 5) bool. A label says so by the
     range's inactive end, which no marking that is there reaches."""
     ends = [span.inactive for span in _SPANS[:-1]]
-    there = torch.tensor(ends, dtype=coded.dtype, device=coded.device)
+    there = _numbers(ends, coded)
     low, width = _ranges(coded)
     return (coded[:, :-1] - _code(there, low[:-1], width[:-1])).abs() < _SAME
 
@@ -93,12 +95,8 @@ def read_scores(distance: Tensor, angle: Tensor) -> Tensor:
     """
     absent = absent_probabilities(distance)
     found = expectation(distance[:, :, :-1])  # in bins' places, [0, 1] of the range
-    ends = torch.tensor(
-        [0.0 if span.inactive == span.lo else 1.0 for span in _SPANS[:-1]],
-        dtype=found.dtype,
-        device=found.device,
-    )
-    limits = torch.tensor(ABSENT_ABOVE, dtype=absent.dtype, device=absent.device)
+    ends = _numbers([0.0 if span.inactive == span.lo else 1.0 for span in _SPANS[:-1]], found)
+    limits = _numbers(ABSENT_ABOVE, absent)
     shares = torch.where(absent > limits, ends.expand_as(found), found)
     shares = torch.cat([shares, expectation(angle)[:, None]], 1)
     return OFFSET + SPAN * shares
@@ -146,9 +144,26 @@ def soft_cross_entropy(scores: Tensor, targets: Tensor) -> Tensor:
 
 
 def _ranges(like: Tensor) -> tuple[Tensor, Tensor]:
-    low = torch.tensor([span.lo for span in _SPANS], dtype=like.dtype, device=like.device)
-    high = torch.tensor([span.hi for span in _SPANS], dtype=like.dtype, device=like.device)
-    return low, high - low
+    low = _numbers([span.lo for span in _SPANS], like)
+    return low, _numbers([span.hi for span in _SPANS], like) - low
+
+
+def _numbers(values: Sequence[float | None], like: Tensor) -> Tensor:
+    """Constants as a tensor of the type and on the device of `like`.
+
+    On a GPU it is kept: while a CUDA graph is recorded, nothing may be copied from the host's
+    memory. On a CPU it is new, since an export traces this code with tensors that hold no values.
+    """
+    if like.is_cuda:
+        return _kept_numbers(tuple(values), like.dtype, like.device)
+    return torch.tensor(values, dtype=like.dtype, device=like.device)
+
+
+@lru_cache
+def _kept_numbers(
+    values: tuple[float | None, ...], dtype: torch.dtype, device: torch.device
+) -> Tensor:
+    return torch.tensor(values, dtype=dtype, device=device)
 
 
 def _code(values: Tensor, low: Tensor, width: Tensor) -> Tensor:

@@ -21,8 +21,9 @@ from mtlnet.inference.model_card import (
 from mtlnet.model.architecture import find_architecture, require_task_heads, with_heads
 from mtlnet.training.distributed import read_rank
 from mtlnet.training.loss import Alpha
-from mtlnet.training.recipes import Recipe, find_recipe
+from mtlnet.training.recipes import Recipe, find_recipe, learning_rate_factor
 from mtlnet.training.task_weighting import require_method
+from mtlnet.training.trainer import choose_device
 from runtime.files import write_json
 from trackfeatures.errors import UserError
 
@@ -55,6 +56,9 @@ class TrainConfig:
     seed: int = 0
     batch: int = 0
     """Images a step; 0: the recipe's."""
+    rate_factor: float = 1.0
+    """Of the recipe's learning rate: `recipes.learning_rate_factor` for a run started on a GPU. It
+    is stored, so that a run goes on with its rate on any device."""
     device: str = "auto"
     threads: int = 0
     """CPU threads; 0: one a core."""
@@ -113,12 +117,22 @@ def new_config(options: Mapping[str, Any], out: Path | None) -> TrainConfig:
         values["alpha"] = find_architecture(network).default_alpha
     values.update(options)
     recipe = find_recipe(values["recipe"]).name
+    values.update(_for_gpu(values))
     if heads := values.pop("heads", None):
         if "init" in options:
             raise UserError("a fine-tuned model keeps its heads; leave --heads out with --init")
         values["network"] = with_heads(values.get("network", find_recipe(recipe).network), heads)
     folder = out or RUNS / f"{time.strftime('%Y%m%d-%H%M%S')}-{recipe}"
     return TrainConfig(out=folder, **values)
+
+
+def _for_gpu(values: Mapping[str, Any]) -> dict[str, Any]:
+    """The batch and the factor of the learning rate of a new run, if it is trained on a GPU."""
+    if choose_device(values.get("device", "auto"), read_rank()).type != "cuda":
+        return {}
+    recipe = find_recipe(values["recipe"])
+    batch = values.get("batch") or recipe.gpu_batch or recipe.batch
+    return {"batch": batch, "rate_factor": learning_rate_factor(recipe, max(batch, 1))}
 
 
 def open_pretrained(name: str | Path) -> tuple[Path, ModelCard]:

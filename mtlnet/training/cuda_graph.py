@@ -1,8 +1,9 @@
 """A training step recorded as a CUDA graph and replayed: one launch in place of hundreds.
 
-A replay uses the same memory as the recording, so each batch is copied into the first one's. Python
-numbers such as the learning rate are constants of the recording, which is repeated when they
-change: every 10,000 steps in recipe `paper`.
+A replay uses the same memory as the recording: each batch is copied into the first one's, and
+numbers that change at every step, such as the learning rate, are tensors on the device. What else
+differs between steps, such as which layers are frozen, is a constant of the recording, which is
+repeated when that changes: twice in a run of recipe `fast`.
 """
 
 from collections.abc import Callable
@@ -15,7 +16,8 @@ from mtlnet.data.gpu_cache import DeviceBatch
 from mtlnet.training.loss import Losses
 
 WARM_UP = 3
-"""Steps run before the recording, so that what the first steps allocate is not part of it."""
+"""Steps run before each recording, so that what the first steps allocate, and the kernels that they
+load, are not part of it."""
 
 Work = Callable[[], Losses]
 
@@ -65,18 +67,20 @@ class CudaGraphStep:
         self._batch: DeviceBatch | None = None
         self._warm_up_left = WARM_UP
         self._constants: object = None
+        """Of the recording, or of the steps that prepare it."""
         self._replay: Work | None = None
 
     def __call__(self, batch: DeviceBatch, constants: object) -> Losses:
         """The losses of `work(batch)`; `constants`: Python values it depends on, compared by ==."""
         static = self._copy_in(batch)
+        if constants != self._constants:
+            self._replay = None  # frees the memory of the last graph before the next is recorded
+            self._constants, self._warm_up_left = constants, WARM_UP
         if self._warm_up_left:
             self._warm_up_left -= 1
             return self._recorder.run(lambda: self._work(static))
-        if self._replay is None or constants != self._constants:
-            self._replay = None  # frees the memory of the last graph before the next is recorded
+        if self._replay is None:
             self._replay = self._recorder.record(lambda: self._work(static))
-            self._constants = constants
         losses = self._replay()
         # Copied, because the next replay overwrites the tensors of the graph.
         return Losses(*(getattr(losses, f.name).detach().clone() for f in fields(Losses)))

@@ -6,7 +6,7 @@ convolutions, the first shared layer and small shared layers. AdamW trains heads
 shared layers and torchvision's backbones, whose matrices have few rows.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 import torch
@@ -27,16 +27,30 @@ MUON_LR_SCALE = 8.0
 
 
 class OptimizerSet:
-    """The optimizers of a network, stepped together; `extra`: parameters without weight decay."""
+    """The optimizers of a network, stepped together; `extra`: parameters without weight decay.
 
-    def __init__(self, network: Network, recipe: Recipe, extra: Sequence[nn.Parameter]) -> None:
+    `capturable`: a step can be recorded as a CUDA graph. Learning rates are then tensors beside the
+    weights, and Muon iterates on layers of one size together.
+    """
+
+    def __init__(
+        self,
+        network: Network,
+        recipe: Recipe,
+        extra: Sequence[nn.Parameter],
+        *,
+        capturable: bool = False,
+    ) -> None:
         self.optimizers: list[Optimizer] = []
+        self.learning_rate = recipe.learning_rate
+        """The recipe's learning rate that is set."""
         self.parameters = [*network.parameters(), *extra]
         self._matrices: list[tuple[nn.Parameter, nn.Parameter]] = []
         if recipe.optimizer == "sgd":
             # The gradient of l2 * |w|^2 is 2 * l2 * w.
             groups = _groups(list(network.parameters()), 2 * recipe.l2, extra)
             self.optimizers.append(SGD(groups, recipe.learning_rate, MOMENTUM, fused=True))
+            self._keep_rates_as_tensors(capturable)
             return
         weights = {name: p for name, p in network.named_parameters() if p.ndim > 1}
         others = [p for p in network.parameters() if p.ndim <= 1]
@@ -48,9 +62,22 @@ class OptimizerSet:
             matrices = [matrix for _, matrix in self._matrices]
             muon_groups = [{"params": matrices, "lr_scale": MUON_LR_SCALE}]
             rate = recipe.learning_rate * MUON_LR_SCALE
-            self.optimizers.append(GramMuon(muon_groups, rate, recipe.l2))
+            self.optimizers.append(GramMuon(muon_groups, rate, recipe.l2, together=capturable))
         groups = _groups(list(weights.values()), recipe.l2, [*others, *extra])
-        self.optimizers.append(AdamW(groups, recipe.learning_rate, betas=(0.9, 0.99), fused=True))
+        betas = (0.9, 0.99)
+        self.optimizers.append(
+            AdamW(groups, recipe.learning_rate, betas, fused=True, capturable=capturable)
+        )
+        self._keep_rates_as_tensors(capturable)
+
+    def _keep_rates_as_tensors(self, capturable: bool) -> None:
+        """Replace the rates of all groups by tensors () on the weights' device."""
+        if not capturable:
+            return
+        for optimizer in self.optimizers:
+            for group in optimizer.param_groups:
+                device = group["params"][0].device
+                group["lr"] = torch.tensor(group["lr"], dtype=torch.float32, device=device)
 
     def gradients(self) -> list[Tensor]:
         """The gradients that exist, to be averaged over processes."""
@@ -63,15 +90,14 @@ class OptimizerSet:
 
     def set_learning_rate(self, rate: float) -> None:
         """Set the recipe's learning rate; Muon's is `MUON_LR_SCALE` times as large."""
+        self.learning_rate = rate
         for optimizer in self.optimizers:
             for group in optimizer.param_groups:
-                group["lr"] = rate * group.get("lr_scale", 1.0)
-
-    @property
-    def learning_rate(self) -> float:
-        """The recipe's learning rate that is set."""
-        group = self.optimizers[-1].param_groups[0]
-        return float(group["lr"])
+                scaled = rate * group.get("lr_scale", 1.0)
+                if isinstance(group["lr"], Tensor):
+                    group["lr"].fill_(scaled)  # a recorded step reads this memory
+                else:
+                    group["lr"] = scaled
 
     def step(self) -> None:
         """Update the weights by their gradients."""
@@ -118,53 +144,111 @@ RMS_OF_ADAMW = 0.2
 
 
 class GramMuon(Muon):
-    """Muon for matrices (F, C), with the state of torch.optim.Muon."""
+    """Muon for matrices (F, C), with the state of torch.optim.Muon.
 
-    def __init__(self, params: Iterable[Any], lr: float, weight_decay: float) -> None:
+    `together`: iterate on the Gram matrices of one size as one batch, for a GPU, on which each of
+    these small products would leave most processors idle.
+    """
+
+    def __init__(
+        self, params: Iterable[Any], lr: float, weight_decay: float, *, together: bool = False
+    ) -> None:
         super().__init__(params, lr, weight_decay, adjust_lr_fn="match_rms_adamw")
+        self._orthogonalize = orthogonalize_together if together else orthogonalize_each
 
     @torch.no_grad()
     def step(self, closure: Callable[[], float] | None = None) -> None:  # type: ignore[override]
         """Update the weights by their gradients; `closure` is not called."""
         for group in self.param_groups:
-            for weight in group["params"]:
-                if weight.grad is not None:
-                    self._update(weight, weight.grad, group)
+            weights = [weight for weight in group["params"] if weight.grad is not None]
+            directions = (self._direction(weight, group["momentum"]) for weight in weights)
+            iteration = (group["ns_coefficients"], group["ns_steps"], group["eps"])
+            changes = self._orthogonalize(directions, *iteration)
+            for weight, change in zip(weights, changes, strict=True):
+                _move(weight, change, group["lr"], group["weight_decay"])
 
-    def _update(self, weight: Tensor, gradient: Tensor, group: dict[str, Any]) -> None:
-        rate, momentum = group["lr"], group["momentum"]
+    def _direction(self, weight: Tensor, momentum: float) -> Tensor:
+        """The gradient (F, C) with Nesterov's momentum."""
+        assert weight.grad is not None
         state = self.state[weight]
         if "momentum_buffer" not in state:
-            state["momentum_buffer"] = torch.zeros_like(gradient)
+            state["momentum_buffer"] = torch.zeros_like(weight.grad)
         mean = state["momentum_buffer"]
-        mean.lerp_(gradient, 1 - momentum)
-        direction = gradient.lerp(mean, momentum)
-        length = rate * RMS_OF_ADAMW * max(weight.shape) ** 0.5
-        weight.mul_(1 - rate * group["weight_decay"])
-        weight.add_(
-            orthogonalize(direction, group["ns_coefficients"], group["ns_steps"], group["eps"]),
-            alpha=-length,
-        )
+        mean.lerp_(weight.grad, 1 - momentum)
+        direction: Tensor = weight.grad.lerp(mean, momentum)
+        return direction
+
+
+def _move(weight: Tensor, change: Tensor, rate: float | Tensor, decay: float) -> None:
+    """Move a weight (F, C) against `change`, at a learning rate that may be a tensor ()."""
+    length = rate * RMS_OF_ADAMW * max(weight.shape) ** 0.5
+    weight.mul_(1 - rate * decay)
+    if isinstance(length, Tensor):
+        weight.sub_(change * length)
+    else:
+        weight.add_(change, alpha=-length)
+
+
+Coefficients = tuple[float, float, float]
+
+
+def orthogonalize_each(
+    matrices: Iterable[Tensor], coefficients: Coefficients, steps: int, min_norm: float
+) -> Iterator[Tensor]:
+    """`orthogonalize` of each matrix, when it is asked for."""
+    return (orthogonalize(matrix, coefficients, steps, min_norm) for matrix in matrices)
+
+
+def orthogonalize_together(
+    matrices: Iterable[Tensor], coefficients: Coefficients, steps: int, min_norm: float
+) -> list[Tensor]:
+    """The same; Gram matrices of one size (F, F) are iterated as one batch (N, F, F)."""
+    all_of = list(matrices)
+    wide = [_wide(matrix, min_norm) for matrix in all_of]
+    of_size: dict[int, list[int]] = {}
+    for number, matrix in enumerate(wide):
+        of_size.setdefault(len(matrix), []).append(number)
+    found: dict[int, Tensor] = {}
+    for numbers in of_size.values():
+        grams = torch.stack([wide[n] @ wide[n].T for n in numbers])
+        products = gram_polynomial(grams, coefficients, steps).unbind()
+        found |= {n: product @ wide[n] for n, product in zip(numbers, products, strict=True)}
+    return [_as_before(found[n], matrix) for n, matrix in enumerate(all_of)]
 
 
 def orthogonalize(
-    matrix: Tensor, coefficients: tuple[float, float, float], steps: int, min_norm: float
+    matrix: Tensor, coefficients: Coefficients, steps: int, min_norm: float
 ) -> Tensor:
     """`matrix` (F, C) with its singular values brought near 1; its norm is taken as >= `min_norm`.
 
     Newton-Schulz iterations with a quintic polynomial (Jordan et al. 2024).
     """
-    wide = matrix if matrix.shape[0] <= matrix.shape[1] else matrix.T
-    wide = wide / wide.norm().clamp(min=min_norm)
+    wide = _wide(matrix, min_norm)
+    return _as_before(gram_polynomial(wide @ wide.T, coefficients, steps) @ wide, matrix)
+
+
+def gram_polynomial(gram: Tensor, coefficients: Coefficients, steps: int) -> Tensor:
+    """The polynomial of Gram matrices (F, F) or (N, F, F) by which the iterations multiply."""
     first, second, third = coefficients
-    gram, product = wide @ wide.T, None
+    add_product = torch.addmm if gram.ndim == 2 else torch.baddbmm
+    product: Tensor | None = None
     for left in reversed(range(steps)):
-        factor = torch.addmm(gram, gram, gram, beta=second, alpha=third)
-        factor.diagonal().add_(first)
+        factor = add_product(gram, gram, gram, beta=second, alpha=third)
+        factor.diagonal(dim1=-2, dim2=-1).add_(first)
         # Polynomials of the same matrix commute.
         product = factor if product is None else factor @ product
         if left:
             gram = factor @ gram @ factor
     assert product is not None
-    result: Tensor = product @ wide
-    return result if matrix.shape[0] <= matrix.shape[1] else result.T
+    return product
+
+
+def _wide(matrix: Tensor, min_norm: float) -> Tensor:
+    """The matrix with the shorter side first, of norm 1."""
+    wide = matrix if matrix.shape[0] <= matrix.shape[1] else matrix.T
+    unit: Tensor = wide / wide.norm().clamp(min=min_norm)
+    return unit
+
+
+def _as_before(wide: Tensor, matrix: Tensor) -> Tensor:
+    return wide if matrix.shape[0] <= matrix.shape[1] else wide.T

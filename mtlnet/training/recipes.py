@@ -31,6 +31,9 @@ first convolution stays as it is; frames in sharp bends and near a change of cla
 errors are, are drawn twice as often (in a pilot of 5 minutes 0.89 of the wrong classes, 0.97 of the
 angle's error). With a learning rate of 1e-3 the model forgot more than it learned.
 
+On a GPU `fast` and `continue` take `gpu_batch` images a step, unless `--batch` is given, and every
+recipe scales its learning rate by `learning_rate_factor`.
+
 `tune`: `fast` from a finished model (`--init`), with AdamW, a fifth of the learning rate, 500 steps
 and no batch normalisation.
 """
@@ -71,6 +74,8 @@ class Recipe:
     """How often frames of `mtlnet.data.road_ahead.hard_frames` are drawn in an epoch."""
     from_model: bool = False
     """Whether it starts from a finished model (`--init`)."""
+    gpu_batch: int = 0
+    """Images a step on a GPU, which smaller batches do not fill; 0: `batch`."""
 
 
 HUBER = HuberLoss(distance_beta=0.05)
@@ -89,6 +94,7 @@ FAST = Recipe(
     freeze_bn_at=0.6,
     huber=HUBER,
     freeze_schedule=((0.3, 1), (0.6, 2)),
+    gpu_batch=256,
 )
 CONTINUE = replace(
     FAST,
@@ -110,6 +116,7 @@ TUNE = replace(
     freeze_bn_at=1.0,
     freeze_schedule=(),
     from_model=True,
+    gpu_batch=0,
 )
 RECIPES = {
     "paper": Recipe("paper", MTL.name, "sgd", 1e-3, 32, 150_000, 0.5, 5e-4, False, False, False),
@@ -132,6 +139,18 @@ def find_recipe(name: str) -> Recipe:
 def frozen_convolutions(recipe: Recipe, progress: float) -> int:
     """How many of the first convolutions are frozen at `progress` in [0, 1] of the run."""
     return max((count for share, count in recipe.freeze_schedule if progress >= share), default=0)
+
+
+def learning_rate_factor(recipe: Recipe, batch: int) -> float:
+    """The learning rate for batches of `batch` images over the recipe's own.
+
+    SGD: the ratio of the batches (Goyal et al. 2017, "Accurate, Large Minibatch SGD"). AdamW and
+    Muon, whose steps have the same length whatever the gradient's: its square root (Krizhevsky
+    2014; Malladi et al. 2022, "On the SDEs and Scaling Rules for Adaptive Gradient Algorithms",
+    who derive it for Adam; the momenta, which they scale too, stay as they are).
+    """
+    ratio = batch / recipe.batch
+    return ratio if recipe.optimizer == "sgd" else math.sqrt(ratio)
 
 
 def learning_rate(recipe: Recipe, step: int, progress: float) -> float:

@@ -10,6 +10,7 @@ import shutil
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -279,6 +280,7 @@ def prepare(
     `init` None: new weights, or those of a checkpoint, which is yet to be read.
     """
     recipe = find_recipe(config.recipe)
+    recipe = replace(recipe, learning_rate=recipe.learning_rate * config.rate_factor)
     steps_per_epoch = max(len(data.frames) // config.batch, 1)
     trainer = Trainer(
         recipe,

@@ -40,6 +40,9 @@ class TaskWeighting:
     ) -> None:
         self.method = require_method(method)
         self.learned = torch.tensor([weight > 0 for weight in alpha], device=device)
+        # Not a mask: how many values it selects is not known when a CUDA graph is recorded.
+        self._chosen = self.learned.nonzero().flatten()
+        self._factors = torch.tensor(LIKELIHOOD_FACTORS, device=device)[self._chosen]
         self.window = max(min(steps_per_epoch, WINDOW_STEPS), 1)
         self.log_variance = nn.Parameter(torch.zeros(len(TASKS), device=device))
         fixed = torch.tensor(alpha, device=device)
@@ -58,10 +61,11 @@ class TaskWeighting:
         """The sum to minimise of the tasks' terms (3,)."""
         if self.method != "uncertainty":
             # A weight of 0 takes the task out of the graph: a true single-task network.
-            return (terms[self.learned] * self.weights[self.learned]).sum()
-        s = self.log_variance[self.learned]
-        factors = torch.tensor(LIKELIHOOD_FACTORS, device=terms.device)
-        return (factors[self.learned] * torch.exp(-s) * terms[self.learned] + 0.5 * s).sum()
+            chosen = terms.index_select(0, self._chosen)
+            return (chosen * self.weights.index_select(0, self._chosen)).sum()
+        s = self.log_variance.index_select(0, self._chosen)
+        chosen = terms.index_select(0, self._chosen)
+        return (self._factors * torch.exp(-s) * chosen + 0.5 * s).sum()
 
     @torch.no_grad()
     def current_weights(self) -> list[float]:

@@ -68,18 +68,19 @@ class Trainer:
         )
         initialise(network, seed)
         self.network = network.to(device).to(memory_format=torch.channels_last)
-        self.optimizers = OptimizerSet(self.network, recipe, self.task_weighting.parameters)
+        self.optimizers = OptimizerSet(
+            self.network,
+            recipe,
+            self.task_weighting.parameters,
+            capturable=device.type == "cuda",
+        )
         self.target_variance: Tensor | None = None
         self.cuda_graph = self._cuda_graph()
         self.seed_dropout()
 
     def _cuda_graph(self) -> CudaGraphStep | None:
-        """The recorded step on a GPU, where the numbers it computes with seldom change.
-
-        Otherwise the learning rate or the tasks' weights change at every step.
-        """
-        constant = self.recipe.optimizer == "sgd" and self.task_weighting.method == "fixed"
-        if self.device.type != "cuda" or not constant or self.rank.world_size > 1:
+        """The recorded step on a GPU; several processes exchange gradients within a step."""
+        if self.device.type != "cuda" or self.rank.world_size > 1:
             return None
         return CudaGraphStep(self.optimize, CudaRecorder(self.device))
 
@@ -113,14 +114,16 @@ class Trainer:
         """Train on one batch at `progress` in [0, 1] of the run; its losses before the step."""
         self.network.train()
         settled = self.step_number >= MIN_STEPS_BEFORE_BN_FREEZE
-        if settled and progress >= self.recipe.freeze_bn_at:
+        frozen_norm = settled and progress >= self.recipe.freeze_bn_at
+        if frozen_norm:
             freeze_batch_norm(self.network)
-        freeze_convolutions(self.network, frozen_convolutions(self.recipe, progress))
+        frozen = frozen_convolutions(self.recipe, progress)
+        freeze_convolutions(self.network, frozen)
         rate = learning_rate(self.recipe, self.step_number, progress)
         self.optimizers.set_learning_rate(rate)
         moved = on_device(batch, self.device)
         graph = self.cuda_graph
-        losses = self.optimize(moved) if graph is None else graph(moved, rate)
+        losses = self.optimize(moved) if graph is None else graph(moved, (frozen, frozen_norm))
         self.task_weighting.update(losses.terms)
         self.step_number += 1
         return losses

@@ -6,6 +6,7 @@ no image is written as JPEG.
 """
 
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 import torch
@@ -25,6 +26,18 @@ from mtlnet.inference.rectification import BORDER_LEVEL
 from trackfeatures.camera import CameraParameters
 
 BLUR_RADIUS = 3
+
+
+def to_device(values: NDArray[Any], device: torch.device) -> Tensor:
+    """An array as a tensor on `device`.
+
+    To a GPU it is copied from pinned memory: a copy from other memory may wait for the kernels that
+    are queued, and the GPU would then idle while the next batch is made.
+    """
+    tensor = torch.from_numpy(values)
+    if device.type == "cuda":
+        return tensor.pin_memory().to(device, non_blocking=True)
+    return tensor.to(device)
 
 
 class DeviceAugment:
@@ -57,7 +70,7 @@ class DeviceAugment:
         return x.round_().clamp_(0, 255).to(torch.uint8).permute(0, 2, 3, 1)
 
     def _on(self, values: NDArray[np.generic]) -> Tensor:
-        return torch.from_numpy(values).to(self._device, non_blocking=True)
+        return to_device(values, self._device)
 
     def _moved(self, x: Tensor, params: AugmentParams) -> Tensor:
         """Moved aside, turned and mirrored: each pixel from where it was, in one step."""

@@ -82,15 +82,16 @@ def test_a_captured_step_gets_each_batch_in_the_same_memory() -> None:
     recorder = FakeRecorder()
     step = CudaGraphStep(work, recorder)
     found = []
-    for number in range(8):
+    for number in range(12):
         full = torch.full((2, 6), float(number))
         batch = DeviceBatch(torch.zeros(2, 1, 1, 3, dtype=torch.uint8), full, torch.zeros(2).long())
-        found.append(step(batch, 0.1 if number < 6 else 0.09))
+        found.append(step(batch, 1 if number < 6 else 2))
     assert len(set(addresses)) == 1
-    assert (recorder.ran, recorder.replayed) == (WARM_UP, 8 - WARM_UP)
-    assert recorder.recorded == 2  # and again for another learning rate
+    assert (recorder.ran, recorder.replayed) == (2 * WARM_UP, 12 - 2 * WARM_UP)
+    assert recorder.recorded == 2  # and again once more layers are frozen
     # Losses already returned do not change when the memory is reused.
-    assert [float(losses.total) for losses in found[WARM_UP:]] == [3.0, 4.0, 5.0, 6.0, 7.0]
+    replayed = [number for number in range(12) if number % 6 >= WARM_UP]
+    assert [float(found[number].total) for number in replayed] == replayed
 
 
 def steps(trainer: Trainer, cached: GpuDataset, count: int) -> list[float]:
@@ -123,9 +124,11 @@ def test_a_cuda_graph_replays_training_steps(dataset: Path) -> None:
     assert isinstance(recorded.cuda_graph, CudaGraphStep)
     plain.cuda_graph = None
     assert steps(recorded, cached, 12) == pytest.approx(steps(plain, cached, 12), rel=2e-2)
-    # With another learning rate it is captured again, and training continues.
+    # The learning rate is not part of the graph: the same one goes on with another.
+    graph = recorded.cuda_graph._replay
     before = [p.clone() for p in recorded.network.parameters()]
     recorded.recipe = plain.recipe = replace(recipe, learning_rate=0.01)
     assert steps(recorded, cached, 4) == pytest.approx(steps(plain, cached, 4), rel=2e-2)
+    assert recorded.cuda_graph._replay is graph
     after = recorded.network.parameters()
     assert any(not torch.equal(a, b) for a, b in zip(before, after, strict=True))

@@ -12,6 +12,8 @@ from mtlnet.training.optimizers import (
     GramMuon,
     OptimizerSet,
     as_matrix,
+    orthogonalize_each,
+    orthogonalize_together,
     uses_muon,
 )
 from mtlnet.training.recipes import RECIPES, Recipe
@@ -93,6 +95,45 @@ def test_steps_equal_those_of_torchs_muon(shape: tuple[int, int]) -> None:
     assert float((change - expected).norm() / expected.norm()) < 0.02
     for name, state in optimizers[1].state[theirs].items():
         torch.testing.assert_close(optimizers[0].state[ours][name], state)
+
+
+def test_muon_iterates_on_layers_together_as_on_each() -> None:
+    """Numbers for which every product and sum is exact in float32, on any processor."""
+    generator = torch.Generator().manual_seed(0)
+
+    def signs(*shape: int) -> torch.Tensor:
+        return torch.randint(0, 2, shape, generator=generator) * 2.0 - 1.0
+
+    # Each with 4^k entries of +-1, so that its norm is a power of two.
+    matrices = [signs(8, 8), signs(4, 16), signs(32, 8), signs(8, 32), signs(4, 4)]
+    exact = (2.0, -1.0, 0.5)
+    each = list(orthogonalize_each(matrices, exact, 1, 1e-7))
+    together = orthogonalize_together(matrices, exact, 1, 1e-7)
+    for matrix, one, other in zip(matrices, each, together, strict=True):
+        assert one.shape == matrix.shape
+        assert torch.equal(one, other)
+    # By hand: with G = X X^T the result is (2 - G + G^2 / 2) X.
+    x = matrices[1] / 8
+    gram = x @ x.T
+    assert torch.equal(together[1], (2 * torch.eye(4) - gram + gram @ gram / 2) @ x)
+
+
+def test_muon_of_layers_together_takes_the_steps_of_each() -> None:
+    generator = torch.Generator().manual_seed(0)
+    starts = [torch.randn(s, generator=generator) for s in ((16, 64), (64, 16), (16, 40), (8, 9))]
+    ends = []
+    for together in (False, True):
+        draw = torch.Generator().manual_seed(1)
+        weights = [torch.nn.Parameter(start.clone()) for start in starts]
+        optimizer = GramMuon(weights, 0.02, 0.1, together=together)
+        for number in range(3):
+            for weight in weights:
+                weight.grad = torch.randn(weight.shape, generator=draw)
+            weights[number].grad = None  # as of a frozen layer
+            optimizer.step()
+        ends.append(weights)
+    for one, other in zip(*ends, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-5, atol=1e-6)
 
 
 def test_a_gradient_of_zero_changes_nothing() -> None:
