@@ -49,7 +49,7 @@ class Collection:
         return Command(tuple(words), folder / f"{self.name}.json", log)
 
 
-def test_collections(size: Size, cores: int) -> list[Collection]:
+def evaluation_collections(size: Size, cores: int) -> list[Collection]:
     """`test`, `unseen` and `random`, each with its share of the cores."""
     rounds = {"test": size.test_rounds, "unseen": size.unseen_rounds, "random": size.random_rounds}
     options: dict[str, tuple[str, ...]] = {

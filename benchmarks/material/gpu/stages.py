@@ -17,8 +17,8 @@ from typing import Any
 from benchmarks.material.gpu.collecting import (
     VARIED,
     counted,
+    evaluation_collections,
     most_frames,
-    test_collections,
     train_collections,
 )
 from benchmarks.material.gpu.plan import Plan, Size
@@ -124,7 +124,7 @@ def gpu_tests(task: Run) -> dict[str, Any]:
 
 def collect_test(task: Run) -> dict[str, Any]:
     """The three datasets to evaluate on."""
-    collections = test_collections(task.size, task.cores)
+    collections = evaluation_collections(task.size, task.cores)
     commands = [each.command(task.work) for each in collections]
     ended = run(commands, task.left("collect_test"))
     _require_success(commands, ended)

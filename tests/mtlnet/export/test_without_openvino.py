@@ -1,17 +1,19 @@
 """A machine without OpenVINO trains, ships and evaluates by torch; another serves the result."""
 
+import shutil
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from benchmarks.material.gpu.salvage import publish_checkpoint
 from datagen.recording import Dataset
 from mtlnet.evaluation.evaluate import evaluate
 from mtlnet.export.openvino_graph import TOLERANCE
 from mtlnet.export.ship import ship_model
 from mtlnet.inference.engine import has_openvino, load_engine
-from mtlnet.inference.model_card import UNCERTAINTY_WEIGHTS, WEIGHTS, read_card
+from mtlnet.inference.model_card import CARD, UNCERTAINTY_WEIGHTS, WEIGHTS, read_card
 from mtlnet.inference.torch_engine import TorchEngine
 from mtlnet.training.run import train
 from mtlnet.uncertainty_fit.head import run_on_frames
@@ -30,6 +32,13 @@ def test_what_torch_alone_trains_and_ships_is_served(
         card = train(training_config(dataset, run), None)
         found = ship_model(run, out)
         report = evaluate([load_engine(out, "torch")], dataset, "test")
+        # As after a training that was stopped: a checkpoint, and no card.
+        stopped = shutil.copytree(run, tmp_path / "stopped")
+        (stopped / CARD).unlink()
+        assert publish_checkpoint(stopped) == card.iterations == 4
+    saved = read_card(stopped)
+    assert (saved.golden, saved.data, saved.uncertainty) == (card.golden, card.data, None)
+    assert set(saved.files) == {WEIGHTS}
     assert set(card.files) == {WEIGHTS, UNCERTAINTY_WEIGHTS}
     assert card.export_check == {"frames": 0.0}
     assert not [*run.glob("model.xml"), *run.glob("model.bin")]
