@@ -65,9 +65,11 @@ def parse() -> argparse.Namespace:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--minutes", type=float, default=10.0, help="of the whole run")
-    parser.add_argument("--out", type=Path, default=Path("gpu_run"), help="folder for the results")
     parser.add_argument(
-        "--work", type=Path, default=Path("build/gpu_run"), help="folder for everything else"
+        "--out", type=Path, default=Path("build/gpu_run/out"), help="folder for the results"
+    )
+    parser.add_argument(
+        "--work", type=Path, default=Path("build/gpu_run/work"), help="folder for everything else"
     )
     parser.add_argument("--wheels", type=Path, help="folder of wheels of what the machine lacks")
     parser.add_argument("--tracks", type=Path, help="folder of TORCS's tracks; else $TORCS_TRACKS")

@@ -19,6 +19,7 @@ import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
+from benchmarks import gpu_run
 from benchmarks.material.gpu import machine, process, report, stages, wheels
 from benchmarks.material.gpu.collecting import (
     SEEDS,
@@ -32,6 +33,7 @@ from benchmarks.material.gpu.process import Command, Ended, Interrupted
 from benchmarks.material.gpu.report import DONE, FAILED, SKIPPED, STOPPED, Report
 from benchmarks.material.gpu.running import run_stages
 from benchmarks.material.gpu.stages import Run, StageFailed, timing
+from benchmarks.material.outcome import NOT_MEASURED
 from mtlnet.inference.curves import COLUMNS
 from mtlnet.inference.model_card import SHIPPED, read_card
 from trackfeatures.errors import UserError
@@ -169,6 +171,48 @@ def test_the_wheels_are_those_of_the_lock_and_the_checkout_has_a_version(tmp_pat
     wheels.describe_checkout(tmp_path / "site")
     (about,) = distributions(name="driverview", path=[str(tmp_path / "site")])
     assert f'version = "{about.version}"' in (ROOT / "pyproject.toml").read_text()
+
+
+def test_wheels_are_downloaded_for_the_machine_and_may_not_be_too_large(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[list[str]] = []
+
+    def pip(command: list[str], **_: object) -> subprocess.CompletedProcess[str]:
+        asked.append(command)
+        (Path(command[command.index("--dest") + 1]) / "mcap.whl").write_bytes(bytes(1_000))
+        return subprocess.CompletedProcess(command, 0, "", "")
+
+    monkeypatch.setattr(subprocess, "run", pip)
+    monkeypatch.setattr(sys, "argv", ["gpu_run.py", "--collect-wheels", str(tmp_path / "new")])
+    assert gpu_run.main() == 0
+    assert asked[0][-10:] == wheels.pinned()
+    assert asked[0][asked[0].index("--python-version") + 1] == "3.12"
+    assert "--only-binary=:all:" in asked[0]
+    monkeypatch.setattr(wheels, "MAX_BYTES", 999)
+    with pytest.raises(UserError, match=r"have 0\.0 MB, at most"):
+        wheels.collect_wheels(tmp_path / "new")
+
+
+def test_a_machine_that_lacks_something_starts_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("PYTHONPATH", "TORCS_TRACKS"):  # which are set for the commands of a run
+        monkeypatch.setenv(name, "before")
+    found = {**GOOD, "gpu": None, "torcs": False}
+    monkeypatch.setattr(machine, "missing_packages", list)
+    monkeypatch.setattr(machine, "describe_machine", lambda: found)
+    words = ["--out", tmp_path / "out", "--work", tmp_path / "work", "--tracks", tmp_path]
+    monkeypatch.setattr(sys, "argv", ["gpu_run.py", *map(str, words)])
+    assert gpu_run.main() == NOT_MEASURED
+    first, *lacks = capsys.readouterr().err.splitlines()
+    assert first == "not measured: this machine lacks"
+    assert [line.split(":")[0] for line in lacks] == ["  tracks", "  gpu"]
+    assert not (tmp_path / "out").exists()
+    assert os.environ["TORCS_TRACKS"] == str(tmp_path)
+    assert os.environ["PYTHONPATH"].split(os.pathsep) == [
+        *(str(ROOT), str(tmp_path / "work" / "site"), "before"),
+    ]
 
 
 # How commands are run and stopped.

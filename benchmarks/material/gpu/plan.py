@@ -83,6 +83,8 @@ class Size:
     """Forward passes of each batch that are timed, after as many for warming up."""
     iterations: int | None
     """Steps of the training; None: as many as its minutes hold."""
+    batch: int | None
+    """Images a step, unless `--batch` is given; None: the recipe's."""
     device: str
 
 
@@ -97,6 +99,7 @@ FULL = Size(
     batches=(1, 2, 4, 8, 16, 32, 64, 128, 256),
     passes=50,
     iterations=None,
+    batch=None,
     device="cuda",
 )
 REHEARSAL = Size(
@@ -110,5 +113,6 @@ REHEARSAL = Size(
     batches=(1, 4),
     passes=2,
     iterations=10,
+    batch=16,
     device="cpu",
 )
