@@ -10,6 +10,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from importlib.metadata import distributions, packages_distributions, requires
 from itertools import pairwise
 from pathlib import Path
@@ -68,7 +69,40 @@ def test_the_training_takes_what_its_start_and_end_and_the_earlier_stages_leave(
     assert on_time == pytest.approx((215 - 12 - 50 - 10) / 60)
     assert plan.train_minutes(185.0, 60_000) == pytest.approx(on_time + 1.0)
     assert plan.train_minutes(245.0, 10**7) == pytest.approx(0.25 * 215 / 60)
-    assert plan.train_minutes(500.0, 0) == pytest.approx(1 / 60)
+    assert plan.train_minutes(594.5, 0) == pytest.approx(1 / 60)
+
+
+def test_a_stage_that_begins_late_has_its_own_time_until_the_run_ends() -> None:
+    plan = Plan(10.0)
+    assert plan.seconds("forward", 10.0) == 20.0  # five seconds were left before it
+    assert plan.seconds("forward", 60.0) == 15.0
+    assert plan.seconds("train", 300.0) == 160.0
+    assert plan.seconds("train", 450.0) == 0.25 * 215.0
+    assert plan.seconds("paper", 500.0) == 95.0
+    assert plan.seconds("paper", 560.0) == 35.0
+    assert plan.seconds("paper", 600.0) == 0.0
+
+
+def test_stages_know_until_when_they_may_take_and_none_begins_after_the_end(
+    tmp_path: Path,
+) -> None:
+    task = task_of(tmp_path)  # of three minutes
+    left: dict[str, float] = {}
+
+    def look(name: str) -> Callable[[Run], dict[str, Any]]:
+        return lambda task: left.setdefault(name, task.left()) and {}
+
+    functions = {name: look(name) for name in STAGES}
+    run_stages(replace(task, begin=time.monotonic() - 150.0), functions)
+    assert left["forward"] == pytest.approx(0.3 * 15.0, abs=1.0)
+    assert left["train"] == pytest.approx(0.25 * 0.3 * 215.0, abs=1.0)
+    assert left["paper"] == pytest.approx(178.5 - 150.0, abs=1.0)
+    over = task_of(tmp_path / "over")
+    run_stages(replace(over, begin=time.monotonic() - 178.0), functions)
+    assert {stage["why"] for stage in over.report.content["stages"].values()} == {
+        *("no time is left", "stage collect_test is not done", "stage collect_train is not done"),
+        "stage ship is not done",
+    }
 
 
 def evaluation_collections_share_the_cores_and_no_seed() -> None:

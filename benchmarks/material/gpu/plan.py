@@ -29,7 +29,8 @@ LOADED_FRAMES_PER_SECOND = 6_000.0
 LOAD_S, FINISH_S = 12.0, 50.0
 """Of `train` in a run of ten minutes: its start, and the fit of the uncertainty head at its end."""
 LEAST_TRAINED_SHARE = 0.25
-"""Share of `train` that is trained at least, if reading the data should take longer than that."""
+"""Share of `train` that is left to it after delays; and share of its time that is trained at least,
+if reading the data should take longer than planned."""
 
 
 @dataclass(frozen=True)
@@ -50,13 +51,24 @@ class Plan:
         return 60.0 * self.minutes / sum(SECONDS.values())
 
     def deadline(self, stage: str) -> float:
-        """Seconds from the start of the run until which `stage` may take."""
+        """Seconds from the start of the run at which `stage` should have ended."""
         names = list(SECONDS)
         return self.scale * sum(SECONDS[name] for name in names[: names.index(stage) + 1])
 
+    def seconds(self, stage: str, now: float) -> float:
+        """Seconds that `stage` may take when it begins at `now`, 0 when the run is over.
+
+        Until its deadline. One that begins late gets its own time all the same, and `train` a
+        quarter of it: so `train` makes up for the delays before it, and `paper` for later ones.
+        """
+        share = LEAST_TRAINED_SHARE if stage == "train" else 1.0
+        own = self.scale * share * SECONDS[stage]
+        until_end = self.deadline(STAGES[-1]) - now
+        return max(min(max(self.deadline(stage) - now, own), until_end), 0.0)
+
     def train_minutes(self, now: float, frames: int) -> float:
         """Minutes of training steps on `frames` frames when `train` begins at `now` seconds."""
-        left = self.deadline("train") - now
+        left = self.seconds("train", now)
         around = self.scale * (LOAD_S + FINISH_S) + frames / LOADED_FRAMES_PER_SECOND
         return max(left - around, LEAST_TRAINED_SHARE * left, 1.0) / 60.0
 

@@ -3,6 +3,7 @@
 import sys
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from benchmarks.material.outcome import exit_code
 from trackfeatures.errors import UserError
 
 INTERRUPTED = 128
+LEAST_SECONDS = 1.0
 Stages = Mapping[str, Callable[[Run], dict[str, Any]]]
 
 
@@ -59,9 +61,13 @@ def run_stages(task: Run, functions: Stages = STAGE_FUNCTIONS) -> None:
             report.add(name, SKIPPED, 0.0, {"why": f"stage {need} is not done"})
             continue
         begin = time.monotonic()
+        seconds = task.plan.seconds(name, begin - task.begin)
+        if seconds < LEAST_SECONDS:
+            report.add(name, SKIPPED, 0.0, {"why": "no time is left"})
+            continue
         print(f"{begin - task.begin:6.1f} s  {name}", file=sys.stderr, flush=True)
         try:
-            found, end = functions[name](task), DONE
+            found, end = functions[name](replace(task, until=begin + seconds)), DONE
         except StageFailed as failed:
             found, end = {**failed.found, "why": str(failed)}, FAILED
         except (UserError, OSError, ValueError, LookupError) as error:

@@ -56,6 +56,8 @@ class Run:
     begin: float
     recipe: str
     given_batch: int | None
+    until: float = 0.0
+    """`time.monotonic()` until which the current stage may take."""
 
     @property
     def work(self) -> Path:
@@ -70,9 +72,9 @@ class Run:
     def cores(self) -> int:
         return int(self.report.content["machine"]["cores"])
 
-    def left(self, stage: str) -> float:
-        """Seconds until the deadline of `stage`."""
-        return self.plan.deadline(stage) - (time.monotonic() - self.begin)
+    def left(self) -> float:
+        """Seconds that are left to the current stage."""
+        return self.until - time.monotonic()
 
     def command(self, name: str, *words: str, openmp_threads: int | None = None) -> Command:
         """`python WORDS`, with output and log named after `name`."""
@@ -89,7 +91,7 @@ def forward(task: Run) -> dict[str, Any]:
         *("-m", "benchmarks.material.gpu.forward", "--device", size.device),
         *("--batches", ",".join(map(str, size.batches)), "--passes", str(size.passes)),
     )
-    (ended,) = run([command], task.left("forward"))
+    (ended,) = run([command], task.left())
     lines = command.out.read_text().splitlines()
     found = {"ms": [json.loads(line) for line in lines if line.endswith("}")]}
     _require_ended(command, ended, found)
@@ -104,7 +106,7 @@ def compile_code(task: Run) -> dict[str, Any]:
         *("--workers", "1", *VARIED[:2], "--tracks", "random,oval"),
         *("--out", str(task.work / "compile")),
     )
-    (ended,) = run([command], task.left("compile"))
+    (ended,) = run([command], task.left())
     _require_ended(command, ended)
     return {}
 
@@ -118,7 +120,7 @@ def gpu_tests(task: Run) -> dict[str, Any]:
         *("-m", "pytest", "--rootdir", str(ROOT), "-c", str(ROOT / "pyproject.toml")),
         *("-p", "no:cacheprovider", "-m", "gpu", *(str(path) for path in marked)),
     )
-    (ended,) = run([command], task.left("tests"))
+    (ended,) = run([command], task.left())
     said = command.out.read_text(errors="replace")
     counts = re.findall(r"(\d+) (passed|failed|skipped|errors?)\b", said)
     found = {"files": files, **{name: int(count) for count, name in counts}}
@@ -131,7 +133,7 @@ def collect_test(task: Run) -> dict[str, Any]:
     """The three datasets to evaluate on; on a slow machine fewer rounds of them."""
     collections = evaluation_collections(task.size, task.cores)
     commands = [each.command(task.work) for each in collections]
-    ended = run(commands, task.left("collect_test"))
+    ended = run(commands, task.left())
     _require_not_failed(commands, ended)
     found = counted(task.work, collections, ended)
     if not found["frames"]["test"]:
@@ -141,7 +143,7 @@ def collect_test(task: Run) -> dict[str, Any]:
 
 def collect_train(task: Run) -> dict[str, Any]:
     """The dataset to train on: as many frames as there is time for, and memory on the GPU."""
-    seconds = (1 - MERGE_SHARE) * task.left("collect_train")
+    seconds = (1 - MERGE_SHARE) * task.left()
     if "train_frames" not in task.report.content:  # a run that goes on keeps its plans
         most = most_frames(task.size, task.report.content["machine"]["gpu_bytes"])
         before = task.report.stage("collect_test")
@@ -158,7 +160,7 @@ def collect_train(task: Run) -> dict[str, Any]:
     if not parts:
         raise StageFailed("no round was finished in time", found)
     merge = task.command("merge", "-m", "datagen", "merge", *parts, "--out", str(_train_set(task)))
-    (merged,) = run([merge], task.left("collect_train"))
+    (merged,) = run([merge], task.left())
     _require_ended(merge, merged, found)
     return found
 
@@ -188,7 +190,7 @@ def _time_recipe(task: Run, recipe: str) -> dict[str, Any]:
         points = read_curves(folder / CURVES)
         return bool(points) and points[-1]["step"] >= steps
 
-    (ended,) = run([command], task.left(recipe), enough)
+    (ended,) = run([command], task.left(), enough)
     task.report.copy_curves(folder / CURVES, f"curves-{recipe}.csv")
     found = timing(read_curves(folder / CURVES))
     if not found:
@@ -244,7 +246,7 @@ def train(task: Run) -> dict[str, Any]:
     else:
         words += ["--minutes", f"{before + minutes:.3f}"]
     command = task.command("train", *words)
-    (ended,) = run([command], task.left("train"))
+    (ended,) = run([command], task.left())
     task.report.copy_curves(folder / CURVES, "curves.csv")
     found = {"frames": frames, "planned_minutes": round(minutes, 2)}
     found |= timing(read_curves(folder / CURVES))
@@ -260,13 +262,13 @@ def ship(task: Run) -> dict[str, Any]:
     folder = task.work / "train"
     if not (folder / CARD).is_file():
         salvage = task.command("salvage", "-m", "benchmarks.material.gpu.salvage", str(folder))
-        (ended,) = run([salvage], task.left("ship"))
+        (ended,) = run([salvage], task.left())
         _require_ended(salvage, ended)
         found["from_checkpoint"] = int(salvage.out.read_text())
     words = ("-m", "mtlnet", "ship", "--json", "--model", str(folder), "--out", str(_model(task)))
     command = task.command("ship", *words)
     if not (_model(task) / CARD).is_file():
-        (ended,) = run([command], task.left("ship"))
+        (ended,) = run([command], task.left())
         _require_ended(command, ended)
         found |= json.loads(command.out.read_text())
     task.report.copy_model(_model(task))
@@ -286,7 +288,7 @@ def evaluate(task: Run) -> dict[str, Any]:
             *("--model", str(_model(task)), "--data", str(task.work / name)),
             openmp_threads=1,
         )
-        (ended,) = run([command], task.left("evaluate"))
+        (ended,) = run([command], task.left())
         _require_ended(command, ended, found)
         found[name] = {**json.loads(command.out.read_text()), "data": name}
         task.report.add("evaluate", RUNNING, ended.seconds, found)
