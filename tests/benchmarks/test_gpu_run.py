@@ -90,7 +90,11 @@ def test_stages_know_until_when_they_may_take_and_none_begins_after_the_end(
     left: dict[str, float] = {}
 
     def look(name: str) -> Callable[[Run], dict[str, Any]]:
-        return lambda task: left.setdefault(name, task.left()) and {}
+        def work(task: Run) -> dict[str, Any]:
+            left[name] = task.left()
+            return {}
+
+        return work
 
     functions = {name: look(name) for name in STAGES}
     run_stages(replace(task, begin=time.monotonic() - 150.0), functions)
