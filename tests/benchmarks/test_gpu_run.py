@@ -7,7 +7,6 @@ import re
 import signal
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -274,24 +273,28 @@ def test_commands_run_side_by_side_until_they_end(tmp_path: Path) -> None:
     assert process.log_tail(tmp_path / "b.log") == "b"
 
 
-POLITE = "trap 'echo saved; exit 7' TERM; while :; do sleep 0.05; done"
-STUBBORN = "trap '' TERM; while :; do sleep 0.05; done"
+POLITE = "trap 'echo saved; exit 7' TERM; echo > {ready}; while :; do sleep 0.05; done"
+STUBBORN = "trap '' TERM; echo > {ready}; while :; do sleep 0.05; done"
 
 
-def test_at_its_deadline_a_command_may_save_and_is_then_killed(tmp_path: Path) -> None:
-    both = [shell(tmp_path, POLITE, "polite"), shell(tmp_path, STUBBORN, "stubborn")]
-    polite, stubborn = process.run(both, 0.3, grace_s=1.0)
+def test_commands_that_have_done_enough_may_save_and_are_then_killed(tmp_path: Path) -> None:
+    ready = [tmp_path / "polite", tmp_path / "stubborn"]
+    both = [
+        shell(tmp_path, script.format(ready=path), path.name)
+        for script, path in zip((POLITE, STUBBORN), ready, strict=True)
+    ]
+    polite, stubborn = process.run(
+        both, 60.0, lambda: all(path.exists() for path in ready), grace_s=1.0
+    )
     assert (polite.code, polite.stopped) == (7, True)
     assert (stubborn.code, stubborn.stopped) == (-signal.SIGKILL, True)
     assert (tmp_path / "polite.out").read_text() == "saved\n"
 
 
-def test_a_command_is_stopped_when_it_has_done_enough(tmp_path: Path) -> None:
-    marker = tmp_path / "marker"
-    command = shell(tmp_path, f"touch {marker}; {POLITE}")
-    (ended,) = process.run([command], 60.0, marker.exists)
-    assert (ended.code, ended.stopped) == (7, True)
-    assert ended.seconds < 30.0
+def test_a_command_is_stopped_at_its_deadline(tmp_path: Path) -> None:
+    (ended,) = process.run([shell(tmp_path, "sleep 60")], 0.3)
+    assert (ended.code, ended.stopped) == (-signal.SIGTERM, True)
+    assert 0.3 <= ended.seconds < 30.0
 
 
 @pytest.fixture
@@ -305,9 +308,15 @@ def own_signals() -> Iterator[None]:
 @pytest.mark.usefixtures("own_signals")
 def test_a_signal_stops_the_commands_too(tmp_path: Path) -> None:
     process.raise_on_signals()
-    threading.Timer(0.4, os.kill, (os.getpid(), signal.SIGTERM)).start()
+    ready = tmp_path / "ready"
+
+    def enough() -> bool:
+        if ready.exists():
+            os.kill(os.getpid(), signal.SIGTERM)
+        return False
+
     with pytest.raises(Interrupted) as raised:
-        process.run([shell(tmp_path, POLITE)], 60.0)
+        process.run([shell(tmp_path, POLITE.format(ready=ready))], 60.0, enough)
     assert raised.value.args == (signal.SIGTERM,)
     assert (tmp_path / "one.out").read_text() == "saved\n"
 
