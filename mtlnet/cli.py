@@ -187,7 +187,7 @@ def evaluate_command(
 
     _print_model(model)
     # Several engines of one thread each take more frames a second than one engine on all cores.
-    engines = [_load(model, engine, precision) for _ in range(os.cpu_count() or 1)]
+    engines = [_load(model, engine, precision, gpu=True) for _ in range(os.cpu_count() or 1)]
     with command.progress_bar() as bar:
         task = bar.add_task("evaluating", total=None)
 
@@ -344,12 +344,14 @@ def _print_model(name: str) -> None:
     typer.echo(f"model: {resolve_run(name)}", err=True)
 
 
-def _load(model: str, kind: str, precision: str | None) -> "Engine":
-    """The engine of a model, with one thread."""
+def _load(model: str, kind: str, precision: str | None, *, gpu: bool = False) -> "Engine":
+    """The engine of a model, with one thread; `gpu`: of torch on a GPU where there is one."""
     from mtlnet.inference.engine import load_engine, parse_kind, parse_precision
     from mtlnet.inference.model_card import resolve_run
 
-    return load_engine(resolve_run(model), parse_kind(kind), parse_precision(precision), threads=1)
+    return load_engine(
+        resolve_run(model), parse_kind(kind), parse_precision(precision), threads=1, gpu=gpu
+    )
 
 
 def main() -> None:

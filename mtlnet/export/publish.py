@@ -1,7 +1,8 @@
 """The model in a run's own folder, written when training ends: weights, OpenVINO graph, card.
 
 All files are put in place together, after the graph has been compared with torch on real frames,
-and the card last: a run without a card holds no finished model.
+and the card last: a run without a card holds no finished model. Without OpenVINO no graph is
+written: an engine makes one of the weights when it loads the model.
 """
 
 import platform
@@ -16,7 +17,7 @@ from safetensors.torch import save
 
 import trackfeatures as tf
 from mtlnet.export.openvino_graph import TOLERANCE, UNCERTAINTY_TOLERANCE, run_graph, write_graph
-from mtlnet.inference.engine import best_precision
+from mtlnet.inference.engine import best_precision, has_openvino
 from mtlnet.inference.model_card import (
     CARD,
     GRAPH,
@@ -70,23 +71,27 @@ def publish(
     """Fold `network` and write `MODEL_FILES`, the uncertainty head and the card to folder `run`.
 
     `images` (N, 210, 280, 3): frames on which the graph is compared with torch. Without
-    `uncertainty` the model predicts no standard deviations. Raises ModelError when the graph
-    differs by more than the tolerances of `mtlnet.export.openvino_graph`. After an error the run
-    has the model that it had.
+    `uncertainty` the model predicts no standard deviations. Without OpenVINO the run gets no graph,
+    and nothing is compared. Raises ModelError when the graph differs by more than the tolerances of
+    `mtlnet.export.openvino_graph`. After an error the run has the model that it had.
     """
     folded = fold(network)
     weights = {name: t.contiguous() for name, t in folded.state_dict().items()}
     head = None if uncertainty is None else uncertainty.head
     golden = golden_image(WIDTH, HEIGHT)
-    names = MODEL_FILES if head is None else (*MODEL_FILES, UNCERTAINTY_WEIGHTS)
+    names: tuple[str, ...] = MODEL_FILES if has_openvino() else (WEIGHTS,)
+    if head is not None:
+        names = (*names, UNCERTAINTY_WEIGHTS)
     origin = provenance or Provenance()
     with replaced_files(run, last=CARD) as staged:
         atomic_write(staged / WEIGHTS, save(weights), fsync=True)
         if head is not None:
             write_uncertainty_head(staged, head)
-        write_graph(folded, staged / GRAPH, staged / GRAPH_WEIGHTS, head)
-        check = compare_graph(folded, staged, images, head)
-        _require_equal(run, check)
+        check = {"frames": 0.0}
+        if GRAPH in names:
+            write_graph(folded, staged / GRAPH, staged / GRAPH_WEIGHTS, head)
+            check = compare_graph(folded, staged, images, head)
+            _require_equal(run, check)
         card = ModelCard(
             name=to_name(run.resolve().name),
             network=folded.architecture.name,

@@ -7,6 +7,7 @@ imported only when the torch engine is requested: the serving image does not con
 import json
 import os
 from functools import cache
+from importlib.util import find_spec
 from pathlib import Path
 from threading import Lock
 from typing import Any, Literal, Protocol, cast, get_args
@@ -61,12 +62,15 @@ def load_engine(
     kind: EngineKind = "openvino",
     precision: Precision | None = None,
     threads: int = 1,
+    *,
+    gpu: bool = False,
 ) -> Engine:
     """Load the model in folder `run` (see `mtlnet.inference.model_card.resolve_run`).
 
     `precision` None selects int8 if the model has an int8 graph that passed its accuracy gate, else
-    bf16 if the CPU supports it, else float32. The torch engine supports float32 only. Raises
-    ModelError when the model is missing, unfinished or damaged.
+    bf16 if the CPU supports it, else float32. The torch engine supports float32 only; with `gpu` it
+    computes on a GPU where there is one. Raises ModelError when the model is missing, unfinished or
+    damaged.
     """
     card = read_card(run)
     if kind == "torch":
@@ -77,7 +81,7 @@ def load_engine(
             )
         from mtlnet.inference.torch_engine import TorchEngine
 
-        return TorchEngine(run, card, threads)
+        return TorchEngine(run, card, threads, gpu=gpu)
     return OpenVinoEngine(run, card, precision, threads)
 
 
@@ -201,6 +205,11 @@ def parse_precision(text: str | None) -> Precision | None:
     if text not in (None, *get_args(Precision)):
         raise ModelError(f"there is no precision {text!r}; choose int8, bf16 or f32")
     return cast(Precision | None, text)
+
+
+def has_openvino() -> bool:
+    """Whether OpenVINO is installed. Without it models are trained and evaluated by torch alone."""
+    return find_spec("openvino") is not None
 
 
 def openvino_core() -> Any:

@@ -20,22 +20,31 @@ class TorchEngine:
 
     kind = "torch"
 
-    def __init__(self, run: Path, card: ModelCard, threads: int = 1) -> None:
+    def __init__(self, run: Path, card: ModelCard, threads: int = 1, *, gpu: bool = False) -> None:
+        """`gpu`: compute on a GPU where there is one."""
         has_head = card.uncertainty is not None
         check_files(run, card, (WEIGHTS, UNCERTAINTY_WEIGHTS) if has_head else (WEIGHTS,))
         torch.set_num_threads(threads)
         self.card = card
         self.precision: Precision = "f32"
+        self.on_gpu = gpu and torch.cuda.is_available()
         self._network = load_network(run / WEIGHTS, card.network)
+        if self.on_gpu:
+            torch.backends.cudnn.allow_tf32 = False  # by default convolutions round to 10 bits
+            self._network.to("cuda")
         self._head = read_uncertainty_head(run) if has_head else None
         self._shape = (card.camera.height, card.camera.width, 3)
 
     def __call__(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
         check_image(image, self._shape)
-        answers = run_network(self._network, image[None])
+        result: NDArray[np.float32] = self.batch(image[None])[0]
+        return result
+
+    def batch(self, images: NDArray[np.uint8]) -> NDArray[np.float32]:
+        """The outputs (B, 9) to (B, 22) for images (B, H, W, 3) at once."""
+        answers = run_network(self._network, images)
         parts = [answers.outputs]
         if self._head is not None:
-            textures = texture_features(image)[None]
+            textures = np.stack([texture_features(image) for image in images])
             parts.append(self._head.predict(answers.uncertainty_inputs, textures))
-        result: NDArray[np.float32] = np.concatenate([*parts, answers.absent], 1)[0]
-        return result
+        return np.concatenate([*parts, answers.absent], 1)

@@ -5,8 +5,10 @@ are held out of its training (`mtlnet.data.sources.hold_out_rounds`); they deter
 the standard deviations and the limit of the out-of-distribution score.
 """
 
+import copy
 import math
 import os
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -28,7 +30,7 @@ from mtlnet.data.sources import (
 )
 from mtlnet.evaluation.metrics import coverage, signed_errors
 from mtlnet.export.openvino_graph import build_feature_graph
-from mtlnet.inference.engine import best_precision, openvino_core
+from mtlnet.inference.engine import best_precision, has_openvino, openvino_core
 from mtlnet.inference.model_card import WEIGHTS, ModelError, read_card
 from mtlnet.inference.prediction import OUTPUTS
 from mtlnet.inference.uncertainty import (
@@ -43,7 +45,7 @@ from mtlnet.inference.uncertainty import (
     texture_features,
 )
 from mtlnet.model.architecture import HEIGHT, WIDTH
-from mtlnet.model.network import Network, load_network
+from mtlnet.model.network import Network, load_network, run_network
 from mtlnet.uncertainty_fit.ood import (
     FitSettings,
     fit_pitch_offset,
@@ -197,11 +199,44 @@ def standardisation(x: Numbers, count: int) -> tuple[Numbers, Numbers]:
 
 
 def run_on_frames(network: Network, frames: Images, limit: int) -> FrameOutputs:
-    """Run `network` on up to `limit` evenly spaced frames, in the precision of the engine.
+    """Run `network` on up to `limit` evenly spaced frames.
 
-    By OpenVINO with one request a core: three times as fast as torch in float32.
+    By OpenVINO in the precision of the engine, where it is installed, else by torch in float32.
     """
     chosen = np.linspace(0, len(frames) - 1, min(limit, len(frames))).astype(np.int64)
+    run = _run_openvino if has_openvino() else _run_torch
+    x, outputs, textures = run(network, frames, chosen)
+    labels = model_labels(frames) if isinstance(frames, Frames) else frames.labels
+    error = signed_errors(outputs, labels.distances[chosen], labels.angle[chosen])
+    x = np.concatenate([x, light_features(textures)], 1)
+    return FrameOutputs(x, error.astype(np.float32), textures)
+
+
+def _run_torch(
+    network: Network, frames: Images, chosen: NDArray[np.int64]
+) -> tuple[Numbers, Numbers, Numbers]:
+    """As `_run_openvino`, on a GPU where there is one."""
+    moved = copy.deepcopy(network).to("cuda" if torch.cuda.is_available() else "cpu")
+    images = np.empty((CHUNK, HEIGHT, WIDTH, 3), np.uint8)
+    parts: list[tuple[Numbers, Numbers, Numbers]] = []
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        for first in range(0, len(chosen), CHUNK):
+            rows = chosen[first : first + CHUNK]
+            found = frames.read_batch(rows, images[: len(rows)])
+            answers = run_network(moved, found)
+            textures = np.stack(list(pool.map(texture_features, found)))
+            parts.append((answers.uncertainty_inputs, answers.outputs, textures))
+    x, outputs, textures = (np.concatenate(each) for each in zip(*parts, strict=True))
+    return x, outputs, textures
+
+
+def _run_openvino(
+    network: Network, frames: Images, chosen: NDArray[np.int64]
+) -> tuple[Numbers, Numbers, Numbers]:
+    """The network's inputs of the head (N, F), its outputs (N, 9) and the textures (N, T).
+
+    With one request a core: three times as fast as torch in float32.
+    """
     x = np.empty((len(chosen), network.architecture.uncertainty_inputs), np.float32)
     outputs = np.empty((len(chosen), OUTPUTS), np.float32)
     textures = np.empty((len(chosen), TEXTURE_VALUES), np.float32)
@@ -219,10 +254,7 @@ def run_on_frames(network: Network, frames: Images, limit: int) -> FrameOutputs:
             queue.start_async([image[None].copy()], first + row)
             textures[first + row] = texture_features(image)
         queue.wait_all()
-    labels = model_labels(frames) if isinstance(frames, Frames) else frames.labels
-    error = signed_errors(outputs, labels.distances[chosen], labels.angle[chosen])
-    x = np.concatenate([x, light_features(textures)], 1)
-    return FrameOutputs(x, error.astype(np.float32), textures)
+    return x, outputs, textures
 
 
 def _infer_queue(network: Network) -> Any:

@@ -1,0 +1,99 @@
+"""One prepared run on a machine with a GPU: collect, train, evaluate, test and time.
+
+    python benchmarks/gpu_run.py --collect-wheels wheels      # beforehand, where there is a network
+    python benchmarks/gpu_run.py --minutes 10 --wheels wheels --tracks torcs/tracks --out gpu_run
+
+The machine needs Python 3.12, torch, EGL on the GPU and the packages that
+`benchmarks/material/gpu/packages.toml` lists; it needs no network, no OpenVINO and no PyBullet.
+What is missing is printed before anything starts. The run ends within `--minutes`: each stage has a
+deadline, and the next ones run when one fails or is stopped. Results are written after each stage,
+to `gpu_run.json`, `curves*.csv` and `model/` (weights in float16 and card) in `--out`. The same
+command continues a stopped run, as long as `--work` is kept.
+
+`--rehearse`: all of it on a CPU, with a few frames and steps; its figures mean nothing.
+Exit codes: 0 all stages are done, 1 some are not, 3 something is missing.
+"""
+
+import argparse
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from benchmarks.material.gpu import machine, wheels
+from benchmarks.material.outcome import not_measured
+from trackfeatures.errors import UserError
+
+RECIPES = ("continue", "fast")
+
+
+def main() -> int:
+    begin = time.monotonic()
+    given = parse()
+    if given.collect_wheels is not None:
+        size = wheels.collect_wheels(given.collect_wheels)
+        print(f"{given.collect_wheels}: {size / 1e6:.1f} MB")
+        return 0
+    work, out = given.work.resolve(), given.out.resolve()
+    site = work / "site"
+    if given.wheels is not None:
+        wheels.install_wheels(given.wheels, site)
+    wheels.describe_checkout(site)
+    machine.set_paths(site, given.tracks)
+    found, lacks = machine.missing_at_all(gpu=not given.rehearse)
+    if lacks:
+        return not_measured("\n  ".join(["this machine lacks", *lacks]))
+    from benchmarks.material.gpu.running import run_all  # it imports what the wheels brought
+
+    return run_all(
+        work,
+        out,
+        given.minutes,
+        begin,
+        found,
+        rehearse=given.rehearse,
+        recipe=given.recipe,
+        batch=given.batch,
+        commit=commit(),
+    )
+
+
+def parse() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--minutes", type=float, default=10.0, help="of the whole run")
+    parser.add_argument(
+        "--out", type=Path, default=Path("build/gpu_run/out"), help="folder for the results"
+    )
+    parser.add_argument(
+        "--work", type=Path, default=Path("build/gpu_run/work"), help="folder for everything else"
+    )
+    parser.add_argument("--wheels", type=Path, help="folder of wheels of what the machine lacks")
+    parser.add_argument("--tracks", type=Path, help="folder of TORCS's tracks; else $TORCS_TRACKS")
+    parser.add_argument("--recipe", choices=RECIPES, default=RECIPES[0])
+    parser.add_argument("--batch", type=int, help="images a step of the training")
+    parser.add_argument("--rehearse", action="store_true", help="on a CPU, with small numbers")
+    parser.add_argument(
+        "--collect-wheels", type=Path, metavar="FOLDER", help="only download the wheels"
+    )
+    return parser.parse_args()
+
+
+def commit() -> str:
+    """The commit of this checkout; empty where git does not know it."""
+    command = ["git", "rev-parse", "HEAD"]
+    try:
+        done = subprocess.run(command, cwd=wheels.ROOT, capture_output=True, text=True, check=False)
+    except FileNotFoundError:
+        return ""
+    return done.stdout.strip()
+
+
+if __name__ == "__main__":
+    try:
+        sys.exit(main())
+    except UserError as error:
+        sys.exit(f"error: {error}")

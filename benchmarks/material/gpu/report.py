@@ -1,0 +1,78 @@
+"""What a GPU run has found so far: `gpu_run.json` in its work folder and in its output folder.
+
+Each stage is written as soon as it ends, so that a run that is stopped keeps what it has done, and
+a run that is started again in the same work folder goes on after its last finished stage.
+"""
+
+import csv
+import json
+from pathlib import Path
+from typing import Any
+
+from runtime.files import atomic_write, write_json
+from trackfeatures.errors import UserError
+
+NAME = "gpu_run.json"
+FORMAT = 1
+MAX_CURVE_ROWS = 2_000
+MAX_BYTES = 16 * 2**20
+"""Of the whole output folder."""
+DONE, FAILED, STOPPED, SKIPPED, RUNNING = "done", "failed", "stopped", "skipped", "running"
+
+
+class Report:
+    """The results by stage; `work`: the folder that is kept between runs, `out`: for the user."""
+
+    def __init__(self, work: Path, out: Path, rehearsal: bool) -> None:
+        """Raises UserError when `work` holds a run of another kind."""
+        work.mkdir(parents=True, exist_ok=True)
+        out.mkdir(parents=True, exist_ok=True)
+        self.work, self.out = work, out
+        self.content: dict[str, Any] = {"format": FORMAT, "rehearsal": rehearsal, "stages": {}}
+        path = work / NAME
+        if path.is_file():
+            self.content = json.loads(path.read_text(encoding="utf-8"))
+            if (self.content["format"], self.content["rehearsal"]) != (FORMAT, rehearsal):
+                raise UserError(
+                    f"{path} is of another kind of run; give the same options as then, or another "
+                    "--work"
+                )
+
+    def is_done(self, stage: str) -> bool:
+        return bool(self.stage(stage).get("status") == DONE)
+
+    def stage(self, name: str) -> dict[str, Any]:
+        """What is known of a stage; {} before it ran."""
+        found: dict[str, Any] = self.content["stages"].get(name, {})
+        return found
+
+    def add(self, stage: str, status: str, seconds: float, found: dict[str, Any]) -> None:
+        """Write the result of a stage."""
+        entry = {**found, "status": status, "seconds": round(seconds, 1)}
+        self.content["stages"][stage] = entry
+        self.save()
+
+    def save(self, **changes: Any) -> None:
+        """Write all results to both folders."""
+        self.content.update(changes)
+        for folder in (self.work, self.out):
+            write_json(folder / NAME, self.content)
+
+    def copy_curves(self, curves: Path, name: str) -> None:
+        """Write every n-th row of a `curves.csv`, at most `MAX_CURVE_ROWS`, as `name`."""
+        if not curves.is_file():
+            return
+        with curves.open(encoding="utf-8", newline="") as file:
+            header, *rows = csv.reader(file)
+        step = -(-len(rows) // MAX_CURVE_ROWS) or 1
+        kept = rows[::-1][::step][::-1]  # the last row is among them
+        atomic_write(self.out / name, "".join(",".join(row) + "\n" for row in (header, *kept)))
+
+    def copy_model(self, model: Path) -> None:
+        """Copy the weights and the card."""
+        (self.out / "model").mkdir(exist_ok=True)
+        for file in sorted(model.iterdir()):
+            atomic_write(self.out / "model" / file.name, file.read_bytes())
+
+    def out_bytes(self) -> int:
+        return sum(path.stat().st_size for path in self.out.rglob("*") if path.is_file())
