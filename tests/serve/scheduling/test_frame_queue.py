@@ -72,7 +72,7 @@ def test_a_refusal_schedules_nothing_on_the_event_loop(monkeypatch: pytest.Monke
         until(gate.busy.is_set)
         scheduled: list[Callable[..., Any]] = []
         monkeypatch.setattr(loop, "call_soon", lambda call, *_: scheduled.append(call))
-        with pytest.raises(Problem, match="send this one or a newer one later"):
+        with pytest.raises(Problem, match="send this frame or a newer one later"):
             queue.submit(make_frame(), result.set_result)
         monkeypatch.undo()
         gate.open.set()
