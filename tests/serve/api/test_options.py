@@ -170,7 +170,7 @@ def test_an_option_beside_the_parameters_is_refused(service: Served, name: str) 
     for content in contents:
         reply = service.ask("POST", INFER, json.dumps(content).encode())
         assert reply.status == 422
-        assert f"{name} is not a member of its own" in reply.content["error"]
+        assert f"{name} is at the wrong place" in reply.content["error"]
 
 
 def test_unknown_parameters_of_the_inference_protocol_are_refused(service: Served) -> None:

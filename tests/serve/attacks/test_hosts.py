@@ -143,7 +143,7 @@ def test_allowed_hosts_may_be_given_with_a_port_a_final_dot_or_brackets() -> Non
     check = HostCheck(Limits(hosts=("Cam.example:8443", "other.example.", "[fd00::1]:80", "")))
     for host in (b"cam.example", b"cam.example:80", b"other.example", b"[fd00::1]"):
         check.check({b"host": host})
-    with pytest.raises(Problem, match="does not answer to"):
+    with pytest.raises(Problem, match="does not accept"):
         check.check({b"host": b"evil.example"})
 
 
