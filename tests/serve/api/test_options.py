@@ -96,12 +96,12 @@ def test_a_websocket_takes_them_for_all_images_or_for_one(service: Served) -> No
 @pytest.mark.parametrize(
     ("query", "seen"),
     [
-        ("?fov=60", "'fov'; there are frame_id, stream_id, deadline_ms, fov_y, camera"),
+        ("?fov=60", "'fov'; known are frame_id, stream_id, deadline_ms, fov_y, camera"),
         ("?Fov_Y=60", "'Fov_Y'"),
         ("?x-camera-fov-y=60", "'x-camera-fov-y'"),
         ("?deadline=5", "'deadline'"),
         ("?=5", "''"),
-        ("?fov_y=60&fov_y=60", "'fov_y' is twice"),
+        ("?fov_y=60&fov_y=60", "'fov_y' occurs twice"),
         ("?fov_y=", "X-Camera-Fov-Y is ''"),
         ("?fov_y", "X-Camera-Fov-Y is ''"),
         ("?frame_id=", "X-Frame-Id has 0 characters"),
@@ -110,7 +110,7 @@ def test_a_websocket_takes_them_for_all_images_or_for_one(service: Served) -> No
         ("?deadline_ms=nan", "X-Deadline-Ms is 'nan'"),
         ("?deadline_ms=-1", "expected a number from 0 to 60000"),
         ("?fov_y=%C3%A9", "X-Camera-Fov-Y"),
-        ("?" + "&".join(["fov_y=1"] * 20), "over 16 fields"),
+        ("?" + "&".join(["fov_y=1"] * 20), "more than 16 fields"),
     ],
 )
 def test_what_is_unknown_twice_or_empty_is_refused_everywhere(
@@ -153,7 +153,7 @@ def test_a_misspelt_header_is_refused(service: Served, name: str) -> None:
     for ask in (features, infer):
         reply = ask(service, headers=[(name, "60")])
         assert (reply.status, reply.content["type"]) == (422, "/problems/invalid-request")
-        assert f"unknown header {name.lower()!r}; there are X-Frame-Id" in reply.content["detail"]
+        assert f"unknown header {name.lower()!r}; known are X-Frame-Id" in reply.content["detail"]
 
 
 def test_headers_of_clients_and_proxies_are_ignored(service: Served) -> None:
@@ -195,14 +195,14 @@ def test_unknown_parameters_of_the_inference_protocol_are_refused(service: Serve
         reply = service.ask("POST", INFER, json.dumps(content).encode())
         assert (reply.status, seen in reply.content["error"]) == (422, True)
     twice = b'{"inputs":[%b],"parameters":{"fov_y":60,"fov_y":70}}' % json.dumps(image).encode()
-    assert "is twice" in service.ask("POST", INFER, twice).content["error"]
+    assert "occurs twice" in service.ask("POST", INFER, twice).content["error"]
 
 
 def test_text_messages_name_what_is_unknown(service: Served) -> None:
     for text, seen in (
         ('{"fov": 60}', "frame_id, deadline_ms, fov_y, camera"),
         ('{"stream_id": "a"}', "'stream_id'"),
-        ('{"fov_y": 60, "fov_y": 70}', "is twice"),
+        ('{"fov_y": 60, "fov_y": 70}', "occurs twice"),
         ('{"deadline_ms": true}', "must be a number"),
         ('{"frame_id": ""}', "0 characters"),
     ):
