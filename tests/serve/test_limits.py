@@ -314,7 +314,7 @@ def test_a_client_over_its_rate_is_refused_with_a_retry_time() -> None:
 def test_a_rate_below_one_a_second_lets_a_request_pass_now_and_then() -> None:
     limiter = RateLimiter(shared_memory.create_shared_memory(blocks=1).clients(), 0.5)
     limiter.check("10.0.0.1", 100.0)
-    with pytest.raises(Problem, match=r"more than 0\.5 requests a second"):
+    with pytest.raises(Problem, match=r"more than 0\.5 requests per second"):
         limiter.check("10.0.0.1", 101.0)
     limiter.check("10.0.0.1", 103.0)
 

@@ -174,7 +174,7 @@ def test_an_option_beside_the_parameters_is_refused(service: Served, name: str) 
 
 
 def test_unknown_parameters_of_the_inference_protocol_are_refused(service: Served) -> None:
-    known = "there are binary_data_output, frame_id, stream_id, deadline_ms, fov_y, camera"
+    known = "known are binary_data_output, frame_id, stream_id, deadline_ms, fov_y, camera"
     unknown: list[dict[str, Any]] = [{"sequence_id": 1}, {"timeout": 5}, {"Fov_Y": 60}]
     for one in unknown:
         reply = infer(service, **one)
