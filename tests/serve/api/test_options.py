@@ -1,4 +1,4 @@
-"""The options of an image are the same for every endpoint, and none is ignored."""
+"""The options of an image are the same for every endpoint, and no option is ignored."""
 
 import json
 import struct
@@ -24,12 +24,12 @@ Pairs = Sequence[tuple[str, str]]
 
 
 def features(service: Served, query: str = "", headers: Pairs = ()) -> Reply:
-    """POST /features; `headers` may hold a name twice."""
+    """POST /features; a name can occur twice in `headers`."""
     return post(service, f"/features{query}", WIDE, [("Content-Type", "image/jpeg"), *headers])
 
 
 def infer(service: Served, query: str = "", headers: Pairs = (), **parameters: Any) -> Reply:
-    """An inference request with the image in binary."""
+    """An inference request with the image as binary data."""
     raw = struct.pack("<I", len(WIDE)) + WIDE
     tensor = {"name": "image", "shape": [1, 1], "datatype": "BYTES"}
     content: dict[str, Any] = {"inputs": [{**tensor, "parameters": {"binary_data_size": len(raw)}}]}
@@ -55,7 +55,7 @@ def frame_id(reply: Reply) -> Any:
 
 
 def stream(service: Served, query: str = "", text: str | None = None) -> Any:
-    """The answer to one image on a WebSocket, or the problem that refuses the handshake."""
+    """The answer to an image on a WebSocket, or the problem in the reply to the handshake."""
     url = f"ws://127.0.0.1:{service.port}/stream{query}"
     try:
         with connect(url, open_timeout=PATIENCE_S, compression=None) as websocket:
