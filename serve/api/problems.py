@@ -35,10 +35,10 @@ FORBIDDEN_ORIGIN = ProblemType(
     "forbidden-origin", 403, "Pages of other sites may not use this service"
 )
 FORBIDDEN_HOST = ProblemType(
-    "forbidden-host", 403, "Without a token this service answers to its own names only"
+    "forbidden-host", 403, "Without a token only the service's own host names are accepted"
 )
 NOT_FOUND = ProblemType("not-found", 404, "There is nothing at this path")
-METHOD_NOT_ALLOWED = ProblemType("method-not-allowed", 405, "This path does not take this method")
+METHOD_NOT_ALLOWED = ProblemType("method-not-allowed", 405, "This path does not accept this method")
 NOT_ACCEPTABLE = ProblemType(
     "not-acceptable", 406, "The answer is not available in the accepted types"
 )
@@ -84,9 +84,9 @@ IMAGE_PROBLEMS = {
 # Advice for clients of this service, appended to the image decoder's message.
 HINTS = {
     NOT_AN_IMAGE: "; post the bytes of the file itself",
-    IMAGE_SIZE: " (GET /model)",
-    IMAGE_ASPECT: " (GET /model gives its mounting)",
-    FIELD_OF_VIEW: " (GET /model gives the mounting of the model's camera)",
+    IMAGE_SIZE: " (GET /model has the model's camera)",
+    IMAGE_ASPECT: " (GET /model has the mount of the model's camera)",
+    FIELD_OF_VIEW: " (GET /model has the mount of the model's camera)",
 }
 RETRY_AFTER_MS = 1000  # used without a better estimate
 

@@ -174,7 +174,7 @@ class GuardedWebSocket(WebSocketsSansIOProtocol):
         if small and not self._allow(small):
             self.conn.events.clear()
             self._guard.count_closed(RATE_LIMITED)
-            reason = f"more than {SMALL_FRAMES} small frames and texts a second"
+            reason = f"more than {SMALL_FRAMES} small frames and texts per second"
             self.fail(CloseCode.POLICY_VIOLATION, reason)
             return
         super().handle_events()
