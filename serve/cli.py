@@ -19,38 +19,21 @@ ServicePort = Annotated[int, typer.Option(help="Port of the running service.", m
 Model = Annotated[
     str,
     typer.Option(
-        help="Model to serve: a run's folder, its name in runs/, 'latest' (newest run), or "
-        "'default' (the shipped model)."
+        help="A run's folder, its name in runs/, 'latest', or 'default' (the shipped model)."
     ),
 ]
 NewModel = Annotated[
     str | None,
-    typer.Option(
-        help="Model to load; values as for `serve --model`. Default: the current one, looked up "
-        "and loaded again."
-    ),
+    typer.Option(help="Model to load, as for `serve --model`. Default: the current one again."),
 ]
-Host = Annotated[
-    str,
-    typer.Option(help="Name or address to listen on. The default is for this machine only."),
-]
-Port = Annotated[
-    int, typer.Option(help="Port to listen on; 0 chooses a free port.", min=0, max=65535)
-]
+Host = Annotated[str, typer.Option(help="Address to listen on. Default: this machine only.")]
+Port = Annotated[int, typer.Option(help="Port to listen on; 0: any free port.", min=0, max=65535)]
 RayPort = Annotated[int, typer.Option(help="Port of Ray's HTTP proxy.", min=1, max=65535)]
 Workers = Annotated[
     int,
-    typer.Option(
-        help="Number of worker processes. Each has one engine with one thread: useful values go "
-        "up to the number of cores.",
-        min=1,
-        max=256,
-    ),
+    typer.Option(help="Worker processes; each needs one core for its engine.", min=1, max=256),
 ]
-Replicas = Annotated[
-    int,
-    typer.Option(help="Number of engines. Each uses one core of the cluster.", min=1),
-]
+Replicas = Annotated[int, typer.Option(help="Engines; each uses one core of the cluster.", min=1)]
 TokenFile = Annotated[
     Path | None,
     typer.Option(
@@ -61,21 +44,15 @@ TokenFile = Annotated[
 Insecure = Annotated[
     bool,
     typer.Option(
-        "--insecure",
-        help="Allow a --host that other machines can reach although there is no token.",
+        "--insecure", help="Serve other machines without a token, for example behind a proxy."
     ),
 ]
 RequestRate = Annotated[
     float,
-    typer.Option(
-        help="Largest number of requests per second from one other machine; 0: no limit.", min=0
-    ),
+    typer.Option(help="Requests per second allowed for each other machine; 0: no limit.", min=0),
 ]
 Connections = Annotated[
-    int,
-    typer.Option(
-        help="Largest number of open connections of all workers together.", min=1, max=65536
-    ),
+    int, typer.Option(help="Largest number of open connections.", min=1, max=65536)
 ]
 AllowHost = Annotated[
     list[str] | None,
@@ -93,11 +70,7 @@ TrustedProxy = Annotated[
 ]
 BodyMib = Annotated[
     int,
-    typer.Option(
-        help="Memory in MiB for the bodies of all unanswered requests of all workers.",
-        min=4,
-        max=1 << 20,
-    ),
+    typer.Option(help="MiB of memory for the bodies of all requests.", min=4, max=1 << 20),
 ]
 CameraFiles = Annotated[
     list[str] | None,
@@ -109,10 +82,7 @@ CameraFiles = Annotated[
     ),
 ]
 LogAnswers = Annotated[
-    bool,
-    typer.Option(
-        "--log-answers", help="Log answered requests too. Refused requests are always logged."
-    ),
+    bool, typer.Option("--log-answers", help="Log answered requests, not only refused ones.")
 ]
 
 
