@@ -19,7 +19,6 @@ MIN_TOKEN_LENGTH = 16
 
 def read_token(path: Path | None) -> str | None:
     """The token in the file `path`; without `path`, in $DRIVERVIEW_TOKEN; else None.
-
     Raises UserError if the file is missing or the token is unsuitable."""
     if path is None:
         token = os.environ.get(TOKEN_VARIABLE, "").strip()

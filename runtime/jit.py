@@ -57,7 +57,6 @@ def code_folder(name: str, package: Path) -> Path:
 
 def _make_own(folder: Path) -> bool:
     """Create `folder`, or take an existing one, writable for this user only.
-
     Returns False if it is a link, belongs to another user or is not writable."""
     with suppress(FileExistsError):
         folder.mkdir(mode=OWN_MODE)

@@ -115,7 +115,6 @@ def read_json_length(body: bytes, header: bytes | None) -> int:
 
 def parse_request(body: bytes, length: int) -> tuple[InferRequest, memoryview]:
     """The decoded JSON part (the first `length` bytes) and the binary part of a request.
-
     Raises Problem."""
     text, values = np.frombuffer(body, np.uint8, length), 0
     for start in range(0, length, COUNT_BYTES):
@@ -322,7 +321,6 @@ def encode_response(
     head: dict[str, Any], tensors: dict[str, NDArray[np.float32]], request: InferRequest
 ) -> tuple[bytes, int | None]:
     """The body of the answer, and the size of its JSON part in bytes (None if all of it is JSON).
-
     Raises Problem."""
     requested = request.outputs or [RequestedOutput(name) for name in tensors]
     default = request.parameters.get(ALL_BINARY, False)

@@ -94,7 +94,6 @@ class WorkerProcess:
 
     async def wait_loaded(self, generation: int, timeout_s: float) -> dict[str, Any]:
         """Wait until the worker has loaded a generation of weights; returns its report.
-
         Raises UserError if it failed, ended or exceeded `timeout_s`."""
         result = self._load_result(generation)
         if self._reading.done():
