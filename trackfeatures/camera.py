@@ -1,4 +1,4 @@
-"""The driver camera: size in pixels, lens, and mounting place in the body frame (SI units).
+"""The driver camera: size in px, lens, and mount (position and angles) in the body frame.
 
 Body frame: x ahead, y left, z up, origin at the car's centre of gravity. Camera frame: x right,
 y down, z ahead along the optical axis. Image frame: pixels, u right, v down; a pixel's centre has

@@ -76,7 +76,7 @@ def encode_features(features: TrackFeatures) -> NDArray[np.float32]:
 
 
 def decode_features(coded: ArrayLike, heading: Heading) -> TrackFeatures:
-    """The features of coded values (6,) and a class."""
+    """The features decoded from `coded` (6,), with the class `heading`."""
     distances, angle = decode(coded)
     ml, mr, l, m, r = (None if np.isnan(d) else float(d) for d in distances[0])
     return TrackFeatures(ml, mr, l, m, r, float(angle[0]), heading)

@@ -79,13 +79,13 @@ class TrackFeatures:
     """The track features at one time."""
 
     ml: float | None
-    """Distances in m, negative on the left of the car; None where absent."""
+    """This and the next four: distances in m, negative left of the car; None if absent."""
     mr: float | None
     l: float | None
     m: float | None
     r: float | None
     angle: float
-    """rad, positive when the car points to the right of the track."""
+    """Heading angle in rad, positive when the car points to the right of the track."""
     heading: Heading
 
     @property

@@ -181,7 +181,7 @@ async def _answer(
             if more:
                 headers = merge_options(headers, more, "parameters")
                 options = parse_options(headers, stamp_ns, request_id, KSERVE_FORMATS)
-            share.grow(len(infer_request.input.data))  # a copy, until it is decoded
+            share.grow(len(infer_request.input.data))  # a copy; freed after decoding
             read, read_ms = await _pixel_reader(
                 infer_request, binary, frames, frames.sight(options)
             )

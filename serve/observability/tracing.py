@@ -119,7 +119,7 @@ class TracedApp:
         if scope["type"] == "http" and _is_infer_request(scope):
             await self._answer(scope, receive, send)
         elif scope["type"] == "websocket":
-            with _attached(_parent_context(scope["headers"])):  # inherited by each frame's task
+            with _attached(_parent_context(scope["headers"])):  # for each frame's task
                 await self._app(scope, receive, send)
         else:
             await self._app(scope, receive, send)

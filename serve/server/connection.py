@@ -267,7 +267,7 @@ class GuardedProtocol(HttpToolsProtocol):
         self._guard.forget(self)
         self.abandon_requests()
         super().connection_lost(exc)
-        self.pipeline.clear()  # its requests hold this connection
+        self.pipeline.clear()  # its requests reference this connection
         self.cycle = self._running = None  # type: ignore[assignment]
 
     def abandon_requests(self) -> None:

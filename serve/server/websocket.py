@@ -204,7 +204,7 @@ class GuardedWebSocket(WebSocketsSansIOProtocol):
                 self.frames = []
                 self.fail(CloseCode.INVALID_DATA, "the text is not UTF-8")
                 return
-        if not self.close_sent:  # else the message is dropped
+        if not self.close_sent:  # after a close frame, messages are dropped
             cost = TEXT_COST if self.curr_msg_data_type == "text" else 1
             self._queued_bytes.append(cost * self._frame_bytes)
         super().send_receive_event_to_app()
