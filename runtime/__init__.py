@@ -1,1 +1,1 @@
-"""Infrastructure of every package: commands, sockets, files, compiled kernels, HTML and charts."""
+"""What every package uses: commands, sockets, files, compiled functions, HTML pages and charts."""

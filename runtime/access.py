@@ -1,9 +1,9 @@
-"""Who may use a service of this machine: the token, the addresses it listens on, and the names and
-pages that a request may come by.
+"""Access control of a service: its token, the addresses it listens on, and the accepted values of
+the Host and Origin headers.
 
-A web page can point a name of its own at this machine (DNS rebinding), or post to it without asking
-(a "simple" request). Without a token nothing else tells such a page from a client of the user's.
-Source: RFC 9112, 3.2 (Host); RFC 6454 (Origin).
+A web page can make its own host name resolve to this machine (DNS rebinding), or send a "simple"
+cross-origin POST. Without a token only these two headers distinguish a foreign page from a client
+that the user started. Source: RFC 9112, 3.2 (Host); RFC 6454 (Origin).
 """
 
 import os
@@ -18,7 +18,8 @@ MIN_TOKEN_LENGTH = 16
 
 
 def read_token(path: Path | None) -> str | None:
-    """The token in a file, else in $DRIVERVIEW_TOKEN, else None. Raises UserError."""
+    """The token in the file `path`; without `path`, in $DRIVERVIEW_TOKEN; else None.
+    Raises UserError if the file is missing or the token is unsuitable."""
     if path is None:
         token = os.environ.get(TOKEN_VARIABLE, "").strip()
         source = f"${TOKEN_VARIABLE}"
@@ -40,7 +41,7 @@ def read_token(path: Path | None) -> str | None:
 
 
 def check_exposure(host: str, token: str | None, insecure: bool) -> None:
-    """Raise UserError when other machines could use the service without a token."""
+    """Raise UserError if other machines could use the service without a token."""
     if is_loopback(host) or token is not None or insecure:
         return
     raise UserError(
@@ -50,7 +51,7 @@ def check_exposure(host: str, token: str | None, insecure: bool) -> None:
 
 
 def is_loopback(host: str) -> bool:
-    """Whether an address, or the name "localhost", can be reached from this machine only."""
+    """Whether only this machine can reach `host`: a loopback address or the name "localhost"."""
     try:
         found = ip_address(host.partition("%")[0])
     except ValueError:
@@ -60,18 +61,19 @@ def is_loopback(host: str) -> bool:
 
 
 class HostNames:
-    """The names that a service is called by: loopback ones, and those given."""
+    """The host names that a service accepts: loopback names and addresses, and the given names."""
 
     def __init__(self, names: Iterable[str], *, any_name: bool) -> None:
-        """`any_name`: any Host will do, since a token is required."""
+        """With `any_name` every Host is accepted; for services that require a token."""
         found = (host_name(name.encode("latin-1", "replace")) for name in names)
         self._names = {name for name in found if name is not None}
         self._any_name = any_name
-        # A service that listens on all addresses is called by any of them: a rebound name is none.
+        # A service that listens on all addresses accepts every address. A page that uses DNS
+        # rebinding sends a name, not an address.
         self._any_address = any(_is_unspecified(name) for name in self._names)
 
     def allow_host(self, host: bytes) -> bool:
-        """Whether a request with this Host may use the service."""
+        """Whether a request with this Host header is accepted."""
         if self._any_name:
             return True
         name = host_name(host)
@@ -80,9 +82,11 @@ class HostNames:
         return is_loopback(name) or name in self._names or (self._any_address and _is_ip(name))
 
     def allow_origin(self, origin: bytes, host: bytes) -> bool:
-        """Whether a page of this Origin may: its own, or one that a proxy calls by a known name.
+        """Whether a request with this Origin is accepted: the service's own origin, or a known name
+        behind a proxy.
 
-        A page of another site could use the browser of a user in here.
+        Other origins are refused: a page of another site could send requests through the browser of
+        a user who can reach this service.
         """
         scheme, separator, place = origin.lower().partition(b"://")
         if not (separator and scheme in (b"http", b"https") and place):
@@ -96,8 +100,8 @@ class HostNames:
 def host_name(host: bytes) -> str | None:
     """The name in `name:port`, in lower case; None if malformed.
 
-    Of IPv6 the shortest form of the address, without brackets and without a zone, which has a
-    meaning on one machine only.
+    An IPv6 address is returned in its shortest form, without brackets and without its zone, because
+    a zone has a meaning on one machine only.
     """
     text = host.decode("latin-1").lower()
     name, port = text, ""

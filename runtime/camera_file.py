@@ -1,7 +1,7 @@
-"""Camera files: ours, OpenCV's, ROS's and Kalibr's YAML as `CameraParameters`.
+"""Reads camera files in YAML (our format, OpenCV, ROS, Kalibr) as `CameraParameters`; writes ours.
 
-Ours holds the fields of `CameraParameters`, and `height_above_road_m` in place of `z`. Files of
-others hold size and lens; the mount's keys of ours may stand beside them.
+Our format has the fields of `CameraParameters`, with `height_above_road_m` in place of `z`. The
+other formats describe image size and lens; the mount's keys of our format can be added to them.
 """
 
 import re
@@ -26,7 +26,7 @@ NOT_ASSUMED: dict[str, Any] = {
     "coefficients": (),
     "height_std": 0.0,
 }
-"""Fields that a file that leaves them out does not take from the camera it is read with."""
+"""Values of fields that a file omits; other omitted fields come from the default camera."""
 LIMITS_DEG = {"pitch_deg": 30.0, "roll_deg": 30.0, "yaw_deg": 180.0}
 MATRIX_KEYS = ("camera_matrix", "cameraMatrix", "K", "k", "mtx")
 COEFFICIENT_KEYS = (
@@ -43,19 +43,19 @@ MODELS = {
     "equi": "fisheye",
     "fisheye": "fisheye",
 }
-"""Names of distortion models in files, and ours."""
-MAX_SKEW = 1e-3  # of the focal length
+"""Names of distortion models in files, with our names."""
+MAX_SKEW = 1e-3  # as a fraction of the focal length
 
 Note = Callable[[str], None]
 
 
 class _Loader(yaml.SafeLoader):  # type: ignore[misc]  # yaml has no types
-    """YAML with OpenCV's matrices, as mappings."""
+    """A YAML loader that reads OpenCV's `!!opencv-matrix` as a mapping."""
 
 
 def _matrix_of_opencv(loader: yaml.SafeLoader, node: yaml.Node) -> Any:
     if not isinstance(node, yaml.MappingNode):
-        raise yaml.constructor.ConstructorError(None, None, "an opencv-matrix is no mapping")
+        raise yaml.constructor.ConstructorError(None, None, "an opencv-matrix is not a mapping")
     return loader.construct_mapping(node, deep=True)
 
 
@@ -65,10 +65,11 @@ _Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", _matrix_of_opencv)
 def read_camera(
     path: Path, default: CameraParameters, note: Note | None = None
 ) -> CameraParameters:
-    """The camera that a file describes: ours, OpenCV's, ROS `camera_info` or Kalibr's camchain.
+    """The camera that a file describes: our format, OpenCV, ROS `camera_info` or Kalibr's camchain.
 
-    Size, mount and field of view that it leaves out are those of `default`; a lens is never. `note`
-    gets a line on what was chosen or assumed. Raises UserError, one line, for a faulty file.
+    Size, mount and field of view are taken from `default` if the file omits them; the lens is not.
+    `note` is called with a line about chosen or assumed values. Raises UserError with a one-line
+    message for a faulty file.
     """
     content = _load(path)
     try:
@@ -82,11 +83,11 @@ def read_camera(
 
 
 def write_camera(path: Path, camera: CameraParameters, comment: str = "") -> None:
-    """Write our YAML, atomically; `read_camera` gives the same camera back. `comment` stands above
-    it, a `#` before each of its lines."""
+    """Write a camera file in our format, atomically; `read_camera` returns an equal camera. The
+    file starts with `comment`, each line after a `#`."""
     values = {**dict.fromkeys(KEYS[:9], 0.0), **camera.as_dict()}
     if camera.matrix is not None:
-        del values["fov_y_deg"]  # follows from it
+        del values["fov_y_deg"]  # follows from the matrix
     if camera.height_above_road_m - CameraParameters.cg_height_m == camera.z:
         del values["z"]
         values[HEIGHT] = camera.height_above_road_m
@@ -102,8 +103,8 @@ def write_camera(path: Path, camera: CameraParameters, comment: str = "") -> Non
 def _load(path: Path) -> dict[str, Any]:
     try:
         text = path.read_text(encoding="utf-8")
-        # OpenCV's first line is no YAML directive that others read.
-        found = yaml.load(re.sub(r"\A\ufeff?%YAML.*", "", text), _Loader)  # it is safe
+        # OpenCV's first line, `%YAML:1.0`, is not a valid YAML directive.
+        found = yaml.load(re.sub(r"\A\ufeff?%YAML.*", "", text), _Loader)  # a SafeLoader
     except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:
         reason = getattr(error, "strerror", None) or " ".join(str(error).split())
         raise UserError(f"{path} cannot be read as a camera: {reason}") from error
@@ -113,7 +114,7 @@ def _load(path: Path) -> dict[str, Any]:
 
 
 def _values(content: dict[str, Any]) -> tuple[str, dict[str, Any]]:
-    """What kind of file it is, empty for ours, and the fields of the camera that it gives."""
+    """The kind of file (empty for our format), and the camera's fields that the file gives."""
     if cameras := sorted(str(key) for key in content if re.fullmatch(r"cam\d+", str(key))):
         others = f" of {', '.join(cameras)}" if len(cameras) > 1 else ""
         return f"{cameras[0]}{others} of a Kalibr camchain", _kalibr(content, cameras[0])
@@ -125,10 +126,10 @@ def _values(content: dict[str, Any]) -> tuple[str, dict[str, Any]]:
 def _ours(content: dict[str, Any]) -> dict[str, Any]:
     unknown = [str(key) for key in content if key not in KEYS]
     if unknown:
-        raise CameraError(f"it has the unknown key {unknown[0]!r}; known are {', '.join(KEYS)}")
+        raise CameraError(f"the key {unknown[0]!r} is unknown; known keys are {', '.join(KEYS)}")
     values = _plain(content, ("width", "height", "fov_y_deg", *MOUNT))
     if "matrix" in content and not {"width", "height"} <= set(content):
-        raise CameraError("its matrix is of pictures of an unknown size; give width and height too")
+        raise CameraError("the matrix is for images of an unknown size; give width and height too")
     for name in ("matrix", "coefficients"):
         if content.get(name) is not None:
             values[name] = tuple(_numbers(name, content[name]))
@@ -138,7 +139,7 @@ def _ours(content: dict[str, Any]) -> dict[str, Any]:
 
 
 def _opencv(content: dict[str, Any]) -> dict[str, Any]:
-    """Of OpenCV's calibration files and of ROS's `camera_info`."""
+    """The fields of a calibration file of OpenCV or a `camera_info` of ROS."""
     key = next(key for key in MATRIX_KEYS if key in content)
     k = _numbers(key, content[key])
     if len(k) != 9:
@@ -151,11 +152,13 @@ def _opencv(content: dict[str, Any]) -> dict[str, Any]:
         raise CameraError(f"{key} is not [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]; give such a matrix")
     name = next((key for key in COEFFICIENT_KEYS if key in content), None)
     if name is None:
-        raise CameraError(f"it has {key} but no distortion_coefficients; give them, zeros for none")
+        raise CameraError(
+            f"the file has {key} but no distortion_coefficients; give them, zeros for none"
+        )
     model = content.get("distortion_model", "fisheye" if content.get("fisheye_model") else "opencv")
     widths = [(w, h) for w, h in SIZE_KEYS if w in content and h in content]
     if not widths:
-        raise CameraError(f"it has {key} but no size of the pictures; give width and height in px")
+        raise CameraError(f"the file has {key} but no image size; give width and height in px")
     width, height = (_whole(size, content[size]) for size in widths[0])
     return {
         "width": width,
@@ -193,19 +196,19 @@ def _kalibr(content: dict[str, Any], name: str) -> dict[str, Any]:
 def _distortion(model: Any, given: list[float]) -> dict[str, Any]:
     if not isinstance(model, str) or model.lower() not in MODELS:
         known = ", ".join(MODELS)
-        raise CameraError(f"its distortion model is {model!r}; known are {known}")
+        raise CameraError(f"the distortion model is {model!r}; known models are {known}")
     kind = MODELS[model.lower()]
     if kind == "opencv" and len(given) in (12, 14) and not any(given[8:]):
-        given = given[:8]  # no thin prism, no tilt
+        given = given[:8]  # the thin-prism and tilt terms are 0
     if kind != "fisheye" and not any(given) and len(given) in (0, *COEFFICIENTS[kind]):
         return {}  # a pinhole
     return {"distortion": kind, "coefficients": tuple(given)}
 
 
 def _plain(content: dict[str, Any], keys: Any) -> dict[str, Any]:
-    """The numbers that stand in the file under `keys`, by field."""
+    """The numbers that the file has under `keys`, by field of `CameraParameters`."""
     if HEIGHT in content and "z" in content:
-        raise CameraError(f"it gives both z and {HEIGHT}; leave one out")
+        raise CameraError(f"the file has both z and {HEIGHT}; leave one out")
     values: dict[str, Any] = {}
     for key in (key for key in keys if key in content):
         value = content[key]
@@ -225,7 +228,7 @@ def _whole(name: str, value: Any) -> int:
 
 
 def _number(name: str, value: Any) -> float:
-    if isinstance(value, str):  # 1e-05 is text to YAML 1.1, and OpenCV writes .Nan
+    if isinstance(value, str):  # YAML 1.1 reads 1e-05 as text, and OpenCV writes .Nan
         try:
             value = float(value.lstrip("."))
         except ValueError:
@@ -236,7 +239,7 @@ def _number(name: str, value: Any) -> float:
 
 
 def _numbers(name: str, value: Any) -> list[float]:
-    """The finite numbers of a list, a list of rows, or a matrix of OpenCV or ROS."""
+    """The finite numbers in a list, a list of rows, or a matrix of OpenCV or ROS."""
     if isinstance(value, dict):
         data = value.get("data")
         if data is None:
@@ -268,7 +271,7 @@ def _flat(value: list[Any]) -> Iterator[Any]:
 def _checked(camera: CameraParameters) -> CameraParameters:
     finite = all(map(isfinite, (camera.x, camera.y, camera.z)))
     if min(camera.width, camera.height) < 1 or not (finite and camera.height_above_road_m > 0):
-        raise CameraError(f"a camera of {camera} is impossible; give sizes above 0")
+        raise CameraError(f"the camera {camera} is impossible; give size and height above 0")
     for name, limit in LIMITS_DEG.items():
         if not abs(getattr(camera, name)) <= limit:
             raise CameraError(f"{name} is {getattr(camera, name):g}; give {-limit:g} to {limit:g}")
@@ -279,6 +282,6 @@ def _mount_note(values: dict[str, Any], camera: CameraParameters) -> str:
     if any(key in values for key in ("x", "y", "z", "roll_deg", "pitch_deg", "yaw_deg")):
         return f"the camera is {camera}"
     return (
-        f"it gives no mount: {camera.height_above_road_m:g} m above the road and pitch "
+        f"no mount is given, so {camera.height_above_road_m:g} m above the road and pitch "
         f"{camera.pitch_deg:g} deg are assumed; add {HEIGHT}, pitch_deg and yaw_deg"
     )

@@ -1,7 +1,7 @@
 """What all commands share: exit codes, the error line, the option `--json`.
 
-Results go to stdout; errors, progress and logs go to stderr. Any name of a file can be printed on
-any terminal: what it cannot show is written as an escape, e.g. `caf\\udce9.jpg`.
+Results go to stdout; errors, progress and logs go to stderr. Any file name can be printed on any
+terminal: characters that the terminal cannot show become escapes, e.g. `caf\\udce9.jpg`.
 """
 
 import errno
@@ -19,7 +19,7 @@ from trackfeatures.errors import UserError
 if TYPE_CHECKING:
     from rich.progress import Progress
 
-FAILED = 1  # a UserError or OSError; typer ends with 2 for a wrong option
+FAILED = 1  # exit code for a UserError or OSError; Typer exits with 2 for a wrong option
 INTERRUPTED = 130  # the shell's code for a process ended by Ctrl-C
 
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON on stdout.")]
@@ -28,14 +28,14 @@ AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON o
 def main(app: Callable[[], object]) -> None:
     """Run `app`. A UserError or OSError becomes one line `error: ...` on stderr and exit code 1."""
     for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):  # not one that a test or a notebook has put there
+        if isinstance(stream, io.TextIOWrapper):  # tests and notebooks replace it
             stream.reconfigure(errors="backslashreplace")
     try:
         app()
     except UserError as error:
         fail(str(error))
     except BrokenPipeError:
-        # The reader of our output has gone (`| head`): nothing is left to report or to flush.
+        # The reader of stdout has ended (`| head`): there is nothing to report or to flush.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(FAILED)
     except OSError as error:
@@ -46,18 +46,18 @@ def main(app: Callable[[], object]) -> None:
 
 
 def fail(message: str) -> None:
-    """Write the error line and exit."""
+    """Write the error line to stderr and exit with code 1."""
     sys.stderr.write(f"error: {printable(message)}\n")
     sys.exit(FAILED)
 
 
 def print_result(content: dict[str, Any], as_json: bool, line: str) -> None:
-    """Print `content` as JSON, or `line`."""
+    """Print `content` as JSON if `as_json`, else `line`."""
     sys.stdout.write(f"{json.dumps(content, indent=1) if as_json else line}\n")
 
 
 def progress_bar() -> "Progress":
-    """A bar on stderr with "done/total", which goes when its `with` block ends."""
+    """A progress bar on stderr with "done/total"; it is erased when its `with` block ends."""
     from rich.console import Console
     from rich.progress import MofNCompleteColumn, Progress
 
@@ -66,7 +66,7 @@ def progress_bar() -> "Progress":
 
 
 def printable(text: str) -> str:
-    """`text` on one line and without control characters, which a file's name may hold."""
+    """`text` with control characters as escapes, so on one line. File names can contain them."""
     return text if text.isprintable() else "".join(map(_printable, text))
 
 
@@ -76,7 +76,7 @@ def _printable(character: str) -> str:
 
 
 def counted(count: int, noun: str) -> str:
-    """The number with its noun, e.g. "1 round", "2 rounds"."""
+    """The number and the noun, in the plural if needed: "1 round", "2 rounds"."""
     return f"{count} {noun}{'' if count == 1 else 's'}"
 
 

@@ -1,8 +1,7 @@
-"""Atomic writes, by which the old file stays until the new one is complete; locks; and an order of
-names.
+"""Atomic writes (the old file stays until the new one is complete), locks, and sorting of names.
 
-A name can hold any bytes. Those that are not UTF-8 are kept as Python keeps them (`os.fsdecode`),
-and a text file gets them as an escape: `caf\\xe9.jpg` of Latin-1 stands as `caf\\udce9.jpg`.
+A file name can contain any bytes. `os.fsdecode` turns bytes that are not UTF-8 into surrogates, and
+text files get surrogates as escapes: the Latin-1 name `caf\\xe9.jpg` becomes `caf\\udce9.jpg`.
 """
 
 import fcntl
@@ -17,16 +16,16 @@ from pathlib import Path
 
 from trackfeatures.errors import UserError
 
-STAGED = ".staged"  # where `replaced_files` keeps new files
+STAGED = ".staged"  # the folder of `replaced_files` for new files
 
 
 def natural_key(name: str) -> tuple[list[str | tuple[int, str]], str]:
-    """Sorts names as people count: `frame2` before `frame10`, `b1` after `A1`.
+    """Sort key for names with numbers: `frame2` before `frame10`, `b1` after `A1`.
 
-    A run of ASCII digits counts as a number; other digits, signs and points are text.
+    A run of ASCII digits is a number; other digits, signs and decimal points are text.
     """
     parts: list[str | tuple[int, str]] = list(re.split("([0-9]+)", name.casefold()))
-    for place in range(1, len(parts), 2):  # every second part is a number, of any length
+    for place in range(1, len(parts), 2):  # every second part is a number; too long for int()
         digits = str(parts[place]).lstrip("0")
         parts[place] = (len(digits), digits)
     return parts, name
@@ -34,10 +33,10 @@ def natural_key(name: str) -> tuple[list[str | tuple[int, str]], str]:
 
 @contextmanager
 def utf8_path(path: Path) -> Iterator[Path]:
-    """`path` for a library that takes UTF-8 names only; else a link to it that has one.
+    """Yield `path`, or a link to it with a UTF-8 name, for a library that needs UTF-8 names.
 
-    The path is absolute: to FFmpeg a name like `a:b` has a protocol. Beside the link stands what is
-    beside the file, where the name of the file itself is UTF-8.
+    The path is absolute, because FFmpeg takes the `a:` of a relative name `a:b` for a protocol. If
+    only the folder's name is not UTF-8, the folder is linked, so that neighbouring files are found.
     """
     whole = Path.cwd() / path
     if str(whole).isprintable():
@@ -55,7 +54,7 @@ def utf8_path(path: Path) -> Iterator[Path]:
 
 
 def check_folder(path: Path) -> None:
-    """Raise UserError unless a file `path` can be made; to be called before a long computation."""
+    """Raise UserError if no file can be written to `path`; call it before a long computation."""
     if path.is_dir():
         raise UserError(f"{path} is a folder; give the name of a file in it")
     if not path.parent.is_dir():
@@ -63,16 +62,16 @@ def check_folder(path: Path) -> None:
 
 
 def atomic_write(path: Path, content: str | bytes, *, fsync: bool = False) -> None:
-    """Replace the file at `path` in one step, by renaming a file beside it; text becomes UTF-8.
+    """Replace the file at `path` atomically: write a new file, then rename it. Text is UTF-8.
 
-    When writing fails (a full disk, a power cut) the old file stays. `fsync` waits until the data
-    and the new name are on the disk. Raises UserError where the folder is missing, OSError with
+    If writing fails (a full disk, a power cut) the old file stays. `fsync` waits until the data
+    and the new name are on the disk. Raises UserError if the folder is missing, and OSError with
     the file's name.
     """
     check_folder(path)
     data = content.encode(errors="backslashreplace") if isinstance(content, str) else content
     if path.exists() and not path.is_file():
-        # A pipe or /dev/stdout must not be replaced.
+        # A pipe or /dev/stdout must be written to, not replaced.
         path.write_bytes(data)
         return
     partial = unfinished_path(path)
@@ -84,7 +83,7 @@ def atomic_write(path: Path, content: str | bytes, *, fsync: bool = False) -> No
         if fsync:
             fsync_path(path.parent)
     except OSError as error:
-        # The error of a failed write lacks the file's name, which the user needs.
+        # The OSError of a failed write has no file name; the user needs it.
         error.filename = error.filename or str(path)
         raise
     finally:
@@ -92,17 +91,17 @@ def atomic_write(path: Path, content: str | bytes, *, fsync: bool = False) -> No
 
 
 def write_json(path: Path, content: object) -> None:
-    """Replace the file at `path` by `content` in indented JSON; see `atomic_write` with `fsync`."""
+    """Replace the file at `path` by `content` as indented JSON, as `atomic_write` with `fsync`."""
     atomic_write(path, json.dumps(content, indent=1) + "\n", fsync=True)
 
 
 def unfinished_path(path: Path) -> Path:
-    """The file that `atomic_write` fills before it renames it to `path`."""
+    """The name of the temporary file that `atomic_write` renames to `path`."""
     return path.with_name(path.name + ".partial")
 
 
 def atomic_move(source: Path, target: Path) -> None:
-    """Rename a finished file, or a folder of files, once all of it is on the disk.
+    """Write a finished file or folder to the disk (fsync), then rename it.
 
     After a power cut `target` is complete or does not exist. Raises OSError.
     """
@@ -114,13 +113,13 @@ def atomic_move(source: Path, target: Path) -> None:
 
 @contextmanager
 def replaced_files(folder: Path, last: str) -> Iterator[Path]:
-    """Yield a folder; its files replace those in `folder` when the block ends without an error.
+    """Yield a temporary folder; its files replace those in `folder` if the block raises no error.
 
-    The file `last` describes the others. It is removed before the first of them is replaced, and
-    comes after all of them: who finds it finds files that belong together. Raises OSError.
+    The file named `last` describes the other files. It is deleted before the first replacement and
+    written after the last one, so if it exists, all files belong together. Raises OSError.
     """
     staged = folder / STAGED
-    shutil.rmtree(staged, ignore_errors=True)  # left by a kill
+    shutil.rmtree(staged, ignore_errors=True)  # left by a killed process
     staged.mkdir(parents=True)
     try:
         yield staged
@@ -138,7 +137,7 @@ def replaced_files(folder: Path, last: str) -> Iterator[Path]:
 def try_lock(descriptor: int, *, shared: bool = False) -> bool:
     """Lock an open file or folder until it is closed or the process ends (`flock`).
 
-    False when another process holds a lock on it (with `shared`: an exclusive one).
+    Returns False if another process holds a lock on it (with `shared`: an exclusive lock).
     """
     try:
         fcntl.flock(descriptor, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
@@ -149,15 +148,15 @@ def try_lock(descriptor: int, *, shared: bool = False) -> bool:
 
 @contextmanager
 def locked_folder(folder: Path) -> Iterator[None]:
-    """Keep other processes from the folder within the context; a lock ends with its process.
+    """Lock the folder within the context; a lock ends with its process.
 
-    Raises UserError while another process holds it.
+    Raises UserError if another process holds the lock.
     """
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
         if not try_lock(descriptor):
             raise UserError(
-                f"another process is writing to {folder}; wait for its end, or give another --out"
+                f"another process is writing to {folder}; wait until it ends, or give another --out"
             )
         yield
     finally:
@@ -165,7 +164,7 @@ def locked_folder(folder: Path) -> Iterator[None]:
 
 
 def fsync_path(path: Path) -> None:
-    """Wait until a file, or the names in a folder, are on the disk."""
+    """Wait until the content of a file, or the names in a folder, are on the disk."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)

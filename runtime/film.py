@@ -1,4 +1,4 @@
-"""Films: pictures written one after the other as MPEG-4 (.mp4)."""
+"""Writes images to a film: an MPEG-4 file (.mp4)."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,10 +16,10 @@ BOX_HEAD = 8
 
 
 class Film:
-    """A film at `fps` pictures a second, playable also when its command is interrupted.
+    """A film of `fps` images per second; it can be played even if the command is interrupted.
 
-    The first picture gives the size. A context manager that closes the file. Raises UserError when
-    the file cannot be written, at the latest when it is closed.
+    The first image sets the film's size. Use it as a context manager, which closes the file. Raises
+    UserError if the file cannot be written, at the latest on closing.
     """
 
     def __init__(self, path: Path, fps: float) -> None:
@@ -27,7 +27,7 @@ class Film:
         self._film: cv2.VideoWriter | None = None
 
     def write(self, picture: NDArray[np.uint8]) -> None:
-        """Add a picture (H, W, 3) RGB."""
+        """Append an image (H, W, 3) uint8 RGB."""
         if self._film is None:
             code = cv2.VideoWriter.fourcc(*"mp4v")
             size = (picture.shape[1], picture.shape[0])
@@ -44,7 +44,7 @@ class Film:
         if self._film is None:
             return
         self._film.release()
-        # The writer is silent about a full disk; the index of the film is written last.
+        # OpenCV reports no full disk. The film's index is written last, so a cut film has none.
         if kind is None and self._path.is_file() and not _is_complete(self._path):
             raise UserError(
                 f"{self._path} could not be written to its end; free some space and run the same "
@@ -61,7 +61,7 @@ def _is_complete(path: Path) -> bool:
 def boxes(file: BinaryIO, start: int, end: int) -> Iterator[tuple[bytes, int, int]]:
     """(type, start, end of the content) of each box of an MP4 file from byte `start` to `end`.
 
-    The last one may end beyond `end`; bytes that are no box end the list. Source: ISO 14496-12.
+    The last box can end beyond `end`; bytes that are not a box end the list. Source: ISO 14496-12.
     """
     while start + BOX_HEAD <= end:
         file.seek(start)

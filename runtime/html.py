@@ -1,7 +1,7 @@
-"""HTML pages: jinja2 templates with autoescape that extend one shell, and images embedded in them.
+"""Renders HTML pages from jinja2 templates with autoescape; images are embedded.
 
-A page is one file that needs nothing beside it. Its template extends `page_shell.html` (style
-sheet, title) and may import the tables and figures of `macros.html`.
+A page is one self-contained file. Its template extends `page_shell.html` (style sheet, title) and
+can import the table macro of `macros.html`.
 """
 
 import base64
@@ -16,10 +16,10 @@ JPEG_QUALITY = 80
 
 
 def render(package: str, template: str, **values: Any) -> str:
-    """The HTML of `template`, a file of `package`; text among `values` is escaped.
+    """The HTML of `template`, a file of `package`; text in `values` is escaped.
 
-    Values that are HTML already (charts) are `markupsafe.Markup`. Raises jinja2.UndefinedError when
-    the template uses a value that is not given.
+    Values that already are HTML (charts) must be `markupsafe.Markup`. Raises jinja2.UndefinedError
+    if the template uses a value that is not given.
     """
     environment = Environment(
         loader=ChoiceLoader([PackageLoader(package, ""), PackageLoader("runtime", "")]),
@@ -34,20 +34,20 @@ def render(package: str, template: str, **values: Any) -> str:
 
 
 def format_number(value: float | None, digits: int) -> str:
-    """`value` with so many decimal places; "-" for None."""
+    """`value` with `digits` decimal places; "-" for None."""
     return "-" if value is None else f"{value:.{digits}f}"
 
 
 def format_percent(share: float | None, digits: int = 1) -> str:
-    """A share in [0, 1] as a percentage; "-" for None."""
+    """`share` in [0, 1] as a percentage with `digits` decimal places; "-" for None."""
     return "-" if share is None else f"{share:.{digits}%}"
 
 
 def data_uri(content: bytes, media_type: str = "image/jpeg") -> str:
-    """The URI of an embedded file."""
+    """A `data:` URI with the content of a file."""
     return f"data:{media_type};base64,{base64.b64encode(content).decode()}"
 
 
 def embed_jpeg(image: NDArray[np.uint8]) -> str:
-    """The URI of an image (H, W, 3) uint8 RGB, encoded as JPEG."""
+    """A `data:` URI of an image (H, W, 3) uint8 RGB, encoded as JPEG."""
     return data_uri(simplejpeg.encode_jpeg(np.ascontiguousarray(image), quality=JPEG_QUALITY))

@@ -1,7 +1,8 @@
-"""Where compiled machine code is kept on disk: a folder for each state of a package's sources.
+"""Compiles functions with numba and caches their machine code on disk, in one folder for each
+version of a package's sources.
 
-numba's own cache only sees the file of the outermost function: after a change in a function that it
-calls from another file, the old machine code would go on being used.
+numba's own cache checks only the source file of the outermost function. After a change of a called
+function in another file it would still use the old machine code.
 """
 
 import atexit
@@ -21,16 +22,18 @@ from typing import Any, TypeVar, cast
 import numba
 
 OWN_MODE = 0o700
-UNUSED_DAYS = 30.0  # after which the code of other sources is deleted
+UNUSED_DAYS = 30.0  # after this time, unused machine code of other source versions is deleted
 
 
 def code_folder(name: str, package: Path) -> Path:
-    """A folder that can be written to, for the machine code of all of a package's sources.
+    """A writable folder for the machine code of the sources in `package`.
 
-    Below `$NUMBA_CACHE_DIR` or the user's cache folder, else a new temporary one that goes when
-    the process ends; named after `name` and a hash of the sources. What was not used for a month
-    goes. What lies in the folder is unpickled and run: so it must be the user's own, and nobody
-    else's to write to. A temporary folder of a guessable name might be another user's.
+    The folder is named after `name` and a hash of the sources. It is in `$NUMBA_CACHE_DIR`, or in
+    the user's cache folder; if neither is writable, it is a temporary folder that is deleted when
+    the process ends. Folders of other versions that were unused for `UNUSED_DAYS` are deleted.
+
+    numba unpickles and executes the files of this folder, so only this user must be able to write
+    to it. A temporary folder needs a random name: another user could create a predictable one.
     """
     digest = hashlib.sha256()
     for source in sorted(package.rglob("*.py")):
@@ -45,21 +48,22 @@ def code_folder(name: str, package: Path) -> Path:
             os.utime(folder)
             _forget_unused(parent, name)
             return folder
-    except (OSError, RuntimeError):  # a read-only disk, another user's folder, no home at all
+    except (OSError, RuntimeError):  # read-only disk, another user's folder, no home
         pass
-    temporary = tempfile.mkdtemp(prefix=found)  # of mode 700, and a name that nobody can guess
+    temporary = tempfile.mkdtemp(prefix=found)  # mode 700 and a random name
     atexit.register(shutil.rmtree, temporary, ignore_errors=True)
     return Path(temporary)
 
 
 def _make_own(folder: Path) -> bool:
-    """Make a folder for this user alone, or take one; False: it is another's, or a link."""
+    """Create `folder`, or take an existing one, writable for this user only.
+    Returns False if it is a link, belongs to another user or is not writable."""
     with suppress(FileExistsError):
         folder.mkdir(mode=OWN_MODE)
     found = folder.lstat()
     if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid():
         return False
-    if found.st_mode & (stat.S_IWGRP | stat.S_IWOTH):  # others may have put code into it
+    if found.st_mode & (stat.S_IWGRP | stat.S_IWOTH):  # others could have written code into it
         shutil.rmtree(folder)
         folder.mkdir(mode=OWN_MODE)
     folder.chmod(OWN_MODE)
@@ -72,7 +76,7 @@ def _forget_unused(parent: Path, name: str) -> None:
         try:
             if folder.stat().st_mtime < since:
                 shutil.rmtree(folder, ignore_errors=True)
-        except OSError:  # another process was quicker
+        except OSError:  # another process has deleted it
             continue
 
 
@@ -82,21 +86,21 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 @functools.cache
 def _cache_folder(package: str) -> str:
     """The folder for the machine code of a package, chosen when its first function is decorated."""
-    # Not at its first call: numba's Cache.__init__ opens the folder of the time of decoration.
+    # numba's Cache.__init__ reads the folder at decoration, so the first call would be too late.
     return str(code_folder("driverview", Path(str(sys.modules[package].__file__)).parent))
 
 
 def compiled(function: Function) -> Function:
-    """Compile `function` with numba in no-python mode, keeping its type for the type checker.
+    """Compile `function` with numba in no-python mode; its static type stays the same.
 
-    Without fast-math: it would let the compiler reorder sums, and two builds of the same kernel
-    could then differ in the last bit. Every recording and replay relies on them being equal.
+    fast-math is off: with it the compiler can reorder sums, and two builds of the same function can
+    differ in the last bit. Recordings and replays require equal results.
     """
     return _compiled(function, nogil=False)
 
 
 def compiled_for_threads(function: Function) -> Function:
-    """Like `compiled`; the function releases the GIL, so that threads run it at the same time."""
+    """Like `compiled`, but the function releases the GIL: threads can run it in parallel."""
     return _compiled(function, nogil=True)
 
 

@@ -1,4 +1,4 @@
-"""Ends of a loop by a signal."""
+"""Ends a loop after a signal, between two steps."""
 
 import signal
 import threading
@@ -9,11 +9,11 @@ from types import FrameType
 
 @contextmanager
 def interrupts(*numbers: int) -> Iterator[Callable[[], bool]]:
-    """A function that returns whether one of these signals arrived, for a loop to check.
+    """Yield a function that returns whether one of these signals has arrived; a loop calls it.
 
-    A KeyboardInterrupt raised inside a callback, a finaliser or an extension module may be lost:
-    numpy discards one raised while it compares a scalar with an IntEnum. A second signal is raised
-    as KeyboardInterrupt. Other threads than the main one receive no signals.
+    A KeyboardInterrupt raised inside a callback, a finaliser or an extension module can be lost:
+    numpy discards one that is raised while it compares a scalar with an IntEnum. A second signal
+    raises KeyboardInterrupt. Only the main thread receives signals; elsewhere the result is False.
     """
     seen: list[int] = []
     if threading.current_thread() is not threading.main_thread():

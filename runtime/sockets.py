@@ -1,6 +1,6 @@
-"""Listening sockets of the commands that serve, and connections to a host of several addresses.
+"""Listening sockets for services, and connections to a host with several addresses.
 
-A socket is bound before anything else is loaded, so that a port in use is reported at once.
+Commands bind their socket before they load anything else, to report a port in use at once.
 """
 
 import ctypes
@@ -15,19 +15,19 @@ from typing import Any
 from trackfeatures.errors import UserError
 
 LOOPBACKS = {socket.AF_INET: "127.0.0.1", socket.AF_INET6: "::1"}
-CONNECT_S = 0.25  # that an address gets where the time is short
-PORT_TRIES = 8  # for a free port of every address of a host
-# A kernel without a family, a host without an address of it: the other family serves.
+CONNECT_S = 0.25  # least time for an attempt to connect to one address, if so much is left
+PORT_TRIES = 8  # attempts to find one port that is free on every address of a host
+# Errors of a kernel or a host without IPv4 or without IPv6; the other family is used then.
 NO_FAMILY = (errno.EAFNOSUPPORT, errno.EADDRNOTAVAIL, errno.EPROTONOSUPPORT)
-SO_ATTACH_FILTER = 26  # of Linux; not in Python's `socket`
-# Classic BPF on a TCP header: drop (return 0) what has SYN, the bit 2 of byte 13; pass the rest.
+SO_ATTACH_FILTER = 26  # Linux's value; Python's `socket` lacks it
+# Classic BPF on a TCP header: drop (return 0) packets with the SYN flag (0x02 of byte 13).
 NO_SYN = ((0x30, 0, 0, 13), (0x45, 0, 1, 2), (0x06, 0, 0, 0), (0x06, 0, 0, 0xFFFFFFFF))
 
-Address = tuple[int, int, int, str, Any]  # as `socket.getaddrinfo` gives it
+Address = tuple[int, int, int, str, Any]  # a row of `socket.getaddrinfo`
 
 
 def bind(host: str, port: int) -> socket.socket:
-    """A bound TCP socket. Raises UserError when the address is taken, unknown or forbidden."""
+    """A bound TCP socket. Raises UserError if the address is in use, unknown or forbidden."""
     try:
         return _bind(_addresses(host, port, socket.AI_PASSIVE)[0])
     except (OSError, UnicodeError) as error:
@@ -35,10 +35,10 @@ def bind(host: str, port: int) -> socket.socket:
 
 
 def bind_all(host: str, port: int) -> list[socket.socket]:
-    """Bound TCP sockets, of the same port, for all addresses of a host: "localhost" has two.
+    """TCP sockets bound to the same port of all addresses of a host: "localhost" has two addresses.
 
-    `::` takes IPv4 too. Raises as `bind`; an address of a family that this machine lacks is left
-    out where there is another.
+    `::` also accepts IPv4. An address is left out if this machine lacks its family, unless no
+    address remains. Raises the same errors as `bind`.
     """
     for _ in range(PORT_TRIES):
         try:
@@ -74,7 +74,7 @@ def _bind_all(host: str, port: int) -> list[socket.socket]:
 
 
 def _at_port(address: Address, bound: list[socket.socket]) -> Address:
-    """`address`, at the port of the first socket that is bound."""
+    """`address` with the port of the first bound socket, if there is one."""
     if not bound:
         return address
     *rest, place = address
@@ -98,9 +98,9 @@ def _bind(address: Address) -> socket.socket:
 
 
 def _addresses(host: str, port: int, flags: int = 0) -> list[Address]:
-    """The TCP addresses of a host, without repetition.
+    """The TCP addresses of a host, without duplicates.
 
-    "localhost" has both loopback addresses (RFC 6761, 6.3), whatever /etc/hosts names.
+    "localhost" always has both loopback addresses (RFC 6761, 6.3); /etc/hosts can lack one.
     """
     hosts = [host]
     if is_localhost(host):
@@ -117,7 +117,7 @@ def _addresses(host: str, port: int, flags: int = 0) -> list[Address]:
 
 
 def is_localhost(host: str) -> bool:
-    """Whether a name is one of this machine's loopback addresses."""
+    """Whether a name stands for the loopback addresses: "localhost" or a name below it."""
     name = host.lower().removesuffix(".")
     return name == "localhost" or name.endswith(".localhost")
 
@@ -125,10 +125,10 @@ def is_localhost(host: str) -> bool:
 def connect(
     place: tuple[str, int], timeout_s: float | None, source: tuple[str, int] | None = None
 ) -> socket.socket:
-    """A connection to the first address of (host, port) that answers, within `timeout_s` in all.
+    """A connection to the first address of (host, port) that accepts, within `timeout_s` in total.
 
-    Each address gets an equal part of the time that is left, or CONNECT_S of it. Raises OSError:
-    the first refusal. Arguments as of `socket.create_connection`.
+    Each address gets an equal share of the remaining time, but at least CONNECT_S if so much is
+    left. Raises the first OSError. The arguments are those of `socket.create_connection`.
     """
     host, port = place
     addresses = _addresses(host, port)
@@ -158,12 +158,12 @@ def connect(
 
 
 def refuse_connections(listener: socket.socket) -> None:
-    """Let no more connections begin at a listening socket; those that have begun can be accepted.
+    """Start no new connections on a listening socket; connections in its queue can be accepted.
 
-    A listening socket that is closed resets what waits in its queue, and between the last accept
-    and the close there is always time for one more. So the kernel drops what asks for a connection
-    from now on: such a client asks again after a second, and is refused then. Does nothing where
-    the system has no such filter (Linux has).
+    Closing a listening socket resets the connections in its queue, and a connection could always
+    arrive between the last accept and the close. So from now on the kernel drops SYN packets: the
+    client sends its SYN again after 1 s, and is refused once the socket is closed. Does nothing on
+    systems without socket filters; Linux has them.
     """
     program = ctypes.create_string_buffer(b"".join(struct.pack("HBBI", *step) for step in NO_SYN))
     head = struct.pack("HP", len(NO_SYN), ctypes.addressof(program))
@@ -172,12 +172,12 @@ def refuse_connections(listener: socket.socket) -> None:
 
 
 def address(listener: socket.socket, host: str) -> str:
-    """The URL of a bound socket, with the port that the system chose for port 0."""
+    """The URL of a bound socket, with its real port (the system's choice for port 0)."""
     return url(host, listener.getsockname()[1])
 
 
 def url(host: str, port: int) -> str:
-    """The URL of a service; a zone of IPv6 is written as RFC 6874 says."""
+    """The URL of a service; the zone of an IPv6 address is escaped as in RFC 6874."""
     shown = f"[{host.replace('%', '%25')}]" if ":" in host else host
     return f"http://{shown}:{port}"
 

@@ -1,8 +1,7 @@
-"""Charts of HTML pages as SVG: line plots, reliability diagrams, histograms and bars.
+"""SVG charts for HTML pages: line plots, reliability diagrams, histograms and bars.
 
-A plot's SVG, in coordinates from 0 to `SIDE` with y down, is stretched over its box and labelled in
-HTML: its lines scale with the page and its text does not. Pages with charts include
-`svg_charts.css`.
+A plot's SVG has coordinates from 0 to `SIDE`, y down, and is stretched over its box. Its labels are
+HTML, so that the text does not scale with the box. Pages with charts include `svg_charts.css`.
 """
 
 import math
@@ -16,16 +15,16 @@ from numpy.typing import NDArray
 
 SIDE = 1000.0
 LOG_FLOOR = 1e-9
-"""The value at which a logarithmic axis draws 0."""
+"""A logarithmic axis draws smaller values, 0 among them, at this value."""
 MAX_POINTS = 800
-"""Points of a line that a page has room for."""
+"""Largest useful number of points of a line on a page."""
 
 Numbers = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Axis:
-    """Maps values to [0, SIDE], from `first` to `last`; `log`: by their logarithms."""
+    """Maps the values from `first` to `last` to [0, SIDE]; logarithmically with `log`."""
 
     first: float
     last: float
@@ -39,7 +38,7 @@ class Axis:
 
     @property
     def ticks(self) -> list[float]:
-        """Round numbers on this axis, ascending."""
+        """Round values on this axis, in ascending order."""
         low, high = sorted((self.first, self.last))
         return (
             log_ticks(max(low, LOG_FLOOR), max(high, LOG_FLOOR)) if self.log else ticks(low, high)
@@ -47,7 +46,7 @@ class Axis:
 
 
 def value_range(columns: Iterable[Numbers], *, log: bool) -> tuple[float, float]:
-    """Least and greatest finite value of `columns`, with a margin for an axis."""
+    """Smallest and largest finite value of `columns`, with a margin, for an axis."""
     values = np.concatenate([column[np.isfinite(column)] for column in columns])
     if not len(values):
         return (LOG_FLOOR, 1.0) if log else (-1.0, 1.0)
@@ -59,7 +58,7 @@ def value_range(columns: Iterable[Numbers], *, log: bool) -> tuple[float, float]
 
 
 def ticks(low: float, high: float) -> list[float]:
-    """Three to eight round numbers from `low` to `high`; none where `high` is not above `low`."""
+    """Three to eight round numbers between `low` and `high`; none unless `high` > `low`."""
     if not high > low:
         return []
     step = 10 ** math.floor(math.log10((high - low) / 3))
@@ -69,7 +68,8 @@ def ticks(low: float, high: float) -> list[float]:
 
 
 def log_ticks(low: float, high: float) -> list[float]:
-    """Ticks between two positive numbers: 1, 2 and 5 of each decade, or only 1 of many decades."""
+    """Ticks between two positive numbers: 1, 2 and 5 times each power of ten; only the powers of
+    ten if more than four of them are in the range."""
     decades = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
     found = [float(f"{digit}e{decade}") for decade in decades for digit in (1, 2, 5)]
     inside = [value for value in found if low <= value <= high]
@@ -82,10 +82,10 @@ def log_ticks(low: float, high: float) -> list[float]:
 
 @dataclass(frozen=True)
 class Line:
-    """A line through y (N,) at x (N,), broken at NaN; `band` (low, high) is filled behind it.
+    """A line through the points x (N,), y (N,), interrupted at NaN.
 
-    `kind`: its class in `svg_charts.css`. A line with a `label` is named in the legend and has a
-    `colour` of its own.
+    `kind` is its class in `svg_charts.css`; `label` and `colour` appear in the legend. `band` is a
+    pair (low, high) of bounds (N,); the area between them is filled behind the line.
     """
 
     kind: str
@@ -98,7 +98,7 @@ class Line:
 
 @dataclass(frozen=True)
 class Plot:
-    """Lines, and intervals (from, to) of x shaded behind them; `log`: logarithmic y axis."""
+    """Lines over `shaded` intervals (from, to) of x; `log` makes the y axis logarithmic."""
 
     title: str
     lines: Sequence[Line]
@@ -108,11 +108,11 @@ class Plot:
 
 
 def line_plot(plot: Plot) -> Markup:
-    """The figure; the note "not yet" in its place when there is no line."""
+    """The plot as an HTML figure; it has the text "not yet" if the plot has no lines."""
     if not plot.lines:
         note = Markup("<figure><figcaption>{}</figcaption><p>not yet</p></figure>")
         return note.format(plot.title)
-    # The axis fits the bands of lines with a label; the other bands may be cut off at its ends.
+    # The y axis covers all lines and the bands of labelled lines; other bands can be cut off.
     fitted = [line.y for line in plot.lines]
     fitted += [edge for line in plot.lines if line.label for edge in line.band or ()]
     low, high = value_range(fitted, log=plot.log)
@@ -136,7 +136,8 @@ def line_plot(plot: Plot) -> Markup:
 
 
 def reliability_diagram(title: str, predicted: Numbers, observed: Numbers) -> Markup:
-    """Observed errors against predicted standard deviations, logarithmic, with the diagonal."""
+    """Observed errors over predicted standard deviations (both (N,)), on logarithmic axes with the
+    diagonal."""
     both = np.maximum(np.concatenate([predicted, observed]), LOG_FLOOR)
     low, high = float(both.min()) * 0.8, float(both.max()) * 1.25
     x_axis, y_axis = Axis(low, high, log=True), Axis(high, low, log=True)
@@ -215,20 +216,20 @@ def _figure(
     )
 
 
-# Histograms and bars of the splits of a dataset, drawn over and under each other.
+# Histograms (splits of a dataset on top of each other) and bars (one below the other).
 
 
 BINS = 48
 SPLIT_COLOURS = {"train": "#3b6fd4", "test": "#e07a2e", "unseen": "#2a9d5c"}
 WIDTH, HEIGHT = 320, 120
 MARGIN, FOOT = 6, 18
-"""Of a histogram: space left and right, and below for the labels."""
+"""Space of a histogram on the left and right, and below it for the labels, in SVG units."""
 
 
 def histogram(title: str, unit: str, values: Mapping[str, NDArray[np.float32]]) -> Markup:
-    """Shares of the finite values of each split (N,) in `BINS` equal bins; NaN is inactive.
+    """Histogram of the finite values (N,) of each split in `BINS` equal bins; NaN means inactive.
 
-    The shares of a split sum to one, so that splits of different sizes can be compared.
+    The bins of a split sum to one, so that splits of different sizes can be compared.
     """
     finite = {split: column[np.isfinite(column)] for split, column in values.items()}
     filled = [column for column in finite.values() if column.size]
@@ -252,7 +253,7 @@ def histogram(title: str, unit: str, values: Mapping[str, NDArray[np.float32]]) 
 
 
 def bars(title: str, counts: Mapping[str, Sequence[int]]) -> Markup:
-    """A row of bars for each name: its frames in each split, in the order of `SPLIT_COLOURS`."""
+    """A row of bars for each name: its frame counts in the splits, ordered as `SPLIT_COLOURS`."""
     top = max((max(row) for row in counts.values()), default=0) or 1
     rows = []
     for name, row in counts.items():
@@ -269,7 +270,7 @@ def bars(title: str, counts: Mapping[str, Sequence[int]]) -> Markup:
 
 
 def _outline(share: Numbers, colour: str) -> str:
-    """A stepped area; `share` (BINS,) in [0, 1]."""
+    """A step outline of the bin heights `share` (BINS,) in [0, 1]."""
     floor = HEIGHT - FOOT
     points = [f"{_bin_x(0.0):.1f},{floor}"]
     for k, part in enumerate(share.tolist()):
@@ -280,7 +281,7 @@ def _outline(share: Numbers, colour: str) -> str:
 
 
 def _value_axis(low: float, high: float) -> str:
-    """The labels of both ends, and a line at zero where it is between them."""
+    """Labels of both ends, and a line at zero if zero is between them."""
     drawn = _text(MARGIN, "start", f"{low:.3g}") + _text(WIDTH - MARGIN, "end", f"{high:.3g}")
     if low < 0.0 < high:
         zero = -low / (high - low)

@@ -1,4 +1,5 @@
-"""The service as one ASGI application: POST /features and /stream directly, the rest by FastAPI."""
+"""The service as one ASGI application. It handles POST /features and /stream; FastAPI handles the
+other paths."""
 
 import os
 import time
@@ -72,11 +73,12 @@ class Service:
         tracer: "Tracer | None" = None,
         cameras: Cameras = NO_CAMERAS,
     ) -> None:
-        """`check` warms up an engine and raises when its outputs are wrong.
+        """`check` warms up the engine and raises an error if its outputs are wrong. It runs when
+        the application starts (ASGI lifespan); until it returns, /readyz and /features answer 503.
 
-        It runs when the application starts (its lifespan); until it has returned, /readyz and
-        /features answer 503. `shared` None: this is the only worker; else `block` is its block.
-        `tracer` None: no traces. `cameras`: what requests may name.
+        `shared` is the workers' shared memory and `block` this worker's block in it; None for a
+        single worker. `cameras` are the cameras that requests can name. Without `tracer` no traces
+        are recorded.
         """
         self.limits = limits or Limits()
         self.shared = shared or create_shared_memory(1)
@@ -126,9 +128,9 @@ class Service:
     def open(
         self, headers: Headers, client: str, send: Callable[[Reply], None]
     ) -> FeaturesRequest | None:
-        """Begin a POST /features; None: it was refused, and the refusal was sent.
+        """Begin a POST /features without ASGI. Returns None after a refusal, which is then sent.
 
-        No header was sent twice.
+        Precondition: no header name occurs twice in the request.
         """
         refusal = self._authorize(headers, client) or self.frames.refuse_early(headers, client)
         if refusal is not None:
@@ -138,10 +140,8 @@ class Service:
         return request if request.open(headers) else None
 
     def _authorize(self, headers: Headers, client: str) -> Reply | None:
-        """The refusal of a client over its rate, of a wrong Host or Origin, or without the token.
-
-        None: it may go on.
-        """
+        """The refusal of a client that exceeds its rate, has a wrong Host or Origin, or lacks the
+        token; None for an accepted client."""
         try:
             self.rate_limiter.check(client)
             self._hosts.check(headers)
@@ -151,7 +151,7 @@ class Service:
         return None
 
     def _authorize_scope(self, scope: Scope) -> Reply | None:
-        """As `_authorize`, for a request of any path; its headers may hold a name twice."""
+        """Like `_authorize`, for any path and for headers in which a name can occur twice."""
         path, headers, client = scope["path"], dict(scope["headers"]), client_address(scope)
         try:
             public = _is_public(path)
@@ -184,14 +184,14 @@ def _traced_apps(tracer: "Tracer", *apps: App) -> list[App]:
 
 
 def _cores() -> int:
-    """The number of cores that this process may use."""
+    """The number of cores available to this process."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
 
 
 def _is_public(path: str) -> bool:
-    """Whether a path needs no token: probes, the console (it asks for the token), the docs."""
+    """Whether a path needs no token: probes, docs, and the console, which asks for the token."""
     return path in PROBES or path in ("/", DOCS_PATH) or path.startswith("/console/")
 
 
@@ -213,7 +213,7 @@ def _framework(service: Service) -> FastAPI:
     )
     install_problem_handlers(app)
     schemas.install_openapi(app, PROBES, token_required=service.limits.token is not None)
-    # Reached with other methods than POST only; answers 405 with the allowed method.
+    # POST never arrives here; other methods get 405 with the allowed method.
     app.router.routes.append(Route("/features", service.features, methods=["POST"]))
     _add_status(app, service.frames)
     _add_metrics(app, service)

@@ -1,6 +1,7 @@
-"""The cameras that a service knows by name, `serve --camera NAME=FILE`, and how an image is seen.
+"""The named cameras of a service (`serve --camera NAME=FILE`), and the mapping of an image to the
+view of the model's camera.
 
-A request names one; the service opens no file that a client names.
+A request names a camera; the service never opens a file whose name a client sent.
 """
 
 import re
@@ -24,9 +25,9 @@ MAX_CAMERAS = 64
 
 
 def read_cameras(options: Iterable[str], model: CameraParameters) -> dict[str, CameraParameters]:
-    """The cameras of `NAME=FILE` options; what a file leaves out is as in the model's camera.
+    """The cameras of `NAME=FILE` options; values that a file omits come from the model's camera.
 
-    Raises UserError.
+    Raises UserError for a faulty option or file, and for a camera that sees too little.
     """
     found: dict[str, CameraParameters] = {}
     for option in options:
@@ -34,7 +35,7 @@ def read_cameras(options: Iterable[str], model: CameraParameters) -> dict[str, C
         if not (equals and file and re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}", name)):
             raise UserError(
                 f"--camera is {option!r}; give NAME=FILE, with a name of up to 64 letters, digits, "
-                "points, dashes and underscores, as --camera roof=roof.yaml"
+                "points, dashes and underscores, for example --camera roof=roof.yaml"
             )
         if name in found:
             raise UserError(f"--camera gives {name} twice; give each camera a name of its own")
@@ -42,35 +43,35 @@ def read_cameras(options: Iterable[str], model: CameraParameters) -> dict[str, C
         try:
             Rectification(found[name], model).check(found[name].width, found[name].height)
         except ImageError as error:
-            raise UserError(f"{file}: of this camera {error}") from error
+            raise UserError(f"{file}: with this camera {error}") from error
     if len(found) > MAX_CAMERAS:
-        raise UserError(f"--camera is given {len(found)} times; at most {MAX_CAMERAS} are kept")
+        raise UserError(f"--camera is given {len(found)} times; give at most {MAX_CAMERAS}")
     return found
 
 
 @dataclass(frozen=True, slots=True)
 class Sight:
-    """What is known of the camera of an image: `camera`, else its vertical field of view
-    `fov_y_deg`, else it is the model's."""
+    """The camera of an image: `camera`, if given; else the model's camera, with the vertical field
+    of view `fov_y_deg` if given."""
 
     fov_y_deg: float | None = None
     camera: CameraParameters | None = None
 
     def check(self, width: int, height: int, view: CameraParameters) -> None:
-        """Raise ImageError where an image of that size does not show what `view` does."""
+        """Raise ImageError if an image of this size in px does not cover what `view` shows."""
         if self.camera is None:
             crop_box(width, height, view, self.fov_y_deg)
         else:
             Rectification(self.camera, view).check(width, height)
 
     def through(self, image: NDArray[np.uint8], view: CameraParameters) -> NDArray[np.uint8]:
-        """An image (H, W, 3) as the model's camera `view` sees it. Raises ImageError."""
+        """`image` (H, W, 3) as seen by the model's camera `view`. Raises ImageError."""
         if self.camera is None:
             return crop_and_resize(image, view, self.fov_y_deg)
         return Rectification(self.camera, view).image(image)
 
     def crop_px(self, width: int, height: int, view: CameraParameters) -> list[int] | None:
-        """[left, top, width, height] of the part the model sees, px; None: the whole image, or one
-        that is warped."""
+        """[left, top, width, height] in px of the part that the model sees. None if the whole image
+        is used or the image is warped."""
         box = None if self.camera else crop_box(width, height, view, self.fov_y_deg)
         return None if box is None else [box.left, box.top, box.width, box.height]

@@ -1,6 +1,6 @@
-"""Command line of the perception service. Run: `serve`, or
-`serve --model runs/NAME --port 8000 --workers 2`; `serve reload` and `serve restart` control a
-running service.
+"""Command line of the perception service. Run `serve`, or
+`serve --model runs/NAME --port 8000 --workers 2`. `serve reload` and `serve restart` control a
+running service; `serve ray` runs it on Ray.
 """
 
 from pathlib import Path
@@ -24,30 +24,32 @@ Model = Annotated[
 ]
 NewModel = Annotated[
     str | None,
-    typer.Option(help="Model to load instead of the current one; values as for `serve --model`."),
+    typer.Option(help="Model to load, as for `serve --model`. Default: the current one again."),
 ]
-Host = Annotated[str, typer.Option(help="Address to listen on.")]
-Port = Annotated[int, typer.Option(help="Port to listen on; 0: any free one.", min=0, max=65535)]
-RayPort = Annotated[int, typer.Option(help="Port of Ray's proxy.", min=1, max=65535)]
+Host = Annotated[str, typer.Option(help="Address to listen on. Default: this machine only.")]
+Port = Annotated[int, typer.Option(help="Port to listen on; 0: any free port.", min=0, max=65535)]
+RayPort = Annotated[int, typer.Option(help="Port of Ray's HTTP proxy.", min=1, max=65535)]
 Workers = Annotated[
     int,
-    typer.Option(help="Worker processes, each with one engine; one per core.", min=1, max=256),
+    typer.Option(help="Worker processes; each needs one core for its engine.", min=1, max=256),
 ]
 Replicas = Annotated[int, typer.Option(help="Engines; each uses one core of the cluster.", min=1)]
 TokenFile = Annotated[
     Path | None,
     typer.Option(
-        help="File with the token that clients send as Authorization: Bearer. "
-        "Default: $DRIVERVIEW_TOKEN."
+        help="File with the token that clients must send in the header Authorization: Bearer. "
+        "Default: $DRIVERVIEW_TOKEN; if that is empty, no token."
     ),
 ]
 Insecure = Annotated[
     bool,
-    typer.Option("--insecure", help="Allow a --host that other machines reach, without a token."),
+    typer.Option(
+        "--insecure", help="Serve other machines without a token, for example behind a proxy."
+    ),
 ]
 RequestRate = Annotated[
     float,
-    typer.Option(help="Requests a second from one other machine; 0: no limit.", min=0),
+    typer.Option(help="Requests per second allowed for each other machine; 0: no limit.", min=0),
 ]
 Connections = Annotated[
     int, typer.Option(help="Largest number of open connections.", min=1, max=65536)
@@ -55,32 +57,32 @@ Connections = Annotated[
 AllowHost = Annotated[
     list[str] | None,
     typer.Option(
-        help="Name that clients without a token may call the service by, beside localhost and "
-        "--host; may be given several times."
+        help="Host name that is accepted in requests if there is no token, in addition to "
+        "localhost and --host. Can be repeated."
     ),
 ]
 TrustedProxy = Annotated[
     list[str] | None,
     typer.Option(
-        help="Address or network of a proxy whose X-Forwarded-For names the client; may be given "
-        "several times. Default: 127.0.0.1."
+        help="Address or network of a proxy whose header X-Forwarded-For is accepted as the "
+        "client's address. Can be repeated. Default: 127.0.0.1."
     ),
 ]
 BodyMib = Annotated[
     int,
-    typer.Option(help="Memory for the bodies of all requests in flight, MiB.", min=4, max=1 << 20),
+    typer.Option(help="MiB of memory for the bodies of all requests.", min=4, max=1 << 20),
 ]
 CameraFiles = Annotated[
     list[str] | None,
     typer.Option(
         "--camera",
         metavar="NAME=FILE",
-        help="Camera that requests may name (X-Camera: NAME), described by a camera.yaml; may be "
-        "given several times.",
+        help="Camera that requests can select with the header X-Camera: NAME; FILE is its "
+        "camera.yaml. Can be repeated. Default: the model's camera only.",
     ),
 ]
 LogAnswers = Annotated[
-    bool, typer.Option("--log-answers", help="Log answered requests as well as refused ones.")
+    bool, typer.Option("--log-answers", help="Log answered requests, not only refused ones.")
 ]
 
 
@@ -101,11 +103,11 @@ def serve(
     body_mib: BodyMib = Limits.body_mib,
     camera: CameraFiles = None,
 ) -> None:
-    """Answer driver-view images over HTTP with track features.
+    """Serve a model over HTTP: clients send driver-view images and receive track features.
 
-    The first line on stderr names the model and the address. Send an image with
-    [bold]curl -H "Content-Type: image/jpeg" --data-binary @frame.jpg URL/features[/bold];
-    the API documentation is at URL/docs. SIGTERM or Ctrl-C stops the service, SIGHUP reloads the
+    The first line on stderr shows the model and the service's URL. Send an image with
+    [bold]curl -H "Content-Type: image/jpeg" --data-binary @frame.jpg URL/features[/bold].
+    The API documentation is at URL/docs. SIGTERM or Ctrl-C stops the service, SIGHUP reloads the
     model.
     """
     if context.invoked_subcommand is not None:
@@ -127,7 +129,7 @@ def serve(
 
 
 def _check_no_options(context: typer.Context) -> None:
-    """Raise UserError for options before the name of a subcommand, which would have no effect."""
+    """Raise UserError for options before the name of a subcommand: they would have no effect."""
     for name in context.params:
         source = context.get_parameter_source(name)
         if source is not None and source.name == "COMMANDLINE":
@@ -143,12 +145,12 @@ def _check_no_options(context: typer.Context) -> None:
 def reload(port: ServicePort = ServiceConfig.port, model: NewModel = None) -> None:
     """Load new weights into the service that runs on this machine; no request is lost.
 
-    Every worker loads and checks the new weights while the old ones go on answering. If they fail
-    the check, the old weights stay in use and this command prints the reason.
+    Every worker loads and checks the new weights while it still answers with the old ones. If the
+    check fails, the old weights stay in use and this command prints the reason.
     """
     from serve.workers.control_socket import send_command
 
-    # The service may run in another working folder: send an absolute path.
+    # The service can have another working directory, so the path must be absolute.
     name = str(Path(model).resolve()) if model is not None and Path(model).is_dir() else model
     typer.echo(send_command(port, "reload", name))
 
@@ -171,9 +173,9 @@ def ray(
     insecure: Insecure = False,
     allow_host: AllowHost = None,
 ) -> None:
-    """Serve on Ray: on the cluster of $RAY_ADDRESS, or on a new local one.
+    """Serve on Ray: on the cluster at $RAY_ADDRESS, or on a new local cluster.
 
-    Needs [bold]pip install 'driverview\\[rayserve]'[/bold]. The model's folder must exist on all
+    Requires [bold]pip install 'driverview\\[rayserve]'[/bold]. The model's folder must exist on all
     machines of the cluster.
     """
     token = read_token(token_file)

@@ -1,4 +1,4 @@
-"""Configuration of the service: limits on its clients, the token, and the address to listen on."""
+"""Configuration of the service: limits for clients, the token, and the address to listen on."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -19,30 +19,30 @@ MAX_DEADLINE_MS = 60_000  # the longest deadline that a client may set
 
 @dataclass(frozen=True)
 class Limits:
-    """Limits on clients. `docs/how-to/deploy.md` documents these defaults."""
+    """Limits for clients. `docs/how-to/deploy.md` documents these defaults."""
 
     connections: int = 256
-    """Open connections of all workers together."""
+    """Largest number of open connections of all workers together."""
     queue: int = 4
-    """Frames that may wait in one worker while it processes another."""
+    """Largest number of frames that wait in one worker while it processes a frame."""
     head_s: float = 5.0
-    """Time to receive the headers of a request."""
+    """Longest time to receive the headers of a request."""
     body_s: float = 10.0
-    """Time to receive the body of a request, counted from the end of its headers."""
+    """Longest time to receive the body of a request, from the end of its headers."""
     idle_s: float = 30.0
-    """Time a connection may stay open without a request."""
+    """Longest time that a connection stays open without a request."""
     rate: float = 200.0
-    """Requests a second from one client address, and the size of a burst; 0: no limit."""
+    """Requests per second from one client address, also the size of a burst; 0: no limit."""
     log_answers: bool = False
     """Log every answered request. Refused requests are always logged."""
     token: str | None = None
-    """Required in `Authorization: Bearer`; None: no token is required."""
+    """Token that requests must have in `Authorization: Bearer`; None: no token is required."""
     hosts: tuple[str, ...] = ()
-    """Names beside the loopback ones that a Host header may have without a token."""
+    """Accepted names in the Host header besides the loopback names; ignored with a token."""
     trusted_proxies: tuple[str, ...] = ()
-    """Addresses and networks whose X-Forwarded-For is believed; empty: 127.0.0.1."""
+    """Addresses and networks of proxies whose X-Forwarded-For is used; empty: 127.0.0.1."""
     body_mib: int = 64
-    """Memory for the bodies of all requests in flight, MiB."""
+    """Memory in MiB for the bodies of all unanswered requests of all workers."""
 
 
 @dataclass(frozen=True)
@@ -53,13 +53,13 @@ class ServiceConfig:
     """A run's folder, its name in runs/, "latest" or "default"."""
     host: str = "127.0.0.1"
     port: int = 8000
-    """0: any free port; the first line on stderr names it."""
+    """0 chooses a free port; the first line on stderr shows it."""
     workers: int = 1
     insecure: bool = False
-    """Listen on addresses that other machines can reach, without a token."""
+    """Allow a `host` that other machines can reach although there is no token."""
     limits: Limits = field(default_factory=Limits)
     cameras: tuple[str, ...] = ()
-    """NAME=FILE of each camera that requests may name."""
+    """NAME=FILE of each camera that requests can name."""
 
 
 def check_proxies(proxies: Iterable[str]) -> tuple[str, ...]:
@@ -70,15 +70,16 @@ def check_proxies(proxies: Iterable[str]) -> tuple[str, ...]:
             ip_network(proxy)
         except ValueError as error:
             raise UserError(
-                f"--trusted-proxy is {proxy!r} ({error}); give an address or a network, as "
-                "10.0.0.7 or 10.0.0.0/8"
+                f"--trusted-proxy is {proxy!r} ({error}); give an address or a network, for "
+                "example 10.0.0.7 or 10.0.0.0/8"
             ) from error
     return found
 
 
 @lru_cache(4096)
 def network_of(address: str) -> str:
-    """The address, or the /64 network of an IPv6 address; an IPv4 address within IPv6 is that."""
+    """An IPv4 address as it is, an IPv4-mapped IPv6 address as IPv4, and the /64 network of any
+    other IPv6 address: one client usually owns the whole /64."""
     try:
         found = ip_address(address.partition("%")[0])
     except ValueError:

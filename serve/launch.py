@@ -1,7 +1,7 @@
-"""Start of the service: checks, the listening socket, the first line on stderr, a clean shutdown.
+"""Starts the service: checks, listening sockets, the first line on stderr; shuts it down cleanly.
 
 Each worker process has one engine with one thread, because two threads in one process slow each
-other down. All workers share the listening socket; `serve.workers.supervisor` manages them.
+other down. All workers share the listening sockets; `serve.workers.supervisor` manages them.
 """
 
 import asyncio
@@ -19,10 +19,10 @@ from trackfeatures.camera import CameraParameters
 
 
 def run(config: ServiceConfig) -> None:
-    """Serve until SIGTERM or Ctrl-C. Raises UserError when the service cannot start."""
+    """Serve until SIGTERM or Ctrl-C. Raises UserError if the service cannot start."""
     logs.set_up()
     check_exposure(config.host, config.limits.token, config.insecure)
-    # Fail on a missing exporter or model before any process is started.
+    # A missing exporter or model is reported here, before any process is started.
     telemetry.exporter_name()
     cameras = _cameras(config.cameras, resolve_run(config.model))
     listeners = bind_all(config.host, config.port)
@@ -64,7 +64,7 @@ def _cameras(options: tuple[str, ...], run: Path) -> dict[str, CameraParameters]
     """The cameras of `--camera`, checked against the model in folder `run`."""
     if not options:
         return {}
-    from serve.cameras import read_cameras  # loads OpenCV, for which every worker would wait
+    from serve.cameras import read_cameras  # imported late: loading OpenCV delays the workers
 
     return read_cameras(options, read_card(run).camera)
 

@@ -1,13 +1,13 @@
-"""The service as an application of Ray Serve (the extra `rayserve`): each replica is one engine.
+"""The service as a Ray Serve application (the extra `rayserve`); each replica has one engine.
 
     serve ray --model runs/latest --replicas 2 --port 8000
 
-starts it on the cluster of $RAY_ADDRESS, or on a new local one, until Ctrl-C. `build` is an
+runs it on the cluster at $RAY_ADDRESS, or on a new local cluster, until Ctrl-C. `build` is the
 application builder for Ray's own `run`, `deploy` and configuration files
 (`import_path: serve.on_ray:build`, `args: {model: /runs/latest}`).
 
-Ray handles restarts, scaling and the port. Streams and rate limits are therefore per replica, and
-the limits on slow clients are those of Ray's proxies.
+Ray handles restarts, scaling and the port. So streams and rate limits apply to each replica
+separately, and Ray's proxies set the limits for slow clients.
 """
 
 import os
@@ -30,10 +30,10 @@ from serve.scheduling.warmup import warm_up
 from trackfeatures.errors import UserError
 
 NAME = "driverview"
-# A replica refuses what does not fit into its queue at once. Ray's own limit, below this one, would
-# let requests wait in its proxies.
+# High enough that Ray never holds requests back in its proxies: a replica refuses requests that do
+# not fit into its queue at once.
 MAX_ONGOING = 100
-ARGUMENTS = {"model", "replicas", "token_file", "hosts"}  # of `build`
+ARGUMENTS = {"model", "replicas", "token_file", "hosts"}  # arguments of `build`
 
 
 @dataclass(frozen=True)
@@ -48,37 +48,36 @@ class RayConfig:
 
 
 def _application(folder: str, limits: Limits) -> Service:
-    """The service of one replica; it accepts requests once this has returned."""
+    """The service of one replica; the replica accepts requests after this function returns."""
     engine = load_engine(Path(folder))
     warm_up(engine)
     return Service(engine, lambda _engine: None, limits, tracer=telemetry.tracer())
 
 
 def build(args: dict[str, Any]) -> ray_serve.Application:
-    """The application; `args`: `model` as for `serve`, resolved on this machine, and others.
-
-    Those are `replicas`, `token_file` (else the token is $DRIVERVIEW_TOKEN) and `hosts`, the names
-    that clients may call the service by without a token. Raises UserError.
+    """The Ray Serve application. Keys of `args`: `model` as for `serve`, resolved on this machine;
+    `replicas`; `token_file` (default: the token in $DRIVERVIEW_TOKEN); `hosts`, the host names that
+    are accepted without a token. Raises UserError.
     """
     unknown = set(args) - ARGUMENTS
     if unknown:
         raise UserError(
-            f"unknown argument {', '.join(sorted(unknown))}; there are "
+            f"unknown argument {', '.join(sorted(unknown))}; known arguments are "
             f"{', '.join(sorted(ARGUMENTS))}"
         )
     token_file = args.get("token_file")
     token = read_token(None if token_file is None else Path(token_file))
     hosts = args.get("hosts", ())
     limits = Limits(token=token, hosts=(hosts,) if isinstance(hosts, str) else tuple(hosts))
-    replicas = str(args.get("replicas", 1))  # text where it comes from Ray's command line
+    replicas = str(args.get("replicas", 1))  # Ray's command line gives text
     if not replicas.isdecimal() or int(replicas) < 1:
-        raise UserError(f"replicas is {replicas[:40]}; expected a whole number from 1")
+        raise UserError(f"replicas is {replicas[:40]}; expected a whole number of at least 1")
     folder = resolve_run(str(args.get("model", "default"))).resolve()
     return _bind(folder, int(replicas), limits)
 
 
 def _bind(folder: Path, replicas: int, limits: Limits) -> ray_serve.Application:
-    def application() -> Service:  # sent to the replicas, which then load the engine
+    def application() -> Service:  # runs in each replica, which then loads the engine
         return _application(str(folder), limits)
 
     track = ray_serve.deployment(
@@ -88,7 +87,7 @@ def _bind(folder: Path, replicas: int, limits: Limits) -> ray_serve.Application:
 
 
 def run(config: RayConfig) -> None:
-    """Serve on Ray until SIGTERM or Ctrl-C. Raises UserError when it cannot start."""
+    """Serve on Ray until SIGTERM or Ctrl-C. Raises UserError if the service cannot start."""
     folder = resolve_run(config.model).resolve()
     owns_cluster = _connect()
     try:
@@ -106,7 +105,7 @@ def run(config: RayConfig) -> None:
 
 
 def _connect() -> bool:
-    """Join the cluster at $RAY_ADDRESS, or start one here; whether it was started here."""
+    """Join the cluster at $RAY_ADDRESS, or start a local one; True if one was started."""
     import ray
 
     quiet: dict[str, Any] = {"logging_level": "ERROR", "log_to_driver": False}

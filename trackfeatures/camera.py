@@ -1,4 +1,4 @@
-"""The driver camera: size in pixels, lens, and mounting place in the body frame (SI units).
+"""The driver camera: size in px, lens, and mount (position and angles) in the body frame.
 
 Body frame: x ahead, y left, z up, origin at the car's centre of gravity. Camera frame: x right,
 y down, z ahead along the optical axis. Image frame: pixels, u right, v down; a pixel's centre has
@@ -17,42 +17,43 @@ if TYPE_CHECKING:
 
 FOV_LIMITS_DEG = (1.0, 150.0)
 COEFFICIENTS: dict[str, tuple[int, ...]] = {"none": (0,), "opencv": (4, 5, 8), "fisheye": (4,)}
-"""Kinds of distortion, and how many coefficients each takes."""
+"""Distortion models, each with the numbers of coefficients that it accepts."""
 
 
 class CameraError(UserError, ValueError):
-    """Impossible camera parameters; also a ValueError, for readers of damaged files."""
+    """Impossible camera parameters. Also a ValueError, which readers of damaged files catch."""
 
 
 @dataclass(frozen=True, slots=True)
 class CameraParameters:
-    """A camera on the car: size, lens and mount. A model understands only images of the camera it
-    was trained with, or images that were warped into it.
+    """A camera on the car: size in px, lens, and mount in m and degrees. A model is valid only for
+    images of its training camera, or images warped to that camera's view.
 
-    The mount turns the body by Rz(yaw) Ry(pitch) Rx(roll). Raises CameraError for an impossible
-    lens, such as a vertical field of view outside `FOV_LIMITS_DEG`.
+    The camera's rotation relative to the car is Rz(yaw) Ry(pitch) Rx(roll). Raises CameraError for
+    an impossible lens, for example a vertical field of view outside `FOV_LIMITS_DEG`.
     """
 
     width: int = 280
     height: int = 210
     fov_y_deg: float = 67.5
-    """Of the lens without its distortion; follows from `matrix` where that is given."""
+    """Vertical field of view without distortion; computed from `matrix` if `matrix` is given."""
     x: float = 0.75
     y: float = 0.0
     z: float = 0.95
     pitch_deg: float = 0.0
-    """Positive looks down."""
+    """Positive: the camera looks down."""
     roll_deg: float = 0.0
-    """Positive lowers the right side."""
+    """Positive: the right side is lowered."""
     yaw_deg: float = 0.0
-    """Positive turns to the left."""
+    """Positive: the camera is turned to the left."""
     matrix: tuple[float, float, float, float] | None = None
-    """fx, fy, cx, cy in px; None: square pixels of `fov_y_deg`, principal point in the middle."""
+    """fx, fy, cx, cy in px. None: square pixels, `fov_y_deg`, principal point in the centre."""
     distortion: str = "none"
-    """"none"; "opencv": k1, k2, p1, p2 [, k3 [, k4, k5, k6]]; or "fisheye": k1 to k4."""
+    """Model and its `coefficients`: "none"; "opencv": k1, k2, p1, p2 [, k3 [, k4, k5, k6]];
+    "fisheye": k1 to k4."""
     coefficients: tuple[float, ...] = ()
     height_std: float = 0.0
-    """Standard deviation of the height above the road, as a share of it."""
+    """Standard deviation of the height above the road, as a fraction of that height."""
 
     cg_height_m: ClassVar[float] = 0.25
     """Height of the car's centre of gravity above the road."""
@@ -68,7 +69,7 @@ class CameraParameters:
             object.__setattr__(self, "matrix", matrix)
             fov_y_deg = degrees(2 * atan(self.height / 2 / matrix[1]))
             object.__setattr__(self, "fov_y_deg", fov_y_deg)
-        if self.distortion not in tuple(COEFFICIENTS):  # it may be of any type
+        if self.distortion not in tuple(COEFFICIENTS):  # may be unhashable
             kinds = ", ".join(COEFFICIENTS)
             raise CameraError(f"the distortion is {self.distortion!r}; give one of {kinds}")
         counts = COEFFICIENTS[self.distortion]
@@ -77,30 +78,31 @@ class CameraParameters:
         lo, hi = FOV_LIMITS_DEG
         if not lo <= self.fov_y_deg <= hi:
             raise CameraError(
-                f"vertical field of view {self.fov_y_deg} deg; give one between {lo:g} and "
+                f"vertical field of view {self.fov_y_deg} deg; give a value between {lo:g} and "
                 f"{hi:g} deg"
             )
         if not 0.0 <= self.height_std < 1.0:
             raise CameraError(
-                f"height_std is {self.height_std}; give a share of the height from 0 to below 1"
+                f"height_std is {self.height_std}; give a fraction of the height, at least 0 and "
+                "below 1"
             )
 
     @property
     def focal_px(self) -> float:
-        """Focal length in pixels along the rows' axis (fy); without a matrix that of both axes."""
+        """Vertical focal length fy in px; without a `matrix` fx has the same value."""
         if self.matrix is not None:
             return self.matrix[1]
         return self.height / 2 / tan(radians(self.fov_y_deg) / 2)
 
     @property
     def height_above_road_m(self) -> float:
-        """Of the camera, on a car that stands level."""
+        """Height of the camera above the road in m when the car is level."""
         return self.z + self.cg_height_m
 
     @property
     def is_plain(self) -> bool:
-        """Whether pictures are those of a pinhole with square pixels, centred, without roll and
-        yaw: a level road's horizon is a row."""
+        """Whether the camera is a centred pinhole with square pixels, roll 0 and yaw 0. The horizon
+        of a level road is then one row of pixels."""
         return (
             self.matrix is None
             and self.distortion == "none"
@@ -110,7 +112,7 @@ class CameraParameters:
 
     def intrinsics(self) -> "NDArray[np.float64]":
         """Pinhole matrix K (3, 3) in pixels."""
-        import numpy as np  # a command's help needs no numpy
+        import numpy as np  # imported here: `--help` of a command must not load numpy
 
         focal = self.focal_px
         centre = ((self.width - 1) / 2, (self.height - 1) / 2)
@@ -118,7 +120,7 @@ class CameraParameters:
         return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
     def rotation(self) -> "NDArray[np.float64]":
-        """From the car's frame to the camera's (3, 3)."""
+        """Rotation matrix (3, 3) from the car's frame to the camera's frame."""
         from trackfeatures.lens import mount_rotation
 
         return mount_rotation(
@@ -126,8 +128,8 @@ class CameraParameters:
         )
 
     def project(self, points: "ArrayLike") -> "NDArray[np.float64]":
-        """Pixels (N, 2) of points (N, 3) of the car's frame, m; NaN behind the camera and where
-        the lens model folds."""
+        """Pixels (N, 2) of points (N, 3) in the car's frame in m. NaN for points behind the camera
+        and for points beyond the angle at which the lens model folds."""
         import numpy as np
 
         from trackfeatures.lens import project
@@ -136,15 +138,15 @@ class CameraParameters:
         return project(self, away @ self.rotation().T)
 
     def rays(self, pixels: "ArrayLike") -> "NDArray[np.float64]":
-        """Directions (N, 3) in the camera's frame, z = 1, of pixels (N, 2); NaN where the lens
-        sees nothing."""
+        """Ray directions (N, 3) of pixels (N, 2) in the camera's frame, with z = 1. NaN where the
+        lens model maps no ray to the pixel."""
         from trackfeatures.lens import rays
 
         return rays(self, pixels)
 
     def road_points(self, pixels: "ArrayLike") -> "NDArray[np.float64]":
-        """Points (N, 2) of the flat road, x ahead and y left of the foot of the centre of gravity,
-        m, of pixels (N, 2); NaN at and above the horizon."""
+        """Points (N, 2) on the flat road of pixels (N, 2), in m: x ahead and y left of the point
+        below the centre of gravity. NaN for pixels on or above the horizon."""
         import numpy as np
 
         ahead, left, up = (self.rays(pixels) @ self.rotation()).T
@@ -153,8 +155,8 @@ class CameraParameters:
         return np.column_stack([self.x + far * ahead, self.y + far * left])
 
     def homography(self, other: "CameraParameters") -> "NDArray[np.float64]":
-        """From pixels of this camera to those of `other` (3, 3), from the same place, for lenses
-        without distortion: exact for any scene (Hartley and Zisserman 2004, section 8.4)."""
+        """Homography (3, 3) from pixels of this camera to pixels of `other`. Exact for any scene if
+        both are in the same place and have no distortion (Hartley and Zisserman 2004, 8.4)."""
         import numpy as np
 
         turn = other.rotation() @ self.rotation().T
@@ -162,11 +164,11 @@ class CameraParameters:
         return found
 
     def undistorted(self) -> "CameraParameters":
-        """The same camera with a lens without distortion."""
+        """The same camera with a distortion-free lens."""
         return replace(self, distortion="none", coefficients=())
 
     def resized(self, width: int, height: int) -> "CameraParameters":
-        """The camera of its pictures scaled to `width` x `height` px, also to another aspect."""
+        """The camera of the images scaled to `width` x `height` px; the aspect ratio may differ."""
         if self.matrix is None and width * self.height == height * self.width:
             return replace(self, width=width, height=height)
         x, y = width / self.width, height / self.height
@@ -176,7 +178,7 @@ class CameraParameters:
         return replace(self, width=width, height=height, matrix=matrix)
 
     def as_dict(self) -> dict[str, Any]:
-        """The fields by name, as they are written to files; see `stored`."""
+        """The fields by name as they are written to files; `stored` omits some defaults."""
         return asdict(self, dict_factory=stored)
 
     def __str__(self) -> str:
@@ -194,12 +196,13 @@ class CameraParameters:
 
 _NAMES = tuple(field.name for field in fields(CameraParameters))
 _LATER = {field.name: field.default for field in fields(CameraParameters)[7:]}
-"""Fields that older files do not have, with their defaults."""
+"""Fields that older files lack, with their defaults."""
 
 
 def stored(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """A `dict_factory` for `dataclasses.asdict`: leaves out those fields of a camera, at any depth,
-    that older files do not have and that are at their default, so that hashes stay the same."""
+    """A `dict_factory` for `dataclasses.asdict`: omits the fields of `_LATER` that have their
+    default value, in cameras at any depth. So the hash of a camera that older files can describe
+    does not change."""
     values = dict(pairs)
     if tuple(values) == _NAMES:
         return {k: v for k, v in values.items() if k not in _LATER or v != _LATER[k]}
@@ -207,7 +210,7 @@ def stored(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def _numbers(what: str, values: Any, counts: tuple[int, ...]) -> tuple[Any, ...]:
-    """`values` as finite floats, of one of these counts; else CameraError."""
+    """`values` as finite floats; raises CameraError if their number is not in `counts`."""
     listed = tuple(values) if isinstance(values, list | tuple) else None
     wanted = " or ".join(map(str, counts))
     if listed is None or len(listed) not in counts:

@@ -1,8 +1,8 @@
-"""Encodes features in metres and radians as the six values a network is trained on, and back.
+"""Encodes features in m and rad as the six training targets of the network, and decodes them.
 
 `y = 0.1 + 0.8 (x - lo) / (hi - lo)`, clipped to [0, 1]; the columns are those of `TARGETS`. An
-absent distance is NaN in metres, and the outer end of its range when coded; an unknown one is
-infinite in metres, and NaN when coded.
+absent distance is NaN in m and the outer end of its range when coded. An unknown distance is
+infinite in m and NaN when coded.
 """
 
 import math
@@ -22,13 +22,13 @@ from trackfeatures.definitions import (
 
 OFFSET, SPAN = 0.1, 0.8
 UNKNOWN_M: Final = math.inf
-"""In arrays of distances: a label that does not tell it. It has no loss and is not counted."""
+"""Marks an unlabelled distance; the loss and the metrics ignore it."""
 IN_LANE_WIDTH_LIMIT_M = 5.5
-"""Decoding: `ml` and `mr` are present when they are nearer to each other than this."""
+"""Decoding: `ml` and `mr` are present if `mr - ml` is below this limit."""
 ON_MARKING_LIMIT_M = 2.75
-"""Decoding: `m` is present below this."""
+"""Decoding: `m` is present if its value is below this limit."""
 NEIGHBOUR_LIMIT_M = 6.75
-"""Decoding: `l` and `r` are present beside a present `m` when nearer than this."""
+"""Decoding: `l` and `r` are present if `m` is present and their magnitude is below this limit."""
 
 _LO = np.array([RANGES[name].lo for name in TARGETS])
 _WIDTH = np.array([RANGES[name].hi - RANGES[name].lo for name in TARGETS])
@@ -39,7 +39,7 @@ _ML, _MR, _L, _M, _R, _ANGLE = range(len(TARGETS))
 def encode(distances: ArrayLike, angle: ArrayLike) -> NDArray[np.float32]:
     """Coded targets (N, 6) of distances (N, 5) in m, NaN where absent, and angles (N,) in rad.
 
-    A distance that is unknown (`UNKNOWN_M`) is NaN when coded.
+    An unknown distance (`UNKNOWN_M`) is coded as NaN.
     """
     metres = np.atleast_2d(np.asarray(distances, dtype=np.float64))
     present = np.where(np.isnan(metres), _INACTIVE, metres)
@@ -49,14 +49,14 @@ def encode(distances: ArrayLike, angle: ArrayLike) -> NDArray[np.float32]:
 
 
 def decode_values(coded: ArrayLike) -> NDArray[np.float64]:
-    """The values (N, 6) in m and rad of `coded` (N, 6), without a test for absent ones."""
+    """The values (N, 6) in m and rad of `coded` (N, 6); absent distances are not detected."""
     y = np.atleast_2d(np.asarray(coded, dtype=np.float64))
     values: NDArray[np.float64] = _LO + (y - OFFSET) / SPAN * _WIDTH
     return values
 
 
 def decode(coded: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Distances (N, 5) in m, NaN where absent, and angles (N,) in rad of `coded` (N, 6)."""
+    """Distances (N, 5) in m, NaN where absent, and angles (N,) in rad from `coded` (N, 6)."""
     values = decode_values(coded)
     distances = values[:, :_ANGLE].copy()
     in_lane = values[:, _MR] - values[:, _ML] < IN_LANE_WIDTH_LIMIT_M
@@ -69,14 +69,14 @@ def decode(coded: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 
 def encode_features(features: TrackFeatures) -> NDArray[np.float32]:
-    """Coded targets (6,) of one moment."""
+    """Coded targets (6,) of one set of features."""
     distances = [np.nan if d is None else d for d in features.distances.values()]
     coded: NDArray[np.float32] = encode([distances], [features.angle])[0]
     return coded
 
 
 def decode_features(coded: ArrayLike, heading: Heading) -> TrackFeatures:
-    """The features of coded values (6,) and a class."""
+    """The features decoded from `coded` (6,), with the class `heading`."""
     distances, angle = decode(coded)
     ml, mr, l, m, r = (None if np.isnan(d) else float(d) for d in distances[0])
     return TrackFeatures(ml, mr, l, m, r, float(angle[0]), heading)
@@ -86,7 +86,7 @@ def mirror_coded(coded: ArrayLike) -> NDArray[np.float32]:
     """The coded targets (N, 6) of the left-right mirrored scenes."""
     y = np.atleast_2d(np.asarray(coded, dtype=np.float64))
     swapped = 1.0 - y[:, [_MR, _ML, _R, _M, _L, _ANGLE]]
-    # The range of `m` is not symmetric about 0, and its inactive end stays where it is.
+    # The range of `m` is not symmetric about 0, and an absent `m` keeps its code at the upper end.
     m = decode_values(y)[:, _M]
     mirrored_m = np.where(m < ON_MARKING_LIMIT_M, -m, m)
     swapped[:, _M] = OFFSET + SPAN * (mirrored_m - _LO[_M]) / _WIDTH[_M]
@@ -94,7 +94,7 @@ def mirror_coded(coded: ArrayLike) -> NDArray[np.float32]:
 
 
 def mirror_heading(heading: ArrayLike) -> NDArray[np.int64]:
-    """The classes (N,) of the mirrored scenes: left and right change places."""
+    """The classes (N,) of the left-right mirrored scenes: LEFT and RIGHT are swapped."""
     classes = np.asarray(heading, dtype=np.int64)
     return np.where(classes == UNKNOWN_HEADING, classes, Heading.RIGHT - classes)
 

@@ -13,11 +13,11 @@ from types import MappingProxyType
 from typing import Final
 
 VERSION: Final = "2"
-"""Of these definitions; stored in every recording, model and answer."""
+"""Version of these definitions; stored in every recording, model and answer."""
 
 MARKINGS: Final = ("ml", "mr", "l", "m", "r")
 """In-lane system: `ml`, `mr`, the markings of the car's lane. On-marking system: `m`, the marking
-the car drives on, `l` and `r`, the next markings to the left and right of it."""
+that the car drives on; `l`, `r`, the next markings to the left and right of `m`."""
 
 TARGETS: Final = (*MARKINGS, "angle")
 """The six regression targets of a network, in the order of its outputs."""
@@ -27,20 +27,20 @@ LANE_WIDTH_M: Final = 4.0
 LANE_WIDTH_LIMITS_M: Final = (2.7, 4.5)
 
 IN_LANE_MARGIN_M: Final = 0.5
-"""The in-lane system is active at least this far from both markings of the lane."""
+"""The in-lane system is active if the car is at least this far from both markings of its lane."""
 ON_MARKING_REACH_M: Final = 1.2
-"""The on-marking system is active within this distance of a marking..."""
+"""The on-marking system is active within this distance of a marking."""
 OUTSIDE_REACH_M: Final = 2.0
-"""...and within this one on the outer side of an outermost marking."""
+"""Limit of the on-marking system on the outer side of an outermost marking."""
 
 BEND_CURVATURE: Final = 1.0 / 170.0
-"""1/m; a gentler bend counts as straight."""
+"""Smallest curvature of a bend in 1/m; a road of lower curvature counts as straight."""
 LOOK_AHEAD_M: Final = 20.0
-"""Where the road at the car is straight, the class is that of the road this far ahead."""
+"""If the road is straight at the car, its curvature this far ahead decides the class."""
 
 
 class Heading(IntEnum):
-    """The direction in which the track turns, the paper's third task."""
+    """The direction in which the road bends: the third task of the paper's network."""
 
     LEFT = 0
     STRAIGHT = 1
@@ -48,12 +48,12 @@ class Heading(IntEnum):
 
 
 UNKNOWN_HEADING: Final = -1
-"""In arrays of classes: a label that does not tell it. It has no loss and is not counted."""
+"""Marks an unlabelled class; the loss and the metrics ignore it."""
 
 
 @dataclass(frozen=True, slots=True)
 class Range:
-    """The values [lo, hi] of a network output, and the value that encodes "absent"."""
+    """The range [lo, hi] of a network output in m or rad, and the value that encodes "absent"."""
 
     lo: float
     hi: float
@@ -76,16 +76,16 @@ RANGES: Final = MappingProxyType(
 
 @dataclass(frozen=True, slots=True)
 class TrackFeatures:
-    """The track features of one moment."""
+    """The track features at one time."""
 
     ml: float | None
-    """Distances in m, negative on the left of the car; None where absent."""
+    """This and the next four: distances in m, negative left of the car; None if absent."""
     mr: float | None
     l: float | None
     m: float | None
     r: float | None
     angle: float
-    """rad, positive when the car points to the right of the track."""
+    """Heading angle in rad, positive when the car points to the right of the track."""
     heading: Heading
 
     @property
@@ -95,23 +95,23 @@ class TrackFeatures:
 
     @property
     def to_lane_centre(self) -> float | None:
-        """Offset from the centre of the lane the car is in or nearest to (m, left positive)."""
+        """Offset from the centre of the car's lane, or of the nearest lane (m, left positive)."""
         return lane_offset(self.ml, self.mr, self.l, self.m, self.r)
 
 
 def lane_offset(
     ml: float | None, mr: float | None, l: float | None, m: float | None, r: float | None
 ) -> float | None:
-    """Offset from the centre of the nearest lane (m, left positive); None where none is visible.
+    """Offset from the centre of the nearest lane (m, left positive); None if no lane is visible.
 
-    The in-lane pair comes first. Without it the lane lies on the car's side of the marking `m` it
-    drives on; outside the road it is the only lane beside that marking.
+    The pair `ml`, `mr` has priority. Without this pair, the lane on the car's side of the marking
+    `m` is used; outside the road, the only lane next to `m`.
     """
     if ml is not None and mr is not None:
         return (ml + mr) / 2
     if m is None:
         return None
-    # A marking on the car's left has the car's lane on its right, and vice versa.
+    # If the marking is left of the car (m <= 0), the car's lane is right of the marking.
     near, far = (r, l) if m <= 0 else (l, r)
     neighbour = near if near is not None else far
     return None if neighbour is None else (m + neighbour) / 2

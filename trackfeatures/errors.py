@@ -1,10 +1,10 @@
-"""Errors caused by the input, each reported in one line."""
+"""Errors that the user's input causes; commands report each in one line."""
 
 from trackfeatures.definitions import VERSION
 
 
 class UserError(Exception):
-    """A problem the user can fix; the message gives what was seen, expected, and what to do."""
+    """A problem that the user can fix; the message has the finding, the expectation, the remedy."""
 
 
 class DefinitionsMismatch(UserError):
@@ -15,7 +15,7 @@ def require_version(found: str, what: str) -> None:
     """Raise DefinitionsMismatch unless `what` was made with this version of the definitions."""
     if found != VERSION:
         raise DefinitionsMismatch(
-            f"{what} was made with version {found!r} of the track-feature definitions, this "
+            f"{what} was made with version {found!r} of the track-feature definitions, but this "
             f"program has version {VERSION!r}; make it again with this program, or use the program "
-            "it was made with"
+            "that made it"
         )

@@ -1,8 +1,8 @@
-"""Projection through a camera's lens and back, in its frame: x right, y down, z ahead.
+"""Projection through a lens and its inverse, in the camera's frame: x right, y down, z ahead.
 
-Distortion of OpenCV's pinhole model (k1, k2, p1, p2, k3 to k6: calib3d's documentation; Brown 1966)
-and of its fisheye model (k1 to k4 over the angle from the axis: Kannala and Brandt 2006). Both are
-used only up to the angle at which their radius stops growing: beyond it a lens model folds.
+Distortion is OpenCV's pinhole model (k1, k2, p1, p2, k3 to k6: calib3d's documentation; Brown 1966)
+or OpenCV's fisheye model (k1 to k4 over the angle from the axis: Kannala and Brandt 2006). Beyond
+the angle at which the distorted radius stops growing, a model folds; no ray is projected there.
 """
 
 from functools import lru_cache
@@ -16,16 +16,16 @@ if TYPE_CHECKING:
     from trackfeatures.camera import CameraParameters
 
 MAX_ANGLE_RAD = pi / 2 - 1e-3
-"""Between a ray and the axis: directions are written with z = 1."""
-TABLE = 4096  # angles of the table that inverts the radius
-STEPS = 8  # of Newton's method; from the table's value the error is below 1e-12 after three
-CONVERGED = 1e-10  # in units of the focal length
+"""Largest angle between a ray and the optical axis, since directions are scaled to z = 1."""
+TABLE = 4096  # number of angles in the table that inverts the radius
+STEPS = 8  # Newton steps at most; three from the table's value give an error below 1e-12
+CONVERGED = 1e-10  # error in units of the focal length
 
 Numbers = NDArray[np.float64]
 
 
 def mount_rotation(roll: float, pitch: float, yaw: float) -> Numbers:
-    """From the car's frame to that of a camera turned by Rz(yaw) Ry(pitch) Rx(roll), (3, 3)."""
+    """Rotation (3, 3) from the car's frame to a camera turned by Rz(yaw) Ry(pitch) Rx(roll)."""
     cr, sr, cp, sp, cy, sy = cos(roll), sin(roll), cos(pitch), sin(pitch), cos(yaw), sin(yaw)
     ahead = (cy * cp, sy * cp, -sp)
     left = (cy * sp * sr - sy * cr, sy * sp * sr + cy * cr, cp * sr)
@@ -34,7 +34,7 @@ def mount_rotation(roll: float, pitch: float, yaw: float) -> Numbers:
 
 
 def project(camera: "CameraParameters", points: Numbers) -> Numbers:
-    """Pixels (N, 2) of points (N, 3) in the camera's frame; NaN where the lens does not see."""
+    """Pixels (N, 2) of points (N, 3) in the camera's frame; NaN outside the lens model's range."""
     ahead = points[:, 2] > 1e-9
     flat = points[:, :2] / np.where(ahead, points[:, 2], np.nan)[:, None]
     if camera.distortion != "none":
@@ -48,7 +48,7 @@ def project(camera: "CameraParameters", points: Numbers) -> Numbers:
 
 
 def rays(camera: "CameraParameters", pixels: ArrayLike) -> Numbers:
-    """Directions (N, 3), z = 1, of pixels (N, 2); NaN where no ray of the lens arrives."""
+    """Directions (N, 3) of pixels (N, 2), with z = 1; NaN where the lens maps no ray to a pixel."""
     k = camera.intrinsics()
     flat = (np.asarray(pixels, dtype=np.float64).reshape(-1, 2) - k[:2, 2]) / (k[0, 0], k[1, 1])
     if camera.distortion != "none":
@@ -57,7 +57,7 @@ def rays(camera: "CameraParameters", pixels: ArrayLike) -> Numbers:
 
 
 def _undistort(camera: "CameraParameters", distorted: Numbers) -> Numbers:
-    """The points (N, 2), before distortion, on the plane z = 1; NaN where there are none."""
+    """Undistorted points (N, 2) on the plane z = 1; NaN where the distortion has no inverse."""
     kind, coefficients = camera.distortion, camera.coefficients
     angles, radii = _radius_table(kind, coefficients)
     radius = np.hypot(*distorted.T)
@@ -79,7 +79,7 @@ def _undistort(camera: "CameraParameters", distorted: Numbers) -> Numbers:
 
 
 def _distort(camera: "CameraParameters", flat: Numbers) -> tuple[Numbers, Numbers]:
-    """Points (N, 2) on the plane z = 1 after distortion, and the derivatives (2, 2, N)."""
+    """Distorted points (N, 2) of `flat` (N, 2) on the plane z = 1, and the Jacobian (2, 2, N)."""
     x, y = flat.T
     square = x * x + y * y
     p1 = p2 = 0.0
@@ -110,14 +110,14 @@ def _distort(camera: "CameraParameters", flat: Numbers) -> tuple[Numbers, Number
 
 
 def _fisheye_scale(square: Numbers, coefficients: tuple[float, ...]) -> tuple[Numbers, Numbers]:
-    """Radius in the image over r, and its derivative by r^2, at squared radii r^2 (N,)."""
+    """Distorted radius divided by r, and its derivative by r^2, for `square` = r^2 (N,)."""
     r = np.sqrt(square)
     small = r < 1e-4
     safe = np.where(small, 1.0, r)
     angle = np.arctan(safe)
     polynomial = _angle_polynomial(coefficients)
     radius, slope = np.polyval(polynomial, angle), np.polyval(np.polyder(polynomial), angle)
-    k1 = coefficients[0]  # tan's series: the radius is r + (k1 - 1/3) r^3
+    k1 = coefficients[0]  # near 0 the series of arctan gives the radius r + (k1 - 1/3) r^3
     scale = np.where(small, 1 + (k1 - 1 / 3) * square, radius / safe)
     by_square = (slope / (1 + safe * safe) - radius / safe) / (2 * safe * safe)
     return scale, np.where(small, k1 - 1 / 3, by_square)
@@ -128,19 +128,19 @@ def _padded(coefficients: tuple[float, ...]) -> tuple[float, ...]:
 
 
 def _rational(k: tuple[float, ...]) -> tuple[list[float], list[float]]:
-    """Polynomials of r^2, highest power first, above and below the line of OpenCV's model."""
+    """Numerator and denominator of OpenCV's model as polynomials of r^2, highest power first."""
     return [k[4], k[1], k[0], 1.0], [k[7], k[6], k[5], 1.0]
 
 
 def _angle_polynomial(coefficients: tuple[float, ...]) -> list[float]:
-    """The fisheye radius as a polynomial of the angle, highest power first."""
+    """The distorted fisheye radius as a polynomial of the angle, highest power first."""
     k1, k2, k3, k4 = coefficients
     return [k4, 0.0, k3, 0.0, k2, 0.0, k1, 0.0, 1.0, 0.0]
 
 
 @lru_cache(maxsize=64)
 def angle_limit(kind: str, coefficients: tuple[float, ...]) -> float:
-    """The angle from the axis, rad, up to which the distorted radius grows."""
+    """The angle from the optical axis in rad at which the distorted radius stops growing."""
     if kind == "fisheye":
         limits = _positive_roots(np.polyder(_angle_polynomial(coefficients)))
         return min([*limits, MAX_ANGLE_RAD])
@@ -160,7 +160,7 @@ def _positive_roots(polynomial: NDArray[np.floating[Any]]) -> list[float]:
 
 @lru_cache(maxsize=64)
 def _radius_table(kind: str, coefficients: tuple[float, ...]) -> tuple[Numbers, Numbers]:
-    """Angles from the axis (TABLE,), rad, up to the limit, and their distorted radii."""
+    """Angles from the axis (TABLE,) in rad up to `angle_limit`, and their distorted radii."""
     angles = np.linspace(0.0, angle_limit(kind, coefficients), TABLE)
     if kind == "fisheye":
         return angles, np.asarray(np.polyval(_angle_polynomial(coefficients), angles), np.float64)

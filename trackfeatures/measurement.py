@@ -1,6 +1,6 @@
 """Track features from the true pose of a car, and the lane offset from track features.
 
-SI units; `to_middle` is the distance from the centre line of the road, left positive.
+SI units. `to_middle` is the car's lateral distance from the centre line of the road, left positive.
 """
 
 import math
@@ -25,17 +25,18 @@ from trackfeatures.definitions import (
 from trackfeatures.errors import UserError
 
 LineOffsets = Sequence[tuple[float, float]]
-"""Of each marking, in m from its place, left positive: of the line that bounds the lane on its left
-and of the one that bounds the lane on its right."""
+"""For each marking two offsets from its nominal position in m, left positive: of the line that
+bounds the lane to its left, and of the line that bounds the lane to its right."""
 LEFT_LANE, RIGHT_LANE = range(2)
 _ONE_LINE: LineOffsets = ((0.0, 0.0),) * (max(LANES) + 1)
 
 
 class CentreLine(Protocol):
-    """The centre line of a closed track: m, rad counter-clockwise, 1/m left positive."""
+    """Centre line of a closed track. Lengths in m, angles in rad (counter-clockwise positive),
+    curvatures in 1/m (left positive)."""
 
     def project(self, x: float, y: float) -> tuple[float, float]:
-        """Arc length s and lateral distance `to_middle` of a point."""
+        """Arc length `s` and lateral distance `to_middle` of a point, both in m."""
         ...
 
     def heading(self, s: float) -> float: ...
@@ -44,7 +45,7 @@ class CentreLine(Protocol):
 
 
 def check_lanes(lanes: int, lane_width_m: float) -> None:
-    """Raise UserError unless the road is one that the definitions cover."""
+    """Raise UserError unless the definitions cover this number of lanes and lane width."""
     if lanes not in LANES:
         raise UserError(f"a road of {lanes} lanes is not supported; give 1, 2 or 3")
     lo, hi = LANE_WIDTH_LIMITS_M
@@ -58,18 +59,18 @@ def marking_offsets(lanes: int, lane_width_m: float) -> NDArray[np.float64]:
 
 
 def lane_index(to_middle: float, lanes: int, lane_width_m: float) -> int:
-    """Index of the lane the car is in or nearest to: 0 is the leftmost."""
+    """Index of the lane that the car is in, or that is nearest to it; 0 is the leftmost lane."""
     lane = math.floor(lanes / 2 - to_middle / lane_width_m)
     return min(max(lane, 0), lanes - 1)
 
 
 def lane_centre(index: int, lanes: int, lane_width_m: float) -> float:
-    """Lateral position of a lane's centre (m, left positive)."""
+    """Lateral position of the centre of lane `index` (m, left positive)."""
     return lane_width_m * (lanes / 2 - index - 0.5)
 
 
 def classify_heading(curvature: float, curvature_ahead: float) -> Heading:
-    """The class for `curvature` at the car and `curvature_ahead` 20 m further on (1/m)."""
+    """The class of a road with `curvature` at the car and `curvature_ahead` 20 m ahead (1/m)."""
     for kappa in (curvature, curvature_ahead):
         if abs(kappa) >= BEND_CURVATURE:
             return Heading.LEFT if kappa > 0 else Heading.RIGHT
@@ -77,7 +78,7 @@ def classify_heading(curvature: float, curvature_ahead: float) -> Heading:
 
 
 def wrap_angle(angle: float) -> float:
-    """The same angle in [-pi, pi) (rad)."""
+    """The equivalent angle in [-pi, pi) (rad)."""
     return (angle + math.pi) % (2 * math.pi) - math.pi
 
 
@@ -90,11 +91,10 @@ def measure(
     lane_width_m: float,
     line_offsets: LineOffsets = (),
 ) -> TrackFeatures:
-    """The features of a car `to_middle` m left of the centre of a road, heading `angle` (rad).
+    """The features of a car `to_middle` m left of the centre line, at `angle` (rad) to the road.
 
-    `line_offsets`: of each marking, where the lines lie that bound the lane on its left and on its
-    right, in m from the marking's place, left positive: of a double line the one nearer to a lane
-    counts. Without it every line lies at its marking's place.
+    `line_offsets` (see `LineOffsets`) is needed for double lines, where each adjacent lane is
+    bounded by its nearer line. Without it every line is at its marking's nominal position.
     """
     offsets = line_offsets or _ONE_LINE
     ml, mr = _in_lane(to_middle, lanes, lane_width_m, offsets)
@@ -106,7 +106,7 @@ def measure(
 def measure_pose(
     centre_line: CentreLine, x: float, y: float, yaw: float, lanes: int, lane_width_m: float
 ) -> TrackFeatures:
-    """The features of a car at (x, y) in m with `yaw` in rad, counter-clockwise."""
+    """The features of a car at (x, y) in m with `yaw` in rad (counter-clockwise positive)."""
     check_lanes(lanes, lane_width_m)
     s, to_middle = centre_line.project(x, y)
     angle = wrap_angle(centre_line.heading(s) - yaw)
@@ -128,11 +128,11 @@ def _in_lane(
 def _on_marking(
     to_middle: float, lanes: int, lane_width_m: float, offsets: LineOffsets
 ) -> tuple[float | None, float | None, float | None]:
-    # Markings are counted from the leftmost, 0, to the rightmost, `lanes`.
+    # Markings are numbered from 0 (leftmost) to `lanes` (rightmost).
     nearest = min(max(round(lanes / 2 - to_middle / lane_width_m), 0), lanes)
     place = to_middle - lane_width_m * (lanes / 2 - nearest)
     outside = (nearest == 0 and place > 0) or (nearest == lanes and place < 0)
-    # Outside the road the nearest lane is on the other side of the marking.
+    # Inside the road the car's lane is on the car's side of the marking; outside, on the far side.
     m = place - offsets[nearest][LEFT_LANE if (place > 0) != outside else RIGHT_LANE]
     if abs(m) > (OUTSIDE_REACH_M if outside else ON_MARKING_REACH_M):
         return None, None, None
@@ -142,7 +142,7 @@ def _on_marking(
 
 
 def localise(distances: ArrayLike) -> NDArray[np.float64]:
-    """`lane_offset` (N,) in m, NaN where none is visible, of distances (N, 5), NaN where absent."""
+    """`lane_offset` (N,) in m of distances (N, 5) in m; NaN: no visible lane, absent distance."""
     rows = np.atleast_2d(np.asarray(distances, dtype=np.float64)).tolist()
     present = ((None if math.isnan(d) else d for d in row) for row in rows)
     offsets = (lane_offset(*row) for row in present)

@@ -1,7 +1,7 @@
-"""Names that come from files, such as the id of a round: safe as a part of a path.
+"""Checks names read from files, for example a round's id, before they become part of a path.
 
-A dataset or a model may come from a stranger. A name read from it must never lead out of the
-folder in which a file of that name is written or deleted.
+A dataset or a model can come from an untrusted source. A name read from it must never lead outside
+the folder in which a file of this name is written or deleted.
 """
 
 import re
@@ -14,7 +14,7 @@ OTHER = re.compile(r"[^A-Za-z0-9._-]")
 
 
 class BadName(UserError, ValueError):
-    """A name with characters that no name may have."""
+    """A name with forbidden characters or of forbidden length."""
 
 
 def is_name(value: object) -> bool:
@@ -23,7 +23,7 @@ def is_name(value: object) -> bool:
 
 
 def require_name(value: object, what: str) -> str:
-    """`value`, if it is a name; else raises BadName. `what`: what the name is of, as "round id"."""
+    """Return `value` if it is a name, else raise BadName. `what` is for the message: "round id"."""
     if not is_name(value):
         raise BadName(
             f"the {what} is {str(value)[:80]!r}; expected a name of letters, digits, '.', '_' and "
@@ -33,6 +33,6 @@ def require_name(value: object, what: str) -> str:
 
 
 def to_name(text: str) -> str:
-    """`text` with `-` for every character that a name may not have."""
+    """`text` with `-` in place of every forbidden character, cut to `MAX_LENGTH`."""
     found = OTHER.sub("-", text)[:MAX_LENGTH]
     return found if is_name(found) else "unnamed"

@@ -1,1 +1,1 @@
-"""The HTTP API: endpoints, request options, schemas and problems."""
+"""The HTTP API: endpoints, request options, schemas, problems, and the web pages."""

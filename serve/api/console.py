@@ -1,7 +1,7 @@
 """Web pages of the service: the console at `/` and the API documentation (Swagger UI) at `/docs`.
 
-The files of Swagger UI come from the package fastapi-offline. No page loads anything from another
-site, and the content security policy allows no inline script.
+The files of Swagger UI come from the package fastapi-offline. The pages load nothing from other
+sites, and the content security policy forbids inline scripts.
 """
 
 import json
@@ -23,7 +23,7 @@ HEADERS = {
     "form-action 'none'; frame-ancestors 'none'",
     "X-Content-Type-Options": "nosniff",
     "Referrer-Policy": "no-referrer",
-    "Cache-Control": "no-cache",  # a browser revalidates after an update of the service
+    "Cache-Control": "no-cache",  # browsers revalidate, for updates of the service
 }
 
 
@@ -43,7 +43,7 @@ def add_console(app: FastAPI) -> None:
 
 
 def docs_page(app: FastAPI) -> str:
-    """The HTML of `/docs`. It contains the OpenAPI document, as /openapi.json may need a token."""
+    """The HTML of `/docs`. It includes the OpenAPI document: /openapi.json can require a token."""
     document = json.dumps(app.openapi()).replace("<", "\\u003c")
     return (FOLDER / "docs.html").read_text(encoding="utf-8").replace("{{openapi}}", document)
 

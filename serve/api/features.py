@@ -1,7 +1,7 @@
-"""POST /features: from the headers of a request to its reply. The JSON is in `serve.api.schemas`.
+"""POST /features, from the headers of a request to its reply; `serve.api.schemas` has the JSON.
 
-`serve.server.fast_path` creates a `FeaturesRequest` for each request; `FeaturesEndpoint` is the
-same as an ASGI application, for other servers. `FrameHandler` also serves the other endpoints.
+`serve.server.fast_path` creates a `FeaturesRequest` for each request. `FeaturesEndpoint` does the
+same as an ASGI application, for other servers. All endpoints for images use `FrameHandler`.
 """
 
 import asyncio
@@ -43,15 +43,15 @@ from serve.scheduling.fair_queue import Frame, FrameResult, PixelReader, ResultC
 from serve.scheduling.frame_queue import FrameQueue
 from serve.scheduling.streams import stream_key
 
-# An image of at most so many pixels, estimated to be decoded in so many ms, may be decoded on the
-# event loop; but not a JPEG file of more bytes: the estimate is one of its pixels.
+# Limits of pixels, estimated decoding time in ms and JPEG bytes for decoding on the event loop. The
+# estimate depends on a JPEG's pixels only, so its bytes need a limit.
 SMALL_PIXELS, SMALL_MS, SMALL_BYTES = 640 * 480, 12.0, LATE_CHECK_BYTES
 
 logger = logging.getLogger(__name__)
 
 
 class FrameHandler:
-    """What every endpoint does with a frame: queue it, count its result, log it."""
+    """The handling of a frame for all endpoints: queue it, count its result, log it."""
 
     def __init__(
         self,
@@ -70,7 +70,7 @@ class FrameHandler:
         self._log_answers = log_answers
 
     def share(self) -> BodyShare:
-        """What a new request holds of the budget of bodies: nothing yet."""
+        """The share of a new request in the budget for bodies, initially 0 bytes."""
         return BodyShare(self._bodies)
 
     def submit(
@@ -78,8 +78,7 @@ class FrameHandler:
     ) -> list[int] | None:
         """Queue the image file in `body`; `on_result` is called with its result or an error.
 
-        Returns the part of the image that the model sees, as `crop_px`. Raises Problem,
-        ImageError.
+        Returns `crop_px` of the answer. Raises Problem, ImageError.
         """
         self.queue.check_ready()
         if options.stream is None:
@@ -102,22 +101,23 @@ class FrameHandler:
         return sight.crop_px(header.width, header.height, camera)
 
     def sight(self, options: RequestOptions) -> Sight:
-        """How the image of a request is seen. Raises Problem for a camera that is not known."""
+        """The camera of a request's image. Raises Problem for an unknown camera."""
         name = options.camera
         if name is None:
             return Sight(options.fov_y_deg)
         if options.fov_y_deg is not None:
             seen = f"{CAMERA} and {FIELD_OF_VIEW} are both given"
-            raise Problem(INVALID_REQUEST, f"{seen}; the camera holds its field of view, send one")
+            raise Problem(INVALID_REQUEST, f"{seen}; the camera has a field of view, so send one")
         if name not in self.cameras:
             known = ", ".join(self.cameras) or "none (serve --camera NAME=FILE gives it one)"
             raise Problem(INVALID_REQUEST, f"{CAMERA} is {name[:80]!r}; the service knows {known}")
         return Sight(None, self.cameras[name])
 
     def refuse_early(self, headers: Headers, client: str) -> Reply | None:
-        """The refusal of a frame for which there is no room, by its headers; None: there is room.
+        """The refusal of a frame for which the queue has no room, else None.
 
-        An overloaded worker does no more for it than this. A frame of a stream may replace another.
+        It needs only the headers, so that an overloaded worker does little work. A frame of a
+        stream is not refused here, since it can replace a queued frame.
         """
         if b"x-stream-id" in headers:
             return None
@@ -131,21 +131,21 @@ class FrameHandler:
     async def predict_file(
         self, options: RequestOptions, body: bytes, client: str
     ) -> dict[str, Any]:
-        """The answer for an image file, as in `serve.api.schemas`. Raises Problem, ImageError."""
+        """The answer for an image file, a `schemas.Features`. Raises Problem, ImageError."""
         future: asyncio.Future[FrameResult] = asyncio.get_running_loop().create_future()
         crop = self.submit(options, body, client, partial(resolve, future))
         del body
         try:
             result = await future
         finally:
-            del future  # its error, whose traceback holds this frame, would be in a cycle
+            del future  # avoids a cycle: its error's traceback references this frame
         self.record_answer(options, client, result)
         return response_content(options, result, crop)
 
     async def predict_pixels(
         self, options: RequestOptions, client: str, read: PixelReader, read_ms: float
     ) -> FrameResult:
-        """The result for the pixels that `read` gives in about `read_ms`.
+        """The result for the pixels that `read` returns in about `read_ms`.
 
         Raises Problem, ImageError.
         """
@@ -156,19 +156,19 @@ class FrameHandler:
         try:
             result = await future
         finally:
-            del future  # as above
+            del future  # avoids a cycle, as in `predict_file`
         self.record_answer(options, client, result)
         return result
 
     def record_answer(self, options: RequestOptions, client: str, result: FrameResult) -> None:
-        """Count an answer, and log it where that is configured."""
+        """Count an answer, and log it if `log_answers` is set."""
         total_s = (time.monotonic_ns() - options.stamp_ns) / 1e9
         self._metrics.count_answer(result, total_s, self.queue.waiting)
         if self._log_answers:
             log_answer(options.request_id, client, 1e3 * total_s)
 
     def record_refusal(self, error: Problem | ImageError, request_id: str, client: str) -> Problem:
-        """Count and log an error; the problem to answer with."""
+        """Count and log an error; returns the problem for the reply."""
         forget_frames(error)
         problem = as_problem(error)
         self._count_refusal(problem, request_id, client)
@@ -180,8 +180,8 @@ class FrameHandler:
 
 
 def forget_frames(error: BaseException) -> None:
-    """Drop the tracebacks of an error and of those it came from: their frames may hold the body of
-    the request, and the error itself, which makes a cycle."""
+    """Drop the tracebacks of an error and of its causes: their frames can reference the body of the
+    request, and the error itself, which makes a cycle."""
     found: BaseException | None = error
     while found is not None:
         found.__traceback__ = None
@@ -191,8 +191,8 @@ def forget_frames(error: BaseException) -> None:
 class FeaturesRequest:
     """One request, from its headers to its reply: call `open`, then `submit` with its body.
 
-    `send` is called once, unless the client disconnects before its body is complete: then call
-    `abandon`.
+    `send` is called once with the reply. If the client disconnects before its body is complete,
+    call `abandon`; then `send` is not called.
     """
 
     __slots__ = ("_client", "_crop", "_frames", "_options", "_request_id", "_send", "_share")
@@ -204,21 +204,21 @@ class FeaturesRequest:
         self._share = frames.share()
 
     def grow(self, size: int) -> None:
-        """Hold `size` bytes more of the body. Raises Problem."""
+        """Reserve memory for `size` more bytes of the body. Raises Problem."""
         check_body_size(self._share.size + size)
         self._share.grow(size)
 
     def abandon(self) -> None:
-        """Give up: the client is gone."""
+        """Release the request's memory because the client has disconnected."""
         self._share.close()
 
     def open(self, headers: Headers) -> bool:
-        """Check the headers; False: the request was refused, its body is not needed."""
+        """Check the headers; returns False after a refusal, when the body is not needed."""
         stamp_ns = time.monotonic_ns()
         self._request_id = request_id_of(headers)
         try:
             if b"x-stream-id" not in headers:
-                # An overloaded worker reads no bodies.
+                # An overloaded worker must not read bodies.
                 self._frames.queue.check_capacity(self._client)
             self._options = parse_options(headers, stamp_ns, self._request_id)
             check_image_headers(headers)
@@ -267,7 +267,7 @@ class FeaturesRequest:
 
 
 RequestFactory = Callable[[FrameHandler, str, Callable[[Reply], None]], FeaturesRequest]
-"""Makes a request from the handler, the client's address and the function that sends the reply."""
+"""Makes a request from its handler, the client's address and the function that sends the reply."""
 
 
 class FeaturesEndpoint:
@@ -303,7 +303,7 @@ class FeaturesEndpoint:
 
 
 def resolve(future: "asyncio.Future[Any]", result: Any) -> None:
-    """Set a future's result or exception; ignored when the future was cancelled."""
+    """Set a future's result or exception; no effect if the future was cancelled."""
     if future.done():
         return
     if isinstance(result, Exception):
@@ -327,7 +327,7 @@ def _frame(
 
 
 def client_address(scope: Scope) -> str:
-    """The client's address, empty where it is unknown."""
+    """The client's address; empty if it is unknown."""
     client = scope.get("client")
     return client[0] if client else ""
 
@@ -335,7 +335,7 @@ def client_address(scope: Scope) -> str:
 def response_content(
     options: RequestOptions, result: FrameResult, crop: list[int] | None
 ) -> dict[str, Any]:
-    """The answer. Not validated against the schema here, for speed; the tests validate it."""
+    """The answer. For speed it is not validated against the schema here; the tests do that."""
     return {
         **result.prediction.as_json(),
         **result.provenance,

@@ -1,4 +1,4 @@
-"""Reading the body of a request within the size limit, and writing a whole reply."""
+"""Reads the body of a request within the size limit, and writes a complete reply."""
 
 from collections.abc import Awaitable, Callable, MutableMapping
 from functools import lru_cache
@@ -21,7 +21,7 @@ STATUS_LINES: dict[int, bytes] = {
     status: f"HTTP/1.1 {status} {status.phrase}\r\n".encode() for status in HTTPStatus
 }
 PROBLEM_HEADER: Header = (b"content-type", MEDIA_TYPE.encode())
-CACHED_PROBLEMS = 128  # encoded problems that are kept
+CACHED_PROBLEMS = 128  # number of encoded problems in the cache
 _format_header = b"%b: %b\r\n".__mod__
 _encode_json = msgspec.json.Encoder().encode
 
@@ -39,9 +39,9 @@ class ClientDisconnectedError(Exception):
 
 
 async def read_body(receive: Receive, grow: Callable[[int], None]) -> bytes:
-    """The whole body; `grow` is called with the size of each part.
+    """The complete body; `grow` is called with the size of each part in bytes.
 
-    Raises Problem when it is too large, ClientDisconnectedError, and what `grow` raises.
+    Raises Problem if the body is too large, ClientDisconnectedError, and the errors of `grow`.
     """
     body, more = bytearray(), True
     while more:
@@ -57,20 +57,20 @@ async def read_body(receive: Receive, grow: Callable[[int], None]) -> bytes:
 
 
 def check_body_size(size: int) -> None:
-    """Raise Problem when a body of `size` bytes is too large."""
+    """Raise Problem if a body of `size` bytes is too large."""
     if size > MAX_BODY_BYTES:
         raise body_too_large(f"more than {MAX_BODY_BYTES} bytes")
 
 
 async def send_reply(send: Send, reply: Reply, protocol: str = "http") -> None:
-    """Send a reply over ASGI; `protocol` "websocket.http": as the refusal of a handshake."""
+    """Send a reply over ASGI; with `protocol` "websocket.http" it refuses a handshake."""
     headers = [*reply.headers, (b"content-length", b"%d" % len(reply.body))]
     await send({"type": f"{protocol}.response.start", "status": reply.status, "headers": headers})
     await send({"type": f"{protocol}.response.body", "body": reply.body})
 
 
 def without_body(send: Send) -> Send:
-    """`send` for the answer to HEAD: the headers of GET, which name its length, and no body."""
+    """`send` for answers to HEAD: the headers of GET, including Content-Length, without a body."""
 
     async def send_head(message: Message) -> None:
         await send({**message, "body": b""} if "body" in message else message)
@@ -79,7 +79,7 @@ def without_body(send: Send) -> Send:
 
 
 def problem_reply(problem: Problem, *headers: Header, path: str = "") -> Reply:
-    """The reply for a problem of a request for `path`."""
+    """The reply with the problem of a request for `path`, with additional `headers`."""
     fields = (problem.type, problem.detail, problem.retry_after_ms)
     own_headers, body = _encode_problem(*fields, path[:4])
     return Reply(problem.type.status, [*own_headers, *headers], body)
@@ -89,14 +89,14 @@ def problem_reply(problem: Problem, *headers: Header, path: str = "") -> Reply:
 def _encode_problem(
     problem_type: ProblemType, detail: str, retry_after_ms: int | None, path: str
 ) -> tuple[list[Header], bytes]:
-    """The headers and the body of a problem; an overloaded service repeats a few of them."""
+    """The headers and body of a problem. Cached: an overloaded service repeats a few problems."""
     problem = Problem(problem_type, detail, retry_after_ms)
     headers = [(k.lower().encode(), v.encode()) for k, v in problem.headers.items()]
     return [PROBLEM_HEADER, *headers], _encode_json(with_error(problem.content, path))
 
 
 def encode_head(reply: Reply, *extra: Header) -> bytes:
-    """The bytes of a reply before its body, in HTTP/1.1."""
+    """The bytes of a reply's status line and headers in HTTP/1.1; `extra` headers come first."""
     return b"%b%b%bcontent-length: %d\r\n\r\n" % (
         STATUS_LINES[reply.status],
         b"".join(map(_format_header, extra)),

@@ -1,10 +1,10 @@
 """The Open Inference Protocol v2 over HTTP, for clients of Triton and KServe: the model `track`.
 
 Inputs: `image` (BYTES [1, 1], the bytes of a JPEG or PNG file) or `pixels` (UINT8 [1, height,
-width, 3], RGB). Outputs, float32: `distances_m` (1, 5) in the order ml, mr, l, m, r, NaN where
-absent; `std` in the order of `mtlnet.inference.uncertainty`; `out_of_distribution` 0 or 1;
-`absent` in the order of the distances; the others as in POST /features. The options of an image are
-those of POST /features: headers, the query, or `parameters` of the request.
+width, 3], RGB). Outputs, float32: `distances_m` (1, 5) in the order ml, mr, l, m, r, NaN if absent;
+`std` in the order of `mtlnet.inference.uncertainty`; `out_of_distribution` 0 or 1; `absent` in the
+order of the distances; `to_lane_centre_m`, `angle_rad` and `heading` as in POST /features. The
+options of an image are those of POST /features, in headers, in the query, or in `parameters`.
 """
 
 import asyncio
@@ -71,7 +71,7 @@ OUTPUTS = {
     "out_of_distribution": 1,
     "absent": len(tf.MARKINGS),
 }
-# The OpenAPI operation of an inference request, without the headers of every image.
+# The OpenAPI operation of an inference request, without the header parameters of an image.
 OPERATION: dict[str, Any] = json.loads(
     Path(__file__).with_name("kserve_infer.json").read_text(encoding="utf-8")
 )
@@ -101,7 +101,7 @@ def add_kserve(app: FastAPI, frames: FrameHandler) -> None:
         frames.queue.check_ready()
         return {"name": NAME, "ready": True}
 
-    @app.get("/v2", summary="The service, as the Open Inference Protocol describes it")
+    @app.get("/v2", summary="Name, version and extensions of the service (Open Inference Protocol)")
     async def server() -> dict[str, Any]:
         extensions = ["binary_tensor_data"]
         return {"name": "driverview", "version": version("driverview"), "extensions": extensions}
@@ -132,7 +132,7 @@ def _metadata(frames: FrameHandler) -> Any:
 
 
 def _infer(frames: FrameHandler) -> Any:
-    one_large = FairLock()  # of the large JSON parts is parsed at a time: others have turns
+    one_large = FairLock()  # one large JSON part is parsed at a time; clients take turns
 
     async def infer(request: Request) -> Response:
         stamp_ns = time.monotonic_ns()
@@ -181,7 +181,7 @@ async def _answer(
             if more:
                 headers = merge_options(headers, more, "parameters")
                 options = parse_options(headers, stamp_ns, request_id, KSERVE_FORMATS)
-            share.grow(len(infer_request.input.data))  # a copy, until it is decoded
+            share.grow(len(infer_request.input.data))  # a copy; freed after decoding
             read, read_ms = await _pixel_reader(
                 infer_request, binary, frames, frames.sight(options)
             )
@@ -207,7 +207,7 @@ async def _answer(
 async def _pixel_reader(
     request: InferRequest, binary: memoryview, frames: FrameHandler, sight: Sight
 ) -> tuple[PixelReader, float]:
-    """The reader of the pixels of the input, and an estimate of its time, ms.
+    """A function that reads the input's pixels, and the estimate of its time in ms.
 
     Raises Problem, ImageError.
     """
@@ -215,10 +215,10 @@ async def _pixel_reader(
     if tensor.name not in ("image", "pixels"):
         raise invalid_request("expected one input, named image or pixels")
     if len({output.name for output in request.outputs}) < len(request.outputs):
-        raise invalid_request("an output is asked for twice; name each once")
+        raise invalid_request("an output is requested twice; request each output once")
     unknown = next((o.name for o in request.outputs if o.name not in OUTPUTS), None)
     if unknown is not None:
-        raise invalid_request(f"unknown output {unknown[:80]!r}; there are {', '.join(OUTPUTS)}")
+        raise invalid_request(f"unknown output {unknown[:80]!r}; known are {', '.join(OUTPUTS)}")
     camera = frames.queue.loaded.engine.card.camera
     if tensor.name == "image":
         body = await read_image_bytes(tensor, binary)
@@ -232,7 +232,7 @@ async def _pixel_reader(
 
 
 def _tensors(prediction: Prediction) -> dict[str, NDArray[np.float32]]:
-    """The outputs by name, each (1, n)."""
+    """The output tensors by name, each (1, n)."""
     rows: dict[str, list[float | None]] = {
         "distances_m": [prediction.distances_m[name] for name in tf.MARKINGS],
         "to_lane_centre_m": [prediction.to_lane_centre_m],

@@ -1,8 +1,8 @@
-"""Encoding of tensors in the Open Inference Protocol v2: JSON or raw binary.
+"""Reads and writes tensors of the Open Inference Protocol v2, in JSON or raw binary.
 
-Source: Open Inference Protocol, REST, and its binary tensor data extension: a JSON header of
-`Inference-Header-Content-Length` bytes is followed by the tensors that have `binary_data_size`, in
-order, little-endian, row-major; each element of BYTES is preceded by its length as a 4-byte number.
+Source: Open Inference Protocol, REST, and its binary tensor data extension. A JSON part of
+`Inference-Header-Content-Length` bytes is followed by the tensors with a `binary_data_size`, in
+order, little-endian, row-major. A 4-byte length precedes each element of a BYTES tensor.
 """
 
 import asyncio
@@ -20,18 +20,18 @@ from serve.api.problems import INVALID_REQUEST, Problem
 from serve.api.request_options import OPTIONS, check_names, parse_json_object
 
 MAX_DEPTH = 4
-MAX_VALUES = 1_300_000  # and lists, in JSON: 640 x 480 px; each takes some 10 ns of the event loop
-MAX_SMALL_BYTES = 4096  # of what is not the tensor itself, in JSON
-WINDOW_BYTES = 1 << 16  # of JSON or base64, decoded at once; others may run in between
+MAX_VALUES = 1_300_000  # JSON values and lists: 640 x 480 px; each blocks the event loop for 10 ns
+MAX_SMALL_BYTES = 4096  # JSON size of shape, outputs and parameters
+WINDOW_BYTES = 1 << 16  # JSON or base64 decoded in one piece; other tasks can run in between
 SIZE, BINARY, ALL_BINARY = "binary_data_size", "binary_data", "binary_data_output"
-# The parameters of an input, of an output and of a request; OPTIONS are those of every image.
+# Known parameters of an input, of an output and of a request; OPTIONS are the options of an image.
 INPUT_PARAMETERS, OUTPUT_PARAMETERS = {SIZE: "int"}, {BINARY: "bool"}
 REQUEST_PARAMETERS = {ALL_BINARY: "bool", **OPTIONS}
-PAUSE_S = 0.001  # between windows: without it, the engine's thread waits for the interpreter's lock
-COUNT_BYTES = 1 << 18  # of JSON whose values are counted at once, in little memory
-JSON_MS_PER_BYTE = 1e-4  # to decode pixels in JSON
-PIXEL_MS = 1e-6  # to crop and scale
-MAX_SIDE = 1 << 31  # of a shape; a larger number may not fit into a float
+PAUSE_S = 0.001  # pause between windows; without it the engine's thread waits for the GIL
+COUNT_BYTES = 1 << 18  # JSON whose values are counted in one step, which bounds the memory
+JSON_MS_PER_BYTE = 1e-4  # time to decode a byte of pixels in JSON
+PIXEL_MS = 1e-6  # time to crop and scale a pixel
+MAX_SIDE = 1 << 31  # limit for the numbers of a shape; much larger ones do not fit into a float
 COMMA, BRACKET = b",["
 MAX_LENGTH_DIGITS = 20
 NULL = memoryview(b"null")
@@ -40,7 +40,7 @@ T = TypeVar("T")
 
 
 class _Misplaced(msgspec.Struct, kw_only=True):
-    """Options beside `parameters` instead of in it; empty where there are none."""
+    """Options placed next to `parameters` instead of in it; absent ones are empty."""
 
     frame_id: msgspec.Raw = msgspec.Raw()
     stream_id: msgspec.Raw = msgspec.Raw()
@@ -50,12 +50,12 @@ class _Misplaced(msgspec.Struct, kw_only=True):
     binary_data_output: msgspec.Raw = msgspec.Raw()
 
     def check(self) -> None:
-        """Raise Problem if there is one: it would be ignored."""
+        """Raise Problem for a misplaced option, which would otherwise be ignored."""
         for name in self.__struct_fields__:
             value = getattr(self, name)
             if name in REQUEST_PARAMETERS and len(memoryview(value)):
                 raise invalid_request(
-                    f"{name} is not a member of its own; put it into the parameters of the request"
+                    f"{name} is at the wrong place; put it into the parameters of the request"
                 )
 
 
@@ -67,7 +67,7 @@ class RequestedOutput(msgspec.Struct):
 
 
 class Tensor(msgspec.Struct):
-    """An input tensor; `data` is JSON, or empty."""
+    """An input tensor; `data` is JSON text, or empty for a binary tensor."""
 
     name: str
     shape: list[int]
@@ -85,7 +85,7 @@ class InferRequest(msgspec.Struct):
     parameters: dict[str, Any] = {}
 
 
-# What is sent is split first, which makes no objects: a list of 4 MB can become 40 MB of them.
+# The raw structs split a request without decoding it: the objects of a 4 MB list can need 40 MB.
 
 
 class _RawTensor(_Misplaced):
@@ -104,7 +104,7 @@ class _RawRequest(_Misplaced):
 
 
 def read_json_length(body: bytes, header: bytes | None) -> int:
-    """How many bytes of a body are its JSON part. Raises Problem."""
+    """The size of the JSON part of a body in bytes. Raises Problem."""
     if header is None:
         return len(body)
     usable = header.isdigit() and len(header) <= MAX_LENGTH_DIGITS
@@ -114,14 +114,15 @@ def read_json_length(body: bytes, header: bytes | None) -> int:
 
 
 def parse_request(body: bytes, length: int) -> tuple[InferRequest, memoryview]:
-    """(the JSON part of `length` bytes, the binary part) of a request. Raises Problem."""
+    """The decoded JSON part (the first `length` bytes) and the binary part of a request.
+    Raises Problem."""
     text, values = np.frombuffer(body, np.uint8, length), 0
     for start in range(0, length, COUNT_BYTES):
         part = text[start : start + COUNT_BYTES]
         values += int(np.count_nonzero(part == COMMA) + np.count_nonzero(part == BRACKET))
     if values > MAX_VALUES:
         raise invalid_request(
-            f"the JSON part has {values} values and lists, at most {MAX_VALUES} are accepted; send "
+            f"the JSON part has {values} values and lists; at most {MAX_VALUES} are accepted: send "
             "the tensor as binary data"
         )
     try:
@@ -132,7 +133,7 @@ def parse_request(body: bytes, length: int) -> tuple[InferRequest, memoryview]:
 
 
 def _parse_json(text: memoryview) -> InferRequest:
-    """Raises Problem, msgspec.DecodeError, RecursionError."""
+    """The request in JSON. Raises Problem, msgspec.DecodeError, RecursionError."""
     raw = msgspec.json.decode(text, type=_RawRequest)
     (tensor,) = raw.inputs
     raw.check()
@@ -162,7 +163,7 @@ def _outputs(raw: msgspec.Raw) -> list[RequestedOutput]:
 
 
 def _parameters(raw: msgspec.Raw, known: dict[str, str], where: str) -> dict[str, Any]:
-    """The parameters in `where`. Raises Problem, also for one that is not `known`."""
+    """The parameters in `where`. Raises Problem, also for a parameter that is not `known`."""
     if len(memoryview(raw)) > MAX_SMALL_BYTES:
         raise _too_large()
     found = parse_json_object(bytes(raw), where)
@@ -179,31 +180,28 @@ def _check_flag(parameters: dict[str, Any], name: str, where: str) -> None:
 
 
 def take_options(request: InferRequest) -> dict[str, Any]:
-    """The options of the image among the parameters of a request."""
+    """The image's options among the parameters of a request."""
     return {name: value for name, value in request.parameters.items() if name in OPTIONS}
 
 
 def _too_large() -> Problem:
     return invalid_request(
-        f"a shape, the outputs or the parameters have over {MAX_SMALL_BYTES} bytes; send fewer"
+        f"a shape, the outputs or the parameters exceed {MAX_SMALL_BYTES} bytes; send fewer"
     )
 
 
 def _small(raw: msgspec.Raw, kind: type[T]) -> T:
-    """A part of a request that is never large. Raises Problem, msgspec.DecodeError."""
+    """Decode a part of a request of at most MAX_SMALL_BYTES. Raises Problem, DecodeError."""
     if len(memoryview(raw)) > MAX_SMALL_BYTES:
         raise _too_large()
     return msgspec.json.decode(raw, type=kind)
 
 
 async def read_image_bytes(tensor: Tensor, binary: memoryview) -> bytes:
-    """The file in a BYTES tensor of one element; in JSON it is base64.
-
-    Raises Problem.
-    """
+    """The image file in a BYTES tensor with one element (base64 in JSON). Raises Problem."""
     if tensor.datatype != "BYTES" or tensor.shape not in ([1], [1, 1]):
         raise invalid_request(
-            f"{tensor.name} is {tensor.datatype[:20]} {tensor.shape[:8]}; it takes BYTES [1, 1]"
+            f"{tensor.name} is {tensor.datatype[:20]} {tensor.shape[:8]}; it must be BYTES [1, 1]"
         )
     raw = _binary(tensor, binary)
     if raw is not None:
@@ -214,9 +212,9 @@ async def read_image_bytes(tensor: Tensor, binary: memoryview) -> bytes:
 
 
 async def _read_base64(tensor: Tensor) -> bytes:
-    """The bytes in a string, which may be in lists. Raises Problem.
+    """The decoded base64 string, which can be nested in lists. Raises Problem.
 
-    Decoded in windows, between which others run.
+    It is decoded in windows; other tasks run between them.
     """
     data, start = tensor.data, tensor.data.find(b'"')
     end = data.rfind(b'"') + 1
@@ -229,7 +227,7 @@ async def _read_base64(tensor: Tensor) -> bytes:
     try:
         if data.find(b"\\", start) >= 0:
             if len(text) > WINDOW_BYTES:
-                await asyncio.sleep(PAUSE_S)  # to read the escapes of 4 MiB takes 10 ms
+                await asyncio.sleep(PAUSE_S)  # decoding the escapes of 4 MiB takes 10 ms
             text = memoryview(msgspec.json.decode(data[start:end], type=str).encode())
         for window in range(0, len(text), WINDOW_BYTES):
             if window:
@@ -239,28 +237,28 @@ async def _read_base64(tensor: Tensor) -> bytes:
     except (msgspec.DecodeError, ValueError) as error:  # binascii.Error is a ValueError
         raise invalid_request(f"{tensor.name} is not base64: {error}") from error
     if any(len(part) < WINDOW_BYTES // 4 * 3 for part in parts[:-1]):
-        raise invalid_request(f"{tensor.name} is not base64: it goes on after its padding")
+        raise invalid_request(f"{tensor.name} is not base64: characters follow its padding")
     return b"".join(parts)
 
 
 @dataclass(frozen=True, slots=True)
 class Pixels:
-    """A UINT8 tensor of a request, not yet decoded. `read_ms`: an estimate of the time for that."""
+    """A UINT8 tensor of a request before decoding; `read_ms` is the estimated decoding time."""
 
     height: int
     width: int
     read_ms: float
     read: Callable[[], NDArray[np.uint8]]
-    """The tensor as (height, width, 3). Raises Problem."""
+    """Returns the tensor as (height, width, 3) uint8 RGB. Raises Problem."""
 
 
 def find_pixels(tensor: Tensor, binary: memoryview) -> Pixels:
-    """The UINT8 tensor in a request; a leading 1 of its shape is removed. Raises Problem."""
+    """The UINT8 tensor of a request, without a leading 1 of its shape. Raises Problem."""
     shape = tensor.shape[1:] if len(tensor.shape) == 4 and tensor.shape[0] == 1 else tensor.shape
     usable = len(shape) == 3 and shape[2] == 3 and min(shape) > 0 and max(shape) < MAX_SIDE
     if tensor.datatype != "UINT8" or not usable:
         raise invalid_request(
-            f"{tensor.name} is {tensor.datatype[:20]} {tensor.shape[:8]}; it takes UINT8 "
+            f"{tensor.name} is {tensor.datatype[:20]} {tensor.shape[:8]}; it must be UINT8 "
             "[1, height, width, 3]"
         )
     raw = _binary(tensor, binary)
@@ -281,15 +279,15 @@ def _shaped(
 ) -> NDArray[np.uint8]:
     if len(values) != prod(shape):
         raise invalid_request(
-            f"{tensor.name} has {len(values)} values, its shape needs {prod(shape)}"
+            f"{tensor.name} has {len(values)} values, but its shape requires {prod(shape)}"
         )
     return np.frombuffer(values, np.uint8).reshape(shape)
 
 
 def _read_json(name: str, text: bytes) -> bytearray:
-    """The integers in nested lists, in order. Raises Problem.
+    """The integers of nested lists, flattened. Raises Problem.
 
-    Decoded in windows, so that the event loop does not wait for a long list.
+    Decoded in windows: msgspec holds the GIL, and a long list would delay the event loop.
     """
     flat = text.translate(None, b"[]" + BLANKS)
     values, start = bytearray(), 0
@@ -322,14 +320,15 @@ def _binary(tensor: Tensor, binary: memoryview) -> memoryview | None:
 def encode_response(
     head: dict[str, Any], tensors: dict[str, NDArray[np.float32]], request: InferRequest
 ) -> tuple[bytes, int | None]:
-    """(body of the answer, length of its JSON part or None where all is JSON). Raises Problem."""
+    """The body of the answer, and the size of its JSON part in bytes (None if all of it is JSON).
+    Raises Problem."""
     requested = request.outputs or [RequestedOutput(name) for name in tensors]
     default = request.parameters.get(ALL_BINARY, False)
     outputs, parts = [], []
     for output_request in requested:
         if output_request.name not in tensors:
             raise invalid_request(
-                f"unknown output {output_request.name[:80]!r}; there are {', '.join(tensors)}"
+                f"unknown output {output_request.name[:80]!r}; known are {', '.join(tensors)}"
             )
         values = tensors[output_request.name]
         output: dict[str, Any] = {
@@ -341,7 +340,7 @@ def encode_response(
             parts.append(values.astype("<f4").tobytes())
             output["parameters"] = {SIZE: len(parts[-1])}
         else:
-            output["data"] = values.ravel().tolist()  # NaN, for absent, becomes null
+            output["data"] = values.ravel().tolist()  # NaN (absent) becomes null
         outputs.append(output)
     content = msgspec.json.encode({**head, "outputs": outputs})
     return content + b"".join(parts), len(content) if parts else None

@@ -1,4 +1,4 @@
-"""Handlers that turn every error of the FastAPI application into a problem."""
+"""Exception handlers that turn every error of the FastAPI application into a problem."""
 
 import http
 import json
@@ -24,7 +24,7 @@ from serve.api.problems import (
 
 
 def install_problem_handlers(app: FastAPI) -> None:
-    """Answer every error that leaves `app`, also those of the framework, with a problem."""
+    """Answer every error raised in `app` with a problem, including the framework's errors."""
     app.add_exception_handler(Problem, _on_expected)
     app.add_exception_handler(ImageError, _on_expected)
     app.add_exception_handler(HTTPException, _on_http_exception)
@@ -60,7 +60,7 @@ def _on_http_exception(request: Request, error: Exception) -> Response:
         if "GET" in allowed:
             allowed.add("HEAD")
         methods = headers["Allow"] = ", ".join(sorted(allowed))
-        detail = f"{path} takes {methods}, not {request.method}; see /docs"
+        detail = f"{path} accepts {methods}, not {request.method}; see /docs"
         return _response(request, Problem(METHOD_NOT_ALLOWED, detail), headers)
     title = http.HTTPStatus(error.status_code).phrase
     content = members("about:blank", title, error.status_code, str(error.detail))
@@ -74,5 +74,5 @@ def _on_validation_error(request: Request, error: Exception) -> Response:
 
 
 def _on_unexpected(request: Request, _error: Exception) -> Response:
-    # The server logs the error, and closes the connection after it.
+    # The server logs the error and then closes the connection.
     return _response(request, internal_error(), {"Connection": "close"})

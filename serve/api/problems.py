@@ -1,7 +1,7 @@
-"""Error answers of the service: RFC 9457 problems, each with a stable type.
+"""Error answers of the service: RFC 9457 problems.
 
-`type` never changes; `detail` says what was seen, what was expected and what to do. Below /v2 a
-problem has the member `error` too, which the Open Inference Protocol requires.
+The `type` of a problem never changes; `detail` has what was seen, what was expected, and what to
+do. Below /v2 a problem also has the member `error`, which the Open Inference Protocol requires.
 """
 
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from trackfeatures.errors import UserError
 MEDIA_TYPE = "application/problem+json"
 
 
-@dataclass(frozen=True, slots=True, eq=False)  # each is the only one of its kind
+@dataclass(frozen=True, slots=True, eq=False)  # compared by identity
 class ProblemType:
     """A type of problem: its name in the type URI, its HTTP status, its title."""
 
@@ -35,10 +35,10 @@ FORBIDDEN_ORIGIN = ProblemType(
     "forbidden-origin", 403, "Pages of other sites may not use this service"
 )
 FORBIDDEN_HOST = ProblemType(
-    "forbidden-host", 403, "Without a token this service answers to its own names only"
+    "forbidden-host", 403, "Without a token only the service's own host names are accepted"
 )
 NOT_FOUND = ProblemType("not-found", 404, "There is nothing at this path")
-METHOD_NOT_ALLOWED = ProblemType("method-not-allowed", 405, "This path does not take this method")
+METHOD_NOT_ALLOWED = ProblemType("method-not-allowed", 405, "This path does not accept this method")
 NOT_ACCEPTABLE = ProblemType(
     "not-acceptable", 406, "The answer is not available in the accepted types"
 )
@@ -70,7 +70,7 @@ DEADLINE_PASSED = ProblemType(
     "deadline-passed", 503, "The deadline passed before the frame was processed"
 )
 
-# In the order of the definitions above, which is also that of the counters in shared memory.
+# In the order of the definitions above. The counters in shared memory have the same order.
 PROBLEM_TYPES = tuple(found for found in vars().values() if isinstance(found, ProblemType))
 IMAGE_PROBLEMS = {
     Fault.NOT_AN_IMAGE: NOT_AN_IMAGE,
@@ -81,18 +81,18 @@ IMAGE_PROBLEMS = {
     Fault.FIELD_OF_VIEW: FIELD_OF_VIEW,
     Fault.TRAILING: TRAILING_BYTES,
 }
-# Added to the image decoder's message: what a client of this service can do.
+# Advice for clients of this service, appended to the image decoder's message.
 HINTS = {
     NOT_AN_IMAGE: "; post the bytes of the file itself",
-    IMAGE_SIZE: " (GET /model)",
-    IMAGE_ASPECT: " (GET /model gives its mounting)",
-    FIELD_OF_VIEW: " (GET /model gives the mounting of the model's camera)",
+    IMAGE_SIZE: " (GET /model has the model's camera)",
+    IMAGE_ASPECT: " (GET /model has the mount of the model's camera)",
+    FIELD_OF_VIEW: " (GET /model has the mount of the model's camera)",
 }
-RETRY_AFTER_MS = 1000  # where no better estimate exists
+RETRY_AFTER_MS = 1000  # used without a better estimate
 
 
 class Problem(UserError):
-    """A request that cannot be answered; `retry_after_ms` is when to send it again, ms."""
+    """A request that cannot be answered; `retry_after_ms` is the time until a retry in ms."""
 
     def __init__(
         self, problem_type: ProblemType, detail: str, retry_after_ms: float | None = None
@@ -106,7 +106,7 @@ class Problem(UserError):
 
     @property
     def content(self) -> dict[str, Any]:
-        """The members of the JSON object; `retry_after_ms` only where it is known."""
+        """The members of the JSON object; `retry_after_ms` only if it is known."""
         content = members(self.type.uri, self.type.title, self.type.status, self.detail)
         if self.retry_after_ms is not None:
             content["retry_after_ms"] = self.retry_after_ms
@@ -122,7 +122,7 @@ class Problem(UserError):
 
 
 def as_problem(error: Problem | ImageError) -> Problem:
-    """The problem of an image that cannot be decoded; a Problem is returned as it is."""
+    """The problem of an image that cannot be decoded; a Problem is returned unchanged."""
     if isinstance(error, Problem):
         return error
     problem_type = IMAGE_PROBLEMS[error.fault]
@@ -130,44 +130,44 @@ def as_problem(error: Problem | ImageError) -> Problem:
 
 
 def internal_error() -> Problem:
-    """The problem of an unexpected exception; it reveals nothing about the exception."""
+    """The problem of an unexpected exception; the exception's text is not sent to the client."""
     return Problem(INTERNAL, "the request could not be answered; see the service's log")
 
 
 def head_too_large() -> Problem:
-    """The problem of headers or trailers over the limit."""
+    """The problem of headers or trailers above the size limit."""
     return Problem(HEAD_TOO_LARGE, f"the headers have more than {MAX_HEAD_BYTES} bytes; send fewer")
 
 
 def stopping() -> Problem:
     """The problem of a request that arrives while the service stops."""
-    return Problem(NOT_READY, "the service stops or restarts; ask again on a new connection")
+    return Problem(NOT_READY, "the service stops or restarts; try again on a new connection")
 
 
 def small_chunks(size: int) -> Problem:
-    """The problem of a body in hundreds of chunks of fewer bytes."""
+    """The problem of a body in hundreds of chunks that are smaller than `size` bytes."""
     return Problem(
-        BODY_TOO_LARGE, f"the body comes in chunks of under {size} bytes; send larger ones"
+        BODY_TOO_LARGE, f"the body has many chunks of less than {size} bytes; send larger ones"
     )
 
 
 def too_many_requests(what: str) -> Problem:
-    """The problem of requests that do not wait for the replies to others."""
+    """The problem of requests sent without waiting for the replies to earlier ones."""
     return Problem(RATE_LIMITED, f"more than {what} arrived at once; wait for the replies")
 
 
 def too_slow(part: str, limit_s: float) -> Problem:
-    """The problem of a part of a request that has a deadline."""
+    """The problem of a part of a request that missed its deadline of `limit_s`."""
     return Problem(TOO_SLOW, f"the {part} did not arrive within {limit_s:g} s")
 
 
 def members(type_uri: str, title: str, status: int, detail: str) -> dict[str, Any]:
-    """The members that every problem has."""
+    """The members of every problem."""
     return {"type": type_uri, "title": title, "status": status, "detail": detail}
 
 
 def with_error(content: dict[str, Any], path: str) -> dict[str, Any]:
-    """The members of a problem at `path`: below /v2 with `error`, as that protocol names it."""
+    """The members of a problem at `path`; below /v2 with `error` (Open Inference Protocol)."""
     if path == "/v2" or path.startswith(("/v2/", "/v2?")):
         return {**content, "error": content["detail"]}
     return content

@@ -1,8 +1,8 @@
-"""The options of one request, read and checked: ids, stream, deadline, camera, field of view, the
-format of the answer (JSON or MessagePack), the token, and the declared body.
+"""Reads and checks the options of a request: ids, stream, deadline, camera, field of view, format
+of the answer (JSON or MessagePack), token, and the headers that describe the body.
 
-All endpoints that take images have the same options, as headers or in the query; the Open Inference
-Protocol also has them as `parameters`, and /stream in a text message.
+All endpoints for images have the same options, as headers or in the query. The Open Inference
+Protocol also accepts them in `parameters`, and /stream in a text message.
 """
 
 import itertools
@@ -37,10 +37,11 @@ OPTIONS = {
     "fov_y": FIELD_OF_VIEW,
     "camera": CAMERA,
 }
-"""The options of an image by their names in a query or in JSON, with the headers they stand for."""
+"""The options of an image: names in a query or in JSON, with the equivalent headers."""
 KEYS = {name: header.lower().encode() for name, header in OPTIONS.items()}
 HEADER_KEYS = frozenset(KEYS.values())
-# What begins so is meant as an option: ignored where it is misspelt, the answer would be wrong.
+# Prefixes of headers meant as options. A misspelt option must be refused: ignoring it would make
+# the answer wrong.
 OPTION_HEADERS = (
     *(b"x-camera", b"x-deadline", b"x-fov", b"x-frame-id", b"x-stream"),
     *(b"deadline", b"fov", b"frame-id", b"frame_id", b"stream-id", b"stream_id"),
@@ -50,23 +51,23 @@ KINDS = {
     "stream_id": (str | int, "text or a whole number"),
     "camera": (str, "text"),
 }
-"""Types of the options that are no numbers, and their names."""
-MAX_QUERY_FIELDS = 16  # of a query: more are not read
+"""Types of the options that are not numbers, with the names of these types."""
+MAX_QUERY_FIELDS = 16  # largest number of fields in a query
 SINGLE_HEADERS = (*OPTIONS.values(), REQUEST_ID, "Content-Type", "Content-Encoding")
 MEDIA_TYPES = ("image/jpeg", "image/png")
 IMAGE_MEDIA_TYPES = frozenset(name.encode() for name in MEDIA_TYPES)
 MIN_FOV_DEG, MAX_FOV_DEG = 1.0, 179.0
-MAX_ACCEPT = 1024  # characters of an Accept header: browsers send fewer than 200
+MAX_ACCEPT = 1024  # characters of an Accept header; browsers send fewer than 200
 
-Headers = dict[bytes, bytes]  # by lower-case name
+Headers = dict[bytes, bytes]  # the keys are lower-case names
 
-_process_id = os.urandom(4).hex()  # part of the request ids that this process makes
+_process_id = os.urandom(4).hex()  # part of the request ids of this process
 _request_numbers = itertools.count(1)
 
 
 @dataclass(frozen=True, slots=True)
 class ResponseFormat:
-    """An encoding of the answer; `names` are the media types that select it."""
+    """An encoding of the answer; `names` are the media types in Accept that select it."""
 
     media_type: str
     names: tuple[str, ...]
@@ -86,7 +87,7 @@ MSGPACK = ResponseFormat(
 )
 TENSORS = ResponseFormat("application/octet-stream", ("application/octet-stream",), JSON.encode)
 Formats = tuple[ResponseFormat, ...]
-FORMATS: Formats = (JSON, MSGPACK)  # the first is preferred where the client has no preference
+FORMATS: Formats = (JSON, MSGPACK)  # the first is the default
 KSERVE_FORMATS: Formats = (JSON, TENSORS)
 
 
@@ -118,7 +119,7 @@ def _parse_media_range(item: str) -> tuple[str, float]:
 
 
 def _quality(choice: ResponseFormat, ranges: list[tuple[str, float]]) -> float:
-    """The quality value of a format: that of the most specific media range that matches it."""
+    """The quality value of the most specific media range that matches a format."""
     for names in (choice.names, ("application/*",), ("*/*",)):
         matching = [weight for name, weight in ranges if name in names]
         if matching:
@@ -128,7 +129,8 @@ def _quality(choice: ResponseFormat, ranges: list[tuple[str, float]]) -> float:
 
 @dataclass(frozen=True, slots=True)
 class RequestOptions:
-    """The options of one frame. Times are ns of the monotonic clock; `stamp_ns`: its arrival."""
+    """The options of one frame. Times are in ns of the monotonic clock; `stamp_ns` is the start of
+    the request."""
 
     stamp_ns: int
     request_id: str = ""
@@ -141,9 +143,9 @@ class RequestOptions:
 
 
 def read_options(scope: MutableMapping[str, Any]) -> Headers:
-    """The headers of an ASGI scope, with the options of its query. Raises Problem.
+    """The headers of an ASGI scope, together with the options of its query.
 
-    An option may be given once: one that is given twice would be ignored once.
+    Raises Problem, also for an option that is given twice: one of the values would be ignored.
     """
     headers: Headers = {}
     for name, value in scope["headers"]:
@@ -158,31 +160,33 @@ def read_options(scope: MutableMapping[str, Any]) -> Headers:
 
 
 def parse_query(query: bytes) -> dict[str, str]:
-    """The options in a query. Raises Problem for one that is unknown or given twice."""
+    """The options in a query. Raises Problem for an option that is given twice."""
     if not query:
         return {}
     try:
         text = query.decode("latin-1")
         pairs = parse_qsl(text, keep_blank_values=True, max_num_fields=MAX_QUERY_FIELDS)
     except ValueError as error:
-        raise Problem(INVALID_REQUEST, f"the query has over {MAX_QUERY_FIELDS} fields") from error
+        raise Problem(
+            INVALID_REQUEST, f"the query has more than {MAX_QUERY_FIELDS} fields; send fewer"
+        ) from error
     return single_options(pairs, "the query")
 
 
 def single_options(pairs: list[tuple[str, Any]], where: str) -> dict[str, Any]:
-    """Pairs as a dictionary. Raises Problem where a name is there twice."""
+    """The pairs as a dictionary. Raises Problem if a name occurs twice."""
     found = dict(pairs)
     if len(found) < len(pairs):
         names = [name for name, _ in pairs]
         twice = next(name for name in names if names.count(name) > 1)
-        raise Problem(INVALID_REQUEST, f"{twice[:40]!r} is twice in {where}; send it once")
+        raise Problem(INVALID_REQUEST, f"{twice[:40]!r} occurs twice in {where}; send it once")
     return found
 
 
 def merge_options(headers: Headers, options: Mapping[str, Any], where: str) -> Headers:
-    """`headers` with `options` by name, found in `where`: a query, or `parameters`.
+    """`headers` together with the `options` found in `where` (a query, or `parameters`).
 
-    Raises Problem for one that is unknown, is also a header, or is not of its type.
+    Raises Problem for an option that is unknown, is also a header, or has the wrong type.
     """
     if not options:
         return headers
@@ -205,12 +209,12 @@ def check_names(options: Mapping[str, Any], known: Mapping[str, Any], where: str
     if unknown is not None:
         raise Problem(
             INVALID_REQUEST,
-            f"{where} has an unknown option {unknown[:40]!r}; there are {', '.join(known)}",
+            f"{where} has an unknown option {unknown[:40]!r}; known are {', '.join(known)}",
         )
 
 
 def parse_json_object(text: str | bytes, where: str) -> dict[str, Any] | None:
-    """A JSON object, None for anything else. Raises Problem where a name is in it twice."""
+    """The JSON object in `text`, None for other text. Raises Problem if a name occurs twice."""
     try:
         content = json.loads(text, object_pairs_hook=lambda pairs: single_options(pairs, where))
     except (ValueError, RecursionError):
@@ -225,7 +229,7 @@ def parse_options(
     for name in headers:
         if name.startswith(OPTION_HEADERS) and name not in HEADER_KEYS:
             seen = f"the request has an unknown header {name[:40].decode('latin-1')!r}"
-            raise Problem(INVALID_REQUEST, f"{seen}; there are {', '.join(OPTIONS.values())}")
+            raise Problem(INVALID_REQUEST, f"{seen}; known are {', '.join(OPTIONS.values())}")
     return RequestOptions(
         stamp_ns,
         request_id,
@@ -243,30 +247,30 @@ def parse_format(accept: bytes | None, formats: Formats = FORMATS) -> ResponseFo
     if accept is None or accept == b"*/*":
         return formats[0]
     if len(accept) > MAX_ACCEPT:
-        seen = f"Accept has {len(accept)} characters, at most {MAX_ACCEPT} are read"
+        seen = f"Accept has {len(accept)} characters; send at most {MAX_ACCEPT}"
         raise Problem(INVALID_REQUEST, seen)
     return negotiate(accept.decode("latin-1"), formats)
 
 
 def parse_name(sent: bytes | None, header: str) -> str | None:
-    """The value of a header that holds a name; None without it. Raises Problem."""
+    """The value of a header that contains a name; None without the header. Raises Problem."""
     if sent is None:
         return None
     if not is_name(sent):
         raise Problem(
             INVALID_REQUEST,
-            f"{header} has {len(sent)} characters; expected 1 to {MAX_NAME}, printable ASCII",
+            f"{header} has {len(sent)} characters; expected 1 to {MAX_NAME} of printable ASCII",
         )
     return sent.decode("ascii")
 
 
 def is_name(sent: bytes) -> bool:
-    """Whether `sent` is short and printable ASCII."""
+    """Whether `sent` is printable ASCII of 1 to MAX_NAME characters."""
     return 0 < len(sent) <= MAX_NAME and sent.isascii() and sent.decode("ascii").isprintable()
 
 
 def request_id_of(headers: Headers) -> str:
-    """The id of a request: the client's own where it is valid, else a new one."""
+    """The id of a request: the client's id if it is valid, else a new id."""
     sent = headers.get(b"x-request-id")
     if sent and is_name(sent):
         return sent.decode("ascii")
@@ -274,7 +278,7 @@ def request_id_of(headers: Headers) -> str:
 
 
 def parse_deadline(sent: bytes | str | None, stamp_ns: int) -> int | None:
-    """The time of a deadline given in ms after `stamp_ns`, ns. Raises Problem."""
+    """The time in ns of a deadline that is given in ms after `stamp_ns`. Raises Problem."""
     if sent is None:
         return None
     wait_ms = _parse_number(sent, DEADLINE, 0.0, MAX_DEADLINE_MS)
@@ -282,14 +286,14 @@ def parse_deadline(sent: bytes | str | None, stamp_ns: int) -> int | None:
 
 
 def parse_fov_deg(sent: bytes | str | None) -> float | None:
-    """The vertical field of view of an image, degrees. Raises Problem."""
+    """The vertical field of view of an image in degrees. Raises Problem."""
     return None if sent is None else _parse_number(sent, FIELD_OF_VIEW, MIN_FOV_DEG, MAX_FOV_DEG)
 
 
 def _parse_number(sent: bytes | str, header: str, low: float, high: float) -> float:
     text = sent.decode("latin-1") if isinstance(sent, bytes) else sent
     try:
-        # Python alone takes 1_000 for a number.
+        # float() accepts 1_000 and non-ASCII digits; other languages do not.
         value = float(text) if text.isascii() and "_" not in text else float("nan")
     except ValueError:
         value = float("nan")
@@ -302,7 +306,7 @@ def _parse_number(sent: bytes | str, header: str, low: float, high: float) -> fl
 
 
 def check_token(headers: Headers, token: str | None) -> None:
-    """Raise Problem unless the request carries the service's token."""
+    """Raise Problem if the request lacks the service's token."""
     if token is None:
         return
     scheme, _, sent = headers.get(b"authorization", b"").partition(b" ")
@@ -313,7 +317,7 @@ def check_token(headers: Headers, token: str | None) -> None:
 
 
 def check_image_headers(headers: Headers) -> None:
-    """Raise Problem when the headers show that the body is not a usable image."""
+    """Raise Problem if the headers show that the body is not a usable image."""
     sent = headers.get(b"content-type", b"")
     if (
         sent not in IMAGE_MEDIA_TYPES
@@ -329,12 +333,12 @@ def check_image_headers(headers: Headers) -> None:
 
 
 def check_body_headers(headers: Headers) -> None:
-    """Raise Problem when the headers announce a compressed or too large body."""
+    """Raise Problem if the headers announce a compressed or too large body."""
     coding = headers.get(b"content-encoding", b"identity")
     if coding.strip().lower() != b"identity":
         raise Problem(
             UNSUPPORTED_TYPE,
-            f"the body has Content-Encoding {coding[:40].decode('latin-1')!r}; post it as it is",
+            f"the body has Content-Encoding {coding[:40].decode('latin-1')!r}; post it without one",
         )
     length = headers.get(b"content-length", b"")
     if length.isdigit() and int(length[:20]) > MAX_BODY_BYTES:
@@ -345,6 +349,6 @@ def body_too_large(seen: str) -> Problem:
     """The problem of a body that is too large; `seen` describes its size."""
     return Problem(
         BODY_TOO_LARGE,
-        f"the body has {seen}, the limit is {MAX_BODY_BYTES}; send a smaller image or "
+        f"the body has {seen}; the limit is {MAX_BODY_BYTES}: send a smaller image or "
         "compress it more",
     )

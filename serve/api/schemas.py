@@ -1,4 +1,4 @@
-"""Schemas of the answers, and the parts of the OpenAPI document that FastAPI cannot derive."""
+"""Schemas of the answers, and the parts of the OpenAPI document that FastAPI cannot generate."""
 
 from collections.abc import Collection
 from typing import Any
@@ -28,106 +28,106 @@ PROBLEM_URIS: list[JsonValue] = [*(found.uri for found in PROBLEM_TYPES), "about
 
 
 class Distances(BaseModel):
-    """Signed distances to lane markings in m, left negative; null where a marking is absent."""
+    """Signed distances to lane markings in m, left negative; null if the marking is absent."""
 
     ml: float | None = Field(description="left marking of the car's lane")
     mr: float | None = Field(description="right marking of the car's lane")
-    l: float | None = Field(description="next marking left of the one driven on")
-    m: float | None = Field(description="marking the car is driving on")
-    r: float | None = Field(description="next marking right of the one driven on")
+    l: float | None = Field(description="next marking to the left of m")
+    m: float | None = Field(description="marking that the car is driving on")
+    r: float | None = Field(description="next marking to the right of m")
 
 
 class HeadingProbabilities(BaseModel):
-    """Probabilities that the road bends left, goes straight, bends right; they sum to 1."""
+    """Probabilities of the three classes of the road; they sum to 1."""
 
-    left: float = Field(description="of a bend to the left")
-    straight: float = Field(description="of a straight road")
-    right: float = Field(description="of a bend to the right")
+    left: float = Field(description="probability of a bend to the left")
+    straight: float = Field(description="probability of a straight road")
+    right: float = Field(description="probability of a bend to the right")
 
 
 class Deviations(Distances):
-    """Standard deviation of the error of each feature, m and rad; null where it is absent."""
+    """Standard deviation of the error of each feature, m and rad; null if the feature is absent."""
 
-    to_lane_centre: float | None = Field(description="of to_lane_centre_m, m")
-    angle: float = Field(description="of angle_rad, rad")
+    to_lane_centre: float | None = Field(description="standard deviation of to_lane_centre_m, m")
+    angle: float = Field(description="standard deviation of angle_rad, rad")
 
 
 class AbsentProbabilities(BaseModel):
     """Probability that each marking is absent; above 0.54 (`l`, `r`: 0.75) a distance is null."""
 
-    ml: float = Field(description="equal to that of mr: a lane has both or none")
+    ml: float = Field(description="left marking of the car's lane; always equal to mr")
     mr: float = Field(description="right marking of the car's lane")
-    l: float = Field(description="next marking left of the one driven on")
-    m: float = Field(description="marking the car is driving on")
-    r: float = Field(description="next marking right of the one driven on")
+    l: float = Field(description="next marking to the left of m")
+    m: float = Field(description="marking that the car is driving on")
+    r: float = Field(description="next marking to the right of m")
 
 
 class Timing(BaseModel):
-    """Time of each stage, ms. `queue` and `total` include receiving the body."""
+    """Time of each stage in ms. `queue` and `total` include receiving the body."""
 
     queue: float = Field(description="from the start of the request to the start of decoding")
-    decode: float = Field(description="of the image, with cropping and resizing")
-    forward: float = Field(description="of the network")
+    decode: float = Field(description="decoding, cropping and resizing of the image")
+    forward: float = Field(description="forward pass of the network")
     total: float = Field(description="from the start of the request to the answer")
 
 
 class Features(BaseModel):
-    """Track features read from one driver-view image."""
+    """Track features predicted from one driver-view image."""
 
     distances_m: Distances
     to_lane_centre_m: float | None = Field(
-        description="offset from the centre of the lane the car is in or nearest to, m, left "
-        "positive; null where no marking is near"
+        description="offset from the centre of the car's lane or of the nearest lane, m, left "
+        "positive; null if no marking is near"
     )
     angle_rad: float = Field(
-        description="track heading minus the car's, rad: positive when the car points to the right"
+        description="track heading minus the car's heading, rad: positive if the car points right"
     )
     heading: HeadingProbabilities
-    std: Deviations | None = Field(description="null where the model has no uncertainty head")
+    std: Deviations | None = Field(description="null if the model has no uncertainty head")
     out_of_distribution: bool | None = Field(
-        description="the image is unlike the training images: do not drive by the prediction; "
-        "null where the model cannot detect it"
+        description="whether the image is unlike the training images; if true, do not drive with "
+        "the prediction. null if the model has no uncertainty head"
     )
     absent: AbsentProbabilities | None = Field(
-        description="null where the model answers in the paper's coded numbers"
+        description="null if the model has the paper's heads, which output coded numbers"
     )
-    model: str = Field(description="hash of the weights that were used")
+    model: str = Field(description="hash of the model's weights")
     definitions_version: str = Field(description="version of the definitions of the features")
     engine: str = Field(description="openvino or torch")
     precision: str = Field(description="f32, bf16 or int8")
     crop_px: list[int] | None = Field(
-        description="left, top, width, height of the part of the image that is used, px; null: "
-        "all, or it was warped (X-Camera)",
+        description="left, top, width, height of the used part of the image, px; null if the whole "
+        "image is used or it was warped (X-Camera)",
         min_length=4,
         max_length=4,
     )
     timing_ms: Timing
-    frame_id: str | None = Field(description=f"the request's {FRAME_ID}, null without one")
+    frame_id: str | None = Field(description=f"the request's {FRAME_ID}; null without one")
 
 
 class Status(BaseModel):
     """State of the service."""
 
     status: str
-    model: str | None = Field(default=None, description="hash of the weights that will be used")
+    model: str | None = Field(default=None, description="hash of the current weights")
 
 
 class ProblemDetails(BaseModel):
     """Why a request was refused (RFC 9457)."""
 
     type: str = Field(
-        description="the type of the problem; stable",
+        description="the type of the problem; never changes",
         json_schema_extra={"enum": PROBLEM_URIS},
     )
     title: str
     status: int
     detail: str = Field(description="what was seen, what was expected and what to do")
     retry_after_ms: int | None = Field(
-        default=None, description="when to send the request again, ms; only where that may help"
+        default=None, description="time until a retry, ms; only if a retry can help"
     )
 
 
-# Refusals of any request. Probes need no token and have no rate limit.
+# Refusals of any request. AUTHORIZATION_REFUSALS do not concern probes, which need no token.
 SERVER_REFUSALS = (
     problems.MALFORMED,
     problems.TOO_SLOW,
@@ -139,7 +139,7 @@ SERVER_REFUSALS = (
 )
 AUTHORIZATION_REFUSALS = (problems.UNAUTHORIZED,)
 OTHER_REFUSALS = (problems.NOT_FOUND, problems.METHOD_NOT_ALLOWED)
-REFUSALS = tuple(  # of an image
+REFUSALS = tuple(  # refusals of an image
     found
     for found in PROBLEM_TYPES
     if found not in (*SERVER_REFUSALS, *AUTHORIZATION_REFUSALS, *OTHER_REFUSALS)
@@ -153,29 +153,30 @@ NAME: dict[str, Any] = {
 HEADERS: dict[str, tuple[str, dict[str, Any]]] = {
     FRAME_ID: ("Returned as `frame_id`. Printable ASCII.", NAME),
     STREAM_ID: (
-        "Name of a stream of frames of this client, for example of one camera: a newer frame "
-        "replaces a queued one, which is answered with 503, `superseded`.",
+        "Name of a stream of frames of this client, for example of one camera. A newer frame of "
+        "the stream replaces a queued one, which is answered with 503, `superseded`.",
         NAME,
     ),
     DEADLINE: (
-        "A frame that is not processed within this time after its request began, ms, is answered "
-        "with 503, `deadline-passed`.",
+        "Deadline in ms from the start of the request. A frame whose processing has not begun by "
+        "then is answered with 503, `deadline-passed`.",
         {"type": "number", "minimum": 0, "maximum": MAX_DEADLINE_MS},
     ),
     CAMERA: (
-        "Name of a camera that the service was started with (`serve --camera NAME=FILE`; GET "
-        "/model has them under `cameras`): the image is warped into the model's camera, and the "
-        "distances are those of its car. Not together with X-Camera-Fov-Y.",
+        "Name of a camera that the service was started with (`serve --camera NAME=FILE`); GET "
+        "/model lists the names under `cameras`. The image is warped into the view of the model's "
+        "camera, and the distances are measured from the named camera's car. Cannot be combined "
+        "with X-Camera-Fov-Y.",
         NAME,
     ),
     FIELD_OF_VIEW: (
-        "Vertical field of view of the image, degrees; default: that of the model's camera. A "
-        "larger one is cropped to the model's.",
+        "Vertical field of view of the image in degrees. Default: the value of the model's camera. "
+        "An image with a larger value is cropped to the model's view.",
         {"type": "number", "minimum": MIN_FOV_DEG, "maximum": MAX_FOV_DEG},
     ),
     REQUEST_ID: (
-        "Returned in a header of the same name, and written to the log. A value that is not "
-        f"printable ASCII of at most {MAX_NAME} characters is replaced by a new one.",
+        "Returned in a header of the same name, and written to the log. The service replaces a "
+        f"value that is not printable ASCII or has more than {MAX_NAME} characters.",
         {"type": "string"},
     ),
 }
@@ -189,14 +190,14 @@ def image_parameters() -> list[dict[str, Any]]:
         for name, (text, schema) in HEADERS.items()
     ]
     for name, header in OPTIONS.items():
-        text = f"As the header {header}, which may not be sent then."
+        text = f"Same as the header {header}; only one of the two can be sent."
         schema = HEADERS[header][1]
         found.append({**common, "in": "query", "name": name, "description": text, "schema": schema})
     return found
 
 
 def features_operation() -> dict[str, Any]:
-    """OpenAPI operation of POST /features, which bypasses FastAPI."""
+    """OpenAPI operation of POST /features, which does not use FastAPI."""
     schema = {"$ref": "#/components/schemas/Features"}
     return {
         "summary": "Track features of one driver-view image",
@@ -204,9 +205,9 @@ def features_operation() -> dict[str, Any]:
         "parameters": image_parameters(),
         "requestBody": {
             "required": True,
-            "description": "The bytes of one JPEG or PNG file: no form, no base64. At most 4 MiB, "
-            "16 to 4096 px a side, 8.4 million px. A wider image is cropped to the model's view; "
-            "an image that does not contain this view is refused.",
+            "description": "The bytes of one JPEG or PNG file (no form, no base64) of at most "
+            "4 MiB, with sides of 16 to 4096 px and at most 8.4 million px. A wider image is "
+            "cropped to the model's view; an image that does not contain this view is refused.",
             "content": {
                 name: {"schema": {"type": "string", "format": "binary", "contentMediaType": name}}
                 for name in MEDIA_TYPES
@@ -214,7 +215,7 @@ def features_operation() -> dict[str, Any]:
         },
         "responses": {
             "200": {
-                "description": "The track features, in the media type that `Accept` prefers",
+                "description": "The track features, in the media type preferred by `Accept`",
                 "content": {form.media_type: {"schema": schema} for form in FORMATS},
                 "headers": {REQUEST_ID: {"schema": NAME}},
             },
@@ -224,7 +225,7 @@ def features_operation() -> dict[str, Any]:
 
 
 def problem_responses(*types: ProblemType) -> dict[int | str, dict[str, Any]]:
-    """OpenAPI responses of a route that can be refused with these problems."""
+    """OpenAPI responses of a route whose requests can be refused with these problems."""
     statuses = dict.fromkeys(found.status for found in types)
     schema = {"$ref": "#/components/schemas/ProblemDetails"}
     return {
@@ -237,7 +238,7 @@ def problem_responses(*types: ProblemType) -> dict[int | str, dict[str, Any]]:
 
 
 def add_common_responses(operation: dict[str, Any], needs_token: bool) -> None:
-    """Add the refusals that any request may get to an operation's own responses."""
+    """Add the refusals that every request can get to an operation's own responses."""
     types = (*SERVER_REFUSALS, *AUTHORIZATION_REFUSALS) if needs_token else SERVER_REFUSALS
     responses = operation["responses"]
     for status, response in problem_responses(*types).items():
@@ -250,7 +251,7 @@ def add_common_responses(operation: dict[str, Any], needs_token: bool) -> None:
 def install_openapi(app: FastAPI, public: Collection[str], token_required: bool) -> None:
     """Complete the OpenAPI document of `app` with the paths and schemas that FastAPI lacks.
 
-    `public`: the paths that need no token.
+    `public` are the paths that need no token.
     """
 
     def document() -> dict[str, Any]:

@@ -1,11 +1,11 @@
 """GET /stream: frames and answers over one WebSocket, with the rules of POST /features.
 
-A binary message is one image; its answer is a text message of JSON, or with the subprotocol
-`driverview.msgpack` a binary message of MessagePack. A new frame replaces a frame of the same
-WebSocket that is still queued. A text message before an image is a JSON object with options of that
-image: `frame_id`, `deadline_ms`, `fov_y`, `camera`. Options of all images are sent with the
-handshake, as headers (X-Camera-Fov-Y and the others) or, from a browser, in the query. A refused
-frame is answered with its problem and its frame_id; the WebSocket stays open.
+A binary message is one image. Its answer is a text message with JSON, or with the subprotocol
+`driverview.msgpack` a binary message with MessagePack. A new frame replaces a queued frame of the
+same WebSocket. A text message before an image is a JSON object with options of this image:
+`frame_id`, `deadline_ms`, `fov_y`, `camera`. Options for all images are sent with the handshake, as
+headers (e.g. X-Camera-Fov-Y) or, from a browser, in the query. A refused frame is answered with its
+problem and its frame_id; the WebSocket stays open.
 """
 
 import asyncio
@@ -47,25 +47,25 @@ from serve.scheduling.rate_limit import RateLimiter
 
 PATH = "/stream"
 PROTOCOLS = {"driverview.json": JSON, "driverview.msgpack": MSGPACK}
-# Else a client that floods the service with refused messages would delay all others.
+# Pauses after a refused message, so that a client with many of them does not delay other clients.
 REFUSAL_PAUSE_S, BUSY_PAUSE_S = 0.01, 0.002
-MAX_TEXT = 1024  # characters of a text message
+MAX_TEXT = 1024  # largest number of characters of a text message
 FRAME_OPTIONS = {name: OPTIONS[name] for name in ("frame_id", "deadline_ms", "fov_y", "camera")}
-MAX_PENDING = 8  # frames of one WebSocket whose answers are not sent; then no more is received
+MAX_PENDING = 8  # unanswered frames of one WebSocket; at this number no more are received
 
 logger = logging.getLogger(__name__)
 
 
 @dataclass(slots=True)
 class StreamOptions:
-    """The options of a WebSocket, from its handshake; `deadline_ms` as the client sent it."""
+    """The options of a WebSocket from its handshake; `deadline_ms` is the client's text."""
 
     defaults: RequestOptions
     protocol: str | None
     deadline_ms: bytes | None
     client: str
     pause_s: float = 0.0
-    """Before the next message is received: the last one was refused."""
+    """Pause before the next message is received; above 0 after a refusal."""
 
 
 class Stream:
@@ -94,7 +94,7 @@ class Stream:
         number, metadata = 0, ""
         while (message := await receive())["type"] == "websocket.receive":
             if message.get("bytes") is None:
-                metadata = message["text"][: MAX_TEXT + 1]  # an idle client may not keep megabytes
+                metadata = message["text"][: MAX_TEXT + 1]  # no megabytes for an idle client
                 message.clear()
                 continue
             number += 1
@@ -122,7 +122,8 @@ class Stream:
         message: Message,
         send: Send,
     ) -> None:
-        """Answer the image in `message`; it is let go of before the answer waits for the client."""
+        """Answer the image in `message`, and empty `message` before the answer is sent: a slow
+        client must not keep its image in memory."""
         request_id = f"{stream.defaults.request_id}/{number}"
         frame_id = stream.defaults.frame_id or number
         share = self._frames.share()
@@ -167,14 +168,14 @@ class Stream:
 
 
 def _parse_handshake(scope: Scope, request_id: str) -> StreamOptions:
-    """The options in a handshake. Raises Problem."""
+    """The options of a handshake. Raises Problem."""
     if scope["path"] != PATH:
-        raise Problem(NOT_FOUND, f"there is no WebSocket at {scope['path']}, only at {PATH}")
+        raise Problem(NOT_FOUND, f"there is no WebSocket at {scope['path']}; use {PATH}")
     headers = read_options(scope)
     options = parse_options(headers, time.monotonic_ns(), request_id)
     protocol = next((p for p in scope["subprotocols"] if p in PROTOCOLS), None)
     response_format = PROTOCOLS[protocol] if protocol else options.format
-    # Each WebSocket is a stream of its own, unless it names a stream.
+    # Each WebSocket is a separate stream, unless its handshake names a stream.
     stream = options.stream or f"websocket {request_id_of({})}"
     options = replace(options, stream=stream, format=response_format)
     return StreamOptions(options, protocol, headers.get(KEYS["deadline_ms"]), client_address(scope))
@@ -188,8 +189,8 @@ def _parse_metadata(text: str) -> Headers:
     if metadata is None:
         raise Problem(
             INVALID_REQUEST,
-            f"a text message must be a JSON object with {', '.join(FRAME_OPTIONS)} or some of "
-            f"these, of at most {MAX_TEXT} characters",
+            f"a text message must be a JSON object with some of {', '.join(FRAME_OPTIONS)}, of at "
+            f"most {MAX_TEXT} characters",
         )
     check_names(metadata, FRAME_OPTIONS, "a text message")
     return merge_options({}, metadata, "a text message")

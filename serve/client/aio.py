@@ -3,8 +3,8 @@
     async with AsyncClient("http://127.0.0.1:8000") as client:
         answer = await client.features(jpeg_bytes, deadline_s=0.05)
 
-It runs `serve.client.Client` in a thread of its own. Requests of one client wait for each other;
-for concurrent requests, make several clients.
+It runs `serve.client.Client` in a separate thread. The requests of one client are sent one after
+the other; for concurrent requests, use several clients.
 """
 
 import asyncio
@@ -27,7 +27,7 @@ class AsyncClient:
         timeout_s: float = 5.0,
         token: str | None = None,
     ) -> None:
-        """Raises ServiceError when `url` is not valid. Connects at the first request."""
+        """Raises ServiceError if `url` is not valid. Connects at the first request."""
         self._client = Client(url, timeout_s, token)
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="driverview-client")
         self._closed = False
@@ -54,7 +54,7 @@ class AsyncClient:
         return await self._in_thread(send)
 
     async def model(self) -> dict[str, Any]:
-        """The card of the model that is served. Raises ServiceError."""
+        """The card of the served model. Raises ServiceError."""
         return await self._in_thread(self._client.model)
 
     async def ready(self) -> bool:
@@ -62,7 +62,7 @@ class AsyncClient:
         return await self._in_thread(self._client.ready)
 
     async def close(self) -> None:
-        """Close the connection and stop the thread; a second call does nothing."""
+        """Close the connection and stop the thread; a second call has no effect."""
         if not self._closed:
             self._closed = True
             await self._in_thread(self._client.close)

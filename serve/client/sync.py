@@ -1,10 +1,10 @@
-"""Blocking client of the service, on the standard library alone, with one persistent connection.
+"""Blocking client of the service: only the standard library, and one persistent connection.
 
     with Client("http://127.0.0.1:8000") as client:
         client.wait_until_ready()
         answer = client.features(jpeg_bytes)
 
-Not thread-safe: make one client per thread.
+Not thread-safe: use one client per thread.
 """
 
 import http.client
@@ -20,21 +20,21 @@ from serve.config import MAX_DEADLINE_MS, TOKEN_VARIABLE
 from trackfeatures.errors import UserError
 
 RETRY_S = 0.1
-MAX_TIMEOUT_S = 1e6  # the operating system takes no much longer one
-# Refusals of a frame for which a retry is useless.
+MAX_TIMEOUT_S = 1e6  # operating systems refuse much longer timeouts
+# Problem types for which a retry is useless.
 NOT_RETRIED = ("/problems/superseded", "/problems/deadline-passed")
 UNSENDABLE = re.compile("[^!-~]")  # characters that the path of an HTTP request cannot contain
 UNSENDABLE_IN_HEADER = re.compile(r"[\r\n\0]|[^\x00-\xff]")
 PNG_SIGNATURE = b"\x89PNG"
-# Errors on a connection that the service has closed while it was idle.
+# Errors of a request on a connection that the service has closed while it was idle.
 DROPPED = (http.client.RemoteDisconnected, ConnectionResetError, BrokenPipeError)
 
 
 class ServiceError(UserError):
     """The service cannot be reached, or refused the request.
 
-    `status` is the HTTP status and `problem` the type of the problem, None where no reply came;
-    `retry_after_s` is the service's advice on when to try again, s.
+    `status` is the HTTP status and `problem` the problem's type; both are None without a reply.
+    `retry_after_s` is the service's recommended time until a retry in s.
     """
 
     def __init__(
@@ -51,8 +51,8 @@ class ServiceError(UserError):
 
 
 def retry_pause_s(error: ServiceError) -> float | None:
-    """Time to wait before a retry, s; None where a retry is useless."""
-    if error.status is None:  # no reply: the service may be starting
+    """Time to wait before a retry in s; None if a retry is useless."""
+    if error.status is None:  # no reply: the service can be starting
         return RETRY_S
     if error.status not in (429, 503) or error.problem in NOT_RETRIED:
         return None
@@ -62,7 +62,8 @@ def retry_pause_s(error: ServiceError) -> float | None:
 class Client:
     """A connection to the service at `url` ("http://HOST:PORT" or "HOST:PORT").
 
-    `token`: the service's token; None: $DRIVERVIEW_TOKEN if it is set. `timeout_s`: of one request.
+    `timeout_s` is the time limit of one request. `token` is the service's token; the default is
+    $DRIVERVIEW_TOKEN, if it is set.
     """
 
     def __init__(
@@ -71,13 +72,13 @@ class Client:
         timeout_s: float = 5.0,
         token: str | None = None,
     ) -> None:
-        """Raises ServiceError when `url` or `token` is not valid. Connects at the first request."""
+        """Raises ServiceError if `url` or `token` is not valid. Connects at the first request."""
         parts = _parse_url(url)
         self.url = parts.geturl().rstrip("/")
         self._path = parts.path.rstrip("/")
         kind = http.client.HTTPSConnection if parts.scheme == "https" else _plain_connection
         self._connection = kind(_host(parts), parts.port, timeout=timeout_s)
-        # Both families of "localhost" are tried, whatever /etc/hosts names, within the timeout.
+        # Tries IPv4 and IPv6 for "localhost" within the timeout; /etc/hosts can lack one of them.
         self._connection._create_connection = connect  # type: ignore[attr-defined]
         self._timeout_s = timeout_s
         token = os.environ.get(TOKEN_VARIABLE, "").strip() if token is None else token
@@ -95,14 +96,15 @@ class Client:
         fov_y_deg: float | None = None,
         camera: str | None = None,
     ) -> dict[str, Any]:
-        """The track features of a JPEG or PNG file, `image` being its bytes.
+        """The track features of `image`, the bytes of a JPEG or PNG file, as POST /features returns
+        them. Raises ServiceError.
 
-        The members are those of POST /features. `content_type` None: detected from the first bytes.
-        `stream`: a newer frame of this stream replaces this one. `fov_y_deg`: the vertical field of
-        view of the image; None: that of the model's camera. `camera`: the name of a camera that the
-        service was started with. With `deadline_s` (from now) the
-        service drops the frame when it is late, and the request is retried until then where that
-        may help (the service is overloaded, not ready, or restarting). Raises ServiceError.
+        `content_type` is detected from the first bytes if it is None. `stream` names a stream of
+        frames, in which a newer frame replaces a queued one. `fov_y_deg` is the vertical field of
+        view of the image; the default is the value of the model's camera. `camera` names a camera
+        that the service was started with. `deadline_s` is counted from now: the service drops the
+        frame after it, and until then the request is retried if the service is overloaded, not
+        ready, or restarting.
         """
         if content_type is None:
             content_type = "image/png" if image.startswith(PNG_SIGNATURE) else "image/jpeg"
@@ -121,7 +123,7 @@ class Client:
         return self._request_until(time.monotonic() + deadline_s, image, headers)
 
     def _request_until(self, end: float, image: bytes, headers: dict[str, str]) -> dict[str, Any]:
-        """Send, and retry as long as that may help, until `end` (s, monotonic)."""
+        """Send the image, and retry while a retry can help, until `end` (s, monotonic clock)."""
         while True:
             left_s = max(0.0, end - time.monotonic())
             headers["X-Deadline-Ms"] = f"{min(1e3 * left_s, MAX_DEADLINE_MS):.1f}"
@@ -142,7 +144,7 @@ class Client:
             self._connection.sock.settimeout(seconds)
 
     def model(self) -> dict[str, Any]:
-        """The card of the model that is served. Raises ServiceError."""
+        """The card of the served model. Raises ServiceError."""
         return self._request("GET", "/model")
 
     def ready(self) -> bool:
@@ -154,7 +156,7 @@ class Client:
         return True
 
     def wait_until_ready(self, timeout_s: float = 30.0) -> None:
-        """Wait until the service is ready; raise ServiceError with the last reason otherwise."""
+        """Wait until the service is ready. Raises ServiceError with the last reason."""
         end = time.monotonic() + timeout_s
         while True:
             try:
@@ -184,8 +186,8 @@ class Client:
         body: bytes | None = None,
         headers: dict[str, str] | None = None,
     ) -> dict[str, Any]:
-        # A reused connection may have been closed while it was idle; then the request is sent again
-        # on a new one. Nothing is stored, so a request may be sent twice.
+        # The service can have closed an idle connection. Then the request is sent again on a new
+        # connection, which is harmless because the service stores nothing.
         fresh = self._connection.sock is None
         try:
             status, content = self._send(method, path, body, headers or {})
@@ -229,7 +231,7 @@ class Client:
             self._connection.request(method, self._path + path, body, headers)
             response = self._connection.getresponse()
             return response.status, response.read()
-        except BaseException:  # half a request, or a reply that nobody has read
+        except BaseException:  # an incomplete request, or an unread reply
             self.close()
             raise
 
@@ -242,28 +244,29 @@ def _parse_url(url: str) -> SplitResult:
     try:
         parts = urlsplit(url if "://" in url else f"http://{url}")
         host = _host(parts)
-        host.encode("idna")  # as the name lookup does
+        host.encode("idna")  # the name lookup does the same
         usable = host and parts.scheme in ("http", "https") and parts.port != 0
         usable = usable and host.isprintable() and " " not in host
         usable = usable and not UNSENDABLE.search(parts.path)
     except (
         ValueError
-    ):  # an open bracket, a port that is not a number, a label too long (UnicodeError)
+    ):  # an open bracket, a port that is not a number, too long a label (UnicodeError)
         usable = False
     if not usable:
         raise ServiceError(
-            f"{url!r} is not the address of a service; expected one like http://127.0.0.1:8000"
+            f"{url!r} is not the address of a service; give one like http://127.0.0.1:8000"
         )
     return parts
 
 
 def _host(parts: SplitResult) -> str:
-    """The host of a URL; a zone of IPv6 is written [fe80::1%25eth0] there (RFC 6874)."""
+    """The host of a URL, with an unescaped IPv6 zone: a URL has [fe80::1%25eth0] (RFC 6874)."""
     return (parts.hostname or "").replace("%25", "%")
 
 
 def _check_headers(headers: dict[str, str]) -> None:
-    """Raise ServiceError for what `http.client` would refuse with a request half written."""
+    """Raise ServiceError for values that `http.client` refuses only after writing a part of the
+    request."""
     for name, value in headers.items():
         if UNSENDABLE_IN_HEADER.search(value):
             raise ServiceError(f"{name} has characters that a header cannot contain")

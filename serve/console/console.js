@@ -1,4 +1,4 @@
-// The console: sends images, a film or a webcam to the service and shows its answers.
+// The console: sends images, frames of a film, or webcam pictures to the service; shows the answers.
 
 import { IN_LANE, ON_MARKING } from "./geometry.js";
 import { absence, drawAbove, drawLatency, drawPicture } from "./drawing.js";
@@ -150,7 +150,7 @@ $("stop").addEventListener("click", live.stop);
 
 $("file").addEventListener("change", (event) => {
   takeFile(event.target.files[0]);
-  event.target.value = ""; // the same file can be chosen again
+  event.target.value = ""; // so that the same file can be chosen again
 });
 const stage = document.querySelector(".picture");
 for (const kind of ["dragover", "dragleave", "drop"]) {

@@ -1,22 +1,22 @@
-// The canvases: the image with its markings, the car from above, the latencies.
+// Draws the canvases: the image with its markings, the car from above, the latencies.
 
 import { IN_LANE, ON_MARKING, onMarking, project, seenPart } from "./geometry.js";
 
-const AHEAD_M = [3, 28]; // the lines assume a straight and level road, so they end before a bend matters
+const AHEAD_M = [3, 28]; // the lines assume a straight and level road, so they must be short
 
 function colour(name) {
   return getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim();
 }
 
-// The markings that are present: [name, distance, standard deviation or null].
+// The present markings: [name, distance in m, standard deviation in m or null].
 function present(answer) {
   return [...IN_LANE, ...ON_MARKING]
     .filter((name) => answer.distances_m[name] != null)
     .map((name) => [name, answer.distances_m[name], answer.std?.[name] ?? null]);
 }
 
-// What the table says of a marking that is absent; null where it is not. The service decides, whose
-// limit of the probability is not the same for all markings.
+// The table's text for an absent marking, null for a present one. The service decides which markings
+// are absent: its limit of the probability differs between markings.
 export function absence(answer, name) {
   if (!answer.absent || answer.distances_m[name] !== null) return null;
   return `absent, ${(100 * answer.absent[name]).toFixed(0)} %`;
@@ -26,7 +26,7 @@ function paintOf(name) {
   return colour(IN_LANE.includes(name) ? "lane" : "marking");
 }
 
-// `whole`: the image is all that `camera` sees; else the service uses its middle.
+// `whole`: the image shows exactly the view of `camera`; otherwise the service crops its middle.
 export function drawPicture(canvas, image, answer, truth, camera, whole = false) {
   const context = canvas.getContext("2d");
   canvas.height = Math.round(canvas.width * image.height / image.width);
@@ -73,7 +73,7 @@ function label(context, text, u, v) {
   context.lineWidth = 5;
 }
 
-// The car points up; one metre is `scale` pixels, and the same both ways.
+// The car points up; one metre is `scale` pixels in both directions.
 export function drawAbove(canvas, answer, truth) {
   const context = canvas.getContext("2d"), scale = 26;
   const middle = canvas.width / 2, car = canvas.height - 120;
@@ -101,14 +101,14 @@ export function drawAbove(canvas, answer, truth) {
     const left = distance < 0, text = `${name} ${Math.abs(distance).toFixed(2)} m`;
     context.textAlign = left ? "right" : "left";
     context.fillStyle = "#fff";
-    // in two rows, as both kinds of markings may be present
+    // in two rows, since in-lane and on-marking distances can both be present
     context.fillText(text, left ? u - 10 : u + 10, car + (IN_LANE.includes(name) ? 50 : 85));
   }
   if (truth) for (const [, d] of present(truth)) line(d, truth.angle_rad, [3, 12], 4, "#8ce99a");
   drawCar(context, middle, car, scale);
   const offset = answer.to_lane_centre_m;
   if (offset != null) {
-    // positive when the car is left of the centre, which is then to its right
+    // `offset` is positive if the car is left of the centre: the centre is then right of the car
     const target = at(onMarking(offset, answer.angle_rad, 9));
     context.strokeStyle = context.fillStyle = "#ffe066";
     context.lineWidth = 3;
@@ -135,7 +135,7 @@ function drawCar(context, u, v, scale) {
   context.fill();
 }
 
-// `rows` of {total, trip}, ms, the newest last: in each bar the service's part of the round trip.
+// `rows`: {total, trip} in ms, the newest last. Each bar shows the service's part of the round trip.
 export function drawLatency(canvas, rows, shown) {
   const context = canvas.getContext("2d"), { width, height } = canvas, foot = height - 8;
   context.clearRect(0, 0, width, height);

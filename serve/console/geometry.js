@@ -1,18 +1,18 @@
-// From track features to points on the road, in the car frame (x ahead, y to the left, m, from the
-// centre of gravity), and from there to pixels through a camera.
+// Converts track features to points on the road, in the car frame (m; x ahead, y left, origin at the
+// centre of gravity), and these points to pixels of a camera.
 
-export const CG_HEIGHT_M = 0.25; // of the simulated car; the camera's position is relative to it
+export const CG_HEIGHT_M = 0.25; // centre of gravity above the road: origin of the camera's position
 export const IN_LANE = ["ml", "mr"], ON_MARKING = ["l", "m", "r"];
 
-// A marking `distance` m away (left negative), `ahead` m along the track whose heading is `angle`
-// (rad, positive when the car points to the right of it).
+// The point on a marking at `distance` m (left negative), `ahead` m along the track. `angle` in rad is
+// the track's heading minus the car's: positive if the car points to the right of the track.
 export function onMarking(distance, angle, ahead) {
   const cos = Math.cos(angle), sin = Math.sin(angle), left = -distance;
   return [ahead * cos - left * sin, ahead * sin + left * cos];
 }
 
-// Place [u, v] of a point on the road in a picture, px from its upper left corner, null where the
-// camera does not see it. `camera` is one of /model; see trackfeatures/camera.py.
+// Position [u, v] of a point on the road in an image, in px from the upper left corner; null if the
+// camera does not see it. `camera` is a camera of /model; see trackfeatures/camera.py.
 export function project([x, y], camera) {
   const [cr, cp, cy] = ANGLES.map((name) => Math.cos((camera[name] ?? 0) * Math.PI / 180));
   const [sr, sp, sy] = ANGLES.map((name) => Math.sin((camera[name] ?? 0) * Math.PI / 180));
@@ -31,7 +31,7 @@ export function project([x, y], camera) {
 
 const ANGLES = ["roll_deg", "pitch_deg", "yaw_deg"];
 
-// A point on the plane one focal length ahead after the lens's distortion; null where it folds.
+// The distorted position of a point on the plane z = 1; null where the lens model folds.
 function distort(x, y, camera) {
   const k = camera.coefficients ?? [];
   const r = Math.hypot(x, y);
@@ -55,8 +55,8 @@ function distort(x, y, camera) {
   ];
 }
 
-// The part of an image of `width` x `height` that the service uses: the middle, as high as the image
-// and with the model's aspect ratio (the service refuses a narrower image).
+// The part of an image of `width` x `height` that the service uses: its middle, with the image's
+// height and the model's aspect ratio (the service refuses a narrower image).
 export function seenPart(width, height, camera) {
   const seen = Math.min(width, height * camera.width / camera.height);
   return { x: (width - seen) / 2, w: seen };

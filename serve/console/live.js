@@ -1,14 +1,14 @@
-// Pictures of a webcam or a film, one at a time: the next is taken when the last one is answered.
+// Takes pictures of a webcam or a film, each after the answer to the previous picture.
 
-const ROWS = 420; // twice those of the model, which scales the rest away
+const ROWS = 420; // twice the model's rows; the service would scale a larger picture down
 const QUALITY = 0.92, WAIT_MS = 30;
 
-// `answer`: takes {body, image} and returns when it is answered; `told`: takes a line of text.
+// `answer`: sends {body, image} and returns after the answer; `told`: shows an error text.
 export function createLive(video, answer, told) {
   const canvas = document.createElement("canvas");
-  let running = 0; // number of the present run, so that an older one ends
+  let running = 0; // number of the current run; an older run ends when it differs
 
-  // The picture that the video shows as a JPEG of at most `ROWS` rows.
+  // The current picture of the video, as a JPEG of at most `ROWS` rows.
   async function take() {
     const scale = Math.min(1, ROWS / video.videoHeight);
     canvas.width = Math.round(video.videoWidth * scale);
@@ -19,7 +19,7 @@ export function createLive(video, answer, told) {
 
   const nextFrame = () => new Promise((resolve) => {
     if (video.requestVideoFrameCallback) video.requestVideoFrameCallback(resolve);
-    setTimeout(resolve, 10 * WAIT_MS); // a video that is paused or over shows no other frame
+    setTimeout(resolve, 10 * WAIT_MS); // a paused or ended video has no next frame
     if (!video.requestVideoFrameCallback) setTimeout(resolve, WAIT_MS);
   });
 
@@ -63,7 +63,7 @@ export function createLive(video, answer, told) {
   return {
     stop,
     webcam: () => begin(async () => {
-      if (!navigator.mediaDevices) throw new Error("browsers give it to pages of localhost or HTTPS only");
+      if (!navigator.mediaDevices) throw new Error("browsers allow it only on pages of localhost or HTTPS");
       const wanted = { width: { ideal: 1280 }, height: { ideal: 720 }, facingMode: "environment" };
       video.srcObject = await navigator.mediaDevices.getUserMedia({ video: wanted, audio: false });
     }, "no webcam"),

@@ -1,9 +1,10 @@
-"""The service's log: one JSON object a line on stderr, with the id of the request.
+"""The service's log on stderr: each line is a JSON object, with the id of the request.
 
-No client can fill the disk: its refusals, for its token, Host, Origin or rate too, are logged once
-a second, those of all clients ten times; the same error, and what native libraries write to
-stderr, once a second. Each of several workers has its share of these rates. The number of those
-left out is in the next one logged, as `suppressed`.
+Rate limits keep clients from filling the disk. Refusals, including those for token, Host, Origin
+and rate, are logged at most once per second for each client and ten times per second for all
+clients. Equal errors and lines of native libraries are logged at most once per second. With several
+workers each has its share of these rates. The next logged line has the number of omitted lines as
+`suppressed`.
 """
 
 import faulthandler
@@ -19,20 +20,20 @@ from typing import TYPE_CHECKING
 from serve.config import network_of
 
 if TYPE_CHECKING:
-    from serve.api.problems import Problem  # loads FastAPI, which the supervisor does without
+    from serve.api.problems import Problem  # loads FastAPI, which the supervisor does not need
 
 REFUSALS_PER_S = 10.0
-INTERVAL_S = 1.0  # between two refusals of one client, and between two equal errors
-REMEMBERED = 1024  # clients, and errors, whose last time is known
+INTERVAL_S = 1.0  # least time between two refusals of one client, and between two equal errors
+REMEMBERED = 1024  # number of clients or errors whose last time is kept
 MAX_LINE = 500  # characters kept of a native library's line
-SUPERVISION = "serve.workers"  # its lines are not limited: no client causes them
+SUPERVISION = "serve.workers"  # logger without limits: clients cannot cause its lines
 FIELDS = ("request", "client", "problem", "status", "total_ms", "suppressed")
 
 logger = logging.getLogger("serve.requests")
 
 
 class JsonFormatter(logging.Formatter):
-    """Formats a record as one line of JSON."""
+    """Formats a log record as one line of JSON."""
 
     def format(self, record: logging.LogRecord) -> str:
         content: dict[str, object] = {
@@ -50,14 +51,14 @@ class JsonFormatter(logging.Formatter):
 
 
 class Interval:
-    """Passes each key at most once in INTERVAL_S, counted over `workers` processes."""
+    """Passes each key at most once per INTERVAL_S, averaged over `workers` processes."""
 
     def __init__(self, workers: int = 1) -> None:
         self._interval_s = INTERVAL_S * workers
         self._last_s: dict[str, float] = {}
 
     def passes(self, key: str, now: float) -> bool:
-        """Whether `key` is due; then it counts as seen at `now`, s."""
+        """Whether `key` passes at `now` in s; if it passes, `now` is its last time."""
         if now - self._last_s.get(key, -self._interval_s) < self._interval_s:
             return False
         if len(self._last_s) >= REMEMBERED:
@@ -67,14 +68,14 @@ class Interval:
 
 
 class ErrorLimit(logging.Filter):
-    """Passes a warning or an error once in INTERVAL_S, whatever its arguments."""
+    """Passes equal warnings and errors once per INTERVAL_S; their arguments can differ."""
 
     def __init__(self, workers: int = 1) -> None:
         super().__init__()
         self._interval, self._suppressed = Interval(workers), 0
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """Whether a record is logged."""
+        """Whether `record` is logged."""
         if record.levelno < logging.WARNING or record.name.startswith(SUPERVISION):
             return True
         if not self._interval.passes(f"{record.name} {record.msg}", time.monotonic()):
@@ -86,21 +87,21 @@ class ErrorLimit(logging.Filter):
 
 
 def set_up(workers: int = 1) -> None:
-    """Configure logging to stderr, of one of `workers` processes."""
+    """Configure logging to stderr in one of `workers` processes."""
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(JsonFormatter())
     handler.addFilter(ErrorLimit(workers))
     logging.basicConfig(handlers=[handler], level=logging.WARNING)
     logging.getLogger("serve").setLevel(logging.INFO)
-    # Errors of clients are in the lines of this module.
+    # This module logs the errors of clients, so uvicorn's warnings about them are not needed.
     logging.getLogger("uvicorn").setLevel(logging.ERROR)
 
 
 def capture_native_lines() -> None:
-    """Log what native libraries write to this process's stderr; call it before `set_up`.
+    """Redirect the output of native libraries on stderr to the log; call it before `set_up`.
 
-    libpng writes a line of its own for each damaged image. Python's stderr, and the stack that
-    `faulthandler` writes when the process crashes, go where they went before.
+    libpng writes a line for each damaged image. Python's stderr, and the stack that `faulthandler`
+    writes in a crash, still go to the original stderr.
     """
     own = os.fdopen(os.dup(2), "w", buffering=1, encoding="utf-8", errors="backslashreplace")
     reader, writer = os.pipe()
@@ -118,7 +119,7 @@ def _log_native_lines(reader: int) -> None:
 
 
 class RefusalLog:
-    """Logs refused requests, limited by a token bucket and by client."""
+    """Logs refused requests, limited by a token bucket and for each client."""
 
     def __init__(self, workers: int = 1) -> None:
         self._rate = REFUSALS_PER_S / workers
@@ -127,7 +128,7 @@ class RefusalLog:
         self._clients = Interval(workers)
 
     def log(self, request_id: str, client: str, problem: "Problem") -> None:
-        """Log a refused request, or only count it when there were too many."""
+        """Log a refused request, or only count it if a limit is exceeded."""
         now = time.monotonic()
         elapsed_s = now - self._updated_s
         self._tokens = min(self._most, self._tokens + elapsed_s * self._rate)

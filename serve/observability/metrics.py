@@ -1,7 +1,7 @@
 """Counters of frames and connections in shared memory, and their page for Prometheus.
 
-Only a worker's event loop writes its block, so an increment needs no lock. A replacement worker
-goes on counting in the block of its predecessor: no counter ever falls.
+Only the event loop of one worker writes a block, so an increment needs no lock. A replacement
+worker continues the counts in the block of its predecessor, so counters never decrease.
 Source: Prometheus text exposition format 0.0.4.
 """
 
@@ -28,18 +28,18 @@ BOUNDS_S = (0.0005, 0.001, 0.002, 0.003, 0.005, 0.0075, 0.01, 0.02, 0.03, 0.05, 
 STAGE_NAMES = ("queue", "decode", "forward", "total")
 OUTCOMES = ("answered", *(found.name for found in PROBLEM_TYPES))
 OUTCOME_INDEX = {found: number for number, found in enumerate(PROBLEM_TYPES, start=1)}
-SUM = STAGE_WORDS - 1  # word of a stage's histogram that holds the sum, s; before it the buckets
+SUM = STAGE_WORDS - 1  # index of the sum in s in a stage's histogram; the buckets precede it
 
 
 class Metrics:
-    """The counters of one worker, and the page with the sums over all workers."""
+    """The counters of one worker, and the page with the totals of all workers."""
 
     def __init__(self, shared: SharedMemory, block: int) -> None:
         self._blocks = [shared.worker(number) for number in range(shared.blocks)]
         self._own = self._blocks[block]
 
     def count_answer(self, result: FrameResult, total_s: float, waiting: int) -> None:
-        """Count an answered frame and the times of its stages."""
+        """Count an answered frame and its times; `waiting` is the number of queued frames."""
         own = self._own
         own[FRAME_COUNTS] += 1.0
         own[WAITING] = waiting
@@ -61,17 +61,17 @@ class Metrics:
         self._own[CLOSED_COUNTS + OUTCOME_INDEX[problem_type]] += 1.0
 
     def page(self, now: float, provenance: dict[str, str]) -> str:
-        """The metrics of all workers; `now` in s of the monotonic clock."""
+        """The metrics of all workers at `now`, in s of the monotonic clock."""
         return "\n".join([*self._lines(now, provenance), ""])
 
     def _lines(self, now: float, provenance: dict[str, str]) -> Iterator[str]:
         live = [cells for cells in self._blocks if cells[HEARTBEAT] > now - HEARTBEAT_TIMEOUT_S]
         labels = ",".join(f'{name}="{value}"' for name, value in provenance.items())
-        yield from _header("model_info", "gauge", "The model that is served.")
+        yield from _header("model_info", "gauge", "The served model.")
         yield f"driverview_model_info{{{labels}}} 1"
         for name, cell, text in (
             ("connections", CONNECTIONS, "Open connections."),
-            ("waiting_frames", WAITING, "Queued frames, when a frame last left a queue."),
+            ("waiting_frames", WAITING, "Queued frames at the latest answer or refusal."),
             ("workers_ready", READY, "Workers whose model is warm and has passed its check."),
         ):
             yield from _header(name, "gauge", text)

@@ -1,10 +1,10 @@
-"""Setup of OpenTelemetry traces (the extra `telemetry`) from its standard environment variables.
+"""Sets up OpenTelemetry traces (the extra `telemetry`) from the standard environment variables.
 
-Enabled when $OTEL_TRACES_EXPORTER (`otlp`, `console`; `none`: off) or $OTEL_EXPORTER_OTLP_ENDPOINT,
-or the latter's variant for traces, is set and $OTEL_SDK_DISABLED is not `true`. Service name,
-resource, sampler, propagators and batches follow their standard variables. The spans are in
-`serve.observability.tracing`, which is imported, like the exporter, only when traces are enabled:
-this module is imported by every process of the service and loads nothing heavy.
+Traces are enabled by $OTEL_TRACES_EXPORTER (`otlp`, `console`; `none` disables them),
+$OTEL_EXPORTER_OTLP_ENDPOINT or $OTEL_EXPORTER_OTLP_TRACES_ENDPOINT, and disabled by
+$OTEL_SDK_DISABLED=true. Service name, resource, sampler, propagators and batches follow their
+standard variables. Every process of the service imports this module, so it loads nothing heavy: the
+exporter and `serve.observability.tracing` are imported only if traces are enabled.
 """
 
 import os
@@ -20,15 +20,15 @@ if TYPE_CHECKING:
 EXPORTER = "OTEL_TRACES_EXPORTER"
 ENDPOINTS = ("OTEL_EXPORTER_OTLP_ENDPOINT", "OTEL_EXPORTER_OTLP_TRACES_ENDPOINT")
 PROTOCOLS = ("OTEL_EXPORTER_OTLP_TRACES_PROTOCOL", "OTEL_EXPORTER_OTLP_PROTOCOL")
-GROUP = "opentelemetry_traces_exporter"  # entry points of OpenTelemetry exporters
+GROUP = "opentelemetry_traces_exporter"  # entry-point group of OpenTelemetry's exporters
 BY_PROTOCOL = {"http/protobuf": "otlp_proto_http", "grpc": "otlp_proto_grpc"}
 INSTALL = "pip install 'driverview[telemetry]'"
 
 
 def exporter_name(environment: Mapping[str, str] = os.environ) -> str | None:
-    """The entry point of the exporter that the environment selects; None: no traces.
+    """The entry point of the exporter that the environment selects; None if traces are disabled.
 
-    Raises UserError when it is not installed.
+    Raises UserError if the exporter is not installed.
     """
     found = environment.get(EXPORTER, "").strip().lower()
     asked = found or any(environment.get(name) for name in ENDPOINTS)
@@ -41,13 +41,13 @@ def exporter_name(environment: Mapping[str, str] = os.environ) -> str | None:
     if found not in known:
         raise UserError(
             f"the trace exporter {found!r} is not installed (installed: "
-            f"{', '.join(known) or 'none'}): {INSTALL}, or set {EXPORTER} to another or to none"
+            f"{', '.join(known) or 'none'}): {INSTALL}, or set {EXPORTER} to another one or to none"
         )
     return found
 
 
 def tracer() -> "Tracer | None":
-    """The tracer of this process, with the selected exporter; None: traces are off."""
+    """The tracer of this process, with the selected exporter; None if traces are disabled."""
     name = exporter_name()
     if name is None:
         return None

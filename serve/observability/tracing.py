@@ -1,10 +1,11 @@
-"""OpenTelemetry spans: one per request for features, in it one for the frame, in that its stages.
+"""OpenTelemetry spans: a request for features has a span, which contains the span of its frame,
+which contains the spans of the frame's stages.
 
 A request continues the trace of its `traceparent` header (W3C Trace Context); a frame of a
-WebSocket that of the handshake. Probes, pages, requests refused before they are read (rate, token)
-and requests whose client disconnects have no span. Imported only when traces are enabled
-(`serve.observability.telemetry`). Attributes follow the semantic conventions for HTTP; our own
-begin with `driverview.`.
+WebSocket continues the trace of the handshake. Probes, pages, requests refused before they are read
+(rate, token) and requests of clients that disconnect have no span. Attributes follow the semantic
+conventions for HTTP; additional ones start with `driverview.`. This module is imported only if
+traces are enabled (`serve.observability.telemetry`).
 """
 
 import time
@@ -28,14 +29,15 @@ INFER_PATHS = {f"{model}/infer" for model in MODELS}
 
 
 class TracedFrameHandler(FrameHandler):
-    """A FrameHandler with a span for each frame: `perceive`, in it `queue`, `decode`, `forward`."""
+    """A FrameHandler with a span `perceive` for each frame, which contains the spans `queue`,
+    `decode` and `forward`."""
 
     def __init__(self, tracer: Tracer, *arguments: Any) -> None:
         super().__init__(*arguments)
         self._tracer = tracer
 
     def refuse_early(self, headers: Headers, client: str) -> Reply | None:
-        """None: `TracedFeaturesRequest` refuses the frame, in a span."""
+        """Returns None, so that `TracedFeaturesRequest` refuses the frame, in a span."""
         return None
 
     def record_answer(self, options: RequestOptions, client: str, result: FrameResult) -> None:
@@ -62,14 +64,14 @@ class TracedFrameHandler(FrameHandler):
         span = trace.get_current_span()
         if span.is_recording():
             _set_problem(span, problem, request_id)
-        else:  # a frame of a WebSocket: there is no span of a request
+        else:  # a frame of a WebSocket has no request span
             with self._tracer.start_as_current_span("refuse") as own:
                 _set_problem(own, problem, request_id)
         return problem
 
 
 class TracedFeaturesRequest(FeaturesRequest):
-    """POST /features with a span from its headers to its reply."""
+    """A POST /features with a span from the headers to the reply."""
 
     __slots__ = ("_context", "_send_reply", "_span", "_tracer")
 
@@ -107,7 +109,7 @@ class TracedFeaturesRequest(FeaturesRequest):
 
 
 class TracedApp:
-    """An ASGI application with a span for each inference request that it serves."""
+    """An ASGI application with a span for each inference request (Open Inference Protocol)."""
 
     def __init__(self, tracer: Tracer, app: App) -> None:
         self._tracer = tracer
@@ -117,7 +119,7 @@ class TracedApp:
         if scope["type"] == "http" and _is_infer_request(scope):
             await self._answer(scope, receive, send)
         elif scope["type"] == "websocket":
-            with _attached(_parent_context(scope["headers"])):  # inherited by each frame's task
+            with _attached(_parent_context(scope["headers"])):  # for each frame's task
                 await self._app(scope, receive, send)
         else:
             await self._app(scope, receive, send)

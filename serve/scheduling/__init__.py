@@ -1,1 +1,1 @@
-"""The order in which frames are processed, and who may send how many."""
+"""Scheduling: queues and the order of frames; limits on rate, memory and engine time of clients."""

@@ -1,10 +1,10 @@
-"""How much of the engine's time large images may take, by their estimated cost.
+"""Limits the engine time that large images can use, by their estimated decoding time.
 
-A request is not a measure of work: a PNG of 65 KB can take 0.7 s. So a large image is admitted by
-the time that its decoding will take: in all, and for each client. A client that is alone may use
-the whole engine. Beside others its large images get a quarter of it, and none may take so long that
-the others' frames do not fit into the queue meanwhile. Clients are told apart by their address, of
-IPv6 by its /64 network.
+The size of a request does not measure its work: a PNG of 65 KB can take 0.7 s. So large images are
+admitted by their decoding time, with limits for all clients and for each client. A client that is
+alone can use the whole engine. While other clients are present, its large images get a quarter of
+the engine's time, and an image is refused if the other clients' frames would overflow the queue
+while it is decoded. A client is an IPv4 address or an IPv6 /64 network.
 """
 
 from collections.abc import Callable
@@ -12,35 +12,35 @@ from collections.abc import Callable
 from serve.api.problems import OVERLOADED, Problem
 from serve.config import network_of
 
-MAX_PENDING_MS = 1000.0  # of large images that wait or are processed, of all clients
-MAX_CLIENT_MS = 250.0  # the same, of one client; one image is always allowed
-SHARE = 0.25  # of the engine's time, for the large images of one client beside others
-MAX_BESIDE_MS = 200.0  # of one image beside other clients: four frames at 20 Hz
-PRESENT_NS = 1_000_000_000  # a client counts as present for so long after a frame
-MAX_CLIENTS = 1024  # whose shares are remembered
+MAX_PENDING_MS = 1000.0  # cost of all unfinished large images of all clients
+MAX_CLIENT_MS = 250.0  # cost of all unfinished large images of a client; one is always allowed
+SHARE = 0.25  # share of the engine's time for a client's large images if others are present
+MAX_BESIDE_MS = 200.0  # cost of one image if others are present: four frames at 20 Hz
+PRESENT_NS = 1_000_000_000  # a client counts as present for this time after each of its frames
+MAX_CLIENTS = 1024  # number of clients whose credit is remembered
 
 Client = str
 
 
 class Admission:
-    """Estimated times of large images. For the event loop's thread only."""
+    """Admits large images by their estimated decoding time. Use it in the event loop's thread."""
 
     def __init__(self) -> None:
         self._pending_ms = 0.0
-        self._client_ms: dict[Client, float] = {}  # pending, by client
-        self._credit: dict[Client, tuple[float, int]] = {}  # (ms left, time of that in ns)
+        self._client_ms: dict[Client, float] = {}  # cost of unfinished images
+        self._credit: dict[Client, tuple[float, int]] = {}  # (remaining ms, at this time in ns)
         self._newest: tuple[Client, int] = ("", -PRESENT_NS)
-        self._other: tuple[Client, int] = ("", -PRESENT_NS)  # the latest of another client
+        self._other: tuple[Client, int] = ("", -PRESENT_NS)  # before `_newest`
 
     def note(self, client: Client, now_ns: int) -> None:
-        """A client has sent a frame of any size."""
+        """Record that a client has sent a frame of any size."""
         client = network_of(client)
         if client != self._newest[0]:
             self._other = self._newest
         self._newest = (client, now_ns)
 
     def admit(self, client: Client, cost_ms: float, now_ns: int) -> Callable[[], None]:
-        """Admit a large image; the function to call when it is done. Raises Problem."""
+        """Admit a large image. Returns a function to call when it is done. Raises Problem."""
         client = network_of(client)
         own = self._client_ms.get(client, 0.0)
         if own and own + cost_ms > MAX_CLIENT_MS:
@@ -52,15 +52,16 @@ class Admission:
             if cost_ms > MAX_BESIDE_MS:
                 raise Problem(
                     OVERLOADED,
-                    f"the image would take {cost_ms:.0f} ms; beside other clients at most "
-                    f"{MAX_BESIDE_MS:.0f} ms are spent on one: send a smaller one, or a JPEG",
+                    f"the image would take {cost_ms:.0f} ms; while other clients are present, at "
+                    f"most {MAX_BESIDE_MS:.0f} ms are allowed: send a smaller image, or a JPEG",
                 )
             if credit <= 0.0:
                 raise self._too_much(-credit / SHARE, "beyond this client's share")
         while len(self._credit) >= MAX_CLIENTS:
             self._credit.pop(next(iter(self._credit)))
         self._credit.pop(client, None)
-        # A client that was alone has not taken from others: it owes for one image at most.
+        # A client with negative credit was alone until now, so its images took no time from others.
+        # Its debt is dropped: a client owes for one image at most.
         self._credit[client] = (max(credit, 0.0) - cost_ms, now_ns)
         self._client_ms[client] = own + cost_ms
         self._pending_ms += cost_ms
@@ -86,6 +87,6 @@ class Admission:
         return Problem(
             OVERLOADED,
             f"large images {whose} already need {waiting_ms:.0f} ms of the engine; send smaller "
-            "ones, or this one later",
+            "images, or send this image later",
             waiting_ms,
         )

@@ -1,9 +1,9 @@
-"""The memory for bodies: what all requests of all workers together may hold.
+"""Memory budget for request bodies, shared by all requests of all workers.
 
-Each worker writes the bytes that it holds into its block of the shared memory; there is no lock, so
-that two workers at once may exceed the budget by a body each. While the budget is used up, bodies
-that arrive slowly give way to small ones: else a few clients that hold back the last bytes of large
-bodies would keep all others out.
+Each worker writes its number of bytes into its block of the shared memory. There is no lock, so
+simultaneous requests in different workers can exceed the budget by a body each. If the budget is
+exhausted, requests whose bodies arrive slowly are ended in favour of small bodies. Otherwise a few
+clients that withhold the last bytes of large bodies could block all other clients.
 """
 
 from collections.abc import Callable
@@ -11,28 +11,28 @@ from collections.abc import Callable
 from serve.api.problems import OVERLOADED, Problem
 from serve.workers.shared_memory import BODY_BYTES, SharedMemory
 
-SMALL_BYTES = 256 << 10  # of a body for which slow ones give way; most images have fewer
+SMALL_BYTES = 256 << 10  # slow bodies are ended for a body of up to this size; most images fit
 
 
 class BodyBudget:
-    """The bytes of bodies in flight: received, and not yet answered."""
+    """Counts the bytes of bodies in flight: received, but not yet answered."""
 
     def __init__(self, shared: SharedMemory, block: int, limit: int) -> None:
-        """`limit`: bytes of all workers together; `block`: this worker's."""
+        """`block` is this worker's block of `shared`; `limit` in bytes is for all workers."""
         blocks = [shared.worker(number) for number in range(shared.blocks)]
         self._own = blocks[block]
-        self._own[BODY_BYTES] = 0.0  # of a worker that had this block before
+        self._own[BODY_BYTES] = 0.0  # overwrites the count of an earlier worker
         self._others = [cells for number, cells in enumerate(blocks) if number != block]
         self._limit = limit
         self.held = 0
         self.end_slow_bodies: Callable[[float], float] = lambda _size: 0.0
-        """Ends requests of this worker whose bodies arrive slowly, until so many bytes are free, or
-        soon will be; how many."""
+        """Ends requests of this worker whose bodies arrive slowly, until the given number of bytes
+        is free or will soon be free; returns the number of bytes."""
 
     def take(self, size: int, small: bool) -> None:
-        """Hold `size` bytes more. Raises Problem when that is over the budget.
+        """Reserve `size` more bytes. Raises Problem if that exceeds the budget.
 
-        `small`: slow bodies give way to this one.
+        With `small`, slow bodies are ended to make room.
         """
         excess = self._excess(size)
         if excess > 0 and not (small and self.end_slow_bodies(excess) >= excess):
@@ -44,18 +44,18 @@ class BodyBudget:
         self._own[BODY_BYTES] = self.held
 
     def _excess(self, size: int) -> float:
-        """By how many bytes the budget is exceeded with `size` bytes more."""
+        """By how many bytes `size` more bytes would exceed the budget."""
         others = sum(cells[BODY_BYTES] for cells in self._others)
         return self.held + size + others - self._limit
 
     def give_back(self, size: int) -> None:
-        """Hold `size` bytes fewer."""
+        """Release `size` bytes."""
         self.held -= size
         self._own[BODY_BYTES] = self.held
 
 
 class BodyShare:
-    """What one request holds of the budget. Call `close` when it is answered or given up."""
+    """The part of the budget of one request. Call `close` when it is answered or abandoned."""
 
     __slots__ = ("_budget", "size")
 
@@ -64,12 +64,12 @@ class BodyShare:
         self.size = 0
 
     def grow(self, size: int) -> None:
-        """Hold `size` bytes more. Raises Problem."""
+        """Reserve `size` more bytes. Raises Problem."""
         self._budget.take(size, self.size + size <= SMALL_BYTES)
         self.size += size
 
     def hold(self, size: int) -> None:
-        """Hold `size` bytes in all. Raises Problem."""
+        """Change the reserved size to `size` bytes. Raises Problem."""
         if size > self.size:
             self.grow(size - self.size)
         elif size < self.size:
@@ -77,7 +77,7 @@ class BodyShare:
             self.size = size
 
     def close(self) -> None:
-        """Hold nothing; may be called twice."""
+        """Release all bytes; a second call has no effect."""
         if self.size:
             self._budget.give_back(self.size)
             self.size = 0

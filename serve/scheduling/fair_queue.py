@@ -1,7 +1,7 @@
-"""Frames that wait for the engine, and whose turn it is; a lock for which clients take turns.
+"""A queue of frames, and a lock, in which clients take turns.
 
-Clients take turns, and when the queue is full, a frame of the client that has most in it gives way
-to one of a client with fewer. Clients are told apart by their address, of IPv6 by its /64 network.
+If the queue is full, the client with the most frames in it loses one to a client with fewer frames.
+A client is an IPv4 address or an IPv6 /64 network.
 """
 
 import asyncio
@@ -17,16 +17,16 @@ from mtlnet.inference.prediction import Prediction
 from serve.config import network_of
 from trackfeatures.camera import CameraParameters
 
-MAX_CLIENTS = 1024  # whose turns are remembered
+MAX_CLIENTS = 1024  # number of clients whose last turn is remembered
 
 PixelReader = Callable[[CameraParameters], NDArray[np.uint8]]
-"""Gives the pixels (height, width, 3), RGB, as the model's camera sees them."""
+"""Returns the pixels (height, width, 3) uint8 RGB in the view of the model's camera."""
 ResultCallback = Callable[["FrameResult | Exception"], None]
 
 
 @dataclass(frozen=True, slots=True)
 class FrameResult:
-    """The prediction for a frame, the engine it came from, and the time of each stage, ms."""
+    """The prediction for a frame, its engine's provenance, and the time of each stage in ms."""
 
     prediction: Prediction
     provenance: dict[str, str]
@@ -37,11 +37,11 @@ class FrameResult:
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """An image to process. Times are ns of the monotonic clock.
+    """An image to process. Times are in ns of the monotonic clock.
 
-    `stream` 0: it belongs to no stream. `small`: it is decoded in less time than the engine takes;
-    others are admitted by `cost_ms`, the estimated time of decoding. `source`: its camera, where
-    its pixels are warped into the model's.
+    `stream` is 0 for a frame without a stream. A `small` image is decoded in less time than the
+    engine takes; `cost_ms` is the estimated decoding time. `source` is the image's camera if
+    its pixels are warped into the view of the model's camera.
     """
 
     read: PixelReader
@@ -55,7 +55,7 @@ class Frame:
 
 
 class Slot:
-    """A place in the queue: the frame that holds it, and the callback for its result."""
+    """A place in the queue: a frame, its client, and the callback for its result."""
 
     __slots__ = ("client", "frame", "on_result")
 
@@ -66,23 +66,23 @@ class Slot:
 
 
 class FairQueue:
-    """Slots in the order of their arrival; for one thread at a time."""
+    """Slots in the order of their arrival. Not thread-safe."""
 
     def __init__(self) -> None:
         self._slots: list[Slot] = []
-        self._counts: Counter[str] = Counter()  # of slots, by client
-        self._turns: dict[str, int] = {}  # number of the latest slot that was taken, by client
+        self._counts: Counter[str] = Counter()  # slots of each client
+        self._turns: dict[str, int] = {}  # number of the latest turn of each client
         self._turn = 0
         self.count = 0
         """Number of slots."""
 
     @property
     def all_small(self) -> bool:
-        """Whether all slots hold small frames."""
+        """Whether all waiting frames are small."""
         return all(slot.frame.small for slot in self._slots)
 
     def append(self, slot: Slot) -> None:
-        """Add a slot."""
+        """Append a slot."""
         self._slots.append(slot)
         self._counts[slot.client] += 1
         self.count += 1
@@ -93,11 +93,12 @@ class FairQueue:
         self._discount(slot)
 
     def of_stream(self, stream: int) -> Slot | None:
-        """The slot of a stream."""
+        """The slot of a stream, if it has one."""
         return next((slot for slot in self._slots if slot.frame.stream == stream), None)
 
     def giving_way_to(self, client: str) -> Slot | None:
-        """The last slot of the client with most of the queue, if it has two more than `client`."""
+        """The last slot of the client with the most slots, if it has at least two more than
+        `client`; else None."""
         counts = self._counts
         most = max(counts.values(), default=0)
         if most < counts[network_of(client)] + 2:
@@ -105,7 +106,7 @@ class FairQueue:
         return next(slot for slot in reversed(self._slots) if counts[slot.client] == most)
 
     def take(self) -> Slot:
-        """Remove the slot whose turn it is: the oldest of the client that waited longest."""
+        """Remove and return the oldest slot of the client whose last turn is longest ago."""
         slots, turns = self._slots, self._turns
         one_client = len(self._counts) == 1
         slot = slots.pop(
@@ -127,16 +128,16 @@ class FairQueue:
 
 
 class FairLock:
-    """A lock for the coroutines of one event loop; clients that wait take turns."""
+    """A lock for the coroutines of one event loop; waiting clients take turns."""
 
     def __init__(self) -> None:
         self._locked = False
-        # By client, the one whose turn is next first.
+        # Waiting coroutines of each client; the first client is the next to get the lock.
         self._waiting: dict[str, deque[asyncio.Future[None]]] = {}
 
     @asynccontextmanager
     async def held(self, client: str) -> AsyncIterator[None]:
-        """Wait for the lock, and hold it."""
+        """Wait for the lock, and hold it within the context."""
         if self._locked:
             await self._wait(network_of(client))
         self._locked = True
@@ -151,12 +152,12 @@ class FairLock:
         try:
             await turn
         except asyncio.CancelledError:
-            if not turn.cancelled():  # cancelled after its turn had come
+            if not turn.cancelled():  # cancelled after it got the lock
                 self._release()
             raise
 
     def _release(self) -> None:
-        """Give the lock to the next client that waits."""
+        """Give the lock to the next waiting client, or unlock."""
         while self._waiting:
             client, turns = next(iter(self._waiting.items()))
             del self._waiting[client]

@@ -1,15 +1,15 @@
-"""A short queue of frames before one engine, and the thread that runs the engine.
+"""A short queue of frames in front of one engine, and the thread that runs the engine.
 
-An engine is neither re-entrant nor thread-safe, and a frame that waits for long is of no use to a
-controller, so a frame that does not fit into the queue is refused at once. A newer frame of a
-stream replaces the queued one; a frame whose deadline has passed is dropped before it is decoded.
+An engine is neither re-entrant nor thread-safe, and an old frame is useless to a controller, so a
+frame that does not fit into the queue is refused at once. A newer frame of a stream replaces the
+queued frame of that stream. A frame whose deadline has passed is dropped before it is decoded.
 Clients take turns (`serve.scheduling.fair_queue`).
 
-A small frame that arrives alone at a fast engine is processed on the event loop itself: handing it
-to another thread and back costs more than everything else beside the model. Frames that arrive
-meanwhile would have had to wait for that frame anyway. Two or more go to the thread, unless the
-worker has no second core: there the thread would only take turns with the loop, in the middle of
-frames. Between two frames the loop handles all requests that have arrived.
+A small frame that arrives alone is processed on the event loop itself if the engine is fast: the
+switch to another thread and back costs more than all other work besides the model. Frames that
+arrive in the meantime would have to wait for this frame anyway. Two or more waiting frames go to
+the thread, unless the worker has no second core: on one core the thread and the loop would only
+interrupt each other. Between two frames the loop handles all requests that have arrived.
 """
 
 import asyncio
@@ -32,15 +32,15 @@ from serve.scheduling.fair_queue import FairQueue, Frame, FrameResult, ResultCal
 from serve.scheduling.streams import StreamTable
 
 SMOOTHING = 0.1  # weight of the latest frame in the running mean of the time per frame
-INLINE_MAX_MS = 10.0  # a frame may block the event loop for so long
-LARGE_MS = 30.0  # an image that takes longer to decode needs an admission: 3 Mpx of JPEG
-INLINE_AFTER = 8  # frames in a row within INLINE_MAX_MS before the event loop runs the engine
+INLINE_MAX_MS = 10.0  # longest time per frame at which frames are processed on the event loop
+LARGE_MS = 30.0  # images with a longer decoding time need an admission; a JPEG of 3 Mpx has this
+INLINE_AFTER = 8  # consecutive frames within INLINE_MAX_MS before the event loop runs the engine
 logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
 class LoadedEngine:
-    """An engine and the members of every answer that name it."""
+    """An engine, and the members of every answer that identify the engine and its model."""
 
     engine: Engine
     provenance: dict[str, str]
@@ -59,7 +59,7 @@ class LoadedEngine:
 
 @dataclass(frozen=True, slots=True)
 class StagedEngine:
-    """An engine that replaces the current one as soon as `is_committed()` is true."""
+    """An engine that replaces the current engine as soon as `is_committed()` is true."""
 
     loaded: LoadedEngine
     is_committed: Callable[[], bool]
@@ -68,8 +68,8 @@ class StagedEngine:
 class FrameQueue:
     """Processes frames with one engine, one at a time. Start it in a running event loop.
 
-    `submit` and `check_capacity` are for that loop's thread only. `stage_model` and
-    `drop_staged_model` may be called from any thread.
+    Call `submit` and `check_capacity` in this loop's thread only. `stage_model` and
+    `drop_staged_model` can be called in any thread.
     """
 
     def __init__(
@@ -80,13 +80,13 @@ class FrameQueue:
         capacity: int,
         single_core: bool = False,
     ) -> None:
-        """`capacity`: frames that may wait while one is processed.
+        """`capacity`: largest number of frames that wait while a frame is processed.
 
         `single_core`: the worker has no second core for the thread.
         """
         self._current = LoadedEngine.of(engine)
         self._staged: StagedEngine | None = None
-        self._model_lock = threading.Lock()  # guards the two above, for a few instructions
+        self._model_lock = threading.Lock()  # for _current and _staged; held briefly
         self._warm_up = warm_up
         self._warm: Future[None] = Future()
         self._ready = False
@@ -95,13 +95,13 @@ class FrameQueue:
         self.single_core = single_core
         self._admission = Admission()
         self._waiting = FairQueue()
-        self._queue_lock = threading.Lock()  # guards the slots above, for a few instructions
+        self._queue_lock = threading.Lock()  # for _waiting; held briefly
         self._thread_busy = False  # the thread is processing a frame
-        self._dispatched = False  # the loop or the thread is about to look at the queue
+        self._dispatched = False  # the loop or the thread will check the queue
         self._wake_ups: SimpleQueue[bool] = SimpleQueue()  # True: frames wait; False: stop
         self._mean_frame_ms = 5.0
-        self._fast_engine: LoadedEngine | None = None  # that processed the latest frame, and
-        self._fast_frames = 0  # its latest frames in a row within INLINE_MAX_MS
+        self._fast_engine: LoadedEngine | None = None  # the engine of the latest frame
+        self._fast_frames = 0  # its latest consecutive frames within INLINE_MAX_MS
         self._thread = threading.Thread(target=self._run_thread, name="forward", daemon=True)
 
     @property
@@ -122,7 +122,7 @@ class FrameQueue:
         return self._waiting.count
 
     def start(self) -> None:
-        """Warm up the engine in the thread; `check_ready` reports when that is done."""
+        """Start the thread, which warms up the engine; `check_ready` raises until that is done."""
         self._loop = asyncio.get_running_loop()
         self._thread.start()
 
@@ -134,16 +134,19 @@ class FrameQueue:
             raise Problem(NOT_READY, "the model is warming up; ask again in a second")
         error = self._warm.exception()
         if error is not None:
-            raise Problem(NOT_READY, f"the model failed its check, no image is answered: {error}")
+            raise Problem(NOT_READY, f"the model failed its check; no image is answered: {error}")
 
     def stage_model(self, engine: Engine, is_committed: Callable[[], bool]) -> None:
-        """Switch to `engine`, warm and checked, at the first frame at which `is_committed()`."""
+        """Switch to `engine`, already warm and checked, once `is_committed()` returns True.
+
+        `is_committed` is called at each frame.
+        """
         with self._model_lock:
             self._promote_staged()
             self._staged = StagedEngine(LoadedEngine.of(engine), is_committed)
 
     def drop_staged_model(self) -> None:
-        """Discard a staged engine that is not committed."""
+        """Discard the staged engine, unless it is committed."""
         with self._model_lock:
             self._promote_staged()
             self._staged = None
@@ -154,35 +157,35 @@ class FrameQueue:
             self._current, self._staged = self._staged.loaded, None
 
     def on_warm(self, callback: Callable[[], None]) -> None:
-        """Call `callback`, in the engine's thread, once the engine has passed its check."""
+        """Call `callback` in the engine's thread once the engine has passed its check."""
         self._warm.add_done_callback(lambda warm: None if warm.exception() else callback())
 
     @property
     def full(self) -> bool:
-        """Whether a frame that replaces no other would be refused."""
+        """Whether a new frame would be refused if it replaces no queued frame."""
         return self._waiting.count + self._thread_busy > self._capacity
 
     @property
     def is_thread_behind(self) -> bool:
-        """Whether the queue is full, and the thread processes it."""
+        """Whether the queue is full while the thread processes a frame."""
         return self._thread_busy and self.full
 
     def refusal(self, client: str) -> Problem | None:
-        """The problem of a client's frame for which there is no room; None: there is room.
+        """The problem if the queue has no room for a client's frame, else None.
 
-        The same object for many frames: it must not be raised.
+        Many frames share this object, so it must not be raised.
         """
         if not self._has_no_room(client):
             return None
         return _shared_overloaded(*self._load())
 
     def check_capacity(self, client: str) -> None:
-        """Raise Problem when there is no room for a client's frame."""
+        """Raise Problem if the queue has no room for a client's frame."""
         if self._has_no_room(client):
             raise _overloaded(*self._load())
 
     def _has_no_room(self, client: str) -> bool:
-        """Whether the queue is full, and none of it gives way to a client's frame."""
+        """Whether the queue is full and no slot would be given up for a frame of `client`."""
         if not self.full:
             return False
         with self._queue_lock:
@@ -191,7 +194,7 @@ class FrameQueue:
     def submit(self, frame: Frame, on_result: ResultCallback) -> None:
         """Queue a frame; `on_result` is called on the loop with its result or its error.
 
-        Raises Problem at once where the queue is full or the engine is not ready.
+        Raises Problem at once if the queue is full or the engine is not ready.
         """
         self.check_ready()
         self._admission.note(frame.client, frame.stamp_ns)
@@ -210,7 +213,10 @@ class FrameQueue:
             self._streams.announce(frame.stream, frame.stamp_ns)
 
     def _enqueue(self, frame: Frame, on_result: ResultCallback) -> Callable[[], None] | None:
-        """Queue a frame; what refuses the one in whose place it is, if any. Raises Problem."""
+        """Queue a frame. Returns the function that refuses the frame it replaces, if there is one.
+
+        Raises Problem if the queue has no room.
+        """
         with self._queue_lock:
             superseded = self._supersede(frame, on_result) if frame.stream else None
             if superseded is not None:
@@ -225,12 +231,15 @@ class FrameQueue:
             self._waiting.append(slot)
             if not self._dispatched:
                 self._dispatched = True
-                # Not at once: first the loop reads all requests that have arrived.
+                # Later, so that the loop first reads all requests that have arrived.
                 self._loop.call_soon(self._dispatch)
             return None if last is None else partial(last.on_result, _overloaded(*self._load()))
 
     def _supersede(self, frame: Frame, on_result: ResultCallback) -> ResultCallback | None:
-        """Put a frame into its stream's slot; the callback of the older of the two, if any."""
+        """Put a frame into its stream's slot, unless a newer frame is in it.
+
+        Returns the callback of the superseded frame, None if the stream has no slot.
+        """
         slot = self._waiting.of_stream(frame.stream)
         if slot is None:
             return None
@@ -241,7 +250,7 @@ class FrameQueue:
         return superseded
 
     def _dispatch(self) -> None:
-        """Process a small frame here, on the loop, if it may be; leave all else to the thread."""
+        """Process one frame on the loop if the module's conditions hold; else wake the thread."""
         fast = self._fast_frames >= INLINE_AFTER and self.loaded is self._fast_engine
         inline = 0 < self._waiting.count <= (self._capacity + 1 if self.single_core else 1)
         if not (fast and inline and self._waiting.all_small):
@@ -256,7 +265,7 @@ class FrameQueue:
         slot.on_result(result)
 
     def _load(self) -> tuple[int, int]:
-        """How many frames wait, and the time in which they will be processed, ms."""
+        """The number of waiting frames, and the expected time to process them in ms."""
         waiting = self._waiting.count
         return waiting, max(1, round(self._mean_frame_ms * (waiting + 1)))
 
@@ -264,11 +273,11 @@ class FrameQueue:
         try:
             self._warm_up(self._current.engine)
         except tf.UserError as error:
-            logger.error("the model failed its check, no image is answered: %s", error)
+            logger.error("the model failed its check; no image is answered: %s", error)
             self._warm.set_exception(error)
             return
-        except Exception as error:  # any fault of a model must show in /readyz
-            logger.exception("the model failed its check, no image is answered")
+        except Exception as error:  # /readyz must report any fault of a model
+            logger.exception("the model failed its check; no image is answered")
             self._warm.set_exception(error)
             return
         self._ready = True
@@ -279,7 +288,7 @@ class FrameQueue:
                 self._loop.call_soon_threadsafe(slot.on_result, result)
 
     def _take_slot(self) -> Slot | None:
-        """The next slot for the thread; None: the queue is empty."""
+        """The next slot for the thread; None if the queue is empty."""
         with self._queue_lock:
             self._thread_busy = self._dispatched = self._waiting.count > 0
             return self._waiting.take() if self._dispatched else None
@@ -288,8 +297,8 @@ class FrameQueue:
         try:
             return self._infer(frame)
         except tf.UserError as error:
-            return error.with_traceback(None)  # its frames hold the body of the request
-        except Exception as error:  # reported to the client; the thread goes on
+            return error.with_traceback(None)  # the traceback keeps the request's body in memory
+        except Exception as error:  # reported to the client; the thread must not end
             logger.exception("a frame failed")
             return error
 
@@ -297,7 +306,7 @@ class FrameQueue:
         start = time.monotonic_ns()
         if frame.deadline_ns is not None and start > frame.deadline_ns:
             late_ms = (start - frame.deadline_ns) / 1e6
-            raise Problem(DEADLINE_PASSED, f"it was due {late_ms:.1f} ms after its deadline")
+            raise Problem(DEADLINE_PASSED, f"its turn came {late_ms:.1f} ms after its deadline")
         if frame.stream and self._streams.is_superseded(frame.stream, frame.stamp_ns):
             raise Problem(SUPERSEDED, "a newer frame of this stream arrived")
         with self._model_lock:
@@ -325,7 +334,7 @@ class FrameQueue:
         )
 
     def close(self) -> None:
-        """Process the frames that wait, then end the thread."""
+        """Process the waiting frames, then end the thread."""
         for frames_wait in (True, False):
             self._wake_ups.put(frames_wait)
         self._thread.join()
@@ -334,7 +343,7 @@ class FrameQueue:
 def _overloaded(waiting: int, wait_ms: int) -> Problem:
     return Problem(
         OVERLOADED,
-        f"{waiting} frames are waiting; send this one or a newer one later, or start the "
+        f"{waiting} frames are waiting; send this frame or a newer one later, or start the "
         "service with more --workers",
         wait_ms,
     )
@@ -344,7 +353,7 @@ _shared_overloaded = lru_cache(64)(_overloaded)
 
 
 def _after(done: Callable[[], None], on_result: ResultCallback) -> ResultCallback:
-    """`on_result`, called after `done`."""
+    """A callback that calls `done`, then `on_result`."""
 
     def call(result: FrameResult | Exception) -> None:
         done()

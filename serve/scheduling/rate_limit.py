@@ -1,7 +1,7 @@
-"""Rate limit of each client address: a token bucket, shared by all workers.
+"""Rate limit for each client address: a token bucket, shared by all workers.
 
-The buckets lie in shared memory without a lock: two workers at once may count two requests as one,
-so a client may get slightly more than its rate and never less.
+The buckets are in shared memory without a lock. Two workers can count two simultaneous requests as
+one, so a client can get slightly more than its rate, but never less.
 """
 
 import time
@@ -16,10 +16,10 @@ from serve.workers.shared_memory import CLIENT_ENTRIES, CLIENT_WORDS, PROBES
 
 @lru_cache(4096)
 def client_key(address: str, public: bool = False) -> float:
-    """The key of a client address, never 0 and exact as a real; 0 for this machine.
+    """The key of a client address: an integer above 0, exact as a float; 0.0 for this machine.
 
-    A client has the whole /64 of its IPv6 address, so that is one client. `public`: its key for
-    paths that need no token.
+    All addresses of an IPv6 /64 network are one client. `public`: the key for paths that need no
+    token.
     """
     if not address or is_loopback(address):
         return 0.0
@@ -29,18 +29,18 @@ def client_key(address: str, public: bool = False) -> float:
 
 
 class RateLimiter:
-    """The buckets of all clients: (key, tokens left, time of the last update in s)."""
+    """The buckets of all clients: (key, remaining tokens, time of the last update in s)."""
 
     def __init__(self, cells: "memoryview[float]", per_second: float) -> None:
         self._cells = cells
         self._rate = per_second
-        self._burst = max(1.0, per_second)  # below one a second, a bucket still holds a request
+        self._burst = max(1.0, per_second)  # a rate below 1/s must still allow a request
 
     def check(self, address: str, now: float | None = None, public: bool = False) -> None:
-        """Count a request of a client; raise Problem when it exceeds its rate.
+        """Count a request of a client; raise Problem if the client exceeds its rate.
 
-        `public`: for a path that needs no token. Those are counted apart: whoever floods /features
-        from behind the address of a probe does not make the probe fail.
+        `public`: the path needs no token. These paths have a separate bucket, so that a client
+        that floods /features does not make a load balancer's probe from the same address fail.
         """
         key = client_key(address, public)
         if key == 0.0 or self._rate <= 0:
@@ -53,14 +53,14 @@ class RateLimiter:
             cells[at + 1] = left
             raise Problem(
                 RATE_LIMITED,
-                f"this client sends more than {self._rate:g} requests a second; send fewer, or "
+                f"this client sends more than {self._rate:g} requests per second; send fewer, or "
                 "start the service with a higher --rate",
                 1e3 * (1.0 - left) / self._rate,
             )
         cells[at + 1] = left - 1.0
 
     def _bucket(self, key: float, now: float) -> int:
-        """Index of the client's bucket; a new client gets a full one, in the oldest entry."""
+        """Index of the client's bucket; a new client gets a full bucket in place of the oldest."""
         cells = self._cells
         first = int(key) % CLIENT_ENTRIES
         indices = [(first + n) % CLIENT_ENTRIES * CLIENT_WORDS for n in range(PROBES)]

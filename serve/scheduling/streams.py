@@ -1,8 +1,8 @@
-"""The newest frame of each stream, over all workers.
+"""The newest frame of each stream, in a table shared by all workers.
 
 A frame's stamp is the time at which its request began, in ns of the machine's monotonic clock,
-which is the same for all processes. A queued frame is announced; a frame is superseded when its
-stream has a later stamp.
+which all processes share. Queued frames are announced with their stamp; a frame is superseded if a
+later stamp was announced for its stream.
 """
 
 from functools import lru_cache
@@ -10,12 +10,12 @@ from hashlib import blake2b
 
 from serve.workers.shared_memory import PROBES, STREAM_ENTRIES, STREAM_WORDS
 
-EXPIRY_NS = 10_000_000_000  # longer than any frame waits; then another stream may take the entry
+EXPIRY_NS = 10_000_000_000  # then another stream can use the entry; no frame waits so long
 
 
 @lru_cache(4096)
 def stream_key(client: str, name: str) -> int:
-    """The key of a client's stream, never 0. Streams of two clients are never the same."""
+    """The key of a client's stream, never 0. Equal names of two clients are different streams."""
     digest = blake2b(f"{client}\0{name}".encode(), digest_size=8).digest()
     return int.from_bytes(digest, "big") | 1
 
@@ -27,13 +27,13 @@ class StreamTable:
         self._cells = cells
 
     def announce(self, key: int, stamp_ns: int) -> None:
-        """Record a queued frame. Nothing is recorded where the table has no free entry."""
+        """Record a queued frame, unless the table has no free entry for its stream."""
         cells = self._cells
         free = -1
         for at in _indices(key):
             if cells[at] == key:
-                # Two workers at once may lose one of two stamps: then an old frame is answered,
-                # which does no harm.
+                # No lock: of two simultaneous stamps one can be lost. Then an old frame is
+                # answered, which is harmless.
                 if cells[at + 1] < stamp_ns:
                     cells[at + 1] = stamp_ns
                 return

@@ -1,1 +1,1 @@
-"""The HTTP server that runs inside one worker process: its connections, built on uvicorn."""
+"""The HTTP server of one worker process and its connections, built on uvicorn."""

@@ -1,8 +1,9 @@
-"""HTTP connections with deadlines, a limit on their number, and a limit on the size of headers.
+"""HTTP connections with deadlines, and limits for their number and for the size of headers.
 
-uvicorn's protocol on httptools, with a deadline for each phase of a connection. `close_expired`
-checks them ten times a second, so that a request costs a few assignments. Trailers count as headers
-and are dropped. An upgrade to anything but WebSocket is ignored, as RFC 9110 (7.8) allows.
+This is uvicorn's httptools protocol, extended by a deadline for each phase of a connection.
+`close_expired` checks the deadlines ten times per second, so a deadline costs a request only a few
+assignments. Trailers count as headers and are dropped. An upgrade to anything but WebSocket is
+ignored, as RFC 9110 (7.8) allows.
 """
 
 import asyncio
@@ -32,11 +33,13 @@ from serve.server.lingering_close import LingeringTransport
 from serve.server.upgrade import UPGRADE_HEADERS, repeat_head
 from serve.server.websocket import GuardedWebSocket
 
-WORK_S = 2e-3 * MAX_DEADLINE_MS  # after which an answer that is not sent never will be
-MAX_PIPELINED = 16  # requests of one connection that wait for the reply to another
-MAX_AT_ONCE = 32  # requests received in one part: more would hold the event loop
-MAX_UPGRADES = 4  # offered in one part
-FREE_CHUNKS, CHUNK_BYTES = 512, 512  # of a body; one chunk more for each CHUNK_BYTES received
+# Below, a part means the bytes of one read from the socket.
+WORK_S = 2e-3 * MAX_DEADLINE_MS  # longest time for an answer: twice the longest deadline
+MAX_PIPELINED = 16  # requests of one connection that wait for the reply to an earlier one
+MAX_AT_ONCE = 32  # requests in one part; more would block the event loop
+MAX_UPGRADES = 4  # upgrade requests in one part
+# A body can have FREE_CHUNKS chunks, and one more for each CHUNK_BYTES received.
+FREE_CHUNKS, CHUNK_BYTES = 512, 512
 
 
 class Phase(Enum):
@@ -57,63 +60,65 @@ class GuardedProtocol(HttpToolsProtocol):
         self._guard = guard
         self.group: Group = {}
         self.network = ""
-        self.since_s = 0.0  # when this phase began
+        self.since_s = 0.0  # start of this phase
         self._phase = Phase.HEAD
-        self._settled: Phase | None = None  # the phase whose group and deadline it has
+        self._settled: Phase | None = None  # the phase for which group and deadline are set
         self._deadline_s = inf
         self._idle_group = guard.idle
         self._upgrading = False
         self._running: Any = None  # the request being answered; `cycle` is the last one received
-        self._fault: Problem | None = None  # with which a callback has stopped the parser
-        self._body_lingers = False  # its last reply was sent before the end of the request
+        self._fault: Problem | None = None  # why a callback has stopped the parser
+        self._body_lingers = False  # the last reply was sent before the request's end arrived
         self._trailer_bytes = self._chunks = 0
-        self._part_bytes = self._part_requests = 0  # received last
-        # Received since the last complete request, with the part in which that request ended.
+        self._part_bytes = self._part_requests = 0  # of the latest part
+        # Bytes since the last complete request, including the part in which that request ended.
         self._unread_bytes = 0
-        self._known_bytes = 0  # of these, up to the part with the last byte of a body
+        self._known_bytes = 0  # of `_unread_bytes`, those up to the latest part with body bytes
 
     @property
     def lingers(self) -> bool:
-        """Whether its last reply is sent, and the client has still to close it."""
+        """Whether the last reply was sent and the client has not closed the connection yet."""
         return self._phase is Phase.CLOSING and not self.transport.is_closing()
 
     def begin_draining(self) -> None:
-        """Make the reply to the last request received the last one."""
+        """Close the connection after the reply to the request in progress, if there is one."""
         if self.cycle is not None and not self.cycle.response_complete:
             self.close_after_reply()
 
     def drain(self, elapsed_s: float) -> bool:
-        """Close it once it has been idle until DRAIN_S; whether nothing is owed to its client."""
+        """Close the connection if it has been idle for DRAIN_S. Returns whether nothing is owed to
+        its client any more."""
         idle = self._phase is Phase.IDLE or (self._phase is Phase.HEAD and not self._unread_bytes)
-        # An answer that was sent before this began did not say that it was the last one.
+        # Answers sent before draining began had no "Connection: close", so the client can send
+        # one more request.
         if idle and min(elapsed_s, self._guard.clock() - self.since_s) >= guards.DRAIN_S:
             self.linger()
         return self._phase is Phase.CLOSING and not (self._body_lingers and self.lingers)
 
     def end_draining(self) -> None:
-        """Refuse a request that is incomplete or unanswered."""
+        """Refuse an incomplete or unanswered request, and close the connection."""
         if self._phase is not Phase.CLOSING:
             self._close_with(stopping())
 
     def close_after_reply(self) -> None:
-        """Make the reply to the last request received the last one of this connection."""
+        """Close the connection after the reply to the latest received request."""
         self.cycle.keep_alive = False
         if isinstance(self.cycle, RequestResponseCycle):
             self.cycle.transport = LingeringTransport(self)  # type: ignore[assignment]
 
     def end(self) -> None:
-        """Close it after its last reply; the client closes first where it may still be sending."""
+        """Close after the last reply; with a lingering close if the client can still be sending."""
         lingers = self._guard.draining or self._phase is Phase.BODY
         (self.linger if lingers else self.transport.close)()
 
     def linger(self) -> None:
-        """Send no more, and read until the client closes the connection.
+        """Send no more, but read until the client closes the connection.
 
-        A connection that is closed with unread bytes is reset, and the client loses the reply.
+        Closing a connection with unread bytes resets it, and the client loses the reply.
         """
-        self._body_lingers = self._phase is Phase.BODY  # the client may first send all of it
+        self._body_lingers = self._phase is Phase.BODY  # the client can still send all of the body
         self._phase = Phase.CLOSING
-        self.pipeline.clear()  # the client knows by "Connection: close" that they are not answered
+        self.pipeline.clear()  # "Connection: close" implies that these requests get no answer
         now = self._guard.place(self, self._guard.refused)
         unsent = self.transport.get_write_buffer_size()
         limits = self._guard.limits
@@ -150,7 +155,7 @@ class GuardedProtocol(HttpToolsProtocol):
         except HttpParserError:
             if self._phase is not Phase.CLOSING:
                 self.send_400_response("")
-        # Headers and trailers that have not ended yet are counted as they arrive.
+        # Incomplete headers and trailers are counted as they arrive.
         excess = self._unread_bytes - self._known_bytes > MAX_HEAD_BYTES
         if excess and self._phase is not Phase.CLOSING:
             self._close_with(head_too_large())
@@ -158,7 +163,8 @@ class GuardedProtocol(HttpToolsProtocol):
             self._settle()
 
     def _feed(self, data: bytes) -> int | None:
-        """Parse; the offset of what follows the headers of a request with an upgrade, or None."""
+        """Parse `data`. Returns the offset after the headers of a request with an upgrade, or None
+        if there is no such request."""
         try:
             self.parser.feed_data(data)
         except HttpParserUpgrade as upgrade:
@@ -166,7 +172,7 @@ class GuardedProtocol(HttpToolsProtocol):
         return None
 
     def _feed_again(self, rest: bytes) -> None:
-        """Parse the rest of a part after the headers of a request with an upgrade."""
+        """Parse the bytes that follow the headers of a request with an upgrade."""
         for _ in range(MAX_UPGRADES):
             rest = self._upgrade(rest)
             upgrade_at = self._feed(rest) if rest else None
@@ -182,20 +188,20 @@ class GuardedProtocol(HttpToolsProtocol):
             super().on_header(name, value)
 
     def drop_trailer(self, name: bytes, value: bytes) -> None:
-        """Count a trailer. Raises ValueError, for the parser, when they are too large."""
+        """Count a trailer. Stops the parser with ValueError if the trailers are too large."""
         self._trailer_bytes += len(name) + len(value)
         if self._trailer_bytes > MAX_HEAD_BYTES:
             self.stop_parser(head_too_large())
 
     def begin_body(self) -> None:
-        """Wait for the body. Raises ValueError, for the parser, on too large headers."""
+        """Begin the body phase. Stops the parser with ValueError if the headers are too large."""
         if self._unread_bytes > MAX_HEAD_BYTES:
             self._check_head_size()
         self._trailer_bytes = self._chunks = 0
         self._phase = Phase.BODY
 
     def begin_upgrade(self) -> None:
-        """Leave a request that asks for an upgrade to `_upgrade`."""
+        """Mark the request for `_upgrade`, which handles it after the parser has returned."""
         self._check_head_size()
         self._upgrading = True
 
@@ -211,7 +217,7 @@ class GuardedProtocol(HttpToolsProtocol):
             self.close_after_reply()
 
     def on_chunk_header(self) -> None:
-        """Count the chunks of a body. Raises ValueError, for the parser, when they are too many."""
+        """Count a chunk of a body. Stops the parser with ValueError if there are too many."""
         self._chunks += 1
         if self._chunks > FREE_CHUNKS + self._unread_bytes // CHUNK_BYTES:
             self.stop_parser(small_chunks(CHUNK_BYTES))
@@ -221,7 +227,7 @@ class GuardedProtocol(HttpToolsProtocol):
         super().on_body(body)
 
     def on_body_complete(self) -> None:
-        """Wait for the answer, unless it was sent."""
+        """Begin the work phase, or the idle phase if the answer was already sent."""
         if self._phase is Phase.CLOSING:
             self._body_lingers = False
             self._deadline_s = min(self._deadline_s, self._guard.clock() + guards.LINGER_S)
@@ -248,7 +254,7 @@ class GuardedProtocol(HttpToolsProtocol):
 
     def pause_writing(self) -> None:
         super().pause_writing()
-        # As long as an idle connection has; one that was refused has less already.
+        # The time of an idle connection; a refused connection already has an earlier deadline.
         self._deadline_s = min(self._deadline_s, self._guard.clock() + self._guard.limits.idle_s)
 
     def resume_writing(self) -> None:
@@ -261,11 +267,11 @@ class GuardedProtocol(HttpToolsProtocol):
         self._guard.forget(self)
         self.abandon_requests()
         super().connection_lost(exc)
-        self.pipeline.clear()  # its requests hold this connection
+        self.pipeline.clear()  # its requests reference this connection
         self.cycle = self._running = None  # type: ignore[assignment]
 
     def abandon_requests(self) -> None:
-        """Let go of the requests that nobody waits for any more."""
+        """Mark the unfinished requests as disconnected, since no client waits for them."""
         for cycle in (self._running, self.cycle):
             if cycle is not None and not cycle.response_complete:
                 cycle.disconnected = True
@@ -277,14 +283,14 @@ class GuardedProtocol(HttpToolsProtocol):
         super()._start_asgi_task(cycle, app)
 
     def _settle(self) -> None:
-        """Join the group of this phase, and set its deadline."""
+        """Move to the group of the current phase, and set the phase's deadline."""
         guard, limits, phase = self._guard, self._guard.limits, self._phase
         self._settled = phase
         if phase is Phase.IDLE:
             self._deadline_s = guard.place(self, self._idle_group) + limits.idle_s
         elif phase is Phase.WORK:
             end_s = guard.place(self, guard.working) + WORK_S
-            # A client that does not read has no more time for asking again.
+            # A client that does not read its replies gets no more time by further requests.
             self._deadline_s = min(end_s, self._deadline_s) if self.flow.write_paused else end_s
         elif phase is Phase.BODY:
             self._deadline_s = guard.place(self, guard.receiving) + limits.body_s
@@ -297,12 +303,13 @@ class GuardedProtocol(HttpToolsProtocol):
             self.stop_parser(head_too_large())
 
     def stop_parser(self, fault: Problem) -> None:
-        """Raise ValueError, for the parser: the request ends with this problem."""
+        """Stop the parser with ValueError; the request ends with the problem `fault`."""
         self._fault = fault
-        raise ValueError(fault.detail)  # ends in `send_400_response`
+        raise ValueError(fault.detail)  # httptools' error leads to `send_400_response`
 
     def _upgrade(self, rest: bytes) -> bytes:
-        """Become a WebSocket; else the request without its upgrade, to be parsed again."""
+        """Hand over to a WebSocket, or refuse, and return b"". For another upgrade, return the
+        request without the upgrade headers, followed by `rest`, to be parsed again."""
         self._upgrading = False
         if self.parser.get_method() == b"CONNECT":
             self.send_400_response("")
@@ -312,7 +319,7 @@ class GuardedProtocol(HttpToolsProtocol):
             self.parser.set_dangerous_leniencies(lenient_data_after_close=True)
             return head + rest
         elif rest or not (self.cycle is None or self.cycle.response_complete):
-            detail = "a WebSocket handshake must wait for its reply, and for those before it"
+            detail = "send a WebSocket handshake after all earlier replies, and no bytes behind it"
             self._close_with(Problem(MALFORMED, detail))
         elif self._guard.draining:
             self._close_with(stopping())
@@ -327,7 +334,7 @@ class GuardedProtocol(HttpToolsProtocol):
         )
 
     def handle_websocket_upgrade(self) -> None:
-        """Hand the connection over to a WebSocket."""
+        """Hand the connection over to a `GuardedWebSocket`."""
         head = self._repeated_head()
         self.connections.discard(self)
         self._phase, self._deadline_s = Phase.CLOSING, inf
@@ -339,20 +346,20 @@ class GuardedProtocol(HttpToolsProtocol):
         websocket.connection_made(self.transport)
         self.transport.set_protocol(websocket)
         websocket.data_received(head)
-        self.parser = None  # type: ignore[assignment]  # it holds this object
+        self.parser = None  # type: ignore[assignment]  # breaks a reference cycle
 
     def send_400_response(self, msg: str) -> None:
         detail = "the bytes received are not an HTTP/1.1 request"
         self._close_with(self._fault or Problem(MALFORMED, detail))
 
     def give_way(self) -> None:
-        """Close an idle connection after what it was sent; abort any other."""
+        """Close an idle connection after its unsent bytes; abort a connection in another phase."""
         idle = self._phase is Phase.IDLE
         self._phase, self._deadline_s = Phase.CLOSING, self._guard.clock() + guards.LINGER_S
         (self.transport.close if idle else self.transport.abort)()
 
     def end_slow_body(self, now: float) -> int:
-        """Refuse a body that has been arriving for long; the bytes that it held."""
+        """Refuse a body that has been arriving for EVICTABLE_S; returns the bytes it held."""
         if self._phase is not Phase.BODY or now - self.since_s < guards.EVICTABLE_S:
             return 0
         held = 0 if self.cycle is None or self.cycle.response_complete else self._unread_bytes
@@ -360,7 +367,7 @@ class GuardedProtocol(HttpToolsProtocol):
         return held
 
     def expire(self, now: float) -> None:
-        """Close the connection when its deadline has passed."""
+        """Close the connection if its deadline has passed."""
         if now < self._deadline_s:
             return
         phase, limits = self._phase, self._guard.limits
@@ -371,18 +378,19 @@ class GuardedProtocol(HttpToolsProtocol):
         else:
             self._phase, self._deadline_s = Phase.CLOSING, inf
             self._guard.place(self, self._guard.closing)
-            # Close would wait for a client that does not read its answer.
+            # `close` would wait for a client that does not read its answer.
             idle = phase is Phase.IDLE and not self.transport.get_write_buffer_size()
             (self.transport.close if idle else self.transport.abort)()
 
     def _close_with(self, problem: Problem) -> None:
-        """Send a problem and close the connection; where a reply is owed, send that instead."""
+        """Send a problem and close. If a reply to an earlier request is owed, send that reply
+        instead."""
         owed = self._running if self.pipeline or self._phase is Phase.WORK else None
         self._phase = Phase.CLOSING
         now = self._guard.place(self, self._guard.refused)
         self._deadline_s = now + guards.LINGER_S
         self._guard.count_closed(problem.type)
-        if owed is not None:  # the client would take the problem for that reply
+        if owed is not None:  # the client would take the problem for this reply
             self.pipeline.clear()
             self.cycle = owed
             owed.keep_alive = False
@@ -391,7 +399,7 @@ class GuardedProtocol(HttpToolsProtocol):
         self.abandon_requests()
         if self.transport.is_closing():
             return
-        url = getattr(self, "url", b"").decode("latin-1")  # none before the first request
+        url = getattr(self, "url", b"").decode("latin-1")  # unset before the first request
         reply = problem_reply(problem, (b"connection", b"close"), path=url)
         self.transport.write(encode_head(reply) + reply.body)
-        self.transport.write_eof()  # aborted at once, a client still sending would lose the reply
+        self.transport.write_eof()  # an abort would lose the reply of a client still sending

@@ -1,8 +1,8 @@
-"""POST /features from the HTTP parser to its reply without ASGI: no scope, no task, no messages.
+"""Handles POST /features without ASGI (no scope, no task, no messages), from parser to reply.
 
-ASGI would cost more than everything else that a request needs beside the model. All other requests
-go through ASGI, and so do requests for this path with an upgrade, with "Expect: 100-continue",
-with X-Forwarded-For, or pipelined before the reply to the previous one.
+ASGI would cost more than all other work of a request besides the model. ASGI handles all other
+requests, and POST /features with an upgrade, with "Expect: 100-continue", with X-Forwarded-For, or
+pipelined before the reply to the previous request.
 """
 
 from functools import partial
@@ -17,22 +17,23 @@ from serve.app import Service
 from serve.server.connection import MAX_AT_ONCE, GuardedProtocol, Phase
 
 CLOSE_HEADER: Header = (b"connection", b"close")
-SMALL_BYTES = 1024  # smaller parts of a body are put together: an object each would take more
-TOGETHER_BYTES = 1 << 16  # of them in one object: a longer one is moved as it grows
+SMALL_BYTES = 1024  # smaller parts of a body are joined: one object for each needs more memory
+TOGETHER_BYTES = 1 << 16  # size at which a joined object ends: growing a long one copies it
 BODY, CLOSING = Phase.BODY, Phase.CLOSING
 OK, UNAVAILABLE = HTTPStatus.OK.value, HTTPStatus.SERVICE_UNAVAILABLE.value
 ASGI_HEADERS = frozenset({b"expect", b"upgrade", b"x-forwarded-for"})
 
 
 class NullEvent:
-    """An event that nothing waits for."""
+    """An event without waiting tasks."""
 
     def set(self) -> None:
         """Do nothing."""
 
 
 class DirectRequest:
-    """A request in progress, with the attributes of uvicorn's RequestResponseCycle that it uses."""
+    """A request in progress. It has the attributes that uvicorn reads from a
+    RequestResponseCycle."""
 
     __slots__ = (
         "disconnected",
@@ -51,7 +52,7 @@ class DirectRequest:
         self.parts: list[bytes | bytearray] = []
 
     def add(self, part: bytes) -> None:
-        """Add a part of the body, unless the request was refused."""
+        """Append a part of the body, unless the request was refused."""
         if self.features is None:
             return
         try:
@@ -69,14 +70,14 @@ class DirectRequest:
             self.parts.append(bytearray(part))
 
     def drop(self) -> None:
-        """Let go of the body, and of what would reply: that and this object hold each other."""
+        """Drop the body, and `features`: the two objects reference each other."""
         if self.features is not None:
             self.features.abandon()
         self.features = None
         self.parts.clear()
 
     def submit(self) -> None:
-        """Hand over the complete body, unless the request was refused."""
+        """Submit the complete body, unless the request was refused."""
         parts, self.parts = self.parts, []
         if self.features is not None:
             self.features.submit(bytes(parts[0]) if len(parts) == 1 else b"".join(parts))
@@ -91,7 +92,7 @@ class DirectProtocol(GuardedProtocol):
         self._request: DirectRequest | None = None
 
     def on_message_begin(self) -> None:
-        if self._phase is CLOSING:  # the last reply was sent while a part was parsed
+        if self._phase is CLOSING:  # the last reply was sent while this part was parsed
             raise ValueError
         self._part_requests += 1
         if self._part_requests > MAX_AT_ONCE:
@@ -155,11 +156,11 @@ class DirectProtocol(GuardedProtocol):
             and (self.cycle is None or self.cycle.response_complete)
             and self.parser.get_http_version() == "1.1"
             and headers.keys().isdisjoint(ASGI_HEADERS)
-            and len(headers) == len(self.headers)  # none was sent twice
+            and len(headers) == len(self.headers)  # no name occurs twice
         )
 
     def _build_scope(self) -> None:
-        """Build the ASGI scope as uvicorn does while it parses a request."""
+        """Build the ASGI scope that uvicorn builds while it parses a request."""
         url, headers = self.url, self.headers
         super().on_message_begin()
         self.url = url
@@ -168,7 +169,7 @@ class DirectProtocol(GuardedProtocol):
 
     def _reply(self, request: DirectRequest, reply: Reply) -> None:
         request.response_complete = True
-        request.features = None  # breaks a reference cycle: it holds this method
+        request.features = None  # breaks a reference cycle
         if request.disconnected or self.transport.is_closing():
             return
         headers = self.server_state.default_headers
@@ -180,7 +181,7 @@ class DirectProtocol(GuardedProtocol):
         if reply.status == OK:
             self._idle_group = self._guard.served
         self.on_response_complete()
-        if self.flow.write_paused:  # a client that reads no replies may send no more requests
+        if self.flow.write_paused:  # no more requests from a client that reads no replies
             self.flow.pause_reading()
         elif reply.status == UNAVAILABLE and self._service.frame_queue.is_thread_behind:
             self._guard.pause_reading(self)

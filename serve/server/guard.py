@@ -1,10 +1,10 @@
-"""What the connections of one worker share: limits, deadlines' clock, and who gives way to whom.
+"""What the connections of one worker share: limits, a clock, and the choice of connections to end.
 
-Each connection is in one group, by what it waits for; within a group those that have waited for
-longest come first. While the service has as many connections as it takes, a new one ends another:
-one that was refused and lingers, one that sends its request slowly, the one that has been idle for
-longest, a WebSocket without messages. One whose last image was answered goes after those that have
-sent none. A client with many connections cannot end those of one with fewer; it gives way to it.
+Each connection is in one group, according to what it waits for; a group is ordered by the time of
+waiting, longest first. If the number of connections is at its limit, a new connection ends an old
+one, in this order: refused connections that linger, requests that arrive slowly, connections idle
+for longest (first those that never had an image answered), WebSockets without messages. A new
+connection never ends one of a client that has fewer connections than its own client.
 """
 
 import time
@@ -20,45 +20,46 @@ from serve.api.problems import TOO_MANY_CONNECTIONS, ProblemType
 from serve.config import Limits, network_of
 from serve.scheduling.body_budget import BodyBudget
 
-LINGER_S = 0.5  # for a client to read the problem before its connection is closed
-DRAIN_S = 1.0  # for clients to send one more request, answered with Connection: close
-EVICTABLE_S = 0.1  # connections in headers or a body for longer give way to new ones
-REFUSAL_PAUSE_S = 0.002  # for which refused clients are not read while the queue is full
+LINGER_S = 0.5  # time for a client to read the problem before its connection is closed
+DRAIN_S = 1.0  # time for clients to send one more request, answered with Connection: close
+EVICTABLE_S = 0.1  # headers or a body that take longer are ended in favour of new connections
+REFUSAL_PAUSE_S = 0.002  # pause in reading from refused clients while the queue is full
 
 
 class Guarded(Protocol):
-    """A connection as its guard sees it."""
+    """The interface of a connection for `ConnectionGuard`."""
 
     since_s: float
     group: "Group"
     network: str
-    """Of its client; empty for a trusted proxy, which has many clients."""
+    """The client's network; empty for a trusted proxy, which has many clients."""
 
     def give_way(self) -> None:
-        """End the connection: a new one needs its place."""
+        """End the connection to make room for a new one."""
 
     def expire(self, now: float) -> None:
         """End the connection if its deadline has passed."""
 
     def end_slow_body(self, now: float) -> int:
-        """End the connection if a body has been arriving for EVICTABLE_S; the bytes it held."""
+        """End the connection if a body has been arriving for EVICTABLE_S; returns its bytes."""
 
 
 @runtime_checkable
 class Drained(Protocol):
-    """A connection as a worker that stops sees it."""
+    """The interface of a connection for a worker that stops."""
 
     lingers: bool
-    """Its last bytes are sent; the client has still to close it."""
+    """Whether the last bytes were sent and the client has not closed the connection yet."""
 
     def begin_draining(self) -> None:
-        """Say with the next reply that it is the last one."""
+        """Announce in the next reply that it is the last one."""
 
     def drain(self, elapsed_s: float) -> bool:
-        """Close it if nothing is owed to the client, `elapsed_s` after that; whether that is so."""
+        """Close the connection if nothing is owed to its client, `elapsed_s` after
+        `begin_draining`. Returns whether nothing is owed."""
 
     def end_draining(self) -> None:
-        """End it, with a reply to what is still owed."""
+        """End the connection; refuse the requests that are still unanswered."""
 
 
 Group = dict[Guarded, None]
@@ -74,44 +75,44 @@ class ConnectionGuard:
 
     limits: Limits
     other_connections: Callable[[], int] = lambda: 0
-    """Counts the connections of the other workers."""
+    """Returns the number of connections of the other workers."""
     ask_for_room: Callable[[int], None] = lambda _least: None
-    """Asks another worker to end a connection; `least` as in `make_room`."""
+    """Asks another worker to end a connection; its argument is `least` of `make_room`."""
     count_closed: Callable[[ProblemType], None] = lambda _type: None
     bodies: BodyBudget | None = None
-    """The budget for messages of WebSockets that are incomplete; None: there is none."""
+    """The budget for incomplete WebSocket messages; None: no budget."""
     reading: Guarded | None = None
-    """The connection that received something last."""
+    """The connection that received bytes last."""
     clock: Callable[[], float] = time.monotonic
-    """Time for the deadlines, s."""
+    """Returns the time for the deadlines in s."""
     draining: bool = False
     receiving: Group = field(default_factory=_group)
-    """In the middle of headers or a body."""
+    """Connections that are receiving headers or a body."""
     working: Group = field(default_factory=_group)
-    """Waiting for an answer."""
+    """Connections that wait for an answer."""
     idle: Group = field(default_factory=_group)
-    """Between requests, without an image that was answered."""
+    """Connections between requests for which no image was answered yet."""
     served: Group = field(default_factory=_group)
-    """Between requests, after an image that was answered."""
+    """Connections between requests for which an image was answered."""
     streams: Group = field(default_factory=_group)
-    """WebSockets, by their last message."""
+    """WebSockets, ordered by their last message."""
     refused: Group = field(default_factory=_group)
-    """Refused, and open for LINGER_S only so that the client can read why."""
+    """Refused connections, open for LINGER_S so that the client can read the reason."""
     closing: Group = field(default_factory=_group)
-    """Ended, but still counted by the server for a moment."""
+    """Ended connections that the server still counts for a moment."""
     open: Counter[str] = field(default_factory=Counter)
-    """Connections by the network of their client."""
+    """Number of connections of each client's network."""
     paused: list[HttpToolsProtocol] = field(default_factory=list)
-    """Connections that are not read because they were refused while the queue is full."""
+    """Connections that are not read for REFUSAL_PAUSE_S; see `pause_reading`."""
 
     def admit(self, connection: Guarded, address: str) -> None:
-        """Count a new connection from an address."""
+        """Count a new connection from the client at `address`."""
         if not _is_any_of(address, self.limits.trusted_proxies):
             connection.network = network_of(address)
             self.open[connection.network] += 1
 
     def place(self, connection: Guarded, group: Group) -> float:
-        """Move a connection to the end of a group; the time, s."""
+        """Move a connection to the end of a group; returns the time in s."""
         connection.group.pop(connection, None)
         connection.group = group
         group[connection] = None
@@ -119,7 +120,7 @@ class ConnectionGuard:
         return now
 
     def forget(self, connection: Guarded) -> None:
-        """Let go of a connection that has ended."""
+        """Remove a connection that has ended."""
         connection.group.pop(connection, None)
         if self.reading is connection:
             self.reading = None
@@ -129,7 +130,8 @@ class ConnectionGuard:
                 del self.open[connection.network]
 
     def make_room_for(self, newcomer: Guarded, excess: int) -> bool:
-        """End `excess` connections; False: not so many give way, and another worker is asked."""
+        """End `excess` connections. Returns False if fewer could be ended; then another worker is
+        asked to end one."""
         least = self._count(newcomer)
         made = self.make_room(excess, least)
         if not made:
@@ -137,10 +139,11 @@ class ConnectionGuard:
         return made
 
     def make_room(self, excess: int, least: int) -> bool:
-        """End `excess` connections, the least useful first; False: not so many give way.
+        """End `excess` connections in the order of the module's docstring; False if fewer could be
+        ended.
 
-        `least`: how many connections the newcomer's client has. Those of clients with fewer stay;
-        when all others are too young, those of clients with more are ended.
+        `least` is the number of connections of the newcomer's client. Clients with fewer
+        connections lose none. If all candidates are too young, clients with more lose young ones.
         """
         for group, age_s, count in (
             (self.refused, 0.0, 0),
@@ -156,7 +159,8 @@ class ConnectionGuard:
         return excess <= 0
 
     def _end_oldest(self, group: Group, most: int, age_s: float, count: int) -> int:
-        """End up to `most` connections of an age, and of clients with `count` or more; how many."""
+        """End up to `most` connections of the group that are at least `age_s` old and whose clients
+        have at least `count` connections; returns how many were ended."""
         now, ended = self.clock(), 0
         for connection in list(group):
             if ended == most or now - connection.since_s < age_s:
@@ -170,13 +174,15 @@ class ConnectionGuard:
         return ended
 
     def _count(self, connection: Guarded) -> int:
-        """How many connections its client has; a trusted proxy counts as many clients."""
+        """The number of connections of this connection's client. Behind a trusted proxy it is 1:
+        each connection can be another client's."""
         return self.open[connection.network] if connection.network else 1
 
     def end_slow_bodies(self, size: float) -> float:
-        """End connections whose bodies arrive slowly, until these held `size` bytes; how many.
+        """End connections whose bodies arrive slowly until they have freed `size` bytes; returns
+        the number of freed bytes.
 
-        Those of an ASGI request are free only when its task has noticed.
+        The bytes of an ASGI request become free later, when its task notices the end.
         """
         now, freed = self.clock(), 0
         for connection in (*self.receiving, *self.streams):
@@ -187,10 +193,10 @@ class ConnectionGuard:
         return freed
 
     def pause_reading(self, connection: HttpToolsProtocol) -> None:
-        """Read no more from a refused client for REFUSAL_PAUSE_S.
+        """Pause reading from a refused client for REFUSAL_PAUSE_S.
 
-        Its next request, and those of others refused meanwhile, are then handled together. Waking
-        the loop for each of them would take the core from the engine.
+        Then the next requests of all clients refused in this time are handled together. Waking the
+        loop for each request would take processor time from the engine.
         """
         if not self.paused:
             connection.loop.call_later(REFUSAL_PAUSE_S, self._resume_reading)
@@ -207,13 +213,13 @@ class ConnectionGuard:
 def _is_any_of(address: str, networks: Iterable[str]) -> bool:
     try:
         found = ip_address(address.partition("%")[0])
-    except ValueError:  # no address, as that of a Unix socket
+    except ValueError:  # not an IP address, e.g. of a Unix socket
         return False
     return any(found in ip_network(network, strict=False) for network in networks)
 
 
 def close_expired(connections: Iterable[object], now: float) -> None:
-    """Close the connections whose deadline has passed; `now` in s of the guard's clock."""
+    """Close the connections whose deadline has passed at `now`, in s of the guard's clock."""
     for connection in list(connections):
         expire = getattr(connection, "expire", None)
         if expire is not None:

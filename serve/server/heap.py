@@ -1,6 +1,6 @@
-"""Free memory of the C library's heap, given back to the system.
+"""Returns free memory of the C library's heap to the operating system.
 
-What hundreds of connections or some large images have used stays with the process otherwise.
+Otherwise the process keeps the memory that hundreds of connections or a few large images needed.
 """
 
 import ctypes
@@ -8,17 +8,17 @@ import os
 from functools import cache
 from pathlib import Path
 
-GROWTH_BYTES = 8 << 20  # of resident memory over its least, for which a trim is worth a try
+GROWTH_BYTES = 8 << 20  # growth of resident memory above its minimum that triggers a trim
 
 
 class HeapTrimmer:
-    """Trims the heap while resident memory is larger than it was."""
+    """Trims the heap if resident memory has grown by GROWTH_BYTES above its minimum."""
 
     def __init__(self) -> None:
         self._least_bytes = _resident_bytes()
 
     def __call__(self) -> None:
-        """Trim if there is anything to gain. Takes a few ms then; for a thread of its own."""
+        """Trim if memory has grown. A trim takes a few ms, so call it outside the event loop."""
         resident = _resident_bytes()
         self._least_bytes = min(self._least_bytes, resident)
         if resident - self._least_bytes >= GROWTH_BYTES:
@@ -26,7 +26,7 @@ class HeapTrimmer:
 
 
 def trim_heap() -> None:
-    """Return the free memory of the heap to the system, where the C library can (glibc)."""
+    """Return the heap's free memory to the system; no effect without `malloc_trim` (glibc)."""
     library = _c_library()
     if hasattr(library, "malloc_trim"):
         library.malloc_trim(0)
@@ -38,7 +38,7 @@ def _c_library() -> ctypes.CDLL:
 
 
 def _resident_bytes() -> int:
-    """Resident memory of this process; 0 where the system does not tell."""
+    """Resident memory of this process in bytes; 0 without /proc."""
     try:
         return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
     except OSError:

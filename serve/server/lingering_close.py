@@ -1,8 +1,6 @@
-"""A lingering close: after its last reply a connection sends no more, and reads until the client
-closes it.
+"""Lingering close: the server sends its last reply, then reads until the client closes.
 
-A connection that is closed with unread bytes is reset, and the client loses the reply (RFC 9112,
-9.6).
+Closing a connection with unread bytes resets it, and the client loses the reply (RFC 9112, 9.6).
 """
 
 import asyncio
@@ -15,23 +13,23 @@ class LingeringConnection(Protocol):
     transport: asyncio.Transport
 
     def end(self) -> None:
-        """Close it after its last reply; the client closes first where it may still be sending."""
+        """Close after the last reply; with a lingering close if the client can still be sending."""
 
 
 class LingeringTransport:
-    """The transport of a connection for its last reply: `close` may let the client close first."""
+    """The transport for a connection's last reply: its `close` calls the connection's `end`."""
 
     def __init__(self, connection: LingeringConnection) -> None:
         self._connection = connection
 
     def write(self, data: bytes) -> None:
-        """Send."""
+        """Send bytes."""
         self._connection.transport.write(data)
 
     def is_closing(self) -> bool:
-        """Whether the connection is closed or lost."""
+        """Whether the connection is closing, closed or lost."""
         return self._connection.transport.is_closing()
 
     def close(self) -> None:
-        """Send no more."""
+        """End the connection after what was written."""
         self._connection.end()

@@ -1,4 +1,4 @@
-"""The head of a request that asks for an upgrade, written again for another parser."""
+"""Serialises the head of a request with an upgrade again, to feed it to another parser."""
 
 from collections.abc import Iterable
 
@@ -12,8 +12,8 @@ def repeat_head(
     headers: Iterable[tuple[bytes, bytes]],
     ignore: frozenset[bytes] = frozenset(),
 ) -> bytes:
-    """The bytes of a request's head, less the headers of `ignore` (lower case), which are left out
-    of `Connection` too."""
+    """The bytes of a request's head without the headers in `ignore` (lower case), which are also
+    removed from the value of `Connection`."""
     lines = [b"%b %b HTTP/%b\r\n" % (method, url, version.encode())]
     for name, value in headers:
         if name == b"connection" and ignore:

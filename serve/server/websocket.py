@@ -1,10 +1,10 @@
-"""WebSockets with deadlines, and with bounds on what a client can make the service do or keep.
+"""WebSockets with deadlines, and with limits for the work and memory that a client can cause.
 
-uvicorn's protocol on the library websockets. A handshake that the library refuses is answered with
-a problem. A handshake, a message, and the reading of answers have deadlines. Small frames and text
-have a rate, since each costs as much as a large one: pings, fragments, messages of a few bytes.
-Messages count in the budget for bodies until the service takes them. A client that breaks a bound
-is told the reason in the close frame, for LINGER_S.
+This is uvicorn's protocol on the library websockets. A handshake that the library refuses is
+answered with a problem. The handshake, each message, and the reading of answers have deadlines.
+Small frames (pings, fragments, short messages) and texts have a rate limit, since each costs as
+much as a large frame. Messages count in the memory budget for bodies until the service takes them.
+A client that exceeds a limit gets the reason in the close frame, which it can read for LINGER_S.
 """
 
 from asyncio import Transport
@@ -32,11 +32,11 @@ from serve.scheduling.body_budget import BodyShare
 from serve.server import guard as guards
 from serve.server.guard import ConnectionGuard, Group
 
-SLICE_BYTES = 4096  # parsed before small frames are counted; holds hundreds of them
-SMALL_BYTES = 2048  # a frame of fewer is a small one
-SMALL_FRAMES = 500  # of these and of text, a second, and at once
-MAX_TEXT_BYTES = 4096  # of a text message: 1,024 characters in UTF-8
-TEXT_COST = 4  # bytes of memory of a text by byte, where one character is an emoji
+SLICE_BYTES = 4096  # bytes parsed between two counts of small frames; hundreds of them fit
+SMALL_BYTES = 2048  # a frame with fewer bytes is small
+SMALL_FRAMES = 500  # small frames and texts per second, and in one burst
+MAX_TEXT_BYTES = 4096  # size of a text message: at least 1,024 characters in UTF-8
+TEXT_COST = 4  # bytes of memory per byte of a text: one emoji makes Python use 4 per character
 
 
 class GuardedWebSocket(WebSocketsSansIOProtocol):
@@ -53,8 +53,9 @@ class GuardedWebSocket(WebSocketsSansIOProtocol):
         self._reading_end_s = self._closing_end_s = inf
         self._small_frames, self._counted_s = float(SMALL_FRAMES), 0.0
         self._share = None if guard.bodies is None else BodyShare(guard.bodies)
-        self._frame_bytes = 0  # of the frames of a message that is incomplete
-        self._queued_bytes: deque[int] = deque()  # of complete messages, not yet received
+        self._frame_bytes = 0  # size of the frames of the current message
+        # Sizes of the complete messages that the service has not taken yet.
+        self._queued_bytes: deque[int] = deque()
         self._draining = False
         self._owed = 0  # answers to images that the service has taken
 
@@ -62,31 +63,31 @@ class GuardedWebSocket(WebSocketsSansIOProtocol):
         super().connection_made(transport)
         now = self._guard.place(self, self._guard.streams)
         self._counted_s, self._handshake_end_s = now, now + self._guard.limits.head_s
-        transport.pause_reading()  # frames have to wait for the reply to the handshake
+        transport.pause_reading()  # frames must wait until the handshake is answered
 
     def connection_lost(self, exc: Exception | None) -> None:
         self._guard.forget(self)
         self._drop_messages()
         super().connection_lost(exc)
-        self.conn.parser.close()  # it holds `conn`, which holds it
+        self.conn.parser.close()  # breaks a reference cycle
 
     @property
     def lingers(self) -> bool:
-        """Whether its close frame is sent, and the client has still to close it."""
+        """Whether the close frame was sent and the client has not closed the connection yet."""
         return self._discarding and not self.transport.is_closing()
 
     def begin_draining(self) -> None:
-        """Take no more images: those that have not arrived as a whole are not answered."""
+        """Ignore further bytes: an image that is still incomplete gets no answer."""
         self._draining = True
 
     def drain(self, elapsed_s: float) -> bool:
-        """Close it once all images are answered; whether that is so."""
+        """Close the connection if all images are answered. Returns whether it is closing."""
         if self.handshake_complete and not (self._owed or self._queued_bytes):
             self.end_draining()
         return self._discarding or self.transport.is_closing()
 
     def end_draining(self) -> None:
-        """Close it."""
+        """Close the connection with a reason."""
         if not (self._discarding or self.transport.is_closing()):
             self.fail(CloseCode.SERVICE_RESTART, "the service stops or restarts; connect again")
 
@@ -108,7 +109,7 @@ class GuardedWebSocket(WebSocketsSansIOProtocol):
             self._count_message()
 
     def _count_message(self) -> None:
-        """Hold of the budget for bodies what has arrived of messages."""
+        """Reserve the received bytes of messages in the budget for bodies."""
         if self._share is None:
             return
         try:
@@ -119,7 +120,7 @@ class GuardedWebSocket(WebSocketsSansIOProtocol):
             self.fail(CloseCode.TRY_AGAIN_LATER, problem.detail)
 
     def _drop_messages(self) -> None:
-        """Let go of what has arrived of messages."""
+        """Drop the received messages and release their bytes in the budget."""
         queued = [self.queue.get_nowait() for _ in range(self.queue.qsize())]
         for message in queued:
             if message["type"] != "websocket.receive":
@@ -145,7 +146,7 @@ class GuardedWebSocket(WebSocketsSansIOProtocol):
             super().handle_cont(event)
 
     def _refuse_long_text(self, kind: str) -> bool:
-        """Close when a message of that kind is a long text, before it is decoded."""
+        """Close if the message is a text above MAX_TEXT_BYTES, before it is decoded."""
         if kind != "text" or self._frame_bytes <= MAX_TEXT_BYTES:
             return False
         self._guard.count_closed(INVALID_REQUEST)
@@ -153,9 +154,9 @@ class GuardedWebSocket(WebSocketsSansIOProtocol):
         return True
 
     def _refuse_handshake(self, error: Exception) -> None:
-        """Answer what websockets would leave unanswered."""
-        self.conn.data_to_send()  # its reply to some of them, in plain text
-        self.conn.handshake_exc = None  # its traceback holds this object
+        """Answer a handshake that the library refuses, with a problem."""
+        self.conn.data_to_send()  # discards the library's plain-text reply
+        self.conn.handshake_exc = None  # its traceback references this object
         problem = Problem(MALFORMED, "this is not the handshake of a WebSocket (RFC 6455, 4.1)")
         if isinstance(error, RequestLineTooLong | HeaderLineTooLong | TooManyHeaders):
             problem = Problem(HEAD_TOO_LARGE, f"the handshake is too large: {error}")
@@ -173,13 +174,13 @@ class GuardedWebSocket(WebSocketsSansIOProtocol):
         if small and not self._allow(small):
             self.conn.events.clear()
             self._guard.count_closed(RATE_LIMITED)
-            reason = f"more than {SMALL_FRAMES} small frames and texts a second"
+            reason = f"more than {SMALL_FRAMES} small frames and texts per second"
             self.fail(CloseCode.POLICY_VIOLATION, reason)
             return
         super().handle_events()
 
     def _allow(self, small: int) -> bool:
-        """Count small frames; False: there are too many."""
+        """Count `small` small frames; False if they exceed the rate."""
         self._small_frames -= small
         if self._small_frames < 0:
             now = self._guard.clock()
@@ -189,7 +190,7 @@ class GuardedWebSocket(WebSocketsSansIOProtocol):
         return self._small_frames >= 0
 
     def handle_ping(self) -> None:
-        """Answer, unless the client does not read: RFC 6455, 5.5.3, lets pongs be left out."""
+        """Send a pong, unless the client does not read. RFC 6455, 5.5.3, allows missing pongs."""
         output = self.conn.data_to_send()
         if self.writable.is_set() and not self._discarding:
             self.transport.write(b"".join(output))
@@ -203,7 +204,7 @@ class GuardedWebSocket(WebSocketsSansIOProtocol):
                 self.frames = []
                 self.fail(CloseCode.INVALID_DATA, "the text is not UTF-8")
                 return
-        if not self.close_sent:  # else the message is dropped
+        if not self.close_sent:  # after a close frame, messages are dropped
             cost = TEXT_COST if self.curr_msg_data_type == "text" else 1
             self._queued_bytes.append(cost * self._frame_bytes)
         super().send_receive_event_to_app()
@@ -227,7 +228,7 @@ class GuardedWebSocket(WebSocketsSansIOProtocol):
             self._handshake_end_s = inf
             self.transport.resume_reading()
         elif message["type"] == "websocket.http.response.body":
-            self.handshake_complete = True  # else uvicorn logs an error for a refusal
+            self.handshake_complete = True  # otherwise uvicorn logs an error for a refusal
 
     def pause_writing(self) -> None:
         super().pause_writing()
@@ -238,11 +239,11 @@ class GuardedWebSocket(WebSocketsSansIOProtocol):
         self._reading_end_s = inf
 
     def give_way(self) -> None:
-        """Close this WebSocket without messages: a new connection needs its place."""
-        self.fail(CloseCode.TRY_AGAIN_LATER, "closed for another client, after no message for long")
+        """Close this WebSocket to make room for a new connection."""
+        self.fail(CloseCode.TRY_AGAIN_LATER, "closed for another client: no message for long")
 
     def end_slow_body(self, now: float) -> int:
-        """Close when a message has been arriving for long; the bytes that it held."""
+        """Close if a message has been arriving for EVICTABLE_S; returns the bytes it held."""
         held = 0 if self._share is None else self._share.size
         since_s = self._message_end_s - self._guard.limits.body_s
         if not held or self._discarding or now - since_s < guards.EVICTABLE_S:
@@ -252,7 +253,7 @@ class GuardedWebSocket(WebSocketsSansIOProtocol):
         return held
 
     def expire(self, now: float) -> None:
-        """Close the connection when a deadline has passed."""
+        """Close the connection if a deadline has passed."""
         if self._discarding or self.transport.is_closing():
             if self._closing_end_s == inf:
                 self._closing_end_s = now + guards.LINGER_S
@@ -263,14 +264,14 @@ class GuardedWebSocket(WebSocketsSansIOProtocol):
             self.transport.abort()
         elif now >= self._message_end_s:
             limit_s = self._guard.limits.body_s
-            if self.read_paused:  # the service makes the client wait
+            if self.read_paused:  # the delay is the service's, not the client's
                 self._message_end_s = now + limit_s
                 return
             self._guard.count_closed(TOO_SLOW)
             self.fail(CloseCode.POLICY_VIOLATION, f"a message took more than {limit_s:g} s")
 
     def fail(self, code: CloseCode, reason: str) -> None:
-        """Close with a reason; discard what the client still sends."""
+        """Close with a reason; discard further bytes of the client."""
         if self.conn.state is not State.OPEN:
             self.transport.abort()
             return
@@ -278,9 +279,9 @@ class GuardedWebSocket(WebSocketsSansIOProtocol):
         self.handle_parser_exception()
 
     def handle_parser_exception(self) -> None:
-        """Send the close frame, then discard what the client still sends for LINGER_S.
+        """Send the close frame, then read and discard further bytes for LINGER_S.
 
-        A connection closed with unread bytes is reset, and the client would lose the close frame.
+        Closing a connection with unread bytes resets it: the client would lose the close frame.
         """
         closing = self.conn.close_sent
         if closing is None:
@@ -293,7 +294,7 @@ class GuardedWebSocket(WebSocketsSansIOProtocol):
         self._close_after(b"".join(self.conn.data_to_send()))
 
     def _close_after(self, output: bytes) -> None:
-        """Send the last bytes; close after LINGER_S."""
+        """Send `output` as the last bytes; abort the connection after LINGER_S."""
         self._discarding = self.close_sent = True
         self.stop_keepalive()
         self._guard.place(self, self._guard.refused)

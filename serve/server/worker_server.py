@@ -1,10 +1,9 @@
-"""The server of one worker: it shares new connections with the other workers, and drains them when
-it stops.
+"""The server of one worker: it shares new connections with the other workers, and drains its own
+connections when it stops.
 
-All workers listen on the same sockets and all are woken by a new connection; the one with the
+All workers listen on the same sockets, and a new connection wakes all of them; the worker with the
 fewest connections accepts it. (If the kernel chose, one of two workers could get six of eight
-clients and keep them for hours.) A worker that is warming up leaves connections to those that are
-ready.
+clients and keep them for hours.) While a worker warms up, it leaves connections to ready workers.
 """
 
 import asyncio
@@ -28,20 +27,20 @@ from serve.server.heap import HeapTrimmer
 from serve.server.websocket import GuardedWebSocket
 from serve.workers.shared_memory import WorkerPeers
 
-GRACE_S = 5  # for requests in progress when the service stops
-LAST_S = 1.0  # then for clients to read why they got no answer
+GRACE_S = 5  # time for requests in progress when the service stops
+LAST_S = 1.0  # time after GRACE_S for clients to read why they got no answer
 DRAIN_STEP_S = 0.02
-YIELD_S = 0.002  # for which a worker leaves a connection to one that has fewer
+YIELD_S = 0.002  # pause in which a worker with fewer connections can accept a new one
 ACCEPTS_AT_ONCE, ACCEPTS_PER_S = 32, 1_000  # more would delay the requests of other clients
-ACCEPT_PAUSE_S = 0.004  # for which no connection is accepted when there were too many
-TRIM_TICKS = 50  # every 5 s free memory is given back to the system
-NO_DESCRIPTOR_PAUSE_S = 0.1  # after the system has run out of file descriptors
+ACCEPT_PAUSE_S = 0.004  # pause in accepting after too many new connections
+TRIM_TICKS = 50  # ticks of 0.1 s between two trims of the heap
+NO_DESCRIPTOR_PAUSE_S = 0.1  # pause in accepting when the system has no more file descriptors
 
 logger = logging.getLogger(__name__)
 
 
 class WorkerServer(uvicorn.Server):
-    """uvicorn's server with shared accepting, deadlines and draining."""
+    """uvicorn's server, extended by shared accepting, deadlines and draining."""
 
     def __init__(self, app: Service, limits: Limits, peers: WorkerPeers | None = None) -> None:
         self.guard = ConnectionGuard(
@@ -61,7 +60,7 @@ class WorkerServer(uvicorn.Server):
 
     @contextmanager
     def capture_signals(self) -> Iterator[None]:
-        """SIGTERM stops the worker; Ctrl-C and the other signals are left to the supervisor."""
+        """Stop the worker on SIGTERM; ignore the other signals, which the supervisor handles."""
         if threading.current_thread() is threading.main_thread():
             signal.signal(signal.SIGTERM, self.handle_exit)
             for number in (signal.SIGINT, signal.SIGHUP, signal.SIGUSR2):
@@ -92,8 +91,8 @@ class WorkerServer(uvicorn.Server):
         self.started = True
 
     async def on_tick(self, counter: int) -> bool:
-        """Close expired connections, and one if another worker had no room for a client; publish
-        the status; called ten times a second."""
+        """Called ten times per second. Close expired connections, and one connection if another
+        worker asked for room; publish this worker's status."""
         close_expired(self.server_state.connections, self.guard.clock())
         self._make_room_for_others()
         self._publish_status()
@@ -102,9 +101,9 @@ class WorkerServer(uvicorn.Server):
         return await super().on_tick(counter)
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
-        """Accept no more connections; finish the requests of those that are open.
+        """Stop accepting connections, then finish the requests of the open connections.
 
-        Other workers, or the supervisor of a service that stops, accept the new ones.
+        Other workers accept new connections, or the supervisor if the service stops.
         """
         self._remove_readers()
         self.guard.draining = True
@@ -118,10 +117,10 @@ class WorkerServer(uvicorn.Server):
         await super().shutdown(sockets)
 
     async def _wait_for(self, is_done: Callable[[Drained, float], bool], limit_s: float) -> None:
-        """Wait until each connection is done."""
+        """Wait until `is_done` holds for all connections, at most `limit_s`."""
         start_s = self._loop.time()
         while not self.force_exit and (elapsed_s := self._loop.time() - start_s) < limit_s:
-            await asyncio.sleep(DRAIN_STEP_S)  # first: one may have been accepted just now
+            await asyncio.sleep(DRAIN_STEP_S)  # first, to include connections accepted just now
             close_expired(self.server_state.connections, self.guard.clock())
             done = [is_done(connection, elapsed_s) for connection in self._connections()]
             if all(done):
@@ -134,7 +133,7 @@ class WorkerServer(uvicorn.Server):
         least = self._peers.room_asked()
         count = len(self.server_state.connections) + self.guard.other_connections()
         if least is not None and count >= self.guard.limits.connections:
-            # One at a time, however many ask: refused clients must not end all idle ones at once.
+            # One per tick: many refused clients must not end all idle connections at once.
             self.guard.make_room(1, least)
 
     def _start_accepting(self) -> None:
@@ -159,7 +158,7 @@ class WorkerServer(uvicorn.Server):
             return
         own, others = len(self.server_state.connections), self._peers.other_connections()
         if others and own > min(others) and not self._yielded:
-            self._yielded = True  # only once: the other worker may hang
+            self._yielded = True  # yield only once, in case the other worker hangs
             self._pause_accepting(YIELD_S)
             return
         self._yielded = False
@@ -182,7 +181,7 @@ class WorkerServer(uvicorn.Server):
         task.add_done_callback(self.server_state.tasks.discard)
 
     def _may_accept(self) -> bool:
-        """Count a new connection; False: there are too many at once."""
+        """Count a new connection; False if too many are arriving."""
         now = self._loop.time()
         earned = (now - self._accepts_counted_s) * ACCEPTS_PER_S
         self._accepts = min(self._accepts + earned, ACCEPTS_AT_ONCE)
@@ -213,6 +212,6 @@ def _uvicorn_config(app: Any) -> uvicorn.Config:
         access_log=False,
         server_header=False,
         timeout_graceful_shutdown=GRACE_S,
-        # Never None: uvicorn would read an environment variable.
+        # Never None: with None uvicorn reads an environment variable.
         forwarded_allow_ips=list(app.limits.trusted_proxies) or ["127.0.0.1"],
     )

@@ -1,1 +1,1 @@
-"""The worker processes: their start, end and replacement by the supervisor; what they share."""
+"""Worker processes: start, end and replacement by the supervisor; their shared memory."""

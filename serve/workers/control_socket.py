@@ -1,7 +1,7 @@
 """Commands to a running service (`reload`, `restart`) over a Unix socket, never over HTTP.
 
-The socket lies in a folder that only its owner may enter; its name contains the service's port.
-One line of JSON each way: {"command", "model"}, then {"ok", "text"}.
+The socket is in a folder that only its owner can enter; its name contains the service's port.
+Command and answer are one line of JSON each: {"command", "model"}, then {"ok", "text"}.
 """
 
 import asyncio
@@ -59,7 +59,7 @@ def send_command(port: int, command: str, model: str | None = None) -> str:
 
 
 async def listen_for_commands(port: int, commands: dict[str, Command]) -> asyncio.Server | None:
-    """Accept commands for the service on `port`; None where no socket can be created."""
+    """Accept commands for the service on `port`; None if no socket can be created."""
     path = socket_path(port)
 
     async def handle(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
@@ -71,7 +71,7 @@ async def listen_for_commands(port: int, commands: dict[str, Command]) -> asynci
         path.parent.mkdir(mode=0o700, exist_ok=True)
         _check_owner(path.parent)
         if _accepts(path):
-            raise FileExistsError(f"{path} is that of another service on port {port}")
+            raise FileExistsError(f"{path} belongs to another service on port {port}")
         path.unlink(missing_ok=True)
         server = await asyncio.start_unix_server(handle, str(path))
         path.chmod(0o600)
@@ -86,18 +86,18 @@ async def _execute(line: bytes, commands: dict[str, Command]) -> dict[str, Any]:
         message = json.loads(line)
         command, model = commands[message["command"]], message["model"]
     except (ValueError, KeyError, TypeError):
-        return {"ok": False, "text": f"unknown command; there are {', '.join(commands)}"}
+        return {"ok": False, "text": f"unknown command; known commands are {', '.join(commands)}"}
     try:
         return {"ok": True, "text": await command(model)}
     except (UserError, OSError) as error:
         return {"ok": False, "text": str(error)}
-    except Exception as error:  # the service goes on
+    except Exception as error:  # the service must not stop
         logger.exception("a command failed")
         return {"ok": False, "text": f"the service failed ({error!r}); see its log"}
 
 
 def _accepts(path: Path) -> bool:
-    """Whether a process listens at a socket."""
+    """Whether a process listens on the socket at `path`."""
     with socket.socket(socket.AF_UNIX) as connection:
         connection.settimeout(1.0)
         try:
@@ -108,6 +108,6 @@ def _accepts(path: Path) -> bool:
 
 
 def _check_owner(folder: Path) -> None:
-    """Raise PermissionError for a folder of another user, who may have guessed its name."""
+    """Raise PermissionError if another user owns the folder: its name can be guessed."""
     if folder.stat().st_uid != os.getuid():
         raise PermissionError(f"{folder} belongs to another user")

@@ -1,7 +1,8 @@
-"""Connections that arrive while the service stops: each request is answered 503, and closed.
+"""Answers connections that arrive while the service stops: each request gets 503, then a close.
 
-The workers finish the requests of their own connections meanwhile. A connection that nobody accepts
-is reset when the listening socket is closed, and so is one that is closed with unread bytes.
+In the meantime the workers finish the requests of their own connections. Closing the listening
+socket would reset connections that were not accepted, and closing a connection with unread bytes
+resets it: the client would not learn the reason.
 """
 
 import asyncio
@@ -13,15 +14,15 @@ from runtime.sockets import refuse_connections
 from serve.api.http_io import encode_head, problem_reply
 from serve.api.problems import stopping
 
-REQUEST_S = 1.0  # for a new connection to send its request
-READ_S = 2.0  # for a client to send the rest of its request and read the answer
-HANDSHAKE_S = 0.1  # for the handshakes of connections that began before the last
-MAX_LINE = 1 << 16  # bytes of a request line
-MAX_OPEN = 512  # connections at once
+REQUEST_S = 1.0  # time for a new connection to send its request
+READ_S = 2.0  # time for a client to send the rest of its request and to read the answer
+HANDSHAKE_S = 0.1  # time to complete the TCP handshakes that have begun
+MAX_LINE = 1 << 16  # largest size of a request line in bytes
+MAX_OPEN = 512  # largest number of open connections
 
 
 class LastAnswers:
-    """Accepts the connections of a service that stops. Call `start`, then `finish`."""
+    """Accepts connections while the service stops. Call `start`, then `finish`."""
 
     def __init__(self, listeners: Sequence[socket.socket]) -> None:
         self._listeners = listeners
@@ -30,13 +31,13 @@ class LastAnswers:
         self._tasks: set[asyncio.Task[object]] = set()
 
     def start(self) -> None:
-        """Accept connections, beside workers that may still do so."""
+        """Start accepting connections; workers can still accept too."""
         for listener in self._listeners:
             listener.setblocking(False)
             self._loop.add_reader(listener, self._accept, listener)
 
     async def finish(self) -> None:
-        """Take no more connections, answer those that are there, close the listening sockets."""
+        """Refuse new connections, answer the open ones, then close the listening sockets."""
         for listener in self._listeners:
             refuse_connections(listener)
         await asyncio.sleep(HANDSHAKE_S)
@@ -47,7 +48,7 @@ class LastAnswers:
             listener.close()
 
     def _accept(self, listener: socket.socket) -> None:
-        with suppress(OSError):  # a worker, or another client that has left, was quicker
+        with suppress(OSError):  # a worker has accepted it, or the client has left
             connection, _ = listener.accept()
             connection.setblocking(False)
             make = self._loop.connect_accepted_socket(lambda: LastAnswer(self._open), connection)
@@ -57,7 +58,7 @@ class LastAnswers:
 
 
 class LastAnswer(asyncio.Protocol):
-    """One connection: it waits for a request, answers, and reads until the client closes."""
+    """One connection: waits for a request, answers it, and reads until the client closes."""
 
     def __init__(self, others: "dict[LastAnswer, None]") -> None:
         self._open = others

@@ -1,16 +1,16 @@
-"""Memory that all workers of a service share, and the layout of every cell in it.
+"""The memory that all workers of a service share, and its layout.
 
-Cells are 64-bit words. A word is stored in one instruction, so a reader sees the old or the new
-value, never a mixture; there are no locks. Layout, in this order:
+Cells are 64-bit words. A word is written in one instruction, so a reader gets the old or the new
+value, never a mixture; there are no locks. The parts of the memory, in this order:
 
-    head            HEAD_WORDS unsigned integers, written by the supervisor
-    worker blocks   WORKER_WORDS reals each, written by the one worker that owns the block
-    stream table    STREAM_ENTRIES x (key, newest time stamp in ns), unsigned, written by any worker
-    client table    CLIENT_ENTRIES x (key, tokens left, time of the last update in s), reals,
-                    written by any worker
+    head            HEAD_WORDS unsigned integers; the supervisor writes them
+    worker blocks   WORKER_WORDS floats each; one worker owns and writes each block
+    stream table    STREAM_ENTRIES x (key, newest time stamp in ns), unsigned; all workers write
+    client table    CLIENT_ENTRIES x (key, remaining tokens, time of the last update in s), floats;
+                    all workers write
 
-Both tables are hash tables with open addressing: a key lies in one of the `PROBES` entries that
-follow its hash.
+Both tables are hash tables with open addressing: a key is in one of `PROBES` consecutive entries,
+which start at its hash.
 """
 
 import mmap
@@ -20,12 +20,12 @@ import time
 from dataclasses import dataclass
 
 HEAD_WORDS = 8
-COMMITTED_GENERATION = 0  # head: the generation of weights that all workers answer with
+COMMITTED_GENERATION = 0  # head: the generation of weights that all workers use
 
 WORKER_WORDS = 256
 HEARTBEAT, CONNECTIONS, WAITING, READY = 0, 1, 2, 3  # monotonic s; counts; 1.0 or 0.0
-BODY_BYTES = 4  # of bodies in flight
-ROOM_ASKED, ROOM_FOR = 5, 6  # how often others were asked for room; the newcomer's connections
+BODY_BYTES = 4  # bytes of bodies in flight
+ROOM_ASKED, ROOM_FOR = 5, 6  # count of requests for room; `least` of the latest request
 MAX_OUTCOMES = 64
 STAGES, STAGE_WORDS = 4, 16
 FRAME_COUNTS = 8  # MAX_OUTCOMES counters: frames by outcome
@@ -36,7 +36,7 @@ STREAM_ENTRIES, STREAM_WORDS = 1024, 2
 CLIENT_ENTRIES, CLIENT_WORDS = 1024, 3
 PROBES = 8
 
-HEARTBEAT_TIMEOUT_S = 1.0  # a worker whose heartbeat is older counts as gone
+HEARTBEAT_TIMEOUT_S = 1.0  # a worker with an older heartbeat counts as dead
 
 
 @dataclass(frozen=True)
@@ -49,24 +49,24 @@ class SharedMemory:
 
     @property
     def workers(self) -> int:
-        """How many workers run, but for the moment in which a new one replaces another."""
+        """The number of workers; a replacement that runs beside its predecessor is not counted."""
         return max(1, self.blocks - 1)
 
     def head(self) -> "memoryview[int]":
-        """The head, unsigned integers (HEAD_WORDS,)."""
+        """The head: unsigned integers (HEAD_WORDS,)."""
         return self._words(0, HEAD_WORDS).cast("Q")
 
     def worker(self, block: int) -> "memoryview[float]":
-        """One worker's block, reals (WORKER_WORDS,)."""
+        """The worker block with number `block`: floats (WORKER_WORDS,)."""
         return self._words(HEAD_WORDS + block * WORKER_WORDS, WORKER_WORDS).cast("d")
 
     def streams(self) -> "memoryview[int]":
-        """The stream table, unsigned integers (STREAM_ENTRIES * STREAM_WORDS,)."""
+        """The stream table: unsigned integers (STREAM_ENTRIES * STREAM_WORDS,)."""
         first = HEAD_WORDS + self.blocks * WORKER_WORDS
         return self._words(first, STREAM_ENTRIES * STREAM_WORDS).cast("Q")
 
     def clients(self) -> "memoryview[float]":
-        """The client table, reals (CLIENT_ENTRIES * CLIENT_WORDS,)."""
+        """The client table: floats (CLIENT_ENTRIES * CLIENT_WORDS,)."""
         first = HEAD_WORDS + self.blocks * WORKER_WORDS + STREAM_ENTRIES * STREAM_WORDS
         return self._words(first, CLIENT_ENTRIES * CLIENT_WORDS).cast("d")
 
@@ -75,10 +75,10 @@ class SharedMemory:
 
 
 def create_shared_memory(blocks: int) -> SharedMemory:
-    """New memory, all zero, whose descriptor child processes inherit."""
+    """New zeroed memory; child processes inherit its descriptor."""
     if hasattr(os, "memfd_create"):
         fd = os.memfd_create("driverview-serve", 0)
-    else:  # not Linux: an unlinked file
+    else:  # not Linux: use an unlinked file
         with tempfile.TemporaryFile() as file:
             fd = os.dup(file.fileno())
     os.ftruncate(fd, _size_bytes(blocks))
@@ -87,7 +87,7 @@ def create_shared_memory(blocks: int) -> SharedMemory:
 
 
 def attach_shared_memory(fd: int, blocks: int) -> SharedMemory:
-    """The memory behind an inherited descriptor."""
+    """The shared memory of an inherited descriptor."""
     return SharedMemory(fd, blocks, mmap.mmap(fd, _size_bytes(blocks)))
 
 
@@ -100,7 +100,7 @@ class WorkerPeers:
     """The status of a worker and of its peers: heartbeat, connections, readiness."""
 
     def __init__(self, shared: SharedMemory, block: int) -> None:
-        """`block` is the number of this worker's own block."""
+        """`block` is the number of this worker's block."""
         blocks = [shared.worker(number) for number in range(shared.blocks)]
         self._own = blocks[block]
         self._others = [cells for number, cells in enumerate(blocks) if number != block]
@@ -113,7 +113,7 @@ class WorkerPeers:
         self._own[HEARTBEAT] = time.monotonic()
 
     def withdraw(self) -> None:
-        """Clear this worker's status: it takes no more connections."""
+        """Clear this worker's status, because it accepts no more connections."""
         for cell in (HEARTBEAT, CONNECTIONS, WAITING, READY, BODY_BYTES):
             self._own[cell] = 0.0
 
@@ -122,12 +122,14 @@ class WorkerPeers:
         return [int(cells[CONNECTIONS]) for cells in self._live()]
 
     def ask_for_room(self, least: int) -> None:
-        """Ask the worker with the most connections to end one, of a client that has `least`."""
+        """Ask the worker with the most connections to end one of a client that has at least
+        `least` connections."""
         self._own[ROOM_FOR] = least
         self._own[ROOM_ASKED] += 1
 
     def room_asked(self) -> int | None:
-        """`least`, if another has asked this worker for room since the last call."""
+        """The smallest `least` of the other workers' requests for room since the last call. None
+        without a request, and if another worker has more connections than this one."""
         before, self._room_asked = self._room_asked, [cells[ROOM_ASKED] for cells in self._others]
         if self._own[CONNECTIONS] < max(self.other_connections(), default=0):
             return None
@@ -136,7 +138,7 @@ class WorkerPeers:
         return min(asked, default=None)
 
     def other_is_ready(self) -> bool:
-        """Whether another live worker can answer images."""
+        """Whether another live worker is ready to answer images."""
         return any(cells[READY] for cells in self._live())
 
     def _live(self) -> list["memoryview[float]"]:

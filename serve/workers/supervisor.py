@@ -1,8 +1,8 @@
-"""The parent of the workers: starts them, replaces those that die, distributes new weights.
+"""The parent process of the workers: starts them, replaces dead ones, distributes new weights.
 
-It answers no request and loads no engine. SIGTERM and SIGINT stop the service, SIGHUP reloads the
-model, SIGUSR2 replaces the workers one by one; `serve reload` and `serve restart` do the latter two
-over a Unix socket and report the result.
+It answers no requests and loads no engine. SIGTERM and SIGINT stop the service, SIGHUP reloads the
+model, SIGUSR2 replaces the workers one by one. `serve reload` and `serve restart` request a reload
+or a replacement over a Unix socket and print the result.
 """
 
 import asyncio
@@ -28,17 +28,18 @@ from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
 
 BACKLOG = 2048
-LOAD_TIMEOUT_S = 120.0  # for a worker to load a model on a busy machine
-STOP_TIMEOUT_S = 15.0  # for a worker to stop on SIGTERM; then it is killed
-MIN_BACKOFF_S, MAX_BACKOFF_S = 0.5, 30.0  # before a worker that died is replaced
-STABLE_AGE_S = 10.0  # a worker that lived this long did not fail at its start
+LOAD_TIMEOUT_S = 120.0  # time for a worker to load a model; enough on a busy machine
+STOP_TIMEOUT_S = 15.0  # time for a worker to stop after SIGTERM; then it is killed
+MIN_BACKOFF_S, MAX_BACKOFF_S = 0.5, 30.0  # pause before a dead worker is replaced
+STABLE_AGE_S = 10.0  # a worker that ran for longer did not fail at its start
 
 logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class ServicePlan:
-    """What is served, and by how many workers. `resolve` maps a model's name to its folder."""
+    """The model, the number of workers and the limits of a service. `resolve` maps a model's name
+    to its folder."""
 
     model: str
     resolve: Callable[[str], Path]
@@ -53,35 +54,36 @@ class Supervisor:
     def __init__(self, plan: ServicePlan, listeners: Sequence[socket.socket]) -> None:
         self._plan = plan
         self._listeners = listeners
-        # One block more than workers: a replacement runs beside the worker that it replaces.
+        # One block more than workers: a replacement starts before the old worker stops.
         self._shared: SharedMemory = create_shared_memory(plan.workers + 1)
         self._head = self._shared.head()
         self._workers: dict[int, WorkerProcess] = {}  # by position, 0 to plan.workers - 1
         self._folder = plan.resolve(plan.model)
         self._model = plan.model
         self._model_hash: str | None = None
-        self._last_generation = 0  # of any reload, also of those that failed
+        self._last_generation = 0  # of all reloads, failed ones included
         self._change_lock = asyncio.Lock()
         self._stopping = asyncio.Event()
         self._has_terminal = _has_terminal()
 
     @property
     def folder(self) -> Path:
-        """The folder of the model that is served."""
+        """The folder of the served model."""
         return self._folder
 
     async def start(self) -> dict[str, Any] | None:
         """Listen, and start all workers.
 
-        Returns the first one's report of its engine, None if stopped meanwhile. Raises UserError.
+        Returns the first worker's report about its engine, or None if the service was stopped while
+        the workers loaded the model. Raises UserError.
         """
         loop = asyncio.get_running_loop()
         for number in (signal.SIGTERM, signal.SIGINT):
             loop.add_signal_handler(number, self._stopping.set)
-        # What is loaded now is new: there is nothing to reload or to replace.
+        # Until all workers have started, there is nothing to reload or to replace.
         loop.add_signal_handler(signal.SIGHUP, self._on_hangup, lambda: None)
         loop.add_signal_handler(signal.SIGUSR2, lambda: None)
-        for listener in self._listeners:  # not before: a signal would reset whoever connects
+        for listener in self._listeners:  # after the handlers: a signal would reset connections
             listener.listen(BACKLOG)
         for position in range(self._plan.workers):
             self._workers[position] = await self._start_worker(self._free_block())
@@ -93,7 +95,7 @@ class Supervisor:
         stopping.cancel()
         if not loading.done():
             loading.cancel()
-            await asyncio.gather(loading, return_exceptions=True)  # else the end is logged
+            await asyncio.gather(loading, return_exceptions=True)  # else asyncio logs it
             await self._stop_workers()
             return None
         try:
@@ -105,7 +107,7 @@ class Supervisor:
         return reports[0]
 
     async def run(self) -> None:
-        """Replace workers that die, until the service is stopped."""
+        """Replace dead workers until the service is stopped."""
         loop = asyncio.get_running_loop()
         tasks: set[asyncio.Task[Any]] = set()
 
@@ -126,25 +128,26 @@ class Supervisor:
         await self._stop_workers()
 
     async def _stop_workers(self) -> None:
-        """Stop all workers, then listening; connections that arrive meanwhile are answered 503."""
+        """Stop all workers, then close the listening sockets. Connections that arrive before that
+        are answered with 503."""
         last_answers = LastAnswers(self._listeners)
         last_answers.start()
         await asyncio.gather(*(worker.stop(STOP_TIMEOUT_S) for worker in self._workers.values()))
         await last_answers.finish()
 
     async def reload(self, model: str | None = None) -> str:
-        """Load `model` (None: the current one, again) in all workers, then answer with it.
+        """Load `model` (None: the current one again) in all workers, then switch to it.
 
-        Returns its hash. Raises UserError; the old weights then stay in use.
+        Returns the hash of the weights. Raises UserError; the old weights then stay in use.
         """
         async with self._change_lock:
             name = model or self._model
             folder = self._plan.resolve(name)
             workers = [worker for worker in self._workers.values() if worker.alive]
             if not workers:
-                raise UserError("no worker is alive; they are being restarted, try again")
-            # A number is never used twice: a late report of a failed reload is not taken for one
-            # of the next.
+                raise UserError("no worker is alive; workers are being restarted, try again")
+            # Each reload has a new number, so that a late report of a failed reload is not taken
+            # for a report of the next reload.
             self._last_generation += 1
             generation = self._last_generation
             for worker in workers:
@@ -159,24 +162,24 @@ class Supervisor:
                     worker.send(drop=generation)
                 raise UserError(f"{problem}; the old model stays in use")
             model_hash = str(reports[0]["model"])  # type: ignore[index]
-            # From this store on, every worker answers with the new weights.
+            # After this assignment every worker answers with the new weights.
             self._head[COMMITTED_GENERATION] = generation
             self._folder, self._model, self._model_hash = folder, name, model_hash
             logger.info("now serving %s, model %s", folder, model_hash[:12])
             return model_hash
 
     def _on_hangup(self, reload: Callable[[], None]) -> None:
-        """SIGHUP: reload; but stop when it was sent because the terminal was closed."""
+        """Reload on SIGHUP; stop if the reason of SIGHUP is that the terminal was closed."""
         if self._has_terminal and not _has_terminal():
             self._stopping.set()
         else:
             reload()
 
     async def restart(self) -> None:
-        """Replace the workers one by one; an old one is stopped once the new one is ready.
+        """Replace the workers one by one; each old worker is stopped once its successor is ready.
 
-        Raises UserError when a new one does not become ready; it is stopped then, and the old
-        one stays.
+        Raises UserError if a new worker does not become ready. It is stopped then, and the old
+        worker stays.
         """
         async with self._change_lock:
             for position, old in list(self._workers.items()):
@@ -184,7 +187,7 @@ class Supervisor:
                 try:
                     await new.wait_loaded(self._head[COMMITTED_GENERATION], LOAD_TIMEOUT_S)
                     await new.wait_ready(LOAD_TIMEOUT_S)
-                except BaseException:  # also when the service stops meanwhile
+                except BaseException:  # also if the service is stopped
                     await new.stop(STOP_TIMEOUT_S)
                     raise
                 self._workers[position] = new
@@ -195,14 +198,14 @@ class Supervisor:
         while True:
             worker = self._workers[position]
             await worker.wait_exit()
-            # Killed, it could not do this itself: its bodies would stay in the common budget.
+            # A killed worker cannot do this: its bodies would remain in the shared budget.
             WorkerPeers(self._shared, worker.task.block).withdraw()
             if self._workers[position] is not worker:
                 backoff_s = MIN_BACKOFF_S
                 continue
             stable = worker.age_s() > STABLE_AGE_S
             backoff_s = MIN_BACKOFF_S if stable else min(2 * backoff_s, MAX_BACKOFF_S)
-            logger.error("worker %d ended (%s); starting another", worker.pid, worker.exit_reason())
+            logger.error("worker %d ended (%s); restarting it", worker.pid, worker.exit_reason())
             await asyncio.sleep(backoff_s)
             async with self._change_lock:
                 if self._workers[position] is not worker:
@@ -210,10 +213,10 @@ class Supervisor:
                 block = self._free_block(without=worker)
                 try:
                     self._workers[position] = await self._start_worker(block)
-                except OSError as error:  # out of processes or memory: tried again
+                except OSError as error:  # no processes or memory left; tried again
                     logger.error("cannot start a worker: %s", error)
                 else:
-                    await worker.stop(STOP_TIMEOUT_S)  # closes the connection to it
+                    await worker.stop(STOP_TIMEOUT_S)  # closes the socket to it
 
     async def _start_worker(self, block: int) -> WorkerProcess:
         task = WorkerTask(
@@ -235,7 +238,7 @@ class Supervisor:
 
 
 def _load_problem(reports: list[Any]) -> str | None:
-    """Why a reload failed, None if all workers loaded the same weights."""
+    """The reason why a reload failed; None if all workers loaded the same weights."""
     for report in reports:
         if isinstance(report, UserError):
             return str(report)
@@ -254,7 +257,7 @@ def _has_terminal() -> bool:
 
 
 async def _log_errors(action: Callable[[], Any]) -> None:
-    """Run what a signal asked for; errors go to the log only."""
+    """Run the action that a signal requests; errors are only logged."""
     try:
         await action()
     except (UserError, OSError) as error:

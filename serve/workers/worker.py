@@ -1,8 +1,8 @@
-"""One worker process: one engine, one event loop. Started by `serve.workers.supervisor` as
+"""One worker process: one engine, one event loop. `serve.workers.supervisor` starts it as
 `python -m serve.workers.worker FD`; the two exchange lines of JSON over the socket FD.
 
-From the supervisor: the WorkerTask, then {"load": folder, "generation": n} and {"drop": n}. From
-the worker: {"loaded": n, "model": hash, "engine": ..., "precision": ...} or {"failed": n, "why":
+The supervisor sends the WorkerTask, then {"load": folder, "generation": n} and {"drop": n}. The
+worker sends {"loaded": n, "model": hash, "engine": ..., "precision": ...} or {"failed": n, "why":
 ...}, and {"ready": true}. When the supervisor closes the socket, the worker stops.
 """
 
@@ -41,22 +41,22 @@ class SupervisorConnection:
 
     def lines(self) -> Iterator[str]:
         """The supervisor's messages, until it closes the socket."""
-        # Not a buffered file: at interpreter exit that would wait for the thread reading it.
+        # Not a buffered file: at interpreter exit it would wait for the thread that reads it.
         rest = b""
         while received := self._socket.recv(65536):
             *lines, rest = (rest + received).split(b"\n")
             yield from (line.decode() for line in lines)
 
     def send(self, **message: Any) -> None:
-        """Send a message; ignored when the supervisor is gone."""
+        """Send a message; no effect if the supervisor has ended."""
         with self._lock:
             try:
                 self._socket.sendall(json.dumps(message).encode() + b"\n")
             except OSError:
-                logger.debug("the supervisor is gone")
+                logger.debug("the supervisor has ended")
 
     def send_loaded(self, generation: int, engine: Engine) -> None:
-        """Report which engine was loaded."""
+        """Report the loaded engine for this generation of weights."""
         self.send(
             loaded=generation,
             model=engine.card.model_hash,
@@ -95,21 +95,22 @@ def main() -> None:
 
 
 def load(folder: Path, expected: str | None) -> Engine:
-    """The engine of a run. Raises UserError, also when its weights have another hash."""
+    """The engine of the run in `folder`. Raises UserError, also if its weights do not have the hash
+    `expected`."""
     engine = load_engine(folder)
     found = engine.card.model_hash
     if expected is not None and found != expected:
         raise UserError(
-            f"{folder} now holds model {found[:12]}, but {expected[:12]} is being served; "
+            f"{folder} now has model {found[:12]}, but the service uses {expected[:12]}; "
             "`serve reload` switches to the new one"
         )
     return engine
 
 
 def send_ready(supervisor: SupervisorConnection) -> None:
-    """Report that images are answered from now on."""
-    # Objects loaded so far are permanent. A full garbage collection over them would delay every
-    # client by 50 to 80 ms, several times a minute; over what requests leave behind it takes 3 ms.
+    """Report that the worker now answers images."""
+    # The objects loaded so far are permanent. With them a full garbage collection delays all
+    # clients by 50 to 80 ms, several times per minute; without them it takes 3 ms.
     gc.freeze()
     supervisor.send(ready=True)
 
@@ -128,7 +129,8 @@ def handle_commands(
 
 
 def reload(supervisor: SupervisorConnection, app: Service, folder: str, generation: int) -> None:
-    """Load and check new weights beside the old; used once the supervisor commits `generation`."""
+    """Load and check new weights while the old ones are in use. The new ones replace them once the
+    supervisor commits `generation`."""
     head = app.shared.head()
     try:
         engine = load(Path(folder), None)
@@ -136,7 +138,7 @@ def reload(supervisor: SupervisorConnection, app: Service, folder: str, generati
     except UserError as error:
         supervisor.send(failed=generation, why=str(error))
         return
-    except Exception as error:  # the old weights stay in use, whatever the new ones raise
+    except Exception as error:  # after any error the old weights stay in use
         logger.exception("new weights failed")
         supervisor.send(failed=generation, why=repr(error))
         return

@@ -1,6 +1,6 @@
-"""The supervisor's side of a worker process: its start, its messages, its end.
+"""A worker process as the supervisor handles it: start, messages, end.
 
-The messages between the two are described in `serve.workers.worker`.
+`serve.workers.worker` describes the messages between the two processes.
 """
 
 import asyncio
@@ -22,10 +22,11 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class WorkerTask:
-    """What a new worker is to do, sent as its first message.
+    """The configuration of a new worker, sent as its first message.
 
-    `expected`: the hash its weights must have, None: any. `listeners`, `memory`: inherited file
-    descriptors. `block`: its own block of the shared memory, which has `blocks` of them.
+    `expected` is the required hash of the weights; None accepts any. `listeners` and `memory` are
+    inherited file descriptors. `block` is the worker's block of the shared memory, which has
+    `blocks` blocks.
     """
 
     folder: str
@@ -44,7 +45,7 @@ class WorkerTask:
 
     @classmethod
     def from_json_line(cls, line: str) -> "WorkerTask":
-        """The task in a line of JSON."""
+        """The task from a line of JSON."""
         content = json.loads(line)
         cameras = {name: CameraParameters(**each) for name, each in content["cameras"].items()}
         limits = Limits(**content["limits"])
@@ -77,11 +78,11 @@ class WorkerProcess:
         return self._process.returncode is None
 
     def age_s(self) -> float:
-        """Time since its start, s."""
+        """Time since the start of the process in s."""
         return time.monotonic() - self._started_s
 
     def exit_reason(self) -> str:
-        """The error it reported at its start, else its exit code or signal."""
+        """The error that the worker reported at its start; else its exit code or signal."""
         if self._start_error:
             return self._start_error
         code = self._process.returncode
@@ -92,7 +93,8 @@ class WorkerProcess:
         self._writer.write(json.dumps(message).encode() + b"\n")
 
     async def wait_loaded(self, generation: int, timeout_s: float) -> dict[str, Any]:
-        """Wait until it has loaded a generation of weights; its report. Raises UserError."""
+        """Wait until the worker has loaded a generation of weights; returns its report.
+        Raises UserError if it failed, ended or exceeded `timeout_s`."""
         result = self._load_result(generation)
         if self._reading.done():
             self._fail_pending_loads()
@@ -107,7 +109,7 @@ class WorkerProcess:
         return message
 
     async def wait_ready(self, timeout_s: float) -> None:
-        """Wait until it can answer images. Raises UserError."""
+        """Wait until the worker can answer images. Raises UserError."""
         waits = [asyncio.ensure_future(w) for w in (self._ready.wait(), self.wait_exit())]
         await asyncio.wait(waits, timeout=timeout_s, return_when=asyncio.FIRST_COMPLETED)
         for wait in waits:
@@ -161,7 +163,7 @@ class WorkerProcess:
 
 
 async def start_worker(task: WorkerTask) -> WorkerProcess:
-    """Start a worker process with its task. Raises OSError where the system refuses."""
+    """Start a worker process and send its task. Raises OSError if no process can be started."""
     ours, theirs = socket.socketpair()
     with theirs:
         try:

@@ -33,7 +33,7 @@ def test_the_table_holds_every_attack_once_and_no_other() -> None:
 
 @pytest.mark.parametrize("row", ROWS, ids=lambda row: row[0][:40])
 def test_the_test_of_an_attack_makes_it(row: list[str]) -> None:
-    """By its name, or with all those of `costs`."""
+    """The test names the attack, or runs all attacks of `costs`."""
     text = (ROOT / "tests" / row[3].strip("`")).read_text()
     everything = (ROOT / "tests" / "serve" / "attacks" / "test_each_attack.py").read_text()
     costs = (ROOT / "tests" / "serve" / "attacks" / "costs.py").read_text()

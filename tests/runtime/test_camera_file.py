@@ -1,4 +1,4 @@
-"""Camera files: ours there and back, those of OpenCV, ROS and Kalibr, and faulty ones."""
+"""Camera files: round trip of our format; files of OpenCV, ROS and Kalibr; faulty files."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -112,7 +112,7 @@ def test_files_that_opencv_writes(tmp_path: Path, suffix: str, header: str, name
     storage.write("camera_matrix", K)
     storage.write(name, np.array([D]))
     storage.release()
-    if header == "%YAML:1.0":  # as OpenCV before version 5
+    if header == "%YAML:1.0":  # written by OpenCV before version 5
         path.write_text(path.read_text().replace("%YAML 1.2", header))
     assert path.read_text().startswith(header)
     assert read_camera(path, MODEL) == LENS
@@ -134,7 +134,7 @@ def test_files_that_opencv_writes(tmp_path: Path, suffix: str, header: str, name
          replace(LENS, coefficients=(*D, 0.1, 0.2, 0.3))),
         (ROS + "height_above_road_m: 1.5\nyaw_deg: -2\n", replace(LENS, z=1.25, yaw_deg=-2)),
         (KALIBR + "pitch_deg: 3\nx: 1.5\n", replace(FISHEYE, pitch_deg=3, x=1.5)),
-        # A camera.yaml of before lenses had a matrix.
+        # A file of an older version, without `matrix`.
         ("width: 640\nheight: 360\nfov_y_deg: 40\nz: 1.25\npitch_deg: 1\n",
          CameraParameters(640, 360, 40.0, z=1.25, pitch_deg=1.0)),
     ],
@@ -150,7 +150,8 @@ def test_what_is_chosen_or_assumed_is_said(tmp_path: Path) -> None:
     read_camera(written(tmp_path / "ours.yaml", "fov_y_deg: 60\n"), MODEL, lines.append)
     assert len(lines) == 2
     assert (
-        "chain.yaml: cam0 of cam0, cam1 of a Kalibr camchain; it gives no mount: 1.2 m" in lines[0]
+        "chain.yaml: cam0 of cam0, cam1 of a Kalibr camchain; no mount is given, so 1.2 m"
+        in lines[0]
     )
     assert "ros.yaml: a calibration of OpenCV or ROS; the camera is 1280x720" in lines[1]
 
@@ -171,7 +172,7 @@ def test_what_is_chosen_or_assumed_is_said(tmp_path: Path) -> None:
         (ROS.replace("0.05]", ".nan]"), "distortion_coefficients holds nan; give finite"),
         (ROS.replace("0.05]", ".Inf]"), "distortion_coefficients holds inf; give finite"),
         (ROS.replace("0.05]", "five]"), "distortion_coefficients is 'five'; give a number"),
-        (ROS.replace("image_width: 1280\n", ""), "no size of the pictures; give width and height"),
+        (ROS.replace("image_width: 1280\n", ""), "no image size; give width and height"),
         (ROS.replace("image_width: 1280\n", "image_width: 1280.5\n"), "whole number of pixels"),
         (ROS.replace("plumb_bob", "double_sphere"), "distortion model is 'double_sphere'"),
         (ROS[: ROS.index("distortion_model")], "no distortion_coefficients; give them, zeros"),
@@ -187,7 +188,7 @@ def test_what_is_chosen_or_assumed_is_said(tmp_path: Path) -> None:
         ("height_std: 2\n", "height_std is 2"),
         ("yaw_deg: 200\n", "yaw_deg is 200; give -180 to 180"),
         ("roll_deg: .nan\n", "roll_deg is nan"),
-        ("%YAML:1.0\n---\ncamera_matrix: !!opencv-matrix 3\n", "no mapping"),
+        ("%YAML:1.0\n---\ncamera_matrix: !!opencv-matrix 3\n", "not a mapping"),
         ("%YAML:1.0\n---\ncamera_matrix: !!python/object:os.system {}\n", "could not determine"),
     ],
 )  # fmt: skip

@@ -1,4 +1,4 @@
-"""Atomic writes: replaced in one step, old content kept on failure, pipes written through."""
+"""Atomic writes: replacement in one step, old content after a failure, pipes; locks."""
 
 import errno
 import os
@@ -62,7 +62,7 @@ def test_a_missing_folder_or_a_folder_as_file_is_refused(tmp_path: Path) -> None
 
 
 def test_a_lock_excludes_others_until_its_file_is_closed(tmp_path: Path) -> None:
-    """Two open files are two holders, as two processes are."""
+    """Two file descriptors of one process exclude each other like two processes."""
     first, other = (os.open(tmp_path, os.O_RDONLY) for _ in range(2))
     try:
         assert try_lock(first, shared=True)
@@ -82,7 +82,7 @@ def contents(folder: Path) -> dict[str, str]:
 
 
 def replace_with(folder: Path, content: str, then: Callable[[], object] = lambda: None) -> None:
-    """Replace three files, the card last; `then` is called once they are written."""
+    """Replace three files, `card` last; `then` is called after the new files are written."""
     with replaced_files(folder, last="card") as staged:
         for name in ("card", "a", "z"):
             (staged / name).write_text(content)

@@ -1,4 +1,4 @@
-"""The folder of compiled code: one for each state of the sources; unused ones are deleted."""
+"""The folder of compiled code: one for each version of the sources; unused folders are deleted."""
 
 import os
 import tempfile
@@ -25,7 +25,7 @@ def test_other_sources_have_another_folder(package: Path) -> None:
     assert code_folder("ours", package) == first
     (package / "inner" / "kernel.py").write_text("a = 2\n")
     assert code_folder("ours", package) != first
-    assert first.is_dir()  # a run that began before goes on using it
+    assert first.is_dir()  # an earlier process still uses it
 
 
 def test_code_unused_for_a_month_is_deleted(package: Path) -> None:
@@ -35,7 +35,7 @@ def test_code_unused_for_a_month_is_deleted(package: Path) -> None:
     long_ago = time.time() - (UNUSED_DAYS + 1) * 86_400
     for folder in (used, *others):
         os.utime(folder, (long_ago, long_ago))
-    assert code_folder("ours", package) == used  # used again, so kept
+    assert code_folder("ours", package) == used  # this use updates its time
     (package / "inner" / "kernel.py").write_text("a = 2\n")
     os.utime(used, (long_ago, long_ago))
     code_folder("ours", package)
@@ -57,7 +57,7 @@ def test_without_a_writable_folder_a_temporary_one_is_used(
 def test_the_folder_is_the_users_alone(package: Path) -> None:
     folder = code_folder("ours", package)
     assert folder.stat().st_mode & 0o777 == 0o700
-    folder.chmod(0o755)  # as an older version made it
+    folder.chmod(0o755)  # the mode of an older version
     assert code_folder("ours", package) == folder
     assert folder.stat().st_mode & 0o777 == 0o700
 
@@ -89,14 +89,14 @@ def test_a_folder_of_another_user_or_a_link_is_not_used(
     assert found.parent == Path(tempfile.gettempdir())
     assert not list(found.iterdir())
     assert found.stat().st_mode & 0o777 == 0o700
-    assert found != code_folder("ours", package)  # nobody can guess it
+    assert found != code_folder("ours", package)  # a random name
     assert (known / "kernel.nbi").read_bytes() == b"planted"
 
 
 def test_a_user_without_a_home_folder_gets_a_temporary_folder(
     package: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As in a container that runs under a number that /etc/passwd lacks."""
+    """For example in a container whose user id is not in /etc/passwd."""
 
     def fail() -> Path:
         raise RuntimeError("Could not determine home directory.")

@@ -1,4 +1,4 @@
-"""Names of files: their order, and any bytes in them on any terminal and in any file."""
+"""File names: their order; names of any bytes can be printed on any terminal and used for files."""
 
 import os
 import subprocess

@@ -1,4 +1,4 @@
-"""Ends of a loop by a signal."""
+"""A loop ends after a signal, between two steps."""
 
 import signal
 import threading
@@ -16,7 +16,7 @@ class Kind(IntEnum):
 
 
 def test_a_signal_is_noted_wherever_it_arrives() -> None:
-    """Numpy discards an exception raised while it compares a scalar with an IntEnum."""
+    """numpy discards an exception that is raised while it compares a scalar with an IntEnum."""
     before = signal.getsignal(signal.SIGALRM)
     with interrupts(signal.SIGALRM) as interrupted:
         signal.setitimer(signal.ITIMER_REAL, 0.001)

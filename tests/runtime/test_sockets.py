@@ -1,4 +1,4 @@
-"""Listening sockets and connections: ports in use, unknown hosts, both families, URLs."""
+"""Listening sockets and connections: ports in use, unknown hosts, IPv4 and IPv6, URLs."""
 
 import errno
 import socket
@@ -38,7 +38,7 @@ def test_a_refused_address_leaves_no_socket_open() -> None:
         before = open_descriptors()
         with pytest.raises(UserError) as caught:
             bind("127.0.0.1", listener.getsockname()[1])
-        assert open_descriptors() == before, caught  # which would hold the socket
+        assert open_descriptors() == before, caught  # `caught` keeps the traceback's frames alive
 
 
 def open_descriptors() -> int:
@@ -113,7 +113,7 @@ def test_a_connection_tries_all_addresses(listens: str) -> None:
                 assert connection.gettimeout() == 5
                 assert connection.family == FAMILIES[listens]
         other = next(name for name in FAMILIES if name != listens)
-        with pytest.raises(ConnectionRefusedError):  # a literal address is that address
+        with pytest.raises(ConnectionRefusedError):  # a literal address has no alternative
             connect((other, port), 5)
 
 
@@ -122,7 +122,7 @@ def test_addresses_that_do_not_answer_share_the_time(monkeypatch: pytest.MonkeyP
         listener.listen(0)
         place = listener.getsockname()
         full = [socket.socket() for _ in range(2)]
-        for one in full:  # the queue is full: the kernel drops what asks for a connection
+        for one in full:  # they fill the queue: the kernel then drops further SYNs
             one.setblocking(False)
             one.connect_ex(place)
         found = (socket.AF_INET, socket.SOCK_STREAM, 0, "", place)

@@ -1,4 +1,4 @@
-"""Charts: positions in the coordinates of their SVG (0 to 1000, y down)."""
+"""Charts: positions in SVG coordinates (0 to 1000, y down)."""
 
 import math
 
@@ -44,7 +44,7 @@ def test_a_line_is_drawn_where_its_values_are() -> None:
         line_plot(Plot("offset (m)", [Line("predicted", X, np.array([0, 1, NAN, 1]))], "m driven"))
     )
     (line,) = page.all("path", "predicted")
-    # A margin of 6 %: from -0.06 to 1.06. NaN breaks the line.
+    # The margin is 6 %, so y is drawn from -0.06 to 1.06. NaN interrupts the line.
     assert line.attributes["d"] == "M0.0,946.4L333.3,53.6M1000.0,53.6"
     grid = [path.attributes["d"] for path in page.all("path", "grid")]
     assert grid[0] == "M0,946.4H1000"
@@ -63,7 +63,7 @@ def test_a_band_is_drawn_behind_its_line_and_cut_off_at_the_edge() -> None:
     assert paths == ["band", "predicted"]
     rings = page.all("path", "band")[0].attributes["d"].split("Z")
     assert [points_of(ring) for ring in rings if ring] == [
-        [[0, 0], [333.3, 0], [333.3, 98.2], [0, 991.1]],  # up to the edge, 0; down to y - 0.05
+        [[0, 0], [333.3, 0], [333.3, 98.2], [0, 991.1]],  # from the edge 0 to y - 0.05
         [[1000, 0], [1000, 98.2]],
     ]
 
@@ -90,7 +90,7 @@ def test_labelled_lines_on_a_logarithmic_axis() -> None:
     (band,) = page.all("path", "band")
     assert band.attributes["style"] == "fill:#123456"
     ring = points_of(band.attributes["d"])
-    assert ring[1][1] == points[0][1]  # ten times 0.1 is 1: the axis reaches up to the band
+    assert ring[1][1] == points[0][1]  # ten times 0.1 is 1: the axis covers the band
     height = points_of(page.all("path", "level")[0].attributes["d"])
     assert [y for _, y in height] == [points[1][1]] * 2
     assert [e.text for e in page.all("span") if "p" in e.inside] == ["MTL <1>", "alone"]
@@ -113,8 +113,8 @@ def test_correct_standard_deviations_lie_on_the_diagonal() -> None:
     page = Page(reliability_diagram("ml (m)", predicted, predicted * [1, 1, 2]))
     dots = [points_of(e.attributes["d"].removesuffix("h0"))[0] for e in page.all("path", "dot")]
     assert [x + y for x, y in dots[:2]] == pytest.approx([1000, 1000], abs=0.2)
-    assert sum(dots[2]) < 950  # twice the predicted deviation: above the diagonal
-    # From 0.8 times the least, 0.008, to 1.25 times the greatest, 0.2.
+    assert sum(dots[2]) < 950  # an error of twice the prediction is above the diagonal
+    # Axis from 0.008 (0.8 times the smallest value) to 0.2 (1.25 times the largest).
     share = math.log(0.01 / 0.008) / math.log(0.2 / 0.008)
     assert dots[0][0] == pytest.approx(1000 * share, abs=0.1)
     assert page.all("span", "x")[0].text == "0.008"

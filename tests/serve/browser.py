@@ -1,4 +1,4 @@
-"""A headless Chromium, driven by its chromedriver: W3C WebDriver over HTTP."""
+"""Controls a headless Chromium through chromedriver (W3C WebDriver over HTTP)."""
 
 import json
 import shutil
@@ -16,7 +16,7 @@ from urllib.request import Request, urlopen
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 DRIVER = shutil.which("chromedriver")
 MISSING = "no chromium with its driver (Debian: apt-get install chromium chromium-driver)"
-ELEMENT = "element-6066-11e4-a52e-4f735466cecf"  # the key of a reference, by the standard
+ELEMENT = "element-6066-11e4-a52e-4f735466cecf"  # the standard's key for a reference to an element
 OPTIONS = (
     "--headless=new", "--no-sandbox", "--disable-gpu", "--use-fake-ui-for-media-stream",
     "--use-fake-device-for-media-stream",
@@ -25,7 +25,7 @@ OPTIONS = (
 
 @dataclass
 class Browser:
-    """A session of a browser with a fake webcam: a green picture with a clock."""
+    """A browser session with a fake webcam, which shows a green picture with a clock."""
 
     url: str
 
@@ -33,11 +33,11 @@ class Browser:
         self._ask("POST", "/url", {"url": page})
 
     def run(self, script: str) -> Any:
-        """The value that the body of a function returns."""
+        """The value that `script`, the body of a function, returns in the page."""
         return self._ask("POST", "/execute/sync", {"script": script, "args": []})
 
     def wait(self, script: str, seconds: float = 20.0) -> Any:
-        """The first true value of an expression."""
+        """Wait until the expression `script` is true; returns its value."""
         end = time.monotonic() + seconds
         while not (found := self.run(f"return {script}")):
             assert time.monotonic() < end, f"{script} is not true after {seconds} s"
@@ -61,7 +61,7 @@ def ask(method: str, url: str, body: dict[str, Any] | None = None) -> Any:
 
 @contextmanager
 def open_browser(folder: Path) -> Iterator[Browser]:
-    """`folder`: of the browser's profile."""
+    """A browser session; `folder` is for the browser's profile."""
     assert DRIVER is not None
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))

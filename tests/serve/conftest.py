@@ -1,7 +1,7 @@
-"""A fake engine, images, and a running service: what the tests of `serve` share.
+"""Shared by the tests of `serve`: a fake engine, images, and a running service.
 
-A test waits for an event, never for a time: for `PATIENCE_S` at most, which is long enough on a
-machine that is busy. Where a time limit is tested, the test sets the service's clock (`Clock`).
+Tests wait for events, never for a fixed time, and at most `PATIENCE_S`, which is long enough on a
+busy machine. Tests of time limits set the service's clock (`Clock`).
 """
 
 import gc
@@ -65,7 +65,7 @@ CARD = ModelCard(
 
 
 class FakeEngine:
-    """Answers with `respond(image)`; the real engines have the same attributes."""
+    """An engine that returns `respond(image)`; it has the attributes of the real engines."""
 
     card = CARD
     kind = "fake"
@@ -83,13 +83,13 @@ class FakeEngine:
 def outputs(
     distances: tuple[float, ...] = (-2.0, 2.0, np.nan, np.nan, np.nan), angle: float = 0.1
 ) -> NDArray[np.float32]:
-    """Engine outputs (9,) for these distances (m, NaN absent) and angle (rad)."""
+    """Engine outputs (9,) for these distances (m, NaN if absent) and this angle (rad)."""
     coded = tf.encode(np.array([distances]), np.array([angle]))[0]
     return np.concatenate([coded, [0.2, 0.5, 0.3]]).astype(np.float32)
 
 
 def picture(width: int = 280, height: int = 210, channels: int = 3) -> NDArray[np.uint8]:
-    """A smooth picture (height, width, channels): a gradient in each channel."""
+    """A smooth image (height, width, channels) uint8 with a gradient in each channel."""
     x, y = np.meshgrid(np.linspace(0, 200, width), np.linspace(0, 50, height))
     planes = [(x + y * (1 + c)) % 256 for c in range(channels)]
     return np.stack(planes, axis=2).astype(np.uint8)
@@ -101,14 +101,14 @@ def jpeg(image: NDArray[np.uint8], colours: str = "RGB") -> bytes:
 
 
 def png(image: NDArray[Any], *options: int) -> bytes:
-    """`image` in OpenCV's channel order (BGR, BGRA or grey)."""
+    """A PNG file of `image`, which has OpenCV's channel order (BGR, BGRA or grey)."""
     done, data = cv2.imencode(".png", image, list(options))
     assert done
     return data.tobytes()
 
 
 class Gate:
-    """An engine that answers only when `open`; `busy` once it has begun on a frame."""
+    """An engine that answers only after `open` is set; it sets `busy` when it begins a frame."""
 
     def __init__(self) -> None:
         self.open, self.busy = threading.Event(), threading.Event()
@@ -129,7 +129,7 @@ def until(condition: Callable[[], bool]) -> None:
 
 
 class Clock:
-    """A clock that stands still unless a test moves it; s."""
+    """A clock in s that only the test advances."""
 
     def __init__(self) -> None:
         self.now_s = 1000.0
@@ -143,7 +143,7 @@ class Clock:
 
 @pytest.fixture(autouse=True)
 def patient_service(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let no slow test find that a worker counts as gone or that an unread problem is dropped."""
+    """Lengthen timeouts, so that in a slow test no worker counts as dead and no problem is lost."""
     monkeypatch.setattr(guard, "LINGER_S", PATIENCE_S)
     for reader in (shared_memory, metrics):
         monkeypatch.setattr(reader, "HEARTBEAT_TIMEOUT_S", PATIENCE_S)
@@ -156,7 +156,7 @@ def engine() -> FakeEngine:
 
 @dataclass(frozen=True)
 class Reply:
-    """What came back: the status, headers by lower-case name, the body read as JSON."""
+    """A reply: its status, its headers by lower-case name, its body decoded from JSON."""
 
     status: int
     headers: dict[str, str]
@@ -178,7 +178,7 @@ def assert_problem(reply: Reply, status: int, name: str) -> None:
 
 
 class Served:
-    """A running service, and one connection to it."""
+    """A running service, with one connection to it."""
 
     def __init__(
         self, port: int, server: WorkerServer | None = None, listener: socket.socket | None = None
@@ -191,7 +191,7 @@ class Served:
 
     @property
     def server(self) -> WorkerServer:
-        """What runs behind the port, in a thread of this process."""
+        """The server, which runs in a thread of this process."""
         assert self._server is not None
         return self._server
 
@@ -201,24 +201,24 @@ class Served:
         return self.server.app
 
     def received_bytes(self) -> list[int]:
-        """What has arrived of each request whose headers or body are incomplete, in order."""
+        """The number of received bytes of each incomplete request, in ascending order."""
         receiving = list(self.server.guard.receiving)
         return sorted(f._unread_bytes for f in receiving if isinstance(f, GuardedProtocol))
 
     @property
     def listener(self) -> socket.socket:
-        """The socket on which this process takes its connections."""
+        """The socket on which the service listens."""
         assert self._listener is not None
         return self._listener
 
     def wait_received(self, *counts: int) -> None:
-        """Return once `counts` bytes have arrived of the incomplete requests, and of no others."""
+        """Wait until the incomplete requests have received exactly these numbers of bytes."""
         until(lambda: self.received_bytes() == sorted(counts))
 
     def wait_for_tick(self) -> None:
-        """Return once the server has looked for expired connections again."""
+        """Wait until the server has checked for expired connections again."""
         cells = self.app.shared.worker(0)
-        for _ in range(2):  # the first may have begun before
+        for _ in range(2):  # the first check can have begun before this call
             last = cells[HEARTBEAT]
             until(partial(lambda last: cells[HEARTBEAT] != last, last))
 
@@ -250,10 +250,11 @@ def serving(
     host: str = "127.0.0.1",
     cameras: Cameras | None = None,
 ) -> Iterator[Served]:
-    """The service around `engine` on a free port, as `serve` runs it, in a thread of this process.
+    """The service with `engine` on a free port, as `serve` runs it, in a thread of this process.
 
-    Ready when entered, unless there is a `check`. `beside`: on its port, as another worker.
-    `clock`: of the deadlines of its connections, s. `host`: where it listens. `cameras`: by name.
+    It is ready on entry unless `check` is given. With `beside` it is another worker on the port of
+    that service. `clock` in s is for the deadlines of its connections. `host` is the address to
+    listen on, `cameras` the named cameras.
     """
 
     def checked(engine: Engine) -> None:
@@ -282,14 +283,14 @@ def serving(
 
 @pytest.fixture
 def service(engine: FakeEngine) -> Iterator[Served]:
-    """The service around `engine`, ready."""
+    """The ready service with `engine`."""
     with serving(engine) as served:
         yield served
 
 
 @pytest.fixture(scope="session")
 def published(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An untrained network, published as `mtlnet train` does, in a folder RUNS/latest links to."""
+    """The run of an untrained network, published as by `mtlnet train`; RUNS/latest links to it."""
     runs = tmp_path_factory.mktemp("serve") / "runs"
     publish_untrained(runs / "fresh", seed=3)
     (runs / "latest").symlink_to("fresh")
@@ -297,7 +298,7 @@ def published(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def publish_untrained(run: Path, seed: int) -> None:
-    """A whole model in folder `run`; its weights are those of `seed`."""
+    """Write a complete model with random weights of this `seed` to the folder `run`."""
     import torch
 
     from mtlnet.export.publish import publish
@@ -308,8 +309,8 @@ def publish_untrained(run: Path, seed: int) -> None:
 
 
 def types_in_cycles(work: Callable[[], object]) -> list[type]:
-    """The types of all objects that `work` leaves in reference cycles: in memory until a collection
-    of garbage, which delays all clients."""
+    """The types of the objects that `work` leaves in reference cycles. They stay in memory until a
+    garbage collection, which would delay all clients."""
     gc.collect()
     gc.disable()
     gc.set_debug(gc.DEBUG_SAVEALL)

@@ -1,8 +1,8 @@
-"""Make the console's samples again: frames of simulated rounds with their truth.
+"""Makes the console's samples: frames of simulated rounds with their true features.
 
 Run: `datagen collect --rounds 12 --frames 40 --seed 11 --out DIR \
 --tracks highway,mountain-pass,forest,town,coast,countryside`, then
-`python tests/serve/make_console_samples.py DIR`. On another renderer the pixels differ a little.
+`python tests/serve/make_console_samples.py DIR`. The pixels depend slightly on the renderer.
 """
 
 import json

@@ -1,4 +1,4 @@
-"""The application as a whole: readiness, many clients at once, a full queue, its own pages."""
+"""The whole application: readiness, concurrent clients, a full queue, status pages."""
 
 import subprocess
 import sys
@@ -55,7 +55,7 @@ def test_a_service_is_alive_at_once_and_ready_once_its_model_is_warm() -> None:
 def test_each_of_eight_clients_gets_the_answer_for_its_own_image(
     service: Served, engine: FakeEngine
 ) -> None:
-    """The angle is the picture's first pixel: an answer for another's picture would show."""
+    """The angle encodes the image's first pixel, so that an answer for another image shows."""
     engine.respond = lambda image: outputs(angle=int(image[0, 0, 0]) / 500)
 
     def drive(client: int) -> int:
@@ -77,7 +77,7 @@ def test_each_of_eight_clients_gets_the_answer_for_its_own_image(
 def test_frames_that_do_not_fit_into_the_queue_are_refused_at_once(
     service: Served, engine: FakeEngine
 ) -> None:
-    """One frame is processed and four wait: of nine, five are answered and four refused."""
+    """One frame is processed and four wait: of nine frames five are answered and four refused."""
     gate = threading.Event()
 
     def respond(_image: Any) -> Any:
@@ -137,6 +137,6 @@ def test_a_worker_without_a_second_core_uses_its_loop_alone(
     monkeypatch: pytest.MonkeyPatch, cores: int, workers: int, single: bool
 ) -> None:
     monkeypatch.setattr("os.sched_getaffinity", lambda _pid: set(range(cores)))
-    shared = create_shared_memory(workers + 1)  # as the supervisor does
+    shared = create_shared_memory(workers + 1)  # the same as the supervisor
     app = Service(FakeEngine(lambda _image: outputs()), shared=shared)
     assert app.frame_queue.single_core is single

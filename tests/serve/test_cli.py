@@ -1,4 +1,4 @@
-"""The command `serve`: a published model on a real port, the first line, the end, errors."""
+"""The command `serve`: a published model on a real port, the first line, shutdown, errors."""
 
 import gc
 import json
@@ -34,7 +34,7 @@ def command(*arguments: str) -> list[str]:
 
 @contextmanager
 def started(*arguments: str, folder: Path = ROOT) -> Iterator[tuple[subprocess.Popen[str], str]]:
-    """The running command and its first line; killed at the end if it still runs."""
+    """The running command and its first line; if it still runs at the end, it is killed."""
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     with subprocess.Popen(
         command(*arguments), stderr=subprocess.PIPE, text=True, cwd=folder, env=environment
@@ -53,7 +53,7 @@ def address(line: str) -> str:
 
 
 def refused(*arguments: str, folder: Path = ROOT) -> str:
-    """The one line with which the command ends with exit code 1."""
+    """The error line of a command, which must exit with code 1 after exactly one line."""
     done = typed("serve", *arguments, folder=folder)
     assert done.returncode == 1, done.stderr
     assert done.stderr.startswith("error: ")
@@ -94,14 +94,14 @@ def test_serve_without_options_takes_the_shipped_or_latest_model_until_ctrl_c(
 
 
 def test_both_workers_behind_one_port_answer_alike_and_log_every_request(published: Path) -> None:
-    """A worker is known by the first part of the request ids that it makes."""
+    """The first part of a generated request id identifies the worker."""
     arguments = ("--model", str(published), "--port", "0", "--workers", "2", "--log-answers")
     connections: dict[str, Connection] = {}  # by worker
     requests: dict[str, tuple[str, int]] = {}  # (worker, status) by request id
     answers: list[dict[str, Any]] = []
 
     def ask(connection: Connection, body: bytes) -> str:
-        """The worker of a connection that posts `body`."""
+        """Post `body` on a connection; returns the worker that answered."""
         connection.request("POST", "/features", body, {"Content-Type": "image/png"})
         response = connection.getresponse()
         content = json.loads(response.read())
@@ -130,7 +130,7 @@ def test_both_workers_behind_one_port_answer_alike_and_log_every_request(publish
                 return b"driverview_workers_ready 2\n" in connection.getresponse().read()
 
         def have_answered() -> bool:
-            # All connections stay open, so the next one goes to the worker with fewer of them.
+            # All connections stay open, so the worker with fewer connections accepts the next one.
             connection = Connection("127.0.0.1", port, timeout=PATIENCE_S)
             ask(stack.enter_context(closing(connection)), image)
             return len(connections) == 2
@@ -181,7 +181,7 @@ def test_a_taken_port_and_an_unknown_host_are_errors_of_one_line(published: Path
 
 
 def test_help_loads_nothing_heavy() -> None:
-    """Tested by the modules that are loaded, as a time would depend on the machine."""
+    """The test checks the loaded modules, because a time would depend on the machine."""
     code = (
         "import sys; from serve.cli import app; sys.argv[1:] = ['--help']\n"
         "try: app()\n"
@@ -201,14 +201,14 @@ def test_a_faulty_camera_ends_the_command(tmp_path: Path) -> None:
 
 
 def test_the_supervisor_loads_neither_framework_nor_engine() -> None:
-    """It answers no request, and every worker waits for its start."""
+    """The supervisor answers no request, and every worker waits until it has started."""
     code = "import sys, serve.launch; print({'fastapi', 'cv2', 'openvino'} & set(sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.stdout == "set()\n", done.stderr
 
 
 def test_a_ready_worker_excludes_its_modules_from_garbage_collection() -> None:
-    """A collection over all of them would delay every client."""
+    """A garbage collection that includes all modules would delay every client."""
     ours, other = socket.socketpair()
     with other:
         send_ready(SupervisorConnection(ours.detach()))

@@ -1,4 +1,4 @@
-"""Dockerfile and manifests agree with the service: ports, paths, users, options."""
+"""The Dockerfile and the manifests match the service: ports, paths, users, options."""
 
 import re
 import tomllib
@@ -162,7 +162,7 @@ def test_compose_bounds_memory_and_processes() -> None:
 
 
 def test_the_lock_holds_every_dependency_of_every_package_in_it() -> None:
-    """With hashes, pip refuses to install a dependency that has no line of its own."""
+    """With hashes, pip refuses to install a dependency that has no line in the lock file."""
     lock = (ROOT / "requirements.lock").read_text()
     locked = {canonicalize_name(name) for name in re.findall(r"^([\w.-]+)==", lock, re.MULTILINE)}
     missing = []
@@ -170,7 +170,7 @@ def test_the_lock_holds_every_dependency_of_every_package_in_it() -> None:
         try:
             needed = [Requirement(line) for line in requires(package) or []]
         except PackageNotFoundError:
-            continue  # for another platform
+            continue  # a package for another platform
         missing += [
             f"{package} needs {requirement}"
             for requirement in needed

@@ -1,4 +1,4 @@
-"""Limits on clients: connections, time for a request, size of headers, token, request rate."""
+"""Limits for clients: connections, time for a request, size of headers, token, request rate."""
 
 import json
 import select
@@ -43,7 +43,7 @@ def dial(service: Served, source: str = "127.0.0.1") -> socket.socket:
 
 
 def read_refusal(connection: socket.socket) -> tuple[int, dict[str, object]]:
-    """The status and the problem with which the service ends a connection."""
+    """The status and the problem in the reply with which the service ends a connection."""
     received = b""
     with connection:
         while part := connection.recv(65536):
@@ -79,7 +79,7 @@ def test_slow_headers_slow_bodies_and_silent_connections_are_closed() -> None:
         assert service.received_bytes() == [len(begun)]
         clock.now_s += 5.0
         assert_too_slow(slow_body, "body")
-        # The second request of a connection has the same time.
+        # The second request of a connection has the same time limit.
         complete.sendall(HEAD)
         service.wait_received(len(HEAD))
         clock.now_s += 5.1
@@ -100,7 +100,7 @@ def test_single_bytes_do_not_extend_the_time_for_headers() -> None:
         connection.sendall(begun)
         for count in range(4):
             service.wait_received(len(begun) + count)
-            clock.now_s += 1.2  # 4.8 s in all
+            clock.now_s += 1.2  # 4.8 s in total
             connection.sendall(b"a")
         service.wait_received(len(begun) + 4)
         clock.now_s += 0.3
@@ -109,7 +109,7 @@ def test_single_bytes_do_not_extend_the_time_for_headers() -> None:
 
 @contextmanager
 def filled(count: int) -> Iterator[tuple[Served, list[socket.socket]]]:
-    """A service with as many connections as it takes, each of which waits for an answer."""
+    """A service with its largest number of connections, each of which waits for an answer."""
     gate = Gate()
     with serving(gate.engine, limits=Limits(connections=count, queue=count)) as service:
         connections = [dial(service) for _ in range(count)]
@@ -177,10 +177,10 @@ def test_a_client_with_many_connections_gives_way_to_one_with_few() -> None:
         assert steady.recv(65536).startswith(b"HTTP/1.1 200")
         many = [dial(service, "127.0.0.2") for _ in range(7)]
         service.wait_received(*[0] * 7)
-        assert read_refusal(dial(service, "127.0.0.2"))[0] == 503  # they are too young to be ended
+        assert read_refusal(dial(service, "127.0.0.2"))[0] == 503  # all are too young
         steady.sendall(whole)
         assert steady.recv(65536).startswith(b"HTTP/1.1 200")
-        others = [dial(service) for _ in range(2)]  # in place of the refused one, and another
+        others = [dial(service) for _ in range(2)]  # one replaces the refused connection
         for other in others:
             other.sendall(whole)
             assert other.recv(65536).startswith(b"HTTP/1.1 200")
@@ -208,7 +208,7 @@ def test_the_networks_of_ipv6_are_clients() -> None:
 
 
 class Connection:
-    """A connection of a guard, from an address."""
+    """A connection from `address`, admitted by `guard`."""
 
     def __init__(self, guard: ConnectionGuard, address: str) -> None:
         self.since_s, self.network, self.ended = 0.0, "", False
@@ -287,9 +287,9 @@ def test_requests_without_the_token_are_refused() -> None:
                 assert_problem(reply, 401, "unauthorized")
                 assert reply.headers["www-authenticate"] == "Bearer"
         assert service.post(JPEG, Authorization=f"Bearer {token}").status == 200
-        assert service.ask("GET", "/readyz").status == 200  # a load balancer has no token
-        assert service.ask("GET", "/").status == 200  # the console asks its user for the token
-        assert service.ask("GET", "/docs").status == 200  # a browser cannot send one
+        assert service.ask("GET", "/readyz").status == 200  # load balancers have no token
+        assert service.ask("GET", "/").status == 200  # the console asks the user for the token
+        assert service.ask("GET", "/docs").status == 200  # a browser cannot send a token
 
 
 def test_a_client_over_its_rate_is_refused_with_a_retry_time() -> None:
@@ -314,7 +314,7 @@ def test_a_client_over_its_rate_is_refused_with_a_retry_time() -> None:
 def test_a_rate_below_one_a_second_lets_a_request_pass_now_and_then() -> None:
     limiter = RateLimiter(shared_memory.create_shared_memory(blocks=1).clients(), 0.5)
     limiter.check("10.0.0.1", 100.0)
-    with pytest.raises(Problem, match=r"more than 0\.5 requests a second"):
+    with pytest.raises(Problem, match=r"more than 0\.5 requests per second"):
         limiter.check("10.0.0.1", 101.0)
     limiter.check("10.0.0.1", 103.0)
 
@@ -327,7 +327,7 @@ def test_loopback_addresses() -> None:
 
 
 def test_a_client_refused_by_a_full_queue_is_paused_and_then_read_again() -> None:
-    """While the queue is full its next request waits for a moment; other requests do not."""
+    """While the queue is full, the client's next request waits a moment; other clients do not."""
     gate = Gate()
     with serving(gate.engine, limits=Limits(queue=0)) as service, ThreadPoolExecutor(1) as pool:
         first = pool.submit(Served(service.port).post, JPEG)

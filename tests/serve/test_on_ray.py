@@ -31,7 +31,7 @@ REQUESTS = 40
 
 @contextmanager
 def on_ray(model: Path, token_file: Path, replicas: int) -> Iterator[int]:
-    """The service on its own local Ray cluster; its port."""
+    """The service on a local Ray cluster of its own; yields its port."""
     with bind("127.0.0.1", 0) as listener:
         port = listener.getsockname()[1]
     words = ("ray", "--model", str(model), "--port", str(port), "--replicas", str(replicas))
@@ -79,7 +79,7 @@ def test_answers_of_two_replicas_equal_the_engines(published: Path, tmp_path: Pa
         assert status == 200
         assert {name: answer[name] for name in right} == right
         assert answer["model"] == read_card(published).model_hash
-    # Each replica counts its own: two have answered, and all of the requests between them.
+    # Each replica counts its own requests: both have answered, together all requests.
     assert all(0 < count < REQUESTS for count in counts)
     assert sum(counts) == (REQUESTS if len(counts) == 2 else REQUESTS // 2)
 
@@ -165,6 +165,6 @@ def test_error_without_ray_serve_is_one_line(monkeypatch: pytest.MonkeyPatch) ->
 
 
 def test_driverview_serve_stays_available_beside_rays_serve() -> None:
-    """Ray installs a console script `serve`, too; the package installed last owns that name."""
+    """Ray also installs a console script `serve`; the package installed last owns this name."""
     scripts = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
     assert scripts["driverview-serve"] == scripts["serve"] == f"{main.__module__}:{main.__name__}"

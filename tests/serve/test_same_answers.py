@@ -36,7 +36,7 @@ Connection = http.client.HTTPConnection
 
 
 def post(connection: Connection, path: str, body: bytes, **headers: str) -> tuple[bytes, int]:
-    """(body of the answer, length of its JSON part)."""
+    """The body of the answer, and the size of its JSON part in bytes."""
     sent = {name.replace("_", "-"): value for name, value in headers.items()}
     connection.request("POST", path, body, sent)
     response = connection.getresponse()
@@ -94,7 +94,7 @@ def by_websocket(port: int) -> dict[str, Any]:
 
 
 def as_features(tensors: dict[str, list[float | None]]) -> dict[str, Any]:
-    """Output tensors in the form of an answer of POST /features."""
+    """Output tensors, converted to the form of an answer of POST /features."""
     stds = ("ml", "mr", "l", "m", "r", "to_lane_centre", "angle")
     spread = dict(zip(stds, tensors["std"], strict=True))
     absent = dict(zip(tf.MARKINGS, tensors["absent"], strict=True))
@@ -111,7 +111,7 @@ def as_features(tensors: dict[str, list[float | None]]) -> dict[str, Any]:
 
 
 def narrowed(value: Any) -> Any:
-    """An answer with its numbers rounded to float32, the type of a tensor."""
+    """An answer with its numbers rounded to float32, the type of the tensors."""
     if isinstance(value, dict):
         return {name: narrowed(part) for name, part in value.items()}
     return float(np.float32(value)) if isinstance(value, float) else value
@@ -122,7 +122,7 @@ def wait_until_ready(service: Served) -> None:
 
 
 def test_workers_types_and_endpoints_give_the_same_answer(published: Path) -> None:
-    """Two workers, each on its own port, answer alike for every media type and endpoint."""
+    """Two workers on two ports give equal answers for every media type and endpoint."""
     memory = create_shared_memory(blocks=2)
     plain, tensors = [], []
     with (
@@ -142,8 +142,8 @@ def test_workers_types_and_endpoints_give_the_same_answer(published: Path) -> No
 
 @pytest.fixture(scope="module")
 def sensitive_model(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An untrained network with enlarged weights: its outputs vary between images by more than
-    the tolerances, as a trained network's do."""
+    """An untrained network with enlarged weights. Like those of a trained network, its outputs
+    differ between images by more than the tolerances."""
     import torch
 
     from mtlnet.export.publish import publish
@@ -166,7 +166,7 @@ def oracle(sensitive_model: Path) -> Engine:
 
 
 def model_input(image: bytes) -> NDArray[np.uint8]:
-    """The pixels of an image file as an engine receives them."""
+    """The pixels of an image file in the form that an engine receives."""
     camera = CameraParameters()
     return decode(image, inspect(image, camera), camera)
 
@@ -175,7 +175,7 @@ def model_input(image: bytes) -> NDArray[np.uint8]:
 def test_engines_agree_within_the_stated_tolerance(
     sensitive_model: Path, oracle: Engine, precision: Literal["f32", "bf16"]
 ) -> None:
-    """Compares encoded outputs and probabilities, from which the answer is decoded."""
+    """The coded outputs and probabilities are compared; answers are decoded from them."""
     engine = load_engine(sensitive_model, "openvino", precision)
     assert (engine.kind, engine.precision) == ("openvino", precision)
     image, other = model_input(JPEG), model_input(jpeg(picture()[:, :, ::-1]))

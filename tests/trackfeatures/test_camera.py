@@ -10,7 +10,7 @@ from trackfeatures.camera import CameraParameters
 
 
 def test_intrinsics_of_a_lens_of_90_degrees() -> None:
-    """tan(45 deg) = 1: the focal length is half of the height."""
+    """tan(45 deg) = 1, so the focal length is half of the image height."""
     camera = CameraParameters(width=280, height=210, fov_y_deg=90.0)
     assert camera.focal_px == pytest.approx(105.0)
     expected = [[105.0, 0.0, 139.5], [0.0, 105.0, 104.5], [0.0, 0.0, 1.0]]
@@ -23,7 +23,7 @@ def test_the_default_camera_is_1_20_m_above_the_road() -> None:
 
 @pytest.mark.parametrize("fov_y_deg", [0.0, -20.0, 180.0, float("nan")])
 def test_an_impossible_field_of_view_is_refused(fov_y_deg: float) -> None:
-    """As a UserError to whoever gives it, as a ValueError to a reader of a damaged file."""
+    """The error is a UserError for commands and a ValueError for readers of damaged files."""
     with pytest.raises(UserError, match="between 1 and 150 deg") as caught:
         CameraParameters(fov_y_deg=fov_y_deg)
     assert isinstance(caught.value, ValueError)

@@ -54,7 +54,7 @@ def test_decode_inverts_encode(lanes: int, width: float, to_middle: float, angle
         if distance is not None:
             assert found == pytest.approx(distance, abs=1e-5), name
     centre = truth.to_lane_centre
-    assume(truth.m is None or abs(truth.m) > 1e-5)  # on the line, rounding chooses the lane
+    assume(truth.m is None or abs(truth.m) > 1e-5)  # at m = 0 rounding decides which lane counts
     if centre is None:
         assert back.to_lane_centre is None
     else:

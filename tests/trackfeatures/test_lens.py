@@ -1,4 +1,4 @@
-"""Lens and mount of a camera against OpenCV, and the road's metres against closed forms."""
+"""Lens and mount of a camera compared with OpenCV; points on the road against closed forms."""
 
 from dataclasses import replace
 
@@ -69,7 +69,7 @@ def test_every_pixel_has_a_ray_that_leads_back_or_none(
 
 
 def test_a_lens_that_folds_is_used_up_to_its_fold() -> None:
-    """r (1 - 0.25 r^2) grows up to r = 2 / sqrt(3), where it is 4 / (3 sqrt(3)) = 0.7698."""
+    """r (1 - 0.25 r^2) has its maximum 4 / (3 sqrt(3)) = 0.7698 at r = 2 / sqrt(3)."""
     camera = CameraParameters(201, 201, matrix=(100, 100, 100, 100), x=0, z=0,
                               distortion="opencv", coefficients=(-0.25, 0, 0, 0))  # fmt: skip
     fold = 2 / np.sqrt(3)
@@ -89,8 +89,8 @@ def test_behind_the_camera_there_is_no_pixel() -> None:
 
 
 def test_the_mount_by_hand() -> None:
-    """Yaw turns left: what was ahead is right of the middle. Pitch looks down: the horizon rises.
-    Roll lowers the right side: the horizon's right end rises in the picture."""
+    """Positive yaw moves a point ahead of the car to the right in the image. Positive pitch moves
+    the horizon up. Positive roll raises the right end of the horizon in the image."""
     camera = CameraParameters(201, 201, matrix=(100, 100, 100, 100), x=0, z=0)
     ahead = [[1000.0, 0.0, 0.0]]
     turned = replace(camera, yaw_deg=10.0).project(ahead)[0]
@@ -104,7 +104,7 @@ def test_the_mount_by_hand() -> None:
 
 
 def test_road_points_by_hand_and_back() -> None:
-    """From 1.5 m, 45 degrees below the horizon the road is 1.5 m ahead of the camera."""
+    """A ray 45 degrees below the horizon from 1.5 m height meets the road 1.5 m ahead."""
     camera = CameraParameters(201, 201, matrix=(100, 100, 100, 100), x=0.75, y=0.2, z=1.25)
     np.testing.assert_allclose(camera.road_points([[100, 200]]), [[2.25, 0.2]])
     np.testing.assert_allclose(camera.road_points([[0, 200]]), [[2.25, 1.7]])

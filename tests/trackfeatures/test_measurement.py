@@ -1,4 +1,4 @@
-"""Measurement: signs, limits of the two marking systems, and a brute-force geometric oracle."""
+"""Measured features: signs, limits of the two marking systems, a brute-force geometric oracle."""
 
 import math
 from dataclasses import dataclass
@@ -85,7 +85,7 @@ def test_to_lane_centre_is_the_offset_from_the_nearest_lane(
     index = tf.lane_index(to_middle, lanes, width)
     expected = to_middle - tf.lane_centre(index, lanes, width)
     outside = abs(to_middle) - lanes * width / 2
-    # On a marking to a rounding error, either lane is the nearest.
+    # Within a rounding error of a marking either lane can be the nearest.
     assume(min(abs(to_middle - tf.marking_offsets(lanes, width))) > 1e-9)
     assume(abs(outside - 2.0) > 1e-9)
     if outside > 2.0:
@@ -130,7 +130,7 @@ def test_impossible_roads_are_refused(lanes: int, width: float) -> None:
 
 @dataclass(frozen=True)
 class Circle:
-    """A ring road about the origin, driven counter-clockwise from (radius, 0)."""
+    """A ring road around the origin, driven counter-clockwise; s = 0 is at (radius, 0)."""
 
     radius: float
 
@@ -145,14 +145,14 @@ class Circle:
 
 
 def oracle(ring: Circle, x: float, y: float, lanes: int, width: float) -> dict[str, float | None]:
-    """Distances by a search over 20,000 points of every painted circle, without the formulas."""
+    """Distances found by a search over 20,000 points of each marking's circle, without formulas."""
     turn = np.linspace(0, math.tau, 20_000, endpoint=False)
     gaps = []
     for offset in tf.marking_offsets(lanes, width):
         r = ring.radius - offset
         points = np.column_stack([r * np.cos(turn), r * np.sin(turn)])
         gap = float(np.hypot(points[:, 0] - x, points[:, 1] - y).min())
-        # A larger circle lies on the right of a car that drives counter-clockwise.
+        # The car drives counter-clockwise, so a larger circle is on its right.
         gaps.append(gap if r > math.hypot(x, y) else -gap)
     found: dict[str, float | None] = dict.fromkeys(tf.MARKINGS)
     left = [gap for gap in gaps if gap <= 0]

@@ -1,4 +1,4 @@
-"""Names from files: what is a name, and what is refused."""
+"""Names read from files: accepted and refused values."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""Cameras that the service knows by name: the same answers for every endpoint as for `predict`."""
+"""Named cameras of the service: every endpoint gives the same answers as `mtlnet predict`."""
 
 import json
 from collections.abc import Iterator
@@ -49,8 +49,8 @@ def test_the_answer_is_that_of_the_rectified_image(service: Served, engine: Fake
         assert reply.content["distances_m"] == pytest.approx(EXPECTED.distances_m)
         assert reply.content["to_lane_centre_m"] == pytest.approx(EXPECTED.to_lane_centre_m)
         assert reply.content["crop_px"] is None
-    # 1.4 / 1.2 times (2 m - 0.75 m sin 0.1) beside the camera, which is 0.2 m cos 0.1 - 1 m sin 0.1
-    # left of the car's middle.
+    # The marking is 1.4 / 1.2 (2 m - 0.75 m sin 0.1) from the camera, and the camera is
+    # 0.2 m cos 0.1 - 1 m sin 0.1 left of the car's middle.
     assert EXPECTED.distances_m["mr"] == pytest.approx(2.1468, abs=1e-3)
     first, second, third = engine.images
     assert (first != second).any()
@@ -83,7 +83,7 @@ def test_an_unknown_camera_is_refused(service: Served, engine: FakeEngine) -> No
     assert (both.status, "are both given" in both.content["detail"]) == (422, True)
     assert infer(service, camera=7).status == 422
     other = post(service, "/features?camera=roof", JPEG, [("Content-Type", "image/jpeg")])
-    assert other.status == 200  # of the same aspect ratio
+    assert other.status == 200  # the image has the camera's aspect ratio
     assert len(engine.images) == 1
 
 

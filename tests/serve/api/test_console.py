@@ -19,7 +19,7 @@ from tests.serve.conftest import Served
 from trackfeatures.camera import CameraParameters
 
 COUNT = "Number(/over (\\d+)/.exec(document.getElementById('times').textContent)?.[1] ?? 0)"
-"""The number of latencies in the page."""
+"""JavaScript expression: the number of requests in the page's latency statistics."""
 
 
 def test_the_page_loads_files_of_the_service_only(service: Served) -> None:
@@ -56,7 +56,7 @@ def test_every_sample_has_the_models_size_and_true_features(service: Served) -> 
 @pytest.mark.slow
 @pytest.mark.skipif(CHROMIUM is None, reason="no chromium (Debian: apt-get install chromium)")
 def test_a_browser_shows_the_answer(service: Served, tmp_path: Path) -> None:
-    """The page requests the answer for its first sample without user input."""
+    """The page sends its first sample without user input."""
     shot = tmp_path / "console.png"
     assert CHROMIUM is not None
     command = [CHROMIUM, "--headless", "--no-sandbox", "--hide-scrollbars", "--dump-dom"]
@@ -72,7 +72,7 @@ def test_a_browser_shows_the_answer(service: Served, tmp_path: Path) -> None:
     assert "ml -2.00 m" in text
     assert "mr 2.00 m" in text
     assert "straight 50 %" in text
-    # The markings are drawn, in the blue of a marking of the car's lane.
+    # The markings of the car's lane are drawn in their blue.
     picture = cv2.imread(str(shot))
     assert picture is not None
     assert picture.shape == (1000, 1360, 3)
@@ -87,7 +87,7 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
 
 
 def green_share(browser: Browser) -> float:
-    """Share of the shown picture that is the fake webcam's green."""
+    """Fraction of the shown picture with the green of the fake webcam."""
     pixels = browser.run(
         "const c = document.getElementById('picture');"
         "return [...c.getContext('2d').getImageData(0, 0, c.width, 60).data];"
@@ -100,7 +100,7 @@ def green_share(browser: Browser) -> float:
 @pytest.mark.skipif(None in (CHROMIUM, DRIVER), reason=MISSING)
 def test_a_webcam_is_answered_picture_by_picture(service: Served, browser: Browser) -> None:
     browser.open(service.url)
-    browser.wait(f"{COUNT} === 1")  # the first sample
+    browser.wait(f"{COUNT} === 1")  # the answer for the first sample
     browser.run("document.getElementById('webcam').click()")
     browser.wait(f"{COUNT} >= 6")
     status = browser.run("return document.getElementById('status').textContent")
@@ -131,7 +131,7 @@ def test_a_film_is_answered_while_it_plays(
     browser.wait(f"{COUNT} === 1")
     browser.choose_file("#file", film)
     browser.wait(f"{COUNT} >= 4")
-    browser.wait("document.getElementById('stop').hidden")  # it ends by itself
+    browser.wait("document.getElementById('stop').hidden")  # the film has ended
     assert green_share(browser) > 0.9
     (tmp_path / "none.webm").write_bytes(b"no film")
     browser.choose_file("#file", tmp_path / "none.webm")
@@ -141,7 +141,7 @@ def test_a_film_is_answered_while_it_plays(
 
 @pytest.mark.skipif(shutil.which("node") is None, reason="no node")
 def test_a_marking_is_absent_where_the_service_says_so(tmp_path: Path) -> None:
-    """`l` is answered up to a probability of 0.75 that it is absent."""
+    """`l` is present up to a probability of absence of 0.75."""
     answer = {
         "distances_m": {"ml": None, "l": -3.5},
         "absent": {"ml": 0.9, "l": 0.7},
@@ -161,7 +161,7 @@ def test_a_marking_is_absent_where_the_service_says_so(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(shutil.which("node") is None, reason="no node")
 def test_console_geometry_equals_the_pinhole_camera(tmp_path: Path) -> None:
-    """A marking 2 m right and 5 m ahead is drawn at its projection by the camera matrix."""
+    """A point on a marking is drawn where the camera matrix projects it: 2 m right, 5 m ahead."""
     script = tmp_path / "ask.mjs"
     module = (FOLDER / "geometry.js").as_uri()
     camera = CameraParameters()
@@ -188,7 +188,7 @@ def test_console_geometry_equals_the_projection_of_any_camera(tmp_path: Path) ->
         ("opencv", (-0.3, 0.1, 0.001, -0.002)),
         ("opencv", (0.9, 0.3, 0.0003, -0.0004, 0.02, 1.2, 0.5, 0.05)),
         ("fisheye", (-0.02, 0.005, -0.003, 0.0006)),
-        ("opencv", (-0.5, 0.0, 0.0, 0.0)),  # folds
+        ("opencv", (-0.5, 0.0, 0.0, 0.0)),  # a lens model that folds
     ]
     cameras = [
         CameraParameters(1280, 720, matrix=matrix, distortion=kind, coefficients=k, **mount)

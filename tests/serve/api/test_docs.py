@@ -1,4 +1,4 @@
-"""The page at /docs: Swagger UI with the whole OpenAPI document, without external requests."""
+"""The page at /docs: Swagger UI with the complete OpenAPI document, without external requests."""
 
 import html
 import json
@@ -43,7 +43,7 @@ def test_every_file_is_served_locally_with_a_strict_csp(service: Served) -> None
         assert reply.status == 200, link
         assert reply.headers["content-security-policy"] == policy
     assert service.ask("GET", "/redoc").status == 404
-    assert service.ask("GET", "/console/docs.html").status == 404  # only as /docs
+    assert service.ask("GET", "/console/docs.html").status == 404  # only available as /docs
 
 
 def test_document_text_cannot_close_the_script_element() -> None:

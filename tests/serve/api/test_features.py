@@ -1,4 +1,4 @@
-"""POST /features over HTTP: the answer, its media type, the part of the image used, refusals."""
+"""POST /features over HTTP: the answer, its media type, the used part of the image, refusals."""
 
 import json
 import socket
@@ -136,7 +136,7 @@ def test_bad_input_is_answered_with_a_problem(
 ) -> None:
     assert_problem(service.post(body, kind), status, name)
     assert not engine.images
-    assert service.post(JPEG).status == 200  # on the same connection
+    assert service.post(JPEG).status == 200  # the connection is still open
 
 
 def test_a_body_without_content_length_has_the_same_limit(service: Served) -> None:
@@ -189,7 +189,7 @@ def test_mutated_images_are_answered_or_refused(service: Served) -> None:
         whole = bytearray((JPEG, PNG)[number % 2])
         for place in rng.integers(0, len(whole), rng.integers(1, 20)):
             whole[place] = rng.integers(256)
-        if rng.random() < 0.3:  # the headers are the first hundred bytes
+        if rng.random() < 0.3:  # the first hundred bytes are the headers
             whole[rng.integers(100)] ^= 1 << rng.integers(8)
         if rng.random() < 0.2:
             whole = whole[: rng.integers(len(whole))]

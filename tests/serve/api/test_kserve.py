@@ -1,4 +1,4 @@
-"""The Open Inference Protocol v2, by requests built from its specification."""
+"""The Open Inference Protocol v2, tested with requests built from its specification."""
 
 import base64
 import http.client
@@ -190,7 +190,7 @@ def test_a_wrong_header_length_and_deep_nesting_are_refused(service: Served) -> 
 
 
 def post_raw(service: Served, *lines: str, path: str = INFER) -> dict[str, Any]:
-    """The JSON of the reply to a request with these header lines and no body."""
+    """The JSON reply to a request with these header lines and without a body."""
     with socket.create_connection(("127.0.0.1", service.port), PATIENCE_S) as connection:
         text = "".join(f"{line}\r\n" for line in (f"POST {path} HTTP/1.1", *lines, ""))
         connection.sendall(text.encode("latin-1"))

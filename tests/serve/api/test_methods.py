@@ -1,4 +1,4 @@
-"""HEAD is answered as GET, without the body; other methods get 405 with those that are allowed."""
+"""HEAD is answered like GET, without the body; methods that are not allowed get 405 and Allow."""
 
 import socket
 
@@ -13,7 +13,7 @@ PATHS = (
     *("/v2", "/v2/health/live", "/v2/health/ready", "/v2/models/track", "/v2/models/track/ready"),
 )
 REFUSED = ("/features", "/v2/models/track/infer", "/none", "/v2/models/none", "/stream")
-UNLIKE = {"date", "content-length"}  # /metrics grows
+UNLIKE = {"date", "content-length"}  # the page /metrics grows
 
 
 @pytest.mark.parametrize("path", [*PATHS, *REFUSED])

@@ -1,7 +1,7 @@
-"""The OpenAPI document against the running service, by Schemathesis: requests that follow it and
-requests that break it, each answer held to it.
+"""Compares the OpenAPI document with the running service. Schemathesis sends requests that follow
+the document and requests that violate it, and checks every answer against the document.
 
-    make api        a thousand requests an operation; `make test` makes a few
+    make api        a thousand requests for each operation; `make test` sends a few
 """
 
 import os
@@ -20,7 +20,7 @@ EXAMPLES = int(os.environ.get("DRIVERVIEW_API_EXAMPLES", "10"))
 
 
 def bodies(image: bytes) -> st.SearchStrategy[bytes]:
-    """Bodies that a schema cannot describe: whole images, broken images, other bytes."""
+    """Bodies that a schema cannot describe: complete images, truncated images, other bytes."""
     broken = st.integers(1, len(image) - 1).map(lambda cut: image[:cut])
     return st.just(image) | broken | st.binary(max_size=200)
 
@@ -29,9 +29,9 @@ schemathesis.openapi.media_type("image/jpeg", bodies(jpeg(picture())))
 schemathesis.openapi.media_type("image/png", bodies(png(picture())))
 DOCUMENT = Service(FakeEngine(lambda _image: outputs())).framework.openapi()
 schema = schemathesis.openapi.from_dict(DOCUMENT)
-# 503 is an answer here: the deadline that a request gave itself may have passed.
+# 503 is correct for a request whose own deadline has passed.
 schema.config.checks.not_a_server_error.expected_statuses = ["2xx", "4xx", "503"]
-# 422: no image in the body, or one that a true header makes useless.
+# 422 is correct if the body is no image, or if a valid header makes the image unusable.
 schema.config.checks.positive_data_acceptance.expected_statuses = ["2xx", "422", "503"]
 
 

@@ -1,4 +1,4 @@
-"""The options of an image are the same for every endpoint, and none is ignored."""
+"""The options of an image are the same for every endpoint, and no option is ignored."""
 
 import json
 import struct
@@ -24,12 +24,12 @@ Pairs = Sequence[tuple[str, str]]
 
 
 def features(service: Served, query: str = "", headers: Pairs = ()) -> Reply:
-    """POST /features; `headers` may hold a name twice."""
+    """POST /features; a name can occur twice in `headers`."""
     return post(service, f"/features{query}", WIDE, [("Content-Type", "image/jpeg"), *headers])
 
 
 def infer(service: Served, query: str = "", headers: Pairs = (), **parameters: Any) -> Reply:
-    """An inference request with the image in binary."""
+    """An inference request with the image as binary data."""
     raw = struct.pack("<I", len(WIDE)) + WIDE
     tensor = {"name": "image", "shape": [1, 1], "datatype": "BYTES"}
     content: dict[str, Any] = {"inputs": [{**tensor, "parameters": {"binary_data_size": len(raw)}}]}
@@ -55,7 +55,7 @@ def frame_id(reply: Reply) -> Any:
 
 
 def stream(service: Served, query: str = "", text: str | None = None) -> Any:
-    """The answer to one image on a WebSocket, or the problem that refuses the handshake."""
+    """The answer to an image on a WebSocket, or the problem in the reply to the handshake."""
     url = f"ws://127.0.0.1:{service.port}/stream{query}"
     try:
         with connect(url, open_timeout=PATIENCE_S, compression=None) as websocket:
@@ -96,12 +96,12 @@ def test_a_websocket_takes_them_for_all_images_or_for_one(service: Served) -> No
 @pytest.mark.parametrize(
     ("query", "seen"),
     [
-        ("?fov=60", "'fov'; there are frame_id, stream_id, deadline_ms, fov_y, camera"),
+        ("?fov=60", "'fov'; known are frame_id, stream_id, deadline_ms, fov_y, camera"),
         ("?Fov_Y=60", "'Fov_Y'"),
         ("?x-camera-fov-y=60", "'x-camera-fov-y'"),
         ("?deadline=5", "'deadline'"),
         ("?=5", "''"),
-        ("?fov_y=60&fov_y=60", "'fov_y' is twice"),
+        ("?fov_y=60&fov_y=60", "'fov_y' occurs twice"),
         ("?fov_y=", "X-Camera-Fov-Y is ''"),
         ("?fov_y", "X-Camera-Fov-Y is ''"),
         ("?frame_id=", "X-Frame-Id has 0 characters"),
@@ -110,7 +110,7 @@ def test_a_websocket_takes_them_for_all_images_or_for_one(service: Served) -> No
         ("?deadline_ms=nan", "X-Deadline-Ms is 'nan'"),
         ("?deadline_ms=-1", "expected a number from 0 to 60000"),
         ("?fov_y=%C3%A9", "X-Camera-Fov-Y"),
-        ("?" + "&".join(["fov_y=1"] * 20), "over 16 fields"),
+        ("?" + "&".join(["fov_y=1"] * 20), "more than 16 fields"),
     ],
 )
 def test_what_is_unknown_twice_or_empty_is_refused_everywhere(
@@ -153,7 +153,7 @@ def test_a_misspelt_header_is_refused(service: Served, name: str) -> None:
     for ask in (features, infer):
         reply = ask(service, headers=[(name, "60")])
         assert (reply.status, reply.content["type"]) == (422, "/problems/invalid-request")
-        assert f"unknown header {name.lower()!r}; there are X-Frame-Id" in reply.content["detail"]
+        assert f"unknown header {name.lower()!r}; known are X-Frame-Id" in reply.content["detail"]
 
 
 def test_headers_of_clients_and_proxies_are_ignored(service: Served) -> None:
@@ -170,11 +170,11 @@ def test_an_option_beside_the_parameters_is_refused(service: Served, name: str) 
     for content in contents:
         reply = service.ask("POST", INFER, json.dumps(content).encode())
         assert reply.status == 422
-        assert f"{name} is not a member of its own" in reply.content["error"]
+        assert f"{name} is at the wrong place" in reply.content["error"]
 
 
 def test_unknown_parameters_of_the_inference_protocol_are_refused(service: Served) -> None:
-    known = "there are binary_data_output, frame_id, stream_id, deadline_ms, fov_y, camera"
+    known = "known are binary_data_output, frame_id, stream_id, deadline_ms, fov_y, camera"
     unknown: list[dict[str, Any]] = [{"sequence_id": 1}, {"timeout": 5}, {"Fov_Y": 60}]
     for one in unknown:
         reply = infer(service, **one)
@@ -195,14 +195,14 @@ def test_unknown_parameters_of_the_inference_protocol_are_refused(service: Serve
         reply = service.ask("POST", INFER, json.dumps(content).encode())
         assert (reply.status, seen in reply.content["error"]) == (422, True)
     twice = b'{"inputs":[%b],"parameters":{"fov_y":60,"fov_y":70}}' % json.dumps(image).encode()
-    assert "is twice" in service.ask("POST", INFER, twice).content["error"]
+    assert "occurs twice" in service.ask("POST", INFER, twice).content["error"]
 
 
 def test_text_messages_name_what_is_unknown(service: Served) -> None:
     for text, seen in (
         ('{"fov": 60}', "frame_id, deadline_ms, fov_y, camera"),
         ('{"stream_id": "a"}', "'stream_id'"),
-        ('{"fov_y": 60, "fov_y": 70}', "is twice"),
+        ('{"fov_y": 60, "fov_y": 70}', "occurs twice"),
         ('{"deadline_ms": true}', "must be a number"),
         ('{"frame_id": ""}', "0 characters"),
     ):

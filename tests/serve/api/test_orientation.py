@@ -1,4 +1,4 @@
-"""Every endpoint turns an image upright, as its EXIF orientation says, before anything else."""
+"""Every endpoint first turns an image upright according to its EXIF orientation."""
 
 import base64
 import json
@@ -19,7 +19,7 @@ def exif(orientation: int) -> bytes:
 
 
 def stored_png(orientation: int) -> bytes:
-    """`WIDE` upright: stored on its side (6, 8) or upside down (3)."""
+    """A PNG file of `WIDE`, stored on its side (orientation 6, 8) or upside down (3)."""
     turns = {3: 2, 6: 1, 8: -1}
     body = png(np.ascontiguousarray(np.rot90(WIDE, turns[orientation])[:, :, ::-1]))
     chunk = b"eXIf" + exif(orientation)
@@ -31,7 +31,7 @@ def stored_png(orientation: int) -> bytes:
 def test_endpoints_see_the_upright_image(
     orientation: int, service: Served, engine: FakeEngine
 ) -> None:
-    """Also the crop is one of the upright image."""
+    """`crop_px` refers to the upright image, too."""
     body = stored_png(orientation)
     reply = service.post(body, "image/png")
     assert (reply.status, reply.content["crop_px"]) == (200, [100, 0, 280, 210])

@@ -1,4 +1,4 @@
-"""Frames over a WebSocket: the answers, the problems and the rules of POST /features."""
+"""Frames over a WebSocket have the answers, the problems and the rules of POST /features."""
 
 import asyncio
 import json
@@ -121,7 +121,7 @@ def test_a_message_that_is_too_long_closes_its_websocket_only(service: Served) -
     with dial(service) as socket:
 
         def exchange() -> None:
-            socket.send(bytes(MAX_BODY_BYTES + 1))  # this may raise, or the next line
+            socket.send(bytes(MAX_BODY_BYTES + 1))  # this line or the next one raises
             socket.recv(PATIENCE_S)
 
         with pytest.raises(ConnectionClosedError) as caught:
@@ -141,7 +141,7 @@ def test_a_client_that_is_still_sending_receives_the_close_frame(service: Served
         assert connection.recv(65536).startswith(b"HTTP/1.1 101")
         mask = bytes(4)
         connection.sendall(b"\x82\xff" + (MAX_BODY_BYTES + 1).to_bytes(8, "big") + mask)
-        said = connection.recv(1)  # the service has found the message too long
+        said = connection.recv(1)  # the service has refused the message as too long
         for _ in range(4):
             connection.sendall(bytes(1 << 18))
         said += b"".join(iter(lambda: connection.recv(65536), b""))
@@ -150,7 +150,7 @@ def test_a_client_that_is_still_sending_receives_the_close_frame(service: Served
 
 
 def test_a_long_text_is_not_kept_while_the_websocket_is_idle() -> None:
-    """It is no longer in the budget for bodies once it is complete."""
+    """A complete text is no longer counted in the memory budget for bodies."""
     held: list[int] = []
     service = Service(FakeEngine(lambda _image: outputs()))
     messages = iter(({"type": "websocket.connect"}, {"type": "websocket.receive"}))

@@ -1,8 +1,8 @@
-"""Attacks on the life of a connection, each bounded in count and time, on this machine only.
+"""Attacks with HTTP connections. Each is limited in count and time, and stays on this machine.
 
-Each takes the service's address and returns the connections that it leaves open. The tests make one
-round of each; `make attack` repeats them beside a well-behaved client, with those of `websockets`
-and `costs`.
+An attack takes the service's address and returns the connections that it leaves open. The tests run
+each attack once. `make attack` repeats them, and the attacks of `websockets` and `costs`, together
+with a well-behaved client.
 """
 
 import random
@@ -16,7 +16,7 @@ import numpy as np
 from tests.serve.attacks.conftest import Target, read_head, send_all
 from tests.serve.conftest import jpeg, picture
 
-MANY = 256  # connections that the service takes
+MANY = 256  # the service's largest number of connections
 MB = 1 << 20
 JPEG = jpeg(picture())
 
@@ -34,7 +34,7 @@ def crowded_upgrades(target: Target, count: int = MANY) -> list[socket.socket]:
 
 
 def endless_trailers(target: Target, megabytes: int = 16) -> list[socket.socket]:
-    """A chunked request that never ends its trailers, of many lines."""
+    """A chunked request with an endless number of trailers."""
     connection = _begin_chunked(target)
     send_all(connection, b"0\r\n")
     send_all(connection, b"X-Trailer: %b\r\n" % (b"x" * 1000) * 256, 4 * megabytes)
@@ -42,7 +42,7 @@ def endless_trailers(target: Target, megabytes: int = 16) -> list[socket.socket]
 
 
 def endless_trailer(target: Target, megabytes: int = 16) -> list[socket.socket]:
-    """A chunked request with one trailer that never ends."""
+    """A chunked request with one endless trailer."""
     connection = _begin_chunked(target)
     send_all(connection, b"0\r\nX-Trailer: ")
     send_all(connection, bytes(256 << 10).replace(b"\0", b"x"), 4 * megabytes)
@@ -50,7 +50,7 @@ def endless_trailer(target: Target, megabytes: int = 16) -> list[socket.socket]:
 
 
 def endless_chunk_extension(target: Target, megabytes: int = 16) -> list[socket.socket]:
-    """A chunked request whose chunk has an extension that never ends."""
+    """A chunked request with an endless chunk extension."""
     connection = _begin_chunked(target)
     send_all(connection, b"5;")
     send_all(connection, bytes(256 << 10).replace(b"\0", b"x"), 4 * megabytes)
@@ -66,7 +66,7 @@ def small_chunks(target: Target, count: int = 4) -> list[socket.socket]:
 
 
 def idle_connections(target: Target, count: int = MANY) -> list[socket.socket]:
-    """Connections that keep quiet after one request that needs no token."""
+    """Connections that are idle after one request that needs no token."""
     return dial_each(target, count, target.ask())
 
 
@@ -86,13 +86,13 @@ def slow_bodies(target: Target, count: int = MANY) -> list[socket.socket]:
 
 
 def churn(target: Target, count: int = 2 * MANY) -> list[socket.socket]:
-    """More connections than the service takes, one after the other, each with a request."""
+    """One after the other, more connections than the service allows, each with a request."""
     connections = dial_each(target, count, target.ask(path="/nothing"))
     return connections[-MANY:]
 
 
 def left_uploads(target: Target, count: int = 120) -> list[socket.socket]:
-    """Clients that leave in the middle of a body of 2 MB."""
+    """Clients that disconnect in the middle of a body of 2 MB."""
     for _ in range(count):
         with suppress(OSError), target.dial() as connection:
             connection.sendall(target.post(bytes(2 * MB))[:-1000])
@@ -100,7 +100,7 @@ def left_uploads(target: Target, count: int = 120) -> list[socket.socket]:
 
 
 def refused_uploads(target: Target, count: int = 60) -> list[socket.socket]:
-    """Bodies that are refused in their middle, for an invalid chunk."""
+    """Bodies that are refused in the middle because of an invalid chunk."""
     connections = []
     for _ in range(count):
         connection = _begin_chunked(target)
@@ -110,17 +110,17 @@ def refused_uploads(target: Target, count: int = 60) -> list[socket.socket]:
 
 
 def pipelined_floods(target: Target, count: int = 8) -> list[socket.socket]:
-    """Thousands of small requests at once, which need no token."""
+    """Thousands of small pipelined requests, which need no token."""
     return dial_each(target, count, target.ask() * 4000)
 
 
 def refused_floods(target: Target, count: int = 8) -> list[socket.socket]:
-    """Thousands of frames at once that are refused."""
+    """Thousands of pipelined frames that are refused."""
     return dial_each(target, count, target.post(b"") * 4000)
 
 
 def h2c_in_two_segments(target: Target, count: int = 64) -> list[socket.socket]:
-    """Requests that offer HTTP/2, whose body looks like another request."""
+    """Requests with an upgrade to HTTP/2, whose body looks like another request."""
     inner = target.ask(path="/model")
     whole = target.post(
         inner, Connection="Upgrade, HTTP2-Settings", Upgrade="h2c", HTTP2_Settings=""
@@ -132,17 +132,17 @@ def h2c_in_two_segments(target: Target, count: int = 64) -> list[socket.socket]:
 
 
 def upgrade_floods(target: Target, count: int = 8) -> list[socket.socket]:
-    """Thousands of requests at once that offer HTTP/2."""
+    """Thousands of pipelined requests with an upgrade to HTTP/2."""
     return dial_each(target, count, target.ask(Connection="Upgrade", Upgrade="h2c") * 2000)
 
 
 def tunnels(target: Target, count: int = 64) -> list[socket.socket]:
-    """CONNECT, as to a proxy."""
+    """Requests with CONNECT, which is for proxies."""
     return dial_each(target, count, b"CONNECT 127.0.0.1:22 HTTP/1.1\r\nHost: localhost\r\n\r\n" * 3)
 
 
 def strange_headers(target: Target, count: int = 40) -> list[socket.socket]:
-    """Headers that Python's own functions do not expect."""
+    """Header values that Python's parsing functions do not expect."""
     zeros = "0" * 5000
     bodies = [
         target.post(b"{}", "/v2/models/track/infer", Inference_Header_Content_Length=zeros),
@@ -161,7 +161,7 @@ def strange_headers(target: Target, count: int = 40) -> list[socket.socket]:
 
 
 def damaged_images(target: Target, count: int = 100) -> list[socket.socket]:
-    """PNG files of which libpng would write a line each."""
+    """Damaged PNG files; libpng writes a line to stderr for each."""
     rng = np.random.default_rng(1)
     whole = cv2.imencode(".png", rng.integers(0, 256, (210, 280, 3), np.uint8))[1].tobytes()
     connection = target.dial()
@@ -175,7 +175,7 @@ def damaged_images(target: Target, count: int = 100) -> list[socket.socket]:
 
 
 def mutated_requests(target: Target, count: int = 100, seed: int = 0) -> list[socket.socket]:
-    """Requests and WebSocket streams with bytes that were changed, cut or repeated."""
+    """Requests and WebSocket streams with changed, deleted or repeated bytes."""
     rng, whole = random.Random(seed), whole_streams(target)
     connections = []
     for _ in range(count):
@@ -193,7 +193,7 @@ CONNECTIONS: tuple[Attack, ...] = tuple(
 
 
 def whole_streams(target: Target) -> list[bytes]:
-    """Streams of each kind that the service understands."""
+    """Valid streams of each kind that the service accepts."""
     chunks = b"3\r\nabc\r\n2;x=y\r\nde\r\n0\r\nX-T: 1\r\n\r\n"
     coded = {"Transfer_Encoding": "chunked", "Content_Type": "image/png"}
     return [
@@ -209,7 +209,7 @@ def whole_streams(target: Target) -> list[bytes]:
 
 
 def mutate(rng: random.Random, whole: list[bytes]) -> bytes:
-    """One of the streams with bytes that were changed, cut or repeated."""
+    """One of the streams with changed, deleted or repeated bytes."""
     sent = bytearray(rng.choice(whole))
     for _ in range(rng.randrange(6)):
         at, size = rng.randrange(len(sent)), rng.randrange(1, 20)
@@ -229,7 +229,7 @@ def mutate(rng: random.Random, whole: list[bytes]) -> bytes:
 
 
 def dial_each(target: Target, count: int, sent: bytes) -> list[socket.socket]:
-    """Connections that have sent the same."""
+    """Open up to `count` connections, and send `sent` on each."""
     connections = []
     for _ in range(count):
         with suppress(OSError):

@@ -1,4 +1,4 @@
-"""Raw sockets for attacks: loopback only, with a limit on every wait."""
+"""Raw sockets for attacks, on loopback addresses only; every wait has a time limit."""
 
 import json
 import os
@@ -14,21 +14,21 @@ import pytest
 
 from tests.serve.conftest import FakeEngine, Served, outputs, serving
 
-WAIT_S = 60.0  # for one step of an attack; long enough on a busy machine
+WAIT_S = 60.0  # time limit of a step of an attack; long enough on a busy machine
 TEXT, BINARY, CONTINUATION, CLOSE, PING = 1, 2, 0, 8, 9
 
 
 @dataclass(frozen=True)
 class Target:
-    """A service on this machine; `token`: its own, or None where it needs none."""
+    """A service on this machine; `token` is its token, None if it needs none."""
 
     port: int
     token: str | None = None
     source: str = "127.0.0.1"
-    """The address from which it is called."""
+    """The address from which the attack connects."""
 
     def headers(self, **more: str) -> bytes:
-        """Host, the token, and `more`, with the end of the line of each."""
+        """The header lines for Host, the token, and `more`."""
         sent = {"Host": f"127.0.0.1:{self.port}", **more}
         if self.token is not None:
             sent.setdefault("Authorization", f"Bearer {self.token}")
@@ -58,11 +58,11 @@ class Target:
         )
 
     def ask(self, method: str = "GET", path: str = "/healthz", **headers: str) -> bytes:
-        """A whole request without a body."""
+        """A complete request without a body."""
         return f"{method} {path} HTTP/1.1\r\n".encode() + self.headers(**headers) + b"\r\n"
 
     def post(self, body: bytes, path: str = "/features", **headers: str) -> bytes:
-        """A whole request with an image."""
+        """A complete request with an image."""
         sent = {"Content_Type": "image/jpeg", "Content_Length": str(len(body)), **headers}
         return f"POST {path} HTTP/1.1\r\n".encode() + self.headers(**sent) + b"\r\n" + body
 
@@ -80,7 +80,8 @@ def frame(opcode: int, payload: bytes = b"", fin: bool = True) -> bytes:
 
 
 def send_all(connection: socket.socket, sent: bytes, most: int = 1) -> int:
-    """Send `sent` as often as `most` says, until the service ends it; how many bytes went out."""
+    """Send `sent` up to `most` times, until the service ends the connection; returns the number of
+    bytes sent."""
     done = 0
     for _ in range(most):
         try:
@@ -92,7 +93,7 @@ def send_all(connection: socket.socket, sent: bytes, most: int = 1) -> int:
 
 
 def read_head(connection: socket.socket) -> bytes:
-    """What is received up to the end of the headers."""
+    """The bytes received up to the end of the headers."""
     received = b""
     while b"\r\n\r\n" not in received:
         part = connection.recv(1)
@@ -103,7 +104,7 @@ def read_head(connection: socket.socket) -> bytes:
 
 
 def read_rest(connection: socket.socket) -> bytes:
-    """What is received until the service ends the connection."""
+    """The bytes received until the service ends the connection."""
     received = b""
     with suppress(ConnectionError):
         while part := connection.recv(1 << 16):
@@ -122,7 +123,7 @@ def read_reply(connection: socket.socket) -> tuple[int, Any]:
 
 
 def read_close(connection: socket.socket) -> tuple[int, str]:
-    """The code and the reason with which the service closes a WebSocket."""
+    """The code and the reason in the service's close frame."""
     received = read_rest(connection)
     at = 0
     while at < len(received):
@@ -137,7 +138,7 @@ def read_close(connection: socket.socket) -> tuple[int, str]:
 
 
 def resident_mb(pid: int | str = "self") -> float:
-    """The resident memory of a process, MB."""
+    """The resident memory of a process in MB."""
     pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
     return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
 
@@ -151,13 +152,13 @@ def service(engine: FakeEngine) -> Iterator[Served]:
 
 @pytest.fixture
 def target(service: Served) -> Target:
-    """Where `service` listens."""
+    """The address of `service`."""
     return Target(service.port)
 
 
 @pytest.fixture
 def engine() -> FakeEngine:
-    """An engine that keeps no images."""
+    """A fake engine that does not keep its images."""
 
     def respond(_image: object) -> Any:
         found.images.clear()

@@ -1,6 +1,6 @@
-"""Attacks on what a request costs, and on whom the service takes a client for.
+"""Attacks by costly requests, and on the identification of clients.
 
-Each is bounded in count, on this machine only, and returns the connections that it leaves open.
+Each is limited in count, stays on this machine, and returns the connections that it leaves open.
 """
 
 import base64
@@ -17,23 +17,23 @@ from tests.serve.attacks.conftest import BINARY, Target, frame, read_head, send_
 from tests.serve.conftest import jpeg, picture, png
 
 INFER = "/v2/models/track/infer"
-BODY = 4 * MB  # the largest that the service takes
-ANSWER_S = 10.0  # after which an attacker asks no more
+BODY = 4 * MB  # the service's largest body
+ANSWER_S = 10.0  # without an answer for this time, an attacker stops
 
 
 def fill_bytes(target: Target, count: int = 8) -> list[socket.socket]:
-    """JPEG files of fill bytes."""
+    """JPEG files that consist of fill bytes."""
     return _ask(target, target.post(b"\xff\xd8" + b"\xff" * (BODY - 2)), count)
 
 
 def stuffed_scans(target: Target, count: int = 8) -> list[socket.socket]:
-    """JPEG files whose scan goes on in stuffed bytes."""
+    """JPEG files whose scan continues with stuffed bytes."""
     body = JPEG[:-2] + b"\xff\x00" * ((BODY - len(JPEG)) // 2)
     return _ask(target, target.post(body), count)
 
 
 def repeated_outputs(target: Target, count: int = 8) -> list[socket.socket]:
-    """Inference requests that ask for one output 250,000 times."""
+    """Inference requests that request one output 250,000 times."""
     head = b'{"inputs":[{"name":"pixels","shape":[1,2,2,3],"datatype":"UINT8","data":[1]}],'
     part, end = b'{"name":"std"},', b'{"name":"std"}]}'
     body = head + b'"outputs":[' + part * ((BODY - 200) // len(part)) + end
@@ -41,7 +41,7 @@ def repeated_outputs(target: Target, count: int = 8) -> list[socket.socket]:
 
 
 def nested_inputs(target: Target, count: int = 8) -> list[socket.socket]:
-    """Inference requests of millions of lists in each other, and beside each other."""
+    """Inference requests with millions of lists, nested or in sequence."""
     head = b'{"inputs":[{"name":"pixels","shape":[1,2,2,3],"datatype":"UINT8","data":'
     connections = []
     for body in (head + b"[" * (BODY - 200), head + b"[" + b"[]," * (BODY // 4) + b"0]}]}"):
@@ -51,7 +51,7 @@ def nested_inputs(target: Target, count: int = 8) -> list[socket.socket]:
 
 
 def encoded_garbage(target: Target, count: int = 8) -> list[socket.socket]:
-    """Inference requests with 3 MB in Base64 that are no image."""
+    """Inference requests with 3 MB of base64 that is not an image."""
     data = base64.b64encode(bytes(3 * MB - 3000))
     tensor = b'{"name":"image","shape":[1,1],"datatype":"BYTES","data":[["%b"]]}' % data
     body = b'{"inputs":[%b]}' % tensor
@@ -59,13 +59,13 @@ def encoded_garbage(target: Target, count: int = 8) -> list[socket.socket]:
 
 
 def costly_images(target: Target, count: int = 4) -> list[socket.socket]:
-    """PNG files of 65 KB that take 0.7 s each."""
+    """PNG files of 65 KB with a decoding time of 0.7 s each."""
     sent = target.post(_costly_png(), Content_Type="image/png", X_Camera_Fov_Y="90")
     return [found for _ in range(count) for found in _ask(target, sent, 1)]
 
 
 def chunky_images(target: Target, count: int = 64) -> list[socket.socket]:
-    """Small PNG files of thousands of chunks without content."""
+    """Small PNG files with thousands of empty chunks."""
     body = png(picture())
     chunk = bytes(4) + b"tEXt" + zlib.crc32(b"tEXt").to_bytes(4, "big")
     body = body[:33] + chunk * 9_000 + body[33:]
@@ -73,7 +73,7 @@ def chunky_images(target: Target, count: int = 64) -> list[socket.socket]:
 
 
 def long_accepts(target: Target, count: int = 200) -> list[socket.socket]:
-    """Requests that accept 30,000 formats, in another order each."""
+    """Requests whose Accept headers have 30,000 entries and differ from each other."""
     connections: list[socket.socket] = []
     for number in range(count):
         accept = "," * (30_000 - number) + "x/y"
@@ -82,7 +82,7 @@ def long_accepts(target: Target, count: int = 200) -> list[socket.socket]:
 
 
 def many_costly_images(target: Target, count: int = 64) -> list[socket.socket]:
-    """The same on many connections at once, as many streams."""
+    """The images of `costly_images` on many connections at once, each as a separate stream."""
     connections = []
     for number in range(count):
         sent = target.post(
@@ -93,12 +93,12 @@ def many_costly_images(target: Target, count: int = 64) -> list[socket.socket]:
 
 
 def large_photographs(target: Target, count: int = 16) -> list[socket.socket]:
-    """JPEG files of 12 megapixels, of which the model sees a part."""
+    """JPEG files of 12 megapixels."""
     return _ask(target, target.post(_photograph(), X_Camera_Fov_Y="67.5"), count)
 
 
 def large_bodies(target: Target, count: int = MANY) -> list[socket.socket]:
-    """Bodies of 4 MB whose last byte is held back, of images and of inference requests."""
+    """Images and inference requests of 4 MB whose last byte is withheld."""
     connections = []
     for number in range(count):
         sent = target.post(bytes(BODY), ("/features", INFER)[number % 2])[:-1]
@@ -107,7 +107,7 @@ def large_bodies(target: Target, count: int = MANY) -> list[socket.socket]:
 
 
 def half_messages(target: Target, count: int = MANY) -> list[socket.socket]:
-    """WebSockets that hold back the last byte of the largest message."""
+    """WebSockets that withhold the last byte of a message of the largest size."""
     sent, connections = frame(BINARY, bytes(BODY - 64))[:-1], []
     for _ in range(count):
         with suppress(OSError, AssertionError):
@@ -119,13 +119,13 @@ def half_messages(target: Target, count: int = MANY) -> list[socket.socket]:
 
 
 def promised_bodies(target: Target, count: int = MANY) -> list[socket.socket]:
-    """Headers that promise 4 MB, of which nothing comes."""
+    """Headers that announce a body of 4 MB, which is never sent."""
     sent = target.post(b"", Content_Length=str(BODY))
     return [found for _ in range(count) for found in _send(target, sent)]
 
 
 def rebound_names(target: Target, count: int = 200) -> list[socket.socket]:
-    """Requests by a name of the attacker's, and from pages of other sites."""
+    """Requests with a host name of the attacker, and from pages of other sites."""
     pages = {"Origin": "http://evil.example", "Content_Type": "text/plain"}
     for sent in (target.post(JPEG, Host="evil.example"), target.post(JPEG, INFER, **pages)):
         _ask(target, sent, count // 2)
@@ -133,7 +133,7 @@ def rebound_names(target: Target, count: int = 200) -> list[socket.socket]:
 
 
 def guessed_tokens(target: Target, count: int = 400) -> list[socket.socket]:
-    """Requests with wrong tokens, for paths that need one."""
+    """Requests with wrong tokens, for paths that need a token."""
     connections = []
     for number in range(count // 100):
         sent = target.post(JPEG[:100], Authorization=f"Bearer {number:032x}")
@@ -142,7 +142,7 @@ def guessed_tokens(target: Target, count: int = 400) -> list[socket.socket]:
 
 
 def forged_addresses(target: Target, count: int = 400) -> list[socket.socket]:
-    """Requests that each name another client in X-Forwarded-For."""
+    """Requests with a different client in each X-Forwarded-For."""
     for number in range(count):
         client = f"10.{number % 256}.{number // 256}.1, ::{number:x}, unknown"
         _ask(target, target.post(JPEG[:100], X_Forwarded_For=client), 1)
@@ -150,7 +150,7 @@ def forged_addresses(target: Target, count: int = 400) -> list[socket.socket]:
 
 
 def conflicting_lengths(target: Target, count: int = 40) -> list[socket.socket]:
-    """Requests whose length can be read in two ways, each with another request in its body."""
+    """Requests with an ambiguous length and another request in their body."""
     inner = target.ask(path="/model")
     pairs = [
         {"Content_Length": str(len(inner) + 5), "Transfer_Encoding": "chunked"},
@@ -167,7 +167,7 @@ def conflicting_lengths(target: Target, count: int = 40) -> list[socket.socket]:
 
 
 def unread_pages(target: Target, count: int = 16) -> list[socket.socket]:
-    """Clients that ask for the largest page again and again, and read nothing."""
+    """Clients that repeatedly request the largest page, and read no answers."""
     connections = []
     for _ in range(count):
         for connection in _send(target, b""):
@@ -178,7 +178,7 @@ def unread_pages(target: Target, count: int = 16) -> list[socket.socket]:
 
 
 def half_closed(target: Target, count: int = MANY) -> list[socket.socket]:
-    """Clients that end their side in the middle of a request, and wait."""
+    """Clients that shut down their sending side in the middle of a request, and wait."""
     connections = []
     for _ in range(count):
         for connection in _send(target, target.post(JPEG)[:-10]):
@@ -189,7 +189,7 @@ def half_closed(target: Target, count: int = MANY) -> list[socket.socket]:
 
 
 def reset_requests(target: Target, count: int = 200) -> list[socket.socket]:
-    """Clients that reset the connection as soon as their image is sent."""
+    """Clients that reset the connection after they have sent their image."""
     for _ in range(count):
         for connection in _send(target, target.post(JPEG)):
             connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, bytes([1, *bytes(7)]))
@@ -218,7 +218,7 @@ def _photograph() -> bytes:
 
 
 def _send(target: Target, sent: bytes) -> list[socket.socket]:
-    """A connection that has sent this; none where the service takes none."""
+    """A connection on which `sent` was sent; an empty list if the service accepts none."""
     try:
         connection = target.dial()
     except OSError:
@@ -230,7 +230,7 @@ def _send(target: Target, sent: bytes) -> list[socket.socket]:
 
 
 def _ask(target: Target, sent: bytes, count: int) -> list[socket.socket]:
-    """Send the same request on one connection, each after the answer to the one before."""
+    """Send the request `count` times on one connection, each time after the previous answer."""
     for connection in _send(target, b""):
         connection.settimeout(ANSWER_S)
         for _ in range(count):

@@ -1,4 +1,4 @@
-"""How long a piece of work, or a whole request, holds the event loop."""
+"""Measures how long a function, or a complete request, blocks the event loop."""
 
 import asyncio
 import threading
@@ -10,13 +10,14 @@ from mtlnet.inference.image_decoding.errors import ImageError
 from serve.api.problems import Problem
 from tests.serve.conftest import PATIENCE_S, Served
 
-LOOP_S = 0.02  # for which one request may hold the event loop
-TRIES, TRYING_S = 5, 5.0  # the quickest counts: the machine may be slower for a second
+LOOP_S = 0.02  # longest time for which a request may block the event loop
+TRIES, TRYING_S = 5, 5.0  # the fastest try counts, because a busy machine slows some tries
 TICK_S = 0.0005
 
 
 def held_s(work: Callable[[], object], limit_s: float = LOOP_S) -> float:
-    """The least processor time of `work`, s, which may end with a refusal; or one under a limit."""
+    """The least processor time of several calls of `work` in s; the calls end when one is below
+    `limit_s`. `work` can raise a refusal."""
 
     def measured_s() -> float:
         start_s = time.thread_time()
@@ -28,7 +29,8 @@ def held_s(work: Callable[[], object], limit_s: float = LOOP_S) -> float:
 
 
 def least_s(measure: Callable[[], float], limit_s: float = LOOP_S, at_least: int = TRIES) -> float:
-    """The least of what `measure` returns in `at_least` tries, or one under a limit."""
+    """The least result of `measure` in `at_least` or more tries, which end with one below
+    `limit_s` or after TRYING_S."""
     least, tries, end_s = float("inf"), 0, time.monotonic() + TRYING_S
     while tries < at_least or (least >= limit_s and time.monotonic() < end_s):
         least, tries = min(least, measure()), tries + 1
@@ -36,14 +38,14 @@ def least_s(measure: Callable[[], float], limit_s: float = LOOP_S, at_least: int
 
 
 class LoopWatch:
-    """The longest processor time of a service's event loop between two of its ticks."""
+    """Measures the longest processor time of an event loop between two ticks of TICK_S."""
 
     def __init__(self) -> None:
         self.longest_s = 0.0
         self.stopped = False
 
     def tick(self, last_s: float | None = None) -> None:
-        """Measure, and come again."""
+        """Measure the time since the last tick, and schedule the next tick."""
         now_s = time.thread_time()
         if last_s is not None:
             self.longest_s = max(self.longest_s, now_s - last_s)
@@ -53,7 +55,7 @@ class LoopWatch:
 
 @contextmanager
 def watched(service: Served) -> Iterator[LoopWatch]:
-    """A watch over a service in this process; it includes parsing, joining and answering."""
+    """A LoopWatch on a service in this process; its times include parsing, joining, answering."""
     watch, loop, ended = LoopWatch(), service.server._loop, threading.Event()
 
     def end() -> None:

@@ -1,4 +1,4 @@
-"""All attacks, in the order in which `make attack` makes them."""
+"""All attacks, in the order of `make attack`."""
 
 from tests.serve.attacks.attacks import CONNECTIONS, Attack
 from tests.serve.attacks.costs import REQUESTS
@@ -12,4 +12,4 @@ REPORTED = (
     *("rebound_names", "guessed_tokens", "forged_addresses"),
     *("left_websockets", "damaged_images", "strange_headers"),
 )
-"""By which a service of ours once fell; the others were thought of since."""
+"""The attacks that broke an earlier version of the service; the other attacks are preventive."""

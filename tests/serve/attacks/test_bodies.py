@@ -1,4 +1,4 @@
-"""Attacks on the bodies of HTTP requests: trailers, chunks, uploads that end early."""
+"""Attacks with the bodies of HTTP requests: trailers, chunks, uploads that end early."""
 
 import gc
 import logging
@@ -65,7 +65,7 @@ def test_trailers_after_a_refusal_are_limited_too() -> None:
 
 
 def test_trailers_are_dropped() -> None:
-    """Neither a token nor an address in a trailer is believed, on either path."""
+    """With and without ASGI, a token or an address in a trailer has no effect."""
     engine = FakeEngine(lambda _image: outputs())
     with serving(engine, limits=Limits(token=TOKEN)) as service:
         target = Target(service.port)
@@ -117,7 +117,7 @@ def test_an_upload_that_ends_early_leaves_nothing(
         until(lambda: open_count(service) == 1)
         assert service.post(JPEG).status == 200
         left = [o for o in gc.get_objects() if type(o) in (DirectRequest, FeaturesRequest)]
-        assert len(left) <= 1  # that of the connection above
+        assert len(left) <= 1  # of the connection above
         until(lambda: resident_mb() - before < 30)
     finally:
         gc.enable()
@@ -127,7 +127,7 @@ def test_an_upload_that_ends_early_leaves_nothing(
 def test_a_refused_image_leaves_no_body_in_a_reference_cycle(
     service: Served, target: Target, path: str
 ) -> None:
-    body = JPEG[:-2] + b"\xff\x00" * (1 << 20)  # refused by the engine's thread
+    body = JPEG[:-2] + b"\xff\x00" * (1 << 20)  # the engine's thread refuses it
     gc.collect()
     gc.disable()
     before = resident_mb()
@@ -186,7 +186,7 @@ def test_a_body_in_many_small_chunks_is_refused(service: Served, target: Target)
 def test_a_damaged_body_after_an_expectation_is_one_refusal(
     service: Served, target: Target, path: str, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """The interim reply that the client expects must not follow the refusal: that was an error."""
+    """The expected "100 Continue" must not follow the refusal; it once raised an error."""
     headers = {
         "Expect": "100-continue",
         "Content_Type": "application/json",
@@ -197,5 +197,5 @@ def test_a_damaged_body_after_an_expectation_is_one_refusal(
         connection.sendall(head + b"no number\r\n")
         assert read_reply(connection)[0] == 400
         assert read_rest(connection) == b""
-    assert service.ask("GET", "/healthz").status == 200  # the event loop has gone on
+    assert service.ask("GET", "/healthz").status == 200  # the event loop still runs
     assert [record for record in caplog.records if record.levelno >= logging.ERROR] == []

@@ -1,4 +1,4 @@
-"""Attacks on HTTP connections: each is answered or swept, and costs no memory."""
+"""Attacks with HTTP connections: each is answered or ended, and keeps no memory."""
 
 import gc
 import select
@@ -76,12 +76,12 @@ def test_bytes_sent_with_the_handshake_close_the_connection(target: Target) -> N
     with target.dial() as connection:
         connection.sendall(target.post(JPEG) + target.handshake())
         received = read_rest(connection)
-        assert status_of(received) == 200  # the reply that was owed
+        assert status_of(received) == 200  # the reply to the image
         assert b"101" not in received.partition(b"\r\n")[2]
 
 
 def test_an_answer_that_nobody_reads_has_a_deadline() -> None:
-    """Pipelined requests that wait for a client to read the replies before them."""
+    """Pipelined requests wait until the client reads the earlier replies."""
     clock = Clock()
     engine = FakeEngine(lambda _image: outputs())
     with serving(engine, limits=Limits(idle_s=30.0), clock=clock) as service:
@@ -157,7 +157,8 @@ def test_a_refused_handshake_leaves_no_reference_cycle(
         close(attack(target, 10))
         until(lambda: open_count(service) == 1)
         kinds = (GuardedWebSocket, DirectProtocol)
-        until(lambda: sum(isinstance(o, kinds) for o in gc.get_objects()) <= 1)  # of `service.post`
+        # One remaining connection is that of `service.post`.
+        until(lambda: sum(isinstance(o, kinds) for o in gc.get_objects()) <= 1)
     finally:
         gc.enable()
 
@@ -171,7 +172,7 @@ def test_pipelined_requests_are_bounded(service: Served, target: Target) -> None
     with target.dial() as connection:
         connection.sendall(target.ask() * 4 * MAX_PIPELINED)
         received = read_rest(connection)
-        assert received.count(b"HTTP/1.1 200") == 1  # the one that was being answered
+        assert received.count(b"HTTP/1.1 200") == 1  # the request in progress
         assert b"connection: close" in received
     with target.dial() as connection:
         connection.sendall(target.ask() * MAX_PIPELINED)
@@ -219,7 +220,7 @@ def test_upgrades_that_the_service_does_not_know_end_the_connection(
 
 
 def test_a_connection_that_ends_while_others_begin_is_not_waited_for(service: Served) -> None:
-    """The service never takes more than its limit, also while those evicted are still closing."""
+    """The service never exceeds its limit, even while ended connections are still closing."""
     target = Target(service.port)
     connections = []
     for _ in range(300):

@@ -1,4 +1,4 @@
-"""A round of each attack that no other test makes: the service goes on."""
+"""Runs each attack that no other test runs; the service must still answer."""
 
 import inspect
 
@@ -24,7 +24,7 @@ def test_there_are_as_many_attacks_as_are_promised() -> None:
     assert len(set(names)) == len(names)
     assert set(names) >= set(REPORTED)
     assert len(set(names) - set(REPORTED)) >= OWN
-    for attack in ATTACKS:  # each can be made with other counts, and says what it is
+    for attack in ATTACKS:  # each has a count and a docstring
         assert len(inspect.signature(attack).parameters) >= 2
         assert attack.__doc__
 
@@ -36,11 +36,11 @@ def test_the_service_answers_others(
     before = resident_mb()
     (count,) = list(inspect.signature(attack).parameters.values())[1:]
     connections = attack(target, max(count.default // 8, 4))  # type: ignore[call-arg]
-    until(lambda: service.post(JPEG).status == 200)  # frames of the attack may still be waiting
+    until(lambda: service.post(JPEG).status == 200)  # frames of the attack can still wait
     for connection in connections:
         connection.close()
     assert service.post(JPEG).status == 200
-    until(lambda: resident_mb() - before < 200)  # of both sides: bodies in flight, and what is sent
+    until(lambda: resident_mb() - before < 200)  # of both sides: bodies in flight and sent bytes
     assert [r for r in caplog.records if r.levelname in ("WARNING", "ERROR")] == []
 
 

@@ -1,4 +1,4 @@
-"""Bodies and messages that are held back: they count as they arrive, and give way to small ones."""
+"""Withheld bodies and messages: they are counted as they arrive, and are ended for small ones."""
 
 import socket
 import time
@@ -26,7 +26,7 @@ MIB = 1 << 20
 
 
 def settle(bodies: BodyBudget) -> None:
-    """Return once nothing more arrives of the bodies that are held back; then they are slow."""
+    """Wait until no more bytes of the withheld bodies arrive; then they count as slow."""
     held = -1
     while held != bodies.held or held < 3 * MIB:
         held = bodies.held
@@ -37,7 +37,7 @@ def settle(bodies: BodyBudget) -> None:
 def test_bodies_that_are_held_back_give_way_to_small_ones(
     engine: FakeEngine, attack: Callable[[Target, int], list[socket.socket]]
 ) -> None:
-    """Also to those of other paths; together they never hold more than the budget."""
+    """This holds for all paths; together the bodies never exceed the budget."""
     with serving(engine, limits=Limits(body_mib=8)) as service:
         bodies = service.app.bodies
         connections = attack(Target(service.port), 12)

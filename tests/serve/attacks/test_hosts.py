@@ -1,4 +1,4 @@
-"""Requests from web pages, under other names, through proxies, and from many addresses."""
+"""Requests from web pages, with foreign host names, through proxies, and from many addresses."""
 
 import socket
 from collections.abc import Callable, Iterator
@@ -40,7 +40,7 @@ def guarded(engine: FakeEngine) -> Iterator[Served]:
 
 
 def raw(service: Served, request: bytes) -> tuple[int, bytes]:
-    """The status and the body of the answer to a request without a body, sent as it is."""
+    """The status and the body of the answer to the bytes of a request without a body."""
     with socket.create_connection(("127.0.0.1", service.port), PATIENCE_S) as connection:
         connection.sendall(request)
         connection.shutdown(socket.SHUT_WR)
@@ -143,7 +143,7 @@ def test_allowed_hosts_may_be_given_with_a_port_a_final_dot_or_brackets() -> Non
     check = HostCheck(Limits(hosts=("Cam.example:8443", "other.example.", "[fd00::1]:80", "")))
     for host in (b"cam.example", b"cam.example:80", b"other.example", b"[fd00::1]"):
         check.check({b"host": host})
-    with pytest.raises(Problem, match="does not answer to"):
+    with pytest.raises(Problem, match="does not accept"):
         check.check({b"host": b"evil.example"})
 
 
@@ -184,12 +184,13 @@ def test_large_images_from_a_64_count_as_one_clients() -> None:
     alone = Admission()
     for number in range(9):
         alone.note(f"2001:db8::{number}", number)
-    alone.admit("2001:db8::a", 2 * MAX_CLIENT_MS, 9)()  # no other client is there
+    alone.admit("2001:db8::a", 2 * MAX_CLIENT_MS, 9)()  # no other client is present
 
 
 @pytest.fixture
 def far(engine: FakeEngine) -> Iterator[Callable[..., int]]:
-    """Asks from an address behind a proxy; at most three requests a second each."""
+    """A function that sends a request from an address behind a proxy and returns the status; the
+    rate limit is three requests per second."""
     limits = Limits(token=TOKEN, rate=3.0, trusted_proxies=("127.0.0.0/8", "10.0.0.0/8"))
     with serving(engine, limits=limits) as service:
 
@@ -216,7 +217,7 @@ def test_public_paths_are_counted_apart(far: Callable[..., int], path: str) -> N
 
 def test_behind_a_proxy_each_client_is_its_last_untrusted_address(far: Callable[..., int]) -> None:
     assert 429 in burst(far, "1.1.1.1, 203.0.113.1", "/model")
-    # What the client writes before it changes nothing; what trusted proxies append is skipped.
+    # Addresses that the client writes have no effect; addresses of trusted proxies are skipped.
     assert 429 in {far(f"2.2.2.{n}, 203.0.113.1", "/model") for n in range(9)}
     assert 429 in {far(f"203.0.113.1, 10.0.0.{n}", "/model") for n in range(9)}
     assert far("203.0.113.2", "/model") == 401
@@ -232,7 +233,7 @@ def test_a_proxy_that_is_not_trusted_names_no_client(engine: FakeEngine) -> None
 def test_the_environment_makes_no_proxy_trusted(
     engine: FakeEngine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv("FORWARDED_ALLOW_IPS", "*")  # read by uvicorn
+    monkeypatch.setenv("FORWARDED_ALLOW_IPS", "*")  # uvicorn's variable
     with serving(engine) as service:
         assert service.server.config.forwarded_allow_ips == ["127.0.0.1"]
 

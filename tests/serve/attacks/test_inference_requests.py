@@ -1,4 +1,4 @@
-"""Open Inference requests that cost more than they look: time of the event loop, and memory."""
+"""Open Inference requests that are costly for their size: time of the event loop, memory."""
 
 import asyncio
 import base64
@@ -73,7 +73,7 @@ def test_a_large_image_in_base64_does_not_hold_the_event_loop() -> None:
     found: list[bytes] = []
 
     async def others_s() -> float:
-        """The longest processor time that others wait for while it is read, s."""
+        """The longest processor time in s for which reading the image blocks other tasks."""
         reader = asyncio.ensure_future(read_image_bytes(request.input, binary))
         longest = 0.0
         while not reader.done():

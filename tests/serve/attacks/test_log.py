@@ -1,4 +1,4 @@
-"""What attacks write to the log: a line a second for each client, and no traceback."""
+"""The log under attack: one line per second for each client, and no traceback."""
 
 import asyncio
 import gc
@@ -101,7 +101,7 @@ def test_refusals_of_token_host_and_origin_are_logged_once_a_second(
     problem: str,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    """With their number, and with nothing of the client's that is not escaped."""
+    """The line has the number of refusals, and the client's text is escaped."""
     token = None if problem == "forbidden-host" else "0123456789abcdef"
     with serving(engine, limits=Limits(token=token)) as service:
         sent = {name: value.encode("utf-8").decode("latin-1") for name, value in headers.items()}
@@ -147,7 +147,7 @@ def test_several_workers_share_the_rates_of_the_log(
             for number, refusals in enumerate(workers):
                 client = f"10.{step // 250}.{step % 250}.{number}"
                 refusals.log("1", client, Problem(UNAUTHORIZED, "no token"))
-        assert 72 <= len(caplog.records) <= 90  # ten a second, and what had been saved up
+        assert 72 <= len(caplog.records) <= 90  # ten per second, and the initial burst
 
 
 def test_the_same_error_is_logged_once_a_second() -> None:
@@ -170,7 +170,7 @@ def test_the_same_error_is_logged_once_a_second() -> None:
 
 
 def test_native_libraries_write_one_line_a_second() -> None:
-    """libpng writes a line for each damaged PNG."""
+    """The library of the test is libpng, which writes a line for each damaged PNG."""
     program = """
 import os, sys, time
 import cv2, numpy as np

@@ -1,6 +1,6 @@
-"""Bodies at their limits, sent to a running service: none holds its event loop for LOOP_S.
+"""Bodies at their limits, sent to a running service: none blocks its event loop for LOOP_S.
 
-The time includes parsing, putting parts together, checking, and decoding where the loop does that.
+The time includes parsing, joining of parts, checks, and decoding if the loop does it.
 """
 
 import base64
@@ -29,30 +29,30 @@ def segment(marker: int, content: bytes) -> bytes:
 
 
 def with_segments(data: bytes) -> bytes:
-    """A JPEG with `data` behind its first marker."""
+    """A JPEG with `data` after its first marker."""
     return JPEG[:2] + data + JPEG[2:]
 
 
 def in_scan(data: bytes) -> bytes:
-    """A JPEG whose scan is followed by `data` until it is as large as a body may be."""
+    """A JPEG whose scan is followed by repeated `data`, up to the largest size of a body."""
     return JPEG[:-2] + data * (ROOM // len(data)) + JPEG[-2:]
 
 
 def with_chunk(kind: bytes, content: bytes, count: int = 1) -> bytes:
-    """A PNG with chunks behind its header."""
+    """A PNG with `count` additional chunks after its header."""
     whole = struct.pack(">I", len(content)) + kind + content
     return PNG[:33] + (whole + struct.pack(">I", zlib.crc32(whole[4:]))) * count + PNG[33:]
 
 
 def tables(marker: int, count: int) -> bytes:
-    """The tables of a JPEG again and again, in `count` segments."""
+    """The tables of a JPEG, repeated in `count` segments."""
     at = JPEG.index(bytes([0xFF, marker])) + 2
     table = JPEG[at + 2 : at + int.from_bytes(JPEG[at : at + 2], "big")]
     return segment(marker, table * (65_000 // len(table))) * count
 
 
 def profile(count: int = 62) -> bytes:
-    """A colour profile in parts, which the decoder puts together."""
+    """A colour profile in `count` parts, which the decoder joins."""
     each = (b"ICC_PROFILE\0" + bytes([k + 1, count]) + bytes(65_000) for k in range(count))
     return b"".join(segment(0xE2, part) for part in each)
 
@@ -78,7 +78,7 @@ IMAGES: dict[str, bytes] = {
 
 @pytest.fixture(scope="module")
 def fast() -> Iterator[Served]:
-    """A service whose engine takes no time, so that small images are decoded on the loop."""
+    """A service with an immediate engine, so that small images are decoded on the event loop."""
     with serving(FakeEngine(lambda _image: outputs())) as service:
         for _ in range(12):
             assert service.post(JPEG).status == 200
@@ -86,11 +86,11 @@ def fast() -> Iterator[Served]:
 
 
 def holds_s(service: Served, connect: Callable[[], socket.socket], sent: bytes) -> float:
-    """The longest time for which what is sent on a connection holds the loop, s."""
+    """The longest time in s for which the bytes `sent` on a connection block the event loop."""
 
     def once() -> float:
         with connect() as connection, watched(service) as watch:
-            with suppress(ConnectionError):  # it is refused before all of it is read
+            with suppress(ConnectionError):  # the service refuses it before it is complete
                 connection.sendall(sent)
             with suppress(ConnectionError):
                 connection.recv(1)  # the answer has begun

@@ -1,4 +1,4 @@
-"""Requests that cost more than they look: time of the event loop, of the engine, and memory."""
+"""Requests that are costly for their size: time of the event loop and the engine, memory."""
 
 import http.client
 import socket
@@ -55,7 +55,7 @@ INFER = "/v2/models/track/infer"
 
 
 def scan(data: bytes, size: int = MAX_BODY_BYTES) -> bytes:
-    """A JPEG whose scan is followed by `data` again and again, `size` bytes in all."""
+    """A JPEG whose scan is followed by repeated `data`, `size` bytes in total."""
     start = JPEG[:-2]
     return start + (data * (size // len(data)))[: size - len(start)]
 
@@ -80,7 +80,7 @@ def test_no_jpeg_holds_the_event_loop(body: bytes) -> None:
 
 
 def with_chunks(body: bytes, chunk: bytes, count: int) -> bytes:
-    """A PNG with ancillary chunks of this content behind its header."""
+    """A PNG with `count` ancillary chunks of the content `chunk` after its header."""
     whole = len(chunk).to_bytes(4, "big") + b"teXt" + chunk
     whole += zlib.crc32(whole[4:]).to_bytes(4, "big")
     return body[:33] + whole * count + body[33:]
@@ -146,7 +146,7 @@ def test_a_full_queue_reads_no_inference_request() -> None:
         until(gate.busy.is_set)
         with socket.create_connection(("127.0.0.1", service.port), PATIENCE_S) as connection:
             head = f"POST {INFER} HTTP/1.1\r\nHost: localhost\r\nContent-Length: 1000000\r\n\r\n"
-            connection.sendall(head.encode())  # and no body
+            connection.sendall(head.encode())  # the body is not sent
             assert connection.recv(65536).startswith(b"HTTP/1.1 503")
         gate.open.set()
         assert first.result().status == 200
@@ -156,7 +156,7 @@ LARGE = png(np.zeros((2048, 4096, 4), np.uint16), cv2.IMWRITE_PNG_COMPRESSION, 9
 
 
 def post_from(address: str, service: Served, body: bytes) -> tuple[int, bytes]:
-    """The status and the body of the answer to an image sent from an address of this machine."""
+    """The status and body of the answer to an image, sent from the loopback address `address`."""
     with closing(
         http.client.HTTPConnection(
             "127.0.0.1", service.port, timeout=PATIENCE_S, source_address=(address, 0)
@@ -179,30 +179,30 @@ def test_a_client_has_one_large_image_at_a_time() -> None:
         assert status == 503
         assert b"/problems/overloaded" in body
         assert b"of this client" in body
-        assert post_from("127.0.0.3", service, LARGE)[0] == 503  # 1.4 s are too much in all
+        assert post_from("127.0.0.3", service, LARGE)[0] == 503  # all clients: 1.4 s > 1 s
         small = pool.submit(Served(service.port).post, JPEG)
         until(lambda: service.app.frame_queue.waiting == 1)
         gate.open.set()
         assert first.result()[0] == 200
         assert small.result().status == 200
-        assert post_from("127.0.0.4", service, LARGE)[0] == 503  # the others are still there
+        assert post_from("127.0.0.4", service, LARGE)[0] == 503  # others are still present
         until(lambda: post_from("127.0.0.4", service, LARGE)[0] == 200)
 
 
 def test_shares_of_the_engine() -> None:
     admission, now = Admission(), 10**12
-    for _ in range(20):  # alone: as much as it likes, one after the other
+    for _ in range(20):  # a client that is alone has no limit
         admission.note("a", now)
         admission.admit("a", 700.0, now)()
         now += 700_000_000
     admission.note("b", now)
     admission.note("a", now)
-    with pytest.raises(Problem, match="would take 700 ms"):  # four frames of b do not fit
+    with pytest.raises(Problem, match="would take 700 ms"):  # b's frames would overflow the queue
         admission.admit("a", 700.0, now)
     with pytest.raises(Problem, match="beyond this client's share") as caught:
         admission.admit("a", 100.0, now)
     assert caught.value.retry_after_ms == pytest.approx((700 - 0.25 * 700) / 0.25)
-    admission.admit("b", 100.0, now)()  # it has not had its share
+    admission.admit("b", 100.0, now)()  # b has not used its share
     later = now + PRESENT_NS
     admission.note("a", later)
     admission.admit("a", 700.0, later)()  # alone again
@@ -243,7 +243,7 @@ def test_a_refused_image_of_a_stream_gives_its_admission_back() -> None:
 
 
 def begin(service: Served, size: int, path: str = "/features") -> socket.socket:
-    """A connection that has sent `size` bytes of a body of the largest size."""
+    """A connection on which `size` bytes of a body of the largest size were sent."""
     connection = socket.create_connection(("127.0.0.1", service.port), PATIENCE_S)
     head = f"POST {path} HTTP/1.1\r\nHost: localhost\r\nContent-Type: image/jpeg\r\n"
     connection.sendall(f"{head}Content-Length: {MAX_BODY_BYTES}\r\n\r\n".encode())
@@ -262,7 +262,7 @@ def test_bodies_in_flight_share_a_budget(engine: FakeEngine, path: str) -> None:
         with begin(service, 3 * mib, path) as refused:
             assert refused.recv(65536).startswith(b"HTTP/1.1 503")
         until(lambda: bodies.held == 6 * mib)
-        for connection in held:  # clients that leave in the middle of a body
+        for connection in held:  # the clients disconnect in the middle of a body
             connection.close()
         until(lambda: bodies.held == 0)
         assert service.post(JPEG).status == 200
@@ -283,7 +283,7 @@ def test_workers_share_the_budget() -> None:
     share.close()
     BodyShare(other).grow(500)
     assert (one.held, other.held) == (0, 500)
-    assert BodyBudget(shared, 1, 1000).held == 0  # a new worker in the place of the other
+    assert BodyBudget(shared, 1, 1000).held == 0  # a new worker in the other's block
     BodyShare(one).grow(900)
 
 

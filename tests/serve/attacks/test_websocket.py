@@ -1,4 +1,4 @@
-"""Attacks on WebSockets: queues are bounded, and the close frame says why."""
+"""Attacks with WebSockets: queues have limits, and the close frame has the reason."""
 
 import asyncio
 import gc
@@ -78,7 +78,7 @@ def test_small_frames_are_bounded(
 
 
 def test_no_part_received_holds_the_event_loop(service: Served, target: Target) -> None:
-    """A quarter of a megabyte of empty fragments took a second; another client waits less."""
+    """256 KiB of empty fragments once blocked the loop for 1 s; other clients must wait less."""
     for _ in range(3):
         connections = [target.open_websocket() for _ in range(3)]
         for connection in connections:
@@ -111,7 +111,7 @@ def test_a_message_in_fragments_is_put_together(target: Target) -> None:
 
 
 def test_pings_that_nobody_reads_the_answers_of_take_no_memory() -> None:
-    """Without the rate of small frames: a clock that runs fast gives any number of them."""
+    """A fast clock disables the rate limit for small frames."""
     now_s = 0.0
 
     def clock() -> float:
@@ -164,7 +164,7 @@ def test_a_message_and_the_reading_of_answers_have_deadlines() -> None:
 
 
 def test_a_handshake_has_a_deadline(monkeypatch: pytest.MonkeyPatch) -> None:
-    """An application that does not answer it: only a fault of the service itself."""
+    """The application does not answer the handshake; only a fault of the service causes this."""
     clock = Clock()
     engine = FakeEngine(lambda _image: outputs())
     with serving(engine, clock=clock) as service:
@@ -212,7 +212,7 @@ def test_a_message_counts_in_the_budget_until_the_service_takes_it(
 ) -> None:
     size, taken = 2 << 20, threading.Event()
     with serving(FakeEngine(lambda _image: outputs())) as service:
-        config = service.server.config  # while it is not read, only a ping shows that a client left
+        config = service.server.config  # a ping detects the disconnect of a client that is not read
         config.ws_ping_interval = config.ws_ping_timeout = 0.5
 
         async def busy(_scope: object, receive: Any, send: Any) -> None:
@@ -235,7 +235,7 @@ def test_a_message_counts_in_the_budget_until_the_service_takes_it(
             until(lambda: bodies.held == 0)
             connection.sendall(frame(BINARY, bytes(size)))
             until(lambda: bodies.held == size)
-        until(lambda: bodies.held == 0)  # the client has left
+        until(lambda: bodies.held == 0)  # the client has disconnected
         taken.set()
 
 
@@ -248,7 +248,7 @@ def test_leaving_a_busy_websocket_writes_nothing_to_the_log(
         for _ in range(3):
             websockets.left_websockets(target, 8)
             connections = [target.open_websocket() for _ in range(8)]
-            for connection in connections:  # closed while its frames wait
+            for connection in connections:  # closed while the frames wait
                 send_all(connection, frame(BINARY, JPEG) * 6 + frame(TEXT, b"\xff"))
             until(lambda: not service.server.guard.streams)
             for connection in connections:
@@ -256,7 +256,7 @@ def test_leaving_a_busy_websocket_writes_nothing_to_the_log(
         gate.open.set()
         until(lambda: not service.server.server_state.connections)
         until(lambda: not service.server.server_state.tasks)
-        until(lambda: service.post(JPEG).status == 200)  # the frames of those who left come first
+        until(lambda: service.post(JPEG).status == 200)  # after the frames of the closed ones
         gc.collect()
     assert [record.getMessage() for record in caplog.records] == []
 

@@ -1,4 +1,4 @@
-"""Attacks on WebSockets, bounded as those of `attacks`."""
+"""Attacks with WebSockets, limited like the attacks of `attacks`."""
 
 import socket
 
@@ -21,18 +21,18 @@ def frames_before_the_handshake(target: Target, count: int = 64) -> list[socket.
 
 
 def unread_pings(target: Target, megabytes: int = 16) -> list[socket.socket]:
-    """Pings whose answers nobody reads."""
+    """Pings of a client that does not read the pongs."""
     return _stream(target, frame(PING, bytes(125)), megabytes)
 
 
 def large_unread_pings(target: Target, megabytes: int = 16) -> list[socket.socket]:
-    """Pings between frames of a few hundred bytes, whose answers nobody reads."""
+    """Pings between frames of a few hundred bytes, of a client that does not read the pongs."""
     part = frame(BINARY, bytes(300), fin=False) + frame(CONTINUATION, bytes(300))
     return _stream(target, part + frame(PING, bytes(125)), megabytes)
 
 
 def empty_fragments(target: Target, megabytes: int = 16) -> list[socket.socket]:
-    """One message in fragments without content."""
+    """One message of empty fragments."""
     connection = target.open_websocket()
     send_all(connection, frame(BINARY, fin=False))
     _pour(connection, frame(CONTINUATION, fin=False), megabytes)
@@ -40,12 +40,12 @@ def empty_fragments(target: Target, megabytes: int = 16) -> list[socket.socket]:
 
 
 def small_messages(target: Target, megabytes: int = 16) -> list[socket.socket]:
-    """Messages of one byte, each of which is refused."""
+    """Messages of one byte, which are all refused."""
     return _stream(target, frame(BINARY, b"x"), megabytes)
 
 
 def deep_texts(target: Target, count: int = 50) -> list[socket.socket]:
-    """Options of deep nesting."""
+    """Options with deeply nested JSON."""
     connection = target.open_websocket()
     for text in (b"[" * 900, b"[" * 4000, b'{"a":' * 200):
         send_all(connection, (frame(TEXT, text) + frame(BINARY, b"no image")), count)
@@ -53,7 +53,7 @@ def deep_texts(target: Target, count: int = 50) -> list[socket.socket]:
 
 
 def long_texts(target: Target, count: int = 32) -> list[socket.socket]:
-    """Texts of 4 MB that take four times as much memory once they are decoded."""
+    """Texts of 4 MB that need four times as much memory after decoding."""
     connections = [target.open_websocket() for _ in range(count)]
     for connection in connections:
         connection.settimeout(1.0)
@@ -67,18 +67,18 @@ def text_floods(target: Target, megabytes: int = 16) -> list[socket.socket]:
 
 
 def kept_messages(target: Target, count: int = 32) -> list[socket.socket]:
-    """Messages of 4 MB of clients that do not read the answers to those before."""
+    """Messages of 4 MB from clients that do not read the answers to earlier messages."""
     connections = [target.open_websocket() for _ in range(count)]
     small, large = frame(BINARY, b"no image" * 128), frame(BINARY, bytes(4 * MB - 64))
     for connection in connections:
         connection.settimeout(0.2)
         sent = _send_until_full(connection, small * 2000)
-        send_all(connection, small[sent % len(small) :] + large)  # the cut frame is completed
+        send_all(connection, small[sent % len(small) :] + large)  # completes the cut frame
     return connections
 
 
 def broken_texts(target: Target, count: int = 50) -> list[socket.socket]:
-    """Text that is not UTF-8, on a WebSocket each."""
+    """A text that is not UTF-8, on each of many WebSockets."""
     connections = [target.open_websocket() for _ in range(count)]
     for connection in connections:
         send_all(connection, frame(TEXT, b"\xff\xfe"))
@@ -86,7 +86,7 @@ def broken_texts(target: Target, count: int = 50) -> list[socket.socket]:
 
 
 def half_frames(target: Target, count: int = 32) -> list[socket.socket]:
-    """WebSockets that hold back the last byte of a message of 1 MB."""
+    """WebSockets that withhold the last byte of a message of 1 MB."""
     connections = [target.open_websocket() for _ in range(count)]
     for connection in connections:
         send_all(connection, frame(BINARY, bytes(MB))[:-1])
@@ -94,7 +94,7 @@ def half_frames(target: Target, count: int = 32) -> list[socket.socket]:
 
 
 def unread_answers(target: Target, count: int = 16) -> list[socket.socket]:
-    """WebSockets whose answers nobody reads."""
+    """WebSockets whose clients do not read the answers."""
     connections = [target.open_websocket() for _ in range(count)]
     for connection in connections:
         connection.settimeout(0.2)
@@ -103,7 +103,7 @@ def unread_answers(target: Target, count: int = 16) -> list[socket.socket]:
 
 
 def left_websockets(target: Target, count: int = 32) -> list[socket.socket]:
-    """Clients that leave a WebSocket while their frames wait."""
+    """Clients that reset a WebSocket while their frames wait."""
     for _ in range(count):
         with target.open_websocket() as connection:
             send_all(connection, frame(BINARY, JPEG), 16)
@@ -124,7 +124,7 @@ WEBSOCKETS: tuple[Attack, ...] = (
 
 
 def _send_until_full(connection: socket.socket, data: bytes) -> int:
-    """Send until the service reads no more; how many bytes were sent."""
+    """Send until the service stops reading; returns the number of bytes sent."""
     sent = 0
     try:
         while sent < len(data):
@@ -141,7 +141,7 @@ def _stream(target: Target, sent: bytes, megabytes: int) -> list[socket.socket]:
 
 
 def _pour(connection: socket.socket, sent: bytes, megabytes: int) -> None:
-    """Send the same for some megabytes, or until the service reads no more."""
+    """Send `sent` repeatedly, up to `megabytes`, or until the service stops reading."""
     connection.settimeout(1.0)
     part = sent * ((256 << 10) // len(sent))
     send_all(connection, part, 4 * megabytes)

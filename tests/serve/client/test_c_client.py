@@ -1,4 +1,4 @@
-"""examples/features.c: compiled without a warning, against a running service and a scripted one."""
+"""examples/features.c compiles without a warning, and runs with a real and a scripted service."""
 
 import shutil
 import socket
@@ -114,9 +114,9 @@ def answer() -> bytes:
 
 @contextmanager
 def scripted(*replies: bytes | None) -> Iterator[tuple[int, list[float]]]:
-    """A server that sends these replies byte by byte (None: it closes the connection).
+    """A server that sends these replies byte by byte; for None it closes the connection.
 
-    Gives its port and the times of the requests, s.
+    Yields its port and the list of the request times in s.
     """
     times: list[float] = []
     listener = socket.create_server(("127.0.0.1", 0))
@@ -174,7 +174,7 @@ def test_an_unreadable_image_and_an_invalid_reply_are_errors(
         port,
         _,
     ):
-        assert "ml -1.500" in ask(program, port, image).stdout  # a reply of that length is not read
+        assert "ml -1.500" in ask(program, port, image).stdout  # the longer reply is not read
     assert subprocess.run([program], capture_output=True).returncode == 2
 
 

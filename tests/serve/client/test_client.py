@@ -1,4 +1,4 @@
-"""The client with the service, and with servers that break off, stay silent or send nonsense."""
+"""The client with the service, and with servers that break off, do not reply or send nonsense."""
 
 import asyncio
 import re
@@ -33,7 +33,7 @@ JPEG, PNG = jpeg(picture()), png(picture())
 
 @contextmanager
 def listener(behave: Callable[[socket.socket, int], object]) -> Iterator[str]:
-    """A server that hands each connection and its number to `behave`; gives its URL."""
+    """A server that calls `behave` with each connection and its number; yields its URL."""
     server = bind("127.0.0.1", 0)
     server.listen()
 
@@ -212,7 +212,7 @@ def test_with_a_deadline_requests_are_retried_until_then_where_that_may_help(
 
         return behave
 
-    # Time passes only in the pauses between two requests: of 15 s each, as the service advises.
+    # The clock advances only in the pauses between requests, by the 15 s that the service advises.
     clock = Clock()
     monkeypatch.setattr(sync, "time", SimpleNamespace(monotonic=clock, sleep=clock.advance))
     monkeypatch.setattr(sync, "RETRY_S", 20.0)
@@ -246,7 +246,7 @@ def test_a_silent_service_and_a_port_without_one() -> None:
         with pytest.raises(ServiceError, match=r"did not reply within 0\.2 s"):
             Client(url, timeout_s=0.2).features(JPEG)
         quiet.set()
-    with bind("127.0.0.1", 0) as silent:  # it holds the port, and does not listen
+    with bind("127.0.0.1", 0) as silent:  # bound to the port, but not listening
         url = f"http://127.0.0.1:{silent.getsockname()[1]}"
         with pytest.raises(ServiceError, match="start one with `serve`"):
             Client(url).features(JPEG)

@@ -1,4 +1,4 @@
-"""The counts of all workers, and the log: its fields, and its limit on refusals."""
+"""The counters of all workers; the fields of the log, and its limit for refusals."""
 
 import json
 import logging
@@ -21,7 +21,7 @@ SAMPLE = re.compile(r'^(driverview_\w+)(\{\w+="[^"]*"(?:,\w+="[^"]*")*\})? (\S+)
 
 
 def read(page: bytes) -> dict[str, float]:
-    """The samples of a page, each line of which must be one or a comment."""
+    """The samples of a metrics page; every line must be a sample or a comment."""
     found = {}
     for line in page.decode().splitlines():
         if line.startswith("# "):
@@ -89,10 +89,10 @@ def test_refusals_are_logged_with_their_request_and_at_a_limited_rate(
     assert content["problem"] == "/problems/not-an-image"
     assert (content["status"], content["client"]) == (422, "127.0.0.1")
     service.post(JPEG)
-    assert lines.records[-1] is record  # answers are logged on request only
+    assert lines.records[-1] is record  # answers are not logged by default
     for _ in range(200):
         service.post(b"")
-    assert len(lines.records) == 1  # a client has a line a second
+    assert len(lines.records) == 1  # one line per second for a client
     clock.now_s += 1.0
     service.post(b"")
     assert json.loads(JsonFormatter().format(lines.records[-1]))["suppressed"] == 200

@@ -1,4 +1,4 @@
-"""Traces: names and parents of the spans, and their export to a collector."""
+"""Traces: names and parents of the spans, their export to a collector."""
 
 import subprocess
 import sys
@@ -42,7 +42,7 @@ def traced(engine: FakeEngine, exporter: InMemorySpanExporter) -> Iterator[Serve
 
 
 def spans(exporter: InMemorySpanExporter, last: str) -> dict[str, ReadableSpan]:
-    """The finished spans by name; waits until the span `last` has ended."""
+    """Wait until the span `last` has ended; returns the finished spans by name."""
     until(lambda: last in {span.name for span in exporter.get_finished_spans()})
     return {span.name: span for span in exporter.get_finished_spans()}
 
@@ -83,7 +83,7 @@ def test_a_request_continues_the_callers_trace(
     at = frame.start_time
     for name in STAGES:
         assert_child(found[name], frame)
-        assert found[name].start_time == at  # one after the other
+        assert found[name].start_time == at  # the stages follow each other
         at = found[name].end_time
         assert (found[name].end_time or 0) - (found[name].start_time or 0) == pytest.approx(
             1e6 * timing[name], abs=1001
@@ -123,7 +123,7 @@ def test_refused_requests_record_the_reason_and_probes_have_no_span(
     assert root.parent is None
     assert about(root)["error.type"] == "/problems/not-an-image"
     assert about(root)["http.response.status_code"] == 422
-    assert root.status.status_code is StatusCode.UNSET  # the client's fault
+    assert root.status.status_code is StatusCode.UNSET  # a fault of the client is no error
     exporter.clear()
     assert traced.post(JPEG, X_Deadline_Ms="0").status == 503
     found = spans(exporter, "POST /features")
@@ -134,7 +134,7 @@ def test_refused_requests_record_the_reason_and_probes_have_no_span(
 
 @contextmanager
 def collector() -> Iterator[tuple[str, list[ExportTraceServiceRequest]]]:
-    """An OTLP collector over HTTP: its address, and the requests it received."""
+    """An OTLP collector over HTTP; yields its address and the list of received requests."""
     received: list[ExportTraceServiceRequest] = []
 
     class Handler(BaseHTTPRequestHandler):
@@ -204,7 +204,7 @@ def test_environment_variables_switch_tracing() -> None:
 
 
 def test_without_tracing_no_exporter_is_loaded_or_endpoint_wrapped(service: Served) -> None:
-    """No exporter is loaded and no endpoint is wrapped. (FastAPI imports the API.)"""
+    """The OpenTelemetry API may be loaded, because FastAPI imports it."""
     code = (
         "import sys, serve.workers.worker, serve.launch\n"
         "from serve.observability import telemetry\n"

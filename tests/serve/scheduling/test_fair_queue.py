@@ -1,4 +1,4 @@
-"""The lock for which clients take turns; the queue's own turns are tested with the frame queue."""
+"""The lock for which clients take turns; test_frame_queue.py tests the turns of the queue."""
 
 import asyncio
 from contextlib import suppress
@@ -7,7 +7,7 @@ from serve.scheduling.fair_queue import FairLock
 
 
 def order_of(clients: list[str], cancelled: tuple[int, ...] = ()) -> list[int]:
-    """The order in which waiters, one for each of `clients`, get the lock; some give up."""
+    """The order in which waiters, one for each of `clients`, get the lock, without `cancelled`."""
 
     async def run() -> list[int]:
         lock, order = FairLock(), list[int]()
@@ -33,7 +33,7 @@ def order_of(clients: list[str], cancelled: tuple[int, ...] = ()) -> list[int]:
 
 
 def test_clients_take_turns() -> None:
-    """One that sent three requests does not keep another waiting for all of them."""
+    """A client does not wait until all three requests of another client are done."""
     assert order_of(["10.0.0.1"] * 3 + ["10.0.0.2"] * 2) == [0, 3, 1, 4, 2]
     # Addresses of one IPv6 network are one client.
     assert order_of(["2001:db8::1", "2001:db8::2", "10.0.0.2"]) == [0, 2, 1]
@@ -55,7 +55,7 @@ def test_a_turn_that_comes_to_one_that_was_cancelled_goes_on() -> None:
         async with lock.held("10.0.0.2"):
             task = asyncio.create_task(hold())
             await asyncio.sleep(0)
-        task.cancel()  # its turn has come, but it has not run since
+        task.cancel()  # it has got the lock, but has not run yet
         with suppress(asyncio.CancelledError):
             await task
         async with asyncio.timeout(5), lock.held("10.0.0.3"):

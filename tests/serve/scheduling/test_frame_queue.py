@@ -1,4 +1,4 @@
-"""The frame queue's model and its behaviour when it is full, without a server."""
+"""The frame queue without a server: its model, and its behaviour when it is full."""
 
 import asyncio
 import math
@@ -35,7 +35,7 @@ def make_frame() -> Frame:
 
 
 def test_reading_the_engine_changes_no_state() -> None:
-    """It is read from the event loop while the engine's thread works."""
+    """The event loop reads `loaded` while the engine's thread works."""
     queue = make_queue(make_engine())
     new = make_engine()
     queue.stage_model(new, lambda: True)
@@ -58,7 +58,7 @@ def test_a_committed_engine_is_kept_when_another_is_staged_or_dropped() -> None:
 
 
 def test_a_refusal_schedules_nothing_on_the_event_loop(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A full queue must not make the loop wait: it also answers probes."""
+    """A full queue must not delay the event loop, which also answers probes."""
     gate = Gate()
     queue = make_queue(gate.engine)
 
@@ -72,7 +72,7 @@ def test_a_refusal_schedules_nothing_on_the_event_loop(monkeypatch: pytest.Monke
         until(gate.busy.is_set)
         scheduled: list[Callable[..., Any]] = []
         monkeypatch.setattr(loop, "call_soon", lambda call, *_: scheduled.append(call))
-        with pytest.raises(Problem, match="send this one or a newer one later"):
+        with pytest.raises(Problem, match="send this frame or a newer one later"):
             queue.submit(make_frame(), result.set_result)
         monkeypatch.undo()
         gate.open.set()
@@ -87,8 +87,9 @@ def test_a_refusal_schedules_nothing_on_the_event_loop(monkeypatch: pytest.Monke
 def test_frames_that_wait_together_are_processed_on_the_loop_by_a_worker_with_one_core(
     single_core: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Its thread would take turns with the loop. Between two frames the loop does other work."""
-    monkeypatch.setattr(frame_queue, "INLINE_MAX_MS", math.inf)  # on a busy machine, too
+    """On one core the thread and the loop would interrupt each other. Between two frames the loop
+    does other work."""
+    monkeypatch.setattr(frame_queue, "INLINE_MAX_MS", math.inf)  # holds on a busy machine too
     events: list[str] = []
     engine = make_engine()
     streams = StreamTable(create_shared_memory(1).streams())
@@ -113,7 +114,7 @@ def test_frames_that_wait_together_are_processed_on_the_loop_by_a_worker_with_on
         queue.start()
         until(lambda: queue.ready)
         end = time.monotonic() + PATIENCE_S
-        while "MainThread" not in events:  # the engine counts as fast, and the thread sleeps
+        while "MainThread" not in events:  # then the engine counts as fast, and the thread sleeps
             assert time.monotonic() < end
             await submit(1)
         events.clear()
@@ -173,7 +174,7 @@ def test_a_refusal_of_many_frames_holds_none_of_their_bodies() -> None:
     assert raised.value is not first
     assert first.__traceback__ is None
     queue._waiting.append(slot("10.0.0.1"))
-    assert queue.refusal("10.0.0.2") is None  # one of the other client gives way
+    assert queue.refusal("10.0.0.2") is None  # a slot of the other client would be given up
 
 
 def slot(client: str) -> Slot:
@@ -200,7 +201,7 @@ def test_the_last_frame_of_the_client_with_most_gives_way_to_one_with_fewer() ->
     assert queue.giving_way_to("10.0.0.2") is slots[3]
     assert queue.giving_way_to("10.0.0.1") is None
     queue.remove(slots[3])
-    assert queue.giving_way_to("10.0.0.2") is None  # it would have more than the other then
+    assert queue.giving_way_to("10.0.0.2") is None  # else it would have more slots
     assert queue.giving_way_to("2001:db8::1") is slots[2]
 
 

@@ -1,4 +1,4 @@
-"""The newest frame of a stream wins, in one worker and over several; late frames are dropped."""
+"""A newer frame replaces the queued frame of its stream in all workers; late frames are dropped."""
 
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -27,7 +27,7 @@ JPEG = jpeg(picture())
 
 
 class Crowd:
-    """Clients of a service, each with a connection and a thread of its own."""
+    """Clients of a service, each with its own connection and thread."""
 
     def __init__(self, service: Served, pool: ThreadPoolExecutor) -> None:
         self._service, self._pool = service, pool
@@ -36,7 +36,7 @@ class Crowd:
         return self._pool.submit(lambda: Served(self._service.port).post(JPEG, **headers))
 
     def queue(self, waiting: int, **headers: str) -> "Future[Reply]":
-        """Post, and return once `waiting` frames wait."""
+        """Post an image, and return once `waiting` frames are in the queue."""
         future = self.post(**headers)
         until(lambda: self._service.app.frame_queue.waiting == waiting)
         return future
@@ -44,7 +44,7 @@ class Crowd:
 
 @contextmanager
 def busy(gate: Gate, memory: shared_memory.SharedMemory | None = None) -> Iterator[Crowd]:
-    """A service whose engine is busy with a first frame until the gate is opened."""
+    """A service whose engine is busy with a first frame until `gate` is opened."""
     with serving(gate.engine, shared=memory) as service, ThreadPoolExecutor(8) as pool:
         crowd = Crowd(service, pool)
         first = crowd.post()
@@ -61,9 +61,7 @@ def test_a_newer_frame_replaces_the_queued_one_at_once() -> None:
         other = crowd.queue(2, X_Stream_Id="rear")
         alone = crowd.queue(3)
         new = crowd.post(X_Stream_Id="front")
-        assert_problem(
-            old.result(PATIENCE_S), 503, "superseded"
-        )  # while the engine is still at work
+        assert_problem(old.result(PATIENCE_S), 503, "superseded")  # the engine is still busy
         gate.open.set()
         assert [f.result().status for f in (new, other, alone)] == [200] * 3
     assert len(gate.engine.images) == 4
@@ -120,14 +118,14 @@ def test_the_table_holds_the_newest_stamp_of_each_stream() -> None:
     here.announce(front, now)
     assert [there.is_superseded(front, now + d) for d in (-1, 0, 1)] == [True, False, False]
     assert not there.is_superseded(other, 0)
-    there.announce(front, now - 5)  # an older stamp changes nothing
+    there.announce(front, now - 5)  # an older stamp has no effect
     assert here.is_superseded(front, now - 1)
 
 
 def test_a_full_table_drops_streams_that_have_ended() -> None:
     streams = StreamTable(shared_memory.create_shared_memory(blocks=1).streams())
     now = 10 * EXPIRY_NS
-    keys = [1 + 1024 * n for n in range(PROBES + 1)]  # all of them with the same hash
+    keys = [1 + 1024 * n for n in range(PROBES + 1)]  # all have the same hash
     for key in keys:
         streams.announce(key, now)
     assert [streams.is_superseded(key, now - 1) for key in keys] == [True] * PROBES + [False]

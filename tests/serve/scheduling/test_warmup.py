@@ -1,4 +1,4 @@
-"""The check of a model before it answers: its outputs for the golden image."""
+"""The check of a model before it answers: its outputs for the golden image must match."""
 
 import numpy as np
 import pytest
@@ -34,5 +34,5 @@ def test_a_model_with_other_outputs_than_the_published_never_gets_ready() -> Non
     with pytest.raises(ModelError, match=r"at most 0\.03 is expected in bf16"):
         warm_up(rounded)
     with serving(always(right + np.float32(0.01)), warm_up) as service:
-        until(lambda: "golden" in not_ready_reason(service))  # first it is warming up
+        until(lambda: "golden" in not_ready_reason(service))  # at first the reason is the warm-up
         assert service.ask("GET", "/healthz").status == 200

@@ -1,4 +1,4 @@
-"""The end of one worker: what its clients have sent is answered, and no answer is lost."""
+"""A worker stops: the requests that its clients have sent are answered, and no answer is lost."""
 
 import logging
 import socket
@@ -25,7 +25,7 @@ JPEG = jpeg(picture())
 
 
 def read_all(connection: socket.socket) -> bytes:
-    """What is received until the service ends the connection; raises when it is reset."""
+    """All bytes until the service ends the connection; raises ConnectionResetError on a reset."""
     return b"".join(iter(lambda: connection.recv(1 << 16), b""))
 
 
@@ -43,7 +43,7 @@ def test_requests_under_way_are_answered_and_pipelined_ones_lose_no_reply(
         until(lambda: len(service.server.server_state.connections) == 3)
         service.server.should_exit = True
         until(lambda: service.server.guard.draining)
-        many.sendall(request * 8)  # idle until now; the reply to the first is the last
+        many.sendall(request * 8)  # idle until now; only the first gets a reply
         half.sendall(request[-100:])
         new.sendall(b"lthz HTTP/1.1\r\nHost: localhost\r\n\r\n")
         for connection in (half, many, new):
@@ -65,7 +65,7 @@ def test_a_reply_that_was_begun_is_the_last_one_and_later_bytes_do_not_reset_it(
         gate.open.set()
         with connection:
             assert read_head(connection).startswith(b"HTTP/1.1 200")
-            connection.sendall(target.post(JPEG) * 4)  # unread bytes at a close would reset
+            connection.sendall(target.post(JPEG) * 4)  # a close with unread bytes would reset
             read_all(connection)
 
 
@@ -133,7 +133,7 @@ def test_a_websocket_gets_the_answers_that_it_is_owed_then_the_reason() -> None:
             until(gate.busy.is_set)
             service.server.should_exit = True
             until(lambda: service.server.guard.draining)
-            for _ in range(8):  # unread by the service
+            for _ in range(8):  # the service does not read these
                 websocket.send(JPEG)
             answer = pool.submit(websocket.recv, PATIENCE_S)
             gate.open.set()

@@ -1,4 +1,4 @@
-"""POST /features without ASGI: the thread that runs the engine, the order of replies, bodies."""
+"""POST /features without ASGI: the engine's thread, the order of replies, bodies."""
 
 import contextlib
 import json
@@ -35,10 +35,10 @@ WHOLE = HEAD + b"Content-Length: %d\r\n\r\n" % len(JPEG) + JPEG
 
 
 class RecordingEngine(FakeEngine):
-    """An engine that records which thread runs it, and says itself how long a frame takes.
+    """An engine that records its thread, with a simulated time of `frame_ms` per frame.
 
-    The frame queue reads its clock from `monotonic_ns`, so a busy machine makes no frame slow. A
-    frame waits until `open`; `busy` is set once the engine has begun on it.
+    It replaces the frame queue's clock, so that a busy machine makes no frame slow. A frame waits
+    until `open` is set; `busy` is set when the engine begins a frame.
     """
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -62,7 +62,7 @@ class RecordingEngine(FakeEngine):
 
 
 def read(connection: socket.socket, count: int) -> list[tuple[int, dict[str, Any]]]:
-    """The next `count` replies: their status and content."""
+    """The status and content of the next `count` replies."""
     found: list[tuple[int, dict[str, Any]]] = []
     received = b""
     while len(found) < count:
@@ -97,19 +97,19 @@ def test_a_single_frame_of_a_fast_engine_is_processed_on_the_event_loop(
             return ask() != "forward"
 
         assert [ask() for _ in range(INLINE_AFTER)] == ["forward"] * INLINE_AFTER
-        until(on_the_loop)  # not the next one if the thread has not yet gone back to sleep
+        until(on_the_loop)  # waits until the thread sleeps
         assert ask(large) == "forward"
         until(on_the_loop)
         engine.frame_ms = 1.1 * INLINE_MAX_MS
         ask()
-        assert [ask() for _ in range(3)] == ["forward"] * 3  # the engine counts as slow now
+        assert [ask() for _ in range(3)] == ["forward"] * 3  # now the engine counts as slow
 
 
 def test_frames_that_arrive_together_go_to_the_thread(monkeypatch: pytest.MonkeyPatch) -> None:
     engine = RecordingEngine(monkeypatch)
     with serving(engine) as service:
         first, *others = clients = [dial(service) for _ in range(4)]
-        for client in clients:  # the service reads all of them
+        for client in clients:  # the service reads from all
             client.sendall(WHOLE)
             assert read(client, 1)[0][0] == 200
         until(lambda: service.post(JPEG).status == 200 and engine.threads[-1] != "forward")
@@ -176,13 +176,13 @@ def test_a_reply_says_that_the_connection_will_be_closed(service: Served) -> Non
 
 
 def test_a_client_that_reads_no_replies_is_read_no_more(service: Served) -> None:
-    """What it has sent then stays within what the system and one part received hold."""
+    """The bytes that the client can send are limited to the system's buffers and one read."""
     for option in (socket.SO_SNDBUF, socket.SO_RCVBUF):
         service.listener.setsockopt(socket.SOL_SOCKET, option, 1 << 16)
     client = dial(service)
     client.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 16)
     client.setblocking(False)
-    pad = b"X-Pad: " + b"x" * 7000  # one part received, 128 KiB, then holds fewer than MAX_AT_ONCE
+    pad = b"X-Pad: " + b"x" * 7000  # so one read of 128 KiB has less than MAX_AT_ONCE
     request = b"POST /features HTTP/1.1\r\nHost: localhost\r\n%b\r\nContent-Length: 0\r\n\r\n" % pad
     until(lambda: len(service.server.server_state.connections) == 1)
     (connection,) = service.server.server_state.connections
@@ -219,12 +219,12 @@ def test_a_connection_without_requests_is_closed_after_its_time() -> None:
             clock.now_s += 29.0
         service.wait_for_tick()
         connection.settimeout(0)
-        with pytest.raises(BlockingIOError):  # it is still open
+        with pytest.raises(BlockingIOError):  # the connection is still open
             connection.recv(1)
         connection.settimeout(PATIENCE_S)
         clock.now_s += 1.1
         assert connection.recv(1) == b""
-    with serving(engine, limits=Limits(idle_s=0.1)) as service:  # by the clock of the machine
+    with serving(engine, limits=Limits(idle_s=0.1)) as service:  # with the real clock
         connection = dial(service)
         connection.sendall(WHOLE)
         assert read(connection, 1)[0][0] == 200

@@ -1,4 +1,4 @@
-"""Memory that is free in the heap goes back to the system."""
+"""Free memory of the heap is returned to the system."""
 
 import pytest
 
@@ -25,7 +25,7 @@ def test_freed_blocks_of_the_heap_are_given_back() -> None:
     before = heap._resident_bytes()
     assert before > 1 << 20
     kept = []
-    for _ in range(2000):  # small enough for the heap, with blocks in between that stay
+    for _ in range(2000):  # small enough for the heap; the kept blocks prevent merging
         block = bytearray(100 << 10)
         kept.append(bytearray(200))
         kept.append(block)

@@ -1,7 +1,6 @@
-"""The internals of uvicorn that `serve.server` relies on: they have no stability promise.
+"""The internals of uvicorn that `serve.server` uses; uvicorn can change them in any release.
 
-A failure here means that uvicorn's internals have changed: adapt `serve.server`, then the bounds in
-pyproject.toml.
+If a test fails here, adapt `serve.server` to uvicorn's change, then the bounds in pyproject.toml.
 """
 
 import asyncio

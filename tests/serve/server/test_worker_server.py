@@ -1,4 +1,4 @@
-"""Which of the workers on one port accepts a connection."""
+"""The choice of the worker that accepts a connection, among the workers on one port."""
 
 import threading
 import time
@@ -30,7 +30,7 @@ def make_clients(port: int) -> list[Served]:
 
 
 def ask_each(clients: list[Served]) -> list[int]:
-    """The status that each client gets; all connections stay open."""
+    """The status of a request of each client; all connections stay open."""
     return [client.post(JPEG).status for client in clients]
 
 
@@ -53,7 +53,7 @@ def test_a_worker_that_warms_up_leaves_connections_to_one_that_is_ready(
         assert not others.images
         warm.set()
         until(lambda: two.app.frame_queue.ready)
-        # The worker with more connections leaves them to the other for longer than that can need.
+        # The worker with more connections now yields for longer than the other worker can need.
         monkeypatch.setattr(worker_server, "YIELD_S", PATIENCE_S)
         assert ask_each(late) == [200] * 8
         assert len(others.images) == 8
@@ -82,8 +82,8 @@ def test_a_worker_with_the_most_connections_ends_idle_ones_for_another(
         assert ask_each(idle) == [200] * 4
         with serving(engine, limits=limits, shared=memory, block=1, beside=one) as two:
             until(lambda: WorkerPeers(memory, 1).other_connections() == [4])
-            monkeypatch.setattr(worker_server, "YIELD_S", PATIENCE_S)  # one leaves clients to two
-            refused = Served(two.port).post(JPEG)  # accepted by two, which has none to end
+            monkeypatch.setattr(worker_server, "YIELD_S", PATIENCE_S)  # worker one yields to two
+            refused = Served(two.port).post(JPEG)  # two accepts it, and has no connection to end
             assert_problem(refused, 503, "too-many-connections")
             until(lambda: WorkerPeers(memory, 1).other_connections() == [3])
             assert Served(two.port).post(JPEG).status == 200
@@ -101,7 +101,7 @@ def test_refused_clients_end_one_idle_connection_at_a_time() -> None:
         for _ in range(3):
             other.ask_for_room(least=1)
         until(lambda: other.other_connections() == [3])
-        other.ask_for_room(least=1)  # there is room now
+        other.ask_for_room(least=1)  # now there is room
         one.wait_for_tick()
         assert other.other_connections() == [3]
         assert ask_each(idle[1:]) == [200] * 3
@@ -117,7 +117,7 @@ def test_room_is_asked_of_the_worker_with_the_most_connections_once() -> None:
     assert (few.room_asked(), many.room_asked()) == (None, 2)
     few.publish(9, ready=True)
     assert (few.room_asked(), many.room_asked()) == (None, None)
-    assert WorkerPeers(memory, 0).room_asked() is None  # restarted in its block
+    assert WorkerPeers(memory, 0).room_asked() is None  # a restarted worker in this block
 
 
 def test_many_connections_at_once_are_accepted_one_after_the_other(

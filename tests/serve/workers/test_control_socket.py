@@ -1,4 +1,4 @@
-"""Commands over the control socket: what a user is told when one fails."""
+"""Commands over the control socket: the messages for the user after a failure."""
 
 import asyncio
 import os
@@ -58,7 +58,7 @@ def test_a_folder_of_another_user_is_not_trusted(monkeypatch: pytest.MonkeyPatch
 def test_two_services_with_one_port_do_not_take_each_others_commands(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    """They may listen at different addresses."""
+    """Two services can have the same port on different addresses."""
 
     async def answer(_model: str | None) -> str:
         return "first"
@@ -69,7 +69,7 @@ def test_two_services_with_one_port_do_not_take_each_others_commands(
         async with server:
             assert await listen_for_commands(PORT, {}) is None
             assert await asyncio.to_thread(send_command, PORT, "reload") == "first"
-        again = await listen_for_commands(PORT, {"reload": answer})  # its path was left behind
+        again = await listen_for_commands(PORT, {"reload": answer})  # the file still exists
         assert again is not None
         again.close()
 

@@ -26,21 +26,21 @@ BODY = png(golden_image(280, 210)[:, :, ::-1])
 
 @pytest.fixture(scope="module")
 def models(published: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """Two models with different weights."""
+    """The folders of two models with different weights."""
     other = tmp_path_factory.mktemp("other") / "run"
     publish_untrained(other, seed=4)
     return published, other
 
 
 def expected(run: Path) -> tuple[str, dict[str, Any]]:
-    """(hash, what it answers to BODY)."""
+    """The hash of a model, and its answer to BODY."""
     return read_card(run).model_hash, decode_outputs(
         load_engine(run)(golden_image(280, 210))
     ).as_json()
 
 
 class Traffic:
-    """Clients that ask every `PAUSE_S`, and the answers and errors they got."""
+    """Clients that send a request every `PAUSE_S`, with their answers and errors."""
 
     def __init__(self, url: str, clients: int) -> None:
         self._url = url
@@ -101,7 +101,7 @@ def test_reload_and_restart_lose_no_request_and_give_no_wrong_answer(
             assert done.stdout.strip() == f"now serving model {new[:12]}", done.stderr
             changed = len(found.answers)
             until(lambda: len(found.answers) > changed + 10)
-            # Whatever was asked after the command's end is answered by the new model.
+            # Requests sent after the end of the command are answered by the new model.
             assert {a["model"] for a in found.answers[changed + 4 :]} == {new}
 
             broken = tmp_path / "broken"
@@ -128,7 +128,7 @@ def test_reload_and_restart_lose_no_request_and_give_no_wrong_answer(
 
 
 def children(pid: int) -> list[int]:
-    """The process ids of a process's children; `ps` ends with 1 when there are none."""
+    """The ids of a process's children; `ps` exits with 1 if there are none."""
     command = ["ps", "-o", "pid=", "--ppid", str(pid)]
     found = subprocess.run(command, capture_output=True, text=True)
     return [int(child) for child in found.stdout.split()]

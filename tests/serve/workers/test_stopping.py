@@ -1,4 +1,4 @@
-"""A service that stops or replaces its workers: no client sees a reset or an empty reply."""
+"""A service stops or replaces its workers: no client gets a reset or an empty reply."""
 
 import http.client
 import itertools
@@ -23,7 +23,7 @@ JPEG = jpeg(picture())
 
 
 class Clients:
-    """Clients in threads, each asking again and again until the service refuses connections."""
+    """Clients in threads that repeat their request until the service refuses connections."""
 
     def __init__(self, port: int) -> None:
         self.port = port
@@ -32,7 +32,7 @@ class Clients:
         self._threads: list[threading.Thread] = []
 
     def run(self, ask: Callable[[], str]) -> None:
-        """Call `ask` in a thread of its own; it returns what came out."""
+        """Repeat `ask` in a new thread, and count the outcomes that it returns."""
 
         def loop() -> None:
             while not self._stop.is_set():
@@ -48,7 +48,7 @@ class Clients:
         self._threads[-1].start()
 
     def join(self) -> Counter[str]:
-        """What came out, once all clients were refused."""
+        """The counted outcomes, after all clients were refused."""
         end = time.monotonic() + PATIENCE_S
         for thread in self._threads:
             thread.join(max(0.0, end - time.monotonic()))
@@ -56,12 +56,12 @@ class Clients:
         return self.counts
 
     def stop(self) -> Counter[str]:
-        """What came out until now."""
+        """Stop the clients; returns the outcomes counted so far."""
         self._stop.set()
         return self.join()
 
     def new_each_time(self) -> str:
-        """A new connection for a small request."""
+        """Send a small request on a new connection."""
         connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=PATIENCE_S)
         try:
             connection.request("GET", "/healthz")
@@ -70,7 +70,7 @@ class Clients:
             connection.close()
 
     def large(self) -> str:
-        """A new connection for a large body, which is refused."""
+        """Send a large body, which is refused, on a new connection."""
         connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=PATIENCE_S)
         try:
             connection.request("POST", "/features", bytes(1 << 20), {"Content-Type": "image/png"})
@@ -79,14 +79,15 @@ class Clients:
             connection.close()
 
     def late(self) -> str:
-        """A connection that sends its request some time after it was made."""
+        """Send a request 0.1 s after the connection was made."""
         with socket.create_connection(("127.0.0.1", self.port), PATIENCE_S) as connection:
             time.sleep(0.1)
             connection.sendall(b"GET /healthz HTTP/1.1\r\nHost: localhost\r\n\r\n")
             return connection.recv(65536).split()[1].decode()
 
     def keeper(self) -> Callable[[], str]:
-        """One connection for many images, until the service says that it closes it."""
+        """A function that sends an image on the same connection at each call, until the service
+        announces that it closes the connection."""
         connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=PATIENCE_S)
 
         def keep_alive() -> str:
@@ -104,7 +105,7 @@ def reply_of(connection: http.client.HTTPConnection) -> str:
 
 @contextmanager
 def running(published: Path, *arguments: str) -> Iterator[tuple[subprocess.Popen[str], int]]:
-    """A service that is ready, and its port."""
+    """A ready service; yields its process and its port."""
     with started("--model", str(published), "--port", "0", *arguments) as (process, line):
         url = address(line)
         with Client(url, timeout_s=PATIENCE_S) as client:
@@ -121,7 +122,7 @@ def test_no_client_sees_a_reset_when_the_service_stops(published: Path, workers:
             clients.run(ask)
         clients.run(clients.keeper())
         time.sleep(0.3)
-        for _ in range(2):  # a second signal changes nothing
+        for _ in range(2):  # a second signal has no effect
             process.send_signal(signal.SIGTERM)
             time.sleep(0.05)
         assert process.wait(PATIENCE_S) == 0
@@ -154,7 +155,7 @@ def test_connections_that_wait_while_the_model_loads_are_answered_when_it_stops(
     with running(published) as (first, port):
         first.send_signal(signal.SIGTERM)
         first.wait(PATIENCE_S)
-    # Started again on that port, and stopped before a worker can accept anything.
+    # Start the service again on this port, and stop it before a worker can accept connections.
     with started_without_line(published, port) as process:
         connection = dial(port)
         connection.sendall(b"HEAD /v2 HTTP/1.1\r\nHost: localhost\r\n\r\n")
@@ -164,7 +165,7 @@ def test_connections_that_wait_while_the_model_loads_are_answered_when_it_stops(
         assert process.wait(PATIENCE_S) == 0
     assert reply.startswith(b"HTTP/1.1 503")
     assert b"connection: close" in reply
-    assert reply.endswith(b"\r\n\r\n")  # no body after HEAD
+    assert reply.endswith(b"\r\n\r\n")  # HEAD gets no body
     with pytest.raises(ConnectionRefusedError):
         dial(port, tries=1)
 
@@ -180,7 +181,7 @@ def started_without_line(published: Path, port: int) -> Iterator[subprocess.Pope
 
 
 def dial(port: int, tries: int | None = None) -> socket.socket:
-    """A connection, as soon as the service listens."""
+    """A connection, made as soon as the service listens."""
     for number in itertools.count(1):
         try:
             return socket.create_connection(("127.0.0.1", port), PATIENCE_S)

@@ -1,4 +1,4 @@
-"""Reload and restart when a worker fails; the workers are fakes that load no model."""
+"""Reload and restart with failing workers; the workers are fakes that load no model."""
 
 import asyncio
 import json
@@ -20,7 +20,7 @@ from trackfeatures.errors import UserError
 
 
 class FakeProcess:
-    """The process of a worker: it runs until it is terminated."""
+    """A fake worker process, which runs until it is terminated."""
 
     def __init__(self) -> None:
         self.pid = 1
@@ -37,14 +37,14 @@ class FakeProcess:
 
 
 class FakeWorkers:
-    """Starts workers; they get ready if `is_ready`, and cannot load `failing_folders`."""
+    """Starts fake workers. They become ready if `is_ready`; loading `failing_folders` fails."""
 
     def __init__(self) -> None:
         self.started: list[WorkerProcess] = []
         self.failing_folders: set[str] = set()
         self.is_ready = True
         self.is_loading = False
-        """Whether workers load for ever."""
+        """Whether the workers never finish loading."""
         self._tasks: set[asyncio.Task[None]] = set()
 
     async def start(self, task: WorkerTask) -> WorkerProcess:
@@ -66,7 +66,7 @@ class FakeWorkers:
             writer.write(json.dumps(message).encode() + b"\n")
 
         if self.is_loading:
-            await reader.read()  # until the supervisor closes; the worker holds its end open
+            await reader.read()  # until the supervisor closes the socket
             return
         send(loaded=task.generation, model="a" * 64, engine="fake", precision="f32")
         if self.is_ready:
@@ -147,11 +147,11 @@ def test_a_replacement_that_does_not_become_ready_is_stopped(
     asyncio.run(scenario())
     first, second, timed_out, *replacements = workers.started
     assert not timed_out.alive
-    assert not first.alive  # replaced by the second restart
+    assert not first.alive  # the second restart has replaced it
     assert not second.alive
     assert all(worker.alive for worker in replacements)
     blocks = [worker.task.block for worker in replacements]
-    assert len(set(blocks)) == len(blocks) == 2  # no two write the same metrics
+    assert len(set(blocks)) == len(blocks) == 2  # no two workers write to the same block
 
 
 def test_a_worker_that_failed_a_reload_and_died_later_reports_how_it_died(
@@ -179,7 +179,7 @@ async def until_started(workers: FakeWorkers, count: int) -> None:
 def test_a_killed_worker_leaves_no_bodies_in_the_budget(
     workers: FakeWorkers, tmp_path: Path
 ) -> None:
-    """Its replacement may use another block of the shared memory."""
+    """The replacement of a killed worker can use another block of the shared memory."""
 
     async def scenario() -> None:
         supervisor = make_supervisor(tmp_path)
