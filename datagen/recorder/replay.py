@@ -35,7 +35,7 @@ def replay(
     pixels: bool = False,
     on_replayed: OnReplayed = lambda name: None,
 ) -> tuple[list[str], list[str]]:
-    """Simulate up to `count` rounds, spread over the plan; their ids, and the differences found.
+    """Simulate up to `count` rounds, spread over the plan; returns their ids, and differences.
 
     Labels and states must be equal in every byte; with `pixels` images too, which only the same
     renderer reproduces. Raises UserError if a round cannot be simulated on this machine.

@@ -21,7 +21,7 @@ BALANCED_BY = ("track", "lanes", "trajectory", "traffic")
 MIN_CLASS_SHARE = 0.15
 MIN_ACTIVE_SHARE = 0.02
 SHARED_BY_SPLITS = ("track", "lanes", "light", "trajectory")
-"""Properties of a round of which both splits should have the same values."""
+"""Properties of a round whose values should occur in both splits."""
 REQUIRED_SPLITS = ("train", "test")
 """Splits that every dataset needs; `unseen` is collected on request, and differs on purpose."""
 

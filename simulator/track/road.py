@@ -100,8 +100,8 @@ class Road:
 
     @property
     def line_offsets(self) -> tuple[tuple[float, float], ...]:
-        """Offsets, left positive, from each marking to the lines that bound the lanes on its left and
-        on its right; empty if all of them are 0."""
+        """Offsets, left positive, from each marking to the lines that bound the lanes on its left
+        and on its right; empty if all of them are 0."""
         if self.carriageway is None:
             return ()
         return tuple((marking.left_m, marking.right_m) for marking in self.carriageway.markings)

@@ -39,9 +39,9 @@ class Watcher:
     """Shows the world of the argument of `update` in the browser, at the address `url`.
 
     Without a browser an update costs microseconds; with one, at most 20 pictures a second are
-    taken. `speed` limits the drive to this multiple of real time, None sets no limit; `seed` fixes the
-    scenery. Use it from the thread that steps the environment. Raises UserError when the port is in
-    use.
+    taken. `speed` limits the drive to this multiple of real time, None sets no limit; `seed` fixes
+    the scenery. Use it from the thread that steps the environment. Raises UserError when the port
+    is in use.
     """
 
     def __init__(
@@ -109,7 +109,7 @@ class Watcher:
             self._pacer = Pacer(1.0 / world.frequency_hz, self._speed)
 
     def _handle_requests(self) -> None:
-        """Handle requests for a light; all other requests would change the drive and are ignored."""
+        """Handle requests for a light; other requests would change the drive and are ignored."""
         requests, _ = self._hub.take_requests()
         for _, request in requests:
             if request.kind == "light" and self._renderer is not None:

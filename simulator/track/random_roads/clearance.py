@@ -10,8 +10,8 @@ from simulator.track.layout import Segment, cut, place
 
 CLEARANCE_M: Final = 24.0
 """Least distance between the centre lines of two parts of the road. Walls up to 12 m from the
-centre line then never meet, nor do the inner walls of the tightest bend (12 m). A road of three lanes of
-4.3 m with shoulders of 3 m has its walls at 11.95 m."""
+centre line then never meet, nor do the inner walls of the tightest bend (12 m). A road of three
+lanes of 4.3 m with shoulders of 3 m has its walls at 11.95 m."""
 STEP_M: Final = 3.0
 MOST_SAMPLES: Final = 500
 BULGE_M: Final = 0.3
