@@ -207,12 +207,12 @@ def _differences(found: dict[str, Any], driver: Mapping[str, str], plan: Plan) -
     found = LATER | found
     wanted = json.loads(json.dumps(LATER | plan.config.as_dict()))
     named = [
-        f"{name}: {_short(found.get(name))} there, {_short(value)} asked for"
+        f"{name}: {_short(found.get(name))} in its plan, now {_short(value)}"
         for name, value in wanted.items()
         if found.get(name) != value
     ]
     if plan.driver != driver:
-        named.append(f"driver: {_named(driver)} there, {_named(plan.driver)} asked for")
+        named.append(f"driver: {_named(driver)} in its plan, now {_named(plan.driver)}")
     return "; ".join(named) or "the same options, other rounds"
 
 

@@ -41,7 +41,7 @@ def replay(
     renderer reproduces. Raises UserError if a round cannot be simulated on this machine.
     """
     if count < 1:
-        raise tf.UserError(f"--replay is {count}; give how many rounds to simulate again")
+        raise tf.UserError(f"--replay is {count}; give the number of rounds to simulate again")
     entries = _spread(_recorded(folder), count)
     problems: list[str] = []
     for entry in entries:

@@ -115,7 +115,7 @@ def _rare_labels(statistics: dict[str, Any]) -> Iterator[str]:
             if share < MIN_CLASS_SHARE:
                 yield (
                     f"Class {name} has {share:.1%} of the {split} frames, less than "
-                    f"{MIN_CLASS_SHARE:.0%}: a model may learn to leave it out."
+                    f"{MIN_CLASS_SHARE:.0%}: a model may learn to ignore it."
                 )
         for name, share in statistics[split]["active"].items():
             if share < MIN_ACTIVE_SHARE:

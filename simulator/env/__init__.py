@@ -140,7 +140,8 @@ class LateralControl(gym.Env[Any, Any]):
     ) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         if not self._running:
             raise ResetNeeded(
-                "there is no episode to step in: call reset() first, and after an end"
+                "there is no episode to step in; call reset() before the first step, "
+                "and after each episode"
             )
         state = self.world.step(to_command(action, self._controls))
         ending = self._episode.ending(state)

@@ -19,7 +19,7 @@ def check_start(options: Mapping[str, Any], road: Road) -> dict[str, float]:
     """
     unknown = sorted(str(name) for name in options if name not in OPTIONS)
     if unknown:
-        raise UserError(f"reset does not know the options {unknown}; it takes {OPTIONS}")
+        raise UserError(f"reset got the unknown options {unknown}; it takes {OPTIONS}")
     start = {name: _number(name, value) for name, value in options.items() if value is not None}
     for name, bound in (("to_middle", road.edge), ("speed", MAX_START_SPEED_M_S)):
         if name in start:

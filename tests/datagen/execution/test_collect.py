@@ -92,7 +92,7 @@ def test_a_finished_dataset_is_left_alone_and_a_lost_round_made_again(collected:
 @pytest.mark.parametrize(
     ("args", "message"),
     [
-        (["--seed", "9"], "seed: 0 there, 9 asked for"),
+        (["--seed", "9"], "seed: 0 in its plan, now 9"),
         (["--tracks", "no-such-track"], "no track 'no-such-track'"),
         (["--lanes", "1,5"], "a road of 5 lanes is not supported"),
         (["--lanes", "one"], "--lanes is 'one'"),
@@ -102,7 +102,7 @@ def test_a_finished_dataset_is_left_alone_and_a_lost_round_made_again(collected:
         (["--shard", "3/2"], "--shard is '3/2'"),
         (["--split", "later"], "no split 'later'"),
         (["--split", "unseen"], "track circuit is one of those to train on"),
-        (["--jitter-camera"], "jitter_camera: False there, True asked for"),
+        (["--jitter-camera"], "jitter_camera: False in its plan, now True"),
     ],
 )
 def test_impossible_options_are_refused_with_a_one_line_error(

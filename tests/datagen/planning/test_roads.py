@@ -98,7 +98,7 @@ def test_the_hash_holds_what_was_drawn() -> None:
 
 def test_another_kind_of_roads_does_not_resume(tmp_path: Path) -> None:
     initialise_folder(tmp_path, make_plan(config(roads="varied")))
-    with pytest.raises(UserError, match="roads: varied there, paper asked for"):
+    with pytest.raises(UserError, match="roads: varied in its plan, now paper"):
         require_matching_folder(tmp_path, make_plan(config()))
 
 

@@ -284,7 +284,7 @@ def test_start_options_at_their_bounds_and_of_other_kinds() -> None:
         ({"angle": "left"}, "reset got angle = 'left'; give a number"),
         ({"to_middle": math.nan}, "give a finite number"),
         ({"s": math.inf}, "give a finite number"),
-        ({1: 2.0}, "does not know"),
+        ({1: 2.0}, "unknown options"),
     ]
     for bad, message in refused:
         with pytest.raises(UserError, match=message):
@@ -351,7 +351,7 @@ def test_a_step_without_an_episode_is_refused() -> None:
     while not env.step(steer(0.5))[2]:
         pass
     # What Gymnasium's own wrapper raises too, so that callers catch one error.
-    with pytest.raises(gym.error.ResetNeeded, match="after an end"):
+    with pytest.raises(gym.error.ResetNeeded, match="after each episode"):
         env.step(steer(0.0))
     env.reset(seed=0)
     env.step(steer(0.0))
