@@ -1,4 +1,4 @@
-"""Collecting for real: same bytes twice, resuming, what is refused."""
+"""Real collections: equal bytes in two runs, resuming, refused options."""
 
 import itertools
 import json
@@ -41,7 +41,7 @@ def test_a_collected_dataset_passes_verify_and_can_be_read(collected: Path) -> N
     assert {info.split for info in dataset.rounds} == {"train", "test"}
     frames = dataset.select("all")
     images = frames.read_batch(range(60), np.empty((60, 210, 280, 3), np.uint8))
-    # A road is in the picture: neither black nor of one colour, the sky above it lighter.
+    # The picture shows a road: it is neither black nor of one colour, and the sky is brighter.
     assert images.std(axis=(1, 2, 3)).min() > 10.0
     labels = frames.labels
     place = labels.to_middle[labels.round == 0]
