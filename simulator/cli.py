@@ -32,7 +32,7 @@ app.add_typer(tracks, name="tracks")
 def centreline(
     track: TrackName,
     out: Annotated[Path, typer.Option(help="CSV file to write.")],
-    step: Annotated[float, typer.Option(help="Metres between rows.")] = 1.0,
+    step: Annotated[float, typer.Option(help="Distance between rows, m.")] = 1.0,
     tracks_dir: TracksDir = None,
 ) -> None:
     """Write a track's centre line as CSV: s, x, y, z, ang, curv (m, rad, 1/m)."""
@@ -49,30 +49,31 @@ def snapshot(
     out: Annotated[Path, typer.Option(help="PNG file to write.")],
     lanes: Lanes = 2,
     lane_width: Annotated[
-        float | None, typer.Option(help="Metres, 2.7 to 4.5; without it 4.0, or as drawn.")
+        float | None,
+        typer.Option(help="Lane width, m, 2.7 to 4.5. Default: 4.0; varied roads draw it."),
     ] = None,
     roads: Annotated[
-        str, typer.Option(help="paper, or varied: lanes, paint and look are drawn from the seed.")
+        str, typer.Option(help="paper, or varied: lanes, paint and look are drawn from --seed.")
     ] = "paper",
-    seed: Annotated[int, typer.Option(help="Fixes scenery, light and places.", min=0)] = 0,
+    seed: Annotated[int, typer.Option(help="Seed of scenery, light and places.", min=0)] = 0,
     traffic: Traffic = 3,
     light: Annotated[
-        str | None, typer.Option(help="One kind of light (e.g. rain); without it, all in turn.")
+        str | None, typer.Option(help="Kind of light, such as rain. Default: all, in turn.")
     ] = None,
     view: Annotated[
         str | None,
-        typer.Option(help="front, left, right, rear, chase or top; without it, mostly front."),
+        typer.Option(help="front, left, right, rear, chase or top. Default: mostly front."),
     ] = None,
-    kind: Annotated[str, typer.Option(help="What to show: colour, depth or class.")] = "colour",
+    kind: Annotated[str, typer.Option(help="Kind of image: colour, depth or class.")] = "colour",
     camera: Annotated[
         Path | None,
         typer.Option(
-            help="camera.yaml (ours, OpenCV's, ROS's or Kalibr's): views through that lens."
+            help="Camera file of driverview, OpenCV, ROS or Kalibr: render through its lens."
         ),
     ] = None,
     tracks_dir: TracksDir = None,
 ) -> None:
-    """Write a contact sheet of views, the true markings drawn over them; or depth or classes."""
+    """Write a contact sheet of views with the true markings drawn on them, or depth or classes."""
     from runtime.camera_file import read_camera
     from simulator.camera.snapshot import write_contact_sheet
     from simulator.track.catalogue import find_track

@@ -37,15 +37,15 @@ Out = Annotated[
         f"Default: {DATASET_FOLDER}, or {UNSEEN_FOLDER} with --split unseen."
     ),
 ]
-Seed = Annotated[int, typer.Option(help="Seed of everything random.")]
-Workers = Annotated[int, typer.Option(help="Recording processes; 0: one for each core.")]
+Seed = Annotated[int, typer.Option(help="Seed of all random choices.")]
+Workers = Annotated[int, typer.Option(help="Recording processes; 0: one per core.")]
 Tracks = Annotated[
     str,
     typer.Option(
-        help="Track names or files, separated by commas; empty: all but the held-out ones."
+        help="Names or files of tracks, separated by commas; empty: all but the held-out tracks."
     ),
 ]
-Lanes = Annotated[str, typer.Option(help="Lane counts, separated by commas.")]
+Lanes = Annotated[str, typer.Option(help="Numbers of lanes, separated by commas.")]
 Lights = Annotated[
     str,
     typer.Option(
@@ -56,22 +56,20 @@ Lights = Annotated[
 Stretch = Annotated[
     int,
     typer.Option(
-        help="Frames after which scenery, light and weather change; 0: a round is a film. "
-        "Training sets: 1."
+        help="Frames after which scenery, light and weather change; 0: never, a round is a film. "
+        "Use 1 for training sets."
     ),
 ]
 Scenes = Annotated[
     int,
-    typer.Option(
-        help="Sceneries a round that --stretch cycles through; 0: one for every 200 frames."
-    ),
+    typer.Option(help="Sceneries that --stretch cycles through in a round; 0: one per 200 frames."),
 ]
-TracksDir = Annotated[Path | None, typer.Option(help="Folder of TORCS tracks.")]
-TestShare = Annotated[float, typer.Option(help="Share of rounds for testing.")]
+TracksDir = Annotated[Path | None, typer.Option(help="A further folder to search for tracks.")]
+TestShare = Annotated[float, typer.Option(help="Share of the rounds held out for testing.")]
 SplitName = Annotated[
-    str, typer.Option(help="unseen: rounds on the tracks held out of training plans.")
+    str, typer.Option(help="unseen: record the tracks that are held out of training plans.")
 ]
-Codec = Annotated[str, typer.Option(help="jpeg (quality 95) or png (lossless).")]
+Codec = Annotated[str, typer.Option(help="Image codec: jpeg (quality 95) or png (lossless).")]
 JitterCamera = Annotated[
     bool,
     typer.Option(
@@ -89,22 +87,22 @@ CameraFile = Annotated[
     Path | None,
     typer.Option(
         "--camera",
-        help="camera.yaml (ours, OpenCV's, ROS's or Kalibr's): record through that lens and mount.",
+        help="Camera file of driverview, OpenCV, ROS or Kalibr: record with its lens and mount.",
     ),
 ]
 Prefix = Annotated[
     str,
     typer.Option(
-        help="First part of the rounds' names; give each of several collections its own, and "
-        "another seed, to merge them."
+        help="First part of the rounds' names. Collections can be merged if each has its own "
+        "prefix and seed."
     ),
 ]
 ShardOf = Annotated[
-    str, typer.Option(help="2/4: only the second of four parts, for batch systems.")
+    str, typer.Option(help="Part of the plan, for batch systems: 2/4 is the second of four.")
 ]
 ExecutorName = Annotated[
     str,
-    typer.Option(help="local, or ray: on the cluster at $RAY_ADDRESS, else on this machine."),
+    typer.Option(help="local, or ray: the cluster at $RAY_ADDRESS, or one on this machine."),
 ]
 DryRun = Annotated[bool, typer.Option("--dry-run", help="Print the plan; record nothing.")]
 
@@ -134,7 +132,7 @@ def collect(
     dry_run: DryRun = False,
     as_json: AsJson = False,
 ) -> None:
-    """Record rounds with the scripted driver; the same command again continues them."""
+    """Record rounds with the scripted driver; the same command continues an interrupted dataset."""
     from datagen.planning.class_balance import TrackForecast
     from datagen.planning.plan import Shard
     from datagen.planning.planner import make_plan
@@ -174,7 +172,7 @@ def collect(
 
 
 def print_recorded(result: "CollectResult", as_json: bool) -> None:
-    """What was recorded, as a line or as JSON."""
+    """Print the result of a collection as a line or as JSON."""
     line = (
         f"{result.out}: {counted(result.rounds, 'round')}, "
         f"{counted(result.frames, 'frame')}; recorded "

@@ -20,7 +20,7 @@ DatasetFolder = Annotated[Path, typer.Argument(metavar="DIR", help="A dataset fo
 
 
 def info(folder: DatasetFolder = DATASET_FOLDER, as_json: AsJson = False) -> None:
-    """Count the contents of a dataset, and the error of always predicting the mean."""
+    """Count the contents of a dataset, and the error of a model that always predicts the mean."""
     from datagen.recording.dataset import Dataset
     from datagen.recording.statistics import describe
 
@@ -72,7 +72,7 @@ def export(
     shard_size: Annotated[int, typer.Option(help="webdataset: frames per shard.")] = 1000,
     shuffle: Annotated[
         bool,
-        typer.Option("--shuffle", help="webdataset: fixed random order instead of order of time."),
+        typer.Option("--shuffle", help="webdataset: a fixed random order, not the order of time."),
     ] = False,
     as_json: AsJson = False,
 ) -> None:

@@ -20,15 +20,15 @@ if TYPE_CHECKING:
 
 Level = Annotated[
     str,
-    typer.Option(help="quick: ends and counts. full: every byte. deep: every image and label."),
+    typer.Option(help="quick: file ends, counts. full: every byte. deep: every image and label."),
 ]
 Replay = Annotated[
-    int, typer.Option(help="Also simulate this many rounds again: labels must be bit-equal.")
+    int, typer.Option(help="Simulate this many rounds again: their labels must be bit-equal.")
 ]
 Pixels = Annotated[
-    bool, typer.Option("--pixels", help="With --replay: images too, on the same renderer.")
+    bool, typer.Option("--pixels", help="With --replay: compare images too, on the same renderer.")
 ]
-TracksDir = Annotated[Path | None, typer.Option(help="With --replay: folder of TORCS tracks.")]
+TracksDir = Annotated[Path | None, typer.Option(help="With --replay: a further folder of tracks.")]
 
 
 def verify(
@@ -80,7 +80,7 @@ def recover(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="A damaged round.")],
     out: Annotated[
         Path | None,
-        typer.Option(help="The new file. Default: beside FILE; DIR/recovered for DIR/rounds."),
+        typer.Option(help="File to write. Default: beside FILE; DIR/recovered for DIR/rounds."),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -98,7 +98,7 @@ def split(
     name: Annotated[str, typer.Option(help="Name of the split: splits/NAME.json.")] = "default",
     by: Annotated[
         str,
-        typer.Option(help="Create the split: by round, or by track (tests whole tracks)."),
+        typer.Option(help="Create the split by round, or by track (tests whole tracks)."),
     ] = "",
     test_share: Annotated[
         float, typer.Option(help="With --by: share of rounds for testing.")
@@ -108,13 +108,16 @@ def split(
         bool, typer.Option("--with-recovered", help="With --by: include recovered rounds.")
     ] = False,
     near: Annotated[
-        str, typer.Option(help="Limits for near twins: m along the road, m across it, deg of yaw.")
+        str,
+        typer.Option(
+            help="Tolerances of near-duplicates: m along and across the road, deg of yaw."
+        ),
     ] = "0.5,0.1,0.5",
     as_json: AsJson = False,
 ) -> None:
     """Check a split, or create one with --by: no round, seed or content may be on two sides.
 
-    Counts the frames that have a near twin in train: same road and light, similar position, offset
+    Counts the frames with a near-duplicate in train: same road and light, similar position, offset
     and yaw. A split that leaks is refused; an existing split is not overwritten.
     """
     from datagen.recording.split_report import SplitConfig, check_split, format_report, make_split

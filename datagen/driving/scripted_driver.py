@@ -17,7 +17,7 @@ from simulator.vehicle.state import CarState, Command
 
 NATURAL_FREQUENCY = 2.2  # rad/s of the lateral motion
 DAMPING = 0.85
-MAX_LATERAL_SPEED = 2.4  # m/s: of the point that is steered for
+MAX_LATERAL_SPEED = 2.4  # m/s, of the target point
 MAX_PATH_ANGLE = 0.16  # rad to the road
 LANE_CHANGE_SPEED = 1.4  # m/s sideways, at most
 LANE_CHANGE_RESPONSE = 1.0  # 1/s
@@ -27,7 +27,7 @@ SLOWER_BY = 1.5  # m/s: a leader this much slower is overtaken
 
 
 class SteeringLaw(Protocol):
-    """What turns the driver's path into steering; `LateralLaw` by default."""
+    """Converts the driver's path into steering; `LateralLaw` is the default."""
 
     def road_curvature(self, state: CarState) -> float:
         """Curvature (1/m) of the car's path along the road just ahead."""
@@ -40,12 +40,12 @@ class SteeringLaw(Protocol):
         ...
 
     def restart(self) -> None:
-        """The car was put back onto the road: forget what was before."""
+        """Forget the past: the car was put back onto the road."""
         ...
 
 
 class _ScriptedLaw(LateralLaw):
-    """The law by default. It has no state, so that a restart changes nothing."""
+    """The default law. It has no state, so a restart changes nothing."""
 
     def restart(self) -> None:
         """Do nothing."""
@@ -64,7 +64,7 @@ class ScriptedDriver:
         *,
         law: SteeringLaw | None = None,
     ) -> None:
-        """`speed` in m/s, where road and traffic allow it. `law` steers in place of the usual."""
+        """`speed` in m/s, where road and traffic allow it. `law` replaces the default law."""
         car = car or CarParameters()
         self._road = road
         self._course = course
@@ -91,17 +91,17 @@ class ScriptedDriver:
         return self._course.at(driven_m)[0]
 
     def speed_at(self, s: float) -> float:
-        """Target speed (m/s) at `s`."""
+        """Target speed (m/s) at `s` (m)."""
         return self._profile.at(s)
 
     @property
     def target_offset(self) -> float:
-        """Offset (m) that the last command steered for."""
+        """Target offset (m) of the last command."""
         return self._steered_for or 0.0
 
     def command(self, state: CarState, traffic: Traffic, driven_m: float) -> Command:
-        """The command for one control step; `driven_m` is counted from the start of the round,
-        over resets too."""
+        """The command for one control step; `driven_m` counts from the start of the round and
+        continues after resets."""
         if traffic.count:
             self._choose_lane(state, traffic, driven_m)
         shift_speed = self._step_shift()
@@ -121,7 +121,7 @@ class ScriptedDriver:
         return self._law.steer(state, target, curvature, atan(slope))
 
     def _limit_lateral_speed(self, wanted: float, to_middle: float) -> float:
-        """`wanted`, approached at `MAX_LATERAL_SPEED` at most from the last target."""
+        """`wanted` (m), approached from the last target at `MAX_LATERAL_SPEED` at most."""
         before = to_middle if self._steered_for is None else self._steered_for
         most = MAX_LATERAL_SPEED * self._dt
         self._steered_for = min(max(wanted, before - most), before + most)
@@ -151,14 +151,14 @@ class ScriptedDriver:
                 return
 
     def _step_shift(self) -> float:
-        """Advance the lane change by one step; its lateral speed (m/s)."""
+        """Advance the lane change by one step; returns its lateral speed (m/s)."""
         speed = LANE_CHANGE_RESPONSE * (self._shift_target - self._shift)
         speed = min(max(speed, -LANE_CHANGE_SPEED), LANE_CHANGE_SPEED)
         self._shift += speed * self._dt
         return speed
 
     def _avoid_cars(self, wanted: float, state: CarState, traffic: Traffic) -> tuple[float, bool]:
-        """`wanted` (m) kept on the road and clear of cars alongside; False if it was changed."""
+        """`wanted` (m) kept on the road and clear of cars alongside, and if it is unchanged."""
         low, high = -self._max_offset, self._max_offset
         length = self._road.track.length_m
         near = 0.5 * (TRAFFIC_CAR_SIZE[0] + EGO_CAR_SIZE[0]) + 2.0 + 0.4 * max(state.speed, 0.0)

@@ -1,7 +1,7 @@
 """The lateral course of a round: an offset for each metre driven, in m, left positive.
 
 The data must cover the whole width of the road and all small angles to it. Each kind of trajectory
-covers them in another way, and a slow random wobble is added to all.
+covers them differently; a slow random wobble is added to every kind.
 """
 
 from collections.abc import Callable
@@ -17,7 +17,7 @@ FloatArray = NDArray[np.float64]
 
 TRAJECTORIES = ("lane", "offsets", "weave", "lane-changes", "yaw-recoveries", "offset-recoveries")
 OUTSIDE_M = 1.0
-"""Farthest that a course leads outside of an outer marking."""
+"""Largest distance of a course outside an outer marking."""
 BODY_HALF_WIDTH_M = 0.97
 WALL_CLEARANCE_M = 0.75
 EDGE_CLEARANCE_M = 0.7
@@ -95,7 +95,7 @@ def _offsets(road: Road, count: int, rng: np.random.Generator) -> tuple[FloatArr
 
 
 def _weave(road: Road, count: int, rng: np.random.Generator) -> tuple[FloatArray, float]:
-    """Sine waves within a lane or over the width of the road; the wider, the longer."""
+    """Sine waves within a lane or over the width of the road; wide waves are long."""
     half = road.lanes * road.lane_width / 2
     if rng.uniform() < 0.5:
         middle = tf.lane_centre(int(rng.integers(road.lanes)), road.lanes, road.lane_width)
@@ -173,7 +173,7 @@ def _steps(
     next_offset: Callable[[], float],
     rng: np.random.Generator,
 ) -> FloatArray:
-    """Piecewise constant offsets, for lengths drawn from `apart_m`; to be smoothed."""
+    """Piecewise constant offsets with lengths drawn from `apart_m`, to be smoothed."""
     offset = np.empty(count)
     at = 0
     while at < count:
@@ -184,7 +184,7 @@ def _steps(
 
 
 def _wobble(count: int, rng: np.random.Generator) -> FloatArray:
-    """Slow random drift of the offset, m, as of an inattentive driver."""
+    """Slow random drift of the offset, m, like that of an inattentive driver."""
     noise = _noise(count, 9.0, rng)
     return noise * (WOBBLE_ANGLE_RAD / max(float(np.gradient(noise).std()), 1e-9))
 

@@ -43,13 +43,13 @@ PLAN_FILE = "plan.json"
 
 
 class Executor(Protocol):
-    """Records rounds, see `ProcessPool.run`."""
+    """Records rounds; see `ProcessPool.run`."""
 
     def run(self, jobs: Iterable[Job]) -> list[Failure]: ...
 
 
 def make_pool(executor: str, workers: int, on_message: OnMessage) -> Executor:
-    """Processes on this machine, or actors on a Ray cluster. Raises UserError for others."""
+    """Processes on this machine, or actors on a Ray cluster. Raises UserError for other names."""
     if workers < 0:
         raise tf.UserError(f"{workers} workers asked for; give 1 or more, or 0 for all cores")
     if executor not in EXECUTORS:
@@ -74,10 +74,10 @@ def collect(
 ) -> CollectResult:
     """Record the missing rounds of the plan, or of its part `shard`, into `folder`.
 
-    `make_law` makes what steers in place of the scripted driver; the plan's `driver` names it.
+    `make_law` makes a law in place of the scripted driver's; the plan's `driver` names it.
 
-    Raises DatasetError when the folder has other contents or rounds failed, and UserError or
-    OSError of the recording. In all cases finished rounds stay and unfinished ones are removed.
+    Raises DatasetError when the folder has other contents or rounds failed, and the recording's
+    UserError or OSError. In all cases finished rounds stay and unfinished ones are removed.
     """
     started = time.perf_counter()
     rounds = plan.rounds if shard is None else shard.select(plan.rounds)
@@ -106,9 +106,9 @@ def collect(
 
 
 def _write_derived_files(folder: Path, plan: Plan, shard: Shard | None) -> str | None:
-    """Write manifest, split, statistics and card of the finished rounds; the dataset's hash.
+    """Write manifest, split, statistics, card of the finished rounds; returns the dataset's hash.
 
-    With shards only the last one to end does this, as it finds all rounds finished; others: None.
+    With shards, only the last shard to end does this, since all rounds exist then; others: None.
     """
     with setup_lock(folder):
         finished = read_states(folder).keys() & {entry.id for entry in plan.rounds}
@@ -197,22 +197,22 @@ def require_matching_folder(folder: Path, plan: Plan) -> None:
 
 
 def foreign_files(folder: Path, plan: Plan) -> list[Path]:
-    """Files in rounds/ that are not of the plan: they would be read as rounds."""
+    """Files in rounds/ that do not belong to the plan; readers would read them as rounds."""
     names = {f"{entry.id}.mcap" for entry in plan.rounds}
     return [path for path in sorted(folder.glob("rounds/*.mcap")) if path.name not in names]
 
 
 def _differences(found: dict[str, Any], driver: Mapping[str, str], plan: Plan) -> str:
-    """The options that differ, as text."""
+    """Text that lists the options that differ."""
     found = LATER | found
     wanted = json.loads(json.dumps(LATER | plan.config.as_dict()))
     named = [
-        f"{name}: {_short(found.get(name))} there, {_short(value)} asked for"
+        f"{name}: {_short(found.get(name))} in its plan, now {_short(value)}"
         for name, value in wanted.items()
         if found.get(name) != value
     ]
     if plan.driver != driver:
-        named.append(f"driver: {_named(driver)} there, {_named(plan.driver)} asked for")
+        named.append(f"driver: {_named(driver)} in its plan, now {_named(plan.driver)}")
     return "; ".join(named) or "the same options, other rounds"
 
 
@@ -228,7 +228,7 @@ def _short(value: Any) -> str:
 
 def initialise_folder(folder: Path, plan: Plan) -> None:
     """Write plan and split and create the subfolders."""
-    # The plan first: with it, the same command can continue whatever fails next.
+    # The plan is written first: with it, the same command can continue after any later failure.
     write_if_changed(folder / PLAN_FILE, json.dumps(plan.as_json(), indent=1) + "\n")
     prepare(folder)
     write_split(split_path(folder), split_of(plan, {entry.id for entry in plan.rounds}))

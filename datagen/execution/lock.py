@@ -44,14 +44,14 @@ def folder_lock(folder: Path, shard: Shard | None) -> Iterator[None]:
 
 @contextmanager
 def setup_lock(folder: Path) -> Iterator[None]:
-    """Lock for the files that all shards write: one collector at a time; waits for the others."""
+    """Lock the files that all shards write; waits while another collector holds the lock."""
     with _open(folder, SETUP_LOCK) as descriptor:
         fcntl.flock(descriptor, fcntl.LOCK_EX)
         yield
 
 
 def _require_same_count(folder: Path, shard: Shard) -> None:
-    """Raise DatasetError while shards of another count run: they would record the same rounds."""
+    """Raise DatasetError while shards of another count run: both would record the same rounds."""
     for path in sorted((folder / LOCKS).glob("shard-*-of-*")):
         if path.name.endswith(f"-of-{shard.count}"):
             continue

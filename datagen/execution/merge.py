@@ -89,7 +89,7 @@ def merge(folders: Sequence[Path], out: Path) -> MergeResult:
 def _copy_rounds(
     found: Mapping[str, tuple[Path, RoundState]], round_ids: Sequence[str], out: Path
 ) -> None:
-    """Copy these rounds. Until the split knows them, no reader takes the dataset."""
+    """Copy these rounds. Readers refuse the dataset until its split lists them."""
     if round_ids:
         begin_merge(out)
     for round_id in round_ids:
@@ -97,7 +97,7 @@ def _copy_rounds(
 
 
 def _derive(out: Path, planned: Mapping[str, str]) -> tuple[dict[str, RoundState], dict[str, Any]]:
-    """Write split, statistics, card and manifest of the finished rounds: these, and statistics."""
+    """Write split, statistics, card and manifest; returns finished rounds and statistics."""
     states = {i: state for i, state in read_states(out).items() if i in planned}
     if not states:
         end_merge(out)
@@ -122,7 +122,7 @@ def _read_plan(folder: Path) -> dict[str, Any]:
 
 
 def _merge_plans(plans: Sequence[dict[str, Any]], folders: Sequence[Path]) -> dict[str, Any]:
-    """The plan of shards; or one of all rounds, where plans share no name and no seed of a round.
+    """The common plan of shards, or a plan of all rounds if no two share a name or a seed.
 
     With a shared seed, the same road in the same scenery could be in training and in test.
     """
@@ -166,7 +166,7 @@ def _copy_round(folder: Path, state: RoundState, out: Path) -> None:
         publish(out, partial, state)
     except BaseException:
         if not partial.exists() and state.id not in read_states(out):
-            round_path(out, state.id).unlink(missing_ok=True)  # moved, but without its state
+            round_path(out, state.id).unlink(missing_ok=True)  # it was moved, its state is missing
         raise
     finally:
         discard_partial(out, state.id)

@@ -85,7 +85,7 @@ class ProcessPool:
         return bool(self._queue) or any(worker.job is not None for worker in self._workers)
 
     def _receive(self) -> None:
-        """Handle messages; wait for one until the next deadline or attempt."""
+        """Handle messages; wait for a message until the next deadline or attempt."""
         idle = any(worker.job is None for worker in self._workers)
         due = min(worker.deadline(self._timeouts) for worker in self._workers)
         due = min(due, self._queue.next_at() if idle else due)
@@ -129,7 +129,7 @@ class ProcessPool:
         self._workers[number] = self._start_worker()
 
     def _stop_workers(self) -> None:
-        """Idle workers are asked to end, busy ones are killed."""
+        """Ask idle workers to end, and kill busy ones."""
         for worker in self._workers:
             if worker.connection.closed:
                 continue

@@ -50,7 +50,7 @@ class CollectResult:
 
 
 class CollectProgress:
-    """Counts what is done of `rounds`; `finished` are the ids of those done before."""
+    """Counts finished frames of `rounds`; `finished` are the ids of rounds from earlier runs."""
 
     def __init__(
         self, rounds: Sequence[RoundPlan], finished: Collection[str], progress: ProgressCallback
@@ -90,7 +90,7 @@ class CollectProgress:
 
 
 class FramesPerSecond(ProgressColumn):
-    """Frames per second: recent ones while running, of the whole run at the end.
+    """Frames per second: of the recent frames while running, of the whole run at the end.
 
     Frames from earlier runs (the field `begun`) do not count.
     """

@@ -109,10 +109,10 @@ class RayPool:
         return self._queue.failures
 
     def _connect(self) -> bool:
-        """Join the cluster, or start one here; False if this process is connected already."""
+        """Join the cluster, or start one here; False if this process was already connected."""
         if self._ray.is_initialized():
             return False
-        # Never a cluster that is found by chance: it may be another collection's, and end with it.
+        # Only the named cluster: one found by chance may belong to another collection.
         address = os.environ.get("RAY_ADDRESS", "local")
         cores = {"num_cpus": max(self._size, cpu_count() or 1)} if address == "local" else {}
         try:

@@ -11,7 +11,7 @@ OnMessage = Callable[[FramesDone | RoundDone], None]
 
 ATTEMPTS = 3
 DEATHS_IN_A_ROW = 12
-"""After this many ended processes without a finished round between them, the collection stops."""
+"""The collection stops after this many process deaths without a finished round between them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,15 +19,15 @@ class Timeouts:
     """Time limits in s, measured with the monotonic clock."""
 
     heartbeat_s: float = 300.0
-    """A process without a message for this long is stopped as hanging. Compiling sends none."""
+    """A process is stopped as hanging after this long without a message. Compiling sends none."""
     round_start_s: float = 600.0
     frame_s: float = 1.0
-    """A round may take `round_start_s`, and this for each frame."""
+    """A round may take `round_start_s` plus this time for each frame."""
     retry_delay_s: float = 1.0
     """Delay before the second attempt; four times as long before the third."""
 
     def deadline(self, job: Job | None, started: float, last_heartbeat: float) -> float:
-        """When a process that records `job` is to be stopped; infinite without a job."""
+        """Time at which a process that records `job` is stopped; infinite without a job."""
         if job is None:
             return float("inf")
         round_s = self.round_start_s + self.frame_s * job.plan.frames
@@ -39,7 +39,7 @@ class Failure:
     round_id: str
     reason: str
     final: bool
-    """The same round would fail again."""
+    """True if the same round would fail again."""
 
 
 class RetryQueue:
@@ -72,7 +72,7 @@ class RetryQueue:
         return min((not_before for not_before, _ in self._waiting), default=float("inf"))
 
     def record_outcome(self, job: Job, outcome: Outcome) -> None:
-        """Take the end of an attempt. Raises an error that every round would meet."""
+        """Handle the end of an attempt. Raises an error that every round would meet."""
         if isinstance(outcome, FatalError):
             raise outcome.error
         if isinstance(outcome, AttemptFailed):

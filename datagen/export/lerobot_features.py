@@ -1,7 +1,7 @@
 """Features of a LeRobot export, and their columns in its parquet files.
 
 Source: LeRobotDataset v3.0, github.com/huggingface/lerobot. Vectors are float32; an absent distance
-is NaN, as lists of its tensors hold no nulls. Units and signs are those of the recording.
+is NaN, because LeRobot's tensors hold no nulls. Units and signs are those of the recording.
 """
 
 import json

@@ -1,7 +1,7 @@
-"""Statistics by which LeRobot normalises: of each episode, and of the whole dataset.
+"""Statistics with which LeRobot normalises: of each episode, and of the whole dataset.
 
-Statistics of numbers skip absent values (zeros for a column without values). Those of images are
-from histograms of each channel over frames spread over the episode: in [0, 1], shape (3, 1, 1).
+Statistics of numbers skip absent values (zeros for a column without values). Statistics of images
+use histograms of each channel over frames spread over the episode: in [0, 1], shape (3, 1, 1).
 """
 
 from collections.abc import Mapping, Sequence
@@ -17,7 +17,7 @@ from trackfeatures.camera import CameraParameters
 QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
 LEVELS = 256
 MOST_IMAGES = 100
-"""Frames of an episode whose pixels are counted."""
+"""Largest number of frames of an episode whose pixels are counted."""
 
 Stats = dict[str, list[Any]]
 

@@ -26,7 +26,7 @@ class ExportConfig:
     shard_size: int = 1000
     """Frames of a WebDataset shard."""
     shuffle: bool = False
-    """Put WebDataset's frames in random order, the same each time."""
+    """Write WebDataset's frames in a random order that is the same each time."""
 
     def validate(self) -> None:
         """Raise UserError for options that cannot be met, before anything is read."""

@@ -12,7 +12,7 @@ Progress = Callable[[int], None]
 """Called with the number of frames written so far."""
 
 NO_SIDE = "unsplit"
-"""Name for the rounds that are in no side of the split."""
+"""Name of the side for rounds that are on no side of the split."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +33,7 @@ class Side:
 
 
 def sides(dataset: Dataset, split: str) -> list[Side]:
-    """Sides of `split` (a side or "all") with rounds. Raises DatasetError if there are none."""
+    """Sides of `split` (a side or "all") that have rounds. Raises DatasetError if none has."""
     chosen = dataset.select(split).rounds
     found = [
         Side(name or NO_SIDE, tuple(info for info in chosen if info.split == name))

@@ -29,13 +29,13 @@ FloatArray = NDArray[np.float64]
 KMH = 3.6  # km/h per m/s
 
 MIN_SHARE = 0.15
-"""No class may have a smaller share of the frames."""
+"""Least share of the frames for each class."""
 TARGET_SHARE = 0.19
-"""Forecast shares are brought to this: `MIN_SHARE` plus the error of the forecast."""
+"""Share that the forecast aims at: `MIN_SHARE` plus the error of the forecast."""
 START_CANDIDATES = 48
-"""Starts that are tried for each round, evenly around the lap."""
+"""Number of starts tried for each round, evenly around the lap."""
 MIN_GAIN = 1e-4
-"""Smallest gain in share, times the number of rounds, that moves a round."""
+"""Smallest gain in share, times the number of rounds, for which a start is changed."""
 
 
 class Forecast(Protocol):
@@ -64,7 +64,7 @@ class TrackForecast:
 
     @staticmethod
     def of(choices: tuple[TrackChoice, ...], tracks_dir: Path | None) -> "TrackForecast":
-        """Read the chosen tracks; random roads of rounds are drawn when they are forecast."""
+        """Read the chosen tracks; random roads are drawn when a round on them is forecast."""
         named = (c.name for c in choices if c.name != RANDOM)
         return TrackForecast({name: find_track(name, tracks_dir) for name in named})
 
@@ -99,7 +99,7 @@ class TrackForecast:
 
 
 def expected_speed(entry: RoundPlan) -> float:
-    """Speed on a straight, m/s: on one lane, that of the slowest car, which cannot be overtaken."""
+    """Speed on a straight, m/s; on one lane, the slowest car's, which cannot be overtaken."""
     speed = entry.speed_kmh
     if entry.lanes == 1 and entry.traffic:
         low, high = DESIRED_KMH
@@ -124,8 +124,8 @@ def expected_shares(rounds: Sequence[RoundPlan], forecast: Forecast) -> FloatArr
 
 
 def _better_starts(rounds: Sequence[RoundPlan], forecast: Forecast) -> dict[int, float]:
-    """New starts by place in `rounds`: greedily the greatest gain, until all classes are above
-    `TARGET_SHARE` or no move helps."""
+    """New starts by index in `rounds`, chosen greedily by the greatest gain until all classes reach
+    `TARGET_SHARE` or no change helps."""
     shares = np.array([forecast(entry, np.array([entry.start]))[0] for entry in rounds])
     steps = np.arange(START_CANDIDATES) / START_CANDIDATES
     starts = [(entry.start + steps) % 1.0 for entry in rounds]
@@ -144,5 +144,5 @@ def _better_starts(rounds: Sequence[RoundPlan], forecast: Forecast) -> dict[int,
 
 
 def _missing_share(shares: FloatArray) -> FloatArray:
-    """Sum over the classes of what each lacks to `TARGET_SHARE`; `shares` (..., 3)."""
+    """Sum over the classes of each one's shortfall from `TARGET_SHARE`; `shares` (..., 3)."""
     return np.asarray(np.maximum(TARGET_SHARE - shares, 0.0).sum(axis=-1))

@@ -17,7 +17,7 @@ FRAMES_PER_SCENE = 200
 """Default number of frames for each scene; building one takes as long as about 15 frames."""
 SEEDS_PER_PLAN = 1_000_000
 MAX_ROUNDS = SEEDS_PER_PLAN // 2
-"""With more rounds the seeds would overlap those of another plan."""
+"""With more rounds, the seeds would overlap with those of another plan."""
 
 
 def all_lights() -> tuple[str, ...]:
@@ -29,7 +29,7 @@ def all_lights() -> tuple[str, ...]:
 
 @dataclass(frozen=True, slots=True)
 class TrackChoice:
-    """Name of a track, and the hash of its geometry when the plan was made; or `random`, without a
+    """Name of a track and the hash of its geometry when the plan was made; or `random` without a
     hash: a random road for each round."""
 
     name: str
@@ -48,7 +48,7 @@ class CollectConfig:
     lanes: tuple[int, ...] = (1, 2, 3)
     lights: tuple[str, ...] = field(default_factory=all_lights)
     test_share: float = 0.25
-    """Share of the rounds that are for testing, 0 to below 1."""
+    """Share of the rounds held out for testing, 0 to below 1."""
     codec: str = "jpeg"
     frequency_hz: int = 20
     """Frames per second. The car is controlled at `plan.CONTROL_HZ` or faster."""
@@ -63,12 +63,12 @@ class CollectConfig:
     roads: str = "paper"
     """"paper": lanes of 4.0 m and the paint of the tracks; "varied": drawn for each round."""
     prefix: str = "round"
-    """First part of the rounds' names: collections of different ones can be merged."""
+    """First part of the rounds' names; collections with different prefixes can be merged."""
     split: str = ""
-    """"unseen": all rounds are for tests on tracks without training data. Else train and test."""
+    """"unseen": all rounds test on tracks without training data; "": train and test."""
 
     def as_dict(self) -> dict[str, Any]:
-        """The options by name; `LATER` ones only where they are not at their default."""
+        """The options by name; options in `LATER` only if they differ from their defaults."""
         options = asdict(self, dict_factory=stored)
         return {k: v for k, v in options.items() if k not in LATER or v != LATER[k]}
 
@@ -130,4 +130,4 @@ class CollectConfig:
 
 
 LATER = {"roads": CollectConfig.roads, "prefix": CollectConfig.prefix}
-"""Options that older plans do not have, with their defaults."""
+"""Options that plans of earlier versions do not have, with their defaults."""

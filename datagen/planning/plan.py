@@ -20,7 +20,7 @@ from trackfeatures.errors import UserError
 from trackfeatures.names import require_name
 
 CONTROL_HZ = 20
-"""Lowest rate of control steps."""
+"""Lowest rate of control steps, Hz."""
 
 
 def program() -> str:
@@ -29,7 +29,7 @@ def program() -> str:
 
 
 def check_entry(entry: dict[str, Any]) -> str:
-    """The id of a round in a `plan.json`; BadName if it is no name, KeyError without one."""
+    """The id of a round in a `plan.json`; raises BadName for a bad name, KeyError without one."""
     return require_name(entry["id"], "round id")
 
 
@@ -61,10 +61,10 @@ class RoundPlan:
     """The dataset's camera; `camera` may be a jittered copy of it."""
     lane_width_m: float = tf.LANE_WIDTH_M
     varied: VariedRound | None = None
-    """What the road is drawn with; None: as the paper's roads."""
+    """The drawn values of a varied road; None on the paper's roads."""
 
     def as_dict(self) -> dict[str, Any]:
-        """The entry of `plan.json`; a paper's road has none of `varied`, as in earlier versions."""
+        """The entry of `plan.json`; paper's roads have no key `varied`, as in earlier versions."""
         entry = asdict(self, dict_factory=stored)
         if self.varied is None:
             del entry["varied"]
@@ -95,7 +95,7 @@ class Plan:
     config: CollectConfig
     rounds: tuple[RoundPlan, ...]
     driver: Mapping[str, str] = field(default_factory=dict)
-    """What drives, where it is not the scripted driver: such rounds depend on it, too."""
+    """The driver, if it is not the scripted one; its rounds depend on it, so it is hashed, too."""
 
     @property
     def hash(self) -> str:

@@ -83,7 +83,7 @@ def stratified_shuffle(
 ) -> list[Value]:
     """`count` values: all of `values` in random order, then all again in another order, and so on.
 
-    The numbers of times that two values occur differ by one at most.
+    The counts of two values differ by one at most.
     """
     shuffled: list[Value] = []
     while len(shuffled) < count:
@@ -123,7 +123,7 @@ def _cameras(config: CollectConfig, rng: np.random.Generator) -> list[CameraPara
 def _roads(
     config: CollectConfig, lanes: Sequence[int], lights: Sequence[tuple[str, ...]]
 ) -> list[VariedRound | None]:
-    """What the road of each round is drawn with, from the round's own seed."""
+    """The drawn values of each round's road, from the round's seed; None on the paper's roads."""
     if config.roads == "paper":
         return [None] * config.rounds
     first, height_m = _first_seed(config), config.camera.height_above_road_m
@@ -134,7 +134,7 @@ def _roads(
 
 
 def _mounted(camera: CameraParameters, road: VariedRound | None) -> CameraParameters:
-    """The camera at the height of a varied road."""
+    """The camera at the height drawn for a varied road; unchanged on the paper's roads."""
     if road is None:
         return camera
     height = road.carriageway.camera_height_m

@@ -1,5 +1,5 @@
-"""Which rounds of a plan are held out for testing: the same share of every track, lane count,
-trajectory and light."""
+"""Chooses the rounds of a plan that are held out for testing: the same share of every track, lane
+count, trajectory and light."""
 
 from collections import Counter
 from collections.abc import Hashable, Sequence
@@ -19,7 +19,7 @@ def choose_test_rounds(
 ) -> set[int]:
     """Numbers of the rounds to test on: about `test_share` (0 to below 1) of all.
 
-    `tracks` and `lanes` have one value for each round, as has each sequence in `attributes`. The
+    `tracks`, `lanes` and each sequence in `attributes` have one value for each round. The
     rounds are spread evenly over the tracks first, then over lane counts and `attributes`; ties are
     broken by one draw of `rng` for each round.
 
@@ -55,11 +55,11 @@ def choose_test_rounds(
 
 
 class _Groups:
-    """Rounds grouped by equal value: how many there are of each, and how many are for testing."""
+    """Rounds grouped by equal value, with the numbers of rounds and test rounds in each group."""
 
     def __init__(self, values: Sequence[Hashable]) -> None:
         numbers = {value: number for number, value in enumerate(dict.fromkeys(values))}
-        self.of: IntArray = np.array([numbers[value] for value in values])  # of each round
+        self.of: IntArray = np.array([numbers[value] for value in values])  # each round's group
         self.size: IntArray = np.bincount(self.of)
         self.tested: IntArray = np.zeros_like(self.size)
 
@@ -71,7 +71,7 @@ class _Groups:
 
 
 def _best_roads(road: _Groups, track: _Groups, track_of_road: IntArray) -> NDArray[np.bool_]:
-    """Mask of the roads from which the next test round is taken, all equally good."""
+    """Mask of the roads from which the next test round is taken; all of them are equally good."""
     left = road.in_training()
     last_of_track = (track.in_training() == 1)[track_of_road]
     penalty = 2 * last_of_track + (left == 1) + 4 * (left == 0)

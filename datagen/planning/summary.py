@@ -1,4 +1,4 @@
-"""A plan as tables for the terminal: what will be recorded."""
+"""A plan as tables for the terminal."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -80,7 +80,7 @@ def _sides(plan: Plan) -> dict[str, list[RoundPlan]]:
 
 
 def _track_group(name: str) -> str:
-    """Random roads are counted together: there is one for each round."""
+    """Group of a track for counting: all random roads together, since each round has its own."""
     return RANDOM if is_random(name) else name
 
 

@@ -1,4 +1,4 @@
-"""The tracks that a collection drives on: our own and TORCS's, less those held out of training."""
+"""The tracks of a collection: the project's and TORCS's, without those held out of training."""
 
 from pathlib import Path
 
@@ -8,16 +8,16 @@ from simulator.track.random_roads.road import RANDOM
 from trackfeatures.errors import UserError
 
 HELD_OUT = ("coast", "countryside", "dirt-3", "e-track-4")
-"""Two of our own and two of TORCS: in no training plan unless they are named. The split `unseen` is
-of them."""
+"""Two tracks of the project and two of TORCS. A training plan uses them only if it names them; the
+split `unseen` consists of them."""
 
 
 def choose_tracks(
     names: tuple[str, ...], tracks_dir: Path | None, unseen: bool = False
 ) -> tuple[TrackChoice, ...]:
-    """The named tracks. Without names: our own and all of TORCS that are found, not `HELD_OUT`.
+    """The named tracks. Without names: the project's and all TORCS tracks found, not `HELD_OUT`.
 
-    With `unseen`: those of `HELD_OUT` that are found, or named ones that are not trained on.
+    With `unseen`: the tracks of `HELD_OUT` that are found, or named tracks outside training plans.
     `random` is kept as it is: each round will have a random road of its own, unseen by all others.
     Raises UnknownTrack for a name that is not found, TrackError for a bad file, UserError for a
     training track given as unseen.
@@ -38,6 +38,6 @@ def _choice(name: str, tracks_dir: Path | None) -> TrackChoice:
 
 
 def _trained_on(file: Path) -> bool:
-    """By default. A user's own TOML or CSV track is driven on only when it is named."""
+    """Whether a plan without names uses the track; a user's own tracks must be named."""
     ours = file.parent == OWN_TRACKS
     return file.stem not in HELD_OUT and (ours or file.suffix.lower() == ".xml")

@@ -44,7 +44,7 @@ class Job:
     folder: Path
     tracks_dir: Path | None
     make_law: "MakeLaw | None" = None
-    """Of what steers, in place of the scripted driver; it is sent to the recording processes."""
+    """Makes the steering law that replaces the scripted driver's; it is sent to the processes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,7 +120,7 @@ def record_and_publish(job: Job, report: Report = lambda message: None) -> Round
 
 
 def _check_recorded(partial: Path) -> tuple[RoundState, int]:
-    """State of the recorded file, and number of resets. Raises RuntimeError for a damaged one."""
+    """State of the recorded file, and number of resets. Raises RuntimeError if it is damaged."""
     index = open_round(partial)
     state = RoundState.of(partial, index.header, index.result)
     _, problems = check_round(partial, "full", state)
@@ -161,7 +161,7 @@ def worker_main(connection: Connection, parent: int) -> None:
 
 
 def exit_with_parent(parent: int) -> None:
-    """Make this process end with its collector: another one may be recording the round already."""
+    """Make this process end with its collector: another collector may record the round already."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
     if os.getppid() != parent:

@@ -39,14 +39,14 @@ MAX_RESETS = 20  # times control steps per frame: at low frame rates a round is 
 # is twice as fast without rendering in between.
 BATCH_FRAMES = 20
 CACHED_SCENES = BATCH_FRAMES  # scenes kept by the camera: none is built twice in a batch
-SCENERY_SEED_STRIDE = 2**40  # between the seeds of a round's sceneries: above all round seeds
+SCENERY_SEED_STRIDE = 2**40  # between the seeds of a round's sceneries; larger than a round seed
 
 
 Scenery = tuple[int, Light, RoadLook | None]
 """Seed of the scenery, light, and look of a varied road."""
 
 MakeLaw = Callable[[RoundPlan, World, Camera], SteeringLaw]
-"""Makes what steers in a round in place of the scripted driver's law, from the round's plan, its
+"""Makes the law that steers a round in place of the scripted driver's, from the round's plan, its
 world and the camera on the car, which shows the scenery of the current frame."""
 
 
@@ -103,7 +103,7 @@ class RoundSimulation:
 
     def _start(self, s: float, to_middle: float) -> None:
         self.state = self.world.reset(
-            seed=self.plan.seed,  # no other round's seed: it may be on the other side of the split
+            seed=self.plan.seed,  # never another round's, which may be on the other split side
             s=s,
             to_middle=to_middle,
             speed=self.driver.speed_at(s),

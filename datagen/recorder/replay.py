@@ -35,13 +35,13 @@ def replay(
     pixels: bool = False,
     on_replayed: OnReplayed = lambda name: None,
 ) -> tuple[list[str], list[str]]:
-    """Simulate up to `count` rounds, spread over the plan; their ids, and the differences found.
+    """Simulate up to `count` rounds, spread over the plan; returns their ids, and differences.
 
     Labels and states must be equal in every byte; with `pixels` images too, which only the same
     renderer reproduces. Raises UserError if a round cannot be simulated on this machine.
     """
     if count < 1:
-        raise tf.UserError(f"--replay is {count}; give how many rounds to simulate again")
+        raise tf.UserError(f"--replay is {count}; give the number of rounds to simulate again")
     entries = _spread(_recorded(folder), count)
     problems: list[str] = []
     for entry in entries:

@@ -54,7 +54,7 @@ class Frames:
         camera: CameraParameters,
         rows: NDArray[np.int64] | None = None,
     ) -> None:
-        """`rows`: numbers of the frames to use, ascending, counted over `rounds`; None: all."""
+        """`rows`: indices of the frames to use, ascending, counted over `rounds`; None: all."""
         self.rounds = list(rounds)
         self.camera = camera
         self._images = [index.messages[CAMERA] for index in indexes]
@@ -98,7 +98,7 @@ class Frames:
         return Frames(self.rounds, self._indexes, self.camera, kept)
 
     def places(self) -> NDArray[np.int64]:
-        """Where each frame lies (N, 2): number of its round in `rounds`, its own number in that."""
+        """Place of each frame (N, 2): index of its round in `rounds`, its number in that round."""
         number = np.searchsorted(self._first, self._rows, "right") - 1
         return np.column_stack([number, self._rows - np.array(self._first)[number]])
 
@@ -135,7 +135,7 @@ class Frames:
         absent = numbers[(numbers < 0) | (numbers >= len(self))]
         if len(absent):
             raise IndexError(f"frame {absent[0]} of {len(self)}")
-        # One iterator for all threads: each takes the next image when it is done with its last.
+        # One iterator for all threads: each thread takes the next image when it is free.
         rows = iter(enumerate(numbers.tolist()))
         threads = min(self._threads, len(numbers))
         parts = [self._pool.submit(self._decode, rows, out) for _ in range(threads)]

@@ -21,7 +21,7 @@ from trackfeatures.names import require_name
 
 PARTIAL = ".partial"
 LOCKS = ".locks"
-MERGING = ".merging"  # is there from the first round of a merge to its last
+MERGING = ".merging"  # exists from the first round of a merge to the last
 SUBFOLDERS = ("rounds", "state", "splits", "layouts", "proto", "schemas")
 PUBLISHED_FILES = ("proto/driverview.proto", "layouts/foxglove.json", SCHEMA_FILE)
 READ_BYTES = 1 << 20
@@ -89,12 +89,12 @@ def is_unstarted(folder: Path, first_file: str) -> bool:
 
 
 def begin_merge(folder: Path) -> None:
-    """Mark that rounds are being added, of which the split does not know yet."""
+    """Mark that rounds are being added that the split does not list yet."""
     atomic_write(folder / MERGING, "", fsync=True)
 
 
 def end_merge(folder: Path) -> None:
-    """Remove the mark: split and rounds fit."""
+    """Remove the mark: the split lists all rounds."""
     (folder / MERGING).unlink(missing_ok=True)
 
 
@@ -154,7 +154,7 @@ def discard_partial(folder: Path, round_id: str) -> None:
 
 
 def discard_partials(folder: Path, round_ids: Iterable[str]) -> None:
-    """Remove what a crash or an interruption has left of these rounds."""
+    """Remove unfinished files of these rounds, left by a crash or an interruption."""
     for round_id in round_ids:
         discard_partial(folder, round_id)
     with suppress(OSError):  # it does not exist, or other rounds are being written in it

@@ -1,7 +1,7 @@
 """The derived files of a dataset folder: manifest, split, statistics and dataset card.
 
-`manifest.json` lists the rounds with their metadata and hashes, and the hashes of other files. All
-of it can be computed again from the rounds, so that damage in it is found.
+`manifest.json` lists the rounds with their metadata and hashes, and the hashes of other files. It
+can be computed again from the rounds, so damage in it is found.
 """
 
 import json
@@ -35,7 +35,7 @@ def build_manifest(dataset: Dataset) -> dict[str, Any]:
     rounds = []
     for info, index in zip(dataset.rounds, dataset.indexes, strict=True):
         header = asdict(index.header, dict_factory=stored)
-        del header["varied"]  # some kB for each scene, in the plan and in the round's file
+        del header["varied"]  # some kB for each scene; the plan and the round's file hold it
         state = states.get(info.id)
         rounds.append(
             {
@@ -62,7 +62,7 @@ def to_json(content: dict[str, Any]) -> str:
 
 
 def manifest_problems(folder: Path) -> Iterator[str]:
-    """What is wrong with the manifest, one line each; raises as `Dataset.open` does."""
+    """The problems of the manifest, one line each; raises as `Dataset.open` does."""
     path = folder / MANIFEST
     remedy = "run the same `datagen collect` again to write it anew"
     if not path.is_file():

@@ -3,6 +3,6 @@
 CODECS = ("jpeg", "png")
 UNSEEN = "unseen"
 SIDES = ("train", "test", UNSEEN)
-"""`unseen`: rounds of tracks that no model is trained on."""
+"""Sides of a split. `unseen` holds rounds of tracks that no model is trained on."""
 DRIVEN = "driven-"
-"""Begins the ids of rounds that a controller drove on a model's answers."""
+"""Prefix of the ids of rounds that a controller drove on a model's answers."""

@@ -52,10 +52,10 @@ class RoundHeader:
     camera: CameraParameters = field(default_factory=CameraParameters)
     """The camera of this round's images; with camera jitter it differs from round to round."""
     nominal_camera: CameraParameters | None = None
-    """The camera of the dataset, where `camera` differs from it: jittered, or at the height of a
+    """The camera of the dataset, if `camera` differs from it: by jitter, or by the height of a
     varied road."""
     varied: dict[str, Any] | None = None
-    """What the round of `--roads varied` was drawn with; None: as the paper's roads."""
+    """The drawn values of a round of `--roads varied`; None on the paper's roads."""
 
     @property
     def dataset_camera(self) -> CameraParameters:
@@ -63,10 +63,10 @@ class RoundHeader:
 
     @property
     def label_camera(self) -> CameraParameters:
-        """The camera whose pictures the round's are taken for when a network is trained with them.
+        """The camera that training assumes for the round's images.
 
-        Of varied roads it stands where `camera` does: the network's metres are those beside the
-        dataset's camera, and the labels are scaled. A jittered camera is taken for the dataset's.
+        On varied roads it is `camera`: the network's metres are scaled to the dataset's camera, and
+        so are the labels. With camera jitter it is the dataset's camera.
         """
         return self.camera if self.varied is not None else self.dataset_camera
 

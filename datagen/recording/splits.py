@@ -27,7 +27,7 @@ DEFAULT_SPLIT = "default"
 
 @dataclass(frozen=True, slots=True)
 class RoundKey:
-    """What identifies a round: two rounds that share a value must not be on different sides."""
+    """Identity of a round: two rounds that share one of the values must be on the same side."""
 
     id: str
     seed: int
@@ -42,7 +42,7 @@ class Split:
     test: tuple[str, ...]
     unseen: tuple[str, ...] = ()
     recovered: tuple[str, ...] = ()
-    """Rounds on any side that were recovered from damaged files, and are used knowingly."""
+    """Rounds on any side that were recovered from damaged files and are used nevertheless."""
 
     def side(self, round_id: str) -> str:
         """The side of a round; empty if it is on none."""

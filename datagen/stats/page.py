@@ -21,7 +21,7 @@ BALANCED_BY = ("track", "lanes", "trajectory", "traffic")
 MIN_CLASS_SHARE = 0.15
 MIN_ACTIVE_SHARE = 0.02
 SHARED_BY_SPLITS = ("track", "lanes", "light", "trajectory")
-"""Properties of a round of which both splits should have the same values."""
+"""Properties of a round whose values should occur in both splits."""
 REQUIRED_SPLITS = ("train", "test")
 """Splits that every dataset needs; `unseen` is collected on request, and differs on purpose."""
 
@@ -115,7 +115,7 @@ def _rare_labels(statistics: dict[str, Any]) -> Iterator[str]:
             if share < MIN_CLASS_SHARE:
                 yield (
                     f"Class {name} has {share:.1%} of the {split} frames, less than "
-                    f"{MIN_CLASS_SHARE:.0%}: a model may learn to leave it out."
+                    f"{MIN_CLASS_SHARE:.0%}: a model may learn to ignore it."
                 )
         for name, share in statistics[split]["active"].items():
             if share < MIN_ACTIVE_SHARE:

@@ -22,7 +22,7 @@ TRAFFIC, TRACK, PLOTS = "world/traffic", "world/track", "plots"
 ABOUT, CAPTION = "about", "caption"
 GREEN, BLUE, GREY = (40, 255, 80), (51, 102, 255), (140, 140, 140)
 FROM_CORNER = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])
-"""Rerun counts pixels from the upper left corner of the image."""
+"""Shift by half a pixel: Rerun counts pixels from the upper left corner of the image."""
 SERIES = ((59, 111, 212), (224, 122, 46), (47, 158, 92), (176, 64, 154), (136, 112, 32))
 
 
@@ -170,7 +170,7 @@ def layout(contents: Contents) -> rrb.Blueprint:
 
 
 def _camera_position(contents: Contents) -> list[float]:
-    """Of the 3D view: 25 m behind the car at the start and 12 m above it."""
+    """Position of the 3D view's camera: 25 m behind the car at the start and 12 m above it."""
     pose = contents.pose(0)
     x, y, z, w = pose.quaternion.tolist()
     ahead = np.array([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 0.0])

@@ -1,4 +1,4 @@
-"""Projection of the true lane markings into an image, and drawing them. Pixels."""
+"""Projects the true lane markings into an image and draws them. Pixels."""
 
 from typing import TYPE_CHECKING, Protocol
 
@@ -75,14 +75,14 @@ def draw(
 ) -> NDArray[np.uint8]:
     """A copy of `image` (H, W, 3) with thin antialiased lines over it."""
     drawn = image.copy()
-    # cv2 takes 1/16 pixels as integers.
+    # cv2 takes integer coordinates in 1/16 pixel.
     fixed = [np.rint(line * 16.0).astype(np.int32) for line in polylines]
     cv2.polylines(drawn, fixed, False, colour, 1, cv2.LINE_AA, shift=4)
     return drawn
 
 
 def _near_picture(camera: Projector, pixels: FloatArray, depth: FloatArray) -> NDArray[np.bool_]:
-    """Which points lie in front of the camera and not far outside the image."""
+    """Mask of the points that lie in front of the camera and not far outside the image."""
     margin = 0.5 * max(camera.width, camera.height)
     u, v = pixels[:, 0], pixels[:, 1]
     return np.asarray(
@@ -93,8 +93,8 @@ def _near_picture(camera: Projector, pixels: FloatArray, depth: FloatArray) -> N
 
 
 def _runs(lines: FloatArray, good: NDArray[np.bool_]) -> list[FloatArray]:
-    """The parts (n, 2) of `lines` (L, N, 2) of at least two `good` (L, N) points in a row."""
-    # A column of False on either side keeps the lines apart and gives every run both its ends.
+    """Runs (n, 2) of at least two consecutive `good` (L, N) points of `lines` (L, N, 2)."""
+    # A column of False on either side separates the lines and gives every run a start and an end.
     padded = np.zeros((good.shape[0], good.shape[1] + 2), dtype=np.bool_)
     padded[:, 1:-1] = good
     flat = padded.ravel()

@@ -38,7 +38,7 @@ CLASS_COLOURS: dict[str, tuple[int, int, int]] = {
     "object": (232, 156, 30),
 }
 NEAREST_M, FARTHEST_M = 2.0, 500.0
-"""Depths of the first and the last colour; the scale is logarithmic."""
+"""Depths of the first and the last colour of the logarithmic scale."""
 _NO_DEPTH = (12, 12, 16)
 
 
@@ -67,14 +67,14 @@ def write_contact_sheet(
 ) -> None:
     """Write a PNG of views at places all round `road`.
 
-    All pictures are of `view`, or without it driver views, one chase and one top view; in the light
-    of kind `light`, or without it in each kind by turns, every other one clear. Of `kind` "colour"
-    the right half has the true markings drawn thinly over the painted ones; "depth" and "class" are
-    in false colours. `camera`: seen through that lens, scaled to WIDTH; without it as the driver
-    camera, on a varied road at the height that was drawn for it. On a varied road each light has a
-    look of its own. An older file stays as it is until the new one is complete. Raises UserError if
-    the file cannot be written as PNG or has no folder, or light, view or kind is unknown; OSError
-    if it cannot be written.
+    All pictures show `view`; without it, driver views, one chase view and one top view. All are in
+    the light of kind `light`; without it, every other picture is in clear light and the rest cycle
+    through the other kinds. With `kind` "colour" the right half has the true markings drawn thinly
+    over the painted ones; "depth" and "class" are in false colours. `camera` is the lens, scaled to
+    WIDTH; without it, the driver camera, on a varied road at the height drawn for that road. On a
+    varied road each light has a look of its own. An older file is kept until the new one is
+    complete. Raises UserError if the file is not a PNG, its folder does not exist, or light, view
+    or kind is unknown; OSError if it cannot be written.
     """
     if out.suffix.lower() != ".png":
         raise UserError(f"{out}: the contact sheet is a PNG file; give a name that ends in .png")
@@ -105,8 +105,8 @@ def write_contact_sheet(
 
 
 def _lens(road: Road, camera: CameraParameters | None) -> CameraParameters:
-    """The camera of a sheet: `camera` scaled to WIDTH, or the driver camera, on a varied road at
-    its height."""
+    """The camera of a sheet: `camera` scaled to WIDTH, or else the driver camera, on a varied road
+    at the height drawn for that road."""
     if camera is not None:
         return camera.resized(WIDTH, round(WIDTH * camera.height / camera.width))
     lens = CameraParameters(WIDTH, HEIGHT)
@@ -189,7 +189,7 @@ def _shots(road: Road, light: str | None, rng: np.random.Generator) -> list[Shot
         view = "chase" if k == DRIVER_VIEWS else "top" if k == DRIVER_VIEWS + 1 else "front"
         offset = float(rng.uniform(-reach, reach))
         angle = float(rng.normal(0.0, 0.06)) if view == "front" else 0.0
-        # Every other picture in clear light, the others in each of the rest in turn.
+        # Every other picture is in clear light; the rest cycle through the other kinds.
         turn = "clear" if k % 2 == 0 else KINDS[1 + (k // 2) % (len(KINDS) - 1)]
         shots.append(Shot(float(s), offset, angle, view, light or turn))
     return shots
@@ -208,8 +208,8 @@ def _cars_ahead(road: Road, shot: Shot, count: int, rng: np.random.Generator) ->
 
 
 def colourise(picture: NDArray[np.generic], kind: str) -> Picture:
-    """`picture` of `kind` "depth" (red near, blue far, black the sky) or "class" (the palette
-    CLASS_COLOURS) in colours; one of "colour" as it is."""
+    """`picture` of `kind` "depth" (red near, blue far, black sky) or "class" (CLASS_COLOURS) in
+    false colours; a picture of kind "colour" is returned unchanged."""
     if kind == DEPTH:
         return _depth_colours(np.asarray(picture, dtype=np.float64))
     if kind == CLASS:

@@ -19,7 +19,7 @@ DAMPING: Final = 0.9
 
 
 class Cruise:
-    """Drives on `road` at up to `speed_kmh`, in the lane where it takes over."""
+    """Drives on `road` at up to `speed_kmh`, in the lane nearest to the car when it takes over."""
 
     def __init__(
         self,

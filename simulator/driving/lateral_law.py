@@ -14,13 +14,13 @@ from simulator.vehicle.surface import SURFACES
 
 YAW_RATE_GAIN: Final = 0.08  # s
 MIN_SPEED: Final = 5.0  # m/s: below it, the gains would grow without bound
-PREVIEW_S: Final = 0.12  # about the delay by steering rate and control step
-MAX_OFFSET_ERROR: Final = 1.5  # m: a larger error is corrected no harder
+PREVIEW_S: Final = 0.12  # about the delay of the steering rate and the control step together
+MAX_OFFSET_ERROR: Final = 1.5  # m: larger errors are clipped to it
 MIN_RADIUS_FACTOR: Final = 0.3  # bounds the curvature inside of tight bends
 
 
 class LateralLaw:
-    """Steering commands for one car on one road; without state."""
+    """Stateless law that computes the steering commands for one car on one road."""
 
     def __init__(
         self, car: CarParameters, road: Road, *, natural_frequency: float, damping: float

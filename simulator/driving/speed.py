@@ -39,7 +39,7 @@ class SpeedProfile:
 
 
 def speed_profile(track: Track, desired: float, innermost_y: float) -> SpeedProfile:
-    """At most `desired` (m/s); bends are taken up to `innermost_y` (m) inside the centre line."""
+    """Limits up to `desired` (m/s); bends are driven up to `innermost_y` (m) inside the centre."""
     bends = bend_profile(track, innermost_y)
     return SpeedProfile(np.minimum(bends.limit, desired), bends.cell_m)
 
@@ -51,7 +51,7 @@ def bend_profile(track: Track, innermost_y: float) -> SpeedProfile:
     bend = np.abs(track.at((np.arange(cells) + 0.5) * cell).curvature)
     bend = bend / np.maximum(1.0 - bend * innermost_y, 0.3)
     squared = np.tile(LATERAL_ACCELERATION / np.maximum(bend, 1e-6), 2)
-    # v^2 may fall by 2 * BRAKING a metre; the bend ahead that allows least decides. Two laps,
+    # v^2 can fall by 2 * BRAKING per metre; the most restrictive bend ahead decides. Two laps,
     # because the end of a lap brakes for the bends at its start.
     drop = 2.0 * BRAKING * cell * np.arange(2 * cells)
     allowed = np.minimum.accumulate((squared + drop)[::-1])[::-1] - drop
@@ -104,7 +104,7 @@ class Pedals:
         return self._car.gears[gear - 1] * self._car.final_drive
 
     def _engine_braking(self, speed: float, gear: int) -> float:
-        """Share of the full-load torque that a closed throttle takes."""
+        """Engine braking torque at a closed throttle, as a share of the full-load torque."""
         car = self._car
         above = max(self._rpm(speed, gear) - car.idle_rpm, 0.0)
         return car.engine_braking * above / (car.top_rpm - car.idle_rpm)
@@ -141,7 +141,7 @@ class TargetSpeed:
         if leader is not None:
             follow = float(idm_acceleration(leader[0], speed, leader[1], max(target, 1.0)))
         acceleration = target_acceleration(speed, target, follow)
-        # The trim is for a free road: behind a car, the target speed is not reached on purpose.
+        # The integral is for a free road: behind a car, the target speed is not reached on purpose.
         self.following = follow <= acceleration
         error = 0.0 if self.following else target - speed
         error = error if abs(error) < BRAKING else 0.0

@@ -6,7 +6,7 @@
     gymnasium.make("driverview/LateralControl-v0", track="circuit", lanes=1, frequency_hz=20)
     gymnasium.make("driverview/DriverView-v0", track="forza", views=("front", "rear"))
 
-or, without the second line, by Gymnasium's own syntax for names that a module registers:
+or, without the second import, by Gymnasium's own syntax for names that a module registers:
 
     gymnasium.make("simulator.env:driverview/LateralControl-v0")
 
@@ -46,7 +46,7 @@ class ResetNeeded(UserError, gym.error.ResetNeeded):
 
 
 class NotCopyable(UserError, TypeError):
-    """An environment was to be copied or pickled."""
+    """An environment cannot be copied or pickled."""
 
 
 @dataclass(frozen=True)
@@ -56,9 +56,10 @@ class DriveOptions:
     track: str = "circuit"
     lanes: int = 1
     lane_width: float | None = None
-    """Metres; None: 4.0, or as drawn on varied roads."""
+    """m; None: 4.0, or the width drawn for a varied road."""
     roads: str = "paper"
-    """"varied": lane width, shoulders, lines and look are drawn, from `road_seed`."""
+    """"varied": lane width, shoulders and lines are drawn from `road_seed`, the look from
+    `light_seed`."""
     road_seed: int = 0
     traffic: int = 0
     """Other cars, 0 to 12."""
@@ -71,7 +72,7 @@ class DriveOptions:
     gear."""
 
     tracks_dir: str | Path | None = None
-    """A folder to search for tracks as well."""
+    """A further folder to search for tracks."""
 
     def __post_init__(self) -> None:
         check_controls(self.controls)
@@ -139,7 +140,8 @@ class LateralControl(gym.Env[Any, Any]):
     ) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         if not self._running:
             raise ResetNeeded(
-                "there is no episode to step in: call reset() first, and after an end"
+                "there is no episode to step in; call reset() before the first step, "
+                "and after each episode"
             )
         state = self.world.step(to_command(action, self._controls))
         ending = self._episode.ending(state)
@@ -157,7 +159,7 @@ class LateralControl(gym.Env[Any, Any]):
         return self._renderer.render(self.world, (self._render_view,))[self._render_view]
 
     def calibration(self) -> dict[str, NDArray[np.float64]]:
-        """`intrinsics` (3, 3) in pixels, and by each view's name its `Camera.extrinsics` (4, 4)."""
+        """`intrinsics` (3, 3) in pixels, and each view's `Camera.extrinsics` (4, 4) by its name."""
         return self._renderer.calibration(self._observer.views or (self._render_view,))
 
     def close(self) -> None:

@@ -13,7 +13,7 @@ from trackfeatures.errors import UserError
 Controls = Literal["steer", "full"]
 
 THROTTLE, GEAR = 0.2, 1
-"""Held constant while only the steering is controlled, as in the paper."""
+"""Throttle and gear that are held while only the steering is controlled, as in the paper."""
 
 LIMITS = {
     "steer": (-1.0, 1.0),
@@ -37,12 +37,12 @@ def action_space(controls: Controls) -> gym.spaces.Box:
 
 
 def to_command(action: Any, controls: Controls) -> Command:
-    """The command for `action`; the gear is rounded. Values beyond their bounds by the rounding of
-    float32 are clipped. Raises UserError for what lies further outside the action space."""
+    """The command for `action`; the gear is rounded. Values that exceed their bounds by the
+    rounding of float32 are clipped. Raises UserError for values further outside the space."""
     names = NAMES[controls]
     try:
         values = np.asarray(action, dtype=np.float64)
-    except (TypeError, ValueError, RuntimeError) as error:  # RuntimeError: of torch
+    except (TypeError, ValueError, RuntimeError) as error:  # torch raises RuntimeError
         raise UserError(f"the action {action!r} is no array of numbers: {error}") from error
     if values.shape != (len(names),):
         raise UserError(

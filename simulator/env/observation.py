@@ -24,7 +24,7 @@ STATE_SIZE = 7
 SPEED_SCALE = 75.0 / 3.6  # m/s
 PAPER_STATE_NOISE = 0.05
 STATE_LIMIT = 10.0
-"""Bound of the observation space: ten half widths, 750 km/h; beyond what a drive can reach."""
+"""Bound of the observation space: ten half widths, 750 km/h; no drive reaches it."""
 STATE, IMAGE = "state", "image"
 
 

@@ -2,7 +2,7 @@
 
 `step_reward` is the formula of the paper's section on the RL control module, with one difference:
 the paper divides the lateral offset by half the width of the lane, this code by half the width of
-the track. `quadratic_reward` is the paper's second one.
+the track. `quadratic_reward` is the paper's second reward.
 """
 
 import math
@@ -25,8 +25,8 @@ Reward = Callable[[CarState, Road, Ending | None], float]
 
 
 def ending(state: CarState, ends: Collection[Ending] = ENDINGS) -> Ending | None:
-    """Which of `ends` ends an episode at `state`, None if it goes on.
-
+    """The event out of `ends` that ends an episode at `state`; None if the episode continues.
+    Contact with a wall counts as "off_track"; if that is not among `ends`, as "collision".
     Contact with a wall counts as "off_track"; if that is not among `ends`, as "collision".
     """
     # Walls stand 2.5 m beyond the edge, so the car is off the track before it touches one. The
@@ -79,7 +79,7 @@ class EpisodeOptions:
     """Weight of |sin(angle)| in `step_reward`."""
 
     ends: Collection[Ending] = ENDINGS
-    """The events that end an episode; after others it goes on."""
+    """The events that end an episode; after other events it continues."""
 
     def __post_init__(self) -> None:
         if self.reward is not None and not callable(self.reward):

@@ -12,14 +12,14 @@ OPTIONS = ("s", "to_middle", "angle", "speed")
 
 
 def check_start(options: Mapping[str, Any], road: Road) -> dict[str, float]:
-    """The arguments of `World.reset` for `options`: floats, clipped where they exceed a bound by
-    the rounding of float32. An option that is None is left out.
+    """The arguments of `World.reset` for `options`, as floats; a value that exceeds its bound by
+    the rounding of float32 is clipped. An option that is None is left out.
 
-    Raises UserError for an unknown option, and for what is no number.
+    Raises UserError for an unknown option, and for a value that is not a number.
     """
     unknown = sorted(str(name) for name in options if name not in OPTIONS)
     if unknown:
-        raise UserError(f"reset does not know the options {unknown}; it takes {OPTIONS}")
+        raise UserError(f"reset got the unknown options {unknown}; it takes {OPTIONS}")
     start = {name: _number(name, value) for name, value in options.items() if value is not None}
     for name, bound in (("to_middle", road.edge), ("speed", MAX_START_SPEED_M_S)):
         if name in start:

@@ -1,4 +1,4 @@
-"""Rendering of an environment's views: one camera, built on first use; each view once a step."""
+"""Renders an environment's views with one camera, built on first use; each view once a step."""
 
 import weakref
 from collections.abc import Sequence
@@ -30,8 +30,8 @@ class RenderOptions:
 
     light_seed: int = 0
     mount: CameraParameters | None = None
-    """Position, pitch and field of view of the driver camera, whose size is `width` and `height`;
-    None is the default position."""
+    """Position, pitch and field of view of the driver camera; its image size is `width` x `height`.
+    None: the default position."""
 
     render_view: str = "front"
     """The view that `render()` returns, in colour."""
@@ -84,8 +84,8 @@ class ViewRenderer:
     def render(self, world: World, views: Sequence[str]) -> dict[str, NDArray[Any]]:
         """Copies of the views of the current state, in the order of `views`.
 
-        As from `Camera.render_views`, but with the depth of the sky at the bound of the space,
-        6000 m.
+        The images are those of `Camera.render_views`, except that the depth of the sky is the bound
+        of the space, 6000 m.
         """
         if world.state is not self._rendered_state:
             self._rendered_state, self._images = world.state, {}

@@ -15,7 +15,7 @@ from simulator.link.sync import futex
 from simulator.link.sync.seqlock import DAMAGED, NOTHING, publish, spin_until_new, try_read
 
 SPIN_COUNT = 30_000
-"""Polls before sleeping: about 20 us, the cost of a wake-up."""
+"""Polls before sleeping: about 20 us, as long as a wake-up takes."""
 
 
 class _MessageBuffer:
@@ -52,7 +52,7 @@ class Sender:
 
 
 class Receiver:
-    """Reads `block` without blocking its writer; any number of receivers may."""
+    """Reads `block` without blocking its writer; a block can have any number of receivers."""
 
     def __init__(self, segment: Segment, block: Block, image_bytes: int = 0) -> None:
         self._buffer = _MessageBuffer(segment, block, image_bytes)
@@ -61,9 +61,9 @@ class Receiver:
         self.record, self.image = self._buffer.record, self._buffer.image
 
     def poll(self) -> bool:
-        """Whether there was a newer message, which is then in `record`.
+        """Whether a newer message arrived; it is then in `record`.
 
-        `damaged` is True if its checksum is wrong: its writer violates the protocol.
+        `damaged` is True if its checksum is wrong: the writer then violates the protocol.
         """
         outcome, self._seen = try_read(*self._buffer.arrays, self._seen)
         self.damaged = outcome == DAMAGED

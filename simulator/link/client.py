@@ -79,7 +79,7 @@ class Link:
         return self._request()
 
     def step(self, command: Command) -> Message:
-        """Hold `command` for a control step. In real time: from the next step on."""
+        """Hold `command` for one control step; in real time, from the next step on."""
         write_command(self._outbox.record, command)
         return self._request()
 

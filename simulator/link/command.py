@@ -16,29 +16,29 @@ from simulator.link.config import LinkConfig
 from simulator.track.cli import Lanes, LaneWidth, Traffic
 from trackfeatures.errors import UserError
 
-Name = Annotated[str, typer.Option(help="Name of the shared memory: a slash and letters.")]
+Name = Annotated[str, typer.Option(help="Name of the shared memory, such as /driverview.")]
 Track = Annotated[str, typer.Option(help="Name of a track, or a track file.")]
-Frequency = Annotated[int, typer.Option(help="Control steps per second; must divide 200.")]
+Frequency = Annotated[int, typer.Option(help="Control steps per second; a divisor of 200.")]
 Seed = Annotated[
-    int, typer.Option(help="Seed of scenery, light and episodes that name none.", min=0)
+    int, typer.Option(help="Seed of scenery, light, and episodes without a seed.", min=0)
 ]
-CameraSize = Annotated[str, typer.Option(help="Image size such as 280x210, or none.")]
-LightName = Annotated[str, typer.Option(help="Light of the images, by name.")]
-TracksDir = Annotated[Path | None, typer.Option(help="Folder of TORCS tracks.")]
+CameraSize = Annotated[str, typer.Option(help="Image size in pixels, such as 280x210, or none.")]
+LightName = Annotated[str, typer.Option(help="Light of the images, such as clear or rain.")]
+TracksDir = Annotated[Path | None, typer.Option(help="A further folder to search for tracks.")]
 Realtime = Annotated[
     bool,
     typer.Option(
         "--realtime/--lock-step",
-        help="Step by the wall clock and hold the last command; or wait for a command each step.",
+        help="Step by the wall clock and hold the last command, or wait for a command each step.",
     ),
 ]
-Once = Annotated[bool, typer.Option("--once", help="End when the first client leaves.")]
+Once = Annotated[bool, typer.Option("--once", help="End when the first client disconnects.")]
 Patience = Annotated[
     float,
-    typer.Option(help="Seconds without a command before a client is given up; 0: no limit."),
+    typer.Option(help="Longest wait for a client's command, s; then the server ends. 0: no limit."),
 ]
 Header = Annotated[
-    Path | None, typer.Option(help="Write the C header of the memory to this file, and end.")
+    Path | None, typer.Option(help="Write the C header of the memory to this file and end.")
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 

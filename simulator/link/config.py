@@ -27,4 +27,4 @@ class LinkConfig:
     realtime: bool = False
     once: bool = False
     patience_s: float = 600.0
-    """How long to wait for a command of a living client; 0: without limit."""
+    """Longest wait for a command of a living client; 0: without limit."""

@@ -4,7 +4,7 @@ from trackfeatures.errors import UserError
 
 
 class LinkError(UserError):
-    """The link cannot be made or is lost."""
+    """The link cannot be opened, or is lost."""
 
 
 class NoServer(LinkError):

@@ -107,7 +107,7 @@ class Field:
 
 @dataclass(frozen=True)
 class Block:
-    """A C struct; `offset` is where it lies in the segment."""
+    """A C struct; `offset` is its place in the segment, bytes."""
 
     name: str
     meaning: str
@@ -150,7 +150,7 @@ ERROR_BYTES: Final = STATE.places["error_text"][1]
 
 
 def image_bytes(width: int, height: int) -> int:
-    """Bytes of the picture's area: RGB, rows from top to bottom, rounded up to whole words."""
+    """Size of the image area: RGB, rows from top to bottom, rounded up to whole words."""
     return -(-width * height * 3 // MESSAGE_ALIGNMENT) * MESSAGE_ALIGNMENT
 
 

@@ -35,7 +35,7 @@ class Message:
     ranges: NDArray[np.float64]
     """(19,) m to the track's edge, from +90 to -90 deg."""
     ranges_traffic: NDArray[np.float64]
-    """The same, ending at traffic too."""
+    """The same, but a beam ends at a traffic car, too."""
     reward: float
     score: float
     ended: Ending | None

@@ -35,7 +35,7 @@ def run(config: LinkConfig, report: Callable[[str], None]) -> Summary:
     """
     futex.check_system()
     if not config.patience_s >= 0.0:  # NaN too
-        raise UserError(f"--patience is {config.patience_s}; give seconds, or 0 for any number")
+        raise UserError(f"--patience is {config.patience_s}; give seconds, or 0 for no limit")
     remove_stale(config.name)  # fails on a name in use before the world is built
     with ExitStack() as stack:
         road = Road(find_track(config.track, config.tracks_dir), config.lanes, config.lane_width)

@@ -67,7 +67,7 @@ class Segment:
         try:
             while True:
                 try:
-                    # With a folder's descriptor it is linkat, which follows the link in /proc.
+                    # With src_dir_fd, os.link calls linkat, which follows the link in /proc.
                     ours = f"/proc/self/fd/{self.descriptor}"
                     os.link(ours, _path(self.name), src_dir_fd=folder, follow_symlinks=True)
                 except FileExistsError:

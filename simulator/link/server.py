@@ -113,8 +113,8 @@ class LinkServer:
         self.close()
 
     def _wait_for_command(self) -> bool:
-        """Wait up to POLL_INTERVAL_S for a command, or in real time until the next tick; returns
-        whether there is one."""
+        """Wait up to POLL_INTERVAL_S for a command (in real time: until the next tick). Returns
+        whether a command arrived."""
         if self._pacer is None or not self._simulation.running:
             return self._inbox.wait(POLL_INTERVAL_S)
         self._outbox.record["late_steps"] += self._pacer.wait()

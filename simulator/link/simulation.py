@@ -1,7 +1,7 @@
 """Handles a client's requests: steps the world and writes the answer into a record.
 
-Independent of the shared memory. A bad request is answered with an error code and a message; the
-state of the car is then unchanged.
+Independent of the shared memory. A bad request is answered with an error code and a message, and
+leaves the state of the car unchanged.
 """
 
 import math
@@ -85,7 +85,7 @@ class Simulation:
     def advance(self) -> None:
         """Step with the last command, without a request (real-time mode).
 
-        Where contacts cannot be computed, the episode is closed, and the next step is refused.
+        If contacts cannot be computed, the episode is closed, and the next step is refused.
         """
         try:
             state = self._world.step(self._held)
@@ -155,7 +155,7 @@ class Simulation:
         write_ending(record, ended)
         write_features(record, world.features())
         record["ranges"] = read_track_range(world)
-        # Without traffic both are the same; computing the beams twice would be expensive.
+        # Without traffic both are equal; computing the beams twice would be expensive.
         record["ranges_traffic"] = read_range(world) if world.traffic.count else record["ranges"]
         if self._camera is not None:
             picture = self._camera.render(world.body_pose(), world.traffic.poses())

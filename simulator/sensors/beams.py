@@ -1,4 +1,4 @@
-"""Range beams in the road plane: how far to the track's edge, and to traffic. Metres, radians."""
+"""Range beams in the road plane: distance to the track's edge and to traffic. Metres, radians."""
 
 import math
 
@@ -11,7 +11,7 @@ from simulator.track.piece_table import CURVATURE, HEADING0, LENGTH, X0, Y0, Tab
 RANGE_M = 200.0
 OFF_TRACK = -1.0
 BEAM_ANGLES: FloatArray = np.radians(np.arange(90.0, -91.0, -10.0))
-"""(19,) from the left (+90 deg) to the right of the car's heading."""
+"""(19,) angles from the car's heading, from +90 deg (left) to -90 deg."""
 
 MOST_PIECES = 4096
 """Limit on the track pieces a beam may cross; 200 m of the finest spiral have some hundred."""
@@ -28,8 +28,8 @@ def track_beams(
     edge: float,
     distances: FloatArray,
 ) -> None:
-    """Fill `distances` (n,) with m to the track's edge along `angles` from the heading; -1 off the
-    track. `piece`: the track piece at which the search for (x, y) starts, -1 if unknown.
+    """Fill `distances` (n,) with the distances (m) to the track's edge along `angles` from the
+    heading; -1 off the track. `piece`: the piece at which the search starts, -1 if unknown.
     """
     at, _, d = locate(table, x, y, piece)
     for i in range(angles.shape[0]):
@@ -43,7 +43,7 @@ def track_beams(
 def edge_distance(
     table: Table, piece: int, x: float, y: float, direction: float, edge: float
 ) -> float:
-    """Distance (m) from a point on the road to where the ray leaves it; at most RANGE_M.
+    """Distance (m) from a point on the road to the place where the ray leaves it; up to RANGE_M.
 
     Follows the ray from piece to piece; in each, both edges are lines or circles, and the
     intersection is the root of a quadratic equation.
@@ -103,7 +103,7 @@ def falling_root(a: float, half_b: float, c: float, passed: float) -> float:
     if square < 0.0:
         return math.inf
     root = math.sqrt(square)
-    # Of the two forms of the root, the one that adds numbers of one sign.
+    # Of the two forms of the root, take the one without cancellation: it adds numbers of one sign.
     top, bottom = (half_b + root, -a) if half_b > 0.0 else (c, root - half_b)
     if bottom == 0.0:
         return math.inf
@@ -156,7 +156,7 @@ def shorten_at_boxes(
 
 @compiled
 def cut(start: float, rate: float, half: float) -> tuple[float, float]:
-    """Where start + t rate enters and leaves [-half, half]; an empty interval if it never does."""
+    """The t at which start + t rate enters and leaves [-half, half]; an empty interval if never."""
     if abs(rate) < 1e-12:
         return (-math.inf, math.inf) if abs(start) <= half else (math.inf, -math.inf)
     first, second = (-half - start) / rate, (half - start) / rate

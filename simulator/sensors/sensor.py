@@ -44,10 +44,10 @@ class Sensor:
     it is neither clipped nor noisy."""
 
     shape: tuple[int, ...] = ()
-    """Of a reading; () is a number."""
+    """Shape of a reading; () is a number."""
 
     dtype: str = "float32"
-    """Of the reading in an environment's observation."""
+    """Data type of the reading in an environment's observation."""
 
     def __post_init__(self) -> None:
         if not self.limits[0] < self.limits[1]:
@@ -98,7 +98,7 @@ class SensorSuite:
     """Several sensors read together; their noise depends on `seed` and the order of reading only.
 
     `noise` sets standard deviations by sensor name. Raises UserError for two sensors of one name
-    or noise for a sensor that is not there.
+    or noise for a sensor that is not in the suite.
     """
 
     def __init__(

@@ -1,7 +1,7 @@
 """The sensors of the paper's table, with its ranges and in its units.
 
-v_x and v_y are signed and in the body frame, so their scales are too; speed and wheel spin are
-magnitudes, as the table has them.
+v_x and v_y are signed and in the body frame, and so are their limits; speed and wheel spin are
+magnitudes, as in the table.
 """
 
 import math

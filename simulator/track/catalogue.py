@@ -1,7 +1,7 @@
-"""Finds tracks by name: the project's own, then TORCS and CSV tracks in the folders we look in.
+"""Finds tracks by name: the project's own, then TORCS and CSV tracks in the search folders.
 
-Looked in, in this order: `simulator/tracks`, the folder given (`--tracks-dir`), `$TORCS_TRACKS`,
-`/usr/share/games/torcs/tracks`. The first track of a name wins. `random:SEED` is no file: see
+The folders in order: `simulator/tracks`, the given folder (`--tracks-dir`), `$TORCS_TRACKS`,
+`/usr/share/games/torcs/tracks`. The first track of a name wins. `random:SEED` is not a file: see
 `random_roads`.
 """
 
@@ -24,7 +24,7 @@ SUFFIXES: Final = (".xml", ".toml", ".csv")
 
 
 def find_track(name: str, tracks_dir: Path | None = None) -> Track:
-    """The track of that name, `random:SEED`, or of that file (.xml, .toml or .csv).
+    """The track called `name`: a known name, `random:SEED`, or a file (.xml, .toml or .csv).
 
     Raises UnknownTrack with names close to it, TrackError when its file is bad.
     """
@@ -54,8 +54,8 @@ def list_tracks(tracks_dir: Path | None = None) -> list[Track]:
 
 
 def read_track(path: Path) -> Track:
-    """The track in one file; its kind is told by the suffix."""
-    # One import each: a collector of own tracks needs neither XML nor scipy.
+    """The track in one file; the suffix determines the format."""
+    # Imported for one format only: collecting on own tracks needs neither XML nor scipy.
     match path.suffix.lower():
         case ".xml":
             from simulator.track.torcs.torcs import read_torcs as read
@@ -67,7 +67,7 @@ def read_track(path: Path) -> Track:
 
 
 def track_files(tracks_dir: Path | None = None) -> dict[str, Path]:
-    """File of every track by name, in the order we look."""
+    """File of every track by name, in the order of the search."""
     files: dict[str, Path] = {}
     for folder in _folders(tracks_dir):
         for path in _files_in(folder):
@@ -91,7 +91,7 @@ def _folders(tracks_dir: Path | None) -> Iterator[Path]:
 
 
 def _tracks_below(folder: Path) -> Path:
-    """TORCS keeps its tracks in `tracks`; both it and the folder above may be named."""
+    """The folder of the tracks: TORCS keeps them in `tracks`; a user can name it or its parent."""
     return folder / "tracks" if (folder / "tracks").is_dir() else folder
 
 
@@ -100,7 +100,7 @@ def _files_in(folder: Path) -> list[Path]:
     here = [path for path in folder.glob("*") if path.suffix.lower() in SUFFIXES]
     below = [*folder.glob("*/*.xml"), *folder.glob("*/*/*.xml")]
     named = [path for path in below if path.stem == path.parent.name]
-    # A pipe of such a name would be waited for without end.
+    # Without directories, and without pipes, on which a reader would wait for ever.
     return [path for path in sorted(here) + sorted(named) if path.is_file()]
 
 

@@ -24,17 +24,17 @@ POINTS: Final = (8, 100_000)
 LENGTH_M: Final = (50.0, 100_000.0)
 WIDTH_M: Final = (2.0, 60.0)
 FARTHEST_M: Final = 1e7
-"""No map has coordinates beyond it: the northing of UTM ends there."""
+"""Largest coordinate of a map: the northing of UTM ends there."""
 STEP_LIMITS_M: Final = (0.01, 1000.0)
 
 PIECE_M: Final = 4.0
-"""About the length of a piece."""
+"""Approximate length of a piece."""
 NOISE_M: Final = (0.05, 1.0)
-"""Least and most noise (m, root mean square) that is smoothed away; a survey's own is estimated."""
+"""Least and largest noise (m, RMS) that is smoothed away; a survey's own noise is estimated."""
 SMOOTHER: Final = 1.2
-"""Of the noise's variance: a little too smooth keeps a road, a little too rough wiggles."""
+"""Factor on the noise's variance: too much smoothing still gives a road, too little wiggles."""
 MIN_RADIUS_M: Final = 5.0
-"""A sharper line is a mistake of the survey, not a road."""
+"""A line with a smaller radius is an error of the survey, not a road."""
 MAX_GAP_M: Final = 1e-3
 HEADER: Final = "s,x,y,z,ang,curv\n"
 ROW: Final = "%.6f,%.6f,%.6f,%.6f,%.9f,%.9f\n"
@@ -76,7 +76,7 @@ def _read_points(path: Path) -> tuple[FloatArray, float]:
         )
     points = rows[:, :2]
     apart = np.hypot(*(np.roll(points, -1, axis=0) - points).T)
-    # The first point is often given again as the last one.
+    # Files often repeat the first point as the last one.
     points, apart = points[apart > 1e-6], apart[apart > 1e-6]
     if not LENGTH_M[0] <= float(apart.sum()) <= LENGTH_M[1] or len(points) < POINTS[0]:
         raise TrackError(
@@ -125,7 +125,7 @@ def _read_rows(path: Path) -> FloatArray:
 
 
 def _arcs(points: FloatArray, path: Path) -> Placed:
-    """Arcs along a periodic smoothing spline through the points, where the points are."""
+    """Arcs along a periodic smoothing spline through the points, in the points' coordinates."""
     closed = np.vstack((points, points[:1]))
     noise = min(max(survey_noise(points), NOISE_M[0]), NOISE_M[1])
     tck, _ = splprep(closed.T, s=SMOOTHER * len(points) * noise**2, per=1)
@@ -145,10 +145,10 @@ def _arcs(points: FloatArray, path: Path) -> Placed:
 
 
 def survey_noise(points: FloatArray) -> float:
-    """Standard deviation (m) of the noise sideways of points (N, 2) round a smooth closed line.
+    """Standard deviation (m) of the lateral noise of points (N, 2) along a smooth closed line.
 
-    Each point is held against the cubic through the two before and the two after it, by the length
-    along the chords. The median is blind to the few joints where a bend begins at once.
+    Each point is compared with the cubic through the two points before and the two after it, over
+    the chord length. The median ignores the few joints where a bend begins abruptly.
     """
     before2, before, after, after2 = (np.roll(points, k, axis=0) for k in (2, 1, -1, -2))
     chord = np.hypot(*(after - points).T)
@@ -167,7 +167,7 @@ def survey_noise(points: FloatArray) -> float:
     error = points - np.einsum("in,inj->nj", weights, neighbours)
     along = after - before
     sideways = (along[:, 0] * error[:, 1] - along[:, 1] * error[:, 0]) / np.hypot(*along.T)
-    # The error of a point adds to those of the four that it is held against.
+    # The deviation contains the errors of the point and of the four points around it.
     sideways /= np.sqrt(1.0 + np.sum(weights**2, axis=0))
     return float(np.median(np.abs(sideways)) / 0.6745)
 

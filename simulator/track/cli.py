@@ -1,4 +1,4 @@
-"""`simulator tracks`: what tracks there are, and what one looks like.
+"""`simulator tracks`: lists tracks, plots one, or exports a random road.
 
 simulator tracks --tracks-dir FOLDER --json
 simulator tracks plot forza --out forza.png --lanes 2
@@ -18,11 +18,11 @@ TrackName = Annotated[
     str, typer.Argument(help="Name of a track, random:SEED, or a .xml, .toml or .csv file.")
 ]
 TracksDir = Annotated[
-    Path | None, typer.Option(help="Folder of TORCS (or .toml, .csv) tracks to look in as well.")
+    Path | None, typer.Option(help="A further folder to search for TORCS, .toml or .csv tracks.")
 ]
 
 Lanes = Annotated[int, typer.Option(help="Number of lanes, 1 to 3.")]
-LaneWidth = Annotated[float, typer.Option(help="Metres, 2.7 to 4.5.")]
+LaneWidth = Annotated[float, typer.Option(help="Lane width, m, 2.7 to 4.5.")]
 Traffic = Annotated[int, typer.Option(help="Number of other cars.", min=0, max=12)]
 
 tracks = typer.Typer(rich_markup_mode="rich")
@@ -69,12 +69,12 @@ def plot(
 
 @tracks.command()
 def export(
-    road: Annotated[str, typer.Argument(metavar="random:SEED", help="Which random road.")],
+    road: Annotated[str, typer.Argument(metavar="random:SEED", help="Name of a random road.")],
     out: Annotated[
         Path | None, typer.Option(help="TOML file; random-SEED.toml here if not given.")
     ] = None,
 ) -> None:
-    """Write a random road as TOML: a track to read, to change, and to name by its path."""
+    """Write a random road as a TOML track, which can be edited and driven by its path."""
     from simulator.track.random_roads.export import write_road
     from simulator.track.random_roads.road import seed_of
 
@@ -85,7 +85,7 @@ def export(
 
 
 def describe(track: "Track") -> dict[str, str | float]:
-    """What `tracks --json` says of one track; metres."""
+    """The entry of one track in `tracks --json`; metres."""
     return {
         "name": track.name,
         "source": track.source,

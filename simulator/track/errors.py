@@ -1,11 +1,11 @@
-"""What can be wrong with a track the user names or brings."""
+"""Errors of tracks that a user names or supplies."""
 
 from trackfeatures.errors import UserError
 
 
-class UnknownTrack(UserError):  # says what it is; "Error" would add nothing
-    """No track of that name is found anywhere we look."""
+class UnknownTrack(UserError):
+    """No track of that name was found."""
 
 
 class TrackError(UserError):
-    """A track file that cannot be read, or does not describe a closed road."""
+    """A track file cannot be read, or does not describe a closed road."""

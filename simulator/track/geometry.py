@@ -21,11 +21,11 @@ from simulator.track.pieces import Placed
 Source = Literal["own", "torcs", "csv"]
 Surface = Literal["asphalt", "gravel", "concrete"]
 _UNDECODABLE = re.compile(r"[\ud800-\udfff]")
-"""What Python makes of bytes of a file name that are no UTF-8."""
+"""The surrogates to which Python decodes bytes of a file name that are not UTF-8."""
 
 
 def readable_name(name: str) -> str:
-    """The name of a track whose file is called `name`: bytes that are no UTF-8 become U+FFFD, since
+    """The name of the track in the file `name`. Bytes that are not UTF-8 become U+FFFD, because
     names are drawn, recorded and sent as text."""
     return _UNDECODABLE.sub("\N{REPLACEMENT CHARACTER}", name)
 
@@ -65,7 +65,7 @@ class Track:
     z_left1: FloatArray
     z_right1: FloatArray
     definition_hash: str = ""
-    """Hash of the definition that the geometry was computed from, where it counts instead."""
+    """Hash of the definition; if set, it replaces the hash of the computed geometry."""
 
     @classmethod
     def from_placed(
@@ -111,7 +111,7 @@ class Track:
 
     @cached_property
     def content_hash(self) -> str:
-        """SHA-256 (hex) of the geometry: the same for the same road, whatever its name."""
+        """SHA-256 (hex) of the geometry; it does not depend on the track's name."""
         return (
             self.definition_hash
             or hashlib.sha256(self.arrays().astype("<f8").tobytes()).hexdigest()
@@ -163,8 +163,8 @@ class Track:
     def project(self, x: float, y: float, hint_s: float | None = None) -> tuple[float, float]:
         """Track coordinates (s, to_middle) of a world point.
 
-        Without `hint_s` the nearest point of the whole centre line counts; with it, the part of
-        the track near that s, which tells a bridge from the road below.
+        Without `hint_s` the whole centre line is searched; with it, only the part near that s: this
+        distinguishes a bridge from the road below.
         """
         table = self.arrays()
         hint = -1 if hint_s is None else piece_table.index_at(table, float(hint_s))
@@ -177,7 +177,7 @@ class Track:
         return float(wrap_angle(np.float64(heading)))
 
     def curvature(self, s: float) -> float:
-        """Signed curvature at s (left positive), 1/m; s wraps. `at` is the vectorised one."""
+        """Signed curvature at s (left positive), 1/m; s wraps. `at` is the vectorised version."""
         return float(self.curvature0[piece_table.index_at(self.arrays(), float(s))])
 
     def slope(self, s: float) -> float:

@@ -1,4 +1,4 @@
-"""From straights and bends to pieces: spirals, banking, a smooth height profile, exact closing.
+"""Converts straights and bends to pieces: spirals, banking, smooth heights, exact closing.
 
 Metres and radians; a bend's angle is left positive; grades are dz/ds.
 """
@@ -67,7 +67,7 @@ def cut(segments: list[Segment]) -> Steps:
         rows += ramp
         if arc > 0.0:
             rows += _even(arc, k, -sign * segment.banking, number)
-        # The way out is the way in, backwards: each step ends with the banking it began with.
+        # The exit spiral is the entry spiral reversed: a step ends with the banking it began with.
         starts = [0.0] + [banking for _, _, banking, _ in ramp[:-1]]
         rows += [
             (length, curvature, start, number)
@@ -99,7 +99,7 @@ def _spiral(bend: Bend, sign: float, number: int) -> list[Row]:
 
 
 def place(steps: Steps) -> Placed:
-    """The steps in the plane, without heights. No step is long enough to have to be split."""
+    """The steps in the plane, without heights. No step is long enough to need splitting."""
     return put(steps.length, steps.curvature, np.zeros((len(steps.length), 4)))
 
 
@@ -164,7 +164,7 @@ def heights(segments: list[Segment], s: FloatArray, vertical_curve: float) -> Fl
 
     half = vertical_curve / 2.0
     smooth = (integral(s + half) - integral(s - half)) / vertical_curve
-    # Equal but for rounding; the last must be the first.
+    # Equal except for rounding; the last height must be the first.
     if abs(s[-1] - total) < 1e-6:
         smooth[-1] = smooth[0]
     result: FloatArray = smooth - smooth[0]

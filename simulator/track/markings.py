@@ -1,4 +1,4 @@
-"""How a track's lane markings are painted. Lengths in metres."""
+"""Paint of a track's lane markings. Lengths in metres."""
 
 import hashlib
 from dataclasses import dataclass
@@ -24,7 +24,7 @@ class MarkingStyle:
 
 
 def imported_style(name: str, *, kerbs: bool) -> MarkingStyle:
-    """A style for a track whose file says nothing of paint, drawn from its name."""
+    """A style drawn from the name of a track, for files without information on paint."""
     draw = hashlib.sha256(name.encode()).digest()
     dash_length, dash_gap = ((3.0, 6.0), (4.0, 8.0), (6.0, 12.0), (3.0, 9.0))[draw[1] % 4]
     return MarkingStyle(

@@ -19,9 +19,9 @@ HALF_WIDTH, TRACK_LENGTH = 10, 11
 COLUMNS = 12
 
 MAX_WALK = 64
-"""Pieces a hint may be wrong by before all pieces are searched."""
+"""Pieces by which a hint can be wrong before all pieces are searched."""
 HINT_REACH_M = 40.0
-"""A foot point farther off than this is not trusted to be on the hinted part of the track."""
+"""A foot point farther away than this is not trusted to be on the hinted part of the track."""
 
 
 @compiled
@@ -135,7 +135,7 @@ def surface(
 ) -> tuple[float, float, float, float]:
     """Height and unit normal (z, nx, ny, nz) of the road plane at (s, to_middle) on a piece.
 
-    Beyond the track's width the banking plane goes on.
+    Beyond the track's width the banking plane continues.
     """
     length = table[index, LENGTH]
     along = min(max(s - table[index, S0], 0.0), length)

@@ -1,4 +1,4 @@
-"""From lengths, curvatures and edge heights to placed constant-curvature pieces.
+"""Converts lengths, curvatures and edge heights to placed constant-curvature pieces.
 
 Lengths in metres, curvature in 1/m (left positive), headings in radians counter-clockwise.
 """
@@ -15,8 +15,8 @@ from simulator.track.errors import TrackError
 MAX_TURN: Final = math.pi / 2
 """No piece turns farther, so that a foot point on an arc is unique near it."""
 MAX_GAP_M: Final = 0.28
-"""Of the 38 tracks of TORCS 1.3.7 all but two close within 0.09 m; forza has a gap of 0.152 m,
-wheel-2 one of 0.262 m. The program drives over them, so do we."""
+"""Largest gap between the last piece and the first. Of the 38 tracks of TORCS 1.3.7 all but two
+close within 0.09 m; forza has a gap of 0.152 m, wheel-2 of 0.262 m. TORCS drives over them, too."""
 MAX_HEADING_GAP: Final = math.radians(0.5)
 
 

@@ -54,7 +54,7 @@ class Lap:
 
 
 def sample(road: Road) -> Lap:
-    """The lap of `road`, every metre or (a long one) at 6000 places."""
+    """The lap of `road`, sampled every metre; a long lap at 6000 places."""
     track = road.track
     count = min(round(track.length_m), MOST_SAMPLES)
     s = np.linspace(0.0, track.length_m, count + 1)
@@ -77,8 +77,8 @@ def runs(classes: NDArray[np.int64]) -> list[tuple[int, int, tf.Heading]]:
 def write_plot(road: Road, out: Path) -> None:
     """Write the picture of `road` as a PNG file of 1760 x 990 pixels.
 
-    An older file stays as it is until the new one is complete. Raises UserError for another kind
-    of file, without its folder or without matplotlib, OSError if it cannot be written.
+    An older file is kept until the new one is complete. Raises UserError for a name without .png,
+    a missing folder or missing matplotlib, OSError if the file cannot be written.
     """
     if out.suffix.lower() != ".png":
         raise UserError(f"{out}: the plot is a PNG file; give a name that ends in .png")
@@ -89,7 +89,7 @@ def write_plot(road: Road, out: Path) -> None:
 
 
 def draw(lap: Lap) -> "Figure":
-    """The figure: no window, no display, no global state of matplotlib's."""
+    """The figure, made without a window, a display or matplotlib's global state."""
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
@@ -105,7 +105,7 @@ def draw(lap: Lap) -> "Figure":
     _curvature(figure.add_subplot(grid[1, 1], sharex=height), lap)
     _classes(figure.add_subplot(grid[2, 1], sharex=height), lap)
     _cross_section(figure.add_subplot(grid[3, 1]), lap.road)
-    name = lap.road.track.name.replace("$", "\\$")  # no formula begins here
+    name = lap.road.track.name.replace("$", "\\$")  # a plain $ would begin a formula
     figure.suptitle(name, x=0.012, ha="left", fontsize=17, color=INK, weight="bold")
     return figure
 
@@ -153,7 +153,7 @@ def _distances(axes: "Axes", lap: Lap) -> None:
     pose = track.at(s)
     span = float(max(np.ptp(lap.centre.x), np.ptp(lap.centre.y)))
     turned = float(np.sum(track.curvature0 * track.length))
-    side = -1.0 if turned > 0.0 else 1.0  # of a left-handed loop the right side is outside
+    side = -1.0 if turned > 0.0 else 1.0  # the outer side: right, if the loop turns left
     across = np.stack((-np.sin(pose.heading), np.cos(pose.heading)))
     reach = 0.011 * span
     halo = [withStroke(linewidth=2.5, foreground=PAPER)]
@@ -185,7 +185,7 @@ def tick_step(length: float) -> int:
 
 
 def _start(axes: "Axes", lap: Lap) -> None:
-    """The line, and an arrow beside it in driving direction."""
+    """The start line, and an arrow beside it in driving direction."""
     track = lap.road.track
     span = float(max(np.ptp(lap.centre.x), np.ptp(lap.centre.y)))
     turned = float(np.sum(track.curvature0 * track.length))
@@ -249,7 +249,7 @@ def _classes(axes: "Axes", lap: Lap) -> None:
 
 
 def _cross_section(axes: "Axes", road: Road) -> None:
-    """The road as its driver meets it: left is left, heights are not to scale."""
+    """The road in the driver's view: left is left, heights are not to scale."""
     wall, edge, asphalt = road.wall_offset, road.edge, road.half_asphalt
     axes.axvspan(-wall, wall, ymax=0.35, color=GRASS, lw=0)
     axes.axvspan(-asphalt, asphalt, ymax=0.35, color=ASPHALT, lw=0)

@@ -11,21 +11,21 @@ from simulator.varied.carriageway import Carriageway
 from trackfeatures.errors import UserError
 
 START_BEFORE_LINE_M = 25.0
-"""A drive starts this far before the line."""
+"""Distance from the start of a drive to the line."""
 SHOULDER_M = 1.0
-"""Asphalt beyond the outermost marking."""
+"""Width of the asphalt beyond the outermost marking."""
 WALL_MARGIN_M = 2.5
-"""Rails and walls stand this far outside the edge: half a car's diagonal (2.46 m), so that a car
-has left the track before any part of it meets a wall."""
+"""Distance from the edge to the rails and walls: half a car's diagonal (2.46 m), so that a car has
+left the track before any part of it meets a wall."""
 
 
 @dataclass(frozen=True)
 class Road:
-    """`lanes` lanes of `lane_width`, centred on `track`; a track too narrow is widened.
+    """`lanes` lanes of `lane_width`, centred on `track`; a narrower track is widened.
 
-    `carriageway`: the lines and shoulders of a varied road; None: those of the paper's roads, one
-    line a marking. Raises UserError for a number or width of lanes outside the definitions, or for
-    another carriageway.
+    `carriageway`: the lines and shoulders of a varied road; None: those of the paper's roads, with
+    one line per marking. Raises UserError for a number or width of lanes outside the definitions,
+    or that differs from the carriageway's.
     """
 
     track: Track
@@ -55,24 +55,24 @@ class Road:
 
     @property
     def asphalt(self) -> tuple[float, float]:
-        """From the centre to the left and to the right end of the asphalt."""
+        """Distances from the centre to the left and to the right end of the asphalt."""
         half = self.lanes * self.lane_width / 2
         left, right = self.carriageway.shoulders_m if self.carriageway else (SHOULDER_M,) * 2
         return half + left, half + right
 
     @property
     def half_asphalt(self) -> float:
-        """From the centre to the end of the asphalt, on the side where it is wider."""
+        """Distance from the centre to the end of the asphalt, on the side where it is wider."""
         return max(self.asphalt)
 
     @property
     def edge(self) -> float:
-        """Farther from the centre than this is off the track; the range beams measure to it."""
+        """Distance from the centre beyond which a car is off the track; range beams end there."""
         return max(self.half_width, self.half_asphalt)
 
     @property
     def wall_offset(self) -> float:
-        """From the centre to the rails and walls."""
+        """Distance from the centre to the rails and walls."""
         return self.edge + WALL_MARGIN_M
 
     @property
@@ -81,8 +81,8 @@ class Road:
         return tf.marking_offsets(self.lanes, self.lane_width)
 
     def lines_y(self, to_middle: float) -> NDArray[np.float64]:
-        """Lateral places (lanes + 1,) of the lines that count for a car at `to_middle`: of a
-        double line the one nearer to the car's lane."""
+        """Lateral places (lanes + 1,) of the lines that count for a car at `to_middle`: of a double
+        line, the line nearer to the car's lane."""
         if not self.line_offsets:
             return self.markings_y
         lane = tf.lane_index(to_middle, self.lanes, self.lane_width)
@@ -100,8 +100,8 @@ class Road:
 
     @property
     def line_offsets(self) -> tuple[tuple[float, float], ...]:
-        """Where the lines of each marking lie that bound the lane on its left and on its right,
-        from the marking's place, left positive; empty: all of them there."""
+        """Offsets, left positive, from each marking to the lines that bound the lanes on its left
+        and on its right; empty if all of them are 0."""
         if self.carriageway is None:
             return ()
         return tuple((marking.left_m, marking.right_m) for marking in self.carriageway.markings)

@@ -31,7 +31,7 @@ from simulator.track.pieces import assemble, check_closes
 
 MAX_BYTES: Final = 2**20
 MAX_CORRECTION_M: Final = 1.0
-"""A straight that had to change by more would not be the one its author wrote."""
+"""Largest change of a straight to close the loop; a larger one would not be the author's road."""
 MAX_GAP_M: Final = 1e-3
 LOOKS: Final = (
     "highway",
@@ -49,7 +49,7 @@ LOOKS: Final = (
 
 @dataclass(frozen=True)
 class Table:
-    """A TOML table that says where it stands when something in it is wrong."""
+    """A TOML table with its place in the file, which error messages name."""
 
     values: Mapping[str, Any]
     where: str
@@ -69,7 +69,7 @@ class Table:
         return str(value)
 
     def only(self, *keys: str) -> None:
-        """Refuse keys that mean nothing: a misspelt one would silently have no effect."""
+        """Refuse unknown keys: a misspelt key would silently have no effect."""
         for key in self.values:
             if key not in keys:
                 raise TrackError(f"{self.where}: unknown key {key!r}, expected {', '.join(keys)}")
@@ -106,7 +106,7 @@ def _hash(written: list[Segment], width: float, vertical_curve: float) -> str:
     """SHA-256 (hex) of the numbers of a definition.
 
     The computed geometry differs by 1e-12 m between machines, whose libraries round sines
-    differently; parsed decimals and products of them do not.
+    differently; parsed decimals and their products do not differ.
     """
     rows = [
         (segment.length, 0.0, 0.0, 0.0, segment.grade)

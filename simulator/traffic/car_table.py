@@ -292,8 +292,8 @@ def update_poses(cars: FloatArray, table: FloatArray, poses: FloatArray) -> None
 
 @compiled
 def limit_deceleration(squared: FloatArray, gain: float) -> None:
-    """Lower the squared speed limits (n,) of cells around a loop, in place, so that from one cell
-    to the next they fall by at most `gain`, the decrease one can brake within a cell."""
+    """Lower the squared speed limits (n,) of cells around a loop, in place, so that they fall by at
+    most `gain` from one cell to the next; `gain` is the decrease by braking within a cell."""
     cells = squared.shape[0]
     for cell in range(2 * cells - 1, -1, -1):  # two laps: the limits wrap around at the line
         ahead = squared[(cell + 1) % cells] + gain

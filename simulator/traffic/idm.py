@@ -12,7 +12,7 @@ TIME_HEADWAY_S = 1.4
 STANDSTILL_GAP_M = 2.5
 COMFORTABLE_ACCELERATION = 1.4  # m/s2
 COMFORTABLE_BRAKING = 2.0  # m/s2
-MAX_BRAKING = 9.0  # m/s2: the limit on dry asphalt; the model itself has none
+MAX_BRAKING = 9.0  # m/s2: the limit on dry asphalt; the IDM itself has no limit
 _MIN_GAP_M = 0.1  # the model divides by the gap
 _MIN_DESIRED_SPEED = 0.1  # m/s; the model divides by the desired speed
 

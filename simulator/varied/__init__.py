@@ -1,4 +1,4 @@
-"""Roads as they are: what a round or a scene of `--roads varied` is drawn with; see ranges.toml."""
+"""Varied roads: the values drawn for each round and scene of `--roads varied`; see ranges.toml."""
 
 ROADS = ("paper", "varied")
-"""Kinds of roads: the paper's with the tracks' own paint, and those drawn from ranges.toml."""
+"""Kinds of roads: "paper" has lanes of 4.0 m and the tracks' own paint, "varied" is drawn."""

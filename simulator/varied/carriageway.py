@@ -1,7 +1,7 @@
 """Lanes, shoulders, camera height and lines of one round. Metres; the leftmost line comes first.
 
-The markings stand as far apart as the lanes are wide, for every lane. Of a double line between two
-lanes the two lie on both sides of that place; of a double line at an edge the inner one lies there.
+Neighbouring markings are one lane width apart, equal for all lanes. The two lines of a double line
+between lanes lie on both sides of the marking's place; at an edge, the inner line lies there.
 """
 
 import math
@@ -14,15 +14,15 @@ from trackfeatures.camera import CameraParameters
 from trackfeatures.definitions import LANE_WIDTH_LIMITS_M
 
 APPARENT_WIDTH_M = (2.75, 4.4)
-"""Least and greatest width of a lane in the model's pictures: a camera at another height than the
-model's shows a road enlarged by the ratio of the heights."""
+"""Least and greatest apparent width of a lane in the model's pictures: a camera at another height
+shows the road enlarged by the ratio of the heights."""
 MODEL_HEIGHT_M = CameraParameters().height_above_road_m
 CAMERA_HEIGHT_M = (0.9, 2.2)
 
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """One line of paint, or row of dots: its middle is `offset_m` left of its marking's place."""
+    """One line of paint, or a row of dots; its middle is `offset_m` left of its marking's place."""
 
     offset_m: float
     width_m: float
@@ -30,14 +30,14 @@ class Line:
     dash_m: float = 0.0
     """Length of a dash."""
     gap_m: float = 0.0
-    """From dash to dash; 0: the line is solid, or nothing but dots."""
+    """Gap between two dashes; 0: the line is solid, or consists of dots only."""
     dots_m: float = 0.0
-    """From one of Botts' dots to the next, where there is no paint; 0: there are none."""
+    """Distance between Botts' dots, where there is no paint; 0: no dots."""
 
 
 @dataclass(frozen=True, slots=True)
 class Marking:
-    """One marking: no line, one line, or two, the left one first."""
+    """One marking: no line, one line, or two lines, the left one first."""
 
     lines: tuple[Line, ...] = ()
 
@@ -54,19 +54,19 @@ class Marking:
 
 @dataclass(frozen=True, slots=True)
 class Carriageway:
-    """What one round's road is drawn with, beside its track."""
+    """The drawn values of one round's road, apart from its track."""
 
     lane_width_m: float
     shoulders_m: tuple[float, float]
-    """Left and right: asphalt beyond the outermost markings."""
+    """Width of the asphalt beyond the outermost markings, left and right."""
     camera_height_m: float
-    """Of the camera above the road."""
+    """Height of the camera above the road."""
     markings: tuple[Marking, ...]
-    """From the leftmost to the rightmost, one more than lanes."""
+    """The markings from left to right, one more than lanes."""
 
     @staticmethod
     def drawn(seed: int, lanes: int, model_height_m: float = MODEL_HEIGHT_M) -> "Carriageway":
-        """The road of the round with `seed`; `model_height_m`: of the model's camera."""
+        """The road of the round with `seed`; `model_height_m`: height of the model's camera."""
         size = draw(ranges(), "lanes", generator(seed, "lanes"))
         place = draw(ranges(), "camera", generator(seed, "camera"))["place"]
         width = round(float(size["width_m"]), 3)
@@ -86,7 +86,7 @@ class Carriageway:
 
     @staticmethod
     def from_dict(values: dict[str, Any]) -> "Carriageway":
-        """That with these values; raises KeyError, TypeError or ValueError for others."""
+        """The carriageway with these values; KeyError, TypeError or ValueError for other values."""
         found: Carriageway = rebuilt(Carriageway, values)
         return found
 
@@ -94,9 +94,9 @@ class Carriageway:
 def camera_heights(
     lane_width_m: float, narrowest_m: float = math.inf, model_height_m: float = MODEL_HEIGHT_M
 ) -> tuple[float, float]:
-    """The least and the greatest camera height in m from which a lane so wide is understood.
+    """The least and the greatest camera height (m) that keep a lane within APPARENT_WIDTH_M.
 
-    `narrowest_m`: the narrowest lane, where a double line takes some of the width.
+    `narrowest_m`: width of the narrowest lane, since a double line takes some of the width.
     """
     apparent_low, apparent_high = APPARENT_WIDTH_M
     low, high = CAMERA_HEIGHT_M
@@ -125,8 +125,8 @@ def _marking(
 ) -> Marking:
     """The marking `name` of one of the kinds in ranges.toml.
 
-    `inner` shifts a double line by that share of the distance of its lines, to the left. Where they
-    lie more than `room_m` apart, the first one is alone.
+    `inner` shifts a double line to the left by that share of the distance between its lines. If the
+    lines lie more than `room_m` apart, only the first one is kept.
     """
     kind, colour = str(drawn[name]), str(drawn[f"{name}_colour"])
     apart = width_m + float(drawn["apart_m"])

@@ -17,9 +17,9 @@ Values = dict[str, Any]
 Kind = TypeVar("Kind")
 
 SECTIONS = ("lanes", "camera", "lines", "paint", "surface", "roadside", "light", "lens", "cabin")
-"""Of ranges.toml. The place here is part of a section's generator: append, do not reorder."""
+"""Sections of ranges.toml. A section's index here seeds its generator: append, do not reorder."""
 STREAM = 20
-"""Of the generators of a seed that draw varied roads; smaller numbers draw scenery and drives."""
+"""Part of the seed of generators of varied roads; smaller numbers draw scenery and drives."""
 
 
 def generator(seed: int, section: str, scene: int = 0) -> np.random.Generator:
@@ -41,7 +41,7 @@ def drawn_as(kind: type[Kind], section: str, rng: np.random.Generator) -> Kind:
 
 
 def draw(tables: Tables, name: str, rng: np.random.Generator) -> Values:
-    """The values of the table `name`, after those of the table that it is `like`."""
+    """The values of the table `name`, drawn after those of the table that its `like` names."""
     table = tables[name]
     drawn: Values = draw(tables, table["like"], rng) if "like" in table else {}
     for entry, value in table.items():

@@ -1,4 +1,4 @@
-"""What one scene of `--roads varied` is drawn with; no look at all is `--roads paper`."""
+"""The drawn values of one scene of `--roads varied`; a scene of `--roads paper` has no look."""
 
 from dataclasses import asdict, dataclass, field
 from typing import Any
@@ -14,7 +14,7 @@ from simulator.varied.surface import Surface
 
 @dataclass(frozen=True, slots=True)
 class RoadLook:
-    """The look of one scene. The defaults of every part are today's pictures."""
+    """The look of one scene. The defaults of every part leave the picture unchanged."""
 
     paint: Paint = field(default_factory=Paint)
     surface: Surface = field(default_factory=Surface)
@@ -41,6 +41,6 @@ class RoadLook:
 
     @staticmethod
     def from_dict(values: dict[str, Any]) -> "RoadLook":
-        """The look with these values; raises KeyError, TypeError or ValueError for others."""
+        """The look with these values; raises KeyError, TypeError or ValueError for other values."""
         look: RoadLook = rebuilt(RoadLook, values)
         return look

@@ -11,7 +11,7 @@ from trackfeatures.errors import UserError
 def make_road(
     track: Track, lanes: int, lane_width_m: float | None, roads: str = ROADS[0], seed: int = 0
 ) -> Road:
-    """A road of one of `ROADS`; that of a varied one is drawn from `seed`, its lane width too.
+    """A road of one of `ROADS`. A varied road, its lane width included, is drawn from `seed`.
 
     Raises UserError for an unknown kind, or a lane width for a varied road.
     """

@@ -1,4 +1,4 @@
-"""What one round of `--roads varied` is drawn with: its road, and the look of each scene."""
+"""The drawn values of one round of `--roads varied`: its road, and the look of each scene."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -17,12 +17,12 @@ class VariedRound:
 
     @staticmethod
     def drawn(seed: int, lanes: int, scenes: int, model_height_m: float) -> "VariedRound":
-        """The round with `seed`, in pictures for a model whose camera is `model_height_m` high."""
+        """The round with `seed`, for a model whose camera is `model_height_m` above the road."""
         looks = tuple(RoadLook.drawn(seed, scene) for scene in range(scenes))
         return VariedRound(Carriageway.drawn(seed, lanes, model_height_m), looks)
 
     @staticmethod
     def from_dict(values: dict[str, Any]) -> "VariedRound":
-        """That with these values; raises KeyError, TypeError or ValueError for others."""
+        """The round with these values; KeyError, TypeError or ValueError for other values."""
         found: VariedRound = rebuilt(VariedRound, values)
         return found

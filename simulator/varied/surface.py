@@ -1,4 +1,4 @@
-"""The road's surface in one scene. Defaults are today's pictures."""
+"""The road's surface in one scene. The defaults leave the surface as the track's scenery has it."""
 
 from dataclasses import dataclass
 
@@ -8,33 +8,33 @@ class Surface:
     """The road's surface in one scene; see ranges.toml, section [surface]."""
 
     tone: float = 0.0
-    """Albedo of the asphalt; 0: that of the track's scenery."""
+    """Albedo of the asphalt; 0: the albedo of the track's scenery."""
     warmth: float = 0.0
-    """Of its colour: red above blue, as a share."""
+    """Excess of red over blue in the asphalt's colour, as a share."""
     other_tone: float = 0.0
-    """Albedo of the other material, sections of which interrupt the first; 0: none."""
+    """Albedo of a second material, whose sections alternate with the first; 0: no such material."""
     section_m: float = 100.0
-    """Mean length of a section of either material."""
+    """Mean length of a section of either material, m."""
     concrete: float = 0.0
-    """Share of the sections that is concrete slabs; negative: the other material is."""
+    """Sections made of concrete slabs: 0 none, 1 those of both materials, -1 the second's only."""
     joint_m: float = 5.0
-    """Distance of the joints between concrete slabs."""
+    """Distance between the joints of concrete slabs."""
     halves: float = 0.0
     """Difference in tone of the two sides of a lengthwise seam, as a share."""
     seam_m: float = 0.0
-    """Place of that seam, left of the road's centre."""
+    """Lateral position of that seam, left of the road's centre."""
     tar: float = 0.0
     """How many of the seams and cracks are filled with tar, 0 to 1."""
     patches: float = 0.0
     """Share of the surface in patches of another tone."""
     patch_tone: float = 0.7
     tracks: float = 0.14
-    """How much darker wheels have made the surface; negative: brighter."""
+    """Share by which wheels have darkened the surface; negative: brightened."""
     grain: float = 1.0
     puddles: float = 0.0
     """Share of the surface under water."""
     ragged_m: float = 0.0
-    """How far the asphalt's edge wanders."""
+    """How far the asphalt's edge deviates from a straight line."""
     gravel_m: float = 0.0
     """Width of a strip of gravel beside the asphalt."""
     kerb_m: float = 0.0

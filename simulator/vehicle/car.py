@@ -77,13 +77,13 @@ class CarParameters:
     camber_gain_front: float = 1.048
     """Factor of the wheels' camber on the friction: 1 + 0.05 sin(18 camber), camber 4 deg."""
     camber_gain_rear: float = 1.040
-    """The same, camber 3 deg."""
+    """Factor of the rear wheels' camber, 3 deg, on the friction."""
     working_load: float = 1.2
     """Load at which the friction is nominal, over the static load without fuel."""
     friction_unloaded: float = 1.6
-    """Friction at zero load over the nominal one; it falls exponentially with the load ..."""
+    """Friction at zero load over the nominal one; it falls exponentially with the load."""
     friction_overloaded: float = 0.8
-    """... to this factor at infinite load."""
+    """Friction at infinite load over the nominal one."""
     rolling_resistance: float = 0.001
     """Rolling resistance force over load, on asphalt."""
 

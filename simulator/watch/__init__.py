@@ -19,8 +19,8 @@ __all__ = ["Watcher"]
 
 
 def __getattr__(name: str) -> Any:
-    # Only when asked for: the command says what is wrong with its options before PyBullet, which
-    # prints a line of its own, is loaded.
+    # Imported on request: the command reports bad options before PyBullet, which prints a line of
+    # its own, is loaded.
     if name == "Watcher":
         from simulator.watch.watcher import Watcher
 

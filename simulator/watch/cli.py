@@ -22,7 +22,7 @@ class WatchConfig:
     light: str = "clear"
     host: str = "127.0.0.1"
     port: int = 8765
-    """0: any free one; the first line says which."""
+    """0: any free port, which the first line names."""
     speed: float = 1.0
     """Simulated seconds per second of wall-clock time."""
     seed: int = 0
@@ -38,11 +38,11 @@ def watch(
     ] = WatchConfig.light,
     host: Annotated[str, typer.Option(help="Address to listen on.")] = WatchConfig.host,
     port: Annotated[
-        int, typer.Option(help="Port to listen on; 0: any free one.", min=0, max=65535)
+        int, typer.Option(help="Port to listen on; 0: any free port.", min=0, max=65535)
     ] = WatchConfig.port,
-    speed: Annotated[float, typer.Option(help="Times real time.")] = WatchConfig.speed,
+    speed: Annotated[float, typer.Option(help="Multiple of real time.")] = WatchConfig.speed,
     seed: Annotated[
-        int, typer.Option(help="Fixes scenery, light and traffic.", min=0)
+        int, typer.Option(help="Seed of scenery, light and traffic.", min=0)
     ] = WatchConfig.seed,
     tracks_dir: TracksDir = WatchConfig.tracks_dir,
 ) -> None:

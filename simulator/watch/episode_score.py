@@ -36,7 +36,7 @@ class Score:
         return passed
 
     def as_dict(self) -> dict[str, float | int | str | None]:
-        """For the state message."""
+        """The score's entries of the state message."""
         steps = max(self.steps, 1)
         return {
             "episode": self.episode,

@@ -25,7 +25,7 @@ FIRST_VIEW: Final = "chase"
 START_S: Final = 10.0
 STOP_S: Final = 2.0
 POLICY_VIOLATION, TRY_LATER = 1008, 1013
-# The page loads nothing from anywhere, and may not.
+# The page loads nothing from other hosts, and this policy forbids it.
 POLICY: Final = (
     "default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'; "
     "img-src data: blob:; connect-src 'self' ws: wss:; base-uri 'none'; form-action 'none'"
@@ -110,9 +110,9 @@ async def _receive(connection: WebSocket, hub: Hub, browser: Browser) -> None:
 
 
 def _own_page(connection: WebSocket) -> bool:
-    """Whether a page of this server asks, not one of another site in the same browser."""
+    """Whether the request comes from a page of this server, not from another site's page."""
     origin = connection.headers.get("origin")
-    if origin is None:  # no browser
+    if origin is None:  # not a browser: browsers always send an origin
         return True
     return urlsplit(origin).netloc == connection.headers.get("host")
 
@@ -137,8 +137,8 @@ class Server:
             time.sleep(0.005)
 
     def stop(self) -> None:
-        """Close all connections and end the thread; browsers see that the drive is over."""
-        self._server.should_exit = self._server.force_exit = True  # wait for no browser
+        """Close all connections and end the thread; browsers show that the drive is over."""
+        self._server.should_exit = self._server.force_exit = True  # does not wait for browsers
         self._thread.join(STOP_S)
         self._listener.close()
 

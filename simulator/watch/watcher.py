@@ -22,26 +22,26 @@ SHOW_S: Final = 1.0 / 20.0
 
 @dataclass(frozen=True, slots=True)
 class Perceived:
-    """What a driver knows of the road; drawn beside the truth."""
+    """A driver's estimate of the road, drawn beside the true values."""
 
     to_middle: float | None
-    """m, left positive; None where it knows nothing."""
+    """m, left positive; None if it is unknown."""
     angle: float
     """rad, track tangent minus yaw."""
 
     def as_dict(self) -> dict[str, float | None]:
-        """For the state message."""
+        """The estimate's entries of the state message."""
         offset = None if self.to_middle is None else round(self.to_middle, 3)
         return {"to_middle": offset, "angle": round(self.angle, 5)}
 
 
 class Watcher:
-    """Shows the world of whatever is passed to `update`; `url` is where.
+    """Shows the world of the argument of `update` in the browser, at the address `url`.
 
-    While no browser looks, an update costs microseconds; while one does, a picture is taken at most
-    20 times a second. `speed` holds the drive to so many times real time, None lets it run; `seed`
-    fixes the scenery. Use it from the thread that steps the environment. Raises UserError when the
-    port is in use.
+    Without a browser an update costs microseconds; with one, at most 20 pictures a second are
+    taken. `speed` limits the drive to this multiple of real time, None sets no limit; `seed` fixes
+    the scenery. Use it from the thread that steps the environment. Raises UserError when the port
+    is in use.
     """
 
     def __init__(
@@ -68,11 +68,11 @@ class Watcher:
         sys.stderr.write(f"watch at {self.url}\n")
 
     def update(self, drive: Any, perceived: Perceived | None = None) -> None:
-        """Show `drive` as it is now: a World, or an environment of this package, wrapped or not;
-        `perceived` is what its driver knows of the road.
+        """Show the present state of `drive`: a World, or an environment of this package, wrapped or
+        not; `perceived` is its driver's estimate of the road.
 
-        Call it after every reset and step. Raises UserError for something else, NoRendererError
-        where nothing can draw.
+        Call it after every reset and step. Raises UserError for anything else, NoRendererError
+        without a renderer.
         """
         world = _world_of(drive)
         if world.road is not self._road:
@@ -88,7 +88,7 @@ class Watcher:
             self._pacer.wait()
 
     def close(self) -> None:
-        """End the server; browsers say that the drive is over."""
+        """End the server; browsers show that the drive is over."""
         self._server.stop()
         if self._renderer is not None:
             self._renderer.close()
@@ -109,7 +109,7 @@ class Watcher:
             self._pacer = Pacer(1.0 / world.frequency_hz, self._speed)
 
     def _handle_requests(self) -> None:
-        """Handle requests for another light; all others would change the drive and are ignored."""
+        """Handle requests for a light; other requests would change the drive and are ignored."""
         requests, _ = self._hub.take_requests()
         for _, request in requests:
             if request.kind == "light" and self._renderer is not None:

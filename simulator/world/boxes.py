@@ -72,7 +72,7 @@ def boxes_overlap(a: FloatArray, b: FloatArray, margin: float) -> bool:
             return False
         if abs(distance) > half_b[i] + reach_a + margin:
             return False
-    for i in range(3):  # the nine products of an edge of each
+    for i in range(3):  # the nine cross products of an edge of each box
         i1, i2 = (i + 1) % 3, (i + 2) % 3
         for j in range(3):
             length = math.sqrt(max(1.0 - cosines[i, j] ** 2, 0.0))

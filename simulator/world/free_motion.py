@@ -83,8 +83,8 @@ def advance_free(
 ) -> int:
     """Advance the ego car from physics step `done` of `steps` until it touches something.
 
-    `margin` (m) as in `touches`, before the first of these steps; 0 from then on. Returns the
-    number of steps then done.
+    `margin` (m) as in `touches` applies before the first of these steps, and 0 afterwards. Returns
+    the number of steps then done.
     """
     wrench = np.empty(6)
     while done < steps:

@@ -9,7 +9,7 @@ from trackfeatures.errors import UserError
 
 SPEEDS: Final = (0.05, 100.0)
 MAX_CATCH_UP_S: Final = 0.25
-"""A delay of a watched drive that is longer than this is not made up."""
+"""Delays of a watched drive that are longer than this are not made up."""
 WINDOW_S: Final = 1.5
 """Time over which a rate is measured."""
 
@@ -68,7 +68,7 @@ class Pacer:
         self.restart()
 
     def restart(self) -> None:
-        """The next step is due one interval from now."""
+        """Start the timing anew: the next step is due one interval from now."""
         self._due = self._clock() + self._interval
 
     @property
@@ -77,8 +77,8 @@ class Pacer:
         return self._clock() > self._due
 
     def wait(self) -> bool:
-        """Sleep until the next step is due; returns whether it was late by more than
-        `catch_up_s`, which is not made up."""
+        """Sleep until the next step is due. Returns whether it was late by more than `catch_up_s`;
+        a delay beyond that is not made up."""
         ahead = self._due - self._clock()
         late = ahead < -self._catch_up_s
         if ahead > 0.0:

@@ -1,4 +1,4 @@
-"""Rounds with damaged content whose CRCs are right, as a fault of the program that wrote them."""
+"""Makes rounds with damaged content but correct CRCs, as a faulty writer would."""
 
 import zlib
 

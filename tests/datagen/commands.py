@@ -1,4 +1,4 @@
-"""Running the command and making jobs: what the tests of collection share."""
+"""Shared by the tests of collection: runs the command and makes jobs."""
 
 import subprocess
 import sys
@@ -29,7 +29,7 @@ def datagen(
 
 
 def datagen_here(*args: object) -> subprocess.CompletedProcess[str]:
-    """The command in this process: for those that start no others."""
+    """Run the command in this process; for commands that start no other processes."""
     return typed("datagen", *args)
 
 

@@ -1,4 +1,4 @@
-"""Rounds made without a simulator, and datasets of them: what the tests of recording share."""
+"""Shared by the tests of recording: rounds made without a simulator, and datasets of them."""
 
 import json
 import sys
@@ -81,7 +81,7 @@ class Samples:
 def refused(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> Callable[..., str]:
-    """Runs the command in this process; returns the one line that it was refused with."""
+    """Runs the command in this process; returns the one line of its error message."""
 
     def run(*args: object) -> str:
         monkeypatch.setattr(sys, "argv", ["datagen", *map(str, args)])
@@ -97,7 +97,7 @@ def refused(
 
 @pytest.fixture(scope="session")
 def collected(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two short rounds; a test that changes them puts them back."""
+    """Two short rounds; a test that changes them must restore them."""
     folder = tmp_path_factory.mktemp("collect") / "data"
     done = datagen("collect", *SHORT, "--out", folder, "--workers", "2", "--json")
     assert done.returncode == 0, done.stderr

@@ -1,7 +1,7 @@
 """Brute-force range beams, the reference for `simulator.sensors.beams` in tests and benchmarks.
 
-Both edges of the road are polylines and the other cars rectangles; a beam ends at the nearest of
-all these segments that it intersects. Metres, radians; about 1 ms per pose.
+Both edges of the road are polylines, other cars are rectangles; a beam ends at the nearest segment
+that it intersects. Metres, radians; about 1 ms per pose.
 """
 
 import math
@@ -61,8 +61,8 @@ def cut_by(
     directions: FloatArray,
     distances: FloatArray,
 ) -> None:
-    """Shorten `distances` (n,) of rays from (x, y) to the nearest of the segments (m, 2) that they
-    intersect."""
+    """Shorten `distances` (n,) of rays from (x, y) to the nearest segment (m, 2) that each ray
+    intersects."""
     for i in range(directions.shape[0]):
         ray_x, ray_y = math.cos(directions[i]), math.sin(directions[i])
         for k in range(starts.shape[0]):

@@ -17,13 +17,14 @@ from trackfeatures.measurement import LineOffsets
 TOLERANCE_M = 1e-4
 SHIFTS_M = (0.0, -TOLERANCE_M, TOLERANCE_M)
 MAX_HEIGHT_M = 1.0
-"""Distances are measured from the foot of the centre of gravity on the road plane, `to_middle` is
-recorded vertically below it. They are apart by the height times the tangent of the banking, which
-the roll angle shows; the suspension adds to the roll, and a jump to the height."""
+"""Largest height of the centre of gravity above the road plane. Distances are measured from its
+foot on the road plane, but `to_middle` is recorded vertically below it. The two differ by the
+height times the tangent of the banking, which the roll angle shows; the suspension adds to the
+roll, and a jump to the height."""
 FOOT_SLACK_M = 0.005
 
 _Lines = tuple[int, float, LineOffsets]
-"""Number of lanes, their width in m, and offsets of the lines as of `trackfeatures.measure`."""
+"""Number of lanes, their width in m, and line offsets as in `trackfeatures.measure`."""
 
 
 def label_problems(
@@ -35,7 +36,7 @@ def label_problems(
 ) -> Iterator[str]:
     """Contradictions to the definitions in the labels of one round, one line per kind.
 
-    `roll` (N,) in rad is the car's, which bounds where its foot on a banked road may be.
+    `roll` (N,): the car's roll, rad; it bounds the position of the car's foot on a banked road.
     """
     try:
         tf.check_lanes(lanes, lane_width_m)
@@ -98,7 +99,7 @@ def _centre_follows(labels: Labels) -> NDArray[np.bool_]:
 def _close(
     expected: NDArray[np.float64], found: NDArray[np.floating[Any]], tolerance: float
 ) -> NDArray[np.bool_]:
-    """Where both are NaN, or both are present and differ by at most `tolerance`."""
+    """Mask: both are NaN, or both are present and differ by at most `tolerance`."""
     absent = np.isnan(expected) & np.isnan(found)
     same: NDArray[np.bool_] = absent | (np.abs(expected - found) <= tolerance)
     return same

@@ -91,7 +91,7 @@ def recover(file: Path, out: Path | None = None) -> Recovered:
     try:
         state = _write(partial, header, intact, recovery)
         if in_dataset:
-            # The state first: the file is what readers look for, and what may not exist before.
+            # The state is written first: readers look for the round file, which must come last.
             write_state(folder, state)
         atomic_move(partial, target)
     finally:

@@ -92,7 +92,7 @@ def _summary_bounds(view: memoryview) -> tuple[int, int]:
     if (opcode, length) != (Opcode.FOOTER, FOOTER.size - 9):
         raise ValueError("its footer is missing or damaged")
     if start and not len(MAGIC) + DATA_END.size <= start <= footer_at:
-        raise ValueError("its footer does not say where the index is")
+        raise ValueError("its footer has no position of the index")
     covered = footer_at + FOOTER.size - CRC_BYTES
     if start and crc and zlib.crc32(view[start:covered]) != crc:
         raise ValueError("its index is damaged (the summary's CRC)")

@@ -42,8 +42,8 @@ from datagen.recording.round_metadata import (
 )
 from datagen.recording.schema import topics
 
-# What the official reader and this one raise on bytes that are no MCAP file; MemoryError when a
-# damaged length asks for too much.
+# Exceptions of the official reader and this one on bytes that are not an MCAP file; MemoryError
+# comes from a damaged length.
 DAMAGE_ERRORS = (
     McapError, ValueError, KeyError, TypeError, IndexError, OverflowError, struct.error,
     MemoryError,

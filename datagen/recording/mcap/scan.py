@@ -174,7 +174,7 @@ class _Scanner:
     def _footer(self, before: int, body: bytes, summary_at: int) -> None:
         start, offsets, _ = struct.unpack("<QQI", body)
         if start not in (0, summary_at):
-            self._found.problems.append("its footer does not say where the index is")
+            self._found.problems.append("its footer has no position of the index")
         head = FOOTER.pack(Opcode.FOOTER, len(body), start, offsets, 0)[:-CRC_BYTES]
         self._check_crc(
             zlib.crc32(head, before), body[-CRC_BYTES:], "its index is damaged (its CRC)"

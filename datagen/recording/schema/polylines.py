@@ -1,7 +1,7 @@
 """The markings recorded over an image: pixel polylines read back from its annotations.
 
 Frame: pixels, a pixel's centre at whole numbers. Foxglove's annotations count from the upper left
-corner of the image instead: `CORNER_PX` is between the two.
+corner of the image instead; `CORNER_PX` is the difference.
 """
 
 import numpy as np

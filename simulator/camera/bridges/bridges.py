@@ -49,14 +49,14 @@ class Bridge:
         return np.asarray(direction @ _turn(self.heading))
 
     def near(self, x: FloatArray, y: FloatArray, margin_m: float | FloatArray) -> NDArray[np.bool_]:
-        """Which places lie within `margin_m` of its footprint."""
+        """Mask of the places that lie within `margin_m` of its footprint."""
         own = self.inside(np.stack([x, y, np.zeros_like(x)], axis=-1))
         along, across = np.abs(own[..., 0]), np.abs(own[..., 1])
         return (along < self.half_along + margin_m) & (across < self.half_across + margin_m)
 
 
 def _turn(heading: float) -> FloatArray:
-    """Rotation (3, 3) from a bridge's frame to the world; row vectors times it go the other way."""
+    """Rotation (3, 3): turn @ column maps a bridge's frame to the world, row @ turn the reverse."""
     cos, sin = np.cos(heading), np.sin(heading)
     return np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
 
@@ -67,7 +67,7 @@ def free_of(
     y: FloatArray,
     margin_m: float | FloatArray = KEEP_FREE_M,
 ) -> NDArray[np.bool_]:
-    """Which places are farther than `margin_m` from every bridge."""
+    """Mask of the places that are farther than `margin_m` from every bridge."""
     free = np.ones(np.shape(x), dtype=np.bool_)
     for bridge in bridges:
         free &= ~bridge.near(x, y, margin_m)
@@ -75,8 +75,8 @@ def free_of(
 
 
 def build(ground: Ground, theme: Theme, rng: np.random.Generator) -> tuple[Bridge, ...]:
-    """The bridges of a scene, about one every `theme.bridge_every_m`, none on another part of the
-    track."""
+    """The bridges of a scene, about one every `theme.bridge_every_m`. No bridge stands on another
+    part of the track."""
     if not theme.bridges:
         return ()
     length = ground.road.track.length_m
@@ -98,8 +98,8 @@ def build(ground: Ground, theme: Theme, rng: np.random.Generator) -> tuple[Bridg
 
 
 def _clear_of_the_road(ground: Ground, points: FloatArray, z: float) -> bool:
-    """Whether all parts lower than HEADROOM_M lie outside the wall lines of every part of the
-    track; in a bend an embankment may not."""
+    """Whether all bridge parts lower than HEADROOM_M lie outside the wall lines of every part of
+    the track. In a bend, an embankment can reach inside them."""
     corners = points.reshape(-1, 3, 3)
     edges = (corners + np.roll(corners, 1, axis=1)) / 2.0
     every = np.concatenate([points, edges.reshape(-1, 3)])

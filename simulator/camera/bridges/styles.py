@@ -49,7 +49,7 @@ class BridgeBuilder:
     def box_without_shadow(
         self, size: Point, at: Point, colour: Point, material: float = PLAIN
     ) -> None:
-        """The same for a box too thin to cast a visible shadow."""
+        """Add a closed box that is too thin to cast a visible shadow."""
         self._parts.append(box(size, at, colour, material, floor=True))
 
     def shadow_box(self, size: Point, at: Point) -> None:
@@ -69,8 +69,8 @@ class BridgeBuilder:
         self._parts.append(face(corners, uv, colour, material))
 
     def board(self, size: tuple[float, float], at: Point, colour: Point, facing: float) -> None:
-        """A lettered board (width, height) across the road, its lower edge at `at`; `facing` 1 for
-        traffic that drives along +x, -1 for the other way."""
+        """A lettered board (width, height) across the road, its lower edge at `at`. `facing` is 1
+        for traffic along +x, -1 for traffic along -x."""
         wide, high = size
         left, up = np.array([0.0, facing * wide / 2, 0.0]), np.array([0.0, 0.0, high])
         front = np.array(at) - np.array([0.045 * facing, 0.0, 0.0])

@@ -33,9 +33,9 @@ MAX_SIZE = 4096
 DRIVER_CAMERA = CameraParameters()
 _OWN_PAINT = 0
 PARKED_REACH_M = 110.0
-"""Parked cars farther off are not drawn."""
+"""Parked cars farther away than this are not drawn."""
 HEADLIGHT_AT = (2.1, 0.0, 0.4)
-"""Of both headlights, in the body frame, metres."""
+"""Position that stands for both headlights, in the body frame, metres."""
 
 
 def check_size(width: int, height: int) -> None:
@@ -58,7 +58,7 @@ class _LoadedScene:
     first_paint: int
     cars: Cars
     imaging: Imaging | None
-    """None: the rendered picture is the recorded one."""
+    """None: the rendered picture is recorded unchanged."""
 
 
 @dataclass(frozen=True)
@@ -72,8 +72,8 @@ class _Shot:
 
 
 class Camera:
-    """Draws one scene: `road` with the scenery of `seed` under `light`, and its `look` on varied
-    roads (None: as the paper's).
+    """Draws one scene: `road` with the scenery of `seed` under `light`. `look` is the look of a
+    varied road, None for the paper's roads.
 
     It keeps the last `scenes` scenes in graphics memory. Cameras of a process share one OpenGL
     context (see `context`); any thread may use them, and they draw one after the other. The same
@@ -140,7 +140,7 @@ class Camera:
             Sky(graphics, light.weather, float(self._drawn_intrinsics[0, 0])),
             Precipitation(graphics, light, seed) if light.falling > 0.0 else None,
             frame,
-            # Cars of different rounds differ in colour; index 0 is that of our own car.
+            # Cars of different rounds differ in colour; index 0 is the ego car's colour.
             first_paint=1 + seed % 5,
             cars=shared_cars(graphics, *([NIGHT] if look and look.light.night else [])),
             imaging=Imaging(look, light, self.parameters, scene.bridges) if look else None,
@@ -151,8 +151,8 @@ class Camera:
     ) -> Picture:
         """The picture (height, width, 3) uint8 RGB of `view` from a car at `body_pose`.
 
-        `body_pose` (6,) is x, y, z, roll, pitch, yaw of the centre of gravity; `others` (n, 6)
-        the same of other cars, z at the ground they stand on.
+        `body_pose` (6,) is x, y, z, roll, pitch, yaw of the centre of gravity; `others` (n, 6) are
+        the poses of other cars, with z at the ground below each car.
         """
         return self._views(body_pose, others, {view: ViewRequest(view)})[view]
 
@@ -166,9 +166,10 @@ class Camera:
 
         "front" (any of VIEWS) is the colour picture (height, width, 3) uint8; "front:depth" the
         distance along the optical axis (height, width) float32 in metres, inf in the sky;
-        "front:class" the number in CLASSES (height, width) uint8. Depth and class are those of
-        what the middle of the pixel shows, of leaves and hedges where they are more than half
-        opaque. Kinds of one view share its work. Raises UserError for an unknown view or kind.
+        "front:class" the index into CLASSES (height, width) uint8. Depth and class belong to the
+        surface at the pixel's centre; leaves and hedges count where they are more than half
+        opaque. All kinds of one view share one culling pass. Raises UserError for an unknown view
+        or kind.
         """
         return self._views(body_pose, others, {name: ViewRequest.of(name) for name in views})
 
@@ -194,7 +195,7 @@ class Camera:
         return {name: taken[each] for name, each in wanted.items()}
 
     def _prepare(self, body_pose: ArrayLike, others: ArrayLike | None, view: str) -> _Shot:
-        """Bind the frame of a view and cull what it does not show."""
+        """Fill the uniforms of a view, and cull the parts of the scene that it does not show."""
         loaded = self._loaded
         eye = optics.eye_of(self.parameters, body_pose, view)
         self._set_headlights(loaded.frame, np.asarray(body_pose, dtype=np.float64), eye)
@@ -222,14 +223,14 @@ class Camera:
         return drawn if self._lens is None else self._lens.colours(drawn)
 
     def _recorded(self, picture: NDArray[np.uint8], shot: _Shot, view: str) -> NDArray[np.uint8]:
-        """What the sensor makes of a rendered picture; of the driver view only."""
+        """`picture` after lens, cabin and sensor for the driver view; unchanged for other views."""
         imaging = self._loaded.imaging
         if imaging is None or view != "front":
             return picture
         return imaging.developed(picture, shot.eye, self._s_of(*shot.eye.place[:2].tolist()))
 
     def _draw_labels(self, shot: _Shot) -> NDArray[np.float32]:
-        """Depth and class (height, width, 2) of what `_draw_colours` draws, rain and snow apart."""
+        """Depth and class (height, width, 2) of the scene without rain and snow."""
         target = self._graphics.targets.of(self._drawn.width, self._drawn.height, labels=True)
         self._graphics.begin(target, labels=True)
         self._loaded.cars.draw(shot.cars, shot.paints, shot.eye.place, labels=True)
@@ -255,8 +256,8 @@ class Camera:
         return optics.project(eye, self.parameters, points)
 
     def close(self) -> None:
-        """Free the graphics memory, or leave it to the thread that is drawing; a closed camera
-        cannot render."""
+        """Free the graphics memory; while another thread draws, that thread frees it afterwards.
+        A closed camera cannot render."""
         self._cache, self._current = {}, None
         self._graphics.turns.free_if_idle()
 
@@ -273,7 +274,7 @@ class Camera:
         return self._loaded.scene.mask.fraction(s, self.road.half_asphalt)
 
     def _s_of(self, x: float, y: float) -> float:
-        """Place along the road of (x, y)."""
+        """Distance s (m) along the road of the point (x, y)."""
         self._last_s, _ = self.road.track.project(x, y, self._last_s)
         return self._last_s
 
@@ -305,13 +306,13 @@ class Camera:
     def _set_headlights(
         self, block: NDArray[np.float32], body_pose: FloatArray, eye: optics.Eye
     ) -> None:
-        """Fill the rows of the uniform block `Frame` that say where the car's headlights are."""
+        """Fill the rows of the uniform block `Frame` that hold the positions of the headlights."""
         turn = optics.rotation(*body_pose[3:].tolist())
         block[48:51] = body_pose[:3] + turn @ np.array(HEADLIGHT_AT) - eye.place
         block[52:55] = turn[:, 0]
 
     def _set_frame(self, block: NDArray[np.float32], eye: optics.Eye) -> None:
-        """Fill the uniform block `Frame` of frame.glsl, which `block` keeps."""
+        """Fill `block`, the uniform block `Frame` of frame.glsl."""
         drawn = self._drawn
         clip = optics.clip_matrix(eye, self._drawn_intrinsics, drawn.width, drawn.height)
         block[:16] = clip.T.reshape(-1)
@@ -329,7 +330,7 @@ def open_camera(road: Road, parameters: CameraParameters, *, light: str, seed: i
 
 
 def _light_rows(light: Light) -> list[tuple[float, ...]]:
-    """The rows of the uniform block `Frame` of light and air."""
+    """The rows of the uniform block `Frame` that describe light and air."""
     return [
         (*light.sun_direction, light.shade),
         (*light.sun, light.exposure),

@@ -1,6 +1,6 @@
 """The one OpenGL context of a process: EGL without a window, on a GPU or on Mesa's llvmpipe.
 
-Every thread may draw, each in its turn (see `turns`).
+Any thread can draw; only one thread draws at a time (see `turns`).
 
 On llvmpipe the environment variable LP_NUM_THREADS, read by Mesa when the context is made, sets
 the drawing threads: 0 draws in the calling thread, which suits one worker process a core.
@@ -48,13 +48,13 @@ LIBRARIES = ("output.glsl", "weather.glsl", "road.glsl", "sea.glsl")
 """Functions for fragment shaders."""
 BLOCKS = {"Frame": FRAME_BINDING, "Scene": SCENE_BINDING, "Look": LOOK_BINDING}
 VARIED = "varied"
-"""Feature of the programs of varied roads: they read the uniform block `Look` of look.glsl."""
+"""Feature of the programs for varied roads, which read the uniform block `Look` of look.glsl."""
 NIGHT = "night"
-"""Feature of the programs by night: their light is that of night.glsl."""
+"""Feature of the programs for night scenes, which are lit by night.glsl."""
 VARIED_LIBRARIES = ("paint.glsl", "surface.glsl")
-"""Functions for their fragment shaders."""
+"""Functions for the fragment shaders of varied roads."""
 WEATHER_PROGRAMS = ("sky", "land", "paved", "verge", "barrier", "prop", "tree")
-"""Programs with variants for rain and snow, so that dry scenes cost no more."""
+"""Programs with variants for rain and snow; dry scenes use the faster variant without them."""
 FRAME_FLOATS = 56
 NOISE_SIZE = 256
 NOISE_UNIT, SHADOW_UNIT, ATLAS_UNIT, SKY_UNIT = range(4)
@@ -69,7 +69,7 @@ class NoRendererError(UserError):
 class Graphics:
     """Context, programs and textures that every camera of the process shares.
 
-    All but `turns` is to be used inside a `with` block of `turns` only."""
+    Use everything except `turns` only inside a `with` block of `turns`."""
 
     def __init__(self) -> None:
         self.context, self.turns = _create_context()
@@ -113,8 +113,8 @@ class Graphics:
         return member
 
     def weather_program(self, name: str, weather: str, *features: str) -> str:
-        """Name in `programs` of program `name` as it is in `weather` ("" when dry), with what the
-        shaders define as `features` ("sea": the land has a shore)."""
+        """Key in `programs` of the variant of program `name` for `weather` ("" when dry) and for
+        `features`, which the shaders test by #ifdef ("sea": the land has a shore)."""
         defines = [*features, *([weather] if weather and name in WEATHER_PROGRAMS else [])]
         key = " ".join([name, *defines])
         if key not in self.programs:
@@ -122,7 +122,7 @@ class Graphics:
         return key
 
     def label_program(self, name: str) -> str:
-        """Name in `programs` of the program that draws what `name` draws as depth and class."""
+        """Key in `programs` of the program that draws depth and class in place of `name`."""
         program, *features = name.split()
         kept = [VARIED] if VARIED in features else []
         key = " ".join([program, *kept, "labels"])
@@ -163,7 +163,7 @@ class Graphics:
         components = texels.shape[2] if texels.ndim == 3 else 1
         texture = self.context.texture(texels.shape[1::-1], components, texels.tobytes())
         texture.build_mipmaps()
-        # The nearest mipmap alone: noise shows no step, and a frame is drawn 1 ms sooner.
+        # Reading only the nearest mipmap level saves 1 ms a frame; noise hides the steps.
         texture.filter = (self.context.LINEAR_MIPMAP_NEAREST, self.context.LINEAR)
         return texture
 
@@ -174,7 +174,7 @@ class Graphics:
 
 _shared: dict[int, Graphics] = {}
 _begun: set[int] = set()
-"""Process ids, also of processes that this one was forked from, that have made a context."""
+"""Ids of the processes that have made a context: this one, and those that it was forked from."""
 _making = [threading.Lock()]
 
 
@@ -182,7 +182,7 @@ def graphics() -> Graphics:
     """This process's graphics, made on first use.
 
     Raises NoRendererError without EGL, ForkedRendererError in a process that was forked from one
-    with graphics: Mesa's drawing threads are missing there, so that it would wait for ever.
+    with graphics: Mesa's drawing threads do not exist there, so drawing would never return.
     """
     process = os.getpid()
     if process not in _shared:
@@ -206,7 +206,7 @@ def _make(process: int) -> None:
 
 
 def _renew_lock() -> None:
-    """A thread that was not forked may have held the lock."""
+    """Replace the lock in a forked child: a thread of the parent may have held it."""
     _making[0] = threading.Lock()
 
 
@@ -218,7 +218,7 @@ def _source(name: str) -> str:
 
 
 def _create_context() -> "tuple[moderngl.Context, Turns]":
-    """A new context and its turns; what is current in this thread does not change."""
+    """A new context and its turns; the context that is current in this thread stays current."""
     import moderngl
 
     settings: dict[str, Any] = {"backend": "egl"}
@@ -232,8 +232,8 @@ def _create_context() -> "tuple[moderngl.Context, Turns]":
             f"no OpenGL 3.3 through EGL on this machine ({error}); "
             "install it with: apt-get install libegl1 libgl1 libgl1-mesa-dri"
         ) from error
-    # Objects that Python drops are freed in a turn: another thread, or a forked child, might drop
-    # them.
+    # Objects that Python drops are queued and freed in a turn: the garbage collector can run in a
+    # thread, or a forked child, that must not call OpenGL.
     context.gc_mode = "context_gc"
     own = egl.current()
     egl.give_back(own, before)
@@ -278,7 +278,7 @@ def _filtered(rng: np.random.Generator, power: float) -> NDArray[np.float64]:
 
 
 def _levelled(field: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Values spread evenly over [0, 1]: the rank of each."""
+    """The rank of each value, scaled to [0, 1]."""
     rank = np.empty(field.size)
     rank[np.argsort(field, axis=None, kind="stable")] = np.linspace(0.0, 1.0, field.size)
     return rank.reshape(field.shape)

@@ -18,11 +18,12 @@ def visible_runs(
     planes: FloatArray,
     runs: NDArray[np.int64],
 ) -> int:
-    """Fill `runs` (at least N, 2) with first index and number of indices to draw; how many runs.
+    """Fill `runs` (at least N, 2) with first index and number of indices; returns how many runs.
 
-    Chunk k lies in the sphere `spheres[k]` (centre, radius); of its levels of detail, (levels, N)
-    in `first` and `count`, the one is drawn whose reach is the first beyond the sphere's near end.
-    Chunks that end before `nearest` are left out; what lies together makes one run.
+    Chunk k lies in the sphere `spheres[k]` (centre, radius). Its levels of detail are rows of
+    `first` and `count` (levels, N). The first level whose reach exceeds the distance to the
+    sphere's near end is drawn. Chunks that end before `nearest` are left out; adjacent chunks are
+    merged into one run.
     """
     found, end = 0, -1
     for k in range(len(spheres)):
@@ -56,7 +57,7 @@ def visible_spheres(
     eye: FloatArray,
     planes: FloatArray,
 ) -> NDArray[np.int64]:
-    """Indices, nearest first, of the spheres in the frustum within `reach`; at most `most`."""
+    """Indices, nearest first, of at most `most` spheres in the frustum within `reach`."""
     chosen = np.empty(len(centres), dtype=np.int64)
     distance = np.empty(len(centres))
     found = 0

@@ -1,5 +1,5 @@
-"""Pictures through a lens with distortion: a pinhole view that covers the lens is drawn, and each
-pixel of the picture looked up in it. Pixels, centres at whole numbers.
+"""Renders a lens with distortion: a pinhole view that covers the lens is drawn, then each pixel of
+the picture is looked up in that view. In pixels; pixel centres have whole coordinates.
 """
 
 from dataclasses import dataclass, replace
@@ -15,20 +15,20 @@ from simulator.camera.core.render_modes import CLASSES
 from trackfeatures.camera import CameraParameters
 
 MAX_ANGLE_DEG = 72.0
-"""From the optical axis. One pinhole view covers no more; beyond it a picture is black."""
+"""Largest angle from the optical axis that one pinhole view covers; the picture is black beyond."""
 SHARPNESS = 1.5
-"""Pixels of the drawn view per pixel of the picture, along a line, where the lens enlarges most."""
-SAMPLES = 2  # looked up along each side of a pixel and averaged: a lens makes some places smaller
+"""Pixels of the drawn view per picture pixel, along a line, where the lens enlarges most."""
+SAMPLES = 2  # looked up along each side of a pixel and averaged: a lens shrinks some places
 MARGIN_PX = 2.0
-_OUTSIDE = -1e4  # of every view, px
+_OUTSIDE = -1e4  # px; outside every view
 
 Picture = NDArray[Any]
 
 
 @dataclass(frozen=True)
 class LensView:
-    """The view to draw for a camera with distortion, and where each of the camera's pixels is in
-    it: for colours (2, SAMPLES H, SAMPLES W), for depth and class (2, H, W), px."""
+    """The pinhole view to draw for a camera with distortion, and the position in it of each of the
+    camera's pixels: (2, SAMPLES H, SAMPLES W) for colours, (2, H, W) for depth and class, px."""
 
     drawn: CameraParameters
     colour_places: NDArray[np.float32]
@@ -36,7 +36,7 @@ class LensView:
 
     @classmethod
     def of(cls, camera: CameraParameters, max_size: int) -> Self:
-        """For a view of at most `max_size` px a side."""
+        """Build the view, at most `max_size` px a side."""
         rays, fine = (_seen(camera.rays(_grid(camera, samples))) for samples in (1, SAMPLES))
         drawn = _cover(camera, fine, max_size)
         k = drawn.intrinsics()
@@ -48,7 +48,7 @@ class LensView:
         return cls(drawn, *places)
 
     def colours(self, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """The lens's picture (H, W, 3) from the drawn one."""
+        """The lens's picture (H, W, 3) from the drawn view `picture`."""
         u, v = self.colour_places
         found = cv2.remap(picture, u, v, cv2.INTER_LINEAR)
         height, width = self.label_places.shape[1:]
@@ -57,7 +57,7 @@ class LensView:
         )
 
     def labels(self, labels: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Depth and class (H, W, 2) from the drawn ones; infinite and sky where nothing is seen."""
+        """Depth and class (H, W, 2) from the drawn view; infinity and sky outside the lens."""
         u, v = self.label_places
         found = cv2.remap(
             labels,
@@ -71,7 +71,7 @@ class LensView:
 
 
 def _grid(camera: CameraParameters, samples: int) -> FloatArray:
-    """Places (N, 2) of `samples` times `samples` points a pixel, row by row."""
+    """Pixel coordinates (N, 2) of `samples` x `samples` points in each pixel, row by row."""
     columns, rows = (
         (np.arange(size * samples) + 0.5) / samples - 0.5 for size in (camera.width, camera.height)
     )
@@ -85,8 +85,8 @@ def _seen(rays: FloatArray) -> FloatArray:
 
 
 def _cover(camera: CameraParameters, rays: FloatArray, max_size: int) -> CameraParameters:
-    """The camera without distortion that sees all of `rays`, of the places of
-    `_grid` with SAMPLES, no coarser than the lens."""
+    """The camera without distortion that covers `rays`, the rays of `_grid(camera, SAMPLES)`, at
+    the resolution of the lens or finer."""
     low, high = np.nanmin(rays[:, :2], axis=0), np.nanmax(rays[:, :2], axis=0)
     flat = rays[:, :2].reshape(camera.height * SAMPLES, camera.width * SAMPLES, 2)
     steps = [np.linalg.norm(np.diff(flat, axis=axis), axis=-1) for axis in (0, 1)]

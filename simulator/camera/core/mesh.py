@@ -26,9 +26,9 @@ class Surface:
 
 @dataclass(frozen=True)
 class Chunks:
-    """Runs of indices with their bounding boxes: lowest and highest corners (N, 3), and one row of
-    first index and number of indices a level of detail, (levels, N), the finest first; each up to
-    `reaches` m. They are culled by the spheres round the boxes."""
+    """Runs of indices that are culled together, by the spheres round their bounding boxes. `low`,
+    `high` (N, 3): corners of the boxes. `first`, `count` (levels, N): first index and number of
+    indices at each level of detail, finest first. Level k is drawn up to `reaches[k]` m."""
 
     low: FloatArray
     high: FloatArray
@@ -36,7 +36,7 @@ class Chunks:
     count: NDArray[np.int64]
     reaches: tuple[float, ...]
     nearest: float = 0.0
-    """Chunks wholly nearer than this are not drawn; a finer mesh covers them."""
+    """m; chunks that lie wholly nearer than this are not drawn, since a finer mesh covers them."""
 
 
 class Mesh:
@@ -79,8 +79,8 @@ def vertex_arrays(
     indices: "moderngl.Buffer | None",
     layout: Sequence[str],
 ) -> "tuple[moderngl.VertexArray, moderngl.VertexArray]":
-    """Vertex arrays of the same vertices: one draws them in their colours, one as depth and class.
-    A program may leave out a part of a vertex that it has no use for."""
+    """Two vertex arrays over the same vertices: the first draws colours, the second depth and
+    class. Vertex attributes that a program does not use are skipped."""
     drawn, labelled = (
         graphics.context.vertex_array(
             graphics.programs[name],

@@ -106,7 +106,7 @@ def project(eye: Eye, camera: CameraParameters, points: ArrayLike) -> tuple[Floa
 def _pixels(
     points: FloatArray, eye: FloatArray, axes: FloatArray, matrix: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """`project` point by point: called for every frame's markings, where numpy's calls add up."""
+    """`project` as a compiled loop, which costs less than numpy's calls for a frame's markings."""
     pixels, depth = np.empty((len(points), 2)), np.empty(len(points))
     for k in range(len(points)):
         x, y, z = points[k, 0] - eye[0], points[k, 1] - eye[1], points[k, 2] - eye[2]
@@ -130,7 +130,7 @@ def clip_matrix(eye: Eye, matrix: FloatArray, width: int, height: int) -> FloatA
     x_scale = 2.0 * matrix[0, 0] / width
     y_scale = 2.0 * matrix[1, 1] / height
     clip = np.zeros((4, 4))
-    # How far the principal point is off the middle, in half sides; 0 for a centred one.
+    # Offset of the principal point from the picture's middle, in half sides; 0 for a centred one.
     aside, below = ((2.0 * matrix[k, 2] + 1.0) / (width, height)[k] - 1.0 for k in (0, 1))
     clip[0, :3] = eye.axes[0] * x_scale + eye.axes[2] * aside
     clip[1, :3] = -eye.axes[1] * y_scale + eye.axes[2] * below

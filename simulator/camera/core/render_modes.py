@@ -7,8 +7,8 @@ from simulator.camera.core.optics import VIEWS
 from trackfeatures.errors import UserError
 
 CLASSES: tuple[str, ...] = ("road", "marking", "car", "ground", "sky", "object")
-"""Classes of a pixel by their number. `object` is all else beside the road: trees, rails,
-houses, signs; kerb, verge and terrain are `ground`; worn-off paint is `road`."""
+"""Classes of a pixel; the index is the class number. `object`: trees, rails, houses, signs and
+all else beside the road; `ground`: kerb, verge, terrain; worn-off paint is `road`."""
 
 COLOUR, DEPTH, CLASS = PICTURE_KINDS = ("colour", "depth", "class")
 

@@ -14,8 +14,8 @@ if TYPE_CHECKING:
     import moderngl
 
 GPU_SAMPLES = 4
-"""Samples per pixel on a GPU. On llvmpipe one: four took 24 ms a frame instead of 6, and road and
-paint are filtered in the shader anyway."""
+"""Samples per pixel on a GPU. llvmpipe uses one: four samples took 24 ms a frame instead of 6, and
+the shader filters road and paint anyway."""
 _KEPT = 16
 _SKY = float(CLASSES.index("sky"))
 
@@ -28,7 +28,7 @@ class Target:
     resolved: "moderngl.Framebuffer"
 
     def clear(self, labels: bool) -> None:
-        """Bind and clear it; labels are cleared to sky at infinity."""
+        """Bind the target and clear it; labels are cleared to sky at infinity."""
         self.drawn.use()
         if labels:
             self.drawn.clear(np.inf, _SKY)
@@ -42,7 +42,7 @@ class Target:
         width, height = self.resolved.size
         read = np.empty((height, width, 4), np.uint8)
         self.resolved.read_into(read, components=4)
-        # Mesa takes twice as long to leave out the alpha.
+        # Read with alpha: in Mesa, reading without it takes twice as long.
         return np.asarray(cv2.cvtColor(read, cv2.COLOR_RGBA2RGB), dtype=np.uint8)
 
     def labels(self) -> NDArray[np.float32]:
@@ -54,14 +54,14 @@ class Target:
 
 
 class Targets:
-    """The targets of a context by size; a limited number is kept."""
+    """Cache of a context's targets by size; it keeps a limited number."""
 
     def __init__(self, context: "moderngl.Context", samples: int) -> None:
         self._context, self._samples = context, samples
         self._kept: dict[tuple[int, int, bool], Target] = {}
 
     def of(self, width: int, height: int, labels: bool) -> Target:
-        """The target of this size, made on first use. Raises UserError where it cannot be."""
+        """The target of this size, made on first use. Raises UserError if it cannot be made."""
         key = (width, height, labels)
         if key not in self._kept:
             if len(self._kept) >= _KEPT:

@@ -1,7 +1,7 @@
-"""Which thread may use the process's one OpenGL context: each in its turn, a forked child never.
+"""Grants threads the process's one OpenGL context, one at a time; a forked child never gets it.
 
-OpenGL acts on the context that is current in the calling thread. Without one it does nothing and
-reports nothing: a picture drawn in another thread would be black, or the one before.
+OpenGL acts on the context that is current in the calling thread. Without one its calls silently do
+nothing: the picture would be black, or the previous one.
 """
 
 import ctypes
@@ -13,11 +13,11 @@ from typing import Final
 from trackfeatures.errors import UserError
 
 Current = tuple[int | None, int | None, int | None, int | None]
-"""What is current in a thread: display, surface drawn to, surface read from, context."""
+"""What is current in a thread: display, draw surface, read surface, context."""
 NOTHING: Final[Current] = (None, None, None, None)
 
 END_S: Final = 5.0
-"""The longest wait for another thread's picture at the end of the process."""
+"""Longest wait (s), at the end of the process, for another thread to finish its picture."""
 _DRAW, _READ = 0x3059, 0x305A
 _LIBRARY: Final = os.environ.get("GLCONTEXT_LINUX_LIBEGL") or "libEGL.so.1"
 """The library that moderngl's backend loads."""
@@ -40,7 +40,7 @@ class ContextError(UserError):
 
 
 class Egl:
-    """The calls of EGL that ask and set what is current. Raises OSError without the library."""
+    """The EGL calls that get and set the current context. Raises OSError without the library."""
 
     def __init__(self) -> None:
         library = ctypes.CDLL(_LIBRARY)
@@ -54,14 +54,14 @@ class Egl:
         self._make_current.argtypes = [pointer] * 4
 
     def current(self) -> Current:
-        """What is current in this thread."""
+        """The display, surfaces and context that are current in this thread."""
         context = self._context()
         if context is None:
             return NOTHING
         return self._display(), self._surface(_DRAW), self._surface(_READ), context
 
     def give_back(self, own: Current, before: Current) -> None:
-        """Make `before` current again, or nothing if nothing was, in place of `own`."""
+        """Make `before` current again in place of `own`; nothing, if nothing was current before."""
         self.make_current(before if before is not NOTHING else (own[0], None, None, None))
 
     def make_current(self, wanted: Current) -> None:
@@ -77,8 +77,8 @@ class Egl:
 class Turns:
     """A `with` block makes the context current in its thread; other threads wait for its end.
 
-    Blocks may be nested. At the end of the outermost, `free` is called, and what was current before
-    is so again, as another library expects it. A block costs 0.03 ms on llvmpipe.
+    Blocks may be nested. At the end of the outermost, `free` is called, and the context that was
+    current before is restored, since other libraries rely on it. A block costs 0.03 ms on llvmpipe.
     """
 
     def __init__(self, egl: Egl, own: Current, free: Callable[[], object]) -> None:
@@ -88,7 +88,7 @@ class Turns:
         self._lock, self._depth = threading.RLock(), 0
 
     def __enter__(self) -> None:
-        if self._inherited:  # a thread that was not forked may hold the lock
+        if self._inherited:  # a thread of the parent process may have held the lock
             raise ForkedRendererError(FORKED)
         self._lock.acquire()
         try:
@@ -110,8 +110,8 @@ class Turns:
             self._lock.release()
 
     def free_if_idle(self) -> None:
-        """Call `free` now, or leave it to the block that is open. It never waits, so that the
-        garbage collector can call it in any thread; in a forked child it does nothing."""
+        """Call `free` now, or at the end of the open block. It never waits, so the garbage
+        collector can call it in any thread; in a forked child it does nothing."""
         if not self._inherited and self._lock.acquire(blocking=False):
             try:
                 if self._depth == 0:
@@ -121,8 +121,8 @@ class Turns:
                 self._lock.release()
 
     def end(self) -> None:
-        """At the end of the process, let no other thread draw any more: CPython aborts where it
-        stops a daemon thread inside OpenCV."""
+        """Stop all drawing at the end of the process: CPython aborts if it stops a daemon thread
+        inside OpenCV."""
         if not self._inherited:
             self._lock.acquire(timeout=END_S)
 

@@ -1,5 +1,5 @@
-"""The fixed part of what stands before the sensor: bonnet, windscreen dirt and reflections, and
-the lens's vignette, as a gain and an addition to each pixel's linear light."""
+"""Effects of bonnet, windscreen dirt, reflections and vignette that stay constant in a scene, as a
+gain and an addition to each pixel's linear light."""
 
 from dataclasses import dataclass
 
@@ -30,7 +30,7 @@ class Glass:
 
 
 def glass_of(look: RoadLook, light: Light, width: int, height: int) -> Glass:
-    """What cabin and lens of `look` do to a picture of `width` x `height` in `light`."""
+    """The effects of the cabin and lens of `look` on a `width` x `height` picture in `light`."""
     cabin, lens = look.cabin, look.lens
     rng = np.random.default_rng([cabin.shape, 1])
     scene = surrounding_light(light, night=look.light.night)
@@ -48,7 +48,7 @@ def glass_of(look: RoadLook, light: Light, width: int, height: int) -> Glass:
 
 
 def surrounding_light(light: Light, night: bool) -> FloatArray:
-    """Linear RGB of a grey surface in the open, as displayed; by night the sky alone lights it."""
+    """Linear RGB of a grey surface in the open, as displayed; by night only the sky lights it."""
     sun = 0.0 if night else np.array(light.sun) * np.sin(light.sun_elevation)
     return np.asarray(0.5 * light.exposure * (np.array(light.sky) + sun))
 
@@ -61,7 +61,7 @@ def vignette(loss: float, width: int, height: int) -> FloatArray:
 
 
 def bonnet_edge(cabin: Cabin, width: int, height: int) -> FloatArray:
-    """Rows (W,) from the bottom that the bonnet covers; the highest of them is its share."""
+    """Number of rows (W,), from the bottom, that the bonnet covers; the largest is its share."""
     rng = np.random.default_rng([cabin.shape, 2])
     x = (np.arange(width) + 0.5) / width * 2.0 - 1.0 - rng.normal(0.0, 0.15)
     drop = rng.uniform(0.05, 0.9) * np.abs(x) ** rng.uniform(1.6, 4.5)
@@ -88,7 +88,7 @@ def _bonnet(
     blur = rng.uniform(0.4, 2.0) * width / REFERENCE_WIDTH
     soft = cv2.GaussianBlur(cover, (0, 0), blur, borderType=cv2.BORDER_REPLICATE)
     share = np.clip(below / max(cabin.bonnet * height, 1.0), 0.0, 1.0)
-    # At a flat angle the far end of the bonnet mirrors the sky over the horizon.
+    # Seen at a flat angle, the far end of the bonnet mirrors the sky over the horizon.
     mirror = (0.0 if dashboard else rng.uniform(0.1, 0.45)) * np.exp(-share * rng.uniform(2.0, 7.0))
     streaks = cv2.GaussianBlur(rng.standard_normal((height, width)), (0, 0), 9.0, sigmaY=2.0)
     mirror = mirror * (1.0 + 1.5 * streaks / max(float(streaks.std()), 1e-9) * 0.2)
@@ -108,7 +108,7 @@ def _dirt(width: int, height: int, rng: np.random.Generator) -> FloatArray:
 
 
 def _reflections(width: int, height: int, rng: np.random.Generator) -> FloatArray:
-    """What of the dashboard the windscreen mirrors (H, W), 0 to 1, mostly in its lower part."""
+    """Reflections of the dashboard in the windscreen (H, W), 0 to 1, mostly in its lower part."""
     layer = np.zeros((height, width), dtype=np.float32)
     for _ in range(rng.integers(2, 7)):
         middle = rng.uniform([-0.1, 0.35], [1.1, 1.1]) * (width, height)

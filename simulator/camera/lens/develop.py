@@ -11,7 +11,7 @@ from runtime.jit import compiled
 
 NOISE_SIZE = 2**17
 NOISE_STEPS = 32.0
-"""Steps of the noise table a standard deviation."""
+"""Integer steps of the noise table per standard deviation."""
 MOST_TAPS = 6
 LEAST_BLUR_PX = 0.75
 
@@ -20,7 +20,7 @@ Plane = NDArray[np.float32]
 
 
 def noise_table() -> NDArray[np.int8]:
-    """Normal noise (NOISE_SIZE,), in NOISE_STEPS a standard deviation."""
+    """Normal noise (NOISE_SIZE,) in units of 1 / NOISE_STEPS standard deviations."""
     rng = np.random.default_rng(20261126)
     drawn = np.rint(rng.standard_normal(NOISE_SIZE) * NOISE_STEPS)
     return np.clip(drawn, -127, 127).astype(np.int8)
@@ -40,12 +40,12 @@ def develop(
 ) -> Picture:
     """The developed picture (H, W, 3) of `picture` (H, W, 3).
 
-    `gain` and `add` (H, W, 3), then the factor `exposure`, apply to linear light, 1 the brightest
-    that is displayed. `motion`: u, v of the point the car moves to, height of the camera times
-    focal length (m px), and way during the exposure (m). `glare`: u, v of the sun and strength.
-    `noise`: standard deviation in display values of 0 to 255, and the seed of this picture.
-    `normal`: see `noise_table`. The tone curve is an S through 0, 0.5 and 1 of the display's range,
-    with the slope 1 + `contrast` in the middle.
+    `gain` and `add` (H, W, 3) and the factor `exposure` apply to linear light, where 1 is the
+    brightest displayed value. `motion`: u, v of the point the car drives to; height of the camera
+    times focal length (m px); distance driven during the exposure (m). `glare`: u, v of the sun,
+    and strength. `noise`: standard deviation in display values of 0 to 255, and this picture's
+    seed. `normal`: see `noise_table`. The tone curve is an S through 0, 0.5 and 1 of the display's
+    range, with the slope 1 + `contrast` in the middle.
     """
     height, width = picture.shape[0], picture.shape[1]
     out = np.empty_like(picture)
@@ -76,8 +76,8 @@ def _exposed_row(
 ) -> None:
     """Linear light (3 W,) of row `v`, the mean over the exposure.
 
-    Below the horizon a pixel is taken for a place on the flat road, which moves away from the
-    point the car moves to; above it nothing moves.
+    A pixel below the horizon is treated as a point of a flat road, which moves away from the point
+    the car drives to. Pixels above the horizon do not move.
     """
     height, width = picture.shape[0], picture.shape[1]
     u0, v0, reach, travel = motion
@@ -85,7 +85,7 @@ def _exposed_row(
     row = picture[v].reshape(3 * width)
     for k in range(3 * width):
         light[k] = np.float32(row[k]) * np.float32(row[k]) * full
-    share = travel * max(v - v0, 0.0) / reach  # of the place's distance that the car moves
+    share = travel * max(v - v0, 0.0) / reach  # distance driven over the distance of the point
     apart = share * max(0.5 * width, v - v0)
     if apart < LEAST_BLUR_PX:
         return
@@ -106,7 +106,7 @@ def _exposed_row(
 
 @compiled
 def _add_glare(light: Plane, v: int, glare: tuple[float, float, float]) -> None:
-    """Add light that the lens scatters about the sun, to row `v`."""
+    """Add the light that the lens scatters round the sun to row `v`."""
     width = len(light) // 3
     sun_u, sun_v, strength = glare
     narrow, wide = np.float32(0.04 * width) ** 2, np.float32(0.3 * width) ** 2

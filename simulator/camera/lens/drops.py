@@ -1,5 +1,5 @@
-"""Rain drops on the windscreen, and the wiper that clears them. Pixels; no clock: the place along
-the road sets how far the wiper is and how many drops have fallen since."""
+"""Rain drops on the windscreen and the wiper that clears them, in pixels. There is no clock: the
+place along the road sets the wiper's position and how many drops have fallen since its stroke."""
 
 import math
 from dataclasses import dataclass
@@ -16,24 +16,24 @@ from simulator.varied.cabin import Cabin
 Picture = NDArray[np.uint8]
 
 STAGES = 3
-"""Steps in which drops gather between two strokes of the wiper."""
+"""Number of steps in which drops gather between two strokes of the wiper."""
 SMALL = 4
-"""A drop shows a wide view so small that this coarser picture of it is sharp enough."""
+"""Divisor of the small picture that drops show; they show it so small that it is sharp enough."""
 SWEEP = 0.3
 """Share of a wiper's period that its stroke takes."""
 MOST_DROPS = 400
 OPACITY = 235
-"""Of a drop, of 255."""
+"""Opacity of a drop, of 255."""
 BLADE = 14
-"""Display value of the wiper."""
+"""Display value of the wiper, 0 to 255."""
 VIEW = 0.16
-"""How far about itself a drop shows the picture, as a share of the width."""
+"""Radius of the view that a drop shows, as a share of the picture's width."""
 
 
 @dataclass(frozen=True)
 class _Drops:
-    """N pixels that drops cover: the number of each, counted along the rows, that of the pixel
-    which it shows of the small picture, and how much of a drop covers it (0 to 255)."""
+    """The N pixels that drops cover: each pixel's row-major index, the index of the pixel of the
+    small picture that it shows, and the opacity of the drop there (0 to 255)."""
 
     pixel: NDArray[np.int32]
     source: NDArray[np.int32]
@@ -41,10 +41,10 @@ class _Drops:
 
 
 class Windscreen:
-    """Drops and wiper of one cabin before pictures of one size."""
+    """Drops and wiper of one cabin, for pictures of one size."""
 
     def __init__(self, cabin: Cabin, cover: float, wipes: bool, size: tuple[int, int]) -> None:
-        """`cover`: share of the glass that drops cover at most; `size`: of pictures, (W, H)."""
+        """`cover`: largest share of the glass that drops cover; `size`: pictures (W, H), px."""
         self._cabin, self._cover, self._wipes, self._size = cabin, cover, wipes, size
         width, height = size
         rng = np.random.default_rng([cabin.shape, 4])
@@ -77,7 +77,7 @@ class Windscreen:
         _darken(picture, np.asarray(cv2.blur(mask, (soft, soft)), np.uint8), BLADE)
 
     def _drops(self, stroke: int, stage: int) -> _Drops:
-        """The drops of one stroke at a stage; those of an earlier stage are among them."""
+        """The drops of one stroke at a stage; they include the drops of earlier stages."""
         if self._kept is None or self._kept[0] != (stroke, stage):
             rng = np.random.default_rng([self._cabin.shape, 5, stroke])
             share = (stage + 1) / STAGES
@@ -91,7 +91,7 @@ def _small(size: tuple[int, int]) -> tuple[int, int]:
 
 
 def _fallen(cover: float, share: float, size: tuple[int, int], rng: np.random.Generator) -> _Drops:
-    """The first `share` of drops that would cover about the share `cover` of a picture."""
+    """The first `share` of the drops that together cover about the share `cover` of a picture."""
     width, height = size
     scale = width / REFERENCE_WIDTH
     radius = np.clip(np.exp(rng.normal(0.7, 0.45, MOST_DROPS)), 1.1, 9.0) * scale
@@ -102,7 +102,7 @@ def _fallen(cover: float, share: float, size: tuple[int, int], rng: np.random.Ge
     shape = np.column_stack([middle, radius, tall])[:count]
     mask, source = _stamped(shape, width, height, VIEW * width)
     soft = cv2.GaussianBlur(mask, (0, 0), float(rng.uniform(0.4, 1.0)) * scale)
-    # Where a drop's soft edge lies beside it, the pixel shows no drop: only inside is kept.
+    # The blurred edge reaches outside the drops; pixels there show no drop and are left out.
     pixel = np.flatnonzero(mask).astype(np.int32)
     return _Drops(pixel, source.reshape(-1)[pixel], np.asarray(soft, np.uint8).reshape(-1)[pixel])
 
@@ -111,10 +111,10 @@ def _fallen(cover: float, share: float, size: tuple[int, int], rng: np.random.Ge
 def _stamped(
     shape: FloatArray, width: int, height: int, view: float
 ) -> tuple[Picture, NDArray[np.int32]]:
-    """Where drops lie (H, W), and the pixel of the small picture that each pixel of them shows.
+    """Opacity of the drops (H, W), and for each of their pixels the pixel of the small picture.
 
-    `shape` (N, 4): middle and half axes of each drop. It shows the picture `view` pixels about it,
-    upside down.
+    `shape` (N, 4): middle and half axes of each drop, px. A drop shows the picture within `view`
+    pixels of its middle, upside down.
     """
     mask = np.zeros((height, width), np.uint8)
     source = np.zeros((height, width), np.int32)
@@ -141,7 +141,7 @@ def _through(
     source: NDArray[np.int32],
     cover: Picture,
 ) -> Picture:
-    """A copy of `picture` with the drops in it: see `_Drops`."""
+    """A copy of `picture` with the drops drawn into it; for the arguments see `_Drops`."""
     out = picture.copy()
     flat, seen = out.reshape(-1, 3), small.reshape(-1, 3)
     for k in range(len(pixel)):
@@ -154,7 +154,7 @@ def _through(
 
 @compiled
 def _darken(picture: Picture, cover: Picture, value: int) -> None:
-    """Draw the grey `value` over `picture` where `cover` (H, W), 0 to 255, says how much."""
+    """Draw the grey `value` over `picture` with the opacity `cover` (H, W), 0 to 255."""
     for v in range(picture.shape[0]):
         for u in range(picture.shape[1]):
             weight = np.int32(cover[v, u])

@@ -21,17 +21,17 @@ from trackfeatures.camera import CameraParameters
 Picture = NDArray[np.uint8]
 
 RAIN_DROPS = 0.08
-"""Share of the windscreen that drops cover between two strokes of the wiper in rain, where the
-look has no drops of its own."""
+"""Share of the windscreen that drops cover between two strokes of the wiper in rain, for looks
+without drops of their own."""
 DAZZLED = 245
 """Display value from which a pixel shows the sun itself."""
 GLOWS = np.uint8(215)
-"""Display value from which light glows by night."""
+"""Display value from which a light glows by night."""
 GLOW_GAIN = 12.0
 ADAPTING_M = 10.0
-"""Way that the exposure needs to follow a change of brightness."""
+"""Distance driven in which the exposure follows a change of brightness."""
 DARK_NOISE = 1.8
-"""Factor on the noise by night."""
+"""Factor on the sensor noise by night."""
 
 
 class Imaging:
@@ -59,7 +59,7 @@ class Imaging:
             )
 
     def developed(self, picture: Picture, eye: Eye, s: float) -> Picture:
-        """The recorded picture of the rendered one (H, W, 3), from `eye`, at `s` m of the road."""
+        """The recorded picture for the rendered one (H, W, 3) from `eye`, `s` m along the road."""
         lens = self._lens
         if self._night:
             picture = _with_glow(picture)
@@ -86,7 +86,7 @@ class Imaging:
         return _compressed(picture, lens.jpeg_quality) if lens.jpeg_quality else picture
 
     def _glare(self, picture: Picture, eye: Eye) -> tuple[float, float, float]:
-        """Place of the sun in the picture and strength of its glare: see `develop`."""
+        """Position of the sun in the picture and strength of its glare: see `develop`."""
         right, up, ahead = eye.axes @ np.array(self._light.sun_direction)
         if self._flare == 0.0 or ahead < 0.05 or self._light.shade > 0.5:
             return 0.0, 0.0, 0.0
@@ -104,7 +104,7 @@ class Imaging:
 
 
 def _motion_of(camera: CameraParameters, travel_m: float) -> tuple[float, float, float, float]:
-    """Where the car drives to in the picture, height times focal length, way: see `develop`."""
+    """The argument `motion` of `develop` for a car that drives `travel_m` during the exposure."""
     matrix = camera.intrinsics()
     ahead = optics.extrinsics(camera, np.zeros(6), "front")[:3, 0]
     u, v, _ = matrix @ ahead / ahead[2]
@@ -112,8 +112,8 @@ def _motion_of(camera: CameraParameters, travel_m: float) -> tuple[float, float,
 
 
 def adaptation(s: float, stops: float, decks: Sequence[tuple[float, float]]) -> float:
-    """By how many stops the exposure has opened at `s`: up to `stops` below a bridge, and back to
-    none behind it. `decks`: place along the road and half length of each bridge's deck, in m."""
+    """Stops by which the exposure has opened at `s`: up to `stops` below a bridge, and back to 0
+    behind it. `decks`: position along the road and half length (m) of each bridge's deck."""
     most = 0.0
     for place, half in decks:
         into = min(s - (place - half), 2.0 * half)
@@ -125,13 +125,13 @@ def adaptation(s: float, stops: float, decks: Sequence[tuple[float, float]]) -> 
 
 
 def _deck(bridge: Bridge) -> tuple[float, float]:
-    """Place along the road and half length of what of `bridge` is over it."""
+    """Position along the road and half length (m) of the part of `bridge` above the road."""
     over = bridge.boxes[bridge.boxes[:, 0, 2] > HEADROOM_M]
     return bridge.s, float(np.abs(over[..., 0]).max()) if len(over) else bridge.half_along
 
 
 def _with_glow(picture: Picture) -> Picture:
-    """The picture with a glow round what is brighter than the display shows."""
+    """The picture with a glow round the pixels that are brighter than `GLOWS`."""
     width, height = picture.shape[1], picture.shape[0]
     bright = np.maximum(picture, GLOWS) - GLOWS
     small = cv2.resize(bright, (width // 4, height // 4), interpolation=cv2.INTER_AREA)
@@ -142,7 +142,7 @@ def _with_glow(picture: Picture) -> Picture:
 
 
 def _seed_of(eye: Eye) -> int:
-    """Seed of a picture's noise: a hash of the place it is taken from, so no clock is needed."""
+    """Seed of a picture's noise: a hash of the camera's position, so no clock is needed."""
     x, y, z = (round(float(part) * 1e4) for part in eye.place)
     return ((x * 73_856_093) ^ (y * 19_349_663) ^ (z * 83_492_791)) % 2**62
 

@@ -17,21 +17,21 @@ from simulator.varied.roadside import Roadside
 KINDS: tuple[str, ...] = (
     "rail", "wall", "hedge", "fence", "stones", "tyres", "crops", "bank", "none",
 )  # fmt: skip
-"""In the order in which barrier.frag.glsl numbers them."""
+"""Kinds of barriers; barrier.frag.glsl numbers them in this order."""
 HEIGHT_M = np.array([0.8, 0.9, 1.25, 1.05, 0.75, 0.95, 1.1, 0.6, 0.0])
 THICK_M = np.array([0.06, 0.25, 0.9, 0.06, 0.5, 0.7, 3.0, 0.8, 0.0])
 GROWS = np.isin(KINDS, ("wall", "crops", "bank"))
-"""Which kinds a varied road's look makes higher."""
+"""Mask of the kinds whose height a varied road's look scales."""
 SECTION_M = (90.0, 420.0)
 LAYOUT = ("3f 2f 1f 3f", "at", "along", "kind", "facing")
-"""Of a vertex: x, y, z, s, height, kind, normal (3)."""
+"""Layout of a vertex: x, y, z, s, height, kind, normal (3)."""
 LEVELS = (Level(35.0, 0.005, 16.0), Level(120.0, 0.03, 32.0), Level(300.0, 0.1, 64.0))
 
 
 def build(
     road: Road, mesh: RoadMesh, theme: Theme, rng: np.random.Generator, roadside: Roadside
 ) -> Surface:
-    """Both sides' barriers, of the theme's kinds or of the one that `roadside` names."""
+    """Barriers of both sides: of the theme's kinds, or of the single kind that `roadside` names."""
     grids, profiles = [], []
     heights = np.where(GROWS, roadside.height, 1.0) * HEIGHT_M
     for side, column, only in zip(

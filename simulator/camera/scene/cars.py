@@ -1,7 +1,7 @@
 """The cars: one triangle mesh, drawn at each car's pose, and the shadow on the ground below it.
 
 Car frame: x ahead, y left, z up, metres; origin on the ground below the middle of the car. A vertex
-is a position, a normal and a colour; the colour (-1, -1, -1) stands for the paint of the car.
+is a position, a normal and a colour; the colour (-1, -1, -1) stands for the car's paint.
 """
 
 from collections.abc import Sequence
@@ -40,7 +40,7 @@ _TAIL, _HEAD, _PLATE, _DARK = (0.5, 0.01, 0.01), (0.85, 0.85, 0.78), (0.7, 0.7, 
 _BODY = ((-2.2, 0.42, 0.78), (-2.18, 0.92, 0.82), (-1.35, 0.98, 0.9), (0.75, 0.94, 0.9),
          (1.9, 0.74, 0.84), (2.2, 0.55, 0.74), (2.2, 0.3, 0.74))  # fmt: skip
 _CABIN = ((-1.75, 0.95, 0.78), (-1.05, 1.38, 0.62), (0.05, 1.4, 0.62), (0.95, 0.92, 0.78))
-# Lights, number plate and bumpers: x, y and z from and to, colour.
+# Lights, number plate and bumpers: x, y and z as (from, to), then the colour.
 _REAR_X, _FRONT_X = -2.225, 2.225
 _PANELS = (
     (_REAR_X, 0.78, 0.48, 0.66, 0.84, _TAIL), (_FRONT_X, 0.78, 0.48, 0.5, 0.62, _HEAD),
@@ -53,8 +53,8 @@ _WHEELS_X, _WHEEL_RADIUS = (-1.35, 1.32), 0.33
 
 @dataclass(frozen=True)
 class CarMesh:
-    """Triangles of a car, (3 T, 9) float32: place, normal, colour. The near level of detail is the
-    first `near` vertices; the far one those from `far` on, with simpler wheels."""
+    """Triangles of a car, (3 T, 9) float32: place, normal, colour. The first `near` vertices are
+    the near level of detail; the vertices from `far` on are the far one, with simpler wheels."""
 
     vertices: NDArray[np.float32]
     near: int
@@ -74,7 +74,7 @@ def car_mesh() -> CarMesh:
 
 
 def _face(points: Sequence[Point], colour: Point) -> FloatArray:
-    """Two triangles (6, 9); the normal points to where the four corners run counter-clockwise."""
+    """Two triangles (6, 9); from the normal's side the four corners run counter-clockwise."""
     corners = [np.array(point) for point in points]
     return face(corners, [(0.0, 0.0)] * 4, colour, PLAIN)[:, :9]
 
@@ -198,7 +198,7 @@ class Cars:
         return np.flatnonzero(inside)[np.argsort(distance[inside], kind="stable")]
 
     def draw(self, poses: FloatArray, paints: list[int], eye: FloatArray, labels: bool) -> None:
-        """Draw the cars at `poses` (n, 6), with these indices of PAINTS."""
+        """Draw the cars at `poses` (n, 6); `paints` are indices into PAINTS."""
         for pose, paint in zip(poses, paints, strict=True):
             self._stands[labels].write(_model_matrix(pose, eye).tobytes())
             self._paint.value = PAINTS[paint % len(PAINTS)]
@@ -224,12 +224,12 @@ class Cars:
 
 @lru_cache(maxsize=2)
 def shared_cars(graphics: Graphics, *features: str) -> Cars:
-    """The cars of this graphics, made on first use; `features` as of `weather_program`."""
+    """The cars of this graphics, made on first use; `features` as in `weather_program`."""
     return Cars(graphics, *features)
 
 
 def _model_matrix(pose: FloatArray, eye: FloatArray) -> NDArray[np.float32]:
-    """Car frame to eye-relative world, (4, 4), column by column as GL wants it."""
+    """Car frame to eye-relative world, (4, 4), column-major as OpenGL expects."""
     matrix = np.eye(4)
     matrix[:3, :3] = rotation(float(pose[3]), float(pose[4]), float(pose[5]))
     matrix[:3, 3] = pose[:3] - eye

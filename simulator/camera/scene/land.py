@@ -1,5 +1,5 @@
 """The terrain grid as triangle meshes, fine near the viewer and coarse up to the horizon, and the
-share of sunlight that trees keep from it. World frame, metres."""
+share of sunlight that trees block from it. World frame, metres."""
 
 from dataclasses import dataclass
 
@@ -14,19 +14,19 @@ from simulator.camera.scene.terrain import CentreLine, Terrain, between
 from simulator.camera.vegetation.scenery import Trees
 
 LAYOUT = ("3f 3f 1f", "at", "facing", "sunlit")
-"""Of a vertex: x, y, z, normal (3), share of sunlight."""
+"""Layout of a vertex: x, y, z, normal (3), share of sunlight."""
 BLOCK = 4
 """A chunk is BLOCK x BLOCK cells."""
 SMOOTH_M = 9.0
 MOST_SHADE = 0.8
 CANOPY, CANOPY_M = 0.55, 30.0
-"""In the heavy-shadow light: shade of the canopy, and up to which distance from the road."""
+"""In the heavy-shadow light: shade of the canopy, and its reach from the road."""
 
 
 @dataclass(frozen=True)
 class TreeShade:
-    """Share of sunlight that trees keep from the terrain: `shade` (rows y, columns x) on its grid,
-    0 to MOST_SHADE. Smoothed: single shadows are not resolved."""
+    """Share of sunlight that trees block from the terrain: `shade` (rows y, columns x) on its grid,
+    0 to MOST_SHADE. It is smoothed, so single shadows are not resolved."""
 
     terrain: Terrain
     shade: FloatArray
@@ -58,8 +58,8 @@ class TreeShade:
 
 @dataclass(frozen=True)
 class Span:
-    """One level of detail of the terrain: cells of `step` x `step` of the finest grid, drawn in
-    chunks from `start_m` to `reach_m`; `bare`: also where the road mesh covers it."""
+    """One level of detail of the terrain: cells of `step` x `step` cells of the finest grid, drawn
+    in chunks from `start_m` to `reach_m`. `bare`: drawn also where the road mesh covers it."""
 
     step: int
     start_m: float
@@ -91,8 +91,8 @@ def surface(land: TreeShade, hidden: NDArray[np.bool_], span: Span) -> Surface:
 
 
 def lowered(z: FloatArray, step: int) -> FloatArray:
-    """Every `step`-th height of `z`, each lowered by the most that the coarse triangles rise above
-    the fine heights next to it."""
+    """Every `step`-th height of `z`, lowered by the largest amount by which the coarse triangles
+    rise above the fine heights next to it."""
     kept = z[::step, ::step]
     if step == 1:
         return kept

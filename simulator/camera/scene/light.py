@@ -19,12 +19,12 @@ Colour = tuple[float, float, float]
 
 KINDS: tuple[str, ...] = ("clear", "overcast", "dusk", "fog", "heavy-shadow", "rain", "snow")
 WEATHERS: tuple[str, ...] = ("rain", "snow")
-"""The kinds with precipitation; the others are dry."""
+"""The kinds of light with precipitation; the others are dry."""
 
 
 @dataclass(frozen=True)
 class Light:
-    """One light. `shade` is the share of the lit luminance left in a hard shadow on the road."""
+    """One light. `shade`: share of the lit luminance that is left in a hard shadow on the road."""
 
     kind: str
     sun_azimuth: float
@@ -37,7 +37,7 @@ class Light:
     horizon: Colour
     haze: Colour
     haze_per_km: float
-    """Extinction: after 1 km exp(-haze_per_km) of a colour is left."""
+    """Extinction: after 1 km the share exp(-haze_per_km) of a colour is left."""
     clouds: float
     """Share of the sky that is cloud, 0 to 1."""
     shade: float
@@ -45,7 +45,7 @@ class Light:
     """Whether trees meet over the road and cast dappled shadow on it (kind "heavy-shadow")."""
     exposure: float = 1.0
     cover: float = 0.0
-    """Rain: how wet the road is; snow: how much of it is white; 0 to 1."""
+    """In rain, how wet the road is; in snow, how much of it is white; 0 to 1."""
     falling: float = 0.0
     """Density of rain or snow, 0 to 1."""
 
@@ -84,13 +84,13 @@ def check_light(kind: str) -> None:
 
 @cache
 def _tables() -> Tables:
-    """The table of each kind, from light.toml, which says what its entries mean."""
+    """The table of each kind, from light.toml, which explains the entries."""
     text = files("simulator.camera.scene").joinpath("light.toml").read_text(encoding="utf-8")
     return tomllib.loads(text)
 
 
 def _tinted_sun(kind: str, colour: list[float], strength: float, elevation: float) -> Colour:
-    """The sun's light in clear air, redder the lower it stands; at dusk `strength` adds no blue."""
+    """The sun's light in clear air, redder the lower the sun; at dusk `strength` adds no blue."""
     red, green, blue = colour
     if kind == "dusk":
         return red * strength, green * strength, blue

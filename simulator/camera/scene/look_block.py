@@ -1,4 +1,4 @@
-"""The uniform block `Look` of look.glsl: what a varied road's shaders read beside its scene."""
+"""The uniform block `Look` of look.glsl: the values of a look that a varied road's shaders read."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,11 +13,11 @@ from simulator.varied.paint import Paint
 from simulator.varied.surface import Surface
 
 MARKINGS, LINES = 4, 2
-"""Most markings of a road, and most lines of a marking."""
+"""Largest number of markings of a road, and of lines of a marking, that the block holds."""
 LINE_COLOURS: dict[str, Colour] = {"white": (0.78, 0.78, 0.75), "yellow": (0.75, 0.50, 0.06)}
 ARROWS = {"ahead": 0.0, "left": 1.0, "right": -1.0}
 LAMP_SIDE = -1.0
-"""Street lamps stand on the right of a varied road."""
+"""Side of the street lamps of a varied road: -1 is right."""
 Row = tuple[float, ...]
 
 
@@ -85,7 +85,7 @@ def _surface_rows(surface: Surface) -> list[Row]:
 
 
 def surface_features(surface: Surface) -> tuple[str, ...]:
-    """What of surface.glsl the road's program compiles in: the rest would cost time in vain."""
+    """The features of surface.glsl that this surface needs; each further one would cost time."""
     wanted = {
         "slabs": surface.other_tone > 0.0 or surface.concrete > 0.0,
         "repairs": surface.tar > 0.0 or surface.patches > 0.0,

@@ -31,15 +31,15 @@ from simulator.camera.scene.themes import Theme
 from simulator.camera.vegetation.scenery import DRY_M
 
 LAYOUT = ("3f 3f 3f 2f", "at", "facing", "colour", "face")
-"""Of a vertex: that of `solids` without the material."""
+"""Layout of a vertex: that of `solids` without the material."""
 CHUNK_M, REACH_M = 50.0, 350.0
 SMALL_M2, SMALL_REACH_M = 14.0, 130.0
-"""Props of less area (posts, lamps, signs) are drawn up to this distance: farther off they
-only flicker."""
+"""Props of less area (posts, lamps, signs) are drawn only up to this distance: farther away they
+would flicker."""
 BUILDING_M = 3.9
-"""A prop that extends farther from its middle is a building."""
+"""A prop that extends farther than this from its middle is a building."""
 BUILDING_CLEAR_M = 1.0
-"""Between a building and the wall line, at least."""
+"""Least distance between a building and the wall line."""
 OUTLINE_STEP_M = 2.0
 POST_STEP_M, LAMP_STEP_M, POLE_STEP_M = 50.0, 42.0, 40.0
 _WALLS: tuple[Point, ...] = (
@@ -96,7 +96,7 @@ def sign(rng: np.random.Generator) -> FloatArray:
     wide, high = float(rng.uniform(0.8, 3.4)), float(rng.uniform(0.7, 1.5))
     foot = float(rng.uniform(1.3, 2.0))
     board = box((0.06, wide, high), (0.0, 0.0, foot), _BOARDS[rng.integers(len(_BOARDS))], BOARD)
-    # Boards are lettered in shares of their size.
+    # The lettering of a board is placed in shares of the board's size.
     board[:, 9] /= wide
     board[:, 10] /= high
     legs = [
@@ -133,7 +133,7 @@ def pole() -> FloatArray:
 
 
 def lamp(head: float = PLAIN) -> FloatArray:
-    """A lamp on a tall mast, its arm over the road (-y); its head is of that material."""
+    """A lamp on a tall mast with its arm over the road (-y); `head` is the material of its head."""
     grey = (0.24, 0.25, 0.25)
     return np.concatenate(
         [
@@ -154,7 +154,7 @@ class _Placer:
         self.parts: list[FloatArray] = []
 
     def add(self, template: FloatArray, s: float, offset: float, clear_m: float) -> None:
-        """Add `template` at (s, offset) to the candidates that `place` decides on."""
+        """Add `template` at (s, offset) to the candidates of `place`."""
         self.candidates.append((template, s, offset, clear_m))
 
     def place(self) -> None:
@@ -182,7 +182,8 @@ class _Placer:
                     np.hypot(x[k] - u, y[k] - v) < 0.9 * (reach + other) for u, v, other in taken
                 ):
                     continue
-                # In a bend, or where the track comes back, its ends are nearer than its middle.
+                # In a bend, or beside another part of the track, a building's ends can be nearer
+                # to a wall line than its middle.
                 if not self.ground.is_clear(_outline(template) @ rotate + place, BUILDING_CLEAR_M):
                     continue
                 taken.append((x[k], y[k], reach))
@@ -217,7 +218,7 @@ def build(
     rng: np.random.Generator,
     lit_every_m: float = 0.0,
 ) -> dict[str, Surface]:
-    """All props and bridges of a scene by material; a lit lamp on the right every `lit_every_m`."""
+    """All props and bridges of a scene by material; lit lamps stand right, every `lit_every_m`."""
     placer = _Placer(ground, bridges)
     for bridge in bridges:
         placer.add_placed(bridge.s, bridge.triangles)
@@ -267,8 +268,8 @@ def _gathered(placer: _Placer) -> dict[str, Surface]:
 
 
 def _surface(parts: list[FloatArray], s: FloatArray, small: NDArray[np.bool_]) -> Surface:
-    """Triangles of one material in order of s, with a chunk every CHUNK_M; in each chunk those of
-    small props last, which the second level of detail leaves out."""
+    """Triangles of one material in order of s, with a chunk every CHUNK_M. In each chunk the
+    triangles of small props come last, because the second level of detail leaves them out."""
     cell = (s / CHUNK_M).astype(np.int64)
     order = np.lexsort((s, small, cell))
     sizes = np.array([len(part) for part in parts])[order]

@@ -18,7 +18,7 @@ from simulator.camera.scene.terrain import CentreLine, Survey, Terrain
 from simulator.track.road import Road
 
 LAYOUT = ("3f 2f 3f 1f", "at", "road", "facing", "kerbed")
-"""Of a vertex: x, y, z, s, y, normal (3), kerb."""
+"""Layout of a vertex: x, y, z, s, lateral offset, normal (3), kerb (0 to 1)."""
 SAGITTA_M = 0.0025
 LONGEST_ROW_M = 4.0
 TWIST_M = 0.004
@@ -27,15 +27,15 @@ SKIRT_M = 10.0
 """How far the mesh extends beyond the wall line."""
 KERB_CURVATURE = 1.0 / 220.0
 SKIRT_WEIGHT, KERB_WEIGHT = 0.05, 0.3
-"""Weights of geometric errors there, relative to those of the road."""
+"""Weights of geometric errors on the skirt and the kerb, relative to errors on the road."""
 _ASPHALT = ((3, 4),)
 _LEFT, _RIGHT = ((0, 1), (1, 2), (2, 3)), ((4, 5), (5, 6), (6, 7))
 _FAR = ((0, 2), (2, 3), (4, 5), (5, 7))
 VERGE = (Level(30.0, 0.04, 12.0), Level(90.0, 0.1, 24.0), Level(300.0, 0.3, 48.0))
 """Levels of detail of the verge, coarser than those of the asphalt."""
 LAP_M, LAP_DOWN_M, RISE_WEIGHT = 0.3, 0.06, 4.0
-"""How far the verge overlaps below the asphalt, how far below it lies, and the weight of its
-height error, which keeps it below the asphalt at every level of detail."""
+"""Overlap of the verge below the asphalt (m), its depth there (m), and the weight of its height
+error, which keeps it below the asphalt at every level of detail."""
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,7 @@ def build(road: Road, line: CentreLine, terrain: Terrain) -> RoadMesh:
 def _skirt(
     road: Road, line: CentreLine, s: FloatArray, curvature: FloatArray, side: float
 ) -> FloatArray:
-    """Width of the skirt on one side (+1 left): never overlapping another part of the road."""
+    """Width of the skirt on one side (+1 left), limited so that it overlaps no part of the road."""
     width = np.full(len(s), 0.4)
     for share in (0.25, 0.5, 0.75, 1.0):
         offset = road.wall_offset + SKIRT_M * share
@@ -118,7 +118,7 @@ def _skirt(
 
 
 def covers(mesh: RoadMesh, survey: Survey, margin_m: float) -> NDArray[np.bool_]:
-    """Which grid points (rows, columns) the road mesh covers, `margin_m` inside its edges."""
+    """Mask (rows, columns) of the grid points that the mesh covers, `margin_m` inside its edges."""
     row = np.clip(np.searchsorted(mesh.s, survey.line.s), 1, len(mesh.s) - 1)[survey.sample]
     reach = np.minimum(mesh.y[:, 0], -mesh.y[:, -1])
     return np.asarray(survey.near < np.minimum(reach[row - 1], reach[row]) - margin_m)
@@ -193,7 +193,7 @@ class Ground:
     def place_beside(
         self, s: FloatArray, offset: FloatArray, clear_m: float | FloatArray
     ) -> tuple[NDArray[np.bool_], FloatArray, FloatArray]:
-        """Which of the places (s, offset) are `clear_m` outside every wall line, and their x, y."""
+        """Mask of the places (s, offset) that lie `clear_m` outside all wall lines; x, y of all."""
         pose = self.road.track.at(s, offset)
         near = self.line.distance(pose.x, pose.y)
         free = near > self.road.wall_offset + clear_m

@@ -1,4 +1,4 @@
-"""What a varied road's look puts beside it: nearer barriers, another theme, parked cars. Metres."""
+"""Changes the roadside as a varied road's look requires: barriers, theme, parked cars. Metres."""
 
 from dataclasses import dataclass, replace
 
@@ -10,11 +10,11 @@ from simulator.track.road import Road
 from simulator.varied.look import RoadLook
 
 DRIVEN_M = 1.35
-"""Room beside the outermost marking that a car's middle may need; see datagen's trajectories."""
+"""Distance beyond the outermost marking that a car's centre can reach: datagen's trajectories."""
 PARKED_M = 2.1
 """Width of the strip that a parked car needs."""
 BRIDGES = ("overpass", "footbridge", "gantry", "railway")
-"""Styles of bridges for scenery that has none."""
+"""Styles of bridges for scenery themes without bridges."""
 
 
 @dataclass(frozen=True)
@@ -22,7 +22,7 @@ class NearRoad(Road):
     """A road whose barriers are drawn nearer to the asphalt than cars hit them."""
 
     gap_m: float = 0.0
-    """From the asphalt to the barriers, at least."""
+    """Least distance from the asphalt to the barriers."""
 
     @property
     def wall_offset(self) -> float:
@@ -32,14 +32,14 @@ class NearRoad(Road):
 
 
 def seen_road(road: Road, look: RoadLook | None) -> Road:
-    """The road as it is drawn."""
+    """The road to draw: with nearer barriers if `look` has a gap for them."""
     if look is None or look.roadside.gap_m < 0.0:
         return road
     return NearRoad(road.track, road.lanes, road.lane_width, road.carriageway, look.roadside.gap_m)
 
 
 def seen_theme(theme: Theme, look: RoadLook | None) -> Theme:
-    """The scenery theme as it is drawn."""
+    """The scenery theme to draw: `theme` with the trees, grass, lamps and bridges of `look`."""
     if look is None:
         return theme
     roadside, lit = look.roadside, look.light.night and look.light.lamp_every_m > 0.0
@@ -61,8 +61,8 @@ def _mixed(one: Colour, other: Colour, share: float) -> Colour:
 
 
 def parked_cars(road: Road, every_m: float, rng: np.random.Generator) -> FloatArray:
-    """Poses (n, 6), on the ground, of cars parked along `road`: on a wide shoulder, else beside
-    the asphalt where there is room before the barriers."""
+    """Poses (n, 6), on the ground, of cars parked along `road`: on a wide shoulder, otherwise
+    beside the asphalt where there is room before the barriers."""
     if every_m <= 0.0:
         return np.empty((0, 6))
     poses = []

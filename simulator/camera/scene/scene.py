@@ -42,7 +42,7 @@ _CONCRETE: Colour = (0.21, 0.205, 0.19)
 
 @dataclass(frozen=True)
 class VisibleScene:
-    """What is drawn of a scene from one viewpoint: index runs of its meshes, and its trees."""
+    """The visible part of a scene from one viewpoint: index runs of its meshes, and its trees."""
 
     solid: tuple[tuple[Mesh, list[list[int]]], ...]
     barriers: list[list[int]]
@@ -120,7 +120,7 @@ class Scene:
         )
 
     def draw(self, seen: VisibleScene, labels: bool) -> None:
-        """Draw all opaque parts but the sky, the nearest first, for the depth test."""
+        """Draw all opaque parts but the sky, nearest first: the depth test skips hidden pixels."""
         self._block.bind_to_uniform_block(SCENE_BINDING)
         if self._look is not None:
             self._look.bind_to_uniform_block(LOOK_BINDING)

@@ -32,7 +32,7 @@ LONGEST_SHADOW_M = 40.0
 RUN_OUT_M = (2.0, 5.5)
 """Distances from the wall line between which the mask fades into the shade of the terrain."""
 WINDOW_M = 12.0
-"""Length of a window of the canopy with its own covered share."""
+"""Length of a window of the canopy; each window has its own covered share."""
 THINS_OUT_M = 5.0
 """Distance beyond the wall line over which the canopy thins out to nothing."""
 SHARE = (0.40, 0.64)
@@ -43,21 +43,21 @@ ROAD_Z_M = 2.5
 """Largest difference in height between the road near a bridge and the road below it."""
 FARTHEST_M = 70.0
 SKY_BLUR_M = 3.0
-"""How far beyond a bridge's edges it hides a part of the sky."""
+"""Distance beyond a bridge's edges within which the bridge hides a part of the sky."""
 
 
 @dataclass(frozen=True)
 class ShadowMask:
-    """The mask `strip` and the same folded into `texels` (bands * rows, BAND_TEXELS + ...); on
-    varied roads these have a second component, the share of the sky that bridges hide."""
+    """The mask as a `strip`, and folded into `texels` (bands * rows, BAND_TEXELS + ...). On varied
+    roads the texels have a second component, the share of the sky that bridges hide."""
 
     strip: Strip
     texels: NDArray[np.uint8]
     along_m: float
-    """Length of a texel along s, such that a whole number fits the track."""
+    """Length of a texel along s; a whole number of texels fits the track."""
 
     def fraction(self, s: float, half_width: float) -> float:
-        """Share in shadow of the road within `half_width` of its centre, LOOK_M ahead of s."""
+        """Share in shadow of the road within `half_width` of its centre, from s to s + LOOK_M."""
         middle = self.strip.shape[0] // 2
         reach = min(int(half_width / TEXEL_M), middle)
         rows = self.strip[middle - reach : middle + reach]
@@ -66,7 +66,7 @@ class ShadowMask:
 
 @compiled
 def _dark_share(rows: Strip, first: int, count: int) -> float:
-    """Share of dark texels in `count` columns from `first` on, round the end of the strip."""
+    """Share of dark texels in `count` columns from `first` on; columns wrap round the track."""
     dark, columns = 0, rows.shape[1]
     for row in rows:
         for k in range(first, first + count):
@@ -84,8 +84,8 @@ def build(
     *,
     sky: bool = False,
 ) -> ShadowMask:
-    """The shadows of `light` on `road`: those of bridges, and of trees or of a closed canopy; with
-    `sky` also how much of the sky bridges hide.
+    """The shadows of `light` on `road`, cast by bridges and by trees or a closed canopy; with `sky`
+    also the share of the sky that bridges hide.
 
     Towards its sides the mask fades into the shade of the `land`, so that no edge shows.
     """
@@ -110,8 +110,8 @@ def build(
 def _hidden_sky(
     shape: tuple[int, ...], road: Road, along_m: float, bridges: Sequence[Bridge], light: Light
 ) -> Strip:
-    """Share (rows, columns) of the sky that bridges hide, 0 to 255: what lies below them, spread by
-    a bridge's height."""
+    """Share (rows, columns) of the sky that bridges hide, 0 to 255: the footprints of the bridges,
+    blurred by a bridge's height."""
     below: Strip = np.zeros(shape, dtype=np.uint8)
     cast_bridges(below, road, along_m, bridges, replace(light, sun_elevation=math.pi / 2))
     size = (2 * round(SKY_BLUR_M / along_m) + 1, 2 * round(SKY_BLUR_M / TEXEL_M) + 1)
@@ -194,8 +194,8 @@ def _stamp(
 def _with_canopy(bridged: Strip, road: Road, along_m: float, rng: np.random.Generator) -> Strip:
     """The mask `bridged` (rows, columns) of bridge shadows with a canopy added.
 
-    A noise field is thresholded, at a level found for each WINDOW_M, so that the covered share of
-    the asphalt is the random one of that window; where a bridge covers more, no canopy is added.
+    A noise field is thresholded. The threshold of each WINDOW_M is chosen so that the covered share
+    of the asphalt equals a random share; where a bridge covers more, no canopy is added.
     Over any 30 m the share lies between 0.3 and 0.8.
     """
     rows, columns = bridged.shape
@@ -250,7 +250,7 @@ def cast_bridges(
     for bridge in bridges:
         sun = bridge.turned(np.array(light.sun_direction))
         low, high = _reach(bridge.boxes, sun)
-        # On the inside of a bend a metre of s is shorter, so that more of it is needed.
+        # On the inside of a bend a metre of s is shorter on the ground, so the range is longer.
         bend = 1.0 / max(0.5, 1.0 - abs(road.track.curvature(bridge.s)) * road.wall_offset)
         first = int((bridge.s + max(low * bend, -FARTHEST_M)) / along_m) - 8
         last = int((bridge.s + min(high * bend, FARTHEST_M)) / along_m) + 9
@@ -260,7 +260,7 @@ def cast_bridges(
 
 
 def _reach(boxes: FloatArray, sun: FloatArray) -> tuple[float, float]:
-    """How far along the road the shadows of the boxes begin and end."""
+    """Where along the road (m from the bridge) the shadows of the boxes begin and end."""
     drop = boxes[:, 1, 2] + ROAD_Z_M
     shift = -sun[0] / max(sun[2], 1e-3) * drop
     low = np.minimum(boxes[:, 0, 0], boxes[:, 0, 0] + shift)
@@ -276,7 +276,7 @@ def _darkened(
     rows: int,
     sun: FloatArray,
 ) -> Strip:
-    """The shadow on texels (rows, columns) of the unfolded mask; columns may pass its ends."""
+    """The shadow on texels (rows, columns) of the unfolded mask; columns may exceed its ends."""
     first, last = columns
     s = (first + (np.arange((last - first) * FINE) + 0.5) / FINE) * along_m
     y = ((np.arange(rows * FINE) + 0.5) / FINE - rows / 2) * TEXEL_M
@@ -292,10 +292,10 @@ def _darkened(
 
 
 def _hit(reached: list[NDArray[np.float32]], box: FloatArray) -> NDArray[np.bool_]:
-    """From which points a ray towards the sun meets a box (slab method).
+    """Mask of the points from which a ray towards the sun meets a box (slab method).
 
-    All is measured along the ray: each coordinate of points and box (2, 3) comes divided by the
-    ray's slope in it.
+    Points and box (2, 3) are given along the ray: each coordinate is divided by the ray's slope in
+    that coordinate.
     """
     enter = np.zeros_like(reached[0])
     leave = np.full_like(reached[0], np.inf)

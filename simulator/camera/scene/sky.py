@@ -15,13 +15,13 @@ SECTORS = 12
 _ROWS = ((-90, 0.0), (-8, 0.02), (12, 0.32), (45, 0.70), (90, 1.0))
 """Elevation (deg) and height in the panorama of the dome's rows: finest over the horizon."""
 _SHARPNESS = 0.9
-"""Texels a pixel in the middle of the picture, about."""
+"""Texels of the panorama per pixel in the middle of the picture, about."""
 _WIDTHS = (1024, 4096)
 
 
 class Sky:
-    """The sky of one light, with the resolution for images of focal length `focal_px`. The
-    uniform block of the frame must hold the light."""
+    """The sky of one light, at the resolution for images of focal length `focal_px`. The bound
+    uniform block of the frame must hold this light."""
 
     def __init__(self, graphics: Graphics, weather: str, focal_px: float) -> None:
         context = graphics.context

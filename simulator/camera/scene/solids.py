@@ -14,7 +14,7 @@ from simulator.arrays import FloatArray
 Point = tuple[float, float, float]
 
 MATERIALS = ("plain", "facade", "crowd", "board", "striped", "tiles", "masonry", "earth", "lit")
-"""Index is the material number; prop.frag.glsl uses the names."""
+"""Names of the materials; the index is the material number, prop.frag.glsl uses the names."""
 PLAIN, FACADE, CROWD, BOARD, STRIPED, TILES, MASONRY, EARTH, LIT = map(float, range(len(MATERIALS)))
 
 
@@ -27,7 +27,7 @@ def box(
     """
     rows = _unit_box()[: 36 if floor else 30].copy()
     rows[:, :3] = rows[:, :3] * size + at
-    # Sides are as long as the box in y (the first two) or x, and as high; the others lie flat.
+    # Extent (u, v) of the faces: y by z for the first two sides, x by z for the next, x by y flat.
     x, y, z = size
     rows[:12, 9:11] *= (y, z)
     rows[12:24, 9:11] *= (x, z)
@@ -55,7 +55,7 @@ def _unit_box() -> FloatArray:
 
 
 def _normal(a: FloatArray, b: FloatArray) -> FloatArray:
-    """The cross product of two vectors, which numpy's `cross` takes ten times as long for."""
+    """The cross product of two vectors; numpy's `cross` takes ten times as long."""
     (ax, ay, az), (bx, by, bz) = a, b
     return np.array([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
 
@@ -63,8 +63,8 @@ def _normal(a: FloatArray, b: FloatArray) -> FloatArray:
 def face(
     corners: Sequence[FloatArray], uv: Sequence[tuple[float, float]], colour: Point, material: float
 ) -> FloatArray:
-    """A face of four corners, counter-clockwise from outside, as two triangles (6, 12); two corners
-    that follow each other may be the same."""
+    """A face of four corners, counter-clockwise from outside, as two triangles (6, 12); two
+    consecutive corners may be equal."""
     rows = np.empty((6, 12))
     order = [0, 1, 2, 0, 2, 3]
     rows[:, :3] = np.array(corners)[order]

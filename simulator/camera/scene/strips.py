@@ -19,8 +19,8 @@ _STEPS = (16, 8, 4, 2, 1)
 
 @dataclass(frozen=True)
 class Level:
-    """A level of detail, up to `reach_m` from the eye: rows are left out as long as that changes
-    no place by more than `error_m` and makes no triangle longer than `longest_m`."""
+    """A level of detail, drawn up to `reach_m` from the eye. Rows are left out as long as no point
+    moves by more than `error_m` and no triangle becomes longer than `longest_m`."""
 
     reach_m: float
     error_m: float
@@ -33,7 +33,7 @@ LEVELS = (
     Level(300.0, 0.08, 32.0),
     Level(650.0, 0.3, 64.0),
 )
-"""Errors of about a quarter of a pixel in the driver view."""
+"""The levels of detail of the asphalt: errors of about a quarter of a pixel in the driver view."""
 
 
 def strip(
@@ -98,8 +98,8 @@ def _steps(
 
 
 def _between(rows: NDArray[np.intp], columns: int, sides: NDArray[np.intp]) -> NDArray[np.uint32]:
-    """Indices of two triangles for each pair of columns (n, 2) between consecutive `rows`; the
-    last (provoking) vertex, which sets the flat attributes of a triangle, is of the row before."""
+    """Indices of two triangles for each pair of columns (n, 2) between consecutive `rows`. The last
+    (provoking) vertex sets the flat attributes of a triangle; it lies in the earlier row."""
     near, far = columns * rows[:-1, None, None] + sides, columns * rows[1:, None, None] + sides
     corners = [near[..., 0], far[..., 0], near[..., 1], far[..., 0], far[..., 1], near[..., 1]]
     return np.stack(corners, axis=-1).reshape(-1).astype(np.uint32)

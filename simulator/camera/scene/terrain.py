@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 CELL_M = 8.0
 COARSEST = 8
-"""The number of cells is a multiple of this: the step of the coarsest land mesh."""
+"""The number of cells is a multiple of this step of the coarsest land mesh."""
 MARGIN_M = 400.0
 MAX_CELLS = 1200
 SAMPLE_M = 2.0
@@ -51,7 +51,7 @@ class CentreLine:
         s = np.arange(0.0, length, length / max(8, round(length / SAMPLE_M)))
         pose = road.track.at(s)
         from scipy.spatial import (
-            cKDTree,  # costs 0.2 s, which callers that only check a light do not need
+            cKDTree,  # importing it takes 0.2 s; callers that only check a light do not need it
         )
 
         tree = cKDTree(np.stack([pose.x, pose.y], axis=1))
@@ -90,7 +90,7 @@ class Grid:
 
 @dataclass(frozen=True)
 class Survey:
-    """What the terrain takes from the road alone; it is computed once for all scenes of a road.
+    """Inputs of the terrain that depend on the road alone, computed once for all scenes of a road.
 
     For each point of the grid: the greatest height that keeps the road clear, the interpolated
     height of the road, the distance to the road and the index of the nearest sample of its centre
@@ -124,7 +124,7 @@ class Terrain:
     grid: Grid
     z: FloatArray
     sea: float = -np.inf
-    """Level of the sea, where there is one."""
+    """Height of the sea level; -inf without a sea."""
 
     def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """Height at points, interpolated on the triangles that are drawn."""
@@ -168,7 +168,7 @@ def build(road: Road, survey: Survey, theme: Theme, rng: np.random.Generator) ->
 
 
 def _road_cap(road: Road, line: CentreLine, grid: Grid) -> FloatArray:
-    """The greatest height each grid point may have, so that it covers no part of the road."""
+    """The greatest height of each grid point at which it covers no part of the road."""
     reach = road.wall_offset + 5.0 + 50.0
     offsets = np.arange(-reach, reach + 0.5 * grid.cell, 0.6 * grid.cell)
     s = line.s[:: max(1, round(0.6 * grid.cell / SAMPLE_M))]
@@ -203,7 +203,7 @@ def _spread(
 
 
 def _outside(line: CentreLine, grid: Grid) -> FloatArray:
-    """1 outside the loop of the road, 0 inside, with a smooth step."""
+    """1 outside the loop of the road, 0 inside, with a smooth transition."""
     loop = np.stack([(line.x - grid.x0) / grid.cell, (line.y - grid.y0) / grid.cell], axis=1)
     inside = np.zeros(grid.shape, dtype=np.float32)
     cv2.fillPoly(inside, [np.rint(loop).astype(np.int32)], 1.0)
@@ -211,7 +211,7 @@ def _outside(line: CentreLine, grid: Grid) -> FloatArray:
 
 
 def _rolling(grid: Grid, rng: np.random.Generator) -> FloatArray:
-    """Smooth hills of standard deviation about a half, both signs."""
+    """Smooth hills, positive and negative, of standard deviation about 0.5."""
     shape, cell = grid.shape, grid.cell
     hills = np.zeros(shape)
     for wavelength, weight in ((420.0, 0.45), (160.0, 0.2), (60.0, 0.06)):

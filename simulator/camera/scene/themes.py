@@ -14,21 +14,21 @@ Colour = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Theme:
-    """One scenery theme; a scene varies its values at random, by its seed."""
+    """One scenery theme; each scene varies its values at random, by its seed."""
 
     asphalt: Colour
     verge: Colour
-    """Between asphalt and the track's edge."""
+    """Colour of the strip between asphalt and the track's edge."""
     grass: Colour
     dry: Colour
     soil: Colour
     barriers: tuple[str, ...]
-    """Which of rail, wall, hedge, fence, stones, tyres line the road, by section."""
+    """Kinds of barriers (rail, wall, hedge, fence, stones, tyres) along the road, by section."""
     trees: tuple[str, ...]
     tree_density: float
     tree_reach_m: float = 45.0
     clearings: float = 0.3
-    """How much the trees thin out here and there, 0 to 0.35."""
+    """How much the trees thin out in places, 0 to 0.35."""
     hills_m: float = 8.0
     houses: float = 0.0
     stands: float = 0.0
@@ -38,7 +38,7 @@ class Theme:
     poles: bool = False
     """Telegraph poles along one side."""
     blocks: float = 0.0
-    """Tall flat-roofed buildings."""
+    """Density of tall flat-roofed buildings."""
     grassy: float = 0.35
     """Share of the verge that is grown over."""
     sea: bool = False

@@ -1,4 +1,4 @@
-"""A light as a scene's look changes it: exposure, a low sun, or night with headlights."""
+"""Changes a light as a scene's look requires: exposure, a low sun, or night with headlights."""
 
 import math
 from dataclasses import replace
@@ -9,21 +9,21 @@ from simulator.varied.lighting import Lighting
 SUNNY = ("clear", "dusk", "heavy-shadow")
 """Kinds of light in which the sun may stand low."""
 USUAL_ALBEDO, COMPENSATED = 0.13, 0.45
-"""Of a road for which the kinds of light are right; exponent of the automatic exposure."""
+"""Albedo of the road for which the lights are exposed; exponent of the automatic exposure."""
 DARKEST_NIGHT_STOPS = -0.5
-"""By night a picture exposed for less would be black."""
+"""Least exposure of a night picture; with less the picture would be black."""
 HEADLIGHT: Colour = (3.4, 3.2, 2.75)
 _NIGHT_SKY: Colour = (0.006, 0.007, 0.010)
 _GLOW: Colour = (0.010, 0.009, 0.010)
 _SODIUM: Colour = (1.0, 0.62, 0.25)
 _WHITE: Colour = (0.92, 0.97, 1.0)
 LAMP_GLOW = 0.035
-"""Scattered light on a lit road, as a share of that below a lamp."""
+"""Scattered light on a lit road, as a share of the light directly below a lamp."""
 
 
 def lit_as(light: Light, look: Lighting, albedo: float = 0.0) -> Light:
-    """`light` as `look` has it, on a road of this albedo (0: the scenery's own), for which the
-    exposure makes up in part, as a camera's automatic does."""
+    """`light` changed by `look`, on a road of this albedo (0: the scenery's own). The exposure
+    compensates a part of the albedo, as a camera's automatic exposure does."""
     automatic = (USUAL_ALBEDO / albedo) ** COMPENSATED if albedo else 1.0
     stops = look.exposure_stops
     if look.night:
@@ -45,8 +45,8 @@ def lamp_colour(look: Lighting) -> Colour:
 
 
 def _by_night(light: Light, look: Lighting) -> Light:
-    """Only the headlights, the lamps and a glow over the horizon are left. The headlights take the
-    sun's place (see night.glsl), which then stands at the zenith, out of sight."""
+    """`light` by night: only the headlights, the lamps and a glow over the horizon are left. The
+    headlights replace the sun (see night.glsl), so the sun is put at the zenith, out of sight."""
     lamps = lamp_colour(look)
 
     def mixed(dark: Colour, share: float) -> Colour:
@@ -70,7 +70,7 @@ def _by_night(light: Light, look: Lighting) -> Light:
 
 
 def _with_low_sun(light: Light, elevation_deg: float) -> Light:
-    """The sun lower, and so redder and dimmer, than the kind of light has it."""
+    """`light` with the sun lower, and so redder and dimmer, than the kind of light has it."""
     elevation = min(math.radians(elevation_deg), light.sun_elevation)
     clear = math.sin(elevation) / math.sin(max(light.sun_elevation, elevation))
     red, green, blue = light.sun

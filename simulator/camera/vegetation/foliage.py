@@ -60,7 +60,7 @@ def outlines() -> FloatArray:
 
 
 def _finished(canvas: Canvas) -> NDArray[np.uint8]:
-    """Averaged to cell size, with the leaf colour run out under the transparent rim."""
+    """The canvas averaged to cell size, with the leaf colour extended under the transparent rim."""
     alpha = canvas[..., 3:]
     premultiplied = np.concatenate([canvas[..., :3] * alpha, alpha], axis=-1)
     small = cv2.resize(premultiplied, (CELL, CELL), interpolation=cv2.INTER_AREA)
@@ -204,8 +204,8 @@ def outline(alpha: NDArray[np.uint8]) -> FloatArray:
 
 
 def _one_fewer(polygon: FloatArray) -> FloatArray:
-    """The polygon with the edge taken out that costs the least area: its neighbours are extended
-    until they meet."""
+    """The polygon without one edge, whose neighbours are extended until they meet: the edge for
+    which this adds the least area."""
     best, least = polygon, np.inf
     for k in range(len(polygon)):
         before, a, b, after = (polygon[(k + shift) % len(polygon)] for shift in (-1, 0, 1, 2))
@@ -217,7 +217,7 @@ def _one_fewer(polygon: FloatArray) -> FloatArray:
             kept = np.delete(polygon, (k + 1) % len(polygon), axis=0)
             kept[k - (k == len(polygon) - 1)] = meeting
             best, least = kept, area
-    if best is polygon:  # no two edges meet within the cell: the cell itself does
+    if best is polygon:  # no two edges meet within the cell, so the whole cell is the outline
         return np.array([[-0.5, 0.0], [0.5, 0.0], [0.5, 1.0], [-0.5, 1.0]])
     return best
 

@@ -27,7 +27,7 @@ LEAF_SHEDDING = ("oak", "poplar", "birch", "bush")
 SHADY = ("oak", "birch", "pine", "fir")
 AVENUE_STEP_M, OVERHANG_M = 18.0, 2.5
 TUNNEL_STEP_M, TUNNEL_OVERHANG_M = 9.0, 4.5
-"""Of an avenue whose crowns close over the road."""
+"""Spacing of the trees of a tunnel, and reach of their crowns over the asphalt."""
 
 
 @dataclass(frozen=True)
@@ -55,8 +55,8 @@ def plant(
 ) -> Trees:
     """The trees of a scene, in groves, denser near the road.
 
-    `avenue` adds a row of tall trees behind each wall line that meet over the road, `tunnel` a
-    denser one, whose crowns close over it.
+    `avenue` adds a row of tall trees behind each wall line that meet over the road. `tunnel` makes
+    these rows denser, and the crowns close over the road.
     """
     road = ground.road
     sites = [_groves(road, theme, rng)]
@@ -108,7 +108,7 @@ def _groves(road: Road, theme: Theme, rng: np.random.Generator) -> Sites:
 
 
 def _avenue(road: Road, theme: Theme, rng: np.random.Generator, *, tunnel: bool) -> Sites:
-    """Tall trees along both wall lines; the kinds that grow here and give shade, else pines."""
+    """Tall trees along both wall lines: kinds of the theme that give shade, otherwise pines."""
     shady = [kind for kind in theme.trees if kind in SHADY] or ["pine"]
     step_m, overhang = (TUNNEL_STEP_M, TUNNEL_OVERHANG_M) if tunnel else (AVENUE_STEP_M, OVERHANG_M)
     step = road.track.length_m / max(1, round(road.track.length_m / step_m))

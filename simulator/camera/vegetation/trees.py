@@ -21,10 +21,10 @@ Part = Literal["core", "fringe", "labels"]
 
 REACH_M = 420.0
 MOST = 160
-"""Trees drawn at once; the farthest are left out."""
+"""Largest number of trees drawn at once; the farthest are left out."""
 NEAR_M = 80.0
-"""Nearer trees are drawn in two passes and within their outline; beyond, the extra vertices cost
-more than they save."""
+"""Trees nearer than this are drawn in two passes and within their outline; for farther trees, the
+extra vertices would cost more than they save."""
 _SQUARE = ((-0.5, 0.0), (0.5, 0.0), (0.5, 1.0), (-0.5, 1.0))
 _SQUARE_FAN = np.array([[0, 1, 2], [0, 2, 3]])
 _OUTLINE_FAN = 4 + np.array([[0, k, k + 1] for k in range(1, CORNERS - 1)])
@@ -79,7 +79,7 @@ class TreeMesh:
         trees = visible_spheres(self._feet, self._size, REACH_M, MOST, eye, planes)
         squared = ((self._feet[trees] - eye) ** 2).sum(axis=1)
         near = int(np.searchsorted(squared, NEAR_M**2))
-        # Seen from above, a tree is a crown of another outline.
+        # Seen from above, a tree is drawn as a crown, which has another outline.
         fan = _SQUARE_FAN if from_above else _OUTLINE_FAN
         first = self._corners * trees[:, None, None]
         corners = np.concatenate(

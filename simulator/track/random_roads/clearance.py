@@ -1,4 +1,4 @@
-"""Whether a closed course keeps clear of itself. Metres."""
+"""Checks that no part of a closed course comes too near to another part. Metres."""
 
 import math
 from typing import Final
@@ -9,20 +9,20 @@ from simulator.arrays import FloatArray
 from simulator.track.layout import Segment, cut, place
 
 CLEARANCE_M: Final = 24.0
-"""Least distance between the centre lines of two parts of the road: walls that stand up to 12 m
-from the centre line never meet, the inner walls of the tightest bend (12 m) included. A road of
-three lanes of 4.3 m with shoulders of 3 m has its walls at 11.95 m."""
+"""Least distance between the centre lines of two parts of the road. Walls up to 12 m from the
+centre line then never meet, nor do the inner walls of the tightest bend (12 m). A road of three
+lanes of 4.3 m with shoulders of 3 m has its walls at 11.95 m."""
 STEP_M: Final = 3.0
 MOST_SAMPLES: Final = 500
 BULGE_M: Final = 0.3
-"""Most by which a bend leaves the chord of a piece (5 m long, radius 12 m: 0.26 m)."""
+"""Largest distance of a bend from the chord of a piece (5 m long, radius 12 m: 0.26 m)."""
 
 
 def keeps_clear(segments: list[Segment]) -> bool:
     """Whether no two parts of a closed course are nearer than `CLEARANCE_M`.
 
-    Parts closer along the road than half the circle of that diameter need no check: where no radius
-    is below half of it, they are on no sharper bend than that circle.
+    Points less than half a circle of diameter `CLEARANCE_M` apart along the road are not compared:
+    they are on one bend, and no radius is below half of `CLEARANCE_M`.
     """
     placed = place(cut(segments))
     total = float(placed.s0[-1] + placed.length[-1])
@@ -35,14 +35,14 @@ def keeps_clear(segments: list[Segment]) -> bool:
     near = math.ceil(math.pi / 2.0 * CLEARANCE_M / step)
     # Two lines at `CLEARANCE_M` may be sampled half a step apart along them, round a tight bend.
     least = CLEARANCE_M + BULGE_M + step * step / 64.0
-    # Every pair once: each sample with those up to half a lap ahead.
+    # Each pair once: every sample is compared with the samples up to half a lap ahead.
     ahead_x, ahead_y = (_ahead(values, near, count // 2 + 1) for values in (x, y))
     dx, dy = ahead_x - x[:, None], ahead_y - y[:, None]
     return bool((dx * dx + dy * dy).min() >= least * least)
 
 
 def _ahead(values: FloatArray, first: int, last: int) -> FloatArray:
-    """The values (N, last - first) that come `first` to `last` places after each of `values` (N,),
+    """The values (N, last - first) that lie `first` to `last` places after each of `values` (N,),
     round the lap."""
     lap = np.concatenate((values, values))
     return np.lib.stride_tricks.sliding_window_view(lap, last)[: len(values), first:]

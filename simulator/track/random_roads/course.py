@@ -1,7 +1,7 @@
 """The course of a random road in the plane: a polygon whose corners are rounded to bends.
 
-A closed polygon gives a closed road by itself: nothing has to be searched. Metres; angles in
-degrees, left positive, in the resolution of the file.
+A polygon is closed, so the road closes without a search. Metres; angles in degrees, left positive,
+in the resolution of the file.
 """
 
 import math
@@ -16,13 +16,13 @@ from simulator.track.random_roads.kinds import Kind
 
 MIN_STRAIGHT_M: Final = 1.0
 MIN_BEND_M: Final = 8.0
-"""Shorter bends than this would be kinks."""
+"""Least length of a bend; a shorter one would be a kink."""
 MIN_TURN_DEG: Final = 0.5
 SHARP_DEG: Final = 35.0
-"""A corner that turns by this may be of several arcs."""
+"""Least turn of a corner that may consist of several arcs."""
 MIN_BANKED_SPIRAL_M: Final = 8.0
 RANK_NOISE: Final = 0.6
-"""Of the logarithm of the room for a bend: small radii go to narrow corners, but not always."""
+"""Noise on the logarithm of the room for a bend: small radii mostly go to narrow corners."""
 
 
 class DoesNotFit(Exception):
@@ -31,7 +31,7 @@ class DoesNotFit(Exception):
 
 @dataclass(frozen=True)
 class Arc:
-    """Part of a bend, as a row of the file."""
+    """Part of a bend: one row of the file."""
 
     radius: float
     angle: float
@@ -42,7 +42,7 @@ class Arc:
         return Bend(self.radius, math.radians(self.angle), self.spiral, 0.0, 0.0)
 
     def scaled(self, factor: float) -> "Arc":
-        """Of a similar bend, with spirals that still fit after rounding down."""
+        """The arc scaled by `factor`, with spirals that still fit after rounding down."""
         return replace(
             self,
             radius=round(self.radius * factor, 2),
@@ -55,7 +55,7 @@ Corner = tuple[Arc, ...]
 
 @dataclass(frozen=True)
 class Course:
-    """A closed course: a straight of `straights[i]` leads to `corners[i]`."""
+    """A closed course: the straight `straights[i]` leads to `corners[i]`."""
 
     straights: tuple[float, ...]
     corners: tuple[Corner, ...]
@@ -95,7 +95,7 @@ def _polygon(kind: Kind, unevenness: float, rng: np.random.Generator) -> FloatAr
 
 
 def _turns(edges: FloatArray) -> FloatArray:
-    """Turn (n,) at the start of each edge, degrees with three decimals, in all exactly +-360."""
+    """Turn (n,) at the start of each edge, degrees with three decimals; they add up to +-360."""
     before = np.roll(edges, 1, axis=0)
     cross = before[:, 0] * edges[:, 1] - before[:, 1] * edges[:, 0]
     turns = np.degrees(np.arctan2(cross, (before * edges).sum(axis=1)))
@@ -107,8 +107,8 @@ def _turns(edges: FloatArray) -> FloatArray:
 def _corners(
     kind: Kind, turns: FloatArray, largest: FloatArray, rng: np.random.Generator
 ) -> tuple[Corner, ...]:
-    """A bend for each turn, of radii that are log-even over all; the small ones go where the
-    `largest` that fits is small."""
+    """A bend for each turn. The radii are log-uniform over all bends; small radii go to corners for
+    which the `largest` radius that fits is small."""
     count = len(turns)
     low, high = np.log(kind.radius_m)
     radii = np.exp(low + (high - low) * (np.arange(count) + rng.uniform(size=count)) / count)
@@ -127,7 +127,7 @@ def _least_radius(turn: float) -> float:
 
 
 def _corner(kind: Kind, turn: float, radius: float, rng: np.random.Generator) -> Corner:
-    """One corner that turns by `turn` degrees, `radius` its smallest."""
+    """One corner that turns by `turn` degrees; its smallest radius is `radius`."""
     abrupt, compound, spiral, banking = rng.uniform(size=4).tolist()
     if compound < kind.compound and abs(turn) > SHARP_DEG:
         return _compound(kind, turn, radius, rng)
@@ -140,7 +140,7 @@ def _corner(kind: Kind, turn: float, radius: float, rng: np.random.Generator) ->
 
 
 def _compound(kind: Kind, turn: float, radius: float, rng: np.random.Generator) -> Corner:
-    """Two or three arcs that follow each other abruptly, the tightest of them of `radius`."""
+    """Two or three arcs joined without spirals; the tightest has the radius `radius`."""
     count = int(rng.integers(2, 4))
     shares = rng.uniform(0.6, 1.4, count)
     angles = [round(float(a), 3) for a in turn * shares / shares.sum()]
@@ -154,7 +154,7 @@ def _compound(kind: Kind, turn: float, radius: float, rng: np.random.Generator) 
 
 
 def _fitted(kind: Kind, corners: tuple[Corner, ...], room: FloatArray) -> tuple[Corner, ...]:
-    """The corners, made smaller where they need more than `room` of an edge. Raises DoesNotFit."""
+    """The corners, shrunk where they need more than `room` of an edge. Raises DoesNotFit."""
     need = np.maximum(*_tangents(corners))
     factors = np.minimum(1.0, 0.995 * room / need).tolist()
     fitted = []
@@ -168,12 +168,12 @@ def _fitted(kind: Kind, corners: tuple[Corner, ...], room: FloatArray) -> tuple[
 
 
 def _without_short_banking(arc: Arc) -> Arc:
-    """A road cannot lean within a few metres."""
+    """The arc without its banking if it is short: a road cannot bank within a few metres."""
     return arc if arc.spiral >= MIN_BANKED_SPIRAL_M else replace(arc, spiral=0.0, banking=0.0)
 
 
 def _tangents(corners: tuple[Corner, ...]) -> tuple[FloatArray, FloatArray]:
-    """How much of the edge before and after it each corner takes, two (n,) arrays."""
+    """Lengths of the edges before and after it that each corner uses, two (n,) arrays."""
     bends: list[Segment] = [arc.bend() for corner in corners for arc in corner]
     placed = place(cut(bends))
     lengths = [sum(_length(arc) for arc in corner) for corner in corners]
@@ -194,7 +194,7 @@ def _length(arc: Arc) -> float:
 
 
 def _closed(before: FloatArray, corners: tuple[Corner, ...]) -> Course:
-    """The course whose straights close exactly, begun in the middle of the longest straight."""
+    """The course with straights that close the loop, from the middle of the longest straight on."""
     first = int(np.argmax(before))
     order = [*range(first, len(corners)), *range(first)]
     segments: list[Segment] = []

@@ -36,5 +36,5 @@ def _lines(content: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _literal(value: str | bool | float) -> str:
-    """JSON's text of a plain string, boolean or number is TOML's as well."""
+    """`value` as TOML: for plain strings, booleans and numbers this is JSON's text."""
     return json.dumps(value)

@@ -12,7 +12,7 @@ from typing import Any, Final
 import numpy as np
 
 BLOCK: Final = 20
-"""Sum of the shares: as many seeds in a row, from a multiple of it, have each kind in its share."""
+"""Sum of the shares. `BLOCK` seeds in a row, from a multiple of it, have each kind in its share."""
 
 Range = tuple[float, float]
 
@@ -31,8 +31,8 @@ class Kind:
     unevenness: float
     """How much the corners' distance from the middle varies; 0: a round course."""
     radius_m: Range
-    """Of the bends, log-even. A bend that does not fit between its neighbours becomes tighter, but
-    not tighter than the least."""
+    """Radius of the bends, log-uniform. A bend that does not fit between its neighbours becomes
+    tighter, down to the least radius."""
     abrupt: float
     """Share of the bends that begin and end without a spiral."""
     compound: float
@@ -40,7 +40,7 @@ class Kind:
     spiral: Range
     """Length of each spiral, as a share of radius times angle."""
     banking_deg: Range
-    """Of bends with spirals."""
+    """Banking of bends with spirals."""
     grade_percent: Range
     """Steepest grade of a lap."""
     hill_m: Range

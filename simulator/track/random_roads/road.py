@@ -1,11 +1,11 @@
 """Random roads: the track `random:SEED`, a function of its seed.
 
-Errors of the heading are largest, and biased, in tight bends and at changes of curvature, which
-other tracks show in few frames; half of the frames of a random road's drive show one of the two.
+Errors of the heading are largest, and biased, in tight bends and at changes of curvature. Other
+tracks show these in few frames, the drive on a random road in half of its frames.
 
 The road is drawn as the content of a TOML file (see `toml_track`), in decimals: the same seed gives
-the same decimals on every machine (numpy's PCG64; what sines are rounded to disappears in the
-rounding to decimals), and the hash is that of the decimals.
+the same decimals on every machine (numpy's PCG64; rounding to decimals removes the differences of
+sines in the last bits). The hash of the track is the hash of these decimals.
 """
 
 import math
@@ -28,14 +28,14 @@ from simulator.track.toml_track import Table, build_track, read_segments
 RANDOM: Final = "random"
 MAX_SEED: Final = 2**63 - 1
 CALMER: Final = 0.98
-"""Each course that does not fit makes the next one rounder, so that one is found at last."""
+"""Factor on the unevenness after each course that does not fit, so that one fits in the end."""
 DASHES: Final = ((3.0, 6.0), (4.0, 8.0), (6.0, 12.0), (3.0, 9.0))
 Row = dict[str, Any]
 _SEED: Final = re.compile(r"[0-9]{1,19}")
 
 
 def is_random(name: str) -> bool:
-    """Whether `name` means a random road, a misspelt one included."""
+    """Whether `name` has the form of a random road's name, even if it is misspelt."""
     return name == RANDOM or name.startswith(f"{RANDOM}:")
 
 
@@ -44,7 +44,7 @@ def random_name(seed: int) -> str:
     return f"{RANDOM}:{seed}"
 
 
-@lru_cache(maxsize=1024)  # a plan needs each twice; one takes 70 kB
+@lru_cache(maxsize=1024)  # a plan needs each track twice; a track takes 70 kB
 def random_track(name: str) -> Track:
     """The track called `random:SEED`. Raises UnknownTrack for another name."""
     seed = seed_of(name)
@@ -75,7 +75,7 @@ def road_file(seed: int) -> dict[str, Any]:
 
 
 def _about(kind: Kind, rng: np.random.Generator) -> dict[str, Any]:
-    """What is no segment: look, surface, paint."""
+    """The entries of the file apart from the segments: look, surface, paint."""
     gravel = bool(rng.uniform() < kind.gravel)
     look = "gravel" if gravel else kind.looks[rng.integers(len(kind.looks))]
     surface = "gravel" if gravel else "concrete" if rng.uniform() < 0.1 else "asphalt"
@@ -115,7 +115,7 @@ def _course_rows(kind: Kind, rng: np.random.Generator) -> list[Row]:
 
 
 def _rows(course: Course) -> list[Row]:
-    """From the middle of the first straight to the middle of it."""
+    """The rows of a lap that starts and ends in the middle of the first straight."""
     half = round(course.straights[0] / 2.0, 3)
     rows: list[Row] = []
     for length, corner in zip((half, *course.straights[1:]), course.corners, strict=True):
@@ -129,8 +129,8 @@ def _read(rows: list[Row]) -> list[Segment]:
 
 
 def _grades(kind: Kind, segments: list[Segment], rng: np.random.Generator) -> list[float]:
-    """Grade of each segment, percent: the road lies on hills, so that parts of it that are near
-    each other are about as high, and the lap ends as high as it began."""
+    """Grade of each segment, percent. The road lies on hills, so that neighbouring parts of it have
+    similar heights and the lap closes in height."""
     placed = place(cut(segments))
     lengths = np.array([segment_length(segment) for segment in segments])
     at = np.concatenate(([0.0], np.cumsum(lengths)))[:-1]

@@ -1,7 +1,7 @@
-"""What an imported TORCS track looks like: told by its category, its surface, its name, its height.
+"""Chooses the look of an imported TORCS track from its category, surface, name and height.
 
-TORCS keeps scenery in 3D models, which are not read; a name that says nothing draws one of the
-looks that suit a track with, or without, kerbs.
+TORCS keeps scenery in 3D models, which are not read. For a name without a known word, one of the
+looks that suit a track with, or without, kerbs is drawn.
 """
 
 import hashlib

@@ -1,7 +1,7 @@
-"""TORCS segments to pieces: profile steps, spirals, heights, banking, as TORCS 1.3.7 has them.
+"""Converts TORCS segments to pieces: profile steps, spirals, heights, banking, as in TORCS 1.3.7.
 
-Everything is in SI units and at the centre line; the program's own words are kept where it has
-one (`profil`). Attributes that TORCS does not know (misspelt ones, too) have no effect.
+Everything is in SI units and at the centre line; TORCS's own terms are kept (`profil`). Attributes
+unknown to TORCS (misspelt ones, too) have no effect.
 """
 
 import math
@@ -27,7 +27,7 @@ Edges = NDArray[np.float64]
 
 @dataclass
 class Profile:
-    """What one segment hands on to the next: end heights, end slopes and the sticky grade."""
+    """Values that a segment passes to the next: end heights, end slopes and the sticky grade."""
 
     end: Edges
     tangent: Edges
@@ -117,7 +117,7 @@ def _end_heights(
 
 
 def _edges(read: Callable[[str], float | None], name: str, default: Edges) -> Edges:
-    """The attribute `name`, for both edges or for one by one, else `default`."""
+    """The attribute `name`, given for both edges or one by one, else `default`."""
     left, right = (read(f"{name} {side}") for side in ("left", "right"))
     both = read(name)
     if both is not None:
@@ -130,7 +130,7 @@ def _mean(edges: Edges) -> float:
 
 
 def _banked(middle: float, edges: Edges, banking: float | None, width: float) -> Edges:
-    # Without an angle of its own a segment keeps the height difference of its edges.
+    # Without a banking angle of its own, a segment keeps the height difference of its edges.
     half = (edges[0] - edges[1]) / 2.0 if banking is None else math.tan(banking) * width / 2.0
     return np.array([middle + half, middle - half])
 
@@ -169,7 +169,7 @@ def _steps(
     """Length and radius of every step; a spiral's steps are scaled to turn by `arc` in all."""
     step = length / steps
     if radius == radius_end or steps == 1:
-        # One step knows the start radius only, so its length follows from the arc.
+        # A single step has only the start radius, so its length follows from the arc.
         only = step if radius == radius_end else radius * arc
         return [only] * steps, [radius] * steps
     change = (radius_end - radius) / (steps - 1)

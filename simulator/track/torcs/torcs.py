@@ -13,7 +13,7 @@ from simulator.track.torcs.torcs_xml import Section, read_parameter_file
 
 DEFAULT_WIDTH_M: Final = 15.0
 SEGMENT_LISTS: Final = {3: "segments", 4: "Track Segments"}
-"""Name of the list of segments in each version of the format that we read."""
+"""Name of the list of segments in each version of the format that can be read."""
 MAX_PIECES: Final = 200_000
 
 

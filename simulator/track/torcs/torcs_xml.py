@@ -32,7 +32,7 @@ _ENCODING = re.compile(rb"<\?xml[^>]*?encoding\s*=\s*[\"']([A-Za-z0-9._-]+)[\"']
 
 @dataclass(frozen=True)
 class Section:
-    """One section of a parameter file; attributes that nobody asks for are ignored."""
+    """One section of a parameter file; unknown attributes are ignored."""
 
     element: Element
     file: Path
@@ -87,12 +87,12 @@ class Section:
         return None if attribute is None else attribute.get("val", "")
 
     def _attribute(self, kind: str, name: str) -> Element | None:
-        # The first one wins where a name is given twice: so the program has ruudskogen's heights.
+        # If a name occurs twice, the first one counts: TORCS's heights of ruudskogen need this.
         return next((c for c in self.element.findall(kind) if c.get("name") == name), None)
 
 
 def _number_in(text: str) -> float:
-    """The number, decimal or hexadecimal ("0x1f"), that is all of `text`; NaN if it is none.
+    """The number, decimal or hexadecimal ("0x1f"), if it is all of `text`; else NaN.
 
     TORCS reads "1,5" and "1.5.2" as far as it can, and an empty text as 0; these are refused."""
     found = _NUMBER.fullmatch(text)

@@ -37,7 +37,7 @@ UNITS: Final = {
     **_named("km", factor=1000.0, dimension=LENGTH),
     **_named("cm", factor=0.01, dimension=LENGTH),
     **_named("mm", factor=0.001, dimension=LENGTH),
-    # As the program has them: a foot is 0.3048 m, a slug 14.593903 kg, a psi 6894.757 Pa.
+    # TORCS's own factors; by definition a foot is 0.3048 m, a slug 14.593903 kg, a psi 6894.757 Pa.
     **_named("ft", "feet", factor=0.304801, dimension=LENGTH),
     **_named("in", "inch", "inches", factor=0.0254, dimension=LENGTH),
     **_named("rad"),

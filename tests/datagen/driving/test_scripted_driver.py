@@ -73,7 +73,7 @@ def test_pedals_balance_drag_and_slope_and_shift_up_once() -> None:
 
 @pytest.mark.parametrize("speed", [8.0, 12.0, 18.0])
 def test_pedals_hold_a_speed_without_trim(speed: float) -> None:
-    """Drag, rolling and the engine's own braking are met to 0.1 m/s2."""
+    """Drag, rolling resistance and engine braking are balanced to 0.1 m/s2."""
     pedals = Pedals(CarParameters())
     with World(Road(find_track("oval"))) as world:
         state = world.reset(seed=1, s=50.0, speed=speed)
@@ -105,7 +105,7 @@ def test_a_minute_of_driving_is_on_course_and_clear_of_everything(
 
 
 def test_recoveries_come_from_yaw_and_from_offset_disturbances() -> None:
-    """Off the lane's line by heading in one, by place in the other, and back again in both."""
+    """Yaw recoveries leave the lane by heading, offset recoveries by place; both return to it."""
     road = Road(find_track("highway"), 2)
     lane, yaw, offset = (
         make_course(kind, road, 4000.0, np.random.default_rng(7))

@@ -1,4 +1,4 @@
-"""Collecting for real: same bytes twice, resuming, what is refused."""
+"""Real collections: equal bytes in two runs, resuming, refused options."""
 
 import itertools
 import json
@@ -41,7 +41,7 @@ def test_a_collected_dataset_passes_verify_and_can_be_read(collected: Path) -> N
     assert {info.split for info in dataset.rounds} == {"train", "test"}
     frames = dataset.select("all")
     images = frames.read_batch(range(60), np.empty((60, 210, 280, 3), np.uint8))
-    # A road is in the picture: neither black nor of one colour, the sky above it lighter.
+    # The picture shows a road: it is neither black nor of one colour, and the sky is brighter.
     assert images.std(axis=(1, 2, 3)).min() > 10.0
     labels = frames.labels
     place = labels.to_middle[labels.round == 0]
@@ -92,7 +92,7 @@ def test_a_finished_dataset_is_left_alone_and_a_lost_round_made_again(collected:
 @pytest.mark.parametrize(
     ("args", "message"),
     [
-        (["--seed", "9"], "seed: 0 there, 9 asked for"),
+        (["--seed", "9"], "seed: 0 in its plan, now 9"),
         (["--tracks", "no-such-track"], "no track 'no-such-track'"),
         (["--lanes", "1,5"], "a road of 5 lanes is not supported"),
         (["--lanes", "one"], "--lanes is 'one'"),
@@ -102,7 +102,7 @@ def test_a_finished_dataset_is_left_alone_and_a_lost_round_made_again(collected:
         (["--shard", "3/2"], "--shard is '3/2'"),
         (["--split", "later"], "no split 'later'"),
         (["--split", "unseen"], "track circuit is one of those to train on"),
-        (["--jitter-camera"], "jitter_camera: False there, True asked for"),
+        (["--jitter-camera"], "jitter_camera: False in its plan, now True"),
     ],
 )
 def test_impossible_options_are_refused_with_a_one_line_error(

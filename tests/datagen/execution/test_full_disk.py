@@ -25,7 +25,7 @@ PR_CAPBSET_DROP, CAP_DAC_OVERRIDE = 24, 1  # <linux/prctl.h>, <linux/capability.
 def test_collection_resumes_after_a_disk_that_was_full_from_the_start(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, failing: int
 ) -> None:
-    """Each write before the first round fails once; the same command then works."""
+    """Each write before the first round fails once; afterwards the same command succeeds."""
     folder = tmp_path / "data"
     plan = make_small_plan(1, 10)
     synced: list[Path] = []

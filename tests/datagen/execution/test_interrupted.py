@@ -97,7 +97,7 @@ def test_a_round_that_cannot_be_driven_is_tried_once_and_reported_in_one_line(
         "datagen.execution.process_pool.CONTEXT", multiprocessing.get_context("fork")
     )
     plan = make_small_plan(2, 3)
-    capfd.readouterr()  # what libraries said when they were loaded
+    capfd.readouterr()  # drops the output of libraries at import
     expected = r"1 of 2 rounds failed \(round-000: the car left the road 21 times\); the finished"
     with pytest.raises(DatasetError, match=expected) as told:
         collect(plan, tmp_path / "data", workers=1)

@@ -13,5 +13,5 @@ def test_the_final_speed_counts_only_frames_recorded_in_this_run() -> None:
     assert str(column.render(task)) == "starting"
     task.completed = 1000
     task.finished_time = 4.0
-    task.finished_speed = 9999.0  # of the last moments
+    task.finished_speed = 9999.0  # speed of the last moments, which must not be shown
     assert str(column.render(task)) == "50 frames/s"

@@ -57,7 +57,7 @@ def test_the_round_of_a_dead_actor_is_retried(tmp_path: Path) -> None:
 def test_only_a_cluster_that_is_named_is_joined(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, address: str | None
 ) -> None:
-    """Another collection's cluster on this machine would end with it."""
+    """A cluster found by chance may belong to another collection and would end with it."""
     ray = pytest.importorskip("ray")
     asked: list[dict[str, Any]] = []
 

@@ -69,7 +69,7 @@ def test_parallel_shards_give_the_same_dataset_as_one_collector(
     results = [json.loads(stdout) for stdout, _ in ended]
     assert [result["rounds"] for result in results] == [2, 1]
     assert files(shared) == files(whole)
-    # The last to end has derived the manifest.
+    # The last shard to end has written the manifest.
     last = next(result for result in results if result["content_hash"])
     assert last["content_hash"] == Dataset.open(whole).content_hash
     assert (shared / "manifest.json").read_text() == (whole / "manifest.json").read_text()

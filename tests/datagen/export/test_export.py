@@ -1,4 +1,4 @@
-"""`datagen export`: read back with the libraries it is for, whole or not there at all."""
+"""`datagen export`: read back with the target libraries; complete or not written at all."""
 
 import errno
 import json

@@ -67,7 +67,7 @@ def test_no_class_is_rare_on_either_side_whatever_the_seed(
         moved.append(sum(new != old for new, old in pairs))
     assert np.mean(moved) < 0.25 * rounds
     if rounds < 60:
-        assert min(before) < MIN_SHARE  # there was something to do
+        assert min(before) < MIN_SHARE  # so balancing had to change something
 
 
 def test_balancing_accepts_a_class_that_the_tracks_do_not_have() -> None:
@@ -110,7 +110,7 @@ def test_the_forecast_over_a_lap_is_the_share_of_lap_time_in_each_class() -> Non
     shares = forecast(entry, np.array([0.0, 0.3, 0.9]))
     assert np.allclose(shares, shares[0], atol=0.01)
     assert shares.sum(axis=1) == pytest.approx([1.0, 1.0, 1.0])
-    # In closed form: the oval's two bends, looked at 20 m ahead, at one speed.
+    # In closed form: the oval's two bends, extended by 20 m ahead, at constant speed.
     s = np.arange(0.0, track.length_m, 0.1)
     bends = np.abs(track.at(s).curvature) >= 1 / 170
     soon = np.abs(track.at(s + tf.LOOK_AHEAD_M).curvature) >= 1 / 170

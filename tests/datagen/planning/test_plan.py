@@ -72,7 +72,7 @@ def test_a_quarter_is_for_testing_and_every_track_and_lane_count_is_on_both_side
         assert {light for e in side for light in e.lights} == set(LIGHTS)
         assert {e.trajectory for e in side} == set(TRAJECTORIES)
     roads = {side: {(e.track, e.lanes) for e in sides[side]} for side in sides}
-    assert roads["test"] <= roads["train"]  # of 27 roads each has two rounds or three
+    assert roads["test"] <= roads["train"]  # each of the 27 roads has two or three rounds
     assert len({e.seed for e in rounds}) == 60
     assert not {e.seed for e in rounds} & {e.seed for e in make_plan(wanted(seed=seed + 1)).rounds}
 
@@ -196,7 +196,7 @@ def test_the_plan_hash_depends_on_the_program_version(monkeypatch: pytest.Monkey
 def test_a_plan_of_the_default_camera_is_stored_as_before_cameras_had_lenses(
     jitter: bool, expected: str
 ) -> None:
-    """Hashes of what the program of before wrote, so that an unfinished dataset is continued."""
+    """Hashes of plans written before cameras had lenses; their datasets must stay resumable."""
     tracks = TrackChoice("oval", "0" * 64), TrackChoice("town", "1" * 64)
     config = CollectConfig(
         rounds=4, frames=300, seed=3, tracks=tracks, stretch=50, jitter_camera=jitter,

@@ -1,4 +1,4 @@
-"""`--tracks random`: each round drives on a road of its own, mostly where labels are hard."""
+"""`--tracks random`: each round has its own road, and most of its frames have difficult labels."""
 
 from collections import Counter
 from dataclasses import replace
@@ -60,8 +60,8 @@ def test_no_heading_class_is_rare() -> None:
 
 
 def driven(entry: RoundPlan) -> tuple[float, np.ndarray]:
-    """Share of a round's frames in bends under 100 m or within 8 m of a change of curvature, and in
-    bends of 12 to 25, 25 to 50, 50 to 100 m (3,)."""
+    """Shares of a round's frames: in bends under 100 m or within 8 m of a change of curvature; and
+    in bends of 12 to 25, 25 to 50, 50 to 100 m (3,)."""
     road = Road(random_track(entry.track), entry.lanes, entry.lane_width_m)
     profile = speed_profile(road.track, entry.speed_kmh / 3.6, max_offset(road))
     s, places = entry.start * road.track.length_m, []

@@ -1,4 +1,4 @@
-"""`--roads`: the paper's roads stay as they were, varied ones are drawn, stored and read back."""
+"""`--roads`: the paper's roads are unchanged; varied roads are drawn, stored and read back."""
 
 import json
 from dataclasses import replace
@@ -25,8 +25,8 @@ from simulator.varied.look import RoadLook
 from trackfeatures.errors import UserError
 
 BEFORE: dict[str, Any] = json.loads(Path(__file__).with_name("paper_roads.json").read_text())
-"""Of the last commit before there were varied roads: hashes of plans, and of the images and labels
-of rounds as the renderer that it names drew them."""
+"""Stored from the last commit without varied roads: hashes of plans, and of the images and labels
+of rounds as drawn by the renderer that the file names."""
 TRACKS = ("highway", "town", "gravel-valley")
 
 
@@ -37,7 +37,7 @@ def config(**options: Any) -> CollectConfig:
 
 @pytest.fixture(autouse=True)
 def _version_of_before(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The hash of a plan holds the program's version."""
+    """Set the program's version of that commit, which is part of a plan's hash."""
     monkeypatch.setattr(plan_module, "version", lambda name: "0.2.0")
 
 
@@ -48,7 +48,7 @@ def test_plans_of_the_papers_roads_keep_their_hash(tmp_path: Path) -> None:
         config(rounds=5, frames=30, seed=1, stretch=0, scenes=0, jitter_camera=True)
     )
     assert jittered.hash == BEFORE["jittered_plan_hash"]
-    # A plan of before says nothing of roads; it resumes.
+    # A plan from before varied roads has no option for roads; it can be resumed.
     initialise_folder(tmp_path, plan)
     written = json.loads((tmp_path / PLAN_FILE).read_text())
     assert "roads" not in written["wanted"]
@@ -67,7 +67,7 @@ def test_the_papers_roads_are_recorded_as_before(
     path = tmp_path / "round.mcap"
     plan = make_plan(config())
     record_round(plan.rounds[1], plan.hash, path, None)
-    # Of its images and labels.
+    # The hash of the round's images and labels.
     assert open_round(path).result.content_hash == BEFORE["contents"][1]
 
 
@@ -98,7 +98,7 @@ def test_the_hash_holds_what_was_drawn() -> None:
 
 def test_another_kind_of_roads_does_not_resume(tmp_path: Path) -> None:
     initialise_folder(tmp_path, make_plan(config(roads="varied")))
-    with pytest.raises(UserError, match="roads: varied there, paper asked for"):
+    with pytest.raises(UserError, match="roads: varied in its plan, now paper"):
         require_matching_folder(tmp_path, make_plan(config()))
 
 

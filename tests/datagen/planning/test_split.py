@@ -51,7 +51,7 @@ def test_twenty_thousand_rounds_take_less_than_five_seconds_of_processor_time() 
 
 
 def test_a_road_keeps_its_last_training_round_while_another_has_two() -> None:
-    """Four roads of two rounds each: half of the rounds are one of each road."""
+    """Four roads of two rounds each: the test half takes one round of each road."""
     tracks, lanes = ["a", "a", "a", "a", "b", "b", "b", "b"], [1, 1, 2, 2, 1, 1, 2, 2]
     chosen = choose_test_rounds(0.5, tracks, lanes, (), np.random.default_rng(3))
     assert sorted(number // 2 for number in chosen) == [0, 1, 2, 3]

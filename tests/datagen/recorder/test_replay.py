@@ -1,4 +1,4 @@
-"""Rounds simulated again are those that were recorded."""
+"""Simulating recorded rounds again gives the recorded data."""
 
 import json
 import shutil

@@ -1,4 +1,4 @@
-"""Stretches of a round: each has scenery and light of its own, and every frame says which light."""
+"""Each stretch of a round has its own scenery and light, and every frame records its light."""
 
 from pathlib import Path
 
@@ -77,7 +77,7 @@ def test_scenes_repeat_in_order(tmp_path: Path) -> None:
     lights = frames.rounds[0].lights
     assert len(lights) == 3
     assert frames.labels.light.tolist() == [lights[k // 2 % 3] for k in range(24)]
-    # A frame looks more like that of its scene, 6 before it, than like those of the others.
+    # A frame is more similar to the frame of its scene, 6 before it, than to other scenes' frames.
     images = frames.read_batch(range(24)).astype(np.int16)
     for now in range(6, 24):
         apart = [np.abs(images[now] - images[now - back]).mean() for back in (2, 4, 6)]

@@ -1,4 +1,4 @@
-"""A dataset of a stranger: no name in it leads out of a folder that is written to or emptied."""
+"""Untrusted datasets: no name in them leads to a folder outside that is written or emptied."""
 
 import json
 import shutil
@@ -30,7 +30,7 @@ WAYS_OUT = ["../../precious", "..", ".", "", "a/b", "/tmp/driverview-no-such", "
 
 @pytest.fixture
 def precious(tmp_path: Path) -> Path:
-    """A file that is no part of any dataset, two folders above `.partial/`."""
+    """A file that belongs to no dataset, two folders above `.partial/`."""
     kept = tmp_path / "precious" / "file"
     kept.parent.mkdir()
     kept.write_text("mine")

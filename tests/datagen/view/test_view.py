@@ -76,7 +76,7 @@ def test_the_page_holds_images_markings_and_series_in_step(
     told = json.loads(view(recorded, "--html", out, "--json"))
     assert told == {"round": "r001", "frames": FRAMES, "shown": str(out)}
     text = out.read_text()
-    assert not re.search(r'(src|href)="(?!data:)|https?://', text)  # it needs nothing beside it
+    assert not re.search(r'(src|href)="(?!data:)|https?://', text)  # it needs no other file
     data = read_page(text)
     frames = Dataset.open(dataset).select("train")
     assert [frame["step"] for frame in data["frames"]] == list(range(FRAMES))

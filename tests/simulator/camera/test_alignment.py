@@ -32,8 +32,8 @@ def _profile(grey: FloatArray, centre: FloatArray, normal: FloatArray, reach: fl
 
 
 def _errors(camera: Camera, bare: Camera, pose: FloatArray, s: float) -> FloatArray:
-    """Distances (pixels) from the true outer markings to the centres of the painted ones; NaN
-    where no paint is seen within 0.4 m of the truth.
+    """Distances (pixels) from the true outer markings to the centres of the painted lines; NaN
+    where no paint is visible within 0.4 m of the true marking.
 
     Paint is the difference between the images of `camera` and of `bare`, whose road has no paint.
     """
@@ -102,7 +102,7 @@ def test_rendered_paint_coincides_with_projected_markings(name: str, kind: str) 
     found = np.concatenate(errors)
     seen = found[~np.isnan(found)]
     assert len(found) > 1000
-    # Crests hide some of the road.
+    # Crests hide part of the road.
     assert len(seen) > 0.9 * len(found)
     assert np.median(seen) < 0.15
     # Where a line turns away along the line of sight its centre is not well defined.

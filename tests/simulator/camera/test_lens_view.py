@@ -1,4 +1,4 @@
-"""A board rendered on the road through a lens is calibrated back."""
+"""Calibrating images of a board on the road, rendered through a lens, recovers that lens."""
 
 from dataclasses import replace
 
@@ -57,8 +57,8 @@ def board(
 
 
 def show(camera: Camera, pose: NDArray[np.float64], triangles: NDArray[np.float64]) -> None:
-    """Put triangles (T, 11) of the car's frame into the camera's scene, after what `show` put in
-    before was taken out."""
+    """Put triangles (T, 11) of the car's frame into the camera's scene, in place of the triangles
+    of the previous call."""
     turn, vertices = rotation(*pose[3:]), triangles.copy()
     vertices[:, :3] = triangles[:, :3] @ turn.T + pose[:3]
     vertices[:, 3:6] = triangles[:, 3:6] @ turn.T
@@ -126,7 +126,7 @@ def test_a_board_rendered_on_the_road_is_calibrated_back(road: Road) -> None:
 
 
 def test_a_fisheye_is_black_beyond_what_one_view_covers(road: Road) -> None:
-    """A lens of 1.6 px a degree: a ray 72 degrees aside is 115 px beside the middle."""
+    """The lens has 1.6 px per degree: a ray at 72 degrees is 115 px from the middle."""
     focal = 1.6 * 180 / np.pi
     lens = replace(
         FISHEYE, width=321, height=240, matrix=(focal, focal, 160.0, 119.5),

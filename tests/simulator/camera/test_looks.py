@@ -1,4 +1,4 @@
-"""Rendered looks of varied roads: what each changes in the picture, and what none changes."""
+"""Rendered looks of varied roads: the effect of each look, and what no look changes."""
 
 from dataclasses import replace
 
@@ -62,7 +62,7 @@ def test_the_road_has_the_declared_tone(camera: Camera) -> None:
     tones = []
     for tone in (0.07, 0.28):
         surface = Surface(tone=tone, grain=0.3)
-        # The automatic exposure makes up for a part of the tone.
+        # The automatic exposure compensates part of the tone.
         stops = 0.45 * np.log2(tone / 0.13)
         look = RoadLook(surface=surface, light=Lighting(exposure_stops=float(stops) - 0.5))
         picture = view(camera, look)

@@ -92,7 +92,7 @@ def test_views_differ_from_each_other(road: Road) -> None:
 
 
 def test_projection_follows_the_mount(road: Road) -> None:
-    """A point straight ahead of the mount lies in the middle; one to the left, left of it."""
+    """A point straight ahead of the mount projects to the middle, one to the left, left of it."""
     pose = np.array([10.0, 20.0, 3.0, 0.0, 0.0, np.pi / 2])
     with Camera(road, CameraParameters(x=1.0, z=0.5), seed=1, light=light()) as camera:
         points = np.array([[10.0, 31.0, 3.5], [9.0, 31.0, 3.5], [10.0, 31.0, 4.5], [10, 0, 3.5]])

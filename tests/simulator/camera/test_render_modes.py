@@ -47,7 +47,7 @@ def test_class_names_and_their_order() -> None:
 
 @pytest.mark.parametrize("lanes", [1, 3])
 def test_road_depth_equals_the_depth_of_the_track_surface(lanes: int) -> None:
-    """A road pixel's place, eye plus ray times depth, is a point of the track's road plane."""
+    """The point that a road pixel shows, eye plus ray times depth, lies on the road plane."""
     road = Road(find_track("mountain-pass"), lanes)
     rng = np.random.default_rng(3)
     heights = []
@@ -103,7 +103,7 @@ def test_marking_class_matches_the_painted_lines() -> None:
 
 
 def test_car_class_and_depth_match_the_cars_box(road: Road) -> None:
-    """They cover most of the car's projected box, at depths within the box."""
+    """The car's pixels cover most of its projected box, at depths within the box."""
     with Camera(road, CameraParameters(420, 315), seed=1, light=light()) as camera:
         pose = standing_pose(road, 100.0, 0.0)
         for gap, offset in ((10.0, 2.0), (22.0, -2.0), (35.0, 2.0)):
@@ -130,7 +130,7 @@ def test_car_class_and_depth_match_the_cars_box(road: Road) -> None:
 
 
 def test_sky_class_matches_sky_coloured_pixels(road: Road) -> None:
-    """Under a magenta sky in clear air, and only there."""
+    """Sky pixels are those coloured by a magenta sky in clear air."""
     magenta = (1.0, 0.0, 1.0)
     odd = replace(
         light(), zenith=magenta, horizon=magenta, haze=magenta, haze_per_km=1e-6, clouds=0.0
@@ -145,7 +145,7 @@ def test_sky_class_matches_sky_coloured_pixels(road: Road) -> None:
             assert 0.05 < is_sky.mean() < 0.7
             red, green, blue = found["front"].astype(int).transpose(2, 0, 1)
             coloured = (np.minimum(red, blue) - green) > 128
-            # Only the soft edges of leaves are a bit of both.
+            # Only the soft edges of leaves mix both colours.
             assert (coloured != is_sky).mean() < 0.004
 
 
@@ -159,7 +159,7 @@ def test_a_car_changes_colours_at_its_pixels_and_in_its_shadow(road: Road) -> No
     assert not (empty["front:class"] == CAR).any()
     changed = np.abs(found["front"].astype(int) - empty["front"]).sum(axis=2) > 30
     assert changed[drawn].mean() > 0.9
-    # Beside it only its shadow, which lies below.
+    # Beside the car, only its shadow changes colour; the shadow lies below the car.
     beside = changed & ~drawn
     assert beside[: np.nonzero(drawn)[0].min()].sum() == 0
     same = ~(drawn | changed)

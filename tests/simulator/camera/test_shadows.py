@@ -57,8 +57,8 @@ def test_heavy_shadow_covers_30_to_80_percent_of_every_road(name: str) -> None:
 
 
 def lit_and_dark(camera: Camera, s: float) -> tuple[FloatArray, FloatArray]:
-    """Linear light of road pixels 3 to 15 m ahead: those in the sun and those in shadow, by the
-    mask; markings and shadow edges are left out."""
+    """Linear light of road pixels 3 to 15 m ahead, in the sun and in shadow according to the mask;
+    markings and shadow edges are left out."""
     road, mask = camera.road, camera._loaded.scene.mask
     pose = standing_pose(road, s, 0.0)
     grey = np.square(camera.render(pose) / 255.0).mean(axis=2)
@@ -98,7 +98,7 @@ def test_shadow_edges_are_about_one_texel_wide() -> None:
     half = round(road.half_asphalt / shadow_mask.TEXEL_M)
     middle = strip.shape[0] // 2
     asphalt = strip[middle - half : middle + half]
-    # road.frag.glsl draws all of the change between 0.3 and 0.7.
+    # road.frag.glsl draws the whole transition between mask values 0.3 and 0.7.
     between = np.mean((asphalt > 0.3 * 255) & (asphalt < 0.7 * 255))
     assert between < 0.06
 

@@ -33,7 +33,7 @@ def open_camera(road: Road, kind: str = "clear", size: tuple[int, int] = (64, 48
 
 
 def take(camera: Camera) -> np.ndarray[Any, Any]:
-    """Colours and depths at some places."""
+    """Colours and depths at several places."""
     road = camera.road
     shots = [
         camera.render_views(standing_pose(road, s, 0.5), views=("front", "rear:class"))

@@ -36,7 +36,7 @@ def light(kind: str, seed: int = 1) -> Light:
 
 @cache
 def pictures(kind: str) -> FloatArray:
-    """Pictures (seeds * places, 210, 280, 3), in light rather than display values, 0 to 1."""
+    """Pictures (seeds * places, 210, 280, 3) in linear light, 0 to 1."""
     taken = []
     for seed in SEEDS:
         with Camera(road(), seed=5, light=light(kind, seed)) as camera:

@@ -39,7 +39,7 @@ def test_follows_traffic_in_each_lane_without_collision() -> None:
                 assert ending(state) is None
                 if state.time_s > 5.0:
                     assert state.to_middle == pytest.approx(wanted, abs=0.3)
-            assert state.speed_kmh < 66.0  # nobody ahead drives faster than 62
+            assert state.speed_kmh < 66.0  # no traffic car drives faster than 62
 
 
 def test_take_over_keeps_the_cars_present_lane() -> None:
@@ -57,7 +57,7 @@ def test_take_over_keeps_the_cars_present_lane() -> None:
 
 
 def test_a_leader_far_ahead_does_not_reduce_the_speed() -> None:
-    """Regression: it drove at 37 km/h with a leader 300 m ahead, as it ignored engine braking."""
+    """Regression: a driver that ignored engine braking drove at 37 km/h, 300 m behind a leader."""
     road = Road(find_track("highway"), 2)
     driver = Cruise(road)
     with World(road, traffic=6) as world:

@@ -271,7 +271,7 @@ def test_start_options_at_their_bounds_and_of_other_kinds() -> None:
     for options in given_starts:
         observation, _ = env.reset(seed=0, options=options)
         assert env.observation_space.contains(observation)
-    # Rounded to float32 once, not in each formula.
+    # The values are rounded to float32 once, not in each formula.
     env.reset(seed=0, options={"angle": np.float32(0.1), "to_middle": np.float32(0.3)})
     taken = world.state
     env.reset(
@@ -284,7 +284,7 @@ def test_start_options_at_their_bounds_and_of_other_kinds() -> None:
         ({"angle": "left"}, "reset got angle = 'left'; give a number"),
         ({"to_middle": math.nan}, "give a finite number"),
         ({"s": math.inf}, "give a finite number"),
-        ({1: 2.0}, "does not know"),
+        ({1: 2.0}, "unknown options"),
     ]
     for bad, message in refused:
         with pytest.raises(UserError, match=message):
@@ -350,8 +350,8 @@ def test_a_step_without_an_episode_is_refused() -> None:
     env.reset(seed=0, options={"s": 60.0, "speed": 15.0})
     while not env.step(steer(0.5))[2]:
         pass
-    # What Gymnasium's own wrapper raises too, so that callers catch one error.
-    with pytest.raises(gym.error.ResetNeeded, match="after an end"):
+    # Gymnasium's own wrapper raises the same class, so that callers catch one error.
+    with pytest.raises(gym.error.ResetNeeded, match="after each episode"):
         env.step(steer(0.0))
     env.reset(seed=0)
     env.step(steer(0.0))

@@ -186,7 +186,7 @@ def test_a_reward_that_is_not_finite_is_refused() -> None:
     ("ends", "expected"),
     [
         (("off_track", "backwards", "collision"), "off_track"),
-        # With the wall behind the verge.
+        # The wall stands behind the verge.
         pytest.param(("collision",), "collision", marks=pytest.mark.contacts),
         pytest.param((), "", marks=pytest.mark.contacts),
     ],
@@ -202,7 +202,7 @@ def test_only_events_in_ends_terminate_an_episode(ends: tuple[str, ...], expecte
             break
     assert info["ended"] == expected
     assert (reward == -2.0) == bool(expected)
-    assert farthest > 7.0  # the edge
+    assert farthest > 7.0  # beyond the edge
     env.close()
 
 

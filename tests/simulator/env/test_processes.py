@@ -64,7 +64,7 @@ def test_an_image_environment_is_handed_from_thread_to_thread(expected: list[Ima
 
 @pytest.mark.contacts
 def test_worlds_in_threads_do_not_disturb_each_other() -> None:
-    """Also where PyBullet computes contacts: all of its clients are in one process."""
+    """This holds also while PyBullet computes contacts: all its clients are in one process."""
 
     def positions(seed: int) -> list[tuple[float, float, str | None]]:
         env = gym.make(STATE_ID, track="oval", lanes=2, traffic=4, controls="full", ends=())

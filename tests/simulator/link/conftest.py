@@ -19,7 +19,7 @@ START_S = 180.0
 SHM = Path("/dev/shm")
 
 ANSWER_S = 60.0
-"""How long a client waits for an answer unless a test gives a time: other jobs may be running."""
+"""Default wait (s) for an answer; it is long because other jobs may load the machine."""
 
 Start = Callable[..., "subprocess.Popen[str]"]
 

@@ -32,7 +32,7 @@ from tests.typed import error_line, typed
 
 WAIT_S = 180.0
 BOUND_S = 2.0
-"""No survivor waits longer."""
+"""Longest wait (s) of a process after its peer has died."""
 
 Start = Callable[..., "subprocess.Popen[str]"]
 
@@ -55,7 +55,7 @@ process._warm_up = lambda *_: None  # it asks for steps, too
 Simulation.answer = answer
 process.run(process.LinkConfig(name=sys.argv[1], track="oval"), print)
 """
-"""A server that receives a signal within each step, where an exception is lost."""
+"""A server that receives a signal within each step, at a place where an exception is lost."""
 
 
 @pytest.mark.parametrize(
@@ -139,7 +139,7 @@ def test_a_command_with_a_bad_checksum_is_answered_with_an_error(oval: str) -> N
     with Link(oval, wait_s=WAIT_S) as link:
         link.reset(seed=1)
         words = link._outbox._buffer.arrays[1]
-        words[5] ^= 1  # as a client without the sequence lock might write now and then
+        words[5] ^= 1  # a client without the sequence lock can write such a message
         words.view("u4")[0] += 2
         deadline = time.monotonic() + WAIT_S
         while not (link._receive(0.05) and link._inbox.record["error"]):
@@ -223,9 +223,9 @@ def test_sigterm_notifies_the_client_and_prints_json(server: Start, name: str, n
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_a_signal_ends_the_server_where_an_exception_would_be_lost(name: str, number: int) -> None:
-    """As numpy loses one raised while it compares a scalar with an IntEnum.
+    """numpy loses an exception that is raised while it compares a scalar with an IntEnum.
 
-    The server has a process of its own, for SIGTERM would end the one that runs the tests.
+    The server runs in a process of its own, because SIGTERM would end the test process.
     """
     command = [sys.executable, "-c", SIGNALLED_SERVER, name, str(int(number))]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
@@ -269,7 +269,7 @@ def test_a_killed_client_ends_a_server_with_once(name: str) -> None:
     with serving(config) as served:
         link = Link(name, wait_s=WAIT_S)
         link.reset(seed=1)
-        link._segment.close()  # no leave is taken
+        link._segment.close()  # the client leaves without a message
         with pytest.raises(ClientLost, match=r"has died at step 0 of episode 1"):
             served.result(BOUND_S)
 

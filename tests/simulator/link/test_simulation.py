@@ -1,4 +1,4 @@
-"""What a client is answered where its car touches something and PyBullet is not installed."""
+"""Answers to a client when its car touches something and PyBullet is not installed."""
 
 import sys
 from collections.abc import Iterator

@@ -99,7 +99,7 @@ def test_only_range_traffic_detects_traffic() -> None:
             wheel = 2.0 * world.state.angle - world.state.to_middle
             world.step(Command(steer=min(max(wheel, -1.0), 1.0), throttle=0.4))
             gap = world.traffic.leader(world.state.s, world.state.to_middle)
-            # Within 10 m, road and cars are as good as straight.
+            # Within 10 m, road and cars are nearly straight.
             if gap is not None and gap[0] < 10.0:
                 ahead = gap[0] + 4.52 / 2  # the beams start at the centre of gravity
                 break

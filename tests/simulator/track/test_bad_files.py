@@ -84,7 +84,7 @@ def test_external_and_internal_entities_are_refused(tmp_path: Path, name: str) -
     secret = tmp_path / "secret.txt"
     secret.write_text('<attstr name="read" val="yes"/>')
     path = tmp_path / "outside.xml"
-    # `default-surfaces` as an own (internal) entity is none of TORCS's.
+    # An internal entity with the name of TORCS's `default-surfaces` is not TORCS's entity.
     kind = f'SYSTEM "{secret}"' if name == "default-pits" else '"<section/>"'
     declared = f"<!ENTITY {name} {kind}>"
     path.write_text(f'<!DOCTYPE params [{declared}]><params name="x">&{name};</params>')

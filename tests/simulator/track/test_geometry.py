@@ -71,7 +71,7 @@ def test_wrap_angle_keeps_pi() -> None:
 )
 @example(share=1e-9, y=-4.0, wrong_by=0.0, name="mountain-pass")
 def test_project_inverts_at(share: float, y: float, wrong_by: float, name: str) -> None:
-    """At the closing joint, which has a kink of up to 1e-6 rad, either piece is correct."""
+    """At the closing joint, a kink of up to 1e-6 rad, both pieces are correct answers."""
     limit = 1e-6 * (1.0 + abs(y))
     track = STADIUM if name == "stadium" else MOUNTAIN
     s = share * track.length_m

@@ -67,7 +67,7 @@ def test_radii_grades_and_widths_are_drivable(name: str) -> None:
     assert np.abs(banking).max() <= 10.0
     # The outer edge is the higher one: right in a left bend.
     assert (banking * track.at(s).curvature <= 1e-12).all()
-    # No kinks: heights bend by at most 4 % of grade over 10 m.
+    # No kinks: the grade changes by at most 4 % over 10 m.
     slopes = np.diff(track.at(s).z) / 2.0
     assert np.abs(slopes[5:] - slopes[:-5]).max() < 0.04
     # A car starts 25 m before the line, on a straight.

@@ -25,7 +25,7 @@ def test_ten_minutes_of_traffic_without_a_violation(track: str, lanes: int, park
     seen = audit_traffic(Road(find_track(track), lanes), 600.0, parked=parked)
     assert seen.steps == 12_000
     assert (seen.lane_changes > 3) == (lanes > 1)
-    # Behind a parked car those of its lane stand; all others drive.
+    # Cars in the lane of a parked car stand behind it; all other cars drive.
     assert seen.mean_speed_kmh > (5.0 if parked else 30.0)
     assert seen.own_laps == 0 if parked else seen.own_laps > 1
 

@@ -1,4 +1,4 @@
-"""Labels of varied roads lie on the paint that counts, in class images of the renderer."""
+"""Labels of varied roads lie on the paint that defines them, in class images of the renderer."""
 
 from dataclasses import replace
 
@@ -66,7 +66,7 @@ def classes_along(
 
 
 def off_the_paint(camera: Camera, to_middle: float, side: str) -> NDArray[np.float64]:
-    """Pixels from the label to the middle of the paint that it is on; NaN where it is on none."""
+    """Pixels from the label to the middle of the paint below it; NaN where there is no paint."""
     found = []
     for column, row in classes_along(camera, to_middle, side):
         painted = np.concatenate([[False], row == MARKING, [False]])
@@ -127,7 +127,7 @@ def test_missing_paint_keeps_its_label() -> None:
 
 
 def test_dots_arrows_and_crosswalks_are_drawn() -> None:
-    """Each of them brightens the road of the same scene, none moves a label."""
+    """Each of them brightens the road of the same scene; none of them moves a label."""
     plain = (Marking((SOLID,)), Marking(), Marking((SOLID,)))
     dotted = (plain[0], Marking((replace(SOLID, dots_m=1.2, width_m=0.1),)), plain[2])
     with camera_on(plain) as camera:
@@ -146,7 +146,7 @@ def test_dots_arrows_and_crosswalks_are_drawn() -> None:
 
 
 def test_a_look_of_the_tracks_own_paint_is_the_papers_picture() -> None:
-    """The varied shaders draw lines as those of the paper's roads do."""
+    """The varied shaders draw these lines like the shaders of the paper's roads."""
     road = Road(find_track("oval"), 2, WIDTH)
     style = road.track.markings
     line = replace(SOLID, width_m=style.line_width)

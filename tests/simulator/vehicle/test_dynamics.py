@@ -22,7 +22,7 @@ from simulator.world.world import World
 from trackfeatures.errors import UserError
 
 CAR = CarParameters()
-# Nothing slows this one down: no air, no rolling resistance.
+# A car without air drag and rolling resistance.
 FREE = replace(CAR, rolling_resistance=0.0, drag_coefficient=0.0, wing_drag=0.0)
 NEUTRAL = Command(gear=0)
 ASPHALT = SURFACES["asphalt"].grip
@@ -78,7 +78,7 @@ def test_20_m_s_for_2_s_is_40_m() -> None:
 def test_a_coasting_car_conserves_energy_up_a_hill() -> None:
     grade = 0.05
     states = drive(FREE, 4.0, lambda _: NEUTRAL, speed=20.0, grade=grade)
-    # The wheels carry energy too: each weighs J / r^2 more than it does.
+    # The rotating wheels store energy, too: each adds J / r^2 to the mass.
     inertia = FREE.total_mass + 4 * FREE.wheel_inertia / FREE.wheel_radius**2
     slope = math.atan(grade)
     expected = 20.0 - FREE.total_mass * GRAVITY * math.sin(slope) / inertia * 4.0
@@ -143,7 +143,7 @@ def test_braking_is_limited_by_friction() -> None:
     states = drive(CAR, 1.0, lambda _: Command(brake=1.0, gear=0), speed=30.0)
     slowest = (30.0 - states[-1].speed) / 1.0
     limit = CAR.friction * ASPHALT * GRAVITY
-    # Drag and wings add a little to what the tyres alone can do; locked tyres give some away.
+    # Drag and wings add a little to the tyres' braking; locked tyres brake a little less.
     assert 0.6 * limit < slowest < 1.15 * limit
     assert states[-1].pitch > 0.002  # the nose dips
     gentle = drive(CAR, 1.0, lambda _: Command(brake=0.1, gear=0), speed=30.0)
@@ -266,7 +266,7 @@ def test_the_verge_has_less_grip_and_more_rolling_resistance() -> None:
             slowed[name + " yaw"] = abs(braked[4].yaw_rate)
     assert slowed["verge"] / slowed["road"] == pytest.approx(VERGE.grip / ASPHALT, abs=0.05)
     assert slowed["verge"] < slowed["half"] < slowed["road"]
-    # With the left wheels on the verge the right ones pull the car round.
+    # With its left wheels on the verge, the car is pulled round by the right ones.
     assert slowed["half yaw"] > 0.2
     assert slowed["road yaw"] == pytest.approx(0.0, abs=1e-6)
     rolled = {}

@@ -100,7 +100,7 @@ def test_error_for_a_port_in_use_is_one_line() -> None:
 
 
 def test_error_without_a_renderer_is_one_line() -> None:
-    # EGL looks for its drivers where this says: nowhere.
+    # This variable names the folder in which EGL looks for its drivers.
     done = run(__EGL_VENDOR_LIBRARY_DIRS="/nowhere", __EGL_VENDOR_LIBRARY_FILENAMES="")
     assert done.returncode == 1
     assert "no OpenGL 3.3 through EGL" in done.stderr

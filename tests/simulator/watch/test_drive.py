@@ -172,7 +172,7 @@ def test_state_messages_match_the_road(watched: Watched) -> None:
     assert (s, to_middle) == pytest.approx((state["s"], state["to_middle"]), abs=0.02)
     # In the middle of the right lane of two.
     assert to_middle == pytest.approx(-2.0, abs=0.3)
-    # Whose left marking is the middle of the road.
+    # The left marking of that lane is the middle of the road.
     assert state["distances_m"]["ml"] == pytest.approx(to_middle, abs=0.01)
     assert len(state["beams"]) == len(page.scene["beam_angles"]) == 19
     assert state["beams"][0] == pytest.approx(ROAD.edge - to_middle, abs=0.3)
@@ -199,7 +199,7 @@ def test_images_are_of_the_selected_view(watched: Watched) -> None:
 
 
 def test_a_light_request_changes_the_images(watched: Watched) -> None:
-    """Images in flight still have the earlier light: wait for the sky of the new one."""
+    """Images in flight still have the earlier light, so wait for the sky of the new light."""
     with watched.browser() as page:
         page.ask(view="front")
         page.ask(light="dusk")
@@ -282,14 +282,14 @@ def test_a_browser_that_does_not_read_does_not_delay_others(watched: Watched) ->
         numbers = [page.state()["number"] for _ in range(30)]
         assert numbers == sorted(set(numbers))
         last, took = page.state(), time.monotonic() - began
-        # Real time twice over, on an idle machine.
+        # Twice real time, on an idle machine.
         assert last["time_s"] - first["time_s"] > 0.4 * took
-        # What waits for the mute one is two states and their pictures, not thirty.
+        # Two states and their pictures wait for the mute browser, not thirty.
         waiting = until_quiet(mute, 1.0)
         states = [json.loads(data) for data in waiting if isinstance(data, str)]
         assert 1 <= len(states) <= 2
         assert len(waiting) <= 4
-        # Having answered, it gets what is latest, not what it missed.
+        # After it has answered, it gets the latest state, not the states it missed.
         mute.ask(got=states[-1]["number"])
         latest = json.loads(mute.line.recv(timeout=60))["number"]
         assert latest > numbers[-1] - 3

@@ -72,7 +72,7 @@ def test_an_environment_is_shown_as_it_is_stepped() -> None:
     assert [scene["track"] for scene in scenes] == ["town"]
     assert scenes[0]["controls"] is False
     assert state["driver"] == "program"
-    # The paper's score, as the environment itself counts it.
+    # The paper's score, as the environment computes it.
     assert state["score"] == pytest.approx(scores[state["time_s"]], abs=0.02)
     assert simplejpeg.decode_jpeg(pictures[-1]).shape == (SIZE[1], SIZE[0], 3)
 

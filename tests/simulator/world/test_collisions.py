@@ -67,9 +67,9 @@ def test_a_rear_end_collision_conserves_momentum() -> None:
         for _ in range(4):
             state = world.step(COAST)
         both = own_mass * state.speed + other_mass * float(world.traffic.speed[0])
-        # The road's part in 20 ms: its brakes take a little, my spinning wheels push a little.
+        # The road acts for 20 ms: the other car's brakes take a little, my wheels add a little.
         assert both == pytest.approx(momentum, rel=0.02)
-        # Of the speed that the two ran into each other with, little is left.
+        # Little is left of the closing speed.
         closing = before.speed - other
         assert closing > 5.0
         left = float(world.traffic.speed[0]) - state.speed
@@ -92,7 +92,7 @@ def test_a_struck_car_leaves_its_lane_and_comes_to_rest() -> None:
         for _ in range(20):
             world.step(FULL_BRAKE)
         assert world.traffic.poses().tobytes() == resting
-        # The next episode knows nothing of it.
+        # The next episode has no trace of the collision.
         assert not world.reset(seed=1).collision
         assert world.traffic.struck.tolist() == [False]
 

@@ -52,7 +52,7 @@ def fingerprint(seed: int, *, rehearse: bool) -> str:
         state = world.reset(seed=seed, to_middle=-2.0)
         for step in range(400):
             digest.update(repr(astuple(state)).encode() + world.traffic.poses().tobytes())
-            # Fast enough to run into the traffic, then into the wall.
+            # Fast enough to hit the traffic, then the wall.
             command = follow(state, 0.5, -2.0) if step < 330 else Command(steer=1.0, throttle=1.0)
             state = world.step(command)
     return digest.hexdigest()
@@ -152,7 +152,7 @@ def test_a_collision_with_traffic_is_recorded_and_slows_the_car() -> None:
     with World(stadium(lanes=1), traffic=1) as world:
         world.reset(seed=3)
         gap_s = float(world.traffic.s[0]) - 30.0
-        # Traffic starts clear of the ego car, so begin behind where the car will be.
+        # Traffic starts clear of the ego car, so the ego car starts behind its later place.
         state = world.reset(seed=3, s=gap_s - 60.0, speed=0.0)
         before, hit = state, None
         for _ in range(1200):

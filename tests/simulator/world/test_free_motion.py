@@ -1,4 +1,4 @@
-"""The car moves in compiled code until its box overlaps another; PyBullet is imported then."""
+"""Compiled code moves the car until its box overlaps another; only then PyBullet is imported."""
 
 import importlib
 import math
@@ -100,7 +100,7 @@ def test_a_touch_begins_where_bumpers_and_sides_meet() -> None:
                 for gap, touching in ((-1e-3, True), (1e-3, False)):
                     other[0, :2] = (state.x, state.y) + sign * way * (meeting + gap)
                     assert in_touch(world, other, move) == touching
-        # The traffic car drives 4 m backwards in the control step: at 1/4 of it 1 m is done.
+        # The traffic car drives back 4 m in the control step: after 1/4 of the step, 1 m.
         other[0, :2] = (state.x, state.y) + ahead * (0.5 * (CAR.length + TRAFFIC_CAR.length) + 1.0)
         move[0, :2] = -4.0 * ahead
         assert not in_touch(world, other, move, 0.249)
@@ -115,7 +115,7 @@ def test_a_touch_begins_where_bumpers_and_sides_meet() -> None:
 def test_a_wall_is_touched_when_the_cars_corner_meets_it(
     side: int, angle: float, without_pybullet: None
 ) -> None:
-    """At 200 Hz the car passes the last step before the contact without PyBullet."""
+    """At 200 Hz the last step before the contact needs no PyBullet."""
     with World(Road(find_track("oval")), frequency_hz=200) as world:
         world.reset(seed=0, s=5.0, to_middle=side * 5.0, angle=-side * angle, speed=15.0)
         with pytest.raises(UserError, match="the car touched a wall or another car"):
@@ -148,7 +148,7 @@ def test_a_car_close_to_wall_and_traffic_needs_no_pybullet(without_pybullet: Non
         with pytest.raises(UserError, match="the road ends"):
             world.reset(seed=0, to_middle=beside)
         state = world.reset(seed=0, s=5.0)
-        # Place it there, along the wall of a straight.
+        # The car is placed there, along the wall of a straight.
         world._place(5.0, beside, 0.0, 15.0)
         for _ in range(20):
             state = world.step(COAST)
@@ -192,14 +192,14 @@ def test_pybullet_moves_the_car_from_the_touch_until_the_gap_exceeds_its_thresho
     assert calls[-1] < 449
     assert max(abs(gap) for gap in gaps[calls[0] : 350]) < 0.01
     assert min(gaps) > -0.01
-    # Before the first of these steps the boxes overlap, after the last one they do not any more.
+    # The boxes overlap before the first of these steps, and no longer after the last.
     assert gaps[calls[0] - 1] < 0.0 < gaps[calls[0] - 2]
     assert gaps[calls[-1]] == pytest.approx(CONTACT_MARGIN_M, abs=0.01)
 
 
 @pytest.mark.contacts
 def test_a_contact_needs_no_stderr() -> None:
-    """PyBullet greets on stderr when it is imported, which is hidden; a daemon has it closed."""
+    """PyBullet's greeting on stderr is hidden at import; a daemon has stderr closed."""
     code = """
 from simulator.track.catalogue import find_track
 from simulator.track.road import Road

@@ -32,5 +32,5 @@ def test_closing_a_world_frees_its_memory() -> None:
     make()
     gc.collect()
     # PyBullet 3.2.7 never gives back a mesh's lists: with walls as meshes it was 1 MiB a world.
-    # A leak shows every time; what other tests left in this process may move the heap once.
+    # A leak grows every time; memory of earlier tests may grow the heap once.
     assert min(growth_mib() for _ in range(3)) < 0.15 * MAKES

@@ -44,14 +44,14 @@ def test_walls_follow_every_bend(radius: float, side: int) -> None:
     for s in np.arange(0.0, track.length_m, 0.7):
         panel = walls.panel(float(s), side * (road.wall_offset - 2.0), 3.5)
         if panel is None:
-            # Within a metre of the middle of the bend there is no room for one.
+            # Within a metre of the middle of the bend there is no room for a wall.
             assert side > 0
             assert radius - road.wall_offset <= 1.0
             continue
         face = inner_face(panel)
         offsets = [track.project(float(x), float(y))[1] * side for x, y in face]
         assert offsets[3] == pytest.approx(road.wall_offset, abs=1e-6)
-        # Flat where the wall is bent, but never over the road.
+        # The panel is flat where the wall is bent, but never reaches over the road.
         assert min(offsets) > road.edge
         reach = 0.5 * PANEL[0]
         sagitta = reach**2 / (2.0 * (radius - side * road.wall_offset))
@@ -66,7 +66,7 @@ def test_no_panel_for_a_car_far_from_the_wall_or_behind_it() -> None:
 
 
 def test_a_wall_is_open_where_another_part_of_the_track_lies() -> None:
-    # A hairpin whose two straights are 12 m apart: walls 8.5 m out would stand on the other one.
+    # A hairpin with straights 12 m apart: walls 8.5 m out would stand on the other straight.
     walls = Walls(Road(loop(6.0, 200.0, width=12.0)))
     assert walls.panel(100.0, 6.5, 3.5) is None
     outer = walls.panel(100.0, -6.5, 3.5)

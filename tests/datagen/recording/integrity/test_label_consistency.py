@@ -88,7 +88,7 @@ def test_an_impossible_road_is_found() -> None:
 
 
 def test_on_banked_road_distances_may_be_measured_from_the_foot_point() -> None:
-    """0.25 m above a bank of 9 deg the foot is 0.04 m further up; on a level road it is below."""
+    """0.25 m above a bank of 9 deg the foot is 0.04 m up the bank; on a level road right below."""
     offsets = np.linspace(-5.9, 5.9, 400)
     feet = _labels(offsets + 0.04, 2, WIDTH)
     labels = replace(

@@ -1,4 +1,4 @@
-"""Recovery of damaged rounds: all frames outside the damage, none that it touched."""
+"""Recovery of damaged rounds: it saves all frames outside the damage, and none inside it."""
 
 import json
 from itertools import pairwise
@@ -76,7 +76,7 @@ def test_all_frames_before_a_cut_are_recovered(
         done = recover(file, out)
         expected = sum(end <= cut for end in ends)
         assert (done.saved, saved_frames(out)) == (expected, list(range(expected))), cut
-        # Behind its last frame the file says how many there were; before, that is not known.
+        # The number of frames is stored after the last frame; a cut before it removes the number.
         assert done.lost == 0 or expected < FRAMES
         out.unlink()
 
@@ -93,7 +93,7 @@ def test_garbage_and_zeros_after_a_cut_are_not_taken_for_frames(
         file.write_bytes(undamaged[:cut] + tail)
         saved = recover(file, out).saved
         whole = sum(end <= cut for end in ends)
-        # The frame that ends where the garbage begins cannot be told from one that it touches.
+        # A frame that ends where the garbage begins may also be damaged, so it may be dropped.
         assert whole - 1 <= saved <= whole
         assert saved_frames(out) == list(range(saved))
         out.unlink()
@@ -172,7 +172,7 @@ def test_the_command_writes_to_the_folder_recovered(dataset: Path) -> None:
     assert done.returncode == 0, done.stderr
     result = json.loads(done.stdout)
     assert result["out"] == str(dataset / "recovered" / "r001.mcap")
-    assert result["saved"] + result["lost"] == 45  # as the state file beside it says
+    assert result["saved"] + result["lost"] == 45  # as recorded in the state file
     assert result["at_least"] is False
     assert 0 < result["saved"] == len(saved_frames(Path(result["out"])))
     again = datagen_here("recover", str(path))

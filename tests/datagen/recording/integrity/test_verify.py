@@ -1,4 +1,4 @@
-"""Verification at each level: what it finds, and that a bad file is reported, never raised."""
+"""Verification at each level: faults that it finds; it reports bad files and never raises."""
 
 import json
 from collections.abc import Iterable
@@ -140,13 +140,13 @@ def test_a_leaking_split_and_one_of_other_definitions_are_reported(dataset: Path
 def test_random_damage_never_raises_and_is_found_without_state_files(
     dataset: Path,
 ) -> None:
-    state_path(dataset, "r000").unlink()  # with its sha256, every damage would be found anyway
+    state_path(dataset, "r000").unlink()  # its sha256 would reveal any damage
     rng = np.random.default_rng(0)
     path = round_path(dataset, "r000")
     good = path.read_bytes()
     for trial in range(60):
         bad = bytearray(good)
-        # Half of the trials aim at the index at the end, where a wrong number leads far.
+        # Half of the trials damage the index at the end, where a wrong number has large effects.
         low = 0 if trial % 2 else len(good) - 4000
         for at in rng.integers(low, len(good), 4):
             bad[at] ^= int(rng.integers(1, 256))

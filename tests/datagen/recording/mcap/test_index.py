@@ -83,7 +83,7 @@ def test_a_damaged_summary_is_refused_on_opening(path: Path) -> None:
 
 @pytest.mark.parametrize("entry", ["log_time", "place"])
 def test_a_damaged_message_index_is_refused_on_reading(dataset: Path, entry: str) -> None:
-    """The CRC of the summary does not cover it: the message it points at is checked."""
+    """The summary's CRC does not cover this index, so the message that it points at is checked."""
     path = round_path(dataset, "r000")
     data = bytearray(path.read_bytes())
     summary = read_summary(memoryview(bytes(data)))

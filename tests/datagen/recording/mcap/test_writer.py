@@ -84,7 +84,7 @@ def test_labels_are_exact_and_absent_ones_unset(samples: Samples, tmp_path: Path
         assert message.angle == frame.features.angle
         assert message.heading == frame.features.heading
         assert (message.s, message.to_middle) == (frame.place.s, frame.place.to_middle)
-    assert absent > 100  # the samples do have absent distances
+    assert absent > 100  # the samples contain absent distances
 
 
 def test_our_reader_and_the_official_one_agree(

@@ -1,4 +1,4 @@
-"""What a recording says of its camera: lens and mount, as OpenCV and scipy's readers take them."""
+"""The recorded camera, lens and mount, is read correctly by OpenCV and scipy."""
 
 import json
 from dataclasses import replace

@@ -10,14 +10,14 @@ from datagen.recording.schema.polylines import read_polylines
 
 LINES = [
     np.array([[1.5, 200.25], [-3.0, 150.0], [140.0, 105.5]]),
-    np.array([[0.0, 0.0], [7.0, 0.0], [0.0, 9.5]]),  # protobuf leaves zeros out
+    np.array([[0.0, 0.0], [7.0, 0.0], [0.0, 9.5]]),  # protobuf does not encode zeros
     np.zeros((0, 2)),
     np.random.default_rng(0).normal(0, 1e3, (60, 2)),
 ]
 
 
 def message(lines: list[NDArray[np.float64]]) -> bytes:
-    """As a recorder writes it: lines of points and colours, and a line of text."""
+    """A message as a recorder writes it: lines of points and colours, and a line of text."""
     made = ImageAnnotations()
     for line in lines:
         added = made.points.add(type=PointsAnnotation.LINE_STRIP, thickness=1.0)

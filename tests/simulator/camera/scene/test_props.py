@@ -16,7 +16,7 @@ SEEDS = range(6)
 
 @pytest.mark.parametrize("look", sorted(themes()))
 def test_no_building_reaches_over_the_wall_line(look: str) -> None:
-    road = Road(find_track("town", None), 1)  # its sharpest bend has a radius of 28 m
+    road = Road(find_track("town", None), 1)  # the sharpest bend of town has a radius of 28 m
     survey = Survey.of(road)
     theme = themes()[look]
     inside = []

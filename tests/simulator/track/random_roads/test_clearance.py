@@ -1,4 +1,4 @@
-"""The least distance between parts of a course, on courses whose distance is known."""
+"""The least distance between parts of a course, on courses with known distances."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""A random road as TOML: reads back as the same track, and is the user's to change."""
+"""A random road as TOML reads back as the same track, and can be edited."""
 
 from pathlib import Path
 

@@ -81,7 +81,7 @@ def test_roads_reach_from_12_m_to_5_km_and_stay_drivable(
     # Some bends begin abruptly, others with a spiral.
     assert 0.3 < np.mean([row["spiral"] == 0.0 for row in bends]) < 0.8
     for track in roads.values():
-        # No kinks: heights bend by at most 6 % of grade over 10 m.
+        # No kinks: the grade changes by at most 6 % over 10 m.
         slopes = np.diff(track.at(np.arange(0.0, track.length_m, 2.0)).z) / 2.0
         assert np.abs(slopes[5:] - slopes[:-5]).max() < 0.06
 
@@ -119,7 +119,7 @@ def test_walls_up_to_12_m_from_the_middle_never_cross(roads: dict[int, Track]) -
 
 
 def interest(track: Track, lanes: int, speed_kmh: float) -> tuple[FloatArray, FloatArray]:
-    """Share of the time of a lap in bends under 100 m or within 8 m of a change of curvature; and
+    """Shares of the time of a lap: in bends under 100 m or within 8 m of a change of curvature; and
     in bends of 12 to 25, 25 to 50 and 50 to 100 m (3,)."""
     profile = bend_profile(track, lanes * tf.LANE_WIDTH_M / 2 + 1.0)
     s = (np.arange(len(profile.limit)) + 0.5) * profile.cell_m
@@ -164,7 +164,7 @@ GOLDEN = {
 
 @pytest.mark.parametrize("seed", GOLDEN)
 def test_golden_roads(seed: int) -> None:
-    """These change with the ranges, the drawing, or numpy's generator: say so in CHANGELOG.md."""
+    """These change with the ranges, the drawing or numpy's generator: note it in CHANGELOG.md."""
     assert (kind_of(seed).name, find_track(f"random:{seed}").content_hash[:16]) == GOLDEN[seed]
 
 

@@ -35,7 +35,7 @@ def z(track: Track, s: float, y: float = 0.0) -> float:
 
 
 def test_the_first_of_a_repeated_attribute_counts(tmp_path: Path) -> None:
-    """As in ruudskogen, whose 3D model has the heights of the first."""
+    """As in ruudskogen, whose 3D model has the heights of the first attribute."""
     track = read(tmp_path, (UP, UP + '<attnum name="grade" val="-9" unit="%"/>'))
     assert z(track, 100.0) == pytest.approx(5.0)
 
@@ -71,7 +71,7 @@ def test_start_heights_may_be_given_by_edge(tmp_path: Path) -> None:
     [
         ('<attnum name="profil steps" val="3"/>', 3),
         ('<attnum name="profil steps length" val="30"/>', 4),
-        # A number of steps wins over a length of them, a segment's length over the track's.
+        # A number of steps takes precedence over a length, a segment's length over the track's.
         (
             '<attnum name="profil steps" val="3"/><attnum name="profil steps length" val="30"/>',
             3,
@@ -89,7 +89,7 @@ def test_number_of_profile_steps(tmp_path: Path, steps: str, count: int) -> None
 
 
 def test_banking_of_one_end_only(tmp_path: Path) -> None:
-    """With `banking end` alone, the banking starts from that of the segment before."""
+    """With `banking end` alone, the banking starts with the end banking of the previous segment."""
     lean = '<attnum name="banking end" val="6" unit="deg"/>'
     level = '<attnum name="banking end" val="0" unit="deg"/>'
     home = '<attnum name="z end" val="0" unit="m"/>'

@@ -24,7 +24,7 @@ FloatArray = NDArray[np.float64]
 
 MESH_STEP_M = 0.25
 ADDED_BY_HAND = 0.10
-"""Share of a model's road that may be bridges and side streets its author added."""
+"""Share of a model's road that can be bridges and side streets added by its author."""
 
 
 def installed() -> list[Path]:
@@ -57,7 +57,7 @@ def test_track_is_imported_as_a_closed_loop(path: Path) -> None:
     assert max(map(abs, track.grade_range)) <= 0.30
     before, start = track.at(track.length_m - 1e-9), track.at(0.0)
     assert math.hypot(float(before.x - start.x), float(before.y - start.y)) <= MAX_GAP_M
-    # Once round, or a figure of eight; forza's angles miss it by 0.016 deg.
+    # Once round, or a figure of eight; forza's angles deviate by 0.016 deg.
     turned = math.degrees(float(np.sum(track.curvature0 * track.length)))
     assert min(abs(turned - whole) for whole in (-360.0, 0.0, 360.0)) < 0.02
 
@@ -81,7 +81,7 @@ def test_one_to_three_lanes_can_be_laid(path: Path) -> None:
         assert road.edge < track.min_radius_m
         assert len(road.markings_y) == road.lanes + 1
     walls = Walls(roads[-1])
-    # Nothing stands on the road. A gap of the line, or a kink at it, moves a wall a little.
+    # No wall stands on the road. A gap at the line, or a kink there, moves a wall a little.
     beside = [side * (walls.offset - 0.1) for side in (1.0, -1.0)]
     stations = np.arange(0.0, track.length_m, 8.0)
     panels = [walls.panel(float(s), d, 1.0) for s in stations for d in beside]
@@ -97,7 +97,8 @@ def test_one_to_three_lanes_can_be_laid(path: Path) -> None:
 def test_both_edges_coincide_with_the_3d_model(model: Path) -> None:
     """The 3D model of a track contains points of both edges, up to a constant shift.
 
-    At least 90 % of its points must be ours, and all along our edges there must be some.
+    At least 90 % of the model's points must lie on our edges, and all along our edges there must be
+    model points.
     """
     track = read_track(model.with_suffix(".xml"))
     theirs = _road_points(model)

@@ -62,7 +62,7 @@ def test_banking_lifts_the_left_edge_and_holds_for_later_segments() -> None:
     for s in (100.0, 100.0 + HALF_TURN / 2, 100.0 + HALF_TURN):
         assert z(track, s, 5.0) == pytest.approx(rise)
         assert z(track, s, -5.0) == pytest.approx(-rise)
-        # The plane goes on beyond the width.
+        # The banking plane continues beyond the width.
         assert z(track, s, -10.0) == pytest.approx(-2 * rise)
     assert z(track, 200.0 + 1.5 * HALF_TURN, 5.0) == pytest.approx(0.0, abs=1e-12)
     assert track.z_range_m == pytest.approx(0.0, abs=1e-12)
