@@ -91,7 +91,8 @@ def run_demo(config: DemoConfig) -> DemoResult:
     collect = ["datagen", "collect", "--out", data, "--json"]
     collect += ["--rounds", str(config.rounds), "--frames", str(config.frames)]
     # Another scenery in every frame, and frames far apart, train best in so short a time
-    # (EXPERIMENTS); four sceneries a round, since one is the default for rounds of this length.
+    # (docs/experiments/data.md); four sceneries a round, since one is the default for rounds of
+    # this length.
     collect += ["--frequency", "4", "--stretch", "1", "--scenes", "4"]
     collect += ["--split-test-share", f"{TEST_SHARE:g}"]
     collect += ["--tracks", config.tracks, "--seed", str(config.seed)]

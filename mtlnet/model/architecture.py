@@ -128,7 +128,7 @@ PAIR = slice(0, 2)
 """`ml` and `mr`: the car's lane is told of as a whole, or not at all."""
 ABSENT_ABOVE = (0.54, 0.54, 0.75, 0.54, 0.75)
 """Probabilities above which `ml`, `mr`, `l`, `m` and `r` are answered as absent, chosen on held-out
-frames (EXPERIMENTS). A marking that is wrongly called absent counts as an error of 4 to 5 m, and
+frames (docs/experiments/uncertainty.md). A wrongly absent marking counts as 4 to 5 m of error, and
 `l` and `r` are absent in 70 % of the frames: with 0.5 their mean error is half as large again, with
 0.9 a model of few steps answers the offset from the lane's centre worse."""
 BIN_HEADS = (("distance", 5 * (PLACES + 1)), ("angle", ANGLES), ("heading", 3))

@@ -38,7 +38,7 @@ class HuberLoss:
 
     The gains multiply the terms of distance and angle. Without them the cross-entropy of the
     heading, which stays large, outweighs both: distances are learned far better with them, and
-    nothing is learned worse (EXPERIMENTS).
+    nothing is learned worse (docs/experiments/task-weights.md).
     """
 
     distance_beta: float

@@ -80,7 +80,7 @@ FREEDOM = 3.0
 """Degrees of freedom of the Student t distribution that errors are fitted with: beside their usual
 size they have outliers, which under a normal distribution would determine the standard deviations
 (Lange, Little and Taylor 1989). Within two standard deviations lay 90 to 93 % of the errors of test
-rounds, 85 to 91 % with a normal distribution (EXPERIMENTS)."""
+rounds, 85 to 91 % with a normal distribution (docs/experiments/uncertainty.md)."""
 
 Numbers = NDArray[np.float32]
 
