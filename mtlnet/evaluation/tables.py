@@ -46,6 +46,26 @@ def evaluation_table(result: dict[str, Any]) -> Table:
     return table
 
 
+def protocol_table(result: dict[str, Any]) -> Table:
+    """The figures of the paper's protocol, each beside the paper's."""
+    table = Table(title=escape(printable(f"{result['model']} by the paper's protocol")))
+    columns = ("", "frames", "distance (m)", "paper", "angle (rad)", "paper", "class", "paper")
+    for column in columns:
+        table.add_column(column, justify="right" if column else "left", no_wrap=bool(column))
+    for name, row in result["protocol"].items():
+        pairs = [
+            form(part.get(key))
+            for key, form in (
+                ("distance_m", lambda v: format_number(v, 3)),
+                ("angle_rad", lambda v: format_number(v, 4)),
+                ("heading_accuracy", format_percent),
+            )
+            for part in (row, row["paper"])
+        ]
+        table.add_row(name, str(row["frames"]), *pairs)
+    return table
+
+
 def group_table(result: dict[str, Any]) -> Table:
     """Mean absolute errors by track, lane count, light, shadow, bend and speed."""
     table = Table(title="by groups (m, rad)", box=None, padding=(0, 0, 0, 1))
