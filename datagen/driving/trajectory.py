@@ -26,6 +26,9 @@ MAX_OFFSET_STEP_M = 4.5
 """Largest change between two offsets, so that the angle to the road stays small."""
 WOBBLE_ANGLE_RAD = 0.024
 """Standard deviation of the wobble's angle to the road."""
+MIDDLE_WOBBLE = 0.5
+"""Share of it on MIDDLE: the mean distance to the middle is then 0.17 m; the paper's vehicles drive
+at 0.148 and 0.175 m on their images."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +70,8 @@ def make_course(kind: str, road: Road, length_m: float, rng: np.random.Generator
     if kind not in _MAKERS:
         raise tf.UserError(f"unknown trajectory {kind!r}; choose {', '.join(TRAJECTORIES)}")
     base, smoothing_m = _MAKERS[kind](road, count, rng)
-    offset = _smooth(base, smoothing_m) + _wobble(count, rng)
+    wobble = _wobble(count, rng) * (MIDDLE_WOBBLE if kind == MIDDLE else 1.0)
+    offset = _smooth(base, smoothing_m) + wobble
     # tanh instead of a hard limit keeps the slope smooth.
     limit = max_offset(road)
     offset = limit * np.tanh(1.1 * offset / limit) / np.tanh(1.1)
