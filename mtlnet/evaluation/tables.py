@@ -53,17 +53,20 @@ def protocol_table(result: dict[str, Any]) -> Table:
     for column in columns:
         table.add_column(column, justify="right" if column else "left", no_wrap=bool(column))
     for name, row in result["protocol"].items():
+        paper = row["paper"]
         pairs = [
-            form(part.get(key))
-            for key, form in (
-                ("distance_m", lambda v: format_number(v, 3)),
-                ("angle_rad", lambda v: format_number(v, 4)),
-                ("heading_accuracy", format_percent),
-            )
-            for part in (row, row["paper"])
-        ]
+            format_number(row["distance_m"], 3), _stated(paper, "distance_m"),
+            format_number(row["angle_rad"], 4), _stated(paper, "angle_rad"),
+            format_percent(row["heading_accuracy"]),
+            format_percent(paper.get("heading_accuracy"), 2),
+        ]  # fmt: skip
         table.add_row(name, str(row["frames"]), *pairs)
     return table
+
+
+def _stated(paper: dict[str, float], key: str) -> str:
+    """A figure with the digits that the paper gives it."""
+    return f"{paper[key]:g}" if key in paper else "-"
 
 
 def group_table(result: dict[str, Any]) -> Table:

@@ -2,11 +2,14 @@
 
 import os
 from collections import Counter
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
 import pytest
+import typer.testing
 
+from datagen.cli import app
 from datagen.driving.trajectory import TRAJECTORIES, make_course
 from datagen.planning import protocol
 from datagen.planning.config import ProtocolConfig
@@ -52,6 +55,21 @@ def test_a_drive_takes_as_long_as_its_lap(monkeypatch: pytest.MonkeyPatch) -> No
     assert plan.hash == protocol_plan(ProtocolConfig(rounds=4, frames=50, laps=0.5), None).hash
     with pytest.raises(UserError, match="0 laps asked for"):
         ProtocolConfig(laps=0)
+
+
+def test_the_command_records_this_plan(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(protocol, "NINE_TRACKS", ("oval",))
+    monkeypatch.setattr(protocol, "DRIVEN_TRACKS", ("oval", "coast"))
+    command = import_module("datagen.cli.protocol")  # its attribute of datagen.cli is the function
+    recorded: list[tuple[object, ...]] = []
+    monkeypatch.setattr(command, "record_plan", lambda *given: recorded.append(given))
+    monkeypatch.setattr(command, "print_recorded", lambda result, as_json: None)
+    words = ["protocol", "--rounds", "3", "--frames", "7", "--laps", "0.1", "--seed", "5"]
+    words += ["--workers", "2", "--out", str(tmp_path)]
+    done = typer.testing.CliRunner().invoke(app, words)
+    assert done.exit_code == 0, done.output
+    ((plan, _, out, workers, *_),) = recorded
+    assert (plan, out, workers) == (protocol_plan(ProtocolConfig(3, 7, 0.1, 5), None), tmp_path, 2)
 
 
 @pytest.mark.skipif("TORCS_TRACKS" not in os.environ, reason="$TORCS_TRACKS is not set")

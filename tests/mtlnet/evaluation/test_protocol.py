@@ -1,5 +1,6 @@
 """The paper's protocol on small drives whose errors are painted into their images."""
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -7,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import typer.testing
 from numpy.typing import NDArray
 
 import trackfeatures as tf
@@ -15,6 +17,7 @@ from datagen.recording.mcap.writer import RoundWriter
 from datagen.recording.names import MIDDLE
 from datagen.recording.round_metadata import RoundHeader
 from datagen.recording.splits import Split, split_path, write_split
+from mtlnet import cli
 from mtlnet.evaluation.protocol import darkest_intervals, evaluate_protocol
 from mtlnet.evaluation.tables import protocol_table
 from trackfeatures.camera import CameraParameters
@@ -155,8 +158,8 @@ def test_the_printed_table_has_both_columns(rounds: Path) -> None:
     columns = [[str(cell) for cell in column.cells] for column in printed.columns]
     assert columns[2] == ["0.070", "0.044", "0.010", "0.040", "0.040", "0.005"]
     assert columns[3] == ["0.071", "-", "-", "0.107", "-", "-"]
-    assert columns[5] == ["0.0030", "-", "-", "0.0040", "-", "-"]
-    assert columns[6][-1], columns[7][-1] == ("70.0%", "98.8%")
+    assert columns[5] == ["0.003", "-", "-", "0.004", "-", "-"]
+    assert (columns[6][-1], columns[7][-1]) == ("70.0%", "98.78%")
 
 
 def test_every_nth_frame_is_evaluated(rounds: Path) -> None:
@@ -207,3 +210,18 @@ def test_another_protocol_is_refused(rounds: Path) -> None:
         evaluate_protocol([engine], rounds, "ours")
     with pytest.raises(UserError, match="--every is 0"):
         evaluated(rounds, every=0)
+
+
+def test_the_command_prints_the_table_and_refuses_options_that_do_not_go_with_it(
+    rounds: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(cli, "_load", lambda *_: PaintedEngine())
+    words = ["evaluate", "--protocol", "paper", "--data", str(rounds)]
+    run = typer.testing.CliRunner().invoke
+    printed = run(cli.app, [*words, "--json"])
+    assert json.loads(printed.stdout)["protocol"][FOUR]["distance_m"] == pytest.approx(
+        0.07, abs=1e-5
+    )
+    assert "0.107" in run(cli.app, words).stdout
+    refused = run(cli.app, [*words, "--split", "all"]).exception
+    assert "--protocol has its own rounds" in str(refused)
