@@ -164,6 +164,7 @@ def evaluate_command(
     model: options.Model = "default",
     data: options.EvaluationData = Path("datasets/default"),
     split: options.Split = "test",
+    protocol: options.Protocol = "",
     page: options.ReportPage = None,
     worst: options.WorstSheet = None,
     every: options.EveryFrame = 1,
@@ -178,12 +179,21 @@ def evaluate_command(
     from rich.console import Console
 
     from mtlnet.evaluation.evaluate import evaluate
+    from mtlnet.evaluation.protocol import evaluate_protocol
     from mtlnet.evaluation.tables import (
         evaluation_table,
         group_table,
         picture_table,
+        protocol_table,
         uncertainty_table,
     )
+    from trackfeatures.errors import UserError
+
+    if protocol and (page is not None or worst is not None or copies or split != "test"):
+        raise UserError(
+            "--protocol has its own rounds and table; leave out --split, --report, --worst and "
+            "--copies"
+        )
 
     _print_model(model)
     # Several engines of one thread each take more frames a second than one engine on all cores.
@@ -194,13 +204,18 @@ def evaluate_command(
         def report(done: int, total: int) -> None:
             bar.update(task, completed=done, total=total)
 
-        result = evaluate(engines, data, split, report, page, every, worst, copies)
+        if protocol:
+            result = evaluate_protocol(engines, data, protocol, report, every)
+        else:
+            result = evaluate(engines, data, split, report, page, every, worst, copies)
     if page is not None:
         typer.echo(f"report: {result['page']}", err=True)
     if as_json:
         typer.echo(json.dumps(result))
         return
     console = Console()
+    if "protocol" in result:
+        console.print(protocol_table(result))
     console.print(evaluation_table(result))
     if "pictures" in result:
         console.print(picture_table(result))

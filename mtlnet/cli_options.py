@@ -143,6 +143,13 @@ Split = Annotated[str, typer.Option(help="train, test, unseen or all.")]
 ReportPage = Annotated[
     Path | None, typer.Option("--report", help="HTML page to write: a file, or a folder.")
 ]
+Protocol = Annotated[
+    str,
+    typer.Option(
+        help="paper: judge as the paper does, on rounds of `datagen protocol`, beside the paper's "
+        "figures."
+    ),
+]
 EveryFrame = Annotated[int, typer.Option(help="Evaluate every n-th frame only.")]
 Copies = Annotated[
     str,

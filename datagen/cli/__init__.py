@@ -8,6 +8,7 @@ import typer
 from datagen.cli.collect import collect, merge
 from datagen.cli.inspect import export, info, stats, view
 from datagen.cli.maintain import recover, split, verify
+from datagen.cli.protocol import protocol
 from runtime import cli as command
 
 app = typer.Typer(
@@ -16,7 +17,7 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-for function in (collect, merge, verify, info, recover, split, view, stats, export):
+for function in (collect, protocol, merge, verify, info, recover, split, view, stats, export):
     app.command()(function)
 
 

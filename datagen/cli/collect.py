@@ -210,7 +210,7 @@ def record_plan(
     from datagen.planning.summary import overview
 
     rounds = plan.rounds if shard is None else shard.select(plan.rounds)
-    frames = len(rounds) * plan.config.frames
+    frames = sum(entry.frames for entry in rounds)
     try:
         with progress_bar(len(rounds), frames, overview(plan, classes)) as progress:
             return run(

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import trackfeatures as tf
+from datagen.recording.names import MIDDLE
 from simulator.track.road import Road
 
 FloatArray = NDArray[np.float64]
@@ -25,6 +26,9 @@ MAX_OFFSET_STEP_M = 4.5
 """Largest change between two offsets, so that the angle to the road stays small."""
 WOBBLE_ANGLE_RAD = 0.024
 """Standard deviation of the wobble's angle to the road."""
+MIDDLE_WOBBLE = 0.5
+"""Share of it on MIDDLE: the mean distance to the middle is then 0.17 m; the paper's vehicles drive
+at 0.148 and 0.175 m on their images."""
 
 
 @dataclass(frozen=True)
@@ -58,12 +62,16 @@ def max_offset(road: Road) -> float:
 
 
 def make_course(kind: str, road: Road, length_m: float, rng: np.random.Generator) -> Course:
-    """A course of `kind` (one of TRAJECTORIES), at least `length_m` long; UserError for others."""
+    """A course of `kind` (MIDDLE or one of TRAJECTORIES), at least `length_m` long.
+
+    Raises UserError for another kind.
+    """
     count = int(length_m) + 1
     if kind not in _MAKERS:
         raise tf.UserError(f"unknown trajectory {kind!r}; choose {', '.join(TRAJECTORIES)}")
     base, smoothing_m = _MAKERS[kind](road, count, rng)
-    offset = _smooth(base, smoothing_m) + _wobble(count, rng)
+    wobble = _wobble(count, rng) * (MIDDLE_WOBBLE if kind == MIDDLE else 1.0)
+    offset = _smooth(base, smoothing_m) + wobble
     # tanh instead of a hard limit keeps the slope smooth.
     limit = max_offset(road)
     offset = limit * np.tanh(1.1 * offset / limit) / np.tanh(1.1)
@@ -77,6 +85,11 @@ def _lane(road: Road, count: int, rng: np.random.Generator) -> tuple[FloatArray,
     lane = int(rng.integers(road.lanes))
     centre = tf.lane_centre(lane, road.lanes, road.lane_width)
     return np.full(count, centre + rng.normal(0.0, 0.4)), 1.0
+
+
+def _middle(road: Road, count: int, rng: np.random.Generator) -> tuple[FloatArray, float]:
+    """The centre of the middle lane: as the paper's vehicle drives. Only the wobble leaves it."""
+    return np.full(count, tf.lane_centre(road.lanes // 2, road.lanes, road.lane_width)), 1.0
 
 
 def _offsets(road: Road, count: int, rng: np.random.Generator) -> tuple[FloatArray, float]:
@@ -158,6 +171,7 @@ def _offset_recoveries(
 
 Maker = Callable[[Road, int, np.random.Generator], tuple[FloatArray, float]]
 _MAKERS: dict[str, Maker] = {
+    MIDDLE: _middle,
     "lane": _lane,
     "offsets": _offsets,
     "weave": _weave,

@@ -131,3 +131,20 @@ class CollectConfig:
 
 LATER = {"roads": CollectConfig.roads, "prefix": CollectConfig.prefix}
 """Options that plans of earlier versions do not have, with their defaults."""
+
+
+@dataclass(frozen=True)
+class ProtocolConfig:
+    """Options of `datagen protocol`. Raises UserError for drives of no length."""
+
+    rounds: int = 15
+    """On the nine tracks, as many as the paper's."""
+    frames: int = 2000
+    """Of each of these rounds: the paper's 30,000 test images in all."""
+    laps: float = 1.0
+    """Of each drive."""
+    seed: int = 1810
+
+    def __post_init__(self) -> None:
+        if self.laps <= 0:
+            raise UserError(f"{self.laps:g} laps asked for; give more than 0, such as 1")

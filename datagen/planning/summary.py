@@ -29,7 +29,9 @@ def expected_classes(plan: Plan, forecast: Forecast) -> dict[str, dict[str, floa
 
 def overview(plan: Plan, classes: dict[str, dict[str, float]]) -> RenderableType:
     """Number of rounds by each parameter, and the forecast classes, for each side of the split."""
-    table = Table(title=f"{len(plan.rounds)} rounds of {plan.config.frames} frames", box=None)
+    sizes = {entry.frames for entry in plan.rounds}
+    of_each = f" of {min(sizes)}" if len(sizes) == 1 else f", {sum(e.frames for e in plan.rounds)}"
+    table = Table(title=f"{len(plan.rounds)} rounds{of_each} frames", box=None)
     table.add_column("")
     sides = _sides(plan)
     for side in sides:

@@ -75,7 +75,7 @@ def evaluate(
     outputs = car_outputs(outputs, frames)
     mean = engine.card.data["mean"]
     found = {
-        **_about(engine),
+        **about(engine),
         "data": str(data),
         "split": split,
         "every": every,
@@ -108,7 +108,7 @@ def evaluate_custom_images(
     trained = engine.card.data.get("pictures", ())
     answers = judge(images, predict_frames(engines, images, report), trained)
     found = {
-        **_about(engine),
+        **about(engine),
         "data": str(folder),
         "split": "all",
         "every": every,
@@ -120,7 +120,7 @@ def evaluate_custom_images(
     return found
 
 
-def _about(engine: Engine) -> dict[str, Any]:
+def about(engine: Engine) -> dict[str, Any]:
     """What a report says of the model."""
     return {
         "model": engine.card.name,

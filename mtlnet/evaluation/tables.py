@@ -46,6 +46,29 @@ def evaluation_table(result: dict[str, Any]) -> Table:
     return table
 
 
+def protocol_table(result: dict[str, Any]) -> Table:
+    """The figures of the paper's protocol, each beside the paper's."""
+    table = Table(title=escape(printable(f"{result['model']} by the paper's protocol")))
+    columns = ("", "frames", "distance (m)", "paper", "angle (rad)", "paper", "class", "paper")
+    for column in columns:
+        table.add_column(column, justify="right" if column else "left", no_wrap=bool(column))
+    for name, row in result["protocol"].items():
+        paper = row["paper"]
+        pairs = [
+            format_number(row["distance_m"], 3), _stated(paper, "distance_m"),
+            format_number(row["angle_rad"], 4), _stated(paper, "angle_rad"),
+            format_percent(row["heading_accuracy"]),
+            format_percent(paper.get("heading_accuracy"), 2),
+        ]  # fmt: skip
+        table.add_row(name, str(row["frames"]), *pairs)
+    return table
+
+
+def _stated(paper: dict[str, float], key: str) -> str:
+    """A figure with the digits that the paper gives it."""
+    return f"{paper[key]:g}" if key in paper else "-"
+
+
 def group_table(result: dict[str, Any]) -> Table:
     """Mean absolute errors by track, lane count, light, shadow, bend and speed."""
     table = Table(title="by groups (m, rad)", box=None, padding=(0, 0, 0, 1))

@@ -22,6 +22,7 @@ from datagen.recording.mcap.index import open_round
 from docs.generate import error_classes
 from mtlnet.calibration.run import CalibrateConfig, calibrate
 from mtlnet.data.custom_images import COLUMNS, open_custom_images
+from mtlnet.evaluation.protocol import drive_rows
 from mtlnet.inference.engine import Engine, load_engine
 from mtlnet.inference.image_decoding.decode import inspect, read_image
 from mtlnet.inference.model_card import resolve_run
@@ -454,6 +455,11 @@ def _(folder: Path) -> object:
 @row("a run that does not exist")
 def _(folder: Path) -> object:
     return resolve_run("no-such-run", folder)
+
+
+@row("rounds without the drives")
+def _(folder: Path) -> object:
+    return drive_rows(Dataset.open(write_dataset(folder)).select(), folder)
 
 
 @row("weights of the loss")

@@ -1,0 +1,187 @@
+"""Evaluates a model as the paper does (Li et al., section VII), on rounds of `datagen protocol`:
+`mtlnet evaluate --protocol paper --data datasets/protocol`.
+
+Errors are mean absolute ones, in m and rad: of the offset from the middle of the one-lane road and
+of the yaw angle along whole drives and in four intervals of heavy shadow; the class on held-out
+rounds of nine tracks, whose whole report (`mtlnet.evaluation.metrics`) is given too.
+"""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from datagen.recording import Dataset, Frames, Labels, UndecodableImage
+from datagen.recording.names import MIDDLE, UNSEEN
+from mtlnet.data.model_labels import car_outputs
+from mtlnet.data.sources import require_decodable
+from mtlnet.evaluation.evaluate import about, predict_frames, require_fit
+from mtlnet.evaluation.metrics import evaluate_by_groups, signed_errors
+from mtlnet.inference.engine import Engine
+from mtlnet.inference.prediction import OUTPUTS
+from mtlnet.inference.uncertainty import FEATURES
+from trackfeatures.definitions import UNKNOWN_HEADING
+from trackfeatures.errors import UserError
+
+PAPER = "paper"
+INTERVALS = 4
+INTERVAL_FRAMES = 200
+"""10 s at 20 Hz. The paper marks four intervals of heavy shadow on its lap without their lengths;
+here the whole lap lies in shadow, so its darkest parts stand for them."""
+FOUR = "four darkest intervals"
+DRIVES = {
+    ("g-track-3", "heavy-shadow"): "g-track-3, heavy shadow",
+    ("g-track-3", "clear"): "g-track-3, clear",
+    ("dirt-3", "clear"): "dirt-3, clear",
+    ("dirt-3", "heavy-shadow"): "dirt-3, heavy shadow",
+}
+SHADED = DRIVES["g-track-3", "heavy-shadow"]
+STATED: dict[str, dict[str, float]] = {
+    f"{SHADED}: {FOUR}": {"distance_m": 0.071, "angle_rad": 0.003},
+    DRIVES["dirt-3", "clear"]: {"distance_m": 0.107, "angle_rad": 0.004},
+    "nine tracks, held-out rounds": {"heading_accuracy": 0.9878},
+}
+"""What the paper states: in its text on g-track-3 and dirt-3, and of MTL 3 in its table II."""
+
+Rows = NDArray[np.int64]
+
+
+def evaluate_protocol(
+    engines: Sequence[Engine],
+    data: Path,
+    protocol: str,
+    report: Callable[[int, int], None] = lambda *_: None,
+    every: int = 1,
+) -> dict[str, Any]:
+    """The report on the held-out rounds, and in `drives` and `protocol` that of this module.
+
+    `protocol`: one row a drive or part of it, by name, each with `paper`, the figures stated there.
+    `every`: evaluate every n-th frame only. Raises UserError for another protocol, for data
+    without these rounds, or for a model that was trained on them or on dirt-3.
+    """
+    if protocol != PAPER:
+        raise UserError(f"there is no protocol {protocol!r}; give {PAPER}")
+    if every < 1:
+        raise UserError(f"--every is {every}; give 1 for all frames, 5 for every fifth")
+    dataset = Dataset.open(data)
+    frames = dataset.select().every(every)
+    rows = drive_rows(frames, data)
+    card = engines[0].card
+    for side in ("test", UNSEEN):
+        require_fit(card, dataset.select(side), side)
+    try:
+        outputs = car_outputs(predict_frames(engines, frames, report), frames)
+    except UndecodableImage:
+        require_decodable(frames, data)  # to name and count all of them
+        raise
+    driven = np.concatenate([*rows.values()])
+    found = evaluate_by_groups(
+        np.delete(outputs, driven, axis=0), frames.without(driven), card.data["mean"]
+    )
+    return {
+        **about(engines[0]),
+        "data": str(data),
+        "split": "held-out",
+        "every": every,
+        "rounds": len(frames.rounds) - len(rows),
+        **found,
+        "protocol": protocol_rows(outputs, frames.labels, rows, every, found),
+    }
+
+
+def drive_rows(frames: Frames, data: Path) -> dict[str, Rows]:
+    """The frames of each drive of `DRIVES`, in their order. Raises UserError where one is missing,
+    or where there are no other rounds."""
+    labels = frames.labels
+    found: dict[str, Rows] = {}
+    for (track, light), name in DRIVES.items():
+        rounds = [
+            number
+            for number, info in enumerate(frames.rounds)
+            if (info.trajectory, info.track, info.light) == (MIDDLE, track, light)
+        ]
+        if len(rounds) != 1:
+            raise UserError(
+                f"{data} holds {len(rounds)} drives in the middle of {name}, one is expected; "
+                "record it with `datagen protocol --out DIR`"
+            )
+        found[name] = np.flatnonzero(labels.round == rounds[0])
+    if len(frames) == sum(map(len, found.values())):
+        raise UserError(
+            f"{data} holds drives but no rounds of the nine tracks; record it with "
+            "`datagen protocol --out DIR`"
+        )
+    return found
+
+
+def protocol_rows(
+    outputs: NDArray[np.float32],
+    labels: Labels,
+    rows: dict[str, Rows],
+    every: int,
+    held_out: dict[str, Any],
+) -> dict[str, dict[str, Any]]:
+    """The rows of the table: the drives, the four intervals of heavy shadow, and the nine tracks.
+
+    `outputs` (N, 9 to 22); `rows`: of `drive_rows`; `held_out`: the report on the other frames.
+    """
+    shaded = rows[SHADED]
+    window = max(1, INTERVAL_FRAMES // every)
+    intervals = darkest_intervals(labels.shadow_fraction[shaded], window)
+    parts = {f"{SHADED}: {FOUR}": shaded[np.concatenate(intervals)], **rows}
+    table = {name: drive_figures(outputs[part], labels.take(part)) for name, part in parts.items()}
+    table[f"{SHADED}: {FOUR}"]["intervals"] = [
+        {
+            "s_m": [float(labels.s[shaded[i]]) for i in (each[0], each[-1])],
+            **drive_figures(outputs[shaded[each]], labels.take(shaded[each])),
+        }
+        for each in intervals
+    ]
+    table["nine tracks, held-out rounds"] = {
+        "frames": held_out["frames"],
+        "distance_m": held_out["to_lane_centre_mae_m"],
+        "angle_rad": held_out["angle_mae_rad"],
+        "heading_accuracy": held_out["heading_accuracy"],
+    }
+    return {name: {**part, "paper": STATED.get(name, {})} for name, part in table.items()}
+
+
+def darkest_intervals(shadow: NDArray[np.float32], window: int) -> list[Rows]:
+    """Up to `INTERVALS` intervals of `window` frames that do not overlap, in order: those with the
+    largest mean share of the road in shadow (N,), found one after the other. They are shorter where
+    N is too small for all of them wherever they lie."""
+    window = max(1, min(window, len(shadow) // (2 * INTERVALS - 1)))
+    sums = np.convolve(shadow.astype(np.float64), np.ones(window), mode="valid")
+    starts: list[int] = []
+    while len(starts) < INTERVALS and np.isfinite(sums.max()):
+        start = int(sums.argmax())
+        starts.append(start)
+        sums[max(0, start - window + 1) : start + window] = -np.inf
+    return [np.arange(start, start + window) for start in sorted(starts)]
+
+
+def drive_figures(outputs: NDArray[np.float32], labels: Labels) -> dict[str, Any]:
+    """Of a drive or a part of it: the figures that the paper states, and what they stand beside.
+
+    `distance_m`, `angle_rad`: mean absolute errors; `largest_...`: the largest ones; `zero_...`:
+    those of always answering zero, the mean sizes of the labels; `absent`: frames without an
+    answered distance, which have no error; `heading_accuracy`: share of right classes.
+    """
+    errors = np.abs(signed_errors(outputs, labels.distances, labels.angle))
+    distance, angle = (errors[:, FEATURES.index(f)] for f in ("to_lane_centre", "angle"))
+    answered = distance[~np.isnan(distance)]
+    known = labels.heading != UNKNOWN_HEADING
+    right = (outputs[:, 6:OUTPUTS].argmax(1) == labels.heading)[known]
+    return {
+        "frames": len(labels),
+        "absent": len(distance) - len(answered),
+        "distance_m": float(answered.mean()) if len(answered) else None,
+        "largest_distance_m": float(answered.max()) if len(answered) else None,
+        "zero_distance_m": float(np.nanmean(np.abs(labels.to_lane_centre))),
+        "angle_rad": float(angle.mean()),
+        "largest_angle_rad": float(angle.max()),
+        "zero_angle_rad": float(np.abs(labels.angle).mean()),
+        "heading_accuracy": float(right.mean()) if len(right) else None,
+    }
