@@ -1,6 +1,6 @@
 """Writes the tables of docs/results.md and the first table of README.md from docs/results.toml.
 
-    python docs/results.py
+python docs/results.py
 """
 
 import tomllib
