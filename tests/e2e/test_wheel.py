@@ -66,6 +66,7 @@ WITHOUT = {
     ("mtlnet", "predict"),  # below, on an image
     ("mtlnet", "calibrate"),  # needs a film of a drive
     ("serve", "reload"), ("serve", "restart"),  # of a running service with workers
+    ("datagen", "protocol"),  # needs the tracks of TORCS
     ("serve", "ray"),  # needs Ray
     ("controllers", "demo"),  # runs the commands above, for minutes
 }  # fmt: skip

@@ -215,7 +215,7 @@ def test_another_protocol_is_refused(rounds: Path) -> None:
 def test_the_command_prints_the_table_and_refuses_options_that_do_not_go_with_it(
     rounds: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(cli, "_load", lambda *_: PaintedEngine())
+    monkeypatch.setattr(cli, "_load", lambda *_, **__: PaintedEngine())
     words = ["evaluate", "--protocol", "paper", "--data", str(rounds)]
     run = typer.testing.CliRunner().invoke
     printed = run(cli.app, [*words, "--json"])
