@@ -24,7 +24,7 @@ from mtlnet.training.checkpoint import save_checkpoint
 from mtlnet.training.recipes import find_recipe
 from mtlnet.training.run import create_run
 from mtlnet.training.trainer import Trainer
-from mtlnet.uncertainty_fit.head import run_on_frames
+from mtlnet.uncertainty_fit.frame_outputs import run_on_frames
 from tests.mtlnet.conftest import training_config
 from trackfeatures.errors import UserError
 

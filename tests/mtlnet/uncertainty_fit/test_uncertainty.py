@@ -24,8 +24,8 @@ from mtlnet.inference.uncertainty import (
     texture_features,
 )
 from mtlnet.model.network import load_network
+from mtlnet.uncertainty_fit.frame_outputs import FrameOutputs
 from mtlnet.uncertainty_fit.head import (
-    FrameOutputs,
     fit_std_layers,
     fit_uncertainty_head,
     standardisation,
