@@ -261,10 +261,11 @@ def ship(task: Run) -> dict[str, Any]:
     found: dict[str, Any] = {}
     folder = task.work / "train"
     if not (folder / CARD).is_file():
-        salvage = task.command("salvage", "-m", "benchmarks.material.gpu.salvage", str(folder))
-        (ended,) = run([salvage], task.left())
-        _require_ended(salvage, ended)
-        found["from_checkpoint"] = int(salvage.out.read_text())
+        module = "benchmarks.material.gpu.publish_checkpoint"
+        publish = task.command("publish", "-m", module, str(folder))
+        (ended,) = run([publish], task.left())
+        _require_ended(publish, ended)
+        found["from_checkpoint"] = int(publish.out.read_text())
     words = ("-m", "mtlnet", "ship", "--json", "--model", str(folder), "--out", str(_model(task)))
     command = task.command("ship", *words)
     if not (_model(task) / CARD).is_file():

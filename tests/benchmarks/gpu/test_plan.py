@@ -1,0 +1,96 @@
+"""The minutes of a GPU run's stages, and what it collects."""
+
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+
+from benchmarks.material.gpu import stages
+from benchmarks.material.gpu.collecting import (
+    SEEDS,
+    counted,
+    evaluation_collections,
+    most_frames,
+    train_collections,
+)
+from benchmarks.material.gpu.plan import FULL, REHEARSAL, SECONDS, STAGES, Plan
+from benchmarks.material.gpu.process import Ended
+from mtlnet.inference.model_card import SHIPPED, read_card
+from trackfeatures.errors import UserError
+
+ROOT = Path(__file__).parents[3]
+
+
+def test_deadlines_are_shares_of_the_minutes() -> None:
+    plan = Plan(10.0)
+    assert sum(SECONDS.values()) == 600.0
+    deadlines = [plan.deadline(stage) for stage in STAGES]
+    assert all(a < b for a, b in pairwise(deadlines))
+    assert deadlines[-1] == 595.0  # five seconds are left to end
+    assert (plan.deadline("forward"), plan.deadline("fast"), plan.deadline("train")) == (
+        *(30.0, 245.0, 460.0),
+    )
+    assert [Plan(3.0).deadline(stage) for stage in STAGES] == pytest.approx(
+        [0.3 * deadline for deadline in deadlines]
+    )
+    assert set(stages.STAGE_FUNCTIONS) == set(STAGES) == set(SECONDS) - {"check", "end"}
+    for minutes in (0.5, 601.0, float("nan")):
+        with pytest.raises(UserError, match="give 1 to 600"):
+            Plan(minutes)
+
+
+def test_the_training_takes_what_its_start_and_end_and_the_earlier_stages_leave() -> None:
+    plan = Plan(10.0)
+    on_time = plan.train_minutes(245.0, 60_000)
+    assert on_time == pytest.approx((215 - 12 - 50 - 10) / 60)
+    assert plan.train_minutes(185.0, 60_000) == pytest.approx(on_time + 1.0)
+    assert plan.train_minutes(245.0, 10**7) == pytest.approx(0.25 * 215 / 60)
+    assert plan.train_minutes(594.5, 0) == pytest.approx(1 / 60)
+
+
+def test_a_stage_that_begins_late_has_its_own_time_until_the_run_ends() -> None:
+    plan = Plan(10.0)
+    assert plan.seconds("forward", 10.0) == 20.0  # five seconds were left before it
+    assert plan.seconds("forward", 60.0) == 15.0
+    assert plan.seconds("train", 300.0) == 160.0
+    assert plan.seconds("train", 450.0) == 0.25 * 215.0
+    assert plan.seconds("paper", 500.0) == 95.0
+    assert plan.seconds("paper", 560.0) == 35.0
+    assert plan.seconds("paper", 600.0) == 0.0
+
+
+def test_collections_share_the_cores_and_no_seed() -> None:
+    parts = train_collections(FULL, 16, 200_000)
+    assert [part.workers for part in parts] == [4, 4, 4, 4]
+    assert sum(part.rounds * part.frames for part in parts) == 200_000
+    assert ["random" in part.options for part in parts] == [False, True, False, True]
+    sets = evaluation_collections(FULL, 16)
+    assert [(each.name, each.rounds * each.frames) for each in sets] == [
+        ("test", 25_200),  # of which 20,000 are test frames
+        ("unseen", 5_100),
+        ("random", 5_100),
+    ]
+    assert 16 <= sum(each.workers for each in sets) <= 18
+    seeds = [each.seed for each in (*parts, *sets)]
+    assert len({*seeds}) == len(seeds) == len({each.name for each in (*parts, *sets)})
+    trained_on = {seed // 10**6 for seed in read_card(SHIPPED).data["seeds"]}
+    assert not trained_on & {*seeds, *SEEDS.values()}
+    assert [part.workers for part in train_collections(REHEARSAL, 2, 64)] == [1, 1]
+
+
+def test_no_more_frames_than_the_gpu_holds() -> None:
+    assert most_frames(FULL, 0) == FULL.most_train_frames
+    frames = most_frames(FULL, 80 * 10**9)
+    assert frames * 144 * 280 * 3 == pytest.approx(40e9, rel=1e-4)
+
+
+def test_collections_that_were_stopped_count_their_finished_rounds(tmp_path: Path) -> None:
+    (part,) = train_collections(REHEARSAL, 2, 8)[:1]
+    (tmp_path / part.name).mkdir()
+    found = counted(tmp_path, [part], [Ended(130, True, 2.0)])
+    assert found == {
+        "frames": {"part0": 0},
+        "frames_per_second": None,
+        "whole_frames_per_second": 0.0,
+        "recording_was_stopped": True,
+    }
