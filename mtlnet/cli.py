@@ -180,13 +180,7 @@ def evaluate_command(
 
     from mtlnet.evaluation.evaluate import evaluate
     from mtlnet.evaluation.protocol import evaluate_protocol
-    from mtlnet.evaluation.tables import (
-        evaluation_table,
-        group_table,
-        picture_table,
-        protocol_table,
-        uncertainty_table,
-    )
+    from mtlnet.evaluation.tables import report_tables
     from trackfeatures.errors import UserError
 
     if protocol and (page is not None or worst is not None or copies or split != "test"):
@@ -214,15 +208,8 @@ def evaluate_command(
         typer.echo(json.dumps(result))
         return
     console = Console()
-    if "protocol" in result:
-        console.print(protocol_table(result))
-    console.print(evaluation_table(result))
-    if "pictures" in result:
-        console.print(picture_table(result))
-    if "by_track" in result:
-        console.print(group_table(result))
-    if "uncertainty" in result:
-        console.print(uncertainty_table(result))
+    for table in report_tables(result):
+        console.print(table)
 
 
 @app.command("predict")

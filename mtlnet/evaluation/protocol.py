@@ -55,9 +55,10 @@ def evaluate_protocol(
     report: Callable[[int, int], None] = lambda *_: None,
     every: int = 1,
 ) -> dict[str, Any]:
-    """The report on the held-out rounds, and in `drives` and `protocol` that of this module.
+    """The report on the held-out rounds; its entry `protocol` has the rows of the paper's table.
 
-    `protocol`: one row a drive or part of it, by name, each with `paper`, the figures stated there.
+    A row stands for a drive, a part of it or the held-out rounds; its `paper` holds what the paper
+    states.
     `every`: evaluate every n-th frame only. Raises UserError for another protocol, for data
     without these rounds, or for a model that was trained on them or on dirt-3.
     """
@@ -163,7 +164,7 @@ def darkest_intervals(shadow: NDArray[np.float32], window: int) -> list[Rows]:
 
 
 def drive_figures(outputs: NDArray[np.float32], labels: Labels) -> dict[str, Any]:
-    """Of a drive or a part of it: the figures that the paper states, and what they stand beside.
+    """The figures of a drive or a part of it: those that the paper states, and some beside them.
 
     `distance_m`, `angle_rad`: mean absolute errors; `largest_...`: the largest ones; `zero_...`:
     those of always answering zero, the mean sizes of the labels; `absent`: frames without an

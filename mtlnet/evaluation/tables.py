@@ -31,6 +31,18 @@ def mean_error_cells(result: dict[str, Any]) -> list[str]:
     return [format_number(result["errors"][f]["mean"], DIGITS[f]) for f in FEATURES]
 
 
+def report_tables(result: dict[str, Any]) -> list[Table]:
+    """The tables of a report of `mtlnet evaluate`: one for each part that the report has."""
+    makers = {
+        "protocol": protocol_table,
+        "mae_m": evaluation_table,
+        "pictures": picture_table,
+        "by_track": group_table,
+        "uncertainty": uncertainty_table,
+    }
+    return [make(result) for part, make in makers.items() if part in result]
+
+
 def evaluation_table(result: dict[str, Any]) -> Table:
     """Errors of a model on active labels, beside those of the constant training mean."""
     title = f"{result['model']} on {result['frames']} {result['split']} frames of {result['data']}"

@@ -195,14 +195,15 @@ Coefficients = tuple[float, float, float]
 def orthogonalize_each(
     matrices: Iterable[Tensor], coefficients: Coefficients, steps: int, min_norm: float
 ) -> Iterator[Tensor]:
-    """`orthogonalize` of each matrix, when it is asked for."""
+    """Yields `orthogonalize` of each matrix; computes one at a time, to keep one in memory."""
     return (orthogonalize(matrix, coefficients, steps, min_norm) for matrix in matrices)
 
 
 def orthogonalize_together(
     matrices: Iterable[Tensor], coefficients: Coefficients, steps: int, min_norm: float
 ) -> list[Tensor]:
-    """The same; Gram matrices of one size (F, F) are iterated as one batch (N, F, F)."""
+    """Returns what `orthogonalize_each` yields, but iterates on Gram matrices (F, F) of one size as
+    one batch (N, F, F)."""
     all_of = list(matrices)
     wide = [_wide(matrix, min_norm) for matrix in all_of]
     of_size: dict[int, list[int]] = {}

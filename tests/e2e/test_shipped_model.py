@@ -54,17 +54,7 @@ def test_other_weights_in_the_place_of_the_shipped_ones_are_refused(
 @pytest.mark.slow
 def test_the_shipped_model_reads_a_track_it_has_never_seen(tmp_path: Path) -> None:
     data = str(tmp_path / "data")
-    rounds = (
-        "--rounds",
-        "3",
-        "--frames",
-        "40",
-        "--frequency",
-        "4",
-        "--stretch",
-        "0",
-        "--workers=1",
-    )
+    rounds = ("--rounds=3", "--frames=40", "--frequency=4", "--stretch=0", "--workers=1")
     where = ("--split", "unseen", "--tracks", "coast", "--lights", "clear,overcast", "--seed", "9")
     command("datagen", "collect", "--out", data, *rounds, *where)
     found = command("mtlnet", "evaluate", "--data", data, "--split", "unseen")

@@ -1,4 +1,4 @@
-"""The stages of a GPU run, and until when each may take: seconds from the run's start."""
+"""The stages of a GPU run and their deadlines, in seconds from the start of the run."""
 
 from dataclasses import dataclass
 
@@ -18,9 +18,9 @@ SECONDS = {
     "paper": 75.0,
     "end": 5.0,
 }
-"""What each stage is given of a run of ten minutes, in their order; in another run in proportion.
-What a stage leaves is there for the next ones: above all for `train`, which takes all but what the
-stages after it are given."""
+"""Seconds of each stage in a run of ten minutes, in the order of the stages; runs of other lengths
+scale them. Time that a stage leaves goes to the next stages, above all to `train`, which takes all
+but the seconds of the stages after it."""
 STAGES = tuple(name for name in SECONDS if name not in ("check", "end"))
 LEAST_MINUTES, MOST_MINUTES = 1.0, 600.0
 

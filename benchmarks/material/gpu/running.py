@@ -1,4 +1,4 @@
-"""Runs the stages of a GPU run in turn, and says what became of each."""
+"""Runs the stages of a GPU run in turn, and reports the result of each."""
 
 import sys
 import time
