@@ -134,13 +134,19 @@ def _time_left(progress: TrainProgress) -> str:
 
 
 def _print_result(console: Console, run: Path, card: ModelCard) -> None:
-    check = card.export_check
+    console.print(export_text(card.export_check))
+    console.print(f"finished: {run} (serve it with `serve --model {run}`)")
+
+
+def export_text(check: Mapping[str, float]) -> str:
+    """What is printed of a card's `export_check`; it has no frames where OpenVINO is missing."""
+    if not check["frames"]:
+        return "weights alone: OpenVINO, which writes the graph, is not installed"
     differences = [f"{name} {value:.2g}" for name, value in check.items() if name != "frames"]
-    console.print(
+    return (
         f"exported and compared with torch on {check['frames']:.0f} frames, largest difference: "
         f"{', '.join(differences)}"
     )
-    console.print(f"finished: {run} (serve it with `serve --model {run}`)")
 
 
 def train(

@@ -22,7 +22,7 @@ from mtlnet.model.architecture import HEIGHT, WIDTH, find_architecture
 from mtlnet.model.network import fold, load_network, predict_images
 from mtlnet.training.checkpoint import save_checkpoint
 from mtlnet.training.recipes import find_recipe
-from mtlnet.training.run import create_run
+from mtlnet.training.run import create_run, export_text
 from mtlnet.training.trainer import Trainer
 from mtlnet.uncertainty_fit.frame_outputs import run_on_frames
 from tests.mtlnet.conftest import training_config
@@ -46,6 +46,8 @@ def test_what_torch_alone_publishes_and_ships_is_served(
         report = evaluate([load_engine(out, "torch")], dataset, "test")
     assert set(card.files) == {WEIGHTS, UNCERTAINTY_WEIGHTS}
     assert card.export_check == {"frames": 0.0}
+    assert export_text(card.export_check).startswith("weights alone")
+    assert "16 frames" in export_text({"frames": 16.0, "openvino_f32_max": 1e-6})
     assert {path.name for path in run.iterdir()} == {*card.files, CARD}
     assert 0.0 < found["check"]["from_run_on_golden_image"] < 2e-2
     for folder in (run, out):
