@@ -59,26 +59,26 @@ def evaluation_table(result: dict[str, Any]) -> Table:
 
 
 def protocol_table(result: dict[str, Any]) -> Table:
-    """The figures of the paper's protocol, each beside the paper's."""
-    table = Table(title=escape(printable(f"{result['model']} by the paper's protocol")))
-    columns = ("", "frames", "distance (m)", "paper", "angle (rad)", "paper", "class", "paper")
-    for column in columns:
-        table.add_column(column, justify="right" if column else "left", no_wrap=bool(column))
+    """The figures of the paper's protocol, the paper's in brackets; it fits in 80 columns."""
+    title = f"{result['model']} by the paper's protocol (in brackets: the paper)"
+    table = Table(title=escape(printable(title)))
+    table.add_column("")
+    for column in ("frames", "distance (m)", "angle (rad)", "class"):
+        table.add_column(column, justify="right", no_wrap=True)
     for name, row in result["protocol"].items():
         paper = row["paper"]
-        pairs = [
-            format_number(row["distance_m"], 3), _stated(paper, "distance_m"),
-            format_number(row["angle_rad"], 4), _stated(paper, "angle_rad"),
-            format_percent(row["heading_accuracy"]),
-            format_percent(paper.get("heading_accuracy"), 2),
-        ]  # fmt: skip
-        table.add_row(name, str(row["frames"]), *pairs)
+        figures = (
+            (format_number(row["distance_m"], 3), f"{paper.get('distance_m', '')}"),
+            (format_number(row["angle_rad"], 4), f"{paper.get('angle_rad', '')}"),
+            (format_percent(row["heading_accuracy"]), _percent(paper.get("heading_accuracy"))),
+        )
+        cells = (f"{own} ({stated})" if stated else own for own, stated in figures)
+        table.add_row(name, str(row["frames"]), *cells)
     return table
 
 
-def _stated(paper: dict[str, float], key: str) -> str:
-    """A figure with the digits that the paper gives it."""
-    return f"{paper[key]:g}" if key in paper else "-"
+def _percent(stated: float | None) -> str:
+    return "" if stated is None else format_percent(stated, 2)
 
 
 def group_table(result: dict[str, Any]) -> Table:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import typer.testing
 from numpy.typing import NDArray
+from rich.console import Console
 
 import trackfeatures as tf
 from datagen.recording.frame import DriverCommand, EgoState, Frame, RoadPlace
@@ -153,13 +154,16 @@ def test_each_figure_is_the_painted_error_beside_the_papers(rounds: Path) -> Non
     assert list(report["by_track"]) == ["forza"]
 
 
-def test_the_printed_table_has_both_columns(rounds: Path) -> None:
+def test_the_printed_table_has_the_papers_figures_in_brackets(rounds: Path) -> None:
     printed = protocol_table(evaluated(rounds))
     columns = [[str(cell) for cell in column.cells] for column in printed.columns]
-    assert columns[2] == ["0.070", "0.044", "0.010", "0.040", "0.040", "0.005"]
-    assert columns[3] == ["0.071", "-", "-", "0.107", "-", "-"]
-    assert columns[5] == ["0.003", "-", "-", "0.004", "-", "-"]
-    assert (columns[6][-1], columns[7][-1]) == ("70.0%", "98.78%")
+    assert columns[2] == ["0.070 (0.071)", "0.044", "0.010", "0.040 (0.107)", "0.040", "0.005"]
+    assert [cell.endswith(" (0.003)") for cell in columns[3]] == [True, *[False] * 5]
+    assert columns[3][3].endswith(" (0.004)")
+    assert columns[4][-1] == "70.0% (98.78%)"
+    console = Console(width=80, record=True)
+    console.print(printed)
+    assert "…" not in console.export_text(), "a name is cut off"
 
 
 def test_every_nth_frame_is_evaluated(rounds: Path) -> None:
