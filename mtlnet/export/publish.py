@@ -6,6 +6,7 @@ written: an engine makes one of the weights when it loads the model.
 """
 
 import platform
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -117,6 +118,17 @@ def _require_equal(run: Path, check: dict[str, float]) -> None:
                 f"({name}), at most {limit:g} is expected: the model is not published; report this "
                 "as a fault"
             )
+
+
+def export_text(check: Mapping[str, float]) -> str:
+    """What is printed of a card's `export_check`; it has no frames where OpenVINO is missing."""
+    if not check["frames"]:
+        return "weights alone: OpenVINO, which writes the graph, is not installed"
+    differences = [f"{name} {value:.2g}" for name, value in check.items() if name != "frames"]
+    return (
+        f"exported and compared with torch on {check['frames']:.0f} frames, largest difference: "
+        f"{', '.join(differences)}"
+    )
 
 
 def compare_graph(

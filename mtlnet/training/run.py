@@ -29,7 +29,7 @@ from mtlnet.data.sources import (
     open_training_data,
     resume_data,
 )
-from mtlnet.export.publish import Provenance, publish
+from mtlnet.export.publish import Provenance, export_text, publish
 from mtlnet.inference.model_card import RUNS, ModelCard, read_card
 from mtlnet.model.architecture import find_architecture
 from mtlnet.model.network import fold
@@ -136,17 +136,6 @@ def _time_left(progress: TrainProgress) -> str:
 def _print_result(console: Console, run: Path, card: ModelCard) -> None:
     console.print(export_text(card.export_check))
     console.print(f"finished: {run} (serve it with `serve --model {run}`)")
-
-
-def export_text(check: Mapping[str, float]) -> str:
-    """What is printed of a card's `export_check`; it has no frames where OpenVINO is missing."""
-    if not check["frames"]:
-        return "weights alone: OpenVINO, which writes the graph, is not installed"
-    differences = [f"{name} {value:.2g}" for name, value in check.items() if name != "frames"]
-    return (
-        f"exported and compared with torch on {check['frames']:.0f} frames, largest difference: "
-        f"{', '.join(differences)}"
-    )
 
 
 def train(

@@ -12,7 +12,7 @@ from datagen.recording import Dataset
 from mtlnet.evaluation.evaluate import evaluate
 from mtlnet.evaluation.metrics import describe_data
 from mtlnet.export.openvino_graph import TOLERANCE
-from mtlnet.export.publish import Provenance, publish
+from mtlnet.export.publish import Provenance, export_text, publish
 from mtlnet.export.ship import ship_model
 from mtlnet.inference.engine import has_openvino, load_engine
 from mtlnet.inference.model_card import CARD, UNCERTAINTY_WEIGHTS, WEIGHTS, golden_image, read_card
@@ -22,7 +22,7 @@ from mtlnet.model.architecture import HEIGHT, WIDTH, find_architecture
 from mtlnet.model.network import fold, load_network, predict_images
 from mtlnet.training.checkpoint import save_checkpoint
 from mtlnet.training.recipes import find_recipe
-from mtlnet.training.run import create_run, export_text
+from mtlnet.training.run import create_run
 from mtlnet.training.trainer import Trainer
 from mtlnet.uncertainty_fit.frame_outputs import run_on_frames
 from tests.mtlnet.conftest import training_config
