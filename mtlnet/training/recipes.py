@@ -29,7 +29,11 @@ steps. Dropout 0.5 and L2 5e-4 are our choice: the paper states neither.
 put back first, and the network may get more residual convolutions (`mtlnet.model.pretrained`). The
 first convolution stays as it is; frames in sharp bends and near a change of class, where most
 errors are, are drawn twice as often (in a pilot of 5 minutes 0.89 of the wrong classes, 0.97 of the
-angle's error). With a learning rate of 1e-3 the model forgot more than it learned.
+angle's error). With a learning rate of 1e-3 the model forgot more than it learned. The learning
+rate stays constant until the last fifth of the run, then falls to zero as one minus a square root
+(Hägele et al. 2024, "Scaling Laws and Compute-Optimal Training Beyond Fixed Training Durations").
+So a run that is stopped before can be prolonged (`--resume --minutes`), as if it had been planned
+longer from the start.
 
 On a GPU `fast` and `continue` take `gpu_batch` images a step, unless `--batch` is given, and every
 recipe scales its learning rate by `learning_rate_factor`.
@@ -76,6 +80,9 @@ class Recipe:
     """Whether it starts from a finished model (`--init`)."""
     gpu_batch: int = 0
     """Images a step on a GPU, which smaller batches do not fill; 0: `batch`."""
+    fall_from: float | None = None
+    """Share of the run up to which the learning rate is constant after its warm-up (adamw, muon).
+    None: it falls as a cosine from the warm-up on."""
 
 
 HUBER = HuberLoss(distance_beta=0.05)
@@ -102,8 +109,10 @@ CONTINUE = replace(
     learning_rate=3e-4,
     iterations=30_000,
     hard_repeats=2,
-    freeze_schedule=((0.0, 1), (0.6, 2)),
+    freeze_bn_at=0.8,
+    freeze_schedule=((0.0, 1), (0.8, 2)),
     from_model=True,
+    fall_from=0.8,
 )
 TUNE = replace(
     FAST,
@@ -125,6 +134,9 @@ RECIPES = {
 MOMENTUM = 0.9
 WARM_UP = 0.05
 """Share of a run over which the learning rate rises (adamw, muon)."""
+WARM_UP_STEPS = 500
+"""Steps after which it has risen, if the rate is constant afterwards: longer runs do not need
+more, and a run that is prolonged must not rise again."""
 DECAY, DECAY_STEPS = 0.9, 10_000
 """Factor of the learning rate after so many steps (sgd)."""
 
@@ -157,8 +169,13 @@ def learning_rate(recipe: Recipe, step: int, progress: float) -> float:
     """The learning rate at `step`, at `progress` in [0, 1] of the run."""
     if recipe.optimizer == "sgd":
         return recipe.learning_rate * DECAY ** (step // DECAY_STEPS)
-    if progress < WARM_UP:
-        # Not 0: a run limited by time starts at progress 0.
-        return recipe.learning_rate * max(progress / WARM_UP, 0.02)
-    fall = (min(progress, 1.0) - WARM_UP) / (1 - WARM_UP)
-    return recipe.learning_rate * 0.5 * (1 + math.cos(math.pi * fall))
+    peak = recipe.learning_rate
+    if recipe.fall_from is None:
+        if progress < WARM_UP:
+            # Not 0: a run limited by time starts at progress 0.
+            return peak * max(progress / WARM_UP, 0.02)
+        fall = (min(progress, 1.0) - WARM_UP) / (1 - WARM_UP)
+        return peak * 0.5 * (1 + math.cos(math.pi * fall))
+    rise = max(progress / WARM_UP, step / WARM_UP_STEPS, 0.02)
+    fall = max(min(progress, 1.0) - recipe.fall_from, 0.0) / (1 - recipe.fall_from)
+    return peak * min(rise, 1.0) * (1 - math.sqrt(fall))

@@ -192,6 +192,24 @@ def test_learning_rate_schedules() -> None:
     assert learning_rate(fast, 0, 1.0) == pytest.approx(0, abs=1e-12)
 
 
+def test_a_run_of_continue_can_be_prolonged_until_its_rate_falls() -> None:
+    """Minutes added within the first four fifths leave the rates of the steps so far as they are.
+
+    100 steps a minute; planned for 20 minutes, or for 200.
+    """
+    recipe = RECIPES["continue"]
+    planned, prolonged = (
+        [learning_rate(recipe, step, step / 100 / minutes) for step in range(0, 20 * 100, 50)]
+        for minutes in (20.0, 200.0)
+    )
+    assert planned[0] > 0
+    assert planned[2 : 16 * 2] == [recipe.learning_rate] * 30  # warm-up: 5 % of 20 minutes
+    assert prolonged[10 : 16 * 2] == planned[10 : 16 * 2]  # warm-up: at most 500 steps
+    assert prolonged[-1] == recipe.learning_rate
+    assert planned[-1] < planned[-2] < planned[16 * 2 + 1] < recipe.learning_rate
+    assert learning_rate(recipe, 2_000, 1.0) == learning_rate(recipe, 2_001, 1.2) == 0.0
+
+
 @pytest.mark.parametrize(
     ("changes", "seen"),
     [
