@@ -1,4 +1,4 @@
-"""Writes the tables of docs/results.md and the first table of README.md from docs/results.toml.
+"""Writes the tables of docs/results.md and the table of README.md from docs/results.toml.
 
 python docs/results.py
 """
@@ -23,7 +23,7 @@ def pages(data: dict[str, Any]) -> dict[Path, str]:
     for section in dict.fromkeys(result["section"] for result in data["result"]):
         rows = [result for result in data["result"] if result["section"] == section]
         text = with_table(text, f"## {section}", results_table(rows))
-    summary = with_table(readme.read_text(), "# driverview", summary_table(data["result"]))
+    summary = with_table(readme.read_text(), "## Results", summary_table(data["result"]))
     return {page: text, readme: summary}
 
 

@@ -17,7 +17,12 @@ from mtlnet.data.labels_file import LabelledPicture
 from mtlnet.data.picture_copies import copied_camera, copied_picture
 from mtlnet.evaluation.pictures import FEATURES, GROUPS, Answers
 from mtlnet.inference.image_decoding.decode import read_whole_image
-from mtlnet.inference.overlay import PREDICTION_COLOUR, TRUTH_COLOUR, marking_line
+from mtlnet.inference.overlay import (
+    PREDICTION_COLOUR,
+    TRUTH_COLOUR,
+    draw_road_line,
+    marking_line,
+)
 from mtlnet.inference.prediction import split_outputs
 from mtlnet.inference.uncertainty import FEATURES as ANSWERS
 from runtime.files import atomic_write
@@ -199,7 +204,7 @@ def _drawn(answers: Answers, case: Case) -> Image:
         for distance in distances.tolist():
             if np.isfinite(distance):
                 line = marking_line(distance, heading, curvature, ALONG_M)
-                _draw_line(canvas, camera, line, colour, thickness)
+                draw_road_line(canvas, camera, line, colour, thickness)
     return canvas
 
 
@@ -207,18 +212,3 @@ def source_camera(images: CustomImages, row: int) -> CameraParameters:
     """The camera that took the picture or copy in a row, at its own size."""
     lens = images.lenses[row]
     return images.camera if lens is None else lens.source
-
-
-def _draw_line(
-    canvas: Image,
-    camera: CameraParameters,
-    points: NDArray[np.float64],
-    colour: tuple[int, int, int],
-    thickness: int,
-) -> None:
-    """Draw points (N, 2) of the road, m, as far as the camera sees them."""
-    road = np.column_stack([points, np.full(len(points), -camera.cg_height_m)])
-    pixels = camera.project(road)
-    pixels = pixels[np.isfinite(pixels).all(1) & (np.abs(pixels) < 1e4).all(1)]
-    line = np.round(pixels).astype(np.int32)
-    cv2.polylines(canvas, [line], False, colour, thickness, cv2.LINE_AA)

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mtlnet.inference.prediction import Prediction
 from trackfeatures.camera import CameraParameters
 
 Image = NDArray[np.uint8]
@@ -20,6 +21,10 @@ PREDICTION_COLOUR = (255, 140, 30)
 NEAR_M, FAR_M = 3.0, 14.0
 SCALE = 2
 """Factor by which frames are enlarged, so that lines look thin."""
+LINE_SHARE = 200
+"""Rows of an image per pixel of a line's width."""
+MAX_PX = 1e4
+"""Points that are projected farther outside the image are left out: OpenCV would overflow."""
 TOP_VIEW_WIDTH, TOP_VIEW_METRES = 160, 16.0
 
 
@@ -78,6 +83,35 @@ def draw_overlay(
             cv2.polylines(top_view, [from_above], False, colour, thickness, cv2.LINE_AA)
     _draw_car(top_view)
     return np.hstack([canvas, top_view])
+
+
+def draw_markings(image: Image, camera: CameraParameters, prediction: Prediction) -> Image:
+    """A copy of an image (H, W, 3) RGB of `camera` with the markings drawn, in its own size.
+
+    Flat and straight road: the curvature is not predicted.
+    """
+    canvas = image.copy()
+    width = max(round(image.shape[0] / LINE_SHARE), 1)
+    for distance in prediction.distances_m.values():
+        if distance is not None:
+            line = marking_line(distance, prediction.angle_rad, 0.0)
+            draw_road_line(canvas, camera, line, PREDICTION_COLOUR, width)
+    return canvas
+
+
+def draw_road_line(
+    canvas: Image,
+    camera: CameraParameters,
+    points: NDArray[np.float64],
+    colour: tuple[int, int, int],
+    thickness: int,
+) -> None:
+    """Draw points (N, 2) of the road, m in the car frame, as far as the camera sees them."""
+    road = np.column_stack([points, np.full(len(points), -camera.cg_height_m)])
+    pixels = camera.project(road)
+    pixels = pixels[np.isfinite(pixels).all(1) & (np.abs(pixels) < MAX_PX).all(1)]
+    line = np.round(pixels).astype(np.int32)
+    cv2.polylines(canvas, [line], False, colour, thickness, cv2.LINE_AA)
 
 
 def _top_view_pixels(points: NDArray[np.float64], top_view: Image) -> NDArray[np.int32]:

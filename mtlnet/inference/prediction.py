@@ -87,6 +87,11 @@ class Prediction:
     absent: dict[str, float] | None = None
     """Probability that each marking is absent; None for a model with heads of coded values."""
 
+    @property
+    def road_class(self) -> str:
+        """The most probable class of the road ahead: left, straight or right."""
+        return max(self.heading, key=self.heading.__getitem__)
+
     def as_json(self) -> dict[str, Any]:
         """The prediction as the service returns it."""
         return {

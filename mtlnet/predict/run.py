@@ -94,6 +94,15 @@ def predict_files(
     return answers.finish()
 
 
+def answer(engine: Engine, item: SourceImage) -> Prediction:
+    """The features of an image that could be read, in metres beside its own camera."""
+    assert item.image is not None
+    outputs = engine(item.image)
+    if item.lens is not None:
+        outputs = item.lens.outputs(outputs[None])[0]
+    return decode_outputs(outputs)
+
+
 class _Answers:
     """The answers so far, and what could not be used."""
 
@@ -110,10 +119,7 @@ class _Answers:
             self._unusable.append(item.error)
             return
         begin = time.perf_counter()
-        outputs = self._engine(item.image)
-        if item.lens is not None:
-            outputs = item.lens.outputs(outputs[None])[0]
-        prediction = decode_outputs(outputs)
+        prediction = answer(self._engine, item)
         latency_ms = round(1e3 * (time.perf_counter() - begin), 3)
         writing.write(item, prediction)
         self.used += 1

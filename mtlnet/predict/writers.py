@@ -198,7 +198,7 @@ def feature_lines(prediction: Prediction) -> tuple[str, str]:
     distances = "  ".join(
         f"{name} {_metres(value)}" for name, value in prediction.distances_m.items()
     )
-    heading = max(prediction.heading, key=prediction.heading.__getitem__)
+    heading = prediction.road_class
     unfamiliar = "  out of distribution" if prediction.out_of_distribution else ""
     return (
         f"{distances}  (m)",

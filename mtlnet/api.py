@@ -1,0 +1,290 @@
+"""The Python interface: `from mtlnet import load`, then `load("default").predict("image.jpg")`."""
+
+import logging
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from threading import Lock
+from typing import Any, overload
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mtlnet.inference.engine import load_engine, parse_kind, parse_precision
+from mtlnet.inference.image_decoding.decode import decode_file, read_whole_image
+from mtlnet.inference.model_card import ModelCard, resolve_run
+from mtlnet.inference.overlay import draw_markings
+from mtlnet.inference.prediction import Prediction
+from mtlnet.inference.rectification import Rectification, read_camera
+from mtlnet.predict.kinds import Kind
+from mtlnet.predict.lenses import with_lens
+from mtlnet.predict.pictures import Lens, Picture, fit
+from mtlnet.predict.run import answer
+from mtlnet.predict.sources import Source, SourceImage, find_sources, read_sources
+from mtlnet.predict.writers import draw_prediction
+from trackfeatures.camera import CameraParameters
+from trackfeatures.errors import UserError
+
+Image = NDArray[np.uint8]
+OneImage = str | Path | bytes | Image
+"""A file, the bytes of a file (JPEG, PNG, ...), or pixels (H, W, 3) uint8 RGB."""
+
+log = logging.getLogger("mtlnet")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Features(Prediction):
+    """The features of one image; attributes and units are those of `Prediction`."""
+
+    seen: SourceImage
+    """The image as the model sees it, its name and time."""
+    camera: CameraParameters
+    """The camera that took the image, at any size of its aspect ratio."""
+
+    @property
+    def name(self) -> str:
+        """The image's file; `film.mp4#12` for a frame of a film; empty for bytes and pixels."""
+        return self.seen.name
+
+    @property
+    def time_s(self) -> float | None:
+        """Time of the image in s since the start of its film; since 1970 if that is recorded."""
+        return self.seen.time_s
+
+    def draw(self, image: OneImage | None = None) -> Image:
+        """A picture of the answer, uint8 RGB.
+
+        `image`: the image that was answered; the markings are drawn on a copy of it, as straight
+        lines on a flat road. None: the image in the model's view, with the markings, a view from
+        above and the features as text.
+        """
+        if image is None:
+            view = self.camera if self.seen.lens is None else self.seen.lens.target
+            return draw_prediction(self.seen, self, view)
+        pixels = _pixels(image)
+        camera = self.camera
+        if self.seen.lens is None:  # the model's camera, of which a wider image shows more columns
+            camera = _whole(camera, pixels)
+        else:
+            camera = camera.resized(pixels.shape[1], pixels.shape[0])
+        return draw_markings(pixels, camera, self)
+
+
+class Model:
+    """A trained model. Safe to call from several threads; they take turns."""
+
+    def __init__(
+        self, run: Path, engine: str = "openvino", precision: str | None = None, threads: int = 1
+    ) -> None:
+        self.folder = run
+        self._options = (parse_kind(engine), parse_precision(precision))
+        self._engine = load_engine(run, *self._options, threads=threads)
+        self._turn = Lock()
+
+    @property
+    def card(self) -> ModelCard:
+        """What the model is: network, camera, training data, hashes."""
+        return self._engine.card
+
+    @property
+    def camera(self) -> CameraParameters:
+        """The camera that the model was trained with."""
+        return self.card.camera
+
+    @overload
+    def predict(
+        self,
+        source: bytes | Image,
+        *,
+        camera: str | Path | CameraParameters | None = None,
+        fov_y_deg: float | None = None,
+        topic: str = "",
+    ) -> Features: ...
+
+    @overload
+    def predict(
+        self,
+        source: Sequence[OneImage],
+        *,
+        camera: str | Path | CameraParameters | None = None,
+        fov_y_deg: float | None = None,
+        topic: str = "",
+    ) -> list[Features]: ...
+
+    @overload
+    def predict(
+        self,
+        source: str | Path,
+        *,
+        camera: str | Path | CameraParameters | None = None,
+        fov_y_deg: float | None = None,
+        topic: str = "",
+    ) -> Any: ...
+
+    def predict(
+        self,
+        source: OneImage | Sequence[OneImage],
+        *,
+        camera: str | Path | CameraParameters | None = None,
+        fov_y_deg: float | None = None,
+        topic: str = "",
+    ) -> Any:
+        """The features of one image, of a list of images, or of all images of a source.
+
+        `source`: an image file, the bytes of one or pixels (H, W, 3) uint8 RGB give `Features`; a
+        list of these gives a list. A film, folder, pattern, recorded round, ROS 2 bag, webcam
+        number or address of a stream (all as text, as for `mtlnet predict`) gives an iterator,
+        which reads and answers image by image.
+        `camera`: a camera file or CameraParameters; "model": the model's own. None: the same, but
+        the mount of a film's camera is found from what it shows.
+        `fov_y_deg`: vertical field of view of the images, if that is all that is known of their
+        camera. `topic`: the topic of a recording that holds the pictures.
+
+        Raises UserError for a source that cannot be used (ImageError: one image). An iterator
+        raises it after the last image, if any of them could not be used. What was found or left
+        out goes to the logger `mtlnet`.
+        """
+        lens = self._lens(camera, fov_y_deg)
+        if isinstance(source, bytes | np.ndarray):
+            return self._one(_pixels(source), lens)
+        if isinstance(source, str | Path):
+            sources = find_sources([str(source)], log.info, topic)
+            if len(sources) == 1 and sources[0].kind is Kind.IMAGE:
+                if sources[0].problem:
+                    raise UserError(sources[0].problem)
+                return self._one(read_whole_image(sources[0].path), lens, str(source))
+            return self._all(sources, lens, calibrate=camera is None)
+        return [self._listed(image, lens) for image in source]
+
+    __call__ = predict
+
+    def _lens(self, camera: str | Path | CameraParameters | None, fov_y_deg: float | None) -> Lens:
+        if camera is None or camera == "model":
+            if fov_y_deg is not None and not 0 < fov_y_deg < 180:
+                raise UserError(f"fov_y_deg is {fov_y_deg:g}; give a value above 0 and below 180")
+            return fov_y_deg
+        if fov_y_deg is not None:
+            raise UserError("the camera holds the field of view; leave fov_y_deg out")
+        if not isinstance(camera, CameraParameters):
+            camera = read_camera(Path(camera), self.camera, log.info)
+        return Rectification(camera, self.camera)
+
+    def _listed(self, image: OneImage, lens: Lens) -> Features:
+        name = str(image) if isinstance(image, str | Path) else ""
+        return self._one(_pixels(image), lens, name)
+
+    def _one(self, pixels: Image, lens: Lens, name: str = "") -> Features:
+        small = fit(Picture(0, pixels), self.camera, lens)
+        known = lens if isinstance(lens, Rectification) else None
+        return self._answer(SourceImage(name, None, small, lens=known), lens)
+
+    def _all(self, sources: list[Source], lens: Lens, *, calibrate: bool) -> Iterator[Features]:
+        found = [with_lens(s, self.camera, lens, log.info, calibrate=calibrate) for s in sources]
+        unusable: list[str] = []
+        items = read_sources(found, self.camera)
+        try:
+            for item in items:
+                if item.image is None:
+                    unusable.append(item.error)
+                else:
+                    yield self._answer(item, lens)
+        finally:
+            items.close()
+        if unusable:
+            more = f" (and {len(unusable) - 1} more)" if len(unusable) > 1 else ""
+            raise UserError(f"{unusable[0]}{more}")
+
+    def _answer(self, item: SourceImage, lens: Lens) -> Features:
+        with self._turn:
+            prediction = answer(self._engine, item)
+        values = (getattr(prediction, field.name) for field in fields(Prediction))
+        return Features(*values, seen=item, camera=_camera(item, lens, self.camera))
+
+    def evaluate(
+        self,
+        data: str | Path,
+        split: str = "test",
+        *,
+        every: int = 1,
+        copies: str = "",
+        page: str | Path | None = None,
+    ) -> dict[str, Any]:
+        """The errors on a dataset, as `mtlnet evaluate --json` prints them, in m and rad.
+
+        `data`: a folder of recorded rounds, or of pictures with a `labels.csv`. `split`: train,
+        test or unseen. `every`: use every n-th frame. `copies`: "mirrored,turned" adds changed
+        copies of pictures. `page`: an HTML file to write. Raises UserError.
+        """
+        from mtlnet.evaluation.evaluate import evaluate
+
+        engines = [load_engine(self.folder, *self._options) for _ in range(os.cpu_count() or 1)]
+        written = None if page is None else Path(page)
+        return evaluate(engines, Path(data), split, page=written, every=every, copies=copies)
+
+    def export(
+        self,
+        form: str = "openvino",
+        precision: str = "f32",
+        *,
+        data: str | Path | None = None,
+        out: str | Path | None = None,
+        frames: int = 64,
+    ) -> dict[str, Any]:
+        """Write the model as "onnx" or "openvino", in "f32", "bf16" or "int8", as `mtlnet export`.
+
+        `data`: the dataset whose frames check the result; None: that of the training. `out`: the
+        folder to write; None: `export/` in the model's folder. Returns what `mtlnet export --json`
+        prints. Raises UserError for an export that does not exist, ModelError when the result
+        differs from torch.
+        """
+        from mtlnet.export.convert import export_model
+
+        checked, written = (None if path is None else Path(path) for path in (data, out))
+        return export_model(self.folder, form, precision, checked, written, frames)
+
+
+def load(
+    model: str | Path = "default",
+    *,
+    engine: str = "openvino",
+    precision: str | None = None,
+    threads: int = 1,
+) -> Model:
+    """Load a model, ready to answer.
+
+    `model`: "default" (the model that ships), the name of a run in `runs/` or the folder of a run.
+    `engine`: "openvino" or "torch". `precision`: "int8", "bf16" or "f32"; None: int8 if the model
+    has an int8 graph that passed its accuracy gate, else bf16 where the processor has it, else f32.
+    `threads`: threads of one answer. Raises ModelError when the model is missing or damaged.
+    """
+    return Model(resolve_run(str(model)), engine, precision, threads)
+
+
+def _pixels(image: OneImage) -> Image:
+    """Pixels (H, W, 3) uint8 RGB of one image. Raises ImageError or UserError."""
+    if isinstance(image, bytes):
+        return decode_file(image)
+    if isinstance(image, str | Path):
+        return read_whole_image(Path(image))
+    if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or not image.size:
+        raise UserError(
+            f"the pixels are {image.dtype} of shape {image.shape}; give uint8 RGB of shape "
+            "(height, width, 3)"
+        )
+    return image
+
+
+def _camera(item: SourceImage, lens: Lens, model: CameraParameters) -> CameraParameters:
+    """The camera that took an image."""
+    if item.lens is not None:
+        return item.lens.source
+    fov_y_deg = lens if isinstance(lens, float | int) else model.fov_y_deg
+    return CameraParameters(**{**model.as_dict(), "fov_y_deg": fov_y_deg})
+
+
+def _whole(camera: CameraParameters, pixels: Image) -> CameraParameters:
+    """The camera of an image (H, W, 3) of any aspect ratio with the camera's vertical field of
+    view."""
+    height, width = pixels.shape[:2]
+    return CameraParameters(**{**camera.as_dict(), "width": width, "height": height})

@@ -1,0 +1,161 @@
+"""`from mtlnet import load`: the answers of the commands, from Python."""
+
+import json
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from mtlnet import Features, Model, load
+from mtlnet.cli import app
+from mtlnet.inference.image_decoding.errors import ImageError
+from mtlnet.inference.model_card import golden_image
+from mtlnet.inference.prediction import decode_outputs
+from mtlnet.inference.rectification import Rectification
+from runtime.camera_file import write_camera
+from runtime.film import Film
+from trackfeatures.camera import CameraParameters
+from trackfeatures.errors import UserError
+
+# Golden answers are of float32, which every processor has.
+MODEL_CAMERA = CameraParameters()
+
+
+@pytest.fixture(scope="module")
+def model() -> Model:
+    return load("default", precision="f32")
+
+
+@pytest.fixture(scope="module")
+def road() -> np.ndarray:
+    return golden_image(280, 210)
+
+
+def test_importing_mtlnet_loads_neither_numpy_nor_torch() -> None:
+    code = "import sys, mtlnet; print([m for m in ('numpy', 'torch', 'cv2') if m in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "[]\n"
+    with pytest.raises(ImportError, match="nothing"):
+        exec("from mtlnet import nothing")
+
+
+def test_one_image_as_pixels_bytes_and_file_has_the_engine_s_answer(
+    model: Model, road: np.ndarray, tmp_path: Path
+) -> None:
+    path = tmp_path / "road.png"
+    png = cv2.imencode(".png", road[..., ::-1])[1].tobytes()
+    path.write_bytes(png)
+    true = decode_outputs(model._engine(road))
+    answers = [model.predict(road), model.predict(png), model.predict(path), model(str(path))]
+    assert [found.as_json() for found in answers] == [true.as_json()] * 4
+    assert [found.name for found in answers] == ["", "", str(path), str(path)]
+    listed = model.predict([road, png, path])
+    assert [found.as_json() for found in listed] == [true.as_json()] * 3
+    assert model.predict([]) == []
+    assert answers[0].road_class == "straight"
+    assert answers[0].to_lane_centre_m == pytest.approx(0.0, abs=0.05)
+
+
+def test_a_film_is_answered_frame_by_frame_as_by_the_command(
+    model: Model, road: np.ndarray, tmp_path: Path
+) -> None:
+    film = tmp_path / "drive.mp4"
+    with Film(film, 20.0) as writer:
+        for number in range(5):
+            writer.write(np.roll(road, 3 * number, axis=1))
+    answers = model.predict(film)
+    assert isinstance(answers, Iterator)
+    found = list(answers)
+    words = ["predict", str(film), "--precision", "f32", "--json"]
+    rows = json.loads(CliRunner().invoke(app, words).stdout)
+    assert [(f.name, f.time_s) for f in found] == [(r["image"], r["time_s"]) for r in rows]
+    assert [f.as_json() for f in found] == [{k: r[k] for k in found[0].as_json()} for r in rows]
+
+
+def test_a_camera_file_gives_metres_beside_that_camera(
+    model: Model, road: np.ndarray, tmp_path: Path
+) -> None:
+    """The same picture from 1.05 times the height: all distances are 1.05 times as large."""
+    high = CameraParameters(z=1.05 * 1.2 - 0.25)
+    write_camera(tmp_path / "high.yaml", high)
+    plain = model.predict(road)
+    answers = (model.predict(road, camera=c) for c in (high, tmp_path / "high.yaml"))
+    for found in answers:
+        assert found.distances_m["ml"] == pytest.approx(
+            1.05 * (plain.distances_m["ml"] or 0), abs=1e-3
+        )
+        assert found.camera == high
+    with pytest.raises(UserError, match="leave fov_y_deg out"):
+        model.predict(road, camera=high, fov_y_deg=50.0)
+
+
+def test_markings_are_drawn_on_the_picture_in_its_own_size_and_lens(model: Model) -> None:
+    """Of a wide picture, a distorted camera and the model's view: orange pixels lie on the line."""
+    bent = CameraParameters(
+        640, 480, 70.0, pitch_deg=4.0, distortion="opencv", coefficients=(-0.2, 0.05, 0.0, 0.0)
+    )
+    seen = Rectification(MODEL_CAMERA, bent).image(golden_image(280, 210))
+    for picture, camera in ((golden_image(1280, 960), None), (seen, bent)):
+        features = model.predict(picture, camera=camera)
+        drawn = features.draw(picture)
+        assert drawn.shape == picture.shape
+        changed = np.argwhere((drawn != picture).any(axis=2))[:, ::-1]
+        own = features.camera.resized(picture.shape[1], picture.shape[0])
+        ahead, left = own.road_points(changed).T
+        right_of_car = -left * np.cos(features.angle_rad) + ahead * np.sin(features.angle_rad)
+        distances = [d for d in features.distances_m.values() if d is not None]
+        off = np.abs(right_of_car[:, None] - np.array(distances)).min(axis=1)
+        assert len(changed) > 500
+        assert np.median(off) < 0.05
+        assert features.draw().shape == (484, 720, 3)
+
+
+def test_faulty_sources_are_one_clear_error(model: Model, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="float64 of shape"):
+        model.predict(np.zeros((210, 280, 3)))  # type: ignore[arg-type]
+    with pytest.raises(UserError, match=r"shape \(210, 280\)"):
+        model.predict(np.zeros((210, 280), np.uint8))
+    with pytest.raises(ImageError, match="no image file"):
+        model.predict(b"text")
+    with pytest.raises(ImageError, match="a wider image is cropped"):
+        model.predict(np.zeros((280, 210, 3), np.uint8))
+    with pytest.raises(UserError, match=r"there is no image file .*none\.jpg"):
+        model.predict(tmp_path / "none.jpg")
+    for degrees in (0.0, 180.0, float("nan")):
+        with pytest.raises(UserError, match="fov_y_deg is"):
+            model.predict(np.zeros((210, 280, 3), np.uint8), fov_y_deg=degrees)
+    with pytest.raises(UserError, match="there is no engine 'tpu'"):
+        load("default", engine="tpu")
+
+
+def test_a_folder_gives_all_that_can_be_read_then_the_error(
+    model: Model, road: np.ndarray, tmp_path: Path
+) -> None:
+    for number in (10, 2):
+        cv2.imwrite(str(tmp_path / f"frame{number}.png"), road)
+    (tmp_path / "frame1.jpg").write_bytes(b"\xff\xd8\xff")
+    answers = model.predict(tmp_path)
+    found: list[Features] = []
+    with pytest.raises(UserError, match=r"frame1\.jpg"):
+        found.extend(answers)
+    names = []
+    for features in model.predict(str(tmp_path / "*.png")):
+        names.append(Path(features.name).name)
+    assert names == ["frame2.png", "frame10.png"]
+
+
+def test_evaluation_and_export_are_those_of_the_commands(
+    dataset: Path, published: Path, tmp_path: Path
+) -> None:
+    model = load(published, precision="f32")
+    words = ["evaluate", "--model", str(published), "--data", str(dataset), "--precision", "f32"]
+    told = json.loads(CliRunner().invoke(app, [*words, "--json"]).stdout)
+    assert model.evaluate(dataset)["errors"] == told["errors"]
+    result = model.export("onnx", data=dataset, out=tmp_path / "onnx", frames=4)
+    assert (tmp_path / "onnx" / "model.onnx").is_file()
+    assert result["check"]["frames"] == 4
