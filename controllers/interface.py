@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Protocol
 
-from trackfeatures import Heading
+from trackfeatures import RoadClass
 
 
 @dataclass(frozen=True, slots=True)
@@ -14,7 +14,7 @@ class Observation:
     """m from the middle of the lane to follow; the paper's e1."""
     angle: float
     """rad, track tangent minus yaw: positive when the car points to the right (minus e2)."""
-    heading: Heading
+    heading: RoadClass
     vx: float
     """m/s, forward in the body frame."""
     vy: float

@@ -20,7 +20,7 @@ from controllers.lqr import CurvatureEstimate
 from controllers.perception import Perceived
 from controllers.trust import Trust
 from simulator.vehicle.state import CarState
-from trackfeatures import Heading
+from trackfeatures import RoadClass
 from trackfeatures.errors import UserError
 
 World = TypeVar("World")
@@ -47,7 +47,7 @@ class StatePredictor:
         self._moments: deque[_Moment] = deque(maxlen=round(longest_s / dt) + 2)
         self._curvature = CurvatureEstimate(dt)
 
-    def add(self, now: CarState, heading: Heading) -> None:
+    def add(self, now: CarState, heading: RoadClass) -> None:
         """Note the car's motion at this step; `heading` is the last known class of the road."""
         seen = Observation(0.0, 0.0, heading, now.vx, now.vy, now.yaw_rate)
         self._moments.append(_Moment(now.vx, now.vy, now.yaw_rate, self._curvature(seen)))
@@ -84,7 +84,7 @@ class RoadEstimate:
         self._last: Perceived | None = None
         self._age = 0
         """Control steps since the image of `_last`."""
-        self._heading = Heading.STRAIGHT
+        self._heading = RoadClass.STRAIGHT
 
     def update(self, now: CarState, arrived: Perceived | None, age: int) -> None:
         """One control step on; `arrived` is an answer to the image of `age` control steps ago."""

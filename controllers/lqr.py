@@ -40,7 +40,7 @@ from controllers.lateral_model import (
     discrete_gains,
 )
 from controllers.torcs_feedback import steer_for
-from trackfeatures import Heading
+from trackfeatures import RoadClass
 
 WEIGHTS_PAPER = LqrWeights(2.0, 0.2, 2.0, 0.1, 0.01)
 """The paper's for forza and g-track-3 (second rows of its table)."""
@@ -215,8 +215,8 @@ class CurvatureEstimate:
         """The estimate after this step; its sign does not contradict the heading class."""
         turning = observation.yaw_rate / max(observation.vx, SLOWEST_M_S)
         self.value += self.dt / (self.dt + self.filter_s) * (turning - self.value)
-        if observation.heading is Heading.LEFT:
+        if observation.heading is RoadClass.LEFT:
             self.value = max(self.value, 0.0)
-        elif observation.heading is Heading.RIGHT:
+        elif observation.heading is RoadClass.RIGHT:
             self.value = min(self.value, 0.0)
         return self.value

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import trackfeatures as tf
-from trackfeatures import Heading, UserError
+from trackfeatures import RoadClass, UserError
 from trackfeatures.camera import CameraParameters
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ class Perceived:
     """m, left positive; None where no marking is visible."""
     angle: float
     """rad, positive when the car points to the right of the track."""
-    heading: Heading
+    heading: RoadClass
     curvature: float | None = None
     """1/m, left positive, of the road just ahead; None where it is not estimated."""
     lost_s: float = 0.0
@@ -176,7 +176,7 @@ def parse_prediction(answer: dict[str, Any]) -> Perceived:
     """The quantities that steering needs. Raises UserError where one is missing or not finite."""
     try:
         offset, angle = answer["to_lane_centre_m"], float(answer["angle_rad"])
-        probabilities = [float(answer["heading"][heading.name.lower()]) for heading in Heading]
+        probabilities = [float(answer["heading"][heading.name.lower()]) for heading in RoadClass]
         to_lane_centre = None if offset is None else float(offset)
         std = answer.get("std") or {}
         offset_std, angle_std = std.get("to_lane_centre"), std.get("angle")
@@ -191,7 +191,7 @@ def parse_prediction(answer: dict[str, Any]) -> Perceived:
     return Perceived(
         to_lane_centre,
         angle,
-        Heading(int(np.argmax(probabilities))),
+        RoadClass(int(np.argmax(probabilities))),
         offset_std_m=offset_std,
         angle_std_rad=angle_std,
         out_of_distribution=bool(answer.get("out_of_distribution")),

@@ -17,7 +17,7 @@ from simulator.track.road import Road
 from simulator.traffic.traffic import Traffic
 from simulator.vehicle.car import CarParameters
 from simulator.vehicle.state import CarState
-from trackfeatures import Heading
+from trackfeatures import RoadClass
 from trackfeatures.errors import UserError
 
 SLOWEST, FASTEST = 1.0, 40.0
@@ -109,7 +109,7 @@ class CornerSpeed:
         """Since a bend was announced."""
 
     def __call__(self, now: CarState, perceived: Perceived) -> float:
-        turn = {Heading.LEFT: 1, Heading.STRAIGHT: 0, Heading.RIGHT: -1}[perceived.heading]
+        turn = {RoadClass.LEFT: 1, RoadClass.STRAIGHT: 0, RoadClass.RIGHT: -1}[perceived.heading]
         self._turn += self._dt / (self._dt + CLASS_FILTER_S) * (turn - self._turn)
         side = round(self._turn)
         self._bend_s = 0.0 if side not in (0, self._side) else self._bend_s + self._dt

@@ -14,7 +14,7 @@ from PIL import Image, ImageDraw, ImageFont
 import simulator.env  # noqa: F401  (registers the names)
 from simulator.camera import overlay
 from simulator.camera.core.camera import DRIVER_CAMERA, Camera, open_camera
-from trackfeatures import Heading
+from trackfeatures import RoadClass
 
 IMAGES = Path(__file__).parent / "images"
 WIDTH, HEIGHT, STEPS, EVERY = 480, 360, 200, 2
@@ -54,7 +54,7 @@ def picture(camera: Camera, world: Any, info: dict[str, Any]) -> Image.Image:
     ]
     drawn = Image.fromarray(image)
     write(drawn, "  ".join(names) + " m", (10, HEIGHT - 34))
-    ahead = Heading(features["heading"]).name.lower()
+    ahead = RoadClass(features["heading"]).name.lower()
     write(drawn, f"angle {features['angle']:+.3f} rad   road ahead: {ahead}", (10, HEIGHT - 12))
     return drawn
 

@@ -16,7 +16,7 @@ from trackfeatures.definitions import (
     RANGES,
     TARGETS,
     UNKNOWN_HEADING,
-    Heading,
+    RoadClass,
     TrackFeatures,
 )
 
@@ -75,7 +75,7 @@ def encode_features(features: TrackFeatures) -> NDArray[np.float32]:
     return coded
 
 
-def decode_features(coded: ArrayLike, heading: Heading) -> TrackFeatures:
+def decode_features(coded: ArrayLike, heading: RoadClass) -> TrackFeatures:
     """The features decoded from `coded` (6,), with the class `heading`."""
     distances, angle = decode(coded)
     ml, mr, l, m, r = (None if np.isnan(d) else float(d) for d in distances[0])
@@ -96,7 +96,7 @@ def mirror_coded(coded: ArrayLike) -> NDArray[np.float32]:
 def mirror_heading(heading: ArrayLike) -> NDArray[np.int64]:
     """The classes (N,) of the left-right mirrored scenes: LEFT and RIGHT are swapped."""
     classes = np.asarray(heading, dtype=np.int64)
-    return np.where(classes == UNKNOWN_HEADING, classes, Heading.RIGHT - classes)
+    return np.where(classes == UNKNOWN_HEADING, classes, RoadClass.RIGHT - classes)
 
 
 def _clip(coded: NDArray[np.float64]) -> NDArray[np.float32]:

@@ -39,8 +39,9 @@ LOOK_AHEAD_M: Final = 20.0
 """If the road is straight at the car, its curvature this far ahead decides the class."""
 
 
-class Heading(IntEnum):
-    """The direction in which the road bends: the third task of the paper's network."""
+class RoadClass(IntEnum):
+    """The direction in which the road bends: the third task of the paper's network, which calls it
+    the heading. Files, messages and answers keep the name `heading`."""
 
     LEFT = 0
     STRAIGHT = 1
@@ -86,7 +87,7 @@ class TrackFeatures:
     r: float | None
     angle: float
     """Heading angle in rad, positive when the car points to the right of the track."""
-    heading: Heading
+    heading: RoadClass
 
     @property
     def distances(self) -> dict[str, float | None]:

@@ -18,7 +18,7 @@ from trackfeatures.definitions import (
     LOOK_AHEAD_M,
     ON_MARKING_REACH_M,
     OUTSIDE_REACH_M,
-    Heading,
+    RoadClass,
     TrackFeatures,
     lane_offset,
 )
@@ -69,12 +69,12 @@ def lane_centre(index: int, lanes: int, lane_width_m: float) -> float:
     return lane_width_m * (lanes / 2 - index - 0.5)
 
 
-def classify_heading(curvature: float, curvature_ahead: float) -> Heading:
+def classify_heading(curvature: float, curvature_ahead: float) -> RoadClass:
     """The class of a road with `curvature` at the car and `curvature_ahead` 20 m ahead (1/m)."""
     for kappa in (curvature, curvature_ahead):
         if abs(kappa) >= BEND_CURVATURE:
-            return Heading.LEFT if kappa > 0 else Heading.RIGHT
-    return Heading.STRAIGHT
+            return RoadClass.LEFT if kappa > 0 else RoadClass.RIGHT
+    return RoadClass.STRAIGHT
 
 
 def wrap_angle(angle: float) -> float:

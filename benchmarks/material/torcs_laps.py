@@ -22,7 +22,7 @@ from simulator.track.road import Road
 from simulator.vehicle.state import CarState, Command
 from simulator.world.control_rate import PHYSICS_HZ
 from simulator.world.world import World
-from trackfeatures import Heading, UserError
+from trackfeatures import RoadClass, UserError
 
 TRACKS = ("forza", "g-track-3")
 FLYING_LAP = 2
@@ -128,7 +128,7 @@ def figures(lap: Rows, half_width: float) -> Lap:
     )
 
 
-def _observed(now: CarState, heading: Heading) -> Observation:
+def _observed(now: CarState, heading: RoadClass) -> Observation:
     return Observation(
         to_lane_centre=now.to_middle,
         angle=now.angle,

@@ -7,7 +7,7 @@ import numpy as np
 
 from datagen.recording import Frames
 from serve.client import Client
-from trackfeatures import MARKINGS, Heading, localise
+from trackfeatures import MARKINGS, RoadClass, localise
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +64,7 @@ def _post_frame(frames: Frames, index: int, client: Client) -> PostedFrame:
         },
         to_lane_centre=_lane_offset(values),
         angle=float(labels.angle[index]),
-        heading=Heading(int(labels.heading[index])).name.lower(),
+        heading=RoadClass(int(labels.heading[index])).name.lower(),
         curvature=float(labels.curvature[index]),
         answer=answer,
     )

@@ -76,8 +76,8 @@ class TrackForecast:
         lap_s = time[len(seconds)]
         first = np.interp(starts * len(seconds), np.arange(len(time)), time)
         laps, rest = divmod(entry.frames / entry.frequency_hz, lap_s)
-        spent = np.zeros((len(starts), len(tf.Heading)))
-        for heading in tf.Heading:
+        spent = np.zeros((len(starts), len(tf.RoadClass)))
+        for heading in tf.RoadClass:
             in_class = np.tile(seconds * lap.is_class[heading], 2)
             in_class = np.concatenate([[0.0], np.cumsum(in_class)])
             spent[:, heading] = (
@@ -94,7 +94,7 @@ class TrackForecast:
         here, ahead = track.at(s).curvature, track.at(s + tf.LOOK_AHEAD_M).curvature
         pairs = zip(here.tolist(), ahead.tolist(), strict=True)
         classes = np.array([tf.classify_heading(now, then) for now, then in pairs])
-        is_class = np.stack([classes == heading for heading in tf.Heading])
+        is_class = np.stack([classes == heading for heading in tf.RoadClass])
         return _LapProfile(is_class, profile.limit, profile.cell_m)
 
 

@@ -21,7 +21,7 @@ def expected_classes(plan: Plan, forecast: Forecast) -> dict[str, dict[str, floa
     return {
         name: {
             heading.name.lower(): round(float(share), 4)
-            for heading, share in zip(tf.Heading, expected_shares(rounds, forecast), strict=True)
+            for heading, share in zip(tf.RoadClass, expected_shares(rounds, forecast), strict=True)
         }
         for name, rounds in sides.items()
     }

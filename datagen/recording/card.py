@@ -231,7 +231,7 @@ def _table_rows(statistics: dict[str, Any]) -> Iterator[str]:
     yield _table_row("", names)
     yield _table_row("---", ["---"] * len(names))
     yield _table_row("frames", [str(side["frames"]) for side in sides])
-    for kind in tf.Heading:
+    for kind in tf.RoadClass:
         name = kind.name.lower()
         yield _table_row(name, [f"{side['heading'][name]:.1%}" for side in sides])
     for name in (*tf.MARKINGS, "to_lane_centre", "angle"):

@@ -45,10 +45,10 @@ def describe_labels(labels: Labels) -> dict[str, Any]:
     columns = dict(zip(tf.MARKINGS, labels.distances.T, strict=True))
     columns["to_lane_centre"] = labels.to_lane_centre
     columns["angle"] = labels.angle
-    counts = np.bincount(labels.heading, minlength=len(tf.Heading)) / len(labels)
+    counts = np.bincount(labels.heading, minlength=len(tf.RoadClass)) / len(labels)
     return {
         "frames": len(labels),
-        "heading": {kind.name.lower(): round(float(counts[kind]), 4) for kind in tf.Heading},
+        "heading": {kind.name.lower(): round(float(counts[kind]), 4) for kind in tf.RoadClass},
         "active": {n: round(float(np.mean(~np.isnan(c))), 4) for n, c in columns.items()},
         "mean": {n: _mean(c) for n, c in columns.items()},
         "mean_deviation": {n: _mean(np.abs(c - _mean(c))) for n, c in columns.items()},

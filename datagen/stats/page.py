@@ -52,7 +52,7 @@ def _balance(dataset: Dataset, by_split: dict[str, Labels]) -> Iterator[Markup]:
     counts = [np.bincount(labels.heading, minlength=3).tolist() for labels in by_split.values()]
     yield bars(
         "heading class",
-        {kind.name.lower(): [count[kind] for count in counts] for kind in tf.Heading},
+        {kind.name.lower(): [count[kind] for count in counts] for kind in tf.RoadClass},
     )
     splits = list(by_split)
     for name in BALANCED_BY:

@@ -38,7 +38,7 @@ MARKING_LIMITS_M = {
 }
 """Range of the network's coding; labels beyond it would be clipped."""
 ANGLE_LIMIT_RAD = 0.5
-HEADINGS = {kind.name.lower(): int(kind) for kind in tf.Heading}
+ROAD_CLASSES = {kind.name.lower(): int(kind) for kind in tf.RoadClass}
 
 Cells = dict[str, str]
 
@@ -195,9 +195,11 @@ def _parse(line: int, cells: Cells) -> tuple[LabelledPicture, list[float], float
         )
     heading = UNKNOWN_HEADING
     if cells["heading"] != UNKNOWN:
-        if cells["heading"] not in HEADINGS:
-            raise ValueError(f"heading is {cells['heading']!r}; give {', '.join(HEADINGS)} or ?")
-        heading = HEADINGS[cells["heading"]]
+        if cells["heading"] not in ROAD_CLASSES:
+            raise ValueError(
+                f"heading is {cells['heading']!r}; give {', '.join(ROAD_CLASSES)} or ?"
+            )
+        heading = ROAD_CLASSES[cells["heading"]]
     return _picture(line, cells), [found[m] for m in tf.MARKINGS], angle, heading
 
 

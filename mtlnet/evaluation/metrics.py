@@ -62,7 +62,7 @@ def confusion(
     """Number of frames by true class, then by predicted class."""
     known = heading != UNKNOWN_HEADING
     heading, predicted = heading[known], predicted[known]
-    names = [kind.name.lower() for kind in tf.Heading]
+    names = [kind.name.lower() for kind in tf.RoadClass]
     counts = np.zeros((len(names), len(names)), np.int64)
     np.add.at(counts, (heading, predicted), 1)
     return {
@@ -140,7 +140,7 @@ def mean_labels(labels: LabelArrays) -> dict[str, Any]:
     sums = np.nansum(distances, axis=0)
     offset = _known(tf.localise(distances))
     known = labels.heading[labels.heading != UNKNOWN_HEADING]
-    classes = np.bincount(known, minlength=len(tf.Heading))
+    classes = np.bincount(known, minlength=len(tf.RoadClass))
     return {
         "distances_m": [float(s / n) if n else None for s, n in zip(sums, counts, strict=True)],
         "to_lane_centre_m": float(np.nanmean(offset)) if not np.isnan(offset).all() else 0.0,

@@ -16,7 +16,7 @@ from mtlnet.inference.uncertainty import COLUMNS, FEATURES
 
 OUTPUTS = 9  # five coded distances, the coded angle, three class probabilities
 MARKINGS = len(tf.MARKINGS)
-HEADINGS = tuple(heading.name.lower() for heading in tf.Heading)
+ROAD_CLASSES = tuple(heading.name.lower() for heading in tf.RoadClass)
 # Each optional part, and whether an image's outputs have it, by their number.
 _HAS = {
     OUTPUTS + with_uncertainty * COLUMNS + with_absent * MARKINGS: (with_uncertainty, with_absent)
@@ -124,7 +124,7 @@ def decode_outputs(outputs: Numbers) -> Prediction:
         distances_m=dict(zip(tf.MARKINGS, values[:5], strict=True)),
         to_lane_centre_m=values[5],
         angle_rad=float(angle[0]),
-        heading=dict(zip(HEADINGS, parts.heading.tolist(), strict=True)),
+        heading=dict(zip(ROAD_CLASSES, parts.heading.tolist(), strict=True)),
         std=std,
         # Written so that a NaN counts as out of distribution too.
         out_of_distribution=None if parts.ood_score is None else not parts.ood_score <= 1.0,

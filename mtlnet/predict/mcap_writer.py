@@ -26,7 +26,7 @@ from datagen.recording.images import encode
 from datagen.recording.schema import messages, topics
 from datagen.recording.schema.polylines import CORNER_PX
 from mtlnet.inference.overlay import PREDICTION_COLOUR, Distances, marking_line
-from mtlnet.inference.prediction import HEADINGS, Prediction
+from mtlnet.inference.prediction import ROAD_CLASSES, Prediction
 from mtlnet.predict.sources import SourceImage
 from mtlnet.predict.writers import feature_lines, table_row, view_of
 from trackfeatures.camera import CameraParameters
@@ -164,7 +164,7 @@ def features_schema() -> dict[str, Any]:
     """The JSON schema of `/features`, for Foxglove's panels."""
     number = {"type": "number"}
     names = [f"{marking}_m" for marking in tf.MARKINGS]
-    names += ["to_lane_centre_m", "angle_rad", *(f"p_{name}" for name in HEADINGS)]
+    names += ["to_lane_centre_m", "angle_rad", *(f"p_{name}" for name in ROAD_CLASSES)]
     names += [f"std_{name}" for name in (*tf.MARKINGS, "to_lane_centre", "angle")]
     names += [f"p_absent_{marking}" for marking in tf.MARKINGS]
     properties: dict[str, Any] = {"image": {"type": "string"}, "time_s": number}

@@ -1,7 +1,7 @@
 """The multi-task loss (paper, equations 6 to 9): three tasks weighted by alpha.
 
 Distance: squared error, summed over the five coded distances, mean over the batch. Angle: squared
-error of the coded angle, mean over the batch. Heading (the paper's "type"): cross-entropy of the
+error of the coded angle, mean over the batch. Class (the paper's "type"): cross-entropy of the
 class, mean over the batch. The L2 term is part of the optimizer: a weight decay of 2 lambda is the
 gradient of lambda |w|^2.
 

@@ -73,7 +73,7 @@ def read_features(values: Values) -> tf.TrackFeatures:
     return tf.TrackFeatures(
         **{name: None if math.isnan(values[name]) else values[name] for name in tf.MARKINGS},
         angle=values["angle"],
-        heading=tf.Heading(values["heading"]),
+        heading=tf.RoadClass(values["heading"]),
     )
 
 

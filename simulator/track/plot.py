@@ -26,9 +26,9 @@ if TYPE_CHECKING:
 
 
 COLOURS: Final = {
-    tf.Heading.LEFT: "#1f6fb4",
-    tf.Heading.STRAIGHT: "#5f6b7a",
-    tf.Heading.RIGHT: "#d1661b",
+    tf.RoadClass.LEFT: "#1f6fb4",
+    tf.RoadClass.STRAIGHT: "#5f6b7a",
+    tf.RoadClass.RIGHT: "#d1661b",
 }
 INK, FAINT, PAPER, GRASS, ASPHALT = "#1d2733", "#c9d0d8", "#ffffff", "#dfe8d8", "#8d949c"
 TICKS_M: Final = (50, 100, 200, 250, 500, 1000, 2000, 5000)
@@ -45,12 +45,12 @@ class Lap:
     s: FloatArray
     centre: TrackPose
     classes: NDArray[np.int64]
-    """Heading class at each s."""
+    """Class of the road at each s."""
 
     @property
-    def shares(self) -> dict[tf.Heading, float]:
+    def shares(self) -> dict[tf.RoadClass, float]:
         """Share of the lap in each class."""
-        return {kind: float(np.mean(self.classes[:-1] == kind)) for kind in tf.Heading}
+        return {kind: float(np.mean(self.classes[:-1] == kind)) for kind in tf.RoadClass}
 
 
 def sample(road: Road) -> Lap:
@@ -67,11 +67,11 @@ def sample(road: Road) -> Lap:
     return Lap(road, s, centre, np.array(classes))
 
 
-def runs(classes: NDArray[np.int64]) -> list[tuple[int, int, tf.Heading]]:
+def runs(classes: NDArray[np.int64]) -> list[tuple[int, int, tf.RoadClass]]:
     """Stretches of one class: (first sample, last sample + 1, class)."""
     cuts = np.flatnonzero(np.diff(classes)) + 1
     bounds = [0, *cuts.tolist(), len(classes)]
-    return [(first, last, tf.Heading(int(classes[first]))) for first, last in pairwise(bounds)]
+    return [(first, last, tf.RoadClass(int(classes[first]))) for first, last in pairwise(bounds)]
 
 
 def write_plot(road: Road, out: Path) -> None:
@@ -136,7 +136,7 @@ def _plan(axes: "Axes", lap: Lap) -> None:
     axes.set_title(_facts(track), loc="left", fontsize=10.5, color=INK)
     _bare(axes)
     shares = lap.shares
-    for kind in tf.Heading:
+    for kind in tf.RoadClass:
         axes.plot(
             [], [], color=COLOURS[kind], lw=4, label=f"{kind.name.lower()} {shares[kind]:.0%}"
         )

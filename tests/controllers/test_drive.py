@@ -23,7 +23,7 @@ from simulator.track.road import Road
 from simulator.traffic.traffic import Traffic
 from simulator.vehicle.state import CarState, Command
 from simulator.world.world import World
-from trackfeatures import Heading, UserError
+from trackfeatures import RoadClass, UserError
 
 HALF_WIDTH = Road(find_track("oval")).half_width
 
@@ -63,7 +63,7 @@ class FunctionController:
 
 
 def perceiving(offset: float | None = 0.0) -> Callable[[FakeWorld], Perceived]:
-    return lambda world: Perceived(offset, 0.0, Heading.STRAIGHT)
+    return lambda world: Perceived(offset, 0.0, RoadClass.STRAIGHT)
 
 
 def test_the_score_is_the_sum_of_the_rewards_after_each_step() -> None:
@@ -133,10 +133,10 @@ def test_the_observation_holds_the_perception_and_the_cars_sensors() -> None:
     run_lap(
         world,
         FunctionController(law),
-        lambda world: Perceived(0.7, -0.02, Heading.LEFT, 0.01),
+        lambda world: Perceived(0.7, -0.02, RoadClass.LEFT, 0.01),
         1,
     )
-    assert observations == [Observation(0.7, -0.02, Heading.LEFT, 12.0, 0.3, 0.1, 0.01)]
+    assert observations == [Observation(0.7, -0.02, RoadClass.LEFT, 12.0, 0.3, 0.1, 0.01)]
 
 
 def test_a_lost_offset_is_held_for_a_time_then_zero() -> None:
@@ -211,7 +211,7 @@ def test_truth_measures_the_offset_from_the_target_lane() -> None:
         measured = truth(-4.0)(world)
     assert measured.to_lane_centre == pytest.approx(1.0, abs=1e-6)
     assert measured.angle == pytest.approx(0.05, abs=1e-6)
-    assert (measured.heading, measured.curvature) == (Heading.STRAIGHT, 0.0)
+    assert (measured.heading, measured.curvature) == (RoadClass.STRAIGHT, 0.0)
 
 
 def test_lqr_preview_drives_on_a_noisy_perception() -> None:

@@ -16,7 +16,7 @@ from simulator.track.catalogue import find_track
 from simulator.track.road import Road
 from simulator.world.world import World
 from tests.controllers.test_drive import at_rest
-from trackfeatures import Heading, UserError
+from trackfeatures import RoadClass, UserError
 
 DT = 0.05
 
@@ -32,7 +32,7 @@ class Straight:
         return self.speed * math.sin(-self.angle) * self.step * DT
 
     def perceive(self) -> Perceived:
-        return Perceived(self.offset, self.angle, Heading.STRAIGHT, 0.0)
+        return Perceived(self.offset, self.angle, RoadClass.STRAIGHT, 0.0)
 
 
 def late(latency_s: float, drop: float = 0.0, **options: bool) -> LatePerception[Straight]:

@@ -35,12 +35,12 @@ from controllers.torcs_feedback import STEERING_LOCK, StateFeedback
 from simulator.track.catalogue import find_track
 from simulator.track.road import Road
 from simulator.world.world import World
-from trackfeatures import Heading
+from trackfeatures import RoadClass
 
 STRAIGHT_AT_20 = Observation(
     to_lane_centre=0.0,
     angle=0.0,
-    heading=Heading.STRAIGHT,
+    heading=RoadClass.STRAIGHT,
     vx=20.0,
     vy=0.0,
     yaw_rate=0.0,
@@ -152,7 +152,7 @@ def test_feed_forward_steers_into_the_bend() -> None:
     steady = Observation(
         to_lane_centre=0.0,
         angle=-heading * curvature,
-        heading=Heading.LEFT,
+        heading=RoadClass.LEFT,
         vx=speed,
         vy=-speed * math.sin(heading * curvature),
         yaw_rate=speed * curvature,
@@ -166,7 +166,7 @@ def response(controller: Controller, speed: float, curvature: float = 0.0) -> Ma
     model, dt, parts = LateralModel(), 0.05, 20
     A, B, turn = model.matrices(speed)
     state, offsets = np.array([1.0, 0.0, 0.0, 0.0]), []
-    heading = Heading.STRAIGHT if curvature == 0 else Heading.LEFT
+    heading = RoadClass.STRAIGHT if curvature == 0 else RoadClass.LEFT
     for _ in range(200):
         e1, e1_rate, e2, e2_rate = state
         observation = Observation(
@@ -206,8 +206,8 @@ def test_no_steady_offset_in_a_bend_of_unmeasured_curvature() -> None:
 def test_the_heading_class_limits_the_estimated_curvature() -> None:
     """Yaw to the left where the road turns right is an error, not a bend."""
     observation = replace(STRAIGHT_AT_20, yaw_rate=0.4, curvature=None)
-    limited = LqrPreview().update(replace(observation, heading=Heading.RIGHT))
-    estimated = LqrPreview().update(replace(observation, heading=Heading.LEFT))
+    limited = LqrPreview().update(replace(observation, heading=RoadClass.RIGHT))
+    estimated = LqrPreview().update(replace(observation, heading=RoadClass.LEFT))
     assert limited < estimated
 
 
@@ -222,7 +222,7 @@ def test_torcs_feedback_reproduces_recorded_steering(
     d: float, th: float, vx: float, vy: float, yr: float, steer: float
 ) -> None:
     """Two rows of a lap of the real TORCS (forza): the state and its steering."""
-    observation = Observation(d, -th, Heading.RIGHT, vx, vy, yr)
+    observation = Observation(d, -th, RoadClass.RIGHT, vx, vy, yr)
     assert StateFeedback().update(observation) == pytest.approx(steer, abs=2e-4)
 
 

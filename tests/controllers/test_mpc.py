@@ -9,7 +9,7 @@ from scipy.optimize import minimize
 from controllers.interface import Observation
 from controllers.mpc import HORIZON, Mpc, MpcWeights, Vector, plan_cost, roll_out, solve
 from controllers.torcs_feedback import STEERING_LOCK
-from trackfeatures import Heading
+from trackfeatures import RoadClass
 
 WEIGHTS = {"paper": MpcWeights(1.0, 1.0, 1.0), "sharp": MpcWeights(10.0, 1.0, 0.01)}
 
@@ -70,12 +70,12 @@ def test_compiled_steps_and_cost_are_those_of_the_equations() -> None:
 
 def observed(**changes: float) -> Observation:
     values = {"to_lane_centre": 0.0, "angle": 0.0, "vx": 15.0, "vy": 0.0, "yaw_rate": 0.0}
-    return Observation(heading=Heading.STRAIGHT, curvature=None, **(values | changes))
+    return Observation(heading=RoadClass.STRAIGHT, curvature=None, **(values | changes))
 
 
 def test_without_preview_the_curvature_changes_nothing() -> None:
-    bend = Observation(0.05, 0.01, Heading.LEFT, 15.0, 0.0, 0.3, 1 / 50)
-    straight = Observation(0.05, 0.01, Heading.LEFT, 15.0, 0.0, 0.0, None)
+    bend = Observation(0.05, 0.01, RoadClass.LEFT, 15.0, 0.0, 0.3, 1 / 50)
+    straight = Observation(0.05, 0.01, RoadClass.LEFT, 15.0, 0.0, 0.0, None)
     assert Mpc().update(bend) == Mpc().update(straight)
     assert Mpc(preview=True).update(bend) > Mpc(preview=True).update(straight)
 

@@ -17,7 +17,7 @@ from controllers.perception import (
 from simulator.track.catalogue import find_track
 from simulator.track.road import Road
 from simulator.world.world import World
-from trackfeatures import VERSION, DefinitionsMismatch, Heading, UserError
+from trackfeatures import VERSION, DefinitionsMismatch, RoadClass, UserError
 from trackfeatures.camera import CameraParameters
 
 ANSWER: dict[str, Any] = {
@@ -60,7 +60,7 @@ def client(monkeypatch: pytest.MonkeyPatch) -> type[FakeClient]:
 
 
 def test_a_prediction_is_parsed() -> None:
-    assert parse_prediction(ANSWER) == Perceived(0.5, -0.03, Heading.RIGHT)
+    assert parse_prediction(ANSWER) == Perceived(0.5, -0.03, RoadClass.RIGHT)
     assert parse_prediction({**ANSWER, "to_lane_centre_m": None}).to_lane_centre is None
 
 
@@ -70,7 +70,7 @@ def test_standard_deviations_are_parsed() -> None:
     assert (uncertain.offset_std_m, uncertain.angle_std_rad) == (0.04, 0.01)
     assert uncertain.out_of_distribution is True
     plain = parse_prediction({**ANSWER, "std": None, "out_of_distribution": None})
-    assert plain == Perceived(0.5, -0.03, Heading.RIGHT)
+    assert plain == Perceived(0.5, -0.03, RoadClass.RIGHT)
     blind = {**ANSWER, "to_lane_centre_m": None, "std": {**std, "to_lane_centre": None}}
     assert parse_prediction(blind).offset_std_m is None
 
@@ -126,7 +126,7 @@ def test_images_are_rendered_with_the_models_camera(client: type[FakeClient]) ->
         )
         with source:
             assert isinstance(source.perceive, CameraPerception)
-            assert source.perceive(world) == Perceived(0.5, -0.03, Heading.RIGHT)
+            assert source.perceive(world) == Perceived(0.5, -0.03, RoadClass.RIGHT)
     import simplejpeg
 
     picture = simplejpeg.decode_jpeg(client.bodies[0])

@@ -15,7 +15,7 @@ from simulator.vehicle.state import CarState
 from simulator.world.world import World
 from tests.controllers.test_drive import at_rest
 from tests.controllers.test_late_perception import Straight
-from trackfeatures import Heading, UserError
+from trackfeatures import RoadClass, UserError
 
 DT = 0.05
 
@@ -231,7 +231,7 @@ def test_a_delay_of_its_own_is_refused() -> None:
 
 def test_a_blind_answer_is_no_answer() -> None:
     clock, car = Clock(), Straight()
-    blind = Perceived(None, 0.0, Heading.STRAIGHT)
+    blind = Perceived(None, 0.0, RoadClass.STRAIGHT)
     perceive = RealTimePerception(
         lambda car: blind if car.step == 5 else car.perceive(),
         ImmediateAnswers[Perceived](clock),

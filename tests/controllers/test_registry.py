@@ -7,10 +7,10 @@ import pytest
 
 from controllers.interface import LoopConfig, Observation
 from controllers.registry import CONTROLLERS, make_controller
-from trackfeatures import Heading, UserError
+from trackfeatures import RoadClass, UserError
 
 LOOP = LoopConfig(0.05)
-SEEN = Observation(0.1, 0.0, Heading.STRAIGHT, 15.0, 0.0, 0.0, 0.0)
+SEEN = Observation(0.1, 0.0, RoadClass.STRAIGHT, 15.0, 0.0, 0.0, 0.0)
 OWN = """
 class Good:
     def __init__(self, gain=0.2):

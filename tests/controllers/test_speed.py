@@ -14,52 +14,52 @@ from simulator.track.road import Road
 from simulator.vehicle.state import CarState
 from simulator.world.world import World
 from tests.controllers.test_drive import FakeWorld, at_rest
-from trackfeatures import Heading
+from trackfeatures import RoadClass
 
 DT = 0.05
 
 
-def seen(heading: Heading) -> Perceived:
+def seen(heading: RoadClass) -> Perceived:
     return Perceived(0.0, 0.0, heading)
 
 
 def test_a_straight_road_has_no_limit() -> None:
     bends = CornerSpeed(DT)
-    assert min(bends(at_rest(vx=20.0), seen(Heading.STRAIGHT)) for _ in range(50)) > 100.0
+    assert min(bends(at_rest(vx=20.0), seen(RoadClass.STRAIGHT)) for _ in range(50)) > 100.0
 
 
 def test_a_bend_ahead_is_taken_for_one_of_60_m_until_it_is_felt() -> None:
     bends, straight = CornerSpeed(DT), at_rest(vx=10.0)
-    bends(straight, seen(Heading.STRAIGHT))
-    limits = [bends(straight, seen(Heading.RIGHT)) for _ in range(100)]
+    bends(straight, seen(RoadClass.STRAIGHT))
+    limits = [bends(straight, seen(RoadClass.RIGHT)) for _ in range(100)]
     assert limits[0] > 100.0  # a single answer does not brake
     assert limits[10] == pytest.approx((LATERAL_ACCELERATION * 60.0) ** 0.5)
     assert limits[-1] > 100.0  # 5 s without a bend felt: it was a gentle one
     turning = at_rest(vx=10.0, yaw_rate=-10.0 / 30.0)
-    felt = [bends(turning, seen(Heading.RIGHT)) for _ in range(100)][-1]
+    felt = [bends(turning, seen(RoadClass.RIGHT)) for _ in range(100)][-1]
     assert felt == pytest.approx((LATERAL_ACCELERATION * 30.0) ** 0.5, rel=0.01)
 
 
 def test_the_next_bend_to_the_other_side_is_a_new_one() -> None:
     bends, now = CornerSpeed(DT), at_rest(vx=10.0)
     for _ in range(100):
-        bends(now, seen(Heading.LEFT))
-    limits = [bends(now, seen(Heading.RIGHT)) for _ in range(20)]
+        bends(now, seen(RoadClass.LEFT))
+    limits = [bends(now, seen(RoadClass.RIGHT)) for _ in range(20)]
     assert limits[-1] == pytest.approx((LATERAL_ACCELERATION * 60.0) ** 0.5)
 
 
 def test_pedals_accelerate_below_and_brake_above_the_set_point() -> None:
     world = FakeWorld()
     held = on_perception(15.0, DT)
-    throttle, brake, gear = held(at_rest(vx=10.0), world.traffic, seen(Heading.STRAIGHT))
+    throttle, brake, gear = held(at_rest(vx=10.0), world.traffic, seen(RoadClass.STRAIGHT))
     assert (throttle > 0.2, brake, gear) == (True, 0.0, 1)
-    throttle, brake, _ = held(at_rest(vx=20.0), world.traffic, seen(Heading.STRAIGHT))
+    throttle, brake, _ = held(at_rest(vx=20.0), world.traffic, seen(RoadClass.STRAIGHT))
     assert throttle == 0.0
     assert brake > 0.1
     uphill = on_perception(10.0, DT)(
-        at_rest(vx=10.0, pitch=-0.1), world.traffic, seen(Heading.STRAIGHT)
+        at_rest(vx=10.0, pitch=-0.1), world.traffic, seen(RoadClass.STRAIGHT)
     )
-    level = on_perception(10.0, DT)(at_rest(vx=10.0), world.traffic, seen(Heading.STRAIGHT))
+    level = on_perception(10.0, DT)(at_rest(vx=10.0), world.traffic, seen(RoadClass.STRAIGHT))
     assert uphill[0] > level[0] + 0.05
 
 
@@ -68,14 +68,14 @@ def test_the_error_is_measured_on_free_straights_only() -> None:
     held = on_the_truth(15.0, road, 0.0, DT)
     none = FakeWorld().traffic
     for _ in range(270):  # 13.5 s: not before the car can have reached 15 m/s from rest
-        held(at_rest(vx=2.0), none, seen(Heading.STRAIGHT))
+        held(at_rest(vx=2.0), none, seen(RoadClass.STRAIGHT))
     assert held.mean_error is None
     for _ in range(200):
-        held(at_rest(vx=14.5), none, seen(Heading.STRAIGHT))
+        held(at_rest(vx=14.5), none, seen(RoadClass.STRAIGHT))
     assert held.mean_error == pytest.approx(0.5)
     bend = on_the_truth(15.0, Road(find_track("town")), 0.0, DT)
     for _ in range(200):
-        bend(at_rest(vx=9.0, s=90.0), none, seen(Heading.LEFT))
+        bend(at_rest(vx=9.0, s=90.0), none, seen(RoadClass.LEFT))
     assert bend.mean_error is None
 
 

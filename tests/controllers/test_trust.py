@@ -22,7 +22,7 @@ from simulator.track.road import Road
 from simulator.world.world import World
 from tests.controllers.test_drive import at_rest
 from tests.controllers.test_late_perception import DT, Straight
-from trackfeatures import Heading
+from trackfeatures import RoadClass
 
 
 def answer(
@@ -36,7 +36,7 @@ def answer(
     return Perceived(
         offset,
         angle,
-        Heading.STRAIGHT,
+        RoadClass.STRAIGHT,
         offset_std_m=std,
         angle_std_rad=angle_std,
         out_of_distribution=unfamiliar,
@@ -104,7 +104,7 @@ def test_answers_that_are_not_trusted_count_as_lost() -> None:
 
 def test_an_answer_without_std_is_taken_as_it_is() -> None:
     trust = Trust()
-    exact = Perceived(0.7, 0.1, Heading.LEFT, 0.01)
+    exact = Perceived(0.7, 0.1, RoadClass.LEFT, 0.01)
     assert trust.correct(answer(), exact, 1, 1.0) is exact
     perceive = TrustedPerception[World](lambda world: exact, lambda world: at_rest(vx=20.0), dt=DT)
     with World(Road(find_track("oval"))) as world:

@@ -109,15 +109,15 @@ def test_mirroring_the_road_swaps_sides(lanes: int, width: float, to_middle: flo
 @pytest.mark.parametrize(
     ("here", "ahead", "expected"),
     [
-        (1 / 169, -1 / 50, tf.Heading.LEFT),
-        (-1 / 169, 1 / 50, tf.Heading.RIGHT),
-        (1 / 171, -1 / 50, tf.Heading.RIGHT),
-        (0.0, 1 / 100, tf.Heading.LEFT),
-        (1 / 171, -1 / 171, tf.Heading.STRAIGHT),
+        (1 / 169, -1 / 50, tf.RoadClass.LEFT),
+        (-1 / 169, 1 / 50, tf.RoadClass.RIGHT),
+        (1 / 171, -1 / 50, tf.RoadClass.RIGHT),
+        (0.0, 1 / 100, tf.RoadClass.LEFT),
+        (1 / 171, -1 / 171, tf.RoadClass.STRAIGHT),
     ],
 )
 def test_heading_class_looks_ahead_only_on_straights(
-    here: float, ahead: float, expected: tf.Heading
+    here: float, ahead: float, expected: tf.RoadClass
 ) -> None:
     assert tf.classify_heading(here, ahead) == expected
 
@@ -179,7 +179,7 @@ def test_measured_pose_on_a_ring_road_equals_a_brute_force_search(
     yaw = turn + math.pi / 2 - angle
     measured = tf.measure_pose(ring, x, y, yaw, lanes, width)
     assert measured.angle == pytest.approx(angle, abs=1e-9)
-    expected_class = tf.Heading.LEFT if radius <= 170 else tf.Heading.STRAIGHT
+    expected_class = tf.RoadClass.LEFT if radius <= 170 else tf.RoadClass.STRAIGHT
     assert measured.heading == expected_class
     for name, distance in oracle(ring, x, y, lanes, width).items():
         assert (measured.distances[name] is None) == (distance is None), name

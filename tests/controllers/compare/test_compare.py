@@ -27,7 +27,7 @@ from simulator.track.catalogue import OWN_TRACKS
 from simulator.world.errors import ContactsUnavailable
 from tests.controllers.test_drive import at_rest
 from tests.typed import typed
-from trackfeatures import Heading, UserError
+from trackfeatures import RoadClass, UserError
 
 SHORT = {"tracks": "oval,town", "controllers": "lqr,torcs", "steps": 60}
 LAW = """
@@ -243,7 +243,7 @@ def test_curves_keep_the_peak() -> None:
     for step in range(2000):
         peak = step == 777
         state = at_rest(time_s=step * 0.05, to_middle=1.5 if peak else 0.1, angle=0.02)
-        recorder(state, Perceived(None if peak else 0.12, 0.03, Heading.LEFT), 0.5)
+        recorder(state, Perceived(None if peak else 0.12, 0.03, RoadClass.LEFT), 0.5)
     curves = recorder.curves()
     assert len(curves["t"]) == 400
     assert max(value for value in curves["d"] if value is not None) == 1.5

@@ -22,9 +22,9 @@ from simulator.track.catalogue import find_track
 from simulator.track.road import Road
 from simulator.vehicle.car import CarParameters
 from simulator.vehicle.state import Command
-from trackfeatures import Heading, UserError
+from trackfeatures import RoadClass, UserError
 
-SEEN = Observation(0.5, 0.1, Heading.LEFT, 20.0, 0.0, 0.2, 0.01)
+SEEN = Observation(0.5, 0.1, RoadClass.LEFT, 20.0, 0.0, 0.2, 0.01)
 
 
 class Listener:
@@ -48,7 +48,7 @@ def test_noise_has_the_stated_size_and_is_the_same_for_every_controller() -> Non
     assert offsets.std() == pytest.approx(OFFSET_NOISE_M, rel=0.05)
     assert angles.std() == pytest.approx(ANGLE_NOISE_RAD, rel=0.05)
     assert abs(offsets.mean()) < 3 * OFFSET_NOISE_M / math.sqrt(4000)
-    assert {one.heading for one in first.heard} == {Heading.LEFT}
+    assert {one.heading for one in first.heard} == {RoadClass.LEFT}
     other = Listener()
     NoisySensors(other, np.random.default_rng([4, 6])).update(SEEN)
     assert other.heard[0] != first.heard[0]

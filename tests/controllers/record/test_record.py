@@ -24,7 +24,7 @@ from simulator.track.catalogue import find_track
 from simulator.track.road import Road
 from simulator.world.world import World
 from tests.typed import typed
-from trackfeatures import Heading
+from trackfeatures import RoadClass
 
 SHORT = ["--rounds", "2", "--frames", "60", "--tracks", "oval", "--lanes", "1", "--workers", "1"]
 COMMAND = [sys.executable, "-m", "controllers", "record", *SHORT, "--lights", "clear", "--json"]
@@ -135,16 +135,16 @@ def law_on(lanes: int, answer: Perceived, to_middle: float) -> Callable[[float],
 
 def test_the_answered_offset_is_that_of_the_lane_the_car_is_in() -> None:
     """Two lanes of 4 m: 0.1 m right of the left lane's centre is 1.9 m left of the middle."""
-    steer = law_on(2, Perceived(-0.1, 0.0, Heading.STRAIGHT), 1.7)
+    steer = law_on(2, Perceived(-0.1, 0.0, RoadClass.STRAIGHT), 1.7)
     assert steer(1.9) == pytest.approx(0.0, abs=1e-9)
     assert steer(2.4) > 0.05
     assert steer(1.4) < -0.05
     # Near the middle marking the model answers for the lane beside.
-    steer = law_on(2, Perceived(2.1, 0.0, Heading.STRAIGHT), 0.05)
+    steer = law_on(2, Perceived(2.1, 0.0, RoadClass.STRAIGHT), 0.05)
     assert steer(0.1) == pytest.approx(0.0, abs=1e-9)
 
 
 def test_the_truth_does_not_correct_a_wrong_answer() -> None:
-    steer = law_on(1, Perceived(0.5, 0.0, Heading.STRAIGHT), 0.0)
+    steer = law_on(1, Perceived(0.5, 0.0, RoadClass.STRAIGHT), 0.0)
     assert steer(0.0) < -0.05
     assert steer(0.5) == pytest.approx(0.0, abs=1e-9)

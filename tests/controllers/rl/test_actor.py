@@ -36,7 +36,7 @@ from simulator.track.catalogue import find_track
 from simulator.track.road import Road
 from simulator.world.world import World
 from tests.typed import typed
-from trackfeatures import Heading
+from trackfeatures import RoadClass
 from trackfeatures.errors import UserError
 
 SHA_256 = {
@@ -46,7 +46,7 @@ SHA_256 = {
 BOUNDS_M = {"rl": 0.5, "rl-residual": 0.5}
 """Largest distance from the centre in the test's drive."""
 
-SEEN = Observation(0.5, -0.1, Heading.RIGHT, vx=15.0, vy=-0.2, yaw_rate=0.3)
+SEEN = Observation(0.5, -0.1, RoadClass.RIGHT, vx=15.0, vy=-0.2, yaw_rate=0.3)
 
 
 def an_actor(**changes: Any) -> Actor:
@@ -111,7 +111,7 @@ def test_the_residual_is_added_to_lqr() -> None:
 @pytest.mark.parametrize("name", list(STATES))
 def test_a_mirrored_state_is_that_of_the_mirrored_road(name: str) -> None:
     definition = find_state(name)
-    mirrored = Observation(-0.5, 0.1, Heading.LEFT, vx=15.0, vy=0.2, yaw_rate=-0.3)
+    mirrored = Observation(-0.5, 0.1, RoadClass.LEFT, vx=15.0, vy=0.2, yaw_rate=-0.3)
     state, other = (
         StateBuilder(definition).build(paper_state(seen, 5.0), seen) for seen in (SEEN, mirrored)
     )

@@ -74,7 +74,7 @@ def test_balancing_accepts_a_class_that_the_tracks_do_not_have() -> None:
     tracks = choose_tracks(("oval",), None)
     forecast = TrackForecast.of(tracks, None)
     plan = make_plan(CollectConfig(6, 1000, seed=1, tracks=tracks), forecast)
-    assert expected_shares(plan.rounds, forecast)[tf.Heading.RIGHT] == 0.0
+    assert expected_shares(plan.rounds, forecast)[tf.RoadClass.RIGHT] == 0.0
 
 
 def test_balancing_moves_only_the_starts_that_help_most() -> None:
@@ -115,7 +115,7 @@ def test_the_forecast_over_a_lap_is_the_share_of_lap_time_in_each_class() -> Non
     bends = np.abs(track.at(s).curvature) >= 1 / 170
     soon = np.abs(track.at(s + tf.LOOK_AHEAD_M).curvature) >= 1 / 170
     if profile.limit.min() == profile.limit.max():
-        assert shares[0, tf.Heading.LEFT] == pytest.approx((bends | soon).mean(), abs=0.01)
+        assert shares[0, tf.RoadClass.LEFT] == pytest.approx((bends | soon).mean(), abs=0.01)
 
 
 def test_the_expected_speed_on_one_lane_is_limited_by_traffic() -> None:
@@ -146,20 +146,20 @@ def test_driven_class_shares_are_near_the_forecast(traffic: bool, error: float) 
     forecast = TrackForecast.of(tracks, None)
     plan = make_plan(CollectConfig(8, 300, seed=3, tracks=tracks), forecast)
     rounds = [entry if traffic else replace(entry, traffic=0) for entry in plan.rounds]
-    counts: Counter[tf.Heading] = Counter()
+    counts: Counter[tf.RoadClass] = Counter()
     for entry in rounds:
         counts += _driven(entry)
-    found = np.array([counts[kind] for kind in tf.Heading]) / counts.total()
+    found = np.array([counts[kind] for kind in tf.RoadClass]) / counts.total()
     assert counts.total() == 8 * 300
     assert found.min() > MIN_SHARE
     assert np.abs(found - expected_shares(rounds, forecast)).max() < error
 
 
-def _driven(entry: RoundPlan) -> Counter[tf.Heading]:
+def _driven(entry: RoundPlan) -> Counter[tf.RoadClass]:
     road = Road(find_track(entry.track), entry.lanes)
     course = make_course(entry.trajectory, road, 900.0, np.random.default_rng(entry.seed))
     driver = ScriptedDriver(road, course, entry.speed_kmh / 3.6)
-    seen: Counter[tf.Heading] = Counter()
+    seen: Counter[tf.RoadClass] = Counter()
     driven, start = 0.0, entry.start * road.track.length_m
     with World(road, traffic=entry.traffic) as world:
         state = world.reset(

@@ -44,7 +44,7 @@ def test_labels_are_read_with_absent_markings_as_nan(tmp_path: Path) -> None:
     expected = [[-1.5, 2.5, nan, nan, nan], [nan, nan, -4.1, -0.1, nan], [nan] * 5]
     np.testing.assert_allclose(labels.distances, expected, rtol=1e-6)
     np.testing.assert_allclose(labels.angle, [0.02, -0.3, 0], rtol=1e-6)
-    assert labels.heading.tolist() == [tf.Heading.STRAIGHT, tf.Heading.LEFT, tf.Heading.RIGHT]
+    assert labels.heading.tolist() == [tf.RoadClass.STRAIGHT, tf.RoadClass.LEFT, tf.RoadClass.RIGHT]
     # The labels survive the network's coding.
     distances, _ = tf.decode(tf.encode(labels.distances, labels.angle))
     np.testing.assert_allclose(distances, labels.distances, atol=1e-5)

@@ -156,7 +156,7 @@ def test_road_widths_and_marking_offsets() -> None:
     features = narrow.measure(85.0, 0.5, 0.1)
     assert (features.ml, features.mr) == pytest.approx((-1.5, 2.5))
     # Straight here, but the bend begins within 20 m.
-    assert features.heading is tf.Heading.LEFT
+    assert features.heading is tf.RoadClass.LEFT
     by_pose = tf.measure_pose(STADIUM, 85.0, 0.5, -0.1, 1, 4.0)
     assert (by_pose.ml, by_pose.mr, by_pose.heading) == (features.ml, features.mr, features.heading)
     assert by_pose.angle == pytest.approx(features.angle)

@@ -32,11 +32,11 @@ def test_heading_classes_follow_the_shared_definition() -> None:
         assert lap.classes[k] == tf.classify_heading(here, ahead)
     assert lap.s[-1] == track.length_m
     assert sum(lap.shares.values()) == pytest.approx(1.0)
-    assert {kind for *_, kind in runs(lap.classes)} == set(tf.Heading)
+    assert {kind for *_, kind in runs(lap.classes)} == set(tf.RoadClass)
 
 
 def test_runs_are_contiguous() -> None:
-    left, straight = tf.Heading.LEFT, tf.Heading.STRAIGHT
+    left, straight = tf.RoadClass.LEFT, tf.RoadClass.STRAIGHT
     found = runs(np.array([1, 1, 0, 0, 0, 1]))
     assert found == [(0, 2, straight), (2, 5, left), (5, 6, straight)]
 

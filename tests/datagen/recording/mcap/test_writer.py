@@ -151,7 +151,7 @@ def _assert_same(one: RoundIndex, other: RoundIndex) -> None:
     mine, theirs = read_labels(one, 0), read_labels(other, 0)
     assert np.array_equal(mine.distances, theirs.distances, equal_nan=True)
     assert np.array_equal(mine.angle, theirs.angle)
-    assert set(np.unique(mine.heading)) <= set(tf.Heading)
+    assert set(np.unique(mine.heading)) <= set(tf.RoadClass)
 
 
 def _rewrite(source: Path, target: Path, kind: str) -> None:

@@ -37,7 +37,7 @@ def test_the_published_schema_is_valid_json_schema(dataset: Path) -> None:
     assert (ml["type"], ml["x-unit"], ml["minimum"], ml["maximum"]) == ("number", "m", -4.0, -0.5)
     assert ml["x-reference-point"] == "centre of gravity, in the road plane"
     heading = found["$defs"]["TrackFeatures"]["properties"]["heading"]
-    assert heading["enum"] == [kind.name for kind in tf.Heading]
+    assert heading["enum"] == [kind.name for kind in tf.RoadClass]
     assert found["x-topics"]["/labels"] == "TrackFeatures"
 
 
