@@ -150,7 +150,7 @@ class Model:
             return self._one(_pixels(source), lens)
         if isinstance(source, str | Path):
             sources = find_sources([str(source)], log.info, topic)
-            if len(sources) == 1 and sources[0].kind is Kind.IMAGE:
+            if [(s.path, s.kind) for s in sources] == [(Path(source), Kind.IMAGE)]:
                 if sources[0].problem:
                     raise UserError(sources[0].problem)
                 return self._one(read_whole_image(sources[0].path), lens, str(source))

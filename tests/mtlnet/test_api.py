@@ -147,6 +147,8 @@ def test_a_folder_gives_all_that_can_be_read_then_the_error(
     for features in model.predict(str(tmp_path / "*.png")):
         names.append(Path(features.name).name)
     assert names == ["frame2.png", "frame10.png"]
+    one = model.predict(str(tmp_path / "*2.png"))  # a pattern of one file is no single image
+    assert [Path(features.name).name for features in one] == ["frame2.png"]
 
 
 def test_evaluation_and_export_are_those_of_the_commands(
