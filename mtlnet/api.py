@@ -3,10 +3,10 @@
 import logging
 import os
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from threading import Lock
-from typing import Any, overload
+from typing import Any, TypedDict, Unpack, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +20,7 @@ from mtlnet.inference.rectification import Rectification, read_camera
 from mtlnet.predict.kinds import Kind
 from mtlnet.predict.lenses import with_lens
 from mtlnet.predict.pictures import Lens, Picture, fit
-from mtlnet.predict.run import answer
+from mtlnet.predict.run import answer, first_of
 from mtlnet.predict.sources import Source, SourceImage, find_sources, read_sources
 from mtlnet.predict.writers import draw_prediction
 from trackfeatures.camera import CameraParameters
@@ -37,20 +37,22 @@ log = logging.getLogger("mtlnet")
 class Features(Prediction):
     """The features of one image; attributes and units are those of `Prediction`."""
 
-    seen: SourceImage
-    """The image as the model sees it, its name and time."""
+    source: SourceImage
+    """The image in the model's view, its name and time."""
     camera: CameraParameters
     """The camera that took the image, at any size of its aspect ratio."""
+    model_camera: CameraParameters
+    """The camera that the model was trained with."""
 
     @property
     def name(self) -> str:
         """The image's file; `film.mp4#12` for a frame of a film; empty for bytes and pixels."""
-        return self.seen.name
+        return self.source.name
 
     @property
     def time_s(self) -> float | None:
         """Time of the image in s since the start of its film; since 1970 if that is recorded."""
-        return self.seen.time_s
+        return self.source.time_s
 
     def draw(self, image: OneImage | None = None) -> Image:
         """A picture of the answer, uint8 RGB.
@@ -60,15 +62,22 @@ class Features(Prediction):
         above and the features as text.
         """
         if image is None:
-            view = self.camera if self.seen.lens is None else self.seen.lens.target
-            return draw_prediction(self.seen, self, view)
+            return draw_prediction(self.source, self, self.model_camera)
         pixels = _pixels(image)
-        camera = self.camera
-        if self.seen.lens is None:  # the model's camera, of which a wider image shows more columns
-            camera = _whole(camera, pixels)
+        height, width = pixels.shape[:2]
+        if self.source.lens is None:  # cropped to the model's aspect ratio
+            camera = replace(self.camera, width=width, height=height)
         else:
-            camera = camera.resized(pixels.shape[1], pixels.shape[0])
+            camera = self.camera.resized(width, height)
         return draw_markings(pixels, camera, self)
+
+
+class Options(TypedDict, total=False):
+    """The options of `Model.predict`, which describes them."""
+
+    camera: str | Path | CameraParameters | None
+    fov_y_deg: float | None
+    topic: str
 
 
 class Model:
@@ -80,7 +89,7 @@ class Model:
         self.folder = run
         self._options = (parse_kind(engine), parse_precision(precision))
         self._engine = load_engine(run, *self._options, threads=threads)
-        self._turn = Lock()
+        self._lock = Lock()
 
     @property
     def card(self) -> ModelCard:
@@ -93,34 +102,13 @@ class Model:
         return self.card.camera
 
     @overload
-    def predict(
-        self,
-        source: bytes | Image,
-        *,
-        camera: str | Path | CameraParameters | None = None,
-        fov_y_deg: float | None = None,
-        topic: str = "",
-    ) -> Features: ...
+    def predict(self, source: bytes | Image, **options: Unpack[Options]) -> Features: ...
 
     @overload
-    def predict(
-        self,
-        source: Sequence[OneImage],
-        *,
-        camera: str | Path | CameraParameters | None = None,
-        fov_y_deg: float | None = None,
-        topic: str = "",
-    ) -> list[Features]: ...
+    def predict(self, source: Sequence[OneImage], **options: Unpack[Options]) -> list[Features]: ...
 
     @overload
-    def predict(
-        self,
-        source: str | Path,
-        *,
-        camera: str | Path | CameraParameters | None = None,
-        fov_y_deg: float | None = None,
-        topic: str = "",
-    ) -> Any: ...
+    def predict(self, source: str | Path, **options: Unpack[Options]) -> Any: ...
 
     def predict(
         self,
@@ -146,16 +134,15 @@ class Model:
         out goes to the logger `mtlnet`.
         """
         lens = self._lens(camera, fov_y_deg)
-        if isinstance(source, bytes | np.ndarray):
-            return self._one(_pixels(source), lens)
         if isinstance(source, str | Path):
             sources = find_sources([str(source)], log.info, topic)
-            if [(s.path, s.kind) for s in sources] == [(Path(source), Kind.IMAGE)]:
-                if sources[0].problem:
-                    raise UserError(sources[0].problem)
-                return self._one(read_whole_image(sources[0].path), lens, str(source))
-            return self._all(sources, lens, calibrate=camera is None)
-        return [self._listed(image, lens) for image in source]
+            if [(s.path, s.kind) for s in sources] != [(Path(source), Kind.IMAGE)]:
+                return self._all(sources, lens, calibrate=camera is None)
+            if sources[0].problem:
+                raise UserError(sources[0].problem)
+        if isinstance(source, str | Path | bytes | np.ndarray):
+            return self._one(source, lens)
+        return [self._one(image, lens) for image in source]
 
     __call__ = predict
 
@@ -170,12 +157,9 @@ class Model:
             camera = read_camera(Path(camera), self.camera, log.info)
         return Rectification(camera, self.camera)
 
-    def _listed(self, image: OneImage, lens: Lens) -> Features:
+    def _one(self, image: OneImage, lens: Lens) -> Features:
         name = str(image) if isinstance(image, str | Path) else ""
-        return self._one(_pixels(image), lens, name)
-
-    def _one(self, pixels: Image, lens: Lens, name: str = "") -> Features:
-        small = fit(Picture(0, pixels), self.camera, lens)
+        small = fit(Picture(0, _pixels(image)), self.camera, lens)
         known = lens if isinstance(lens, Rectification) else None
         return self._answer(SourceImage(name, None, small, lens=known), lens)
 
@@ -192,14 +176,14 @@ class Model:
         finally:
             items.close()
         if unusable:
-            more = f" (and {len(unusable) - 1} more)" if len(unusable) > 1 else ""
-            raise UserError(f"{unusable[0]}{more}")
+            raise UserError(first_of(unusable))
 
     def _answer(self, item: SourceImage, lens: Lens) -> Features:
-        with self._turn:
+        with self._lock:
             prediction = answer(self._engine, item)
         values = (getattr(prediction, field.name) for field in fields(Prediction))
-        return Features(*values, seen=item, camera=_camera(item, lens, self.camera))
+        camera = _camera(item, lens, self.camera)
+        return Features(*values, source=item, camera=camera, model_camera=self.camera)
 
     def evaluate(
         self,
@@ -279,12 +263,4 @@ def _camera(item: SourceImage, lens: Lens, model: CameraParameters) -> CameraPar
     """The camera that took an image."""
     if item.lens is not None:
         return item.lens.source
-    fov_y_deg = lens if isinstance(lens, float | int) else model.fov_y_deg
-    return CameraParameters(**{**model.as_dict(), "fov_y_deg": fov_y_deg})
-
-
-def _whole(camera: CameraParameters, pixels: Image) -> CameraParameters:
-    """The camera of an image (H, W, 3) of any aspect ratio with the camera's vertical field of
-    view."""
-    height, width = pixels.shape[:2]
-    return CameraParameters(**{**camera.as_dict(), "width": width, "height": height})
+    return replace(model, fov_y_deg=lens) if isinstance(lens, float | int) else model

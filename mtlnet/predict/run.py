@@ -103,6 +103,11 @@ def answer(engine: Engine, item: SourceImage) -> Prediction:
     return decode_outputs(outputs)
 
 
+def first_of(errors: list[str]) -> str:
+    """The first of some errors, and the number of the others."""
+    return f"{errors[0]} (and {len(errors) - 1} more)" if len(errors) > 1 else errors[0]
+
+
 class _Answers:
     """The answers so far, and what could not be used."""
 
@@ -132,9 +137,8 @@ class _Answers:
         """All answers. Raises InputsLeftOut."""
         if not self._unusable:
             return self._results
-        more = f" (and {len(self._unusable) - 1} more)" if len(self._unusable) > 1 else ""
         others = f"; {self.used} others were done" if self.used else ""
-        raise InputsLeftOut(f"{self._unusable[0]}{more}{others}", self._results)
+        raise InputsLeftOut(f"{first_of(self._unusable)}{others}", self._results)
 
 
 class _Writing:

@@ -22,7 +22,6 @@ from runtime.film import Film
 from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
 
-# Golden answers are of float32, which every processor has.
 MODEL_CAMERA = CameraParameters()
 
 
@@ -113,6 +112,20 @@ def test_markings_are_drawn_on_the_picture_in_its_own_size_and_lens(model: Model
         assert len(changed) > 500
         assert np.median(off) < 0.05
         assert features.draw().shape == (484, 720, 3)
+
+
+def test_a_field_of_view_is_that_of_the_drawing_too(model: Model) -> None:
+    """A wider lens: the model's view of it has the answer drawn as the model's own picture has."""
+    road = golden_image(1120, 840)
+    wide = np.full((1680, 2240, 3), 128, np.uint8)
+    wide[420:1260, 560:1680] = road
+    wide_deg = float(np.degrees(2 * np.arctan(2 * np.tan(np.radians(67.5 / 2)))))
+    own, seen = model.predict(road), model.predict(wide, fov_y_deg=wide_deg)
+    assert (own.draw() == seen.draw()).all()
+    inner = seen.draw(wide)[420:1260, 560:1680]
+    drawn = (inner != road).any(axis=2), (own.draw(road) != road).any(axis=2)
+    assert drawn[0].sum() > 500
+    assert (drawn[0] & drawn[1]).sum() > 0.9 * drawn[1].sum()  # lines are twice as thick
 
 
 def test_faulty_sources_are_one_clear_error(model: Model, tmp_path: Path) -> None:
