@@ -54,7 +54,7 @@ system:
 	elif sudo -n true 2>/dev/null; then sudo apt-get update -qq && sudo apt-get install -y -qq $(EGL_PACKAGES); \
 	else echo "error: EGL and Mesa are missing; type: sudo apt-get install $(EGL_PACKAGES)" >&2; exit 1; fi
 
-demo: $(READY) ## collect, train, evaluate, serve, ask, report: in 17 minutes on two cores
+demo: $(READY) ## collect, train, evaluate, serve, ask, report: in 20 minutes on two cores
 	$(BIN)/controllers demo --out demo
 
 # Two processes a core, for many tests wait; four at most: each takes 1 to 2 GB. A file's tests
