@@ -2,11 +2,13 @@
 
 import os
 import sys
+import tempfile
 from pathlib import Path
 
 import nbformat
 import pytest
 from nbclient import NotebookClient
+from traitlets.config import Config
 
 NOTEBOOK = Path(__file__).parents[2] / "examples" / "quickstart.ipynb"
 # What makes it small: source text of its cells, and what stands there in the test.
@@ -20,6 +22,10 @@ SMALL = {
 @pytest.mark.slow
 def test_the_notebook_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("JUPYTER_DATA_DIR", str(tmp_path / "jupyter"))
+    # Sockets in a folder: a TCP port that is free when it is chosen may be taken when the kernel
+    # opens it, as other tests open ports too. A socket's path has at most 107 characters.
+    sockets = tempfile.TemporaryDirectory(prefix="jupyter")
+    over_files = Config({"KernelManager": {"transport": "ipc", "ip": f"{sockets.name}/kernel"}})
     monkeypatch.setenv("PATH", f"{Path(sys.executable).parent}:{os.environ['PATH']}")
     notebook = nbformat.read(NOTEBOOK, as_version=4)  # type: ignore[no-untyped-call]
     text = "".join(cell.source for cell in notebook.cells)
@@ -28,7 +34,10 @@ def test_the_notebook_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
         for old, new in SMALL.items():
             cell.source = cell.source.replace(old, new)
     where = {"metadata": {"path": str(tmp_path)}}
-    NotebookClient(notebook, timeout=300, kernel_name="python3", resources=where).execute()
+    with sockets:
+        NotebookClient(
+            notebook, timeout=300, kernel_name="python3", resources=where, config=over_files
+        ).execute()
     outputs = [output for cell in notebook.cells for output in cell.get("outputs", [])]
     printed = "".join(output.text for output in outputs if output.output_type == "stream")
     assert "100 train frames, 50 test frames" in printed
