@@ -25,6 +25,7 @@ from mtlnet.evaluation.evaluate import evaluate
 from mtlnet.evaluation.metrics import evaluate_outputs
 from mtlnet.export.openvino_graph import run_graph
 from mtlnet.inference.engine import load_engine
+from runtime.processor import has_int8
 
 CALIBRATION_FRAMES = 300
 FLOAT_ACTIVATIONS: tuple[int, ...] = (0, 2)
@@ -161,13 +162,16 @@ def float_operations(model: Any, chosen: Sequence[int]) -> list[str]:
 
 
 def judge(run: Path, data: Path) -> dict[str, Any]:
-    """The gate's result for a run's int8 graph, on the test rounds of a dataset."""
+    """The gate's result for a run's int8 graph, on the test rounds of a dataset.
+
+    With "native_int8": whether the processor on which it was judged multiplies int8 natively.
+    """
 
     def evaluated(precision: Literal["f32", "int8"]) -> dict[str, Any]:
         engines = [load_engine(run, "openvino", precision) for _ in range(os.cpu_count() or 1)]
         return evaluate(engines, data, "test")
 
-    return gate(evaluated("f32"), evaluated("int8"))
+    return {**gate(evaluated("f32"), evaluated("int8")), "native_int8": has_int8()}
 
 
 def gate(reference: dict[str, Any], quantised: dict[str, Any]) -> dict[str, Any]:

@@ -27,6 +27,7 @@ from mtlnet.inference.model_card import (
     read_card,
 )
 from runtime.files import utf8_path
+from runtime.processor import has_int8
 
 EngineKind = Literal["openvino", "torch"]
 Precision = Literal["bf16", "f32", "int8"]
@@ -67,10 +68,10 @@ def load_engine(
 ) -> Engine:
     """Load the model in folder `run` (see `mtlnet.inference.model_card.resolve_run`).
 
-    `precision` None selects int8 if the model has an int8 graph that passed its accuracy gate, else
-    bf16 if the CPU supports it, else float32. The torch engine supports float32 only; with `gpu` it
-    computes on a GPU where there is one. Raises ModelError when the model is missing, unfinished or
-    damaged.
+    `precision` None selects int8 if the model has an int8 graph that passed its accuracy gate and
+    fits this processor (`uses_int8`), else bf16 if the processor supports it, else float32. The
+    torch engine supports float32 only; with `gpu` it computes on a GPU where there is one. Raises
+    ModelError when the model is missing, unfinished or damaged.
     """
     card = read_card(run)
     if kind == "torch":
@@ -97,7 +98,7 @@ class OpenVinoEngine:
 
         self.card = card
         best = best_precision()
-        self.precision: Precision = precision or ("int8" if passed_gate(run, card) else best)
+        self.precision: Precision = precision or ("int8" if uses_int8(run, card) else best)
         quantised = self.precision == "int8"
         options = {
             "INFERENCE_PRECISION_HINT": best if quantised else self.precision,
@@ -151,8 +152,7 @@ def read_graph(run: Path, card: ModelCard) -> Any:
     return model_from_weights(card.network, read_weights(run / WEIGHTS), head)
 
 
-# The exports of a run, each with an `export.json` that `mtlnet export` writes. An int8 graph is
-# used by default only if it passed its accuracy gate (`mtlnet.export.int8`).
+# The exports of a run, each with an `export.json` that `mtlnet export` writes.
 
 
 def read_export(folder: Path) -> dict[str, Any] | None:
@@ -169,12 +169,18 @@ def read_export(folder: Path) -> dict[str, Any] | None:
     return dict(content)
 
 
-def passed_gate(run: Path, card: ModelCard) -> bool:
-    """Whether the run has an int8 graph of the card's weights that passed the accuracy gate."""
+def uses_int8(run: Path, card: ModelCard) -> bool:
+    """Whether int8 is the default precision of a run on this processor.
+
+    The run has an int8 graph of the card's weights that passed its accuracy gate
+    (`mtlnet.export.int8`), and the processor multiplies int8 natively. One that does not may round
+    sums otherwise, and uses a graph only if that was judged on such a processor.
+    """
     about = read_export(run / INT8)
     if about is None or about["model_hash"] != card.model_hash:
         return False
-    return bool((about.get("gate") or {}).get("passed"))
+    gate = about.get("gate") or {}
+    return bool(gate.get("passed")) and (has_int8() or not gate.get("native_int8", False))
 
 
 def int8_graph(run: Path, card: ModelCard) -> Path:

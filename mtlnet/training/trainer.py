@@ -14,7 +14,6 @@ from mtlnet.data.loader import Batch, Loader
 from mtlnet.model.architecture import MTL, Architecture
 from mtlnet.model.auxiliary import auxiliary_loss
 from mtlnet.model.bins import Scores
-from mtlnet.model.cpu_kernels.bf16 import cpu_has_bf16
 from mtlnet.model.cpu_kernels.forward import FAST, forward_grid, forward_shared, training_outputs
 from mtlnet.model.network import Network, initialise
 from mtlnet.training.bins_loss import bins_loss
@@ -24,6 +23,7 @@ from mtlnet.training.loss import Alpha, Losses, multi_task_loss
 from mtlnet.training.optimizers import OptimizerSet
 from mtlnet.training.recipes import Recipe, frozen_convolutions, learning_rate
 from mtlnet.training.task_weighting import TaskWeighting
+from runtime.processor import has_bf16
 from trackfeatures.errors import UserError
 
 MIN_TARGET_STD = (0.01,) * 6
@@ -182,7 +182,7 @@ class Trainer:
 
     def _dtype(self) -> torch.dtype:
         on_cpu = self.device.type == "cpu"
-        return torch.bfloat16 if not on_cpu or cpu_has_bf16() else torch.float32
+        return torch.bfloat16 if not on_cpu or has_bf16() else torch.float32
 
     def _masks(self, count: int) -> list[Tensor]:
         layers, seed = self.network.architecture.shared, [self.seed, 3, self.step_number]

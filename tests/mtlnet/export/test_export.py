@@ -1,5 +1,6 @@
 """Exports match torch, and the int8 graph is used by default only if it passed its gate."""
 
+import itertools
 import json
 import shutil
 from dataclasses import replace
@@ -29,8 +30,8 @@ from mtlnet.inference.engine import (
     INT8,
     load_engine,
     openvino_core,
-    passed_gate,
     read_graph,
+    uses_int8,
 )
 from mtlnet.inference.model_card import (
     GRAPH,
@@ -194,10 +195,13 @@ def test_int8_is_the_default_once_it_passed_its_gate(
     require_close(quantised, reference, metres=0.05, radians=0.005)
     about = json.loads((run / INT8 / EXPORT_FILE).read_text())
     assert about["gate"] == found["gate"]
-    for passed in (True, False):
-        about["gate"]["passed"] = passed
+    for passed, judged_native, native in itertools.product((True, False), repeat=3):
+        monkeypatch.setattr("mtlnet.inference.engine.has_int8", lambda native=native: native)
+        about["gate"].update(passed=passed, native_int8=judged_native)
         (run / INT8 / EXPORT_FILE).write_text(json.dumps(about))
-        assert (load_engine(run).precision == "int8") is passed is passed_gate(run, card)
+        used = passed and (native or not judged_native)
+        assert uses_int8(run, card) is used
+        assert (load_engine(run).precision == "int8") is used
     about.update(model_hash="of other weights", gate={"passed": True})
     (run / INT8 / EXPORT_FILE).write_text(json.dumps(about))
     assert load_engine(run).precision != "int8"

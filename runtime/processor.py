@@ -1,0 +1,35 @@
+"""Which number formats this processor multiplies natively; it is slow in others.
+
+Read from the flags in /proc/cpuinfo, so on Linux alone; elsewhere nothing counts as native.
+"""
+
+from functools import cache
+from pathlib import Path
+
+CPUINFO = Path("/proc/cpuinfo")
+BF16_FLAGS = {"avx512_bf16", "amx_bf16", "bf16"}
+INT8_FLAGS = {"avx512_vnni", "avx_vnni", "avx_vnni_int8", "amx_int8", "i8mm", "asimddp"}
+"""x86: products of 8-bit numbers summed in 32 bits; without them sums of two saturate at 16 bits.
+ARM: `i8mm` and `asimddp` (dot products)."""
+
+
+def has_bf16() -> bool:
+    """Whether the processor multiplies bfloat16 natively."""
+    return not BF16_FLAGS.isdisjoint(flags(CPUINFO))
+
+
+def has_int8() -> bool:
+    """Whether the processor multiplies and sums 8-bit integers natively."""
+    return not INT8_FLAGS.isdisjoint(flags(CPUINFO))
+
+
+@cache
+def flags(cpuinfo: Path) -> frozenset[str]:
+    """Flags (x86) or features (ARM) of the first processor; none where there is no such file."""
+    if not cpuinfo.is_file():
+        return frozenset()
+    for line in cpuinfo.read_text().splitlines():
+        name, _, values = line.partition(":")
+        if name.strip() in ("flags", "Features"):
+            return frozenset(values.split())
+    return frozenset()
