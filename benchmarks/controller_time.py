@@ -21,9 +21,9 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from benchmarks.material.outcome import exit_code
 from benchmarks.material.servers import OURS, running
-from controllers.closed_loop import run_lap
+from controllers.drive.closed_loop import run_lap
 from controllers.interface import Controller, LoopConfig, Observation
-from controllers.perception import open_perception, truth
+from controllers.perception.sources import open_perception, truth
 from controllers.registry import make_controller
 from mtlnet.inference.model_card import SHIPPED
 from simulator.track.catalogue import find_track

@@ -16,7 +16,7 @@ from types import ModuleType
 from typing import Any
 
 from controllers.interface import Controller, LoopConfig, Observation
-from controllers.rl.actor import is_actor
+from controllers.laws.actor import is_actor
 from trackfeatures.errors import UserError
 
 __all__ = ["CONTROLLERS", "ControllerEntry", "LoopConfig", "make_controller"]
@@ -47,28 +47,32 @@ _MPC_WEIGHTS = {"offset": (0.1, 100.0), "heading": (0.1, 100.0), "wheel": (1e-3,
 
 CONTROLLERS: dict[str, ControllerEntry] = {
     "lqr": ControllerEntry(
-        "controllers.lqr:make_lqr", "the paper's LQR: offset, angle, their rates", _LQR_WEIGHTS
+        "controllers.laws.lqr:make_lqr", "the paper's LQR: offset, angle, their rates", _LQR_WEIGHTS
     ),
     "lqr-preview": ControllerEntry(
-        "controllers.lqr:make_lqr_preview", "LQR with feed-forward of the curvature", _LQR_WEIGHTS
+        "controllers.laws.lqr:make_lqr_preview",
+        "LQR with feed-forward of the curvature",
+        _LQR_WEIGHTS,
     ),
     "lqr-paper": ControllerEntry(
-        "controllers.lqr:make_lqr_paper", "LQR as the paper's released code runs it", _LQR_WEIGHTS
+        "controllers.laws.lqr:make_lqr_paper",
+        "LQR as the paper's released code runs it",
+        _LQR_WEIGHTS,
     ),
     "mpc": ControllerEntry(
-        "controllers.mpc:make_mpc", "the paper's nonlinear MPC, without preview", _MPC_WEIGHTS
+        "controllers.laws.mpc:make_mpc", "the paper's nonlinear MPC, without preview", _MPC_WEIGHTS
     ),
     "mpc-preview": ControllerEntry(
-        "controllers.mpc:make_mpc_preview", "MPC that knows the curvature ahead", _MPC_WEIGHTS
+        "controllers.laws.mpc:make_mpc_preview", "MPC that knows the curvature ahead", _MPC_WEIGHTS
     ),
     "rl": ControllerEntry(
-        "controllers.rl.controller:make_rl", "trained by reinforcement on the paper's state"
+        "controllers.laws.rl:make_rl", "trained by reinforcement on the paper's state"
     ),
     "rl-residual": ControllerEntry(
-        "controllers.rl.controller:make_rl_residual", "LQR, and what was learned to add to it"
+        "controllers.laws.rl:make_rl_residual", "LQR, and what was learned to add to it"
     ),
     "torcs": ControllerEntry(
-        "controllers.torcs_feedback:make_torcs", "the control law of the reference laps"
+        "controllers.laws.torcs_feedback:make_torcs", "the control law of the reference laps"
     ),
 }
 
@@ -82,7 +86,7 @@ def make_controller(
     and a class that cannot be made without arguments or has no method `update`.
     """
     if name not in CONTROLLERS and is_actor(Path(name)):
-        from controllers.rl.controller import load_controller
+        from controllers.laws.rl import load_controller
 
         return load_controller(Path(name), loop)
     if ":" in name:

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from controllers.perception import Perceived
+from controllers.perception.perceived import Perceived
 from simulator.vehicle.state import CarState
 
 MAX_POINTS = 400

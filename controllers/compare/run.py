@@ -12,13 +12,14 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from controllers.compare.config import CompareConfig
 from controllers.compare.curves import CurveRecorder
-from controllers.compare.disturbance import DISTURBANCES, UNDISTURBED
-from controllers.config import CompareConfig, DriveConfig
-from controllers.drive import drive, read_parameters
-from controllers.perception import check_perception
+from controllers.drive.config import DriveConfig
+from controllers.drive.disturbance import DISTURBANCES, UNDISTURBED
+from controllers.drive.run import drive, read_parameters
+from controllers.laws.actor import WEIGHTS, is_actor
+from controllers.perception.sources import check_perception
 from controllers.registry import LoopConfig, make_controller
-from controllers.rl.actor import WEIGHTS, is_actor
 from runtime.files import locked_folder, write_json
 from simulator.camera import check_light
 from simulator.track.catalogue import find_track
@@ -200,7 +201,7 @@ def model_hash(run: str) -> str:
 
 def service_model_hash(url: str) -> str:
     """SHA-256 of the weights of the model at `url`. Raises UserError when it does not answer."""
-    from controllers.perception import ServiceModel
+    from controllers.perception.sources import ServiceModel
 
     service = ServiceModel(url)
     service.close()

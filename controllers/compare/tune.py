@@ -13,11 +13,12 @@ from typing import Any
 
 import numpy as np
 
-from controllers.closed_loop import check_reward
-from controllers.compare.disturbance import find_disturbance
+from controllers.compare.config import TuneConfig
 from controllers.compare.run import GRID_SHARE, names
-from controllers.config import DriveConfig, TuneConfig
-from controllers.drive import drive
+from controllers.drive.closed_loop import check_reward
+from controllers.drive.config import DriveConfig
+from controllers.drive.disturbance import find_disturbance
+from controllers.drive.run import drive
 from controllers.registry import CONTROLLERS
 from runtime.files import check_folder, write_json
 from simulator.track.catalogue import find_track

@@ -11,7 +11,7 @@ from markupsafe import Markup
 from rich.console import Console
 from rich.table import Table
 
-from controllers.config import DemoConfig
+from controllers.demo.config import DemoConfig
 from controllers.demo.frames import PostedFrame
 from controllers.demo.run import DemoResult
 from datagen.recording import Dataset

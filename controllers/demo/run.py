@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from controllers.config import DemoConfig
+from controllers.demo.config import DemoConfig
 from controllers.demo.frames import PostedFrame, post_frames, spread
 from controllers.demo.process import run_module, running_service
-from controllers.lqr import WEIGHTS_BRIEFLY_TRAINED
+from controllers.laws.lqr import WEIGHTS_BRIEFLY_TRAINED
 from datagen.recording import Dataset
 from runtime.files import write_json
 from serve.client import Client

@@ -13,9 +13,10 @@ from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import trackfeatures as tf
-from controllers.closed_loop import HOLD_S, OffsetMemory
+from controllers.drive.closed_loop import HOLD_S, OffsetMemory
 from controllers.interface import Controller, LoopConfig, Observation
-from controllers.perception import CameraPerception, FeatureModel, LocalModel, Perceive
+from controllers.perception.perceived import Perceive
+from controllers.perception.sources import CameraPerception, FeatureModel, LocalModel
 from controllers.registry import make_controller
 from simulator.vehicle.state import CarState
 

@@ -3,10 +3,10 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from controllers.rl.actor import mirror_of
+from controllers.laws.actor import mirror_of
+from controllers.laws.actor_state import StateDefinition
 from controllers.rl.config import Algorithm
 from controllers.rl.networks import Array, Shape, forward
-from controllers.rl.state import StateDefinition
 from controllers.rl.updates import Batch, Trained, actor_update, critic_update
 
 TARGET_NOISE_CUT = 2.5  # standard deviations, as TD3's 0.5 of 0.2

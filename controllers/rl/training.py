@@ -17,11 +17,13 @@ import gymnasium as gym
 import numpy as np
 
 import simulator.env  # noqa: F401 registers the environment
-from controllers.closed_loop import DriveResult, check_reward, run_lap
-from controllers.drive import FREQUENCY_HZ, steps_for
+from controllers.drive.closed_loop import DriveResult, check_reward, run_lap
+from controllers.drive.run import FREQUENCY_HZ, steps_for
 from controllers.interface import Observation
-from controllers.perception import truth
-from controllers.rl.actor import Actor, ActorCard, save_actor
+from controllers.laws.actor import Actor, ActorCard, save_actor
+from controllers.laws.actor_state import StateBuilder, find_state
+from controllers.laws.rl import RlController
+from controllers.perception.sources import truth
 from controllers.rl.agent import Agent
 from controllers.rl.checkpoint import Progress, load_checkpoint, save_checkpoint
 from controllers.rl.config import (
@@ -32,9 +34,7 @@ from controllers.rl.config import (
     exploration_share,
     find_algorithm,
 )
-from controllers.rl.controller import RlController
 from controllers.rl.networks import layers
-from controllers.rl.state import StateBuilder, find_state
 from runtime.files import atomic_write, locked_folder, write_json
 from simulator.env.reward import quadratic_reward
 from simulator.track.road import Road

@@ -13,19 +13,19 @@ import pytest
 from safetensors.numpy import save
 
 import controllers.compare.run as comparison
+from controllers.compare.config import CompareConfig, TuneConfig
 from controllers.compare.curves import CurveRecorder
 from controllers.compare.report import driving_curves, score_table, spread, write_report
 from controllers.compare.run import Cell, cells, compare, fingerprint
 from controllers.compare.tune import propose, tune
-from controllers.config import CompareConfig, TuneConfig
-from controllers.drive import read_parameters
-from controllers.perception import Perceived
-from controllers.rl.actor import WEIGHTS, load_actor
-from controllers.rl.controller import SHIPPED
+from controllers.drive.run import read_parameters
+from controllers.laws.actor import WEIGHTS, load_actor
+from controllers.laws.rl import SHIPPED
+from controllers.perception.perceived import Perceived
 from runtime.files import locked_folder
 from simulator.track.catalogue import OWN_TRACKS
 from simulator.world.errors import ContactsUnavailable
-from tests.controllers.test_drive import at_rest
+from tests.controllers.fake_world import at_rest
 from tests.typed import typed
 from trackfeatures import RoadClass, UserError
 

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import pytest
 
-from controllers.config import DemoConfig
+from controllers.demo.config import DemoConfig
 from controllers.demo.frames import PostedFrame, spread
 from controllers.demo.process import run_module
 from controllers.demo.report import check_drive, check_evaluation, check_posted, print_tables

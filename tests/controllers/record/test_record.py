@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from controllers.interface import LoopConfig
-from controllers.perception import Perceived
+from controllers.perception.perceived import Perceived
 from controllers.record.law import PerceivedLaw
 from datagen.execution.merge import merge
 from datagen.recorder.replay import replay

@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from controllers.rl.actor import load_actor
+from controllers.laws.actor import load_actor
+from controllers.laws.actor_state import PAPER, STACKED, STATES
 from controllers.rl.agent import Agent, Replay
 from controllers.rl.config import ALGORITHMS, TrainConfig, exploration_share
-from controllers.rl.state import PAPER, STACKED, STATES
 from controllers.rl.training import train
 from tests.typed import typed
 from trackfeatures.errors import UserError

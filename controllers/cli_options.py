@@ -1,0 +1,98 @@
+"""The options of the `controllers` commands, as annotations of the fields of their configurations.
+
+A command's configuration is a dataclass. Its annotated fields are the command's options, so each
+option is declared once. Options of several commands are defined here.
+
+Rich reads help texts as markup and drops text in square brackets: defaults that Typer does not know
+are sentences ("Default: ...").
+"""
+
+from collections.abc import Callable
+from dataclasses import fields
+from functools import wraps
+from inspect import Parameter, Signature
+from pathlib import Path
+from typing import Annotated, Any, TypeVar, get_origin
+
+from typer import Option
+
+from runtime.cli import AsJson
+
+Config = TypeVar("Config")
+
+ControllerName = Annotated[
+    str,
+    Option(
+        help="Controller: lqr, lqr-preview, lqr-paper, mpc, mpc-preview, rl, rl-residual, torcs, a "
+        "folder of `controllers train`, or a class of your own as MODULE:CLASS or FILE.py:CLASS."
+    ),
+]
+Controllers = Annotated[
+    str, Option(help="Controllers, separated by commas, as in `controllers drive --controller`.")
+]
+Track = Annotated[str, Option(help="Name of a track (`simulator tracks`), or its file.")]
+Tracks = Annotated[str, Option(help="Names of tracks, or their files, separated by commas.")]
+TracksDir = Annotated[Path | None, Option(help="A further folder to search for tracks.")]
+Steps = Annotated[
+    int | None,
+    Option(
+        help="Control steps of 50 ms. Default: the paper's number on its four tracks, about a lap "
+        "on others."
+    ),
+]
+Model = Annotated[
+    str,
+    Option(
+        help='Model of --perception model: run folder, name in runs/, "latest", or "default" (the '
+        "shipped model)."
+    ),
+]
+Latency = Annotated[float, Option(help="Latency of the perception's answers, ms, 0 to 1000.")]
+Drop = Annotated[
+    float, Option(help="Share of the perception's answers that are lost, 0 to below 1.")
+]
+Light = Annotated[
+    str,
+    Option(
+        help="Light of the images: clear, overcast, dusk, fog, heavy-shadow, rain or snow. The "
+        "truth does not depend on it."
+    ),
+]
+Parameters = Annotated[
+    Path | None,
+    Option(
+        help="File of `controllers tune` with parameters of controllers. Default: parameters of "
+        "their own."
+    ),
+]
+Reward = Annotated[
+    str,
+    Option(
+        help="paper, or quadratic: -(0.3 d^2 + angle^2 + 0.03 delta^2), the paper's second reward."
+    ),
+]
+
+
+def options(
+    config: type[Config],
+) -> Callable[[Callable[[Config, bool], None]], Callable[..., None]]:
+    """Makes a Typer command of a function of a configuration and `as_json`.
+
+    Its options are the annotated fields of the dataclass `config`, with their defaults, and --json.
+    """
+
+    def decorate(function: Callable[[Config, bool], None]) -> Callable[..., None]:
+        @wraps(function)
+        def command(as_json: bool, **values: Any) -> None:
+            function(config(**values), as_json)
+
+        parameters = [
+            Parameter(one.name, Parameter.KEYWORD_ONLY, default=one.default, annotation=one.type)
+            for one in fields(config)  # type: ignore[arg-type]  # a dataclass
+            if get_origin(one.type) is Annotated
+        ]
+        as_json = Parameter("as_json", Parameter.KEYWORD_ONLY, default=False, annotation=AsJson)
+        command.__signature__ = Signature([*parameters, as_json])  # type: ignore[attr-defined]
+        return command
+
+    return decorate

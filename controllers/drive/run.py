@@ -1,0 +1,329 @@
+"""One drive from its configuration: road, world, perception, controller, log.
+
+controllers drive --controller lqr --track oval --perception truth --log drive.csv
+"""
+
+import itertools
+import json
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+
+import trackfeatures as tf
+from controllers.drive.closed_loop import DriveLog, DriveResult, HeldThrottle, Pedals, run_lap
+from controllers.drive.config import THROTTLE, DriveConfig
+from controllers.drive.disturbance import Disturbance
+from controllers.interface import LoopConfig
+from controllers.laws.speed import on_perception, on_the_truth
+from controllers.perception.late import LatePerception, TrustedPerception
+from controllers.perception.perceived import Perceive, Perceived
+from controllers.perception.sources import CameraPerception, PerceptionSource, open_perception
+from controllers.registry import make_controller
+from runtime.files import check_folder
+from runtime.film import FILM_SUFFIX, Film
+from simulator.camera import check_light
+from simulator.track.catalogue import find_track
+from simulator.track.road import Road
+from simulator.vehicle.state import CarState
+from simulator.world.world import World
+from trackfeatures import UserError
+from trackfeatures.camera import CameraParameters
+
+if TYPE_CHECKING:
+    from controllers.perception.real_time import RealTimePerception
+
+FREQUENCY_HZ = 20
+SCORED_STEPS = {"forza": 6500, "alpine-2": 4500, "eroad": 3700, "g-track-3": 3300}
+"""Numbers of steps by track at which scores are compared with the paper's."""
+TYPICAL_SPEED = 15.0  # m/s, a little less than gear 1 and the default throttle give on a flat road
+
+START_M, START_S = 5.0, 10.0
+"""A car that ends within so many metres, or stands for so long, did not start."""
+
+Progress = Callable[[int, int], None]
+"""Called with the steps done and the steps in all."""
+
+
+@dataclass(frozen=True)
+class Lane:
+    """Where a drive starts and the line it follows, m left of the track's centre."""
+
+    start_d: float
+    centre: float
+
+
+class Observer(Protocol):
+    """Is called each control step, before the car moves."""
+
+    def __call__(self, now: CarState, perceived: Perceived, steer: float) -> None: ...
+
+
+def drive(
+    config: DriveConfig,
+    progress: Progress | None = None,
+    *,
+    disturbance: Disturbance | None = None,
+    observers: Sequence[Observer] = (),
+    parameters: Mapping[str, float] | None = None,
+) -> DriveResult:
+    """Drive as `config` says; `progress` and the `observers` are called each step.
+
+    `parameters` of the controller go before those of the file in `config`.
+
+    The log and the film are written step by step, so an interrupted drive leaves the part driven.
+    Raises UserError for an unknown name, a lane or start outside the road, or a service that does
+    not answer.
+    """
+    check_light(config.light)  # also without a camera: a misspelt name is an error in any case
+    if config.video is not None:
+        if config.video.suffix.lower() != FILM_SUFFIX:
+            raise UserError(f"--video {config.video}: give a file ending in {FILM_SUFFIX}")
+        check_folder(config.video)
+    track = find_track(config.track, config.tracks_dir)
+    road = Road(track, lanes=config.lanes)
+    lane = choose_lane(config, road)
+    steps = steps_for(config.steps, track.name, track.length_m)
+    noisy = config.perception != "truth"
+    loop = LoopConfig(1.0 / FREQUENCY_HZ, noisy=noisy)
+    if parameters is None:
+        parameters = read_parameters(config.parameters, config.controller)
+    controller = make_controller(config.controller, loop, parameters)
+    pedals = choose_pedals(config, road, lane)
+    with ExitStack() as stack:
+        disturbance = disturbance or Disturbance()
+        world = stack.enter_context(
+            disturbance.world(
+                road, traffic=config.traffic, frequency_hz=FREQUENCY_HZ, seed=config.seed
+            )
+        )
+        world.reset(seed=config.seed, to_middle=lane.start_d)
+        source = stack.enter_context(_open_perception(config, world, lane))
+        watching = [*observers, *_observers(config, stack, world, source, lane)]
+        live = _real_time(config, source.perceive, disturbance) if config.realtime else None
+        if live is not None:
+            stack.enter_context(live)
+        perceive = LastAnswer(live or delay(config, source.perceive, disturbance.delay_s))
+        result = run_lap(
+            world,
+            disturbance.controller(controller, config.seed),
+            perceive,
+            steps,
+            pedals=pedals,
+            lane_centre=lane.centre,
+            noisy=noisy,
+            record=_recorder(perceive, watching, steps, progress),
+        )
+        return result if live is None else replace(result, real_time=live.figures())
+
+
+def _real_time(
+    config: DriveConfig, perceive: Perceive, disturbance: Disturbance
+) -> "RealTimePerception[World, Any, Any]":
+    """`perceive` on the wall clock. Raises UserError where a simulated delay is asked for, too."""
+    from controllers.perception.real_time import real_time
+
+    if config.latency_ms or disturbance.delay_s:
+        raise UserError(
+            "--realtime measures the delay of the answers; leave it out, or --latency-ms"
+        )
+    rng = np.random.default_rng([config.seed, 3])
+    return real_time(perceive, dt=1.0 / FREQUENCY_HZ, drop=config.drop, rng=rng)
+
+
+def check_started(config: DriveConfig, result: DriveResult) -> None:
+    """Raise UserError where the car did not get away from its start."""
+    seconds = result.steps / FREQUENCY_HZ
+    if result.distance_m >= START_M or (result.ended is None and seconds < START_S):
+        return
+    what = f"ended with {result.ended}" if result.ended else "stood"
+    raise UserError(
+        f"the car did not start on {config.track}: it {what} after {seconds:g} s, "
+        f"{result.distance_m:.1f} m driven; give another --throttle, --speed, --start-d or track"
+    )
+
+
+def choose_pedals(config: DriveConfig, road: Road, lane: Lane) -> Pedals:
+    """A held throttle, or the speed of `config`. Raises UserError for both, and out of range."""
+    if config.speed is not None:
+        if config.throttle is not None:
+            raise UserError(
+                f"--speed {config.speed:g} and --throttle {config.throttle:g} contradict each "
+                "other; give one of them"
+            )
+        if config.perception == "truth":
+            return on_the_truth(config.speed, road, lane.centre, 1.0 / FREQUENCY_HZ)
+        return on_perception(config.speed, 1.0 / FREQUENCY_HZ)
+    throttle = THROTTLE if config.throttle is None else config.throttle
+    if not 0.0 <= throttle <= 1.0:
+        raise UserError(f"throttle {throttle} is out of range; give one from 0 to 1")
+    return HeldThrottle(throttle)
+
+
+def delay(config: DriveConfig, perceive: Perceive, unknown_s: float = 0.0) -> Perceive:
+    """`perceive`, late and with lost answers where `config` asks for it, and predicted; uncertain
+    answers are trusted less.
+
+    A delay of `unknown_s` is not known to the controller: nothing is predicted over it.
+    """
+    rng = np.random.default_rng([config.seed, 3])
+    if unknown_s > 0.0:
+        perceive = _late(perceive, unknown_s, 0.0, rng, predict=False)
+    if config.latency_ms == 0.0 and config.drop == 0.0:
+        if config.perception == "truth":
+            return perceive
+        return TrustedPerception(perceive, _state, dt=1.0 / FREQUENCY_HZ)
+    return _late(perceive, config.latency_ms / 1000.0, config.drop, rng, predict=True)
+
+
+def _late(
+    perceive: Perceive,
+    latency_s: float,
+    drop: float,
+    rng: np.random.Generator,
+    *,
+    predict: bool,
+) -> Perceive:
+    return LatePerception(
+        perceive,
+        _state,
+        dt=1.0 / FREQUENCY_HZ,
+        latency_s=latency_s,
+        drop=drop,
+        rng=rng,
+        predict=predict,
+    )
+
+
+def _state(world: World) -> CarState:
+    return world.state
+
+
+def read_parameters(path: Path | None, controller: str) -> dict[str, float]:
+    """The parameters of `controller` in a file of `controllers tune`; none without a file.
+
+    Raises UserError where the file is none, or has no entry for the controller.
+    """
+    if path is None:
+        return {}
+    try:
+        found = json.loads(path.read_text())["controllers"][controller]["parameters"]
+        return {str(name): float(value) for name, value in found.items()}
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise UserError(
+            f"{path} has no parameters of {controller} ({error!r}); give a file that "
+            "`controllers tune` wrote for it"
+        ) from error
+
+
+class LastAnswer:
+    """A perception that keeps its last answer, for those who watch the drive."""
+
+    def __init__(self, perceive: Perceive) -> None:
+        self._perceive = perceive
+        self.last: Perceived | None = None
+
+    def __call__(self, world: World) -> Perceived:
+        self.last = self._perceive(world)
+        return self.last
+
+
+def _open_perception(config: DriveConfig, world: World, lane: Lane) -> PerceptionSource:
+    return open_perception(
+        config.perception,
+        world,
+        model=config.model,
+        lane_centre=lane.centre,
+        light=config.light,
+        seed=config.seed,
+    )
+
+
+def _observers(
+    config: DriveConfig, stack: ExitStack, world: World, source: PerceptionSource, lane: Lane
+) -> Iterator[Observer]:
+    """The log, the film and the page, which `stack` closes."""
+    if config.log is not None:
+        log = DriveLog(stack.enter_context(config.log.open("w", encoding="utf-8")))
+        yield lambda now, perceived, steer: log.write(now, steer)
+    if config.video is not None:
+        from controllers.drive.film import DriveFilm
+        from simulator.camera import open_camera
+
+        film = stack.enter_context(Film(config.video, FREQUENCY_HZ))
+        seen = source.perceive if isinstance(source.perceive, CameraPerception) else None
+        if seen is not None:
+            camera = seen.camera
+        else:
+            parameters = CameraParameters()
+            camera = open_camera(world.road, parameters, light=config.light, seed=config.seed)
+            stack.callback(camera.close)
+        drawn = DriveFilm(film, world, camera, seen, lane_centre=lane.centre)
+        yield lambda now, perceived, steer: drawn.add(perceived, steer)
+    if config.watch is not None:
+        from controllers.drive.watch import watch
+
+        show = stack.enter_context(watch(config, world, lane.centre))
+        yield lambda now, perceived, steer: show(perceived)
+
+
+def _recorder(
+    perceive: LastAnswer, observers: list[Observer], steps: int, progress: Progress | None
+) -> Callable[[CarState, float], None]:
+    """Calls the observers and reports progress."""
+    done = itertools.count()
+
+    def record(state: CarState, steer: float) -> None:
+        assert perceive.last is not None
+        for observer in observers:
+            observer(state, perceive.last, steer)
+        if progress is not None:
+            progress(next(done), steps)
+
+    return record
+
+
+def choose_lane(config: DriveConfig, road: Road) -> Lane:
+    """The lane to follow and where to start.
+
+    Raises UserError for a lane or start outside the road and, on perception, for a target other
+    than the lane of the start: an image shows the offset only from the lane the car is in.
+    """
+    target = config.target_lane
+    if target is not None and not 0 <= target < road.lanes:
+        raise UserError(
+            f"target lane {target} does not exist; the {road.lanes} lane(s) are numbered from 0, "
+            "the leftmost"
+        )
+    if config.start_d is not None:
+        start = config.start_d
+    elif target is not None:
+        start = tf.lane_centre(target, road.lanes, road.lane_width)
+    else:
+        start = 0.0
+    if not (math.isfinite(start) and abs(start) <= road.edge):
+        raise UserError(
+            f"start-d {start:g} m is off the road, which ends {road.edge:.2f} m from its centre"
+        )
+    nearest = tf.lane_index(start, road.lanes, road.lane_width)
+    if target is not None and target != nearest and config.perception != "truth":
+        raise UserError(
+            f"the start is in lane {nearest}, the target is lane {target}: perception measures "
+            "only the lane the car is in; leave --start-d out, or use --perception truth"
+        )
+    chosen = nearest if target is None else target
+    return Lane(start, tf.lane_centre(chosen, road.lanes, road.lane_width))
+
+
+def steps_for(requested: int | None, track: str, length_m: float) -> int:
+    """The steps requested; else the track's scored number; else about one lap, in hundreds."""
+    if requested is not None:
+        if requested < 1:
+            raise UserError(f"{requested} steps requested; give 1 or more")
+        return requested
+    about = length_m / TYPICAL_SPEED * FREQUENCY_HZ
+    return SCORED_STEPS.get(track, 100 * math.ceil(about / 100))
