@@ -75,7 +75,7 @@ def on_images(world: World, model: str, steps: int) -> list[float]:
         settings: dict[str, Any] = {"model": model, "lane_centre": 0.0, "light": "clear", "seed": 0}
         with open_perception(address, world, **settings) as source:
             world.reset(seed=0, to_middle=1.0)
-            perceive = Timed(source.perceive)
+            perceive = Timed(source)
             controller = TimedController(make_controller("lqr", LoopConfig(0.05)))
             run_lap(world, controller, perceive, steps + WARM_UP)
     found = np.add(perceive.times_ms, controller.timed.times_ms)

@@ -1,7 +1,7 @@
 """Closed-loop driving: perceive, steer, step, score. SI units, track frame, left positive.
 
-Throttle is held open loop, as in the paper, unless other `Pedals` are given. A run of `run_lap`
-depends on the world's reset, the controller, the pedals and the perception alone.
+The throttle is held open loop, as in the paper, unless other `Pedals` are given. The result of
+`run_lap` depends only on the reset of the world, the controller, the pedals and the perception.
 """
 
 import math
@@ -13,6 +13,7 @@ import numpy as np
 
 from controllers.drive.config import THROTTLE
 from controllers.interface import Controller, Observation
+from controllers.perception.late import LOST_S
 from controllers.perception.perceived import Perceived
 from controllers.perception.real_time import RealTimeFigures
 from simulator.env.reward import OFF_TRACK_REWARD, ending, quadratic_reward, step_reward
@@ -24,21 +25,19 @@ from trackfeatures.errors import UserError
 
 GEAR = 1
 HOLD_S = 0.5
-"""A lost offset is held this long; after that the car is steered along the road."""
+"""Time (s) for which a lost offset keeps its last value; then it is 0, along the road."""
 RUN_UP_S = 15.0
-"""The standing start, left out of `cruising_kmh`."""
-EASE_OFF = 1.0  # m/s2 of wanted braking at which the throttle is closed
+"""Duration (s) of the standing start, which `cruising_kmh` leaves out."""
+EASE_OFF = 1.0  # m/s2 of demanded braking at which the throttle is closed
 FULL_BRAKING = 15.0  # m/s2 at full brake on asphalt
-LOST_S = 1.0
-"""Without a perceived offset for this long the car slows down ..."""
-LOST_SPEED = 5.0  # m/s, ... to this speed, at which it goes on
-LOST_BRAKE = 0.1
+LOST_SPEED, LOST_BRAKE = 5.0, 0.1
+"""Speed (m/s) to which the car slows down when the perception is lost, and its brake (0 to 1)."""
 REWARDS = ("paper", "quadratic")
-"""`step_reward` and `quadratic_reward` of `simulator.env.reward`."""
+"""Names of `step_reward` and `quadratic_reward` of `simulator.env.reward`."""
 
 
 class Drivable(Protocol):
-    """What a drive needs of `simulator.world.world.World`."""
+    """The part of `simulator.world.world.World` that a drive uses."""
 
     road: Road
     frequency_hz: int
@@ -58,17 +57,19 @@ class Pedals(Protocol):
 
     @property
     def mean_error(self) -> float | None:
-        """m/s from the set-point; None where there is none."""
+        """Mean distance (m/s) from the set-point; None without a set-point."""
         ...
 
     def __call__(
         self, now: CarState, traffic: Traffic, perceived: Perceived
-    ) -> tuple[float, float, int]: ...
+    ) -> tuple[float, float, int]:
+        """Throttle (0 to 1), brake (0 to 1) and gear for the present control step."""
+        ...
 
 
 @dataclass(frozen=True)
 class HeldThrottle:
-    """The paper's: gear 1 and a throttle, less behind a slower car."""
+    """The paper's pedals: gear 1 and a constant throttle, reduced behind a slower car."""
 
     throttle: float = THROTTLE
     mean_error: None = None
@@ -81,17 +82,19 @@ class HeldThrottle:
 
 @dataclass(frozen=True, slots=True)
 class DriveResult:
-    """The score of a drive and the figures that belong beside it."""
+    """The score of a drive and its other figures."""
 
     steps: int
-    """Control steps driven: those requested, unless the drive ended early."""
+    """Control steps driven; fewer than `steps_asked` if the drive ended early."""
     steps_asked: int
+    """Control steps requested."""
     score: float
-    """Sum of the reward over the steps requested; an ending step gives -2, those after it 0."""
+    """Sum of the reward over `steps_asked`; a step that ends the drive counts -2, later steps 0."""
     score_per_step: float
-    """`score` over `steps_asked`."""
+    """`score` divided by `steps_asked`."""
     quadratic_per_step: float
-    """The paper's quadratic reward over `steps_asked`; an ending step and those after it: -2."""
+    """Mean of the paper's quadratic reward over `steps_asked`; the step that ends the drive and all
+    later steps count -2."""
     laps: int
     """Complete laps, from one crossing of the line to the next."""
     distance_m: float
@@ -99,31 +102,34 @@ class DriveResult:
     mean_abs_d_m: float
     """Mean distance from the centre of the lane to follow."""
     max_abs_d_m: float
+    """Largest distance from the centre of the lane to follow."""
     in_lane_share: float
     """Share of the steps with the car's centre between the markings of the lane to follow."""
     speed_kmh: tuple[float, float]
-    """Slowest and fastest, the standing start included."""
+    """Lowest and highest speed, including the standing start."""
     cruising_kmh: tuple[float, float] | None
-    """The same without the first 15 s; None for a shorter drive."""
+    """Lowest and highest speed after the first 15 s; None for a shorter drive."""
     blind_steps: int
     """Steps without a perceived offset."""
     slowed_steps: int
-    """Steps in which the car slowed down because perception was lost for more than 1 s."""
+    """Steps in which the car slowed down because the perception was lost for more than 1 s."""
     noisy: bool
-    """Whether the controller received an estimated state, with errors, instead of the true one."""
+    """Whether the controller received an estimated state, with errors, or the true state."""
     ended: str | None
-    """Why it ended early: off_track (or touching a wall), backwards, or collision (with a car)."""
+    """Why the drive ended early: off_track (also by a contact with a wall), backwards, or collision
+    (with a car); None if it did not."""
     real_time: RealTimeFigures | None = None
-    """Of a drive on the wall clock only; in JSON its fields are those of the result."""
+    """Figures of a drive on the wall clock; in JSON they are fields of the result itself."""
     speed_error_m_s: float | None = None
-    """Mean distance from the set-point of `--speed` on free straights; only there in JSON."""
+    """Mean distance from the set-point of `--speed` on free straights; None (absent from JSON)
+    without a set-point."""
 
     def per_step(self, reward: str) -> float:
-        """The mean over `steps_asked` of a reward of `REWARDS`."""
+        """The mean over `steps_asked` of the reward called `reward`, one of `REWARDS`."""
         return self.score_per_step if reward == "paper" else self.quadratic_per_step
 
     def as_json(self) -> dict[str, Any]:
-        """The fields as JSON values."""
+        """The fields as values for JSON."""
         values = asdict(self)
         if self.speed_error_m_s is None:
             del values["speed_error_m_s"]
@@ -146,9 +152,9 @@ def run_lap(
 ) -> DriveResult:
     """Drive `steps` control steps from the world's present state, or until the episode ends.
 
-    `lane_centre` (m, left positive) is the line that `mean_abs_d_m` is measured from; `noisy` marks
-    a perception with errors in the result. `record` is called with each step's state and steering
-    action. The reward is that of the state after each step.
+    `lane_centre` (m, left positive) is the line from which `mean_abs_d_m` is measured. `noisy`
+    marks the result of a perception with errors. `record` is called with the state and the steering
+    action of each step. The reward of a step is the reward of the state after it.
     """
     memory = OffsetMemory(round(HOLD_S * world.frequency_hz))
     totals = _Totals(start_m=world.state.odometer_m)
@@ -179,25 +185,25 @@ def check_reward(name: str) -> None:
 
 
 def throttle_and_brake(traffic: Traffic, now: CarState, throttle: float) -> tuple[float, float]:
-    """`throttle` and no brake on a free road; less throttle or the brake behind a slower car."""
+    """Throttle and brake: `throttle` and 0 on a free road, less or braking behind a slower car."""
     leader = traffic.leader(now.s, now.to_middle) if traffic.count else None
     if leader is None:
         return throttle, 0.0
     gap, lead_speed = leader
-    wanted = idm_acceleration(gap, max(now.vx, 0.0), lead_speed, math.inf)
-    open_share = min(max(1.0 + wanted / EASE_OFF, 0.0), 1.0)
-    return throttle * open_share, min(max(-wanted - EASE_OFF, 0.0) / FULL_BRAKING, 1.0)
+    demand = idm_acceleration(gap, max(now.vx, 0.0), lead_speed, math.inf)
+    open_share = min(max(1.0 + demand / EASE_OFF, 0.0), 1.0)
+    return throttle * open_share, min(max(-demand - EASE_OFF, 0.0) / FULL_BRAKING, 1.0)
 
 
 def slow_down(speed: float, throttle: float, brake: float) -> tuple[float, float]:
-    """Throttle and brake that slow the car to `LOST_SPEED`, from those of the drive."""
+    """Throttle and brake that slow the car down to `LOST_SPEED`; below it they are unchanged."""
     if speed > LOST_SPEED:
         return 0.0, max(brake, LOST_BRAKE)
     return throttle, brake
 
 
 class OffsetMemory:
-    """Replaces the offset in steps in which no marking is perceived."""
+    """Replaces the offset in steps without a perceived offset."""
 
     def __init__(self, hold_steps: int) -> None:
         self.blind_steps = 0
@@ -207,7 +213,7 @@ class OffsetMemory:
         self._last = 0.0
 
     def fill(self, offset: float | None) -> float:
-        """The offset; while it is None the last one for `hold_steps` steps, after that 0."""
+        """`offset`; if it is None, the last offset for `hold_steps` steps and then 0."""
         if offset is not None:
             self.age, self._last = 0, offset
             return offset
@@ -230,7 +236,7 @@ def _observe(now: CarState, perceived: Perceived, memory: OffsetMemory) -> Obser
 
 @dataclass
 class _Totals:
-    """Running sums of a drive, one `add` a control step."""
+    """Running sums of a drive; `add` is called once for each control step."""
 
     start_m: float
     score: float = 0.0
@@ -277,14 +283,15 @@ class _Totals:
 
 
 COLUMNS = ("t", "s", "d", "th", "v", "vx", "vy", "yr", "steer", "rpm", "lap", "x", "y", "z")
-"""Of a log: s; m along the track; m left of its centre; rad, yaw minus tangent; m/s; rad/s;
-steering action in [-1, 1]; 1/min; laps begun; m."""
+"""Columns of a log: t in s, s in m along the track, d in m left of its centre, th (yaw minus track
+tangent) in rad, v, vx and vy in m/s, yr in rad/s, steer in [-1, 1], rpm in 1/min, lap (laps begun),
+x, y and z in m."""
 
 
 class DriveLog:
-    """CSV log with the columns of the reference laps of the real TORCS, one row a control step.
+    """CSV log with the columns of the reference laps of the real TORCS, a row per control step.
 
-    A row is the state the controller received and its steering action. Each row is complete when
+    A row has the state that the controller acted on and its steering action. It is complete when
     `write` returns.
     """
 
@@ -293,7 +300,7 @@ class DriveLog:
         file.write(",".join(COLUMNS) + "\n")
 
     def write(self, state: CarState, steer: float) -> None:
-        # theta is counter-clockwise in the reference laps, `angle` is clockwise.
+        # th is counter-clockwise in the reference laps, `angle` is clockwise.
         self._file.write(
             f"{state.time_s:.3f},{state.s:.3f},{state.to_middle:.5f},{-state.angle:.6f},"
             f"{state.speed:.4f},{state.vx:.4f},{state.vy:.4f},{state.yaw_rate:.6f},{steer:.6f},"

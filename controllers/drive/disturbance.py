@@ -1,7 +1,7 @@
-"""What `controllers compare --disturb` does to a drive: sensor noise, delay, wind, another car.
+"""Disturbances of a drive: sensor noise, delay, wind, and another car. SI units.
 
-A disturbance depends on the drive's seed alone, so that all controllers meet the same one (paired
-seeds). SI units.
+A disturbance depends only on the seed of the drive, so that all controllers meet the same one
+(paired seeds).
 """
 
 import math
@@ -18,38 +18,40 @@ from trackfeatures.errors import UserError
 
 OFFSET_NOISE_M, ANGLE_NOISE_RAD = 0.05, 0.005
 SPEED_NOISE_M_S, YAW_RATE_NOISE_RAD_S = 0.1, 0.01
-"""Standard deviations of the noise on what a controller receives, drawn anew each step."""
+"""Standard deviations of the noise on an observation, drawn for each step."""
 DELAY_S = 0.1
+"""Delay of the perception."""
 GUST_M_S, GUST_S = 6.0, 1.5
 """Standard deviation and correlation time of the side wind (a Gauss-Markov process)."""
 SIDE_FORCE_M2 = 4.5
-"""Side force over air density, wind speed and speed: slope of the coefficient, 2.3 / rad, times the
-frontal area."""
+"""Side force divided by air density, wind speed and speed: the slope of the side force coefficient,
+2.3 / rad, times the frontal area."""
 FRICTION = (0.8, 1.6)
+"""Range of the tyres' friction coefficient."""
 SPREAD = 0.2
-"""Mass and tyre stiffness are off by up to this share."""
+"""Largest relative deviation of mass and tyre stiffness."""
 
 
 @dataclass(frozen=True)
 class Disturbance:
-    """One kind of disturbance; the defaults are none."""
+    """The kinds of disturbance that act on a drive; by default none acts."""
 
     noise: bool = False
     delay_s: float = 0.0
-    """Of the perception; not predicted, as the controller does not know of it."""
+    """Delay of the perception; it is not predicted, because the controller does not know it."""
     wind: bool = False
     friction: bool = False
     mass: bool = False
     stiffness: bool = False
 
     def car(self, seed: int) -> CarParameters:
-        """The car of the drive with this seed."""
+        """The car of the drive with the seed `seed`."""
         rng, car = np.random.default_rng([seed, 5]), CarParameters()
         low, high = FRICTION
         friction = rng.uniform(low, high)
         mass, stiffness = rng.uniform(1.0 - SPREAD, 1.0 + SPREAD, 2)
         if self.friction:
-            # The slope at zero slip is this times the friction; it stays as it is.
+            # The slope at zero slip, tyre_stiffness * friction, stays the same.
             stiffer = car.tyre_stiffness * car.friction / friction
             car = replace(car, friction=friction, tyre_stiffness=stiffer)
         if self.mass:
@@ -61,7 +63,7 @@ class Disturbance:
         return car
 
     def world(self, road: Road, *, traffic: int, frequency_hz: int, seed: int) -> World:
-        """The world of the drive with this seed."""
+        """The world of the drive with the seed `seed`."""
         car = self.car(seed)
         if self.wind:
             gusts = Gusts(1.0 / frequency_hz, np.random.default_rng([seed, 4]))
@@ -69,7 +71,7 @@ class Disturbance:
         return World(road, traffic=traffic, frequency_hz=frequency_hz, car=car)
 
     def controller(self, controller: Controller, seed: int) -> Controller:
-        """`controller` behind the sensors of the drive with this seed."""
+        """`controller` with the sensors of the drive with the seed `seed`."""
         if not self.noise:
             return controller
         return NoisySensors(controller, np.random.default_rng([seed, 6]))
@@ -88,7 +90,7 @@ DISTURBANCES: dict[str, Disturbance] = {
 
 
 def find_disturbance(name: str) -> Disturbance:
-    """The disturbance `name`. Raises UserError where there is none of that name."""
+    """The disturbance called `name`. Raises UserError for an unknown name."""
     if name not in DISTURBANCES:
         known = ", ".join(DISTURBANCES)
         raise UserError(f"there is no disturbance {name!r}; use one of: {known}")
@@ -96,7 +98,7 @@ def find_disturbance(name: str) -> Disturbance:
 
 
 class NoisySensors:
-    """A controller that receives its observations with normal errors."""
+    """A controller whose observations have normally distributed errors."""
 
     def __init__(self, controller: Controller, rng: np.random.Generator) -> None:
         self._controller, self._rng = controller, rng
@@ -116,7 +118,7 @@ class NoisySensors:
 
 
 class Gusts:
-    """Side wind (m/s, from the right positive), one value a control step of `dt` s."""
+    """Side wind (m/s, positive from the right), one value for each control step of `dt` s."""
 
     def __init__(self, dt: float, rng: np.random.Generator) -> None:
         self._keep = math.exp(-dt / GUST_S)
@@ -130,7 +132,7 @@ class Gusts:
 
 
 class WindyWorld(World):
-    """A world with side wind: its force acts at the centre of gravity, once a control step."""
+    """A world with side wind, whose force acts at the centre of gravity, once a control step."""
 
     def __init__(
         self, road: Road, gusts: Gusts, *, traffic: int, frequency_hz: int, car: CarParameters

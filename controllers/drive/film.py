@@ -1,7 +1,7 @@
-"""The film of a drive: what the driver sees with true and perceived markings, and driving curves.
+"""The film of a drive: the driver's view with true and perceived markings, and driving curves.
 
-Left the driver's view, right the same markings from above; below, the offset and the angle of the
-last seconds. Truth is green, perception orange.
+The driver's view is on the left, the same markings from above are on the right; below are the
+offset and the angle of the last seconds. The truth is green, the perception orange.
 """
 
 from collections import deque
@@ -22,20 +22,20 @@ if TYPE_CHECKING:
 
 Image = NDArray[np.uint8]
 
-CURVE_S = 15.0
-CURVE_HEIGHT = 90
+CURVE_S = 15.0  # s of driving that the curves show
+CURVE_HEIGHT = 90  # px
 OFFSET_SPAN_M, ANGLE_SPAN_RAD = 1.0, 0.1
-"""Values at the upper and lower edge of the curves; larger ones are drawn at the edge."""
+"""Values at the upper and lower edge of the curves; larger values are drawn at the edge."""
 NOTHING: tuple[Distances, float] = ({}, 0.0)
-"""No markings to draw: on the truth they are the green ones."""
+"""The perceived markings of a drive on the truth, which shows only the true markings."""
 TEXT_COLOUR, GRID_COLOUR, BACK = (235, 235, 235), (90, 90, 96), 24
 
 
 class DriveFilm:
-    """Draws one picture a control step into `film`.
+    """Draws a picture for each control step into `film`.
 
-    On images the picture and the markings are those that the controller drives on; on the truth
-    `camera` renders what it would see.
+    With a camera perception the film shows its images and its answers. On the truth `camera`
+    renders the images.
     """
 
     def __init__(
@@ -53,7 +53,7 @@ class DriveFilm:
         self._curves: deque[tuple[float, float, float, float]] = deque(maxlen=length)
 
     def add(self, perceived: Perceived, steer: float) -> None:
-        """Draw the present step: what the controller got, and its steering action."""
+        """Draw the present step, with the perceived road and the steering action."""
         now, world = self._world.state, self._world
         features = world.features()
         offset = now.to_middle - self._lane_centre
@@ -92,16 +92,17 @@ class DriveFilm:
 
 
 def caption(text: str, width: int) -> Image:
-    """A line of text on a dark strip."""
+    """A line of text on a dark strip, (28, width, 3)."""
     strip = np.full((28, width, 3), BACK, np.uint8)
     cv2.putText(strip, text, (10, 20), cv2.FONT_HERSHEY_SIMPLEX, 0.5, TEXT_COLOUR, 1, cv2.LINE_AA)
     return strip
 
 
 def curves(values: NDArray[np.float64], length: int, width: int, span: float, title: str) -> Image:
-    """True and perceived values (n, 2) as lines, the last of `length` places at the right edge.
+    """A strip (CURVE_HEIGHT, width, 3) with the curves of true and perceived values (n, 2).
 
-    Up is positive (left); NaN is left out.
+    The strip has `length` places and the last value is at its right edge. `span` is the value at
+    the upper edge; up is positive (left). NaN leaves a gap.
     """
     strip = np.full((CURVE_HEIGHT, width, 3), BACK, np.uint8)
     middle = CURVE_HEIGHT // 2
@@ -109,7 +110,7 @@ def curves(values: NDArray[np.float64], length: int, width: int, span: float, ti
     place = (10, CURVE_HEIGHT - 8)
     cv2.putText(strip, title, place, cv2.FONT_HERSHEY_SIMPLEX, 0.4, GRID_COLOUR, 1, cv2.LINE_AA)
     x = width - 1 - (len(values) - 1 - np.arange(len(values))) * width / length
-    # Perception first: where both are equal the truth is seen.
+    # The truth is drawn last, so that it covers an equal perceived value.
     for column, colour in ((1, PREDICTION_COLOUR), (0, TRUTH_COLOUR)):
         shown = np.isfinite(values[:, column])
         y = middle - np.clip(values[:, column] / span, -1.0, 1.0) * (middle - 4)

@@ -1,4 +1,4 @@
-"""One drive from its configuration: road, world, perception, controller, log.
+"""One drive from its configuration: road, world, perception, controller, observers.
 
 controllers drive --controller lqr --track oval --perception truth --log drive.csv
 """
@@ -9,8 +9,10 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from functools import partial
+from operator import attrgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -22,7 +24,8 @@ from controllers.interface import LoopConfig
 from controllers.laws.speed import on_perception, on_the_truth
 from controllers.perception.late import LatePerception, TrustedPerception
 from controllers.perception.perceived import Perceive, Perceived
-from controllers.perception.sources import CameraPerception, PerceptionSource, open_perception
+from controllers.perception.real_time import RealTimePerception, real_time
+from controllers.perception.sources import CameraPerception, open_perception
 from controllers.registry import make_controller
 from runtime.files import check_folder
 from runtime.film import FILM_SUFFIX, Film
@@ -34,31 +37,28 @@ from simulator.world.world import World
 from trackfeatures import UserError
 from trackfeatures.camera import CameraParameters
 
-if TYPE_CHECKING:
-    from controllers.perception.real_time import RealTimePerception
-
 FREQUENCY_HZ = 20
 SCORED_STEPS = {"forza": 6500, "alpine-2": 4500, "eroad": 3700, "g-track-3": 3300}
-"""Numbers of steps by track at which scores are compared with the paper's."""
-TYPICAL_SPEED = 15.0  # m/s, a little less than gear 1 and the default throttle give on a flat road
+"""The paper's number of steps for each of its tracks."""
+TYPICAL_SPEED = 15.0  # m/s, slightly below the speed of gear 1 and THROTTLE on a flat road
 
 START_M, START_S = 5.0, 10.0
-"""A car that ends within so many metres, or stands for so long, did not start."""
+"""A car did not start if its drive ended within START_M (m), or if it stood for START_S (s)."""
 
 Progress = Callable[[int, int], None]
-"""Called with the steps done and the steps in all."""
+"""A function that is called with the steps done and the total number of steps."""
 
 
 @dataclass(frozen=True)
 class Lane:
-    """Where a drive starts and the line it follows, m left of the track's centre."""
+    """The start of a drive and the line that it follows, m left of the track's centre."""
 
     start_d: float
     centre: float
 
 
 class Observer(Protocol):
-    """Is called each control step, before the car moves."""
+    """A function that is called in each control step, before the car moves."""
 
     def __call__(self, now: CarState, perceived: Perceived, steer: float) -> None: ...
 
@@ -71,19 +71,15 @@ def drive(
     observers: Sequence[Observer] = (),
     parameters: Mapping[str, float] | None = None,
 ) -> DriveResult:
-    """Drive as `config` says; `progress` and the `observers` are called each step.
+    """Drive as `config` describes; `progress` and the `observers` are called in each step.
 
-    `parameters` of the controller go before those of the file in `config`.
-
-    The log and the film are written step by step, so an interrupted drive leaves the part driven.
-    Raises UserError for an unknown name, a lane or start outside the road, or a service that does
-    not answer.
+    `parameters` of the controller replace those of the file in `config`. The log and the film are
+    written step by step, so an interrupted drive leaves the driven part. Raises UserError for an
+    unknown name, a lane or start outside the road, or a service that does not answer.
     """
-    check_light(config.light)  # also without a camera: a misspelt name is an error in any case
+    check_light(config.light)  # a misspelt name is an error even without a camera
     if config.video is not None:
-        if config.video.suffix.lower() != FILM_SUFFIX:
-            raise UserError(f"--video {config.video}: give a file ending in {FILM_SUFFIX}")
-        check_folder(config.video)
+        _check_film(config.video)
     track = find_track(config.track, config.tracks_dir)
     road = Road(track, lanes=config.lanes)
     lane = choose_lane(config, road)
@@ -102,12 +98,17 @@ def drive(
             )
         )
         world.reset(seed=config.seed, to_middle=lane.start_d)
-        source = stack.enter_context(_open_perception(config, world, lane))
+        scene: dict[str, Any] = {"light": config.light, "seed": config.seed}
+        source = stack.enter_context(
+            open_perception(
+                config.perception, world, model=config.model, lane_centre=lane.centre, **scene
+            )
+        )
         watching = [*observers, *_observers(config, stack, world, source, lane)]
-        live = _real_time(config, source.perceive, disturbance) if config.realtime else None
+        live = _real_time(config, source, disturbance) if config.realtime else None
         if live is not None:
             stack.enter_context(live)
-        perceive = LastAnswer(live or delay(config, source.perceive, disturbance.delay_s))
+        perceive = LastAnswer(live or delay(config, source, disturbance.delay_s))
         result = run_lap(
             world,
             disturbance.controller(controller, config.seed),
@@ -121,12 +122,16 @@ def drive(
         return result if live is None else replace(result, real_time=live.figures())
 
 
+def _check_film(path: Path) -> None:
+    if path.suffix.lower() != FILM_SUFFIX:
+        raise UserError(f"--video {path}: give a file ending in {FILM_SUFFIX}")
+    check_folder(path)
+
+
 def _real_time(
     config: DriveConfig, perceive: Perceive, disturbance: Disturbance
-) -> "RealTimePerception[World, Any, Any]":
-    """`perceive` on the wall clock. Raises UserError where a simulated delay is asked for, too."""
-    from controllers.perception.real_time import real_time
-
+) -> RealTimePerception[World, Any, Any]:
+    """`perceive` on the wall clock. Raises UserError if a delay is simulated at the same time."""
     if config.latency_ms or disturbance.delay_s:
         raise UserError(
             "--realtime measures the delay of the answers; leave it out, or --latency-ms"
@@ -136,7 +141,7 @@ def _real_time(
 
 
 def check_started(config: DriveConfig, result: DriveResult) -> None:
-    """Raise UserError where the car did not get away from its start."""
+    """Raise UserError if the car did not leave its start."""
     seconds = result.steps / FREQUENCY_HZ
     if result.distance_m >= START_M or (result.ended is None and seconds < START_S):
         return
@@ -148,7 +153,10 @@ def check_started(config: DriveConfig, result: DriveResult) -> None:
 
 
 def choose_pedals(config: DriveConfig, road: Road, lane: Lane) -> Pedals:
-    """A held throttle, or the speed of `config`. Raises UserError for both, and out of range."""
+    """Pedals with the throttle or the speed of `config`.
+
+    Raises UserError if both are given, and for a value out of range.
+    """
     if config.speed is not None:
         if config.throttle is not None:
             raise UserError(
@@ -165,48 +173,30 @@ def choose_pedals(config: DriveConfig, road: Road, lane: Lane) -> Pedals:
 
 
 def delay(config: DriveConfig, perceive: Perceive, unknown_s: float = 0.0) -> Perceive:
-    """`perceive`, late and with lost answers where `config` asks for it, and predicted; uncertain
-    answers are trusted less.
+    """`perceive` with the latency and the lost answers of `config`, which a prediction bridges, and
+    with less weight on uncertain answers.
 
-    A delay of `unknown_s` is not known to the controller: nothing is predicted over it.
+    The controller does not know of the delay `unknown_s` (s), so no prediction bridges it.
     """
-    rng = np.random.default_rng([config.seed, 3])
+    late = partial(
+        LatePerception,
+        state=attrgetter("state"),
+        dt=1.0 / FREQUENCY_HZ,
+        rng=np.random.default_rng([config.seed, 3]),
+    )
     if unknown_s > 0.0:
-        perceive = _late(perceive, unknown_s, 0.0, rng, predict=False)
+        perceive = late(perceive, latency_s=unknown_s, drop=0.0, predict=False)
     if config.latency_ms == 0.0 and config.drop == 0.0:
         if config.perception == "truth":
             return perceive
-        return TrustedPerception(perceive, _state, dt=1.0 / FREQUENCY_HZ)
-    return _late(perceive, config.latency_ms / 1000.0, config.drop, rng, predict=True)
-
-
-def _late(
-    perceive: Perceive,
-    latency_s: float,
-    drop: float,
-    rng: np.random.Generator,
-    *,
-    predict: bool,
-) -> Perceive:
-    return LatePerception(
-        perceive,
-        _state,
-        dt=1.0 / FREQUENCY_HZ,
-        latency_s=latency_s,
-        drop=drop,
-        rng=rng,
-        predict=predict,
-    )
-
-
-def _state(world: World) -> CarState:
-    return world.state
+        return TrustedPerception(perceive, attrgetter("state"), dt=1.0 / FREQUENCY_HZ)
+    return late(perceive, latency_s=config.latency_ms / 1000.0, drop=config.drop)
 
 
 def read_parameters(path: Path | None, controller: str) -> dict[str, float]:
-    """The parameters of `controller` in a file of `controllers tune`; none without a file.
+    """The parameters of `controller` in a file of `controllers tune`; {} without a file.
 
-    Raises UserError where the file is none, or has no entry for the controller.
+    Raises UserError for another kind of file, or one without parameters of the controller.
     """
     if path is None:
         return {}
@@ -221,7 +211,7 @@ def read_parameters(path: Path | None, controller: str) -> dict[str, float]:
 
 
 class LastAnswer:
-    """A perception that keeps its last answer, for those who watch the drive."""
+    """A perception that keeps its last answer for the observers."""
 
     def __init__(self, perceive: Perceive) -> None:
         self._perceive = perceive
@@ -232,21 +222,10 @@ class LastAnswer:
         return self.last
 
 
-def _open_perception(config: DriveConfig, world: World, lane: Lane) -> PerceptionSource:
-    return open_perception(
-        config.perception,
-        world,
-        model=config.model,
-        lane_centre=lane.centre,
-        light=config.light,
-        seed=config.seed,
-    )
-
-
 def _observers(
-    config: DriveConfig, stack: ExitStack, world: World, source: PerceptionSource, lane: Lane
+    config: DriveConfig, stack: ExitStack, world: World, perceive: Perceive, lane: Lane
 ) -> Iterator[Observer]:
-    """The log, the film and the page, which `stack` closes."""
+    """The log, the film and the live page; `stack` closes them."""
     if config.log is not None:
         log = DriveLog(stack.enter_context(config.log.open("w", encoding="utf-8")))
         yield lambda now, perceived, steer: log.write(now, steer)
@@ -255,7 +234,7 @@ def _observers(
         from simulator.camera import open_camera
 
         film = stack.enter_context(Film(config.video, FREQUENCY_HZ))
-        seen = source.perceive if isinstance(source.perceive, CameraPerception) else None
+        seen = perceive if isinstance(perceive, CameraPerception) else None
         if seen is not None:
             camera = seen.camera
         else:
@@ -274,7 +253,7 @@ def _observers(
 def _recorder(
     perceive: LastAnswer, observers: list[Observer], steps: int, progress: Progress | None
 ) -> Callable[[CarState, float], None]:
-    """Calls the observers and reports progress."""
+    """A function that calls the observers and reports the progress."""
     done = itertools.count()
 
     def record(state: CarState, steer: float) -> None:
@@ -288,10 +267,11 @@ def _recorder(
 
 
 def choose_lane(config: DriveConfig, road: Road) -> Lane:
-    """The lane to follow and where to start.
+    """The lane to follow and the start.
 
-    Raises UserError for a lane or start outside the road and, on perception, for a target other
-    than the lane of the start: an image shows the offset only from the lane the car is in.
+    Raises UserError for a lane or start outside the road. On perception it also raises UserError
+    for a target other than the lane of the start, because an image shows only the offset from the
+    lane that the car is in.
     """
     target = config.target_lane
     if target is not None and not 0 <= target < road.lanes:
@@ -320,7 +300,8 @@ def choose_lane(config: DriveConfig, road: Road) -> Lane:
 
 
 def steps_for(requested: int | None, track: str, length_m: float) -> int:
-    """The steps requested; else the track's scored number; else about one lap, in hundreds."""
+    """The control steps of a drive: `requested`, or the paper's number for the track, or about one
+    lap, in hundreds. Raises UserError for a number below 1."""
     if requested is not None:
         if requested < 1:
             raise UserError(f"{requested} steps requested; give 1 or more")

@@ -1,5 +1,4 @@
-"""A drive live in the browser: the page of `simulator watch`, with the perceived road beside the
-truth."""
+"""A live drive in the browser: the page of `simulator watch` with the true and perceived road."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -15,12 +14,12 @@ from simulator.world.world import World
 def watch(
     config: DriveConfig, world: World, lane_centre: float
 ) -> Iterator[Callable[[Perceived], None]]:
-    """A function that shows the drive in `world` as it is now, at port `config.watch`, and holds it
-    to real time.
+    """Serve the page at port `config.watch`; yields a function that shows the present state.
 
-    Raises UserError when the port is in use.
+    The function is called once for each control step and keeps the drive in real time. Raises
+    UserError when the port is in use.
     """
-    # On the wall clock the drive keeps to real time by itself.
+    # A drive on the wall clock is in real time already.
     speed = None if config.realtime else 1.0
     port = 0 if config.watch is None else config.watch
     with Watcher(port=port, light=config.light, speed=speed, seed=config.seed) as watcher:

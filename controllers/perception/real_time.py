@@ -13,6 +13,7 @@ from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from operator import attrgetter
 from typing import TYPE_CHECKING, Any, Generic, Protocol, Self, TypeVar
 
 import numpy as np
@@ -242,17 +243,14 @@ def real_time(
             RequestThread(perceive.ask),
             perceive.read,
             estimate,
-            state=_state,
+            state=attrgetter("state"),
             lost=lost,
         )
     return RealTimePerception(
-        perceive, ImmediateAnswers(), _as_it_is, estimate, state=_state, lost=lost
+        perceive,
+        ImmediateAnswers(),
+        lambda answer: answer,
+        estimate,
+        state=attrgetter("state"),
+        lost=lost,
     )
-
-
-def _state(world: "SimulatedWorld") -> CarState:
-    return world.state
-
-
-def _as_it_is(answer: Perceived) -> Perceived:
-    return answer

@@ -4,9 +4,9 @@ Each source is a function of the simulated world that returns `Perceived`.
 """
 
 import math
-from collections.abc import Callable
-from contextlib import ExitStack
-from typing import TYPE_CHECKING, Any, Protocol, Self
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -184,22 +184,6 @@ def _require_finite(*values: float) -> None:
         raise ValueError(f"{values} are not all finite")
 
 
-class PerceptionSource:
-    """A perception function and the resources that it holds open; a context manager."""
-
-    def __init__(self, perceive: Perceive, *closing: Callable[[], None]) -> None:
-        self.perceive = perceive
-        self._stack = ExitStack()
-        for close in closing:
-            self._stack.callback(close)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._stack.close()
-
-
 def check_perception(name: str, model: str) -> None:
     """Raise UserError for an unknown perception `name`, or a missing run `model`."""
     if name == "model":
@@ -213,9 +197,10 @@ def check_perception(name: str, model: str) -> None:
         )
 
 
+@contextmanager
 def open_perception(
     name: str, world: "World", *, model: str, lane_centre: float, light: str, seed: int
-) -> PerceptionSource:
+) -> Iterator[Perceive]:
     """The perception called `name`: "truth", "model" (the run `model`), or a service's address.
 
     `lane_centre` (m, left positive) is the centre of the lane to follow; `light` and `seed` set the
@@ -224,9 +209,13 @@ def open_perception(
     """
     check_perception(name, model)
     if name == "truth":
-        return PerceptionSource(truth(lane_centre))
-    network: FeatureModel = LocalModel(model) if name == "model" else ServiceModel(name)
+        yield truth(lane_centre)
+        return
     from simulator.camera import open_camera
 
-    camera = open_camera(world.road, network.camera, light=light, seed=seed)
-    return PerceptionSource(CameraPerception(camera, network), network.close, camera.close)
+    network: FeatureModel = LocalModel(model) if name == "model" else ServiceModel(name)
+    with (
+        closing(network),
+        closing(open_camera(world.road, network.camera, light=light, seed=seed)) as camera,
+    ):
+        yield CameraPerception(camera, network)

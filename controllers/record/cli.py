@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from controllers.cli_options import ControllerName
 from datagen.cli.collect import (
     DEFAULT_LANES,
     Frames,
@@ -39,22 +40,21 @@ if TYPE_CHECKING:
 
 FOLDER = Path("datasets/driven")
 FIRST_SEED = 1000
-"""Of a recording by default: other rounds than those of a collection with its default."""
+"""The default seed, so that the rounds differ from those of `datagen collect` by default."""
 
-ControllerName = Annotated[
+DrivingModel = Annotated[
     str,
     typer.Option(
-        help="lqr, lqr-preview, lqr-paper, mpc, mpc-preview, rl, torcs, a folder of `controllers "
-        "train`, or your own class as MODULE:CLASS or FILE.py:CLASS."
+        help='Model that perceives: run folder, name in runs/, "latest", or "default" (the shipped '
+        "model)."
     ),
 ]
-Model = Annotated[str, typer.Option(help="Run whose answers are driven on.")]
-Out = Annotated[Path, typer.Option(help="Dataset folder; an unfinished one is continued.")]
+Out = Annotated[Path, typer.Option(help="Dataset folder; an unfinished dataset is continued.")]
 
 
 def record(
     controller: ControllerName = "lqr",
-    model: Model = "default",
+    model: DrivingModel = "default",
     rounds: Rounds = 12,
     frames: Frames = CollectConfig.frames,
     out: Out = FOLDER,
@@ -70,11 +70,11 @@ def record(
     split: SplitName = CollectConfig.split,
     as_json: AsJson = False,
 ) -> None:
-    """Record rounds while a controller steers on a model's answers; true labels.
+    """Record rounds with true labels while a controller steers on a model's answers.
 
-    The rounds are those of `datagen collect`: the controller follows their courses, which sway and
-    leave the lane, at their speed and in their traffic. A car that leaves the road or hits
-    something is put back onto the road. The same command again continues them.
+    The rounds are planned as those of `datagen collect`. The controller follows their courses,
+    which sway and leave the lane, at their speed and in their traffic. A car that leaves the road
+    or hits something is put back onto the road. The same command continues an interrupted dataset.
     """
     from controllers.record.law import MakePerceivedLaw
     from datagen.planning.tracks import choose_tracks
@@ -100,9 +100,9 @@ def record(
 def _plan(
     config: CollectConfig, tracks_dir: Path | None, controller: str, model: str
 ) -> "tuple[Plan, ClassShares]":
-    """The plan of the rounds, which names what drives; and its classes of the heading.
+    """The plan of the rounds, with the controller and the model, and its shares of road classes.
 
-    Raises UserError for a controller that cannot be made, or a model of another camera.
+    Raises UserError for a controller that cannot be made, or a model for another camera.
     """
     from controllers.interface import LoopConfig
     from controllers.registry import make_controller
@@ -120,7 +120,7 @@ def _plan(
         )
     forecast = TrackForecast.of(config.tracks, tracks_dir)
     plan = make_plan(config, forecast)
-    # Names of their own, so that they can be merged with the rounds of other plans.
+    # The rounds get other names, so that they can be merged with the rounds of other plans.
     rounds = tuple(
         replace(entry, id=f"{DRIVEN}{config.seed}-{entry.id.removeprefix('round-')}")
         for entry in plan.rounds

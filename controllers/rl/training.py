@@ -1,9 +1,9 @@
-"""Training an actor in the Gymnasium environment, with drives to judge it. Frame and units: SI.
+"""Training of an actor in the Gymnasium environment; drives choose the best actor. SI units.
 
 controllers train --algorithm td3 --track forza --seed 0 --out runs/rl
 
-An episode's random numbers come from the seed and its number alone, and a checkpoint is written
-between episodes, so a training resumed from one gives the same actor as one never stopped.
+The random numbers of an episode depend only on the seed and the episode's number, and checkpoints
+are written between episodes. So a resumed training gives the same actor as an uninterrupted one.
 """
 
 import json
@@ -41,22 +41,23 @@ from simulator.track.road import Road
 from simulator.world.world import World
 from trackfeatures.errors import UserError
 
-PAPER_EPISODE_STEPS = 6500
-RANDOM_EPISODE_STEPS = 400
+PAPER_EPISODE_STEPS, RANDOM_EPISODE_STEPS = 6500, 400
+"""Steps of an episode from the paper's start, and with `random_starts`."""
 PAPER_STARTS = 0.1
-"""Share of episodes from the paper's start among those from random ones."""
+"""Share of the episodes that begin at the paper's start with `random_starts`."""
 CONFIG, CURVE = "config.json", "curve.csv"
 COLUMNS = ("step", "seconds", "episodes", "loss", "score_per_step", "mean_abs_d_m", "max_abs_d_m")
 
 Report = Callable[[int, float], None]
-"""Called with the steps done and the best score a step so far, -inf before the first drive."""
+"""A function that is called with the steps done and the best score a step so far, which is -inf
+before the first drive."""
 
 
 def train(config: TrainConfig, report: Report | None = None) -> dict[str, Any]:
-    """Train as `config` says, from the run's checkpoint where it has one.
+    """Train as `config` describes, from the checkpoint of the run if it has one.
 
-    Leaves the best actor (of the drives on the training track), `curve.csv` and `config.json` in
-    `config.out`. Raises UserError for an unknown name or a run of another configuration.
+    Writes the best actor (by the drives on the training track), `curve.csv` and `config.json` into
+    `config.out`. Raises UserError for an unknown name, or a run of another configuration.
     """
     algorithm = _settings(config)
     find_state(config.state)
@@ -73,7 +74,7 @@ def train(config: TrainConfig, report: Report | None = None) -> dict[str, Any]:
 
 
 def _settings(config: TrainConfig) -> Algorithm:
-    """The algorithm's settings, with those that `config` changes."""
+    """The settings of the algorithm, with the changes of `config`."""
     check_reward(config.reward)
     algorithm = find_algorithm(config.algorithm)
     if config.reward == "quadratic":
@@ -93,7 +94,7 @@ def _settings(config: TrainConfig) -> Algorithm:
 
 
 def _prepare_folder(config: TrainConfig) -> None:
-    """Make the run's folder, or check that it holds a run of the same configuration."""
+    """Make the folder of the run, or check that it contains a run of the same configuration."""
     path = config.out / CONFIG
     content = json.loads(json.dumps(asdict(config), default=str))
     if path.exists():
@@ -101,8 +102,8 @@ def _prepare_folder(config: TrainConfig) -> None:
             found = dict(json.loads(path.read_text(encoding="utf-8")))
         except (ValueError, TypeError) as error:
             raise UserError(f"{path} cannot be read ({error}); give another --out") from error
-        found = asdict(TrainConfig()) | found  # runs of before `reward` have none
-        # The folder may have been moved.
+        found = asdict(TrainConfig()) | found  # runs made before `reward` existed lack it
+        # `out` is not compared, because the folder may have been moved.
         changed = [n for n in content if n != "out" and found.get(n) != content[n]]
         if changed:
             raise UserError(
@@ -149,7 +150,7 @@ class _Training:
         }
 
     def _episode(self) -> None:
-        """One episode, with one update a step once the replay holds enough."""
+        """One episode, with an update a step once the replay has `learning_starts` transitions."""
         progress, algorithm, agent = self._progress, self._algorithm, self._agent
         rng = np.random.default_rng([self._config.seed, 1, progress.episode])
         paper, _ = self._env.reset(seed=int(rng.integers(2**31)), options=self._start(rng))
@@ -164,9 +165,9 @@ class _Training:
             if self._config.reward == "quadratic":
                 now = self._world.state
                 reward = quadratic_reward(now.to_middle, now.angle, float(steer[0]), ended)
-            following = agent.see(states.build(paper, self._observe()))
-            agent.remember(seen, action, float(reward), following, ended)
-            seen = following
+            next_seen = agent.see(states.build(paper, self._observe()))
+            agent.remember(seen, action, float(reward), next_seen, ended)
+            seen = next_seen
             progress.step += 1
             if len(agent.replay) >= algorithm.learning_starts:
                 losses.append(agent.update(rng, self._rate_share()))
@@ -179,13 +180,13 @@ class _Training:
         progress.seconds = time.monotonic() - self._started
 
     def _observe(self) -> Observation:
-        """What a controller observes of the truth; the noise on the state is not in it."""
+        """The observation of a controller on the truth, without the noise on the state."""
         now = self._world.state
         heading = self._world.features().heading
         return Observation(now.to_middle, now.angle, heading, now.vx, now.vy, now.yaw_rate)
 
     def _start(self, rng: np.random.Generator) -> dict[str, float]:
-        """Reset options: none for the paper's start, else a random place and motion."""
+        """Options of the reset: {} for the paper's start, or a random place and motion."""
         if not self._algorithm.random_starts or rng.random() < PAPER_STARTS:
             return {}
         return {
@@ -196,7 +197,7 @@ class _Training:
         }
 
     def _explore(self, action: float, rng: np.random.Generator) -> float:
-        """`action`, with the paper's noise at the probability of this step."""
+        """`action` with the paper's noise, which is added with the probability of this step."""
         if rng.random() < exploration_share(self._progress.step):
             action += self._algorithm.beta * EXPLORATION_NOISE * rng.standard_normal()
         return min(max(action, -1.0), 1.0)
@@ -206,7 +207,7 @@ class _Training:
         return 1.0 - (1.0 - self._algorithm.rate_end) * done
 
     def _evaluate(self) -> None:
-        """Drive the training track without noise; keep the actor where it is the best so far."""
+        """Drive the training track without noise; save the actor if it is the best so far."""
         progress, config = self._progress, self._config
         actor = self._actor(0.0)
         result = _drive(actor, self._world.road)
@@ -232,7 +233,7 @@ class _Training:
         atomic_write(config.out / CURVE, text + "\n")
 
     def _actor(self, score: float) -> Actor:
-        """The target actor, an average over the last updates, which steers more evenly."""
+        """The target actor: an average over the last updates, which steers more smoothly."""
         agent, algorithm, config = self._agent, self._algorithm, self._config
         weights = {
             name: array[0].reshape(-1) if name[0] == "b" else array[0]
@@ -256,7 +257,7 @@ class _Training:
 
 
 def _drive(actor: Actor, road: Road) -> DriveResult:
-    """The drive of `controllers drive` on the truth."""
+    """The result of the drive that `controllers drive` makes on the truth."""
     world = World(road, frequency_hz=FREQUENCY_HZ)
     try:
         world.reset(seed=0)
