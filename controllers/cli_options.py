@@ -1,10 +1,9 @@
-"""The options of the `controllers` commands, as annotations of the fields of their configurations.
+"""The options of the `controllers` commands, as annotated fields of their configurations.
 
-A command's configuration is a dataclass. Its annotated fields are the command's options, so each
-option is declared once. Options of several commands are defined here.
-
-Rich reads help texts as markup and drops text in square brackets: defaults that Typer does not know
-are sentences ("Default: ...").
+A command's configuration is a dataclass. A field with an annotation is an option of the command, so
+an option is declared once: the annotation is its help text or a `typer.Option`. Options of several
+commands are defined here. Rich reads help texts as markup and drops text in square brackets, so a
+default that Typer does not know is a sentence ("Default: ...").
 """
 
 from collections.abc import Callable
@@ -12,7 +11,7 @@ from dataclasses import fields
 from functools import wraps
 from inspect import Parameter, Signature
 from pathlib import Path
-from typing import Annotated, Any, TypeVar, get_origin
+from typing import Annotated, Any, TypeVar, get_args, get_origin
 
 from typer import Option
 
@@ -22,54 +21,34 @@ Config = TypeVar("Config")
 
 ControllerName = Annotated[
     str,
-    Option(
-        help="Controller: lqr, lqr-preview, lqr-paper, mpc, mpc-preview, rl, rl-residual, torcs, a "
-        "folder of `controllers train`, or a class of your own as MODULE:CLASS or FILE.py:CLASS."
-    ),
+    "Controller: lqr, lqr-preview, lqr-paper, mpc, mpc-preview, rl, rl-residual, torcs, a folder "
+    "of `controllers train`, or a class of your own as MODULE:CLASS or FILE.py:CLASS.",
 ]
 Controllers = Annotated[
-    str, Option(help="Controllers, separated by commas, as in `controllers drive --controller`.")
+    str, "Controllers, separated by commas, as in `controllers drive --controller`."
 ]
-Track = Annotated[str, Option(help="Name of a track (`simulator tracks`), or its file.")]
-Tracks = Annotated[str, Option(help="Names of tracks, or their files, separated by commas.")]
-TracksDir = Annotated[Path | None, Option(help="A further folder to search for tracks.")]
+Track = Annotated[str, "Name of a track (`simulator tracks`), or its file."]
+Tracks = Annotated[str, "Names of tracks, or their files, separated by commas."]
+TracksDir = Annotated[Path | None, "A further folder to search for tracks."]
 Steps = Annotated[
     int | None,
-    Option(
-        help="Control steps of 50 ms. Default: the paper's number on its four tracks, about a lap "
-        "on others."
-    ),
+    "Control steps of 50 ms. Default: the paper's number on its tracks, about a lap on others.",
 ]
-Model = Annotated[
-    str,
-    Option(
-        help='Model of --perception model: run folder, name in runs/, "latest", or "default" (the '
-        "shipped model)."
-    ),
-]
-Latency = Annotated[float, Option(help="Latency of the perception's answers, ms, 0 to 1000.")]
-Drop = Annotated[
-    float, Option(help="Share of the perception's answers that are lost, 0 to below 1.")
-]
+MODELS = 'run folder, name in runs/, "latest", or "default" (the shipped model).'
+Model = Annotated[str, f"Model of --perception model: {MODELS}"]
+Latency = Annotated[float, "Latency of the perception's answers, ms, 0 to 1000."]
+Drop = Annotated[float, "Share of the perception's answers that are lost, 0 to below 1."]
 Light = Annotated[
     str,
-    Option(
-        help="Light of the images: clear, overcast, dusk, fog, heavy-shadow, rain or snow. The "
-        "truth does not depend on it."
-    ),
+    "Light of the images: clear, overcast, dusk, fog, heavy-shadow, rain or snow. The truth does "
+    "not depend on it.",
 ]
 Parameters = Annotated[
     Path | None,
-    Option(
-        help="File of `controllers tune` with parameters of controllers. Default: parameters of "
-        "their own."
-    ),
+    "File of `controllers tune` with parameters of controllers. Default: parameters of their own.",
 ]
 Reward = Annotated[
-    str,
-    Option(
-        help="paper, or quadratic: -(0.3 d^2 + angle^2 + 0.03 delta^2), the paper's second reward."
-    ),
+    str, "paper, or quadratic: -(0.3 d^2 + angle^2 + 0.03 delta^2), the paper's second reward."
 ]
 
 
@@ -80,19 +59,26 @@ def options(
 
     Its options are the annotated fields of the dataclass `config`, with their defaults, and --json.
     """
+    declared = [
+        Parameter(
+            one.name, Parameter.KEYWORD_ONLY, default=one.default, annotation=_option(one.type)
+        )
+        for one in fields(config)  # type: ignore[arg-type]  # a dataclass
+        if get_origin(one.type) is Annotated
+    ]
+    as_json = Parameter("as_json", Parameter.KEYWORD_ONLY, default=False, annotation=AsJson)
 
     def decorate(function: Callable[[Config, bool], None]) -> Callable[..., None]:
         @wraps(function)
         def command(as_json: bool, **values: Any) -> None:
             function(config(**values), as_json)
 
-        parameters = [
-            Parameter(one.name, Parameter.KEYWORD_ONLY, default=one.default, annotation=one.type)
-            for one in fields(config)  # type: ignore[arg-type]  # a dataclass
-            if get_origin(one.type) is Annotated
-        ]
-        as_json = Parameter("as_json", Parameter.KEYWORD_ONLY, default=False, annotation=AsJson)
-        command.__signature__ = Signature([*parameters, as_json])  # type: ignore[attr-defined]
+        command.__signature__ = Signature([*declared, as_json])  # type: ignore[attr-defined]
         return command
 
     return decorate
+
+
+def _option(annotated: Any) -> Any:
+    kind, about = get_args(annotated)
+    return Annotated[kind, Option(help=about)] if isinstance(about, str) else annotated

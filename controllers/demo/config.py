@@ -11,7 +11,7 @@ from typer import Option
 class DemoConfig:
     """What the demo collects and how long it trains; the defaults take 17 minutes on two cores."""
 
-    out: Annotated[Path, Option(help="Folder for all results.")] = Path("demo")
+    out: Annotated[Path, "Folder for all results."] = Path("demo")
     rounds: Annotated[int, Option(help="Number of rounds to collect.", min=12)] = 300
     frames: Annotated[int, Option(help="Frames per round.", min=20)] = 200
     minutes: Annotated[float, Option(help="Training time, minutes.", min=0.1)] = 8.5

@@ -31,11 +31,10 @@ import math
 from dataclasses import replace
 
 from controllers.interface import LoopConfig, Observation
-from controllers.laws.lateral_model import LateralModel
+from controllers.laws.lateral_model import LateralModel, Matrix
 from controllers.laws.lqr_gains import (
     SLOWEST_M_S,
     LqrWeights,
-    Matrix,
     SpeedTable,
     continuous_gains,
     discrete_gains,

@@ -6,7 +6,7 @@ from typing import Annotated
 
 from typer import Option
 
-from controllers.cli_options import Reward, Track, TracksDir
+from controllers import cli_options as options
 from trackfeatures.errors import UserError
 
 EXPLORATION_STEPS = 400_000
@@ -21,36 +21,36 @@ EXPLORATION_NOISE = 0.05
 
 @dataclass(frozen=True)
 class Algorithm:
-    """The settings of an algorithm, which stay the same from one training to the next."""
+    """The settings of an algorithm; the defaults are those of `ddpg`."""
 
-    critics: int
+    critics: int = 1
     """Number of critics; the target uses the smallest of their values."""
-    actor_delay: int
+    actor_delay: int = 1
     """Updates of the critics per update of the actor."""
-    target_noise: float
+    target_noise: float = 0.0
     """Standard deviation of the noise on the target action; the noise is clipped at 2.5 of it."""
-    discount: float
-    tau: float
+    discount: float = 0.99
+    tau: float = 0.001
     """Share of the networks' parameters in the soft update of the target networks."""
-    batch: int
+    batch: int = 64
     """Transitions per update."""
-    actor_rate: float
-    critic_rate: float
-    rate_end: float
+    actor_rate: float = 1e-4
+    critic_rate: float = 3e-4
+    rate_end: float = 1.0
     """Share of the learning rates that is left at the last step; they fall linearly."""
-    beta: float
+    beta: float = 4.0
     """The noise on an action has the standard deviation beta * EXPLORATION_NOISE."""
-    state_noise: float
+    state_noise: float = 0.05
     """Standard deviation of the noise on the state."""
-    random_starts: bool
+    random_starts: bool = False
     """Whether episodes are of 400 steps from a random place and motion; the paper's have 6500."""
-    mirrored: bool
+    mirrored: bool = False
     """Whether left and right are exchanged in half of the transitions, and the actor is odd."""
-    scaled: bool
+    scaled: bool = False
     """Whether the networks' inputs are divided by their typical spread."""
-    reward_baseline: float
+    reward_baseline: float = 0.0
     """Subtracted from every reward, also after a terminal state: the optimal policy is the same."""
-    reward_scale: float
+    reward_scale: float = 1.0
     """Factor on the rewards."""
     hidden: tuple[int, int] = (64, 64)
     """Sizes of the two hidden layers."""
@@ -61,31 +61,13 @@ class Algorithm:
 
 
 ALGORITHMS = {
-    "ddpg": Algorithm(
-        critics=1,
-        actor_delay=1,
-        target_noise=0.0,
-        discount=0.99,
-        tau=0.001,
-        batch=64,
-        actor_rate=1e-4,
-        critic_rate=3e-4,
-        rate_end=1.0,
-        beta=4.0,
-        state_noise=0.05,
-        random_starts=False,
-        mirrored=False,
-        scaled=False,
-        reward_baseline=0.0,
-        reward_scale=1.0,
-    ),
+    "ddpg": Algorithm(),
     "td3": Algorithm(
         critics=2,
         actor_delay=2,
         target_noise=0.02,
         discount=0.95,
         tau=0.005,
-        batch=64,
         actor_rate=3e-4,
         critic_rate=5e-4,
         rate_end=0.05,
@@ -109,38 +91,30 @@ def _defaults(name: str) -> str:
 class TrainConfig:
     """One training. Equal configurations give equal actors, bit for bit."""
 
-    out: Annotated[Path, Option(help="Folder for the actor, its curve and its checkpoint.")] = Path(
-        "runs/rl"
-    )
-    algorithm: Annotated[str, Option(help=f"Algorithm: {' or '.join(ALGORITHMS)}.")] = "ddpg"
-    track: Track = "forza"
+    out: Annotated[Path, "Folder for the actor, its curve and its checkpoint."] = Path("runs/rl")
+    algorithm: Annotated[str, f"Algorithm: {' or '.join(ALGORITHMS)}."] = "ddpg"
+    track: options.Track = "forza"
     seed: Annotated[int, Option(help="Seed of all random numbers of the training.", min=0)] = 0
     steps: Annotated[
         int, Option(help="Control steps of 50 ms, with one update after each.", min=1)
     ] = 400_000
-    state: Annotated[
-        str, Option(help="State that the actor receives: paper, stacked or residual.")
-    ] = "paper"
+    state: Annotated[str, "State that the actor receives: paper, stacked or residual."] = "paper"
     state_noise: Annotated[
         float | None,
-        Option(
-            help="Standard deviation of the noise on the paper's state. Default: "
-            f"{_defaults('state_noise')}."
-        ),
+        "Standard deviation of the noise on the paper's state. Default: "
+        f"{_defaults('state_noise')}.",
     ] = None
     actor_rate: Annotated[
-        float | None,
-        Option(help=f"Learning rate of the actor. Default: {_defaults('actor_rate')}."),
+        float | None, f"Learning rate of the actor. Default: {_defaults('actor_rate')}."
     ] = None
     critic_rate: Annotated[
-        float | None,
-        Option(help=f"Learning rate of the critics. Default: {_defaults('critic_rate')}."),
+        float | None, f"Learning rate of the critics. Default: {_defaults('critic_rate')}."
     ] = None
-    reward: Reward = "paper"
+    reward: options.Reward = "paper"
     evaluate_every: Annotated[
         int, Option(help="Steps between two drives; a checkpoint is written after each.", min=1)
     ] = 20_000
-    tracks_dir: TracksDir = None
+    tracks_dir: options.TracksDir = None
 
 
 def find_algorithm(name: str) -> Algorithm:

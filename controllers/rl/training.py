@@ -80,13 +80,8 @@ def _settings(config: TrainConfig) -> Algorithm:
     if config.reward == "quadratic":
         scale = QUADRATIC_SCALE * algorithm.reward_scale
         algorithm = replace(algorithm, reward_baseline=0.0, reward_scale=scale)
-    noise, actor, critic = config.state_noise, config.actor_rate, config.critic_rate
-    algorithm = replace(
-        algorithm,
-        state_noise=algorithm.state_noise if noise is None else noise,
-        actor_rate=algorithm.actor_rate if actor is None else actor,
-        critic_rate=algorithm.critic_rate if critic is None else critic,
-    )
+    given = {name: getattr(config, name) for name in ("state_noise", "actor_rate", "critic_rate")}
+    algorithm = replace(algorithm, **{n: value for n, value in given.items() if value is not None})
     for rate in (algorithm.actor_rate, algorithm.critic_rate):
         if not 0.0 < rate < math.inf:
             raise UserError(f"the learning rate {rate} is out of range; give one above 0")

@@ -1,4 +1,4 @@
-"""The demo: overlays at hand-computed pixels, choice of frames, limit checks, child processes."""
+"""The demo: overlays at known pixels, choice of frames, limit checks, child processes."""
 
 import json
 import os
@@ -60,7 +60,7 @@ def test_absent_distances_are_not_drawn() -> None:
 
 
 class FakeFrames:
-    """Only what `spread` reads: the round of each frame."""
+    """The round of each frame, which is all that `spread` reads."""
 
     class labels:  # noqa: N801  # stands for an attribute
         round = np.repeat([3, 4, 9], [50, 5, 50])
@@ -89,7 +89,7 @@ def evaluation(angle: float = 0.02, ml: float = 0.2, heading: float = 0.9) -> di
     [
         ({}, []),
         ({"ml": 0.36}, ["ml (m)"]),
-        ({"ml": 0.33}, ["ml (m)"]),  # under 0.35 m, but not under 0.65 of the mean's 0.5 m
+        ({"ml": 0.33}, ["ml (m)"]),  # below 0.35 m, but above 0.65 of the baseline's 0.5 m
         ({"angle": 0.027}, ["angle (rad)"]),
         ({"heading": 0.84}, ["heading (share right)"]),
     ],
@@ -147,7 +147,7 @@ def test_posted_answers_must_be_as_good_as_the_evaluation_says() -> None:
     assert [one.reached for one in bad] == [False, False]
 
 
-def test_the_plan_scales_with_what_is_asked_for(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_plan_scales_with_rounds_and_minutes(capsys: pytest.CaptureFixture[str]) -> None:
     announce(DemoConfig())
     announce(DemoConfig(rounds=600, minutes=30.0))
     announce(DemoConfig(first_drive=True))
@@ -162,7 +162,7 @@ def test_the_plan_scales_with_what_is_asked_for(capsys: pytest.CaptureFixture[st
 
 
 @pytest.mark.slow
-def test_the_first_drive_alone_leaves_a_film_of_the_shipped_models_answers(tmp_path: Path) -> None:
+def test_the_first_drive_makes_a_film_of_the_shipped_models_answers(tmp_path: Path) -> None:
     done = typed("controllers", "demo", "--first-drive", "--out", tmp_path / "demo", "--json")
     assert done.returncode == 0, done.stderr
     result = json.loads(done.stdout)
@@ -189,7 +189,7 @@ def test_run_module_returns_exit_code_and_output() -> None:
 
 
 def test_sigterm_also_ends_the_child_process(tmp_path: Path) -> None:
-    """The child has time to clean up: here, to write a file."""
+    """The child has time to clean up; this one writes a file."""
     (tmp_path / "child.py").write_text(
         "import pathlib, signal, sys, time\n"
         "def stop(*_):\n    pathlib.Path('stopped').touch()\n    sys.exit(0)\n"

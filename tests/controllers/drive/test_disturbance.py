@@ -1,4 +1,4 @@
-"""Disturbances: paired by the seed, of the stated size, and felt by the car."""
+"""Disturbances: equal for equal seeds, of the stated size, and with an effect on the car."""
 
 import math
 
@@ -28,6 +28,8 @@ SEEN = Observation(0.5, 0.1, RoadClass.LEFT, 20.0, 0.0, 0.2, 0.01)
 
 
 class Listener:
+    """A controller that stores its observations."""
+
     def __init__(self) -> None:
         self.heard: list[Observation] = []
 
@@ -60,7 +62,7 @@ def test_the_car_is_drawn_within_the_stated_ranges() -> None:
     for seed in range(20):
         friction = DISTURBANCES["friction"].car(seed)
         assert 0.8 <= friction.friction <= 1.6
-        # Less grip, but not softer tyres.
+        # The friction changes, the stiffness of the tyres does not.
         assert friction.cornering_stiffness(True, 1.0) == pytest.approx(
             plain.cornering_stiffness(True, 1.0)
         )
@@ -81,7 +83,7 @@ def test_gusts_have_the_stated_size_and_last() -> None:
 
 
 def test_a_side_wind_accelerates_the_car_by_its_force_over_its_mass() -> None:
-    """Free of steering, the sideways speed gained in one step is the force over the mass."""
+    """Without steering, the lateral speed gained in a step is the force over the mass."""
 
     class Steady:
         def step(self) -> float:
@@ -98,7 +100,7 @@ def test_a_side_wind_accelerates_the_car_by_its_force_over_its_mass() -> None:
             ends.append(world.step(Command(gear=0)))
         force = 0.5 * 1.23 * 4.5 * 10.0 * 20.0
         gained = ends[1].vy - ends[0].vy
-        # The tyres begin to hold against it within the 5 ms.
+        # The tyre forces reduce it slightly within the 5 ms.
         assert 0.6 < gained / (force / plain.car.total_mass / 200) <= 1.01
 
 

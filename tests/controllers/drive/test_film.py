@@ -1,4 +1,4 @@
-"""The film of a drive: size, length, curves, and that it survives an interruption."""
+"""The film of a drive: size, length, curves, and a film of an interrupted drive."""
 
 from pathlib import Path
 
@@ -30,14 +30,14 @@ def test_a_drive_on_the_truth_is_filmed(tmp_path: Path) -> None:
     shown = frames(path)
     assert len(shown) == 8
     assert shown[0].shape == (2 * 210 + 28 + 2 * CURVE_HEIGHT, 2 * 280 + 160, 3)
-    # The markings of the truth are drawn over the painted ones, in the view and from above.
+    # The true markings are drawn over the painted markings, in both views.
     red, green, blue = np.moveaxis(shown[0][:420].astype(int), 2, 0)
     drawn = green - np.maximum(red, blue) > 80
     assert drawn[:, :560].sum() > 100
     assert drawn[:, 560:].sum() > 100
 
 
-def test_an_interrupted_film_keeps_what_was_driven(tmp_path: Path) -> None:
+def test_an_interrupted_film_contains_the_driven_part(tmp_path: Path) -> None:
     path = tmp_path / "drive.mp4"
 
     def stop(done: int, total: int) -> None:
@@ -57,7 +57,7 @@ def test_another_suffix_is_refused(name: str, tmp_path: Path) -> None:
         drive(DriveConfig(steps=5, video=tmp_path / "none" / "drive.mp4"))
 
 
-def test_curves_rise_to_the_left_and_leave_out_what_was_not_perceived() -> None:
+def test_curves_rise_to_the_left_and_have_gaps_without_perception() -> None:
     values = np.array([[0.5, np.nan]] * 10 + [[-0.5, 0.9]] * 10)
     strip = curves(values, 20, 400, 1.0, "offset").astype(int)
 

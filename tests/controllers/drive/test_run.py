@@ -1,4 +1,4 @@
-"""Closed-loop driving on a fake world with known sums, and on the simulator."""
+"""Closed-loop driving on a fake world with known results, and on the simulator."""
 
 import csv
 import io
@@ -22,8 +22,8 @@ from controllers.drive.config import DriveConfig
 from controllers.drive.run import choose_lane, drive, steps_for
 from controllers.interface import Observation
 from controllers.laws.lqr import WEIGHTS_BRIEFLY_TRAINED, LqrPreview
-from controllers.perception.perceived import Perceived
-from controllers.perception.sources import PerceptionSource, truth
+from controllers.perception.perceived import Perceive, Perceived
+from controllers.perception.sources import truth
 from serve.client import ServiceError
 from simulator.track.catalogue import find_track
 from simulator.track.road import Road
@@ -66,7 +66,7 @@ def test_the_score_is_the_sum_of_the_rewards_after_each_step() -> None:
 
 
 def test_the_share_of_steps_between_the_markings_of_the_lane() -> None:
-    # A lane of 4 m about 1 m to the left of the middle: from -1 to 3 m.
+    # A lane of 4 m with its centre 1 m left of the middle: from -1 to 3 m.
     places = (-1.1, -0.9, 2.9, 3.1)
     world = FakeWorld(*(at_rest(to_middle=place) for place in places))
     law = FunctionController(lambda observation: 0.0)
@@ -160,7 +160,7 @@ def test_log_has_the_columns_and_signs_of_the_reference_laps() -> None:
 
 
 def test_the_default_controller_on_the_true_state_stays_in_the_middle(tmp_path: Path) -> None:
-    """15 s from rest, half a metre off at the start, through the first bend of the town."""
+    """15 s from rest, with an initial offset of 0.5 m, through the first bend of the town."""
     log = tmp_path / "drive.csv"
     config = DriveConfig(track="town", steps=300, start_d=0.5, log=log)
     result = drive(config)
@@ -196,7 +196,7 @@ def test_truth_measures_the_offset_from_the_target_lane() -> None:
 
 
 def test_lqr_preview_drives_on_a_noisy_perception() -> None:
-    """Errors of a briefly trained model; the weights for it keep the car in its lane."""
+    """The soft weights keep the car in its lane with the errors of a briefly trained model."""
     rng = np.random.default_rng(3)
 
     def perceive(world: World) -> Perceived:
@@ -222,18 +222,15 @@ def test_lqr_preview_drives_on_a_noisy_perception() -> None:
 
 @pytest.mark.parametrize(("perception", "noisy"), [("truth", False), ("model", True)])
 def test_a_drive_on_perception_is_noisy(
-    perception: str, noisy: bool, monkeypatch: pytest.MonkeyPatch
+    perception: str, noisy: bool, perceive_by: Callable[[Perceive], None]
 ) -> None:
-    def open_perception(*_: object, **__: object) -> PerceptionSource:
-        return PerceptionSource(truth(0.0))
-
-    monkeypatch.setattr("controllers.drive.run.open_perception", open_perception)
+    perceive_by(truth(0.0))
     result = drive(DriveConfig(perception=perception, steps=3))
     assert result.as_json()["noisy"] is noisy
 
 
 def test_a_service_that_dies_in_the_middle_of_a_drive_leaves_the_log(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, perceive_by: Callable[[Perceive], None]
 ) -> None:
     exact, asked = truth(0.0), 0
 
@@ -244,10 +241,7 @@ def test_a_service_that_dies_in_the_middle_of_a_drive_leaves_the_log(
             raise ServiceError("http://127.0.0.1:8000 does not answer")
         return exact(world)
 
-    def open_perception(*_: object, **__: object) -> PerceptionSource:
-        return PerceptionSource(perceive)
-
-    monkeypatch.setattr("controllers.drive.run.open_perception", open_perception)
+    perceive_by(perceive)
     log = tmp_path / "drive.csv"
     with pytest.raises(UserError, match="does not answer"):
         drive(DriveConfig(perception="http://127.0.0.1:8000", steps=30, log=log))

@@ -1,4 +1,4 @@
-"""`controllers drive --watch`: the page of `simulator watch` beside a controller's drive."""
+"""`controllers drive --watch`: the page of `simulator watch` during a controller's drive."""
 
 import json
 import re
@@ -39,7 +39,7 @@ def test_a_drive_is_shown_live_and_the_page_ends_with_it() -> None:
         with Page(int(found[1])) as page:
             assert (page.scene["track"], page.scene["controls"]) == ("oval", False)
             page.ask(view="top")
-            with suppress(ConnectionClosed):  # the loop's only end: the page's, with the drive
+            with suppress(ConnectionClosed):  # the page ends with the drive, which ends the loop
                 while True:
                     data = page.line.recv(timeout=120)
                     if isinstance(data, bytes):
@@ -56,7 +56,7 @@ def test_a_drive_is_shown_live_and_the_page_ends_with_it() -> None:
     assert time.monotonic() - began > 0.9 * STEPS / 20  # at its real pace
     assert simplejpeg.decode_jpeg(pictures[-1]).shape == (SIZE[1], SIZE[0], 3)
     assert states[-1]["driver"] == "program"
-    # On the truth what the controller knows is the state: in the middle of the left lane.
+    # On the truth the perceived road is the state: the centre of the left lane.
     assert states[-1]["perceived"] == {
         "to_middle": states[-1]["to_middle"],
         "angle": states[-1]["angle"],

@@ -1,4 +1,4 @@
-"""Actors: their files, what is refused, their state, and the ones that ship."""
+"""Actors: their files, refusals, their state, and the shipped actors."""
 
 import hashlib
 import json
@@ -35,7 +35,7 @@ from controllers.registry import make_controller
 from simulator.track.catalogue import find_track
 from simulator.track.road import Road
 from simulator.world.world import World
-from tests.typed import typed
+from tests.typed import error_line, typed
 from trackfeatures import RoadClass
 from trackfeatures.errors import UserError
 
@@ -44,7 +44,7 @@ SHA_256 = {
     "rl-residual": "e7c30c5a1f0bc12b982b5a29b7ba8ad2f41a1c07b06243328d7922453dafffd3",
 }
 BOUNDS_M = {"rl": 0.5, "rl-residual": 0.5}
-"""Largest distance from the centre in the test's drive."""
+"""Largest distance from the centre in the drive of the test."""
 
 SEEN = Observation(0.5, -0.1, RoadClass.RIGHT, vx=15.0, vy=-0.2, yaw_rate=0.3)
 
@@ -79,7 +79,11 @@ def test_the_state_is_the_environments() -> None:
     world = env.unwrapped.world  # type: ignore[attr-defined]
     now, heading = world.state, world.features().heading
     seen = Observation(now.to_middle, now.angle, heading, now.vx, now.vy, now.yaw_rate)
-    assert paper_state(seen, world.road.half_width) == pytest.approx(expected, abs=1e-6)
+    np.testing.assert_array_equal(paper_state(seen, world.road.half_width), expected)
+    speed = 75.0 / 3.6
+    numbers = [now.to_middle / 6.0, now.angle / np.pi, now.vx / speed, now.vy / speed]
+    one_hot = [float(heading == kind) for kind in RoadClass]
+    assert expected == pytest.approx([*numbers, *one_hot], abs=1e-6)
     env.close()
 
 
@@ -196,7 +200,7 @@ def test_wrong_weights_are_refused_in_one_line(tmp_path: Path, case: str) -> Non
         load_actor(tmp_path)
     done = typed("controllers", "drive", "--controller", tmp_path, "--track", "oval")
     assert done.returncode == 1
-    assert len([line for line in done.stderr.splitlines() if line.startswith("error: ")]) == 1
+    error_line(done)
     assert "\n" not in str(caught.value)
     assert isinstance(caught.value, ActorError) or "version" in message or "pixels" in message
 
@@ -228,7 +232,7 @@ def test_a_shipped_actor_is_refused_at_another_rate(name: str) -> None:
 
 
 def test_a_shipped_actor_gets_no_curvature() -> None:
-    """The same information as the paper's: the curvature given to LQR changes nothing."""
+    """An actor receives the same information as the paper's; the curvature does not change it."""
     for name in SHA_256:
         without, given = (
             load_controller(SHIPPED / name).update(replace(SEEN, curvature=c)) for c in (None, 0.05)
@@ -262,7 +266,7 @@ def test_an_update_takes_less_than_a_tenth_of_a_millisecond(name: str) -> None:
             taken.append(time.perf_counter() - start)
         return float(np.median(taken))
 
-    assert min(median_s() for _ in range(5)) < 1e-4  # another program may run for a second
+    assert min(median_s() for _ in range(5)) < 1e-4  # another program may disturb a round
 
 
 def test_two_controllers_of_one_actor_do_not_share_their_past() -> None:

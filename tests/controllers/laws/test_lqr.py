@@ -1,4 +1,4 @@
-"""LQR: textbook cases, stability of the closed loop, signs, step response."""
+"""LQR: closed-form gains, stability of the closed loop, signs, step response."""
 
 import math
 from dataclasses import replace
@@ -10,7 +10,7 @@ from scipy.linalg import solve_discrete_are
 
 from controllers.drive.closed_loop import run_lap
 from controllers.interface import Controller, LoopConfig, Observation
-from controllers.laws.lateral_model import LateralModel
+from controllers.laws.lateral_model import LateralModel, Matrix
 from controllers.laws.lqr import (
     WEIGHTS_BRIEFLY_TRAINED,
     WEIGHTS_EXACT,
@@ -21,7 +21,7 @@ from controllers.laws.lqr import (
     LqrPreview,
     RateEstimate,
 )
-from controllers.laws.lqr_gains import FASTEST_M_S, SLOWEST_M_S, LqrWeights, Matrix, clqr, dlqr
+from controllers.laws.lqr_gains import FASTEST_M_S, SLOWEST_M_S, LqrWeights, clqr, dlqr
 from controllers.laws.steering import STEERING_LOCK
 from controllers.laws.torcs_feedback import StateFeedback
 from controllers.perception.sources import truth
@@ -60,7 +60,7 @@ def test_gain_solves_the_discrete_riccati_equation() -> None:
 
 
 def test_model_matrices_are_those_of_the_paper() -> None:
-    """The entries of the paper's A and B, typed from it, at 20 m/s."""
+    """The entries of A and B at 20 m/s, typed from the paper."""
     A, B, turn = LateralModel().matrices(20.0)
     c, m, inertia, lf, lr, v = 80_000.0, 1150.0, 2000.0, 1.27, 1.37, 20.0
     moment = -2 * c * lf + 2 * c * lr
@@ -101,7 +101,7 @@ def test_continuous_regulator_of_an_integrator_has_the_closed_form_gain() -> Non
 @pytest.mark.parametrize("dt", [0.02, 0.05, 0.1])
 def test_the_closed_loop_is_stable_at_every_speed(weights: LqrWeights, dt: float) -> None:
     lqr = Lqr(dt, weights)
-    for speed in np.arange(5.0, 35.5, 0.5):  # between the points of the grid, too
+    for speed in np.arange(5.0, 35.5, 0.5):  # also between the points of the grid
         A, B = lqr.model.discretise(float(speed), dt)
         loop = A - B @ lqr.gain(float(speed))[None, :]
         assert np.abs(np.linalg.eigvals(loop)).max() < 0.999
@@ -129,7 +129,7 @@ def test_steering_signs(name: str, noisy: bool) -> None:
     assert steer(to_lane_centre=-0.05) > 0
     assert steer(angle=0.01) > 0  # nose to the right of the track: steer left
     assert steer(angle=-0.01) < 0
-    if name in ("lqr-preview", "torcs"):  # the others do not look at the yaw rate
+    if name in ("lqr-preview", "torcs"):  # the only laws that depend on the yaw rate
         assert steer(yaw_rate=0.05) < 0  # turning left on a straight: steer right
     assert steer(to_lane_centre=9.0) == -steer(to_lane_centre=-9.0)
     assert -1.0 <= steer(to_lane_centre=90.0) < -0.3
@@ -188,7 +188,7 @@ def test_step_response(
 ) -> None:
     offsets = response(form(0.05, weights), speed)
     assert offsets.min() > -0.15  # overshoots by less than 15 %
-    assert np.abs(offsets[100:]).max() < 0.02  # there within 5 s
+    assert np.abs(offsets[100:]).max() < 0.02  # settled within 5 s
     assert np.abs(response(StateFeedback(), speed)[100:]).max() < 0.05
 
 
@@ -198,7 +198,7 @@ def test_no_steady_offset_in_a_bend_of_unmeasured_curvature() -> None:
 
 
 def test_the_heading_class_limits_the_estimated_curvature() -> None:
-    """Yaw to the left where the road turns right is an error, not a bend."""
+    """A yaw to the left on a road that turns right is an error, not a bend."""
     observation = replace(STRAIGHT_AT_20, yaw_rate=0.4, curvature=None)
     limited = LqrPreview().update(replace(observation, heading=RoadClass.RIGHT))
     estimated = LqrPreview().update(replace(observation, heading=RoadClass.LEFT))
@@ -221,7 +221,7 @@ def test_torcs_feedback_reproduces_recorded_steering(
 
 
 def test_lqr_without_preview_keeps_an_offset_in_a_bend_and_ignores_the_curvature() -> None:
-    """In a steady bend K1 e1 + K3 e2 is minus the wheel angle that the bend needs."""
+    """In a steady bend -(K1 e1 + K3 e2) is the wheel angle that the bend needs."""
     lqr, speed, curvature = Lqr(), 15.0, 1 / 80
     offset = response(Lqr(), speed, curvature)[-1]
     wheel, heading = LateralModel().cornering(speed)
@@ -253,7 +253,7 @@ def test_rates_are_differences_and_can_be_filtered() -> None:
 
 @pytest.mark.parametrize("name", ["lqr", "lqr-preview", "mpc", "mpc-preview", "rl", "rl-residual"])
 def test_a_return_from_far_beside_the_line_stays_within_what_a_model_answers(name: str) -> None:
-    """From TORCS's place on a wide grid, at rest; the model that ships answers 0.25 rad at most."""
+    """At rest at TORCS's place on a wide grid; the shipped model answers 0.25 rad at most."""
     controller = make_controller(name, LoopConfig(0.05, noisy=True))
     angles = []
     with World(Road(find_track("highway"), lanes=1), frequency_hz=20) as world:

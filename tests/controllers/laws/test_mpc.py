@@ -1,4 +1,4 @@
-"""MPC: the solver against SciPy's, its constraints, the model's steps, driving in a bend."""
+"""MPC: the solver compared with SciPy's, its constraints, the steps of the model, bends."""
 
 import math
 
@@ -17,7 +17,7 @@ WEIGHTS = {"paper": MpcWeights(1.0, 1.0, 1.0), "sharp": MpcWeights(10.0, 1.0, 0.
 def paper_cost(
     plan: Vector, start: tuple[float, float], speed: float, curvature: float, weights: MpcWeights
 ) -> float:
-    """The paper's cost, written from its equations with x, y and psi in the plane."""
+    """The paper's cost by its equations, with x, y and psi in the plane."""
     lf, lr, dt = 1.27, 1.37, 0.05
     x, (y, psi), total = 0.0, start, 0.0
     for k, delta in enumerate(plan):
@@ -89,8 +89,8 @@ def test_at_rest_and_far_off_the_answer_is_finite_and_within_the_lock() -> None:
         assert steer * offset < 0.0
 
 
-def test_the_plan_is_shifted_as_the_start_of_the_next_solve() -> None:
-    """The same answer from a warm start and from none."""
+def test_a_warm_start_gives_the_answer_of_a_cold_start() -> None:
+    """A warm and a cold start give the same answer."""
     warm = Mpc()
     warm.update(observed(to_lane_centre=1.0))
     again = observed(to_lane_centre=0.9, angle=0.03)

@@ -1,14 +1,14 @@
-"""Driving at a set speed: the law of the perceived bends, and drives with and without traffic."""
+"""Driving at a set speed: the limit in perceived bends, and drives with and without traffic."""
 
-from typing import Any
+from collections.abc import Callable
 
 import pytest
 
 from controllers.drive.config import DriveConfig
 from controllers.drive.run import drive
 from controllers.laws.speed import CornerSpeed, on_perception, on_the_truth
-from controllers.perception.perceived import Perceived
-from controllers.perception.sources import PerceptionSource, truth
+from controllers.perception.perceived import Perceive, Perceived
+from controllers.perception.sources import truth
 from simulator.driving.speed import LATERAL_ACCELERATION
 from simulator.track.catalogue import find_track
 from simulator.track.road import Road
@@ -29,19 +29,19 @@ def test_a_straight_road_has_no_limit() -> None:
     assert min(bends(at_rest(vx=20.0), seen(RoadClass.STRAIGHT)) for _ in range(50)) > 100.0
 
 
-def test_a_bend_ahead_is_taken_for_one_of_60_m_until_it_is_felt() -> None:
+def test_an_announced_bend_has_a_radius_of_60_m_until_the_yaw_rate_shows_it() -> None:
     bends, straight = CornerSpeed(DT), at_rest(vx=10.0)
     bends(straight, seen(RoadClass.STRAIGHT))
     limits = [bends(straight, seen(RoadClass.RIGHT)) for _ in range(100)]
     assert limits[0] > 100.0  # a single answer does not brake
     assert limits[10] == pytest.approx((LATERAL_ACCELERATION * 60.0) ** 0.5)
-    assert limits[-1] > 100.0  # 5 s without a bend felt: it was a gentle one
+    assert limits[-1] > 100.0  # 5 s without a yaw rate: the bend is gentle
     turning = at_rest(vx=10.0, yaw_rate=-10.0 / 30.0)
     felt = [bends(turning, seen(RoadClass.RIGHT)) for _ in range(100)][-1]
     assert felt == pytest.approx((LATERAL_ACCELERATION * 30.0) ** 0.5, rel=0.01)
 
 
-def test_the_next_bend_to_the_other_side_is_a_new_one() -> None:
+def test_a_bend_to_the_other_side_is_a_new_bend() -> None:
     bends, now = CornerSpeed(DT), at_rest(vx=10.0)
     for _ in range(100):
         bends(now, seen(RoadClass.LEFT))
@@ -68,7 +68,7 @@ def test_the_error_is_measured_on_free_straights_only() -> None:
     road = Road(find_track("oval"))
     held = on_the_truth(15.0, road, 0.0, DT)
     none = FakeWorld().traffic
-    for _ in range(270):  # 13.5 s: not before the car can have reached 15 m/s from rest
+    for _ in range(270):  # 13.5 s: a car at rest cannot have reached 15 m/s yet
         held(at_rest(vx=2.0), none, seen(RoadClass.STRAIGHT))
     assert held.mean_error is None
     for _ in range(200):
@@ -81,7 +81,7 @@ def test_the_error_is_measured_on_free_straights_only() -> None:
 
 
 class Watch:
-    """Keeps speed and side acceleration of each step, and the gears."""
+    """Stores the speed and the lateral acceleration of each step, and the gears."""
 
     def __init__(self) -> None:
         self.speeds: list[float] = []
@@ -112,21 +112,20 @@ def test_traffic_is_followed_without_a_collision() -> None:
     config = DriveConfig(track="circuit", speed=25.0, traffic=6, steps=1500, seed=1)
     result = drive(config, observers=[watch])
     assert result.ended is None
-    assert max(watch.speeds[800:]) < 62.0 / 3.6 + 2.0  # no car of the traffic is faster
+    assert max(watch.speeds[800:]) < 62.0 / 3.6 + 2.0  # the highest speed of the traffic
 
 
-def test_on_perception_bends_are_slowed_for_too(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without the curvature, which perception does not answer."""
+def test_on_perception_the_car_slows_down_in_bends(
+    perceive_by: Callable[[Perceive], None],
+) -> None:
+    """The perception has no curvature, as a model's answer has none."""
     exact = truth(0.0)
 
     def perceive(world: World) -> Perceived:
         now = exact(world)
         return Perceived(now.to_lane_centre, now.angle, now.heading)
 
-    def open_perception(*_: Any, **__: Any) -> PerceptionSource:
-        return PerceptionSource(perceive)
-
-    monkeypatch.setattr("controllers.drive.run.open_perception", open_perception)
+    perceive_by(perceive)
     watch = Watch()
     config = DriveConfig(track="circuit", perception="model", speed=20.0, steps=1500)
     result = drive(config, observers=[watch])

@@ -1,4 +1,4 @@
-"""Late and lost answers, the predicted state, and the car that slows down without perception."""
+"""Late and lost answers, the prediction over them, and the car that slows down without them."""
 
 import math
 from dataclasses import replace
@@ -46,21 +46,21 @@ def test_the_offset_is_predicted_to_the_present(latency_s: float) -> None:
             assert known.lost_s == 0.0
 
 
-def test_without_prediction_the_answer_is_that_of_its_image() -> None:
+def test_without_prediction_the_answer_is_late() -> None:
     car, perceive = Straight(), late(0.1, predict=False)
     for car.step in range(10):
         known = perceive(car)
     assert known.to_lane_centre == pytest.approx(car.offset - 2 * DT * 20.0 * math.sin(0.1))
 
 
-def test_lost_answers_are_predicted_for_a_second_and_then_lost() -> None:
+def test_the_prediction_ends_a_second_after_the_last_answer() -> None:
     car, perceive = Straight(), late(0.05, drop=0.0)
     for car.step in range(5):
         perceive(car)
-    perceive._drop = 1.0  # from now on no answer comes
+    perceive._drop = 1.0  # from now on all answers are lost
     for car.step in range(5, 40):
         known = perceive(car)
-        waited = (car.step - 4 - 1) * DT + DT  # the answer of step 4 came at step 5
+        waited = (car.step - 4 - 1) * DT + DT  # the answer of step 4 arrived at step 5
         if car.step == 5:
             assert known.lost_s == 0.0
         elif known.to_lane_centre is not None:
@@ -73,7 +73,7 @@ def test_lost_answers_are_predicted_for_a_second_and_then_lost() -> None:
     assert perceive.lost_answers == 35
 
 
-def test_the_share_of_lost_answers_is_that_asked_for() -> None:
+def test_the_share_of_lost_answers_is_the_requested_share() -> None:
     perceive, car = late(0.0, drop=0.3), Straight()
     for car.step in range(2000):
         perceive(car)
@@ -86,8 +86,8 @@ def test_values_out_of_range_are_refused(latency: float, drop: float) -> None:
         late(latency, drop)
 
 
-def test_prediction_brings_back_what_the_delay_costs() -> None:
-    """0.15 s late on a winding road: with prediction the car stays nearer to its lane."""
+def test_prediction_compensates_a_delay() -> None:
+    """With prediction over 0.15 s the car stays nearer to its lane on a winding road."""
     found = {}
     for predict in (False, True):
         with World(Road(find_track("town"))) as world:
@@ -121,14 +121,14 @@ def test_the_car_slows_down_when_perception_is_lost_and_goes_on_when_it_returns(
         result = run_lap(
             world, Lqr(DT), perceive, 400, record=lambda now, steer: speeds.append(now.speed)
         )
-    # One second of 20 steps is waited for.
+    # The car slows down after a second, 20 steps.
     assert result.slowed_steps == 259 - 200 - 20
     assert result.blind_steps == 59
     assert speeds[259] < speeds[215] - 1.0
     assert speeds[-1] > speeds[262]
 
 
-def test_slowing_down_ends_at_a_walking_pace() -> None:
+def test_slowing_down_ends_at_5_m_per_s() -> None:
     assert slow_down(20.0, 0.2, 0.0) == (0.0, 0.1)
     assert slow_down(20.0, 0.2, 0.5) == (0.0, 0.5)
     assert slow_down(LOST_SPEED - 0.1, 0.2, 0.0) == (0.2, 0.0)

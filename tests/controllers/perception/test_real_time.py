@@ -1,7 +1,8 @@
-"""Drives in real time with delayed answers, on a clock that the test moves."""
+"""Drives in real time with delayed answers, on a simulated clock."""
 
 import math
 import threading
+from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
@@ -9,14 +10,14 @@ import pytest
 from controllers.drive.config import DriveConfig
 from controllers.drive.run import drive
 from controllers.perception.late import RoadEstimate
-from controllers.perception.perceived import Perceived
+from controllers.perception.perceived import Perceive, Perceived
 from controllers.perception.real_time import (
     ImmediateAnswers,
     RealTimePerception,
     RequestThread,
     TimedAnswer,
 )
-from controllers.perception.sources import PerceptionSource, truth
+from controllers.perception.sources import truth
 from simulator.vehicle.state import CarState
 from simulator.world.world import World
 from tests.controllers.fake_world import Straight, at_rest
@@ -26,7 +27,7 @@ DT = 0.05
 
 
 class Clock:
-    """Wall-clock time that passes only in `sleep` and where a test adds to `now`."""
+    """A clock whose time passes only in `sleep`, and when a test adds to `now`."""
 
     def __init__(self) -> None:
         self.now = 100.0
@@ -40,7 +41,7 @@ class Clock:
 
 
 class SlowModel:
-    """Answers each request after `seconds`, one at a time, the newest first."""
+    """Answers requests one at a time, the newest first; a request takes `seconds`."""
 
     def __init__(self, clock: Clock, *seconds: float) -> None:
         self._clock, self._seconds = clock, list(seconds)
@@ -95,8 +96,8 @@ def live(clock: Clock, model: SlowModel) -> RealTimePerception[Straight, Perceiv
     [
         (0.01, 0, (10.0, 10.0), (50.0, 50.0)),
         (0.049, 0, (49.0, 49.0), (50.0, 50.0)),
-        # One after the other: 24 answers in the 2.9 s since the first image in motion. An image
-        # waits for up to a step, its answer for as long to be used, and then ages by 120 ms.
+        # 24 answers, one after the other, in the 2.9 s since the first image in motion. An image
+        # waits up to a step, its answer waits up to a step, and until the next it ages by 120 ms.
         (0.12, 24, (120.0, 170.0), (150.0, 300.0)),
     ],
 )
@@ -161,13 +162,13 @@ def test_slow_control_steps_are_counted_and_made_up() -> None:
     for car.step in range(10):
         perceive(car)
         clock.now += 0.12 if car.step == 3 else 0.02  # the control of this step
-    # Step 3 ran from 0.15 s to 0.27 s and 4 to 0.29 s: both later than their end. The clock is
-    # caught up with at 0.31 s, the end of 5.
+    # Step 3 took from 0.15 s to 0.27 s and step 4 to 0.29 s; both ended late. The delay is made up
+    # at 0.31 s, the end of step 5.
     assert perceive.figures().missed_steps == 3
     assert clock.now == pytest.approx(100.0 + 9 * DT + 0.02)
 
 
-def test_an_asker_asks_for_the_newest_waiting_frame_only() -> None:
+def test_only_the_newest_waiting_frame_is_requested() -> None:
     begun, go_on = threading.Semaphore(0), threading.Semaphore(0)
 
     def ask(frame: str) -> str:
@@ -188,7 +189,7 @@ def test_an_asker_asks_for_the_newest_waiting_frame_only() -> None:
     requests.close()
 
 
-def test_an_error_of_the_question_is_raised_in_the_drive() -> None:
+def test_an_error_of_a_request_is_raised_in_the_drive() -> None:
     def ask(frame: int) -> int:
         raise UserError("the service does not answer")
 
@@ -200,9 +201,7 @@ def test_an_error_of_the_question_is_raised_in_the_drive() -> None:
     requests.close()
 
 
-def test_a_drive_on_the_truth_in_real_time_is_that_without(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_drive_on_the_truth_in_real_time_has_the_same_result() -> None:
     config = DriveConfig(controller="lqr", steps=12, start_d=0.5)
     simulated = drive(config)
     result = drive(replace(config, realtime=True))
@@ -213,7 +212,7 @@ def test_a_drive_on_the_truth_in_real_time_is_that_without(
     assert {"late_answers", "missed_steps", "age_ms_p99"} <= set(result.as_json())
 
 
-def test_a_service_that_fails_ends_the_drive(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_service_that_fails_ends_the_drive(perceive_by: Callable[[Perceive], None]) -> None:
     exact = truth(0.0)
 
     def perceive(world: World) -> Perceived:
@@ -221,15 +220,12 @@ def test_a_service_that_fails_ends_the_drive(monkeypatch: pytest.MonkeyPatch) ->
             raise UserError("the service does not answer")
         return exact(world)
 
-    def open_perception(*_: object, **__: object) -> PerceptionSource:
-        return PerceptionSource(perceive)
-
-    monkeypatch.setattr("controllers.drive.run.open_perception", open_perception)
+    perceive_by(perceive)
     with pytest.raises(UserError, match="does not answer"):
         drive(DriveConfig(steps=10, realtime=True))
 
 
-def test_a_delay_of_its_own_is_refused() -> None:
+def test_a_simulated_delay_is_refused() -> None:
     with pytest.raises(UserError, match="--latency-ms"):
         drive(DriveConfig(steps=3, realtime=True, latency_ms=50.0))
 

@@ -1,12 +1,13 @@
-"""Perception: parsing predictions, refusing malformed ones, rendering the model's camera."""
+"""Sources of perception: parsed and refused predictions, images of the model's camera."""
 
+from contextlib import AbstractContextManager
 from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from controllers.perception.perceived import Perceived
+from controllers.perception.perceived import Perceive, Perceived
 from controllers.perception.sources import (
     CameraPerception,
     ServiceModel,
@@ -37,9 +38,10 @@ class FakeClient:
     card: dict[str, Any] = {"definitions_version": VERSION, "camera": CAMERA}  # noqa: RUF012  # replaced whole
     bodies: list[bytes] = []  # noqa: RUF012  # emptied by the test
     url = ""
+    closed = False
 
     def __init__(self, url: str) -> None:
-        FakeClient.url = url
+        FakeClient.url, FakeClient.closed = url, False
 
     def model(self) -> dict[str, Any]:
         return self.card
@@ -49,7 +51,11 @@ class FakeClient:
         return ANSWER
 
     def close(self) -> None:
-        pass
+        FakeClient.closed = True
+
+
+def opened(name: str, world: World) -> AbstractContextManager[Perceive]:
+    return open_perception(name, world, model="latest", lane_centre=0.0, light="clear", seed=0)
 
 
 @pytest.fixture
@@ -121,17 +127,15 @@ def test_images_are_rendered_with_the_models_camera(client: type[FakeClient]) ->
     """An image of the model's size is rendered, encoded and sent; the answer is parsed."""
     with World(Road(find_track("oval"))) as world:
         world.reset(seed=0)
-        source = open_perception(
-            "http://127.0.0.1:8000", world, model="latest", lane_centre=0.0, light="clear", seed=0
-        )
-        with source:
-            assert isinstance(source.perceive, CameraPerception)
-            assert source.perceive(world) == Perceived(0.5, -0.03, RoadClass.RIGHT)
+        with opened("http://127.0.0.1:8000", world) as perceive:
+            assert isinstance(perceive, CameraPerception)
+            assert perceive(world) == Perceived(0.5, -0.03, RoadClass.RIGHT)
+    assert client.closed
     import simplejpeg
 
     picture = simplejpeg.decode_jpeg(client.bodies[0])
     assert picture.shape == (63, 84, 3)
-    assert picture.std() > 10  # a scene, not a blank
+    assert picture.std() > 10  # not a uniform picture
 
 
 @pytest.mark.parametrize(
@@ -145,5 +149,5 @@ def test_a_malformed_camera_is_refused(camera: Any) -> None:
 @pytest.mark.parametrize("word", ["modle", "", "Truth"])
 def test_an_unknown_perception_is_refused(word: str) -> None:
     expected = pytest.raises(UserError, match="give truth, model, or the address")
-    with World(Road(find_track("oval"))) as world, expected:
-        open_perception(word, world, model="latest", lane_centre=0.0, light="clear", seed=0)
+    with World(Road(find_track("oval"))) as world, expected, opened(word, world):
+        pass

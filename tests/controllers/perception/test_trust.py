@@ -1,4 +1,4 @@
-"""The Kalman gains on answers with a standard deviation, and drives on them."""
+"""The Kalman gains for answers with a standard deviation, and drives on them."""
 
 from dataclasses import replace
 
@@ -51,12 +51,12 @@ def corrected(second: Perceived, *, steps: int = 1, moved_m: float = 0.0) -> Per
     return trust.correct(known, second, steps, moved_m)
 
 
-def test_an_ordinary_answer_counts_in_full() -> None:
+def test_an_ordinary_answer_replaces_the_estimate() -> None:
     ordinary = answer(1.0, 0.1, std=ORDINARY_M, angle_std=ORDINARY_RAD)
     assert corrected(ordinary) is ordinary
 
 
-def test_the_gain_on_a_uncertain_answer_is_that_of_a_kalman_filter() -> None:
+def test_an_uncertain_answer_has_the_gain_of_a_kalman_filter() -> None:
     found = corrected(answer(1.0, 0.1, std=0.5, angle_std=0.05))
     prior = 0.05**2 + OFFSET_NOISE_M**2
     assert found.to_lane_centre == pytest.approx(prior / (prior + 0.5**2 - ORDINARY_M**2))
@@ -64,7 +64,7 @@ def test_the_gain_on_a_uncertain_answer_is_that_of_a_kalman_filter() -> None:
     assert found.angle == pytest.approx(0.1 * prior / (prior + 0.05**2 - ORDINARY_RAD**2))
 
 
-def test_uncertainty_lowers_the_gain_and_the_way_since_raises_it() -> None:
+def test_uncertainty_lowers_the_gain_and_the_distance_driven_raises_it() -> None:
     def moved(std: float, *, unfamiliar: bool = False, **way: float) -> float:
         second = answer(1.0, std=std, unfamiliar=unfamiliar)
         offset = corrected(
@@ -102,7 +102,7 @@ def test_answers_that_are_not_trusted_count_as_lost() -> None:
     assert estimate.present(0) == replace(answer(0.2), lost_s=0.0)
 
 
-def test_an_answer_without_std_is_taken_as_it_is() -> None:
+def test_an_answer_without_standard_deviation_is_unchanged() -> None:
     trust = Trust()
     exact = Perceived(0.7, 0.1, RoadClass.LEFT, 0.01)
     assert trust.correct(answer(), exact, 1, 1.0) is exact
@@ -111,7 +111,7 @@ def test_an_answer_without_std_is_taken_as_it_is() -> None:
         assert all(perceive(world) is exact for _ in range(3))
 
 
-def test_a_wild_uncertain_answer_hardly_moves_the_estimate_and_a_blind_one_stays_blind() -> None:
+def test_an_uncertain_outlier_hardly_moves_the_estimate_and_a_blind_answer_stays_blind() -> None:
     car = Straight()
 
     def perceive(car: Straight) -> Perceived:
@@ -142,7 +142,7 @@ def test_a_wild_uncertain_answer_hardly_moves_the_estimate_and_a_blind_one_stays
             assert known_late.to_lane_centre == pytest.approx(car.offset, abs=0.01)
 
 
-def test_after_a_long_loss_the_first_answer_counts_in_full() -> None:
+def test_after_a_long_loss_the_first_answer_replaces_the_estimate() -> None:
     estimate = RoadEstimate(DT)
     for step in range(60):
         first = answer(0.5) if step == 0 else answer(-0.5, std=0.3) if step == 50 else None
@@ -151,8 +151,8 @@ def test_after_a_long_loss_the_first_answer_counts_in_full() -> None:
             assert estimate.present(0).to_lane_centre == -0.5
 
 
-def test_the_car_keeps_nearer_to_its_lane_when_uncertain_answers_are_trusted_less() -> None:
-    """One answer in five is wild and says so."""
+def test_less_weight_on_uncertain_answers_keeps_the_car_nearer_to_its_lane() -> None:
+    """One answer in five has a large error and a large standard deviation."""
     found = {}
     for trusted in (False, True):
         rng = np.random.default_rng(5)
