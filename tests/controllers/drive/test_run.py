@@ -24,7 +24,6 @@ from controllers.interface import Observation
 from controllers.laws.lqr import WEIGHTS_BRIEFLY_TRAINED, LqrPreview
 from controllers.perception.perceived import Perceive, Perceived
 from controllers.perception.sources import truth
-from serve.client import ServiceError
 from simulator.track.catalogue import find_track
 from simulator.track.road import Road
 from simulator.traffic.traffic import Traffic
@@ -227,25 +226,6 @@ def test_a_drive_on_perception_is_noisy(
     perceive_by(truth(0.0))
     result = drive(DriveConfig(perception=perception, steps=3))
     assert result.as_json()["noisy"] is noisy
-
-
-def test_a_service_that_dies_in_the_middle_of_a_drive_leaves_the_log(
-    tmp_path: Path, perceive_by: Callable[[Perceive], None]
-) -> None:
-    exact, asked = truth(0.0), 0
-
-    def perceive(world: World) -> Perceived:
-        nonlocal asked
-        asked += 1
-        if asked > 7:
-            raise ServiceError("http://127.0.0.1:8000 does not answer")
-        return exact(world)
-
-    perceive_by(perceive)
-    log = tmp_path / "drive.csv"
-    with pytest.raises(UserError, match="does not answer"):
-        drive(DriveConfig(perception="http://127.0.0.1:8000", steps=30, log=log))
-    assert len(log.read_text().splitlines()) == 1 + 7
 
 
 def test_steps_by_track() -> None:

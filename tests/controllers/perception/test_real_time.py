@@ -12,13 +12,13 @@ from controllers.drive.run import drive
 from controllers.perception.late import RoadEstimate
 from controllers.perception.perceived import Perceive, Perceived
 from controllers.perception.real_time import (
+    AnswerSource,
     ImmediateAnswers,
     RealTimePerception,
     RequestThread,
     TimedAnswer,
 )
 from controllers.perception.sources import truth
-from simulator.vehicle.state import CarState
 from simulator.world.world import World
 from tests.controllers.fake_world import Straight, at_rest
 from trackfeatures import RoadClass, UserError
@@ -75,17 +75,19 @@ class SlowModel:
         self._under_way.append((self._free_s, TimedAnswer(frame, step, asked, self._free_s)))
 
 
-def state(car: Straight) -> CarState:
-    return at_rest(vx=car.speed)
-
-
-def live(clock: Clock, model: SlowModel) -> RealTimePerception[Straight, Perceived, Perceived]:
+def live(
+    clock: Clock,
+    source: AnswerSource[Perceived, Perceived],
+    capture: Callable[[Straight], Perceived] = Straight.perceive,
+    lost: Callable[[], bool] = lambda: False,
+) -> RealTimePerception[Straight, Perceived, Perceived]:
     return RealTimePerception(
-        lambda car: car.perceive(),
-        model,
+        capture,
+        source,
         lambda answer: answer,
         RoadEstimate(DT),
-        state=state,
+        state=lambda car: at_rest(vx=car.speed),
+        lost=lost,
         clock=clock,
         sleep=clock.sleep,
     )
@@ -138,16 +140,7 @@ def test_lost_answers_stay_lost() -> None:
         asked += 1
         return asked % 2 == 0
 
-    perceive = RealTimePerception(
-        lambda car: car.perceive(),
-        ImmediateAnswers[Perceived](clock),
-        lambda answer: answer,
-        RoadEstimate(DT),
-        state=state,
-        lost=lost,
-        clock=clock,
-        sleep=clock.sleep,
-    )
+    perceive = live(clock, ImmediateAnswers(clock), lost=lost)
     for car.step in range(21):
         assert perceive(car).to_lane_centre == pytest.approx(car.offset, abs=1e-9)
     figures = perceive.figures()
@@ -233,14 +226,8 @@ def test_a_simulated_delay_is_refused() -> None:
 def test_a_blind_answer_is_no_answer() -> None:
     clock, car = Clock(), Straight()
     blind = Perceived(None, 0.0, RoadClass.STRAIGHT)
-    perceive = RealTimePerception(
-        lambda car: blind if car.step == 5 else car.perceive(),
-        ImmediateAnswers[Perceived](clock),
-        lambda answer: answer,
-        RoadEstimate(DT),
-        state=state,
-        clock=clock,
-        sleep=clock.sleep,
+    perceive = live(
+        clock, ImmediateAnswers(clock), lambda car: blind if car.step == 5 else car.perceive()
     )
     for car.step in range(7):
         known = perceive(car)

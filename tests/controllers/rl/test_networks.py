@@ -114,12 +114,8 @@ def test_the_target_has_the_smaller_q_and_no_reward_after_a_terminal_state() -> 
     next_states = torch.tensor(batch.next_states)
     next_action = torch_actor(as_torch(actor.target, Shape(7, 6, 5)), next_states)
     next_action = torch.clip(next_action + torch.tensor(noise), -1, 1)
-    next_q = torch.minimum(
-        *(
-            torch_critic(as_torch(critics.target, SHAPE, k), next_states, next_action)
-            for k in (0, 1)
-        )
-    )
+    targets = [as_torch(critics.target, SHAPE, k) for k in range(2)]
+    next_q = torch.minimum(*(torch_critic(of, next_states, next_action) for of in targets))
     td_target = torch.tensor(batch.rewards) + 0.9 * next_q * torch.tensor(1 - batch.ended)
     td_target = td_target.detach()
     assert float(td_target[3]) == pytest.approx(float(batch.rewards[3]))
