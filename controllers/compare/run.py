@@ -126,8 +126,8 @@ def _drive_missing(
             write_json(path, content)
     if lost:
         raise ContactsUnavailable(
-            f"{len(lost)} of {len(todo)} drives have no result; those of the others are in {path}, "
-            f"and the same command drives the missing ones. First {lost[0]}"
+            f"{len(lost)} of {len(todo)} drives have no result; the other results are in {path}, "
+            f"and the same command drives the missing ones. The first is {lost[0]}"
         )
     wanted = set(todo)
     return content | {"drives": [entry for cell, entry in known.items() if cell in wanted]}

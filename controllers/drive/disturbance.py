@@ -38,7 +38,7 @@ class Disturbance:
 
     noise: bool = False
     delay_s: float = 0.0
-    """Delay of the perception; it is not predicted, because the controller does not know it."""
+    """Delay of the perception, over which the state is not predicted."""
     wind: bool = False
     friction: bool = False
     mass: bool = False

@@ -173,10 +173,9 @@ def choose_pedals(config: DriveConfig, road: Road, lane: Lane) -> Pedals:
 
 
 def delay(config: DriveConfig, perceive: Perceive, unknown_s: float = 0.0) -> Perceive:
-    """`perceive` with the latency and the lost answers of `config`, which a prediction bridges, and
-    with less weight on uncertain answers.
+    """`perceive` with the latency and losses of `config`, and less weight on uncertain answers.
 
-    The controller does not know of the delay `unknown_s` (s), so no prediction bridges it.
+    The state is predicted over the latency, but not over the further delay `unknown_s` (s).
     """
     late = partial(
         LatePerception,
@@ -300,8 +299,10 @@ def choose_lane(config: DriveConfig, road: Road) -> Lane:
 
 
 def steps_for(requested: int | None, track: str, length_m: float) -> int:
-    """The control steps of a drive: `requested`, or the paper's number for the track, or about one
-    lap, in hundreds. Raises UserError for a number below 1."""
+    """Control steps of a drive: `requested`, or the paper's number for the track, or about one lap.
+
+    Raises UserError for a number below 1.
+    """
     if requested is not None:
         if requested < 1:
             raise UserError(f"{requested} steps requested; give 1 or more")

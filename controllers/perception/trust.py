@@ -44,10 +44,10 @@ class Trust:
     def correct(
         self, known: Perceived | None, answer: Perceived, steps: int, moved_m: float
     ) -> Perceived:
-        """Fuse the state estimate `known` at the moment of `answer` with `answer`.
+        """The state estimate after `answer`, from the estimate `known` before it.
 
         `known` has been propagated over `steps` control steps and `moved_m` metres since the last
-        answer; it is None before the first answer.
+        answer. It is None before the first answer and after a long time without one.
         """
         if answer.offset_std_m is None or answer.angle_std_rad is None:
             return answer

@@ -125,7 +125,7 @@ def test_the_target_has_the_smaller_q_and_no_reward_after_a_terminal_state() -> 
         q = torch_critic(parameters, torch.tensor(batch.states), torch.tensor(batch.actions))
         error = ((q - td_target) ** 2).mean()
         error.backward()
-        total += float(error) / 2
+        total += error.item() / 2
         of = np.concatenate([p.grad.numpy().ravel() for p in parameters])
         assert critics._gradient[k] == pytest.approx(of, abs=1e-4)
     assert loss == pytest.approx(total, rel=1e-4)
