@@ -80,10 +80,6 @@ def test_the_state_is_the_environments() -> None:
     now, heading = world.state, world.features().heading
     seen = Observation(now.to_middle, now.angle, heading, now.vx, now.vy, now.yaw_rate)
     np.testing.assert_array_equal(paper_state(seen, world.road.half_width), expected)
-    speed = 75.0 / 3.6
-    numbers = [now.to_middle / 6.0, now.angle / np.pi, now.vx / speed, now.vy / speed]
-    one_hot = [float(heading == kind) for kind in RoadClass]
-    assert expected == pytest.approx([*numbers, *one_hot], abs=1e-6)
     env.close()
 
 
