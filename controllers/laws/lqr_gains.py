@@ -15,7 +15,7 @@ SLOWEST_M_S, FASTEST_M_S, GRID_M_S = 3.0, 45.0, 2.0
 
 @dataclass(frozen=True)
 class LqrWeights:
-    """Q = diag(offset, offset_rate, heading, heading_rate) and R = rho."""
+    """Weights of the cost: Q = diag(offset, offset_rate, heading, heading_rate), R = rho."""
 
     offset: float
     offset_rate: float
