@@ -21,9 +21,9 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from benchmarks.material.outcome import exit_code
 from benchmarks.material.servers import OURS, running
-from controllers.closed_loop import run_lap
+from controllers.drive.closed_loop import run_lap
 from controllers.interface import Controller, LoopConfig, Observation
-from controllers.perception import open_perception, truth
+from controllers.perception.sources import open_perception, truth
 from controllers.registry import make_controller
 from mtlnet.inference.model_card import SHIPPED
 from simulator.track.catalogue import find_track
@@ -75,7 +75,7 @@ def on_images(world: World, model: str, steps: int) -> list[float]:
         settings: dict[str, Any] = {"model": model, "lane_centre": 0.0, "light": "clear", "seed": 0}
         with open_perception(address, world, **settings) as source:
             world.reset(seed=0, to_middle=1.0)
-            perceive = Timed(source.perceive)
+            perceive = Timed(source)
             controller = TimedController(make_controller("lqr", LoopConfig(0.05)))
             run_lap(world, controller, perceive, steps + WARM_UP)
     found = np.add(perceive.times_ms, controller.timed.times_ms)

@@ -1,7 +1,7 @@
-"""The controllers by name. To add one: a new file with a class that has `update`, one entry here.
+"""The controllers by name. To add one, write a class with `update` in `laws` and an entry here.
 
-A user's own controller needs no entry: `MODULE:CLASS` names a class of any module that Python can
-import, the working folder included, and `FILE.py:CLASS` one of a file.
+A user's own controller needs no entry. `MODULE:CLASS` is a class of a module that Python can
+import, also from the working folder; `FILE.py:CLASS` is a class of a file.
 """
 
 import importlib
@@ -16,24 +16,23 @@ from types import ModuleType
 from typing import Any
 
 from controllers.interface import Controller, LoopConfig, Observation
-from controllers.rl.actor import is_actor
+from controllers.laws.actor import is_actor
 from trackfeatures.errors import UserError
 
-__all__ = ["CONTROLLERS", "ControllerEntry", "LoopConfig", "make_controller"]
-
 OWN_FILE = "controller_of_"
-"""Before the name of a user's file in `sys.modules`, so that it hides no other module."""
+"""Prefix of a user's file in `sys.modules`, so that the file hides no other module."""
 
 
 @dataclass(frozen=True)
 class ControllerEntry:
-    """A controller of this project; its module is imported when it is made."""
+    """A controller of this project; its module is imported when the controller is made."""
 
     factory: str
-    """MODULE:FUNCTION; called with a `LoopConfig` and, by name, the parameters that are set."""
+    """MODULE:FUNCTION; it is called with a `LoopConfig` and the given parameters by name."""
     about: str
+    """A description of one line."""
     tunable: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    """Parameters of the factory that `controllers tune` searches, with their ranges, all > 0."""
+    """Ranges of the parameters that `controllers tune` searches; all limits are above 0."""
 
 
 _LQR_WEIGHTS = {
@@ -47,28 +46,32 @@ _MPC_WEIGHTS = {"offset": (0.1, 100.0), "heading": (0.1, 100.0), "wheel": (1e-3,
 
 CONTROLLERS: dict[str, ControllerEntry] = {
     "lqr": ControllerEntry(
-        "controllers.lqr:make_lqr", "the paper's LQR: offset, angle, their rates", _LQR_WEIGHTS
+        "controllers.laws.lqr:make_lqr", "the paper's LQR: offset, angle, their rates", _LQR_WEIGHTS
     ),
     "lqr-preview": ControllerEntry(
-        "controllers.lqr:make_lqr_preview", "LQR with feed-forward of the curvature", _LQR_WEIGHTS
+        "controllers.laws.lqr:make_lqr_preview",
+        "LQR with feed-forward of the curvature",
+        _LQR_WEIGHTS,
     ),
     "lqr-paper": ControllerEntry(
-        "controllers.lqr:make_lqr_paper", "LQR as the paper's released code runs it", _LQR_WEIGHTS
+        "controllers.laws.lqr:make_lqr_paper",
+        "LQR as the paper's released code runs it",
+        _LQR_WEIGHTS,
     ),
     "mpc": ControllerEntry(
-        "controllers.mpc:make_mpc", "the paper's nonlinear MPC, without preview", _MPC_WEIGHTS
+        "controllers.laws.mpc:make_mpc", "the paper's nonlinear MPC, without preview", _MPC_WEIGHTS
     ),
     "mpc-preview": ControllerEntry(
-        "controllers.mpc:make_mpc_preview", "MPC that knows the curvature ahead", _MPC_WEIGHTS
+        "controllers.laws.mpc:make_mpc_preview", "MPC that knows the curvature ahead", _MPC_WEIGHTS
     ),
     "rl": ControllerEntry(
-        "controllers.rl.controller:make_rl", "trained by reinforcement on the paper's state"
+        "controllers.laws.rl:make_rl", "trained by reinforcement on the paper's state"
     ),
     "rl-residual": ControllerEntry(
-        "controllers.rl.controller:make_rl_residual", "LQR, and what was learned to add to it"
+        "controllers.laws.rl:make_rl_residual", "LQR with a learned correction"
     ),
     "torcs": ControllerEntry(
-        "controllers.torcs_feedback:make_torcs", "the control law of the reference laps"
+        "controllers.laws.torcs_feedback:make_torcs", "the control law of the reference laps"
     ),
 }
 
@@ -76,13 +79,14 @@ CONTROLLERS: dict[str, ControllerEntry] = {
 def make_controller(
     name: str, loop: LoopConfig, parameters: Mapping[str, float] | None = None
 ) -> Controller:
-    """The controller `name`, or a trained actor's folder, or MODULE:CLASS with `parameters`.
+    """The controller called `name`, with `parameters`.
 
-    Raises UserError for a name or parameter that does not exist, a module that cannot be imported,
-    and a class that cannot be made without arguments or has no method `update`.
+    `name` is a key of `CONTROLLERS`, the folder of a trained actor, or a user's class. Raises
+    UserError for an unknown name or parameter, a module that cannot be imported, and a class that
+    cannot be made or has no method `update`.
     """
     if name not in CONTROLLERS and is_actor(Path(name)):
-        from controllers.rl.controller import load_controller
+        from controllers.laws.rl import load_controller
 
         return load_controller(Path(name), loop)
     if ":" in name:
@@ -105,7 +109,7 @@ def make_controller(
 
 
 def _make_own(name: str, parameters: Mapping[str, float] | None) -> Controller:
-    """The controller of a user's own class."""
+    """The controller of a user's class."""
     place, _, class_name = name.rpartition(":")
     module = _load_file(Path(place)) if place.endswith(".py") else _import(place)
     found = getattr(module, class_name, None)
@@ -126,7 +130,7 @@ def _make_own(name: str, parameters: Mapping[str, float] | None) -> Controller:
 
 
 class _OwnController:
-    """A user's controller; what its `update` raises or wrongly returns is a UserError."""
+    """A user's controller; an error of its `update`, or a wrong result, becomes a UserError."""
 
     def __init__(self, name: str, controller: Controller) -> None:
         self._name, self._controller = name, controller
@@ -155,7 +159,7 @@ def _import(name: str) -> ModuleType:
     if not name:
         raise UserError("the controller's module is missing; give MODULE:CLASS")
     folder = str(Path.cwd())
-    if folder not in sys.path:  # as `python -m` does
+    if folder not in sys.path:  # `python -m` adds it, too
         sys.path.insert(0, folder)
     try:
         return importlib.import_module(name)
@@ -170,7 +174,7 @@ def _load_file(path: Path) -> ModuleType:
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module  # where dataclasses look up postponed annotations
+    sys.modules[spec.name] = module  # dataclasses look up postponed annotations there
     try:
         spec.loader.exec_module(module)
     except Exception as error:  # as above

@@ -1,8 +1,8 @@
 """The simulated car against the real TORCS: one control law, one track, one flying lap each.
 
-A recording is a CSV of `drives/`: laps of TORCS under `controllers.torcs_feedback`. The same law
-drives the simulator from the same start and at the same times: TORCS ticks every 20 to 22 ms, so
-that its control steps take 40 to 66 ms, which matters for gains as high as these.
+A recording is a CSV of `drives/`: laps of TORCS under `controllers.laws.torcs_feedback`. The same
+law drives the simulator from the same start and at the same times: TORCS ticks every 20 to 22 ms,
+so that its control steps take 40 to 66 ms, which matters for gains as high as these.
 """
 
 import itertools
@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from controllers.closed_loop import GEAR
-from controllers.config import THROTTLE
+from controllers.drive.closed_loop import GEAR
+from controllers.drive.config import THROTTLE
 from controllers.interface import Observation
-from controllers.torcs_feedback import StateFeedback
+from controllers.laws.torcs_feedback import StateFeedback
 from simulator.track.catalogue import find_track
 from simulator.track.road import Road
 from simulator.vehicle.state import CarState, Command

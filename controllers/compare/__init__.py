@@ -1,1 +1,1 @@
-"""Every controller on every track: one file of results, a table like the paper's, curves."""
+"""Compares controllers on tracks (results, tables, curves) and tunes their parameters."""

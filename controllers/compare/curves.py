@@ -1,8 +1,8 @@
-"""The driving curves of a drive, true and perceived."""
+"""The driving curves of a drive: true and perceived offset and angle over time."""
 
 import numpy as np
 
-from controllers.perception import Perceived
+from controllers.perception.perceived import Perceived
 from simulator.vehicle.state import CarState
 
 MAX_POINTS = 400
@@ -10,7 +10,7 @@ COLUMNS = ("t", "d", "angle", "perceived_d", "perceived_angle")
 
 
 class CurveRecorder:
-    """An observer of a drive on one lane, whose centre is the track's."""
+    """An observer of a drive on one lane, whose centre is the centre of the track."""
 
     def __init__(self) -> None:
         self._rows: list[tuple[float, ...]] = []
@@ -20,9 +20,9 @@ class CurveRecorder:
         self._rows.append((now.time_s, now.to_middle, now.angle, seen, perceived.angle))
 
     def curves(self) -> dict[str, list[float | None]]:
-        """The columns, at most `MAX_POINTS` points long; None where nothing was perceived.
+        """The columns `COLUMNS`, of at most `MAX_POINTS` points; None if nothing was perceived.
 
-        Of each stretch the step with the largest offset is kept, so that no peak is lost.
+        Each point is the step with the largest offset of its stretch, so that no peak is lost.
         """
         table = np.array(self._rows)
         chosen = [

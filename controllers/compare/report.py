@@ -1,4 +1,4 @@
-"""The comparison as tables, for the terminal and as an HTML page with driving curves."""
+"""The comparison as tables for the terminal, and as an HTML page with driving curves."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -8,6 +8,7 @@ import numpy as np
 from markupsafe import Markup
 
 from controllers.compare.run import REPORT, groups
+from controllers.drive.run import SCORED_STEPS
 from runtime.files import atomic_write
 from runtime.html import render
 from runtime.svg_charts import Line, Plot, line_plot
@@ -18,8 +19,7 @@ PAPER_SCORES = {
     "eroad": (3591.9, 3603.6, 3593.9),
     "g-track-3": (3209.4, 3210.5, 3215.3),
 }
-"""The best of the paper's LQR, MPC and RL, over the numbers of steps in `SCORED_STEPS`."""
-PAPER_STEPS = {"forza": 6500, "alpine-2": 4500, "eroad": 3700, "g-track-3": 3300}
+"""The best scores of the paper's LQR, MPC and RL, over the numbers of steps in `SCORED_STEPS`."""
 FIGURES = (
     "track", "controller", "score", "score a step", "quadratic a step", "mean |d| (m)",
     "max |d| (m)", "in the lane", "laps", "speed (km/h)", "blind steps", "ended",
@@ -28,28 +28,29 @@ TRUTH, PERCEIVED = "#2a9d5c", "#e07a2e"
 
 
 def spread(values: list[float], digits: int) -> str:
-    """The mean, and beside it the standard deviation of several."""
+    """The mean of `values`; of several values also the standard deviation."""
     mean = f"{np.mean(values):.{digits}f}"
     return mean if len(values) == 1 else f"{mean} ± {np.std(values, ddof=1):.{digits}f}"
 
 
 def score_table(drives: list[dict[str, Any]]) -> tuple[list[str], list[list[str]]]:
-    """Titles and rows of the paper's table: tracks by controllers, scores a step.
+    """Titles and rows of the paper's table: scores a step by track and controller.
 
-    The paper's own figures stand beside drives over its numbers of steps.
+    Tracks that were driven over the paper's number of steps also show the paper's scores.
     """
     controllers = list(dict.fromkeys(entry["controller"] for entry in drives))
     tracks = list(dict.fromkeys(entry["track"] for entry in drives))
     asked = {entry["track"]: entry["result"]["steps_asked"] for entry in drives}
-    as_paper = [track for track in tracks if asked[track] == PAPER_STEPS.get(track)]
+    as_paper = [track for track in tracks if asked[track] == SCORED_STEPS.get(track)]
     rows = []
     for track in tracks:
         row = [f"{track} ({asked[track]} steps)"]
         for controller in controllers:
-            found = _of(drives, track, controller, "score_per_step")
-            ended = sum(value is not None for value in _of(drives, track, controller, "ended"))
+            found = _results(drives, track, controller)
+            ended = sum(result["ended"] is not None for result in found)
             note = f" ({ended} ended early)" if ended else ""
-            row.append(spread(found, 4) + note if found else "-")
+            scores = [result["score_per_step"] for result in found]
+            row.append(spread(scores, 4) + note if found else "-")
         if as_paper:
             shown = PAPER_SCORES[track] if track in as_paper else (None, None, None)
             row += ["-" if score is None else f"{score / asked[track]:.4f}" for score in shown]
@@ -59,11 +60,10 @@ def score_table(drives: list[dict[str, Any]]) -> tuple[list[str], list[list[str]
 
 
 def figure_rows(drives: list[dict[str, Any]]) -> Iterator[list[str]]:
-    """Rows of `FIGURES`, one for each track and controller: means over the seeds."""
+    """Rows of `FIGURES` over the seeds, one for each track and controller."""
     pairs = dict.fromkeys((entry["track"], entry["controller"]) for entry in drives)
     for track, controller in pairs:
-        here = [e for e in drives if (e["track"], e["controller"]) == (track, controller)]
-        results = [entry["result"] for entry in here]
+        results = _results(drives, track, controller)
         slowest = min(result["speed_kmh"][0] for result in results)
         fastest = max(result["speed_kmh"][1] for result in results)
         ended = [result["ended"] for result in results if result["ended"] is not None]
@@ -72,7 +72,7 @@ def figure_rows(drives: list[dict[str, Any]]) -> Iterator[list[str]]:
             controller,
             spread([result["score"] for result in results], 1),
             spread([result["score_per_step"] for result in results], 4),
-            spread([entry["result"]["quadratic_per_step"] for entry in here], 5),
+            spread([result["quadratic_per_step"] for result in results], 5),
             spread([result["mean_abs_d_m"] for result in results], 3),
             f"{max(result['max_abs_d_m'] for result in results):.3f}",
             f"{min(result['in_lane_share'] for result in results):.2%}",
@@ -84,7 +84,7 @@ def figure_rows(drives: list[dict[str, Any]]) -> Iterator[list[str]]:
 
 
 def write_report(out: Path, content: dict[str, Any]) -> Path:
-    """Write the page into the folder `out` and return its path."""
+    """Write the HTML page into the folder `out`; returns its path."""
     sections = []
     for (perception, disturbance), drives in groups(content):
         head, rows = score_table(drives)
@@ -115,7 +115,7 @@ def write_report(out: Path, content: dict[str, Any]) -> Path:
 
 
 def driving_curves(curves: dict[str, list[float | None]]) -> tuple[Markup, Markup]:
-    """Offset and angle over time, true and perceived, as in the paper's figures 12 and 13."""
+    """Charts of true and perceived offset and angle, as in the paper's figures 12 and 13."""
     columns = {
         name: np.array([np.nan if value is None else value for value in values])
         for name, values in curves.items()
@@ -131,9 +131,9 @@ def driving_curves(curves: dict[str, list[float | None]]) -> tuple[Markup, Marku
     return plot("offset (m)", "d", "perceived_d"), plot("angle (rad)", "angle", "perceived_angle")
 
 
-def _of(drives: list[dict[str, Any]], track: str, controller: str, name: str) -> list[Any]:
+def _results(drives: list[dict[str, Any]], track: str, controller: str) -> list[dict[str, Any]]:
     return [
-        entry["result"][name]
+        entry["result"]
         for entry in drives
         if (entry["track"], entry["controller"]) == (track, controller)
     ]

@@ -1,7 +1,7 @@
-"""The drives of a comparison, and the file that holds their results.
+"""The drives of a comparison, and the file with their results.
 
-`results.json`: {"version", "settings", "drives": [...]}, written again after each drive. A drive
-that is in it is not driven again, unless its controller or its model has changed since.
+`results.json` is {"version", "settings", "drives": [...]} and is written after each drive. A drive
+whose result is in the file is not driven again, unless its controller or model has changed.
 """
 
 import hashlib
@@ -12,28 +12,32 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from controllers.compare.config import CompareConfig
 from controllers.compare.curves import CurveRecorder
-from controllers.compare.disturbance import DISTURBANCES, UNDISTURBED
-from controllers.config import CompareConfig, DriveConfig
-from controllers.drive import drive, read_parameters
-from controllers.perception import check_perception
-from controllers.registry import LoopConfig, make_controller
-from controllers.rl.actor import WEIGHTS, is_actor
+from controllers.drive.config import DriveConfig
+from controllers.drive.disturbance import DISTURBANCES, UNDISTURBED
+from controllers.drive.run import drive, read_parameters
+from controllers.interface import LoopConfig
+from controllers.laws.actor import WEIGHTS, is_actor
+from controllers.perception.sources import ServiceModel, check_perception
+from controllers.registry import make_controller
 from runtime.files import locked_folder, write_json
 from simulator.camera import check_light
 from simulator.track.catalogue import find_track
 from simulator.world.errors import ContactsUnavailable
 from trackfeatures.errors import UserError
 
-VERSION = 3  # 2: `in_lane_share`; 3: `quadratic_per_step` in the result
+VERSION = 3
+"""Version of `results.json`."""
 RESULTS, REPORT = "results.json", "report.html"
 GRID_SHARE = 1.0 / 6.0
-"""TORCS's first place on the grid: so much of the track's width to the right of its centre."""
+"""TORCS's first place on the grid: distance to the right of the centre over the track's width."""
 SETTINGS = ("steps", "start_d", "latency_ms", "drop", "model", "light")
-"""What must be equal for drives to be compared in one file."""
+"""Settings that are equal for all drives of a file."""
 
 Progress = Callable[[int, int, str, float], None]
-"""Called with the drives done, the drives in all, the present one and the share of it driven."""
+"""A function that is called with the number of drives done, their total number, the name of the
+present drive and the share of it that is done."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +57,7 @@ class Cell:
 
 
 def cells(config: CompareConfig) -> list[Cell]:
-    """All drives, in the order of the tracks. Raises UserError for an empty list or seeds < 1."""
+    """All drives, ordered by track. Raises UserError for an empty list or fewer than one seed."""
     if config.seeds < 1:
         raise UserError(f"{config.seeds} seeds; give 1 or more")
     disturbances = list(DISTURBANCES) if config.disturb else [UNDISTURBED]
@@ -68,7 +72,10 @@ def cells(config: CompareConfig) -> list[Cell]:
 
 
 def names(text: str, what: str) -> list[str]:
-    """The names in a list with commas, each once. Raises UserError for an empty list."""
+    """The names in `text`, separated by commas, without repetition.
+
+    Raises UserError for an empty list; `what` is the name of the option.
+    """
     found = list(dict.fromkeys(filter(None, (name.strip() for name in text.split(",")))))
     if not found:
         raise UserError(f"--{what} names nothing; give names with commas between them")
@@ -76,11 +83,11 @@ def names(text: str, what: str) -> list[str]:
 
 
 def compare(config: CompareConfig, progress: Progress | None = None) -> dict[str, Any]:
-    """Drive all cells that `config.out` does not hold yet; the content of `results.json`.
+    """Drive all cells without a result in `config.out`; returns the results of all cells.
 
-    Raises UserError for an unknown name, before the first drive, and where the folder holds results
-    of other settings or another process drives for it. Raises ContactsUnavailable after the last
-    drive where some of them touched something; the others are in `results.json`.
+    Raises UserError before the first drive for an unknown name, a folder with results of other
+    settings, or a folder to which another process writes. Raises ContactsUnavailable after the last
+    drive if a car touched something; the results of the other drives are in `results.json`.
     """
     todo = cells(config)
     for controller in dict.fromkeys(cell.controller for cell in todo):
@@ -98,19 +105,19 @@ def compare(config: CompareConfig, progress: Progress | None = None) -> dict[str
 def _drive_missing(
     config: CompareConfig, todo: list[Cell], progress: Progress | None
 ) -> dict[str, Any]:
-    """Drive those of `todo` whose results the folder does not hold; write each when it is done."""
+    """Drive the cells of `todo` without a result in the folder; write each result at once."""
     path = config.out / RESULTS
     content = read_results(path, config)
     known = {_key(entry): entry for entry in content["drives"]}
     lost: list[str] = []
     for done, cell in enumerate(todo):
-        print_share = _print_share(progress, done, len(todo), cell)
-        print_share(0, 1)
+        report_share = _report_share(progress, done, len(todo), cell)
+        report_share(0, 1)
         code = fingerprint(config, cell)
         found = known.get(cell)
         if found is None or found["code"] != code:
             try:
-                driven = drive_cell(config, cell, print_share)
+                driven = drive_cell(config, cell, report_share)
             except ContactsUnavailable as error:
                 lost.append(f"{cell.name}: {error}")
                 continue
@@ -119,8 +126,8 @@ def _drive_missing(
             write_json(path, content)
     if lost:
         raise ContactsUnavailable(
-            f"{len(lost)} of {len(todo)} drives have no result; those of the others are in {path}, "
-            f"and the same command drives the missing ones. First {lost[0]}"
+            f"{len(lost)} of {len(todo)} drives have no result; the other results are in {path}, "
+            f"and the same command drives the missing ones. The first is {lost[0]}"
         )
     wanted = set(todo)
     return content | {"drives": [entry for cell, entry in known.items() if cell in wanted]}
@@ -129,7 +136,7 @@ def _drive_missing(
 def drive_cell(
     config: CompareConfig, cell: Cell, progress: Callable[[int, int], None] | None = None
 ) -> dict[str, Any]:
-    """The result of one drive: figures and, of the first seed, its curves."""
+    """The result of one drive: its figures and, for seed 0, its curves."""
     track = find_track(cell.track, config.tracks_dir)
     start = -GRID_SHARE * track.width if config.start_d is None else config.start_d
     recorder = CurveRecorder()
@@ -157,7 +164,7 @@ def drive_cell(
 
 
 def parameters_of(config: CompareConfig, controller: str) -> dict[str, float]:
-    """The tuned parameters of a controller; none where the file has no entry for it."""
+    """The tuned parameters of a controller; {} if the file has no entry for it."""
     if config.parameters is None:
         return {}
     try:
@@ -168,8 +175,8 @@ def parameters_of(config: CompareConfig, controller: str) -> dict[str, float]:
 
 
 def fingerprint(config: CompareConfig, cell: Cell) -> str:
-    """What a drive depends on beside its cell: the road, the tuned parameters, the user's file or
-    trained actor, and the weights of the model, also of a service's."""
+    """A hash of the inputs of a drive that its cell does not name: the road, the tuned parameters,
+    the user's file or trained actor, and the weights of the model or of the service's model."""
     digest = hashlib.sha256(json.dumps(parameters_of(config, cell.controller)).encode())
     digest.update(find_track(cell.track, config.tracks_dir).content_hash.encode())
     file = _file_of(cell.controller)
@@ -183,7 +190,7 @@ def fingerprint(config: CompareConfig, cell: Cell) -> str:
 
 
 def _file_of(controller: str) -> Path | None:
-    """The weights of a trained actor, or the file of a user's class, which was made before."""
+    """The weights of a trained actor, or the file of a user's class, whose module is imported."""
     if is_actor(Path(controller)):
         return Path(controller) / WEIGHTS
     place = controller.rpartition(":")[0]
@@ -199,16 +206,14 @@ def model_hash(run: str) -> str:
 
 
 def service_model_hash(url: str) -> str:
-    """SHA-256 of the weights of the model at `url`. Raises UserError when it does not answer."""
-    from controllers.perception import ServiceModel
-
+    """SHA-256 of the weights of the model at `url`. Raises UserError if it does not answer."""
     service = ServiceModel(url)
     service.close()
     return service.model_hash
 
 
 def read_results(path: Path, config: CompareConfig) -> dict[str, Any]:
-    """The results so far. Raises UserError for a file of other settings or of another version."""
+    """The results so far. Raises UserError for a file of other settings or another version."""
     settings = {name: getattr(config, name) for name in SETTINGS}
     if not path.exists():
         return {"version": VERSION, "settings": settings, "drives": []}
@@ -233,7 +238,7 @@ def _key(entry: dict[str, Any]) -> Cell:
     return Cell(**{name: entry[name] for name in Cell.__dataclass_fields__})
 
 
-def _print_share(
+def _report_share(
     progress: Progress | None, done: int, total: int, cell: Cell
 ) -> Callable[[int, int], None]:
     def share(step: int, steps: int) -> None:
@@ -244,7 +249,7 @@ def _print_share(
 
 
 def groups(content: dict[str, Any]) -> Iterator[tuple[tuple[str, str], list[dict[str, Any]]]]:
-    """The drives by (perception, disturbance), in the order in which they were driven."""
+    """The drives by (perception, disturbance), in their order in `content`."""
     found: dict[tuple[str, str], list[dict[str, Any]]] = {}
     for entry in content["drives"]:
         found.setdefault((entry["perception"], entry["disturbance"]), []).append(entry)

@@ -1,8 +1,8 @@
-"""Parameters of several controllers, searched with the same budget of drives for each.
+"""A search for the parameters of several controllers, with equal budgets of drives.
 
-The first drive has the controller's own parameters; a third of the budget is drawn over the whole
-ranges, log-uniformly, the rest around the best so far, ever nearer. `tuned.json` is written again
-after each candidate; the same command goes on where it was stopped.
+The first candidate is the controller's own parameters. A third of the budget is drawn log-uniformly
+over the whole ranges, the rest around the best candidate so far with a falling spread. The file is
+written after each candidate, so the same command continues an interrupted search.
 """
 
 import json
@@ -13,11 +13,12 @@ from typing import Any
 
 import numpy as np
 
-from controllers.closed_loop import check_reward
-from controllers.compare.disturbance import find_disturbance
+from controllers.compare.config import TuneConfig
 from controllers.compare.run import GRID_SHARE, names
-from controllers.config import DriveConfig, TuneConfig
-from controllers.drive import drive
+from controllers.drive.closed_loop import check_reward
+from controllers.drive.config import DriveConfig
+from controllers.drive.disturbance import find_disturbance
+from controllers.drive.run import drive
 from controllers.registry import CONTROLLERS
 from runtime.files import check_folder, write_json
 from simulator.track.catalogue import find_track
@@ -25,14 +26,16 @@ from trackfeatures.errors import UserError
 
 VERSION = 1
 EXPLORED = 1.0 / 3.0
-SETTINGS = ("tracks", "reward", "steps", "disturbance", "seed")
+"""Share of the budget that is drawn over the whole ranges."""
+SETTINGS = ("tracks", "reward", "steps", "disturbance", "seed", "budget")
+"""Settings that the file stores; another search refuses it."""
 
 Progress = Callable[[int, int, str], None]
-"""Called with the candidates done, those in all, and the present controller."""
+"""A function that is called with the candidates done, their total number, and the controller."""
 
 
 def tune(config: TuneConfig, progress: Progress | None = None) -> dict[str, Any]:
-    """Search, and return the content of `config.out`.
+    """Search the parameters; returns the content of `config.out`.
 
     Raises UserError for an unknown name, or a file of other settings.
     """
@@ -78,7 +81,7 @@ def propose(
     budget: int,
     rng: np.random.Generator,
 ) -> dict[str, float]:
-    """The next candidate after those tried; {} is the controller's own parameters."""
+    """The candidate after those in `tried`; {} is the controller's own parameters."""
     if not tried:
         return {}
     best = max(tried, key=lambda one: float(one["reward"]))["parameters"]
@@ -96,7 +99,7 @@ def propose(
 
 
 def evaluate(config: TuneConfig, controller: str, parameters: Mapping[str, float]) -> float:
-    """The mean reward a step over the tracks."""
+    """The mean reward a step over the tracks of `config`."""
     rewards = []
     for name in names(config.tracks, "tracks"):
         track = find_track(name, config.tracks_dir)
@@ -117,7 +120,7 @@ def evaluate(config: TuneConfig, controller: str, parameters: Mapping[str, float
 
 
 def _read(path: Path, config: TuneConfig) -> dict[str, Any]:
-    settings = {name: getattr(config, name) for name in SETTINGS} | {"budget": config.budget}
+    settings = {name: getattr(config, name) for name in SETTINGS}
     if not path.exists():
         return {"version": VERSION, "settings": settings, "controllers": {}}
     try:

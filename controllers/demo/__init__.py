@@ -1,1 +1,1 @@
-"""`controllers demo`: the whole pipeline in one command, with a table and an HTML report."""
+"""The demo: the whole pipeline in one command, with tables and an HTML report."""

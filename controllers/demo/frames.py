@@ -1,4 +1,4 @@
-"""Held-out frames for the demo: chosen from all test rounds, then posted to the service."""
+"""Held-out frames for the demo: their choice from the test rounds, and the service's answers."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -12,7 +12,7 @@ from trackfeatures import MARKINGS, RoadClass, localise
 
 @dataclass(frozen=True, slots=True)
 class PostedFrame:
-    """One held-out frame (JPEG), its labels, and the answer of the service."""
+    """One held-out frame (JPEG), its labels (m, rad, 1/m), and the answer of the service."""
 
     jpeg: bytes
     round_id: str
@@ -32,7 +32,7 @@ class PostedFrame:
 
 
 def spread(frames: Frames, count: int, rng: np.random.Generator) -> list[int]:
-    """`count` frame numbers, equally many of every round, drawn without repetition."""
+    """`count` frame numbers in ascending order, drawn equally from all rounds, none twice."""
     rounds = frames.labels.round
     shares = np.array_split(np.arange(count), len(np.unique(rounds)))
     chosen: list[int] = []
@@ -43,7 +43,7 @@ def spread(frames: Frames, count: int, rng: np.random.Generator) -> list[int]:
 
 
 def post_frames(frames: Frames, indices: list[int], client: Client) -> list[PostedFrame]:
-    """Post the recorded JPEG files; the answers with their labels."""
+    """Post the recorded JPEG files to the service; returns the answers with the labels."""
     return [_post_frame(frames, index, client) for index in indices]
 
 

@@ -1,6 +1,6 @@
-"""The project's commands as child processes: run to the end, or started and stopped (the service).
+"""The project's commands as child processes that run to their end, or serve until they are stopped.
 
-On Ctrl-C and SIGTERM the child processes get `STOP_LIMIT_S` to end by themselves.
+After Ctrl-C or SIGTERM the child processes have `STOP_LIMIT_S` to end by themselves.
 """
 
 import signal
@@ -14,12 +14,12 @@ from pathlib import Path
 from serve.client import Client
 from trackfeatures import UserError
 
-START_LIMIT_S = 60.0
-STOP_LIMIT_S = 10.0
+START_LIMIT_S, STOP_LIMIT_S = 60.0, 10.0
+"""Time in which the service must be ready, and in which a child process must end."""
 
 
 class Terminated(KeyboardInterrupt):
-    """SIGTERM: unlike Ctrl-C in a terminal, it does not reach the child processes by itself."""
+    """SIGTERM arrived. Unlike Ctrl-C in a terminal, it does not reach the child processes."""
 
 
 def stop_on_sigterm() -> None:
@@ -32,7 +32,7 @@ def stop_on_sigterm() -> None:
 
 
 def run_module(command: list[str]) -> tuple[int, str]:
-    """Run `python -m command...` with this interpreter; its exit code and standard output."""
+    """Run `python -m command...` with this interpreter; returns the exit code and stdout."""
     with subprocess.Popen(
         [sys.executable, "-m", *command], stdout=subprocess.PIPE, text=True
     ) as child:
@@ -47,7 +47,7 @@ def run_module(command: list[str]) -> tuple[int, str]:
 
 
 def free_port() -> int:
-    """A port of the loopback interface that is free now."""
+    """A port of the loopback interface that is free at present."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port: int = probe.getsockname()[1]
@@ -56,9 +56,10 @@ def free_port() -> int:
 
 @contextmanager
 def running_service(model: str, log: Path) -> Iterator[str]:
-    """Serve the model of that name or run folder; yields the service's address.
+    """Serve `model`, a name or a run folder; yields the service's address.
 
-    Raises UserError with the end of the log if the service does not become ready or does not stop.
+    The service writes its output to `log`. Raises UserError with the end of the log if the service
+    does not become ready, and UserError if it does not stop.
     """
     port = free_port()
     url = f"http://127.0.0.1:{port}"
@@ -71,7 +72,8 @@ def running_service(model: str, log: Path) -> Iterator[str]:
             _wait_until_ready(server, url, log)
             yield url
         finally:
-            stopped = _stop(server)
+            server.terminate()
+            stopped = _wait(server)
     if not stopped:
         raise UserError(f"the service did not stop within {STOP_LIMIT_S:.0f} s; see {log}")
 
@@ -88,13 +90,8 @@ def _wait_until_ready(server: subprocess.Popen[bytes], url: str, log: Path) -> N
         ) from None
 
 
-def _stop(server: subprocess.Popen[bytes]) -> bool:
-    server.terminate()
-    return _wait(server)
-
-
 def _wait(child: "subprocess.Popen[bytes] | subprocess.Popen[str]") -> bool:
-    """Wait `STOP_LIMIT_S` for the process to end; False when it had to be killed."""
+    """Wait until the process ends, at most `STOP_LIMIT_S`; False if it had to be killed."""
     try:
         child.wait(STOP_LIMIT_S)
     except subprocess.TimeoutExpired:

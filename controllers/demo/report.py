@@ -1,4 +1,4 @@
-"""The demo's results: limit checks, tables for the terminal, and a self-contained HTML report."""
+"""The demo's results: limit checks, tables for the terminal, and an HTML report in one file."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from markupsafe import Markup
 from rich.console import Console
 from rich.table import Table
 
-from controllers.config import DemoConfig
+from controllers.demo.config import DemoConfig
 from controllers.demo.frames import PostedFrame
 from controllers.demo.run import DemoResult
 from datagen.recording import Dataset
@@ -24,15 +24,15 @@ from trackfeatures import MARKINGS
 from trackfeatures.camera import CameraParameters
 
 LIMITS = {"ml": 0.35, "mr": 0.35, "angle": 0.03, "heading": 0.85}
-"""What the demo must reach: mean error in m and rad, and the accuracy of the heading class."""
+"""Largest mean errors in m and rad, and the least accuracy of the class of the road."""
 MAX_MEAN_ABS_D_M = 0.3
-"""Of the drive on the service's answers; it must also not leave the road."""
+"""Largest mean offset (m) of the drive on the service's answers; the car must stay on the road."""
 LIMIT_COLUMNS = ("feature", "mean error", "limit", "training mean", "ratio", "reached")
 LEARNED_RATIO = 0.65
-"""A feature counts as learned when its error is at most this share of the baseline's, which always
-predicts the mean of the training labels."""
+"""A feature counts as learned if its error is at most this share of the baseline's error. The
+baseline always predicts the mean of the training labels."""
 MIN_TERMINAL_WIDTH = 120
-"""Columns that the tables need; a narrower terminal wraps whole lines, which is easier to read."""
+"""Columns that the tables need; a narrower terminal wraps whole lines, which stay readable."""
 ANSWER_COLUMNS = (
     *("round", "track", "lanes"),
     *(f"{name} (m)" for name in MARKINGS),
@@ -43,15 +43,17 @@ CURVE_COLOURS = {"distance": "#22bb66", "angle": "#ee8822", "type": "#3366cc"}
 
 @dataclass(frozen=True, slots=True)
 class LimitCheck:
-    """A result of the evaluation beside its limit and the result of the baseline."""
+    """A result of the demo, with its limit and the result of the baseline."""
 
     what: str
+    """Name of the result, with its unit."""
     figure: float
     mean: float | None
-    """That of the baseline; None where there is none."""
+    """The result of the baseline; None without a baseline."""
     limit: float | None = None
-    """None: the demo sets no limit."""
+    """None if the demo sets no limit."""
     reached: bool = True
+    """Whether the result is within its limit."""
 
     @property
     def word(self) -> str:
@@ -61,7 +63,7 @@ class LimitCheck:
 
 
 def check_limits(result: DemoResult) -> list[LimitCheck]:
-    """The demo's results against its limits: evaluation, posted frames, drive."""
+    """The checks of all results of the demo: evaluation, posted frames, drive."""
     return [
         *check_evaluation(result.evaluation),
         *check_posted(result.asked, result.evaluation),
@@ -70,12 +72,12 @@ def check_limits(result: DemoResult) -> list[LimitCheck]:
 
 
 def check_evaluation(evaluation: dict[str, Any]) -> list[LimitCheck]:
-    """The results of an evaluation against the demo's limits, feature by feature."""
+    """The checks of the results of an evaluation, feature by feature."""
     baseline = evaluation["baseline"]
     rows = []
     for name in MARKINGS:
         error, mean = evaluation["mae_m"][name], baseline["mae_m"][name]
-        if error is not None and mean is not None:  # on one lane no test frame may show an `l`
+        if error is not None and mean is not None:  # test frames of one lane may show no `l`
             rows.append(_check_error(f"{name} (m)", error, mean, LIMITS.get(name)))
     angle, mean_angle = evaluation["angle_mae_rad"], baseline["angle_mae_rad"]
     rows.append(_check_error("angle (rad)", angle, mean_angle, LIMITS["angle"]))
@@ -92,9 +94,9 @@ def _check_error(what: str, error: float, mean: float, limit: float | None) -> L
 
 
 def check_posted(frames: list[PostedFrame], evaluation: dict[str, Any]) -> list[LimitCheck]:
-    """The service's answers to posted frames: mean errors within the evaluation's 95th percentile.
+    """The checks of the service's answers: mean errors up to the 95th percentile of the evaluation.
 
-    A service that answers for another camera or model than the evaluated one is far outside.
+    A service with another camera or model than the evaluated one has far larger errors.
     """
     found = []
     for what, name, pairs in (
@@ -114,14 +116,14 @@ def check_posted(frames: list[PostedFrame], evaluation: dict[str, Any]) -> list[
 
 
 def check_drive(drive: dict[str, Any]) -> LimitCheck:
-    """The drive on the service's answers: on the road to the end, near the middle of its lane."""
+    """The check of the drive on the service's answers: the car stays on the road, near its lane."""
     mean = drive["mean_abs_d_m"]
     stayed = drive["ended"] is None and mean <= MAX_MEAN_ABS_D_M
     return LimitCheck("drive: mean |d| (m)", mean, None, MAX_MEAN_ABS_D_M, stayed)
 
 
 def check_cells(check: LimitCheck) -> tuple[str, ...]:
-    """A check as the cells of `LIMIT_COLUMNS`."""
+    """The cells of `LIMIT_COLUMNS` for a check."""
     limit = "" if check.limit is None else f"{check.limit:.4g}"
     mean = "" if check.mean is None else f"{check.mean:.4f}"
     ratio = "" if check.mean is None else f"{check.figure / check.mean:.2f}"
@@ -132,7 +134,7 @@ def check_cells(check: LimitCheck) -> tuple[str, ...]:
 
 
 def write_report(config: DemoConfig, result: DemoResult) -> Path:
-    """Write `report.html` into the demo's folder and return its path."""
+    """Write `report.html` into the demo's folder; returns its path."""
     path = config.out / "report.html"
     camera = Dataset.open(config.out / "data").camera
     page = render(
@@ -154,7 +156,7 @@ def write_report(config: DemoConfig, result: DemoResult) -> Path:
 
 
 def _answer_cells(frame: PostedFrame) -> tuple[str, ...]:
-    """True and predicted values of a frame, separated by a slash."""
+    """The cells of `ANSWER_COLUMNS` for a frame: "true / predicted" values."""
     answer = frame.answer
     distances = ((frame.distances[name], answer["distances_m"][name]) for name in MARKINGS)
     return (
@@ -173,7 +175,7 @@ def _pair(true: float | None, predicted: float | None, digits: int) -> str:
 
 
 def _figures(camera: CameraParameters, frames: list[PostedFrame]) -> Iterator[dict[str, str]]:
-    """The frames with true and predicted markings drawn on them, and their captions."""
+    """The frames with their captions; true and predicted markings are drawn on them."""
     height_m = camera.height_above_road_m
     for one in frames:
         image = simplejpeg.decode_jpeg(one.jpeg)
@@ -185,7 +187,7 @@ def _figures(camera: CameraParameters, frames: list[PostedFrame]) -> Iterator[di
 
 
 def _training_curves(path: Path) -> Markup | None:
-    """The training losses, each as a share of its first value; None without a logged point."""
+    """A chart of the training losses, as shares of their first values; None without a point."""
     rows = read_curves(path)
     if not rows:
         return None
@@ -202,7 +204,7 @@ def _training_curves(path: Path) -> Markup | None:
 
 
 def print_tables(checks: list[LimitCheck], frames: list[PostedFrame]) -> None:
-    """Print the limit checks, and true beside predicted values, on standard output."""
+    """Print the limit checks and the true and predicted values on stdout."""
     console = Console()
     console = Console(width=max(console.width, MIN_TERMINAL_WIDTH))
     console.print(_limit_table(checks))

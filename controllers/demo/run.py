@@ -1,4 +1,4 @@
-"""The steps of the demo. Each is a command of this project, printed before it runs."""
+"""The steps of the demo. Each step is a command of this project and is printed before it runs."""
 
 import json
 import shlex
@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from controllers.config import DemoConfig
+from controllers.demo.config import DemoConfig
 from controllers.demo.frames import PostedFrame, post_frames, spread
 from controllers.demo.process import run_module, running_service
-from controllers.lqr import WEIGHTS_BRIEFLY_TRAINED
+from controllers.laws.lqr import WEIGHTS_BRIEFLY_TRAINED
 from datagen.recording import Dataset
 from runtime.files import write_json
 from serve.client import Client
@@ -22,21 +22,20 @@ from trackfeatures import UserError
 
 LOG = Console(stderr=True, highlight=False, markup=False)
 FIRST_TRACK = "coast"
-"""No model is trained on it."""
+"""Track of the first drive; no model is trained on it."""
 FIRST_FRAMES, FIRST_POSTED = 60, 4
+"""Frames of the first drive, and how many of them are posted to the service."""
 TEST_SHARE = 0.1
-"""Of the rounds collected: most of the time is for frames to train on."""
+"""Share of the collected rounds that is held out for testing."""
 DRIVE_STEPS = 800
-"""Of 50 ms: 40 s from a standing start."""
-
-
+"""Control steps of 50 ms of the drive: 40 s from a standing start."""
 COLLECTED_PER_S, CHECKED_PER_S = 250, 2_000
-"""Frames collected and verified in a second on two cores, for the plan that `announce` prints."""
+"""Frames that two cores collect and verify in a second, for the plan that `announce` prints."""
 
 
 @dataclass(slots=True)
 class DemoResult:
-    """The output of every step, for the report."""
+    """The results of all steps, for the report."""
 
     collected: dict[str, Any] = field(default_factory=dict)
     evaluation: dict[str, Any] = field(default_factory=dict)
@@ -48,7 +47,7 @@ class DemoResult:
     """Frames answered by the shipped model."""
 
     def as_json(self) -> dict[str, Any]:
-        """All of it except the images."""
+        """The fields as values for JSON, without the images."""
         content = asdict(self)
         for one in content["asked"] + content["shipped"]:
             del one["jpeg"]
@@ -56,7 +55,7 @@ class DemoResult:
 
 
 def announce(config: DemoConfig) -> None:
-    """Print what the demo will do, and about how long each part takes on two cores."""
+    """Print the parts of the demo, and about how long each takes on two cores."""
     frames = config.rounds * config.frames
     parts = [
         (0.5, f"first drive: a film of the shipped model's answers, {config.out / 'first.mp4'}"),
@@ -79,20 +78,19 @@ def _duration(minutes: float) -> str:
 
 
 def run_demo(config: DemoConfig) -> DemoResult:
-    """Try the shipped model; collect, verify, train, evaluate, serve, predict, drive.
+    """Try the shipped model, then collect, verify, train, evaluate, serve, predict and drive.
 
-    All results go to `config.out`. With `config.first_drive` it ends after the shipped model.
-
-    Raises UserError when `config.out` holds other files than an earlier demo's, or a step fails.
+    All results are written to `config.out`. With `config.first_drive` the demo ends after the
+    shipped model. Raises UserError if `config.out` contains files of another origin, or if a step
+    fails.
     """
     _check_folder(config.out)
     result = DemoResult()
     data, run = str(config.out / "data"), str(config.out / "run")
     collect = ["datagen", "collect", "--out", data, "--json"]
     collect += ["--rounds", str(config.rounds), "--frames", str(config.frames)]
-    # Another scenery in every frame, and frames far apart, train best in so short a time
-    # (docs/experiments/data.md); four sceneries a round, since one is the default for rounds of
-    # this length.
+    # In a short training the best frames are far apart, each with another scenery
+    # (docs/experiments/data.md). Four sceneries a round: the default for this length is one.
     collect += ["--frequency", "4", "--stretch", "1", "--scenes", "4"]
     collect += ["--split-test-share", f"{TEST_SHARE:g}"]
     collect += ["--tracks", config.tracks, "--seed", str(config.seed)]
@@ -116,7 +114,7 @@ def run_demo(config: DemoConfig) -> DemoResult:
 
 
 def _try_shipped_model(config: DemoConfig, result: DemoResult) -> None:
-    """Serve the shipped model, post it frames of a short round, and draw its answers in a film."""
+    """Serve the shipped model, post frames of a short round, and draw its answers in a film."""
     folder = config.out / "first"
     collect = ["datagen", "collect", "--out", str(folder), "--json", "--split", "unseen"]
     collect += ["--rounds", "1", "--frames", str(FIRST_FRAMES), "--frequency", "5"]
@@ -133,7 +131,7 @@ def _try_shipped_model(config: DemoConfig, result: DemoResult) -> None:
 
 
 def _use_service(config: DemoConfig, result: DemoResult) -> None:
-    """Post held-out frames, and drive a car on the answers, with one service."""
+    """Post held-out frames to a service, and drive a car on its answers."""
     started = time.monotonic()
     _log_command(result, f"serve --model {config.out / 'run'}")
     frames = Dataset.open(config.out / "data").select("test")
@@ -144,14 +142,8 @@ def _use_service(config: DemoConfig, result: DemoResult) -> None:
     ):
         result.asked = post_frames(frames, chosen, client)
         result.seconds["serve"] = time.monotonic() - started
-        drive = [
-            "controllers",
-            "drive",
-            "--controller",
-            "lqr-preview",
-            "--track",
-            config.drive_track,
-        ]
+        drive = ["controllers", "drive", "--controller", "lqr-preview"]
+        drive += ["--track", config.drive_track]
         drive += ["--lanes", "1", "--perception", url, "--steps", str(DRIVE_STEPS), "--json"]
         drive += ["--log", str(config.out / "drive.csv")]
         drive += ["--parameters", str(write_soft_parameters(config.out / "soft-weights.json"))]
@@ -159,14 +151,14 @@ def _use_service(config: DemoConfig, result: DemoResult) -> None:
 
 
 def write_soft_parameters(path: Path) -> Path:
-    """Write weights of `lqr-preview` for a briefly trained model, for `--parameters`; the path."""
+    """Write the weights of `lqr-preview` for a briefly trained model, a file for `--parameters`."""
     parameters = asdict(WEIGHTS_BRIEFLY_TRAINED)
     write_json(path, {"controllers": {"lqr-preview": {"parameters": parameters}}})
     return path
 
 
 def _step(result: DemoResult, name: str, command: list[str]) -> str:
-    """Run one of the project's commands and return its stdout; its stderr is not captured."""
+    """Run a command of the project; returns its stdout. Its stderr is not captured."""
     shown = shlex.join(command)
     _log_command(result, shown)
     started = time.monotonic()

@@ -1,1 +1,1 @@
-"""Rounds recorded while a controller drives on a model's perception: data for further training."""
+"""Records rounds in which a controller drives on a model's perception, as further training data."""

@@ -1,11 +1,11 @@
-"""Steering a recorded round by a controller that sees the road through a model.
+"""The steering law of a recorded round: a controller on a model's perception.
 
-The round is that of `datagen collect`: its course over the road, its speed, traffic and light. The
-controller follows the course on what the model answers to each image, so that the car gets to where
-the model's errors lead (DAgger, Ross et al. 2011); the recorded labels are the simulator's truth.
+Course, speed, traffic and light of the round are those of `datagen collect`. The controller follows
+the course by the model's answer to each image, so that the car reaches the states to which the
+model's errors lead (DAgger, Ross et al. 2011). The recorded labels are the simulator's truth.
 
-Beside the images two things come from the simulator: which lane the answered offset is measured
-from, as an image shows only the lane that the car is in, and where the other cars are.
+Two inputs come from the simulator: the positions of the other cars, and the lane from which the
+answered offset is measured, because an image shows only the lane that the car is in.
 """
 
 from dataclasses import dataclass
@@ -13,9 +13,10 @@ from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import trackfeatures as tf
-from controllers.closed_loop import HOLD_S, OffsetMemory
+from controllers.drive.closed_loop import HOLD_S, OffsetMemory
 from controllers.interface import Controller, LoopConfig, Observation
-from controllers.perception import CameraPerception, FeatureModel, LocalModel, Perceive
+from controllers.perception.perceived import Perceive
+from controllers.perception.sources import CameraPerception, FeatureModel, LocalModel
 from controllers.registry import make_controller
 from simulator.vehicle.state import CarState
 
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
 
 
 class PerceivedLaw:
-    """A `datagen.driving.scripted_driver.SteeringLaw` that steers by perception, m and rad."""
+    """A `datagen.driving.scripted_driver.SteeringLaw` that steers by perception; m and rad."""
 
     def __init__(
         self, controller: str, loop: LoopConfig, perceive: Perceive, world: "World"
@@ -36,18 +37,18 @@ class PerceivedLaw:
         self.restart()
 
     def restart(self) -> None:
-        """Begin with a new controller and no memory of the road."""
+        """Replace the controller and the memory of the road by new ones."""
         self._controller: Controller = make_controller(self._name, self._loop)
         self._memory = OffsetMemory(round(HOLD_S / self._loop.dt))
 
     def road_curvature(self, state: CarState) -> float:
-        """Unknown: no image answers it. The controller estimates it, where it needs it."""
+        """0, because the model does not answer it; a controller that needs it estimates it."""
         return 0.0
 
     def steer(
         self, state: CarState, offset: float, curvature: float, path_angle: float = 0.0
     ) -> float:
-        """The controller's action towards the path at `offset`, of `path_angle` to the road."""
+        """The steering action towards the path at `offset`, which has `path_angle` to the road."""
         perceived = self._perceive(self._world)
         error = None
         if perceived.to_lane_centre is not None:
@@ -64,9 +65,10 @@ class PerceivedLaw:
         )
 
     def _from_middle(self, to_lane_centre: float, true: float) -> float:
-        """The answered offset from the middle of the road, for the lane nearest to the `true` one.
+        """The answered offset from the middle of the road; the lane is chosen by the `true` offset.
 
-        Near a marking the model may answer for the lane beside.
+        It is the lane that brings the answer nearest to `true`, because near a marking the model
+        may answer for the adjacent lane.
         """
         road = self._world.road
         centres = (tf.lane_centre(n, road.lanes, road.lane_width) for n in range(road.lanes))
@@ -75,7 +77,7 @@ class PerceivedLaw:
 
 @dataclass(frozen=True)
 class MakePerceivedLaw:
-    """Makes the law of a round; it is sent to the recording processes."""
+    """A function that makes the law of a round; it is pickled for the recording processes."""
 
     controller: str
     model: str
@@ -88,5 +90,5 @@ class MakePerceivedLaw:
 
 @lru_cache(maxsize=1)
 def _load(model: str) -> FeatureModel:
-    """The model, once a process: it drives many rounds."""
+    """The model; it is loaded once in each process, for all its rounds."""
     return LocalModel(model)

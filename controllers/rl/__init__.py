@@ -1,28 +1,29 @@
-"""Steering learnt by reinforcement: the paper's DDPG, and TD3 as the stronger yardstick.
+"""Training of an actor by reinforcement learning: the paper's DDPG, and TD3 as a stronger baseline.
 
-`ddpg` follows the paper: its state, reward, ends, exploration (Gaussian noise of 0.05 beta on an
-action with a probability that falls from 1 to 0.1 over 4*10^5 steps), noise of 0.05 on the state,
-discount 0.99, Adam, a replay, soft targets, the action joined to the critic's last hidden layer.
-Deviations from the paper, and settings where it is silent:
+`ddpg` follows the paper in its state, reward, ends of an episode, exploration (Gaussian noise of
+0.05 beta on an action, with a probability that falls from 1 to 0.1 over 4*10^5 steps), noise of
+0.05 on the state, discount of 0.99, Adam, replay and soft targets. The action joins the critic's
+last hidden layer, as in the paper. Deviations from the paper, and settings that it does not state:
 
-- The sizes of the layers stand in a figure that the text does not repeat: 64 and 64 here.
-- Learning rates 1e-4 (actor) and 3e-4 (critic), batch 64, tau 0.001: the authors' released
-  settings. The paper gives 1e-3 and 1e-4: `--actor-rate 1e-3 --critic-rate 1e-4`.
-- beta is 4, so the noise on an action has the standard deviation 0.2; the replay holds all steps.
+- The hidden layers have 64 units each; the paper gives sizes only in a figure.
+- The learning rates are 1e-4 (actor) and 3e-4 (critic), the batch is 64 and tau is 0.001, as in the
+  authors' released settings. The paper states learning rates of 1e-3 and 1e-4, which are given by
+  `--actor-rate 1e-3 --critic-rate 1e-4`.
+- beta is 4, so the noise on an action has a standard deviation of 0.2. The replay keeps all steps.
 - The first 1000 steps only fill the replay.
-- `w` is half the width of the track, as in the environment's reward. In other drives the offset is
-  divided by that of the track trained on: a controller does not know the road's width.
-- What drives is the target actor, an average over the last updates, taken at the best of the drives
-  on the training track.
+- `w` is half the width of the track, as in the environment's reward. Other drives divide the offset
+  by the `w` of the training, because a controller does not know the width of the road.
+- The target actor drives, an average over the last updates. The best of its drives on the training
+  track decides which actor is saved.
 
-`td3` differs further: two critics, target noise 0.02, an actor updated every second time; no noise
-on the state; discount 0.95, tau 0.005, learning rates that fall to 5 %; a constant of 1 subtracted
-from the reward (after an end, too, so the optimal policy stays the same) and the rest times 4;
-networks' inputs divided by their typical spread; left and right exchanged in half of the
-transitions and an actor that is odd by construction; episodes of 400 steps from random places and
-motions.
+`td3` has further differences: two critics, target noise of 0.02, an update of the actor after every
+second update of the critics, no noise on the state, discount of 0.95, tau of 0.005, learning rates
+that fall to 5 %. Its reward is the paper's minus 1 (also after a terminal state, so the optimal
+policy is the same), times 4. The inputs of its networks are divided by their typical spread. Left
+and right are exchanged in half of the transitions, and the actor is odd by construction. Its
+episodes have 400 steps and begin at random places and motions.
 
-The paper's state holds neither the curvature nor the yaw rate. With `--state stacked` the actor
-also sees the yaw rate, the changes since the last step and its last two actions; with `--state
-residual` it also sees the steering of the controller `lqr`, and its own action is added to that.
+The paper's state contains neither the curvature of the road nor the yaw rate. `--state stacked`
+adds the yaw rate, the changes since the last step and the last two actions. `--state residual` also
+adds the steering of the controller `lqr`, which the actor's action corrects.
 """

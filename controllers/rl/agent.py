@@ -1,35 +1,37 @@
-"""The learning agent: its actor and critics, its replay of transitions, and its updates."""
+"""The learning agent: actor, critics, replay of transitions, and updates."""
 
 import numpy as np
 from numpy.typing import NDArray
 
-from controllers.rl.actor import mirror_of
+from controllers.laws.actor import mirror_of
+from controllers.laws.actor_state import StateDefinition
 from controllers.rl.config import Algorithm
 from controllers.rl.networks import Array, Shape, forward
-from controllers.rl.state import StateDefinition
 from controllers.rl.updates import Batch, Trained, actor_update, critic_update
 
-TARGET_NOISE_CUT = 2.5  # standard deviations, as TD3's 0.5 of 0.2
+TARGET_NOISE_CUT = 2.5  # standard deviations; TD3 clips noise of 0.2 at 0.5
 
 
 class Replay:
-    """The last `capacity` transitions."""
+    """The last `capacity` transitions, with states of `size` numbers."""
 
     def __init__(self, capacity: int, size: int) -> None:
         self.states = np.zeros((capacity, size), np.float32)
         self.next_states = np.zeros((capacity, size), np.float32)
         self.results = np.zeros((capacity, 3), np.float32)
-        """Action, reward, and 1 where the episode ended."""
+        """Action, reward, and 1 if the episode ended, otherwise 0."""
         self.added = 0
+        """Number of transitions added so far, also of those that were overwritten."""
 
     def __len__(self) -> int:
         return min(self.added, len(self.states))
 
     def add(
-        self, state: Array, action: float, reward: float, following: Array, ended: bool
+        self, state: Array, action: float, reward: float, next_state: Array, ended: bool
     ) -> None:
+        """Store a transition; it overwrites the oldest one when the replay is full."""
         place = self.added % len(self.states)
-        self.states[place], self.next_states[place] = state, following
+        self.states[place], self.next_states[place] = state, next_state
         self.results[place] = action, reward, ended
         self.added += 1
 
@@ -46,7 +48,7 @@ class Replay:
 
 
 class Agent:
-    """An actor and its critics; one `update` a control step."""
+    """An actor and its critics; `update` is called once for each control step."""
 
     def __init__(
         self,
@@ -67,11 +69,11 @@ class Agent:
         self._order, self._signs = mirror_of(definition)
 
     def see(self, state: Array) -> Array:
-        """The networks' input for a state (size,)."""
+        """The input of the networks for a state (size,)."""
         return np.asarray(state / self.divisor, np.float32)
 
     def act(self, seen: Array) -> float:
-        """The present actor's action for a network's input."""
+        """The action of the present actor for an input of the networks."""
         rows = seen[None]
         if self.algorithm.mirrored:
             rows = np.stack([seen, seen[self._order] * self._signs])
@@ -79,17 +81,23 @@ class Agent:
         return float(0.5 * (actions[0] - actions[1]) if len(rows) == 2 else actions[0])
 
     def remember(
-        self, seen: Array, action: float, reward: float, following: Array, ended: bool
+        self, seen: Array, action: float, reward: float, next_seen: Array, ended: bool
     ) -> None:
-        """Keep a transition. With a baseline, an end stands for the same rewards ever after."""
+        """Add a transition to the replay.
+
+        With a baseline, a terminal state is worth the baseline's reward repeated for ever.
+        """
         of = self.algorithm
         value = reward - of.reward_baseline
         if ended:
             value -= of.reward_baseline * of.discount / (1.0 - of.discount)
-        self.replay.add(seen, action, of.reward_scale * value, following, ended)
+        self.replay.add(seen, action, of.reward_scale * value, next_seen, ended)
 
     def update(self, rng: np.random.Generator, rate_share: float) -> float:
-        """One update on a random mini-batch; returns the critics' loss."""
+        """One update on a random mini-batch; returns the critics' loss.
+
+        `rate_share` is a factor on the learning rates.
+        """
         of = self.algorithm
         batch = self.replay.sample(rng.integers(len(self.replay), size=of.batch))
         if of.mirrored:
@@ -114,7 +122,7 @@ class Agent:
         return np.asarray(np.clip(drawn, -cut, cut), np.float32)
 
     def _mirror(self, batch: Batch, chosen: NDArray[np.bool_]) -> None:
-        """Exchange left and right in the chosen rows of `batch`."""
+        """Exchange left and right in the `chosen` rows (B,) of `batch`."""
         for states in (batch.states, batch.next_states):
             states[chosen] = states[chosen][:, self._order] * self._signs
         batch.actions[chosen] *= -1.0

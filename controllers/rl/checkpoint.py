@@ -1,6 +1,7 @@
 """The checkpoint of a training: one safetensors file, written between two episodes.
 
-Tensors: the agent's parameters, Adam's moments and the replay. Metadata: the progress as JSON.
+Its tensors are the agent's parameters, Adam's moments and the replay; its metadata is the progress
+as JSON.
 """
 
 import json
@@ -22,22 +23,28 @@ Row = tuple[float, ...]
 
 @dataclass
 class Progress:
-    """How far a training has come."""
+    """The progress of a training."""
 
     step: int = 0
+    """Control steps done."""
     episode: int = 0
+    """Episodes done."""
     seconds: float = 0.0
+    """Wall-clock time of the training."""
     loss: float = float("nan")
     """Mean of the critics' losses over the last episode."""
     evaluated: int = 0
-    """Step of the last drive."""
+    """Step of the last drive on the training track."""
     best_score: float = float("-inf")
+    """Best reward a step of these drives."""
     best_step: int = 0
+    """Step of the best drive."""
     curve: list[Row] = field(default_factory=list)
+    """The rows of `curve.csv`, one for each drive."""
 
 
 def save_checkpoint(run: Path, agent: Agent, progress: Progress) -> None:
-    """Write the state of a training to `run`."""
+    """Write the state of a training to the folder `run`."""
     tensors = _parameters(agent)
     filled = len(agent.replay)
     for name in ("states", "next_states", "results"):
@@ -48,9 +55,9 @@ def save_checkpoint(run: Path, agent: Agent, progress: Progress) -> None:
 
 
 def load_checkpoint(run: Path, agent: Agent) -> Progress | None:
-    """Restore `agent` from the checkpoint in `run`; None where there is none.
+    """Restore `agent` from the checkpoint in `run`; returns None without a checkpoint.
 
-    Raises UserError for a damaged one.
+    Raises UserError for a damaged checkpoint.
     """
     path = run / FILE
     if not path.exists():
@@ -75,7 +82,7 @@ def load_checkpoint(run: Path, agent: Agent) -> Progress | None:
 
 
 def _parameters(agent: Agent) -> dict[str, NDArray[np.float32]]:
-    """The agent's arrays by name, as they are, not copied."""
+    """The agent's arrays by name; they are not copied."""
     return {
         f"{name}.{part}": getattr(networks, part)
         for name, networks in (("actor", agent.actor), ("critics", agent.critics))

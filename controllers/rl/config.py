@@ -1,79 +1,73 @@
-"""What the command `controllers train` can be given, and the settings of each algorithm."""
+"""The configuration of `controllers train`, and the settings of each algorithm."""
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
+from typer import Option
+
+from controllers import cli_options as options
 from trackfeatures.errors import UserError
 
 EXPLORATION_STEPS = 400_000
-"""The paper's T_epsilon: the probability of noise on an action falls to its least over these."""
+"""The paper's T_epsilon: the number of steps over which the probability of noise on an action falls
+from EXPLORATION_FIRST to EXPLORATION_LEAST."""
 EXPLORATION_FIRST, EXPLORATION_LEAST = 1.0, 0.1
 QUADRATIC_SCALE = 5.0
-"""Times an algorithm's `reward_scale`, for the quadratic reward, which is that much smaller."""
+"""Factor on `reward_scale` for the quadratic reward, which is about five times smaller."""
 EXPLORATION_NOISE = 0.05
-"""Standard deviation of the paper's noise on an action, which beta multiplies."""
+"""Standard deviation of the paper's noise on an action before the factor beta."""
 
 
 @dataclass(frozen=True)
 class Algorithm:
-    """Settings that nobody needs to change from one training to the next."""
+    """The settings of an algorithm; the defaults are those of `ddpg`."""
 
-    critics: int
-    actor_delay: int
-    """Updates of the critics for one of the actor."""
-    target_noise: float
-    """Standard deviation of the noise on the target's action, cut at 2.5 of them."""
-    discount: float
-    tau: float
-    batch: int
-    actor_rate: float
-    critic_rate: float
-    rate_end: float
+    critics: int = 1
+    """Number of critics; the target uses the smallest of their values."""
+    actor_delay: int = 1
+    """Updates of the critics per update of the actor."""
+    target_noise: float = 0.0
+    """Standard deviation of the noise on the target action; the noise is clipped at 2.5 of it."""
+    discount: float = 0.99
+    tau: float = 0.001
+    """Share of the networks' parameters in the soft update of the target networks."""
+    batch: int = 64
+    """Transitions per update."""
+    actor_rate: float = 1e-4
+    critic_rate: float = 3e-4
+    rate_end: float = 1.0
     """Share of the learning rates that is left at the last step; they fall linearly."""
-    beta: float
-    """Times EXPLORATION_NOISE: the noise on an action."""
-    state_noise: float
+    beta: float = 4.0
+    """The noise on an action has the standard deviation beta * EXPLORATION_NOISE."""
+    state_noise: float = 0.05
     """Standard deviation of the noise on the state."""
-    random_starts: bool
-    """Episodes of 400 steps from a random place and motion, in place of the paper's start."""
-    mirrored: bool
-    """Left and right are exchanged in half of the transitions, and the actor is made odd."""
-    scaled: bool
-    """The networks' inputs are divided by their spread."""
-    reward_baseline: float
-    """Subtracted from every reward, those after an end included: the same optimal policy."""
-    reward_scale: float
+    random_starts: bool = False
+    """Whether episodes are of 400 steps from a random place and motion; the paper's have 6500."""
+    mirrored: bool = False
+    """Whether left and right are exchanged in half of the transitions, and the actor is odd."""
+    scaled: bool = False
+    """Whether the networks' inputs are divided by their typical spread."""
+    reward_baseline: float = 0.0
+    """Subtracted from every reward, also after a terminal state: the optimal policy is the same."""
+    reward_scale: float = 1.0
+    """Factor on the rewards."""
     hidden: tuple[int, int] = (64, 64)
+    """Sizes of the two hidden layers."""
     replay: int = 400_000
+    """Transitions that the replay keeps."""
     learning_starts: int = 1000
+    """Transitions in the replay before the first update."""
 
 
 ALGORITHMS = {
-    "ddpg": Algorithm(
-        critics=1,
-        actor_delay=1,
-        target_noise=0.0,
-        discount=0.99,
-        tau=0.001,
-        batch=64,
-        actor_rate=1e-4,
-        critic_rate=3e-4,
-        rate_end=1.0,
-        beta=4.0,
-        state_noise=0.05,
-        random_starts=False,
-        mirrored=False,
-        scaled=False,
-        reward_baseline=0.0,
-        reward_scale=1.0,
-    ),
+    "ddpg": Algorithm(),
     "td3": Algorithm(
         critics=2,
         actor_delay=2,
         target_noise=0.02,
         discount=0.95,
         tau=0.005,
-        batch=64,
         actor_rate=3e-4,
         critic_rate=5e-4,
         rate_end=0.05,
@@ -88,30 +82,43 @@ ALGORITHMS = {
 }
 
 
+def _defaults(name: str) -> str:
+    """The value of a setting for each algorithm, for the help of an option."""
+    return ", ".join(f"{key} {getattr(one, name):g}" for key, one in ALGORITHMS.items())
+
+
 @dataclass(frozen=True)
 class TrainConfig:
-    """One training. The same configuration gives the same actor, bit for bit."""
+    """One training. Equal configurations give equal actors, bit for bit."""
 
-    out: Path = Path("runs/rl")
-    algorithm: str = "ddpg"
-    track: str = "forza"
-    seed: int = 0
-    steps: int = 400_000
-    """Control steps of 50 ms, with one update each."""
-    state: str = "paper"
-    state_noise: float | None = None
-    """None: the algorithm's own."""
-    actor_rate: float | None = None
-    critic_rate: float | None = None
-    reward: str = "paper"
-    """paper, or quadratic: -(0.3 d^2 + angle^2 + 0.03 delta^2)."""
-    evaluate_every: int = 20_000
-    """Steps between two drives; a checkpoint is written after each."""
-    tracks_dir: Path | None = None
+    out: Annotated[Path, "Folder for the actor, its curve and its checkpoint."] = Path("runs/rl")
+    algorithm: Annotated[str, f"Algorithm: {' or '.join(ALGORITHMS)}."] = "ddpg"
+    track: options.Track = "forza"
+    seed: Annotated[int, Option(help="Seed of all random numbers of the training.", min=0)] = 0
+    steps: Annotated[
+        int, Option(help="Control steps of 50 ms, with one update after each.", min=1)
+    ] = 400_000
+    state: Annotated[str, "State that the actor receives: paper, stacked or residual."] = "paper"
+    state_noise: Annotated[
+        float | None,
+        "Standard deviation of the noise on the paper's state. Default: "
+        f"{_defaults('state_noise')}.",
+    ] = None
+    actor_rate: Annotated[
+        float | None, f"Learning rate of the actor. Default: {_defaults('actor_rate')}."
+    ] = None
+    critic_rate: Annotated[
+        float | None, f"Learning rate of the critics. Default: {_defaults('critic_rate')}."
+    ] = None
+    reward: options.Reward = "paper"
+    evaluate_every: Annotated[
+        int, Option(help="Steps between two drives; a checkpoint is written after each.", min=1)
+    ] = 20_000
+    tracks_dir: options.TracksDir = None
 
 
 def find_algorithm(name: str) -> Algorithm:
-    """The settings of `name`. Raises UserError where there are none."""
+    """The settings of the algorithm `name`. Raises UserError for an unknown name."""
     if name not in ALGORITHMS:
         raise UserError(f"there is no algorithm {name!r}; use one of: {', '.join(ALGORITHMS)}")
     return ALGORITHMS[name]

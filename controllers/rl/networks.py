@@ -1,11 +1,11 @@
 """Actor and critic: two hidden layers and their gradients, in numpy on flat float32 vectors.
 
-Written out because these networks are tiny: of an update by torch's autograd the arithmetic is a
-tenth. The gradients are tested against torch's.
+The gradients are written out because the networks are tiny: in an update by torch's autograd the
+arithmetic takes only a tenth of the time. Tests compare the gradients with torch's.
 
 A network is state -> hidden 1 (ReLU) -> hidden 2 (ReLU) -> one number. The critic's action joins
-the output of hidden 1, so that it enters the last hidden layer (the paper's figure of the
-networks). N networks of one shape are computed together, from parameters (N, P): each row holds
+the output of hidden 1, so that it enters the last hidden layer, as in the paper's figure of the
+networks. N networks of one shape are computed together from parameters (N, P). A row consists of
 W1 (state, h1), b1, W2 (h1 + actions, h2), b2, W3 (h2), b3.
 """
 
@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 Array = NDArray[np.float32]
 
 SMALL_OUTPUT = 3e-3
-"""Bound of the output layer's first weights, so that the first answers are near 0 (Lillicrap et al.
-2016, section 7)."""
+"""Bound of the output layer's initial weights, so that the first outputs are near 0 (Lillicrap et
+al. 2016, section 7)."""
 
 
 class Shape(NamedTuple):
@@ -29,16 +29,16 @@ class Shape(NamedTuple):
     h1: int
     h2: int
     actions: int = 0
-    """Numbers that enter hidden 2 beside hidden 1: 1 for a critic, 0 for an actor."""
+    """Numbers that join the output of hidden 1: 1 for a critic, 0 for an actor."""
 
     @property
     def parameters(self) -> int:
-        """Length of a network's row of parameters."""
+        """Number of parameters of one network, P."""
         return self.state * self.h1 + self.h1 + (self.h1 + self.actions + 2) * self.h2 + 1
 
 
 class Layers(NamedTuple):
-    """Views into the parameters of N networks, or into their gradient."""
+    """Views into the parameters of N networks, or into their gradients."""
 
     w1: Array  # (N, state, h1)
     b1: Array  # (N, 1, h1)
@@ -50,7 +50,7 @@ class Layers(NamedTuple):
 
 @dataclass(frozen=True)
 class Activations:
-    """What `forward` computes for N networks and B states, and `backward` needs."""
+    """The activations of N networks for B states: results of `forward`, inputs of `backward`."""
 
     x: Array  # (B, state)
     z: Array  # (N, B, h1 + actions)
@@ -59,7 +59,7 @@ class Activations:
 
 
 def layers(theta: Array, shape: Shape) -> Layers:
-    """The layers of parameters (N, P); writing to them writes to `theta`."""
+    """The layers in the parameters `theta` (N, P); writing to them writes to `theta`."""
     state, h1, h2, actions = shape
     ends = np.cumsum([state * h1, h1, (h1 + actions) * h2, h2, h2]).tolist()
     w1, b1, w2, b2, w3, b3 = (
@@ -77,7 +77,7 @@ def layers(theta: Array, shape: Shape) -> Layers:
 
 
 def initial(shape: Shape, count: int, rng: np.random.Generator) -> Array:
-    """First parameters (count, P): uniform within one over the root of each layer's inputs."""
+    """Initial parameters (count, P): uniform within 1 / sqrt(number of the layer's inputs)."""
     theta = np.zeros((count, shape.parameters), np.float32)
     of = layers(theta, shape)
     for weights, bias in ((of.w1, of.b1), (of.w2, of.b2)):
@@ -89,7 +89,7 @@ def initial(shape: Shape, count: int, rng: np.random.Generator) -> Array:
 
 
 def forward(of: Layers, x: Array, actions: Array | None = None) -> Activations:
-    """The answers for states x (B, state) and, for critics, actions (B,)."""
+    """The activations for states `x` (B, state) and, for critics, `actions` (B,)."""
     z = np.matmul(x, of.w1)
     z += of.b1
     np.maximum(z, 0.0, out=z)
@@ -106,8 +106,11 @@ def forward(of: Layers, x: Array, actions: Array | None = None) -> Activations:
 
 
 def backward(of: Layers, seen: Activations, g_out: Array, gradient: Layers | None) -> Array:
-    """Fill the gradient of sum(g_out * out), g_out (N, B), by the parameters; returns that by the
-    columns of z (N, B, h1 + actions), of which a critic's last is that by the action."""
+    """Fill `gradient` with the gradient of sum(g_out * out) with respect to the parameters.
+
+    `g_out` is (N, B). Returns the gradient with respect to z (N, B, h1 + actions); its last column
+    is a critic's gradient with respect to the action.
+    """
     g2 = g_out[:, :, None] * of.w3.transpose(0, 2, 1)
     g2 *= seen.h2 > 0.0
     g_z: Array = np.matmul(g2, of.w2.transpose(0, 2, 1))

@@ -1,9 +1,9 @@
-"""Training an actor in the Gymnasium environment, with drives to judge it. Frame and units: SI.
+"""Training of an actor in the Gymnasium environment; drives choose the best actor. SI units.
 
 controllers train --algorithm td3 --track forza --seed 0 --out runs/rl
 
-An episode's random numbers come from the seed and its number alone, and a checkpoint is written
-between episodes, so a training resumed from one gives the same actor as one never stopped.
+The random numbers of an episode depend only on the seed and the episode's number, and checkpoints
+are written between episodes. So a resumed training gives the same actor as an uninterrupted one.
 """
 
 import json
@@ -17,11 +17,13 @@ import gymnasium as gym
 import numpy as np
 
 import simulator.env  # noqa: F401 registers the environment
-from controllers.closed_loop import DriveResult, check_reward, run_lap
-from controllers.drive import FREQUENCY_HZ, steps_for
+from controllers.drive.closed_loop import DriveResult, check_reward, run_lap
+from controllers.drive.run import FREQUENCY_HZ, steps_for
 from controllers.interface import Observation
-from controllers.perception import truth
-from controllers.rl.actor import Actor, ActorCard, save_actor
+from controllers.laws.actor import Actor, ActorCard, save_actor
+from controllers.laws.actor_state import StateBuilder, find_state
+from controllers.laws.rl import RlController
+from controllers.perception.sources import truth
 from controllers.rl.agent import Agent
 from controllers.rl.checkpoint import Progress, load_checkpoint, save_checkpoint
 from controllers.rl.config import (
@@ -32,31 +34,30 @@ from controllers.rl.config import (
     exploration_share,
     find_algorithm,
 )
-from controllers.rl.controller import RlController
 from controllers.rl.networks import layers
-from controllers.rl.state import StateBuilder, find_state
 from runtime.files import atomic_write, locked_folder, write_json
 from simulator.env.reward import quadratic_reward
 from simulator.track.road import Road
 from simulator.world.world import World
 from trackfeatures.errors import UserError
 
-PAPER_EPISODE_STEPS = 6500
-RANDOM_EPISODE_STEPS = 400
+PAPER_EPISODE_STEPS, RANDOM_EPISODE_STEPS = 6500, 400
+"""Steps of an episode from the paper's start, and with `random_starts`."""
 PAPER_STARTS = 0.1
-"""Share of episodes from the paper's start among those from random ones."""
+"""Share of the episodes that begin at the paper's start with `random_starts`."""
 CONFIG, CURVE = "config.json", "curve.csv"
 COLUMNS = ("step", "seconds", "episodes", "loss", "score_per_step", "mean_abs_d_m", "max_abs_d_m")
 
 Report = Callable[[int, float], None]
-"""Called with the steps done and the best score a step so far, -inf before the first drive."""
+"""A function that is called with the steps done and the best score a step so far, which is -inf
+before the first drive."""
 
 
 def train(config: TrainConfig, report: Report | None = None) -> dict[str, Any]:
-    """Train as `config` says, from the run's checkpoint where it has one.
+    """Train as `config` describes, from the checkpoint of the run if it has one.
 
-    Leaves the best actor (of the drives on the training track), `curve.csv` and `config.json` in
-    `config.out`. Raises UserError for an unknown name or a run of another configuration.
+    Writes the best actor (by the drives on the training track), `curve.csv` and `config.json` into
+    `config.out`. Raises UserError for an unknown name, or a run of another configuration.
     """
     algorithm = _settings(config)
     find_state(config.state)
@@ -73,19 +74,14 @@ def train(config: TrainConfig, report: Report | None = None) -> dict[str, Any]:
 
 
 def _settings(config: TrainConfig) -> Algorithm:
-    """The algorithm's settings, with those that `config` changes."""
+    """The settings of the algorithm, with the changes of `config`."""
     check_reward(config.reward)
     algorithm = find_algorithm(config.algorithm)
     if config.reward == "quadratic":
         scale = QUADRATIC_SCALE * algorithm.reward_scale
         algorithm = replace(algorithm, reward_baseline=0.0, reward_scale=scale)
-    noise, actor, critic = config.state_noise, config.actor_rate, config.critic_rate
-    algorithm = replace(
-        algorithm,
-        state_noise=algorithm.state_noise if noise is None else noise,
-        actor_rate=algorithm.actor_rate if actor is None else actor,
-        critic_rate=algorithm.critic_rate if critic is None else critic,
-    )
+    given = {name: getattr(config, name) for name in ("state_noise", "actor_rate", "critic_rate")}
+    algorithm = replace(algorithm, **{n: value for n, value in given.items() if value is not None})
     for rate in (algorithm.actor_rate, algorithm.critic_rate):
         if not 0.0 < rate < math.inf:
             raise UserError(f"the learning rate {rate} is out of range; give one above 0")
@@ -93,7 +89,7 @@ def _settings(config: TrainConfig) -> Algorithm:
 
 
 def _prepare_folder(config: TrainConfig) -> None:
-    """Make the run's folder, or check that it holds a run of the same configuration."""
+    """Make the folder of the run, or check that it contains a run of the same configuration."""
     path = config.out / CONFIG
     content = json.loads(json.dumps(asdict(config), default=str))
     if path.exists():
@@ -101,8 +97,8 @@ def _prepare_folder(config: TrainConfig) -> None:
             found = dict(json.loads(path.read_text(encoding="utf-8")))
         except (ValueError, TypeError) as error:
             raise UserError(f"{path} cannot be read ({error}); give another --out") from error
-        found = asdict(TrainConfig()) | found  # runs of before `reward` have none
-        # The folder may have been moved.
+        found = asdict(TrainConfig()) | found  # runs made before `reward` existed lack it
+        # `out` is not compared, because the folder may have been moved.
         changed = [n for n in content if n != "out" and found.get(n) != content[n]]
         if changed:
             raise UserError(
@@ -149,7 +145,7 @@ class _Training:
         }
 
     def _episode(self) -> None:
-        """One episode, with one update a step once the replay holds enough."""
+        """One episode, with an update a step once the replay has `learning_starts` transitions."""
         progress, algorithm, agent = self._progress, self._algorithm, self._agent
         rng = np.random.default_rng([self._config.seed, 1, progress.episode])
         paper, _ = self._env.reset(seed=int(rng.integers(2**31)), options=self._start(rng))
@@ -164,9 +160,9 @@ class _Training:
             if self._config.reward == "quadratic":
                 now = self._world.state
                 reward = quadratic_reward(now.to_middle, now.angle, float(steer[0]), ended)
-            following = agent.see(states.build(paper, self._observe()))
-            agent.remember(seen, action, float(reward), following, ended)
-            seen = following
+            next_seen = agent.see(states.build(paper, self._observe()))
+            agent.remember(seen, action, float(reward), next_seen, ended)
+            seen = next_seen
             progress.step += 1
             if len(agent.replay) >= algorithm.learning_starts:
                 losses.append(agent.update(rng, self._rate_share()))
@@ -179,13 +175,13 @@ class _Training:
         progress.seconds = time.monotonic() - self._started
 
     def _observe(self) -> Observation:
-        """What a controller observes of the truth; the noise on the state is not in it."""
+        """The observation of a controller on the truth, without the noise on the state."""
         now = self._world.state
         heading = self._world.features().heading
         return Observation(now.to_middle, now.angle, heading, now.vx, now.vy, now.yaw_rate)
 
     def _start(self, rng: np.random.Generator) -> dict[str, float]:
-        """Reset options: none for the paper's start, else a random place and motion."""
+        """Options of the reset: {} for the paper's start, or a random place and motion."""
         if not self._algorithm.random_starts or rng.random() < PAPER_STARTS:
             return {}
         return {
@@ -196,7 +192,7 @@ class _Training:
         }
 
     def _explore(self, action: float, rng: np.random.Generator) -> float:
-        """`action`, with the paper's noise at the probability of this step."""
+        """`action` with the paper's noise, which is added with the probability of this step."""
         if rng.random() < exploration_share(self._progress.step):
             action += self._algorithm.beta * EXPLORATION_NOISE * rng.standard_normal()
         return min(max(action, -1.0), 1.0)
@@ -206,7 +202,7 @@ class _Training:
         return 1.0 - (1.0 - self._algorithm.rate_end) * done
 
     def _evaluate(self) -> None:
-        """Drive the training track without noise; keep the actor where it is the best so far."""
+        """Drive the training track without noise; save the actor if it is the best so far."""
         progress, config = self._progress, self._config
         actor = self._actor(0.0)
         result = _drive(actor, self._world.road)
@@ -232,7 +228,7 @@ class _Training:
         atomic_write(config.out / CURVE, text + "\n")
 
     def _actor(self, score: float) -> Actor:
-        """The target actor, an average over the last updates, which steers more evenly."""
+        """The target actor: an average over the last updates, which steers more smoothly."""
         agent, algorithm, config = self._agent, self._algorithm, self._config
         weights = {
             name: array[0].reshape(-1) if name[0] == "b" else array[0]
@@ -256,7 +252,7 @@ class _Training:
 
 
 def _drive(actor: Actor, road: Road) -> DriveResult:
-    """The drive of `controllers drive` on the truth."""
+    """The result of the drive that `controllers drive` makes on the truth."""
     world = World(road, frequency_hz=FREQUENCY_HZ)
     try:
         world.reset(seed=0)

@@ -1,8 +1,8 @@
-"""One update of DDPG or TD3 on a mini-batch, in place.
+"""The gradients of one update of DDPG or TD3 on a mini-batch, and Adam's step.
 
-DDPG: Lillicrap et al. 2016 (the paper's equations of the critic's loss, its target and the actor's
-gradient). TD3 (Fujimoto et al. 2018) is the same with the smaller of two critics' targets, noise on
-the target's action, and an actor updated every second time.
+DDPG is from Lillicrap et al. 2016 (the paper's equations of the critic's loss, its target and the
+actor's gradient). TD3 (Fujimoto et al. 2018) adds the smaller value of two target critics, noise on
+the target action, and an actor that is updated after every second update of the critics.
 """
 
 from dataclasses import dataclass
@@ -11,12 +11,12 @@ import numpy as np
 
 from controllers.rl.networks import Array, Shape, backward, forward, initial, layers
 
-BETA_1, BETA_2, EPSILON = 0.9, 0.999, 1e-8  # Adam's usual ones
+BETA_1, BETA_2, EPSILON = 0.9, 0.999, 1e-8  # Adam's usual settings
 
 
 @dataclass(frozen=True)
 class Batch:
-    """B transitions. An ended one is followed by no more reward."""
+    """B transitions; no reward follows one that ended its episode."""
 
     states: Array  # (B, state)
     actions: Array  # (B,)
@@ -38,7 +38,7 @@ class Trained:
         self.gradient = layers(self._gradient, shape)
 
     def descend(self, rate: float, number: int) -> None:
-        """Adam's step `number` (from 1) along `gradient` with the learning rate `rate`."""
+        """Adam's step `number` (from 1) against `gradient` with the learning rate `rate`."""
         first, second = self.moments
         first += (1.0 - BETA_1) * (self._gradient - first)
         second += (1.0 - BETA_2) * (self._gradient * self._gradient - second)
@@ -54,26 +54,31 @@ class Trained:
 def critic_update(
     actor: Trained, critics: Trained, batch: Batch, noise: Array, discount: float
 ) -> float:
-    """Fill the critics' gradient towards r + discount min Q'(s', mu'(s') + noise); returns their
-    mean squared error."""
-    following = np.tanh(forward(actor.target_layers, batch.next_states).out[0])
-    following = np.clip(following + noise, -1.0, 1.0)
-    values = forward(critics.target_layers, batch.next_states, following).out.min(axis=0)
-    wanted = batch.rewards + discount * (1.0 - batch.ended) * values
-    seen = forward(critics.layers, batch.states, batch.actions)
-    error = seen.out - wanted
-    slope = np.asarray((2.0 / len(wanted)) * error, np.float32)
-    backward(critics.layers, seen, slope, critics.gradient)
-    return float(np.mean(error * error))
+    """Fill the critics' gradients of their mean squared error; returns that error.
+
+    The target is r + discount min Q'(s', mu'(s') + noise); `noise` is (B,).
+    """
+    next_action = np.tanh(forward(actor.target_layers, batch.next_states).out[0])
+    next_action = np.clip(next_action + noise, -1.0, 1.0)
+    next_q = forward(critics.target_layers, batch.next_states, next_action).out.min(axis=0)
+    td_target = batch.rewards + discount * (1.0 - batch.ended) * next_q
+    q = forward(critics.layers, batch.states, batch.actions)
+    td_error = q.out - td_target
+    gradient = np.asarray((2.0 / len(td_target)) * td_error, np.float32)
+    backward(critics.layers, q, gradient, critics.gradient)
+    return float(np.mean(td_error * td_error))
 
 
 def actor_update(actor: Trained, critics: Trained, shape: Shape, states: Array) -> None:
-    """Fill the actor's gradient, down which the first critic's Q(s, mu(s)) grows."""
-    seen = forward(actor.layers, states)
-    actions = np.tanh(seen.out)
-    first = layers(critics.theta[:1], shape)
-    judged = forward(first, states, actions[0])
-    descent = np.full_like(actions, -1.0 / len(states))
-    slope = backward(first, judged, descent, None)[:, :, -1]
-    slope *= 1.0 - actions * actions
-    backward(actor.layers, seen, slope, actor.gradient)
+    """Fill the actor's gradient of the loss -mean Q(s, mu(s)) with the first critic's Q.
+
+    `shape` is the shape of a critic, `states` is (B, state).
+    """
+    policy = forward(actor.layers, states)
+    actions = np.tanh(policy.out)
+    critic = layers(critics.theta[:1], shape)
+    q = forward(critic, states, actions[0])
+    gradient = np.full_like(actions, -1.0 / len(states))
+    action_gradient = backward(critic, q, gradient, None)[:, :, -1]
+    action_gradient *= 1.0 - actions * actions
+    backward(actor.layers, policy, action_gradient, actor.gradient)

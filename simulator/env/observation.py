@@ -15,13 +15,12 @@ from simulator.sensors.sensor import Reading, Sensor, SensorSuite
 from simulator.sensors.standard import CAMERA, picture_sensor, sensors_of
 from simulator.world.world import World
 from trackfeatures.errors import UserError
+from trackfeatures.state_vector import STATE_SIZE, state_vector
 
 Kind = Literal["state", "image", "dict"]
 Observation = dict[str, NDArray[Any]] | NDArray[Any]
 
 KINDS: tuple[Kind, ...] = get_args(Kind)
-STATE_SIZE = 7
-SPEED_SCALE = 75.0 / 3.6  # m/s
 PAPER_STATE_NOISE = 0.05
 STATE_LIMIT = 10.0
 """Bound of the observation space: ten half widths, 750 km/h; no drive reaches it."""
@@ -125,17 +124,10 @@ class Observer:
         self, world: World, features: tf.TrackFeatures, rng: np.random.Generator
     ) -> NDArray[np.float32]:
         now = world.state
-        state = [
-            now.to_middle / world.road.half_width,
-            now.angle / math.pi,
-            now.vx / SPEED_SCALE,
-            now.vy / SPEED_SCALE,
-            0.0,
-            0.0,
-            0.0,
-        ]
-        state[4 + features.heading] = 1.0
-        vector = np.array(state)
+        vector = state_vector(
+            *(now.to_middle, now.angle, now.vx, now.vy, features.heading),
+            half_width=world.road.half_width,
+        )
         if self._noise:
             vector += rng.normal(0.0, self._noise, size=STATE_SIZE)
         within = np.minimum(np.maximum(vector, -self._limit), self._limit)

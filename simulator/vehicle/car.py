@@ -3,8 +3,8 @@
 The defaults describe TORCS's car1-trb1, the car of the paper's experiments. The mass and the axle
 distances (lf, lr) are also the paper's. Two values differ from the paper: its yaw inertia
 (2000 kg m2) and cornering stiffness (80 kN/rad per tyre) belong to the model of its controllers
-(`controllers.lateral_model`). The recorded TORCS laps of this car show 1120 kg m2 and 125 kN/rad;
-with the paper's values it deviates twice as far in the kink of g-track-3.
+(`controllers.laws.lateral_model`). The recorded TORCS laps of this car show 1120 kg m2 and
+125 kN/rad; with the paper's values it deviates twice as far in the kink of g-track-3.
 """
 
 from dataclasses import astuple, dataclass, fields

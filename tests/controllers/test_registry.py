@@ -1,4 +1,4 @@
-"""The controllers by name, their parameters, and a user's own classes."""
+"""The controllers by name, their parameters, and classes of a user."""
 
 import importlib
 from pathlib import Path
@@ -65,7 +65,7 @@ class Law:
 
 @pytest.fixture
 def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder with a user's modules, and the working folder."""
+    """The working folder, which contains a user's modules."""
     (tmp_path / "own_law.py").write_text(OWN)
     (tmp_path / "own_broken.py").write_text("import no_such_package\n")
     monkeypatch.chdir(tmp_path)
@@ -102,7 +102,7 @@ def test_a_users_class_is_made(own: Path, name: str) -> None:
     assert make_controller(name, LOOP, {"gain": 1.0}).update(SEEN) == pytest.approx(-0.1)
 
 
-@pytest.mark.parametrize("name", ["own_data", "json"])  # no module is hidden by its name
+@pytest.mark.parametrize("name", ["own_data", "json"])  # a file hides no module of its name
 def test_a_users_file_may_hold_a_dataclass_with_postponed_annotations(own: Path, name: str) -> None:
     (own / f"{name}.py").write_text(OWN_DATACLASS)
     assert make_controller(f"{name}.py:Law", LOOP).update(SEEN) == pytest.approx(-0.02)

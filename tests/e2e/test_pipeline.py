@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from controllers.config import DemoConfig
+from controllers.demo.config import DemoConfig
 from controllers.demo.frames import post_frames
 from controllers.demo.process import running_service
 from controllers.demo.report import write_report

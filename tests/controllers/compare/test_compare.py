@@ -1,4 +1,4 @@
-"""The comparison: its drives, its file, resuming, tables and page; the search for parameters."""
+"""The comparison: its drives, its file, resumption, tables and page; the search for parameters."""
 
 import json
 import math
@@ -13,19 +13,19 @@ import pytest
 from safetensors.numpy import save
 
 import controllers.compare.run as comparison
+from controllers.compare.config import CompareConfig, TuneConfig
 from controllers.compare.curves import CurveRecorder
 from controllers.compare.report import driving_curves, score_table, spread, write_report
 from controllers.compare.run import Cell, cells, compare, fingerprint
 from controllers.compare.tune import propose, tune
-from controllers.config import CompareConfig, TuneConfig
-from controllers.drive import read_parameters
-from controllers.perception import Perceived
-from controllers.rl.actor import WEIGHTS, load_actor
-from controllers.rl.controller import SHIPPED
+from controllers.drive.run import read_parameters
+from controllers.laws.actor import WEIGHTS, load_actor
+from controllers.laws.rl import SHIPPED
+from controllers.perception.perceived import Perceived
 from runtime.files import locked_folder
-from simulator.track.catalogue import OWN_TRACKS
+from simulator.track.catalogue import OWN_TRACKS, find_track
 from simulator.world.errors import ContactsUnavailable
-from tests.controllers.test_drive import at_rest
+from tests.controllers.fake_world import at_rest
 from tests.typed import typed
 from trackfeatures import RoadClass, UserError
 
@@ -42,7 +42,7 @@ def short(folder: Path, **changes: Any) -> CompareConfig:
 
 
 class Counter:
-    """Counts the drives, which still take place."""
+    """Stores the cells that are driven."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, stop_after: int | None = None) -> None:
         self.cells: list[Cell] = []
@@ -67,7 +67,7 @@ def test_every_controller_drives_every_track_with_every_seed_and_disturbance() -
         cells(CompareConfig(tracks=" , "))
 
 
-def test_an_interrupted_comparison_goes_on_and_drives_nothing_twice(
+def test_an_interrupted_comparison_is_continued_and_drives_nothing_twice(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     config = short(tmp_path)
@@ -85,7 +85,7 @@ def test_an_interrupted_comparison_goes_on_and_drives_nothing_twice(
     assert content["drives"][:3] == kept["drives"]
     compare(config)
     assert len(second.cells) == 1
-    # More controllers join the same file; the answer holds those asked for.
+    # The file keeps all controllers; the returned content has only the requested ones.
     more = compare(replace(config, controllers="lqr-preview"))
     assert [drive["controller"] for drive in more["drives"]] == ["lqr-preview"] * 2
     assert len(json.loads((config.out / "results.json").read_text())["drives"]) == 6
@@ -159,21 +159,19 @@ def test_two_comparisons_do_not_write_to_one_folder(tmp_path: Path) -> None:
         compare(config)
 
 
-def test_a_drive_that_ends_early_has_no_better_quadratic_reward_for_it(tmp_path: Path) -> None:
+def test_a_drive_that_ends_early_has_no_better_quadratic_reward(tmp_path: Path) -> None:
     law = tmp_path / "law.py"
     law.write_text("class Law:\n    def update(self, observation):\n        return 1.0\n")
     content = compare(short(tmp_path, tracks="oval", controllers=f"{law}:Law", steps=400))
     drive = content["drives"][0]
     missing = 400 - drive["result"]["steps"]
     assert missing > 100
-    # Each missing step counts -2, as in `controllers tune`.
+    # Each missing step counts -2.
     assert drive["result"]["quadratic_per_step"] < -2.0 * missing / 400
 
 
 def test_the_start_is_torcss_place_on_the_grid(tmp_path: Path) -> None:
     content = compare(short(tmp_path, tracks="oval", controllers="torcs"))
-    from simulator.track.catalogue import find_track
-
     expected = find_track("oval").width / 6
     assert content["drives"][0]["result"]["max_abs_d_m"] == pytest.approx(expected, abs=0.01)
     assert content["drives"][0]["curves"]["d"][0] == pytest.approx(-expected, abs=0.01)
@@ -268,10 +266,10 @@ def test_the_commands_print_json_and_tables(tmp_path: Path) -> None:
 # The search for parameters.
 
 
-def test_the_search_finds_better_parameters_and_goes_on_where_it_stopped(
+def test_the_search_finds_better_parameters_and_is_continued(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A known optimum in place of drives: the reward falls with the distance in log space."""
+    """A reward that falls with the distance from 1 in log space replaces the drives."""
     counted = []
 
     def evaluate(config: TuneConfig, controller: str, parameters: dict[str, float]) -> float:
@@ -329,7 +327,7 @@ def test_a_wrong_search_is_refused_before_its_first_drive(
     assert not (tmp_path / "tuned.json").exists()
 
 
-def test_a_contact_without_pybullet_costs_only_its_own_drive(
+def test_a_contact_without_pybullet_loses_only_its_own_drive(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "left.py").write_text(

@@ -1,4 +1,4 @@
-"""Rounds driven on a model's answers: an ordinary dataset, continued after a kill; what steers."""
+"""Rounds driven on a model's answers: the dataset, its resumption, and the steering law."""
 
 import json
 import os
@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from controllers.interface import LoopConfig
-from controllers.perception import Perceived
+from controllers.perception.perceived import Perceived
 from controllers.record.law import PerceivedLaw
 from datagen.execution.merge import merge
 from datagen.recorder.replay import replay
@@ -36,13 +36,13 @@ def record(out: Path, *more: str) -> subprocess.CompletedProcess[str]:
 
 
 def record_here(out: Path, *more: str) -> subprocess.CompletedProcess[str]:
-    """The command in this process: for what is refused before a round."""
+    """Run the command in this process; for refusals before the first round."""
     return typed(*COMMAND[2:], "--out", out, *more)
 
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two rounds, the command killed after the first and given again."""
+    """Two rounds; the command is killed after the first and run again."""
     out = tmp_path_factory.mktemp("record") / "driven"
     with subprocess.Popen(
         [*COMMAND, "--out", str(out)], stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True
@@ -73,7 +73,7 @@ def test_a_recording_is_an_ordinary_dataset(recorded: Path) -> None:
     labels = data.frames.labels
     assert isinstance(labels, Labels)
     assert labels.speed.min() > 5.0
-    assert 0.2 < abs(labels.to_middle).max() < 4.5  # it sways, and stays near its lane of 4 m
+    assert 0.2 < abs(labels.to_middle).max() < 4.5  # the course sways about a lane of 4 m
 
 
 def test_the_plan_names_the_driver_and_another_one_is_refused(recorded: Path) -> None:
@@ -139,7 +139,7 @@ def test_the_answered_offset_is_that_of_the_lane_the_car_is_in() -> None:
     assert steer(1.9) == pytest.approx(0.0, abs=1e-9)
     assert steer(2.4) > 0.05
     assert steer(1.4) < -0.05
-    # Near the middle marking the model answers for the lane beside.
+    # Near the middle marking the model answers for the adjacent lane.
     steer = law_on(2, Perceived(2.1, 0.0, RoadClass.STRAIGHT), 0.05)
     assert steer(0.1) == pytest.approx(0.0, abs=1e-9)
 

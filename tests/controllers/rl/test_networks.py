@@ -1,4 +1,4 @@
-"""Networks and updates: shapes, where the action enters, gradients and Adam against torch's."""
+"""Networks and updates: shapes, the layer of the action, gradients and Adam equal to torch's."""
 
 from typing import Any
 
@@ -18,7 +18,7 @@ def random(*shape: int) -> Array:
 
 
 def torch_critic(of: list[Any], states: Any, actions: Any) -> Any:
-    """The critic of one row, by torch."""
+    """The critic of one row of parameters, in torch."""
     w1, b1, w2, b2, w3, b3 = of
     hidden = torch.relu(states @ w1 + b1)
     hidden = torch.relu(torch.cat([hidden, actions[:, None]], 1) @ w2 + b2)
@@ -26,7 +26,7 @@ def torch_critic(of: list[Any], states: Any, actions: Any) -> Any:
 
 
 def torch_actor(of: list[Any], states: Any) -> Any:
-    """The actor, by torch."""
+    """The actor, in torch."""
     w1, b1, w2, b2, w3, b3 = of
     return torch.tanh(torch.relu(torch.relu(states @ w1 + b1) @ w2 + b2) @ w3 + b3)[:, 0]
 
@@ -74,8 +74,8 @@ def test_gradients_equal_torchs() -> None:
         out = torch_critic(parameters, torch.tensor(states), given)
         assert seen.out[row] == pytest.approx(out.detach().numpy(), abs=1e-5)
         (out * torch.tensor(g_out[row])).sum().backward()
-        wanted = np.concatenate([p.grad.numpy().ravel() for p in parameters])
-        assert gradient[row] == pytest.approx(wanted, abs=1e-4)
+        expected = np.concatenate([p.grad.numpy().ravel() for p in parameters])
+        assert gradient[row] == pytest.approx(expected, abs=1e-4)
         assert by_z[row, :, -1] == pytest.approx(given.grad.numpy(), abs=1e-4)
 
 
@@ -101,7 +101,7 @@ def test_a_soft_update_moves_the_target_by_tau() -> None:
     assert np.all(networks.target_layers.w2 == 1.5)
 
 
-def test_the_critics_target_is_the_smaller_one_and_nothing_follows_an_end() -> None:
+def test_the_target_has_the_smaller_q_and_no_reward_after_a_terminal_state() -> None:
     actor = Trained(Shape(7, 6, 5), 1, RNG)
     critics = Trained(SHAPE, 2, RNG)
     critics.target[:] = RNG.normal(size=critics.target.shape)
@@ -111,20 +111,21 @@ def test_the_critics_target_is_the_smaller_one_and_nothing_follows_an_end() -> N
     noise = np.array([0.0, 0.1, -0.1, 5.0], np.float32)
     loss = critic_update(actor, critics, batch, noise, 0.9)
 
-    follow = torch_actor(as_torch(actor.target, Shape(7, 6, 5)), torch.tensor(batch.next_states))
-    follow = torch.clip(follow + torch.tensor(noise), -1, 1)
-    nexts = torch.tensor(batch.next_states)
-    values = [torch_critic(as_torch(critics.target, SHAPE, k), nexts, follow) for k in range(2)]
-    smaller = torch.minimum(*values) * torch.tensor(1 - batch.ended)
-    wanted = (torch.tensor(batch.rewards) + 0.9 * smaller).detach()
-    assert float(wanted[3]) == pytest.approx(float(batch.rewards[3]))
+    next_states = torch.tensor(batch.next_states)
+    next_action = torch_actor(as_torch(actor.target, Shape(7, 6, 5)), next_states)
+    next_action = torch.clip(next_action + torch.tensor(noise), -1, 1)
+    targets = [as_torch(critics.target, SHAPE, k) for k in range(2)]
+    next_q = torch.minimum(*(torch_critic(of, next_states, next_action) for of in targets))
+    td_target = torch.tensor(batch.rewards) + 0.9 * next_q * torch.tensor(1 - batch.ended)
+    td_target = td_target.detach()
+    assert float(td_target[3]) == pytest.approx(float(batch.rewards[3]))
     total = 0.0
     for k in range(2):
         parameters = as_torch(critics.theta, SHAPE, k)
-        given = torch_critic(parameters, torch.tensor(batch.states), torch.tensor(batch.actions))
-        error = ((given - wanted) ** 2).mean()
+        q = torch_critic(parameters, torch.tensor(batch.states), torch.tensor(batch.actions))
+        error = ((q - td_target) ** 2).mean()
         error.backward()
-        total += float(error) / 2
+        total += error.item() / 2
         of = np.concatenate([p.grad.numpy().ravel() for p in parameters])
         assert critics._gradient[k] == pytest.approx(of, abs=1e-4)
     assert loss == pytest.approx(total, rel=1e-4)
@@ -140,5 +141,5 @@ def test_the_actor_follows_the_first_critic() -> None:
     actions = torch_actor(parameters, torch.tensor(states))
     loss = -torch_critic(as_torch(critics.theta, SHAPE, 0), torch.tensor(states), actions).mean()
     loss.backward()
-    wanted = np.concatenate([p.grad.numpy().ravel() for p in parameters])
-    assert actor._gradient[0] == pytest.approx(wanted, abs=1e-5)
+    expected = np.concatenate([p.grad.numpy().ravel() for p in parameters])
+    assert actor._gradient[0] == pytest.approx(expected, abs=1e-5)

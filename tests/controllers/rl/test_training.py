@@ -1,4 +1,4 @@
-"""Training: the schedule of exploration, the replay, resuming to the same bits, the command."""
+"""Training: exploration, replay, a resumed training that gives the same bits, the command."""
 
 import json
 import signal
@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from controllers.rl.actor import load_actor
+from controllers.laws.actor import load_actor
+from controllers.laws.actor_state import PAPER, STACKED, STATES
 from controllers.rl.agent import Agent, Replay
 from controllers.rl.config import ALGORITHMS, TrainConfig, exploration_share
-from controllers.rl.state import PAPER, STACKED, STATES
 from controllers.rl.training import train
-from tests.typed import typed
+from tests.typed import error_line, typed
 from trackfeatures.errors import UserError
 
 
@@ -60,8 +60,8 @@ def test_the_replay_keeps_the_last_transitions() -> None:
     assert batch.next_states[at].tolist() == [-4.0, -4.0]
 
 
-def test_an_end_costs_the_baseline_for_ever() -> None:
-    """With a baseline of 1, driving on at reward r beats ending wherever it did without one."""
+def test_a_terminal_state_costs_the_baseline_for_ever() -> None:
+    """A baseline shifts the return of a terminal state and of driving on by the same number."""
     td3 = replace(ALGORITHMS["td3"], reward_scale=1.0)
     agent = Agent(td3, PAPER, 0)
     seen = np.zeros(7, np.float32)
@@ -69,7 +69,7 @@ def test_an_end_costs_the_baseline_for_ever() -> None:
     agent.remember(seen, 0.0, 0.75, seen, False)
     ended, on = agent.replay.results[:2, 1]
     assert on == -0.25
-    # Without a baseline the end's return is -2; subtracting 1 a step for ever shifts it by this:
+    # Without a baseline the return of the end is -2; 1 subtracted a step for ever shifts it.
     assert ended == pytest.approx(-2.0 - 1.0 / (1.0 - td3.discount))
 
 
@@ -120,7 +120,7 @@ def test_a_stopped_training_resumes_to_the_same_bits(tmp_path: Path, state: str)
 
 @pytest.mark.extended
 def test_a_training_learns_to_stay_on_the_road(tmp_path: Path) -> None:
-    """From a drive that leaves the road early to whole drives (seeds 0 to 3: at least 0.94)."""
+    """The first drive leaves the road early, later drives do not (seeds 0 to 3 reach 0.94)."""
     train(short(tmp_path, steps=16_000, seed=2, evaluate_every=1000))
     scores = read_curve(tmp_path)["score_per_step"]
     assert scores[0] < 0.3
@@ -140,7 +140,7 @@ def test_the_quadratic_reward_chooses_and_trains(tmp_path: Path) -> None:
         train(short(tmp_path / "cubic", reward="cubic"))
 
 
-def test_a_run_of_before_the_rewards_is_continued(tmp_path: Path) -> None:
+def test_a_run_without_a_stored_reward_is_continued(tmp_path: Path) -> None:
     train(short(tmp_path, steps=200))
     path = tmp_path / "config.json"
     content = json.loads(path.read_text())
@@ -171,13 +171,13 @@ def test_a_moved_run_is_continued_and_keeps_its_file(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("text", ["{", "[1]"])
-def test_a_damaged_configuration_is_named(tmp_path: Path, text: str) -> None:
+def test_a_damaged_configuration_is_refused(tmp_path: Path, text: str) -> None:
     (tmp_path / "config.json").write_text(text)
     with pytest.raises(UserError, match=r"config.json cannot be read"):
         train(short(tmp_path, steps=200))
 
 
-def test_a_damaged_checkpoint_is_named(tmp_path: Path) -> None:
+def test_a_damaged_checkpoint_is_refused(tmp_path: Path) -> None:
     train(short(tmp_path / "run", steps=200))
     path = tmp_path / "run" / "checkpoint.safetensors"
     path.write_bytes(path.read_bytes()[:1000])
@@ -215,9 +215,7 @@ def test_a_wrong_option_is_one_error_line(
 ) -> None:
     done = typed("controllers", "train", "--out", tmp_path / "run", *words)
     assert done.returncode == 1
-    errors = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
-    assert len(errors) == 1
-    assert message in errors[0]
+    assert message in error_line(done)
     assert not (tmp_path / "run").exists()
 
 

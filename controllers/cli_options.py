@@ -1,0 +1,84 @@
+"""The options of the `controllers` commands, as annotated fields of their configurations.
+
+A command's configuration is a dataclass. A field with an annotation is an option of the command, so
+an option is declared once: the annotation is its help text or a `typer.Option`. Options of several
+commands are defined here. Rich reads help texts as markup and drops text in square brackets, so a
+default that Typer does not know is a sentence ("Default: ...").
+"""
+
+from collections.abc import Callable
+from dataclasses import fields
+from functools import wraps
+from inspect import Parameter, Signature
+from pathlib import Path
+from typing import Annotated, Any, TypeVar, get_args, get_origin
+
+from typer import Option
+
+from runtime.cli import AsJson
+
+Config = TypeVar("Config")
+
+ControllerName = Annotated[
+    str,
+    "Controller: lqr, lqr-preview, lqr-paper, mpc, mpc-preview, rl, rl-residual, torcs, a folder "
+    "of `controllers train`, or a class of your own as MODULE:CLASS or FILE.py:CLASS.",
+]
+Controllers = Annotated[
+    str, "Controllers, separated by commas, as in `controllers drive --controller`."
+]
+Track = Annotated[str, "Name of a track (`simulator tracks`), or its file."]
+Tracks = Annotated[str, "Names of tracks, or their files, separated by commas."]
+TracksDir = Annotated[Path | None, "A further folder to search for tracks."]
+Steps = Annotated[
+    int | None,
+    "Control steps of 50 ms. Default: the paper's number on its tracks, about a lap on others.",
+]
+MODELS = 'run folder, name in runs/, "latest", or "default" (the shipped model).'
+Model = Annotated[str, f"Model of --perception model: {MODELS}"]
+Latency = Annotated[float, "Latency of the perception's answers, ms, 0 to 1000."]
+Drop = Annotated[float, "Share of the perception's answers that are lost, 0 to below 1."]
+Light = Annotated[
+    str,
+    "Light of the images: clear, overcast, dusk, fog, heavy-shadow, rain or snow. The truth does "
+    "not depend on it.",
+]
+Parameters = Annotated[
+    Path | None,
+    "File of `controllers tune` with parameters of controllers. Default: parameters of their own.",
+]
+Reward = Annotated[
+    str, "paper, or quadratic: -(0.3 d^2 + angle^2 + 0.03 delta^2), the paper's second reward."
+]
+
+
+def options(
+    config: type[Config],
+) -> Callable[[Callable[[Config, bool], None]], Callable[..., None]]:
+    """Makes a Typer command of a function of a configuration and `as_json`.
+
+    Its options are the annotated fields of the dataclass `config`, with their defaults, and --json.
+    """
+    declared = [
+        Parameter(
+            one.name, Parameter.KEYWORD_ONLY, default=one.default, annotation=_option(one.type)
+        )
+        for one in fields(config)  # type: ignore[arg-type]  # a dataclass
+        if get_origin(one.type) is Annotated
+    ]
+    as_json = Parameter("as_json", Parameter.KEYWORD_ONLY, default=False, annotation=AsJson)
+
+    def decorate(function: Callable[[Config, bool], None]) -> Callable[..., None]:
+        @wraps(function)
+        def command(as_json: bool, **values: Any) -> None:
+            function(config(**values), as_json)
+
+        command.__signature__ = Signature([*declared, as_json])  # type: ignore[attr-defined]
+        return command
+
+    return decorate
+
+
+def _option(annotated: Any) -> Any:
+    kind, about = get_args(annotated)
+    return Annotated[kind, Option(help=about)] if isinstance(about, str) else annotated

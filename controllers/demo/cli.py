@@ -1,0 +1,42 @@
+"""The command `controllers demo`. Run: `controllers demo --out demo`."""
+
+import json
+
+import typer
+
+from controllers.cli_options import options
+from controllers.demo.config import DemoConfig
+from runtime import cli as command
+
+
+@options(DemoConfig)
+def demo(config: DemoConfig, as_json: bool) -> None:
+    """Show the shipped model on a first drive, then run the whole pipeline: collect, train,
+    evaluate, serve, predict, drive, and an HTML report.
+
+    The same command continues an interrupted demo. The exit code is 1 when a limit is missed.
+    """
+    from controllers.demo.process import stop_on_sigterm
+    from controllers.demo.report import check_limits, print_tables, write_report
+    from controllers.demo.run import announce, run_demo
+
+    stop_on_sigterm()
+    announce(config)
+    result = run_demo(config)
+    if config.first_drive:
+        if as_json:
+            typer.echo(json.dumps(result.as_json()))
+        return
+    found = check_limits(result)
+    report = write_report(config, result)
+    if as_json:
+        typer.echo(json.dumps(result.as_json()))
+    else:
+        print_tables(found, result.asked)
+        typer.echo(f"report: {report}")
+    missed = [one.what for one in found if not one.reached]
+    if missed:
+        command.fail(
+            f"the limit is missed for {', '.join(missed)}; a slower machine needs more --minutes "
+            "(with another --out)"
+        )

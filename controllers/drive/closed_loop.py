@@ -1,0 +1,308 @@
+"""Closed-loop driving: perceive, steer, step, score. SI units, track frame, left positive.
+
+The throttle is held open loop, as in the paper, unless other `Pedals` are given. The result of
+`run_lap` depends only on the reset of the world, the controller, the pedals and the perception.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any, Protocol, TextIO, TypeVar
+
+import numpy as np
+
+from controllers.drive.config import THROTTLE
+from controllers.interface import Controller, Observation
+from controllers.perception.late import LOST_S
+from controllers.perception.perceived import Perceived
+from controllers.perception.real_time import RealTimeFigures
+from simulator.env.reward import OFF_TRACK_REWARD, ending, quadratic_reward, step_reward
+from simulator.track.road import Road
+from simulator.traffic.idm import idm_acceleration
+from simulator.traffic.traffic import Traffic
+from simulator.vehicle.state import CarState, Command
+from trackfeatures.errors import UserError
+
+GEAR = 1
+HOLD_S = 0.5
+"""Time (s) for which a lost offset keeps its last value; then it is 0, along the road."""
+RUN_UP_S = 15.0
+"""Duration (s) of the standing start, which `cruising_kmh` leaves out."""
+EASE_OFF = 1.0  # m/s2 of demanded braking at which the throttle is closed
+FULL_BRAKING = 15.0  # m/s2 at full brake on asphalt
+LOST_SPEED, LOST_BRAKE = 5.0, 0.1
+"""Speed (m/s) to which the car slows down when the perception is lost, and its brake (0 to 1)."""
+REWARDS = ("paper", "quadratic")
+"""Names of `step_reward` and `quadratic_reward` of `simulator.env.reward`."""
+
+
+class Drivable(Protocol):
+    """The part of `simulator.world.world.World` that a drive uses."""
+
+    road: Road
+    frequency_hz: int
+    traffic: Traffic
+
+    @property
+    def state(self) -> CarState: ...
+
+    def step(self, command: Command) -> CarState: ...
+
+
+World = TypeVar("World", bound=Drivable)
+
+
+class Pedals(Protocol):
+    """Throttle, brake and gear of a drive."""
+
+    @property
+    def mean_error(self) -> float | None:
+        """Mean distance (m/s) from the set-point; None without a set-point."""
+        ...
+
+    def __call__(
+        self, now: CarState, traffic: Traffic, perceived: Perceived
+    ) -> tuple[float, float, int]:
+        """Throttle (0 to 1), brake (0 to 1) and gear for the present control step."""
+        ...
+
+
+@dataclass(frozen=True)
+class HeldThrottle:
+    """The paper's pedals: gear 1 and a constant throttle, reduced behind a slower car."""
+
+    throttle: float = THROTTLE
+    mean_error: None = None
+
+    def __call__(
+        self, now: CarState, traffic: Traffic, perceived: Perceived
+    ) -> tuple[float, float, int]:
+        return *throttle_and_brake(traffic, now, self.throttle), GEAR
+
+
+@dataclass(frozen=True, slots=True)
+class DriveResult:
+    """The score of a drive and its other figures."""
+
+    steps: int
+    """Control steps driven; fewer than `steps_asked` if the drive ended early."""
+    steps_asked: int
+    """Control steps requested."""
+    score: float
+    """Sum of the reward over `steps_asked`; a step that ends the drive counts -2, later steps 0."""
+    score_per_step: float
+    """`score` divided by `steps_asked`."""
+    quadratic_per_step: float
+    """Mean of the paper's quadratic reward over `steps_asked`; the step that ends the drive and all
+    later steps count -2."""
+    laps: int
+    """Complete laps, from one crossing of the line to the next."""
+    distance_m: float
+    """Distance driven."""
+    mean_abs_d_m: float
+    """Mean distance from the centre of the lane to follow."""
+    max_abs_d_m: float
+    """Largest distance from the centre of the lane to follow."""
+    in_lane_share: float
+    """Share of the steps with the car's centre between the markings of the lane to follow."""
+    speed_kmh: tuple[float, float]
+    """Lowest and highest speed, including the standing start."""
+    cruising_kmh: tuple[float, float] | None
+    """Lowest and highest speed after the first 15 s; None for a shorter drive."""
+    blind_steps: int
+    """Steps without a perceived offset."""
+    slowed_steps: int
+    """Steps in which the car slowed down because the perception was lost for more than 1 s."""
+    noisy: bool
+    """Whether the controller received an estimated state, with errors, or the true state."""
+    ended: str | None
+    """Why the drive ended early: off_track (also by a contact with a wall), backwards, or collision
+    (with a car); None if it did not."""
+    real_time: RealTimeFigures | None = None
+    """Figures of a drive on the wall clock; in JSON they are fields of the result itself."""
+    speed_error_m_s: float | None = None
+    """Mean distance from the set-point of `--speed` on free straights; None (absent from JSON)
+    without a set-point."""
+
+    def per_step(self, reward: str) -> float:
+        """The mean over `steps_asked` of the reward called `reward`, one of `REWARDS`."""
+        return self.score_per_step if reward == "paper" else self.quadratic_per_step
+
+    def as_json(self) -> dict[str, Any]:
+        """The fields as values for JSON."""
+        values = asdict(self)
+        if self.speed_error_m_s is None:
+            del values["speed_error_m_s"]
+        values["speed_kmh"] = list(self.speed_kmh)
+        if self.cruising_kmh is not None:
+            values["cruising_kmh"] = list(self.cruising_kmh)
+        return values | (values.pop("real_time") or {})
+
+
+def run_lap(
+    world: World,
+    controller: Controller,
+    perceive: Callable[[World], Perceived],
+    steps: int,
+    *,
+    pedals: Pedals = HeldThrottle(),
+    lane_centre: float = 0.0,
+    noisy: bool = False,
+    record: Callable[[CarState, float], None] | None = None,
+) -> DriveResult:
+    """Drive `steps` control steps from the world's present state, or until the episode ends.
+
+    `lane_centre` (m, left positive) is the line from which `mean_abs_d_m` is measured. `noisy`
+    marks the result of a perception with errors. `record` is called with the state and the steering
+    action of each step. The reward of a step is the reward of the state after it.
+    """
+    memory = OffsetMemory(round(HOLD_S * world.frequency_hz))
+    totals = _Totals(start_m=world.state.odometer_m)
+    for _ in range(steps):
+        now = world.state
+        perceived = perceive(world)
+        steer = controller.update(_observe(now, perceived, memory))
+        if record is not None:
+            record(now, steer)
+        throttle, brake, gear = pedals(now, world.traffic, perceived)
+        lost_s = max(perceived.lost_s, memory.age / world.frequency_hz)
+        if lost_s > LOST_S:
+            throttle, brake = slow_down(now.vx, throttle, brake)
+            totals.slowed_steps += 1
+        after = world.step(Command(steer=steer, throttle=throttle, brake=brake, gear=gear))
+        totals.add(after, steer, lane_centre, world.road)
+        if totals.ended is not None:
+            break
+    run_up = round(RUN_UP_S * world.frequency_hz)
+    result = totals.result(world.state, steps, run_up, memory.blind_steps, noisy=noisy)
+    return replace(result, speed_error_m_s=pedals.mean_error)
+
+
+def check_reward(name: str) -> None:
+    """Raise UserError unless `name` is one of `REWARDS`."""
+    if name not in REWARDS:
+        raise UserError(f"there is no reward {name!r}; use one of: {', '.join(REWARDS)}")
+
+
+def throttle_and_brake(traffic: Traffic, now: CarState, throttle: float) -> tuple[float, float]:
+    """Throttle and brake: `throttle` and 0 on a free road, less or braking behind a slower car."""
+    leader = traffic.leader(now.s, now.to_middle) if traffic.count else None
+    if leader is None:
+        return throttle, 0.0
+    gap, lead_speed = leader
+    demand = idm_acceleration(gap, max(now.vx, 0.0), lead_speed, math.inf)
+    open_share = min(max(1.0 + demand / EASE_OFF, 0.0), 1.0)
+    return throttle * open_share, min(max(-demand - EASE_OFF, 0.0) / FULL_BRAKING, 1.0)
+
+
+def slow_down(speed: float, throttle: float, brake: float) -> tuple[float, float]:
+    """Throttle and brake that slow the car down to `LOST_SPEED`; below it they are unchanged."""
+    if speed > LOST_SPEED:
+        return 0.0, max(brake, LOST_BRAKE)
+    return throttle, brake
+
+
+class OffsetMemory:
+    """Replaces the offset in steps without a perceived offset."""
+
+    def __init__(self, hold_steps: int) -> None:
+        self.blind_steps = 0
+        self._hold_steps = hold_steps
+        self.age = 0
+        """Steps since the last perceived offset."""
+        self._last = 0.0
+
+    def fill(self, offset: float | None) -> float:
+        """`offset`; if it is None, the last offset for `hold_steps` steps and then 0."""
+        if offset is not None:
+            self.age, self._last = 0, offset
+            return offset
+        self.blind_steps += 1
+        self.age += 1
+        return self._last if self.age <= self._hold_steps else 0.0
+
+
+def _observe(now: CarState, perceived: Perceived, memory: OffsetMemory) -> Observation:
+    return Observation(
+        to_lane_centre=memory.fill(perceived.to_lane_centre),
+        angle=perceived.angle,
+        heading=perceived.heading,
+        vx=now.vx,
+        vy=now.vy,
+        yaw_rate=now.yaw_rate,
+        curvature=perceived.curvature,
+    )
+
+
+@dataclass
+class _Totals:
+    """Running sums of a drive; `add` is called once for each control step."""
+
+    start_m: float
+    score: float = 0.0
+    quadratic: float = 0.0
+    ended: str | None = None
+    slowed_steps: int = 0
+    in_lane_steps: int = 0
+    offsets_m: list[float] = field(default_factory=list)
+    speeds_kmh: list[float] = field(default_factory=list)
+
+    def add(self, after: CarState, steer: float, lane_centre: float, road: Road) -> None:
+        self.offsets_m.append(abs(after.to_middle - lane_centre))
+        self.in_lane_steps += self.offsets_m[-1] <= road.lane_width / 2
+        self.speeds_kmh.append(after.speed_kmh)
+        self.ended = ending(after)
+        ended = self.ended is not None
+        self.score += step_reward(after.angle, after.to_middle, road.half_width, ended)
+        self.quadratic += quadratic_reward(self.offsets_m[-1], after.angle, steer, ended)
+
+    def result(
+        self, last: CarState, steps: int, run_up: int, blind_steps: int, *, noisy: bool
+    ) -> DriveResult:
+        speeds = self.speeds_kmh
+        cruising = speeds[run_up:]
+        missing = steps - len(speeds)
+        return DriveResult(
+            steps=len(speeds),
+            steps_asked=steps,
+            score=self.score,
+            score_per_step=self.score / steps,
+            quadratic_per_step=(self.quadratic + OFF_TRACK_REWARD * missing) / steps,
+            laps=max(last.lap - 1, 0),
+            distance_m=last.odometer_m - self.start_m,
+            mean_abs_d_m=float(np.mean(self.offsets_m)),
+            max_abs_d_m=max(self.offsets_m),
+            in_lane_share=self.in_lane_steps / len(speeds),
+            speed_kmh=(min(speeds), max(speeds)),
+            cruising_kmh=(min(cruising), max(cruising)) if cruising else None,
+            blind_steps=blind_steps,
+            slowed_steps=self.slowed_steps,
+            noisy=noisy,
+            ended=self.ended,
+        )
+
+
+COLUMNS = ("t", "s", "d", "th", "v", "vx", "vy", "yr", "steer", "rpm", "lap", "x", "y", "z")
+"""Columns of a log: t in s, s in m along the track, d in m left of its centre, th (yaw minus track
+tangent) in rad, v, vx and vy in m/s, yr in rad/s, steer in [-1, 1], rpm in 1/min, lap (laps begun),
+x, y and z in m."""
+
+
+class DriveLog:
+    """CSV log with the columns of the reference laps of the real TORCS, a row per control step.
+
+    A row has the state that the controller acted on and its steering action. It is complete when
+    `write` returns.
+    """
+
+    def __init__(self, file: TextIO) -> None:
+        self._file = file
+        file.write(",".join(COLUMNS) + "\n")
+
+    def write(self, state: CarState, steer: float) -> None:
+        # th is counter-clockwise in the reference laps, `angle` is clockwise.
+        self._file.write(
+            f"{state.time_s:.3f},{state.s:.3f},{state.to_middle:.5f},{-state.angle:.6f},"
+            f"{state.speed:.4f},{state.vx:.4f},{state.vy:.4f},{state.yaw_rate:.6f},{steer:.6f},"
+            f"{state.rpm:.1f},{state.lap},{state.x:.4f},{state.y:.4f},{state.z:.4f}\n"
+        )

@@ -1,0 +1,71 @@
+"""The configuration of `controllers drive`: its options and their defaults."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from typer import Option
+
+from controllers import cli_options as options
+
+THROTTLE = 0.2
+"""The held throttle, in gear 1."""
+
+
+@dataclass(frozen=True)
+class DriveConfig:
+    """One closed-loop drive. Equal configurations give equal drives, except with `realtime`."""
+
+    controller: options.ControllerName = "lqr-preview"
+    track: options.Track = "oval"
+    lanes: Annotated[int, "Number of lanes, 1 to 3."] = 1
+    perception: Annotated[
+        str, "truth, model, or the address of a service, e.g. http://127.0.0.1:8000."
+    ] = "truth"
+    steps: options.Steps = None
+    log: Annotated[Path | None, "CSV file for the state and the steering of each step."] = None
+    video: Annotated[Path | None, "File for a film of the drive (.mp4)."] = None
+    watch: Annotated[
+        int | None,
+        Option(
+            metavar="PORT",
+            min=0,
+            max=65535,
+            help="Show the drive live in the browser, at its real pace, at this port; 0: any free "
+            "port.",
+        ),
+    ] = None
+    latency_ms: options.Latency = 0.0
+    drop: options.Drop = 0.0
+    realtime: Annotated[
+        bool,
+        Option(
+            "--realtime",
+            help="Drive on the wall clock, without waiting for the perception's answers. "
+            "No two such drives are the same.",
+        ),
+    ] = False
+    parameters: options.Parameters = None
+    model: options.Model = "default"
+    start_d: Annotated[
+        float | None,
+        "Start, m left of the track's centre. Default: the centre of --target-lane, or 0.",
+    ] = None
+    target_lane: Annotated[
+        int | None, "Lane to follow, 0 is the leftmost. Default: the lane nearest to the start."
+    ] = None
+    throttle: Annotated[
+        float | None,
+        f"Held throttle, 0 to 1, in gear 1. Default: {THROTTLE}, unless --speed is given.",
+    ] = None
+    speed: Annotated[
+        float | None,
+        "Speed to hold, m/s, 1 to 40; slower in bends and behind traffic. Default: hold the "
+        "throttle.",
+    ] = None
+    traffic: Annotated[int, "Number of other cars, 0 to 12."] = 0
+    light: options.Light = "clear"
+    seed: Annotated[
+        int, Option(help="Seed of traffic, scenery, light and lost answers.", min=0)
+    ] = 0
+    tracks_dir: options.TracksDir = None

@@ -1,0 +1,149 @@
+"""Disturbances of a drive: sensor noise, delay, wind, and another car. SI units.
+
+A disturbance depends only on the seed of the drive, so that all controllers meet the same one
+(paired seeds).
+"""
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from controllers.interface import Controller, Observation
+from simulator.track.road import Road
+from simulator.vehicle.car import CarParameters
+from simulator.vehicle.state import CarState, Command
+from simulator.world.world import World
+from trackfeatures.errors import UserError
+
+OFFSET_NOISE_M, ANGLE_NOISE_RAD = 0.05, 0.005
+SPEED_NOISE_M_S, YAW_RATE_NOISE_RAD_S = 0.1, 0.01
+"""Standard deviations of the noise on an observation, drawn for each step."""
+DELAY_S = 0.1
+"""Delay of the perception."""
+GUST_M_S, GUST_S = 6.0, 1.5
+"""Standard deviation and correlation time of the side wind (a Gauss-Markov process)."""
+SIDE_FORCE_M2 = 4.5
+"""Side force divided by air density, wind speed and speed: the slope of the side force coefficient,
+2.3 / rad, times the frontal area."""
+FRICTION = (0.8, 1.6)
+"""Range of the tyres' friction coefficient."""
+SPREAD = 0.2
+"""Largest relative deviation of mass and tyre stiffness."""
+
+
+@dataclass(frozen=True)
+class Disturbance:
+    """The kinds of disturbance that act on a drive; by default none acts."""
+
+    noise: bool = False
+    delay_s: float = 0.0
+    """Delay of the perception, over which the state is not predicted."""
+    wind: bool = False
+    friction: bool = False
+    mass: bool = False
+    stiffness: bool = False
+
+    def car(self, seed: int) -> CarParameters:
+        """The car of the drive with the seed `seed`."""
+        rng, car = np.random.default_rng([seed, 5]), CarParameters()
+        low, high = FRICTION
+        friction = rng.uniform(low, high)
+        mass, stiffness = rng.uniform(1.0 - SPREAD, 1.0 + SPREAD, 2)
+        if self.friction:
+            # The slope at zero slip, tyre_stiffness * friction, stays the same.
+            stiffer = car.tyre_stiffness * car.friction / friction
+            car = replace(car, friction=friction, tyre_stiffness=stiffer)
+        if self.mass:
+            ix, iy, iz = car.inertia
+            inertia = (ix * mass, iy * mass, iz * mass)
+            car = replace(car, mass=car.mass * mass, inertia=inertia)
+        if self.stiffness:
+            car = replace(car, tyre_stiffness=car.tyre_stiffness * stiffness)
+        return car
+
+    def world(self, road: Road, *, traffic: int, frequency_hz: int, seed: int) -> World:
+        """The world of the drive with the seed `seed`."""
+        car = self.car(seed)
+        if self.wind:
+            gusts = Gusts(1.0 / frequency_hz, np.random.default_rng([seed, 4]))
+            return WindyWorld(road, gusts, traffic=traffic, frequency_hz=frequency_hz, car=car)
+        return World(road, traffic=traffic, frequency_hz=frequency_hz, car=car)
+
+    def controller(self, controller: Controller, seed: int) -> Controller:
+        """`controller` with the sensors of the drive with the seed `seed`."""
+        if not self.noise:
+            return controller
+        return NoisySensors(controller, np.random.default_rng([seed, 6]))
+
+
+UNDISTURBED = "none"
+DISTURBANCES: dict[str, Disturbance] = {
+    UNDISTURBED: Disturbance(),
+    "noise": Disturbance(noise=True),
+    "delay": Disturbance(delay_s=DELAY_S),
+    "wind": Disturbance(wind=True),
+    "friction": Disturbance(friction=True),
+    "mass": Disturbance(mass=True),
+    "stiffness": Disturbance(stiffness=True),
+}
+
+
+def find_disturbance(name: str) -> Disturbance:
+    """The disturbance called `name`. Raises UserError for an unknown name."""
+    if name not in DISTURBANCES:
+        known = ", ".join(DISTURBANCES)
+        raise UserError(f"there is no disturbance {name!r}; use one of: {known}")
+    return DISTURBANCES[name]
+
+
+class NoisySensors:
+    """A controller whose observations have normally distributed errors."""
+
+    def __init__(self, controller: Controller, rng: np.random.Generator) -> None:
+        self._controller, self._rng = controller, rng
+
+    def update(self, observation: Observation) -> float:
+        errors = self._rng.normal(size=5).tolist()
+        return self._controller.update(
+            replace(
+                observation,
+                to_lane_centre=observation.to_lane_centre + OFFSET_NOISE_M * errors[0],
+                angle=observation.angle + ANGLE_NOISE_RAD * errors[1],
+                vx=observation.vx + SPEED_NOISE_M_S * errors[2],
+                vy=observation.vy + SPEED_NOISE_M_S * errors[3],
+                yaw_rate=observation.yaw_rate + YAW_RATE_NOISE_RAD_S * errors[4],
+            )
+        )
+
+
+class Gusts:
+    """Side wind (m/s, positive from the right), one value for each control step of `dt` s."""
+
+    def __init__(self, dt: float, rng: np.random.Generator) -> None:
+        self._keep = math.exp(-dt / GUST_S)
+        self._rng = rng
+        self._wind = 0.0
+
+    def step(self) -> float:
+        share = math.sqrt(1.0 - self._keep**2)
+        self._wind = self._keep * self._wind + share * GUST_M_S * float(self._rng.normal())
+        return self._wind
+
+
+class WindyWorld(World):
+    """A world with side wind, whose force acts at the centre of gravity, once a control step."""
+
+    def __init__(
+        self, road: Road, gusts: Gusts, *, traffic: int, frequency_hz: int, car: CarParameters
+    ) -> None:
+        super().__init__(road, traffic=traffic, frequency_hz=frequency_hz, car=car)
+        self._gusts = gusts
+
+    def step(self, command: Command) -> CarState:
+        now, wind = self.state, self._gusts.step()
+        force = self.car.air_density * SIDE_FORCE_M2 * wind * abs(now.vx) * 0.5
+        change = force / self.car.total_mass / self.frequency_hz
+        self._motion[7] -= change * math.sin(now.yaw)
+        self._motion[8] += change * math.cos(now.yaw)
+        return super().step(command)

@@ -1,0 +1,311 @@
+"""One drive from its configuration: road, world, perception, controller, observers.
+
+controllers drive --controller lqr --track oval --perception truth --log drive.csv
+"""
+
+import itertools
+import json
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from functools import partial
+from operator import attrgetter
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+import trackfeatures as tf
+from controllers.drive.closed_loop import DriveLog, DriveResult, HeldThrottle, Pedals, run_lap
+from controllers.drive.config import THROTTLE, DriveConfig
+from controllers.drive.disturbance import Disturbance
+from controllers.interface import LoopConfig
+from controllers.laws.speed import on_perception, on_the_truth
+from controllers.perception.late import LatePerception, TrustedPerception
+from controllers.perception.perceived import Perceive, Perceived
+from controllers.perception.real_time import RealTimePerception, real_time
+from controllers.perception.sources import CameraPerception, open_perception
+from controllers.registry import make_controller
+from runtime.files import check_folder
+from runtime.film import FILM_SUFFIX, Film
+from simulator.camera import check_light
+from simulator.track.catalogue import find_track
+from simulator.track.road import Road
+from simulator.vehicle.state import CarState
+from simulator.world.world import World
+from trackfeatures import UserError
+from trackfeatures.camera import CameraParameters
+
+FREQUENCY_HZ = 20
+SCORED_STEPS = {"forza": 6500, "alpine-2": 4500, "eroad": 3700, "g-track-3": 3300}
+"""The paper's number of steps for each of its tracks."""
+TYPICAL_SPEED = 15.0  # m/s, slightly below the speed of gear 1 and THROTTLE on a flat road
+
+START_M, START_S = 5.0, 10.0
+"""A car did not start if its drive ended within START_M (m), or if it stood for START_S (s)."""
+
+Progress = Callable[[int, int], None]
+"""A function that is called with the steps done and the total number of steps."""
+
+
+@dataclass(frozen=True)
+class Lane:
+    """The start of a drive and the line that it follows, m left of the track's centre."""
+
+    start_d: float
+    centre: float
+
+
+class Observer(Protocol):
+    """A function that is called in each control step, before the car moves."""
+
+    def __call__(self, now: CarState, perceived: Perceived, steer: float) -> None: ...
+
+
+def drive(
+    config: DriveConfig,
+    progress: Progress | None = None,
+    *,
+    disturbance: Disturbance | None = None,
+    observers: Sequence[Observer] = (),
+    parameters: Mapping[str, float] | None = None,
+) -> DriveResult:
+    """Drive as `config` describes; `progress` and the `observers` are called in each step.
+
+    `parameters` of the controller replace those of the file in `config`. The log and the film are
+    written step by step, so an interrupted drive leaves the driven part. Raises UserError for an
+    unknown name, a lane or start outside the road, or a service that does not answer.
+    """
+    check_light(config.light)  # a misspelt name is an error even without a camera
+    if config.video is not None:
+        _check_film(config.video)
+    track = find_track(config.track, config.tracks_dir)
+    road = Road(track, lanes=config.lanes)
+    lane = choose_lane(config, road)
+    steps = steps_for(config.steps, track.name, track.length_m)
+    noisy = config.perception != "truth"
+    loop = LoopConfig(1.0 / FREQUENCY_HZ, noisy=noisy)
+    if parameters is None:
+        parameters = read_parameters(config.parameters, config.controller)
+    controller = make_controller(config.controller, loop, parameters)
+    pedals = choose_pedals(config, road, lane)
+    with ExitStack() as stack:
+        disturbance = disturbance or Disturbance()
+        world = stack.enter_context(
+            disturbance.world(
+                road, traffic=config.traffic, frequency_hz=FREQUENCY_HZ, seed=config.seed
+            )
+        )
+        world.reset(seed=config.seed, to_middle=lane.start_d)
+        scene: dict[str, Any] = {"light": config.light, "seed": config.seed}
+        source = stack.enter_context(
+            open_perception(
+                config.perception, world, model=config.model, lane_centre=lane.centre, **scene
+            )
+        )
+        watching = [*observers, *_observers(config, stack, world, source, lane)]
+        live = _real_time(config, source, disturbance) if config.realtime else None
+        if live is not None:
+            stack.enter_context(live)
+        perceive = LastAnswer(live or delay(config, source, disturbance.delay_s))
+        result = run_lap(
+            world,
+            disturbance.controller(controller, config.seed),
+            perceive,
+            steps,
+            pedals=pedals,
+            lane_centre=lane.centre,
+            noisy=noisy,
+            record=_recorder(perceive, watching, steps, progress),
+        )
+        return result if live is None else replace(result, real_time=live.figures())
+
+
+def _check_film(path: Path) -> None:
+    if path.suffix.lower() != FILM_SUFFIX:
+        raise UserError(f"--video {path}: give a file ending in {FILM_SUFFIX}")
+    check_folder(path)
+
+
+def _real_time(
+    config: DriveConfig, perceive: Perceive, disturbance: Disturbance
+) -> RealTimePerception[World, Any, Any]:
+    """`perceive` on the wall clock. Raises UserError if a delay is simulated at the same time."""
+    if config.latency_ms or disturbance.delay_s:
+        raise UserError(
+            "--realtime measures the delay of the answers; leave it out, or --latency-ms"
+        )
+    rng = np.random.default_rng([config.seed, 3])
+    return real_time(perceive, dt=1.0 / FREQUENCY_HZ, drop=config.drop, rng=rng)
+
+
+def check_started(config: DriveConfig, result: DriveResult) -> None:
+    """Raise UserError if the car did not leave its start."""
+    seconds = result.steps / FREQUENCY_HZ
+    if result.distance_m >= START_M or (result.ended is None and seconds < START_S):
+        return
+    what = f"ended with {result.ended}" if result.ended else "stood"
+    raise UserError(
+        f"the car did not start on {config.track}: it {what} after {seconds:g} s, "
+        f"{result.distance_m:.1f} m driven; give another --throttle, --speed, --start-d or track"
+    )
+
+
+def choose_pedals(config: DriveConfig, road: Road, lane: Lane) -> Pedals:
+    """Pedals with the throttle or the speed of `config`.
+
+    Raises UserError if both are given, and for a value out of range.
+    """
+    if config.speed is not None:
+        if config.throttle is not None:
+            raise UserError(
+                f"--speed {config.speed:g} and --throttle {config.throttle:g} contradict each "
+                "other; give one of them"
+            )
+        if config.perception == "truth":
+            return on_the_truth(config.speed, road, lane.centre, 1.0 / FREQUENCY_HZ)
+        return on_perception(config.speed, 1.0 / FREQUENCY_HZ)
+    throttle = THROTTLE if config.throttle is None else config.throttle
+    if not 0.0 <= throttle <= 1.0:
+        raise UserError(f"throttle {throttle} is out of range; give one from 0 to 1")
+    return HeldThrottle(throttle)
+
+
+def delay(config: DriveConfig, perceive: Perceive, unknown_s: float = 0.0) -> Perceive:
+    """`perceive` with the latency and losses of `config`, and less weight on uncertain answers.
+
+    The state is predicted over the latency, but not over the further delay `unknown_s` (s).
+    """
+    late = partial(
+        LatePerception,
+        state=attrgetter("state"),
+        dt=1.0 / FREQUENCY_HZ,
+        rng=np.random.default_rng([config.seed, 3]),
+    )
+    if unknown_s > 0.0:
+        perceive = late(perceive, latency_s=unknown_s, drop=0.0, predict=False)
+    if config.latency_ms == 0.0 and config.drop == 0.0:
+        if config.perception == "truth":
+            return perceive
+        return TrustedPerception(perceive, attrgetter("state"), dt=1.0 / FREQUENCY_HZ)
+    return late(perceive, latency_s=config.latency_ms / 1000.0, drop=config.drop)
+
+
+def read_parameters(path: Path | None, controller: str) -> dict[str, float]:
+    """The parameters of `controller` in a file of `controllers tune`; {} without a file.
+
+    Raises UserError for another kind of file, or one without parameters of the controller.
+    """
+    if path is None:
+        return {}
+    try:
+        found = json.loads(path.read_text())["controllers"][controller]["parameters"]
+        return {str(name): float(value) for name, value in found.items()}
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise UserError(
+            f"{path} has no parameters of {controller} ({error!r}); give a file that "
+            "`controllers tune` wrote for it"
+        ) from error
+
+
+class LastAnswer:
+    """A perception that keeps its last answer for the observers."""
+
+    def __init__(self, perceive: Perceive) -> None:
+        self._perceive = perceive
+        self.last: Perceived | None = None
+
+    def __call__(self, world: World) -> Perceived:
+        self.last = self._perceive(world)
+        return self.last
+
+
+def _observers(
+    config: DriveConfig, stack: ExitStack, world: World, perceive: Perceive, lane: Lane
+) -> Iterator[Observer]:
+    """The log, the film and the live page; `stack` closes them."""
+    if config.log is not None:
+        log = DriveLog(stack.enter_context(config.log.open("w", encoding="utf-8")))
+        yield lambda now, perceived, steer: log.write(now, steer)
+    if config.video is not None:
+        from controllers.drive.film import DriveFilm
+        from simulator.camera import open_camera
+
+        film = stack.enter_context(Film(config.video, FREQUENCY_HZ))
+        seen = perceive if isinstance(perceive, CameraPerception) else None
+        if seen is not None:
+            camera = seen.camera
+        else:
+            parameters = CameraParameters()
+            camera = open_camera(world.road, parameters, light=config.light, seed=config.seed)
+            stack.callback(camera.close)
+        drawn = DriveFilm(film, world, camera, seen, lane_centre=lane.centre)
+        yield lambda now, perceived, steer: drawn.add(perceived, steer)
+    if config.watch is not None:
+        from controllers.drive.watch import watch
+
+        show = stack.enter_context(watch(config, world, lane.centre))
+        yield lambda now, perceived, steer: show(perceived)
+
+
+def _recorder(
+    perceive: LastAnswer, observers: list[Observer], steps: int, progress: Progress | None
+) -> Callable[[CarState, float], None]:
+    """A function that calls the observers and reports the progress."""
+    done = itertools.count()
+
+    def record(state: CarState, steer: float) -> None:
+        assert perceive.last is not None
+        for observer in observers:
+            observer(state, perceive.last, steer)
+        if progress is not None:
+            progress(next(done), steps)
+
+    return record
+
+
+def choose_lane(config: DriveConfig, road: Road) -> Lane:
+    """The lane to follow and the start.
+
+    Raises UserError for a lane or start outside the road. On perception it also raises UserError
+    for a target other than the lane of the start, because an image shows only the offset from the
+    lane that the car is in.
+    """
+    target = config.target_lane
+    if target is not None and not 0 <= target < road.lanes:
+        raise UserError(
+            f"target lane {target} does not exist; the {road.lanes} lane(s) are numbered from 0, "
+            "the leftmost"
+        )
+    if config.start_d is not None:
+        start = config.start_d
+    elif target is not None:
+        start = tf.lane_centre(target, road.lanes, road.lane_width)
+    else:
+        start = 0.0
+    if not (math.isfinite(start) and abs(start) <= road.edge):
+        raise UserError(
+            f"start-d {start:g} m is off the road, which ends {road.edge:.2f} m from its centre"
+        )
+    nearest = tf.lane_index(start, road.lanes, road.lane_width)
+    if target is not None and target != nearest and config.perception != "truth":
+        raise UserError(
+            f"the start is in lane {nearest}, the target is lane {target}: perception measures "
+            "only the lane the car is in; leave --start-d out, or use --perception truth"
+        )
+    chosen = nearest if target is None else target
+    return Lane(start, tf.lane_centre(chosen, road.lanes, road.lane_width))
+
+
+def steps_for(requested: int | None, track: str, length_m: float) -> int:
+    """Control steps of a drive: `requested`, or the paper's number for the track, or about one lap.
+
+    Raises UserError for a number below 1.
+    """
+    if requested is not None:
+        if requested < 1:
+            raise UserError(f"{requested} steps requested; give 1 or more")
+        return requested
+    about = length_m / TYPICAL_SPEED * FREQUENCY_HZ
+    return SCORED_STEPS.get(track, 100 * math.ceil(about / 100))

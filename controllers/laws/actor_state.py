@@ -1,0 +1,129 @@
+"""The state vector that an actor receives; training and driving share its definitions.
+
+`paper`: the paper's seven numbers (`trackfeatures.state_vector`).
+`stacked`: d/w, angle/pi, v_x and v_y over 75 km/h, left minus right, the yaw rate (rad/s), the
+changes of the first two since the last step, and the last two steering actions. The curvature of
+the road can be inferred from them; the paper's state does not contain it. LQR also receives the yaw
+rate.
+`residual`: `stacked` and the steering of the controller `lqr`. 0.3 times the actor's action is
+added to that steering (Johannink et al. 2019, residual reinforcement learning).
+
+Every drive divides the lateral offset by half the width of the track of the training: a controller
+does not know the width of the road, and its gains are per metre.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from controllers.interface import Controller, LoopConfig, Observation
+from trackfeatures.errors import UserError
+from trackfeatures.state_vector import state_vector
+
+Vector = NDArray[np.float32]
+STEP_S = 0.05
+"""The control step of the trainings; an actor drives at the same rate."""
+EXACT = LoopConfig(STEP_S)
+RESIDUAL_REACH = 0.3
+"""Steering that the action 1 adds to that of LQR, in [-1, 1]; a bend of 25 m needs about 0.3."""
+
+
+@dataclass(frozen=True)
+class StateDefinition:
+    """Names, spreads and symmetry of the numbers of a state."""
+
+    name: str
+    parts: tuple[str, ...]
+    spread: tuple[float, ...]
+    """Typical size of each number; an algorithm may divide by it."""
+    odd: tuple[float, ...]
+    """-1 for a number that changes its sign when left and right are exchanged, 1 otherwise."""
+    order: tuple[int, ...]
+    """Index of the number that replaces each number when left and right are exchanged."""
+
+    @property
+    def size(self) -> int:
+        return len(self.parts)
+
+
+PAPER = StateDefinition(
+    name="paper",
+    parts=("d", "angle", "v_x", "v_y", "left", "straight", "right"),
+    spread=(0.1, 0.04, 1.0, 0.04, 1.0, 1.0, 1.0),
+    odd=(-1.0, -1.0, 1.0, -1.0, 1.0, 1.0, 1.0),
+    order=(0, 1, 2, 3, 6, 5, 4),
+)
+STACKED = StateDefinition(
+    name="stacked",
+    parts=(
+        *("d", "angle", "v_x", "v_y", "turn", "yaw_rate"),
+        *("d_change", "angle_change", "steer_1", "steer_2"),
+    ),
+    spread=(0.1, 0.04, 1.0, 0.04, 1.0, 0.4, 0.02, 0.01, 0.4, 0.4),
+    odd=(-1.0, -1.0, 1.0, -1.0, -1.0, -1.0, -1.0, -1.0, -1.0, -1.0),
+    order=tuple(range(10)),
+)
+RESIDUAL = StateDefinition(
+    name="residual",
+    parts=(*STACKED.parts, "lqr"),
+    spread=(*STACKED.spread, 0.4),
+    odd=(*STACKED.odd, -1.0),
+    order=tuple(range(11)),
+)
+STATES = {state.name: state for state in (PAPER, STACKED, RESIDUAL)}
+
+
+def find_state(name: str) -> StateDefinition:
+    """The definition called `name`. Raises UserError for an unknown name."""
+    if name not in STATES:
+        raise UserError(f"there is no state {name!r}; use one of: {', '.join(STATES)}")
+    return STATES[name]
+
+
+def paper_state(seen: Observation, half_width: float) -> Vector:
+    """The paper's state (7,) of an observation; `half_width` of the track of the training in m."""
+    return state_vector(
+        *(seen.to_lane_centre, seen.angle, seen.vx, seen.vy, seen.heading), half_width=half_width
+    ).astype(np.float32)
+
+
+class StateBuilder:
+    """Builds the state of each step of one drive; it keeps what later states need of this step."""
+
+    def __init__(self, definition: StateDefinition, loop: LoopConfig = EXACT) -> None:
+        self._plain = definition.name == PAPER.name
+        self._lqr: Controller | None = None
+        if definition.name == RESIDUAL.name:
+            from controllers.laws.lqr import (
+                Lqr,
+                approach_limit,
+            )  # scipy; the other states need none
+
+            self._lqr = Lqr(STEP_S, approach_rad=approach_limit(loop))
+        self._lqr_steer = 0.0
+        self._before: tuple[float, float] | None = None
+        self._steers = (0.0, 0.0)
+
+    def build(self, paper: Vector, observation: Observation) -> Vector:
+        """The state from the paper's state (7,) and the observation of the same step."""
+        if self._plain:
+            return paper
+        d, angle, v_x, v_y, left, _, right = paper.tolist()
+        d_before, angle_before = self._before or (d, angle)
+        self._before = (d, angle)
+        numbers = [
+            *(d, angle, v_x, v_y, left - right, observation.yaw_rate),
+            *(d - d_before, angle - angle_before, *self._steers),
+        ]
+        if self._lqr is not None:
+            self._lqr_steer = self._lqr.update(observation)
+            numbers.append(self._lqr_steer)
+        return np.array(numbers, np.float32)
+
+    def steer(self, action: float) -> float:
+        """The steering in [-1, 1] for the actor's action in the state that was built last."""
+        if self._lqr is not None:
+            action = min(max(self._lqr_steer + RESIDUAL_REACH * action, -1.0), 1.0)
+        self._steers = (action, self._steers[0])
+        return action

@@ -1,0 +1,88 @@
+"""Gains of the linear quadratic regulator for the lateral model, by speed. SI units."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from scipy.linalg import solve_continuous_are, solve_discrete_are
+
+from controllers.laws.lateral_model import LateralModel, Matrix
+
+SLOWEST_M_S, FASTEST_M_S, GRID_M_S = 3.0, 45.0, 2.0
+"""The grid of speeds. The model divides by the speed, so the gains are constant below the grid."""
+
+
+@dataclass(frozen=True)
+class LqrWeights:
+    """Weights of the cost: Q = diag(offset, offset_rate, heading, heading_rate), R = rho."""
+
+    offset: float
+    offset_rate: float
+    heading: float
+    heading_rate: float
+    rho: float
+
+    @property
+    def Q(self) -> Matrix:  # noqa: N802  # the matrix of the paper
+        return np.diag([self.offset, self.offset_rate, self.heading, self.heading_rate])
+
+    @property
+    def R(self) -> Matrix:  # noqa: N802
+        return np.array([[self.rho]])
+
+
+def dlqr(A: Matrix, B: Matrix, Q: Matrix, R: Matrix) -> Matrix:
+    """Gain K (inputs, states) of u = -K x for x' = A x + B u, cost sum(x'Qx + u'Ru)."""
+    P = solve_discrete_are(A, B, Q, R)
+    gain: Matrix = np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)
+    return gain
+
+
+def clqr(A: Matrix, B: Matrix, Q: Matrix, R: Matrix) -> Matrix:
+    """Gain K (inputs, states) of u = -K x for dx/dt = A x + B u, cost integral(x'Qx + u'Ru)."""
+    P = solve_continuous_are(A, B, Q, R)
+    gain: Matrix = np.linalg.solve(R, B.T @ P)
+    return gain
+
+
+def discrete_gain(model: LateralModel, weights: LqrWeights, speed: float, dt: float) -> Matrix:
+    """K (4,) in rad per unit of (e1, e1', e2, e2') at one speed (m/s) and control step (s)."""
+    A, B = model.discretise(speed, dt)
+    gain: Matrix = dlqr(A, B, weights.Q, weights.R)[0]
+    return gain
+
+
+def continuous_gain(model: LateralModel, weights: LqrWeights, speed: float) -> Matrix:
+    """K (4,) of the continuous regulator at one speed (m/s)."""
+    A, B, _ = model.matrices(speed)
+    gain: Matrix = clqr(A, B, weights.Q, weights.R)[0]
+    return gain
+
+
+class SpeedTable:
+    """Rows computed at a grid of speeds, interpolated linearly, constant outside the grid."""
+
+    def __init__(self, row_at: Callable[[float], Matrix | tuple[float, ...]]) -> None:
+        speeds = np.arange(SLOWEST_M_S, FASTEST_M_S + GRID_M_S, GRID_M_S)
+        self._rows = np.array([row_at(float(speed)) for speed in speeds])
+
+    def __call__(self, speed: float) -> Matrix:
+        """The row (n,) at `speed` m/s."""
+        place = (min(max(speed, SLOWEST_M_S), FASTEST_M_S) - SLOWEST_M_S) / GRID_M_S
+        low = min(int(place), len(self._rows) - 2)
+        share = place - low
+        row: Matrix = (1.0 - share) * self._rows[low] + share * self._rows[low + 1]
+        return row
+
+
+@lru_cache(maxsize=64)
+def discrete_gains(model: LateralModel, weights: LqrWeights, dt: float) -> SpeedTable:
+    """`discrete_gain` by speed. Cached, because a command may make many equal controllers."""
+    return SpeedTable(lambda speed: discrete_gain(model, weights, speed, dt))
+
+
+@lru_cache(maxsize=64)
+def continuous_gains(model: LateralModel, weights: LqrWeights) -> SpeedTable:
+    """`continuous_gain` by speed."""
+    return SpeedTable(lambda speed: continuous_gain(model, weights, speed))

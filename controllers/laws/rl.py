@@ -1,0 +1,52 @@
+"""A trained actor as a controller; one `update` is three small matrix products in numpy."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+from controllers.interface import LoopConfig, Observation
+from controllers.laws.actor import Actor, load_actor
+from controllers.laws.actor_state import EXACT, STEP_S, StateBuilder, paper_state
+from trackfeatures.errors import UserError
+
+FARTHEST_M = 1.0
+"""Limit of the offset on perception. From further away an actor returns at an angle of 0.3 rad, but
+the shipped model answers 0.25 rad at most."""
+SHIPPED = Path(__file__).parent.parent / "weights"
+
+
+class RlController:
+    """Steers by the actions of `actor`, without noise."""
+
+    def __init__(self, actor: Actor, loop: LoopConfig = EXACT) -> None:
+        self._actor = actor
+        self._states = StateBuilder(actor.definition, loop)
+        self._farthest_m = FARTHEST_M if loop.noisy else math.inf
+
+    def update(self, observation: Observation) -> float:
+        if abs(observation.to_lane_centre) > self._farthest_m:
+            offset = math.copysign(self._farthest_m, observation.to_lane_centre)
+            observation = replace(observation, to_lane_centre=offset)
+        paper = paper_state(observation, self._actor.card.half_width_m)
+        return self._states.steer(self._actor.steer(self._states.build(paper, observation)))
+
+
+def load_controller(folder: Path, loop: LoopConfig = EXACT) -> RlController:
+    """The controller of the actor in `folder`.
+
+    Raises ActorError for unusable files and UserError for a control step other than that of the
+    training.
+    """
+    if loop.dt != STEP_S:
+        raise UserError(f"{folder.name} was trained for steps of {STEP_S:g} s, not {loop.dt:g}")
+    return RlController(load_actor(folder), loop)
+
+
+def make_rl(loop: LoopConfig) -> RlController:
+    """The shipped actor of the paper's state. Raises UserError as `load_controller` does."""
+    return load_controller(SHIPPED / "rl", loop)
+
+
+def make_rl_residual(loop: LoopConfig) -> RlController:
+    """The shipped actor that corrects LQR. Raises UserError as `load_controller` does."""
+    return load_controller(SHIPPED / "rl-residual", loop)

@@ -1,0 +1,1 @@
+"""What a controller knows of the road: sources of perception, late and uncertain answers."""

@@ -1,0 +1,221 @@
+"""Sources of perception: ground truth, a model in this process, or a service over HTTP.
+
+Each source is a function of the simulated world that returns `Perceived`.
+"""
+
+import math
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+import trackfeatures as tf
+from controllers.perception.perceived import Perceive, Perceived
+from trackfeatures import RoadClass, UserError
+from trackfeatures.camera import CameraParameters
+
+if TYPE_CHECKING:
+    from simulator.camera import Camera
+    from simulator.world.world import World
+
+Image = NDArray[np.uint8]
+JPEG_QUALITY = 95  # as in the recorded training images
+LOOK_AHEAD_S = 0.1
+"""The ground truth has the curvature this far ahead: about the delay of steering and tyres."""
+
+
+class FeatureModel(Protocol):
+    """A network as `CameraPerception` uses it: its camera, and its prediction for an image."""
+
+    camera: CameraParameters
+
+    def predict(self, image: Image) -> dict[str, Any]:
+        """The prediction for an image (H, W, 3) RGB, in the format of the service's answers."""
+        ...
+
+    def close(self) -> None:
+        """Release what the model holds open."""
+        ...
+
+
+def truth(lane_centre: float) -> Perceive:
+    """The exact features; the offset is from the line at `lane_centre` (m, left positive)."""
+
+    def perceive(world: "World") -> Perceived:
+        now = world.state
+        ahead = now.s + LOOK_AHEAD_S * max(now.vx, 0.0)
+        return Perceived(
+            to_lane_centre=now.to_middle - lane_centre,
+            angle=now.angle,
+            heading=world.features().heading,
+            curvature=world.road.track.curvature(ahead),
+        )
+
+    return perceive
+
+
+class LocalModel:
+    """The model of a run, computed in this process."""
+
+    def __init__(self, run: str) -> None:
+        from mtlnet.inference.engine import load_engine
+        from mtlnet.inference.model_card import resolve_run
+        from mtlnet.inference.prediction import decode_outputs
+
+        self._engine = load_engine(resolve_run(run))
+        self._decode = decode_outputs
+        self.camera: CameraParameters = self._engine.card.camera
+
+    def predict(self, image: Image) -> dict[str, Any]:
+        return self._decode(self._engine(image)).as_json()
+
+    def close(self) -> None:
+        """Do nothing: the model holds nothing open."""
+
+
+class ServiceModel:
+    """The model of the perception service at `url`; the path may end with /features.
+
+    Raises UserError for a service that does not answer, and DefinitionsMismatch for one of another
+    version of the definitions.
+    """
+
+    def __init__(self, url: str) -> None:
+        from serve.client import Client
+
+        self._client = Client(url.rstrip("/").removesuffix("/features"))
+        card = self._client.model()
+        tf.require_version(str(card.get("definitions_version")), f"the service at {url}")
+        self.camera: CameraParameters = parse_camera(card.get("camera"))
+        self.model_hash = str(card.get("model_hash"))
+
+    def predict(self, image: Image) -> dict[str, Any]:
+        import simplejpeg
+
+        body = simplejpeg.encode_jpeg(
+            np.ascontiguousarray(image), quality=JPEG_QUALITY, colorsubsampling="420"
+        )
+        return self._client.features(body)
+
+    def close(self) -> None:
+        self._client.close()
+
+
+def parse_camera(content: Any) -> CameraParameters:
+    """The camera in a service's model card. Raises UserError for a missing or incomplete camera."""
+    try:
+        return CameraParameters(
+            width=int(content["width"]),
+            height=int(content["height"]),
+            fov_y_deg=float(content["fov_y_deg"]),
+            x=float(content["x"]),
+            y=float(content["y"]),
+            z=float(content["z"]),
+            pitch_deg=float(content["pitch_deg"]),
+        )
+    except (KeyError, TypeError, ValueError) as error:
+        raise UserError(
+            f"the service's model card gives no usable camera ({error!r}), found {content}; use a "
+            "perception service of this version"
+        ) from error
+
+
+class CameraPerception:
+    """Perception by a camera on the car and a network that evaluates its images."""
+
+    def __init__(self, camera: "Camera", model: FeatureModel) -> None:
+        self.camera = camera
+        self._model = model
+        self.image: Image | None = None
+        """The last image, (H, W, 3) RGB."""
+        self.answer: dict[str, Any] = {}
+        """The model's answer to the last image, in the format of the service's answers."""
+
+    def __call__(self, world: "World") -> Perceived:
+        return self.read(self.ask(self.capture(world)))
+
+    def capture(self, world: "World") -> Image:
+        """The image of the present state; call it in the thread that opened the camera."""
+        image: Image = self.camera.render(world.body_pose(), world.traffic.poses())
+        self.image = image
+        return image
+
+    def ask(self, image: Image) -> dict[str, Any]:
+        """The model's answer; call it in any thread, but in one at a time."""
+        return self._model.predict(image)
+
+    def read(self, answer: dict[str, Any]) -> Perceived:
+        """The quantities of an answer that steering needs; raises as `parse_prediction` does."""
+        self.answer = answer
+        return parse_prediction(answer)
+
+
+def parse_prediction(answer: dict[str, Any]) -> Perceived:
+    """The quantities that steering needs. Raises UserError for a missing or non-finite quantity."""
+    try:
+        offset, angle = answer["to_lane_centre_m"], float(answer["angle_rad"])
+        probabilities = [float(answer["heading"][heading.name.lower()]) for heading in RoadClass]
+        to_lane_centre = None if offset is None else float(offset)
+        std = answer.get("std") or {}
+        offset_std, angle_std = std.get("to_lane_centre"), std.get("angle")
+        _require_finite(
+            angle, to_lane_centre or 0.0, *probabilities, offset_std or 0.0, angle_std or 0.0
+        )
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise UserError(
+            "the service's answer lacks to_lane_centre_m, angle_rad or heading in finite numbers "
+            f"({error!r}); is it a perception service of this version?"
+        ) from error
+    return Perceived(
+        to_lane_centre,
+        angle,
+        RoadClass(int(np.argmax(probabilities))),
+        offset_std_m=offset_std,
+        angle_std_rad=angle_std,
+        out_of_distribution=bool(answer.get("out_of_distribution")),
+    )
+
+
+def _require_finite(*values: float) -> None:
+    # A NaN passes every comparison with a limit, and would steer to full lock.
+    if not all(map(math.isfinite, values)):
+        raise ValueError(f"{values} are not all finite")
+
+
+def check_perception(name: str, model: str) -> None:
+    """Raise UserError for an unknown perception `name`, or a missing run `model`."""
+    if name == "model":
+        from mtlnet.inference.model_card import resolve_run
+
+        resolve_run(model)
+    elif name != "truth" and ":" not in name:
+        raise UserError(
+            f"perception {name!r} is unknown; give truth, model, or the address of a "
+            "service such as http://127.0.0.1:8000"
+        )
+
+
+@contextmanager
+def open_perception(
+    name: str, world: "World", *, model: str, lane_centre: float, light: str, seed: int
+) -> Iterator[Perceive]:
+    """The perception called `name`: "truth", "model" (the run `model`), or a service's address.
+
+    `lane_centre` (m, left positive) is the centre of the lane to follow; `light` and `seed` set the
+    scene of the images. Raises UserError for another name, a missing model, or a service that does
+    not answer.
+    """
+    check_perception(name, model)
+    if name == "truth":
+        yield truth(lane_centre)
+        return
+    from simulator.camera import open_camera
+
+    network: FeatureModel = LocalModel(model) if name == "model" else ServiceModel(name)
+    with (
+        closing(network),
+        closing(open_camera(world.road, network.camera, light=light, seed=seed)) as camera,
+    ):
+        yield CameraPerception(camera, network)

@@ -1,0 +1,153 @@
+"""Sources of perception: parsed and refused predictions, images of the model's camera."""
+
+from contextlib import AbstractContextManager
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from controllers.perception.perceived import Perceive, Perceived
+from controllers.perception.sources import (
+    CameraPerception,
+    ServiceModel,
+    open_perception,
+    parse_camera,
+    parse_prediction,
+)
+from simulator.track.catalogue import find_track
+from simulator.track.road import Road
+from simulator.world.world import World
+from trackfeatures import VERSION, DefinitionsMismatch, RoadClass, UserError
+from trackfeatures.camera import CameraParameters
+
+ANSWER: dict[str, Any] = {
+    "distances_m": {"ml": -1.5, "mr": 2.5, "l": None, "m": None, "r": None},
+    "to_lane_centre_m": 0.5,
+    "angle_rad": -0.03,
+    "heading": {"left": 0.2, "straight": 0.1, "right": 0.7},
+}
+CAMERA = {
+    "width": 84, "height": 63, "x": 0.75, "y": 0.0, "z": 0.95, "pitch_deg": 0.0, "fov_y_deg": 67.5,
+}  # fmt: skip
+
+
+class FakeClient:
+    """Replaces `serve.client.Client`."""
+
+    card: dict[str, Any] = {"definitions_version": VERSION, "camera": CAMERA}  # noqa: RUF012  # replaced whole
+    bodies: list[bytes] = []  # noqa: RUF012  # emptied by the test
+    url = ""
+    closed = False
+
+    def __init__(self, url: str) -> None:
+        FakeClient.url, FakeClient.closed = url, False
+
+    def model(self) -> dict[str, Any]:
+        return self.card
+
+    def features(self, image: bytes) -> dict[str, Any]:
+        self.bodies.append(image)
+        return ANSWER
+
+    def close(self) -> None:
+        FakeClient.closed = True
+
+
+def opened(name: str, world: World) -> AbstractContextManager[Perceive]:
+    return open_perception(name, world, model="latest", lane_centre=0.0, light="clear", seed=0)
+
+
+@pytest.fixture
+def client(monkeypatch: pytest.MonkeyPatch) -> type[FakeClient]:
+    monkeypatch.setattr("serve.client.Client", FakeClient)
+    FakeClient.bodies.clear()
+    return FakeClient
+
+
+def test_a_prediction_is_parsed() -> None:
+    assert parse_prediction(ANSWER) == Perceived(0.5, -0.03, RoadClass.RIGHT)
+    assert parse_prediction({**ANSWER, "to_lane_centre_m": None}).to_lane_centre is None
+
+
+def test_standard_deviations_are_parsed() -> None:
+    std = {"ml": 0.1, "to_lane_centre": 0.04, "angle": 0.01}
+    uncertain = parse_prediction({**ANSWER, "std": std, "out_of_distribution": True})
+    assert (uncertain.offset_std_m, uncertain.angle_std_rad) == (0.04, 0.01)
+    assert uncertain.out_of_distribution is True
+    plain = parse_prediction({**ANSWER, "std": None, "out_of_distribution": None})
+    assert plain == Perceived(0.5, -0.03, RoadClass.RIGHT)
+    blind = {**ANSWER, "to_lane_centre_m": None, "std": {**std, "to_lane_centre": None}}
+    assert parse_prediction(blind).offset_std_m is None
+
+
+@pytest.mark.parametrize(
+    "answer",
+    [
+        {},
+        {**ANSWER, "std": [0.1]},
+        {**ANSWER, "std": {"to_lane_centre": "wide", "angle": 0.1}},
+        {**ANSWER, "std": {"to_lane_centre": 0.1, "angle": float("nan")}},
+        {**ANSWER, "heading": {"left": 1.0}},
+        {**ANSWER, "angle_rad": "north"},
+        {**ANSWER, "heading": None},
+        {**ANSWER, "to_lane_centre_m": "x"},
+        {**ANSWER, "to_lane_centre_m": float("nan")},
+        {**ANSWER, "angle_rad": float("nan")},
+        {**ANSWER, "angle_rad": float("-inf")},
+        {**ANSWER, "heading": {**ANSWER["heading"], "left": float("nan")}},
+    ],
+)
+def test_a_malformed_prediction_is_refused(answer: dict[str, Any]) -> None:
+    with pytest.raises(UserError, match="perception service"):
+        parse_prediction(answer)
+
+
+def test_an_image_is_sent_to_the_service_as_jpeg(client: type[FakeClient]) -> None:
+    service = ServiceModel("http://127.0.0.1:8000/features")
+    assert client.url == "http://127.0.0.1:8000"
+    image: NDArray[np.uint8] = np.full((63, 84, 3), 90, np.uint8)
+    assert service.predict(image) == ANSWER
+    assert client.bodies[0][:2] == b"\xff\xd8"
+    assert service.camera == CameraParameters(width=84, height=63)
+
+
+def test_a_service_with_other_definitions_or_no_camera_is_refused(
+    client: type[FakeClient], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(client, "card", {"definitions_version": "0", "camera": CAMERA})
+    with pytest.raises(DefinitionsMismatch):
+        ServiceModel("http://127.0.0.1:8000")
+    monkeypatch.setattr(client, "card", {"definitions_version": VERSION})
+    with pytest.raises(UserError, match="camera"):
+        ServiceModel("http://127.0.0.1:8000")
+
+
+def test_images_are_rendered_with_the_models_camera(client: type[FakeClient]) -> None:
+    """An image of the model's size is rendered, encoded and sent; the answer is parsed."""
+    with World(Road(find_track("oval"))) as world:
+        world.reset(seed=0)
+        with opened("http://127.0.0.1:8000", world) as perceive:
+            assert isinstance(perceive, CameraPerception)
+            assert perceive(world) == Perceived(0.5, -0.03, RoadClass.RIGHT)
+    assert client.closed
+    import simplejpeg
+
+    picture = simplejpeg.decode_jpeg(client.bodies[0])
+    assert picture.shape == (63, 84, 3)
+    assert picture.std() > 10  # not a uniform picture
+
+
+@pytest.mark.parametrize(
+    "camera", [None, {}, {**CAMERA, "x": "far"}, {**CAMERA, "fov_y_deg": 180.0}]
+)
+def test_a_malformed_camera_is_refused(camera: Any) -> None:
+    with pytest.raises(UserError, match="model card gives no usable camera"):
+        parse_camera(camera)
+
+
+@pytest.mark.parametrize("word", ["modle", "", "Truth"])
+def test_an_unknown_perception_is_refused(word: str) -> None:
+    expected = pytest.raises(UserError, match="give truth, model, or the address")
+    with World(Road(find_track("oval"))) as world, expected, opened(word, world):
+        pass
