@@ -64,6 +64,16 @@ CONTROLLERS: dict[str, ControllerEntry] = {
     "mpc-preview": ControllerEntry(
         "controllers.laws.mpc:make_mpc_preview", "MPC that knows the curvature ahead", _MPC_WEIGHTS
     ),
+    "lqr-kalman": ControllerEntry(
+        "controllers.laws.estimated:make_lqr_kalman",
+        "LQR on a filtered state, for noisy and late perception",
+        _LQR_WEIGHTS | {"wheel_rate": (1e-3, 100.0)},
+    ),
+    "mpc-kalman": ControllerEntry(
+        "controllers.laws.estimated:make_mpc_kalman",
+        "MPC on a filtered state, for noisy and late perception",
+        _MPC_WEIGHTS,
+    ),
     "rl": ControllerEntry(
         "controllers.laws.rl:make_rl", "trained by reinforcement on the paper's state"
     ),

@@ -1,0 +1,79 @@
+"""The delay of a perception, estimated from the car's own yaw rate. SI units."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+Vector = NDArray[np.float64]
+
+MAX_DELAY = 4
+"""Longest delay in control steps: 0.2 s at 20 Hz."""
+SPANS = (1, 4)
+"""Control steps over which second differences are taken: short ones are exact without noise, long
+ones contain more of the motion and no more of the noise."""
+WINDOW, FEWEST = 200, 20
+"""Control steps that are compared, at most and at least."""
+SURE = 3.5
+"""Standard errors by which one delay must explain the measurements better than another one."""
+
+
+class DelayEstimate:
+    """By how many control steps the perceived heading lags behind the measured yaw rate.
+
+    The heading error changes by theta' = r - kappa vx. Its second differences minus those of the
+    integrated yaw rate contain the noise, the change of the road's curvature kappa, which is small,
+    and for a wrong delay the motion of the car. Their squares are compared for the delays of 0 to
+    `MAX_DELAY` steps over the last `WINDOW` steps.
+    """
+
+    def __init__(self, dt: float) -> None:
+        self._dt = dt
+        self.steps = 0
+        """The delay that is assumed: 0 until the measurements contradict it."""
+        self.is_known = False
+        """Whether the measurements ever separated the delay from all others."""
+        self._rates = np.zeros(MAX_DELAY + 2)
+        self._turned = np.zeros(MAX_DELAY + 1)  # rad, integrals of the yaw rate of so long ago
+        self._residuals = np.zeros((2 * max(SPANS) + 1, MAX_DELAY + 1))
+        self._squares = np.zeros((len(SPANS), WINDOW, MAX_DELAY + 1))
+        self._count = -(2 * max(SPANS) + MAX_DELAY)
+
+    def update(self, theta: float, yaw_rate: float) -> bool:
+        """One control step with the perceived heading error (rad) and the yaw rate (rad/s) of now.
+
+        Returns whether `steps` changed.
+        """
+        self._rates[1:] = self._rates[:-1].copy()
+        self._rates[0] = yaw_rate
+        self._turned += 0.5 * self._dt * (self._rates[1:] + self._rates[:-1])
+        self._residuals[1:] = self._residuals[:-1].copy()
+        self._residuals[0] = theta - self._turned
+        self._count += 1
+        if self._count <= 0:
+            return False
+        for squares, span in zip(self._squares, SPANS, strict=True):
+            second = self._residuals[0] - 2.0 * self._residuals[span] + self._residuals[2 * span]
+            squares[self._count % WINDOW] = second**2
+        before = self.steps
+        if self._count >= FEWEST:
+            self._decide()
+        return self.steps != before
+
+    def _decide(self) -> None:
+        better = np.array(
+            [self._advantages(*pair) for pair in zip(self._squares, SPANS, strict=True)]
+        )
+        rivals = np.delete(better, self.steps, axis=1)
+        if better.max() > SURE:
+            self.steps = int(better.max(axis=0).argmax())
+            self.is_known = True
+        elif (rivals.max(axis=1) < -SURE).any():
+            self.is_known = True
+
+    def _advantages(self, squares: Vector, span: int) -> Vector:
+        """Standard errors (MAX_DELAY + 1,) by which each delay is better than the assumed one."""
+        compared = squares[: min(self._count, WINDOW)]
+        gains = compared[:, [self.steps]] - compared
+        # Neighbouring second differences over several steps have measurements in common.
+        error = gains.std(axis=0) * (span / len(compared)) ** 0.5
+        advantages: Vector = gains.mean(axis=0) / (error + 1e-12)
+        return advantages
