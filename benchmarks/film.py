@@ -7,7 +7,6 @@ film is noise over moving colours of 6 Mbit/s, made by the FFmpeg program.
     claim: at least 45 pictures a second
 """
 
-import argparse
 import os
 import subprocess
 import sys
@@ -20,7 +19,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import cv2
 
-from benchmarks.material.outcome import exit_code, not_measured
+from benchmarks.claims.outcome import conclude, not_measured, run_command
 from mtlnet.inference.engine import load_engine
 from mtlnet.inference.model_card import resolve_run
 from mtlnet.inference.prediction import decode_outputs
@@ -88,32 +87,30 @@ def parts(film: Path, model: str, folder: Path) -> dict[str, float]:
     return found
 
 
-def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seconds", type=float, default=20.0)
-    parser.add_argument("--model", default="default")
-    given = parser.parse_args()
+def main(seconds: float = 20.0, model: str = "default") -> None:
     cores = sorted(os.sched_getaffinity(0))[:CORES]
     os.sched_setaffinity(0, cores)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         film = folder / "film.mp4"
-        if not make_film(film, given.seconds):
-            return not_measured("install imageio-ffmpeg, which makes the film")
+        if not make_film(film, seconds):
+            not_measured("install imageio-ffmpeg, which makes the film")
         cv2.setNumThreads(CORES)
-        print("ms of CPU a picture: ", end="")
-        print(", ".join(f"{k} {v:.1f}" for k, v in parts(film, given.model, folder).items()))
-        engine = load_engine(resolve_run(given.model))
+        cpu_ms_of_parts = parts(film, model, folder)
+        engine = load_engine(resolve_run(model))
         begin, used = perf_counter(), process_time()
         count = len(predict_files(engine, [str(film)], [folder / "drawn.mp4"]))
-        seconds, used = perf_counter() - begin, process_time() - used
-    fps = count / seconds
-    print(
-        f"{count} pictures of 1280 x 720 on {len(cores)} cores: {1e3 * used / count:.1f} ms of CPU"
-    )
-    print(f"each, {fps:.1f} pictures a second (claim: {CLAIM_FPS:g})")
-    return exit_code(fps >= CLAIM_FPS)
+        wall_s, used_s = perf_counter() - begin, process_time() - used
+    result = {
+        "cores": len(cores),
+        "pictures": count,
+        "cpu_ms": {name: round(value, 1) for name, value in cpu_ms_of_parts.items()},
+        "cpu_ms_in_all": round(1e3 * used_s / count, 1),
+        "pictures_per_second": round(count / wall_s, 1),
+        "claim": CLAIM_FPS,
+    }
+    conclude(result, None, count / wall_s >= CLAIM_FPS)
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    run_command(main)

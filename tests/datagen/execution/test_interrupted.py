@@ -261,7 +261,7 @@ def _children(process: int) -> list[int]:
 @pytest.mark.extended
 def test_kills_of_the_whole_tree_at_random_moments_lose_nothing() -> None:
     """A short run of the benchmark that kills collections."""
-    script = Path(__file__).parents[3] / "benchmarks" / "killed.py"
+    script = Path(__file__).parents[3] / "benchmarks" / "collect_killed.py"
     small = ["--kills", "3", "--rounds", "3", "--frames", "10", "--seed", "2"]
     done = subprocess.run(
         [sys.executable, str(script), *small], capture_output=True, text=True, timeout=500

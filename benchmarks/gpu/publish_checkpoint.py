@@ -1,6 +1,6 @@
 """Publishes the newest checkpoint of a training that was stopped; prints the number of its step.
 
-    python -m benchmarks.material.gpu.publish_checkpoint RUN
+    python -m benchmarks.gpu.publish_checkpoint RUN
 
 Without an uncertainty head: `mtlnet ship --data` fits one on other rounds, on any machine.
 """

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from benchmarks.material.gpu.plan import Size
-from benchmarks.material.gpu.process import Command, Ended
+from benchmarks.gpu.plan import Size
+from benchmarks.gpu.process import Command, Ended
 from datagen.recording import Dataset, DatasetError
 
 SEEDS = {"test": 3601, "unseen": 3602, "random": 3603, "train": 3610}

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from benchmarks.material.link_processes import START_S, start, start_server
+from benchmarks.shared_memory.processes import START_S, start, start_server
 from simulator.link.client import Link
 from simulator.link.errors import ServerDied
 from simulator.link.segment import SHM

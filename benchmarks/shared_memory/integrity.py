@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.material.link_processes import INFO, LINK, START_S, fresh_name, start
+from benchmarks.shared_memory.processes import INFO, LINK, START_S, fresh_name, start
 from runtime.jit import compiled
 from simulator.link.channel import Receiver, Sender, state_image_bytes
 from simulator.link.handshake import write_header
@@ -77,7 +77,7 @@ def write_states(name: str) -> None:
 def server_to_client(hammer: str, task: str, messages: int, patience_s: float) -> dict[str, float]:
     """numba writes states with pictures, C reads them."""
     name = fresh_name()
-    writer = start(sys.executable, str(LINK), "--write-states", name)
+    writer = start(sys.executable, str(LINK), "--flood", name)
     try:
         told = subprocess.run(
             [hammer, task, name, str(messages), str(patience_s)],

@@ -1,11 +1,11 @@
-/* link_hammer.c: the C side of benchmarks/link.py.
+/* hammer.c: the C side of benchmarks/link.py.
  *
- *   link_hammer drive NAME           steps for ever, over and over; ends with the link
- *   link_hammer time NAME STEPS      one line: microseconds of every step
- *   link_hammer write NAME           commands as fast as it can; all words of one are its number
- *   link_hammer read NAME COUNT S    takes COUNT messages, for at most S seconds, and says how many
+ *   hammer drive NAME           steps for ever, over and over; ends with the link
+ *   hammer time NAME STEPS      one line: microseconds of every step
+ *   hammer write NAME           commands as fast as it can; all words of one are its number
+ *   hammer read NAME COUNT S    takes COUNT messages, for at most S seconds, and says how many
  *                                    were whole, torn and damaged
- *   link_hammer racy NAME COUNT S    the same without looking at the sequence: the control
+ *   hammer racy NAME COUNT S    the same without looking at the sequence: the control
  */
 #include <stdio.h>
 #include <stdlib.h>
@@ -91,7 +91,7 @@ int main(int number, char **arguments) {
     struct drvlink link;
     const char *task = number > 2 ? arguments[1] : "";
     if (number < 3 || drvlink_attach(&link, arguments[2], 180.0)) {
-        fprintf(stderr, "error: %s\n", number < 3 ? "see the top of link_hammer.c" : link.error);
+        fprintf(stderr, "error: %s\n", number < 3 ? "see the top of hammer.c" : link.error);
         return 1;
     }
     int failed = -1;

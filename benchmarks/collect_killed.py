@@ -1,19 +1,17 @@
 """SIGKILL of the whole process tree at random moments of a collection: no finished round is lost.
 
-Run: `python benchmarks/killed.py [--kills 200] [--rounds 8] [--frames 20] [--json FILE]`. A run of
-`datagen collect` is killed at a random moment and started again until it is complete; then the next
-folder is begun, until the number of kills is reached. Claim: every round that was finished at a
-kill has the same bytes and modification time at the end, and every dataset has the hash of an
-undisturbed run.
+Run: `python benchmarks/collect_killed.py [--kills 200] [--rounds 8] [--frames 20] [--seed 1]
+[--json FILE]`. A run of `datagen collect` is killed at a random moment and started again until it
+is complete; then the next folder is begun, until the number of kills is reached. Claim: every round
+that was finished at a kill has the same bytes and modification time at the end, and every dataset
+has the hash of an undisturbed run.
 
 A third of the kills come at any time of a run, which is mostly start-up. The others wait for a
 change in the folder (a round is begun, renamed, has its state, was the last one) and come within a
 short random time after it. `phases` counts the states in which the folder was found.
 """
 
-import argparse
 import hashlib
-import json
 import os
 import random
 import signal
@@ -24,8 +22,13 @@ import time
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from json import loads
 from pathlib import Path
 from typing import Any
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from benchmarks.claims.outcome import conclude, run_command
 
 TRACKS = "oval,circuit"
 WARM_UP = ("--rounds", "2", "--frames", "2")
@@ -141,7 +144,7 @@ def phase(out: Path) -> str:
         return "recording or checking"
     if partial or _number(out, ".partial/*"):
         return "beginning a round"
-    planned = len(json.loads((out / "plan.json").read_text())["rounds"])
+    planned = len(loads((out / "plan.json").read_text())["rounds"])
     return "deriving" if _number(out, "state/*.json") == planned else "starting up"
 
 
@@ -166,7 +169,7 @@ def content_hash(out: Path) -> tuple[str, bool]:
         capture_output=True,
         text=True,
     )
-    report = json.loads(done.stdout)
+    report = loads(done.stdout)
     return str(report["content_hash"]), bool(report["ok"])
 
 
@@ -204,22 +207,15 @@ def kill_and_resume(
     return count
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--kills", type=int, default=200)
-    parser.add_argument("--rounds", type=int, default=8)
-    parser.add_argument("--frames", type=int, default=20)
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--json", type=Path)
-    arguments = parser.parse_args()
-    options = ("--rounds", str(arguments.rounds), "--frames", str(arguments.frames))
+def main(
+    kills: int = 200, rounds: int = 8, frames: int = 20, seed: int = 1, json: Path | None = None
+) -> None:
+    options = ("--rounds", str(rounds), "--frames", str(frames))
     with tempfile.TemporaryDirectory() as folder:
         home = Path(folder)
         collect(home / "warm-up", WARM_UP)  # the first time, code is compiled
         seconds = collect(home / "undisturbed", options)
-        count = kill_and_resume(
-            home, options, arguments.kills, random.Random(arguments.seed), seconds
-        )
+        count = kill_and_resume(home, options, kills, random.Random(seed), seconds)
     result: dict[str, Any] = {
         "kills": count.kills,
         "datasets": count.folders,
@@ -230,13 +226,9 @@ def main() -> None:
         "datasets_with_another_hash": count.wrong_hash,
         "datasets_not_in_order": count.not_in_order,
     }
-    result["reached"] = not (count.lost or count.wrong_hash or count.not_in_order)
-    text = json.dumps(result, indent=1)
-    print(text)
-    if arguments.json:
-        arguments.json.write_text(text + "\n")
-    sys.exit(0 if result["reached"] else 1)
+    reached = not (count.lost or count.wrong_hash or count.not_in_order)
+    conclude({**result, "reached": reached}, json, reached)
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

@@ -1,13 +1,11 @@
 """Single flipped bits in a dataset: `verify --level full` is to find every one.
 
-Run: `python benchmarks/flips.py [--flips 1000] [--data DIR] [--json FILE]`. One bit of one file is
-flipped, the dataset verified, the bit put back. Of four flips three are in the rounds, at any byte,
-and one in the other files: states, splits, the manifest and all files that it names. Without
-`--data` a few rounds are collected; a given dataset is copied first.
+Run: `python benchmarks/verify_flipped_bits.py [--flips 1000] [--seed 0] [--data DIR] [--json
+FILE]`. One bit of one file is flipped, the dataset verified, the bit put back. Of four flips three
+are in the rounds, at any byte, and one in the other files: states, splits, the manifest and all
+files that it names. Without `--data` a few rounds are collected; a given dataset is copied first.
 """
 
-import argparse
-import json
 import shutil
 import sys
 import tempfile
@@ -16,6 +14,12 @@ from collections import Counter
 from pathlib import Path
 
 import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from benchmarks.claims.outcome import conclude, run_command
+from benchmarks.recordings.enlarged import collect_few
+from datagen.recording.integrity.verify import verify
 
 DERIVED = ("README.md",)  # people write into it: nothing vouches for it
 
@@ -28,9 +32,7 @@ def flip(path: Path, at: int, bit: int) -> None:
         stream.write(bytes([byte ^ (1 << bit)]))
 
 
-def run(data: Path, flips: int, seed: int) -> dict[str, object]:
-    from datagen.recording.integrity.verify import verify
-
+def flip_bits(data: Path, flips: int, seed: int) -> dict[str, object]:
     rng = np.random.default_rng(seed)
     rounds = sorted((data / "rounds").glob("*.mcap"))
     named = {p for p in data.rglob("*") if p.is_file() and "/." not in str(p)[len(str(data)) :]}
@@ -62,28 +64,18 @@ def run(data: Path, flips: int, seed: int) -> dict[str, object]:
     }
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--flips", type=int, default=1000)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--data", type=Path)
-    parser.add_argument("--json", type=Path)
-    arguments = parser.parse_args()
-    sys.path.insert(0, str(Path(__file__).parents[1]))
-    from benchmarks.material.rounds import collect
-
+def main(
+    flips: int = 1000, seed: int = 0, data: Path | None = None, json: Path | None = None
+) -> None:
     with tempfile.TemporaryDirectory() as home:
-        data = Path(home) / "data"
-        if arguments.data is None:
-            collect(data, rounds=3, frames=100)
+        copy = Path(home) / "data"
+        if data is None:
+            collect_few(copy, rounds=3, frames=100)
         else:
-            shutil.copytree(arguments.data, data)
-        result = run(data, arguments.flips, arguments.seed)
-    print(json.dumps(result, indent=1))
-    if arguments.json:
-        arguments.json.write_text(json.dumps(result, indent=1) + "\n")
-    sys.exit(0 if result["reached"] and result["untouched_ok"] else 1)
+            shutil.copytree(data, copy)
+        result = flip_bits(copy, flips, seed)
+    conclude(result, json, bool(result["reached"] and result["untouched_ok"]))
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

@@ -1,6 +1,6 @@
 """Clients that hold connections open: half never end their headers, half never end their body.
 
-    python benchmarks/material/slow.py PORT COUNT      until it is killed
+    python benchmarks/service_load/slow_clients.py PORT COUNT      until it is killed
 
 Each sends a byte a second, and dials again a second after it was cut.
 """

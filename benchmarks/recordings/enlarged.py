@@ -11,6 +11,7 @@ import sys
 from collections import defaultdict
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from mcap.reader import make_reader
@@ -28,14 +29,25 @@ from datagen.recording.splits import Split
 Steps = list[dict[str, bytes]]
 
 
-def collect(folder: Path, rounds: int, frames: int) -> Path:
-    """Real rounds by `datagen collect`."""
+def collect(folder: Path, **options: object) -> dict[str, Any]:
+    """Run `datagen collect` with these options; its result."""
     command = [sys.executable, "-m", "datagen", "collect", "--json", "--out", str(folder)]
-    command += ["--rounds", str(rounds), "--frames", str(frames), "--seed", "11"]
-    command += ["--stretch", "1"]
-    done = subprocess.run(command, check=True, capture_output=True, text=True)
-    print(f"collected {json.loads(done.stdout)['frames']} frames", file=sys.stderr)
+    for name, value in options.items():
+        command += [f"--{name}", str(value)]
+    done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
+    result: dict[str, Any] = json.loads(done.stdout)
+    return result
+
+
+def collect_few(folder: Path, rounds: int, frames: int) -> Path:
+    """Collect a small training set into `folder`, and return the folder."""
+    collect(folder, rounds=rounds, frames=frames, seed=11, stretch=1)
     return folder
+
+
+def enlarged_few(home: Path, rounds: int, frames: int) -> Path:
+    """A dataset in `home` of `rounds` rounds, out of four collected ones of 150 frames."""
+    return enlarge(collect_few(home / "few", 4, 150), home / "data", rounds, frames)
 
 
 def enlarge(source: Path, folder: Path, rounds: int, frames: int) -> Path:

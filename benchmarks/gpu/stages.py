@@ -14,17 +14,17 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from benchmarks.material.gpu.collecting import (
+from benchmarks.gpu.collecting import (
     VARIED,
     counted,
     evaluation_collections,
     most_frames,
     train_collections,
 )
-from benchmarks.material.gpu.plan import Plan, Size
-from benchmarks.material.gpu.process import Command, Ended, log_tail, run
-from benchmarks.material.gpu.report import RUNNING, Report
-from benchmarks.material.gpu.wheels import ROOT
+from benchmarks.gpu.plan import Plan, Size
+from benchmarks.gpu.process import Command, Ended, log_tail, run
+from benchmarks.gpu.report import RUNNING, Report
+from benchmarks.gpu.wheels import ROOT
 from mtlnet.inference.curves import CURVES, read_curves
 from mtlnet.inference.model_card import CARD
 
@@ -88,7 +88,7 @@ def forward(task: Run) -> dict[str, Any]:
     size = task.size
     command = task.command(
         "forward",
-        *("-m", "benchmarks.material.gpu.forward", "--device", size.device),
+        *("-m", "benchmarks.gpu.forward", "--device", size.device),
         *("--batches", ",".join(map(str, size.batches)), "--passes", str(size.passes)),
     )
     (ended,) = run([command], task.left())
@@ -261,7 +261,7 @@ def ship(task: Run) -> dict[str, Any]:
     found: dict[str, Any] = {}
     folder = task.work / "train"
     if not (folder / CARD).is_file():
-        module = "benchmarks.material.gpu.publish_checkpoint"
+        module = "benchmarks.gpu.publish_checkpoint"
         publish = task.command("publish", "-m", module, str(folder))
         (ended,) = run([publish], task.left())
         _require_ended(publish, ended)

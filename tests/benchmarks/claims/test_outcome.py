@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.material.outcome import MISSED, NOT_MEASURED, REACHED, exit_code
+from benchmarks.claims.outcome import MISSED, NOT_MEASURED, REACHED, exit_code
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 
 
 def test_exit_codes_differ() -> None:

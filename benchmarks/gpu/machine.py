@@ -11,7 +11,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from benchmarks.material.gpu.wheels import ROOT, missing_packages
+from benchmarks.gpu.wheels import ROOT, missing_packages
 
 TORCS_TRACK = "g-track-3"
 SOFTWARE = ("llvmpipe", "softpipe", "swrast")

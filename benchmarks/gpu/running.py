@@ -7,11 +7,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from benchmarks.material.gpu.plan import FULL, REHEARSAL, STAGES, Plan
-from benchmarks.material.gpu.process import Interrupted, raise_on_signals
-from benchmarks.material.gpu.report import DONE, FAILED, MAX_BYTES, SKIPPED, STOPPED, Report
-from benchmarks.material.gpu.stages import NEEDS, STAGE_FUNCTIONS, Run, StageFailed
-from benchmarks.material.outcome import exit_code
+from benchmarks.claims.outcome import exit_code
+from benchmarks.gpu.plan import FULL, REHEARSAL, STAGES, Plan
+from benchmarks.gpu.process import Interrupted, raise_on_signals
+from benchmarks.gpu.report import DONE, FAILED, MAX_BYTES, SKIPPED, STOPPED, Report
+from benchmarks.gpu.stages import NEEDS, STAGE_FUNCTIONS, Run, StageFailed
 from trackfeatures.errors import UserError
 
 INTERRUPTED = 128

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 import bentoml
 from bentoml.validators import ContentType
 
-from benchmarks.material.peer_work import Work, workers
+from benchmarks.service_load.peer_work import Work, workers
 
 
 @bentoml.service(workers=workers(), traffic={"timeout": 30}, logging={"access": {"enabled": False}})

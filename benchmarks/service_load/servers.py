@@ -3,7 +3,6 @@
 A peer runs in an environment of its own, which has it, openvino, numpy and simplejpeg.
 """
 
-import argparse
 import http.client
 import os
 import shutil
@@ -21,13 +20,15 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.material.peer_work import MODEL, PORT, WORKERS
+from benchmarks.service_load.peer_work import MODEL, PORT, WORKERS
 from tests.serve.conftest import jpeg, picture, publish_untrained
 
 HERE = Path(__file__).parent
 ROOT = HERE.parents[1]
 OURS = "driverview"
 PEERS = ("litserve", "bentoml", "mosec")
+Peer = Path | None
+"""The interpreter of an environment that has the peer; None: it is left out."""
 START_S, END_S = 120.0, 10.0
 BODY = jpeg(picture())
 
@@ -38,25 +39,14 @@ def request(path: str = "/features") -> bytes:
     return f"{head}Content-Length: {len(BODY)}\r\n\r\n".encode() + BODY
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """The options that say which servers, and which model."""
-    for name in PEERS:
-        parser.add_argument(f"--{name}", type=Path, help=f"the interpreter that has {name}")
-    parser.add_argument("--model", type=Path, help="a run's folder; without it untrained weights")
-    parser.add_argument(
-        "--int8", action="store_true", help="keep the run's int8 graph, for all of them"
-    )
-    parser.add_argument("--out", type=Path, help="write the figures here, too")
-
-
-def pythons(options: argparse.Namespace) -> dict[str, Path]:
-    """The interpreter of each server: ours, and of the peers that are given."""
-    given = {name: getattr(options, name) for name in PEERS}
-    return {OURS: Path(sys.executable), **{name: path for name, path in given.items() if path}}
+def pythons(*peers: Path | None) -> dict[str, Path]:
+    """The interpreter of each server: ours, and those given for `PEERS`, in their order."""
+    given = {name: path for name, path in zip(PEERS, peers, strict=True) if path}
+    return {OURS: Path(sys.executable), **given}
 
 
 @contextmanager
-def model(run: Path | None, int8: bool = False) -> Iterator[Path]:
+def model_copy(run: Path | None, int8: bool = False) -> Iterator[Path]:
     """A copy of `run`, without its int8 graph unless that is wanted; None: untrained weights."""
     with tempfile.TemporaryDirectory() as folder:
         found = Path(folder) / "run"
@@ -72,7 +62,7 @@ def _command(name: str, python: Path, port: int, workers: int, run: Path) -> lis
         options = ["--model", str(run), "--port", str(port), "--workers", str(workers)]
         return [str(python), "-m", "serve", *options]
     if name == "bentoml":
-        target = ["serve", "benchmarks.material.peer_bentoml:Features"]
+        target = ["serve", "benchmarks.service_load.peer_bentoml:Features"]
         options = ["--host", "127.0.0.1", "--port", str(port)]
         return [str(python.parent / "bentoml"), *target, *options]
     return [str(python), str(HERE / f"peer_{name}.py")]

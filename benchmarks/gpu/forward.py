@@ -1,6 +1,6 @@
 """Time of a forward pass of the shipped network by batch, on a device; prints JSON.
 
-    python -m benchmarks.material.gpu.forward --device cuda --batches 1,2,4 --passes 50
+    python -m benchmarks.gpu.forward --device cuda --batches 1,2,4 --passes 50
 
 Median ms of all nine outputs, images in the device's memory as uint8: `f32` (no TF32), `bf16`
 (autocast) and, on a GPU, `bf16_graph`: the same recorded as a CUDA graph, which leaves the time of

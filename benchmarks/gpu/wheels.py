@@ -10,7 +10,7 @@ from pathlib import Path
 
 from trackfeatures.errors import UserError
 
-ROOT = Path(__file__).parents[3]
+ROOT = Path(__file__).parents[2]
 PACKAGES = Path(__file__).with_name("packages.toml")
 PYTHON = "3.12"
 MAX_BYTES = 40 * 10**6

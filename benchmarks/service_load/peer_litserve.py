@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import litserve
 from fastapi import Body
 
-from benchmarks.material.peer_work import Work, port, workers
+from benchmarks.service_load.peer_work import Work, port, workers
 
 
 class Features(litserve.LitAPI):

@@ -22,8 +22,8 @@ def fresh_name() -> str:
 
 
 def compile_hammer(folder: Path) -> str:
-    program = str(folder / "link_hammer")
-    source = LINK.with_name("link_hammer.c")
+    program = str(folder / "hammer")
+    source = Path(__file__).with_name("hammer.c")
     include = f"-I{files('simulator.link').joinpath('c')}"
     strict = ["-std=c11", "-Wall", "-Wextra", "-Werror", "-O2", "-D_GNU_SOURCE", include]
     subprocess.run(["gcc", *strict, "-o", program, str(source), "-lm"], check=True)

@@ -23,7 +23,7 @@ FORK = multiprocessing.get_context("fork")
 
 
 @contextmanager
-def bad_clients(port: int) -> Iterator[None]:
+def malicious_clients(port: int) -> Iterator[None]:
     """Attack the service at a port of this machine, from the first attack to the end."""
     begun = SPAWN.Event()
     process = SPAWN.Process(target=attack_in_turn, args=(port, begun))

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.material.torcs_laps import (
+from benchmarks.recordings.torcs_laps import (
     LIMITS,
     TRACKS,
     Fit,

@@ -5,7 +5,7 @@ from typing import Any
 
 import mosec
 
-from benchmarks.material.peer_work import Work, port, workers
+from benchmarks.service_load.peer_work import Work, port, workers
 
 
 class Features(mosec.Worker):
