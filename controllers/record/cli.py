@@ -11,15 +11,8 @@ import typer
 
 from datagen.cli.collect import (
     DEFAULT_LANES,
-    Frames,
     Lanes,
     Lights,
-    Rounds,
-    Scenes,
-    Seed,
-    SplitName,
-    Stretch,
-    TestShare,
     Tracks,
     TracksDir,
     Workers,
@@ -28,7 +21,17 @@ from datagen.cli.collect import (
     print_recorded,
     record_plan,
 )
-from datagen.planning.config import CollectConfig, all_lights
+from datagen.planning.config import (
+    CollectConfig,
+    Frames,
+    Rounds,
+    Scenes,
+    Seed,
+    SplitName,
+    Stretch,
+    TestShare,
+    all_lights,
+)
 from datagen.recording.names import DRIVEN, UNSEEN
 from runtime.cli import AsJson
 from trackfeatures import UserError

@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 
 from benchmarks import gpu_run
-from benchmarks.gpu import machine, wheels
 from benchmarks.claims.outcome import NOT_MEASURED
+from benchmarks.gpu import machine, wheels
 from trackfeatures.errors import UserError
 
 ROOT = Path(__file__).parents[3]

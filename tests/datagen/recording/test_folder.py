@@ -51,6 +51,6 @@ def test_a_merge_that_has_not_ended_is_refused_by_every_reader(dataset: Path) ->
     (problem,) = verify(dataset, "quick").problems
     assert "was interrupted" in problem
     with pytest.raises(DatasetError, match="was interrupted"):
-        make_split(dataset, "mine", SplitConfig())
+        make_split(dataset, "mine", SplitConfig("round", 0.25, 0, False))
     rebuild(dataset, read_split(split_path(dataset)))
     assert verify(dataset, "full").ok

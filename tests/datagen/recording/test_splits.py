@@ -187,7 +187,7 @@ def test_the_command_never_overwrites_a_split(dataset: Path) -> None:
 def test_unseen_rounds_stay_unseen_in_a_new_split(samples: Samples, dataset: Path) -> None:
     samples.add_round(dataset, samples.header("r003"))
     write_split(split_path(dataset), Split(("r000", "r001"), ("r002",), unseen=("r003",)))
-    make_split(dataset, "mine", SplitConfig(test_share=0.4))
+    make_split(dataset, "mine", SplitConfig("round", 0.4, 0, False))
     split = read_split(split_path(dataset, "mine"))
     assert split.unseen == ("r003",)
     assert sorted(split.train + split.test) == ["r000", "r001", "r002"]
@@ -195,7 +195,7 @@ def test_unseen_rounds_stay_unseen_in_a_new_split(samples: Samples, dataset: Pat
     assert (report.rounds["unseen"], report.near["unseen"].frames) == (1, 45)
     samples.add_round(dataset, samples.header("r004", seed=3), content_seed=9)
     with pytest.raises(DatasetError, match=r"seed 3 on both sides, (train|test) and unseen"):
-        make_split(dataset, "leak", SplitConfig(test_share=0.4))
+        make_split(dataset, "leak", SplitConfig("round", 0.4, 0, False))
     assert not split_path(dataset, "leak").exists()
 
 
