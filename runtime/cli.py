@@ -28,7 +28,7 @@ INTERRUPTED = 130  # the shell's code for a process ended by Ctrl-C
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON on stdout.")]
 
 
-def options(config: type[Any]) -> Callable[[Callable[..., None]], Callable[..., None]]:
+def options(config: Any) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """Make a Typer command of a function whose first parameter is a `partial` of `config`.
 
     The annotated fields of the dataclass `config` become options with their names and defaults, in

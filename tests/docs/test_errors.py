@@ -8,6 +8,7 @@ import sys
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
+from typing import Any
 from unittest import mock
 
 import gymnasium as gym
@@ -116,7 +117,7 @@ def damaged_round(folder: Path) -> Dataset:
     return Dataset.open(data)
 
 
-def calibrated(folder: Path, source: Path, **options: float) -> object:
+def calibrated(folder: Path, source: Path, **options: Any) -> object:
     return calibrate(CalibrateConfig([str(source)], folder / "camera.yaml", **options))
 
 

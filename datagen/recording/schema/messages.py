@@ -116,9 +116,10 @@ def caption(features: tf.TrackFeatures) -> str:
 
 def labels(frame: Frame) -> bytes:
     features = frame.features
+    distances: dict[str, Any] = {f"to_marking_{n}": d for n, d in features.distances.items()}
     return _serialize(
         TrackFeatures(
-            **{f"to_marking_{name}": value for name, value in features.distances.items()},
+            **distances,
             to_lane_centre=features.to_lane_centre,
             angle=features.angle,
             heading=features.heading.name,

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from datagen.cli.maintain import split as split_command
-from datagen.recording import Dataset, DatasetError, Labels, RoundInfo, near_duplicates
+from datagen.recording import Dataset, DatasetError, Labels, RoundInfo
 from datagen.recording.folder import prepare, round_path
 from datagen.recording.integrity.recover import recover
 from datagen.recording.manifest import rebuild
@@ -113,12 +113,8 @@ def test_impossible_splits_are_refused(
         split_rounds(rounds, by, share, 0)
 
 
-@pytest.mark.parametrize("at_once", [100, 4_000_000])
 @pytest.mark.parametrize("tolerances", [Tolerances(), Tolerances(3.0, 0.5, 2.0)])
-def test_near_duplicates_equal_those_of_comparing_all_pairs(
-    tolerances: Tolerances, at_once: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(near_duplicates, "MAX_PAIRS_AT_ONCE", at_once)
+def test_near_duplicates_equal_those_of_comparing_all_pairs(tolerances: Tolerances) -> None:
     rng = np.random.default_rng(0)
     rounds = [make_info(n, f"track-{n % 2}") for n in range(6)]
     labels = make_labels(rng, 1500, 6)
