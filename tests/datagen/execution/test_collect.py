@@ -103,6 +103,10 @@ def test_a_finished_dataset_is_left_alone_and_a_lost_round_made_again(collected:
         (["--split", "later"], "no split 'later'"),
         (["--split", "unseen"], "track circuit is one of those to train on"),
         (["--jitter-camera"], "jitter_camera: False in its plan, now True"),
+        (["--scenes", "4"], "4 scenes a round asked for, but the scenery never changes; give --st"),
+        (["--scenes", "-1"], "-1 scenes a round"),
+        (["--stretch", "-1"], "a stretch of -1 frames"),
+        (["--frequency", "7"], "7 Hz does not divide"),
     ],
 )
 def test_impossible_options_are_refused_with_a_one_line_error(
