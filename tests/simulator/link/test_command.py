@@ -15,7 +15,6 @@ from trackfeatures.errors import UserError
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        ({"name": "driverview"}, "begins with a slash"),
         ({"name": "/" + "x" * 300}, "has 301 bytes"),
         ({"track": "no-such-track"}, "no track 'no-such-track'"),
         ({"frequency_hz": 30}, "30 Hz does not divide"),
