@@ -10,7 +10,6 @@ time that each takes a request is disturbed least.
 """
 
 import json
-import os
 import socket
 import subprocess
 import sys
@@ -23,6 +22,7 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from benchmarks.claims.outcome import conclude, run_command
+from benchmarks.service_load.servers import processor_s
 from tests.serve.conftest import FakeEngine, jpeg, outputs, picture
 
 CLAIM = 0.75
@@ -144,12 +144,6 @@ class Asker:
         return total_ms, timing["decode"] + timing["forward"]
 
 
-def cpu_ms(pid: int) -> float:
-    """Processor time of a process so far, ms. (Linux: fields 14 and 15 of its stat.)"""
-    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    return 1e3 * (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
-
-
 def measure(requests: int) -> dict[str, Any]:
     """The figures of both, and their ratio."""
     body = jpeg(picture())
@@ -166,14 +160,17 @@ def measure(requests: int) -> dict[str, Any]:
         for asker in askers.values():
             for _ in range(TURN):
                 asker.ask()
-        before = [cpu_ms(process.pid) for process in processes]
+        before = [processor_s([process.pid]) for process in processes]
         for _ in range(requests // TURN):
             for name, asked in found.items():
                 for _ in range(TURN):
                     total, work = askers[name].ask()
                     asked.total.append(total)
                     asked.work.append(work)
-        spent = [cpu_ms(p.pid) - b for p, b in zip(processes, before, strict=True)]
+        spent = [
+            1e3 * (processor_s([process.pid]) - start)
+            for process, start in zip(processes, before, strict=True)
+        ]
     finally:
         for process in processes:
             process.kill()

@@ -25,25 +25,23 @@ from statistics import median
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from benchmarks.claims.outcome import conclude, not_measured, run_command
-from benchmarks.service_load.servers import OURS, ROOT, Loader, descendants, model_copy, running
+from benchmarks.service_load.servers import (
+    OURS,
+    ROOT,
+    Loader,
+    descendants,
+    model_copy,
+    processor_s,
+    running,
+)
 
 CLAIM = 1.03
 CONNECTIONS = 8
-TICKS = os.sysconf("SC_CLK_TCK")
 PUBLISH = """
 import pathlib, sys
 from tests.serve.conftest import publish_untrained
 publish_untrained(pathlib.Path(sys.argv[1]), seed=3)
 """
-
-
-def processor_s(pids: list[int]) -> float:
-    """Processor time of some processes so far, s."""
-    total = 0
-    for pid in pids:
-        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-        total += int(fields[11]) + int(fields[12])
-    return total / TICKS
 
 
 @contextmanager

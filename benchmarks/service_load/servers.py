@@ -122,6 +122,13 @@ def _end(process: "subprocess.Popen[bytes]") -> None:
     process.wait()
 
 
+def processor_s(pids: list[int]) -> float:
+    """Processor time of some processes so far, s."""
+    stats = [Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split() for pid in pids]
+    ticks = sum(int(fields[11]) + int(fields[12]) for fields in stats)
+    return ticks / os.sysconf("SC_CLK_TCK")
+
+
 def descendants(pid: int) -> list[int]:
     """All processes below one. (Linux: the children of its first thread.)"""
     try:
