@@ -11,7 +11,7 @@ from datagen.recorder.record import scenery
 from datagen.recorder.replay import replay
 from datagen.recording import Dataset
 from datagen.view.steps import Steps
-from tests.datagen.commands import datagen
+from tests.datagen.commands import datagen_here
 
 LIGHTS = all_lights()
 TRACKS = (TrackChoice("oval", "0"),)
@@ -45,7 +45,7 @@ def test_no_two_stretches_have_the_same_scenery() -> None:
 def test_scenery_and_light_change_where_a_stretch_ends(tmp_path: Path) -> None:
     folder = tmp_path / "data"
     options = ("--rounds", "1", "--frames", "28", "--tracks", "oval", "--lights", "clear,fog")
-    done = datagen("collect", "--out", folder, *options, "--stretch", "10", "--scenes", "3")
+    done = datagen_here("collect", "--out", folder, *options, "--stretch", "10", "--scenes", "3")
     assert done.returncode == 0, done.stderr
     frames = Dataset.open(folder).select("all")
     assert set(frames.rounds[0].lights) == {"clear", "fog"}
@@ -63,7 +63,7 @@ def test_scenery_and_light_change_where_a_stretch_ends(tmp_path: Path) -> None:
 def test_scenes_repeat_in_order(tmp_path: Path) -> None:
     folder = tmp_path / "data"
     options = ("--rounds", "1", "--frames", "24", "--tracks", "oval", "--lights", "clear,fog")
-    done = datagen("collect", "--out", folder, *options, "--stretch", "2", "--scenes", "3")
+    done = datagen_here("collect", "--out", folder, *options, "--stretch", "2", "--scenes", "3")
     assert done.returncode == 0, done.stderr
     frames = Dataset.open(folder).select("all")
     lights = frames.rounds[0].lights
