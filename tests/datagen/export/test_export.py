@@ -1,8 +1,6 @@
 """`datagen export`: read back with the target libraries; complete or not written at all."""
 
-import errno
 import json
-import os
 import subprocess
 import sys
 from collections.abc import Callable
@@ -253,12 +251,9 @@ def test_without_pyarrow_the_line_says_what_to_install(
 
 @pytest.mark.parametrize("kind", ["webdataset", "lerobot"])
 def test_a_full_disk_leaves_nothing(
-    dataset: Path, tmp_path: Path, refused: Refused, monkeypatch: pytest.MonkeyPatch, kind: str
+    dataset: Path, tmp_path: Path, refused: Refused, fill_disk: Callable[[], None], kind: str
 ) -> None:
-    def full(*args: object) -> None:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    monkeypatch.setattr("runtime.files.fsync_path", full)
+    fill_disk()
     line = refused("export", dataset, "--format", kind, "--out", tmp_path / "out")
     assert "the disk is full" in line
     assert not (tmp_path / "out").exists()
