@@ -21,6 +21,7 @@ import simplejpeg
 from benchmarks.claims.outcome import conclude, run_command
 from mtlnet.inference.image_decoding.decode import decode, inspect
 from mtlnet.inference.image_decoding.errors import ImageError
+from tests.serve.attacks.conftest import resident_mb
 from trackfeatures.camera import CameraParameters
 
 MAX_GROWTH = 0.01
@@ -60,12 +61,6 @@ def mutate(rng: np.random.Generator, whole: list[bytes]) -> bytes:
     return bytes(body)
 
 
-def memory_mb() -> float:
-    """What this process holds of the machine's memory."""
-    pages = int(Path("/proc/self/statm").read_text().split()[1])
-    return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
-
-
 def run_part(seed: int, part: int, count: int) -> tuple[int, int, float, list[str]]:
     """(images that gave pixels, refused, growth of memory, faults) of one part."""
     whole, accepted, refused, faults = seeds(), 0, 0, []
@@ -83,8 +78,8 @@ def run_part(seed: int, part: int, count: int) -> tuple[int, int, float, list[st
         except Exception as error:  # noqa: BLE001  # just what is looked for
             faults.append(f"part {part}, number {number}: {error!r}")
         if number == count // 10:
-            early = memory_mb()
-    return accepted, refused, memory_mb() / early - 1.0, faults
+            early = resident_mb()
+    return accepted, refused, resident_mb() / early - 1.0, faults
 
 
 def main(count: int = 1_000_000, seed: int = 0, workers: int = os.cpu_count() or 1) -> None:
