@@ -7,9 +7,7 @@ of a film of 25 or 30 (`mtlnet.calibration.film.SAMPLE_S`). Afterwards, where
 `../shared/real_roads` is: the pitch of one drive's pictures against the horizon of their labels.
 """
 
-import argparse
 import csv
-import json
 import math
 import os
 import sys
@@ -19,9 +17,12 @@ from pathlib import Path
 
 os.environ.setdefault("LP_NUM_THREADS", "0")  # before Mesa reads it: draw in this thread
 
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.claims.outcome import conclude, run_command
 from datagen.driving.scripted_driver import ScriptedDriver
 from datagen.driving.trajectory import make_course
 from mtlnet.calibration.drive import calibrate_film, calibrate_pictures
@@ -162,38 +163,34 @@ def real_pitch(folder: Path) -> dict[str, float] | None:
     }
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--films", type=int, default=10)
-    parser.add_argument("--seconds", type=float, default=60.0)
-    parser.add_argument("--keep", type=Path, help="folder for the films; those in it are used")
-    parser.add_argument("--real", type=Path, default=Path("../shared/real_roads"))
-    parser.add_argument("--json", type=Path)
-    arguments = parser.parse_args()
-    films = []
+def main(
+    films: int = 10,
+    seconds: float = 60.0,
+    keep: Path | None = None,
+    real: Path = Path("../shared/real_roads"),
+    json: Path | None = None,
+) -> None:
+    found = []
     with tempfile.TemporaryDirectory() as temporary:
-        folder = arguments.keep or Path(temporary)
+        folder = keep or Path(temporary)
         folder.mkdir(parents=True, exist_ok=True)
-        for seed in range(arguments.films):
+        for seed in range(films):
             mount, path = random_mount(seed), folder / f"mount-{seed}.mp4"
             if not path.is_file():
-                render_film(mount, path.with_suffix(".new.mp4"), arguments.seconds, seed)
+                render_film(mount, path.with_suffix(".new.mp4"), seconds, seed)
                 path.with_suffix(".new.mp4").rename(path)
-            films.append({"mount": asdict(mount), "errors": errors(mount, path)})
-            print(json.dumps(films[-1]["errors"]), file=sys.stderr, flush=True)
+            found.append({"mount": asdict(mount), "errors": errors(mount, path)})
+            print(found[-1]["errors"], file=sys.stderr, flush=True)
     worst = {
-        name: max(abs(film["errors"][name]) for film in films)
+        name: max(abs(film["errors"][name]) for film in found)
         for name in ("pitch_deg", "yaw_deg", "roll_deg", "height")
     }
-    real = real_pitch(arguments.real)
+    drive = real_pitch(real)
     reached = all(worst[name] <= most for name, most in CLAIM.items())
-    reached &= real is None or abs(real["error_deg"]) <= REAL_CLAIM_DEG
-    result = {"films": films, "worst": worst, "claim": CLAIM, "real": real, "reached": reached}
-    print(json.dumps(result, indent=1))
-    if arguments.json:
-        arguments.json.write_text(json.dumps(result, indent=1) + "\n")
-    sys.exit(0 if reached else 1)
+    reached &= drive is None or abs(drive["error_deg"]) <= REAL_CLAIM_DEG
+    result = {"films": found, "worst": worst, "claim": CLAIM, "real": drive, "reached": reached}
+    conclude(result, json, reached)
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

@@ -9,35 +9,36 @@ decides, and of processor time, which depends less on other jobs. Sixty rounds a
 fewer, start-up and the end, when a core idles, weigh more than in real use.
 """
 
-import argparse
 import contextlib
-import json
 import os
 import resource
-import subprocess
 import sys
 import tempfile
 import time
 from concurrent.futures import ProcessPoolExecutor
+from json import loads
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from benchmarks.claims.outcome import conclude, run_command
+from benchmarks.recordings.enlarged import collect
 
 CLAIM_FRAMES_PER_SECOND = 250.0
 CLAIM_RATIO = 0.75
 FRAMES_OF_WARM_UP = 20
 
 
-def collect(out: Path, rounds: int, frames: int, seed: int) -> dict[str, Any]:
-    """Run `datagen collect --json`: its result, and the processor time of all its processes."""
-    command = [sys.executable, "-m", "datagen", "collect", "--json", "--out", str(out)]
-    command += ["--rounds", str(rounds), "--frames", str(frames), "--seed", str(seed)]
-    command += ["--stretch", "1"]  # a training set: more sceneries to build than a film has
+def collect_timed(out: Path, rounds: int, frames: int, seed: int) -> dict[str, Any]:
+    """The result of `datagen collect`, and the processor time of all its processes."""
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
+    # A training set: more sceneries to build than a film has.
+    found = collect(out, rounds=rounds, frames=frames, seed=seed, stretch=1)
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     cpu_s = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-    return {**json.loads(done.stdout), "cpu_s": cpu_s}
+    return {**found, "cpu_s": cpu_s}
 
 
 def draw_round(entry: dict[str, Any]) -> tuple[int, float, float]:
@@ -60,43 +61,34 @@ def draw_round(entry: dict[str, Any]) -> tuple[int, float, float]:
         return drawn, wall_s, cpu_s
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--rounds", type=int, default=60)
-    parser.add_argument("--frames", type=int, default=2000)
-    parser.add_argument("--out", type=Path)
-    parser.add_argument("--json", type=Path)
-    arguments = parser.parse_args()
+def main(
+    rounds: int = 60, frames: int = 2000, out: Path | None = None, json: Path | None = None
+) -> None:
     cores = len(os.sched_getaffinity(0))
     with contextlib.ExitStack() as held:
-        folder = arguments.out or held.enter_context(tempfile.TemporaryDirectory())
-        collect(Path(folder) / "warm-up", cores, FRAMES_OF_WARM_UP, seed=1)
-        data = Path(folder) / "data"
-        collected = collect(data, arguments.rounds, arguments.frames, seed=2)
-        plan = json.loads((data / "plan.json").read_text())
+        folder = out or Path(held.enter_context(tempfile.TemporaryDirectory()))
+        collect_timed(folder / "warm-up", cores, FRAMES_OF_WARM_UP, seed=1)
+        collected = collect_timed(folder / "data", rounds, frames, seed=2)
+        plan = loads((folder / "data" / "plan.json").read_text())
         with ProcessPoolExecutor(cores, mp_context=get_context("spawn")) as pool:
             drawn = list(pool.map(draw_round, plan["rounds"]))
-    frames = sum(count for count, _, _ in drawn)
-    bare = cores * frames / sum(wall for _, wall, _ in drawn)
+    count = sum(part for part, _, _ in drawn)
+    bare = cores * count / sum(wall for _, wall, _ in drawn)
     speed = float(collected["frames_per_second"])
     result = {
         "cores": cores,
-        "frames": frames,
+        "frames": count,
         "collect_frames_per_second": round(speed, 1),
         "bare_frames_per_second": round(bare, 1),
         "ratio": round(speed / bare, 3),
-        "collect_cpu_ms_per_frame": round(1000.0 * collected["cpu_s"] / frames, 3),
-        "bare_cpu_ms_per_frame": round(1000.0 * sum(cpu for _, _, cpu in drawn) / frames, 3),
+        "collect_cpu_ms_per_frame": round(1000.0 * collected["cpu_s"] / count, 3),
+        "bare_cpu_ms_per_frame": round(1000.0 * sum(cpu for _, _, cpu in drawn) / count, 3),
         "cpu_ratio": round(sum(cpu for _, _, cpu in drawn) / collected["cpu_s"], 3),
         "claims": {"frames_per_second": CLAIM_FRAMES_PER_SECOND, "ratio": CLAIM_RATIO},
     }
-    result["reached"] = speed >= CLAIM_FRAMES_PER_SECOND and speed / bare >= CLAIM_RATIO
-    text = json.dumps(result, indent=1)
-    print(text)
-    if arguments.json:
-        arguments.json.write_text(text + "\n")
-    sys.exit(0 if result["reached"] else 1)
+    reached = speed >= CLAIM_FRAMES_PER_SECOND and speed / bare >= CLAIM_RATIO
+    conclude({**result, "reached": reached}, json, reached)
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

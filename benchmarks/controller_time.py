@@ -1,14 +1,13 @@
 """The time of one controller step, and of a whole step on images.
 
-Run: `python benchmarks/controller_time.py [--track town] [--steps 3000] [--json FILE]`. Each
+Run: `python benchmarks/controller_time.py [--track town] [--steps 3000] [--model RUN]
+[--json FILE]`. Each
 controller drives the track and its `update` is timed alone; then `lqr` drives on the answers of the
 service in another process, and all of a step is timed: the image, HTTP and the controller. Limits:
 MPC median 0.3 ms and p99 1 ms, LQR and RL p99 0.1 ms, a step on images p99 25 ms. Exit code 1 when
 one is missed.
 """
 
-import argparse
-import json
 import sys
 import time
 from collections.abc import Callable
@@ -19,8 +18,8 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from benchmarks.material.outcome import exit_code
-from benchmarks.material.servers import OURS, running
+from benchmarks.claims.outcome import conclude, run_command
+from benchmarks.service_load.servers import OURS, running
 from controllers.drive.closed_loop import run_lap
 from controllers.interface import Controller, LoopConfig, Observation
 from controllers.perception.sources import open_perception, truth
@@ -82,32 +81,25 @@ def on_images(world: World, model: str, steps: int) -> list[float]:
     return [float(value) for value in found[WARM_UP:]]
 
 
-def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--track", default="town")
-    parser.add_argument("--steps", type=int, default=3000)
-    parser.add_argument("--model", default=str(SHIPPED), help="a run's folder")
-    parser.add_argument("--json", type=Path, help="write the figures to this file")
-    arguments = parser.parse_args()
+def main(
+    track: str = "town", steps: int = 3000, model: str = str(SHIPPED), json: Path | None = None
+) -> None:
     times = {}
-    with World(Road(find_track(arguments.track))) as world:
+    with World(Road(find_track(track))) as world:
         for name in P99_MS:
             world.reset(seed=0, to_middle=1.0)
             controller = TimedController(make_controller(name, LoopConfig(0.05)))
-            run_lap(world, controller, truth(0.0), arguments.steps)
+            run_lap(world, controller, truth(0.0), steps)
             times[name] = controller.timed.times_ms
-        times[IMAGES] = on_images(world, arguments.model, arguments.steps)
+        times[IMAGES] = on_images(world, model, steps)
     results = {}
     for name, limit in {**P99_MS, IMAGES: IMAGES_P99_MS}.items():
         median, p99 = (float(value) for value in np.percentile(times[name], (50, 99)))
         reached = p99 <= limit and median <= MEDIAN_MS.get(name, limit)
-        results[name] = {"median_ms": median, "p99_ms": p99, "reached": reached}
-        missed = "" if reached else " MISSED"
-        print(f"{name:13} median {median:.4f} ms, p99 {p99:.4f} ms (limit {limit}){missed}")
-    if arguments.json:
-        arguments.json.write_text(json.dumps(results, indent=2) + "\n")
-    return exit_code(all(result["reached"] for result in results.values()))
+        figures = {"median_ms": median, "p99_ms": p99, "limit_ms": limit}
+        results[name] = {**figures, "reached": reached}
+    conclude(results, json, all(result["reached"] for result in results.values()))
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    run_command(main)

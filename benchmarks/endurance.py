@@ -14,8 +14,6 @@ service's memory in the last minute is at most 1 % above that in the first, and 
 minute is at most 1.2 times that of the first. The minute before the first is a warm-up.
 """
 
-import argparse
-import json
 import os
 import re
 import sys
@@ -35,8 +33,9 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from benchmarks.material.bad_clients import bad_clients
-from benchmarks.material.servers import OURS, descendants, running
+from benchmarks.claims.outcome import conclude, run_command
+from benchmarks.service_load.malicious_clients import malicious_clients
+from benchmarks.service_load.servers import OURS, descendants, running
 from mtlnet.inference.engine import load_engine
 from mtlnet.inference.image_decoding.decode import decode, inspect
 from mtlnet.inference.model_card import read_card
@@ -45,6 +44,7 @@ from serve.client import Client, ServiceError
 from serve.workers.control_socket import send_command
 from tests.serve.attacks.conftest import resident_mb
 from tests.serve.conftest import jpeg, picture, publish_untrained
+from trackfeatures.errors import UserError
 
 CLIENTS, HERTZ, WORKERS = 8, 20.0, 2
 RELOAD_S, RESTART_S = 60.0, 300.0
@@ -263,7 +263,7 @@ def measure_attacked(minutes: float, folder: Path) -> dict[str, Any]:
     logs = [ClientLog() for _ in range(CLIENTS)]
     with running(OURS, Path(sys.executable), run, WORKERS) as port:
         memory = Memory(descendants(os.getpid()))
-        with bad_clients(port):
+        with malicious_clients(port):
             begin = time.monotonic() + MINUTE_S
             end = begin + MINUTE_S * minutes
             with clients(port, images, expected, end, logs):
@@ -313,23 +313,14 @@ def counted(port: int) -> int:
     return round(sum(map(float, found)))
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--minutes", type=float, default=60.0)
-    parser.add_argument("--attacks", action="store_true", help="beside malicious clients")
-    parser.add_argument("--out", type=Path, help="write the figures here, too")
-    options = parser.parse_args()
-    if options.attacks and options.minutes < 2:
-        parser.error("the last minute is compared with the first: give --minutes 2 or more")
+def main(minutes: float = 60.0, attacks: bool = False, out: Path | None = None) -> None:
+    if attacks and minutes < 2:
+        raise UserError("the last minute is compared with the first: give --minutes 2 or more")
     with tempfile.TemporaryDirectory() as folder:
-        made = measure_attacked if options.attacks else measure
-        result = made(options.minutes, Path(folder))
-    text = json.dumps(result, indent=1)
-    print(text)
-    if options.out:
-        options.out.write_text(f"{text}\n")
-    sys.exit(0 if result["reached"] else 1)
+        made = measure_attacked if attacks else measure
+        result = made(minutes, Path(folder))
+    conclude(result, out, result["reached"])
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

@@ -3,11 +3,10 @@
 Decoded, answered and drawn, on two cores; and where the CPU's time goes, each part by itself. The
 film is noise over moving colours of 6 Mbit/s, made by the FFmpeg program.
 
-    python benchmarks/film.py [--seconds 20] [--model RUN]
+    python benchmarks/film.py [--seconds 20] [--model RUN] [--json FILE]
     claim: at least 45 pictures a second
 """
 
-import argparse
 import os
 import subprocess
 import sys
@@ -20,7 +19,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import cv2
 
-from benchmarks.material.outcome import exit_code, not_measured
+from benchmarks.claims.outcome import conclude, not_measured, run_command
 from mtlnet.inference.engine import load_engine
 from mtlnet.inference.model_card import resolve_run
 from mtlnet.inference.prediction import decode_outputs
@@ -88,32 +87,32 @@ def parts(film: Path, model: str, folder: Path) -> dict[str, float]:
     return found
 
 
-def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seconds", type=float, default=20.0)
-    parser.add_argument("--model", default="default")
-    given = parser.parse_args()
+def main(seconds: float = 20.0, model: str = "default", json: Path | None = None) -> None:
     cores = sorted(os.sched_getaffinity(0))[:CORES]
     os.sched_setaffinity(0, cores)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         film = folder / "film.mp4"
-        if not make_film(film, given.seconds):
-            return not_measured("install imageio-ffmpeg, which makes the film")
+        if not make_film(film, seconds):
+            not_measured("install imageio-ffmpeg, which makes the film")
         cv2.setNumThreads(CORES)
-        print("ms of CPU a picture: ", end="")
-        print(", ".join(f"{k} {v:.1f}" for k, v in parts(film, given.model, folder).items()))
-        engine = load_engine(resolve_run(given.model))
+        by_part = {part: round(ms, 1) for part, ms in parts(film, model, folder).items()}
+        engine = load_engine(resolve_run(model))
         begin, used = perf_counter(), process_time()
         count = len(predict_files(engine, [str(film)], [folder / "drawn.mp4"]))
-        seconds, used = perf_counter() - begin, process_time() - used
-    fps = count / seconds
-    print(
-        f"{count} pictures of 1280 x 720 on {len(cores)} cores: {1e3 * used / count:.1f} ms of CPU"
-    )
-    print(f"each, {fps:.1f} pictures a second (claim: {CLAIM_FPS:g})")
-    return exit_code(fps >= CLAIM_FPS)
+        elapsed, used = perf_counter() - begin, process_time() - used
+    fps = count / elapsed
+    figures = {
+        "pictures": count,
+        "cores": len(cores),
+        "precision": engine.precision,
+        "cpu_ms_by_part": by_part,
+        "cpu_ms_per_picture": round(1e3 * used / count, 1),
+        "pictures_per_second": round(fps, 1),
+        "claim_pictures_per_second": CLAIM_FPS,
+    }
+    conclude(figures, json, fps >= CLAIM_FPS)
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    run_command(main)

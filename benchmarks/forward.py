@@ -11,8 +11,6 @@ All compute the network's nine outputs. For a model with an uncertainty head
     claims: bf16 at most 0.40 of torch's time, int8 at most 0.20; with uncertainty 0.40 and 0.25
 """
 
-import argparse
-import json
 import os
 import sys
 from collections.abc import Callable
@@ -30,7 +28,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from benchmarks.material.servers import model
+from benchmarks.claims.outcome import conclude, run_command
+from benchmarks.service_load.servers import model_copy
 from mtlnet.export.int8 import quantise
 from mtlnet.export.openvino_graph import build_graph
 from mtlnet.inference.engine import best_precision, openvino_core, read_graph
@@ -105,20 +104,11 @@ def measure(run: Path, rounds: int) -> dict[str, Any]:
     return {"median_ms": medians, "ratios": ratios, "claims": CLAIMS, "held": held}
 
 
-def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--model", type=Path, help="a run's folder; default: untrained weights")
-    parser.add_argument("--rounds", type=int, default=200)
-    parser.add_argument("--out", type=Path, help="also write the result to this file")
-    options = parser.parse_args()
-    with model(options.model) as run:
-        result = measure(run, options.rounds)
-    text = json.dumps(result, indent=1)
-    print(text)
-    if options.out:
-        options.out.write_text(f"{text}\n")
-    return 0 if result["held"] else 1
+def main(model: Path | None = None, rounds: int = 200, out: Path | None = None) -> None:
+    with model_copy(model) as run_folder:
+        result = measure(run_folder, rounds)
+    conclude(result, out, result["held"])
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    run_command(main)

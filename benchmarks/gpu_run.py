@@ -4,7 +4,7 @@
     python benchmarks/gpu_run.py --minutes 10 --wheels wheels --tracks torcs/tracks --out gpu_run
 
 The machine needs Python 3.12, torch, EGL on the GPU and the packages that
-`benchmarks/material/gpu/packages.toml` lists; it needs no network, no OpenVINO and no PyBullet.
+`benchmarks/gpu/packages.toml` lists; it needs no network, no OpenVINO and no PyBullet.
 What is missing is printed before anything starts. The run ends within `--minutes`: each stage has a
 deadline, and the next ones run when one fails or is stopped. Results are written after each stage,
 to `gpu_run.json`, `curves*.csv` and `model/` (weights in float16 and card) in `--out`. The same
@@ -22,8 +22,8 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from benchmarks.material.gpu import machine, wheels
-from benchmarks.material.outcome import not_measured
+from benchmarks.claims.outcome import not_measured
+from benchmarks.gpu import machine, wheels
 from trackfeatures.errors import UserError
 
 RECIPES = ("continue", "fast")
@@ -45,7 +45,7 @@ def main() -> int:
     found, lacks = machine.missing_at_all(gpu=not given.rehearse)
     if lacks:
         return not_measured("\n  ".join(["this machine lacks", *lacks]))
-    from benchmarks.material.gpu.running import run_all  # it imports what the wheels brought
+    from benchmarks.gpu.running import run_all  # it imports what the wheels brought
 
     return run_all(
         work,

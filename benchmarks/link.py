@@ -1,13 +1,12 @@
 """The shared-memory link: no torn message, no hang after a kill, no leaked segment; how fast it is.
 
-Run: `python benchmarks/link.py [--messages 1000000] [--kills 200] [--steps 5000] [--json FILE]`.
+Run: `python benchmarks/link.py [--messages 1000000] [--patience 600] [--kills 200] [--steps 5000]
+[--json FILE]`; `--patience` in s for each count of messages. `--flood` and `--echo` are internal.
 Limits: of 10^6 messages in each direction, verified against a writer at full speed, none torn; with
 either side killed by SIGKILL at a random moment 200 times, the survivor knows within 2 s and no
 segment is left. As a control, a reader that ignores the sequence lock sees torn ones. Needs gcc.
 """
 
-import argparse
-import json
 import os
 import shutil
 import signal
@@ -22,9 +21,10 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from benchmarks.material.link_integrity import client_to_server, server_to_client, write_states
-from benchmarks.material.link_kills import BOUND_S, kill
-from benchmarks.material.link_processes import (
+from benchmarks.claims.outcome import conclude, not_measured, run_command
+from benchmarks.shared_memory.integrity import client_to_server, server_to_client, write_states
+from benchmarks.shared_memory.kills import BOUND_S, kill
+from benchmarks.shared_memory.processes import (
     INFO,
     START_S,
     TRACK,
@@ -34,7 +34,6 @@ from benchmarks.material.link_processes import (
     start_server,
 )
 from simulator.link.client import Link
-from simulator.link.errors import LinkError
 from simulator.link.server import LinkServer
 from simulator.track.catalogue import find_track
 from simulator.track.road import Road
@@ -131,44 +130,6 @@ def speed(hammer: str, steps: int) -> dict[str, Any]:
     return {what: figures(times) for what, times in taken.items()}
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--messages", type=int, default=1_000_000)
-    parser.add_argument("--patience", type=float, default=600.0, help="seconds a count")
-    parser.add_argument("--kills", type=int, default=200)
-    parser.add_argument("--steps", type=int, default=5000)
-    parser.add_argument("--json", type=Path)
-    parser.add_argument("--write-states", help=argparse.SUPPRESS)
-    parser.add_argument("--echo", help=argparse.SUPPRESS)
-    arguments = parser.parse_args()
-    # SIGTERM cleans up as Ctrl-C does.
-    signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
-    if arguments.write_states:
-        write_states(arguments.write_states)
-    if arguments.echo:
-        serve_echo(arguments.echo)
-        return
-    if shutil.which("gcc") is None:
-        raise SystemExit("this benchmark needs gcc: apt-get install gcc libc6-dev")
-    with tempfile.TemporaryDirectory() as folder:
-        hammer = compile_hammer(Path(folder))
-        result: dict[str, Any] = {"cores": os.cpu_count()}
-        if arguments.messages:
-            wanted = arguments.messages, arguments.patience
-            result["server_to_client"] = server_to_client(hammer, "read", *wanted)
-            result["client_to_server"] = client_to_server(hammer, *wanted)
-            result["control_without_lock"] = server_to_client(hammer, "racy", *wanted)
-        if arguments.kills:
-            result["killed"] = kill(hammer, arguments.kills)
-        if arguments.steps:
-            result["speed"] = speed(hammer, arguments.steps)
-    result["limits_kept"] = not missed(result, arguments.messages)
-    print(json.dumps(result, indent=2))
-    if arguments.json:
-        arguments.json.write_text(json.dumps(result, indent=2))
-    sys.exit(not result["limits_kept"])
-
-
 def missed(result: dict[str, Any], messages: int) -> list[str]:
     """The limits that were missed, as sentences; also printed on stderr."""
     found = []
@@ -193,8 +154,39 @@ def missed(result: dict[str, Any], messages: int) -> list[str]:
     return found
 
 
+def main(
+    messages: int = 1_000_000,
+    patience: float = 600.0,
+    kills: int = 200,
+    steps: int = 5000,
+    json: Path | None = None,
+    flood: str = "",
+    echo: str = "",
+) -> None:
+    # SIGTERM cleans up as Ctrl-C does.
+    signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
+    if flood:
+        write_states(flood)
+    if echo:
+        serve_echo(echo)
+        return
+    if shutil.which("gcc") is None:
+        not_measured("this benchmark needs gcc: apt-get install gcc libc6-dev")
+    with tempfile.TemporaryDirectory() as folder:
+        hammer = compile_hammer(Path(folder))
+        result: dict[str, Any] = {"cores": os.cpu_count()}
+        if messages:
+            wanted = messages, patience
+            result["server_to_client"] = server_to_client(hammer, "read", *wanted)
+            result["client_to_server"] = client_to_server(hammer, *wanted)
+            result["control_without_lock"] = server_to_client(hammer, "racy", *wanted)
+        if kills:
+            result["killed"] = kill(hammer, kills)
+        if steps:
+            result["speed"] = speed(hammer, steps)
+    result["limits_kept"] = not missed(result, messages)
+    conclude(result, json, result["limits_kept"])
+
+
 if __name__ == "__main__":
-    try:
-        main()
-    except LinkError as error:
-        raise SystemExit(f"error: {error}") from error
+    run_command(main)

@@ -9,8 +9,6 @@ files, and five times the `mcap` reader item by item; 60 rounds open in at most 
 two persistent workers; it uses our index (with the official reader it would be far slower).
 """
 
-import argparse
-import json
 import os
 import statistics
 import sys
@@ -19,11 +17,16 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import numpy as np
 import simplejpeg
 from numpy.typing import NDArray
 
+from benchmarks.claims.outcome import conclude, run_command
+from benchmarks.recordings.enlarged import enlarged_few
 from datagen.recording import Dataset, Frames
 
 LEAST_IMAGES_PER_SECOND = 6500.0
@@ -128,7 +131,7 @@ def opening_ms(folder: Path) -> float:
     return 1e3 * (time.perf_counter() - started) * ROUNDS / len(frames.rounds)
 
 
-def measure(folder: Path, repeats: int) -> dict[str, object]:
+def measure(folder: Path, repeats: int) -> dict[str, Any]:
     frames = Dataset.open(folder).select("all")
     order = np.random.default_rng(0).permutation(len(frames))
     ways: dict[str, Read] = {
@@ -171,28 +174,11 @@ def measure(folder: Path, repeats: int) -> dict[str, object]:
     }
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--data", type=Path, help="a dataset; by default one is made")
-    parser.add_argument("--repeats", type=int, default=5)
-    parser.add_argument("--json", type=Path)
-    arguments = parser.parse_args()
-    sys.path.insert(0, str(Path(__file__).parents[1]))
-    from benchmarks.material.rounds import collect, enlarge
-
+def main(data: Path | None = None, repeats: int = 5, json: Path | None = None) -> None:
     with tempfile.TemporaryDirectory() as home:
-        data = arguments.data
-        if data is None:
-            few = collect(Path(home) / "few", rounds=4, frames=150)
-            data = enlarge(few, Path(home) / "data", ROUNDS, frames=250)
-        result = measure(data, arguments.repeats)
-    print(json.dumps(result, indent=1))
-    if arguments.json:
-        arguments.json.write_text(json.dumps(result, indent=1) + "\n")
-    reached = result["reached"]
-    assert isinstance(reached, dict)
-    sys.exit(0 if all(reached.values()) else 1)
+        result = measure(data or enlarged_few(Path(home), ROUNDS, frames=250), repeats)
+    conclude(result, json, all(result["reached"].values()))
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

@@ -12,8 +12,6 @@ they send. With a peer's interpreter its figures on the same script stand beside
     the others' p99 at most doubles, and none of them is refused or cut
 """
 
-import argparse
-import json
 import os
 import subprocess
 import sys
@@ -26,7 +24,8 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from benchmarks.material.servers import HERE, OURS, Loader, add_options, model, pythons, running
+from benchmarks.claims.outcome import conclude, run_command
+from benchmarks.service_load.servers import HERE, OURS, Loader, Peer, model_copy, pythons, running
 from serve.config import Limits
 
 OVER, GOODPUT, REFUSED_MS, SLOWER = 5.0, 0.95, 5.0, 2.0
@@ -73,7 +72,7 @@ def beside_slow_ones(loader: Loader, port: int, seconds: float, rate: float) -> 
 def crowd(port: int) -> Iterator[None]:
     """1,000 slow connections."""
     process = subprocess.Popen(
-        [sys.executable, str(HERE / "slow.py"), str(port), str(SLOW)],
+        [sys.executable, str(HERE / "slow_clients.py"), str(port), str(SLOW)],
         preexec_fn=lambda: os.sched_setaffinity(0, CLIENTS),
     )
     try:
@@ -96,27 +95,27 @@ def judge(found: dict[str, Any]) -> dict[str, bool]:
     }
 
 
-def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__)
-    add_options(parser)
-    parser.add_argument("--seconds", type=float, default=30.0, help="of each of the five loads")
-    options = parser.parse_args()
+def main(
+    litserve: Peer = None,
+    bentoml: Peer = None,
+    mosec: Peer = None,
+    model: Path | None = None,
+    int8: bool = False,
+    seconds: float = 30.0,
+    out: Path | None = None,
+) -> None:
     result: dict[str, Any] = {}
-    with model(options.model, options.int8) as run, tempfile.TemporaryDirectory() as folder:
-        loader = Loader(Path(folder), CLIENTS)
-        for name, python in pythons(options).items():
-            with running(name, python, run, 1, SERVER) as port:
-                found = overload(loader, port, options.seconds)
+    with model_copy(model, int8) as folder, tempfile.TemporaryDirectory() as temporary:
+        loader = Loader(Path(temporary), CLIENTS)
+        for name, python in pythons(litserve, bentoml, mosec).items():
+            with running(name, python, folder, 1, SERVER) as port:
+                found = overload(loader, port, seconds)
                 rate = found["peak_per_second"] / 5
-                found |= beside_slow_ones(loader, port, options.seconds, rate)
+                found |= beside_slow_ones(loader, port, seconds, rate)
             result[name] = found
     result[OURS]["held"] = judge(result[OURS])
-    text = json.dumps(result, indent=1)
-    print(text)
-    if options.out:
-        options.out.write_text(f"{text}\n")
-    return 0 if all(result[OURS]["held"].values()) else 1
+    conclude(result, out, all(result[OURS]["held"].values()))
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    run_command(main)

@@ -1,7 +1,8 @@
 """The service against LitServe, BentoML and mosec, on one model: time of a request, throughput.
 
 Each answers the same JPEG by POST with the same JSON, from the same weights on OpenVINO in the same
-precision, an engine of one thread a worker; each as its own manual advises, `material/peer_*.py`.
+precision, an engine of one thread a worker; each as its own manual advises
+(`service_load/peer_*.py`).
 First all run at once with one worker and are asked in turns over one connection; then, one after
 another, in turns again, each with two workers by eight clients that ask as soon as they have their
 answer. A peer is an environment of its own with it, openvino, numpy and simplejpeg; one that is not
@@ -12,8 +13,6 @@ given is skipped.
     claims: see CLAIMS
 """
 
-import argparse
-import json
 import sys
 import tempfile
 from contextlib import ExitStack
@@ -24,18 +23,18 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from benchmarks.material.outcome import exit_code, not_measured
-from benchmarks.material.servers import (
+from benchmarks.claims.outcome import conclude, not_measured, run_command
+from benchmarks.service import TURN, connect, exchange
+from benchmarks.service_load.servers import (
     OURS,
     PEERS,
     Loader,
-    add_options,
-    model,
+    Peer,
+    model_copy,
     pythons,
     request,
     running,
 )
-from benchmarks.service import TURN, connect, exchange
 
 CLAIMS = {"litserve": (0.75, 1.5), "bentoml": (0.65, 1.8), "mosec": (1.0, 1.0)}
 """Our p50 at most so many times theirs, our throughput at least so many times theirs."""
@@ -85,18 +84,6 @@ def throughput(servers: dict[str, Path], run: Path, seconds: float, turns: int) 
     }
 
 
-def measure(options: argparse.Namespace) -> dict[str, Any]:
-    """All figures, and which claims hold."""
-    found = pythons(options)
-    with model(options.model, options.int8) as run:
-        times = latency(found, run, options.requests)
-        rates = throughput(found, run, options.seconds, options.turns)
-    figures = {name: {"p50_ms": median(times[name]), **rates[name]} for name in found}
-    for name in figures.keys() - {OURS}:
-        figures[name] |= compare(name, figures[OURS], figures[name])
-    return {"servers": figures, "skipped": [name for name in PEERS if name not in found]}
-
-
 def compare(name: str, ours: dict[str, Any], theirs: dict[str, Any]) -> dict[str, Any]:
     """Our figures over a peer's, and whether the claims hold."""
     p50, rate = ours["p50_ms"] / theirs["p50_ms"], ours["per_second"] / theirs["per_second"]
@@ -105,24 +92,30 @@ def compare(name: str, ours: dict[str, Any], theirs: dict[str, Any]) -> dict[str
     return {"our_ratios": [p50, rate], "claims": [slowest, fewest], "held": held}
 
 
-def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__)
-    add_options(parser)
-    parser.add_argument("--requests", type=int, default=2_000, help="to each, one after another")
-    parser.add_argument("--seconds", type=float, default=10.0, help="of a turn with many clients")
-    parser.add_argument("--turns", type=int, default=3)
-    options = parser.parse_args()
-    if list(pythons(options)) == [OURS]:
-        return not_measured("give at least one peer, e.g. --litserve PYTHON")
-    result = measure(options)
-    text = json.dumps(result, indent=1)
-    print(text)
-    if options.out:
-        options.out.write_text(f"{text}\n")
-    for name in result["skipped"]:
-        print(f"skipped {name}: give --{name} PYTHON")
-    return exit_code(all(each.get("held", True) for each in result["servers"].values()))
+def main(
+    litserve: Peer = None,
+    bentoml: Peer = None,
+    mosec: Peer = None,
+    model: Path | None = None,
+    int8: bool = False,
+    requests: int = 2_000,
+    seconds: float = 10.0,
+    turns: int = 3,
+    out: Path | None = None,
+) -> None:
+    servers = pythons(litserve, bentoml, mosec)
+    if list(servers) == [OURS]:
+        not_measured("give at least one peer, e.g. --litserve PYTHON")
+    with model_copy(model, int8) as folder:
+        times = latency(servers, folder, requests)
+        rates = throughput(servers, folder, seconds, turns)
+    figures = {name: {"p50_ms": median(times[name]), **rates[name]} for name in servers}
+    for name in figures.keys() - {OURS}:
+        figures[name] |= compare(name, figures[OURS], figures[name])
+    skipped = [name for name in PEERS if name not in servers]
+    held = all(each.get("held", True) for each in figures.values())
+    conclude({"servers": figures, "skipped": skipped}, out, held)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    run_command(main)

@@ -4,24 +4,14 @@ Run: `python benchmarks/ray_hash.py [--rounds 6] [--frames 200] [--json FILE]`. 
 hash and the bytes of every round are the same; the seconds of both are printed.
 """
 
-import argparse
-import json
-import subprocess
 import sys
 import tempfile
 from pathlib import Path
-from typing import Any
 
+sys.path.insert(0, str(Path(__file__).parents[1]))
 
-def collect(out: Path, options: list[str]) -> dict[str, Any]:
-    done = subprocess.run(
-        [sys.executable, "-m", "datagen", "collect", "--json", "--out", str(out), *options],
-        check=True,
-        stdout=subprocess.PIPE,
-        text=True,
-    )
-    result: dict[str, Any] = json.loads(done.stdout)
-    return result
+from benchmarks.claims.outcome import conclude, run_command
+from benchmarks.recordings.enlarged import collect
 
 
 def same_rounds(one: Path, other: Path) -> bool:
@@ -33,31 +23,22 @@ def same_rounds(one: Path, other: Path) -> bool:
     return first == second
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--rounds", type=int, default=6)
-    parser.add_argument("--frames", type=int, default=200)
-    parser.add_argument("--json", type=Path)
-    arguments = parser.parse_args()
-    options = ["--rounds", str(arguments.rounds), "--frames", str(arguments.frames)]
+def main(rounds: int = 6, frames: int = 200, json: Path | None = None) -> None:
     with tempfile.TemporaryDirectory() as folder:
         one, two = Path(folder) / "one-process", Path(folder) / "two-ray-workers"
-        alone = collect(one, [*options, "--workers", "1"])
-        ray = collect(two, [*options, "--workers", "2", "--executor", "ray"])
+        alone = collect(one, rounds=rounds, frames=frames, workers=1)
+        ray = collect(two, rounds=rounds, frames=frames, workers=2, executor="ray")
         bytes_equal = same_rounds(one, two)
+    reached = bytes_equal and alone["content_hash"] == ray["content_hash"]
     result = {
         "rounds": alone["rounds"],
         "one_process_s": alone["seconds"],
         "two_ray_workers_s": ray["seconds"],
         "content_hash": alone["content_hash"],
-        "reached": bytes_equal and alone["content_hash"] == ray["content_hash"],
+        "reached": reached,
     }
-    text = json.dumps(result, indent=1)
-    print(text)
-    if arguments.json:
-        arguments.json.write_text(text + "\n")
-    sys.exit(0 if result["reached"] else 1)
+    conclude(result, json, reached)
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

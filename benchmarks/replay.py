@@ -7,9 +7,7 @@ features and info (a) in a process, (b) in another one that runs them in the opp
 (c) in parallel in Gymnasium's `AsyncVectorEnv`. A SHA-256 over all steps is compared.
 """
 
-import argparse
 import hashlib
-import json
 import os
 import struct
 import sys
@@ -23,11 +21,14 @@ from typing import Any
 
 os.environ.setdefault("LP_NUM_THREADS", "1")
 
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
 import gymnasium as gym
 import numpy as np
 from gymnasium.vector import AsyncVectorEnv
 
 import simulator.env  # noqa: F401  (registers the names)
+from benchmarks.claims.outcome import conclude, run_command
 from simulator.camera.scene.light import KINDS
 from simulator.track.catalogue import OWN_TRACKS
 
@@ -177,37 +178,31 @@ def run_beside(episodes: list[Episode]) -> dict[int, str]:
     return digests
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--episodes", type=int, default=100)
-    parser.add_argument("--json", type=Path, help="write the result to this file as well")
-    arguments = parser.parse_args()
-    episodes, started = plan(arguments.episodes), time.perf_counter()
+def main(episodes: int = 100, json: Path | None = None) -> None:
+    planned, started = plan(episodes), time.perf_counter()
     # Vectors first: they fork, and this process has no picture's context yet.
-    beside = run_beside(episodes)
+    beside = run_beside(planned)
     with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
-        forwards = pool.submit(run_alone, episodes)
-        backwards = pool.submit(run_alone, episodes[::-1])
+        forwards = pool.submit(run_alone, planned)
+        backwards = pool.submit(run_alone, planned[::-1])
         alone, again = forwards.result(), backwards.result()
     different = {
         "another_process": [n for n in alone if alone[n] != again[n]],
         "async_vector": [n for n in alone if alone[n] != beside[n]],
     }
+    reached = len(set(alone.values())) == len(planned) and not any(different.values())
     result = {
-        "episodes": len(episodes),
-        "with_pictures": sum(episode.kind.startswith("pictures") for episode in episodes),
+        "episodes": len(planned),
+        "with_pictures": sum(episode.kind.startswith("pictures") for episode in planned),
         "distinct": len(set(alone.values())),
         "ended_early": sum(int(told.split()[0]) < STEPS for told in alone.values()),
         "steps": sum(int(told.split()[0]) for told in alone.values()),
         "seconds": round(time.perf_counter() - started, 1),
         "different": different,
-        "reached": len(set(alone.values())) == len(episodes) and not any(different.values()),
+        "reached": reached,
     }
-    print(json.dumps(result))
-    if arguments.json is not None:
-        arguments.json.write_text(json.dumps(result, indent=1) + "\n")
-    sys.exit(0 if result["reached"] else 1)
+    conclude(result, json, reached)
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

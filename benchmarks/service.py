@@ -9,9 +9,7 @@ time that each takes a request is disturbed least.
     python benchmarks/service.py [--quick] [--out FILE]     claim: overhead at most 0.75
 """
 
-import argparse
 import json
-import os
 import socket
 import subprocess
 import sys
@@ -23,7 +21,8 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from benchmarks.material.outcome import REACHED, exit_code
+from benchmarks.claims.outcome import conclude, run_command
+from benchmarks.service_load.servers import processor_s
 from tests.serve.conftest import FakeEngine, jpeg, outputs, picture
 
 CLAIM = 0.75
@@ -145,12 +144,6 @@ class Asker:
         return total_ms, timing["decode"] + timing["forward"]
 
 
-def cpu_ms(pid: int) -> float:
-    """Processor time of a process so far, ms. (Linux: fields 14 and 15 of its stat.)"""
-    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    return 1e3 * (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
-
-
 def measure(requests: int) -> dict[str, Any]:
     """The figures of both, and their ratio."""
     body = jpeg(picture())
@@ -158,7 +151,8 @@ def measure(requests: int) -> dict[str, Any]:
     processes, askers = [], {}
     for name in found:
         listener = socket.create_server(("127.0.0.1", 0))
-        command = [sys.executable, __file__, "--serve", name, str(listener.fileno())]
+        command = [sys.executable, __file__, "--which", name]
+        command += ["--descriptor", str(listener.fileno())]
         processes.append(subprocess.Popen(command, pass_fds=(listener.fileno(),)))
         askers[name] = Asker(listener.getsockname(), body)  # answered once the server is up
         listener.close()
@@ -166,14 +160,17 @@ def measure(requests: int) -> dict[str, Any]:
         for asker in askers.values():
             for _ in range(TURN):
                 asker.ask()
-        before = [cpu_ms(process.pid) for process in processes]
+        before = [processor_s([process.pid]) for process in processes]
         for _ in range(requests // TURN):
             for name, asked in found.items():
                 for _ in range(TURN):
                     total, work = askers[name].ask()
                     asked.total.append(total)
                     asked.work.append(work)
-        spent = [cpu_ms(p.pid) - b for p, b in zip(processes, before, strict=True)]
+        spent = [
+            1e3 * (processor_s([process.pid]) - start)
+            for process, start in zip(processes, before, strict=True)
+        ]
     finally:
         for process in processes:
             process.kill()
@@ -186,24 +183,15 @@ def measure(requests: int) -> dict[str, Any]:
     return {**figures, "requests": requests, "overhead_ratio": ratio, "claim": CLAIM}
 
 
-def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true", help="a tenth of the requests")
-    parser.add_argument("--out", type=Path, help="write the figures here, too")
-    parser.add_argument("--serve", nargs=2, help=argparse.SUPPRESS)
-    options = parser.parse_args()
-    if options.serve:
-        serve(options.serve[0], int(options.serve[1]))
-        return REACHED
-    result = measure(1_000 if options.quick else 10_000)
-    text = json.dumps(result, indent=1)
-    print(text)
-    if options.out:
-        options.out.write_text(f"{text}\n")
-    held = result["overhead_ratio"] <= CLAIM
-    print(f"overhead {result['overhead_ratio']:.2f} of plain FastAPI's, claim {CLAIM}: {held}")
-    return exit_code(held)
+def main(
+    quick: bool = False, out: Path | None = None, which: str = "", descriptor: int = 0
+) -> None:
+    if which:
+        serve(which, descriptor)
+        return
+    result = measure(1_000 if quick else 10_000)
+    conclude(result, out, result["overhead_ratio"] <= CLAIM)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    run_command(main)

@@ -14,9 +14,7 @@ Without an address a service is started, whose token is made for it; the token o
 is read from $DRIVERVIEW_TOKEN, its `--pid` is that of the command `serve`.
 """
 
-import argparse
 import http.client
-import json
 import multiprocessing
 import os
 import secrets
@@ -27,6 +25,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
+from json import dumps
 from multiprocessing.synchronize import Event
 from pathlib import Path
 from statistics import quantiles
@@ -34,14 +33,15 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from benchmarks.material.bad_clients import ADDRESS
-from benchmarks.material.outcome import exit_code
-from benchmarks.material.servers import descendants
+from benchmarks.claims.outcome import exit_code, run_command
+from benchmarks.service_load.malicious_clients import ADDRESS
+from benchmarks.service_load.servers import descendants
 from runtime.sockets import bind
 from serve.config import TOKEN_VARIABLE, is_loopback
 from tests.serve.attacks.attacks import JPEG, Attack
 from tests.serve.attacks.conftest import Target, resident_mb
 from tests.serve.attacks.registry import ATTACKS
+from trackfeatures.errors import UserError
 
 ANSWERED, SLOWER = 0.99, 3.0
 BODIES_MB, GROWTH_MB, LEFT_MB = 67.2, 60.0, 10.0
@@ -176,24 +176,34 @@ def log_lines(said: Any) -> int:
     return int(said.read().count(b"\n"))
 
 
-def chosen(names: str | None) -> list[Attack]:
+@dataclass(frozen=True)
+class Asked:
+    """Seconds for each attack, and at most after it; the attacks; whether stdout is for JSON."""
+
+    seconds: float
+    settle_s: float
+    attacks: list[Attack]
+    as_json: bool
+
+
+def chosen(names: str) -> list[Attack]:
     """The attacks with these names, or all."""
     wanted = set(names.split(",")) if names else {attack.__name__ for attack in ATTACKS}
     unknown = wanted - {attack.__name__ for attack in ATTACKS}
     if unknown:
-        sys.exit(f"error: there is no attack {', '.join(sorted(unknown))}")
+        raise UserError(f"there is no attack {', '.join(sorted(unknown))}")
     return [attack for attack in ATTACKS if attack.__name__ in wanted]
 
 
-def compare(target: Target, pid: int, options: argparse.Namespace) -> list[dict[str, Any]]:
+def compare(target: Target, pid: int, asked: Asked) -> list[dict[str, Any]]:
     """The rows of the report: a quiet service, then each attack."""
     measure(target, pid, 5.0, None)  # its caches and pools are filled
-    quiet = measure(target, pid, max(QUIET_S, options.seconds), None)
+    quiet = measure(target, pid, max(QUIET_S, asked.seconds), None)
     rows: list[dict[str, Any]] = [{"attack": "none", **asdict(quiet)}]
-    report(rows[0], options.json)
-    for attack in chosen(options.only):
-        under = measure(target, pid, options.seconds, attack)
-        settled_s = settle(pid, quiet.most_mb + LEFT_MB, options.settle)
+    report(rows[0], asked.as_json)
+    for attack in asked.attacks:
+        under = measure(target, pid, asked.seconds, attack)
+        settled_s = settle(pid, quiet.most_mb + LEFT_MB, asked.settle_s)
         row = {"attack": attack.__name__, **asdict(under), "settled_s": settled_s}
         row["slower"] = under.p99_ms / quiet.p99_ms
         row["growth_mb"] = under.most_mb - quiet.most_mb
@@ -205,7 +215,7 @@ def compare(target: Target, pid: int, options: argparse.Namespace) -> list[dict[
             and row["left_mb"] <= LEFT_MB
         )
         rows.append(row)
-        report(row, options.json)
+        report(row, asked.as_json)
     return rows
 
 
@@ -232,35 +242,34 @@ def report(row: dict[str, Any], as_json: bool) -> None:
     print(line, flush=True, file=sys.stderr if as_json else sys.stdout)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--address", help="HOST:PORT of a service of one's own on this machine")
-    parser.add_argument("--pid", type=int, help="its process id")
-    parser.add_argument("--seconds", type=float, default=60.0, help="for each attack")
-    parser.add_argument("--settle", type=float, default=60.0, help="at most, after each attack")
-    parser.add_argument("--only", help="names of attacks, with commas between them")
-    parser.add_argument("--model", default="default")
-    parser.add_argument("--json", action="store_true", help="print the rows as JSON on stdout")
-    parser.add_argument("--out", type=Path, help="write them as JSON to this file, too")
-    options = parser.parse_args()
-    if options.address is None:
-        with own_service(options.model) as (target, pid):
-            rows = compare(target, pid, options)
+def main(
+    address: str = "",
+    pid: int = 0,
+    seconds: float = 60.0,
+    settle: float = 60.0,
+    only: str = "",
+    model: str = "default",
+    json: bool = False,
+    out: Path | None = None,
+) -> None:
+    asked = Asked(seconds, settle, chosen(only), json)
+    if not address:
+        with own_service(model) as (target, process):
+            rows = compare(target, process, asked)
     else:
-        host, _, port = options.address.rpartition(":")
-        if not is_loopback(host) or options.pid is None:
-            sys.exit("error: give a loopback address, and the --pid of the service there")
-        target = Target(int(port), os.environ.get(TOKEN_VARIABLE))
-        rows = compare(target, options.pid, options)
-    text = json.dumps(rows, indent=1)
-    if options.json:
+        host, _, port = address.rpartition(":")
+        if not is_loopback(host) or not pid:
+            raise UserError("give a loopback address, and the --pid of the service there")
+        rows = compare(Target(int(port), os.environ.get(TOKEN_VARIABLE)), pid, asked)
+    text = dumps(rows, indent=1)
+    if json:
         print(text)
-    if options.out is not None:
-        options.out.write_text(text + "\n", encoding="utf-8")
+    if out is not None:
+        out.write_text(text + "\n", encoding="utf-8")
     missed = [row["attack"] for row in rows if not row.get("ok", True)]
     print(f"{len(rows) - 1} attacks, missed: {', '.join(missed) or 'none'}", file=sys.stderr)
     sys.exit(exit_code(not missed))
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

@@ -7,18 +7,21 @@ whose seed and number make it again. Memory is read after a tenth of the images 
     python benchmarks/service_fuzz.py [--count 1000000] [--seed 0] [--workers N]
 """
 
-import argparse
 import os
 import sys
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
 import cv2
 import numpy as np
 import simplejpeg
 
+from benchmarks.claims.outcome import conclude, run_command
 from mtlnet.inference.image_decoding.decode import decode, inspect
 from mtlnet.inference.image_decoding.errors import ImageError
+from tests.serve.attacks.conftest import resident_mb
 from trackfeatures.camera import CameraParameters
 
 MAX_GROWTH = 0.01
@@ -58,13 +61,7 @@ def mutate(rng: np.random.Generator, whole: list[bytes]) -> bytes:
     return bytes(body)
 
 
-def memory_mb() -> float:
-    """What this process holds of the machine's memory."""
-    pages = int(Path("/proc/self/statm").read_text().split()[1])
-    return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
-
-
-def run(seed: int, part: int, count: int) -> tuple[int, int, float, list[str]]:
+def run_part(seed: int, part: int, count: int) -> tuple[int, int, float, list[str]]:
     """(images that gave pixels, refused, growth of memory, faults) of one part."""
     whole, accepted, refused, faults = seeds(), 0, 0, []
     early = 0.0
@@ -81,30 +78,27 @@ def run(seed: int, part: int, count: int) -> tuple[int, int, float, list[str]]:
         except Exception as error:  # noqa: BLE001  # just what is looked for
             faults.append(f"part {part}, number {number}: {error!r}")
         if number == count // 10:
-            early = memory_mb()
-    return accepted, refused, memory_mb() / early - 1.0, faults
+            early = resident_mb()
+    return accepted, refused, resident_mb() / early - 1.0, faults
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--count", type=int, default=1_000_000)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
-    options = parser.parse_args()
-    share = options.count // options.workers
-    with ProcessPoolExecutor(options.workers) as pool:  # a crash breaks the pool, and is told
-        parts = range(options.workers)
+def main(count: int = 1_000_000, seed: int = 0, workers: int = os.cpu_count() or 1) -> None:
+    share = count // workers
+    with ProcessPoolExecutor(workers) as pool:  # a crash breaks the pool, and is told
         results = list(
-            pool.map(run, [options.seed] * len(parts), parts, [share] * len(parts), chunksize=1)
+            pool.map(run_part, [seed] * workers, range(workers), [share] * workers, chunksize=1)
         )
-    accepted, refused = sum(r[0] for r in results), sum(r[1] for r in results)
     growth = max(result[2] for result in results)
     faults = [fault for result in results for fault in result[3]]
-    print(f"{accepted} gave pixels, {refused} were refused, {len(faults)} faults")
-    print(f"memory grew by {100 * growth:.2f} %, claim: under {100 * MAX_GROWTH:g} %")
-    print("\n".join(faults[:20]))
-    sys.exit(bool(faults) or growth >= MAX_GROWTH)
+    figures = {
+        "gave_pixels": sum(result[0] for result in results),
+        "refused": sum(result[1] for result in results),
+        "faults": faults[:20],
+        "memory_growth": round(growth, 4),
+        "claim_growth_below": MAX_GROWTH,
+    }
+    conclude(figures, None, not faults and growth < MAX_GROWTH)
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

@@ -7,22 +7,20 @@ first start of all is not counted: it reads the programs from the disk. Without 
 untrained network.
 """
 
-import argparse
 import http.client
-import json
 import os
 import subprocess
 import sys
-import tempfile
 import time
 from pathlib import Path
 from statistics import median
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
+from benchmarks.claims.outcome import conclude, run_command
+from benchmarks.service_load.servers import ROOT, model_copy
 from runtime.sockets import bind
 
-ROOT = Path(__file__).parents[1]
 CLAIM_S = 1.0
 GIVE_UP_S = 120.0
 
@@ -56,31 +54,17 @@ def start_s(model: Path) -> float:
             process.terminate()
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--model", type=Path, help="the folder of a run")
-    parser.add_argument("--starts", type=int, default=5)
-    parser.add_argument("--json", type=Path, help="write the result to this file as well")
-    options = parser.parse_args()
-    with tempfile.TemporaryDirectory() as folder:
-        model = options.model
-        if model is None:
-            from tests.serve.conftest import publish_untrained
-
-            model = Path(folder) / "run"
-            publish_untrained(model, seed=3)
-        times = [start_s(model) for _ in range(options.starts + 1)][1:]
+def main(model: Path | None = None, starts: int = 5, json: Path | None = None) -> None:
+    with model_copy(model, int8=True) as folder:
+        times = [start_s(folder) for _ in range(starts + 1)][1:]
     result = {
         "start_s": [round(found, 3) for found in times],
         "median_s": round(median(times), 3),
         "claim_below_s": CLAIM_S,
         "reached": median(times) < CLAIM_S,
     }
-    print(json.dumps(result))
-    if options.json is not None:
-        options.json.write_text(json.dumps(result, indent=1) + "\n")
-    sys.exit(0 if result["reached"] else 1)
+    conclude(result, json, median(times) < CLAIM_S)
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

@@ -1,14 +1,13 @@
 """A million mutated byte streams through the service's HTTP and WebSocket connections, in process.
 
-Each begins as a request, a handshake or both, from a grammar (`material.stream_grammar`) or from
-the attacks of the tests; WebSocket frames follow where the handshake was accepted. It arrives in
-parts, on a transport that behaves as uvloop's. Nothing may be raised, hang, be answered with 500,
-be logged as an error, or be left behind; seed, part and number make a stream again.
+Each begins as a request, a handshake or both, from a grammar (`service_load/stream_grammar.py`) or
+from the attacks of the tests; WebSocket frames follow where the handshake was accepted. It arrives
+in parts, on a transport that behaves as uvloop's. Nothing may be raised, hang, be answered with
+500, be logged as an error, or be left behind; seed, part and number make a stream again.
 
     python benchmarks/service_stream_fuzz.py [--count 1000000] [--seed 0] [--workers N]
 """
 
-import argparse
 import asyncio
 import logging
 import os
@@ -25,7 +24,8 @@ from uvicorn.server import ServerState
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from benchmarks.material import stream_grammar
+from benchmarks.claims.outcome import conclude, run_command
+from benchmarks.service_load import stream_grammar
 from serve.app import Service
 from serve.config import Limits
 from serve.server.fast_path import DirectProtocol
@@ -199,32 +199,28 @@ async def run_part(seed: int, part: int, count: int) -> tuple[float, list[str]]:
     return resident_mb() / early_mb - 1.0, faults
 
 
-def run(seed: int, part: int, count: int) -> tuple[float, list[str]]:
+def run_in_loop(seed: int, part: int, count: int) -> tuple[float, list[str]]:
     """`run_part` in an event loop of its own."""
     logging.getLogger("serve").setLevel(logging.ERROR)
     return asyncio.run(run_part(seed, part, count))
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--count", type=int, default=1_000_000)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
-    options = parser.parse_args()
-    share = options.count // options.workers
-    parts = range(options.workers)
+def main(count: int = 1_000_000, seed: int = 0, workers: int = os.cpu_count() or 1) -> None:
+    share, parts = count // workers, range(workers)
     begin = time.monotonic()
-    with ProcessPoolExecutor(options.workers) as pool:  # a crash breaks the pool, and is told
-        found = list(pool.map(run, [options.seed] * len(parts), parts, [share] * len(parts)))
+    with ProcessPoolExecutor(workers) as pool:  # a crash breaks the pool, and is told
+        found = list(pool.map(run_in_loop, [seed] * workers, parts, [share] * workers))
     growth, faults = max(part[0] for part in found), [f for part in found for f in part[1]]
-    count, seconds = share * len(parts), time.monotonic() - begin
-    print(
-        f"{count} streams in {seconds:.0f} s, {count / seconds:.0f} a second; {len(faults)} faults"
-    )
-    print(f"memory grew by {100 * growth:.2f} %, claim: under {100 * MAX_GROWTH:g} %")
-    print("\n".join(faults[:20]))
-    sys.exit(bool(faults) or growth >= MAX_GROWTH)
+    seconds = time.monotonic() - begin
+    figures = {
+        "streams": share * workers,
+        "streams_per_second": round(share * workers / seconds),
+        "faults": faults[:20],
+        "memory_growth": round(growth, 4),
+        "claim_growth_below": MAX_GROWTH,
+    }
+    conclude(figures, None, not faults and growth < MAX_GROWTH)
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

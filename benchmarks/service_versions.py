@@ -12,8 +12,6 @@ CHECKOUT is a clone of this repository at another commit; it runs in this enviro
 seed. A model that is given must be in a format that both read.
 """
 
-import argparse
-import json
 import os
 import subprocess
 import sys
@@ -26,12 +24,19 @@ from statistics import median
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from benchmarks.material.outcome import exit_code, not_measured
-from benchmarks.material.servers import OURS, ROOT, Loader, descendants, model, running
+from benchmarks.claims.outcome import conclude, not_measured, run_command
+from benchmarks.service_load.servers import (
+    OURS,
+    ROOT,
+    Loader,
+    descendants,
+    model_copy,
+    processor_s,
+    running,
+)
 
 CLAIM = 1.03
 CONNECTIONS = 8
-TICKS = os.sysconf("SC_CLK_TCK")
 PUBLISH = """
 import pathlib, sys
 from tests.serve.conftest import publish_untrained
@@ -39,20 +44,11 @@ publish_untrained(pathlib.Path(sys.argv[1]), seed=3)
 """
 
 
-def processor_s(pids: list[int]) -> float:
-    """Processor time of some processes so far, s."""
-    total = 0
-    for pid in pids:
-        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-        total += int(fields[11]) + int(fields[12])
-    return total / TICKS
-
-
 @contextmanager
 def models(run: Path | None, trees: Mapping[str, Path]) -> Iterator[dict[str, Path]]:
     """The model that each source tree serves: `run`, or None: untrained weights in its format."""
     if run is not None:
-        with model(run) as copy:
+        with model_copy(run) as copy:
             yield dict.fromkeys(trees, copy)
         return
     with tempfile.TemporaryDirectory() as folder:
@@ -83,36 +79,34 @@ def measure(root: Path, run: Path, loader: Loader, seconds: float) -> dict[str, 
     }
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--before", type=Path, help="the other checkout")
-    parser.add_argument("--model", type=Path, help="a run's folder; without it untrained weights")
-    parser.add_argument("--pairs", type=int, default=9)
-    parser.add_argument("--seconds", type=float, default=8.0, help="of each load")
-    parser.add_argument("--out", type=Path, help="write the figures here, too")
-    options = parser.parse_args()
-    if options.before is None:
-        sys.exit(not_measured("give --before, a clone at another commit"))
-    trees = {"before": options.before.resolve(), "after": ROOT}
-    pairs = []
-    with tempfile.TemporaryDirectory() as folder, models(options.model, trees) as runs:
+def main(
+    before: Path | None = None,
+    model: Path | None = None,
+    pairs: int = 9,
+    seconds: float = 8.0,
+    out: Path | None = None,
+) -> None:
+    if before is None:
+        not_measured("give --before, a clone at another commit")
+    trees = {"before": before.resolve(), "after": ROOT}
+    measured = []
+    with tempfile.TemporaryDirectory() as folder, models(model, trees) as runs:
         loader = Loader(Path(folder))
-        for number in range(options.pairs):
+        for number in range(pairs):
             order = list(trees) if number % 2 else list(trees)[::-1]
-            found = {n: measure(trees[n], runs[n], loader, options.seconds) for n in order}
-            pairs.append(found)
-            print(json.dumps(found), file=sys.stderr, flush=True)
+            found = {n: measure(trees[n], runs[n], loader, seconds) for n in order}
+            measured.append(found)
+            print(found, file=sys.stderr, flush=True)
     result = {}
-    for name in pairs[0]["after"]:
+    for name in measured[0]["after"]:
+        ratios = [pair["after"][name] / pair["before"][name] for pair in measured]
         result[name] = {
-            **{side: round(median(pair[side][name] for pair in pairs), 3) for side in trees},
-            "ratio": round(median(pair["after"][name] / pair["before"][name] for pair in pairs), 3),
+            **{side: round(median(pair[side][name] for pair in measured), 3) for side in trees},
+            "ratio": round(median(ratios), 3),
         }
-    print(json.dumps(result, indent=1))
-    if options.out is not None:
-        options.out.write_text(json.dumps({"medians": result, "pairs": pairs}, indent=1) + "\n")
-    sys.exit(exit_code(all(figures["ratio"] <= CLAIM for figures in result.values())))
+    held = all(figures["ratio"] <= CLAIM for figures in result.values())
+    conclude({"medians": result, "pairs": measured}, out, held)
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

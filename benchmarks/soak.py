@@ -6,8 +6,6 @@ than 1 %. Environments are made, driven, reset and closed over and over: all of 
 tracks, one to three lanes, 0 to 12 cars, and stretches of pictures, each with a camera of its own.
 """
 
-import argparse
-import json
 import os
 import statistics
 import sys
@@ -18,10 +16,13 @@ from typing import Any
 
 os.environ.setdefault("LP_NUM_THREADS", "1")
 
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
 import gymnasium as gym
 import numpy as np
 
 import simulator.env  # noqa: F401  (registers the names)
+from benchmarks.claims.outcome import conclude, run_command
 from simulator.camera import KINDS
 from simulator.track.catalogue import OWN_TRACKS
 
@@ -69,7 +70,7 @@ def drive(number: int, tracks: list[str], steps: int) -> int:
     }
     name, sensors = "driverview/LateralControl-v0", ("range", "range_traffic", "v_x")
     env = gym.make(name, **options, sensors=sensors, noise=True, sensor_noise={"v_x": 0.1})
-    resets = run(env, number, steps, RESET_EVERY)
+    resets = steps_with_resets(env, number, steps, RESET_EVERY)
     env.close()
     if number % 2 == 0:
         light = KINDS[number // 2 % len(KINDS)]
@@ -77,13 +78,13 @@ def drive(number: int, tracks: list[str], steps: int) -> int:
         seen = gym.make(
             "driverview/DriverView-v0", **options, light=light, light_seed=number, views=views
         )
-        run(seen, number, PICTURE_STEPS, RESET_EVERY)
+        steps_with_resets(seen, number, PICTURE_STEPS, RESET_EVERY)
         if number % 4 == 0:
             seen.close()  # the others are dropped, as users do
     return resets
 
 
-def run(env: gym.Env[Any, Any], seed: int, steps: int, reset_every: int) -> int:
+def steps_with_resets(env: gym.Env[Any, Any], seed: int, steps: int, reset_every: int) -> int:
     """Drive `steps` steps; how many resets they took."""
     resets, since = 1, 0
     _, info = env.reset(seed=seed)
@@ -118,19 +119,16 @@ def sample(hours: float) -> Sample:
     return Sample(hours, resident_mib(), len(list(Path("/proc/self/fd").iterdir())))
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--hours", type=float, default=8.0, help="simulated")
-    parser.add_argument("--json", type=Path, help="write the result to this file as well")
-    arguments = parser.parse_args()
+def main(hours: float = 8.0, json: Path | None = None) -> None:
     started = time.perf_counter()
-    samples, resets = soak(arguments.hours)
+    samples, resets = soak(hours)
     last = samples[-1]
     before, after = (
         statistics.median(each.resident_mib for each in part)
         for part in (samples[:COMPARED], samples[-COMPARED:])
     )
     growth = after / before - 1.0
+    reached = growth < CLAIM_GROWTH and last.descriptors <= samples[0].descriptors
     result = {
         "simulated_hours": last.hours,
         "control_steps": round(last.hours * 3600 * FREQUENCY_HZ),
@@ -143,13 +141,10 @@ def main() -> None:
         "descriptors": [samples[0].descriptors, last.descriptors],
         "growth": round(growth, 5),
         "claim_growth_below": CLAIM_GROWTH,
-        "reached": growth < CLAIM_GROWTH and last.descriptors <= samples[0].descriptors,
+        "reached": reached,
     }
-    print(json.dumps(result))
-    if arguments.json is not None:
-        arguments.json.write_text(json.dumps(result, indent=1) + "\n")
-    sys.exit(0 if result["reached"] else 1)
+    conclude(result, json, reached)
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

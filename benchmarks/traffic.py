@@ -5,8 +5,6 @@ two cars ever overlap, whether the ego car drives or is parked in the rightmost 
 three lanes cars change lanes. Exits 1 otherwise.
 """
 
-import argparse
-import json
 import sys
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict
@@ -16,6 +14,7 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parents[1]))  # to import from tests
 
+from benchmarks.claims.outcome import conclude, run_command
 from simulator.track.catalogue import find_track, track_files
 from simulator.track.road import Road
 from tests.simulator.traffic_audit import TrafficViolation, audit_traffic
@@ -31,28 +30,20 @@ def one(case: tuple[str, int, bool], seconds: float) -> dict[str, Any]:
         return about | {"violation": str(wrong)}
 
 
-def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--minutes", type=float, default=10.0)
-    parser.add_argument("--tracks", help="names, comma-separated; all that are found without it")
-    parser.add_argument("--json", type=Path, help="write the figures to this file")
-    arguments = parser.parse_args()
-    names = arguments.tracks.split(",") if arguments.tracks else list(track_files())
+def main(minutes: float = 10.0, tracks: str = "", json: Path | None = None) -> None:
+    names = tracks.split(",") if tracks else list(track_files())
     cases = list(product(names, (1, 2, 3), (False, True)))
     with ProcessPoolExecutor() as pool:
-        results = list(pool.map(one, cases, [60.0 * arguments.minutes] * len(cases)))
-    for result in results:
-        print(json.dumps(result))
-    wrong = [result for result in results if "violation" in result]
+        results = list(pool.map(one, cases, [60.0 * minutes] * len(cases)))
     changes = {
         lanes: sum(r.get("lane_changes", 0) for r in results if r["lanes"] == lanes)
         for lanes in (1, 2, 3)
     }
+    wrong = [result for result in results if "violation" in result]
     print(f"{len(results)} roads, {len(wrong)} in violation; lane changes by lanes: {changes}")
-    if arguments.json:
-        arguments.json.write_text(json.dumps(results, indent=2) + "\n")
-    return 0 if not wrong and changes[1] == 0 and changes[2] > 0 and changes[3] > 0 else 1
+    reached = not wrong and changes[1] == 0 and changes[2] > 0 and changes[3] > 0
+    conclude(results, json, reached)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    run_command(main)

@@ -9,8 +9,6 @@ DataLoader with two workers that decodes and mirrors. Steps are sampled from the
 whole run, in which layers are frozen one after another; `all` gives the ratios while none is.
 """
 
-import argparse
-import json
 import os
 import statistics
 import sys
@@ -21,6 +19,8 @@ from itertools import cycle
 from pathlib import Path
 from typing import Any
 
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
 import cv2
 import numpy as np
 import simplejpeg
@@ -28,6 +28,8 @@ import torch
 from torch import Tensor
 
 import trackfeatures as tf
+from benchmarks.claims.outcome import conclude, run_command
+from benchmarks.recordings.enlarged import collect_few
 from datagen.recording import Dataset, Frames
 from mtlnet.data.loader import Loader
 from mtlnet.model.network import Network, initialise
@@ -165,25 +167,14 @@ def judge(frames: Frames, rounds: int, steps: int) -> dict[str, Any]:
     }
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--data", type=Path, help="a dataset; else one is collected")
-    parser.add_argument("--quick", action="store_true", help="3 turns of 4 steps, not 7 of 8")
-    parser.add_argument("--json", type=Path)
-    arguments = parser.parse_args()
-    sys.path.insert(0, str(Path(__file__).parents[1]))
-    from benchmarks.material.rounds import collect
-
+def main(data: Path | None = None, quick: bool = False, json: Path | None = None) -> None:
     keep_freed_memory()
     with tempfile.TemporaryDirectory() as home:
-        data = arguments.data or collect(Path(home) / "few", rounds=4, frames=300)
+        data = data or collect_few(Path(home) / "few", rounds=4, frames=300)
         frames = Dataset.open(data).select("train")
-        result = judge(frames, *((3, 4) if arguments.quick else (7, 8)))
-    print(json.dumps(result, indent=1))
-    if arguments.json:
-        arguments.json.write_text(json.dumps(result, indent=1) + "\n")
-    sys.exit(0 if all(result["reached"].values()) else 1)
+        result = judge(frames, *((3, 4) if quick else (7, 8)))  # turns, steps of each
+    conclude(result, json, all(result["reached"].values()))
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

@@ -5,9 +5,7 @@ frames on two cores. Without `--data`, 60 rounds of 2,000 frames are made from a
 Exit code: 0 reached, 1 missed, 3 not measured (the dataset has fewer frames than the claim).
 """
 
-import argparse
 import hashlib
-import json
 import os
 import statistics
 import sys
@@ -16,6 +14,13 @@ import time
 import zlib
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from benchmarks.claims.outcome import conclude, run_command
+from benchmarks.recordings.enlarged import enlarged_few
+from datagen.recording.integrity.verify import verify
 
 LIMIT_S = 15.0
 LIMIT_FRAMES = 120_000
@@ -34,9 +39,7 @@ def hash_files(folder: Path) -> None:
         list(pool.map(one, sorted((folder / "rounds").glob("*.mcap"))))
 
 
-def measure(folder: Path) -> dict[str, object]:
-    from datagen.recording.integrity.verify import verify
-
+def measure(folder: Path) -> dict[str, Any]:
     verify_s: dict[str, list[float]] = {"quick": [], "full": []}
     hash_s: list[float] = []
     cpu_s: list[float] = []
@@ -67,34 +70,18 @@ def measure(folder: Path) -> dict[str, object]:
         "gigabytes_per_second": round(size / 1e9 / full, 2),
         "cores": len(os.sched_getaffinity(0)),
         "limit_s": LIMIT_S,
-        "reached": full <= LIMIT_S if frames >= LIMIT_FRAMES else None,
+        "limit_is_of_frames": LIMIT_FRAMES,
     }
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--data", type=Path, help="a dataset; by default one is made")
-    parser.add_argument("--rounds", type=int, default=60)
-    parser.add_argument("--frames", type=int, default=2000)
-    parser.add_argument("--json", type=Path)
-    arguments = parser.parse_args()
-    sys.path.insert(0, str(Path(__file__).parents[1]))
-    from benchmarks.material.outcome import exit_code, not_measured
-    from benchmarks.material.rounds import collect, enlarge
-
+def main(
+    data: Path | None = None, rounds: int = 60, frames: int = 2000, json: Path | None = None
+) -> None:
     with tempfile.TemporaryDirectory() as home:
-        data = arguments.data
-        if data is None:
-            few = collect(Path(home) / "few", rounds=4, frames=150)
-            data = enlarge(few, Path(home) / "data", arguments.rounds, arguments.frames)
-        result = measure(data)
-    print(json.dumps(result, indent=1))
-    if arguments.json:
-        arguments.json.write_text(json.dumps(result, indent=1) + "\n")
-    if result["reached"] is None:
-        sys.exit(not_measured(f"the claim is of {LIMIT_FRAMES} frames, found {result['frames']}"))
-    sys.exit(exit_code(bool(result["reached"])))
+        result = measure(data or enlarged_few(Path(home), rounds, frames))
+    measured = result["frames"] >= LIMIT_FRAMES
+    conclude(result, json, result["full_s"] <= LIMIT_S if measured else None)
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

@@ -1,12 +1,10 @@
 """Processor time a frame in each kind of light, relative to the clear light of the same scene.
 
-Run: `python benchmarks/weather.py [--poses 40] [--json FILE]`. Claim: rain and snow take at most
-1.25 times the processor time of the clear light, drawn in the calling thread on Mesa. The lights
-take turns, pose by pose.
+Run: `python benchmarks/weather.py [--poses 40] [--json FILE]`; `--poses`: of each track. Claim:
+rain and snow take at most 1.25 times the processor time of the clear light, drawn in the calling
+thread on Mesa. The lights take turns, pose by pose.
 """
 
-import argparse
-import json
 import os
 import sys
 import time
@@ -14,8 +12,11 @@ from pathlib import Path
 
 os.environ.setdefault("LP_NUM_THREADS", "0")  # before Mesa reads it: draw in this thread
 
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
 import numpy as np
 
+from benchmarks.claims.outcome import conclude, run_command
 from simulator.camera import KINDS, Camera, Light
 from simulator.camera.scene.light import WEATHERS
 from simulator.camera.snapshot import standing_pose
@@ -51,20 +52,13 @@ def measure(poses: int) -> dict[str, float]:
     return {kind: round(float(np.median(values)), 3) for kind, values in best.items()}
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--poses", type=int, default=40, help="a track")
-    parser.add_argument("--json", type=Path)
-    arguments = parser.parse_args()
-    frame_ms = measure(arguments.poses)
+def main(poses: int = 40, json: Path | None = None) -> None:
+    frame_ms = measure(poses)
     ratio = {kind: round(value / frame_ms["clear"], 3) for kind, value in frame_ms.items()}
     reached = all(ratio[kind] <= CLAIM_RATIO for kind in WEATHERS)
     result = {"frame_ms": frame_ms, "ratio": ratio, "claim": CLAIM_RATIO, "reached": reached}
-    print(json.dumps(result, indent=1))
-    if arguments.json:
-        arguments.json.write_text(json.dumps(result, indent=1) + "\n")
-    sys.exit(0 if reached else 1)
+    conclude(result, json, reached)
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

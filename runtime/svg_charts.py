@@ -7,11 +7,10 @@ HTML, so that the text does not scale with the box. Pages with charts include `s
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import groupby
 
 import numpy as np
 from markupsafe import Markup, escape
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 SIDE = 1000.0
 LOG_FLOOR = 1e-9
@@ -30,11 +29,12 @@ class Axis:
     last: float
     log: bool = False
 
-    def __call__(self, value: float) -> float:
+    def __call__(self, values: ArrayLike) -> Numbers:
         first, last, here = (
-            math.log10(max(v, LOG_FLOOR)) if self.log else v for v in (self.first, self.last, value)
+            np.log10(np.maximum(v, LOG_FLOOR)) if self.log else np.asarray(v, np.float64)
+            for v in (self.first, self.last, values)
         )
-        return (here - first) * SIDE / ((last - first) or 1.0)
+        return np.asarray((here - first) * SIDE / ((last - first) or 1.0))
 
     @property
     def ticks(self) -> list[float]:
@@ -141,50 +141,47 @@ def reliability_diagram(title: str, predicted: Numbers, observed: Numbers) -> Ma
     both = np.maximum(np.concatenate([predicted, observed]), LOG_FLOOR)
     low, high = float(both.min()) * 0.8, float(both.max()) * 1.25
     x_axis, y_axis = Axis(low, high, log=True), Axis(high, low, log=True)
-    dots = [
-        f'<path class=dot d="M{x_axis(x):.1f},{y_axis(y):.1f}h0"/>'
-        for x, y in zip(predicted.tolist(), observed.tolist(), strict=True)
-    ]
+    points = _points(x_axis, y_axis, predicted, observed)
+    dots = [f'<path class=dot d="M{point}h0"/>' for point in points]
+    corners = ("y", "top:97%", low), ("y", "top:3%", high), ("x", "left:0%", low)
     labels = [
-        f'<span class=y style="top:97%">{low:.2g}</span>',
-        f'<span class=y style="top:3%">{high:.2g}</span>',
-        f'<span class=x style="left:0%">{low:.2g}</span>',
-        f'<span class=x style="left:100%">{high:.2g}</span>',
+        f'<span class={side} style="{at}">{value:.2g}</span>'
+        for side, at, value in (*corners, ("x", "left:100%", high))
     ]
     diagonal = f'<path class=grid d="M0,{SIDE:.0f}L{SIDE:.0f},0"/>'
     return _figure(title, [diagonal, *dots], labels, "predicted", "square")
 
 
 def _path(x_axis: Axis, y_axis: Axis, line: Line) -> str:
-    parts, drawing = [], False
-    for x, y in zip(line.x.tolist(), line.y.tolist(), strict=True):
-        present = bool(np.isfinite(y))
-        if present:
-            parts.append(f"{'L' if drawing else 'M'}{x_axis(x):.1f},{y_axis(y):.1f}")
-        drawing = present
-    return "".join(parts)
+    points = _points(x_axis, y_axis, line.x, line.y)
+    return "".join("M" + "L".join(points[run]) for run in _runs(np.isfinite(line.y)))
 
 
 def _band(x_axis: Axis, y_axis: Axis, line: Line) -> str:
     assert line.band is not None
     first, last = sorted((y_axis.first, y_axis.last))
-    low, high = (edge.clip(first, last) for edge in line.band)
-    present = np.isfinite(low) & np.isfinite(high)
-    rings = []
-    for drawn, rows in groupby(range(len(line.x)), key=lambda row: bool(present[row])):
-        if drawn:
-            there = list(rows)
-            ring = [(line.x[i], high[i]) for i in there]
-            ring += [(line.x[i], low[i]) for i in reversed(there)]
-            rings.append("M" + "L".join(f"{x_axis(x):.1f},{y_axis(y):.1f}" for x, y in ring) + "Z")
-    return f'<path class=band{_colour("fill", line)} d="{"".join(rings)}"/>'
+    edges = [edge.clip(first, last) for edge in line.band]
+    low, high = (_points(x_axis, y_axis, line.x, edge) for edge in edges)
+    rings = (high[run] + low[run][::-1] for run in _runs(np.isfinite(sum(edges))))
+    path = "".join(f"M{'L'.join(ring)}Z" for ring in rings)
+    return f'<path class=band{_colour("fill", line)} d="{path}"/>'
+
+
+def _points(x_axis: Axis, y_axis: Axis, x: Numbers, y: Numbers) -> list[str]:
+    return [f"{a:.1f},{b:.1f}" for a, b in zip(x_axis(x), y_axis(y), strict=True)]
+
+
+def _runs(present: NDArray[np.bool_]) -> list[slice]:
+    """The parts of a line between its gaps, where `present` (N,) is true."""
+    edges = np.flatnonzero(np.diff(present, prepend=False, append=False))
+    return [slice(a, b) for a, b in edges.reshape(-1, 2).tolist()]
 
 
 def _colour(style: str, line: Line) -> str:
     return f' style="{style}:{line.colour}"' if line.colour else ""
 
 
-def _tick_label(side: str, place: float, value: float) -> str:
+def _tick_label(side: str, place: Numbers, value: float) -> str:
     edge = "top" if side == "y" else "left"
     return f'<span class={side} style="{edge}:{100 * place / SIDE:.1f}%">{value:g}</span>'
 
@@ -271,13 +268,10 @@ def bars(title: str, counts: Mapping[str, Sequence[int]]) -> Markup:
 
 def _outline(share: Numbers, colour: str) -> str:
     """A step outline of the bin heights `share` (BINS,) in [0, 1]."""
-    floor = HEIGHT - FOOT
-    points = [f"{_bin_x(0.0):.1f},{floor}"]
-    for k, part in enumerate(share.tolist()):
-        y = floor - part * (floor - 4)
-        points += [f"{_bin_x(k / BINS):.1f},{y:.1f}", f"{_bin_x((k + 1) / BINS):.1f},{y:.1f}"]
-    points.append(f"{_bin_x(1.0):.1f},{floor}")
-    return f'<polygon points="{" ".join(points)}" fill="{colour}" stroke="{colour}"/>'
+    x = _bin_x(np.repeat(np.linspace(0.0, 1.0, BINS + 1), 2))
+    y = HEIGHT - FOOT - np.pad(np.repeat(share, 2), 1) * (HEIGHT - FOOT - 4)
+    points = " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(x, y, strict=True))
+    return f'<polygon points="{points}" fill="{colour}" stroke="{colour}"/>'
 
 
 def _value_axis(low: float, high: float) -> str:
@@ -285,15 +279,15 @@ def _value_axis(low: float, high: float) -> str:
     drawn = _text(MARGIN, "start", f"{low:.3g}") + _text(WIDTH - MARGIN, "end", f"{high:.3g}")
     if low < 0.0 < high:
         zero = -low / (high - low)
-        x = _bin_x(zero)
+        x = float(_bin_x(zero))
         drawn += f'<line x1="{x:.1f}" x2="{x:.1f}" y1="0" y2="{HEIGHT - FOOT}" class="zero"/>'
         if 0.12 < zero < 0.88:
             drawn += _text(x, "middle", "0")
     return drawn
 
 
-def _bin_x(share: float) -> float:
-    return MARGIN + share * (WIDTH - 2 * MARGIN)
+def _bin_x(share: ArrayLike) -> Numbers:
+    return MARGIN + np.asarray(share) * (WIDTH - 2 * MARGIN)
 
 
 def _text(x: float, anchor: str, text: str) -> str:

@@ -59,21 +59,15 @@ class DelayEstimate:
         return self.steps != before
 
     def _decide(self) -> None:
-        better = np.array(
-            [self._advantages(*pair) for pair in zip(self._squares, SPANS, strict=True)]
-        )
-        rivals = np.delete(better, self.steps, axis=1)
-        if better.max() > SURE:
-            self.steps = int(better.max(axis=0).argmax())
-            self.is_known = True
-        elif (rivals.max(axis=1) < -SURE).any():
-            self.is_known = True
-
-    def _advantages(self, squares: Vector, span: int) -> Vector:
-        """Standard errors (MAX_DELAY + 1,) by which each delay is better than the assumed one."""
-        compared = squares[: min(self._count, WINDOW)]
-        gains = compared[:, [self.steps]] - compared
-        # Neighbouring second differences over several steps have measurements in common.
-        error = gains.std(axis=0) * (span / len(compared)) ** 0.5
-        advantages: Vector = gains.mean(axis=0) / (error + 1e-12)
-        return advantages
+        for squares, span in zip(self._squares, SPANS, strict=True):
+            compared = squares[: min(self._count, WINDOW)]
+            best = int(compared.mean(axis=0).argmin())
+            # Neighbouring second differences over several steps have measurements in common.
+            independent = len(compared) / span
+            gains = compared - compared[:, [best]]
+            error = gains.std(axis=0) / independent**0.5
+            sure = gains.mean(axis=0) > SURE * error
+            if best != self.steps and sure[self.steps]:
+                self.steps, self.is_known = best, True
+            elif best == self.steps and np.delete(sure, best).all():
+                self.is_known = True

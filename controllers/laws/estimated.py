@@ -48,7 +48,7 @@ class SmoothWeights:
         return LqrWeights(self.offset, self.offset_rate, self.heading, self.heading_rate, self.rho)
 
 
-WEIGHTS = SmoothWeights(1.0, 0.2, 2.0, 0.1, 0.3, 3.0)
+WEIGHTS = SmoothWeights(10.0, 0.2, 10.0, 0.1, 0.01, 3.0)
 WEIGHTS_UNKNOWN_DELAY = SmoothWeights(1.0, 1.0, 5.0, 1.0, 10.0, 0.3)
 MPC_WEIGHTS = MpcWeights(1.0, 3.0, 0.3)
 

@@ -12,6 +12,7 @@ is estimated (`controllers.laws.delay`). The variance of the measurements' noise
 their third differences, in which motion nearly cancels and noise does not.
 """
 
+import math
 from functools import lru_cache
 
 import numpy as np
@@ -160,15 +161,22 @@ def predict(
     low = min(int(place), len(table) - 2)
     share = place - low
     step = (1.0 - share) * table[low] + share * table[low + 1]
-    states = np.ascontiguousarray(step[:, :STATES])
-    after = states @ x + step[:, STATES] * wheel
-    # The sine of the heading error moves the car sideways; at a start it may be large.
-    middle = 0.5 * (x[THETA] + after[THETA])
-    after[E] += step[E, THETA] * (np.sin(middle) - middle)
-    x[:] = after
-    covariance[:] = states @ covariance @ states.T
+    before, half = x.copy(), np.zeros((STATES, STATES))
+    # Loops: numba takes half a minute to compile products of matrices, and small ones run slower.
     for i in range(STATES):
-        covariance[i, i] += process[i]
+        x[i] = step[i, STATES] * wheel
+        for j in range(STATES):
+            x[i] += step[i, j] * before[j]
+            for k in range(STATES):
+                half[i, j] += step[i, k] * covariance[k, j]
+    for i in range(STATES):
+        for j in range(STATES):
+            covariance[i, j] = process[i] if i == j else 0.0
+            for k in range(STATES):
+                covariance[i, j] += half[i, k] * step[j, k]
+    # The sine of the heading error moves the car sideways; at a start it may be large.
+    middle = 0.5 * (before[THETA] + x[THETA])
+    x[E] += step[E, THETA] * (math.sin(middle) - middle)
 
 
 @compiled

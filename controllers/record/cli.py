@@ -10,15 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 from controllers import cli_options as options
 from datagen.cli.collect import (
     DEFAULT_LANES,
-    Frames,
     Lanes,
     Lights,
-    Rounds,
-    Scenes,
-    Seed,
-    SplitName,
-    Stretch,
-    TestShare,
     Tracks,
     TracksDir,
     Workers,
@@ -27,7 +20,17 @@ from datagen.cli.collect import (
     print_recorded,
     record_plan,
 )
-from datagen.planning.config import CollectConfig, all_lights
+from datagen.planning.config import (
+    CollectConfig,
+    Frames,
+    Rounds,
+    Scenes,
+    Seed,
+    SplitName,
+    Stretch,
+    TestShare,
+    all_lights,
+)
 from datagen.recording.names import DRIVEN, UNSEEN
 from trackfeatures import UserError
 

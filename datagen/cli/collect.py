@@ -4,6 +4,8 @@ datagen collect --rounds 60 --out datasets/default
 """
 
 import sys
+from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -12,7 +14,7 @@ import typer
 from datagen.planning.config import DATASET_FOLDER, UNSEEN_FOLDER, CollectConfig, all_lights
 from datagen.recording.names import UNSEEN
 from runtime import cli as command
-from runtime.cli import AsJson, counted, print_result
+from runtime.cli import AsJson, counted, options, print_result
 from trackfeatures.errors import UserError
 
 if TYPE_CHECKING:
@@ -25,11 +27,6 @@ if TYPE_CHECKING:
 DEFAULT_LANES = ",".join(map(str, CollectConfig.lanes))
 PIPE_WIDTH = 120  # characters, for tables where stdout is no terminal
 
-Rounds = Annotated[int, typer.Option(help="Number of rounds.")]
-Frames = Annotated[int, typer.Option(help="Frames per round.")]
-Frequency = Annotated[
-    int, typer.Option(help="Frames per second. The car is controlled at 20 Hz or faster.")
-]
 Out = Annotated[
     Path | None,
     typer.Option(
@@ -37,7 +34,6 @@ Out = Annotated[
         f"Default: {DATASET_FOLDER}, or {UNSEEN_FOLDER} with --split unseen."
     ),
 ]
-Seed = Annotated[int, typer.Option(help="Seed of all random choices.")]
 Workers = Annotated[int, typer.Option(help="Recording processes; 0: one per core.")]
 Tracks = Annotated[
     str,
@@ -53,48 +49,12 @@ Lights = Annotated[
         "snow; empty: all."
     ),
 ]
-Stretch = Annotated[
-    int,
-    typer.Option(
-        help="Frames after which scenery, light and weather change; 0: never, a round is a film. "
-        "Use 1 for training sets."
-    ),
-]
-Scenes = Annotated[
-    int,
-    typer.Option(help="Sceneries that --stretch cycles through in a round; 0: one per 200 frames."),
-]
 TracksDir = Annotated[Path | None, typer.Option(help="A further folder to search for tracks.")]
-TestShare = Annotated[float, typer.Option(help="Share of the rounds held out for testing.")]
-SplitName = Annotated[
-    str, typer.Option(help="unseen: record the tracks that are held out of training plans.")
-]
-Codec = Annotated[str, typer.Option(help="Image codec: jpeg (quality 95) or png (lossless).")]
-JitterCamera = Annotated[
-    bool,
-    typer.Option(
-        "--jitter-camera", help="Vary height, pitch and field of view from round to round."
-    ),
-]
-Roads = Annotated[
-    str,
-    typer.Option(
-        help="paper: lanes of 4.0 m and the tracks' own paint; varied: lanes, shoulders, paint, "
-        "surface, light and camera height are drawn for each round or scene."
-    ),
-]
 CameraFile = Annotated[
     Path | None,
     typer.Option(
         "--camera",
         help="Camera file of driverview, OpenCV, ROS or Kalibr: record with its lens and mount.",
-    ),
-]
-Prefix = Annotated[
-    str,
-    typer.Option(
-        help="First part of the rounds' names. Collections can be merged if each has its own "
-        "prefix and seed."
     ),
 ]
 ShardOf = Annotated[
@@ -107,26 +67,16 @@ ExecutorName = Annotated[
 DryRun = Annotated[bool, typer.Option("--dry-run", help="Print the plan; record nothing.")]
 
 
+@options(CollectConfig)
 def collect(
-    rounds: Rounds = CollectConfig.rounds,
-    frames: Frames = CollectConfig.frames,
-    frequency: Frequency = CollectConfig.frequency_hz,
+    make_config: partial[CollectConfig],
     out: Out = None,
-    seed: Seed = CollectConfig.seed,
     workers: Workers = 0,
     tracks: Tracks = "",
     lanes: Lanes = DEFAULT_LANES,
     lights: Lights = "",
-    stretch: Stretch = CollectConfig.stretch,
-    scenes: Scenes = CollectConfig.scenes,
     tracks_dir: TracksDir = None,
-    split_test_share: TestShare = CollectConfig.test_share,
-    split: SplitName = CollectConfig.split,
-    codec: Codec = CollectConfig.codec,
     camera: CameraFile = None,
-    jitter_camera: JitterCamera = CollectConfig.jitter_camera,
-    roads: Roads = CollectConfig.roads,
-    prefix: Prefix = CollectConfig.prefix,
     shard: ShardOf = "",
     executor: ExecutorName = "local",
     dry_run: DryRun = False,
@@ -141,23 +91,12 @@ def collect(
     from runtime.camera_file import read_camera
     from trackfeatures.camera import CameraParameters
 
-    config = CollectConfig(
-        rounds=rounds,
-        frames=frames,
-        seed=seed,
-        frequency_hz=frequency,
-        tracks=choose_tracks(names(tracks), tracks_dir, unseen=split == UNSEEN),
+    unseen = make_config.keywords["split"] == UNSEEN
+    config = make_config(
+        tracks=choose_tracks(names(tracks), tracks_dir, unseen),
         lanes=numbers(lanes),
         lights=names(lights) or all_lights(),
-        stretch=stretch,
-        scenes=scenes,
-        test_share=split_test_share,
-        codec=codec,
         camera=CameraParameters() if camera is None else read_camera(camera, CameraParameters()),
-        jitter_camera=jitter_camera,
-        roads=roads,
-        prefix=prefix,
-        split=split,
     )
     part = Shard.parse(shard) if shard else None
     forecast = TrackForecast.of(config.tracks, tracks_dir)
@@ -166,7 +105,7 @@ def collect(
     if dry_run:
         _print_plan(plan, classes, as_json)
         return
-    folder = out or (UNSEEN_FOLDER if split else DATASET_FOLDER)
+    folder = out or (UNSEEN_FOLDER if config.split else DATASET_FOLDER)
     result = record_plan(plan, classes, folder, workers, tracks_dir, executor, part)
     print_recorded(result, as_json)
 
@@ -179,7 +118,7 @@ def print_recorded(result: "CollectResult", as_json: bool) -> None:
         f"{result.recorded_frames} in {result.seconds:.1f} s, "
         f"{result.frames_per_second:.0f} a second"
     )
-    print_result(result.as_json(), as_json, line)
+    print_result(asdict(result), as_json, line)
 
 
 def _print_plan(plan: "Plan", classes: "ClassShares", as_json: bool) -> None:
@@ -238,7 +177,7 @@ def merge(
 
     merged = run(folders, out)
     line = f"{out}: {merged.rounds} of {counted(merged.planned, 'round')} of the plan"
-    print_result(merged.as_json(), as_json, line)
+    print_result(asdict(merged), as_json, line)
 
 
 def names(text: str) -> tuple[str, ...]:

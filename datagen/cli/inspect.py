@@ -6,6 +6,7 @@ datagen export datasets/default --format webdataset --out shards
 """
 
 import sys
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -91,7 +92,7 @@ def export(
     line = (
         f"{target}: {counted(done.frames, 'frame')} of {counted(done.rounds, 'round')}, {megabytes}"
     )
-    print_result(done.as_json(), as_json, line)
+    print_result(asdict(done), as_json, line)
 
 
 def view(

@@ -3,7 +3,7 @@
 datagen verify datasets/default --level full
 """
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -72,7 +72,7 @@ def _print_report(
     contents = f"{counted(report.rounds, 'round')}, {counted(report.frames, 'frame')}"
     again = f", {len(replayed)} replayed" if replayed else ""
     line = f"{folder}: {contents}, level {level}{again}: {verdict}"
-    result = {**report.as_json(), "replayed": replayed}
+    result = {**asdict(report), "replayed": replayed}
     print_result(result, as_json, "\n".join([line, *report.problems, *report.recovered]))
 
 
@@ -90,7 +90,7 @@ def recover(
     done = run(file, out)
     least = "at least " if done.at_least else ""
     line = f"{done.out}: {counted(done.saved, 'frame')} saved, {least}{done.lost} lost"
-    print_result(done.as_json(), as_json, line)
+    print_result(asdict(done), as_json, line)
 
 
 def split(

@@ -3,6 +3,7 @@
 datagen protocol --out datasets/protocol
 """
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -10,23 +11,17 @@ import typer
 
 from datagen.cli.collect import TracksDir, Workers, print_recorded, record_plan
 from datagen.planning.config import ProtocolConfig, TrackChoice
-from runtime.cli import AsJson
+from runtime.cli import AsJson, options
 
 FOLDER = Path("datasets/protocol")
 
-Rounds = Annotated[int, typer.Option(help="Rounds on the nine tracks.")]
-Frames = Annotated[int, typer.Option(help="Frames of each of these rounds.")]
-Laps = Annotated[float, typer.Option(help="Laps of each of the four drives.")]
-Seed = Annotated[int, typer.Option(help="Seed of everything random.")]
 Out = Annotated[Path, typer.Option(help="Dataset folder; an unfinished one is continued.")]
 
 
+@options(ProtocolConfig)
 def protocol(
+    make_config: partial[ProtocolConfig],
     out: Out = FOLDER,
-    rounds: Rounds = ProtocolConfig.rounds,
-    frames: Frames = ProtocolConfig.frames,
-    laps: Laps = ProtocolConfig.laps,
-    seed: Seed = ProtocolConfig.seed,
     workers: Workers = 0,
     tracks_dir: TracksDir = None,
     as_json: AsJson = False,
@@ -40,7 +35,7 @@ def protocol(
     from datagen.planning.protocol import protocol_plan
     from datagen.planning.summary import expected_classes
 
-    plan = protocol_plan(ProtocolConfig(rounds, frames, laps, seed), tracks_dir)
+    plan = protocol_plan(make_config(), tracks_dir)
     choices = {entry.track: TrackChoice(entry.track, entry.track_hash) for entry in plan.rounds}
     classes = expected_classes(plan, TrackForecast.of(tuple(choices.values()), tracks_dir))
     print_recorded(record_plan(plan, classes, out, workers, tracks_dir, "local", None), as_json)

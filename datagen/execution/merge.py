@@ -5,7 +5,7 @@ import json
 import shutil
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -44,9 +44,6 @@ class MergeResult:
     frames: int
     content_hash: str
     out: str
-
-    def as_json(self) -> dict[str, Any]:
-        return asdict(self)
 
 
 def merge(folders: Sequence[Path], out: Path) -> MergeResult:

@@ -1,9 +1,8 @@
 """Exports chosen rounds of a dataset in one format into a new folder."""
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
 
 from datagen.export import webdataset
 from datagen.export.card import card
@@ -18,15 +17,12 @@ FORMATS = ("webdataset", "lerobot")
 
 @dataclass(frozen=True, slots=True)
 class ExportConfig:
-    """Options of an export."""
+    """Options of `datagen export`, which has their defaults."""
 
     format: str
-    split: str = "all"
-    """train, test, unseen or all."""
-    shard_size: int = 1000
-    """Frames of a WebDataset shard."""
-    shuffle: bool = False
-    """Write WebDataset's frames in a random order that is the same each time."""
+    split: str
+    shard_size: int
+    shuffle: bool
 
     def validate(self) -> None:
         """Raise UserError for options that cannot be met, before anything is read."""
@@ -54,9 +50,6 @@ class ExportResult:
     files: int
     bytes: int
     content_hash: str
-
-    def as_json(self) -> dict[str, Any]:
-        return asdict(self)
 
 
 def export(folder: Path, out: Path, config: ExportConfig, progress: Progress) -> ExportResult:

@@ -1,8 +1,13 @@
-"""The options of a collection, with the default of each."""
+"""The options of a collection: name, help text and default of each.
+
+Annotated fields are options of the commands (`runtime.cli.options`).
+"""
 
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+from typer import Option
 
 import trackfeatures as tf
 from datagen.recording.names import CODECS, UNSEEN
@@ -36,36 +41,70 @@ class TrackChoice:
     content_hash: str
 
 
+Rounds = Annotated[int, Option(help="Number of rounds.")]
+Frames = Annotated[int, Option(help="Frames per round.")]
+Seed = Annotated[int, Option(help="Seed of all random choices.")]
+TestShare = Annotated[
+    float,
+    Option("--split-test-share", help="Share of the rounds held out for testing, 0 to below 1."),
+]
+Stretch = Annotated[
+    int,
+    Option(
+        help="Frames after which scenery, light and weather change; 0: never, a round is a film. "
+        "Use 1 for training sets."
+    ),
+]
+Scenes = Annotated[
+    int,
+    Option(
+        help="Sceneries that --stretch cycles through in a round; 0: one per "
+        f"{FRAMES_PER_SCENE} frames."
+    ),
+]
+SplitName = Annotated[
+    str, Option(help="unseen: record the tracks that are held out of training plans.")
+]
+
+
 @dataclass(frozen=True)
 class CollectConfig:
     """Options of a collection. Raises UserError for values that cannot be collected."""
 
-    rounds: int = 60
-    frames: int = 2000
-    """Per round."""
-    seed: int = 0
+    rounds: Rounds = 60
+    frames: Frames = 2000
+    seed: Seed = 0
     tracks: tuple[TrackChoice, ...] = field(kw_only=True)
     lanes: tuple[int, ...] = (1, 2, 3)
     lights: tuple[str, ...] = field(default_factory=all_lights)
-    test_share: float = 0.25
-    """Share of the rounds held out for testing, 0 to below 1."""
-    codec: str = "jpeg"
-    frequency_hz: int = 20
-    """Frames per second. The car is controlled at `plan.CONTROL_HZ` or faster."""
+    test_share: TestShare = 0.25
+    codec: Annotated[str, Option(help="Image codec: jpeg (quality 95) or png (lossless).")] = "jpeg"
+    frequency_hz: Annotated[
+        int,
+        Option("--frequency", help="Frames per second. The car is controlled at 20 Hz or faster."),
+    ] = 20
     camera: CameraParameters = field(default_factory=CameraParameters)
-    stretch: int = 0
-    """Frames after which scenery and light change; 0: a round is a film in one scenery."""
-    scenes: int = 0
-    """Number of sceneries that the stretches of a round cycle through; 0: one for every
-    `FRAMES_PER_SCENE`."""
-    jitter_camera: bool = False
-    """Vary height, pitch and field of view of the camera a little from round to round."""
-    roads: str = "paper"
-    """"paper": lanes of 4.0 m and the paint of the tracks; "varied": drawn for each round."""
-    prefix: str = "round"
-    """First part of the rounds' names; collections with different prefixes can be merged."""
-    split: str = ""
-    """"unseen": all rounds test on tracks without training data; "": train and test."""
+    stretch: Stretch = 0
+    scenes: Scenes = 0
+    jitter_camera: Annotated[
+        bool,
+        Option("--jitter-camera", help="Vary height, pitch and field of view from round to round."),
+    ] = False
+    roads: Annotated[
+        str,
+        Option(
+            help="paper: lanes of 4.0 m and the tracks' own paint; varied: lanes, shoulders, "
+            "paint, surface, light and camera height are drawn for each round or scene."
+        ),
+    ] = "paper"
+    prefix: Annotated[
+        str,
+        Option(
+            help="First part of the rounds' names. Collections can be merged if each has its own "
+            "prefix and seed."
+        ),
+    ] = "round"
+    split: SplitName = ""
 
     def as_dict(self) -> dict[str, Any]:
         """The options by name; options in `LATER` only if they differ from their defaults."""
@@ -135,15 +174,13 @@ LATER = {"roads": CollectConfig.roads, "prefix": CollectConfig.prefix}
 
 @dataclass(frozen=True)
 class ProtocolConfig:
-    """Options of `datagen protocol`. Raises UserError for drives of no length."""
+    """Options of `datagen protocol`; by default as many rounds and images as the paper's 30,000.
+    Raises UserError for drives of no length."""
 
-    rounds: int = 15
-    """On the nine tracks, as many as the paper's."""
-    frames: int = 2000
-    """Of each of these rounds: the paper's 30,000 test images in all."""
-    laps: float = 1.0
-    """Of each drive."""
-    seed: int = 1810
+    rounds: Annotated[int, Option(help="Rounds on the nine tracks.")] = 15
+    frames: Annotated[int, Option(help="Frames of each of these rounds.")] = 2000
+    laps: Annotated[float, Option(help="Laps of each of the four drives.")] = 1.0
+    seed: Seed = 1810
 
     def __post_init__(self) -> None:
         if self.laps <= 0:

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields, replace
 from functools import lru_cache
 from itertools import count
 from pathlib import Path
@@ -32,6 +32,8 @@ from simulator.world.world import World
 
 MARKING_LENGTH_M = 60.0  # of the markings drawn into an image
 TRACK_LINE_STEP_M = 4.0
+NO_IMAGE: NDArray[np.uint8] = np.zeros((0, 0, 3), np.uint8)
+EGO_NAMES = ("x", "y", "z", "yaw", "pitch", "roll", "vx", "vy", "yaw_rate")
 WHEELS = ("front_left", "front_right", "rear_left", "rear_right")
 NOT_RECORDED = ("range_traffic",)
 MAX_RESETS = 20  # times control steps per frame: at low frame rates a round is a longer drive
@@ -116,30 +118,13 @@ class FrameTruth:
 
     scenery: Scenery
     pose: NDArray[np.float64]
-    traffic: NDArray[np.float64]
-    features: tf.TrackFeatures
-    place: RoadPlace
-    ego: EgoState
-    command: DriverCommand
-    sensors: SensorReadings
-    markings: tuple[NDArray[np.float64], ...]
+    frame: Frame
+    """Without its image."""
 
     def render(self, camera: Camera) -> NDArray[np.uint8]:
         """The camera image, (height, width, 3) RGB."""
         camera.change_scene(*self.scenery)
-        return camera.render(self.pose, self.traffic)
-
-    def with_image(self, image: NDArray[np.uint8]) -> Frame:
-        return Frame(
-            image=image,
-            features=self.features,
-            place=self.place,
-            ego=self.ego,
-            command=self.command,
-            sensors=self.sensors,
-            traffic=self.traffic,
-            markings=self.markings,
-        )
+        return camera.render(self.pose, self.frame.traffic)
 
 
 def record_round(
@@ -159,7 +144,7 @@ def record_round(
             for batch in simulate(simulation, camera):
                 images = [truth.render(camera) for truth in batch]
                 for truth, image in zip(batch, images, strict=True):
-                    writer.add(truth.with_image(image))
+                    writer.add(replace(truth.frame, image=image))
                     progress(next(done))
             writer.finish(
                 laps=simulation.laps,
@@ -224,26 +209,14 @@ def open_simulation(
 
 
 def _header(plan: RoundPlan, plan_hash: str, road: Road) -> RoundHeader:
-    return RoundHeader(
-        id=plan.id,
-        seed=plan.seed,
-        track=road.track.name,
-        track_hash=plan.track_hash,
-        lanes=plan.lanes,
-        lane_width_m=plan.lane_width_m,
-        traffic=plan.traffic,
-        trajectory=plan.trajectory,
-        lights=plan.lights,
-        stretch=plan.stretch,
-        speed_kmh=plan.speed_kmh,
-        frequency_hz=plan.frequency_hz,
-        codec=plan.codec,
-        plan_hash=plan_hash,
-        program=program(),
-        camera=plan.camera,
-        nominal_camera=None if plan.camera == plan.nominal_camera else plan.nominal_camera,
-        varied=asdict(plan.varied) if plan.varied else None,
-    )
+    names = [each.name for each in fields(RoundHeader)]
+    planned = {name: getattr(plan, name) for name in names if hasattr(plan, name)}
+    planned |= {
+        "track": road.track.name,
+        "nominal_camera": None if plan.camera == plan.nominal_camera else plan.nominal_camera,
+        "varied": asdict(plan.varied) if plan.varied else None,
+    }
+    return RoundHeader(**planned, plan_hash=plan_hash, program=program())
 
 
 def _next_frame(
@@ -254,10 +227,8 @@ def _next_frame(
     camera.change_scene(*scene)
     world, now = simulation.world, simulation.state
     road, pose, command = world.road, world.body_pose(), simulation.command()
-    truth = FrameTruth(
-        scenery=scene,
-        pose=pose,
-        traffic=world.traffic.poses(),
+    frame = Frame(
+        image=NO_IMAGE,
         features=world.features(),
         place=RoadPlace(
             lanes=road.lanes,
@@ -267,25 +238,18 @@ def _next_frame(
             s=now.s,
         ),
         ego=EgoState(
-            x=now.x,
-            y=now.y,
-            z=now.z,
-            yaw=now.yaw,
-            pitch=now.pitch,
-            roll=now.roll,
-            vx=now.vx,
-            vy=now.vy,
-            yaw_rate=now.yaw_rate,
+            **{name: getattr(now, name) for name in EGO_NAMES},
             shadow_fraction=camera.shadow_fraction(pose),
         ),
         command=DriverCommand(command.steer, command.throttle, command.brake, command.gear),
         sensors=_readings(suite.read(world)),
+        traffic=world.traffic.poses(),
         markings=tuple(marking_polylines(camera, road, (now.s, pose), MARKING_LENGTH_M)),
     )
     simulation.step(command)
     for _ in range(simulation.plan.steps_per_frame - 1):
         simulation.step(simulation.command())
-    return truth
+    return FrameTruth(scene, pose, frame)
 
 
 def _readings(read: dict[str, Any]) -> SensorReadings:

@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 import trackfeatures as tf
 from datagen.execution.collect import PLAN_FILE
@@ -21,8 +20,6 @@ from datagen.recording.images import encode
 from datagen.recording.mcap.index import RoundIndex, open_round
 from datagen.recording.mcap.protobuf_wire import bytes_field
 from datagen.recording.schema import messages, topics
-
-NO_IMAGE: NDArray[np.uint8] = np.zeros((0, 0, 3), np.uint8)
 
 OnReplayed = Callable[[str], None]
 """Called with the id of each replayed round."""
@@ -61,10 +58,9 @@ def differences(
     with open_simulation(entry, tracks_dir) as (simulation, camera):
         for batch in simulate(simulation, camera):
             for truth in batch:
-                frame = truth.with_image(NO_IMAGE)
                 simulated = {
-                    topics.LABELS: messages.labels(frame),
-                    topics.EGO_STATE: messages.ego_state(frame.ego),
+                    topics.LABELS: messages.labels(truth.frame),
+                    topics.EGO_STATE: messages.ego_state(truth.frame.ego),
                 }
                 for topic, data in simulated.items():
                     messages_of_topic = recorded[topic]

@@ -16,12 +16,18 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from datagen.recording.dataset import Dataset, Frames
-    from datagen.recording.errors import DatasetError, UndecodableImage
-    from datagen.recording.labels import Labels
-    from datagen.recording.mcap.index import RoundIndex, open_round
-    from datagen.recording.round_metadata import Recovery, RoundHeader, RoundInfo, RoundResult
-    from datagen.recording.splits import Split
+    from datagen.recording.dataset import Dataset as Dataset
+    from datagen.recording.dataset import Frames as Frames
+    from datagen.recording.errors import DatasetError as DatasetError
+    from datagen.recording.errors import UndecodableImage as UndecodableImage
+    from datagen.recording.labels import Labels as Labels
+    from datagen.recording.mcap.index import RoundIndex as RoundIndex
+    from datagen.recording.mcap.index import open_round as open_round
+    from datagen.recording.round_metadata import Recovery as Recovery
+    from datagen.recording.round_metadata import RoundHeader as RoundHeader
+    from datagen.recording.round_metadata import RoundInfo as RoundInfo
+    from datagen.recording.round_metadata import RoundResult as RoundResult
+    from datagen.recording.splits import Split as Split
 
 _MODULES = {
     "Dataset": "dataset",
@@ -37,20 +43,6 @@ _MODULES = {
     "UndecodableImage": "errors",
     "open_round": "mcap.index",
 }
-__all__ = [
-    "Dataset",
-    "DatasetError",
-    "Frames",
-    "Labels",
-    "Recovery",
-    "RoundHeader",
-    "RoundIndex",
-    "RoundInfo",
-    "RoundResult",
-    "Split",
-    "UndecodableImage",
-    "open_round",
-]
 
 
 def __getattr__(name: str) -> object:

@@ -1,9 +1,10 @@
-"""The dataset card, `README.md` of a dataset folder: content, origin, statistics, how to read it.
+"""Fills the dataset card `card.md`, which becomes `README.md` of a dataset folder.
 
 Its YAML header is that of the Hugging Face hub: huggingface.co/docs/hub/datasets-cards.
 """
 
 from collections.abc import Iterator
+from importlib.resources import files
 from typing import Any
 
 import trackfeatures as tf
@@ -13,6 +14,7 @@ from datagen.recording.names import DRIVEN, SIDES
 from datagen.recording.schema.fields import FIELDS, Field
 from datagen.recording.schema.json_schema import SCHEMA_FILE
 from datagen.recording.schema.topics import MESSAGE_TYPES
+from runtime.cli import counted
 from trackfeatures.camera import CameraParameters
 
 SIZE_CATEGORIES = (
@@ -24,126 +26,18 @@ SIZE_CATEGORIES = (
 LARGEST_CATEGORY = "1M<n<10M"
 CODECS = {"jpeg": f"JPEG, quality {JPEG_QUALITY}, 4:2:0", "png": "PNG, lossless"}
 
-TEMPLATE = """---
-license: mit
-pretty_name: "{name}: driver-view images and track features"
-annotations_creators:
-- machine-generated
-source_datasets:
-- original
-task_categories:
-- image-classification
-- robotics
-tags:
-- autonomous-driving
-- lane-keeping
-- simulation
-- mcap
-size_categories:
-- {size}
-viewer: false
----
-# {name}: driver-view images and track features
-
-{frames} frames in {rounds}, {hertz} a second, {width} x {height} px.
-With every image: the distances to the lane markings, the angle to the road, the class of the road
-ahead (left, straight, right), the state, sensors and command of the car, the other cars and the
-road. For training and testing camera-based lane perception and driving.
-
-Content hash, over all images and labels: `{hash}`.
-
-## Read it
-
-```python
-from datagen.recording import Dataset
-
-train = Dataset.open(".").select("train")  # or "test", "all"
-labels = train.labels                      # arrays, one row per frame, NaN where absent
-images = train.read_batch([0, 1, 2])       # (3, {height}, {width}, 3) uint8 RGB
-print(len(train), labels.to_lane_centre[:3], labels.angle[:3], labels.heading[:3])
-```
-
-Or with any MCAP reader: the schemas are inside the files. Foxglove shows a round with
-`layouts/foxglove.json`, Rerun opens it directly, `datagen view rounds/{first}.mcap` adds plots.
-`datagen export` writes WebDataset shards or a LeRobotDataset. `datagen verify` checks that nothing
-has changed since it was recorded.
-
-## What is in the folder
-
-| | |
-|---|---|
-| `rounds/*.mcap` | one file per round, uncompressed MCAP, protobuf messages |
-| `splits/default.json` | the rounds of each side: train, test, unseen |
-| `proto/driverview.proto` | the `driverview.*` messages; the others are `foxglove.*` |
-| `{schema}` | unit, frame, reference point and limits of every field |
-| `stats.json`, `manifest.json` | all statistics; every round with its hashes |
-| `state/*.json`, `plan.json` | size and SHA-256 of each file; the plan of all rounds |
-| `layouts/foxglove.json` | a layout for Foxglove |
-
-The messages of one control step have the same log time, which is simulated time counted from
-2020-01-01. An image and its labels are paired by it.
-
-## What is recorded
-
-Units are SI unless stated otherwise. Lateral values are positive to the left, except the distances
-to markings, which are negative to the left; `angle` is positive when the car points to the right.
-Absent means unset, not zero. Definitions of the labels: version {definitions}.
-
-| topic | schema |
-|---|---|
-{topics}
-
-{fields}
-
-## How it was made
-
-By `datagen collect` of {program}: a simulated car (rigid body, tyres, suspension at 200 Hz) is
-driven by a scripted driver; trajectory and speed differ by round; the other cars follow a
-car-following model. The labels are computed from the geometry of the road. One seed determines all.
-{driven}{stretches}Camera: {camera}{jitter}. Images: {codecs}.
-
-Frames by
-
-- track: {by_track}
-- number of lanes: {by_lanes}
-- number of other cars: {by_traffic}
-- light: {by_light}
-- trajectory: {by_trajectory}
-
-## Splits and figures
-
-By round, never by frame: {sides}. No seed and no content hash is on two sides.{recovered}
-
-{table}
-
-"Mean deviation" is the mean absolute error of predicting the mean: the baseline for a model.
-
-## Known limits
-
-- Everything is simulated: cars, roads and weather are those of this program, not real ones.
-- Frames of a round are 1/{hertz} s apart and similar: use the number of rounds, not of frames, for
-  confidence intervals.
-- Labels state where markings are, also where paint is worn, hidden by a car or outside the image.
-- Every image is of one camera{one_camera}. For other cameras, train with images of these.
-- No pedestrians, crossings, traffic lights or oncoming traffic.
-
-## Licence
-
-MIT, as the program that made it. Roads imported from elsewhere (TORCS's tracks) are their authors'
-work; only the geometry of the road is taken from their files.
-"""
-
 
 def render_card(dataset: Dataset, statistics: dict[str, Any]) -> str:
     """Markdown with a YAML header; `statistics` is the result of `describe`."""
     headers = [index.header for index in dataset.indexes]
     jittered = any(header.nominal_camera for header in headers)
     rounds, frames = statistics["rounds"], statistics["frames"]
-    return TEMPLATE.format(
+    template = files("datagen.recording").joinpath("card.md").read_text(encoding="utf-8")
+    return template.format(
         name=dataset.path.resolve().name,
         size=next((name for most, name in SIZE_CATEGORIES if frames < most), LARGEST_CATEGORY),
         frames=f"{frames:,}",
-        rounds=f"{rounds} round{'' if rounds == 1 else 's'}",
+        rounds=counted(rounds, "round"),
         hertz=_join({str(header.frequency_hz) for header in headers}),
         width=dataset.camera.width,
         height=dataset.camera.height,

@@ -1,21 +1,19 @@
 """Near-duplicate frames of two sides of a split: same track and light, nearly the same pose.
 
-A test set with many near-duplicates of training frames measures memorisation. The search uses a
-grid whose cells have the size of the tolerances: near frames are in the same or adjacent cells.
+A test set with many near-duplicates of training frames measures memorisation.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from itertools import product
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from datagen.recording.labels import Labels
 from datagen.recording.round_metadata import RoundInfo
 
-MAX_PAIRS_AT_ONCE = 4_000_000
 MAX_LISTED = 10
 
 
@@ -70,75 +68,33 @@ def find_near_duplicates(
     near, partner = np.flatnonzero(side), np.flatnonzero(other)
     if not (near.size and partner.size):
         return NearDuplicates(int(near.size), 0, ())
-    poses = _scaled_poses(labels, tolerances)
-    cells, strides = _grid_cells(poses, _scene_numbers(labels, rounds))
-    partner = partner[np.argsort(cells[partner], kind="stable")]
-    best = np.full(near.size, np.inf)
-    nearest = np.zeros(near.size, np.int64)
-    for rows, candidates in _candidate_pairs(cells[near], cells[partner], strides):
-        apart = np.abs(poses[near[rows]] - poses[partner[candidates]]).max(axis=1)
-        order = np.argsort(-apart)  # numpy keeps the last of several writes to a row: the nearest
-        order = order[apart[order] < best[rows[order]]]
-        best[rows[order]] = apart[order]
-        nearest[rows[order]] = partner[candidates[order]]
+    poses = _scaled_poses(labels, rounds, tolerances)
+    best, place = cKDTree(poses[partner]).query(poses[near], p=np.inf, distance_upper_bound=2.0)
     close = best <= 1.0
     worst = np.argsort(best, kind="stable")[: min(MAX_LISTED, int(close.sum()))]
     starts = np.searchsorted(labels.round, np.arange(len(rounds)))
     pairs = [
-        _make_pair(labels, rounds, starts, int(near[i]), int(nearest[i]), best[i]) for i in worst
+        _make_pair(labels, rounds, starts, int(near[i]), int(partner[place[i]]), best[i])
+        for i in worst
     ]
     return NearDuplicates(int(near.size), int(close.sum()), tuple(pairs))
 
 
-def _scaled_poses(labels: Labels, tolerances: Tolerances) -> NDArray[np.float64]:
-    """(N, 3): s, lateral offset and yaw, in units of their tolerances."""
+def _scaled_poses(
+    labels: Labels, rounds: Sequence[RoundInfo], tolerances: Tolerances
+) -> NDArray[np.float64]:
+    """(N, 4): s, lateral offset and yaw, in units of their tolerances, and 10 times the number of
+    the scene (a combination of track, lanes and light), so that two scenes are far apart."""
+    numbers: dict[tuple[str, int], int] = {}
+    of_round = [numbers.setdefault((r.track, r.lanes), len(numbers)) for r in rounds]
+    kinds, light = np.unique(labels.light, return_inverse=True)
     columns = (
         labels.s / tolerances.s_m,
         labels.to_middle / tolerances.to_middle_m,
         np.degrees(labels.angle) / tolerances.angle_deg,
+        10 * (np.array(of_round)[labels.round] * len(kinds) + light),
     )
     return np.stack(columns, axis=1).astype(np.float64)
-
-
-def _scene_numbers(labels: Labels, rounds: Sequence[RoundInfo]) -> NDArray[np.int64]:
-    """(N,): a number for each combination of track, lanes and light."""
-    numbers: dict[tuple[str, int], int] = {}
-    of_round = [numbers.setdefault((r.track, r.lanes), len(numbers)) for r in rounds]
-    kinds, light = np.unique(labels.light, return_inverse=True)
-    return np.array(of_round, np.int64)[labels.round] * len(kinds) + light
-
-
-def _grid_cells(
-    poses: NDArray[np.float64], scenes: NDArray[np.int64]
-) -> tuple[NDArray[np.int64], tuple[int, int]]:
-    """(N,) cell numbers, adjacent in yaw; and their strides in s and in lateral offset."""
-    grid = np.floor(poses).astype(np.int64)
-    grid -= grid.min(axis=0) - 1  # an empty cell on either side: strides never wrap around
-    _, offsets, yaws = (int(size) + 2 for size in grid.max(axis=0))
-    longest = int(grid[:, 0].max()) + 2
-    s_step, offset_step = offsets * yaws, yaws
-    cells = scenes * longest * s_step + grid[:, 0] * s_step + grid[:, 1] * offset_step + grid[:, 2]
-    return cells, (s_step, offset_step)
-
-
-def _candidate_pairs(
-    cells: NDArray[np.int64], partners: NDArray[np.int64], strides: tuple[int, int]
-) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
-    """Index pairs into `cells` and sorted `partners`, in equal or adjacent cells, in batches."""
-    for s, offset in product((-1, 0, 1), repeat=2):
-        middle = cells + s * strides[0] + offset * strides[1]
-        low = np.searchsorted(partners, middle - 1, "left")
-        counts = np.searchsorted(partners, middle + 1, "right") - low
-        total = np.concatenate([[0], np.cumsum(counts)])
-        first = 0
-        while first < len(cells):
-            last = int(np.searchsorted(total, total[first] + MAX_PAIRS_AT_ONCE, "right")) - 1
-            last = max(last, first + 1)
-            part = slice(first, last)
-            rows = np.repeat(np.arange(first, last), counts[part])
-            start = np.repeat(low[part] - (total[part] - total[first]), counts[part])
-            yield rows, start + np.arange(len(rows))
-            first = last
 
 
 def _make_pair(

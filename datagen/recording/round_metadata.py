@@ -6,7 +6,7 @@ of the file format.
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -202,20 +202,7 @@ class RoundInfo:
 
     @staticmethod
     def of(path: Path, header: RoundHeader, result: RoundResult, split: str) -> "RoundInfo":
-        return RoundInfo(
-            id=header.id,
-            seed=header.seed,
-            track=header.track,
-            lanes=header.lanes,
-            split=split,
-            lights=header.lights,
-            traffic=header.traffic,
-            trajectory=header.trajectory,
-            frames=result.frames,
-            speed_kmh=header.speed_kmh,
-            lane_width_m=header.lane_width_m,
-            content_hash=result.content_hash,
-            path=path,
-            label_camera=header.label_camera,
-            line_offsets=header.line_offsets,
-        )
+        names = [each.name for each in fields(RoundInfo)]
+        parts = {name: getattr(header, name) for name in names if hasattr(header, name)}
+        parts |= {"frames": result.frames, "content_hash": result.content_hash}
+        return RoundInfo(**parts, path=path, split=split)

@@ -27,12 +27,12 @@ PAIRS_SHOWN = 3
 
 @dataclass(frozen=True, slots=True)
 class SplitConfig:
-    """How to make a split."""
+    """Options of `datagen split`, which has their defaults."""
 
-    by: str = "round"
-    test_share: float = 0.25
-    seed: int = 0
-    with_recovered: bool = False
+    by: str
+    test_share: float
+    seed: int
+    with_recovered: bool
 
 
 @dataclass(frozen=True, slots=True)

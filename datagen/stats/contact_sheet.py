@@ -16,6 +16,7 @@ from datagen.recording.round_metadata import RoundInfo
 from datagen.recording.schema.topics import ANNOTATIONS
 from datagen.view.contents import Contents
 from datagen.view.steps import TOPICS, Steps
+from runtime.cli import counted
 
 Image = NDArray[np.uint8]
 
@@ -71,6 +72,6 @@ def _card(info: RoundInfo, frame: int, size: tuple[int, int]) -> Card:
     for line in contents.markings(frame):
         points = np.round(line * SCALE - 0.5).astype(np.int32)  # OpenCV's pixel centres
         cv2.polylines(big, [points], False, _GREEN, 1, cv2.LINE_AA)
-    lanes = f"{info.lanes} lane{'s' if info.lanes > 1 else ''}"
+    lanes = counted(info.lanes, "lane")
     about = f"{info.id} #{frame} ({info.split or 'no side'}): {info.track}, {lanes}, {step.light}"
     return Card(np.asarray(big, np.uint8), about, contents.caption(frame))

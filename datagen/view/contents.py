@@ -24,6 +24,7 @@ from datagen.recording.schema.topics import (
     TRANSFORMS,
 )
 from datagen.view.steps import Step, Steps, values
+from runtime.cli import counted
 
 KMH = 3.6
 Numbers = list[float | None]
@@ -82,10 +83,9 @@ class Contents:
     def about(self) -> str:
         """Summary of the round in one line."""
         h, frames = self.header, len(self.steps)
-        lanes = f"{h.lanes} lane{'' if h.lanes == 1 else 's'}"
-        cars = f"{h.traffic} other car{'' if h.traffic == 1 else 's'}"
+        road = f"{counted(h.lanes, 'lane')}, {counted(h.traffic, 'other car')}"
         return (
-            f"{h.id}: {h.track}, {lanes}, {cars}, {summarize_lights(h.lights)}, {h.trajectory}, "
+            f"{h.id}: {h.track}, {road}, {summarize_lights(h.lights)}, {h.trajectory}, "
             f"{h.speed_kmh:g} km/h; {frames} frames, {frames / h.frequency_hz:g} s"
         )
 

@@ -3,6 +3,7 @@
 Positions are in m in the world frame, angles in rad, markings in pixels of the image.
 """
 
+from dataclasses import asdict
 from math import atan2
 from typing import Any
 
@@ -57,13 +58,7 @@ def _plot(plot: Plot) -> dict[str, Any]:
         name: [None if value is None else round(value, 4) for value in column]
         for name, column in plot.series.items()
     }
-    return {
-        "title": plot.title,
-        "unit": plot.unit,
-        "series": series,
-        "dots": plot.dots,
-        "limits": plot.limits,
-    }
+    return asdict(plot) | {"series": series}
 
 
 def _flatten(points: Points, digits: int = 2) -> list[float]:

@@ -20,12 +20,12 @@ OnShown = Callable[[str], None]
 
 @dataclass(frozen=True, slots=True)
 class ShowConfig:
-    """How to show a round. Without any option: in a window of Rerun."""
+    """Options of `datagen view`, which has their defaults."""
 
-    html: Path | None = None
-    save: Path | None = None
-    web: bool = False
-    port: int = 9090
+    html: Path | None
+    save: Path | None
+    web: bool
+    port: int
 
     def validate(self) -> None:
         """Raise UserError for options that cannot be met, before anything is read."""

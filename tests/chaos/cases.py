@@ -32,7 +32,7 @@ from trackfeatures.errors import UserError
 
 ROUNDS = {"r000": "train", "r001": "train", "r002": "test", "r003": "test"}
 IMAGE = golden_image(280, 210)
-RUN = ["--recipe", "paper", "--batch", "2", "--device", "cpu", "--threads", "1"]
+RUN = "--recipe paper --batch 2 --device cpu --threads 1"
 UNFINISHED = (".partial", "staged", ".merging")
 """Parts of the names of files that are not complete."""
 
@@ -44,14 +44,20 @@ class Case:
     name: str
     prepare: Callable[[Path, Path], object]
     """Makes the old state, from (material, home)."""
-    words: Callable[[Path, Path], list[str]]
-    """The command, or what continues it: from (material, home)."""
+    words: str
+    """The command, with the places {material} and {home}."""
     look: Callable[[Path], Any]
     """What a reader takes as whole; None: it refuses. Fails where a part is taken as whole."""
     share: int = 1
     """One in so many kills: loading a model takes longer."""
     by_round: bool = False
     """Each round counts: a dataset of old rounds and some of the new ones is whole as well."""
+
+    def command(self, material: Path, home: Path) -> list[str]:
+        """The command, or what continues a training that has its configuration."""
+        if self.words == TRAIN_WORDS and (home / "run" / "config.json").is_file():
+            return ["mtlnet", "train", "--out", str(home / "run"), "--resume"]
+        return self.words.format(material=material, home=home).split()
 
 
 def make_material(folder: Path, runner: Runner) -> None:
@@ -62,8 +68,10 @@ def make_material(folder: Path, runner: Runner) -> None:
         _write_plan(folder / name)
         for round_id in ids:
             samples.add_round(folder / name, samples.header(round_id))
-    assert runner.run(_merge(folder, folder / "first", "one"), folder).code == 0
-    assert runner.run(_merge(folder, folder / "both", "one", "two"), folder).code == 0
+    for name, shards in {"first": ["one"], "both": ["one", "two"]}.items():
+        parts = [str(folder / shard) for shard in shards]
+        words = ["datagen", "merge", *parts, "--out", str(folder / name)]
+        assert runner.run(words, folder).code == 0
     damaged = bytearray(round_path(folder / "both", "r001").read_bytes())
     damaged[len(damaged) // 2] ^= 255
     (folder / "r001.mcap").write_bytes(damaged)
@@ -74,7 +82,7 @@ def make_material(folder: Path, runner: Runner) -> None:
     write_split(split_path(folder / "roads"), Split(TRAIN, TEST))
     for name, seed in (("model", "3"), ("other", "2")):
         words = ["mtlnet", "train", "--data", str(folder / "roads"), "--out", str(folder / name)]
-        done = runner.run([*words, *RUN, "--iterations", "2", "--seed", seed], folder)
+        done = runner.run([*words, *RUN.split(), "--iterations", "2", "--seed", seed], folder)
         assert done.code == 0, done.stderr
 
 
@@ -82,10 +90,6 @@ def _write_plan(folder: Path) -> None:
     entries = [{"id": name, "split": side} for name, side in ROUNDS.items()]
     plan = {"hash": "0" * 64, "definitions": tf.VERSION, "rounds": entries}
     (folder / "plan.json").write_text(json.dumps(plan))
-
-
-def _merge(material: Path, out: Path, *shards: str) -> list[str]:
-    return ["datagen", "merge", *(str(material / name) for name in shards), "--out", str(out)]
 
 
 # Datasets
@@ -178,99 +182,75 @@ def look_at_report(home: Path) -> Any:
     return (home / "page.html").read_text()
 
 
-def _train(material: Path, home: Path) -> list[str]:
-    """The command, or with the run's configuration there what continues it."""
-    words = ["mtlnet", "train", "--out", str(home / "run")]
-    if (home / "run" / "config.json").is_file():
-        return [*words, "--resume"]
-    return [*words, "--data", str(material / "roads"), *RUN, "--iterations", "3"]
+TRAIN_WORDS = "mtlnet train --out {home}/run --iterations 3 --data {material}/roads " + RUN
+
+
+def copied(source: str, target: str) -> Callable[[Path, Path], object]:
+    """Makes the old state: a folder of the material in the home."""
+    return lambda material, home: shutil.copytree(material / source, home / target)
 
 
 CASES = (
     Case(
         "merge",
         lambda *_: None,
-        lambda material, home: _merge(material, home / "out", "one", "two"),
+        "datagen merge {material}/one {material}/two --out {home}/out",
         look_at_dataset,
         by_round=True,
     ),
     Case(
         "merge into a dataset",
-        lambda material, home: shutil.copytree(material / "first", home / "out"),
-        lambda material, home: _merge(material, home / "out", "two"),
+        copied("first", "out"),
+        "datagen merge {material}/two --out {home}/out",
         look_at_dataset,
         by_round=True,
     ),
     Case(
         "recover",
         lambda *_: None,
-        lambda material, home: [
-            *("datagen", "recover", str(material / "r001.mcap")),
-            *("--out", str(home / "saved.mcap")),
-        ],
+        "datagen recover {material}/r001.mcap --out {home}/saved.mcap",
         look_at_file,
     ),
     Case(
         "recover into a dataset",
         _prepare_recovery,
-        lambda material, home: [
-            *("datagen", "recover", str(material / "r001.mcap")),
-            *("--out", str(round_path(home / "data", "r001"))),
-        ],
+        "datagen recover {material}/r001.mcap --out {home}/data/rounds/r001.mcap",
         look_at_recovered,
     ),
     Case(
         "split",
-        lambda material, home: shutil.copytree(material / "both", home / "data"),
-        lambda _material, home: [
-            *("datagen", "split", str(home / "data"), "--name", "mine", "--by", "round"),
-        ],
+        copied("both", "data"),
+        "datagen split {home}/data --name mine --by round",
         look_at_split,
     ),
     Case(
         "export a dataset",
         lambda *_: None,
-        lambda material, home: [
-            *("datagen", "export", str(material / "both"), "--out", str(home / "out")),
-        ],
+        "datagen export {material}/both --out {home}/out",
         look_at_shards,
         share=4,
     ),
-    Case(
-        "train",
-        lambda *_: None,
-        _train,
-        look_at_run,
-        share=4,
-    ),
+    Case("train", lambda *_: None, TRAIN_WORDS, look_at_run, share=4),
     Case(
         "train on",
-        lambda material, home: shutil.copytree(material / "model", home / "run"),
-        lambda _material, home: [
-            *("mtlnet", "train", "--out", str(home / "run"), "--resume", "--iterations", "4"),
-        ],
+        copied("model", "run"),
+        "mtlnet train --out {home}/run --resume --iterations 4",
         look_at_run,
         share=4,
     ),
     Case(
         "export",
-        lambda material, home: shutil.copytree(
-            material / "other" / "export" / "openvino-f32", home / "out"
-        ),
-        lambda material, home: [
-            *("mtlnet", "export", "--model", str(material / "model"), "--frames", "2"),
-            *("--data", str(material / "roads"), "--out", str(home / "out")),
-        ],
+        copied("other/export/openvino-f32", "out"),
+        "mtlnet export --model {material}/model --frames 2 --data {material}/roads"
+        " --out {home}/out",
         look_at_export,
         share=4,
     ),
     Case(
         "evaluate",
         lambda _material, home: (home / "page.html").write_text("old"),
-        lambda material, home: [
-            *("mtlnet", "evaluate", "--model", str(material / "model"), "--split", "test"),
-            *("--data", str(material / "roads"), "--report", str(home / "page.html")),
-        ],
+        "mtlnet evaluate --model {material}/model --split test --data {material}/roads"
+        " --report {home}/page.html",
         look_at_report,
         share=4,
     ),

@@ -71,7 +71,7 @@ class Stage:
 
     def run(self, fault: Fault | None = None) -> Done:
         """Run the command, or what continues it."""
-        return self.commands.run(self.case.words(self.material, self.home), self.home, fault)
+        return self.commands.run(self.case.command(self.material, self.home), self.home, fault)
 
     def measure(self) -> None:
         """Run it undisturbed."""

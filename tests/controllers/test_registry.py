@@ -1,6 +1,8 @@
 """The controllers by name, their parameters, and classes of a user."""
 
 import importlib
+import math
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -73,12 +75,26 @@ def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
+def oscillation() -> list[Observation]:
+    """A second and a half of a car that turns to and fro once a second: the delay is plain."""
+    omega = 2.0 * math.pi
+    return [
+        replace(
+            SEEN, angle=-0.05 * math.sin(omega * t), yaw_rate=0.05 * omega * math.cos(omega * t)
+        )
+        for t in (LOOP.dt * step for step in range(60))
+    ]
+
+
 @pytest.mark.parametrize("name", list(CONTROLLERS))
 def test_every_parameter_can_be_set_and_changes_the_steering(name: str) -> None:
     for parameter, (low, high) in CONTROLLERS[name].tunable.items():
         assert 0.0 < low < high
-        soft, hard = (make_controller(name, LOOP, {parameter: v}) for v in (low, high))
-        assert soft.update(SEEN) != hard.update(SEEN), parameter
+        soft, hard = (
+            [controller.update(seen) for seen in oscillation()]
+            for controller in (make_controller(name, LOOP, {parameter: v}) for v in (low, high))
+        )
+        assert soft[-1] != hard[-1], parameter
 
 
 def test_an_unknown_parameter_or_value_is_refused() -> None:

@@ -1,6 +1,8 @@
 """Shared by the tests of recording: rounds made without a simulator, and datasets of them."""
 
+import errno
 import json
+import os
 import sys
 from collections.abc import Callable
 from dataclasses import replace
@@ -93,6 +95,16 @@ def refused(
         return stderr
 
     return run
+
+
+@pytest.fixture
+def fill_disk(monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
+    """From its call on, no file can be written to the disk to its end."""
+
+    def full(*args: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    return lambda: monkeypatch.setattr("runtime.files.fsync_path", full)
 
 
 @pytest.fixture(scope="session")

@@ -8,6 +8,7 @@ import sys
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
+from typing import Any
 from unittest import mock
 
 import gymnasium as gym
@@ -56,16 +57,6 @@ ROWS = [
 ]
 VIEW = CameraParameters()
 Try = Callable[[Path], object]
-TRIES: dict[str, Try] = {}
-"""What makes the program refuse, by the first words of the row."""
-
-
-def row(words: str) -> Callable[[Try], Try]:
-    def add(function: Try) -> Try:
-        TRIES[words] = function
-        return function
-
-    return add
 
 
 def jpeg(width: int = 280, height: int = 210) -> bytes:
@@ -96,31 +87,8 @@ def film(folder: Path, *arguments: str, name: str = "a.mp4") -> Path:
     return folder / name
 
 
-@row("no image, or a kind")
-def _(folder: Path) -> object:
-    return read_image(written(folder, "a.jpg", b"\0\0\0\x18ftypheic" + bytes(40)), VIEW)
-
-
-@row("a damaged or incomplete image")
-def _(folder: Path) -> object:
-    return read_image(written(folder, "a.jpg", jpeg()[:-300]), VIEW)
-
-
-@row("an image of under 16 px")
-def _(folder: Path) -> object:
-    return read_image(written(folder, "a.jpg", jpeg(12, 9)), VIEW)
-
-
-@row("an image that shows less")
-def _(folder: Path) -> object:
-    return read_image(written(folder, "a.jpg", jpeg(100, 210)), VIEW)
-
-
-@row("an image of a camera file")
-def _(folder: Path) -> object:
-    return Rectification(CameraParameters(fov_y_deg=12.0), VIEW).image(
-        np.zeros((210, 280, 3), np.uint8)
-    )
+def image(folder: Path, content: bytes) -> object:
+    return read_image(written(folder, "a.jpg", content), VIEW)
 
 
 def camera_file(folder: Path, text: str) -> object:
@@ -128,69 +96,153 @@ def camera_file(folder: Path, text: str) -> object:
 
 
 SIZED = "image_width: 640\nimage_height: 480\ndist_coeffs: [0.1, 0, 0, 0]\n"
+MATRIX = "camera_matrix: [[500, 0, 9], [0, 500, 9], [0, 0, 1]]\n"
+GREY = recorded.ros_image(np.full((210, 280), 90, np.uint8), "mono8")
+LARGE = recorded.ros_image(np.full((420, 560), 90, np.uint8), "mono8")
+DEPTHS = recorded.ros_image(np.ones((210, 280), np.float32), "32FC1")
+CAMERA = recorded.ros_camera((280, 210), (150, 150, 140, 105))
 
 
-@row("a camera file without numbers")
-def _(folder: Path) -> object:
-    return camera_file(folder, SIZED + "camera_matrix:\n")
+def bag(folder: Path, *messages: tuple[str, str, object]) -> Path:
+    return recorded.write_bag(folder / "bag", list(messages))
 
 
-@row("a singular camera matrix")
-def _(folder: Path) -> object:
-    return camera_file(folder, SIZED + "camera_matrix: [[0, 0, 9], [0, 5, 9], [0, 0, 1]]\n")
+def damaged_round(folder: Path) -> Dataset:
+    data = write_dataset(folder)
+    path = data / "rounds" / "r000.mcap"
+    content = bytearray(path.read_bytes())
+    content[read_summary(memoryview(bytes(content))).chunks[0].start + 20_000] ^= 0x10
+    path.unlink()  # other tests may have mapped it
+    path.write_bytes(content)
+    return Dataset.open(data)
 
 
-@row("coefficients of another number")
-def _(folder: Path) -> object:
-    text = SIZED.replace("0, 0, 0]", "0]")
-    return camera_file(folder, text + "camera_matrix: [[500, 0, 9], [0, 500, 9], [0, 0, 1]]\n")
+def calibrated(folder: Path, source: Path, **options: Any) -> object:
+    return calibrate(CalibrateConfig([str(source)], folder / "camera.yaml", **options))
 
 
-@row("a number that is not finite")
-def _(folder: Path) -> object:
-    return camera_file(folder, SIZED + "camera_matrix: [[.nan, 0, 9], [0, 5, 9], [0, 0, 1]]\n")
+def labelled(folder: Path, ml: str, width: int) -> object:
+    written(folder, "a.jpg", jpeg(width))
+    rows = f"{','.join(COLUMNS)}\na.jpg,{ml},2.0,,,,0.0,straight\n"
+    written(folder, "labels.csv", rows.encode())
+    return open_custom_images(folder, VIEW)
 
 
-@row("a camera matrix without")
-def _(folder: Path) -> object:
-    return camera_file(folder, "K: [500, 0, 9, 0, 500, 9, 0, 0, 1]\nD: [0, 0, 0, 0]\n")
+def pictures_without_camera(folder: Path) -> object:
+    written(folder, "a.jpg", jpeg())
+    return LabelFolder(folder, None, VIEW)
 
 
-@row("to the service: two cameras")
-def _(folder: Path) -> object:
-    path = written(folder, "camera.yaml", b"fov_y_deg: 60\n")
-    return read_cameras([f"a={path}", f"a={path}"], VIEW)
+def environment() -> gym.Env[object, object]:
+    return gym.make("driverview/LateralControl-v0", track="oval").unwrapped
 
 
-@row("to the service: another kind")
-def _(folder: Path) -> object:
-    return inspect(b"BM" + bytes(100), VIEW)
+def on_oval(command: Command | None = None, **start: float) -> object:
+    with World(Road(find_track("oval"))) as world:
+        return [world.reset(seed=0, **start), command and world.step(command)]
 
 
-@row("to the service: bytes behind")
-def _(folder: Path) -> object:
-    return inspect(jpeg() + bytes(100), VIEW)
+def halved(path: Path) -> Path:
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    return path
 
 
-@row("to the service: over")
-def _(folder: Path) -> object:
-    return inspect(jpeg(4000, 3000), VIEW)
+TRIES: dict[str, Try] = {
+    "no image, or a kind": lambda folder: image(folder, b"\0\0\0\x18ftypheic" + bytes(40)),
+    "a damaged or incomplete image": lambda folder: image(folder, jpeg()[:-300]),
+    "an image of under 16 px": lambda folder: image(folder, jpeg(12, 9)),
+    "an image that shows less": lambda folder: image(folder, jpeg(100, 210)),
+    "an image of a camera file": lambda folder: Rectification(
+        CameraParameters(fov_y_deg=12.0), VIEW
+    ).image(np.zeros((210, 280, 3), np.uint8)),
+    "a camera file without numbers": lambda folder: camera_file(folder, SIZED + "camera_matrix:\n"),
+    "a singular camera matrix": lambda folder: camera_file(
+        folder, SIZED + MATRIX.replace("500", "0")
+    ),
+    "coefficients of another number": lambda folder: camera_file(
+        folder, SIZED.replace("0, 0, 0]", "0]") + MATRIX
+    ),
+    "a number that is not finite": lambda folder: camera_file(
+        folder, SIZED + MATRIX.replace("500", ".nan")
+    ),
+    "a camera matrix without": lambda folder: camera_file(
+        folder, "K: [500, 0, 9, 0, 500, 9, 0, 0, 1]\nD: [0, 0, 0, 0]\n"
+    ),
+    "to the service: two cameras": lambda folder: read_cameras(
+        [f"a={written(folder, 'camera.yaml', b'fov_y_deg: 60')}"] * 2, VIEW
+    ),
+    "to the service: another kind": lambda folder: inspect(b"BM" + bytes(100), VIEW),
+    "to the service: bytes behind": lambda folder: inspect(jpeg() + bytes(100), VIEW),
+    "to the service: over": lambda folder: inspect(jpeg(4000, 3000), VIEW),
+    "a missing file": lambda folder: read_image(folder / "none.jpg", VIEW),
+    "no film": lambda folder: read_film_header(written(folder, "a.mp4", b"no film at all")),
+    "a film that breaks off": lambda folder: predict(
+        halved(film(folder, "-c:v", "mpeg4", "-movflags", "faststart"))
+    ),
+    "a recording without pictures": lambda folder: predict(
+        bag(folder, ("/info", "CameraInfo", CAMERA))
+    ),
+    "a recording with several cameras": lambda folder: predict(
+        bag(folder, ("/left", "Image", GREY), ("/right", "Image", GREY))
+    ),
+    "a topic that is not there": lambda folder: predict_files(
+        engine(), [str(bag(folder, ("/left", "Image", GREY)))], topic="/right"
+    ),
+    "a picture that holds depths": lambda folder: predict(bag(folder, ("/depth", "Image", DEPTHS))),
+    "pictures that change their size": lambda folder: predict(
+        bag(folder, ("/left", "Image", GREY), ("/left", "Image", LARGE))
+    ),
+    "a stream that cannot be opened": lambda folder: predict_files(
+        engine(), ["http://127.0.0.1:9/a"]
+    ),
+    "a webcam that is not there": lambda folder: predict_files(engine(), ["63"]),
+    "a film that shows no marked road": lambda folder: calibrated(
+        folder, film(folder, "-vf", "boxblur=30", "-c:v", "mpeg4")
+    ),
+    "pictures without a board": lambda folder: calibrated(folder, written(folder, "a.jpg", jpeg())),
+    "a lane width that no lane has": lambda folder: calibrated(
+        folder, written(folder, "a.jpg", jpeg()), lane_width_m=0.3
+    ),
+    "a frame in a chunk": lambda folder: damaged_round(folder).select("train").image(0),
+    "a label in a chunk": lambda folder: damaged_round(folder).select("train").labels,
+    "a file that is no round": lambda folder: open_round(written(folder, "a.mcap", jpeg())),
+    "another version of the definitions": lambda folder: Dataset.open(
+        write_dataset(folder, definitions="1")
+    ).select("train"),
+    "a faulty row": lambda folder: labelled(folder, "2.0", 280),
+    "an image of another aspect ratio": lambda folder: labelled(folder, "-2.0", 400),
+    "a `?` where none may be": lambda folder: labelled(folder, "?", 280),
+    "a table to import": lambda folder: import_labels(
+        written(folder, "a.csv", b"file\n"), folder / "new"
+    ),
+    "pictures to label without their camera": pictures_without_camera,
+    "handles above the horizon": lambda folder: fit_markings(
+        VIEW, [[9, 9], [20, 8]], [[200, 180], [150, 120]], pitch_deg=0.0
+    ),
+    "a lane width for varied": lambda folder: make_road(find_track("oval"), 1, 3.5, "varied"),
+    "an action or command": lambda folder: on_oval(Command(steer=1.00001)),
+    "a start outside": lambda folder: on_oval(to_middle=40.0),
+    "a step before the first reset": lambda folder: environment().step([0.0]),
+    "a copy of an environment": lambda folder: copy.deepcopy(environment()),
+    "an unknown track": lambda folder: find_track("no-such-track"),
+    "a random road": lambda folder: find_track("random:x"),
+    "a run that does not exist": lambda folder: resolve_run("no-such-run", folder),
+    "rounds without the drives": lambda folder: drive_rows(
+        Dataset.open(write_dataset(folder)).select(), folder
+    ),
+    "weights of the loss": lambda folder: parse_alpha("0.3,-1,0.5"),
+}
+"""What makes the program refuse, by the first words of the row."""
 
 
-@row("a missing file")
-def _(folder: Path) -> object:
-    return read_image(folder / "none.jpg", VIEW)
+def row(words: str) -> Callable[[Try], Try]:
+    """Adds a longer attempt to `TRIES`."""
 
+    def add(function: Try) -> Try:
+        TRIES[words] = function
+        return function
 
-@row("no film")
-def _(folder: Path) -> object:
-    return read_film_header(written(folder, "a.mp4", b"no film at all"))
-
-
-@row("a film that breaks off")
-def _(folder: Path) -> object:
-    path = film(folder, "-c:v", "mpeg4", "-movflags", "faststart")
-    return predict(written(folder, "cut.mp4", path.read_bytes()[: path.stat().st_size // 2]))
+    return add
 
 
 @row("a film in which FFmpeg")
@@ -238,142 +290,12 @@ def _(folder: Path) -> object:
     return predict(folder / "a.mp4")
 
 
-GREY = recorded.ros_image(np.full((210, 280), 90, np.uint8), "mono8")
-
-
-@row("a recording without pictures")
-def _(folder: Path) -> object:
-    camera = recorded.ros_camera((280, 210), (150, 150, 140, 105))
-    return predict(recorded.write_bag(folder / "bag", [("/info", "CameraInfo", camera)]))
-
-
-@row("a recording with several cameras")
-def _(folder: Path) -> object:
-    images = [("/left", "Image", GREY), ("/right", "Image", GREY)]
-    return predict(recorded.write_bag(folder / "bag", images))
-
-
-@row("a topic that is not there")
-def _(folder: Path) -> object:
-    bag = recorded.write_bag(folder / "bag", [("/left", "Image", GREY)])
-    return predict_files(engine(), [str(bag)], topic="/right")
-
-
 @row("a recording that is cut")
 def _(folder: Path) -> object:
     bag = recorded.write_bag(folder / "bag", [("/left", "Image", GREY)] * 3)
     file = next(bag.glob("*.mcap"))
     file.write_bytes(file.read_bytes()[:-100])
     return predict(bag)
-
-
-@row("a picture that holds depths")
-def _(folder: Path) -> object:
-    depths = recorded.ros_image(np.ones((210, 280), np.float32), "32FC1")
-    return predict(recorded.write_bag(folder / "bag", [("/depth", "Image", depths)]))
-
-
-@row("pictures that change their size")
-def _(folder: Path) -> object:
-    other = recorded.ros_image(np.full((420, 560), 90, np.uint8), "mono8")
-    images = [("/left", "Image", GREY), ("/left", "Image", other)]
-    return predict(recorded.write_bag(folder / "bag", images))
-
-
-@row("a stream that cannot be opened")
-def _(folder: Path) -> object:
-    return predict_files(engine(), ["http://127.0.0.1:9/a"])
-
-
-@row("a webcam that is not there")
-def _(folder: Path) -> object:
-    return predict_files(engine(), ["63"])
-
-
-def damaged_round(folder: Path) -> Dataset:
-    data = write_dataset(folder)
-    path = data / "rounds" / "r000.mcap"
-    content = bytearray(path.read_bytes())
-    content[read_summary(memoryview(bytes(content))).chunks[0].start + 20_000] ^= 0x10
-    path.unlink()  # other tests may have mapped it
-    path.write_bytes(content)
-    return Dataset.open(data)
-
-
-@row("a film that shows no marked road")
-def _(folder: Path) -> object:
-    path = film(folder, "-vf", "boxblur=30", "-c:v", "mpeg4")
-    return calibrate(CalibrateConfig([str(path)], folder / "camera.yaml"))
-
-
-@row("pictures without a board")
-def _(folder: Path) -> object:
-    path = written(folder, "a.jpg", jpeg())
-    return calibrate(CalibrateConfig([str(path)], folder / "camera.yaml"))
-
-
-@row("a lane width that no lane has")
-def _(folder: Path) -> object:
-    path = written(folder, "a.jpg", jpeg())
-    return calibrate(CalibrateConfig([str(path)], folder / "camera.yaml", lane_width_m=0.3))
-
-
-@row("a frame in a chunk")
-def _(folder: Path) -> object:
-    return damaged_round(folder).select("train").image(0)
-
-
-@row("a label in a chunk")
-def _(folder: Path) -> object:
-    return damaged_round(folder).select("train").labels
-
-
-@row("a file that is no round")
-def _(folder: Path) -> object:
-    return open_round(written(folder, "a.mcap", jpeg()))
-
-
-@row("another version of the definitions")
-def _(folder: Path) -> object:
-    return Dataset.open(write_dataset(folder, definitions="1")).select("train")
-
-
-def labelled(folder: Path, ml: str, width: int) -> object:
-    written(folder, "a.jpg", jpeg(width))
-    rows = f"{','.join(COLUMNS)}\na.jpg,{ml},2.0,,,,0.0,straight\n"
-    written(folder, "labels.csv", rows.encode())
-    return open_custom_images(folder, VIEW)
-
-
-@row("a faulty row")
-def _(folder: Path) -> object:
-    return labelled(folder, "2.0", 280)
-
-
-@row("an image of another aspect ratio")
-def _(folder: Path) -> object:
-    return labelled(folder, "-2.0", 400)
-
-
-@row("a `?` where none may be")
-def _(folder: Path) -> object:
-    return labelled(folder, "?", 280)
-
-
-@row("a table to import")
-def _(folder: Path) -> object:
-    return import_labels(written(folder, "a.csv", b"file\n"), folder / "new")
-
-
-@row("pictures to label without their camera")
-def _(folder: Path) -> object:
-    written(folder, "a.jpg", jpeg())
-    return LabelFolder(folder, None, VIEW)
-
-
-@row("handles above the horizon")
-def _(folder: Path) -> object:
-    return fit_markings(VIEW, [[9, 9], [20, 8]], [[200, 180], [150, 120]], pitch_deg=0.0)
 
 
 @row("a contact without PyBullet")
@@ -385,33 +307,6 @@ def _(folder: Path) -> object:
         return [world.step(Command(gear=0)) for _ in range(40)]
 
 
-@row("a lane width for varied")
-def _(folder: Path) -> object:
-    return make_road(find_track("oval"), 1, 3.5, "varied")
-
-
-@row("an action or command")
-def _(folder: Path) -> object:
-    with World(Road(find_track("oval"))) as world:
-        world.reset(seed=0)
-        return world.step(Command(steer=1.00001))
-
-
-@row("a start outside")
-def _(folder: Path) -> object:
-    with World(Road(find_track("oval"))) as world:
-        return world.reset(seed=0, to_middle=40.0)
-
-
-def environment() -> gym.Env[object, object]:
-    return gym.make("driverview/LateralControl-v0", track="oval").unwrapped
-
-
-@row("a step before the first reset")
-def _(folder: Path) -> object:
-    return environment().step([0.0])
-
-
 @row("a picture in a process")
 def _(folder: Path) -> object:
     turns = Turns(mock.Mock(), (1, 2, 2, 3), free=lambda: None)
@@ -419,25 +314,10 @@ def _(folder: Path) -> object:
         return None
 
 
-@row("a copy of an environment")
-def _(folder: Path) -> object:
-    return copy.deepcopy(environment())
-
-
 @row("EGL is missing")
 def _(folder: Path) -> object:
     with mock.patch("moderngl.create_context", side_effect=ImportError("libEGL.so not loaded")):
         return Graphics()
-
-
-@row("an unknown track")
-def _(folder: Path) -> object:
-    return find_track("no-such-track")
-
-
-@row("a random road")
-def _(folder: Path) -> object:
-    return find_track("random:x")
 
 
 @row("a TORCS track")
@@ -450,21 +330,6 @@ def _(folder: Path) -> object:
         f'<section name="Track Segments">{segment}</section></section></params>'
     )
     return read_torcs(written(folder, "t.xml", text.encode()))
-
-
-@row("a run that does not exist")
-def _(folder: Path) -> object:
-    return resolve_run("no-such-run", folder)
-
-
-@row("rounds without the drives")
-def _(folder: Path) -> object:
-    return drive_rows(Dataset.open(write_dataset(folder)).select(), folder)
-
-
-@row("weights of the loss")
-def _(folder: Path) -> object:
-    return parse_alpha("0.3,-1,0.5")
 
 
 @pytest.mark.parametrize("row", ROWS, ids=lambda cells: cells[0][:40])

@@ -32,11 +32,8 @@ def command(*arguments: str) -> Any:
 @pytest.mark.extended
 def test_collect_train_evaluate_serve_and_drive(tmp_path: Path) -> None:
     data, run = str(tmp_path / "data"), str(tmp_path / "run")
-    collected = command(
-        *("datagen", "collect", "--rounds", "1", "--frames", "300", "--tracks", "oval"),
-        *("--lanes", "1", "--lights", "clear", "--seed", "3", "--workers", "1"),
-        *("--out", data, "--json"),
-    )
+    options = "--rounds 1 --frames 300 --tracks oval --lanes 1 --lights clear --seed 3 --workers 1"
+    collected = command("datagen", "collect", *options.split(), "--out", data, "--json")
     assert (collected["rounds"], collected["frames"]) == (1, 300)
     verified = command("datagen", "verify", data, "--level", "deep", "--json")
     expected = {"ok": True, "rounds": 1, "frames": 300, "problems": []}
@@ -64,20 +61,10 @@ def test_collect_train_evaluate_serve_and_drive(tmp_path: Path) -> None:
         assert answer["angle_rad"] == pytest.approx(predicted[0]["angle_rad"], abs=1e-6)
         posted = post_frames(frames, [100, 200], client)
         log = tmp_path / "drive.csv"
-        drive = command(
-            *(
-                "controllers",
-                "drive",
-                "--controller",
-                "lqr-preview",
-                "--track",
-                "oval",
-                "--lanes",
-                "1",
-            ),
-            *("--perception", url, "--steps", "400", "--log", str(log), "--json"),
-            *("--parameters", str(write_soft_parameters(tmp_path / "soft.json"))),
-        )
+        words = f"controllers drive --controller lqr-preview --track oval --lanes 1 --log {log}"
+        soft = write_soft_parameters(tmp_path / "soft.json")
+        words += f" --perception {url} --steps 400 --parameters {soft} --json"
+        drive = command(*words.split())
     # 400 steps of 50 ms: 20 s, on the oval's straight, which a model trained on 60 batches of that
     # road can follow; the first bend comes later.
     rows = log.read_text().splitlines()

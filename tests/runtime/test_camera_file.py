@@ -19,64 +19,10 @@ LENS = replace(
     distortion="opencv", coefficients=D,
 )  # fmt: skip
 FISHEYE = replace(LENS, distortion="fisheye", coefficients=(0.1, -0.02, 0.003, -1e-05))
-
-ROS = """\
-image_width: 1280
-image_height: 720
-camera_name: narrow_stereo
-camera_matrix:
-  rows: 3
-  cols: 3
-  data: [700.5, 0., 655.25, 0., 720.25, 340.75, 0., 0., 1.]
-distortion_model: plumb_bob
-distortion_coefficients:
-  rows: 1
-  cols: 5
-  data: [-0.3, 0.1, 0.001, -0.002, 0.05]
-rectification_matrix:
-  rows: 3
-  cols: 3
-  data: [1, 0, 0, 0, 1, 0, 0, 0, 1]
-projection_matrix:
-  rows: 3
-  cols: 4
-  data: [700.5, 0, 655.25, 0, 0, 720.25, 340.75, 0, 0, 0, 1, 0]
-"""
-MESSAGE = """\
-header: {frame_id: camera}
-height: 720
-width: 1280
-distortion_model: plumb_bob
-d: [-0.3, 0.1, 0.001, -0.002, 0.05]
-k: [700.5, 0.0, 655.25, 0.0, 720.25, 340.75, 0.0, 0.0, 1.0]
-r: [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]
-"""
-KALIBR = """\
-cam0:
-  cam_overlaps: [1]
-  camera_model: pinhole
-  distortion_coeffs: [0.1, -0.02, 0.003, -1e-05]
-  distortion_model: equidistant
-  intrinsics: [700.5, 720.25, 655.25, 340.75]
-  resolution: [1280, 720]
-  rostopic: /cam0/image_raw
-cam1:
-  camera_model: pinhole
-  distortion_coeffs: [0.0, 0.0, 0.0, 0.0]
-  distortion_model: radtan
-  intrinsics: [1.0, 1.0, 1.0, 1.0]
-  resolution: [10, 10]
-"""
-ROWS = """\
-camera_matrix:
-- [700.5, 0.0, 655.25]
-- [0.0, 720.25, 340.75]
-- [0.0, 0.0, 1.0]
-dist_coeff:
-- [-0.3, 0.1, 0.001, -0.002, 0.05]
-image_width: 1280
-image_height: 720
-"""
+ROS, MESSAGE, KALIBR, ROWS = (
+    (Path(__file__).parent / "camera_files" / f"{name}.yaml").read_text()
+    for name in ("ros", "message", "kalibr", "rows")
+)
 
 
 def written(path: Path, text: str) -> Path:

@@ -6,9 +6,8 @@ A frame is intact if all its messages are: the image, its label and everything r
 import hashlib
 from collections import defaultdict
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import trackfeatures as tf
 from datagen.recording.dataset import IMAGE_DATA
@@ -62,9 +61,6 @@ class Recovered:
     saved: int
     lost: int
     at_least: bool
-
-    def as_json(self) -> dict[str, Any]:
-        return asdict(self)
 
 
 def recover(file: Path, out: Path | None = None) -> Recovered:

@@ -6,7 +6,7 @@ A bad file is reported, never raised.
 import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import trackfeatures as tf
@@ -39,9 +39,6 @@ class Report:
     content_hash: str | None = None
     recovered: tuple[str, ...] = ()
     """Rounds saved by `datagen recover`, one line each; not a problem by themselves."""
-
-    def as_json(self) -> dict[str, object]:
-        return asdict(self)
 
 
 def verify(

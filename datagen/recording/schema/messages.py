@@ -115,22 +115,15 @@ def caption(features: tf.TrackFeatures) -> str:
 
 
 def labels(frame: Frame) -> bytes:
-    features, place = frame.features, frame.place
+    features = frame.features
+    distances: dict[str, Any] = {f"to_marking_{n}": d for n, d in features.distances.items()}
     return _serialize(
         TrackFeatures(
-            to_marking_ml=features.ml,
-            to_marking_mr=features.mr,
-            to_marking_l=features.l,
-            to_marking_m=features.m,
-            to_marking_r=features.r,
+            **distances,
             to_lane_centre=features.to_lane_centre,
             angle=features.angle,
             heading=features.heading.name,
-            lanes=place.lanes,
-            lane_index=place.lane_index,
-            curvature=place.curvature,
-            to_middle=place.to_middle,
-            s=place.s,
+            **asdict(frame.place),
         )
     )
 

@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 
 from benchmarks import gpu_run
-from benchmarks.material.gpu import machine, wheels
-from benchmarks.material.outcome import NOT_MEASURED
+from benchmarks.claims.outcome import NOT_MEASURED
+from benchmarks.gpu import machine, wheels
 from trackfeatures.errors import UserError
 
 ROOT = Path(__file__).parents[3]
@@ -110,7 +110,9 @@ def test_a_machine_that_lacks_something_starts_nothing(
     monkeypatch.setattr(machine, "describe_machine", lambda: found)
     words = ["--out", tmp_path / "out", "--work", tmp_path / "work", "--tracks", tmp_path]
     monkeypatch.setattr(sys, "argv", ["gpu_run.py", *map(str, words)])
-    assert gpu_run.main() == NOT_MEASURED
+    with pytest.raises(SystemExit) as ended:
+        gpu_run.main()
+    assert ended.value.code == NOT_MEASURED
     first, *lacks = capsys.readouterr().err.splitlines()
     assert first == "not measured: this machine lacks"
     assert [line.split(":")[0] for line in lacks] == ["  tracks", "  gpu"]

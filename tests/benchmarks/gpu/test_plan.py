@@ -5,16 +5,16 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.material.gpu import stages
-from benchmarks.material.gpu.collecting import (
+from benchmarks.gpu import stages
+from benchmarks.gpu.collecting import (
     SEEDS,
     counted,
     evaluation_collections,
     most_frames,
     train_collections,
 )
-from benchmarks.material.gpu.plan import FULL, REHEARSAL, SECONDS, STAGES, Plan
-from benchmarks.material.gpu.process import Ended
+from benchmarks.gpu.plan import FULL, REHEARSAL, SECONDS, STAGES, Plan
+from benchmarks.gpu.process import Ended
 from mtlnet.inference.model_card import SHIPPED, read_card
 from trackfeatures.errors import UserError
 

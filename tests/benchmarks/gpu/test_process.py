@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.material.gpu import process
-from benchmarks.material.gpu.process import Command, Interrupted
+from benchmarks.gpu import process
+from benchmarks.gpu.process import Command, Interrupted
 
 ROOT = Path(__file__).parents[3]
 

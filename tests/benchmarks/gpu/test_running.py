@@ -19,12 +19,12 @@ import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
-from benchmarks.material.gpu import report, wheels
-from benchmarks.material.gpu.plan import REHEARSAL, STAGES, Plan
-from benchmarks.material.gpu.process import Interrupted
-from benchmarks.material.gpu.report import DONE, FAILED, SKIPPED, STOPPED, Report
-from benchmarks.material.gpu.running import run_stages
-from benchmarks.material.gpu.stages import Run, StageFailed, timing
+from benchmarks.gpu import report, wheels
+from benchmarks.gpu.plan import REHEARSAL, STAGES, Plan
+from benchmarks.gpu.process import Interrupted
+from benchmarks.gpu.report import DONE, FAILED, SKIPPED, STOPPED, Report
+from benchmarks.gpu.running import run_stages
+from benchmarks.gpu.stages import Run, StageFailed, timing
 from mtlnet.inference.curves import COLUMNS
 from mtlnet.inference.model_card import read_card
 from trackfeatures.errors import UserError

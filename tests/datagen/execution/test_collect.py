@@ -70,7 +70,7 @@ def test_verify_and_info_as_commands(
 def test_the_same_plan_gives_the_same_bytes_with_another_number_of_workers(
     collected: Path, tmp_path: Path
 ) -> None:
-    done = datagen("collect", *SHORT, "--out", tmp_path / "again", "--workers", "1")
+    done = datagen_here("collect", *SHORT, "--out", tmp_path / "again", "--workers", "1")
     assert done.returncode == 0, done.stderr
     for path in sorted((collected / "rounds").iterdir()):
         assert path.read_bytes() == (tmp_path / "again" / "rounds" / path.name).read_bytes()
@@ -81,7 +81,7 @@ def test_a_finished_dataset_is_left_alone_and_a_lost_round_made_again(collected:
     kept = collected / "rounds" / "round-000.mcap"
     before, written = lost.read_bytes(), kept.stat().st_mtime_ns
     lost.unlink()
-    done = datagen("collect", *SHORT, "--out", collected, "--json")
+    done = datagen_here("collect", *SHORT, "--out", collected, "--workers", "1", "--json")
     assert json.loads(done.stdout)["recorded_frames"] == 30
     assert lost.read_bytes() == before
     assert kept.stat().st_mtime_ns == written
@@ -103,6 +103,10 @@ def test_a_finished_dataset_is_left_alone_and_a_lost_round_made_again(collected:
         (["--split", "later"], "no split 'later'"),
         (["--split", "unseen"], "track circuit is one of those to train on"),
         (["--jitter-camera"], "jitter_camera: False in its plan, now True"),
+        (["--scenes", "4"], "4 scenes a round asked for, but the scenery never changes; give --st"),
+        (["--scenes", "-1"], "-1 scenes a round"),
+        (["--stretch", "-1"], "a stretch of -1 frames"),
+        (["--frequency", "7"], "7 Hz does not divide"),
     ],
 )
 def test_impossible_options_are_refused_with_a_one_line_error(
@@ -212,7 +216,7 @@ def test_rounds_of_an_unseen_track_with_jittered_cameras_are_a_dataset_of_their_
     folder = tmp_path / "data"
     args = ["--rounds", "2", "--frames", "10", "--split", "unseen", "--jitter-camera"]
     args += ["--lights", "clear,fog", "--tracks", "coast", "--workers", "1"]
-    done = datagen("collect", *args, "--out", folder)
+    done = datagen_here("collect", *args, "--out", folder)
     assert done.returncode == 0, done.stderr
     dataset = Dataset.open(folder)
     assert {(info.split, info.track) for info in dataset.rounds} == {("unseen", "coast")}

@@ -24,7 +24,7 @@ from datagen.recording.folder import RoundState, read_states
 from datagen.recording.integrity.verify import verify
 from simulator.vehicle.state import Command
 from simulator.world.errors import ContactsUnavailable
-from tests.datagen.commands import attempted, datagen, make_jobs, make_small_plan
+from tests.datagen.commands import attempted, datagen_here, make_jobs, make_small_plan
 from tests.datagen.conftest import Samples
 from trackfeatures.camera import CameraParameters
 
@@ -51,7 +51,7 @@ def test_an_interruption_leaves_whole_rounds_only_and_is_resumed(
     assert len(list(folder.glob("rounds/*"))) == len(kept)
     assert verify(folder, "full").ok
     if number == signal.SIGINT:
-        done = datagen(*args, "--out", folder, "--json")
+        done = datagen_here(*args, "--out", folder, "--json")
         assert json.loads(done.stdout)["recorded_frames"] == 60 * (3 - len(kept))
         assert verify(folder, "full").ok
 
@@ -261,7 +261,7 @@ def _children(process: int) -> list[int]:
 @pytest.mark.extended
 def test_kills_of_the_whole_tree_at_random_moments_lose_nothing() -> None:
     """A short run of the benchmark that kills collections."""
-    script = Path(__file__).parents[3] / "benchmarks" / "killed.py"
+    script = Path(__file__).parents[3] / "benchmarks" / "collect_killed.py"
     small = ["--kills", "3", "--rounds", "3", "--frames", "10", "--seed", "2"]
     done = subprocess.run(
         [sys.executable, str(script), *small], capture_output=True, text=True, timeout=500

@@ -21,7 +21,7 @@ from datagen.recording import Dataset
 from datagen.recording.errors import DatasetError
 from datagen.recording.folder import prepare, read_states
 from datagen.recording.integrity.verify import verify
-from tests.datagen.commands import datagen, datagen_here, make_small_plan
+from tests.datagen.commands import datagen_here, make_small_plan
 
 ROUNDS = ["--rounds", "3", "--frames", "20", "--tracks", "oval", "--workers", "1"]
 
@@ -33,7 +33,7 @@ def files(folder: Path) -> dict[str, bytes]:
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("shards") / "whole"
-    assert datagen("collect", *ROUNDS, "--out", folder).returncode == 0
+    assert datagen_here("collect", *ROUNDS, "--out", folder).returncode == 0
     return folder
 
 
@@ -176,5 +176,5 @@ def test_a_collector_refuses_a_folder_that_another_process_holds(
         assert "another `datagen collect`" in refused("collect", *ROUNDS, "--out", whole)
         other.kill()
     deadline = time.monotonic() + 120.0
-    while datagen("collect", *ROUNDS, "--out", whole).returncode:  # the lock ended with it
+    while datagen_here("collect", *ROUNDS, "--out", whole).returncode:  # the lock ended with it
         assert time.monotonic() < deadline

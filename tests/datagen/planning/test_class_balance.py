@@ -46,13 +46,14 @@ def tracks_of(source: str) -> tuple[TrackChoice, ...]:
 
 @pytest.mark.parametrize("source", ["own", "torcs", "default"])
 @pytest.mark.parametrize(("rounds", "frames"), [(60, 2000), (60, 300), (16, 500)])
+@pytest.mark.parametrize("seeds", [2, pytest.param(10, marks=pytest.mark.extended)])
 def test_no_class_is_rare_on_either_side_whatever_the_seed(
-    source: str, rounds: int, frames: int
+    source: str, rounds: int, frames: int, seeds: int
 ) -> None:
     tracks = tracks_of(source)
     forecast = TrackForecast.of(tracks, None)
     moved, before = [], []
-    for seed in range(10):
+    for seed in range(seeds):
         wanted = CollectConfig(rounds, frames, seed=seed, tracks=tracks)
         plan, plain = make_plan(wanted, forecast), make_plan(wanted)
         assert plan == make_plan(wanted, forecast)

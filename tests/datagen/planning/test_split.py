@@ -38,6 +38,7 @@ def test_test_rounds_equal_those_of_the_first_implementation(case: str) -> None:
     assert f"{mask:x}" == GOLDEN[case]
 
 
+@pytest.mark.extended
 def test_twenty_thousand_rounds_take_less_than_five_seconds_of_processor_time() -> None:
     count = 20_000
     rng = np.random.default_rng(0)

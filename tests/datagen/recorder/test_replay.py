@@ -72,9 +72,11 @@ def test_a_replay_finds_that_a_round_holds_more_frames(
     assert (len(problems), frames) == (2, 29)
 
 
-def test_pixels_without_a_replay_are_refused(collected: Path, refused: Callable[..., str]) -> None:
-    assert "give --replay N, too" in refused("verify", collected, "--level", "quick", "--pixels")
-
-
-def test_a_round_count_below_one_is_refused(collected: Path, refused: Callable[..., str]) -> None:
-    assert "--replay is -1" in refused("verify", collected, "--level", "quick", "--replay", "-1")
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [(["--pixels"], "give --replay N, too"), (["--replay", "-1"], "--replay is -1")],
+)
+def test_options_of_a_replay_are_checked(
+    collected: Path, refused: Callable[..., str], words: list[str], message: str
+) -> None:
+    assert message in refused("verify", collected, "--level", "quick", *words)

@@ -153,22 +153,24 @@ def test_header_and_result_round_trip_through_metadata(samples: Samples) -> None
 
 
 @pytest.mark.parametrize(
-    ("changes", "content", "what"),
-    [({"seed": 0}, 77, "seed 0"), ({}, 1, "content")],
-    ids=["same-seed", "same-content"],
+    ("changes", "content", "test", "what"),
+    [
+        ({"seed": 0}, 77, ("r002", "r003"), "seed 0"),
+        ({}, 1, ("r002", "r003"), "content"),
+        ({}, 77, ("r001", "r002"), "round r001"),
+    ],
 )
-def test_a_split_with_a_seed_or_content_on_both_sides_is_refused(
-    samples: Samples, dataset: Path, changes: dict[str, Any], content: int, what: str
+def test_a_split_with_a_seed_content_or_round_on_both_sides_is_refused(
+    samples: Samples,
+    dataset: Path,
+    changes: dict[str, Any],
+    content: int,
+    test: tuple[str, ...],
+    what: str,
 ) -> None:
     samples.add_round(dataset, samples.header("r003", **changes), content_seed=content)
-    write_split(split_path(dataset), Split(("r000", "r001"), ("r002", "r003")))
+    write_split(split_path(dataset), Split(("r000", "r001"), test))
     with pytest.raises(DatasetError, match=f"{what}.* on both sides"):
-        Dataset.open(dataset)
-
-
-def test_a_split_with_a_round_on_both_sides_is_refused(dataset: Path) -> None:
-    write_split(split_path(dataset), Split(("r000", "r001"), ("r001", "r002")))
-    with pytest.raises(DatasetError, match="round r001 on both sides"):
         Dataset.open(dataset)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from datagen.cli.maintain import split as split_command
-from datagen.recording import Dataset, DatasetError, Labels, RoundInfo, near_duplicates
+from datagen.recording import Dataset, DatasetError, Labels, RoundInfo
 from datagen.recording.folder import prepare, round_path
 from datagen.recording.integrity.recover import recover
 from datagen.recording.manifest import rebuild
@@ -113,12 +113,8 @@ def test_impossible_splits_are_refused(
         split_rounds(rounds, by, share, 0)
 
 
-@pytest.mark.parametrize("at_once", [100, 4_000_000])
 @pytest.mark.parametrize("tolerances", [Tolerances(), Tolerances(3.0, 0.5, 2.0)])
-def test_near_duplicates_equal_those_of_comparing_all_pairs(
-    tolerances: Tolerances, at_once: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(near_duplicates, "MAX_PAIRS_AT_ONCE", at_once)
+def test_near_duplicates_equal_those_of_comparing_all_pairs(tolerances: Tolerances) -> None:
     rng = np.random.default_rng(0)
     rounds = [make_info(n, f"track-{n % 2}") for n in range(6)]
     labels = make_labels(rng, 1500, 6)
@@ -187,7 +183,7 @@ def test_the_command_never_overwrites_a_split(dataset: Path) -> None:
 def test_unseen_rounds_stay_unseen_in_a_new_split(samples: Samples, dataset: Path) -> None:
     samples.add_round(dataset, samples.header("r003"))
     write_split(split_path(dataset), Split(("r000", "r001"), ("r002",), unseen=("r003",)))
-    make_split(dataset, "mine", SplitConfig(test_share=0.4))
+    make_split(dataset, "mine", SplitConfig("round", 0.4, 0, False))
     split = read_split(split_path(dataset, "mine"))
     assert split.unseen == ("r003",)
     assert sorted(split.train + split.test) == ["r000", "r001", "r002"]
@@ -195,7 +191,7 @@ def test_unseen_rounds_stay_unseen_in_a_new_split(samples: Samples, dataset: Pat
     assert (report.rounds["unseen"], report.near["unseen"].frames) == (1, 45)
     samples.add_round(dataset, samples.header("r004", seed=3), content_seed=9)
     with pytest.raises(DatasetError, match=r"seed 3 on both sides, (train|test) and unseen"):
-        make_split(dataset, "leak", SplitConfig(test_share=0.4))
+        make_split(dataset, "leak", SplitConfig("round", 0.4, 0, False))
     assert not split_path(dataset, "leak").exists()
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.material.gpu.publish_checkpoint import publish_checkpoint
+from benchmarks.gpu.publish_checkpoint import publish_checkpoint
 from datagen.recording import Dataset
 from mtlnet.evaluation.evaluate import evaluate
 from mtlnet.evaluation.metrics import describe_data

@@ -13,7 +13,6 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import simulator.env  # registers the names
-from simulator.env.action import Controls, to_command
 from simulator.env.reward import quadratic_reward, step_reward
 from simulator.sensors import Sensor
 from simulator.vehicle.car import CarParameters
@@ -190,73 +189,6 @@ def test_a_vector_environment_equals_two_single_environments() -> None:
         env.close()
 
 
-@pytest.mark.parametrize(
-    ("action", "message"),
-    [
-        ([math.nan], "steer = nan; give a finite number"),
-        ([1.5], "steer = 1.5"),
-        ([-math.inf], "steer = -inf"),
-        ([-1.01], "steer"),
-        ([0.0, 0.0], "shape"),
-        ([0.0, 1.1, 0.0, 1.0], "throttle = 1.1"),
-        ([0.0, 0.0, -0.5, 1.0], "brake = -0.5"),
-        ([0.0, 0.0, 0.0, 7.0], "gear = 7"),
-        ([1.00001], "steer = 1.00001001; give a finite number from -1 to 1"),
-        ([0.0, -0.00001, 0.0, 1.0], "throttle = -9.9999997"),
-        ([0.0, 0.0, 0.0, 6.0001], "gear = 6.0001"),
-    ],
-)
-def test_bad_actions_are_refused(action: list[float], message: str) -> None:
-    env = make(disable_env_checker=True, controls="full" if len(action) == 4 else "steer")
-    env.reset(seed=0)
-    with pytest.raises(UserError, match=message):
-        env.unwrapped.step(np.array(action, np.float32))
-    env.close()
-
-
-@pytest.mark.parametrize(
-    ("action", "bound"),
-    [
-        (np.array([1.0000001], np.float32), [1.0]),
-        (np.nextafter(np.array([-1.0], np.float32), np.float32(-2.0)), [-1.0]),
-        ([-1.0 - 1e-6], [-1.0]),
-        (np.array([0.0, -1e-8, 1.0000001, 6.0000005], np.float32), [0.0, 0.0, 1.0, 6.0]),
-        (np.array([-1.0000002, 1.0000004, -1e-7, -1.0000001], np.float32), [-1.0, 1.0, 0.0, -1.0]),
-        ([1], [1.0]),
-        (np.array([True]), [1.0]),
-    ],
-)
-def test_actions_beyond_a_bound_by_rounding_are_clipped(action: Any, bound: list[float]) -> None:
-    controls: Controls = "full" if len(bound) == 4 else "steer"
-    command = to_command(action, controls)
-    assert command == to_command(np.array(bound), controls)
-    env = make(controls=controls)
-    env.reset(seed=0)
-    assert env.action_space.contains(np.array(bound, np.float32))
-    observation, *_ = env.step(action)
-    assert env.observation_space.contains(observation)
-    env.close()
-
-
-@pytest.mark.parametrize(
-    ("action", "message"),
-    [
-        (0.5, r"the action is 0.5; give 1 number\(s\), shape \(1,\): steer"),
-        (np.zeros((1, 1), np.float32), "shape"),
-        ([], "shape"),
-        (None, "shape"),
-        ("left", "'left' is no array of numbers"),
-        (["left"], "no array of numbers"),
-        ([[0.0], [0.0, 1.0]], "no array of numbers"),
-        ({"steer": 0.0}, "no array of numbers"),
-        ([1.00000212], "steer = 1.00000212"),
-    ],
-)
-def test_actions_of_another_kind_are_refused(action: Any, message: str) -> None:
-    with pytest.raises(UserError, match=message):
-        to_command(action, "steer")
-
-
 def test_start_options_at_their_bounds_and_of_other_kinds() -> None:
     env = make(lane_width=4.1)
     world = env.unwrapped.world  # type: ignore[attr-defined]
@@ -285,6 +217,7 @@ def test_start_options_at_their_bounds_and_of_other_kinds() -> None:
         ({"to_middle": math.nan}, "give a finite number"),
         ({"s": math.inf}, "give a finite number"),
         ({1: 2.0}, "unknown options"),
+        ({"velocity": 3.0}, "velocity"),
     ]
     for bad, message in refused:
         with pytest.raises(UserError, match=message):
@@ -334,13 +267,6 @@ def test_bad_options_are_refused(options: dict[str, Any], message: str) -> None:
 def test_an_unknown_render_mode_is_refused() -> None:
     with pytest.raises(UserError, match="render_mode is 'ansi'"):
         simulator.env.LateralControl(render_mode="ansi")
-
-
-def test_unknown_reset_options_are_refused() -> None:
-    env = make()
-    with pytest.raises(UserError, match="velocity"):
-        env.reset(seed=0, options={"velocity": 3.0})
-    env.close()
 
 
 def test_a_step_without_an_episode_is_refused() -> None:

@@ -9,14 +9,12 @@ import pytest
 from simulator.link.command import picture_size
 from simulator.link.config import LinkConfig
 from simulator.link.process import run
-from tests.typed import error_line, typed
 from trackfeatures.errors import UserError
 
 
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        ({"name": "driverview"}, "begins with a slash"),
         ({"name": "/" + "x" * 300}, "has 301 bytes"),
         ({"track": "no-such-track"}, "no track 'no-such-track'"),
         ({"frequency_hz": 30}, "30 Hz does not divide"),
@@ -41,18 +39,3 @@ def test_bad_image_sizes_are_refused(text: str) -> None:
     with pytest.raises(UserError, match="give a size such as 280x210, or none"):
         picture_size(text)
     assert (picture_size("280x210"), picture_size("none")) == ((280, 210), (0, 0))
-
-
-@pytest.mark.parametrize(
-    ("options", "said"),
-    [
-        (("--name", "driverview"), "begins with a slash"),
-        (("--frequency", "30"), "30 Hz does not divide"),
-        (("--camera", "280"), "--camera is '280'"),
-        (("--header", "/no/such/folder/x.h"), "/no/such/folder"),
-    ],
-)
-def test_errors_of_the_link_command_are_one_line(options: tuple[str, ...], said: str) -> None:
-    done = typed("simulator", "link", *options)
-    assert done.returncode == 1
-    assert said in error_line(done)

@@ -14,7 +14,9 @@ FIXTURES = Path(__file__).parent / "fixtures"
 STADIUM = (FIXTURES / "sticky-grade.xml").read_text()
 
 
-def refused(path: Path) -> str:
+def refused(path: Path, content: str | bytes) -> str:
+    """The message about a track file of this content: one line that names the file."""
+    path.write_bytes(content.encode() if isinstance(content, str) else content)
     with pytest.raises(TrackError) as caught:
         read_track(path)
     message = str(caught.value)
@@ -52,9 +54,7 @@ def refused(path: Path) -> str:
 )
 def test_errors_name_the_invalid_value(tmp_path: Path, old: str, new: str, said: str) -> None:
     assert old in STADIUM
-    path = tmp_path / "bad.xml"
-    path.write_text(STADIUM.replace(old, new))
-    assert said in refused(path)
+    assert said in refused(tmp_path / "bad.xml", STADIUM.replace(old, new))
 
 
 def test_a_track_with_a_gap_is_refused(tmp_path: Path) -> None:
@@ -62,41 +62,37 @@ def test_a_track_with_a_gap_is_refused(tmp_path: Path) -> None:
     first = STADIUM.replace('name="lg" val="100"', 'name="lg" val="100.25"', 1)
     path.write_text(first)
     assert read_torcs(path).length_m == pytest.approx(200.25 + 100.0 * math.pi)
-    path.write_text(STADIUM.replace('name="lg" val="100"', 'name="lg" val="100.3"', 1))
-    assert "0.30 m from their start" in refused(path)
+    wider = STADIUM.replace('name="lg" val="100"', 'name="lg" val="100.3"', 1)
+    assert "0.30 m from their start" in refused(path, wider)
 
 
 def test_a_track_without_segments_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "empty.xml"
-    path.write_text(STADIUM.replace('attstr name="type"', 'attstr name="kind"'))
-    assert "no segments" in refused(path)
+    empty = STADIUM.replace('attstr name="type"', 'attstr name="kind"')
+    assert "no segments" in refused(tmp_path / "empty.xml", empty)
 
 
 def test_an_entity_expansion_bomb_is_refused(tmp_path: Path) -> None:
     levels = "".join(f'<!ENTITY l{i} "{f"&l{i - 1};" * 10}">' for i in range(1, 10))
-    path = tmp_path / "bomb.xml"
-    path.write_text(f'<!DOCTYPE params [<!ENTITY l0 "lol">{levels}]><params name="x">&l9;</params>')
-    assert "entities" in refused(path)
+    bomb = f'<!DOCTYPE params [<!ENTITY l0 "lol">{levels}]><params name="x">&l9;</params>'
+    assert "entities" in refused(tmp_path / "bomb.xml", bomb)
 
 
 @pytest.mark.parametrize("name", ["default-pits", "default-surfaces"])
 def test_external_and_internal_entities_are_refused(tmp_path: Path, name: str) -> None:
     secret = tmp_path / "secret.txt"
     secret.write_text('<attstr name="read" val="yes"/>')
-    path = tmp_path / "outside.xml"
     # An internal entity with the name of TORCS's `default-surfaces` is not TORCS's entity.
     kind = f'SYSTEM "{secret}"' if name == "default-pits" else '"<section/>"'
     declared = f"<!ENTITY {name} {kind}>"
-    path.write_text(f'<!DOCTYPE params [{declared}]><params name="x">&{name};</params>')
-    assert "entities" in refused(path)
+    text = f'<!DOCTYPE params [{declared}]><params name="x">&{name};</params>'
+    assert "entities" in refused(tmp_path / "outside.xml", text)
 
 
 def test_parameter_and_undeclared_entities_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "parameter.xml"
-    path.write_text('<!DOCTYPE params [<!ENTITY % p SYSTEM "file:///etc/passwd"> %p;]><params/>')
-    assert "entities" in refused(path)
-    path.write_text("<params>&undeclared;</params>")
-    refused(path)
+    text = '<!DOCTYPE params [<!ENTITY % p SYSTEM "file:///etc/passwd"> %p;]><params/>'
+    assert "entities" in refused(path, text)
+    refused(path, "<params>&undeclared;</params>")
 
 
 @pytest.mark.parametrize(
@@ -114,15 +110,12 @@ def test_parameter_and_undeclared_entities_are_refused(tmp_path: Path) -> None:
     ids=["empty", "text", "cut", "binary", "encoding", "utf8", "html", "nested"],
 )
 def test_files_that_are_no_track_are_refused(tmp_path: Path, content: bytes) -> None:
-    path = tmp_path / "broken.xml"
-    path.write_bytes(content)
-    refused(path)
+    refused(tmp_path / "broken.xml", content)
 
 
 def test_a_file_over_the_size_limit_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "large.xml"
-    path.write_bytes(b"<params>" + b" " * (5 * 2**20) + b"</params>")
-    assert "bytes" in refused(path)
+    large = b"<params>" + b" " * (5 * 2**20) + b"</params>"
+    assert "bytes" in refused(tmp_path / "large.xml", large)
 
 
 @pytest.mark.usefixtures("no_torcs_install")
@@ -141,9 +134,8 @@ def test_a_bad_file_in_a_folder_is_skipped_with_a_warning(
 
 @pytest.mark.parametrize("encoding", ["undefined", "punycode", "no-such-code"])
 def test_an_unknown_encoding_is_refused(tmp_path: Path, encoding: str) -> None:
-    path = tmp_path / "odd.xml"
-    path.write_text(f'<?xml version="1.0" encoding="{encoding}"?>\n<params name="\u00e9"/>')
-    assert "cannot be read as text" in refused(path)
+    text = f'<?xml version="1.0" encoding="{encoding}"?>\n<params name="\u00e9"/>'
+    assert "cannot be read as text" in refused(tmp_path / "odd.xml", text)
 
 
 def test_named_pipes_are_skipped(tmp_path: Path) -> None:

@@ -60,6 +60,8 @@ def test_centreline_writes_the_csv_of_a_track_file(tmp_path: Path) -> None:
         (("snapshot", "oval", "--out", "x.png", "--view", "up"), "unknown camera view 'up'"),
         (("snapshot", "oval", "--out", "x.png", "--kind", "depths"), "unknown kind of picture"),
         (("tracks", "--tracks-dir", "/no/such/folder"), "/no/such/folder"),
+        (("link", "--camera", "280"), "--camera is '280'"),
+        (("link", "--header", "/no/such/folder/x.h"), "/no/such/folder"),
     ],
 )
 def test_errors_are_one_line(arguments: tuple[str, ...], said: str) -> None:

@@ -1,9 +1,6 @@
 """Track geometry in closed form, and projection against a brute-force search."""
 
-import importlib.util
 import math
-from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 import pytest
@@ -15,21 +12,9 @@ from simulator.track import piece_table
 from simulator.track.catalogue import find_track
 from simulator.track.geometry import Track, wrap_angle
 from simulator.track.road import Road
+from tests.simulator.track.track_samples import figure_of_eight, stadium
 
-
-def _samples() -> ModuleType:
-    # Test folders are no packages, so a neighbour is loaded by its path.
-    path = Path(__file__).with_name("track_samples.py")
-    spec = importlib.util.spec_from_file_location("track_samples", path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-STADIUM: Track = _samples().stadium()
-EIGHT: Track = _samples().figure_of_eight()
+STADIUM, EIGHT = stadium(), figure_of_eight()
 MOUNTAIN = find_track("mountain-pass")
 LAP = 200.0 + 100.0 * math.pi
 
@@ -142,8 +127,7 @@ def test_compiled_pose_equals_the_vectorised_one() -> None:
 
 
 def test_equal_geometry_has_an_equal_content_hash() -> None:
-    again = _samples().stadium()
-    assert again.content_hash == STADIUM.content_hash
+    assert stadium().content_hash == STADIUM.content_hash
     assert len(STADIUM.content_hash) == 64
     assert EIGHT.content_hash != STADIUM.content_hash
 

@@ -1,4 +1,4 @@
-"""Small tracks with known dimensions: a stadium, and a figure of eight with a bridge."""
+"""Small tracks with known dimensions: stadiums, and a figure of eight with a bridge."""
 
 import math
 
@@ -7,14 +7,14 @@ from simulator.track.markings import MarkingStyle
 from simulator.track.pieces import Piece, assemble
 
 
-def build(pieces: list[Piece], width: float = 10.0, name: str = "sample") -> Track:
+def build(pieces: list[Piece], width: float = 10.0, look: str = "circuit") -> Track:
     return Track.from_placed(
         assemble(pieces),
-        name=name,
+        name="sample",
         source="own",
         width=width,
         surface="asphalt",
-        look="circuit",
+        look=look,
         markings=MarkingStyle(),
     )
 
@@ -29,6 +29,12 @@ def stadium() -> Track:
             Piece(50.0 * math.pi, 1.0 / 50.0, 3.0, 3.0, 0.0, 0.0),
         ]
     )
+
+
+def flat_stadium(straight: float, radius: float = 40.0, width: float = 12.0) -> Track:
+    """Two straights and two half circles to the left."""
+    bend = Piece(math.pi * radius, 1.0 / radius, 0.0, 0.0, 0.0, 0.0)
+    return build([Piece(straight, 0.0, 0.0, 0.0, 0.0, 0.0), bend] * 2, width)
 
 
 def figure_of_eight() -> Track:

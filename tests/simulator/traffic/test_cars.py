@@ -9,8 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from simulator.track.geometry import Track
-from simulator.track.markings import MarkingStyle
-from simulator.track.pieces import Piece, assemble
+from simulator.track.pieces import Piece
 from simulator.track.road import Road
 from simulator.traffic.traffic import (
     DESIRED_KMH,
@@ -19,6 +18,7 @@ from simulator.traffic.traffic import (
     TRAFFIC_CAR_SIZE,
     Traffic,
 )
+from tests.simulator.track.track_samples import build
 from trackfeatures.errors import UserError
 
 DT = 0.05
@@ -33,15 +33,7 @@ def stadium(straight: float = 300.0, radius: float = 40.0, hill: float = 6.0) ->
         Piece(straight, 0.0, hill - 1.0, hill + 1.0, 0.0, 0.0),
         Piece(bend, 1 / radius, 0.0, 0.0, 0.0, 0.0),
     ]
-    return Track.from_placed(
-        assemble(pieces),
-        name="stadium",
-        source="own",
-        width=12.0,
-        surface="asphalt",
-        look="circuit",
-        markings=MarkingStyle(),
-    )
+    return build(pieces, width=12.0)
 
 
 def corners(poses: NDArray[np.float64], size: tuple[float, ...]) -> NDArray[np.float64]:

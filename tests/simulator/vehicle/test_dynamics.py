@@ -7,9 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from simulator.track.geometry import Track
-from simulator.track.markings import MarkingStyle
-from simulator.track.pieces import Piece, assemble
+from simulator.track.pieces import Piece
 from simulator.track.road import Road
 from simulator.vehicle.car import GRAVITY, RPM, CarParameters
 from simulator.vehicle.dynamics import DT, MEMORY, MOTION, PIECE, compute_forces
@@ -19,6 +17,7 @@ from simulator.vehicle.surface import SURFACES, VERGE, ground
 from simulator.vehicle.tyre import peak_force
 from simulator.vehicle.wheels import wheel_angle
 from simulator.world.world import World
+from tests.simulator.track.track_samples import build
 from trackfeatures.errors import UserError
 
 CAR = CarParameters()
@@ -32,23 +31,13 @@ def plain(grade: float = 0.0, width: float = 600.0) -> Road:
     """A loop so wide that its first straight (1500 m, rising by `grade`) is an open plane."""
     rise = 1500.0 * grade
     bend = math.pi * 400.0
-    track = Track.from_placed(
-        assemble(
-            [
-                Piece(1500.0, 0.0, 0.0, 0.0, rise, rise),
-                Piece(bend, 1 / 400.0, rise, rise, rise, rise),
-                Piece(1500.0, 0.0, rise, rise, 0.0, 0.0),
-                Piece(bend, 1 / 400.0, 0.0, 0.0, 0.0, 0.0),
-            ]
-        ),
-        name="plain",
-        source="own",
-        width=width,
-        surface="asphalt",
-        look="circuit",
-        markings=MarkingStyle(),
-    )
-    return Road(track)
+    pieces = [
+        Piece(1500.0, 0.0, 0.0, 0.0, rise, rise),
+        Piece(bend, 1 / 400.0, rise, rise, rise, rise),
+        Piece(1500.0, 0.0, rise, rise, 0.0, 0.0),
+        Piece(bend, 1 / 400.0, 0.0, 0.0, 0.0, 0.0),
+    ]
+    return Road(build(pieces, width))
 
 
 def drive(

@@ -1,21 +1,18 @@
 """Collisions with traffic, which is pushed, and with walls, which are not crossed."""
 
 import itertools
-import math
 
 import numpy as np
 import pytest
 
 from simulator.env.reward import ending
-from simulator.track.geometry import Track
-from simulator.track.markings import MarkingStyle
-from simulator.track.pieces import Piece, assemble
 from simulator.track.road import Road
 from simulator.traffic.traffic import TRAFFIC_CAR_SIZE
 from simulator.traffic.wreck import TRAFFIC_CAR
 from simulator.vehicle.car import CarParameters
 from simulator.vehicle.state import CarState, Command
 from simulator.world.world import World
+from tests.simulator.track.track_samples import flat_stadium
 
 pytestmark = pytest.mark.contacts
 
@@ -24,19 +21,7 @@ FULL_BRAKE = Command(brake=1.0, gear=0)
 
 
 def stadium(width: float = 12.0, lanes: int = 1, straight: float = 1500.0) -> Road:
-    """Two straights and two half circles of 40 m radius, to the left, flat."""
-    bend = Piece(math.pi * 40.0, 1 / 40.0, 0, 0, 0, 0)
-    pieces = [Piece(straight, 0.0, 0, 0, 0, 0), bend]
-    track = Track.from_placed(
-        assemble(pieces * 2),
-        name="stadium",
-        source="own",
-        width=width,
-        surface="asphalt",
-        look="circuit",
-        markings=MarkingStyle(),
-    )
-    return Road(track, lanes)
+    return Road(flat_stadium(straight, width=width), lanes)
 
 
 def follow(state: CarState, throttle: float) -> Command:

@@ -6,25 +6,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from simulator.track.geometry import Track
-from simulator.track.markings import MarkingStyle
-from simulator.track.pieces import Piece, assemble
 from simulator.track.road import Road
 from simulator.world.walls import PANEL, Panel, Walls
-
-
-def loop(radius: float, straight: float, width: float = 9.0) -> Track:
-    bend = Piece(math.pi * radius, 1.0 / radius, 0.0, 0.0, 0.0, 0.0)
-    pieces = [Piece(straight, 0.0, 0.0, 0.0, 0.0, 0.0), bend] * 2
-    return Track.from_placed(
-        assemble(pieces),
-        name="loop",
-        source="own",
-        width=width,
-        surface="asphalt",
-        look="town",
-        markings=MarkingStyle(),
-    )
+from tests.simulator.track.track_samples import flat_stadium
 
 
 def inner_face(panel: Panel) -> NDArray[np.float64]:
@@ -38,7 +22,7 @@ def inner_face(panel: Panel) -> NDArray[np.float64]:
 @pytest.mark.parametrize("radius", [8.0, 10.0, 11.0, 20.0, 60.0])
 @pytest.mark.parametrize("side", [1, -1])
 def test_walls_follow_every_bend(radius: float, side: int) -> None:
-    track = loop(radius, 40.0)
+    track = flat_stadium(40.0, radius, width=9.0)
     road = Road(track)
     walls = Walls(road)
     for s in np.arange(0.0, track.length_m, 0.7):
@@ -59,7 +43,7 @@ def test_walls_follow_every_bend(radius: float, side: int) -> None:
 
 
 def test_no_panel_for_a_car_far_from_the_wall_or_behind_it() -> None:
-    walls = Walls(Road(loop(60.0, 200.0)))
+    walls = Walls(Road(flat_stadium(200.0, 60.0, width=9.0)))
     assert walls.panel(100.0, walls.offset - 3.6, 3.5) is None
     assert walls.panel(100.0, walls.offset - 3.4, 3.5) is not None
     assert walls.panel(100.0, walls.offset + 0.1, 3.5) is None
@@ -67,7 +51,7 @@ def test_no_panel_for_a_car_far_from_the_wall_or_behind_it() -> None:
 
 def test_a_wall_is_open_where_another_part_of_the_track_lies() -> None:
     # A hairpin with straights 12 m apart: walls 8.5 m out would stand on the other straight.
-    walls = Walls(Road(loop(6.0, 200.0, width=12.0)))
+    walls = Walls(Road(flat_stadium(200.0, 6.0, width=12.0)))
     assert walls.panel(100.0, 6.5, 3.5) is None
     outer = walls.panel(100.0, -6.5, 3.5)
     assert outer is not None

@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from mcap.reader import make_reader
-from mcap_protobuf.decoder import DecoderFactory
 
 from datagen.recording import Dataset, DatasetError
 from datagen.recording.folder import round_path, state_path
@@ -55,9 +54,8 @@ def ends(undamaged: bytes, tmp_path_factory: pytest.TempPathFactory) -> list[int
 def saved_frames(path: Path) -> list[int]:
     """Frame numbers of a recovered file, by the official reader."""
     with path.open("rb") as stream:
-        reader = make_reader(stream, validate_crcs=True, decoder_factories=[DecoderFactory()])
         found: dict[str, list[int]] = {}
-        for _, channel, message, _ in reader.iter_decoded_messages():
+        for _, channel, message in make_reader(stream, validate_crcs=True).iter_messages():
             found.setdefault(channel.topic, []).append(message.sequence)
     labels = found[topics.LABELS]
     assert all(found[topic] == labels for topic in topics.EVERY_STEP)

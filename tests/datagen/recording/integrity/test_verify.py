@@ -286,7 +286,6 @@ def test_a_gap_in_log_times_is_found(
 def test_the_datasets_hash_is_in_the_report(dataset: Path) -> None:
     report = verify(dataset, "quick")
     assert report.content_hash == Dataset.open(dataset).content_hash
-    assert report.as_json()["content_hash"] == report.content_hash
     round_path(dataset, "r001").write_bytes(b"")
     assert verify(dataset, "quick").content_hash is None
 

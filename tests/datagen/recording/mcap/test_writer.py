@@ -117,11 +117,9 @@ def test_the_same_round_gives_the_same_bytes_in_two_processes(
     samples: Samples, tmp_path: Path
 ) -> None:
     code = (
-        "import importlib.util, pathlib, sys\n"
-        f"spec = importlib.util.spec_from_file_location('c', {str(Path(__file__).parents[2])!r} + "
-        "'/conftest.py')\n"
-        "c = importlib.util.module_from_spec(spec); spec.loader.exec_module(c)\n"
-        "s = c.Samples(); s.write(pathlib.Path(sys.argv[1]), s.header(), s.frames(25, seed=7))\n"
+        "import pathlib, sys\n"
+        "from tests.datagen.conftest import Samples\n"
+        "s = Samples(); s.write(pathlib.Path(sys.argv[1]), s.header(), s.frames(25, seed=7))\n"
     )
     paths = [tmp_path / "a.mcap", tmp_path / "b.mcap"]
     for path in paths:

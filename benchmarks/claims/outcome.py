@@ -1,0 +1,49 @@
+"""How a benchmark is run and how it ends: its options, its figures as JSON, its exit code.
+
+The exit codes are read by `make bench`, which lists missed and unmeasured benchmarks separately.
+"""
+
+import json
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import NoReturn
+
+REACHED, MISSED, NOT_MEASURED = 0, 1, 3
+
+
+def run_command(main: Callable[..., None]) -> None:
+    """Run `main` as a command with an option for each of its parameters.
+
+    The script's docstring is the help text. A UserError becomes one line on stderr.
+    """
+    import typer  # here: a GPU run ends on a machine that lacks it, too
+
+    from runtime import cli as command
+
+    app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
+    app.command(help=sys.modules["__main__"].__doc__)(main)
+    command.main(app)
+
+
+def conclude(figures: object, file: Path | None, reached: bool | None) -> NoReturn:
+    """Print `figures` as JSON, write them to `file` if one is given, and exit with the code.
+
+    `reached` is None if the claim was not measured.
+    """
+    text = json.dumps(figures, indent=1)
+    print(text)
+    if file is not None:
+        file.write_text(text + "\n")
+    sys.exit(NOT_MEASURED if reached is None else exit_code(reached))
+
+
+def exit_code(reached: bool) -> int:
+    """The exit code of a benchmark that measured its claim."""
+    return REACHED if reached else MISSED
+
+
+def not_measured(reason: str) -> NoReturn:
+    """Write why the claim was not measured and what is needed for it, and exit."""
+    sys.stderr.write(f"not measured: {reason}\n")
+    sys.exit(NOT_MEASURED)

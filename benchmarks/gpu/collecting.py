@@ -1,0 +1,122 @@
+"""The datasets of a GPU run: three to evaluate on, and one to train on.
+
+`test`: the tracks to train on, four fifths test rounds; its train rounds are those of the timed
+recipes. `unseen`: tracks never trained on. `random`: random roads of varied looks. `train`: half
+rounds on the tracks with roads of 4.0 m, half random roads of varied looks; collected in parts at
+once, for a plan of random roads takes one core a third of a minute, and then merged.
+"""
+
+import json
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from benchmarks.gpu.plan import Size
+from benchmarks.gpu.process import Command, Ended
+from datagen.recording import Dataset, DatasetError
+
+SEEDS = {"test": 3601, "unseen": 3602, "random": 3603, "train": 3610}
+"""No model has been trained on rounds of these; the parts of `train` count on from theirs."""
+FREQUENCY_HZ = 4
+VARIED = ("--roads", "varied", "--tracks", "random")
+WORKERS_A_PART = 4
+IMAGE_BYTES = (210 - 66) * 280 * 3
+"""Of a frame in GPU memory, without the sky."""
+MEMORY_SHARE = 0.5
+"""Of the GPU's memory for the training's frames: the loader takes 0.6 of what is free."""
+
+
+@dataclass(frozen=True)
+class Collection:
+    """One call of `datagen collect`."""
+
+    name: str
+    seed: int
+    rounds: int
+    frames: int
+    workers: int
+    options: tuple[str, ...]
+
+    def command(self, folder: Path) -> Command:
+        """Records into `folder`/NAME."""
+        words = [sys.executable, "-m", "datagen", "collect", "--json"]
+        words += ["--out", str(folder / self.name), "--prefix", self.name]
+        words += ["--seed", str(self.seed), "--frequency", str(FREQUENCY_HZ)]
+        words += ["--rounds", str(self.rounds), "--frames", str(self.frames)]
+        words += ["--workers", str(self.workers), *self.options]
+        log = folder / f"{self.name}.log"
+        return Command(tuple(words), folder / f"{self.name}.json", log)
+
+
+def evaluation_collections(size: Size, cores: int) -> list[Collection]:
+    """`test`, `unseen` and `random`, each with its share of the cores."""
+    rounds = {"test": size.test_rounds, "unseen": size.unseen_rounds, "random": size.random_rounds}
+    options: dict[str, tuple[str, ...]] = {
+        "test": ("--split-test-share", "0.8"),
+        "unseen": ("--split", "unseen"),
+        "random": ("--split", "unseen", *VARIED),
+    }
+    total = sum(rounds.values())
+    return [
+        Collection(name, SEEDS[name], count, size.frames, -(-cores * count // total), options[name])
+        for name, count in rounds.items()
+    ]
+
+
+def train_collections(size: Size, cores: int, frames: int) -> list[Collection]:
+    """The parts of `train`, `frames` frames in all, alternately on tracks and on random roads."""
+    parts = max(2 * (cores // (2 * WORKERS_A_PART)), 2)
+    rounds = max(-(-frames // (parts * size.train_frames)), 1)
+    share = ("--split-test-share", "0", "--stretch", "1")
+    return [
+        Collection(
+            f"part{number}",
+            SEEDS["train"] + number,
+            rounds,
+            size.train_frames,
+            max(cores // parts, 1),
+            (*share, *VARIED) if number % 2 else share,
+        )
+        for number in range(parts)
+    ]
+
+
+def most_frames(size: Size, gpu_bytes: int) -> int:
+    """How many frames to train on the GPU holds, at most those of `size`; without a GPU these."""
+    if not gpu_bytes:
+        return size.most_train_frames
+    return min(size.most_train_frames, int(MEMORY_SHARE * gpu_bytes / IMAGE_BYTES))
+
+
+def counted(folder: Path, collections: list[Collection], ended: list[Ended]) -> dict[str, Any]:
+    """Frames of the finished rounds by collection, and all of them a second.
+
+    `whole_frames_per_second`: with start and planning, until the last call ended;
+    `frames_per_second`: the sum of what the calls say of their recording, None if one was stopped.
+    """
+    frames = {each.name: finished_frames(folder / each.name) for each in collections}
+    seconds = max(end.seconds for end in ended)
+    stopped = any(end.stopped for end in ended)
+    return {
+        "frames": frames,
+        "frames_per_second": None
+        if stopped
+        else round(sum(_speed(folder, each) for each in collections), 1),
+        "whole_frames_per_second": round(sum(frames.values()) / seconds, 1),
+        "recording_was_stopped": stopped,
+    }
+
+
+def finished_frames(folder: Path) -> int:
+    """Frames of the finished rounds of a dataset, 0 where there is none."""
+    try:
+        return sum(info.frames for info in Dataset.open(folder).rounds)
+    except DatasetError:
+        return 0
+
+
+def _speed(folder: Path, collection: Collection) -> float:
+    """Frames a second that `datagen collect` printed."""
+    said = json.loads((folder / f"{collection.name}.json").read_text(encoding="utf-8"))
+    return float(said["frames_per_second"])

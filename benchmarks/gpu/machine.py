@@ -1,0 +1,120 @@
+"""What a machine has for a GPU run, and what it lacks: packages, EGL on the GPU, tracks, a GPU.
+
+Each is asked in a process of its own: this one takes no GPU memory and no OpenGL context.
+"""
+
+import json
+import os
+import platform
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+from benchmarks.gpu.wheels import ROOT, missing_packages
+
+TORCS_TRACK = "g-track-3"
+SOFTWARE = ("llvmpipe", "softpipe", "swrast")
+ASK_S = 120.0
+
+GPU_QUESTION = """
+import json, torch
+found = {"torch": torch.__version__, "cuda": torch.version.cuda, "gpu": None, "gpu_bytes": 0}
+if torch.cuda.is_available():
+    about = torch.cuda.get_device_properties(0)
+    found |= {"gpu": about.name, "gpu_bytes": about.total_memory}
+print(json.dumps(found))
+"""
+EGL_QUESTION = """
+import json
+from simulator.camera.core.context import graphics
+print(json.dumps({"renderer": graphics().context.info["GL_RENDERER"]}))
+"""
+TRACKS_QUESTION = f"""
+import json
+from simulator.track.catalogue import track_files
+found = track_files(None)
+print(json.dumps({{"tracks": len(found), "torcs": {TORCS_TRACK!r} in found}}))
+"""
+
+
+def describe_machine() -> dict[str, Any]:
+    """Processor cores, Python, torch, GPU, renderer and tracks; `errors`: what could not be asked.
+
+    The packages must be installed.
+    """
+    found: dict[str, Any] = {
+        "python": platform.python_version(),
+        "cores": len(os.sched_getaffinity(0)),
+        "gpu": None,
+        "gpu_bytes": 0,
+        "renderer": None,
+        "tracks": 0,
+        "torcs": False,
+        "errors": {},
+    }
+    for name, question in (
+        ("gpu", GPU_QUESTION),
+        ("egl", EGL_QUESTION),
+        ("tracks", TRACKS_QUESTION),
+    ):
+        answer = ask(question)
+        if isinstance(answer, str):
+            found["errors"][name] = answer
+        else:
+            found |= answer
+    return found
+
+
+def ask(question: str) -> dict[str, Any] | str:
+    """The JSON that the program `question` prints, or the last line of its error."""
+    command = [sys.executable, "-c", question]
+    try:
+        done = subprocess.run(
+            command, cwd=ROOT, capture_output=True, text=True, timeout=ASK_S, check=False
+        )
+        answer: dict[str, Any] = json.loads(done.stdout)
+    except subprocess.TimeoutExpired:
+        return f"no answer within {ASK_S:g} s"
+    except ValueError:
+        lines = done.stderr.strip().splitlines() or [f"exit code {done.returncode}"]
+        return lines[-1]
+    return answer
+
+
+def missing(found: dict[str, Any], *, gpu: bool = True) -> list[str]:
+    """What a run lacks on a machine that `describe_machine` found; `gpu`: whether it needs one."""
+    errors: dict[str, str] = found["errors"]
+    lacks = [f"{name}: {error}" for name, error in errors.items()]
+    if not found["torcs"] and "tracks" not in errors:
+        lacks.append(
+            f"tracks: TORCS's ({TORCS_TRACK} and others) are not found; name their folder with "
+            "--tracks or $TORCS_TRACKS"
+        )
+    if gpu and found["gpu"] is None and "gpu" not in errors:
+        lacks.append(f"gpu: torch {found['torch']} finds none")
+    renderer = found["renderer"]
+    if gpu and renderer is not None and any(name in renderer for name in SOFTWARE):
+        lacks.append(
+            f"egl: OpenGL draws on {renderer}, not on the GPU; give the driver's file with "
+            "__EGL_VENDOR_LIBRARY_FILENAMES"
+        )
+    return lacks
+
+
+def missing_at_all(*, gpu: bool = True) -> tuple[dict[str, Any], list[str]]:
+    """The description of this machine, and all that it lacks; {} where packages are missing."""
+    packages = missing_packages()
+    if packages:
+        named = ", ".join(packages)
+        return {}, [f"packages: {named}; bring them with --wheels (--collect-wheels gathers them)"]
+    found = describe_machine()
+    return found, missing(found, gpu=gpu)
+
+
+def set_paths(site: Path, tracks: Path | None) -> None:
+    """Set what the commands of a run read from the environment: imports, tracks."""
+    paths = [str(ROOT), str(site), os.environ.get("PYTHONPATH", "")]
+    os.environ["PYTHONPATH"] = os.pathsep.join(path for path in paths if path)
+    if tracks is not None:
+        os.environ["TORCS_TRACKS"] = str(tracks.resolve())

@@ -1,0 +1,55 @@
+"""Publishes the newest checkpoint of a training that was stopped; prints the number of its step.
+
+    python -m benchmarks.gpu.publish_checkpoint RUN
+
+Without an uncertainty head: `mtlnet ship --data` fits one on other rounds, on any machine.
+"""
+
+import sys
+from pathlib import Path
+
+from safetensors import safe_open
+
+from mtlnet.export.publish import Provenance, publish
+from mtlnet.inference.model_card import golden_image
+from mtlnet.model.architecture import HEIGHT, WIDTH, find_architecture
+from mtlnet.model.network import Network
+from mtlnet.training.checkpoint import list_checkpoints
+from mtlnet.training.config import read_config
+from mtlnet.training.recipes import find_recipe
+from trackfeatures.errors import UserError
+
+PREFIX = "network."
+
+
+def publish_checkpoint(run: Path) -> int:
+    """Publish the model in the folder of its run; UserError without a checkpoint."""
+    config, about = read_config(run)
+    checkpoints = list_checkpoints(run)
+    if not checkpoints:
+        raise UserError(f"{run} has no checkpoint; train again")
+    with safe_open(checkpoints[-1], framework="pt") as file:
+        step = int(file.metadata()["step"])
+        names = [name for name in file.keys() if name.startswith(PREFIX)]  # noqa: SIM118 no dict
+        weights = {name.removeprefix(PREFIX): file.get_tensor(name) for name in names}
+    recipe = find_recipe(config.recipe)
+    network = Network(
+        batch_norm=recipe.batch_norm,
+        dropout=recipe.dropout,
+        architecture=find_architecture(config.network),
+    )
+    network.load_state_dict(weights)
+    provenance = Provenance(
+        alpha=config.alpha,
+        recipe=config.recipe,
+        iterations=step,
+        batch=config.batch,
+        seed=config.seed,
+        data=about,
+    )
+    publish(network, run, golden_image(WIDTH, HEIGHT)[None], provenance)
+    return step
+
+
+if __name__ == "__main__":
+    print(publish_checkpoint(Path(sys.argv[1])))

@@ -1,0 +1,342 @@
+"""The stages of a GPU run: each runs commands of this project and returns what they found.
+
+Stages in the order of `plan.STAGES`; one that fails raises StageFailed, and the next ones run.
+"""
+
+import json
+import re
+import statistics
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+from benchmarks.gpu.collecting import (
+    VARIED,
+    counted,
+    evaluation_collections,
+    most_frames,
+    train_collections,
+)
+from benchmarks.gpu.plan import Plan, Size
+from benchmarks.gpu.process import Command, Ended, log_tail, run
+from benchmarks.gpu.report import RUNNING, Report
+from benchmarks.gpu.wheels import ROOT
+from mtlnet.inference.curves import CURVES, read_curves
+from mtlnet.inference.model_card import CARD
+
+MERGE_SHARE = 0.12
+"""Share of the time of `collect_train` for merging its parts."""
+START_S = 12.0
+"""Until a collection records, in a run of ten minutes: imports and the plan."""
+WHOLE_RUN = 150_000
+"""Steps of recipe `paper`."""
+EVALUATED = {"test": "test", "unseen": "unseen", "random": "unseen"}
+"""The split of each dataset that is evaluated."""
+
+
+class StageFailed(Exception):
+    """A stage did not reach its end; the argument says why. `found`: what it has found."""
+
+    def __init__(self, why: str, found: dict[str, Any] | None = None) -> None:
+        super().__init__(why)
+        self.found = found or {}
+
+
+@dataclass(frozen=True)
+class Run:
+    """What all stages share; `begin`: `time.monotonic()` at the start of the run."""
+
+    plan: Plan
+    size: Size
+    report: Report
+    begin: float
+    recipe: str
+    given_batch: int | None
+    until: float = 0.0
+    """`time.monotonic()` until which the current stage may take."""
+
+    @property
+    def work(self) -> Path:
+        return self.report.work
+
+    @property
+    def batch(self) -> int | None:
+        """Images a step of the training; None: the recipe's."""
+        return self.given_batch or self.size.batch
+
+    @property
+    def cores(self) -> int:
+        return int(self.report.content["machine"]["cores"])
+
+    def left(self) -> float:
+        """Seconds that are left to the current stage."""
+        return self.until - time.monotonic()
+
+    def command(self, name: str, *words: str, openmp_threads: int | None = None) -> Command:
+        """`python WORDS`, with output and log named after `name`."""
+        threads = {} if openmp_threads is None else {"OMP_NUM_THREADS": str(openmp_threads)}
+        out, log = self.work / f"{name}.out", self.work / f"{name}.log"
+        return Command((sys.executable, *words), out, log, threads)
+
+
+def forward(task: Run) -> dict[str, Any]:
+    """Milliseconds of the shipped network's forward pass by batch."""
+    size = task.size
+    command = task.command(
+        "forward",
+        *("-m", "benchmarks.gpu.forward", "--device", size.device),
+        *("--batches", ",".join(map(str, size.batches)), "--passes", str(size.passes)),
+    )
+    (ended,) = run([command], task.left())
+    lines = command.out.read_text().splitlines()
+    found = {"ms": [json.loads(line) for line in lines if line.endswith("}")]}
+    _require_ended(command, ended, found)
+    return found
+
+
+def compile_code(task: Run) -> dict[str, Any]:
+    """The simulator's numeric code is compiled once, before many processes need it."""
+    command = task.command(
+        "compile",
+        *("-m", "datagen", "collect", "--json", "--rounds", "2", "--frames", "3"),
+        *("--workers", "1", *VARIED[:2], "--tracks", "random,oval"),
+        *("--out", str(task.work / "compile")),
+    )
+    (ended,) = run([command], task.left())
+    _require_ended(command, ended)
+    return {}
+
+
+def gpu_tests(task: Run) -> dict[str, Any]:
+    """The tests marked `gpu`; only their files are read, for others need more packages."""
+    marked = [p for p in sorted((ROOT / "tests").rglob("test_*.py")) if "mark.gpu" in p.read_text()]
+    files = [str(path.relative_to(ROOT)) for path in marked]
+    command = task.command(
+        "tests",
+        *("-m", "pytest", "--rootdir", str(ROOT), "-c", str(ROOT / "pyproject.toml")),
+        *("-p", "no:cacheprovider", "-m", "gpu", *(str(path) for path in marked)),
+    )
+    (ended,) = run([command], task.left())
+    said = command.out.read_text(errors="replace")
+    counts = re.findall(r"(\d+) (passed|failed|skipped|errors?)\b", said)
+    found = {"files": files, **{name: int(count) for count, name in counts}}
+    if ended.code or ended.stopped:
+        raise StageFailed("\n".join(said.splitlines()[-30:]) or log_tail(command.log), found)
+    return found
+
+
+def collect_test(task: Run) -> dict[str, Any]:
+    """The three datasets to evaluate on; on a slow machine fewer rounds of them."""
+    collections = evaluation_collections(task.size, task.cores)
+    commands = [each.command(task.work) for each in collections]
+    ended = run(commands, task.left())
+    _require_not_failed(commands, ended)
+    found = counted(task.work, collections, ended)
+    if not found["frames"]["test"]:
+        raise StageFailed("no round was finished in time", found)
+    return found
+
+
+def collect_train(task: Run) -> dict[str, Any]:
+    """The dataset to train on: as many frames as there is time for, and memory on the GPU."""
+    seconds = (1 - MERGE_SHARE) * task.left()
+    if "train_frames" not in task.report.content:  # a run that goes on keeps its plans
+        most = most_frames(task.size, task.report.content["machine"]["gpu_bytes"])
+        before = task.report.stage("collect_test")
+        speed = before["frames_per_second"] or before["whole_frames_per_second"]
+        fitting = int(speed * (seconds - START_S * task.plan.scale))
+        task.report.save(train_frames=max(min(most, fitting), 1))
+    frames = task.report.content["train_frames"]
+    collections = train_collections(task.size, task.cores, frames)
+    commands = [each.command(task.work) for each in collections]
+    ended = run(commands, seconds)
+    _require_not_failed(commands, ended)
+    found = counted(task.work, collections, ended)
+    parts = [str(task.work / name) for name, frames in found["frames"].items() if frames]
+    if not parts:
+        raise StageFailed("no round was finished in time", found)
+    merge = task.command("merge", "-m", "datagen", "merge", *parts, "--out", str(_train_set(task)))
+    (merged,) = run([merge], task.left())
+    _require_ended(merge, merged, found)
+    return found
+
+
+def time_fast(task: Run) -> dict[str, Any]:
+    """The speed of recipe `fast`."""
+    return _time_recipe(task, "fast")
+
+
+def time_paper(task: Run) -> dict[str, Any]:
+    """The time of recipe `paper`'s steps: of all 150,000 if they fit."""
+    return _time_recipe(task, "paper")
+
+
+def _time_recipe(task: Run, recipe: str) -> dict[str, Any]:
+    """Times from the curves of `mtlnet train`, which is stopped after its last step."""
+    folder, steps = task.work / f"timed-{recipe}", task.size.timed_steps[recipe]
+    resume = ("--resume",) if (folder / "config.json").is_file() else ()
+    command = task.command(
+        recipe,
+        *("-m", "mtlnet", "train", "--recipe", recipe, "--iterations", str(steps), *resume),
+        *(() if task.size.batch is None else ("--batch", str(task.size.batch))),
+        *("--data", str(task.work / "test"), "--out", str(folder), "--device", task.size.device),
+    )
+
+    def enough() -> bool:
+        points = read_curves(folder / CURVES)
+        return bool(points) and points[-1]["step"] >= steps
+
+    (ended,) = run([command], task.left(), enough)
+    task.report.copy_curves(folder / CURVES, f"curves-{recipe}.csv")
+    found = timing(read_curves(folder / CURVES))
+    if not found:
+        raise StageFailed(log_tail(command.log) or "no ten steps were trained")
+    if ended.code and not ended.stopped:
+        raise StageFailed(log_tail(command.log), found)
+    return found
+
+
+def timing(points: list[dict[str, float]]) -> dict[str, Any]:
+    """Steps, seconds and speed of a training from its curves; {} without any.
+
+    `step_ms`: the median; `whole_run_s`: the seconds of 150,000 steps at the mean speed of those
+    that were taken, the first ten apart, in which the GPU's code is made ready.
+    """
+    if not points:
+        return {}
+    first, last = points[0], points[-1]
+    found = {
+        "steps": int(last["step"]),
+        "train_seconds": last["elapsed_s"],
+        "images_per_second": round(statistics.median(p["images_per_second"] for p in points), 1),
+    }
+    taken = last["step"] - first["step"]
+    if taken:
+        each = (last["elapsed_s"] - first["elapsed_s"]) / taken
+        gaps = [
+            (b["elapsed_s"] - a["elapsed_s"]) / (b["step"] - a["step"]) for a, b in pairwise(points)
+        ]
+        found["step_ms"] = round(1e3 * statistics.median(gaps), 4)
+        found["whole_run_s"] = round(first["elapsed_s"] + each * (WHOLE_RUN - first["step"]), 1)
+    return found
+
+
+def train(task: Run) -> dict[str, Any]:
+    """The model: `fast` from new weights, or `continue` from the shipped ones."""
+    folder = task.work / "train"
+    points = read_curves(folder / CURVES)
+    frames = sum(task.report.stage("collect_train").get("frames", {}).values())
+    now = time.monotonic() - task.begin
+    minutes = task.plan.train_minutes(now, frames)
+    before = points[-1]["elapsed_s"] / 60.0 if points else 0.0
+    words = ["-m", "mtlnet", "train", "--json", "--out", str(folder)]
+    words += ["--data", str(_train_set(task)), "--device", task.size.device]
+    if (folder / "config.json").is_file():
+        words += ["--resume"]
+    else:
+        words += ["--recipe", task.recipe, "--seed", "1"]
+        words += ["--init", "default"] if task.recipe == "continue" else []
+        words += ["--batch", str(task.batch)] if task.batch else []
+    if task.size.iterations is not None:
+        words += ["--iterations", str(task.size.iterations)]
+    else:
+        words += ["--minutes", f"{before + minutes:.3f}"]
+    command = task.command("train", *words)
+    (ended,) = run([command], task.left())
+    task.report.copy_curves(folder / CURVES, "curves.csv")
+    found = {"frames": frames, "planned_minutes": round(minutes, 2)}
+    found |= timing(read_curves(folder / CURVES))
+    found.pop("whole_run_s", None)
+    if ended.code or ended.stopped:
+        raise StageFailed(log_tail(command.log), found)
+    return found
+
+
+def ship(task: Run) -> dict[str, Any]:
+    """The model's weights in float16; of a training that was stopped, those of its checkpoint."""
+    found: dict[str, Any] = {}
+    folder = task.work / "train"
+    if not (folder / CARD).is_file():
+        module = "benchmarks.gpu.publish_checkpoint"
+        publish = task.command("publish", "-m", module, str(folder))
+        (ended,) = run([publish], task.left())
+        _require_ended(publish, ended)
+        found["from_checkpoint"] = int(publish.out.read_text())
+    words = ("-m", "mtlnet", "ship", "--json", "--model", str(folder), "--out", str(_model(task)))
+    command = task.command("ship", *words)
+    if not (_model(task) / CARD).is_file():
+        (ended,) = run([command], task.left())
+        _require_ended(command, ended)
+        found |= json.loads(command.out.read_text())
+    task.report.copy_model(_model(task))
+    return {name: value for name, value in found.items() if name != "out"}
+
+
+def evaluate(task: Run) -> dict[str, Any]:
+    """The reports of `mtlnet evaluate`, by torch, on what `collect_test` recorded."""
+    found: dict[str, Any] = {}
+    recorded = task.report.stage("collect_test")["frames"]
+    for name, split in EVALUATED.items():
+        if not recorded[name]:
+            continue
+        command = task.command(
+            f"evaluate-{name}",
+            *("-m", "mtlnet", "evaluate", "--json", "--engine", "torch", "--split", split),
+            *("--model", str(_model(task)), "--data", str(task.work / name)),
+            openmp_threads=1,
+        )
+        (ended,) = run([command], task.left())
+        _require_ended(command, ended, found)
+        found[name] = {**json.loads(command.out.read_text()), "data": name}
+        task.report.add("evaluate", RUNNING, ended.seconds, found)
+    return found
+
+
+STAGE_FUNCTIONS: dict[str, Callable[[Run], dict[str, Any]]] = {
+    "forward": forward,
+    "compile": compile_code,
+    "tests": gpu_tests,
+    "collect_test": collect_test,
+    "collect_train": collect_train,
+    "fast": time_fast,
+    "train": train,
+    "ship": ship,
+    "evaluate": evaluate,
+    "paper": time_paper,
+}
+NEEDS = {
+    "collect_train": "collect_test",
+    "fast": "collect_test",
+    "paper": "collect_test",
+    "train": "collect_train",
+    "ship": "collect_train",
+    "evaluate": "ship",
+}
+"""The stage that must be done before; `ship` saves a training that was stopped."""
+
+
+def _train_set(task: Run) -> Path:
+    return task.work / "train-set"
+
+
+def _model(task: Run) -> Path:
+    return task.work / "model"
+
+
+def _require_not_failed(commands: list[Command], ended: list[Ended]) -> None:
+    """Raise StageFailed where one ended by itself with an error; others may have been stopped."""
+    for command, end in zip(commands, ended, strict=True):
+        if not end.stopped:
+            _require_ended(command, end)
+
+
+def _require_ended(command: Command, ended: Ended, found: dict[str, Any] | None = None) -> None:
+    """Raise StageFailed, with what the command wrote to its log, unless it ended well in time."""
+    if ended.stopped:
+        raise StageFailed(f"stopped after {ended.seconds:.0f} s; {log_tail(command.log)}", found)
+    if ended.code:
+        raise StageFailed(log_tail(command.log) or f"exit code {ended.code}", found)

@@ -1,0 +1,61 @@
+"""Malicious clients beside well-behaved ones: all attacks of the tests in turn, once a minute.
+
+They come from an address of their own, on this machine.
+"""
+
+import multiprocessing
+import os
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from multiprocessing.synchronize import Event
+
+from datagen.recorder.job import exit_with_parent
+from tests.serve.attacks.attacks import Attack
+from tests.serve.attacks.conftest import Target
+from tests.serve.attacks.registry import ATTACKS
+
+ADDRESS = "127.0.0.2"
+ROUND_S = 60.0
+START_S = 120.0
+SPAWN = multiprocessing.get_context("spawn")
+FORK = multiprocessing.get_context("fork")
+
+
+@contextmanager
+def malicious_clients(port: int) -> Iterator[None]:
+    """Attack the service at a port of this machine, from the first attack to the end."""
+    begun = SPAWN.Event()
+    process = SPAWN.Process(target=attack_in_turn, args=(port, begun))
+    process.start()
+    try:
+        if not begun.wait(START_S):
+            raise RuntimeError("the bad clients do not begin")
+        yield
+    finally:
+        process.terminate()
+        process.join()
+
+
+def attack_in_turn(port: int, begun: Event) -> None:
+    """Make round after round; each attack in a process, whose end closes its connections."""
+    target = Target(port, source=ADDRESS)
+    while True:
+        for attack in ATTACKS:
+            attacker = FORK.Process(target=make_and_hold, args=(attack, target, os.getpid()))
+            attacker.start()
+            begun.set()
+            time.sleep(ROUND_S / len(ATTACKS))
+            attacker.kill()
+            attacker.join()
+
+
+def make_and_hold(attack: Attack, target: Target, parent: int) -> None:
+    """Make an attack, and keep its connections open, at most as long as the parent lives."""
+    exit_with_parent(parent)
+    held = []
+    with suppress(OSError, AssertionError):  # it is kept out: as it should be
+        held = attack(target)
+    time.sleep(ROUND_S)
+    for connection in held:
+        connection.close()

@@ -1,0 +1,203 @@
+"""The service and its peers as processes, and a load on them: what several benchmarks share.
+
+A peer runs in an environment of its own, which has it, openvino, numpy and simplejpeg.
+"""
+
+import http.client
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.service_load.peer_work import MODEL, PORT, WORKERS
+from tests.serve.conftest import jpeg, picture, publish_untrained
+
+HERE = Path(__file__).parent
+ROOT = HERE.parents[1]
+OURS = "driverview"
+PEERS = ("litserve", "bentoml", "mosec")
+Peer = Path | None
+"""The interpreter of an environment that has the peer; None: it is left out."""
+START_S, END_S = 120.0, 10.0
+BODY = jpeg(picture())
+
+
+def request(path: str = "/features") -> bytes:
+    """One whole request with an image of the model's own camera."""
+    head = f"POST {path} HTTP/1.1\r\nHost: localhost\r\nContent-Type: image/jpeg\r\n"
+    return f"{head}Content-Length: {len(BODY)}\r\n\r\n".encode() + BODY
+
+
+def pythons(*peers: Path | None) -> dict[str, Path]:
+    """The interpreter of each server: ours, and those given for `PEERS`, in their order."""
+    given = {name: path for name, path in zip(PEERS, peers, strict=True) if path}
+    return {OURS: Path(sys.executable), **given}
+
+
+@contextmanager
+def model_copy(run: Path | None, int8: bool = False) -> Iterator[Path]:
+    """A copy of `run`, without its int8 graph unless that is wanted; None: untrained weights."""
+    with tempfile.TemporaryDirectory() as folder:
+        found = Path(folder) / "run"
+        if run is None:
+            publish_untrained(found, seed=3)
+        else:
+            shutil.copytree(run, found, ignore=None if int8 else shutil.ignore_patterns("export"))
+        yield found
+
+
+def _command(name: str, python: Path, port: int, workers: int, run: Path) -> list[str]:
+    if name == OURS:
+        options = ["--model", str(run), "--port", str(port), "--workers", str(workers)]
+        return [str(python), "-m", "serve", *options]
+    if name == "bentoml":
+        target = ["serve", "benchmarks.service_load.peer_bentoml:Features"]
+        options = ["--host", "127.0.0.1", "--port", str(port)]
+        return [str(python.parent / "bentoml"), *target, *options]
+    return [str(python), str(HERE / f"peer_{name}.py")]
+
+
+@contextmanager
+def running(
+    name: str,
+    python: Path,
+    run: Path,
+    workers: int,
+    cores: set[int] | None = None,
+    root: Path = ROOT,
+) -> Iterator[int]:
+    """The port of a server that answers; `cores`: all that it may use, `root`: its source tree.
+
+    SIGTERM ends this process in order from now on, and the server with it.
+    """
+    signal.signal(signal.SIGTERM, lambda number, _frame: sys.exit(128 + number))
+    with socket.create_server(("127.0.0.1", 0)) as probe:
+        port = probe.getsockname()[1]
+    settings = {MODEL: str(run), WORKERS: str(workers), PORT: str(port)}
+    environment = {
+        **os.environ,
+        **settings,
+        "PYTHONPATH": str(root),
+        "BENTOML_DO_NOT_TRACK": "True",
+    }
+    with tempfile.TemporaryFile() as said:
+        process = subprocess.Popen(
+            _command(name, python, port, workers, run),
+            env=environment,
+            cwd=root,
+            stdout=said,
+            stderr=said,
+            start_new_session=True,
+            preexec_fn=None if cores is None else lambda: os.sched_setaffinity(0, cores),
+        )
+        try:
+            if not _answers(port, process):
+                said.seek(0)
+                raise RuntimeError(f"{name} does not answer:\n{said.read().decode()[-2000:]}")
+            yield port
+        finally:
+            _end(process)
+
+
+def _end(process: "subprocess.Popen[bytes]") -> None:
+    """End a server in peace, by force where it does not, and whoever it leaves behind."""
+    family = descendants(process.pid)
+    process.terminate()
+    with suppress(subprocess.TimeoutExpired):
+        process.wait(END_S)
+    for pid in (process.pid, *family):
+        with suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGKILL)
+    process.wait()
+
+
+def processor_s(pids: list[int]) -> float:
+    """Processor time of some processes so far, s."""
+    stats = [Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split() for pid in pids]
+    ticks = sum(int(fields[11]) + int(fields[12]) for fields in stats)
+    return ticks / os.sysconf("SC_CLK_TCK")
+
+
+def descendants(pid: int) -> list[int]:
+    """All processes below one. (Linux: the children of its first thread.)"""
+    try:
+        children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+    except OSError:  # it has ended
+        return []
+    return [found for child in map(int, children) for found in (child, *descendants(child))]
+
+
+def _answers(port: int, process: "subprocess.Popen[bytes]") -> bool:
+    end = time.monotonic() + START_S
+    while time.monotonic() < end and process.poll() is None:
+        connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
+        try:
+            connection.request("POST", "/features", BODY, {"Content-Type": "image/jpeg"})
+            if connection.getresponse().status == 200:
+                return True
+        except OSError:
+            pass
+        finally:
+            connection.close()
+        time.sleep(0.1)
+    return False
+
+
+@dataclass(frozen=True)
+class Load:
+    """What became of requests: when each was due (s), its time (ms), its status; 0: it broke."""
+
+    due_s: NDArray[np.float64]
+    time_ms: NDArray[np.float64]
+    status: NDArray[np.int64]
+    seconds: float
+
+    def per_second(self, status: int = 200) -> float:
+        """Answers of this status that came, a second."""
+        return float((self.status == status).sum()) / self.seconds
+
+    def percentile(self, percent: float, status: int = 200) -> float:
+        """Of the times of requests with this status, ms; NaN where there is none."""
+        times = self.time_ms[self.status == status]
+        return float(np.percentile(times, percent)) if len(times) else float("nan")
+
+
+class Loader:
+    """The compiled load generator."""
+
+    def __init__(self, folder: Path, cores: set[int] | None = None) -> None:
+        """Compiled into `folder`; `cores`: all that it may use."""
+        self._program = folder / "load"
+        self._request = folder / "request"
+        self._request.write_bytes(request())
+        self._cores = cores
+        compiler = ["cc", "-O2", "-o", str(self._program), str(HERE / "load.c")]
+        subprocess.run(compiler, check=True)
+
+    def run(self, port: int, connections: int, seconds: float, rate: float = 0.0) -> Load:
+        """Ask for `seconds`; `rate` 0: each connection as soon as it has its answer."""
+        numbers = [str(port), str(connections), str(seconds), str(rate)]
+        done = subprocess.run(
+            [str(self._program), *numbers, str(self._request)],
+            check=True,
+            capture_output=True,
+            text=True,
+            preexec_fn=None if self._cores is None else self._pin,
+        )
+        rows = np.array(done.stdout.split(), np.float64).reshape(-1, 3)
+        return Load(rows[:, 0], rows[:, 1], rows[:, 2].astype(np.int64), seconds)
+
+    def _pin(self) -> None:
+        assert self._cores is not None
+        os.sched_setaffinity(0, self._cores)

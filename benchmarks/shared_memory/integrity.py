@@ -1,0 +1,118 @@
+"""Messages of the link, written at full speed and verified by the other side: none is torn."""
+
+import json
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.shared_memory.processes import INFO, LINK, START_S, fresh_name, start
+from runtime.jit import compiled
+from simulator.link.channel import Receiver, Sender, state_image_bytes
+from simulator.link.handshake import write_header
+from simulator.link.layout import COMMAND, STATE, segment_size
+from simulator.link.segment import SHM, Segment, create
+from simulator.link.sync.seqlock import DAMAGED, READ, publish, spin_until_new, try_read
+
+PICTURE = 32, 24
+
+
+@compiled
+def flood(
+    sequence: Any, shared: Any, local: Any, shared_image: Any, local_image: Any, first: int
+) -> int:
+    """Publish messages whose words are all their own number; a pause lets a reader come between."""
+    for number in range(first, first + 5000):
+        local[1:] = number
+        local_image[:] = number
+        publish(sequence, shared, local, shared_image, local_image)
+        # Up to 4 us, of changing length so that the two sides do not keep in step.
+        spin_until_new(sequence, int(sequence[0]), number % 7 * 1000)
+    return first + 5000
+
+
+@compiled
+def verify(
+    sequence: Any, shared: Any, local: Any, shared_image: Any, local_image: Any, goal: int
+) -> tuple[int, int, int]:
+    """Take up to `goal` messages in 10^6 looks: (whole, torn, damaged)."""
+    whole, torn, damaged, seen = 0, 0, 0, 0
+    for _ in range(1_000_000):
+        if whole + torn >= goal:
+            break
+        outcome, seen = try_read(sequence, shared, local, shared_image, local_image, seen)
+        if outcome == DAMAGED:
+            damaged += 1
+        if outcome == READ:
+            if np.all(local[1:-1] == local[1]):
+                whole += 1
+            else:
+                torn += 1
+    return whole, torn, damaged
+
+
+def segment_for_flood(name: str, picture: tuple[int, int]) -> Segment:
+    """The server's end of a link without a server."""
+    info = INFO.__class__(
+        **{**INFO.__dict__, "image_width": picture[0], "image_height": picture[1]}
+    )
+    segment = create(name, segment_size(*picture))
+    write_header(segment, info)
+    segment.publish()
+    return segment
+
+
+def write_states(name: str) -> None:
+    """In a process of its own: state messages as fast as it can, until it is killed."""
+    segment = segment_for_flood(name, PICTURE)
+    arrays = Sender(segment, STATE, state_image_bytes(segment))._buffer.arrays
+    number = 1
+    while True:
+        number = flood(*arrays, number)
+
+
+def server_to_client(hammer: str, task: str, messages: int, patience_s: float) -> dict[str, float]:
+    """numba writes states with pictures, C reads them."""
+    name = fresh_name()
+    writer = start(sys.executable, str(LINK), "--flood", name)
+    try:
+        told = subprocess.run(
+            [hammer, task, name, str(messages), str(patience_s)],
+            check=True,
+            capture_output=True,
+            text=True,
+        )
+    finally:
+        writer.kill()
+        writer.communicate()
+        Path(SHM / name[1:]).unlink(missing_ok=True)
+    result: dict[str, float] = json.loads(told.stdout)
+    return result
+
+
+def client_to_server(hammer: str, messages: int, patience_s: float) -> dict[str, float]:
+    """C writes commands, numba reads them."""
+    name = fresh_name()
+    segment = segment_for_flood(name, (0, 0))
+    writer = start(hammer, "write", name)
+    arrays = Receiver(segment, COMMAND)._buffer.arrays
+    verify(*arrays, 0)  # compiled before the clock runs
+    whole, torn, damaged = 0, 0, 0
+    began = time.monotonic()
+    try:
+        while whole + torn < messages and time.monotonic() - began < patience_s:
+            more = verify(*arrays, messages - whole - torn)
+            whole, torn, damaged = whole + more[0], torn + more[1], damaged + more[2]
+    finally:
+        seconds = time.monotonic() - began
+        segment.close()
+        writer.communicate(timeout=START_S)
+    return {
+        "messages": whole + torn,
+        "torn": torn,
+        "damaged": damaged,
+        "seconds": round(seconds, 3),
+    }

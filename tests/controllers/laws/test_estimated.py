@@ -1,0 +1,57 @@
+"""LQR and MPC on an estimated state: the gain's closed form, drives with noise and delay."""
+
+import numpy as np
+import pytest
+
+from controllers.drive.closed_loop import DriveResult
+from controllers.drive.config import DriveConfig
+from controllers.drive.disturbance import DISTURBANCES
+from controllers.drive.run import drive
+from controllers.laws.estimated import SmoothWeights, smooth_gain
+from controllers.laws.kalman import CAR
+from controllers.laws.lqr_gains import discrete_gain
+
+STEPS = 900
+ESTIMATED = ("lqr-kalman", "mpc-kalman")
+
+
+def driven(controller: str, disturbance: str) -> tuple[DriveResult, float]:
+    """A drive from beside the line, and the mean change of its steering action in a step."""
+    actions: list[float] = []
+    result = drive(
+        DriveConfig(controller=controller, track="circuit", steps=STEPS, start_d=1.0),
+        disturbance=DISTURBANCES[disturbance],
+        observers=[lambda state, perceived, steer: actions.append(steer)],
+    )
+    return result, float(np.abs(np.diff(actions)).mean())
+
+
+@pytest.mark.parametrize("speed", [5.0, 15.0, 30.0])
+def test_without_weight_on_its_change_the_wheel_angle_is_that_of_the_regulator(
+    speed: float,
+) -> None:
+    weights = SmoothWeights(2.0, 0.2, 2.0, 0.1, 0.01, wheel_rate=0.0)
+    found = smooth_gain(weights, speed, 0.05)
+    np.testing.assert_allclose(found[:4], discrete_gain(CAR, weights.state, speed, 0.05), rtol=1e-6)
+    assert found[4] == pytest.approx(1.0)  # the old wheel angle is replaced
+
+
+@pytest.mark.parametrize("controller", ESTIMATED)
+def test_with_noise_the_steering_is_a_third_as_restless_as_that_of_lqr(controller: str) -> None:
+    (plain, restless), (found, smooth) = driven("lqr", "noise"), driven(controller, "noise")
+    assert found.ended is None
+    assert smooth < restless / 3
+    assert found.score > plain.score
+
+
+@pytest.mark.parametrize("controller", ESTIMATED)
+def test_with_a_delay_the_score_is_near_that_without(controller: str) -> None:
+    (plain, _), (late, _) = driven(controller, "none"), driven(controller, "delay")
+    assert driven("lqr", "delay")[0].score_per_step < plain.score_per_step - 0.05
+    assert late.score_per_step > plain.score_per_step - 0.015
+
+
+@pytest.mark.parametrize("controller", ESTIMATED)
+def test_without_disturbance_nothing_is_lost(controller: str) -> None:
+    plain = driven(controller.removesuffix("-kalman"), "none")[0]
+    assert driven(controller, "none")[0].score_per_step > plain.score_per_step - 0.0003
